@@ -1,0 +1,69 @@
+# Everything a newcomer needs: `make reproduce` and `make test`.
+#   CORES=n          cores for the workflow (default: all)
+#   PRESET=name      smoke, fast (default) or paper
+#   SET="a.b=1 …"    Hydra overrides for every dataset
+#   TARGETS="…"      Snakemake targets, for example dataset3 (default: all)
+#   TORCH_INDEX=url  package index with PyTorch's CPU builds (default: pip's own index)
+#   PYTHON=python3   interpreter that makes the environment (3.11 or newer)
+
+PYTHON ?= python3
+CORES ?= all
+PRESET ?= fast
+SET ?=
+TARGETS ?=
+TORCH_INDEX ?=
+
+VENV := $(CURDIR)/.venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check --no-input
+export PATH := $(BIN):$(PATH)
+export PYTHONUNBUFFERED := 1
+SNAKEMAKE := snakemake --cores $(CORES) --config preset=$(PRESET) $(if $(SET),set="$(SET)")
+
+.DEFAULT_GOAL := help
+.PHONY: help env reproduce report test test-all lint format lock clean
+
+help: ## List the targets
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
+
+env: $(VENV)/.complete ## Create the environment .venv from the lock file
+
+$(VENV)/.complete: requirements.lock pyproject.toml
+	$(PYTHON) -c 'import sys; sys.exit("psfdae needs Python 3.11 or newer" if sys.version_info < (3, 11) else 0)'
+	$(PYTHON) -m venv $(VENV)
+	$(PIP) install --quiet --require-hashes --no-deps --requirement requirements.lock
+	$(PIP) install --quiet $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) "$$(sed -nE 's/^ *"(torch==[^"]+)",/\1/p' pyproject.toml)"
+	$(PIP) install --quiet --no-deps --no-build-isolation --editable .
+	touch $@
+
+reproduce: env ## Build everything of the preset: datasets, models, tables
+	@sh workflow/locked.sh $(SNAKEMAKE) -- $(TARGETS)
+
+report: env ## Write results/report.html for what reproduce has built
+	$(SNAKEMAKE) --report results/report.html $(TARGETS)
+
+lint: env
+	ruff check .
+	ruff format --check .
+	snakefmt --check Snakefile workflow
+	snakemake --lint
+
+format: env ## Format Python and Snakemake files
+	ruff check --fix .
+	ruff format .
+	snakefmt Snakefile workflow
+
+test: lint ## Lint, unit tests and the smoke workflow
+	pytest -m "not slow"
+
+test-all: lint ## The tests and the slow ones
+	pytest
+
+lock: env ## Renew requirements.lock from pyproject.toml
+	uv pip compile --quiet --upgrade --universal --python-version 3.11 --generate-hashes \
+	  --no-header --no-annotate --extra dev --overrides requirements/no-torch.txt \
+	  pyproject.toml requirements/torch-runtime.in --output-file requirements.lock
+
+clean: ## Remove results (but not results/reference) and Snakemake's memory of them
+	find results -mindepth 1 -maxdepth 1 ! -name reference -exec rm -rf {} + 2>/dev/null || true
+	rm -rf .snakemake

@@ -1,0 +1,1 @@
+"""Typed configuration: Hydra composes it from `config/`, pydantic checks it."""

@@ -1,0 +1,1 @@
+"""Estimators of the point spread function from a noisy star image."""

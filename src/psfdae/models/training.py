@@ -1,0 +1,305 @@
+"""Training of the denoising autoencoder: fresh noise every epoch, resumable, watched.
+
+Every epoch draws its order, noise levels and noise from a stream of its own, so
+a training that resumes after epoch e continues with exactly the numbers that an
+uninterrupted one would have used.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from psfdae.configuration.schema import Dae as DaeConfig
+from psfdae.configuration.schema import Train
+from psfdae.files import atomic_path
+from psfdae.models.dae import Dae, build_dae, image_scale, predict
+from psfdae.rng import stream
+from psfdae.stars.noise import NoiseModel
+
+
+class TrainingError(RuntimeError):
+    """A training cannot go on; the message says why and what to change."""
+
+
+class DeadNetworkError(RuntimeError):
+    """All outputs of the network are zero: no gradient will ever revive it."""
+
+
+@dataclass(frozen=True)
+class TrainingSet:
+    """Noise-free stars of one dataset and what is to be estimated from them.
+
+    Attributes
+    ----------
+    images, references : ndarray, shape (n, d, d), float32
+    fit, validation : ndarray of int
+        Star indices.
+    levels : ndarray, shape (L,)
+        Noise levels λ that are mixed.
+    noise : NoiseModel
+    """
+
+    images: np.ndarray
+    references: np.ndarray
+    fit: np.ndarray
+    validation: np.ndarray
+    levels: np.ndarray
+    noise: NoiseModel
+
+    def draw(self, stars: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Noisy images of `stars`, each at a random level."""
+        levels = self.levels[rng.integers(self.levels.size, size=stars.size)]
+        return self.noise.draw(self.images[stars], levels, rng)
+
+
+class Training:
+    """State of one training: network, optimiser, schedule, best state, history.
+
+    Parameters
+    ----------
+    data : TrainingSet
+    dae, train : config groups
+    seed : int
+    attempt : int
+        0 at first; a restart after a dead network counts up and so gets other
+        weights and other noise.
+    """
+
+    def __init__(
+        self, data: TrainingSet, dae: DaeConfig, train: Train, seed: int, attempt: int
+    ) -> None:
+        self.data = data
+        self.train = train
+        self.seed = seed
+        self.attempt = attempt
+        self.factor = image_scale(dae.scale, data.images.shape[-1])
+        generator = torch.Generator()
+        generator.manual_seed(int(stream(seed, "dae", "init", attempt).integers(2**62)))
+        self.model = build_dae(dae.kernels, dae.widths, dae.init, generator)
+        self.optimiser = torch.optim.Adam(self.model.parameters(), lr=train.lr)
+        self.steps_per_epoch = -(-data.fit.size // train.batch)
+        self.scheduler = self._make_scheduler()
+        self.epoch = 0
+        self.seconds = 0.0
+        self.history: list[dict[str, float]] = []
+        self.best_mse = float("inf")
+        self.best_state: dict[str, torch.Tensor] = {}
+
+    def _make_scheduler(self) -> torch.optim.lr_scheduler.LRScheduler:
+        if self.train.schedule == "onecycle":
+            total = self.train.epochs * self.steps_per_epoch
+            return torch.optim.lr_scheduler.OneCycleLR(
+                self.optimiser, self.train.lr, total_steps=max(total, 2)
+            )
+        return torch.optim.lr_scheduler.ConstantLR(self.optimiser, factor=1.0)
+
+    def run_epoch(self, tick: Callable[[], None]) -> dict[str, float]:
+        """One pass over the training stars, then validation where it is due.
+
+        Returns
+        -------
+        dict
+            Row of the history: epoch, step, lr, train_mse, validation_mse (NaN
+            where not due), seconds. Errors are of flux-normalised images.
+
+        Raises
+        ------
+        TrainingError
+            If the loss is not finite.
+        DeadNetworkError
+            If the network has died.
+        """
+        started = time.monotonic()
+        rng = stream(self.seed, "dae", "epoch", self.attempt, self.epoch)
+        losses = []
+        self.model.train()
+        for noisy, target in self._batches(rng):
+            losses.append(
+                self._step(noisy, target, self.epoch * self.steps_per_epoch + len(losses))
+            )
+            tick()
+        self.epoch += 1
+        due = self.epoch % self.train.validate_every == 0 or self.epoch == self.train.epochs
+        validation = self._validate() if due else float("nan")
+        self.seconds += time.monotonic() - started
+        row = {
+            "epoch": self.epoch,
+            "step": self.epoch * self.steps_per_epoch,
+            "lr": self.optimiser.param_groups[0]["lr"],
+            "train_mse": float(np.mean(losses)) / self.factor**2,
+            "validation_mse": validation,
+            "seconds": round(self.seconds, 3),
+        }
+        self.history.append(row)
+        return row
+
+    def _batches(self, rng: np.random.Generator) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
+        order = rng.permutation(self.data.fit)
+        for start in range(0, order.size, self.train.batch):
+            stars = order[start : start + self.train.batch]
+            yield (
+                self._tensor(self.data.draw(stars, rng)),
+                self._tensor(self.data.references[stars]),
+            )
+
+    def _tensor(self, images: np.ndarray) -> torch.Tensor:
+        scaled = torch.from_numpy(images)[:, None] * self.factor
+        return scaled.to(memory_format=torch.channels_last)
+
+    def _step(self, noisy: torch.Tensor, target: torch.Tensor, step: int) -> float:
+        output = self.model(noisy)
+        loss = torch.nn.functional.mse_loss(output, target)
+        value = loss.item()
+        if not np.isfinite(value):
+            raise TrainingError(
+                f"the loss is {value} at step {step} (epoch {self.epoch + 1}): "
+                f"lower train.lr = {self.train.lr} or train.grad_clip = {self.train.grad_clip}"
+            )
+        if step % self.train.dead_check_steps == 0 and not output.detach().any():
+            raise DeadNetworkError(f"all outputs are zero at step {step}")
+        self.optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        if self.train.grad_clip > 0:
+            torch.nn.utils.clip_grad_norm_(self.model.parameters(), self.train.grad_clip)
+        self.optimiser.step()
+        self.scheduler.step()
+        return value
+
+    def _validate(self) -> float:
+        stars = np.tile(self.data.validation, self.train.validation_draws)
+        noisy = self.data.draw(stars, stream(self.seed, "dae", "validation"))
+        estimate = predict(self.model, noisy, self.factor)
+        error = float(((estimate - self.data.references[stars]) ** 2).mean(dtype=np.float64))
+        if error < self.best_mse:
+            self.best_mse = error
+            self.best_state = {k: v.detach().clone() for k, v in self.model.state_dict().items()}
+        return error
+
+    def state(self) -> dict[str, Any]:
+        """Everything that `restore` needs, as tensors and plain values."""
+        return {
+            "attempt": self.attempt,
+            "epoch": self.epoch,
+            "seconds": self.seconds,
+            "model": self.model.state_dict(),
+            "optimiser": self.optimiser.state_dict(),
+            "scheduler": self.scheduler.state_dict(),
+            "history": self.history,
+            "best_mse": self.best_mse,
+            "best_state": self.best_state,
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Continue from a `state`."""
+        self.epoch = state["epoch"]
+        self.seconds = state["seconds"]
+        self.model.load_state_dict(state["model"])
+        self.optimiser.load_state_dict(state["optimiser"])
+        self.scheduler.load_state_dict(state["scheduler"])
+        self.history = state["history"]
+        self.best_mse = state["best_mse"]
+        self.best_state = state["best_state"]
+
+
+@dataclass(frozen=True)
+class TrainingResult:
+    """The best validation state and how it was reached."""
+
+    state: dict[str, torch.Tensor]
+    history: list[dict[str, float]]
+    attempt: int
+
+
+def train_dae(
+    data: TrainingSet,
+    dae: DaeConfig,
+    train: Train,
+    seed: int,
+    checkpoint: Path,
+    fingerprint: str,
+    report: Callable[[dict[str, float]], None],
+    tick: Callable[[], None],
+) -> TrainingResult:
+    """Train, restart if the network dies, resume from a checkpoint if there is one.
+
+    Parameters
+    ----------
+    data, dae, train, seed : see `Training`
+    checkpoint : Path
+        Where the state is kept while the training runs; removed at its end.
+    fingerprint : str
+        Identifies configuration and data; a checkpoint of another one is ignored.
+    report : called with the history's row after each epoch
+    tick : called after each step
+
+    Raises
+    ------
+    TrainingError
+        On a non-finite loss, or if every restart died.
+    """
+    torch.set_num_threads(train.threads)
+    saved = _load_checkpoint(checkpoint, fingerprint)
+    first = saved["attempt"] if saved else 0
+    for attempt in range(first, train.restarts + 1):
+        training = Training(data, dae, train, seed, attempt)
+        if saved:
+            training.restore(saved)
+            saved = None
+        try:
+            _run(training, checkpoint, fingerprint, report, tick)
+        except DeadNetworkError as death:
+            print(f"attempt {attempt}: {death}; starting from another seed", flush=True)
+            continue
+        checkpoint.unlink(missing_ok=True)
+        return TrainingResult(training.best_state, training.history, attempt)
+    raise TrainingError(
+        f"the network died in all {train.restarts + 1} attempts: lower train.lr = {train.lr}"
+    )
+
+
+def _run(
+    training: Training,
+    checkpoint: Path,
+    fingerprint: str,
+    report: Callable[[dict[str, float]], None],
+    tick: Callable[[], None],
+) -> None:
+    last_saved = time.monotonic()
+    while training.epoch < training.train.epochs:
+        report(training.run_epoch(tick))
+        if time.monotonic() - last_saved >= training.train.checkpoint_seconds:
+            with atomic_path(checkpoint) as temporary:
+                torch.save({"fingerprint": fingerprint, **training.state()}, temporary)
+            last_saved = time.monotonic()
+
+
+def _load_checkpoint(path: Path, fingerprint: str) -> dict[str, Any] | None:
+    """The state of an interrupted training of the same configuration, if there is one."""
+    if not path.is_file():
+        return None
+    try:
+        state = torch.load(path, weights_only=True)
+    except Exception as error:  # any damage means the same: start afresh
+        print(f"{path}: unreadable checkpoint ignored ({error})", flush=True)
+        return None
+    if state.pop("fingerprint", None) != fingerprint:
+        print(f"{path}: checkpoint of another configuration ignored", flush=True)
+        return None
+    print(f"{path}: resuming after epoch {state['epoch']}", flush=True)
+    return state
+
+
+def load_dae(config: DaeConfig, weights: Path) -> Dae:
+    """Network of a configuration with weights from a safetensors file."""
+    from safetensors.torch import load_file
+
+    model = Dae(config.kernels, config.widths).to(memory_format=torch.channels_last)
+    model.load_state_dict(load_file(weights))
+    return model.eval()

@@ -1,0 +1,101 @@
+"""How finely a pupil must be sampled so that nothing is aliased."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+class SamplingError(ValueError):
+    """The pupil grid is too coarse for a wavefront or for the stamp's position."""
+
+
+def required_samples(slopes: np.ndarray, reach: np.ndarray) -> np.ndarray:
+    """Smallest number of pupil samples that represents a wavefront and its stamp.
+
+    Two conditions per axis. The OPD may change by half a wave per sample:
+    N ≥ 4·max|∂W/∂ρ|. And the images of the pupil grid repeat every N λ/D, so
+    no replica of the geometric blur, which spans 2·∂W/∂ρ, may reach the stamp.
+
+    Parameters
+    ----------
+    slopes : ndarray, shape (..., 2, 2)
+        [axis, (min, max)] slope of the OPD in waves per pupil radius.
+    reach : ndarray, shape (..., 2, 2)
+        [axis, (min, max)] edges of the stamp in λ/D from the chief ray.
+
+    Returns
+    -------
+    ndarray of int, shape (...)
+    """
+    steepest = 4.0 * np.abs(slopes).max(axis=(-2, -1))
+    blur = 2.0 * slopes
+    replica = np.maximum(
+        blur[..., 1] - reach[..., 0],
+        reach[..., 1] - blur[..., 0],
+    ).max(axis=-1)
+    return np.ceil(np.maximum(steepest, replica)).astype(int)
+
+
+def choose_samples(needed: np.ndarray, ladder: tuple[int, ...]) -> np.ndarray:
+    """Smallest rung of a ladder of grid sizes that serves each wavefront.
+
+    Parameters
+    ----------
+    needed : ndarray of int, shape (B,)
+        Result of `required_samples`.
+    ladder : tuple of int
+        Available grid sizes N, ascending.
+
+    Returns
+    -------
+    ndarray of int, shape (B,)
+
+    Raises
+    ------
+    SamplingError
+        If a wavefront needs more than the last rung; names the N that would do.
+    """
+    worst = int(needed.max())
+    if worst > ladder[-1]:
+        star = int(needed.argmax())
+        raise SamplingError(
+            f"optics.pupil_samples = {list(ladder)}: wavefront {star} needs N ≥ {worst} pupil "
+            f"samples (half a wave per sample, replicas clear of the stamp); "
+            f"{int((needed > ladder[-1]).sum())} of {needed.size} wavefronts exceed the last value"
+        )
+    rungs = np.asarray(ladder)
+    return rungs[np.searchsorted(rungs, needed)]
+
+
+def check_opd(opd: np.ndarray, pupil: np.ndarray) -> None:
+    """Refuse an OPD map that changes by more than half a wave per pupil sample.
+
+    Parameters
+    ----------
+    opd : ndarray, shape (..., N, N)
+        OPD in waves.
+    pupil : ndarray, shape (N, N)
+        Amplitude transmission; steps across cells without light do not count.
+
+    Raises
+    ------
+    SamplingError
+        Names the steepest step and the N that would do.
+    """
+    samples = pupil.shape[-1]
+    lit = pupil > 0
+    steps = [
+        np.abs(np.diff(opd, axis=axis))[..., pair].max(initial=0.0)
+        for axis, pair in ((-1, lit[:, 1:] & lit[:, :-1]), (-2, lit[1:] & lit[:-1]))
+    ]
+    steepest = max(steps)
+    if not steepest <= 0.5:
+        advice = (
+            f"at least N = {int(np.ceil(samples * steepest / 0.5))} would do"
+            if np.isfinite(steepest)
+            else "the OPD is not finite"
+        )
+        raise SamplingError(
+            f"the OPD changes by {steepest:.3g} waves per sample at N = {samples} "
+            f"pupil samples (at most 0.5): {advice}"
+        )

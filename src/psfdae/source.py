@@ -1,0 +1,80 @@
+"""What code a stage consists of, so that a workflow reruns it when that code changes."""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+from functools import cache
+from pathlib import Path
+
+PACKAGE = "psfdae"
+ROOT = Path(__file__).resolve().parent
+
+NOT_SCIENCE = (f"{PACKAGE}.configuration",)
+"""Left out: configuration reaches a rule through its params, value by value."""
+
+
+def source_hash(*modules: str) -> str:
+    """Hash of modules and of every module of the package that they import.
+
+    Imports inside functions count; comments, docstrings and formatting do not,
+    so that rewording never retrains a network.
+
+    Parameters
+    ----------
+    *modules : str
+        Dotted names, for example `psfdae.stages.train`.
+    """
+    reached: set[str] = set()
+    waiting = list(modules)
+    while waiting:
+        module = waiting.pop()
+        if module not in reached:
+            reached.add(module)
+            waiting += _imports(module)
+    digest = hashlib.sha256()
+    for module in sorted(reached):
+        digest.update(f"{module}\n{_code(module)}\n".encode())
+    return digest.hexdigest()[:16]
+
+
+def _path(module: str) -> Path | None:
+    parts = module.split(".")[1:]
+    for candidate in (
+        ROOT.joinpath(*parts).with_suffix(".py"),
+        ROOT.joinpath(*parts, "__init__.py"),
+    ):
+        if parts and candidate.is_file():
+            return candidate
+    return None
+
+
+@cache
+def _tree(module: str) -> ast.Module:
+    path = _path(module)
+    if path is None:
+        raise ValueError(f"no module {module!r} in {ROOT}")
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+@cache
+def _imports(module: str) -> tuple[str, ...]:
+    names: list[str] = []
+    for node in ast.walk(_tree(module)):
+        if isinstance(node, ast.Import):
+            names += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            names += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+    ours = (n for n in names if n.startswith(PACKAGE + ".") and not n.startswith(NOT_SCIENCE))
+    return tuple(n for n in ours if _path(n) is not None)
+
+
+@cache
+def _code(module: str) -> str:
+    tree = ast.parse(ast.unparse(_tree(module)))
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.FunctionDef | ast.ClassDef):
+            first = node.body[0] if node.body else None
+            if isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant):
+                node.body = node.body[1:] or [ast.Pass()]
+    return ast.dump(tree)

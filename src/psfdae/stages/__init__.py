@@ -1,0 +1,1 @@
+"""Stages: one step of the science each, from input files to output files."""

@@ -1,0 +1,47 @@
+"""Stage `baseline`: PCA and self-organising map of one dataset and split."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from psfdae.files import Column, read_product, write_product
+from psfdae.models.pca_som import PcaSom, fit_pca_som
+from psfdae.rng import stream
+from psfdae.stages.common import limit_threads, mixed_levels, noise_model, read_stars, split_stars
+
+
+def run(config: Any, stars: Path, split: str, out: Path) -> None:
+    """Fit the baseline on the noisy, mixed-λ training stars.
+
+    Parameters
+    ----------
+    config : stage config (seed, noise, parts, baseline)
+    stars : product "stars"
+    split : "random" or "held_out"
+    out : path of the HDF5 product "pca_som"
+    """
+    limit_threads(config.baseline.threads)
+    product = read_stars(stars)
+    train = split_stars(product, split, config).train
+    rng = stream(config.seed, "noise", "baseline")
+    levels = mixed_levels(config, train.size, rng)
+    noisy = noise_model(config).draw(product["realisation"][train], levels, rng)
+    settings = config.baseline.model_dump(exclude={"threads"})
+    model = fit_pca_som(
+        noisy, **settings, seed=int(stream(config.seed, "baseline", "map").integers(2**31))
+    )
+    columns = {
+        "mean": Column(model.mean, "1", "mean training image"),
+        "components": Column(model.components, "1", "eigenvectors, rows"),
+        "nodes": Column(model.nodes, "1", "map nodes in feature space"),
+        "psf": Column(model.psf, "1", "mean star image of each node's cluster"),
+    }
+    described = {**config.model_dump(), "split": split}
+    write_product(out, "pca_som", columns, described)
+
+
+def load(path: Path) -> PcaSom:
+    """The fitted baseline of a product "pca_som"."""
+    product = read_product(path, "pca_som", ("mean", "components", "nodes", "psf"))
+    return PcaSom(**product.arrays)

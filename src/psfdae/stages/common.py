@@ -1,0 +1,69 @@
+"""What stages share: scene, threads, stars, their parts and their noise."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from psfdae.files import Product, ProductError, read_product
+from psfdae.stars.noise import NoiseModel
+from psfdae.stars.splits import Split, held_out_split, random_split
+
+
+def scene_module(name: str) -> ModuleType:
+    """Module of a scene; the others are neither imported nor part of a rerun's reasons."""
+    return import_module(f"psfdae.stars.{name}_scene")
+
+
+def limit_threads(threads: int) -> None:
+    """Use this many threads for linear algebra, whatever the environment says.
+
+    Results depend on it in the last digits, so it comes from the config.
+    """
+    from threadpoolctl import threadpool_limits
+
+    threadpool_limits(threads)
+
+
+def read_stars(path: Path, *references: str) -> Product:
+    """Stars with their noise-free images, fields and the references asked for."""
+    names = ("realisation", *(r for r in references if r != "realisation"), "field_index", "grid")
+    return read_product(path, "stars", names)
+
+
+def split_stars(stars: Product, kind: str, config: Any) -> Split:
+    """Training, validation and test stars of a split.
+
+    Raises
+    ------
+    ProductError
+        If the file holds fewer stars than the config's parts need.
+    """
+    parts, count = config.parts, len(stars["field_index"])
+    if kind == "held_out":
+        return held_out_split(
+            stars["field_index"], stars["grid"], parts.validation_fraction, config.seed
+        )
+    if parts.train_stars + parts.test_stars > count:
+        raise ProductError(
+            f"{stars.path}: holds {count} stars, but parts.train_stars + parts.test_stars = "
+            f"{parts.train_stars + parts.test_stars}"
+        )
+    return random_split(
+        count, parts.train_stars, parts.test_stars, parts.validation_fraction, config.seed
+    )
+
+
+def noise_model(config: Any) -> NoiseModel:
+    """The noise of a stage's config."""
+    return NoiseModel(config.noise.kappa, config.noise.background_photons)
+
+
+def mixed_levels(config: Any, count: int, rng: np.random.Generator) -> np.ndarray:
+    """A random noise level λ of the band for each of `count` stars."""
+    levels = np.asarray(config.noise.levels)
+    return levels[rng.integers(levels.size, size=count)]

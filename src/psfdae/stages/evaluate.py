@@ -1,0 +1,111 @@
+"""Stage `evaluate`: every method on every test star at each noise level."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from psfdae.evaluation.metrics import all_metrics, clustered_mean
+from psfdae.files import atomic_path, write_text
+from psfdae.models.lmmse import LinearMmse
+from psfdae.rng import stream
+from psfdae.stages import baseline
+from psfdae.stages.common import limit_threads, noise_model, read_stars, split_stars
+from psfdae.stages.train import CONFIG, WEIGHTS
+
+Predictor = Callable[[np.ndarray, float], np.ndarray]
+
+
+def run(
+    config: Any,
+    dataset: str,
+    stars: Path,
+    pca_som: Path,
+    dae: Path,
+    split: str,
+    reference: str,
+    out: Path,
+    per_star: Path,
+) -> None:
+    """Measure noisy images, PCA+SOM, linear MMSE and DAE against the reference.
+
+    The test noise of a star depends on seed and λ only, so all methods and both
+    references see the same noisy images and their differences are paired.
+
+    Parameters
+    ----------
+    config : stage config (seed, noise, parts, evaluation)
+    dataset : name that goes into the table
+    stars, pca_som : products
+    dae : folder of a trained network
+    split, reference : as in `train`
+    out : CSV, columns dataset, split, reference, method, noise_level, metric,
+        value, stderr (clustered by field), n
+    per_star : Parquet with one row per method, λ and star
+    """
+    import pandas as pd
+
+    limit_threads(config.evaluation.threads)
+    product = read_stars(stars, reference)
+    parts = split_stars(product, split, config)
+    noise = noise_model(config)
+    truth = product[reference][parts.test]
+    linear = LinearMmse.fit(
+        product["realisation"][parts.train], product[reference][parts.train], noise
+    )
+    methods: dict[str, Predictor] = {
+        "noisy": lambda noisy, level: noisy,
+        "pca_som": _ignoring_level(baseline.load(pca_som).predict),
+        "lmmse": linear.predict,
+        "dae": _dae_predictor(dae, config),
+    }
+    field = product["field_index"][parts.test]
+    key = {"dataset": dataset, "split": split, "reference": reference}
+    summary, stars_table = [], []
+    for level in config.noise.levels:
+        rng = stream(config.seed, "noise", "test", f"{level:.6g}")
+        noisy = noise.draw(product["realisation"][parts.test], level, rng)
+        for method, predict in methods.items():
+            metrics = all_metrics(predict(noisy, level), truth, config.evaluation.data_range)
+            row = {**key, "method": method, "noise_level": level}
+            summary += _summarise(row, metrics, field)
+            stars_table.append(pd.DataFrame({**row, "star": parts.test, "field": field, **metrics}))
+    write_text(out, pd.DataFrame(summary).to_csv(index=False, float_format="%.8g"))
+    with atomic_path(per_star) as temporary:
+        pd.concat(stars_table, ignore_index=True).to_parquet(temporary, index=False)
+
+
+def _summarise(
+    row: dict[str, Any], metrics: dict[str, np.ndarray], field: np.ndarray
+) -> list[dict[str, Any]]:
+    rows = []
+    for metric, values in metrics.items():
+        mean, stderr = clustered_mean(values, field)
+        rows.append({**row, "metric": metric, "value": mean, "stderr": stderr, "n": values.size})
+    return rows
+
+
+def _ignoring_level(predict: Callable[[np.ndarray], np.ndarray]) -> Predictor:
+    return lambda noisy, level: predict(noisy)
+
+
+def _dae_predictor(folder: Path, config: Any) -> Predictor:
+    import torch
+    import yaml
+
+    from psfdae.configuration.schema import Dae
+    from psfdae.models.dae import image_scale, predict
+    from psfdae.models.training import load_dae
+
+    torch.set_num_threads(config.evaluation.threads)
+    settings = Dae.model_validate(yaml.safe_load((folder / CONFIG).read_text())["dae"])
+    model = load_dae(settings, folder / WEIGHTS)
+    batch = config.evaluation.batch
+
+    def apply(noisy: np.ndarray, level: float) -> np.ndarray:
+        return predict(model, noisy, image_scale(settings.scale, noisy.shape[-1]), batch)
+
+    return apply

@@ -1,0 +1,49 @@
+"""Stage `templates`: the static PSF at every field point of a scene."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from psfdae.files import Column, write_product
+from psfdae.stages.common import limit_threads, scene_module
+from psfdae.stars.fields import square_grid
+from psfdae.stars.framing import stamp_offset
+from psfdae.stars.scene import Propagation
+
+
+def run(config: Any, out: Path) -> None:
+    """Propagate the static wavefronts and write them framed, with a margin for jitter.
+
+    Parameters
+    ----------
+    config : stage config (telescope, grid, wavefront, framing, optics)
+    out : path of the HDF5 product "templates"
+
+    Raises
+    ------
+    SamplingError, FramingError
+        If the pupil grid or the search window is too small.
+    """
+    limit_threads(config.optics.threads)
+    framing = config.framing
+    source = scene_module(config.scene.name).template_wavefronts(config)
+    propagation = Propagation(source, config.telescope, config.optics, framing, framing.search_px)
+    peak = propagation.brightest()
+    side = framing.stamp_px + 2 * framing.jitter_px
+    psf = propagation.stamps(side, stamp_offset(peak, np.zeros_like(peak)))
+    inner = slice(framing.jitter_px, side - framing.jitter_px)
+    index, angle_deg = square_grid(config.grid.points, config.grid.spacing_deg)
+    columns = {
+        "psf": Column(
+            psf.astype(np.float32), "1", "pixel flux as a fraction of the light, jitter margin"
+        ),
+        "energy": Column(psf[:, inner, inner].sum(axis=(1, 2)), "1", "light inside the stamp"),
+        "peak": Column(peak, "pixel", "brightest pixel (row, column) from the chief ray"),
+        "grid": Column(index, "1", "grid index (ix, iy) of the field"),
+        "field": Column(np.deg2rad(angle_deg), "rad", "field angle (x, y)"),
+        "pupil_samples": Column(propagation.samples, "1", "pupil samples N"),
+    }
+    write_product(out, "templates", columns, config.model_dump())

@@ -1,0 +1,1 @@
+"""Star images: field points, random aberrations, framing, noise and splits."""

@@ -1,0 +1,179 @@
+"""What every scene delivers: framed noise-free images from wavefronts.
+
+A scene is a source of wavefronts; this module turns them into stamps. The
+wavefronts arrive as monomial coefficients or as OPD maps, both through the
+small protocol `WavefrontSource`, so that the search for the brightest pixel and
+the propagation are written once.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+
+from psfdae.configuration.schema import Framing, Optics, Telescope
+from psfdae.optics.propagation import StampPropagator
+from psfdae.optics.pupil import Pupil, annular_pupil
+from psfdae.optics.sampling import choose_samples, required_samples
+from psfdae.stars.framing import FramingError, brightest_pixel
+
+COARSE_NODES = 2
+"""Nodes per pixel of the search image, which only has to shortlist pixels."""
+
+SHORTLIST = 0.97
+"""Search-image pixels above this fraction of its maximum may be the brightest.
+
+Two nodes shift no brightest pixel of scene 1 by more than 0.2 % of the maximum, so
+one pixel on the shortlist settles a star; only the others are computed exactly.
+"""
+
+
+class WavefrontSource(Protocol):
+    """A batch of wavefronts that can be put on any pupil grid."""
+
+    def __len__(self) -> int: ...
+
+    def slopes(self) -> np.ndarray:
+        """[wavefront, axis, (min, max)] slope in waves per pupil radius, shape (B, 2, 2)."""
+
+    def opd(self, index: np.ndarray, pupil: Pupil, dtype: np.dtype) -> np.ndarray:
+        """OPD in waves of the wavefronts `index` on the grid of `pupil`, shape (b, M, M)."""
+
+
+class Propagation:
+    """Stamps and brightest pixels of the wavefronts of one source.
+
+    Each wavefront uses the smallest grid of the ladder that its slopes allow.
+
+    Parameters
+    ----------
+    source : WavefrontSource
+    telescope, optics, framing : config groups
+    search_px : int
+        The brightest pixel is searched within ± this distance of the chief ray.
+
+    Raises
+    ------
+    SamplingError
+        If the ladder ends below what a wavefront needs.
+    """
+
+    def __init__(
+        self,
+        source: WavefrontSource,
+        telescope: Telescope,
+        optics: Optics,
+        framing: Framing,
+        search_px: int,
+    ) -> None:
+        self.search_px = search_px
+        self.source = source
+        self.telescope = telescope
+        self.optics = optics
+        self.framing = framing
+        self.samples = self._choose_samples()
+
+    def _choose_samples(self) -> np.ndarray:
+        reach = 2 * self.search_px + 0.5 * self.framing.stamp_px + self.framing.jitter_px
+        edges = np.array([-reach, reach]) * self.telescope.pixel
+        needed = required_samples(self.source.slopes(), np.broadcast_to(edges, (2, 2)))
+        return choose_samples(needed, tuple(self.optics.pupil_samples))
+
+    def stamps(self, stamp_px: int, offset_px: np.ndarray) -> np.ndarray:
+        """Pixel-integrated stamps centred `offset_px` (row, column) from the chief ray.
+
+        Returns
+        -------
+        ndarray, shape (B, stamp_px, stamp_px), float64
+            Fraction of the light through the pupil on each pixel.
+        """
+        out = np.empty((len(self.source), stamp_px, stamp_px))
+        for pupil, stars in self._groups(np.arange(len(self.source))):
+            kernel = self._kernel(pupil, stamp_px, self.optics.nodes, self.optics.precision)
+            for batch in self._batches(stars):
+                opd = self.source.opd(batch, pupil, kernel.real_dtype)
+                out[batch] = kernel(opd, offset_px[batch])
+        return out
+
+    def brightest(self) -> np.ndarray:
+        """Brightest pixel (row, column) of every wavefront, in pixels from the chief ray.
+
+        A single-precision search image shortlists pixels; those are then
+        computed in complex128 with the full number of nodes, and the first in
+        (row, column) order within the tie tolerance is taken. Wavefronts whose
+        peak touches the window's border are searched again at twice the distance.
+
+        Raises
+        ------
+        FramingError
+            If the brightest pixel lies on the border of that window, too.
+        """
+        everyone = np.arange(len(self.source))
+        reach = self.search_px
+        peaks = self._search(everyone, reach)
+        border = np.flatnonzero(_touches(peaks, reach))
+        if border.size:
+            reach *= 2
+            peaks[border] = self._search(border, reach)
+            outside = border[_touches(peaks[border], reach)]
+            if outside.size:
+                raise FramingError(
+                    f"search_px = {self.search_px}: the brightest pixel of {outside.size} of "
+                    f"{len(peaks)} wavefronts lies {reach} px or more from the chief ray "
+                    f"(the first is wavefront {outside[0]}); a larger value would do"
+                )
+        return peaks
+
+    def _search(self, stars: np.ndarray, reach: int) -> np.ndarray:
+        peaks = np.empty((len(self.source), 2), dtype=np.int64)
+        for pupil, members in self._groups(stars):
+            search = self._kernel(pupil, 2 * reach, COARSE_NODES, "complex64")
+            exact = self._kernel(pupil, 1, self.optics.nodes, "complex128")
+            for batch in self._batches(members):
+                image = search(self.source.opd(batch, pupil, search.real_dtype))
+                peaks[batch] = self._refine(batch, pupil, image, exact) - reach
+        return peaks[stars]
+
+    def _refine(
+        self, batch: np.ndarray, pupil: Pupil, image: np.ndarray, exact: StampPropagator
+    ) -> np.ndarray:
+        """Brightest pixel of every search image; exact values where several compete."""
+        half = image.shape[-1] // 2
+        bright = image >= SHORTLIST * image.max(axis=(1, 2), keepdims=True)
+        contested = bright.sum(axis=(1, 2)) > 1
+        star, row, column = np.nonzero(bright & contested[:, None, None])
+        values = np.where(contested[:, None, None], 0.0, image)
+        # The centre of pixel j is at j + 1/2 pixels; a one-pixel stamp is centred there.
+        offsets = np.stack([row, column], axis=1) - half + 0.5
+        for start in range(0, star.size, self.optics.batch):
+            part = slice(start, start + self.optics.batch)
+            opd = self.source.opd(batch[star[part]], pupil, exact.real_dtype)
+            values[star[part], row[part], column[part]] = exact(opd, offsets[part])[:, 0, 0]
+        return np.array([brightest_pixel(image, self.framing.tie) for image in values])
+
+    def _groups(self, stars: np.ndarray) -> list[tuple[Pupil, np.ndarray]]:
+        """Pupil and members of every grid size that the wavefronts `stars` use."""
+        samples = self.samples[stars]
+        return [
+            (annular_pupil(int(n), self.telescope.obscuration), stars[samples == n])
+            for n in np.unique(samples)
+        ]
+
+    def _batches(self, stars: np.ndarray) -> list[np.ndarray]:
+        return np.array_split(stars, range(self.optics.batch, stars.size, self.optics.batch))
+
+    def _kernel(self, pupil: Pupil, stamp_px: int, nodes: int, precision: str) -> StampPropagator:
+        return StampPropagator(
+            pupil,
+            stamp_px,
+            self.telescope.pixel,
+            nodes,
+            precision,  # type: ignore[arg-type]
+            self.optics.backend,
+        )
+
+
+def _touches(peaks: np.ndarray, reach: int) -> np.ndarray:
+    """Which brightest pixels lie on the border of a window of ± `reach` pixels."""
+    return ((peaks == -reach) | (peaks == reach - 1)).any(axis=1)

@@ -1,0 +1,46 @@
+rule templates:
+    output:
+        f"{RESULTS}/data/{{scene}}/templates.h5",
+    log:
+        f"{RESULTS}/logs/templates/{{scene}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/templates/{{scene}}.tsv"
+    threads: lambda w: compose((f"scene={w.scene}", *OVERRIDES))["optics"]["threads"]
+    resources:
+        mem_mb=500,
+    params:
+        config=lambda w: stage_overrides("templates", f"scene={w.scene}"),
+        source=lambda w: source_hash(
+            "psfdae.stages.templates", f"psfdae.stars.{w.scene}_scene"
+        ),
+    message:
+        "Propagating the static PSFs of scene {wildcards.scene}"
+    shell:
+        "psfdae templates --out {output} {params.config:q} > {log} 2>&1"
+
+
+rule stars:
+    input:
+        templates=lambda w: templates_of(w.stars),
+    output:
+        f"{RESULTS}/data/{{scene}}/{{stars}}.h5",
+    log:
+        f"{RESULTS}/logs/stars/{{scene}}/{{stars}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/stars/{{scene}}/{{stars}}.tsv"
+    threads: lambda w: compose((f"scene={w.scene}", *OVERRIDES))["optics"]["threads"]
+    resources:
+        mem_mb=1000,
+    params:
+        config=lambda w: stage_overrides("stars", f"stars={w.stars}"),
+        source=lambda w: source_hash(
+            "psfdae.stages.stars", f"psfdae.stars.{w.scene}_scene"
+        ),
+    message:
+        "Simulating the noise-free stars {wildcards.stars}"
+    shell:
+        "psfdae stars --templates {input.templates} --out {output} {params.config:q}"
+        " > {log} 2>&1"
+
+
+ruleorder: templates > stars

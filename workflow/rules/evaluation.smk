@@ -1,0 +1,69 @@
+rule evaluate:
+    input:
+        stars=lambda w: stars_of(w.dataset),
+        pca_som=rules.baseline.output,
+        dae=rules.train.output.weights,
+        dae_config=rules.train.output.config,
+    output:
+        summary=f"{RESULTS}/evaluation/{{dataset}}/{{split}}-{{reference}}.csv",
+        per_star=f"{RESULTS}/evaluation/{{dataset}}/{{split}}-{{reference}}.parquet",
+    log:
+        f"{RESULTS}/logs/evaluation/{{dataset}}/{{split}}-{{reference}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/evaluation/{{dataset}}/{{split}}-{{reference}}.tsv"
+    threads: lambda w: dataset_config(w.dataset).evaluation.threads
+    resources:
+        mem_mb=1500,
+    params:
+        config=lambda w: stage_overrides("evaluate", f"dataset={w.dataset}"),
+        source=source_hash("psfdae.stages.evaluate"),
+        dae=subpath(input.dae, parent=True),
+    message:
+        "Evaluating {wildcards.dataset}, {wildcards.split}, {wildcards.reference}"
+    shell:
+        "psfdae evaluate --dataset {wildcards.dataset} --split {wildcards.split}"
+        " --reference {wildcards.reference} --stars {input.stars}"
+        " --pca-som {input.pca_som} --dae {params.dae} --per-star {output.per_star}"
+        " --out {output.summary} {params.config:q} > {log} 2>&1"
+
+
+rule paper_tables:
+    input:
+        lambda w: evaluations_of(w.dataset, ["random"]),
+    output:
+        csv=f"{RESULTS}/tables/{{dataset}}_{{metric}}.csv",
+        markdown=f"{RESULTS}/tables/{{dataset}}_{{metric}}.md",
+    log:
+        f"{RESULTS}/logs/tables/{{dataset}}_{{metric}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/tables/{{dataset}}_{{metric}}.tsv"
+    threads: 1
+    resources:
+        mem_mb=500,
+    params:
+        source=source_hash("psfdae.stages.tables"),
+    message:
+        "Writing the paper's {wildcards.metric} table of {wildcards.dataset}"
+    shell:
+        "psfdae paper-tables --dataset {wildcards.dataset} --metric {wildcards.metric}"
+        " --out {output.csv} {input} > {log} 2>&1"
+
+
+rule psf_metrics:
+    input:
+        [csv for dataset in default_datasets() for csv in evaluations_of(dataset)],
+    output:
+        f"{RESULTS}/tables/psf_metrics.csv",
+    log:
+        f"{RESULTS}/logs/tables/psf_metrics.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/tables/psf_metrics.tsv"
+    threads: 1
+    resources:
+        mem_mb=500,
+    params:
+        source=source_hash("psfdae.stages.tables"),
+    message:
+        "Collecting the metrics of all datasets"
+    shell:
+        "psfdae collect --out {output} {input} > {log} 2>&1"

@@ -1,0 +1,51 @@
+rule baseline:
+    input:
+        stars=lambda w: stars_of(w.dataset),
+    output:
+        f"{RESULTS}/pca_som/{{dataset}}/{{split}}.h5",
+    log:
+        f"{RESULTS}/logs/pca_som/{{dataset}}/{{split}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/pca_som/{{dataset}}/{{split}}.tsv"
+    threads: lambda w: dataset_config(w.dataset).baseline.threads
+    resources:
+        mem_mb=1000,
+    params:
+        config=lambda w: stage_overrides("baseline", f"dataset={w.dataset}"),
+        source=source_hash("psfdae.stages.baseline"),
+    message:
+        "Fitting PCA and SOM to {wildcards.dataset}, split {wildcards.split}"
+    shell:
+        "psfdae baseline --stars {input.stars} --split {wildcards.split} --out {output}"
+        " {params.config:q} > {log} 2>&1"
+
+
+rule train:
+    input:
+        stars=lambda w: stars_of(w.dataset),
+    output:
+        multiext(
+            f"{RESULTS}/dae/{{dataset}}/{{split}}-{{reference}}/",
+            weights="dae.safetensors",
+            config="config.yaml",
+            history="history.csv",
+        ),
+    log:
+        f"{RESULTS}/logs/dae/{{dataset}}/{{split}}-{{reference}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/dae/{{dataset}}/{{split}}-{{reference}}.tsv"
+    threads: lambda w: dataset_config(w.dataset).train.threads
+    resources:
+        mem_mb=1500,
+    params:
+        config=lambda w: stage_overrides("train", f"dataset={w.dataset}"),
+        source=source_hash("psfdae.stages.train"),
+        folder=subpath(output.weights, parent=True),
+        # Not an output: Snakemake would delete it with a failed job's outputs.
+        checkpoint=lambda w: f"{RESULTS}/checkpoints/{w.dataset}-{w.split}-{w.reference}.pt",
+    message:
+        "Training the DAE of {wildcards.dataset}, {wildcards.split}, {wildcards.reference}"
+    shell:
+        "psfdae train --stars {input.stars} --split {wildcards.split}"
+        " --reference {wildcards.reference} --checkpoint {params.checkpoint}"
+        " --out {params.folder} {params.config:q} > {log} 2>&1"
