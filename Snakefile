@@ -12,4 +12,14 @@ include: "workflow/rules/common.smk"
 include: "workflow/rules/data.smk"
 include: "workflow/rules/models.smk"
 include: "workflow/rules/evaluation.smk"
+
+
+rule all:
+    default_target: True
+    input:
+        rules.psf_metrics.output,
+        [file for dataset in default_datasets() for file in paper_tables_of(dataset)],
+    localrule: True
+
+
 include: "workflow/rules/targets.smk"

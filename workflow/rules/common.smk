@@ -10,21 +10,24 @@ from psfdae.source import source_hash
 validate(config, "../schemas/command_line.schema.yaml")
 
 PRESET = config["preset"]
-OVERRIDES = (f"preset={PRESET}", *shlex.split(config["set"]))
+OVERRIDES = (f"preset={PRESET}", *shlex.split(config["set"] or ""))
 RESULTS = config["results"] or ("results" if PRESET == "fast" else f"results/{PRESET}")
-ALL_DATASETS = sorted(
-    path.stem
-    for path in config_dir().glob("dataset/*.yaml")
-    if not path.stem.startswith("_")
-)
+
+
+def options(group):
+    """Options of a config group that can be chosen by name."""
+    return sorted(path.stem for path in config_dir().glob(f"{group}/[!_]*.yaml"))
+
+
+ALL_DATASETS = options("dataset")
 
 
 wildcard_constraints:
     dataset="|".join(ALL_DATASETS),
     split="random|held_out",
     reference="realisation|template",
-    scene="[a-z]+",
-    stars="[A-Za-z0-9_]+",
+    scene="|".join(options("scene")),
+    stars="|".join(options("stars")),
     metric="mse|ssim",
 
 

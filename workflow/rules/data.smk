@@ -41,6 +41,3 @@ rule stars:
     shell:
         "psfdae stars --templates {input.templates} --out {output} {params.config:q}"
         " > {log} 2>&1"
-
-
-ruleorder: templates > stars

@@ -6,6 +6,7 @@ science code receives SI units (`Telescope.pixel_scale` is in radians).
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Annotated, Literal
 
 import numpy as np
@@ -289,6 +290,7 @@ STAGE_KEYS: dict[str, tuple[str, ...]] = {
 """The groups that each stage reads; nothing else can influence its result."""
 
 
+@cache
 def stage_model(stage: str) -> type[Group]:
     """The config groups of one stage as a model of their own."""
     fields = {key: (Config.model_fields[key].annotation, ...) for key in STAGE_KEYS[stage]}

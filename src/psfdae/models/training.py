@@ -179,7 +179,10 @@ class Training:
         error = float(((estimate - self.data.references[stars]) ** 2).mean(dtype=np.float64))
         if error < self.best_mse:
             self.best_mse = error
-            self.best_state = {k: v.detach().clone() for k, v in self.model.state_dict().items()}
+            self.best_state = {
+                key: value.detach().clone(memory_format=torch.contiguous_format)
+                for key, value in self.model.state_dict().items()
+            }
         return error
 
     def state(self) -> dict[str, Any]:
@@ -233,7 +236,8 @@ def train_dae(
     ----------
     data, dae, train, seed : see `Training`
     checkpoint : Path
-        Where the state is kept while the training runs; removed at its end.
+        Where the state is kept while the training runs; the caller removes it once
+        the result is safe.
     fingerprint : str
         Identifies configuration and data; a checkpoint of another one is ignored.
     report : called with the history's row after each epoch
@@ -257,7 +261,6 @@ def train_dae(
         except DeadNetworkError as death:
             print(f"attempt {attempt}: {death}; starting from another seed", flush=True)
             continue
-        checkpoint.unlink(missing_ok=True)
         return TrainingResult(training.best_state, training.history, attempt)
     raise TrainingError(
         f"the network died in all {train.restarts + 1} attempts: lower train.lr = {train.lr}"

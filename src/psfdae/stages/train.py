@@ -80,6 +80,7 @@ def run(config: Any, stars: Path, split: str, reference: str, out: Path, checkpo
         save_file(result.state, temporary, metadata={"config": json.dumps(described)})
     write_text(out / HISTORY, _as_csv(result.history))
     write_text(out / CONFIG, _as_yaml({**described, "attempt": result.attempt}))
+    checkpoint.unlink(missing_ok=True)
 
 
 def _fingerprint(described: dict[str, Any], data: Any) -> str:

@@ -1,0 +1,40 @@
+"""Shared fixtures: small pupils, a tiny set of stars, the real configuration."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from psfdae.configuration.compose import load
+from psfdae.optics.pupil import annular_pupil
+from psfdae.stars.noise import NoiseModel
+
+
+@pytest.fixture(scope="session")
+def scene1():
+    """Configuration of dataset 3, as the workflow uses it."""
+    return load(["dataset=dataset3"])
+
+
+@pytest.fixture(scope="session")
+def pupil():
+    """Unobscured pupil with 128 samples across."""
+    return annular_pupil(128, 0.0)
+
+
+@pytest.fixture(scope="session")
+def gaussian_stars():
+    """300 flux-normalised 16 × 16 Gaussians of random width and position, float32."""
+    rng = np.random.default_rng(3)
+    grid = np.arange(16) - 8
+    centre = rng.uniform(-1, 1, size=(2, 300, 1, 1))
+    width = rng.uniform(1.0, 2.5, size=(300, 1, 1))
+    r2 = (grid[:, None] - centre[0]) ** 2 + (grid - centre[1]) ** 2
+    images = np.exp(-0.5 * r2 / width**2)
+    return (images / images.sum(axis=(1, 2), keepdims=True)).astype(np.float32)
+
+
+@pytest.fixture(scope="session")
+def noise():
+    """The paper's noise as calibrated."""
+    return NoiseModel(kappa=4.98, background=1e4)

@@ -1,0 +1,110 @@
+"""The real configuration tree: every dataset and preset composes, every mistake is named."""
+
+from __future__ import annotations
+
+import pytest
+
+from psfdae.configuration import compose
+from psfdae.configuration.compose import ConfigError, as_overrides, config_dir, load, load_stage
+from psfdae.configuration.schema import STAGE_KEYS
+
+DATASETS = sorted(p.stem for p in config_dir().glob("dataset/[!_]*.yaml"))
+PRESETS = sorted(p.stem for p in config_dir().glob("preset/*.yaml"))
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("dataset", DATASETS)
+def test_every_dataset_composes_in_every_preset(dataset, preset):
+    config = load([f"dataset={dataset}", f"preset={preset}"])
+    assert config.dataset.name == dataset
+
+
+@pytest.mark.parametrize("group", ["telescope", "noise", "stars"])
+def test_names_of_options_are_their_file_names(group):
+    for option in config_dir().glob(f"{group}/[!_]*.yaml"):
+        config = load([f"{group}={option.stem}"])
+        assert getattr(config, group).name == option.stem
+
+
+def test_noise_bands_and_aberrations_of_the_paper_s_table():
+    bands = {1: [3e-5, 5e-5, 7e-5, 9e-5], 2: [3e-4, 5e-4, 7e-4, 9e-4], 3: [1e-3, 2e-3, 3e-3, 5e-3]}
+    for number in range(1, 7):
+        config = load([f"dataset=dataset{number}"])
+        assert config.noise.levels == bands[(number - 1) % 3 + 1]
+        assert config.stars.aberration_fraction == (0.1 if number <= 3 else 0.5)
+        assert config.stars.count == 8405
+
+
+def test_paper_preset_has_the_paper_s_hyper_parameters():
+    config = load(["preset=paper"])
+    assert (config.train.epochs, config.train.batch, config.train.lr) == (100, 125, 5e-5)
+    assert config.dae.kernels == [9, 7, 5, 3, 1, 1, 3, 5, 7, 9]
+    assert config.baseline.epochs == 200
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("framing.stamp_px=6", r"framing\.stamp_px = 6: .*greater than or equal to 8"),
+        ("framing.stamp_px=15", r"framing\.stamp_px = 15: .*multiple of 2"),
+        ("telescope.wavelength_m=-5e-7", r"telescope\.wavelength_m = -5e-07: .*greater than"),
+        ("noise.levels=[0.001,0]", r"noise\.levels\.1 = 0: .*greater than 0"),
+        ("noise.levels=[-0.001]", r"noise\.levels\.0 = -0\.001: .*greater than 0"),
+        ("parts.train_stars=9000", r"= 10681: must be at most stars\.count = 8405"),
+        ("train.lr=fast", r"train\.lr = 'fast': .*valid number"),
+        ("seed=-1", r"seed = -1: .*greater than or equal to 0"),
+        ("telescope.obscuration=1.0", r"telescope\.obscuration = 1\.0: .*less than 1"),
+        ("dae.widths=[8,8]", r"dae: widths = \[8, 8\]: 10 kernels need 9 widths"),
+        ("dae.kernels=[4,4]", r"dae: kernels = \[4, 4\]: must be odd"),
+        ("optics.pupil_samples=[300,200]", r"pupil_samples = \[300, 200\]: must be ascending"),
+        ("baseline.components=300", r"baseline\.components = 300: must be at most .* 256"),
+        ("+train.momentum=0.9", r"train\.momentum: unknown key"),
+        ("+colour=blue", r"colour: unknown key"),
+        ("trian.lr=0.1", r"trian\.lr"),
+        ("dataset=dataset99", r"dataset/dataset99"),
+        ("noise.levels=[0.1", r"no viable alternative at input"),
+    ],
+)
+def test_every_mistake_is_named(override, message):
+    with pytest.raises(ConfigError, match=message):
+        load([override])
+
+
+@pytest.mark.parametrize("stage", sorted(STAGE_KEYS))
+def test_stage_overrides_reproduce_the_stage_s_configuration(stage):
+    """What the workflow puts on a command line means what the dataset meant."""
+    chosen = ["dataset=dataset5", "preset=smoke"]
+    tree = compose.stage_tree(stage, compose.compose(tuple(chosen)))
+    assert load_stage(stage, as_overrides(tree)) == load_stage(stage, chosen)
+
+
+def test_stage_refuses_an_unknown_group():
+    with pytest.raises(ConfigError, match="colour: unknown key"):
+        load_stage("train", ["+colour=blue"])
+
+
+def test_other_config_folder_must_have_a_root(tmp_path, monkeypatch):
+    monkeypatch.setenv("PSFDAE_CONFIG", str(tmp_path))
+    with pytest.raises(ConfigError, match=r"no config\.yaml"):
+        config_dir()
+
+
+def test_ninth_dataset_is_one_small_file(tmp_path, monkeypatch):
+    import shutil
+
+    folder = tmp_path / "config"
+    shutil.copytree(config_dir(), folder)
+    (folder / "dataset" / "dataset9.yaml").write_text(
+        "# @package _global_\n"
+        "defaults:\n  - dataset3\n  - _self_\n"
+        "seed: 7\n"
+        "dataset:\n  name: dataset9\n"
+        "noise:\n  name: bright\n  levels: [2.0e-3]\n"
+    )
+    monkeypatch.setenv("PSFDAE_CONFIG", str(folder))
+    compose.compose.cache_clear()
+    try:
+        config = load(["dataset=dataset9"])
+        assert (config.seed, config.noise.levels, config.stars.name) == (7, [2e-3], "seidel_10pct")
+    finally:
+        compose.compose.cache_clear()

@@ -1,0 +1,102 @@
+"""Metrics and tables."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+from skimage.metrics import mean_squared_error, structural_similarity
+
+from psfdae.evaluation.metrics import all_metrics, clustered_mean, mse, ssim
+from psfdae.evaluation.paper import as_markdown, paper_table, published
+
+
+@pytest.fixture(scope="module")
+def pair(gaussian_stars):
+    rng = np.random.default_rng(0)
+    return gaussian_stars + rng.normal(size=gaussian_stars.shape) * 0.01, gaussian_stars
+
+
+@pytest.mark.parametrize("data_range", [0.66, 1.0])
+def test_ssim_is_scikit_image_s(pair, data_range):
+    noisy, clean = (a[:20].astype(np.float64) for a in pair)
+    each = [
+        structural_similarity(x, y, data_range=data_range)
+        for x, y in zip(noisy, clean, strict=True)
+    ]
+    assert ssim(noisy, clean, data_range) == pytest.approx(each, abs=1e-12)
+
+
+def test_ssim_with_a_range_per_star_is_scikit_image_s(pair):
+    noisy, clean = (a[:20].astype(np.float64) for a in pair)
+    peak = clean.max(axis=(1, 2)) - clean.min(axis=(1, 2))
+    each = [
+        structural_similarity(x, y, data_range=r)
+        for x, y, r in zip(noisy, clean, peak, strict=True)
+    ]
+    assert all_metrics(noisy, clean, 0.66)["ssim_peak"] == pytest.approx(each, abs=1e-10)
+
+
+def test_mse_is_scikit_image_s(pair):
+    noisy, clean = (a[:20] for a in pair)
+    each = [
+        mean_squared_error(x.astype(float), y.astype(float))
+        for x, y in zip(noisy, clean, strict=True)
+    ]
+    assert mse(noisy, clean) == pytest.approx(each, rel=1e-6)
+
+
+def test_ssim_of_identical_stamps_is_one(gaussian_stars):
+    assert ssim(gaussian_stars, gaussian_stars, 0.66) == pytest.approx(np.ones(300))
+
+
+def test_ssim_refuses_what_it_cannot_measure(gaussian_stars):
+    with pytest.raises(ValueError, match="smaller than the SSIM window"):
+        ssim(gaussian_stars[:, :6, :6], gaussian_stars[:, :6, :6], 1.0)
+    with pytest.raises(ValueError, match="must be positive"):
+        ssim(gaussian_stars, gaussian_stars, 0.0)
+
+
+def test_clustered_error_equals_the_usual_one_for_single_star_clusters():
+    values = np.random.default_rng(0).normal(size=500)
+    mean, stderr = clustered_mean(values, np.arange(500))
+    assert mean == pytest.approx(values.mean())
+    assert stderr == pytest.approx(values.std(ddof=1) / np.sqrt(500), rel=1e-9)
+
+
+def test_clustered_error_counts_fields_where_stars_repeat():
+    """50 equal stars per field are 20 measurements, not 1000."""
+    fields = np.random.default_rng(1).normal(size=20)
+    _, stderr = clustered_mean(np.repeat(fields, 50), np.repeat(np.arange(20), 50))
+    assert stderr == pytest.approx(fields.std(ddof=1) / np.sqrt(20), rel=1e-9)
+
+
+def test_one_cluster_has_no_error():
+    assert np.isnan(clustered_mean(np.ones(5), np.zeros(5, dtype=int))[1])
+
+
+def test_published_tables_are_complete():
+    psf = published("psf")
+    assert len(psf) == 3 * 2 * 3 * 4
+    value = psf.set_index(["dataset", "metric", "method", "noise_level"]).value
+    assert value["dataset3", "ssim", "original_noise", 0.003] == 0.7326
+    assert value["dataset8", "mse", "dae", 0.005] == 1.0136e-6
+
+
+def test_paper_table_puts_ours_beside_the_paper_s():
+    rows = [
+        ("dataset3", "random", reference, method, level, "mse", 1e-5, 1e-7, 10)
+        for reference in ("realisation", "template")
+        for method in ("noisy", "pca_som", "lmmse", "dae")
+        for level in (1e-3, 2e-3, 3e-3, 5e-3)
+    ]
+    columns = [*("dataset", "split", "reference", "method"), *("noise_level", "metric")]
+    columns += ["value", "stderr", "n"]
+    table = paper_table(pd.DataFrame(rows, columns=columns), "dataset3", "mse")
+    assert list(table.columns[3:]) == ["0.001", "0.002", "0.003", "0.005"]
+    assert (
+        table.groupby(["source", "reference"]).method.agg(list).tolist()
+        == [["original-noise", "PCA", "DAE"]] * 3
+    )
+    assert "| paper" in as_markdown(table, "dataset3", "mse")
+    assert "2.7568e-05" in as_markdown(table, "dataset3", "mse")

@@ -1,0 +1,209 @@
+"""Baseline, linear estimator, network and training."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from psfdae.configuration.schema import Dae as DaeConfig
+from psfdae.configuration.schema import Train
+from psfdae.evaluation.metrics import mse
+from psfdae.models.dae import build_dae, image_scale, predict
+from psfdae.models.lmmse import LinearMmse
+from psfdae.models.pca_som import fit_pca_som
+from psfdae.models.training import TrainingError, TrainingSet, train_dae
+from psfdae.rng import stream
+
+SOM = {"rows": 4, "columns": 4, "epochs": 3, "sigma": 1.0, "learning_rate": 0.5, "seed": 1}
+DAE = DaeConfig(kernels=[5, 3, 1, 3, 5], widths=[4] * 4, init="he", scale="mean")
+TRAIN = Train(
+    epochs=3,
+    batch=50,
+    lr=3e-3,
+    schedule="onecycle",
+    grad_clip=1.0,
+    threads=1,
+    validate_every=1,
+    validation_draws=1,
+    dead_check_steps=2,
+    restarts=1,
+    checkpoint_seconds=0.0,
+)
+
+
+@pytest.fixture
+def data(gaussian_stars, noise):
+    return TrainingSet(
+        images=gaussian_stars,
+        references=gaussian_stars,
+        fit=np.arange(250),
+        validation=np.arange(250, 300),
+        levels=np.array([1e-3, 5e-3]),
+        noise=noise,
+    )
+
+
+def train(data, folder, train_config=TRAIN, report=lambda row: None, dae=DAE, tick=lambda: None):
+    path = folder / "checkpoint.pt"
+    result = train_dae(data, dae, train_config, 3, path, "config", report, tick)
+    path.unlink(missing_ok=True)
+    return result
+
+
+def same(first, second):
+    return all(torch.equal(first[key], second[key]) for key in first)
+
+
+def test_linear_mmse_is_the_posterior_mean_of_gaussian_data(noise):
+    """For Gaussian images of known covariance its error is tr(C − C(C + N)⁻¹C)/P."""
+    rng = np.random.default_rng(0)
+    mixing = rng.normal(size=(64, 5)) * 0.01
+    images = (rng.normal(size=(20000, 5)) @ mixing.T + 1 / 64).reshape(-1, 8, 8)
+    fitted = LinearMmse.fit(images[:10000], images[:10000], noise)
+    level = 2e-3
+    sigma2 = (noise.kappa * level) ** 2 + (1 / 64) / float(noise.flux(level))
+    noisy = images[10000:] + rng.normal(size=(10000, 8, 8)) * np.sqrt(sigma2)
+    cov = mixing @ mixing.T
+    expected = np.trace(cov - cov @ np.linalg.solve(cov + sigma2 * np.eye(64), cov)) / 64
+    assert mse(fitted.predict(noisy, level), images[10000:]).mean() == pytest.approx(
+        expected, rel=0.05
+    )
+
+
+def test_linear_mmse_returns_the_mean_when_the_noise_is_overwhelming(gaussian_stars, noise):
+    fitted = LinearMmse.fit(gaussian_stars, gaussian_stars, noise)
+    estimate = fitted.predict(gaussian_stars[:5], 1e3)
+    assert estimate == pytest.approx(
+        np.broadcast_to(gaussian_stars.mean(axis=0), (5, 16, 16)), abs=1e-6
+    )
+
+
+def test_baseline_recovers_separate_classes():
+    rng = np.random.default_rng(0)
+    classes = rng.random((3, 8, 8))
+    label = np.arange(300) % 3
+    images = classes[label] + 0.01 * rng.normal(size=(300, 8, 8))
+    fitted = fit_pca_som(images, components=4, **SOM)
+    assert mse(fitted.predict(images), classes[label]).max() < 1e-4
+
+
+def test_baseline_leaves_out_empty_nodes(gaussian_stars):
+    few = gaussian_stars[:12]
+    fitted = fit_pca_som(few, components=4, **SOM)
+    assert len(fitted.psf) <= 12
+    assert np.isfinite(fitted.predict(gaussian_stars)).all()
+
+
+def test_baseline_is_repeatable(gaussian_stars):
+    first, second = (fit_pca_som(gaussian_stars, components=6, **SOM) for _ in range(2))
+    assert (first.psf == second.psf).all()
+
+
+def test_baseline_refuses_more_components_than_stars(gaussian_stars):
+    with pytest.raises(ValueError, match=r"components = 30: must be at most 20"):
+        fit_pca_som(gaussian_stars[:20], components=30, **SOM)
+
+
+def test_dae_keeps_the_size_and_is_never_negative(gaussian_stars):
+    kernels = [9, 7, 5, 3, 1, 1, 3, 5, 7, 9]
+    model = build_dae(kernels, [4] * 9, "he", torch.Generator().manual_seed(0))
+    out = predict(model, gaussian_stars[:7], image_scale("mean", 16), batch=3)
+    assert out.shape == (7, 16, 16)
+    assert (out >= 0).all()
+    sizes = [layer.kernel_size[0] for layer in model.layers]
+    assert sizes == kernels
+
+
+def test_he_initialisation_keeps_the_variance(gaussian_stars):
+    model = build_dae([9, 9], [64], "he", torch.Generator().manual_seed(0))
+    first = model.layers[0].weight
+    assert first.std().item() == pytest.approx(np.sqrt(2 / 81), rel=0.05)
+    assert not model.layers[0].bias.any()
+
+
+def test_training_learns_and_repeats(data, tmp_path):
+    longer = TRAIN.model_copy(update={"epochs": 12})
+    first = train(data, tmp_path, longer)
+    second = train(data, tmp_path, longer)
+    assert same(first.state, second.state)
+    errors = [row["validation_mse"] for row in first.history]
+    assert errors[-1] < 0.5 * errors[0]
+
+
+def test_interrupted_training_continues_as_if_nothing_had_happened(data, tmp_path):
+    whole = train(data, tmp_path)
+
+    def interrupt(row):
+        # The checkpoint of epoch 1 exists when epoch 2 ends; its own does not.
+        if row["epoch"] == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(data, tmp_path, report=interrupt)
+    assert (tmp_path / "checkpoint.pt").exists()
+    seen = []
+    resumed = train(data, tmp_path, report=lambda row: seen.append(row["epoch"]))
+    assert seen == [2, 3]
+    assert same(whole.state, resumed.state)
+
+
+@pytest.mark.parametrize("damage", ["foreign", "garbage"])
+def test_unusable_checkpoint_is_ignored(data, tmp_path, damage):
+    path = tmp_path / "checkpoint.pt"
+    if damage == "foreign":
+        torch.save({"fingerprint": "another"}, path)
+    else:
+        path.write_bytes(b"not a checkpoint")
+    epochs = []
+    train(data, tmp_path, report=lambda row: epochs.append(row["epoch"]))
+    assert epochs == [1, 2, 3]
+
+
+def test_exploding_loss_stops_with_advice(data, tmp_path):
+    wild = TRAIN.model_copy(update={"lr": 1.0, "grad_clip": 0.0, "schedule": "constant"})
+    bright = replace(data, references=data.references * np.float32(1e30))
+    with pytest.raises(TrainingError, match=r"the loss is .* lower train\.lr = 1\.0"):
+        train(bright, tmp_path, wild)
+
+
+def test_dead_network_restarts_and_then_gives_up(data, tmp_path, monkeypatch, capsys):
+    import psfdae.models.training as module
+
+    def dead(*args):
+        model = build_dae(*args)
+        with torch.no_grad():
+            model.layers[-1].bias.fill_(-1e6)
+        return model
+
+    monkeypatch.setattr(module, "build_dae", dead)
+    with pytest.raises(TrainingError, match="died in all 2 attempts"):
+        train(data, tmp_path)
+    assert "starting from another seed" in capsys.readouterr().out
+
+
+def test_restart_uses_other_weights(data, tmp_path, monkeypatch):
+    import psfdae.models.training as module
+
+    attempts = []
+
+    def dead_once(*args):
+        model = build_dae(*args)
+        attempts.append(model.layers[0].weight.detach().clone())
+        if len(attempts) == 1:
+            with torch.no_grad():
+                model.layers[-1].bias.fill_(-1e6)
+        return model
+
+    monkeypatch.setattr(module, "build_dae", dead_once)
+    assert train(data, tmp_path).attempt == 1
+    assert not torch.equal(*attempts)
+
+
+def test_fresh_noise_every_epoch(data):
+    stars = np.arange(10)
+    first = data.draw(stars, stream(1, "dae", "epoch", 0, 0))
+    second = data.draw(stars, stream(1, "dae", "epoch", 0, 1))
+    assert (first != second).any(axis=(1, 2)).all()

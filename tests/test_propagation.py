@@ -1,0 +1,200 @@
+"""The propagation kernel against physics and against independent codes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.special import j0, j1
+
+from psfdae.optics.propagation import StampPropagator, pixel_in_lambda_over_d
+from psfdae.optics.pupil import Pupil, annular_pupil, pupil_axis
+from psfdae.optics.seidel import monomial_coefficients, monomial_images
+
+ARCSEC = np.pi / 180 / 3600
+COMATIC = monomial_coefficients(np.array([0.5, 4.0, 4.196, 1.813, -0.113]), np.array([0.6, 0.4]))
+
+
+def opd_of(coefficients, pupil):
+    images = monomial_images(pupil.axis[None, :], pupil.axis[:, None])
+    return np.tensordot(np.atleast_2d(coefficients), images, axes=1)
+
+
+def flat(pupil):
+    return np.zeros((1, pupil.axis.size, pupil.axis.size))
+
+
+def test_pixel_scale_in_diffraction_units():
+    assert pixel_in_lambda_over_d(0.1 * ARCSEC, 550e-9, 1.0) == pytest.approx(0.88148, rel=1e-5)
+
+
+@pytest.mark.parametrize("obscuration", [0.0, 0.3])
+def test_airy_pattern_along_a_radius(obscuration):
+    pupil = annular_pupil(256, obscuration)
+    kernel = StampPropagator(pupil, 161, 0.05, nodes=1)
+    row = kernel(flat(pupil))[0, 80, 80:]
+    v = np.pi * 0.05 * np.arange(1, 81)
+    e = obscuration
+    amplitude = (2 * j1(v) / v - e**2 * 2 * j1(e * v) / (e * v if e else 1)) / (1 - e**2)
+    assert row[1:] / row[0] == pytest.approx(amplitude**2, abs=1e-6)
+
+
+def test_airy_encircled_energy(pupil):
+    side, pixel = 64, 0.125
+    kernel = StampPropagator(pupil, side, pixel, nodes=3)
+    image = kernel(flat(pupil))[0]
+    centre = (np.arange(side) - (side - 1) / 2) * pixel
+    radius = np.hypot(centre[:, None], centre)
+    for inside in (1.22, 2.233):
+        expected = 1 - j0(np.pi * inside) ** 2 - j1(np.pi * inside) ** 2
+        assert image[radius < inside].sum() == pytest.approx(expected, abs=6e-3)
+
+
+@pytest.mark.parametrize("backend", ["numpy", "torch"])
+def test_parseval_light_is_conserved(backend):
+    pupil = annular_pupil(64, 0.3)
+    period = 2 / pupil.spacing
+    kernel = StampPropagator(pupil, 64, period / 64, nodes=8, backend=backend)
+    total = kernel(opd_of(0.3 * COMATIC, pupil)).sum()
+    assert total == pytest.approx(1.0, abs=1e-10)
+
+
+@pytest.mark.parametrize("tilt", [0.8, -1.7])
+def test_tilt_moves_the_image_along_its_own_sign(tilt):
+    pupil = annular_pupil(64, 0.2)
+    opd = tilt * np.broadcast_to(pupil.axis[None, :], (1, 66, 66))
+    kernel = StampPropagator(pupil, 65, 0.2, nodes=1)
+    image = kernel(opd)[0]
+    row, column = np.unravel_index(image.argmax(), image.shape)
+    assert row == 32
+    assert (column - 32) * 0.2 == pytest.approx(2 * tilt, abs=0.11)
+
+
+def test_offset_looks_at_that_place(pupil):
+    opd = opd_of(0.2 * COMATIC, pupil)
+    wide = StampPropagator(pupil, 32, 0.7, nodes=3)(opd)[0]
+    moved = StampPropagator(pupil, 8, 0.7, nodes=3)(opd, np.array([[5, -3]]))[0]
+    assert moved == pytest.approx(wide[12 + 5 : 20 + 5, 12 - 3 : 20 - 3], abs=1e-12)
+
+
+def test_backends_and_precisions_agree(pupil):
+    opd = opd_of(np.stack([0.2 * COMATIC, 0.4 * COMATIC]), pupil)
+    offset = np.array([[3, -2], [0, 7]])
+    exact = StampPropagator(pupil, 16, 0.88, nodes=3)(opd, offset)
+    peak = exact.max(axis=(1, 2), keepdims=True)
+    for backend in ("numpy", "torch"):
+        for precision, tolerance in (("complex128", 1e-12), ("complex64", 2e-5)):
+            kernel = StampPropagator(pupil, 16, 0.88, 3, precision, backend)
+            assert np.abs((kernel(opd, offset) - exact) / peak).max() < tolerance
+
+
+def autocorrelation_stamp(pupil, opd, stamp_px, pixel):
+    """Pixel-integrated stamp by the optical transfer function: exact, and another route.
+
+    The intensity is a trigonometric polynomial whose coefficients are the pupil's
+    autocorrelation; integrating over a pixel multiplies them by sinc functions.
+    """
+    n = pupil.axis.size
+    field = pupil.amplitude * np.exp(2j * np.pi * opd)
+    spectrum = np.fft.fft2(field, (2 * n, 2 * n))
+    lags = np.fft.fftfreq(2 * n, 1 / (2 * n)) * pupil.spacing / 2
+    transfer = np.fft.ifft2(np.abs(spectrum) ** 2)
+    window = np.sinc(lags * pixel)
+    centre = (np.arange(stamp_px) - (stamp_px - 1) / 2) * pixel
+    # Symmetric autocorrelation: the sign of the lag is that of the exponent.
+    phase = np.exp(-2j * np.pi * np.outer(centre, lags)) * window
+    image = (phase @ transfer @ phase.T).real
+    return image * (pixel * pupil.spacing / 2) ** 2 / (pupil.amplitude**2).sum()
+
+
+def test_against_the_transfer_function_method(pupil):
+    opd = opd_of(0.4 * COMATIC, pupil)[0]
+    ours = StampPropagator(pupil, 16, 0.88, nodes=8)(opd[None])[0]
+    exact = autocorrelation_stamp(pupil, opd, 16, 0.88)
+    assert np.abs(ours - exact).max() / exact.max() < 1e-12
+
+
+def test_scene_settings_stay_within_the_error_budget(scene1):
+    """1 % of the smallest noise variance that a stamp of scene 1 will carry."""
+    from psfdae.stars.fields import perturb_seidel
+    from psfdae.stars.scene import Propagation
+    from psfdae.stars.seidel_scene import SeidelWavefronts, relative_field
+
+    budget = 0.01 * (scene1.noise.kappa * 3e-5) ** 2
+    _, field = relative_field(scene1.grid)
+    rng = np.random.default_rng(7)
+    for fraction in (0.1, 0.5):
+        seidel = perturb_seidel(scene1.wavefront.coefficients, fraction, 121, rng)
+        source = SeidelWavefronts(seidel, field)
+        wavefronts = Propagation(source, scene1.telescope, scene1.optics, scene1.framing, 64)
+        peak = wavefronts.brightest()
+        stamps = wavefronts.stamps(16, peak)
+        fine = scene1.optics.model_copy(
+            update={"pupil_samples": [512], "precision": "complex128", "nodes": 5}
+        )
+        truth = Propagation(source, scene1.telescope, fine, scene1.framing, 64).stamps(16, peak)
+        stamps, truth = (a / a.sum(axis=(1, 2), keepdims=True) for a in (stamps, truth))
+        error = ((stamps - truth) ** 2).mean(axis=(1, 2))
+        assert error.max() < budget
+
+
+def poppy_wavefront(samples, opd_waves, wavelength=550e-9):
+    """A poppy pupil element with an amplitude and an OPD array, 1 m across."""
+    import astropy.units as u
+    import poppy
+
+    grey = annular_pupil(samples, 0.3, sharpen=False)
+    amplitude = grey.amplitude[1:-1, 1:-1]
+    element = poppy.ArrayOpticalElement(
+        transmission=amplitude,
+        opd=opd_waves * wavelength,
+        pixelscale=(1.0 / samples) * u.m / u.pixel,
+        name="pupil",
+    )
+    return element, Pupil(amplitude, pupil_axis(samples))
+
+
+def test_against_poppy_fraunhofer():
+    """poppy counts phase the other way, so both of its images are rotated by 180°."""
+    import astropy.units as u
+    import poppy
+
+    samples, pixel_arcsec, stamp = 128, 0.05, 33
+    axis = pupil_axis(samples)
+    opd = np.tensordot(0.2 * COMATIC, monomial_images(axis[None, :], axis[:, None]), axes=1)
+    element, pupil = poppy_wavefront(samples, opd)
+    system = poppy.OpticalSystem(npix=samples, oversample=1, pupil_diameter=1.0 * u.m)
+    system.add_pupil(element)
+    system.add_detector(pixelscale=pixel_arcsec, fov_pixels=stamp)
+    theirs = system.calc_psf(wavelength=550e-9)[0].data
+    pixel = pixel_in_lambda_over_d(pixel_arcsec * ARCSEC, 550e-9, 1.0)
+    ours = StampPropagator(pupil, stamp, pixel, nodes=1)(opd[None])[0]
+    rotated = theirs[::-1, ::-1]
+    assert np.abs(ours / ours.max() - rotated / rotated.max()).max() < 1e-6
+
+
+def test_against_poppy_fresnel():
+    """Full Fresnel propagation to the focus of a lens buys nothing in focus."""
+    import astropy.units as u
+    import poppy
+
+    samples, ratio, stamp = 128, 0.25, 33
+    axis = pupil_axis(samples)
+    opd = np.tensordot(0.2 * COMATIC, monomial_images(axis[None, :], axis[:, None]), axes=1)
+    element, pupil = poppy_wavefront(samples, opd)
+    focal = 10.0 * u.m
+    wave = poppy.FresnelWavefront(0.5 * u.m, wavelength=550e-9, npix=samples, oversample=4)
+    wave *= element
+    wave *= poppy.QuadraticLens(focal)
+    wave.propagate_fresnel(focal)
+    theirs = wave.intensity
+    centre = theirs.shape[0] // 2
+    half = stamp // 2
+    theirs = theirs[centre - half : centre + half + 1, centre - half : centre + half + 1]
+    ours = StampPropagator(pupil, stamp, ratio, nodes=1)(opd[None])[0]
+    rotated = theirs[::-1, ::-1]
+    assert np.abs(ours / ours.max() - rotated / rotated.max()).max() < 1e-6
+
+
+def test_unknown_backend_is_named(pupil):
+    with pytest.raises(ValueError, match=r"optics\.backend = 'jax'"):
+        StampPropagator(pupil, 16, 0.88, 3, backend="jax")

@@ -1,0 +1,155 @@
+"""Pupil, Seidel wavefronts, Zernike polynomials and the sampling guard."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from psfdae.optics.pupil import annular_pupil, disc_coverage, pupil_axis
+from psfdae.optics.sampling import SamplingError, check_opd, choose_samples, required_samples
+from psfdae.optics.seidel import (
+    gradient_ranges,
+    monomial_coefficients,
+    monomial_gradients,
+    monomial_images,
+)
+from psfdae.optics.zernike import noll_to_nm, zernike, zernike_basis
+
+STATIC = np.array([0.5, 4.0, 4.196, 1.813, -0.113])
+
+
+@pytest.mark.parametrize("sharpen", [False, True])
+def test_annulus_has_its_area(sharpen):
+    pupil = annular_pupil(96, 0.3, sharpen)
+    area = pupil.amplitude.sum() * pupil.spacing**2
+    assert area == pytest.approx(np.pi * (1 - 0.09), rel=3e-5)
+
+
+def test_sharpening_takes_the_cell_s_second_moment_out():
+    """∫ x² over the unit disc is π/4; a plain grey edge adds area/12 cell²."""
+    plain, sharp = (
+        (p.amplitude * p.axis[None, :] ** 2).sum() * p.spacing**2 - np.pi / 4
+        for p in (annular_pupil(48, 0.0, sharpen=False), annular_pupil(48, 0.0, sharpen=True))
+    )
+    added = np.pi / 12 / 24**2
+    assert plain == pytest.approx(added, rel=0.15)
+    assert sharp == pytest.approx(0, abs=0.15 * added)
+
+
+def test_coverage_of_a_cell_is_a_fraction():
+    coverage = disc_coverage(40, 0.7)
+    assert coverage.min() == 0
+    assert coverage.max() == 1
+    assert ((coverage > 0) & (coverage < 1)).any()
+
+
+@pytest.mark.parametrize("obscuration", [-0.1, 1.0])
+def test_impossible_obscuration(obscuration):
+    with pytest.raises(ValueError, match="obscuration"):
+        annular_pupil(32, obscuration)
+
+
+def test_seidel_wavefront_equals_its_formula():
+    rng = np.random.default_rng(0)
+    hx, hy = 0.5, -0.7
+    rho, angle = rng.uniform(0, 1, 50), rng.uniform(0, 2 * np.pi, 50)
+    field = np.hypot(hx, hy)
+    phi = angle - np.arctan2(hy, hx)
+    w040, w131, w222, w220, w311 = STATIC
+    expected = (
+        w040 * rho**4
+        + w131 * field * rho**3 * np.cos(phi)
+        + w222 * field**2 * rho**2 * np.cos(phi) ** 2
+        + w220 * field**2 * rho**2
+        + w311 * field**3 * rho * np.cos(phi)
+    )
+    images = monomial_images(rho * np.cos(angle), rho * np.sin(angle))
+    ours = monomial_coefficients(STATIC, np.array([hx, hy])) @ images
+    assert ours == pytest.approx(expected, abs=1e-12)
+
+
+def test_on_axis_only_spherical_aberration_is_left():
+    on_axis = monomial_coefficients(STATIC, np.zeros(2))
+    assert on_axis == pytest.approx([0.5, 0, 0, 0, 0, 0, 0, 0])
+
+
+def test_gradients_are_derivatives():
+    rng = np.random.default_rng(1)
+    x, y = rng.uniform(-0.7, 0.7, (2, 30))
+    step = 1e-6
+    d_dx, d_dy = monomial_gradients(x, y)
+    numeric_x = (monomial_images(x + step, y) - monomial_images(x - step, y)) / (2 * step)
+    numeric_y = (monomial_images(x, y + step) - monomial_images(x, y - step)) / (2 * step)
+    assert d_dx == pytest.approx(numeric_x, abs=1e-8)
+    assert d_dy == pytest.approx(numeric_y, abs=1e-8)
+
+
+def test_templates_need_131_samples():
+    """The steepest template of scene 1, in the corner of the field."""
+    corner = monomial_coefficients(STATIC, np.array([[1.0, 1.0]]))
+    small = np.array([[-1.0, 1.0], [-1.0, 1.0]])
+    assert required_samples(gradient_ranges(corner), small)[0] == pytest.approx(131, abs=1)
+
+
+def test_replicas_must_stay_off_a_distant_stamp():
+    flat = np.zeros((1, 2, 2))
+    far = np.array([[100.0, 116.0], [-8.0, 8.0]])
+    assert required_samples(flat, far)[0] == 116
+
+
+def test_ladder_takes_the_first_rung_that_suffices():
+    assert choose_samples(np.array([100, 130, 131]), (100, 130, 200)).tolist() == [100, 130, 200]
+
+
+def test_too_coarse_ladder_names_the_grid_that_would_do():
+    with pytest.raises(SamplingError, match="needs N ≥ 217"):
+        choose_samples(np.array([100, 217]), (96, 128))
+
+
+@pytest.mark.parametrize(("slope", "fails"), [(15.9, False), (16.1, True)])
+def test_opd_guard_is_half_a_wave_per_sample(slope, fails):
+    axis = pupil_axis(64)
+    opd = slope * np.broadcast_to(axis, (64, 64))
+    lit = np.ones((64, 64))
+    if fails:
+        with pytest.raises(SamplingError, match="at least N = 65"):
+            check_opd(opd, lit)
+    else:
+        check_opd(opd, lit)
+
+
+def test_opd_guard_refuses_a_nan():
+    opd = np.zeros((8, 8))
+    opd[4, 4] = np.nan
+    with pytest.raises(SamplingError, match="not finite"):
+        check_opd(opd, np.ones((8, 8)))
+
+
+def test_noll_order_starts_as_published():
+    published = [(0, 0), (1, 1), (1, -1), (2, 0), (2, -2), (2, 2), (3, -1), (3, 1), (3, -3)]
+    published += [(3, 3), (4, 0)]
+    assert [noll_to_nm(j) for j in range(1, 12)] == published
+
+
+def test_zernikes_against_poppy():
+    import poppy.zernike
+
+    rng = np.random.default_rng(2)
+    r, theta = np.sqrt(rng.uniform(0, 1, 200)), rng.uniform(0, 2 * np.pi, 200)
+    x, y = r * np.cos(theta), r * np.sin(theta)
+    for j in range(1, 37):
+        theirs = np.asarray(poppy.zernike.zernike1(j, rho=r, theta=theta), float)
+        assert zernike(j, x, y) == pytest.approx(theirs, abs=1e-10)
+
+
+def test_zernikes_are_orthonormal():
+    axis = pupil_axis(400)
+    weight = disc_coverage(400, 1.0)
+    basis = zernike_basis(15, axis[None, :], axis[:, None])
+    gram = np.einsum("iyx,jyx,yx->ij", basis, basis, weight) / weight.sum()
+    assert gram == pytest.approx(np.eye(15), abs=2e-3)
+
+
+def test_noll_index_zero_is_refused():
+    with pytest.raises(ValueError, match="Noll index 0"):
+        noll_to_nm(0)

@@ -1,0 +1,180 @@
+"""Fields, framing, noise and splits."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from psfdae.rng import stream
+from psfdae.stars.fields import assign_fields, draw_jitter, perturb_seidel, square_grid
+from psfdae.stars.framing import (
+    FramingError,
+    brightest_pixel,
+    crop_jittered,
+    normalise_flux,
+    stamp_offset,
+)
+from psfdae.stars.scene import Propagation
+from psfdae.stars.seidel_scene import SeidelWavefronts, relative_field, template_wavefronts
+from psfdae.stars.splits import held_out_fields, held_out_split, random_split
+
+
+@pytest.fixture(scope="module")
+def templates(scene1):
+    """Propagation of the 121 static wavefronts and their brightest pixels."""
+    framing = scene1.framing
+    propagation = Propagation(
+        template_wavefronts(scene1), scene1.telescope, scene1.optics, framing, framing.search_px
+    )
+    return propagation, propagation.brightest()
+
+
+def test_streams_are_independent_and_repeatable():
+    first = stream(1, "noise", "test").random(4)
+    assert (stream(1, "noise", "test").random(4) == first).all()
+    assert (stream(1, "noise", "train").random(4) != first).all()
+    assert (stream(2, "noise", "test").random(4) != first).all()
+
+
+def test_grid_of_scene_1():
+    index, angle = square_grid(11, 1.1)
+    assert index[:12].tolist() == [[i, 0] for i in range(11)] + [[0, 1]]
+    assert angle.min() == pytest.approx(-5.5)
+    assert angle[60] == pytest.approx([0, 0])
+
+
+def test_every_field_gets_69_or_70_stars():
+    counts = np.bincount(assign_fields(8405, 121, stream(1, "field")))
+    assert sorted(set(counts)) == [69, 70]
+    assert counts.size == 121
+
+
+def test_jitter_is_uniform_over_nine_positions():
+    jitter = draw_jitter(9000, 1, stream(1, "jitter"))
+    _, counts = np.unique(jitter, axis=0, return_counts=True)
+    assert counts.size == 9
+    assert counts == pytest.approx(np.full(9, 1000), abs=5 * np.sqrt(1000))
+
+
+def test_random_aberrations_have_their_relative_spread():
+    static = np.array([0.5, 4.0, 4.196, 1.813, -0.113])
+    drawn = perturb_seidel(static, 0.1, 20000, stream(1, "aberration"))
+    assert drawn.mean(axis=0) == pytest.approx(static, rel=4e-3)
+    assert drawn.std(axis=0) == pytest.approx(0.1 * np.abs(static), rel=0.02)
+    correlation = np.corrcoef(drawn.T) - np.eye(5)
+    assert np.abs(correlation).max() < 0.03
+
+
+def test_ties_go_to_the_first_pixel_in_row_order():
+    image = np.array([[0.0, 1.0 - 5e-5], [1.0, 0.2]])
+    assert brightest_pixel(image, tie=1e-4) == (0, 1)
+    assert brightest_pixel(image, tie=1e-5) == (1, 0)
+
+
+def test_brightest_pixel_lands_at_half_the_stamp_plus_jitter(templates):
+    propagation, peak = templates
+    jitter = np.tile([[1, -1]], (len(peak), 1))
+    stamps = propagation.stamps(16, stamp_offset(peak, jitter))
+    brightest = [brightest_pixel(s, 1e-4) for s in stamps]
+    ties = sum(position != (9, 7) for position in brightest)
+    assert ties == 0
+
+
+def test_templates_mirror_with_the_field(templates):
+    """The field's mirror symmetry y → −y is that of the image."""
+    propagation, _ = templates
+    stamps = propagation.stamps(64, np.zeros((121, 2), dtype=int)).reshape(11, 11, 64, 64)
+    mirrored = stamps[::-1, :, ::-1, :]
+    assert np.abs(stamps - mirrored).max() / stamps.max() < 1e-5
+
+
+def test_templates_lie_where_the_design_says(templates):
+    _, peak = templates
+    assert np.abs(peak + 0.5).max() == pytest.approx(14, abs=1)
+
+
+def test_search_agrees_with_a_full_search(scene1):
+    _, field = relative_field(scene1.grid)
+    seidel = perturb_seidel(scene1.wavefront.coefficients, 0.5, 121, stream(5, "x"))
+    source = SeidelWavefronts(seidel, field)
+    wavefronts = Propagation(source, scene1.telescope, scene1.optics, scene1.framing, 40)
+    fine = scene1.optics.model_copy(update={"precision": "complex128"})
+    exact = Propagation(source, scene1.telescope, fine, scene1.framing, 40)
+    images = exact.stamps(80, np.zeros((121, 2), dtype=int))
+    expected = np.array([brightest_pixel(image, 1e-4) for image in images]) - 40
+    assert (wavefronts.brightest() == expected).all()
+
+
+def test_peak_outside_a_small_window_is_found_by_a_second_search(scene1, templates):
+    _, peak = templates
+    framing, optics = scene1.framing, scene1.optics
+    source = template_wavefronts(scene1)
+    near = Propagation(source, scene1.telescope, optics, framing, 12)
+    assert (near.brightest() == peak).all()
+
+
+def test_peak_outside_every_window_is_an_error(scene1):
+    source = template_wavefronts(scene1)
+    tiny = Propagation(source, scene1.telescope, scene1.optics, scene1.framing, 4)
+    with pytest.raises(FramingError, match="search_px = 4"):
+        tiny.brightest()
+
+
+def test_crop_moves_the_image_by_the_jitter():
+    framed = np.zeros((2, 18, 18))
+    framed[:, 9, 9] = 1
+    cropped = crop_jittered(framed, np.array([[0, 0], [1, -1]]), margin=1)
+    assert cropped.shape == (2, 16, 16)
+    assert cropped[0, 8, 8] == 1
+    assert cropped[1, 9, 7] == 1
+
+
+def test_flux_normalisation():
+    stamps, flux = normalise_flux(np.full((3, 4, 4), 0.5))
+    assert flux == pytest.approx([8, 8, 8])
+    assert stamps.sum(axis=(1, 2)) == pytest.approx([1, 1, 1])
+
+
+@pytest.mark.parametrize("level", [3e-5, 1e-3, 5e-3])
+def test_noise_has_the_paper_s_rms_and_the_star_s_photons(noise, gaussian_stars, level):
+    psf = np.repeat(gaussian_stars, 8, axis=0)
+    error = noise.draw(psf, level, stream(1, "n", str(level))) - psf
+    expected = noise.variance(psf, level)
+    assert expected.mean() == pytest.approx(
+        (4.98 * level) ** 2 + psf.mean() / noise.flux(level), rel=1e-6
+    )
+    assert error.mean() == pytest.approx(0, abs=5 * np.sqrt(expected.mean() / error.size))
+    assert (error**2).mean() == pytest.approx(expected.mean(), rel=0.01)
+
+
+def test_star_photons_add_a_quarter_at_the_lowest_level(noise, gaussian_stars):
+    mean = noise.variance(gaussian_stars, 3e-5).mean()
+    assert mean / (4.98 * 3e-5) ** 2 == pytest.approx(1.26, abs=0.01)
+
+
+def test_fainter_stars_have_fewer_photons(noise):
+    flux = noise.flux(np.array([1e-3, 5e-3]))
+    assert flux == pytest.approx([20080.32, 4016.06], rel=1e-5)
+
+
+def test_random_split_sizes_and_separation():
+    split = random_split(8405, 6724, 1681, 0.1, seed=4)
+    assert (split.fit.size, split.validation.size, split.test.size) == (6052, 672, 1681)
+    everyone = np.concatenate([split.fit, split.validation, split.test])
+    assert np.unique(everyone).size == 8405
+    assert (split.train == np.sort(np.concatenate([split.fit, split.validation]))).all()
+
+
+@pytest.mark.parametrize(("points", "held"), [(11, 24), (20, 80)])
+def test_held_out_split_never_shares_a_field(points, held):
+    grid, _ = square_grid(points, 1.0)
+    fields = len(grid)
+    star_field = assign_fields(20 * fields, fields, stream(1, "field"))
+    assert held_out_fields(grid).sum() == held
+    split = held_out_split(star_field, grid, 0.1, seed=1)
+    parts = [set(star_field[part]) for part in (split.fit, split.validation, split.test)]
+    assert not parts[0] & parts[1]
+    assert not parts[0] & parts[2]
+    assert not parts[1] & parts[2]
+    assert len(parts[2]) == held
+    assert split.fit.size + split.validation.size + split.test.size == star_field.size
