@@ -3,6 +3,7 @@
 #   PRESET=name      smoke, fast (default) or paper
 #   SET="a.b=1 …"    Hydra overrides for every dataset
 #   TARGETS="…"      Snakemake targets, for example dataset3 (default: all)
+#   PORT=n           port of the MLflow page (default: 5000)
 #   TORCH_INDEX=url  package index with PyTorch's CPU builds (default: pip's own index)
 #   PYTHON=python3   interpreter that makes the environment (3.11 or newer)
 
@@ -12,16 +13,19 @@ PRESET ?= fast
 SET ?=
 TARGETS ?=
 TORCH_INDEX ?=
+PORT ?= 5000
 
 VENV := $(CURDIR)/.venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --no-input
 export PATH := $(BIN):$(PATH)
 export PYTHONUNBUFFERED := 1
+export MLFLOW_DISABLE_TELEMETRY := true
+RESULTS := results$(if $(filter-out fast,$(PRESET)),/$(PRESET))
 SNAKEMAKE := snakemake --cores $(CORES) --config preset=$(PRESET) $(if $(SET),set="$(SET)")
 
 .DEFAULT_GOAL := help
-.PHONY: help env reproduce report test test-all lint format lock clean
+.PHONY: help env reproduce report mlflow reference docs test test-all lint format lock clean
 
 help: ## List the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -41,6 +45,18 @@ reproduce: env ## Build everything of the preset: datasets, models, tables
 
 report: env ## Write results/report.html for what reproduce has built
 	$(SNAKEMAKE) --report results/report.html $(TARGETS)
+
+mlflow: env ## Compare the tracked runs in a browser (PORT=n)
+	@test -f $(RESULTS)/mlflow.db || { echo "no $(RESULTS)/mlflow.db yet: make reproduce"; exit 1; }
+	mlflow ui --workers 1 --port $(PORT) --backend-store-uri sqlite:///$(RESULTS)/mlflow.db \
+	  --artifacts-destination $(RESULTS)/mlartifacts
+
+reference: env ## Make the finished run in results the run of record, and renew the docs
+	$(SNAKEMAKE) --forcerun reference -- reference
+	psfdae docs
+
+docs: env ## Render README and docs from the run of record
+	psfdae docs
 
 lint: env
 	ruff check .

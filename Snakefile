@@ -5,6 +5,9 @@ from snakemake.utils import min_version
 min_version("9.0")
 
 
+report: "workflow/report/workflow.rst"
+
+
 container: "docker://condaforge/miniforge3:25.3.1-0"
 
 
@@ -12,13 +15,17 @@ include: "workflow/rules/common.smk"
 include: "workflow/rules/data.smk"
 include: "workflow/rules/models.smk"
 include: "workflow/rules/evaluation.smk"
+include: "workflow/rules/figures.smk"
+include: "workflow/rules/calibration.smk"
+include: "workflow/rules/tracking.smk"
+include: "workflow/rules/record.smk"
 
 
 rule all:
     default_target: True
     input:
-        rules.psf_metrics.output,
-        [file for dataset in default_datasets() for file in paper_tables_of(dataset)],
+        rules.runtime.input,
+        rules.runtime.output,
     localrule: True
 
 

@@ -48,6 +48,7 @@ def test_paper_preset_has_the_paper_s_hyper_parameters():
         ("framing.stamp_px=6", r"framing\.stamp_px = 6: .*greater than or equal to 8"),
         ("framing.stamp_px=15", r"framing\.stamp_px = 15: .*multiple of 2"),
         ("telescope.wavelength_m=-5e-7", r"telescope\.wavelength_m = -5e-07: .*greater than"),
+        ("dataset.shown_levels=[0.004]", r"shown_levels = \[0\.004\]: must be among noise"),
         ("noise.levels=[0.001,0]", r"noise\.levels\.1 = 0: .*greater than 0"),
         ("noise.levels=[-0.001]", r"noise\.levels\.0 = -0\.001: .*greater than 0"),
         ("parts.train_stars=9000", r"= 10681: must be at most stars\.count = 8405"),
@@ -99,12 +100,16 @@ def test_ninth_dataset_is_one_small_file(tmp_path, monkeypatch):
         "defaults:\n  - dataset3\n  - _self_\n"
         "seed: 7\n"
         "dataset:\n  name: dataset9\n"
-        "noise:\n  name: bright\n  levels: [2.0e-3]\n"
+        "noise:\n  name: bright\n  levels: [1.0e-3, 3.0e-3]\n"
     )
     monkeypatch.setenv("PSFDAE_CONFIG", str(folder))
     compose.compose.cache_clear()
     try:
         config = load(["dataset=dataset9"])
-        assert (config.seed, config.noise.levels, config.stars.name) == (7, [2e-3], "seidel_10pct")
+        assert (config.seed, config.noise.levels, config.stars.name) == (
+            7,
+            [1e-3, 3e-3],
+            "seidel_10pct",
+        )
     finally:
         compose.compose.cache_clear()

@@ -11,7 +11,7 @@ import torch
 from psfdae.configuration.schema import Dae as DaeConfig
 from psfdae.configuration.schema import Train
 from psfdae.evaluation.metrics import mse
-from psfdae.models.dae import build_dae, image_scale, predict
+from psfdae.models.dae import SingleChannelConv, build_dae, image_scale, predict
 from psfdae.models.lmmse import LinearMmse
 from psfdae.models.pca_som import fit_pca_som
 from psfdae.models.training import TrainingError, TrainingSet, train_dae
@@ -115,6 +115,18 @@ def test_dae_keeps_the_size_and_is_never_negative(gaussian_stars):
     assert (out >= 0).all()
     sizes = [layer.kernel_size[0] for layer in model.layers]
     assert sizes == kernels
+
+
+def test_single_channel_convolution_is_the_plain_one():
+    layer = SingleChannelConv(3, 1, 5, padding=2)
+    x = torch.randn(2, 3, 9, 9, requires_grad=True)
+    plain = torch.nn.functional.conv2d(x, layer.weight, layer.bias, padding=2)
+    assert torch.allclose(layer(x), plain, atol=1e-6)
+    parameters = [x, layer.weight, layer.bias]
+    ours = torch.autograd.grad(layer(x).square().sum(), parameters)
+    theirs = torch.autograd.grad(plain.square().sum(), parameters)
+    for mine, other in zip(ours, theirs, strict=True):
+        assert torch.allclose(mine, other, rtol=1e-4, atol=1e-5)
 
 
 def test_he_initialisation_keeps_the_variance(gaussian_stars):

@@ -5,6 +5,7 @@ from snakemake.utils import validate
 
 from psfdae.configuration.compose import ConfigError, as_overrides, config_dir
 from psfdae.configuration.compose import compose, load, stage_tree
+from psfdae.configuration.schema import STAGE_KEYS
 from psfdae.source import source_hash
 
 validate(config, "../schemas/command_line.schema.yaml")
@@ -20,6 +21,8 @@ def options(group):
 
 
 ALL_DATASETS = options("dataset")
+# The datasets that the paper tabulates; calibration compares with their rows.
+TABULATED = ["dataset3", "dataset5", "dataset8"]
 
 
 wildcard_constraints:
@@ -38,11 +41,14 @@ def dataset_config(dataset):
 
 
 def stage_overrides(stage, choice):
-    """The groups that a stage reads, as overrides: command line and rerun trigger in one."""
-    chosen, option = choice.split("=")
-    keep = [choice] if chosen in ("scene", "stars") else []
+    """The groups that a stage reads, as overrides: command line and rerun trigger in one.
+
+    A stage that reads the scene starts from the option that chose it, because scenes
+    differ in their keys; for the others every key is pinned.
+    """
     tree = compose((choice, *OVERRIDES))
-    return keep + as_overrides(stage_tree(stage, tree))
+    base = [choice] if "wavefront" in STAGE_KEYS[stage] else []
+    return base + as_overrides(stage_tree(stage, tree))
 
 
 def default_datasets():
@@ -75,4 +81,42 @@ def paper_tables_of(dataset):
         f"{RESULTS}/tables/{dataset}_{metric}.{suffix}"
         for metric in ("ssim", "mse")
         for suffix in ("csv", "md")
+    ]
+
+
+def category_of(w):
+    """Heading of a figure in the report: the paper's scene."""
+    if "scene" in w.keys():
+        experiment = compose((f"scene={w.scene}", *OVERRIDES))["scene"]["experiment"]
+    else:
+        experiment = dataset_config(w.dataset).scene.experiment
+    return experiment.replace("scene", "Scene ")
+
+
+def networks_of(dataset):
+    """Split and reference of each network of a dataset."""
+    settings = dataset_config(dataset).dataset
+    return [(s, r) for s in settings.splits for r in settings.references]
+
+
+def figures_of(dataset):
+    """Figures of a dataset and of its scene."""
+    settings = dataset_config(dataset)
+    folder = f"{RESULTS}/figures"
+    return [
+        f"{folder}/{settings.scene.name}/templates.png",
+        f"{folder}/{settings.scene.name}/energy.png",
+        f"{folder}/{dataset}/curves.png",
+        *(f"{folder}/{dataset}/errors_{metric}.png" for metric in ("mse", "ssim")),
+        *(f"{folder}/{dataset}/strip_{r}.png" for r in settings.dataset.references),
+    ]
+
+
+def products_of(dataset):
+    """Everything that a dataset's target builds."""
+    return [
+        *evaluations_of(dataset),
+        *paper_tables_of(dataset),
+        *figures_of(dataset),
+        f"{RESULTS}/mlflow/{dataset}.csv",
     ]

@@ -10,7 +10,7 @@ rule evaluate:
     log:
         f"{RESULTS}/logs/evaluation/{{dataset}}/{{split}}-{{reference}}.log",
     benchmark:
-        f"{RESULTS}/benchmarks/evaluation/{{dataset}}/{{split}}-{{reference}}.tsv"
+        f"{RESULTS}/benchmarks/evaluate/{{dataset}}/{{split}}-{{reference}}.tsv"
     threads: lambda w: dataset_config(w.dataset).evaluation.threads
     resources:
         mem_mb=1500,
@@ -36,7 +36,7 @@ rule paper_tables:
     log:
         f"{RESULTS}/logs/tables/{{dataset}}_{{metric}}.log",
     benchmark:
-        f"{RESULTS}/benchmarks/tables/{{dataset}}_{{metric}}.tsv"
+        f"{RESULTS}/benchmarks/paper_tables/{{dataset}}-{{metric}}.tsv"
     threads: 1
     resources:
         mem_mb=500,
@@ -57,7 +57,7 @@ rule psf_metrics:
     log:
         f"{RESULTS}/logs/tables/psf_metrics.log",
     benchmark:
-        f"{RESULTS}/benchmarks/tables/psf_metrics.tsv"
+        f"{RESULTS}/benchmarks/psf_metrics/all.tsv"
     threads: 1
     resources:
         mem_mb=500,

@@ -6,7 +6,7 @@ rule baseline:
     log:
         f"{RESULTS}/logs/pca_som/{{dataset}}/{{split}}.log",
     benchmark:
-        f"{RESULTS}/benchmarks/pca_som/{{dataset}}/{{split}}.tsv"
+        f"{RESULTS}/benchmarks/baseline/{{dataset}}/{{split}}.tsv"
     threads: lambda w: dataset_config(w.dataset).baseline.threads
     resources:
         mem_mb=1000,
@@ -33,7 +33,7 @@ rule train:
     log:
         f"{RESULTS}/logs/dae/{{dataset}}/{{split}}-{{reference}}.log",
     benchmark:
-        f"{RESULTS}/benchmarks/dae/{{dataset}}/{{split}}-{{reference}}.tsv"
+        f"{RESULTS}/benchmarks/train/{{dataset}}/{{split}}-{{reference}}.tsv"
     threads: lambda w: dataset_config(w.dataset).train.threads
     resources:
         mem_mb=1500,

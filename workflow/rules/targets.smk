@@ -1,10 +1,11 @@
 rule tables:
     input:
-        rules.all.input,
+        rules.psf_metrics.output,
+        [file for dataset in TABULATED for file in paper_tables_of(dataset)],
     localrule: True
 
 
-for _scene in ("scene1",):
+for _scene in ("scene1", "scene2"):
 
     rule:
         name:
@@ -14,7 +15,7 @@ for _scene in ("scene1",):
                 file
                 for dataset in default_datasets()
                 if dataset_config(dataset).scene.experiment == _scene
-                for file in evaluations_of(dataset) + paper_tables_of(dataset)
+                for file in products_of(dataset)
             ],
         localrule: True
 
@@ -25,6 +26,5 @@ for _dataset in ALL_DATASETS:
         name:
             _dataset
         input:
-            lambda w, dataset=_dataset: evaluations_of(dataset)
-            + paper_tables_of(dataset),
+            lambda w, dataset=_dataset: products_of(dataset),
         localrule: True

@@ -77,10 +77,36 @@ class Seidel(Group):
         )
 
 
+class VonKarman(Group):
+    """Static atmospheric turbulence in layers."""
+
+    kind: Literal["von_karman"]
+    seed: Annotated[int, Field(ge=0, lt=2**63)]
+    r0_m: Positive = Field(description="Fried parameter of all layers at the telescope's band")
+    outer_scale_m: Positive = Field(description="Outer scale L0")
+    layer_heights_m: Annotated[list[Annotated[float, Field(ge=0)]], Field(min_length=1)]
+    layer_strengths: Annotated[list[Positive], Field(min_length=1)] = Field(
+        description="Fraction of the turbulence in each layer"
+    )
+    waves: Annotated[int, Field(ge=16, multiple_of=8)] = Field(description="Plane waves per layer")
+    remove_tilt: bool = Field(description="Remove tip and tilt over the lit pupil")
+
+    @model_validator(mode="after")
+    def _layers(self) -> VonKarman:
+        if len(self.layer_heights_m) != len(self.layer_strengths):
+            raise ValueError(
+                f"layer_strengths = {self.layer_strengths}: one for each of the "
+                f"{len(self.layer_heights_m)} layer_heights_m"
+            )
+        if abs(sum(self.layer_strengths) - 1.0) > 1e-6:
+            raise ValueError(f"layer_strengths = {self.layer_strengths}: must add up to 1")
+        return self
+
+
 class Scene(Group):
     """A family of static PSFs."""
 
-    name: Literal["seidel"]
+    name: Literal["seidel", "turbulence"]
     experiment: Name = Field(description="The paper's scene, and the MLflow experiment")
 
 
@@ -164,6 +190,9 @@ class Dataset(Group):
     name: Name
     splits: Annotated[list[SplitKind], Field(min_length=1)]
     references: Annotated[list[Reference], Field(min_length=1)]
+    shown_levels: Annotated[list[Positive], Field(min_length=1)] = Field(
+        description="Noise levels λ of the figure of restored stars, a subset of noise.levels"
+    )
 
 
 class Dae(Group):
@@ -238,6 +267,21 @@ class Evaluation(Group):
     threads: Count = Field(description="Threads of the linear algebra")
 
 
+class Calibration(Group):
+    """Scan of what the paper leaves open."""
+
+    stars: Count = Field(description="Stars simulated per point of the scan")
+    pixel_scales_arcsec: Annotated[list[Positive], Field(min_length=2)] = Field(
+        description="Pixel scales scanned, ascending"
+    )
+    r0_m: Annotated[list[Positive], Field(min_length=1)] = Field(
+        description="Fried parameters scanned (scene 2; scene 1 has none)"
+    )
+    data_ranges: Annotated[list[Positive], Field(min_length=2)] = Field(
+        description="SSIM dynamic ranges scanned, ascending"
+    )
+
+
 class Workflow(Group):
     """What the default target of the workflow builds."""
 
@@ -252,7 +296,7 @@ class Config(Group):
     scene: Scene
     telescope: Telescope
     grid: Grid
-    wavefront: Seidel
+    wavefront: Annotated[Seidel | VonKarman, Field(discriminator="kind")]
     stars: Stars
     framing: Framing
     optics: Optics
@@ -263,6 +307,7 @@ class Config(Group):
     train: Train
     baseline: Baseline
     evaluation: Evaluation
+    calibration: Calibration
 
     @model_validator(mode="after")
     def _consistent(self) -> Config:
@@ -271,6 +316,12 @@ class Config(Group):
             raise ValueError(
                 f"parts.train_stars + parts.test_stars = {used}: "
                 f"must be at most stars.count = {self.stars.count}"
+            )
+        strange = set(self.dataset.shown_levels) - set(self.noise.levels)
+        if strange:
+            raise ValueError(
+                f"dataset.shown_levels = {self.dataset.shown_levels}: must be among "
+                f"noise.levels = {self.noise.levels}"
             )
         if self.baseline.components > self.framing.stamp_px**2:
             raise ValueError(
@@ -286,6 +337,11 @@ STAGE_KEYS: dict[str, tuple[str, ...]] = {
     "baseline": ("seed", "noise", "parts", "baseline"),
     "train": ("seed", "noise", "parts", "dae", "train"),
     "evaluate": ("seed", "noise", "parts", "evaluation"),
+    "scan": (
+        *("seed", "scene", "telescope", "grid", "wavefront", "stars", "framing", "optics"),
+        *("noise", "calibration"),
+    ),
+    "calibrate": ("seed", "noise", "evaluation"),
 }
 """The groups that each stage reads; nothing else can influence its result."""
 
@@ -293,5 +349,7 @@ STAGE_KEYS: dict[str, tuple[str, ...]] = {
 @cache
 def stage_model(stage: str) -> type[Group]:
     """The config groups of one stage as a model of their own."""
-    fields = {key: (Config.model_fields[key].annotation, ...) for key in STAGE_KEYS[stage]}
+    fields = {
+        key: (Config.model_fields[key].rebuild_annotation(), ...) for key in STAGE_KEYS[stage]
+    }
     return create_model(f"{stage.title()}Config", __base__=Group, **fields)  # type: ignore[call-overload]

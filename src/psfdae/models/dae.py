@@ -16,6 +16,25 @@ import torch
 from torch import nn
 
 
+class SingleChannelConv(nn.Conv2d):
+    """Convolution to one channel, computed as a transposed convolution.
+
+    The two are the same sum: correlating with a kernel is scattering with the
+    flipped one. oneDNN vectorises over output channels and is slow for one; the
+    matrix-product path of the transposed convolution takes half the time (a
+    tenth of a training step at width 16).
+    """
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Map (B, C, h, w) to (B, 1, h, w)."""
+        if x.device.type != "cpu":
+            return super().forward(x)
+        flipped = self.weight.flip(2, 3).transpose(0, 1)
+        return torch.ops.aten.slow_conv_transpose2d(
+            x, flipped, self.kernel_size, self.bias, [1, 1], self.padding, [0, 0], [1, 1]
+        )
+
+
 class Dae(nn.Module):
     """Denoising autoencoder on single-channel images.
 
@@ -31,7 +50,9 @@ class Dae(nn.Module):
         super().__init__()
         channels = [1, *widths, 1]
         self.layers = nn.ModuleList(
-            nn.Conv2d(inner, outer, kernel, padding=kernel // 2)
+            (nn.Conv2d if outer > 1 else SingleChannelConv)(
+                inner, outer, kernel, padding=kernel // 2
+            )
             for (inner, outer), kernel in zip(pairwise(channels), kernels, strict=True)
         )
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from psfdae.files import Product, ProductError, read_product
+from psfdae.rng import stream
 from psfdae.stars.noise import NoiseModel
 from psfdae.stars.splits import Split, held_out_split, random_split
 
@@ -61,6 +62,12 @@ def split_stars(stars: Product, kind: str, config: Any) -> Split:
 def noise_model(config: Any) -> NoiseModel:
     """The noise of a stage's config."""
     return NoiseModel(config.noise.kappa, config.noise.background_photons)
+
+
+def noisy_test_images(config: Any, images: np.ndarray, level: float) -> np.ndarray:
+    """Noisy images of the test stars at one λ; the noise depends on seed and λ only."""
+    rng = stream(config.seed, "noise", "test", f"{level:.6g}")
+    return noise_model(config).draw(images, level, rng)
 
 
 def mixed_levels(config: Any, count: int, rng: np.random.Generator) -> np.ndarray:

@@ -11,9 +11,14 @@ import numpy as np
 from psfdae.evaluation.metrics import all_metrics, clustered_mean
 from psfdae.files import atomic_path, write_text
 from psfdae.models.lmmse import LinearMmse
-from psfdae.rng import stream
 from psfdae.stages import baseline
-from psfdae.stages.common import limit_threads, noise_model, read_stars, split_stars
+from psfdae.stages.common import (
+    limit_threads,
+    noise_model,
+    noisy_test_images,
+    read_stars,
+    split_stars,
+)
 from psfdae.stages.train import CONFIG, WEIGHTS
 
 Predictor = Callable[[np.ndarray, float], np.ndarray]
@@ -51,23 +56,21 @@ def run(
     limit_threads(config.evaluation.threads)
     product = read_stars(stars, reference)
     parts = split_stars(product, split, config)
-    noise = noise_model(config)
     truth = product[reference][parts.test]
     linear = LinearMmse.fit(
-        product["realisation"][parts.train], product[reference][parts.train], noise
+        product["realisation"][parts.train], product[reference][parts.train], noise_model(config)
     )
     methods: dict[str, Predictor] = {
         "noisy": lambda noisy, level: noisy,
         "pca_som": _ignoring_level(baseline.load(pca_som).predict),
         "lmmse": linear.predict,
-        "dae": _dae_predictor(dae, config),
+        "dae": dae_predictor(dae, config),
     }
     field = product["field_index"][parts.test]
     key = {"dataset": dataset, "split": split, "reference": reference}
     summary, stars_table = [], []
     for level in config.noise.levels:
-        rng = stream(config.seed, "noise", "test", f"{level:.6g}")
-        noisy = noise.draw(product["realisation"][parts.test], level, rng)
+        noisy = noisy_test_images(config, product["realisation"][parts.test], level)
         for method, predict in methods.items():
             metrics = all_metrics(predict(noisy, level), truth, config.evaluation.data_range)
             row = {**key, "method": method, "noise_level": level}
@@ -92,7 +95,7 @@ def _ignoring_level(predict: Callable[[np.ndarray], np.ndarray]) -> Predictor:
     return lambda noisy, level: predict(noisy)
 
 
-def _dae_predictor(folder: Path, config: Any) -> Predictor:
+def dae_predictor(folder: Path, config: Any) -> Predictor:
     import torch
     import yaml
 

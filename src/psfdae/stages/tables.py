@@ -16,7 +16,7 @@ def collect(evaluations: Sequence[Path], out: Path) -> None:
     ProductError
         If an evaluation lacks columns.
     """
-    write_text(out, _read(evaluations).to_csv(index=False, float_format="%.8g"))
+    write_text(out, read_evaluations(evaluations).to_csv(index=False, float_format="%.8g"))
 
 
 def paper_tables(evaluations: Sequence[Path], dataset: str, metric: str, out: Path) -> None:
@@ -30,12 +30,12 @@ def paper_tables(evaluations: Sequence[Path], dataset: str, metric: str, out: Pa
     """
     from psfdae.evaluation.paper import as_markdown, paper_table
 
-    table = paper_table(_read(evaluations), dataset, metric)
+    table = paper_table(read_evaluations(evaluations), dataset, metric)
     write_text(out, table.to_csv(index=False, float_format="%.6g"))
     write_text(out.with_suffix(".md"), as_markdown(table, dataset, metric))
 
 
-def _read(evaluations: Sequence[Path]):  # type: ignore[no-untyped-def]
+def read_evaluations(evaluations: Sequence[Path]):  # type: ignore[no-untyped-def]
     import pandas as pd
 
     columns = ["dataset", "split", "reference", "method", "noise_level", "metric"]

@@ -1,0 +1,9 @@
+"""Command line: one command per stage.
+
+Only click is imported at the top; each command imports its stage when it runs.
+"""
+
+from psfdae.cli import figures, reporting, science
+from psfdae.cli.base import main
+
+__all__ = ["figures", "main", "reporting", "science"]

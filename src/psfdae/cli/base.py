@@ -1,0 +1,64 @@
+"""The command group and the options that its commands share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import click
+
+import psfdae
+
+FileArgument = click.Path(path_type=Path, dir_okay=False)
+FolderArgument = click.Path(path_type=Path, file_okay=False)
+
+
+class StageGroup(click.Group):
+    """Turns the package's own errors into one message and exit code 2."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run the command; a refusal of ours is a message, a bug stays a traceback."""
+        try:
+            return super().invoke(ctx)
+        except (RuntimeError, ValueError) as error:
+            if not type(error).__module__.startswith("psfdae"):
+                raise
+            click.echo(f"psfdae: {error}", err=True)
+            ctx.exit(2)
+
+
+@click.group(cls=StageGroup, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(psfdae.__version__)
+def main() -> None:
+    """PSF modelling with a denoising autoencoder, one command per stage.
+
+    OVERRIDES are Hydra overrides, such as dataset=dataset5 train.lr=1e-3; the
+    groups and keys are those of the config folder.
+    """
+
+
+def overrides(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The trailing Hydra overrides of a stage."""
+    return click.argument("overrides", nargs=-1)(function)
+
+
+def out_option(what: str, kind: click.Path = FileArgument) -> Callable[..., Any]:
+    """The option that names a stage's output."""
+    return click.option("--out", type=kind, required=True, help=what)
+
+
+def input_option(name: str, what: str, kind: click.Path = FileArgument) -> Callable[..., Any]:
+    """An option that names a stage's input."""
+    return click.option(f"--{name}", type=kind, required=True, help=what)
+
+
+split_option = click.option(
+    "--split", type=click.Choice(["random", "held_out"]), default="random", show_default=True
+)
+reference_option = click.option(
+    "--reference",
+    type=click.Choice(["realisation", "template"]),
+    default="realisation",
+    show_default=True,
+)

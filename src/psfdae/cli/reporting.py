@@ -1,0 +1,122 @@
+"""Commands that calibrate, tabulate and record."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from psfdae.cli.base import FileArgument, FolderArgument, input_option, main, out_option, overrides
+
+
+@main.command()
+@out_option("Tidy CSV.")
+@click.argument("evaluations", nargs=-1, type=FileArgument, required=True)
+def collect(out: Path, evaluations: tuple[Path, ...]) -> None:
+    """Join evaluations into one tidy table."""
+    from psfdae.stages.tables import collect as stage
+
+    stage(evaluations, out)
+
+
+@main.command()
+@click.option("--dataset", required=True)
+@click.option("--metric", type=click.Choice(["mse", "ssim"]), required=True)
+@out_option("CSV; the Markdown goes beside it.")
+@click.argument("evaluations", nargs=-1, type=FileArgument, required=True)
+def paper_tables(dataset: str, metric: str, out: Path, evaluations: tuple[Path, ...]) -> None:
+    """Write one of the paper's tables, ours beside the paper's."""
+    from psfdae.stages.tables import paper_tables as stage
+
+    stage(evaluations, dataset, metric, out)
+
+
+@main.command()
+@click.option("--dataset", required=True, help="A dataset that the paper tabulates.")
+@out_option("CSV with the SSIM over scale, r0 and dynamic range.")
+@overrides
+def scan(dataset: str, out: Path, overrides: tuple[str, ...]) -> None:
+    """Scan what the paper leaves open against its original-noise rows."""
+    from psfdae.configuration.compose import load_stage
+    from psfdae.stages import calibrate as stage
+
+    stage.scan(load_stage("scan", overrides), dataset, out)
+
+
+@main.command()
+@click.option("--scan", "scans", type=FileArgument, multiple=True, required=True)
+@click.option(
+    "--stars",
+    type=(str, FileArgument),
+    multiple=True,
+    required=True,
+    help="Dataset and its product of the stage stars.",
+)
+@out_option("Folder for fit.csv, columns.csv and degeneracy.csv.", FolderArgument)
+@overrides
+def calibrate(
+    scans: tuple[Path, ...],
+    stars: tuple[tuple[str, Path], ...],
+    out: Path,
+    overrides: tuple[str, ...],
+) -> None:
+    """Fit noise, dynamic range and pixel scales to the scans."""
+    from psfdae.configuration.compose import load_stage
+    from psfdae.stages import calibrate as stage
+
+    stage.calibrate(load_stage("calibrate", overrides), scans, dict(stars), out)
+
+
+@main.command()
+@input_option("results", "Folder that the workflow writes to.", FolderArgument)
+@click.option("--preset", required=True, help="Goes into the tags.")
+@input_option("database", "SQLite file; mlartifacts/ lies beside it.")
+@click.option(
+    "--stars",
+    type=(str, FileArgument),
+    multiple=True,
+    required=True,
+    help="Dataset and its product of the stage stars.",
+)
+@out_option("CSV with the MLflow id of every run and what was done.")
+def track(
+    results: Path, preset: str, database: Path, stars: tuple[tuple[str, Path], ...], out: Path
+) -> None:
+    """Import finished runs into MLflow; MLFLOW_TRACKING_URI names a server instead."""
+    from psfdae.runs import discover
+    from psfdae.stages import track as stage
+
+    entries = discover(results, dict(stars))
+    stage.run(entries, preset, database, database.parent / "mlartifacts", out)
+
+
+@main.command()
+@input_option("results", "Folder of a run.", FolderArgument)
+@out_option("CSV with the cost of every job.")
+def runtime(results: Path, out: Path) -> None:
+    """Collect wall time, CPU time and memory of a run's jobs."""
+    from psfdae.stages import record as stage
+
+    stage.runtime(results, out)
+
+
+@main.command()
+@input_option("results", "Folder of a finished run.", FolderArgument)
+@out_option("Folder of the run of record.", FolderArgument)
+@click.argument("files", nargs=-1, type=FileArgument, required=True)
+def reference(results: Path, out: Path, files: tuple[Path, ...]) -> None:
+    """Replace the committed run of record by a finished run."""
+    from psfdae.configuration.compose import load
+    from psfdae.stages import record as stage
+
+    stage.reference(results, load(), files, out)
+
+
+@main.command()
+@click.option("--root", type=FolderArgument, default=Path(), help="Root of the source tree.")
+def docs(root: Path) -> None:
+    """Render README and docs from the run of record."""
+    from psfdae.stages import docs as stage
+
+    for page in stage.run(root / "results/reference", root / "docs/templates", root):
+        click.echo(page)

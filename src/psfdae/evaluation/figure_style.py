@@ -1,0 +1,91 @@
+"""How every figure looks: colours of the methods, type sizes, field angles."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import wraps
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+WIDTH_IN = 8.0
+"""Width of every figure in inches."""
+
+METHODS: dict[str, dict[str, str]] = {
+    "noisy": {"label": "noisy", "color": "#4d4d4d", "marker": "o"},
+    "pca_som": {"label": "PCA+SOM", "color": "#d55e00", "marker": "s"},
+    "dae": {"label": "DAE", "color": "#0072b2", "marker": "D"},
+    "lmmse": {"label": "linear MMSE (told λ)", "color": "#009e73", "marker": "^"},
+}
+"""Label, colour (Okabe & Ito's colour-blind-safe set) and marker of every method."""
+
+SERIES_COLORS = ("#0072b2", "#e69f00", "#cc79a7", "#009e73", "#56b4e9", "#d55e00")
+"""Colours of lines that are not methods."""
+
+REFERENCES = {
+    "realisation": "against the star's own noise-free image (realisation)",
+    "template": "against the static PSF of the field (template)",
+}
+"""What each reference is, for titles."""
+
+RC: dict[str, Any] = {
+    "figure.dpi": 150,
+    "font.size": 9,
+    "axes.titlesize": 10,
+    "axes.labelsize": 9,
+    "xtick.labelsize": 8,
+    "ytick.labelsize": 8,
+    "legend.fontsize": 8,
+    "figure.titlesize": 11,
+    "axes.grid": False,
+    "grid.color": "#d9d9d9",
+    "grid.linewidth": 0.6,
+}
+
+Drawing = Callable[..., "Figure"]
+
+
+def styled(draw: Drawing) -> Drawing:
+    """Draw in the style above, whatever matplotlibrc the user has."""
+
+    @wraps(draw)
+    def wrapped(*args: Any, **kwargs: Any) -> Figure:
+        import matplotlib.style
+
+        with matplotlib.style.context(["default", RC]):
+            return draw(*args, **kwargs)
+
+    return wrapped
+
+
+def new_figure(height_in: float, **kwargs: Any) -> Figure:
+    """An empty figure of the common width, outside pyplot's global state."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(WIDTH_IN, height_in), **kwargs)
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def in_field_unit(field: np.ndarray) -> tuple[np.ndarray, str]:
+    """Field angles in degrees, or in arc minutes if the whole field is within ±1°.
+
+    Parameters
+    ----------
+    field : ndarray
+        Angles in radians.
+
+    Returns
+    -------
+    values : ndarray
+    unit : str
+        "deg" or "arcmin".
+    """
+    degrees = np.rad2deg(field)
+    if np.abs(degrees).max() >= 1.0:
+        return degrees, "deg"
+    return 60.0 * degrees, "arcmin"

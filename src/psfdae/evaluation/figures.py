@@ -1,0 +1,271 @@
+"""Figures made of stamps: templates over the field, light in the stamp, restored stars.
+
+Every function takes arrays and returns a matplotlib figure; nothing is read or
+written here. Row 0 of a stamp is at its lowest field angle y, so stamps and
+field are both drawn with y upwards.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from psfdae.evaluation.figure_style import in_field_unit, new_figure, styled
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+STAMP_MAP = "magma"
+MAX_NUMBERED = 15
+"""Grids with more points a side get no numbers in their cells: they would touch."""
+
+
+@dataclass(frozen=True)
+class StripRow:
+    """One row of a restoration strip.
+
+    Attributes
+    ----------
+    label : str
+        Text at the left.
+    images : ndarray, shape (n, d, d)
+        Flux-normalised stamps, one per column.
+    mse : ndarray, shape (n,), optional
+        Error against the first row, printed under the stamps.
+    own_scale : bool
+        Scale each stamp by its own maximum instead of the first row's.
+    """
+
+    label: str
+    images: np.ndarray
+    mse: np.ndarray | None = None
+    own_scale: bool = False
+
+
+def mosaic(stamps: np.ndarray, grid: np.ndarray, gap: int = 1) -> np.ndarray:
+    """Stamps side by side at their grid positions.
+
+    Stamp (ix, iy) starts at row gap + iy (d + gap) and column gap + ix (d + gap)
+    and is not flipped.
+
+    Parameters
+    ----------
+    stamps : ndarray, shape (F, d, d)
+    grid : ndarray of int, shape (F, 2)
+        Grid index (ix, iy) of every stamp.
+    gap : int
+        Pixels between and around the stamps.
+
+    Returns
+    -------
+    ndarray, shape (P_y (d + gap) + gap, P_x (d + gap) + gap)
+        NaN where there is no stamp.
+    """
+    side = stamps.shape[-1]
+    pitch = side + gap
+    columns, rows = grid.max(axis=0) + 1
+    canvas = np.full((rows * pitch + gap, columns * pitch + gap), np.nan)
+    for stamp, (ix, iy) in zip(stamps, grid, strict=True):
+        row, column = gap + iy * pitch, gap + ix * pitch
+        canvas[row : row + side, column : column + side] = stamp
+    return canvas
+
+
+def spread_stars(position: np.ndarray, count: int) -> np.ndarray:
+    """Stars that lie evenly over the field, the same for the same stars.
+
+    The targets ((k + ½)/n, fraction of ½ + k/φ), with φ the golden ratio, are a
+    lattice that fills the square evenly; the first star nearest to each is
+    taken, so the result goes from left to right.
+
+    Parameters
+    ----------
+    position : ndarray, shape (n, 2)
+        Field position (x, y) of the stars, any unit.
+    count : int
+        Stars wanted; fewer come back if there are fewer.
+
+    Returns
+    -------
+    ndarray of int, shape (min(count, n),)
+    """
+    golden = 0.5 * (1.0 + np.sqrt(5.0))
+    count = min(count, len(position))
+    low, high = position.min(axis=0), position.max(axis=0)
+    step = np.arange(count)
+    target = np.stack([(step + 0.5) / count, (0.5 + step / golden) % 1.0], axis=1)
+    target = low + target * (high - low)
+    free = np.ones(len(position), dtype=bool)
+    picks = []
+    for point in target:
+        distance = np.where(free, np.hypot(*(position - point).T), np.inf)
+        # Rounding must not choose between equally near stars.
+        nearest = int(np.argmax(distance <= distance.min() * (1.0 + 1e-9)))
+        free[nearest] = False
+        picks.append(nearest)
+    return np.array(picks, dtype=int)
+
+
+@styled
+def template_map(psf: np.ndarray, grid: np.ndarray, field: np.ndarray, title: str) -> Figure:
+    """All templates at their field positions, as one mosaic.
+
+    Parameters
+    ----------
+    psf : ndarray, shape (F, d, d)
+        Stamps, [row, column] with y along the rows.
+    grid : ndarray of int, shape (F, 2)
+        Grid index (ix, iy).
+    field : ndarray, shape (F, 2)
+        Field angle (x, y) in radians.
+    title : str
+    """
+    from matplotlib import colormaps
+
+    gap = 1
+    share = psf / psf.max(axis=(1, 2), keepdims=True)
+    image = mosaic(np.sqrt(np.clip(share, 0.0, None)), grid, gap)
+    figure = new_figure(7.1, layout="constrained")
+    axes = figure.add_subplot()
+    shown = axes.imshow(
+        image,
+        origin="lower",
+        extent=_extent(grid, field, psf.shape[-1], gap),
+        cmap=colormaps[STAMP_MAP].with_extremes(bad="#b0b0b0"),
+        vmin=0.0,
+        vmax=1.0,
+        interpolation="nearest",
+    )
+    _field_axes(axes, field)
+    axes.set_title(title)
+    bar = figure.colorbar(shown, ax=axes, shrink=0.8, pad=0.02)
+    bar.set_label("pixel flux / maximum of the stamp (square-root scale)")
+    share_ticks = np.array([0.0, 0.01, 0.05, 0.1, 0.25, 0.5, 0.75, 1.0])
+    bar.set_ticks(np.sqrt(share_ticks), labels=[f"{value:g}" for value in share_ticks])
+    return figure
+
+
+@styled
+def stamp_energy_map(
+    energy: np.ndarray, grid: np.ndarray, field: np.ndarray, stamp_px: int
+) -> Figure:
+    """Fraction of a star's light that its stamp holds, over the field.
+
+    Parameters
+    ----------
+    energy : ndarray, shape (F,)
+        Fraction of the light through the pupil, 0 … 1.
+    grid : ndarray of int, shape (F, 2)
+        Grid index (ix, iy).
+    field : ndarray, shape (F, 2)
+        Field angle (x, y) in radians.
+    stamp_px : int
+        Side of the stamp, for the title.
+    """
+    image = mosaic(energy[:, None, None], grid, gap=0)
+    figure = new_figure(7.1, layout="constrained")
+    axes = figure.add_subplot()
+    shown = axes.imshow(
+        image,
+        origin="lower",
+        extent=_extent(grid, field, 1, 0),
+        cmap="viridis",
+        interpolation="nearest",
+    )
+    _field_axes(axes, field)
+    if max(image.shape) <= MAX_NUMBERED:
+        position, _ = in_field_unit(field)
+        for (x, y), value in zip(position, energy, strict=True):
+            red, green, blue, _ = shown.cmap(shown.norm(value))
+            dark = 0.299 * red + 0.587 * green + 0.114 * blue < 0.5
+            color = "white" if dark else "black"
+            axes.text(x, y, f"{value:.2f}", ha="center", va="center", color=color, fontsize=8)
+    axes.set_title(
+        f"Light inside the stamp of {stamp_px} × {stamp_px} px: min {energy.min():.2f}, "
+        f"median {np.median(energy):.2f}, max {energy.max():.2f}"
+    )
+    bar = figure.colorbar(shown, ax=axes, shrink=0.8, pad=0.02)
+    bar.set_label("fraction of the star's light")
+    return figure
+
+
+@styled
+def restoration_strip(rows: Sequence[StripRow], columns: Sequence[str], title: str) -> Figure:
+    """Stars before and after restoration, as in the paper.
+
+    All stamps of a column share the colour scale 0 … maximum of the first row,
+    on a square-root scale, except rows with `own_scale`.
+
+    Parameters
+    ----------
+    rows : sequence of StripRow
+        The first one is the reference.
+    columns : sequence of str
+        Heading of each star.
+    title : str
+    """
+    left, right, top, bottom, cell, text = 1.0, 0.1, 0.85, 0.35, 0.86, 0.17
+    height = top + bottom + len(rows) * cell + text * sum(row.mse is not None for row in rows)
+    figure = new_figure(height)
+    width = figure.get_figwidth()
+    step = (width - left - right) / len(columns)
+    y = height - top
+    peak = rows[0].images.max(axis=(1, 2))
+    for number, row in enumerate(rows):
+        y -= cell
+        scale = row.images.max(axis=(1, 2)) if row.own_scale else peak
+        for i, image in enumerate(row.images):
+            box = ((left + i * step) / width, y / height, 0.97 * step / width, 0.97 * cell / height)
+            axes = figure.add_axes(box, xticks=[], yticks=[])
+            _stamp(axes, image, scale[i])
+            if number == 0:
+                axes.set_title(columns[i], fontsize=8, pad=3)
+            if row.mse is not None:
+                number_text = f"{1e6 * row.mse[i]:#.3g}".rstrip(".")
+                axes.set_xlabel(number_text, fontsize=8, labelpad=1.5)
+            if i == 0:
+                axes.set_ylabel(row.label, rotation=0, ha="right", va="center", labelpad=5)
+        y -= text if row.mse is not None else 0.0
+    figure.suptitle(title, y=1.0 - 0.12 / height, va="top")
+    figure.text(
+        0.5,
+        0.09 / height,
+        "Colour: √flux from 0 to the reference's maximum in each column; noisy stamps to their own"
+        " maximum. Numbers: MSE × 10⁶.",
+        ha="center",
+        va="bottom",
+        fontsize=8,
+    )
+    return figure
+
+
+def _stamp(axes: Axes, image: np.ndarray, scale: float) -> Any:
+    shown = np.sqrt(np.clip(image / scale, 0.0, 1.0))
+    return axes.imshow(
+        shown, origin="lower", cmap=STAMP_MAP, vmin=0.0, vmax=1.0, interpolation="nearest"
+    )
+
+
+def _extent(grid: np.ndarray, field: np.ndarray, side: int, gap: int) -> tuple[float, ...]:
+    """Edges of a mosaic (left, right, bottom, top) that put each stamp's centre on its field."""
+    position, _ = in_field_unit(field)
+    pitch = side + gap
+    edges: list[float] = []
+    for axis in (0, 1):
+        points = int(grid[:, axis].max()) + 1
+        first, last = position[:, axis].min(), position[:, axis].max()
+        # A single field point has no spacing; any width will do.
+        pixel = ((last - first) / (points - 1) if points > 1 else 1.0) / pitch
+        margin = (gap + 0.5 * side) * pixel
+        edges += [first - margin, last + margin]
+    return tuple(edges)
+
+
+def _field_axes(axes: Axes, field: np.ndarray) -> None:
+    _, unit = in_field_unit(field)
+    axes.set_xlabel(f"field angle x ({unit})")
+    axes.set_ylabel(f"field angle y ({unit})")

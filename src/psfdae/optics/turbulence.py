@@ -1,0 +1,312 @@
+"""Von Kármán turbulence, evaluated only where a telescope looks through it.
+
+Each layer is a sum of plane waves with random frequencies (sparse spectrum,
+Charnotskii 2013, JOSA A 30, 479 and JOSA A 30, 2455), so no screen is
+needed: the waves are known everywhere, and footprints tens of metres apart cost
+no more than one. A plane wave is separable, exp(iκ_x x) exp(iκ_y y), hence the
+phase on the pupil grid of a direction is one matrix product.
+
+Lengths are in metres, spatial frequencies f in cycles per metre, phases in
+radians at the wavelength at which r0 is given, OPDs in waves of it. The spectrum
+is 0.0229 r0^(−5/3) (f² + 1/L0²)^(−11/6) rad² m².
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.special import gamma, jv, kv
+
+Removal = Literal["none", "piston", "tilt"]
+
+WAVES_PER_RING = 8
+"""Plane waves in a ring of the frequency plane; their angles are stratified."""
+
+INNERMOST = 0.5
+"""Radius of the innermost ring, a disc around f = 0, in units of 1/L0."""
+
+STRENGTH = (24.0 / 5.0 * gamma(6.0 / 5.0)) ** (5.0 / 6.0)
+"""Half of Fried's 6.88, by which r0 is defined."""
+
+SPECTRUM = gamma(11.0 / 6.0) ** 2 / (2.0 * np.pi ** (11.0 / 3.0)) * STRENGTH
+"""Factor 0.0229 of the phase spectrum."""
+
+BLOCK = 4
+"""Directions per matrix product: their rows still fit the cache of a core."""
+
+
+def structure_function(separation: np.ndarray, r0: float, outer_scale: float) -> np.ndarray:
+    """Von Kármán phase structure function D(r) = ⟨[φ(x + r) − φ(x)]²⟩.
+
+    Conan 2000 (thesis, Université de Nice); Lucke & Young 2007, Appl. Opt. 46, 559:
+    with u = 2πr/L0,
+
+        D = (L0/r0)^(5/3) 2^(1/6) Γ(11/6) π^(−8/3) [24/5 Γ(6/5)]^(5/6)
+            × [Γ(5/6) 2^(−1/6) − u^(5/6) K_(5/6)(u)].
+
+    The bracket cancels for small u: six digits are left at r = 2e-7 L0.
+
+    Parameters
+    ----------
+    separation : ndarray, shape (...)
+        Distance r in metres, ≥ 0.
+    r0, outer_scale : float
+        Fried's parameter and the outer scale L0 in metres.
+
+    Returns
+    -------
+    ndarray, shape (...)
+        rad² at the wavelength at which r0 is given.
+    """
+    u = 2.0 * np.pi * np.asarray(separation, float) / outer_scale
+    positive = np.where(u > 0, u, 1.0)
+    bracket = gamma(5 / 6) / 2 ** (1 / 6) - positive ** (5 / 6) * kv(5 / 6, positive)
+    scale = (outer_scale / r0) ** (5 / 3) * 2 ** (1 / 6) * gamma(11 / 6) / np.pi ** (8 / 3)
+    return np.where(u > 0, scale * STRENGTH * bracket, 0.0)
+
+
+def layer_r0(r0: float, strengths: Sequence[float]) -> np.ndarray:
+    """Fried's parameter of each layer, r0_l = r0 · s_l^(−3/5), in metres.
+
+    Parameters
+    ----------
+    r0 : float
+        Of all layers together, in metres.
+    strengths : sequence of float
+        Fractions s_l of the integrated strength.
+
+    Raises
+    ------
+    ValueError
+        If the fractions are not positive or do not add up to 1.
+    """
+    fraction = np.asarray(strengths, float)
+    if not (fraction > 0).all() or abs(fraction.sum() - 1.0) > 1e-6:
+        raise ValueError(f"layer strengths {list(strengths)}: must be positive and add up to 1")
+    return r0 * fraction ** (-3.0 / 5.0)
+
+
+@dataclass(frozen=True)
+class PlaneWaves:
+    """The plane waves of one layer.
+
+    Attributes
+    ----------
+    frequency : ndarray, shape (K, 2), float64
+        (f_x, f_y) in cycles per metre.
+    amplitude : ndarray, shape (K,), complex128
+        φ(x) = Re Σ amplitude · exp(2πi f·x), in radians.
+    """
+
+    frequency: np.ndarray
+    amplitude: np.ndarray
+
+    def phase(self, position: np.ndarray) -> np.ndarray:
+        """Phase in radians, shape (...), at positions (x, y) in metres, shape (..., 2).
+
+        The plain sum; `Footprints` computes whole pupils faster.
+        """
+        argument = 2.0 * np.pi * np.asarray(position, float) @ self.frequency.T
+        # Two real products: half the cost of a complex exponential and its product.
+        return np.cos(argument) @ self.amplitude.real - np.sin(argument) @ self.amplitude.imag
+
+
+def draw_waves(
+    count: int, r0: float, outer_scale: float, highest: float, rng: np.random.Generator
+) -> PlaneWaves:
+    """Random plane waves whose ensemble has the von Kármán spectrum up to a frequency.
+
+    The frequency plane is cut into rings with log-spaced edges around a disc
+    that reaches f = 0. Within a ring the radius is drawn with a density
+    proportional to the spectrum (its integral has a closed form) and all waves
+    share the ring's power equally: the ensemble's spectrum is exact below
+    `highest`, there is no cut at low frequencies. Moduli are fixed and phases
+    uniform, which leaves less scatter between realisations than Gaussian
+    amplitudes; with tens of waves per octave the sum is Gaussian all the same.
+    Angles are stratified over a half-turn within a ring, which keeps a single
+    realisation isotropic.
+
+    Parameters
+    ----------
+    count : int
+        Number K of waves, a multiple of `WAVES_PER_RING`.
+    r0, outer_scale : float
+        In metres.
+    highest : float
+        Highest frequency in cycles per metre. The variance that is missing
+        beyond it is 0.086 (r0 · highest)^(−5/3) rad².
+    rng : numpy Generator
+
+    Raises
+    ------
+    ValueError
+        If `count` does not fill at least two rings or `highest` is not above
+        the innermost disc.
+    """
+    rings, rest = divmod(count, WAVES_PER_RING)
+    if rest or rings < 2:
+        raise ValueError(
+            f"{count} plane waves: must be a multiple of {WAVES_PER_RING}, "
+            f"at least {2 * WAVES_PER_RING}"
+        )
+    low = 1.0 / outer_scale
+    if highest <= INNERMOST * low:
+        raise ValueError(f"highest frequency {highest} must exceed {INNERMOST}/L0 = {low / 2}")
+    edges = np.concatenate([[0.0], np.geomspace(INNERMOST * low, highest, rings)])
+    # ∫ f (f² + f0²)^(−11/6) df = −3/5 (f² + f0²)^(−5/6)
+    integral = (edges**2 + low**2) ** (-5.0 / 6.0)
+    drop = integral[:-1] - integral[1:]
+    power = 2.0 * np.pi * SPECTRUM * r0 ** (-5.0 / 3.0) * 0.6 * drop / WAVES_PER_RING
+    radius_draw, angle_draw, phase_draw = rng.random((3, rings, WAVES_PER_RING))
+    remaining = integral[:-1, None] - radius_draw * drop[:, None]
+    radius = np.sqrt(np.maximum(remaining ** (-6.0 / 5.0) - low**2, 0.0))
+    angle = np.pi * (np.arange(WAVES_PER_RING) + angle_draw) / WAVES_PER_RING
+    frequency = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1)
+    amplitude = np.sqrt(2.0 * power)[:, None] * np.exp(2j * np.pi * phase_draw)
+    return PlaneWaves(frequency.reshape(-1, 2), amplitude.ravel())
+
+
+def fitted_planes(wavevector: np.ndarray, obscuration: float = 0.0) -> np.ndarray:
+    """Least-squares plane p + t_x x + t_y y of waves exp(iκ·x) over the lit pupil.
+
+    In closed form, hence the same for every pupil grid: over the disc of radius
+    R, ⟨exp(iκ·x)⟩ = 2J1(κR)/(κR) and ⟨x exp(iκ·x)⟩ = 2i κ_x J2(κR)/κ².
+
+    Parameters
+    ----------
+    wavevector : ndarray, shape (K, 2)
+        (κ_x, κ_y) in radians per pupil radius.
+    obscuration : float
+        Linear central obscuration ε, 0 ≤ ε < 1.
+
+    Returns
+    -------
+    ndarray, shape (K, 3), complex128
+        p, t_x, t_y; the tilts per pupil radius.
+    """
+    kappa = np.maximum(np.hypot(*wavevector.T), 1e-6)
+    mean, moment = np.zeros_like(kappa), np.zeros_like(kappa)
+    for radius, area in ((1.0, 1.0), (obscuration, -(obscuration**2))):
+        if area:
+            mean += area * 2.0 * jv(1, kappa * radius) / (kappa * radius)
+            moment += area * 2.0 * jv(2, kappa * radius) / kappa**2
+    lit = 1.0 - obscuration**2
+    second = 0.25 * (1.0 + obscuration**2)  # ⟨x²⟩ over the annulus
+    tilt = 1j * wavevector * (moment / lit / second)[:, None]
+    return np.concatenate([(mean / lit)[:, None].astype(complex), tilt], axis=1)
+
+
+class Footprints:
+    """OPD over the pupil in a set of directions through turbulent layers.
+
+    In direction θ the phase at the pupil point x is Σ_l φ_l(x + h_l θ): the
+    directions share the waves, so neighbours see the same turbulence wherever
+    their footprints overlap.
+
+    Parameters
+    ----------
+    layers : sequence of PlaneWaves
+    heights : sequence of float
+        Height h_l of every layer in metres.
+    directions : ndarray, shape (B, 2)
+        Small field angles (x, y) in radians.
+    diameter : float
+        Outer diameter of the pupil in metres.
+    obscuration : float
+        Linear obscuration of the pupil over which planes are fitted.
+    remove : "none", "piston" or "tilt"
+        What is taken out of every direction; "tilt" includes the piston.
+
+    Raises
+    ------
+    ValueError
+        If there is not one height per layer.
+    """
+
+    def __init__(
+        self,
+        layers: Sequence[PlaneWaves],
+        heights: Sequence[float],
+        directions: np.ndarray,
+        diameter: float,
+        obscuration: float = 0.0,
+        remove: Removal = "tilt",
+    ) -> None:
+        if len(layers) != len(heights):
+            raise ValueError(f"{len(heights)} heights for {len(layers)} layers: must be as many")
+        frequency = np.concatenate([layer.frequency for layer in layers])
+        amplitude = np.concatenate([layer.amplitude for layer in layers])
+        height = np.repeat(np.asarray(heights, float), [len(w.amplitude) for w in layers])
+        shift = np.asarray(directions, float) @ (frequency * height[:, None]).T
+        self.wavevector = np.pi * diameter * frequency
+        self.coefficients = amplitude / (2.0 * np.pi) * np.exp(2j * np.pi * shift)
+        self.planes = (self.coefficients @ fitted_planes(self.wavevector, obscuration)).real
+        kept = {"none": 0, "piston": 1, "tilt": 3}[remove]
+        self.planes[:, kept:] = 0.0
+        # All directions look through the same part of a layer at height 0.
+        self._moving = np.flatnonzero(height != 0.0)
+        self._common = np.flatnonzero(height == 0.0)
+        self._cache: dict[tuple[bytes, str], tuple[np.ndarray, ...]] = {}
+
+    def __len__(self) -> int:
+        return len(self.coefficients)
+
+    def opd(self, index: np.ndarray, axis: np.ndarray, dtype: np.dtype) -> np.ndarray:
+        """OPD in waves of the directions `index`.
+
+        Parameters
+        ----------
+        index : ndarray of int, shape (b,)
+            Directions; one that is named several times is computed once.
+        axis : ndarray, shape (M,)
+            Coordinates in pupil radii along either axis.
+        dtype : float32 or float64
+            Precision of the products. Single precision costs about 1e-6 waves.
+
+        Returns
+        -------
+        ndarray, shape (b, M, M)
+            Indexed [y, x].
+        """
+        wanted, inverse = np.unique(index, return_inverse=True)
+        waves_y, waves_x, common = self._factors(axis, np.dtype(dtype))
+        coefficients = self.coefficients[:, self._moving].astype(waves_y.dtype)
+        out = np.empty((wanted.size, axis.size, axis.size), dtype)
+        for start in range(0, wanted.size, BLOCK):
+            part = wanted[start : start + BLOCK]
+            rows = _real_rows(coefficients[part, None, :] * waves_y)
+            out[start : start + BLOCK] = (rows @ waves_x).reshape(part.size, axis.size, -1)
+        piston, tilt_x, tilt_y = self.planes[wanted].T[:, :, None]
+        # The planes carry the tilts of thousands of waves: formed in float64, cast once.
+        out += common
+        out -= (piston + tilt_y * axis).astype(dtype)[:, :, None]
+        out -= (tilt_x * axis).astype(dtype)[:, None, :]
+        return out if wanted.size == np.size(index) and (wanted == index).all() else out[inverse]
+
+    def _factors(self, axis: np.ndarray, dtype: np.dtype) -> tuple[np.ndarray, ...]:
+        """exp(iκ_y y), the real matrix of exp(iκ_x x), and the OPD common to all directions."""
+        key = (np.asarray(axis).tobytes(), dtype.str)
+        if key not in self._cache:
+            kappa = self.wavevector[:, None, :] * axis[None, :, None]
+            x, y = np.moveaxis(np.exp(1j * kappa), -1, 0)
+            still = self.coefficients[0, self._common, None] * x[self._common]
+            common = (y[self._common].T @ still).real
+            moving = np.ascontiguousarray(y[self._moving].T)
+            # Re(a b) = Re a · Re b − Im a · Im b: the conjugate brings the sign.
+            across = _real_rows(np.ascontiguousarray(x[self._moving].T.conj())).T
+            complex_dtype = np.result_type(dtype, np.complex64)
+            self._cache[key] = (
+                moving.astype(complex_dtype),
+                np.ascontiguousarray(across, dtype=dtype),
+                common.astype(dtype),
+            )
+        return self._cache[key]
+
+
+def _real_rows(array: np.ndarray) -> np.ndarray:
+    """Complex (..., K) as real rows (·, 2K), real and imaginary parts interleaved."""
+    real = array.view(array.real.dtype)
+    return real.reshape(-1, real.shape[-1])

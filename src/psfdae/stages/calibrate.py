@@ -1,0 +1,169 @@
+"""Stages `scan` and `calibrate`: what the paper leaves open, fitted to its own rows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import ceil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from psfdae.evaluation.calibration import fit_scales, kappa_of_mse, original_noise_rows
+from psfdae.evaluation.metrics import mse, ssim
+from psfdae.files import read_product, write_text
+from psfdae.rng import stream
+from psfdae.stages.common import limit_threads, scene_module
+from psfdae.stars.fields import assign_fields
+from psfdae.stars.framing import normalise_flux, stamp_offset
+from psfdae.stars.noise import NoiseModel
+from psfdae.stars.scene import Propagation
+
+
+def scan(config: Any, dataset: str, out: Path) -> None:
+    """SSIM of a dataset's original-noise columns over pixel scale, r0 and dynamic range.
+
+    The noise of each column is scaled to the MSE that the paper prints, so that
+    only image structure and dynamic range are left to explain the SSIM.
+
+    Parameters
+    ----------
+    config : stage config (seed, scene … optics, noise, calibration)
+    dataset : one of the datasets that the paper tabulates
+    out : CSV, columns experiment, dataset, pixel_scale_arcsec, r0_m, noise_level,
+        data_range, ssim
+    """
+    import pandas as pd
+
+    limit_threads(config.optics.threads)
+    rows = original_noise_rows()
+    rows = rows[rows.dataset == dataset]
+    turbulent = config.scene.name == "turbulence"
+    table = []
+    for r0 in config.calibration.r0_m if turbulent else [float("nan")]:
+        for scale in config.calibration.pixel_scales_arcsec:
+            images = _images(config, scale, r0 if turbulent else None)
+            for row in rows.itertuples():
+                level = row.noise_level
+                noisy = _at_published_mse(images, row.mse, level, config)
+                table += [
+                    {
+                        "experiment": config.scene.experiment,
+                        "dataset": dataset,
+                        "pixel_scale_arcsec": scale,
+                        "r0_m": r0,
+                        "noise_level": level,
+                        "data_range": data_range,
+                        "ssim": ssim(noisy, images, data_range).mean(),
+                    }
+                    for data_range in config.calibration.data_ranges
+                ]
+    write_text(out, pd.DataFrame(table).to_csv(index=False, float_format="%.8g"))
+
+
+def _images(config: Any, scale: float, r0: float | None) -> np.ndarray:
+    """Noise-free, framed, normalised stars at another pixel scale (and r0)."""
+    telescope = config.telescope.model_copy(update={"pixel_scale_arcsec": scale})
+    search_px = ceil(config.stars.search_px * config.telescope.pixel_scale_arcsec / scale)
+    count, fields = config.calibration.stars, config.grid.points**2
+    scene = scene_module(config.scene.name)
+    if r0 is None:
+        star_field = assign_fields(count, fields, stream(config.seed, "scan", "field"))
+        source = scene.star_wavefronts(config, star_field)
+    else:
+        wavefront = config.wavefront.model_copy(update={"r0_m": r0})
+        source = scene.template_wavefronts(config.model_copy(update={"wavefront": wavefront}))
+    propagation = Propagation(source, telescope, config.optics, config.framing, search_px)
+    peak = propagation.brightest()
+    stamps = propagation.stamps(config.framing.stamp_px, stamp_offset(peak, 0 * peak))
+    return normalise_flux(stamps)[0]
+
+
+def _at_published_mse(
+    images: np.ndarray, published_mse: float, level: float, config: Any
+) -> np.ndarray:
+    background = config.noise.background_photons
+    kappa = float(kappa_of_mse(published_mse, level, images[0].size, background))
+    rng = stream(config.seed, "noise", "scan", f"{level:.6g}")
+    return NoiseModel(kappa, background).draw(images, level, rng)
+
+
+def calibrate(config: Any, scans: Sequence[Path], stars: dict[str, Path], out: Path) -> None:
+    """Fit κ, dynamic range and pixel scales; set the configured values beside them.
+
+    Parameters
+    ----------
+    config : stage config (seed, noise, evaluation)
+    scans : CSV files of the stage `scan`
+    stars : product "stars" of each tabulated dataset
+    out : folder that receives `fit.csv`, `columns.csv` and `degeneracy.csv`
+    """
+    import pandas as pd
+
+    limit_threads(config.evaluation.threads)
+    scan_table = pd.concat([pd.read_csv(path) for path in scans], ignore_index=True)
+    columns = pd.DataFrame(
+        [_column(row, stars[row.dataset], config) for row in original_noise_rows().itertuples()]
+    )
+    by_r0 = {r0: _fit_at(scan_table, r0) for r0 in sorted(scan_table.r0_m.dropna().unique())}
+    configured = _configured(stars)
+    fit = by_r0[configured["r0_m"]]
+    kappa = float(np.median(columns.kappa[columns.fitted]))
+    table = [
+        ("kappa", kappa, config.noise.kappa, "1"),
+        ("data_range", fit.data_range, config.evaluation.data_range, "1"),
+        ("pixel_scale_scene1", fit.pixel_scale["scene1"], configured["scene1"], "arcsec"),
+        ("pixel_scale_scene2", fit.pixel_scale["scene2"], configured["scene2"], "arcsec"),
+        ("ssim_residual_rms", fit.rms, float("nan"), "1"),
+    ]
+    degeneracy = [
+        (r0, other.pixel_scale["scene2"], other.data_range, other.rms)
+        for r0, other in by_r0.items()
+    ]
+    frames = {
+        "fit.csv": pd.DataFrame(table, columns=["quantity", "fitted", "configured", "unit"]),
+        "columns.csv": columns,
+        "degeneracy.csv": pd.DataFrame(
+            degeneracy, columns=["r0_m", "pixel_scale_scene2_arcsec", "data_range", "rms"]
+        ),
+    }
+    for name, frame in frames.items():
+        write_text(out / name, frame.to_csv(index=False, float_format="%.6g"))
+
+
+def _fit_at(scan_table, r0: float):  # type: ignore[no-untyped-def]
+    return fit_scales(scan_table[scan_table.r0_m.isna() | (scan_table.r0_m == r0)])
+
+
+def _configured(stars: dict[str, Path]) -> dict[str, float]:
+    """Pixel scales and r0 that the star products were simulated with."""
+    values: dict[str, float] = {}
+    for path in stars.values():
+        config = read_product(path, "stars", ()).config
+        values[config["scene"]["experiment"]] = config["telescope"]["pixel_scale_arcsec"]
+        if "r0_m" in config["wavefront"]:
+            values["r0_m"] = config["wavefront"]["r0_m"]
+    return values
+
+
+def _column(row: Any, path: Path, config: Any) -> dict[str, Any]:
+    """One original-noise column: the paper's values and ours, at κλ and at its own MSE."""
+    images = read_product(path, "stars", ("realisation",))["realisation"]
+    background = config.noise.background_photons
+    rng = stream(config.seed, "noise", "calibrate", row.dataset, f"{row.noise_level:.6g}")
+    noise = NoiseModel(config.noise.kappa, background)
+    ours = noise.draw(images, row.noise_level, rng)
+    matched = _at_published_mse(images, row.mse, row.noise_level, config)
+    data_range = config.evaluation.data_range
+    return {
+        "dataset": row.dataset,
+        "noise_level": row.noise_level,
+        "fitted": row.fitted,
+        "kappa": float(kappa_of_mse(row.mse, row.noise_level, images[0].size, background)),
+        "mse_paper": row.mse,
+        "mse": mse(ours, images).mean(),
+        "mse_ratio": mse(ours, images).mean() / row.mse,
+        "ssim_paper": row.ssim,
+        "ssim_at_published_mse": ssim(matched, images, data_range).mean(),
+        "ssim_at_kappa": ssim(ours, images, data_range).mean(),
+    }

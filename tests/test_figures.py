@@ -1,0 +1,301 @@
+"""Figures of scenes 1 and 2 from tiny synthetic inputs."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from psfdae.configuration.compose import load_stage
+from psfdae.evaluation.curves import error_against_noise, training_curves
+from psfdae.evaluation.figure_style import METHODS, in_field_unit
+from psfdae.evaluation.figures import (
+    StripRow,
+    mosaic,
+    restoration_strip,
+    spread_stars,
+    stamp_energy_map,
+    template_map,
+)
+from psfdae.evaluation.paper import published
+from psfdae.files import Column, ProductError, write_product
+from psfdae.rng import stream
+from psfdae.stages import figures as stage
+from psfdae.stars.fields import square_grid
+from psfdae.stars.noise import NoiseModel
+from psfdae.stars.splits import random_split
+
+LEVELS = (0.001, 0.002, 0.003, 0.005)
+
+
+def small_field(points=3, spacing_deg=1.1):
+    index, angle_deg = square_grid(points, spacing_deg)
+    return index, np.deg2rad(angle_deg)
+
+
+def one_bright_pixel(fields, bright, row, column, side=4):
+    psf = np.full((fields, side, side), 1e-6)
+    psf[:, 0, 0] = 1e-3
+    psf[bright] = 0.0
+    psf[bright, row, column] = 1.0
+    return psf
+
+
+def rgb_at(figure, axes, x, y):
+    """Colour that the drawn figure shows at data coordinates."""
+    figure.canvas.draw()
+    picture = np.asarray(figure.canvas.buffer_rgba())
+    column, row = axes.transData.transform((x, y))
+    return picture[picture.shape[0] - 1 - int(row), int(column), :3] / 255.0
+
+
+def metrics_table(splits=("random",), references=("realisation", "template"), dataset="dataset3"):
+    rows = [
+        (dataset, split, reference, method, level, metric, 10.0 * level + 0.01 * i, 1e-3, 7)
+        for split in splits
+        for reference in references
+        for i, method in enumerate(METHODS)
+        for level in LEVELS
+        for metric in ("mse", "ssim")
+    ]
+    names = "dataset split reference method noise_level metric value stderr n"
+    return pd.DataFrame(rows, columns=names.split())
+
+
+def legend_texts(legend):
+    return [text.get_text() for text in legend.get_texts()]
+
+
+def test_mosaic_places_stamps_unflipped():
+    index, _ = square_grid(3, 1.0)
+    stamps = np.arange(9 * 4.0).reshape(9, 2, 2)
+    canvas = mosaic(stamps, index, gap=1)
+    assert canvas.shape == (10, 10)
+    assert np.isnan(canvas[0]).all()
+    assert np.isnan(canvas[:, 3]).all()
+    field = 5  # ix = 2, iy = 1
+    assert (canvas[4:6, 7:9] == stamps[field]).all()
+
+
+def test_mosaic_leaves_missing_fields_empty():
+    canvas = mosaic(np.ones((2, 2, 2)), np.array([[0, 0], [1, 1]]), gap=0)
+    assert np.isnan(canvas[:2, 2:]).all()
+    assert np.nansum(canvas) == 8
+
+
+@pytest.mark.parametrize(("row", "column"), [(3, 0), (0, 3)])
+def test_template_map_shows_the_bright_pixel_where_it_belongs(row, column):
+    index, field = small_field()
+    bright = int(np.flatnonzero((index == [2, 0]).all(axis=1))[0])
+    figure = template_map(one_bright_pixel(9, bright, row, column), index, field, "templates")
+    axes = figure.axes[0]
+    assert axes.get_xlabel() == "field angle x (deg)"
+    assert axes.get_ylabel() == "field angle y (deg)"
+    x, y = np.rad2deg(field[bright])
+    pixel = 1.1 / 5  # four pixels and a gap per field
+    at = (x + (column - 1.5) * pixel, y + (row - 1.5) * pixel)
+    opposite = (x - (column - 1.5) * pixel, y - (row - 1.5) * pixel)
+    assert rgb_at(figure, axes, *at).min() > 0.7
+    assert rgb_at(figure, axes, *opposite).max() < 0.1
+
+
+def test_field_is_in_arcmin_if_small():
+    index, field = small_field(points=20, spacing_deg=0.02)
+    figure = template_map(np.ones((400, 4, 4)), index, field, "templates")
+    assert figure.axes[0].get_xlabel() == "field angle x (arcmin)"
+    assert len(figure.axes[0].images) == 1
+    values, unit = in_field_unit(np.deg2rad(np.array([0.5])))
+    assert unit == "arcmin"
+    assert values == pytest.approx([30.0])
+
+
+def test_energy_map_has_numbers_at_their_fields():
+    index, field = small_field()
+    energy = np.linspace(0.1, 0.9, 9)
+    figure = stamp_energy_map(energy, index, field, 16)
+    axes = figure.axes[0]
+    assert [text.get_text() for text in axes.texts] == [f"{value:.2f}" for value in energy]
+    assert axes.texts[2].get_position() == pytest.approx((1.1, -1.1))
+    assert (axes.images[0].get_array()[0] == energy[:3]).all()
+    assert "min 0.10, median 0.50, max 0.90" in axes.get_title()
+
+
+def test_large_energy_map_has_no_numbers():
+    index, field = small_field(points=20, spacing_deg=0.02)
+    assert not stamp_energy_map(np.linspace(0, 1, 400), index, field, 16).axes[0].texts
+
+
+def test_spread_stars_are_distinct_and_even():
+    index, _ = square_grid(11, 1.0)
+    position = np.repeat(index, 3, axis=0).astype(float)
+    picks = spread_stars(position, 8)
+    chosen = position[picks]
+    assert len(set(picks)) == 8
+    assert (spread_stars(position, 8) == picks).all()
+    assert (np.diff(chosen[:, 0]) >= 0).all()
+    for quadrant in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        assert ((chosen > 5) == quadrant).all(axis=1).any()
+    assert sorted(spread_stars(position[:2], 8)) == [0, 1]
+
+
+def test_strip_has_a_stamp_per_star_and_row(gaussian_stars):
+    truth = gaussian_stars[:3]
+    rows = [
+        StripRow("reference", truth),
+        StripRow("noisy\nλ = 0.001", 0.5 * truth, np.array([1e-6, 2.5e-5, 6.174e-4]), True),
+        StripRow("DAE\nλ = 0.001", 0.5 * truth, np.array([1e-6, 2e-6, 3e-6])),
+    ]
+    figure = restoration_strip(rows, ["a", "b", "c"], "stars")
+    assert len(figure.axes) == 9
+    shown = [axes.images[0].get_array() for axes in figure.axes]
+    assert shown[0].max() == pytest.approx(1.0)
+    assert shown[3].max() == pytest.approx(1.0)  # noisy: by its own maximum
+    assert shown[6].max() == pytest.approx(np.sqrt(0.5))
+    assert [axes.get_ylabel() for axes in figure.axes[::3]] == [row.label for row in rows]
+    assert [axes.get_xlabel() for axes in figure.axes[3:6]] == ["1.00", "25.0", "617"]
+    assert [axes.get_title() for axes in figure.axes[:3]] == ["a", "b", "c"]
+    assert not figure.axes[0].yaxis.get_inverted()
+
+
+def test_training_curves_draw_both_errors_and_the_kept_network():
+    history = pd.DataFrame(
+        {
+            "step": [10, 20, 30, 40],
+            "train_mse": [8e-5, 4e-5, 2e-5, 1e-5],
+            "validation_mse": [np.nan, 3e-5, np.nan, 5e-5],
+        }
+    )
+    figure = training_curves({"one": history, "two": 2 * history}, "training")
+    axes = figure.axes[0]
+    assert len(axes.lines) == 6
+    assert axes.get_yscale() == "log"
+    assert list(axes.lines[1].get_xdata()) == [20, 40]
+    assert list(axes.lines[2].get_xdata()) == [20]
+    assert axes.get_xlabel() == "optimiser step"
+    assert {"one", "two", "kept network"} <= set(legend_texts(axes.get_legend()))
+
+
+@pytest.mark.parametrize("metric", ["mse", "ssim"])
+def test_errors_of_both_references_with_the_papers_points(metric):
+    figure = error_against_noise(metrics_table(), published("psf"), "dataset3", metric)
+    assert len(figure.axes) == 2
+    for axes in figure.axes:
+        assert len(axes.containers) == len(METHODS)
+        papers = [line for line in axes.lines if line.get_markerfacecolor() == "none"]
+        assert len(papers) == 3
+        assert [tick.get_text() for tick in axes.get_xticklabels()] == ["1", "2", "3", "5"]
+        assert "noise level λ" in axes.get_xlabel()
+    assert figure.axes[0].get_yscale() == ("log" if metric == "mse" else "linear")
+    texts = legend_texts(figure.legends[0])
+    assert "linear MMSE (told λ)" in texts
+    assert "DAE, paper" in texts
+
+
+def test_held_out_is_dashed_and_unpublished_datasets_have_no_paper():
+    table = metrics_table(("random", "held_out"), ("realisation",), "dataset1")
+    figure = error_against_noise(table, published("psf"), "dataset1", "mse")
+    (axes,) = figure.axes
+    styles = [container.lines[0].get_linestyle() for container in axes.containers]
+    assert styles.count("-") == styles.count("--") == len(METHODS)
+    assert not any("paper" in text for text in legend_texts(figure.legends[0]))
+    assert legend_texts(axes.get_legend()) == ["random test stars", "stars of held-out fields"]
+
+
+def test_stages_write_the_same_bytes_twice(tmp_path):
+    index, field = small_field()
+    columns = {
+        "psf": Column(one_bright_pixel(9, 0, 2, 2, side=6), "1", "stamps"),
+        "energy": Column(np.linspace(0.1, 0.9, 9), "1", "light"),
+        "grid": Column(index, "1", "grid"),
+        "field": Column(field, "rad", "field"),
+    }
+    config = {"framing": {"jitter_px": 1, "stamp_px": 4}, "scene": {"name": "seidel"}}
+    write_product(tmp_path / "t.h5", "templates", columns, config)
+    metrics_table().to_csv(tmp_path / "m.csv", index=False)
+    history = pd.DataFrame({"step": [1, 2], "train_mse": [2e-5, 1e-5], "validation_mse": 1e-5})
+    history.to_csv(tmp_path / "h.csv", index=False)
+    draws = {
+        "templates": lambda out: stage.templates(tmp_path / "t.h5", out),
+        "energy": lambda out: stage.energy(tmp_path / "t.h5", out),
+        "curves": lambda out: stage.curves([tmp_path / "h.csv"], ["one"], out),
+        "errors": lambda out: stage.errors([tmp_path / "m.csv"], "dataset3", "mse", out),
+    }
+    for name, draw in draws.items():
+        one, two = tmp_path / f"{name}_1.png", tmp_path / f"{name}_2.png"
+        draw(one)
+        draw(two)
+        assert one.read_bytes() == two.read_bytes()
+        assert one.read_bytes().startswith(b"\x89PNG")
+    assert not list(tmp_path.glob(".*.tmp"))
+
+
+def test_a_users_matplotlibrc_changes_nothing(tmp_path):
+    import matplotlib
+
+    def draw(out):
+        stage.write_png(
+            error_against_noise(metrics_table(), published("psf"), "dataset3", "mse"), out
+        )
+
+    draw(tmp_path / "plain.png")
+    with matplotlib.rc_context({"font.size": 20, "axes.facecolor": "red", "lines.linewidth": 9}):
+        draw(tmp_path / "odd.png")
+    assert (tmp_path / "plain.png").read_bytes() == (tmp_path / "odd.png").read_bytes()
+
+
+def test_strip_shows_the_noise_that_evaluate_measures(tmp_path, gaussian_stars, monkeypatch):
+    index, _ = square_grid(5, 1.1)
+    columns = {
+        "realisation": Column(gaussian_stars, "1", "stars"),
+        "template": Column(gaussian_stars[::-1].copy(), "1", "templates"),
+        "field_index": Column(np.arange(300) % 25, "1", "field"),
+        "grid": Column(index, "1", "grid"),
+    }
+    grid = {"points": 5, "spacing_deg": 1.1, "edge_deg": 2.2}
+    write_product(tmp_path / "s.h5", "stars", columns, {"grid": grid})
+    config = load_stage(
+        "evaluate", ("dataset=dataset3", "parts.train_stars=200", "parts.test_stars=100")
+    )
+    shown = {}
+    monkeypatch.setattr(stage.baseline, "load", lambda path: SimpleNamespace(predict=lambda x: x))
+    monkeypatch.setattr(stage, "dae_predictor", lambda folder, config: lambda x, level: x)
+    monkeypatch.setattr(
+        "psfdae.evaluation.figures.restoration_strip",
+        lambda rows, columns, title: shown.update(rows=rows, columns=columns, title=title),
+    )
+    monkeypatch.setattr(stage, "write_png", lambda figure, out: None)
+    files = (tmp_path / "s.h5", tmp_path / "p.h5", tmp_path / "dae")
+    stage.strip(config, "dataset3", *files, "template", [0.002], tmp_path / "strip.png")
+    labels = [row.label.replace("\n", " ") for row in shown["rows"]]
+    models = ["noisy λ = 0.002", "PCA+SOM λ = 0.002", "DAE λ = 0.002"]
+    assert labels == ["reference", "star without noise", *models]
+    assert [row.own_scale for row in shown["rows"]] == [False, False, True, False, False]
+    test = random_split(300, 200, 100, config.parts.validation_fraction, config.seed).test
+    rng = stream(config.seed, "noise", "test", "0.002")
+    noise = NoiseModel(config.noise.kappa, config.noise.background_photons)
+    expected = noise.draw(gaussian_stars[test], 0.002, rng)
+    for image in shown["rows"][2].images:
+        assert (expected == image).all(axis=(1, 2)).any()
+    assert len(shown["columns"]) == 8
+    assert "deg" in shown["title"]
+
+
+def test_refusals_name_the_problem(tmp_path):
+    metrics_table().to_csv(tmp_path / "m.csv", index=False)
+    with pytest.raises(ProductError, match="no rows of dataset5, mse"):
+        stage.errors([tmp_path / "m.csv"], "dataset5", "mse", tmp_path / "e.png")
+    (tmp_path / "h.csv").write_text("step,train_mse\n1,2\n")
+    with pytest.raises(ProductError, match="validation_mse"):
+        stage.curves([tmp_path / "h.csv"], ["one"], tmp_path / "c.png")
+    with pytest.raises(ProductError, match="1 histories, but 2 labels"):
+        stage.curves([tmp_path / "h.csv"], ["one", "two"], tmp_path / "c.png")
+    assert not list(tmp_path.glob("*.png"))
+
+
+def test_importing_the_stage_does_not_import_matplotlib():
+    code = "import sys, psfdae.stages.figures; sys.exit('matplotlib' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

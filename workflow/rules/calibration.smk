@@ -1,0 +1,56 @@
+rule scan:
+    output:
+        f"{RESULTS}/calibration/scan_{{dataset}}.csv",
+    log:
+        f"{RESULTS}/logs/scan/{{dataset}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/scan/{{dataset}}.tsv"
+    threads: lambda w: dataset_config(w.dataset).optics.threads
+    resources:
+        mem_mb=1000,
+    params:
+        config=lambda w: stage_overrides("scan", f"dataset={w.dataset}"),
+        source=lambda w: source_hash(
+            "psfdae.stages.calibrate",
+            f"psfdae.stars.{dataset_config(w.dataset).scene.name}_scene",
+        ),
+    message:
+        "Scanning pixel scales and dynamic ranges for {wildcards.dataset}"
+    shell:
+        "psfdae scan --dataset {wildcards.dataset} --out {output} {params.config:q}"
+        " > {log} 2>&1"
+
+
+rule calibrate:
+    input:
+        scans=expand(rules.scan.output, dataset=TABULATED),
+        stars=[stars_of(dataset) for dataset in TABULATED],
+    output:
+        multiext(
+            f"{RESULTS}/calibration/",
+            fit="fit.csv",
+            columns="columns.csv",
+            degeneracy="degeneracy.csv",
+        ),
+    log:
+        f"{RESULTS}/logs/calibrate/all.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/calibrate/all.tsv"
+    threads: lambda w: dataset_config(TABULATED[0]).evaluation.threads
+    resources:
+        mem_mb=1500,
+    params:
+        config=lambda w: stage_overrides("calibrate", f"dataset={TABULATED[0]}"),
+        source=source_hash("psfdae.stages.calibrate"),
+        folder=subpath(output.fit, parent=True),
+        scans=lambda w, input: [f"--scan={path}" for path in input.scans],
+        stars=lambda w, input: [
+            word
+            for dataset, path in zip(TABULATED, input.stars)
+            for word in ("--stars", dataset, path)
+        ],
+    message:
+        "Fitting noise, dynamic range and pixel scales to the paper"
+    shell:
+        "psfdae calibrate --out {params.folder} {params.scans:q} {params.stars:q}"
+        " {params.config:q} > {log} 2>&1"

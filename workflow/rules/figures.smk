@@ -1,0 +1,143 @@
+rule figure_templates:
+    input:
+        rules.templates.output,
+    output:
+        report(
+            f"{RESULTS}/figures/{{scene}}/templates.png",
+            caption="../report/figure_templates.rst",
+            category=category_of,
+            labels={"data": "{scene}", "figure": "static PSFs"},
+        ),
+    log:
+        f"{RESULTS}/logs/figures/{{scene}}/templates.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/figure_templates/{{scene}}.tsv"
+    threads: 1
+    resources:
+        mem_mb=500,
+    params:
+        source=source_hash("psfdae.stages.figures"),
+    message:
+        "Drawing the static PSFs of scene {wildcards.scene}"
+    shell:
+        "psfdae figure templates --templates {input} --out {output} > {log} 2>&1"
+
+
+rule figure_energy:
+    input:
+        rules.templates.output,
+    output:
+        report(
+            f"{RESULTS}/figures/{{scene}}/energy.png",
+            caption="../report/figure_energy.rst",
+            category=category_of,
+            labels={"data": "{scene}", "figure": "light in the stamp"},
+        ),
+    log:
+        f"{RESULTS}/logs/figures/{{scene}}/energy.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/figure_energy/{{scene}}.tsv"
+    threads: 1
+    resources:
+        mem_mb=500,
+    params:
+        source=source_hash("psfdae.stages.figures"),
+    message:
+        "Drawing the light inside the stamps of scene {wildcards.scene}"
+    shell:
+        "psfdae figure energy --templates {input} --out {output} > {log} 2>&1"
+
+
+rule figure_strip:
+    input:
+        stars=lambda w: stars_of(w.dataset),
+        pca_som=f"{RESULTS}/pca_som/{{dataset}}/random.h5",
+        dae=f"{RESULTS}/dae/{{dataset}}/random-{{reference}}/dae.safetensors",
+        dae_config=f"{RESULTS}/dae/{{dataset}}/random-{{reference}}/config.yaml",
+    output:
+        report(
+            f"{RESULTS}/figures/{{dataset}}/strip_{{reference}}.png",
+            caption="../report/figure_strip.rst",
+            category=category_of,
+            labels={"data": "{dataset}", "figure": "restored stars, {reference}"},
+        ),
+    log:
+        f"{RESULTS}/logs/figures/{{dataset}}/strip_{{reference}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/figure_strip/{{dataset}}-{{reference}}.tsv"
+    threads: lambda w: dataset_config(w.dataset).evaluation.threads
+    resources:
+        mem_mb=1000,
+    params:
+        config=lambda w: stage_overrides("evaluate", f"dataset={w.dataset}"),
+        source=source_hash("psfdae.stages.figures"),
+        dae=subpath(input.dae, parent=True),
+        levels=lambda w: [
+            f"--level={level:g}"
+            for level in dataset_config(w.dataset).dataset.shown_levels
+        ],
+    message:
+        "Drawing restored stars of {wildcards.dataset}, {wildcards.reference}"
+    shell:
+        "psfdae figure strip --dataset {wildcards.dataset}"
+        " --reference {wildcards.reference} --stars {input.stars}"
+        " --pca-som {input.pca_som} --dae {params.dae} {params.levels}"
+        " --out {output} {params.config:q} > {log} 2>&1"
+
+
+rule figure_curves:
+    input:
+        lambda w: [
+            f"{RESULTS}/dae/{w.dataset}/{split}-{reference}/history.csv"
+            for split, reference in networks_of(w.dataset)
+        ],
+    output:
+        report(
+            f"{RESULTS}/figures/{{dataset}}/curves.png",
+            caption="../report/figure_curves.rst",
+            category=category_of,
+            labels={"data": "{dataset}", "figure": "training"},
+        ),
+    log:
+        f"{RESULTS}/logs/figures/{{dataset}}/curves.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/figure_curves/{{dataset}}.tsv"
+    threads: 1
+    resources:
+        mem_mb=500,
+    params:
+        labels=lambda w: [
+            f"--label={w.dataset}, {split}, {reference}"
+            for split, reference in networks_of(w.dataset)
+        ],
+        source=source_hash("psfdae.stages.figures"),
+    message:
+        "Drawing the training curves of {wildcards.dataset}"
+    shell:
+        "psfdae figure curves {params.labels:q} --out {output} {input} > {log} 2>&1"
+
+
+rule figure_errors:
+    input:
+        lambda w: evaluations_of(w.dataset),
+    output:
+        report(
+            f"{RESULTS}/figures/{{dataset}}/errors_{{metric}}.png",
+            caption="../report/figure_errors.rst",
+            category=category_of,
+            labels={"data": "{dataset}", "figure": "{metric} against noise"},
+        ),
+    log:
+        f"{RESULTS}/logs/figures/{{dataset}}/errors_{{metric}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/figure_errors/{{dataset}}-{{metric}}.tsv"
+    threads: 1
+    resources:
+        mem_mb=500,
+    params:
+        source=source_hash("psfdae.stages.figures"),
+    message:
+        "Drawing {wildcards.metric} of {wildcards.dataset} against the noise level"
+    shell:
+        "psfdae figure errors --dataset {wildcards.dataset} --metric {wildcards.metric}"
+        " --out {output} {input} > {log} 2>&1"

@@ -1,0 +1,28 @@
+rule track:
+    input:
+        stars=lambda w: stars_of(w.dataset),
+        evaluations=lambda w: evaluations_of(w.dataset),
+        figures=lambda w: figures_of(w.dataset),
+    output:
+        f"{RESULTS}/mlflow/{{dataset}}.csv",
+    log:
+        f"{RESULTS}/logs/track/{{dataset}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/track/{{dataset}}.tsv"
+    # SQLite takes one machine; jobs that meet on it wait for each other.
+    localrule: True
+    threads: 1
+    resources:
+        mem_mb=500,
+    params:
+        results=RESULTS,
+        preset=PRESET,
+        # Not an output: Snakemake would delete it, and with it the runs of older configs.
+        database=f"{RESULTS}/mlflow.db",
+        source=source_hash("psfdae.stages.track"),
+    message:
+        "Importing the runs of {wildcards.dataset} into MLflow"
+    shell:
+        "psfdae track --results {params.results} --preset {params.preset}"
+        " --database {params.database} --stars {wildcards.dataset} {input.stars}"
+        " --out {output} > {log} 2>&1"
