@@ -40,11 +40,12 @@ $(VENV)/.complete: requirements.lock pyproject.toml
 	$(PIP) install --quiet --no-deps --no-build-isolation --editable .
 	touch $@
 
-reproduce: env ## Build everything of the preset: datasets, models, tables
+reproduce: env ## Build everything of the preset: datasets, models, tables, report
 	@sh workflow/locked.sh $(SNAKEMAKE) -- $(TARGETS)
+	@$(MAKE) --no-print-directory report
 
-report: env ## Write results/report.html for what reproduce has built
-	$(SNAKEMAKE) --report results/report.html $(TARGETS)
+report: env ## Gather the figures of a finished run in results/report.html
+	$(SNAKEMAKE) --report $(RESULTS)/report.html -- $(TARGETS)
 
 mlflow: env ## Compare the tracked runs in a browser (PORT=n)
 	@test -f $(RESULTS)/mlflow.db || { echo "no $(RESULTS)/mlflow.db yet: make reproduce"; exit 1; }
@@ -70,10 +71,10 @@ format: env ## Format Python and Snakemake files
 	snakefmt Snakefile workflow
 
 test: lint ## Lint, unit tests and the smoke workflow
-	pytest -m "not slow"
+	pytest -m "not slow" --junitxml results/tests.xml
 
-test-all: lint ## The tests and the slow ones
-	pytest
+test-all: test ## The tests, then the slow ones
+	pytest -m slow
 
 lock: env ## Renew requirements.lock from pyproject.toml
 	uv pip compile --quiet --upgrade --universal --python-version 3.11 --generate-hashes \

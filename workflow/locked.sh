@@ -9,6 +9,9 @@ if command -v flock >/dev/null 2>&1; then
         echo "Another run is active in this folder; waiting for it to end." >&2
         flock 9
     fi
-    snakemake --unlock --cores 1 >/dev/null 2>&1 || true
+    program=$1
+    shift
+    "$program" --unlock "$@" >/dev/null 2>&1 || true
+    set -- "$program" "$@"
 fi
 exec "$@"

@@ -1,9 +1,10 @@
-"""What code a stage consists of, so that a workflow reruns it when that code changes."""
+"""What code a stage consists of, and which commit it is: a workflow reruns what changed."""
 
 from __future__ import annotations
 
 import ast
 import hashlib
+import subprocess
 from functools import cache
 from pathlib import Path
 
@@ -78,3 +79,21 @@ def _code(module: str) -> str:
             if isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant):
                 node.body = node.body[1:] or [ast.Pass()]
     return ast.dump(tree)
+
+
+def git_commit() -> str:
+    """Commit of the source tree; "-dirty" if it differs from it, "unknown" outside git."""
+    root = ROOT.parents[1]
+
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(root), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+    try:
+        # Installed into an environment inside somebody else's repository, it is not ours.
+        if Path(git("rev-parse", "--show-toplevel")).resolve() != root:
+            return "unknown"
+        dirty = "-dirty" if git("status", "--porcelain", "--untracked-files=no") else ""
+        return git("rev-parse", "HEAD") + dirty
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"

@@ -30,6 +30,7 @@ rule calibrate:
             f"{RESULTS}/calibration/",
             fit="fit.csv",
             columns="columns.csv",
+            scales="scales.csv",
             degeneracy="degeneracy.csv",
         ),
     log:

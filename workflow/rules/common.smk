@@ -1,3 +1,4 @@
+import glob
 import shlex
 from functools import cache
 

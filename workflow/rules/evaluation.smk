@@ -31,7 +31,12 @@ rule paper_tables:
     input:
         lambda w: evaluations_of(w.dataset, ["random"]),
     output:
-        csv=f"{RESULTS}/tables/{{dataset}}_{{metric}}.csv",
+        csv=report(
+            f"{RESULTS}/tables/{{dataset}}_{{metric}}.csv",
+            caption="../report/paper_tables.rst",
+            category=category_of,
+            labels={"data": "{dataset}", "figure": "table of {metric}"},
+        ),
         markdown=f"{RESULTS}/tables/{{dataset}}_{{metric}}.md",
     log:
         f"{RESULTS}/logs/tables/{{dataset}}_{{metric}}.log",

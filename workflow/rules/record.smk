@@ -28,6 +28,8 @@ rule reference:
         rules.runtime.output,
         [file for dataset in TABULATED for file in paper_tables_of(dataset)],
         [file for dataset in default_datasets() for file in figures_of(dataset)],
+        # Rows of the preset paper, where it has been run.
+        glob.glob(f"{RESULTS}/paper/tables/psf_metrics.csv"),
     output:
         touch(f"{RESULTS}/.reference_renewed"),
     log:

@@ -100,6 +100,30 @@ def fit_scales(scan: pd.DataFrame) -> ScaleFit:
     return ScaleFit(float(np.exp(found.x[0])), scale, rms)
 
 
+def residuals_by_scale(scan: pd.DataFrame, data_range: float) -> pd.DataFrame:
+    """How well each scanned pixel scale explains the rows at one dynamic range.
+
+    Returns
+    -------
+    DataFrame
+        Columns experiment, r0_m, pixel_scale_arcsec, rms, largest (SSIM).
+    """
+    rows = original_noise_rows()
+    rows = rows[rows.fitted]
+    table = []
+    for (experiment, r0), part in scan.groupby(["experiment", "r0_m"], dropna=False):
+        columns = rows[rows.dataset.isin(part.dataset)]
+        surfaces = [_surface(part, row.dataset, row.noise_level) for row in columns.itertuples()]
+        for scale in sorted(part.pixel_scale_arcsec.unique()):
+            residual = np.array([s(scale, data_range) for s in surfaces]) - columns.ssim
+            table.append(
+                (experiment, r0, scale, np.sqrt((residual**2).mean()), np.abs(residual).max())
+            )
+    return pd.DataFrame(
+        table, columns=["experiment", "r0_m", "pixel_scale_arcsec", "rms", "largest"]
+    )
+
+
 def _surface(scan: pd.DataFrame, dataset: str, level: float):  # type: ignore[no-untyped-def]
     """SSIM of one column as a smooth function of pixel scale and dynamic range."""
     from scipy.interpolate import RectBivariateSpline

@@ -9,7 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from psfdae.evaluation.calibration import fit_scales, kappa_of_mse, original_noise_rows
+from psfdae.evaluation.calibration import (
+    fit_scales,
+    kappa_of_mse,
+    original_noise_rows,
+    residuals_by_scale,
+)
 from psfdae.evaluation.metrics import mse, ssim
 from psfdae.files import read_product, write_text
 from psfdae.rng import stream
@@ -96,7 +101,7 @@ def calibrate(config: Any, scans: Sequence[Path], stars: dict[str, Path], out: P
     config : stage config (seed, noise, evaluation)
     scans : CSV files of the stage `scan`
     stars : product "stars" of each tabulated dataset
-    out : folder that receives `fit.csv`, `columns.csv` and `degeneracy.csv`
+    out : folder that receives `fit.csv`, `columns.csv`, `scales.csv`, `degeneracy.csv`
     """
     import pandas as pd
 
@@ -108,7 +113,8 @@ def calibrate(config: Any, scans: Sequence[Path], stars: dict[str, Path], out: P
     by_r0 = {r0: _fit_at(scan_table, r0) for r0 in sorted(scan_table.r0_m.dropna().unique())}
     configured = _configured(stars)
     fit = by_r0[configured["r0_m"]]
-    kappa = float(np.median(columns.kappa[columns.fitted]))
+    # Least squares of log MSE: every column counts alike.
+    kappa = float(np.exp(np.log(columns.kappa[columns.fitted]).mean()))
     table = [
         ("kappa", kappa, config.noise.kappa, "1"),
         ("data_range", fit.data_range, config.evaluation.data_range, "1"),
@@ -123,6 +129,7 @@ def calibrate(config: Any, scans: Sequence[Path], stars: dict[str, Path], out: P
     frames = {
         "fit.csv": pd.DataFrame(table, columns=["quantity", "fitted", "configured", "unit"]),
         "columns.csv": columns,
+        "scales.csv": residuals_by_scale(scan_table, config.evaluation.data_range),
         "degeneracy.csv": pd.DataFrame(
             degeneracy, columns=["r0_m", "pixel_scale_scene2_arcsec", "data_range", "rms"]
         ),

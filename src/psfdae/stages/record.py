@@ -7,16 +7,18 @@ import json
 import os
 import platform
 import shutil
-import subprocess
+import sys
 import time
 from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 
 from psfdae.files import ProductError, write_text
+from psfdae.source import git_commit
 
 VERSIONED = ("psfdae", "numpy", "scipy", "torch", "scikit-image", "scikit-learn", "minisom")
 """Packages whose versions can change a number; recorded with the run."""
@@ -76,13 +78,8 @@ def reference(results: Path, config: Any, files: Sequence[Path], out: Path) -> N
 
 
 def provenance(results: Path, config: Any) -> dict[str, Any]:
-    """Where a run comes from and what it took.
-
-    The wall time counts from the start of the first job to the end of the last.
-    """
+    """Where a run comes from and what it took."""
     costs = _costs(results)
-    ends = {path: path.stat().st_mtime for path in (results / "benchmarks").rglob("*.tsv")}
-    starts = [end - _seconds(path) for path, end in ends.items()]
     canonical = json.dumps(config.model_dump(), sort_keys=True)
     return {
         "commit": git_commit(),
@@ -97,18 +94,13 @@ def provenance(results: Path, config: Any) -> dict[str, Any]:
             "evaluation": config.evaluation.threads,
         },
         "matrix_product_gflops": round(matrix_product_speed(), 1),
-        "wall_s": round(max(ends.values()) - min(starts), 1),
+        "wall_s": round(_busy_seconds(results), 1),
+        **_installation(),
+        "results_mb": round(_size_mb(results), 1),
+        "tests_s": _test_seconds(results / "tests.xml"),
         "cpu_s": round(float(costs.cpu_s.sum()), 1),
         "peak_mb": round(float(costs.peak_mb.max()), 1),
     }
-
-
-def git_commit() -> str:
-    """Commit of the source tree, with `-dirty` if files differ; "unknown" outside git."""
-    source = Path(__file__).resolve().parent
-    command = ["git", "-C", str(source), "describe", "--always", "--abbrev=40", "--dirty"]
-    result = subprocess.run(command, capture_output=True, text=True, check=False)
-    return result.stdout.strip() or "unknown"
 
 
 def matrix_product_speed(size: int = 1024, repeats: int = 5) -> float:
@@ -123,6 +115,40 @@ def matrix_product_speed(size: int = 1024, repeats: int = 5) -> float:
         a @ a
         best = min(best, time.perf_counter() - start)
     return 2.0 * size**3 / best / 1e9
+
+
+def _busy_seconds(results: Path) -> float:
+    """Wall time during which at least one job ran; a later visit adds its own time only."""
+    files = (results / "benchmarks").rglob("*.tsv")
+    spans = sorted((p.stat().st_mtime - _seconds(p), p.stat().st_mtime) for p in files)
+    busy, until = 0.0, float("-inf")
+    for start, end in spans:
+        busy += max(0.0, end - max(start, until))
+        until = max(until, end)
+    return busy
+
+
+def _installation() -> dict[str, float]:
+    """Time and disk of the environment that `make` created, as its files tell."""
+    environment = Path(sys.prefix)
+    start, end = environment / "pyvenv.cfg", environment / ".complete"
+    if not (start.is_file() and end.is_file()):
+        return {}
+    seconds = end.stat().st_mtime - start.stat().st_mtime
+    return {"install_s": round(seconds, 1), "environment_mb": round(_size_mb(environment), 1)}
+
+
+def _size_mb(folder: Path) -> float:
+    files = (path for path in folder.rglob("*") if path.is_file() and not path.is_symlink())
+    return sum(path.stat().st_size for path in files) / 1e6
+
+
+def _test_seconds(report: Path) -> float | None:
+    """Wall time of the last `make test`, from its JUnit report."""
+    if not report.is_file():
+        return None
+    suite = ElementTree.parse(report).getroot().find("testsuite")
+    return None if suite is None else round(float(suite.get("time", "nan")), 1)
 
 
 def _seconds(benchmark: Path) -> float:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import csv
 import io
 import os
-import subprocess
 import tempfile
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -20,6 +19,7 @@ from typing import Any
 import psfdae
 from psfdae.files import atomic_path, write_text
 from psfdae.runs import Entry, Record, flatten, read
+from psfdae.source import git_commit
 
 SLOT = ("kind", "dataset", "split", "reference", "preset", "source")
 """Tags that name a place in the results folder; with `config_hash` they name a run."""
@@ -69,7 +69,7 @@ def run(
     os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "1")
     uri = os.environ.get("MLFLOW_TRACKING_URI", "")
     records = [read(entry) for entry in entries]
-    tags = {"preset": preset, "commit": _commit(), "psfdae_version": psfdae.__version__}
+    tags = {"preset": preset, "commit": git_commit(), "psfdae_version": psfdae.__version__}
     done: list[tuple[str, str]] = []
     with _alone(database):
         try:
@@ -220,24 +220,6 @@ def _tags(record: Record) -> dict[str, str]:
 
 def _slot(tags: dict[str, str]) -> tuple[str, ...]:
     return tuple(tags.get(key, "") for key in SLOT)
-
-
-def _commit() -> str:
-    """Commit of the source tree; "-dirty" if it differs from it, "unknown" outside git."""
-    root = Path(psfdae.__file__).resolve().parents[2]
-
-    def git(*arguments: str) -> str:
-        command = ["git", "-C", str(root), *arguments]
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
-
-    try:
-        # Installed into an environment inside somebody else's repository, it is not ours.
-        if Path(git("rev-parse", "--show-toplevel")).resolve() != root:
-            return "unknown"
-        dirty = "-dirty" if git("status", "--porcelain", "--untracked-files=no") else ""
-        return git("rev-parse", "HEAD") + dirty
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown"
 
 
 def _ours_to_explain(error: Exception) -> bool:

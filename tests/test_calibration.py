@@ -1,0 +1,79 @@
+"""The fit of what the paper leaves open."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from psfdae.evaluation.calibration import (
+    fit_scales,
+    kappa_of_mse,
+    original_noise_rows,
+    residuals_by_scale,
+)
+
+
+def model(level, scale, data_range):
+    """A smooth stand-in for the SSIM of noisy stamps."""
+    return 1.0 / (1.0 + 30.0 * level / data_range * (0.5 + scale))
+
+
+@pytest.fixture
+def rows(monkeypatch):
+    """The paper's columns with SSIM values that range 0.7 and scales 0.11, 0.16 explain."""
+    import psfdae.evaluation.calibration as module
+
+    table = original_noise_rows()
+    scale = np.where(table.dataset == "dataset8", 0.16, 0.11)
+    table["ssim"] = model(table.noise_level, scale, 0.7)
+    monkeypatch.setattr(module, "original_noise_rows", lambda: table)
+    return table
+
+
+@pytest.fixture
+def scan(rows):
+    grid = [
+        {
+            "experiment": "scene2" if row.dataset == "dataset8" else "scene1",
+            "dataset": row.dataset,
+            "pixel_scale_arcsec": scale,
+            "r0_m": 0.2 if row.dataset == "dataset8" else np.nan,
+            "noise_level": row.noise_level,
+            "data_range": data_range,
+            "ssim": model(row.noise_level, scale, data_range),
+        }
+        for row in rows.itertuples()
+        for scale in (0.06, 0.08, 0.1, 0.12, 0.15, 0.2)
+        for data_range in (0.5, 0.6, 0.7, 0.85, 1.0)
+    ]
+    return pd.DataFrame(grid)
+
+
+def test_paper_has_twelve_columns_and_one_outlier():
+    rows = original_noise_rows()
+    assert len(rows) == 12
+    outlier = rows[~rows.fitted]
+    assert outlier[["dataset", "noise_level"]].to_numpy().tolist() == [["dataset8", 0.002]]
+
+
+def test_kappa_of_the_noise_model_s_own_error(noise, gaussian_stars):
+    level = 3e-5
+    expected = noise.variance(gaussian_stars, level).mean()
+    assert kappa_of_mse(expected, level, 256, noise.background) == pytest.approx(4.98, rel=1e-6)
+
+
+def test_fit_recovers_range_and_scales(scan):
+    fit = fit_scales(scan)
+    assert fit.rms < 1e-3
+    # Range and scale act alike on these rows; their combined effect is what is fixed.
+    for experiment, scale in (("scene1", 0.11), ("scene2", 0.16)):
+        effect = (0.5 + fit.pixel_scale[experiment]) / fit.data_range
+        assert effect == pytest.approx((0.5 + scale) / 0.7, rel=5e-3)
+
+
+def test_best_scanned_scale_has_the_smallest_residual(scan):
+    table = residuals_by_scale(scan, 0.7)
+    best = table.loc[table.groupby("experiment").rms.idxmin()].set_index("experiment")
+    assert best.pixel_scale_arcsec["scene1"] in (0.1, 0.12)
+    assert best.pixel_scale_arcsec["scene2"] == 0.15

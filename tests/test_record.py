@@ -1,0 +1,117 @@
+"""Run costs, the run of record, and the pages made from it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from psfdae.configuration.compose import load
+from psfdae.files import ProductError
+from psfdae.stages import docs, record
+
+ROOT = Path(__file__).resolve().parents[1]
+REFERENCE = ROOT / "results/reference"
+TEMPLATES = ROOT / "docs/templates"
+
+
+@pytest.fixture
+def results(tmp_path):
+    """A finished run with two jobs and one table."""
+    header = "s\th:m:s\tmax_rss\tmax_vms\tmax_uss\tmax_pss\tio_in\tio_out\tmean_load\tcpu_time\n"
+    for name, seconds in (("train/dataset3/random-template", 12.5), ("runtime/all", 0.4)):
+        path = tmp_path / "results/benchmarks" / f"{name}.tsv"
+        path.parent.mkdir(parents=True)
+        memory = "-" if seconds < 1 else "812.5"
+        row = f"{seconds}\t0:00:12\t{memory}\t1\t1\t1\t0\t0\t99\t{2 * seconds}\n"
+        path.write_text(header + row)
+    table = tmp_path / "results/tables/t.csv"
+    table.parent.mkdir()
+    table.write_text("a\n1\n")
+    return tmp_path / "results"
+
+
+def test_runtime_lists_every_job(results, tmp_path):
+    record.runtime(results, tmp_path / "runtime.csv")
+    table = pd.read_csv(tmp_path / "runtime.csv")
+    assert list(table.columns) == ["rule", "wildcards", "wall_s", "cpu_s", "peak_mb"]
+    row = table.set_index("rule").loc["train"]
+    assert (row.wildcards, row.wall_s, row.cpu_s) == ("dataset3/random-template", 12.5, 25.0)
+    assert row.peak_mb == 812.5
+
+
+def test_reference_keeps_the_layout_and_says_where_it_comes_from(results, tmp_path):
+    out = tmp_path / "reference"
+    (out / "tables").mkdir(parents=True)
+    (out / "tables/old.csv").write_text("stale")
+    record.reference(results, load(), [results / "tables/t.csv"], out)
+    assert (out / "tables/t.csv").read_text() == "a\n1\n"
+    assert not (out / "tables/old.csv").exists()
+    provenance = json.loads((out / "provenance.json").read_text())
+    assert provenance["peak_mb"] == 812.5
+    assert provenance["cpu_s"] == pytest.approx(25.8)
+    assert provenance["wall_s"] >= 12.5
+    assert provenance["matrix_product_gflops"] > 0
+    assert provenance["versions"]["torch"].startswith("2.")
+
+
+def test_incomplete_run_leaves_the_record_alone(results, tmp_path):
+    out = tmp_path / "reference"
+    out.mkdir()
+    with pytest.raises(ProductError, match=r"missing\.csv: missing"):
+        record.reference(results, load(), [results / "missing.csv"], out)
+    assert list(out.iterdir()) == []
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/results.md", "docs/fidelity.md"])
+def test_pages_are_what_the_run_of_record_says(page):
+    assert docs.render(REFERENCE, TEMPLATES)[page] == (ROOT / page).read_text(encoding="utf-8")
+
+
+def test_changing_a_table_changes_the_page(tmp_path):
+    changed = tmp_path / "reference"
+    shutil.copytree(REFERENCE, changed)
+    path = changed / "tables/psf_metrics.csv"
+    table = pd.read_csv(path)
+    table.loc[table.metric == "mse", "value"] *= 2
+    table.to_csv(path, index=False)
+    before, after = docs.render(REFERENCE, TEMPLATES), docs.render(changed, TEMPLATES)
+    assert before["docs/results.md"] != after["docs/results.md"]
+
+
+def test_pages_are_written(tmp_path):
+    pages = docs.run(REFERENCE, TEMPLATES, tmp_path)
+    assert tmp_path / "README.md" in pages
+    assert all(page.read_text().startswith("# ") for page in pages)
+
+
+def test_run_of_record_reaches_the_numbers_that_it_must():
+    """Bounds of dataset 3, 5 and 8 and the order of the methods, on the committed run."""
+    metrics = pd.read_csv(REFERENCE / "tables/psf_metrics.csv")
+    errors = metrics[metrics.metric == "mse"].pivot(
+        index=["dataset", "split", "reference", "noise_level"], columns="method", values="value"
+    )
+    assert len(errors) == 4 * 19
+    assert (errors.dae < errors.pca_som).all()
+    bounds = {
+        ("dataset3", "realisation"): [3.0e-6, 5.2e-6, 8.6e-6, 1.75e-5],
+        ("dataset3", "template"): [1.5e-5, 1.8e-5, 2.2e-5, 3.1e-5],
+        ("dataset5", "realisation"): [1.35e-6, 1.9e-6, 2.6e-6, 3.4e-6],
+    }
+    for (dataset, reference), bound in bounds.items():
+        assert (errors.loc[dataset, "random", reference].dae <= bound).all()
+    third = errors.loc["dataset3", "random"]
+    assert (third.dae < third.lmmse).all()
+    assert errors.loc["dataset8", "random", "realisation", 0.005].dae <= 7e-6
+    held_out = errors.xs("held_out", level="split")
+    loud = held_out[held_out.index.get_level_values("noise_level") >= 3e-4]
+    assert (loud.dae < loud.noisy).all()
+
+
+def test_original_noise_of_the_run_of_record():
+    columns = pd.read_csv(REFERENCE / "calibration/columns.csv")
+    assert (abs(columns.mse_ratio - 1) < 0.12).sum() >= 11
+    assert (abs(columns.ssim_at_published_mse - columns.ssim_paper) < 0.03).sum() >= 11
