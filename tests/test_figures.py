@@ -202,7 +202,8 @@ def test_held_out_is_dashed_and_unpublished_datasets_have_no_paper():
     styles = [container.lines[0].get_linestyle() for container in axes.containers]
     assert styles.count("-") == styles.count("--") == len(METHODS)
     assert not any("paper" in text for text in legend_texts(figure.legends[0]))
-    assert legend_texts(axes.get_legend()) == ["random test stars", "stars of held-out fields"]
+    texts = legend_texts(figure.legends[0])
+    assert {"random test stars", "stars of held-out fields"} <= set(texts)
 
 
 def test_stages_write_the_same_bytes_twice(tmp_path):

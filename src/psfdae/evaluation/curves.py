@@ -107,9 +107,9 @@ def error_against_noise(
     panels[0].set_ylabel(METRIC_LABELS.get(metric, metric))
     figure.suptitle(f"{metric.upper().replace('_', ' ')} of {dataset} against the noise level")
     handles = _method_handles(set(ours["method"]), set(theirs["method"]))
-    figure.legend(handles=handles, loc="outside lower center", ncols=4)
     if "held_out" in set(ours["split"]):
-        panels[-1].legend(handles=_split_handles(), loc="best")
+        handles += _split_handles()
+    figure.legend(handles=handles, loc="outside lower center", ncols=4)
     return figure
 
 
