@@ -96,6 +96,7 @@ def _ignoring_level(predict: Callable[[np.ndarray], np.ndarray]) -> Predictor:
 
 
 def dae_predictor(folder: Path, config: Any) -> Predictor:
+    """The trained network of a folder as a function of noisy images and λ, which it ignores."""
     import torch
     import yaml
 

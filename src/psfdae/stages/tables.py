@@ -36,6 +36,13 @@ def paper_tables(evaluations: Sequence[Path], dataset: str, metric: str, out: Pa
 
 
 def read_evaluations(evaluations: Sequence[Path]):  # type: ignore[no-untyped-def]
+    """Join CSV files of the stage `evaluate`.
+
+    Raises
+    ------
+    ProductError
+        If a file has other columns.
+    """
     import pandas as pd
 
     columns = ["dataset", "split", "reference", "method", "noise_level", "metric"]

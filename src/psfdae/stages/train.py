@@ -25,15 +25,11 @@ def run(config: Any, stars: Path, split: str, reference: str, out: Path, checkpo
     ----------
     config : stage config (seed, noise, parts, dae, train)
     stars : product "stars"
-    split : "random" or "held_out"
-    reference : "realisation" or "template"
+    split, reference : "random" or "held_out"; "realisation" or "template"
     out : folder that receives `dae.safetensors`, `config.yaml`, `history.csv`
     checkpoint : file that lets an interrupted training resume
 
-    Raises
-    ------
-    TrainingError
-        See `train_dae`.
+    Raises TrainingError as `train_dae` does.
     """
     from safetensors.torch import save_file
     from tqdm import tqdm
