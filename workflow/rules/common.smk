@@ -100,6 +100,14 @@ def networks_of(dataset):
     return [(s, r) for s in settings.splits for r in settings.references]
 
 
+def shown_levels(dataset):
+    """Noise levels of the figure of restored stars: those asked for that the band has."""
+    settings = dataset_config(dataset)
+    band = settings.noise.levels
+    asked = [level for level in settings.dataset.shown_levels if level in band]
+    return asked or sorted({min(band), max(band)})
+
+
 def figures_of(dataset):
     """Figures of a dataset and of its scene."""
     settings = dataset_config(dataset)

@@ -72,10 +72,7 @@ rule figure_strip:
         config=lambda w: stage_overrides("evaluate", f"dataset={w.dataset}"),
         source=source_hash("psfdae.stages.figures"),
         dae=subpath(input.dae, parent=True),
-        levels=lambda w: [
-            f"--level={level:g}"
-            for level in dataset_config(w.dataset).dataset.shown_levels
-        ],
+        levels=lambda w: [f"--level={level:g}" for level in shown_levels(w.dataset)],
     message:
         "Drawing restored stars of {wildcards.dataset}, {wildcards.reference}"
     shell:
