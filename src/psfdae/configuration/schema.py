@@ -191,7 +191,7 @@ class Dataset(Group):
     splits: Annotated[list[SplitKind], Field(min_length=1)]
     references: Annotated[list[Reference], Field(min_length=1)]
     shown_levels: Annotated[list[Positive], Field(min_length=1)] = Field(
-        description="Noise levels λ in the figure of restored stars; the extremes if none is in the band"
+        description="Noise levels λ of the figure of restored stars; extremes if none is in band"
     )
 
 
