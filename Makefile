@@ -61,7 +61,7 @@ reference: env ## Make the finished run in results the run of record, and renew 
 docs: env ## Render README and docs from the run of record
 	psfdae docs
 
-lint: env
+lint: env ## Check style of Python and Snakemake files
 	ruff check .
 	ruff format --check .
 	snakefmt --check Snakefile workflow

@@ -12,7 +12,7 @@ rule runtime:
     resources:
         mem_mb=500,
     params:
-        results=RESULTS,
+        results=lambda w: RESULTS,
         source=source_hash("psfdae.stages.record"),
     message:
         "Collecting what the jobs cost"
@@ -39,7 +39,7 @@ rule reference:
     resources:
         mem_mb=500,
     params:
-        results=RESULTS,
+        results=lambda w: RESULTS,
         folder="results/reference",
     message:
         "Renewing the run of record"

@@ -15,7 +15,7 @@ rule track:
     resources:
         mem_mb=500,
     params:
-        results=RESULTS,
+        results=lambda w: RESULTS,
         preset=PRESET,
         # Not an output: Snakemake would delete it, and with it the runs of older configs.
         database=f"{RESULTS}/mlflow.db",
