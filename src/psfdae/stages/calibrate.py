@@ -120,6 +120,7 @@ def calibrate(config: Any, scans: Sequence[Path], stars: dict[str, Path], out: P
         ("data_range", fit.data_range, config.evaluation.data_range, "1"),
         ("pixel_scale_scene1", fit.pixel_scale["scene1"], configured["scene1"], "arcsec"),
         ("pixel_scale_scene2", fit.pixel_scale["scene2"], configured["scene2"], "arcsec"),
+        ("r0_scene2", min(by_r0, key=lambda r0: by_r0[r0].rms), configured["r0_m"], "m"),
         ("ssim_residual_rms", fit.rms, _configured_rms(columns), "1"),
     ]
     degeneracy = [
