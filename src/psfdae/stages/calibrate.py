@@ -45,7 +45,9 @@ def scan(config: Any, dataset: str, out: Path) -> None:
     rows = rows[rows.dataset == dataset]
     turbulent = config.scene.name == "turbulence"
     table = []
-    for r0 in config.calibration.r0_m if turbulent else [float("nan")]:
+    # The configured r0 is always scanned: its fit is set beside the configured scale.
+    scanned = {*config.calibration.r0_m, config.wavefront.r0_m} if turbulent else {float("nan")}
+    for r0 in sorted(scanned):
         for scale in config.calibration.pixel_scales_arcsec:
             images = _images(config, scale, r0 if turbulent else None)
             for row in rows.itertuples():
@@ -112,7 +114,7 @@ def calibrate(config: Any, scans: Sequence[Path], stars: dict[str, Path], out: P
     )
     by_r0 = {r0: _fit_at(scan_table, r0) for r0 in sorted(scan_table.r0_m.dropna().unique())}
     configured = _configured(stars)
-    fit = by_r0[configured["r0_m"]]
+    fit = by_r0[min(by_r0, key=lambda r0: abs(r0 - configured["r0_m"]))]
     # Least squares of log MSE: every column counts alike.
     kappa = float(np.exp(np.log(columns.kappa[columns.fitted]).mean()))
     table = [
