@@ -193,7 +193,7 @@ def test_killed_snakemake_needs_no_manual_step(smoke, tmp_path):
     source, _ = smoke
     shutil.copytree(source / "results/data", tmp_path / "results/data")
     target = "results/dae/dataset3/random-realisation/dae.safetensors"
-    options = {"overrides": "train.epochs=60 train.checkpoint_seconds=0 train.batch=8"}
+    options = {"overrides": "train.epochs=80 train.checkpoint_seconds=0 train.batch=8"}
     locked = ["sh", str(ROOT / "workflow/locked.sh"), *command(tmp_path, target, **options)]
     environment = {**os.environ, "PATH": PATH}
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
