@@ -18,6 +18,7 @@ include: "workflow/rules/evaluation.smk"
 include: "workflow/rules/figures.smk"
 include: "workflow/rules/calibration.smk"
 include: "workflow/rules/tracking.smk"
+include: "workflow/rules/knee.smk"
 include: "workflow/rules/record.smk"
 
 

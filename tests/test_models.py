@@ -14,7 +14,7 @@ from psfdae.evaluation.metrics import mse
 from psfdae.models.dae import SingleChannelConv, build_dae, image_scale, predict
 from psfdae.models.lmmse import LinearMmse
 from psfdae.models.pca_som import fit_pca_som
-from psfdae.models.training import TrainingError, TrainingSet, train_dae
+from psfdae.models.training import Training, TrainingError, TrainingSet, train_dae
 from psfdae.rng import stream
 
 SOM = {"rows": 4, "columns": 4, "epochs": 3, "sigma": 1.0, "learning_rate": 0.5, "seed": 1}
@@ -31,6 +31,8 @@ TRAIN = Train(
     dead_check_steps=2,
     restarts=1,
     checkpoint_seconds=0.0,
+    noise="fresh",
+    patience=0,
 )
 
 
@@ -219,3 +221,32 @@ def test_fresh_noise_every_epoch(data):
     first = data.draw(stars, stream(1, "dae", "epoch", 0, 0))
     second = data.draw(stars, stream(1, "dae", "epoch", 0, 1))
     assert (first != second).any(axis=(1, 2)).all()
+
+
+def test_fixed_noise_is_the_same_in_every_epoch(data):
+    settings = TRAIN.model_copy(update={"noise": "fixed", "batch": 250})
+    training = Training(data, DAE, settings, 3, 0)
+    orders = [stream(3, "dae", "epoch", 0, epoch) for epoch in range(2)]
+    first, second = (next(iter(training._batches(rng)))[0] for rng in orders)
+    again = Training(data, DAE, settings, 3, 0)
+    assert torch.equal(first.sum((1, 2, 3)).sort()[0], second.sum((1, 2, 3)).sort()[0])
+    assert np.array_equal(training.fixed, again.fixed)
+
+
+def test_patience_stops_a_training_that_no_longer_improves(data, tmp_path):
+    hopeless = TRAIN.model_copy(
+        update={"epochs": 30, "lr": 1e-12, "schedule": "constant", "patience": 4}
+    )
+    # At this rate nothing changes, so every validation after the first brings nothing new.
+    assert len(train(data, tmp_path, hopeless).history) < 30
+    unlimited = hopeless.model_copy(update={"epochs": 6, "patience": 0})
+    assert len(train(data, tmp_path, unlimited).history) == 6
+
+
+def test_gradient_that_is_not_finite_stops_with_advice(data, tmp_path, monkeypatch):
+    def spoil(model, limit):
+        return torch.tensor(float("nan"))
+
+    monkeypatch.setattr(torch.nn.utils, "clip_grad_norm_", spoil)
+    with pytest.raises(TrainingError, match=r"gradient's norm is nan .* lower train\.lr"):
+        train(data, tmp_path)

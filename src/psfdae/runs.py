@@ -185,7 +185,7 @@ def _epoch_points(epochs: list[dict[str, float]], start_ms: int) -> list[Point]:
         Point(name, value, int(row["epoch"]), start_ms + int(1000 * row["seconds"]))
         for row in epochs
         for name, value in row.items()
-        if name not in ("epoch", "step", "seconds")
+        if name not in ("epoch", "step", "seconds", "cpu_seconds")
     ]
     # MLflow's lists show the last value; the network kept is that of the lowest.
     valid = [p for p in points if p.name == "validation_mse" and math.isfinite(p.value)]

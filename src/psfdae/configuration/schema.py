@@ -243,6 +243,12 @@ class Train(Group):
     checkpoint_seconds: Annotated[float, Field(ge=0)] = Field(
         description="Least time between checkpoints"
     )
+    noise: Literal["fresh", "fixed"] = Field(
+        description="Noise drawn anew every epoch, or once for all epochs"
+    )
+    patience: Annotated[int, Field(ge=0)] = Field(
+        description="Stop after this many validations without a better one; 0 never stops"
+    )
 
 
 class Baseline(Group):
@@ -282,6 +288,38 @@ class Calibration(Group):
     )
 
 
+class Benchmark(Group):
+    """Run time against error; needs a quiet machine."""
+
+    repeats: Count = Field(description="Timings of every point; the median is reported")
+    stamps: Count = Field(description="Stamps per timing of a kernel")
+    peers: bool = Field(description="Time POPPY beside our kernels")
+    star_counts: Annotated[list[Count], Field(min_length=2)] = Field(
+        description="Numbers of stars at which time, memory and disk are measured, ascending"
+    )
+    stamp_sizes: Annotated[
+        list[Annotated[int, Field(ge=8, le=256, multiple_of=2)]], Field(min_length=2)
+    ] = Field(description="Stamp sides at which cost is measured, ascending")
+    threads: Count = Field(description="Largest number of threads timed")
+
+
+class Stability(Group):
+    """Stress tests of the whole chain."""
+
+    stars: Count = Field(description="Stars simulated for the tests")
+    seeds: Annotated[int, Field(ge=2)] = Field(description="Short trainings from other seeds")
+    epochs: Count = Field(description="Epochs of a short training")
+    threads: Count = Field(description="Threads of the linear algebra")
+
+
+class Bounds(Group):
+    """Best possible estimates."""
+
+    bank_stars: Count = Field(description="Fresh draws of the simulator in the bank")
+    test_stars: Count = Field(description="Test stars that are bounded, the first of the part")
+    threads: Count = Field(description="Threads of the linear algebra")
+
+
 class Workflow(Group):
     """What the default target of the workflow builds."""
 
@@ -308,6 +346,9 @@ class Config(Group):
     baseline: Baseline
     evaluation: Evaluation
     calibration: Calibration
+    benchmark: Benchmark
+    stability: Stability
+    bounds: Bounds
 
     @model_validator(mode="after")
     def _consistent(self) -> Config:
@@ -336,6 +377,23 @@ STAGE_KEYS: dict[str, tuple[str, ...]] = {
         *("noise", "calibration"),
     ),
     "calibrate": ("seed", "noise", "evaluation"),
+    "knee": ("seed", "noise", "parts", "dae", "train", "evaluation"),
+    "propagation": (
+        *("seed", "scene", "telescope", "grid", "wavefront", "stars", "framing", "optics"),
+        *("noise", "benchmark"),
+    ),
+    "timing": (
+        *("seed", "scene", "telescope", "grid", "wavefront", "stars", "framing", "optics"),
+        *("noise", "parts", "dae", "baseline", "evaluation", "benchmark"),
+    ),
+    "stability": (
+        *("seed", "scene", "telescope", "grid", "wavefront", "stars", "framing", "optics"),
+        *("noise", "parts", "dae", "train", "baseline", "evaluation", "stability"),
+    ),
+    "bounds": (
+        *("seed", "scene", "telescope", "grid", "wavefront", "stars", "framing", "optics"),
+        *("noise", "parts", "bounds"),
+    ),
 }
 """The groups that each stage reads; nothing else can influence its result."""
 

@@ -1,4 +1,4 @@
-"""Training of the denoising autoencoder: fresh noise every epoch, resumable, watched.
+"""Training of the denoising autoencoder: resumable, watched, with fresh or fixed noise.
 
 Every epoch draws its order, noise levels and noise from a stream of its own, so
 a training that resumes after epoch e continues with exactly the numbers that an
@@ -21,7 +21,7 @@ from psfdae.configuration.schema import Train
 from psfdae.files import atomic_path
 from psfdae.models.dae import Dae, build_dae, image_scale, predict
 from psfdae.rng import stream
-from psfdae.stars.noise import NoiseModel
+from psfdae.stars.noise import NoiseModel, mixed_levels
 
 
 class TrainingError(RuntimeError):
@@ -55,8 +55,7 @@ class TrainingSet:
 
     def draw(self, stars: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Noisy images of `stars`, each at a random level."""
-        levels = self.levels[rng.integers(self.levels.size, size=stars.size)]
-        return self.noise.draw(self.images[stars], levels, rng)
+        return self.noise.draw(self.images[stars], mixed_levels(self.levels, stars.size, rng), rng)
 
 
 class Training:
@@ -85,9 +84,10 @@ class Training:
         self.model = build_dae(dae.kernels, dae.widths, dae.init, generator)
         self.optimiser = torch.optim.Adam(self.model.parameters(), lr=train.lr)
         self.steps_per_epoch = -(-data.fit.size // train.batch)
+        self.fixed = self._fixed_images() if train.noise == "fixed" else None
         self.scheduler = self._make_scheduler()
         self.epoch = 0
-        self.seconds = 0.0
+        self.seconds = self.cpu_seconds = 0.0
         self.history: list[dict[str, float]] = []
         self.best_mse = float("inf")
         self.best_state: dict[str, torch.Tensor] = {}
@@ -107,16 +107,16 @@ class Training:
         -------
         dict
             Row of the history: epoch, step, lr, train_mse, validation_mse (NaN
-            where not due), seconds. Errors are of flux-normalised images.
+            where not due), seconds, cpu_seconds. Errors are of flux-normalised images.
 
         Raises
         ------
         TrainingError
-            If the loss is not finite.
+            If the loss or the gradient is not finite.
         DeadNetworkError
             If the network has died.
         """
-        started = time.monotonic()
+        started, started_cpu = time.monotonic(), time.process_time()
         rng = stream(self.seed, "dae", "epoch", self.attempt, self.epoch)
         losses = []
         self.model.train()
@@ -129,6 +129,7 @@ class Training:
         due = self.epoch % self.train.validate_every == 0 or self.epoch == self.train.epochs
         validation = self._validate() if due else float("nan")
         self.seconds += time.monotonic() - started
+        self.cpu_seconds += time.process_time() - started_cpu
         row = {
             "epoch": self.epoch,
             "step": self.epoch * self.steps_per_epoch,
@@ -136,6 +137,7 @@ class Training:
             "train_mse": float(np.mean(losses)) / self.factor**2,
             "validation_mse": validation,
             "seconds": round(self.seconds, 3),
+            "cpu_seconds": round(self.cpu_seconds, 3),
         }
         self.history.append(row)
         return row
@@ -144,10 +146,13 @@ class Training:
         order = rng.permutation(self.data.fit)
         for start in range(0, order.size, self.train.batch):
             stars = order[start : start + self.train.batch]
-            yield (
-                self._tensor(self.data.draw(stars, rng)),
-                self._tensor(self.data.references[stars]),
-            )
+            noisy = self.data.draw(stars, rng) if self.fixed is None else self.fixed[stars]
+            yield self._tensor(noisy), self._tensor(self.data.references[stars])
+
+    def _fixed_images(self) -> np.ndarray:
+        """One noisy image of every star, for all epochs; only those of `fit` are used."""
+        rng = stream(self.seed, "dae", "fixed noise")
+        return self.data.draw(np.arange(len(self.data.images)), rng)
 
     def _tensor(self, images: np.ndarray) -> torch.Tensor:
         scaled = torch.from_numpy(images)[:, None] * self.factor
@@ -166,8 +171,13 @@ class Training:
             raise DeadNetworkError(f"all outputs are zero at step {step}")
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
-        if self.train.grad_clip > 0:
-            torch.nn.utils.clip_grad_norm_(self.model.parameters(), self.train.grad_clip)
+        limit = self.train.grad_clip or float("inf")
+        norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), limit).item()
+        if not np.isfinite(norm):
+            raise TrainingError(
+                f"the gradient's norm is {norm} at step {step} (epoch {self.epoch + 1}): "
+                f"lower train.lr = {self.train.lr}"
+            )
         self.optimiser.step()
         self.scheduler.step()
         return value
@@ -185,12 +195,20 @@ class Training:
             }
         return error
 
+    def finished(self) -> bool:
+        """All epochs are done, or `patience` validations brought nothing better."""
+        scores = [row["validation_mse"] for row in self.history]
+        scores = [score for score in scores if np.isfinite(score)]
+        stale = len(scores) - 1 - int(np.argmin(scores)) if scores else 0
+        return self.epoch >= self.train.epochs or 0 < self.train.patience <= stale
+
     def state(self) -> dict[str, Any]:
         """Everything that `restore` needs, as tensors and plain values."""
         return {
             "attempt": self.attempt,
             "epoch": self.epoch,
             "seconds": self.seconds,
+            "cpu_seconds": self.cpu_seconds,
             "model": self.model.state_dict(),
             "optimiser": self.optimiser.state_dict(),
             "scheduler": self.scheduler.state_dict(),
@@ -202,7 +220,7 @@ class Training:
     def restore(self, state: dict[str, Any]) -> None:
         """Continue from a `state`."""
         self.epoch = state["epoch"]
-        self.seconds = state["seconds"]
+        self.seconds, self.cpu_seconds = state["seconds"], state["cpu_seconds"]
         self.model.load_state_dict(state["model"])
         self.optimiser.load_state_dict(state["optimiser"])
         self.scheduler.load_state_dict(state["scheduler"])
@@ -275,7 +293,7 @@ def _run(
     tick: Callable[[], None],
 ) -> None:
     last_saved = time.monotonic()
-    while training.epoch < training.train.epochs:
+    while not training.finished():
         report(training.run_epoch(tick))
         if time.monotonic() - last_saved >= training.train.checkpoint_seconds:
             with atomic_path(checkpoint) as temporary:

@@ -5,10 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from psfdae.files import Column, read_product, write_product
 from psfdae.models.pca_som import PcaSom, fit_pca_som
 from psfdae.rng import stream
-from psfdae.stages.common import limit_threads, mixed_levels, noise_model, read_stars, split_stars
+from psfdae.stages.common import limit_threads, noise_model, read_stars, split_stars
+from psfdae.stars.noise import mixed_levels
 
 
 def run(config: Any, stars: Path, split: str, out: Path) -> None:
@@ -25,7 +28,7 @@ def run(config: Any, stars: Path, split: str, out: Path) -> None:
     product = read_stars(stars)
     train = split_stars(product, split, config).train
     rng = stream(config.seed, "noise", "baseline")
-    levels = mixed_levels(config, train.size, rng)
+    levels = mixed_levels(np.asarray(config.noise.levels), train.size, rng)
     noisy = noise_model(config).draw(product["realisation"][train], levels, rng)
     settings = config.baseline.model_dump(exclude={"threads"})
     model = fit_pca_som(

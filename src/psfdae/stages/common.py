@@ -68,9 +68,3 @@ def noisy_test_images(config: Any, images: np.ndarray, level: float) -> np.ndarr
     """Noisy images of the test stars at one λ; the noise depends on seed and λ only."""
     rng = stream(config.seed, "noise", "test", f"{level:.6g}")
     return noise_model(config).draw(images, level, rng)
-
-
-def mixed_levels(config: Any, count: int, rng: np.random.Generator) -> np.ndarray:
-    """A random noise level λ of the band for each of `count` stars."""
-    levels = np.asarray(config.noise.levels)
-    return levels[rng.integers(levels.size, size=count)]

@@ -59,3 +59,8 @@ class NoiseModel:
         flux = np.broadcast_to(self.flux(level), (len(psf),))[:, None, None]
         photons = rng.poisson(flux * psf + self.background)
         return ((photons - self.background) / flux).astype(np.float32)
+
+
+def mixed_levels(levels: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
+    """A random noise level λ of a band for each of `count` stars, shape (count,)."""
+    return levels[rng.integers(levels.size, size=count)]
