@@ -51,6 +51,20 @@ class Column:
     about: str
 
 
+@dataclass(frozen=True)
+class Empty:
+    """A column that is created at its full length and filled slice by slice."""
+
+    shape: tuple[int, ...]
+    dtype: type | np.dtype
+    unit: str
+    about: str
+
+
+CHUNK_BYTES = 2**18
+"""Size of the chunks of an `Empty` column, which hold whole rows."""
+
+
 def write_product(
     path: str | Path, kind: str, columns: Mapping[str, Column], config: Mapping[str, Any]
 ) -> None:
@@ -75,9 +89,7 @@ def write_product(
     import h5py
 
     with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
-        file.attrs["kind"] = kind
-        file.attrs["psfdae_version"] = psfdae.__version__
-        file.attrs["config"] = json.dumps(config, sort_keys=True)
+        _describe(file, kind, config)
         stored: dict[int, str] = {}
         for name, column in columns.items():
             if id(column.values) in stored:
@@ -87,6 +99,66 @@ def write_product(
             data = file.create_dataset(name, data=column.values, chunks=True, fletcher32=True)
             data.attrs["unit"] = column.unit
             data.attrs["about"] = column.about
+
+
+@contextmanager
+def stream_product(
+    path: str | Path,
+    kind: str,
+    columns: Mapping[str, Column | Empty],
+    config: Mapping[str, Any],
+) -> Iterator[Mapping[str, Any]]:
+    """Write a product piece by piece, so that it never has to fit into memory.
+
+    Yields the HDF5 datasets by name; the block fills those of the `Empty`
+    columns, best in the order of their rows: `data["psf"][start:stop] = …`. The
+    file is that of `write_product` but for the shape of the chunks, and appears
+    under its name only when the block has succeeded. An `Empty` that is the very
+    object of an earlier one is stored as a link.
+
+    Parameters are those of `write_product`.
+
+    Raises
+    ------
+    ProductError
+        If the block has left a chunk of a column unwritten.
+    """
+    import h5py
+
+    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
+        _describe(file, kind, config)
+        stored: dict[int, str] = {}
+        for name, column in columns.items():
+            if id(column) in stored:
+                file[name] = h5py.SoftLink(f"/{stored[id(column)]}")
+                continue
+            stored[id(column)] = name
+            data = file.create_dataset(name, fletcher32=True, **_storage(column))
+            data.attrs["unit"] = column.unit
+            data.attrs["about"] = column.about
+        yield {name: file[name] for name in columns}
+        file.flush()
+        for name in stored.values():
+            data = file[name]
+            written = data.id.get_num_chunks() * data.chunks[0]
+            if isinstance(columns[name], Empty) and written < data.shape[0]:
+                raise ProductError(f"{path}: array {name!r} was not filled to its end")
+
+
+def _storage(column: Column | Empty) -> dict[str, Any]:
+    """Arguments with which h5py creates the dataset of a streamed column."""
+    if isinstance(column, Column):
+        return {"data": column.values, "chunks": True}
+    dtype = np.dtype(column.dtype)
+    row_bytes = int(np.prod(column.shape[1:], dtype=int)) * dtype.itemsize
+    rows = max(1, min(column.shape[0], CHUNK_BYTES // row_bytes))
+    return {"shape": column.shape, "dtype": dtype, "chunks": (rows, *column.shape[1:])}
+
+
+def _describe(file: Any, kind: str, config: Mapping[str, Any]) -> None:
+    file.attrs["kind"] = kind
+    file.attrs["psfdae_version"] = psfdae.__version__
+    file.attrs["config"] = json.dumps(config, sort_keys=True)
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,9 @@ import numpy as np
 SEIDEL_TERMS = ("spherical", "coma", "astigmatism", "field_curvature", "distortion")
 """Order of the coefficients W040, W131, W222, W220, W311 in every array."""
 
+SLOPE_BATCH = 256
+"""Wavefronts whose slopes are held at a time: at 65² points 8 MB per axis."""
+
 MONOMIALS = ("r4", "r2x", "r2y", "xx", "xy", "yy", "x", "y")
 """Order of the pupil monomials of a Seidel wavefront (r² = x² + y²)."""
 
@@ -105,5 +108,11 @@ def gradient_ranges(coefficients: np.ndarray, points: int = 65) -> np.ndarray:
     angle = np.linspace(0.0, 2.0 * np.pi, 8 * points, endpoint=False)
     x = np.concatenate([xx[inside], np.cos(angle)])
     y = np.concatenate([yy[inside], np.sin(angle)])
-    slopes = [coefficients @ g for g in monomial_gradients(x, y)]
-    return np.stack([np.stack([s.min(axis=1), s.max(axis=1)], axis=-1) for s in slopes], axis=1)
+    ranges = np.empty((len(coefficients), 2, 2))
+    for axis_index, gradient in enumerate(monomial_gradients(x, y)):
+        for start in range(0, len(coefficients), SLOPE_BATCH):
+            part = slice(start, start + SLOPE_BATCH)
+            slopes = coefficients[part] @ gradient
+            ranges[part, axis_index, 0] = slopes.min(axis=1)
+            ranges[part, axis_index, 1] = slopes.max(axis=1)
+    return ranges

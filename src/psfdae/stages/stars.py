@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from psfdae.files import Column, read_product, write_product
+from psfdae.files import Column, Empty, read_product, stream_product
 from psfdae.rng import stream
 from psfdae.stages.common import limit_threads, scene_module
 from psfdae.stars.fields import assign_fields, draw_jitter
 from psfdae.stars.framing import crop_jittered, normalise_flux, stamp_offset
+
+STARS_AT_A_TIME = 1024
+"""Stars that are propagated before they are written; memory does not grow beyond them."""
 
 
 def run(config: Any, templates: Path, out: Path) -> None:
@@ -19,7 +23,9 @@ def run(config: Any, templates: Path, out: Path) -> None:
 
     Every star gets a realisation (static and random aberrations) and a template
     (static only), each framed on its own brightest pixel and moved by the same
-    jitter, each normalised by the flux inside its stamp (eq. 8).
+    jitter, each normalised by the flux inside its stamp (eq. 8). All random
+    numbers are drawn first, about 100 bytes per star; the images are made and
+    written `STARS_AT_A_TIME`.
 
     Parameters
     ----------
@@ -31,38 +37,73 @@ def run(config: Any, templates: Path, out: Path) -> None:
     name, count, jitter_px = config.stars.name, config.stars.count, config.framing.jitter_px
     star_field = assign_fields(count, len(fixed["psf"]), stream(config.seed, "field", name))
     jitter = draw_jitter(count, jitter_px, stream(config.seed, "jitter", name))
-    cropped = crop_jittered(fixed["psf"][star_field].astype(np.float64), jitter, jitter_px)
-    template, energy = normalise_flux(cropped)
-    template = template.astype(np.float32)
-    columns = {
-        "template": Column(template, "1", "static PSF, sum 1"),
+    columns: dict[str, Column | Empty] = {
+        "template": _images(config, "static PSF, sum 1"),
         "field_index": Column(star_field, "1", "field of the star"),
         "grid": Column(fixed["grid"], "1", "grid index (ix, iy) of every field"),
         "jitter": Column(jitter, "pixel", "centring error (row, column)"),
     }
     if config.stars.aberration_fraction > 0:
-        columns |= _realisations(config, star_field, jitter)
+        propagation = _propagation(config, star_field)
+        columns |= _realisation_columns(config, propagation)
     else:
-        columns["realisation"] = Column(template, "1", "noise-free image: the template")
-        columns["energy"] = Column(energy, "1", "light inside the stamp")
-    write_product(out, "stars", columns, config.model_dump())
+        propagation = None
+        columns["realisation"] = columns["template"]
+        columns["energy"] = Empty((count,), np.float64, "1", "light inside the stamp")
+    with stream_product(out, "stars", columns, config.model_dump()) as data:
+        for stars in _chunks(count):
+            part = slice(stars[0], stars[-1] + 1)
+            cut = _templates(fixed["psf"][star_field[stars]], jitter[stars], jitter_px)
+            if propagation is not None:
+                cut |= _realisations(config, propagation, stars, jitter[stars])
+            for column, values in cut.items():
+                data[column][part] = values
 
 
-def _realisations(config: Any, star_field: np.ndarray, jitter: np.ndarray) -> dict[str, Column]:
+def _chunks(count: int) -> Iterator[np.ndarray]:
+    for start in range(0, count, STARS_AT_A_TIME):
+        yield np.arange(start, min(start + STARS_AT_A_TIME, count))
+
+
+def _images(config: Any, about: str) -> Empty:
+    side = config.framing.stamp_px
+    return Empty((config.stars.count, side, side), np.float32, "1", about)
+
+
+def _templates(framed: np.ndarray, jitter: np.ndarray, margin: int) -> dict[str, np.ndarray]:
+    cropped = crop_jittered(framed.astype(np.float64), jitter, margin)
+    template, energy = normalise_flux(cropped)
+    return {"template": template, "energy": energy}
+
+
+def _propagation(config: Any, star_field: np.ndarray) -> Any:
     from psfdae.stars.scene import Propagation
 
     limit_threads(config.optics.threads)
     source = scene_module(config.scene.name).star_wavefronts(config, star_field)
-    propagation = Propagation(
+    return Propagation(
         source, config.telescope, config.optics, config.framing, config.stars.search_px
     )
-    peak = propagation.brightest()
-    stamps = propagation.stamps(config.framing.stamp_px, stamp_offset(peak, jitter))
-    realisation, energy = normalise_flux(stamps)
+
+
+def _realisation_columns(config: Any, propagation: Any) -> dict[str, Column | Empty]:
+    count = config.stars.count
+    about_peak = "brightest pixel (row, column) from the chief ray"
+    seidel = propagation.source.seidel
     return {
-        "realisation": Column(realisation.astype(np.float32), "1", "noise-free image, sum 1"),
-        "energy": Column(energy, "1", "light inside the stamp"),
-        "peak": Column(peak, "pixel", "brightest pixel (row, column) from the chief ray"),
-        "seidel": Column(source.seidel, "wave", "W040, W131, W222, W220, W311 at H = 1"),
+        "realisation": _images(config, "noise-free image, sum 1"),
+        "energy": Empty((count,), np.float64, "1", "light inside the stamp"),
+        "peak": Empty((count, 2), np.int64, "pixel", about_peak),
+        "seidel": Column(seidel, "wave", "W040, W131, W222, W220, W311 at H = 1"),
         "pupil_samples": Column(propagation.samples, "1", "pupil samples N"),
     }
+
+
+def _realisations(
+    config: Any, propagation: Any, stars: np.ndarray, jitter: np.ndarray
+) -> dict[str, np.ndarray]:
+    peak = propagation.brightest(stars)
+    offset = stamp_offset(peak, jitter)
+    stamps = propagation.stamps(config.framing.stamp_px, offset, stars)
+    realisation, energy = normalise_flux(stamps)
+    return {"realisation": realisation, "energy": energy, "peak": peak}

@@ -13,19 +13,17 @@ from typing import Protocol
 import numpy as np
 
 from psfdae.configuration.schema import Framing, Optics, Telescope
-from psfdae.optics.propagation import StampPropagator
+from psfdae.optics.propagation import SearchPropagator, StampPropagator
 from psfdae.optics.pupil import Pupil, annular_pupil
 from psfdae.optics.sampling import choose_samples, required_samples
 from psfdae.stars.framing import FramingError, brightest_pixel
 
-COARSE_NODES = 2
-"""Nodes per pixel of the search image, which only has to shortlist pixels."""
+SEARCH_ERROR = 1e-3
+"""Search-image pixels this far below a tie with the maximum may still be the brightest.
 
-SHORTLIST = 0.97
-"""Search-image pixels above this fraction of its maximum may be the brightest.
-
-Two nodes shift no brightest pixel of scene 1 by more than 0.2 % of the maximum, so
-one pixel on the shortlist settles a star; only the others are computed exactly.
+The search image has all nodes and errs by rounding alone, by 2e-6 of its maximum at
+most (256 stars each of scene 1 at 10 and 50 %, and of scene 2). A pixel that is alone
+on the shortlist settles a star; only the others are computed exactly.
 """
 
 
@@ -73,6 +71,7 @@ class Propagation:
         self.optics = optics
         self.framing = framing
         self.samples = self._choose_samples()
+        self._pupils: dict[int, Pupil] = {}
 
     def _choose_samples(self) -> np.ndarray:
         reach = 2 * self.search_px + 0.5 * self.framing.stamp_px + self.framing.jitter_px
@@ -80,67 +79,85 @@ class Propagation:
         needed = required_samples(self.source.slopes(), np.broadcast_to(edges, (2, 2)))
         return choose_samples(needed, tuple(self.optics.pupil_samples))
 
-    def stamps(self, stamp_px: int, offset_px: np.ndarray) -> np.ndarray:
+    def stamps(
+        self, stamp_px: int, offset_px: np.ndarray, stars: np.ndarray | None = None
+    ) -> np.ndarray:
         """Pixel-integrated stamps centred `offset_px` (row, column) from the chief ray.
+
+        Parameters
+        ----------
+        stamp_px : int
+        offset_px : ndarray, shape (B, 2)
+        stars : ndarray of int, shape (B,), optional
+            The wavefronts; all of the source by default.
 
         Returns
         -------
         ndarray, shape (B, stamp_px, stamp_px), float64
             Fraction of the light through the pupil on each pixel.
         """
-        out = np.empty((len(self.source), stamp_px, stamp_px))
-        for pupil, stars in self._groups(np.arange(len(self.source))):
-            kernel = self._kernel(pupil, stamp_px, self.optics.nodes, self.optics.precision)
-            for batch in self._batches(stars):
-                opd = self.source.opd(batch, pupil, kernel.real_dtype)
+        stars = self._everyone() if stars is None else stars
+        out = np.empty((len(stars), stamp_px, stamp_px))
+        for pupil, places in self._groups(stars):
+            kernel = self._kernel(pupil, stamp_px, self.optics.precision)
+            for batch in self._batches(places):
+                opd = self.source.opd(stars[batch], pupil, kernel.real_dtype)
                 out[batch] = kernel(opd, offset_px[batch])
         return out
 
-    def brightest(self) -> np.ndarray:
+    def brightest(self, stars: np.ndarray | None = None) -> np.ndarray:
         """Brightest pixel (row, column) of every wavefront, in pixels from the chief ray.
 
-        A single-precision search image shortlists pixels; those are then
-        computed in complex128 with the full number of nodes, and the first in
-        (row, column) order within the tie tolerance is taken. Wavefronts whose
-        peak touches the window's border are searched again at twice the distance.
+        A single-precision search image shortlists pixels; those are then computed
+        in complex128, and the first in (row, column) order within the tie
+        tolerance is taken. Wavefronts whose peak touches the window's border are
+        searched again at twice the distance.
+
+        Parameters
+        ----------
+        stars : ndarray of int, shape (B,), optional
+            The wavefronts; all of the source by default.
 
         Raises
         ------
         FramingError
             If the brightest pixel lies on the border of that window, too.
         """
-        everyone = np.arange(len(self.source))
+        stars = self._everyone() if stars is None else stars
         reach = self.search_px
-        peaks = self._search(everyone, reach)
+        peaks = self._search(stars, reach)
         border = np.flatnonzero(_touches(peaks, reach))
         if border.size:
             reach *= 2
-            peaks[border] = self._search(border, reach)
+            peaks[border] = self._search(stars[border], reach)
             outside = border[_touches(peaks[border], reach)]
             if outside.size:
                 raise FramingError(
                     f"search_px = {self.search_px}: the brightest pixel of {outside.size} of "
                     f"{len(peaks)} wavefronts lies {reach} px or more from the chief ray "
-                    f"(the first is wavefront {outside[0]}); a larger value would do"
+                    f"(the first is wavefront {stars[outside[0]]}); a larger value would do"
                 )
         return peaks
 
     def _search(self, stars: np.ndarray, reach: int) -> np.ndarray:
-        peaks = np.empty((len(self.source), 2), dtype=np.int64)
-        for pupil, members in self._groups(stars):
-            search = self._kernel(pupil, 2 * reach, COARSE_NODES, "complex64")
-            exact = self._kernel(pupil, 1, self.optics.nodes, "complex128")
-            for batch in self._batches(members):
-                image = search(self.source.opd(batch, pupil, search.real_dtype))
-                peaks[batch] = self._refine(batch, pupil, image, exact) - reach
-        return peaks[stars]
+        peaks = np.empty((len(stars), 2), dtype=np.int64)
+        for pupil, places in self._groups(stars):
+            pixel, nodes = self.telescope.pixel, self.optics.nodes
+            search = SearchPropagator(pupil, 2 * reach, pixel, nodes, "complex64")
+            exact = self._kernel(pupil, 1, "complex128")
+            for batch in self._batches(places):
+                members = stars[batch]
+                image = search(self.source.opd(members, pupil, search.real_dtype))
+                peaks[batch] = self._refine(members, pupil, image, exact) - reach
+        return peaks
 
     def _refine(
         self, batch: np.ndarray, pupil: Pupil, image: np.ndarray, exact: StampPropagator
     ) -> np.ndarray:
         """Brightest pixel of every search image; exact values where several compete."""
         half = image.shape[-1] // 2
-        bright = image >= SHORTLIST * image.max(axis=(1, 2), keepdims=True)
+        least = (1.0 - self.framing.tie) * (1.0 - SEARCH_ERROR)
+        bright = image >= least * image.max(axis=(1, 2), keepdims=True)
         contested = bright.sum(axis=(1, 2)) > 1
         star, row, column = np.nonzero(bright & contested[:, None, None])
         values = np.where(contested[:, None, None], 0.0, image)
@@ -152,23 +169,28 @@ class Propagation:
             values[star[part], row[part], column[part]] = exact(opd, offsets[part])[:, 0, 0]
         return np.array([brightest_pixel(image, self.framing.tie) for image in values])
 
+    def _everyone(self) -> np.ndarray:
+        return np.arange(len(self.source))
+
     def _groups(self, stars: np.ndarray) -> list[tuple[Pupil, np.ndarray]]:
-        """Pupil and members of every grid size that the wavefronts `stars` use."""
+        """Pupil of every grid size that the wavefronts `stars` use, and where they are in it."""
         samples = self.samples[stars]
-        return [
-            (annular_pupil(int(n), self.telescope.obscuration), stars[samples == n])
-            for n in np.unique(samples)
-        ]
+        return [(self._pupil(int(n)), np.flatnonzero(samples == n)) for n in np.unique(samples)]
 
-    def _batches(self, stars: np.ndarray) -> list[np.ndarray]:
-        return np.array_split(stars, range(self.optics.batch, stars.size, self.optics.batch))
+    def _pupil(self, samples: int) -> Pupil:
+        if samples not in self._pupils:
+            self._pupils[samples] = annular_pupil(samples, self.telescope.obscuration)
+        return self._pupils[samples]
 
-    def _kernel(self, pupil: Pupil, stamp_px: int, nodes: int, precision: str) -> StampPropagator:
+    def _batches(self, places: np.ndarray) -> list[np.ndarray]:
+        return np.array_split(places, range(self.optics.batch, places.size, self.optics.batch))
+
+    def _kernel(self, pupil: Pupil, stamp_px: int, precision: str) -> StampPropagator:
         return StampPropagator(
             pupil,
             stamp_px,
             self.telescope.pixel,
-            nodes,
+            self.optics.nodes,
             precision,  # type: ignore[arg-type]
             self.optics.backend,
         )

@@ -1,0 +1,161 @@
+"""Simulation and inference a piece at a time, and the search for the brightest pixel."""
+
+from __future__ import annotations
+
+import h5py
+import numpy as np
+import pytest
+
+from psfdae.benchmark.isolated import MeasurementError, run_isolated
+from psfdae.configuration.compose import load_stage, stage_tree
+from psfdae.files import Column, Empty, ProductError, read_product, stream_product, write_product
+from psfdae.optics.propagation import SearchPropagator, StampPropagator
+from psfdae.optics.pupil import annular_pupil
+from psfdae.optics.seidel import gradient_ranges, monomial_gradients
+from psfdae.stages import stars, templates, timing_jobs
+from psfdae.stars import turbulence_scene
+from psfdae.stars.framing import brightest_pixel
+from psfdae.stars.scene import Propagation
+
+CHEAP = (
+    *("grid.points=3", "optics.pupil_samples=[40,80]", "optics.nodes=1", "optics.threads=1"),
+    *("wavefront.spherical=0.05", "wavefront.coma=0.2", "wavefront.astigmatism=0.2"),
+    *("wavefront.field_curvature=0.1", "stars.search_px=6", "framing.search_px=6"),
+)
+
+
+@pytest.fixture(scope="module")
+def cheap(tmp_path_factory):
+    """Config of 50 stars with weak aberrations on small pupils, and their templates."""
+    path = tmp_path_factory.mktemp("cheap") / "templates.h5"
+    templates.run(load_stage("templates", CHEAP), path)
+    return load_stage("stars", [*CHEAP, "stars.count=50"]), path
+
+
+def test_streamed_product_is_that_of_one_write(tmp_path):
+    values = np.random.default_rng(1).random((70, 5, 5))
+    fixed = Column(np.arange(70), "1", "number")
+    write_product(
+        tmp_path / "one.h5", "k", {"a": Column(values, "m", "x"), "n": fixed}, {"seed": 1}
+    )
+    for name in ("two.h5", "three.h5"):
+        columns = {"a": Empty((70, 5, 5), float, "m", "x"), "n": fixed}
+        with stream_product(tmp_path / name, "k", columns, {"seed": 1}) as data:
+            for start in range(0, 70, 32):
+                data["a"][start : start + 32] = values[start : start + 32]
+    one, two = (read_product(tmp_path / name, "k") for name in ("one.h5", "two.h5"))
+    assert (one["a"] == two["a"]).all()
+    assert (one["n"] == two["n"]).all()
+    assert one.config == two.config
+    assert (tmp_path / "two.h5").read_bytes() == (tmp_path / "three.h5").read_bytes()
+    with h5py.File(tmp_path / "one.h5") as whole, h5py.File(tmp_path / "two.h5") as streamed:
+        assert dict(whole["a"].attrs) == dict(streamed["a"].attrs)
+        assert streamed["a"].fletcher32
+
+
+def test_same_empty_column_is_a_link(tmp_path):
+    empty = Empty((3, 2), np.float32, "1", "x")
+    with stream_product(tmp_path / "p.h5", "k", {"a": empty, "b": empty}, {}) as data:
+        data["a"][:] = 7
+    assert (read_product(tmp_path / "p.h5", "k")["b"] == 7).all()
+
+
+def test_unfilled_or_failed_stream_leaves_no_file(tmp_path):
+    columns = {"a": Empty((300, 64, 64), float, "1", "x")}
+    with (
+        pytest.raises(ProductError, match="array 'a' was not filled"),
+        stream_product(tmp_path / "p.h5", "k", columns, {}) as data,
+    ):
+        data["a"][:100] = 1
+    with pytest.raises(KeyError), stream_product(tmp_path / "p.h5", "k", columns, {}):
+        raise KeyError
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_stars_do_not_depend_on_how_many_are_made_at_a_time(cheap, tmp_path, monkeypatch):
+    config, fixed = cheap
+    stars.run(config, fixed, tmp_path / "whole.h5")
+    monkeypatch.setattr(stars, "STARS_AT_A_TIME", 17)
+    stars.run(config, fixed, tmp_path / "pieces.h5")
+    whole, pieces = (read_product(tmp_path / f"{n}.h5", "stars") for n in ("whole", "pieces"))
+    for name in ("field_index", "jitter", "peak", "seidel", "pupil_samples"):
+        assert (whole[name] == pieces[name]).all(), name
+    for name in ("template", "realisation", "energy"):
+        assert pieces[name] == pytest.approx(whole[name], rel=1e-5, abs=1e-8), name
+
+
+def test_slopes_do_not_depend_on_the_batch():
+    coefficients = np.random.default_rng(2).normal(size=(600, 8))
+    ranges = gradient_ranges(coefficients, points=9)
+    axis = np.linspace(-1, 1, 9)
+    x, y = np.meshgrid(axis, axis)
+    inside = x**2 + y**2 <= 1
+    for axis_index, gradient in enumerate(monomial_gradients(x[inside], y[inside])):
+        slopes = coefficients @ gradient
+        # The rim is sampled beyond this grid, so the extremes are at least these.
+        assert (ranges[:, axis_index, 0] <= slopes.min(axis=1) + 1e-12).all()
+        assert (ranges[:, axis_index, 1] >= slopes.max(axis=1) - 1e-12).all()
+    one_by_one = np.concatenate([gradient_ranges(c[None], points=9) for c in coefficients])
+    assert ranges == pytest.approx(one_by_one, rel=1e-12)
+
+
+@pytest.mark.parametrize("samples", [40, 41])
+def test_search_window_is_the_stamp_of_the_whole_window(samples):
+    pupil = annular_pupil(samples, 0.3)
+    opd = np.random.default_rng(3).normal(size=(3, samples + 2, samples + 2))
+    offset = np.array([[0, 0], [3, -2], [1, 1]])
+    expected = StampPropagator(pupil, 12, 0.88, 3)(opd, offset)
+    found = SearchPropagator(pupil, 12, 0.88, 3, "complex128")(opd, offset)
+    assert found == pytest.approx(expected, rel=1e-10, abs=1e-15)
+
+
+def test_search_window_has_an_even_side():
+    with pytest.raises(ValueError, match="even side"):
+        SearchPropagator(annular_pupil(32, 0.0), 7, 0.9, 2, "complex64")
+
+
+def test_search_is_exact_for_large_pixels():
+    """Scene 2's pixel is 1.6 λ/D wide: fewer nodes in the search shift its brightest pixels."""
+    config = load_stage("templates", ["scene=turbulence", "optics.threads=1"])
+    source = turbulence_scene.template_wavefronts(config)
+    # Measuring 400 slopes takes longer than the test; the largest grid serves all.
+    source.slopes = lambda: np.zeros((len(source), 2, 2))  # type: ignore[method-assign]
+    optics = config.optics.model_copy(update={"pupil_samples": [222]})
+    some = np.arange(4, 400, 19)
+    settings = (source, config.telescope)
+    found = Propagation(*settings, optics, config.framing, 12).brightest(some)
+    fine = optics.model_copy(update={"precision": "complex128"})
+    exact = Propagation(*settings, fine, config.framing, 12)
+    images = exact.stamps(24, np.zeros((some.size, 2), dtype=int), some)
+    expected = np.array([brightest_pixel(image, config.framing.tie) for image in images]) - 12
+    assert (found == expected).all()
+
+
+@pytest.fixture(scope="module")
+def memory(cheap, tmp_path_factory):
+    """Peak memory of simulation and inference of 4000 and of 40 000 stars, MB."""
+    config, fixed = cheap
+    folder = tmp_path_factory.mktemp("memory")
+    path, psf = str(folder / "stars.h5"), str(folder / "psf.h5")
+    found = {"simulate": [], "infer": []}
+    for count in (4000, 40_000):
+        tree = stage_tree("stars", config.model_dump())
+        tree["stars"]["count"] = count
+        job = run_isolated(timing_jobs.simulate, 1, config=tree, templates=str(fixed), out=path)
+        found["simulate"].append(job["peak_mb"])
+        network = {"kernels": [3, 3], "widths": [2], "scale": "mean"}
+        job = run_isolated(timing_jobs.infer, 1, **network, stars=path, out=psf)
+        found["infer"].append(job["peak_mb"])
+    return found
+
+
+@pytest.mark.parametrize("job", ["simulate", "infer"])
+def test_memory_does_not_grow_with_the_stars(memory, job):
+    few, many = memory[job]
+    # Images alone would need 37 000 × 3 kB = 110 MB more; the drawn numbers 100 bytes a star.
+    assert many - few < 25
+
+
+def test_failing_process_is_an_error():
+    with pytest.raises(MeasurementError, match="simulate"):
+        run_isolated(timing_jobs.simulate, 1, config={}, templates="", out="")
