@@ -27,10 +27,11 @@ SNAKEMAKE := snakemake --cores $(CORES) --config preset=$(PRESET) $(if $(SET),se
 LONGEST_FIRST := $(if $(strip $(TARGETS)),,--prioritize scene2)
 
 .DEFAULT_GOAL := help
-.PHONY: help env reproduce report mlflow reference docs test test-all lint format lock clean
+.PHONY: help env reproduce report mlflow reference docs test test-all lint format lock clean \
+  benchmark stability bounds training_knee
 
 help: ## List the targets
-	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
+	@grep -hE '^[a-z_-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
 
 env: $(VENV)/.complete ## Create the environment .venv from the lock file
 
@@ -45,6 +46,13 @@ $(VENV)/.complete: requirements.lock pyproject.toml
 reproduce: env ## Build everything of the preset: datasets, models, tables, report
 	@sh workflow/locked.sh $(SNAKEMAKE) $(LONGEST_FIRST) -- $(TARGETS)
 	@$(MAKE) --no-print-directory report
+
+benchmark: env ## Run time against error, on a quiet machine
+stability: env ## Stress tests of the whole chain
+bounds: env ## How far each method is from the best possible one
+training_knee: env ## Test error against training time
+benchmark stability bounds training_knee:
+	@sh workflow/locked.sh $(SNAKEMAKE) -- $@
 
 report: env ## Gather the figures of a finished run in results/report.html
 	$(SNAKEMAKE) --report $(RESULTS)/report.html -- $(TARGETS)

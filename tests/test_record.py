@@ -47,7 +47,7 @@ def test_reference_keeps_the_layout_and_says_where_it_comes_from(results, tmp_pa
     out = tmp_path / "reference"
     (out / "tables").mkdir(parents=True)
     (out / "tables/old.csv").write_text("stale")
-    record.reference(results, load(), [results / "tables/t.csv"], out)
+    record.reference(results, load(), [results / "tables/t.csv"], [], out)
     assert (out / "tables/t.csv").read_text() == "a\n1\n"
     assert not (out / "tables/old.csv").exists()
     provenance = json.loads((out / "provenance.json").read_text())
@@ -58,11 +58,35 @@ def test_reference_keeps_the_layout_and_says_where_it_comes_from(results, tmp_pa
     assert provenance["versions"]["torch"].startswith("2.")
 
 
+def test_record_keeps_what_was_not_renewed_and_says_since_when(results, tmp_path):
+    out = tmp_path / "reference"
+    slow = results / "tables/slow.csv"
+    slow.write_text("b\n2\n")
+    files, keep = [results / "tables/t.csv"], [Path("tables/slow.csv"), Path("tables/never.csv")]
+    record.reference(results, load(), [*files, slow], keep, out)
+    assert json.loads((out / "provenance.json").read_text())["kept"] == {}
+    (out / "provenance.json").write_text('{"commit": "first"}')
+    for _ in range(2):
+        record.reference(results, load(), files, keep, out)
+        assert (out / "tables/slow.csv").read_text() == "b\n2\n"
+        kept = json.loads((out / "provenance.json").read_text())["kept"]
+        assert kept == {"tables/slow.csv": "first"}
+
+
+def test_targets_on_request_are_not_part_of_the_run(results, tmp_path):
+    path = results / record.ON_REQUEST / "stability/stability.tsv"
+    path.parent.mkdir(parents=True)
+    path.write_text("s\n100.0\n")
+    described = record.provenance(results, load())
+    assert described["on_request_s"] == {"stability": 100.0}
+    assert described["wall_s"] < 20
+
+
 def test_incomplete_run_leaves_the_record_alone(results, tmp_path):
     out = tmp_path / "reference"
     out.mkdir()
     with pytest.raises(ProductError, match=r"missing\.csv: missing"):
-        record.reference(results, load(), [results / "missing.csv"], out)
+        record.reference(results, load(), [results / "missing.csv"], [], out)
     assert list(out.iterdir()) == []
 
 

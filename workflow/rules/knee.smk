@@ -26,7 +26,7 @@ rule fresh_stars:
     log:
         f"{RESULTS}/logs/knee/fresh_stars.log",
     benchmark:
-        f"{RESULTS}/benchmarks/knee/fresh_stars.tsv"
+        f"{RESULTS}/benchmarks_on_request/training_knee/fresh_stars.tsv"
     threads: lambda w: dataset_config(KNEE_DATASET).optics.threads
     resources:
         mem_mb=3000,
@@ -71,7 +71,7 @@ rule knee_train:
     log:
         f"{RESULTS}/logs/knee/{{point}}.log",
     benchmark:
-        f"{RESULTS}/benchmarks/knee/{{point}}.tsv"
+        f"{RESULTS}/benchmarks_on_request/training_knee/{{point}}.tsv"
     threads: 1
     resources:
         mem_mb=2000,
@@ -102,7 +102,7 @@ rule knee_table:
     log:
         f"{RESULTS}/logs/knee/table.log",
     benchmark:
-        f"{RESULTS}/benchmarks/knee/table.tsv"
+        f"{RESULTS}/benchmarks_on_request/training_knee/table.tsv"
     threads: lambda w: dataset_config(KNEE_DATASET).evaluation.threads
     resources:
         mem_mb=1500,
@@ -134,7 +134,7 @@ rule figure_knee:
     log:
         f"{RESULTS}/logs/figures/benchmark/training.log",
     benchmark:
-        f"{RESULTS}/benchmarks/figure_knee/all.tsv"
+        f"{RESULTS}/benchmarks_on_request/training_knee/figure.tsv"
     threads: 1
     resources:
         mem_mb=500,

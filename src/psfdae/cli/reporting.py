@@ -102,14 +102,20 @@ def runtime(results: Path, out: Path) -> None:
 
 @main.command()
 @input_option("results", "Folder of a finished run.", FolderArgument)
+@click.option(
+    "--keep",
+    type=FileArgument,
+    multiple=True,
+    help="File, relative to the results, that may stay from the record before.",
+)
 @out_option("Folder of the run of record.", FolderArgument)
 @click.argument("files", nargs=-1, type=FileArgument, required=True)
-def reference(results: Path, out: Path, files: tuple[Path, ...]) -> None:
+def reference(results: Path, keep: tuple[Path, ...], out: Path, files: tuple[Path, ...]) -> None:
     """Replace the committed run of record by a finished run."""
     from psfdae.configuration.compose import load
     from psfdae.stages import record as stage
 
-    stage.reference(results, load(), files, out)
+    stage.reference(results, load(), files, keep, out)
 
 
 @main.command()

@@ -9,7 +9,7 @@ import platform
 import shutil
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,9 @@ from psfdae.source import git_commit
 
 VERSIONED = ("psfdae", "numpy", "scipy", "torch", "scikit-image", "scikit-learn", "minisom")
 """Packages whose versions can change a number; recorded with the run."""
+
+ON_REQUEST = "benchmarks_on_request"
+"""Folder with the cost of the targets that are not part of `make reproduce`."""
 
 
 def runtime(results: Path, out: Path) -> None:
@@ -47,14 +50,21 @@ def _costs(results: Path):  # type: ignore[no-untyped-def]
     return pd.DataFrame(rows, columns=["rule", "wildcards", "wall_s", "cpu_s", "peak_mb"])
 
 
-def reference(results: Path, config: Any, files: Sequence[Path], out: Path) -> None:
+def reference(
+    results: Path, config: Any, files: Sequence[Path], keep: Sequence[Path], out: Path
+) -> None:
     """Replace the run of record by the tables and figures of a finished run.
+
+    What takes long and changes rarely may stay from the record before: provenance
+    names each such file with the commit that it was recorded at.
 
     Parameters
     ----------
     results : folder of the run
     config : whole config of the run's default dataset
-    files : tables and figures to keep, all inside `results`
+    files : tables and figures to record, all inside `results`
+    keep : paths relative to `results`; where `files` has no such file, that of the
+        present record stays
     out : folder of the run of record; replaced as a whole
 
     Raises
@@ -67,14 +77,25 @@ def reference(results: Path, config: Any, files: Sequence[Path], out: Path) -> N
         raise ProductError(f"{missing[0]}: missing; run `make reproduce` first")
     staging = out.with_name(f".{out.name}.new")
     shutil.rmtree(staging, ignore_errors=True)
-    for path in files:
-        target = staging / path.relative_to(results)
+    renewed = {path.relative_to(results): path for path in files}
+    kept = {path: out / path for path in keep if path not in renewed and (out / path).is_file()}
+    for name, path in (renewed | kept).items():
+        target = staging / name
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(path, target)
-    text = json.dumps(provenance(results, config), indent=2, sort_keys=True)
+    described = provenance(results, config) | {"kept": _kept_since(out, kept)}
+    text = json.dumps(described, indent=2, sort_keys=True)
     write_text(staging / "provenance.json", text + "\n")
     shutil.rmtree(out, ignore_errors=True)
     staging.rename(out)
+
+
+def _kept_since(out: Path, kept: Iterable[Path]) -> dict[str, str]:
+    """Commit at which each kept file was recorded."""
+    described = out / "provenance.json"
+    before = json.loads(described.read_text()) if described.is_file() else {}
+    earlier, last = before.get("kept", {}), before.get("commit", "unknown")
+    return {str(path): earlier.get(str(path), last) for path in kept}
 
 
 def provenance(results: Path, config: Any) -> dict[str, Any]:
@@ -94,7 +115,11 @@ def provenance(results: Path, config: Any) -> dict[str, Any]:
             "evaluation": config.evaluation.threads,
         },
         "matrix_product_gflops": round(matrix_product_speed(), 1),
-        "wall_s": round(_busy_seconds(results), 1),
+        "wall_s": round(_busy_seconds(results / "benchmarks"), 1),
+        "on_request_s": {
+            target.name: round(_busy_seconds(target), 1)
+            for target in sorted((results / ON_REQUEST).glob("*/"))
+        },
         **_installation(),
         "results_mb": round(_size_mb(results), 1),
         "tests_s": _test_seconds(results / "tests.xml"),
@@ -117,9 +142,9 @@ def matrix_product_speed(size: int = 1024, repeats: int = 5) -> float:
     return 2.0 * size**3 / best / 1e9
 
 
-def _busy_seconds(results: Path) -> float:
+def _busy_seconds(benchmarks: Path) -> float:
     """Wall time during which at least one job ran; a later visit adds its own time only."""
-    files = (results / "benchmarks").rglob("*.tsv")
+    files = benchmarks.rglob("*.tsv")
     spans = sorted((p.stat().st_mtime - _seconds(p), p.stat().st_mtime) for p in files)
     busy, until = 0.0, float("-inf")
     for start, end in spans:
