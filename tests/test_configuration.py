@@ -6,7 +6,7 @@ import pytest
 
 from psfdae.configuration import compose
 from psfdae.configuration.compose import ConfigError, as_overrides, config_dir, load, load_stage
-from psfdae.configuration.schema import STAGE_KEYS
+from psfdae.configuration.stages import STAGE_KEYS
 
 DATASETS = sorted(p.stem for p in config_dir().glob("dataset/[!_]*.yaml"))
 PRESETS = sorted(p.stem for p in config_dir().glob("preset/*.yaml"))

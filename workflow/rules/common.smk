@@ -5,14 +5,15 @@ from functools import cache
 from snakemake.utils import validate
 
 from psfdae.configuration.compose import ConfigError, as_overrides, config_dir
-from psfdae.configuration.compose import compose, load, stage_tree
-from psfdae.configuration.schema import STAGE_KEYS
+from psfdae.configuration.compose import compose, load, overrides_for, stage_tree
+from psfdae.configuration.stages import STAGE_KEYS
 from psfdae.source import source_hash
 
 validate(config, "../schemas/command_line.schema.yaml")
 
 PRESET = config["preset"]
-OVERRIDES = (f"preset={PRESET}", *shlex.split(config["set"] or ""))
+GIVEN = (f"preset={PRESET}", *shlex.split(config["set"] or ""))
+OVERRIDES = overrides_for("config", GIVEN)
 RESULTS = config["results"] or ("results" if PRESET == "fast" else f"results/{PRESET}")
 
 

@@ -3,7 +3,16 @@
 Only click is imported at the top; each command imports its stage when it runs.
 """
 
-from psfdae.cli import figures, knee, reporting, science
+from psfdae.cli import alignment, benchmark_timing, bounds, figures, knee, reporting, science
 from psfdae.cli.base import main
 
-__all__ = ["figures", "knee", "main", "reporting", "science"]
+__all__ = [
+    "alignment",
+    "benchmark_timing",
+    "bounds",
+    "figures",
+    "knee",
+    "main",
+    "reporting",
+    "science",
+]

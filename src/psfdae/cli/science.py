@@ -26,7 +26,7 @@ def config(stage: str | None, overrides: tuple[str, ...]) -> None:
     import yaml
 
     from psfdae.configuration.compose import load, load_stage
-    from psfdae.configuration.schema import STAGE_KEYS
+    from psfdae.configuration.stages import STAGE_KEYS
 
     if stage is not None and stage not in STAGE_KEYS:
         raise click.BadParameter(f"{stage!r} is not one of {', '.join(STAGE_KEYS)}")

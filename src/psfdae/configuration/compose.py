@@ -4,12 +4,24 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from psfdae.configuration.schema import STAGE_KEYS, Config, stage_model
+from psfdae.configuration.alignment import ALIGNMENT_STAGE_KEYS, AlignmentConfig
+from psfdae.configuration.schema import Config, Group
+from psfdae.configuration.stages import STAGE_KEYS, stage_model
+
+Root = Literal["config", "alignment"]
+"""Root files of the configuration: the datasets', and that of scene 3."""
+
+ROOTS: dict[Root, tuple[type[Group], dict[str, tuple[str, ...]]]] = {
+    "config": (Config, STAGE_KEYS),
+    "alignment": (AlignmentConfig, ALIGNMENT_STAGE_KEYS),
+}
+"""The checked model of every root and the groups that its stages read."""
 
 
 class ConfigError(ValueError):
@@ -30,8 +42,8 @@ def config_dir() -> Path:
 
 
 @cache
-def compose(overrides: tuple[str, ...] = ()) -> dict[str, Any]:
-    """Resolved configuration tree of a list of Hydra overrides, not yet checked.
+def compose(overrides: tuple[str, ...] = (), root: Root = "config") -> dict[str, Any]:
+    """Resolved configuration tree of a root and a list of Hydra overrides, not yet checked.
 
     Raises
     ------
@@ -47,7 +59,7 @@ def compose(overrides: tuple[str, ...] = ()) -> dict[str, Any]:
     GlobalHydra.instance().clear()
     try:
         with hydra.initialize_config_dir(str(config_dir()), version_base="1.3"):
-            tree = hydra.compose("config", overrides=list(overrides))
+            tree = hydra.compose(root, overrides=list(overrides))
         resolved = OmegaConf.to_container(tree, resolve=True, throw_on_missing=True)
     except (HydraException, OmegaConfBaseException) as error:
         raise ConfigError(f"config: {_first_lines(error)}") from error
@@ -55,15 +67,15 @@ def compose(overrides: tuple[str, ...] = ()) -> dict[str, Any]:
     return resolved
 
 
-def load(overrides: Sequence[str] = ()) -> Config:
-    """Compose and check the whole configuration of one dataset.
+def load(overrides: Sequence[str] = (), root: Root = "config") -> Any:
+    """Compose and check the whole configuration of one dataset, or of another root.
 
     Raises
     ------
     ConfigError
         Names each wrong key with its value and the allowed range.
     """
-    return validate(Config, compose(tuple(overrides)))
+    return validate(ROOTS[root][0], compose(tuple(overrides), root))
 
 
 def validate(model: type[Any], tree: Mapping[str, Any]) -> Any:
@@ -87,23 +99,62 @@ def load_stage(stage: str, overrides: Sequence[str] = ()) -> Any:
 
     Returns
     -------
-    pydantic model with the groups of `STAGE_KEYS[stage]` as attributes
+    pydantic model with the groups that the stage reads as attributes
 
     Raises
     ------
     ConfigError
         As `load`; an unknown group at the top is refused, too.
     """
-    tree = compose(tuple(overrides))
-    unknown = sorted(set(tree) - set(Config.model_fields))
+    root = root_of(stage)
+    model, keys = ROOTS[root]
+    tree = compose(tuple(overrides), root)
+    unknown = sorted(set(tree) - set(model.model_fields))
     if unknown:
         raise ConfigError(f"{unknown[0]}: unknown key")
-    return validate(stage_model(stage), stage_tree(stage, tree))
+    return validate(stage_model(stage, keys[stage], model), stage_tree(stage, tree))
+
+
+def root_of(stage: str) -> Root:
+    """The root whose groups a stage reads."""
+    return next(root for root, (_, keys) in ROOTS.items() if stage in keys)
 
 
 def stage_tree(stage: str, tree: Mapping[str, Any]) -> dict[str, Any]:
     """The part of a configuration tree that a stage reads."""
-    return {key: tree[key] for key in STAGE_KEYS[stage]}
+    return {key: tree[key] for key in ROOTS[root_of(stage)][1][stage]}
+
+
+def overrides_for(root: Root, overrides: Sequence[str]) -> tuple[str, ...]:
+    """Those of the workflow's overrides that concern a root.
+
+    The workflow takes one list for everything. A key that only another root
+    knows is left out; one that none knows stays and is refused by name. A shared
+    value, such as noise.kappa=5, reaches every root, but the choice of an option
+    of a shared group, such as telescope=wfsat_literal, is the datasets'. The
+    preset is every root's own option of that name.
+    """
+    kept = []
+    for override in overrides:
+        key = re.split(r"[=@]", override.lstrip("+~"), maxsplit=1)[0]
+        if key == "preset":
+            kept.append(override if root == "config" else f"{root}_{override}")
+            continue
+        known = {name for name in ROOTS if _knows(compose((), name), key)}
+        chooses = "config" in known and isinstance(compose((), "config").get(key), Mapping)
+        if not known or root in ({"config"} if chooses else known):
+            kept.append(override)
+    return tuple(kept)
+
+
+def _knows(tree: Mapping[str, Any], key: str) -> bool:
+    """Whether a configuration tree has a dotted key."""
+    node: Any = tree
+    for part in key.split("."):
+        if not isinstance(node, Mapping) or part not in node:
+            return False
+        node = node[part]
+    return True
 
 
 def as_overrides(tree: Mapping[str, Any]) -> list[str]:

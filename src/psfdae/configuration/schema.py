@@ -6,11 +6,10 @@ science code receives SI units (`Telescope.pixel_scale` is in radians).
 
 from __future__ import annotations
 
-from functools import cache
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, create_model, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 ARCSEC = np.pi / 180.0 / 3600.0
 
@@ -364,44 +363,3 @@ class Config(Group):
                 f"framing.stamp_px² = {self.framing.stamp_px**2}"
             )
         return self
-
-
-STAGE_KEYS: dict[str, tuple[str, ...]] = {
-    "templates": ("scene", "telescope", "grid", "wavefront", "framing", "optics"),
-    "stars": ("seed", "scene", "telescope", "grid", "wavefront", "stars", "framing", "optics"),
-    "baseline": ("seed", "noise", "parts", "baseline"),
-    "train": ("seed", "noise", "parts", "dae", "train"),
-    "evaluate": ("seed", "noise", "parts", "evaluation"),
-    "scan": (
-        *("seed", "scene", "telescope", "grid", "wavefront", "stars", "framing", "optics"),
-        *("noise", "calibration"),
-    ),
-    "calibrate": ("seed", "noise", "evaluation"),
-    "knee": ("seed", "noise", "parts", "dae", "train", "evaluation"),
-    "propagation": (
-        *("seed", "scene", "telescope", "grid", "wavefront", "stars", "framing", "optics"),
-        *("noise", "benchmark"),
-    ),
-    "timing": (
-        *("seed", "scene", "telescope", "grid", "wavefront", "stars", "framing", "optics"),
-        *("noise", "parts", "dae", "baseline", "evaluation", "benchmark"),
-    ),
-    "stability": (
-        *("seed", "scene", "telescope", "grid", "wavefront", "stars", "framing", "optics"),
-        *("noise", "parts", "dae", "train", "baseline", "evaluation", "stability"),
-    ),
-    "bounds": (
-        *("seed", "scene", "telescope", "grid", "wavefront", "stars", "framing", "optics"),
-        *("noise", "parts", "bounds"),
-    ),
-}
-"""The groups that each stage reads; nothing else can influence its result."""
-
-
-@cache
-def stage_model(stage: str) -> type[Group]:
-    """The config groups of one stage as a model of their own."""
-    fields = {
-        key: (Config.model_fields[key].rebuild_annotation(), ...) for key in STAGE_KEYS[stage]
-    }
-    return create_model(f"{stage.title()}Config", __base__=Group, **fields)  # type: ignore[call-overload]

@@ -60,7 +60,7 @@ def training_curves(histories: Mapping[str, pd.DataFrame], title: str) -> Figure
         Line2D([], [], color="black", marker="*", ms=11, ls="", label="kept network"),
     ]
     axes.set_yscale("log")
-    _readable_log_axis(axes)
+    readable_log_axis(axes)
     axes.set_xlabel("optimiser step")
     axes.set_ylabel(METRIC_LABELS["mse"])
     axes.set_title(title)
@@ -99,11 +99,11 @@ def error_against_noise(
         for method, rows in theirs.groupby("method"):
             axes.plot(rows["noise_level"], rows["value"], **_paper_marker(method))
         axes.set_title(REFERENCES[reference].replace(" (", "\n("))
-        _noise_axis(axes, levels)
+        noise_axis(axes, levels)
         axes.grid(True, which="major")
     if metric == "mse":
         panels[0].set_yscale("log")
-        _readable_log_axis(panels[0])
+        readable_log_axis(panels[0])
     panels[0].set_ylabel(METRIC_LABELS.get(metric, metric))
     figure.suptitle(f"{metric.upper().replace('_', ' ')} of {dataset} against the noise level")
     handles = _method_handles(set(ours["method"]), set(theirs["method"]))
@@ -163,7 +163,7 @@ def _split_handles() -> list[Any]:
     ]
 
 
-def _noise_axis(axes: Axes, levels: np.ndarray) -> None:
+def noise_axis(axes: Axes, levels: np.ndarray) -> None:
     """Logarithmic axis with a tick at each noise level and the common power of ten outside."""
     from matplotlib.ticker import NullLocator
 
@@ -174,7 +174,7 @@ def _noise_axis(axes: Axes, levels: np.ndarray) -> None:
     axes.set_xlabel(rf"noise level λ ($\times 10^{{{power}}}$)")
 
 
-def _readable_log_axis(axes: Axes) -> None:
+def readable_log_axis(axes: Axes) -> None:
     """Numbers also between the decades, as these axes often span only one or two."""
     from matplotlib.ticker import LogFormatterSciNotation, LogLocator, NullFormatter
 

@@ -1,0 +1,103 @@
+"""Local error floor of a star image whose field, centring and frame are known.
+
+Then only the Seidel coefficients c are open. Near the true ones the image is
+linear in c, p(c + δ) ≈ p + Jδ, and the posterior covariance of c is that of a
+linear Gaussian problem, (JᵀΣ⁻¹J + P⁻¹)⁻¹ with noise covariance Σ and prior
+covariance P (e.g. Kay 1993, Fundamentals of Statistical Signal Processing:
+Estimation Theory, chapter 11). It is a local approximation, not a strict bound.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from psfdae.configuration.schema import Optics, Telescope
+from psfdae.optics.derivatives import ModalStamps, NodeSampling, normalise_with_derivatives
+from psfdae.optics.pupil import Pupil, annular_pupil
+from psfdae.optics.seidel import SEIDEL_TERMS, monomial_coefficients, monomial_images
+
+BATCH = 16
+"""Stars at a time, to bound the memory."""
+
+
+def seidel_stamps(pupil: Pupil, stamp_px: int, pixel: float, nodes: int) -> ModalStamps:
+    """Operator from monomial coefficients to stamps and their derivatives, complex128."""
+    modes = monomial_images(pupil.axis[None, :], pupil.axis[:, None])
+    sampling = NodeSampling(pupil, stamp_px, pixel, nodes, "complex128")
+    return ModalStamps(pupil, modes, sampling, pixel)
+
+
+def sensitivities(
+    seidel: np.ndarray,
+    field: np.ndarray,
+    offset_px: np.ndarray,
+    samples: np.ndarray,
+    telescope: Telescope,
+    optics: Optics,
+    stamp_px: int,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Stamps of many stars and their derivatives by the Seidel coefficients.
+
+    Parameters
+    ----------
+    seidel : ndarray, shape (n, 5)
+        Coefficients in waves.
+    field : ndarray, shape (n, 2)
+        Relative field vectors.
+    offset_px : ndarray, shape (n, 2)
+        Centre (row, column) of each stamp from the chief ray, in pixels.
+    samples : ndarray of int, shape (n,)
+        Pupil samples N of each star.
+    telescope, optics : config groups
+    stamp_px : int
+        Side d of the stamps.
+
+    Returns
+    -------
+    stamps : ndarray, shape (n, d, d)
+        Sum 1.
+    derivatives : ndarray, shape (n, 5, d, d)
+        Per wave; each sums to 0.
+    """
+    terms = monomial_coefficients(np.eye(len(SEIDEL_TERMS)), field[:, None])
+    coefficients = monomial_coefficients(seidel, field)
+    stamps = np.empty((len(seidel), stamp_px, stamp_px))
+    derivatives = np.empty((len(seidel), len(SEIDEL_TERMS), stamp_px, stamp_px))
+    for count in np.unique(samples):
+        pupil = annular_pupil(int(count), telescope.obscuration)
+        kernel = seidel_stamps(pupil, stamp_px, telescope.pixel, optics.nodes)
+        members = np.flatnonzero(samples == count)
+        for star in np.array_split(members, range(BATCH, members.size, BATCH)):
+            stamps[star], derivatives[star], _ = normalise_with_derivatives(
+                *kernel.derivatives(coefficients[star], terms[star], offset_px[star])
+            )
+    return stamps, derivatives
+
+
+def local_error(derivatives: np.ndarray, prior_sd: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    """tr[J (JᵀΣ⁻¹J + P⁻¹)⁻¹ Jᵀ] / N_pix of every star.
+
+    Coefficients are counted in their prior standard deviations, P = 1, so that a
+    term that cannot vary drops out instead of dividing by zero.
+
+    Parameters
+    ----------
+    derivatives : ndarray, shape (n, K, d, d)
+        Image per unit of each coefficient.
+    prior_sd : ndarray, shape (K,)
+        Prior standard deviations, ≥ 0.
+    variance : ndarray, shape (n, d, d)
+        Noise variance of every pixel.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        Mean squared error per pixel.
+    """
+    count, terms = derivatives.shape[:2]
+    jacobian = (derivatives * prior_sd[:, None, None]).reshape(count, terms, -1)
+    weighted = jacobian / variance.reshape(count, 1, -1)
+    information = weighted @ jacobian.swapaxes(1, 2) + np.eye(terms)
+    spread = jacobian @ jacobian.swapaxes(1, 2)
+    trace = np.trace(np.linalg.solve(information, spread), axis1=1, axis2=2)
+    return trace / jacobian.shape[-1]

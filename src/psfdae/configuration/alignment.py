@@ -1,0 +1,190 @@
+"""Configuration of scene 3, the alignment of a secondary mirror (`config/alignment.yaml`).
+
+It is a root of its own: nothing of it exists in a dataset's configuration, and
+groups of the same name mean the same in both.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import AfterValidator, Field, model_validator
+
+from psfdae.configuration.schema import Count, Group, Name, Noise, Positive, Telescope
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+
+def _not_zero(value: float) -> float:
+    if value == 0:
+        raise ValueError("must not be 0")
+    return value
+
+
+Radius = Annotated[Finite, AfterValidator(_not_zero)]
+
+
+class Mirror(Group):
+    """A conic mirror."""
+
+    radius_m: Radius = Field(description="Radius of curvature, > 0: centre above the vertex")
+    conic: Finite = Field(description="Conic constant")
+    vertex_m: Finite = Field(description="z of the vertex")
+
+
+class Secondary(Mirror):
+    """The mirror that is misaligned."""
+
+    clear_radius_m: Positive = Field(description="Rays beyond this radius are vignetted")
+
+
+class Lens(Group):
+    """A lens with two spherical surfaces; light meets the front first."""
+
+    front_radius_m: Radius = Field(description="Radius of curvature, > 0: centre above vertex")
+    back_radius_m: Radius = Field(description="As front_radius_m")
+    front_vertex_m: Finite = Field(description="z of the front vertex")
+    back_vertex_m: Finite = Field(description="z of the back vertex, below the front")
+    clear_radius_m: Positive = Field(description="Rays beyond this radius are vignetted")
+
+    @model_validator(mode="after")
+    def _thick(self) -> Lens:
+        thickness = self.front_vertex_m - self.back_vertex_m
+        if not thickness > 0:
+            raise ValueError(
+                f"thickness = {thickness:.6g} m (front_vertex_m − back_vertex_m): "
+                "must be greater than 0"
+            )
+        return self
+
+
+class Glass(Group):
+    """Sellmeier's equation, n² − 1 = Σ b λ² / (λ² − c)."""
+
+    sellmeier_b: Annotated[list[Finite], Field(min_length=3, max_length=3)]
+    sellmeier_c_um2: Annotated[list[Finite], Field(min_length=3, max_length=3)] = Field(
+        description="In square micrometres"
+    )
+
+
+class Prescription(Group):
+    """A two-mirror telescope with a lens corrector; z up, light along −z."""
+
+    name: Name
+    entrance_pupil_m: Finite = Field(description="z of the plane that holds the pupil")
+    launch_distance_m: Positive = Field(description="Start of the rays above that plane")
+    reference_sphere_m: Positive = Field(description="Radius of the wavefront's reference")
+    primary: Mirror
+    secondary: Secondary
+    lenses: Annotated[dict[Name, Lens], Field(min_length=1)]
+    glass: Glass
+    best_focus_m: Finite = Field(description="z of the detector in focus")
+
+    @property
+    def ordered_lenses(self) -> list[tuple[str, Lens]]:
+        """Name and lens in the order in which light meets them."""
+        return sorted(self.lenses.items(), key=lambda item: -item[1].front_vertex_m)
+
+    @model_validator(mode="after")
+    def _in_order(self) -> Prescription:
+        along = [("secondary", self.secondary.vertex_m)]
+        for name, lens in self.ordered_lenses:
+            along += [(f"front of {name}", lens.front_vertex_m)]
+            along += [(f"back of {name}", lens.back_vertex_m)]
+        along += [("best focus", self.best_focus_m)]
+        for (above, z_above), (below, z_below) in pairwise(along):
+            if not z_above > z_below:
+                raise ValueError(
+                    f"distance from {above} to {below} = {z_above - z_below:.6g} m: "
+                    "must be greater than 0"
+                )
+        if not self.secondary.vertex_m > self.primary.vertex_m:
+            raise ValueError(
+                f"distance from primary to secondary = "
+                f"{self.secondary.vertex_m - self.primary.vertex_m:.6g} m: must be greater than 0"
+            )
+        return self
+
+
+class AlignmentOptics(Group):
+    """Numerical settings of the propagation; pixels are wide, which allows another way."""
+
+    pupil_samples: Annotated[list[Annotated[int, Field(ge=16, le=8192)]], Field(min_length=1)] = (
+        Field(description="Ladder of grid sizes N; each wavefront takes the first that suffices")
+    )
+    nodes: Annotated[int, Field(ge=1, le=32)] | None = Field(
+        description="Gauss-Legendre nodes per pixel and axis; null: whole-period Fourier transform"
+    )
+    precision: Literal["complex64", "complex128"]
+    batch: Count = Field(description="Wavefronts per batch")
+    threads: Count = Field(description="Batches at once")
+
+    @model_validator(mode="after")
+    def _ascending(self) -> AlignmentOptics:
+        if sorted(set(self.pupil_samples)) != self.pupil_samples:
+            raise ValueError(f"pupil_samples = {self.pupil_samples}: must be ascending")
+        return self
+
+
+class Alignment(Group):
+    """States of misalignment, fields, stamps and sets of states."""
+
+    decenter_range_m: Annotated[float, Field(gt=0, le=0.01)] = Field(
+        description="Decentre of the secondary in x and y: ± this"
+    )
+    tilt_range_deg: Annotated[float, Field(gt=0, le=1)] = Field(
+        description="Tilt of the secondary about x and y: ± this"
+    )
+    defocus_m: Annotated[float, Field(ge=-0.01, le=0.01)] = Field(
+        description="Fixed distance of the CCD beyond best focus"
+    )
+    field_radius_deg: Annotated[float, Field(gt=0, le=5)] = Field(
+        description="Radius of the circle of field points; one more is in the centre"
+    )
+    field_points: Annotated[int, Field(ge=1, le=64)] = Field(
+        description="Field points on the circle"
+    )
+    highest_zernike: Annotated[int, Field(ge=11, le=28)] = Field(
+        description="Highest Noll index of the wavefront"
+    )
+    model_tolerance_waves: Positive = Field(
+        description="Largest RMS by which the quadratic model may differ from ray tracing"
+    )
+    stamp_px: Annotated[int, Field(ge=8, le=64, multiple_of=2)] = Field(
+        description="Side d of a stamp, centred on the image's centroid"
+    )
+    least_energy: Annotated[float, Field(gt=0, lt=1)] = Field(
+        description="A stamp that holds less of the light is refused"
+    )
+    grid_levels: Annotated[int, Field(ge=2, le=9)] = Field(
+        description="Levels per degree of freedom of the grid of states"
+    )
+    test_states: Count = Field(description="Uniform states of the independent test set")
+    train_states: Count = Field(description="Uniform states of the large training set")
+
+    @property
+    def unit(self) -> np.ndarray:
+        """Ranges of decentre x, y in metres and tilt x, y in radians, shape (4,)."""
+        tilt = np.deg2rad(self.tilt_range_deg)
+        return np.array([self.decenter_range_m, self.decenter_range_m, tilt, tilt])
+
+
+class AlignmentConfig(Group):
+    """The whole configuration of scene 3."""
+
+    seed: Annotated[int, Field(ge=0, lt=2**63)]
+    telescope: Telescope
+    prescription: Prescription
+    alignment: Alignment
+    optics: AlignmentOptics
+    noise: Noise
+
+
+ALIGNMENT_STAGE_KEYS: dict[str, tuple[str, ...]] = {
+    "alignment_model": ("telescope", "prescription", "alignment"),
+    "alignment_states": ("seed", "telescope", "prescription", "alignment", "optics"),
+    "alignment_telescope": ("telescope", "alignment"),
+}
+"""The groups that each stage of scene 3 reads; nothing else can influence its result."""

@@ -1,0 +1,41 @@
+"""Which groups of the configuration each stage reads."""
+
+from __future__ import annotations
+
+from functools import cache
+
+from pydantic import create_model
+
+from psfdae.configuration.schema import Config, Group
+
+SIMULATION = ("seed", "scene", "telescope", "grid", "wavefront", "stars", "framing", "optics")
+"""Groups that decide the noise-free stars."""
+
+STAGE_KEYS: dict[str, tuple[str, ...]] = {
+    "templates": ("scene", "telescope", "grid", "wavefront", "framing", "optics"),
+    "stars": SIMULATION,
+    "baseline": ("seed", "noise", "parts", "baseline"),
+    "train": ("seed", "noise", "parts", "dae", "train"),
+    "evaluate": ("seed", "noise", "parts", "evaluation"),
+    "scan": (*SIMULATION, "noise", "calibration"),
+    "calibrate": ("seed", "noise", "evaluation"),
+    "knee": ("seed", "noise", "parts", "dae", "train", "evaluation"),
+    "propagation": (*SIMULATION, "noise", "benchmark"),
+    "timing": (*SIMULATION, "noise", "parts", "dae", "baseline", "evaluation", "benchmark"),
+    "stability": (
+        *SIMULATION,
+        *("noise", "parts", "dae", "train", "baseline", "evaluation", "stability"),
+    ),
+    "bank": (*SIMULATION, "bounds"),
+    "bounds": (*SIMULATION, "noise", "parts", "bounds"),
+}
+"""The groups that each stage reads; nothing else can influence its result."""
+
+
+@cache
+def stage_model(stage: str, keys: tuple[str, ...] = (), root: type[Group] = Config) -> type[Group]:
+    """Some config groups of a root as a model of their own; keys default to `STAGE_KEYS`."""
+    fields = {
+        key: (root.model_fields[key].rebuild_annotation(), ...) for key in keys or STAGE_KEYS[stage]
+    }
+    return create_model(f"{stage.title()}Config", __base__=Group, **fields)  # type: ignore[call-overload]

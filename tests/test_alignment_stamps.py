@@ -1,0 +1,322 @@
+"""Stamps of scene 3 and their derivatives, against physics and against independent codes."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+
+from psfdae.configuration.compose import load
+from psfdae.optics.derivatives import ModalStamps, NodeSampling, PeriodSampling
+from psfdae.optics.propagation import StampPropagator, pixel_nodes
+from psfdae.optics.pupil import annular_pupil
+from psfdae.optics.raytracing import annulus_points, misaligned
+from psfdae.optics.sampling import SamplingError, check_opd
+from psfdae.optics.seidel import monomial_coefficients, monomial_images
+from psfdae.stars.alignment_model import design_states, fit_quadratic
+from psfdae.stars.alignment_scene import (
+    grid_states,
+    state_derivatives,
+    state_stamps,
+    traced_zernikes,
+    uniform_states,
+    zernike_tracer,
+)
+from psfdae.stars.alignment_stamps import (
+    AlignmentStamps,
+    EnergyError,
+    centred_modes,
+    mean_slope,
+)
+
+OBSCURATION = 0.42
+SHOWN = [((0, 0, 0, 0), 0), ((0.6, -0.3, 0.2, 0.8), 2), ((1, 1, 1, 1), 7)]
+"""State and field of three stamps: aligned, astigmatic and comatic, a corner of the range."""
+
+
+@pytest.fixture(scope="module")
+def config():
+    return load((), "alignment")
+
+
+@pytest.fixture(scope="module")
+def tracer(config):
+    return zernike_tracer(config)
+
+
+@pytest.fixture(scope="module")
+def model(tracer):
+    return fit_quadratic(design_states(), traced_zernikes(tracer, design_states()))
+
+
+@pytest.fixture(scope="module")
+def grid(tracer):
+    """The 625 states and their ray-traced coefficients."""
+    states = grid_states(5)
+    return states, traced_zernikes(tracer, states)
+
+
+@pytest.fixture(scope="module")
+def operator(config):
+    return AlignmentStamps(config.telescope, config.optics, config.alignment)
+
+
+@pytest.fixture(scope="module")
+def exact(config):
+    """A finer pupil in double precision."""
+    optics = config.optics.model_copy(update={"pupil_samples": [254], "precision": "complex128"})
+    return AlignmentStamps(config.telescope, optics, config.alignment)
+
+
+def shown_zernikes(tracer):
+    return np.stack([traced_zernikes(tracer, np.array([s], float))[0, f] for s, f in SHOWN])
+
+
+def test_mean_slope_of_zernikes_over_the_annulus():
+    x, y, weights = annulus_points(36, OBSCURATION)
+    modes = [centred_modes(22, OBSCURATION, x + h, y) for h in (1e-5, -1e-5)]
+    assert ((modes[0] - modes[1]) / 2e-5) @ weights == pytest.approx(0, abs=1e-8)
+    modes = [centred_modes(22, OBSCURATION, x, y + h) for h in (1e-5, -1e-5)]
+    assert ((modes[0] - modes[1]) / 2e-5) @ weights == pytest.approx(0, abs=1e-8)
+    # Z8 = √8 (3r³ − 2r) cosθ over the full disc: mean slope √8.
+    assert mean_slope(8, 0.0) == pytest.approx((np.sqrt(8), 0.0))
+    assert mean_slope(7, 0.0) == pytest.approx((0.0, np.sqrt(8)))
+    assert mean_slope(9, OBSCURATION) == (0.0, 0.0)
+
+
+def test_centroid_of_the_whole_image_is_in_the_stamp_s_centre(tracer, config):
+    """To a hundredth of a pixel over the image's period, and the better the longer it is."""
+    zernikes, worst = shown_zernikes(tracer), []
+    for samples in (126, 254):
+        pupil = annular_pupil(samples, OBSCURATION)
+        x, y = pupil.axis[None, :], pupil.axis[:, None]
+        pixel = 2 / pupil.spacing / samples
+        sampling = PeriodSampling(pupil, samples, pixel, "complex128")
+        modes = centred_modes(22, OBSCURATION, x, y)
+        images = ModalStamps(pupil, modes, sampling, pixel).stamps(zernikes)
+        assert images.sum(axis=(1, 2)) == pytest.approx(1, abs=1e-12)
+        position = (np.arange(samples) - 0.5 * (samples - 1)) * pixel / config.telescope.pixel
+        centroids = [images.sum(axis=axis) @ position for axis in (1, 2)]
+        worst.append(np.abs(centroids).max())
+    assert worst[1] < 0.01
+    assert worst[1] < 0.6 * worst[0]
+
+
+def test_node_sampling_is_the_stamp_propagator():
+    pupil = annular_pupil(64, 0.3)
+    modes = monomial_images(pupil.axis[None, :], pupil.axis[:, None])
+    seidel = np.array([[0.1, 0.4, 0.4, 0.2, 0.0], [0.2, 0.1, 0.5, -0.3, 0.1]])
+    coefficients = monomial_coefficients(seidel, np.array([[0.6, 0.4], [-1.0, 0.2]]))
+    offset = np.array([[2, -1], [0, 3]])
+    kernel = StampPropagator(pupil, 8, 0.9, nodes=3)
+    modal = ModalStamps(pupil, modes, NodeSampling(pupil, 8, 0.9, 3, "complex128"), 0.9)
+    expected = kernel(modal.opd(coefficients), offset)
+    assert modal.stamps(coefficients, offset) == pytest.approx(expected, abs=1e-14)
+    assert modal.derivatives(coefficients, None, offset)[0] == pytest.approx(expected, abs=1e-14)
+
+
+def test_period_sampling_integrates_pixels_exactly(tracer, exact, config):
+    """The stamp propagator approaches it spectrally as its nodes increase."""
+    zernikes = shown_zernikes(tracer)
+    modal = exact.operator(254)
+    pupil = annular_pupil(254, OBSCURATION)
+    stamps = modal.stamps(zernikes)
+    errors = []
+    for nodes in (14, 18, 22):
+        kernel = StampPropagator(pupil, 16, config.telescope.pixel, nodes)
+        errors.append(np.abs(kernel(modal.opd(zernikes)) - stamps).max() / stamps.max())
+    assert errors[0] < 1e-3
+    assert errors[1] < 1e-5
+    assert errors[2] < 1e-7
+
+
+@pytest.mark.parametrize("kind", ["nodes", "period"])
+def test_derivatives_by_coefficients_are_differences(kind):
+    pupil = annular_pupil(48, 0.3)
+    x, y = pupil.axis[None, :], pupil.axis[:, None]
+    modes = centred_modes(11, 0.3, x, y)
+    sampling = (
+        NodeSampling(pupil, 8, 2.0, 4, "complex128")
+        if kind == "nodes"
+        else PeriodSampling(pupil, 8, 2.0, "complex128")
+    )
+    modal = ModalStamps(pupil, modes, sampling, 2.0)
+    rng = np.random.default_rng(0)
+    coefficients = 0.2 * rng.standard_normal((2, 8))
+    stamps, slopes = modal.derivatives(coefficients)
+    assert stamps == pytest.approx(modal.stamps(coefficients), abs=1e-14)
+    for mode, step in enumerate(1e-5 * np.eye(8)):
+        difference = modal.stamps(coefficients + step) - modal.stamps(coefficients - step)
+        assert slopes[:, mode] == pytest.approx(difference / 2e-5, abs=1e-8)
+    directions = rng.standard_normal((2, 3, 8))
+    along = modal.derivatives(coefficients, directions)[1]
+    assert along == pytest.approx(np.einsum("bkj,bjyx->bkyx", directions, slopes), abs=1e-12)
+
+
+def test_derivatives_by_state_are_differences(model, exact):
+    states = uniform_states(2, np.random.default_rng(5))
+    stamps, slopes = state_derivatives(model, exact, states)
+    assert stamps == pytest.approx(state_stamps(exact, model(states))[0], abs=1e-14)
+    assert slopes.sum(axis=(3, 4)) == pytest.approx(0, abs=1e-12)
+    for axis, step in enumerate(1e-4 * np.eye(4)):
+        plus, minus = (state_stamps(exact, model(states + s * step))[0] for s in (1, -1))
+        assert slopes[:, :, axis] == pytest.approx((plus - minus) / 2e-4, abs=2e-6)
+
+
+def test_configured_precision_and_threads(model, operator, config, exact):
+    """Single precision costs 1e-5 of the peak; the number of threads costs nothing."""
+    states = uniform_states(4, np.random.default_rng(6))
+    stamps, slopes = state_derivatives(model, operator, states)
+    assert stamps.dtype == slopes.dtype == np.float32
+    one = AlignmentStamps(
+        config.telescope, config.optics.model_copy(update={"threads": 1}), config.alignment
+    )
+    assert (state_stamps(one, model(states))[0] == state_stamps(operator, model(states))[0]).all()
+    truth = state_derivatives(model, exact, states)[1]
+    assert slopes == pytest.approx(truth, abs=5e-3 * np.abs(truth).max())
+
+
+def test_every_stamp_of_the_range_holds_its_light(operator, tracer, grid):
+    """At least 0.99 in the corners of the range, where the images are widest."""
+    states, zernikes = grid
+    corners = (np.abs(states) == 1).all(axis=1)
+    stamps, energy = state_stamps(operator, zernikes[corners])
+    assert energy.min() >= 0.99
+    assert stamps.sum(axis=(2, 3)) == pytest.approx(1, abs=1e-5)
+
+
+def test_stamp_that_loses_light_is_refused(config, model):
+    small = config.alignment.model_copy(update={"stamp_px": 8, "least_energy": 0.9})
+    telescope = config.telescope.model_copy(update={"pixel_scale_arcsec": 0.25})
+    stamps = AlignmentStamps(telescope, config.optics, small)
+    message = r"stamp \d+ holds 0\.\d+ of the light \(alignment\.least_energy = 0\.9\)"
+    with pytest.raises(EnergyError, match=message):
+        state_stamps(stamps, model(np.ones((1, 4))))
+
+
+def test_coarse_pupil_is_refused(config, model):
+    optics = config.optics.model_copy(update={"pupil_samples": [64, 90]})
+    stamps = AlignmentStamps(config.telescope, optics, config.alignment)
+    with pytest.raises(SamplingError, match=r"pupil_samples = \[64, 90\]: wavefront \d+ needs N"):
+        state_stamps(stamps, model(np.ones((1, 4))))
+
+
+def test_chosen_grids_satisfy_the_guard_of_the_maps(operator, grid):
+    """The slopes that choose N are those of the OPD maps that are propagated."""
+    states, zernikes = grid
+    steep = zernikes[(np.abs(states) == 1).all(axis=1)].reshape(-1, 19)
+    samples = operator.samples(steep)
+    for n in np.unique(samples):
+        opd = operator.operator(int(n)).opd(steep[samples == n])
+        check_opd(opd, annular_pupil(int(n), OBSCURATION).amplitude)
+
+
+def test_settings_stay_within_the_error_budget(operator, exact, tracer, config):
+    """1 % of the smallest noise variance; within about 1e-3 of the peak as well."""
+    budget = 0.01 * (config.noise.kappa * min(config.noise.levels)) ** 2
+    zernikes = traced_zernikes(tracer, uniform_states(15, np.random.default_rng(7)))
+    stamps, truth = (state_stamps(o, zernikes)[0] for o in (operator, exact))
+    assert ((stamps - truth) ** 2).mean(axis=(2, 3)).max() < budget
+    assert (np.abs(stamps - truth) / truth.max(axis=(2, 3), keepdims=True)).max() < 2e-3
+
+
+def test_mirrored_states_have_mirrored_stamps(operator, tracer):
+    """Columns run along the x, rows along the y of fields and decentres."""
+    state = np.array([0.5, -0.8, 0.3, 0.7])
+    mirrored_x = state * [-1, 1, 1, -1]
+    mirrored_y = state * [1, -1, -1, 1]
+    zernikes = traced_zernikes(tracer, np.stack([state, mirrored_x, mirrored_y]))
+    here, in_x, in_y = state_stamps(operator, zernikes)[0]
+    across_x, across_y = [0, 5, 4, 3, 2, 1, 8, 7, 6], [0, 1, 8, 7, 6, 5, 4, 3, 2]
+    assert in_x[across_x] == pytest.approx(here[:, :, ::-1], abs=1e-5)
+    assert in_y[across_y] == pytest.approx(here[:, ::-1], abs=1e-5)
+    assert np.abs(here - here[:, :, ::-1]).max() > 0.02
+
+
+def huygens_stamp(tracer, state, field, telescope, nodes=14, rays_across=160):
+    """Sum over batoid's rays at points of the detector, a stamp by the local plate scale.
+
+    The points lie on a grid of field angles, so the phases of a ray separate:
+    the sum that batoid's huygensPSF forms point by point becomes two products.
+    """
+    import batoid
+    from batoid.analysis import drdth
+
+    optic = misaligned(tracer.optic, np.array(state) * tracer.unit)
+    theta, wavelength = tracer.fields[field], telescope.wavelength_m
+    rays = batoid.RayVector.asGrid(
+        optic=optic, wavelength=wavelength, theta_x=theta[0], theta_y=theta[1], nx=rays_across
+    )
+    optic.trace(rays)
+    lit = ~rays.vignetted
+    centre = rays.r[lit].mean(axis=0)
+    start = rays.amplitude(centre, rays.t[0])[lit]
+    scale = drdth(optic, *theta, wavelength)
+    pixel = np.deg2rad(telescope.pixel_scale_arcsec / 3600)
+    inside, weights = pixel_nodes(pixel, nodes)
+    angle = ((np.arange(16) - 7.5)[:, None] * pixel + inside).ravel()
+    wave_x, wave_y = (np.exp(1j * np.outer(angle, k)) for k in (rays.k[lit][:, :2] @ scale).T)
+    intensity = np.abs((wave_y * start) @ wave_x.T) ** 2
+    points = centre + np.pad(scale @ [angle[70], angle[90]], (0, 1))
+    assert intensity[90, 70] == pytest.approx(
+        np.abs(rays[lit].sumAmplitude(points, rays.t[0])) ** 2, rel=1e-3
+    )
+    weighted = intensity * np.outer(*[np.tile(weights, 16)] * 2)
+    stamp = weighted.reshape(16, nodes, 16, nodes).sum(axis=(1, 3))
+    return stamp / stamp.sum()
+
+
+def test_against_batoid_s_huygens_psf(tracer, operator, config):
+    """No pupil, no Zernikes, no Fourier transform: rays alone; 2 % of the peak at most."""
+    ours = operator(shown_zernikes(tracer))[0]
+    for stamp, (state, field) in zip(ours, SHOWN, strict=True):
+        theirs = huygens_stamp(tracer, state, field, config.telescope)
+        assert np.abs(stamp - theirs).max() < 0.02 * stamp.max(), (state, field)
+
+
+def poppy_stamp(zernikes, telescope, samples=512, oversampling=48):
+    """POPPY's Fraunhofer image of an OPD from galsim's Zernike polynomials, binary pupil.
+
+    POPPY counts phase the other way, so the lead of the wavefront is its OPD.
+    """
+    import astropy.units as u
+    import poppy
+    from galsim.zernike import Zernike
+
+    axis = (np.arange(samples) + 0.5) * 2 / samples - 1
+    x, y = np.meshgrid(axis, axis)
+    lit = (np.hypot(x, y) <= 1) & (np.hypot(x, y) >= OBSCURATION)
+    wave = Zernike([0, 0, 0, 0, *zernikes])
+    opd = wave(x, y) - wave.gradX(x, y)[lit].mean() * x - wave.gradY(x, y)[lit].mean() * y
+    element = poppy.ArrayOpticalElement(
+        transmission=lit.astype(float),
+        opd=opd * telescope.wavelength_m,
+        pixelscale=telescope.diameter_m / samples * u.m / u.pixel,
+    )
+    system = poppy.OpticalSystem(
+        npix=samples, oversample=1, pupil_diameter=telescope.diameter_m * u.m
+    )
+    system.add_pupil(element)
+    system.add_detector(
+        pixelscale=telescope.pixel_scale_arcsec / oversampling, fov_pixels=16 * oversampling
+    )
+    fine = system.calc_psf(wavelength=telescope.wavelength_m)[0].data
+    stamp = fine.reshape(16, oversampling, 16, oversampling).sum(axis=(1, 3))
+    return stamp / stamp.sum()
+
+
+def test_against_poppy_fraunhofer(tracer, operator, config):
+    zernikes = shown_zernikes(tracer)
+    for stamp, wave in zip(operator(zernikes)[0], zernikes, strict=True):
+        theirs = poppy_stamp(wave, config.telescope)
+        assert np.abs(stamp - theirs).max() < 1e-3 * stamp.max()
+
+
+@pytest.mark.slow
+def test_stamps_of_the_grid_take_twenty_seconds(operator, grid):
+    start = time.perf_counter()
+    stamps, energy = state_stamps(operator, grid[1])
+    assert time.perf_counter() - start < 20
+    assert stamps.shape == (625, 9, 16, 16)
+    assert energy.min() >= 0.99

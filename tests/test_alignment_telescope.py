@@ -1,0 +1,259 @@
+"""The telescope of scene 3 by ray tracing: signs, symmetries, refusals, batoid's own results."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import psfdae
+from psfdae.configuration.compose import ConfigError, load
+from psfdae.optics.raytracing import (
+    DEGREES_OF_FREEDOM,
+    RayTracingError,
+    annulus_points,
+    build_optic,
+    misaligned,
+)
+from psfdae.optics.zernike import zernike_basis
+from psfdae.stars.alignment_scene import (
+    field_points,
+    grid_states,
+    traced_zernikes,
+    uniform_states,
+    zernike_tracer,
+)
+
+ARCSEC = np.pi / 180 / 3600
+
+
+@pytest.fixture(scope="module")
+def config():
+    return load((), "alignment")
+
+
+@pytest.fixture(scope="module")
+def tracer(config):
+    return zernike_tracer(config)
+
+
+@pytest.fixture(scope="module")
+def fields_deg(tracer):
+    return np.rad2deg(tracer.fields)
+
+
+def test_focal_ratio_and_spots_of_the_prescription(config, tracer):
+    from batoid.analysis import drdth, spot
+
+    optic = build_optic(config.prescription, config.telescope)
+    wavelength = config.telescope.wavelength_m
+    focal = drdth(optic, 0.0, 0.0, wavelength)[0, 0]
+    assert focal / config.telescope.diameter_m == pytest.approx(5.99, abs=0.005)
+    for field in tracer.fields:
+        x, y = spot(optic, *field, wavelength, nx=32, reference="mean")
+        assert np.sqrt(x.var() + y.var()) / focal < 0.05 * ARCSEC
+
+
+def test_no_misalignment_is_the_aligned_telescope(tracer):
+    aligned = misaligned(tracer.optic, np.zeros(4))
+    assert aligned == tracer.optic
+    centre = tracer(np.zeros((1, 4)))[0, 0, 3:]
+    round_terms = np.isin(np.arange(4, 23), [4, 11, 22])
+    assert np.abs(centre[~round_terms]).max() < 1e-8
+    assert centre[0] == pytest.approx(0.32, abs=0.01)  # the CCD is beyond focus
+
+
+def test_perturbing_leaves_the_telescope_as_it_was(config, tracer):
+    before = build_optic(config.prescription, config.telescope, config.alignment.defocus_m)
+    moved = misaligned(tracer.optic, np.array([1e-3, 0.0, 0.0, 1e-3]))
+    assert moved != tracer.optic
+    assert tracer.optic == before
+    assert moved["M2"].coordSys.origin[0] == pytest.approx(1e-3)
+    assert moved["M1"] == tracer.optic["M1"]
+
+
+def linear_response(tracer, name):
+    """Change of the coefficients per unit of the range, shape (F, 23), Noll index as column."""
+    step = 0.1 * np.eye(4)[DEGREES_OF_FREEDOM.index(name)]
+    plus, minus = tracer(np.stack([step, -step]))
+    return np.pad((plus - minus) / 0.2, ((0, 0), (1, 0)))
+
+
+# Noll index: (constant, per degree of f_x, per degree of f_y), waves RMS for 1 mm and 0.1°.
+SENSITIVITIES = {
+    "decenter_x": {8: (-0.446, 0, 0), 7: (0, 0, 0), 4: (0, -0.212, 0)},
+    "decenter_y": {7: (-0.446, 0, 0), 8: (0, 0, 0), 4: (0, 0, -0.212)},
+    "tilt_x": {7: (0.650, 0, 0), 4: (0, 0, -0.560), 6: (0, 0, 1.604), 5: (0, -1.60, 0)},
+    "tilt_y": {8: (-0.650, 0, 0), 4: (0, 0.560, 0), 6: (0, 1.604, 0), 5: (0, 0, 1.60)},
+}
+
+
+@pytest.mark.parametrize("name", DEGREES_OF_FREEDOM)
+def test_signs_and_sizes_of_the_four_degrees_of_freedom(tracer, fields_deg, name):
+    response = linear_response(tracer, name)
+    for noll, (constant, per_x, per_y) in SENSITIVITIES[name].items():
+        expected = constant + fields_deg @ [per_x, per_y]
+        assert response[:, noll] == pytest.approx(expected, abs=0.006), noll
+
+
+MIRRORS = {
+    "x": np.array([[-1, 0], [0, 1]]),
+    "y": np.array([[1, 0], [0, -1]]),
+    "diagonal": np.array([[0, 1], [1, 0]]),
+    "quarter turn": np.array([[0, -1], [1, 0]]),
+}
+
+
+@pytest.mark.parametrize("name", MIRRORS)
+def test_mirror_symmetries_of_the_telescope(tracer, name):
+    """A mirrored state shows the mirrored wavefront in the mirrored field.
+
+    Decentres and fields are vectors; tilts are axial, a mirror turns them round.
+    """
+    mirror = MIRRORS[name]
+    states = uniform_states(4, np.random.default_rng(3))
+    axial = np.linalg.det(mirror) * mirror
+    mirrored = np.hstack([states[:, :2] @ mirror.T, states[:, 2:] @ axial.T])
+    distance = np.linalg.norm(tracer.fields @ mirror.T - tracer.fields[:, None], axis=-1)
+    partner = distance.argmin(axis=0)
+    assert distance.min(axis=0).max() < 1e-12
+    x, y = np.random.default_rng(4).uniform(-0.7, 0.7, (2, 50))
+    here = tracer(states) @ zernike_basis(22, x, y)
+    there = tracer(mirrored)[:, partner] @ zernike_basis(22, *(mirror @ [x, y]))
+    assert np.abs(here).max() > 1
+    assert there == pytest.approx(here, abs=3e-8)
+
+
+def test_batoid_s_own_zernike_fit(config, tracer):
+    """On a fine square grid; ours needs 96 rays of the annulus."""
+    from batoid import zernike
+
+    state = np.array([0.7, -1.0, 0.4, 0.9])
+    optic = misaligned(tracer.optic, state * tracer.unit)
+    ours = tracer(state[None])[0]
+    for field in (0, 3, 6):
+        theirs = zernike(
+            optic, *tracer.fields[field], 6e-7, nx=96, reference="mean", jmax=22, eps=0.0
+        )
+        assert ours[field, 3:] == pytest.approx(theirs[4:], abs=2e-6)
+
+
+def test_surfaces_of_the_telescope(tracer):
+    """Shapes, places and glass as batoid holds them; the detector is 0.2 mm beyond focus."""
+    import batoid
+
+    optic = tracer.optic
+    surfaces = {
+        "M1": (batoid.Quadric(7.5, -1.2536), 0.0),
+        "M2": (batoid.Quadric(4.5882, -9.512), 2.4118),
+        "l1 front": (batoid.Sphere(-0.701), -0.4891),
+        "l1 back": (batoid.Sphere(-1.179), -0.5141),
+        "l2 front": (batoid.Sphere(1.1446), -0.616),
+        "l2 back": (batoid.Sphere(-4.4215), -0.641),
+        "D": (batoid.Plane(), -0.80231),
+    }
+    for name, (surface, z) in surfaces.items():
+        part = optic[name.split()[0]][name] if name.startswith("l") else optic[name]
+        assert part.surface == surface, name
+        assert part.coordSys.origin == pytest.approx([0, 0, z], abs=1e-12), name
+    assert optic["l1"].medium.getN(600e-9) == pytest.approx(1.4580, abs=1e-4)  # fused silica
+
+
+def test_weights_of_the_annulus_integrate_zernike_products():
+    """Means of Z_j² over the annulus agree with a fine midpoint sum."""
+    x, y, weights = annulus_points(22, 0.42)
+    basis = zernike_basis(22, x, y)
+    radius = np.sqrt(0.42**2 + (1 - 0.42**2) * (np.arange(400) + 0.5) / 400)
+    angle = 2 * np.pi * np.arange(64) / 64
+    fine = zernike_basis(22, np.outer(radius, np.cos(angle)), np.outer(radius, np.sin(angle)))
+    assert weights.sum() == pytest.approx(1, abs=1e-12)
+    assert (basis**2) @ weights == pytest.approx((fine**2).mean(axis=(1, 2)), rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("state", "message"),
+    [
+        ([0, 0, 1.2, 0], r"state 1: tilt_x = 1\.2 of the range \(0\.12°\): must be between"),
+        ([0, -1.5, 0, 0], r"state 1: decenter_y = -1\.5 of the range \(-1\.5 mm\)"),
+        ([0, 0, 0, np.nan], r"state 1: tilt_y = nan"),
+    ],
+)
+def test_state_outside_the_range_is_refused(tracer, state, message):
+    with pytest.raises(RayTracingError, match=message):
+        tracer(np.array([[0.0] * 4, state]))
+
+
+def test_ends_of_the_range_are_inside(tracer):
+    assert tracer(np.array([np.ones(4) * (1 + 1e-12)])).shape == (1, 9, 22)
+
+
+def test_vignetted_field_is_refused():
+    config = load(["alignment.field_radius_deg=0.7"], "alignment")
+    message = r"state 0, field \(0\.7, 0\)°: \d+ of 132 rays are vignetted; 8 of 9 fields are"
+    with pytest.raises(RayTracingError, match=message):
+        zernike_tracer(config)(np.zeros((1, 4)))
+
+
+def test_no_state_of_the_grid_is_vignetted(tracer):
+    assert np.isfinite(tracer(grid_states(2))).all()
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        (
+            "prescription.lenses.l1.back_vertex_m=-0.48",
+            r"prescription\.lenses\.l1: thickness = -0\.0091 m .*greater than 0",
+        ),
+        (
+            "prescription.lenses.l2.front_vertex_m=-0.51",
+            r"distance from back of l1 to front of l2 = -0\.0041 m",
+        ),
+        ("prescription.best_focus_m=-0.6", r"from back of l2 to best focus = -0\.041 m"),
+        ("prescription.secondary.vertex_m=-0.2", r"primary to secondary = -0\.2 m"),
+        ("~prescription.secondary.conic", r"prescription\.secondary\.conic: missing"),
+        ("~prescription.lenses.l2.clear_radius_m", r"lenses\.l2\.clear_radius_m: missing"),
+        ("prescription.primary.radius_m=0", r"prescription\.primary\.radius_m: must not be 0"),
+        ("prescription.glass.sellmeier_b=[1.0]", r"sellmeier_b = \[1\.0\]: .*at least 3"),
+        ("alignment.tilt_range_deg=2", r"alignment\.tilt_range_deg = 2: .*less than or equal to 1"),
+        ("alignment.decenter_range_m=0", r"alignment\.decenter_range_m = 0: .*greater than 0"),
+        ("alignment.grid_levels=1", r"alignment\.grid_levels = 1: .*greater than or equal to 2"),
+        ("alignment.stamp_px=15", r"alignment\.stamp_px = 15: .*multiple of 2"),
+        ("optics.pupil_samples=[158,126]", r"pupil_samples = \[158, 126\]: must be ascending"),
+    ],
+)
+def test_wrong_configuration_is_named(override, message):
+    with pytest.raises(ConfigError, match=message):
+        load([override], "alignment")
+
+
+def test_nine_fields_are_the_centre_and_a_circle():
+    degrees = np.rad2deg(field_points(0.5, 8))
+    assert degrees[0] == pytest.approx([0, 0])
+    assert degrees[1] == pytest.approx([0.5, 0])
+    assert degrees[3] == pytest.approx([0, 0.5])
+    assert np.hypot(*degrees[1:].T) == pytest.approx(0.5)
+
+
+def test_a_thousand_fields_take_a_second(tracer):
+    """The grid of 625 states × 9 fields may take 10 s, 1.8 ms per field."""
+    states = uniform_states(111, np.random.default_rng(0))
+    start = time.perf_counter()
+    traced_zernikes(tracer, states)
+    assert time.perf_counter() - start < 999 * 1.8e-3
+
+
+def test_batoid_is_imported_by_ray_tracing_only():
+    package = Path(psfdae.__file__).parent
+    importing = {
+        path.relative_to(package).as_posix()
+        for path in package.rglob("*.py")
+        if "import batoid" in path.read_text() or "from batoid" in path.read_text()
+    }
+    assert importing == {"optics/raytracing.py"}
+    code = "import sys, psfdae.stages.alignment as s; sys.exit('batoid' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

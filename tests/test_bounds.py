@@ -1,0 +1,343 @@
+"""Best possible estimates: the bank's symmetries, the posterior mean and the local floor."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import poisson
+
+from psfdae.bounds.bank import Bank, jittered_templates, jitters, windows
+from psfdae.bounds.discrete import exact_posterior
+from psfdae.bounds.efficiency import compare
+from psfdae.bounds.fisher import local_error, sensitivities
+from psfdae.bounds.growth import extrapolate, last_change, nested_means, segments
+from psfdae.bounds.likelihood import Likelihood
+from psfdae.bounds.posterior import merge, posterior_sums
+from psfdae.bounds.symmetry import SYMMETRIES, weights
+from psfdae.optics.propagation import StampPropagator
+from psfdae.optics.pupil import annular_pupil
+from psfdae.optics.seidel import monomial_coefficients, monomial_images
+from psfdae.stars.fields import perturb_seidel
+from psfdae.stars.framing import brightest_pixel, normalise_flux, stamp_offset
+from psfdae.stars.scene import Propagation
+from psfdae.stars.seidel_scene import SeidelWavefronts, relative_field
+
+POINTS, SIDE = 3, 8
+
+
+def framed_image(star_field, rng):
+    """An image of a 3 × 3 grid's star, 12 px a side, brightest at index 6, field-dependent."""
+    row, column = np.mgrid[:12, :12] - 6.0
+    iy, ix = np.divmod(star_field, POINTS)
+    width = rng.uniform(1.0, 1.6)
+    tail = np.exp(-np.hypot(row - 1.5 * (iy - 1), column - 1.5 * (ix - 1)) / width)
+    image = np.exp(-0.5 * (row**2 + column**2)) + 0.3 * tail + 0.01 * rng.random((12, 12))
+    image[6, 6] = 2.0
+    return image
+
+
+@pytest.fixture(scope="module")
+def bank():
+    """Forty made-up stars on a 3 × 3 grid, stamps of 8 px."""
+    rng = np.random.default_rng(5)
+    field = np.arange(40) % POINTS**2
+    framed = np.array([framed_image(f, rng) for f in field])
+    return Bank(framed.astype(np.float32), field, rng.integers(-5, 5, (40, 2)), POINTS, 1)
+
+
+@pytest.fixture(scope="module")
+def members(bank):
+    """Every image of the bank, one by one: image, field, jitter number, weight."""
+    weight = weights(bank.field, bank.peak, POINTS)
+    rows = []
+    for k in range(len(bank)):
+        for s, symmetry in enumerate(SYMMETRIES):
+            for j, jitter in enumerate(jitters(1)):
+                row, column = symmetry.window(jitter, bank.margin)
+                cut = bank.framed[k, row : row + SIDE, column : column + SIDE].astype(float)
+                image = symmetry.image(cut / cut.sum())
+                rows.append((image, symmetry.field(bank.field[k], POINTS), j, weight[k, s]))
+    return [np.array(column) for column in zip(*rows, strict=True)]
+
+
+@pytest.fixture(scope="module")
+def stars(members):
+    """Some of the bank's images as test stars."""
+    return members[0][[0, 100, 777, 1500, 2400]]
+
+
+def test_symmetries_are_eight_and_reversible():
+    images = np.random.default_rng(1).random((2, 5, 5))
+    moved = {symmetry.image(images).tobytes() for symmetry in SYMMETRIES}
+    assert len(moved) == 8
+    for symmetry in SYMMETRIES:
+        assert (symmetry.undo(symmetry.image(images)) == images).all()
+
+
+@pytest.mark.parametrize("symmetry", SYMMETRIES)
+def test_pixels_and_fields_move_with_the_image(symmetry):
+    field = np.zeros((4, 4))
+    field[1, 3] = 1.0  # row iy = 1, column ix = 3
+    row, column = np.argwhere(symmetry.image(field) == 1.0)[0]
+    assert symmetry.field(3 + 4 * 1, 4) == column + 4 * row
+    # Pixels from the chief ray in the middle: index − 2.
+    assert (symmetry.pixel(np.array([1, 3]) - 2) == np.array([row, column]) - 2).all()
+
+
+def test_every_window_frames_the_brightest_pixel():
+    framed = np.zeros((12, 12))
+    framed[6, 6] = 1.0
+    seen = 0
+    for (row, column), uses in windows(1).items():
+        cut = framed[row : row + SIDE, column : column + SIDE]
+        assert cut.shape == (SIDE, SIDE)
+        for s, j in uses:
+            at = np.argwhere(SYMMETRIES[s].image(cut) == 1.0)[0]
+            assert (at == SIDE // 2 + np.array(jitters(1)[j])).all()
+            seen += 1
+    assert seen == 8 * 9
+
+
+def test_fields_stay_equally_likely():
+    field, peak = np.arange(POINTS**2), np.tile([2, -4], (POINTS**2, 1))
+    weight = weights(field, peak, POINTS)
+    assert (weight.sum(axis=1) == 8).all()
+    assert sorted(weight[4])[-1] == 8  # the centre: one image stands for all eight
+    assert sorted(weight[0]) == [0, 0, 0, 0, 2, 2, 2, 2]  # a corner is on one diagonal
+    total = np.zeros(POINTS**2)
+    for s, symmetry in enumerate(SYMMETRIES):
+        np.add.at(total, symmetry.field(field, POINTS), weight[:, s])
+    assert (total == 8).all()
+
+
+@pytest.fixture(scope="module")
+def mirrored(scene1):
+    """Stars on the axes, the diagonals, the centre and elsewhere, and all their mirror images."""
+    _, position = relative_field(scene1.grid)
+    field = np.array([60, 5, 115, 57, 0, 108, 32, 85])
+    rng = np.random.default_rng(8)
+    seidel = perturb_seidel(scene1.wavefront.coefficients, 0.5, field.size, rng)
+    targets = np.stack([s.field(field, 11) for s in SYMMETRIES], axis=1)
+    everything = Propagation(
+        SeidelWavefronts(np.repeat(seidel, 8, axis=0), position[targets.ravel()]),
+        *(scene1.telescope, scene1.optics, scene1.framing, 64),
+    )
+    return field, targets, everything, everything.brightest()
+
+
+def test_mirrored_crops_are_the_stars_of_mirrored_fields(mirrored, scene1):
+    field, targets, everything, peaks = mirrored
+    own = peaks[::8]  # the identity comes first
+    framed = everything.stamps(20, np.repeat(stamp_offset(own, 0 * own), 8, axis=0))[::8]
+    bank = Bank(framed, field, own, 11, 1)
+    weight = weights(field, own, 11)
+    jitter = (1, 0)
+    direct, _ = normalise_flux(everything.stamps(16, stamp_offset(peaks, np.array([jitter]))))
+    compared = np.zeros(targets.shape, dtype=int)
+    for s, symmetry in enumerate(SYMMETRIES):
+        cut = symmetry.image(bank.stamps(symmetry.window(jitter, bank.margin)))
+        expected = direct.reshape(field.size, 8, 16, 16)[:, s]
+        close = np.abs(cut - expected).max(axis=(1, 2)) < 1e-4 * expected.max(axis=(1, 2))
+        assert close[weight[:, s] > 0].all()
+        compared[:, s] = weight[:, s] > 0
+    # On a mirror axis some symmetries would frame the other of two equal maxima.
+    assert compared.sum() < compared.size
+    assert compared.any(axis=1).all()
+
+
+def test_templates_of_all_jitters_are_framed_and_normalised(bank):
+    stamps = jittered_templates(bank.framed[:5, 1:-1, 1:-1], jitter_px=1)
+    assert stamps.shape == (5, 9, SIDE, SIDE)
+    assert stamps.sum(axis=(2, 3)) == pytest.approx(np.ones((5, 9)), rel=1e-6)
+    for shifted in stamps:
+        found = [brightest_pixel(stamp, 1e-4) for stamp in shifted]
+        assert found == [(4 + row, 4 + column) for row, column in jitters(1)]
+
+
+def brute_force(members, noisy, flux, background):
+    """Normalised weights of all images by the Poisson distribution itself."""
+    images, _, _, weight = members
+    counts = np.rint(flux * noisy.astype(float)) + background
+    log_l = poisson.logpmf(counts[:, None], flux * images + background).sum(axis=(2, 3))
+    with np.errstate(divide="ignore"):
+        log_l += np.log(weight)
+    w = np.exp(log_l - log_l.max(axis=1, keepdims=True))
+    return w / w.sum(axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize(("level", "tolerance"), [(3e-5, 0.5), (1e-3, 5e-3), (5e-3, 5e-4)])
+def test_single_precision_keeps_differences_of_the_log_likelihood(
+    level, tolerance, gaussian_stars, noise
+):
+    """The terms themselves reach 10⁶; stamps need not sum to 1."""
+    noisy = noise.draw(gaussian_stars[:20], level, np.random.default_rng(1))
+    scale = np.linspace(0.9, 1.1, 300)[:, None, None]
+    stamps = (gaussian_stars * scale).reshape(300, -1).astype(np.float64)
+    likelihood = Likelihood.of(noise, level, gaussian_stars)
+    ratio, offset = likelihood.factors(stamps)
+    residuals = likelihood.residuals(noisy)
+    single = residuals.astype(np.float32) @ ratio.T.astype(np.float32) + offset
+    counts = np.rint(likelihood.flux * noisy.astype(float)).reshape(20, 1, -1) + noise.background
+    exact = poisson.logpmf(counts, likelihood.flux * stamps + noise.background).sum(axis=2)
+    best = exact.argmax(axis=1)[:, None]
+    expected, found = (
+        scores - np.take_along_axis(scores, best, axis=1)
+        for scores in (exact, residuals @ ratio.T + offset)
+    )
+    assert found == pytest.approx(expected, abs=1e-4)
+    error = single - np.take_along_axis(single, best, axis=1) - expected
+    assert np.abs(error).max() < tolerance
+    assert np.abs(expected).max() > 1e5 * tolerance
+
+
+@pytest.mark.parametrize("level", [3e-5, 1e-3, 2e-2])
+def test_posterior_mean_is_that_of_the_poisson_distribution(level, bank, members, stars, noise):
+    noisy = noise.draw(stars, level, np.random.default_rng(2))
+    likelihood = Likelihood.of(noise, level, bank.stamps((2, 2)))
+    sums = posterior_sums(bank, noisy, likelihood, chunk=7)
+    w = brute_force(members, noisy, likelihood.flux, noise.background)
+    images, field, jitter, _ = members
+    expected = np.einsum("nk,khw->nhw", w, images).reshape(len(stars), -1)
+    assert np.abs(sums.mean_image - expected).max() < 1e-4 * expected.max()
+    assert sums.effective_size == pytest.approx(1 / (w**2).sum(axis=1), rel=2e-2)
+    templates = np.random.default_rng(3).random((POINTS**2, 9, SIDE, SIDE))
+    static = np.einsum("nk,khw->nhw", w, templates[field, jitter]).reshape(len(stars), -1)
+    assert sums.mean_template(templates) == pytest.approx(static, rel=1e-2)
+    # At the highest noise the data say little, at the lowest everything.
+    assert (sums.effective_size > 50).all() if level > 1e-2 else True
+    assert (sums.effective_size < 1.01).all() if level < 1e-4 else True
+
+
+def test_chunks_and_parts_change_nothing(bank, stars, noise):
+    noisy = noise.draw(stars, 3e-3, np.random.default_rng(2))
+    likelihood = Likelihood.of(noise, 3e-3, stars)
+    whole = posterior_sums(bank, noisy, likelihood, chunk=1000)
+    small = posterior_sums(bank, noisy, likelihood, chunk=3)
+    halves = [bank.take(np.arange(half, 40, 2)) for half in (0, 1)]
+    merged = merge([posterior_sums(half, noisy, likelihood) for half in halves])
+    for other in (small, merged):
+        assert other.mean_image == pytest.approx(whole.mean_image, rel=1e-5)
+        assert other.effective_size == pytest.approx(whole.effective_size, rel=1e-4)
+        assert other.share / other.total[:, None, None] == pytest.approx(
+            whole.share / whole.total[:, None, None], abs=1e-6
+        )
+
+
+def test_posterior_mean_does_not_depend_on_what_is_taken_out(bank, stars, noise):
+    """The centre only serves precision."""
+    noisy = noise.draw(stars, 1e-3, np.random.default_rng(2))
+    flat = np.full((1, SIDE, SIDE), 1 / SIDE**2)
+    one = posterior_sums(bank, noisy, Likelihood.of(noise, 1e-3, stars))
+    two = posterior_sums(bank, noisy, Likelihood.of(noise, 1e-3, flat))
+    assert two.mean_image == pytest.approx(one.mean_image, rel=1e-3)
+
+
+def test_nested_banks_end_with_the_whole_one(bank, stars, noise):
+    noisy = noise.draw(stars, 3e-3, np.random.default_rng(2))
+    likelihood = Likelihood.of(noise, 3e-3, stars)
+    parts = [posterior_sums(bank.take(np.arange(k, 40, 4)), noisy, likelihood) for k in range(4)]
+    sizes = nested_means(parts, lambda sums: sums.effective_size)
+    assert list(sizes) == [1, 2, 4]
+    assert sizes[1] == pytest.approx(np.mean([p.effective_size for p in parts], axis=0))
+    assert sizes[4] == pytest.approx(merge(parts).effective_size)
+    assert [segments(count) for count in (1, 3, 16, 60, 32000)] == [1, 2, 16, 16, 16]
+
+
+def test_extrapolation_recovers_a_power_law():
+    draws = 500 * 2 ** np.arange(5)
+    limit, exponent, residual = extrapolate(draws, 2e-6 + 3e-4 / draws**0.8)
+    assert (limit, exponent) == (pytest.approx(2e-6, rel=1e-3), pytest.approx(0.8, rel=1e-3))
+    assert residual < 1e-5
+    assert np.isnan(extrapolate(draws[:3], np.ones(3))).all()
+    assert last_change([4.0, 3.0, 2.5, 2.0]) == pytest.approx(0.5)
+    assert np.isnan(last_change([1.0, 1.0]))
+
+
+def test_exact_posterior_is_the_poisson_one(noise, members):
+    templates = members[0][:27].reshape(3, 9, SIDE, SIDE)
+    truth = templates[[0, 1, 2, 0], [4, 0, 8, 3]]
+    for level, known in ((1e-3, True), (1e-2, False), (10.0, False)):
+        noisy = noise.draw(truth, level, np.random.default_rng(4))
+        likelihood = Likelihood.of(noise, level, truth)
+        mean, probability = exact_posterior(noisy, templates, likelihood)
+        flat = (templates.reshape(27, SIDE, SIDE), None, None, np.ones(27))
+        w = brute_force(flat, noisy, likelihood.flux, noise.background)
+        assert probability == pytest.approx(w.reshape(4, 3, 9).sum(axis=2), abs=1e-8)
+        assert mean == pytest.approx(np.einsum("nk,khw->nhw", w, flat[0]), abs=1e-8)
+        right = probability[np.arange(4), [0, 1, 2, 0]]
+        assert (right > 0.99).all() == known
+    assert probability == pytest.approx(np.full((4, 3), 1 / 3), abs=0.02)
+
+
+@pytest.fixture(scope="module")
+def derivatives(scene1):
+    """Stamp and derivatives at N = 160 of one star away from every mirror axis."""
+    pupil = annular_pupil(160, scene1.telescope.obscuration)
+    star = (np.array([0.55, 3.7, 4.3, 1.7, -0.12]), np.array([0.2, -0.6]), np.array([-3, 2]))
+    stamps, jacobians = sensitivities(
+        *(part[None] for part in star), np.array([160]), scene1.telescope, scene1.optics, 16
+    )
+    return pupil, stamps[0], jacobians[0], star
+
+
+def stamp(pupil, seidel, field, offset, pixel):
+    propagate = StampPropagator(pupil, 16, pixel, 3)
+    images = monomial_images(pupil.axis[None, :], pupil.axis[:, None])
+    opd = np.tensordot(monomial_coefficients(seidel, field), images, axes=1)
+    return normalise_flux(propagate(opd[None], offset[None]))[0][0]
+
+
+def test_derivatives_are_those_of_the_propagated_stamp(derivatives, scene1):
+    pupil, image, jacobian, (seidel, field, offset) = derivatives
+    pixel = scene1.telescope.pixel
+    assert image == pytest.approx(stamp(pupil, seidel, field, offset, pixel), abs=1e-12)
+    assert jacobian.sum(axis=(1, 2)) == pytest.approx(np.zeros(5), abs=1e-12)
+    step = 1e-4
+    for k, direction in enumerate(step * np.eye(5)):
+        ahead, behind = (
+            stamp(pupil, seidel + sign * direction, field, offset, pixel) for sign in (1, -1)
+        )
+        difference = (ahead - behind) / (2 * step)
+        assert np.abs(jacobian[k]).max() > 1e-4
+        assert np.abs(jacobian[k] - difference).max() < 1e-5 * np.abs(jacobian[k]).max()
+
+
+def test_floor_of_a_linear_gaussian_problem():
+    """The error of the optimal linear estimator, in closed form and by simulation."""
+    rng = np.random.default_rng(6)
+    jacobian = rng.standard_normal((1, 3, 4, 4))
+    sd = np.array([0.5, 2.0, 0.0])
+    variance = rng.uniform(0.5, 2.0, (1, 4, 4))
+    error = local_error(jacobian, sd, variance)[0]
+    h, prior, noise_cov = jacobian[0].reshape(3, 16).T, np.diag(sd**2), np.diag(variance.ravel())
+    gain = prior @ h.T @ np.linalg.inv(h @ prior @ h.T + noise_cov)
+    posterior = prior - gain @ h @ prior
+    assert error == pytest.approx(np.trace(h @ posterior @ h.T) / 16, rel=1e-10)
+    truth = sd[:, None] * rng.standard_normal((3, 20000))
+    data = h @ truth + np.sqrt(variance.reshape(16, 1)) * rng.standard_normal((16, 20000))
+    assert error == pytest.approx(((h @ (gain @ data - truth)) ** 2).mean(), rel=0.03)
+
+
+def test_floor_lies_between_no_and_all_prior_knowledge():
+    rng = np.random.default_rng(7)
+    jacobian, sd = rng.standard_normal((2, 2, 4, 4)), np.array([0.3, 0.4])
+    prior_only = ((jacobian * sd[:, None, None]) ** 2).sum(axis=1).mean(axis=(1, 2))
+    errors = [local_error(jacobian, sd, np.full((2, 4, 4), v)) for v in (1e-6, 1e-2, 1.0, 1e6)]
+    assert (np.diff(errors, axis=0) > 0).all()
+    assert errors[-1] == pytest.approx(prior_only, rel=1e-4)
+    # K coefficients and a weak prior: K of the N pixels' noise is left.
+    assert errors[0] == pytest.approx([1e-6 * 2 / 16] * 2, rel=1e-3)
+
+
+def test_comparison_is_paired_and_tolerant():
+    rng = np.random.default_rng(9)
+    field, bound = np.arange(400) % 20, rng.exponential(1.0, 400)
+    same = compare(bound, bound, field)
+    assert (same.efficiency, same.difference, same.beaten) == (1.0, 0.0, False)
+    worse = compare(bound + 0.1, bound, field)
+    assert worse.difference == pytest.approx(0.1)
+    assert worse.stderr < 1e-12  # the stars' own scatter is common to both
+    assert not worse.beaten
+    assert not compare(0.96 * bound, bound, field).beaten
+    assert compare(0.8 * bound, bound, field).beaten
+    assert np.isnan(compare(bound, 0 * bound, field).efficiency)

@@ -1,0 +1,274 @@
+"""Stages of the target bounds on tiny products, and its figures."""
+
+from __future__ import annotations
+
+import h5py
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.collections import PolyCollection
+
+from psfdae.configuration.compose import load_stage
+from psfdae.evaluation.bound_figures import (
+    bank_growth,
+    efficiency_against_noise,
+    errors_above_bounds,
+)
+from psfdae.files import ProductError, read_product
+from psfdae.stages import bank, bound_figures, bounds, efficiency, stars, templates
+from psfdae.stages.common import noisy_test_images, split_stars
+
+LEVELS = (0.001, 0.003, 0.01, 0.1)
+SIZES = ("preset=smoke", "grid.points=3", "stars.count=60", "parts.train_stars=20")
+SIZES += ("parts.test_stars=40", "bounds.bank_stars=80", "bounds.test_stars=24")
+SIZES += (f"noise.levels={list(LEVELS)}", "bounds.threads=1", "optics.threads=1")
+
+
+def settings(stage, dataset, *more):
+    return load_stage(stage, (f"dataset={dataset}", *SIZES, *more))
+
+
+def build(folder, dataset):
+    """Products and tables of a dataset's bounds, made by the stages."""
+    templates.run(settings("templates", dataset), folder / "templates.h5")
+    stars.run(settings("stars", dataset), folder / "templates.h5", folder / "stars.h5")
+    config = settings("bounds", dataset)
+    drawn = folder / "bank.h5" if config.stars.aberration_fraction else None
+    if drawn:
+        bank.run(config, drawn)
+    products = (folder / "stars.h5", folder / "templates.h5", drawn)
+    tables = [folder / name for name in ("bounds.csv", "growth.csv", "bounds.parquet")]
+    bounds.run(config, dataset, *products, *tables)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def scene_1(tmp_path_factory):
+    return build(tmp_path_factory.mktemp("scene1"), "dataset6")
+
+
+@pytest.fixture(scope="module")
+def scene_2(tmp_path_factory):
+    return build(tmp_path_factory.mktemp("scene2"), "dataset8")
+
+
+def evaluated(folder, dataset, factor):
+    """Per-star errors of a made-up method, `factor` times the posterior mean's."""
+    best = pd.read_parquet(folder / "bounds.parquet")
+    best = best[best.method == "bayes"].assign(method="lmmse", dataset=dataset)
+    best["mse"] *= factor
+    # The stage evaluate knows all test stars, in its own order, and other splits.
+    extra = best.assign(star=best.star + 1000, mse=1.0)
+    held_out = best.assign(split="held_out", mse=0.0)
+    path = folder / f"evaluation_{factor}.parquet"
+    pd.concat([extra, best[::-1], held_out]).to_parquet(path)
+    return path
+
+
+def compared(folder, dataset, factor):
+    inputs = ([folder / "bounds.csv"], [folder / "bounds.parquet"])
+    efficiency.run(*inputs, [evaluated(folder, dataset, factor)], folder / "efficiency.csv")
+    return pd.read_csv(folder / "efficiency.csv")
+
+
+def test_bank_holds_none_of_the_stars(scene_1):
+    drawn = read_product(scene_1 / "bank.h5", "bank")
+    ours = read_product(scene_1 / "stars.h5", "stars", ("seidel",))["seidel"]
+    assert drawn["seidel"].shape == (80, 5)
+    assert not np.isin(drawn["seidel"], ours).any()
+    assert np.bincount(drawn["field_index"]).tolist() == [9] * 8 + [8]
+    assert drawn["framed"].shape == (80, 20, 20)
+    central = drawn["framed"][:, 2:-2, 2:-2].reshape(80, -1)
+    assert (central.argmax(axis=1) == 8 * 16 + 8).mean() > 0.8  # the rest are exact ties
+
+
+def test_bounds_of_scene_1(scene_1):
+    table = pd.read_csv(scene_1 / "bounds.csv")
+    assert list(table.columns) == bounds.COLUMNS
+    assert set(table.n) == {24}
+    assert set(table.metric) == {"mse"}
+    assert sorted(set(zip(table.reference, table.method, strict=True))) == [
+        ("realisation", "bayes"),
+        ("realisation", "floor"),
+        ("template", "bayes"),
+    ]
+    cells = table.set_index(["reference", "method", "noise_level"]).value
+    for level in LEVELS:
+        assert cells["realisation", "floor", level] < cells["realisation", "bayes", level]
+        noisy = (4.98 * level) ** 2
+        assert cells["realisation", "bayes", level] < noisy
+    assert (table.ci_low < table.value).all()
+    assert (table.ci_high > table.value).all()
+
+
+def test_growth_ends_with_the_error_of_the_table(scene_1):
+    growth = pd.read_csv(scene_1 / "growth.csv")
+    assert list(growth.columns) == bounds.GROWTH_COLUMNS
+    table = pd.read_csv(scene_1 / "bounds.csv")
+    best = table[table.method == "bayes"].set_index(["reference", "noise_level"])
+    for key, sizes in growth.groupby(["reference", "noise_level"]):
+        # 80 draws, or a quarter of them where the bank is hopelessly thin.
+        assert sizes.draws.tolist() in ([5, 10, 20, 40, 80], [5, 10, 20])
+        assert sizes.mse.iloc[-1] == pytest.approx(best.value[key])
+        change = abs(sizes.mse.iloc[-3] / sizes.mse.iloc[-1] - 1)
+        assert sizes.last_change.tolist() == pytest.approx([change] * len(sizes), rel=1e-5)
+        assert best.tight[key] == ("yes" if change <= 0.05 else "no")
+    assert growth.ess_mean.min() >= 1
+    assert growth.draws.max() == 80
+
+
+def test_bounded_stars_are_the_first_test_stars_with_their_noise(scene_1):
+    config = settings("bounds", "dataset6")
+    product = read_product(scene_1 / "stars.h5", "stars")
+    test = split_stars(product, "random", config).test
+    rows = pd.read_parquet(scene_1 / "bounds.parquet")
+    for _, column in rows.groupby(["reference", "method", "noise_level"]):
+        assert column.star.tolist() == test[:24].tolist()
+        assert column.field.tolist() == product["field_index"][test[:24]].tolist()
+    used = bounds._test_stars(config, product).noisy
+    assert list(used) == list(LEVELS)
+    for level in LEVELS:
+        everyone = noisy_test_images(config, product["realisation"][test], level)
+        assert (used[level] == everyone[:24]).all()
+
+
+def test_a_bank_of_other_stars_is_refused(scene_1, tmp_path):
+    bank.run(settings("bounds", "dataset3", "bounds.bank_stars=9"), tmp_path / "bank.h5")
+    outputs = [tmp_path / name for name in ("a.csv", "b.csv", "c.parquet")]
+    products = (scene_1 / "stars.h5", scene_1 / "templates.h5")
+    config = settings("bounds", "dataset6")
+    with pytest.raises(ProductError, match="another stars than that"):
+        bounds.run(config, "dataset6", *products, tmp_path / "bank.h5", *outputs)
+    with pytest.raises(ProductError, match="a bank is needed"):
+        bounds.run(config, "dataset6", *products, None, *outputs)
+    assert not outputs[0].exists()
+
+
+def test_scene_2_is_exact(scene_2):
+    table = pd.read_csv(scene_2 / "bounds.csv")
+    assert set(table.method) == {"bayes"}
+    assert set(table.tight) == {"yes"}
+    right = table[table.metric == "p_right"].sort_values("noise_level").value
+    assert (np.diff(right) < 0).all()
+    assert right.iloc[0] > 0.999
+    error = table[table.metric == "mse"].sort_values("noise_level").value.to_numpy()
+    assert error[0] == 0.0
+    assert error[-1] > 1e-9
+    assert pd.read_csv(scene_2 / "growth.csv").empty
+
+
+@pytest.mark.parametrize(("factor", "verdict"), [(1.5, "ok"), (1e-3, "beaten")])
+def test_efficiency_of_a_known_method(scene_1, factor, verdict):
+    table = compared(scene_1, "dataset6", factor)
+    assert list(table.columns) == efficiency.COLUMNS
+    assert set(table.n) == {24}
+    method = table[table.method == "lmmse"]
+    tight = method[(method.bound == "bayes") & (method.tight == "yes")]
+    assert tight.efficiency.to_numpy() == pytest.approx(1 / factor, rel=1e-5)
+    floor = method[method.bound == "floor"]
+    assert set(floor.reference) == {"realisation"}
+    assert len(floor) == len(LEVELS)
+    assert floor.efficiency.to_numpy() == pytest.approx(floor.mse_bound / floor.mse, rel=1e-5)
+    assert set(pd.concat([tight, floor]).verdict) == {verdict}
+    thin = method[(method.bound == "bayes") & (method.tight == "no")]
+    assert thin.verdict.isna().all()
+    assert thin.efficiency.isna().all()
+    assert len(tight)
+    assert len(thin)
+
+
+def test_the_posterior_mean_respects_the_floor(scene_1):
+    table = compared(scene_1, "dataset6", 1.5)
+    rows = table[table.method == "bayes"]
+    assert len(rows) == len(LEVELS)
+    assert set(rows.verdict) == {"ok"}
+    assert (rows.efficiency < 1).all()
+
+
+def test_methods_must_cover_the_bounded_stars(scene_1, tmp_path):
+    rows = pd.read_parquet(evaluated(scene_1, "dataset6", 1.5))
+    rows[rows.star != rows.star.min()].to_parquet(tmp_path / "e.parquet")
+    inputs = ([scene_1 / "bounds.csv"], [scene_1 / "bounds.parquet"])
+    with pytest.raises(ProductError, match="lmmse lacks 1 of the bounded stars"):
+        efficiency.run(*inputs, [tmp_path / "e.parquet"], tmp_path / "x.csv")
+    rows.assign(dataset="dataset1").to_parquet(tmp_path / "e.parquet")
+    with pytest.raises(ProductError, match="no method was evaluated"):
+        efficiency.run(*inputs, [tmp_path / "e.parquet"], tmp_path / "x.csv")
+
+
+def test_collect_joins_tables_of_one_kind(scene_1, scene_2, tmp_path):
+    parts = [folder / "bounds.csv" for folder in (scene_1, scene_2)]
+    bounds.collect(parts, tmp_path / "all.csv")
+    joined = pd.read_csv(tmp_path / "all.csv")
+    assert len(joined) == sum(len(pd.read_csv(part)) for part in parts)
+    sizes = [folder / "growth.csv" for folder in (scene_2, scene_1)]
+    bounds.collect(sizes, tmp_path / "growth.csv")  # the first has no rows
+    pd.testing.assert_frame_equal(
+        pd.read_csv(tmp_path / "growth.csv"), pd.read_csv(scene_1 / "growth.csv")
+    )
+    with pytest.raises(ProductError, match="unlike"):
+        bounds.collect([parts[0], sizes[1]], tmp_path / "mixed.csv")
+
+
+def test_same_config_gives_the_same_bytes(scene_1, tmp_path):
+    bank.run(settings("bounds", "dataset6"), tmp_path / "bank.h5")
+    with h5py.File(tmp_path / "bank.h5") as one, h5py.File(scene_1 / "bank.h5") as two:
+        assert (one["framed"][()] == two["framed"][()]).all()
+
+
+def test_markers_are_filled_where_the_bound_is_tight(scene_1):
+    table = pd.read_csv(scene_1 / "bounds.csv")
+    figure = errors_above_bounds(compared(scene_1, "dataset6", 1.5), table, "dataset6")
+    assert len(figure.axes) == 2
+    for axes, reference in zip(figure.axes, ("realisation", "template"), strict=True):
+        best = table[(table.reference == reference) & (table.method == "bayes")]
+        drawn = {
+            fill: sum(
+                len(line.get_xdata())
+                for line in axes.lines
+                if line.get_marker() == "o" and line.get_markerfacecolor() == fill
+            )
+            for fill in ("black", "white")
+        }
+        tight = int((best.tight == "yes").sum())
+        assert drawn == {"black": tight, "white": len(best) - tight}
+        shaded = sum(isinstance(item, PolyCollection) for item in axes.collections)
+        assert shaded == (1 if reference == "realisation" else 0)
+
+
+def test_a_bound_of_zero_is_written_not_drawn(scene_2):
+    table = pd.read_csv(scene_2 / "bounds.csv")
+    figure = errors_above_bounds(compared(scene_2, "dataset8", 1.5), table, "dataset8")
+    zero = table[(table.metric == "mse") & (table.value == 0)].noise_level.tolist()
+    assert zero
+    texts = [(text.get_text(), text.get_position()[0]) for text in figure.axes[0].texts]
+    assert texts == [("0", level) for level in zero]
+
+
+def test_efficiency_figure_keeps_its_axis_without_values(scene_1):
+    table = compared(scene_1, "dataset6", 1.5)
+    table.loc[table.reference == "template", "efficiency"] = np.nan
+    figure = efficiency_against_noise(table, "dataset6")
+    left, right = figure.axes
+    assert left.get_xlim() == right.get_xlim()
+    assert [text.get_text() for text in right.texts] == ["no tight bound above 0"]
+    assert not left.texts
+
+
+def test_growth_figure_has_a_line_per_level(scene_1):
+    figure = bank_growth(pd.read_csv(scene_1 / "growth.csv"), "dataset6")
+    for axes in figure.axes:
+        assert sum(line.get_marker() == "o" for line in axes.lines) == len(LEVELS)
+        assert axes.get_xscale() == "log"
+
+
+def test_figure_stages_write_png_and_name_what_is_missing(scene_1, tmp_path):
+    compared(scene_1, "dataset6", 1.5)
+    tables = (scene_1 / "bounds.csv", scene_1 / "efficiency.csv")
+    bound_figures.errors(*tables, "dataset6", tmp_path / "e.png")
+    bound_figures.efficiency(tables[1], "dataset6", tmp_path / "f.png")
+    bound_figures.growth(scene_1 / "growth.csv", "dataset6", tmp_path / "g.png")
+    for name in "efg":
+        assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+    with pytest.raises(ProductError, match="no rows of dataset1"):
+        bound_figures.growth(scene_1 / "growth.csv", "dataset1", tmp_path / "h.png")

@@ -1,0 +1,227 @@
+BOUNDS = f"{RESULTS}/bounds"
+
+
+def has_bank(dataset):
+    """Whether the stars of a dataset have random aberrations, of which a bank is drawn."""
+    return dataset_config(dataset).stars.aberration_fraction > 0
+
+
+def bank_of(dataset):
+    stars = dataset_config(dataset).stars.name
+    return [f"{BOUNDS}/bank/{stars}.h5"] if has_bank(dataset) else []
+
+
+def per_star_of(dataset):
+    """Errors of the methods on the test stars of the split that is bounded."""
+    return [
+        csv.removesuffix(".csv") + ".parquet"
+        for csv in evaluations_of(dataset, ["random"])
+    ]
+
+
+def bound_figures_of(dataset):
+    kinds = ["errors", "efficiency"] + (["growth"] if has_bank(dataset) else [])
+    return [f"{RESULTS}/figures/bounds/{dataset}_{kind}.png" for kind in kinds]
+
+
+rule bank:
+    output:
+        f"{BOUNDS}/bank/{{stars}}.h5",
+    log:
+        f"{RESULTS}/logs/bounds/bank_{{stars}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks_on_request/bounds/bank-{{stars}}.tsv"
+    threads: lambda w: compose((f"stars={w.stars}", *OVERRIDES))["bounds"]["threads"]
+    resources:
+        mem_mb=1500,
+    params:
+        config=lambda w: stage_overrides("bank", f"stars={w.stars}"),
+        source=source_hash("psfdae.stages.bank", "psfdae.stars.seidel_scene"),
+    message:
+        "Simulating the bank of {wildcards.stars}"
+    shell:
+        "psfdae bank --out {output} {params.config:q} > {log} 2>&1"
+
+
+rule dataset_bounds:
+    input:
+        stars=lambda w: stars_of(w.dataset),
+        templates=lambda w: templates_of(dataset_config(w.dataset).stars.name),
+        bank=lambda w: bank_of(w.dataset),
+    output:
+        summary=f"{BOUNDS}/{{dataset}}.csv",
+        growth=f"{BOUNDS}/{{dataset}}_growth.csv",
+        per_star=f"{BOUNDS}/{{dataset}}.parquet",
+    log:
+        f"{RESULTS}/logs/bounds/{{dataset}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks_on_request/bounds/{{dataset}}.tsv"
+    threads: lambda w: dataset_config(w.dataset).bounds.threads
+    resources:
+        mem_mb=1500,
+    params:
+        config=lambda w: stage_overrides("bounds", f"dataset={w.dataset}"),
+        source=source_hash("psfdae.stages.bounds"),
+        bank=lambda w: [f"--bank={path}" for path in bank_of(w.dataset)],
+    message:
+        "Bounding the errors of {wildcards.dataset}"
+    shell:
+        "psfdae bounds --dataset {wildcards.dataset} --stars {input.stars}"
+        " --templates {input.templates} {params.bank:q} --growth {output.growth}"
+        " --per-star {output.per_star} --out {output.summary} {params.config:q}"
+        " > {log} 2>&1"
+
+
+rule psf_bounds:
+    input:
+        expand(rules.dataset_bounds.output.summary, dataset=default_datasets()),
+    output:
+        f"{RESULTS}/tables/psf_bounds.csv",
+    log:
+        f"{RESULTS}/logs/bounds/psf_bounds.log",
+    benchmark:
+        f"{RESULTS}/benchmarks_on_request/bounds/psf_bounds.tsv"
+    threads: 1
+    resources:
+        mem_mb=500,
+    params:
+        source=source_hash("psfdae.stages.bounds"),
+    message:
+        "Collecting the bounds of all datasets"
+    shell:
+        "psfdae collect-bounds --out {output} {input} > {log} 2>&1"
+
+
+rule psf_bounds_growth:
+    input:
+        expand(rules.dataset_bounds.output.growth, dataset=default_datasets()),
+    output:
+        f"{RESULTS}/tables/psf_bounds_growth.csv",
+    log:
+        f"{RESULTS}/logs/bounds/psf_bounds_growth.log",
+    benchmark:
+        f"{RESULTS}/benchmarks_on_request/bounds/psf_bounds_growth.tsv"
+    threads: 1
+    resources:
+        mem_mb=500,
+    params:
+        source=source_hash("psfdae.stages.bounds"),
+    message:
+        "Collecting how the posterior means depend on their banks"
+    shell:
+        "psfdae collect-bounds --out {output} {input} > {log} 2>&1"
+
+
+rule psf_efficiency:
+    input:
+        bounds=expand(rules.dataset_bounds.output.summary, dataset=default_datasets()),
+        best=expand(rules.dataset_bounds.output.per_star, dataset=default_datasets()),
+        methods=[
+            path for dataset in default_datasets() for path in per_star_of(dataset)
+        ],
+    output:
+        f"{RESULTS}/tables/psf_efficiency.csv",
+    log:
+        f"{RESULTS}/logs/bounds/psf_efficiency.log",
+    benchmark:
+        f"{RESULTS}/benchmarks_on_request/bounds/psf_efficiency.tsv"
+    threads: 1
+    resources:
+        mem_mb=1000,
+    params:
+        bounds=lambda w, input: [f"--bounds={path}" for path in input.bounds],
+        best=lambda w, input: [f"--bounds-per-star={path}" for path in input.best],
+        source=source_hash("psfdae.stages.efficiency"),
+    message:
+        "Comparing all methods with the bounds"
+    shell:
+        "psfdae efficiency {params.bounds:q} {params.best:q} --out {output}"
+        " {input.methods} > {log} 2>&1"
+
+
+rule figure_bounds:
+    input:
+        bounds=rules.psf_bounds.output,
+        efficiency=rules.psf_efficiency.output,
+    output:
+        report(
+            f"{RESULTS}/figures/bounds/{{dataset}}_errors.png",
+            caption="../report/figure_bounds.rst",
+            category="Best possible",
+            labels={"data": "{dataset}", "figure": "errors above the bounds"},
+        ),
+    log:
+        f"{RESULTS}/logs/figures/bounds/{{dataset}}_errors.log",
+    benchmark:
+        f"{RESULTS}/benchmarks_on_request/bounds/figure_errors-{{dataset}}.tsv"
+    threads: 1
+    resources:
+        mem_mb=500,
+    params:
+        source=source_hash("psfdae.stages.bound_figures"),
+    message:
+        "Drawing the errors of {wildcards.dataset} above their bounds"
+    shell:
+        "psfdae figure bounds --dataset {wildcards.dataset} --bounds {input.bounds}"
+        " --efficiency {input.efficiency} --out {output} > {log} 2>&1"
+
+
+rule figure_efficiency:
+    input:
+        rules.psf_efficiency.output,
+    output:
+        report(
+            f"{RESULTS}/figures/bounds/{{dataset}}_efficiency.png",
+            caption="../report/figure_efficiency.rst",
+            category="Best possible",
+            labels={"data": "{dataset}", "figure": "efficiency"},
+        ),
+    log:
+        f"{RESULTS}/logs/figures/bounds/{{dataset}}_efficiency.log",
+    benchmark:
+        f"{RESULTS}/benchmarks_on_request/bounds/figure_efficiency-{{dataset}}.tsv"
+    threads: 1
+    resources:
+        mem_mb=500,
+    params:
+        source=source_hash("psfdae.stages.bound_figures"),
+    message:
+        "Drawing the efficiency of the methods on {wildcards.dataset}"
+    shell:
+        "psfdae figure efficiency --dataset {wildcards.dataset} --efficiency {input}"
+        " --out {output} > {log} 2>&1"
+
+
+rule figure_bank_growth:
+    input:
+        rules.dataset_bounds.output.growth,
+    output:
+        report(
+            f"{RESULTS}/figures/bounds/{{dataset}}_growth.png",
+            caption="../report/figure_bank_growth.rst",
+            category="Best possible",
+            labels={"data": "{dataset}", "figure": "growth of the bank"},
+        ),
+    log:
+        f"{RESULTS}/logs/figures/bounds/{{dataset}}_growth.log",
+    benchmark:
+        f"{RESULTS}/benchmarks_on_request/bounds/figure_growth-{{dataset}}.tsv"
+    threads: 1
+    resources:
+        mem_mb=500,
+    params:
+        source=source_hash("psfdae.stages.bound_figures"),
+    message:
+        "Drawing how the bound of {wildcards.dataset} depends on its bank"
+    shell:
+        "psfdae figure bank-growth --dataset {wildcards.dataset} --growth {input}"
+        " --out {output} > {log} 2>&1"
+
+
+rule bounds:
+    input:
+        rules.psf_bounds.output,
+        rules.psf_bounds_growth.output,
+        rules.psf_efficiency.output,
+        [file for dataset in default_datasets() for file in bound_figures_of(dataset)],
+    localrule: True
