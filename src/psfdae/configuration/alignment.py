@@ -171,6 +171,65 @@ class Alignment(Group):
         return np.array([self.decenter_range_m, self.decenter_range_m, tilt, tilt])
 
 
+class Cnn(Group):
+    """The network that estimates a state from its stamps."""
+
+    widths: Annotated[list[Count], Field(min_length=1)] = Field(
+        description="Channels after every convolution"
+    )
+    kernels: Annotated[list[Annotated[int, Field(ge=1, le=15)]], Field(min_length=1)] = Field(
+        description="Kernel sizes of the convolutions; odd"
+    )
+    strides: Annotated[list[Annotated[int, Field(ge=1, le=4)]], Field(min_length=1)] = Field(
+        description="Strides of the convolutions"
+    )
+    leak: Annotated[float, Field(ge=0, lt=1)] = Field(
+        description="Slope of the leaky ReLU below 0"
+    )
+
+    @model_validator(mode="after")
+    def _shape(self) -> Cnn:
+        if any(k % 2 == 0 for k in self.kernels):
+            raise ValueError(f"kernels = {self.kernels}: must be odd")
+        for name in ("kernels", "strides"):
+            values = getattr(self, name)
+            if len(values) != len(self.widths):
+                raise ValueError(
+                    f"{name} = {values}: {len(self.widths)} widths need as many {name}, "
+                    f"not {len(values)}"
+                )
+        return self
+
+
+class CnnTrain(Group):
+    """Optimisation of one CNN."""
+
+    epochs: Count
+    batch: Annotated[int, Field(ge=2)] = Field(description="States per step")
+    lr: Annotated[float, Field(gt=0, le=1)] = Field(
+        description="Adam's learning rate (its maximum if one-cycle)"
+    )
+    schedule: Literal["steps", "onecycle"]
+    decay: Annotated[float, Field(gt=0, le=1)] = Field(
+        description="Factor of the learning rate at each step of the schedule"
+    )
+    decay_epochs: Count = Field(description="Epochs between steps of the schedule")
+    threads: Count = Field(description="Threads of the training")
+
+
+class Fit(Group):
+    """Maximum-likelihood fit of a state."""
+
+    iterations: Count = Field(description="Most steps of a fit")
+    tolerance: Positive = Field(
+        description="A fit ends with a step of this many standard errors or fewer"
+    )
+    damping: Positive = Field(description="Levenberg damping of the first step")
+    limit: Annotated[float, Field(ge=1, le=2)] = Field(
+        description="States are kept within ± this, in units of the range"
+    )
+
+
 class AlignmentConfig(Group):
     """The whole configuration of scene 3."""
 
