@@ -20,6 +20,8 @@ include: "workflow/rules/calibration.smk"
 include: "workflow/rules/tracking.smk"
 include: "workflow/rules/alignment.smk"
 include: "workflow/rules/bounds.smk"
+include: "workflow/rules/stability.smk"
+include: "workflow/rules/propagation.smk"
 include: "workflow/rules/timing.smk"
 include: "workflow/rules/knee.smk"
 include: "workflow/rules/record.smk"
@@ -34,3 +36,4 @@ rule all:
 
 
 include: "workflow/rules/targets.smk"
+include: "workflow/rules/reference.smk"

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.special import j0, j1
 
-from psfdae.optics.propagation import StampPropagator, pixel_in_lambda_over_d
+from psfdae.optics.propagation import StampPropagator, pixel_in_lambda_over_d, pixel_nodes
 from psfdae.optics.pupil import Pupil, annular_pupil, pupil_axis
 from psfdae.optics.seidel import monomial_coefficients, monomial_images
 
@@ -78,6 +78,32 @@ def test_offset_looks_at_that_place(pupil):
     wide = StampPropagator(pupil, 32, 0.7, nodes=3)(opd)[0]
     moved = StampPropagator(pupil, 8, 0.7, nodes=3)(opd, np.array([[5, -3]]))[0]
     assert moved == pytest.approx(wide[12 + 5 : 20 + 5, 12 - 3 : 20 - 3], abs=1e-12)
+
+
+@pytest.mark.parametrize("backend", ["numpy", "torch"])
+@pytest.mark.parametrize("nodes", [1, 2, 3])
+@pytest.mark.parametrize(("samples", "side"), [(40, 12), (41, 12), (40, 7), (41, 7), (40, 1)])
+def test_halves_add_up_to_the_plain_sum(samples, side, nodes, backend):
+    """Even and odd grids and stamps, whose middle sample, node or pixel is its own mirror."""
+    pupil = annular_pupil(samples, 0.3)
+    size = pupil.axis.size
+    opd = np.random.default_rng(3).normal(size=(2, size, size))
+    offset = np.array([[0, 0], [3, -2]])
+    inside, weights = pixel_nodes(0.88, nodes)
+    centres = (np.arange(side) - (side - 1) / 2) * 0.88
+    plain = []
+    for wavefront, (row, column) in zip(opd, 0.88 * offset, strict=True):
+        field = pupil.amplitude * np.exp(2j * np.pi * wavefront)
+        down, along = (
+            np.exp(-1j * np.pi * np.outer((centres[:, None] + inside).ravel() + at, pupil.axis))
+            for at in (row, column)
+        )
+        intensity = np.abs(down @ field @ along.T) ** 2 * np.tile(weights, side)
+        intensity *= np.tile(weights, side)[:, None]
+        plain.append(intensity.reshape(side, nodes, side, nodes).sum((1, 3)))
+    total = (2 / pupil.spacing) ** 2 * (pupil.amplitude**2).sum()
+    found = StampPropagator(pupil, side, 0.88, nodes, backend=backend)(opd, offset)
+    assert found == pytest.approx(np.array(plain) / total, rel=1e-10, abs=1e-15)
 
 
 def test_backends_and_precisions_agree(pupil):

@@ -63,7 +63,8 @@ def test_record_keeps_what_was_not_renewed_and_says_since_when(results, tmp_path
     slow = results / "tables/slow.csv"
     slow.write_text("b\n2\n")
     files, keep = [results / "tables/t.csv"], [Path("tables/slow.csv"), Path("tables/never.csv")]
-    record.reference(results, load(), [*files, slow], keep, out)
+    record.reference(results, load(), files, keep, out)
+    slow.unlink()
     assert json.loads((out / "provenance.json").read_text())["kept"] == {}
     (out / "provenance.json").write_text('{"commit": "first"}')
     for _ in range(2):

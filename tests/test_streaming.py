@@ -9,8 +9,6 @@ import pytest
 from psfdae.benchmark.isolated import MeasurementError, run_isolated
 from psfdae.configuration.compose import load_stage, stage_tree
 from psfdae.files import Column, Empty, ProductError, read_product, stream_product, write_product
-from psfdae.optics.propagation import SearchPropagator, StampPropagator
-from psfdae.optics.pupil import annular_pupil
 from psfdae.optics.seidel import gradient_ranges, monomial_gradients
 from psfdae.stages import stars, templates, timing_jobs
 from psfdae.stars import turbulence_scene
@@ -97,21 +95,6 @@ def test_slopes_do_not_depend_on_the_batch():
         assert (ranges[:, axis_index, 1] >= slopes.max(axis=1) - 1e-12).all()
     one_by_one = np.concatenate([gradient_ranges(c[None], points=9) for c in coefficients])
     assert ranges == pytest.approx(one_by_one, rel=1e-12)
-
-
-@pytest.mark.parametrize("samples", [40, 41])
-def test_search_window_is_the_stamp_of_the_whole_window(samples):
-    pupil = annular_pupil(samples, 0.3)
-    opd = np.random.default_rng(3).normal(size=(3, samples + 2, samples + 2))
-    offset = np.array([[0, 0], [3, -2], [1, 1]])
-    expected = StampPropagator(pupil, 12, 0.88, 3)(opd, offset)
-    found = SearchPropagator(pupil, 12, 0.88, 3, "complex128")(opd, offset)
-    assert found == pytest.approx(expected, rel=1e-10, abs=1e-15)
-
-
-def test_search_window_has_an_even_side():
-    with pytest.raises(ValueError, match="even side"):
-        SearchPropagator(annular_pupil(32, 0.0), 7, 0.9, 2, "complex64")
 
 
 def test_search_is_exact_for_large_pixels():

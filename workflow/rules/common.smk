@@ -1,4 +1,3 @@
-import glob
 import shlex
 from functools import cache
 

@@ -28,3 +28,10 @@ for _dataset in ALL_DATASETS:
         input:
             lambda w, dataset=_dataset: products_of(dataset),
         localrule: True
+
+
+rule benchmark:
+    input:
+        PROPAGATION_PRODUCTS,
+        TIMING_PRODUCTS,
+    localrule: True

@@ -3,11 +3,22 @@
 Only click is imported at the top; each command imports its stage when it runs.
 """
 
-from psfdae.cli import alignment, benchmark_timing, bounds, figures, knee, reporting, science
+from psfdae.cli import (
+    alignment,
+    benchmark_propagation,
+    benchmark_timing,
+    bounds,
+    figures,
+    knee,
+    reporting,
+    science,
+    stability,
+)
 from psfdae.cli.base import main
 
 __all__ = [
     "alignment",
+    "benchmark_propagation",
     "benchmark_timing",
     "bounds",
     "figures",
@@ -15,4 +26,5 @@ __all__ = [
     "main",
     "reporting",
     "science",
+    "stability",
 ]

@@ -6,9 +6,11 @@ OPD W(x) in waves, x in pupil radii, is
     E(u) = Σ A(x) exp(2πi W(x)) exp(−πi u·x),
 
 two matrix products per stamp (a matrix DFT, Soummer et al. 2007, Opt. Express
-15, 15935). Only the wanted points are computed; there is no padded grid. The
-products are written with real matrices, cosine and sine side by side, which
-runs at the full speed of the real GEMM of numpy and of torch alike.
+15, 15935). Only the wanted points are computed; there is no padded grid. Pupil
+grid and stamp are symmetric about the chief ray, so the even part of the pupil
+field meets cosines only, the odd part sines only, each on half of the pupil and
+for half of the stamp; the other half follows by a sign. That is a quarter of
+the arithmetic, all of it with real matrices in the GEMM of numpy or torch.
 """
 
 from __future__ import annotations
@@ -77,17 +79,33 @@ class StampPropagator:
         self.nodes = nodes
         self._xp = _array_module(backend)
         self.real_dtype = np.dtype(np.float32 if precision == "complex64" else np.float64)
-        centres = (np.arange(stamp_px) - 0.5 * (stamp_px - 1)) * pixel
-        inside, weights = pixel_nodes(pixel, nodes)
-        angle = np.pi * np.outer(pupil.axis, (centres[:, None] + inside).ravel())
-        self._dft = self._array(np.hstack([np.cos(angle), np.sin(angle)]))
-        self._dft_t = self._array(np.hstack([np.cos(angle), np.sin(angle)]).T)
+        self._half = (pupil.axis.size + 1) // 2
+        axis = pupil.axis[-self._half :]
+        points, weights = self._half_points()
+        angle = np.pi * np.outer(axis, points)
+        # Of an odd grid the middle sample is its own mirror image and counts once.
+        self._cos = self._array(np.cos(angle) * np.where(axis == 0.0, 0.5, 1.0)[:, None])
+        self._sin = self._array(np.sin(angle))
         # Parseval: one period of the image, (2/spacing)² (λ/D)², holds (2/spacing)² ΣA².
         total = (2.0 / pupil.spacing) ** 2 * float((pupil.amplitude**2).sum())
-        self._weights = self._array(np.tile(weights, stamp_px) / np.sqrt(total))
+        bins = weights / np.sqrt(total)
+        # Products with these add up the nodes of every pixel of a half and of both halves.
+        self._bins_x, self._bins_y = self._array(bins), self._array(np.kron(np.eye(2), bins).T)
         self._amplitude = self._array(pupil.amplitude)
         self._axis = self._array(pupil.axis)
         self._work: dict[str, Any] = {}
+
+    def _half_points(self) -> tuple[np.ndarray, np.ndarray]:
+        """Nodes from the chief ray on, shape (m,), and their weights in pixels, (⌈d/2⌉, m)."""
+        d, q = self.stamp_px, self.nodes
+        inside, weights = pixel_nodes(self.pixel, q)
+        centres = (np.arange(d) - 0.5 * (d - 1)) * self.pixel
+        m = (d * q + 1) // 2
+        bins = np.kron(np.eye(d), weights)[d // 2 :, -m:]
+        if d * q % 2:
+            # The node on the chief ray belongs to both halves.
+            bins[:, 0] *= 0.5
+        return (centres[:, None] + inside).ravel()[-m:], bins
 
     def __call__(self, opd: Any, offset_px: np.ndarray | None = None) -> np.ndarray:
         """Propagate a batch.
@@ -107,23 +125,60 @@ class StampPropagator:
             (over the whole image plane it sums to 1).
         """
         xp, (batch, n, _) = self._xp, opd.shape
-        d, q = self.stamp_px, self.nodes
-        m = d * q
-        field = self._field(opd, offset_px)
-        # exp(iφ)(c − i s) for every row of every pupil: all sums over x.
-        half = xp.matmul(
-            field.reshape(2 * batch * n, n),
-            self._dft,
-            out=self._buffer("half", 2 * batch * n, 2 * m),
-        ).reshape(2, batch, n, 2, m)
-        rows = self._buffer("rows", batch, n, 2 * m)
-        xp.add(half[0, :, :, 0], half[1, :, :, 1], out=rows[:, :, :m])
-        xp.subtract(half[1, :, :, 0], half[0, :, :, 1], out=rows[:, :, m:])
-        image = xp.matmul(self._dft_t, rows, out=self._buffer("image", batch, 2 * m, 2 * m))
-        real = image[:, :m, :m] + image[:, m:, m:]
-        imag = image[:, :m, m:] - image[:, m:, :m]
-        intensity = (real**2 + imag**2) * (self._weights[:, None] * self._weights)
-        return np.asarray(intensity.reshape(batch, d, q, d, q).sum((2, 4)))
+        m = self._cos.shape[1]
+        even, odd = self._fold("y", self._field(opd, offset_px))
+        cosine = self._product("cy", even.swapaxes(-1, -2), self._cos)
+        sine = self._product("sy", odd.swapaxes(-1, -2), self._sin)
+        # [pupil x, (real, imaginary) × (above, below the chief ray) × node].
+        columns = self._buffer("columns", batch, n, 2, 2, m)
+        xp.add(cosine[0], sine[1], out=columns[:, :, 0, 0])
+        xp.subtract(cosine[1], sine[0], out=columns[:, :, 1, 0])
+        xp.subtract(cosine[0], sine[1], out=columns[:, :, 0, 1])
+        xp.add(cosine[1], sine[0], out=columns[:, :, 1, 1])
+        even, odd = self._fold("x", columns.reshape(1, batch, n, 4 * m))
+        cosine = self._product("cx", self._cos.T, even[0]).reshape(batch, m, 2, 2 * m)
+        sine = self._product("sx", self._sin.T, odd[0]).reshape(batch, m, 2, 2 * m)
+        return self._assemble(cosine, sine)
+
+    def _fold(self, name: str, values: Any) -> tuple[Any, Any]:
+        """Even and odd part over the third axis, shape (…, half, …) each."""
+        xp = self._xp
+        upper = values[:, :, -self._half :]
+        mirrored = xp.flip(values[:, :, : self._half], (2,))
+        even = self._buffer("even" + name, *upper.shape)
+        odd = self._buffer("odd" + name, *upper.shape)
+        xp.add(upper, mirrored, out=even)
+        xp.subtract(upper, mirrored, out=odd)
+        return even, odd
+
+    def _product(self, name: str, left: Any, right: Any) -> Any:
+        lead = left.shape[:-2] or right.shape[:-2]
+        out = self._buffer(name, *lead, left.shape[-2], right.shape[-1])
+        return self._xp.matmul(left, right, out=out)
+
+    def _assemble(self, cosine: Any, sine: Any) -> np.ndarray:
+        """Pixels of the stamp from the products over x.
+
+        |C ∓ iS|² = |C|² + |S|² ± 2 (C_r S_i − C_i S_r) on either side in x.
+        """
+        xp, (batch, m, _, _) = self._xp, cosine.shape
+        intensity = self._buffer("intensity", 2, batch, m, 2 * m)
+        xp.add((cosine**2).sum(2), (sine**2).sum(2), out=intensity[0])
+        xp.subtract(
+            cosine[:, :, 0] * sine[:, :, 1], cosine[:, :, 1] * sine[:, :, 0], out=intensity[1]
+        )
+        # Axes: [sum, cross term], star, distance in x, side in y, distance in y.
+        binned = np.asarray(self._bins_x @ (intensity @ self._bins_y))
+        d, half = self.stamp_px, (self.stamp_px + 1) // 2
+        pixels = binned.reshape(2, batch, half, 2, half)
+        above, below = slice(d // 2, None), slice(half - 1, None, -1)
+        # The middle pixel of an odd stamp receives from both sides.
+        stamp = np.zeros((batch, d, d), self.real_dtype)
+        for sign, columns in ((2.0, above), (-2.0, below)):
+            one_side = pixels[0] + sign * pixels[1]
+            stamp[:, above, columns] += one_side[:, :, 0].swapaxes(1, 2)
+            stamp[:, below, columns] += one_side[:, :, 1].swapaxes(1, 2)
+        return stamp
 
     def _field(self, opd: Any, offset_px: np.ndarray | None) -> Any:
         """Real and imaginary part of the pupil field, shape (2, B, M, M)."""
@@ -153,93 +208,6 @@ class StampPropagator:
         if buffer is None or tuple(buffer.shape) != shape:
             buffer = self._work[name] = self._array(np.empty(shape, self.real_dtype))
         return buffer
-
-
-class SearchPropagator(StampPropagator):
-    """The same operator for a wide window around the chief ray, without offsets.
-
-    Pupil and window are symmetric about the chief ray, so both sums are taken
-    over one half of the pupil, of the even part with cosines and of the odd part
-    with sines, and for one half of the window; the other half follows by a sign.
-    That is a quarter of the products. It rounds differently from the parent
-    class (1e-6 of the peak in single precision), which makes the stamps.
-
-    Parameters
-    ----------
-    pupil, pixel, nodes, precision
-        As for `StampPropagator`; numpy only.
-    stamp_px : int
-        Side of the window, even.
-    """
-
-    def __init__(
-        self, pupil: Pupil, stamp_px: int, pixel: float, nodes: int, precision: Precision
-    ) -> None:
-        super().__init__(pupil, stamp_px, pixel, nodes, precision, "numpy")
-        if stamp_px % 2:
-            raise ValueError(f"stamp_px = {stamp_px}: the window must have an even side")
-        self._half = (pupil.axis.size + 1) // 2
-        half = pupil.axis[-self._half :]
-        points = np.arange(stamp_px // 2)[:, None] * pixel + 0.5 * pixel
-        angle = np.pi * np.outer(half, (points + pixel_nodes(pixel, nodes)[0]).ravel())
-        # Of an odd grid the middle sample is its own mirror image and counts once.
-        once = np.where(half == 0.0, 0.5, 1.0)[:, None]
-        self._cos = self._array(np.cos(angle) * once)
-        self._sin = self._array(np.sin(angle))
-        # Products with these add up the nodes of every pixel.
-        bins = np.kron(np.eye(points.size), self._weights[:nodes])
-        self._bins_x, self._bins_y = self._array(bins), self._array(np.kron(np.eye(2), bins).T)
-
-    def __call__(self, opd: np.ndarray, offset_px: np.ndarray | None = None) -> np.ndarray:
-        """Window images, shape (B, stamp_px, stamp_px); see `StampPropagator`."""
-        batch, n, _ = opd.shape
-        m = self._cos.shape[1]
-        even, odd = self._fold("y", self._field(opd, offset_px))
-        cosine = self._product("cy", even.swapaxes(-1, -2), self._cos)
-        sine = self._product("sy", odd.swapaxes(-1, -2), self._sin)
-        # [pupil x, (real, imaginary) × (above, below the chief ray) × point].
-        columns = self._buffer("columns", batch, n, 2, 2, m)
-        np.add(cosine[0], sine[1], out=columns[:, :, 0, 0])
-        np.subtract(cosine[1], sine[0], out=columns[:, :, 1, 0])
-        np.subtract(cosine[0], sine[1], out=columns[:, :, 0, 1])
-        np.add(cosine[1], sine[0], out=columns[:, :, 1, 1])
-        even, odd = self._fold("x", columns.reshape(1, batch, n, 4 * m))
-        cosine = self._product("cx", self._cos.T, even[0]).reshape(batch, m, 2, 2 * m)
-        sine = self._product("sx", self._sin.T, odd[0]).reshape(batch, m, 2, 2 * m)
-        return self._assemble(cosine, sine)
-
-    def _fold(self, axis: str, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Even and odd part over the third axis, shape (…, half, …) each."""
-        mirrored, upper = values[:, :, self._half - 1 :: -1], values[:, :, -self._half :]
-        even = self._buffer("even" + axis, *upper.shape)
-        odd = self._buffer("odd" + axis, *upper.shape)
-        return np.add(upper, mirrored, out=even), np.subtract(upper, mirrored, out=odd)
-
-    def _product(self, name: str, left: np.ndarray, right: np.ndarray) -> np.ndarray:
-        lead = left.shape[:-2] or right.shape[:-2]
-        return np.matmul(
-            left, right, out=self._buffer(name, *lead, left.shape[-2], right.shape[-1])
-        )
-
-    def _assemble(self, cosine: np.ndarray, sine: np.ndarray) -> np.ndarray:
-        """Pixels of the whole window from the products over x.
-
-        |C ∓ iS|² = |C|² + |S|² ± 2 (C_r S_i − C_i S_r) on either side in x.
-        """
-        batch, m, _, _ = cosine.shape
-        half = self.stamp_px // 2
-        intensity = self._buffer("intensity", 2, batch, m, 2 * m)
-        np.add((cosine**2).sum(axis=2), (sine**2).sum(axis=2), out=intensity[0])
-        crossed = cosine * sine[:, :, ::-1]
-        np.subtract(crossed[:, :, 0], crossed[:, :, 1], out=intensity[1])
-        # Axes: [sum, cross term], star, distance in x, side in y, distance in y.
-        pixels = (self._bins_x @ (intensity @ self._bins_y)).reshape(2, batch, half, 2, half)
-        window = np.empty((batch, self.stamp_px, self.stamp_px), self.real_dtype)
-        for sign, columns in ((2.0, slice(half, None)), (-2.0, slice(half - 1, None, -1))):
-            one_side = pixels[0] + sign * pixels[1]
-            window[:, half:, columns] = one_side[:, :, 0].swapaxes(1, 2)
-            window[:, half - 1 :: -1, columns] = one_side[:, :, 1].swapaxes(1, 2)
-        return window
 
 
 def _array_module(backend: Backend) -> Any:

@@ -124,11 +124,13 @@ def _stopping(points: Mapping[str, Path]):  # type: ignore[no-untyped-def]
             {
                 "item": f"training that has stopped improving ({name})",
                 "scene": "seidel",
+                "per": "training",
                 "with_s": with_s,
                 "without_s": without_s,
                 "saving": with_s / without_s,
                 "change": best / scores.min() - 1.0,
                 "unit": "relative validation MSE",
+                "skipped": "yes" if stop < scores.size - 1 else "no",
             }
         )
     return pd.DataFrame(rows)

@@ -63,8 +63,8 @@ def reference(
     results : folder of the run
     config : whole config of the run's default dataset
     files : tables and figures to record, all inside `results`
-    keep : paths relative to `results`; where `files` has no such file, that of the
-        present record stays
+    keep : paths relative to `results` of what is renewed rarely; where the run has
+        no such file, that of the present record stays
     out : folder of the run of record; replaced as a whole
 
     Raises
@@ -77,6 +77,7 @@ def reference(
         raise ProductError(f"{missing[0]}: missing; run `make reproduce` first")
     staging = out.with_name(f".{out.name}.new")
     shutil.rmtree(staging, ignore_errors=True)
+    files = [*files, *(results / path for path in keep if (results / path).is_file())]
     renewed = {path.relative_to(results): path for path in files}
     kept = {path: out / path for path in keep if path not in renewed and (out / path).is_file()}
     for name, path in (renewed | kept).items():

@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 
 from psfdae.configuration.schema import Framing, Optics, Telescope
-from psfdae.optics.propagation import SearchPropagator, StampPropagator
+from psfdae.optics.propagation import StampPropagator
 from psfdae.optics.pupil import Pupil, annular_pupil
 from psfdae.optics.sampling import choose_samples, required_samples
 from psfdae.stars.framing import FramingError, brightest_pixel
@@ -142,8 +142,7 @@ class Propagation:
     def _search(self, stars: np.ndarray, reach: int) -> np.ndarray:
         peaks = np.empty((len(stars), 2), dtype=np.int64)
         for pupil, places in self._groups(stars):
-            pixel, nodes = self.telescope.pixel, self.optics.nodes
-            search = SearchPropagator(pupil, 2 * reach, pixel, nodes, "complex64")
+            search = self._kernel(pupil, 2 * reach, "complex64")
             exact = self._kernel(pupil, 1, "complex128")
             for batch in self._batches(places):
                 members = stars[batch]

@@ -1,0 +1,172 @@
+PROPAGATION = f"{RESULTS}/benchmark/propagation/{{scene}}/"
+SCENES = options("scene")
+
+
+@cache
+def strictest_dataset(scene):
+    """The dataset of a scene with the least noise and the strongest aberrations."""
+
+    def strictness(dataset):
+        settings = dataset_config(dataset)
+        return (-min(settings.noise.levels), settings.stars.aberration_fraction)
+
+    return max(
+        (d for d in ALL_DATASETS if dataset_config(d).scene.name == scene),
+        key=strictness,
+    )
+
+
+def sharing_stars(dataset):
+    """Number of datasets that are made of the same stars."""
+    stars = dataset_config(dataset).stars.name
+    return sum(dataset_config(d).stars.name == stars for d in ALL_DATASETS)
+
+
+def timed_threads(w):
+    """A timing takes as many cores as it may use, so that no other job disturbs it."""
+    return dataset_config(ALL_DATASETS[0]).benchmark.threads
+
+
+rule propagation:
+    output:
+        multiext(
+            PROPAGATION,
+            propagation="propagation.csv",
+            convergence="convergence.csv",
+            choice="choice.csv",
+            guard="guard.csv",
+            skipping="skipping.csv",
+            machine="machine.csv",
+        ),
+    log:
+        f"{RESULTS}/logs/propagation/{{scene}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks_on_request/benchmark/propagation-{{scene}}.tsv"
+    threads: timed_threads
+    resources:
+        mem_mb=3000,
+    params:
+        config=lambda w: stage_overrides(
+            "propagation", f"dataset={strictest_dataset(w.scene)}"
+        ),
+        source=lambda w: source_hash(
+            "psfdae.stages.propagation", f"psfdae.stars.{w.scene}_scene"
+        ),
+        folder=subpath(output.propagation, parent=True),
+        datasets=lambda w: sharing_stars(strictest_dataset(w.scene)),
+    message:
+        "Timing the optics of scene {wildcards.scene} against its error"
+    shell:
+        "psfdae propagation --datasets {params.datasets} --out {params.folder}"
+        " {params.config:q} > {log} 2>&1"
+
+
+rule import_times:
+    output:
+        f"{RESULTS}/benchmark/propagation/imports.csv",
+    log:
+        f"{RESULTS}/logs/propagation/imports.log",
+    benchmark:
+        f"{RESULTS}/benchmarks_on_request/benchmark/imports.tsv"
+    threads: timed_threads
+    resources:
+        mem_mb=1000,
+    params:
+        config=lambda w: stage_overrides("propagation", f"dataset={ALL_DATASETS[0]}"),
+        source=source_hash("psfdae.stages.propagation", "psfdae.stages.stars"),
+    message:
+        "Timing the imports that the stages do without"
+    shell:
+        "psfdae import-times --out {output} {params.config:q} > {log} 2>&1"
+
+
+rule propagation_tables:
+    input:
+        scenes=expand(rules.propagation.output.propagation, scene=SCENES),
+        extra=rules.import_times.output,
+    output:
+        multiext(
+            f"{RESULTS}/tables/benchmark_",
+            propagation="propagation.csv",
+            peers="peers.csv",
+            convergence="convergence.csv",
+            choice="choice.csv",
+            guard="guard.csv",
+            skipping="skipping.csv",
+            machine="machine.csv",
+        ),
+    log:
+        f"{RESULTS}/logs/propagation/tables.log",
+    benchmark:
+        f"{RESULTS}/benchmarks_on_request/benchmark/propagation_tables.tsv"
+    threads: 1
+    resources:
+        mem_mb=500,
+    params:
+        source=source_hash("psfdae.stages.propagation"),
+        folder=subpath(output.propagation, parent=True),
+        scenes=lambda w, input: [path.rpartition("/")[0] for path in input.scenes],
+        extra=lambda w, input: [f"--extra={path}" for path in input.extra],
+    message:
+        "Joining the tables of the optics benchmark"
+    shell:
+        "psfdae propagation-tables {params.extra:q} --out {params.folder}"
+        " {params.scenes:q} > {log} 2>&1"
+
+
+rule figure_propagation:
+    input:
+        rules.propagation_tables.output.propagation,
+    output:
+        report(
+            f"{RESULTS}/figures/benchmark/propagation_{{scene}}.png",
+            caption="../report/figure_propagation.rst",
+            category="Fast and accurate",
+            labels={"data": "{scene}", "figure": "propagation error against time"},
+        ),
+    log:
+        f"{RESULTS}/logs/figures/benchmark/propagation_{{scene}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks_on_request/benchmark/figure_propagation-{{scene}}.tsv"
+    threads: 1
+    resources:
+        mem_mb=500,
+    params:
+        source=source_hash("psfdae.stages.propagation"),
+    message:
+        "Drawing error against time of the optics of scene {wildcards.scene}"
+    shell:
+        "psfdae figure propagation --scene {wildcards.scene} --table {input}"
+        " --out {output} > {log} 2>&1"
+
+
+rule figure_skipping:
+    input:
+        rules.propagation_tables.output.skipping,
+    output:
+        report(
+            f"{RESULTS}/figures/benchmark/skipping.png",
+            caption="../report/figure_skipping.rst",
+            category="Fast and accurate",
+            labels={"data": "all scenes", "figure": "what is not computed"},
+        ),
+    log:
+        f"{RESULTS}/logs/figures/benchmark/skipping.log",
+    benchmark:
+        f"{RESULTS}/benchmarks_on_request/benchmark/figure_skipping.tsv"
+    threads: 1
+    resources:
+        mem_mb=500,
+    params:
+        source=source_hash("psfdae.stages.propagation"),
+    message:
+        "Drawing what leaving out superfluous work saves"
+    shell:
+        "psfdae figure skipping --table {input} --out {output} > {log} 2>&1"
+
+
+PROPAGATION_PRODUCTS = [
+    *rules.propagation_tables.output,
+    *(f"{RESULTS}/figures/benchmark/propagation_{scene}.png" for scene in SCENES),
+    *rules.figure_skipping.output,
+]

@@ -1,0 +1,37 @@
+# The run of record is committed, so nothing but an explicit request renews it.
+rule reference:
+    input:
+        rules.psf_metrics.output,
+        rules.calibrate.output,
+        rules.runtime.output,
+        [file for dataset in TABULATED for file in paper_tables_of(dataset)],
+        [file for dataset in default_datasets() for file in figures_of(dataset)],
+        rules.benchmark.input,
+        rules.stability.input,
+        rules.bounds.input,
+    output:
+        touch(f"{RESULTS}/.reference_renewed"),
+    log:
+        f"{RESULTS}/logs/reference/all.log",
+    localrule: True
+    threads: 1
+    resources:
+        mem_mb=500,
+    params:
+        results=lambda w: RESULTS,
+        folder="results/reference",
+        # What takes long stays from the record before where it has not been run again.
+        keep=[
+            f"--keep={file}"
+            for file in (
+                "paper/tables/psf_metrics.csv",
+                "tables/benchmark_training.csv",
+                "tables/benchmark_stopping.csv",
+                "figures/benchmark/training.png",
+            )
+        ],
+    message:
+        "Renewing the run of record"
+    shell:
+        "psfdae reference --results {params.results} --out {params.folder} {params.keep}"
+        " {input} > {log} 2>&1"
