@@ -17,6 +17,7 @@ from psfdae.configuration.compose import load_stage
 from psfdae.files import ProductError
 from psfdae.optics.propagation import StampPropagator
 from psfdae.optics.pupil import annular_pupil
+from psfdae.optics.sampling import SamplingError
 from psfdae.optics.seidel import monomial_coefficients, monomial_images
 from psfdae.optics.turbulence import structure_function
 from psfdae.stages import propagation as stage
@@ -121,9 +122,9 @@ def test_configured_settings_stay_within_the_budget(scenes, scene):
 
 
 @pytest.mark.parametrize("scene", SCENES)
-def test_two_nodes_fewer_would_leave_the_budget(scenes, scene):
-    nodes = scenes[scene].optics.nodes - 2
-    assert worst_errors(scenes[scene], SCENES[scene][1], nodes=nodes).max() > scenes[scene].budget
+def test_two_nodes_fewer_are_refused(scenes, scene):
+    with pytest.raises(SamplingError, match=r"needs at least \d nodes"):
+        worst_errors(scenes[scene], SCENES[scene][1], nodes=scenes[scene].optics.nodes - 2)
 
 
 @pytest.mark.parametrize(

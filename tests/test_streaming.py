@@ -16,7 +16,7 @@ from psfdae.stars.framing import brightest_pixel
 from psfdae.stars.scene import Propagation
 
 CHEAP = (
-    *("grid.points=3", "optics.pupil_samples=[40,80]", "optics.nodes=1", "optics.threads=1"),
+    *("grid.points=3", "optics.pupil_samples=[40,80]", "optics.nodes=3", "optics.threads=1"),
     *("wavefront.spherical=0.05", "wavefront.coma=0.2", "wavefront.astigmatism=0.2"),
     *("wavefront.field_curvature=0.1", "stars.search_px=6", "framing.search_px=6"),
 )

@@ -59,6 +59,7 @@ rule figure_stability:
 rule stability:
     input:
         table=rules.stability_table.output.table,
+        graded=rules.stability_table.output.graded,
         figure=rules.figure_stability.output,
     output:
         touch(f"{RESULTS}/.stability_passed"),

@@ -12,7 +12,7 @@ import numpy as np
 from psfdae.benchmark.cases import Scene, Selection, stamps_at
 from psfdae.benchmark.propagation import PRECISIONS, candidate_nodes, candidate_samples, yes
 from psfdae.configuration.schema import Optics
-from psfdae.optics.sampling import SamplingError, choose_samples
+from psfdae.optics.sampling import SamplingError, choose_samples, required_nodes
 from psfdae.stars.framing import normalise_flux
 
 if TYPE_CHECKING:
@@ -116,8 +116,10 @@ def take_sample(scene: Scene, stars: int, thorough: bool) -> Sample:
     source = Selection(scene.stars, index)
     offset = scene.propagation(source, scene.search_px).brightest()
     stamps = {}
+    least = required_nodes(scene.telescope.pixel)
+    allowed = [q for q in candidate_nodes(scene.optics, thorough) if q >= least]
     for samples in candidate_samples(scene.optics, thorough):
-        for nodes, precision in product(candidate_nodes(scene.optics, thorough), PRECISIONS):
+        for nodes, precision in product(allowed, PRECISIONS):
             try:
                 found = stamps_at(scene, source, offset, samples, nodes, precision)
             except SamplingError:

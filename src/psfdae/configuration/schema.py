@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 ARCSEC = np.pi / 180.0 / 3600.0
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
 Fraction = Annotated[float, Field(ge=0, lt=1)]
 Count = Annotated[int, Field(ge=1)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_]+$")]
@@ -56,11 +57,11 @@ class Seidel(Group):
     """Static third-order aberrations in waves at H = 1."""
 
     kind: Literal["seidel"]
-    spherical: float
-    coma: float
-    astigmatism: float
-    field_curvature: float
-    distortion: float
+    spherical: Finite
+    coma: Finite
+    astigmatism: Finite
+    field_curvature: Finite
+    distortion: Finite
 
     @property
     def coefficients(self) -> np.ndarray:

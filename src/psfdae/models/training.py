@@ -186,7 +186,14 @@ class Training:
         stars = np.tile(self.data.validation, self.train.validation_draws)
         noisy = self.data.draw(stars, stream(self.seed, "dae", "validation"))
         estimate = predict(self.model, noisy, self.factor)
+        if not estimate.any():
+            raise DeadNetworkError(f"all outputs are zero after epoch {self.epoch}")
         error = float(((estimate - self.data.references[stars]) ** 2).mean(dtype=np.float64))
+        if not np.isfinite(error):
+            raise TrainingError(
+                f"the validation error is {error} after epoch {self.epoch}: "
+                f"look for validation stars that are not finite"
+            )
         if error < self.best_mse:
             self.best_mse = error
             self.best_state = {

@@ -17,6 +17,7 @@ from psfdae.evaluation.calibration import (
 )
 from psfdae.evaluation.metrics import mse, ssim
 from psfdae.files import read_product, write_text
+from psfdae.optics.sampling import required_nodes
 from psfdae.rng import stream
 from psfdae.stages.common import limit_threads, scene_module
 from psfdae.stars.fields import assign_fields
@@ -80,7 +81,10 @@ def _images(config: Any, scale: float, r0: float | None) -> np.ndarray:
     else:
         wavefront = config.wavefront.model_copy(update={"r0_m": r0})
         source = scene.template_wavefronts(config.model_copy(update={"wavefront": wavefront}))
-    propagation = Propagation(source, telescope, config.optics, config.framing, search_px)
+    # The scan reaches wider pixels than the configured one.
+    nodes = max(config.optics.nodes, required_nodes(telescope.pixel))
+    optics = config.optics.model_copy(update={"nodes": nodes})
+    propagation = Propagation(source, telescope, optics, config.framing, search_px)
     peak = propagation.brightest()
     stamps = propagation.stamps(config.framing.stamp_px, stamp_offset(peak, 0 * peak))
     return normalise_flux(stamps)[0]

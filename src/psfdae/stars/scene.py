@@ -15,7 +15,12 @@ import numpy as np
 from psfdae.configuration.schema import Framing, Optics, Telescope
 from psfdae.optics.propagation import StampPropagator
 from psfdae.optics.pupil import Pupil, annular_pupil
-from psfdae.optics.sampling import choose_samples, required_samples
+from psfdae.optics.sampling import (
+    SamplingError,
+    choose_samples,
+    required_nodes,
+    required_samples,
+)
 from psfdae.stars.framing import FramingError, brightest_pixel
 
 SEARCH_ERROR = 1e-3
@@ -54,7 +59,8 @@ class Propagation:
     Raises
     ------
     SamplingError
-        If the ladder ends below what a wavefront needs.
+        If the ladder ends below what a wavefront needs, or the pixels are too wide
+        for the nodes.
     """
 
     def __init__(
@@ -70,8 +76,18 @@ class Propagation:
         self.telescope = telescope
         self.optics = optics
         self.framing = framing
+        self._check_nodes()
         self.samples = self._choose_samples()
         self._pupils: dict[int, Pupil] = {}
+
+    def _check_nodes(self) -> None:
+        pixel, nodes = self.telescope.pixel, self.optics.nodes
+        if nodes < required_nodes(pixel):
+            raise SamplingError(
+                f"optics.nodes = {nodes}: a pixel of {pixel:.3g} λ/D "
+                f"(telescope.pixel_scale_arcsec = {self.telescope.pixel_scale_arcsec:g}) "
+                f"needs at least {required_nodes(pixel)} nodes"
+            )
 
     def _choose_samples(self) -> np.ndarray:
         reach = 2 * self.search_px + 0.5 * self.framing.stamp_px + self.framing.jitter_px

@@ -8,7 +8,7 @@ import numpy as np
 
 from psfdae.optics.pupil import Pupil, annular_pupil
 from psfdae.optics.sampling import SamplingError
-from psfdae.optics.turbulence import Footprints, draw_waves, layer_r0
+from psfdae.optics.turbulence import SPECTRUM, Footprints, draw_waves, layer_r0
 from psfdae.rng import stream
 from psfdae.stars.fields import square_grid
 
@@ -18,6 +18,9 @@ CYCLES_PER_DIAMETER = 60
 Anything finer scatters light beyond ±60 λ/D (±6.8″ at 1 m and 550 nm), outside
 every stamp: 0.14 % of the light at D/r0 = 5, lost to the flux normalisation.
 """
+
+MOST_LEFT_OUT = 0.1
+"""Phase variance in rad² beyond that frequency above which it matters; 0.0014 at D/r0 = 5."""
 
 SLOPE_SAMPLES = 128
 """Samples of the grid on which slopes are measured."""
@@ -103,8 +106,18 @@ def template_wavefronts(config: Any) -> TurbulentWavefronts:
     ValueError
         If there is not one height and one strength per layer, or the strengths
         do not add up to 1.
+    SamplingError
+        If the turbulence is too strong for the highest frequency.
     """
     turbulence, telescope = config.wavefront, config.telescope
+    cycles = turbulence.r0_m * CYCLES_PER_DIAMETER / telescope.diameter_m
+    left_out = 1.2 * np.pi * SPECTRUM * cycles ** (-5.0 / 3.0)
+    if left_out > MOST_LEFT_OUT:
+        raise SamplingError(
+            f"wavefront.r0_m = {turbulence.r0_m:g}, telescope.diameter_m = "
+            f"{telescope.diameter_m:g}: a phase variance of {left_out:.2g} rad² lies beyond "
+            f"{CYCLES_PER_DIAMETER} cycles per diameter (at most {MOST_LEFT_OUT})"
+        )
     highest = CYCLES_PER_DIAMETER / telescope.diameter_m
     layers = [
         draw_waves(
