@@ -227,3 +227,30 @@ def test_two_whole_runs_give_identical_bytes(smoke, tmp_path):
     for path in products:
         assert path.read_bytes() == (tmp_path / path.relative_to(folder)).read_bytes(), path
     assert len(products) > 50
+
+
+@pytest.mark.slow
+def test_targets_on_request(smoke):
+    """Benchmark, stress tests and bounds of the tiny run."""
+    folder, _ = smoke
+    snakemake(folder, "benchmark", "stability", "bounds")
+    tables = folder / "results/tables"
+    stability = pd.read_csv(tables / "stability.csv")
+    assert list(stability.columns) == ["case", "quantity", "expected", "measured", "verdict"]
+    assert (stability.verdict == "pass").all()
+    bounds = pd.read_csv(tables / "psf_bounds.csv")
+    columns = [
+        "dataset",
+        "split",
+        "reference",
+        "method",
+        "noise_level",
+        "metric",
+        "value",
+        "stderr",
+    ]
+    assert list(bounds.columns) == [*columns, "n", "ci_low", "ci_high", "tight"]
+    assert set(bounds.method) == {"bayes", "floor"}
+    choice = pd.read_csv(tables / "benchmark_choice.csv")
+    assert (choice.configured == "yes").groupby(choice.scene).any().all()
+    assert planned(folder, "benchmark", "stability", "bounds") == {}
