@@ -23,6 +23,12 @@ export PYTHONUNBUFFERED := 1
 export MLFLOW_DISABLE_TELEMETRY := true
 RESULTS := results$(if $(filter-out fast,$(PRESET)),/$(PRESET))
 SNAKEMAKE := snakemake --cores $(CORES) --config preset=$(PRESET) $(if $(SET),set="$(SET)")
+# Targets on request are in the report where they have been built.
+REPORTED = $(or $(TARGETS),all \
+  $(if $(wildcard $(RESULTS)/figures/benchmark/skipping.png),benchmark) \
+  $(if $(wildcard $(RESULTS)/.stability_passed),stability) \
+  $(if $(wildcard $(RESULTS)/tables/psf_efficiency.csv),bounds) \
+  $(if $(wildcard $(RESULTS)/figures/benchmark/training.png),training_knee))
 # The 24 × 24 trainings take longest; started last, one would run alone in the end.
 LONGEST_FIRST := $(if $(strip $(TARGETS)),,--prioritize scene2)
 
@@ -55,7 +61,7 @@ benchmark stability bounds training_knee:
 	@sh workflow/locked.sh $(SNAKEMAKE) -- $@
 
 report: env ## Gather the figures of a finished run in results/report.html
-	$(SNAKEMAKE) --report $(RESULTS)/report.html -- $(TARGETS)
+	$(SNAKEMAKE) --report $(RESULTS)/report.html -- $(REPORTED)
 
 mlflow: env ## Compare the tracked runs in a browser (PORT=n)
 	@test -f $(RESULTS)/mlflow.db || { echo "no $(RESULTS)/mlflow.db yet: make reproduce"; exit 1; }

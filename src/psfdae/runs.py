@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 from psfdae.files import ProductError, read_product
 
@@ -27,6 +27,17 @@ class Point(NamedTuple):
     value: float
     epoch: int
     time_ms: int
+
+
+class Source(Protocol):
+    """A finished run of any kind, as the import into MLflow sees it."""
+
+    @property
+    def name(self) -> str: ...
+
+    def files(self) -> dict[str, Path]: ...
+
+    def read(self) -> Record: ...
 
 
 @dataclass(frozen=True)
@@ -49,6 +60,10 @@ class Entry:
     history: Path | None = None
     figures: tuple[tuple[str, Path], ...] = ()
 
+    def read(self) -> Record:
+        """Config, metrics and hashes; see the function `read`."""
+        return read(self)
+
     @property
     def name(self) -> str:
         """For people: dataset3 random template dae."""
@@ -66,7 +81,7 @@ class Entry:
 class Record:
     """What a finished run says about itself."""
 
-    entry: Entry
+    entry: Source
     experiment: str
     config: dict[str, Any]
     config_hash: str
@@ -143,26 +158,26 @@ def read(entry: Entry) -> Record:
     ProductError
         If a file is missing or damaged; the message names it.
     """
-    contents = {name: _sha256(path) for name, path in entry.files().items()}
+    contents = {name: sha256(path) for name, path in entry.files().items()}
     stars = read_product(entry.stars, "stars", ()).config
     if entry.kind == "dae":
-        own = _read_yaml(entry.config)
+        own = read_yaml(entry.config)
         # Which start succeeded is an outcome, not a setting.
         own.pop("attempt", None)
     else:
         own = read_product(entry.model, "pca_som", ()).config
     config = {**stars, **own}
-    config_hash = _hash_of(config)
+    config_hash = hash_of(config)
     end_ms = int(entry.model.stat().st_mtime * 1000)
     epochs = _epochs(entry.history) if entry.history else []
     start_ms = end_ms - int(1000 * max((row["seconds"] for row in epochs), default=0.0))
-    points = _epoch_points(epochs, start_ms) + _test_points(entry, end_ms)
+    points = epoch_points(epochs, start_ms) + _test_points(entry, end_ms)
     return Record(
         entry=entry,
         experiment=_experiment(entry.stars, stars),
         config=config,
         config_hash=config_hash,
-        content_hash=_hash_of([CONTENT, config_hash, contents]),
+        content_hash=hash_of([CONTENT, config_hash, contents]),
         points=[point for point in points if math.isfinite(point.value)],
         start_ms=start_ms,
         end_ms=end_ms,
@@ -180,7 +195,8 @@ def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
     return leaves
 
 
-def _epoch_points(epochs: list[dict[str, float]], start_ms: int) -> list[Point]:
+def epoch_points(epochs: list[dict[str, float]], start_ms: int) -> list[Point]:
+    """Metrics of every epoch of a history, and the best validation error."""
     points = [
         Point(name, value, int(row["epoch"]), start_ms + int(1000 * row["seconds"]))
         for row in epochs
@@ -196,11 +212,11 @@ def _epoch_points(epochs: list[dict[str, float]], start_ms: int) -> list[Point]:
 
 def _test_points(entry: Entry, time_ms: int) -> list[Point]:
     points = []
-    for row in _read_csv(entry.evaluation, "method", "noise_level", "metric", "value", "stderr"):
+    for row in read_csv(entry.evaluation, "method", "noise_level", "metric", "value", "stderr"):
         if row["method"] == METHODS[entry.kind]:
-            metric, level = row["metric"], f"{_number(entry.evaluation, row['noise_level']):g}"
+            metric, level = row["metric"], f"{number(entry.evaluation, row['noise_level']):g}"
             for name, column in ((metric, "value"), (f"{metric}_stderr", "stderr")):
-                value = _number(entry.evaluation, row[column])
+                value = number(entry.evaluation, row[column])
                 points.append(Point(f"test_{name}_{level}", value, 0, time_ms))
     if not points:
         raise ProductError(f"{entry.evaluation}: no rows of method {METHODS[entry.kind]!r}")
@@ -208,8 +224,8 @@ def _test_points(entry: Entry, time_ms: int) -> list[Point]:
 
 
 def _epochs(path: Path) -> list[dict[str, float]]:
-    rows = _read_csv(path, "epoch", "train_mse", "validation_mse", "seconds")
-    return [{name: _number(path, text) for name, text in row.items()} for row in rows]
+    rows = read_csv(path, "epoch", "train_mse", "validation_mse", "seconds")
+    return [{name: number(path, text) for name, text in row.items()} for row in rows]
 
 
 def _experiment(path: Path, stars: Mapping[str, Any]) -> str:
@@ -219,7 +235,8 @@ def _experiment(path: Path, stars: Mapping[str, Any]) -> str:
         raise ProductError(f"{path}: its config has no scene.experiment") from None
 
 
-def _read_csv(path: Path, *columns: str) -> list[dict[str, str]]:
+def read_csv(path: Path, *columns: str) -> list[dict[str, str]]:
+    """Rows of a CSV with the columns named; raises ProductError."""
     try:
         with path.open(newline="", encoding="utf-8") as file:
             reader = csv.DictReader(file)
@@ -233,14 +250,16 @@ def _read_csv(path: Path, *columns: str) -> list[dict[str, str]]:
         raise ProductError(f"{path}: damaged ({error}); delete it and run again") from error
 
 
-def _number(path: Path, text: Any) -> float:
+def number(path: Path, text: Any) -> float:
+    """A number of a table; raises ProductError that names the file."""
     try:
         return float(text)
     except (TypeError, ValueError):
         raise ProductError(f"{path}: damaged ({text!r} is no number)") from None
 
 
-def _read_yaml(path: Path | None) -> dict[str, Any]:
+def read_yaml(path: Path | None) -> dict[str, Any]:
+    """A YAML file with a mapping; raises ProductError."""
     import yaml
 
     assert path is not None
@@ -255,12 +274,14 @@ def _read_yaml(path: Path | None) -> dict[str, Any]:
     return tree
 
 
-def _hash_of(tree: Any) -> str:
+def hash_of(tree: Any) -> str:
+    """Hash of a tree in its canonical JSON."""
     canonical = json.dumps(tree, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(canonical.encode()).hexdigest()
 
 
-def _sha256(path: Path) -> str:
+def sha256(path: Path) -> str:
+    """Hash of a file's bytes; raises ProductError if it is missing."""
     try:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()

@@ -3,6 +3,8 @@ rule runtime:
         [file for dataset in default_datasets() for file in products_of(dataset)],
         rules.psf_metrics.output,
         rules.calibrate.output,
+        ALIGNMENT_PRODUCTS,
+        rules.track_alignment.output,
     output:
         f"{RESULTS}/runtime.csv",
     log:

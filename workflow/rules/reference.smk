@@ -6,6 +6,7 @@ rule reference:
         rules.runtime.output,
         [file for dataset in TABULATED for file in paper_tables_of(dataset)],
         [file for dataset in default_datasets() for file in figures_of(dataset)],
+        ALIGNMENT_PRODUCTS,
         rules.benchmark.input,
         rules.stability.input,
         rules.bounds.input,

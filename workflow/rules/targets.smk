@@ -35,3 +35,10 @@ rule benchmark:
         PROPAGATION_PRODUCTS,
         TIMING_PRODUCTS,
     localrule: True
+
+
+rule scene3:
+    input:
+        ALIGNMENT_PRODUCTS,
+        rules.track_alignment.output,
+    localrule: True

@@ -26,3 +26,34 @@ rule track:
         "psfdae track --results {params.results} --preset {params.preset}"
         " --database {params.database} --stars {wildcards.dataset} {input.stars}"
         " --out {output} > {log} 2>&1"
+
+
+rule track_alignment:
+    input:
+        rules.alignment_tables.output.errors,
+        rules.alignment_dae.output,
+        expand(rules.alignment_cnn.output, cnn=ALIGNMENT_CNNS),
+        rules.figure_alignment_predicted.output,
+        rules.figure_alignment_errors.output,
+        rules.figure_alignment_correlation.output,
+        rules.figure_alignment_stamps.output,
+    output:
+        f"{RESULTS}/mlflow/alignment.csv",
+    log:
+        f"{RESULTS}/logs/track/alignment.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/track/alignment.tsv"
+    localrule: True
+    threads: 1
+    resources:
+        mem_mb=500,
+    params:
+        results=lambda w: RESULTS,
+        preset=PRESET,
+        database=f"{RESULTS}/mlflow.db",
+        source=source_hash("psfdae.stages.track", "psfdae.alignment_runs"),
+    message:
+        "Importing the runs of scene 3 into MLflow"
+    shell:
+        "psfdae track --results {params.results} --preset {params.preset}"
+        " --database {params.database} --alignment --out {output} > {log} 2>&1"

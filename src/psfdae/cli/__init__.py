@@ -5,6 +5,7 @@ Only click is imported at the top; each command imports its stage when it runs.
 
 from psfdae.cli import (
     alignment,
+    alignment_methods,
     benchmark_propagation,
     benchmark_timing,
     bounds,
@@ -18,6 +19,7 @@ from psfdae.cli.base import main
 
 __all__ = [
     "alignment",
+    "alignment_methods",
     "benchmark_propagation",
     "benchmark_timing",
     "bounds",

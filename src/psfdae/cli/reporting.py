@@ -75,18 +75,24 @@ def calibrate(
     "--stars",
     type=(str, FileArgument),
     multiple=True,
-    required=True,
     help="Dataset and its product of the stage stars.",
 )
+@click.option("--alignment", is_flag=True, help="The networks of scene 3.")
 @out_option("CSV with the MLflow id of every run and what was done.")
 def track(
-    results: Path, preset: str, database: Path, stars: tuple[tuple[str, Path], ...], out: Path
+    results: Path,
+    preset: str,
+    database: Path,
+    stars: tuple[tuple[str, Path], ...],
+    alignment: bool,
+    out: Path,
 ) -> None:
     """Import finished runs into MLflow; MLFLOW_TRACKING_URI names a server instead."""
+    from psfdae.alignment_runs import discover_alignment
     from psfdae.runs import discover
     from psfdae.stages import track as stage
 
-    entries = discover(results, dict(stars))
+    entries = [*discover(results, dict(stars)), *(discover_alignment(results) if alignment else [])]
     stage.run(entries, preset, database, database.parent / "mlartifacts", out)
 
 

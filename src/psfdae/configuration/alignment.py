@@ -12,7 +12,17 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
-from psfdae.configuration.schema import Count, Group, Name, Noise, Positive, Telescope
+from psfdae.configuration.schema import (
+    Count,
+    Dae,
+    Evaluation,
+    Group,
+    Name,
+    Noise,
+    Positive,
+    Telescope,
+    Train,
+)
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 
@@ -183,9 +193,7 @@ class Cnn(Group):
     strides: Annotated[list[Annotated[int, Field(ge=1, le=4)]], Field(min_length=1)] = Field(
         description="Strides of the convolutions"
     )
-    leak: Annotated[float, Field(ge=0, lt=1)] = Field(
-        description="Slope of the leaky ReLU below 0"
-    )
+    leak: Annotated[float, Field(ge=0, lt=1)] = Field(description="Slope of the leaky ReLU below 0")
 
     @model_validator(mode="after")
     def _shape(self) -> Cnn:
@@ -209,12 +217,21 @@ class CnnTrain(Group):
     lr: Annotated[float, Field(gt=0, le=1)] = Field(
         description="Adam's learning rate (its maximum if one-cycle)"
     )
+    weigh_noise: bool = Field(
+        description="Weigh a state's error by 1/λ², so that every noise level counts alike"
+    )
     schedule: Literal["steps", "onecycle"]
     decay: Annotated[float, Field(gt=0, le=1)] = Field(
         description="Factor of the learning rate at each step of the schedule"
     )
     decay_epochs: Count = Field(description="Epochs between steps of the schedule")
+    mirrors: bool = Field(
+        description="Train on the telescope's mirror images and average estimates over them"
+    )
     threads: Count = Field(description="Threads of the training")
+    checkpoint_seconds: Annotated[float, Field(ge=0)] = Field(
+        description="Least time between checkpoints"
+    )
 
 
 class Fit(Group):
@@ -239,11 +256,27 @@ class AlignmentConfig(Group):
     alignment: Alignment
     optics: AlignmentOptics
     noise: Noise
+    dae: Dae
+    dae_train: Train
+    cnn: Cnn
+    train_original: CnnTrain
+    train_noise_trained: CnnTrain
+    train_dae_retrained: CnnTrain
+    evaluation: Evaluation
+    fit: Fit
 
 
 ALIGNMENT_STAGE_KEYS: dict[str, tuple[str, ...]] = {
     "alignment_model": ("telescope", "prescription", "alignment"),
     "alignment_states": ("seed", "telescope", "prescription", "alignment", "optics"),
     "alignment_telescope": ("telescope", "alignment"),
+    "alignment_dae": ("seed", "noise", "dae", "dae_train"),
+    "alignment_original": ("seed", "cnn", "train_original"),
+    "alignment_noise_trained": ("seed", "noise", "cnn", "train_noise_trained"),
+    "alignment_dae_retrained": ("seed", "noise", "cnn", "train_dae_retrained", "evaluation"),
+    "alignment_estimate": ("seed", "noise", "evaluation"),
+    "alignment_fit": ("seed", "telescope", "alignment", "optics", "noise", "fit", "evaluation"),
+    "alignment_bound": ("telescope", "alignment", "optics", "noise"),
+    "alignment_twin": ("telescope", "prescription", "alignment", "optics", "noise"),
 }
 """The groups that each stage of scene 3 reads; nothing else can influence its result."""

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from psfdae.evaluation.alignment_tables import METHOD_LABELS, PARAMETERS
+from psfdae.evaluation.curves import readable_log_axis
 from psfdae.evaluation.figure_style import SERIES_COLORS, new_figure, styled
 
 if TYPE_CHECKING:
@@ -103,6 +104,7 @@ def predicted_against_true(
         bottom.set_xlabel("true / range")
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=2, markerscale=5)
+    figure.supylabel("estimate / range", fontsize=9)
     return figure
 
 
@@ -137,6 +139,7 @@ def errors_against_size(
         axes.set_xlabel("RMS of the state's four numbers / range")
         axes.set_yscale("log")
         axes.grid(True, which="both")
+    readable_log_axis(panels[0])
     panels[0].set_ylabel("mean absolute error / range")
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=3)
@@ -157,13 +160,14 @@ def binned(size: np.ndarray, error: np.ndarray) -> tuple[np.ndarray, np.ndarray,
 def twin_ambiguity(
     curves: pd.DataFrame, stamps: Sequence[tuple[str, np.ndarray]], state: np.ndarray
 ) -> Figure:
-    """Misfit along the line from a state to its twin, and the stamps of both.
+    """Misfit of multiples of a state, and the stamps of the state and its twin.
 
     Parameters
     ----------
     curves : DataFrame
         Columns noise_level, defocus_mm, position (1 the state, −1 its twin), chi2.
     stamps : sequence of (label, stamps of shape (F, d, d))
+        Their middle is drawn.
     state : ndarray, shape (4,)
     """
     figure = new_figure(7.2, layout="constrained")
@@ -177,16 +181,18 @@ def twin_ambiguity(
         axes.set_yscale("log")
         axes.set_ylim(bottom=0.3)
         axes.set_title(f"λ = {level:g}")
-        axes.set_xlabel("position: 1 the state, −1 its twin")
+        axes.set_xlabel("multiple of the state; −1 is its twin")
         axes.grid(True)
     panels[0].set_ylabel("χ² from the state's stamps")
     panels[0].legend(loc="lower left")
     text = ", ".join(f"{name} {x:+.2f}" for name, x in zip(NAMES.values(), state, strict=True))
     top.suptitle(f"State: {text} (range)", fontsize=10)
     axes = bottom.subplots(len(stamps), stamps[0][1].shape[0])
+    peak = max(images.max() for _, images in stamps)
     for line, (label, images) in zip(axes, stamps, strict=True):
         for cell, stamp in zip(line, images, strict=True):
-            _show(cell, stamp, max(images.max() for _, images in stamps))
+            edge = stamp.shape[0] // 4
+            _show(cell, stamp[edge:-edge, edge:-edge], peak)
         line[0].set_ylabel(label, rotation=0, ha="right", va="center")
     return figure
 

@@ -83,8 +83,8 @@ def build_cnn(
     return model
 
 
-Batches = Callable[[int], Iterator[tuple[np.ndarray, np.ndarray]]]
-"""Stamps (B, fields, d, d) and states (B, 4) of an epoch, batch by batch."""
+Batches = Callable[[int], Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]]
+"""Stamps (B, fields, d, d), states (B, 4) and weights (B,) of an epoch, batch by batch."""
 
 
 class CnnTraining:
@@ -115,7 +115,6 @@ class CnnTraining:
     ) -> None:
         self.batches, self.train, self.name = batches, train, name
         self.factor = float(shape[1] ** 2)
-        self.loss = {"mse": nn.functional.mse_loss, "l1": nn.functional.l1_loss}[train.loss]
         generator = torch.Generator()
         generator.manual_seed(int(stream(seed, "cnn", "init", name).integers(2**62)))
         self.model = build_cnn(cnn, *shape, generator)
@@ -129,8 +128,8 @@ class CnnTraining:
         Returns
         -------
         dict
-            Row of the history: epoch, lr at its start, loss (in units of the
-            range), seconds since the start of the training.
+            Row of the history: epoch, lr at its start, loss (weighted mean
+            squared error in units of the range), seconds since the start of the training.
 
         Raises
         ------
@@ -141,8 +140,8 @@ class CnnTraining:
         rate = self.optimiser.param_groups[0]["lr"]
         self.model.train()
         losses = []
-        for stamps, states in self.batches(epoch):
-            losses.append(self._step(stamps, states))
+        for batch in self.batches(epoch):
+            losses.append(self._step(*batch))
             if not np.isfinite(losses[-1]):
                 raise CnnTrainingError(
                     f"{self.name}: the loss is {losses[-1]} in epoch {epoch + 1}: "
@@ -158,9 +157,11 @@ class CnnTraining:
         self.history.append(row)
         return row
 
-    def _step(self, stamps: np.ndarray, states: np.ndarray) -> float:
+    def _step(self, stamps: np.ndarray, states: np.ndarray, weights: np.ndarray) -> float:
         output = self.model(_scaled(stamps, self.factor))
-        loss = self.loss(output, torch.from_numpy(states.astype(np.float32)))
+        truth = torch.from_numpy(states.astype(np.float32))
+        each = torch.from_numpy(weights.astype(np.float32))[:, None]
+        loss = (each * nn.functional.mse_loss(output, truth, reduction="none")).mean()
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         self.optimiser.step()

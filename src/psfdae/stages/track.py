@@ -18,7 +18,7 @@ from typing import Any
 
 import psfdae
 from psfdae.files import atomic_path, write_text
-from psfdae.runs import Entry, Record, flatten, read
+from psfdae.runs import Record, Source, flatten
 from psfdae.source import git_commit
 
 SLOT = ("kind", "dataset", "split", "reference", "preset", "source")
@@ -36,7 +36,7 @@ class TrackingError(RuntimeError):
 
 
 def run(
-    entries: Sequence[Entry], preset: str, database: Path, artifacts: Path, receipt: Path
+    entries: Sequence[Source], preset: str, database: Path, artifacts: Path, receipt: Path
 ) -> None:
     """Import finished runs into MLflow.
 
@@ -50,7 +50,7 @@ def run(
 
     Parameters
     ----------
-    entries : as from `psfdae.runs.discover`
+    entries : as from `psfdae.runs.discover` and `psfdae.alignment_runs.discover_alignment`
     preset : goes into the tags
     database : SQLite file, made if missing
     artifacts : folder for the runs' files
@@ -68,7 +68,7 @@ def run(
     os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", "20")
     os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "1")
     uri = os.environ.get("MLFLOW_TRACKING_URI", "")
-    records = [read(entry) for entry in entries]
+    records = [entry.read() for entry in entries]
     tags = {"preset": preset, "commit": git_commit(), "psfdae_version": psfdae.__version__}
     done: list[tuple[str, str]] = []
     with _alone(database):

@@ -1,0 +1,1 @@
+"""Estimating the misalignment of a secondary mirror from its stamps."""

@@ -1,0 +1,226 @@
+"""Stages of scene 3 that train: the DAE on its stamps, and the CNNs that estimate states.
+
+Three CNNs of the same architecture differ in what they are trained on: clean
+stamps of the grid (the paper's, used as "original" and as "dae"), noisy stamps
+of many states, and the DAE's output for noisy stamps of many states.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from psfdae.alignment.batches import (
+    TrainingStates,
+    epoch_batches,
+    gaussian_states,
+    mixed,
+    noise_weights,
+    noisy_states,
+    steps_per_epoch,
+)
+from psfdae.files import atomic_path, read_product, write_text
+from psfdae.rng import stream
+from psfdae.stages.common import limit_threads, noise_model
+from psfdae.stages.train import CONFIG, HISTORY, WEIGHTS, _as_csv, _as_yaml
+
+CNN_WEIGHTS = "cnn.safetensors"
+
+VALIDATION_STATES = 100
+"""States of the large set that choose the DAE's best epoch; it is not trained on them."""
+
+
+def train_dae_stamps(config: Any, grid: Path, train: Path, out: Path, checkpoint: Path) -> None:
+    """Train the DAE on the stamps of the grid with fresh noise in every epoch.
+
+    Parameters
+    ----------
+    config : stage config (seed, noise, dae, dae_train)
+    grid, train : products "alignment_states"; the first states of `train` validate
+    out : folder that receives `dae.safetensors`, `config.yaml`, `history.csv`
+    checkpoint : file that lets an interrupted training resume
+
+    Raises TrainingError as `psfdae.models.training.train_dae` does.
+    """
+    from safetensors.torch import save_file
+
+    from psfdae.models.training import TrainingSet, train_dae
+
+    fit, validation = (_flat(_read(path)[1]) for path in (grid, train))
+    per_state = _read(train)[1].shape[1]
+    validation = validation[: VALIDATION_STATES * per_state]
+    images = np.concatenate([fit, validation])
+    data = TrainingSet(
+        images=images,
+        references=images,
+        fit=np.arange(len(fit)),
+        validation=np.arange(len(fit), len(images)),
+        levels=np.asarray(config.noise.levels),
+        noise=noise_model(config),
+    )
+    described = config.model_dump()
+    result = train_dae(
+        data,
+        config.dae,
+        config.dae_train,
+        config.seed,
+        checkpoint,
+        _fingerprint(described, images),
+        lambda row: print(
+            f"epoch {row['epoch']:.0f}/{config.dae_train.epochs}  train MSE "
+            f"{row['train_mse']:.3e}  validation MSE {row['validation_mse']:.3e}",
+            flush=True,
+        ),
+        lambda: None,
+    )
+    with atomic_path(out / WEIGHTS) as temporary:
+        save_file(result.state, temporary, metadata={"config": json.dumps(described)})
+    write_text(out / HISTORY, _as_csv(result.history))
+    write_text(out / CONFIG, _as_yaml({**described, "attempt": result.attempt}))
+    checkpoint.unlink(missing_ok=True)
+
+
+def train_original(config: Any, grid: Path, out: Path, checkpoint: Path) -> None:
+    """Train the paper's CNN on the clean stamps of the grid.
+
+    Parameters
+    ----------
+    config : stage config (seed, cnn, train_original)
+    grid : product "alignment_states"
+    out : folder that receives `cnn.safetensors`, `config.yaml`, `history.csv`
+    checkpoint : file that lets an interrupted training resume
+
+    Raises CnnTrainingError as `psfdae.models.cnn.train_cnn` does.
+    """
+    data = TrainingStates(*_read(grid))
+    _train("original", config, config.train_original, data, out, checkpoint)
+
+
+def train_noise_trained(config: Any, train: Path, out: Path, checkpoint: Path) -> None:
+    """Train a CNN on noisy stamps of many states, with fresh noise in every epoch.
+
+    Parameters
+    ----------
+    config : stage config (seed, noise, cnn, train_noise_trained)
+    train : product "alignment_states"
+    out, checkpoint : as for `train_original`
+    """
+    noise, settings = noise_model(config), config.train_noise_trained
+
+    def disturb(stamps: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        level = mixed(config.noise.levels, len(stamps), rng)
+        return gaussian_states(noise, stamps, level, rng), _weights(config, settings, level)
+
+    data = TrainingStates(*_read(train), disturb=disturb)
+    _train("noise_trained", config, settings, data, out, checkpoint)
+
+
+def train_dae_retrained(config: Any, train: Path, dae: Path, out: Path, checkpoint: Path) -> None:
+    """Train a CNN on what the DAE makes of noisy stamps of many states.
+
+    The DAE takes most of an epoch's time, so that the noise is drawn once.
+
+    Parameters
+    ----------
+    config : stage config (seed, noise, cnn, train_dae_retrained, evaluation)
+    train : product "alignment_states"
+    dae : folder of the trained DAE
+    out, checkpoint : as for `train_original`
+    """
+    states, stamps = _read(train)
+    rng = stream(config.seed, "cnn", "noise", "dae_retrained")
+    level = mixed(config.noise.levels, len(states), rng)
+    denoised = denoise(dae, config, noisy_states(noise_model(config), stamps, level, rng))
+    settings = config.train_dae_retrained
+    data = TrainingStates(states, denoised, weights=_weights(config, settings, level))
+    _train("dae_retrained", config, settings, data, out, checkpoint)
+
+
+def _weights(config: Any, settings: Any, level: np.ndarray) -> np.ndarray:
+    """Weights of states in the loss, (n,)."""
+    if not settings.weigh_noise:
+        return np.ones(len(level))
+    return noise_weights(level, config.noise.levels)
+
+
+def denoise(dae: Path, config: Any, stamps: np.ndarray) -> np.ndarray:
+    """Output of a trained DAE for stamps (n, F, d, d), neither clipped nor renormalised."""
+    import torch
+    import yaml
+
+    from psfdae.configuration.schema import Dae
+    from psfdae.models.dae import image_scale, predict
+    from psfdae.models.training import load_dae
+
+    torch.set_num_threads(config.evaluation.threads)
+    settings = Dae.model_validate(yaml.safe_load((dae / CONFIG).read_text())["dae"])
+    factor = image_scale(settings.scale, stamps.shape[-1])
+    model = load_dae(settings, dae / WEIGHTS)
+    return predict(model, _flat(stamps), factor, config.evaluation.batch).reshape(stamps.shape)
+
+
+def _train(
+    name: str,
+    config: Any,
+    settings: Any,
+    data: TrainingStates,
+    out: Path,
+    checkpoint: Path,
+) -> None:
+    """Train one CNN and leave weights, resolved config and history in a folder."""
+    from safetensors.torch import save_file
+
+    from psfdae.alignment.symmetry import mirror_symmetries
+    from psfdae.models.cnn import CnnTraining, train_cnn
+
+    limit_threads(settings.threads)
+    stamps = data.stamps
+    fields, side = stamps.shape[1], stamps.shape[-1]
+    mirrors = mirror_symmetries(fields - 1) if settings.mirrors else None
+    training = CnnTraining(
+        epoch_batches(data, settings.batch, config.seed, name, mirrors),
+        steps_per_epoch(len(data.states), settings.batch),
+        (fields, side),
+        config.cnn,
+        settings,
+        config.seed,
+        name,
+    )
+    described = {**config.model_dump(), "fields": fields, "stamp_px": side, "name": name}
+    described["mirrors"] = settings.mirrors
+    train_cnn(
+        training,
+        checkpoint,
+        _fingerprint(described, stamps),
+        lambda row: print(
+            f"epoch {row['epoch']:.0f}/{settings.epochs}  loss {row['loss']:.3e}  "
+            f"{row['seconds']:.0f} s",
+            flush=True,
+        ),
+    )
+    with atomic_path(out / CNN_WEIGHTS) as temporary:
+        weights = {key: value.contiguous() for key, value in training.model.state_dict().items()}
+        save_file(weights, temporary, metadata={"config": json.dumps(described)})
+    write_text(out / HISTORY, _as_csv(training.history))
+    write_text(out / CONFIG, _as_yaml(described))
+    checkpoint.unlink(missing_ok=True)
+
+
+def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    product = read_product(path, "alignment_states", ("states", "stamps"))
+    return product["states"], product["stamps"]
+
+
+def _flat(stamps: np.ndarray) -> np.ndarray:
+    return stamps.reshape(-1, *stamps.shape[-2:])
+
+
+def _fingerprint(described: dict[str, Any], stamps: np.ndarray) -> str:
+    """Hash of the configuration and the images that a training sees."""
+    digest = hashlib.sha256(json.dumps(described, sort_keys=True).encode())
+    digest.update(np.ascontiguousarray(stamps).tobytes())
+    return digest.hexdigest()

@@ -1,0 +1,355 @@
+"""Methods of scene 3: CNN, mirror symmetries, maximum likelihood, Cramér–Rao bounds."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from psfdae.alignment.batches import (
+    TrainingStates,
+    epoch_batches,
+    gaussian_states,
+    noise_weights,
+    noisy_states,
+    steps_per_epoch,
+)
+from psfdae.alignment.fisher import (
+    bound_covariances,
+    coma_free_decentre,
+    correlations,
+    expected_abs_error,
+    fisher_information,
+    sigmas,
+    twin_states,
+)
+from psfdae.alignment.fit import Likelihood, fit_states, refit_twins
+from psfdae.alignment.symmetry import mirror_symmetries
+from psfdae.configuration.alignment import Cnn, Fit
+from psfdae.configuration.compose import ConfigError, load
+from psfdae.models.cnn import (
+    AlignmentCnn,
+    CnnTraining,
+    CnnTrainingError,
+    build_cnn,
+    predict_states,
+    train_cnn,
+)
+from psfdae.stars.alignment_model import design_states, fit_quadratic
+from psfdae.stars.alignment_scene import (
+    state_derivatives,
+    state_stamps,
+    traced_zernikes,
+    uniform_states,
+    zernike_tracer,
+)
+from psfdae.stars.alignment_stamps import AlignmentStamps
+
+EXACT = Fit(iterations=25, tolerance=1e-7, damping=1e-3, limit=1.25)
+
+
+@pytest.fixture(scope="module")
+def config():
+    return load((), "alignment")
+
+
+@pytest.fixture(scope="module")
+def model(config):
+    tracer = zernike_tracer(config)
+    return fit_quadratic(design_states(), traced_zernikes(tracer, design_states()))
+
+
+@pytest.fixture(scope="module")
+def operator(config):
+    return AlignmentStamps(config.telescope, config.optics, config.alignment)
+
+
+@pytest.fixture(scope="module")
+def exact_operator(config):
+    optics = config.optics.model_copy(update={"precision": "complex128"})
+    return AlignmentStamps(config.telescope, optics, config.alignment)
+
+
+@pytest.fixture(scope="module")
+def states():
+    return uniform_states(30, np.random.default_rng(5))
+
+
+@pytest.fixture(scope="module")
+def stamps(model, operator, states):
+    return state_stamps(operator, model(states))[0]
+
+
+# --- mirror symmetries
+
+
+def test_mirrored_states_have_the_mirrored_stamps(model, operator, states, stamps):
+    symmetries = mirror_symmetries(8)
+    assert len(symmetries) == 8
+    for symmetry in symmetries:
+        expected = state_stamps(operator, model(symmetry.states(states[:3])))[0]
+        # The fit of the quadratic model to rays is symmetric to 1e-6 waves.
+        assert symmetry.stamps(stamps[:3]) == pytest.approx(expected, abs=1e-5)
+        assert symmetry.state @ symmetry.state.T == pytest.approx(np.eye(4))
+
+
+def test_eight_symmetries_are_different(states, stamps):
+    images = [symmetry.states(states[:1]).tolist() for symmetry in mirror_symmetries(8)]
+    assert len({str(image) for image in images}) == 8
+    # Six points on the ring do not map on themselves when x and y are exchanged.
+    assert len(mirror_symmetries(6)) == 4
+
+
+# --- CNN
+
+
+def test_cnn_is_the_paper_s(config):
+    network = AlignmentCnn(config.cnn, 9, 16)
+    kinds = [type(layer) for layer in network.features]
+    assert kinds == [nn.Conv2d, nn.BatchNorm2d, nn.LeakyReLU] * 5
+    assert network.features[0].in_channels == 9
+    linear = [layer for layer in network.modules() if isinstance(layer, nn.Linear)]
+    assert len(linear) == 1
+    assert linear[0].out_features == 4
+    assert network(torch.zeros(3, 9, 16, 16)).shape == (3, 4)
+    train = config.train_original
+    assert (train.batch, train.epochs, train.lr) == (10, 100, 1e-3)
+    assert not train.mirrors and not train.weigh_noise
+
+
+def test_learning_rate_falls_every_30_epochs(config):
+    training = _training(config, 31, _tiny())
+    rates = [training.run_epoch()["lr"] for _ in range(31)]
+    assert rates == pytest.approx([1e-3 * 0.1 ** (epoch // 30) for epoch in range(31)])
+
+
+def _tiny():
+    rng = np.random.default_rng(0)
+    return rng.random((6, 9, 16, 16), dtype=np.float32), rng.uniform(-1, 1, (6, 4))
+
+
+def _training(config, epochs, data, seed=3):
+    stamps, states = data
+    train = config.train_original.model_copy(update={"epochs": epochs, "checkpoint_seconds": 0})
+    cnn = Cnn(widths=[4] * 5, kernels=[3] * 5, strides=[1, 2, 1, 2, 2], leak=0.01)
+    batches = epoch_batches(TrainingStates(states, stamps), 3, seed, "test", mirror_symmetries(8))
+    steps = steps_per_epoch(len(states), 3)
+    return CnnTraining(batches, steps, (9, 16), cnn, train, seed, "test")
+
+
+def test_training_is_deterministic_and_resumes_where_it_was(config, tmp_path):
+    whole, again, other = (_training(config, 4, _tiny(), seed) for seed in (3, 3, 4))
+    for training, name in ((whole, "a"), (other, "b")):
+        train_cnn(training, tmp_path / name, name, lambda row: None)
+
+    class InterruptedError(Exception):
+        pass
+
+    def interrupt(row):
+        if row["epoch"] == 3:
+            raise InterruptedError
+
+    with pytest.raises(InterruptedError):
+        train_cnn(again, tmp_path / "c", "c", interrupt)
+    resumed = _training(config, 4, _tiny())
+    seen = []
+    train_cnn(resumed, tmp_path / "c", "c", lambda row: seen.append(row["epoch"]))
+    assert seen == [3, 4]
+    for key, value in whole.model.state_dict().items():
+        assert torch.equal(value, resumed.model.state_dict()[key]), key
+    assert not torch.equal(whole.model.linear.weight, other.model.linear.weight)
+
+
+def test_training_refuses_what_is_not_finite(config, tmp_path):
+    stamps, states = _tiny()
+    training = _training(config, 2, (stamps * np.nan, states))
+    with pytest.raises(CnnTrainingError, match=r"test: the loss is nan in epoch 1: lower lr"):
+        train_cnn(training, tmp_path / "x", "x", lambda row: None)
+
+
+def test_cnn_learns_states_from_clean_stamps(config, stamps, states, tmp_path):
+    training = _training(config, 60, (stamps, states))
+    train_cnn(training, tmp_path / "x", "x", lambda row: None)
+    error = np.abs(predict_states(training.model, stamps) - states).mean()
+    assert error < 0.7 * np.abs(states).mean()
+
+
+def test_configuration_names_what_is_wrong():
+    with pytest.raises(ConfigError, match=r"cnn: strides = \[1, 2\]: 5 widths need as many"):
+        load(["cnn.strides=[1,2]"], "alignment")
+    with pytest.raises(ConfigError, match=r"cnn: kernels = .* must be odd"):
+        load(["cnn.kernels=[3,3,4,3,3]"], "alignment")
+
+
+def test_weights_come_from_the_generator_alone(config):
+    def weights(seed):
+        generator = torch.Generator()
+        generator.manual_seed(seed)
+        return build_cnn(config.cnn, 9, 16, generator).linear.weight
+
+    torch.manual_seed(0)
+    first = weights(1)
+    torch.manual_seed(9)
+    assert torch.equal(first, weights(1))
+    assert not torch.equal(first, weights(2))
+
+
+# --- batches
+
+
+def test_every_epoch_sees_every_state_once(states, stamps):
+    batches = epoch_batches(TrainingStates(states, stamps), 8, 1, "x")
+    first, second = (np.concatenate([y for _, y, _ in batches(epoch)]) for epoch in (0, 1))
+    assert sorted(first.tolist()) == sorted(states.tolist()) == sorted(second.tolist())
+    assert first.tolist() != second.tolist()
+    assert steps_per_epoch(30, 8) == len(list(batches(0))) == 4
+    # A batch of one has no variance to normalise.
+    assert (
+        steps_per_epoch(30, 29)
+        == len(list(epoch_batches(TrainingStates(states, stamps), 29, 1, "x")(0)))
+        == 1
+    )
+
+
+def test_weights_make_noise_levels_count_alike(states, stamps):
+    weights = noise_weights(np.array([0.002, 0.005, 0.005]), [0.002, 0.005])
+    assert weights[0] / weights[1] == pytest.approx(6.25)
+    assert weights[:2].mean() == pytest.approx(1)
+    own = np.arange(30.0)
+    data = TrainingStates(states, stamps, weights=own)
+    for _, truth, weight in epoch_batches(data, 8, 1, "x")(0):
+        assert (states[weight.astype(int)] == truth).all()
+
+
+def test_gaussian_noise_has_poisson_s_variance(noise, stamps):
+    levels = np.full(len(stamps), 0.005)
+    draws = [
+        draw(noise, stamps, levels, np.random.default_rng(1))
+        for draw in (noisy_states, gaussian_states)
+    ]
+    expected = noise.variance(stamps, 0.005)
+    for images in draws:
+        ratio = (images - stamps) ** 2 / expected
+        assert ratio.mean() == pytest.approx(1.0, abs=0.02)
+        bright = stamps > 0.05
+        assert ratio[bright].mean() == pytest.approx(1.0, abs=0.15)
+
+
+# --- Fisher information and maximum likelihood
+
+
+def test_fisher_matrix_against_finite_differences(model, exact_operator, noise):
+    state = np.array([[0.3, -0.5, 0.4, 0.2]])
+    fisher = fisher_information(*state_derivatives(model, exact_operator, state), noise, 0.002)
+    step = 1e-4
+    plus, minus = (
+        state_stamps(exact_operator, model(state + sign * step * np.eye(4)))[0] for sign in (1, -1)
+    )
+    slopes = ((plus - minus) / (2 * step)).reshape(4, -1)
+    own = state_stamps(exact_operator, model(state))[0].ravel()
+    expected = (slopes / noise.variance(own, 0.002)) @ slopes.T
+    assert fisher[0] == pytest.approx(expected, rel=1e-4, abs=1e-4 * expected.max())
+
+
+def test_bound_scales_with_noise(model, operator, noise, states):
+    low, high = bound_covariances(model, operator, noise, [1e-5, 2e-5], states[:2])
+    # Background-limited at high noise, star-limited at low noise: between 2 and 4.
+    ratio = np.diagonal(high, axis1=1, axis2=2) / np.diagonal(low, axis1=1, axis2=2)
+    assert (ratio > 2).all()
+    assert (ratio < 4).all()
+    assert expected_abs_error(low) == pytest.approx(0.79788456 * sigmas(low))
+
+
+def test_decentre_and_tilt_errors_are_correlated_with_the_signs_of_coma(
+    model, operator, noise, states
+):
+    """More decentre along x is hidden by less tilt about y, along y by more tilt about x."""
+    matrix = correlations(bound_covariances(model, operator, noise, [0.002], states))[0].mean(0)
+    assert -0.9 < matrix[0, 3] < -0.6
+    assert 0.6 < matrix[1, 2] < 0.9
+    assert np.abs(matrix[[0, 1, 2], [1, 3, 3]]).max() < 0.3
+    assert np.diag(matrix) == pytest.approx(1)
+
+
+def test_gauss_newton_recovers_a_noise_free_state(model, exact_operator, noise):
+    truth = np.array([[0.3, -0.5, 0.4, 0.2], [0.9, 0.8, -0.7, -0.95]])
+    images = state_stamps(exact_operator, model(truth))[0]
+    likelihood = Likelihood(model, exact_operator, noise, 0.002)
+    found = fit_states(likelihood, images, truth + 0.08, EXACT)
+    assert found.converged.all()
+    assert found.states == pytest.approx(truth, abs=1e-6)
+    assert found.deviance == pytest.approx(0, abs=1e-6)
+
+
+def test_score_is_the_slope_of_the_likelihood(model, exact_operator, noise, states):
+    truth = states[:1]
+    rng = np.random.default_rng(2)
+    stamps = state_stamps(exact_operator, model(truth))[0]
+    images = noisy_states(noise, stamps, np.array([0.005]), rng)
+    likelihood = Likelihood(model, exact_operator, noise, 0.005)
+    score = likelihood.evaluate(images, truth)[1][0]
+    step = 1e-5
+    for axis in range(4):
+        move = step * np.eye(4)[axis]
+        plus, minus = (likelihood.evaluate(images, truth + s * move)[0][0] for s in (1, -1))
+        assert score[axis] == pytest.approx(-(plus - minus) / (4 * step), rel=1e-3, abs=1e-2)
+
+
+def test_scatter_of_the_fit_is_the_bound(model, operator, noise, states, stamps):
+    """At low noise the estimator is efficient: χ² of 30 × 4 errors within its 99.9 % range."""
+    level = 2e-4
+    images = noisy_states(noise, stamps, np.full(30, level), np.random.default_rng(7))
+    likelihood = Likelihood(model, operator, noise, level)
+    settings = Fit(iterations=8, tolerance=0.05, damping=1e-3, limit=1.25)
+    found = fit_states(likelihood, images, states + 0.01, settings)
+    covariances = bound_covariances(model, operator, noise, [level], states)[0]
+    error = found.states - states
+    chi2 = np.einsum("nk,nkl,nl->", error, np.linalg.inv(covariances), error)
+    assert 75 < chi2 < 177
+    # Pixels minus parameters, with the spread √(2 N) of χ².
+    pixels = 9 * 16 * 16
+    assert found.deviance.mean() == pytest.approx(pixels - 4, abs=5 * np.sqrt(2 * pixels / 30))
+
+
+def test_fit_stays_near_the_range(model, operator, noise):
+    truth = np.array([[1.0, -1.0, 1.0, 1.0]])
+    stamps = state_stamps(operator, model(truth))[0]
+    images = noisy_states(noise, stamps, np.array([0.02]), np.random.default_rng(3))
+    settings = Fit(iterations=8, tolerance=0.05, damping=1e-3, limit=1.0)
+    found = fit_states(Likelihood(model, operator, noise, 0.02), images, truth, settings)
+    assert np.abs(found.states).max() <= 1.0
+
+
+def test_twin_keeps_the_coma_and_turns_the_tilt(model, config):
+    noll = np.arange(4, 23)
+    state = np.array([[-0.36, 0.29, 0.20, 0.25]])
+    twin = twin_states(model, state, noll)
+    assert twin[:, 2:] == pytest.approx(-state[:, 2:])
+    coma = model.coefficients[:, 1:5][:, :, np.isin(noll, (7, 8))].mean(axis=0)
+    assert (twin - state) @ coma == pytest.approx(0, abs=1e-12)
+    assert twin_states(model, twin, noll) == pytest.approx(state)
+    line = coma_free_decentre(model, state[:, 2:], noll)
+    assert twin_states(model, np.hstack([line, state[:, 2:]]), noll)[0, :2] == pytest.approx(
+        -line[0]
+    )
+
+
+def test_wrong_twin_is_left_for_the_more_likely_state(model, operator, noise):
+    noll = np.arange(4, 23)
+    tilt = np.array([[0.1, 0.12]])
+    truth = np.hstack([coma_free_decentre(model, tilt, noll), tilt])
+    images = state_stamps(operator, model(truth))[0]
+    likelihood = Likelihood(model, operator, noise, 0.002)
+    settings = Fit(iterations=12, tolerance=0.05, damping=1e-3, limit=1.25)
+    # A fit that stopped at the twin.
+    stuck = fit_states(
+        likelihood,
+        images,
+        twin_states(model, truth, noll),
+        settings.model_copy(update={"iterations": 1}),
+    )
+    found, tried = refit_twins(likelihood, images, stuck, noll, settings)
+    assert tried.all()
+    assert found.states == pytest.approx(truth, abs=2e-3)
+    assert found.deviance[0] < stuck.deviance[0]
