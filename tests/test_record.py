@@ -91,7 +91,10 @@ def test_incomplete_run_leaves_the_record_alone(results, tmp_path):
     assert list(out.iterdir()) == []
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/results.md", "docs/fidelity.md"])
+PAGES = ("alignment", "benchmark", "bounds", "fidelity", "results", "stability")
+
+
+@pytest.mark.parametrize("page", ["README.md", *(f"docs/{page}.md" for page in PAGES)])
 def test_pages_are_what_the_run_of_record_says(page):
     assert docs.render(REFERENCE, TEMPLATES)[page] == (ROOT / page).read_text(encoding="utf-8")
 
@@ -140,3 +143,55 @@ def test_original_noise_of_the_run_of_record():
     columns = pd.read_csv(REFERENCE / "calibration/columns.csv")
     assert (abs(columns.mse_ratio - 1) < 0.12).sum() >= 11
     assert (abs(columns.ssim_at_published_mse - columns.ssim_paper) < 0.03).sum() >= 11
+
+
+def test_no_method_beats_a_bound():
+    efficiency = pd.read_csv(REFERENCE / "tables/psf_efficiency.csv")
+    judged = efficiency.verdict.dropna()
+    assert len(judged) > 200
+    assert (judged == "ok").all()
+    bounds = pd.read_csv(REFERENCE / "tables/psf_bounds.csv")
+    rows = bounds[(bounds.method == "bayes") & (bounds.metric == "mse")]
+    third = rows[(rows.dataset == "dataset3") & (rows.noise_level >= 0.003)]
+    assert len(third) == 4
+    assert (third.tight == "yes").all()
+    assert (rows[rows.dataset.isin(["dataset7", "dataset8"])].tight == "yes").all()
+
+
+def test_every_stress_test_passes():
+    table = pd.read_csv(REFERENCE / "tables/stability.csv")
+    assert list(table.columns) == ["case", "quantity", "expected", "measured", "verdict"]
+    assert len(table) > 250
+    assert (table.verdict == "pass").all()
+
+
+def test_settings_are_those_that_the_benchmark_chose():
+    choice = pd.read_csv(REFERENCE / "tables/benchmark_choice.csv")
+    for scene, rows in choice.groupby("scene"):
+        assert (rows.config_is_cheapest == "yes").all(), scene
+    training = pd.read_csv(REFERENCE / "tables/benchmark_training.csv")
+    assert (training[training.used == "yes"].knee == "yes").all()
+
+
+def test_simulation_and_inference_stream():
+    scaling = pd.read_csv(REFERENCE / "tables/benchmark_scaling.csv")
+    measured = scaling[(scaling.against == "stars") & (scaling.measured == "yes")]
+    for what, rows in measured.groupby("what"):
+        peak = rows.set_index("stars").peak_mb
+        assert peak[100_000] <= 1.5 * peak[10_000], what
+
+
+def test_alignment_of_the_run_of_record():
+    errors = pd.read_csv(REFERENCE / "tables/alignment_errors.csv")
+    errors = errors[(errors.unit == "range") & (errors.test_set == "uniform")]
+    table = errors.pivot(
+        index="method", columns=["noise_level", "parameter"], values="mean_abs_error"
+    )
+    noisy = table[[0.002, 0.005]]
+    assert (noisy.loc["dae"] < noisy.loc["original"]).all()
+    mean = noisy.T.groupby(level="noise_level").mean().T
+    learned = mean.loc[["original", "dae", "noise_trained", "dae_retrained"]].min()
+    assert learned[0.002] <= 0.027
+    assert learned[0.005] <= 0.06
+    ratio = mean.loc["max_likelihood"] / mean.loc["cramer_rao"]
+    assert 0.9 <= ratio[0.002] <= 1.15
