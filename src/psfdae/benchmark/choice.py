@@ -24,6 +24,9 @@ REFERENCE = (768, 6)
 SCREENED = 32
 """Stars that are screened for large errors where not all are."""
 
+SAME_TIME = 0.02
+"""Relative difference of two times that says nothing: repeats spread by more."""
+
 EVERY_GRID = range(16, 2049)
 """A ladder without gaps, to ask the sampling guard what it needs."""
 
@@ -162,7 +165,11 @@ def screen(scene: Scene, needed: np.ndarray, kept: int, thorough: bool) -> np.nd
     everyone = np.arange(count)
     finest = int(choose_samples(needed[looked_at].max(keepdims=True), optics.pupil_samples)[0])
     exact = stamps(everyone, finest, optics.nodes)
-    changes = [(everyone, stamp_mse(stamps(everyone, finest, optics.nodes + 2), exact))]
+    integrated = stamps(everyone, finest, optics.nodes + 2)
+    changes = [(everyone, stamp_mse(exact, integrated))]
+    # The stars that fewer nodes spoil most are others.
+    for nodes in range(required_nodes(scene.telescope.pixel), optics.nodes):
+        changes.append((everyone, stamp_mse(stamps(everyone, finest, nodes), integrated)))
     for samples in candidate_samples(optics, thorough):
         members = np.flatnonzero(needed[looked_at] <= samples)
         if members.size and samples <= optics.pupil_samples[0]:
@@ -254,7 +261,12 @@ def choose(
 
 
 def _mark_cheapest(table: pd.DataFrame, budget: float) -> pd.DataFrame:
+    """Times within `SAME_TIME` are equal; among equal candidates the configured one stays."""
     best = cheapest_within(table["time_ms"].to_numpy(), table["mse"].to_numpy(), budget)
+    good = (table["configured"] == "yes") & (table["mse"] <= budget)
+    for configured in table.index[good]:
+        if table.loc[configured, "time_ms"] <= (1.0 + SAME_TIME) * table.loc[best, "time_ms"]:
+            best = int(configured)
     table.insert(10, "cheapest", [yes(i == best) for i in range(len(table))])
     agrees = best is not None and table.loc[best, "configured"] == "yes"
     return table.assign(config_is_cheapest=yes(agrees))
