@@ -1,18 +1,3 @@
-ALIGNMENT_OVERRIDES = overrides_for("alignment", GIVEN)
-ALIGNMENT_DATA = f"{RESULTS}/data/alignment"
-
-
-@cache
-def alignment_config():
-    """Checked configuration of scene 3; a wrong key stops before any job."""
-    return load(ALIGNMENT_OVERRIDES, "alignment")
-
-
-def alignment_stage(stage):
-    """The groups that a stage of scene 3 reads, as overrides."""
-    return as_overrides(stage_tree(stage, compose(ALIGNMENT_OVERRIDES, "alignment")))
-
-
 rule alignment_model:
     output:
         f"{ALIGNMENT_DATA}/model.h5",

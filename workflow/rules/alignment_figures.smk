@@ -86,7 +86,7 @@ rule figure_alignment_errors:
 
 rule figure_alignment_twin:
     output:
-        report(
+        figure=report(
             f"{ALIGNMENT_FIGURES}/twin.png",
             caption="../report/figure_alignment_twin.rst",
             category="Scene 3",
@@ -106,7 +106,7 @@ rule figure_alignment_twin:
     message:
         "Drawing the twin ambiguity"
     shell:
-        "psfdae alignment figure twin --table {output.table} --out {output[0]}"
+        "psfdae alignment figure twin --table {output.table} --out {output.figure}"
         " {params.config:q} > {log} 2>&1"
 
 

@@ -1,26 +1,10 @@
-ALIGNMENT = f"{RESULTS}/alignment"
 ALIGNMENT_FIGURES = f"{RESULTS}/figures/alignment"
-ALIGNMENT_SETS = ["uniform", "grid"]
-ALIGNMENT_CNNS = ["original", "noise_trained", "dae_retrained"]
 
 
 wildcard_constraints:
     test_set="|".join(ALIGNMENT_SETS),
     cnn="|".join(ALIGNMENT_CNNS),
     level=r"[0-9.e-]+",
-
-
-def alignment_levels():
-    return [f"{level:g}" for level in alignment_config().noise.levels]
-
-
-def cnn_inputs(w):
-    """Clean grid stamps for the paper's CNN, the large set for ours, and the DAE."""
-    kind = "grid" if w.cnn == "original" else "train"
-    named = {"states": f"{ALIGNMENT_DATA}/{kind}.h5"}
-    if w.cnn == "dae_retrained":
-        named["dae"] = f"{ALIGNMENT}/dae/dae.safetensors"
-    return named
 
 
 rule alignment_dae:
@@ -106,7 +90,7 @@ rule alignment_estimate:
     params:
         config=lambda w: alignment_stage("alignment_estimate"),
         source=source_hash("psfdae.stages.alignment_evaluate"),
-        folder=ALIGNMENT,
+        folder=lambda w: ALIGNMENT,
     message:
         "Estimating misalignments with the networks, set {wildcards.test_set}"
     shell:
@@ -136,7 +120,7 @@ rule alignment_fit:
         # One thread of its own per job: the jobs fill the machine.
         config=lambda w: [*alignment_stage("alignment_fit"), "++optics.threads=1"],
         source=source_hash("psfdae.stages.alignment_evaluate"),
-        folder=ALIGNMENT,
+        folder=lambda w: ALIGNMENT,
     message:
         "Fitting misalignments by maximum likelihood, {wildcards.test_set}, λ = {wildcards.level}"
     shell:
@@ -172,11 +156,6 @@ ALIGNMENT_ESTIMATES = expand(
     rules.alignment_estimate.output.estimates, test_set=ALIGNMENT_SETS
 )
 ALIGNMENT_BOUNDS = expand(rules.alignment_bound.output, test_set=ALIGNMENT_SETS)
-
-
-def alignment_fits(test_sets=ALIGNMENT_SETS, what="fit"):
-    path = getattr(rules.alignment_fit.output, what)
-    return expand(path, test_set=test_sets, level=alignment_levels())
 
 
 rule alignment_tables:
@@ -235,7 +214,7 @@ rule alignment_paper_tables:
         mem_mb=500,
     params:
         source=source_hash("psfdae.stages.alignment_tables"),
-        folder=f"{RESULTS}/tables",
+        folder=lambda w: f"{RESULTS}/tables",
     message:
         "Setting the paper's tables of scene 3 beside ours"
     shell:

@@ -1,29 +1,6 @@
 BOUNDS = f"{RESULTS}/bounds"
 
 
-def has_bank(dataset):
-    """Whether the stars of a dataset have random aberrations, of which a bank is drawn."""
-    return dataset_config(dataset).stars.aberration_fraction > 0
-
-
-def bank_of(dataset):
-    stars = dataset_config(dataset).stars.name
-    return [f"{BOUNDS}/bank/{stars}.h5"] if has_bank(dataset) else []
-
-
-def per_star_of(dataset):
-    """Errors of the methods on the test stars of the split that is bounded."""
-    return [
-        csv.removesuffix(".csv") + ".parquet"
-        for csv in evaluations_of(dataset, ["random"])
-    ]
-
-
-def bound_figures_of(dataset):
-    kinds = ["errors", "efficiency"] + (["growth"] if has_bank(dataset) else [])
-    return [f"{RESULTS}/figures/bounds/{dataset}_{kind}.png" for kind in kinds]
-
-
 rule bank:
     output:
         f"{BOUNDS}/bank/{{stars}}.h5",

@@ -1,20 +1,3 @@
-import yaml
-
-KNEE = yaml.safe_load((config_dir() / "knee/points.yaml").read_text())
-FRESH = "fresh_realisations"
-
-
-def knee_choice(point):
-    """Overrides of a point, last so that they win; the fresh stars have no test part."""
-    own = [f"dataset={KNEE_DATASET}", *OVERRIDES, *KNEE["points"][point]]
-    if point == FRESH:
-        fit = KNEE["fresh_stars"] - 1
-        own += [f"parts.train_stars={fit}", "parts.test_stars=1"]
-        own += [f"stars.count={KNEE['fresh_stars']}"]
-    return tuple(own)
-
-
-KNEE_DATASET = "dataset3"
 KNEE_FOLDER = f"{RESULTS}/knee/{{point}}"
 
 

@@ -2,31 +2,6 @@ PROPAGATION = f"{RESULTS}/benchmark/propagation/{{scene}}/"
 SCENES = options("scene")
 
 
-@cache
-def strictest_dataset(scene):
-    """The dataset of a scene with the least noise and the strongest aberrations."""
-
-    def strictness(dataset):
-        settings = dataset_config(dataset)
-        return (-min(settings.noise.levels), settings.stars.aberration_fraction)
-
-    return max(
-        (d for d in ALL_DATASETS if dataset_config(d).scene.name == scene),
-        key=strictness,
-    )
-
-
-def sharing_stars(dataset):
-    """Number of datasets that are made of the same stars."""
-    stars = dataset_config(dataset).stars.name
-    return sum(dataset_config(d).stars.name == stars for d in ALL_DATASETS)
-
-
-def timed_threads(w):
-    """A timing takes as many cores as it may use, so that no other job disturbs it."""
-    return dataset_config(ALL_DATASETS[0]).benchmark.threads
-
-
 rule propagation:
     output:
         multiext(

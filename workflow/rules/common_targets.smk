@@ -1,0 +1,97 @@
+import yaml
+
+KNEE = yaml.safe_load((config_dir() / "knee/points.yaml").read_text())
+FRESH = "fresh_realisations"
+KNEE_DATASET = "dataset3"
+ALIGNMENT_OVERRIDES = overrides_for("alignment", GIVEN)
+ALIGNMENT_DATA = f"{RESULTS}/data/alignment"
+ALIGNMENT = f"{RESULTS}/alignment"
+ALIGNMENT_SETS = ["uniform", "grid"]
+ALIGNMENT_CNNS = ["original", "noise_trained", "dae_retrained"]
+
+
+def has_bank(dataset):
+    """Whether the stars of a dataset have random aberrations, of which a bank is drawn."""
+    return dataset_config(dataset).stars.aberration_fraction > 0
+
+
+def bank_of(dataset):
+    stars = dataset_config(dataset).stars.name
+    return [f"{BOUNDS}/bank/{stars}.h5"] if has_bank(dataset) else []
+
+
+def per_star_of(dataset):
+    """Errors of the methods on the test stars of the split that is bounded."""
+    return [
+        csv.removesuffix(".csv") + ".parquet"
+        for csv in evaluations_of(dataset, ["random"])
+    ]
+
+
+def bound_figures_of(dataset):
+    kinds = ["errors", "efficiency"] + (["growth"] if has_bank(dataset) else [])
+    return [f"{RESULTS}/figures/bounds/{dataset}_{kind}.png" for kind in kinds]
+
+
+def knee_choice(point):
+    """Overrides of a point, last so that they win; the fresh stars have no test part."""
+    own = [f"dataset={KNEE_DATASET}", *OVERRIDES, *KNEE["points"][point]]
+    if point == FRESH:
+        fit = KNEE["fresh_stars"] - 1
+        own += [f"parts.train_stars={fit}", "parts.test_stars=1"]
+        own += [f"stars.count={KNEE['fresh_stars']}"]
+    return tuple(own)
+
+
+@cache
+def strictest_dataset(scene):
+    """The dataset of a scene with the least noise and the strongest aberrations."""
+
+    def strictness(dataset):
+        settings = dataset_config(dataset)
+        return (-min(settings.noise.levels), settings.stars.aberration_fraction)
+
+    return max(
+        (d for d in ALL_DATASETS if dataset_config(d).scene.name == scene),
+        key=strictness,
+    )
+
+
+def sharing_stars(dataset):
+    """Number of datasets that are made of the same stars."""
+    stars = dataset_config(dataset).stars.name
+    return sum(dataset_config(d).stars.name == stars for d in ALL_DATASETS)
+
+
+def timed_threads(w):
+    """A timing takes as many cores as it may use, so that no other job disturbs it."""
+    return dataset_config(ALL_DATASETS[0]).benchmark.threads
+
+
+@cache
+def alignment_config():
+    """Checked configuration of scene 3; a wrong key stops before any job."""
+    return load(ALIGNMENT_OVERRIDES, "alignment")
+
+
+def alignment_stage(stage):
+    """The groups that a stage of scene 3 reads, as overrides."""
+    return as_overrides(stage_tree(stage, compose(ALIGNMENT_OVERRIDES, "alignment")))
+
+
+def alignment_levels():
+    return [f"{level:g}" for level in alignment_config().noise.levels]
+
+
+def cnn_inputs(w):
+    """Clean grid stamps for the paper's CNN, the large set for ours, and the DAE."""
+    kind = "grid" if w.cnn == "original" else "train"
+    named = {"states": f"{ALIGNMENT_DATA}/{kind}.h5"}
+    if w.cnn == "dae_retrained":
+        named["dae"] = f"{ALIGNMENT}/dae/dae.safetensors"
+    return named
+
+
+def alignment_fits(test_sets=ALIGNMENT_SETS, what="fit"):
+    path = getattr(rules.alignment_fit.output, what)
+    return expand(path, test_set=test_sets, level=alignment_levels())
