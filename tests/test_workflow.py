@@ -121,6 +121,12 @@ def test_scene_2_touches_nothing_of_scene_1(tmp_path):
     assert "seidel" not in out
 
 
+def test_scene_3_touches_nothing_of_the_others(tmp_path):
+    jobs = planned(tmp_path, "scene3")
+    assert jobs["alignment_cnn"] == 3
+    assert all("alignment" in rule for rule in jobs), jobs
+
+
 def test_changing_one_learning_rate_reruns_its_training_and_tables_only(smoke):
     folder, _ = smoke
     jobs = planned(folder, overrides="train.lr=0.002")
