@@ -7,6 +7,8 @@ import pytest
 
 from psfdae.configuration.compose import load
 from psfdae.optics.pupil import annular_pupil
+from psfdae.stars.alignment_model import design_states, fit_quadratic
+from psfdae.stars.alignment_scene import grid_states, traced_zernikes, zernike_tracer
 from psfdae.stars.noise import NoiseModel
 
 
@@ -38,3 +40,23 @@ def gaussian_stars():
 def noise():
     """The paper's noise as calibrated."""
     return NoiseModel(kappa=4.98, background=1e4)
+
+
+@pytest.fixture(scope="session")
+def tracer():
+    """Ray tracer of scene 3."""
+    return zernike_tracer(load((), "alignment"))
+
+
+@pytest.fixture(scope="session")
+def model(tracer):
+    """Quadratic model of scene 3's Zernikes."""
+    states = design_states()
+    return fit_quadratic(states, traced_zernikes(tracer, states))
+
+
+@pytest.fixture(scope="session")
+def grid(tracer):
+    """The 625 states of scene 3 and their ray-traced coefficients."""
+    states = grid_states(5)
+    return states, traced_zernikes(tracer, states)

@@ -22,28 +22,9 @@ from psfdae.files import read_product
 from psfdae.stages import alignment as stage
 from psfdae.stars.alignment_model import ModelError, design_states, fit_quadratic, verify
 from psfdae.stars.alignment_scene import (
-    grid_states,
     traced_zernikes,
     uniform_states,
-    zernike_tracer,
 )
-
-
-@pytest.fixture(scope="module")
-def tracer():
-    return zernike_tracer(load((), "alignment"))
-
-
-@pytest.fixture(scope="module")
-def model(tracer):
-    return fit_quadratic(design_states(), traced_zernikes(tracer, design_states()))
-
-
-@pytest.fixture(scope="module")
-def grid(tracer):
-    """The 625 states and their ray-traced coefficients."""
-    states = grid_states(5)
-    return states, traced_zernikes(tracer, states)
 
 
 def test_quadratic_model_reproduces_ray_tracing(model, grid, tracer):

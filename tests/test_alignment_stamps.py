@@ -14,14 +14,11 @@ from psfdae.optics.pupil import annular_pupil
 from psfdae.optics.raytracing import annulus_points, misaligned
 from psfdae.optics.sampling import SamplingError, check_opd
 from psfdae.optics.seidel import monomial_coefficients, monomial_images
-from psfdae.stars.alignment_model import design_states, fit_quadratic
 from psfdae.stars.alignment_scene import (
-    grid_states,
     state_derivatives,
     state_stamps,
     traced_zernikes,
     uniform_states,
-    zernike_tracer,
 )
 from psfdae.stars.alignment_stamps import (
     AlignmentStamps,
@@ -38,23 +35,6 @@ SHOWN = [((0, 0, 0, 0), 0), ((0.6, -0.3, 0.2, 0.8), 2), ((1, 1, 1, 1), 7)]
 @pytest.fixture(scope="module")
 def config():
     return load((), "alignment")
-
-
-@pytest.fixture(scope="module")
-def tracer(config):
-    return zernike_tracer(config)
-
-
-@pytest.fixture(scope="module")
-def model(tracer):
-    return fit_quadratic(design_states(), traced_zernikes(tracer, design_states()))
-
-
-@pytest.fixture(scope="module")
-def grid(tracer):
-    """The 625 states and their ray-traced coefficients."""
-    states = grid_states(5)
-    return states, traced_zernikes(tracer, states)
 
 
 @pytest.fixture(scope="module")

@@ -37,11 +37,6 @@ def config():
 
 
 @pytest.fixture(scope="module")
-def tracer(config):
-    return zernike_tracer(config)
-
-
-@pytest.fixture(scope="module")
 def fields_deg(tracer):
     return np.rad2deg(tracer.fields)
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.special import j0, j1
 
-from psfdae.optics.propagation import StampPropagator, pixel_in_lambda_over_d, pixel_nodes
+from psfdae.optics.propagation import StampPropagator, pixel_nodes
 from psfdae.optics.pupil import Pupil, annular_pupil, pupil_axis
 from psfdae.optics.seidel import monomial_coefficients, monomial_images
 
@@ -27,8 +27,8 @@ def flat(pupil):
     return np.zeros((1, pupil.axis.size, pupil.axis.size))
 
 
-def test_pixel_scale_in_diffraction_units():
-    assert pixel_in_lambda_over_d(0.1 * ARCSEC, 550e-9, 1.0) == pytest.approx(0.88148, rel=1e-5)
+def test_pixel_scale_in_diffraction_units(scene1):
+    assert scene1.telescope.pixel == pytest.approx(0.88148, rel=1e-5)
 
 
 @pytest.mark.parametrize("obscuration", [0.0, 0.3])
@@ -216,7 +216,7 @@ def test_against_poppy_fraunhofer():
     system.add_pupil(element)
     system.add_detector(pixelscale=pixel_arcsec, fov_pixels=stamp)
     theirs = system.calc_psf(wavelength=550e-9)[0].data
-    pixel = pixel_in_lambda_over_d(pixel_arcsec * ARCSEC, 550e-9, 1.0)
+    pixel = pixel_arcsec * ARCSEC / 550e-9
     ours = StampPropagator(pupil, stamp, pixel, nodes=1)(opd[None])[0]
     rotated = theirs[::-1, ::-1]
     assert np.abs(ours / ours.max() - rotated / rotated.max()).max() < 1e-6

@@ -17,6 +17,7 @@ from psfdae.runs import (
     read_csv,
     read_yaml,
     sha256,
+    span_ms,
 )
 
 NETWORKS = {
@@ -66,14 +67,12 @@ class AlignmentEntry:
         contents = {name: sha256(path) for name, path in files.items()}
         config = read_yaml(files["model/config.yaml"])
         config.pop("attempt", None)
-        weights = self.folder / NETWORKS[self.kind][0]
-        end_ms = int(weights.stat().st_mtime * 1000)
         history = files["history.csv"]
         epochs = [
             {key: number(history, text) for key, text in row.items()}
             for row in read_csv(history, "epoch", "seconds")
         ]
-        start_ms = end_ms - int(1000 * max((row["seconds"] for row in epochs), default=0.0))
+        start_ms, end_ms = span_ms(self.folder / NETWORKS[self.kind][0], epochs)
         points = epoch_points(epochs, start_ms) + self._test_points(end_ms)
         config_hash = hash_of(config)
         return Record(

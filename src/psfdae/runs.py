@@ -168,9 +168,8 @@ def read(entry: Entry) -> Record:
         own = read_product(entry.model, "pca_som", ()).config
     config = {**stars, **own}
     config_hash = hash_of(config)
-    end_ms = int(entry.model.stat().st_mtime * 1000)
     epochs = _epochs(entry.history) if entry.history else []
-    start_ms = end_ms - int(1000 * max((row["seconds"] for row in epochs), default=0.0))
+    start_ms, end_ms = span_ms(entry.model, epochs)
     points = epoch_points(epochs, start_ms) + _test_points(entry, end_ms)
     return Record(
         entry=entry,
@@ -182,6 +181,12 @@ def read(entry: Entry) -> Record:
         start_ms=start_ms,
         end_ms=end_ms,
     )
+
+
+def span_ms(model: Path, epochs: list[dict[str, float]]) -> tuple[int, int]:
+    """Start and end of a training in ms since 1970: the model's file, and the history's seconds."""
+    end_ms = int(model.stat().st_mtime * 1000)
+    return end_ms - int(1000 * max((row["seconds"] for row in epochs), default=0.0)), end_ms
 
 
 def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, str]:

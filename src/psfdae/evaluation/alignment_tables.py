@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from psfdae.alignment.fisher import expected_abs_error
 from psfdae.evaluation.correlation import error_correlation
 from psfdae.evaluation.paper import published
 
@@ -73,7 +74,7 @@ def bound_rows(
         Cramér–Rao bounds of the states, in squared units of the range.
     """
     variance = np.diagonal(covariances, axis1=1, axis2=2)
-    absolute = np.sqrt(2.0 / np.pi * variance).mean(axis=0)
+    absolute = expected_abs_error(covariances).mean(axis=0)
     statistics = {
         "mean_abs_error": absolute,
         "bias": np.zeros(4),

@@ -18,7 +18,7 @@ from torch import nn
 
 from psfdae.configuration.alignment import Cnn as CnnConfig
 from psfdae.configuration.alignment import CnnTrain
-from psfdae.files import atomic_path
+from psfdae.models.checkpoint import load_checkpoint, save_checkpoint
 from psfdae.rng import stream
 
 PARAMETERS = 4
@@ -216,26 +216,9 @@ def train_cnn(
     while len(training.history) < training.train.epochs:
         report(training.run_epoch())
         if time.monotonic() - last_saved >= training.train.checkpoint_seconds:
-            with atomic_path(checkpoint) as temporary:
-                torch.save({"fingerprint": fingerprint, **training.state()}, temporary)
+            save_checkpoint(checkpoint, fingerprint, training.state())
             last_saved = time.monotonic()
     training.model.eval()
-
-
-def load_checkpoint(path: Path, fingerprint: str) -> dict[str, Any] | None:
-    """The state of an interrupted training of the same configuration, if there is one."""
-    if not path.is_file():
-        return None
-    try:
-        state = torch.load(path, weights_only=True)
-    except Exception as error:  # any damage means the same: start afresh
-        print(f"{path}: unreadable checkpoint ignored ({error})", flush=True)
-        return None
-    if state.pop("fingerprint", None) != fingerprint:
-        print(f"{path}: checkpoint of another configuration ignored", flush=True)
-        return None
-    print(f"{path}: resuming after epoch {len(state['history'])}", flush=True)
-    return state
 
 
 def _scheduler(

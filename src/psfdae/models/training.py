@@ -18,7 +18,7 @@ import torch
 
 from psfdae.configuration.schema import Dae as DaeConfig
 from psfdae.configuration.schema import Train
-from psfdae.files import atomic_path
+from psfdae.models.checkpoint import load_checkpoint, save_checkpoint
 from psfdae.models.dae import Dae, build_dae, image_scale, predict
 from psfdae.rng import stream
 from psfdae.stars.noise import NoiseModel, mixed_levels
@@ -274,7 +274,7 @@ def train_dae(
         On a non-finite loss, or if every restart died.
     """
     torch.set_num_threads(train.threads)
-    saved = _load_checkpoint(checkpoint, fingerprint)
+    saved = load_checkpoint(checkpoint, fingerprint)
     first = saved["attempt"] if saved else 0
     for attempt in range(first, train.restarts + 1):
         training = Training(data, dae, train, seed, attempt)
@@ -303,25 +303,8 @@ def _run(
     while not training.finished():
         report(training.run_epoch(tick))
         if time.monotonic() - last_saved >= training.train.checkpoint_seconds:
-            with atomic_path(checkpoint) as temporary:
-                torch.save({"fingerprint": fingerprint, **training.state()}, temporary)
+            save_checkpoint(checkpoint, fingerprint, training.state())
             last_saved = time.monotonic()
-
-
-def _load_checkpoint(path: Path, fingerprint: str) -> dict[str, Any] | None:
-    """The state of an interrupted training of the same configuration, if there is one."""
-    if not path.is_file():
-        return None
-    try:
-        state = torch.load(path, weights_only=True)
-    except Exception as error:  # any damage means the same: start afresh
-        print(f"{path}: unreadable checkpoint ignored ({error})", flush=True)
-        return None
-    if state.pop("fingerprint", None) != fingerprint:
-        print(f"{path}: checkpoint of another configuration ignored", flush=True)
-        return None
-    print(f"{path}: resuming after epoch {state['epoch']}", flush=True)
-    return state
 
 
 def load_dae(config: DaeConfig, weights: Path) -> Dae:

@@ -28,11 +28,6 @@ ARCSEC = np.pi / 180.0 / 3600.0
 """One arc second in radians."""
 
 
-def pixel_in_lambda_over_d(pixel_scale: float, wavelength: float, diameter: float) -> float:
-    """Pixel width in units of λ/D; pixel scale in radians, lengths in metres."""
-    return pixel_scale * diameter / wavelength
-
-
 def pixel_nodes(pixel: float, nodes: int) -> tuple[np.ndarray, np.ndarray]:
     """Gauss–Legendre nodes and weights across a pixel of width `pixel` around 0.
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from psfdae.alignment.fisher import coma_free_decentre
+from psfdae.alignment.fisher import coma_free_decentre, expected_abs_error
 from psfdae.files import atomic_path, read_product, write_text
 from psfdae.stages.alignment_tables import read_errors
 from psfdae.stages.common import limit_threads, noise_model
@@ -96,8 +96,7 @@ def errors(
         size = size_of(product["states"])
         count = size.size
         for level, covariances in zip(product["levels"], product["covariances"], strict=True):
-            variance = np.diagonal(covariances, axis1=1, axis2=2)
-            error = np.sqrt(2.0 / np.pi * variance).mean(axis=1)
+            error = expected_abs_error(covariances).mean(axis=1)
             curves[float(level)]["cramer_rao"] = (size, error)
     _save(errors_against_size(curves, f"Errors against misalignment, {count} uniform states"), out)
 

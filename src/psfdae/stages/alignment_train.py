@@ -26,7 +26,7 @@ from psfdae.alignment.batches import (
 from psfdae.files import atomic_path, read_product, write_text
 from psfdae.rng import stream
 from psfdae.stages.common import limit_threads, noise_model
-from psfdae.stages.train import CONFIG, HISTORY, WEIGHTS, _as_csv, _as_yaml
+from psfdae.stages.train import CONFIG, HISTORY, WEIGHTS, as_csv, as_yaml
 
 CNN_WEIGHTS = "cnn.safetensors"
 
@@ -79,8 +79,8 @@ def train_dae_stamps(config: Any, grid: Path, train: Path, out: Path, checkpoint
     )
     with atomic_path(out / WEIGHTS) as temporary:
         save_file(result.state, temporary, metadata={"config": json.dumps(described)})
-    write_text(out / HISTORY, _as_csv(result.history))
-    write_text(out / CONFIG, _as_yaml({**described, "attempt": result.attempt}))
+    write_text(out / HISTORY, as_csv(result.history))
+    write_text(out / CONFIG, as_yaml({**described, "attempt": result.attempt}))
     checkpoint.unlink(missing_ok=True)
 
 
@@ -205,8 +205,8 @@ def _train(
     with atomic_path(out / CNN_WEIGHTS) as temporary:
         weights = {key: value.contiguous() for key, value in training.model.state_dict().items()}
         save_file(weights, temporary, metadata={"config": json.dumps(described)})
-    write_text(out / HISTORY, _as_csv(training.history))
-    write_text(out / CONFIG, _as_yaml(described))
+    write_text(out / HISTORY, as_csv(training.history))
+    write_text(out / CONFIG, as_yaml(described))
     checkpoint.unlink(missing_ok=True)
 
 

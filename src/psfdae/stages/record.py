@@ -17,6 +17,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from psfdae.benchmark.timing import cpu_model
 from psfdae.files import ProductError, write_text
 from psfdae.source import git_commit
 
@@ -106,7 +107,7 @@ def provenance(results: Path, config: Any) -> dict[str, Any]:
     return {
         "commit": git_commit(),
         "config_sha256": hashlib.sha256(canonical.encode()).hexdigest(),
-        "cpu": _cpu(),
+        "cpu": cpu_model(),
         "cores": os.cpu_count(),
         "python": platform.python_version(),
         "versions": {name: metadata.version(name) for name in VERSIONED},
@@ -179,12 +180,3 @@ def _test_seconds(report: Path) -> float | None:
 
 def _seconds(benchmark: Path) -> float:
     return float(benchmark.read_text().splitlines()[-1].split("\t")[0])
-
-
-def _cpu() -> str:
-    info = Path("/proc/cpuinfo")
-    if info.is_file():
-        for line in info.read_text().splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    return platform.processor() or platform.machine()

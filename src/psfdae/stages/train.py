@@ -74,8 +74,8 @@ def run(config: Any, stars: Path, split: str, reference: str, out: Path, checkpo
         )
     with atomic_path(out / WEIGHTS) as temporary:
         save_file(result.state, temporary, metadata={"config": json.dumps(described)})
-    write_text(out / HISTORY, _as_csv(result.history))
-    write_text(out / CONFIG, _as_yaml({**described, "attempt": result.attempt}))
+    write_text(out / HISTORY, as_csv(result.history))
+    write_text(out / CONFIG, as_yaml({**described, "attempt": result.attempt}))
     checkpoint.unlink(missing_ok=True)
 
 
@@ -87,7 +87,8 @@ def _fingerprint(described: dict[str, Any], data: Any) -> str:
     return digest.hexdigest()
 
 
-def _as_csv(rows: list[dict[str, float]]) -> str:
+def as_csv(rows: list[dict[str, float]]) -> str:
+    """CSV of a training's history."""
     text = io.StringIO()
     writer = csv.DictWriter(text, fieldnames=list(rows[0]), lineterminator="\n")
     writer.writeheader()
@@ -95,7 +96,8 @@ def _as_csv(rows: list[dict[str, float]]) -> str:
     return text.getvalue()
 
 
-def _as_yaml(tree: dict[str, Any]) -> str:
+def as_yaml(tree: dict[str, Any]) -> str:
+    """YAML of a resolved configuration, keys sorted."""
     import yaml
 
     return yaml.safe_dump(tree, sort_keys=True)
