@@ -5,8 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from psfdae.configuration.compose import load
 from psfdae.rng import stream
-from psfdae.stars.fields import assign_fields, draw_jitter, perturb_seidel, square_grid
+from psfdae.stars.fields import (
+    assign_fields,
+    draw_jitter,
+    draw_phase,
+    perturb_seidel,
+    square_grid,
+)
 from psfdae.stars.framing import (
     FramingError,
     brightest_pixel,
@@ -178,3 +185,37 @@ def test_held_out_split_never_shares_a_field(points, held):
     assert not parts[1] & parts[2]
     assert len(parts[2]) == held
     assert split.fit.size + split.validation.size + split.test.size == star_field.size
+
+
+def test_threads_change_nothing_and_batches_a_rounding(scene1):
+    source = template_wavefronts(scene1)
+    found = []
+    for batch, threads in ((8, 2), (8, 1), (5, 3)):
+        optics = scene1.optics.model_copy(update={"batch": batch, "threads": threads})
+        propagation = Propagation(source, scene1.telescope, optics, scene1.framing, 24)
+        peak = propagation.brightest()
+        found.append((peak, propagation.stamps(16, peak)))
+    (peak, stamps), (one_peak, one_thread), (other_peak, other_batch) = found
+    assert (peak == one_peak).all()
+    assert (stamps == one_thread).all()
+    assert (peak == other_peak).all()
+    assert other_batch == pytest.approx(stamps, abs=1e-5 * stamps.max())
+
+
+def test_subpixel_phase_moves_the_grid_and_keeps_the_frame(scene1, templates):
+    """A grid moved by half a pixel twice is the grid moved by one; the peak stays in place."""
+    propagation, peak = templates
+    phase = draw_phase(len(peak), stream(1, "phase"))
+    assert np.abs(phase).max() <= 0.5
+    moved = propagation.brightest(phase_px=phase)
+    assert np.abs(moved - peak).max() <= 1 + np.abs(peak).max()
+    stamps = propagation.stamps(16, moved + phase)
+    brightest = stamps.reshape(len(stamps), -1).max(axis=1)
+    assert (stamps[:, 8, 8] >= (1 - 2 * scene1.framing.tie) * brightest).all()
+    whole = propagation.brightest(phase_px=np.ones_like(phase))
+    assert (whole == peak - 1).all()
+
+
+def test_templates_have_no_subpixel_phase():
+    with pytest.raises(ValueError, match=r"framing\.subpixel"):
+        load(["dataset=dataset3", "framing.subpixel=true"])

@@ -16,6 +16,7 @@ from psfdae.configuration.schema import Benchmark, Optics
 from psfdae.optics.propagation import StampPropagator
 from psfdae.optics.sampling import SamplingError
 from psfdae.stars.framing import normalise_flux
+from psfdae.threads import side_by_side
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -134,7 +135,9 @@ def time_kernel(
 
 
 def _time_setting(case: Case, setting: Setting, repeats: int, stamps: int) -> dict[str, Any]:
-    use_threads(setting.backend, setting.threads)
+    """Numpy's batches run side by side as in a scene, torch's on threads of its own."""
+    numpy = setting.backend == "numpy"
+    use_threads(setting.backend, 1 if numpy else setting.threads)
     pupil = pupil_of(setting.samples, case.obscuration)
     kernel = StampPropagator(
         pupil,
@@ -146,8 +149,13 @@ def _time_setting(case: Case, setting: Setting, repeats: int, stamps: int) -> di
     )
     opd = case.batch(pupil, setting.batch, kernel.real_dtype)
     offset = np.repeat(case.offset_px, setting.batch, axis=0)
-    calls = max(1, stamps // setting.batch)
-    timing = time_calls(lambda: kernel(opd, offset), repeats, calls)
+    calls = max(setting.threads, stamps // setting.batch)
+    threads = setting.threads if numpy else 1
+
+    def propagate() -> None:
+        side_by_side(lambda _: kernel(opd, offset), range(calls), threads)
+
+    timing = time_calls(propagate, repeats).per(calls)
     stamp = normalise_flux(kernel(opd[:1], offset[:1]).astype(np.float64))[0][0]
     return row(case, "kernel", astuple(setting), timing, stamp)
 
@@ -164,7 +172,7 @@ def row(
     setting : tuple
         The fields of `Setting`, in order.
     timing : Timing
-        Of one call with `setting`'s batch.
+        Of one batch of `setting`, whatever runs beside it.
     stamp : ndarray, shape (d, d)
         Of sum 1.
     """

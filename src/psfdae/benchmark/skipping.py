@@ -152,7 +152,7 @@ def repeated_work(
     datasets : int
         Datasets that share the stars.
     """
-    use_threads(scene.optics.backend, scene.optics.threads)
+    use_threads(scene.optics.backend, 1)  # batches run side by side
     every = _spread(len(scene.stars), benchmark.stamps)
     propagation = scene.propagation(Selection(scene.stars, every), scene.search_px)
     side = scene.framing.stamp_px

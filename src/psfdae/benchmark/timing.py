@@ -33,6 +33,11 @@ class Timing:
     high_s: float
     repeats: int
 
+    def per(self, parts: int) -> Timing:
+        """The same for one of equal parts of the call."""
+        seconds = (s / parts for s in (self.median_s, self.low_s, self.high_s))
+        return Timing(*seconds, self.repeats)
+
 
 def time_calls(function: Callable[[], Any], repeats: int, calls: int = 1) -> Timing:
     """Time a callable after one call to warm up.

@@ -138,6 +138,9 @@ class Framing(Group):
     tie: Annotated[float, Field(ge=0, lt=0.1)] = Field(
         description="Pixels within this fraction of the maximum count as equally bright"
     )
+    subpixel: bool = Field(
+        description="Pixel grid of every realisation anywhere within ± ½ pixel, as for real stars"
+    )
 
 
 class Optics(Group):
@@ -357,6 +360,16 @@ class Config(Group):
             raise ValueError(
                 f"parts.train_stars + parts.test_stars = {used}: "
                 f"must be at most stars.count = {self.stars.count}"
+            )
+        if self.framing.subpixel and "template" in self.dataset.references:
+            raise ValueError(
+                "framing.subpixel = true: templates have no sub-pixel phase, "
+                "dataset.references must be [realisation]"
+            )
+        if self.framing.subpixel and self.stars.aberration_fraction == 0:
+            raise ValueError(
+                "framing.subpixel = true: stars.aberration_fraction must be above 0, "
+                "stars without random aberrations are their templates"
             )
         if self.baseline.components > self.framing.stamp_px**2:
             raise ValueError(

@@ -15,6 +15,7 @@ the arithmetic, all of it with real matrices in the GEMM of numpy or torch.
 
 from __future__ import annotations
 
+import threading
 from typing import Any, Literal
 
 import numpy as np
@@ -43,7 +44,8 @@ class StampPropagator:
 
     The stamp is centred on the chief ray moved by an offset per star, which
     enters as a tilt: all stars share the same matrices. For an even stamp the
-    chief ray falls on a pixel corner.
+    chief ray falls on a pixel corner. Several threads may use one propagator at
+    the same time: each has scratch space of its own.
 
     Parameters
     ----------
@@ -88,7 +90,7 @@ class StampPropagator:
         self._bins_x, self._bins_y = self._array(bins), self._array(np.kron(np.eye(2), bins).T)
         self._amplitude = self._array(pupil.amplitude)
         self._axis = self._array(pupil.axis)
-        self._work: dict[str, Any] = {}
+        self._work = threading.local()
 
     def _half_points(self) -> tuple[np.ndarray, np.ndarray]:
         """Nodes from the chief ray on, shape (m,), and their weights in pixels, (⌈d/2⌉, m)."""
@@ -158,10 +160,13 @@ class StampPropagator:
         """
         xp, (batch, m, _, _) = self._xp, cosine.shape
         intensity = self._buffer("intensity", 2, batch, m, 2 * m)
-        xp.add((cosine**2).sum(2), (sine**2).sum(2), out=intensity[0])
-        xp.subtract(
-            cosine[:, :, 0] * sine[:, :, 1], cosine[:, :, 1] * sine[:, :, 0], out=intensity[1]
-        )
+        term = self._buffer("term", batch, m, 2 * m)
+        total, cross = intensity
+        xp.multiply(cosine[:, :, 0], sine[:, :, 1], out=cross)
+        cross -= xp.multiply(cosine[:, :, 1], sine[:, :, 0], out=term)
+        xp.multiply(cosine[:, :, 0], cosine[:, :, 0], out=total)
+        for part in (cosine[:, :, 1], sine[:, :, 0], sine[:, :, 1]):
+            total += xp.multiply(part, part, out=term)
         # Axes: [sum, cross term], star, distance in x, side in y, distance in y.
         binned = np.asarray(self._bins_x @ (intensity @ self._bins_y))
         d, half = self.stamp_px, (self.stamp_px + 1) // 2
@@ -199,9 +204,10 @@ class StampPropagator:
 
     def _buffer(self, name: str, *shape: int) -> Any:
         """Scratch space kept between calls: fresh pages would cost more than the arithmetic."""
-        buffer = self._work.get(name)
+        kept = self._work.__dict__
+        buffer = kept.get(name)
         if buffer is None or tuple(buffer.shape) != shape:
-            buffer = self._work[name] = self._array(np.empty(shape, self.real_dtype))
+            buffer = kept[name] = self._array(np.empty(shape, self.real_dtype))
         return buffer
 
 

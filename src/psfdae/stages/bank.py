@@ -40,14 +40,16 @@ def run(config: Any, out: Path) -> None:
     SamplingError, FramingError
         If the pupil grid or the search window is too small.
     """
-    limit_threads(config.bounds.threads)
+    limit_threads(1)  # batches run side by side
     drawn = _renamed(config)
     fields = drawn.grid.points**2
     name, count = drawn.stars.name, drawn.stars.count
     star_field = assign_fields(count, fields, stream(drawn.seed, "field", name))
     source = scene_module(drawn.scene.name).star_wavefronts(drawn, star_field)
     ladder = sorted({*FINE_RUNGS, *drawn.optics.pupil_samples})
-    optics = drawn.optics.model_copy(update={"pupil_samples": ladder})
+    optics = drawn.optics.model_copy(
+        update={"pupil_samples": ladder, "threads": config.bounds.threads}
+    )
     framing = drawn.framing
     propagation = Propagation(source, drawn.telescope, optics, framing, drawn.stars.search_px)
     peak = propagation.brightest()

@@ -41,7 +41,7 @@ def scan(config: Any, dataset: str, out: Path) -> None:
     """
     import pandas as pd
 
-    limit_threads(config.optics.threads)
+    limit_threads(1)  # batches run side by side
     rows = original_noise_rows()
     rows = rows[rows.dataset == dataset]
     turbulent = config.scene.name == "turbulence"

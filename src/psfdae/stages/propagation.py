@@ -34,7 +34,7 @@ def run(config: Any, datasets: int, out: Path) -> None:
     import pandas as pd
 
     described = timing.machine()
-    limit_threads(config.optics.threads)
+    limit_threads(1)  # batches run side by side
     scene = scene_of(config)
     cases, convergence = build_cases(scene)
     table = _time_everything(config, cases)

@@ -11,7 +11,7 @@ import numpy as np
 from psfdae.files import Column, Empty, read_product, stream_product
 from psfdae.rng import stream
 from psfdae.stages.common import limit_threads, scene_module
-from psfdae.stars.fields import assign_fields, draw_jitter
+from psfdae.stars.fields import assign_fields, draw_jitter, draw_phase
 from psfdae.stars.framing import crop_jittered, normalise_flux, stamp_offset
 
 STARS_AT_A_TIME = 1024
@@ -23,7 +23,9 @@ def run(config: Any, templates: Path, out: Path) -> None:
 
     Every star gets a realisation (static and random aberrations) and a template
     (static only), each framed on its own brightest pixel and moved by the same
-    jitter, each normalised by the flux inside its stamp (eq. 8). All random
+    jitter, each normalised by the flux inside its stamp (eq. 8). With
+    `framing.subpixel` the pixel grid of a realisation lies anywhere within ± half a
+    pixel of the template's, as it does for real stars. All random
     numbers are drawn first, about 100 bytes per star; the images are made and
     written `STARS_AT_A_TIME`.
 
@@ -37,6 +39,9 @@ def run(config: Any, templates: Path, out: Path) -> None:
     name, count, jitter_px = config.stars.name, config.stars.count, config.framing.jitter_px
     star_field = assign_fields(count, len(fixed["psf"]), stream(config.seed, "field", name))
     jitter = draw_jitter(count, jitter_px, stream(config.seed, "jitter", name))
+    phase = np.zeros((count, 2))
+    if config.framing.subpixel:
+        phase = draw_phase(count, stream(config.seed, "phase", name))
     columns: dict[str, Column | Empty] = {
         "template": _images(config, "static PSF, sum 1"),
         "field_index": Column(star_field, "1", "field of the star"),
@@ -46,6 +51,8 @@ def run(config: Any, templates: Path, out: Path) -> None:
     if config.stars.aberration_fraction > 0:
         propagation = _propagation(config, star_field)
         columns |= _realisation_columns(config, propagation)
+        if config.framing.subpixel:
+            columns["phase"] = Column(phase, "pixel", "position of the pixel grid (row, column)")
     else:
         propagation = None
         columns["realisation"] = columns["template"]
@@ -55,7 +62,7 @@ def run(config: Any, templates: Path, out: Path) -> None:
             part = slice(stars[0], stars[-1] + 1)
             cut = _templates(fixed["psf"][star_field[stars]], jitter[stars], jitter_px)
             if propagation is not None:
-                cut |= _realisations(config, propagation, stars, jitter[stars])
+                cut |= _realisations(config, propagation, stars, jitter[stars], phase[stars])
             for column, values in cut.items():
                 data[column][part] = values
 
@@ -79,7 +86,7 @@ def _templates(framed: np.ndarray, jitter: np.ndarray, margin: int) -> dict[str,
 def _propagation(config: Any, star_field: np.ndarray) -> Any:
     from psfdae.stars.scene import Propagation
 
-    limit_threads(config.optics.threads)
+    limit_threads(1)  # batches run side by side
     source = scene_module(config.scene.name).star_wavefronts(config, star_field)
     return Propagation(
         source, config.telescope, config.optics, config.framing, config.stars.search_px
@@ -100,10 +107,10 @@ def _realisation_columns(config: Any, propagation: Any) -> dict[str, Column | Em
 
 
 def _realisations(
-    config: Any, propagation: Any, stars: np.ndarray, jitter: np.ndarray
+    config: Any, propagation: Any, stars: np.ndarray, jitter: np.ndarray, phase: np.ndarray
 ) -> dict[str, np.ndarray]:
-    peak = propagation.brightest(stars)
-    offset = stamp_offset(peak, jitter)
+    peak = propagation.brightest(stars, phase)
+    offset = stamp_offset(peak, jitter) + phase
     stamps = propagation.stamps(config.framing.stamp_px, offset, stars)
     realisation, energy = normalise_flux(stamps)
     return {"realisation": realisation, "energy": energy, "peak": peak}

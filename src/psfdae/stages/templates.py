@@ -27,7 +27,7 @@ def run(config: Any, out: Path) -> None:
     SamplingError, FramingError
         If the pupil grid or the search window is too small.
     """
-    limit_threads(config.optics.threads)
+    limit_threads(1)  # batches run side by side
     framing = config.framing
     source = scene_module(config.scene.name).template_wavefronts(config)
     propagation = Propagation(source, config.telescope, config.optics, framing, framing.search_px)

@@ -9,7 +9,6 @@ derivative of a stamp is that of the centred stamp.
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
@@ -25,6 +24,7 @@ from psfdae.optics.pupil import annular_pupil
 from psfdae.optics.sampling import choose_samples, required_samples
 from psfdae.optics.zernike import noll_to_nm, radial_polynomial, zernike
 from psfdae.stars.framing import normalise_flux
+from psfdae.threads import side_by_side
 
 FIRST_NOLL = 4
 """Piston and tilts do not show in a centred stamp."""
@@ -238,9 +238,7 @@ class AlignmentStamps:
             members = np.flatnonzero(samples == n)
             batches = np.array_split(members, range(size, members.size, size))
             tasks += [(self.operator(int(n)), batch) for batch in batches]
-        with ThreadPoolExecutor(self.optics.threads) as pool:
-            for _ in pool.map(lambda task: work(*task), tasks):
-                pass
+        side_by_side(lambda task: work(*task), tasks, self.optics.threads)
 
     def _check_energy(self, energy: np.ndarray) -> None:
         least = self.alignment.least_energy

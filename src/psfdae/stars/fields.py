@@ -37,6 +37,11 @@ def draw_jitter(count: int, jitter_px: int, rng: np.random.Generator) -> np.ndar
     return rng.integers(-jitter_px, jitter_px + 1, size=(count, 2))
 
 
+def draw_phase(count: int, rng: np.random.Generator) -> np.ndarray:
+    """Place of the pixel grid of every star (row, column), uniform in ± ½ pixel."""
+    return rng.uniform(-0.5, 0.5, size=(count, 2))
+
+
 def perturb_seidel(
     seidel: np.ndarray, fraction: float, count: int, rng: np.random.Generator
 ) -> np.ndarray:

@@ -8,6 +8,7 @@ the propagation are written once.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
@@ -22,6 +23,7 @@ from psfdae.optics.sampling import (
     required_samples,
 )
 from psfdae.stars.framing import FramingError, brightest_pixel
+from psfdae.threads import side_by_side
 
 SEARCH_ERROR = 1e-3
 """Search-image pixels this far below a tie with the maximum may still be the brightest.
@@ -47,7 +49,9 @@ class WavefrontSource(Protocol):
 class Propagation:
     """Stamps and brightest pixels of the wavefronts of one source.
 
-    Each wavefront uses the smallest grid of the ladder that its slopes allow.
+    Each wavefront uses the smallest grid of the ladder that its slopes allow. Batches
+    run in `optics.threads` threads; results do not depend on their number, and on the
+    batch by rounding only. The caller limits the linear algebra to one thread.
 
     Parameters
     ----------
@@ -91,6 +95,7 @@ class Propagation:
 
     def _choose_samples(self) -> np.ndarray:
         reach = 2 * self.search_px + 0.5 * self.framing.stamp_px + self.framing.jitter_px
+        reach += 0.5 * self.framing.subpixel
         edges = np.array([-reach, reach]) * self.telescope.pixel
         needed = required_samples(self.source.slopes(), np.broadcast_to(edges, (2, 2)))
         return choose_samples(needed, tuple(self.optics.pupil_samples))
@@ -116,12 +121,19 @@ class Propagation:
         out = np.empty((len(stars), stamp_px, stamp_px))
         for pupil, places in self._groups(stars):
             kernel = self._kernel(pupil, stamp_px, self.optics.precision)
-            for batch in self._batches(places):
+
+            def propagate(
+                batch: np.ndarray, pupil: Pupil = pupil, kernel: StampPropagator = kernel
+            ) -> None:
                 opd = self.source.opd(stars[batch], pupil, kernel.real_dtype)
                 out[batch] = kernel(opd, offset_px[batch])
+
+            self._run(propagate, places)
         return out
 
-    def brightest(self, stars: np.ndarray | None = None) -> np.ndarray:
+    def brightest(
+        self, stars: np.ndarray | None = None, phase_px: np.ndarray | None = None
+    ) -> np.ndarray:
         """Brightest pixel (row, column) of every wavefront, in pixels from the chief ray.
 
         A single-precision search image shortlists pixels; those are then computed
@@ -133,6 +145,9 @@ class Propagation:
         ----------
         stars : ndarray of int, shape (B,), optional
             The wavefronts; all of the source by default.
+        phase_px : ndarray, shape (B, 2), optional
+            (row, column) by which the pixel grid of every wavefront lies beside the one
+            that has the chief ray on a corner; 0 by default.
 
         Raises
         ------
@@ -140,12 +155,13 @@ class Propagation:
             If the brightest pixel lies on the border of that window, too.
         """
         stars = self._everyone() if stars is None else stars
+        phase_px = np.zeros((len(stars), 2)) if phase_px is None else phase_px
         reach = self.search_px
-        peaks = self._search(stars, reach)
+        peaks = self._search(stars, phase_px, reach)
         border = np.flatnonzero(_touches(peaks, reach))
         if border.size:
             reach *= 2
-            peaks[border] = self._search(stars[border], reach)
+            peaks[border] = self._search(stars[border], phase_px[border], reach)
             outside = border[_touches(peaks[border], reach)]
             if outside.size:
                 raise FramingError(
@@ -155,19 +171,33 @@ class Propagation:
                 )
         return peaks
 
-    def _search(self, stars: np.ndarray, reach: int) -> np.ndarray:
+    def _search(self, stars: np.ndarray, phase_px: np.ndarray, reach: int) -> np.ndarray:
         peaks = np.empty((len(stars), 2), dtype=np.int64)
         for pupil, places in self._groups(stars):
             search = self._kernel(pupil, 2 * reach, "complex64")
             exact = self._kernel(pupil, 1, "complex128")
-            for batch in self._batches(places):
-                members = stars[batch]
-                image = search(self.source.opd(members, pupil, search.real_dtype))
-                peaks[batch] = self._refine(members, pupil, image, exact) - reach
+
+            def find(
+                batch: np.ndarray,
+                pupil: Pupil = pupil,
+                search: StampPropagator = search,
+                exact: StampPropagator = exact,
+            ) -> None:
+                members, phase = stars[batch], phase_px[batch]
+                opd = self.source.opd(members, pupil, search.real_dtype)
+                image = search(opd, phase if phase.any() else None)
+                peaks[batch] = self._refine(members, phase, pupil, image, exact) - reach
+
+            self._run(find, places)
         return peaks
 
     def _refine(
-        self, batch: np.ndarray, pupil: Pupil, image: np.ndarray, exact: StampPropagator
+        self,
+        batch: np.ndarray,
+        phase_px: np.ndarray,
+        pupil: Pupil,
+        image: np.ndarray,
+        exact: StampPropagator,
     ) -> np.ndarray:
         """Brightest pixel of every search image; exact values where several compete."""
         half = image.shape[-1] // 2
@@ -177,7 +207,7 @@ class Propagation:
         star, row, column = np.nonzero(bright & contested[:, None, None])
         values = np.where(contested[:, None, None], 0.0, image)
         # The centre of pixel j is at j + 1/2 pixels; a one-pixel stamp is centred there.
-        offsets = np.stack([row, column], axis=1) - half + 0.5
+        offsets = np.stack([row, column], axis=1) - half + 0.5 + phase_px[star]
         for start in range(0, star.size, self.optics.batch):
             part = slice(start, start + self.optics.batch)
             opd = self.source.opd(batch[star[part]], pupil, exact.real_dtype)
@@ -197,8 +227,10 @@ class Propagation:
             self._pupils[samples] = annular_pupil(samples, self.telescope.obscuration)
         return self._pupils[samples]
 
-    def _batches(self, places: np.ndarray) -> list[np.ndarray]:
-        return np.array_split(places, range(self.optics.batch, places.size, self.optics.batch))
+    def _run(self, work: Callable[[np.ndarray], None], places: np.ndarray) -> None:
+        batches = np.array_split(places, range(self.optics.batch, places.size, self.optics.batch))
+        # torch has threads of its own, inside every product.
+        side_by_side(work, batches, 1 if self.optics.backend == "torch" else self.optics.threads)
 
     def _kernel(self, pupil: Pupil, stamp_px: int, precision: str) -> StampPropagator:
         return StampPropagator(
