@@ -11,10 +11,12 @@ import torch
 from psfdae.configuration.schema import Dae as DaeConfig
 from psfdae.configuration.schema import Train
 from psfdae.evaluation.metrics import mse
+from psfdae.files import ProductError
 from psfdae.models.dae import SingleChannelConv, build_dae, image_scale, predict
 from psfdae.models.lmmse import LinearMmse
 from psfdae.models.pca_som import fit_pca_som
 from psfdae.models.training import Training, TrainingError, TrainingSet, train_dae
+from psfdae.models.weights import load_weights, save_weights
 from psfdae.rng import stream
 
 SOM = {"rows": 4, "columns": 4, "epochs": 3, "sigma": 1.0, "learning_rate": 0.5, "seed": 1}
@@ -250,3 +252,28 @@ def test_gradient_that_is_not_finite_stops_with_advice(data, tmp_path, monkeypat
     monkeypatch.setattr(torch.nn.utils, "clip_grad_norm_", spoil)
     with pytest.raises(TrainingError, match=r"gradient's norm is nan .* lower train\.lr"):
         train(data, tmp_path)
+
+
+def test_weights_come_back_and_damage_is_noticed(tmp_path):
+    """Every byte of the file counts, the checksum covers the tensors."""
+    state = {"w": torch.arange(6.0).reshape(2, 3).T, "steps": torch.tensor(7)}
+    path = tmp_path / "dae.safetensors"
+    save_weights(path, state, {"seed": 1})
+    found = load_weights(path)
+    assert {name: array.tolist() for name, array in found.items()} == {
+        name: tensor.tolist() for name, tensor in state.items()
+    }
+    whole = path.read_bytes()
+    for place in (-1, -20):
+        damaged = bytearray(whole)
+        damaged[place] ^= 1
+        path.write_bytes(damaged)
+        with pytest.raises(ProductError, match=r"dae\.safetensors: damaged .*checksum"):
+            load_weights(path)
+    for text in (whole[:-5], whole[:20], b"", b"hello"):
+        path.write_bytes(text)
+        with pytest.raises(ProductError, match=r"dae\.safetensors: damaged"):
+            load_weights(path)
+    path.unlink()
+    with pytest.raises(ProductError, match="no such file"):
+        load_weights(path)

@@ -23,7 +23,7 @@ from psfdae.alignment.batches import (
     noisy_states,
     steps_per_epoch,
 )
-from psfdae.files import atomic_path, read_product, write_text
+from psfdae.files import read_product, write_text
 from psfdae.rng import stream
 from psfdae.stages.common import limit_threads, noise_model
 from psfdae.stages.train import CONFIG, HISTORY, WEIGHTS, as_csv, as_yaml
@@ -46,9 +46,8 @@ def train_dae_stamps(config: Any, grid: Path, train: Path, out: Path, checkpoint
 
     Raises TrainingError as `psfdae.models.training.train_dae` does.
     """
-    from safetensors.torch import save_file
-
     from psfdae.models.training import TrainingSet, train_dae
+    from psfdae.models.weights import save_weights
 
     fit, validation = (_flat(_read(path)[1]) for path in (grid, train))
     per_state = _read(train)[1].shape[1]
@@ -77,8 +76,7 @@ def train_dae_stamps(config: Any, grid: Path, train: Path, out: Path, checkpoint
         ),
         lambda: None,
     )
-    with atomic_path(out / WEIGHTS) as temporary:
-        save_file(result.state, temporary, metadata={"config": json.dumps(described)})
+    save_weights(out / WEIGHTS, result.state, described)
     write_text(out / HISTORY, as_csv(result.history))
     write_text(out / CONFIG, as_yaml({**described, "attempt": result.attempt}))
     checkpoint.unlink(missing_ok=True)
@@ -172,10 +170,9 @@ def _train(
     checkpoint: Path,
 ) -> None:
     """Train one CNN and leave weights, resolved config and history in a folder."""
-    from safetensors.torch import save_file
-
     from psfdae.alignment.symmetry import mirror_symmetries
     from psfdae.models.cnn import CnnTraining, train_cnn
+    from psfdae.models.weights import save_weights
 
     limit_threads(settings.threads)
     stamps = data.stamps
@@ -202,9 +199,7 @@ def _train(
             flush=True,
         ),
     )
-    with atomic_path(out / CNN_WEIGHTS) as temporary:
-        weights = {key: value.contiguous() for key, value in training.model.state_dict().items()}
-        save_file(weights, temporary, metadata={"config": json.dumps(described)})
+    save_weights(out / CNN_WEIGHTS, training.model.state_dict(), described)
     write_text(out / HISTORY, as_csv(training.history))
     write_text(out / CONFIG, as_yaml(described))
     checkpoint.unlink(missing_ok=True)

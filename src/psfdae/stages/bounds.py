@@ -106,7 +106,9 @@ class Tables:
         sizes = pd.DataFrame(self.growth, columns=GROWTH_COLUMNS)
         write_text(growth, sizes.to_csv(index=False, float_format="%.8g"))
         with atomic_path(per_star) as temporary:
-            pd.concat(self.per_star, ignore_index=True).to_parquet(temporary, index=False)
+            pd.concat(self.per_star, ignore_index=True).to_parquet(
+                temporary, index=False, write_page_checksum=True
+            )
 
 
 def run(

@@ -78,7 +78,9 @@ def run(
             stars_table.append(pd.DataFrame({**row, "star": parts.test, "field": field, **metrics}))
     write_text(out, pd.DataFrame(summary).to_csv(index=False, float_format="%.8g"))
     with atomic_path(per_star) as temporary:
-        pd.concat(stars_table, ignore_index=True).to_parquet(temporary, index=False)
+        pd.concat(stars_table, ignore_index=True).to_parquet(
+            temporary, index=False, write_page_checksum=True
+        )
 
 
 def _summarise(

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from psfdae.files import atomic_path, write_text
+from psfdae.files import write_text
 from psfdae.stages.common import noise_model, read_stars, split_stars
 
 WEIGHTS, CONFIG, HISTORY = "dae.safetensors", "config.yaml", "history.csv"
@@ -31,10 +31,10 @@ def run(config: Any, stars: Path, split: str, reference: str, out: Path, checkpo
 
     Raises TrainingError as `train_dae` does.
     """
-    from safetensors.torch import save_file
     from tqdm import tqdm
 
     from psfdae.models.training import TrainingSet, train_dae
+    from psfdae.models.weights import save_weights
 
     product = read_stars(stars, reference)
     parts = split_stars(product, split, config)
@@ -72,8 +72,7 @@ def run(config: Any, stars: Path, split: str, reference: str, out: Path, checkpo
             report,
             bar.update,
         )
-    with atomic_path(out / WEIGHTS) as temporary:
-        save_file(result.state, temporary, metadata={"config": json.dumps(described)})
+    save_weights(out / WEIGHTS, result.state, described)
     write_text(out / HISTORY, as_csv(result.history))
     write_text(out / CONFIG, as_yaml({**described, "attempt": result.attempt}))
     checkpoint.unlink(missing_ok=True)

@@ -1,0 +1,66 @@
+"""Weights of a network as a file that notices damage: safetensors with a checksum."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from psfdae.files import ProductError, atomic_path
+
+DIGEST = "sha256"
+"""Key of the checksum in the file's metadata."""
+
+
+def digest_of(arrays: Mapping[str, np.ndarray]) -> str:
+    """SHA-256 of names, types, shapes and values of arrays, in the order of the names."""
+    digest = hashlib.sha256()
+    for name in sorted(arrays):
+        values = np.ascontiguousarray(arrays[name])
+        digest.update(f"{name} {values.dtype.str} {values.shape}\n".encode())
+        digest.update(values.tobytes())
+    return digest.hexdigest()
+
+
+def save_weights(path: Path, state: Mapping[str, Any], config: Mapping[str, Any]) -> None:
+    """Write a network's tensors, its resolved config and the checksum of the tensors.
+
+    Parameters
+    ----------
+    path : path of the safetensors file; replaced atomically
+    state : mapping of name to torch.Tensor
+    config : mapping that JSON can hold
+    """
+    from safetensors.numpy import save_file
+
+    arrays = {name: np.array(tensor.numpy(), order="C") for name, tensor in state.items()}
+    metadata = {"config": json.dumps(config), DIGEST: digest_of(arrays)}
+    with atomic_path(path) as temporary:
+        save_file(arrays, temporary, metadata)
+
+
+def load_weights(path: Path) -> dict[str, np.ndarray]:
+    """Arrays of a network by name.
+
+    Raises
+    ------
+    ProductError
+        If the file is missing, not a safetensors file, or not what was written.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, "numpy") as file:
+            written = (file.metadata() or {}).get(DIGEST)
+            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except FileNotFoundError:
+        raise ProductError(f"{path}: no such file") from None
+    except (SafetensorError, OSError, ValueError, TypeError, KeyError) as error:
+        raise ProductError(f"{path}: damaged ({error}); delete it and run again") from error
+    if written != digest_of(arrays):
+        raise ProductError(f"{path}: damaged (wrong checksum); delete it and run again")
+    return arrays
