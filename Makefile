@@ -22,6 +22,7 @@ export PATH := $(BIN):$(PATH)
 export PYTHONUNBUFFERED := 1
 export MLFLOW_DISABLE_TELEMETRY := true
 RESULTS := results$(if $(filter-out fast,$(PRESET)),/$(PRESET))
+export PSFDAE_RESULTS := $(RESULTS)
 SNAKEMAKE := snakemake --cores $(CORES) --config preset=$(PRESET) $(if $(SET),set="$(SET)")
 # Targets on request are in the report where they have been built.
 REPORTED = $(or $(TARGETS),all \

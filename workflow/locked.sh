@@ -18,6 +18,8 @@ if command -v flock >/dev/null 2>&1; then
     program=$1
     shift
     "$program" --unlock "$@" >/dev/null 2>&1 || true
+    # Damaged files of an earlier run are set aside and named; Snakemake builds them again.
+    [ -z "${PSFDAE_RESULTS:-}" ] || psfdae verify "$PSFDAE_RESULTS"
     set -- "$program" "$@"
 fi
 export PSFDAE_RUN="$PWD"

@@ -18,9 +18,17 @@ class StageGroup(click.Group):
     """Turns the package's own errors into one message and exit code 2."""
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run the command; a refusal of ours is a message, a bug stays a traceback."""
+        """Run the command; a refusal of ours is a message, a bug stays a traceback.
+
+        So is a file that the system does not let us read or write.
+        """
         try:
             return super().invoke(ctx)
+        except OSError as error:
+            if error.errno is None:
+                raise
+            click.echo(f"psfdae: {error}", err=True)
+            ctx.exit(2)
         except (RuntimeError, ValueError) as error:
             if not type(error).__module__.startswith("psfdae"):
                 raise

@@ -132,3 +132,13 @@ def docs(root: Path) -> None:
 
     for page in stage.run(root / "results/reference", root / "docs/templates", root):
         click.echo(page)
+
+
+@main.command()
+@click.argument("results", type=FolderArgument)
+def verify(results: Path) -> None:
+    """Set damaged files of a run aside, so that the workflow builds them again."""
+    from psfdae.stages import verify as stage
+
+    for path, reason in stage.run(results):
+        click.echo(f"{path}: {reason}; set aside, it will be built again", err=True)
