@@ -34,8 +34,8 @@ REPORTED = $(or $(TARGETS),all \
 LONGEST_FIRST := $(if $(strip $(TARGETS)),,--prioritize scene2)
 
 .DEFAULT_GOAL := help
-.PHONY: help env reproduce report mlflow reference docs test test-all lint format lock clean \
-  benchmark stability bounds training_knee
+.PHONY: help env reproduce report mlflow reference docs site test test-all lint format lock clean \
+  benchmark stability bounds training_knee bundles shipped
 
 help: ## List the targets
 	@grep -hE '^[a-z_-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -58,8 +58,12 @@ benchmark: env ## Run time against error, on a quiet machine
 stability: env ## Stress tests of the whole chain
 bounds: env ## How far each method is from the best possible one
 training_knee: env ## Test error against training time
-benchmark stability bounds training_knee:
+bundles: env ## Pack each dataset's network as a model that psfdae predict takes
+benchmark stability bounds training_knee bundles:
 	@sh workflow/locked.sh $(SNAKEMAKE) -- $@
+
+shipped: env ## Train the model that comes with the package and renew it
+	@sh workflow/locked.sh $(SNAKEMAKE) --forcerun shipped -- shipped
 
 report: env ## Gather the figures of a finished run in results/report.html
 	$(SNAKEMAKE) --report $(RESULTS)/report.html -- $(REPORTED)
@@ -71,10 +75,15 @@ mlflow: env ## Compare the tracked runs in a browser (PORT=n)
 
 reference: env ## Make the finished run in results the run of record, and renew the docs
 	$(SNAKEMAKE) --forcerun reference -- reference
+	@$(MAKE) --no-print-directory docs
+
+docs: env ## Render README, docs and their drawings
+	$(SNAKEMAKE) --rulegraph -- all | psfdae draw rules --out docs/figures/rules.svg
+	psfdae draw modules --out docs/figures/modules.svg
 	psfdae docs
 
-docs: env ## Render README and docs from the run of record
-	psfdae docs
+site: docs ## Build the site of README and docs in site/
+	NO_MKDOCS_2_WARNING=1 mkdocs build --strict
 
 lint: env ## Check style of Python and Snakemake files
 	ruff check .

@@ -13,8 +13,12 @@ container: "docker://condaforge/miniforge3:25.3.1-0"
 
 include: "workflow/rules/common.smk"
 include: "workflow/rules/common_targets.smk"
+include: "workflow/rules/common_sweep.smk"
 include: "workflow/rules/data.smk"
+include: "workflow/rules/own_telescope.smk"
 include: "workflow/rules/models.smk"
+include: "workflow/rules/bundle.smk"
+include: "workflow/rules/own_stars.smk"
 include: "workflow/rules/evaluation.smk"
 include: "workflow/rules/figures.smk"
 include: "workflow/rules/calibration.smk"
@@ -27,7 +31,10 @@ include: "workflow/rules/stability.smk"
 include: "workflow/rules/propagation.smk"
 include: "workflow/rules/timing.smk"
 include: "workflow/rules/knee.smk"
+include: "workflow/rules/sweep.smk"
+include: "workflow/rules/prediction.smk"
 include: "workflow/rules/record.smk"
+include: "workflow/rules/scaling.smk"
 
 
 rule all:

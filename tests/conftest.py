@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 import pytest
 
+from prediction_stars import fresh_psfs
+from psfdae import load_model
 from psfdae.configuration.compose import load
 from psfdae.optics.pupil import annular_pupil
 from psfdae.stars.alignment_model import design_states, fit_quadratic
 from psfdae.stars.alignment_scene import grid_states, traced_zernikes, zernike_tracer
 from psfdae.stars.noise import NoiseModel
+from workflow_runs import snakemake
 
 
 @pytest.fixture(scope="session")
@@ -60,3 +65,24 @@ def grid(tracer):
     """The 625 states of scene 3 and their ray-traced coefficients."""
     states = grid_states(5)
     return states, traced_zernikes(tracer, states)
+
+
+@pytest.fixture(scope="session")
+def smoke(tmp_path_factory):
+    """The whole DAG on tiny sizes, with its wall time in seconds."""
+    folder = tmp_path_factory.mktemp("smoke")
+    start = time.monotonic()
+    snakemake(folder)
+    return folder, time.monotonic() - start
+
+
+@pytest.fixture(scope="session")
+def shipped():
+    """The model that comes with the package."""
+    return load_model()
+
+
+@pytest.fixture(scope="session")
+def field_psfs(tmp_path_factory):
+    """384 noise-free stars of the shipped model's scene, 16 × 16, flux 1."""
+    return fresh_psfs(tmp_path_factory.mktemp("field"), 384)

@@ -9,6 +9,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
+from psfdae.cli import main
 from psfdae.configuration.compose import load
 from psfdae.files import ProductError
 from psfdae.stages import docs, record
@@ -91,27 +92,36 @@ def test_incomplete_run_leaves_the_record_alone(results, tmp_path):
     assert list(out.iterdir()) == []
 
 
-PAGES = ("alignment", "benchmark", "bounds", "fidelity", "results", "stability")
+PAGES = sorted(path.stem for path in (TEMPLATES / "docs").glob("*.md.j2"))
 
 
-@pytest.mark.parametrize("page", ["README.md", *(f"docs/{page}.md" for page in PAGES)])
-def test_pages_are_what_the_run_of_record_says(page):
-    assert docs.render(REFERENCE, TEMPLATES)[page] == (ROOT / page).read_text(encoding="utf-8")
+@pytest.fixture(scope="module")
+def rendered():
+    return docs.render(REFERENCE, TEMPLATES, main)
 
 
-def test_changing_a_table_changes_the_page(tmp_path):
+@pytest.mark.parametrize("page", ["README.md", *(f"docs/{page}" for page in PAGES)])
+def test_pages_are_what_the_run_of_record_says(page, rendered):
+    assert rendered[page] == (ROOT / page).read_text(encoding="utf-8")
+
+
+def test_every_page_of_docs_has_a_template():
+    assert {path.name for path in (ROOT / "docs").glob("*.md")} == set(PAGES)
+
+
+def test_changing_a_table_changes_the_page(tmp_path, rendered):
     changed = tmp_path / "reference"
     shutil.copytree(REFERENCE, changed)
     path = changed / "tables/psf_metrics.csv"
     table = pd.read_csv(path)
     table.loc[table.metric == "mse", "value"] *= 2
     table.to_csv(path, index=False)
-    before, after = docs.render(REFERENCE, TEMPLATES), docs.render(changed, TEMPLATES)
-    assert before["docs/results.md"] != after["docs/results.md"]
+    after = docs.render(changed, TEMPLATES, main)
+    assert rendered["docs/results.md"] != after["docs/results.md"]
 
 
 def test_pages_are_written(tmp_path):
-    pages = docs.run(REFERENCE, TEMPLATES, tmp_path)
+    pages = docs.run(REFERENCE, TEMPLATES, tmp_path, main)
     assert tmp_path / "README.md" in pages
     assert all(page.read_text().startswith("# ") for page in pages)
 

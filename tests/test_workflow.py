@@ -4,63 +4,14 @@ from __future__ import annotations
 
 import os
 import re
-import shutil
 import subprocess
-import sys
-import time
-from pathlib import Path
 
 import pandas as pd
-import psutil
 import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
-PATH = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+from workflow_runs import PATH, command, planned, snakemake
 
 pytestmark = pytest.mark.workflow
-
-
-def command(folder, *arguments, overrides="", preset="smoke"):
-    return [
-        "snakemake",
-        *("--snakefile", str(ROOT / "Snakefile"), "--directory", str(folder)),
-        *("--workflow-profile", str(ROOT / "workflow/profiles/default"), "--cores", "2"),
-        *arguments,
-        *("--config", f"preset={preset}", "results=results", f"set={overrides}"),
-    ]
-
-
-def snakemake(folder, *arguments, check=True, **options):
-    result = subprocess.run(
-        command(folder, *arguments, **options),
-        env={**os.environ, "PATH": PATH},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    if check:
-        assert result.returncode == 0, result.stdout + result.stderr
-    return result.stdout + result.stderr
-
-
-def planned(folder, *targets, **options):
-    """Jobs of a dry run: number by rule, without the target itself."""
-    out = snakemake(folder, "--dry-run", *targets, **options)
-    table = re.search(r"^job +count\n-+ +-+\n(.*?)\n\n", out, re.M | re.S)
-    if table is None:
-        assert "Nothing to be done" in out, out
-        return {}
-    jobs = dict(line.split() for line in table[1].splitlines())
-    return {rule: int(n) for rule, n in jobs.items() if rule not in ("total", "all", *targets)}
-
-
-@pytest.fixture(scope="session")
-def smoke(tmp_path_factory):
-    """The whole DAG on tiny sizes, with its wall time in seconds."""
-    folder = tmp_path_factory.mktemp("smoke")
-    start = time.monotonic()
-    snakemake(folder)
-    return folder, time.monotonic() - start
 
 
 def test_smoke_builds_everything_in_time(smoke):
@@ -160,64 +111,6 @@ def test_unknown_command_line_key_is_refused(tmp_path):
     )
     assert result.returncode != 0
     assert "presett" in result.stdout + result.stderr
-
-
-def test_killed_training_resumes_and_repeats_nothing(smoke, tmp_path):
-    source, _ = smoke
-    shutil.copytree(source, tmp_path, dirs_exist_ok=True)
-    slow = "train.epochs=120 train.checkpoint_seconds=0 train.batch=8"
-    target = "results/dae/dataset3/random-realisation/dae.safetensors"
-    checkpoint = tmp_path / "results/checkpoints/dataset3-random-realisation.pt"
-    stars = tmp_path / "results/data/seidel/seidel_10pct.h5"
-    written = stars.stat().st_mtime_ns
-    run = subprocess.Popen(
-        command(tmp_path, target, overrides=slow),
-        env={**os.environ, "PATH": PATH},
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
-    deadline = time.monotonic() + 60
-    while not checkpoint.exists():
-        assert time.monotonic() < deadline, "the training left no checkpoint"
-        time.sleep(0.05)
-    for child in psutil.Process(run.pid).children(recursive=True):
-        if "train" in child.cmdline() and "--checkpoint" in child.cmdline():
-            child.kill()
-    assert run.wait(60) != 0
-    assert checkpoint.exists()
-    assert not (tmp_path / target).exists()
-    snakemake(tmp_path, target, overrides=slow)
-    log = (tmp_path / "results/logs/dae/dataset3/random-realisation.log").read_text()
-    assert "resuming after epoch" in log
-    assert "epoch 120/120" in log
-    assert stars.stat().st_mtime_ns == written
-    assert not checkpoint.exists()
-
-
-def test_killed_snakemake_needs_no_manual_step(smoke, tmp_path):
-    """After SIGKILL its jobs run on and its lock stays; the wrapper of make deals with both."""
-    source, _ = smoke
-    shutil.copytree(source / "results/data", tmp_path / "results/data")
-    target = "results/dae/dataset3/random-realisation/dae.safetensors"
-    options = {"overrides": "train.epochs=80 train.checkpoint_seconds=0 train.batch=8"}
-    locked = ["sh", str(ROOT / "workflow/locked.sh"), *command(tmp_path, target, **options)]
-    environment = {**os.environ, "PATH": PATH}
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    run = subprocess.Popen(locked, cwd=tmp_path, env=environment, **quiet)
-    deadline = time.monotonic() + 60
-    while not list((tmp_path / "results").glob("checkpoints/*.pt")):
-        assert time.monotonic() < deadline, "the training left no checkpoint"
-        time.sleep(0.05)
-    orphans = psutil.Process(run.pid).children(recursive=True)
-    run.kill()
-    run.wait()
-    assert any(child.is_running() for child in orphans)
-    again = subprocess.run(
-        locked, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
-    )
-    assert again.returncode == 0, again.stdout + again.stderr
-    assert "waiting for it to end" in again.stderr
-    assert (tmp_path / target).exists()
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ import hashlib
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -34,6 +34,9 @@ class Source(Protocol):
 
     @property
     def name(self) -> str: ...
+
+    @property
+    def source(self) -> str: ...
 
     def files(self) -> dict[str, Path]: ...
 
@@ -79,7 +82,11 @@ class Entry:
 
 @dataclass(frozen=True)
 class Record:
-    """What a finished run says about itself."""
+    """What a finished run says about itself.
+
+    `status` is MLflow's, FINISHED or FAILED; `parent` the source of the run that this
+    one is a part of, which must be imported before it; `tags` are tags of its own.
+    """
 
     entry: Source
     experiment: str
@@ -89,6 +96,9 @@ class Record:
     points: list[Point]
     start_ms: int
     end_ms: int
+    status: str = "FINISHED"
+    parent: str = ""
+    tags: Mapping[str, str] = field(default_factory=dict)
 
 
 def discover(results: Path, datasets: Mapping[str, Path]) -> list[Entry]:

@@ -59,15 +59,20 @@ def _tree(module: str) -> ast.Module:
 
 
 @cache
-def _imports(module: str) -> tuple[str, ...]:
+def imports(module: str) -> tuple[str, ...]:
+    """Modules of the package that a module imports, inside functions too; dotted names."""
     names: list[str] = []
     for node in ast.walk(_tree(module)):
         if isinstance(node, ast.Import):
             names += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
             names += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
-    ours = (n for n in names if n.startswith(PACKAGE + ".") and not n.startswith(NOT_SCIENCE))
-    return tuple(n for n in ours if _path(n) is not None)
+    return tuple(n for n in names if n.startswith(PACKAGE + ".") and _path(n) is not None)
+
+
+@cache
+def _imports(module: str) -> tuple[str, ...]:
+    return tuple(name for name in imports(module) if not name.startswith(NOT_SCIENCE))
 
 
 @cache

@@ -8,6 +8,7 @@ rule alignment_model:
     threads: 1
     resources:
         mem_mb=500,
+        runtime=10,
     params:
         config=lambda w: alignment_stage("alignment_model"),
         source=source_hash("psfdae.stages.alignment"),
@@ -29,6 +30,7 @@ rule alignment_states:
     threads: lambda w: alignment_config().optics.threads
     resources:
         mem_mb=500,
+        runtime=10,
     params:
         config=lambda w: alignment_stage("alignment_states"),
         source=source_hash("psfdae.stages.alignment"),
@@ -51,6 +53,7 @@ rule alignment_train_states:
     threads: lambda w: alignment_config().optics.threads
     resources:
         mem_mb=1000,
+        runtime=10,
     params:
         config=lambda w: alignment_stage("alignment_states"),
         source=source_hash("psfdae.stages.alignment"),
@@ -75,6 +78,7 @@ rule alignment_telescope:
     threads: 1
     resources:
         mem_mb=500,
+        runtime=10,
     params:
         config=lambda w: alignment_stage("alignment_telescope"),
         source=source_hash("psfdae.stages.alignment"),

@@ -6,8 +6,9 @@ rule figure_alignment_stamps:
         report(
             f"{ALIGNMENT_FIGURES}/stamps.png",
             caption="../report/figure_alignment_stamps.rst",
-            category="Scene 3",
-            labels={"data": "alignment", "figure": "stamps before and after the DAE"},
+            category="Scene 3: alignment of a mirror",
+            subcategory="telescope and stamps",
+            labels={"figure": "stamps before and after the DAE"},
         ),
     log:
         f"{RESULTS}/logs/figures/alignment/stamps.log",
@@ -16,6 +17,7 @@ rule figure_alignment_stamps:
     threads: lambda w: alignment_config().evaluation.threads
     resources:
         mem_mb=1000,
+        runtime=10,
     params:
         config=lambda w: alignment_stage("alignment_estimate"),
         source=source_hash("psfdae.stages.alignment_figures"),
@@ -35,8 +37,9 @@ rule figure_alignment_predicted:
         report(
             f"{ALIGNMENT_FIGURES}/predicted.png",
             caption="../report/figure_alignment_predicted.rst",
-            category="Scene 3",
-            labels={"data": "alignment", "figure": "estimates against the truth"},
+            category="Scene 3: alignment of a mirror",
+            subcategory="estimates",
+            labels={"figure": "estimates against the truth"},
         ),
     log:
         f"{RESULTS}/logs/figures/alignment/predicted.log",
@@ -45,6 +48,7 @@ rule figure_alignment_predicted:
     threads: 1
     resources:
         mem_mb=500,
+        runtime=10,
     params:
         source=source_hash("psfdae.stages.alignment_figures"),
         fits=lambda w, input: [f"--fit={path}" for path in input.fits],
@@ -64,8 +68,9 @@ rule figure_alignment_errors:
         report(
             f"{ALIGNMENT_FIGURES}/errors.png",
             caption="../report/figure_alignment_errors.rst",
-            category="Scene 3",
-            labels={"data": "alignment", "figure": "errors against misalignment"},
+            category="Scene 3: alignment of a mirror",
+            subcategory="estimates",
+            labels={"figure": "errors against misalignment"},
         ),
     log:
         f"{RESULTS}/logs/figures/alignment/errors.log",
@@ -74,6 +79,7 @@ rule figure_alignment_errors:
     threads: 1
     resources:
         mem_mb=500,
+        runtime=10,
     params:
         source=source_hash("psfdae.stages.alignment_figures"),
         fits=lambda w, input: [f"--fit={path}" for path in input.fits],
@@ -89,8 +95,9 @@ rule figure_alignment_twin:
         figure=report(
             f"{ALIGNMENT_FIGURES}/twin.png",
             caption="../report/figure_alignment_twin.rst",
-            category="Scene 3",
-            labels={"data": "alignment", "figure": "twin ambiguity"},
+            category="Scene 3: alignment of a mirror",
+            subcategory="telescope and stamps",
+            labels={"figure": "twin ambiguity"},
         ),
         table=f"{RESULTS}/tables/alignment_twin.csv",
     log:
@@ -99,7 +106,8 @@ rule figure_alignment_twin:
         f"{RESULTS}/benchmarks/alignment/figure_twin.tsv"
     threads: 1
     resources:
-        mem_mb=500,
+        mem_mb=1000,
+        runtime=10,
     params:
         config=lambda w: [*alignment_stage("alignment_twin"), "++optics.threads=1"],
         source=source_hash("psfdae.stages.alignment_figures"),
@@ -117,8 +125,9 @@ rule figure_alignment_correlation:
         report(
             f"{ALIGNMENT_FIGURES}/correlation.png",
             caption="../report/figure_alignment_correlation.rst",
-            category="Scene 3",
-            labels={"data": "alignment", "figure": "correlations of errors"},
+            category="Scene 3: alignment of a mirror",
+            subcategory="estimates",
+            labels={"figure": "correlations of errors"},
         ),
     log:
         f"{RESULTS}/logs/figures/alignment/correlation.log",
@@ -127,6 +136,7 @@ rule figure_alignment_correlation:
     threads: 1
     resources:
         mem_mb=500,
+        runtime=10,
     params:
         source=source_hash("psfdae.stages.alignment_figures"),
     message:

@@ -25,6 +25,7 @@ rule alignment_dae:
     threads: lambda w: alignment_config().dae_train.threads
     resources:
         mem_mb=1500,
+        runtime=60,
     params:
         config=lambda w: alignment_stage("alignment_dae"),
         source=source_hash("psfdae.stages.alignment_train"),
@@ -56,6 +57,7 @@ rule alignment_cnn:
     threads: 1
     resources:
         mem_mb=1500,
+        runtime=60,
     params:
         config=lambda w: alignment_stage(f"alignment_{w.cnn}"),
         source=source_hash("psfdae.stages.alignment_train"),
@@ -87,6 +89,7 @@ rule alignment_estimate:
     threads: lambda w: alignment_config().evaluation.threads
     resources:
         mem_mb=1500,
+        runtime=10,
     params:
         config=lambda w: alignment_stage("alignment_estimate"),
         source=source_hash("psfdae.stages.alignment_evaluate"),
@@ -116,6 +119,7 @@ rule alignment_fit:
     threads: 1
     resources:
         mem_mb=1500,
+        runtime=20,
     params:
         # One thread of its own per job: the jobs fill the machine.
         config=lambda w: [*alignment_stage("alignment_fit"), "++optics.threads=1"],
@@ -142,6 +146,7 @@ rule alignment_bound:
     threads: 1
     resources:
         mem_mb=1000,
+        runtime=10,
     params:
         config=lambda w: [*alignment_stage("alignment_bound"), "++optics.threads=1"],
         source=source_hash("psfdae.stages.alignment_evaluate"),
@@ -174,6 +179,7 @@ rule alignment_tables:
     threads: 1
     resources:
         mem_mb=500,
+        runtime=10,
     params:
         source=source_hash("psfdae.stages.alignment_tables"),
         estimates=lambda w, input: [f"--estimates={path}" for path in input.estimates],
@@ -187,31 +193,41 @@ rule alignment_tables:
         " --correlation {output.correlation} > {log} 2>&1"
 
 
+ALIGNMENT_PAPER_TABLES = {
+    "0.002": "table of errors at λ = 0.002",
+    "0.005": "table of errors at λ = 0.005",
+    "correlation": "table of correlations",
+}
+
+
 rule alignment_paper_tables:
     input:
         errors=rules.alignment_tables.output.errors,
         correlation=rules.alignment_tables.output.correlation,
     output:
-        report(
-            expand(
-                f"{RESULTS}/tables/alignment_paper_{{table}}.csv",
-                table=["0.002", "0.005", "correlation"],
-            ),
-            caption="../report/alignment_tables.rst",
-            category="Scene 3",
-            labels={"data": "alignment", "figure": "the paper's tables beside ours"},
-        ),
+        [
+            report(
+                f"{RESULTS}/tables/alignment_paper_{table}.csv",
+                caption="../report/alignment_tables.rst",
+                category="Scene 3: alignment of a mirror",
+                subcategory="tables",
+                labels={"figure": label},
+            )
+            for table, label in ALIGNMENT_PAPER_TABLES.items()
+        ],
         expand(
             f"{RESULTS}/tables/alignment_paper_{{table}}.md",
-            table=["0.002", "0.005", "correlation"],
+            table=ALIGNMENT_PAPER_TABLES,
         ),
     log:
         f"{RESULTS}/logs/alignment/paper_tables.log",
     benchmark:
         f"{RESULTS}/benchmarks/alignment/paper_tables.tsv"
+    localrule: True
     threads: 1
     resources:
         mem_mb=500,
+        runtime=10,
     params:
         source=source_hash("psfdae.stages.alignment_tables"),
         folder=lambda w: f"{RESULTS}/tables",
@@ -234,9 +250,11 @@ rule alignment_time:
         f"{RESULTS}/logs/alignment/time.log",
     benchmark:
         f"{RESULTS}/benchmarks/alignment/time.tsv"
+    localrule: True
     threads: 1
     resources:
         mem_mb=500,
+        runtime=10,
     params:
         source=source_hash("psfdae.stages.alignment_tables"),
         times=lambda w, input: [

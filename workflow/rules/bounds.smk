@@ -1,4 +1,5 @@
 BOUNDS = f"{RESULTS}/bounds"
+HEADLINE_DATASET = "dataset3"
 
 
 rule bank:
@@ -11,6 +12,7 @@ rule bank:
     threads: lambda w: compose((f"stars={w.stars}", *OVERRIDES))["bounds"]["threads"]
     resources:
         mem_mb=1500,
+        runtime=30,
     params:
         config=lambda w: stage_overrides("bank", f"stars={w.stars}"),
         source=source_hash("psfdae.stages.bank", "psfdae.stars.seidel_scene"),
@@ -36,6 +38,7 @@ rule dataset_bounds:
     threads: lambda w: dataset_config(w.dataset).bounds.threads
     resources:
         mem_mb=1500,
+        runtime=20,
     params:
         config=lambda w: stage_overrides("bounds", f"dataset={w.dataset}"),
         source=source_hash("psfdae.stages.bounds"),
@@ -58,9 +61,11 @@ rule psf_bounds:
         f"{RESULTS}/logs/bounds/psf_bounds.log",
     benchmark:
         f"{RESULTS}/benchmarks_on_request/bounds/psf_bounds.tsv"
+    localrule: True
     threads: 1
     resources:
         mem_mb=500,
+        runtime=10,
     params:
         source=source_hash("psfdae.stages.bounds"),
     message:
@@ -78,9 +83,11 @@ rule psf_bounds_growth:
         f"{RESULTS}/logs/bounds/psf_bounds_growth.log",
     benchmark:
         f"{RESULTS}/benchmarks_on_request/bounds/psf_bounds_growth.tsv"
+    localrule: True
     threads: 1
     resources:
         mem_mb=500,
+        runtime=10,
     params:
         source=source_hash("psfdae.stages.bounds"),
     message:
@@ -105,6 +112,7 @@ rule psf_efficiency:
     threads: 1
     resources:
         mem_mb=1000,
+        runtime=10,
     params:
         bounds=lambda w, input: [f"--bounds={path}" for path in input.bounds],
         best=lambda w, input: [f"--bounds-per-star={path}" for path in input.best],
@@ -124,8 +132,9 @@ rule figure_bounds:
         report(
             f"{RESULTS}/figures/bounds/{{dataset}}_errors.png",
             caption="../report/figure_bounds.rst",
-            category="Best possible",
-            labels={"data": "{dataset}", "figure": "errors above the bounds"},
+            category="Bounds: the best possible",
+            subcategory="{dataset}",
+            labels={"figure": "errors above the bounds"},
         ),
     log:
         f"{RESULTS}/logs/figures/bounds/{{dataset}}_errors.log",
@@ -134,6 +143,7 @@ rule figure_bounds:
     threads: 1
     resources:
         mem_mb=500,
+        runtime=10,
     params:
         source=source_hash("psfdae.stages.bound_figures"),
     message:
@@ -150,8 +160,9 @@ rule figure_efficiency:
         report(
             f"{RESULTS}/figures/bounds/{{dataset}}_efficiency.png",
             caption="../report/figure_efficiency.rst",
-            category="Best possible",
-            labels={"data": "{dataset}", "figure": "efficiency"},
+            category="Bounds: the best possible",
+            subcategory="{dataset}",
+            labels={"figure": "efficiency"},
         ),
     log:
         f"{RESULTS}/logs/figures/bounds/{{dataset}}_efficiency.log",
@@ -160,6 +171,7 @@ rule figure_efficiency:
     threads: 1
     resources:
         mem_mb=500,
+        runtime=10,
     params:
         source=source_hash("psfdae.stages.bound_figures"),
     message:
@@ -176,8 +188,9 @@ rule figure_bank_growth:
         report(
             f"{RESULTS}/figures/bounds/{{dataset}}_growth.png",
             caption="../report/figure_bank_growth.rst",
-            category="Best possible",
-            labels={"data": "{dataset}", "figure": "growth of the bank"},
+            category="Bounds: the best possible",
+            subcategory="{dataset}",
+            labels={"figure": "growth of the bank"},
         ),
     log:
         f"{RESULTS}/logs/figures/bounds/{{dataset}}_growth.log",
@@ -186,6 +199,7 @@ rule figure_bank_growth:
     threads: 1
     resources:
         mem_mb=500,
+        runtime=10,
     params:
         source=source_hash("psfdae.stages.bound_figures"),
     message:
@@ -195,8 +209,49 @@ rule figure_bank_growth:
         " --out {output} > {log} 2>&1"
 
 
+rule figure_headline:
+    input:
+        stars=lambda w: stars_of(HEADLINE_DATASET),
+        pca_som=f"{RESULTS}/pca_som/{HEADLINE_DATASET}/random.h5",
+        dae=f"{RESULTS}/dae/{HEADLINE_DATASET}/random-realisation/dae.safetensors",
+        dae_config=f"{RESULTS}/dae/{HEADLINE_DATASET}/random-realisation/config.yaml",
+        bounds=rules.psf_bounds.output,
+        efficiency=rules.psf_efficiency.output,
+    output:
+        report(
+            f"{RESULTS}/figures/headline.png",
+            caption="../report/figure_headline.rst",
+            category="Bounds: the best possible",
+            subcategory=HEADLINE_DATASET,
+            labels={"figure": "in one look"},
+        ),
+    log:
+        f"{RESULTS}/logs/figures/headline.log",
+    benchmark:
+        f"{RESULTS}/benchmarks_on_request/bounds/figure_headline.tsv"
+    threads: lambda w: dataset_config(HEADLINE_DATASET).evaluation.threads
+    resources:
+        mem_mb=1000,
+        runtime=5,
+    params:
+        config=lambda w: stage_overrides("evaluate", f"dataset={HEADLINE_DATASET}"),
+        source=source_hash("psfdae.stages.headline"),
+        dataset=HEADLINE_DATASET,
+        dae=subpath(input.dae, parent=True),
+        level=lambda w: shown_levels(HEADLINE_DATASET)[-1],
+    message:
+        "Drawing the figure of the README"
+    shell:
+        "psfdae figure headline --dataset {params.dataset} --stars {input.stars}"
+        " --pca-som {input.pca_som} --dae {params.dae} --level {params.level}"
+        " --bounds {input.bounds} --efficiency {input.efficiency} --out {output}"
+        " {params.config:q} > {log} 2>&1"
+
+
 rule bounds:
     input:
+        # The tables of the bounds have the datasets of the default target.
+        rules.figure_headline.output if HEADLINE_DATASET in default_datasets() else [],
         rules.psf_bounds.output,
         rules.psf_bounds_growth.output,
         rules.psf_efficiency.output,

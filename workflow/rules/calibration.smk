@@ -8,6 +8,7 @@ rule scan:
     threads: lambda w: dataset_config(w.dataset).optics.threads
     resources:
         mem_mb=1000,
+        runtime=30,
     params:
         config=lambda w: stage_overrides("scan", f"dataset={w.dataset}"),
         source=lambda w: source_hash(
@@ -39,7 +40,8 @@ rule calibrate:
         f"{RESULTS}/benchmarks/calibrate/all.tsv"
     threads: lambda w: dataset_config(TABULATED[0]).evaluation.threads
     resources:
-        mem_mb=1500,
+        mem_mb=2000,
+        runtime=10,
     params:
         config=lambda w: stage_overrides("calibrate", f"dataset={TABULATED[0]}"),
         source=source_hash("psfdae.stages.calibrate"),

@@ -21,7 +21,16 @@ def options(group):
     return sorted(path.stem for path in config_dir().glob(f"{group}/[!_]*.yaml"))
 
 
-ALL_DATASETS = options("dataset")
+# Stars of an image are not simulated: own_stars.smk.
+OWN_STARS = "from_stars"
+ALL_DATASETS = [name for name in options("dataset") if name != OWN_STARS]
+# Data of telescopes that bring their own aberrations; they bear the dataset's name.
+OWN_TELESCOPES = f"{RESULTS}/data/telescope"
+SCENE_HEADINGS = {
+    "scene1": "Scene 1: field-dependent aberrations",
+    "scene2": "Scene 2: static turbulence",
+    "own_telescope": "Own telescopes",
+}
 # The datasets that the paper tabulates; calibration compares with their rows.
 TABULATED = ["dataset3", "dataset5", "dataset8"]
 
@@ -50,6 +59,17 @@ def stage_overrides(stage, choice):
     tree = compose((choice, *OVERRIDES))
     base = [choice] if "wavefront" in STAGE_KEYS[stage] else []
     return base + as_overrides(stage_tree(stage, tree))
+
+
+def telescope_overrides(stage, dataset):
+    """As stage_overrides, for a telescope that brings its own aberrations.
+
+    Their keys differ from telescope to telescope, so that it is chosen by name, too.
+    """
+    choice = f"dataset={dataset}"
+    name = dataset_config(dataset).telescope.name
+    telescope = [f"telescope={name}"] if name in options("telescope") else []
+    return [choice, *telescope, *stage_overrides(stage, choice)[1:]]
 
 
 def default_datasets():
@@ -86,12 +106,12 @@ def paper_tables_of(dataset):
 
 
 def category_of(w):
-    """Heading of a figure in the report: the paper's scene."""
+    """Heading of a figure in the report: the scene."""
     if "scene" in w.keys():
         experiment = compose((f"scene={w.scene}", *OVERRIDES))["scene"]["experiment"]
     else:
         experiment = dataset_config(w.dataset).scene.experiment
-    return experiment.replace("scene", "Scene ")
+    return SCENE_HEADINGS.get(experiment, experiment)
 
 
 def networks_of(dataset):
@@ -108,13 +128,25 @@ def shown_levels(dataset):
     return asked or sorted({min(band), max(band)})
 
 
+def has_own_telescope(dataset):
+    return dataset_config(dataset).scene.name == "telescope"
+
+
+def field_figures_of(dataset):
+    """Figures of the scene of a dataset, or of its own telescope."""
+    settings = dataset_config(dataset)
+    if has_own_telescope(dataset):
+        return [f"{RESULTS}/figures/telescope/{settings.stars.name}.png"]
+    folder = f"{RESULTS}/figures/{settings.scene.name}"
+    return [f"{folder}/templates.png", f"{folder}/energy.png"]
+
+
 def figures_of(dataset):
     """Figures of a dataset and of its scene."""
     settings = dataset_config(dataset)
     folder = f"{RESULTS}/figures"
     return [
-        f"{folder}/{settings.scene.name}/templates.png",
-        f"{folder}/{settings.scene.name}/energy.png",
+        *field_figures_of(dataset),
         f"{folder}/{dataset}/curves.png",
         *(f"{folder}/{dataset}/errors_{metric}.png" for metric in ("mse", "ssim")),
         *(f"{folder}/{dataset}/strip_{r}.png" for r in settings.dataset.references),
@@ -123,7 +155,12 @@ def figures_of(dataset):
 
 def products_of(dataset):
     """Everything that a dataset's target builds."""
+    bundles = [
+        f"{RESULTS}/bundles/{dataset}-{split}-{reference}.psf.safetensors"
+        for split, reference in networks_of(dataset)
+    ]
     return [
+        *(bundles if has_own_telescope(dataset) else []),
         *evaluations_of(dataset),
         *paper_tables_of(dataset),
         *figures_of(dataset),

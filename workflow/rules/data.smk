@@ -8,6 +8,7 @@ rule templates:
     threads: lambda w: compose((f"scene={w.scene}", *OVERRIDES))["optics"]["threads"]
     resources:
         mem_mb=500,
+        runtime=10,
     params:
         config=lambda w: stage_overrides("templates", f"scene={w.scene}"),
         source=lambda w: source_hash(
@@ -31,6 +32,7 @@ rule stars:
     threads: lambda w: compose((f"scene={w.scene}", *OVERRIDES))["optics"]["threads"]
     resources:
         mem_mb=1000,
+        runtime=30,
     params:
         config=lambda w: stage_overrides("stars", f"stars={w.stars}"),
         source=lambda w: source_hash(

@@ -14,6 +14,7 @@ rule evaluate:
     threads: lambda w: dataset_config(w.dataset).evaluation.threads
     resources:
         mem_mb=1500,
+        runtime=10,
     params:
         config=lambda w: stage_overrides("evaluate", f"dataset={w.dataset}"),
         source=source_hash("psfdae.stages.evaluate"),
@@ -35,16 +36,19 @@ rule paper_tables:
             f"{RESULTS}/tables/{{dataset}}_{{metric}}.csv",
             caption="../report/paper_tables.rst",
             category=category_of,
-            labels={"data": "{dataset}", "figure": "table of {metric}"},
+            subcategory="{dataset}",
+            labels={"figure": "table of {metric}"},
         ),
         markdown=f"{RESULTS}/tables/{{dataset}}_{{metric}}.md",
     log:
         f"{RESULTS}/logs/tables/{{dataset}}_{{metric}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/paper_tables/{{dataset}}-{{metric}}.tsv"
+    localrule: True
     threads: 1
     resources:
         mem_mb=500,
+        runtime=10,
     params:
         source=source_hash("psfdae.stages.tables"),
     message:
@@ -63,9 +67,11 @@ rule psf_metrics:
         f"{RESULTS}/logs/tables/psf_metrics.log",
     benchmark:
         f"{RESULTS}/benchmarks/psf_metrics/all.tsv"
+    localrule: True
     threads: 1
     resources:
         mem_mb=500,
+        runtime=10,
     params:
         source=source_hash("psfdae.stages.tables"),
     message:

@@ -6,7 +6,8 @@ rule figure_templates:
             f"{RESULTS}/figures/{{scene}}/templates.png",
             caption="../report/figure_templates.rst",
             category=category_of,
-            labels={"data": "{scene}", "figure": "static PSFs"},
+            subcategory="static PSFs",
+            labels={"figure": "static PSFs"},
         ),
     log:
         f"{RESULTS}/logs/figures/{{scene}}/templates.log",
@@ -15,6 +16,7 @@ rule figure_templates:
     threads: 1
     resources:
         mem_mb=500,
+        runtime=10,
     params:
         source=source_hash("psfdae.stages.figures"),
     message:
@@ -31,7 +33,8 @@ rule figure_energy:
             f"{RESULTS}/figures/{{scene}}/energy.png",
             caption="../report/figure_energy.rst",
             category=category_of,
-            labels={"data": "{scene}", "figure": "light in the stamp"},
+            subcategory="static PSFs",
+            labels={"figure": "light in the stamp"},
         ),
     log:
         f"{RESULTS}/logs/figures/{{scene}}/energy.log",
@@ -40,6 +43,7 @@ rule figure_energy:
     threads: 1
     resources:
         mem_mb=500,
+        runtime=10,
     params:
         source=source_hash("psfdae.stages.figures"),
     message:
@@ -59,7 +63,8 @@ rule figure_strip:
             f"{RESULTS}/figures/{{dataset}}/strip_{{reference}}.png",
             caption="../report/figure_strip.rst",
             category=category_of,
-            labels={"data": "{dataset}", "figure": "restored stars, {reference}"},
+            subcategory="{dataset}",
+            labels={"figure": "restored stars, {reference}"},
         ),
     log:
         f"{RESULTS}/logs/figures/{{dataset}}/strip_{{reference}}.log",
@@ -68,6 +73,7 @@ rule figure_strip:
     threads: lambda w: dataset_config(w.dataset).evaluation.threads
     resources:
         mem_mb=1000,
+        runtime=10,
     params:
         config=lambda w: stage_overrides("evaluate", f"dataset={w.dataset}"),
         source=source_hash("psfdae.stages.figures"),
@@ -93,7 +99,8 @@ rule figure_curves:
             f"{RESULTS}/figures/{{dataset}}/curves.png",
             caption="../report/figure_curves.rst",
             category=category_of,
-            labels={"data": "{dataset}", "figure": "training"},
+            subcategory="{dataset}",
+            labels={"figure": "training"},
         ),
     log:
         f"{RESULTS}/logs/figures/{{dataset}}/curves.log",
@@ -102,6 +109,7 @@ rule figure_curves:
     threads: 1
     resources:
         mem_mb=500,
+        runtime=10,
     params:
         labels=lambda w: [
             f"--label={w.dataset}, {split}, {reference}"
@@ -122,7 +130,8 @@ rule figure_errors:
             f"{RESULTS}/figures/{{dataset}}/errors_{{metric}}.png",
             caption="../report/figure_errors.rst",
             category=category_of,
-            labels={"data": "{dataset}", "figure": "{metric} against noise"},
+            subcategory="{dataset}",
+            labels={"figure": "{metric} against noise"},
         ),
     log:
         f"{RESULTS}/logs/figures/{{dataset}}/errors_{{metric}}.log",
@@ -131,6 +140,7 @@ rule figure_errors:
     threads: 1
     resources:
         mem_mb=500,
+        runtime=10,
     params:
         source=source_hash("psfdae.stages.figures"),
     message:

@@ -13,6 +13,7 @@ rule fresh_stars:
     threads: lambda w: dataset_config(KNEE_DATASET).optics.threads
     resources:
         mem_mb=3000,
+        runtime=20,
     params:
         config=lambda w: [
             f"dataset={KNEE_DATASET}",
@@ -58,6 +59,7 @@ rule knee_train:
     threads: 1
     resources:
         mem_mb=2000,
+        runtime=60,
     params:
         config=lambda w: as_overrides(
             stage_tree("train", compose(knee_choice(w.point)))
@@ -89,6 +91,7 @@ rule knee_table:
     threads: lambda w: dataset_config(KNEE_DATASET).evaluation.threads
     resources:
         mem_mb=1500,
+        runtime=10,
     params:
         config=lambda w: stage_overrides("knee", f"dataset={KNEE_DATASET}"),
         source=source_hash("psfdae.stages.knee"),
@@ -111,8 +114,9 @@ rule figure_knee:
         report(
             f"{RESULTS}/figures/benchmark/training.png",
             caption="../report/figure_knee.rst",
-            category="Fast and accurate",
-            labels={"data": KNEE_DATASET, "figure": "training error against time"},
+            category="Benchmark: time against error",
+            subcategory="training",
+            labels={"figure": "training error against time"},
         ),
     log:
         f"{RESULTS}/logs/figures/benchmark/training.log",
@@ -121,6 +125,7 @@ rule figure_knee:
     threads: 1
     resources:
         mem_mb=500,
+        runtime=10,
     params:
         source=source_hash("psfdae.stages.knee"),
     message:

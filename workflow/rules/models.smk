@@ -10,6 +10,7 @@ rule baseline:
     threads: lambda w: dataset_config(w.dataset).baseline.threads
     resources:
         mem_mb=1000,
+        runtime=20,
     params:
         config=lambda w: stage_overrides("baseline", f"dataset={w.dataset}"),
         source=source_hash("psfdae.stages.baseline"),
@@ -37,6 +38,7 @@ rule train:
     threads: lambda w: dataset_config(w.dataset).train.threads
     resources:
         mem_mb=1500,
+        runtime=60,
     params:
         config=lambda w: stage_overrides("train", f"dataset={w.dataset}"),
         source=source_hash("psfdae.stages.train"),

@@ -20,6 +20,7 @@ rule propagation:
     threads: timed_threads
     resources:
         mem_mb=3000,
+        runtime=30,
     params:
         config=lambda w: stage_overrides(
             "propagation", f"dataset={strictest_dataset(w.scene)}"
@@ -46,6 +47,7 @@ rule import_times:
     threads: timed_threads
     resources:
         mem_mb=1000,
+        runtime=10,
     params:
         config=lambda w: stage_overrides("propagation", f"dataset={ALL_DATASETS[0]}"),
         source=source_hash("psfdae.stages.propagation", "psfdae.stages.stars"),
@@ -74,9 +76,11 @@ rule propagation_tables:
         f"{RESULTS}/logs/propagation/tables.log",
     benchmark:
         f"{RESULTS}/benchmarks_on_request/benchmark/propagation_tables.tsv"
+    localrule: True
     threads: 1
     resources:
         mem_mb=500,
+        runtime=10,
     params:
         source=source_hash("psfdae.stages.propagation"),
         folder=subpath(output.propagation, parent=True),
@@ -96,8 +100,9 @@ rule figure_propagation:
         report(
             f"{RESULTS}/figures/benchmark/propagation_{{scene}}.png",
             caption="../report/figure_propagation.rst",
-            category="Fast and accurate",
-            labels={"data": "{scene}", "figure": "propagation error against time"},
+            category="Benchmark: time against error",
+            subcategory="propagation",
+            labels={"figure": "error against time, {scene}"},
         ),
     log:
         f"{RESULTS}/logs/figures/benchmark/propagation_{{scene}}.log",
@@ -106,6 +111,7 @@ rule figure_propagation:
     threads: 1
     resources:
         mem_mb=500,
+        runtime=10,
     params:
         source=source_hash("psfdae.stages.propagation"),
     message:
@@ -122,8 +128,9 @@ rule figure_skipping:
         report(
             f"{RESULTS}/figures/benchmark/skipping.png",
             caption="../report/figure_skipping.rst",
-            category="Fast and accurate",
-            labels={"data": "all scenes", "figure": "what is not computed"},
+            category="Benchmark: time against error",
+            subcategory="propagation",
+            labels={"figure": "what is not computed"},
         ),
     log:
         f"{RESULTS}/logs/figures/benchmark/skipping.log",
@@ -132,6 +139,7 @@ rule figure_skipping:
     threads: 1
     resources:
         mem_mb=500,
+        runtime=10,
     params:
         source=source_hash("psfdae.stages.propagation"),
     message:

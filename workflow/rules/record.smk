@@ -13,6 +13,7 @@ rule runtime:
     threads: 1
     resources:
         mem_mb=500,
+        runtime=10,
     params:
         results=lambda w: RESULTS,
         source=source_hash("psfdae.stages.record"),

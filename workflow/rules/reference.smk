@@ -18,6 +18,7 @@ rule reference:
     threads: 1
     resources:
         mem_mb=500,
+        runtime=10,
     params:
         results=lambda w: RESULTS,
         folder="results/reference",
@@ -29,6 +30,10 @@ rule reference:
                 "tables/benchmark_training.csv",
                 "tables/benchmark_stopping.csv",
                 "figures/benchmark/training.png",
+                "tables/scaling_stages.csv",
+                "tables/scaling_dag.csv",
+                "tables/scaling_plan.csv",
+                "tables/scaling_limits.csv",
             )
         ],
     message:

@@ -16,6 +16,7 @@ rule stability_table:
     threads: lambda w: dataset_config(STABILITY_DATASET).stability.threads
     resources:
         mem_mb=3000,
+        runtime=20,
     params:
         config=lambda w: stage_overrides("stability", f"dataset={STABILITY_DATASET}"),
         source=source_hash(
@@ -39,7 +40,7 @@ rule figure_stability:
             f"{RESULTS}/figures/stability/graded.png",
             caption="../report/stability.rst",
             category="Stability",
-            labels={"data": "both scenes", "figure": "error against stress"},
+            labels={"figure": "error against stress"},
         ),
     log:
         f"{RESULTS}/logs/figures/stability/graded.log",
@@ -48,6 +49,7 @@ rule figure_stability:
     threads: 1
     resources:
         mem_mb=500,
+        runtime=10,
     params:
         source=source_hash("psfdae.stages.stability_report"),
     message:
@@ -69,6 +71,7 @@ rule stability:
     threads: 1
     resources:
         mem_mb=500,
+        runtime=10,
     params:
         source=source_hash("psfdae.stability.rows"),
     message:

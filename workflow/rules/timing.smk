@@ -20,6 +20,7 @@ rule benchmark_baseline:
     threads: workflow.cores
     resources:
         mem_mb=1500,
+        runtime=20,
     params:
         config=stage_overrides("timing", f"dataset={TIMED_DATASET}"),
         source=source_hash("psfdae.stages.timing", "psfdae.stages.timing_jobs"),
@@ -40,6 +41,7 @@ rule benchmark_inference:
     threads: workflow.cores
     resources:
         mem_mb=3000,
+        runtime=30,
     params:
         config=stage_overrides("timing", f"dataset={TIMED_DATASET}"),
         source=source_hash("psfdae.stages.timing"),
@@ -59,6 +61,7 @@ rule benchmark_scaling:
     threads: workflow.cores
     resources:
         mem_mb=2000,
+        runtime=30,
         disk_mb=1000,
     params:
         config=stage_overrides("timing", f"dataset={TIMED_DATASET}"),
@@ -80,11 +83,9 @@ rule figure_timing:
         report(
             f"{RESULTS}/figures/benchmark/{{timing}}.png",
             caption="../report/figure_timing.rst",
-            category="Fast and accurate",
-            labels=lambda w: {
-                "data": TIMED_DATASET,
-                "figure": TIMING_LABELS[w.timing],
-            },
+            category="Benchmark: time against error",
+            subcategory="{timing}",
+            labels=lambda w: {"figure": TIMING_LABELS[w.timing]},
         ),
     log:
         f"{RESULTS}/logs/figures/benchmark/{{timing}}.log",
@@ -95,6 +96,7 @@ rule figure_timing:
     threads: 1
     resources:
         mem_mb=500,
+        runtime=10,
     params:
         source=source_hash(
             "psfdae.evaluation.throughput_figures", "psfdae.stages.figures"

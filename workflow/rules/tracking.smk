@@ -14,6 +14,7 @@ rule track:
     threads: 1
     resources:
         mem_mb=500,
+        runtime=10,
     params:
         results=lambda w: RESULTS,
         preset=PRESET,
@@ -47,6 +48,7 @@ rule track_alignment:
     threads: 1
     resources:
         mem_mb=500,
+        runtime=10,
     params:
         results=lambda w: RESULTS,
         preset=PRESET,

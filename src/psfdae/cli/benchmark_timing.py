@@ -1,4 +1,4 @@
-"""Commands that time baseline, inference and the growth of costs, and the ONNX export."""
+"""Commands that time baseline, inference and the growth of costs."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from pathlib import Path
 import click
 
 from psfdae.cli.base import (
-    FolderArgument,
     input_option,
     main,
     out_option,
@@ -59,14 +58,3 @@ def figure_benchmark(kind: str, table: Path, out: Path) -> None:
     from psfdae.stages import timing as stage
 
     stage.figure(kind, table, out)
-
-
-@main.command()
-@input_option("dae", "Folder of a trained network.", FolderArgument)
-@click.option("--stamp-px", type=click.IntRange(min=1), required=True, help="Side of its stamps.")
-@out_option("ONNX file.")
-def export_onnx(dae: Path, stamp_px: int, out: Path) -> None:
-    """Export a trained network to ONNX and check it."""
-    from psfdae.stages import timing as stage
-
-    stage.export(dae, stamp_px, out)

@@ -76,6 +76,37 @@ def figure_strip(
     stage.strip(checked, dataset, stars, pca_som, dae, reference, levels, out)
 
 
+@figure.command("headline")
+@click.option("--dataset", required=True)
+@input_option("stars", "Product of the stage stars.")
+@input_option("pca-som", "Product of the stage baseline, split random.")
+@input_option("dae", "Folder of a network trained on the split random.", FolderArgument)
+@click.option(
+    "--level", type=click.FloatRange(min=0, min_open=True), required=True, help="Noise level λ."
+)
+@input_option("bounds", "CSV of the stage bounds.")
+@input_option("efficiency", "CSV of the stage efficiency.")
+@out_option("PNG.")
+@overrides
+def figure_headline(
+    dataset: str,
+    stars: Path,
+    pca_som: Path,
+    dae: Path,
+    level: float,
+    bounds: Path,
+    efficiency: Path,
+    out: Path,
+    overrides: tuple[str, ...],
+) -> None:
+    """Draw restored stars beside the errors and their bounds."""
+    from psfdae.configuration.compose import load_stage
+    from psfdae.stages import headline as stage
+
+    checked = load_stage("evaluate", overrides)
+    stage.run(checked, dataset, stars, pca_som, dae, level, bounds, efficiency, out)
+
+
 @figure.command("curves")
 @click.option("--label", "labels", multiple=True, required=True, help="One per history, in order.")
 @out_option("PNG.")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TextIO
 
 import click
 
@@ -78,6 +79,7 @@ def calibrate(
     help="Dataset and its product of the stage stars.",
 )
 @click.option("--alignment", is_flag=True, help="The networks of scene 3.")
+@click.option("--sweep", "sweeps", multiple=True, help="The points of a sweep.")
 @out_option("CSV with the MLflow id of every run and what was done.")
 def track(
     results: Path,
@@ -85,14 +87,17 @@ def track(
     database: Path,
     stars: tuple[tuple[str, Path], ...],
     alignment: bool,
+    sweeps: tuple[str, ...],
     out: Path,
 ) -> None:
     """Import finished runs into MLflow; MLFLOW_TRACKING_URI names a server instead."""
     from psfdae.alignment_runs import discover_alignment
     from psfdae.runs import discover
     from psfdae.stages import track as stage
+    from psfdae.sweep_runs import discover_sweep
 
     entries = [*discover(results, dict(stars)), *(discover_alignment(results) if alignment else [])]
+    entries += [entry for sweep in sweeps for entry in discover_sweep(results, sweep)]
     stage.run(entries, preset, database, database.parent / "mlartifacts", out)
 
 
@@ -130,8 +135,33 @@ def docs(root: Path) -> None:
     """Render README and docs from the run of record."""
     from psfdae.stages import docs as stage
 
-    for page in stage.run(root / "results/reference", root / "docs/templates", root):
+    for page in stage.run(root / "results/reference", root / "docs/templates", root, main):
         click.echo(page)
+
+
+@main.group()
+def draw() -> None:
+    """Draw the architecture for docs as SVG."""
+
+
+@draw.command("rules")
+@click.option("--rules", type=FolderArgument, default=Path("workflow/rules"), show_default=True)
+@out_option("SVG.")
+@click.argument("rulegraph", type=click.File(encoding="utf-8"), default="-")
+def draw_rules(rules: Path, out: Path, rulegraph: TextIO) -> None:
+    """Draw the rules; RULEGRAPH (default: standard input) is from snakemake --rulegraph."""
+    from psfdae.stages import docs as stage
+
+    stage.draw_rules(rulegraph.read(), rules, out)
+
+
+@draw.command("modules")
+@out_option("SVG.")
+def draw_modules(out: Path) -> None:
+    """Draw the package's modules and what they import."""
+    from psfdae.stages import docs as stage
+
+    stage.draw_modules(out)
 
 
 @main.command()

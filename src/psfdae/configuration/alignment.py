@@ -6,116 +6,22 @@ groups of the same name mean the same in both.
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field, model_validator
 
+from psfdae.configuration.prescription import Prescription
 from psfdae.configuration.schema import (
     Count,
     Dae,
     Evaluation,
     Group,
-    Name,
     Noise,
     Positive,
     Telescope,
     Train,
 )
-
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-
-
-def _not_zero(value: float) -> float:
-    if value == 0:
-        raise ValueError("must not be 0")
-    return value
-
-
-Radius = Annotated[Finite, AfterValidator(_not_zero)]
-
-
-class Mirror(Group):
-    """A conic mirror."""
-
-    radius_m: Radius = Field(description="Radius of curvature, > 0: centre above the vertex")
-    conic: Finite = Field(description="Conic constant")
-    vertex_m: Finite = Field(description="z of the vertex")
-
-
-class Secondary(Mirror):
-    """The mirror that is misaligned."""
-
-    clear_radius_m: Positive = Field(description="Rays beyond this radius are vignetted")
-
-
-class Lens(Group):
-    """A lens with two spherical surfaces; light meets the front first."""
-
-    front_radius_m: Radius = Field(description="Radius of curvature, > 0: centre above vertex")
-    back_radius_m: Radius = Field(description="As front_radius_m")
-    front_vertex_m: Finite = Field(description="z of the front vertex")
-    back_vertex_m: Finite = Field(description="z of the back vertex, below the front")
-    clear_radius_m: Positive = Field(description="Rays beyond this radius are vignetted")
-
-    @model_validator(mode="after")
-    def _thick(self) -> Lens:
-        thickness = self.front_vertex_m - self.back_vertex_m
-        if not thickness > 0:
-            raise ValueError(
-                f"thickness = {thickness:.6g} m (front_vertex_m − back_vertex_m): "
-                "must be greater than 0"
-            )
-        return self
-
-
-class Glass(Group):
-    """Sellmeier's equation, n² − 1 = Σ b λ² / (λ² − c)."""
-
-    sellmeier_b: Annotated[list[Finite], Field(min_length=3, max_length=3)]
-    sellmeier_c_um2: Annotated[list[Finite], Field(min_length=3, max_length=3)] = Field(
-        description="In square micrometres"
-    )
-
-
-class Prescription(Group):
-    """A two-mirror telescope with a lens corrector; z up, light along −z."""
-
-    name: Name
-    entrance_pupil_m: Finite = Field(description="z of the plane that holds the pupil")
-    launch_distance_m: Positive = Field(description="Start of the rays above that plane")
-    reference_sphere_m: Positive = Field(description="Radius of the wavefront's reference")
-    primary: Mirror
-    secondary: Secondary
-    lenses: Annotated[dict[Name, Lens], Field(min_length=1)]
-    glass: Glass
-    best_focus_m: Finite = Field(description="z of the detector in focus")
-
-    @property
-    def ordered_lenses(self) -> list[tuple[str, Lens]]:
-        """Name and lens in the order in which light meets them."""
-        return sorted(self.lenses.items(), key=lambda item: -item[1].front_vertex_m)
-
-    @model_validator(mode="after")
-    def _in_order(self) -> Prescription:
-        along = [("secondary", self.secondary.vertex_m)]
-        for name, lens in self.ordered_lenses:
-            along += [(f"front of {name}", lens.front_vertex_m)]
-            along += [(f"back of {name}", lens.back_vertex_m)]
-        along += [("best focus", self.best_focus_m)]
-        for (above, z_above), (below, z_below) in pairwise(along):
-            if not z_above > z_below:
-                raise ValueError(
-                    f"distance from {above} to {below} = {z_above - z_below:.6g} m: "
-                    "must be greater than 0"
-                )
-        if not self.secondary.vertex_m > self.primary.vertex_m:
-            raise ValueError(
-                f"distance from primary to secondary = "
-                f"{self.secondary.vertex_m - self.primary.vertex_m:.6g} m: must be greater than 0"
-            )
-        return self
 
 
 class AlignmentOptics(Group):
@@ -127,7 +33,7 @@ class AlignmentOptics(Group):
     nodes: Annotated[int, Field(ge=1, le=32)] | None = Field(
         description="Gauss-Legendre nodes per pixel and axis; null: whole-period Fourier transform"
     )
-    precision: Literal["complex64", "complex128"]
+    precision: Literal["complex64", "complex128"] = Field(description="Of the propagation")
     batch: Count = Field(description="Wavefronts per batch")
     threads: Count = Field(description="Batches at once")
 
@@ -212,7 +118,7 @@ class Cnn(Group):
 class CnnTrain(Group):
     """Optimisation of one CNN."""
 
-    epochs: Count
+    epochs: Count = Field(description="Passes over the training states")
     batch: Annotated[int, Field(ge=2)] = Field(description="States per step")
     lr: Annotated[float, Field(gt=0, le=1)] = Field(
         description="Adam's learning rate (its maximum if one-cycle)"
@@ -220,7 +126,7 @@ class CnnTrain(Group):
     weigh_noise: bool = Field(
         description="Weigh a state's error by 1/λ², so that every noise level counts alike"
     )
-    schedule: Literal["steps", "onecycle"]
+    schedule: Literal["steps", "onecycle"] = Field(description="Course of the learning rate")
     decay: Annotated[float, Field(gt=0, le=1)] = Field(
         description="Factor of the learning rate at each step of the schedule"
     )
@@ -250,7 +156,7 @@ class Fit(Group):
 class AlignmentConfig(Group):
     """The whole configuration of scene 3."""
 
-    seed: Annotated[int, Field(ge=0, lt=2**63)]
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = Field(description="Of every random draw")
     telescope: Telescope
     prescription: Prescription
     alignment: Alignment
@@ -278,5 +184,7 @@ ALIGNMENT_STAGE_KEYS: dict[str, tuple[str, ...]] = {
     "alignment_fit": ("seed", "telescope", "alignment", "optics", "noise", "fit", "evaluation"),
     "alignment_bound": ("telescope", "alignment", "optics", "noise"),
     "alignment_twin": ("telescope", "prescription", "alignment", "optics", "noise"),
+    "sweep_original": ("seed", "noise", "cnn", "train_original", "evaluation"),
+    "sweep_noise_trained": ("seed", "noise", "cnn", "train_noise_trained", "evaluation"),
 }
 """The groups that each stage of scene 3 reads; nothing else can influence its result."""

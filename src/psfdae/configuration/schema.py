@@ -8,118 +8,48 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
-ARCSEC = np.pi / 180.0 / 3600.0
+from psfdae.configuration.base import Count, Group, Name, Positive
+from psfdae.configuration.consistency import Consistent
+from psfdae.configuration.telescope import AnyTelescope, Telescope  # noqa: F401
+from psfdae.configuration.wavefront import OfTelescope, Seidel, VonKarman
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Fraction = Annotated[float, Field(ge=0, lt=1)]
-Count = Annotated[int, Field(ge=1)]
-Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_]+$")]
 Reference = Literal["realisation", "template"]
 SplitKind = Literal["random", "held_out"]
-
-
-class Group(BaseModel):
-    """A config group: immutable, and no key beyond those declared."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class Telescope(Group):
-    """Aperture, band and detector."""
-
-    name: Name
-    diameter_m: Positive = Field(description="Outer diameter of the aperture")
-    obscuration: Fraction = Field(description="Linear central obscuration")
-    wavelength_m: Annotated[float, Field(gt=1e-8, lt=1e-3)] = Field(
-        description="Monochromatic wavelength"
-    )
-    pixel_scale_arcsec: Positive = Field(description="Width of a pixel on the sky")
-
-    @property
-    def pixel(self) -> float:
-        """Pixel width in units of λ/D."""
-        return self.pixel_scale_arcsec * ARCSEC * self.diameter_m / self.wavelength_m
 
 
 class Grid(Group):
     """A square grid of field points."""
 
     points: Count = Field(description="Field points along a side")
-    spacing_deg: Positive = Field(description="Distance of neighbouring field points")
-    edge_deg: Positive = Field(description="Field angle at which the relative field H is 1")
-
-
-class Seidel(Group):
-    """Static third-order aberrations in waves at H = 1."""
-
-    kind: Literal["seidel"]
-    spherical: Finite
-    coma: Finite
-    astigmatism: Finite
-    field_curvature: Finite
-    distortion: Finite
-
-    @property
-    def coefficients(self) -> np.ndarray:
-        """W040, W131, W222, W220, W311 in waves, shape (5,)."""
-        return np.array(
-            [
-                self.spherical,
-                self.coma,
-                self.astigmatism,
-                self.field_curvature,
-                self.distortion,
-            ]
-        )
-
-
-class VonKarman(Group):
-    """Static atmospheric turbulence in layers."""
-
-    kind: Literal["von_karman"]
-    seed: Annotated[int, Field(ge=0, lt=2**63)]
-    r0_m: Positive = Field(description="Fried parameter of all layers at the telescope's band")
-    outer_scale_m: Positive = Field(description="Outer scale L0")
-    layer_heights_m: Annotated[list[Annotated[float, Field(ge=0)]], Field(min_length=1)]
-    layer_strengths: Annotated[list[Positive], Field(min_length=1)] = Field(
-        description="Fraction of the turbulence in each layer"
+    spacing_deg: Positive = Field(
+        description="Distance of neighbouring field points; null: the outermost lie at edge_deg"
     )
-    waves: Annotated[int, Field(ge=16, multiple_of=8)] = Field(description="Plane waves per layer")
-    remove_tilt: bool = Field(description="Remove tip and tilt over the lit pupil")
-
-    @model_validator(mode="after")
-    def _layers(self) -> VonKarman:
-        if len(self.layer_heights_m) != len(self.layer_strengths):
-            raise ValueError(
-                f"layer_strengths = {self.layer_strengths}: one for each of the "
-                f"{len(self.layer_heights_m)} layer_heights_m"
-            )
-        if abs(sum(self.layer_strengths) - 1.0) > 1e-6:
-            raise ValueError(f"layer_strengths = {self.layer_strengths}: must add up to 1")
-        return self
+    edge_deg: Positive = Field(
+        description="Field angle at which the relative field H is 1; null: that of the telescope"
+    )
 
 
 class Scene(Group):
     """A family of static PSFs."""
 
-    name: Literal["seidel", "turbulence"]
+    name: Literal["seidel", "turbulence", "telescope"] = Field(
+        description="Module that makes its wavefronts"
+    )
     experiment: Name = Field(description="The paper's scene, and the MLflow experiment")
 
 
 class Stars(Group):
     """A set of noise-free stars, shared by all datasets that only differ in noise."""
 
-    name: Name
+    name: Name = Field(description="Names the file of the stars")
     count: Count = Field(description="Number of stars")
     aberration_fraction: Annotated[float, Field(ge=0, le=10)] = Field(
         description="Relative standard deviation of every aberration term"
     )
     search_px: Annotated[int, Field(ge=4, le=512)] = Field(
-        description="Search distance for the brightest pixel of a star, as in framing"
+        description="Search distance for the brightest pixel of a star; null: 48 λ/D"
     )
 
 
@@ -130,7 +60,8 @@ class Framing(Group):
         description="Side d of a stamp"
     )
     search_px: Annotated[int, Field(ge=4, le=512)] = Field(
-        description="A template's brightest pixel is searched within ± this of the chief ray"
+        description="A template's brightest pixel is searched within ± this of the chief ray; "
+        "null: 48 λ/D"
     )
     jitter_px: Annotated[int, Field(ge=0, le=8)] = Field(
         description="Centring error, uniform in ± this many whole pixels per axis"
@@ -150,10 +81,10 @@ class Optics(Group):
         Field(description="Ladder of grid sizes N; each wavefront takes the first that suffices")
     )
     nodes: Annotated[int, Field(ge=1, le=32)] = Field(
-        description="Gauss-Legendre nodes per pixel and axis"
+        description="Gauss-Legendre nodes per pixel and axis; null: as many as the pixel needs"
     )
-    precision: Literal["complex64", "complex128"]
-    backend: Literal["numpy", "torch"]
+    precision: Literal["complex64", "complex128"] = Field(description="Of the propagation")
+    backend: Literal["numpy", "torch"] = Field(description="Library of the matrix products")
     batch: Count = Field(description="Wavefronts per batch")
     threads: Count = Field(description="Threads of the linear algebra")
 
@@ -167,7 +98,7 @@ class Optics(Group):
 class Noise(Group):
     """A noise band: the levels λ that one dataset mixes."""
 
-    name: Name
+    name: Name = Field(description="For titles and messages")
     levels: Annotated[list[Positive], Field(min_length=1)] = Field(
         description="Noise levels λ of the paper"
     )
@@ -190,9 +121,13 @@ class Parts(Group):
 class Dataset(Group):
     """A dataset of the paper: stars, a noise band, splits and references."""
 
-    name: Name
-    splits: Annotated[list[SplitKind], Field(min_length=1)]
-    references: Annotated[list[Reference], Field(min_length=1)]
+    name: Name = Field(description="Names folders, tables and figures")
+    splits: Annotated[list[SplitKind], Field(min_length=1)] = Field(
+        description="Test stars of all fields, or of fields never seen in training"
+    )
+    references: Annotated[list[Reference], Field(min_length=1)] = Field(
+        description="The truth: the star's own noise-free image, or the PSF of its field"
+    )
     shown_levels: Annotated[list[Positive], Field(min_length=1)] = Field(
         description="Noise levels λ of the figure of restored stars; extremes if none is in band"
     )
@@ -227,12 +162,12 @@ class Dae(Group):
 class Train(Group):
     """Optimisation of the denoising autoencoder."""
 
-    epochs: Count
+    epochs: Count = Field(description="Passes over the training stars")
     batch: Count = Field(description="Stars per step")
     lr: Annotated[float, Field(gt=0, le=1)] = Field(
         description="Adam's learning rate (its maximum if one-cycle)"
     )
-    schedule: Literal["onecycle", "constant"]
+    schedule: Literal["onecycle", "constant"] = Field(description="Course of the learning rate")
     grad_clip: Annotated[float, Field(ge=0)] = Field(
         description="Maximum norm of the gradient; 0 switches clipping off"
     )
@@ -323,21 +258,60 @@ class Bounds(Group):
     threads: Count = Field(description="Threads of the linear algebra")
 
 
+class CalibrationStars(Group):
+    """Which stars of an image become training data, and the noise that they get."""
+
+    snr_min: Positive = Field(description="Least S/N of a star that is learnt from")
+    isolation_px: Positive = Field(description="Distance within which a neighbour is too close")
+    neighbour_ratio: Positive = Field(
+        description="Brightness of such a neighbour, in that of the star, from which it disturbs"
+    )
+    misfit_sigma: Positive = Field(
+        description="Difference from the nearest stars, in robust σ of all stars, of a misfit"
+    )
+    search_px: Annotated[int, Field(ge=1, le=16)] = Field(
+        description="The brightest pixel is searched within ± this of the catalogue's position"
+    )
+    margin_px: Annotated[int, Field(ge=0, le=64)] = Field(
+        description="Pixels around a stamp, in which the sky is measured"
+    )
+    stars_min: Annotated[int, Field(ge=10)] = Field(description="Fewest stars to learn from")
+    bins: Annotated[int, Field(ge=1, le=64)] = Field(
+        description="Parts of the field along a side; stars of a part are stacked"
+    )
+    snr_levels: Annotated[list[Positive], Field(min_length=1)] = Field(
+        description="S/N to which bright stars are degraded, ascending"
+    )
+
+    @model_validator(mode="after")
+    def _levels(self) -> CalibrationStars:
+        if sorted(set(self.snr_levels)) != self.snr_levels:
+            raise ValueError(f"snr_levels = {self.snr_levels}: must be ascending")
+        if self.snr_levels[-1] > 0.5 * self.snr_min:
+            raise ValueError(
+                f"snr_levels = {self.snr_levels}: must end at snr_min / 2 = "
+                f"{0.5 * self.snr_min:g}, or the stars' own noise counts"
+            )
+        return self
+
+
 class Workflow(Group):
     """What the default target of the workflow builds."""
 
-    datasets: Annotated[list[Name], Field(min_length=1)]
+    datasets: Annotated[list[Name], Field(min_length=1)] = Field(
+        description="Options of the group dataset"
+    )
 
 
-class Config(Group):
+class Config(Consistent):
     """The whole configuration of one dataset."""
 
-    seed: Annotated[int, Field(ge=0, lt=2**63)]
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = Field(description="Of every random draw")
     workflow: Workflow
     scene: Scene
-    telescope: Telescope
+    telescope: AnyTelescope
     grid: Grid
-    wavefront: Annotated[Seidel | VonKarman, Field(discriminator="kind")]
+    wavefront: Annotated[Seidel | VonKarman | OfTelescope, Field(discriminator="kind")]
     stars: Stars
     framing: Framing
     optics: Optics
@@ -352,6 +326,7 @@ class Config(Group):
     benchmark: Benchmark
     stability: Stability
     bounds: Bounds
+    calibration_stars: CalibrationStars
 
     @model_validator(mode="after")
     def _consistent(self) -> Config:

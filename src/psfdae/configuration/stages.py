@@ -6,6 +6,7 @@ from functools import cache
 
 from pydantic import create_model
 
+from psfdae.configuration.consistency import Consistent
 from psfdae.configuration.schema import Config, Group
 
 SIMULATION = ("seed", "scene", "telescope", "grid", "wavefront", "stars", "framing", "optics")
@@ -17,17 +18,29 @@ STAGE_KEYS: dict[str, tuple[str, ...]] = {
     "baseline": ("seed", "noise", "parts", "baseline"),
     "train": ("seed", "noise", "parts", "dae", "train"),
     "evaluate": ("seed", "noise", "parts", "evaluation"),
+    "bundle": ("seed", "noise", "parts", "evaluation"),
+    "from_stars": (
+        *("seed", "calibration_stars", "framing", "noise", "parts"),
+        *("dae", "train", "baseline", "evaluation"),
+    ),
     "scan": (*SIMULATION, "noise", "calibration"),
     "calibrate": ("seed", "noise", "evaluation"),
     "knee": ("seed", "noise", "parts", "dae", "train", "evaluation"),
     "propagation": (*SIMULATION, "noise", "benchmark"),
+    "prediction": (*SIMULATION, "noise", "benchmark"),
     "timing": (*SIMULATION, "noise", "parts", "dae", "baseline", "evaluation", "benchmark"),
+    "scaling": (
+        *SIMULATION,
+        *("noise", "parts", "dae", "train", "baseline", "evaluation", "benchmark"),
+    ),
     "stability": (
         *SIMULATION,
         *("noise", "parts", "dae", "train", "baseline", "evaluation", "stability"),
     ),
     "bank": (*SIMULATION, "bounds"),
     "bounds": (*SIMULATION, "noise", "parts", "bounds"),
+    "sweep_dae": ("seed", "noise", "parts", "dae", "train", "evaluation"),
+    "sweep_pca_som": ("seed", "noise", "parts", "baseline", "evaluation"),
 }
 """The groups that each stage reads; nothing else can influence its result."""
 
@@ -38,4 +51,5 @@ def stage_model(stage: str, keys: tuple[str, ...] = (), root: type[Group] = Conf
     fields = {
         key: (root.model_fields[key].rebuild_annotation(), ...) for key in keys or STAGE_KEYS[stage]
     }
-    return create_model(f"{stage.title()}Config", __base__=Group, **fields)  # type: ignore[call-overload]
+    base = Consistent if issubclass(root, Consistent) else Group
+    return create_model(f"{stage.title()}Config", __base__=base, **fields)  # type: ignore[call-overload]

@@ -221,7 +221,7 @@ def restoration_strip(rows: Sequence[StripRow], columns: Sequence[str], title: s
         for i, image in enumerate(row.images):
             box = ((left + i * step) / width, y / height, 0.97 * step / width, 0.97 * cell / height)
             axes = figure.add_axes(box, xticks=[], yticks=[])
-            _stamp(axes, image, scale[i])
+            draw_stamp(axes, image, scale[i])
             if number == 0:
                 axes.set_title(columns[i], fontsize=8, pad=3)
             if row.mse is not None:
@@ -243,7 +243,8 @@ def restoration_strip(rows: Sequence[StripRow], columns: Sequence[str], title: s
     return figure
 
 
-def _stamp(axes: Axes, image: np.ndarray, scale: float) -> Any:
+def draw_stamp(axes: Axes, image: np.ndarray, scale: float) -> Any:
+    """A stamp on a square-root scale that ends at `scale`."""
     shown = np.sqrt(np.clip(image / scale, 0.0, 1.0))
     return axes.imshow(
         shown, origin="lower", cmap=STAMP_MAP, vmin=0.0, vmax=1.0, interpolation="nearest"

@@ -12,8 +12,8 @@ import numpy as np
 
 from psfdae.files import ProductError, atomic_path
 
-DIGEST = "sha256"
-"""Key of the checksum in the file's metadata."""
+ABOUT = "psfdae"
+"""The one key of the metadata: safetensors would write several in random order."""
 
 
 def digest_of(arrays: Mapping[str, np.ndarray]) -> str:
@@ -35,12 +35,13 @@ def save_weights(path: Path, state: Mapping[str, Any], config: Mapping[str, Any]
     state : mapping of name to torch.Tensor
     config : mapping that JSON can hold
     """
-    from safetensors.numpy import save_file
+    from safetensors.numpy import save
 
     arrays = {name: np.array(tensor.numpy(), order="C") for name, tensor in state.items()}
-    metadata = {"config": json.dumps(config), DIGEST: digest_of(arrays)}
+    about = json.dumps({"config": config, "sha256": digest_of(arrays)})
     with atomic_path(path) as temporary:
-        save_file(arrays, temporary, metadata)
+        # Written by us, so that the file gets the usual permissions.
+        temporary.write_bytes(save(arrays, {ABOUT: about}))
 
 
 def load_weights(path: Path) -> dict[str, np.ndarray]:
@@ -55,13 +56,13 @@ def load_weights(path: Path) -> dict[str, np.ndarray]:
 
     try:
         with safe_open(path, "numpy") as file:
-            written = (file.metadata() or {}).get(DIGEST)
+            about = json.loads((file.metadata() or {}).get(ABOUT, "{}"))
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except FileNotFoundError:
         raise ProductError(f"{path}: no such file") from None
-    except (SafetensorError, OSError, ValueError, TypeError, KeyError) as error:
+    except (SafetensorError, OSError, ValueError, TypeError) as error:
         raise ProductError(f"{path}: damaged ({error}); delete it and run again") from error
     # Weights of another program have no checksum, and nothing to compare with.
-    if written not in (None, digest_of(arrays)):
+    if about.get("sha256", digest_of(arrays)) != digest_of(arrays):
         raise ProductError(f"{path}: damaged (wrong checksum); delete it and run again")
     return arrays

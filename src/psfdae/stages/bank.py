@@ -61,7 +61,7 @@ def run(config: Any, out: Path) -> None:
         ),
         "field_index": Column(star_field, "1", "field of the star"),
         "peak": Column(peak, "pixel", "brightest pixel (row, column) from the chief ray"),
-        "seidel": Column(source.seidel, "wave", "W040, W131, W222, W220, W311 at H = 1"),
+        **source.columns(),
         "pupil_samples": Column(propagation.samples, "1", "pupil samples N"),
     }
     write_product(out, "bank", columns, config.model_dump())

@@ -90,9 +90,9 @@ def strip(
     limit_threads(config.evaluation.threads)
     product = read_stars(stars_h5, reference)
     test = split_stars(product, "random", config).test
-    field = _field(product)[product["field_index"][test]]
+    field = field_of(product)[product["field_index"][test]]
     picks = spread_stars(field, STRIP_STARS)
-    rows = _strip_rows(config, product, test, picks, reference, pca_som_h5, dae_dir, levels)
+    rows = strip_rows(config, product, test, picks, reference, pca_som_h5, dae_dir, levels)
     angle, unit = in_field_unit(field)
     columns = [f"({x:+.1f}, {y:+.1f})".replace("-", "−") for x, y in angle[picks]]
     title = (
@@ -162,7 +162,7 @@ def write_png(figure: Figure, out: Path) -> None:
         figure.savefig(temporary, format="png", dpi=DPI, metadata={"Software": None})
 
 
-def _field(stars: Product) -> np.ndarray:
+def field_of(stars: Product) -> np.ndarray:
     """Field angle (x, y) of every field point in radians, shape (F, 2)."""
     from psfdae.stars.fields import square_grid
 
@@ -170,7 +170,7 @@ def _field(stars: Product) -> np.ndarray:
     return np.deg2rad(square_grid(grid["points"], grid["spacing_deg"])[1])
 
 
-def _strip_rows(
+def strip_rows(
     config: Any,
     product: Product,
     test: np.ndarray,
@@ -180,6 +180,15 @@ def _strip_rows(
     dae: Path,
     levels: Sequence[float],
 ) -> list[StripRow]:
+    """Rows of a restoration strip: the reference, then groups by noise level.
+
+    Parameters
+    ----------
+    config : stage config of `evaluate`
+    product : product "stars"
+    test, picks : test stars, and those of them that are shown
+    reference, pca_som, dae, levels : as in `strip`
+    """
     from psfdae.evaluation.figures import StripRow
     from psfdae.evaluation.metrics import mse
 

@@ -96,12 +96,11 @@ def _propagation(config: Any, star_field: np.ndarray) -> Any:
 def _realisation_columns(config: Any, propagation: Any) -> dict[str, Column | Empty]:
     count = config.stars.count
     about_peak = "brightest pixel (row, column) from the chief ray"
-    seidel = propagation.source.seidel
     return {
         "realisation": _images(config, "noise-free image, sum 1"),
         "energy": Empty((count,), np.float64, "1", "light inside the stamp"),
         "peak": Empty((count, 2), np.int64, "pixel", about_peak),
-        "seidel": Column(seidel, "wave", "W040, W131, W222, W220, W311 at H = 1"),
+        **propagation.source.columns(),
         "pupil_samples": Column(propagation.samples, "1", "pupil samples N"),
     }
 

@@ -196,25 +196,3 @@ def figure(kind: str, table: Path, out: Path) -> None:
 
     draw = getattr(throughput_figures, f"{kind}_figure")
     write_png(draw(pd.read_csv(table)), out)
-
-
-def export(dae: Path, stamp_px: int, out: Path) -> None:
-    """Export a trained network to ONNX.
-
-    Parameters
-    ----------
-    dae : folder of a trained network
-    stamp_px : side of the stamps it was trained on
-    out : path of the ONNX file
-    """
-    import yaml
-
-    from psfdae.configuration.schema import Dae
-    from psfdae.models.dae import image_scale
-    from psfdae.models.export import export_onnx
-    from psfdae.models.training import load_dae
-    from psfdae.stages.train import CONFIG, WEIGHTS
-
-    settings = Dae.model_validate(yaml.safe_load((dae / CONFIG).read_text())["dae"])
-    model = load_dae(settings, dae / WEIGHTS)
-    export_onnx(model, image_scale(settings.scale, stamp_px), stamp_px, out)

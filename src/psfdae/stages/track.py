@@ -24,6 +24,9 @@ from psfdae.source import git_commit
 SLOT = ("kind", "dataset", "split", "reference", "preset", "source")
 """Tags that name a place in the results folder; with `config_hash` they name a run."""
 
+PARENT = "mlflow.parentRunId"
+"""Tag by which MLflow shows a run as a part of another."""
+
 BATCH, PARAM_LENGTH = 100, 6000
 """MLflow takes 100 params, or 1000 metrics, at once, and 6000 characters of a param."""
 
@@ -112,6 +115,7 @@ def _import(
     client = _client(uri, database)
     experiments: dict[str, str] = {}
     known: dict[tuple[str, ...], list[Any]] = {}
+    imported: dict[str, str] = {}
     for record in records:
         name = record.experiment
         if name not in experiments:
@@ -122,9 +126,13 @@ def _import(
             for old in _runs(client, experiments[name]):
                 known.setdefault((name, *_slot(old.data.tags)), []).append(old)
         own = {**tags, **_tags(record)}
-        yield _import_one(
+        if record.parent:
+            own[PARENT] = imported[record.parent]
+        outcome = _import_one(
             client, experiments[name], record, own, known.get((name, *_slot(own)), ())
         )
+        imported[record.entry.source] = outcome[0]
+        yield outcome
 
 
 def _client(uri: str, database: Path) -> Any:
@@ -174,8 +182,10 @@ def _import_one(
     valid = [r for r in same if r.data.tags.get("content_hash") == record.content_hash]
     if valid:
         run_id, action = valid[0].info.run_id, "unchanged"
-        if valid[0].data.tags.get("superseded") != "false":
-            client.set_tag(run_id, "superseded", "false")
+        for key in ("superseded", PARENT):
+            # A parent that has new files is another run.
+            if key in tags and valid[0].data.tags.get(key) != tags[key]:
+                client.set_tag(run_id, key, tags[key])
     else:
         run_id, action = _create(client, experiment, record, tags), "created"
         if same:
@@ -207,7 +217,7 @@ def _create(client: Any, experiment: str, record: Record, tags: dict[str, str]) 
             link.symlink_to(path.resolve())
         Path(folder, "config.yaml").write_text(yaml.safe_dump(record.config), encoding="utf-8")
         client.log_artifacts(run_id, folder)
-    client.set_terminated(run_id, "FINISHED", record.end_ms)
+    client.set_terminated(run_id, record.status, record.end_ms)
     client.set_tag(run_id, "content_hash", record.content_hash)
     return run_id
 
@@ -215,6 +225,7 @@ def _create(client: Any, experiment: str, record: Record, tags: dict[str, str]) 
 def _tags(record: Record) -> dict[str, str]:
     entry = record.entry
     own = {key: getattr(entry, key) for key in SLOT if key != "preset"}
+    own |= record.tags
     return {**own, "config_hash": record.config_hash, "superseded": "false"}
 
 

@@ -32,7 +32,7 @@ bad pixels that are known should be NaN. No star influences another one.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from enum import IntFlag
 
 import numpy as np
@@ -128,6 +128,8 @@ class FluxEstimate:
     flux, error : ndarray, shape (n,), float64
         Estimate and standard error (sky noise and PSF variation; the star's own
         photons are not in it). NaN where no fit was possible.
+    noise : ndarray, shape (n,), float64
+        RMS σ of a pixel's noise, from the residuals. NaN where no fit was possible.
     flags : ndarray, shape (n,), uint8
         Sum of `Flag`s, 0 for a star without complaint.
     images : ndarray, shape (n, d, d), float64
@@ -136,6 +138,7 @@ class FluxEstimate:
 
     flux: np.ndarray
     error: np.ndarray
+    noise: np.ndarray
     flags: np.ndarray
     images: np.ndarray
 
@@ -166,18 +169,14 @@ def robust_flux(images: np.ndarray, model: FluxModel) -> FluxEstimate:
         raise ValueError(f"stamps of {flat.shape[1]} px, but the flux model has {model.mean.size}")
     count = len(flat)
     out = FluxEstimate(
-        np.full(count, np.nan),
-        np.full(count, np.nan),
+        *(np.full(count, np.nan) for _ in range(3)),
         np.zeros(count, np.uint8),
         np.zeros(flat.shape),
     )
     for start in range(0, count, CHUNK):
         part = slice(start, start + CHUNK)
-        _measure(
-            flat[part].astype(np.float64),
-            model,
-            FluxEstimate(out.flux[part], out.error[part], out.flags[part], out.images[part]),
-        )
+        chunk = (getattr(out, field.name)[part] for field in fields(out))
+        _measure(flat[part].astype(np.float64), model, FluxEstimate(*chunk))
     return replace(out, images=out.images.reshape(images.shape))
 
 
@@ -238,10 +237,11 @@ def _measure(flat: np.ndarray, model: FluxModel, out: FluxEstimate) -> None:
     unit = _unit(x)
     with np.errstate(over="ignore"):
         scaled = np.clip(x / unit[:, None], -LARGEST, LARGEST)
-    flux, error, kept, repaired = _fit(scaled, usable_pixel, model)
+    flux, error, sigma, kept, repaired = _fit(scaled, usable_pixel, model)
     fitted = possible & (kept.mean(axis=1) >= KEPT)
     out.flux[fitted] = (flux * unit)[fitted]
     out.error[fitted] = (error * unit)[fitted]
+    out.noise[fitted] = (sigma * unit)[fitted]
     out.images[fitted] = (repaired * unit[:, None])[fitted]
     usable = fitted & (flux > error)
     for flag, stars in (
@@ -266,8 +266,8 @@ def _unit(flat: np.ndarray) -> np.ndarray:
 
 def _fit(
     x: np.ndarray, finite: np.ndarray, model: FluxModel
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Flux, error, pixels kept and repaired stamps of stars in units of their median pixel."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Flux, error, σ, pixels kept and repaired stamps, in units of a star's median pixel."""
     flux = _least_absolute(x, finite, model.mean)
     first = _scatter(np.abs(x - flux[:, None] * model.mean), finite)
     sigma = np.maximum(first, NOISE_FLOOR)
@@ -282,7 +282,7 @@ def _fit(
         prior = np.maximum(flux, 0.0) ** 2 + sigma**2 / (model.mean @ model.mean)
         flux, error, score, repaired = _generalised_least_squares(x, used, prior, sigma, model)
         sigma = np.maximum(sigma * np.clip(_scatter(score, used), 0.2, 1.5), NOISE_FLOOR)
-    return flux, error, kept, repaired
+    return flux, error, sigma, kept, repaired
 
 
 def _least_absolute(x: np.ndarray, finite: np.ndarray, mean: np.ndarray) -> np.ndarray:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from psfdae.configuration.schema import Grid
+from psfdae.files import Column
 from psfdae.optics.pupil import Pupil
 from psfdae.optics.seidel import gradient_ranges, monomial_coefficients, monomial_images
 from psfdae.rng import stream
@@ -31,6 +32,10 @@ class SeidelWavefronts:
 
     def __len__(self) -> int:
         return len(self.coefficients)
+
+    def columns(self) -> dict[str, Column]:
+        """The coefficients as the product "stars" keeps them."""
+        return {"seidel": Column(self.seidel, "wave", "W040, W131, W222, W220, W311 at H = 1")}
 
     def slopes(self) -> np.ndarray:
         """Extreme slopes, shape (B, 2, 2); see `gradient_ranges`."""

@@ -1,0 +1,370 @@
+"""What training leaves for use: one file with a network and all that it takes to apply it.
+
+A bundle is a safetensors file: arrays, and a JSON text that describes them. Reading
+it executes nothing. The text holds a SHA-256 of the description and the arrays, so a
+damaged file is refused; the date alone is outside, for the same model has the same
+checksum whenever it was made.
+
+Only the leading eigenvectors of the flux model's covariance are stored. The variance
+of the others is spread evenly over the directions that they span, which reading
+completes: which basis of them it takes does not matter then.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib.resources import files
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+import psfdae
+from psfdae.files import atomic_path
+from psfdae.models.weights import digest_of
+from psfdae.stars.flux import FluxModel
+
+if TYPE_CHECKING:
+    from psfdae.models.dae import Dae
+
+FORMAT_VERSION = 1
+"""Raised whenever an older psfdae could no longer read what a newer one writes."""
+
+SUFFIX = ".psf.safetensors"
+
+SHIPPED = "wfsat"
+"""Name of the bundle that comes with the package."""
+
+FRAMING = "brightest pixel at (d/2, d/2)"
+"""Where a star lies in a stamp of side d, 0-based (row, column), before the jitter."""
+
+KIND = "psfdae bundle"
+
+Positive = Annotated[float, Field(gt=0)]
+Count = Annotated[int, Field(ge=1)]
+
+
+class BundleError(ValueError):
+    """A model bundle is missing, damaged, of a newer format, or no bundle at all."""
+
+
+class _Described(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Architecture(_Described):
+    """Shape of the network."""
+
+    kernels: Annotated[tuple[Count, ...], Field(min_length=2)]
+    widths: Annotated[tuple[Count, ...], Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _shape(self) -> Architecture:
+        if len(self.widths) != len(self.kernels) - 1:
+            raise ValueError(f"{len(self.kernels)} kernels, but {len(self.widths)} widths")
+        return self
+
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """Shape of every weight by its name in the network."""
+        named: dict[str, tuple[int, ...]] = {}
+        channels = (1, *self.widths, 1)
+        for layer, ((inner, outer), kernel) in enumerate(
+            zip(pairwise(channels), self.kernels, strict=True)
+        ):
+            named[f"layers.{layer}.weight"] = (outer, inner, kernel, kernel)
+            named[f"layers.{layer}.bias"] = (outer,)
+        return named
+
+
+class BundleInfo(_Described):
+    """What a bundle says of itself.
+
+    Noise is the RMS of the sky noise in a pixel divided by the flux of the star
+    inside its stamp, κλ in the words of the simulation. The signal to noise ratio is
+    that of a matched filter on the mean PSF, 1 / (noise · √A), with the
+    noise-equivalent area A (King 1983, PASP 95, 163).
+    """
+
+    format_version: Count = FORMAT_VERSION
+    psfdae_version: str
+    name: Annotated[str, Field(min_length=1)]
+    licence: str
+    created: Annotated[str, Field(pattern=r"^[0-9]{4}-[0-9]{2}-[0-9]{2}$")]
+    stamp_px: Annotated[int, Field(ge=8, multiple_of=2)]
+    pixel_scale_arcsec: Positive
+    pixel_lambda_d: Positive | None = Field(description="None where the optics are unknown")
+    normalisation: Literal["flux"] = Field("flux", description="stamps have the flux 1")
+    image_scale: Positive = Field(description="factor from normalised stamps to the network's")
+    framing: str = FRAMING
+    jitter_px: Annotated[int, Field(ge=0)]
+    subpixel: bool = Field(description="stars lay anywhere in their pixels")
+    noise_min: Positive
+    noise_max: Positive
+    snr_min: Positive
+    snr_max: Positive
+    noise_equivalent_px: Positive = Field(description="A = 1 / Σ(mean PSF)²")
+    components: Count = Field(description="leading eigenvectors: stored, and in the distance")
+    training_sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+    training_stars: Count
+    source: Literal["simulated", "stars"]
+    dae: Architecture
+    config: dict[str, Any] = Field(description="resolved configuration of all stages")
+    metrics: list[dict[str, float]] = Field(description="errors of the test stars by noise level")
+
+
+@dataclass(frozen=True, eq=False)
+class Bundle:
+    """A trained network, what it was trained on, and how well it does.
+
+    Attributes
+    ----------
+    info : BundleInfo
+    weights : dict of ndarray, float32
+        State of `psfdae.models.dae.Dae`.
+    flux_model : FluxModel
+        Of the noise-free training stars; eigenvalues ascending, the last
+        `info.components` are those that were measured.
+    noise_nodes : ndarray, shape (S,)
+        Noise at which the errors were measured, ascending.
+    error68 : ndarray, shape (S, d, d)
+        Half-width that holds 68.27 % of the PSF's errors, in units of the flux.
+    rms : ndarray, shape (S, d, d)
+        Root mean square of the PSF's errors, in units of the flux.
+    distance_limit : float
+        99.9 % quantile of the Mahalanobis distance of test stars (`distance`).
+    """
+
+    info: BundleInfo
+    weights: dict[str, np.ndarray]
+    flux_model: FluxModel
+    noise_nodes: np.ndarray
+    error68: np.ndarray
+    rms: np.ndarray
+    distance_limit: float
+
+    @property
+    def sha256(self) -> str:
+        """Checksum of everything but the date."""
+        return _digest(self.info.model_dump(mode="json"), _tensors(self))
+
+
+def network(bundle: Bundle) -> Dae:
+    """The network of a bundle, ready to predict."""
+    import torch
+
+    from psfdae.models.dae import Dae
+
+    model = Dae(bundle.info.dae.kernels, bundle.info.dae.widths)
+    model.load_state_dict({k: torch.from_numpy(v.copy()) for k, v in bundle.weights.items()})
+    return model.to(memory_format=torch.channels_last).eval()
+
+
+def creation_date() -> str:
+    """Today in UTC as ISO 8601; SOURCE_DATE_EPOCH (seconds) makes it reproducible.
+
+    Raises
+    ------
+    BundleError
+        If SOURCE_DATE_EPOCH is not a whole number of seconds.
+    """
+    epoch = os.environ.get("SOURCE_DATE_EPOCH")
+    try:
+        moment = datetime.now(UTC) if epoch is None else datetime.fromtimestamp(int(epoch), UTC)
+    except (ValueError, OverflowError, OSError):
+        raise BundleError(f"SOURCE_DATE_EPOCH = {epoch!r}: must be seconds since 1970") from None
+    return moment.date().isoformat()
+
+
+def write_bundle(bundle: Bundle, path: Path) -> None:
+    """Write a bundle atomically; the same bundle gives the same bytes.
+
+    Raises
+    ------
+    BundleError
+        If its arrays do not fit together.
+    """
+    from safetensors.numpy import save
+
+    tensors = _tensors(bundle)
+    _check(bundle.info, tensors, Path(path))
+    described = bundle.info.model_dump(mode="json")
+    text = {
+        "kind": KIND,
+        "format_version": bundle.info.format_version,
+        "sha256": _digest(described, tensors),
+        "info": described,
+    }
+    # A single key: safetensors writes several in an order that changes from run to run.
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(save(tensors, {"bundle": json.dumps(text, sort_keys=True)}))
+
+
+def shipped_path() -> Path:
+    """File of the bundle that comes with the package."""
+    return Path(str(files("psfdae") / "bundles" / f"{SHIPPED}{SUFFIX}"))
+
+
+def read_bundle(path: Path | None = None) -> Bundle:
+    """Read a bundle and check it.
+
+    Parameters
+    ----------
+    path : Path, optional
+        The shipped one by default.
+
+    Raises
+    ------
+    BundleError
+        If the file is missing, damaged, of a newer format, or no bundle; the message
+        names it.
+    """
+    path = shipped_path() if path is None else Path(path)
+    text, tensors = _load(path)
+    info = _described(text, tensors, path)
+    _check(info, tensors, path)
+    model = _completed(tensors)
+    return Bundle(
+        info=info,
+        weights={name: tensors[f"dae/{name}"] for name in info.dae.shapes()},
+        flux_model=model,
+        **{name: tensors[name] for name in ("noise_nodes", "error68", "rms")},
+        distance_limit=float(tensors["distance_limit"]),
+    )
+
+
+def _load(path: Path) -> tuple[Any, dict[str, np.ndarray]]:
+    """Text and arrays of a safetensors file."""
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="numpy") as file:
+            text = (file.metadata() or {}).get("bundle")
+            if text is None:
+                raise BundleError(f"{path}: a safetensors file, but not a psfdae model bundle")
+            parsed = json.loads(text)
+            _refuse_newer(parsed, path)
+            names = list(file.keys())
+            return parsed, {name: file.get_tensor(name) for name in names}
+    except FileNotFoundError:
+        raise BundleError(f"{path}: no such file") from None
+    except BundleError:
+        raise
+    except OSError as error:
+        raise BundleError(f"{path}: cannot be read ({error.strerror or error})") from None
+    except (SafetensorError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise BundleError(f"{path}: damaged, or not a model bundle ({_one_line(error)})") from None
+
+
+def _refuse_newer(text: Any, path: Path) -> None:
+    """Before anything else is looked at: a newer format may differ in all of it."""
+    if not isinstance(text, dict) or text.get("kind") != KIND:
+        raise BundleError(f"{path}: a safetensors file, but not a psfdae model bundle")
+    version = text.get("format_version")
+    if not isinstance(version, int) or version < 1:
+        raise BundleError(f"{path}: damaged (format version {version!r})")
+    if version > FORMAT_VERSION:
+        raise BundleError(
+            f"{path}: format {version}, but psfdae {psfdae.__version__} reads up to "
+            f"format {FORMAT_VERSION}; a newer psfdae would do"
+        )
+
+
+def _described(text: Mapping[str, Any], tensors: dict[str, np.ndarray], path: Path) -> BundleInfo:
+    described = text.get("info")
+    if not isinstance(described, dict) or text.get("sha256") != _digest(described, tensors):
+        raise BundleError(f"{path}: damaged (the checksum differs)")
+    try:
+        return BundleInfo.model_validate(described)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise BundleError(f"{path}: damaged ({where}: {_one_line(first['msg'])})") from None
+
+
+def _digest(described: Mapping[str, Any], tensors: Mapping[str, np.ndarray]) -> str:
+    """SHA-256 of a description without its date, and of arrays."""
+    kept = {key: value for key, value in described.items() if key != "created"}
+    text = json.dumps(kept, sort_keys=True) + digest_of(tensors)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _tensors(bundle: Bundle) -> dict[str, np.ndarray]:
+    """Arrays of the file, the covariance cut to its leading eigenvectors."""
+    model, kept = bundle.flux_model, bundle.info.components
+    rest = model.variance[: model.variance.size - kept]
+    # A model that was read has equal ones; their mean could differ in the last digit.
+    even = rest[0] if rest.size and (rest == rest[0]).all() else rest.sum() / max(rest.size, 1)
+    arrays = {
+        "flux/variance": model.variance[-kept:],
+        "flux/rest": np.array(even),
+        "noise_nodes": bundle.noise_nodes,
+        "distance_limit": np.array(bundle.distance_limit),
+    }
+    wide = {name: np.asarray(value, np.float64, order="C") for name, value in arrays.items()}
+    single = {
+        "flux/mean": model.mean,
+        "flux/low": model.low,
+        "flux/high": model.high,
+        "flux/basis": model.basis[:, -kept:],
+        "error68": bundle.error68,
+        "rms": bundle.rms,
+        **{f"dae/{name}": value for name, value in bundle.weights.items()},
+    }
+    return wide | {name: np.asarray(v, np.float32, order="C") for name, v in single.items()}
+
+
+def _check(info: BundleInfo, tensors: Mapping[str, np.ndarray], path: Path) -> None:
+    """Whether arrays have the shapes that the description asks for, and are finite."""
+    pixels, nodes = info.stamp_px**2, tensors["noise_nodes"].size if "noise_nodes" in tensors else 0
+    expected: dict[str, tuple[int, ...]] = {
+        "flux/mean": (pixels,),
+        "flux/low": (pixels,),
+        "flux/high": (pixels,),
+        "flux/variance": (info.components,),
+        "flux/rest": (),
+        "flux/basis": (pixels, info.components),
+        "noise_nodes": (nodes,),
+        "error68": (nodes, info.stamp_px, info.stamp_px),
+        "rms": (nodes, info.stamp_px, info.stamp_px),
+        "distance_limit": (),
+        **{f"dae/{name}": shape for name, shape in info.dae.shapes().items()},
+    }
+    if set(tensors) != set(expected):
+        name = min(set(tensors) ^ set(expected))
+        state = "missing" if name in expected else "unknown"
+        raise BundleError(f"{path}: array {name!r} is {state}")
+    for name, shape in expected.items():
+        if tensors[name].shape != shape:
+            raise BundleError(
+                f"{path}: array {name!r} has shape {tensors[name].shape}, not {shape}"
+            )
+        if not np.isfinite(tensors[name]).all():
+            raise BundleError(f"{path}: array {name!r} is not finite")
+    if nodes < 1 or tensors["noise_nodes"][0] <= 0 or (np.diff(tensors["noise_nodes"]) <= 0).any():
+        raise BundleError(f"{path}: noise_nodes must be positive and ascending")
+
+
+def _completed(tensors: Mapping[str, np.ndarray]) -> FluxModel:
+    """Flux model with a whole basis, eigenvalues ascending."""
+    leading = tensors["flux/basis"].astype(np.float64)
+    pixels, kept = leading.shape
+    others = np.linalg.svd(leading)[0][:, kept:]
+    rest = np.full(pixels - kept, float(tensors["flux/rest"]))
+    return FluxModel(
+        mean=tensors["flux/mean"].astype(np.float64),
+        basis=np.concatenate([others, leading], axis=1),
+        variance=np.concatenate([rest, tensors["flux/variance"]]),
+        low=tensors["flux/low"].astype(np.float64),
+        high=tensors["flux/high"].astype(np.float64),
+    )
+
+
+def _one_line(error: object) -> str:
+    return " ".join(str(error).split())

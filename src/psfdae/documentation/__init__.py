@@ -1,0 +1,1 @@
+"""Reference pages and drawings made from the code itself: keys, commands, rules, modules."""

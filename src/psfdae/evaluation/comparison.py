@@ -1,0 +1,150 @@
+"""Two trained networks side by side: settings, training curves, errors star by star."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from psfdae.evaluation.metrics import clustered_mean
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+SIGNIFICANT = 3.0
+"""A difference of so many standard errors is called one; 1 of 370 is chance."""
+
+SHARES = (0.25, 0.5, 0.75, 1.0)
+"""Parts of a training at which the validation errors are shown."""
+
+COLUMNS = [
+    *("metric", "method", "noise_level", "first", "second"),
+    *("difference", "stderr", "sigmas", "verdict"),
+]
+
+SMALLER_IS_BETTER = {"mse": True, "ssim": False}
+"""Metrics that are compared."""
+
+ABSENT = "–"
+
+
+def config_differences(
+    first: Mapping[str, str], second: Mapping[str, str]
+) -> list[tuple[str, str, str]]:
+    """Settings with their two values where these differ; keys sorted.
+
+    Parameters
+    ----------
+    first, second : flattened configs, see `psfdae.runs.flatten`
+    """
+    keys = sorted(first.keys() | second.keys())
+    pairs = [(key, first.get(key, ABSENT), second.get(key, ABSENT)) for key in keys]
+    return [pair for pair in pairs if pair[1] != pair[2]]
+
+
+def training_summary(history: pd.DataFrame) -> dict[str, float]:
+    """Length, time and validation errors of a training, by name.
+
+    Parameters
+    ----------
+    history : DataFrame
+        A row per epoch: epoch, train_mse, validation_mse (NaN where not measured), seconds.
+    """
+    valid = history.dropna(subset=["validation_mse"])
+    best = valid.loc[valid["validation_mse"].idxmin()]
+    epochs = float(history["epoch"].max())
+    summary = {
+        "epochs": epochs,
+        "seconds": float(history["seconds"].max()),
+        "best validation MSE": float(best["validation_mse"]),
+        "at epoch": float(best["epoch"]),
+    }
+    for share in SHARES:
+        reached = valid[valid["epoch"] <= share * epochs]
+        value = reached["validation_mse"].iloc[-1] if len(reached) else np.nan
+        summary[f"validation MSE after {share:.0%}"] = float(value)
+    return summary
+
+
+def same_noisy_stars(first: pd.DataFrame, second: pd.DataFrame) -> bool:
+    """Whether two evaluations saw the same noisy images.
+
+    The error of the untouched image is a fingerprint of star and noise: if it agrees
+    for every star and level, differences can be taken star by star.
+
+    Parameters
+    ----------
+    first, second : DataFrame
+        Errors per star: method, noise_level, star, field, mse, ssim …
+    """
+    one, other = (
+        table[table["method"] == "noisy"].set_index(["noise_level", "star"])["mse"].sort_index()
+        for table in (first, second)
+    )
+    return one.index.equals(other.index) and bool(np.allclose(one, other, rtol=1e-5, atol=0.0))
+
+
+def compare_errors(first: pd.DataFrame, second: pd.DataFrame) -> pd.DataFrame:
+    """Mean errors of two evaluations and how sure their difference is.
+
+    Paired star by star where both saw the same noisy images, else as independent
+    samples; standard errors are clustered by field (`clustered_mean`).
+
+    Parameters
+    ----------
+    first, second : as for `same_noisy_stars`
+
+    Returns
+    -------
+    DataFrame
+        metric, method, noise_level, first, second, difference (second − first), stderr,
+        sigmas, verdict: "better", "worse" (the second) or "same", for methods and levels
+        that both have.
+    """
+    import pandas as pd
+
+    paired = same_noisy_stars(first, second)
+    rows = []
+    keys = ["method", "noise_level"]
+    groups = {key: table for key, table in second.groupby(keys, sort=False)}
+    for (method, level), one in first.groupby(keys, sort=False):
+        other = groups.get((method, level))
+        if other is None:
+            continue
+        for metric in SMALLER_IS_BETTER:
+            values = _difference(one, other, metric, paired)
+            rows.append({"metric": metric, "method": method, "noise_level": level, **values})
+    table = pd.DataFrame(rows, columns=COLUMNS)
+    return table.sort_values(["metric", "method", "noise_level"], ignore_index=True)
+
+
+def _difference(
+    one: pd.DataFrame, other: pd.DataFrame, metric: str, paired: bool
+) -> dict[str, float | str]:
+    if paired:
+        one, other = (table.sort_values("star") for table in (one, other))
+        change = other[metric].to_numpy() - one[metric].to_numpy()
+        difference, stderr = clustered_mean(change, one["field"].to_numpy())
+    else:
+        means = [
+            clustered_mean(table[metric].to_numpy(), table["field"].to_numpy())
+            for table in (one, other)
+        ]
+        difference = means[1][0] - means[0][0]
+        stderr = float(np.hypot(means[0][1], means[1][1]))
+    sigmas = difference / stderr if stderr > 0 else 0.0 if difference == 0 else np.inf
+    return {
+        "first": float(one[metric].mean()),
+        "second": float(other[metric].mean()),
+        "difference": difference,
+        "stderr": stderr,
+        "sigmas": float(sigmas),
+        "verdict": _verdict(float(sigmas), SMALLER_IS_BETTER[metric]),
+    }
+
+
+def _verdict(sigmas: float, smaller_is_better: bool) -> str:
+    if not abs(sigmas) >= SIGNIFICANT:
+        return "same"
+    return "better" if (sigmas < 0) == smaller_is_better else "worse"

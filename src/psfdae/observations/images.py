@@ -1,0 +1,276 @@
+"""Images in FITS files: finding the right extension and reading its pixels piece by piece."""
+
+from __future__ import annotations
+
+import gzip
+import math
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from psfdae.observations.errors import ObservationError, reading, shorten
+from psfdae.observations.headers import card_value
+from psfdae.observations.tiles import check_tiles
+
+MASKS = frozenset({"DQ", "MASK", "BPM", "FLAG", "FLAGS"})
+ERRORS = frozenset({"ERR", "ERROR", "SIGMA", "STDDEV", "RMS", "VAR", "VARIANCE", "IVAR", "UNCERT"})
+EXTRAS = frozenset({"WEIGHT", "WHT", "WGT", "BKG", "BACKGROUND", "SKY", "CTX", "SAMP", "TIME"})
+NOT_SCIENCE = MASKS | ERRORS | EXTRAS
+"""Names of extensions that go with an image; they are read on demand only."""
+
+MAGIC = (b"SIMPLE  =", b"\x1f\x8b", b"BZh", b"\xfd7zXZ\x00", b"PK\x03\x04")
+"""First bytes of FITS files, plain and compressed as a whole (gzip, bzip2, xz, zip)."""
+
+MOST_COMPRESSED = 2000
+"""Pixels per byte of file that no compression reaches; a header that claims more is damaged."""
+
+
+@dataclass(frozen=True)
+class Scaling:
+    """From stored to physical values: value = bscale·stored + bzero, NaN where blank."""
+
+    bscale: float
+    bzero: float
+    blank: int | None
+
+    def apply(self, stored: np.ndarray) -> np.ndarray:
+        """Physical values of stored ones, float32 in native byte order, same shape."""
+        if self.bscale == 1.0 and self.bzero == 0.0:
+            values = stored.astype(np.float32)
+        else:
+            values = (stored.astype(np.float64) * self.bscale + self.bzero).astype(np.float32)
+        if self.blank is not None and stored.dtype.kind in "iu":
+            values[stored == self.blank] = np.nan
+        return values
+
+
+@dataclass(frozen=True)
+class ImageFile:
+    """One image of a FITS file, described but not read.
+
+    `shape` is that of the image or cube without leading axes of length 1, of which
+    `leading` were removed; `headers` are its own and the primary one; `wcs` is the
+    celestial WCS or None.
+    """
+
+    path: Path
+    index: int
+    shape: tuple[int, ...]
+    leading: int
+    scaling: Scaling
+    headers: tuple[Any, ...]
+    wcs: Any
+
+
+def find_image(path: str | Path, extension: str | int | None = None) -> ImageFile:
+    """Find an image in a FITS file and check that its data are all there.
+
+    Parameters
+    ----------
+    path : path-like
+        FITS file, also tile-compressed (.fz) or compressed as a whole (.gz, …).
+    extension : str or int, optional
+        Name (case does not matter), "NAME,version" or number (0 is the primary
+        one) of the extension. Without it the only image that is not a mask, an
+        error or the like (`NOT_SCIENCE`) is taken.
+
+    Raises
+    ------
+    ObservationError
+        If the file is no FITS file, damaged or truncated, has no such image or
+        several, or the image is neither 2- nor 3-dimensional or without pixels.
+    """
+    from astropy.io import fits
+
+    path = Path(path)
+    check_readable(path)
+    with reading(path), fits.open(path, memmap=True, **_AS_STORED) as hdus:
+        len(hdus)  # reads all headers
+        hdu = _choose(path, hdus, extension)
+        index = hdus.index(hdu)
+        shape = tuple(int(n) for n in hdu.shape)
+        header = hdu.header.copy()
+        headers = (header,) if index == 0 else (header, hdus[0].header.copy())
+        _check_complete(path, hdu)
+        wcs = _celestial(header, hdus)
+    leading = 0
+    while len(shape) > 3 and shape[0] == 1:
+        shape, leading = shape[1:], leading + 1
+    if len(shape) not in (2, 3):
+        raise ObservationError(path, f"an image of {len(shape)} dimensions, expected 2 or 3")
+    return ImageFile(path, index, shape, leading, _scaling(path, header), headers, wcs)
+
+
+_AS_STORED = {"do_not_scale_image_data": True, "uint": False, "ignore_blank": True}
+
+
+def check_readable(path: Path) -> None:
+    """Refuse what is not there, is empty, or does not begin like a FITS file."""
+    with reading(path), path.open("rb") as file:
+        start = file.read(16)
+    if not start:
+        raise ObservationError(path, "the file is empty")
+    if not start.startswith(MAGIC):
+        raise ObservationError(path, "not a FITS file")
+
+
+def _choose(path: Path, hdus: Any, extension: str | int | None) -> Any:
+    listed = shorten([_label(k, hdu) for k, hdu in enumerate(hdus)])
+    if extension is not None:
+        hdu = _named(hdus, extension)
+        if hdu is None:
+            raise ObservationError(path, f"no extension {extension!r}; the file has {listed}")
+        if not _has_pixels(hdu):
+            raise ObservationError(
+                path, f"extension {extension!r} holds no image; the file has {listed}"
+            )
+        return hdu
+    images = [hdu for hdu in hdus if _has_pixels(hdu)]
+    science = [hdu for hdu in images if hdu.name.upper() not in NOT_SCIENCE] or images
+    if not science:
+        raise ObservationError(path, f"no image; the file has {listed}")
+    if len(science) > 1:
+        raise ObservationError(path, f"several images, choose an extension of {listed}")
+    return science[0]
+
+
+def _named(hdus: Any, extension: str | int) -> Any:
+    """The extension, or None."""
+    text = str(extension).strip()
+    if text.isdecimal():
+        return hdus[int(text)] if int(text) < len(hdus) else None
+    name, _, version = text.rpartition(",") if "," in text else (text, "", "")
+    for hdu in hdus:
+        if hdu.name.upper() == name.strip().upper() and version.strip() in ("", str(hdu.ver)):
+            return hdu
+    return None
+
+
+def _has_pixels(hdu: Any) -> bool:
+    from astropy.io import fits
+
+    if not isinstance(hdu, fits.PrimaryHDU | fits.ImageHDU | fits.CompImageHDU):
+        return False
+    if isinstance(hdu, fits.GroupsHDU):
+        return False
+    return len(hdu.shape) > 0 and math.prod(hdu.shape) > 0
+
+
+def _label(index: int, hdu: Any) -> str:
+    shape = getattr(hdu, "shape", None) or ()
+    size = "×".join(str(n) for n in shape) if _has_pixels(hdu) else "no image"
+    return f"{index} {hdu.name or '(no name)'} ({size})"
+
+
+def _check_complete(path: Path, hdu: Any) -> None:
+    """Refuse data that end before the header says, or that cannot be as large as it says."""
+    from astropy.io import fits
+
+    on_disk = path.stat().st_size
+    if math.prod(hdu.shape) > MOST_COMPRESSED * on_disk:
+        raise ObservationError(path, f"damaged: {on_disk} bytes cannot hold {hdu.shape} pixels")
+    if isinstance(hdu, fits.CompImageHDU):
+        check_tiles(path, hdu)
+        return
+    place = hdu.fileinfo()
+    plain = place["file"].compression in (None, "")
+    if plain and place["datLoc"] + hdu.size > on_disk:
+        missing = place["datLoc"] + hdu.size - on_disk
+        raise ObservationError(path, f"truncated: the last {missing} bytes are missing")
+
+
+def _scaling(path: Path, header: Any) -> Scaling:
+    factors = {}
+    for key, default in (("BSCALE", 1.0), ("BZERO", 0.0)):
+        value = card_value(header, key)
+        factors[key] = default if value is None else value
+    if not all(isinstance(f, int | float) and math.isfinite(f) for f in factors.values()):
+        raise ObservationError(path, "BSCALE or BZERO is not a number")
+    blank = card_value(header, "BLANK")
+    return Scaling(
+        float(factors["BSCALE"]),
+        float(factors["BZERO"]),
+        blank if isinstance(blank, int) else None,
+    )
+
+
+def _celestial(header: Any, hdus: Any) -> Any:
+    """Celestial WCS with a stated scale, or None; a WCS that is damaged counts as missing."""
+    from astropy.wcs import WCS
+
+    if not any(card_value(header, key) is not None for key in ("CD1_1", "CD1_2", "CDELT1")):
+        return None
+    try:
+        wcs = WCS(header, fobj=hdus)
+        return wcs.celestial if wcs.has_celestial else None
+    except Exception:  # wcslib and astropy raise many kinds, all of which mean the same here
+        return None
+
+
+@contextmanager
+def open_pixels(image: ImageFile, *, whole: bool) -> Iterator[Any]:
+    """The stored values of an image as something to index, without the leading axes.
+
+    Parameters
+    ----------
+    image : ImageFile
+    whole : bool
+        True: an array, mapped into memory where the file allows, for access at
+        random; False: for slices `[start:stop]` along the first axis, of which
+        only what is asked for is read.
+
+    Raises
+    ------
+    ObservationError
+        If the file has become unreadable; also when indexing, inside `reading`.
+    """
+    from astropy.io import fits
+
+    with ExitStack() as files:
+        with reading(image.path):
+            path = files.enter_context(_unpacked(image.path))
+            hdus = files.enter_context(fits.open(path, memmap=whole, **_AS_STORED))
+            hdu = hdus[image.index]
+            if tuple(hdu.shape)[image.leading :] != image.shape:
+                raise ObservationError(image.path, "has changed since it was opened")
+            pixels = _Array(hdu.data, image) if whole else _Array(hdu.section, image)
+        yield pixels
+
+
+@contextmanager
+def _unpacked(path: Path) -> Iterator[Path]:
+    """The file, or a temporary copy without its gzip compression.
+
+    Python reads gzip files forwards only, and astropy steps back after each read:
+    every slice would decompress the file from its start.
+    """
+    with path.open("rb") as file:
+        packed = file.read(2) == b"\x1f\x8b"
+    if not packed:
+        yield path
+        return
+    with tempfile.NamedTemporaryFile(suffix=".fits") as plain:
+        with gzip.open(path) as content:
+            shutil.copyfileobj(content, plain)
+        plain.flush()
+        yield Path(plain.name)
+
+
+@dataclass(frozen=True)
+class _Array:
+    """Physical values of an array or section of stored ones."""
+
+    stored: Any
+    image: ImageFile
+
+    def __getitem__(self, key: Any) -> np.ndarray:
+        key = key if isinstance(key, tuple) else (key,)
+        with reading(self.image.path):
+            stored = np.asarray(self.stored[(0,) * self.image.leading + key])
+            return self.image.scaling.apply(stored)

@@ -1,0 +1,155 @@
+"""A map of the PSF over the field: stamps at their positions, size and shape of all stars."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from psfdae.evaluation.figure_style import WIDTH_IN, new_figure, styled
+from psfdae.prediction.flags import StarFlag
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+CELLS = 9
+"""Stamps along the longer side of the field."""
+
+WHISKERS = 2500
+"""Stars with a whisker, at most; more would be a carpet."""
+
+SPOILT = (
+    StarFlag.NO_FLUX
+    | StarFlag.FAINT
+    | StarFlag.MASKED
+    | StarFlag.SATURATED
+    | StarFlag.TRUNCATED
+    | StarFlag.OFF_CENTRE
+    | StarFlag.UNLIKE_TRAINING
+)
+"""Stars with one of these flags are not drawn."""
+
+
+@dataclass(frozen=True)
+class FieldStars:
+    """Stars of a prediction as the map needs them, shape (n,) each.
+
+    Attributes
+    ----------
+    x, y : ndarray
+        Position in the image, pixels.
+    snr, fwhm_px, ellipticity, position_angle_deg, flags : ndarray
+        As in `psfdae.prediction.Prediction`.
+    """
+
+    x: np.ndarray
+    y: np.ndarray
+    snr: np.ndarray
+    fwhm_px: np.ndarray
+    ellipticity: np.ndarray
+    position_angle_deg: np.ndarray
+    flags: np.ndarray
+
+    def drawable(self) -> np.ndarray:
+        """Indices of the stars that can be drawn, brightest first."""
+        finite = np.isfinite(self.x) & np.isfinite(self.y) & np.isfinite(self.fwhm_px)
+        good = np.flatnonzero(finite & ((self.flags & int(SPOILT)) == 0))
+        return good[np.argsort(-self.snr[good], kind="stable")]
+
+
+def cell_size(stars: FieldStars) -> float:
+    """Least distance of two stamps in pixels of the image."""
+    drawn = stars.drawable()
+    extent = max((np.ptp(axis[drawn]) for axis in (stars.x, stars.y) if drawn.size), default=0.0)
+    return float(extent) / (CELLS - 1) if extent > 0 else 1.0
+
+
+def chosen_stars(stars: FieldStars) -> np.ndarray:
+    """Bright stars far enough from each other for their stamps not to overlap, indices."""
+    left, side, chosen = stars.drawable(), cell_size(stars), []
+    while left.size:
+        chosen.append(left[0])
+        apart = np.maximum(*(np.abs(axis[left] - axis[left[0]]) for axis in (stars.x, stars.y)))
+        left = left[apart >= side]
+    return np.array(chosen, dtype=int)
+
+
+@styled
+def psf_map(psf: np.ndarray, chosen: np.ndarray, stars: FieldStars, title: str) -> Figure:
+    """Stamps at their positions, and a whisker for every star.
+
+    Parameters
+    ----------
+    psf : ndarray, shape (k, d, d)
+        PSFs of the stars `chosen`.
+    chosen : ndarray of int, shape (k,)
+        Result of `chosen_stars`.
+    stars : FieldStars
+    title : str
+    """
+    drawn = stars.drawable()
+    margin = 0.6 * cell_size(stars)
+    x, y = stars.x[drawn], stars.y[drawn]
+    box = (
+        (x.min() - margin, x.max() + margin, y.min() - margin, y.max() + margin)
+        if drawn.size
+        else (0.0, 1.0, 0.0, 1.0)
+    )
+    shape = np.clip((box[3] - box[2]) / (box[1] - box[0]), 0.3, 2.0)
+    figure = new_figure(0.46 * WIDTH_IN * shape + 1.5, layout="constrained")
+    left, right = figure.subplots(1, 2, sharex=True, sharey=True)
+    _stamps(left, psf, stars.x[chosen], stars.y[chosen], cell_size(stars))
+    shown = _whiskers(right, stars, drawn[:WHISKERS], cell_size(stars))
+    for axes, name in ((left, "PSF, each to its maximum"), (right, "ellipticity and FWHM")):
+        axes.set(xlim=box[:2], ylim=box[2:], aspect="equal", xlabel="x (px)", title=name)
+    left.set_ylabel("y (px)")
+    if shown is not None:
+        bar = figure.colorbar(shown, ax=[left, right], location="bottom", shrink=0.6, aspect=40)
+        bar.set_label("FWHM of the PSF (px)")
+    figure.suptitle(title)
+    return figure
+
+
+def _stamps(axes: Axes, psf: np.ndarray, x: np.ndarray, y: np.ndarray, cell: float) -> None:
+    half = 0.46 * cell
+    for stamp, x0, y0 in zip(psf, x, y, strict=True):
+        axes.imshow(
+            np.sqrt(np.clip(stamp / stamp.max(), 0.0, 1.0)),
+            origin="lower",
+            extent=(x0 - half, x0 + half, y0 - half, y0 + half),
+            cmap="magma",
+            vmin=0.0,
+            vmax=1.0,
+            interpolation="nearest",
+        )
+
+
+def _whiskers(axes: Axes, stars: FieldStars, drawn: np.ndarray, cell: float) -> Any:
+    """Lines along the major axes; a key tells the length of ellipticity 0.2."""
+    from matplotlib.collections import LineCollection
+
+    if not drawn.size:
+        axes.text(0.5, 0.5, "no star without complaint", ha="center", transform=axes.transAxes)
+        return None
+    per_ellipticity = 2.0 * cell
+    angle = np.deg2rad(stars.position_angle_deg[drawn])
+    half = 0.5 * per_ellipticity * stars.ellipticity[drawn]
+    step = np.stack([half * np.cos(angle), half * np.sin(angle)], axis=1)
+    middle = np.stack([stars.x[drawn], stars.y[drawn]], axis=1)
+    size = stars.fwhm_px[drawn]
+    lines = LineCollection(
+        np.stack([middle - step, middle + step], axis=1), cmap="viridis", linewidths=1.3
+    )
+    lines.set_array(size)
+    lines.set_clim(*np.percentile(size, [2, 98]))
+    axes.add_collection(lines)
+    key = 0.2 * per_ellipticity
+    corner = middle.min(axis=0) - 0.45 * cell
+    axes.plot([corner[0], corner[0] + key], [corner[1]] * 2, color="black", lw=2.0)
+    axes.annotate(
+        "0.2", (corner[0] + key, corner[1]), xytext=(3, 0), textcoords="offset points",
+        va="center", fontsize=7,
+    )  # fmt: skip
+    return lines

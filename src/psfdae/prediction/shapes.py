@@ -1,0 +1,149 @@
+"""Size and shape of PSFs from adaptive moments.
+
+The moments of a PSF under an elliptical Gaussian weight that is matched to them
+(Bernstein & Jarvis 2002, AJ 123, 583; Hirata & Seljak 2003, MNRAS 343, 459): the
+ellipse of the Gaussian that fits the PSF best. Unlike plain second moments they do
+not hang on the wings and the edge of the stamp, and unlike a contour at half the
+maximum they do not hang on a few pixels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+
+FWHM_OF_SIGMA = 2.0 * np.sqrt(2.0 * np.log(2.0))
+
+ROUNDS = 16
+"""Updates of the weight. A Gaussian needs two, the most aberrated PSF some 30 for 1e-4."""
+
+WIDER_PX2 = 0.5
+"""Variance by which the weight is wider than the PSF, px²: narrower ones fall between pixels."""
+
+LEAST_PX2 = 0.08
+"""Least variance along an axis, px²: that of the pixel itself."""
+
+
+@dataclass(frozen=True)
+class Shapes:
+    """Shapes of n PSFs, NaN where a PSF has no light.
+
+    Attributes
+    ----------
+    fwhm_px : ndarray, shape (n,)
+        2 √(2 ln 2) · |M|^¼ of the moments M, in pixels; the pixel itself is in it.
+    ellipticity : ndarray, shape (n,)
+        1 − b/a of the axes of the ellipse.
+    position_angle_deg : ndarray, shape (n,)
+        Of the major axis, from the columns' direction (+x) towards that of the
+        rows (+y), −90 … 90.
+    """
+
+    fwhm_px: np.ndarray
+    ellipticity: np.ndarray
+    position_angle_deg: np.ndarray
+
+
+def measure_shapes(psf: np.ndarray) -> Shapes:
+    """Shapes of PSFs (n, d, d) of any flux; negative pixels count as zero."""
+    xx, xy, yy = _adaptive_moments(psf)
+    with np.errstate(invalid="ignore"):
+        determinant = xx * yy - xy**2
+        spread = np.hypot(xx - yy, 2.0 * xy)
+        ratio = (xx + yy - spread) / (xx + yy + spread)
+        return Shapes(
+            fwhm_px=FWHM_OF_SIGMA * determinant**0.25,
+            ellipticity=1.0 - np.sqrt(np.maximum(ratio, 0.0)),
+            position_angle_deg=np.rad2deg(0.5 * np.arctan2(2.0 * xy, xx - yy)),
+        )
+
+
+def _adaptive_moments(psf: np.ndarray) -> np.ndarray:
+    """M_xx, M_xy, M_yy, shape (3, n), float64."""
+    count, side = len(psf), psf.shape[-1]
+    light = np.maximum(psf.reshape(count, -1), 0.0).astype(np.float32)
+    peak = light.max(axis=1, initial=0.0)
+    lit = np.isfinite(peak) & (peak > 0)
+    light /= np.where(lit, peak, 1.0)[:, None]
+    light[~lit] = 1.0
+    terms = _monomials(side)
+    x, y, moments = _centre_and_moments(light @ terms.T)
+    moments = _bounded(*moments, side)
+    weighted = np.empty_like(light)
+    for _ in range(ROUNDS):
+        weight = (moments[0] + WIDER_PX2, moments[1], moments[2] + WIDER_PX2)
+        np.matmul(_exponent(x, y, *weight), terms, out=weighted)
+        np.exp(weighted, out=weighted)
+        weighted *= light
+        x1, y1, seen = _centre_and_moments(weighted @ terms.T)
+        moments = _bounded(*_without_weight(seen, weight), side)
+        x, y = (np.clip(v, -0.5 * side, 0.5 * side) for v in _moved(x, y, x1, y1, seen, moments))
+    return np.where(lit, np.array(moments), np.nan)
+
+
+@cache
+def _monomials(side: int) -> np.ndarray:
+    """1, x, y, x², xy, y² of every pixel, from the middle of the stamp, shape (6, d²)."""
+    y, x = (axis.ravel() for axis in np.indices((side, side)) - 0.5 * (side - 1))
+    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y]).astype(np.float32)
+
+
+Matrix = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Elements xx, xy, yy of n symmetric matrices."""
+
+
+def _centre_and_moments(sums: np.ndarray) -> tuple[np.ndarray, np.ndarray, Matrix]:
+    """x, y and central second moments from the sums over `_monomials`, shape (n, 6)."""
+    total = np.maximum(sums[:, 0].astype(np.float64), 1e-30)
+    x, y, xx, xy, yy = sums[:, 1:].T / total
+    return x, y, (xx - x * x, xy - x * y, yy - y * y)
+
+
+def _without_weight(seen: Matrix, weight: Matrix) -> Matrix:
+    """Moments T + T(W − T)⁻¹T of the Gaussian that shows the moments T under the weight W.
+
+    Twice the moments seen where no Gaussian does: the PSF is flat.
+    """
+    a, b, c = (w - t for w, t in zip(weight, seen, strict=True))
+    determinant = a * c - b * b
+    gaussian = (a > 0) & (determinant > 1e-3 * weight[0] * weight[2])
+    determinant = np.where(gaussian, determinant, 1.0)
+    xx, xy, yy = seen
+    more = (
+        (xx * xx * c - 2.0 * xx * xy * b + xy * xy * a) / determinant,
+        (xx * xy * c - (xx * yy + xy * xy) * b + xy * yy * a) / determinant,
+        (xy * xy * c - 2.0 * xy * yy * b + yy * yy * a) / determinant,
+    )
+    return tuple(t + np.where(gaussian, m, t) for t, m in zip(seen, more, strict=True))
+
+
+def _moved(
+    x: np.ndarray, y: np.ndarray, x1: np.ndarray, y1: np.ndarray, seen: Matrix, moments: Matrix
+) -> tuple[np.ndarray, np.ndarray]:
+    """Centre c + M T⁻¹ (c₁ − c) of a Gaussian of moments M whose weighted centre is c₁."""
+    xx, xy, yy = seen
+    determinant = np.maximum(xx * yy - xy * xy, 1e-12)
+    u = (yy * (x1 - x) - xy * (y1 - y)) / determinant
+    v = (xx * (y1 - y) - xy * (x1 - x)) / determinant
+    return x + moments[0] * u + moments[1] * v, y + moments[1] * u + moments[2] * v
+
+
+def _bounded(xx: np.ndarray, xy: np.ndarray, yy: np.ndarray, side: int) -> Matrix:
+    """The same moments, kept where they make sense for a stamp."""
+    xx, yy = (np.clip(variance, LEAST_PX2, (0.5 * side) ** 2) for variance in (xx, yy))
+    most = 0.99 * np.sqrt(xx * yy)
+    return xx, np.clip(xy, -most, most), yy
+
+
+def _exponent(
+    x: np.ndarray, y: np.ndarray, xx: np.ndarray, xy: np.ndarray, yy: np.ndarray
+) -> np.ndarray:
+    """Coefficients of `_monomials` in the exponent of the weight, shape (n, 6)."""
+    determinant = xx * yy - xy**2
+    a, b, c = yy / determinant, -xy / determinant, xx / determinant
+    constant = a * x * x + 2.0 * b * x * y + c * y * y
+    linear_x, linear_y = -2.0 * (a * x + b * y), -2.0 * (b * x + c * y)
+    powers = np.stack([constant, linear_x, linear_y, a, 2.0 * b, c], axis=1)
+    return (-0.5 * powers).astype(np.float32)

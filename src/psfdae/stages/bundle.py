@@ -1,0 +1,223 @@
+"""Stage `bundle`: a trained network with all that it takes to apply it, in one file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import psfdae
+from psfdae.bundle import measure
+from psfdae.bundle.format import (
+    Architecture,
+    Bundle,
+    BundleError,
+    BundleInfo,
+    creation_date,
+    write_bundle,
+)
+from psfdae.configuration.compose import as_overrides
+from psfdae.evaluation.metrics import all_metrics
+from psfdae.files import Product, ProductError
+from psfdae.rng import stream
+from psfdae.stages.common import (
+    limit_threads,
+    noise_model,
+    noisy_test_images,
+    read_stars,
+    split_stars,
+)
+from psfdae.stages.train import CONFIG, WEIGHTS
+from psfdae.stars.flux import FluxModel
+
+SEEN_BY_TRAINING = ("seed", "noise", "parts")
+"""Groups in which the configuration must be that of the training."""
+
+
+def run(
+    config: Any, stars: Path, dae: Path, split: str | None, name: str, licence: str, out: Path
+) -> None:
+    """Measure a network on the test stars of its split and write the bundle.
+
+    The configuration inside the product "stars" says what kind of stamps they are:
+    `telescope` holds `pixel_scale_arcsec`, and `diameter_m` and `wavelength_m` where
+    the optics are known; `framing` holds `jitter_px` and `subpixel`; `source` is
+    "stars" for those that are not simulated.
+
+    Parameters
+    ----------
+    config : stage config (seed, noise, parts, evaluation)
+    stars : product "stars" that the network was trained on
+    dae : folder of a trained network
+    split : "random" or "held_out"; None for that of the training
+    name, licence : what the bundle says of itself
+    out : path of the bundle
+
+    Raises
+    ------
+    BundleError
+        If the network was trained with another seed, noise, parts or split.
+    ProductError
+        If the configuration of the stars lacks what a bundle must know.
+    """
+    import torch
+
+    limit_threads(config.evaluation.threads)
+    torch.set_num_threads(config.evaluation.threads)
+    trained = _trained(dae, config, split)
+    product = read_stars(stars, trained["reference"])
+    kind = _kind_of_stamps(product)
+    network = _load(dae, trained, kind["stamp_px"], config.evaluation.batch)
+    parts = split_stars(product, trained["split"], config)
+    images, references = product["realisation"], product[trained["reference"]]
+    held_out = measure.HeldOutStars(images[parts.test], references[parts.test], noise_model(config))
+    model = measure.leading(FluxModel.fit(images[parts.train]), measure.COMPONENTS)
+    errors = measure.measure_errors(
+        held_out, network.predict, model, _nodes(config), stream(config.seed, "noise", "bundle")
+    )
+    info = BundleInfo(
+        psfdae_version=psfdae.__version__,
+        name=name,
+        licence=licence,
+        created=creation_date(),
+        **kind,
+        **_reach(config, model),
+        image_scale=network.factor,
+        components=measure.COMPONENTS,
+        training_sha256=measure.checksum(images[parts.train], references[parts.train]),
+        training_stars=parts.train.size,
+        dae=Architecture(**{key: trained["dae"][key] for key in ("kernels", "widths")}),
+        config=_all_settings(product, trained, config),
+        metrics=_metrics(config, held_out, network, errors, model),
+    )
+    maps = (errors.nodes, errors.half_width(), errors.rms(), errors.distance_limit())
+    write_bundle(Bundle(info, network.weights, model, *maps), out)
+
+
+@dataclass(frozen=True)
+class _Network:
+    """A trained network as a function, its weights, and the factor of its images."""
+
+    predict: measure.Predict
+    weights: dict[str, np.ndarray]
+    factor: float
+
+
+def _trained(folder: Path, config: Any, split: str | None) -> dict[str, Any]:
+    """Configuration of a training, if it is that of the stage."""
+    import yaml
+
+    for path in (folder / CONFIG, folder / WEIGHTS):
+        if not path.is_file():
+            raise BundleError(f"{path}: no such file; psfdae train writes it")
+    trained: dict[str, Any] = yaml.safe_load((folder / CONFIG).read_text(encoding="utf-8"))
+    lacking = {*SEEN_BY_TRAINING, "dae", "split", "reference"} - set(trained or ())
+    if lacking:
+        raise BundleError(f"{folder / CONFIG}: key {min(lacking)!r} is missing")
+    asked = config.model_dump(include={*SEEN_BY_TRAINING}) | {"split": split or trained["split"]}
+    _refuse_mismatch({key: trained[key] for key in asked}, asked, folder / CONFIG)
+    return trained
+
+
+def _refuse_mismatch(trained: dict[str, Any], asked: dict[str, Any], path: Path) -> None:
+    found, wanted = ([word.strip("+") for word in as_overrides(t)] for t in (trained, asked))
+    differing = sorted({*found} - {*wanted}) or sorted({*wanted} - {*found})
+    if differing:
+        key = differing[0].split("=")[0]
+        other = next((word for word in wanted if word.startswith(f"{key}=")), f"no {key}")
+        raise BundleError(
+            f"{path}: the network was trained with {differing[0]}, "
+            f"but the bundle is asked for with {other}"
+        )
+
+
+def _load(folder: Path, trained: dict[str, Any], stamp_px: int, batch: int) -> _Network:
+    from psfdae.configuration.schema import Dae
+    from psfdae.models.dae import image_scale, predict
+    from psfdae.models.training import load_dae
+
+    settings = Dae.model_validate(trained["dae"])
+    model = load_dae(settings, folder / WEIGHTS)
+    factor = image_scale(settings.scale, stamp_px)
+    weights = {name: value.contiguous().numpy() for name, value in model.state_dict().items()}
+    return _Network(lambda noisy: predict(model, noisy, factor, batch), weights, factor)
+
+
+def _kind_of_stamps(product: Product) -> dict[str, Any]:
+    """What the configuration of the stars says of their stamps."""
+    config = product.config
+    try:
+        telescope, framing = config["telescope"], config["framing"]
+        pixel = None
+        if "diameter_m" in telescope:
+            diffraction = telescope["wavelength_m"] / telescope["diameter_m"]
+            pixel = float(np.deg2rad(telescope["pixel_scale_arcsec"] / 3600.0)) / diffraction
+        return {
+            "stamp_px": product["realisation"].shape[-1],
+            "pixel_scale_arcsec": telescope["pixel_scale_arcsec"],
+            "pixel_lambda_d": pixel,
+            "jitter_px": framing["jitter_px"],
+            "subpixel": framing.get("subpixel", False),
+            "source": config.get("source", "simulated"),
+        }
+    except KeyError as error:
+        raise ProductError(f"{product.path}: its configuration lacks {error}") from None
+
+
+def _band(config: Any) -> np.ndarray:
+    """Pixel RMS over the flux at the noise levels of a configuration."""
+    return config.noise.kappa * np.asarray(config.noise.levels)
+
+
+def _nodes(config: Any) -> np.ndarray:
+    band = _band(config)
+    return measure.noise_nodes(float(band.min()), float(band.max()))
+
+
+def _reach(config: Any, model: FluxModel) -> dict[str, float]:
+    """Noise and S/N that the training has covered."""
+    area = measure.noise_equivalent_px(model.mean)
+    least, most = float(_band(config).min()), float(_band(config).max())
+    return {
+        "noise_min": least,
+        "noise_max": most,
+        "snr_min": measure.signal_to_noise(most, area),
+        "snr_max": measure.signal_to_noise(least, area),
+        "noise_equivalent_px": area,
+    }
+
+
+def _all_settings(product: Product, trained: dict[str, Any], config: Any) -> dict[str, Any]:
+    evaluation = config.evaluation.model_dump()
+    return {"stars": product.config, "train": trained, "evaluation": evaluation}
+
+
+def _metrics(
+    config: Any,
+    held_out: measure.HeldOutStars,
+    network: _Network,
+    errors: measure.Errors,
+    model: FluxModel,
+) -> list[dict[str, float]]:
+    """Mean errors at each λ on the noisy images that the stage `evaluate` uses, too."""
+    rows = []
+    area = measure.noise_equivalent_px(model.mean)
+    for level, noise in zip(config.noise.levels, _band(config), strict=True):
+        noisy = noisy_test_images(config, held_out.images, level)
+        estimate = network.predict(noisy)
+        error = estimate - held_out.references
+        quality = all_metrics(estimate, held_out.references, config.evaluation.data_range)
+        rows.append(
+            {
+                "noise_level": level,
+                "noise": float(noise),
+                "snr": measure.signal_to_noise(float(noise), area),
+                "mse_noisy": float(np.square(noisy - held_out.references).mean()),
+                **{name: float(values.mean()) for name, values in quality.items()},
+                **measure.crossed_coverage(errors, error, float(noise)),
+                "stars": len(noisy),
+            }
+        )
+    return rows

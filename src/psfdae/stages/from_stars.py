@@ -1,0 +1,312 @@
+"""Stage `from_stars`: from an image and its star list to a model of its own, in one go."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from psfdae.bundle.format import SUFFIX
+from psfdae.bundle.measure import noise_equivalent_px, signal_to_noise
+from psfdae.configuration.compose import as_overrides
+from psfdae.configuration.schema import Noise
+from psfdae.configuration.stages import STAGE_KEYS, stage_model
+from psfdae.files import atomic_path, write_text
+from psfdae.observations import Observation, ObservationError, open_observation
+from psfdae.stages import baseline, bundle, evaluate, train
+from psfdae.stages.calibration_stars import (
+    Candidates,
+    collect,
+    sky_photons,
+    write_selection,
+    write_stars,
+)
+from psfdae.stars.from_observation import star_grid
+from psfdae.stars.splits import held_out_fields
+
+SPLIT, REFERENCE = "held_out", "realisation"
+
+SHOWN_SNR = 10.0
+"""The figure shows stars at the S/N nearest to this."""
+
+SHOWN_STARS = 6
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """A FITS file with stars and what is stated about it; see `open_observation`."""
+
+    path: Path
+    catalogue: Path | None = None
+    extension: str | int | None = None
+    origin: int | None = None
+    mask: str | int | Path | None = None
+    pixel_scale_arcsec: float | None = None
+    gain: float | None = None
+    saturate: float | None = None
+
+    def open(self, stamp_px: int, margin_px: int) -> Observation:
+        """Check the files; a cube may have larger stamps than asked for.
+
+        Raises
+        ------
+        ObservationError
+            If a file cannot be used or the pixel scale is unknown.
+        """
+        given = {key: value for key, value in vars(self).items() if key != "path"}
+        side = _side_of_cube(self.path, self.extension, stamp_px)
+        found = open_observation(
+            self.path, stamp_px=side or stamp_px, margin=0 if side else margin_px, **given
+        )
+        if found.pixel_scale_arcsec is None:
+            raise ObservationError(
+                self.path, "the pixel scale is neither in the header nor given (--pixel-scale)"
+            )
+        return found
+
+
+@dataclass(frozen=True)
+class Folder:
+    """Files that the stage leaves."""
+
+    path: Path
+    name: str
+
+    @property
+    def stars(self) -> Path:
+        return self.path / "stars.h5"
+
+    @property
+    def pca_som(self) -> Path:
+        return self.path / "pca_som.h5"
+
+    @property
+    def dae(self) -> Path:
+        return self.path / "dae"
+
+    @property
+    def bundle(self) -> Path:
+        return self.path / f"{self.name}{SUFFIX}"
+
+
+def run(
+    config: Any,
+    exposure: Exposure,
+    out: Path,
+    *,
+    name: str,
+    licence: str = "not stated",
+    say: Callable[[str], object] = lambda line: None,
+) -> None:
+    """Train a network on the bright stars of an exposure, test it, and pack it.
+
+    Parameters
+    ----------
+    config : stage config (seed, calibration_stars, framing, noise, parts, dae, train,
+        baseline, evaluation); the noise levels follow from the stars
+    exposure : Exposure
+    out : folder that receives
+
+        - `NAME.psf.safetensors`, the model bundle,
+        - `report.csv` (columns snr, noise, method, mse, mse_stderr, ssim, images, stars,
+          truth_mse) and `report.png`,
+        - `selection.csv` with every star of the catalogue and why it was not used,
+        - `stars.h5`, `pca_som.h5`, `dae/`, `evaluation.csv`, `per_star.parquet`, as the
+          stages leave them, and `overrides.txt`, with which they can be run again.
+    name, licence : what the bundle says of itself
+    say : called with a line of progress
+
+    Raises
+    ------
+    ObservationError, CalibrationStarsError, BundleError, TrainingError
+    """
+    files = Folder(out, name)
+    observation = exposure.open(config.framing.stamp_px, config.calibration_stars.margin_px)
+    found = collect(observation, config)
+    grid = star_grid(found.bright.position)
+    held_out = held_out_fields(grid)
+    say(f"{len(found.verdict)} stars: {found.count()}")
+    say(f"{int((~held_out).sum())} to learn from, {int(held_out.sum())} held out")
+    write_selection(found, held_out, out / "selection.csv")
+    described = _described(config, observation)
+    columns = write_stars(found.bright, grid, held_out, config, described, files.stars)
+    settings = _with_noise(config, found, held_out, columns, observation.gain)
+    write_text(out / "overrides.txt", _overrides(settings))
+    for line, work in _steps(settings, files, licence):
+        say(line)
+        work()
+    report(settings, files)
+
+
+def _side_of_cube(path: Path, extension: str | int | None, stamp_px: int) -> int | None:
+    """Side of the stamps of a cube that are larger than needed."""
+    from psfdae.observations.images import find_image
+
+    shape = find_image(path, extension).shape
+    larger = len(shape) == 3 and shape[1] == shape[2] > stamp_px
+    return shape[1] if larger else None
+
+
+def _described(config: Any, observation: Observation) -> dict[str, Any]:
+    """Configuration of the product: what `stages.bundle` wants to know of its stars."""
+    kept = config.model_dump(include={"seed", "calibration_stars", "framing", "parts"})
+    return {
+        **kept,
+        "source": "stars",
+        "image": observation.path.name,
+        "telescope": {"pixel_scale_arcsec": observation.pixel_scale_arcsec},
+    }
+
+
+def _with_noise(
+    config: Any,
+    found: Candidates,
+    held_out: np.ndarray,
+    columns: dict[str, np.ndarray],
+    gain: float | None,
+) -> dict[str, Any]:
+    """The configuration as a tree, its noise levels those of the S/N asked for."""
+    training = ~held_out[columns["field_index"]]
+    area = noise_equivalent_px(columns["realisation"][training].mean(axis=0, dtype=np.float64))
+    kappa = config.noise.kappa
+    levels = [1.0 / (snr * np.sqrt(area) * kappa) for snr in config.calibration_stars.snr_levels]
+    noise = Noise(
+        name=config.noise.name,
+        levels=[float(f"{level:.6g}") for level in reversed(levels)],
+        kappa=kappa,
+        background_photons=sky_photons(found.bright, gain, config.noise.background_photons),
+    )
+    return {**config.model_dump(), "noise": noise.model_dump()}
+
+
+def _part(stage: str, settings: dict[str, Any]) -> Any:
+    """Checked configuration of another stage."""
+    keys = STAGE_KEYS[stage]
+    return stage_model(stage).model_validate({key: settings[key] for key in keys})
+
+
+def _overrides(settings: dict[str, Any]) -> str:
+    tree = {key: value for key, value in settings.items() if key != "calibration_stars"}
+    return "\n".join(["dataset=from_stars", *as_overrides(tree)]) + "\n"
+
+
+def _steps(
+    settings: dict[str, Any], files: Folder, licence: str
+) -> list[tuple[str, Callable[[], None]]]:
+    stars = files.stars
+    return [
+        (
+            "fitting PCA and SOM",
+            lambda: baseline.run(_part("baseline", settings), stars, SPLIT, files.pca_som),
+        ),
+        (
+            "training the DAE",
+            lambda: train.run(
+                *(_part("train", settings), stars, SPLIT, REFERENCE),
+                *(files.dae, files.dae / "checkpoint.pt"),
+            ),
+        ),
+        (
+            "testing on the stars held out",
+            lambda: evaluate.run(
+                *(_part("evaluate", settings), files.name, stars, files.pca_som, files.dae),
+                *(SPLIT, REFERENCE, files.path / "evaluation.csv"),
+                files.path / "per_star.parquet",
+            ),
+        ),
+        (
+            "packing the model",
+            lambda: bundle.run(
+                *(_part("bundle", settings), stars, files.dae, SPLIT, files.name),
+                *(licence, files.bundle),
+            ),
+        ),
+    ]
+
+
+def report(settings: dict[str, Any], files: Folder) -> None:
+    """Table and figure of the errors on the stars held out."""
+    import pandas as pd
+
+    from psfdae.stages.common import read_stars, split_stars
+
+    config = _part("evaluate", settings)
+    product = read_stars(files.stars, REFERENCE)
+    parts = split_stars(product, SPLIT, config)
+    images = product["realisation"]
+    area = noise_equivalent_px(images[parts.train].mean(axis=0, dtype=np.float64))
+    rows = pd.read_csv(files.path / "evaluation.csv")
+    wide = rows.pivot(index=["noise_level", "method"], columns="metric", values=["value", "stderr"])
+    table = pd.DataFrame(
+        {
+            "mse": wide["value", "mse"],
+            "mse_stderr": wide["stderr", "mse"],
+            "ssim": wide["value", "ssim_peak"],
+        }
+    ).reset_index()
+    noise = config.noise.kappa * table.pop("noise_level")
+    table.insert(0, "noise", noise)
+    table.insert(0, "snr", [signal_to_noise(level, area) for level in noise])
+    table["images"] = parts.test.size
+    table["stars"] = np.unique(product["field_index"][parts.test]).size
+    table["truth_mse"] = _noise_of_truth(files.stars, parts.test, config.noise.background_photons)
+    order = {method: place for place, method in enumerate(("noisy", "pca_som", "lmmse", "dae"))}
+    table = table.sort_values(["snr", "method"], key=lambda c: c.map(order).fillna(c))
+    write_text(files.path / "report.csv", table.to_csv(index=False, float_format="%.6g"))
+    _draw(config, files, images[parts.test], product["field_index"][parts.test], area)
+
+
+def _noise_of_truth(stars: Path, test: np.ndarray, sky: float) -> float:
+    """Mean variance of the pixels of the stars held out: their own noise, in every MSE.
+
+    Sky noise σ and the star's photons F, F = √B / σ: σ² + p/F with the mean p = 1/P.
+    """
+    from psfdae.files import read_product
+
+    product = read_product(stars, "stars", ("realisation", "field_index", "noise"))
+    noise = product["noise"][product["field_index"][test]]
+    pixels = product["realisation"][0].size
+    return float((noise**2 + noise / np.sqrt(sky) / pixels).mean())
+
+
+def _draw(config: Any, files: Folder, images: np.ndarray, star: np.ndarray, area: float) -> None:
+    """Strip of stars held out, made faint, and what the methods make of them."""
+    from psfdae.evaluation.figures import StripRow, restoration_strip
+    from psfdae.evaluation.metrics import mse
+    from psfdae.files import read_product
+    from psfdae.stages.common import noisy_test_images
+
+    levels = np.asarray(config.noise.levels)
+    snr = 1.0 / (config.noise.kappa * levels * np.sqrt(area))
+    level = float(levels[np.abs(np.log(snr / SHOWN_SNR)).argmin()])
+    noisy = noisy_test_images(config, images, level)
+    product = read_product(files.stars, "stars", ("position", "snr"))
+    shown = _shown(star, product["position"])
+    truth = images[shown]
+    estimates = {
+        "noisy": noisy[shown],
+        "PCA+SOM": baseline.load(files.pca_som).predict(noisy)[shown],
+        "DAE": evaluate.dae_predictor(files.dae, config)(noisy, level)[shown],
+    }
+    rows = [StripRow("bright\nstar", truth)]
+    for label, stamps in estimates.items():
+        rows.append(StripRow(label, stamps, mse(stamps, truth), own_scale=label == "noisy"))
+    found = signal_to_noise(config.noise.kappa * level, area)
+    columns = [f"S/N {value:.0f}" for value in product["snr"][star[shown]]]
+    title = f"Bright stars that no training saw, made faint: S/N {found:.3g}"
+    figure = restoration_strip(rows, columns, title)
+    with atomic_path(files.path / "report.png") as temporary:
+        figure.savefig(temporary, format="png")
+
+
+def _shown(star: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """An image each of stars that lie evenly over the field."""
+    from psfdae.evaluation.figures import spread_stars
+
+    stars, first = np.unique(star, return_index=True)
+    if not np.isfinite(position[stars]).all():
+        return first[:SHOWN_STARS]
+    return first[spread_stars(position[stars], SHOWN_STARS)]

@@ -1,0 +1,134 @@
+"""What the stage `scaling` measures; each function runs in a process of its own.
+
+Arguments and results are what JSON carries.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from time import perf_counter, process_time
+from typing import Any
+
+import numpy as np
+
+from psfdae.benchmark.isolated import forget_peak, peak_mb
+from psfdae.configuration.compose import stage_tree, validate
+from psfdae.configuration.stages import stage_model
+from psfdae.files import Column, read_product, write_product
+
+SPLIT, REFERENCE = "random", "realisation"
+PER_STAR = ("realisation", "template", "field_index")
+
+
+def repeat_stars(stars: str, count: int, out: str) -> None:
+    """Write as many stars as asked for by repeating those of a product.
+
+    What the stages cost does not depend on what the stars look like.
+    """
+    product = read_product(stars, "stars", (*PER_STAR, "grid"))
+    rows = np.arange(count) % len(product["field_index"])
+    columns = {name: Column(product[name][rows], "1", "repeated") for name in PER_STAR}
+    columns["grid"] = Column(product["grid"], "1", "as of the product that is repeated")
+    write_product(out, "stars", columns, product.config)
+
+
+def make_templates(config: dict[str, Any], out: str) -> None:
+    """Run the stage `templates`."""
+    from psfdae.stages import templates
+
+    templates.run(_checked("templates", config), Path(out))
+
+
+def simulate(config: dict[str, Any], templates: str, out: str) -> dict[str, float]:
+    """Run the stage `stars`; costs as of `_measure`."""
+    from psfdae.stages import stars
+
+    checked = _checked("stars", config)
+    return _measure(lambda: stars.run(checked, Path(templates), Path(out)), Path(out))
+
+
+def predict(config: dict[str, Any], dae: str, stars: str, out: str) -> dict[str, float]:
+    """Read stars piece by piece, predict and write their PSFs; costs as of `_measure`."""
+    import h5py
+    import torch
+    import yaml
+
+    from psfdae.configuration.schema import Dae
+    from psfdae.files import Empty, stream_product
+    from psfdae.models.dae import image_scale, predict_stream
+    from psfdae.models.training import load_dae
+    from psfdae.stages.train import CONFIG, WEIGHTS
+
+    torch.set_num_threads(_checked("evaluate", config).evaluation.threads)
+    settings = Dae.model_validate(yaml.safe_load((Path(dae) / CONFIG).read_text())["dae"])
+
+    def run() -> None:
+        model = load_dae(settings, Path(dae) / WEIGHTS)
+        with h5py.File(stars) as file:
+            images = file["realisation"]
+            columns = {"psf": Empty(images.shape, np.float32, "1", "predicted PSF")}
+            factor = image_scale(settings.scale, images.shape[-1])
+            with stream_product(out, "psf", columns, {}) as data:
+                for part, psf in predict_stream(model, images, factor):
+                    data["psf"][part] = psf
+
+    return _measure(run, Path(out))
+
+
+def baseline(config: dict[str, Any], stars: str, out: str) -> dict[str, float]:
+    """Run the stage `baseline`; costs as of `_measure`."""
+    from psfdae.stages import baseline as stage
+
+    checked = _checked("baseline", config)
+    return _measure(lambda: stage.run(checked, Path(stars), SPLIT, Path(out)), Path(out))
+
+
+def train(config: dict[str, Any], stars: str, out: str) -> dict[str, float]:
+    """Run the stage `train`; costs as of `_measure`."""
+    from psfdae.stages import train as stage
+
+    checked, folder = _checked("train", config), Path(out)
+    checkpoint = folder.with_suffix(".pt")
+    return _measure(
+        lambda: stage.run(checked, Path(stars), SPLIT, REFERENCE, folder, checkpoint), folder
+    )
+
+
+def evaluate(
+    config: dict[str, Any], stars: str, pca_som: str, dae: str, out: str
+) -> dict[str, float]:
+    """Run the stage `evaluate`; costs as of `_measure`."""
+    from psfdae.stages import evaluate as stage
+
+    checked, folder = _checked("evaluate", config), Path(out)
+    inputs = (Path(stars), Path(pca_som), Path(dae))
+    outputs = (folder / "summary.csv", folder / "per_star.parquet")
+    return _measure(
+        lambda: stage.run(checked, "measured", *inputs, SPLIT, REFERENCE, *outputs), folder
+    )
+
+
+def _checked(stage: str, config: dict[str, Any]) -> Any:
+    return validate(stage_model(stage), stage_tree(stage, config))
+
+
+def _measure(run: Callable[[], None], out: Path) -> dict[str, float]:
+    """Time, largest memory of the process and disk of a call.
+
+    Returns
+    -------
+    dict
+        time_s, cpu_s, peak_mb (10⁶ bytes, with interpreter and libraries), disk_mb.
+    """
+    forget_peak()
+    start, start_cpu = perf_counter(), process_time()
+    run()
+    seconds, cpu = perf_counter() - start, process_time() - start_cpu
+    files = [path for path in out.rglob("*") if path.is_file()] if out.is_dir() else [out]
+    return {
+        "time_s": seconds,
+        "cpu_s": cpu,
+        "peak_mb": peak_mb() * 2**20 / 1e6,
+        "disk_mb": sum(path.stat().st_size for path in files) / 1e6,
+    }

@@ -1,0 +1,206 @@
+"""Stage `sweep point`: one training of a sweep, measured on validation and test part."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from psfdae.files import ProductError, write_text
+from psfdae.sweeps.measured import EVALUATION, VALIDATION, Task
+from psfdae.sweeps.space import changes, with_values
+
+RESULT, COST, FINISHED = "result.json", "cost.json", "finished.json"
+"""Result and cost of a point, and a copy of its result that a workflow does not know.
+
+A workflow that was killed takes what its last jobs still brought to an end for
+incomplete and deletes their results; the copy keeps these trainings from being repeated.
+"""
+
+POINT_MODULES = {
+    "dae": "psfdae.sweeps.dae_point",
+    "pca_som": "psfdae.sweeps.pca_som_point",
+    "original": "psfdae.sweeps.cnn_point",
+    "noise_trained": "psfdae.sweeps.cnn_point",
+}
+"""Module that trains and measures each model; a point's rule depends on its own only."""
+
+ADAPTIVE_MODULE = "psfdae.sweeps.adaptive"
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A trial of an adaptive sweep.
+
+    Attributes
+    ----------
+    slot : int
+        Its number.
+    search : dict
+        space, seed, startup, metric and direction of the sweep, and study, the name under
+        which the journal has its trials.
+    known : sequence of str
+        Names of the points that it learns from.
+    journal : Path
+        File of Optuna's journal storage.
+    """
+
+    slot: int
+    search: Mapping[str, Any]
+    known: Sequence[str]
+    journal: Path
+
+
+def point(
+    config: Any,
+    model: str,
+    values: Mapping[str, Any],
+    keys: Mapping[str, Any],
+    task: Task,
+    trial: Trial | None = None,
+    source: str = "",
+) -> None:
+    """Train and measure one point; leave `result.json`, `cost.json` and the model's files.
+
+    A training that cannot go on (not finite, or dead in all its starts) is a result, too:
+    status failed, with the reason. `result.json` is written last and has nothing in it that
+    differs between two runs. A point that is finished with the same code, configuration and
+    data is not trained again.
+
+    Parameters
+    ----------
+    config : stage config `sweep_<model>`
+    model : "dae", "pca_som", "original" or "noise_trained"
+    values : value of every axis; those of a trial are asked for here
+    keys : configuration keys that differ from the dataset's
+    task : Task
+    trial : Trial, of an adaptive sweep
+    source : hash of the code that the point consists of
+
+    Raises
+    ------
+    ProductError
+        If an input is missing or damaged.
+    ConfigError
+        If a trial asks for values that the configuration does not allow.
+    """
+    name = task.folder.name
+    module = import_module(POINT_MODULES[model])
+    if trial is not None:
+        adaptive, space = _open(trial)
+        known = [read_result(task.folder.parent / other / RESULT) for other in trial.known]
+        values = adaptive.ask(space, trial.search, trial.slot, known)
+        about = {"slot": trial.slot, "point": name}
+        adaptive.begin(trial.journal, space, trial.search, about, values, known)
+        asked = changes(space, values)
+        config, keys = _with(config, asked), {**keys, **asked}
+    content = [source, model, config.model_dump(), dict(values), dict(keys), task.described()]
+    fingerprint = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+    result = _finished(task.folder, fingerprint, module.FILES)
+    if result is None:
+        for stale in (*module.FILES, EVALUATION, VALIDATION, COST, RESULT, FINISHED):
+            (task.folder / stale).unlink(missing_ok=True)
+        result = {
+            "point": name,
+            "slot": trial.slot if trial else None,
+            "model": model,
+            "dataset": task.dataset,
+            "split": task.split,
+            "reference": task.reference,
+            "values": dict(values),
+            "keys": dict(keys),
+            **_outcome(module, config, task),
+            "fingerprint": fingerprint,
+        }
+        write_text(task.folder / FINISHED, _as_json(result))
+    write_text(task.folder / RESULT, _as_json(result))
+    if trial is not None:
+        adaptive.finish(trial.journal, space, trial.search, result)
+
+
+def _finished(folder: Path, fingerprint: str, files: Sequence[str]) -> dict[str, Any] | None:
+    """The result of an earlier run of the same point, if it is whole."""
+    try:
+        result = read_result(folder / FINISHED)
+    except ProductError:
+        return None
+    needed = [COST] if result["status"] == "failed" else [COST, *files]
+    if result.get("fingerprint") != fingerprint:
+        return None
+    if not all((folder / name).is_file() for name in needed):
+        return None
+    print("finished before with the same code, configuration and data; kept", flush=True)
+    return result
+
+
+def _as_json(result: Mapping[str, Any]) -> str:
+    return json.dumps(result, indent=1) + "\n"
+
+
+def _outcome(module: Any, config: Any, task: Task) -> dict[str, Any]:
+    """Status, metrics and configuration of a point; its cost goes to a file of its own."""
+    started, started_cpu = time.monotonic(), time.process_time()
+    try:
+        done = module.run(config, task)
+    except module.FAILURES as error:
+        reason = str(error).splitlines()[0]
+        print(f"failed: {reason}", flush=True)
+        task.checkpoint.unlink(missing_ok=True)
+        cost = (time.monotonic() - started, time.process_time() - started_cpu)
+        _write_cost(task.folder, *cost)
+        return {
+            "status": "failed",
+            "reason": reason,
+            "epochs": None,
+            "attempt": None,
+            "metrics": {},
+            "config": config.model_dump(),
+        }
+    _write_cost(task.folder, done.seconds, done.cpu_seconds)
+    return {
+        "status": "stopped" if done.stopped else "finished",
+        "reason": "",
+        "epochs": done.epochs,
+        "attempt": done.attempt,
+        "metrics": done.metrics,
+        "config": done.described,
+    }
+
+
+def _write_cost(folder: Path, seconds: float, cpu_seconds: float) -> None:
+    cost = {"seconds": round(seconds, 3), "cpu_seconds": round(cpu_seconds, 3)}
+    write_text(folder / COST, json.dumps(cost) + "\n")
+
+
+def _open(trial: Trial) -> tuple[Any, dict[str, Any]]:
+    """Module that asks, and axes of the space."""
+    from psfdae.configuration.compose import validate
+    from psfdae.configuration.sweep import Axis
+
+    space = {name: validate(Axis, axis) for name, axis in trial.search["space"].items()}
+    return import_module(ADAPTIVE_MODULE), space
+
+
+def _with(config: Any, keys: Mapping[str, Any]) -> Any:
+    """The stage's configuration with other values, checked again."""
+    from psfdae.configuration.compose import validate
+
+    return validate(type(config), with_values(config.model_dump(), keys))
+
+
+def read_result(path: Path) -> dict[str, Any]:
+    """A point's `result.json`; raises ProductError."""
+    try:
+        tree = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ProductError(f"{path}: no such file") from None
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise ProductError(f"{path}: damaged ({error}); delete it and run again") from None
+    if not isinstance(tree, dict) or not {"point", "status", "values", "metrics"} <= set(tree):
+        raise ProductError(f"{path}: damaged (not a point's result); delete it and run again")
+    return tree

@@ -1,0 +1,128 @@
+"""Stage `sweep summary`: what the points of a sweep have found."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from psfdae.files import ProductError, write_text
+from psfdae.stages.sweep import COST, read_result
+from psfdae.sweeps.space import SweepError
+
+SUMMARY, COSTS, BEST, DEFINITION = "summary.csv", "cost.csv", "best.yaml", "sweep.yaml"
+
+
+def summary(
+    name: str,
+    definition: Mapping[str, Any],
+    given: Sequence[str],
+    points: Sequence[Path],
+    out: Path,
+) -> None:
+    """Tabulate the points of a sweep and choose the best by its metric.
+
+    Parameters
+    ----------
+    name : of the sweep
+    definition : config group `Sweep`
+    given : the workflow's overrides that all points share, its preset first
+    points : `result.json` of every point, in the order of the table
+    out : folder that receives `summary.csv` (point, a column per axis, status, reason,
+        epochs, attempt, best, metrics), `cost.csv` (seconds of each training), `best.yaml`
+        and `sweep.yaml`
+
+    Raises
+    ------
+    ProductError
+        If a result is missing or damaged.
+    SweepError
+        If no point has a metric.
+    """
+    import pandas as pd
+    import yaml
+
+    results = [read_result(path) for path in points]
+    best = choose(results, definition["metric"], definition["direction"])
+    if best is None:
+        failed = f"{results[0]['point']}: {results[0]['reason']}"
+        raise SweepError(f"all {len(results)} points of sweep {name} failed; the first, {failed}")
+    rows = [_row(result, result is best) for result in results]
+    write_text(out / SUMMARY, pd.DataFrame(rows).to_csv(index=False, float_format="%.8g"))
+    costs = [
+        {"point": result["point"], **_cost(path)}
+        for result, path in zip(results, points, strict=True)
+    ]
+    write_text(out / COSTS, pd.DataFrame(costs).to_csv(index=False))
+    described = {"sweep": name, "given": list(given), **definition}
+    # Unsorted: the order of the axes is that of the figures.
+    write_text(out / DEFINITION, yaml.safe_dump(described, sort_keys=False))
+    write_text(out / BEST, _best_yaml(name, definition, given, best))
+
+
+def choose(
+    results: Sequence[Mapping[str, Any]], metric: str, direction: str
+) -> Mapping[str, Any] | None:
+    """The result with the best validation metric, the first of equals; None if all failed."""
+    sign = 1.0 if direction == "minimize" else -1.0
+    with_metric = [result for result in results if metric in result["metrics"]]
+    return min(with_metric, key=lambda result: sign * result["metrics"][metric], default=None)
+
+
+def best_overrides(results: Path, name: str) -> list[str]:
+    """Hydra overrides of the best point of a sweep.
+
+    Parameters
+    ----------
+    results : folder that the workflow writes to
+    name : of the sweep
+
+    Raises
+    ------
+    ProductError
+        If the sweep has not been run.
+    """
+    from psfdae.runs import read_yaml
+
+    path = results / "sweeps" / name / BEST
+    if not path.is_file():
+        raise ProductError(f"{path}: missing; run `snakemake sweep --config sweep={name}` first")
+    overrides = read_yaml(path).get("overrides")
+    if not isinstance(overrides, list):
+        raise ProductError(f"{path}: damaged (no overrides); delete it and run again")
+    return [str(override) for override in overrides]
+
+
+def _cost(path: Path) -> dict[str, Any]:
+    cost: dict[str, Any] = json.loads((path.parent / COST).read_text(encoding="utf-8"))
+    return cost
+
+
+def _row(result: Mapping[str, Any], best: bool) -> dict[str, Any]:
+    values = {k: json.dumps(v) if isinstance(v, list) else v for k, v in result["values"].items()}
+    outcome = {key: result[key] for key in ("status", "reason", "epochs", "attempt")}
+    chosen = {"best": "yes" if best else "no"}
+    return {"point": result["point"], **values, **outcome, **chosen, **result["metrics"]}
+
+
+def _best_yaml(
+    name: str, definition: Mapping[str, Any], given: Sequence[str], best: Mapping[str, Any]
+) -> str:
+    """The best point as overrides, those of the workflow before its own."""
+    from psfdae.configuration.compose import as_overrides
+    from psfdae.stages.train import as_yaml
+
+    own = [override.removeprefix("++") for override in as_overrides(best["keys"])]
+    tree = {
+        "sweep": name,
+        "point": best["point"],
+        "preset": next((g.partition("=")[2] for g in given if g.startswith("preset=")), ""),
+        "overrides": [*(g for g in given if not g.startswith("preset=")), *own],
+        "dataset": definition.get("dataset") or definition["model"],
+        "split": best["split"],
+        "reference": best["reference"],
+        "metric": definition["metric"],
+        "metrics": {key: float(f"{value:.8g}") for key, value in best["metrics"].items()},
+    }
+    return as_yaml(tree)

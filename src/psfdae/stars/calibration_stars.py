@@ -1,0 +1,222 @@
+"""Which stars of an image are good enough to learn the PSF from.
+
+Everything works on stamps (n, s, s) somewhat wider than those of the network. The
+star of a stamp lies near index (s//2, s//2).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+SKY_CLIP = 3.0
+"""Pixels of the sky this many σ off their median belong to other stars."""
+
+REGISTRATION_ROUNDS = 10
+"""Steps of the windowed centroid; each leaves less than a fifth of the distance."""
+
+COMPANIONS = 12
+"""Nearest stars with which a star is compared."""
+
+
+class CalibrationStarsError(ValueError):
+    """An image has too few stars to learn from, or its settings contradict each other."""
+
+
+class Verdict(StrEnum):
+    """Why a star is not used; the first reason that applies."""
+
+    GOOD = "good"
+    INCOMPLETE = "incomplete"  # pixels off the image, masked or not finite
+    SATURATED = "saturated"
+    FAINT = "faint"
+    OFF_CENTRE = "off centre"
+    CROWDED = "crowded"
+    MISFIT = "misfit"  # unlike its neighbours: a blend, a galaxy, a cosmic ray
+
+
+@dataclass(frozen=True)
+class Sky:
+    """Level and RMS of the sky around n stars, in counts per pixel, shape (n,) each."""
+
+    level: np.ndarray
+    noise: np.ndarray
+
+
+def sky_around(wide: np.ndarray, bad: np.ndarray, stamp_px: int) -> Sky:
+    """Median and scatter of the pixels outside the stamps, other stars clipped.
+
+    Without a margin (s < d + 4) the pixels are the outer two rows and columns of
+    the stamp itself; light of the star in them counts as sky then.
+
+    Parameters
+    ----------
+    wide : ndarray, shape (n, s, s)
+    bad : ndarray of bool, shape (n, s, s)
+        Pixels that do not count.
+    stamp_px : int
+        Side d.
+    """
+    from astropy.stats import sigma_clipped_stats
+
+    side = wide.shape[-1]
+    inner = stamp_px if side >= stamp_px + 4 else side - 4
+    start = side // 2 - inner // 2
+    ring = np.ones((side, side), dtype=bool)
+    ring[start : start + inner, start : start + inner] = False
+    _, level, noise = sigma_clipped_stats(
+        wide[:, ring],
+        mask=bad[:, ring],
+        sigma=SKY_CLIP,
+        cenfunc="median",
+        stdfunc="mad_std",
+        axis=1,
+    )
+    return Sky(*(np.nan_to_num(np.ma.filled(a, np.nan)).astype(float) for a in (level, noise)))
+
+
+def signal_to_noise(stamps: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """S/N of a filter matched to the star itself, √(Σx²/σ² − P), shape (n,).
+
+    For an image x = F p the expectation of Σx² is F²Σp² + Pσ², and F/(σ √A) with
+    the noise-equivalent area A = 1/Σp² is what stays (King 1983, PASP 95, 163). No
+    PSF has to be known. 0 where the noise is 0.
+
+    Parameters
+    ----------
+    stamps : ndarray, shape (n, d, d)
+        Sky-subtracted.
+    noise : ndarray, shape (n,)
+        RMS σ of a pixel.
+    """
+    power = np.square(stamps, dtype=np.float64).sum(axis=(1, 2))
+    safe = np.where(noise > 0, noise, np.inf)
+    return np.sqrt(np.maximum(power / safe**2 - stamps[0].size, 0.0)) if len(stamps) else power
+
+
+def crowded(
+    position: np.ndarray, brightness: np.ndarray, distance_px: float, ratio: float
+) -> np.ndarray:
+    """Stars with a neighbour of at least `ratio` of their brightness nearby, bool, shape (n,).
+
+    Parameters
+    ----------
+    position : ndarray, shape (n, 2)
+        In pixels; a star at NaN has no neighbours.
+    brightness : ndarray, shape (n,)
+    distance_px, ratio : float
+    """
+    from scipy.spatial import cKDTree
+
+    placed = np.flatnonzero(np.isfinite(position).all(axis=1))
+    out = np.zeros(len(position), dtype=bool)
+    pairs = placed[cKDTree(position[placed]).query_pairs(distance_px, output_type="ndarray")]
+    for one, other in ((pairs[:, 0], pairs[:, 1]), (pairs[:, 1], pairs[:, 0])):
+        out[one[brightness[other] >= ratio * brightness[one]]] = True
+    return out
+
+
+def brightest_pixels(wide: np.ndarray, search_px: int) -> tuple[np.ndarray, np.ndarray]:
+    """Brightest pixel near the middle of every stamp.
+
+    Parameters
+    ----------
+    wide : ndarray, shape (n, s, s)
+    search_px : int
+        Searched within ± this of the middle.
+
+    Returns
+    -------
+    peak : ndarray of int, shape (n, 2)
+        (row, column) from index (s//2, s//2); the first in that order among equals.
+    inside : ndarray of bool, shape (n,)
+        Whether no pixel just outside the search window is brighter.
+    """
+    middle, reach = wide.shape[-1] // 2, search_px + 1
+    window = wide[:, middle - reach : middle + reach + 1, middle - reach : middle + reach + 1]
+    flat = window.reshape(len(wide), -1).argmax(axis=1)
+    peak = np.stack(np.divmod(flat, 2 * reach + 1), axis=1) - reach
+    return peak, np.abs(peak).max(axis=1, initial=0) <= search_px
+
+
+def star_centres(wide: np.ndarray, peak: np.ndarray, window_px: np.ndarray) -> np.ndarray:
+    """Centroids under a Gaussian window that follows the star (Bertin's XWIN), shape (n, 2).
+
+    Parameters
+    ----------
+    wide : ndarray, shape (n, s, s)
+        Sky-subtracted.
+    peak : ndarray, shape (n, 2)
+        Where to start, (row, column) from index (s//2, s//2).
+    window_px : ndarray, shape (n,)
+        σ of the window, about that of the star.
+
+    Returns
+    -------
+    ndarray, shape (n, 2)
+        (row, column) from index (s//2, s//2), at most 1.5 px per axis from `peak`.
+    """
+    axis = np.arange(wide.shape[-1]) - wide.shape[-1] // 2
+    centre = peak.astype(np.float64)
+    width = window_px[:, None] ** 2
+    for _ in range(REGISTRATION_ROUNDS):
+        rows, columns = (axis - centre[:, i : i + 1] for i in (0, 1))
+        weight = np.exp(-0.5 * rows**2 / width)[:, :, None]
+        light = weight * np.exp(-0.5 * columns**2 / width)[:, None, :] * wide
+        total = light.sum(axis=(1, 2))
+        moved = np.stack(
+            [
+                np.einsum("nij,ni->n", light, rows),
+                np.einsum("nij,nj->n", light, columns),
+            ],
+            axis=1,
+        )
+        # A window as wide as the star halves the distance of the centroid, hence the 2.
+        step = 2.0 * moved / np.where(total > 0, total, np.inf)[:, None]
+        centre = np.clip(centre + step, peak - 1.5, peak + 1.5)
+    return centre
+
+
+def window_of(snr: np.ndarray, flux: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """σ in pixels of the Gaussian with the noise-equivalent area of a star, shape (n,).
+
+    A = (F / (σ_noise · S/N))² = 4π σ²; at least 0.7 px.
+    """
+    area = (flux / (noise * snr)) ** 2
+    return np.maximum(np.sqrt(area / (4.0 * np.pi)), 0.7)
+
+
+def misfit(aligned: np.ndarray, position: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """How far each star is from the median of its neighbours, in robust σ of all, shape (n,).
+
+    The measure of a star is the RMS of its difference from the median image of the
+    nearest `COMPANIONS` stars, its own noise subtracted. A field-dependent PSF
+    raises the measure of all stars, a blend only its own.
+
+    Parameters
+    ----------
+    aligned : ndarray, shape (n, d, d)
+        Of flux 1, moved to a common centre.
+    position : ndarray, shape (n, 2)
+        In the image; all stars are neighbours where a position is not finite.
+    noise : ndarray, shape (n,)
+        RMS of a pixel over the flux.
+    """
+    from scipy.spatial import cKDTree
+
+    count = len(aligned)
+    if count < 3:
+        return np.zeros(count)
+    near = np.broadcast_to(np.arange(count), (count, count))
+    if np.isfinite(position).all() and count > COMPANIONS:
+        near = cKDTree(position).query(position, k=COMPANIONS + 1)[1]
+    excess = np.empty(count)
+    for star, others in enumerate(near):
+        median = np.median(aligned[others[others != star]], axis=0)
+        power = np.square(aligned[star] - median).mean() - noise[star] ** 2
+        excess[star] = np.sqrt(max(power, 0.0))
+    middle = np.median(excess)
+    scatter = 1.4826 * np.median(np.abs(excess - middle))
+    return (excess - middle) / max(scatter, 1e-12)

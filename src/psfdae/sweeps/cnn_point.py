@@ -1,0 +1,87 @@
+"""A point of a sweep over the CNNs of scene 3."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from psfdae.evaluation.alignment_tables import error_rows
+from psfdae.files import read_product, write_text
+from psfdae.models.cnn import CnnTrainingError
+from psfdae.stages import alignment_train as stage
+from psfdae.stages.alignment_evaluate import cnn_predictor, noisy_test_states
+from psfdae.stages.common import limit_threads
+from psfdae.stages.train import CONFIG, HISTORY
+from psfdae.sweeps.measured import (
+    EVALUATION,
+    VALIDATION,
+    Measured,
+    Task,
+    geometric_mean,
+    stage_part,
+)
+
+FILES = (stage.CNN_WEIGHTS, CONFIG, HISTORY)
+FAILURES = (CnnTrainingError,)
+
+TEST_SET = "uniform"
+"""Test set of scene 3, whose noise is drawn as in the main workflow."""
+
+
+def run(config: Any, task: Task) -> Measured:
+    """Train as the stage of the same CNN does, and measure.
+
+    Parameters
+    ----------
+    config : stage config (seed, noise, cnn, train_<CNN>, evaluation)
+    task : Task; its `dataset` is the CNN, original or noise_trained
+
+    Raises CnnTrainingError if the training cannot go on.
+    """
+    import pandas as pd
+    import yaml
+
+    train = {"original": stage.train_original, "noise_trained": stage.train_noise_trained}
+    part = stage_part(f"alignment_{task.dataset}", config)
+    train[task.dataset](part, task.data["states"], task.folder, task.checkpoint)
+    limit_threads(config.evaluation.threads)
+    metrics: dict[str, float] = {}
+    for role, name in (("validation", VALIDATION), ("test", EVALUATION)):
+        rows = _rows(config, task, role)
+        metrics |= _metrics(role, rows)
+        write_text(task.folder / name, pd.DataFrame(rows).to_csv(index=False, float_format="%.8g"))
+    described = yaml.safe_load((task.folder / CONFIG).read_text(encoding="utf-8"))
+    states = read_product(task.data["states"], "alignment_states", ()).config
+    history = pd.read_csv(task.folder / HISTORY)
+    return Measured(
+        metrics=metrics,
+        described={**states, **described},
+        seconds=float(history["seconds"].iloc[-1]),
+        cpu_seconds=float("nan"),
+        epochs=int(history["epoch"].iloc[-1]),
+    )
+
+
+def _rows(config: Any, task: Task, role: str) -> list[dict[str, Any]]:
+    """Rows of the table of errors as the main workflow makes them, of one CNN."""
+    product = read_product(task.data[role], "alignment_states", ("states", "stamps", "unit"))
+    predict = cnn_predictor(task.folder, config)
+    test_set = TEST_SET if role == "test" else role
+    rows = []
+    for level in task.levels:
+        stamps = noisy_test_states(config, product["stamps"], test_set, level)
+        key = {"test_set": test_set, "noise_level": level, "method": task.dataset}
+        rows += error_rows(key, predict(stamps) - product["states"], product["unit"])
+    return rows
+
+
+def _metrics(role: str, rows: list[dict[str, Any]]) -> dict[str, float]:
+    """Mean absolute error in units of the range: of all parameters, and at each noise level."""
+    levels: dict[float, list[float]] = {}
+    for row in rows:
+        if row["unit"] == "range":
+            levels.setdefault(row["noise_level"], []).append(row["mean_abs_error"])
+    each = {level: float(np.mean(errors)) for level, errors in levels.items()}
+    metrics = {f"{role}_mae": geometric_mean(list(each.values()))}
+    return metrics | {f"{role}_mae_{level:g}": value for level, value in each.items()}

@@ -1,0 +1,48 @@
+"""A point of a sweep over denoising autoencoders."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from psfdae.files import read_product
+from psfdae.models.training import TrainingError
+from psfdae.stages import train as stage
+from psfdae.stages.common import limit_threads
+from psfdae.stages.evaluate import dae_predictor
+from psfdae.sweeps.measured import Measured, Task, measure_images, stage_part
+
+FILES = (stage.WEIGHTS, stage.CONFIG, stage.HISTORY)
+FAILURES = (TrainingError,)
+
+
+def run(config: Any, task: Task) -> Measured:
+    """Train as the stage `train` does, and measure.
+
+    Parameters
+    ----------
+    config : stage config (seed, noise, parts, dae, train, evaluation)
+    task : Task
+
+    Raises TrainingError if the training cannot go on.
+    """
+    import pandas as pd
+    import yaml
+
+    part = stage_part("train", config)
+    stars = task.data["stars"]
+    stage.run(part, stars, task.split, task.reference, task.folder, task.checkpoint)
+    limit_threads(config.evaluation.threads)
+    predict = dae_predictor(task.folder, config)
+    metrics = measure_images(config, task, "dae", predict, predict)
+    described = yaml.safe_load((task.folder / stage.CONFIG).read_text(encoding="utf-8"))
+    attempt = described.pop("attempt")
+    last = pd.read_csv(task.folder / stage.HISTORY).iloc[-1]
+    return Measured(
+        metrics=metrics,
+        described={**read_product(stars, "stars", ()).config, **described},
+        seconds=float(last["seconds"]),
+        cpu_seconds=float(last["cpu_seconds"]),
+        epochs=int(last["epoch"]),
+        stopped=int(last["epoch"]) < config.train.epochs,
+        attempt=attempt,
+    )

@@ -1,0 +1,75 @@
+"""README and docs as tests see them: their shell and Python blocks, links and anchors."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+FENCE = re.compile(r"^(`{3,}|~{3,})(\w*)[^\n]*\n(.*?)^\1", re.M | re.S)
+
+
+@dataclass(frozen=True)
+class Command:
+    """A line of a shell block: its words, and the text of its heredoc."""
+
+    words: tuple[str, ...]
+    heredoc: str = ""
+
+
+def pages():
+    """Names of all pages that a user reads."""
+    docs = sorted(f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md"))
+    return ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", *docs]
+
+
+def read(page):
+    """Text of a page."""
+    return (ROOT / page).read_text(encoding="utf-8")
+
+
+def blocks(text, language):
+    """Texts of the code blocks of a language."""
+    return [body for _, found, body in FENCE.findall(text) if found == language]
+
+
+def commands(text):
+    """Commands of all `sh` blocks, in order."""
+    found = []
+    for block in blocks(text, "sh"):
+        lines = iter(block.replace("\\\n", " ").splitlines())
+        for line in lines:
+            heredoc = re.search(r"<<-?\s*'?(\w+)'?", line)
+            written = []
+            if heredoc:
+                for inner in lines:
+                    if inner.strip() == heredoc[1]:
+                        break
+                    written.append(inner + "\n")
+            words = shlex.split(line.replace(heredoc[0], "") if heredoc else line, comments=True)
+            if words:
+                found.append(Command(tuple(words), "".join(written)))
+    return found
+
+
+def prose(text):
+    """A page without its code blocks and code spans."""
+    return re.sub(r"(`+)(?!`).+?(?<!`)\1(?!`)", "", FENCE.sub("", text))
+
+
+def links(text):
+    """Targets of all links and images."""
+    return re.findall(r"\]\(([^)\s]+)\)", prose(text))
+
+
+def anchors(text):
+    """Anchors of all headings, as GitHub makes them."""
+    found = []
+    for heading in re.findall(r"^#{1,6} +(.+?) *$", FENCE.sub("", text), re.M):
+        plain = re.sub(r"\[([^\]]*)\]\([^)]*\)|[`*]", r"\1", heading)
+        anchor = re.sub(r"[^\w\- ]", "", plain.lower()).replace(" ", "-")
+        number = found.count(anchor)
+        found.append(f"{anchor}-{number}" if number else anchor)
+    return found

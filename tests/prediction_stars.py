@@ -1,0 +1,43 @@
+"""Stars of the shipped model's scene that nothing was trained on, with noise, sky and truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from psfdae.configuration.compose import load_stage
+from psfdae.files import read_product
+from psfdae.stages import stars, templates
+
+KAPPA, SKY = 4.98, 1e4
+
+
+@dataclass(frozen=True)
+class Observed:
+    """Stamps in photons with what made them."""
+
+    stamps: np.ndarray
+    flux: float
+    truth: np.ndarray
+
+    @property
+    def noise(self):
+        return SKY**0.5 / self.flux
+
+
+def fresh_psfs(folder, count):
+    """Noise-free stars of flux 1 with aberrations that no training has seen, float64."""
+    overrides = ["dataset=field", "seed=7", f"stars.count={count}"]
+    overrides += ["parts.train_stars=1", "parts.test_stars=1"]
+    templates.run(load_stage("templates", overrides), folder / "templates.h5")
+    stars.run(load_stage("stars", overrides), folder / "templates.h5", folder / "stars.h5")
+    product = read_product(folder / "stars.h5", "stars", ("realisation",))
+    return product["realisation"].astype(np.float64)
+
+
+def observe(psf, level, seed=0):
+    """Photon counts of stars of noise level λ on a sky of 10⁴ photons."""
+    flux = SKY**0.5 / (KAPPA * level)
+    stamps = np.random.default_rng(seed).poisson(flux * psf + SKY).astype(np.float32)
+    return Observed(stamps, flux, psf)

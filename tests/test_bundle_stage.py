@@ -1,0 +1,301 @@
+"""Packing networks: that a bundle says what was trained, and that its errors are those made."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from click.testing import CliRunner
+
+from psfdae.bundle import (
+    BundleError,
+    at_noise,
+    mahalanobis,
+    measure,
+    network,
+    read_bundle,
+    shipped_path,
+    write_bundle,
+)
+from psfdae.cli import main
+from psfdae.configuration.compose import load_stage
+from psfdae.files import Column, ProductError, write_product
+from psfdae.models import export
+from psfdae.models.dae import predict
+from psfdae.rng import stream
+from psfdae.stages import bundle as stage
+from psfdae.stages import bundle_use, train
+from psfdae.stages.common import noise_model, noisy_test_images
+from psfdae.stars.flux import FluxModel
+
+TINY = [
+    "noise.levels=[1e-3,3e-3,1e-2]",
+    "parts.train_stars=1000",
+    "parts.test_stars=400",
+    "dae.kernels=[5,3,3,5]",
+    "dae.widths=[6,6,6]",
+    "train.epochs=4",
+]
+STARS = {
+    "telescope": {"pixel_scale_arcsec": 0.1, "diameter_m": 1.0, "wavelength_m": 5.5e-7},
+    "framing": {"jitter_px": 1, "subpixel": True},
+}
+
+
+def gaussians(count, seed):
+    """Gaussian stars of random width and position, 12 × 12, float32, of sum 1."""
+    rng = np.random.default_rng(seed)
+    grid = np.arange(12) - 6
+    centre = rng.uniform(-1, 1, size=(2, count, 1, 1))
+    width = rng.uniform(0.8, 2.5, size=(count, 1, 1))
+    r2 = (grid[:, None] - centre[0]) ** 2 + (grid - centre[1]) ** 2
+    images = np.exp(-0.5 * r2 / width**2)
+    return (images / images.sum(axis=(1, 2), keepdims=True)).astype(np.float32)
+
+
+def write_stars(path, config):
+    images = gaussians(1400, 1)
+    columns = {
+        "realisation": Column(images, "1", "noise-free image"),
+        "field_index": Column(np.arange(1400) % 25, "1", "field"),
+        "grid": Column(np.stack([np.arange(25) % 5, np.arange(25) // 5], axis=1), "1", "index"),
+    }
+    write_product(path, "stars", columns, config)
+    return path
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Stars, a network trained on them, and its bundle."""
+    folder = tmp_path_factory.mktemp("bundle")
+    stars = write_stars(folder / "stars.h5", STARS)
+    config = load_stage("train", TINY)
+    train.run(config, stars, "random", "realisation", folder / "dae", folder / "checkpoint.pt")
+    pack(folder, folder / "tiny.psf.safetensors")
+    return folder
+
+
+def pack(folder, out, overrides=(), **options):
+    chosen = {"stars": folder / "stars.h5", "split": None, "name": "tiny", "licence": "MIT"}
+    config = load_stage("bundle", [*TINY, *overrides])
+    stage.run(config, dae=folder / "dae", out=out, **(chosen | options))
+
+
+@pytest.fixture(scope="module")
+def tiny(folder):
+    return read_bundle(folder / "tiny.psf.safetensors")
+
+
+def test_same_inputs_give_the_same_bytes(folder, tmp_path, monkeypatch):
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "0")
+    for name in ("one", "two"):
+        pack(folder, tmp_path / name)
+    assert (tmp_path / "one").read_bytes() == (tmp_path / "two").read_bytes()
+    early = read_bundle(tmp_path / "one")
+    assert early.info.created == "1970-01-01"
+    assert early.sha256 == read_bundle(folder / "tiny.psf.safetensors").sha256
+
+
+def test_info_says_what_the_stars_and_the_training_were(tiny):
+    info = tiny.info
+    assert (info.stamp_px, info.jitter_px, info.subpixel, info.source) == (12, 1, True, "simulated")
+    assert info.pixel_lambda_d == pytest.approx(np.deg2rad(0.1 / 3600) / 5.5e-7)
+    assert (info.noise_min, info.noise_max) == pytest.approx((4.98e-3, 4.98e-2))
+    assert info.snr_max == pytest.approx(1 / (info.noise_min * np.sqrt(info.noise_equivalent_px)))
+    assert info.snr_max / info.snr_min == pytest.approx(10)
+    assert info.training_stars == 1000
+    assert info.image_scale == 144
+    assert info.config["train"]["train"]["epochs"] == 4
+
+
+def test_unknown_optics_have_no_diffraction_limit(folder, tmp_path):
+    own = {"telescope": {"pixel_scale_arcsec": 2.0}, "framing": {"jitter_px": 0}, "source": "stars"}
+    pack(folder, tmp_path / "own", stars=write_stars(tmp_path / "own.h5", own))
+    info = read_bundle(tmp_path / "own").info
+    assert (info.pixel_lambda_d, info.source, info.subpixel) == (None, "stars", False)
+    assert info.pixel_scale_arcsec == 2.0
+
+
+def test_metrics_are_those_of_the_stage_evaluate(folder, tiny):
+    config = load_stage("bundle", TINY)
+    images = gaussians(1400, 1)
+    from psfdae.stars.splits import random_split
+
+    test = random_split(1400, 1000, 400, config.parts.validation_fraction, config.seed).test
+    for row in tiny.info.metrics:
+        noisy = noisy_test_images(config, images[test], row["noise_level"])
+        estimate = predict(network(tiny), noisy, 144.0)
+        assert row["mse"] == pytest.approx(np.square(estimate - images[test]).mean(), rel=1e-4)
+        assert row["mse"] < row["mse_noisy"]
+
+
+def test_half_width_covers_fresh_stars_and_the_rms_too_many(tiny):
+    config = load_stage("bundle", TINY)
+    images = gaussians(1500, 99)
+    rng = np.random.default_rng(5)
+    noise = np.exp(rng.uniform(np.log(4.98e-3), np.log(4.98e-2), size=1500))
+    noisy = noise_model(config).draw(images, noise / 4.98, rng)
+    error = predict(network(tiny), noisy, 144.0) - images
+    covered = measure.coverage(error, noise, tiny.noise_nodes, tiny.error68)
+    assert covered == pytest.approx(0.6827, abs=0.05)
+    for part in np.array_split(np.argsort(noise), 3):
+        within = measure.coverage(error[part], noise[part], tiny.noise_nodes, tiny.error68)
+        assert within == pytest.approx(0.6827, abs=0.05)
+    assert measure.coverage(error, noise, tiny.noise_nodes, tiny.rms) > covered + 0.05
+    for row in tiny.info.metrics:
+        assert row["coverage68"] == pytest.approx(0.6827, abs=0.05)
+
+
+def test_signal_to_noise_is_that_of_a_matched_filter():
+    """The flux of the mean PSF in white noise scatters by 1 / (S/N) of itself."""
+    mean = gaussians(1, 3)[0].astype(np.float64)
+    noise = 0.01
+    images = mean + np.random.default_rng(0).normal(0, noise, size=(20000, 12, 12))
+    flux = (images * mean).sum(axis=(1, 2)) / (mean**2).sum()
+    area = measure.noise_equivalent_px(mean)
+    assert 1 / flux.std() == pytest.approx(measure.signal_to_noise(noise, area), rel=0.03)
+    flat = np.full((12, 12), 1 / 144)
+    assert measure.noise_equivalent_px(flat) == pytest.approx(144)
+
+
+def test_errors_between_nodes_are_interpolated_and_held_outside():
+    nodes, maps = np.array([1.0, 2.0, 4.0]), np.arange(12.0).reshape(3, 2, 2)
+    found = at_noise(np.array([1.0, 1.5, 3.0, 4.0, 9.0, 0.1, np.nan]), nodes, maps)
+    expected = [maps[0], (maps[0] + maps[1]) / 2, (maps[1] + maps[2]) / 2, maps[2], maps[2]]
+    assert found[:5] == pytest.approx(np.stack(expected))
+    assert (found[5] == maps[0]).all()
+    assert np.isnan(found[6]).all()
+    assert (at_noise(np.array([0.5, 7.0]), np.array([1.0]), maps[:1]) == maps[0]).all()
+
+
+def test_distance_is_the_number_of_components_whatever_the_noise():
+    model = FluxModel.fit(gaussians(4000, 4))
+    fresh, rng = gaussians(2000, 5), np.random.default_rng(6)
+    for noise in (1e-4, 3e-3, 5e-2):
+        noisy = fresh + rng.normal(0, noise, fresh.shape)
+        squared = mahalanobis(noisy, np.full(2000, noise), model, 20) ** 2
+        assert squared.mean() == pytest.approx(20, rel=0.1)
+
+
+def test_strange_stars_are_farther_than_any_of_the_training_set(tiny):
+    stars = gaussians(200, 7)
+    noise = np.full(200, 5e-3)
+    rng = np.random.default_rng(8)
+    blends = 0.5 * (stars + np.roll(stars, 5, axis=2))
+    info, model = tiny.info, tiny.flux_model
+    near, far = (
+        mahalanobis(images + rng.normal(0, 5e-3, stars.shape), noise, model, info.components)
+        for images in (stars, blends)
+    )
+    assert (near > tiny.distance_limit).mean() < 0.02
+    assert (far > tiny.distance_limit).mean() > 0.6
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("noise.kappa=5", r"trained with noise\.kappa=4\.98, .* asked for with noise\.kappa=5\.0"),
+        ("seed=3", r"trained with seed=20200611, .* asked for with seed=3"),
+        ("parts.test_stars=300", r"parts\.test_stars=400"),
+    ],
+)
+def test_network_of_another_training_is_refused(folder, tmp_path, override, message):
+    with pytest.raises(BundleError, match=message):
+        pack(folder, tmp_path / "x", [override])
+    with pytest.raises(BundleError, match=r"split=random, .* split=held_out"):
+        pack(folder, tmp_path / "x", split="held_out")
+
+
+def test_stars_that_say_too_little_are_refused(folder, tmp_path):
+    stars = write_stars(tmp_path / "s.h5", {"telescope": {}, "framing": {"jitter_px": 0}})
+    with pytest.raises(ProductError, match=r"s\.h5: its configuration lacks 'pixel_scale_arcsec'"):
+        pack(folder, tmp_path / "x", stars=stars)
+
+
+def test_missing_network_is_one_line_and_exit_code_2(folder, tmp_path):
+    arguments = ["bundle", "--stars", str(folder / "stars.h5"), "--dae", str(tmp_path)]
+    result = CliRunner().invoke(main, [*arguments, "--out", str(tmp_path / "x")])
+    assert result.exit_code == 2
+    assert (
+        result.output == f"psfdae: {tmp_path}/config.yaml: no such file; psfdae train writes it\n"
+    )
+
+
+def test_commands_pack_describe_and_export(folder, tmp_path):
+    """The same by the command line; the ONNX file computes what torch does."""
+    path, onnx = tmp_path / "mine.psf.safetensors", tmp_path / "mine.onnx"
+    inputs = ["--stars", str(folder / "stars.h5"), "--dae", str(folder / "dae")]
+    runner = CliRunner()
+    result = runner.invoke(main, ["bundle", *inputs, "--out", str(path), *TINY])
+    assert result.exit_code == 0, result.output
+    said = runner.invoke(main, ["describe", str(path)]).output
+    for fact in ("mine", "12 × 12 px of 0.1 arcsec (0.881 λ/D)", "not stated", "1000 simulated"):
+        assert fact in said
+    result = runner.invoke(main, ["export", str(path), "--out", str(onnx)])
+    assert result.exit_code == 0, result.output
+    images = gaussians(5, 11)
+    found = export.session(onnx, threads=1).run(None, {"images": images})[0]
+    expected = predict(network(read_bundle(path)), images, 144.0)
+    assert np.abs(found - expected).max() <= export.TOLERANCE * expected.max()
+
+
+def test_export_of_a_wrong_network_fails_and_leaves_no_file(folder, tmp_path, monkeypatch):
+    plain = export._plain
+
+    def wrong(layer):
+        changed = plain(layer)
+        changed.weight = torch.nn.Parameter(changed.weight * 1.001)
+        return changed
+
+    monkeypatch.setattr(export, "_plain", wrong)
+    with pytest.raises(export.ExportError, match="differs from torch"):
+        bundle_use.export(folder / "tiny.psf.safetensors", tmp_path / "x.onnx")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_shipped_bundle_is_small_and_wide():
+    bundle = read_bundle()
+    assert bundle.info.name == "wfsat"
+    assert shipped_path().stat().st_size <= bundle_use.LARGEST_SHIPPED
+    assert bundle.info.subpixel
+    assert bundle.info.snr_min < 5
+    assert bundle.info.snr_max > 500
+    faint = [row for row in bundle.info.metrics if row["snr"] < 50]
+    assert len(faint) >= 3
+    assert all(row["mse"] < 0.2 * row["mse_noisy"] for row in faint)
+    for row in bundle.info.metrics:
+        assert row["coverage68"] == pytest.approx(0.6827, abs=0.05)
+
+
+def test_shipped_bundle_covers_stars_that_nobody_has_seen(tmp_path):
+    """New stars of the same telescope, from another seed."""
+    from psfdae.files import read_product
+    from psfdae.stages import stars, templates
+
+    sizes = ["seed=11", "grid.points=5", "grid.spacing_deg=2.75", "stars.count=500"]
+    chosen = ["dataset=field", *sizes, "parts.train_stars=400", "parts.test_stars=100"]
+    templates.run(load_stage("templates", chosen), tmp_path / "t.h5")
+    stars.run(load_stage("stars", chosen), tmp_path / "t.h5", tmp_path / "s.h5")
+    images = read_product(tmp_path / "s.h5", "stars", ("realisation",))["realisation"]
+    bundle, rng = read_bundle(), stream(11, "coverage")
+    band = np.log([bundle.info.noise_min, bundle.info.noise_max])
+    noise = np.exp(rng.uniform(*band, size=len(images)))
+    config = load_stage("bundle", chosen)
+    noisy = noise_model(config).draw(images, noise / config.noise.kappa, rng)
+    error = predict(network(bundle), noisy, bundle.info.image_scale) - images
+    covered = measure.coverage(error, noise, bundle.noise_nodes, bundle.error68)
+    assert covered == pytest.approx(0.6827, abs=0.05)
+    assert measure.coverage(error, noise, bundle.noise_nodes, bundle.rms) > 0.75
+
+
+def test_ship_names_checks_and_writes(folder, tiny, tmp_path):
+    out = bundle_use.ship(folder / "tiny.psf.safetensors", tmp_path / "bundles")
+    assert out.name == "wfsat.psf.safetensors"
+    assert read_bundle(out).info.licence == "MIT"
+    rows = [row | {"coverage68": 0.5} for row in tiny.info.metrics]
+    poor = replace(tiny, info=tiny.info.model_copy(update={"metrics": rows}))
+    write_bundle(poor, tmp_path / "poor.psf.safetensors")
+    with pytest.raises(BundleError, match=r"error68 holds 50\.0% of the errors"):
+        bundle_use.ship(tmp_path / "poor.psf.safetensors", tmp_path / "bundles")

@@ -1,0 +1,211 @@
+"""Runs that are killed, starved, locked out or damaged end, once repeated, in the same files.
+
+Every case breaks a run of one dataset's network, baseline and evaluation, then repeats
+it with the command that `make reproduce` gives. What comes out is compared byte by byte
+with an undisturbed run; the time of the recovery goes into the report of the tests.
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import tempfile
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+
+from workflow_runs import QUIET, job_counts, locked, wait_until
+
+pytestmark = pytest.mark.workflow
+
+TARGET = "results/evaluation/dataset3/random-realisation.csv"
+WEIGHTS = "results/dae/dataset3/random-realisation/dae.safetensors"
+STARS = "results/data/seidel/seidel_10pct.h5"
+CHECKPOINT = "results/checkpoints/dataset3-random-realisation.pt"
+LOG = "results/logs/dae/dataset3/random-realisation.log"
+# Long enough for a signal to arrive in mid-training, which then resumes.
+SLOW = {"overrides": "train.epochs=80 train.checkpoint_seconds=0 train.batch=8"}
+TOO_LARGE = 150_000
+"""Bytes that a file may have on the full disk: less than the stars need."""
+
+
+@pytest.fixture(scope="module")
+def undisturbed(smoke, tmp_path_factory):
+    """The run that nothing happens to."""
+    folder = tmp_path_factory.mktemp("undisturbed")
+    shutil.copytree(smoke[0] / "results/data", folder / "results/data")
+    subprocess.run(**locked(folder, TARGET, **SLOW), check=True, **QUIET)
+    return folder
+
+
+@pytest.fixture
+def half_done(smoke, tmp_path):
+    """A folder with the stars, but without network and evaluation."""
+    shutil.copytree(smoke[0] / "results/data", tmp_path / "results/data")
+    return tmp_path
+
+
+@pytest.fixture
+def recovers(undisturbed, record_property):
+    """Repeats the run of a folder and compares its files with those of the undisturbed one."""
+
+    def repeat(folder, **more):
+        start = time.monotonic()
+        run = subprocess.run(
+            **{**locked(folder, TARGET, **SLOW), **more},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert run.returncode == 0, run.stdout + run.stderr
+        seconds = round(time.monotonic() - start, 1)
+        record_property("recovery_s", seconds)
+        print(f"recovered in {seconds} s")
+        products = [
+            path.relative_to(undisturbed)
+            for path in (undisturbed / "results").rglob("*")
+            if path.suffix in (".h5", ".safetensors", ".csv", ".parquet")
+            and path.name != "history.csv"
+        ]
+        assert len(products) >= 6
+        for path in products:
+            assert (folder / path).read_bytes() == (undisturbed / path).read_bytes(), path
+        assert not list((folder / "results").rglob("*.tmp"))
+        assert not (folder / CHECKPOINT).exists()
+        return run.stdout + run.stderr
+
+    return repeat
+
+
+def started(folder, **more):
+    """A run that has reached the middle of its training."""
+    run = subprocess.Popen(**{**locked(folder, TARGET, **SLOW), **more}, **QUIET)
+    wait_until((folder / CHECKPOINT).exists, 90, "the training left no checkpoint")
+    return run
+
+
+def ended(run, folder):
+    """Wait for a broken run; nothing in it may look finished."""
+    assert run.wait(60) != 0
+    assert not (folder / TARGET).exists()
+
+
+def test_killed_worker(half_done, recovers):
+    written = (half_done / STARS).stat().st_mtime_ns
+    run = started(half_done)
+    for child in psutil.Process(run.pid).children(recursive=True):
+        if "train" in child.cmdline() and "--checkpoint" in child.cmdline():
+            child.kill()
+    ended(run, half_done)
+    assert (half_done / CHECKPOINT).exists()
+    assert not (half_done / WEIGHTS).exists()
+    recovers(half_done)
+    log = (half_done / LOG).read_text()
+    assert "resuming after epoch" in log
+    assert "epoch 80/80" in log
+    assert (half_done / STARS).stat().st_mtime_ns == written
+
+
+def test_killed_snakemake(half_done, recovers):
+    """Its jobs run on and its lock stays; the wrapper of make deals with both."""
+    run = started(half_done)
+    orphans = psutil.Process(run.pid).children(recursive=True)
+    run.kill()
+    run.wait()
+    assert any(child.is_running() for child in orphans)
+    assert "waiting for it to end" in recovers(half_done)
+
+
+def test_terminated_snakemake(half_done, recovers):
+    run = started(half_done)
+    run.send_signal(signal.SIGTERM)
+    ended(run, half_done)
+    recovers(half_done)
+
+
+def test_interrupted_from_the_keyboard(half_done, recovers):
+    run = started(half_done, start_new_session=True)
+    os.killpg(run.pid, signal.SIGINT)
+    ended(run, half_done)
+    recovers(half_done)
+
+
+def test_full_disk(tmp_path, recovers):
+    """A limit on the size of files: the stars do not fit, nothing half-written stays."""
+
+    def limit():
+        resource.setrlimit(resource.RLIMIT_FSIZE, (TOO_LARGE, resource.RLIM_INFINITY))
+
+    run = subprocess.run(
+        **locked(tmp_path, TARGET, **SLOW),
+        preexec_fn=limit,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert run.returncode != 0
+    assert not (tmp_path / STARS).exists()
+    log = (tmp_path / "results/logs/stars/seidel/seidel_10pct.log").read_text()
+    assert log.startswith("psfdae: "), log
+    assert "File too large" in log
+    recovers(tmp_path)
+
+
+def test_read_only_results(smoke, undisturbed, recovers):
+    """Refused with a message, nothing changed; goes on once the folder can be written."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        shutil.copytree(smoke[0] / "results/data", folder / "results/data")
+        # Root may write anywhere, hence another user where we are root.
+        user = {"user": "nobody"} if os.geteuid() == 0 else {}
+        if user:
+            shutil.chown(folder, "nobody")
+        for path in (folder / "results", *(folder / "results").rglob("*")):
+            path.chmod(0o555 if path.is_dir() else 0o444)
+        arguments = locked(folder, TARGET, **SLOW)
+        arguments["env"]["HOME"] = arguments["env"]["XDG_CACHE_HOME"] = str(folder)
+        run = subprocess.run(**arguments, **user, capture_output=True, text=True, check=False)
+        assert run.returncode != 0
+        assert "Permission denied" in run.stdout + run.stderr
+        assert not (folder / TARGET).exists()
+        for path in (folder / "results", *(folder / "results").rglob("*")):
+            path.chmod(0o755 if path.is_dir() else 0o644)
+            if user:
+                shutil.chown(path, "nobody")
+        recovers(folder, env=arguments["env"], **user)
+
+
+@pytest.mark.parametrize("damage", ["truncated", "flipped"])
+@pytest.mark.parametrize("product", [STARS, WEIGHTS])
+def test_damaged_file(undisturbed, tmp_path, recovers, product, damage):
+    """Named, set aside, and built again with everything that depends on it."""
+    shutil.copytree(undisturbed, tmp_path, dirs_exist_ok=True)
+    path = tmp_path / product
+    whole = path.read_bytes()
+    times = path.stat()
+    middle = len(whole) // 2
+    flipped = whole[:middle] + bytes([whole[middle] ^ 1]) + whole[middle + 1 :]
+    path.write_bytes(whole[:middle] if damage == "truncated" else flipped)
+    # As a failing disk does it: nothing tells by its date.
+    os.utime(path, ns=(times.st_atime_ns, times.st_mtime_ns))
+    said = recovers(tmp_path)
+    assert f"{product}: " in said
+    assert "set aside" in said
+    jobs = job_counts(said)
+    assert jobs["train"] == 1
+    assert ("stars" in jobs) == (product == STARS)
+    assert "templates" not in jobs
+
+
+def test_two_runs_in_one_folder(half_done, recovers):
+    """The second waits, then finds nothing left to do."""
+    first = started(half_done)
+    second = recovers(half_done)
+    assert first.wait(60) == 0
+    assert "waiting for it to end" in second
+    assert not job_counts(second).get("train")

@@ -1,0 +1,191 @@
+"""Every command of README and docs does what it says, on tiny sizes or as a dry run."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from docs_pages import ROOT, Command, blocks, commands, pages, read
+from psfdae.bundle import read_bundle
+from psfdae.cli import main
+from psfdae.configuration.compose import compose
+from psfdae.observations.examples import write_field
+from workflow_runs import command, environment
+
+TINY = {
+    "templates": ["grid.points=5"],
+    "stars": ["grid.points=5", "stars.count=200"],
+    "train": ["preset=smoke", "parts.train_stars=150", "parts.test_stars=50"],
+    "config": [],
+    "predict": [],
+}
+"""What makes a command quick; one that is not here has no handler."""
+
+TESTED_ELSEWHERE = {"docs/own_telescope.md": "test_own_telescope.py"}
+"""Pages whose commands another test runs from first to last."""
+
+NOT_RUN = {"conda": "makes a second environment", ".": "activates the environment"}
+"""Commands that no test runs, and why."""
+
+IGNORED_OPTIONS = {"--cores": 1, "--jobs": 1, "-n": 0, "--dry-run": 0}
+"""Options of snakemake, with their number of values, that a dry run on two cores replaces."""
+
+
+class NoHandlerError(Exception):
+    """A page has a command that no test knows how to run."""
+
+
+@pytest.fixture
+def sandbox(tmp_path, monkeypatch):
+    """A working folder with a config tree of its own, an image and its star list."""
+    shutil.copytree(ROOT / "config", tmp_path / "config")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PSFDAE_CONFIG", str(tmp_path / "config"))
+    compose.cache_clear()
+    yield tmp_path
+    compose.cache_clear()
+
+
+@pytest.fixture(scope="module")
+def observation(tmp_path_factory):
+    """An image with nine stars and its catalogue, for the model that comes with the package."""
+    folder = tmp_path_factory.mktemp("observation")
+    info = read_bundle(None).info
+    x, y = (axis.ravel() for axis in np.meshgrid([30.0, 60, 90], [30.0, 60, 90]))
+    paths = folder / "image.fits", folder / "stars.csv"
+    sky = np.random.default_rng(1).normal(100, 3, (120, 120))
+    scale = info.pixel_scale_arcsec
+    stamps = 5e3 * star_stamps(9, info.stamp_px)
+    write_field(*paths, stamps, x, y, shape=sky.shape, background=sky, pixel_scale_arcsec=scale)
+    return paths
+
+
+def star_stamps(count, side):
+    """Round stars of flux 1, brightest in the middle."""
+    grid = np.arange(side) - side // 2
+    image = np.exp(-0.5 * (grid[:, None] ** 2 + grid**2) / 1.5**2)
+    return np.tile(image / image.sum(), (count, 1, 1))
+
+
+def run(command: Command, folder):
+    """Run a command that is no workflow; snakemake has a test of its own."""
+    first, *rest = command.words
+    if first == "psfdae":
+        run_psfdae(rest)
+    elif first == "cat":
+        write_heredoc(command, folder)
+    elif first == "make":
+        run_make(rest)
+    elif first not in (*NOT_RUN, "snakemake"):
+        raise NoHandlerError(" ".join(command.words))
+
+
+def run_psfdae(words):
+    if words[0] not in TINY:
+        raise NoHandlerError(f"psfdae {words[0]}")
+    result = CliRunner().invoke(main, [*words, *TINY[words[0]]])
+    assert result.exit_code == 0, result.output or result.exception
+
+
+def write_heredoc(command, folder):
+    *_, arrow, path = command.words
+    assert arrow == ">"
+    (folder / path).write_text(command.heredoc)
+    compose.cache_clear()
+
+
+def run_make(words):
+    makefile = (ROOT / "Makefile").read_text()
+    for target in (word for word in words if "=" not in word):
+        assert re.search(rf"^{target}:", makefile, re.M), target
+    # What a shell would fill in is not there.
+    words = [re.sub(r"\$\([^)]*\)", "", word) for word in words]
+    listed = ["make", "--dry-run", "--directory", str(ROOT), *words]
+    subprocess.run(listed, env=environment(), check=True, capture_output=True)
+
+
+def dry_run(command_: Command, folder):
+    """Jobs that a snakemake command would run."""
+    targets, settings = [], []
+    words = list(command_.words[1:])
+    while words:
+        word = words.pop(0)
+        if word == "--config":
+            while words and re.match(r"\w+=", words[0]):
+                settings.append(words.pop(0))
+        elif word in IGNORED_OPTIONS:
+            del words[: IGNORED_OPTIONS[word]]
+        elif word.startswith("-"):
+            raise NoHandlerError(f"snakemake {word}")
+        else:
+            targets.append(word)
+    line = [*command(folder, "--dry-run", *targets), *settings]
+    return subprocess.run(line, env=environment(), capture_output=True, text=True, check=False)
+
+
+def own_pages():
+    return [page for page in pages() if page not in TESTED_ELSEWHERE]
+
+
+@pytest.mark.parametrize("page", [p for p in own_pages() if commands(read(p))])
+def test_commands_run(page, sandbox, observation):
+    for path in observation:
+        shutil.copy(path, sandbox)
+    for line in commands(read(page)):
+        run(line, sandbox)
+
+
+def snakemake_pages():
+    return [p for p in own_pages() if any(c.words[0] == "snakemake" for c in commands(read(p)))]
+
+
+@pytest.mark.workflow
+@pytest.mark.parametrize("page", snakemake_pages())
+def test_workflow_commands_have_jobs(page, sandbox):
+    for line in commands(read(page)):
+        if line.words[0] == "cat":
+            write_heredoc(line, sandbox)
+        elif line.words[0] == "snakemake":
+            result = dry_run(line, sandbox)
+            assert result.returncode == 0, result.stdout + result.stderr
+            assert re.search(r"^total +\d+", result.stdout, re.M), line.words
+
+
+@pytest.mark.parametrize(("page", "test"), TESTED_ELSEWHERE.items())
+def test_the_other_test_reads_the_page(page, test):
+    assert commands(read(page))
+    assert page.removeprefix("docs/") in (ROOT / "tests" / test).read_text(encoding="utf-8")
+
+
+def test_python_blocks_run(sandbox):
+    side = read_bundle(None).info.stamp_px
+    found = [body for page in own_pages() for body in blocks(read(page), "python")]
+    assert found
+    for body in found:
+        names = {"stamps": 5e3 * star_stamps(4, side) + 100.0}
+        exec(compile(body, "page", "exec"), names)
+        assert names["prediction"].psf.shape == names["stamps"].shape
+
+
+@pytest.mark.parametrize("words", [("frobnicate",), ("psfdae", "frobnicate")])
+def test_a_command_without_handler_fails(words, tmp_path):
+    with pytest.raises(NoHandlerError, match="frobnicate"):
+        run(Command(words), tmp_path)
+
+
+def test_unknown_target_of_make_fails():
+    with pytest.raises(AssertionError, match="frobnicate"):
+        run_make(["frobnicate"])
+
+
+def test_blocks_are_read_to_the_word():
+    text = "```sh\ncat > a.yaml <<'END'\nx: 1  # kept\nEND\npsfdae a \\\n  b='c d' # gone\n```\n"
+    assert commands(text) == [
+        Command(("cat", ">", "a.yaml"), "x: 1  # kept\n"),
+        Command(("psfdae", "a", "b=c d")),
+    ]

@@ -1,0 +1,282 @@
+"""Whatever is wrong with a file: it reads, or one line says what and where. Nothing else."""
+
+from __future__ import annotations
+
+import contextlib
+import gzip
+import threading
+import warnings
+
+import numpy as np
+import pytest
+from astropy import log
+from astropy.io import fits
+from astropy.table import Table
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from psfdae.observations import ObservationError, open_observation
+from psfdae.observations.errors import reading
+from psfdae.observations.examples import write_cube, write_field
+
+D = 8
+HEADERS = 8640
+"""Bytes at the start of the files here that hold their headers and some data."""
+
+
+def examples(count):
+    return settings(
+        max_examples=count,
+        deadline=None,
+        derandomize=True,
+        database=None,
+        suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+    )
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Cubes, images and catalogues of every kind, all of them good."""
+    folder = tmp_path_factory.mktemp("good")
+    rng = np.random.default_rng(1)
+    stamps = rng.normal(200, 20, (30, D, D))
+    x, y = rng.uniform(0, 60, 30), rng.uniform(0, 40, 30)
+    write_cube(folder / "cube.fits", stamps, PIXSCALE=1.0)
+    write_cube(folder / "cube16.fits", stamps.astype(np.uint16))
+    write_cube(folder / "cube.fits.fz", stamps, compress=True)
+    (folder / "cube.fits.gz").write_bytes(gzip.compress((folder / "cube.fits").read_bytes()))
+    for name, compress in (("image.fits", False), ("image.fits.fz", True)):
+        write_field(
+            folder / name, folder / "s.csv", stamps, x, y, shape=(40, 60), compress=compress
+        )
+    for coding in ("GZIP_1", "GZIP_2"):
+        tiles = fits.CompImageHDU(rng.poisson(9, (40, 60)), compression_type=coding)
+        fits.HDUList([fits.PrimaryHDU(), tiles]).writeto(folder / f"{coding}.fits.fz")
+    Table.read(folder / "s.csv").write(folder / "s.fits")
+    Table.read(folder / "s.csv").write(folder / "s.ecsv")
+    return folder
+
+
+CUBES = ("cube.fits", "cube16.fits", "cube.fits.fz", "cube.fits.gz")
+IMAGES = ("image.fits", "image.fits.fz", "GZIP_1.fits.fz", "GZIP_2.fits.fz")
+CATALOGUES = ("s.csv", "s.fits", "s.ecsv")
+
+
+def attempt(path, **options):
+    """Read a file as a user would; whether it could be read."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        try:
+            found = open_observation(path, stamp_px=D, **options)
+            chunks = list(found.chunks(7))
+        except ObservationError as error:
+            text = str(error)
+            assert "\n" not in text and text.isprintable() and len(text) < 2000
+            named = (path, options.get("catalogue"), options.get("mask"))
+            assert any(name is not None and text.startswith(f"{name}: ") for name in named)
+            return False
+    assert sum(len(chunk) for chunk in chunks) == found.count
+    for chunk in chunks:
+        assert chunk.data.dtype == np.float32 and np.isfinite(chunk.data).all()
+        assert chunk.data.shape == chunk.bad.shape == chunk.saturated.shape
+        assert chunk.id.shape == chunk.x.shape == chunk.y.shape == chunk.truncated.shape
+    return True
+
+
+def attempt_all(folder, data, kind):
+    """The bytes as a cube, as an image or as a catalogue."""
+    path = folder / f"bad_{kind}"
+    path.write_bytes(data)
+    sky = ("ra", "dec") if len(data) % 2 else ("X_IMAGE", "Y_IMAGE")
+    if kind == "cube":
+        return attempt(path)
+    if kind == "image":
+        return attempt(path, catalogue=folder / "s.csv", columns=sky, margin=1)
+    return attempt(folder / "image.fits", catalogue=path, columns=sky)
+
+
+kinds = st.sampled_from(["cube", "image", "catalogue"])
+files = st.one_of(
+    st.tuples(st.just("cube"), st.sampled_from(CUBES)),
+    st.tuples(st.just("image"), st.sampled_from(IMAGES)),
+    st.tuples(st.just("catalogue"), st.sampled_from(CATALOGUES)),
+)
+card_bytes = st.sampled_from(list(b"0123456789 'TFABX-.E/=,"))
+
+
+def test_the_good_files_are_read(folder):
+    for kind, names in (("cube", CUBES), ("image", IMAGES[:2]), ("catalogue", CATALOGUES)):
+        for name in names:
+            assert attempt_all(folder, (folder / name).read_bytes(), kind), name
+
+
+@examples(100)
+@given(kind=kinds, start=st.sampled_from([b"", b"SIMPLE  =", b"# %ECSV 1.0\n"]), rest=st.binary())
+def test_random_bytes(folder, capfd, kind, start, rest):
+    assert not attempt_all(folder, start + rest, kind)
+    assert capfd.readouterr() == ("", "")
+
+
+@examples(120)
+@given(file=files, part=st.floats(0, 1))
+def test_truncated_files(folder, capfd, file, part):
+    data = (folder / file[1]).read_bytes()
+    attempt_all(folder, data[: int(part * len(data))], file[0])
+    assert capfd.readouterr() == ("", "")
+
+
+@examples(200)
+@given(
+    file=files,
+    changes=st.lists(st.tuples(st.floats(0, 1), card_bytes), min_size=1, max_size=6),
+)
+def test_changed_headers(folder, capfd, file, changes):
+    data = bytearray((folder / file[1]).read_bytes())
+    for place, byte in changes:
+        data[int(place * (min(HEADERS, len(data)) - 1))] = byte
+    attempt_all(folder, bytes(data), file[0])
+    assert capfd.readouterr() == ("", "")
+
+
+@examples(120)
+@given(file=files, place=st.floats(0, 1), removed=st.integers(0, 200), added=st.binary(max_size=99))
+def test_bytes_changed_removed_and_added_anywhere(folder, capfd, file, place, removed, added):
+    data = (folder / file[1]).read_bytes()
+    start = int(place * len(data))
+    attempt_all(folder, data[:start] + added + data[start + removed :], file[0])
+    assert capfd.readouterr() == ("", "")
+
+
+cells = st.one_of(
+    st.floats().map(repr),
+    st.integers().map(str),
+    st.sampled_from(["", "nan", "1e999", "10:20:30", "1h", '"', "'", "🔭", "1;2", "--", "#"]),
+    st.text(max_size=8),
+)
+headers = st.sampled_from(
+    ["X_IMAGE,Y_IMAGE", "ra,dec", "x,y", "X_IMAGE;Y_IMAGE", "# X_IMAGE Y_IMAGE", "a,b", "x,X", ""]
+)
+
+
+@examples(120)
+@given(header=headers, rows=st.lists(st.lists(cells, max_size=3), max_size=5))
+def test_catalogues_of_any_content(folder, capfd, header, rows):
+    text = "\n".join([header, *(",".join(row) for row in rows)])
+    path = folder / "bad.csv"
+    path.write_text(text, encoding="utf-8", errors="surrogatepass")
+    attempt(folder / "image.fits", catalogue=path, origin=0)
+    assert capfd.readouterr() == ("", "")
+
+
+# Damage and misuse that have their own words.
+
+
+def test_what_is_not_there_or_not_fits(tmp_path, folder):
+    (tmp_path / "empty.fits").write_bytes(b"")
+    (tmp_path / "text.fits").write_text("hello")
+    for name, message in (
+        ("nowhere.fits", "no such file"),
+        ("empty.fits", "the file is empty"),
+        ("text.fits", "not a FITS file"),
+        ("", "a folder, not a file"),
+    ):
+        with pytest.raises(ObservationError, match=f": {message}$"):
+            open_observation(tmp_path / name, stamp_px=D)
+    with pytest.raises(ObservationError, match=r"nowhere\.csv: no such file"):
+        open_observation(folder / "image.fits", stamp_px=D, catalogue=tmp_path / "nowhere.csv")
+
+
+@pytest.mark.parametrize(
+    ("shape", "message"),
+    [
+        ((4, 9, 9), "stamps of 9×9 pixels, expected 8×8 pixels"),
+        ((4, 8, 9), "stamps of 8×9 pixels, expected 8×8 pixels"),
+        ((30, 40), "an image of 30×40 pixels needs a star catalogue"),
+        ((2, 3, 8, 8), "an image of 4 dimensions, expected 2 or 3"),
+        ((64,), "an image of 1 dimensions, expected 2 or 3"),
+        ((0, 8, 8), "no image"),
+    ],
+)
+def test_wrong_dimensions_name_both_numbers(tmp_path, shape, message):
+    fits.PrimaryHDU(np.zeros(shape, dtype=np.float32)).writeto(tmp_path / "a.fits")
+    with pytest.raises(ObservationError, match=message):
+        open_observation(tmp_path / "a.fits", stamp_px=D)
+
+
+def test_a_truncated_cube_is_refused_before_any_pixel(tmp_path, folder):
+    data = (folder / "cube.fits").read_bytes()
+    end = 2880 + 4 * 30 * D * D
+    (tmp_path / "a.fits").write_bytes(data[: end - 10])
+    with pytest.raises(ObservationError, match="truncated: the last 10 bytes are missing"):
+        open_observation(tmp_path / "a.fits", stamp_px=D)
+    (tmp_path / "b.fits").write_bytes(data[:end])  # only the padding of the last block is missing
+    assert attempt(tmp_path / "b.fits")
+
+
+def test_a_file_that_changes_after_opening_is_noticed(tmp_path, folder):
+    path = tmp_path / "a.fits"
+    path.write_bytes((folder / "cube.fits").read_bytes())
+    found = open_observation(path, stamp_px=D)
+    write_cube(path, np.zeros((3, D, D)))
+    with pytest.raises(ObservationError, match="has changed"):
+        list(found.chunks(10))
+    path.unlink()
+    with pytest.raises(ObservationError, match="no such file"):
+        list(found.chunks(10))
+
+
+@pytest.mark.parametrize("coding", ["HCOMPRESS_1", "PLIO_1"])
+def test_tiles_whose_decoder_is_not_safe_are_refused(tmp_path, coding):
+    tiles = fits.CompImageHDU(np.ones((16, 16), dtype=np.int32), compression_type=coding)
+    fits.HDUList([fits.PrimaryHDU(), tiles]).writeto(tmp_path / "a.fits.fz")
+    with pytest.raises(ObservationError, match=f"compressed with {coding}, accepted are RICE_1"):
+        open_observation(tmp_path / "a.fits.fz", stamp_px=16)
+
+
+@pytest.mark.parametrize(("card", "value"), [("ZVAL1", 0), ("ZVAL2", 8), ("ZNAXIS2", 9999)])
+def test_damaged_settings_of_tiles_are_refused(tmp_path, card, value):
+    tiles = fits.CompImageHDU(np.ones((16, 16), dtype=np.int32))
+    fits.HDUList([fits.PrimaryHDU(), tiles]).writeto(tmp_path / "a.fits.fz")
+    with fits.open(tmp_path / "a.fits.fz", mode="update", disable_image_compression=True) as hdus:
+        hdus[1].header[card] = value
+    with pytest.raises(ObservationError, match="damaged: "):
+        open_observation(tmp_path / "a.fits.fz", stamp_px=16)
+
+
+@pytest.mark.parametrize(
+    "option",
+    [
+        {"stamp_px": 0},
+        {"margin": -1},
+        {"origin": 2},
+        {"pixel_scale_arcsec": 0.0},
+        {"gain": float("nan")},
+        {"saturate": -5.0},
+    ],
+)
+def test_options_out_of_range(folder, option):
+    with pytest.raises(ObservationError, match=r"cube\.fits: .*expected"):
+        open_observation(folder / "cube.fits", **({"stamp_px": D} | option))
+
+
+def test_no_rows_at_a_time_is_refused(folder):
+    with pytest.raises(ValueError, match="rows is 0"):
+        next(open_observation(folder / "cube.fits", stamp_px=D).chunks(0))
+
+
+def test_threads_leave_warnings_and_log_as_they_were(tmp_path):
+    before, level = list(warnings.filters), log.level
+    inside = threading.Barrier(2, timeout=0.2)
+
+    def read():
+        # Never both inside: one would restore the other's filters.
+        with reading(tmp_path), contextlib.suppress(threading.BrokenBarrierError):
+            inside.wait()
+
+    threads = [threading.Thread(target=read) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert inside.broken
+    assert (list(warnings.filters), log.level) == (before, level)

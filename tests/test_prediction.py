@@ -1,0 +1,443 @@
+"""PSFs of stars in memory: quality, uncertainty, photometry, centring, flags."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+
+import numpy as np
+import pytest
+
+from prediction_stars import KAPPA, SKY, observe
+from psfdae import Prediction, PredictionError, StarFlag, prediction
+from psfdae.prediction.centring import displacement, recut
+from psfdae.prediction.engine import BLOCK
+from psfdae.prediction.flags import MEANING, names
+from psfdae.prediction.shapes import measure_shapes
+from psfdae.prediction.stream import in_order
+
+LEVELS = (1e-4, 1e-3, 3e-3)
+COLUMNS = tuple(Prediction.__dataclass_fields__)
+
+
+def rms(values):
+    return np.sqrt(np.nanmean(np.square(values)))
+
+
+def has(found, flag):
+    return (found.flags & int(flag)) > 0
+
+
+def same(a, b, rows=slice(None)):
+    return all(
+        np.array_equal(getattr(a, name), getattr(b, name)[rows], equal_nan=True) for name in COLUMNS
+    )
+
+
+@pytest.fixture(scope="module")
+def medium(field_psfs):
+    """Stars of S/N 23."""
+    return observe(field_psfs, 1e-3)
+
+
+@pytest.fixture(scope="module")
+def clean(shipped, medium):
+    """Their prediction, nothing given."""
+    return shipped.predict(medium.stamps)
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_uncertainty_covers_68_per_cent(shipped, field_psfs, level):
+    stars = observe(field_psfs, level)
+    for given in ({"flux": stars.flux, "background": SKY}, {}):
+        found = shipped.predict(stars.stamps, **given)
+        kept = ~has(found, StarFlag.NO_FLUX)
+        assert kept.mean() > 0.99
+        error = np.abs(found.psf - stars.flux * stars.truth)[kept]
+        assert (error <= found.uncertainty[kept]).mean() == pytest.approx(0.68, abs=0.05)
+
+
+def test_errors_are_those_that_the_bundle_states(shipped, field_psfs):
+    for row in shipped.info.metrics[3:6]:
+        stars = observe(field_psfs, row["noise_level"])
+        found = shipped.predict(stars.stamps, flux=stars.flux, background=SKY)
+        mse = np.mean((found.psf / stars.flux - stars.truth) ** 2)
+        assert mse == pytest.approx(row["mse"], rel=0.15)
+
+
+def test_estimating_flux_and_sky_costs_less_than_the_noise_does(shipped, medium, clean):
+    given = shipped.predict(medium.stamps, flux=medium.flux, background=SKY)
+    truth = medium.truth
+    error = {
+        "given": rms(given.psf / medium.flux - truth),
+        "estimated": rms(clean.psf / clean.flux[:, None, None] - truth),
+        "noisy": rms((medium.stamps - SKY) / medium.flux - truth),
+    }
+    assert error["given"] < error["estimated"] < 1.3 * error["given"]
+    assert error["estimated"] < 0.5 * error["noisy"]
+
+
+@pytest.mark.parametrize("level", LEVELS[1:])
+def test_stated_flux_error_is_the_scatter(shipped, field_psfs, level):
+    stars = observe(field_psfs, level)
+    for given in ({"background": SKY}, {}):
+        found = shipped.predict(stars.stamps, **given)
+        assert rms(found.flux - stars.flux) == pytest.approx(rms(found.flux_error), rel=0.2)
+        assert np.nanmean(found.flux / stars.flux) == pytest.approx(1.0, abs=0.05)
+
+
+def test_noise_and_sky_are_measured(medium, clean):
+    assert np.mean(clean.noise) == pytest.approx(SKY**0.5, rel=0.05)
+    assert np.std(clean.noise / SKY**0.5) < 0.12
+    # A constant under a star of known flux would be known to σ/16.
+    assert np.mean(clean.background) == pytest.approx(SKY, abs=0.1 * SKY**0.5)
+    assert np.std(clean.background) < 0.3 * SKY**0.5
+    area = 1 / (medium.noise**2 * clean.snr**2)
+    assert np.median(area) == pytest.approx(71.0, rel=0.1)
+
+
+def test_signal_to_noise_is_the_matched_filter_s(shipped, clean):
+    area = shipped.info.noise_equivalent_px
+    mean = shipped.bundle.flux_model.mean
+    assert area == pytest.approx(1 / np.sum(mean**2))
+    assert clean.snr == pytest.approx(clean.flux / (clean.noise * area**0.5))
+
+
+def test_noise_of_very_bright_stars_is_never_too_small(shipped, field_psfs):
+    """Light of the star that the model does not know must not make the S/N infinite."""
+    found = shipped.predict(observe(field_psfs, 3e-5).stamps)
+    assert found.noise.min() > 0.8 * SKY**0.5
+    assert not has(found, StarFlag.SNR_HIGH).any()
+
+
+def test_residual_is_what_is_left_of_the_stamp(medium, clean):
+    left = medium.stamps - clean.background[:, None, None] - clean.psf
+    assert clean.residual == pytest.approx(left, abs=1e-2)
+    assert np.median(clean.chi2) == pytest.approx(1.0, abs=0.15)
+
+
+def test_photons_of_the_star_belong_to_chi2_if_the_gain_is_known(shipped, field_psfs):
+    stars = observe(field_psfs, 1e-4)
+    without = shipped.predict(stars.stamps, noise=SKY**0.5)
+    counted = shipped.predict(stars.stamps, noise=SKY**0.5, gain=1.0)
+    assert (counted.chi2 < without.chi2).all()
+    assert counted.flux_error == pytest.approx(np.hypot(without.flux_error, without.flux**0.5))
+
+
+def test_any_unit_gives_the_same_psf(shipped, medium, clean):
+    for unit in (1e-12, 7.0, 1e12):
+        found = shipped.predict(medium.stamps.astype(np.float64) * unit)
+        assert found.psf / unit == pytest.approx(clean.psf, rel=1e-3, abs=1e-2)
+        assert found.snr == pytest.approx(clean.snr, rel=1e-3)
+        assert np.mean(found.flags == clean.flags) > 0.99
+
+
+def test_result_depends_neither_on_threads_nor_on_company(shipped, medium, clean):
+    assert len(medium.stamps) > BLOCK
+    assert same(shipped.predict(medium.stamps, threads=2), clean)
+    assert same(shipped.predict(medium.stamps, threads=None), clean)
+    order = np.random.default_rng(0).permutation(len(medium.stamps))
+    for rows, some in ((slice(5, 8), None), (300, slice(300, 301)), (order, None)):
+        found = shipped.predict(medium.stamps[rows])
+        for name in COLUMNS:
+            expected = getattr(clean, name)[rows if some is None else some]
+            assert getattr(found, name) == pytest.approx(
+                expected, rel=1e-4, abs=1e-3, nan_ok=True
+            ), name
+
+
+def test_numbers_of_any_type_and_byte_order_are_taken(shipped, medium, clean):
+    few = medium.stamps[:9]
+    for stamps in (few.astype(">f4"), few.astype(np.int32), few.astype(">i2"), few.tolist()):
+        found = shipped.predict(stamps)
+        assert found.psf == pytest.approx(clean.psf[:9], rel=1e-4, abs=1e-2)
+        assert found.psf.dtype == np.float32
+
+
+def test_inputs_are_left_alone(shipped, medium):
+    stamps, bad = medium.stamps[:5].copy(), np.zeros((5, 16, 16), dtype=bool)
+    stamps[1, 3, 3], bad[2, 4, 4] = np.nan, True
+    before = stamps.copy(), bad.copy()
+    shipped.predict(stamps, bad=bad)
+    assert np.array_equal(stamps, before[0], equal_nan=True)
+    assert np.array_equal(bad, before[1])
+
+
+def test_no_star_gives_no_row(shipped):
+    found = shipped.predict(np.empty((0, 16, 16)))
+    assert len(found) == 0
+    assert found.uncertainty.shape == (0, 16, 16)
+
+
+def broken_stamps(stamps):
+    """One stamp of every kind of trouble, with masks and the flags that it must get."""
+    cases = {}
+
+    def add(name, flag, change):
+        cases[name] = (stamps[len(cases)].copy(), flag, change)
+
+    add("a NaN", StarFlag.MASKED, lambda s: s.__setitem__((4, 9), np.nan))
+    add("an infinity", StarFlag.MASKED, lambda s: s.__setitem__((8, 8), np.inf))
+    add("a dead row", StarFlag.MASKED, lambda s: s.__setitem__(5, np.nan))
+    add("all NaN", StarFlag.MASKED | StarFlag.NO_FLUX, lambda s: s.fill(np.nan))
+    add("a hot pixel", StarFlag.OUTLIER, lambda s: s.__setitem__((3, 3), 9e4))
+    add("a huge pixel", StarFlag.OUTLIER, lambda s: s.__setitem__((8, 8), 3e38))
+    add("zeros", StarFlag.NO_FLUX, lambda s: s.fill(0.0))
+    add("a constant", StarFlag.NO_FLUX, lambda s: s.fill(SKY))
+    add("negative", StarFlag.NO_FLUX, lambda s: np.subtract(2 * SKY, s, s))
+    add("all negative", StarFlag.NO_FLUX, lambda s: np.negative(s, s))
+    add("far off centre", StarFlag.OFF_CENTRE, lambda s: s.__setitem__(..., np.roll(s, 5, 0)))
+    add("another PSF", StarFlag.UNLIKE_TRAINING, lambda s: s.__setitem__(..., bar()))
+    changed = np.stack([case[0] for case in cases.values()])
+    for stamp, (_, _, change) in zip(changed, cases.values(), strict=True):
+        change(stamp)
+    return list(cases), changed, [case[1] for case in cases.values()]
+
+
+def bar():
+    """A trailed star."""
+    image = np.full((16, 16), SKY, np.float32)
+    image[8, 2:14] += 3e3
+    return image
+
+
+def test_broken_stamps_are_flagged_and_their_neighbours_do_not_notice(shipped, medium, clean):
+    kinds, stamps, flags = broken_stamps(medium.stamps)
+    found = shipped.predict(np.concatenate([stamps, medium.stamps[len(stamps) :]]))
+    for row, (kind, flag) in enumerate(zip(kinds, flags, strict=True)):
+        assert (found.flags[row] & int(flag)) == int(flag), kind
+    lost = has(found, StarFlag.NO_FLUX)
+    assert np.isnan(found.psf[lost]).all()
+    assert np.isfinite(found.psf[~lost]).all()
+    assert np.isfinite(found.uncertainty[~lost]).all()
+    rest = slice(len(stamps), None)
+    for name in COLUMNS:
+        expected = getattr(clean, name)[rest]
+        assert np.array_equal(getattr(found, name)[rest], expected, equal_nan=True), name
+
+
+def test_good_stars_carry_no_flag(shipped, field_psfs, clean):
+    assert (clean.flags > 0).mean() < 0.02
+    bright = shipped.predict(observe(field_psfs, 1e-4).stamps)
+    assert (bright.flags > 0).mean() < 0.02
+
+
+def test_masked_and_saturated_pixels_are_repaired_and_left_out(shipped, medium, clean):
+    bad = np.zeros(medium.stamps.shape, dtype=bool)
+    bad[:, 3, 4] = bad[:, 12, 7] = True
+    spoilt = medium.stamps.copy()
+    spoilt[bad] = 6e4
+    masked = shipped.predict(spoilt, bad=bad)
+    saturated = shipped.predict(spoilt, saturated=bad)
+    assert has(masked, StarFlag.MASKED).all()
+    assert not has(masked, StarFlag.SATURATED).any()
+    assert has(saturated, StarFlag.SATURATED).all()
+    assert np.isnan(masked.residual[bad]).all()
+    assert np.isfinite(masked.residual[~bad]).mean() > 0.999
+    assert np.array_equal(masked.psf, saturated.psf, equal_nan=True)
+    truth = medium.flux * medium.truth
+    assert rms(masked.psf - truth) < 1.2 * rms(clean.psf - truth)
+    assert np.median(masked.noise) == pytest.approx(np.median(clean.noise), rel=0.05)
+
+
+def test_half_a_star_is_still_measured_but_less_is_not(shipped, medium):
+    bad = np.zeros((2, 16, 16), dtype=bool)
+    bad[0, :6] = True
+    bad[1, :12] = True
+    found = shipped.predict(medium.stamps[:2], bad=bad)
+    assert not has(found, StarFlag.NO_FLUX)[0]
+    assert has(found, StarFlag.NO_FLUX)[1]
+
+
+def test_given_values_are_used_and_missing_ones_estimated(shipped, medium, clean):
+    flux = np.full(len(medium.stamps), np.nan)
+    flux[::2] = medium.flux
+    found = shipped.predict(medium.stamps, flux=flux, noise=123.0)
+    assert (found.flux[::2] == medium.flux).all()
+    assert np.isnan(found.flux_error[::2]).all()
+    assert np.isfinite(found.flux_error[1::2]).all()
+    assert (found.noise == 123.0).all()
+    sky = shipped.predict(medium.stamps, background=SKY + 1.0)
+    assert (sky.background == SKY + 1.0).all()
+    assert rms(sky.flux / medium.flux - 1) < rms(clean.flux / medium.flux - 1)
+    for wrong in (0.0, -5.0):
+        assert has(shipped.predict(medium.stamps[:3], flux=wrong), StarFlag.NO_FLUX).all()
+
+
+def test_sn_outside_the_training_is_flagged(shipped, field_psfs):
+    info = shipped.info
+    area = info.noise_equivalent_px**0.5
+    for snr, flag in (
+        (0.6 * info.snr_min, StarFlag.SNR_LOW),
+        (2.0 * info.snr_max, StarFlag.SNR_HIGH),
+    ):
+        stars = observe(field_psfs[:50], 1 / (snr * area * KAPPA))
+        found = shipped.predict(stars.stamps, flux=stars.flux, background=SKY, noise=SKY**0.5)
+        assert has(found, flag).all()
+
+
+def test_a_star_beside_the_middle_is_moved_there(shipped, field_psfs):
+    wide = np.zeros((64, 22, 22))
+    wide[:, 3:19, 3:19] = field_psfs[:64]
+    moved = np.roll(wide, (-2, 2), axis=(1, 2))
+    stars = observe(np.stack([wide, moved]).reshape(-1, 22, 22), 3e-4)
+    found = shipped.predict(stars.stamps, margin=3)
+    straight, shifted = found.shift_x[:64], found.shift_x[64:]
+    assert (straight == 0).mean() > 0.98
+    # Those that the jitter had moved the other way lie within it still.
+    assert set(np.unique(shifted)) <= {0, 1, 2, 3}
+    assert (shifted >= 2).mean() > 0.5
+    mine = shifted != 0
+    offset = np.stack([found.shift_y[64:], shifted], axis=1)
+    truth = stars.flux * recut(moved, offset, 16)
+    assert rms((found.psf[64:] - truth)[mine]) < 1.3 * rms(found.psf[:64] - truth_of(stars, 64))
+    too_far = shipped.predict(stars.stamps[64:], margin=3).flags & int(StarFlag.OFF_CENTRE)
+    assert (too_far > 0).mean() < 0.05
+
+
+def truth_of(stars, count):
+    return stars.flux * stars.truth[:count, 3:19, 3:19]
+
+
+def test_noise_moves_no_star(field_psfs):
+    for level in (3e-3, 1e-2):
+        stars = observe(field_psfs, level, seed=4)
+        assert displacement(stars.stamps, 1).any(axis=1).mean() < 0.01
+
+
+def test_recut_moves_the_middle():
+    wide = np.arange(2 * 100).reshape(2, 10, 10)
+    cut = recut(wide, np.array([[0, 0], [-1, 2]]), 6)
+    assert np.array_equal(cut[0], wide[0, 2:8, 2:8])
+    assert np.array_equal(cut[1], wide[1, 1:7, 4:10])
+
+
+def test_what_is_no_single_star_of_this_telescope_is_flagged(shipped, field_psfs, clean):
+    unlike = StarFlag.UNLIKE_TRAINING | StarFlag.OUTLIER | StarFlag.OFF_CENTRE
+    neighbour = np.zeros_like(field_psfs)
+    neighbour[:, 6:, :-6] = field_psfs[:, :-6, 6:]
+    doubles = shipped.predict(observe(field_psfs + neighbour, 3e-4).stamps)
+    assert has(doubles, unlike).mean() > 0.8
+    spike = np.zeros((50, 16, 16))
+    spike[:, 8, 8] = 1.0
+    assert has(shipped.predict(observe(spike, 1e-3).stamps), unlike).all()
+    assert has(clean, unlike).mean() < 0.02
+
+
+def gaussians(sigma, count=50, ratio=1.0, angle=0.0):
+    """Gaussians at random sub-pixel positions, integrated over fine sub-pixels."""
+    rng, q = np.random.default_rng(1), 5
+    grid = (np.arange(16 * q) + 0.5) / q - 8
+    x0, y0 = rng.uniform(-1, 1, (2, count, 1, 1))
+    x, y = grid[None, None, :] - x0, grid[None, :, None] - y0
+    u, v = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)
+    fine = np.exp(-0.5 * (u**2 + (v / ratio) ** 2) / sigma**2)
+    return fine.reshape(count, 16, q, 16, q).sum(axis=(2, 4))
+
+
+@pytest.mark.parametrize("fwhm", [2.0, 3.0, 5.0])
+def test_width_of_a_gaussian_with_its_pixel(fwhm):
+    sigma = fwhm / 2.3548
+    shapes = measure_shapes(gaussians(sigma))
+    assert shapes.fwhm_px == pytest.approx(2.3548 * np.hypot(sigma, 12**-0.5), rel=0.01)
+    assert shapes.ellipticity.max() < 0.02
+
+
+@pytest.mark.parametrize("degrees", [-60.0, 0.0, 30.0, 89.0])
+def test_axes_of_an_ellipse(degrees):
+    shapes = measure_shapes(gaussians(2.4, ratio=0.6, angle=np.deg2rad(degrees)))
+    major, minor = np.hypot(2.4, 12**-0.5), np.hypot(0.6 * 2.4, 12**-0.5)
+    assert shapes.ellipticity == pytest.approx(1 - minor / major, abs=0.01)
+    assert shapes.fwhm_px == pytest.approx(2.3548 * (major * minor) ** 0.5, rel=0.01)
+    off = (shapes.position_angle_deg - degrees + 90) % 180 - 90
+    assert np.abs(off).max() < 0.5
+
+
+def test_shapes_of_nothing_are_nan_and_of_anything_finite():
+    rng = np.random.default_rng(0)
+    odd = [np.zeros((16, 16)), -np.ones((16, 16)), np.full((16, 16), np.nan)]
+    spikes = [
+        np.ones((16, 16)),
+        rng.random((16, 16)) ** 8,
+        1e30 * np.eye(16),
+        np.eye(16)[:1] * np.ones((16, 1)),
+    ]
+    shapes = measure_shapes(np.stack(odd + spikes))
+    assert np.isnan(shapes.fwhm_px[:3]).all()
+    for values in vars(shapes).values():
+        assert np.isfinite(values[3:]).all()
+    assert (shapes.ellipticity[3:] >= 0).all()
+
+
+def test_scale_of_a_pixel_is_checked(shipped):
+    for scale in (0.1, 0.1019, 0.0981):
+        shipped.check_scale(scale, "x.fits")
+    for scale, text in ((0.1021, r"x\.fits: pixels of 0\.1021 arcsec.*trained on 0\.1 arcsec"),
+                        (None, r"x\.fits: .*--pixel-scale"),
+                        (np.nan, "x.fits: pixels of nan")):  # fmt: skip
+        with pytest.raises(PredictionError, match=text):
+            shipped.check_scale(scale, "x.fits")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"stamps": np.zeros((3, 24, 24))}, "3×24×24, but the model 'wfsat' takes n×16×16"),
+        ({"stamps": np.zeros((3, 16, 15))}, "3×16×15"),
+        ({"stamps": np.zeros(256)}, "shape 256"),
+        ({"margin": 2}, "takes n×20×20"),
+        ({"margin": -1}, "takes n×14×14"),
+        ({"stamps": np.zeros((3, 16, 16), complex)}, "complex128, expected real numbers"),
+        ({"stamps": [["a"]]}, "expected real numbers"),
+        ({"bad": np.zeros((3, 16, 15))}, r"bad of shape \(3, 16, 15\)"),
+        ({"saturated": np.zeros((2, 16, 16))}, r"saturated of shape \(2, 16, 16\)"),
+        ({"flux": np.ones(4)}, r"flux of shape \(4,\), expected one for 3 stamps"),
+        ({"noise": "many"}, "noise of type"),
+    ],
+)
+def test_what_does_not_fit_is_refused_with_the_numbers(shipped, arguments, message):
+    with pytest.raises(PredictionError, match=message):
+        shipped.predict(**{"stamps": np.zeros((3, 16, 16)), **arguments})
+
+
+def test_stream_keeps_order_and_takes_no_more_than_it_needs():
+    taken, lock = [], threading.Lock()
+
+    def items():
+        for number in range(50):
+            with lock:
+                taken.append(number)
+            yield number
+
+    results = in_order(lambda n: n * n, items(), 3)
+    assert next(results) == (0, 0)
+    assert len(taken) <= 5
+    assert list(results) == [(n, n * n) for n in range(1, 50)]
+
+
+def test_stream_raises_what_the_work_raises_and_stops():
+    done = []
+
+    def work(number):
+        if number == 3:
+            raise ZeroDivisionError
+        done.append(number)
+        return number
+
+    with pytest.raises(ZeroDivisionError):
+        list(in_order(work, range(1000), 2))
+    assert len(done) < 20
+
+
+def test_flags_have_names_and_meanings():
+    assert set(MEANING) == set(StarFlag)
+    assert names(0) == ""
+    assert names(int(StarFlag.MASKED | StarFlag.SNR_LOW)) == "MASKED|SNR_LOW"
+
+
+def test_package_answers_without_torch():
+    code = "import sys, psfdae; psfdae.__version__; assert 'torch' not in sys.modules"
+    code += "; assert callable(psfdae.load_model)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+    assert prediction.load_model.__doc__

@@ -1,0 +1,103 @@
+"""What an edit makes the workflow do again, and what not: the real DAG, planned on a copy."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from workflow_runs import ROOT, planned
+
+pytestmark = pytest.mark.workflow
+
+TARGETS = ("dataset3", "dataset8")
+FIGURES = {
+    *("figure_curves", "figure_errors", "figure_strip", "figure_templates", "figure_energy"),
+}
+
+
+@pytest.fixture
+def tree(tmp_path):
+    """A copy of everything that decides what runs."""
+    for name in ("Snakefile", "workflow", "config", "src"):
+        source = ROOT / name
+        if source.is_dir():
+            ignored = shutil.ignore_patterns("__pycache__")
+            shutil.copytree(source, tmp_path / name, ignore=ignored)
+        else:
+            shutil.copy(source, tmp_path / name)
+    return tmp_path
+
+
+@pytest.fixture
+def jobs(smoke, tree):
+    """Jobs that the smoke run would repeat with the edited copy."""
+    return lambda *targets: planned(smoke[0], *targets, root=tree)
+
+
+def append(path: Path, text: str) -> None:
+    assert path.is_file()
+    path.write_text(path.read_text() + text)
+
+
+def test_a_copy_alone_repeats_nothing(jobs):
+    assert jobs() == {}
+
+
+def test_comments_repeat_nothing(jobs, tree):
+    append(tree / "config/train/onecycle.yaml", "# A thought.\n")
+    append(tree / "config/dataset/dataset3.yaml", "# Another.\n")
+    append(tree / "src/psfdae/optics/propagation.py", "# And a third.\n")
+    assert jobs() == {}
+
+
+def test_learning_rate_of_one_dataset(jobs, tree):
+    """Its four trainings and evaluations, its tables and figures, its import; no more."""
+    append(tree / "config/dataset/dataset3.yaml", "train:\n  lr: 0.002\n")
+    assert jobs(*TARGETS, "tables") == {
+        "train": 4,
+        "evaluate": 4,
+        "paper_tables": 2,
+        "psf_metrics": 1,
+        "figure_curves": 1,
+        "figure_errors": 2,
+        "figure_strip": 2,
+        "track": 1,
+    }
+
+
+def test_plotting_module(jobs, tree):
+    """Figures, and their import into MLflow; nothing that computes."""
+    append(tree / "src/psfdae/evaluation/figures.py", "\nEDITED = True\n")
+    found = jobs(*TARGETS, "tables")
+    assert set(found) | {"figure_errors", "figure_curves"} >= FIGURES
+    assert set(found) <= FIGURES | {"track"}
+
+
+def test_optics_module(jobs, tree):
+    """Templates and stars, and all that is made from them."""
+    append(tree / "src/psfdae/optics/propagation.py", "\nEDITED = True\n")
+    found = jobs(*TARGETS, "tables")
+    assert found["templates"] == 2
+    assert found["stars"] == 2
+    assert found["train"] == 6
+    assert found["evaluate"] == 6
+    assert {"baseline", "paper_tables", "psf_metrics", "track"} <= set(found)
+
+
+def test_metric_module(jobs, tree):
+    """Evaluations and what follows, but no training."""
+    append(tree / "src/psfdae/evaluation/metrics.py", "\nEDITED = True\n")
+    found = jobs(*TARGETS, "tables")
+    assert found["evaluate"] == 6
+    assert not {"templates", "stars", "train", "baseline"} & set(found)
+
+
+def test_network_module(jobs, tree):
+    """Trainings and what follows, but no stars."""
+    append(tree / "src/psfdae/models/dae.py", "\nEDITED = True\n")
+    found = jobs(*TARGETS, "tables")
+    assert found["train"] == 6
+    assert found["evaluate"] == 6
+    assert not {"templates", "stars"} & set(found)

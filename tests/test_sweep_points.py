@@ -1,0 +1,375 @@
+"""Points of sweeps, trained and measured; their summary, figures and MLflow runs."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import shlex
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+
+from psfdae.configuration.compose import compose, load, load_stage, stage_tree
+from psfdae.files import Column, ProductError, write_product
+from psfdae.stages import baseline, sweep_figures, sweep_summary, track, train
+from psfdae.stages import sweep as stage
+from psfdae.stages.alignment_train import train_noise_trained
+from psfdae.stages.common import noise_model
+from psfdae.stars.splits import random_split
+from psfdae.sweep_runs import discover_sweep
+from psfdae.sweeps.measured import Task
+from psfdae.sweeps.space import SweepError
+
+SIZES = ("parts.train_stars=160", "parts.test_stars=60", "noise.levels=[0.001,0.005]")
+TINY = ("dataset=dataset3", "preset=smoke", *SIZES, "train.epochs=3")
+LEVELS = [0.001, 0.005]
+
+
+@pytest.fixture(scope="module")
+def stars(tmp_path_factory, gaussian_stars):
+    """240 Gaussians at 12 field points."""
+    return write_stars(tmp_path_factory.mktemp("stars") / "stars.h5", gaussian_stars[:240])
+
+
+def write_stars(path, images):
+    """Product of 240 images."""
+    columns = {
+        "realisation": Column(images, "1", "noise-free"),
+        "template": Column(images, "1", "noise-free"),
+        "field_index": Column(np.arange(240) % 12, "1", "field"),
+        "grid": Column(np.array([(i, j) for i in range(4) for j in range(3)]), "1", "field"),
+    }
+    write_product(path, "stars", columns, {"seed": 1, "scene": {"experiment": "scene1"}})
+    return path
+
+
+class Point:
+    """A folder for one point and the stage that fills it."""
+
+    def __init__(self, root, stars, name="0123456789ab"):
+        self.folder = root / "sweeps/tried/points" / name
+        self.task = Task(
+            *("dataset3", "random", "realisation"),
+            data={"stars": stars},
+            levels=LEVELS,
+            folder=self.folder,
+            checkpoint=root / f"{name}.pt",
+        )
+
+    def run(self, *overrides, model="dae", values=None, keys=None, trial=None, source="1"):
+        config = load_stage(f"sweep_{model}", (*TINY, *overrides))
+        stage.point(config, model, values or {}, keys or {}, self.task, trial, source)
+        return self.result()
+
+    def result(self):
+        return stage.read_result(self.folder / stage.RESULT)
+
+
+@pytest.fixture
+def point(tmp_path, stars):
+    return Point(tmp_path, stars)
+
+
+def test_point_is_the_main_workflow_s_training(point, stars, tmp_path):
+    result = point.run()
+    assert result["status"] == "finished"
+    assert (result["epochs"], result["attempt"]) == (3, 0)
+    config = load_stage("train", TINY)
+    train.run(config, stars, "random", "realisation", tmp_path / "main", tmp_path / "main.pt")
+    for name in ("dae.safetensors", "config.yaml"):
+        assert (tmp_path / "main" / name).read_bytes() == (point.folder / name).read_bytes()
+
+
+def test_metrics_are_those_of_the_tables_and_means_over_levels(point):
+    metrics = point.run()["metrics"]
+    for part, name in (("test", "evaluation.csv"), ("validation", "validation.csv")):
+        table = pd.read_csv(point.folder / name)
+        assert set(table.n) == {60 if part == "test" else 16}
+        for metric in ("mse", "ssim"):
+            values = table[table.metric == metric].set_index("noise_level").value
+            for level in LEVELS:
+                found = metrics[f"{part}_{metric}_{level:g}"]
+                assert found == pytest.approx(values[level], rel=1e-7)
+        both = [metrics[f"{part}_mse_{level:g}"] for level in LEVELS]
+        assert metrics[f"{part}_mse"] == pytest.approx(np.sqrt(both[0] * both[1]))
+
+
+def test_finished_point_is_not_trained_again_unless_something_changed(point, capsys):
+    first = point.run()
+    trained = (point.folder / stage.COST).stat().st_mtime_ns
+    # Snakemake deletes the result of a job that it believes to be incomplete.
+    (point.folder / stage.RESULT).unlink()
+    assert point.run() == first
+    assert "kept" in capsys.readouterr().out
+    assert (point.folder / stage.COST).stat().st_mtime_ns == trained
+    for change in ({"source": "2"}, {"values": {"train.lr": 0.1}}):
+        assert point.run(**change)["metrics"] == first["metrics"]
+        now = (point.folder / stage.COST).stat().st_mtime_ns
+        assert now > trained, change
+        trained = now
+    (point.folder / "dae.safetensors").unlink()
+    point.run(values={"train.lr": 0.1})
+    assert (point.folder / "dae.safetensors").is_file()
+
+
+def test_early_stopping_is_recorded(point):
+    late = ("train.epochs=40", "train.lr=0.3", "train.schedule=constant", "train.grad_clip=0.01")
+    result = point.run(*late, "train.patience=1", "train.validate_every=1")
+    assert result["status"] == "stopped"
+    assert result["epochs"] < 40
+    assert np.isfinite(result["metrics"]["validation_mse"])
+
+
+def test_failed_point_is_a_result_with_its_reason(point):
+    point.run()
+    fatal = ("train.lr=1", "train.restarts=0", "train.grad_clip=0", "train.dead_check_steps=1")
+    result = point.run(*fatal)
+    assert result["status"] == "failed"
+    assert re.search(r"lower train\.lr = 1", result["reason"])
+    assert result["metrics"] == {}
+    assert not (point.folder / "dae.safetensors").exists()
+    assert not point.task.checkpoint.exists()
+
+
+def test_baseline_is_the_main_workflow_s(point, stars, tmp_path):
+    assert point.run(model="pca_som")["status"] == "finished"
+    baseline.run(load_stage("baseline", TINY), stars, "random", tmp_path / "main.h5")
+    assert (tmp_path / "main.h5").read_bytes() == (point.folder / "pca_som.h5").read_bytes()
+
+
+def test_baseline_is_validated_on_stars_that_it_has_not_seen(tmp_path, gaussian_stars):
+    """Validation stars of a shape of their own cannot be known; a fit to them would know it."""
+    images = gaussian_stars[:240].copy()
+    validation = random_split(240, 160, 60, 0.1, load(TINY).seed).validation
+    images[validation] = 0.0
+    images[validation, 2, 2] = 1.0
+    point = Point(tmp_path, write_stars(tmp_path / "stars.h5", images))
+    point.run(model="pca_som")
+    table = pd.read_csv(point.folder / "validation.csv")
+    errors = table[table.metric == "mse"].value
+    # The spike alone, missed, is 1/256 per pixel.
+    assert (errors > 0.9 / 256).all()
+    config = load_stage("baseline", TINY)
+    noisy = noise_model(config).draw(images[validation], 0.001, np.random.default_rng(0))
+    seen = baseline.load(point.folder / "pca_som.h5").predict(noisy)
+    assert ((seen - images[validation]) ** 2).mean() < 0.1 / 256
+
+
+def test_more_components_than_stars_is_a_failed_point(point):
+    result = point.run("baseline.components=150", model="pca_som")
+    assert result["status"] == "failed"
+    assert result["reason"].startswith("baseline.components = 150: must be at most 144")
+
+
+def write_states(path, rng, count):
+    """Product of states with stamps that tell them: Gaussians shifted by the state."""
+    states = rng.uniform(-1, 1, (count, 4))
+    shift = np.stack([states[:, :2], states[:, 2:], -states[:, :2]], axis=1)[..., None, None]
+    y, x = np.mgrid[-8:8, -8:8]
+    stamps = np.exp(-0.1 * ((x - 3 * shift[:, :, 0]) ** 2 + (y - 3 * shift[:, :, 1]) ** 2))
+    stamps /= stamps.sum(axis=(2, 3), keepdims=True)
+    columns = {
+        "states": Column(states, "range", "true states"),
+        "stamps": Column(stamps.astype(np.float32), "1", "noise-free"),
+        "unit": Column(np.array([1e-3, 1e-3, 2e-3, 2e-3]), "m, m, rad, rad", "range"),
+    }
+    write_product(path, "alignment_states", columns, {"seed": 1})
+    return path
+
+
+def test_cnn_is_the_main_workflow_s_and_measured_on_other_states(tmp_path):
+    rng = np.random.default_rng(1)
+    roles = {"states": 200, "validation": 60, "test": 50}
+    data = {role: write_states(tmp_path / f"{role}.h5", rng, n) for role, n in roles.items()}
+    folder = tmp_path / "points/0123456789ab"
+    given = ("alignment_preset=smoke", "train_noise_trained.mirrors=false", "cnn.widths=[8,8,8]")
+    given += ("cnn.kernels=[5,3,3]", "cnn.strides=[2,2,2]")
+    task = Task(
+        *("noise_trained", "random", "realisation"),
+        data=data,
+        levels=[0.002],
+        folder=folder,
+        checkpoint=tmp_path / "sweep.pt",
+    )
+    stage.point(load_stage("sweep_noise_trained", given), "noise_trained", {}, {}, task)
+    config = load_stage("alignment_noise_trained", given)
+    train_noise_trained(config, data["states"], tmp_path / "main", tmp_path / "main.pt")
+    for name in ("cnn.safetensors", "config.yaml"):
+        assert (tmp_path / "main" / name).read_bytes() == (folder / name).read_bytes()
+    metrics = stage.read_result(folder / stage.RESULT)["metrics"]
+    for role, name in (("validation", "validation.csv"), ("test", "evaluation.csv")):
+        table = pd.read_csv(folder / name)
+        assert set(table.n) == {roles[role]}
+        mean = table[table.unit == "range"].mean_abs_error.mean()
+        assert metrics[f"{role}_mae"] == pytest.approx(mean, rel=1e-7)
+
+
+def test_trial_asks_and_trains_what_it_asked_for(point):
+    space = {"train.lr": {"low": 1e-3, "high": 1e-2, "log": True}}
+    search = {"space": space, "seed": 1, "startup": 2, "metric": "validation_mse"}
+    search |= {"direction": "minimize", "study": "s"}
+    journal = point.folder.parents[1] / "study.journal"
+    result = point.run(trial=stage.Trial(0, search, (), journal))
+    asked = result["values"]["train.lr"]
+    assert 1e-3 <= asked <= 1e-2
+    assert result["keys"] == {"train.lr": asked}
+    described = yaml.safe_load((point.folder / "config.yaml").read_text())
+    assert described["train"]["lr"] == asked
+    assert journal.stat().st_size > 0
+
+
+def write_points(root, outcomes):
+    """Results of a grid without any training; a metric of None is a failed point."""
+    files = []
+    for i, (width, lr, score) in enumerate(outcomes):
+        name = f"{i:012x}"
+        folder = root / "sweeps/tried/points" / name
+        folder.mkdir(parents=True, exist_ok=True)
+        metrics = {} if score is None else {"validation_mse": score, "test_mse": 1.1 * score}
+        result = {
+            **{"point": name, "slot": None, "model": "dae", "dataset": "dataset3"},
+            **{"split": "random", "reference": "realisation"},
+            "values": {"width": width, "train.lr": lr},
+            "keys": {"dae.widths": [width] * 9, "train.lr": lr},
+            "status": "failed" if score is None else "finished",
+            "reason": "the network died" if score is None else "",
+            **{"epochs": 3, "attempt": 0, "metrics": metrics, "config": {"train": {"lr": lr}}},
+        }
+        (folder / "result.json").write_text(json.dumps(result))
+        (folder / "cost.json").write_text('{"seconds": 2.0, "cpu_seconds": 1.5}')
+        if score is not None:
+            (folder / "dae.safetensors").write_bytes(name.encode())
+            (folder / "config.yaml").write_text("seed: 1\n")
+            header = "epoch,step,lr,train_mse,validation_mse,seconds,cpu_seconds"
+            (folder / "history.csv").write_text(f"{header}\n1,5,0.1,2e-5,1e-5,2.0,1.5\n")
+        files.append(folder / "result.json")
+    return files
+
+
+DEFINITION = {
+    **{"kind": "grid", "model": "dae", "dataset": "dataset3"},
+    **{"metric": "validation_mse", "direction": "minimize"},
+    "space": {"width": {"values": [4, 8]}, "train.lr": {"values": [0.001, 0.004]}},
+}
+OUTCOMES = [(4, 0.001, 3e-5), (4, 0.004, 2e-5), (8, 0.001, None), (8, 0.004, 1e-5)]
+GIVEN = ("preset=smoke", "train.epochs=3")
+
+
+def summarise(root, outcomes=OUTCOMES, **changes):
+    out = root / "sweeps/tried"
+    files = write_points(root, outcomes)
+    sweep_summary.summary("tried", {**DEFINITION, **changes}, GIVEN, files, out)
+    return out
+
+
+def test_summary_has_every_point_and_the_best_of_them(tmp_path):
+    out = summarise(tmp_path)
+    table = pd.read_csv(out / "summary.csv").set_index("point")
+    assert table.status.tolist() == ["finished", "finished", "failed", "finished"]
+    assert table.reason.tolist()[2] == "the network died"
+    assert table.best.tolist() == ["no", "no", "no", "yes"]
+    assert table.width.tolist() == [4, 4, 8, 8]
+    assert pd.read_csv(out / "cost.csv").seconds.tolist() == [2.0] * 4
+
+
+def test_best_is_chosen_by_validation_in_the_direction_asked_for(tmp_path):
+    def chosen(name, **changes):
+        tree = yaml.safe_load((summarise(tmp_path / name, **changes) / "best.yaml").read_text())
+        return tree["point"]
+
+    assert chosen("a") == f"{3:012x}"
+    assert chosen("b", direction="maximize") == f"{0:012x}"
+    results = [stage.read_result(p) for p in write_points(tmp_path / "c", OUTCOMES)]
+    for result in results:
+        result["metrics"]["test_mse"] = 0.0 if result["point"].endswith("0") else 1.0
+    best = sweep_summary.choose(results, "validation_mse", "minimize")
+    assert best["point"] == f"{3:012x}"
+
+
+def test_sweep_without_any_result_says_why(tmp_path):
+    with pytest.raises(SweepError, match=r"all 1 points of sweep tried failed.*the network died"):
+        summarise(tmp_path, [(4, 0.1, None)])
+
+
+def test_best_overrides_are_what_the_point_was(tmp_path):
+    summarise(tmp_path)
+    text = " ".join(sweep_summary.best_overrides(tmp_path, "tried"))
+    assert text == "train.epochs=3 dae.widths=[8,8,8,8,8,8,8,8,8] train.lr=0.004"
+    tree = stage_tree("train", compose(("preset=smoke", *shlex.split(text))))
+    assert (tree["train"]["lr"], tree["train"]["epochs"]) == (0.004, 3)
+    assert tree["dae"]["widths"] == [8] * 9
+
+
+def test_best_of_a_sweep_that_was_not_run_says_what_to_do(tmp_path):
+    with pytest.raises(ProductError, match="run `snakemake sweep --config sweep=tried`"):
+        sweep_summary.best_overrides(tmp_path, "tried")
+
+
+@pytest.mark.parametrize("kind", ["parallel", "response"])
+def test_figures_are_drawn_with_failed_points_and_the_same_again(tmp_path, kind):
+    out = summarise(tmp_path)
+    for name in ("a.png", "b.png"):
+        sweep_figures.run(kind, out / "sweep.yaml", out / "summary.csv", tmp_path / name)
+    image = (tmp_path / "a.png").read_bytes()
+    assert image.startswith(b"\x89PNG")
+    assert image == (tmp_path / "b.png").read_bytes()
+
+
+class Site:
+    """Imports of a sweep into MLflow."""
+
+    def __init__(self, root):
+        self.root, self.database = root, root / "mlflow.db"
+
+    def track(self):
+        entries = discover_sweep(self.root, "tried")
+        receipt = self.root / "receipt.csv"
+        track.run(entries, "smoke", self.database, self.root / "mlartifacts", receipt)
+        with receipt.open(newline="") as file:
+            return [row["action"] for row in csv.DictReader(file)]
+
+    def runs(self):
+        from mlflow import MlflowClient
+
+        client = MlflowClient(f"sqlite:///{self.database}")
+        experiment = client.get_experiment_by_name("sweep_tried").experiment_id
+        return {run.data.tags["source"]: run for run in client.search_runs([experiment])}
+
+
+def test_sweep_is_a_parent_run_with_a_child_per_point(tmp_path, monkeypatch):
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    for key, value in (("TIMEOUT", "3"), ("MAX_RETRIES", "0")):
+        monkeypatch.setenv(f"MLFLOW_HTTP_REQUEST_{key}", value)
+    monkeypatch.setenv("MLFLOW_DISABLE_TELEMETRY", "true")
+    summarise(tmp_path)
+    site = Site(tmp_path)
+    assert site.track() == ["created"] * 5
+    assert site.track() == ["unchanged"] * 5
+    runs = site.runs()
+    parent = runs.pop("sweeps/tried")
+    assert parent.data.metrics["best_validation_mse"] == 1e-5
+    assert parent.data.metrics["points_failed"] == 1
+    assert parent.data.tags["best_point"] == f"{3:012x}"
+    for run in runs.values():
+        assert run.data.tags["mlflow.parentRunId"] == parent.info.run_id
+    failed = runs[f"sweeps/tried/points/{2:012x}"]
+    assert (failed.info.status, failed.data.tags["reason"]) == ("FAILED", "the network died")
+    best = runs[f"sweeps/tried/points/{3:012x}"]
+    assert best.info.run_name == "width=8, train.lr=0.004"
+    assert best.data.metrics["test_mse"] == pytest.approx(1.1e-5)
+    assert best.data.params["axes.width"] == "8"
+    # A grid that has grown is another parent: old points move to it and are not doubled.
+    space = {**DEFINITION["space"], "width": {"values": [4, 8, 16]}}
+    summarise(tmp_path, [*OUTCOMES, (16, 0.004, 2e-5)], space=space)
+    assert site.track() == ["created", *["unchanged"] * 4, "created"]
+    parents = {run.data.tags.get("mlflow.parentRunId") for run in site.runs().values()}
+    assert len(parents - {None}) == 1
+    assert parent.info.run_id not in parents
+
+
+def test_sweep_without_summary_is_refused(tmp_path):
+    with pytest.raises(ProductError, match="run `snakemake sweep --config sweep=tried`"):
+        discover_sweep(tmp_path, "tried")

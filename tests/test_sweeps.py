@@ -1,0 +1,331 @@
+"""Points of sweeps: their names, their values, what a trial learns, what is checked."""
+
+from __future__ import annotations
+
+import json
+import random
+import shutil
+
+import numpy as np
+import pytest
+import yaml
+
+from psfdae.configuration import compose
+from psfdae.configuration.compose import ConfigError, config_dir, load
+from psfdae.configuration.sweep import Axis, load_sweep, sweep_names
+from psfdae.sweeps import adaptive
+from psfdae.sweeps.points import plan_sweep
+from psfdae.sweeps.space import SweepError, draws, grid, tidy, with_values
+
+PRESETS = sorted(p.stem for p in config_dir().glob("preset/*.yaml"))
+GRID = {
+    "kind": "grid",
+    "model": "dae",
+    "dataset": "dataset3",
+    "metric": "validation_mse",
+    "direction": "minimize",
+    "space": {
+        "width": {"keys": ["dae.widths"], "values": [4, 8], "repeat": 9},
+        "train.lr": [0.001, 0.004],
+    },
+}
+SEARCH = {"seed": 3, "startup": 4, "metric": "validation_mse", "direction": "minimize"}
+
+
+@pytest.fixture
+def sweep(tmp_path, monkeypatch):
+    """Writes a sweep into a copy of the configuration and plans it."""
+    folder = tmp_path / "config"
+    shutil.copytree(config_dir(), folder)
+    monkeypatch.setenv("PSFDAE_CONFIG", str(folder))
+    compose.compose.cache_clear()
+
+    def plan(tree, *given, name="tried"):
+        text = tree if isinstance(tree, str) else yaml.safe_dump(tree, sort_keys=False)
+        (folder / f"sweep/{name}.yaml").write_text(text)
+        return plan_sweep(name, ("preset=smoke", *given))
+
+    yield plan
+    compose.compose.cache_clear()
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("name", sweep_names())
+def test_every_shipped_sweep_can_be_planned(name, preset):
+    plan = plan_sweep(name, (f"preset={preset}",))
+    assert 5 <= len(plan.points) <= 12
+    if plan.sweep.kind != "adaptive":
+        assert len({json.dumps(p.values) for p in plan.points.values()}) == len(plan.points)
+    for point in plan.points.values():
+        assert "seed" in point.config
+
+
+def test_grid_has_every_combination_once(sweep):
+    points = list(sweep(GRID).points.values())
+    assert [tuple(p.values.values()) for p in points] == (
+        [(4, 0.001), (4, 0.004), (8, 0.001), (8, 0.004)]
+    )
+    assert points[2].config["dae"]["widths"] == [8] * 9
+    assert points[3].config["train"]["lr"] == 0.004
+
+
+def test_names_depend_on_content_not_on_order(sweep):
+    names = set(sweep(GRID).points)
+    axes = list(GRID["space"].items())
+    for seed in range(3):
+        random.Random(seed).shuffle(axes)
+        space = {
+            name: {**a, "values": a["values"][::-1]} if isinstance(a, dict) else a[::-1]
+            for name, a in axes
+        }
+        shuffled = dict(random.Random(seed).sample(list(GRID.items()), len(GRID)))
+        assert set(sweep({**shuffled, "space": space}, name=f"other{seed}").points) == names
+
+
+def test_names_of_a_grown_grid_contain_the_old_ones(sweep):
+    old = set(sweep(GRID).points)
+    wider = {**GRID["space"], "train.lr": [0.0005, 0.001, 0.004]}
+    new = set(sweep({**GRID, "space": wider}).points)
+    assert old < new
+    assert len(new) == 6
+
+
+def test_equal_numbers_are_equal_points(sweep):
+    text = yaml.safe_dump(GRID).replace("0.001", "1e-3").replace("0.004", "4.0E-3")
+    assert "1e-3" in text
+    assert set(sweep(text).points) == set(sweep(GRID).points)
+
+
+def test_names_follow_what_decides_the_result_and_nothing_else(sweep):
+    names = set(sweep(GRID).points)
+    assert set(sweep(GRID, "calibration.stars=30", "bounds.test_stars=5").points) == names
+    for change in ("train.batch=16", "telescope.obscuration=0.2", "noise.kappa=5", "seed=3"):
+        assert not set(sweep(GRID, change).points) & names, change
+    assert not set(sweep({**GRID, "reference": "template"}).points) & names
+    # The metric chooses among the points, it does not change them.
+    assert set(sweep({**GRID, "metric": "validation_ssim"}).points) == names
+
+
+def test_points_are_measured_at_the_dataset_s_levels_whatever_they_train_on():
+    plan = plan_sweep("noise_mix", ("preset=smoke",))
+    levels = load(["dataset=dataset3"]).noise.levels
+    assert plan.levels == levels
+    assert any(point.config["noise"]["levels"] != levels for point in plan.points.values())
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"kind": "all"}, r"tried\.yaml: kind = 'all'"),
+        ({"colour": "blue"}, "colour: unknown key"),
+        ({"trials": 5}, "trials: random and adaptive sweeps need it"),
+        ({"kind": "random"}, "trials: random and adaptive sweeps need it"),
+        ({"dataset": None}, "dataset: dae and pca_som need one"),
+        ({"model": "original"}, "dataset: .* scene 3's CNNs have none"),
+        ({"metric": "validation_mae"}, "model dae has validation_mse or validation_ssim"),
+        ({"space": {}}, "space = {}"),
+        ({"space": {"train.lr": []}}, r"space\.train\.lr\.values"),
+        ({"space": {"train.lr": {"low": 1e-3}}}, "either values, or choices, or low and high"),
+        ({"space": {"train.lr": {"low": 1e-3, "high": 1e-2}}}, "not a range"),
+        ({"space": {"seed": [1, 2]}}, "seed: a sweep of dae may change dae, train, noise.levels"),
+        ({"space": {"telescope.obscuration": [0.1]}}, "telescope.obscuration: a sweep of dae may"),
+        ({"space": {"baseline.rows": [4]}}, "baseline.rows: a sweep of dae may"),
+        ({"space": {"status": {"keys": ["train.lr"], "values": [1]}}}, "column of the summary"),
+        ({"overrides": {"train.lr": 0.1}}, "train.lr: set more than once"),
+        ({"space": {"train.learning": [0.1]}}, r"tried\.yaml: train\.learning: unknown key"),
+        ({"space": {"train.lr": [0.1, 7]}}, r"train\.lr = 7: .* \(point train\.lr=7\)"),
+        ({"space": {"dae.widths": [[4, 4]]}}, "10 kernels need 9 widths"),
+        ({"dataset": "dataset99"}, "dataset99"),
+    ],
+)
+def test_every_mistake_is_named_before_any_work(sweep, change, message):
+    with pytest.raises((ConfigError, SweepError), match=message):
+        assert sweep({**GRID, **change}).points
+
+
+def test_range_with_an_impossible_end_is_refused(sweep):
+    tree = {**GRID, "kind": "adaptive", "trials": 3, "space": {"train.lr": {"low": 0.1, "high": 2}}}
+    with pytest.raises(SweepError, match=r"train\.lr = 2\.0: .*less than or equal to 1"):
+        assert sweep(tree).points
+
+
+def test_damaged_file_and_unknown_name_are_named(sweep):
+    with pytest.raises(ConfigError, match=r"tried\.yaml: .*line"):
+        sweep("kind: [grid\n")
+    with pytest.raises(ConfigError, match=r"sweep = 'nothing': must be one of .*dae_width"):
+        load_sweep("nothing")
+
+
+def test_other_keys_of_the_tree_stay():
+    tree = {"train": {"lr": 1, "batch": 2}, "dae": {"widths": [4]}}
+    new = with_values(tree, {"train.lr": 5})
+    assert new == {"train": {"lr": 5, "batch": 2}, "dae": {"widths": [4]}}
+    assert tree["train"]["lr"] == 1
+    for key in ("train.rate", "train", "train.lr.x", "optics.nodes"):
+        with pytest.raises(SweepError, match="unknown key"):
+            with_values(tree, {key: 1})
+
+
+def axes(**space):
+    return {name: Axis.model_validate(axis) for name, axis in space.items()}
+
+
+def test_grid_of_lists_and_choices():
+    found = grid(axes(a=[1, 2], b={"choices": {3: {"x": 1}, 4: {"x": 2}}}))
+    assert found == [{"a": i, "b": j} for i in (1, 2) for j in ("3", "4")]
+
+
+def test_draws_extend_and_each_axis_is_on_its_own():
+    space = axes(a={"low": 1, "high": 9, "integer": True}, b={"low": 1e-4, "high": 1, "log": True})
+    assert draws(space, 9, seed=5)[:4] == draws(space, 4, seed=5)
+    alone = [point["b"] for point in draws({"b": space["b"]}, 4, seed=5)]
+    assert alone == [point["b"] for point in draws(space, 4, seed=5)]
+    assert draws(space, 4, seed=6) != draws(space, 4, seed=5)
+
+
+def test_draws_fill_their_range_evenly():
+    space = axes(
+        whole={"low": 1, "high": 4, "integer": True},
+        even={"low": 2, "high": 4},
+        log={"low": 1e-4, "high": 1, "log": True},
+        listed=["x", "y"],
+    )
+    found = draws(space, 2000, seed=1)
+    counts = np.bincount([point["whole"] for point in found])[1:]
+    assert counts.size == 4
+    # Five standard deviations of a binomial with 2000 trials of probability 1/4.
+    assert np.abs(counts - 500).max() < 5 * np.sqrt(2000 * 0.25 * 0.75)
+    listed = sum(point["listed"] == "x" for point in found)
+    assert abs(listed - 1000) < 5 * np.sqrt(2000 * 0.25)
+    for unit in (
+        (np.array([point["even"] for point in found]) - 2) / 2,
+        np.log10([point["log"] for point in found]) / 4 + 1,
+    ):
+        assert unit.min() >= 0
+        assert unit.max() <= 1
+        assert abs(unit.mean() - 0.5) < 5 / np.sqrt(12 * 2000)
+        assert abs(unit.var() - 1 / 12) < 0.01
+
+
+def test_numbers_are_short_and_stay_inside():
+    axis = Axis(low=0.00123456, high=0.987654)
+    assert tidy(axis, 0.1234567) == 0.1235
+    assert tidy(axis, 0.9876539) == 0.987654
+    assert tidy(axis, 0.00123457) == 0.001235
+    assert tidy(Axis(low=2, high=8, integer=True), 7.6) == 8
+
+
+SPACE = axes(
+    x={"low": -4.0, "high": 4.0},
+    kind={"choices": {"good": {"k": 0}, "bad": {"k": 1}}},
+    list=[[1, 2], [3, 4]],
+)
+
+
+def outcome(slot, values, status="finished"):
+    """Result of a trial on a parabola."""
+    loss = (values["x"] - 1.5) ** 2 + (values["kind"] == "bad")
+    metrics = {"validation_mse": loss} if status == "finished" else {}
+    name = f"{slot:012x}"
+    return {"slot": slot, "point": name, "values": values, "status": status, "metrics": metrics}
+
+
+def run_trials(count, known_at=lambda slot: slot, journal=None):
+    results = []
+    for slot in range(count):
+        known = results[: known_at(slot)]
+        values = adaptive.ask(SPACE, SEARCH, slot, known)
+        results.append(outcome(slot, values, "failed" if slot == 2 else "finished"))
+        if journal is not None:
+            search = {**SEARCH, "study": "s"}
+            about = {"slot": slot, "point": results[-1]["point"]}
+            adaptive.begin(journal, SPACE, search, about, values, known)
+            adaptive.finish(journal, SPACE, search, results[-1])
+    return results
+
+
+def test_asking_is_a_function_of_what_is_known():
+    results = run_trials(8)
+    assert run_trials(8) == results
+    again = adaptive.ask(SPACE, SEARCH, 8, results)
+    assert adaptive.ask(SPACE, SEARCH, 8, results[::-1]) == again
+    assert again["list"] in ([1, 2], [3, 4])
+    assert adaptive.ask(SPACE, {**SEARCH, "seed": 4}, 8, results) != again
+
+
+def test_search_learns():
+    """On a parabola the later trials come nearer to the minimum than random ones do."""
+    results = [r for r in run_trials(40, lambda slot: max(0, slot - 1)) if r["metrics"]]
+    losses = np.array([r["metrics"]["validation_mse"] for r in results])
+    blind = draws(SPACE, 2000, seed=1)
+    expected = np.median([(v["x"] - 1.5) ** 2 + (v["kind"] == "bad") for v in blind])
+    assert np.median(losses[-15:]) < 0.5 * expected
+
+
+def test_trial_waits_for_all_but_those_beside_it(sweep):
+    tree = {**GRID, "kind": "adaptive", "trials": 5, "parallel": 2}
+    plan = sweep(tree)
+    slots = [[other.slot for other in plan.known(p)] for p in plan.points.values()]
+    assert slots == [[], [], [0], [0, 1], [0, 1, 2]]
+
+
+def test_more_trials_keep_the_old_ones_and_another_search_has_others(sweep):
+    tree = {**GRID, "kind": "adaptive", "trials": 3}
+    old = list(sweep(tree).points)
+    assert list(sweep({**tree, "trials": 5}).points)[:3] == old
+    assert sweep({**tree, "trials": 5}).study == old[0]
+    for change in ({"seed": 1}, {"direction": "maximize"}, {"startup": 2}):
+        assert not set(sweep({**tree, **change}).points) & set(old)
+    narrower = {**GRID["space"], "train.lr": [0.001]}
+    assert not set(sweep({**tree, "space": narrower}).points) & set(old)
+
+
+def trials(journal):
+    import optuna
+    from optuna.storages import JournalStorage
+    from optuna.storages.journal import JournalFileBackend
+
+    storage = JournalStorage(JournalFileBackend(str(journal)))
+    study = optuna.load_study(study_name="s", storage=storage)
+    return [(t.user_attrs["slot"], t.state.name, t.value) for t in study.trials]
+
+
+def test_journal_holds_every_trial_once(tmp_path):
+    journal = tmp_path / "sweep/study.journal"
+    results = run_trials(5, journal=journal)
+    expected = [
+        (r["slot"], "COMPLETE" if r["metrics"] else "FAIL", r["metrics"].get("validation_mse"))
+        for r in results
+    ]
+    assert trials(journal) == expected
+    adaptive.finish(journal, SPACE, {**SEARCH, "study": "s"}, results[3])
+    assert trials(journal) == expected
+
+
+def test_interrupted_trial_goes_on_under_its_number(tmp_path):
+    journal, search = tmp_path / "study.journal", {**SEARCH, "study": "s"}
+    values = adaptive.ask(SPACE, SEARCH, 0, [])
+    about = {"slot": 0, "point": f"{0:012x}"}
+    for _ in range(2):
+        adaptive.begin(journal, SPACE, search, about, values, [])
+    assert trials(journal) == [(0, "RUNNING", None)]
+    result = outcome(0, values)
+    adaptive.finish(journal, SPACE, search, result)
+    assert trials(journal) == [(0, "COMPLETE", result["metrics"]["validation_mse"])]
+
+
+def test_lost_or_damaged_journal_is_written_again(tmp_path, capsys):
+    journal, search = tmp_path / "study.journal", {**SEARCH, "study": "s"}
+    results = run_trials(3, journal=journal)
+    before = trials(journal)
+    values = adaptive.ask(SPACE, SEARCH, 3, results)
+    about = {"slot": 3, "point": f"{3:012x}"}
+    with journal.open("a") as file:
+        file.write('{"op_code":4,"worker')
+        file.write("\n")
+    adaptive.begin(journal, SPACE, search, about, values, results)
+    assert "set aside" in capsys.readouterr().out
+    assert trials(journal) == [*before, (3, "RUNNING", None)]
+    journal.unlink()
+    adaptive.begin(journal, SPACE, search, about, values, results)
+    assert trials(journal) == [*before, (3, "RUNNING", None)]

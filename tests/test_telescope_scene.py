@@ -1,0 +1,328 @@
+"""A telescope of one's own: its aberrations against Seidel's theory and the ray trace."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from psfdae.cli import main
+from psfdae.configuration.compose import (
+    ConfigError,
+    as_overrides,
+    compose,
+    load,
+    load_stage,
+    stage_tree,
+)
+from psfdae.files import read_product
+from psfdae.observations import open_observation
+from psfdae.optics.field_zernikes import field_coefficients, slope_ranges, zernike_images
+from psfdae.optics.pupil import annular_pupil
+from psfdae.optics.raytracing import RayTracingError
+from psfdae.optics.seidel import gradient_ranges
+from psfdae.stages import stars, templates
+from psfdae.stars.alignment_scene import zernike_tracer
+from psfdae.stars.alignment_stamps import AlignmentStamps, mean_slope
+from psfdae.stars.framing import normalise_flux
+from psfdae.stars.scene import Propagation
+from psfdae.stars.seidel_scene import SeidelWavefronts, relative_field
+from psfdae.stars.telescope_scene import star_wavefronts, static_terms, template_wavefronts
+from psfdae.stars.zernike_wavefronts import ZernikeWavefronts
+
+OWN = "dataset=_telescope"
+Z4, Z5, Z8, Z11 = 2 * np.sqrt(3), np.sqrt(6), 3 * np.sqrt(8), 6 * np.sqrt(5)
+
+
+def zernikes_of_scene_1(seidel):
+    """Seidel's theory in Noll's terms by hand: ρ⁴, ρ³ cos, ρ² cos 2θ … expanded.
+
+    Piston is left out. Per Noll index, coefficient by powers of the field (x, y).
+    """
+    w040, w131, w222, w220, w311 = seidel
+    focus = (w220 + 0.5 * w222) / Z4
+    tilt = w131 / 3
+    return {
+        2: {(1, 0): tilt, (3, 0): w311 / 2, (1, 2): w311 / 2},
+        3: {(0, 1): tilt, (0, 3): w311 / 2, (2, 1): w311 / 2},
+        4: {(0, 0): w040 / Z4, (2, 0): focus, (0, 2): focus},
+        5: {(1, 1): w222 / Z5},
+        6: {(2, 0): w222 / (2 * Z5), (0, 2): -w222 / (2 * Z5)},
+        7: {(0, 1): w131 / Z8},
+        8: {(1, 0): w131 / Z8},
+        11: {(0, 0): w040 / Z11},
+    }
+
+
+@pytest.fixture(scope="module")
+def both(scene1):
+    """Scene 1's templates as Seidel's monomials and as Zernikes over the field."""
+    _, field = relative_field(scene1.grid)
+    seidel = scene1.wavefront.coefficients
+    terms = zernikes_of_scene_1(seidel)
+    coefficients = field_coefficients(list(terms.values()), field)
+    return (
+        SeidelWavefronts(np.tile(seidel, (len(field), 1)), field),
+        ZernikeWavefronts(tuple(terms), coefficients),
+    )
+
+
+def test_seidel_s_wavefront_in_zernikes(both):
+    pupil = annular_pupil(64, 0.0)
+    everyone = np.arange(121)
+    lit = pupil.amplitude > 0.5
+    ours, expected = (
+        source.opd(everyone, pupil, np.dtype(np.float64))[:, lit] for source in both[::-1]
+    )
+    assert np.ptp(expected) > 10
+    difference = ours - expected
+    assert np.ptp(difference, axis=1) == pytest.approx(0, abs=1e-9)
+
+
+def test_seidel_s_stamps_from_zernikes(scene1, both):
+    """Tilts included: the brightest pixels are the same."""
+    framing = scene1.framing
+    offsets = np.zeros((3, 2))
+    some = np.array([0, 38, 60])
+    stamps, peaks = [], []
+    for source in both:
+        propagation = Propagation(
+            source, scene1.telescope, scene1.optics, framing, framing.search_px
+        )
+        stamps.append(propagation.stamps(32, offsets, some))
+        peaks.append(propagation.brightest(some))
+    assert stamps[0] == pytest.approx(stamps[1], abs=2e-5 * stamps[0].max())
+    assert (peaks[0] == peaks[1]).all()
+
+
+def test_slopes_are_those_of_the_same_polynomials(both):
+    seidel, zernikes = both
+    assert zernikes.slopes() == pytest.approx(gradient_ranges(seidel.coefficients), abs=1e-5)
+    flat = slope_ranges((4,), np.array([[1.0]]))
+    assert flat[0] == pytest.approx(np.full((2, 2), [-4 * np.sqrt(3), 4 * np.sqrt(3)]), abs=1e-6)
+
+
+@pytest.mark.parametrize(("noll", "axis"), [(2, 1), (3, 0)])
+def test_tilt_moves_the_image_along_its_axis(scene1, noll, axis):
+    """Z2 = 2x waves is a slope of 2 waves per radius: + 4 λ/D along x, the columns."""
+    source = ZernikeWavefronts((noll,), np.array([[3.0]]))
+    propagation = Propagation(source, scene1.telescope, scene1.optics, scene1.framing, 24)
+    moved = np.zeros(2)
+    moved[axis] = 3.0 * 4.0 / scene1.telescope.pixel
+    assert propagation.brightest()[0] == pytest.approx(moved - 0.5, abs=0.51)
+
+
+def test_field_polynomials():
+    field = np.array([[0.5, -2.0]])
+    terms = [{(0, 0): 1.0, (1, 0): 2.0}, {(2, 1): 3.0}, {}]
+    assert field_coefficients(terms, field) == pytest.approx(np.array([[2.0, -1.5, 0.0]]))
+
+
+def test_zernike_images_follow_the_list():
+    x = np.array([0.3, -0.2])
+    assert zernike_images((3, 2), x, 0 * x) == pytest.approx(np.stack([0 * x, 2 * x]), abs=1e-12)
+
+
+@pytest.fixture(scope="module")
+def traced():
+    """The ray-traced example on fields of which five are scene 3's."""
+    edge = 0.5 / 2**0.5
+    names = [OWN, "telescope=example_raytraced", "grid.points=3"]
+    return load([*names, f"telescope.field_edge_deg={edge!r}"])
+
+
+def test_ray_trace_is_that_of_scene_3(traced):
+    alignment = load((), "alignment")
+    tracer = zernike_tracer(alignment)
+    noll, ours = static_terms(traced)
+    theirs = -tracer(np.zeros((1, 4)))[0, :, 3:]
+    assert noll == tuple(range(4, 23))
+    assert traced.telescope.aberrations.defocus_m == alignment.alignment.defocus_m
+    # Scene 3's circle starts on the x axis; its odd points are the corners of the grid.
+    for own, other in ((4, 0), (8, 2), (6, 4), (0, 6), (2, 8)):
+        assert ours[own] == pytest.approx(theirs[other], abs=1e-9)
+    assert np.abs(theirs).max() > 0.3
+
+
+def test_ray_traced_stamps_are_those_of_scene_3(traced):
+    """In pixels, to which the sign of every term and both axes count."""
+    alignment = load((), "alignment")
+    source = template_wavefronts(traced)
+    leaning = source.coefficients[[0, 4, 8]]
+    leaning[:, 3:5] += [0.2, -0.1]  # the aligned telescope has too little coma to tell its sign
+    operator = AlignmentStamps(traced.telescope, alignment.optics, alignment.alignment)
+    expected, _ = operator(-leaning)
+    # Scene 3 centres a stamp on the centroid, 2 λ/D per wave of mean slope away.
+    slopes = np.array([mean_slope(j, traced.telescope.obscuration) for j in source.noll])
+    centroid = 2.0 * (leaning @ slopes)[:, ::-1] / traced.telescope.pixel
+    own = ZernikeWavefronts(source.noll, leaning)
+    propagation = Propagation(own, traced.telescope, traced.optics, traced.framing, 24)
+    stamps, _ = normalise_flux(propagation.stamps(16, centroid))
+    assert np.abs(stamps - expected).max() < 2e-3 * expected.max()
+    for other in (expected[:, ::-1], expected[:, :, ::-1], expected.swapaxes(1, 2)):
+        assert np.abs(stamps - other).max(axis=(1, 2)).min() > 0.1 * expected.max()
+
+
+def test_field_beyond_the_corrector_is_refused(traced):
+    with pytest.raises(RayTracingError, match="vignetted"):
+        static_terms(load([OWN, "telescope=example_raytraced", "telescope.field_edge_deg=3"]))
+
+
+def test_seidel_telescope_is_scene_1_byte_by_byte(tmp_path):
+    small = ["grid.points=3", "stars.count=24", "stars.name=seidel_10pct"]
+    own = [OWN, "telescope=example_seidel", "grid.spacing_deg=1.1", "optics=scene1"]
+    own += ["framing=stamp16", "stars.search_px=24"]
+    products = []
+    for name, choice in (("paper", ["stars=seidel_10pct"]), ("own", own)):
+        fields, out = tmp_path / f"{name}_t.h5", tmp_path / f"{name}.h5"
+        templates.run(load_stage("templates", [*choice, *small]), fields)
+        stars.run(load_stage("stars", [*choice, *small]), fields, out)
+        products.append((read_product(fields, "templates"), read_product(out, "stars")))
+    for paper, mine in zip(*products, strict=True):
+        assert set(paper.arrays) == set(mine.arrays)
+        for column, values in paper.arrays.items():
+            assert values.tobytes() == mine[column].tobytes(), column
+
+
+def test_random_aberrations_have_both_spreads():
+    config = load([OWN, "stars.aberration_fraction=0.2", "grid.points=3"])
+    field = np.full(20000, 8)
+    drawn = star_wavefronts(config, field)
+    _, static = static_terms(config)
+    assert drawn.coefficients.mean(axis=0) == pytest.approx(static[8], abs=0.005)
+    jitter = config.telescope.aberrations.jitter_waves
+    assert drawn.coefficients.std(axis=0) == pytest.approx(
+        np.hypot(0.2 * static[8], jitter), rel=0.03
+    )
+    assert drawn.columns()["zernike"].values.shape == drawn.coefficients.shape
+    again = star_wavefronts(config, field)
+    assert (again.coefficients == drawn.coefficients).all()
+
+
+def test_stars_of_zernike_telescope_differ_from_their_template(tmp_path):
+    choice = [OWN, "grid.points=3", "stars.count=20"]
+    templates.run(load_stage("templates", choice), tmp_path / "t.h5")
+    stars.run(load_stage("stars", choice), tmp_path / "t.h5", tmp_path / "s.h5")
+    product = read_product(tmp_path / "s.h5", "stars")
+    assert product["realisation"].sum(axis=(1, 2)) == pytest.approx(np.ones(20), abs=1e-5)
+    assert np.abs(product["realisation"] - product["template"]).max() > 0.01
+    assert np.abs(product["phase"]).max() > 0.3
+
+
+def test_what_follows_from_the_telescope():
+    config = load([OWN, "telescope.pixel_scale_arcsec=1.6", "grid.points=5"])
+    assert config.grid.spacing_deg == pytest.approx(0.5)
+    assert config.grid.edge_deg == config.telescope.field_edge_deg == 1.0
+    assert config.telescope.pixel == pytest.approx(3.88, abs=0.01)
+    assert config.optics.nodes == 8
+    assert config.framing.search_px == config.stars.search_px == 13
+    assert load([OWN, "optics.nodes=12", "framing.search_px=30"]).optics.nodes == 12
+
+
+def test_other_scenes_keep_their_groups():
+    """Their products hold the configuration; a new key would change their bytes."""
+    dumped = load_stage("templates", ["scene=seidel"]).model_dump()
+    keys = {"name", "diameter_m", "obscuration", "wavelength_m", "pixel_scale_arcsec"}
+    assert set(dumped["telescope"]) == keys
+    assert dumped["wavefront"]["kind"] == "seidel"
+
+
+@pytest.mark.parametrize("telescope", ["zernike", "seidel", "raytraced"])
+def test_workflow_s_overrides_reproduce_the_configuration(telescope):
+    """Options that differ in their keys are chosen by name, then every key is pinned."""
+    option = f"telescope=example_{telescope}"
+    chosen = (OWN, option, "preset=smoke")
+    tree = stage_tree("stars", compose(chosen))
+    assert load_stage("stars", [OWN, option, *as_overrides(tree)]) == load_stage("stars", chosen)
+
+
+TERMS = "telescope.aberrations.terms"
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["telescope=example_zernike"], "brings its own aberrations, but scene = seidel"),
+        ([OWN, "telescope=wfsat"], "wfsat: has no aberrations; scene = telescope needs"),
+        ([OWN, "telescope.pixel_scale_arcsec=20"], "needs 78 quadrature nodes; at most 32"),
+        ([OWN, "telescope.diameter_m=-1"], r"^telescope\.diameter_m = -1: .*greater than 0$"),
+        ([OWN, f"++{TERMS}.z1=1"], r"'z1': must be between z2 and z45"),
+        ([OWN, f"++{TERMS}.coma=1"], r"'coma': must be between z2 and z45"),
+        ([OWN, f"++{TERMS}.z4.xz=1"], r"z4: 'xz': must be constant or a product such as"),
+        ([OWN, f"++{TERMS}.z4.xxxxyyy=1"], "of degree 6 or less"),
+        ([OWN, f"++{TERMS}.z4=high"], r"terms\.z4 = 'high'"),
+        ([OWN, "telescope.aberrations.kind=spot"], "kind = 'spot': must be seidel, zernike"),
+        ([OWN, "++telescope.aberrations.seing=1"], r"^telescope\.aberrations\.seing: unknown key$"),
+        ([OWN, "++telescope.colour=1"], r"^telescope\.colour: unknown key$"),
+        ([OWN, "stars.aberration_fraction=0"], "jitter_waves = 0.03: .*must be above 0"),
+        ([OWN, "telescope.field_edge_deg=90"], r"field_edge_deg = 90: .*less than or equal to 45"),
+    ],
+)
+def test_every_mistake_is_named(overrides, message):
+    with pytest.raises(ConfigError, match=message):
+        load(overrides)
+
+
+def simulate(folder, *arguments):
+    return CliRunner().invoke(main, ["simulate", "--out", str(folder), *arguments])
+
+
+def test_simulate_writes_what_the_stage_writes(tmp_path):
+    choice = ["telescope=example_zernike", "grid.points=3"]
+    result = simulate(tmp_path / "mine", "--fits", "--image-snr", "40", *choice)
+    assert result.exit_code == 0, result.output
+    names = {"templates.h5", "psfs.png", "fields.csv", "psfs.fits", "image.fits", "stars.csv"}
+    assert {path.name for path in (tmp_path / "mine").iterdir()} == names
+    templates.run(load_stage("templates", [OWN, *choice]), tmp_path / "t.h5")
+    assert (tmp_path / "mine/templates.h5").read_bytes() == (tmp_path / "t.h5").read_bytes()
+    table = np.genfromtxt(tmp_path / "mine/fields.csv", delimiter=",", names=True)
+    assert sorted(set(table["x_deg"])) == [-1, 0, 1]
+    product = read_product(tmp_path / "t.h5", "templates")
+    assert table["energy"] == pytest.approx(product["energy"], rel=1e-5)
+    assert (table["fwhm_arcsec"] > 0.8).all()
+
+
+def test_simulated_observations_can_be_read(tmp_path):
+    choice = ["telescope=example_zernike", "grid.points=3"]
+    for folder in ("one", "two"):
+        simulate(tmp_path / folder, "--fits", "--image-snr", "40", *choice)
+    for name in ("psfs.fits", "image.fits", "stars.csv", "psfs.png"):
+        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
+    cube = open_observation(tmp_path / "one/psfs.fits", stamp_px=16)
+    assert (cube.count, cube.pixel_scale_arcsec) == (9, 0.8)
+    psf = next(cube.chunks(9)).data
+    image = open_observation(
+        tmp_path / "one/image.fits", catalogue=tmp_path / "one/stars.csv", stamp_px=16
+    )
+    assert image.pixel_scale_arcsec == pytest.approx(0.8, rel=1e-6)
+    data = next(image.chunks(9)).data - 1000.0
+    mean = (psf / psf.sum(axis=(1, 2), keepdims=True)).mean(axis=0)
+    flux = (data * mean).sum(axis=(1, 2)) / (mean**2).sum()
+    assert np.mean(flux) / np.sqrt(1000.0 / (mean**2).sum()) == pytest.approx(40, rel=0.1)
+
+
+def test_psf_that_does_not_fit_is_reported_then_refused(tmp_path):
+    blurred = ["telescope=example_zernike", "grid.points=3", f"{TERMS}.z4.constant=1.2"]
+    warned = simulate(tmp_path / "a", *blurred)
+    assert warned.exit_code == 0
+    assert "9 of 9 fields have less than 80% of their light inside 16 × 16 px" in warned.output
+    assert "framing.stamp_px=" in warned.output
+    refused = simulate(tmp_path / "b", "--least-energy", "0.9", *blurred)
+    assert refused.exit_code == 2
+    assert refused.output.count("\n") == 1
+    assert not list((tmp_path / "b").iterdir())
+
+
+def test_wavefront_that_the_grid_would_alias_is_refused(tmp_path):
+    steep = ["telescope=example_zernike", "grid.points=3", f"{TERMS}.z4.constant=40"]
+    result = simulate(tmp_path / "c", *steep)
+    assert result.exit_code == 2
+    assert "optics.pupil_samples" in result.output
+    assert "needs N ≥" in result.output
+
+
+def test_undersampled_psf_is_reported(tmp_path):
+    wide = ["telescope=example_zernike", "grid.points=3", "telescope.pixel_scale_arcsec=4"]
+    result = simulate(tmp_path / "d", *wide)
+    assert result.exit_code == 0
+    assert "undersampled" in result.output

@@ -1,0 +1,76 @@
+"""Runs of the real workflow in a folder of a test, on tiny sizes."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+PATH = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+QUIET = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+
+
+def environment(**more):
+    """The environment of a run, without what this run of the tests has found in its own."""
+    dropped = ("PSFDAE_RESULTS", "MAKEFLAGS", "MAKELEVEL")
+    kept = {key: value for key, value in os.environ.items() if key not in dropped}
+    return {**kept, "PATH": PATH, **more}
+
+
+def command(folder, *arguments, overrides="", preset="smoke", root=ROOT):
+    """The command line of a run in `folder`, of the workflow in `root`."""
+    return [
+        "snakemake",
+        *("--snakefile", str(root / "Snakefile"), "--directory", str(folder)),
+        *("--workflow-profile", str(root / "workflow/profiles/default"), "--cores", "2"),
+        *arguments,
+        *("--config", f"preset={preset}", "results=results", f"set={overrides}"),
+    ]
+
+
+def snakemake(folder, *arguments, check=True, **options):
+    """Output of a run; fails the test if the run fails, unless told otherwise."""
+    result = subprocess.run(
+        command(folder, *arguments, **options),
+        env=environment(PYTHONPATH=str(options.get("root", ROOT) / "src")),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if check:
+        assert result.returncode == 0, result.stdout + result.stderr
+    return result.stdout + result.stderr
+
+
+def planned(folder, *targets, **options):
+    """Jobs of a dry run: number by rule, without the target itself."""
+    out = snakemake(folder, "--dry-run", *targets, **options)
+    jobs = job_counts(out)
+    if not jobs:
+        assert "Nothing to be done" in out, out
+    return {rule: n for rule, n in jobs.items() if rule not in ("total", "all", *targets)}
+
+
+def job_counts(out):
+    """The table of jobs that Snakemake prints, as a mapping."""
+    table = re.search(r"^job +count\n-+ +-+\n(.*?)\n\n", out, re.M | re.S)
+    rows = [] if table is None else [line.split() for line in table[1].splitlines()]
+    return {rule: int(n) for rule, n in rows}
+
+
+def locked(folder, *arguments, **options):
+    """The command that `make reproduce` gives, for `subprocess`: arguments by name."""
+    line = ["sh", str(ROOT / "workflow/locked.sh"), *command(folder, *arguments, **options)]
+    return {"args": line, "cwd": folder, "env": environment(PSFDAE_RESULTS="results")}
+
+
+def wait_until(condition, seconds, what):
+    """Wait for something; a test fails if it takes too long."""
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, what
+        time.sleep(0.05)

@@ -1,0 +1,102 @@
+import json
+
+from snakemake.exceptions import WorkflowError
+
+from psfdae.configuration.sweep import load_sweep, sweep_names
+from psfdae.stages.sweep import ADAPTIVE_MODULE, POINT_MODULES
+from psfdae.sweeps.points import plan_sweep
+
+SWEEPS = f"{RESULTS}/sweeps"
+SWEEP_FIGURES = ["parallel", "response"]
+
+# Group with the threads of each model's training.
+SWEEP_TRAINING = {
+    "dae": "train",
+    "pca_som": "baseline",
+    "original": "train_original",
+    "noise_trained": "train_noise_trained",
+}
+
+
+@cache
+def sweep_plan(name):
+    """Points of a sweep; a wrong key stops before any job."""
+    return plan_sweep(name, GIVEN)
+
+
+def sweep_point_of(w):
+    points = sweep_plan(w.sweep).points
+    if w.point not in points:
+        raise WorkflowError(f"sweep {w.sweep} has no point {w.point}")
+    return points[w.point]
+
+
+def sweep_data(w):
+    """Products that the points of a sweep share, by role."""
+    sweep = load_sweep(w.sweep)
+    if sweep.root == "config":
+        return {"stars": stars_of(sweep.dataset)}
+    return {
+        "states": f"{ALIGNMENT_DATA}/{'grid' if sweep.model == 'original' else 'train'}.h5",
+        "validation": f"{ALIGNMENT_DATA}/validation.h5",
+        "test": f"{ALIGNMENT_DATA}/uniform.h5",
+    }
+
+
+def sweep_known(w):
+    """Results that a trial of an adaptive sweep learns from."""
+    known = sweep_plan(w.sweep).known(sweep_point_of(w))
+    return [f"{SWEEPS}/{w.sweep}/points/{point.name}/result.json" for point in known]
+
+
+def sweep_threads(w):
+    point, model = sweep_point_of(w), load_sweep(w.sweep).model
+    training = point.config[SWEEP_TRAINING[model]]["threads"]
+    return max(training, point.config["evaluation"]["threads"])
+
+
+def sweep_options(w):
+    """What a point is, but for its configuration and its data."""
+    plan, point = sweep_plan(w.sweep), sweep_point_of(w)
+    sweep = plan.sweep
+    options = [f"--model={sweep.model}", f"--dataset={sweep.dataset or sweep.model}"]
+    options += [f"--split={sweep.split}", f"--reference={sweep.reference}"]
+    options += [f"--level={level:.12g}" for level in plan.levels]
+    options += [
+        f"--values={json.dumps(point.values)}",
+        f"--keys={json.dumps(point.keys)}",
+    ]
+    if point.slot is not None:
+        search = json.dumps({**plan.search, "study": plan.study}, sort_keys=True)
+        options += [f"--slot={point.slot}", f"--search={search}"]
+        options += [f"--journal={SWEEPS}/{w.sweep}/study.journal"]
+        options += [f"--known={other.name}" for other in plan.known(point)]
+    return options
+
+
+def sweep_sources(w):
+    """Code that a point consists of: its model's, and the search's if there is one."""
+    sweep = load_sweep(w.sweep)
+    search = [ADAPTIVE_MODULE] if sweep.kind == "adaptive" else []
+    return source_hash("psfdae.stages.sweep", POINT_MODULES[sweep.model], *search)
+
+
+def sweep_results(w):
+    points = sweep_plan(w.sweep).points
+    return [f"{SWEEPS}/{w.sweep}/points/{name}/result.json" for name in points]
+
+
+def sweep_products(w):
+    """What the target sweep builds."""
+    name = config["sweep"]
+    if not name:
+        raise WorkflowError(
+            f"which sweep? --config sweep=NAME, one of {', '.join(sweep_names())}"
+        )
+    sweep_plan(name)
+    figures = [f"{SWEEPS}/{name}/figures/{kind}.png" for kind in SWEEP_FIGURES]
+    return [
+        *(f"{SWEEPS}/{name}/{file}" for file in ("summary.csv", "best.yaml")),
+        *figures,
+        f"{RESULTS}/mlflow/sweep_{name}.csv",
+    ]

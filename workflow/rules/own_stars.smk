@@ -1,0 +1,81 @@
+OWN_STARS_EXAMPLE = f"{RESULTS}/own_stars/example"
+
+
+rule example_field:
+    output:
+        image=f"{OWN_STARS_EXAMPLE}/image.fits",
+        catalogue=f"{OWN_STARS_EXAMPLE}/stars.csv",
+    log:
+        f"{RESULTS}/logs/own_stars/example_field.log",
+    benchmark:
+        f"{RESULTS}/benchmarks_on_request/own_stars/example_field.tsv"
+    threads: 1
+    resources:
+        mem_mb=500,
+    params:
+        source=source_hash("psfdae.stages.example_field"),
+    message:
+        "Simulating an image of a star field"
+    shell:
+        "psfdae example-field --out {output.image} --catalogue {output.catalogue}"
+        " > {log} 2>&1"
+
+
+rule own_stars:
+    input:
+        image=rules.example_field.output.image,
+        catalogue=rules.example_field.output.catalogue,
+    output:
+        multiext(
+            f"{OWN_STARS_EXAMPLE}/model/",
+            bundle="example.psf.safetensors",
+            report="report.csv",
+            selection="selection.csv",
+            picture="report.png",
+        ),
+    log:
+        f"{RESULTS}/logs/own_stars/model.log",
+    benchmark:
+        f"{RESULTS}/benchmarks_on_request/own_stars/model.tsv"
+    threads: lambda w: dataset_config(OWN_STARS).train.threads
+    resources:
+        mem_mb=1500,
+    params:
+        config=lambda w: stage_overrides("from_stars", f"dataset={OWN_STARS}"),
+        source=source_hash("psfdae.stages.from_stars"),
+        folder=subpath(output.bundle, parent=True),
+    message:
+        "Training on the bright stars of the image"
+    shell:
+        "psfdae from-stars {input.image} --catalogue {input.catalogue} --name example"
+        " --licence MIT --out {params.folder} {params.config:q} > {log} 2>&1"
+
+
+rule from_stars_example:
+    input:
+        report=rules.own_stars.output.report,
+        selection=rules.own_stars.output.selection,
+        picture=rules.own_stars.output.picture,
+    output:
+        table=f"{RESULTS}/tables/from_stars.csv",
+        selection=f"{RESULTS}/tables/from_stars_selection.csv",
+        picture=report(
+            f"{RESULTS}/figures/own_stars/strip.png",
+            caption="../report/own_stars.rst",
+            category="Own stars",
+            labels={"data": "simulated image", "figure": "restored stars"},
+        ),
+    log:
+        f"{RESULTS}/logs/own_stars/table.log",
+    benchmark:
+        f"{RESULTS}/benchmarks_on_request/own_stars/table.tsv"
+    localrule: True
+    threads: 1
+    resources:
+        mem_mb=500,
+    message:
+        "Collecting what was learnt from the image"
+    shell:
+        "{{ cp {input.report} {output.table}"
+        " && cp {input.selection} {output.selection}"
+        " && cp {input.picture} {output.picture}; }} > {log} 2>&1"

@@ -1,0 +1,76 @@
+rule telescope_templates:
+    output:
+        f"{OWN_TELESCOPES}/{{stars}}/templates.h5",
+    log:
+        f"{RESULTS}/logs/templates/telescope/{{stars}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/templates/telescope/{{stars}}.tsv"
+    wildcard_constraints:
+        stars="|".join(ALL_DATASETS),
+    threads: lambda w: dataset_config(w.stars).optics.threads
+    resources:
+        mem_mb=1000,
+        runtime=10,
+    params:
+        config=lambda w: telescope_overrides("templates", w.stars),
+        source=source_hash("psfdae.stages.templates", "psfdae.stars.telescope_scene"),
+    message:
+        "Propagating the static PSFs of the telescope of {wildcards.stars}"
+    shell:
+        "psfdae templates --out {output} {params.config:q} > {log} 2>&1"
+
+
+rule telescope_stars:
+    input:
+        templates=rules.telescope_templates.output,
+    output:
+        f"{OWN_TELESCOPES}/{{stars}}.h5",
+    log:
+        f"{RESULTS}/logs/stars/telescope/{{stars}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/stars/telescope/{{stars}}.tsv"
+    wildcard_constraints:
+        stars="|".join(ALL_DATASETS),
+    threads: lambda w: dataset_config(w.stars).optics.threads
+    resources:
+        mem_mb=1000,
+        runtime=60,
+    params:
+        config=lambda w: telescope_overrides("stars", w.stars),
+        source=source_hash("psfdae.stages.stars", "psfdae.stars.telescope_scene"),
+    message:
+        "Simulating the noise-free stars of {wildcards.stars}"
+    shell:
+        "psfdae stars --templates {input.templates} --out {output} {params.config:q}"
+        " > {log} 2>&1"
+
+
+rule figure_telescope:
+    input:
+        rules.telescope_templates.output,
+    output:
+        picture=report(
+            f"{RESULTS}/figures/telescope/{{stars}}.png",
+            caption="../report/own_telescope.rst",
+            category=SCENE_HEADINGS["own_telescope"],
+            subcategory="{stars}",
+            labels={"figure": "static PSFs"},
+        ),
+        table=f"{RESULTS}/tables/telescope/{{stars}}.csv",
+    log:
+        f"{RESULTS}/logs/figures/telescope/{{stars}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/figure_telescope/{{stars}}.tsv"
+    wildcard_constraints:
+        stars="|".join(ALL_DATASETS),
+    threads: 1
+    resources:
+        mem_mb=500,
+        runtime=10,
+    params:
+        source=source_hash("psfdae.stages.simulate"),
+    message:
+        "Drawing the static PSFs of the telescope of {wildcards.stars}"
+    shell:
+        "psfdae figure telescope --templates {input} --table {output.table}"
+        " --out {output.picture} > {log} 2>&1"

@@ -1,0 +1,157 @@
+wildcard_constraints:
+    sweep="|".join(sweep_names()) or "none",
+
+
+# States of their own choose between CNNs: all others train or test.
+rule sweep_validation_states:
+    input:
+        model=rules.alignment_model.output,
+    output:
+        f"{ALIGNMENT_DATA}/validation.h5",
+    log:
+        f"{RESULTS}/logs/alignment/validation.log",
+    benchmark:
+        f"{RESULTS}/benchmarks_on_request/sweep/validation_states.tsv"
+    threads: lambda w: alignment_config().optics.threads
+    resources:
+        mem_mb=500,
+    params:
+        config=lambda w: [
+            *alignment_stage("alignment_states"),
+            f"++seed={alignment_config().seed + 1}",
+        ],
+        source=source_hash("psfdae.stages.alignment"),
+    message:
+        "Propagating the stamps of scene 3, uniform states that choose between CNNs"
+    shell:
+        "psfdae alignment states --set uniform --model {input.model} --out {output}"
+        " {params.config:q} > {log} 2>&1"
+
+
+rule sweep_point:
+    input:
+        unpack(sweep_data),
+        known=sweep_known,
+    output:
+        f"{SWEEPS}/{{sweep}}/points/{{point}}/result.json",
+    log:
+        f"{RESULTS}/logs/sweeps/{{sweep}}/{{point}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks_on_request/sweep/{{sweep}}/{{point}}.tsv"
+    wildcard_constraints:
+        point="[0-9a-f]{12}",
+    threads: sweep_threads
+    resources:
+        mem_mb=2000,
+    params:
+        config=lambda w: as_overrides(sweep_point_of(w).config),
+        options=sweep_options,
+        data=lambda w, input: [
+            word for role in sweep_data(w) for word in ("--data", role, input[role])
+        ],
+        source=sweep_sources,
+        folder=subpath(output[0], parent=True),
+        # Not an output: Snakemake would delete it with a failed job's outputs.
+        checkpoint=lambda w: f"{RESULTS}/checkpoints/sweep-{w.sweep}-{w.point}.pt",
+    message:
+        "Training point {wildcards.point} of sweep {wildcards.sweep}"
+    shell:
+        "psfdae sweep point {params.options:q} {params.data:q}"
+        " --checkpoint {params.checkpoint} --source {params.source} --out {params.folder}"
+        " {params.config:q} > {log} 2>&1"
+
+
+rule sweep_summary:
+    input:
+        sweep_results,
+    output:
+        multiext(
+            f"{SWEEPS}/{{sweep}}/",
+            summary="summary.csv",
+            cost="cost.csv",
+            best="best.yaml",
+            definition="sweep.yaml",
+        ),
+    log:
+        f"{RESULTS}/logs/sweeps/{{sweep}}/summary.log",
+    benchmark:
+        f"{RESULTS}/benchmarks_on_request/sweep/{{sweep}}/summary.tsv"
+    threads: 1
+    resources:
+        mem_mb=500,
+    params:
+        given=GIVEN,
+        definition=lambda w: load_sweep(w.sweep).model_dump_json(),
+        source=source_hash("psfdae.stages.sweep_summary"),
+        points=lambda w: f"{SWEEPS}/{w.sweep}/points",
+        folder=subpath(output.summary, parent=True),
+    message:
+        "Summarising sweep {wildcards.sweep}"
+    shell:
+        "psfdae sweep summary {wildcards.sweep} --points {params.points}"
+        " --out {params.folder} {params.given:q} > {log} 2>&1"
+
+
+rule figure_sweep:
+    input:
+        summary=rules.sweep_summary.output.summary,
+        definition=rules.sweep_summary.output.definition,
+    output:
+        report(
+            f"{SWEEPS}/{{sweep}}/figures/{{sweep_figure}}.png",
+            caption="../report/figure_sweep.rst",
+            category="Sweeps",
+            labels={"data": "{sweep}", "figure": "{sweep_figure}"},
+        ),
+    log:
+        f"{RESULTS}/logs/sweeps/{{sweep}}/{{sweep_figure}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks_on_request/sweep/{{sweep}}/{{sweep_figure}}.tsv"
+    wildcard_constraints:
+        sweep_figure="|".join(SWEEP_FIGURES),
+    threads: 1
+    resources:
+        mem_mb=500,
+    params:
+        source=source_hash("psfdae.stages.sweep_figures"),
+    message:
+        "Drawing the figure {wildcards.sweep_figure} of sweep {wildcards.sweep}"
+    shell:
+        "psfdae sweep figure {wildcards.sweep_figure} --definition {input.definition}"
+        " --table {input.summary} --out {output} > {log} 2>&1"
+
+
+rule track_sweep:
+    input:
+        rules.sweep_summary.output,
+        expand(
+            rules.figure_sweep.output, sweep_figure=SWEEP_FIGURES, allow_missing=True
+        ),
+    output:
+        f"{RESULTS}/mlflow/sweep_{{sweep}}.csv",
+    log:
+        f"{RESULTS}/logs/track/sweep_{{sweep}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks_on_request/sweep/{{sweep}}/track.tsv"
+    # SQLite takes one machine; jobs that meet on it wait for each other.
+    localrule: True
+    threads: 1
+    resources:
+        mem_mb=500,
+    params:
+        results=lambda w: RESULTS,
+        preset=PRESET,
+        database=f"{RESULTS}/mlflow.db",
+        source=source_hash("psfdae.stages.track", "psfdae.sweep_runs"),
+    message:
+        "Importing sweep {wildcards.sweep} into MLflow"
+    shell:
+        "psfdae track --results {params.results} --preset {params.preset}"
+        " --database {params.database} --sweep {wildcards.sweep} --out {output}"
+        " > {log} 2>&1"
+
+
+rule sweep:
+    input:
+        sweep_products,
+    localrule: True
