@@ -6,7 +6,6 @@ import os
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 import yaml
@@ -79,4 +78,4 @@ def test_images_and_files_are_in_the_site(site):
         text = re.sub(r"<pre.*?</pre>", "", path.read_text(encoding="utf-8"), flags=re.S)
         for target in re.findall(r"(?:src|href)=\"([^\"#]+)\"", text):
             if not re.match(r"[a-z]+:", target):
-                assert (site / Path(target)).exists(), f"{path.name}: {target}"
+                assert (site / target.lstrip("/")).exists(), f"{path.name}: {target}"

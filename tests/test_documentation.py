@@ -8,8 +8,10 @@ import click
 import networkx as nx
 import numpy as np
 import pytest
+import yaml
 from click.testing import CliRunner
 
+import psfdae
 from docs_pages import ROOT
 from psfdae.cli import main
 from psfdae.configuration.alignment import AlignmentConfig
@@ -109,7 +111,7 @@ def test_every_module_is_in_the_drawing():
 
 
 def words_of(svg):
-    return re.sub(r"<[^>]+>", " ", svg.read_text(encoding="utf-8"))
+    return " ".join(re.findall(r"<(?:text|tspan)\b[^>]*>([^<]+)", svg.read_text(encoding="utf-8")))
 
 
 def test_drawing_of_modules_is_that_of_the_code(tmp_path):
@@ -122,7 +124,7 @@ def test_drawing_of_modules_is_that_of_the_code(tmp_path):
 
 @pytest.mark.workflow
 def test_drawing_of_rules_is_that_of_the_workflow(tmp_path):
-    rules = set(rule_graph(snakemake(tmp_path, "--rulegraph", "all")))
+    rules = set(rule_graph(snakemake(tmp_path, "all", "--rulegraph")))
     drawn = re.sub(r"_\s+", "_", words_of(ROOT / "docs/figures/rules.svg")).split()
     topics = rule_topics(ROOT / "workflow/rules")
     assert set(drawn) - set(["file", "in", "workflow/rules"]) - set(topics.values()) == rules
@@ -172,6 +174,22 @@ def test_every_command_is_in_the_reference():
     assert len(names) > 40
     for name in names:
         assert re.search(rf"^#+ `{re.escape(name)}`$", text, re.M), name
+
+
+def test_versions_agree():
+    cited = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert cited["version"] == psfdae.__version__
+    changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert re.search(r"^## (\S+)", changes, re.M)[1] == psfdae.__version__
+    assert cited["license"] == "MIT"
+    assert (ROOT / "LICENSE").read_text(encoding="utf-8").startswith("MIT License")
+
+
+def test_example_of_a_wrong_value_is_what_is_printed():
+    page = (ROOT / "docs/configuration.md").read_text(encoding="utf-8")
+    printed = CliRunner().invoke(main, ["config", "train.lr=2.0"])
+    assert printed.exit_code == 2
+    assert printed.output in page
 
 
 def test_options_of_a_command():

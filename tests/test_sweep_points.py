@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import re
 import shlex
 
@@ -113,6 +112,17 @@ def test_finished_point_is_not_trained_again_unless_something_changed(point, cap
     (point.folder / "dae.safetensors").unlink()
     point.run(values={"train.lr": 0.1})
     assert (point.folder / "dae.safetensors").is_file()
+
+
+def test_changed_digit_of_a_result_is_damage(point):
+    point.run()
+    path = point.folder / stage.RESULT
+    text = path.read_text()
+    changed = re.sub(r'("validation_mse": \d\.)(\d)', lambda m: m[1] + str(9 - int(m[2])), text)
+    assert changed != text
+    path.write_text(changed)
+    with pytest.raises(ProductError, match=r"result\.json: damaged \(wrong checksum\)"):
+        point.result()
 
 
 def test_early_stopping_is_recorded(point):
@@ -238,7 +248,7 @@ def write_points(root, outcomes):
             "reason": "the network died" if score is None else "",
             **{"epochs": 3, "attempt": 0, "metrics": metrics, "config": {"train": {"lr": lr}}},
         }
-        (folder / "result.json").write_text(json.dumps(result))
+        (folder / "result.json").write_text(stage.as_json(result))
         (folder / "cost.json").write_text('{"seconds": 2.0, "cpu_seconds": 1.5}')
         if score is not None:
             (folder / "dae.safetensors").write_bytes(name.encode())

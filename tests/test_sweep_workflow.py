@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import shlex
 import shutil
 import subprocess
-import time
 from pathlib import Path
 
 import pandas as pd
@@ -15,7 +13,16 @@ import yaml
 
 from psfdae.configuration.compose import config_dir
 from psfdae.stages.sweep_summary import best_overrides
-from test_workflow import PATH, ROOT, command, planned, snakemake
+from workflow_runs import (
+    QUIET,
+    command,
+    environment,
+    job_counts,
+    locked,
+    planned,
+    snakemake,
+    wait_until,
+)
 
 pytestmark = pytest.mark.workflow
 
@@ -56,21 +63,15 @@ def finished(folder):
 def killed(configuration, tmp_path_factory):
     """A sweep of 12 points, killed in the middle and started again: folder, points before."""
     folder = tmp_path_factory.mktemp("killed")
-    locked = ["sh", str(ROOT / "workflow/locked.sh"), *command(folder, SUMMARY)]
-    environment = {**os.environ, "PATH": PATH}
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    run = subprocess.Popen(locked, cwd=folder, env=environment, **quiet)
-    deadline = time.monotonic() + 300
-    while len(finished(folder)) < 4:
-        assert run.poll() is None, "the sweep ended too early"
-        assert time.monotonic() < deadline
-        time.sleep(0.1)
+    run = subprocess.Popen(**locked(folder, SUMMARY), **QUIET)
+    wait_until(lambda: len(finished(folder)) >= 4 or run.poll() is not None, 300, "too slow")
+    assert run.poll() is None, "the sweep ended too early"
     run.kill()
     run.wait()
     before = finished(folder)
     assert 4 <= len(before) < 12
     assert not (folder / SUMMARY).exists()
-    subprocess.run(locked, cwd=folder, env=environment, check=True, capture_output=True)
+    subprocess.run(**locked(folder, SUMMARY), check=True, capture_output=True)
     return folder, before
 
 
@@ -151,7 +152,6 @@ def states(journal):
     storage = JournalStorage(JournalFileBackend(str(journal)))
     (study,) = optuna.get_all_study_summaries(storage)
     trials = optuna.load_study(study_name=study.study_name, storage=storage).trials
-    # The last one was asked for after the loss and knew the first three.
     assert {trial.user_attrs["slot"] for trial in trials} == {0, 1, 2, 3}
     return [trial.state.name for trial in trials]
 
@@ -159,13 +159,11 @@ def states(journal):
 def test_sweep_lists_its_points_figures_and_import(tmp_path, monkeypatch):
     monkeypatch.delenv("PSFDAE_CONFIG", raising=False)
     for name, points in (("dae_width", 12), ("som", 12)):
-        arguments = [*command(tmp_path, "--dry-run", "sweep"), f"sweep={name}"]
-        run = subprocess.run(
-            arguments, env={**os.environ, "PATH": PATH}, capture_output=True, text=True, check=True
-        )
-        jobs = dict(line.split() for line in run.stdout.splitlines() if len(line.split()) == 2)
-        assert jobs["sweep_point"] == str(points)
-        assert (jobs["figure_sweep"], jobs["track_sweep"]) == ("2", "1")
+        line = [*command(tmp_path, "--dry-run", "sweep"), f"sweep={name}"]
+        run = subprocess.run(line, env=environment(), capture_output=True, text=True, check=True)
+        jobs = job_counts(run.stdout)
+        assert jobs["sweep_point"] == points
+        assert (jobs["figure_sweep"], jobs["track_sweep"]) == (2, 1)
         assert not {"train", "baseline", "evaluate"} & set(jobs)
 
 
@@ -176,7 +174,7 @@ def test_sweep_lists_its_points_figures_and_import(tmp_path, monkeypatch):
 def test_wrong_choice_of_a_sweep_is_named(tmp_path, chosen, message):
     run = subprocess.run(
         [*command(tmp_path, "sweep"), *chosen],
-        env={**os.environ, "PATH": PATH},
+        env=environment(),
         capture_output=True,
         text=True,
         check=False,

@@ -240,7 +240,7 @@ def run_trials(count, known_at=lambda slot: slot, journal=None):
             search = {**SEARCH, "study": "s"}
             about = {"slot": slot, "point": results[-1]["point"]}
             adaptive.begin(journal, SPACE, search, about, values, known)
-            adaptive.finish(journal, SPACE, search, results[-1])
+            adaptive.finish(journal, SPACE, search, results[-1:])
     return results
 
 
@@ -298,7 +298,7 @@ def test_journal_holds_every_trial_once(tmp_path):
         for r in results
     ]
     assert trials(journal) == expected
-    adaptive.finish(journal, SPACE, {**SEARCH, "study": "s"}, results[3])
+    adaptive.finish(journal, SPACE, {**SEARCH, "study": "s"}, results[3:])
     assert trials(journal) == expected
 
 
@@ -310,7 +310,7 @@ def test_interrupted_trial_goes_on_under_its_number(tmp_path):
         adaptive.begin(journal, SPACE, search, about, values, [])
     assert trials(journal) == [(0, "RUNNING", None)]
     result = outcome(0, values)
-    adaptive.finish(journal, SPACE, search, result)
+    adaptive.finish(journal, SPACE, search, [result])
     assert trials(journal) == [(0, "COMPLETE", result["metrics"]["validation_mse"])]
 
 

@@ -6,7 +6,6 @@ import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from psfdae.files import ProductError
 from psfdae.runs import (
@@ -20,11 +19,12 @@ from psfdae.runs import (
     read_yaml,
     sha256,
 )
+from psfdae.stages.sweep import COST, RESULT, read_cost, read_result
 
 SUMMARY_FILES = ("summary.csv", "cost.csv", "best.yaml", "sweep.yaml")
 
 POINT_FILES = (
-    *("result.json", "cost.json", "evaluation.csv", "validation.csv"),
+    *(RESULT, COST, "evaluation.csv", "validation.csv"),
     *("dae.safetensors", "cnn.safetensors", "pca_som.h5", "config.yaml", "history.csv"),
 )
 """Files that a point may have; a failed one has the first two only."""
@@ -96,7 +96,7 @@ class PointEntry:
     @property
     def name(self) -> str:
         """For people: the axes with their values, or the point's name."""
-        values = _json(self.folder / "result.json")["values"].items()
+        values = read_result(self.folder / RESULT)["values"].items()
         return ", ".join(f"{key}={json.dumps(value)}" for key, value in values) or self.folder.name
 
     def files(self) -> dict[str, Path]:
@@ -110,10 +110,10 @@ class PointEntry:
         """Configuration, metrics and hashes; raises ProductError."""
         files = self.files()
         contents = {name: sha256(path) for name, path in files.items()}
-        result = _json(self.folder / "result.json")
+        result = read_result(self.folder / RESULT)
         config = {**result["config"], "axes": result["values"]}
-        end_ms = int((self.folder / "result.json").stat().st_mtime * 1000)
-        start_ms = end_ms - int(1000 * float(_json(self.folder / "cost.json")["seconds"]))
+        end_ms = int((self.folder / RESULT).stat().st_mtime * 1000)
+        start_ms = end_ms - int(1000 * read_cost(self.folder)["seconds"])
         points = [Point(name, value, 0, end_ms) for name, value in result["metrics"].items()]
         points += epoch_points(self._epochs(), start_ms)
         config_hash = hash_of(config)
@@ -163,7 +163,7 @@ def discover_sweep(results: Path, name: str) -> list[SweepEntry | PointEntry]:
     points = []
     for row in read_csv(folder / "summary.csv", "point", "status"):
         place = folder / "points" / row["point"]
-        result = _json(place / "result.json")
+        result = read_result(place / RESULT)
         points.append(
             PointEntry(
                 folder=place,
@@ -183,15 +183,3 @@ def discover_sweep(results: Path, name: str) -> list[SweepEntry | PointEntry]:
 def _experiment(folder: Path) -> str:
     """Every sweep is an experiment of its own, apart from the paper's scenes."""
     return f"sweep_{folder.name}"
-
-
-def _json(path: Path) -> dict[str, Any]:
-    try:
-        tree = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise ProductError(f"{path}: no such file") from None
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise ProductError(f"{path}: damaged ({error}); delete it and run again") from None
-    if not isinstance(tree, dict):
-        raise ProductError(f"{path}: damaged (no object in it); delete it and run again")
-    return tree

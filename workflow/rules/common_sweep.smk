@@ -2,7 +2,7 @@ import json
 
 from snakemake.exceptions import WorkflowError
 
-from psfdae.configuration.sweep import load_sweep, sweep_names
+from psfdae.configuration.sweep import sweep_names
 from psfdae.stages.sweep import ADAPTIVE_MODULE, POINT_MODULES
 from psfdae.sweeps.points import plan_sweep
 
@@ -33,7 +33,7 @@ def sweep_point_of(w):
 
 def sweep_data(w):
     """Products that the points of a sweep share, by role."""
-    sweep = load_sweep(w.sweep)
+    sweep = sweep_plan(w.sweep).sweep
     if sweep.root == "config":
         return {"stars": stars_of(sweep.dataset)}
     return {
@@ -50,7 +50,7 @@ def sweep_known(w):
 
 
 def sweep_threads(w):
-    point, model = sweep_point_of(w), load_sweep(w.sweep).model
+    point, model = sweep_point_of(w), sweep_plan(w.sweep).sweep.model
     training = point.config[SWEEP_TRAINING[model]]["threads"]
     return max(training, point.config["evaluation"]["threads"])
 
@@ -62,10 +62,9 @@ def sweep_options(w):
     options = [f"--model={sweep.model}", f"--dataset={sweep.dataset or sweep.model}"]
     options += [f"--split={sweep.split}", f"--reference={sweep.reference}"]
     options += [f"--level={level:.12g}" for level in plan.levels]
-    options += [
-        f"--values={json.dumps(point.values)}",
-        f"--keys={json.dumps(point.keys)}",
-    ]
+    # Sorted: another order of the axes is the same point.
+    for name, tree in (("values", point.values), ("keys", point.keys)):
+        options.append(f"--{name}={json.dumps(tree, sort_keys=True)}")
     if point.slot is not None:
         search = json.dumps({**plan.search, "study": plan.study}, sort_keys=True)
         options += [f"--slot={point.slot}", f"--search={search}"]
@@ -74,9 +73,10 @@ def sweep_options(w):
     return options
 
 
-def sweep_sources(w):
+@cache
+def sweep_source(name):
     """Code that a point consists of: its model's, and the search's if there is one."""
-    sweep = load_sweep(w.sweep)
+    sweep = sweep_plan(name).sweep
     search = [ADAPTIVE_MODULE] if sweep.kind == "adaptive" else []
     return source_hash("psfdae.stages.sweep", POINT_MODULES[sweep.model], *search)
 

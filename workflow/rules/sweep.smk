@@ -49,7 +49,7 @@ rule sweep_point:
         data=lambda w, input: [
             word for role in sweep_data(w) for word in ("--data", role, input[role])
         ],
-        source=sweep_sources,
+        source=lambda w: sweep_source(w.sweep),
         folder=subpath(output[0], parent=True),
         # Not an output: Snakemake would delete it with a failed job's outputs.
         checkpoint=lambda w: f"{RESULTS}/checkpoints/sweep-{w.sweep}-{w.point}.pt",
@@ -81,7 +81,7 @@ rule sweep_summary:
         mem_mb=500,
     params:
         given=GIVEN,
-        definition=lambda w: load_sweep(w.sweep).model_dump_json(),
+        definition=lambda w: sweep_plan(w.sweep).sweep.model_dump_json(),
         source=source_hash("psfdae.stages.sweep_summary"),
         points=lambda w: f"{SWEEPS}/{w.sweep}/points",
         folder=subpath(output.summary, parent=True),

@@ -42,3 +42,10 @@ rule scene3:
         ALIGNMENT_PRODUCTS,
         rules.track_alignment.output,
     localrule: True
+
+
+rule tracking:
+    input:
+        expand(rules.track.output, dataset=default_datasets()),
+        rules.track_alignment.output,
+    localrule: True

@@ -194,8 +194,10 @@ def submission(row: Mapping[str, Any], home: frozenset[str], start_s: float) -> 
     -------
     str
         "home" (beside snakemake), "single", "array" or, where starting a job takes
-        more than a tenth of its time, "group".
+        more than a tenth of its time, "group"; "" for what Snakemake adds.
     """
+    if row["rule"] == "snakemake":
+        return ""
     if row["rule"] in home:
         return "home"
     if row["jobs"] == 1:

@@ -266,8 +266,8 @@ class CalibrationStars(Group):
     neighbour_ratio: Positive = Field(
         description="Brightness of such a neighbour, in that of the star, from which it disturbs"
     )
-    misfit_sigma: Positive = Field(
-        description="Difference from the nearest stars, in robust σ of all stars, of a misfit"
+    misfit: Annotated[float, Field(gt=1, allow_inf_nan=False)] = Field(
+        description="Difference of a misfit from the nearest stars, in that of the median star"
     )
     search_px: Annotated[int, Field(ge=1, le=16)] = Field(
         description="The brightest pixel is searched within ± this of the catalogue's position"

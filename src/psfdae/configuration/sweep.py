@@ -39,12 +39,14 @@ RESERVED = ("point", "status", "reason", "epochs", "attempt", "best")
 class Axis(Group):
     """One thing that is varied: listed values, named sets of values, or a range."""
 
-    values: Annotated[list[Value], Field(min_length=1)] | None = None
+    values: Annotated[list[Value], Field(min_length=1)] | None = Field(
+        default=None, description="Listed values; a bare list means the same"
+    )
     choices: Annotated[dict[str, dict[str, Value]], Field(min_length=1)] | None = Field(
         default=None, description="Name of each choice, and the keys with values that it stands for"
     )
-    low: Finite | None = None
-    high: Finite | None = None
+    low: Finite | None = Field(default=None, description="Lower end of a range")
+    high: Finite | None = Field(default=None, description="Upper end of a range")
     log: bool = Field(default=False, description="A range that is even in the logarithm")
     integer: bool = Field(default=False, description="A range of whole numbers")
     keys: Annotated[list[str], Field(min_length=1)] | None = Field(
@@ -106,14 +108,16 @@ class Sweep(Group):
     )
     model: Model = Field(description="DAE, PCA+SOM, or one of scene 3's CNNs")
     dataset: Name | None = Field(default=None, description="Dataset; none for scene 3's CNNs")
-    split: SplitKind = "random"
-    reference: Reference = "realisation"
-    metric: Metric
-    direction: Literal["minimize", "maximize"]
+    split: SplitKind = Field(default="random", description="Split of the stars")
+    reference: Reference = Field(default="realisation", description="What the DAE is to restore")
+    metric: Metric = Field(description="Chooses the best point: over all noise levels")
+    direction: Literal["minimize", "maximize"] = Field(description="Which metric is better")
     overrides: dict[AxisName, Value] = Field(
         default={}, description="Configuration keys that all points share"
     )
-    space: Annotated[dict[AxisName, Axis], Field(min_length=1)]
+    space: Annotated[dict[AxisName, Axis], Field(min_length=1)] = Field(
+        description="What is varied, by name"
+    )
     trials: Count | None = Field(default=None, description="Number of draws; a grid has none")
     seed: Annotated[int, Field(ge=0, lt=2**63)] = Field(default=0, description="Of the draws")
     startup: Count = Field(default=4, description="Adaptive: random trials before it learns")

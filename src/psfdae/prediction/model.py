@@ -110,25 +110,9 @@ class PsfModel:
         PredictionError
             If shapes or types do not fit.
         """
-        data = _numbers("stamps", stamps)
-        masks = [None if m is None else np.asarray(m, dtype=bool) for m in (bad, saturated)]
-        if data.ndim == 2:
-            data, masks = data[None], [None if m is None else m[None] for m in masks]
-        self._check_shape(data, margin)
-        finite = np.isfinite(data)
-        hidden = [_mask(name, m, data) for name, m in zip(("bad", "saturated"), masks, strict=True)]
         given = {"flux": flux, "background": background, "noise": noise, "gain": gain}
-        values = {name: _per_star(name, value, len(data)) for name, value in given.items()}
-        gains = values.pop("gain")
-        stars = Stars(
-            data=data if finite.all() else np.where(finite, data, 0),
-            bad=hidden[0] | ~finite,
-            saturated=hidden[1],
-            truncated=np.zeros(len(data), dtype=bool),
-            known=Known(**values),
-            gain=gains,
-        )
-        return self.predict_stars(stars, threads)
+        masks = {"bad": bad, "saturated": saturated}
+        return self.predict_stars(self._stars(stamps, given, masks, margin), threads)
 
     def predict_stars(self, stars: Stars, threads: int | None = 1) -> Prediction:
         """As `predict`, of stars that are known to fit."""
@@ -166,6 +150,30 @@ class PsfModel:
                 f"(tolerance {100 * SCALE_TOLERANCE:g} %)"
             )
 
+    def _stars(
+        self,
+        stamps: ArrayLike,
+        given: dict[str, ArrayLike | None],
+        masks: dict[str, ArrayLike | None],
+        margin: int,
+    ) -> Stars:
+        """Stars from what a caller gives, checked."""
+        data = _numbers("stamps", stamps)
+        single = data.ndim == 2
+        data = data[None] if single else data
+        self._check_shape(data, margin)
+        finite = np.isfinite(data)
+        values = {name: _per_star(name, value, len(data)) for name, value in given.items()}
+        hidden = {name: _mask(name, mask, data, single) for name, mask in masks.items()}
+        return Stars(
+            data=data if finite.all() else np.where(finite, data, 0),
+            bad=hidden["bad"] | ~finite,
+            saturated=hidden["saturated"],
+            truncated=np.zeros(len(data), dtype=bool),
+            gain=values.pop("gain"),
+            known=Known(**values),
+        )
+
     def _check_shape(self, data: np.ndarray, margin: int) -> None:
         side = self.info.stamp_px + 2 * margin
         if margin < 0 or data.ndim != 3 or data.shape[1:] != (side, side):
@@ -191,12 +199,14 @@ def _numbers(name: str, values: ArrayLike) -> np.ndarray:
     return array.astype(np.float32 if narrow else np.float64, copy=False)
 
 
-def _mask(name: str, mask: np.ndarray | None, data: np.ndarray) -> np.ndarray:
+def _mask(name: str, mask: ArrayLike | None, data: np.ndarray, single: bool) -> np.ndarray:
     if mask is None:
         return np.zeros(data.shape, dtype=bool)
-    if mask.shape != data.shape:
-        raise PredictionError(f"{name} of shape {mask.shape}, but stamps of shape {data.shape}")
-    return mask
+    array = np.asarray(mask, dtype=bool)
+    array = array[None] if single else array
+    if array.shape != data.shape:
+        raise PredictionError(f"{name} of shape {array.shape}, but stamps of shape {data.shape}")
+    return array
 
 
 def _per_star(name: str, value: ArrayLike | None, count: int) -> np.ndarray:

@@ -13,6 +13,7 @@ extension after the other.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -167,9 +168,13 @@ def _primary_header(bundle: Bundle, cards: Sequence[Card], history: str) -> Any:
         ("SNRMAX", info.snr_max, "largest S/N of the training"),
         ("DISTMAX", bundle.distance_limit, "largest distance that raises no flag"),
     ]
-    for key, value, comment in (*own, *cards):
-        header[key] = (_printable(value), _printable(comment))
-    header["HISTORY"] = _printable(history)
+    with warnings.catch_warnings():
+        # A long value leaves no room for its comment, which astropy reports.
+        warnings.simplefilter("ignore", fits.verify.VerifyWarning)
+        for key, value, comment in (*own, *cards):
+            header[key] = (_printable(value), _printable(comment))
+        header["HISTORY"] = _printable(history)
+        header.tostring()
     return header
 
 

@@ -114,10 +114,10 @@ def collect(observation: Observation, config: Any) -> Candidates:
     centre = star_centres(wide, peak, window_of(snr, flux, noise))
     bright = BrightStars(wide, peak, centre, found["position"][row], flux, noise, snr, row)
     score = _misfits(bright, side)
-    verdict[row[score > settings.misfit_sigma]] = Verdict.MISFIT
+    verdict[row[score > settings.misfit]] = Verdict.MISFIT
     result = Candidates(
         **{key: found[key] for key in ("id", "position", "snr", "noise", "verdict")},
-        bright=bright.of(score <= settings.misfit_sigma),
+        bright=bright.of(score <= settings.misfit),
     )
     _check_number(result, observation.path, settings)
     return result

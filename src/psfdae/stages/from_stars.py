@@ -175,7 +175,7 @@ def _with_noise(
     levels = [1.0 / (snr * np.sqrt(area) * kappa) for snr in config.calibration_stars.snr_levels]
     noise = Noise(
         name=config.noise.name,
-        levels=[float(f"{level:.6g}") for level in reversed(levels)],
+        levels=[float(f"{level:.9g}") for level in reversed(levels)],
         kappa=kappa,
         background_photons=sky_photons(found.bright, gain, config.noise.background_photons),
     )

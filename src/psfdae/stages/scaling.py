@@ -22,6 +22,7 @@ from psfdae.files import ProductError, write_text
 from psfdae.stages import scaling_jobs as jobs
 
 if TYPE_CHECKING:
+    import numpy as np
     import pandas as pd
 
 ASKED = {"stars": 1e9, "models": 1e4, "points": 1e5}
@@ -181,25 +182,37 @@ def plan(
     rows = cost.stars_case(ASKED["stars"], measured, site, whole["train"], stars)
     found = cost.stars_limits(ASKED["stars"], whole, site)
     for case in dag.KINDS:
-        steps = cost.dag_case(case, ASKED[case], planning[case], costs)
-        total = sum(row["jobs"] for row in steps)
-        share = min(ASKED[case], cost.count_per_dag(planning[case], START_S))
-        rows += [*steps, cost.snakemake_row(case, total, share, planning[case])]
-        rows[-1]["per_dag"] = share
-        work = sum(row["core_h"] for row in steps) * cost.HOUR / total
         # A model has stars of its own; points share theirs.
         stored = costs["stars"][1] if case == "models" else 0.0
-        each = cost.Footprint(network.files, network.storage_bytes + stored)
-        found += cost.dag_limits(case, ASKED[case], planning[case], each, work, site)
+        own = point_footprint(results, network) if case == "points" else network
+        each = cost.Footprint(own.files, own.storage_bytes + stored)
+        more, more_limits = _dag_plan(case, planning[case], costs, each, site)
+        rows += more
+        found += more_limits
     start = planning["models"].start_s.fixed
     for row in rows:
         row["asked"] = ASKED[row["case"]]
-        row["submit"] = (
-            "" if row["rule"] == "snakemake" else cost.submission(row, frozenset(home), start)
-        )
+        row["submit"] = cost.submission(row, frozenset(home), start)
     found.sort(key=lambda row: (list(ASKED).index(row["case"]), row["reached_at"]))
     _write(out, rows)
     _write(limits, found)
+
+
+def _dag_plan(
+    case: str,
+    planning: cost.Planning,
+    costs: Mapping[str, tuple[float, float, float]],
+    each: cost.Footprint,
+    site: cost.Site,
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Rows and limits of a run whose DAG grows, in parts whose jobs start soon enough."""
+    asked = ASKED[case]
+    steps = cost.dag_case(case, asked, planning, costs)
+    total = sum(row["jobs"] for row in steps)
+    work = sum(row["core_h"] for row in steps) * cost.HOUR / total
+    share = min(asked, cost.count_per_dag(planning, START_S))
+    starts = {**cost.snakemake_row(case, total, share, planning), "per_dag": share}
+    return [*steps, starts], cost.dag_limits(case, asked, planning, each, work, site)
 
 
 def stage_lines(table: pd.DataFrame) -> dict[str, cost.Stage]:
@@ -224,26 +237,30 @@ def _epochs(stage: cost.Stage, epochs: int) -> cost.Stage:
 
 def planning_of(table: pd.DataFrame, kind: str) -> cost.Planning:
     """What Snakemake costs, from the table of `dag_times`."""
-    import numpy as np
-
-    part = table[table["kind"] == kind]
-    total = part[part["rule"] == "total"].sort_values("count")
+    part = table[table["kind"] == kind].sort_values("count")
+    total = part[part["rule"] == "total"]
     x = total["count"].to_numpy(float)
-    by_rule = {}
-    for rule, jobs_of in part[part["rule"] != "total"].groupby("rule", sort=False):
-        # The DAG is the same at every size but for its number of units.
-        fixed, slope = (
-            np.polynomial.Polynomial.fit(jobs_of["count"], jobs_of["jobs"], 1).convert().coef
-            if len(jobs_of) > 1
-            else (jobs_of["jobs"].iloc[0], 0.0)
-        )
-        by_rule[str(rule)] = cost.Line(round(float(fixed)), max(0.0, round(float(slope), 6)))
+    by_rule = {
+        str(rule): _jobs_of(jobs_of["count"].to_numpy(float), jobs_of["jobs"].to_numpy(float))
+        for rule, jobs_of in part[part["rule"] != "total"].groupby("rule", sort=False)
+    }
     return cost.Planning(
         seconds=fit_power_law(x, total["plan_cpu_s"].to_numpy()),
         start_s=cost.fit_line(x, total["start_cpu_s"].to_numpy()),
         memory_bytes=cost.fit_line(x, cost.MB * total["peak_mb"].to_numpy()),
         jobs=by_rule,
     )
+
+
+def _jobs_of(count: np.ndarray, number: np.ndarray) -> cost.Line:
+    """Jobs of a rule over the number of units: those that are there once, and those of each.
+
+    The two largest sizes tell, which differ in nothing but their number of units.
+    """
+    if count.size < 2:
+        return cost.Line(float(number[0]), 0.0)
+    slope = (number[-1] - number[-2]) / (count[-1] - count[-2])
+    return cost.Line(float(number[-1] - slope * count[-1]), float(slope))
 
 
 def footprint(results: Path) -> cost.Footprint:
@@ -266,6 +283,19 @@ def footprint(results: Path) -> cost.Footprint:
     ]
     size = sum(path.stat().st_size for path in files)
     return cost.Footprint(len(files) / networks, size / networks)
+
+
+def point_footprint(results: Path, network: cost.Footprint) -> cost.Footprint:
+    """Files and bytes of a point of a sweep, its log and benchmark among them.
+
+    A run without a sweep leaves only a network to judge by.
+    """
+    points = list(results.glob("sweeps/*/points/*/result.json"))
+    if not points:
+        return network
+    files = [path for point in points for path in point.parent.iterdir() if path.is_file()]
+    size = sum(path.stat().st_size for path in files)
+    return cost.Footprint(len(files) / len(points) + 2, size / len(points))
 
 
 def _job_costs(

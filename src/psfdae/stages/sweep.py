@@ -22,6 +22,9 @@ A workflow that was killed takes what its last jobs still brought to an end for
 incomplete and deletes their results; the copy keeps these trainings from being repeated.
 """
 
+CHECKSUM = "sha256"
+"""Key of the checksum of all other keys in a result."""
+
 POINT_MODULES = {
     "dae": "psfdae.sweeps.dae_point",
     "pca_som": "psfdae.sweeps.pca_som_point",
@@ -100,7 +103,7 @@ def point(
         asked = changes(space, values)
         config, keys = _with(config, asked), {**keys, **asked}
     content = [source, model, config.model_dump(), dict(values), dict(keys), task.described()]
-    fingerprint = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+    fingerprint = _digest(content)
     result = _finished(task.folder, fingerprint, module.FILES)
     if result is None:
         for stale in (*module.FILES, EVALUATION, VALIDATION, COST, RESULT, FINISHED):
@@ -117,10 +120,10 @@ def point(
             **_outcome(module, config, task),
             "fingerprint": fingerprint,
         }
-        write_text(task.folder / FINISHED, _as_json(result))
-    write_text(task.folder / RESULT, _as_json(result))
+        write_text(task.folder / FINISHED, as_json(result))
+    write_text(task.folder / RESULT, as_json(result))
     if trial is not None:
-        adaptive.finish(trial.journal, space, trial.search, result)
+        adaptive.finish(trial.journal, space, trial.search, [result])
 
 
 def _finished(folder: Path, fingerprint: str, files: Sequence[str]) -> dict[str, Any] | None:
@@ -138,8 +141,13 @@ def _finished(folder: Path, fingerprint: str, files: Sequence[str]) -> dict[str,
     return result
 
 
-def _as_json(result: Mapping[str, Any]) -> str:
-    return json.dumps(result, indent=1) + "\n"
+def as_json(result: Mapping[str, Any]) -> str:
+    """A result as text with its checksum."""
+    return json.dumps({**result, CHECKSUM: _digest(result)}, indent=1) + "\n"
+
+
+def _digest(tree: Any) -> str:
+    return hashlib.sha256(json.dumps(tree, sort_keys=True).encode()).hexdigest()
 
 
 def _outcome(module: Any, config: Any, task: Task) -> dict[str, Any]:
@@ -194,13 +202,31 @@ def _with(config: Any, keys: Mapping[str, Any]) -> Any:
 
 
 def read_result(path: Path) -> dict[str, Any]:
-    """A point's `result.json`; raises ProductError."""
+    """A point's `result.json` without its checksum.
+
+    Raises
+    ------
+    ProductError
+        If the file is missing, or not what was written.
+    """
     try:
         tree = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise ProductError(f"{path}: no such file") from None
     except (UnicodeDecodeError, json.JSONDecodeError) as error:
         raise ProductError(f"{path}: damaged ({error}); delete it and run again") from None
-    if not isinstance(tree, dict) or not {"point", "status", "values", "metrics"} <= set(tree):
-        raise ProductError(f"{path}: damaged (not a point's result); delete it and run again")
+    if not isinstance(tree, dict) or tree.pop(CHECKSUM, None) != _digest(tree):
+        raise ProductError(f"{path}: damaged (wrong checksum); delete it and run again")
     return tree
+
+
+def read_cost(folder: Path) -> dict[str, float]:
+    """Seconds and CPU seconds of a point's training; raises ProductError."""
+    path = folder / COST
+    try:
+        tree = json.loads(path.read_text(encoding="utf-8"))
+        return {key: float(tree[key]) for key in ("seconds", "cpu_seconds")}
+    except FileNotFoundError:
+        raise ProductError(f"{path}: no such file") from None
+    except (ValueError, KeyError, TypeError) as error:
+        raise ProductError(f"{path}: damaged ({error}); delete it and run again") from None

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from psfdae.files import ProductError, write_text
-from psfdae.stages.sweep import COST, read_result
+from psfdae.stages.sweep import read_cost, read_result
 from psfdae.sweeps.space import SweepError
 
 SUMMARY, COSTS, BEST, DEFINITION = "summary.csv", "cost.csv", "best.yaml", "sweep.yaml"
+JOURNAL = "study.journal"
 
 
 def summary(
@@ -48,10 +49,10 @@ def summary(
     if best is None:
         failed = f"{results[0]['point']}: {results[0]['reason']}"
         raise SweepError(f"all {len(results)} points of sweep {name} failed; the first, {failed}")
-    rows = [_row(result, result is best) for result in results]
+    rows = [_row(result, definition["space"], result is best) for result in results]
     write_text(out / SUMMARY, pd.DataFrame(rows).to_csv(index=False, float_format="%.8g"))
     costs = [
-        {"point": result["point"], **_cost(path)}
+        {"point": result["point"], **read_cost(path.parent)}
         for result, path in zip(results, points, strict=True)
     ]
     write_text(out / COSTS, pd.DataFrame(costs).to_csv(index=False))
@@ -59,6 +60,21 @@ def summary(
     # Unsorted: the order of the axes is that of the figures.
     write_text(out / DEFINITION, yaml.safe_dump(described, sort_keys=False))
     write_text(out / BEST, _best_yaml(name, definition, given, best))
+    if definition["kind"] == "adaptive":
+        _complete_journal(out / JOURNAL, definition, results)
+
+
+def _complete_journal(
+    journal: Path, definition: Mapping[str, Any], results: Sequence[Mapping[str, Any]]
+) -> None:
+    """Note all trials, also those that a new journal did not learn from the ones after them."""
+    from psfdae.configuration.compose import validate
+    from psfdae.configuration.sweep import Axis
+    from psfdae.sweeps import adaptive
+
+    space = {name: validate(Axis, axis) for name, axis in sorted(definition["space"].items())}
+    # The study is called like its first point.
+    adaptive.finish(journal, space, {**definition, "study": results[0]["point"]}, results)
 
 
 def choose(
@@ -94,13 +110,9 @@ def best_overrides(results: Path, name: str) -> list[str]:
     return [str(override) for override in overrides]
 
 
-def _cost(path: Path) -> dict[str, Any]:
-    cost: dict[str, Any] = json.loads((path.parent / COST).read_text(encoding="utf-8"))
-    return cost
-
-
-def _row(result: Mapping[str, Any], best: bool) -> dict[str, Any]:
-    values = {k: json.dumps(v) if isinstance(v, list) else v for k, v in result["values"].items()}
+def _row(result: Mapping[str, Any], axes: Iterable[str], best: bool) -> dict[str, Any]:
+    values = {name: result["values"][name] for name in axes}
+    values = {k: json.dumps(v) if isinstance(v, list) else v for k, v in values.items()}
     outcome = {key: result[key] for key in ("status", "reason", "epochs", "attempt")}
     chosen = {"best": "yes" if best else "no"}
     return {"point": result["point"], **values, **outcome, **chosen, **result["metrics"]}

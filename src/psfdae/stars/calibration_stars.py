@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
+from itertools import repeat
 
 import numpy as np
 
@@ -189,11 +190,12 @@ def window_of(snr: np.ndarray, flux: np.ndarray, noise: np.ndarray) -> np.ndarra
 
 
 def misfit(aligned: np.ndarray, position: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    """How far each star is from the median of its neighbours, in robust σ of all, shape (n,).
+    """How unlike its neighbours each star is, in what is usual in this image, shape (n,).
 
-    The measure of a star is the RMS of its difference from the median image of the
-    nearest `COMPANIONS` stars, its own noise subtracted. A field-dependent PSF
-    raises the measure of all stars, a blend only its own.
+    A star is compared with the nearest `COMPANIONS` stars, pixel by pixel: its
+    difference from their median in units of their robust scatter, root mean square
+    over the stamp. Where the PSF varies, so do the neighbours; a companion or a cosmic
+    ray lies where they agree. The result is 1 for the median star.
 
     Parameters
     ----------
@@ -207,16 +209,23 @@ def misfit(aligned: np.ndarray, position: np.ndarray, noise: np.ndarray) -> np.n
     from scipy.spatial import cKDTree
 
     count = len(aligned)
-    if count < 3:
-        return np.zeros(count)
-    near = np.broadcast_to(np.arange(count), (count, count))
+    if count < 4:
+        return np.ones(count)
     if np.isfinite(position).all() and count > COMPANIONS:
         near = cKDTree(position).query(position, k=COMPANIONS + 1)[1]
-    excess = np.empty(count)
-    for star, others in enumerate(near):
-        median = np.median(aligned[others[others != star]], axis=0)
-        power = np.square(aligned[star] - median).mean() - noise[star] ** 2
-        excess[star] = np.sqrt(max(power, 0.0))
-    middle = np.median(excess)
-    scatter = 1.4826 * np.median(np.abs(excess - middle))
-    return (excess - middle) / max(scatter, 1e-12)
+        usual = (_usual(aligned[found[found != star]]) for star, found in enumerate(near))
+    else:
+        usual = repeat(_usual(aligned), count)
+    score = np.empty(count)
+    for star, (median, variance) in enumerate(usual):
+        square = (aligned[star] - median) ** 2 / (variance + noise[star] ** 2)
+        score[star] = np.sqrt(square.mean())
+    return score / np.median(score)
+
+
+def _usual(stars: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Median and robust variance of every pixel of some stars."""
+    median = np.median(stars, axis=0)
+    scatter = 1.4826 * np.median(np.abs(stars - median), axis=0)
+    # A dozen stars may agree in a pixel by chance.
+    return median, scatter**2 + np.median(scatter) ** 2

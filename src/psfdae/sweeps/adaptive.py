@@ -95,10 +95,19 @@ def finish(
     journal: Path,
     space: Mapping[str, Any],
     search: Mapping[str, Any],
-    result: Mapping[str, Any],
+    results: Sequence[Mapping[str, Any]],
 ) -> None:
-    """Note the result of a trial: slot, values, status and metrics."""
-    _tell(_study(journal, search), space, search, result)
+    """Note results of trials, those that are there already excepted.
+
+    Parameters
+    ----------
+    journal, space, search : as for `begin`
+    results : sequence of mappings
+        slot, point, values, status and metrics of each.
+    """
+    study = _study(journal, search)
+    for result in results:
+        _tell(study, space, search, result)
 
 
 def _tell(

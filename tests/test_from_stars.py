@@ -1,0 +1,490 @@
+"""Training on the bright stars of an image: which stars, which images, which model."""
+
+from __future__ import annotations
+
+import re
+import resource
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from click.testing import CliRunner
+
+from psfdae.bundle import network, read_bundle
+from psfdae.cli import main
+from psfdae.configuration.compose import ConfigError, load_stage
+from psfdae.files import read_product
+from psfdae.models.dae import predict
+from psfdae.observations.examples import write_cube
+from psfdae.rng import stream
+from psfdae.stages import example_field as example_stage
+from psfdae.stages.calibration_stars import collect, write_stars
+from psfdae.stages.common import noise_model, split_stars
+from psfdae.stages.from_stars import Exposure
+from psfdae.stars.calibration_stars import (
+    brightest_pixels,
+    crowded,
+    misfit,
+    signal_to_noise,
+    sky_around,
+    star_centres,
+)
+from psfdae.stars.example_field import FieldRecipe, example_field, noise_area
+from psfdae.stars.from_observation import (
+    BrightStars,
+    bins_of,
+    cut,
+    make_images,
+    moved,
+    stacks,
+    star_grid,
+    star_of_images,
+)
+from psfdae.stars.splits import held_out_fields
+
+ROOT = Path(__file__).resolve().parents[1]
+SIDE = {"side_px": 700, "bright": 60, "faint": 80, "blended": 6, "saturated": 3}
+TINY = ["preset=smoke", "parts.train_stars=120", "parts.test_stars=30", "train.epochs=1"]
+
+
+def gaussians(centre, side=32, sigma=1.5):
+    """Round stars of flux 1, centre (row, column) from index side//2; (n, side, side)."""
+    axis = np.arange(side) - side // 2
+    rows, columns = (axis - np.asarray(centre)[:, i, None] for i in (0, 1))
+    light = np.exp(-0.5 * rows[:, :, None] ** 2 / sigma**2 - 0.5 * columns[:, None] ** 2 / sigma**2)
+    return light / light.sum(axis=(1, 2), keepdims=True)
+
+
+def bright_stars(centre, snr=500.0):
+    """Stars without noise around the given centres, at random positions of an image."""
+    wide = 1e4 * gaussians(centre)
+    count = len(wide)
+    position = np.random.default_rng(4).uniform(0, 1000, (count, 2))
+    peak, _ = brightest_pixels(wide, 3)
+    level = np.full(count, snr)
+    noise = np.ones(count)
+    return BrightStars(
+        wide, peak, np.asarray(centre), position, 1e4 * noise, noise, level, np.arange(count)
+    )
+
+
+@pytest.fixture(scope="module")
+def config():
+    return load_stage("from_stars", ["dataset=from_stars", *TINY])
+
+
+@pytest.fixture(scope="module")
+def field(tmp_path_factory):
+    """A small simulated image with its star list, and the truth."""
+    folder = tmp_path_factory.mktemp("field")
+    paths = folder / "image.fits", folder / "stars.csv"
+    return *paths, example_stage.run(*paths, seed=5, **SIDE)
+
+
+@pytest.fixture(scope="module")
+def model(field, tmp_path_factory):
+    """Folder of the command on the small image, and what it said."""
+    out = tmp_path_factory.mktemp("own") / "model"
+    result = run(field[0], "--catalogue", field[1], "--out", out, *TINY)
+    assert result.exit_code == 0, result.output
+    return out, result.output
+
+
+@pytest.fixture(scope="module")
+def candidates(field, config):
+    return collect(Exposure(field[0], field[1]).open(16, 8), config)
+
+
+# Measuring
+
+
+def test_sky_is_that_around_the_star():
+    rng = np.random.default_rng(1)
+    wide = rng.normal(200.0, 5.0, (50, 32, 32))
+    wide[:, 12:20, 12:20] += 1e4  # the star
+    wide[::2, 2:5, 2:5] += 500.0  # a neighbour
+    bad = np.zeros(wide.shape, dtype=bool)
+    bad[:, 30] = True
+    wide[bad] = 1e6
+    sky = sky_around(wide, bad, 16)
+    # Of 736 pixels: 5 √(π/2/736) = 0.23 for a median, 4.3 % for a median deviation.
+    assert np.abs(sky.level - 200.0).max() < 4 * 0.23
+    assert np.abs(sky.noise / 5.0 - 1).max() < 4 * 0.043
+
+
+def test_sky_of_a_stamp_that_is_all_bad_is_no_number_s_fault():
+    sky = sky_around(np.zeros((2, 24, 24)), np.ones((2, 24, 24), dtype=bool), 16)
+    assert (sky.level == 0).all()
+    assert (sky.noise == 0).all()
+
+
+def test_signal_to_noise_is_that_of_king_s_area():
+    star = gaussians([[0.2, -0.3]], side=16)
+    noise, flux = 3.0, 20000.0
+    rng = np.random.default_rng(2)
+    noisy = flux * star + rng.normal(0, noise, (400, 16, 16))
+    expected = flux / (noise * np.sqrt(noise_area(star[0])))
+    measured = signal_to_noise(noisy, np.full(400, noise))
+    assert measured.mean() == pytest.approx(expected, rel=3e-4)
+    assert measured.std() == pytest.approx(1.0, abs=0.15)  # its error is one unit
+    assert (signal_to_noise(noisy, np.zeros(400)) == 0).all()
+
+
+def test_only_a_bright_neighbour_crowds():
+    position = np.array([[0.0, 0.0], [5.0, 0.0], [100.0, 0.0], [106.0, 0.0], [np.nan, 0.0]])
+    brightness = np.array([100.0, 1.0, 100.0, 50.0, 1e6])
+    found = crowded(position, brightness, 10.0, 0.02)
+    assert found.tolist() == [False, True, True, True, False]
+    assert not crowded(np.full((2, 2), np.nan), brightness[:2], 10.0, 0.02).any()
+
+
+def test_centres_are_found_to_a_hundredth_of_a_pixel():
+    centre = np.random.default_rng(3).uniform(-1.4, 1.4, (40, 2))
+    wide = gaussians(centre)
+    peak, inside = brightest_pixels(wide, 3)
+    assert inside.all()
+    assert (np.abs(peak - centre) <= 0.5 + 1e-9).all()
+    found = star_centres(wide, peak, np.full(40, 1.5))
+    assert np.abs(found - centre).max() < 0.01
+
+
+def test_a_peak_beyond_the_search_is_told():
+    _, inside = brightest_pixels(gaussians([[4.0, 0.0], [3.0, -3.0]]), 3)
+    assert inside.tolist() == [False, True]
+
+
+def test_a_blend_is_a_misfit_although_the_psf_varies():
+    rng = np.random.default_rng(6)
+    position = rng.uniform(0, 1000, (80, 2))
+    width = 1.3 + 0.6 * position[:, 0] / 1000
+    stars = np.concatenate([gaussians([[0, 0]], 16, sigma=s) for s in width])
+    stars += rng.normal(0, 3e-4, stars.shape)
+    stars[10] += 0.3 * gaussians([[0, 5.0]], 16)[0]
+    stars[20, 3, 12] += 0.02  # a cosmic ray
+    score = misfit(stars, position, np.full(80, 3e-4))
+    assert set(np.flatnonzero(score > 2.5)) == {10, 20}
+    unknown = misfit(stars, np.full((80, 2), np.nan), np.full(80, 3e-4))
+    assert unknown[10] == unknown.max()
+
+
+# Images
+
+
+@pytest.mark.parametrize("count", [47, 195, 300])
+def test_every_fifth_star_is_held_out_evenly_over_the_field(count):
+    position = np.random.default_rng(count).uniform(0, 2000, (count, 2))
+    grid = star_grid(position)
+    assert len(np.unique(grid, axis=0)) == count
+    held = held_out_fields(grid)
+    assert held.mean() == pytest.approx(0.2, abs=0.05)
+    quarter = bins_of(position, 2)
+    assert (np.bincount(quarter[held], minlength=4) > 0).all()
+    order = np.random.default_rng(0).permutation(count)
+    assert (star_grid(position[order]) == grid[order]).all()
+
+
+def test_stars_without_positions_keep_their_order():
+    grid = star_grid(np.full((30, 2), np.nan))
+    assert grid[:6].tolist() == [[0, i] for i in range(5)] + [[1, 0]]
+    assert held_out_fields(grid).any()
+    assert (bins_of(np.full((30, 2), np.nan), 4) == 0).all()
+
+
+def test_images_are_shared_out_evenly():
+    held = np.array([False, True, False, False, True])
+    star = star_of_images(held, 10, 5)
+    assert np.bincount(star[:10], minlength=5).tolist() == [4, 0, 3, 3, 0]
+    assert np.bincount(star[10:], minlength=5).tolist() == [0, 3, 0, 0, 2]
+    assert star_of_images(held, 1, 1).size == 5  # none is left out
+
+
+def test_a_moved_star_is_the_star_rendered_there():
+    rng = np.random.default_rng(7)
+    centre, shift = rng.uniform(-0.5, 0.5, (2, 30, 2))
+    error = moved(gaussians(centre), shift) - gaussians(centre + shift)
+    assert np.square(error).mean() < 1e-8 * gaussians(centre).max() ** 2 / 0.01
+    assert np.square(error).mean() < 1e-8
+
+
+def test_cut_puts_the_offset_in_the_middle_and_repeats_the_edge():
+    wide = np.arange(400.0).reshape(1, 20, 20)
+    assert cut(wide, np.array([[2, -1]]), 8)[0, 4, 4] == wide[0, 12, 9]
+    beyond = cut(wide, np.array([[9, 0]]), 8)[0]
+    assert (beyond[5:] == beyond[4]).all()
+
+
+def test_stacks_are_weighted_by_signal_to_noise():
+    aligned = np.stack([np.full((4, 4), v) for v in (1.0, 4.0, 10.0)])
+    found = stacks(aligned, np.array([2.0, 1.0, 1.0]), np.array([0, 0, 2]), 4)
+    assert found[:, 0, 0] == pytest.approx([2.0, 4.0, 10.0, 4.0])
+
+
+def test_images_are_framed_normalised_and_moved_only_where_asked():
+    centre = np.random.default_rng(8).uniform(-0.5, 0.5, (10, 2))
+    stars = bright_stars(centre)
+    template = gaussians(np.zeros((10, 2)))
+    star = np.repeat(np.arange(10), 40)
+    subpixel = np.tile([False, True], 200)
+    found = make_images(stars, template, star, 16, 1, subpixel, stream(1, "test"))
+    assert found.realisation.sum(axis=(1, 2)) == pytest.approx(1.0, abs=1e-5)
+    peak = np.stack(np.divmod(found.realisation.reshape(400, -1).argmax(axis=1), 16), axis=1)
+    assert (peak - 8 == found.jitter).all()
+    assert set(map(tuple, found.jitter)) == {(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)}
+    # A star that is not moved is a plain piece of the image.
+    for image in np.flatnonzero(~subpixel)[::9]:
+        who = star[image]
+        offset = stars.peak[who] - found.jitter[image]
+        piece = cut(stars.wide[who : who + 1], offset[None], 16)[0]
+        assert found.realisation[image] == pytest.approx(piece / piece.sum(), abs=1e-7)
+    # The others lie anywhere in their pixel, and so do their templates.
+    place = star_centres(found.realisation.astype(float), found.jitter, np.full(400, 1.5))
+    phase = (place - found.jitter)[subpixel]
+    assert np.abs(phase.mean(axis=0)).max() < 4 * np.sqrt(1 / 12 / 200)
+    assert phase.std(axis=0) == pytest.approx(np.sqrt(1 / 12), rel=0.1)
+    again = star_centres(found.template.astype(float), found.jitter, np.full(400, 1.5))
+    assert np.abs(again - place).max() < 0.03
+
+
+# The simulated image
+
+
+def test_example_is_reproducible_and_has_the_noise_that_it_states():
+    recipe = FieldRecipe(**{**SIDE, "bright": 5, "faint": 5, "blended": 0, "saturated": 1})
+    made, again = example_field(recipe, 3), example_field(recipe, 3)
+    assert (made.image == again.image).all()
+    assert (made.image != example_field(recipe, 4).image).any()
+    far = np.ones(made.image.shape, dtype=bool)
+    for column, row in np.rint(made.position).astype(int):
+        far[max(row - 30, 0) : row + 31, max(column - 30, 0) : column + 31] = False
+    middle = far.copy()
+    middle[:, :300] = middle[:, 400:] = False
+    sky = made.image[middle].astype(float) * recipe.gain
+    variance = recipe.sky_e + recipe.read_noise_e**2 + recipe.gain**2 / 12
+    assert sky.mean() == pytest.approx(recipe.sky_e, rel=0.01)
+    assert sky.var() == pytest.approx(variance, rel=0.03)
+    assert made.image.max() == recipe.saturation
+
+
+def test_example_stars_lie_where_the_catalogue_says(field):
+    *_, made = field
+    # Near the axis, where stars are round and a window moves no centroid.
+    near = np.abs(made.position - 350).max(axis=1) < 120
+    psf = made.psf[near].astype(float)
+    found = star_centres(psf, brightest_pixels(psf, 3)[0], np.full(len(psf), 2.0))
+    expected = (made.centroid - np.rint(made.position))[near, ::-1]
+    assert near.sum() > 10
+    assert np.abs(found - expected).max() < 0.06
+    bright = made.kind == "bright"
+    snr = made.flux[bright] / np.sqrt(336 * np.median([noise_area(p) for p in made.psf[bright]]))
+    assert 80 < snr.min() < snr.max() < 3500
+
+
+def test_selection_keeps_good_stars_only(field, candidates):
+    *_, made = field
+    verdict = pd.Series(candidates.verdict)
+    good = verdict == "good"
+    assert (made.kind[good] == "bright").mean() == 1.0
+    assert (verdict[made.kind == "saturated"] == "saturated").all()
+    assert good.sum() > 0.6 * (made.kind == "bright").sum()
+    assert (candidates.bright.row == np.flatnonzero(good)).all()
+    measured = candidates.snr[good]
+    assert measured.min() >= 100.0
+
+
+def test_product_stars_is_what_the_stages_read(candidates, config, tmp_path):
+    bright = candidates.bright
+    grid = star_grid(bright.position)
+    held_out = held_out_fields(grid)
+    out = tmp_path / "stars.h5"
+    write_stars(bright, grid, held_out, config, {}, out)
+    first = out.read_bytes()
+    write_stars(bright, grid, held_out, config, {}, out)
+    assert out.read_bytes() == first
+    product = read_product(out, "stars")
+    parts = split_stars(product, "held_out", config)
+    assert parts.train.size == 120
+    assert set(product["field_index"][parts.test]) == set(np.flatnonzero(held_out))
+    assert not set(product["field_index"][parts.train]) & set(np.flatnonzero(held_out))
+    assert not {*product["field_index"][parts.fit]} & {*product["field_index"][parts.validation]}
+    # The stack of a star's part of the field is like the star.
+    difference = product["template"] - product["realisation"]
+    assert np.square(difference).mean() < 1e-5
+
+
+def test_held_out_stars_are_the_truth_but_for_their_noise(field, candidates):
+    *_, made = field
+    bright = candidates.bright
+    images = make_images(
+        bright,
+        bright.wide,
+        np.arange(len(bright)),
+        16,
+        0,
+        np.zeros(len(bright), dtype=bool),
+        stream(1, "t"),
+    )
+    for image, row, noise in zip(
+        images.realisation, bright.row, bright.noise / bright.flux, strict=True
+    ):
+        error = best_match(made.psf[row], image)
+        photons = 1 / (made.flux[row] * 256)
+        assert error < 3 * (noise**2 + photons)
+
+
+def best_match(psf, image):
+    """Least MSE of an image against all pieces of the noise-free star near its middle."""
+    offsets = np.array([(i, j) for i in range(-3, 4) for j in range(-3, 4)])
+    pieces = cut(np.broadcast_to(psf, (len(offsets), *psf.shape)), offsets, image.shape[-1])
+    pieces = pieces / pieces.sum(axis=(1, 2), keepdims=True)
+    return np.square(pieces - image).mean(axis=(1, 2)).min()
+
+
+# The command
+
+
+def run(*words):
+    return CliRunner().invoke(main, ["from-stars", *map(str, words)])
+
+
+def test_command_leaves_a_model_and_a_report(model):
+    out, said = model
+    assert "saturated" in said
+    report = pd.read_csv(out / "report.csv")
+    assert list(report.columns) == (
+        ["snr", "noise", "method", "mse", "mse_stderr", "ssim", "images", "stars", "truth_mse"]
+    )
+    assert report.snr.unique() == pytest.approx([5, 10, 20, 50])
+    assert (out / "report.png").is_file()
+    selection = pd.read_csv(out / "selection.csv")
+    held = (selection.part == "held out").sum()
+    assert (report.stars == held).all()
+    noisy = report[report.method == "noisy"]
+    # Sky σ² and the star's own photons, 1/F of the flux over all pixels.
+    assert (noisy.mse / noisy.noise**2).between(0.95, 1.25).all()
+    bundle = read_bundle(out / "image.psf.safetensors")
+    assert bundle.info.source == "stars"
+    assert bundle.info.pixel_scale_arcsec == pytest.approx(1.2)
+    assert bundle.info.pixel_lambda_d is None
+    assert bundle.info.snr_min == pytest.approx(5, rel=1e-3)
+
+
+def test_settings_can_be_used_by_hand(model, tmp_path):
+    out, _ = model
+    config = load_stage("train", (out / "overrides.txt").read_text().split())
+    assert config.noise.kappa == 1.0
+    assert len(config.noise.levels) == 4
+    by_hand = [*("train", "--stars", str(out / "stars.h5"), "--split", "held_out")]
+    words = [*by_hand, "--out", str(tmp_path / "dae"), *(out / "overrides.txt").read_text().split()]
+    assert CliRunner().invoke(main, words).exit_code == 0
+    weights = "dae.safetensors"
+    assert (tmp_path / "dae" / weights).read_bytes() == (out / "dae" / weights).read_bytes()
+
+
+@pytest.mark.parametrize("margin", [0, 5])
+def test_a_cube_of_stamps_will_do(candidates, tmp_path, margin):
+    inner = slice(8 - margin, 24 + margin)
+    sky = np.random.default_rng(1).normal(100, 1, (len(candidates.bright), 32, 32))
+    stamps = (candidates.bright.wide + sky)[:, inner, inner].astype(np.float32)
+    write_cube(tmp_path / "cube.fits", stamps, PIXSCALE=1.2)
+    result = run(tmp_path / "cube.fits", "--out", tmp_path / "model", *TINY)
+    assert result.exit_code == 0, result.output
+    assert read_bundle(tmp_path / "model/cube.psf.safetensors").info.stamp_px == 16
+
+
+def test_what_cannot_be_used_ends_in_one_line(field, tmp_path):
+    image, catalogue, _ = field
+    out = tmp_path / "model"
+    for words, message in (
+        ([image], "needs a star catalogue"),
+        ([image, "--catalogue", catalogue, "calibration_stars.stars_min=1000"], r"= 1000 are need"),
+        ([image, "--catalogue", catalogue, "calibration_stars.snr_min=1e7"], "0 stars are good"),
+        ([tmp_path / "none.fits", "--catalogue", catalogue], "none.fits"),
+    ):
+        result = run(*words, "--out", out, *TINY)
+        assert result.exit_code == 2, result.output
+        assert re.search(message, result.output), result.output
+        assert len(result.output.strip().splitlines()) == 1
+    stamps = np.ones((4, 16, 16), np.float32)
+    write_cube(tmp_path / "cube.fits", stamps)
+    result = run(tmp_path / "cube.fits", "--out", out, *TINY)
+    assert result.exit_code == 2
+    assert "--pixel-scale" in result.output
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("calibration_stars.snr_levels=[10,5]", "must be ascending"),
+        ("calibration_stars.snr_levels=[10,80]", r"must end at snr_min / 2 = 50"),
+        ("calibration_stars.misfit=1", r"calibration_stars\.misfit = 1"),
+    ],
+)
+def test_wrong_settings_are_named(override, message):
+    with pytest.raises(ConfigError, match=message):
+        load_stage("from_stars", ["dataset=from_stars", override])
+
+
+@pytest.mark.workflow
+def test_commands_of_own_stars_md_run(tmp_path, monkeypatch):
+    """From first to last, on a small image and a tiny network."""
+    text = (ROOT / "docs/templates/docs/own_stars.md.j2").read_text(encoding="utf-8")
+    lines = [
+        line for block in re.findall(r"```sh\n(.*?)```", text, re.S) for line in block.split("\n")
+    ]
+    steps = [shlex.split(line, comments=True) for line in lines if line.startswith("psfdae ")]
+    assert {"example-field", "from-stars", "predict", "describe"} <= {step[1] for step in steps}
+    small = {
+        "example-field": ["--side=700", "--bright=60", "--faint=80"],
+        "from-stars": TINY,
+        "predict": ["--quiet"],
+    }
+    monkeypatch.chdir(tmp_path)
+    for _, name, *rest in steps:
+        if rest[-2:] == ["$(cat", "model/overrides.txt)"]:
+            rest[-2:] = (tmp_path / "model/overrides.txt").read_text().split()
+        words = [name, *rest, *small.get(name, [])]
+        result = CliRunner().invoke(main, words)
+        assert result.exit_code == 0, (words, result.output)
+
+
+@pytest.mark.workflow
+def test_target_from_stars_example_is_planned(tmp_path):
+    from workflow_runs import planned
+
+    jobs = planned(tmp_path, "from_stars_example")
+    assert jobs == {"example_field": 1, "own_stars": 1}
+
+
+@pytest.mark.slow
+def test_one_command_beats_the_noisy_star_and_the_baseline(tmp_path):
+    """Show 4: 300 bright stars, 16 × 16 px, held-out stars at S/N 10, minutes of one core."""
+    image, catalogue, out = (tmp_path / name for name in ("i.fits", "s.csv", "model"))
+    made = example_stage.run(image, catalogue, seed=1)
+    words = ["from-stars", image, "--catalogue", catalogue, "--out", out]
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    subprocess.run([sys.executable, "-m", "psfdae", *map(str, words)], check=True)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    # One thread works; other work on the machine does not count.
+    assert after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime < 180
+    report = pd.read_csv(out / "report.csv").set_index(["method", "snr"])
+    dae, baseline, noisy = (report.loc[m] for m in ("dae", "pca_som", "noisy"))
+    assert (dae.mse + 3 * dae.mse_stderr < baseline.mse - 3 * baseline.mse_stderr).all()
+    ten = dae.index[np.abs(dae.index - 10).argmin()]
+    assert dae.mse[ten] < 0.5 * baseline.mse[ten]
+    assert dae.mse[ten] < 0.03 * noisy.mse[ten]
+    # Against what the simulation knows, too, and not only the bright star's own image.
+    product = read_product(out / "stars.h5", "stars")
+    bundle = read_bundle(out / "i.psf.safetensors")
+    config = load_stage("evaluate", (out / "overrides.txt").read_text().split())
+    test = split_stars(product, "held_out", config).test
+    level = min(config.noise.levels, key=lambda v: abs(v - noisy.noise[ten]))
+    drawn = noise_model(config).draw(product["realisation"][test], level, stream(9, "exact"))
+    estimate = predict(network(bundle), drawn, bundle.info.image_scale)
+    row = product["row"][product["field_index"][test]]
+    exact = [best_match(made.psf[r], e) for r, e in zip(row, estimate, strict=True)]
+    assert np.mean(exact) < dae.mse[ten]

@@ -1,0 +1,391 @@
+"""`psfdae predict`: FITS in, FITS out, and one line with exit code 2 for what cannot be used."""
+
+from __future__ import annotations
+
+import json
+import struct
+import warnings
+
+import numpy as np
+import pandas as pd
+import pytest
+from astropy.io import fits
+from astropy.table import Table
+from click.testing import CliRunner
+
+from prediction_stars import SKY, observe
+from psfdae import StarFlag, load_model
+from psfdae.bundle.format import shipped_path
+from psfdae.cli import main
+from psfdae.configuration.compose import load_stage
+from psfdae.observations.examples import write_cube, write_field
+from psfdae.prediction import engine, plot, writer
+from psfdae.prediction.model import SCALE_TOLERANCE
+from psfdae.stages import predict as stage
+from psfdae.stages import prediction as measured
+from psfdae.stars.framing import normalise_flux, stamp_offset
+from psfdae.stars.scene import Propagation
+from psfdae.stars.seidel_scene import SeidelWavefronts
+from workflow_runs import ROOT, snakemake
+
+SIDE = 320
+
+
+def run(*words):
+    result = CliRunner().invoke(main, ["predict", *map(str, words)])
+    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
+    return result
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory, field_psfs):
+    """A cube of 300 stamps, and an image of 60 stars with catalogues."""
+    folder = tmp_path_factory.mktemp("predict")
+    stars = observe(field_psfs[:300], 1e-3)
+    write_cube(folder / "cube.fits", stars.stamps, PIXSCALE=0.1, OBJECT="M 67")
+    np.save(folder / "cube.npy", stars.stamps)
+    rng = np.random.default_rng(2)
+    row, column = np.divmod(np.arange(60), 8)
+    x, y = (20 + 38 * a + rng.uniform(-3, 3, 60) for a in (column, row))
+    sky = rng.normal(SKY, SKY**0.5, (SIDE, SIDE))
+    write_field(
+        folder / "image.fits", folder / "stars.csv", 2e4 * field_psfs[:60], x, y,
+        shape=(SIDE, SIDE), background=sky, pixel_scale_arcsec=0.1, GAIN=1.0, SATURATE=6e4,
+    )  # fmt: skip
+    table = Table.read(folder / "stars.csv")
+    table["id"] = [f"star-{number}" for number in table["id"]]
+    table["flux"] = np.where(np.arange(60) % 2, 2e4, np.nan)
+    table.write(folder / "named.fits")
+    return folder
+
+
+def read(path):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with fits.open(path) as file:
+            file.verify("exception")
+            cubes = {hdu.name: np.array(hdu.data) for hdu in file[1:4]}
+            return cubes, Table.read(path, hdu="STARS"), file[0].header
+
+
+def test_cube_gives_what_the_model_gives(folder, shipped):
+    out = folder / "cube_psf.fits"
+    result = run(folder / "cube.fits", "--out", out)
+    assert result.exit_code == 0, result.output
+    assert "300 stars" in result.output
+    cubes, table, header = read(out)
+    expected = shipped.predict(np.load(folder / "cube.npy"))
+    assert list(cubes) == ["PSF", "RESIDUAL", "UNCERT"]
+    assert np.array_equal(cubes["PSF"], expected.psf)
+    assert np.array_equal(cubes["RESIDUAL"], expected.residual, equal_nan=True)
+    assert np.array_equal(cubes["UNCERT"], expected.uncertainty)
+    for name in ("flux", "snr", "distance", "fwhm_px", "position_angle_deg", "shift_x", "flags"):
+        assert np.array_equal(table[name], getattr(expected, name)), name
+    assert np.array_equal(table["id"], np.arange(300))
+    assert table["x"].mask.all()
+    assert header["PSFMODEL"] == "wfsat"
+    assert header["PSFSHA"] == shipped.bundle.sha256
+    assert header["INFILE"] == "cube.fits"
+    assert header["OBJECT"] == "M 67"
+    assert header["CREATOR"].startswith("psfdae ")
+    assert "HISTORY" in header
+
+
+def test_image_and_catalogue(folder, field_psfs):
+    out, png = folder / "image_psf.fits", folder / "map.png"
+    result = run(
+        *(folder / "image.fits", "--catalogue", folder / "stars.csv"), "--out", out, "--plot", png
+    )
+    assert result.exit_code == 0, result.output
+    cubes, table, header = read(out)
+    truth = Table.read(folder / "stars.csv")
+    assert np.allclose(table["x"], truth["X_IMAGE"] - 1)
+    assert header["GAIN"] == 1.0
+    still = (table["shift_x"] == 0) & (table["shift_y"] == 0)
+    assert still.sum() > 55
+    error = np.abs(cubes["PSF"] - 2e4 * field_psfs[:60])[still]
+    assert (error <= cubes["UNCERT"][still]).mean() == pytest.approx(0.68, abs=0.06)
+    assert png.read_bytes()[:4] == b"\x89PNG"
+
+
+def test_names_given_fluxes_and_columns_of_a_table(folder):
+    out = folder / "named_psf.fits"
+    result = run(
+        *(folder / "image.fits", "--catalogue", folder / "named.fits", "--out", out),
+        *("--flux-column", "flux", "--quiet"),
+    )
+    assert result.exit_code == 0, result.output
+    assert result.output == ""
+    _, table, _ = read(out)
+    assert table["id"][59] == "star-59"
+    assert (table["flux"][1::2] == 2e4).all()
+    assert table["flux_error"].mask[1::2].all()
+    assert (table["flux"][::2] != 2e4).all()
+
+
+def test_chunks_and_threads_do_not_show(folder, monkeypatch):
+    files = []
+    for rows, threads in ((engine.BLOCK, 1), (4 * engine.BLOCK, 2), (engine.BLOCK, 3)):
+        monkeypatch.setattr(stage, "ROWS", rows)
+        out = folder / f"rows{rows}_{threads}.fits"
+        stage.run(stage.Source(folder / "cube.fits"), out, threads=threads)
+        files.append(out.read_bytes())
+    assert files[0] == files[1] == files[2]
+
+
+def test_blemished_stamps_keep_their_rows(folder):
+    stamps = np.load(folder / "cube.npy")[:8]
+    stamps[0, 3, 3] = np.nan
+    stamps[1] = np.nan
+    stamps[2] = 0.0
+    stamps[3] = 2 * SKY - stamps[3]
+    stamps[4, 8, 8] = 6e4
+    stamps[5] = np.roll(stamps[5], 5, axis=0)
+    write_cube(folder / "odd.fits", stamps, PIXSCALE=0.1, SATURATE=5e4)
+    assert run(folder / "odd.fits", "--out", folder / "odd_psf.fits").exit_code == 0
+    cubes, table, _ = read(folder / "odd_psf.fits")
+    flags = [StarFlag(int(value)) for value in table["flags"]]
+    assert StarFlag.MASKED in flags[0]
+    assert StarFlag.MASKED | StarFlag.NO_FLUX in flags[1]
+    assert StarFlag.NO_FLUX in flags[2]
+    assert StarFlag.NO_FLUX in flags[3]
+    assert StarFlag.SATURATED in flags[4]
+    assert StarFlag.OFF_CENTRE in flags[5]
+    assert flags[6] == flags[7] == StarFlag(0)
+    assert np.isnan(cubes["PSF"][[1, 2, 3]]).all()
+    assert np.isfinite(cubes["PSF"][[0, 4, 6, 7]]).all()
+
+
+def test_names_that_no_header_card_can_hold_are_no_trouble(folder, tmp_path):
+    odd = tmp_path / f"{'long' * 40} Köln\t.fits"
+    odd.write_bytes((folder / "cube.fits").read_bytes())
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert run(odd, "--out", tmp_path / "psf.fits").exit_code == 0
+    _, _, header = read(tmp_path / "psf.fits")
+    assert header["INFILE"] == f"{'long' * 40} K?ln .fits"
+
+
+def test_stars_at_and_beyond_the_edge_keep_their_rows(folder):
+    table = Table({"x": [20.0, 1.0, -500.0], "y": [20.0, 1.0, 40.0]})
+    table.write(folder / "edge.csv")
+    result = run(
+        *(folder / "image.fits", "--catalogue", folder / "edge.csv", "--origin", 0),
+        *("--out", folder / "edge_psf.fits"),
+    )
+    assert result.exit_code == 0, result.output
+    _, found, _ = read(folder / "edge_psf.fits")
+    assert [bool(f & int(StarFlag.TRUNCATED)) for f in found["flags"]] == [False, True, True]
+    assert found["flags"][2] & int(StarFlag.NO_FLUX)
+
+
+def newer_bundle(path):
+    """The shipped bundle with a format that does not exist yet."""
+    raw = shipped_path().read_bytes()
+    size = struct.unpack("<Q", raw[:8])[0]
+    header = json.loads(raw[8 : 8 + size])
+    text = json.loads(header["__metadata__"]["bundle"]) | {"format_version": 99}
+    header["__metadata__"]["bundle"] = json.dumps(text)
+    changed = json.dumps(header).encode()
+    path.write_bytes(struct.pack("<Q", len(changed)) + changed + raw[8 + size :])
+
+
+@pytest.fixture(scope="module")
+def bad(folder):
+    """Files that cannot be used."""
+    stamps = np.load(folder / "cube.npy")[:4]
+    raw = (folder / "cube.fits").read_bytes()
+    (folder / "damaged.fits").write_bytes(raw[: len(raw) // 2])
+    (folder / "text.fits").write_text("no FITS file")
+    write_cube(folder / "coarse.fits", stamps, PIXSCALE=0.2)
+    write_cube(folder / "unknown.fits", stamps)
+    write_cube(folder / "large.fits", np.zeros((3, 24, 24)), PIXSCALE=0.1)
+    write_cube(folder / "plain.fits", np.zeros((SIDE, SIDE)), PIXSCALE=0.1)
+    (folder / "empty.csv").write_text("x,y\n")
+    (folder / "outside.csv").write_text("X_IMAGE,Y_IMAGE\n5000,5000\n6000,100\n")
+    (folder / "sky.csv").write_text("ra,dec\n150.0,2.0\n")
+    newer_bundle(folder / "newer.psf.safetensors")
+    (folder / "exists.fits").write_text("precious")
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("words", "named", "texts"),
+    [
+        (["damaged.fits"], "damaged.fits", []),
+        (["text.fits"], "text.fits", []),
+        (["nowhere.fits"], "nowhere.fits", ["no such file"]),
+        (["coarse.fits"], "coarse.fits", ["0.2 arcsec", "0.1 arcsec"]),
+        (["cube.fits", "--pixel-scale", "0.11"], "cube.fits", ["0.11 arcsec", "0.1 arcsec"]),
+        (["unknown.fits"], "unknown.fits", ["--pixel-scale"]),
+        (["large.fits"], "large.fits", ["24×24", "16×16"]),
+        (["plain.fits"], "plain.fits", ["catalogue"]),
+        (["plain.fits", "--catalogue", "sky.csv"], "plain.fits", ["WCS"]),
+        (["image.fits", "--catalogue", "empty.csv"], "empty.csv", []),
+        (["image.fits", "--catalogue", "outside.csv"], "outside.csv", ["none of the 2 stars"]),
+        (["cube.fits", "--model", "newer.psf.safetensors"], "newer.psf", ["format 99", "format 1"]),
+        (["cube.fits", "--model", "cube.npy"], "cube.npy", []),
+        (["cube.fits", "--flux-column", "flux"], "cube.fits", ["no catalogue"]),
+        (["image.fits", "--catalogue", "stars.csv", "--flux-column", "f"], "stars.csv", ["'f'"]),
+        (["cube.fits", "--plot", "x.png"], "cube.fits", ["map"]),
+        (["cube.fits", "--out", "exists.fits"], "exists.fits", ["--overwrite"]),
+        (["cube.fits", "--out", "cube.fits", "--overwrite"], "cube.fits", ["input"]),
+        (["cube.fits", "--out", "."], ".", []),
+        (["cube.fits", "--plot", "out.fits"], "out.fits", []),
+    ],
+)
+def test_what_cannot_be_used_ends_in_one_line_and_code_2(bad, monkeypatch, words, named, texts):
+    monkeypatch.chdir(bad)
+    out = [] if "--out" in words else ["--out", "out.fits"]
+    result = run(*words, *out)
+    assert result.exit_code == 2, result.output
+    lines = [line for line in result.output.splitlines() if line.startswith(("psfdae:", "Error"))]
+    assert len(lines) == 1, result.output
+    assert named in lines[0]
+    assert all(text in lines[0] for text in texts), lines[0]
+    assert not (bad / "out.fits").exists()
+    assert (bad / "exists.fits").read_text() == "precious"
+
+
+def test_scale_within_two_per_cent_is_taken(bad, tmp_path):
+    for words in (["cube.fits", "--pixel-scale", 0.1015], ["unknown.fits", "--pixel-scale", 0.1]):
+        out = tmp_path / f"{words[2]}.fits"
+        assert run(bad / words[0], *words[1:], "--out", out).exit_code == 0
+
+
+def test_failure_in_the_middle_leaves_no_file(folder, tmp_path, monkeypatch):
+    def fail(self, stars):
+        raise MemoryError
+
+    monkeypatch.setattr(engine.Engine, "block", fail)
+    with pytest.raises(MemoryError):
+        stage.run(stage.Source(folder / "cube.fits"), tmp_path / "psf.fits")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_full_disk_is_one_line(folder, tmp_path):
+    (tmp_path / "file").write_text("")
+    result = run(folder / "cube.fits", "--out", tmp_path / "file" / "psf.fits")
+    assert result.exit_code == 2
+    assert "cannot be written" in result.output
+
+
+def test_memory_does_not_grow_with_the_stars(folder, monkeypatch):
+    """Stamps are taken as they are needed and let go when written."""
+    alive, most = set(), 0
+    chunks = stage.Observation.chunks
+
+    def counted(self, rows):
+        nonlocal most
+        for number, stamps in enumerate(chunks(self, rows)):
+            alive.add(number)
+            most = max(most, len(alive))
+            yield stamps
+
+    monkeypatch.setattr(stage, "ROWS", 50)
+    monkeypatch.setattr(stage.Observation, "chunks", counted)
+    done = []
+
+    def tick(stars):
+        done.append(stars)
+        alive.discard(len(done) - 1)
+
+    out = folder / "few.fits"
+    stage.run(stage.Source(folder / "cube.fits"), out, threads=2, tick=tick)
+    assert sum(done) == 300
+    assert most <= 4
+
+
+def field_of(**changes):
+    values = {
+        "x": np.array([0.0, 10.0, 100.0, 101.0]),
+        "y": np.zeros(4),
+        "snr": np.array([5.0, 50.0, 20.0, 30.0]),
+        "fwhm_px": np.full(4, 2.0),
+        "ellipticity": np.full(4, 0.2),
+        "position_angle_deg": np.zeros(4),
+        "flags": np.zeros(4, int),
+    }
+    return plot.FieldStars(**(values | changes))
+
+
+def test_map_shows_bright_stars_that_do_not_overlap():
+    assert plot.chosen_stars(field_of()).tolist() == [1, 3]
+    spoilt = np.array([0, int(StarFlag.SATURATED), 0, 0])
+    assert plot.chosen_stars(field_of(flags=spoilt)).tolist() == [3, 0]
+
+
+def test_map_of_nothing_is_still_a_map():
+    stars = field_of(flags=np.full(4, int(StarFlag.NO_FLUX)))
+    figure = plot.psf_map(np.empty((0, 16, 16)), plot.chosen_stars(stars), stars, "nothing")
+    assert len(figure.axes) == 2
+
+
+def test_poppy_simulates_the_same_stars():
+    """The recipe given to POPPY is ours: independent optics, the same image."""
+    pytest.importorskip("poppy")
+    from psfdae.benchmark import poppy_stars as module
+
+    config = load_stage("prediction", ["dataset=dataset3"])
+    telescope, framing = config.telescope, config.framing
+    seidel, field = config.wavefront.coefficients * 1.1, np.array([0.6, -0.4])
+    image = module._Telescope(telescope, 66).image(seidel, field)
+    stamp = module._framed(image, np.array([1, -1]), framing, 24)
+    source = SeidelWavefronts(seidel[None], field[None])
+    ours = Propagation(source, telescope, config.optics, framing, 24)
+    offset = stamp_offset(ours.brightest(), np.array([[1, -1]]))
+    expected = normalise_flux(ours.stamps(16, offset))[0]
+    assert np.mean((normalise_flux(stamp[None])[0] - expected) ** 2) < 1e-8
+
+
+def test_poppy_table(tmp_path, monkeypatch, field_psfs, shipped):
+    from psfdae.benchmark import poppy_stars as module
+
+    monkeypatch.setattr(module, "poppy_stars", lambda config, count: field_psfs[:count])
+    config = load_stage("prediction", ["dataset=field", "noise.levels=[1.0e-3,3.0e-3]"])
+    table = pd.DataFrame(
+        {"method": "dae", "metric": "mse", "noise_level": [1e-3, 3e-3], "value": [2.8e-6, 1.0e-5]}
+    )
+    table.to_csv(tmp_path / "evaluation.csv", index=False)
+    arguments = (config, shipped_path(), tmp_path / "evaluation.csv", 300, tmp_path / "out.csv")
+    measured.poppy(*arguments)
+    found = pd.read_csv(tmp_path / "out.csv")
+    assert found["noise_level"].tolist() == [1e-3, 3e-3]
+    assert (found["met"] == "yes").all()
+    assert (found["ratio_estimated"] > found["ratio_given"]).all()
+    assert found["coverage_given"].between(0.63, 0.73).all()
+    assert (found["stars"] == 300).all()
+    table.iloc[:1].to_csv(tmp_path / "evaluation.csv", index=False)
+    with pytest.raises(RuntimeError, match=r"evaluation\.csv: 0 rows.*0\.003"):
+        measured.poppy(*arguments)
+
+
+@pytest.mark.workflow
+def test_target_prediction(smoke):
+    folder, _ = smoke
+    snakemake(folder, "prediction")
+    table = pd.read_csv(folder / "results/tables/predict_poppy.csv")
+    assert table["noise_level"].tolist() == [0.001, 0.002, 0.003, 0.005]
+    assert (table["stars"] == 50).all()
+    (row,) = pd.read_csv(folder / "results/tables/predict_throughput.csv").to_dict("records")
+    assert row["stamps"] == 64
+    assert row["bare_per_s"] == max(row["bare_shared_per_s"], row["bare_parallel_per_s"])
+    assert row["share"] == pytest.approx(row["predict_per_s"] / row["bare_per_s"], rel=1e-4)
+    assert 50 < row["peak_mb"] < 1000
+
+
+def test_model_of_a_file_is_the_shipped_one():
+    assert load_model(shipped_path()).bundle.sha256 == load_model().bundle.sha256
+
+
+def test_page_lists_all_flags_and_columns():
+    text = (ROOT / "docs/templates/docs/predict.md.j2").read_text(encoding="utf-8")
+    for flag in StarFlag:
+        assert f"| `{flag.name}` | {int(flag)} |" in text
+    for name in ("id", *writer.COLUMNS):
+        assert f"`{name}`" in text, name
+    for extension, _ in writer.CUBES.values():
+        assert f"| `{extension}` |" in text
+    assert f"by up to {stage.MARGIN_PX} px" in text
+    assert f"more than {100 * SCALE_TOLERANCE:g} %" in text
+    assert f"1/{engine.SNR_TOLERANCE:g} of the least" in text
