@@ -18,8 +18,16 @@ if command -v flock >/dev/null 2>&1; then
     program=$1
     shift
     "$program" --unlock "$@" >/dev/null 2>&1 || true
-    # Damaged files of an earlier run are set aside and named; Snakemake builds them again.
-    [ -z "${PSFDAE_RESULTS:-}" ] || psfdae verify "$PSFDAE_RESULTS"
+    # Damaged files of an earlier run are set aside and named. They are forced, because Snakemake
+    # does not miss a file as long as what was made from it is there.
+    damaged=$([ -z "${PSFDAE_RESULTS:-}" ] || psfdae verify "$PSFDAE_RESULTS")
+    if [ -n "$damaged" ]; then
+        IFS='
+'
+        set -f
+        # shellcheck disable=SC2086 # one argument per line
+        set -- --forcerun $damaged "$@"
+    fi
     set -- "$program" "$@"
 fi
 export PSFDAE_RUN="$PWD"

@@ -30,9 +30,11 @@ class StageGroup(click.Group):
             click.echo(f"psfdae: {error}", err=True)
             ctx.exit(2)
         except (RuntimeError, ValueError) as error:
-            if not type(error).__module__.startswith("psfdae"):
+            # HDF5 reports a full disk as a RuntimeError without a number of its own.
+            ours = type(error).__module__.startswith("psfdae")
+            if not ours and "errno = " not in str(error):
                 raise
-            click.echo(f"psfdae: {error}", err=True)
+            click.echo(f"psfdae: {' '.join(str(error).split()) if not ours else error}", err=True)
             ctx.exit(2)
 
 

@@ -167,8 +167,10 @@ def draw_modules(out: Path) -> None:
 @main.command()
 @click.argument("results", type=FolderArgument)
 def verify(results: Path) -> None:
-    """Set damaged files of a run aside, so that the workflow builds them again."""
+    """Set damaged files of a run aside and list the files that have to be built again."""
     from psfdae.stages import verify as stage
 
     for path, reason in stage.run(results):
         click.echo(f"{path}: {reason}; set aside, it will be built again", err=True)
+    for path in stage.missing(results):
+        click.echo(path)

@@ -37,6 +37,12 @@ def run(results: Path) -> list[tuple[Path, str]]:
     return found
 
 
+def missing(results: Path) -> list[Path]:
+    """Files that were set aside, now or earlier, and have not been built again, sorted."""
+    whole = (path.with_name(path.name.removesuffix(ASIDE)) for path in results.rglob(f"*{ASIDE}"))
+    return sorted(path for path in whole if not path.exists())
+
+
 def damaged(results: Path) -> Iterator[tuple[Path, str]]:
     """Damaged files below a folder, sorted by path, with the reason."""
     for path in sorted(results.rglob("*")):
