@@ -50,8 +50,10 @@ def obstacle() -> str:
     """Why the cluster cannot be started here; empty if it can."""
     if os.geteuid() != 0:
         return "slurmctld and slurmd need root"
-    if CONF.exists() and not _left_behind():
-        return f"{CONF} exists: this machine has a cluster of its own"
+    # Debian's clients bring plugstack.conf; anything else is somebody's cluster.
+    found = [path for path in CONF.parent.glob("*") if not path.name.startswith("plugstack")]
+    if found and not (found == [CONF] and _left_behind()):
+        return f"{found[0]} exists: this machine has a cluster of its own"
     if not all(shutil.which(program) for program in ("slurmctld", "slurmd", "sbatch", "munged")):
         return _install()
     return ""

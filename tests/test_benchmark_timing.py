@@ -192,7 +192,7 @@ def test_docs_show_the_tables(tmp_path):
     part = Path(__file__).parents[1] / "docs/templates/_benchmark_throughput.md"
     (tmp_path / "t").mkdir()
     (tmp_path / "t/page.md.j2").write_text(part.read_text())
-    page = render(tmp_path / "r", tmp_path / "t")["page.md"]
+    page = render(tmp_path / "r", tmp_path / "t", main)["page.md"]
     assert "to the power\n  1.000 ± 0.000" in page
     assert "| simulation | 1000000 | 500.00 | 180 | 2000.0 | extrapolated |" in page
     assert "| 20 | 11 × 11 | 10 | 1.00 |" in page

@@ -21,6 +21,7 @@ def test_default_target_packs_nothing_and_trains_no_other_dataset(tmp_path):
     assert "seidel_field" not in out
 
 
+@pytest.mark.slow
 def test_shipped_bundle_is_trained_on_its_own_stars_and_written_where_it_is_read(tmp_path):
     assert planned(tmp_path, "shipped") == {"templates": 1, "stars": 1, "train": 1, "bundle": 1}
     snakemake(tmp_path, "shipped")

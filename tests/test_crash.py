@@ -20,7 +20,7 @@ import pytest
 
 from workflow_runs import QUIET, job_counts, locked, wait_until
 
-pytestmark = pytest.mark.workflow
+pytestmark = [pytest.mark.workflow, pytest.mark.slow]
 
 TARGET = "results/evaluation/dataset3/random-realisation.csv"
 WEIGHTS = "results/dae/dataset3/random-realisation/dae.safetensors"

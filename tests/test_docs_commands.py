@@ -44,6 +44,10 @@ NOT_RUN = {"conda": "makes a second environment", ".": "activates the environmen
 IGNORED_OPTIONS = {"--cores": 1, "--jobs": 1, "-n": 0, "--dry-run": 0}
 """Options of snakemake, with their number of values, that a dry run on two cores replaces."""
 
+ONE_VALUE = ("--workflow-profile", "--max-threads")
+MANY_VALUES = ("--default-resources", "--set-resources", "--groups", "--slurm-array-jobs")
+"""Options of snakemake on a cluster, which a dry run gets as they stand."""
+
 RULES = rule_topics(ROOT / "workflow/rules")
 
 
@@ -55,6 +59,7 @@ class NoHandlerError(Exception):
 def sandbox(tmp_path, monkeypatch):
     """A working folder with a config tree of its own and finished trainings to compare."""
     shutil.copytree(ROOT / "config", tmp_path / "config")
+    shutil.copytree(ROOT / "workflow/profiles", tmp_path / "workflow/profiles")
     for run in ("results", "results/paper", "results/smoke"):
         for network in ("random-realisation", "held_out-realisation"):
             write_network(tmp_path / run, f"dataset3/{network}")
@@ -102,6 +107,8 @@ def run(command: Command, folder):
         run_psfdae(rest)
     elif first == "cat":
         write_heredoc(command, folder)
+    elif first == "cp":
+        subprocess.run(command.words, cwd=folder, check=True)
     elif first == "make":
         run_make(rest)
     elif first not in (*NOT_RUN, "snakemake"):
@@ -133,14 +140,19 @@ def run_make(words):
 
 
 def targets_and_settings(words):
-    """What a snakemake command builds, and what follows its --config."""
-    targets, settings = [], []
+    """What a snakemake command builds, and how: options of a cluster, what follows --config."""
+    targets, options, settings = [], [], []
     words = list(words[1:])
     while words:
         word = words.pop(0)
         if word == "--config":
             while words and re.match(r"\w+=", words[0]):
                 settings.append(words.pop(0))
+        elif word.partition("=")[0] in ONE_VALUE + MANY_VALUES:
+            values = [] if "=" in word else [words.pop(0)]
+            while word in MANY_VALUES and words and not words[0].startswith("-"):
+                values.append(words.pop(0))
+            options += [word, *values]
         elif word in IGNORED_OPTIONS:
             del words[: IGNORED_OPTIONS[word]]
         elif word == "--forcerun":
@@ -151,7 +163,9 @@ def targets_and_settings(words):
             raise NoHandlerError(f"snakemake {word}")
         else:
             targets.append(word)
-    return targets, tuple(settings)
+    named = re.findall(r"(\w+)[:,]|,(\w+)|(\w+)=model", " ".join(options))
+    assert {name for names in named for name in names if name} <= set(RULES)
+    return targets, (tuple(options), tuple(settings))
 
 
 def own_pages():
@@ -170,20 +184,23 @@ def snakemake_pages():
     return [p for p in own_pages() if any(c.words[0] == "snakemake" for c in commands(read(p)))]
 
 
+@pytest.mark.slow
 @pytest.mark.workflow
 @pytest.mark.parametrize("page", snakemake_pages())
 def test_workflow_commands_have_jobs(page, sandbox):
     """All targets of a page that need no settings in one dry run."""
     together: dict[tuple, list] = {}
     for line in commands(read(page)):
-        if line.words[0] == "cat":
-            write_heredoc(line, sandbox)
+        if line.words[0] in ("cat", "cp"):
+            run(line, sandbox)
         elif line.words[0] == "snakemake":
             targets, settings = targets_and_settings(line.words)
             together.setdefault(settings, []).extend(targets)
-    for settings, targets in together.items():
-        line = [*command(sandbox, "--dry-run", *targets), *settings]
-        done = subprocess.run(line, env=environment(), capture_output=True, text=True, check=False)
+    for (options, settings), targets in together.items():
+        line = [*command(sandbox, *options, "--dry-run", *targets), *settings]
+        done = subprocess.run(
+            line, cwd=sandbox, env=environment(), capture_output=True, text=True, check=False
+        )
         assert done.returncode == 0, done.stdout + done.stderr
         jobs = job_counts(done.stdout)
         assert set(targets) <= set(jobs), (settings, targets)

@@ -360,6 +360,7 @@ def test_poppy_table(tmp_path, monkeypatch, field_psfs, shipped):
         measured.poppy(*arguments)
 
 
+@pytest.mark.slow
 @pytest.mark.workflow
 def test_target_prediction(smoke):
     folder, _ = smoke

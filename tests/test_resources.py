@@ -18,7 +18,10 @@ pytestmark = pytest.mark.workflow
 
 SNAKEMAKE_MB = 250
 """Memory of the snakemake that starts a job on its node, which counts as the job's."""
-ON_REQUEST = ("benchmark", "stability", "bounds", "training_knee")
+ON_REQUEST = (
+    *("benchmark", "stability", "bounds", "training_knee"),
+    *("prediction", "from_stars_example", "bundles", "scaling"),
+)
 PROFILES = ROOT / "workflow/profiles"
 RULES = "".join(path.read_text() for path in (ROOT / "workflow/rules").glob("*.smk"))
 LOCAL = set(re.findall(r"^rule (\w+):\n(?:(?!rule ).*\n)*?    localrule: True", RULES, re.M))

@@ -225,6 +225,7 @@ def test_measurements_run_on_one_cpu():
     assert os.sched_getaffinity(0) == before
 
 
+@pytest.mark.slow
 @pytest.mark.workflow
 @pytest.mark.parametrize(("kind", "count"), [("models", 3), ("points", 5)])
 def test_made_up_dags_have_the_jobs_that_are_asked_for(kind, count):

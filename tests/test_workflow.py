@@ -44,6 +44,7 @@ def test_everything_is_up_to_date_afterwards(smoke):
     assert planned(folder) == {}
 
 
+@pytest.mark.slow
 def test_second_run_gives_identical_bytes(smoke, tmp_path):
     folder, _ = smoke
     snakemake(tmp_path, "results/tables/dataset3_mse.csv", "results/tables/dataset8_mse.csv")

@@ -12,6 +12,7 @@ rule example_field:
     threads: 1
     resources:
         mem_mb=500,
+        runtime=10,
     params:
         source=source_hash("psfdae.stages.example_field"),
     message:
@@ -40,6 +41,7 @@ rule own_stars:
     threads: lambda w: dataset_config(OWN_STARS).train.threads
     resources:
         mem_mb=1500,
+        runtime=30,
     params:
         config=lambda w: stage_overrides("from_stars", f"dataset={OWN_STARS}"),
         source=source_hash("psfdae.stages.from_stars"),
@@ -73,6 +75,7 @@ rule from_stars_example:
     threads: 1
     resources:
         mem_mb=500,
+        runtime=10,
     message:
         "Collecting what was learnt from the image"
     shell:

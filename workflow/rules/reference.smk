@@ -10,6 +10,8 @@ rule reference:
         rules.benchmark.input,
         rules.stability.input,
         rules.bounds.input,
+        rules.prediction.input,
+        rules.from_stars_example.output,
     output:
         touch(f"{RESULTS}/.reference_renewed"),
     log:
