@@ -59,6 +59,7 @@ def test_paper_preset_has_the_paper_s_hyper_parameters():
         ("dae.widths=[8,8]", r"dae: widths = \[8, 8\]: 10 kernels need 9 widths"),
         ("dae.kernels=[4,4]", r"dae: kernels = \[4, 4\]: must be odd"),
         ("optics.pupil_samples=[300,200]", r"pupil_samples = \[300, 200\]: must be ascending"),
+        ("parts.train_stars=19", r"baseline\.components = 20: must be at most .* 19"),
         ("baseline.components=300", r"baseline\.components = 300: must be at most .* 256"),
         ("+train.momentum=0.9", r"train\.momentum: unknown key"),
         ("+colour=blue", r"colour: unknown key"),

@@ -351,4 +351,9 @@ class Config(Consistent):
                 f"baseline.components = {self.baseline.components}: must be at most "
                 f"framing.stamp_px² = {self.framing.stamp_px**2}"
             )
+        if self.baseline.components > self.parts.train_stars:
+            raise ValueError(
+                f"baseline.components = {self.baseline.components}: must be at most "
+                f"parts.train_stars = {self.parts.train_stars}"
+            )
         return self

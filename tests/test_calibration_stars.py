@@ -1,0 +1,205 @@
+"""Selecting bright stars and making training images of them: sky, centres, stacks, shifts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from psfdae.rng import stream
+from psfdae.stars.calibration_stars import (
+    brightest_pixels,
+    crowded,
+    misfit,
+    signal_to_noise,
+    sky_around,
+    star_centres,
+)
+from psfdae.stars.example_field import noise_area
+from psfdae.stars.from_observation import (
+    BrightStars,
+    bins_of,
+    cut,
+    make_images,
+    moved,
+    stacks,
+    star_grid,
+    star_of_images,
+)
+from psfdae.stars.splits import held_out_fields
+
+ROOT = Path(__file__).resolve().parents[1]
+SIDE = {"side_px": 700, "bright": 60, "faint": 80, "blended": 6, "saturated": 3}
+TINY = ["preset=smoke", "parts.train_stars=120", "parts.test_stars=30", "train.epochs=1"]
+
+
+def gaussians(centre, side=32, sigma=1.5):
+    """Round stars of flux 1, centre (row, column) from index side//2; (n, side, side)."""
+    axis = np.arange(side) - side // 2
+    rows, columns = (axis - np.asarray(centre)[:, i, None] for i in (0, 1))
+    light = np.exp(-0.5 * rows[:, :, None] ** 2 / sigma**2 - 0.5 * columns[:, None] ** 2 / sigma**2)
+    return light / light.sum(axis=(1, 2), keepdims=True)
+
+
+def bright_stars(centre, snr=500.0):
+    """Stars without noise around the given centres, at random positions of an image."""
+    wide = 1e4 * gaussians(centre)
+    count = len(wide)
+    position = np.random.default_rng(4).uniform(0, 1000, (count, 2))
+    peak, _ = brightest_pixels(wide, 3)
+    level = np.full(count, snr)
+    noise = np.ones(count)
+    return BrightStars(
+        wide, peak, np.asarray(centre), position, 1e4 * noise, noise, level, np.arange(count)
+    )
+
+
+def test_sky_is_that_around_the_star():
+    rng = np.random.default_rng(1)
+    wide = rng.normal(200.0, 5.0, (50, 32, 32))
+    wide[:, 12:20, 12:20] += 1e4  # the star
+    wide[::2, 2:5, 2:5] += 500.0  # a neighbour
+    bad = np.zeros(wide.shape, dtype=bool)
+    bad[:, 30] = True
+    wide[bad] = 1e6
+    sky = sky_around(wide, bad, 16)
+    # Of 736 pixels: 5 √(π/2/736) = 0.23 for a median, 4.3 % for a median deviation.
+    assert np.abs(sky.level - 200.0).max() < 4 * 0.23
+    assert np.abs(sky.noise / 5.0 - 1).max() < 4 * 0.043
+
+
+def test_sky_of_a_stamp_that_is_all_bad_is_no_number_s_fault():
+    sky = sky_around(np.zeros((2, 24, 24)), np.ones((2, 24, 24), dtype=bool), 16)
+    assert (sky.level == 0).all()
+    assert (sky.noise == 0).all()
+
+
+def test_signal_to_noise_is_that_of_king_s_area():
+    star = gaussians([[0.2, -0.3]], side=16)
+    noise, flux = 3.0, 20000.0
+    rng = np.random.default_rng(2)
+    noisy = flux * star + rng.normal(0, noise, (400, 16, 16))
+    expected = flux / (noise * np.sqrt(noise_area(star[0])))
+    measured = signal_to_noise(noisy, np.full(400, noise))
+    assert measured.mean() == pytest.approx(expected, rel=3e-4)
+    assert measured.std() == pytest.approx(1.0, abs=0.15)  # its error is one unit
+    assert (signal_to_noise(noisy, np.zeros(400)) == 0).all()
+
+
+def test_only_a_bright_neighbour_crowds():
+    position = np.array([[0.0, 0.0], [5.0, 0.0], [100.0, 0.0], [106.0, 0.0], [np.nan, 0.0]])
+    brightness = np.array([100.0, 1.0, 100.0, 50.0, 1e6])
+    found = crowded(position, brightness, 10.0, 0.02)
+    assert found.tolist() == [False, True, True, True, False]
+    assert not crowded(np.full((2, 2), np.nan), brightness[:2], 10.0, 0.02).any()
+
+
+def test_centres_are_found_to_a_hundredth_of_a_pixel():
+    centre = np.random.default_rng(3).uniform(-1.4, 1.4, (40, 2))
+    wide = gaussians(centre)
+    peak, inside = brightest_pixels(wide, 3)
+    assert inside.all()
+    assert (np.abs(peak - centre) <= 0.5 + 1e-9).all()
+    found = star_centres(wide, peak, np.full(40, 1.5))
+    assert np.abs(found - centre).max() < 0.01
+
+
+def test_a_peak_beyond_the_search_is_told():
+    _, inside = brightest_pixels(gaussians([[4.0, 0.0], [3.0, -3.0]]), 3)
+    assert inside.tolist() == [False, True]
+
+
+def test_a_blend_is_a_misfit_although_the_psf_varies():
+    rng = np.random.default_rng(6)
+    position = rng.uniform(0, 1000, (80, 2))
+    width = 1.3 + 0.6 * position[:, 0] / 1000
+    stars = np.concatenate([gaussians([[0, 0]], 16, sigma=s) for s in width])
+    stars += rng.normal(0, 3e-4, stars.shape)
+    stars[10] += 0.3 * gaussians([[0, 5.0]], 16)[0]
+    stars[20, 3, 12] += 0.02  # a cosmic ray
+    score = misfit(stars, position, np.full(80, 3e-4))
+    assert set(np.flatnonzero(score > 2.5)) == {10, 20}
+    unknown = misfit(stars, np.full((80, 2), np.nan), np.full(80, 3e-4))
+    assert unknown[10] == unknown.max()
+
+
+# Images
+
+
+@pytest.mark.parametrize("count", [47, 195, 300])
+def test_every_fifth_star_is_held_out_evenly_over_the_field(count):
+    position = np.random.default_rng(count).uniform(0, 2000, (count, 2))
+    grid = star_grid(position)
+    assert len(np.unique(grid, axis=0)) == count
+    held = held_out_fields(grid)
+    assert held.mean() == pytest.approx(0.2, abs=0.05)
+    quarter = bins_of(position, 2)
+    assert (np.bincount(quarter[held], minlength=4) > 0).all()
+    order = np.random.default_rng(0).permutation(count)
+    assert (star_grid(position[order]) == grid[order]).all()
+
+
+def test_stars_without_positions_keep_their_order():
+    grid = star_grid(np.full((30, 2), np.nan))
+    assert grid[:6].tolist() == [[0, i] for i in range(5)] + [[1, 0]]
+    assert held_out_fields(grid).any()
+    assert (bins_of(np.full((30, 2), np.nan), 4) == 0).all()
+
+
+def test_images_are_shared_out_evenly():
+    held = np.array([False, True, False, False, True])
+    star = star_of_images(held, 10, 5)
+    assert np.bincount(star[:10], minlength=5).tolist() == [4, 0, 3, 3, 0]
+    assert np.bincount(star[10:], minlength=5).tolist() == [0, 3, 0, 0, 2]
+    assert star_of_images(held, 1, 1).size == 5  # none is left out
+
+
+def test_a_moved_star_is_the_star_rendered_there():
+    rng = np.random.default_rng(7)
+    centre, shift = rng.uniform(-0.5, 0.5, (2, 30, 2))
+    error = moved(gaussians(centre), shift) - gaussians(centre + shift)
+    assert np.square(error).mean() < 1e-8 * gaussians(centre).max() ** 2 / 0.01
+    assert np.square(error).mean() < 1e-8
+
+
+def test_cut_puts_the_offset_in_the_middle_and_repeats_the_edge():
+    wide = np.arange(400.0).reshape(1, 20, 20)
+    assert cut(wide, np.array([[2, -1]]), 8)[0, 4, 4] == wide[0, 12, 9]
+    beyond = cut(wide, np.array([[9, 0]]), 8)[0]
+    assert (beyond[5:] == beyond[4]).all()
+
+
+def test_stacks_are_weighted_by_signal_to_noise():
+    aligned = np.stack([np.full((4, 4), v) for v in (1.0, 4.0, 10.0)])
+    found = stacks(aligned, np.array([2.0, 1.0, 1.0]), np.array([0, 0, 2]), 4)
+    assert found[:, 0, 0] == pytest.approx([2.0, 4.0, 10.0, 4.0])
+
+
+def test_images_are_framed_normalised_and_moved_only_where_asked():
+    centre = np.random.default_rng(8).uniform(-0.5, 0.5, (10, 2))
+    stars = bright_stars(centre)
+    template = gaussians(np.zeros((10, 2)))
+    star = np.repeat(np.arange(10), 40)
+    subpixel = np.tile([False, True], 200)
+    found = make_images(stars, template, star, 16, 1, subpixel, stream(1, "test"))
+    assert found.realisation.sum(axis=(1, 2)) == pytest.approx(1.0, abs=1e-5)
+    peak = np.stack(np.divmod(found.realisation.reshape(400, -1).argmax(axis=1), 16), axis=1)
+    assert (peak - 8 == found.jitter).all()
+    assert set(map(tuple, found.jitter)) == {(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)}
+    # A star that is not moved is a plain piece of the image.
+    for image in np.flatnonzero(~subpixel)[::9]:
+        who = star[image]
+        offset = stars.peak[who] - found.jitter[image]
+        piece = cut(stars.wide[who : who + 1], offset[None], 16)[0]
+        assert found.realisation[image] == pytest.approx(piece / piece.sum(), abs=1e-7)
+    # The others lie anywhere in their pixel, and so do their templates.
+    place = star_centres(found.realisation.astype(float), found.jitter, np.full(400, 1.5))
+    phase = (place - found.jitter)[subpixel]
+    assert np.abs(phase.mean(axis=0)).max() < 4 * np.sqrt(1 / 12 / 200)
+    assert phase.std(axis=0) == pytest.approx(np.sqrt(1 / 12), rel=0.1)
+    again = star_centres(found.template.astype(float), found.jitter, np.full(400, 1.5))
+    assert np.abs(again - place).max() < 0.03
+
+
+# The simulated image
