@@ -105,7 +105,7 @@ def test_ninth_dataset_is_one_small_file(tmp_path, monkeypatch):
         "noise:\n  name: bright\n  levels: [1.0e-3, 3.0e-3]\n"
     )
     monkeypatch.setenv("PSFDAE_CONFIG", str(folder))
-    compose.compose.cache_clear()
+    compose.forget()
     try:
         config = load(["dataset=dataset9"])
         assert (config.seed, config.noise.levels, config.stars.name) == (
@@ -114,4 +114,4 @@ def test_ninth_dataset_is_one_small_file(tmp_path, monkeypatch):
             "seidel_10pct",
         )
     finally:
-        compose.compose.cache_clear()
+        compose.forget()

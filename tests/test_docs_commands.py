@@ -13,7 +13,7 @@ from click.testing import CliRunner
 from docs_pages import ROOT, Command, blocks, commands, pages, read
 from psfdae.bundle import read_bundle
 from psfdae.cli import main
-from psfdae.configuration.compose import compose
+from psfdae.configuration.compose import forget
 from psfdae.documentation.graphs import rule_topics
 from psfdae.files import write_text
 from psfdae.observations.examples import write_field
@@ -65,9 +65,9 @@ def sandbox(tmp_path, monkeypatch):
             write_network(tmp_path / run, f"dataset3/{network}")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PSFDAE_CONFIG", str(tmp_path / "config"))
-    compose.cache_clear()
+    forget()
     yield tmp_path
-    compose.cache_clear()
+    forget()
 
 
 def write_network(results, place):
@@ -126,7 +126,7 @@ def write_heredoc(command, folder):
     *_, arrow, path = command.words
     assert arrow == ">"
     (folder / path).write_text(command.heredoc)
-    compose.cache_clear()
+    forget()
 
 
 def run_make(words):

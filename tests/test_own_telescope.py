@@ -12,7 +12,7 @@ from astropy.io import fits
 from click.testing import CliRunner
 
 from psfdae.cli import main
-from psfdae.configuration.compose import compose, config_dir
+from psfdae.configuration.compose import config_dir, forget
 from test_workflow import planned
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -51,9 +51,9 @@ def workshop(blocks, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PSFDAE_CONFIG", str(folder / "config"))
         patch.chdir(folder)
-        compose.cache_clear()
+        forget()
         yield folder
-    compose.cache_clear()
+    forget()
 
 
 def commands(blocks, program):

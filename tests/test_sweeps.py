@@ -38,7 +38,7 @@ def sweep(tmp_path, monkeypatch):
     folder = tmp_path / "config"
     shutil.copytree(config_dir(), folder)
     monkeypatch.setenv("PSFDAE_CONFIG", str(folder))
-    compose.compose.cache_clear()
+    compose.forget()
 
     def plan(tree, *given, name="tried"):
         text = tree if isinstance(tree, str) else yaml.safe_dump(tree, sort_keys=False)
@@ -46,7 +46,7 @@ def sweep(tmp_path, monkeypatch):
         return plan_sweep(name, ("preset=smoke", *given))
 
     yield plan
-    compose.compose.cache_clear()
+    compose.forget()
 
 
 @pytest.mark.parametrize("preset", PRESETS)

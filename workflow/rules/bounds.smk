@@ -100,7 +100,7 @@ rule psf_efficiency:
     input:
         bounds=expand(rules.dataset_bounds.output.summary, dataset=default_datasets()),
         best=expand(rules.dataset_bounds.output.per_star, dataset=default_datasets()),
-        methods=[
+        methods=lambda w: [
             path for dataset in default_datasets() for path in per_star_of(dataset)
         ],
     output:
@@ -255,5 +255,9 @@ rule bounds:
         rules.psf_bounds.output,
         rules.psf_bounds_growth.output,
         rules.psf_efficiency.output,
-        [file for dataset in default_datasets() for file in bound_figures_of(dataset)],
+        lambda w: [
+            file
+            for dataset in default_datasets()
+            for file in bound_figures_of(dataset)
+        ],
     localrule: True

@@ -60,7 +60,10 @@ rule paper_tables:
 
 rule psf_metrics:
     input:
-        [csv for dataset in default_datasets() for csv in evaluations_of(dataset)],
+        # Evaluated only where it is asked for: a job of a cluster reads all rules at its start.
+        lambda w: [
+            csv for dataset in default_datasets() for csv in evaluations_of(dataset)
+        ],
     output:
         f"{RESULTS}/tables/psf_metrics.csv",
     log:

@@ -1,6 +1,8 @@
 rule runtime:
     input:
-        [file for dataset in default_datasets() for file in products_of(dataset)],
+        lambda w: [
+            file for dataset in default_datasets() for file in products_of(dataset)
+        ],
         rules.psf_metrics.output,
         rules.calibrate.output,
         ALIGNMENT_PRODUCTS,

@@ -11,10 +11,10 @@ for _scene in ("scene1", "scene2"):
         name:
             _scene
         input:
-            [
+            lambda w, scene=_scene: [
                 file
                 for dataset in default_datasets()
-                if dataset_config(dataset).scene.experiment == _scene
+                if dataset_config(dataset).scene.experiment == scene
                 for file in products_of(dataset)
             ],
         localrule: True

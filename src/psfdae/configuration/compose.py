@@ -41,8 +41,7 @@ def config_dir() -> Path:
     return folder.resolve()
 
 
-@cache
-def compose(overrides: tuple[str, ...] = (), root: Root = "config") -> dict[str, Any]:
+def compose(overrides: Sequence[str] = (), root: Root = "config") -> dict[str, Any]:
     """Resolved configuration tree of a root and a list of Hydra overrides, not yet checked.
 
     Raises
@@ -50,6 +49,16 @@ def compose(overrides: tuple[str, ...] = (), root: Root = "config") -> dict[str,
     ConfigError
         If Hydra refuses an override (unknown key or group option, bad syntax).
     """
+    return _composed(tuple(overrides), root)
+
+
+def forget() -> None:
+    """Compose everything anew, for example after a change of the config folder."""
+    _composed.cache_clear()
+
+
+@cache
+def _composed(overrides: tuple[str, ...], root: Root) -> dict[str, Any]:
     import hydra
     from hydra.core.global_hydra import GlobalHydra
     from hydra.errors import HydraException
@@ -75,7 +84,7 @@ def load(overrides: Sequence[str] = (), root: Root = "config") -> Any:
     ConfigError
         Names each wrong key with its value and the allowed range.
     """
-    return validate(ROOTS[root][0], compose(tuple(overrides), root))
+    return validate(ROOTS[root][0], compose(overrides, root))
 
 
 def validate(model: type[Any], tree: Mapping[str, Any]) -> Any:
@@ -108,7 +117,7 @@ def load_stage(stage: str, overrides: Sequence[str] = ()) -> Any:
     """
     root = root_of(stage)
     model, keys = ROOTS[root]
-    tree = compose(tuple(overrides), root)
+    tree = compose(overrides, root)
     unknown = sorted(set(tree) - set(model.model_fields))
     if unknown:
         raise ConfigError(f"{unknown[0]}: unknown key")
