@@ -260,5 +260,5 @@ def test_target_scaling(smoke):
     plan = pd.read_csv(tables / "scaling_plan.csv")
     assert set(plan.case) == {"stars", "models", "points"}
     assert (plan[plan.rule != "snakemake"].core_h >= 0).all()
-    assert {"array", "home"} <= set(plan.submit)
+    assert {"home", "group"} <= set(plan.submit)
     assert planned(folder, "scaling") == {}

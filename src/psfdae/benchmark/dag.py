@@ -57,7 +57,9 @@ trials: {count}
 seed: 1
 space:
   train.lr: {{low: 1.0e-4, high: 1.0e-1, log: true}}
+  train.grad_clip: {{low: 0.1, high: 10.0, log: true}}
 """
+"""Two settings, because drawn values are rounded and equal points are one job."""
 
 
 class PlanError(RuntimeError):
