@@ -29,7 +29,8 @@ REPORTED = $(or $(TARGETS),all \
   $(if $(wildcard $(RESULTS)/figures/benchmark/skipping.png),benchmark) \
   $(if $(wildcard $(RESULTS)/.stability_passed),stability) \
   $(if $(wildcard $(RESULTS)/tables/psf_efficiency.csv),bounds) \
-  $(if $(wildcard $(RESULTS)/figures/benchmark/training.png),training_knee))
+  $(if $(wildcard $(RESULTS)/figures/benchmark/training.png),training_knee) \
+  $(if $(wildcard $(RESULTS)/figures/own_stars/strip.png),from_stars_example))
 # The 24 × 24 trainings take longest; started last, one would run alone in the end.
 LONGEST_FIRST := $(if $(strip $(TARGETS)),,--prioritize scene2)
 
