@@ -7,7 +7,7 @@ import pytest
 from psfdae.bundle import read_bundle
 from workflow_runs import planned, snakemake
 
-pytestmark = pytest.mark.workflow
+pytestmark = [pytest.mark.workflow, pytest.mark.slow]
 
 
 def test_bundles_are_those_of_the_paper_s_datasets(tmp_path):
@@ -21,7 +21,6 @@ def test_default_target_packs_nothing_and_trains_no_other_dataset(tmp_path):
     assert "seidel_field" not in out
 
 
-@pytest.mark.slow
 def test_shipped_bundle_is_trained_on_its_own_stars_and_written_where_it_is_read(tmp_path):
     assert planned(tmp_path, "shipped") == {"templates": 1, "stars": 1, "train": 1, "bundle": 1}
     snakemake(tmp_path, "shipped")

@@ -249,6 +249,7 @@ def test_wrong_settings_are_named(override, message):
         load_stage("from_stars", ["dataset=from_stars", override])
 
 
+@pytest.mark.slow
 @pytest.mark.workflow
 def test_commands_of_own_stars_md_run(tmp_path, monkeypatch):
     """From first to last, on a small image and a tiny network."""

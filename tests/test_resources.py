@@ -14,7 +14,7 @@ import yaml
 
 from workflow_runs import ROOT, environment
 
-pytestmark = pytest.mark.workflow
+pytestmark = [pytest.mark.workflow, pytest.mark.slow]
 
 SNAKEMAKE_MB = 250
 """Memory of the snakemake that starts a job on its node, which counts as the job's."""
