@@ -127,7 +127,11 @@ def test_terminated_snakemake(half_done, recovers):
 
 
 def test_interrupted_from_the_keyboard(half_done, recovers):
-    run = started(half_done, start_new_session=True)
+    def heed():
+        # Tests that run in the background of a shell have inherited that SIGINT is ignored.
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+    run = started(half_done, start_new_session=True, preexec_fn=heed)
     os.killpg(run.pid, signal.SIGINT)
     ended(run, half_done)
     recovers(half_done)
