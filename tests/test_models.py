@@ -111,6 +111,14 @@ def test_baseline_refuses_more_components_than_stars(gaussian_stars):
         fit_pca_som(gaussian_stars[:20], components=30, **SOM)
 
 
+def test_baseline_refuses_stars_that_are_not_finite(gaussian_stars):
+    fitted = fit_pca_som(gaussian_stars, components=4, **SOM)
+    broken = gaussian_stars.copy()
+    broken[7, 0, 0], broken[9, 3, 3] = np.nan, np.inf
+    with pytest.raises(ValueError, match=r"2 of \d+ .* not finite, the first is number 7"):
+        fitted.predict(broken)
+
+
 def test_dae_keeps_the_size_and_is_never_negative(gaussian_stars):
     kernels = [9, 7, 5, 3, 1, 1, 3, 5, 7, 9]
     model = build_dae(kernels, [4] * 9, "he", torch.Generator().manual_seed(0))

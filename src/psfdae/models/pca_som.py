@@ -35,14 +35,25 @@ class PcaSom:
     psf: np.ndarray
 
     def assign(self, images: np.ndarray) -> np.ndarray:
-        """Winning node (eq. 7) of every image, shape (n,)."""
+        """Winning node (eq. 7) of every image, shape (n,).
+
+        Raises
+        ------
+        ValueError
+            If an image has a pixel that is not finite: it is nearest to no node.
+        """
         features = (images.reshape(len(images), -1) - self.mean) @ self.components.T
+        if not (finite := np.isfinite(features).all(axis=1)).all():
+            raise ValueError(
+                f"images: {np.count_nonzero(~finite)} of {len(images)} have pixels that are not "
+                f"finite, the first is number {int(np.argmin(finite))}"
+            )
         # |y − m|² without the term that is the same for all nodes.
         score = (self.nodes**2).sum(axis=1) - 2.0 * features @ self.nodes.T
         return score.argmin(axis=1)
 
     def predict(self, images: np.ndarray) -> np.ndarray:
-        """PSF of every image, shape (n, d, d)."""
+        """PSF of every image, shape (n, d, d); raises as `assign`."""
         return self.psf[self.assign(images)].reshape(images.shape)
 
 

@@ -116,6 +116,18 @@ def empty_nodes(bench: Bench) -> Iterator[Entry]:
     )
 
 
+def broken_stars(bench: Bench) -> Iterator[Entry]:
+    """Stars without a distance to any node: in the training set, and before a fitted map."""
+    images = _noisy(bench, 64).astype(np.float64)
+    fitted = _fit(images, 8)
+    for label, value in (("NaN", np.nan), ("infinite", np.inf)):
+        broken = images.copy()
+        broken[3, 4, 5] = value
+        case = f"{label} pixel in a star of the baseline"
+        yield refused(f"{case}'s training set", lambda b=broken: _fit(b, 8), ValueError)
+        yield refused(case, lambda b=broken: fitted.predict(b), ValueError)
+
+
 def _fit(images: np.ndarray, components: int, **update: int) -> PcaSom:
     return fit_pca_som(images, components, **{**SMALL_MAP, **update}, seed=1)  # type: ignore[arg-type]
 
@@ -125,5 +137,5 @@ def _noisy(bench: Bench, count: int) -> np.ndarray:
     return bench.noise.draw(bench.seidel.images[:count], min(bench.config.noise.levels), rng)
 
 
-CASES = (eigenvectors, degenerate_stars, empty_nodes)
+CASES = (eigenvectors, degenerate_stars, empty_nodes, broken_stars)
 """All cases of this module."""
