@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -229,6 +230,46 @@ def test_time_calls_warms_up_and_counts():
     assert 0 <= found.low_s <= found.median_s <= found.high_s
     with pytest.raises(ValueError, match="repeats = 0"):
         timing.time_calls(lambda: None, repeats=0)
+
+
+def test_rounds_take_turns_and_set_up_off_the_clock():
+    events = []
+
+    def builder(name, seconds):
+        def build():
+            time.sleep(0.05)
+            return lambda: (events.append(name), time.sleep(seconds))
+
+        return build
+
+    slow, fast = timing.time_in_rounds([builder("slow", 0.02), builder("fast", 0.002)], repeats=3)
+    assert events == ["slow", "fast"] * 3
+    assert slow.repeats == 3
+    assert 0.002 <= fast.median_s < 0.02 <= slow.low_s <= slow.median_s < 0.05
+    with pytest.raises(ValueError, match="repeats = 0"):
+        timing.time_in_rounds([], repeats=0)
+
+
+def test_methods_are_timed_per_stamp_and_refused_grids_left_out(case):
+    """A grid that the wavefront refuses has no row; times are those of one stamp."""
+
+    class FineGridsOnly:
+        def opd(self, index, pupil, dtype):
+            if pupil.axis.size < 60:
+                raise SamplingError("too coarse")
+            return case.source.opd(index, pupil, dtype)
+
+    wary = replace(case, source=FineGridsOnly())
+    settings = [
+        propagation.Setting(samples, 4, "complex64", "numpy", 2, 8) for samples in (30, 62, 126)
+    ]
+    rows = peers.time_methods([wary], [settings], [[peers.Peer("fft_pruned", 126, 4)]], 2, 2, 16)
+    table = pd.DataFrame(rows)
+    assert list(table.samples[table.method == "kernel"]) == [62, 126]
+    assert list(table.repeats) == [2, 2, 2]
+    assert (table.mse < 1e-5).all()
+    assert (table.time_ms_low <= table.time_ms).all()
+    assert table.time_ms.between(1e-3, 1e3).all()
 
 
 def test_fresh_process_is_another_one_with_its_own_threads(monkeypatch):

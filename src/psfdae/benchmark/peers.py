@@ -10,13 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from psfdae.benchmark.cases import Case, pupil_of
-from psfdae.benchmark.propagation import row, yes
-from psfdae.benchmark.timing import time_calls, use_threads
+from psfdae.benchmark.propagation import Setting, Trial, kernel_trials, time_trials, yes
+from psfdae.benchmark.timing import use_threads
 from psfdae.optics.propagation import ARCSEC
 from psfdae.optics.pupil import Pupil
 from psfdae.stars.framing import normalise_flux
@@ -34,6 +35,9 @@ GRID_TOLERANCE = 5e-5
 
 REQUIRED_SPEEDUP = {"poppy_mft": 40.0, "poppy_fresnel": 400.0}
 """How many times faster than a peer the kernel has to be at equal error."""
+
+KERNEL_STAMPS = 4
+"""Stamps per timing of the kernel in units of `benchmark.stamps`."""
 
 PEER_COLUMNS = (
     *("scene", "aberration", "method", "samples", "nodes", "precision", "threads"),
@@ -88,21 +92,60 @@ def peers_of(case: Case, thorough: bool, coarse: int = 126) -> list[Peer]:
     return list(dict.fromkeys(chosen))
 
 
-def time_peers(
-    cases: Sequence[Case], peers: Sequence[Sequence[Peer]], threads: int, repeats: int, stamps: int
-) -> list[dict[str, Any]]:
-    """Rows of the peers, one list of peers per case, one stamp per call."""
-    rows = []
+def peer_trials(
+    cases: Sequence[Case], peers: Sequence[Sequence[Peer]], threads: int, stamps: int
+) -> list[Trial]:
+    """Trials of the peers, one list of peers per case, one stamp per call.
+
+    Parameters
+    ----------
+    stamps : int
+        Stamps per timing, but for Fresnel propagation, which takes long enough.
+    """
+    trials = []
     for case, chosen in zip(cases, peers, strict=True):
         for peer in chosen:
             use_threads("numpy", threads)
             samples, propagate = build(case, peer, threads)
-            calls = 1 if peer.method == "poppy_fresnel" else max(1, stamps // 16)
-            timing = time_calls(propagate, repeats, calls)
             stamp = normalise_flux(propagate().astype(np.float64))[0]
             setting = (samples, peer.nodes, peer.precision, "numpy", threads, 1)
-            rows.append(row(case, peer.method, setting, timing, stamp))
-    return rows
+            calls = 1 if peer.method == "poppy_fresnel" else stamps
+            again = partial(_repeated, case, peer, threads, calls)
+            trials.append(Trial(case, peer.method, setting, stamp, again, calls))
+    return trials
+
+
+def _repeated(case: Case, peer: Peer, threads: int, calls: int) -> Callable[[], Any]:
+    use_threads("numpy", threads)
+    propagate = build(case, peer, threads)[1]
+    propagate()
+    return lambda: [propagate() for _ in range(calls)]
+
+
+def time_methods(
+    cases: Sequence[Case],
+    settings: Sequence[Sequence[Setting]],
+    peers: Sequence[Sequence[Peer]],
+    threads: int,
+    repeats: int,
+    stamps: int,
+) -> list[dict[str, Any]]:
+    """Rows of the kernel and of its peers, in turn in one process; run it in a fresh one.
+
+    Parameters
+    ----------
+    settings, peers : one list per case; an empty list of peers for none
+    threads : int
+        Threads of the peers.
+    repeats : int
+    stamps : int
+        Size of a timing. The kernel does more than a peer: it is faster, and its
+        threads start and get their scratch space once per set of stars.
+    """
+    trials = kernel_trials(cases, settings, KERNEL_STAMPS * stamps)
+    return time_trials(
+        [*trials, *peer_trials(cases, peers, threads, max(1, stamps // 16))], repeats
+    )
 
 
 def build(case: Case, peer: Peer, threads: int) -> tuple[int, Propagate]:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import astuple, dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import astuple, dataclass, replace
+from functools import partial
 from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from psfdae.benchmark.cases import Case, errors, pupil_of
-from psfdae.benchmark.timing import Timing, time_calls, use_threads
+from psfdae.benchmark.timing import Timing, time_in_rounds, use_threads
 from psfdae.benchmark.training import pareto
 from psfdae.configuration.schema import Benchmark, Optics
 from psfdae.optics.propagation import StampPropagator
@@ -114,30 +115,59 @@ def configured_setting(
     )
 
 
-def time_kernel(
-    cases: Sequence[Case],
-    settings: Sequence[Sequence[Setting]],
-    repeats: int,
-    stamps: int,
-) -> list[dict[str, Any]]:
-    """Rows of the kernel's settings, one list of settings per case.
+@dataclass(frozen=True)
+class Trial:
+    """One setting of one method for one wavefront, ready to be timed.
+
+    Attributes
+    ----------
+    case : Case
+    method : str
+    setting : tuple
+        The fields of `Setting`, in order.
+    stamp : ndarray, shape (d, d)
+        What it makes, of sum 1.
+    build : callable
+        Sets up and warms up what the clock sees: a callable that propagates
+        `batches` batches.
+    batches : int
+    """
+
+    case: Case
+    method: str
+    setting: tuple[Any, ...]
+    stamp: np.ndarray
+    build: Callable[[], Callable[[], Any]]
+    batches: int
+
+
+def kernel_trials(
+    cases: Sequence[Case], settings: Sequence[Sequence[Setting]], stamps: int
+) -> list[Trial]:
+    """Trials of the kernel's settings, one list of settings per case.
 
     Settings that a wavefront refuses (its grid would alias) are left out.
+
+    Parameters
+    ----------
+    stamps : int
+        Stamps per timing, at least.
     """
-    rows = []
+    trials = []
     for case, chosen in zip(cases, settings, strict=True):
         for setting in chosen:
             try:
-                rows.append(_time_setting(case, setting, repeats, stamps))
+                kernel, opd = _kernel_of(case, replace(setting, batch=1))
             except SamplingError:
                 continue
-    return rows
+            stamp = normalise_flux(kernel(opd, case.offset_px).astype(np.float64))[0][0]
+            batches = max(setting.threads, stamps // setting.batch)
+            build = partial(_side_by_side, case, setting, batches)
+            trials.append(Trial(case, "kernel", astuple(setting), stamp, build, batches))
+    return trials
 
 
-def _time_setting(case: Case, setting: Setting, repeats: int, stamps: int) -> dict[str, Any]:
-    """Numpy's batches run side by side as in a scene, torch's on threads of its own."""
-    numpy = setting.backend == "numpy"
-    use_threads(setting.backend, 1 if numpy else setting.threads)
+def _kernel_of(case: Case, setting: Setting) -> tuple[StampPropagator, np.ndarray]:
     pupil = pupil_of(setting.samples, case.obscuration)
     kernel = StampPropagator(
         pupil,
@@ -147,17 +177,31 @@ def _time_setting(case: Case, setting: Setting, repeats: int, stamps: int) -> di
         setting.precision,  # type: ignore[arg-type]
         setting.backend,  # type: ignore[arg-type]
     )
-    opd = case.batch(pupil, setting.batch, kernel.real_dtype)
+    return kernel, case.batch(pupil, setting.batch, kernel.real_dtype)
+
+
+def _side_by_side(case: Case, setting: Setting, batches: int) -> Callable[[], Any]:
+    """Numpy's batches run side by side as in a scene, torch's on threads of its own."""
+    numpy = setting.backend == "numpy"
+    use_threads(setting.backend, 1 if numpy else setting.threads)
+    kernel, opd = _kernel_of(case, setting)
     offset = np.repeat(case.offset_px, setting.batch, axis=0)
-    calls = max(setting.threads, stamps // setting.batch)
     threads = setting.threads if numpy else 1
 
-    def propagate() -> None:
-        side_by_side(lambda _: kernel(opd, offset), range(calls), threads)
+    def propagate(count: int) -> None:
+        side_by_side(lambda _: kernel(opd, offset), range(count), threads)
 
-    timing = time_calls(propagate, repeats).per(calls)
-    stamp = normalise_flux(kernel(opd[:1], offset[:1]).astype(np.float64))[0][0]
-    return row(case, "kernel", astuple(setting), timing, stamp)
+    propagate(threads)
+    return partial(propagate, batches)
+
+
+def time_trials(trials: Sequence[Trial], repeats: int) -> list[dict[str, Any]]:
+    """Rows of trials, timed in rounds."""
+    timings = time_in_rounds([trial.build for trial in trials], repeats)
+    return [
+        row(t.case, t.method, t.setting, timing.per(t.batches), t.stamp)
+        for t, timing in zip(trials, timings, strict=True)
+    ]
 
 
 def row(

@@ -33,6 +33,12 @@ class Timing:
     high_s: float
     repeats: int
 
+    @classmethod
+    def of(cls, seconds: np.ndarray) -> Timing:
+        """Median and quartiles of repeats, `seconds` of shape (n,)."""
+        low, median, high = np.percentile(seconds, [25, 50, 75])
+        return cls(float(median), float(low), float(high), len(seconds))
+
     def per(self, parts: int) -> Timing:
         """The same for one of equal parts of the call."""
         seconds = (s / parts for s in (self.median_s, self.low_s, self.high_s))
@@ -64,8 +70,39 @@ def time_calls(function: Callable[[], Any], repeats: int, calls: int = 1) -> Tim
         for _ in range(calls):
             function()
         seconds[i] = (time.perf_counter() - start) / calls
-    low, median, high = np.percentile(seconds, [25, 50, 75])
-    return Timing(float(median), float(low), float(high), repeats)
+    return Timing.of(seconds)
+
+
+def time_in_rounds(
+    builders: Sequence[Callable[[], Callable[[], Any]]], repeats: int
+) -> list[Timing]:
+    """Time callables in turn, each once per round, so that their ratios hold.
+
+    A machine that others share is slower for seconds at a time. Rounds spread the
+    repeats of every callable over the whole run, so that all meet the same machine.
+
+    Parameters
+    ----------
+    builders : callables
+        Each sets up what is timed and warms it up, anew in every round.
+    repeats : int
+        Rounds.
+
+    Raises
+    ------
+    ValueError
+        If `repeats` is below 1.
+    """
+    if repeats < 1:
+        raise ValueError(f"repeats = {repeats}: must be at least 1")
+    seconds = np.empty((repeats, len(builders)))
+    for i in range(repeats):
+        for j, build in enumerate(builders):
+            function = build()
+            start = time.perf_counter()
+            function()
+            seconds[i, j] = time.perf_counter() - start
+    return [Timing.of(column) for column in seconds.T]
 
 
 def in_fresh_process(threads: int, function: Callable[..., Any], *arguments: Any) -> Any:

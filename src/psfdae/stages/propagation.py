@@ -93,12 +93,11 @@ def _time_everything(config: Any, cases: Sequence[Case]):  # type: ignore[no-unt
         ]
         for threads in sorted({s.threads for some in settings for s in some}):
             chosen = [[s for s in some if s.threads == threads] for some in settings]
-            jobs: list[Any] = [(propagation.time_kernel, (cases, chosen, *load))]
+            beside: list[list[peers.Peer]] = [[] for _ in cases]
             if (backend, threads) == ("numpy", benchmark.threads):
                 beside = [peers.peers_of(case, benchmark.peers) for case in cases]
-                jobs.append((peers.time_peers, (cases, beside, threads, *load)))
-            for part in timing.in_fresh_process(threads, timing.call_all, jobs):
-                rows += part
+            work = (cases, chosen, beside, threads, *load)
+            rows += timing.in_fresh_process(threads, peers.time_methods, *work)
     used = {
         case.aberration: propagation.configured_setting(optics, benchmark, case.samples)
         for case in cases
