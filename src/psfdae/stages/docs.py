@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import statistics
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -55,6 +56,7 @@ def render(reference: Path, templates: Path, commands: Group) -> dict[str, str]:
     )
     environment.filters["sci"] = lambda value, digits=2: f"{float(value):.{digits}e}"
     environment.filters["fixed"] = lambda value, digits=2: f"{float(value):.{digits}f}"
+    environment.filters["median"] = statistics.median
     context = {
         "csv": lambda name: _rows(reference / name),
         "table": lambda name: (reference / name).read_text(encoding="utf-8").strip(),
