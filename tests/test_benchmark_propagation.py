@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -250,9 +251,45 @@ def test_rounds_take_turns_and_set_up_off_the_clock():
         timing.time_in_rounds([], repeats=0)
 
 
-def test_methods_are_timed_per_stamp_and_refused_grids_left_out(case):
-    """A grid that the wavefront refuses has no row; times are those of one stamp."""
+def test_times_are_those_of_one_stamp(case):
+    """A run of 5 batches of 8 stamps that takes 80 ms: 2 ms per stamp."""
+    setting = (126, 4, "complex64", "numpy", 2, 8)
+    build = partial(partial, time.sleep, 0.08)
+    trial = propagation.Trial(case, "kernel", setting, case.truth, build, batches=5)
+    (row,) = propagation.time_trials([trial], repeats=3)
+    assert 2.0 <= row["time_ms_low"] <= row["time_ms"] <= row["time_ms_high"] < 2.5
+    assert (row["repeats"], row["mse"], row["within_budget"]) == (3, 0.0, "yes")
 
+
+def test_kernel_runs_as_many_batches_as_its_time_is_divided_by(case, monkeypatch):
+    ran = []
+    monkeypatch.setattr(
+        propagation, "side_by_side", lambda _, batches, threads: ran.append((len(batches), threads))
+    )
+    settings = [
+        propagation.Setting(62, 4, "complex64", "numpy", threads, batch)
+        for threads, batch in ((1, 8), (2, 8), (2, 64))
+    ]
+    trials = propagation.kernel_trials([case], [settings], stamps=64)
+    for trial in trials:
+        trial.build()()
+    assert [trial.batches for trial in trials] == [8, 8, 2]
+    timed = ran[1::2]  # after the warm-up of each
+    assert timed == [(8, 1), (8, 2), (2, 2)]
+
+
+def test_peers_run_as_many_stamps_as_their_time_is_divided_by(case, monkeypatch):
+    ran = []
+    monkeypatch.setattr(peers, "build", lambda *_: (62, lambda: ran.append(1) or case.truth))
+    chosen = [peers.Peer("poppy_mft", 62, 2), peers.Peer("poppy_fresnel", 62, 2)]
+    for trial, stamps in zip(peers.peer_trials([case], [chosen], 1, 5), (5, 1), strict=True):
+        run = trial.build()
+        ran.clear()
+        run()
+        assert len(ran) == trial.batches == stamps
+
+
+def test_grids_that_a_wavefront_refuses_are_left_out(case):
     class FineGridsOnly:
         def opd(self, index, pupil, dtype):
             if pupil.axis.size < 60:
@@ -266,10 +303,7 @@ def test_methods_are_timed_per_stamp_and_refused_grids_left_out(case):
     rows = peers.time_methods([wary], [settings], [[peers.Peer("fft_pruned", 126, 4)]], 2, 2, 16)
     table = pd.DataFrame(rows)
     assert list(table.samples[table.method == "kernel"]) == [62, 126]
-    assert list(table.repeats) == [2, 2, 2]
     assert (table.mse < 1e-5).all()
-    assert (table.time_ms_low <= table.time_ms).all()
-    assert table.time_ms.between(1e-3, 1e3).all()
 
 
 def test_fresh_process_is_another_one_with_its_own_threads(monkeypatch):

@@ -196,38 +196,23 @@ def _side_by_side(case: Case, setting: Setting, batches: int) -> Callable[[], An
 
 
 def time_trials(trials: Sequence[Trial], repeats: int) -> list[dict[str, Any]]:
-    """Rows of trials, timed in rounds."""
+    """Rows of trials, timed in rounds; `pareto` and `used` follow when all rows are there."""
     timings = time_in_rounds([trial.build for trial in trials], repeats)
     return [
-        row(t.case, t.method, t.setting, timing.per(t.batches), t.stamp)
-        for t, timing in zip(trials, timings, strict=True)
+        _row(trial, timing.per(trial.batches))
+        for trial, timing in zip(trials, timings, strict=True)
     ]
 
 
-def row(
-    case: Case, method: str, setting: tuple[Any, ...], timing: Timing, stamp: np.ndarray
-) -> dict[str, Any]:
-    """One row of the table; `pareto` and `used` follow when all rows are there.
-
-    Parameters
-    ----------
-    case : Case
-    method : str
-    setting : tuple
-        The fields of `Setting`, in order.
-    timing : Timing
-        Of one batch of `setting`, whatever runs beside it.
-    stamp : ndarray, shape (d, d)
-        Of sum 1.
-    """
-    batch = setting[-1]
-    error_peak, mse = errors(stamp, case.truth)
+def _row(trial: Trial, timing: Timing) -> dict[str, Any]:
+    """The row of a trial with the time of one batch, whatever ran beside it."""
+    case, batch = trial.case, trial.setting[-1]
+    error_peak, mse = errors(trial.stamp, case.truth)
     milliseconds = [1e3 * s / batch for s in (timing.median_s, timing.low_s, timing.high_s)]
-    names = COLUMNS[2:9]
     return {
         "scene": case.scene,
         "aberration": case.aberration,
-        **dict(zip(names, (method, *setting), strict=True)),
+        **dict(zip(COLUMNS[2:9], (trial.method, *trial.setting), strict=True)),
         "repeats": timing.repeats,
         **dict(zip(COLUMNS[10:13], milliseconds, strict=True)),
         "error_peak": error_peak,
@@ -247,7 +232,7 @@ def finish(rows: Iterable[dict[str, Any]], used: dict[str, Setting]) -> pd.DataF
 
     Parameters
     ----------
-    rows : results of `row`, all of one scene
+    rows : results of `time_trials`, all of one scene
     used : mapping of aberration to Setting
     """
     import pandas as pd

@@ -92,14 +92,10 @@ def point(
     ConfigError
         If a trial asks for values that the configuration does not allow.
     """
-    name = task.folder.name
     module = import_module(POINT_MODULES[model])
     if trial is not None:
         adaptive, space = _open(trial)
-        known = [read_result(task.folder.parent / other / RESULT) for other in trial.known]
-        values = adaptive.ask(space, trial.search, trial.slot, known)
-        about = {"slot": trial.slot, "point": name}
-        adaptive.begin(trial.journal, space, trial.search, about, values, known)
+        values = _asked(adaptive, space, trial, task.folder)
         asked = changes(space, values)
         config, keys = _with(config, asked), {**keys, **asked}
     content = [source, model, config.model_dump(), dict(values), dict(keys), task.described()]
@@ -109,7 +105,7 @@ def point(
         for stale in (*module.FILES, EVALUATION, VALIDATION, COST, RESULT, FINISHED):
             (task.folder / stale).unlink(missing_ok=True)
         result = {
-            "point": name,
+            "point": task.folder.name,
             "slot": trial.slot if trial else None,
             "model": model,
             "dataset": task.dataset,
@@ -192,6 +188,17 @@ def _open(trial: Trial) -> tuple[Any, dict[str, Any]]:
 
     space = {name: validate(Axis, axis) for name, axis in trial.search["space"].items()}
     return import_module(ADAPTIVE_MODULE), space
+
+
+def _asked(
+    adaptive: Any, space: Mapping[str, Any], trial: Trial, folder: Path
+) -> Mapping[str, Any]:
+    """Values that the search proposes for a trial, which the journal then has as begun."""
+    known = [read_result(folder.parent / other / RESULT) for other in trial.known]
+    values: Mapping[str, Any] = adaptive.ask(space, trial.search, trial.slot, known)
+    about = {"slot": trial.slot, "point": folder.name}
+    adaptive.begin(trial.journal, space, trial.search, about, values, known)
+    return values
 
 
 def _with(config: Any, keys: Mapping[str, Any]) -> Any:
