@@ -81,10 +81,8 @@ def fit_pca_som(
         Size of the map.
     epochs : int
         Passes over the stars (t_max).
-    sigma : float
-        Initial neighbourhood radius in nodes.
-    learning_rate : float
-        Initial learning rate.
+    sigma, learning_rate : float
+        Initial values; the neighbourhood radius `sigma` is in nodes.
     seed : int
         Seed of the map's initial weights and of the order of stars.
 

@@ -70,10 +70,9 @@ def point(
 ) -> None:
     """Train and measure one point; leave `result.json`, `cost.json` and the model's files.
 
-    A training that cannot go on (not finite, or dead in all its starts) is a result, too:
-    status failed, with the reason. `result.json` is written last and has nothing in it that
-    differs between two runs. A point that is finished with the same code, configuration and
-    data is not trained again.
+    A training that cannot go on (not finite, or dead in all its starts) is a result, too: status
+    failed, with the reason. `result.json` is written last; nothing in it differs between two
+    runs. A point finished with the same code, configuration and data is not trained again.
 
     Parameters
     ----------
