@@ -15,22 +15,36 @@ TARGETS ?=
 TORCH_INDEX ?=
 PORT ?= 5000
 
-VENV := $(CURDIR)/.venv
-BIN := $(VENV)/bin
-PIP := $(BIN)/python -m pip --disable-pip-version-check --no-input
-export PATH := $(BIN):$(PATH)
+VENV := .venv
+PIP := $(VENV)/bin/python -m pip --disable-pip-version-check --no-input
+export PATH := $(CURDIR)/$(VENV)/bin:$(PATH)
 export PYTHONUNBUFFERED := 1
 export MLFLOW_DISABLE_TELEMETRY := true
-RESULTS := results$(if $(filter-out fast,$(PRESET)),/$(PRESET))
-export PSFDAE_RESULTS := $(RESULTS)
-SNAKEMAKE := snakemake --cores $(CORES) --config preset=$(PRESET) $(if $(SET),set="$(SET)")
+# Everything stays in this folder, caches of libraries, too.
+export XDG_CACHE_HOME := $(CURDIR)/.cache
+export MPLCONFIGDIR := $(CURDIR)/.cache/matplotlib
+export PIP_NO_CACHE_DIR := 1
+
+# What a user gives reaches the recipes through the environment, as it stands: neither make nor
+# a shell expands a text that may come from a colleague's file.
+override CORES := $(value CORES)
+override PRESET := $(value PRESET)
+override SET := $(value SET)
+override TARGETS := $(value TARGETS)
+override PORT := $(value PORT)
+override TORCH_INDEX := $(value TORCH_INDEX)
+PSFDAE_RESULTS := results$(if $(filter-out fast,$(PRESET)),/$(PRESET))
+export CORES PRESET SET TARGETS PORT TORCH_INDEX PSFDAE_RESULTS
+SNAKEMAKE := snakemake --cores "$$CORES" --config preset="$$PRESET" set="$$SET"
+# -f: a target is no pattern of file names.
+LOCKED := set -f; sh workflow/locked.sh $(SNAKEMAKE)
 # Targets on request are in the report where they have been built.
-REPORTED = $(or $(TARGETS),all \
-  $(if $(wildcard $(RESULTS)/figures/benchmark/skipping.png),benchmark) \
-  $(if $(wildcard $(RESULTS)/.stability_passed),stability) \
-  $(if $(wildcard $(RESULTS)/tables/psf_efficiency.csv),bounds) \
-  $(if $(wildcard $(RESULTS)/figures/benchmark/training.png),training_knee) \
-  $(if $(wildcard $(RESULTS)/figures/own_stars/strip.png),from_stars_example))
+REPORTED = all \
+  $(if $(wildcard $(PSFDAE_RESULTS)/figures/benchmark/skipping.png),benchmark) \
+  $(if $(wildcard $(PSFDAE_RESULTS)/.stability_passed),stability) \
+  $(if $(wildcard $(PSFDAE_RESULTS)/tables/psf_efficiency.csv),bounds) \
+  $(if $(wildcard $(PSFDAE_RESULTS)/figures/benchmark/training.png),training_knee) \
+  $(if $(wildcard $(PSFDAE_RESULTS)/figures/own_stars/strip.png),from_stars_example)
 # The 24 × 24 trainings take longest; started last, one would run alone in the end.
 LONGEST_FIRST := $(if $(strip $(TARGETS)),,--prioritize scene2)
 
@@ -52,7 +66,7 @@ $(VENV)/.complete: requirements.lock pyproject.toml
 	touch $@
 
 reproduce: env ## Build everything of the preset: datasets, models, tables, report
-	@sh workflow/locked.sh $(SNAKEMAKE) $(LONGEST_FIRST) -- $(TARGETS)
+	@$(LOCKED) $(LONGEST_FIRST) -- $$TARGETS
 	@$(MAKE) --no-print-directory report
 
 benchmark: env ## Run time against error, on a quiet machine
@@ -61,18 +75,21 @@ bounds: env ## How far each method is from the best possible one
 training_knee: env ## Test error against training time
 bundles: env ## Pack each dataset's network as a model that psfdae predict takes
 benchmark stability bounds training_knee bundles:
-	@sh workflow/locked.sh $(SNAKEMAKE) -- $@
+	@$(LOCKED) -- $@
 
 shipped: env ## Train the model that comes with the package and renew it
-	@sh workflow/locked.sh $(SNAKEMAKE) --forcerun shipped -- shipped
+	@$(LOCKED) --forcerun shipped -- shipped
 
 report: env ## Gather the figures of a finished run in results/report.html
-	$(SNAKEMAKE) --report $(RESULTS)/report.html -- $(REPORTED)
+	@mkdir -p .snakemake
+	@set -f; flock .snakemake/psfdae.lock \
+	  $(SNAKEMAKE) --report "$$PSFDAE_RESULTS/.report.html" -- $${TARGETS:-$(REPORTED)}
+	@mv "$$PSFDAE_RESULTS/.report.html" "$$PSFDAE_RESULTS/report.html"
 
 mlflow: env ## Compare the tracked runs in a browser (PORT=n)
-	@test -f $(RESULTS)/mlflow.db || { echo "no $(RESULTS)/mlflow.db yet: make reproduce"; exit 1; }
-	mlflow ui --workers 1 --port $(PORT) --backend-store-uri sqlite:///$(RESULTS)/mlflow.db \
-	  --artifacts-destination $(RESULTS)/mlartifacts
+	@test -f "$$PSFDAE_RESULTS/mlflow.db" || { echo "no $$PSFDAE_RESULTS/mlflow.db yet: make reproduce"; exit 1; }
+	mlflow ui --workers 1 --port "$$PORT" --backend-store-uri "sqlite:///$$PSFDAE_RESULTS/mlflow.db" \
+	  --artifacts-destination "$$PSFDAE_RESULTS/mlartifacts"
 
 reference: env ## Make the finished run in results the run of record, and renew the docs
 	$(SNAKEMAKE) --forcerun reference -- reference
@@ -110,4 +127,4 @@ lock: env ## Renew requirements.lock from pyproject.toml
 
 clean: ## Remove results (but not results/reference) and Snakemake's memory of them
 	find results -mindepth 1 -maxdepth 1 ! -name reference -exec rm -rf {} + 2>/dev/null || true
-	rm -rf .snakemake
+	rm -rf .snakemake .cache

@@ -59,7 +59,7 @@ class NoHandlerError(Exception):
 def sandbox(tmp_path, monkeypatch):
     """A working folder with a config tree of its own and finished trainings to compare."""
     shutil.copytree(ROOT / "config", tmp_path / "config")
-    shutil.copytree(ROOT / "workflow/profiles", tmp_path / "workflow/profiles")
+    shutil.copytree(ROOT / "profiles", tmp_path / "profiles")
     for run in ("results", "results/paper", "results/smoke"):
         for network in ("random-realisation", "held_out-realisation"):
             write_network(tmp_path / run, f"dataset3/{network}")

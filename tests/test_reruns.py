@@ -20,7 +20,7 @@ FIGURES = {
 @pytest.fixture
 def tree(tmp_path):
     """A copy of everything that decides what runs."""
-    for name in ("Snakefile", "workflow", "config", "src"):
+    for name in ("Snakefile", "profiles", "workflow", "config", "src"):
         source = ROOT / name
         if source.is_dir():
             ignored = shutil.ignore_patterns("__pycache__")

@@ -22,7 +22,7 @@ ON_REQUEST = (
     *("benchmark", "stability", "bounds", "training_knee"),
     *("prediction", "from_stars_example", "bundles", "scaling"),
 )
-PROFILES = ROOT / "workflow/profiles"
+PROFILES = ROOT / "profiles"
 RULES = "".join(path.read_text() for path in (ROOT / "workflow/rules").glob("*.smk"))
 LOCAL = set(re.findall(r"^rule (\w+):\n(?:(?!rule ).*\n)*?    localrule: True", RULES, re.M))
 

@@ -69,7 +69,7 @@ def command(folder, *targets):
     return [
         "snakemake",
         *("--snakefile", str(ROOT / "Snakefile"), "--directory", str(folder)),
-        *("--workflow-profile", str(ROOT / "workflow/profiles/slurm"), *QUICK, *targets),
+        *("--workflow-profile", str(ROOT / "profiles/slurm"), *QUICK, *targets),
         *("--config", "preset=smoke", "results=results"),
     ]
 

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 import time
 from pathlib import Path
+
+import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PATH = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
@@ -21,12 +24,39 @@ def environment(**more):
     return {**kept, "PATH": PATH, **more}
 
 
+def clone(folder):
+    """A fresh copy of the source tree in `folder`, with the environment of this one."""
+    environment_of_make = Path(sys.prefix)
+    if not (environment_of_make / ".complete").is_file():
+        pytest.skip("the environment is not make's")
+    made = shutil.ignore_patterns(
+        *(".*_cache", ".cache", ".git", ".hypothesis", ".snakemake", ".venv"),
+        *("__pycache__", "dist", "site"),
+    )
+
+    def ignored(place, names):
+        # Times are kept, so that make finds its environment newer than the lock file.
+        return set(names) - {"reference"} if Path(place) == ROOT / "results" else made(place, names)
+
+    shutil.copytree(ROOT, folder, ignore=ignored, dirs_exist_ok=True)
+    (folder / ".venv").symlink_to(environment_of_make)
+    return folder
+
+
+def shell(folder, line, home=None, **options):
+    """A line of README as a user types it: the environment active, nothing else set.
+
+    `home` is the user's, by default the folder itself; options are those of `Popen`.
+    """
+    own = {"HOME": str(home or folder), "PATH": PATH, "LANG": "C.UTF-8"}
+    return subprocess.Popen(["bash", "-c", line], cwd=folder, env=own, **options)
+
+
 def command(folder, *arguments, overrides="", preset="smoke", root=ROOT):
     """The command line of a run in `folder`, of the workflow in `root`."""
     return [
         "snakemake",
         *("--snakefile", str(root / "Snakefile"), "--directory", str(folder)),
-        *("--workflow-profile", str(root / "workflow/profiles/default"), "--cores", "2"),
         *arguments,
         *("--config", f"preset={preset}", "results=results", f"set={overrides}"),
     ]
