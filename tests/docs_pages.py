@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -13,10 +13,11 @@ FENCE = re.compile(r"^(`{3,}|~{3,})(\w*)[^\n]*\n(.*?)^\1", re.M | re.S)
 
 @dataclass(frozen=True)
 class Command:
-    """A line of a shell block: its words, and the text of its heredoc."""
+    """A line of a shell block: its words, the text of its heredoc, and what a user types."""
 
     words: tuple[str, ...]
     heredoc: str = ""
+    typed: str = field(default="", compare=False)
 
 
 def pages():
@@ -42,15 +43,15 @@ def commands(text):
         lines = iter(block.replace("\\\n", " ").splitlines())
         for line in lines:
             heredoc = re.search(r"<<-?\s*'?(\w+)'?", line)
-            written = []
-            if heredoc:
-                for inner in lines:
-                    if inner.strip() == heredoc[1]:
-                        break
-                    written.append(inner + "\n")
+            typed, written = [line], []
+            while heredoc:
+                typed.append(next(lines))
+                if typed[-1].strip() == heredoc[1]:
+                    break
+                written.append(typed[-1] + "\n")
             words = shlex.split(line.replace(heredoc[0], "") if heredoc else line, comments=True)
             if words:
-                found.append(Command(tuple(words), "".join(written)))
+                found.append(Command(tuple(words), "".join(written), "\n".join(typed)))
     return found
 
 

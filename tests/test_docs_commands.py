@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
+import signal
 import subprocess
+import time
+import urllib.request
+from subprocess import PIPE, STDOUT
 
 import numpy as np
 import pytest
@@ -14,11 +19,10 @@ from docs_pages import ROOT, Command, blocks, commands, pages, read
 from psfdae.bundle import read_bundle
 from psfdae.cli import main
 from psfdae.configuration.compose import forget
-from psfdae.documentation.graphs import rule_topics
 from psfdae.files import write_text
 from psfdae.observations.examples import write_field
 from test_compare import errors
-from workflow_runs import command, environment, job_counts
+from workflow_runs import QUIET, clone, environment, shell, wait_until
 
 TINY = {
     "templates": ["grid.points=5"],
@@ -41,14 +45,17 @@ TESTED_ELSEWHERE = {
 NOT_RUN = {"conda": "makes a second environment", ".": "activates the environment"}
 """Commands that no test runs, and why."""
 
-IGNORED_OPTIONS = {"--cores": 1, "--jobs": 1, "-n": 0, "--dry-run": 0}
-"""Options of snakemake, with their number of values, that a dry run on two cores replaces."""
-
-ONE_VALUE = ("--workflow-profile", "--max-threads")
-MANY_VALUES = ("--default-resources", "--set-resources", "--groups", "--slurm-array-jobs")
-"""Options of snakemake on a cluster, which a dry run gets as they stand."""
-
-RULES = rule_topics(ROOT / "workflow/rules")
+LONG = "takes over 10 minutes, or needs a run that does"
+DRY = {
+    **dict.fromkeys(("make reproduce", "make reproduce CORES=4"), LONG),
+    **dict.fromkeys(("make reproduce PRESET=paper", "make reference"), LONG),
+    **dict.fromkeys((f"snakemake {t}" for t in ("scene1", "scene2", "scene3", "tables")), LONG),
+    **dict.fromkeys((f"make {t}" for t in ("benchmark", "stability", "bounds")), LONG),
+    "make training_knee": LONG,
+    "snakemake tracking --forcerun track track_alignment": LONG,
+    **dict.fromkeys(("make test", "make test-all"), "would run this test"),
+}
+"""Commands that are planned only, and why; all others run as they are written."""
 
 
 class NoHandlerError(Exception):
@@ -139,35 +146,6 @@ def run_make(words):
     subprocess.run(listed, env=environment(), check=True, capture_output=True)
 
 
-def targets_and_settings(words):
-    """What a snakemake command builds, and how: options of a cluster, what follows --config."""
-    targets, options, settings = [], [], []
-    words = list(words[1:])
-    while words:
-        word = words.pop(0)
-        if word == "--config":
-            while words and re.match(r"\w+=", words[0]):
-                settings.append(words.pop(0))
-        elif word.partition("=")[0] in ONE_VALUE + MANY_VALUES:
-            values = [] if "=" in word else [words.pop(0)]
-            while word in MANY_VALUES and words and not words[0].startswith("-"):
-                values.append(words.pop(0))
-            options += [word, *values]
-        elif word in IGNORED_OPTIONS:
-            del words[: IGNORED_OPTIONS[word]]
-        elif word == "--forcerun":
-            # In a dry run of an empty folder everything runs; the rules must exist.
-            while words and not words[0].startswith("-"):
-                assert words.pop(0) in RULES
-        elif word.startswith("-"):
-            raise NoHandlerError(f"snakemake {word}")
-        else:
-            targets.append(word)
-    named = re.findall(r"(\w+)[:,]|,(\w+)|(\w+)=model", " ".join(options))
-    assert {name for names in named for name in names if name} <= set(RULES)
-    return targets, (tuple(options), tuple(settings))
-
-
 def own_pages():
     return [page for page in pages() if page not in TESTED_ELSEWHERE]
 
@@ -180,30 +158,67 @@ def test_commands_run(page, sandbox, observation):
         run(line, sandbox)
 
 
-def snakemake_pages():
-    return [p for p in own_pages() if any(c.words[0] == "snakemake" for c in commands(read(p)))]
+@pytest.fixture(scope="module")
+def house(smoke, tmp_path_factory, observation):
+    """A fresh copy of the source tree with the results of a run, and an image."""
+    folder = clone(tmp_path_factory.mktemp("house") / "psfdae")
+    for name in ("results", ".snakemake"):
+        shutil.copytree(smoke[0] / name, folder / name, dirs_exist_ok=True)
+    for path in observation:
+        shutil.copy(path, folder)
+    return folder
+
+
+def typed(line, folder):
+    """What a user types, or how it is only planned."""
+    command = " ".join(line.words)
+    if "--workflow-profile" in line.words or (DRY.get(command) and line.words[0] == "snakemake"):
+        return f"{line.typed} --dry-run" if "#" not in line.typed else f"{command} --dry-run"
+    if command in DRY:
+        return command.replace("make", "make --dry-run", 1)
+    return line.typed
+
+
+def served(folder, line):
+    """A page that is served until it is stopped."""
+    port = dict(word.split("=") for word in line.split() if "=" in word).get("PORT", "5000")
+    server = shell(folder, line, start_new_session=True, **QUIET)
+    try:
+        wait_until(lambda: answers(f"http://127.0.0.1:{port}/"), 60, line)
+    finally:
+        os.killpg(server.pid, signal.SIGTERM)
+        server.wait()
+
+
+def answers(url):
+    try:
+        return urllib.request.urlopen(url, timeout=5).status == 200
+    except OSError:
+        return False
 
 
 @pytest.mark.slow
 @pytest.mark.workflow
-@pytest.mark.parametrize("page", snakemake_pages())
-def test_workflow_commands_have_jobs(page, sandbox):
-    """All targets of a page that need no settings in one dry run."""
-    together: dict[tuple, list] = {}
+@pytest.mark.parametrize("page", [page for page in pages() if commands(read(page))])
+def test_commands_as_written(page, house, tmp_path):
+    """In a shell with the environment active and nothing else set."""
     for line in commands(read(page)):
-        if line.words[0] in ("cat", "cp"):
-            run(line, sandbox)
-        elif line.words[0] == "snakemake":
-            targets, settings = targets_and_settings(line.words)
-            together.setdefault(settings, []).extend(targets)
-    for (options, settings), targets in together.items():
-        line = [*command(sandbox, *options, "--dry-run", *targets), *settings]
-        done = subprocess.run(
-            line, cwd=sandbox, env=environment(), capture_output=True, text=True, check=False
-        )
-        assert done.returncode == 0, done.stdout + done.stderr
-        jobs = job_counts(done.stdout)
-        assert set(targets) <= set(jobs), (settings, targets)
+        folder = house
+        if line.words == ("make", "clean"):
+            folder = clone(tmp_path / "clean")
+        elif "results/paper" in line.words and not (house / "results/paper").exists():
+            for name in ("dae", "evaluation"):
+                shutil.copytree(house / "results" / name, house / "results/paper" / name)
+        if line.words[:2] == ("make", "mlflow"):
+            served(folder, line.typed)
+            continue
+        if line.words[0] in NOT_RUN:
+            continue
+        start = time.monotonic()
+        run = shell(folder, typed(line, folder), stdout=PIPE, stderr=STDOUT, text=True)
+        out, _ = run.communicate()
+        assert run.returncode == 0, f"{line.typed}\n{out}"
+        print(f"{time.monotonic() - start:6.1f} s  {typed(line, folder)}", flush=True)
 
 
 @pytest.mark.parametrize(("page", "test"), TESTED_ELSEWHERE.items())

@@ -49,6 +49,8 @@ def shell(folder, line, home=None, **options):
     `home` is the user's, by default the folder itself; options are those of `Popen`.
     """
     own = {"HOME": str(home or folder), "PATH": PATH, "LANG": "C.UTF-8"}
+    # An environment of the copy's own would be linked to the copy's source.
+    own["PYTHONPATH"] = str(folder / "src")
     return subprocess.Popen(["bash", "-c", line], cwd=folder, env=own, **options)
 
 
