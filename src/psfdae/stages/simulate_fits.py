@@ -60,7 +60,7 @@ def write_psfs(config: Any, fields: FieldOfPsfs, path: Path) -> None:
         [fits.Column(name=n, format=f, unit=u, array=a) for n, f, u, a in columns], name="FIELDS"
     )
     with atomic_path(path) as temporary:
-        fits.HDUList([cube, table]).writeto(temporary, output_verify="exception")
+        fits.HDUList([cube, table]).writeto(temporary, overwrite=True, output_verify="exception")
 
 
 def write_image(
