@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import hashlib
 import json
 import os
@@ -58,9 +57,8 @@ def _cost(path: Path, *names: str) -> list[float]:
     is to be repeated for them.
     """
     try:
-        columns, *_, last = csv.reader(
-            path.read_text(encoding="utf-8").splitlines(), delimiter="\t"
-        )
+        lines = path.read_text(encoding="utf-8").splitlines()
+        columns, *_, last = (line.split("\t") for line in lines)
         job = dict(zip(columns, last, strict=True))
         return [float("nan" if job[name] in ("-", "NA") else job[name]) for name in names]
     except (ValueError, KeyError) as error:
