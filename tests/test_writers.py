@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -128,7 +129,7 @@ def test_on_the_disk_before_it_has_its_name(results, monkeypatch):
         fsync(descriptor)
 
     def renamed(source, target, **more):
-        events.append(("name", os.stat(source).st_ino, os.path.basename(target)))
+        events.append(("name", Path(source).stat().st_ino, Path(target).name))
         replace(source, target, **more)
 
     monkeypatch.setattr(os, "fsync", synced)
