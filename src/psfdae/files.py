@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import hashlib
+import io
 import json
 import os
 import re
@@ -164,6 +165,15 @@ def write_text(path: str | Path, text: str) -> None:
     """Write a UTF-8 text file atomically."""
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+def write_fits(path: str | Path, hdus: Any) -> None:
+    """Write an astropy `HDUList` atomically."""
+    content = io.BytesIO()
+    hdus.writeto(content, output_verify="exception")
+    # By us, because astropy does not pass on what the system says of a full disk.
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(content.getbuffer())
 
 
 @dataclass(frozen=True)

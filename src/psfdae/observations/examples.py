@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from psfdae.files import atomic_path
+from psfdae.files import atomic_path, write_fits
 from psfdae.observations.cutting import central_pixel
 
 
@@ -120,5 +120,4 @@ def _write_image(
         hdus = fits.HDUList([fits.PrimaryHDU(), image])
     else:
         hdus = fits.HDUList([fits.PrimaryHDU(pixels, header)])
-    with atomic_path(path) as temporary:
-        hdus.writeto(temporary, overwrite=True, output_verify="exception")
+    write_fits(path, hdus)
