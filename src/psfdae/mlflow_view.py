@@ -25,6 +25,9 @@ DATABASE, ARTIFACTS, RECEIPTS = "mlflow.db", "mlartifacts", "mlflow"
 BUSY = (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED, sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_PERM)
 """What SQLite says of a database that somebody uses, or that may not be read."""
 
+PATIENCE_S = 20.0
+"""How long to wait for somebody who writes to the database."""
+
 
 def note(receipt: Path, runs: Mapping[str, tuple[Sequence[str], Sequence[str]]]) -> None:
     """Keep hashes of imported runs, if the results have digests; none for a server's runs.
@@ -90,7 +93,7 @@ def _noted(receipt: Path) -> Path:
 def _open(results: Path) -> Any:
     # Not read-only: what a killed import has left half-done is rolled back.
     uri = f"{(results / DATABASE).resolve().as_uri()}?mode=rw"
-    return closing(sqlite3.connect(uri, uri=True, timeout=20))
+    return closing(sqlite3.connect(uri, uri=True, timeout=PATIENCE_S))
 
 
 def _changed(database: sqlite3.Connection, results: Path, receipt: Path) -> str:

@@ -14,7 +14,7 @@ from psfdae.models.weights import load_weights
 ASIDE = ".damaged"
 """Suffix that a damaged file gets; it is overwritten by the next one of its name."""
 
-SKIPPED = {DIGESTS, *UNDIGESTED, mlflow_view.ARTIFACTS}
+SKIPPED = {DIGESTS, *UNDIGESTED, mlflow_view.ARTIFACTS, mlflow_view.ARTIFACTS + ASIDE}
 """Folders that no rule's output lies in."""
 
 
