@@ -37,6 +37,11 @@ include: "workflow/rules/record.smk"
 include: "workflow/rules/scaling.smk"
 
 
+# Where the digests of the products go: `psfdae verify` compares.
+onstart:
+    Path(RESULTS, DIGESTS).mkdir(parents=True, exist_ok=True)
+
+
 rule all:
     default_target: True
     input:

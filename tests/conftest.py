@@ -86,3 +86,17 @@ def shipped():
 def field_psfs(tmp_path_factory):
     """384 noise-free stars of the shipped model's scene, 16 × 16, flux 1."""
     return fresh_psfs(tmp_path_factory.mktemp("field"), 384)
+
+
+@pytest.fixture(scope="session")
+def empty_database(tmp_path_factory):
+    """A migrated database without runs; the migrations take seconds."""
+    from psfdae.stages import track
+
+    path = tmp_path_factory.mktemp("mlflow") / "mlflow.db"
+    patch = pytest.MonkeyPatch()
+    patch.setenv("MLFLOW_DISABLE_TELEMETRY", "true")
+    track._client("", path)
+    patch.undo()
+    assert [p.name for p in path.parent.iterdir()] == ["mlflow.db"]
+    return path

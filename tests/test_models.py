@@ -12,6 +12,7 @@ from psfdae.configuration.schema import Dae as DaeConfig
 from psfdae.configuration.schema import Train
 from psfdae.evaluation.metrics import mse
 from psfdae.files import ProductError
+from psfdae.models.checkpoint import save_checkpoint
 from psfdae.models.dae import SingleChannelConv, build_dae, image_scale, predict
 from psfdae.models.lmmse import LinearMmse
 from psfdae.models.pca_som import fit_pca_som
@@ -178,7 +179,7 @@ def test_interrupted_training_continues_as_if_nothing_had_happened(data, tmp_pat
 def test_unusable_checkpoint_is_ignored(data, tmp_path, damage):
     path = tmp_path / "checkpoint.pt"
     if damage == "foreign":
-        torch.save({"fingerprint": "another"}, path)
+        save_checkpoint(path, "another", {})
     else:
         path.write_bytes(b"not a checkpoint")
     epochs = []

@@ -60,18 +60,6 @@ def write_tree(results, dataset="dataset3", reference="template"):
     return {dataset: stars}
 
 
-@pytest.fixture(scope="module")
-def empty_database(tmp_path_factory):
-    """A migrated database without runs; the migrations take seconds."""
-    path = tmp_path_factory.mktemp("mlflow") / "mlflow.db"
-    patch = pytest.MonkeyPatch()
-    patch.setenv("MLFLOW_DISABLE_TELEMETRY", "true")
-    track._client("", path)
-    patch.undo()
-    assert [p.name for p in path.parent.iterdir()] == ["mlflow.db"]
-    return path
-
-
 class Site:
     """A results folder with its own copy of the database."""
 

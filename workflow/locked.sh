@@ -22,6 +22,11 @@ if command -v flock >/dev/null 2>&1; then
     # does not miss a file as long as what was made from it is there.
     damaged=$([ -z "${PSFDAE_RESULTS:-}" ] || psfdae verify "$PSFDAE_RESULTS")
     if [ -n "$damaged" ]; then
+        # Those that this run knows: it would stop at others, such as a user's own.
+        known=$("$program" --summary "$@" 2>/dev/null | cut -f 1)
+        damaged=$(printf '%s\n' "$damaged" | grep -Fx -e "$known" || true)
+    fi
+    if [ -n "$damaged" ]; then
         IFS='
 '
         set -f

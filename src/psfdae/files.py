@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import errno
+import hashlib
+import io
 import json
 import os
+import re
+import secrets
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
@@ -19,27 +25,155 @@ class ProductError(RuntimeError):
     """A data product is missing, damaged, or not what the stage expects."""
 
 
-@contextmanager
-def atomic_path(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary name beside `path`; rename onto it if the block succeeds.
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""What the system says where a file has no space; libraries leave out which file."""
 
-    A reader therefore never sees a half-written file, and an interrupted stage
-    leaves nothing that looks finished.
+
+@contextmanager
+def atomic_path(path: str | Path, digest: bool = True) -> Iterator[Path]:
+    """Yield a new, empty file beside `path`; rename it onto `path` if the block succeeds.
+
+    A reader therefore never sees a half-written file, an interrupted stage leaves nothing
+    that looks finished, and what has its name is on the disk. Below a folder that holds
+    `DIGESTS`, the file's digest is written, too. What a killed writer of the same file has
+    left is removed.
+
+    Parameters
+    ----------
+    path : path-like
+        Its folder is made if missing.
+    digest : bool
+        Whether the file is a product; False for one that changes after it was written.
+
+    Raises
+    ------
+    OSError
+        As from the system; one of writing names `path`.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    # Of 255 bytes that a name may have; a character takes up to four.
+    stem = f".{path.name[:40]}"
+    sweep_stale(path.parent, stem)
+    temporary = path.with_name(f"{stem}.{_writer()}-{secrets.token_hex(4)}.tmp")
+    os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o666))
     try:
         yield temporary
+        _to_disk(temporary)
+        if digest and (record := digest_path(path)):
+            # First, so that no product stands without its digest.
+            with atomic_path(record, digest=False) as noted:
+                noted.write_text(digest_line(temporary, path.name), encoding="utf-8")
         temporary.replace(path)
+        _to_disk(path.parent)
+    except OSError as error:
+        if error.errno in FULL or error.filename in (temporary, str(temporary)):
+            named = error.filename not in (None, temporary, str(temporary))
+            where = error.filename if named else str(path)
+            raise OSError(error.errno, os.strerror(error.errno or 0), where) from error
+        raise
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _to_disk(path: Path) -> None:
+    """Wait until a file's content, or a folder's names, would outlive a loss of power."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
+    try:
+        os.fsync(descriptor)
+    except OSError as error:
+        # File systems that cannot do it for a folder say EINVAL.
+        if error.errno != errno.EINVAL:
+            raise
+    finally:
+        os.close(descriptor)
+
+
+DIGESTS = ".digests"
+"""Folder in a folder of results with the SHA-256 of every product, in a file each."""
+
+UNDIGESTED = ("reference",)
+"""Folders of results whose files have no digest: the run of record is in git."""
+
+
+def digest_path(path: Path) -> Path | None:
+    """Where the digest of a product belongs, if it lies in a folder with digests."""
+    path = Path(os.path.abspath(path))  # noqa: PTH100 - symbolic links are names here
+    for root in path.parents:
+        if (root / DIGESTS).is_dir():
+            parts = path.relative_to(root).parts
+            if parts[0] in UNDIGESTED or any(part.startswith(".") for part in parts):
+                return None
+            return root / DIGESTS / Path(*parts[:-1]) / f"{path.name}.sha256"
+    return None
+
+
+def digest_line(path: Path, name: str) -> str:
+    """What `sha256sum` would print for a file of that name."""
+    with path.open("rb") as file:
+        return f"{hashlib.file_digest(file, 'sha256').hexdigest()}  {name}\n"
+
+
+@cache
+def _machine() -> str:
+    """Hash of what makes a process number unique: host, its boot, the namespace of processes."""
+    boot = Path("/proc/sys/kernel/random/boot_id")
+    namespace = Path("/proc/self/ns/pid")
+    known = [
+        os.uname().nodename,
+        boot.read_text() if boot.exists() else secrets.token_hex(16),
+        str(namespace.readlink()) if namespace.exists() else "",
+    ]
+    return hashlib.sha256("\n".join(known).encode()).hexdigest()[:12]
+
+
+def _started(pid: int | str) -> str:
+    """When a process started, in ticks since the boot: its number may be used again."""
+    try:
+        # The name of the program may hold blanks and brackets.
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[19]
+    except OSError:
+        return ""
+
+
+def _writer() -> str:
+    return f"{_machine()}-{os.getpid()}-{_started(os.getpid())}"
+
+
+_STALE = re.compile(r"\.([0-9a-f]{12})-([0-9]+)-([0-9]+)-[0-9a-f]{8}\.tmp")
+
+
+def sweep_stale(folder: Path, stem: str) -> None:
+    """Remove temporary files of `atomic_path` whose writer is certainly dead.
+
+    Certainly: it ran on this host since its last boot. Others are left alone, such as
+    those of another node of a cluster.
+
+    Parameters
+    ----------
+    folder : Path
+    stem : str
+        What the names start with.
+    """
+    for entry in os.scandir(folder):
+        found = _STALE.search(entry.name) if entry.name.startswith(stem) else None
+        if found and found[1] == _machine() and found[3] != _started(found[2]):
+            Path(entry.path).unlink(missing_ok=True)
 
 
 def write_text(path: str | Path, text: str) -> None:
     """Write a UTF-8 text file atomically."""
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+def write_fits(path: str | Path, hdus: Any) -> None:
+    """Write an astropy `HDUList` atomically."""
+    content = io.BytesIO()
+    hdus.writeto(content, output_verify="exception")
+    # By us, because astropy does not pass on what the system says of a full disk.
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(content.getbuffer())
 
 
 @dataclass(frozen=True)
@@ -88,7 +222,8 @@ def write_product(
     """
     import h5py
 
-    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
+    # In memory, because HDF5 crashes where a full disk keeps it from closing a file.
+    with h5py.File(Path(path).name, "w", driver="core", backing_store=False) as file:
         _describe(file, kind, config)
         stored: dict[int, str] = {}
         for name, column in columns.items():
@@ -99,6 +234,10 @@ def write_product(
             data = file.create_dataset(name, data=column.values, chunks=True, fletcher32=True)
             data.attrs["unit"] = column.unit
             data.attrs["about"] = column.about
+        file.flush()
+        content = file.id.get_file_image()
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(content)
 
 
 @contextmanager
@@ -114,7 +253,8 @@ def stream_product(
     columns, best in the order of their rows: `data["psf"][start:stop] = …`. The
     file is that of `write_product` but for the shape of the chunks, and appears
     under its name only when the block has succeeded. An `Empty` that is the very
-    object of an earlier one is stored as a link.
+    object of an earlier one is stored as a link. The space that it takes is reserved
+    before anything is written.
 
     Parameters are those of `write_product`.
 
@@ -122,10 +262,12 @@ def stream_product(
     ------
     ProductError
         If the block has left a chunk of a column unwritten.
+    OSError
+        If the disk has too little space.
     """
     import h5py
 
-    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
+    with atomic_path(path) as temporary, _reserved(temporary, columns) as file:
         _describe(file, kind, config)
         stored: dict[int, str] = {}
         for name, column in columns.items():
@@ -143,6 +285,43 @@ def stream_product(
             written = data.id.get_num_chunks() * data.chunks[0]
             if isinstance(columns[name], Empty) and written < data.shape[0]:
                 raise ProductError(f"{path}: array {name!r} was not filled to its end")
+
+
+@contextmanager
+def _reserved(path: Path, columns: Mapping[str, Column | Empty]) -> Iterator[Any]:
+    """A new HDF5 file that has its space: HDF5 crashes where a full disk keeps it from closing."""
+    import h5py
+
+    most = sum(_most_bytes(column) for column in columns.values()) + 2**20
+    with path.open("wb") as space:
+        # Once before HDF5 opens the file, and cuts it to nothing, to fail while that is safe.
+        _reserve(space, most)
+        with h5py.File(path, "w") as file:
+            _reserve(space, most)
+            yield file
+            file.flush()
+            size = file.id.get_filesize()
+        space.truncate(size)
+
+
+def _reserve(file: IO[bytes], size: int) -> None:
+    try:
+        os.posix_fallocate(file.fileno(), 0, size)
+    except OSError as error:
+        # Not every file system and C library can.
+        if error.errno not in (errno.EOPNOTSUPP, errno.EINVAL):
+            raise
+
+
+def _most_bytes(column: Column | Empty) -> int:
+    """Upper limit of what HDF5 stores of a column, with the table of its chunks."""
+    if isinstance(column, Column):
+        # Chunks at the border are whole; h5py gives them at least half of an axis' length.
+        return int(column.values.nbytes) * 2**column.values.ndim + 2**17
+    rows = _storage(column)["chunks"][0]
+    count = -(-column.shape[0] // rows)
+    row_bytes = int(np.prod(column.shape[1:], dtype=int)) * np.dtype(column.dtype).itemsize
+    return int(count * (rows * row_bytes + 256)) + 2**17
 
 
 def _storage(column: Column | Empty) -> dict[str, Any]:

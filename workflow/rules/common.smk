@@ -6,6 +6,7 @@ from snakemake.utils import validate
 from psfdae.configuration.compose import ConfigError, as_overrides, config_dir
 from psfdae.configuration.compose import compose, load, overrides_for, stage_tree
 from psfdae.configuration.stages import STAGE_KEYS
+from psfdae.files import DIGESTS
 from psfdae.source import source_hash
 
 validate(config, "../schemas/command_line.schema.yaml")

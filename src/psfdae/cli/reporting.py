@@ -165,6 +165,19 @@ def draw_modules(out: Path) -> None:
 
 
 @main.command()
+@click.argument("files", nargs=-1, type=FileArgument, required=True)
+def copy(files: tuple[Path, ...]) -> None:
+    """Copy files as products; FILES are pairs of a file and the name of its copy."""
+    from psfdae.files import atomic_path
+
+    if len(files) % 2:
+        raise click.UsageError(f"{files[-1]}: the name of its copy is missing")
+    for path, out in zip(files[::2], files[1::2], strict=True):
+        with path.open("rb") as source, atomic_path(out) as copied:
+            copied.write_bytes(source.read())
+
+
+@main.command()
 @click.argument("results", type=FolderArgument)
 def verify(results: Path) -> None:
     """Set damaged files of a run aside and list the files that have to be built again."""

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from psfdae.files import atomic_path
+from psfdae.files import atomic_path, write_fits
 from psfdae.observations.cutting import central_pixel
 
 
@@ -80,7 +80,7 @@ def write_field(
     rows = {"id": np.arange(len(x)), "X_IMAGE": x + 1, "Y_IMAGE": y + 1, "ra": ra, "dec": dec}
     with atomic_path(catalogue) as temporary:
         formats = {"X_IMAGE": "%.4f", "Y_IMAGE": "%.4f", "ra": "%.8f", "dec": "%.8f"}
-        Table(rows).write(temporary, format="ascii.csv", formats=formats)
+        Table(rows).write(temporary, format="ascii.csv", formats=formats, overwrite=True)
 
 
 def _add_stamps(image: np.ndarray, stamps: np.ndarray, x: np.ndarray, y: np.ndarray) -> None:
@@ -120,5 +120,4 @@ def _write_image(
         hdus = fits.HDUList([fits.PrimaryHDU(), image])
     else:
         hdus = fits.HDUList([fits.PrimaryHDU(pixels, header)])
-    with atomic_path(path) as temporary:
-        hdus.writeto(temporary, overwrite=True, output_verify="exception")
+    write_fits(path, hdus)

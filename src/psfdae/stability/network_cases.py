@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from psfdae.models.checkpoint import save_checkpoint
 from psfdae.models.dae import Dae, image_scale, predict
 from psfdae.models.training import (
     DeadNetworkError,
@@ -74,7 +75,7 @@ def dead_networks(bench: Bench) -> Iterator[Entry]:
     fresh = Training(data, config, settings, bench.seed, 0)
     _kill(fresh.model)
     checkpoint = bench.folder / "dead.pt"
-    torch.save({"fingerprint": FINGERPRINT, **fresh.state()}, checkpoint)
+    save_checkpoint(checkpoint, FINGERPRINT, fresh.state())
     outcome = attempt(lambda: _train(bench, data, settings, checkpoint=checkpoint))
     restarted = outcome.attempt if isinstance(outcome, TrainingResult) else repr(outcome)
     yield equal("dead at the first step", "attempt that came through", restarted, 1)

@@ -46,9 +46,24 @@ def _costs(results: Path):  # type: ignore[no-untyped-def]
     rows = []
     for path in sorted(folder.rglob("*.tsv")):
         rule, *wildcards = path.relative_to(folder).with_suffix("").parts
-        job = pd.read_csv(path, sep="\t", na_values="-").iloc[-1]
-        rows.append((rule, "/".join(wildcards), job["s"], job["cpu_time"], job["max_rss"]))
+        rows.append((rule, "/".join(wildcards), *_cost(path, "s", "cpu_time", "max_rss")))
     return pd.DataFrame(rows, columns=["rule", "wildcards", "wall_s", "cpu_s", "peak_mb"])
+
+
+def _cost(path: Path, *names: str) -> list[float]:
+    """Columns of a job's last run, NaN where Snakemake has no number.
+
+    A benchmark file that was damaged costs its numbers, with a line that says so: no job
+    is to be repeated for them.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+        columns, *_, last = (line.split("\t") for line in lines)
+        job = dict(zip(columns, last, strict=True))
+        return [float("nan" if job[name] in ("-", "NA") else job[name]) for name in names]
+    except (ValueError, KeyError) as error:
+        print(f"{path}: damaged ({error}); its cost is left out", file=sys.stderr, flush=True)
+        return [float("nan")] * len(names)
 
 
 def reference(
@@ -174,9 +189,13 @@ def _test_seconds(report: Path) -> float | None:
     """Wall time of the last `make test`, from its JUnit report."""
     if not report.is_file():
         return None
-    suite = ElementTree.parse(report).getroot().find("testsuite")
+    try:
+        suite = ElementTree.parse(report).getroot().find("testsuite")
+    except ElementTree.ParseError as error:
+        print(f"{report}: damaged ({error}); left out", file=sys.stderr, flush=True)
+        return None
     return None if suite is None else round(float(suite.get("time", "nan")), 1)
 
 
 def _seconds(benchmark: Path) -> float:
-    return float(benchmark.read_text().splitlines()[-1].split("\t")[0])
+    return float(np.nan_to_num(_cost(benchmark, "s")[0]))

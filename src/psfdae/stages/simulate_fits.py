@@ -9,7 +9,7 @@ import numpy as np
 
 import psfdae
 from psfdae.evaluation.telescope_figure import FieldOfPsfs
-from psfdae.files import atomic_path
+from psfdae.files import write_fits
 from psfdae.observations.examples import write_field
 from psfdae.rng import stream
 from psfdae.stars.framing import normalise_flux
@@ -59,8 +59,7 @@ def write_psfs(config: Any, fields: FieldOfPsfs, path: Path) -> None:
     table = fits.BinTableHDU.from_columns(
         [fits.Column(name=n, format=f, unit=u, array=a) for n, f, u, a in columns], name="FIELDS"
     )
-    with atomic_path(path) as temporary:
-        fits.HDUList([cube, table]).writeto(temporary, output_verify="exception")
+    write_fits(path, fits.HDUList([cube, table]))
 
 
 def write_image(

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import psfdae
+from psfdae import mlflow_view
 from psfdae.files import atomic_path, write_text
 from psfdae.runs import Record, Source, flatten
 from psfdae.source import git_commit
@@ -93,6 +94,7 @@ def run(
             )
     done += [("", NOT_SENT)] * (len(records) - len(done))
     write_text(receipt, _as_csv(records, preset, done))
+    mlflow_view.note(receipt, {} if uri else _written(records, tags, done))
     counts = Counter(action for _, action in done)
     print(f"{len(done)} runs:", ", ".join(f"{n} {action}" for action, n in sorted(counts.items())))
 
@@ -141,7 +143,7 @@ def _client(uri: str, database: Path) -> Any:
     if not uri:
         if not database.exists():
             # The migrations take seconds; killed within them, MLflow could not go on.
-            with atomic_path(database) as temporary:
+            with atomic_path(database, digest=False) as temporary:
                 MlflowClient(f"sqlite:///{temporary.resolve()}").search_experiments(max_results=1)
         uri = f"sqlite:///{database.resolve()}"
     return MlflowClient(uri)
@@ -220,6 +222,17 @@ def _create(client: Any, experiment: str, record: Record, tags: dict[str, str]) 
     client.set_terminated(run_id, record.status, record.end_ms)
     client.set_tag(run_id, "content_hash", record.content_hash)
     return run_id
+
+
+def _written(
+    records: Sequence[Record], tags: dict[str, str], done: Sequence[tuple[str, str]]
+) -> dict[str, tuple[list[str], list[str]]]:
+    """Names of the tags and files of each run, by its id."""
+    written = {}
+    for record, (run_id, _) in zip(records, done, strict=True):
+        own = {*tags, *_tags(record), "content_hash", *([PARENT] if record.parent else [])}
+        written[run_id] = (sorted(own), sorted([*record.entry.files(), "config.yaml"]))
+    return written
 
 
 def _tags(record: Record) -> dict[str, str]:

@@ -2,26 +2,33 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from psfdae.files import ProductError
+from psfdae import mlflow_view
+from psfdae.files import DIGESTS, UNDIGESTED, ProductError, digest_line, digest_path, sweep_stale
 from psfdae.models.weights import load_weights
 
 ASIDE = ".damaged"
 """Suffix that a damaged file gets; it is overwritten by the next one of its name."""
 
-SKIPPED = {"reference", "mlartifacts"}
+SKIPPED = {DIGESTS, *UNDIGESTED, mlflow_view.ARTIFACTS, mlflow_view.ARTIFACTS + ASIDE}
 """Folders that no rule's output lies in."""
 
 
 def run(results: Path) -> list[tuple[Path, str]]:
     """Rename every damaged file, so that the workflow builds it again.
 
-    Looked at are data products (a checksum per chunk of HDF5), weights (SHA-256) and
-    tables per star (a checksum per page of Parquet). Files are written under another
-    name and renamed, hence an interrupted run leaves nothing to find here: damage
-    comes from the disk, or from a program that is not ours.
+    Products are compared with the digest that their writer has left; the data products,
+    weights and tables per star of earlier versions, which have none, with the checksums
+    inside them. A damaged digest looks like a damaged product. The database of MLflow and
+    its files are compared with what was imported, and imported anew as a whole.
+
+    Files are written under another name and renamed, hence an interrupted run leaves
+    nothing to find here: damage comes from the disk, or from a program that is not ours.
+    Temporary files of killed writers are removed.
 
     Parameters
     ----------
@@ -34,27 +41,64 @@ def run(results: Path) -> list[tuple[Path, str]]:
     found = list(damaged(results))
     for path, _ in found:
         path.replace(path.with_name(path.name + ASIDE))
+    if reason := mlflow_view.damage(results):
+        for path in mlflow_view.files(results):
+            _set_aside(path)
+        found.append((results / mlflow_view.DATABASE, reason))
     return found
 
 
+def _set_aside(path: Path) -> None:
+    aside = path.with_name(path.name + ASIDE)
+    if aside.is_dir():
+        shutil.rmtree(aside)
+    path.replace(aside)
+
+
 def missing(results: Path) -> list[Path]:
-    """Files that were set aside, now or earlier, and have not been built again, sorted."""
+    """Files to build that were set aside, now or earlier, and have not been built again, sorted."""
     whole = (path.with_name(path.name.removesuffix(ASIDE)) for path in results.rglob(f"*{ASIDE}"))
-    return sorted(path for path in whole if not path.exists())
+    return sorted({_output(path, results) for path in whole if not path.exists()})
+
+
+def _output(path: Path, results: Path) -> Path:
+    """The file that the workflow knows: some jobs leave more than that."""
+    parts = path.relative_to(results).parts
+    if parts[0] == "sweeps" and parts[2:3] == ("points",):
+        return results.joinpath(*parts[:4], "result.json")
+    if parts[0] == "own_stars" and parts[2:3] == ("model",):
+        return results.joinpath(*parts[:3], "report.csv")
+    return path
 
 
 def damaged(results: Path) -> Iterator[tuple[Path, str]]:
-    """Damaged files below a folder, sorted by path, with the reason."""
-    for path in sorted(results.rglob("*")):
-        check = CHECKS.get("".join(path.suffixes[-2:]), CHECKS.get(path.suffix))
-        inside = path.relative_to(results).parts
-        if check is None or SKIPPED & set(inside) or path.name.startswith(".") or path.is_dir():
-            continue
-        try:
+    """Damaged products below a folder, sorted by path, with the reason."""
+    for folder, folders, names in os.walk(results):
+        here = Path(folder)
+        # Another preset has results of its own.
+        folders[:] = sorted(
+            name for name in folders if name not in SKIPPED and not (here / name / DIGESTS).is_dir()
+        )
+        sweep_stale(here, ".")
+        for path in (here / name for name in sorted(names) if not name.startswith(".")):
+            if reason := _damage(path):
+                yield path, reason
+
+
+def _damage(path: Path) -> str:
+    """What is wrong with a product; empty if nothing is known."""
+    digest = digest_path(path)
+    check = CHECKS.get("".join(path.suffixes[-2:]), CHECKS.get(path.suffix))
+    try:
+        if digest and digest.exists():
+            same = digest.read_bytes() == digest_line(path, path.name).encode()
+            return "" if same else "not what was written (wrong checksum)"
+        if check:
             check(path)
-        except (ProductError, OSError, ValueError, RuntimeError, KeyError) as error:
-            reason = " ".join(str(error).split()).removeprefix(f"{path}: ")
-            yield path, reason.removesuffix("; delete it and run again")
+    except (ProductError, OSError, ValueError, RuntimeError, KeyError) as error:
+        reason = " ".join(str(error).split()).removeprefix(f"{path}: ")
+        return reason.removesuffix("; delete it and run again")
+    return ""
 
 
 def _check_product(path: Path) -> None:

@@ -1,0 +1,115 @@
+"""One flipped bit in each kind of file below the results: noticed and rebuilt, or harmless."""
+
+from __future__ import annotations
+
+import os
+import random
+import shutil
+import subprocess
+
+import pytest
+
+from workflow_runs import locked
+
+pytestmark = [pytest.mark.workflow, pytest.mark.slow]
+
+HARMLESS = {
+    "logs": "for people; nothing reads them",
+    "benchmarks": "costs of jobs, which differ from run to run; runtime.csv alone is made of them, "
+    "and leaves out what is no number",
+}
+"""Folders whose files may change unnoticed, and why."""
+
+VARYING = ("history.csv", "_times.csv", "alignment_time.csv", "runtime.csv", "mlflow.db")
+"""Ends of the names of files with run times, which no two runs share."""
+
+
+def kind_of(path, results):
+    """Folder and suffix: files of a kind have one writer and one reader."""
+    inside = path.relative_to(results).parts
+    depth = 2 if inside[0] in (".digests", "alignment", "data") else 1
+    return (*inside[: min(depth, len(inside) - 1)], path.suffix)
+
+
+def one_of_each(results):
+    """A file of every kind that has a bit to flip, drawn by a seed."""
+    draw = random.Random(4)
+    kinds = {}
+    for path in sorted(results.rglob("*")):
+        if path.is_file() and path.stat().st_size:
+            kinds.setdefault(kind_of(path, results), []).append(path)
+    return {kind: draw.choice(paths) for kind, paths in sorted(kinds.items())}
+
+
+def flip(path, rng):
+    content = bytearray(path.read_bytes())
+    place = rng.randrange(8 * len(content))
+    if path.name == "mlflow.db":
+        # Elsewhere it may hit free space, or what people write.
+        place = 8 * content.index(b"content_hash") + 8 * 20
+    content[place // 8] ^= 1 << place % 8
+    times = path.stat()
+    path.write_bytes(content)
+    # As a failing disk does it: nothing tells by its date.
+    os.utime(path, ns=(times.st_atime_ns, times.st_mtime_ns))
+
+
+@pytest.fixture(scope="module")
+def flipped(smoke, tmp_path_factory):
+    """The folder of a run that was damaged and repeated, what was flipped, and what was said."""
+    folder = tmp_path_factory.mktemp("flipped")
+    shutil.copytree(smoke[0], folder, dirs_exist_ok=True, symlinks=True)
+    chosen = one_of_each(folder / "results")
+    rng = random.Random(4)
+    for path in chosen.values():
+        flip(path, rng)
+    run = subprocess.run(**locked(folder), capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stdout + run.stderr
+    return folder, chosen, run.stderr
+
+
+def guarded(path, results):
+    """What is set aside where a file has changed: itself, but for digests and views."""
+    inside = path.relative_to(results).parts
+    if inside[0] == "mlartifacts" or inside[:2] == (".digests", "mlflow.db"):
+        return results / "mlflow.db"
+    if inside[0] == ".digests":
+        return results.joinpath(*inside[1:]).with_suffix("")
+    return path
+
+
+def test_every_kind_is_noticed_or_harmless(flipped):
+    folder, chosen, said = flipped
+    assert len(chosen) > 30
+    for kind, path in chosen.items():
+        if kind[0] not in HARMLESS:
+            product = guarded(path, folder / "results").relative_to(folder)
+            assert f"{product}: " in said, (kind, path)
+
+
+def test_everything_is_what_it_was(smoke, flipped):
+    folder, *_ = flipped
+    whole = [path for path in (smoke[0] / "results").rglob("*") if path.is_file()]
+    compared = 0
+    for path in whole:
+        name = path.relative_to(smoke[0])
+        if name.parts[1] in (*HARMLESS, "mlartifacts", "mlflow", ".digests"):
+            continue
+        assert (folder / name).is_file(), name
+        if not name.name.endswith(VARYING):
+            assert (folder / name).read_bytes() == path.read_bytes(), name
+            compared += 1
+    assert compared > 150
+
+
+def test_nothing_is_left_to_find(flipped):
+    folder, *_ = flipped
+    done = subprocess.run(
+        ["psfdae", "verify", "results"],
+        cwd=folder,
+        env=locked(folder)["env"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert (done.stdout, done.stderr) == ("", "")
