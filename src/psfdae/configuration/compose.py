@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from psfdae.configuration.alignment import ALIGNMENT_STAGE_KEYS, AlignmentConfig
+from psfdae.configuration.consistency import Consistent, with_derived
 from psfdae.configuration.schema import Config, Group
 from psfdae.configuration.stages import STAGE_KEYS, stage_model
 
@@ -130,8 +131,22 @@ def root_of(stage: str) -> Root:
 
 
 def stage_tree(stage: str, tree: Mapping[str, Any]) -> dict[str, Any]:
-    """The part of a configuration tree that a stage reads."""
-    return {key: tree[key] for key in ROOTS[root_of(stage)][1][stage]}
+    """The part of a configuration tree that a stage reads.
+
+    What follows from groups that it does not read is filled in.
+
+    Raises
+    ------
+    ConfigError
+        If nothing can follow from them.
+    """
+    model, keys = ROOTS[root_of(stage)]
+    if issubclass(model, Consistent):
+        try:
+            tree = with_derived(tree)
+        except ValueError as error:
+            raise ConfigError(str(error)) from None
+    return {key: tree[key] for key in keys[stage]}
 
 
 def overrides_for(root: Root, overrides: Sequence[str]) -> tuple[str, ...]:
