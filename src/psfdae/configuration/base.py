@@ -25,6 +25,12 @@ SearchDistance = Annotated[float, Field(gt=0, allow_inf_nan=False, exclude=True)
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_]+$")]
 
 
+NEUTRAL = "cannot change a result"
+"""Marks a setting of which no byte of a result depends: another value repeats no job."""
+
+CheckpointSeconds = Annotated[float, Field(ge=0), NEUTRAL]
+
+
 class Group(BaseModel):
     """A config group: immutable, and no key beyond those declared."""
 

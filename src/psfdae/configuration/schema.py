@@ -10,7 +10,15 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from psfdae.configuration.base import SEARCH, Count, Group, Name, Positive, SearchDistance
+from psfdae.configuration.base import (
+    SEARCH,
+    CheckpointSeconds,
+    Count,
+    Group,
+    Name,
+    Positive,
+    SearchDistance,
+)
 from psfdae.configuration.consistency import Consistent
 from psfdae.configuration.telescope import AnyTelescope, Telescope  # noqa: F401
 from psfdae.configuration.wavefront import OfTelescope, Seidel, VonKarman
@@ -184,8 +192,8 @@ class Train(Group):
     restarts: Annotated[int, Field(ge=0)] = Field(
         description="New starts from another seed if the network dies"
     )
-    checkpoint_seconds: Annotated[float, Field(ge=0)] = Field(
-        description="Least time between checkpoints"
+    checkpoint_seconds: CheckpointSeconds = Field(
+        description="Least time between checkpoints; repeats nothing"
     )
     noise: Literal["fresh", "fixed"] = Field(
         description="Noise drawn anew every epoch, or once for all epochs"

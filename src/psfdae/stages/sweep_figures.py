@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from psfdae.files import atomic_path
-from psfdae.runs import read_yaml
+from psfdae.reading import read_yaml
 
 
 def run(kind: str, definition: Path, table: Path, out: Path) -> None:
