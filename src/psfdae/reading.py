@@ -66,7 +66,7 @@ def parse_yaml(path: Path | None) -> Any:
     except yaml.reader.ReaderError as error:
         where = _place(text, error.position)
         found = f"character #x{ord(text[error.position]):04x} is not allowed"
-        raise ProductError(f"{path}, {where}: {found}") from None
+        raise ProductError(f"{path}: {where}: {found}") from None
     except RecursionError:
         raise ProductError(f"{path}: nested too deeply") from None
     except ProductError as error:
@@ -90,19 +90,19 @@ def _check(node: Any, sizes: dict[int, int]) -> int:
             if isinstance(key, yaml.ScalarNode) and key.tag != "tag:yaml.org,2002:merge":
                 if (key.tag, key.value) in seen:
                     where = _mark(key.start_mark)
-                    raise ProductError(f", {where}: key {key.value!r} is there twice")
+                    raise ProductError(f": {where}: key {key.value!r} is there twice")
                 seen.add((key.tag, key.value))
     elif isinstance(node, yaml.SequenceNode):
         parts = node.value
     sizes[id(node)] = 1 + sum(_check(part, sizes) for part in parts)
     if sizes[id(node)] > MOST_NODES:
-        raise ProductError(f", {_mark(node.start_mark)}: more than {MOST_NODES} values")
+        raise ProductError(f": {_mark(node.start_mark)}: more than {MOST_NODES} values")
     return sizes[id(node)]
 
 
 def _complaint(path: Path, error: Any) -> str:
     mark = error.problem_mark or error.context_mark
-    where = f", {_mark(mark)}" if mark is not None else ""
+    where = f": {_mark(mark)}" if mark is not None else ""
     what = " ".join(part for part in (error.context, error.problem) if part)
     return f"{path}{where}: {' '.join(what.split()) or 'no YAML'}"
 
@@ -126,9 +126,10 @@ def _text(path: Path) -> str:
     try:
         return data.decode("utf-8")
     except UnicodeDecodeError as error:
-        where = _place(data[: error.start].decode("utf-8"), error.start)
+        before = data[: error.start].decode("utf-8")
+        where = _place(before, len(before))
         found = f"byte {data[error.start]:#04x} is not UTF-8"
-        raise ProductError(f"{path}, {where}: {found}") from None
+        raise ProductError(f"{path}: {where}: {found}") from None
 
 
 def from_tree(path: Path, tree: Any, *keys: str, make: Callable[[Any], Any] | None = None) -> Any:
@@ -159,7 +160,7 @@ def read_json(path: Path) -> dict[str, Any]:
         tree = json.loads(_text(path))
     except json.JSONDecodeError as error:
         where = f"line {error.lineno}, column {error.colno}"
-        raise ProductError(f"{path}, {where}: {error.msg}") from None
+        raise ProductError(f"{path}: {where}: {error.msg}") from None
     except RecursionError:
         raise ProductError(f"{path}: nested too deeply") from None
     except ValueError as error:
@@ -179,6 +180,19 @@ def read_csv(path: Path, *columns: str) -> list[dict[str, str]]:
         return list(reader)
     except csv.Error as error:
         raise ProductError(f"{path}: damaged ({error}); delete it and run again") from error
+
+
+def read_table(path: Path, **options: Any) -> Any:
+    """A CSV as a pandas DataFrame, read with its options; raises ProductError."""
+    import pandas as pd
+
+    try:
+        return pd.read_csv(path, **options)
+    except FileNotFoundError:
+        raise ProductError(f"{path}: no such file") from None
+    except (ValueError, pd.errors.ParserError, RecursionError) as error:
+        line = " ".join(str(error).split())
+        raise ProductError(f"{path}: damaged ({line}); delete it and run again") from error
 
 
 def number(path: Path, text: Any) -> float:

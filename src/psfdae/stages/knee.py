@@ -12,7 +12,7 @@ from psfdae.benchmark.training import knee, pareto, stopping_point
 from psfdae.configuration.compose import decisive
 from psfdae.evaluation.metrics import mse
 from psfdae.files import atomic_path, write_text
-from psfdae.reading import read_yaml
+from psfdae.reading import read_table, read_yaml
 from psfdae.stages.common import limit_threads, noisy_test_images, read_stars, split_stars
 from psfdae.stages.evaluate import dae_predictor
 from psfdae.stages.trained import CONFIG, HISTORY
@@ -71,11 +71,10 @@ def run(config: Any, stars: Path, points: Mapping[str, Path], out: Path, stoppin
 
 def figure(table: Path, out: Path) -> None:
     """Draw the table of `run`."""
-    import pandas as pd
 
     from psfdae.evaluation.knee_figure import training_knee
 
-    drawn = training_knee(pd.read_csv(table))
+    drawn = training_knee(read_table(table))
     with atomic_path(out) as temporary:
         drawn.savefig(temporary, format="png")
 
@@ -93,9 +92,8 @@ def _settings(folder: Path, configured: dict[str, Any]) -> dict[str, Any]:
 
 
 def _history(folder: Path):  # type: ignore[no-untyped-def]
-    import pandas as pd
 
-    return pd.read_csv(folder / HISTORY)
+    return read_table(folder / HISTORY)
 
 
 def _cost(folder: Path) -> dict[str, float]:

@@ -19,6 +19,7 @@ import numpy as np
 
 from psfdae.benchmark.timing import cpu_model
 from psfdae.files import ProductError, write_text
+from psfdae.reading import read_table
 from psfdae.source import git_commit
 
 VERSIONED = ("psfdae", "numpy", "scipy", "torch", "scikit-image", "scikit-learn", "minisom")
@@ -46,7 +47,7 @@ def _costs(results: Path):  # type: ignore[no-untyped-def]
     rows = []
     for path in sorted(folder.rglob("*.tsv")):
         rule, *wildcards = path.relative_to(folder).with_suffix("").parts
-        job = pd.read_csv(path, sep="\t", na_values="-").iloc[-1]
+        job = read_table(path, sep="\t", na_values="-").iloc[-1]
         rows.append((rule, "/".join(wildcards), job["s"], job["cpu_time"], job["max_rss"]))
     return pd.DataFrame(rows, columns=["rule", "wildcards", "wall_s", "cpu_s", "peak_mb"])
 

@@ -9,7 +9,7 @@ import numpy as np
 from psfdae.evaluation.alignment_tables import error_rows
 from psfdae.files import read_product, write_text
 from psfdae.models.cnn import CnnTrainingError
-from psfdae.reading import read_yaml
+from psfdae.reading import read_table, read_yaml
 from psfdae.stages import alignment_train as stage
 from psfdae.stages.alignment_evaluate import cnn_predictor, noisy_test_states
 from psfdae.stages.common import limit_threads
@@ -53,7 +53,7 @@ def run(config: Any, task: Task) -> Measured:
         write_text(task.folder / name, pd.DataFrame(rows).to_csv(index=False, float_format="%.8g"))
     described = read_yaml(task.folder / CONFIG)
     states = read_product(task.data["states"], "alignment_states", ()).config
-    history = pd.read_csv(task.folder / HISTORY)
+    history = read_table(task.folder / HISTORY)
     return Measured(
         metrics=metrics,
         described={**states, **described},

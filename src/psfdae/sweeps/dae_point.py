@@ -6,7 +6,7 @@ from typing import Any
 
 from psfdae.files import read_product
 from psfdae.models.training import TrainingError
-from psfdae.reading import read_yaml
+from psfdae.reading import read_table, read_yaml
 from psfdae.stages import train as stage
 from psfdae.stages.common import limit_threads
 from psfdae.stages.evaluate import dae_predictor
@@ -27,7 +27,6 @@ def run(config: Any, task: Task) -> Measured:
 
     Raises TrainingError if the training cannot go on.
     """
-    import pandas as pd
 
     part = stage_part("train", config)
     stars = task.data["stars"]
@@ -37,7 +36,7 @@ def run(config: Any, task: Task) -> Measured:
     metrics = measure_images(config, task, "dae", predict, predict)
     described = read_yaml(task.folder / CONFIG)
     attempt = described.pop("attempt")
-    last = pd.read_csv(task.folder / HISTORY).iloc[-1]
+    last = read_table(task.folder / HISTORY).iloc[-1]
     return Measured(
         metrics=metrics,
         described={**read_product(stars, "stars", ()).config, **described},
