@@ -73,6 +73,60 @@ def test_every_mistake_is_named(override, message):
         load([override])
 
 
+def test_search_distances_follow_from_the_telescope():
+    """21, 38, 42 and 56 λ/D are what the stars need; whole pixels of the default telescopes."""
+    asked = {f"dataset{n}": 24 for n in (1, 2, 3, 7, 8)}
+    asked |= {"dataset4": 64, "dataset5": 64, "dataset6": 64, "field": 48}
+    for dataset, px in asked.items():
+        config = load([f"dataset={dataset}"])
+        assert (config.framing.search_px, config.stars.search_px) == (24, px)
+        assert "search_lambda_d" not in config.model_dump()["stars"]
+    literal = load(["telescope=wfsat_literal"])
+    assert literal.framing.search_px == literal.stars.search_px == 239
+    given = load(["telescope=wfsat_literal", "framing.search_px=100", "stars.search_lambda_d=5"])
+    assert (given.framing.search_px, given.stars.search_px) == (100, 57)
+    with pytest.raises(ConfigError, match=r"stars\.search_lambda_d = -1: .*greater than 0"):
+        load(["stars.search_lambda_d=-1"])
+
+
+@pytest.mark.parametrize("stage", ["train", "alignment_dae", "alignment_original"])
+def test_settings_that_cannot_change_a_result_are_set_apart(stage):
+    tree = compose.stage_tree(stage, compose.compose((), compose.root_of(stage)))
+    free = as_overrides(compose.neutral(tree))
+    assert [text.split(".", 1)[1] for text in free] == ["checkpoint_seconds=20.0"]
+    assert sorted([*free, *as_overrides(compose.decisive(tree))]) == as_overrides(tree)
+
+
+def test_a_checkpoint_does_not_depend_on_how_often_it_is_written():
+    import numpy as np
+
+    from psfdae.stages.alignment_train import _fingerprint as of_stamps
+    from psfdae.stages.train import _fingerprint as of_stars
+
+    class Images:
+        images = references = fit = np.zeros(3)
+
+    def both(*overrides):
+        tree = load(overrides).model_dump()
+        return of_stars(tree, Images), of_stamps(tree, Images.images)
+
+    assert both("train.checkpoint_seconds=3") == both()
+    assert not set(both("train.lr=0.003")) & set(both())
+
+
+def test_overrides_reach_the_datasets_that_know_them():
+    given = ["preset=smoke", "wavefront.coma=3", "++wavefront.r0_m=0.1", "stars.count=9000"]
+    given += ["wavefront.colour=1", "+train.momentum=1", "telescope=wfsat_literal"]
+    both = ["stars.count=9000", "wavefront.colour=1", "+train.momentum=1"]
+    both += ["telescope=wfsat_literal"]
+    for dataset, own in (("dataset3", "wavefront.coma=3"), ("dataset8", "++wavefront.r0_m=0.1")):
+        kept = compose.overrides_for("config", given, [f"dataset={dataset}"])
+        assert kept == ("preset=smoke", own, *both)
+    # What chooses another wavefront decides which keys there are.
+    given = ["wavefront=seidel", "wavefront.coma=3"]
+    assert compose.overrides_for("config", given, ["dataset=dataset8"]) == tuple(given)
+
+
 @pytest.mark.parametrize("stage", sorted(STAGE_KEYS))
 def test_stage_overrides_reproduce_the_stage_s_configuration(stage):
     """What the workflow puts on a command line means what the dataset meant."""
@@ -115,3 +169,47 @@ def test_ninth_dataset_is_one_small_file(tmp_path, monkeypatch):
         )
     finally:
         compose.forget()
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory):
+    """A folder into which the wheel of this source tree has been installed."""
+    import subprocess
+    import sys
+
+    folder = tmp_path_factory.mktemp("wheel")
+    python, root = [sys.executable, "-m"], config_dir().parent
+    pip = ["pip", "--quiet", "--disable-pip-version-check", "--no-input"]
+    build = [*python, "hatchling", "build", "-t", "wheel", "-d", str(folder)]
+    subprocess.run(build, cwd=root, check=True, capture_output=True)
+    (wheel,) = folder.glob("*.whl")
+    target = folder / "site"
+    install = [*python, *pip, "install", "--no-deps", "--no-index", "--target", str(target)]
+    subprocess.run([*install, str(wheel)], check=True, capture_output=True)
+    return target
+
+
+@pytest.mark.parametrize("arguments", [["config", "--stage", "train"], ["alignment", "config"]])
+def test_an_installed_wheel_finds_its_configuration(installed, tmp_path, arguments):
+    import os
+    import subprocess
+    import sys
+
+    kept = {key: value for key, value in os.environ.items() if key != "PSFDAE_CONFIG"}
+    # Somebody else's Hydra project is not ours.
+    (installed / "config").mkdir(exist_ok=True)
+    (installed / "config/config.yaml").write_text("colour: blue\n")
+    shown = [
+        subprocess.run(
+            [sys.executable, "-m", "psfdae", *arguments],
+            cwd=tmp_path,
+            env={**kept, "PYTHONPATH": str(path)},
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
+        for path in (installed, config_dir().parent / "src")
+    ]
+    assert shown[0] == shown[1]
+    assert "checkpoint_seconds: 20.0" in shown[0]
+    assert (installed / "psfdae/config/config.yaml").is_file()

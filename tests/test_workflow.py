@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import subprocess
 
 import pandas as pd
 import pytest
 
-from workflow_runs import PATH, command, planned, snakemake
+from psfdae.files import read_product
+from workflow_runs import PATH, ROOT, command, planned, snakemake
 
 pytestmark = pytest.mark.workflow
 
@@ -91,17 +93,80 @@ def test_same_value_in_another_format_reruns_nothing(smoke):
     assert planned(folder, overrides="train.lr=0.0040 noise.kappa=4.980") == {}
 
 
+def test_interval_of_checkpoints_reruns_nothing_but_reaches_the_trainings(smoke, tmp_path):
+    folder, _ = smoke
+    groups = ("train", "dae_train", "train_original", "train_dae_retrained")
+    given = [f"{group}.checkpoint_seconds=1.5" for group in groups]
+    assert planned(folder, overrides=" ".join(given)) == {}
+    out = snakemake(tmp_path, "--dry-run", "--printshellcmds", "all", overrides=" ".join(given))
+    for group in groups:
+        assert f"++{group}.checkpoint_seconds=1.5" in out
+    assert "++train_noise_trained.checkpoint_seconds=20.0" in out
+
+
+def test_command_of_the_readme_with_another_telescope(tmp_path):
+    """Templates and stars are made; all that follows is planned."""
+    (given,) = re.findall(r'SET="(.*wfsat_literal)"', (ROOT / "README.md").read_text())
+    # A field in the centre and those on the edge, where peaks lie farthest out.
+    few = (
+        "grid.points=3 grid.spacing_deg=5.5 stars.count=27 parts.train_stars=18 parts.test_stars=9"
+    )
+    stars = "results/data/seidel/seidel_10pct.h5"
+    snakemake(tmp_path, stars, overrides=f"{given} {few} baseline.components=8", preset="fast")
+    config = read_product(tmp_path / stars, "stars", ()).config
+    assert config["telescope"]["name"] == "wfsat_literal"
+    assert config["framing"]["search_px"] == config["stars"]["search_px"] == 239
+    jobs = planned(tmp_path / "whole", "dataset3", overrides=given, preset="fast")
+    assert {"templates", "stars", "train", "evaluate", "paper_tables", "track"} <= set(jobs)
+
+
+def test_keys_of_one_scene_leave_the_others_alone(smoke):
+    """The README's SET with a key of scene 1 alone, and one that is too small for scene 2."""
+    folder, _ = smoke
+    jobs = planned(folder, "scene1", "scene2", overrides="wavefront.coma=3.5")
+    assert jobs["templates"] == jobs["stars"] - 1 == 1
+    for scene, r0 in (("scene1", {}), ("scene2", {"templates": 1, "stars": 1})):
+        found = planned(folder, scene, overrides="wavefront.r0_m=0.15")
+        assert {rule: n for rule, n in found.items() if rule in ("templates", "stars")} == r0
+
+
+def test_sizes_have_to_fit_together_where_a_dataset_is_built(tmp_path):
+    options = {"overrides": "stars.count=9000", "preset": "fast"}
+    assert planned(tmp_path, "dataset3", **options)["stars"] == 1
+    out = snakemake(tmp_path, "--dry-run", "dataset7", check=False, **options)
+    refusal = (
+        "psfdae: dataset=dataset7: parts.train_stars + parts.test_stars = 10000: "
+        "must be at most stars.count = 9000"
+    )
+    assert refusal in out.splitlines()
+    assert "Traceback" not in out
+
+
+def test_damaged_yaml_is_one_line(tmp_path, monkeypatch):
+    shutil.copytree(ROOT / "config", tmp_path / "config")
+    path = tmp_path / "config/train/onecycle.yaml"
+    path.write_text("epochs: 12\n\tbatch: 32\n")
+    monkeypatch.setenv("PSFDAE_CONFIG", str(tmp_path / "config"))
+    out = snakemake(tmp_path, check=False)
+    assert out.startswith(f"psfdae: {path}: line 2, column 1: ")
+    assert len(out.splitlines()) == 1
+
+
 @pytest.mark.parametrize(
     ("option", "message"),
     [
         ({"overrides": "framing.stamp_px=6"}, "framing.stamp_px = 6"),
         ({"overrides": "trian.lr=1"}, "trian.lr"),
+        ({"overrides": "wavefront.colour=1"}, "wavefront.colour"),
+        ({"overrides": "stars.count=0"}, "stars.count = 0: input should be greater"),
         ({"preset": "none"}, "preset/none"),
     ],
 )
 def test_wrong_config_stops_before_any_job(tmp_path, option, message):
     out = snakemake(tmp_path, check=False, **option)
-    assert message in out
+    (line,) = [line for line in out.splitlines() if message in line]
+    assert line.startswith("psfdae: ")
+    assert "Traceback" not in out
     assert not (tmp_path / "results").exists()
 
 

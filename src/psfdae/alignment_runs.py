@@ -7,15 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from psfdae.files import ProductError
+from psfdae.reading import number, read_csv, read_yaml
 from psfdae.runs import (
     CONTENT,
     Point,
     Record,
     epoch_points,
     hash_of,
-    number,
-    read_csv,
-    read_yaml,
     sha256,
     span_ms,
 )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import hashlib
 import json
 import math
@@ -12,6 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 from psfdae.files import ProductError, read_product
+from psfdae.reading import number, read_csv, read_yaml
 
 METHODS = {"dae": "dae", "baseline": "pca_som"}
 """Kind of a run, and its name in the column `method` of an evaluation."""
@@ -248,45 +248,6 @@ def _experiment(path: Path, stars: Mapping[str, Any]) -> str:
         return str(stars["scene"]["experiment"])
     except (KeyError, TypeError):
         raise ProductError(f"{path}: its config has no scene.experiment") from None
-
-
-def read_csv(path: Path, *columns: str) -> list[dict[str, str]]:
-    """Rows of a CSV with the columns named; raises ProductError."""
-    try:
-        with path.open(newline="", encoding="utf-8") as file:
-            reader = csv.DictReader(file)
-            missing = [name for name in columns if name not in (reader.fieldnames or ())]
-            if missing:
-                raise ProductError(f"{path}: column {missing[0]!r} is missing")
-            return list(reader)
-    except FileNotFoundError:
-        raise ProductError(f"{path}: no such file") from None
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise ProductError(f"{path}: damaged ({error}); delete it and run again") from error
-
-
-def number(path: Path, text: Any) -> float:
-    """A number of a table; raises ProductError that names the file."""
-    try:
-        return float(text)
-    except (TypeError, ValueError):
-        raise ProductError(f"{path}: damaged ({text!r} is no number)") from None
-
-
-def read_yaml(path: Path | None) -> dict[str, Any]:
-    """A YAML file with a mapping; raises ProductError."""
-    import yaml
-
-    assert path is not None
-    try:
-        tree = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise ProductError(f"{path}: no such file") from None
-    except (UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ProductError(f"{path}: damaged ({error}); delete it and run again") from error
-    if not isinstance(tree, dict):
-        raise ProductError(f"{path}: damaged (no config in it); delete it and run again")
-    return tree
 
 
 def hash_of(tree: Any) -> str:

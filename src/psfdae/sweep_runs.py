@@ -8,15 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from psfdae.files import ProductError
+from psfdae.reading import number, read_csv, read_yaml
 from psfdae.runs import (
     CONTENT,
     Point,
     Record,
     epoch_points,
     hash_of,
-    number,
-    read_csv,
-    read_yaml,
     sha256,
 )
 from psfdae.stages.sweep import COST, RESULT, read_cost, read_result

@@ -28,6 +28,7 @@ rule alignment_dae:
         runtime=60,
     params:
         config=lambda w: alignment_stage("alignment_dae"),
+        free=lambda w, threads: alignment_stage("alignment_dae", neutral),
         source=source_hash("psfdae.stages.alignment_train"),
         folder=subpath(output.weights, parent=True),
         # Not an output: Snakemake would delete it with a failed job's outputs.
@@ -37,7 +38,7 @@ rule alignment_dae:
     shell:
         "psfdae alignment train-dae --grid {input.grid} --train {input.train}"
         " --checkpoint {params.checkpoint} --out {params.folder} {params.config:q}"
-        " > {log} 2>&1"
+        " {params.free:q} > {log} 2>&1"
 
 
 rule alignment_cnn:
@@ -60,6 +61,7 @@ rule alignment_cnn:
         runtime=60,
     params:
         config=lambda w: alignment_stage(f"alignment_{w.cnn}"),
+        free=lambda w, threads: alignment_stage(f"alignment_{w.cnn}", neutral),
         source=source_hash("psfdae.stages.alignment_train"),
         folder=subpath(output.weights, parent=True),
         dae=lambda w, input: (
@@ -71,7 +73,7 @@ rule alignment_cnn:
     shell:
         "psfdae alignment train-cnn --kind {wildcards.cnn} --states {input.states}"
         " {params.dae:q} --checkpoint {params.checkpoint} --out {params.folder}"
-        " {params.config:q} > {log} 2>&1"
+        " {params.config:q} {params.free:q} > {log} 2>&1"
 
 
 rule alignment_estimate:

@@ -9,7 +9,7 @@ rule bank:
         f"{RESULTS}/logs/bounds/bank_{{stars}}.log",
     benchmark:
         f"{RESULTS}/benchmarks_on_request/bounds/bank-{{stars}}.tsv"
-    threads: lambda w: compose((f"stars={w.stars}", *OVERRIDES))["bounds"]["threads"]
+    threads: lambda w: composed(f"stars={w.stars}")["bounds"]["threads"]
     resources:
         mem_mb=1500,
         runtime=30,

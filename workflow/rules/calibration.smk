@@ -25,7 +25,7 @@ rule scan:
 rule calibrate:
     input:
         scans=expand(rules.scan.output, dataset=TABULATED),
-        stars=[stars_of(dataset) for dataset in TABULATED],
+        stars=lambda w: [stars_of(dataset) for dataset in TABULATED],
     output:
         multiext(
             f"{RESULTS}/calibration/",

@@ -1,20 +1,38 @@
 import shlex
+import sys
+from contextlib import contextmanager
 from functools import cache
 
 from snakemake.utils import validate
 
 from psfdae.configuration.compose import ConfigError, as_overrides, config_dir
-from psfdae.configuration.compose import compose, load, overrides_for, stage_tree
+from psfdae.configuration.compose import compose, dataset_names, decisive, load
+from psfdae.configuration.compose import load_groups, neutral, overrides_for, stage_tree
 from psfdae.configuration.stages import STAGE_KEYS
-from psfdae.files import DIGESTS
+from psfdae.files import DIGESTS, ProductError
 from psfdae.source import source_hash
+from psfdae.sweeps.space import SweepError
 
 validate(config, "../schemas/command_line.schema.yaml")
 
 PRESET = config["preset"]
 GIVEN = (f"preset={PRESET}", *shlex.split(config["set"] or ""))
-OVERRIDES = overrides_for("config", GIVEN)
 RESULTS = config["results"] or ("results" if PRESET == "fast" else f"results/{PRESET}")
+
+
+@contextmanager
+def one_line():
+    """A mistake in the configuration ends in its message; Snakemake adds a traceback."""
+    try:
+        yield
+    except (ConfigError, ProductError, SweepError) as error:
+        sys.exit(f"psfdae: {error}")
+
+
+@one_line()
+def composed(*choice, more=()):
+    """Configuration of a choice, with those of the given overrides that concern it."""
+    return compose((*choice, *overrides_for("config", GIVEN, choice), *more))
 
 
 def options(group):
@@ -24,7 +42,7 @@ def options(group):
 
 # Stars of an image are not simulated: own_stars.smk.
 OWN_STARS = "from_stars"
-ALL_DATASETS = [name for name in options("dataset") if name != OWN_STARS]
+ALL_DATASETS = [name for name in dataset_names() if name != OWN_STARS]
 # Data of telescopes that bring their own aberrations; they bear the dataset's name.
 OWN_TELESCOPES = f"{RESULTS}/data/telescope"
 SCENE_HEADINGS = {
@@ -47,19 +65,35 @@ wildcard_constraints:
 
 @cache
 def dataset_config(dataset):
-    """Checked configuration of a dataset; a wrong key stops before any job."""
-    return load((f"dataset={dataset}", *OVERRIDES))
+    """Checked configuration of a dataset that is built; a wrong key stops before any job."""
+    choice = f"dataset={dataset}"
+    try:
+        return load((choice, *overrides_for("config", GIVEN, (choice,))))
+    except ConfigError as error:
+        sys.exit(f"psfdae: {choice}: {error}")
 
 
-def stage_overrides(stage, choice):
+@one_line()
+def stage_overrides(stage, choice, more=()):
     """The groups that a stage reads, as overrides: command line and rerun trigger in one.
 
     A stage that reads the scene starts from the option that chose it, because scenes
-    differ in their keys; for the others every key is pinned.
+    differ in their keys; for the others every key is pinned but those that cannot
+    change a result (free_overrides).
     """
-    tree = compose((choice, *OVERRIDES))
     base = [choice] if "wavefront" in STAGE_KEYS[stage] else []
-    return base + as_overrides(stage_tree(stage, tree))
+    tree = stage_tree(stage, composed(choice, more=more))
+    return base + as_overrides(decisive(tree))
+
+
+@one_line()
+def free_overrides(stage, choice, more=()):
+    """The settings of a stage that cannot change a result, as overrides.
+
+    A param of its own that asks for `threads`: Snakemake takes it for derived, which
+    is not a reason to repeat a job.
+    """
+    return as_overrides(neutral(stage_tree(stage, composed(choice, more=more))))
 
 
 def telescope_overrides(stage, dataset):
@@ -73,12 +107,18 @@ def telescope_overrides(stage, dataset):
     return [choice, *telescope, *stage_overrides(stage, choice)[1:]]
 
 
+@cache
+@one_line()
 def default_datasets():
-    return load(OVERRIDES).workflow.datasets
+    """What is built if no dataset is asked for.
+
+    Sizes that fit together in one dataset may not in another: that counts where one is built.
+    """
+    return load_groups(overrides_for("config", GIVEN)).workflow.datasets
 
 
 def templates_of(stars):
-    tree = compose((f"stars={stars}", *OVERRIDES))
+    tree = composed(f"stars={stars}")
     return f"{RESULTS}/data/{tree['scene']['name']}/templates.h5"
 
 
@@ -109,7 +149,7 @@ def paper_tables_of(dataset):
 def category_of(w):
     """Heading of a figure in the report: the scene."""
     if "scene" in w.keys():
-        experiment = compose((f"scene={w.scene}", *OVERRIDES))["scene"]["experiment"]
+        experiment = composed(f"scene={w.scene}")["scene"]["experiment"]
     else:
         experiment = dataset_config(w.dataset).scene.experiment
     return SCENE_HEADINGS.get(experiment, experiment)

@@ -19,9 +19,12 @@ SWEEP_TRAINING = {
 
 
 @cache
+@one_line()
 def sweep_plan(name):
     """Points of a sweep; a wrong key stops before any job."""
-    return plan_sweep(name, GIVEN)
+    plan = plan_sweep(name, GIVEN)
+    assert plan.points
+    return plan
 
 
 def sweep_point_of(w):

@@ -1,9 +1,10 @@
-import yaml
+from psfdae.configuration.knee import load_knee
 
-KNEE = yaml.safe_load((config_dir() / "knee/points.yaml").read_text())
+with one_line():
+    KNEE = load_knee()
+    ALIGNMENT_OVERRIDES = overrides_for("alignment", GIVEN)
 FRESH = "fresh_realisations"
 KNEE_DATASET = "dataset3"
-ALIGNMENT_OVERRIDES = overrides_for("alignment", GIVEN)
 ALIGNMENT_DATA = f"{RESULTS}/data/alignment"
 ALIGNMENT = f"{RESULTS}/alignment"
 ALIGNMENT_SETS = ["uniform", "grid"]
@@ -33,14 +34,13 @@ def bound_figures_of(dataset):
     return [f"{RESULTS}/figures/bounds/{dataset}_{kind}.png" for kind in kinds]
 
 
-def knee_choice(point):
-    """Overrides of a point, last so that they win; the fresh stars have no test part."""
-    own = [f"dataset={KNEE_DATASET}", *OVERRIDES, *KNEE["points"][point]]
+def knee_overrides(point, overrides):
+    """Overrides of a point, its own last so that they win; the fresh stars have no test part."""
+    own = list(KNEE.points[point])
     if point == FRESH:
-        fit = KNEE["fresh_stars"] - 1
-        own += [f"parts.train_stars={fit}", "parts.test_stars=1"]
-        own += [f"stars.count={KNEE['fresh_stars']}"]
-    return tuple(own)
+        own += [f"parts.train_stars={KNEE.fresh_stars - 1}", "parts.test_stars=1"]
+        own += [f"stars.count={KNEE.fresh_stars}"]
+    return overrides("train", f"dataset={KNEE_DATASET}", own)
 
 
 @cache
@@ -69,14 +69,17 @@ def timed_threads(w):
 
 
 @cache
+@one_line()
 def alignment_config():
     """Checked configuration of scene 3; a wrong key stops before any job."""
     return load(ALIGNMENT_OVERRIDES, "alignment")
 
 
-def alignment_stage(stage):
-    """The groups that a stage of scene 3 reads, as overrides."""
-    return as_overrides(stage_tree(stage, compose(ALIGNMENT_OVERRIDES, "alignment")))
+@one_line()
+def alignment_stage(stage, part=decisive):
+    """The groups that a stage of scene 3 reads, as overrides; part=neutral: free_overrides."""
+    tree = stage_tree(stage, compose(ALIGNMENT_OVERRIDES, "alignment"))
+    return as_overrides(part(tree))
 
 
 def alignment_levels():

@@ -5,7 +5,7 @@ rule templates:
         f"{RESULTS}/logs/templates/{{scene}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/templates/{{scene}}.tsv"
-    threads: lambda w: compose((f"scene={w.scene}", *OVERRIDES))["optics"]["threads"]
+    threads: lambda w: composed(f"scene={w.scene}")["optics"]["threads"]
     resources:
         mem_mb=500,
         runtime=10,
@@ -29,7 +29,7 @@ rule stars:
         f"{RESULTS}/logs/stars/{{scene}}/{{stars}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/stars/{{scene}}/{{stars}}.tsv"
-    threads: lambda w: compose((f"scene={w.scene}", *OVERRIDES))["optics"]["threads"]
+    threads: lambda w: composed(f"scene={w.scene}")["optics"]["threads"]
     resources:
         mem_mb=1000,
         runtime=30,

@@ -15,23 +15,12 @@ rule fresh_stars:
         mem_mb=3000,
         runtime=20,
     params:
-        config=lambda w: [
+        config=lambda w: stage_overrides(
+            "stars",
             f"dataset={KNEE_DATASET}",
-            *as_overrides(
-                stage_tree(
-                    "stars",
-                    compose(
-                        (
-                            f"dataset={KNEE_DATASET}",
-                            *OVERRIDES,
-                            # Another name is another random stream.
-                            "stars.name=fresh",
-                            f"stars.count={KNEE['fresh_stars']}",
-                        )
-                    ),
-                )
-            ),
-        ],
+            # Another name is another random stream.
+            ["stars.name=fresh", f"stars.count={KNEE.fresh_stars}"],
+        ),
         source=source_hash("psfdae.stages.stars", "psfdae.stars.seidel_scene"),
     message:
         "Simulating other stars for the knee of the training"
@@ -61,9 +50,8 @@ rule knee_train:
         mem_mb=2000,
         runtime=60,
     params:
-        config=lambda w: as_overrides(
-            stage_tree("train", compose(knee_choice(w.point)))
-        ),
+        config=lambda w: knee_overrides(w.point, stage_overrides),
+        free=lambda w, threads: knee_overrides(w.point, free_overrides),
         source=source_hash("psfdae.stages.train"),
         folder=subpath(output.weights, parent=True),
         checkpoint=lambda w: f"{RESULTS}/checkpoints/knee-{w.point}.pt",
@@ -72,15 +60,15 @@ rule knee_train:
     shell:
         "psfdae train --stars {input.stars} --split random --reference realisation"
         " --checkpoint {params.checkpoint} --out {params.folder} {params.config:q}"
-        " > {log} 2>&1"
+        " {params.free:q} > {log} 2>&1"
 
 
 rule knee_table:
     input:
-        stars=stars_of(KNEE_DATASET),
-        networks=expand(rules.knee_train.output.weights, point=KNEE["points"]),
-        histories=expand(rules.knee_train.output.history, point=KNEE["points"]),
-        configs=expand(rules.knee_train.output.config, point=KNEE["points"]),
+        stars=lambda w: stars_of(KNEE_DATASET),
+        networks=expand(rules.knee_train.output.weights, point=KNEE.points),
+        histories=expand(rules.knee_train.output.history, point=KNEE.points),
+        configs=expand(rules.knee_train.output.config, point=KNEE.points),
     output:
         table=f"{RESULTS}/tables/benchmark_training.csv",
         stopping=f"{RESULTS}/tables/benchmark_stopping.csv",
@@ -97,7 +85,7 @@ rule knee_table:
         source=source_hash("psfdae.stages.knee"),
         points=[
             f"--point={point}={KNEE_FOLDER.format(point=point)}"
-            for point in KNEE["points"]
+            for point in KNEE.points
         ],
     message:
         "Testing the trainings of the knee"

@@ -41,6 +41,7 @@ rule train:
         runtime=60,
     params:
         config=lambda w: stage_overrides("train", f"dataset={w.dataset}"),
+        free=lambda w, threads: free_overrides("train", f"dataset={w.dataset}"),
         source=source_hash("psfdae.stages.train"),
         folder=subpath(output.weights, parent=True),
         # Not an output: Snakemake would delete it with a failed job's outputs.
@@ -50,4 +51,4 @@ rule train:
     shell:
         "psfdae train --stars {input.stars} --split {wildcards.split}"
         " --reference {wildcards.reference} --checkpoint {params.checkpoint}"
-        " --out {params.folder} {params.config:q} > {log} 2>&1"
+        " --out {params.folder} {params.config:q} {params.free:q} > {log} 2>&1"

@@ -44,13 +44,15 @@ rule own_stars:
         runtime=30,
     params:
         config=lambda w: stage_overrides("from_stars", f"dataset={OWN_STARS}"),
+        free=lambda w, threads: free_overrides("from_stars", f"dataset={OWN_STARS}"),
         source=source_hash("psfdae.stages.from_stars"),
         folder=subpath(output.bundle, parent=True),
     message:
         "Training on the bright stars of the image"
     shell:
         "psfdae from-stars {input.image} --catalogue {input.catalogue} --name example"
-        " --licence MIT --out {params.folder} {params.config:q} > {log} 2>&1"
+        " --licence MIT --out {params.folder} {params.config:q} {params.free:q}"
+        " > {log} 2>&1"
 
 
 rule from_stars_example:

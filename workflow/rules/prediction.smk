@@ -5,7 +5,7 @@ POPPY_STARS = 500
 # Every core, so that no other job runs beside the measurement.
 rule predict_throughput:
     input:
-        stars=stars_of(PREDICTION_DATASET),
+        stars=lambda w: stars_of(PREDICTION_DATASET),
         bundle=f"{RESULTS}/bundles/{PREDICTION_DATASET}-random-realisation.psf.safetensors",
     output:
         f"{RESULTS}/tables/predict_throughput.csv",
@@ -19,7 +19,7 @@ rule predict_throughput:
         disk_mb=1000,
         runtime=20,
     params:
-        config=stage_overrides("prediction", f"dataset={PREDICTION_DATASET}"),
+        config=lambda w: stage_overrides("prediction", f"dataset={PREDICTION_DATASET}"),
         source=source_hash("psfdae.stages.prediction", "psfdae.benchmark.prediction"),
     message:
         "Timing the prediction from FITS to FITS"
@@ -43,10 +43,12 @@ rule predict_poppy:
         mem_mb=1500,
         runtime=20,
     params:
-        config=stage_overrides("prediction", f"dataset={PREDICTION_DATASET}"),
+        config=lambda w: stage_overrides("prediction", f"dataset={PREDICTION_DATASET}"),
         source=source_hash("psfdae.stages.prediction", "psfdae.benchmark.poppy_stars"),
         # A small preset has small test parts; POPPY takes its time for each star.
-        stars=min(POPPY_STARS, dataset_config(PREDICTION_DATASET).parts.test_stars),
+        stars=lambda w: min(
+            POPPY_STARS, dataset_config(PREDICTION_DATASET).parts.test_stars
+        ),
     message:
         "Predicting stars that POPPY has simulated"
     shell:

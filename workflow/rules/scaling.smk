@@ -15,7 +15,7 @@ rule scaling_stages:
         runtime=60,
         disk_mb=2000,
     params:
-        config=stage_overrides("scaling", f"dataset={SCALED_DATASET}"),
+        config=lambda w: stage_overrides("scaling", f"dataset={SCALED_DATASET}"),
         source=source_hash(
             "psfdae.stages.scaling_jobs",
             "psfdae.stages.scaling",
@@ -67,7 +67,7 @@ rule scaling_plan:
         mem_mb=500,
         runtime=10,
     params:
-        config=stage_overrides("scaling", f"dataset={SCALED_DATASET}"),
+        config=lambda w: stage_overrides("scaling", f"dataset={SCALED_DATASET}"),
         source=source_hash("psfdae.stages.scaling"),
         results=lambda w: RESULTS,
         home=["--home=paper_tables", "--home=track", "--home=track_sweep"],

@@ -4,8 +4,8 @@ STABILITY_DATASET, STABILITY_OTHER = "dataset3", "dataset8"
 # Writes the table whatever it says: a failed job would lose it.
 rule stability_table:
     input:
-        stars=stars_of(STABILITY_DATASET),
-        turbulence=stars_of(STABILITY_OTHER),
+        stars=lambda w: stars_of(STABILITY_DATASET),
+        turbulence=lambda w: stars_of(STABILITY_OTHER),
     output:
         table=f"{RESULTS}/tables/stability.csv",
         graded=f"{RESULTS}/tables/stability_graded.csv",

@@ -44,7 +44,8 @@ rule sweep_point:
     resources:
         mem_mb=2000,
     params:
-        config=lambda w: as_overrides(sweep_point_of(w).config),
+        config=lambda w: as_overrides(decisive(sweep_point_of(w).config)),
+        free=lambda w, threads: as_overrides(neutral(sweep_point_of(w).config)),
         options=sweep_options,
         data=lambda w, input: [
             word for role in sweep_data(w) for word in ("--data", role, input[role])
@@ -58,7 +59,7 @@ rule sweep_point:
     shell:
         "psfdae sweep point {params.options:q} {params.data:q}"
         " --checkpoint {params.checkpoint} --source {params.source} --out {params.folder}"
-        " {params.config:q} > {log} 2>&1"
+        " {params.config:q} {params.free:q} > {log} 2>&1"
 
 
 rule sweep_summary:

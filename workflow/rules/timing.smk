@@ -10,7 +10,7 @@ TIMING_LABELS = {
 # Every core, so that no other job runs beside a measurement.
 rule benchmark_baseline:
     input:
-        stars=stars_of(TIMED_DATASET),
+        stars=lambda w: stars_of(TIMED_DATASET),
     output:
         f"{RESULTS}/tables/benchmark_baseline.csv",
     log:
@@ -22,7 +22,7 @@ rule benchmark_baseline:
         mem_mb=1500,
         runtime=20,
     params:
-        config=stage_overrides("timing", f"dataset={TIMED_DATASET}"),
+        config=lambda w: stage_overrides("timing", f"dataset={TIMED_DATASET}"),
         source=source_hash("psfdae.stages.timing", "psfdae.stages.timing_jobs"),
     message:
         "Timing the baseline over its sizes"
@@ -43,7 +43,7 @@ rule benchmark_inference:
         mem_mb=3000,
         runtime=30,
     params:
-        config=stage_overrides("timing", f"dataset={TIMED_DATASET}"),
+        config=lambda w: stage_overrides("timing", f"dataset={TIMED_DATASET}"),
         source=source_hash("psfdae.stages.timing"),
     message:
         "Timing the network in torch and onnxruntime"
@@ -64,7 +64,7 @@ rule benchmark_scaling:
         runtime=30,
         disk_mb=1000,
     params:
-        config=stage_overrides("timing", f"dataset={TIMED_DATASET}"),
+        config=lambda w: stage_overrides("timing", f"dataset={TIMED_DATASET}"),
         source=source_hash(
             "psfdae.stages.timing",
             "psfdae.stages.timing_jobs",

@@ -11,6 +11,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
+from psfdae.configuration.base import CheckpointSeconds
 from psfdae.configuration.prescription import Prescription
 from psfdae.configuration.schema import (
     Count,
@@ -135,8 +136,8 @@ class CnnTrain(Group):
         description="Train on the telescope's mirror images and average estimates over them"
     )
     threads: Count = Field(description="Threads of the training")
-    checkpoint_seconds: Annotated[float, Field(ge=0)] = Field(
-        description="Least time between checkpoints"
+    checkpoint_seconds: CheckpointSeconds = Field(
+        description="Least time between checkpoints; repeats nothing"
     )
 
 

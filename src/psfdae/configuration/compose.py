@@ -5,14 +5,20 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
+from pydantic import ValidationError, create_model
+
 from psfdae.configuration.alignment import ALIGNMENT_STAGE_KEYS, AlignmentConfig
+from psfdae.configuration.base import NEUTRAL
+from psfdae.configuration.consistency import Consistent, with_derived
 from psfdae.configuration.schema import Config, Group
 from psfdae.configuration.stages import STAGE_KEYS, stage_model
+from psfdae.files import ProductError
+from psfdae.reading import parse_yaml
 
 Root = Literal["config", "alignment"]
 """Root files of the configuration: the datasets', and that of scene 3."""
@@ -24,6 +30,10 @@ ROOTS: dict[Root, tuple[type[Group], dict[str, tuple[str, ...]]]] = {
 """The checked model of every root and the groups that its stages read."""
 
 
+LONGEST = 200
+"""Characters of a wrong value that a message repeats."""
+
+
 class ConfigError(ValueError):
     """The configuration is not usable; every line names a key, its value and the range."""
 
@@ -31,11 +41,13 @@ class ConfigError(ValueError):
 def config_dir() -> Path:
     """Folder of the configuration tree.
 
-    `PSFDAE_CONFIG` names another one; otherwise it is `config/` of the source
-    tree that the package was installed from.
+    `PSFDAE_CONFIG` names another one; otherwise it is the copy that an installed
+    package has, or `config/` of the source tree.
     """
-    chosen = os.environ.get("PSFDAE_CONFIG")
-    folder = Path(chosen) if chosen else Path(__file__).resolve().parents[3] / "config"
+    package = Path(__file__).resolve().parents[1]
+    places = (package / "config", package.parents[1] / "config")
+    folder = next((place for place in places if place.is_dir()), places[-1])
+    folder = Path(os.environ.get("PSFDAE_CONFIG") or folder)
     if not (folder / "config.yaml").is_file():
         raise ConfigError(f"{folder}: no config.yaml (set PSFDAE_CONFIG to the config folder)")
     return folder.resolve()
@@ -61,19 +73,35 @@ def forget() -> None:
 def _composed(overrides: tuple[str, ...], root: Root) -> dict[str, Any]:
     import hydra
     from hydra.core.global_hydra import GlobalHydra
-    from hydra.errors import HydraException
     from omegaconf import OmegaConf
-    from omegaconf.errors import OmegaConfBaseException
 
+    folder = config_dir()
     GlobalHydra.instance().clear()
     try:
-        with hydra.initialize_config_dir(str(config_dir()), version_base="1.3"):
+        with hydra.initialize_config_dir(str(folder), version_base="1.3"):
             tree = hydra.compose(root, overrides=list(overrides))
         resolved = OmegaConf.to_container(tree, resolve=True, throw_on_missing=True)
-    except (HydraException, OmegaConfBaseException) as error:
-        raise ConfigError(f"config: {_first_lines(error)}") from error
-    assert isinstance(resolved, dict)
+    except Exception as error:  # what a broken file leads to inside Hydra is beyond listing
+        raise ConfigError(_reason(error, folder)) from error
+    if not isinstance(resolved, dict):
+        raise ConfigError(f"{folder / root}.yaml: must be a mapping")
     return resolved
+
+
+def _reason(error: Exception, folder: Path) -> str:
+    """One line on why a composition failed: the file that is no YAML, if there is one."""
+    from hydra.errors import HydraException
+    from omegaconf.errors import OmegaConfBaseException
+
+    if not isinstance(error, HydraException | OmegaConfBaseException):
+        for path in sorted(folder.rglob("*.yaml")):
+            try:
+                tree = parse_yaml(path)
+            except ProductError as damage:
+                return str(damage)
+            if not isinstance(tree, dict | None):
+                return f"{path}: must be a mapping, not {type(tree).__name__}"
+    return f"config: {_first_lines(error)}"
 
 
 def load(overrides: Sequence[str] = (), root: Root = "config") -> Any:
@@ -87,6 +115,51 @@ def load(overrides: Sequence[str] = (), root: Root = "config") -> Any:
     return validate(ROOTS[root][0], compose(overrides, root))
 
 
+def load_groups(overrides: Sequence[str] = ()) -> Any:
+    """As `load`, with every group checked by itself, not what groups owe each other.
+
+    Raises
+    ------
+    ConfigError
+        As `load`.
+    """
+    return validate(_groups_model(), _derived(compose(overrides)))
+
+
+@cache
+def _groups_model() -> type[Group]:
+    fields: dict[str, Any] = {
+        key: (field.rebuild_annotation(), ...) for key, field in Config.model_fields.items()
+    }
+    model: type[Group] = create_model("Groups", __base__=Group, **fields)
+    return model
+
+
+def load_file(model: type[Any], path: Path) -> Any:
+    """Read and check a file of the configuration that Hydra does not compose.
+
+    Raises
+    ------
+    ConfigError
+        One line per finding: file, key, what is allowed.
+    """
+    from omegaconf import OmegaConf
+
+    try:
+        parse_yaml(path)
+        # OmegaConf reads 4e-3 as a number; plain YAML takes it for text.
+        tree = OmegaConf.to_container(OmegaConf.load(path), resolve=True)
+    except ProductError as error:
+        raise ConfigError(str(error)) from None
+    except Exception as error:
+        raise ConfigError(f"{path}: {_first_lines(error)}") from None
+    try:
+        return validate(model, tree if isinstance(tree, dict) else {})
+    except ConfigError as error:
+        lines = "\n".join(f"{path}: {line}" for line in str(error).splitlines())
+        raise ConfigError(lines) from None
+
+
 def validate(model: type[Any], tree: Mapping[str, Any]) -> Any:
     """Check a configuration tree against a pydantic model.
 
@@ -95,8 +168,6 @@ def validate(model: type[Any], tree: Mapping[str, Any]) -> Any:
     ConfigError
         One line per finding: key = value: what is allowed.
     """
-    from pydantic import ValidationError
-
     try:
         return model.model_validate(tree)
     except ValidationError as error:
@@ -130,30 +201,113 @@ def root_of(stage: str) -> Root:
 
 
 def stage_tree(stage: str, tree: Mapping[str, Any]) -> dict[str, Any]:
-    """The part of a configuration tree that a stage reads."""
-    return {key: tree[key] for key in ROOTS[root_of(stage)][1][stage]}
+    """The part of a configuration tree that a stage reads.
+
+    What follows from groups that it does not read is filled in.
+
+    Raises
+    ------
+    ConfigError
+        If nothing can follow from them.
+    """
+    model, keys = ROOTS[root_of(stage)]
+    tree = _derived(tree) if issubclass(model, Consistent) else tree
+    missing = [key for key in keys[stage] if key not in tree]
+    if missing:
+        raise ConfigError(f"{missing[0]}: missing")
+    return {key: tree[key] for key in keys[stage]}
 
 
-def overrides_for(root: Root, overrides: Sequence[str]) -> tuple[str, ...]:
-    """Those of the workflow's overrides that concern a root.
+def _derived(tree: Mapping[str, Any]) -> dict[str, Any]:
+    try:
+        return with_derived(tree)
+    except ValueError as error:
+        raise ConfigError(str(error)) from None
 
-    The workflow takes one list for everything. A key that only another root
-    knows is left out; one that none knows stays and is refused by name. A shared
+
+def overrides_for(
+    root: Root, overrides: Sequence[str], choice: Sequence[str] = ()
+) -> tuple[str, ...]:
+    """Those of the workflow's overrides that concern a configuration.
+
+    The workflow takes one list for everything. A key that only other roots or other
+    datasets have is left out; one that none has stays and is refused by name. A shared
     value, such as noise.kappa=5, reaches every root, but the choice of an option
     of a shared group, such as telescope=wfsat_literal, is the datasets'. The
     preset is every root's own option of that name.
+
+    Parameters
+    ----------
+    root : Root
+    overrides : sequence of str
+    choice : sequence of str
+        What chooses the configuration in its root, such as dataset=dataset7.
+
+    Raises
+    ------
+    ConfigError
+        If an option does not exist.
     """
     kept = []
     for override in overrides:
-        key = re.split(r"[=@]", override.lstrip("+~"), maxsplit=1)[0]
-        if key == "preset":
-            kept.append(override if root == "config" else f"{root}_{override}")
-            continue
-        known = {name for name in ROOTS if _knows(compose((), name), key)}
-        chooses = "config" in known and isinstance(compose((), "config").get(key), Mapping)
-        if not known or root in ({"config"} if chooses else known):
+        if _owner(_key(override)):
+            kept += _options(root, [override])
+        elif _concerns(root, override, overrides, choice):
             kept.append(override)
     return tuple(kept)
+
+
+def _owner(key: str) -> str | None:
+    """The root whose groups a key chooses an option of, "every" for the preset."""
+    if key == "preset":
+        return "every"
+    return next((root for root in ROOTS if isinstance(compose((), root).get(key), Mapping)), None)
+
+
+def _options(root: Root, overrides: Sequence[str]) -> tuple[str, ...]:
+    """Overrides that choose an option of a group of a root."""
+    found = []
+    for override in overrides:
+        owner = _owner(_key(override))
+        if owner == "every" and root != "config":
+            found.append(f"{root}_{override}")
+        elif owner in (root, "every"):
+            found.append(override)
+    return tuple(found)
+
+
+def _concerns(root: Root, override: str, overrides: Sequence[str], choice: Sequence[str]) -> bool:
+    """Whether a configuration has the key of an override, or no other one has it, either."""
+
+    def has(key: str, root: Root, choice: Sequence[str] = ()) -> bool:
+        return _knows(compose((*choice, *_options(root, overrides)), root), key)
+
+    for key in _places(override):
+        if has(key, root, choice):
+            return True
+        if any(has(key, other) for other in ROOTS if other != root):
+            return False
+        if any(has(key, "config", [f"dataset={name}"]) for name in dataset_names()):
+            return False
+    return True
+
+
+def dataset_names() -> list[str]:
+    """Options of the group dataset, those for other files to start from left out."""
+    return sorted(path.stem for path in config_dir().glob("dataset/[!_]*.yaml"))
+
+
+def _key(override: str) -> str:
+    return re.split(r"[=@]", override.lstrip("+~"), maxsplit=1)[0]
+
+
+def _places(override: str) -> list[str]:
+    """Keys that tell where an override belongs: its own, or the group to which it adds one."""
+    key = _key(override)
+    group = key.rpartition(".")[0]
+    if not override.startswith("+"):
+        return [key]
+    return ([key] if override.startswith("++") else []) + ([group] if group else [])
 
 
 def _knows(tree: Mapping[str, Any], key: str) -> bool:
@@ -164,6 +318,39 @@ def _knows(tree: Mapping[str, Any], key: str) -> bool:
             return False
         node = node[part]
     return True
+
+
+@cache
+def _neutral_keys() -> frozenset[tuple[str, str]]:
+    """Group and name of the settings that cannot change a result, over all roots."""
+    return frozenset(
+        (group, name)
+        for model, _ in ROOTS.values()
+        for group, field in model.model_fields.items()
+        if isinstance(field.annotation, type) and issubclass(field.annotation, Group)
+        for name, inner in field.annotation.model_fields.items()
+        if NEUTRAL in inner.metadata
+    )
+
+
+def decisive(tree: Mapping[str, Any]) -> dict[str, Any]:
+    """A configuration tree without the settings that cannot change a result."""
+    return _part(tree, lambda place: place not in _neutral_keys())
+
+
+def neutral(tree: Mapping[str, Any]) -> dict[str, Any]:
+    """Those settings of a configuration tree that cannot change a result."""
+    return _part(tree, lambda place: place in _neutral_keys())
+
+
+def _part(tree: Mapping[str, Any], wanted: Callable[[tuple[str, str]], bool]) -> dict[str, Any]:
+    part: dict[str, Any] = {}
+    for group, value in tree.items():
+        if isinstance(value, Mapping):
+            part[group] = {key: inner for key, inner in value.items() if wanted((group, key))}
+        elif wanted((group, "")):
+            part[group] = value
+    return part
 
 
 def as_overrides(tree: Mapping[str, Any]) -> list[str]:
@@ -201,7 +388,9 @@ def _finding(error: Mapping[str, Any]) -> str:
         return f"{key}: missing"
     if error["type"] == "value_error":
         return f"{key}: {message}" if key else message
-    return f"{key} = {error['input']!r}: {message[0].lower()}{message[1:]}"
+    given = repr(error["input"])
+    given = given if len(given) <= LONGEST else f"{given[:LONGEST]}…"
+    return f"{key} = {given}: {message[0].lower()}{message[1:]}"
 
 
 def _first_lines(error: Exception) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError, model_validator
 
-from psfdae.configuration.base import Group
+from psfdae.configuration.base import SEARCH, Group
 from psfdae.configuration.telescope import Telescope, has_own_aberrations
 from psfdae.optics.sampling import required_nodes
 
@@ -18,15 +18,8 @@ OWN_SCENE = "telescope"
 MOST_NODES = 32
 """Quadrature nodes per pixel that `optics.nodes` allows."""
 
-SEARCH = 48.0
-"""λ/D around the chief ray within which brightest pixels are searched by default.
-
-Four times the distance of the farthest template of scene 1; a peak that lies
-farther out is searched at twice the distance, then refused.
-"""
-
 SEARCH_PX = (4, 256)
-"""Least and largest such distance in pixels."""
+"""Least and largest distance in pixels that follows from one in λ/D."""
 
 
 class Consistent(Group):
@@ -34,7 +27,7 @@ class Consistent(Group):
 
     Some values may be null in the files, because they follow from other groups:
     edge and spacing of the field points, quadrature nodes per pixel, and the search
-    distances of brightest pixels.
+    distances of brightest pixels, which have the telescope's pixels.
     """
 
     @model_validator(mode="before")
@@ -43,10 +36,7 @@ class Consistent(Group):
         if not isinstance(tree, Mapping):
             return tree
         _check_scene(tree)
-        filled = {name: _filled(group, _derived_values(name, tree)) for name, group in tree.items()}
-        if isinstance(filled.get("grid"), dict):
-            _space(filled["grid"])
-        return filled
+        return with_derived(tree)
 
     @model_validator(mode="after")
     def _jitter_is_drawn(self) -> Consistent:
@@ -61,6 +51,20 @@ class Consistent(Group):
                 "are their templates"
             )
         return self
+
+
+def with_derived(tree: Mapping[str, Any]) -> dict[str, Any]:
+    """A whole configuration with values in place of those nulls that follow from other groups.
+
+    Raises
+    ------
+    ValueError
+        If the pixels are too wide for any number of nodes.
+    """
+    filled = {name: _filled(group, _derived_values(name, tree)) for name, group in tree.items()}
+    if isinstance(filled.get("grid"), dict):
+        _space(filled["grid"])
+    return filled
 
 
 def _check_scene(tree: Mapping[str, Any]) -> None:
@@ -98,11 +102,18 @@ def _derived_values(name: str, tree: Mapping[str, Any]) -> dict[str, Any]:
     if name == "grid":
         return {"edge_deg": telescope.get("field_edge_deg")}
     if name in ("framing", "stars"):
-        pixel = _pixel(telescope)
-        return {"search_px": int(np.clip(np.ceil(SEARCH / (pixel or 1.0)), *SEARCH_PX))}
+        return {"search_px": _search(tree[name], _pixel(telescope))}
     if name == "optics" and "nodes" in tree["optics"] and tree["optics"]["nodes"] is None:
         return {"nodes": _nodes(telescope)}
     return {}
+
+
+def _search(group: Any, pixel: float | None) -> int:
+    """Search distance in pixels; any number for a group that will be refused in a moment."""
+    reach = group.get("search_lambda_d", SEARCH) if isinstance(group, Mapping) else SEARCH
+    if isinstance(reach, bool) or not isinstance(reach, int | float) or not reach > 0:
+        reach = SEARCH
+    return int(np.clip(np.ceil(reach / (pixel or 1.0)), *SEARCH_PX))
 
 
 def _pixel(telescope: Mapping[str, Any]) -> float | None:

@@ -10,7 +10,15 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from psfdae.configuration.base import Count, Group, Name, Positive
+from psfdae.configuration.base import (
+    SEARCH,
+    CheckpointSeconds,
+    Count,
+    Group,
+    Name,
+    Positive,
+    SearchDistance,
+)
 from psfdae.configuration.consistency import Consistent
 from psfdae.configuration.telescope import AnyTelescope, Telescope  # noqa: F401
 from psfdae.configuration.wavefront import OfTelescope, Seidel, VonKarman
@@ -49,7 +57,10 @@ class Stars(Group):
         description="Relative standard deviation of every aberration term"
     )
     search_px: Annotated[int, Field(ge=4, le=512)] = Field(
-        description="Search distance for the brightest pixel of a star; null: 48 λ/D"
+        description="Search distance for the brightest pixel of a star; null: search_lambda_d"
+    )
+    search_lambda_d: SearchDistance = Field(
+        default=SEARCH, description="The same in λ/D of whatever telescope, if search_px is null"
     )
 
 
@@ -61,7 +72,10 @@ class Framing(Group):
     )
     search_px: Annotated[int, Field(ge=4, le=512)] = Field(
         description="A template's brightest pixel is searched within ± this of the chief ray; "
-        "null: 48 λ/D"
+        "null: search_lambda_d"
+    )
+    search_lambda_d: SearchDistance = Field(
+        default=SEARCH, description="The same in λ/D of whatever telescope, if search_px is null"
     )
     jitter_px: Annotated[int, Field(ge=0, le=8)] = Field(
         description="Centring error, uniform in ± this many whole pixels per axis"
@@ -178,8 +192,8 @@ class Train(Group):
     restarts: Annotated[int, Field(ge=0)] = Field(
         description="New starts from another seed if the network dies"
     )
-    checkpoint_seconds: Annotated[float, Field(ge=0)] = Field(
-        description="Least time between checkpoints"
+    checkpoint_seconds: CheckpointSeconds = Field(
+        description="Least time between checkpoints; repeats nothing"
     )
     noise: Literal["fresh", "fixed"] = Field(
         description="Noise drawn anew every epoch, or once for all epochs"

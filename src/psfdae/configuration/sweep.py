@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from psfdae.configuration.base import Count, Finite, Group, Name
-from psfdae.configuration.compose import ConfigError, Root, config_dir, validate
+from psfdae.configuration.compose import ConfigError, Root, config_dir, load_file
 from psfdae.configuration.schema import Reference, SplitKind
 
 Scalar = bool | int | float | str
@@ -184,19 +184,7 @@ def load_sweep(name: str) -> Sweep:
     ConfigError
         If there is no such sweep, or with one line per wrong key: file, key, what is allowed.
     """
-    from omegaconf import OmegaConf
-    from yaml import YAMLError
-
     if name not in sweep_names():
         raise ConfigError(f"sweep = {name!r}: must be one of {', '.join(sweep_names())}")
-    path = config_dir() / "sweep" / f"{name}.yaml"
-    try:
-        # OmegaConf reads 4e-3 as a number; plain YAML takes it for text.
-        tree = OmegaConf.to_container(OmegaConf.load(path))
-        checked: Sweep = validate(Sweep, tree if isinstance(tree, dict) else {})
-    except YAMLError as error:
-        raise ConfigError(f"{path}: {' '.join(str(error).split())}") from None
-    except ConfigError as error:
-        lines = "\n".join(f"{path}: {line}" for line in str(error).splitlines())
-        raise ConfigError(lines) from None
+    checked: Sweep = load_file(Sweep, config_dir() / "sweep" / f"{name}.yaml")
     return checked

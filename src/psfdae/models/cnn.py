@@ -19,7 +19,7 @@ from torch import nn
 from psfdae.configuration.alignment import Cnn as CnnConfig
 from psfdae.configuration.alignment import CnnTrain
 from psfdae.models.checkpoint import load_checkpoint, save_checkpoint
-from psfdae.models.weights import load_weights
+from psfdae.models.weights import with_weights
 from psfdae.rng import stream
 
 PARAMETERS = 4
@@ -252,8 +252,5 @@ def predict_states(model: AlignmentCnn, stamps: np.ndarray, batch: int = 256) ->
 
 
 def load_cnn(config: CnnConfig, fields: int, stamp_px: int, weights: Path) -> AlignmentCnn:
-    """Network of a configuration with weights from a file; ProductError if that is damaged."""
-    model = AlignmentCnn(config, fields, stamp_px).to(memory_format=torch.channels_last)
-    state = {name: torch.from_numpy(array) for name, array in load_weights(weights).items()}
-    model.load_state_dict(state)
-    return model.eval()
+    """Network of a configuration with weights from a file; ProductError as `load_dae`."""
+    return with_weights(lambda: AlignmentCnn(config, fields, stamp_px), weights)

@@ -20,7 +20,7 @@ from psfdae.configuration.schema import Dae as DaeConfig
 from psfdae.configuration.schema import Train
 from psfdae.models.checkpoint import load_checkpoint, save_checkpoint
 from psfdae.models.dae import Dae, build_dae, image_scale, predict
-from psfdae.models.weights import load_weights
+from psfdae.models.weights import with_weights
 from psfdae.rng import stream
 from psfdae.stars.noise import NoiseModel, mixed_levels
 
@@ -309,8 +309,11 @@ def _run(
 
 
 def load_dae(config: DaeConfig, weights: Path) -> Dae:
-    """Network of a configuration with weights from a file; ProductError if that is damaged."""
-    model = Dae(config.kernels, config.widths).to(memory_format=torch.channels_last)
-    state = {name: torch.from_numpy(array) for name, array in load_weights(weights).items()}
-    model.load_state_dict(state)
-    return model.eval()
+    """Network of a configuration with weights from a file.
+
+    Raises
+    ------
+    ProductError
+        If the file is damaged, or holds another network's weights.
+    """
+    return with_weights(lambda: Dae(config.kernels, config.widths), weights)

@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from psfdae.files import ProductError, atomic_path
+
+if TYPE_CHECKING:
+    from torch.nn import Module
+
+Network = TypeVar("Network", bound="Module")
 
 ABOUT = "psfdae"
 """The one key of the metadata: safetensors would write several in random order."""
@@ -42,6 +47,44 @@ def save_weights(path: Path, state: Mapping[str, Any], config: Mapping[str, Any]
     with atomic_path(path) as temporary:
         # Written by us, so that the file gets the usual permissions.
         temporary.write_bytes(save(arrays, {ABOUT: about}))
+
+
+def with_weights(build: Callable[[], Network], path: Path) -> Network:
+    """A network with weights from a file, ready to predict.
+
+    Parameters
+    ----------
+    build : callable
+        Makes the network that the file's configuration describes.
+    path : Path
+
+    Raises
+    ------
+    ProductError
+        As `load_weights`, and if the tensors are not those of the network. That is
+        found before the network is made, so that a wrong size does not fill the memory.
+    """
+    import torch
+
+    state = {name: torch.from_numpy(array) for name, array in load_weights(path).items()}
+    try:
+        with torch.device("meta"):
+            wanted = {name: value.shape for name, value in build().state_dict().items()}
+    except (RuntimeError, ValueError, TypeError, OverflowError) as error:
+        line = " ".join(str(error).split())
+        raise ProductError(f"{path}: its config.yaml describes no network ({line})") from None
+    found = {name: value.shape for name, value in state.items()}
+    for name in sorted(wanted.keys() | found.keys()):
+        if wanted.get(name) != found.get(name):
+            has, needs = (
+                f"{tuple(each[name])}" if name in each else "none" for each in (found, wanted)
+            )
+            raise ProductError(
+                f"{path}: shape of {name} is {has}, but {needs} in the network of its config.yaml"
+            )
+    model = build().to(memory_format=torch.channels_last)
+    model.load_state_dict(state)
+    return model.eval()
 
 
 def load_weights(path: Path) -> dict[str, np.ndarray]:

@@ -14,11 +14,12 @@ from typing import Any
 import numpy as np
 
 from psfdae.files import Column, read_product, write_product, write_text
+from psfdae.reading import from_tree, read_yaml
 from psfdae.rng import stream
 from psfdae.stages.alignment import read_model
 from psfdae.stages.alignment_train import CNN_WEIGHTS, denoise
 from psfdae.stages.common import limit_threads, noise_model
-from psfdae.stages.train import CONFIG
+from psfdae.stages.trained import CONFIG
 from psfdae.stars.alignment_stamps import AlignmentStamps
 
 LEARNED = ("original", "dae", "noise_trained", "dae_retrained")
@@ -45,17 +46,19 @@ def cnn_predictor(folder: Path, config: Any) -> Callable[[np.ndarray], np.ndarra
     its estimates are averaged.
     """
     import torch
-    import yaml
 
     from psfdae.alignment.symmetry import mirror_symmetries
     from psfdae.configuration.alignment import Cnn
+    from psfdae.configuration.compose import validate
     from psfdae.models.cnn import load_cnn, predict_states
 
     torch.set_num_threads(config.evaluation.threads)
-    described = yaml.safe_load((folder / CONFIG).read_text())
-    fields, side = described["fields"], described["stamp_px"]
-    model = load_cnn(Cnn.model_validate(described["cnn"]), fields, side, folder / CNN_WEIGHTS)
-    mirrors = mirror_symmetries(fields - 1) if described["mirrors"] else []
+    path = folder / CONFIG
+    described = read_yaml(path)
+    fields, side = (from_tree(path, described, key, make=_size) for key in ("fields", "stamp_px"))
+    settings = from_tree(path, described, "cnn", make=lambda tree: validate(Cnn, tree))
+    model = load_cnn(settings, fields, side, folder / CNN_WEIGHTS)
+    mirrors = mirror_symmetries(fields - 1) if from_tree(path, described, "mirrors") else []
     batch = config.evaluation.batch
 
     def predict(stamps: np.ndarray) -> np.ndarray:
@@ -67,6 +70,12 @@ def cnn_predictor(folder: Path, config: Any) -> Callable[[np.ndarray], np.ndarra
         )
 
     return predict
+
+
+def _size(value: Any) -> int:
+    if not isinstance(value, int) or not 1 <= value <= 4096:
+        raise ValueError(f"{value!r} must be a whole number from 1 to 4096")
+    return value
 
 
 def learned_methods(

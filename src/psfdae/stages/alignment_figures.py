@@ -10,6 +10,7 @@ import numpy as np
 
 from psfdae.alignment.fisher import coma_free_decentre, expected_abs_error
 from psfdae.files import atomic_path, read_product, write_text
+from psfdae.reading import read_table
 from psfdae.stages.alignment_tables import read_errors
 from psfdae.stages.common import limit_threads, noise_model
 from psfdae.stars.alignment_model import design_states, fit_quadratic
@@ -157,12 +158,11 @@ def correlation(table: Path, out: Path) -> None:
     table : CSV `alignment_correlation.csv`
     out : PNG
     """
-    import pandas as pd
 
     from psfdae.evaluation.alignment_figures import correlation_matrices
     from psfdae.evaluation.paper import published
 
-    ours, paper = pd.read_csv(table), published("correlation")
+    ours, paper = read_table(table), published("correlation")
     ours = ours[(ours.test_set == "uniform") & (ours.noise_level > 0)]
     panels = []
     for level, rows in ours.groupby("noise_level"):

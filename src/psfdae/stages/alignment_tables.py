@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from psfdae.files import ProductError, read_product, write_text
+from psfdae.reading import read_table
 
 LEARNED = ("original", "dae", "noise_trained", "dae_retrained")
 """Order of the methods in the product "alignment_estimates"."""
@@ -99,12 +100,11 @@ def paper_tables(errors: Path, correlation: Path, out: Path) -> None:
     ProductError
         If the noise levels have no rows.
     """
-    import pandas as pd
 
     from psfdae.evaluation import alignment_tables as rows
     from psfdae.evaluation.paper import published
 
-    ours = pd.read_csv(errors)
+    ours = read_table(errors)
     for level in sorted(published("alignment").noise_level.unique()):
         if not np.isclose(ours.noise_level, level).any():
             raise ProductError(f"{errors}: no rows of noise level {level:g}")
@@ -112,7 +112,7 @@ def paper_tables(errors: Path, correlation: Path, out: Path) -> None:
         title = f"Absolute errors in units of the range, λ = {level:g}"
         digits = {"mean": ".4f", "variance": ".2e"}
         _write(out / f"alignment_paper_{level:g}.csv", table, title, digits)
-    table = rows.paper_correlations(pd.read_csv(correlation))
+    table = rows.paper_correlations(read_table(correlation))
     title = "Correlations of signed errors"
     _write(out / "alignment_paper_correlation.csv", table, title, {"": ".3f"})
 
@@ -138,7 +138,7 @@ def time_table(times: Sequence[Path], histories: dict[str, Path], out: Path) -> 
     import pandas as pd
 
     training = {
-        name: float(pd.read_csv(path)["seconds"].iloc[-1]) for name, path in histories.items()
+        name: float(read_table(path)["seconds"].iloc[-1]) for name, path in histories.items()
     }
     needs = {
         "original": ("original",),
@@ -147,7 +147,7 @@ def time_table(times: Sequence[Path], histories: dict[str, Path], out: Path) -> 
         "dae_retrained": ("dae", "dae_retrained"),
         "max_likelihood": ("noise_trained",),
     }
-    table = pd.concat([pd.read_csv(path) for path in times], ignore_index=True)
+    table = pd.concat([read_table(path) for path in times], ignore_index=True)
     total = table.groupby("method")[["seconds", "states"]].sum()
     rows = [
         (

@@ -23,10 +23,12 @@ from psfdae.alignment.batches import (
     noisy_states,
     steps_per_epoch,
 )
+from psfdae.configuration.compose import decisive
 from psfdae.files import read_product, write_text
 from psfdae.rng import stream
 from psfdae.stages.common import limit_threads, noise_model
-from psfdae.stages.train import CONFIG, HISTORY, WEIGHTS, as_csv, as_yaml
+from psfdae.stages.train import as_csv, as_yaml
+from psfdae.stages.trained import CONFIG, HISTORY, WEIGHTS, trained_dae
 
 CNN_WEIGHTS = "cnn.safetensors"
 
@@ -148,16 +150,12 @@ def _weights(config: Any, settings: Any, level: np.ndarray) -> np.ndarray:
 def denoise(dae: Path, config: Any, stamps: np.ndarray) -> np.ndarray:
     """Output of a trained DAE for stamps (n, F, d, d), neither clipped nor renormalised."""
     import torch
-    import yaml
 
-    from psfdae.configuration.schema import Dae
     from psfdae.models.dae import image_scale, predict
-    from psfdae.models.training import load_dae
 
     torch.set_num_threads(config.evaluation.threads)
-    settings = Dae.model_validate(yaml.safe_load((dae / CONFIG).read_text())["dae"])
+    settings, model = trained_dae(dae)
     factor = image_scale(settings.scale, stamps.shape[-1])
-    model = load_dae(settings, dae / WEIGHTS)
     return predict(model, _flat(stamps), factor, config.evaluation.batch).reshape(stamps.shape)
 
 
@@ -215,7 +213,7 @@ def _flat(stamps: np.ndarray) -> np.ndarray:
 
 
 def _fingerprint(described: dict[str, Any], stamps: np.ndarray) -> str:
-    """Hash of the configuration and the images that a training sees."""
-    digest = hashlib.sha256(json.dumps(described, sort_keys=True).encode())
+    """Hash of the images that a training sees, and of what of its configuration counts."""
+    digest = hashlib.sha256(json.dumps(decisive(described), sort_keys=True).encode())
     digest.update(np.ascontiguousarray(stamps).tobytes())
     return digest.hexdigest()

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from psfdae.files import ProductError
+from psfdae.reading import read_table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -50,9 +51,8 @@ def growth(growth_csv: Path, dataset: str, out: Path) -> None:
 
 
 def _rows_of(path: Path, dataset: str) -> pd.DataFrame:
-    import pandas as pd
 
-    table = pd.read_csv(path)
+    table = read_table(path)
     rows = table[table.dataset == dataset]
     if rows.empty:
         raise ProductError(f"{path}: no rows of {dataset}")

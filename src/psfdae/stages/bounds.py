@@ -16,6 +16,7 @@ from psfdae.bounds.likelihood import Likelihood
 from psfdae.bounds.posterior import PosteriorSums, posterior_sums
 from psfdae.evaluation.metrics import clustered_mean, mse
 from psfdae.files import Product, ProductError, atomic_path, read_product, write_text
+from psfdae.reading import read_table
 from psfdae.stages.common import (
     limit_threads,
     noise_model,
@@ -163,7 +164,7 @@ def collect(parts: Sequence[Path], out: Path) -> None:
     """
     import pandas as pd
 
-    frames = [pd.read_csv(path) for path in parts]
+    frames = [read_table(path) for path in parts]
     for path, frame in zip(parts, frames, strict=True):
         if list(frame.columns) != list(frames[0].columns):
             raise ProductError(f"{path}: columns {list(frame.columns)}, unlike {parts[0]}")

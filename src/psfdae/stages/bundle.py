@@ -21,6 +21,7 @@ from psfdae.bundle.format import (
 from psfdae.configuration.compose import as_overrides
 from psfdae.evaluation.metrics import all_metrics
 from psfdae.files import Product, ProductError
+from psfdae.reading import read_yaml
 from psfdae.rng import stream
 from psfdae.stages.common import (
     limit_threads,
@@ -29,7 +30,7 @@ from psfdae.stages.common import (
     read_stars,
     split_stars,
 )
-from psfdae.stages.train import CONFIG, WEIGHTS
+from psfdae.stages.trained import CONFIG, WEIGHTS, dae_settings
 from psfdae.stars.flux import FluxModel
 
 SEEN_BY_TRAINING = ("seed", "noise", "parts")
@@ -107,13 +108,11 @@ class _Network:
 
 def _trained(folder: Path, config: Any, split: str | None) -> dict[str, Any]:
     """Configuration of a training, if it is that of the stage."""
-    import yaml
-
     for path in (folder / CONFIG, folder / WEIGHTS):
         if not path.is_file():
             raise BundleError(f"{path}: no such file; psfdae train writes it")
-    trained: dict[str, Any] = yaml.safe_load((folder / CONFIG).read_text(encoding="utf-8"))
-    lacking = {*SEEN_BY_TRAINING, "dae", "split", "reference"} - set(trained or ())
+    trained = read_yaml(folder / CONFIG)
+    lacking = {*SEEN_BY_TRAINING, "dae", "split", "reference"} - set(trained)
     if lacking:
         raise BundleError(f"{folder / CONFIG}: key {min(lacking)!r} is missing")
     asked = config.model_dump(include={*SEEN_BY_TRAINING}) | {"split": split or trained["split"]}
@@ -134,11 +133,10 @@ def _refuse_mismatch(trained: dict[str, Any], asked: dict[str, Any], path: Path)
 
 
 def _load(folder: Path, trained: dict[str, Any], stamp_px: int, batch: int) -> _Network:
-    from psfdae.configuration.schema import Dae
     from psfdae.models.dae import image_scale, predict
     from psfdae.models.training import load_dae
 
-    settings = Dae.model_validate(trained["dae"])
+    settings = dae_settings(folder, trained)
     model = load_dae(settings, folder / WEIGHTS)
     factor = image_scale(settings.scale, stamp_px)
     weights = {name: value.contiguous().numpy() for name, value in model.state_dict().items()}

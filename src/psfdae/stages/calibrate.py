@@ -18,6 +18,7 @@ from psfdae.evaluation.calibration import (
 from psfdae.evaluation.metrics import mse, ssim
 from psfdae.files import read_product, write_text
 from psfdae.optics.sampling import required_nodes
+from psfdae.reading import read_table
 from psfdae.rng import stream
 from psfdae.stages.common import limit_threads, scene_module
 from psfdae.stars.fields import assign_fields
@@ -112,7 +113,7 @@ def calibrate(config: Any, scans: Sequence[Path], stars: dict[str, Path], out: P
     import pandas as pd
 
     limit_threads(config.evaluation.threads)
-    scan_table = pd.concat([pd.read_csv(path) for path in scans], ignore_index=True)
+    scan_table = pd.concat([read_table(path) for path in scans], ignore_index=True)
     columns = pd.DataFrame(
         [_column(row, stars[row.dataset], config) for row in original_noise_rows().itertuples()]
     )

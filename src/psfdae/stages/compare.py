@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from psfdae.files import ProductError
-from psfdae.runs import flatten, read_csv, read_yaml
+from psfdae.reading import read_csv, read_yaml
+from psfdae.runs import flatten
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from psfdae.files import atomic_path, write_text
+from psfdae.reading import read_table
 
 if TYPE_CHECKING:
     from click import Group
@@ -97,9 +98,8 @@ def _from_the_code(commands: Group) -> dict[str, Callable[..., Any]]:
 
 
 def _rows(path: Path) -> list[dict[str, Any]]:
-    import pandas as pd
 
-    return pd.read_csv(path).to_dict("records")
+    return read_table(path).to_dict("records")
 
 
 def draw_rules(rulegraph: str, rules: Path, out: Path) -> None:

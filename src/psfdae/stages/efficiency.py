@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from psfdae.bounds.efficiency import compare
 from psfdae.files import ProductError, write_text
+from psfdae.reading import read_table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -43,7 +44,7 @@ def run(
     """
     import pandas as pd
 
-    tight = _tight(pd.concat([pd.read_csv(path) for path in bounds], ignore_index=True))
+    tight = _tight(pd.concat([read_table(path) for path in bounds], ignore_index=True))
     best = pd.concat([pd.read_parquet(path) for path in bounds_per_star], ignore_index=True)
     wanted = [*COLUMN_OF_TABLE, "method", "star", "field", "mse"]
     methods = pd.concat([pd.read_parquet(path, columns=wanted) for path in per_star])

@@ -19,7 +19,7 @@ from psfdae.stages.common import (
     read_stars,
     split_stars,
 )
-from psfdae.stages.train import CONFIG, WEIGHTS
+from psfdae.stages.trained import trained_dae
 
 Predictor = Callable[[np.ndarray, float], np.ndarray]
 
@@ -100,15 +100,11 @@ def _ignoring_level(predict: Callable[[np.ndarray], np.ndarray]) -> Predictor:
 def dae_predictor(folder: Path, config: Any) -> Predictor:
     """The trained network of a folder as a function of noisy images and λ, which it ignores."""
     import torch
-    import yaml
 
-    from psfdae.configuration.schema import Dae
     from psfdae.models.dae import image_scale, predict
-    from psfdae.models.training import load_dae
 
     torch.set_num_threads(config.evaluation.threads)
-    settings = Dae.model_validate(yaml.safe_load((folder / CONFIG).read_text())["dae"])
-    model = load_dae(settings, folder / WEIGHTS)
+    settings, model = trained_dae(folder)
     batch = config.evaluation.batch
 
     def apply(noisy: np.ndarray, level: float) -> np.ndarray:

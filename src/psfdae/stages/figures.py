@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from psfdae.files import Product, ProductError, atomic_path, read_product
+from psfdae.reading import read_table
 from psfdae.stages import baseline
 from psfdae.stages.common import limit_threads, noisy_test_images, read_stars, split_stars
 from psfdae.stages.evaluate import dae_predictor
@@ -116,7 +117,6 @@ def curves(history_csvs: Sequence[Path], labels: Sequence[str], out: Path) -> No
     ProductError
         If the numbers of files and labels differ, or a file lacks a column.
     """
-    import pandas as pd
 
     from psfdae.evaluation.curves import training_curves
 
@@ -124,7 +124,7 @@ def curves(history_csvs: Sequence[Path], labels: Sequence[str], out: Path) -> No
         raise ProductError(f"{len(history_csvs)} histories, but {len(labels)} labels")
     histories = {}
     for path, label in zip(history_csvs, labels, strict=True):
-        histories[label] = pd.read_csv(path)
+        histories[label] = read_table(path)
         missing = {"step", "train_mse", "validation_mse"} - set(histories[label].columns)
         if missing:
             raise ProductError(f"{path}: no column {min(missing)!r}")

@@ -16,6 +16,7 @@ from psfdae.configuration.schema import Noise
 from psfdae.configuration.stages import STAGE_KEYS, stage_model
 from psfdae.files import atomic_path, write_text
 from psfdae.observations import Observation, ObservationError, open_observation
+from psfdae.reading import read_table
 from psfdae.stages import baseline, bundle, evaluate, train
 from psfdae.stages.calibration_stars import (
     Candidates,
@@ -238,7 +239,7 @@ def report(settings: dict[str, Any], files: Folder) -> None:
     parts = split_stars(product, SPLIT, config)
     images = product["realisation"]
     area = noise_equivalent_px(images[parts.train].mean(axis=0, dtype=np.float64))
-    rows = pd.read_csv(files.path / "evaluation.csv")
+    rows = read_table(files.path / "evaluation.csv")
     wide = rows.pivot(index=["noise_level", "method"], columns="metric", values=["value", "stderr"])
     table = pd.DataFrame(
         {

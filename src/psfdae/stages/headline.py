@@ -8,6 +8,7 @@ from typing import Any
 import pandas as pd
 
 from psfdae.files import ProductError
+from psfdae.reading import read_table
 from psfdae.stages.common import limit_threads, read_stars, split_stars
 from psfdae.stages.figures import field_of, strip_rows, write_png
 
@@ -62,7 +63,7 @@ def run(
 
 
 def _rows_of(path: Path, dataset: str) -> pd.DataFrame:
-    table = pd.read_csv(path)
+    table = read_table(path)
     rows = table[(table.dataset == dataset) & (table.reference == REFERENCE)]
     if "metric" in rows:
         rows = rows[rows.metric == "mse"]

@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 
 from psfdae.benchmark.training import knee, pareto, stopping_point
+from psfdae.configuration.compose import decisive
 from psfdae.evaluation.metrics import mse
 from psfdae.files import atomic_path, write_text
+from psfdae.reading import read_table, read_yaml
 from psfdae.stages.common import limit_threads, noisy_test_images, read_stars, split_stars
 from psfdae.stages.evaluate import dae_predictor
-from psfdae.stages.train import CONFIG, HISTORY
+from psfdae.stages.trained import CONFIG, HISTORY
 
 PATIENCE = 5
 """Validations without a better one after which a training has stopped improving."""
@@ -40,7 +42,7 @@ def run(config: Any, stars: Path, points: Mapping[str, Path], out: Path, stoppin
     product = read_stars(stars)
     images = product["realisation"][split_stars(product, "random", config).test]
     noisy = {level: noisy_test_images(config, images, level) for level in config.noise.levels}
-    configured = {"dae": config.dae.model_dump(), "train": config.train.model_dump()}
+    configured = decisive(config.model_dump(include={"dae", "train"}))
     rows = []
     for name, folder in points.items():
         predict = dae_predictor(folder, config)
@@ -69,24 +71,16 @@ def run(config: Any, stars: Path, points: Mapping[str, Path], out: Path, stoppin
 
 def figure(table: Path, out: Path) -> None:
     """Draw the table of `run`."""
-    import pandas as pd
 
     from psfdae.evaluation.knee_figure import training_knee
 
-    drawn = training_knee(pd.read_csv(table))
+    drawn = training_knee(read_table(table))
     with atomic_path(out) as temporary:
         drawn.savefig(temporary, format="png")
 
 
-def _read_config(folder: Path) -> dict[str, Any]:
-    import yaml
-
-    tree: dict[str, Any] = yaml.safe_load((folder / CONFIG).read_text(encoding="utf-8"))
-    return tree
-
-
 def _settings(folder: Path, configured: dict[str, Any]) -> dict[str, Any]:
-    tree = _read_config(folder)
+    tree = decisive(read_yaml(folder / CONFIG))
     train = tree["train"]
     same = tree["parts"]["test_stars"] > 1
     return {
@@ -98,9 +92,8 @@ def _settings(folder: Path, configured: dict[str, Any]) -> dict[str, Any]:
 
 
 def _history(folder: Path):  # type: ignore[no-untyped-def]
-    import pandas as pd
 
-    return pd.read_csv(folder / HISTORY)
+    return read_table(folder / HISTORY)
 
 
 def _cost(folder: Path) -> dict[str, float]:
@@ -113,7 +106,7 @@ def _stopping(points: Mapping[str, Path]):  # type: ignore[no-untyped-def]
 
     rows = []
     for name, folder in points.items():
-        if _read_config(folder)["train"]["schedule"] != "constant":
+        if read_yaml(folder / CONFIG)["train"]["schedule"] != "constant":
             continue
         history = _history(folder).dropna(subset=["validation_mse"])
         scores = history["validation_mse"].to_numpy()

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from psfdae.files import ProductError, write_text
+from psfdae.reading import read_table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -121,7 +122,7 @@ def poppy(config: Any, bundle: Path, evaluation: Path, count: int, out: Path) ->
     from psfdae.rng import stream
     from psfdae.stages.common import noise_model
 
-    table = pd.read_csv(evaluation)
+    table = read_table(evaluation)
     expected = {level: _table_mse(table, level, evaluation) for level in config.noise.levels}
     model, noise = load_model(bundle), noise_model(config)
     truth = poppy_stars(config, count)

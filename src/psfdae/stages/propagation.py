@@ -9,6 +9,7 @@ from typing import Any
 from psfdae.benchmark import choice, peers, propagation, skipping, timing, wavefronts
 from psfdae.benchmark.cases import Case, Scene, build_cases, error_budget
 from psfdae.files import ProductError, write_text
+from psfdae.reading import read_table
 from psfdae.rng import stream
 from psfdae.stages.common import limit_threads, scene_module
 from psfdae.stars.fields import assign_fields
@@ -189,7 +190,7 @@ def tables(scenes: Sequence[Path], extra: Sequence[Path], out: Path) -> None:
     import pandas as pd
 
     for name in TABLES:
-        parts = [pd.read_csv(folder / f"{name}.csv", dtype=_TEXT.get(name)) for folder in scenes]
+        parts = [read_table(folder / f"{name}.csv", dtype=_TEXT.get(name)) for folder in scenes]
         if name == "skipping":
             parts += [_read_savings(path) for path in extra]
         joined = pd.concat(parts, ignore_index=True)
@@ -203,9 +204,8 @@ _TEXT: dict[str, Any] = {"machine": str, "choice": {"ladder": str}}
 
 
 def _read_savings(path: Path):  # type: ignore[no-untyped-def]
-    import pandas as pd
 
-    table = pd.read_csv(path, keep_default_na=False)
+    table = read_table(path, keep_default_na=False)
     if tuple(table.columns) != skipping.COLUMNS:
         raise ProductError(
             f"{path}: columns {list(table.columns)}, expected {list(skipping.COLUMNS)}"
@@ -232,12 +232,11 @@ def figure_propagation(table: Path, scene: str, out: Path) -> None:
     ProductError
         If the table has no rows of the scene.
     """
-    import pandas as pd
 
     from psfdae.evaluation.benchmark_figures import propagation_front
     from psfdae.stages.figures import write_png
 
-    rows = pd.read_csv(table)
+    rows = read_table(table)
     rows = rows[rows["scene"] == scene]
     if rows.empty:
         raise ProductError(f"{table}: no rows of scene {scene}")
@@ -252,9 +251,8 @@ def figure_skipping(table: Path, out: Path) -> None:
     table : `benchmark_skipping.csv`
     out : path of the PNG
     """
-    import pandas as pd
 
     from psfdae.evaluation.benchmark_figures import savings
     from psfdae.stages.figures import write_png
 
-    write_png(savings(pd.read_csv(table, keep_default_na=False)), out)
+    write_png(savings(read_table(table, keep_default_na=False)), out)

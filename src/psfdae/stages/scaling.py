@@ -19,6 +19,7 @@ from psfdae.benchmark.isolated import run_isolated
 from psfdae.benchmark.scaling import fit_power_law
 from psfdae.configuration.compose import config_dir
 from psfdae.files import ProductError, write_text
+from psfdae.reading import read_table
 from psfdae.stages import scaling_jobs as jobs
 
 if TYPE_CHECKING:
@@ -166,12 +167,11 @@ def plan(
     CostError
         If a table allows no prediction.
     """
-    import pandas as pd
 
     for path in tables.values():
         if not path.is_file():
             raise ProductError(f"{path}: missing; run `snakemake scaling` first")
-    read = {name: pd.read_csv(path) for name, path in tables.items()}
+    read = {name: read_table(path) for name, path in tables.items()}
     measured = stage_lines(read["stages"])
     planning = {kind: planning_of(read["dag"], kind) for kind in dag.KINDS}
     network = footprint(results)

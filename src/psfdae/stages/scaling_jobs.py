@@ -52,19 +52,15 @@ def predict(config: dict[str, Any], dae: str, stars: str, out: str) -> dict[str,
     """Read stars piece by piece, predict and write their PSFs; costs as of `_measure`."""
     import h5py
     import torch
-    import yaml
 
-    from psfdae.configuration.schema import Dae
     from psfdae.files import Empty, stream_product
     from psfdae.models.dae import image_scale, predict_stream
-    from psfdae.models.training import load_dae
-    from psfdae.stages.train import CONFIG, WEIGHTS
+    from psfdae.stages.trained import trained_dae
 
     torch.set_num_threads(_checked("evaluate", config).evaluation.threads)
-    settings = Dae.model_validate(yaml.safe_load((Path(dae) / CONFIG).read_text())["dae"])
 
     def run() -> None:
-        model = load_dae(settings, Path(dae) / WEIGHTS)
+        settings, model = trained_dae(Path(dae))
         with h5py.File(stars) as file:
             images = file["realisation"]
             columns = {"psf": Empty(images.shape, np.float32, "1", "predicted PSF")}

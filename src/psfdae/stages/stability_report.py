@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from psfdae.files import ProductError
+from psfdae.reading import read_table
 from psfdae.stability.rows import check, read_rows
 
 
@@ -34,12 +35,11 @@ def figure(graded: Path, out: Path) -> None:
     ProductError
         If the file lacks columns or rows.
     """
-    import pandas as pd
 
     from psfdae.stability.figure import graded_stress
     from psfdae.stages.figures import write_png
 
-    table = pd.read_csv(graded)
+    table = read_table(graded)
     if list(table.columns) != ["case", "stress", "error", "bound"] or table.empty:
         raise ProductError(f"{graded}: not a table of graded stress tests")
     write_png(graded_stress(table), out)

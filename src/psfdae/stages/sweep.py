@@ -11,7 +11,9 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from psfdae.configuration.compose import decisive
 from psfdae.files import ProductError, write_text
+from psfdae.reading import from_tree, read_json
 from psfdae.sweeps.measured import EVALUATION, VALIDATION, Task
 from psfdae.sweeps.space import changes, with_values
 
@@ -97,7 +99,14 @@ def point(
         values = _asked(adaptive, space, trial, task.folder)
         asked = changes(space, values)
         config, keys = _with(config, asked), {**keys, **asked}
-    content = [source, model, config.model_dump(), dict(values), dict(keys), task.described()]
+    content = [
+        source,
+        model,
+        decisive(config.model_dump()),
+        dict(values),
+        dict(keys),
+        task.described(),
+    ]
     fingerprint = _digest(content)
     result = _finished(task.folder, fingerprint, module.FILES)
     if result is None:
@@ -215,13 +224,8 @@ def read_result(path: Path) -> dict[str, Any]:
     ProductError
         If the file is missing, or not what was written.
     """
-    try:
-        tree = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise ProductError(f"{path}: no such file") from None
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise ProductError(f"{path}: damaged ({error}); delete it and run again") from None
-    if not isinstance(tree, dict) or tree.pop(CHECKSUM, None) != _digest(tree):
+    tree = read_json(path)
+    if tree.pop(CHECKSUM, None) != _digest(tree):
         raise ProductError(f"{path}: damaged (wrong checksum); delete it and run again")
     return tree
 
@@ -229,10 +233,5 @@ def read_result(path: Path) -> dict[str, Any]:
 def read_cost(folder: Path) -> dict[str, float]:
     """Seconds and CPU seconds of a point's training; raises ProductError."""
     path = folder / COST
-    try:
-        tree = json.loads(path.read_text(encoding="utf-8"))
-        return {key: float(tree[key]) for key in ("seconds", "cpu_seconds")}
-    except FileNotFoundError:
-        raise ProductError(f"{path}: no such file") from None
-    except (ValueError, KeyError, TypeError) as error:
-        raise ProductError(f"{path}: damaged ({error}); delete it and run again") from None
+    tree = read_json(path)
+    return {key: from_tree(path, tree, key, make=float) for key in ("seconds", "cpu_seconds")}

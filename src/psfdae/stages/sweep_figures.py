@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from psfdae.files import atomic_path
-from psfdae.runs import read_yaml
+from psfdae.reading import read_table, read_yaml
 
 
 def run(kind: str, definition: Path, table: Path, out: Path) -> None:
@@ -18,7 +18,6 @@ def run(kind: str, definition: Path, table: Path, out: Path) -> None:
     table : `summary.csv`
     out : PNG
     """
-    import pandas as pd
 
     from psfdae.configuration.compose import validate
     from psfdae.configuration.sweep import Axis
@@ -32,6 +31,6 @@ def run(kind: str, definition: Path, table: Path, out: Path) -> None:
     }[kind]
     axes = list(described["space"])
     text = dict.fromkeys(axes, str)
-    drawn = draw(pd.read_csv(table, dtype=text), described, axes, logarithmic)
+    drawn = draw(read_table(table, dtype=text), described, axes, logarithmic)
     with atomic_path(out) as temporary:
         drawn.savefig(temporary, format="png")

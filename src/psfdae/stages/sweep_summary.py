@@ -99,7 +99,7 @@ def best_overrides(results: Path, name: str) -> list[str]:
     ProductError
         If the sweep has not been run.
     """
-    from psfdae.runs import read_yaml
+    from psfdae.reading import read_yaml
 
     path = results / "sweeps" / name / BEST
     if not path.is_file():

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from psfdae.files import ProductError, write_text
+from psfdae.reading import read_table
 
 
 def collect(evaluations: Sequence[Path], out: Path) -> None:
@@ -49,7 +50,7 @@ def read_evaluations(evaluations: Sequence[Path]):  # type: ignore[no-untyped-de
     columns += ["value", "stderr", "n"]
     parts = []
     for path in evaluations:
-        part = pd.read_csv(path)
+        part = read_table(path)
         if list(part.columns) != columns:
             raise ProductError(f"{path}: columns {list(part.columns)}, expected {columns}")
         parts.append(part)

@@ -16,6 +16,7 @@ from psfdae.benchmark.isolated import run_isolated
 from psfdae.benchmark.scaling import fit_power_law
 from psfdae.configuration.compose import stage_tree
 from psfdae.files import write_text
+from psfdae.reading import read_table
 from psfdae.stages import timing_jobs
 
 if TYPE_CHECKING:
@@ -189,10 +190,9 @@ def figure(kind: str, table: Path, out: Path) -> None:
     table : CSV
     out : path of the PNG
     """
-    import pandas as pd
 
     from psfdae.evaluation import throughput_figures
     from psfdae.stages.figures import write_png
 
     draw = getattr(throughput_figures, f"{kind}_figure")
-    write_png(draw(pd.read_csv(table)), out)
+    write_png(draw(read_table(table)), out)

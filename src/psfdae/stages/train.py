@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from psfdae.configuration.compose import decisive
 from psfdae.files import write_text
 from psfdae.stages.common import noise_model, read_stars, split_stars
-
-WEIGHTS, CONFIG, HISTORY = "dae.safetensors", "config.yaml", "history.csv"
+from psfdae.stages.trained import CONFIG, HISTORY, WEIGHTS
 
 
 def run(config: Any, stars: Path, split: str, reference: str, out: Path, checkpoint: Path) -> None:
@@ -79,8 +79,8 @@ def run(config: Any, stars: Path, split: str, reference: str, out: Path, checkpo
 
 
 def _fingerprint(described: dict[str, Any], data: Any) -> str:
-    """Hash of the configuration and the images that a training sees."""
-    digest = hashlib.sha256(json.dumps(described, sort_keys=True).encode())
+    """Hash of the images that a training sees, and of what of its configuration counts."""
+    digest = hashlib.sha256(json.dumps(decisive(described), sort_keys=True).encode())
     for array in (data.images, data.references, data.fit):
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()

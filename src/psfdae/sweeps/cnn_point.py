@@ -9,10 +9,11 @@ import numpy as np
 from psfdae.evaluation.alignment_tables import error_rows
 from psfdae.files import read_product, write_text
 from psfdae.models.cnn import CnnTrainingError
+from psfdae.reading import read_table, read_yaml
 from psfdae.stages import alignment_train as stage
 from psfdae.stages.alignment_evaluate import cnn_predictor, noisy_test_states
 from psfdae.stages.common import limit_threads
-from psfdae.stages.train import CONFIG, HISTORY
+from psfdae.stages.trained import CONFIG, HISTORY
 from psfdae.sweeps.measured import (
     EVALUATION,
     VALIDATION,
@@ -40,7 +41,6 @@ def run(config: Any, task: Task) -> Measured:
     Raises CnnTrainingError if the training cannot go on.
     """
     import pandas as pd
-    import yaml
 
     train = {"original": stage.train_original, "noise_trained": stage.train_noise_trained}
     part = stage_part(f"alignment_{task.dataset}", config)
@@ -51,9 +51,9 @@ def run(config: Any, task: Task) -> Measured:
         rows = _rows(config, task, role)
         metrics |= _metrics(role, rows)
         write_text(task.folder / name, pd.DataFrame(rows).to_csv(index=False, float_format="%.8g"))
-    described = yaml.safe_load((task.folder / CONFIG).read_text(encoding="utf-8"))
+    described = read_yaml(task.folder / CONFIG)
     states = read_product(task.data["states"], "alignment_states", ()).config
-    history = pd.read_csv(task.folder / HISTORY)
+    history = read_table(task.folder / HISTORY)
     return Measured(
         metrics=metrics,
         described={**states, **described},

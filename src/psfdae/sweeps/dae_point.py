@@ -6,12 +6,14 @@ from typing import Any
 
 from psfdae.files import read_product
 from psfdae.models.training import TrainingError
+from psfdae.reading import read_table, read_yaml
 from psfdae.stages import train as stage
 from psfdae.stages.common import limit_threads
 from psfdae.stages.evaluate import dae_predictor
+from psfdae.stages.trained import CONFIG, HISTORY, WEIGHTS
 from psfdae.sweeps.measured import Measured, Task, measure_images, stage_part
 
-FILES = (stage.WEIGHTS, stage.CONFIG, stage.HISTORY)
+FILES = (WEIGHTS, CONFIG, HISTORY)
 FAILURES = (TrainingError,)
 
 
@@ -25,8 +27,6 @@ def run(config: Any, task: Task) -> Measured:
 
     Raises TrainingError if the training cannot go on.
     """
-    import pandas as pd
-    import yaml
 
     part = stage_part("train", config)
     stars = task.data["stars"]
@@ -34,9 +34,9 @@ def run(config: Any, task: Task) -> Measured:
     limit_threads(config.evaluation.threads)
     predict = dae_predictor(task.folder, config)
     metrics = measure_images(config, task, "dae", predict, predict)
-    described = yaml.safe_load((task.folder / stage.CONFIG).read_text(encoding="utf-8"))
+    described = read_yaml(task.folder / CONFIG)
     attempt = described.pop("attempt")
-    last = pd.read_csv(task.folder / stage.HISTORY).iloc[-1]
+    last = read_table(task.folder / HISTORY).iloc[-1]
     return Measured(
         metrics=metrics,
         described={**read_product(stars, "stars", ()).config, **described},

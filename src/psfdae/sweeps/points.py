@@ -12,6 +12,7 @@ from psfdae.configuration.compose import (
     ConfigError,
     compose,
     config_dir,
+    decisive,
     overrides_for,
     stage_tree,
     validate,
@@ -116,7 +117,7 @@ class Plan:
             "reference": self.sweep.reference,
             "levels": self.levels,
             "data": self._data,
-            "config": config,
+            "config": decisive(config),
             "search": None if slot is None else {**self.search, "slot": slot},
         }
         return Point(hash_of(content)[:NAME_LENGTH], values, keys, config, slot)
@@ -176,6 +177,6 @@ def plan_sweep(name: str, given: Sequence[str] = ()) -> Plan:
         Name file and key.
     """
     sweep = load_sweep(name)
-    kept = overrides_for(sweep.root, given)
-    chosen = (f"dataset={sweep.dataset}", *kept) if sweep.root == "config" else kept
+    choice = (f"dataset={sweep.dataset}",) if sweep.root == "config" else ()
+    chosen = (*choice, *overrides_for(sweep.root, given, choice))
     return Plan(name, sweep, tuple(given), compose(chosen, sweep.root))
