@@ -138,7 +138,8 @@ def test_a_bank_of_other_stars_is_refused(scene_1, tmp_path):
     outputs = [tmp_path / name for name in ("a.csv", "b.csv", "c.parquet")]
     products = (scene_1 / "stars.h5", scene_1 / "templates.h5")
     config = settings("bounds", "dataset6")
-    with pytest.raises(ProductError, match="another stars than that"):
+    other = r"bank\.h5: stars\.aberration_fraction = 0\.1, but .*stars\.h5 has 0\.5"
+    with pytest.raises(ProductError, match=other):
         bounds.run(config, "dataset6", *products, tmp_path / "bank.h5", *outputs)
     with pytest.raises(ProductError, match="a bank is needed"):
         bounds.run(config, "dataset6", *products, None, *outputs)
@@ -191,6 +192,9 @@ def test_methods_must_cover_the_bounded_stars(scene_1, tmp_path):
     rows[rows.star != rows.star.min()].to_parquet(tmp_path / "e.parquet")
     inputs = ([scene_1 / "bounds.csv"], [scene_1 / "bounds.parquet"])
     with pytest.raises(ProductError, match="lmmse lacks 1 of the bounded stars"):
+        efficiency.run(*inputs, [tmp_path / "e.parquet"], tmp_path / "x.csv")
+    rows.assign(field=rows.field + 1).to_parquet(tmp_path / "e.parquet")
+    with pytest.raises(ProductError, match=r"star \d+ of lmmse lies in field \d, but that of the"):
         efficiency.run(*inputs, [tmp_path / "e.parquet"], tmp_path / "x.csv")
     rows.assign(dataset="dataset1").to_parquet(tmp_path / "e.parquet")
     with pytest.raises(ProductError, match="no method was evaluated"):
