@@ -26,6 +26,9 @@ NOT_SCIENCE = MASKS | ERRORS | EXTRAS
 MOST_COMPRESSED = 2000
 """Pixels per byte of file that no compression reaches; a header that claims more is damaged."""
 
+LARGEST_ORDER = 9
+"""Of the distortion polynomials (SIP); astropy would take any number and be busy for ever."""
+
 
 @dataclass(frozen=True)
 class Scaling:
@@ -69,9 +72,7 @@ class ImageFile:
         return self.file.name
 
 
-def find_image(
-    path: str | Path | PlainFile, extension: str | int | None = None
-) -> ImageFile:
+def find_image(path: str | Path | PlainFile, extension: str | int | None = None) -> ImageFile:
     """Find an image in a FITS file and check that its data are all there.
 
     Parameters
@@ -194,6 +195,9 @@ def _celestial(header: Any, hdus: Any) -> Any:
     from astropy.wcs import WCS
 
     if not any(card_value(header, key) is not None for key in ("CD1_1", "CD1_2", "CDELT1")):
+        return None
+    orders = [card_value(header, f"{name}_ORDER") or 0 for name in ("A", "B", "AP", "BP")]
+    if not all(isinstance(order, int) and order <= LARGEST_ORDER for order in orders):
         return None
     try:
         wcs = WCS(header, fobj=hdus)

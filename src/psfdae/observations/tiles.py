@@ -64,7 +64,8 @@ def check_tiles(path: Path, hdu: Any) -> None:
     if math.prod(hdu.tile_shape) > LARGEST_TILE:
         size = "×".join(str(n) for n in hdu.tile_shape)
         raise ObservationError(
-            path, f"tiles of {size} pixels, at most {LARGEST_TILE} are accepted; decompress the file"
+            path,
+            f"tiles of {size} pixels, at most {LARGEST_TILE} are accepted; decompress the file",
         )
     tiles = math.prod(-(-n // t) for n, t in zip(hdu.shape, hdu.tile_shape, strict=True))
     if tiles != len(table.data):
@@ -105,10 +106,10 @@ def decompress(path: Path, hdu: Any, copy: IO[bytes]) -> np.ndarray:
     """
     first = (0,) * (len(hdu.shape) - 2)
     dtype = hdu.section[(*first, slice(0, 1), slice(0, 1))].dtype
-    allowed, why = DECOMPRESSED.of(path.stat().st_size)
+    allowed, words = DECOMPRESSED.of(path.stat().st_size)
     needed = math.prod(hdu.shape) * dtype.itemsize
     if needed > allowed:
-        raise ObservationError(path, f"decompresses to {needed} bytes, more than {allowed}, {why}")
+        raise ObservationError(path, f"decompresses to {needed} bytes, more than {words}")
     # Room for all of it now: a disk that fills up later would kill the process.
     os.posix_fallocate(copy.fileno(), 0, needed)
     values = np.memmap(copy, dtype, "r+", shape=hdu.shape)

@@ -63,12 +63,13 @@ class Limit:
     ratio: int = 100
 
     def of(self, packed: int) -> tuple[int, str]:
-        """Bytes allowed for so many packed ones, and why not more."""
-        free = shutil.disk_usage(tempfile.gettempdir()).free // 2
+        """Bytes allowed for so many packed ones, and the words for them."""
+        folder = tempfile.gettempdir()
+        free = shutil.disk_usage(folder).free // 2
         allowed = max(self.least, self.ratio * packed)
         if free < allowed:
-            return free, f"half of what is free in {tempfile.gettempdir()}, which TMPDIR changes"
-        return allowed, f"{self.ratio} times its size"
+            return free, f"{free} bytes, half of what is free in {folder} (TMPDIR names another)"
+        return allowed, f"{allowed} bytes, the most for {packed} packed ones"
 
 
 WHOLE = Limit(2**29)
@@ -119,16 +120,14 @@ def _check_start(path: Path, start: bytes) -> None:
 def _unpacked(path: Path, content: IO[bytes]) -> PlainFile:
     start = content.read(BLOCK_BYTES)
     _check_start(path, start)
-    allowed, why = WHOLE.of(path.stat().st_size)
+    allowed, words = WHOLE.of(path.stat().st_size)
     copy = tempfile.NamedTemporaryFile(prefix="psfdae-", suffix=".fits")  # noqa: SIM115
     done = copy.write(start)
     while piece := content.read(PIECE):
         done += len(piece)
         if done > allowed:
             copy.close()
-            raise ObservationError(
-                path, f"unpacks to more than {allowed} bytes, {why}; unpack it beforehand"
-            )
+            raise ObservationError(path, f"unpacks to more than {words}; unpack it beforehand")
         copy.write(piece)
     copy.flush()
     return PlainFile(path, Path(copy.name), copy)
