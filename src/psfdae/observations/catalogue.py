@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import itertools
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -330,22 +329,25 @@ def _delimiter(rows: list[str]) -> str:
 
 def _check_widths(path: Path, rows: list[str]) -> None:
     """Refuse a table of which numpy would make far more than it is; see `WIDEST`."""
-    _check_size(path, len(rows), 0)
     delimiter = _delimiter(rows)
-    widest: list[int] = []
+    columns = len(rows[0].split(None if delimiter == " " else delimiter))
+    _check_size(path, len(rows), columns)
+    widest = [0] * columns
     for start in range(0, len(rows), ROWS):
         part = rows[start : start + ROWS]
-        cells = map(str.split, part) if delimiter == " " else csv.reader(part, delimiter=delimiter)
+        split = map(str.split, part) if delimiter == " " else csv.reader(part, delimiter=delimiter)
         try:
-            found = [
-                max(map(len, column)) for column in itertools.zip_longest(*cells, fillvalue="")
-            ]
+            cells = list(split)
         except csv.Error as error:
             raise ObservationError(path, f"not a text table ({error})") from None
-        widest = [max(pair) for pair in itertools.zip_longest(widest, found, fillvalue=0)]
-        _check_size(path, 0, len(widest))
+        if all(len(row) == columns for row in cells):
+            found = [max(map(len, column)) for column in zip(*cells, strict=True)]
+        else:
+            # Quoted otherwise than we think, or no table at all.
+            found = [max(map(len, part))] * columns
+        widest = list(map(max, widest, found))
     if len(rows) * sum(widest) > WIDEST:
-        column = max(range(len(widest)), key=widest.__getitem__)
+        column = max(range(columns), key=widest.__getitem__)
         raise ObservationError(
             path,
             f"column {column + 1} is {widest[column]} characters wide; {len(rows)} rows may have "

@@ -65,7 +65,7 @@ def check_tiles(path: Path, hdu: Any) -> None:
         size = "×".join(str(n) for n in hdu.tile_shape)
         raise ObservationError(
             path,
-            f"tiles of {size} pixels, at most {LARGEST_TILE} are accepted; decompress the file",
+            f"tiles of {size} pixels, accepted are {LARGEST_TILE} pixels; decompress the file",
         )
     tiles = math.prod(-(-n // t) for n, t in zip(hdu.shape, hdu.tile_shape, strict=True))
     if tiles != len(table.data):
