@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import tempfile
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -135,7 +136,7 @@ def _choose(path: Path, hdus: Any, extension: str | int | None) -> Any:
 def _named(hdus: Any, extension: str | int) -> Any:
     """The extension, or None."""
     text = str(extension).strip()
-    if text.isdecimal():
+    if re.fullmatch("[0-9]{1,6}", text):
         return hdus[int(text)] if int(text) < len(hdus) else None
     name, _, version = text.rpartition(",") if "," in text else (text, "", "")
     for hdu in hdus:

@@ -24,6 +24,7 @@ from psfdae.stages.calibration_stars import (
     write_selection,
     write_stars,
 )
+from psfdae.stages.common import check_outputs
 from psfdae.stars.from_observation import star_grid
 from psfdae.stars.splits import held_out_fields
 
@@ -75,6 +76,12 @@ class Folder:
     path: Path
     name: str
 
+    def written(self) -> list[Path]:
+        """Files of the folder itself."""
+        names = ("selection.csv", "overrides.txt", "evaluation.csv", "per_star.parquet")
+        more = ("report.csv", "report.png")
+        return [self.stars, self.pca_som, self.bundle, *(self.path / n for n in (*names, *more))]
+
     @property
     def stars(self) -> Path:
         return self.path / "stars.h5"
@@ -121,9 +128,10 @@ def run(
 
     Raises
     ------
-    ObservationError, CalibrationStarsError, BundleError, TrainingError
+    ObservationError, CalibrationStarsError, BundleError, TrainingError, OutputError
     """
     files = Folder(out, name)
+    check_outputs(files.written(), (exposure.path, exposure.catalogue, exposure.mask))
     observation = exposure.open(config.framing.stamp_px, config.calibration_stars.margin_px)
     found = collect(observation, config)
     grid = star_grid(found.bright.position)
