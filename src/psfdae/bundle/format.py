@@ -116,7 +116,7 @@ class BundleInfo(_Described):
 
     format_version: Count = FORMAT_VERSION
     psfdae_version: str
-    name: Annotated[str, Field(min_length=1, max_length=200)]
+    name: Annotated[str, Field(min_length=1, max_length=255)]
     licence: str
     created: Annotated[str, Field(pattern=r"^[0-9]{4}-[0-9]{2}-[0-9]{2}$")]
     stamp_px: Annotated[int, Field(ge=8, le=256, multiple_of=2)]
