@@ -3,11 +3,13 @@
 A bundle is a safetensors file: arrays, and a JSON text that describes them. Reading
 it executes nothing. The text holds a SHA-256 of the description and the arrays, so a
 damaged file is refused; the date alone is outside, for the same model has the same
-checksum whenever it was made.
+checksum whenever it was made. A checksum says nothing of who wrote it: sizes and
+numbers that no training leaves are refused as well, before memory is spent on them.
 
 Only the leading eigenvectors of the flux model's covariance are stored. The variance
-of the others is spread evenly over the directions that they span, which reading
-completes: which basis of them it takes does not matter then.
+of the others is spread evenly over the directions that they span. For stamps of up to
+`COMPLETED_PX` pixels reading completes the basis, and which basis it takes does not
+matter; for larger ones, whose whole basis would take gigabytes, they stay one number.
 """
 
 from __future__ import annotations
@@ -29,6 +31,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 import psfdae
 from psfdae.files import atomic_path
 from psfdae.models.weights import digest_of
+from psfdae.safe_text import one_line
 from psfdae.stars.flux import FluxModel
 
 if TYPE_CHECKING:
@@ -47,12 +50,29 @@ FRAMING = "brightest pixel at (d/2, d/2)"
 
 KIND = "psfdae bundle"
 
+COMPLETED_PX = 32**2
+"""Pixels of the largest stamps whose covariance gets a whole basis."""
+
+LARGEST = 2**28
+"""Bytes of a bundle; one of stamps of 256 × 256 pixels has some 20 MB."""
+
+DOUBLE = frozenset({"flux/variance", "flux/rest", "noise_nodes", "distance_limit"})
+"""Arrays of float64; the others are float32."""
+
+TOLERANCE = 1e-3
+"""By which the stored mean PSF may miss the sum 1, and eigenvectors orthonormality."""
+
 Positive = Annotated[float, Field(gt=0)]
 Count = Annotated[int, Field(ge=1)]
+Kernel = Annotated[int, Field(ge=1, le=31)]
+Width = Annotated[int, Field(ge=1, le=1024)]
 
 
 class BundleError(ValueError):
-    """A model bundle is missing, damaged, of a newer format, or no bundle at all."""
+    """A model bundle is missing, damaged, of a newer format, or no bundle at all; one line."""
+
+    def __init__(self, problem: str) -> None:
+        super().__init__(one_line(problem))
 
 
 class _Described(BaseModel):
@@ -62,11 +82,13 @@ class _Described(BaseModel):
 class Architecture(_Described):
     """Shape of the network."""
 
-    kernels: Annotated[tuple[Count, ...], Field(min_length=2)]
-    widths: Annotated[tuple[Count, ...], Field(min_length=1)]
+    kernels: Annotated[tuple[Kernel, ...], Field(min_length=2, max_length=100)]
+    widths: Annotated[tuple[Width, ...], Field(min_length=1)]
 
     @model_validator(mode="after")
     def _shape(self) -> Architecture:
+        if any(kernel % 2 == 0 for kernel in self.kernels):
+            raise ValueError(f"kernels {self.kernels}: must be odd")
         if len(self.widths) != len(self.kernels) - 1:
             raise ValueError(f"{len(self.kernels)} kernels, but {len(self.widths)} widths")
         return self
@@ -94,10 +116,10 @@ class BundleInfo(_Described):
 
     format_version: Count = FORMAT_VERSION
     psfdae_version: str
-    name: Annotated[str, Field(min_length=1)]
+    name: Annotated[str, Field(min_length=1, max_length=255)]
     licence: str
     created: Annotated[str, Field(pattern=r"^[0-9]{4}-[0-9]{2}-[0-9]{2}$")]
-    stamp_px: Annotated[int, Field(ge=8, multiple_of=2)]
+    stamp_px: Annotated[int, Field(ge=8, le=256, multiple_of=2)]
     pixel_scale_arcsec: Positive
     pixel_lambda_d: Positive | None = Field(description="None where the optics are unknown")
     normalisation: Literal["flux"] = Field("flux", description="stamps have the flux 1")
@@ -110,7 +132,9 @@ class BundleInfo(_Described):
     snr_min: Positive
     snr_max: Positive
     noise_equivalent_px: Positive = Field(description="A = 1 / Σ(mean PSF)²")
-    components: Count = Field(description="leading eigenvectors: stored, and in the distance")
+    components: Annotated[int, Field(ge=1, le=1024)] = Field(
+        description="leading eigenvectors: stored, and in the distance"
+    )
     training_sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
     training_stars: Count
     source: Literal["simulated", "stars"]
@@ -226,8 +250,11 @@ def read_bundle(path: Path | None = None) -> Bundle:
         names it.
     """
     path = shipped_path() if path is None else Path(path)
-    text, tensors = _load(path)
-    info = _described(text, tensors, path)
+    try:
+        text, tensors = _load(path)
+        info = _described(text, tensors, path)
+    except RecursionError:
+        raise BundleError(f"{path}: damaged (its description is nested too deeply)") from None
     _check(info, tensors, path)
     model = _completed(tensors)
     return Bundle(
@@ -244,6 +271,8 @@ def _load(path: Path) -> tuple[Any, dict[str, np.ndarray]]:
     from safetensors import SafetensorError, safe_open
 
     try:
+        if path.stat().st_size > LARGEST:
+            raise BundleError(f"{path}: {path.stat().st_size} bytes, at most {LARGEST}")
         with safe_open(path, framework="numpy") as file:
             text = (file.metadata() or {}).get("bundle")
             if text is None:
@@ -258,8 +287,8 @@ def _load(path: Path) -> tuple[Any, dict[str, np.ndarray]]:
         raise
     except OSError as error:
         raise BundleError(f"{path}: cannot be read ({error.strerror or error})") from None
-    except (SafetensorError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise BundleError(f"{path}: damaged, or not a model bundle ({_one_line(error)})") from None
+    except (SafetensorError, ValueError, LookupError, TypeError, AttributeError) as error:
+        raise BundleError(f"{path}: damaged, or not a model bundle ({error})") from None
 
 
 def _refuse_newer(text: Any, path: Path) -> None:
@@ -283,9 +312,9 @@ def _described(text: Mapping[str, Any], tensors: dict[str, np.ndarray], path: Pa
     try:
         return BundleInfo.model_validate(described)
     except ValidationError as error:
-        first = error.errors()[0]
+        first = error.errors(include_input=False)[0]
         where = ".".join(str(part) for part in first["loc"])
-        raise BundleError(f"{path}: damaged ({where}: {_one_line(first['msg'])})") from None
+        raise BundleError(f"{path}: damaged ({where[:80]}: {first['msg']})") from None
 
 
 def _digest(described: Mapping[str, Any], tensors: Mapping[str, np.ndarray]) -> str:
@@ -298,7 +327,7 @@ def _digest(described: Mapping[str, Any], tensors: Mapping[str, np.ndarray]) -> 
 def _tensors(bundle: Bundle) -> dict[str, np.ndarray]:
     """Arrays of the file, the covariance cut to its leading eigenvectors."""
     model, kept = bundle.flux_model, bundle.info.components
-    rest = model.variance[: model.variance.size - kept]
+    rest = model.variance[: model.variance.size - kept] if model.whole else np.array([model.rest])
     # A model that was read has equal ones; their mean could differ in the last digit.
     even = rest[0] if rest.size and (rest == rest[0]).all() else rest.sum() / max(rest.size, 1)
     arrays = {
@@ -341,30 +370,54 @@ def _check(info: BundleInfo, tensors: Mapping[str, np.ndarray], path: Path) -> N
         state = "missing" if name in expected else "unknown"
         raise BundleError(f"{path}: array {name!r} is {state}")
     for name, shape in expected.items():
+        dtype = np.dtype(np.float64 if name in DOUBLE else np.float32)
+        if tensors[name].dtype != dtype:
+            raise BundleError(f"{path}: array {name!r} of {tensors[name].dtype}, not {dtype}")
         if tensors[name].shape != shape:
             raise BundleError(
                 f"{path}: array {name!r} has shape {tensors[name].shape}, not {shape}"
             )
         if not np.isfinite(tensors[name]).all():
             raise BundleError(f"{path}: array {name!r} is not finite")
+    _check_flux_model(info, tensors, path)
     if nodes < 1 or tensors["noise_nodes"][0] <= 0 or (np.diff(tensors["noise_nodes"]) <= 0).any():
         raise BundleError(f"{path}: noise_nodes must be positive and ascending")
 
 
+def _check_flux_model(info: BundleInfo, tensors: Mapping[str, np.ndarray], path: Path) -> None:
+    """Whether the flux model is one: a mean of sum 1 and the eigenvectors of a covariance."""
+    total = tensors["flux/mean"].sum(dtype=np.float64)
+    basis = tensors["flux/basis"].astype(np.float64)
+    for name, right, wanted in (
+        ("flux/mean", abs(total - 1.0) <= TOLERANCE, "a sum of 1"),
+        ("flux/variance", (tensors["flux/variance"] >= 0).all(), "no negative number"),
+        ("flux/rest", tensors["flux/rest"] >= 0, "no negative number"),
+        ("flux/high", (tensors["flux/low"] <= tensors["flux/high"]).all(), "at least flux/low"),
+        ("flux/basis", info.components < basis.shape[0], "fewer columns than rows"),
+        ("flux/basis", _orthonormal(basis), "orthonormal columns"),
+    ):
+        if not right:
+            raise BundleError(f"{path}: array {name!r} must have {wanted}")
+
+
+def _orthonormal(basis: np.ndarray) -> bool:
+    return bool((np.abs(basis.T @ basis - np.eye(basis.shape[1])) <= TOLERANCE).all())
+
+
 def _completed(tensors: Mapping[str, np.ndarray]) -> FluxModel:
-    """Flux model with a whole basis, eigenvalues ascending."""
-    leading = tensors["flux/basis"].astype(np.float64)
-    pixels, kept = leading.shape
-    others = np.linalg.svd(leading)[0][:, kept:]
-    rest = np.full(pixels - kept, float(tensors["flux/rest"]))
+    """Flux model, eigenvalues ascending, with a whole basis unless it would be large."""
+    basis, variance = tensors["flux/basis"].astype(np.float64), tensors["flux/variance"]
+    rest = float(tensors["flux/rest"])
+    pixels, kept = basis.shape
+    if pixels <= COMPLETED_PX:
+        others = np.linalg.svd(basis)[0][:, kept:]
+        basis = np.concatenate([others, basis], axis=1)
+        variance = np.concatenate([np.full(pixels - kept, rest), variance])
     return FluxModel(
         mean=tensors["flux/mean"].astype(np.float64),
-        basis=np.concatenate([others, leading], axis=1),
-        variance=np.concatenate([rest, tensors["flux/variance"]]),
+        basis=basis,
+        variance=variance,
         low=tensors["flux/low"].astype(np.float64),
         high=tensors["flux/high"].astype(np.float64),
+        rest=rest,
     )
-
-
-def _one_line(error: object) -> str:
-    return " ".join(str(error).split())

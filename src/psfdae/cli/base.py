@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ class StageGroup(click.Group):
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command; a refusal of ours is a message, a bug stays a traceback.
 
-        So is a file that the system does not let us read or write.
+        So is a file that the system does not let us read or write, and a lack of memory.
         """
         try:
             return super().invoke(ctx)
@@ -29,10 +30,14 @@ class StageGroup(click.Group):
                 raise
             click.echo(f"psfdae: {error}", err=True)
             ctx.exit(2)
+        except MemoryError as error:
+            click.echo(f"psfdae: not enough memory ({error or 'no more is known'})", err=True)
+            ctx.exit(2)
         except (RuntimeError, ValueError) as error:
             # HDF5 reports a full disk as a RuntimeError without a number of its own.
+            # So does torch a lack of memory, as its own RuntimeError.
             ours = type(error).__module__.startswith("psfdae")
-            if not ours and "errno = " not in str(error):
+            if not ours and not re.search("errno = |not enough memory", str(error)):
                 raise
             click.echo(f"psfdae: {' '.join(str(error).split()) if not ours else error}", err=True)
             ctx.exit(2)
@@ -46,6 +51,11 @@ def main() -> None:
     OVERRIDES are Hydra overrides, such as dataset=dataset5 train.lr=1e-3; the
     groups and keys are those of the config folder.
     """
+
+
+def name_or_number(text: str | None) -> str | int | None:
+    """An extension: its number, in plain digits, or its name."""
+    return int(text) if text is not None and re.fullmatch("[0-9]{1,6}", text) else text
 
 
 def overrides(function: Callable[..., Any]) -> Callable[..., Any]:

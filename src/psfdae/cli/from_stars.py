@@ -6,13 +6,16 @@ from pathlib import Path
 
 import click
 
-from psfdae.cli.base import FileArgument, FolderArgument, main, out_option, overrides
+from psfdae.cli.base import (
+    FileArgument,
+    FolderArgument,
+    main,
+    name_or_number,
+    out_option,
+    overrides,
+)
 
 Positive = click.FloatRange(min=0, min_open=True)
-
-
-def _name_or_number(text: str | None) -> str | int | None:
-    return int(text) if text is not None and text.isdigit() else text
 
 
 @main.command("from-stars")
@@ -55,9 +58,9 @@ def from_stars(
     exposure = stage.Exposure(
         path=image,
         catalogue=catalogue,
-        extension=_name_or_number(extension),
+        extension=name_or_number(extension),
         origin=origin,
-        mask=_name_or_number(mask),
+        mask=name_or_number(mask),
         pixel_scale_arcsec=pixel_scale,
         gain=gain,
         saturate=saturate,
@@ -86,6 +89,8 @@ def example_field(
 ) -> None:
     """Simulate an image of a star field with its star list, to try things on."""
     from psfdae.stages import example_field as stage
+    from psfdae.stages.common import check_outputs
 
+    check_outputs((out,), (catalogue,))
     asked = {"side_px": side, "bright": bright, "faint": faint}
     stage.run(out, catalogue, seed, **{k: v for k, v in asked.items() if v is not None})

@@ -7,14 +7,9 @@ from pathlib import Path
 
 import click
 
-from psfdae.cli.base import FileArgument, main, out_option
+from psfdae.cli.base import FileArgument, main, name_or_number, out_option
 
 Positive = click.FloatRange(min=0, min_open=True)
-
-
-def _name_or_number(text: str | None) -> str | int | None:
-    """An extension: its number, or its name."""
-    return int(text) if text is not None and text.isdigit() else text
 
 
 @main.command()
@@ -65,9 +60,9 @@ def predict(
     source = stage.Source(
         path=stars,
         catalogue=catalogue,
-        extension=_name_or_number(extension),
+        extension=name_or_number(extension),
         origin=origin,
-        mask=_name_or_number(mask),
+        mask=name_or_number(mask),
         pixel_scale_arcsec=pixel_scale,
         gain=gain,
         saturate=saturate,

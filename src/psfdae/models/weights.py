@@ -99,11 +99,11 @@ def load_weights(path: Path) -> dict[str, np.ndarray]:
 
     try:
         with safe_open(path, "numpy") as file:
-            about = json.loads((file.metadata() or {}).get(ABOUT, "{}"))
+            about = dict(json.loads((file.metadata() or {}).get(ABOUT, "{}")))
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except FileNotFoundError:
         raise ProductError(f"{path}: no such file") from None
-    except (SafetensorError, OSError, ValueError, TypeError) as error:
+    except (SafetensorError, OSError, ValueError, TypeError, RecursionError) as error:
         raise ProductError(f"{path}: damaged ({error}); delete it and run again") from error
     # Weights of another program have no checksum, and nothing to compare with.
     if about.get("sha256", digest_of(arrays)) != digest_of(arrays):

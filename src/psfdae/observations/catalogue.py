@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,9 +20,59 @@ from psfdae.observations.columns import (
     resolve,
 )
 from psfdae.observations.errors import ObservationError, reading, shorten
+from psfdae.observations.unpacking import UNPACK, PlainFile, open_hdus, plain_file
 
-SEXTRACTOR_HEADER = re.compile(r"#\s*\d+\s+[A-Za-z_]\w*")
+SEXTRACTOR_HEADER = re.compile(r"#\s*(\d+)\s+[A-Za-z_]\w*")
 SEXAGESIMAL = re.compile(r"[:hd\s]", re.IGNORECASE)
+
+MOST_STARS = 5_000_000
+MOST_COLUMNS = 2000
+"""Rows and columns of a catalogue."""
+
+LARGEST_TEXT = 2**27
+"""Bytes of a text table; reading takes up to five times as much memory."""
+
+LARGEST_ECSV_HEADER = 2**18
+"""Characters of an ECSV header, which is YAML and slow to read."""
+
+WIDEST = 2**27
+"""Characters of all rows of a text table, each as wide as its columns' widest cells.
+
+numpy keeps text in columns as wide as their longest cell, four bytes a character:
+one long cell makes every row as long.
+"""
+
+LONGEST_IDENTIFIER = 200
+"""Characters; each row of the prediction is as long as the longest."""
+
+ROWS = 10_000
+"""Rows of a text table that are measured at a time."""
+
+
+@dataclass(frozen=True)
+class _FitsTable:
+    """Columns of a FITS table, each read when it is asked for: the others may be large."""
+
+    file: PlainFile
+    index: int
+    colnames: list[str]
+    rows: int
+
+    def __len__(self) -> int:
+        return self.rows
+
+    def __getitem__(self, name: str) -> Any:
+        from astropy.table import Table
+
+        with reading(self.file.name), open_hdus(self.file, memmap=True) as hdus:
+            hdu = hdus[self.index]
+            column = hdu.columns[name]
+            # Arrays of variable length may all be the same bytes of the file: 3 MB unfold to 1 TB.
+            if re.match(r"\d*[PQ]", str(column.format)):
+                raise ObservationError(self.file.name, f"column {name!r} holds arrays, not numbers")
+            alone = type(hdu).from_columns([column])
+            # Masked NaN would look like text without value; here both end in one message.
+            return Table.read(alone, format="fits", mask_invalid=False)[name]
 
 
 @dataclass(frozen=True)
@@ -103,9 +154,23 @@ class Catalogue:
                 name = resolve(self.table.colnames, alias)
             except ColumnError:
                 continue
-            if name is not None and self._column(name).ndim == 1:
-                return _as_identifiers(self._column(name))
+            if name is None:
+                continue
+            column = self._column(name)
+            if column.ndim == 1:
+                return self._short(name, _as_identifiers(column))
         return np.arange(len(self), dtype=np.int64)
+
+    def _short(self, name: str, found: np.ndarray) -> np.ndarray:
+        if found.dtype.kind == "U" and found.dtype.itemsize > 4 * LONGEST_IDENTIFIER:
+            lengths = np.char.str_len(found)
+            row = lengths.argmax()
+            raise ObservationError(
+                self.path,
+                f"column {name!r} has {lengths[row]} characters in row {row + 1}, "
+                f"an identifier may have {LONGEST_IDENTIFIER}",
+            )
+        return found
 
     def _column(self, name: str) -> Any:
         try:
@@ -178,24 +243,24 @@ def read_catalogue(path: str | Path) -> Catalogue:
         If the file is none of these, damaged, or has no rows.
     """
     path = Path(path)
-    with reading(path):
-        content = path.read_bytes()
+    with reading(path), path.open("rb") as file:
+        content = file.read(16)
+        if not content.startswith((b"SIMPLE  =", *UNPACK)):
+            content += file.read(LARGEST_TEXT)
     if not content.strip():
         raise ObservationError(path, "the catalogue is empty")
-    if content.startswith((b"SIMPLE  =", b"\x1f\x8b")):
-        table = _fits_table(path)
-    else:
-        table = _text_table(path, content)
+    fits = content.startswith((b"SIMPLE  =", *UNPACK))
+    table = _fits_table(path) if fits else _text_table(path, content)
     if len(table) == 0:
         raise ObservationError(path, "the catalogue has no stars")
     return Catalogue(path, table)
 
 
-def _fits_table(path: Path) -> Any:
+def _fits_table(path: Path) -> _FitsTable:
     from astropy.io import fits
-    from astropy.table import Table
 
-    with reading(path), fits.open(path, memmap=True) as hdus:
+    file = plain_file(path)
+    with reading(path), open_hdus(file, memmap=True) as hdus:
         tables = [
             hdu
             for hdu in hdus
@@ -205,16 +270,28 @@ def _fits_table(path: Path) -> Any:
         if len(objects) != 1:
             names = shorten([hdu.name or "(no name)" for hdu in objects])
             raise ObservationError(path, f"expected one table of stars, found {names}")
-        size = objects[0].header["NAXIS1"] * objects[0].header["NAXIS2"]
-        if size > 2000 * path.stat().st_size:
+        rows = int(objects[0].header["NAXIS2"])
+        size = objects[0].header["NAXIS1"] * rows
+        if objects[0].fileinfo()["datLoc"] + size > file.path.stat().st_size:
             raise ObservationError(path, "damaged: the table is larger than the file")
-        # Masked NaN would look like text without value; here both end in one message.
-        return Table.read(objects[0], format="fits", mask_invalid=False)
+        names = list(objects[0].columns.names)
+        _check_size(path, rows, len(names))
+        return _FitsTable(file, hdus.index(objects[0]), names, rows)
+
+
+def _check_size(path: Path, rows: int, columns: int) -> None:
+    for what, found, most in (("stars", rows, MOST_STARS), ("columns", columns, MOST_COLUMNS)):
+        if found > most:
+            raise ObservationError(path, f"{found} {what} in a catalogue, at most {most}")
 
 
 def _text_table(path: Path, content: bytes) -> Any:
     from astropy.io import ascii as text_tables
 
+    if len(content) > LARGEST_TEXT:
+        raise ObservationError(
+            path, f"a text table of more than {LARGEST_TEXT} bytes; a FITS table may be larger"
+        )
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -222,19 +299,60 @@ def _text_table(path: Path, content: bytes) -> Any:
     if "\x00" in text:
         raise ObservationError(path, "neither a FITS table nor text")
     lines = [line for line in text.splitlines() if line.strip()]
+    del text
     if lines[0].startswith("# %ECSV"):
         kind: dict[str, Any] = {"format": "ecsv"}
+        rows = _without_comments(lines)
+        if sum(map(len, lines)) - sum(map(len, rows)) > LARGEST_ECSV_HEADER:
+            raise ObservationError(
+                path, f"an ECSV header of more than {LARGEST_ECSV_HEADER} characters"
+            )
     elif SEXTRACTOR_HEADER.match(lines[0]):
         kind = {"format": "sextractor"}
+        rows = _without_comments(lines)
+        numbered = filter(None, map(SEXTRACTOR_HEADER.match, lines))
+        _check_size(path, 0, max(int(found[1][:9]) for found in numbered))
     else:
-        lines = _without_comments(lines)
-        delimiter = next((c for c in ",;\t" if c in lines[0]), " ") if lines else ","
-        kind = {"format": "basic", "delimiter": delimiter}
-    if not lines:
+        lines = rows = _without_comments(lines)
+        kind = {"format": "basic", "delimiter": _delimiter(rows)}
+    if not rows:
         raise ObservationError(path, "the catalogue has no stars")
+    _check_widths(path, rows)
     with reading(path):
         # The line break at the end is what tells a table from the name of a file.
         return text_tables.read("\n".join(lines) + "\n", guess=False, **kind)
+
+
+def _delimiter(rows: list[str]) -> str:
+    return next((c for c in ",;\t" if c in rows[0]), " ") if rows else ","
+
+
+def _check_widths(path: Path, rows: list[str]) -> None:
+    """Refuse a table of which numpy would make far more than it is; see `WIDEST`."""
+    delimiter = _delimiter(rows)
+    columns = len(rows[0].split(None if delimiter == " " else delimiter))
+    _check_size(path, len(rows), columns)
+    widest = [0] * columns
+    for start in range(0, len(rows), ROWS):
+        part = rows[start : start + ROWS]
+        split = map(str.split, part) if delimiter == " " else csv.reader(part, delimiter=delimiter)
+        try:
+            cells = list(split)
+        except csv.Error as error:
+            raise ObservationError(path, f"not a text table ({error})") from None
+        if all(len(row) == columns for row in cells):
+            found = [max(map(len, column)) for column in zip(*cells, strict=True)]
+        else:
+            # Quoted otherwise than we think, or no table at all.
+            found = [max(map(len, part))] * columns
+        widest = list(map(max, widest, found))
+    if len(rows) * sum(widest) > WIDEST:
+        column = max(range(columns), key=widest.__getitem__)
+        raise ObservationError(
+            path,
+            f"column {column + 1} is {widest[column]} characters wide; {len(rows)} rows may have "
+            f"{WIDEST // len(rows)} characters in all columns",
+        )
 
 
 def _without_comments(lines: list[str]) -> list[str]:

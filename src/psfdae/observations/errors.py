@@ -10,6 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
+from psfdae.safe_text import one_line
+
 LONGEST = 160
 """Characters of a library's message that are passed on."""
 
@@ -19,12 +21,6 @@ class ObservationError(ValueError):
 
     def __init__(self, path: str | Path, problem: str) -> None:
         super().__init__(one_line(f"{path}: {problem}"))
-
-
-def one_line(text: object) -> str:
-    """The text without line breaks and characters that do not print."""
-    words = " ".join(str(text).split())
-    return "".join(c if c.isprintable() else "?" for c in words)
 
 
 _ONE_AT_A_TIME = threading.RLock()

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import gzip
 import math
-import shutil
+import re
 import tempfile
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -16,7 +15,8 @@ import numpy as np
 
 from psfdae.observations.errors import ObservationError, reading, shorten
 from psfdae.observations.headers import card_value
-from psfdae.observations.tiles import check_tiles
+from psfdae.observations.tiles import check_tiles, decompress
+from psfdae.observations.unpacking import PlainFile, open_hdus, plain_file
 
 MASKS = frozenset({"DQ", "MASK", "BPM", "FLAG", "FLAGS"})
 ERRORS = frozenset({"ERR", "ERROR", "SIGMA", "STDDEV", "RMS", "VAR", "VARIANCE", "IVAR", "UNCERT"})
@@ -24,11 +24,11 @@ EXTRAS = frozenset({"WEIGHT", "WHT", "WGT", "BKG", "BACKGROUND", "SKY", "CTX", "
 NOT_SCIENCE = MASKS | ERRORS | EXTRAS
 """Names of extensions that go with an image; they are read on demand only."""
 
-MAGIC = (b"SIMPLE  =", b"\x1f\x8b", b"BZh", b"\xfd7zXZ\x00", b"PK\x03\x04")
-"""First bytes of FITS files, plain and compressed as a whole (gzip, bzip2, xz, zip)."""
-
 MOST_COMPRESSED = 2000
 """Pixels per byte of file that no compression reaches; a header that claims more is damaged."""
+
+LARGEST_ORDER = 9
+"""Of the distortion polynomials (SIP); astropy would take any number and be busy for ever."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class ImageFile:
     celestial WCS or None.
     """
 
-    path: Path
+    file: PlainFile
     index: int
     shape: tuple[int, ...]
     leading: int
@@ -67,14 +67,20 @@ class ImageFile:
     headers: tuple[Any, ...]
     wcs: Any
 
+    @property
+    def path(self) -> Path:
+        """The file's own name, for messages."""
+        return self.file.name
 
-def find_image(path: str | Path, extension: str | int | None = None) -> ImageFile:
+
+def find_image(path: str | Path | PlainFile, extension: str | int | None = None) -> ImageFile:
     """Find an image in a FITS file and check that its data are all there.
 
     Parameters
     ----------
-    path : path-like
-        FITS file, also tile-compressed (.fz) or compressed as a whole (.gz, …).
+    path : path-like or PlainFile
+        FITS file, also tile-compressed (.fz) or compressed as a whole (.gz, .bz2, .xz,
+        .zip with one file).
     extension : str or int, optional
         Name (case does not matter), "NAME,version" or number (0 is the primary
         one) of the extension. Without it the only image that is not a mask, an
@@ -86,38 +92,25 @@ def find_image(path: str | Path, extension: str | int | None = None) -> ImageFil
         If the file is no FITS file, damaged or truncated, has no such image or
         several, or the image is neither 2- nor 3-dimensional or without pixels.
     """
-    from astropy.io import fits
-
-    path = Path(path)
-    check_readable(path)
-    with reading(path), fits.open(path, memmap=True, **_AS_STORED) as hdus:
-        len(hdus)  # reads all headers
+    file = path if isinstance(path, PlainFile) else plain_file(Path(path))
+    path = file.name
+    with reading(path), open_hdus(file, memmap=True, **_AS_STORED) as hdus:
         hdu = _choose(path, hdus, extension)
         index = hdus.index(hdu)
         shape = tuple(int(n) for n in hdu.shape)
         header = hdu.header.copy()
         headers = (header,) if index == 0 else (header, hdus[0].header.copy())
-        _check_complete(path, hdu)
+        _check_complete(file, hdu)
         wcs = _celestial(header, hdus)
     leading = 0
     while len(shape) > 3 and shape[0] == 1:
         shape, leading = shape[1:], leading + 1
     if len(shape) not in (2, 3):
         raise ObservationError(path, f"an image of {len(shape)} dimensions, expected 2 or 3")
-    return ImageFile(path, index, shape, leading, _scaling(path, header), headers, wcs)
+    return ImageFile(file, index, shape, leading, _scaling(path, header), headers, wcs)
 
 
 _AS_STORED = {"do_not_scale_image_data": True, "uint": False, "ignore_blank": True}
-
-
-def check_readable(path: Path) -> None:
-    """Refuse what is not there, is empty, or does not begin like a FITS file."""
-    with reading(path), path.open("rb") as file:
-        start = file.read(16)
-    if not start:
-        raise ObservationError(path, "the file is empty")
-    if not start.startswith(MAGIC):
-        raise ObservationError(path, "not a FITS file")
 
 
 def _choose(path: Path, hdus: Any, extension: str | int | None) -> Any:
@@ -143,7 +136,7 @@ def _choose(path: Path, hdus: Any, extension: str | int | None) -> Any:
 def _named(hdus: Any, extension: str | int) -> Any:
     """The extension, or None."""
     text = str(extension).strip()
-    if text.isdecimal():
+    if re.fullmatch("[0-9]{1,6}", text):
         return hdus[int(text)] if int(text) < len(hdus) else None
     name, _, version = text.rpartition(",") if "," in text else (text, "", "")
     for hdu in hdus:
@@ -168,20 +161,18 @@ def _label(index: int, hdu: Any) -> str:
     return f"{index} {hdu.name or '(no name)'} ({size})"
 
 
-def _check_complete(path: Path, hdu: Any) -> None:
+def _check_complete(file: PlainFile, hdu: Any) -> None:
     """Refuse data that end before the header says, or that cannot be as large as it says."""
     from astropy.io import fits
 
-    on_disk = path.stat().st_size
+    path, on_disk = file.name, file.path.stat().st_size
     if math.prod(hdu.shape) > MOST_COMPRESSED * on_disk:
         raise ObservationError(path, f"damaged: {on_disk} bytes cannot hold {hdu.shape} pixels")
     if isinstance(hdu, fits.CompImageHDU):
         check_tiles(path, hdu)
         return
-    place = hdu.fileinfo()
-    plain = place["file"].compression in (None, "")
-    if plain and place["datLoc"] + hdu.size > on_disk:
-        missing = place["datLoc"] + hdu.size - on_disk
+    missing = hdu.fileinfo()["datLoc"] + hdu.size - on_disk
+    if missing > 0:
         raise ObservationError(path, f"truncated: the last {missing} bytes are missing")
 
 
@@ -205,6 +196,9 @@ def _celestial(header: Any, hdus: Any) -> Any:
     from astropy.wcs import WCS
 
     if not any(card_value(header, key) is not None for key in ("CD1_1", "CD1_2", "CDELT1")):
+        return None
+    orders = [card_value(header, f"{name}_ORDER") or 0 for name in ("A", "B", "AP", "BP")]
+    if not all(isinstance(order, int) and order <= LARGEST_ORDER for order in orders):
         return None
     try:
         wcs = WCS(header, fobj=hdus)
@@ -234,32 +228,18 @@ def open_pixels(image: ImageFile, *, whole: bool) -> Iterator[Any]:
 
     with ExitStack() as files:
         with reading(image.path):
-            path = files.enter_context(_unpacked(image.path))
-            hdus = files.enter_context(fits.open(path, memmap=whole, **_AS_STORED))
+            hdus = files.enter_context(open_hdus(image.file, memmap=whole, **_AS_STORED))
             hdu = hdus[image.index]
             if tuple(hdu.shape)[image.leading :] != image.shape:
                 raise ObservationError(image.path, "has changed since it was opened")
-            pixels = _Array(hdu.data, image) if whole else _Array(hdu.section, image)
-        yield pixels
-
-
-@contextmanager
-def _unpacked(path: Path) -> Iterator[Path]:
-    """The file, or a temporary copy without its gzip compression.
-
-    Python reads gzip files forwards only, and astropy steps back after each read:
-    every slice would decompress the file from its start.
-    """
-    with path.open("rb") as file:
-        packed = file.read(2) == b"\x1f\x8b"
-    if not packed:
-        yield path
-        return
-    with tempfile.NamedTemporaryFile(suffix=".fits") as plain:
-        with gzip.open(path) as content:
-            shutil.copyfileobj(content, plain)
-        plain.flush()
-        yield Path(plain.name)
+            if not whole:
+                stored = hdu.section
+            elif isinstance(hdu, fits.CompImageHDU):
+                copy = files.enter_context(tempfile.TemporaryFile(prefix="psfdae-"))
+                stored = decompress(image.path, hdu, copy)
+            else:
+                stored = hdu.data
+        yield _Array(stored, image)
 
 
 @dataclass(frozen=True)

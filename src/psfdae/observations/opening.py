@@ -203,7 +203,7 @@ def _scale_of_wcs(image: ImageFile) -> float | None:
 
 def _find_mask(image: ImageFile, mask: str | int | Path) -> ImageFile:
     outside = isinstance(mask, Path) or (isinstance(mask, str) and Path(mask).is_file())
-    found = find_image(mask) if outside else find_image(image.path, mask)
+    found = find_image(mask) if outside else find_image(image.file, mask)
     wanted = image.shape
     if found.shape != wanted and not (len(wanted) == 3 and found.shape == wanted[1:]):
         sizes = ["×".join(str(n) for n in shape) for shape in (found.shape, wanted)]

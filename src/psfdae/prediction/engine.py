@@ -20,6 +20,12 @@ from psfdae.prediction.shapes import measure_shapes
 BLOCK = 256
 """Stars that are computed together, always so many: other numbers would round otherwise."""
 
+BLOCK_PX = BLOCK * 32**2
+"""Pixels of a block at most; larger stamps come in smaller blocks."""
+
+BLOCK_VALUES = 64 * BLOCK_PX
+"""Numbers between two layers of the network at most: 64 channels of a block."""
+
 SNR_TOLERANCE = 1.25
 """Factor beyond the trained S/N that raises no flag: a faint star's S/N is no better known."""
 
@@ -33,13 +39,21 @@ class Engine:
     def __init__(self, bundle: Bundle) -> None:
         self.bundle = bundle
         self.network = network(bundle)
+        pixels = bundle.info.stamp_px**2
+        self.size = min(BLOCK, max(1, BLOCK_PX // pixels))
+        widest = max(bundle.info.dae.widths)
+        self._images = min(self.size, max(1, BLOCK_VALUES // (widest * pixels)))
         self._photometer = Photometer(bundle.flux_model, bundle.info.components)
 
+    def blocks(self, stars: Stars) -> list[Stars]:
+        """Stars in parts of `size`."""
+        return [stars.part(slice(a, a + self.size)) for a in range(0, len(stars), self.size)]
+
     def block(self, stars: Stars) -> Prediction:
-        """PSFs of at most `BLOCK` stars; computed as if there were just so many."""
+        """PSFs of at most `size` stars; computed as if there were just so many."""
         count = len(stars)
-        if count < BLOCK:
-            stars = _filled(stars, self.bundle.flux_model.mean)
+        if count < self.size:
+            stars = _filled(stars, self.bundle.flux_model.mean, self.size)
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             return self._compute(stars).first(count)
 
@@ -50,7 +64,7 @@ class Engine:
         stamps, bad, shift, flags = self._centred(stars)
         sky = border_median(stamps, bad)
         found = self._photometer.measure(stamps, bad, sky, stars.known)
-        psf = predict(self.network, found.images, info.image_scale, BLOCK)
+        psf = predict(self.network, found.images, info.image_scale, self._images)
         lost = (found.flags & StarFlag.NO_FLUX) > 0
         psf[lost] = np.nan
         shapes = measure_shapes(psf)
@@ -130,9 +144,9 @@ def _chi2(residual: np.ndarray, psf: np.ndarray, noise: np.ndarray, gain: np.nda
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
-def _filled(stars: Stars, mean: np.ndarray) -> Stars:
-    """Stars up to `BLOCK`, the last ones being mean PSFs."""
-    missing, side, stamp_px = BLOCK - len(stars), stars.data.shape[-1], round(mean.size**0.5)
+def _filled(stars: Stars, mean: np.ndarray, size: int) -> Stars:
+    """Stars up to `size`, the last ones being mean PSFs."""
+    missing, side, stamp_px = size - len(stars), stars.data.shape[-1], round(mean.size**0.5)
     margin = (side - stamp_px) // 2
     filler = np.zeros((missing, side, side), stars.data.dtype)
     filler[:, margin : margin + stamp_px, margin : margin + stamp_px] = mean.reshape(

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from psfdae.bundle import Bundle, BundleInfo, read_bundle
-from psfdae.prediction.engine import BLOCK, Engine, one_thread_each
+from psfdae.prediction.engine import Engine, one_thread_each
 from psfdae.prediction.photometry import Known
 from psfdae.prediction.results import Prediction, Stars
 from psfdae.threads import side_by_side
@@ -116,7 +116,7 @@ class PsfModel:
 
     def predict_stars(self, stars: Stars, threads: int | None = 1) -> Prediction:
         """As `predict`, of stars that are known to fit."""
-        blocks = [stars.part(slice(start, start + BLOCK)) for start in range(0, len(stars), BLOCK)]
+        blocks = self.engine.blocks(stars)
         with one_thread_each():
             threads = min(threads or available_cores(), max(len(blocks), 1))
             parts = side_by_side(self.engine.block, blocks or [stars], threads)

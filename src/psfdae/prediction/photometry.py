@@ -124,10 +124,11 @@ class Photometer:
         self.side = round(pixels**0.5)
         # At least a quarter of the directions must be left to tell the noise.
         kept = min(components, 3 * pixels // 4)
-        leading = model.basis[:, pixels - kept :]
-        self._variance = model.variance[pixels - kept :]
+        leading = model.basis[:, -kept:]
+        self._variance = model.variance[-kept:]
         self._peak = float(model.mean @ model.mean)
-        self._unseen = float(model.variance[: pixels - kept].mean())
+        unseen = model.variance[: pixels - kept] if model.whole else np.array([model.rest])
+        self._unseen = float(unseen.mean())
         self._others = pixels - 1 - kept
         contrast = model.mean - 1.0 / pixels
         # Double precision: OpenBLAS rounds single precision by the place of a star in its block.
@@ -323,6 +324,14 @@ class Photometer:
 def _with_free_sky(model: FluxModel) -> FluxModel:
     """The flux model of stars on an unknown constant sky."""
     constant = np.full((model.mean.size, 1), model.mean.size**-0.5)
+    if not model.whole:
+        # All but the rest of the covariance lives in the space of basis and constant.
+        space = np.linalg.qr(np.hstack([model.basis, constant]))[0]
+        modes, sky = space.T @ model.basis, space.T @ constant
+        inside = (modes * (model.variance - model.rest)) @ modes.T + FREE_SKY * sky @ sky.T
+        variance, turn = np.linalg.eigh(inside)
+        variance = np.maximum(variance + model.rest, 0.0)
+        return replace(model, basis=space @ turn, variance=variance)
     covariance = (model.basis * model.variance) @ model.basis.T
     variance, basis = np.linalg.eigh(covariance + FREE_SKY * constant @ constant.T)
     return replace(model, basis=basis, variance=np.maximum(variance, 0.0))

@@ -108,7 +108,7 @@ def psf_map(psf: np.ndarray, chosen: np.ndarray, stars: FieldStars, title: str) 
     if shown is not None:
         bar = figure.colorbar(shown, ax=[left, right], location="bottom", shrink=0.6, aspect=40)
         bar.set_label("FWHM of the PSF (px)")
-    figure.suptitle(title)
+    figure.suptitle(title, parse_math=False)
     return figure
 
 

@@ -15,6 +15,8 @@ from psfdae.bundle.format import (
     read_bundle,
     write_bundle,
 )
+from psfdae.safe_text import one_line
+from psfdae.stages.common import check_outputs
 
 LARGEST_SHIPPED = 300_000
 """Bytes of the bundle that comes with the package, at most."""
@@ -62,7 +64,7 @@ def ship(path: Path, folder: Path) -> Path:
     for row in bundle.info.metrics:
         if not low <= row.get("coverage68", 0.0) <= high:
             raise BundleError(
-                f"{path}: at noise level {row['noise_level']:g} error68 holds "
+                f"{path}: at noise level {row.get('noise_level', 0.0):g} error68 holds "
                 f"{row.get('coverage68', 0.0):.1%} of the errors ({low:.0%} to {high:.0%} allowed)"
             )
     info = bundle.info.model_copy(update={"name": SHIPPED, "licence": LICENCE})
@@ -87,12 +89,15 @@ def export(path: Path | None, out: Path) -> None:
         As `read_bundle`.
     ExportError
         As `export_onnx`; no file is left then.
+    OutputError
+        If the ONNX file would replace the bundle.
     """
     import logging
     import warnings
 
     from psfdae.models.export import export_onnx
 
+    check_outputs((out,), (path,))
     bundle = read_bundle(path)
     # The exporter speaks of optional packages and of its own internals.
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
@@ -111,7 +116,7 @@ def describe(path: Path | None) -> str:
     bundle = read_bundle(path)
     facts = _facts(bundle)
     width = max(len(name) for name in facts)
-    lines = [f"{name:<{width}}  {value}" for name, value in facts.items()]
+    lines = [f"{name:<{width}}  {one_line(value)}" for name, value in facts.items()]
     return "\n".join([*lines, "", "Errors of the test stars:", _table(bundle.info)])
 
 

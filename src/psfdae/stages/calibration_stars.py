@@ -12,6 +12,7 @@ import numpy as np
 from psfdae.files import Column, write_product, write_text
 from psfdae.observations import Observation, Stamps
 from psfdae.rng import stream
+from psfdae.safe_text import no_formula
 from psfdae.stars.calibration_stars import (
     CalibrationStarsError,
     Verdict,
@@ -176,7 +177,7 @@ def write_selection(found: Candidates, held_out: np.ndarray, path: Path) -> None
     part[found.bright.row] = np.where(held_out, "held out", "training")
     table = pd.DataFrame(
         {
-            "id": found.id,
+            "id": found.id if found.id.dtype.kind == "i" else [no_formula(n) for n in found.id],
             "x": found.position[:, 0],
             "y": found.position[:, 1],
             "snr": found.snr,

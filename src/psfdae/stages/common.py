@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -13,6 +14,23 @@ from psfdae.files import Product, ProductError, read_product
 from psfdae.rng import stream
 from psfdae.stars.noise import NoiseModel
 from psfdae.stars.splits import Split, held_out_split, random_split
+
+
+class OutputError(ValueError):
+    """A result would take the place of what it is made of."""
+
+
+def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Any]) -> None:
+    """Refuse outputs that are inputs, too; what is no path of a file is passed over.
+
+    Raises
+    ------
+    OutputError
+    """
+    given = {Path(name).resolve() for name in inputs if isinstance(name, str | Path)}
+    for out in outputs:
+        if out is not None and out.resolve() in given:
+            raise OutputError(f"{out}: is an input, too; choose another name")
 
 
 def scene_module(name: str) -> ModuleType:

@@ -27,6 +27,7 @@ from psfdae.stages.calibration_stars import (
     write_selection,
     write_stars,
 )
+from psfdae.stages.common import check_outputs
 from psfdae.stars.from_observation import star_grid
 from psfdae.stars.splits import held_out_fields
 
@@ -84,6 +85,12 @@ class Folder:
     path: Path
     name: str
 
+    def written(self) -> list[Path]:
+        """Files of the folder itself."""
+        names = ("selection.csv", "overrides.txt", "evaluation.csv", "per_star.parquet")
+        more = ("report.csv", "report.png")
+        return [self.stars, self.pca_som, self.bundle, *(self.path / n for n in (*names, *more))]
+
     @property
     def stars(self) -> Path:
         return self.path / "stars.h5"
@@ -132,16 +139,18 @@ def run(
 
     Raises
     ------
-    ObservationError, CalibrationStarsError, BundleError, TrainingError
+    ObservationError, CalibrationStarsError, BundleError, TrainingError, OutputError
     FolderError
         If the folder holds a model that may not be replaced, or another process is
         making one there.
     """
+    files = Folder(out, name)
+    check_outputs(files.written(), (exposure.path, exposure.catalogue, exposure.mask))
     with _alone(out):
         finished = sorted(out.glob(f"*{SUFFIX}"))
         if finished and not overwrite:
             raise FolderError(f"{finished[0]}: a model is there already; --overwrite replaces it")
-        _run(config, exposure, Folder(out, name), licence, say)
+        _run(config, exposure, files, licence, say)
 
 
 @contextmanager

@@ -18,9 +18,10 @@ from psfdae.prediction.photometry import Known
 from psfdae.prediction.results import Stars
 from psfdae.prediction.stream import in_order
 from psfdae.prediction.writer import Card, writing
+from psfdae.stages.common import check_outputs
 
 ROWS = 4 * BLOCK
-"""Stars that are read and written at a time."""
+"""Stars that are read and written at a time, fewer if their stamps are large."""
 
 MARGIN_PX = 2
 """Pixels by which a star of an image may be moved to centre it."""
@@ -111,10 +112,11 @@ def run(
 
     Raises
     ------
-    PredictionError, ObservationError, BundleError
+    PredictionError, ObservationError, BundleError, OutputError
         In one line that names the file.
     """
-    _check_targets(source, out, plot, overwrite)
+    check_outputs((out, plot), (source.path, source.catalogue, source.mask, model))
+    _check_targets(out, plot, overwrite)
     loaded = load_model(model)
     observation = source.open(loaded.info.stamp_px)
     loaded.check_scale(observation.pixel_scale_arcsec, str(source.path))
@@ -130,14 +132,10 @@ def run(
     return summary
 
 
-def _check_targets(source: Source, out: Path, plot: Path | None, overwrite: bool) -> None:
-    given = (source.path, source.catalogue, source.mask)
-    inputs = [Path(name) for name in given if isinstance(name, str | Path)]
+def _check_targets(out: Path, plot: Path | None, overwrite: bool) -> None:
     for target in (out, plot):
         if target is None:
             continue
-        if any(target.resolve() == path.resolve() for path in inputs):
-            raise PredictionError(f"{target}: is an input, too; choose another name")
         if target.is_dir():
             raise PredictionError(f"{target}: is a folder, not a file")
         if target.exists() and not overwrite:
@@ -157,7 +155,7 @@ def _predict(
 ) -> Summary:
     from psfdae.prediction import StarFlag
 
-    chunks = observation.chunks(ROWS)
+    chunks = observation.chunks(min(ROWS, 4 * model.engine.size))
     first = next(chunks)
     known = _Known(source, observation)
     counts = np.zeros(len(StarFlag), dtype=int)
@@ -179,8 +177,7 @@ def _predict(
 
 
 def _blocks(model: PsfModel, stars: Stars) -> Prediction:
-    parts = (stars.part(slice(start, start + BLOCK)) for start in range(0, len(stars), BLOCK))
-    return Prediction.joined([model.engine.block(part) for part in parts])
+    return Prediction.joined([model.engine.block(part) for part in model.engine.blocks(stars)])
 
 
 class _Known:

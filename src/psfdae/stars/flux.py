@@ -83,12 +83,14 @@ class FluxModel:
     ----------
     mean : ndarray, shape (P,)
         Mean PSF, sum 1.
-    basis : ndarray, shape (P, P)
-        Eigenvectors of the covariance, columns.
-    variance : ndarray, shape (P,)
+    basis : ndarray, shape (P, K)
+        Eigenvectors of the covariance, columns; K = P, or fewer for large stamps.
+    variance : ndarray, shape (K,)
         Eigenvalues.
     low, high : ndarray, shape (P,)
         Least and greatest value of every pixel in the set.
+    rest : float
+        Variance along all directions that `basis` leaves out.
     """
 
     mean: np.ndarray
@@ -96,6 +98,12 @@ class FluxModel:
     variance: np.ndarray
     low: np.ndarray
     high: np.ndarray
+    rest: float = 0.0
+
+    @property
+    def whole(self) -> bool:
+        """The basis leaves no direction out."""
+        return self.basis.shape[1] >= self.mean.size
 
     @classmethod
     def fit(cls, images: np.ndarray) -> FluxModel:
@@ -313,7 +321,8 @@ def _generalised_least_squares(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """One fit with S = prior·C + σ²I over the used pixels of every star.
 
-    In the eigenbasis of C all stars are solved at once. Unused pixels get the
+    In the eigenbasis of C all stars are solved at once; directions without an
+    eigenvector of their own share one weight, S⁻¹ = B (w − w₀) Bᵀ + w₀. Unused pixels get the
     values at which they carry no weight, S⁻¹x = 0 there; the sums over all pixels
     are then those over the used ones.
 
@@ -325,21 +334,25 @@ def _generalised_least_squares(
     repaired : ndarray, shape (n, P)
         Stamps with the unused pixels at their conditional expectation.
     """
-    weight = 1.0 / (prior[:, None] * model.variance + sigma[:, None] ** 2)
-    precision = weight @ (model.basis**2).T
+    common = 0.0 * sigma if model.whole else 1.0 / (prior * model.rest + sigma**2)
+    weight = 1.0 / (prior[:, None] * model.variance + sigma[:, None] ** 2) - common[:, None]
+    precision = weight @ (model.basis**2).T + common[:, None]
     data = np.where(used, x, 0.0)
     mean = np.where(used, model.mean, 0.0)
     for star in np.flatnonzero(~used.all(axis=1)):
         bad = np.flatnonzero(~used[star])
         columns = (model.basis * weight[star]) @ model.basis[bad].T
+        columns[bad, np.arange(bad.size)] += common[star]
         gain = columns @ np.linalg.inv(columns[bad])
         data[star, bad] = -data[star] @ gain
         mean[star, bad] = -mean[star] @ gain
         precision[star] -= (gain * columns).sum(axis=1)
     data_modes, mean_modes = data @ model.basis, mean @ model.basis
-    information = (mean_modes**2 * weight).sum(axis=1)
-    flux = (mean_modes * data_modes * weight).sum(axis=1) / information
+    information = (mean_modes**2 * weight).sum(axis=1) + common * (mean**2).sum(axis=1)
+    signal = (mean_modes * data_modes * weight).sum(axis=1) + common * (mean * data).sum(axis=1)
+    flux = signal / information
     residual = ((data_modes - flux[:, None] * mean_modes) * weight) @ model.basis.T
+    residual += common[:, None] * (data - flux[:, None] * mean)
     score = np.abs(residual) / np.sqrt(np.where(used, precision, 1.0))
     repaired = np.where(used, x, data + flux[:, None] * (model.mean - mean))
     return flux, 1.0 / np.sqrt(information), score, repaired
