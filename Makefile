@@ -18,6 +18,12 @@ PORT ?= 5000
 VENV := $(CURDIR)/.venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --no-input
+# Hashed files only; what has no wheel is built with the pinned tools of build.lock.
+LOCKED := $(PIP) install --quiet --require-hashes --no-build-isolation
+TORCH = $(shell sed -nE 's/^ *"(torch==[^"]+)",/\1/p' pyproject.toml)
+TORCH_CPU := https://download.pytorch.org/whl/cpu
+COMPILE := uv pip compile --quiet --upgrade --universal --python-version 3.11 --generate-hashes \
+  --no-header --no-annotate
 export PATH := $(BIN):$(PATH)
 export PYTHONUNBUFFERED := 1
 export MLFLOW_DISABLE_TELEMETRY := true
@@ -43,12 +49,13 @@ help: ## List the targets
 
 env: $(VENV)/.complete ## Create the environment .venv from the lock file
 
-$(VENV)/.complete: requirements.lock pyproject.toml
+$(VENV)/.complete: requirements.lock requirements/build.lock requirements/torch.lock pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit("psfdae needs Python 3.11 or newer" if sys.version_info < (3, 11) else 0)'
 	$(PYTHON) -m venv $(VENV)
-	$(PIP) install --quiet --require-hashes --no-deps --requirement requirements.lock
-	$(PIP) install --quiet $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) "$$(sed -nE 's/^ *"(torch==[^"]+)",/\1/p' pyproject.toml)"
-	$(PIP) install --quiet --no-deps --no-build-isolation --editable .
+	$(LOCKED) --no-deps --requirement requirements/build.lock
+	$(LOCKED) --no-deps --requirement requirements.lock
+	$(LOCKED) $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) --constraint requirements/torch.lock '$(TORCH)'
+	$(PIP) install --quiet --no-index --no-deps --no-build-isolation --editable .
 	touch $@
 
 reproduce: env ## Build everything of the preset: datasets, models, tables, report
@@ -103,10 +110,17 @@ test: lint ## Lint, unit tests and the smoke workflow
 test-all: test ## The tests, then the slow ones
 	pytest -m slow
 
-lock: env ## Renew requirements.lock from pyproject.toml
-	uv pip compile --quiet --upgrade --universal --python-version 3.11 --generate-hashes \
-	  --no-header --no-annotate --extra dev --overrides requirements/no-torch.txt \
+lock: env ## Renew the lock files from pyproject.toml
+	$(COMPILE) --extra dev --overrides requirements/no-torch.txt \
 	  pyproject.toml requirements/torch-runtime.in --output-file requirements.lock
+	$(COMPILE) --constraints requirements.lock \
+	  requirements/build.in --output-file requirements/build.lock
+	@grep -q '^$(TORCH)+cpu ' requirements/torch-cpu.lock || echo '$(TORCH)' | $(COMPILE) --no-deps \
+	  --default-index $(TORCH_CPU) - --output-file requirements/torch-cpu.lock
+	echo '$(TORCH)' | $(COMPILE) --constraints requirements.lock \
+	  - --output-file requirements/torch.lock
+	sed -nE 's/^( *--hash=[^ ]+).*/\1 \\/p' requirements/torch-cpu.lock \
+	  | sed -i '/^torch==/r /dev/stdin' requirements/torch.lock
 
 clean: ## Remove results (but not results/reference) and Snakemake's memory of them
 	find results -mindepth 1 -maxdepth 1 ! -name reference -exec rm -rf {} + 2>/dev/null || true
