@@ -111,12 +111,12 @@ test-all: test ## The tests, then the slow ones
 	pytest -m slow
 
 lock: env ## Renew the lock files from pyproject.toml
+	@grep -q '^$(TORCH)+cpu ' requirements/torch-cpu.lock || echo '$(TORCH)' | $(COMPILE) --no-deps \
+	  --default-index $(TORCH_CPU) - --output-file requirements/torch-cpu.lock
 	$(COMPILE) --extra dev --overrides requirements/no-torch.txt \
 	  pyproject.toml requirements/torch-runtime.in --output-file requirements.lock
 	$(COMPILE) --constraints requirements.lock \
 	  requirements/build.in --output-file requirements/build.lock
-	@grep -q '^$(TORCH)+cpu ' requirements/torch-cpu.lock || echo '$(TORCH)' | $(COMPILE) --no-deps \
-	  --default-index $(TORCH_CPU) - --output-file requirements/torch-cpu.lock
 	echo '$(TORCH)' | $(COMPILE) --constraints requirements.lock \
 	  - --output-file requirements/torch.lock
 	sed -nE 's/^( *--hash=[^ ]+).*/\1 \\/p' requirements/torch-cpu.lock \
