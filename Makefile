@@ -21,6 +21,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --no-input
 # Hashed files only; what has no wheel is built with the pinned tools of build.lock.
 LOCKED := $(PIP) install --quiet --require-hashes --no-build-isolation
 TORCH = $(shell sed -nE 's/^ *"(torch==[^"]+)",/\1/p' pyproject.toml)
+FROM = $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX))
 TORCH_CPU := https://download.pytorch.org/whl/cpu
 COMPILE := uv pip compile --quiet --upgrade --universal --python-version 3.11 --generate-hashes \
   --no-header --no-annotate
@@ -49,12 +50,13 @@ help: ## List the targets
 
 env: $(VENV)/.complete ## Create the environment .venv from the lock file
 
-$(VENV)/.complete: requirements.lock requirements/build.lock requirements/torch.lock pyproject.toml
+$(VENV)/.complete: requirements.lock $(wildcard requirements/*.lock) pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit("psfdae needs Python 3.11 or newer" if sys.version_info < (3, 11) else 0)'
 	$(PYTHON) -m venv $(VENV)
 	$(LOCKED) --no-deps --requirement requirements/build.lock
 	$(LOCKED) --no-deps --requirement requirements.lock
-	$(LOCKED) $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) --constraint requirements/torch.lock '$(TORCH)'
+	@$(PIP) index versions torch $(FROM) | grep -F '$(TORCH:torch==%=%)+cpu' >/dev/null && lock=torch-cpu || lock=torch; \
+	set -x; $(LOCKED) $(FROM) --constraint requirements/$$lock.lock '$(TORCH)'
 	$(PIP) install --quiet --no-index --no-deps --no-build-isolation --editable .
 	touch $@
 
@@ -119,8 +121,6 @@ lock: env ## Renew the lock files from pyproject.toml
 	  requirements/build.in --output-file requirements/build.lock
 	echo '$(TORCH)' | $(COMPILE) --constraints requirements.lock \
 	  - --output-file requirements/torch.lock
-	sed -nE 's/^( *--hash=[^ ]+).*/\1 \\/p' requirements/torch-cpu.lock \
-	  | sed -i '/^torch==/r /dev/stdin' requirements/torch.lock
 
 clean: ## Remove results (but not results/reference) and Snakemake's memory of them
 	find results -mindepth 1 -maxdepth 1 ! -name reference -exec rm -rf {} + 2>/dev/null || true
