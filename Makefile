@@ -20,7 +20,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --no-input
 # Hashed files only; what has no wheel is built with the pinned tools of build.lock.
 LOCKED := $(PIP) install --quiet --require-hashes --no-build-isolation
-TORCH = $(shell sed -nE 's/^ *"(torch==[^"]+)",/\1/p' pyproject.toml)
+TORCH = $(shell sed -nE 's/^ *"torch==([^"]+)",/\1/p' pyproject.toml)
 FROM = $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX))
 TORCH_CPU := https://download.pytorch.org/whl/cpu
 COMPILE := uv pip compile --quiet --upgrade --universal --python-version 3.11 --generate-hashes \
@@ -55,8 +55,8 @@ $(VENV)/.complete: requirements.lock $(wildcard requirements/*.lock) pyproject.t
 	$(PYTHON) -m venv $(VENV)
 	$(LOCKED) --no-deps --requirement requirements/build.lock
 	$(LOCKED) --no-deps --requirement requirements.lock
-	@$(PIP) index versions torch $(FROM) | grep -F '$(TORCH:torch==%=%)+cpu' >/dev/null && lock=torch-cpu || lock=torch; \
-	set -x; $(LOCKED) $(FROM) --constraint requirements/$$lock.lock '$(TORCH)'
+	@$(PIP) index versions torch $(FROM) | grep -F '$(TORCH)+cpu' >/dev/null && lock=torch-cpu || lock=torch; \
+	set -x; $(LOCKED) $(FROM) --constraint requirements/$$lock.lock torch==$(TORCH)
 	$(PIP) install --quiet --no-index --no-deps --no-build-isolation --editable .
 	touch $@
 
@@ -113,13 +113,13 @@ test-all: test ## The tests, then the slow ones
 	pytest -m slow
 
 lock: env ## Renew the lock files from pyproject.toml
-	@grep -q '^$(TORCH)+cpu ' requirements/torch-cpu.lock || echo '$(TORCH)' | $(COMPILE) --no-deps \
+	@grep -q '^torch==$(TORCH)+cpu ' requirements/torch-cpu.lock || echo torch==$(TORCH) | $(COMPILE) --no-deps \
 	  --default-index $(TORCH_CPU) - --output-file requirements/torch-cpu.lock
 	$(COMPILE) --extra dev --overrides requirements/no-torch.txt \
 	  pyproject.toml requirements/torch-runtime.in --output-file requirements.lock
 	$(COMPILE) --constraints requirements.lock \
 	  requirements/build.in --output-file requirements/build.lock
-	echo '$(TORCH)' | $(COMPILE) --constraints requirements.lock \
+	echo torch==$(TORCH) | $(COMPILE) --constraints requirements.lock \
 	  - --output-file requirements/torch.lock
 
 clean: ## Remove results (but not results/reference) and Snakemake's memory of them

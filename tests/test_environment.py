@@ -137,7 +137,7 @@ def test_every_locked_requirement_has_a_hash(path):
 
 
 @pytest.mark.parametrize("index", ["", "https://example.org/cpu"])
-def test_make_env_installs_nothing_without_a_hash(index):
+def test_make_env_installs_nothing_without_a_hash(index, declared):
     line = ["make", "--dry-run", "--assume-new=pyproject.toml", "env", f"TORCH_INDEX={index}"]
     shown = subprocess.check_output(line, cwd=ROOT, text=True)
     installs = [step for step in shown.splitlines() if " pip " in step and " install " in step]
@@ -147,3 +147,6 @@ def test_make_env_installs_nothing_without_a_hash(index):
     assert [step for step in installs if "--index-url" in step] == [
         step for step in installs if index and "torch==" in step
     ]
+    pin = str(declared["torch"].specifier)
+    assert f"grep -F '{pin[2:]}+cpu'" in shown
+    assert installs[-2].endswith(f"requirements/$lock.lock torch{pin}")
