@@ -17,6 +17,12 @@ PORT ?= 5000
 
 VENV := .venv
 PIP := $(VENV)/bin/python -m pip --disable-pip-version-check --no-input
+# Hashed files only; what has no wheel is built with the pinned tools of build.lock.
+HASHED := $(PIP) install --quiet --require-hashes --no-build-isolation
+TORCH = $(shell sed -nE 's/^ *"torch==([^"]+)",/\1/p' pyproject.toml)
+FROM = $(if $(TORCH_INDEX),--index-url "$$TORCH_INDEX")
+COMPILE := uv pip compile --quiet --upgrade --universal --python-version 3.11 --generate-hashes \
+  --no-header --no-annotate
 export PATH := $(CURDIR)/$(VENV)/bin:$(PATH)
 export PYTHONUNBUFFERED := 1
 export MLFLOW_DISABLE_TELEMETRY := true
@@ -57,12 +63,14 @@ help: ## List the targets
 
 env: $(VENV)/.complete ## Create the environment .venv from the lock file
 
-$(VENV)/.complete: requirements.lock pyproject.toml
+$(VENV)/.complete: requirements.lock $(wildcard requirements/*.lock) pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit("psfdae needs Python 3.11 or newer" if sys.version_info < (3, 11) else 0)'
 	$(PYTHON) -m venv $(VENV)
-	$(PIP) install --quiet --require-hashes --no-deps --requirement requirements.lock
-	$(PIP) install --quiet $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) "$$(sed -nE 's/^ *"(torch==[^"]+)",/\1/p' pyproject.toml)"
-	$(PIP) install --quiet --no-deps --no-build-isolation --editable .
+	$(HASHED) --no-deps --requirement requirements/build.lock
+	$(HASHED) --no-deps --requirement requirements.lock
+	@$(PIP) index versions torch $(FROM) | grep -F '$(TORCH)+cpu' >/dev/null && lock=torch-cpu || lock=torch; \
+	set -x; $(HASHED) $(FROM) --constraint requirements/$$lock.lock torch==$(TORCH)
+	$(PIP) install --quiet --no-index --no-deps --no-build-isolation --editable .
 	touch $@
 
 reproduce: env ## Build everything of the preset: datasets, models, tables, report
@@ -120,10 +128,15 @@ test: lint ## Lint, unit tests and the smoke workflow
 test-all: test ## The tests, then the slow ones
 	pytest -m slow
 
-lock: env ## Renew requirements.lock from pyproject.toml
-	uv pip compile --quiet --upgrade --universal --python-version 3.11 --generate-hashes \
-	  --no-header --no-annotate --extra dev --overrides requirements/no-torch.txt \
+lock: env ## Renew the lock files from pyproject.toml; torch's CPU builds from TORCH_INDEX
+	$(if $(TORCH_INDEX),echo torch==$(TORCH) | $(COMPILE) --no-deps --default-index "$$TORCH_INDEX" \
+	  - --output-file requirements/torch-cpu.lock)
+	$(COMPILE) --extra dev --overrides requirements/no-torch.txt \
 	  pyproject.toml requirements/torch-runtime.in --output-file requirements.lock
+	$(COMPILE) --constraints requirements.lock \
+	  requirements/build.in --output-file requirements/build.lock
+	echo torch==$(TORCH) | $(COMPILE) --constraints requirements.lock \
+	  - --output-file requirements/torch.lock
 
 clean: ## Remove results (but not results/reference) and Snakemake's memory of them
 	find results -mindepth 1 -maxdepth 1 ! -name reference -exec rm -rf {} + 2>/dev/null || true

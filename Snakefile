@@ -8,6 +8,7 @@ min_version("9.0")
 report: "workflow/report/workflow.rst"
 
 
+# By tag: its digest has not been read from the registry. `docker buildx imagetools inspect` shows it.
 container: "docker://condaforge/miniforge3:25.3.1-0"
 
 

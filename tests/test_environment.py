@@ -1,9 +1,13 @@
-"""The conda environment, the lock file and pyproject.toml say the same."""
+"""The conda environment, the lock files and pyproject.toml say the same, and pip takes them."""
 
 from __future__ import annotations
 
+import os
 import re
+import subprocess
+import sys
 import tomllib
+from collections import defaultdict
 from importlib.metadata import version
 from pathlib import Path
 
@@ -18,6 +22,17 @@ CONDA_NAMES = {
     "snakemake-minimal": "snakemake",
     "matplotlib-base": "matplotlib",
 }
+CONDA_ONLY = {"pip", "python", "numba"}
+LOCKS = ["requirements.lock", *(f"requirements/{n}.lock" for n in ("build", "torch", "torch-cpu"))]
+
+# Stands in for python: notes what it is asked, and offers versions of torch.
+RECORDER = """#!/bin/sh
+echo "$*" >>"$LOG"
+case "$*" in
+"-m venv "*) mkdir -p "$3/bin" && cp "$0" "$3/bin/python" ;;
+*" index versions torch"*) echo "Available versions: $OFFERED" ;;
+esac
+"""
 
 
 @pytest.fixture(scope="module")
@@ -33,21 +48,28 @@ def conda():
 
 
 @pytest.fixture(scope="module")
-def locked():
-    pins = re.findall(
-        r"^([A-Za-z0-9_.-]+)==([^ ;\\]+)", (ROOT / "requirements.lock").read_text(), re.M
-    )
-    return {canonicalize_name(name): pin for name, pin in pins}
+def pip_part(conda):
+    return next(part["pip"] for part in conda["dependencies"] if isinstance(part, dict))
 
 
-def test_conda_requires_what_pyproject_requires(declared, conda):
-    requirements = [Requirement(line) for line in conda["dependencies"] if isinstance(line, str)]
-    ours = {CONDA_NAMES.get(r.name, r.name): r.specifier for r in requirements}
-    del ours["pip"]
-    python = ours.pop("python")
+def locked(path):
+    """Versions and hashes of each package of a lock file; versions differ between Pythons."""
+    versions, hashes = defaultdict(set), defaultdict(set)
+    text = re.sub(r"^#.*\n", "", (ROOT / path).read_text(), flags=re.M)
+    for block in re.split(r"\n(?=[^ ])", text.strip()):
+        name, pin = re.match(r"([A-Za-z0-9_.-]+)==([^ ;]+)", block).groups()
+        versions[canonicalize_name(name)].add(pin)
+        hashes[canonicalize_name(name)] |= set(re.findall(r"--hash=sha256:([0-9a-f]{64})\b", block))
+    return versions, hashes
+
+
+def test_conda_requires_what_pyproject_requires(declared, conda, pip_part):
+    lines = [line for line in conda["dependencies"] if isinstance(line, str)]
+    lines += [line for line in pip_part if line != "--editable ."]
+    ours = {CONDA_NAMES.get(r.name, r.name): r.specifier for r in map(Requirement, lines)}
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    assert str(python) == project["requires-python"]
-    assert {canonicalize_name(n): s for n, s in ours.items()} == {
+    assert str(ours["python"]) == project["requires-python"]
+    assert {canonicalize_name(n): s for n, s in ours.items() if n not in CONDA_ONLY} == {
         n: r.specifier for n, r in declared.items()
     }
 
@@ -56,10 +78,35 @@ def test_conda_channels(conda):
     assert conda["channels"] == ["conda-forge", "bioconda", "nodefaults"]
 
 
-def test_lock_satisfies_pyproject(declared, locked):
+@pytest.mark.slow
+def test_pip_takes_the_pip_part_as_conda_hands_it_over(pip_part, tmp_path):
+    """conda joins the lines to a requirements file and runs pip beside environment.yml."""
+    python = tmp_path / "venv" / "bin" / "python"
+    env = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "VIRTUAL_ENV")}
+
+    def pip(*args):
+        line = [python, "-m", "pip", "install", "--quiet", "--no-deps", *args]
+        done = subprocess.run(line, cwd=ROOT, env=env, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+
+    subprocess.run([sys.executable, "-m", "venv", tmp_path / "venv"], env=env, check=True)
+    pip("--require-hashes", "--requirement", "requirements/build.lock")
+    requirements = tmp_path / "condaenv.requirements.txt"
+    requirements.write_text("\n".join(pip_part))
+    pip("--upgrade", "--no-build-isolation", "--requirement", requirements)
+    found = (
+        "import importlib.util as u; print(*(u.find_spec(n).origin for n in ('psfdae', 'aotools')))"
+    )
+    shown = subprocess.check_output([python, "-I", "-c", found], text=True, env=env).split()
+    assert shown[0] == str(ROOT / "src" / "psfdae" / "__init__.py")
+    assert Path(shown[1]).is_relative_to(tmp_path)
+
+
+def test_lock_satisfies_pyproject(declared):
+    versions, _ = locked("requirements.lock")
     for name, requirement in declared.items():
         if name != "torch":
-            assert requirement.specifier.contains(locked[name]), name
+            assert all(map(requirement.specifier.contains, versions[name])), name
 
 
 def test_installed_versions_satisfy_pyproject(declared):
@@ -67,13 +114,58 @@ def test_installed_versions_satisfy_pyproject(declared):
         assert requirement.specifier.contains(version(name), prereleases=True), name
 
 
-def test_torch_is_pinned_outside_the_hashed_lock(declared, locked):
-    assert re.fullmatch(r"==[0-9.]+", str(declared["torch"].specifier))
-    assert "torch" not in locked
-    assert not [name for name in locked if name.startswith("nvidia")]
+def test_torch_and_cuda_are_locked_apart(declared):
+    pin = str(declared["torch"].specifier)
+    assert re.fullmatch(r"==[0-9.]+", pin)
+    apart = locked("requirements/torch.lock")[0]
+    cpu = locked("requirements/torch-cpu.lock")[0]
+    assert apart["torch"] == {pin[2:]}
+    assert cpu["torch"] - apart["torch"] == {f"{pin[2:]}+cpu"}
+    assert any(name.startswith("nvidia") for name in apart)
+    everyone = locked("requirements.lock")[0]
+    assert not [name for name in everyone if name == "torch" or name.startswith("nvidia")]
 
 
-def test_every_locked_requirement_has_a_hash():
-    text = (ROOT / "requirements.lock").read_text()
-    blocks = re.split(r"\n(?=[A-Za-z0-9])", text.strip())
-    assert all("--hash=sha256:" in block for block in blocks if "==" in block)
+@pytest.mark.parametrize("path", ["requirements/build.lock", "requirements/torch.lock"])
+def test_locks_agree_on_what_they_share(path):
+    versions, everyone = locked(path)[0], locked("requirements.lock")[0]
+    shared = versions.keys() & everyone.keys()
+    assert len(shared) > 3
+    assert {n: versions[n] for n in shared} == {n: everyone[n] for n in shared}
+
+
+def test_build_tools_are_locked():
+    assert locked("requirements/build.lock")[0].keys() >= {"pip", "setuptools", "hatchling"}
+
+
+@pytest.mark.parametrize("path", LOCKS)
+def test_every_locked_requirement_has_a_hash(path):
+    versions, hashes = locked(path)
+    assert versions
+    assert [name for name in versions if not hashes[name]] == []
+
+
+@pytest.mark.parametrize(
+    ("index", "offered", "lock"),
+    [
+        ("", "2.99.0, {pin}", "torch"),
+        ("", "2.99.0, {pin}+cpu, {pin}", "torch-cpu"),
+        ("https://example.org/cpu", "{pin}+cpu", "torch-cpu"),
+    ],
+)
+def test_make_env_installs_nothing_without_a_hash(index, offered, lock, declared, tmp_path):
+    pin = str(declared["torch"].specifier)[2:]
+    python = tmp_path / "python"
+    python.write_text(RECORDER)
+    python.chmod(0o755)
+    line = ["make", "env", f"PYTHON={python}", f"VENV={tmp_path / 'venv'}", f"TORCH_INDEX={index}"]
+    env = {"OFFERED": offered.format(pin=pin), "LOG": str(tmp_path / "log"), "MAKEFLAGS": ""}
+    subprocess.run(line, cwd=ROOT, env=os.environ | env, check=True, capture_output=True)
+    installs = [step for step in Path(env["LOG"]).read_text().splitlines() if " install " in step]
+    assert len(installs) > 3
+    assert all("--require-hashes" in step or "--no-index" in step for step in installs), installs
+    assert all("--no-build-isolation" in step for step in installs), installs
+    torch = next(step for step in installs if "torch==" in step)
+    assert torch.endswith(f" --constraint requirements/{lock}.lock torch=={pin}")
+    assert [step for step in installs if "--index-url" in step] == ([torch] if index else [])
+    assert not index or f"--index-url {index} " in torch
