@@ -1,0 +1,372 @@
+"""Mutants of the science: do the fast tests notice a wrong sign, factor or limit?
+
+    python tests/mutants.py run [WORD …]    mutate a private copy of the package, one by one
+    python tests/mutants.py draw            draw the list of random mutants anew
+
+`mutants.csv` names every mutant by its function, a fragment of the code and which
+occurrence of the fragment in the function it is, so that code may move to another
+module. A fragment that is no longer there is an error that names it; whoever changes
+the line writes the mutant's new text into the list.
+
+`run` first runs the fast tests once, noting which test calls which function. A mutant
+then meets the tests that call its function, quickest first, and if it lives the rest.
+It takes hours; words select mutants whose row holds one of them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import copy
+import csv
+import json
+import os
+import random
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+LIST = Path(__file__).with_suffix(".csv")
+SEED, DRAWN = 13, 40
+SCIENCE = [
+    *("alignment", "bounds", "models", "optics", "stars"),
+    *(f"bundle/{name}.py" for name in ("measure", "statistics")),
+    *(f"evaluation/{name}.py" for name in ("calibration", "comparison", "correlation", "metrics")),
+    *(f"observations/{name}.py" for name in ("cutting", "sky")),
+    *(f"prediction/{name}.py" for name in ("border", "centring", "photometry", "shapes")),
+]
+"""Where the random mutants were drawn from; no matter once they are drawn."""
+
+FAST = "not slow and not workflow"
+MEMORY = 8 * 2**30
+FUNCTION = (ast.FunctionDef, ast.AsyncFunctionDef)
+SWAPPED = {
+    **{ast.Add: [ast.Sub], ast.Sub: [ast.Add], ast.Mult: [ast.Div], ast.Div: [ast.Mult]},
+    **{ast.FloorDiv: [ast.Mult], ast.Mod: [ast.FloorDiv], ast.Pow: [ast.Mult]},
+    **{ast.BitAnd: [ast.BitOr], ast.BitOr: [ast.BitAnd], ast.And: [ast.Or], ast.Or: [ast.And]},
+    **{ast.Lt: [ast.LtE, ast.GtE], ast.LtE: [ast.Lt, ast.Gt], ast.Eq: [ast.NotEq]},
+    **{ast.Gt: [ast.GtE, ast.LtE], ast.GtE: [ast.Gt, ast.Lt], ast.NotEq: [ast.Eq]},
+    **{ast.Is: [ast.IsNot], ast.IsNot: [ast.Is], ast.In: [ast.NotIn], ast.NotIn: [ast.In]},
+}
+Units = dict[str, dict[Path, list[ast.AST]]]
+"""Functions, methods, classes without their methods and constants by name and file."""
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """A row of the list; `equivalent` is the reason why no test can notice it, if there is one."""
+
+    function: str
+    original: str
+    mutated: str
+    occurrence: int
+    source: str
+    equivalent: str
+
+
+class LostError(LookupError):
+    """A mutant's fragment is not in the code."""
+
+
+def read_list() -> list[Mutant]:
+    with LIST.open(encoding="utf-8", newline="") as file:
+        return [Mutant(**{**row, "occurrence": int(row["occurrence"])}) for row in csv.DictReader(file)]
+
+
+def write_list(mutants: list[Mutant]) -> None:
+    with LIST.open("w", encoding="utf-8", newline="") as file:
+        out = csv.DictWriter(file, [field.name for field in fields(Mutant)], lineterminator="\n")
+        out.writeheader()
+        out.writerows(asdict(mutant) for mutant in mutants)
+
+
+def named_parts(tree: ast.Module) -> Iterator[tuple[str, ast.AST]]:
+    for node in tree.body:
+        if isinstance(node, FUNCTION):
+            yield node.name, node
+        elif isinstance(node, ast.ClassDef):
+            for part in node.body:
+                method = isinstance(part, FUNCTION)
+                yield (f"{node.name}.{part.name}" if method else node.name), part
+        elif isinstance(node, ast.Assign | ast.AnnAssign):
+            yield ast.unparse(node.targets[0] if isinstance(node, ast.Assign) else node.target), node
+
+
+def units_of(package: Path) -> Units:
+    units: Units = {}
+    for path in sorted(package.rglob("*.py")):
+        for name, part in named_parts(ast.parse(path.read_text(encoding="utf-8"))):
+            units.setdefault(name, {}).setdefault(path, []).append(part)
+    return units
+
+
+def matches(parts: list[ast.AST], fragment: str) -> list[ast.AST]:
+    """Nodes that read like a fragment, an expression or a statement, in the order of the code."""
+    wanted = ast.parse(fragment).body[0]
+    text = ast.dump(wanted.value if isinstance(wanted, ast.Expr) else wanted)
+    found = [node for part in parts for node in ast.walk(part) if ast.dump(node) == text]
+    return sorted(found, key=lambda node: (node.lineno, node.col_offset))
+
+
+def find(units: Units, mutant: Mutant) -> tuple[Path, ast.AST]:
+    """File and node of a mutant."""
+    found = [
+        (path, nodes[mutant.occurrence])
+        for path, parts in units.get(mutant.function, {}).items()
+        if len(nodes := matches(parts, mutant.original)) > mutant.occurrence
+    ]
+    if len(found) != 1:
+        where = "nowhere" if not found else f"in {len(found)} files"
+        raise LostError(f"{mutant.function}: {mutant.original!r} ({mutant.occurrence}) is {where}")
+    return found[0]
+
+
+def apply(path: Path, node: ast.AST, mutated: str) -> str:
+    """The file with the node replaced."""
+    lines = path.read_bytes().splitlines(keepends=True)
+    begin = sum(map(len, lines[: node.lineno - 1])) + node.col_offset
+    end = sum(map(len, lines[: node.end_lineno - 1])) + node.end_col_offset
+    new = mutated if isinstance(node, ast.stmt) else f"({mutated})"
+    whole = b"".join(lines)
+    text = (whole[:begin] + new.encode() + whole[end:]).decode()
+    ast.parse(text)
+    return text
+
+
+def changes(node: ast.AST, rng: random.Random) -> ast.AST | None:
+    """A node with one operator or number changed; None if it has none of its own."""
+    new = copy.deepcopy(node)
+    if isinstance(node, ast.BinOp) and isinstance(node.op, ast.MatMult):
+        new.left, new.right = new.right, new.left
+    elif isinstance(node, ast.BinOp | ast.BoolOp | ast.AugAssign) and type(node.op) in SWAPPED:
+        new.op = rng.choice(SWAPPED[type(node.op)])()
+    elif isinstance(node, ast.Compare):
+        new.ops[0] = rng.choice(SWAPPED[type(node.ops[0])])()
+    elif isinstance(node, ast.UnaryOp):
+        return new.operand
+    elif isinstance(node, ast.Constant) and type(node.value) in (int, float):
+        step = node.value + rng.choice((-1, 1))
+        factor = (node.value or 1.0) * rng.choice((0.5, 2.0))
+        new.value = step if isinstance(node.value, int) else factor
+    else:
+        return None
+    return None if ast.dump(new) == ast.dump(node) else new
+
+
+def places(node: ast.AST, around: ast.AST | None = None) -> Iterator[tuple[ast.AST, ast.AST]]:
+    """Nodes of code that computes, each with the expression that tells where it is."""
+    telling = (ast.BinOp, ast.Call, ast.Subscript, ast.Compare, ast.BoolOp, ast.AugAssign)
+    if isinstance(node, ast.Raise | ast.JoinedStr):
+        return
+    around = node if isinstance(node, telling) or around is None else around
+    yield node, node if isinstance(node, ast.UnaryOp) else around
+    for name, value in ast.iter_fields(node):
+        if name in ("annotation", "returns", "decorator_list"):
+            continue
+        for child in value if isinstance(value, list) else [value]:
+            if isinstance(child, ast.AST):
+                inside = isinstance(node, ast.expr | ast.keyword | ast.comprehension | ast.AugAssign)
+                yield from places(child, around if inside else None)
+
+
+def draw(count: int) -> list[Mutant]:
+    """Random mutants of the science modules."""
+    package = ROOT / "src" / "psfdae"
+    units = units_of(package)
+    science = [package / name for name in SCIENCE]
+    rng = random.Random(SEED)
+    able = [
+        (name, path, node, around)
+        for name in sorted(units)
+        for path, parts in units[name].items()
+        if any(path.is_relative_to(folder) for folder in science)
+        for part in parts
+        for node, around in places(part)
+        if changes(node, random.Random(0))
+    ]
+    print(f"{count} of {len(able)} operators and numbers")
+    drawn = []
+    for name, path, node, around in rng.sample(able, count):
+        original = ast.unparse(around)
+        nodes = matches(units[name][path], original)
+        new = Swap([*ast.walk(around)].index(node), changes(node, rng)).of(around)
+        mutant = Mutant(name, original, ast.unparse(new), nodes.index(around), "drawn", "")
+        find(units, mutant)
+        drawn.append(mutant)
+    return drawn
+
+
+class Swap(ast.NodeTransformer):
+    """Puts another node in the place of one, known by its number in `ast.walk`."""
+
+    def __init__(self, number: int, new: ast.AST) -> None:
+        self.number, self.new = number, new
+
+    def of(self, tree: ast.AST) -> ast.AST:
+        tree = copy.deepcopy(tree)
+        self.old = [*ast.walk(tree)][self.number]
+        return self.visit(tree)
+
+    def visit(self, node: ast.AST) -> ast.AST:
+        return self.new if node is self.old else self.generic_visit(node)
+
+
+RECORDER = """
+import json, time
+from pathlib import Path
+import pytest
+seen, fixtures, tests, failed = set(), {}, {}, set()
+hit = seen.add
+
+@pytest.hookimpl(wrapper=True)
+def pytest_fixture_setup(fixturedef):
+    outer = set(seen)
+    seen.clear()
+    try:
+        return (yield)
+    finally:
+        fixtures.setdefault(fixturedef.argname, set()).update(seen)
+        seen.update(outer)
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item):
+    seen.clear()
+    start = time.monotonic()
+    result = yield
+    used = seen.union(*(fixtures.get(name, ()) for name in item.fixturenames))
+    tests[item.nodeid] = (time.monotonic() - start, sorted(used))
+    return result
+
+def pytest_runtest_logreport(report):
+    if report.failed:
+        failed.add(report.nodeid)
+
+def pytest_sessionfinish():
+    good = {name: test for name, test in tests.items() if name not in failed}
+    Path("calls.json").write_text(json.dumps(good))
+    print("not used, since they fail without a mutant:", *sorted(failed), sep="\\n")
+"""
+
+
+def private_copy(folder: Path) -> None:
+    """The files of the project, as they are now, in a folder of their own."""
+    listed = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
+    names = subprocess.run(listed, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    for name in filter(None, names.split("\0")):
+        if (ROOT / name).is_file():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(ROOT / name, folder / name)
+
+
+def record_calls(folder: Path) -> None:
+    """Run the tests on code that tells its calls; leaves `calls.json` in the folder."""
+    package = folder / "src" / "psfdae"
+    (folder / "src/calls.py").write_text(RECORDER)
+    for path in package.rglob("*.py"):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        for name, part in named_parts(tree):
+            if isinstance(part, FUNCTION):
+                call = ast.parse(f"__import__('calls').hit({name!r})").body
+                start = 1 if ast.get_docstring(part) is not None else 0
+                part.body[start:start] = call
+        path.write_text(ast.unparse(ast.fix_missing_locations(tree)), encoding="utf-8")
+    pytest(folder, ["-p", "calls", "-m", FAST], None)
+
+
+def pytest(folder: Path, arguments: list[str], limit: float | None) -> tuple[int | None, str]:
+    """Exit code (None after `limit` seconds) and output of the tests of a copy."""
+    run = subprocess.Popen(
+        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *arguments],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": str(folder / "src"), "OMP_NUM_THREADS": "1"},
+        stdout=subprocess.PIPE if limit else None,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY)),
+    )
+    try:
+        output = run.communicate(timeout=limit)[0]
+    except subprocess.TimeoutExpired:
+        os.killpg(run.pid, signal.SIGKILL)
+        return None, run.communicate()[0]
+    return run.returncode, output
+
+
+def fate(folder: Path, mutant: Mutant, number: int, calls: dict[str, tuple[float, list[str]]]) -> str:
+    """What becomes of a mutant: which tests kill it, if any."""
+    units = units_of(ROOT / "src" / "psfdae")
+    path, node = find(units, mutant)
+    place = folder / path.relative_to(ROOT)
+    place.write_text(apply(path, node, mutant.mutated), encoding="utf-8")
+    # Compiled code is known by whole seconds and its size.
+    os.utime(place, (0, time.time() + 10 * number))
+    names = {mutant.function}
+    if not isinstance(units[mutant.function][path][0], FUNCTION):
+        # A constant is used by whatever its module holds.
+        names = {name for name, files in units.items() if path in files}
+    quickest = sorted(calls, key=lambda test: calls[test][0])
+    first = [test for test in quickest if names & set(calls[test][1])]
+    rest = [test for test in calls if test not in {*first}]
+    try:
+        for stage, tests in (("callers", first), ("rest", rest)):
+            limit = 60 + 5 * sum(calls[test][0] for test in tests)
+            code, output = pytest(folder, ["-x", "-rfE", *tests], limit) if tests else (0, "")
+            if code is None:
+                return f"killed: {stage}: no end within {limit:.0f} s"
+            if code:
+                told = [line for line in output.splitlines() if line.startswith(("FAILED", "ERROR"))]
+                return f"killed: {stage}: {' '.join((told or ['ERROR'])[0].split()[:2])}"
+        return "alive"
+    finally:
+        shutil.copy2(path, place)
+
+
+def run(words: list[str], folder: Path) -> int:
+    """Apply the mutants one by one and tell what became of them; 1 if too many live."""
+    os.nice(10)
+    private_copy(folder)
+    if not (folder / "calls.json").is_file():
+        record_calls(folder)
+        private_copy(folder)
+    calls = json.loads((folder / "calls.json").read_text())
+    chosen = [
+        (number, mutant)
+        for number, mutant in enumerate(read_list(), 1)
+        if not mutant.equivalent and (not words or any(w in str(mutant) for w in words))
+    ]
+    dead = 0
+    for number, mutant in chosen:
+        start = time.monotonic()
+        found = fate(folder, mutant, number, calls)
+        dead += found.startswith("killed")
+        print(f"{number:3d} {mutant.function}: {mutant.original} -> {mutant.mutated}")
+        print(f"    {found} ({time.monotonic() - start:.0f} s)", flush=True)
+    print(f"{dead} of {len(chosen)} killed")
+    return int(dead < 0.9 * len(chosen))
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("mode", choices=("run", "draw"))
+    parser.add_argument("words", nargs="*")
+    parser.add_argument("--folder", type=Path, help="of the copy; kept, with the record of calls")
+    given = parser.parse_args()
+    if given.mode == "draw":
+        listed = [mutant for mutant in read_list() if mutant.source != "drawn"]
+        write_list([*listed, *draw(DRAWN)])
+        return 0
+    with tempfile.TemporaryDirectory() as temporary:
+        return run(given.words, given.folder or Path(temporary))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
