@@ -78,7 +78,9 @@ class LostError(LookupError):
 
 def read_list() -> list[Mutant]:
     with LIST.open(encoding="utf-8", newline="") as file:
-        return [Mutant(**{**row, "occurrence": int(row["occurrence"])}) for row in csv.DictReader(file)]
+        return [
+            Mutant(**{**row, "occurrence": int(row["occurrence"])}) for row in csv.DictReader(file)
+        ]
 
 
 def write_list(mutants: list[Mutant]) -> None:
@@ -97,7 +99,10 @@ def named_parts(tree: ast.Module) -> Iterator[tuple[str, ast.AST]]:
                 method = isinstance(part, FUNCTION)
                 yield (f"{node.name}.{part.name}" if method else node.name), part
         elif isinstance(node, ast.Assign | ast.AnnAssign):
-            yield ast.unparse(node.targets[0] if isinstance(node, ast.Assign) else node.target), node
+            yield (
+                ast.unparse(node.targets[0] if isinstance(node, ast.Assign) else node.target),
+                node,
+            )
 
 
 def units_of(package: Path) -> Units:
@@ -173,7 +178,9 @@ def places(node: ast.AST, around: ast.AST | None = None) -> Iterator[tuple[ast.A
             continue
         for child in value if isinstance(value, list) else [value]:
             if isinstance(child, ast.AST):
-                inside = isinstance(node, ast.expr | ast.keyword | ast.comprehension | ast.AugAssign)
+                inside = isinstance(
+                    node, ast.expr | ast.keyword | ast.comprehension | ast.AugAssign
+                )
                 yield from places(child, around if inside else None)
 
 
@@ -301,7 +308,9 @@ def pytest(folder: Path, arguments: list[str], limit: float | None) -> tuple[int
     return run.returncode, output
 
 
-def fate(folder: Path, mutant: Mutant, number: int, calls: dict[str, tuple[float, list[str]]]) -> str:
+def fate(
+    folder: Path, mutant: Mutant, number: int, calls: dict[str, tuple[float, list[str]]]
+) -> str:
     """What becomes of a mutant: which tests kill it, if any."""
     units = units_of(ROOT / "src" / "psfdae")
     path, node = find(units, mutant)
@@ -323,7 +332,9 @@ def fate(folder: Path, mutant: Mutant, number: int, calls: dict[str, tuple[float
             if code is None:
                 return f"killed: {stage}: no end within {limit:.0f} s"
             if code:
-                told = [line for line in output.splitlines() if line.startswith(("FAILED", "ERROR"))]
+                told = [
+                    line for line in output.splitlines() if line.startswith(("FAILED", "ERROR"))
+                ]
                 return f"killed: {stage}: {' '.join((told or ['ERROR'])[0].split()[:2])}"
         return "alive"
     finally:
@@ -355,7 +366,9 @@ def run(words: list[str], folder: Path) -> int:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
     parser.add_argument("mode", choices=("run", "draw"))
     parser.add_argument("words", nargs="*")
     parser.add_argument("--folder", type=Path, help="of the copy; kept, with the record of calls")
