@@ -9,7 +9,7 @@ module. A fragment that is no longer there is an error that names it; whoever ch
 the line writes the mutant's new text into the list.
 
 `run` first runs the fast tests once, noting which test calls which function. A mutant
-then meets the tests that call its function, quickest first, and if it lives the rest.
+then meets the tests that call its function, quick files first, and the rest if it lives.
 It takes hours; words select mutants whose row holds one of them.
 """
 
@@ -29,6 +29,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -298,7 +299,6 @@ def pytest(folder: Path, arguments: list[str], limit: float | None) -> tuple[int
         stderr=subprocess.STDOUT,
         text=True,
         start_new_session=True,
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY)),
     )
     try:
         output = run.communicate(timeout=limit)[0]
@@ -322,9 +322,13 @@ def fate(
     if not isinstance(units[mutant.function][path][0], FUNCTION):
         # A constant is used by whatever its module holds.
         names = {name for name, files in units.items() if path in files}
-    quickest = sorted(calls, key=lambda test: calls[test][0])
-    first = [test for test in quickest if names & set(calls[test][1])]
-    rest = [test for test in calls if test not in {*first}]
+    callers = {test: cost for test, (cost, called) in calls.items() if names & {*called}}
+    seconds = Counter()
+    for test, cost in callers.items():
+        seconds[test.split("::")[0]] += cost
+    # File by file, since the tests of one share what they set up.
+    first = sorted(callers, key=lambda test: seconds[test.split("::")[0]])
+    rest = [test for test in calls if test not in callers]
     try:
         for stage, tests in (("callers", first), ("rest", rest)):
             limit = 60 + 5 * sum(calls[test][0] for test in tests)
@@ -344,6 +348,7 @@ def fate(
 def run(words: list[str], folder: Path) -> int:
     """Apply the mutants one by one and tell what became of them; 1 if too many live."""
     os.nice(10)
+    resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY))
     private_copy(folder)
     if not (folder / "calls.json").is_file():
         record_calls(folder)

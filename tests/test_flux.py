@@ -214,6 +214,21 @@ def test_training_stars_may_have_any_flux(stars, model):
         assert getattr(scaled, name) == pytest.approx(getattr(plain, name), rel=1e-5, abs=1e-8)
 
 
+@pytest.mark.parametrize(("factor", "flags"), [(1.3, 0), (1.8, Flag.OUTLIER)])
+def test_pixels_may_leave_the_range_of_the_training_by_half(stars, model, noise, factor, flags):
+    batch = noise.draw(stars, 1e-5, np.random.default_rng(1)).astype(np.float64)
+    pixel = model.high.argmax()
+    batch[3].flat[pixel] = factor * model.high[pixel]
+    assert robust_flux(batch, model).flags[3] == flags
+
+
+def test_noise_of_a_noise_free_star_is_a_millionth_of_its_median_pixel(model):
+    images = np.array([1.0, 300.0])[:, None, None] * model.mean.reshape(16, 16)
+    assert robust_flux(images, model).noise == pytest.approx(
+        1e-6 * np.median(images, axis=(1, 2)), rel=1e-3
+    )
+
+
 def test_one_fit_is_the_one_of_dense_matrices(stars, model):
     """Flux, error, leave-one-out residuals and repaired pixels of the formulae over used pixels."""
     rng = np.random.default_rng(1)

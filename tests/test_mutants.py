@@ -1,4 +1,4 @@
-"""The list of mutants still names code that is there; `python tests/mutants.py run` applies them."""
+"""The list of mutants names code that is there; `python tests/mutants.py run` applies them."""
 
 from __future__ import annotations
 
