@@ -1,6 +1,6 @@
 """Mutants of the science: do the fast tests notice a wrong sign, factor or limit?
 
-    python tests/mutants.py run [WORD …]    mutate a private copy of the package, one by one
+    python tests/mutants.py run [WORD …]    apply the mutants to a private copy, one by one
     python tests/mutants.py draw            draw the list of random mutants anew
 
 `mutants.csv` names every mutant by its function, a fragment of the code and which
@@ -8,18 +8,15 @@ occurrence of the fragment in the function it is, so that code may move to anoth
 module. A fragment that is no longer there is an error that names it; whoever changes
 the line writes the mutant's new text into the list.
 
-`run` first runs the fast tests once, noting which test calls which function. A mutant
-then meets the tests that call its function, quick files first, and the rest if it lives.
-It takes hours; words select mutants whose row holds one of them.
+Each mutant meets the test files that name its module, then the other fast tests. That
+takes hours; words select mutants whose row holds one of them.
 """
 
 from __future__ import annotations
 
-import argparse
 import ast
 import copy
 import csv
-import json
 import os
 import random
 import resource
@@ -29,9 +26,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections import Counter
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -48,6 +44,14 @@ SCIENCE = [
 
 FAST = "not slow and not workflow"
 MEMORY = 8 * 2**30
+LIMIT = 3600
+"""Seconds after which a mutant counts as killed; without one the tests take some minutes."""
+
+LEAST = 0.9
+NOTHING_FAILED = (0, 5)
+"""Exit codes of pytest: all passed, no test was chosen."""
+
+INSIDE = (ast.expr, ast.keyword, ast.comprehension, ast.AugAssign)
 FUNCTION = (ast.FunctionDef, ast.AsyncFunctionDef)
 SWAPPED = {
     **{ast.Add: [ast.Sub], ast.Sub: [ast.Add], ast.Mult: [ast.Div], ast.Div: [ast.Mult]},
@@ -84,13 +88,6 @@ def read_list() -> list[Mutant]:
         ]
 
 
-def write_list(mutants: list[Mutant]) -> None:
-    with LIST.open("w", encoding="utf-8", newline="") as file:
-        out = csv.DictWriter(file, [field.name for field in fields(Mutant)], lineterminator="\n")
-        out.writeheader()
-        out.writerows(asdict(mutant) for mutant in mutants)
-
-
 def named_parts(tree: ast.Module) -> Iterator[tuple[str, ast.AST]]:
     for node in tree.body:
         if isinstance(node, FUNCTION):
@@ -100,10 +97,8 @@ def named_parts(tree: ast.Module) -> Iterator[tuple[str, ast.AST]]:
                 method = isinstance(part, FUNCTION)
                 yield (f"{node.name}.{part.name}" if method else node.name), part
         elif isinstance(node, ast.Assign | ast.AnnAssign):
-            yield (
-                ast.unparse(node.targets[0] if isinstance(node, ast.Assign) else node.target),
-                node,
-            )
+            target = node.targets[0] if isinstance(node, ast.Assign) else node.target
+            yield ast.unparse(target), node
 
 
 def units_of(package: Path) -> Units:
@@ -179,18 +174,22 @@ def places(node: ast.AST, around: ast.AST | None = None) -> Iterator[tuple[ast.A
             continue
         for child in value if isinstance(value, list) else [value]:
             if isinstance(child, ast.AST):
-                inside = isinstance(
-                    node, ast.expr | ast.keyword | ast.comprehension | ast.AugAssign
-                )
+                inside = isinstance(node, INSIDE)
                 yield from places(child, around if inside else None)
 
 
-def draw(count: int) -> list[Mutant]:
-    """Random mutants of the science modules."""
+def write_list(mutants: list[Mutant]) -> None:
+    with LIST.open("w", encoding="utf-8", newline="") as file:
+        out = csv.DictWriter(file, [field.name for field in fields(Mutant)], lineterminator="\n")
+        out.writeheader()
+        out.writerows(asdict(mutant) for mutant in mutants)
+
+
+def draw(known: list[Mutant]) -> list[Mutant]:
+    """Random mutants of the science, as many more as are known to be equivalent."""
     package = ROOT / "src" / "psfdae"
     units = units_of(package)
     science = [package / name for name in SCIENCE]
-    rng = random.Random(SEED)
     able = [
         (name, path, node, around)
         for name in sorted(units)
@@ -200,15 +199,20 @@ def draw(count: int) -> list[Mutant]:
         for node, around in places(part)
         if changes(node, random.Random(0))
     ]
-    print(f"{count} of {len(able)} operators and numbers")
-    drawn = []
-    for name, path, node, around in rng.sample(able, count):
+    reasons = {replace(mutant, equivalent=""): mutant.equivalent for mutant in known}
+    rng = random.Random(SEED)
+
+    def mutant_at(name: str, path: Path, node: ast.AST, around: ast.AST) -> Mutant:
         original = ast.unparse(around)
-        nodes = matches(units[name][path], original)
+        occurrence = matches(units[name][path], original).index(around)
         new = Swap([*ast.walk(around)].index(node), changes(node, rng)).of(around)
-        mutant = Mutant(name, original, ast.unparse(new), nodes.index(around), "drawn", "")
+        mutant = Mutant(name, original, ast.unparse(new), occurrence, "drawn", "")
         find(units, mutant)
-        drawn.append(mutant)
+        return replace(mutant, equivalent=reasons.get(mutant, ""))
+
+    drawn = [mutant_at(*place) for place in rng.sample(able, DRAWN)]
+    while sum(not mutant.equivalent for mutant in drawn) < DRAWN:
+        drawn.append(mutant_at(*rng.choice(able)))
     return drawn
 
 
@@ -227,43 +231,6 @@ class Swap(ast.NodeTransformer):
         return self.new if node is self.old else self.generic_visit(node)
 
 
-RECORDER = """
-import json, time
-from pathlib import Path
-import pytest
-seen, fixtures, tests, failed = set(), {}, {}, set()
-hit = seen.add
-
-@pytest.hookimpl(wrapper=True)
-def pytest_fixture_setup(fixturedef):
-    outer = set(seen)
-    seen.clear()
-    try:
-        return (yield)
-    finally:
-        fixtures.setdefault(fixturedef.argname, set()).update(seen)
-        seen.update(outer)
-
-@pytest.hookimpl(wrapper=True)
-def pytest_runtest_protocol(item):
-    seen.clear()
-    start = time.monotonic()
-    result = yield
-    used = seen.union(*(fixtures.get(name, ()) for name in item.fixturenames))
-    tests[item.nodeid] = (time.monotonic() - start, sorted(used))
-    return result
-
-def pytest_runtest_logreport(report):
-    if report.failed:
-        failed.add(report.nodeid)
-
-def pytest_sessionfinish():
-    good = {name: test for name, test in tests.items() if name not in failed}
-    Path("calls.json").write_text(json.dumps(good))
-    print("not used, since they fail without a mutant:", *sorted(failed), sep="\\n")
-"""
-
-
 def private_copy(folder: Path) -> None:
     """The files of the project, as they are now, in a folder of their own."""
     listed = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
@@ -274,116 +241,87 @@ def private_copy(folder: Path) -> None:
             shutil.copy2(ROOT / name, folder / name)
 
 
-def record_calls(folder: Path) -> None:
-    """Run the tests on code that tells its calls; leaves `calls.json` in the folder."""
-    package = folder / "src" / "psfdae"
-    (folder / "src/calls.py").write_text(RECORDER)
-    for path in package.rglob("*.py"):
-        tree = ast.parse(path.read_text(encoding="utf-8"))
-        for name, part in named_parts(tree):
-            if isinstance(part, FUNCTION):
-                call = ast.parse(f"__import__('calls').hit({name!r})").body
-                start = 1 if ast.get_docstring(part) is not None else 0
-                part.body[start:start] = call
-        path.write_text(ast.unparse(ast.fix_missing_locations(tree)), encoding="utf-8")
-    pytest(folder, ["-p", "calls", "-m", FAST], None)
-
-
-def pytest(folder: Path, arguments: list[str], limit: float | None) -> tuple[int | None, str]:
-    """Exit code (None after `limit` seconds) and output of the tests of a copy."""
+def pytest(folder: Path, arguments: list[str]) -> tuple[int | None, str]:
+    """Exit code (None if there is no end) and output of fast tests of a copy."""
     run = subprocess.Popen(
-        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *arguments],
+        [sys.executable, "-m", "pytest", "-q", "-x", "-rfE", "-m", FAST, *arguments],
         cwd=folder,
         env={**os.environ, "PYTHONPATH": str(folder / "src"), "OMP_NUM_THREADS": "1"},
-        stdout=subprocess.PIPE if limit else None,
+        stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
         start_new_session=True,
     )
     try:
-        output = run.communicate(timeout=limit)[0]
+        output = run.communicate(timeout=LIMIT)[0]
     except subprocess.TimeoutExpired:
         os.killpg(run.pid, signal.SIGKILL)
         return None, run.communicate()[0]
     return run.returncode, output
 
 
-def fate(
-    folder: Path, mutant: Mutant, number: int, calls: dict[str, tuple[float, list[str]]]
-) -> str:
-    """What becomes of a mutant: which tests kill it, if any."""
-    units = units_of(ROOT / "src" / "psfdae")
-    path, node = find(units, mutant)
+def fate(folder: Path, mutant: Mutant, number: int) -> str:
+    """What becomes of a mutant: the test that kills it, if one does."""
+    path, node = find(units_of(ROOT / "src" / "psfdae"), mutant)
     place = folder / path.relative_to(ROOT)
     place.write_text(apply(path, node, mutant.mutated), encoding="utf-8")
     # Compiled code is known by whole seconds and its size.
     os.utime(place, (0, time.time() + 10 * number))
-    names = {mutant.function}
-    if not isinstance(units[mutant.function][path][0], FUNCTION):
-        # A constant is used by whatever its module holds.
-        names = {name for name, files in units.items() if path in files}
-    callers = {test: cost for test, (cost, called) in calls.items() if names & {*called}}
-    seconds = Counter()
-    for test, cost in callers.items():
-        seconds[test.split("::")[0]] += cost
-    # File by file, since the tests of one share what they set up.
-    first = sorted(callers, key=lambda test: seconds[test.split("::")[0]])
-    rest = [test for test in calls if test not in callers]
+    module = ".".join(path.relative_to(ROOT / "src").with_suffix("").parts)
+    tests = [test.relative_to(folder) for test in sorted(folder.glob("tests/test_*.py"))]
+    near = [str(test) for test in tests if module in (folder / test).read_text(encoding="utf-8")]
+    stages = [("near", near)] if near else []
     try:
-        for stage, tests in (("callers", first), ("rest", rest)):
-            limit = 60 + 5 * sum(calls[test][0] for test in tests)
-            code, output = pytest(folder, ["-x", "-rfE", *tests], limit) if tests else (0, "")
+        for stage, arguments in [*stages, ("rest", [f"--ignore={test}" for test in near])]:
+            code, output = pytest(folder, arguments)
             if code is None:
-                return f"killed: {stage}: no end within {limit:.0f} s"
-            if code:
-                told = [
-                    line for line in output.splitlines() if line.startswith(("FAILED", "ERROR"))
-                ]
+                return f"killed: {stage}: no end within {LIMIT} s"
+            if code not in NOTHING_FAILED:
+                told = [x for x in output.splitlines() if x.startswith(("FAILED", "ERROR"))]
                 return f"killed: {stage}: {' '.join((told or ['ERROR'])[0].split()[:2])}"
         return "alive"
     finally:
         shutil.copy2(path, place)
 
 
-def run(words: list[str], folder: Path) -> int:
+def run(words: list[str]) -> int:
     """Apply the mutants one by one and tell what became of them; 1 if too many live."""
     os.nice(10)
     resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY))
-    private_copy(folder)
-    if not (folder / "calls.json").is_file():
-        record_calls(folder)
-        private_copy(folder)
-    calls = json.loads((folder / "calls.json").read_text())
     chosen = [
         (number, mutant)
         for number, mutant in enumerate(read_list(), 1)
-        if not mutant.equivalent and (not words or any(w in str(mutant) for w in words))
+        if not mutant.equivalent and (not words or any(word in str(mutant) for word in words))
     ]
-    dead = 0
-    for number, mutant in chosen:
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        private_copy(folder)
         start = time.monotonic()
-        found = fate(folder, mutant, number, calls)
-        dead += found.startswith("killed")
-        print(f"{number:3d} {mutant.function}: {mutant.original} -> {mutant.mutated}")
-        print(f"    {found} ({time.monotonic() - start:.0f} s)", flush=True)
+        code, output = (0, "") if words else pytest(folder, [])
+        if code != 0 or time.monotonic() - start > LIMIT / 4:
+            print(output, "\nthe tests fail or take too long without a mutant")
+            return 2
+        dead = 0
+        for number, mutant in chosen:
+            start = time.monotonic()
+            found = fate(folder, mutant, number)
+            dead += found.startswith("killed")
+            print(f"{number:3d} {mutant.function}: {mutant.original} -> {mutant.mutated}")
+            print(f"    {found} ({time.monotonic() - start:.0f} s)", flush=True)
     print(f"{dead} of {len(chosen)} killed")
-    return int(dead < 0.9 * len(chosen))
+    return int(dead < LEAST * len(chosen))
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
-    parser.add_argument("mode", choices=("run", "draw"))
-    parser.add_argument("words", nargs="*")
-    parser.add_argument("--folder", type=Path, help="of the copy; kept, with the record of calls")
-    given = parser.parse_args()
-    if given.mode == "draw":
-        listed = [mutant for mutant in read_list() if mutant.source != "drawn"]
-        write_list([*listed, *draw(DRAWN)])
-        return 0
-    with tempfile.TemporaryDirectory() as temporary:
-        return run(given.words, given.folder or Path(temporary))
+    match sys.argv[1:]:
+        case ["run", *words]:
+            return run(words)
+        case ["draw"]:
+            known = read_list()
+            write_list([*(mutant for mutant in known if mutant.source != "drawn"), *draw(known)])
+            return 0
+    print(__doc__)
+    return 2
 
 
 if __name__ == "__main__":
