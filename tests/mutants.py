@@ -42,7 +42,9 @@ SCIENCE = [
 ]
 """Where the random mutants were drawn from; no matter once they are drawn."""
 
-FAST = "not slow and not workflow"
+CHOICE = ["-m", "not slow and not workflow", "--ignore=tests/test_mutants.py"]
+"""The fast tests but for those of the list, which notice every mutant."""
+
 MEMORY = 8 * 2**30
 LIMIT = 3600
 """Seconds after which a mutant counts as killed; without one the tests take some minutes."""
@@ -244,7 +246,7 @@ def private_copy(folder: Path) -> None:
 def pytest(folder: Path, arguments: list[str]) -> tuple[int | None, str]:
     """Exit code (None if there is no end) and output of fast tests of a copy."""
     run = subprocess.Popen(
-        [sys.executable, "-m", "pytest", "-q", "-x", "-rfE", "-m", FAST, *arguments],
+        [sys.executable, "-m", "pytest", "-q", "-x", "-rfE", *CHOICE, *arguments],
         cwd=folder,
         env={**os.environ, "PYTHONPATH": str(folder / "src"), "OMP_NUM_THREADS": "1"},
         stdout=subprocess.PIPE,
