@@ -169,6 +169,15 @@ def test_weights_of_the_annulus_integrate_zernike_products():
     assert (basis**2) @ weights == pytest.approx((fine**2).mean(axis=(1, 2)), rel=1e-3)
 
 
+@pytest.mark.parametrize("highest", [4, 22, 28, 37])
+def test_points_of_the_annulus_are_their_own_mirror_images(highest):
+    x, y, _ = annulus_points(highest, 0.42)
+    points = np.stack([x, y], axis=1)
+    for mirrored in (points * [-1, 1], points * [1, -1], points[:, ::-1]):
+        off = np.linalg.norm(mirrored[:, None] - points, axis=2).min(axis=1)
+        assert off.max() < 1e-12
+
+
 @pytest.mark.parametrize(
     ("state", "message"),
     [

@@ -167,6 +167,31 @@ def test_signal_to_noise_is_that_of_a_matched_filter():
     assert measure.noise_equivalent_px(flat) == pytest.approx(144)
 
 
+def test_errors_of_some_stars_are_those_stars_errors():
+    """Images repeat the stars; a mask over stars keeps every image of those, and no other."""
+    star = np.array([0, 1, 2, 3, 4, 0, 1, 2, 3, 4])
+    error = np.arange(10.0)[None, :, None, None] + np.zeros((2, 10, 4, 4))
+    distance = 100.0 + np.arange(20.0).reshape(2, 10)
+    some = measure.Errors(np.array([1.0, 2.0]), error, star, distance).of(
+        np.array([False, True, False, False, True])
+    )
+    assert some.star.tolist() == [1, 4, 1, 4]
+    assert (some.error[:, :, 0, 0] == [1, 4, 6, 9]).all()
+    assert (some.distance == [[101, 104, 106, 109], [111, 114, 116, 119]]).all()
+
+
+def test_either_half_of_the_stars_is_judged_by_the_errors_of_the_other():
+    """Even stars err by σ, odd ones by 3σ: ± σ holds 26 % of these, ± 3σ 99.7 % of those."""
+    rng, star = np.random.default_rng(0), np.tile(np.arange(400), 10)
+    scale = np.where(star % 2, 3.0, 1.0)[:, None, None]
+    error = rng.normal(size=(1, 4000, 8, 8)) * scale
+    errors = measure.Errors(np.array([0.01]), error, star, np.zeros((1, 4000)))
+    fresh = rng.normal(size=(400, 8, 8)) * scale[:400]
+    found = measure.crossed_coverage(errors, fresh, 0.01)
+    expected = (0.9973 + 0.2611) / 2
+    assert found == pytest.approx({"coverage68": expected, "coverage_rms": expected}, abs=0.01)
+
+
 def test_errors_between_nodes_are_interpolated_and_held_outside():
     nodes, maps = np.array([1.0, 2.0, 4.0]), np.arange(12.0).reshape(3, 2, 2)
     found = at_noise(np.array([1.0, 1.5, 3.0, 4.0, 9.0, 0.1, np.nan]), nodes, maps)

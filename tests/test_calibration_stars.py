@@ -15,6 +15,7 @@ from psfdae.stars.calibration_stars import (
     signal_to_noise,
     sky_around,
     star_centres,
+    window_of,
 )
 from psfdae.stars.example_field import noise_area
 from psfdae.stars.from_observation import (
@@ -53,6 +54,16 @@ def bright_stars(centre, snr=500.0):
     return BrightStars(
         wide, peak, np.asarray(centre), position, 1e4 * noise, noise, level, np.arange(count)
     )
+
+
+def test_window_of_a_gaussian_is_as_wide_as_it_is():
+    """S/N = F / (σ √A) with A = 1/Σp² gives its width back, but no less than 0.7 px."""
+    sigma = np.array([0.9, 1.5, 2.5, 0.3])
+    psf = np.concatenate([gaussians([[0.2, 0.4]], sigma=s) for s in sigma])
+    area = np.array([noise_area(image / image.sum()) for image in psf])
+    flux, noise = np.array([1e4, 2e3, 5e5, 1e4]), np.array([3.0, 7.0, 2.0, 3.0])
+    window = window_of(flux / (noise * np.sqrt(area)), flux, noise)
+    assert window == pytest.approx(np.maximum(sigma, 0.7), rel=0.02)
 
 
 def test_sky_is_that_around_the_star():

@@ -207,6 +207,53 @@ def test_inputs_are_left_alone(noisy, model):
     assert np.array_equal(batch, before, equal_nan=True)
 
 
+def test_training_stars_may_have_any_flux(stars, model):
+    scale = np.random.default_rng(0).uniform(0.1, 1e4, size=(len(stars), 1, 1))
+    plain, scaled = FluxModel.fit(stars), FluxModel.fit(stars.astype(np.float64) * scale)
+    for name in ("mean", "variance", "low", "high"):
+        assert getattr(scaled, name) == pytest.approx(getattr(plain, name), rel=1e-5, abs=1e-8)
+
+
+@pytest.mark.parametrize(("factor", "flags"), [(1.3, 0), (1.8, Flag.OUTLIER)])
+def test_pixels_may_leave_the_range_of_the_training_by_half(stars, model, noise, factor, flags):
+    batch = noise.draw(stars, 1e-5, np.random.default_rng(1)).astype(np.float64)
+    pixel = model.high.argmax()
+    batch[3].flat[pixel] = factor * model.high[pixel]
+    assert robust_flux(batch, model).flags[3] == flags
+
+
+def test_noise_of_a_noise_free_star_is_a_millionth_of_its_median_pixel(model):
+    images = np.array([1.0, 300.0])[:, None, None] * model.mean.reshape(16, 16)
+    assert robust_flux(images, model).noise == pytest.approx(
+        1e-6 * np.median(images, axis=(1, 2)), rel=1e-3
+    )
+
+
+def test_one_fit_is_the_one_of_dense_matrices(stars, model):
+    """Flux, error, leave-one-out residuals and repaired pixels of the formulae over used pixels."""
+    rng = np.random.default_rng(1)
+    x = 2.0 * stars[:4].reshape(4, -1).astype(np.float64) + rng.normal(0, 0.01, (4, 256))
+    used = rng.random((4, 256)) > np.array([0.0, 0.01, 0.2, 0.4])[:, None]
+    prior, sigma = np.array([4.0, 3.0, 5.0, 4.0]), np.array([0.01, 0.02, 0.01, 0.005])
+    found = module._generalised_least_squares(x, used, prior, sigma, model)
+    covariance = (model.basis * model.variance) @ model.basis.T
+    for star, (flux, error, score, repaired) in enumerate(zip(*found, strict=True)):
+        whole = prior[star] * covariance + sigma[star] ** 2 * np.eye(256)
+        kept, lost = np.flatnonzero(used[star]), np.flatnonzero(~used[star])
+        inverse = np.linalg.inv(whole[np.ix_(kept, kept)])
+        mean = model.mean[kept]
+        information = mean @ inverse @ mean
+        assert flux == pytest.approx(mean @ inverse @ x[star, kept] / information, rel=1e-6)
+        assert error == pytest.approx(information**-0.5, rel=1e-6)
+        residual = inverse @ (x[star, kept] - flux * mean)
+        assert score[kept] == pytest.approx(
+            np.abs(residual) / np.sqrt(np.diag(inverse)), rel=1e-5, abs=1e-8
+        )
+        filled = flux * model.mean[lost] + whole[np.ix_(lost, kept)] @ residual
+        assert repaired[kept] == pytest.approx(x[star, kept], abs=0)
+        assert repaired[lost] == pytest.approx(filled, rel=1e-5, abs=1e-8)
+
+
 def test_model_refuses_stars_without_flux_and_stamps_of_another_size(stars, model):
     with pytest.raises(ValueError, match="finite and of positive sum"):
         FluxModel.fit(np.concatenate([stars[:5], 0 * stars[:1]]))

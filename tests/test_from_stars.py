@@ -30,7 +30,13 @@ from psfdae.stars.calibration_stars import (
     brightest_pixels,
     star_centres,
 )
-from psfdae.stars.example_field import FieldRecipe, example_field, noise_area
+from psfdae.stars.example_field import (
+    RENDER_PX,
+    FieldRecipe,
+    example_field,
+    noise_area,
+    star_images,
+)
 from psfdae.stars.from_observation import (
     cut,
     make_images,
@@ -71,6 +77,15 @@ def candidates(field, config):
 
 
 # Measuring
+
+
+def test_star_of_a_perfect_telescope_lies_where_it_was_put():
+    """Its centre of light, from the middle of the pixel nearest to the position."""
+    position = np.array([[300.0, 400.0], [310.3, 399.8], [299.6, 405.45], [301.49, 288.52]])
+    images = star_images(FieldRecipe(seidel=(0.0,) * 5), position)
+    axis = np.arange(RENDER_PX) - RENDER_PX // 2
+    centre = np.stack([images.sum(axis=1) @ axis, images.sum(axis=2) @ axis], axis=1)
+    assert centre == pytest.approx(position - np.rint(position), abs=0.02)
 
 
 def test_example_is_reproducible_and_has_the_noise_that_it_states():

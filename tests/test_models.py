@@ -15,7 +15,7 @@ from psfdae.files import ProductError
 from psfdae.models.checkpoint import save_checkpoint
 from psfdae.models.dae import SingleChannelConv, build_dae, image_scale, predict
 from psfdae.models.lmmse import LinearMmse
-from psfdae.models.pca_som import fit_pca_som
+from psfdae.models.pca_som import PcaSom, fit_pca_som
 from psfdae.models.training import Training, TrainingError, TrainingSet, train_dae
 from psfdae.models.weights import load_weights, save_weights
 from psfdae.rng import stream
@@ -58,6 +58,17 @@ def train(data, folder, train_config=TRAIN, report=lambda row: None, dae=DAE, ti
     return result
 
 
+def interrupted(data, folder, epoch, **options):
+    """A training that stops when an epoch ends; the checkpoint is that of the one before."""
+
+    def interrupt(row):
+        if row["epoch"] == epoch:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(data, folder, report=interrupt, **options)
+
+
 def same(first, second):
     return all(torch.equal(first[key], second[key]) for key in first)
 
@@ -84,6 +95,26 @@ def test_linear_mmse_returns_the_mean_when_the_noise_is_overwhelming(gaussian_st
     assert estimate == pytest.approx(
         np.broadcast_to(gaussian_stars.mean(axis=0), (5, 16, 16)), abs=1e-6
     )
+
+
+def test_linear_mmse_finds_references_that_are_another_image(noise):
+    """References of few linear modes of the images, almost no noise: they come back."""
+    rng = np.random.default_rng(0)
+    modes, images, references = rng.normal(size=(500, 4)), *rng.normal(size=(2, 4, 64)) * 1e-3
+    x, y = ((1 / 64 + modes @ mixing).reshape(-1, 8, 8) for mixing in (images, references))
+    estimate = LinearMmse.fit(x[:400], y[:400], noise).predict(x[400:], 1e-8)
+    assert mse(estimate, y[400:]).max() < 1e-4 * y.var()
+
+
+def test_baseline_assigns_the_nearest_node():
+    rng = np.random.default_rng(0)
+    mean, components = 1.0 + rng.random(64), rng.normal(size=(5, 64))
+    nodes = rng.normal(size=(20, 5)) * rng.uniform(1, 30, size=(20, 1))
+    images = mean.reshape(8, 8) + rng.normal(size=(500, 8, 8))
+    features = (images.reshape(-1, 64) - mean) @ components.T
+    nearest = np.linalg.norm(features[:, None] - nodes, axis=2).argmin(axis=1)
+    assert len(set(nearest)) > 10
+    assert (PcaSom(mean, components, nodes, np.empty((20, 64))).assign(images) == nearest).all()
 
 
 def test_baseline_recovers_separate_classes():
@@ -161,18 +192,25 @@ def test_training_learns_and_repeats(data, tmp_path):
 def test_interrupted_training_continues_as_if_nothing_had_happened(data, tmp_path):
     whole = train(data, tmp_path)
 
-    def interrupt(row):
-        # The checkpoint of epoch 1 exists when epoch 2 ends; its own does not.
-        if row["epoch"] == 2:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        train(data, tmp_path, report=interrupt)
+    interrupted(data, tmp_path, 2)
     assert (tmp_path / "checkpoint.pt").exists()
     seen = []
     resumed = train(data, tmp_path, report=lambda row: seen.append(row["epoch"]))
     assert seen == [2, 3]
     assert same(whole.state, resumed.state)
+
+
+def test_best_epoch_before_an_interruption_stays_the_best(data, tmp_path):
+    """Validation on what no star looks like: the better the fit, the worse the score."""
+    references = data.references.copy()
+    references[data.validation] = 0.0
+    contrary = replace(data, references=references)
+    quick = TRAIN.model_copy(update={"lr": 1e-2})
+    whole = train(contrary, tmp_path, quick)
+    errors = [row["validation_mse"] for row in whole.history]
+    assert errors[0] < min(errors[1:])
+    interrupted(contrary, tmp_path, 2, train_config=quick)
+    assert same(whole.state, train(contrary, tmp_path, quick).state)
 
 
 @pytest.mark.parametrize("damage", ["foreign", "garbage"])
@@ -223,8 +261,15 @@ def test_restart_uses_other_weights(data, tmp_path, monkeypatch):
         return model
 
     monkeypatch.setattr(module, "build_dae", dead_once)
-    assert train(data, tmp_path).attempt == 1
+    whole = train(data, tmp_path)
+    assert whole.attempt == 1
     assert not torch.equal(*attempts)
+    attempts.clear()
+    interrupted(data, tmp_path, 2)
+    resumed = train(data, tmp_path)
+    assert len(attempts) == 3  # the dead one, the one that was interrupted, and that again
+    assert resumed.attempt == 1
+    assert same(whole.state, resumed.state)
 
 
 def test_fresh_noise_every_epoch(data):
@@ -265,7 +310,7 @@ def test_gradient_that_is_not_finite_stops_with_advice(data, tmp_path, monkeypat
 
 def test_weights_come_back_and_damage_is_noticed(tmp_path):
     """Every byte of the file counts, the checksum covers the tensors."""
-    state = {"w": torch.arange(6.0).reshape(2, 3).T, "steps": torch.tensor(7)}
+    state = {"w": torch.arange(600.0).reshape(20, 30).T, "steps": torch.tensor(7)}
     path = tmp_path / "dae.safetensors"
     save_weights(path, state, {"seed": 1})
     found = load_weights(path)
@@ -273,7 +318,7 @@ def test_weights_come_back_and_damage_is_noticed(tmp_path):
         name: tensor.tolist() for name, tensor in state.items()
     }
     whole = path.read_bytes()
-    for place in (-1, -20):
+    for place in (-1, -20, -300, -1200, -2000, -2400):
         damaged = bytearray(whole)
         damaged[place] ^= 1
         path.write_bytes(damaged)

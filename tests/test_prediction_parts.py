@@ -6,17 +6,101 @@ import threading
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from prediction_stars import observe
-from psfdae.prediction.centring import displacement, recut
+from psfdae.prediction.border import border_pixels
+from psfdae.prediction.centring import SMOOTHED_NOISE, displacement, recut, smoothed
+from psfdae.prediction.photometry import Known, Photometer
 from psfdae.prediction.shapes import measure_shapes
 from psfdae.prediction.stream import in_order
+from psfdae.stars.flux import FluxModel, robust_flux
 
 
 def test_noise_moves_no_star(field_psfs):
     for level in (3e-3, 1e-2):
         stars = observe(field_psfs, level, seed=4)
         assert displacement(stars.stamps, 1).any(axis=1).mean() < 0.01
+
+
+def test_smoothing_is_by_a_quarter_a_half_a_quarter_and_repeats_the_edge():
+    stamps = np.random.default_rng(0).normal(size=(40, 16, 16))
+    kernel = np.outer([1, 2, 1], [1, 2, 1])[None] / 16
+    expected = ndimage.convolve(stamps, kernel, mode="nearest")
+    assert smoothed(stamps) == pytest.approx(expected, abs=1e-12)
+    many = smoothed(np.random.default_rng(1).normal(size=(4000, 16, 16)))
+    assert (many[:, 3, 3] - many[:, 9, 9]).std() == pytest.approx(SMOOTHED_NOISE, rel=0.05)
+
+
+@pytest.fixture(scope="module")
+def flux_model(gaussian_stars):
+    return FluxModel.fit(gaussian_stars)
+
+
+def known(count, flux=np.nan, background=np.nan, noise=np.nan):
+    return Known(*(np.full(count, value) for value in (flux, background, noise)))
+
+
+@pytest.mark.parametrize("sky_known", [True, False])
+def test_flux_is_the_one_of_dense_matrices(gaussian_stars, flux_model, sky_known):
+    """F = mᵀQx / mᵀQm with Q = S⁻¹, without its part along the sky where that is unknown."""
+    stars, sky, sigma = gaussian_stars[:40].astype(np.float64), 70.0, 8.0
+    stamps = 1e3 * stars + sky + np.random.default_rng(5).normal(0, sigma, stars.shape)
+    given = known(40, background=sky if sky_known else np.nan, noise=sigma)
+    bad = np.zeros(stamps.shape, dtype=bool)
+    found = Photometer(flux_model, 48).measure(stamps, bad, np.full(40, sky + 3.0), given)
+    covariance = (flux_model.basis * flux_model.variance) @ flux_model.basis.T
+    mean, one = flux_model.mean, np.ones(256)
+    for star in range(40):
+        prior = found.flux[star] ** 2 + sigma**2 / (mean @ mean)
+        inverse = np.linalg.inv(prior * covariance + sigma**2 * np.eye(256))
+        if not sky_known:
+            inverse -= np.outer(inverse @ one, inverse @ one) / (one @ inverse @ one)
+        x, information = stamps[star].ravel() - sky, mean @ inverse @ mean
+        error = information**-0.5
+        assert found.flux_error[star] == pytest.approx(error, rel=0.01)
+        assert found.flux[star] == pytest.approx(mean @ inverse @ x / information, abs=0.05 * error)
+        left = 0.0 if sky_known else (x.sum() - found.flux[star]) / 256
+        assert found.background[star] == pytest.approx(sky + left, abs=1e-3)
+        image = (x - left) / found.flux[star]
+        assert found.images[star].ravel() == pytest.approx(image, abs=1e-5)
+
+
+def test_sky_that_is_given_is_believed_in_stamps_with_bad_pixels_too(gaussian_stars, flux_model):
+    """Of flux_of(x − b) nothing is left but what the good pixels say at that sky."""
+    stamps = 1e3 * gaussian_stars[:20].astype(np.float64)
+    stamps += np.random.default_rng(6).normal(0, 8.0, stamps.shape)
+    bad = np.zeros(stamps.shape, dtype=bool)
+    bad[:, 2:5, 3:9] = True
+    for sky in (-4.0, 0.0, 4.0):
+        given = known(20, background=sky)
+        found = Photometer(flux_model, 48).measure(stamps, bad, np.zeros(20), given)
+        alone = robust_flux(np.where(bad, np.nan, stamps - sky), flux_model)
+        assert found.flux == pytest.approx(alone.flux, rel=1e-6)
+        assert found.flux_error == pytest.approx(alone.error, rel=1e-6)
+        assert found.background == pytest.approx(sky, abs=1e-12)
+
+
+@pytest.mark.parametrize("sky_known", [True, False])
+def test_residuals_of_the_border_are_those_of_dense_matrices(gaussian_stars, flux_model, sky_known):
+    """Q(x − Fm) over the root of the diagonal of Q, Q as above."""
+    photometer, ring = Photometer(flux_model, 48), border_pixels(16)
+    sigma, flux = 0.01, np.array([1.1, 0.9, 1.0])
+    stars = gaussian_stars[:3].reshape(3, -1).astype(np.float64) + 0.004
+    stars += np.random.default_rng(7).normal(0, sigma, stars.shape)
+    total = stars.sum(axis=1)
+    x = stars - total[:, None] / 256
+    leading, variance = flux_model.basis[:, -48:], flux_model.variance[-48:]
+    weight = np.tile(1 / (variance + sigma**2), (3, 1))
+    found = photometer._border_scores(
+        x, x @ leading, total, flux, weight, np.full(3, sigma**2), np.full(3, sky_known)
+    )
+    inverse = np.linalg.inv((leading * variance) @ leading.T + sigma**2 * np.eye(256))
+    if not sky_known:
+        beyond = inverse @ np.ones(256)
+        inverse -= np.outer(beyond, beyond) / beyond.sum()
+    residual = (stars - flux[:, None] * flux_model.mean) @ inverse / np.sqrt(np.diag(inverse))
+    assert found == pytest.approx(residual[:, ring], abs=1e-4)
 
 
 def test_recut_moves_the_middle():

@@ -21,6 +21,7 @@ from psfdae.stars.framing import (
     normalise_flux,
     stamp_offset,
 )
+from psfdae.stars.noise import mixed_levels
 from psfdae.stars.scene import Propagation
 from psfdae.stars.seidel_scene import SeidelWavefronts, relative_field, template_wavefronts
 from psfdae.stars.splits import held_out_fields, held_out_split, random_split
@@ -157,6 +158,14 @@ def test_noise_has_the_paper_s_rms_and_the_star_s_photons(noise, gaussian_stars,
 def test_star_photons_add_a_quarter_at_the_lowest_level(noise, gaussian_stars):
     mean = noise.variance(gaussian_stars, 3e-5).mean()
     assert mean / (4.98 * 3e-5) ** 2 == pytest.approx(1.26, abs=0.01)
+
+
+def test_every_level_of_a_band_is_drawn_as_often():
+    levels = np.array([3e-4, 5e-4, 7e-4, 9e-4])
+    drawn = mixed_levels(levels, 40000, stream(1, "levels"))
+    found, counts = np.unique(drawn, return_counts=True)
+    assert (found == levels).all()
+    assert counts == pytest.approx(np.full(4, 10000), abs=5 * np.sqrt(10000))
 
 
 def test_fainter_stars_have_fewer_photons(noise):

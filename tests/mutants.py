@@ -1,0 +1,330 @@
+"""Mutants of the science: do the fast tests notice a wrong sign, factor or limit?
+
+    python tests/mutants.py run [WORD …]    apply the mutants to a private copy, one by one
+    python tests/mutants.py draw            draw the list of random mutants anew
+
+`mutants.csv` names every mutant by its function, a fragment of the code and which
+occurrence of the fragment in the function it is, so that code may move to another
+module. A fragment that is no longer there is an error that names it; whoever changes
+the line writes the mutant's new text into the list.
+
+Each mutant meets the test files that name its module, then the other fast tests. That
+takes hours; words select mutants whose row holds one of them.
+"""
+
+from __future__ import annotations
+
+import ast
+import copy
+import csv
+import os
+import random
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+LIST = Path(__file__).with_suffix(".csv")
+SEED, DRAWN = 13, 40
+SCIENCE = [
+    *("alignment", "bounds", "models", "optics", "stars"),
+    *(f"bundle/{name}.py" for name in ("measure", "statistics")),
+    *(f"evaluation/{name}.py" for name in ("calibration", "comparison", "correlation", "metrics")),
+    *(f"observations/{name}.py" for name in ("cutting", "sky")),
+    *(f"prediction/{name}.py" for name in ("border", "centring", "photometry", "shapes")),
+]
+"""Where the random mutants were drawn from; no matter once they are drawn."""
+
+CHOICE = ["-m", "not slow and not workflow", "--ignore=tests/test_mutants.py"]
+"""The fast tests but for those of the list, which notice every mutant."""
+
+MEMORY = 8 * 2**30
+LIMIT = 3600
+"""Seconds after which a mutant counts as killed; without one the tests take some minutes."""
+
+LEAST = 0.9
+NOTHING_FAILED = (0, 5)
+"""Exit codes of pytest: all passed, no test was chosen."""
+
+INSIDE = (ast.expr, ast.keyword, ast.comprehension, ast.AugAssign)
+FUNCTION = (ast.FunctionDef, ast.AsyncFunctionDef)
+SWAPPED = {
+    **{ast.Add: [ast.Sub], ast.Sub: [ast.Add], ast.Mult: [ast.Div], ast.Div: [ast.Mult]},
+    **{ast.FloorDiv: [ast.Mult], ast.Mod: [ast.FloorDiv], ast.Pow: [ast.Mult]},
+    **{ast.BitAnd: [ast.BitOr], ast.BitOr: [ast.BitAnd], ast.And: [ast.Or], ast.Or: [ast.And]},
+    **{ast.Lt: [ast.LtE, ast.GtE], ast.LtE: [ast.Lt, ast.Gt], ast.Eq: [ast.NotEq]},
+    **{ast.Gt: [ast.GtE, ast.LtE], ast.GtE: [ast.Gt, ast.Lt], ast.NotEq: [ast.Eq]},
+    **{ast.Is: [ast.IsNot], ast.IsNot: [ast.Is], ast.In: [ast.NotIn], ast.NotIn: [ast.In]},
+}
+Units = dict[str, dict[Path, list[ast.AST]]]
+"""Functions, methods, classes without their methods and constants by name and file."""
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """A row of the list; `equivalent` is the reason why no test can notice it, if there is one."""
+
+    function: str
+    original: str
+    mutated: str
+    occurrence: int
+    source: str
+    equivalent: str
+
+
+class LostError(LookupError):
+    """A mutant's fragment is not in the code."""
+
+
+def read_list() -> list[Mutant]:
+    with LIST.open(encoding="utf-8", newline="") as file:
+        return [
+            Mutant(**{**row, "occurrence": int(row["occurrence"])}) for row in csv.DictReader(file)
+        ]
+
+
+def named_parts(tree: ast.Module) -> Iterator[tuple[str, ast.AST]]:
+    for node in tree.body:
+        if isinstance(node, FUNCTION):
+            yield node.name, node
+        elif isinstance(node, ast.ClassDef):
+            for part in node.body:
+                method = isinstance(part, FUNCTION)
+                yield (f"{node.name}.{part.name}" if method else node.name), part
+        elif isinstance(node, ast.Assign | ast.AnnAssign):
+            target = node.targets[0] if isinstance(node, ast.Assign) else node.target
+            yield ast.unparse(target), node
+
+
+def units_of(package: Path) -> Units:
+    units: Units = {}
+    for path in sorted(package.rglob("*.py")):
+        for name, part in named_parts(ast.parse(path.read_text(encoding="utf-8"))):
+            units.setdefault(name, {}).setdefault(path, []).append(part)
+    return units
+
+
+def matches(parts: list[ast.AST], fragment: str) -> list[ast.AST]:
+    """Nodes that read like a fragment, an expression or a statement, in the order of the code."""
+    wanted = ast.parse(fragment).body[0]
+    text = ast.dump(wanted.value if isinstance(wanted, ast.Expr) else wanted)
+    found = [node for part in parts for node in ast.walk(part) if ast.dump(node) == text]
+    return sorted(found, key=lambda node: (node.lineno, node.col_offset))
+
+
+def find(units: Units, mutant: Mutant) -> tuple[Path, ast.AST]:
+    """File and node of a mutant."""
+    found = [
+        (path, nodes[mutant.occurrence])
+        for path, parts in units.get(mutant.function, {}).items()
+        if len(nodes := matches(parts, mutant.original)) > mutant.occurrence
+    ]
+    if len(found) != 1:
+        where = "nowhere" if not found else f"in {len(found)} files"
+        raise LostError(f"{mutant.function}: {mutant.original!r} ({mutant.occurrence}) is {where}")
+    return found[0]
+
+
+def apply(path: Path, node: ast.AST, mutated: str) -> str:
+    """The file with the node replaced."""
+    lines = path.read_bytes().splitlines(keepends=True)
+    begin = sum(map(len, lines[: node.lineno - 1])) + node.col_offset
+    end = sum(map(len, lines[: node.end_lineno - 1])) + node.end_col_offset
+    new = mutated if isinstance(node, ast.stmt) else f"({mutated})"
+    whole = b"".join(lines)
+    text = (whole[:begin] + new.encode() + whole[end:]).decode()
+    ast.parse(text)
+    return text
+
+
+def changes(node: ast.AST, rng: random.Random) -> ast.AST | None:
+    """A node with one operator or number changed; None if it has none of its own."""
+    new = copy.deepcopy(node)
+    if isinstance(node, ast.BinOp) and isinstance(node.op, ast.MatMult):
+        new.left, new.right = new.right, new.left
+    elif isinstance(node, ast.BinOp | ast.BoolOp | ast.AugAssign) and type(node.op) in SWAPPED:
+        new.op = rng.choice(SWAPPED[type(node.op)])()
+    elif isinstance(node, ast.Compare):
+        new.ops[0] = rng.choice(SWAPPED[type(node.ops[0])])()
+    elif isinstance(node, ast.UnaryOp):
+        return new.operand
+    elif isinstance(node, ast.Constant) and type(node.value) in (int, float):
+        step = node.value + rng.choice((-1, 1))
+        factor = (node.value or 1.0) * rng.choice((0.5, 2.0))
+        new.value = step if isinstance(node.value, int) else factor
+    else:
+        return None
+    return None if ast.dump(new) == ast.dump(node) else new
+
+
+def places(node: ast.AST, around: ast.AST | None = None) -> Iterator[tuple[ast.AST, ast.AST]]:
+    """Nodes of code that computes, each with the expression that tells where it is."""
+    telling = (ast.BinOp, ast.Call, ast.Subscript, ast.Compare, ast.BoolOp, ast.AugAssign)
+    if isinstance(node, ast.Raise | ast.JoinedStr):
+        return
+    around = node if isinstance(node, telling) or around is None else around
+    yield node, node if isinstance(node, ast.UnaryOp) else around
+    for name, value in ast.iter_fields(node):
+        if name in ("annotation", "returns", "decorator_list"):
+            continue
+        for child in value if isinstance(value, list) else [value]:
+            if isinstance(child, ast.AST):
+                inside = isinstance(node, INSIDE)
+                yield from places(child, around if inside else None)
+
+
+def write_list(mutants: list[Mutant]) -> None:
+    with LIST.open("w", encoding="utf-8", newline="") as file:
+        out = csv.DictWriter(file, [field.name for field in fields(Mutant)], lineterminator="\n")
+        out.writeheader()
+        out.writerows(asdict(mutant) for mutant in mutants)
+
+
+def draw(known: list[Mutant]) -> list[Mutant]:
+    """Random mutants of the science, as many more as are known to be equivalent."""
+    package = ROOT / "src" / "psfdae"
+    units = units_of(package)
+    science = [package / name for name in SCIENCE]
+    able = [
+        (name, path, node, around)
+        for name in sorted(units)
+        for path, parts in units[name].items()
+        if any(path.is_relative_to(folder) for folder in science)
+        for part in parts
+        for node, around in places(part)
+        if changes(node, random.Random(0))
+    ]
+    reasons = {replace(mutant, equivalent=""): mutant.equivalent for mutant in known}
+    rng = random.Random(SEED)
+
+    def mutant_at(name: str, path: Path, node: ast.AST, around: ast.AST) -> Mutant:
+        original = ast.unparse(around)
+        occurrence = matches(units[name][path], original).index(around)
+        new = Swap([*ast.walk(around)].index(node), changes(node, rng)).of(around)
+        mutant = Mutant(name, original, ast.unparse(new), occurrence, "drawn", "")
+        find(units, mutant)
+        return replace(mutant, equivalent=reasons.get(mutant, ""))
+
+    drawn = [mutant_at(*place) for place in rng.sample(able, DRAWN)]
+    while sum(not mutant.equivalent for mutant in drawn) < DRAWN:
+        drawn.append(mutant_at(*rng.choice(able)))
+    return drawn
+
+
+class Swap(ast.NodeTransformer):
+    """Puts another node in the place of one, known by its number in `ast.walk`."""
+
+    def __init__(self, number: int, new: ast.AST) -> None:
+        self.number, self.new = number, new
+
+    def of(self, tree: ast.AST) -> ast.AST:
+        tree = copy.deepcopy(tree)
+        self.old = [*ast.walk(tree)][self.number]
+        return self.visit(tree)
+
+    def visit(self, node: ast.AST) -> ast.AST:
+        return self.new if node is self.old else self.generic_visit(node)
+
+
+def private_copy(folder: Path) -> None:
+    """The files of the project, as they are now, in a folder of their own."""
+    listed = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
+    names = subprocess.run(listed, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    for name in filter(None, names.split("\0")):
+        if (ROOT / name).is_file():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(ROOT / name, folder / name)
+
+
+def pytest(folder: Path, arguments: list[str]) -> tuple[int | None, str]:
+    """Exit code (None if there is no end) and output of fast tests of a copy."""
+    run = subprocess.Popen(
+        [sys.executable, "-m", "pytest", "-q", "-x", "-rfE", *CHOICE, *arguments],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": str(folder / "src"), "OMP_NUM_THREADS": "1"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+    )
+    try:
+        output = run.communicate(timeout=LIMIT)[0]
+    except subprocess.TimeoutExpired:
+        os.killpg(run.pid, signal.SIGKILL)
+        return None, run.communicate()[0]
+    return run.returncode, output
+
+
+def fate(folder: Path, mutant: Mutant, number: int) -> str:
+    """What becomes of a mutant: the test that kills it, if one does."""
+    path, node = find(units_of(ROOT / "src" / "psfdae"), mutant)
+    place = folder / path.relative_to(ROOT)
+    place.write_text(apply(path, node, mutant.mutated), encoding="utf-8")
+    # Compiled code is known by whole seconds and its size.
+    os.utime(place, (0, time.time() + 10 * number))
+    module = ".".join(path.relative_to(ROOT / "src").with_suffix("").parts)
+    tests = [test.relative_to(folder) for test in sorted(folder.glob("tests/test_*.py"))]
+    near = [str(test) for test in tests if module in (folder / test).read_text(encoding="utf-8")]
+    stages = [("near", near)] if near else []
+    try:
+        for stage, arguments in [*stages, ("rest", [f"--ignore={test}" for test in near])]:
+            code, output = pytest(folder, arguments)
+            if code is None:
+                return f"killed: {stage}: no end within {LIMIT} s"
+            if code not in NOTHING_FAILED:
+                told = [x for x in output.splitlines() if x.startswith(("FAILED", "ERROR"))]
+                return f"killed: {stage}: {' '.join((told or ['ERROR'])[0].split()[:2])}"
+        return "alive"
+    finally:
+        shutil.copy2(path, place)
+
+
+def run(words: list[str]) -> int:
+    """Apply the mutants one by one and tell what became of them; 1 if too many live."""
+    os.nice(10)
+    resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY))
+    chosen = [
+        (number, mutant)
+        for number, mutant in enumerate(read_list(), 1)
+        if not mutant.equivalent and (not words or any(word in str(mutant) for word in words))
+    ]
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        private_copy(folder)
+        start = time.monotonic()
+        code, output = (0, "") if words else pytest(folder, [])
+        if code != 0 or time.monotonic() - start > LIMIT / 4:
+            print(output, "\nthe tests fail or take too long without a mutant")
+            return 2
+        dead = 0
+        for number, mutant in chosen:
+            start = time.monotonic()
+            found = fate(folder, mutant, number)
+            dead += found.startswith("killed")
+            print(f"{number:3d} {mutant.function}: {mutant.original} -> {mutant.mutated}")
+            print(f"    {found} ({time.monotonic() - start:.0f} s)", flush=True)
+    print(f"{dead} of {len(chosen)} killed")
+    return int(dead < LEAST * len(chosen))
+
+
+def main() -> int:
+    match sys.argv[1:]:
+        case ["run", *words]:
+            return run(words)
+        case ["draw"]:
+            known = read_list()
+            write_list([*(mutant for mutant in known if mutant.source != "drawn"), *draw(known)])
+            return 0
+    print(__doc__)
+    return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())
