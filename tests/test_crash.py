@@ -1,8 +1,8 @@
 """Runs that are killed, starved, locked out or damaged end, once repeated, in the same files.
 
-Every case breaks a run of one dataset's network, baseline and evaluation, then repeats
-it with the command that `make reproduce` gives. What comes out is compared byte by byte
-with an undisturbed run; the time of the recovery goes into the report of the tests.
+Every case breaks a `make reproduce` of one dataset's network, baseline and evaluation, then
+types the same again. What comes out is compared byte by byte with an undisturbed run; the
+time of the recovery goes into the report of the tests.
 """
 
 from __future__ import annotations
@@ -17,35 +17,45 @@ import time
 import psutil
 import pytest
 
-from workflow_runs import QUIET, job_counts, locked, wait_until
+from workflow_runs import PATH, QUIET, clone, job_counts, wait_until
 
 pytestmark = [pytest.mark.workflow, pytest.mark.slow]
 
-TARGET = "results/evaluation/dataset3/random-realisation.csv"
-WEIGHTS = "results/dae/dataset3/random-realisation/dae.safetensors"
-STARS = "results/data/seidel/seidel_10pct.h5"
-CHECKPOINT = "results/checkpoints/dataset3-random-realisation.pt"
-LOG = "results/logs/dae/dataset3/random-realisation.log"
+TARGET = "results/smoke/evaluation/dataset3/random-realisation.csv"
+WEIGHTS = "results/smoke/dae/dataset3/random-realisation/dae.safetensors"
+STARS = "results/smoke/data/seidel/seidel_10pct.h5"
+CHECKPOINT = "results/smoke/checkpoints/dataset3-random-realisation.pt"
+LOG = "results/smoke/logs/dae/dataset3/random-realisation.log"
 # Long enough for a signal to arrive in mid-training, which then resumes.
-SLOW = {"overrides": "train.epochs=80 train.checkpoint_seconds=0 train.batch=8"}
+SLOW = "train.epochs=80 train.checkpoint_seconds=0 train.batch=8"
 TOO_LARGE = 150_000
 """Bytes that a file may have on the full disk: less than the stars need."""
+
+
+def reproduce(folder):
+    """What a user types, with the environment active and nothing else set, for `subprocess`."""
+    own = {"HOME": str(folder), "PATH": PATH, "PYTHONPATH": str(folder / "src")}
+    line = ["make", "reproduce", "PRESET=smoke", f"TARGETS={TARGET}", f"SET={SLOW}"]
+    return {"args": line, "cwd": folder, "env": own}
+
+
+def with_stars(smoke, folder):
+    """A house with the stars, but without network and evaluation."""
+    shutil.copytree(smoke[0] / "results/data", clone(folder) / "results/smoke/data")
+    return folder
 
 
 @pytest.fixture(scope="module")
 def undisturbed(smoke, tmp_path_factory):
     """The run that nothing happens to."""
-    folder = tmp_path_factory.mktemp("undisturbed")
-    shutil.copytree(smoke[0] / "results/data", folder / "results/data")
-    subprocess.run(**locked(folder, TARGET, **SLOW), check=True, **QUIET)
+    folder = with_stars(smoke, tmp_path_factory.mktemp("undisturbed") / "house")
+    subprocess.run(**reproduce(folder), check=True, **QUIET)
     return folder
 
 
 @pytest.fixture
 def half_done(smoke, tmp_path):
-    """A folder with the stars, but without network and evaluation."""
-    shutil.copytree(smoke[0] / "results/data", tmp_path / "results/data")
-    return tmp_path
+    return with_stars(smoke, tmp_path / "house")
 
 
 @pytest.fixture
@@ -55,7 +65,7 @@ def recovers(undisturbed, record_property):
     def repeat(folder, **more):
         start = time.monotonic()
         run = subprocess.run(
-            **{**locked(folder, TARGET, **SLOW), **more},
+            **{**reproduce(folder), **more},
             capture_output=True,
             text=True,
             check=False,
@@ -66,14 +76,14 @@ def recovers(undisturbed, record_property):
         print(f"recovered in {seconds} s")
         products = [
             path.relative_to(undisturbed)
-            for path in (undisturbed / "results").rglob("*")
+            for path in (undisturbed / "results/smoke").rglob("*")
             if path.suffix in (".h5", ".safetensors", ".csv", ".parquet")
             and path.name != "history.csv"
         ]
         assert len(products) >= 6
         for path in products:
             assert (folder / path).read_bytes() == (undisturbed / path).read_bytes(), path
-        assert not list((folder / "results").rglob("*.tmp"))
+        assert not list((folder / "results/smoke").rglob("*.tmp"))
         assert not (folder / CHECKPOINT).exists()
         return run.stdout + run.stderr
 
@@ -82,7 +92,7 @@ def recovers(undisturbed, record_property):
 
 def started(folder, **more):
     """A run that has reached the middle of its training."""
-    run = subprocess.Popen(**{**locked(folder, TARGET, **SLOW), **more}, **QUIET)
+    run = subprocess.Popen(**{**reproduce(folder), **more}, **QUIET)
     wait_until((folder / CHECKPOINT).exists, 90, "the training left no checkpoint")
     return run
 
@@ -112,9 +122,11 @@ def test_killed_worker(half_done, recovers):
 def test_killed_snakemake(half_done, recovers):
     """Its jobs run on and its lock stays; the wrapper of make deals with both."""
     run = started(half_done)
-    orphans = psutil.Process(run.pid).children(recursive=True)
-    run.kill()
-    run.wait()
+    everyone = psutil.Process(run.pid).children(recursive=True)
+    snakemake = next(p for p in everyone if any("bin/snakemake" in w for w in p.cmdline()[:2]))
+    orphans = snakemake.children(recursive=True)
+    snakemake.kill()
+    assert run.wait() != 0
     assert any(child.is_running() for child in orphans)
     assert "waiting for it to end" in recovers(half_done)
 
@@ -145,7 +157,7 @@ def test_full_disk(half_done, recovers):
         resource.setrlimit(resource.RLIMIT_FSIZE, (TOO_LARGE, resource.RLIM_INFINITY))
 
     run = subprocess.run(
-        **locked(half_done, TARGET, **SLOW),
+        **reproduce(half_done),
         preexec_fn=limit,
         capture_output=True,
         text=True,
@@ -153,7 +165,7 @@ def test_full_disk(half_done, recovers):
     )
     assert run.returncode != 0
     assert not (half_done / STARS).exists()
-    log = (half_done / "results/logs/stars/seidel/seidel_10pct.log").read_text()
+    log = (half_done / "results/smoke/logs/stars/seidel/seidel_10pct.log").read_text()
     assert log.startswith("psfdae: "), log
     assert "File too large" in log
     recovers(half_done)
@@ -161,10 +173,10 @@ def test_full_disk(half_done, recovers):
 
 def test_read_only_results(half_done, recovers):
     """Refused with a message, nothing changed; goes on once the folder can be written."""
-    inside = [half_done / "results", *(half_done / "results").rglob("*")]
+    inside = [half_done / "results/smoke", *(half_done / "results/smoke").rglob("*")]
     for path in inside:
         path.chmod(0o555 if path.is_dir() else 0o444)
-    arguments = locked(half_done, TARGET, **SLOW)
+    arguments = reproduce(half_done)
     if os.geteuid() == 0:
         # Root may write anywhere, unless it gives up that capability.
         arguments["args"] = ["setpriv", "--bounding-set=-dac_override", *arguments["args"]]
@@ -181,7 +193,8 @@ def test_read_only_results(half_done, recovers):
 @pytest.mark.parametrize("product", [STARS, WEIGHTS])
 def test_damaged_file(undisturbed, tmp_path, recovers, product, damage):
     """Named, set aside, and built again with everything that depends on it."""
-    shutil.copytree(undisturbed, tmp_path, dirs_exist_ok=True)
+    tmp_path /= "house"
+    shutil.copytree(undisturbed, tmp_path, symlinks=True)
     path = tmp_path / product
     whole = path.read_bytes()
     times = path.stat()
