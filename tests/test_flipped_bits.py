@@ -9,6 +9,7 @@ import subprocess
 
 import pytest
 
+from psfdae.files import write_text
 from workflow_runs import locked
 
 pytestmark = [pytest.mark.workflow, pytest.mark.slow]
@@ -22,6 +23,8 @@ HARMLESS = {
 
 VARYING = ("history.csv", "_times.csv", "alignment_time.csv", "runtime.csv", "mlflow.db")
 """Ends of the names of files with run times, which no two runs share."""
+
+OWN = "of_my_own.txt"
 
 
 def kind_of(path, results):
@@ -59,7 +62,9 @@ def flipped(smoke, tmp_path_factory):
     """The folder of a run that was damaged and repeated, what was flipped, and what was said."""
     folder = tmp_path_factory.mktemp("flipped")
     shutil.copytree(smoke[0], folder, dirs_exist_ok=True, symlinks=True)
-    chosen = one_of_each(folder / "results")
+    # A user's own, which no job can build again.
+    write_text(folder / "results" / OWN, "1\n")
+    chosen = one_of_each(folder / "results") | {("own",): folder / "results" / OWN}
     rng = random.Random(4)
     for path in chosen.values():
         flip(path, rng)
@@ -112,4 +117,4 @@ def test_nothing_is_left_to_find(flipped):
         text=True,
         check=True,
     )
-    assert (done.stdout, done.stderr) == ("", "")
+    assert (done.stdout, done.stderr) == (f"results/{OWN}\n", "")
