@@ -215,6 +215,18 @@ def test_verify_sweeps_only_what_is_certainly_stale(tmp_path, killed):
     assert not reused.exists()
 
 
+def test_a_writer_that_is_hidden_is_not_taken_for_dead(tmp_path, killed, monkeypatch):
+    _, left = killed
+
+    def denied(pid, number):
+        raise PermissionError
+
+    monkeypatch.setattr(files, "_started", lambda pid: "")
+    monkeypatch.setattr(os, "kill", denied)
+    verify(tmp_path)
+    assert left.exists()
+
+
 def test_a_long_name_can_be_written(tmp_path):
     path = tmp_path / ("ü" * 120 + ".csv")
     write_text(path, "1")

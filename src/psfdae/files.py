@@ -157,8 +157,20 @@ def sweep_stale(folder: Path, stem: str) -> None:
     """
     for entry in os.scandir(folder):
         found = _STALE.search(entry.name) if entry.name.startswith(stem) else None
-        if found and found[1] == _machine() and found[3] != _started(found[2]):
+        if found and found[1] == _machine() and _ended(int(found[2]), found[3]):
             Path(entry.path).unlink(missing_ok=True)
+
+
+def _ended(pid: int, started: str) -> bool:
+    """Whether a process of this machine has certainly ended."""
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return True
+    except OSError:
+        # Of another user, whose processes may be hidden from us.
+        return False
+    return _started(pid) not in (started, "")
 
 
 def write_text(path: str | Path, text: str) -> None:
@@ -223,7 +235,8 @@ def write_product(
     import h5py
 
     # In memory, because HDF5 crashes where a full disk keeps it from closing a file.
-    with h5py.File(Path(path).name, "w", driver="core", backing_store=False) as file:
+    # A name of its own, because HDF5 opens no file twice.
+    with h5py.File(secrets.token_hex(16), "w", driver="core", backing_store=False) as file:
         _describe(file, kind, config)
         stored: dict[int, str] = {}
         for name, column in columns.items():
