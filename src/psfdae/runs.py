@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
+from psfdae.belonging import STARS, require_origin
 from psfdae.files import ProductError, read_product
 from psfdae.reading import number, read_csv, read_yaml
 
@@ -166,24 +167,27 @@ def read(entry: Entry) -> Record:
     Raises
     ------
     ProductError
-        If a file is missing or damaged; the message names it.
+        If a file is missing or damaged, or the model was trained on other stars; the
+        message names it.
     """
     contents = {name: sha256(path) for name, path in entry.files().items()}
-    stars = read_product(entry.stars, "stars", ()).config
+    stars = read_product(entry.stars, "stars", ())
     if entry.kind == "dae":
+        require_origin(entry.model.parent, STARS, stars)
         own = read_yaml(entry.config)
         # Which start succeeded is an outcome, not a setting.
         own.pop("attempt", None)
     else:
+        require_origin(entry.model, STARS, stars)
         own = read_product(entry.model, "pca_som", ()).config
-    config = {**stars, **own}
+    config = {**stars.config, **own}
     config_hash = hash_of(config)
     epochs = _epochs(entry.history) if entry.history else []
     start_ms, end_ms = span_ms(entry.model, epochs)
     points = epoch_points(epochs, start_ms) + _test_points(entry, end_ms)
     return Record(
         entry=entry,
-        experiment=_experiment(entry.stars, stars),
+        experiment=_experiment(entry.stars, stars.config),
         config=config,
         config_hash=config_hash,
         content_hash=hash_of([CONTENT, config_hash, contents]),

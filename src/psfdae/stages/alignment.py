@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from psfdae.belonging import OURS, STATE_STAMPS, STATES, require
 from psfdae.files import Column, Product, read_product, write_product, write_text
 from psfdae.rng import stream
 from psfdae.stages.common import limit_threads
@@ -62,9 +63,17 @@ def model(config: Any, out: Path) -> None:
     write_product(out, "alignment_model", columns, config.model_dump())
 
 
-def read_model(path: Path) -> QuadraticModel:
-    """The quadratic model of a product "alignment_model"."""
-    return QuadraticModel(read_product(path, "alignment_model", ("coefficients",))["coefficients"])
+def read_model(path: Path, wanted: Any, whose: object = OURS) -> QuadraticModel:
+    """The quadratic model of a product "alignment_model".
+
+    Parameters
+    ----------
+    path : product "alignment_model"
+    wanted, whose : what it must be a model of, as in `psfdae.belonging.require`
+    """
+    product = read_product(path, "alignment_model", ("coefficients",))
+    require(path, product.config, STATES, wanted, whose)
+    return QuadraticModel(product["coefficients"])
 
 
 def states(config: Any, kind: StateSet, model_path: Path | None, out: Path) -> None:
@@ -84,14 +93,13 @@ def states(config: Any, kind: StateSet, model_path: Path | None, out: Path) -> N
     ------
     RayTracingError, SamplingError, EnergyError
         If a field is vignetted, the pupil grid too coarse or a stamp too small.
+    ProductError
+        If the model is that of another telescope or range.
     """
     limit_threads(1)  # batches run side by side, optics.threads of them
+    fitted = None if model_path is None else read_model(model_path, config)
     chosen = _choose(config, kind)
-    zernikes = (
-        traced_zernikes(zernike_tracer(config), chosen)
-        if model_path is None
-        else read_model(model_path)(chosen)
-    )
+    zernikes = fitted(chosen) if fitted else traced_zernikes(zernike_tracer(config), chosen)
     operator = AlignmentStamps(config.telescope, config.optics, config.alignment)
     stamps, energy = state_stamps(operator, zernikes)
     columns = {
@@ -136,6 +144,11 @@ def telescope(config: Any, model_path: Path, grid: Path, uniform: Path, out: Pat
     model_path : product "alignment_model"
     grid, uniform : products "alignment_states"
     out : CSV, columns quantity, value, unit
+
+    Raises
+    ------
+    ProductError
+        If products and configuration do not belong together.
     """
     import pandas as pd
 
@@ -144,6 +157,9 @@ def telescope(config: Any, model_path: Path, grid: Path, uniform: Path, out: Pat
         name: read_product(path, "alignment_states", ("energy", "stamps"))
         for name, path in (("grid", grid), ("uniform", uniform))
     }
+    require(model_path, fitted.config, STATES, config)
+    for product in sets.values():
+        require(product.path, product.config, STATE_STAMPS, config)
     pixel = config.telescope.pixel
     rows = [
         ("pixel", pixel, "lambda/D"),

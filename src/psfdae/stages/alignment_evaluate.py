@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from psfdae.files import Column, read_product, write_product, write_text
+from psfdae.belonging import STATE_STAMPS, require, require_origin
+from psfdae.files import Column, Product, read_product, write_product, write_text
 from psfdae.reading import from_tree, read_yaml
 from psfdae.rng import stream
 from psfdae.stages.alignment import read_model
@@ -78,6 +79,23 @@ def _size(value: Any) -> int:
     return value
 
 
+def require_cnn(folder: Path, states: Product, name: str | None = None) -> None:
+    """Refuse a CNN that does not belong to states.
+
+    Parameters
+    ----------
+    folder : of the trained CNN
+    states : product "alignment_states" with its stamps
+    name : which CNN it must be, if that matters
+    """
+    _, fields, _, side = states["stamps"].shape
+    said, keys = read_yaml(folder / CONFIG), ("fields", "stamp_px")
+    require(folder / CONFIG, said, keys, {"fields": fields, "stamp_px": side}, states.path)
+    require_origin(folder, STATE_STAMPS, states)
+    if name:
+        require(folder / CONFIG, said, ("name",), {"name": name}, "the command")
+
+
 def learned_methods(
     config: Any, dae: Path, cnns: dict[str, Path]
 ) -> dict[str, Callable[[np.ndarray], np.ndarray]]:
@@ -120,11 +138,19 @@ def estimate(
     cnns : folders of the CNNs original, noise_trained and dae_retrained
     out : product "alignment_estimates"
     times : CSV, columns test_set, noise_level, method, seconds, states
+
+    Raises
+    ------
+    ProductError
+        If a product is damaged, or states and networks do not belong together.
     """
     import pandas as pd
 
     limit_threads(config.evaluation.threads)
     product = read_product(states, "alignment_states", ("states", "stamps"))
+    require_origin(dae, STATE_STAMPS, product)
+    for name, folder in cnns.items():
+        require_cnn(folder, product, name)
     methods = learned_methods(config, dae, cnns)
     levels = [CLEAN, *config.noise.levels]
     found = np.empty((len(levels), len(LEARNED), *product["states"].shape))
@@ -178,6 +204,11 @@ def fit(
     cnn : folder of the CNN that starts the fit
     out : product "alignment_fit"
     times : CSV, columns test_set, noise_level, method, seconds, states
+
+    Raises
+    ------
+    ProductError
+        If a product is damaged, or inputs and configuration do not belong together.
     """
     import pandas as pd
 
@@ -185,8 +216,11 @@ def fit(
 
     limit_threads(1)
     product = read_product(states, "alignment_states", ("states", "stamps", "noll"))
+    require(states, product.config, STATE_STAMPS, config)
+    wavefronts = read_model(model, product.config, states)
+    require_cnn(cnn, product)
+    predict = cnn_predictor(cnn, config)
     stamps = noisy_test_states(config, product["stamps"], test_set, level)
-    wavefronts, predict = read_model(model), cnn_predictor(cnn, config)
     likelihood = Likelihood(wavefronts, _operator(config), noise_model(config), level)
     started = time.perf_counter()
     start = predict(stamps)
@@ -220,14 +254,21 @@ def bound(config: Any, test_set: str, states: Path, model: Path, out: Path) -> N
     states : product "alignment_states"
     model : product "alignment_model"
     out : product "alignment_bound"
+
+    Raises
+    ------
+    ProductError
+        If a product is damaged, or inputs and configuration do not belong together.
     """
     from psfdae.alignment.fisher import bound_covariances
 
     limit_threads(1)
-    truth = read_product(states, "alignment_states", ("states",))["states"]
-    levels = config.noise.levels
+    product = read_product(states, "alignment_states", ("states",))
+    require(states, product.config, STATE_STAMPS, config)
+    wavefronts = read_model(model, product.config, states)
+    truth, levels = product["states"], config.noise.levels
     covariances = bound_covariances(
-        read_model(model), _operator(config), noise_model(config), levels, truth
+        wavefronts, _operator(config), noise_model(config), levels, truth
     )
     columns = {
         "states": Column(truth, "range", "true states"),

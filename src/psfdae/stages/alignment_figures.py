@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 
 from psfdae.alignment.fisher import coma_free_decentre, expected_abs_error
+from psfdae.belonging import STATE_STAMPS, require_origin
 from psfdae.files import atomic_path, read_product, write_text
 from psfdae.reading import read_table
-from psfdae.stages.alignment_tables import read_errors
+from psfdae.stages.alignment_tables import read_errors, require_one_test
 from psfdae.stages.common import limit_threads, noise_model
 from psfdae.stars.alignment_model import design_states, fit_quadratic
 from psfdae.stars.alignment_scene import state_stamps, traced_zernikes, zernike_tracer
@@ -43,6 +44,7 @@ def stamps(config: Any, states: Path, dae: Path, out: Path) -> None:
     from psfdae.stages.alignment_train import denoise
 
     product = read_product(states, "alignment_states", ("states", "stamps"))
+    require_origin(dae, STATE_STAMPS, product)
     clean = product["stamps"][:SHOWN_STATES]
     rows = [("noise-free", clean)]
     for level in config.noise.levels:
@@ -66,6 +68,7 @@ def predicted(estimates: Path, fits: Sequence[Path], out: Path) -> None:
     """
     from psfdae.evaluation.alignment_figures import predicted_against_true
 
+    require_one_test([estimates], fits, [])
     found: dict[str, dict[float, np.ndarray]] = {method: {} for method in DRAWN}
     truth = np.empty(0)
     for key, truth, states in read_errors([estimates], fits):  # noqa: B007
@@ -86,6 +89,7 @@ def errors(
     """
     from psfdae.evaluation.alignment_figures import errors_against_size, size_of
 
+    require_one_test(estimates, fits, bounds)
     curves: dict[float, dict[str, Any]] = {}
     for key, truth, states in read_errors(estimates, fits):
         if key["method"] in DRAWN and key["noise_level"] > 0:

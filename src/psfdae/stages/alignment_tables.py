@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from psfdae.files import ProductError, read_product, write_text
+from psfdae.belonging import STATE_STAMPS, require
+from psfdae.files import Product, ProductError, read_product, write_text
 from psfdae.reading import read_table
 
 LEARNED = ("original", "dae", "noise_trained", "dae_retrained")
@@ -39,6 +40,41 @@ def read_errors(
         yield {**key, "method": "max_likelihood"}, product["states"], product["estimates"]
 
 
+SAME_TEST = ("noise.kappa", "noise.background_photons", *STATE_STAMPS)
+"""What products of one test agree in; estimates and fits in the seed of the noise, too."""
+
+
+def require_one_test(
+    estimates: Sequence[Path], fits: Sequence[Path], bounds: Sequence[Path]
+) -> None:
+    """Refuse estimates, fits and bounds that are not of the same telescope, noise and states.
+
+    Raises
+    ------
+    ProductError
+        If a product is damaged, or differs from an earlier one.
+    """
+    earlier: list[Product] = []
+    for kind, paths in (("estimates", estimates), ("fit", fits), ("bound", bounds)):
+        for path in paths:
+            product = read_product(path, f"alignment_{kind}", ("states",))
+            for other in earlier:
+                keys = SAME_TEST if kind == "bound" else ("seed", *SAME_TEST)
+                require(path, product.config, keys, other.config, other.path)
+                _require_states(product, other)
+            earlier.append(product)
+
+
+def _require_states(product: Product, other: Product) -> None:
+    if product.config["test_set"] != other.config["test_set"]:
+        return
+    ours, theirs = ({"states": p["states"].tolist()} for p in (product, other))
+    for said, there in zip(ours["states"], theirs["states"], strict=False):
+        require(product.path, {"states": said}, ("states",), {"states": there}, other.path)
+    counts = ({"number of states": len(tree["states"])} for tree in (ours, theirs))
+    require(product.path, next(counts), ("number of states",), next(counts), other.path)
+
+
 def tables(
     states: Path,
     estimates: Sequence[Path],
@@ -57,12 +93,22 @@ def tables(
         mean_abs_error, bias, variance, variance_abs, unit, n
     correlation_out : CSV, columns test_set, noise_level, method, parameter_a,
         parameter_b, correlation, ci_low, ci_high
+
+    Raises
+    ------
+    ProductError
+        If a product is damaged, or they do not belong together.
     """
     import pandas as pd
 
     from psfdae.evaluation import alignment_tables as rows
 
-    unit = read_product(states, "alignment_states", ("unit",))["unit"]
+    require_one_test(estimates, fits, bounds)
+    product = read_product(states, "alignment_states", ("unit",))
+    for path in bounds:
+        bound = read_product(path, "alignment_bound", ())
+        require(path, bound.config, STATE_STAMPS, product.config, states)
+    unit = product["unit"]
     errors: list[dict[str, Any]] = []
     correlations: list[dict[str, Any]] = []
     for key, truth, estimate in read_errors(estimates, fits):

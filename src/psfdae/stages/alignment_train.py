@@ -23,8 +23,9 @@ from psfdae.alignment.batches import (
     noisy_states,
     steps_per_epoch,
 )
+from psfdae.belonging import STATE_STAMPS, require, require_origin, write_origin
 from psfdae.configuration.compose import decisive
-from psfdae.files import read_product, write_text
+from psfdae.files import Product, read_product, write_text
 from psfdae.rng import stream
 from psfdae.stages.common import limit_threads, noise_model
 from psfdae.stages.train import as_csv, as_yaml
@@ -43,17 +44,19 @@ def train_dae_stamps(config: Any, grid: Path, train: Path, out: Path, checkpoint
     ----------
     config : stage config (seed, noise, dae, dae_train)
     grid, train : products "alignment_states"; the first states of `train` validate
-    out : folder that receives `dae.safetensors`, `config.yaml`, `history.csv`
+    out : folder that receives `dae.safetensors`, `config.yaml`, `history.csv`, and in
+        `trained_on.yaml` what the grid says of itself
     checkpoint : file that lets an interrupted training resume
 
-    Raises TrainingError as `psfdae.models.training.train_dae` does.
+    Raises TrainingError as `psfdae.models.training.train_dae` does, and ProductError if the
+    products are of different telescopes or stamps.
     """
     from psfdae.models.training import TrainingSet, train_dae
     from psfdae.models.weights import save_weights
 
-    fit, validation = (_flat(_read(path)[1]) for path in (grid, train))
-    per_state = _read(train)[1].shape[1]
-    validation = validation[: VALIDATION_STATES * per_state]
+    on, validating = _read(grid), _read(train)
+    require(train, validating.config, STATE_STAMPS, on.config, grid)
+    fit, validation = _flat(on["stamps"]), _flat(validating["stamps"][:VALIDATION_STATES])
     images = np.concatenate([fit, validation])
     data = TrainingSet(
         images=images,
@@ -78,6 +81,7 @@ def train_dae_stamps(config: Any, grid: Path, train: Path, out: Path, checkpoint
         ),
         lambda: None,
     )
+    write_origin(out, on)
     save_weights(out / WEIGHTS, result.state, described)
     write_text(out / HISTORY, as_csv(result.history))
     write_text(out / CONFIG, as_yaml({**described, "attempt": result.attempt}))
@@ -91,13 +95,15 @@ def train_original(config: Any, grid: Path, out: Path, checkpoint: Path) -> None
     ----------
     config : stage config (seed, cnn, train_original)
     grid : product "alignment_states"
-    out : folder that receives `cnn.safetensors`, `config.yaml`, `history.csv`
+    out : folder that receives `cnn.safetensors`, `config.yaml`, `history.csv`, and in
+        `trained_on.yaml` what the states say of themselves
     checkpoint : file that lets an interrupted training resume
 
     Raises CnnTrainingError as `psfdae.models.cnn.train_cnn` does.
     """
-    data = TrainingStates(*_read(grid))
-    _train("original", config, config.train_original, data, out, checkpoint)
+    product = _read(grid)
+    data = TrainingStates(product["states"], product["stamps"])
+    _train("original", config, config.train_original, product, data, out, checkpoint)
 
 
 def train_noise_trained(config: Any, train: Path, out: Path, checkpoint: Path) -> None:
@@ -109,14 +115,14 @@ def train_noise_trained(config: Any, train: Path, out: Path, checkpoint: Path) -
     train : product "alignment_states"
     out, checkpoint : as for `train_original`
     """
-    noise, settings = noise_model(config), config.train_noise_trained
+    noise, settings, product = noise_model(config), config.train_noise_trained, _read(train)
 
     def disturb(stamps: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         level = mixed(config.noise.levels, len(stamps), rng)
         return gaussian_states(noise, stamps, level, rng), _weights(config, settings, level)
 
-    data = TrainingStates(*_read(train), disturb=disturb)
-    _train("noise_trained", config, settings, data, out, checkpoint)
+    data = TrainingStates(product["states"], product["stamps"], disturb=disturb)
+    _train("noise_trained", config, settings, product, data, out, checkpoint)
 
 
 def train_dae_retrained(config: Any, train: Path, dae: Path, out: Path, checkpoint: Path) -> None:
@@ -130,14 +136,21 @@ def train_dae_retrained(config: Any, train: Path, dae: Path, out: Path, checkpoi
     train : product "alignment_states"
     dae : folder of the trained DAE
     out, checkpoint : as for `train_original`
+
+    Raises
+    ------
+    ProductError
+        If the DAE was trained on the stamps of another telescope, or of another size.
     """
-    states, stamps = _read(train)
+    product = _read(train)
+    require_origin(dae, STATE_STAMPS, product)
+    states, stamps = product["states"], product["stamps"]
     rng = stream(config.seed, "cnn", "noise", "dae_retrained")
     level = mixed(config.noise.levels, len(states), rng)
     denoised = denoise(dae, config, noisy_states(noise_model(config), stamps, level, rng))
     settings = config.train_dae_retrained
     data = TrainingStates(states, denoised, weights=_weights(config, settings, level))
-    _train("dae_retrained", config, settings, data, out, checkpoint)
+    _train("dae_retrained", config, settings, product, data, out, checkpoint)
 
 
 def _weights(config: Any, settings: Any, level: np.ndarray) -> np.ndarray:
@@ -163,6 +176,7 @@ def _train(
     name: str,
     config: Any,
     settings: Any,
+    product: Product,
     data: TrainingStates,
     out: Path,
     checkpoint: Path,
@@ -197,15 +211,15 @@ def _train(
             flush=True,
         ),
     )
+    write_origin(out, product)
     save_weights(out / CNN_WEIGHTS, training.model.state_dict(), described)
     write_text(out / HISTORY, as_csv(training.history))
     write_text(out / CONFIG, as_yaml(described))
     checkpoint.unlink(missing_ok=True)
 
 
-def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    product = read_product(path, "alignment_states", ("states", "stamps"))
-    return product["states"], product["stamps"]
+def _read(path: Path) -> Product:
+    return read_product(path, "alignment_states", ("states", "stamps"))
 
 
 def _flat(stamps: np.ndarray) -> np.ndarray:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from psfdae.belonging import STARS, STATIC, require
 from psfdae.bounds.bank import Bank, jittered_templates
 from psfdae.bounds.growth import TIGHT, extrapolate, last_change, nested_means, segments
 from psfdae.bounds.likelihood import Likelihood
@@ -137,12 +138,15 @@ def run(
     Raises
     ------
     ProductError
-        If a product is damaged, or the bank does not belong to the stars.
+        If a product is damaged, or stars, templates, bank and configuration do not
+        belong together.
     """
     limit_threads(config.bounds.threads)
     product = read_product(stars, "stars")
-    framed = read_product(templates, "templates", ("psf",))["psf"]
-    static = jittered_templates(framed, config.framing.jitter_px)
+    framed = read_product(templates, "templates", ("psf",))
+    require(stars, product.config, STARS, config)
+    require(templates, framed.config, STATIC, config)
+    static = jittered_templates(framed["psf"], config.framing.jitter_px)
     tables = Tables(dataset, _test_stars(config, product))
     if config.stars.aberration_fraction == 0:
         _exact(config, static, tables)
@@ -196,9 +200,7 @@ def _read_bank(path: Path, stars: Product) -> Bank:
         If it was drawn from another simulator than the stars.
     """
     product = read_product(path, "bank", ("framed", "field_index", "peak"))
-    for group in ("telescope", "grid", "wavefront", "stars", "framing"):
-        if product.config[group] != stars.config[group]:
-            raise ProductError(f"{path}: another {group} than that of {stars.path}; run it again")
+    require(path, product.config, STARS, stars.config, stars.path)
     return Bank(
         product["framed"],
         product["field_index"],

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 import psfdae
+from psfdae.belonging import SAME_IMAGE, SAME_STARS, STARS, require_origin
 from psfdae.bundle import measure
 from psfdae.bundle.format import (
     Architecture,
@@ -61,7 +62,8 @@ def run(
     BundleError
         If the network was trained with another seed, noise, parts or split.
     ProductError
-        If the configuration of the stars lacks what a bundle must know.
+        If the configuration of the stars lacks what a bundle must know, or the network
+        was trained on other stars.
     """
     import torch
 
@@ -70,6 +72,7 @@ def run(
     trained = _trained(dae, config, split)
     product = read_stars(stars, trained["reference"])
     kind = _kind_of_stamps(product)
+    require_origin(dae, (*STARS, *SAME_STARS, *SAME_IMAGE), product)
     network = _load(dae, trained, kind["stamp_px"], config.evaluation.batch)
     parts = split_stars(product, trained["split"], config)
     images, references = product["realisation"], product[trained["reference"]]

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from psfdae.belonging import STATIC, require
 from psfdae.evaluation.calibration import (
     fit_scales,
     kappa_of_mse,
@@ -16,7 +17,7 @@ from psfdae.evaluation.calibration import (
     residuals_by_scale,
 )
 from psfdae.evaluation.metrics import mse, ssim
-from psfdae.files import read_product, write_text
+from psfdae.files import Product, read_product, write_text
 from psfdae.optics.sampling import required_nodes
 from psfdae.reading import read_table
 from psfdae.rng import stream
@@ -109,16 +110,21 @@ def calibrate(config: Any, scans: Sequence[Path], stars: dict[str, Path], out: P
     scans : CSV files of the stage `scan`
     stars : product "stars" of each tabulated dataset
     out : folder that receives `fit.csv`, `columns.csv`, `scales.csv`, `degeneracy.csv`
+
+    Raises
+    ------
+    ProductError
+        If stars of one scene have different telescopes, fields or stamps.
     """
     import pandas as pd
 
+    configured = _configured(stars)
     limit_threads(config.evaluation.threads)
     scan_table = pd.concat([read_table(path) for path in scans], ignore_index=True)
     columns = pd.DataFrame(
         [_column(row, stars[row.dataset], config) for row in original_noise_rows().itertuples()]
     )
     by_r0 = {r0: _fit_at(scan_table, r0) for r0 in sorted(scan_table.r0_m.dropna().unique())}
-    configured = _configured(stars)
     fit = by_r0[min(by_r0, key=lambda r0: abs(r0 - configured["r0_m"]))]
     # Least squares of log MSE: every column counts alike.
     kappa = float(np.exp(np.log(columns.kappa[columns.fitted]).mean()))
@@ -159,8 +165,12 @@ def _fit_at(scan_table, r0: float):  # type: ignore[no-untyped-def]
 def _configured(stars: dict[str, Path]) -> dict[str, float]:
     """Pixel scales and r0 that the star products were simulated with."""
     values: dict[str, float] = {}
+    scenes: dict[str, Product] = {}
     for path in stars.values():
-        config = read_product(path, "stars", ()).config
+        product = read_product(path, "stars", ())
+        config = product.config
+        first = scenes.setdefault(config["scene"]["experiment"], product)
+        require(path, config, STATIC, first.config, first.path)
         values[config["scene"]["experiment"]] = config["telescope"]["pixel_scale_arcsec"]
         if "r0_m" in config["wavefront"]:
             values["r0_m"] = config["wavefront"]["r0_m"]

@@ -8,9 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from psfdae.belonging import require_training
 from psfdae.evaluation.metrics import all_metrics, clustered_mean
-from psfdae.files import atomic_path, write_text
+from psfdae.files import Product, atomic_path, write_text
 from psfdae.models.lmmse import LinearMmse
+from psfdae.reading import read_yaml
 from psfdae.stages import baseline
 from psfdae.stages.common import (
     limit_threads,
@@ -50,11 +52,17 @@ def run(
     out : CSV, columns dataset, split, reference, method, noise_level, metric,
         value, stderr (clustered by field), n
     per_star : Parquet with one row per method, λ and star
+
+    Raises
+    ------
+    ProductError
+        If a product is damaged, or models and stars do not belong together.
     """
     import pandas as pd
 
     limit_threads(config.evaluation.threads)
     product = read_stars(stars, reference)
+    require_models(product, config, pca_som, dae, split, reference)
     parts = split_stars(product, split, config)
     truth = product[reference][parts.test]
     linear = LinearMmse.fit(
@@ -95,6 +103,28 @@ def _summarise(
 
 def _ignoring_level(predict: Callable[[np.ndarray], np.ndarray]) -> Predictor:
     return lambda noisy, level: predict(noisy)
+
+
+def require_models(
+    stars: Product, config: Any, pca_som: Path, dae: Path, split: str, reference: str
+) -> None:
+    """Refuse a baseline or a network that does not belong to test stars."""
+    baseline.require_fitted(pca_som, stars, config, split)
+    require_network(stars, config, dae, split, reference)
+
+
+def require_network(stars: Product, config: Any, dae: Path, split: str, reference: str) -> None:
+    """Refuse a network that does not belong to test stars.
+
+    Parameters
+    ----------
+    stars : product "stars"
+    config : stage config (seed, parts)
+    dae : folder of a trained network
+    split, reference : as in `train`
+    """
+    trained = read_yaml(dae / CONFIG)
+    require_training(dae, trained, stars, config, split=split, reference=reference)
 
 
 def dae_predictor(folder: Path, config: Any) -> Predictor:

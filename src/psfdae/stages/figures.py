@@ -12,7 +12,7 @@ from psfdae.files import Product, ProductError, atomic_path, read_product
 from psfdae.reading import read_table
 from psfdae.stages import baseline
 from psfdae.stages.common import limit_threads, noisy_test_images, read_stars, split_stars
-from psfdae.stages.evaluate import dae_predictor
+from psfdae.stages.evaluate import dae_predictor, require_models
 from psfdae.stages.tables import read_evaluations
 
 if TYPE_CHECKING:
@@ -84,12 +84,18 @@ def strip(
     reference : "realisation" or "template"
     levels : noise levels λ, one group of rows each
     out : path of the PNG
+
+    Raises
+    ------
+    ProductError
+        If models and stars do not belong together.
     """
     from psfdae.evaluation.figure_style import REFERENCES, in_field_unit
     from psfdae.evaluation.figures import restoration_strip, spread_stars
 
     limit_threads(config.evaluation.threads)
     product = read_stars(stars_h5, reference)
+    require_models(product, config, pca_som_h5, dae_dir, "random", reference)
     test = split_stars(product, "random", config).test
     field = field_of(product)[product["field_index"][test]]
     picks = spread_stars(field, STRIP_STARS)

@@ -10,6 +10,7 @@ import pandas as pd
 from psfdae.files import ProductError
 from psfdae.reading import read_table
 from psfdae.stages.common import limit_threads, read_stars, split_stars
+from psfdae.stages.evaluate import require_models
 from psfdae.stages.figures import field_of, strip_rows, write_png
 
 REFERENCE = "realisation"
@@ -42,7 +43,7 @@ def run(
     Raises
     ------
     ProductError
-        If the tables have no such rows.
+        If the tables have no such rows, or models and stars do not belong together.
     """
     from dataclasses import replace
 
@@ -51,6 +52,7 @@ def run(
 
     limit_threads(config.evaluation.threads)
     product = read_stars(stars_h5, REFERENCE)
+    require_models(product, config, pca_som_h5, dae_dir, "random", REFERENCE)
     test = split_stars(product, "random", config).test
     picks = spread_stars(field_of(product)[product["field_index"][test]], STARS)
     args = (config, product, test, picks, REFERENCE, pca_som_h5, dae_dir, [level])

@@ -14,7 +14,7 @@ from psfdae.evaluation.metrics import mse
 from psfdae.files import atomic_path, write_text
 from psfdae.reading import read_table, read_yaml
 from psfdae.stages.common import limit_threads, noisy_test_images, read_stars, split_stars
-from psfdae.stages.evaluate import dae_predictor
+from psfdae.stages.evaluate import dae_predictor, require_network
 from psfdae.stages.trained import CONFIG, HISTORY
 
 PATIENCE = 5
@@ -35,11 +35,18 @@ def run(config: Any, stars: Path, points: Mapping[str, Path], out: Path, stoppin
     out : CSV, one row per point: settings, steps, cpu_s, wall_s, mse_<λ> at every
         level, mse (their geometric mean), n, pareto, knee, used (the configured one)
     stopping : CSV with what stopping early saves in the trainings of constant rate
+
+    Raises
+    ------
+    ProductError
+        If a training is damaged, or of stars of another kind.
     """
     import pandas as pd
 
     limit_threads(config.evaluation.threads)
     product = read_stars(stars)
+    for folder in points.values():
+        require_network(product, config, folder, "random", "realisation")
     images = product["realisation"][split_stars(product, "random", config).test]
     noisy = {level: noisy_test_images(config, images, level) for level in config.noise.levels}
     configured = decisive(config.model_dump(include={"dae", "train"}))

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from psfdae.files import ProductError, write_text
+from psfdae.belonging import STARS, require
+from psfdae.files import ProductError, read_product, write_text
 from psfdae.reading import read_table
 
 if TYPE_CHECKING:
@@ -42,12 +43,19 @@ def throughput(config: Any, stars: Path, bundle: Path, out: Path) -> None:
     out : CSV, one row: stamps, stamp_px, threads, repeats, bare_shared_per_s,
         bare_parallel_per_s, bare_per_s (the faster one), predict_per_s, share,
         required_share, peak_mb, allowed_mb, met
+
+    Raises
+    ------
+    ProductError
+        If stars or bundle are not of the scene of the configuration.
     """
     import pandas as pd
 
     from psfdae.benchmark import prediction as benchmark
     from psfdae.benchmark.isolated import run_isolated
 
+    require(stars, read_product(stars, "stars", ()).config, STARS, config)
+    _require_bundle(bundle, config)
     settings, noise = config.benchmark, config.noise
     repeats = min(settings.repeats, REPEATS)
     with TemporaryDirectory() as folder:
@@ -111,7 +119,7 @@ def poppy(config: Any, bundle: Path, evaluation: Path, count: int, out: Path) ->
     Raises
     ------
     ProductError
-        If the evaluation has no row of a noise level.
+        If the evaluation has no row of a noise level, or the bundle is of another scene.
     PoppyError
         As `psfdae.benchmark.poppy_stars.poppy_stars`.
     """
@@ -122,6 +130,7 @@ def poppy(config: Any, bundle: Path, evaluation: Path, count: int, out: Path) ->
     from psfdae.rng import stream
     from psfdae.stages.common import noise_model
 
+    _require_bundle(bundle, config)
     table = read_table(evaluation)
     expected = {level: _table_mse(table, level, evaluation) for level in config.noise.levels}
     model, noise = load_model(bundle), noise_model(config)
@@ -142,6 +151,15 @@ def poppy(config: Any, bundle: Path, evaluation: Path, count: int, out: Path) ->
         row["met"] = "yes" if abs(row["ratio_given"] - 1.0) <= ALLOWED_RATIO else "no"
         rows.append(row)
     _write(out, pd.DataFrame(rows))
+
+
+def _require_bundle(bundle: Path, config: Any) -> None:
+    """Refuse a bundle whose training stars are not of the configured scene."""
+    from psfdae.bundle import read_bundle
+
+    trained_on = read_bundle(bundle).info.config.get("stars")
+    if isinstance(trained_on, dict):
+        require(bundle, trained_on, STARS, config)
 
 
 def _quality(

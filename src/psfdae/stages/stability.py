@@ -7,6 +7,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+from psfdae.belonging import STARS, require
 from psfdae.configuration.compose import validate
 from psfdae.configuration.stages import stage_model
 from psfdae.files import ProductError, read_product
@@ -33,7 +34,8 @@ def run(config: Any, stars: Path, turbulence: Path, out: Path, graded: Path) -> 
     Raises
     ------
     ProductError
-        If a product is missing, damaged or of the other scene.
+        If a product is missing, damaged or of the other scene, or the stars of scene 1
+        are not those of the configuration.
     """
     import torch
 
@@ -52,6 +54,7 @@ def run(config: Any, stars: Path, turbulence: Path, out: Path, graded: Path) -> 
         *(precision_cases, optics_cases, photometry_cases, baseline_cases),
         *(network_cases, seed_cases, metric_cases, repeat_cases),
     )
+    require(stars, read_product(stars, "stars", ()).config, STARS, config)
     limit_threads(config.stability.threads)
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as folder:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from psfdae.belonging import STATIC, require
 from psfdae.files import Column, Empty, read_product, stream_product
 from psfdae.rng import stream
 from psfdae.stages.common import limit_threads, scene_module
@@ -34,8 +35,16 @@ def run(config: Any, templates: Path, out: Path) -> None:
     config : stage config (seed, telescope, grid, wavefront, stars, framing, optics)
     templates : path of the product "templates" of the scene
     out : path of the HDF5 product "stars"
+
+    Raises
+    ------
+    ProductError
+        If the templates are those of another scene, telescope, grid or stamp size.
+    SamplingError, FramingError
+        If the pupil grid or the search window is too small.
     """
     fixed = read_product(templates, "templates", ("psf", "grid"))
+    require(templates, fixed.config, STATIC, config)
     name, count, jitter_px = config.stars.name, config.stars.count, config.framing.jitter_px
     star_field = assign_fields(count, len(fixed["psf"]), stream(config.seed, "field", name))
     jitter = draw_jitter(count, jitter_px, stream(config.seed, "jitter", name))

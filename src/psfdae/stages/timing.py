@@ -10,12 +10,13 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
+from psfdae.belonging import STARS, require
 from psfdae.benchmark import throughput
 from psfdae.benchmark.baseline import grid_around
 from psfdae.benchmark.isolated import run_isolated
 from psfdae.benchmark.scaling import fit_power_law
 from psfdae.configuration.compose import stage_tree
-from psfdae.files import write_text
+from psfdae.files import read_product, write_text
 from psfdae.reading import read_table
 from psfdae.stages import timing_jobs
 
@@ -42,6 +43,7 @@ def baseline(config: Any, stars: Path, out: Path) -> None:
         predict_stars_per_s, repeats, mse_realisation, mse_template (means over the
         test stars and the noise levels), n, threads
     """
+    require(stars, read_product(stars, "stars", ()).config, STARS, config)
     used = config.baseline
     most = min(config.parts.train_stars, config.framing.stamp_px**2)
     points = grid_around(used.components, used.rows, used.columns, used.epochs, most)

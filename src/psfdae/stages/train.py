@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from psfdae.belonging import write_origin
 from psfdae.configuration.compose import decisive
 from psfdae.files import write_text
 from psfdae.stages.common import noise_model, read_stars, split_stars
@@ -26,7 +27,8 @@ def run(config: Any, stars: Path, split: str, reference: str, out: Path, checkpo
     config : stage config (seed, noise, parts, dae, train)
     stars : product "stars"
     split, reference : "random" or "held_out"; "realisation" or "template"
-    out : folder that receives `dae.safetensors`, `config.yaml`, `history.csv`
+    out : folder that receives `dae.safetensors`, `config.yaml`, `history.csv`, and in
+        `trained_on.yaml` what the stars say of themselves
     checkpoint : file that lets an interrupted training resume
 
     Raises TrainingError as `train_dae` does.
@@ -72,6 +74,7 @@ def run(config: Any, stars: Path, split: str, reference: str, out: Path, checkpo
             report,
             bar.update,
         )
+    write_origin(out, product)
     save_weights(out / WEIGHTS, result.state, described)
     write_text(out / HISTORY, as_csv(result.history))
     write_text(out / CONFIG, as_yaml({**described, "attempt": result.attempt}))

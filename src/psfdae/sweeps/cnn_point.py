@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from psfdae.belonging import STATE_STAMPS, require
 from psfdae.evaluation.alignment_tables import error_rows
 from psfdae.files import read_product, write_text
 from psfdae.models.cnn import CnnTrainingError
@@ -38,10 +39,15 @@ def run(config: Any, task: Task) -> Measured:
     config : stage config (seed, noise, cnn, train_<CNN>, evaluation)
     task : Task; its `dataset` is the CNN, original or noise_trained
 
-    Raises CnnTrainingError if the training cannot go on.
+    Raises CnnTrainingError if the training cannot go on, and ProductError if the products
+    are of different telescopes or stamps.
     """
     import pandas as pd
 
+    trained_on = read_product(task.data["states"], "alignment_states", ())
+    for role in ("validation", "test"):
+        product = read_product(task.data[role], "alignment_states", ())
+        require(product.path, product.config, STATE_STAMPS, trained_on.config, trained_on.path)
     train = {"original": stage.train_original, "noise_trained": stage.train_noise_trained}
     part = stage_part(f"alignment_{task.dataset}", config)
     train[task.dataset](part, task.data["states"], task.folder, task.checkpoint)
@@ -52,11 +58,10 @@ def run(config: Any, task: Task) -> Measured:
         metrics |= _metrics(role, rows)
         write_text(task.folder / name, pd.DataFrame(rows).to_csv(index=False, float_format="%.8g"))
     described = read_yaml(task.folder / CONFIG)
-    states = read_product(task.data["states"], "alignment_states", ()).config
     history = read_table(task.folder / HISTORY)
     return Measured(
         metrics=metrics,
-        described={**states, **described},
+        described={**trained_on.config, **described},
         seconds=float(history["seconds"].iloc[-1]),
         cpu_seconds=float("nan"),
         epochs=int(history["epoch"].iloc[-1]),
