@@ -16,6 +16,7 @@ rule alignment_dae:
             f"{ALIGNMENT}/dae/",
             weights="dae.safetensors",
             config="config.yaml",
+            trained_on="trained_on.yaml",
             history="history.csv",
         ),
     log:
@@ -49,6 +50,7 @@ rule alignment_cnn:
             f"{ALIGNMENT}/{{cnn}}/",
             weights="cnn.safetensors",
             config="config.yaml",
+            trained_on="trained_on.yaml",
             history="history.csv",
         ),
     log:

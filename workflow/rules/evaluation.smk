@@ -1,7 +1,7 @@
 rule evaluate:
     input:
         stars=lambda w: stars_of(w.dataset),
-        pca_som=rules.baseline.output,
+        pca_som=rules.baseline.output.model,
         dae=rules.train.output.weights,
         dae_config=rules.train.output.config,
     output:

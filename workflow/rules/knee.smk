@@ -39,6 +39,7 @@ rule knee_train:
             f"{KNEE_FOLDER}/",
             weights="dae.safetensors",
             config="config.yaml",
+            trained_on="trained_on.yaml",
             history="history.csv",
         ),
     log:

@@ -2,7 +2,8 @@ rule baseline:
     input:
         stars=lambda w: stars_of(w.dataset),
     output:
-        f"{RESULTS}/pca_som/{{dataset}}/{{split}}.h5",
+        model=f"{RESULTS}/pca_som/{{dataset}}/{{split}}.h5",
+        trained_on=f"{RESULTS}/pca_som/{{dataset}}/{{split}}.trained_on.yaml",
     log:
         f"{RESULTS}/logs/pca_som/{{dataset}}/{{split}}.log",
     benchmark:
@@ -17,8 +18,8 @@ rule baseline:
     message:
         "Fitting PCA and SOM to {wildcards.dataset}, split {wildcards.split}"
     shell:
-        "psfdae baseline --stars {input.stars} --split {wildcards.split} --out {output}"
-        " {params.config:q} > {log} 2>&1"
+        "psfdae baseline --stars {input.stars} --split {wildcards.split}"
+        " --out {output.model} {params.config:q} > {log} 2>&1"
 
 
 rule train:
@@ -29,6 +30,7 @@ rule train:
             f"{RESULTS}/dae/{{dataset}}/{{split}}-{{reference}}/",
             weights="dae.safetensors",
             config="config.yaml",
+            trained_on="trained_on.yaml",
             history="history.csv",
         ),
     log:

@@ -51,8 +51,8 @@ rule own_stars:
         "Training on the bright stars of the image"
     shell:
         "psfdae from-stars {input.image} --catalogue {input.catalogue} --name example"
-        " --licence MIT --out {params.folder} {params.config:q} {params.free:q}"
-        " > {log} 2>&1"
+        " --licence MIT --overwrite --out {params.folder} {params.config:q}"
+        " {params.free:q} > {log} 2>&1"
 
 
 rule from_stars_example:

@@ -27,6 +27,7 @@ def _name_or_number(text: str | None) -> str | int | None:
 @click.option("--name", help="Name of the model.  [default: the image's]")
 @click.option("--licence", default="not stated", show_default=True, help="Of the model.")
 @out_option("Folder for the model, its report and what they are made of.", FolderArgument)
+@click.option("--overwrite", is_flag=True, help="Replace a model that the folder holds.")
 @overrides
 def from_stars(
     image: Path,
@@ -40,6 +41,7 @@ def from_stars(
     name: str | None,
     licence: str,
     out: Path,
+    overwrite: bool,
     overrides: tuple[str, ...],
 ) -> None:
     """Train a model on the bright stars of IMAGE.
@@ -62,7 +64,9 @@ def from_stars(
     )
     config = load_stage("from_stars", ("dataset=from_stars", *overrides))
     named = name or image.name.split(".")[0]
-    stage.run(config, exposure, out, name=named, licence=licence, say=click.echo)
+    stage.run(
+        config, exposure, out, name=named, licence=licence, overwrite=overwrite, say=click.echo
+    )
 
 
 @main.command("example-field")

@@ -21,7 +21,7 @@ from psfdae.stages.common import (
     read_stars,
     split_stars,
 )
-from psfdae.stages.trained import trained_dae
+from psfdae.stages.trained import CONFIG, trained_dae
 
 Predictor = Callable[[np.ndarray, float], np.ndarray]
 

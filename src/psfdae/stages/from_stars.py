@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,12 +30,18 @@ from psfdae.stages.calibration_stars import (
 from psfdae.stars.from_observation import star_grid
 from psfdae.stars.splits import held_out_fields
 
+LOCK = ".from_stars.lock"
+
 SPLIT, REFERENCE = "held_out", "realisation"
 
 SHOWN_SNR = 10.0
 """The figure shows stars at the S/N nearest to this."""
 
 SHOWN_STARS = 6
+
+
+class FolderError(RuntimeError):
+    """The folder holds a model already, or another process is making one there."""
 
 
 @dataclass(frozen=True)
@@ -100,6 +108,7 @@ def run(
     *,
     name: str,
     licence: str = "not stated",
+    overwrite: bool = False,
     say: Callable[[str], object] = lambda line: None,
 ) -> None:
     """Train a network on the bright stars of an exposure, test it, and pack it.
@@ -118,13 +127,56 @@ def run(
         - `stars.h5`, `pca_som.h5`, `dae/`, `evaluation.csv`, `per_star.parquet`, as the
           stages leave them, and `overrides.txt`, with which they can be run again.
     name, licence : what the bundle says of itself
+    overwrite : whether a model in the folder may be replaced
     say : called with a line of progress
 
     Raises
     ------
     ObservationError, CalibrationStarsError, BundleError, TrainingError
+    FolderError
+        If the folder holds a model that may not be replaced, or another process is
+        making one there.
     """
-    files = Folder(out, name)
+    with _alone(out):
+        finished = sorted(out.glob(f"*{SUFFIX}"))
+        if finished and not overwrite:
+            raise FolderError(f"{finished[0]}: a model is there already; --overwrite replaces it")
+        _run(config, exposure, Folder(out, name), licence, say)
+
+
+@contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """Refuse a folder in which another process works; its lock ends with the process.
+
+    A folder that is left empty is removed again.
+    """
+    import fcntl
+
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / LOCK
+    try:
+        with path.open("a") as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                # That of a process which has just ended may be removed, and made anew by a third.
+                mine = os.path.samestat(os.fstat(lock.fileno()), path.stat())
+            except (BlockingIOError, FileNotFoundError):
+                mine = False
+            if not mine:
+                raise FolderError(f"{folder}: another psfdae from-stars works there")
+            try:
+                yield
+            finally:
+                path.unlink(missing_ok=True)
+    finally:
+        with suppress(OSError):
+            folder.rmdir()
+
+
+def _run(
+    config: Any, exposure: Exposure, files: Folder, licence: str, say: Callable[[str], object]
+) -> None:
+    out = files.path
     observation = exposure.open(config.framing.stamp_px, config.calibration_stars.margin_px)
     found = collect(observation, config)
     grid = star_grid(found.bright.position)
