@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 import torch
 from click.testing import CliRunner
 
+from psfdae.belonging import write_origin
 from psfdae.bundle import (
     BundleError,
     at_noise,
@@ -21,7 +23,7 @@ from psfdae.bundle import (
 )
 from psfdae.cli import main
 from psfdae.configuration.compose import load_stage
-from psfdae.files import Column, ProductError, write_product
+from psfdae.files import Column, ProductError, read_product, write_product
 from psfdae.models import export
 from psfdae.models.dae import predict
 from psfdae.rng import stream
@@ -112,7 +114,12 @@ def test_info_says_what_the_stars_and_the_training_were(tiny):
 
 def test_unknown_optics_have_no_diffraction_limit(folder, tmp_path):
     own = {"telescope": {"pixel_scale_arcsec": 2.0}, "framing": {"jitter_px": 0}, "source": "stars"}
-    pack(folder, tmp_path / "own", stars=write_stars(tmp_path / "own.h5", own))
+    stars = write_stars(tmp_path / "own.h5", own)
+    with pytest.raises(ProductError, match=r"pixel_scale_arcsec = 0\.1, but .*own\.h5 has 2\.0"):
+        pack(folder, tmp_path / "own", stars=stars)
+    shutil.copytree(folder / "dae", tmp_path / "dae")
+    write_origin(tmp_path / "dae", read_product(stars, "stars", ()))
+    pack(tmp_path, tmp_path / "own", stars=stars)
     info = read_bundle(tmp_path / "own").info
     assert (info.pixel_lambda_d, info.source, info.subpixel) == (None, "stars", False)
     assert info.pixel_scale_arcsec == 2.0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import resource
 import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -24,7 +25,7 @@ from psfdae.rng import stream
 from psfdae.stages import example_field as example_stage
 from psfdae.stages.calibration_stars import collect, write_stars
 from psfdae.stages.common import noise_model, split_stars
-from psfdae.stages.from_stars import Exposure
+from psfdae.stages.from_stars import Exposure, _alone
 from psfdae.stars.calibration_stars import (
     brightest_pixels,
     star_centres,
@@ -202,6 +203,43 @@ def test_settings_can_be_used_by_hand(model, tmp_path):
     assert CliRunner().invoke(main, words).exit_code == 0
     weights = "dae.safetensors"
     assert (tmp_path / "dae" / weights).read_bytes() == (out / "dae" / weights).read_bytes()
+
+
+def test_a_model_is_replaced_on_request_only(field, model, tmp_path):
+    image, catalogue, _ = field
+    out = tmp_path / "model"
+    shutil.copytree(model[0], out)
+    before = {path: path.stat().st_mtime_ns for path in out.rglob("*")}
+    words = [image, "--catalogue", catalogue, "--out", out, *TINY]
+    for name in ([], ["--name", "other"]):
+        result = run(*words, *name)
+        assert result.exit_code == 2
+        there = f"{out}/image.psf.safetensors: a model is there already; --overwrite replaces it"
+        assert result.output == f"psfdae: {there}\n"
+    assert {path: path.stat().st_mtime_ns for path in out.rglob("*")} == before
+    assert run(*words, "--overwrite").exit_code == 0
+    after = {path: path.stat().st_mtime_ns for path in out.rglob("*")}
+    assert after.keys() == before.keys()
+    assert all(after[path] > before[path] for path in before if path.is_file())
+
+
+def test_one_process_at_a_time_works_in_a_folder(field, tmp_path):
+    """Whoever holds the folder is alone, until its process ends in whatever way."""
+    holder = (
+        "import sys, time; from pathlib import Path; from psfdae.stages.from_stars import _alone\n"
+        "with _alone(Path(sys.argv[1])): print('mine', flush=True); time.sleep(600)"
+    )
+    out = tmp_path / "model"
+    words = [sys.executable, "-c", holder, str(out)]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout.readline() == "mine\n"
+        result = run(field[0], "--catalogue", field[1], "--out", out, *TINY)
+        process.kill()
+    assert result.exit_code == 2
+    assert result.output == f"psfdae: {out}: another psfdae from-stars works there\n"
+    with _alone(out):
+        assert [path.name for path in out.iterdir()] == [".from_stars.lock"]
+    assert not out.exists()
 
 
 @pytest.mark.parametrize("margin", [0, 5])
