@@ -193,6 +193,9 @@ def test_methods_must_cover_the_bounded_stars(scene_1, tmp_path):
     inputs = ([scene_1 / "bounds.csv"], [scene_1 / "bounds.parquet"])
     with pytest.raises(ProductError, match="lmmse lacks 1 of the bounded stars"):
         efficiency.run(*inputs, [tmp_path / "e.parquet"], tmp_path / "x.csv")
+    rows.assign(field=rows.field + 1).to_parquet(tmp_path / "e.parquet")
+    with pytest.raises(ProductError, match=r"star \d+ of lmmse lies in field \d, but that of the"):
+        efficiency.run(*inputs, [tmp_path / "e.parquet"], tmp_path / "x.csv")
     rows.assign(dataset="dataset1").to_parquet(tmp_path / "e.parquet")
     with pytest.raises(ProductError, match="no method was evaluated"):
         efficiency.run(*inputs, [tmp_path / "e.parquet"], tmp_path / "x.csv")

@@ -40,7 +40,7 @@ def run(
     Raises
     ------
     ProductError
-        If a column has a bound but no method was evaluated on its stars.
+        If a column has a bound but no method was evaluated on its stars, or on other ones.
     """
     import pandas as pd
 
@@ -81,6 +81,14 @@ def _column(
                 raise ProductError(
                     f"{key['dataset']}, {key['reference']}, λ = {key['noise_level']:g}: "
                     f"{method} lacks {len(limits) - len(paired)} of the bounded stars"
+                )
+            moved = paired[paired["field"] != paired["field_bound"]]
+            if len(moved):
+                star, field, bounded_in = moved[["star", "field", "field_bound"]].iloc[0]
+                raise ProductError(
+                    f"{key['dataset']}, {key['reference']}, λ = {key['noise_level']:g}: star "
+                    f"{star} of {method} lies in field {field}, but that of the bounds in "
+                    f"{bounded_in}"
                 )
             found = compare(
                 paired["mse"].to_numpy(), paired["mse_bound"].to_numpy(), paired["field"].to_numpy()
