@@ -272,7 +272,7 @@ def test_a_damaged_note_is_one_line(at):
     (at / "dae/trained_on.yaml").write_text("telescope: [", encoding="utf-8")
     result = psfdae(*evaluate(at))
     assert result.exit_code == 2
-    assert f"{at / 'dae/trained_on.yaml'}: damaged" in result.stderr
+    assert f"psfdae: {at / 'dae/trained_on.yaml'}: line 1, column 13" in result.stderr
 
 
 # Keys
