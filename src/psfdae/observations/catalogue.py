@@ -62,17 +62,20 @@ class _FitsTable:
         return self.rows
 
     def __getitem__(self, name: str) -> Any:
-        from astropy.table import Table
+        from astropy.table import Column, MaskedColumn
+        from astropy.units import Unit
 
         with reading(self.file.name), open_hdus(self.file, memmap=True) as hdus:
-            hdu = hdus[self.index]
-            column = hdu.columns[name]
+            hdu, place = hdus[self.index], self.colnames.index(name)
+            column = hdu.columns[place]
             # Arrays of variable length may all be the same bytes of the file: 3 MB unfold to 1 TB.
             if re.match(r"\d*[PQ]", str(column.format)):
                 raise ObservationError(self.file.name, f"column {name!r} holds arrays, not numbers")
-            alone = type(hdu).from_columns([column])
-            # Masked NaN would look like text without value; here both end in one message.
-            return Table.read(alone, format="fits", mask_invalid=False)[name]
+            values = hdu.data.field(place)
+            unit = column.unit and Unit(column.unit, format="fits", parse_strict="silent")
+            if column.null is None:
+                return Column(values, name, unit=unit, copy=True)
+            return MaskedColumn(values, name, mask=values == column.null, unit=unit, copy=True)
 
 
 @dataclass(frozen=True)
@@ -274,7 +277,8 @@ def _fits_table(path: Path) -> _FitsTable:
         size = objects[0].header["NAXIS1"] * rows
         if objects[0].fileinfo()["datLoc"] + size > file.path.stat().st_size:
             raise ObservationError(path, "damaged: the table is larger than the file")
-        names = list(objects[0].columns.names)
+        # A damaged table has columns without a name, or of the same one.
+        names = [str(name or f"col{k}") for k, name in enumerate(objects[0].columns.names, 1)]
         _check_size(path, rows, len(names))
         return _FitsTable(file, hdus.index(objects[0]), names, rows)
 

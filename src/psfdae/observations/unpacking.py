@@ -29,10 +29,14 @@ BLOCK_BYTES = 2880
 LONGEST_HEADERS = 8_000 * BLOCK_BYTES
 """Bytes of all headers of a file, 288 000 cards; astropy takes some ten times the memory."""
 
+LARGEST_COUNT = 999
+"""Of axes and of columns, by the standard; astropy goes on for as long as a header says."""
+
 MOST_HDUS = 3000
 """Extensions of a file; those of multi-object spectrographs have two thousand."""
 
 FIRST_CARD = re.compile(rb"SIMPLE  = *T[ /]")
+COUNT_CARD = re.compile(rb"(?:Z?NAXIS|TFIELDS) *= *\+?([0-9]+)")
 END_CARD = re.compile(rb"(?:.{80})*?END(?![A-Z0-9_-])", re.DOTALL)
 
 PIECE = 2**20
@@ -165,6 +169,9 @@ def _header_bytes(name: Path, raw: IO[bytes], place: int, before: int) -> int:
     raw.seek(place)
     for size in range(before + BLOCK_BYTES, LONGEST_HEADERS, BLOCK_BYTES):
         block = raw.read(BLOCK_BYTES)
+        for card in COUNT_CARD.finditer(block):
+            if card.start() % 80 == 0 and int(card[1]) > LARGEST_COUNT:
+                raise ObservationError(name, f"damaged: {card[0].decode()}")
         if len(block) < BLOCK_BYTES or END_CARD.match(block):
             return size
     raise ObservationError(name, f"damaged: headers of more than {LONGEST_HEADERS} bytes")
