@@ -19,6 +19,7 @@ import copy
 import csv
 import os
 import random
+import re
 import resource
 import shutil
 import signal
@@ -262,28 +263,44 @@ def pytest(folder: Path, arguments: list[str]) -> tuple[int | None, str]:
     return run.returncode, output
 
 
-def fate(folder: Path, mutant: Mutant, number: int) -> str:
-    """What becomes of a mutant: the test that kills it, if one does."""
+def near(folder: Path, path: Path) -> list[str]:
+    """The test files that name a module."""
+    *package, name = path.relative_to(ROOT / "src").with_suffix("").parts
+    within = ".".join(package)
+    named = re.compile(rf"{within}\.{name}\b|from {within} import (\([^)]*|[^\n(]*)\b{name}\b")
+    tests = sorted(folder.glob("tests/test_*.py"))
+    found = [test for test in tests if named.search(test.read_text(encoding="utf-8"))]
+    return [str(test.relative_to(folder)) for test in found]
+
+
+def fate(folder: Path, mutant: Mutant, number: int, unfit: list[str]) -> str:
+    """What becomes of a mutant: the test that kills it, if one does.
+
+    A test that fails without the mutant, too, goes to `unfit` and is not asked again.
+    """
     path, node = find(units_of(ROOT / "src" / "psfdae"), mutant)
     place = folder / path.relative_to(ROOT)
-    place.write_text(apply(path, node, mutant.mutated), encoding="utf-8")
-    # Compiled code is known by whole seconds and its size.
-    os.utime(place, (0, time.time() + 10 * number))
-    module = ".".join(path.relative_to(ROOT / "src").with_suffix("").parts)
-    tests = [test.relative_to(folder) for test in sorted(folder.glob("tests/test_*.py"))]
-    near = [str(test) for test in tests if module in (folder / test).read_text(encoding="utf-8")]
-    stages = [("near", near)] if near else []
-    try:
-        for stage, arguments in [*stages, ("rest", [f"--ignore={test}" for test in near])]:
-            code, output = pytest(folder, arguments)
+    first = near(folder, path)
+    stages = [first] if first else []
+    for tests in [*stages, [f"--ignore={test}" for test in first]]:
+        while True:
+            place.write_text(apply(path, node, mutant.mutated), encoding="utf-8")
+            # Compiled code is known by whole seconds and its size.
+            os.utime(place, (0, time.time() + 10 * number))
+            code, output = pytest(folder, [*tests, *(f"--deselect={test}" for test in unfit)])
+            shutil.copy2(path, place)
+            if code in NOTHING_FAILED:
+                break
             if code is None:
-                return f"killed: {stage}: no end within {LIMIT} s"
-            if code not in NOTHING_FAILED:
-                told = [x for x in output.splitlines() if x.startswith(("FAILED", "ERROR"))]
-                return f"killed: {stage}: {' '.join((told or ['ERROR'])[0].split()[:2])}"
-        return "alive"
-    finally:
-        shutil.copy2(path, place)
+                return f"killed: no end within {LIMIT} s"
+            killer = re.search(r"^(?:FAILED|ERROR) (.+?)(?: - |$)", output, re.MULTILINE)
+            if killer is None or killer[1] in unfit:
+                return f"killed: exit code {code} of the tests"
+            if pytest(folder, [killer[1]])[0] == 0:
+                return f"killed: {killer[1]}"
+            print(f"{killer[1]} fails without a mutant, too: not used", flush=True)
+            unfit.append(killer[1])
+    return "alive"
 
 
 def run(words: list[str]) -> int:
@@ -295,18 +312,12 @@ def run(words: list[str]) -> int:
         for number, mutant in enumerate(read_list(), 1)
         if not mutant.equivalent and (not words or any(word in str(mutant) for word in words))
     ]
+    dead, unfit = 0, []
     with tempfile.TemporaryDirectory() as temporary:
-        folder = Path(temporary)
-        private_copy(folder)
-        start = time.monotonic()
-        code, output = (0, "") if words else pytest(folder, [])
-        if code != 0 or time.monotonic() - start > LIMIT / 4:
-            print(output, "\nthe tests fail or take too long without a mutant")
-            return 2
-        dead = 0
+        private_copy(folder := Path(temporary))
         for number, mutant in chosen:
             start = time.monotonic()
-            found = fate(folder, mutant, number)
+            found = fate(folder, mutant, number, unfit)
             dead += found.startswith("killed")
             print(f"{number:3d} {mutant.function}: {mutant.original} -> {mutant.mutated}")
             print(f"    {found} ({time.monotonic() - start:.0f} s)", flush=True)

@@ -66,6 +66,16 @@ def test_flux_is_the_one_of_dense_matrices(gaussian_stars, flux_model, sky_known
         assert found.images[star].ravel() == pytest.approx(image, abs=1e-5)
 
 
+@pytest.mark.parametrize("sigma", [0.1, 1.0, 10.0])
+def test_noise_of_bright_and_of_faint_stars_is_that_of_the_sky(gaussian_stars, flux_model, sigma):
+    """Signal to noise from 20 to 2000: the light of a star is no noise."""
+    stamps = 1e3 * gaussian_stars[:200].astype(np.float64) + 70.0
+    stamps += np.random.default_rng(5).normal(0, sigma, stamps.shape)
+    bad = np.zeros(stamps.shape, dtype=bool)
+    found = Photometer(flux_model, 48).measure(stamps, bad, np.full(200, 72.0), known(200))
+    assert found.noise.mean() == pytest.approx(sigma, rel=0.05)
+
+
 def test_sky_that_is_given_is_believed_in_stamps_with_bad_pixels_too(gaussian_stars, flux_model):
     """Of flux_of(x − b) nothing is left but what the good pixels say at that sky."""
     stamps = 1e3 * gaussian_stars[:20].astype(np.float64)
