@@ -264,6 +264,7 @@ def test_strip_shows_the_noise_that_evaluate_measures(tmp_path, gaussian_stars, 
     shown = {}
     monkeypatch.setattr(stage.baseline, "load", lambda path: SimpleNamespace(predict=lambda x: x))
     monkeypatch.setattr(stage, "dae_predictor", lambda folder, config: lambda x, level: x)
+    monkeypatch.setattr(stage, "require_models", lambda *models: None)
     monkeypatch.setattr(
         "psfdae.evaluation.figures.restoration_strip",
         lambda rows, columns, title: shown.update(rows=rows, columns=columns, title=title),

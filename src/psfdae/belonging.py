@@ -114,7 +114,7 @@ def agree(keys: Sequence[str], said: Mapping[str, Any], other: Mapping[str, Any]
 
 
 def write_origin(model: Path, product: Product) -> None:
-    """Note of which product a model was trained.
+    """Note beside a model, which is written already, of which product it was trained.
 
     Parameters
     ----------
@@ -128,7 +128,7 @@ def write_origin(model: Path, product: Product) -> None:
 
 def origin_path(model: Path) -> Path:
     """The file that says what a model was trained on; see `write_origin`."""
-    return model.with_suffix(f".{TRAINED_ON}") if model.suffix == ".h5" else model / TRAINED_ON
+    return model / TRAINED_ON if model.is_dir() else model.with_name(f"{model.stem}.{TRAINED_ON}")
 
 
 def require_origin(model: Path, keys: Sequence[str], product: Product) -> dict[str, Any]:

@@ -81,8 +81,8 @@ def train_dae_stamps(config: Any, grid: Path, train: Path, out: Path, checkpoint
         ),
         lambda: None,
     )
-    write_origin(out, on)
     save_weights(out / WEIGHTS, result.state, described)
+    write_origin(out, on)
     write_text(out / HISTORY, as_csv(result.history))
     write_text(out / CONFIG, as_yaml({**described, "attempt": result.attempt}))
     checkpoint.unlink(missing_ok=True)
@@ -211,8 +211,8 @@ def _train(
             flush=True,
         ),
     )
-    write_origin(out, product)
     save_weights(out / CNN_WEIGHTS, training.model.state_dict(), described)
+    write_origin(out, product)
     write_text(out / HISTORY, as_csv(training.history))
     write_text(out / CONFIG, as_yaml(described))
     checkpoint.unlink(missing_ok=True)

@@ -44,8 +44,8 @@ def run(config: Any, stars: Path, split: str, out: Path) -> None:
         "psf": Column(model.psf, "1", "mean star image of each node's cluster"),
     }
     described = {**config.model_dump(), "split": split}
-    write_origin(out, product)
     write_product(out, "pca_som", columns, described)
+    write_origin(out, product)
 
 
 def load(path: Path) -> PcaSom:

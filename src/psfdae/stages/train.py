@@ -74,8 +74,8 @@ def run(config: Any, stars: Path, split: str, reference: str, out: Path, checkpo
             report,
             bar.update,
         )
-    write_origin(out, product)
     save_weights(out / WEIGHTS, result.state, described)
+    write_origin(out, product)
     write_text(out / HISTORY, as_csv(result.history))
     write_text(out / CONFIG, as_yaml({**described, "attempt": result.attempt}))
     checkpoint.unlink(missing_ok=True)
