@@ -294,12 +294,13 @@ def fate(folder: Path, mutant: Mutant, number: int, unfit: list[str]) -> str:
             if code is None:
                 return f"killed: no end within {LIMIT} s"
             killer = re.search(r"^(?:FAILED|ERROR) (.+?)(?: - |$)", output, re.MULTILINE)
-            if killer is None or killer[1] in unfit:
-                return f"killed: exit code {code} of the tests"
-            if pytest(folder, [killer[1]])[0] == 0:
-                return f"killed: {killer[1]}"
-            print(f"{killer[1]} fails without a mutant, too: not used", flush=True)
-            unfit.append(killer[1])
+            asked = killer[1] if killer else "--collect-only"
+            if pytest(folder, [asked])[0] == 0:
+                return f"killed: {killer[1] if killer else 'no test can be imported'}"
+            if asked in unfit or not killer:
+                raise SystemExit(f"{asked}: fails without a mutant, too")
+            print(f"{asked} fails without a mutant, too: not used", flush=True)
+            unfit.append(asked)
     return "alive"
 
 
