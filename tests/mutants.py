@@ -293,13 +293,16 @@ def fate(folder: Path, mutant: Mutant, number: int, unfit: list[str]) -> str:
                 break
             if code is None:
                 return f"killed: no end within {LIMIT} s"
-            killer = re.search(r"^(?:FAILED|ERROR) (.+?)(?: - |$)", output, re.MULTILINE)
-            if killer is None or killer[1] in unfit:
-                return f"killed: exit code {code} of the tests"
-            if pytest(folder, [killer[1]])[0] == 0:
-                return f"killed: {killer[1]}"
-            print(f"{killer[1]} fails without a mutant, too: not used", flush=True)
-            unfit.append(killer[1])
+            told = re.search(r"^(?:FAILED|ERROR) (.+?)(?: - |$)", output, re.MULTILINE)
+            killer = told[1] if told else ""
+            # Without the name of a test, what failed is the import of its file or of all.
+            whole = [] if "::" in killer else ["--collect-only"]
+            if pytest(folder, [*whole, *filter(None, [killer])])[0] == 0:
+                return f"killed: {killer or 'no test can be imported'}"
+            if whole or killer in unfit:
+                raise SystemExit(f"{killer or 'tests'}: fails without a mutant, too")
+            print(f"{killer} fails without a mutant, too: not used", flush=True)
+            unfit.append(killer)
     return "alive"
 
 
