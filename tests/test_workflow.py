@@ -159,6 +159,7 @@ def test_damaged_yaml_is_one_line(tmp_path, monkeypatch):
         ({"overrides": "trian.lr=1"}, "trian.lr"),
         ({"overrides": "wavefront.colour=1"}, "wavefront.colour"),
         ({"overrides": "stars.count=0"}, "stars.count = 0: input should be greater"),
+        ({"overrides": "train.lr='2e-3"}, "No closing quotation"),
         ({"preset": "none"}, "preset/none"),
     ],
 )
@@ -170,13 +171,18 @@ def test_wrong_config_stops_before_any_job(tmp_path, option, message):
     assert not (tmp_path / "results").exists()
 
 
-def test_unknown_command_line_key_is_refused(tmp_path):
-    arguments = [*command(tmp_path), "presett=fast"]
+@pytest.mark.parametrize(
+    "word",
+    ["presett=fast", "results=my results", "results=$(touch pwned)", "results=a;b", "preset=a/b"],
+)
+def test_what_is_no_plain_word_or_unknown_is_refused(tmp_path, word):
+    arguments = [*command(tmp_path), word]
     result = subprocess.run(
         arguments, env={**os.environ, "PATH": PATH}, capture_output=True, text=True, check=False
     )
     assert result.returncode != 0
-    assert "presett" in result.stdout + result.stderr
+    assert word.partition("=")[0] in result.stdout + result.stderr
+    assert {path.name for path in tmp_path.iterdir()} <= {".snakemake"}
 
 
 @pytest.mark.slow

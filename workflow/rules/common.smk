@@ -16,7 +16,10 @@ from psfdae.sweeps.space import SweepError
 validate(config, "../schemas/command_line.schema.yaml")
 
 PRESET = config["preset"]
-GIVEN = (f"preset={PRESET}", *shlex.split(config["set"] or ""))
+try:
+    GIVEN = (f"preset={PRESET}", *shlex.split(config["set"] or ""))
+except ValueError as error:
+    sys.exit(f"psfdae: set = {config['set']!r}: {error}")
 RESULTS = config["results"] or ("results" if PRESET == "fast" else f"results/{PRESET}")
 
 
