@@ -148,8 +148,9 @@ def test_damaged_yaml_is_one_line(tmp_path, monkeypatch):
     path.write_text("epochs: 12\n\tbatch: 32\n")
     monkeypatch.setenv("PSFDAE_CONFIG", str(tmp_path / "config"))
     out = snakemake(tmp_path, check=False)
-    assert out.startswith(f"psfdae: {path}: line 2, column 1: ")
-    assert len(out.splitlines()) == 1
+    said = [line for line in out.splitlines() if "workflow specific profile" not in line]
+    assert len(said) == 1
+    assert said[0].startswith(f"psfdae: {path}: line 2, column 1: ")
 
 
 @pytest.mark.parametrize(
