@@ -334,8 +334,9 @@ def with_arrays(bundle, path, **changes):
     [
         ("flux/mean", lambda a: 0 * a, "must have a sum of 1"),
         ("flux/basis", lambda a: 0 * a, "must have orthonormal columns"),
-        ("flux/variance", lambda a: -a, "must have no negative number"),
-        ("flux/rest", lambda a: a - 1, "must have no negative number"),
+        ("flux/variance", lambda a: -a, "must have numbers from 0 to 1e+06"),
+        ("flux/variance", lambda a: a + 1e300, "must have numbers from 0 to 1e+06"),
+        ("flux/rest", lambda a: a - 1, "must have numbers from 0 to 1e+06"),
         ("flux/high", lambda a: a - 9, "must have at least flux/low"),
         ("rms", lambda a: a.astype(np.float64), "of float64, not float32"),
     ],
