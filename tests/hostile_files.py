@@ -35,6 +35,9 @@ import numpy as np
 
 BYTES, SECONDS = 2**30, 20
 
+LARGEST = 2**24
+"""Bytes by which a line is repeated at most; an input must not fill our own memory."""
+
 
 def words(text):
     return text.split()
@@ -198,7 +201,8 @@ def cells(raw, rng):
         lines[row] = "".join(parts)
         what = rng.randrange(12)
         if what == 0:
-            lines[row:row] = [lines[row]] * rng.choice([1, 1000, 50_000])
+            most = LARGEST // (len(lines[row]) + 1)
+            lines[row:row] = [lines[row]] * min(rng.choice([1, 1000, 50_000]), most)
         elif what == 1:
             lines[row] = lines[row] + "," + ",".join(["a"] * rng.choice([1, 3000, 200_000]))
         elif what == 2:
@@ -235,7 +239,8 @@ def tensors(raw, rng, sign):
                 node[rng.choice([name, name, name, "\x1b[31mnew"])] = value
         else:
             name = rng.choice(list(arrays))
-            arrays[name] = changed(arrays[name], rng)
+            with np.errstate(all="ignore"):
+                arrays[name] = changed(arrays[name], rng)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
