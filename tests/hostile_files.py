@@ -283,7 +283,7 @@ def changed(array, rng):
     """Another array."""
     what = rng.randrange(8)
     if what == 0:
-        return np.asarray(array * rng.choice([0, -1, 1e30, 1e-30]), array.dtype)
+        return np.asarray(array * float(rng.choice(["0", "-1", "1e30", "1e-30"])), array.dtype)
     if what == 1:
         return np.full_like(array, rng.choice([0.0, 1.0, np.nan, np.inf]))
     if what == 2:

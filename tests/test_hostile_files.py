@@ -156,6 +156,12 @@ def test_a_zip_file_of_several_files_is_refused(tmp_path):
         ),
         (GOOD + cards("XTENSION= 'BINTABLE'", "TFIELDS = 1000"), "damaged: TFIELDS = 1000"),
         (GOOD + 20 * EXTENSION, "damaged: headers of more than 28800 bytes"),
+        (
+            cards("SIMPLE  =                    T", "BITPIX  = 8", "NAXIS   = 1", "NAXIS1  = 2881")
+            + bytes(5760)
+            + cards("XTENSION= 'BINTABLE'", "TFIELDS = 99999999999"),
+            "damaged: TFIELDS = 99999999999",
+        ),
         (GOOD[:80].ljust(10**6), "damaged: headers of more than 28800 bytes"),
         (GOOD + b"XTENSION= 'IMAGE   '".ljust(10**6), "damaged: headers of more than 28800 bytes"),
     ],
