@@ -241,6 +241,15 @@ def test_tiles_and_images_that_are_too_large_are_refused(tmp_path, monkeypatch):
         open_observation(tmp_path / "a.fz", **options)
 
 
+def test_a_text_as_the_size_of_an_image_is_no_size(tmp_path):
+    packed = fits.CompImageHDU(np.ones((16, 16), np.int32))
+    fits.HDUList([fits.PrimaryHDU(), packed]).writeto(tmp_path / "a.fz")
+    with fits.open(tmp_path / "a.fz", mode="update", disable_image_compression=True) as hdus:
+        hdus[1].header.update(ZNAXIS1="text", ZNAXIS2=2**31)
+    with pytest.raises(ObservationError, match="no image; the file has"):
+        open_observation(tmp_path / "a.fz", stamp_px=16)
+
+
 # Catalogues.
 
 
