@@ -11,6 +11,7 @@ that break it are kept in FOLDER.
 from __future__ import annotations
 
 import bz2
+import contextlib
 import gzip
 import io
 import json
@@ -239,7 +240,7 @@ def tensors(raw, rng, sign):
                 node[rng.choice([name, name, name, "\x1b[31mnew"])] = value
         else:
             name = rng.choice(list(arrays))
-            with np.errstate(all="ignore"):
+            with np.errstate(all="ignore"), contextlib.suppress(OverflowError):
                 arrays[name] = changed(arrays[name], rng)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
