@@ -11,6 +11,7 @@ that break it are kept in FOLDER.
 from __future__ import annotations
 
 import bz2
+import contextlib
 import gzip
 import io
 import json
@@ -34,6 +35,9 @@ from pathlib import Path
 import numpy as np
 
 BYTES, SECONDS = 2**30, 20
+
+LARGEST = 2**24
+"""Bytes by which a line is repeated at most; an input must not fill our own memory."""
 
 
 def words(text):
@@ -198,7 +202,8 @@ def cells(raw, rng):
         lines[row] = "".join(parts)
         what = rng.randrange(12)
         if what == 0:
-            lines[row:row] = [lines[row]] * rng.choice([1, 1000, 50_000])
+            most = LARGEST // (len(lines[row]) + 1)
+            lines[row:row] = [lines[row]] * min(rng.choice([1, 1000, 50_000]), most)
         elif what == 1:
             lines[row] = lines[row] + "," + ",".join(["a"] * rng.choice([1, 3000, 200_000]))
         elif what == 2:
@@ -235,7 +240,8 @@ def tensors(raw, rng, sign):
                 node[rng.choice([name, name, name, "\x1b[31mnew"])] = value
         else:
             name = rng.choice(list(arrays))
-            arrays[name] = changed(arrays[name], rng)
+            with np.errstate(all="ignore"), contextlib.suppress(OverflowError):
+                arrays[name] = changed(arrays[name], rng)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
@@ -278,7 +284,7 @@ def changed(array, rng):
     """Another array."""
     what = rng.randrange(8)
     if what == 0:
-        return array * np.asarray(rng.choice([0, -1, 1e30, 1e-30]), array.dtype)
+        return np.asarray(array * float(rng.choice(["0", "-1", "1e30", "1e-30"])), array.dtype)
     if what == 1:
         return np.full_like(array, rng.choice([0.0, 1.0, np.nan, np.inf]))
     if what == 2:

@@ -62,6 +62,9 @@ DOUBLE = frozenset({"flux/variance", "flux/rest", "noise_nodes", "distance_limit
 TOLERANCE = 1e-3
 """By which the stored mean PSF may miss the sum 1, and eigenvectors orthonormality."""
 
+VARIANCE = 1e6
+"""Largest variance of images of sum 1 that is no nonsense."""
+
 Positive = Annotated[float, Field(gt=0)]
 Count = Annotated[int, Field(ge=1)]
 Kernel = Annotated[int, Field(ge=1, le=31)]
@@ -390,14 +393,18 @@ def _check_flux_model(info: BundleInfo, tensors: Mapping[str, np.ndarray], path:
     basis = tensors["flux/basis"].astype(np.float64)
     for name, right, wanted in (
         ("flux/mean", abs(total - 1.0) <= TOLERANCE, "a sum of 1"),
-        ("flux/variance", (tensors["flux/variance"] >= 0).all(), "no negative number"),
-        ("flux/rest", tensors["flux/rest"] >= 0, "no negative number"),
+        ("flux/variance", _variances(tensors["flux/variance"]), f"numbers from 0 to {VARIANCE:g}"),
+        ("flux/rest", _variances(tensors["flux/rest"]), f"numbers from 0 to {VARIANCE:g}"),
         ("flux/high", (tensors["flux/low"] <= tensors["flux/high"]).all(), "at least flux/low"),
         ("flux/basis", info.components < basis.shape[0], "fewer columns than rows"),
         ("flux/basis", _orthonormal(basis), "orthonormal columns"),
     ):
         if not right:
             raise BundleError(f"{path}: array {name!r} must have {wanted}")
+
+
+def _variances(values: np.ndarray) -> bool:
+    return bool(((values >= 0) & (values <= VARIANCE)).all())
 
 
 def _orthonormal(basis: np.ndarray) -> bool:

@@ -29,8 +29,8 @@ MOST_STARS = 5_000_000
 MOST_COLUMNS = 2000
 """Rows and columns of a catalogue."""
 
-LARGEST_TEXT = 2**27
-"""Bytes of a text table; reading takes up to five times as much memory."""
+LARGEST_TEXT = 2**26
+"""Bytes of a text table; reading takes some ten times as much memory."""
 
 LARGEST_ECSV_HEADER = 2**18
 """Characters of an ECSV header, which is YAML and slow to read."""
@@ -247,13 +247,10 @@ def read_catalogue(path: str | Path) -> Catalogue:
     """
     path = Path(path)
     with reading(path), path.open("rb") as file:
-        content = file.read(16)
-        if not content.startswith((b"SIMPLE  =", *UNPACK)):
-            content += file.read(LARGEST_TEXT)
-    if not content.strip():
-        raise ObservationError(path, "the catalogue is empty")
-    fits = content.startswith((b"SIMPLE  =", *UNPACK))
-    table = _fits_table(path) if fits else _text_table(path, content)
+        start = file.read(16)
+        fits = start.startswith((b"SIMPLE  =", *UNPACK))
+        lines = [] if fits else _lines(path, start + file.read(LARGEST_TEXT))
+    table = _fits_table(path) if fits else _text_table(path, lines)
     if len(table) == 0:
         raise ObservationError(path, "the catalogue has no stars")
     return Catalogue(path, table)
@@ -289,9 +286,10 @@ def _check_size(path: Path, rows: int, columns: int) -> None:
             raise ObservationError(path, f"{found} {what} in a catalogue, at most {most}")
 
 
-def _text_table(path: Path, content: bytes) -> Any:
-    from astropy.io import ascii as text_tables
-
+def _lines(path: Path, content: bytes) -> list[str]:
+    """Lines of a text file that are not blank."""
+    if not content.strip():
+        raise ObservationError(path, "the catalogue is empty")
     if len(content) > LARGEST_TEXT:
         raise ObservationError(
             path, f"a text table of more than {LARGEST_TEXT} bytes; a FITS table may be larger"
@@ -302,8 +300,13 @@ def _text_table(path: Path, content: bytes) -> Any:
         raise ObservationError(path, "neither a FITS table nor text in UTF-8") from None
     if "\x00" in text:
         raise ObservationError(path, "neither a FITS table nor text")
-    lines = [line for line in text.splitlines() if line.strip()]
-    del text
+    return [line for line in text.splitlines() if line.strip()]
+
+
+def _text_table(path: Path, lines: list[str]) -> Any:
+    """Table of the lines, which are gone then: they take twice the memory of the file."""
+    from astropy.io import ascii as text_tables
+
     if lines[0].startswith("# %ECSV"):
         kind: dict[str, Any] = {"format": "ecsv"}
         rows = _without_comments(lines)
@@ -317,14 +320,18 @@ def _text_table(path: Path, content: bytes) -> Any:
         numbered = filter(None, map(SEXTRACTOR_HEADER.match, lines))
         _check_size(path, 0, max(int(found[1][:9]) for found in numbered))
     else:
-        lines = rows = _without_comments(lines)
+        rows = _without_comments(lines)
+        lines[:] = rows
         kind = {"format": "basic", "delimiter": _delimiter(rows)}
     if not rows:
         raise ObservationError(path, "the catalogue has no stars")
     _check_widths(path, rows)
+    # The line break at the end is what tells a table from the name of a file.
+    text = "\n".join(lines) + "\n"
+    lines.clear()
+    rows.clear()
     with reading(path):
-        # The line break at the end is what tells a table from the name of a file.
-        return text_tables.read("\n".join(lines) + "\n", guess=False, **kind)
+        return text_tables.read(text, guess=False, **kind)
 
 
 def _delimiter(rows: list[str]) -> str:

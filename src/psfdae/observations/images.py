@@ -152,7 +152,9 @@ def _has_pixels(hdu: Any) -> bool:
         return False
     if isinstance(hdu, fits.GroupsHDU):
         return False
-    return len(hdu.shape) > 0 and math.prod(hdu.shape) > 0
+    # A damaged header may hold texts there; their product would be one as long.
+    sizes = all(isinstance(size, int) for size in hdu.shape)
+    return sizes and len(hdu.shape) > 0 and math.prod(hdu.shape) > 0
 
 
 def _label(index: int, hdu: Any) -> str:

@@ -95,8 +95,7 @@ class Observation:
         """Stream the stars in their order, at most `rows` at a time.
 
         Only the pixels of a chunk are read. Tile-compressed cubes are decompressed
-        chunk by chunk, tile-compressed images and files compressed as a whole once
-        per call.
+        chunk by chunk, tile-compressed images once per call, to a temporary file.
 
         Raises
         ------

@@ -152,6 +152,10 @@ def open_hdus(file: PlainFile, **options: Any) -> Iterator[Any]:
     with ExitStack() as files:
         raw = files.enter_context(file.path.open("rb"))
         size = _header_bytes(file.name, raw, 0, 0)
+        # To open a file astropy reads the header of the first extension, too.
+        raw.seek(0)
+        data = fits.PrimaryHDU.fromstring(raw.read(size)).size
+        _header_bytes(file.name, raw, size + -(-data // BLOCK_BYTES) * BLOCK_BYTES, 0)
         hdus = files.enter_context(fits.open(file.path, **options))
         for index in range(MOST_HDUS + 1):
             try:

@@ -341,12 +341,17 @@ def _generalised_least_squares(
     mean = np.where(used, model.mean, 0.0)
     for star in np.flatnonzero(~used.all(axis=1)):
         bad = np.flatnonzero(~used[star])
-        columns = (model.basis * weight[star]) @ model.basis[bad].T
-        columns[bad, np.arange(bad.size)] += common[star]
-        gain = columns @ np.linalg.inv(columns[bad])
-        data[star, bad] = -data[star] @ gain
-        mean[star, bad] = -mean[star] @ gain
-        precision[star] -= (gain * columns).sum(axis=1)
+        if model.whole:
+            columns = (model.basis * weight[star]) @ model.basis[bad].T
+            gain = columns @ np.linalg.inv(columns[bad])
+            data[star, bad] = -data[star] @ gain
+            mean[star, bad] = -mean[star] @ gain
+            precision[star] -= (gain * columns).sum(axis=1)
+        else:
+            fill, seen = _reduced(model.basis[bad], weight[star], common[star])
+            data[star, bad] = -(data[star] @ model.basis) @ fill
+            mean[star, bad] = -(mean[star] @ model.basis) @ fill
+            precision[star] -= ((model.basis @ seen) * model.basis).sum(axis=1)
     data_modes, mean_modes = data @ model.basis, mean @ model.basis
     information = (mean_modes**2 * weight).sum(axis=1) + common * (mean**2).sum(axis=1)
     signal = (mean_modes * data_modes * weight).sum(axis=1) + common * (mean * data).sum(axis=1)
@@ -356,3 +361,29 @@ def _generalised_least_squares(
     score = np.abs(residual) / np.sqrt(np.where(used, precision, 1.0))
     repaired = np.where(used, x, data + flux[:, None] * (model.mean - mean))
     return flux, 1.0 / np.sqrt(information), score, repaired
+
+
+def _reduced(rows: np.ndarray, weight: np.ndarray, common: float) -> tuple[np.ndarray, np.ndarray]:
+    """The same for unused pixels by Woodbury's identity, in the space of K eigenvectors.
+
+    Parameters
+    ----------
+    rows : ndarray, shape (b, K)
+        Of the basis, those of the unused pixels.
+    weight : ndarray, shape (K,)
+        Beyond the common one.
+    common : float
+
+    Returns
+    -------
+    fill : ndarray, shape (K, b)
+        From a star's modes to what its unused pixels lack.
+    seen : ndarray, shape (K, K)
+        Form by which the precision of the used pixels falls.
+    """
+    gram = rows.T @ rows
+    # Modes that lie in the unused pixels alone would make it singular, but for the last digits.
+    system = common * (1.0 + 1e-12) * np.eye(weight.size) + weight[:, None] * gram
+    inner = np.linalg.solve(system, np.diag(weight))
+    left = weight[:, None] * (np.eye(weight.size) - gram @ inner) / common
+    return left @ rows.T, (left @ gram) * weight
