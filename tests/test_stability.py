@@ -185,7 +185,7 @@ def test_stage_refuses_the_stars_of_the_other_scene(tmp_path):
     keys = ("seed", "scene", "telescope", "grid", "wavefront", "stars", "framing", "optics")
     tree = {key: config.model_dump()[key] for key in keys}
     write_product(path, "stars", {"realisation": Column(np.ones((2, 8, 8)), "1", "stars")}, tree)
-    with pytest.raises(ProductError, match="scene.name = turbulence, but the configuration has seidel"):
+    with pytest.raises(ProductError, match=r"turbulence, but .* has seidel"):
         stage.run(load(["dataset=dataset3"]), path, path, tmp_path / "t.csv", tmp_path / "g.csv")
 
 
