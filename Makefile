@@ -55,7 +55,7 @@ REPORTED = all \
 LONGEST_FIRST := $(if $(strip $(TARGETS)),,--prioritize scene2)
 
 .DEFAULT_GOAL := help
-.PHONY: help env reproduce report mlflow reference docs site test test-all lint format lock clean \
+.PHONY: help env reproduce report mlflow reference docs site test test-all test-docs lint format lock clean \
   benchmark stability bounds training_knee bundles shipped
 
 help: ## List the targets
@@ -123,10 +123,13 @@ format: env ## Format Python and Snakemake files
 	snakefmt Snakefile workflow
 
 test: lint ## Lint, unit tests and the smoke workflow
-	pytest -m "not slow" --junitxml results/tests.xml
+	pytest -m "not slow and not written" --junitxml results/tests.xml
 
 test-all: test ## The tests, then the slow ones
 	pytest -m slow
+
+test-docs: env ## Every command of README and docs as it is written: half an hour
+	pytest -m written
 
 lock: env ## Renew the lock files from pyproject.toml; torch's CPU builds from TORCH_INDEX
 	$(if $(TORCH_INDEX),echo torch==$(TORCH) | $(COMPILE) --no-deps --default-index "$$TORCH_INDEX" \

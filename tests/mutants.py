@@ -43,7 +43,7 @@ SCIENCE = [
 ]
 """Where the random mutants were drawn from; no matter once they are drawn."""
 
-CHOICE = ["-m", "not slow and not workflow", "--ignore=tests/test_mutants.py"]
+CHOICE = ["-m", "not slow and not written and not workflow", "--ignore=tests/test_mutants.py"]
 """The fast tests but for those of the list, which notice every mutant."""
 
 MEMORY = 8 * 2**30

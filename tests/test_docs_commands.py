@@ -53,7 +53,7 @@ DRY = {
     **dict.fromkeys((f"make {t}" for t in ("benchmark", "stability", "bounds")), LONG),
     "make training_knee": LONG,
     "snakemake tracking --forcerun track track_alignment": LONG,
-    **dict.fromkeys(("make test", "make test-all"), "would run this test"),
+    **dict.fromkeys(("make test", "make test-all", "make test-docs"), "would run this test"),
 }
 """Commands that are planned only, and why; all others run as they are written."""
 
@@ -197,7 +197,7 @@ def answers(url):
         return False
 
 
-@pytest.mark.slow
+@pytest.mark.written
 @pytest.mark.workflow
 @pytest.mark.parametrize("page", [page for page in pages() if commands(read(page))])
 def test_commands_as_written(page, house, tmp_path):
