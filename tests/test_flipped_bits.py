@@ -10,7 +10,7 @@ import subprocess
 import pytest
 
 from psfdae.files import write_text
-from workflow_runs import locked
+from workflow_runs import VARYING, locked
 
 pytestmark = [pytest.mark.workflow, pytest.mark.slow]
 
@@ -20,11 +20,6 @@ HARMLESS = {
     "and leaves out what is no number",
 }
 """Folders whose files may change unnoticed, and why."""
-
-VARYING = ("history.csv", "_times.csv", "alignment_time.csv", "runtime.csv", "mlflow.db")
-"""Ends of the names of files with run times, which no two runs share."""
-
-OWN = "of_my_own.txt"
 
 
 def kind_of(path, results):

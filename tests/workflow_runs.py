@@ -14,6 +14,8 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PATH = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+VARYING = ("history.csv", "_times.csv", "alignment_time.csv", "runtime.csv", "mlflow.db")
+"""Ends of the names of files with run times, which no two runs share."""
 QUIET = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
 
 
