@@ -21,6 +21,8 @@ HARMLESS = {
 }
 """Folders whose files may change unnoticed, and why."""
 
+OWN = "of_my_own.txt"
+
 
 def kind_of(path, results):
     """Folder and suffix: files of a kind have one writer and one reader."""
