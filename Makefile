@@ -128,7 +128,7 @@ test: lint ## Lint, unit tests and the smoke workflow
 test-all: test ## The tests, then the slow ones
 	pytest -m slow
 
-test-docs: env ## Every command of README and docs as it is written: half an hour
+test-docs: env ## Every command of README and docs as it is written
 	pytest -m written
 
 lock: env ## Renew the lock files from pyproject.toml; torch's CPU builds from TORCH_INDEX

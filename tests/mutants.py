@@ -9,7 +9,7 @@ module. A fragment that is no longer there is an error that names it; whoever ch
 the line writes the mutant's new text into the list.
 
 Each mutant meets the test files that name its module, then the other fast tests. That
-takes hours; words select mutants whose row holds one of them.
+takes long; words select mutants whose row holds one of them.
 """
 
 from __future__ import annotations
