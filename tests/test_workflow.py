@@ -16,9 +16,8 @@ from workflow_runs import PATH, ROOT, command, planned, snakemake
 pytestmark = pytest.mark.workflow
 
 
-def test_smoke_builds_everything_in_time(smoke):
-    folder, seconds = smoke
-    assert seconds < 180
+def test_smoke_builds_everything(smoke):
+    folder, _ = smoke
     metrics = pd.read_csv(folder / "results/tables/psf_metrics.csv")
     assert list(metrics.columns) == (
         ["dataset", "split", "reference", "method", "noise_level", "metric", "value", "stderr", "n"]
