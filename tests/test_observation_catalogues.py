@@ -171,6 +171,7 @@ REFUSED = {
     "ragged": ("X_IMAGE,Y_IMAGE\n1,2,3\n", "stars.csv: "),
     "twice": ("x,x,y\n1,1,1\n", "stars.csv: "),
     "all off": ("X_IMAGE,Y_IMAGE\n500,9\n600,9\n", "none of the 2 stars.*x 499 … 599, y 8 … 8"),
+    "crowd": ("X_IMAGE,Y_IMAGE\n" + 20_000 * "12,9\n", "20000 stars are on .* than it has pixels"),
     "all off sky": ("ra,dec\n10,-60\n", "none of the 1 stars"),
     "binary": ("\x00\x01\x02", "neither a FITS table nor text"),
 }

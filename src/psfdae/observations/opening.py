@@ -59,7 +59,7 @@ def open_observation(
     ------
     ObservationError
         If an argument is out of range, a file is missing, damaged or of a wrong
-        form, or all stars are off the image.
+        form, all stars are off the image, or more are on it than it has pixels.
     """
     path = Path(path)
     _check_arguments(path, stamp_px, margin, origin, pixel_scale_arcsec, gain, saturate)
@@ -179,9 +179,16 @@ def _placed_by_wcs(image: ImageFile, table: Catalogue, where: PositionColumns) -
 
 
 def _check_overlap(image: ImageFile, table: Catalogue, positions: np.ndarray) -> None:
-    if on_image(*positions.T, image.shape).any():
-        return
     rows, columns = image.shape
+    found = np.count_nonzero(on_image(*positions.T, image.shape))
+    if found > rows * columns:
+        raise ObservationError(
+            table.path,
+            f"{found} stars are on the image {image.path} of {columns} columns and {rows} rows, "
+            "more than it has pixels",
+        )
+    if found:
+        return
     with np.errstate(all="ignore"):
         placed = positions[np.isfinite(positions).all(axis=1)]
         ranges = "nowhere in its projection"

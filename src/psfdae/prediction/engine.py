@@ -64,8 +64,11 @@ class Engine:
         stamps, bad, shift, flags = self._centred(stars)
         sky = border_median(stamps, bad)
         found = self._photometer.measure(stamps, bad, sky, stars.known)
-        psf = predict(self.network, found.images, info.image_scale, self._images)
         lost = (found.flags & StarFlag.NO_FLUX) > 0
+        if lost.all():  # such as the stars of a catalogue that reaches far beyond the image
+            psf = np.empty_like(found.images)
+        else:
+            psf = predict(self.network, found.images, info.image_scale, self._images)
         psf[lost] = np.nan
         shapes = measure_shapes(psf)
         noise = found.noise / np.where(lost, np.nan, found.flux)

@@ -142,6 +142,7 @@ class Photometer:
         self._high = (MARGIN * model.high + limit).astype(np.float32)
         self._low = (model.low / MARGIN - limit).astype(np.float32)
         self._free_sky = _with_free_sky(model)
+        self._nothing: dict[int, FluxEstimate] = {}
 
     def measure(
         self, stamps: np.ndarray, bad: np.ndarray, start: np.ndarray, known: Known
@@ -281,8 +282,19 @@ class Photometer:
                 x = np.tile(self.model.mean, (GROUP, 1))
                 flat = stamps[group].reshape(group.size, -1).astype(np.float64)
                 x[: group.size] = np.where(hidden[group], np.nan, flat - sky[group, None])
-                estimate = robust_flux(x.reshape(-1, self.side, self.side), model)
+                if hidden[group].all():  # many at once, where a catalogue exceeds the image
+                    estimate = self._of_nothing(model)
+                else:
+                    estimate = robust_flux(x.reshape(-1, self.side, self.side), model)
                 self._overwrite(out, group, x, estimate, sky[group], known.part(group))
+
+    def _of_nothing(self, model: FluxModel) -> FluxEstimate:
+        """What `robust_flux` finds in stamps without a good pixel."""
+        found = self._nothing.get(id(model))
+        if found is None:
+            found = robust_flux(np.full((GROUP, self.side, self.side), np.nan), model)
+            self._nothing[id(model)] = found
+        return found
 
     def _overwrite(
         self,
