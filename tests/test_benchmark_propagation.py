@@ -405,7 +405,7 @@ for name in list(sys.modules):
 from psfdae.stages import baseline, evaluate, stars, tables, templates, train
 out = Path(sys.argv[1])
 made = {name: out / name for name in ("templates", "stars", "pca_som", "dae", "csv", "per_star")}
-templates.run(config["templates"], made["templates"])
+templates.templates(config["templates"], made["templates"])
 stars.run(config["stars"], made["templates"], made["stars"])
 baseline.run(config["baseline"], made["stars"], "random", made["pca_som"])
 train.run(config["train"], made["stars"], "random", "realisation", made["dae"], out / "check.pt")

@@ -30,7 +30,7 @@ def settings(stage, dataset, *more):
 
 def build(folder, dataset):
     """Products and tables of a dataset's bounds, made by the stages."""
-    templates.run(settings("templates", dataset), folder / "templates.h5")
+    templates.templates(settings("templates", dataset), folder / "templates.h5")
     stars.run(settings("stars", dataset), folder / "templates.h5", folder / "stars.h5")
     config = settings("bounds", dataset)
     drawn = folder / "bank.h5" if config.stars.aberration_fraction else None

@@ -308,7 +308,7 @@ def test_shipped_bundle_covers_stars_that_nobody_has_seen(tmp_path):
 
     sizes = ["seed=11", "grid.points=5", "grid.spacing_deg=2.75", "stars.count=500"]
     chosen = ["dataset=field", *sizes, "parts.train_stars=400", "parts.test_stars=100"]
-    templates.run(load_stage("templates", chosen), tmp_path / "t.h5")
+    templates.templates(load_stage("templates", chosen), tmp_path / "t.h5")
     stars.run(load_stage("stars", chosen), tmp_path / "t.h5", tmp_path / "s.h5")
     images = read_product(tmp_path / "s.h5", "stars", ("realisation",))["realisation"]
     bundle, rng = read_bundle(), stream(11, "coverage")

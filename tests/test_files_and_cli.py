@@ -109,7 +109,7 @@ def test_simulation_never_imports_torch(tmp_path):
         "import sys; from pathlib import Path; from psfdae.configuration.compose import load_stage;"
         "from psfdae.stages import templates;"
         "config = load_stage('templates', ['grid.points=3']);"
-        f"templates.run(config, Path({str(tmp_path / 't.h5')!r}));"
+        f"templates.templates(config, Path({str(tmp_path / 't.h5')!r}));"
         "print([m for m in ('torch','pandas','skimage','sklearn') if m in sys.modules])"
     )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

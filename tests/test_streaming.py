@@ -26,7 +26,7 @@ CHEAP = (
 def cheap(tmp_path_factory):
     """Config of 50 stars with weak aberrations on small pupils, and their templates."""
     path = tmp_path_factory.mktemp("cheap") / "templates.h5"
-    templates.run(load_stage("templates", CHEAP), path)
+    templates.templates(load_stage("templates", CHEAP), path)
     return load_stage("stars", [*CHEAP, "stars.count=50"]), path
 
 

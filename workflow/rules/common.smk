@@ -5,9 +5,11 @@ from functools import cache
 
 from snakemake.utils import validate
 
+from psfdae.cli import stage
 from psfdae.configuration.compose import ConfigError, as_overrides, config_dir
 from psfdae.configuration.compose import compose, dataset_names, decisive, load
 from psfdae.configuration.compose import load_groups, neutral, overrides_for, stage_tree
+from psfdae.configuration.compose import write_settings
 from psfdae.configuration.stages import STAGE_KEYS
 from psfdae.files import DIGESTS, ProductError
 from psfdae.source import source_hash
@@ -74,6 +76,25 @@ def dataset_config(dataset):
         return load((choice, *overrides_for("config", GIVEN, (choice,))))
     except ConfigError as error:
         sys.exit(f"psfdae: {choice}: {error}")
+
+
+@cache
+@one_line()
+def settings(name, *choice, more=(), **options):
+    """File with the settings that a stage reads, where a choice is made (dataset=…).
+
+    Its name follows from those that can change a result: another name repeats a job.
+    Options are those of the command on which it depends what is read.
+    """
+    spec = stage(name).stage
+    reads = spec.reads(**options) if callable(spec.reads) else spec.reads
+    if spec.root == "config":
+        tree = composed(*choice, more=more)
+    else:
+        tree = compose(ALIGNMENT_OVERRIDES, spec.root)
+    folder = Path(RESULTS, ".settings")
+    # As text: Snakemake does not remember params that are paths.
+    return str(write_settings(folder, name, reads, tree, spec.root, dry=workflow.dryrun))
 
 
 @one_line()

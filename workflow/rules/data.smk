@@ -10,14 +10,14 @@ rule templates:
         mem_mb=500,
         runtime=10,
     params:
-        config=lambda w: stage_overrides("templates", f"scene={w.scene}"),
+        config=lambda w: settings("templates", f"scene={w.scene}"),
         source=lambda w: source_hash(
             "psfdae.stages.templates", f"psfdae.stars.{w.scene}_scene"
         ),
     message:
         "Propagating the static PSFs of scene {wildcards.scene}"
     shell:
-        "psfdae templates --out {output} {params.config:q} > {log} 2>&1"
+        "psfdae templates --config {params.config} --out {output} > {log} 2>&1"
 
 
 rule stars:

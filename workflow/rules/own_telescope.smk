@@ -12,12 +12,12 @@ rule telescope_templates:
         mem_mb=1000,
         runtime=10,
     params:
-        config=lambda w: telescope_overrides("templates", w.stars),
+        config=lambda w: settings("templates", f"dataset={w.stars}"),
         source=source_hash("psfdae.stages.templates", "psfdae.stars.telescope_scene"),
     message:
         "Propagating the static PSFs of the telescope of {wildcards.stars}"
     shell:
-        "psfdae templates --out {output} {params.config:q} > {log} 2>&1"
+        "psfdae templates --config {params.config} --out {output} > {log} 2>&1"
 
 
 rule telescope_stars:

@@ -1,9 +1,266 @@
-"""Command line: one command per stage.
+"""The command line: a stage is a function, and its signature is its command.
 
-Only click is imported at the top; each command imports its stage when it runs.
+`@command("name")` on a function of `psfdae.stages` makes it one: parameters become options,
+the docstring the help. Which module has which command is read from the text of the modules,
+so that `psfdae --help` imports none of them.
 """
 
-from psfdae.cli import (
+from __future__ import annotations
+
+import ast
+import re
+import types
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, is_dataclass
+from functools import cache
+from importlib import import_module
+from inspect import Parameter, cleandoc, signature
+from pathlib import Path
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+
+import click
+from click.utils import make_default_short_help
+
+import psfdae
+
+File = Annotated[Path, click.Path(path_type=Path, dir_okay=False)]
+Folder = Annotated[Path, click.Path(path_type=Path, file_okay=False)]
+AboveZero = click.FloatRange(min=0, min_open=True)
+Split = Literal["random", "held_out"]
+Reference = Literal["realisation", "template"]
+
+GROUPS = {
+    "alignment": "Scene 3: misalignment of the secondary mirror from its PSFs.",
+    "alignment figure": "Draw a figure of scene 3 as PNG.",
+    "figure": "Draw a figure as PNG from finished products.",
+    "sweep": "Train many variants of a model and compare them (config/sweep).",
+}
+"""Commands of two and three words, and what is said of their first words."""
+
+STAGES = Path(psfdae.__file__).with_name("stages")
+
+
+@dataclass(frozen=True)
+class Stage:
+    """What `command` knows of a function: its command's words and the config groups it reads."""
+
+    name: str
+    reads: tuple[str, ...] | Callable[..., tuple[str, ...]]
+    root: Literal["config", "alignment"]
+
+
+def command(
+    name: str,
+    reads: tuple[str, ...] | Callable[..., tuple[str, ...]] = (),
+    root: Literal["config", "alignment"] = "config",
+) -> Callable[..., Any]:
+    """Make a function the command `psfdae NAME`.
+
+    A parameter `config` receives the groups of the configuration in `reads`, checked, from
+    trailing overrides or a file of settings; which groups may depend on the options. Other
+    parameters are options: required without a default, repeatable as `tuple[X, ...]`, a
+    flag as bool, all fields of a dataclass. `Annotated` adds help (a text), a click type,
+    or a dict of what click's option takes, where "flag" names it and "argument" makes it
+    positional. Help is the docstring.
+    """
+
+    def mark(function: Callable[..., Any]) -> Callable[..., Any]:
+        function.stage = Stage(name, reads, root)  # type: ignore[attr-defined]
+        return function
+
+    return mark
+
+
+class Commands(click.Group):
+    """The commands of all stages; a mistake is one message and exit code 2."""
+
+    def __init__(self, prefix: str = "", **more: Any) -> None:
+        super().__init__(**more)
+        self.prefix = prefix
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """First words after the group's own."""
+        size = len(self.prefix.split())
+        names = [name.split() for name in found()]
+        words = {w[size] for w in names if w[:size] == self.prefix.split() and w[size:]}
+        return sorted(words | set(self.commands))
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """A group, or the command of a stage, whose module is imported now."""
+        name = f"{self.prefix} {cmd_name}".strip()
+        if name in GROUPS:
+            old = self.commands.get(cmd_name)
+            more = old.commands if isinstance(old, click.Group) else {}
+            return Commands(name, name=cmd_name, help=GROUPS[name], commands=more)
+        return as_click(stage(name)) if name in found() else self.commands.get(cmd_name)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """As click does, with help from the modules' text."""
+        names = [f"{self.prefix} {word}".strip() for word in self.list_commands(ctx)]
+        width = formatter.width - 6 - max(map(len, names))
+        with formatter.section("Commands"):
+            formatter.write_dl(
+                [(n.split()[-1], make_default_short_help(_about(n), width)) for n in names]
+            )
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run the command; a refusal of ours is a message, a bug stays a traceback.
+
+        So is a file that the system does not let us read or write, and a lack of memory.
+        """
+        try:
+            return super().invoke(ctx)
+        except OSError as error:
+            if error.errno is None:
+                raise
+            click.echo(f"psfdae: {error}", err=True)
+            ctx.exit(2)
+        except MemoryError as error:
+            click.echo(f"psfdae: not enough memory ({error or 'no more is known'})", err=True)
+            ctx.exit(2)
+        except (RuntimeError, ValueError) as error:
+            # HDF5 reports a full disk as a RuntimeError without a number of its own.
+            # So does torch a lack of memory, as its own RuntimeError.
+            ours = type(error).__module__.startswith("psfdae")
+            if not ours and not re.search("errno = |not enough memory", str(error)):
+                raise
+            click.echo(f"psfdae: {' '.join(str(error).split()) if not ours else error}", err=True)
+            ctx.exit(2)
+
+
+@click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(psfdae.__version__)
+def main() -> None:
+    """PSF modelling with a denoising autoencoder, one command per stage.
+
+    OVERRIDES are Hydra overrides, such as dataset=dataset5 train.lr=1e-3; the
+    groups and keys are those of the config folder.
+    """
+
+
+@cache
+def found() -> dict[str, Path]:
+    """Modules by command."""
+    pattern = re.compile(r'^@command\(\s*"([^"]+)"', re.MULTILINE)
+    texts = {path: path.read_text(encoding="utf-8") for path in STAGES.glob("*.py")}
+    return {name: path for path, text in texts.items() for name in pattern.findall(text)}
+
+
+def stage(name: str) -> Callable[..., Any]:
+    """The function of a command; its module is imported."""
+    module = import_module(f"psfdae.stages.{found()[name].stem}")
+    functions = [f for f in vars(module).values() if isinstance(getattr(f, "stage", None), Stage)]
+    return next(f for f in functions if f.stage.name == name)
+
+
+def _about(name: str) -> str:
+    """First paragraph of a command's help, nothing being imported."""
+    if name in GROUPS:
+        return GROUPS[name]
+    if name not in found():
+        return main.commands[name].help or ""
+    for node in ast.parse(found()[name].read_text(encoding="utf-8")).body:
+        for call in getattr(node, "decorator_list", []):
+            if isinstance(call, ast.Call) and ast.unparse(call).startswith(f"command('{name}'"):
+                return (ast.get_docstring(node) or "").split("\n\n")[0]  # type: ignore[arg-type]
+    return ""
+
+
+def as_click(function: Callable[..., Any]) -> click.Command:
+    """The command of a stage."""
+    spec: Stage = function.stage  # type: ignore[attr-defined]
+    groups: dict[str, Any] = {}
+    parameters: list[click.Parameter] = []
+    for name, hint, default in _parameters(function):
+        if name == "config":
+            continue
+        if is_dataclass(hint):
+            groups[name] = hint
+            parameters += [_option(*field) for field in _parameters(hint)]
+        else:
+            parameters.append(_option(name, hint, default))
+    configured = "config" in signature(function).parameters
+    if configured:
+        path = click.Path(path_type=Path, dir_okay=False)
+        about = "Settings as the workflow writes them, instead of overrides."
+        parameters.append(click.Option(["--config", "settings"], type=path, help=about))
+        parameters.append(click.Argument(["overrides"], nargs=-1))
+
+    def run(**given: Any) -> None:
+        config = {}
+        if configured:
+            file, overrides = given.pop("settings"), given.pop("overrides")
+            config["config"] = _settings(spec, given, file, overrides)
+        for name, kind in groups.items():
+            given[name] = kind(**{key: given.pop(key) for key, *_ in _parameters(kind)})
+        function(**config, **given)
+
+    help_text = cleandoc(function.__doc__ or "")
+    return click.Command(spec.name.split()[-1], callback=run, params=parameters, help=help_text)
+
+
+def _settings(
+    spec: Stage, given: dict[str, Any], file: Path | None, overrides: Sequence[str]
+) -> Any:
+    from psfdae.configuration.compose import load_settings, load_stage
+
+    reads = spec.reads(**given) if callable(spec.reads) else spec.reads
+    if file is None:
+        return load_stage(reads, overrides, spec.root)
+    if overrides:
+        raise click.UsageError("--config and overrides exclude each other")
+    return load_settings(file, reads, spec.root)
+
+
+def _parameters(function: Any) -> list[tuple[str, Any, Any]]:
+    """Name, type and default of each parameter."""
+    kept = signature(function).parameters
+    hints = get_type_hints(function, include_extras=True)
+    return [(name, hints.get(name, Any), p.default) for name, p in kept.items()]
+
+
+def _option(name: str, hint: Any, default: Any) -> click.Parameter:
+    kind, attributes = _unfolded(hint)
+    attributes = {"type": kind, **attributes}
+    if kind is bool:
+        attributes |= {"type": None, "is_flag": True}
+    required = default is Parameter.empty
+    if attributes.pop("argument", False):
+        many = attributes.pop("multiple", False)
+        return click.Argument([name], required=required, nargs=-1 if many else 1, **attributes)
+    attributes["required"] = required
+    if not required and default is not None and default != ():
+        attributes = {"default": default, "show_default": kind is not bool, **attributes}
+    flag = attributes.pop("flag", f"--{name.replace('_', '-')}")
+    return click.Option([flag, name], **attributes)
+
+
+def _unfolded(hint: Any) -> tuple[Any, dict[str, Any]]:
+    """Click's type of an annotation, and what else it says of an option."""
+    attributes: dict[str, Any] = {}
+    if get_origin(hint) is Annotated:
+        kind, attributes = _unfolded(get_args(hint)[0])
+        for said in hint.__metadata__:
+            if isinstance(said, str):
+                attributes["help"] = said
+            else:
+                attributes |= said if isinstance(said, dict) else {"type": said}
+        return attributes.pop("type", kind), attributes
+    if get_origin(hint) in (Union, types.UnionType):
+        return _unfolded(next(part for part in get_args(hint) if part is not type(None)))
+    if get_origin(hint) is Literal:
+        return click.Choice(get_args(hint)), {}
+    if get_origin(hint) is tuple:
+        inner = get_args(hint)
+        if inner[-1] is ...:
+            kind, attributes = _unfolded(inner[0])
+            return kind, {**attributes, "multiple": True}
+        return tuple(_unfolded(part)[0] for part in inner), {}
+    return hint, {}
+
+
+# The commands that are not yet in the stages.
+from psfdae.cli import (  # noqa: E402, F401
     alignment,
     alignment_methods,
     benchmark_propagation,
@@ -23,26 +280,3 @@ from psfdae.cli import (
     stability,
     sweep,
 )
-from psfdae.cli.base import main
-
-__all__ = [
-    "alignment",
-    "alignment_methods",
-    "benchmark_propagation",
-    "benchmark_timing",
-    "bounds",
-    "bundle",
-    "compare",
-    "figures",
-    "from_stars",
-    "knee",
-    "main",
-    "predict",
-    "prediction",
-    "reporting",
-    "scaling",
-    "science",
-    "simulate",
-    "stability",
-    "sweep",
-]

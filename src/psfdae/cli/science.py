@@ -35,17 +35,6 @@ def config(stage: str | None, overrides: tuple[str, ...]) -> None:
 
 
 @main.command()
-@out_option("HDF5 product with the static PSF of every field point.")
-@overrides
-def templates(out: Path, overrides: tuple[str, ...]) -> None:
-    """Propagate the static PSF of every field point."""
-    from psfdae.configuration.compose import load_stage
-    from psfdae.stages import templates as stage
-
-    stage.run(load_stage("templates", overrides), out)
-
-
-@main.command()
 @input_option("templates", "Product of the stage templates.")
 @out_option("HDF5 product with noise-free stars.")
 @overrides

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import re
@@ -17,7 +18,7 @@ from psfdae.configuration.base import NEUTRAL
 from psfdae.configuration.consistency import Consistent, with_derived
 from psfdae.configuration.schema import Config, Group
 from psfdae.configuration.stages import STAGE_KEYS, stage_model
-from psfdae.files import ProductError
+from psfdae.files import ProductError, write_text
 from psfdae.reading import parse_yaml
 
 Root = Literal["config", "alignment"]
@@ -153,8 +154,13 @@ def load_file(model: type[Any], path: Path) -> Any:
         raise ConfigError(str(error)) from None
     except Exception as error:
         raise ConfigError(f"{path}: {_first_lines(error)}") from None
+    return _named(path, lambda: validate(model, tree if isinstance(tree, dict) else {}))
+
+
+def _named(path: Path, check: Callable[[], Any]) -> Any:
+    """What a check gives; its refusals name the file."""
     try:
-        return validate(model, tree if isinstance(tree, dict) else {})
+        return check()
     except ConfigError as error:
         lines = "\n".join(f"{path}: {line}" for line in str(error).splitlines())
         raise ConfigError(lines) from None
@@ -174,25 +180,82 @@ def validate(model: type[Any], tree: Mapping[str, Any]) -> Any:
         raise ConfigError("\n".join(_finding(e) for e in error.errors())) from None
 
 
-def load_stage(stage: str, overrides: Sequence[str] = ()) -> Any:
+def load_stage(
+    reads: str | tuple[str, ...], overrides: Sequence[str] = (), root: Root = "config"
+) -> Any:
     """Compose the configuration and check the groups that a stage reads.
 
     Returns
     -------
-    pydantic model with the groups that the stage reads as attributes
+    pydantic model with these groups as attributes
 
     Raises
     ------
     ConfigError
         As `load`; an unknown group at the top is refused, too.
     """
-    root = root_of(stage)
-    model, keys = ROOTS[root]
+    root = root_of(reads) if isinstance(reads, str) else root
     tree = compose(overrides, root)
-    unknown = sorted(set(tree) - set(model.model_fields))
+    unknown = sorted(set(tree) - set(ROOTS[root][0].model_fields))
     if unknown:
         raise ConfigError(f"{unknown[0]}: unknown key")
-    return validate(stage_model(stage, keys[stage], model), stage_tree(stage, tree))
+    return part(reads, stage_tree(reads, tree, root), root)
+
+
+def load_settings(path: Path, reads: tuple[str, ...], root: Root = "config") -> Any:
+    """The groups that a stage reads from a file that `write_settings` has written.
+
+    Raises
+    ------
+    ConfigError, ProductError
+        If the file is no YAML or holds something else; names file, key and range.
+    """
+    tree = parse_yaml(path)
+    model = stage_model(reads, ROOTS[root][0])
+    return _named(path, lambda: validate(model, tree if isinstance(tree, dict) else {}))
+
+
+def write_settings(
+    folder: Path,
+    stage: str,
+    reads: tuple[str, ...],
+    tree: Mapping[str, Any],
+    root: Root = "config",
+    dry: bool = False,
+) -> Path:
+    """Write the checked groups that a stage reads; the same settings have the same name.
+
+    What cannot change a result is in the file, but not in its name.
+
+    Returns
+    -------
+    Path
+        Of the file in `folder`; it is only named if `dry`.
+    """
+    import yaml
+
+    checked = part(reads, stage_tree(reads, tree, root), root).model_dump()
+    digest = hashlib.sha256(json.dumps(decisive(checked), sort_keys=True).encode()).hexdigest()
+    path = folder / f"{stage.replace(' ', '-')}-{digest[:16]}.yaml"
+    text = yaml.safe_dump(checked, sort_keys=True, allow_unicode=True)
+    if not dry and not (path.is_file() and path.read_text(encoding="utf-8") == text):
+        write_text(path, text)
+    return path
+
+
+def part(reads: str | tuple[str, ...], tree: Any, root: Root = "config") -> Any:
+    """Some groups of a configuration, a tree or a model, checked.
+
+    Raises
+    ------
+    ConfigError
+        As `load`.
+    """
+    root = root_of(reads) if isinstance(reads, str) else root
+    keys = ROOTS[root][1][reads] if isinstance(reads, str) else reads
+    tree = tree if isinstance(tree, Mapping) else tree.model_dump()
+    found = {key: tree[key] for key in keys if key in tree}
+    return validate(stage_model(keys, ROOTS[root][0]), found)
 
 
 def root_of(stage: str) -> Root:
@@ -200,7 +263,9 @@ def root_of(stage: str) -> Root:
     return next(root for root, (_, keys) in ROOTS.items() if stage in keys)
 
 
-def stage_tree(stage: str, tree: Mapping[str, Any]) -> dict[str, Any]:
+def stage_tree(
+    reads: str | tuple[str, ...], tree: Mapping[str, Any], root: Root = "config"
+) -> dict[str, Any]:
     """The part of a configuration tree that a stage reads.
 
     What follows from groups that it does not read is filled in.
@@ -210,12 +275,13 @@ def stage_tree(stage: str, tree: Mapping[str, Any]) -> dict[str, Any]:
     ConfigError
         If nothing can follow from them.
     """
-    model, keys = ROOTS[root_of(stage)]
-    tree = _derived(tree) if issubclass(model, Consistent) else tree
-    missing = [key for key in keys[stage] if key not in tree]
+    root = root_of(reads) if isinstance(reads, str) else root
+    keys = ROOTS[root][1][reads] if isinstance(reads, str) else reads
+    tree = _derived(tree) if issubclass(ROOTS[root][0], Consistent) else tree
+    missing = [key for key in keys if key not in tree]
     if missing:
         raise ConfigError(f"{missing[0]}: missing")
-    return {key: tree[key] for key in keys[stage]}
+    return {key: tree[key] for key in keys}
 
 
 def _derived(tree: Mapping[str, Any]) -> dict[str, Any]:

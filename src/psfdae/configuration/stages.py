@@ -12,8 +12,11 @@ from psfdae.configuration.schema import Config, Group
 SIMULATION = ("seed", "scene", "telescope", "grid", "wavefront", "stars", "framing", "optics")
 """Groups that decide the noise-free stars."""
 
+STATIC = ("scene", "telescope", "grid", "wavefront", "framing", "optics")
+"""Groups that decide the static PSFs."""
+
 STAGE_KEYS: dict[str, tuple[str, ...]] = {
-    "templates": ("scene", "telescope", "grid", "wavefront", "framing", "optics"),
+    "templates": STATIC,
     "stars": SIMULATION,
     "baseline": ("seed", "noise", "parts", "baseline"),
     "train": ("seed", "noise", "parts", "dae", "train"),
@@ -46,10 +49,8 @@ STAGE_KEYS: dict[str, tuple[str, ...]] = {
 
 
 @cache
-def stage_model(stage: str, keys: tuple[str, ...] = (), root: type[Group] = Config) -> type[Group]:
-    """Some config groups of a root as a model of their own; keys default to `STAGE_KEYS`."""
-    fields = {
-        key: (root.model_fields[key].rebuild_annotation(), ...) for key in keys or STAGE_KEYS[stage]
-    }
+def stage_model(keys: tuple[str, ...], root: type[Group] = Config) -> type[Group]:
+    """Some config groups of a root as a model of their own."""
+    fields = {key: (root.model_fields[key].rebuild_annotation(), ...) for key in keys}
     base = Consistent if issubclass(root, Consistent) else Group
-    return create_model(f"{stage.title()}Config", __base__=base, **fields)  # type: ignore[call-overload]
+    return create_model("Settings", __base__=base, **fields)  # type: ignore[call-overload]

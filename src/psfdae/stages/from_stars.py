@@ -13,9 +13,8 @@ import numpy as np
 
 from psfdae.bundle.format import SUFFIX
 from psfdae.bundle.measure import noise_equivalent_px, signal_to_noise
-from psfdae.configuration.compose import as_overrides
+from psfdae.configuration.compose import as_overrides, part
 from psfdae.configuration.schema import Noise
-from psfdae.configuration.stages import STAGE_KEYS, stage_model
 from psfdae.files import atomic_path, write_text
 from psfdae.observations import Observation, ObservationError, open_observation
 from psfdae.reading import read_table
@@ -246,8 +245,7 @@ def _with_noise(
 
 def _part(stage: str, settings: dict[str, Any]) -> Any:
     """Checked configuration of another stage."""
-    keys = STAGE_KEYS[stage]
-    return stage_model(stage).model_validate({key: settings[key] for key in keys})
+    return part(stage, settings)
 
 
 def _overrides(settings: dict[str, Any]) -> str:

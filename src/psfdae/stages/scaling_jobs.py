@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 
 from psfdae.benchmark.isolated import forget_peak, peak_mb
-from psfdae.configuration.compose import stage_tree, validate
-from psfdae.configuration.stages import stage_model
+from psfdae.configuration.compose import part, stage_tree
 from psfdae.files import Column, read_product, write_product
 
 SPLIT, REFERENCE = "random", "realisation"
@@ -37,7 +36,7 @@ def make_templates(config: dict[str, Any], out: str) -> None:
     """Run the stage `templates`."""
     from psfdae.stages import templates
 
-    templates.run(_checked("templates", config), Path(out))
+    templates.templates(_checked("templates", config), Path(out))
 
 
 def simulate(config: dict[str, Any], templates: str, out: str) -> dict[str, float]:
@@ -106,7 +105,7 @@ def evaluate(
 
 
 def _checked(stage: str, config: dict[str, Any]) -> Any:
-    return validate(stage_model(stage), stage_tree(stage, config))
+    return part(stage, stage_tree(stage, config))
 
 
 def _measure(run: Callable[[], None], out: Path) -> dict[str, float]:

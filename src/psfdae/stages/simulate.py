@@ -55,7 +55,7 @@ def run(config: Any, out: Path, least_energy: float) -> tuple[FieldOfPsfs, list[
         If the optics cannot be sampled, framed or traced.
     """
     with atomic_path(out / "templates.h5") as temporary:
-        templates.run(config, temporary)
+        templates.templates(config, temporary)
         fields = measure_fields(read_product(temporary, "templates"))
         warnings = [*_light(config, fields, least_energy), *_sampling(config, fields)]
     draw(out / "templates.h5", out / "psfs.png", out / "fields.csv")

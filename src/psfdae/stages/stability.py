@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from psfdae.belonging import STARS, require
-from psfdae.configuration.compose import validate
-from psfdae.configuration.stages import stage_model
+from psfdae.configuration.compose import part
 from psfdae.files import ProductError, read_product
 from psfdae.stability.bench import LEAST_LEVEL, Bench, Scene
 from psfdae.stability.rows import Point, Row, run_cases, write_table
@@ -80,7 +79,7 @@ def run(config: Any, stars: Path, turbulence: Path, out: Path, graded: Path) -> 
 def _scene(path: Path, name: str, count: int) -> Scene:
     """The first stars of a product with the settings that made them."""
     product = read_product(path, "stars", ("realisation",))
-    config = validate(stage_model("stars"), product.config)
+    config = part("stars", product.config)
     if config.scene.name != name:
         raise ProductError(f"{path}: stars of the scene {config.scene.name!r}, expected {name!r}")
     return Scene(config, product["realisation"][:count], LEAST_LEVEL[name])

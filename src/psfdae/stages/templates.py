@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any
+from typing import Annotated
 
 import numpy as np
 
+from psfdae.cli import File, command
+from psfdae.configuration.schema import Config
+from psfdae.configuration.stages import STATIC
 from psfdae.files import Column, write_product
 from psfdae.stages.common import limit_threads, scene_module
 from psfdae.stars.fields import square_grid
@@ -14,19 +16,12 @@ from psfdae.stars.framing import stamp_offset
 from psfdae.stars.scene import Propagation
 
 
-def run(config: Any, out: Path) -> None:
-    """Propagate the static wavefronts and write them framed, with a margin for jitter.
-
-    Parameters
-    ----------
-    config : stage config (telescope, grid, wavefront, framing, optics)
-    out : path of the HDF5 product "templates"
-
-    Raises
-    ------
-    SamplingError, FramingError
-        If the pupil grid or the search window is too small.
-    """
+@command("templates", reads=STATIC)
+def templates(
+    config: Config,
+    out: Annotated[File, "HDF5 product with the static PSF of every field point."],
+) -> None:
+    """Propagate the static PSF of every field point."""
     limit_threads(1)  # batches run side by side
     framing = config.framing
     source = scene_module(config.scene.name).template_wavefronts(config)

@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from psfdae.benchmark.isolated import forget_peak, peak_mb, resident_mb
-from psfdae.configuration.compose import validate
-from psfdae.configuration.stages import stage_model
+from psfdae.configuration.compose import part
 
 
 def simulate(config: dict[str, Any], templates: str, out: str) -> dict[str, float]:
@@ -37,7 +36,7 @@ def simulate(config: dict[str, Any], templates: str, out: str) -> dict[str, floa
     from psfdae.stages.common import scene_module
     from psfdae.stars import scene  # noqa: F401
 
-    checked = validate(stage_model("stars"), config)
+    checked = part("stars", config)
     scene_module(checked.scene.name)
     return _measure(lambda: stars.run(checked, Path(templates), Path(out)), Path(out))
 
@@ -46,7 +45,7 @@ def make_templates(config: dict[str, Any], out: str) -> None:
     """Run the stage `templates`."""
     from psfdae.stages import templates
 
-    templates.run(validate(stage_model("templates"), config), Path(out))
+    templates.templates(part("templates", config), Path(out))
 
 
 def infer(
@@ -134,7 +133,7 @@ def baseline(
     )
     from psfdae.stars.noise import mixed_levels
 
-    checked = validate(stage_model("baseline"), config)
+    checked = part("baseline", config)
     settings, seed = checked.baseline, checked.seed
     limit_threads(settings.threads)
     product = read_stars(Path(stars), "template")

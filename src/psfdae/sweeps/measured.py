@@ -85,12 +85,9 @@ class Measured:
 
 def stage_part(stage: str, config: Any) -> Any:
     """The groups that a stage reads, checked, out of a sweep's configuration."""
-    from psfdae.configuration.compose import ROOTS, root_of, validate
-    from psfdae.configuration.stages import stage_model
+    from psfdae.configuration.compose import part
 
-    model, keys = ROOTS[root_of(stage)]
-    tree = {key: getattr(config, key).model_dump() for key in keys[stage] if key != "seed"}
-    return validate(stage_model(stage, keys[stage], model), {**tree, "seed": config.seed})
+    return part(stage, config)
 
 
 def geometric_mean(values: Sequence[float]) -> float:
