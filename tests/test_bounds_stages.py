@@ -25,20 +25,21 @@ SIZES += (f"noise.levels={list(LEVELS)}", "bounds.threads=1", "optics.threads=1"
 
 
 def settings(stage, dataset, *more):
-    return load_stage(stage, (f"dataset={dataset}", *SIZES, *more))
+    reads = stage if isinstance(stage, str) else stage.stage.reads
+    return load_stage(reads, (f"dataset={dataset}", *SIZES, *more))
 
 
 def build(folder, dataset):
     """Products and tables of a dataset's bounds, made by the stages."""
     templates.templates(settings("templates", dataset), folder / "templates.h5")
     stars.run(settings("stars", dataset), folder / "templates.h5", folder / "stars.h5")
-    config = settings("bounds", dataset)
+    config = settings(bounds.bounds, dataset)
     drawn = folder / "bank.h5" if config.stars.aberration_fraction else None
     if drawn:
-        bank.run(config, drawn)
-    products = (folder / "stars.h5", folder / "templates.h5", drawn)
-    tables = [folder / name for name in ("bounds.csv", "growth.csv", "bounds.parquet")]
-    bounds.run(config, dataset, *products, *tables)
+        bank.bank(config, drawn)
+    products = (folder / "stars.h5", folder / "templates.h5")
+    tables = [folder / name for name in ("growth.csv", "bounds.parquet", "bounds.csv")]
+    bounds.bounds(config, dataset, *products, *tables, drawn)
     return folder
 
 
@@ -67,7 +68,7 @@ def evaluated(folder, dataset, factor):
 
 def compared(folder, dataset, factor):
     inputs = ([folder / "bounds.csv"], [folder / "bounds.parquet"])
-    efficiency.run(*inputs, [evaluated(folder, dataset, factor)], folder / "efficiency.csv")
+    efficiency.efficiency(*inputs, folder / "efficiency.csv", [evaluated(folder, dataset, factor)])
     return pd.read_csv(folder / "efficiency.csv")
 
 
@@ -119,7 +120,7 @@ def test_growth_ends_with_the_error_of_the_table(scene_1):
 
 
 def test_bounded_stars_are_the_first_test_stars_with_their_noise(scene_1):
-    config = settings("bounds", "dataset6")
+    config = settings(bounds.bounds, "dataset6")
     product = read_product(scene_1 / "stars.h5", "stars")
     test = split_stars(product, "random", config).test
     rows = pd.read_parquet(scene_1 / "bounds.parquet")
@@ -134,15 +135,15 @@ def test_bounded_stars_are_the_first_test_stars_with_their_noise(scene_1):
 
 
 def test_a_bank_of_other_stars_is_refused(scene_1, tmp_path):
-    bank.run(settings("bounds", "dataset3", "bounds.bank_stars=9"), tmp_path / "bank.h5")
+    bank.bank(settings(bounds.bounds, "dataset3", "bounds.bank_stars=9"), tmp_path / "bank.h5")
     outputs = [tmp_path / name for name in ("a.csv", "b.csv", "c.parquet")]
     products = (scene_1 / "stars.h5", scene_1 / "templates.h5")
-    config = settings("bounds", "dataset6")
+    config = settings(bounds.bounds, "dataset6")
     other = r"bank\.h5: stars\.aberration_fraction = 0\.1, but .*stars\.h5 has 0\.5"
     with pytest.raises(ProductError, match=other):
-        bounds.run(config, "dataset6", *products, tmp_path / "bank.h5", *outputs)
+        bounds.bounds(config, "dataset6", *products, *outputs, tmp_path / "bank.h5")
     with pytest.raises(ProductError, match="a bank is needed"):
-        bounds.run(config, "dataset6", *products, None, *outputs)
+        bounds.bounds(config, "dataset6", *products, *outputs)
     assert not outputs[0].exists()
 
 
@@ -192,31 +193,31 @@ def test_methods_must_cover_the_bounded_stars(scene_1, tmp_path):
     rows[rows.star != rows.star.min()].to_parquet(tmp_path / "e.parquet")
     inputs = ([scene_1 / "bounds.csv"], [scene_1 / "bounds.parquet"])
     with pytest.raises(ProductError, match="lmmse lacks 1 of the bounded stars"):
-        efficiency.run(*inputs, [tmp_path / "e.parquet"], tmp_path / "x.csv")
+        efficiency.efficiency(*inputs, tmp_path / "x.csv", [tmp_path / "e.parquet"])
     rows.assign(field=rows.field + 1).to_parquet(tmp_path / "e.parquet")
     with pytest.raises(ProductError, match=r"star \d+ of lmmse lies in field \d, but that of the"):
-        efficiency.run(*inputs, [tmp_path / "e.parquet"], tmp_path / "x.csv")
+        efficiency.efficiency(*inputs, tmp_path / "x.csv", [tmp_path / "e.parquet"])
     rows.assign(dataset="dataset1").to_parquet(tmp_path / "e.parquet")
     with pytest.raises(ProductError, match="no method was evaluated"):
-        efficiency.run(*inputs, [tmp_path / "e.parquet"], tmp_path / "x.csv")
+        efficiency.efficiency(*inputs, tmp_path / "x.csv", [tmp_path / "e.parquet"])
 
 
 def test_collect_joins_tables_of_one_kind(scene_1, scene_2, tmp_path):
     parts = [folder / "bounds.csv" for folder in (scene_1, scene_2)]
-    bounds.collect(parts, tmp_path / "all.csv")
+    bounds.collect_bounds(tmp_path / "all.csv", parts)
     joined = pd.read_csv(tmp_path / "all.csv")
     assert len(joined) == sum(len(pd.read_csv(part)) for part in parts)
     sizes = [folder / "growth.csv" for folder in (scene_2, scene_1)]
-    bounds.collect(sizes, tmp_path / "growth.csv")  # the first has no rows
+    bounds.collect_bounds(tmp_path / "growth.csv", sizes)  # the first has no rows
     pd.testing.assert_frame_equal(
         pd.read_csv(tmp_path / "growth.csv"), pd.read_csv(scene_1 / "growth.csv")
     )
     with pytest.raises(ProductError, match="unlike"):
-        bounds.collect([parts[0], sizes[1]], tmp_path / "mixed.csv")
+        bounds.collect_bounds(tmp_path / "mixed.csv", [parts[0], sizes[1]])
 
 
 def test_same_config_gives_the_same_bytes(scene_1, tmp_path):
-    bank.run(settings("bounds", "dataset6"), tmp_path / "bank.h5")
+    bank.bank(settings(bounds.bounds, "dataset6"), tmp_path / "bank.h5")
     with h5py.File(tmp_path / "bank.h5") as one, h5py.File(scene_1 / "bank.h5") as two:
         assert (one["framed"][()] == two["framed"][()]).all()
 
@@ -270,10 +271,10 @@ def test_growth_figure_has_a_line_per_level(scene_1):
 def test_figure_stages_write_png_and_name_what_is_missing(scene_1, tmp_path):
     compared(scene_1, "dataset6", 1.5)
     tables = (scene_1 / "bounds.csv", scene_1 / "efficiency.csv")
-    bound_figures.errors(*tables, "dataset6", tmp_path / "e.png")
-    bound_figures.efficiency(tables[1], "dataset6", tmp_path / "f.png")
-    bound_figures.growth(scene_1 / "growth.csv", "dataset6", tmp_path / "g.png")
+    bound_figures.figure_bounds("dataset6", *tables, tmp_path / "e.png")
+    bound_figures.figure_efficiency("dataset6", tables[1], tmp_path / "f.png")
+    bound_figures.figure_bank_growth("dataset6", scene_1 / "growth.csv", tmp_path / "g.png")
     for name in "efg":
         assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
     with pytest.raises(ProductError, match="no rows of dataset1"):
-        bound_figures.growth(scene_1 / "growth.csv", "dataset1", tmp_path / "h.png")
+        bound_figures.figure_bank_growth("dataset1", scene_1 / "growth.csv", tmp_path / "h.png")

@@ -14,12 +14,12 @@ rule bank:
         mem_mb=1500,
         runtime=30,
     params:
-        config=lambda w: stage_overrides("bank", f"stars={w.stars}"),
+        config=lambda w: settings("bank", f"stars={w.stars}"),
         source=source_hash("psfdae.stages.bank", "psfdae.stars.seidel_scene"),
     message:
         "Simulating the bank of {wildcards.stars}"
     shell:
-        "psfdae bank --out {output} {params.config:q} > {log} 2>&1"
+        "psfdae bank --config {params.config} --out {output} > {log} 2>&1"
 
 
 rule dataset_bounds:
@@ -40,15 +40,15 @@ rule dataset_bounds:
         mem_mb=1500,
         runtime=20,
     params:
-        config=lambda w: stage_overrides("bounds", f"dataset={w.dataset}"),
+        config=lambda w: settings("bounds", f"dataset={w.dataset}"),
         source=source_hash("psfdae.stages.bounds"),
         bank=lambda w: [f"--bank={path}" for path in bank_of(w.dataset)],
     message:
         "Bounding the errors of {wildcards.dataset}"
     shell:
-        "psfdae bounds --dataset {wildcards.dataset} --stars {input.stars}"
-        " --templates {input.templates} {params.bank:q} --growth {output.growth}"
-        " --per-star {output.per_star} --out {output.summary} {params.config:q}"
+        "psfdae bounds --config {params.config} --dataset {wildcards.dataset}"
+        " --stars {input.stars} --templates {input.templates} {params.bank:q}"
+        " --growth {output.growth} --per-star {output.per_star} --out {output.summary}"
         " > {log} 2>&1"
 
 
@@ -62,10 +62,6 @@ rule psf_bounds:
     benchmark:
         f"{RESULTS}/benchmarks_on_request/bounds/psf_bounds.tsv"
     localrule: True
-    threads: 1
-    resources:
-        mem_mb=500,
-        runtime=10,
     params:
         source=source_hash("psfdae.stages.bounds"),
     message:
@@ -74,7 +70,7 @@ rule psf_bounds:
         "psfdae collect-bounds --out {output} {input} > {log} 2>&1"
 
 
-rule psf_bounds_growth:
+use rule psf_bounds as psf_bounds_growth with:
     input:
         expand(rules.dataset_bounds.output.growth, dataset=default_datasets()),
     output:
@@ -83,17 +79,8 @@ rule psf_bounds_growth:
         f"{RESULTS}/logs/bounds/psf_bounds_growth.log",
     benchmark:
         f"{RESULTS}/benchmarks_on_request/bounds/psf_bounds_growth.tsv"
-    localrule: True
-    threads: 1
-    resources:
-        mem_mb=500,
-        runtime=10,
-    params:
-        source=source_hash("psfdae.stages.bounds"),
     message:
         "Collecting how the posterior means depend on their banks"
-    shell:
-        "psfdae collect-bounds --out {output} {input} > {log} 2>&1"
 
 
 rule psf_efficiency:
@@ -109,10 +96,8 @@ rule psf_efficiency:
         f"{RESULTS}/logs/bounds/psf_efficiency.log",
     benchmark:
         f"{RESULTS}/benchmarks_on_request/bounds/psf_efficiency.tsv"
-    threads: 1
     resources:
         mem_mb=1000,
-        runtime=10,
     params:
         bounds=lambda w, input: [f"--bounds={path}" for path in input.bounds],
         best=lambda w, input: [f"--bounds-per-star={path}" for path in input.best],
@@ -140,10 +125,6 @@ rule figure_bounds:
         f"{RESULTS}/logs/figures/bounds/{{dataset}}_errors.log",
     benchmark:
         f"{RESULTS}/benchmarks_on_request/bounds/figure_errors-{{dataset}}.tsv"
-    threads: 1
-    resources:
-        mem_mb=500,
-        runtime=10,
     params:
         source=source_hash("psfdae.stages.bound_figures"),
     message:
@@ -168,10 +149,6 @@ rule figure_efficiency:
         f"{RESULTS}/logs/figures/bounds/{{dataset}}_efficiency.log",
     benchmark:
         f"{RESULTS}/benchmarks_on_request/bounds/figure_efficiency-{{dataset}}.tsv"
-    threads: 1
-    resources:
-        mem_mb=500,
-        runtime=10,
     params:
         source=source_hash("psfdae.stages.bound_figures"),
     message:
@@ -196,10 +173,6 @@ rule figure_bank_growth:
         f"{RESULTS}/logs/figures/bounds/{{dataset}}_growth.log",
     benchmark:
         f"{RESULTS}/benchmarks_on_request/bounds/figure_growth-{{dataset}}.tsv"
-    threads: 1
-    resources:
-        mem_mb=500,
-        runtime=10,
     params:
         source=source_hash("psfdae.stages.bound_figures"),
     message:

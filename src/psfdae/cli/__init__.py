@@ -265,7 +265,6 @@ from psfdae.cli import (  # noqa: E402, F401
     alignment_methods,
     benchmark_propagation,
     benchmark_timing,
-    bounds,
     bundle,
     compare,
     figures,

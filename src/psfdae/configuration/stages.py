@@ -40,8 +40,6 @@ STAGE_KEYS: dict[str, tuple[str, ...]] = {
         *SIMULATION,
         *("noise", "parts", "dae", "train", "baseline", "evaluation", "stability"),
     ),
-    "bank": (*SIMULATION, "bounds"),
-    "bounds": (*SIMULATION, "noise", "parts", "bounds"),
     "sweep_dae": ("seed", "noise", "parts", "dae", "train", "evaluation"),
     "sweep_pca_som": ("seed", "noise", "parts", "baseline", "evaluation"),
 }

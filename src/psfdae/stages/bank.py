@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any
+from typing import Annotated
 
 import numpy as np
 
 from psfdae.bounds.bank import MIRROR_MARGIN
+from psfdae.cli import File, command
+from psfdae.configuration.schema import Config
+from psfdae.configuration.stages import SIMULATION
 from psfdae.files import Column, write_product
 from psfdae.rng import stream
 from psfdae.stages.common import limit_threads, scene_module
@@ -24,24 +26,16 @@ take half the time.
 """
 
 
-def run(config: Any, out: Path) -> None:
-    """Draw, propagate and frame the stars of a bank.
-
-    Their random streams carry another name than those of the stars, so no star of
-    the training or test part is in the bank.
-
-    Parameters
-    ----------
-    config : stage config "bounds"
-    out : path of the HDF5 product "bank"
-
-    Raises
-    ------
-    SamplingError, FramingError
-        If the pupil grid or the search window is too small.
-    """
+@command("bank", reads=(*SIMULATION, "bounds"))
+def bank(
+    config: Config,
+    out: Annotated[File, "HDF5 product with fresh stars, framed so that they can be mirrored."],
+) -> None:
+    """Simulate the bank of fresh stars behind the posterior mean."""
     limit_threads(1)  # batches run side by side
-    drawn = _renamed(config)
+    # Another name gives other random streams: no training or test star is in the bank.
+    named = {"name": f"{config.stars.name}_bank", "count": config.bounds.bank_stars}
+    drawn = config.model_copy(update={"stars": config.stars.model_copy(update=named)})
     fields = drawn.grid.points**2
     name, count = drawn.stars.name, drawn.stars.count
     star_field = assign_fields(count, fields, stream(drawn.seed, "field", name))
@@ -65,11 +59,3 @@ def run(config: Any, out: Path) -> None:
         "pupil_samples": Column(propagation.samples, "1", "pupil samples N"),
     }
     write_product(out, "bank", columns, config.model_dump())
-
-
-def _renamed(config: Any) -> Any:
-    """The configuration of the bank's stars: other streams, another number."""
-    stars = config.stars.model_copy(
-        update={"name": f"{config.stars.name}_bank", "count": config.bounds.bank_stars}
-    )
-    return config.model_copy(update={"stars": stars})

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
@@ -15,6 +14,9 @@ from psfdae.bounds.bank import Bank, jittered_templates
 from psfdae.bounds.growth import TIGHT, extrapolate, last_change, nested_means, segments
 from psfdae.bounds.likelihood import Likelihood
 from psfdae.bounds.posterior import PosteriorSums, posterior_sums
+from psfdae.cli import File, command
+from psfdae.configuration.schema import Config
+from psfdae.configuration.stages import SIMULATION
 from psfdae.evaluation.metrics import clustered_mean, mse
 from psfdae.files import Product, ProductError, atomic_path, read_product, write_text
 from psfdae.reading import read_table
@@ -51,7 +53,7 @@ NORMAL_95 = 1.959964
 
 
 @dataclass(frozen=True)
-class TestStars:
+class BoundedStars:
     """The test stars that are bounded.
 
     Attributes
@@ -73,7 +75,7 @@ class TestStars:
 class Tables:
     """Rows of a dataset's tables while they grow."""
 
-    def __init__(self, dataset: str, stars: TestStars) -> None:
+    def __init__(self, dataset: str, stars: BoundedStars) -> None:
         self.dataset = dataset
         self.stars = stars
         self.summary: list[dict[str, Any]] = []
@@ -113,34 +115,20 @@ class Tables:
             )
 
 
-def run(
-    config: Any,
-    dataset: str,
-    stars: Path,
-    templates: Path,
-    bank: Path | None,
-    out: Path,
-    growth: Path,
-    per_star: Path,
+@command("bounds", reads=(*SIMULATION, "noise", "parts", "bounds"))
+def bounds(
+    config: Config,
+    dataset: Annotated[str, "Name in the tables."],
+    stars: Annotated[File, "Product of the stage stars."],
+    templates: Annotated[File, "Product of the stage templates."],
+    growth: Annotated[File, "CSV: error by size of the bank."],
+    per_star: Annotated[File, "Parquet with every star."],
+    out: Annotated[File, "CSV with the bounds."],
+    bank: Annotated[
+        File | None, "Product of the stage bank; needed where stars have random aberrations."
+    ] = None,
 ) -> None:
-    """Bound the error of the test stars of a dataset's random split.
-
-    Parameters
-    ----------
-    config : stage config "bounds"
-    dataset : name that goes into the tables
-    stars, templates : products
-    bank : product "bank" of the same stars; None where there are no random aberrations
-    out : CSV, columns `COLUMNS`
-    growth : CSV, columns `GROWTH_COLUMNS`; no rows where the posterior is exact
-    per_star : Parquet with one row per bound, λ and star
-
-    Raises
-    ------
-    ProductError
-        If a product is damaged, or stars, templates, bank and configuration do not
-        belong together.
-    """
+    """Bound the error that any estimator can reach on the test stars."""
     limit_threads(config.bounds.threads)
     product = read_product(stars, "stars")
     framed = read_product(templates, "templates", ("psf",))
@@ -158,14 +146,11 @@ def run(
     tables.write(out, growth, per_star)
 
 
-def collect(parts: Sequence[Path], out: Path) -> None:
-    """Join the CSV files of several datasets into one.
-
-    Raises
-    ------
-    ProductError
-        If the files differ in their columns.
-    """
+@command("collect-bounds")
+def collect_bounds(
+    out: Annotated[File, "CSV."], parts: Annotated[tuple[File, ...], {"argument": True}]
+) -> None:
+    """Join the tables of several datasets' bounds."""
     import pandas as pd
 
     frames = [read_table(path) for path in parts]
@@ -177,13 +162,13 @@ def collect(parts: Sequence[Path], out: Path) -> None:
     write_text(out, joined.to_csv(index=False, float_format="%.8g"))
 
 
-def _test_stars(config: Any, product: Product) -> TestStars:
+def _test_stars(config: Config, product: Product) -> BoundedStars:
     test = split_stars(product, SPLIT, config).test
     first = slice(0, config.bounds.test_stars)
     kept = test[first]
     # The noise is drawn for all test stars, as the stage `evaluate` does, then cut.
     images = product["realisation"][test]
-    return TestStars(
+    return BoundedStars(
         star=kept,
         field=product["field_index"][kept],
         truth={name: product[name][kept] for name in ("realisation", "template")},
@@ -192,13 +177,7 @@ def _test_stars(config: Any, product: Product) -> TestStars:
 
 
 def _read_bank(path: Path, stars: Product) -> Bank:
-    """The bank of a star set.
-
-    Raises
-    ------
-    ProductError
-        If it was drawn from another simulator than the stars.
-    """
+    """The bank of a star set; refused if it was drawn from another simulator than the stars."""
     product = read_product(path, "bank", ("framed", "field_index", "peak"))
     require(path, product.config, STARS, stars.config, stars.path)
     return Bank(
@@ -210,7 +189,7 @@ def _read_bank(path: Path, stars: Product) -> Bank:
     )
 
 
-def _floor(config: Any, product: Product, tables: Tables) -> None:
+def _floor(config: Config, product: Product, tables: Tables) -> None:
     from psfdae.bounds.fisher import local_error, sensitivities
     from psfdae.stars.framing import stamp_offset
     from psfdae.stars.seidel_scene import relative_field
@@ -234,7 +213,7 @@ def _floor(config: Any, product: Product, tables: Tables) -> None:
         tables.add("realisation", "floor", level, {"mse": error}, tight=False)
 
 
-def _sampled(config: Any, bank: Bank, static: np.ndarray, tables: Tables) -> None:
+def _sampled(config: Config, bank: Bank, static: np.ndarray, tables: Tables) -> None:
     """The posterior mean over a bank, and how it changes with the bank's size."""
     for level in config.noise.levels:
         start = time.monotonic()
@@ -254,7 +233,7 @@ def _sampled(config: Any, bank: Bank, static: np.ndarray, tables: Tables) -> Non
 
 
 def _bank_sums(
-    config: Any, bank: Bank, stars: TestStars, level: float
+    config: Config, bank: Bank, stars: BoundedStars, level: float
 ) -> tuple[list[PosteriorSums], int]:
     """Sums over equal parts of the bank, and the number of draws in them.
 
@@ -271,7 +250,7 @@ def _bank_sums(
     return parts, sum(cut.size for cut in cuts[: len(parts)])
 
 
-def _errors(sums: PosteriorSums, static: np.ndarray, stars: TestStars) -> np.ndarray:
+def _errors(sums: PosteriorSums, static: np.ndarray, stars: BoundedStars) -> np.ndarray:
     """MSE against realisation and template, and effective sample size, shape (3, n)."""
     shape = stars.truth["realisation"].shape
     means = {"realisation": sums.mean_image, "template": sums.mean_template(static)}
@@ -301,7 +280,7 @@ def _growth_rows(
     ]
 
 
-def _exact(config: Any, static: np.ndarray, tables: Tables) -> None:
+def _exact(config: Config, static: np.ndarray, tables: Tables) -> None:
     """The exact posterior over the templates at all centring errors."""
     from psfdae.bounds.discrete import exact_posterior
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Annotated, Any
 
 from psfdae.bounds.efficiency import compare
+from psfdae.cli import File, command
 from psfdae.files import ProductError, write_text
 from psfdae.reading import read_table
 
@@ -20,34 +20,29 @@ COLUMN_OF_TABLE = ["dataset", "split", "reference", "noise_level"]
 """What one column of the paper's tables is: methods are compared inside it."""
 
 
-def run(
-    bounds: Sequence[Path], bounds_per_star: Sequence[Path], per_star: Sequence[Path], out: Path
+@command("efficiency")
+def efficiency(
+    bounds: tuple[File, ...],
+    bounds_per_star: Annotated[
+        tuple[File, ...], "Parquet of the stage bounds; repeat for more datasets."
+    ],
+    out: Annotated[File, "CSV: every method beside every bound."],
+    parts: Annotated[tuple[File, ...], {"argument": True}],
 ) -> None:
-    """Compare the methods of evaluations with the bounds, paired by star.
+    """Compare methods with the bounds; PARTS are the evaluations' Parquet files.
 
-    The methods' errors are those of the bounded stars alone. The posterior mean is
-    compared with the floor, too. An efficiency is given for the floor and where
-    the posterior mean is tight; the verdict is `beaten` if a method's error is
-    below such a bound by more than two standard errors of the difference and 5 %
-    of the bound, otherwise `ok`. Both are empty where a posterior mean is not tight.
-
-    Parameters
-    ----------
-    bounds, bounds_per_star : CSV and Parquet files of the stage `bounds`
-    per_star : Parquet files of the stage `evaluate`
-    out : CSV, columns `COLUMNS`
-
-    Raises
-    ------
-    ProductError
-        If a column has a bound but no method was evaluated on its stars, or on other ones.
+    They are paired by star; the methods' errors are those of the bounded stars alone.
+    The posterior mean is compared with the floor, too. An efficiency is given for the
+    floor and where the posterior mean is tight; the verdict is `beaten` if a method's
+    error is below such a bound by more than two standard errors of the difference and
+    5 % of the bound, otherwise `ok`. Both are empty where a posterior mean is not tight.
     """
     import pandas as pd
 
     tight = _tight(pd.concat([read_table(path) for path in bounds], ignore_index=True))
     best = pd.concat([pd.read_parquet(path) for path in bounds_per_star], ignore_index=True)
     wanted = [*COLUMN_OF_TABLE, "method", "star", "field", "mse"]
-    methods = pd.concat([pd.read_parquet(path, columns=wanted) for path in per_star])
+    methods = pd.concat([pd.read_parquet(path, columns=wanted) for path in parts])
     # The posterior mean over a bank is an estimator and must respect the floor.
     methods = pd.concat([methods, best[best.method == "bayes"][wanted]], ignore_index=True)
     by_column = dict(list(methods.groupby(COLUMN_OF_TABLE, sort=False)))
