@@ -48,7 +48,7 @@ def test_reference_keeps_the_layout_and_says_where_it_comes_from(results, tmp_pa
     out = tmp_path / "reference"
     (out / "tables").mkdir(parents=True)
     (out / "tables/old.csv").write_text("stale")
-    record.reference(results, load(), [results / "tables/t.csv"], [], out)
+    record.reference(results, out, [results / "tables/t.csv"])
     assert (out / "tables/t.csv").read_text() == "a\n1\n"
     assert not (out / "tables/old.csv").exists()
     provenance = json.loads((out / "provenance.json").read_text())
@@ -64,12 +64,12 @@ def test_record_keeps_what_was_not_renewed_and_says_since_when(results, tmp_path
     slow = results / "tables/slow.csv"
     slow.write_text("b\n2\n")
     files, keep = [results / "tables/t.csv"], [Path("tables/slow.csv"), Path("tables/never.csv")]
-    record.reference(results, load(), files, keep, out)
+    record.reference(results, out, files, keep)
     slow.unlink()
     assert json.loads((out / "provenance.json").read_text())["kept"] == {}
     (out / "provenance.json").write_text('{"commit": "first"}')
     for _ in range(2):
-        record.reference(results, load(), files, keep, out)
+        record.reference(results, out, files, keep)
         assert (out / "tables/slow.csv").read_text() == "b\n2\n"
         kept = json.loads((out / "provenance.json").read_text())["kept"]
         assert kept == {"tables/slow.csv": "first"}
@@ -88,7 +88,7 @@ def test_incomplete_run_leaves_the_record_alone(results, tmp_path):
     out = tmp_path / "reference"
     out.mkdir()
     with pytest.raises(ProductError, match=r"missing\.csv: missing"):
-        record.reference(results, load(), [results / "missing.csv"], [], out)
+        record.reference(results, out, [results / "missing.csv"])
     assert list(out.iterdir()) == []
 
 

@@ -10,7 +10,7 @@ rule scan:
         mem_mb=1000,
         runtime=30,
     params:
-        config=lambda w: stage_overrides("scan", f"dataset={w.dataset}"),
+        config=lambda w: settings("scan", f"dataset={w.dataset}"),
         source=lambda w: source_hash(
             "psfdae.stages.calibrate",
             f"psfdae.stars.{dataset_config(w.dataset).scene.name}_scene",
@@ -18,7 +18,7 @@ rule scan:
     message:
         "Scanning pixel scales and dynamic ranges for {wildcards.dataset}"
     shell:
-        "psfdae scan --dataset {wildcards.dataset} --out {output} {params.config:q}"
+        "psfdae scan --config {params.config} --dataset {wildcards.dataset} --out {output}"
         " > {log} 2>&1"
 
 
@@ -43,7 +43,7 @@ rule calibrate:
         mem_mb=2000,
         runtime=10,
     params:
-        config=lambda w: stage_overrides("calibrate", f"dataset={TABULATED[0]}"),
+        config=lambda w: settings("calibrate", f"dataset={TABULATED[0]}"),
         source=source_hash("psfdae.stages.calibrate"),
         folder=subpath(output.fit, parent=True),
         scans=lambda w, input: [f"--scan={path}" for path in input.scans],
@@ -55,5 +55,5 @@ rule calibrate:
     message:
         "Fitting noise, dynamic range and pixel scales to the paper"
     shell:
-        "psfdae calibrate --out {params.folder} {params.scans:q} {params.stars:q}"
-        " {params.config:q} > {log} 2>&1"
+        "psfdae calibrate --config {params.config} --out {params.folder}"
+        " {params.scans:q} {params.stars:q} > {log} 2>&1"

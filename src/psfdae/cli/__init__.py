@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import click
-from click.utils import make_default_short_help
 
 import psfdae
 
@@ -99,9 +98,7 @@ class Commands(click.Group):
         names = [f"{self.prefix} {word}".strip() for word in self.list_commands(ctx)]
         width = formatter.width - 6 - max(map(len, names))
         with formatter.section("Commands"):
-            formatter.write_dl(
-                [(n.split()[-1], make_default_short_help(_about(n), width)) for n in names]
-            )
+            formatter.write_dl([(n.split()[-1], _shortened(_about(n), width)) for n in names])
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command; a refusal of ours is a message, a bug stays a traceback.
@@ -151,6 +148,14 @@ def stage(name: str) -> Callable[..., Any]:
     module = import_module(f"psfdae.stages.{found()[name].stem}")
     functions = [f for f in vars(module).values() if isinstance(getattr(f, "stage", None), Stage)]
     return next(f for f in functions if f.stage.name == name)
+
+
+def _shortened(text: str, width: int) -> str:
+    """The first sentence, as much of it as fits."""
+    from textwrap import shorten
+
+    first = " ".join(text.split()).partition(". ")[0].removesuffix(".")
+    return first + "." if len(first) < width else shorten(first, width, placeholder="...")
 
 
 def _about(name: str) -> str:
@@ -229,8 +234,8 @@ def _option(name: str, hint: Any, default: Any) -> click.Parameter:
         many = attributes.pop("multiple", False)
         return click.Argument([name], required=required, nargs=-1 if many else 1, **attributes)
     attributes["required"] = required
-    if not required and default is not None and default != ():
-        attributes = {"default": default, "show_default": kind is not bool, **attributes}
+    if not required and default not in (None, False, ()):
+        attributes = {"default": default, "show_default": True, **attributes}
     flag = attributes.pop("flag", f"--{name.replace('_', '-')}")
     return click.Option([flag, name], **attributes)
 
@@ -266,7 +271,6 @@ from psfdae.cli import (  # noqa: E402, F401
     benchmark_propagation,
     benchmark_timing,
     bundle,
-    compare,
     figures,
     from_stars,
     knee,
@@ -275,7 +279,6 @@ from psfdae.cli import (  # noqa: E402, F401
     reporting,
     scaling,
     science,
-    simulate,
     stability,
     sweep,
 )

@@ -7,7 +7,7 @@ from typing import TextIO
 
 import click
 
-from psfdae.cli.base import FileArgument, FolderArgument, input_option, main, out_option, overrides
+from psfdae.cli.base import FileArgument, FolderArgument, input_option, main, out_option
 
 
 @main.command()
@@ -30,42 +30,6 @@ def paper_tables(dataset: str, metric: str, out: Path, evaluations: tuple[Path, 
     from psfdae.stages.tables import paper_tables as stage
 
     stage(evaluations, dataset, metric, out)
-
-
-@main.command()
-@click.option("--dataset", required=True, help="A dataset that the paper tabulates.")
-@out_option("CSV with the SSIM over scale, r0 and dynamic range.")
-@overrides
-def scan(dataset: str, out: Path, overrides: tuple[str, ...]) -> None:
-    """Scan what the paper leaves open against its original-noise rows."""
-    from psfdae.configuration.compose import load_stage
-    from psfdae.stages import calibrate as stage
-
-    stage.scan(load_stage("scan", overrides), dataset, out)
-
-
-@main.command()
-@click.option("--scan", "scans", type=FileArgument, multiple=True, required=True)
-@click.option(
-    "--stars",
-    type=(str, FileArgument),
-    multiple=True,
-    required=True,
-    help="Dataset and its product of the stage stars.",
-)
-@out_option("Folder for fit.csv, columns.csv and degeneracy.csv.", FolderArgument)
-@overrides
-def calibrate(
-    scans: tuple[Path, ...],
-    stars: tuple[tuple[str, Path], ...],
-    out: Path,
-    overrides: tuple[str, ...],
-) -> None:
-    """Fit noise, dynamic range and pixel scales to the scans."""
-    from psfdae.configuration.compose import load_stage
-    from psfdae.stages import calibrate as stage
-
-    stage.calibrate(load_stage("calibrate", overrides), scans, dict(stars), out)
 
 
 @main.command()
@@ -102,34 +66,6 @@ def track(
 
 
 @main.command()
-@input_option("results", "Folder of a run.", FolderArgument)
-@out_option("CSV with the cost of every job.")
-def runtime(results: Path, out: Path) -> None:
-    """Collect wall time, CPU time and memory of a run's jobs."""
-    from psfdae.stages import record as stage
-
-    stage.runtime(results, out)
-
-
-@main.command()
-@input_option("results", "Folder of a finished run.", FolderArgument)
-@click.option(
-    "--keep",
-    type=FileArgument,
-    multiple=True,
-    help="File, relative to the results, that may stay from the record before.",
-)
-@out_option("Folder of the run of record.", FolderArgument)
-@click.argument("files", nargs=-1, type=FileArgument, required=True)
-def reference(results: Path, keep: tuple[Path, ...], out: Path, files: tuple[Path, ...]) -> None:
-    """Replace the committed run of record by a finished run."""
-    from psfdae.configuration.compose import load
-    from psfdae.stages import record as stage
-
-    stage.reference(results, load(), files, keep, out)
-
-
-@main.command()
 @click.option("--root", type=FolderArgument, default=Path(), help="Root of the source tree.")
 def docs(root: Path) -> None:
     """Render README and docs from the run of record."""
@@ -162,28 +98,3 @@ def draw_modules(out: Path) -> None:
     from psfdae.stages import docs as stage
 
     stage.draw_modules(out)
-
-
-@main.command()
-@click.argument("files", nargs=-1, type=FileArgument, required=True)
-def copy(files: tuple[Path, ...]) -> None:
-    """Copy files as products; FILES are pairs of a file and the name of its copy."""
-    from psfdae.files import atomic_path
-
-    if len(files) % 2:
-        raise click.UsageError(f"{files[-1]}: the name of its copy is missing")
-    for path, out in zip(files[::2], files[1::2], strict=True):
-        with path.open("rb") as source, atomic_path(out) as copied:
-            copied.write_bytes(source.read())
-
-
-@main.command()
-@click.argument("results", type=FolderArgument)
-def verify(results: Path) -> None:
-    """Set damaged files of a run aside and list the files that have to be built again."""
-    from psfdae.stages import verify as stage
-
-    for path, reason in stage.run(results):
-        click.echo(f"{path}: {reason}; set aside, it will be built again", err=True)
-    for path in stage.missing(results):
-        click.echo(path)

@@ -19,22 +19,6 @@ from psfdae.cli.base import (
 
 
 @main.command()
-@click.option("--stage", help="Only the groups that this stage reads.")
-@overrides
-def config(stage: str | None, overrides: tuple[str, ...]) -> None:
-    """Check the configuration and print it, resolved, as YAML."""
-    import yaml
-
-    from psfdae.configuration.compose import load, load_stage
-    from psfdae.configuration.stages import STAGE_KEYS
-
-    if stage is not None and stage not in STAGE_KEYS:
-        raise click.BadParameter(f"{stage!r} is not one of {', '.join(STAGE_KEYS)}")
-    checked = load_stage(stage, overrides) if stage else load(overrides)
-    click.echo(yaml.safe_dump(checked.model_dump(), sort_keys=False), nl=False)
-
-
-@main.command()
 @input_option("templates", "Product of the stage templates.")
 @out_option("HDF5 product with noise-free stars.")
 @overrides

@@ -26,8 +26,6 @@ STAGE_KEYS: dict[str, tuple[str, ...]] = {
         *("seed", "calibration_stars", "framing", "noise", "parts"),
         *("dae", "train", "baseline", "evaluation"),
     ),
-    "scan": (*SIMULATION, "noise", "calibration"),
-    "calibrate": ("seed", "noise", "evaluation"),
     "knee": ("seed", "noise", "parts", "dae", "train", "evaluation"),
     "propagation": (*SIMULATION, "noise", "benchmark"),
     "prediction": (*SIMULATION, "noise", "benchmark"),

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from math import ceil
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from psfdae.belonging import STATIC, require
+from psfdae.cli import File, Folder, command
+from psfdae.configuration.schema import Config
+from psfdae.configuration.stages import SIMULATION
 from psfdae.evaluation.calibration import (
     fit_scales,
     kappa_of_mse,
@@ -28,18 +30,16 @@ from psfdae.stars.noise import NoiseModel
 from psfdae.stars.scene import Propagation
 
 
-def scan(config: Any, dataset: str, out: Path) -> None:
-    """SSIM of a dataset's original-noise columns over pixel scale, r0 and dynamic range.
+@command("scan", reads=(*SIMULATION, "noise", "calibration"))
+def scan(
+    config: Config,
+    dataset: Annotated[str, "A dataset that the paper tabulates."],
+    out: Annotated[File, "CSV with the SSIM over scale, r0 and dynamic range."],
+) -> None:
+    """Scan what the paper leaves open against its original-noise rows.
 
-    The noise of each column is scaled to the MSE that the paper prints, so that
-    only image structure and dynamic range are left to explain the SSIM.
-
-    Parameters
-    ----------
-    config : stage config (seed, scene … optics, noise, calibration)
-    dataset : one of the datasets that the paper tabulates
-    out : CSV, columns experiment, dataset, pixel_scale_arcsec, r0_m, noise_level,
-        data_range, ssim
+    The noise of each column is scaled to the MSE that the paper prints, so that only
+    image structure and dynamic range are left to explain the SSIM.
     """
     import pandas as pd
 
@@ -71,7 +71,7 @@ def scan(config: Any, dataset: str, out: Path) -> None:
     write_text(out, pd.DataFrame(table).to_csv(index=False, float_format="%.8g"))
 
 
-def _images(config: Any, scale: float, r0: float | None) -> np.ndarray:
+def _images(config: Config, scale: float, r0: float | None) -> np.ndarray:
     """Noise-free, framed, normalised stars at another pixel scale (and r0)."""
     telescope = config.telescope.model_copy(update={"pixel_scale_arcsec": scale})
     search_px = ceil(config.stars.search_px * config.telescope.pixel_scale_arcsec / scale)
@@ -93,7 +93,7 @@ def _images(config: Any, scale: float, r0: float | None) -> np.ndarray:
 
 
 def _at_published_mse(
-    images: np.ndarray, published_mse: float, level: float, config: Any
+    images: np.ndarray, published_mse: float, level: float, config: Config
 ) -> np.ndarray:
     background = config.noise.background_photons
     kappa = float(kappa_of_mse(published_mse, level, images[0].size, background))
@@ -101,28 +101,22 @@ def _at_published_mse(
     return NoiseModel(kappa, background).draw(images, level, rng)
 
 
-def calibrate(config: Any, scans: Sequence[Path], stars: dict[str, Path], out: Path) -> None:
-    """Fit κ, dynamic range and pixel scales; set the configured values beside them.
-
-    Parameters
-    ----------
-    config : stage config (seed, noise, evaluation)
-    scans : CSV files of the stage `scan`
-    stars : product "stars" of each tabulated dataset
-    out : folder that receives `fit.csv`, `columns.csv`, `scales.csv`, `degeneracy.csv`
-
-    Raises
-    ------
-    ProductError
-        If stars of one scene have different telescopes, fields or stamps.
-    """
+@command("calibrate", reads=("seed", "noise", "evaluation"))
+def calibrate(
+    config: Config,
+    scans: Annotated[tuple[File, ...], {"flag": "--scan"}],
+    stars: Annotated[tuple[tuple[str, File], ...], "Dataset and its product of the stage stars."],
+    out: Annotated[Folder, "Folder for fit.csv, columns.csv and degeneracy.csv."],
+) -> None:
+    """Fit noise, dynamic range and pixel scales to the scans."""
     import pandas as pd
 
-    configured = _configured(stars)
+    products = dict(stars)
+    configured = _configured(products)
     limit_threads(config.evaluation.threads)
     scan_table = pd.concat([read_table(path) for path in scans], ignore_index=True)
     columns = pd.DataFrame(
-        [_column(row, stars[row.dataset], config) for row in original_noise_rows().itertuples()]
+        [_column(row, products[row.dataset], config) for row in original_noise_rows().itertuples()]
     )
     by_r0 = {r0: _fit_at(scan_table, r0) for r0 in sorted(scan_table.r0_m.dropna().unique())}
     fit = by_r0[min(by_r0, key=lambda r0: abs(r0 - configured["r0_m"]))]
@@ -177,7 +171,7 @@ def _configured(stars: dict[str, Path]) -> dict[str, float]:
     return values
 
 
-def _column(row: Any, path: Path, config: Any) -> dict[str, Any]:
+def _column(row: Any, path: Path, config: Config) -> dict[str, Any]:
     """One original-noise column: the paper's values and ours, at κλ and at its own MSE."""
     images = read_product(path, "stars", ("realisation",))["realisation"]
     background = config.noise.background_photons

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-from psfdae.files import ProductError
+from psfdae.cli import File, Folder, command
+from psfdae.files import ProductError, write_text
 from psfdae.reading import read_csv, read_yaml
 from psfdae.runs import flatten
 
@@ -31,34 +32,27 @@ class Run:
     errors: pd.DataFrame
 
 
-def run(folders: Sequence[Path]) -> str:
-    """Compare the first run with each of the others.
+@command("compare")
+def compare(
+    runs: Annotated[tuple[Folder, ...], {"argument": True}],
+    out: Annotated[File | None, "Write the Markdown to this file, too."] = None,
+) -> None:
+    """Compare the first of some RUNS with each of the others.
 
-    Parameters
-    ----------
-    folders : two or more runs, each the folder of a network (with `config.yaml` and
-        `history.csv`), or folders of results, whose networks of equal place are compared
-
-    Returns
-    -------
-    str
-        Markdown.
-
-    Raises
-    ------
-    ComparisonError
-        If fewer than two runs are named, a folder holds no network, or folders of
-        results have no network in common.
-    ProductError
-        If a file of a run is missing or damaged.
+    A run is the folder of a trained network, such as results/dae/dataset3/random-realisation
+    or a point of a sweep; two folders of results compare all networks that both hold. Shown
+    are settings that differ, the trainings, and errors with their significance.
     """
-    if len(folders) < 2:
+    if len(runs) < 2:
         raise ComparisonError("name at least two runs to compare")
     blocks = []
-    for group in _groups(folders):
+    for group in _groups(runs):
         first, *others = (read_run(*found) for found in group)
         blocks += [describe(first, other) for other in others]
-    return "\n\n".join(blocks) + "\n"
+    text = "\n\n".join(blocks) + "\n"
+    if out is not None:
+        write_text(out, text)
+    print(text, end="")
 
 
 def _groups(folders: Sequence[Path]) -> list[list[tuple[Path, Path]]]:

@@ -9,17 +9,21 @@ import platform
 import shutil
 import sys
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 from xml.etree import ElementTree
 
 import numpy as np
 
 from psfdae.benchmark.timing import cpu_model
+from psfdae.cli import File, Folder, command
 from psfdae.files import ProductError, write_text
 from psfdae.source import git_commit
+
+if TYPE_CHECKING:
+    from psfdae.configuration.schema import Config
 
 VERSIONED = ("psfdae", "numpy", "scipy", "torch", "scikit-image", "scikit-learn", "minisom")
 """Packages whose versions can change a number; recorded with the run."""
@@ -28,14 +32,12 @@ ON_REQUEST = "benchmarks_on_request"
 """Folder with the cost of the targets that are not part of `make reproduce`."""
 
 
-def runtime(results: Path, out: Path) -> None:
-    """Cost of the last run of every job, from Snakemake's benchmark files.
-
-    Parameters
-    ----------
-    results : folder that holds `benchmarks/<rule>/<wildcards>.tsv`
-    out : CSV, columns rule, wildcards, wall_s, cpu_s, peak_mb
-    """
+@command("runtime")
+def runtime(
+    results: Annotated[Folder, "Folder of a run."],
+    out: Annotated[File, "CSV with the cost of every job."],
+) -> None:
+    """Collect wall time, CPU time and memory of a run's jobs."""
     write_text(out, _costs(results).to_csv(index=False, float_format="%.6g"))
 
 
@@ -66,41 +68,34 @@ def _cost(path: Path, *names: str) -> list[float]:
         return [float("nan")] * len(names)
 
 
+@command("reference")
 def reference(
-    results: Path, config: Any, files: Sequence[Path], keep: Sequence[Path], out: Path
+    results: Annotated[Folder, "Folder of a finished run."],
+    out: Annotated[Folder, "Folder of the run of record."],
+    files: Annotated[tuple[File, ...], {"argument": True}],
+    keep: Annotated[
+        tuple[File, ...], "File, relative to the results, that may stay from the record before."
+    ] = (),
 ) -> None:
-    """Replace the run of record by the tables and figures of a finished run.
+    """Replace the committed run of record by a finished run.
 
-    What takes long and changes rarely may stay from the record before: provenance
-    names each such file with the commit that it was recorded at.
-
-    Parameters
-    ----------
-    results : folder of the run
-    config : whole config of the run's default dataset
-    files : tables and figures to record, all inside `results`
-    keep : paths relative to `results` of what is renewed rarely; where the run has
-        no such file, that of the present record stays
-    out : folder of the run of record; replaced as a whole
-
-    Raises
-    ------
-    ProductError
-        If a file is missing.
+    Provenance names each file that stays with the commit that it was recorded at.
     """
+    from psfdae.configuration.compose import load
+
     missing = [path for path in files if not path.is_file()]
     if missing:
         raise ProductError(f"{missing[0]}: missing; run `make reproduce` first")
     staging = out.with_name(f".{out.name}.new")
     shutil.rmtree(staging, ignore_errors=True)
-    files = [*files, *(results / path for path in keep if (results / path).is_file())]
-    renewed = {path.relative_to(results): path for path in files}
+    renewable = [*files, *(results / path for path in keep if (results / path).is_file())]
+    renewed = {path.relative_to(results): path for path in renewable}
     kept = {path: out / path for path in keep if path not in renewed and (out / path).is_file()}
     for name, path in (renewed | kept).items():
         target = staging / name
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(path, target)
-    described = provenance(results, config) | {"kept": _kept_since(out, kept)}
+    described = provenance(results, load()) | {"kept": _kept_since(out, kept)}
     text = json.dumps(described, indent=2, sort_keys=True)
     write_text(staging / "provenance.json", text + "\n")
     shutil.rmtree(out, ignore_errors=True)
@@ -115,7 +110,7 @@ def _kept_since(out: Path, kept: Iterable[Path]) -> dict[str, str]:
     return {str(path): earlier.get(str(path), last) for path in kept}
 
 
-def provenance(results: Path, config: Any) -> dict[str, Any]:
+def provenance(results: Path, config: Config) -> dict[str, Any]:
     """Where a run comes from and what it took."""
     costs = _costs(results)
     canonical = json.dumps(config.model_dump(), sort_keys=True)

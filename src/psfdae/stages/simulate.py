@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
+import click
 import numpy as np
 
+from psfdae.cli import File, Folder, command
+from psfdae.configuration.schema import Config
+from psfdae.configuration.stages import STATIC
 from psfdae.evaluation.telescope_figure import FieldOfPsfs, field_of_psfs
 from psfdae.files import Product, atomic_path, read_product, write_text
 from psfdae.prediction.shapes import measure_shapes
 from psfdae.stages import templates
 from psfdae.stages.common import scene_module
 from psfdae.stages.figures import write_png
+
+OWN_DATASET = "_telescope"
+"""The dataset that a telescope of one's own is put into."""
 
 ENOUGH_LIGHT = 0.8
 """Fraction of the light below which a stamp is called too small."""
@@ -28,53 +36,68 @@ class FitError(ValueError):
     """The PSFs of a telescope do not fit into their stamps."""
 
 
-def run(config: Any, out: Path, least_energy: float) -> tuple[FieldOfPsfs, list[str]]:
-    """Propagate the static PSFs, look at them, and write them with a picture and a table.
+@command("simulate")
+def simulate(
+    out: Annotated[Folder | None, "Folder.  [default: name of the telescope]"] = None,
+    fits: Annotated[bool, "Also write the PSFs as FITS cube, psfs.fits."] = False,
+    image_snr: Annotated[
+        float | None,
+        click.FloatRange(min=0, min_open=True, max=1e6),
+        "Also write an image with a noisy star per field, image.fits, and stars.csv.",
+    ] = None,
+    seed: Annotated[int, click.IntRange(min=0), "Of the image's noise."] = 0,
+    least_energy: Annotated[
+        float, click.FloatRange(0, 1), "Refuse stamps that hold less of the light."
+    ] = 0.1,
+    overrides: Annotated[tuple[str, ...], {"argument": True}] = (),
+) -> None:
+    """Draw the PSFs of a telescope over its field: psfdae simulate telescope=NAME.
 
-    Writes `templates.h5` (byte by byte that of the stage `templates`), `psfs.png` and
-    `fields.csv` into a folder. No file is written if the PSFs do not fit.
-
-    Parameters
-    ----------
-    config : stage config of `templates`
-    out : folder
-    least_energy : float
-        A stamp that holds less of the light is refused, 0 … 1.
-
-    Returns
-    -------
-    fields : FieldOfPsfs
-    warnings : list of str
-        What a user should know, a line each.
-
-    Raises
-    ------
-    FitError
-        If a stamp holds too little of the light.
-    SamplingError, FramingError, RayTracingError
-        If the optics cannot be sampled, framed or traced.
+    Writes templates.h5, psfs.png and fields.csv.
     """
-    with atomic_path(out / "templates.h5") as temporary:
+    from psfdae.configuration.compose import load_stage
+    from psfdae.stages import simulate_fits
+
+    if not any(word.startswith(("dataset=", "scene=", "stars=")) for word in overrides):
+        overrides = (f"dataset={OWN_DATASET}", *overrides)
+    config = load_stage(STATIC, overrides)
+    folder = out or Path(config.telescope.name)
+    # No file is written if the PSFs do not fit.
+    with atomic_path(folder / "templates.h5") as temporary:
         templates.templates(config, temporary)
         fields = measure_fields(read_product(temporary, "templates"))
         warnings = [*_light(config, fields, least_energy), *_sampling(config, fields)]
-    draw(out / "templates.h5", out / "psfs.png", out / "fields.csv")
-    return fields, warnings
+    figure_telescope(folder / "templates.h5", folder / "fields.csv", folder / "psfs.png")
+    written = ["templates.h5", "psfs.png", "fields.csv"]
+    if fits:
+        simulate_fits.write_psfs(config, fields, folder / "psfs.fits")
+        written.append("psfs.fits")
+    if image_snr:
+        image, catalogue = folder / "image.fits", folder / "stars.csv"
+        simulate_fits.write_image(config, fields, image_snr, seed, image, catalogue)
+        written += ["image.fits", "stars.csv"]
+    for line in warnings:
+        print(f"psfdae: {line}", file=sys.stderr)
+    telescope = config.telescope
+    print(
+        f"{telescope.name}: {len(fields.psf)} fields, pixels of {telescope.pixel:.3g} λ/D, "
+        f"light inside the stamp {fields.energy.min():.3f} … {fields.energy.max():.3f}, "
+        f"FWHM {fields.fwhm_arcsec.min():.3g} … {fields.fwhm_arcsec.max():.3g} arcsec"
+    )
+    print(f"{folder}: {', '.join(written)}")
 
 
-def draw(templates_h5: Path, picture: Path, table: Path) -> None:
-    """Draw and tabulate the static PSFs of a telescope.
-
-    Parameters
-    ----------
-    templates_h5 : product "templates"
-    picture : path of the PNG
-    table : path of the CSV, a row for every field point
-    """
-    product = read_product(templates_h5, "templates")
+@command("figure telescope")
+def figure_telescope(
+    templates: Annotated[File, "Product of the stage templates."],
+    table: Annotated[File, "CSV, a row per field point."],
+    out: Annotated[File, "PNG."],
+) -> None:
+    """Draw the static PSFs of a telescope with their light and their width."""
+    product = read_product(templates, "templates")
     fields, telescope = measure_fields(product), product.config["telescope"]
     write_text(table, _table(fields, product["pupil_samples"]))
-    write_png(field_of_psfs(fields, telescope["name"], telescope["pixel_scale_arcsec"]), picture)
+    write_png(field_of_psfs(fields, telescope["name"], telescope["pixel_scale_arcsec"]), out)
 
 
 def measure_fields(product: Product) -> FieldOfPsfs:
@@ -94,7 +117,7 @@ def measure_fields(product: Product) -> FieldOfPsfs:
     )
 
 
-def _light(config: Any, fields: FieldOfPsfs, least_energy: float) -> list[str]:
+def _light(config: Config, fields: FieldOfPsfs, least_energy: float) -> list[str]:
     energy, side = fields.energy, config.framing.stamp_px
     if not energy.min() < ENOUGH_LIGHT:
         return []
@@ -116,7 +139,7 @@ def _light(config: Any, fields: FieldOfPsfs, least_energy: float) -> list[str]:
     return [found]
 
 
-def _wide_enough(config: Any, worst: int) -> int | None:
+def _wide_enough(config: Config, worst: int) -> int | None:
     """Least even stamp that holds enough light of the field that needs the widest one."""
     from psfdae.optics.sampling import SamplingError
     from psfdae.stars.framing import FramingError
@@ -140,7 +163,7 @@ def _wide_enough(config: Any, worst: int) -> int | None:
     return None
 
 
-def _sampling(config: Any, fields: FieldOfPsfs) -> list[str]:
+def _sampling(config: Config, fields: FieldOfPsfs) -> list[str]:
     width = np.median(fields.fwhm_arcsec) / config.telescope.pixel_scale_arcsec
     if width >= LEAST_FWHM_PX:
         return []

@@ -4,11 +4,24 @@ from __future__ import annotations
 
 import os
 import shutil
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Annotated
+
+import click
 
 from psfdae import mlflow_view
-from psfdae.files import DIGESTS, UNDIGESTED, ProductError, digest_line, digest_path, sweep_stale
+from psfdae.cli import File, Folder, command
+from psfdae.files import (
+    DIGESTS,
+    UNDIGESTED,
+    ProductError,
+    atomic_path,
+    digest_line,
+    digest_path,
+    sweep_stale,
+)
 from psfdae.models.weights import load_weights
 
 ASIDE = ".damaged"
@@ -18,8 +31,27 @@ SKIPPED = {DIGESTS, *UNDIGESTED, mlflow_view.ARTIFACTS, mlflow_view.ARTIFACTS + 
 """Folders that no rule's output lies in."""
 
 
-def run(results: Path) -> list[tuple[Path, str]]:
-    """Rename every damaged file, so that the workflow builds it again.
+@command("copy")
+def copy(files: Annotated[tuple[File, ...], {"argument": True}]) -> None:
+    """Copy files as products; FILES are pairs of a file and the name of its copy."""
+    if len(files) % 2:
+        raise click.UsageError(f"{files[-1]}: the name of its copy is missing")
+    for path, out in zip(files[::2], files[1::2], strict=True):
+        with path.open("rb") as source, atomic_path(out) as copied:
+            copied.write_bytes(source.read())
+
+
+@command("verify")
+def verify(results: Annotated[Folder, {"argument": True}]) -> None:
+    """Set damaged files of a run aside and list the files that have to be built again."""
+    for path, reason in set_aside(results):
+        print(f"{path}: {reason}; set aside, it will be built again", file=sys.stderr)
+    for path in missing(results):
+        print(path)
+
+
+def set_aside(results: Path) -> list[tuple[Path, str]]:
+    """Rename every damaged file, so that the workflow builds it again; say what was wrong.
 
     Products are compared with the digest that their writer has left; the data products,
     weights and tables per star of earlier versions, which have none, with the checksums
@@ -29,14 +61,6 @@ def run(results: Path) -> list[tuple[Path, str]]:
     Files are written under another name and renamed, hence an interrupted run leaves
     nothing to find here: damage comes from the disk, or from a program that is not ours.
     Temporary files of killed writers are removed.
-
-    Parameters
-    ----------
-    results : folder of a run; a folder that is not there holds no damage
-
-    Returns
-    -------
-    list of (path before renaming, what is wrong)
     """
     found = list(damaged(results))
     for path, _ in found:
