@@ -9,10 +9,9 @@ import pytest
 
 from prediction_stars import fresh_psfs
 from psfdae import load_model
+from psfdae.alignment.telescope import design_states, fit_quadratic, grid_states, zernike_tracer
 from psfdae.configuration.compose import load
 from psfdae.optics.pupil import annular_pupil
-from psfdae.stars.alignment_model import design_states, fit_quadratic
-from psfdae.stars.alignment_scene import grid_states, traced_zernikes, zernike_tracer
 from psfdae.stars.noise import NoiseModel
 from workflow_runs import snakemake
 
@@ -50,21 +49,22 @@ def noise():
 @pytest.fixture(scope="session")
 def tracer():
     """Ray tracer of scene 3."""
-    return zernike_tracer(load((), "alignment"))
+    config = load((), "alignment")
+    return zernike_tracer(config.telescope, config.prescription, config.alignment)
 
 
 @pytest.fixture(scope="session")
 def model(tracer):
     """Quadratic model of scene 3's Zernikes."""
     states = design_states()
-    return fit_quadratic(states, traced_zernikes(tracer, states))
+    return fit_quadratic(states, tracer(states))
 
 
 @pytest.fixture(scope="session")
 def grid(tracer):
     """The 625 states of scene 3 and their ray-traced coefficients."""
     states = grid_states(5)
-    return states, traced_zernikes(tracer, states)
+    return states, tracer(states)
 
 
 @pytest.fixture(scope="session")

@@ -7,6 +7,13 @@ import pytest
 from click.testing import CliRunner
 
 import psfdae.cli.alignment  # noqa: F401  registers the commands
+from psfdae.alignment.telescope import (
+    ModelError,
+    design_states,
+    fit_quadratic,
+    uniform_states,
+    verify,
+)
 from psfdae.cli import main
 from psfdae.configuration.compose import (
     ConfigError,
@@ -20,11 +27,6 @@ from psfdae.configuration.compose import (
 )
 from psfdae.files import read_product
 from psfdae.stages import alignment as stage
-from psfdae.stars.alignment_model import ModelError, design_states, fit_quadratic, verify
-from psfdae.stars.alignment_scene import (
-    traced_zernikes,
-    uniform_states,
-)
 
 
 def test_quadratic_model_reproduces_ray_tracing(model, grid, tracer):
@@ -33,7 +35,7 @@ def test_quadratic_model_reproduces_ray_tracing(model, grid, tracer):
     assert states.shape == (625, 4)
     assert verify(model, states, zernikes, 5e-4).shape == (625, 9)
     uniform = uniform_states(100, np.random.default_rng(1))
-    residual = verify(model, uniform, traced_zernikes(tracer, uniform), 5e-4)
+    residual = verify(model, uniform, tracer(uniform), 5e-4)
     assert np.sqrt((residual**2).mean()) < 2e-4
 
 
@@ -49,7 +51,7 @@ def test_linear_terms_alone_do_not(model, grid):
 def test_too_few_states_do_not_determine_the_model(tracer):
     states = design_states()[:9]
     with pytest.raises(ModelError, match=r"9 states determine 9 of the 15 quadratic terms"):
-        fit_quadratic(states, traced_zernikes(tracer, states))
+        fit_quadratic(states, tracer(states))
 
 
 def test_jacobian_of_the_model_is_that_of_the_rays(model, tracer):
@@ -57,7 +59,7 @@ def test_jacobian_of_the_model_is_that_of_the_rays(model, tracer):
     jacobian = model.jacobian(states)
     assert jacobian.shape == (3, 9, 4, 19)
     for axis, step in enumerate(0.05 * np.eye(4)):
-        plus, minus = (traced_zernikes(tracer, states + s * step) for s in (1, -1))
+        plus, minus = (tracer(states + s * step) for s in (1, -1))
         assert jacobian[:, :, axis] == pytest.approx((plus - minus) / 0.1, abs=1e-3)
 
 

@@ -25,7 +25,9 @@ from psfdae.alignment.fisher import (
     twin_states,
 )
 from psfdae.alignment.fit import Likelihood, fit_states, refit_twins
+from psfdae.alignment.stamps import AlignmentStamps
 from psfdae.alignment.symmetry import mirror_symmetries
+from psfdae.alignment.telescope import uniform_states
 from psfdae.configuration.alignment import Cnn, Fit
 from psfdae.configuration.compose import ConfigError, load
 from psfdae.models.cnn import (
@@ -36,15 +38,6 @@ from psfdae.models.cnn import (
     predict_states,
     train_cnn,
 )
-from psfdae.stars.alignment_model import design_states, fit_quadratic
-from psfdae.stars.alignment_scene import (
-    state_derivatives,
-    state_stamps,
-    traced_zernikes,
-    uniform_states,
-    zernike_tracer,
-)
-from psfdae.stars.alignment_stamps import AlignmentStamps
 
 EXACT = Fit(iterations=25, tolerance=1e-7, damping=1e-3, limit=1.25)
 
@@ -52,12 +45,6 @@ EXACT = Fit(iterations=25, tolerance=1e-7, damping=1e-3, limit=1.25)
 @pytest.fixture(scope="module")
 def config():
     return load((), "alignment")
-
-
-@pytest.fixture(scope="module")
-def model(config):
-    tracer = zernike_tracer(config)
-    return fit_quadratic(design_states(), traced_zernikes(tracer, design_states()))
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +65,7 @@ def states():
 
 @pytest.fixture(scope="module")
 def stamps(model, operator, states):
-    return state_stamps(operator, model(states))[0]
+    return operator(model(states))[0]
 
 
 # --- mirror symmetries
@@ -88,7 +75,7 @@ def test_mirrored_states_have_the_mirrored_stamps(model, operator, states, stamp
     symmetries = mirror_symmetries(8)
     assert len(symmetries) == 8
     for symmetry in symmetries:
-        expected = state_stamps(operator, model(symmetry.states(states[:3])))[0]
+        expected = operator(model(symmetry.states(states[:3])))[0]
         # The fit of the quadratic model to rays is symmetric to 1e-6 waves.
         assert symmetry.stamps(stamps[:3]) == pytest.approx(expected, abs=1e-5)
         assert symmetry.state @ symmetry.state.T == pytest.approx(np.eye(4))
@@ -241,13 +228,13 @@ def test_gaussian_noise_has_poisson_s_variance(noise, stamps):
 
 def test_fisher_matrix_against_finite_differences(model, exact_operator, noise):
     state = np.array([[0.3, -0.5, 0.4, 0.2]])
-    fisher = fisher_information(*state_derivatives(model, exact_operator, state), noise, 0.002)
-    step = 1e-4
-    plus, minus = (
-        state_stamps(exact_operator, model(state + sign * step * np.eye(4)))[0] for sign in (1, -1)
+    fisher = fisher_information(
+        *exact_operator.derivatives(model(state), model.jacobian(state)), noise, 0.002
     )
+    step = 1e-4
+    plus, minus = (exact_operator(model(state + sign * step * np.eye(4)))[0] for sign in (1, -1))
     slopes = ((plus - minus) / (2 * step)).reshape(4, -1)
-    own = state_stamps(exact_operator, model(state))[0].ravel()
+    own = exact_operator(model(state))[0].ravel()
     expected = (slopes / noise.variance(own, 0.002)) @ slopes.T
     assert fisher[0] == pytest.approx(expected, rel=1e-4, abs=1e-4 * expected.max())
 
@@ -274,7 +261,7 @@ def test_decentre_and_tilt_errors_are_correlated_with_the_signs_of_coma(
 
 def test_gauss_newton_recovers_a_noise_free_state(model, exact_operator, noise):
     truth = np.array([[0.3, -0.5, 0.4, 0.2], [0.9, 0.8, -0.7, -0.95]])
-    images = state_stamps(exact_operator, model(truth))[0]
+    images = exact_operator(model(truth))[0]
     likelihood = Likelihood(model, exact_operator, noise, 0.002)
     found = fit_states(likelihood, images, truth + 0.08, EXACT)
     assert found.converged.all()
@@ -285,7 +272,7 @@ def test_gauss_newton_recovers_a_noise_free_state(model, exact_operator, noise):
 def test_score_is_the_slope_of_the_likelihood(model, exact_operator, noise, states):
     truth = states[:1]
     rng = np.random.default_rng(2)
-    stamps = state_stamps(exact_operator, model(truth))[0]
+    stamps = exact_operator(model(truth))[0]
     images = noisy_states(noise, stamps, np.array([0.005]), rng)
     likelihood = Likelihood(model, exact_operator, noise, 0.005)
     score = likelihood.evaluate(images, truth)[1][0]
@@ -314,7 +301,7 @@ def test_scatter_of_the_fit_is_the_bound(model, operator, noise, states, stamps)
 
 def test_fit_stays_near_the_range(model, operator, noise):
     truth = np.array([[1.0, -1.0, 1.0, 1.0]])
-    stamps = state_stamps(operator, model(truth))[0]
+    stamps = operator(model(truth))[0]
     images = noisy_states(noise, stamps, np.array([0.02]), np.random.default_rng(3))
     settings = Fit(iterations=8, tolerance=0.05, damping=1e-3, limit=1.0)
     found = fit_states(Likelihood(model, operator, noise, 0.02), images, truth, settings)
@@ -339,7 +326,7 @@ def test_wrong_twin_is_left_for_the_more_likely_state(model, operator, noise):
     noll = np.arange(4, 23)
     tilt = np.array([[0.1, 0.12]])
     truth = np.hstack([coma_free_decentre(model, tilt, noll), tilt])
-    images = state_stamps(operator, model(truth))[0]
+    images = operator(model(truth))[0]
     likelihood = Likelihood(model, operator, noise, 0.002)
     settings = Fit(iterations=12, tolerance=0.05, damping=1e-3, limit=1.25)
     # A fit that stopped at the twin.

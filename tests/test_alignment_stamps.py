@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import time
+from functools import partial
 
 import numpy as np
 import pytest
 
+from psfdae.alignment.stamps import AlignmentStamps, EnergyError, centred_modes, mean_slope
+from psfdae.alignment.telescope import uniform_states
 from psfdae.configuration.compose import load
 from psfdae.optics.derivatives import ModalStamps, NodeSampling, PeriodSampling
 from psfdae.optics.propagation import StampPropagator, pixel_nodes
@@ -14,18 +17,6 @@ from psfdae.optics.pupil import annular_pupil
 from psfdae.optics.raytracing import annulus_points, misaligned
 from psfdae.optics.sampling import SamplingError, check_opd
 from psfdae.optics.seidel import monomial_coefficients, monomial_images
-from psfdae.stars.alignment_scene import (
-    state_derivatives,
-    state_stamps,
-    traced_zernikes,
-    uniform_states,
-)
-from psfdae.stars.alignment_stamps import (
-    AlignmentStamps,
-    EnergyError,
-    centred_modes,
-    mean_slope,
-)
 
 OBSCURATION = 0.42
 SHOWN = [((0, 0, 0, 0), 0), ((0.6, -0.3, 0.2, 0.8), 2), ((1, 1, 1, 1), 7)]
@@ -50,7 +41,7 @@ def exact(config):
 
 
 def shown_zernikes(tracer):
-    return np.stack([traced_zernikes(tracer, np.array([s], float))[0, f] for s, f in SHOWN])
+    return np.stack([tracer(np.array([s], float))[0, f] for s, f in SHOWN])
 
 
 def test_mean_slope_of_zernikes_over_the_annulus():
@@ -70,10 +61,9 @@ def test_centroid_of_the_whole_image_is_in_the_stamp_s_centre(tracer, config):
     zernikes, worst = shown_zernikes(tracer), []
     for samples in (126, 254):
         pupil = annular_pupil(samples, OBSCURATION)
-        x, y = pupil.axis[None, :], pupil.axis[:, None]
         pixel = 2 / pupil.spacing / samples
         sampling = PeriodSampling(pupil, samples, pixel, "complex128")
-        modes = centred_modes(22, OBSCURATION, x, y)
+        modes = partial(centred_modes, 22, OBSCURATION)
         images = ModalStamps(pupil, modes, sampling, pixel).stamps(zernikes)
         assert images.sum(axis=(1, 2)) == pytest.approx(1, abs=1e-12)
         position = (np.arange(samples) - 0.5 * (samples - 1)) * pixel / config.telescope.pixel
@@ -85,12 +75,11 @@ def test_centroid_of_the_whole_image_is_in_the_stamp_s_centre(tracer, config):
 
 def test_node_sampling_is_the_stamp_propagator():
     pupil = annular_pupil(64, 0.3)
-    modes = monomial_images(pupil.axis[None, :], pupil.axis[:, None])
     seidel = np.array([[0.1, 0.4, 0.4, 0.2, 0.0], [0.2, 0.1, 0.5, -0.3, 0.1]])
     coefficients = monomial_coefficients(seidel, np.array([[0.6, 0.4], [-1.0, 0.2]]))
     offset = np.array([[2, -1], [0, 3]])
     kernel = StampPropagator(pupil, 8, 0.9, nodes=3)
-    modal = ModalStamps(pupil, modes, NodeSampling(pupil, 8, 0.9, 3, "complex128"), 0.9)
+    modal = ModalStamps(pupil, monomial_images, NodeSampling(pupil, 8, 0.9, 3, "complex128"), 0.9)
     expected = kernel(modal.opd(coefficients), offset)
     assert modal.stamps(coefficients, offset) == pytest.approx(expected, abs=1e-14)
     assert modal.derivatives(coefficients, None, offset)[0] == pytest.approx(expected, abs=1e-14)
@@ -114,14 +103,12 @@ def test_period_sampling_integrates_pixels_exactly(tracer, exact, config):
 @pytest.mark.parametrize("kind", ["nodes", "period"])
 def test_derivatives_by_coefficients_are_differences(kind):
     pupil = annular_pupil(48, 0.3)
-    x, y = pupil.axis[None, :], pupil.axis[:, None]
-    modes = centred_modes(11, 0.3, x, y)
     sampling = (
         NodeSampling(pupil, 8, 2.0, 4, "complex128")
         if kind == "nodes"
         else PeriodSampling(pupil, 8, 2.0, "complex128")
     )
-    modal = ModalStamps(pupil, modes, sampling, 2.0)
+    modal = ModalStamps(pupil, partial(centred_modes, 11, 0.3), sampling, 2.0)
     rng = np.random.default_rng(0)
     coefficients = 0.2 * rng.standard_normal((2, 8))
     stamps, slopes = modal.derivatives(coefficients)
@@ -136,24 +123,24 @@ def test_derivatives_by_coefficients_are_differences(kind):
 
 def test_derivatives_by_state_are_differences(model, exact):
     states = uniform_states(2, np.random.default_rng(5))
-    stamps, slopes = state_derivatives(model, exact, states)
-    assert stamps == pytest.approx(state_stamps(exact, model(states))[0], abs=1e-14)
+    stamps, slopes = exact.derivatives(model(states), model.jacobian(states))
+    assert stamps == pytest.approx(exact(model(states))[0], abs=1e-14)
     assert slopes.sum(axis=(3, 4)) == pytest.approx(0, abs=1e-12)
     for axis, step in enumerate(1e-4 * np.eye(4)):
-        plus, minus = (state_stamps(exact, model(states + s * step))[0] for s in (1, -1))
+        plus, minus = (exact(model(states + s * step))[0] for s in (1, -1))
         assert slopes[:, :, axis] == pytest.approx((plus - minus) / 2e-4, abs=2e-6)
 
 
 def test_configured_precision_and_threads(model, operator, config, exact):
     """Single precision costs 1e-5 of the peak; the number of threads costs nothing."""
     states = uniform_states(4, np.random.default_rng(6))
-    stamps, slopes = state_derivatives(model, operator, states)
+    stamps, slopes = operator.derivatives(model(states), model.jacobian(states))
     assert stamps.dtype == slopes.dtype == np.float32
     one = AlignmentStamps(
         config.telescope, config.optics.model_copy(update={"threads": 1}), config.alignment
     )
-    assert (state_stamps(one, model(states))[0] == state_stamps(operator, model(states))[0]).all()
-    truth = state_derivatives(model, exact, states)[1]
+    assert (one(model(states))[0] == operator(model(states))[0]).all()
+    truth = exact.derivatives(model(states), model.jacobian(states))[1]
     assert slopes == pytest.approx(truth, abs=5e-3 * np.abs(truth).max())
 
 
@@ -161,7 +148,7 @@ def test_every_stamp_of_the_range_holds_its_light(operator, tracer, grid):
     """At least 0.99 in the corners of the range, where the images are widest."""
     states, zernikes = grid
     corners = (np.abs(states) == 1).all(axis=1)
-    stamps, energy = state_stamps(operator, zernikes[corners])
+    stamps, energy = operator(zernikes[corners])
     assert energy.min() >= 0.99
     assert stamps.sum(axis=(2, 3)) == pytest.approx(1, abs=1e-5)
 
@@ -172,14 +159,14 @@ def test_stamp_that_loses_light_is_refused(config, model):
     stamps = AlignmentStamps(telescope, config.optics, small)
     message = r"stamp \d+ holds 0\.\d+ of the light \(alignment\.least_energy = 0\.9\)"
     with pytest.raises(EnergyError, match=message):
-        state_stamps(stamps, model(np.ones((1, 4))))
+        stamps(model(np.ones((1, 4))))
 
 
 def test_coarse_pupil_is_refused(config, model):
     optics = config.optics.model_copy(update={"pupil_samples": [64, 90]})
     stamps = AlignmentStamps(config.telescope, optics, config.alignment)
     with pytest.raises(SamplingError, match=r"pupil_samples = \[64, 90\]: wavefront \d+ needs N"):
-        state_stamps(stamps, model(np.ones((1, 4))))
+        stamps(model(np.ones((1, 4))))
 
 
 def test_chosen_grids_satisfy_the_guard_of_the_maps(operator, grid):
@@ -195,8 +182,8 @@ def test_chosen_grids_satisfy_the_guard_of_the_maps(operator, grid):
 def test_settings_stay_within_the_error_budget(operator, exact, tracer, config):
     """1 % of the smallest noise variance; within about 1e-3 of the peak as well."""
     budget = 0.01 * (config.noise.kappa * min(config.noise.levels)) ** 2
-    zernikes = traced_zernikes(tracer, uniform_states(15, np.random.default_rng(7)))
-    stamps, truth = (state_stamps(o, zernikes)[0] for o in (operator, exact))
+    zernikes = tracer(uniform_states(15, np.random.default_rng(7)))
+    stamps, truth = (o(zernikes)[0] for o in (operator, exact))
     assert ((stamps - truth) ** 2).mean(axis=(2, 3)).max() < budget
     assert (np.abs(stamps - truth) / truth.max(axis=(2, 3), keepdims=True)).max() < 2e-3
 
@@ -206,8 +193,8 @@ def test_mirrored_states_have_mirrored_stamps(operator, tracer):
     state = np.array([0.5, -0.8, 0.3, 0.7])
     mirrored_x = state * [-1, 1, 1, -1]
     mirrored_y = state * [1, -1, -1, 1]
-    zernikes = traced_zernikes(tracer, np.stack([state, mirrored_x, mirrored_y]))
-    here, in_x, in_y = state_stamps(operator, zernikes)[0]
+    zernikes = tracer(np.stack([state, mirrored_x, mirrored_y]))
+    here, in_x, in_y = operator(zernikes)[0]
     across_x, across_y = [0, 5, 4, 3, 2, 1, 8, 7, 6], [0, 1, 8, 7, 6, 5, 4, 3, 2]
     assert in_x[across_x] == pytest.approx(here[:, :, ::-1], abs=1e-5)
     assert in_y[across_y] == pytest.approx(here[:, ::-1], abs=1e-5)
@@ -296,7 +283,7 @@ def test_against_poppy_fraunhofer(tracer, operator, config):
 @pytest.mark.slow
 def test_stamps_of_the_grid_take_twenty_seconds(operator, grid):
     start = time.perf_counter()
-    stamps, energy = state_stamps(operator, grid[1])
+    stamps, energy = operator(grid[1])
     assert time.perf_counter() - start < 20
     assert stamps.shape == (625, 9, 16, 16)
     assert energy.min() >= 0.99

@@ -22,9 +22,9 @@ from psfdae.optics.pupil import annular_pupil
 from psfdae.optics.sampling import SamplingError
 from psfdae.optics.seidel import monomial_coefficients, monomial_images
 from psfdae.optics.turbulence import structure_function
+from psfdae.optics.wavefronts import seidel_wavefronts
 from psfdae.stages import propagation as stage
 from psfdae.stars.framing import normalise_flux
-from psfdae.stars.seidel_scene import SeidelWavefronts
 
 COMATIC = np.array([0.3, 0.8, 0.6, 0.4, -0.1])
 SCENES = {
@@ -46,7 +46,10 @@ def scenes():
 @pytest.fixture(scope="module")
 def case():
     """A comatic star well off the chief ray, with its exact stamp."""
-    source, fine = SeidelWavefronts(COMATIC[None], np.array([[0.6, -0.4]])), annular_pupil(512, 0.3)
+    source, fine = (
+        seidel_wavefronts(COMATIC[None], np.array([[0.6, -0.4]])),
+        annular_pupil(512, 0.3),
+    )
     offset = np.array([[3, -5]])
     exact = StampPropagator(fine, 10, 0.88, nodes=6)
     opd = source.opd(np.zeros(1, int), fine, np.dtype(float))
@@ -209,8 +212,8 @@ def test_zernike_fit_is_exact_and_piston_does_not_matter(case):
     assert fitted == pytest.approx(np.tensordot(monomials, monomial_images(x, y), axes=1), abs=1e-9)
     pupil = annular_pupil(96, 0.3)
     kernel = StampPropagator(pupil, 10, 0.88, nodes=3)
-    lean = wavefronts.Images(monomials, monomial_images, 2)
-    full = wavefronts.Images(np.append(monomials, 0.37), wavefronts.with_piston, 2)
+    lean = wavefronts.equal_stars(monomial_images, monomials, 2)
+    full = wavefronts.equal_stars(wavefronts.with_piston, np.append(monomials, 0.37), 2)
     stamps, others = (kernel(opd_of(pupil, np.dtype(float))) for opd_of in (lean, full))
     assert skipping.relative_to_peak(stamps, others) < 1e-12
 

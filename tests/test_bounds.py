@@ -17,10 +17,10 @@ from psfdae.bounds.symmetry import SYMMETRIES, weights
 from psfdae.optics.propagation import StampPropagator
 from psfdae.optics.pupil import annular_pupil
 from psfdae.optics.seidel import monomial_coefficients, monomial_images
-from psfdae.stars.fields import perturb_seidel
-from psfdae.stars.framing import brightest_pixel, normalise_flux, stamp_offset
+from psfdae.optics.wavefronts import seidel_wavefronts
+from psfdae.stars.fields import perturb, relative_field
+from psfdae.stars.framing import brightest_pixel, normalise_flux
 from psfdae.stars.scene import Propagation
-from psfdae.stars.seidel_scene import SeidelWavefronts, relative_field
 
 POINTS, SIDE = 3, 8
 
@@ -113,13 +113,13 @@ def test_fields_stay_equally_likely():
 @pytest.fixture(scope="module")
 def mirrored(scene1):
     """Stars on the axes, the diagonals, the centre and elsewhere, and all their mirror images."""
-    _, position = relative_field(scene1.grid)
+    position = relative_field(scene1.grid)
     field = np.array([60, 5, 115, 57, 0, 108, 32, 85])
     rng = np.random.default_rng(8)
-    seidel = perturb_seidel(scene1.wavefront.coefficients, 0.5, field.size, rng)
+    seidel = perturb(np.tile(scene1.wavefront.coefficients, (field.size, 1)), 0.5, rng)
     targets = np.stack([s.field(field, 11) for s in SYMMETRIES], axis=1)
     everything = Propagation(
-        SeidelWavefronts(np.repeat(seidel, 8, axis=0), position[targets.ravel()]),
+        seidel_wavefronts(np.repeat(seidel, 8, axis=0), position[targets.ravel()]),
         *(scene1.telescope, scene1.optics, scene1.framing, 64),
     )
     return field, targets, everything, everything.brightest()
@@ -128,11 +128,11 @@ def mirrored(scene1):
 def test_mirrored_crops_are_the_stars_of_mirrored_fields(mirrored, scene1):
     field, targets, everything, peaks = mirrored
     own = peaks[::8]  # the identity comes first
-    framed = everything.stamps(20, np.repeat(stamp_offset(own, 0 * own), 8, axis=0))[::8]
+    framed = everything.stamps(20, np.repeat(own, 8, axis=0))[::8]
     bank = Bank(framed, field, own, 11, 1)
     weight = weights(field, own, 11)
     jitter = (1, 0)
-    direct, _ = normalise_flux(everything.stamps(16, stamp_offset(peaks, np.array([jitter]))))
+    direct, _ = normalise_flux(everything.stamps(16, peaks - np.array([jitter])))
     compared = np.zeros(targets.shape, dtype=int)
     for s, symmetry in enumerate(SYMMETRIES):
         cut = symmetry.image(bank.stamps(symmetry.window(jitter, bank.margin)))

@@ -19,13 +19,13 @@ from psfdae.bundle.format import shipped_path
 from psfdae.cli import main
 from psfdae.configuration.compose import load_stage
 from psfdae.observations.examples import write_cube, write_field
+from psfdae.optics.wavefronts import seidel_wavefronts
 from psfdae.prediction import engine, plot, writer
 from psfdae.prediction.model import SCALE_TOLERANCE
 from psfdae.stages import predict as stage
 from psfdae.stages import prediction as measured
-from psfdae.stars.framing import normalise_flux, stamp_offset
+from psfdae.stars.framing import normalise_flux
 from psfdae.stars.scene import Propagation
-from psfdae.stars.seidel_scene import SeidelWavefronts
 from workflow_runs import ROOT, snakemake
 
 SIDE = 320
@@ -331,10 +331,9 @@ def test_poppy_simulates_the_same_stars():
     seidel, field = config.wavefront.coefficients * 1.1, np.array([0.6, -0.4])
     image = module._Telescope(telescope, 66).image(seidel, field)
     stamp = module._framed(image, np.array([1, -1]), framing, 24)
-    source = SeidelWavefronts(seidel[None], field[None])
+    source = seidel_wavefronts(seidel[None], field[None])
     ours = Propagation(source, telescope, config.optics, framing, 24)
-    offset = stamp_offset(ours.brightest(), np.array([[1, -1]]))
-    expected = normalise_flux(ours.stamps(16, offset))[0]
+    expected = normalise_flux(ours.framed(16, np.array([[1, -1]]))[0])[0]
     assert np.mean((normalise_flux(stamp[None])[0] - expected) ** 2) < 1e-8
 
 

@@ -145,16 +145,16 @@ def test_against_the_transfer_function_method(pupil):
 
 def test_scene_settings_stay_within_the_error_budget(scene1):
     """1 % of the smallest noise variance that a stamp of scene 1 will carry."""
-    from psfdae.stars.fields import perturb_seidel
+    from psfdae.optics.wavefronts import seidel_wavefronts
+    from psfdae.stars.fields import perturb, relative_field
     from psfdae.stars.scene import Propagation
-    from psfdae.stars.seidel_scene import SeidelWavefronts, relative_field
 
     budget = 0.01 * (scene1.noise.kappa * 3e-5) ** 2
-    _, field = relative_field(scene1.grid)
+    field = relative_field(scene1.grid)
     rng = np.random.default_rng(7)
     for fraction in (0.1, 0.5):
-        seidel = perturb_seidel(scene1.wavefront.coefficients, fraction, 121, rng)
-        source = SeidelWavefronts(seidel, field)
+        seidel = perturb(np.tile(scene1.wavefront.coefficients, (121, 1)), fraction, rng)
+        source = seidel_wavefronts(seidel, field)
         wavefronts = Propagation(source, scene1.telescope, scene1.optics, scene1.framing, 64)
         peak = wavefronts.brightest()
         stamps = wavefronts.stamps(16, peak)
@@ -169,8 +169,8 @@ def test_scene_settings_stay_within_the_error_budget(scene1):
 
 def test_scene_2_settings_stay_within_the_error_budget():
     from psfdae.configuration.compose import load
+    from psfdae.stages.common import template_wavefronts
     from psfdae.stars.scene import Propagation
-    from psfdae.stars.turbulence_scene import template_wavefronts
 
     config = load(["dataset=dataset7", "grid.points=6"])
     budget = 0.01 * (config.noise.kappa * min(config.noise.levels)) ** 2

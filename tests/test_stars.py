@@ -6,12 +6,15 @@ import numpy as np
 import pytest
 
 from psfdae.configuration.compose import load
+from psfdae.optics.wavefronts import seidel_wavefronts
 from psfdae.rng import stream
+from psfdae.stages.common import template_wavefronts
 from psfdae.stars.fields import (
     assign_fields,
     draw_jitter,
     draw_phase,
-    perturb_seidel,
+    perturb,
+    relative_field,
     square_grid,
 )
 from psfdae.stars.framing import (
@@ -19,11 +22,9 @@ from psfdae.stars.framing import (
     brightest_pixel,
     crop_jittered,
     normalise_flux,
-    stamp_offset,
 )
 from psfdae.stars.noise import mixed_levels
 from psfdae.stars.scene import Propagation
-from psfdae.stars.seidel_scene import SeidelWavefronts, relative_field, template_wavefronts
 from psfdae.stars.splits import held_out_fields, held_out_split, random_split
 
 
@@ -66,7 +67,7 @@ def test_jitter_is_uniform_over_nine_positions():
 
 def test_random_aberrations_have_their_relative_spread():
     static = np.array([0.5, 4.0, 4.196, 1.813, -0.113])
-    drawn = perturb_seidel(static, 0.1, 20000, stream(1, "aberration"))
+    drawn = perturb(np.tile(static, (20000, 1)), 0.1, stream(1, "aberration"))
     assert drawn.mean(axis=0) == pytest.approx(static, rel=4e-3)
     assert drawn.std(axis=0) == pytest.approx(0.1 * np.abs(static), rel=0.02)
     correlation = np.corrcoef(drawn.T) - np.eye(5)
@@ -80,9 +81,8 @@ def test_ties_go_to_the_first_pixel_in_row_order():
 
 
 def test_brightest_pixel_lands_at_half_the_stamp_plus_jitter(templates):
-    propagation, peak = templates
-    jitter = np.tile([[1, -1]], (len(peak), 1))
-    stamps = propagation.stamps(16, stamp_offset(peak, jitter))
+    propagation, _ = templates
+    stamps, _ = propagation.framed(16, np.array([[1, -1]]))
     brightest = [brightest_pixel(s, 1e-4) for s in stamps]
     ties = sum(position != (9, 7) for position in brightest)
     assert ties == 0
@@ -102,9 +102,9 @@ def test_templates_lie_where_the_design_says(templates):
 
 
 def test_search_agrees_with_a_full_search(scene1):
-    _, field = relative_field(scene1.grid)
-    seidel = perturb_seidel(scene1.wavefront.coefficients, 0.5, 121, stream(5, "x"))
-    source = SeidelWavefronts(seidel, field)
+    field = relative_field(scene1.grid)
+    seidel = perturb(np.tile(scene1.wavefront.coefficients, (121, 1)), 0.5, stream(5, "x"))
+    source = seidel_wavefronts(seidel, field)
     wavefronts = Propagation(source, scene1.telescope, scene1.optics, scene1.framing, 40)
     fine = scene1.optics.model_copy(update={"precision": "complex128"})
     exact = Propagation(source, scene1.telescope, fine, scene1.framing, 40)

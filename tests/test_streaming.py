@@ -9,9 +9,10 @@ import pytest
 from psfdae.benchmark.isolated import MeasurementError, run_isolated
 from psfdae.configuration.compose import load_stage, stage_tree
 from psfdae.files import Column, Empty, ProductError, read_product, stream_product, write_product
-from psfdae.optics.seidel import gradient_ranges, monomial_gradients
+from psfdae.optics.seidel import monomial_images
+from psfdae.optics.wavefronts import ModalWavefronts
 from psfdae.stages import stars, templates, timing_jobs
-from psfdae.stars import turbulence_scene
+from psfdae.stages.common import template_wavefronts
 from psfdae.stars.framing import brightest_pixel
 from psfdae.stars.scene import Propagation
 
@@ -84,23 +85,15 @@ def test_stars_do_not_depend_on_how_many_are_made_at_a_time(cheap, tmp_path, mon
 
 def test_slopes_do_not_depend_on_the_batch():
     coefficients = np.random.default_rng(2).normal(size=(600, 8))
-    ranges = gradient_ranges(coefficients, points=9)
-    axis = np.linspace(-1, 1, 9)
-    x, y = np.meshgrid(axis, axis)
-    inside = x**2 + y**2 <= 1
-    for axis_index, gradient in enumerate(monomial_gradients(x[inside], y[inside])):
-        slopes = coefficients @ gradient
-        # The rim is sampled beyond this grid, so the extremes are at least these.
-        assert (ranges[:, axis_index, 0] <= slopes.min(axis=1) + 1e-12).all()
-        assert (ranges[:, axis_index, 1] >= slopes.max(axis=1) - 1e-12).all()
-    one_by_one = np.concatenate([gradient_ranges(c[None], points=9) for c in coefficients])
-    assert ranges == pytest.approx(one_by_one, rel=1e-12)
+    whole = ModalWavefronts(monomial_images, coefficients).slopes()
+    parts = [ModalWavefronts(monomial_images, c).slopes() for c in np.split(coefficients, 30)]
+    assert whole == pytest.approx(np.concatenate(parts), rel=1e-12)
 
 
 def test_search_is_exact_for_large_pixels():
     """Scene 2's pixel is 1.6 λ/D wide: fewer nodes in the search shift its brightest pixels."""
     config = load_stage("templates", ["scene=turbulence", "optics.threads=1"])
-    source = turbulence_scene.template_wavefronts(config)
+    source = template_wavefronts(config)
     # Measuring 400 slopes takes longer than the test; the largest grid serves all.
     source.slopes = lambda: np.zeros((len(source), 2, 2))  # type: ignore[method-assign]
     optics = config.optics.model_copy(update={"pupil_samples": [222]})

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from psfdae.alignment.stamps import AlignmentStamps, mean_slope
+from psfdae.alignment.telescope import zernike_tracer
 from psfdae.cli import main
 from psfdae.configuration.compose import (
     ConfigError,
@@ -17,18 +19,16 @@ from psfdae.configuration.compose import (
 )
 from psfdae.files import read_product
 from psfdae.observations import open_observation
-from psfdae.optics.field_zernikes import field_coefficients, slope_ranges, zernike_images
 from psfdae.optics.pupil import annular_pupil
 from psfdae.optics.raytracing import RayTracingError
-from psfdae.optics.seidel import gradient_ranges
+from psfdae.optics.wavefronts import seidel_wavefronts, zernike_wavefronts
+from psfdae.optics.zernike import field_coefficients, zernike_images
 from psfdae.stages import stars, templates
-from psfdae.stars.alignment_scene import zernike_tracer
-from psfdae.stars.alignment_stamps import AlignmentStamps, mean_slope
+from psfdae.stages.common import star_wavefronts, template_wavefronts
+from psfdae.stars.fields import relative_field
 from psfdae.stars.framing import normalise_flux
 from psfdae.stars.scene import Propagation
-from psfdae.stars.seidel_scene import SeidelWavefronts, relative_field
-from psfdae.stars.telescope_scene import star_wavefronts, static_terms, template_wavefronts
-from psfdae.stars.zernike_wavefronts import ZernikeWavefronts
+from psfdae.stars.telescope_scene import static_terms
 
 OWN = "dataset=_telescope"
 Z4, Z5, Z8, Z11 = 2 * np.sqrt(3), np.sqrt(6), 3 * np.sqrt(8), 6 * np.sqrt(5)
@@ -57,13 +57,13 @@ def zernikes_of_scene_1(seidel):
 @pytest.fixture(scope="module")
 def both(scene1):
     """Scene 1's templates as Seidel's monomials and as Zernikes over the field."""
-    _, field = relative_field(scene1.grid)
+    field = relative_field(scene1.grid)
     seidel = scene1.wavefront.coefficients
     terms = zernikes_of_scene_1(seidel)
     coefficients = field_coefficients(list(terms.values()), field)
     return (
-        SeidelWavefronts(np.tile(seidel, (len(field), 1)), field),
-        ZernikeWavefronts(tuple(terms), coefficients),
+        seidel_wavefronts(np.tile(seidel, (len(field), 1)), field),
+        zernike_wavefronts(tuple(terms), coefficients),
     )
 
 
@@ -97,15 +97,17 @@ def test_seidel_s_stamps_from_zernikes(scene1, both):
 
 def test_slopes_are_those_of_the_same_polynomials(both):
     seidel, zernikes = both
-    assert zernikes.slopes() == pytest.approx(gradient_ranges(seidel.coefficients), abs=1e-5)
-    flat = slope_ranges((4,), np.array([[1.0]]))
-    assert flat[0] == pytest.approx(np.full((2, 2), [-4 * np.sqrt(3), 4 * np.sqrt(3)]), abs=1e-6)
+    assert zernikes.slopes() == pytest.approx(seidel.slopes(), abs=1e-5)
+    focus = zernike_wavefronts((4,), np.array([[1.0]]))
+    assert focus.slopes()[0] == pytest.approx(
+        np.full((2, 2), [-4 * np.sqrt(3), 4 * np.sqrt(3)]), abs=1e-6
+    )
 
 
 @pytest.mark.parametrize(("noll", "axis"), [(2, 1), (3, 0)])
 def test_tilt_moves_the_image_along_its_axis(scene1, noll, axis):
     """Z2 = 2x waves is a slope of 2 waves per radius: + 4 λ/D along x, the columns."""
-    source = ZernikeWavefronts((noll,), np.array([[3.0]]))
+    source = zernike_wavefronts((noll,), np.array([[3.0]]))
     propagation = Propagation(source, scene1.telescope, scene1.optics, scene1.framing, 24)
     moved = np.zeros(2)
     moved[axis] = 3.0 * 4.0 / scene1.telescope.pixel
@@ -133,9 +135,9 @@ def traced():
 
 def test_ray_trace_is_that_of_scene_3(traced):
     alignment = load((), "alignment")
-    tracer = zernike_tracer(alignment)
-    noll, ours = static_terms(traced)
-    theirs = -tracer(np.zeros((1, 4)))[0, :, 3:]
+    tracer = zernike_tracer(alignment.telescope, alignment.prescription, alignment.alignment)
+    noll, ours = static_terms(traced.grid, traced.telescope)
+    theirs = -tracer(np.zeros((1, 4)))[0]
     assert noll == tuple(range(4, 23))
     assert traced.telescope.aberrations.defocus_m == alignment.alignment.defocus_m
     # Scene 3's circle starts on the x axis; its odd points are the corners of the grid.
@@ -153,9 +155,9 @@ def test_ray_traced_stamps_are_those_of_scene_3(traced):
     operator = AlignmentStamps(traced.telescope, alignment.optics, alignment.alignment)
     expected, _ = operator(-leaning)
     # Scene 3 centres a stamp on the centroid, 2 λ/D per wave of mean slope away.
-    slopes = np.array([mean_slope(j, traced.telescope.obscuration) for j in source.noll])
+    slopes = np.array([mean_slope(j, traced.telescope.obscuration) for j in range(4, 23)])
     centroid = 2.0 * (leaning @ slopes)[:, ::-1] / traced.telescope.pixel
-    own = ZernikeWavefronts(source.noll, leaning)
+    own = zernike_wavefronts(range(4, 23), leaning)
     propagation = Propagation(own, traced.telescope, traced.optics, traced.framing, 24)
     stamps, _ = normalise_flux(propagation.stamps(16, centroid))
     assert np.abs(stamps - expected).max() < 2e-3 * expected.max()
@@ -165,7 +167,9 @@ def test_ray_traced_stamps_are_those_of_scene_3(traced):
 
 def test_field_beyond_the_corrector_is_refused(traced):
     with pytest.raises(RayTracingError, match="vignetted"):
-        static_terms(load([OWN, "telescope=example_raytraced", "telescope.field_edge_deg=3"]))
+        template_wavefronts(
+            load([OWN, "telescope=example_raytraced", "telescope.field_edge_deg=3"])
+        )
 
 
 def test_seidel_telescope_is_scene_1_byte_by_byte(tmp_path):
@@ -188,13 +192,13 @@ def test_random_aberrations_have_both_spreads():
     config = load([OWN, "stars.aberration_fraction=0.2", "grid.points=3"])
     field = np.full(20000, 8)
     drawn = star_wavefronts(config, field)
-    _, static = static_terms(config)
+    _, static = static_terms(config.grid, config.telescope)
     assert drawn.coefficients.mean(axis=0) == pytest.approx(static[8], abs=0.005)
     jitter = config.telescope.aberrations.jitter_waves
     assert drawn.coefficients.std(axis=0) == pytest.approx(
         np.hypot(0.2 * static[8], jitter), rel=0.03
     )
-    assert drawn.columns()["zernike"].values.shape == drawn.coefficients.shape
+    assert (drawn.drawn["zernike"][0] == drawn.coefficients).all()
     again = star_wavefronts(config, field)
     assert (again.coefficients == drawn.coefficients).all()
 

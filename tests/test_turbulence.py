@@ -28,8 +28,8 @@ R0, L0, HEIGHTS, STRENGTHS = 0.2, 25.0, (0.0, 4000.0, 10000.0), (0.6, 0.25, 0.15
 FLOAT64 = np.dtype(np.float64)
 
 
-def scene_config(points=20, diameter=1.0, obscuration=0.0, **changes):
-    """Configuration of scene 2; `changes` go to the group `wavefront`."""
+def scene(points=20, **changes):
+    """Wavefronts of scene 2; `changes` go to the group `wavefront`."""
     wavefront = {
         "kind": "von_karman",
         "seed": 7,
@@ -40,12 +40,10 @@ def scene_config(points=20, diameter=1.0, obscuration=0.0, **changes):
         "waves": 512,
         "remove_tilt": True,
     }
-    return SimpleNamespace(
-        grid=SimpleNamespace(points=points, spacing_deg=14 / 60 / 19),
-        telescope=SimpleNamespace(
-            diameter_m=diameter, obscuration=obscuration, wavelength_m=550e-9, pixel=0.88
-        ),
-        wavefront=SimpleNamespace(**(wavefront | changes)),
+    return template_wavefronts(
+        SimpleNamespace(points=points, spacing_deg=14 / 60 / 19),
+        SimpleNamespace(diameter_m=1.0, obscuration=0.0),
+        SimpleNamespace(**(wavefront | changes)),
     )
 
 
@@ -234,8 +232,8 @@ def test_one_height_per_layer():
 
 
 def test_tilt_is_removed_on_every_grid(pupil):
-    source = template_wavefronts(scene_config(points=4))
-    kept = template_wavefronts(scene_config(points=4, remove_tilt=False))
+    source = scene(points=4)
+    kept = scene(points=4, remove_tilt=False)
     for size in (pupil, annular_pupil(201, 0.0)):
         x, y, lit = disc(size.axis)
         plane = np.linalg.pinv(np.stack([np.ones_like(x), x, y], axis=1))
@@ -250,24 +248,19 @@ def test_tilt_is_removed_on_every_grid(pupil):
 
 def test_same_seed_same_bytes_and_another_seed_differs(pupil):
     index = np.arange(3)
-    first, again, other = (
-        template_wavefronts(scene_config(seed=seed)).opd(index, pupil, FLOAT64)
-        for seed in (7, 7, 8)
-    )
+    first, again, other = (scene(seed=seed).opd(index, pupil, FLOAT64) for seed in (7, 7, 8))
     assert first.tobytes() == again.tobytes()
     assert np.abs(first - other).max() > 0.1
 
 
 def test_opd_scales_with_r0_and_nothing_else_changes(pupil):
     index = np.arange(3)
-    coarse, fine = (
-        template_wavefronts(scene_config(r0_m=r0)).opd(index, pupil, FLOAT64) for r0 in (R0, R0 / 2)
-    )
+    coarse, fine = (scene(r0_m=r0).opd(index, pupil, FLOAT64) for r0 in (R0, R0 / 2))
     assert fine == pytest.approx(2 ** (5 / 6) * coarse, abs=1e-10)
 
 
 def test_any_order_of_directions_and_single_precision(pupil):
-    source = template_wavefronts(scene_config())
+    source = scene()
     index = np.array([399, 7, 7, 0, 210])
     opd = source.opd(index, pupil, np.dtype(np.float32))
     assert opd.shape == (5, 130, 130)
@@ -279,7 +272,7 @@ def test_any_order_of_directions_and_single_precision(pupil):
 
 def test_residual_variance_over_the_scene(pupil):
     """Noll's 0.134 (D/r0)^(5/3) rad² without tilts, 0.985 of it with L0 = 25 m."""
-    source = template_wavefronts(scene_config())
+    source = scene()
     _, _, lit = disc(pupil.axis)
     opd = source.opd(np.arange(0, 400, 7), pupil, np.dtype(np.float32))[:, lit]
     expected = 0.985 * 0.134 * 5 ** (5 / 3) / (2 * np.pi) ** 2
@@ -290,7 +283,7 @@ def test_residual_variance_over_the_scene(pupil):
 
 @pytest.mark.parametrize("samples", [128, 320])
 def test_slopes_bound_the_finite_differences(samples):
-    source = template_wavefronts(scene_config(points=5))
+    source = scene(points=5)
     slopes = source.slopes()
     grid = annular_pupil(samples, 0.0, sharpen=False)
     _, _, lit = disc(grid.axis)
@@ -304,6 +297,6 @@ def test_slopes_bound_the_finite_differences(samples):
 
 
 def test_a_grid_that_would_alias_the_turbulence_is_refused():
-    source = template_wavefronts(scene_config(points=2))
+    source = scene(points=2)
     with pytest.raises(SamplingError, match="N = 120"):
         source.opd(np.arange(1), annular_pupil(96, 0.0), FLOAT64)

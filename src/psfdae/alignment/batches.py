@@ -9,7 +9,7 @@ import numpy as np
 
 from psfdae.alignment.symmetry import Symmetry
 from psfdae.rng import stream
-from psfdae.stars.noise import NoiseModel, mixed_levels
+from psfdae.stars.noise import NoiseModel
 
 Batch = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Stamps (B, F, d, d), their states (B, 4) and the weights of their errors (B,)."""
@@ -126,8 +126,3 @@ def steps_per_epoch(states: int, batch: int) -> int:
 def noise_weights(level: np.ndarray, levels: list[float]) -> np.ndarray:
     """Weights ∝ 1/λ² with mean 1 over the levels of a band, shape (n,)."""
     return np.asarray(level) ** -2.0 / np.mean(np.asarray(levels) ** -2.0)
-
-
-def mixed(levels: list[float], count: int, rng: np.random.Generator) -> np.ndarray:
-    """A random noise level of a band for each of `count` states, shape (count,)."""
-    return mixed_levels(np.asarray(levels), count, rng)

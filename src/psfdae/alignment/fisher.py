@@ -11,9 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from psfdae.stars.alignment_model import QuadraticModel
-from psfdae.stars.alignment_scene import state_derivatives
-from psfdae.stars.alignment_stamps import AlignmentStamps
+from psfdae.alignment.stamps import AlignmentStamps
+from psfdae.alignment.telescope import QuadraticModel
 from psfdae.stars.noise import NoiseModel
 
 CHUNK = 64
@@ -76,7 +75,7 @@ def bound_covariances(
     out = np.empty((len(levels), len(states), 4, 4))
     for start in range(0, len(states), CHUNK):
         part = slice(start, start + CHUNK)
-        images, slopes = state_derivatives(model, operator, states[part])
+        images, slopes = operator.derivatives(model(states[part]), model.jacobian(states[part]))
         for index, level in enumerate(levels):
             out[index, part] = np.linalg.inv(fisher_information(images, slopes, noise, level))
     return out

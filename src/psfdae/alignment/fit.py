@@ -12,10 +12,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from psfdae.alignment.fisher import by_parameter, twin_states
+from psfdae.alignment.stamps import AlignmentStamps
+from psfdae.alignment.telescope import QuadraticModel
 from psfdae.configuration.alignment import Fit
-from psfdae.stars.alignment_model import QuadraticModel
-from psfdae.stars.alignment_scene import state_derivatives
-from psfdae.stars.alignment_stamps import AlignmentStamps
 from psfdae.stars.noise import NoiseModel
 
 ROUNDING = 1e-6
@@ -75,7 +74,9 @@ class Likelihood:
             Noisy, normalised by the true flux.
         states : ndarray, shape (n, 4)
         """
-        stamps, derivatives = state_derivatives(self.model, self.operator, states)
+        stamps, derivatives = self.operator.derivatives(
+            self.model(states), self.model.jacobian(states)
+        )
         slopes = by_parameter(derivatives)
         expected = stamps.reshape(len(states), -1).astype(np.float64)
         observed = images.reshape(len(states), -1).astype(np.float64)

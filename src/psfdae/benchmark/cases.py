@@ -9,11 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from psfdae.configuration.schema import Framing, Optics, Telescope
+from psfdae.configuration.schema import Framing, Optics
+from psfdae.configuration.telescope import Telescope
 from psfdae.optics.propagation import StampPropagator
 from psfdae.optics.pupil import Pupil, annular_pupil
+from psfdae.optics.wavefronts import WavefrontSource
 from psfdae.stars.framing import normalise_flux
-from psfdae.stars.scene import Propagation, WavefrontSource
+from psfdae.stars.scene import Propagation
 
 BUDGET = 0.01
 """Numerical MSE that a stamp may have, in units of the smallest noise variance it carries."""

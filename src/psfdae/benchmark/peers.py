@@ -18,8 +18,8 @@ import numpy as np
 from psfdae.benchmark.cases import Case, pupil_of
 from psfdae.benchmark.propagation import Setting, Trial, kernel_trials, time_trials, yes
 from psfdae.benchmark.timing import use_threads
-from psfdae.optics.propagation import ARCSEC
 from psfdae.optics.pupil import Pupil
+from psfdae.optics.sampling import ARCSEC
 from psfdae.stars.framing import normalise_flux
 
 if TYPE_CHECKING:

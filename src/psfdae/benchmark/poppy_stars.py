@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from psfdae.rng import stream
-from psfdae.stars.fields import assign_fields, draw_jitter, perturb_seidel, square_grid
+from psfdae.stars.fields import assign_fields, draw_jitter, perturb, relative_field
 from psfdae.stars.framing import brightest_pixel, crop_jittered, normalise_flux
 
 SAMPLES = 256
@@ -48,13 +48,11 @@ def poppy_stars(config: Any, count: int) -> np.ndarray:
     if config.scene.name != "seidel":
         raise PoppyError(f"scene {config.scene.name!r}: only 'seidel' is simulated with POPPY")
     framing = config.framing
-    _, angle_deg = square_grid(config.grid.points, config.grid.spacing_deg)
-    star_field = assign_fields(count, len(angle_deg), stream(config.seed, "poppy", "field"))
-    field = angle_deg[star_field] / config.grid.edge_deg
-    seidel = perturb_seidel(
-        config.wavefront.coefficients,
+    field = relative_field(config.grid)
+    field = field[assign_fields(count, len(field), stream(config.seed, "poppy", "field"))]
+    seidel = perturb(
+        np.tile(config.wavefront.coefficients, (count, 1)),
         config.stars.aberration_fraction,
-        count,
         stream(config.seed, "poppy", "aberration"),
     )
     jitter = draw_jitter(count, framing.jitter_px, stream(config.seed, "poppy", "jitter"))

@@ -19,7 +19,7 @@ from psfdae.configuration.schema import Benchmark
 from psfdae.optics.propagation import StampPropagator
 from psfdae.optics.pupil import Pupil
 from psfdae.optics.sampling import choose_samples
-from psfdae.stars.framing import crop_jittered, normalise_flux, stamp_offset
+from psfdae.stars.framing import crop_jittered, normalise_flux
 
 COLUMNS = (*("item", "scene", "per", "with_s", "without_s", "saving", "change", "unit", "skipped"),)
 """Columns of the table of savings.
@@ -187,7 +187,7 @@ def _one_per_field(scene: Scene, benchmark: Benchmark) -> tuple[float, float]:
     peak = propagation.brightest()
     jitter = np.resize([[-margin, margin], [margin, 0]], (some.size, 2))
     framed = propagation.stamps(side + 2 * margin, peak).astype(np.float32)
-    direct = propagation.stamps(side, stamp_offset(peak, jitter))
+    direct = propagation.stamps(side, peak - jitter)
     cut = crop_jittered(framed.astype(np.float64), jitter, margin)
 
     def stamps() -> np.ndarray:

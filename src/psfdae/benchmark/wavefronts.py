@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,8 +17,8 @@ from psfdae.configuration.schema import Benchmark, VonKarman
 from psfdae.optics.pupil import Pupil
 from psfdae.optics.seidel import MONOMIALS, monomial_images
 from psfdae.optics.turbulence import Footprints, structure_function
+from psfdae.optics.wavefronts import ModalWavefronts, Modes, WavefrontSource
 from psfdae.optics.zernike import zernike_basis
-from psfdae.stars.scene import WavefrontSource
 
 if TYPE_CHECKING:
     from psfdae.stars.turbulence_scene import TurbulentWavefronts
@@ -30,28 +32,12 @@ PISTON_WAVES = 0.37
 STRUCTURE = "largest relative difference of the structure function"
 
 
-class Images:
-    """OPDs of equal stars as a product of coefficients with images of the terms.
-
-    Parameters
-    ----------
-    coefficients : ndarray, shape (K,)
-    images : callable (x, y) -> ndarray, shape (K, M, M)
-    count : int
-        Stars at a time.
-    """
-
-    def __init__(self, coefficients: np.ndarray, images: Any, count: int) -> None:
-        self.coefficients = np.tile(coefficients, (count, 1))
-        self._images = images
-        self._basis: np.ndarray | None = None
-
-    def __call__(self, pupil: Pupil, dtype: np.dtype) -> np.ndarray:
-        if self._basis is None:
-            images = self._images(pupil.axis[None, :], pupil.axis[:, None])
-            self._basis = images.reshape(len(images), -1).astype(dtype)
-        size = pupil.axis.size
-        return (self.coefficients.astype(dtype) @ self._basis).reshape(-1, size, size)
+def equal_stars(
+    modes: Modes, coefficients: np.ndarray, count: int
+) -> Callable[[Pupil, np.dtype], np.ndarray]:
+    """OPDs of `count` equal stars, as a function of pupil and precision."""
+    source = ModalWavefronts(modes, np.tile(coefficients, (count, 1)))
+    return partial(source.opd, np.arange(count))
 
 
 def with_piston(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -105,10 +91,10 @@ def superfluous_seidel_terms(
     """
     use_threads(scene.optics.backend, benchmark.threads)
     batch = batch_of(scene.optics, benchmark)
-    lean = Images(monomials, monomial_images, batch)
+    lean = equal_stars(monomial_images, monomials, batch)
     variants = (
-        ("Piston", Images(np.append(monomials, PISTON_WAVES), with_piston, batch)),
-        (f"{ZERNIKES} Zernikes", Images(zernike_fit(monomials), zernikes, batch)),
+        ("Piston", equal_stars(with_piston, np.append(monomials, PISTON_WAVES), batch)),
+        (f"{ZERNIKES} Zernikes", equal_stars(zernikes, zernike_fit(monomials), batch)),
     )
     without_s, stamps = stamp_timer(scene, case, lean, benchmark)
     rows = []
@@ -138,8 +124,8 @@ def dropped_distortion(
     use_threads(scene.optics.backend, benchmark.threads)
     batch = batch_of(scene.optics, benchmark)
     kept = monomials[: MONOMIALS.index("x")]
-    with_s, _ = stamp_timer(scene, case, Images(monomials, monomial_images, batch), benchmark)
-    without_s, _ = stamp_timer(scene, case, Images(kept, without_tilt, batch), benchmark)
+    with_s, _ = stamp_timer(scene, case, equal_stars(monomial_images, monomials, batch), benchmark)
+    without_s, _ = stamp_timer(scene, case, equal_stars(without_tilt, kept, batch), benchmark)
     change = _framed_change(scene, undistorted, scene.templates, benchmark.stamps)
     return saving(
         "Distortion (tilt)", scene.name, "star", with_s, without_s, change, OF_PEAK, skipped=False

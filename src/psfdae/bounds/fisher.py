@@ -9,22 +9,19 @@ Estimation Theory, chapter 11). It is a local approximation, not a strict bound.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
-from psfdae.configuration.schema import Optics, Telescope
+from psfdae.configuration.schema import Optics
+from psfdae.configuration.telescope import Telescope
 from psfdae.optics.derivatives import ModalStamps, NodeSampling, normalise_with_derivatives
-from psfdae.optics.pupil import Pupil, annular_pupil
+from psfdae.optics.propagation import in_batches
+from psfdae.optics.pupil import annular_pupil
 from psfdae.optics.seidel import SEIDEL_TERMS, monomial_coefficients, monomial_images
 
 BATCH = 16
 """Stars at a time, to bound the memory."""
-
-
-def seidel_stamps(pupil: Pupil, stamp_px: int, pixel: float, nodes: int) -> ModalStamps:
-    """Operator from monomial coefficients to stamps and their derivatives, complex128."""
-    modes = monomial_images(pupil.axis[None, :], pupil.axis[:, None])
-    sampling = NodeSampling(pupil, stamp_px, pixel, nodes, "complex128")
-    return ModalStamps(pupil, modes, sampling, pixel)
 
 
 def sensitivities(
@@ -63,14 +60,19 @@ def sensitivities(
     coefficients = monomial_coefficients(seidel, field)
     stamps = np.empty((len(seidel), stamp_px, stamp_px))
     derivatives = np.empty((len(seidel), len(SEIDEL_TERMS), stamp_px, stamp_px))
-    for count in np.unique(samples):
-        pupil = annular_pupil(int(count), telescope.obscuration)
-        kernel = seidel_stamps(pupil, stamp_px, telescope.pixel, optics.nodes)
-        members = np.flatnonzero(samples == count)
-        for star in np.array_split(members, range(BATCH, members.size, BATCH)):
-            stamps[star], derivatives[star], _ = normalise_with_derivatives(
-                *kernel.derivatives(coefficients[star], terms[star], offset_px[star])
-            )
+
+    def prepare(count: int) -> Callable[[np.ndarray], None]:
+        pupil, pixel = annular_pupil(count, telescope.obscuration), telescope.pixel
+        sampling = NodeSampling(pupil, stamp_px, pixel, optics.nodes, "complex128")
+        operator = ModalStamps(pupil, monomial_images, sampling, pixel)
+
+        def differentiate(star: np.ndarray) -> None:
+            raw = operator.derivatives(coefficients[star], terms[star], offset_px[star])
+            stamps[star], derivatives[star], _ = normalise_with_derivatives(*raw)
+
+        return differentiate
+
+    in_batches(samples, BATCH, 1, prepare)
     return stamps, derivatives
 
 

@@ -20,9 +20,9 @@ from psfdae.configuration.schema import (
     Group,
     Noise,
     Positive,
-    Telescope,
     Train,
 )
+from psfdae.configuration.telescope import Telescope
 
 
 class AlignmentOptics(Group):

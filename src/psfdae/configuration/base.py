@@ -4,10 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
-import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
-
-ARCSEC = np.pi / 180.0 / 3600.0
 
 SEARCH = 48.0
 """λ/D around the chief ray within which brightest pixels are searched by default.

@@ -20,7 +20,7 @@ from psfdae.configuration.base import (
     SearchDistance,
 )
 from psfdae.configuration.consistency import Consistent
-from psfdae.configuration.telescope import AnyTelescope, Telescope  # noqa: F401
+from psfdae.configuration.telescope import AnyTelescope
 from psfdae.configuration.wavefront import OfTelescope, Seidel, VonKarman
 
 Reference = Literal["realisation", "template"]

@@ -7,8 +7,9 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, Field
 
-from psfdae.configuration.base import ARCSEC, Fraction, Group, Name, Positive
+from psfdae.configuration.base import Fraction, Group, Name, Positive
 from psfdae.configuration.wavefront import Raytraced, Seidel, Zernike
+from psfdae.optics.sampling import pixel_width
 
 ABERRATIONS: dict[str, type[Group]] = {
     "seidel": Seidel,
@@ -32,7 +33,7 @@ class Telescope(Group):
     @property
     def pixel(self) -> float:
         """Pixel width in units of λ/D."""
-        return self.pixel_scale_arcsec * ARCSEC * self.diameter_m / self.wavelength_m
+        return pixel_width(self.pixel_scale_arcsec, self.diameter_m, self.wavelength_m)
 
 
 def _aberrations(tree: Any) -> Any:

@@ -10,6 +10,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from psfdae.configuration.base import Finite, Group, Positive
 from psfdae.configuration.prescription import Prescription
+from psfdae.optics.seidel import SEIDEL_TERMS
 
 HIGHEST_NOLL = 45
 HIGHEST_POWER = 6
@@ -27,16 +28,8 @@ class Seidel(Group):
 
     @property
     def coefficients(self) -> np.ndarray:
-        """W040, W131, W222, W220, W311 in waves, shape (5,)."""
-        return np.array(
-            [
-                self.spherical,
-                self.coma,
-                self.astigmatism,
-                self.field_curvature,
-                self.distortion,
-            ]
-        )
+        """In waves, in the order of `SEIDEL_TERMS`, shape (5,)."""
+        return np.array([getattr(self, term) for term in SEIDEL_TERMS])
 
 
 class VonKarman(Group):

@@ -25,6 +25,7 @@ from scipy import fft
 
 from psfdae.optics.propagation import Precision, pixel_nodes
 from psfdae.optics.pupil import Pupil
+from psfdae.optics.wavefronts import Modes
 
 
 class Sampling(Protocol):
@@ -106,21 +107,21 @@ class ModalStamps:
     ----------
     pupil : Pupil
         Transmission on an M × M grid.
-    modes : ndarray, shape (J, M, M)
-        OPD in waves of a unit coefficient.
+    modes : Modes
     sampling : Sampling
         Made for the same pupil.
     pixel : float
         Pixel width in λ/D; the unit of offsets.
     """
 
-    def __init__(self, pupil: Pupil, modes: np.ndarray, sampling: Sampling, pixel: float) -> None:
+    def __init__(self, pupil: Pupil, modes: Modes, sampling: Sampling, pixel: float) -> None:
         dtype = sampling.pixels.dtype
         self.shape = pupil.amplitude.shape
         self._sampling = sampling
         self._pixel = pixel
         self._axis = pupil.axis.astype(dtype)
-        self._modes = np.ascontiguousarray(modes.reshape(len(modes), -1), dtype)
+        images = modes(pupil.axis[None, :], pupil.axis[:, None])
+        self._modes = np.ascontiguousarray(images.reshape(len(images), -1), dtype)
         # Parseval, as in StampPropagator: the whole image plane sums to 1.
         total = (2.0 / pupil.spacing) ** 2 * float((pupil.amplitude**2).sum())
         self._amplitude = (pupil.amplitude / np.sqrt(total)).astype(dtype)

@@ -16,17 +16,16 @@ the arithmetic, all of it with real matrices in the GEMM of numpy or torch.
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from typing import Any, Literal
 
 import numpy as np
 
 from psfdae.optics.pupil import Pupil
+from psfdae.threads import side_by_side
 
 Backend = Literal["numpy", "torch"]
 Precision = Literal["complex64", "complex128"]
-
-ARCSEC = np.pi / 180.0 / 3600.0
-"""One arc second in radians."""
 
 
 def pixel_nodes(pixel: float, nodes: int) -> tuple[np.ndarray, np.ndarray]:
@@ -209,6 +208,31 @@ class StampPropagator:
         if buffer is None or tuple(buffer.shape) != shape:
             buffer = kept[name] = self._array(np.empty(shape, self.real_dtype))
         return buffer
+
+
+def in_batches(
+    samples: np.ndarray,
+    size: int,
+    threads: int,
+    prepare: Callable[[int], Callable[[np.ndarray], None]],
+) -> None:
+    """Work on wavefronts in batches that share a pupil grid, side by side in threads.
+
+    Parameters
+    ----------
+    samples : ndarray of int, shape (B,)
+        Pupil samples N of every wavefront.
+    size : int
+        Most wavefronts in a batch.
+    threads : int
+        Batches at once; linear algebra should be on one thread meanwhile.
+    prepare : callable
+        From N to the work on a batch, which gets its wavefronts' numbers, shape (b,).
+    """
+    for count in np.unique(samples):
+        members = np.flatnonzero(samples == count)
+        batches = np.array_split(members, range(size, members.size, size))
+        side_by_side(prepare(int(count)), batches, threads)
 
 
 def _array_module(backend: Backend) -> Any:

@@ -1,7 +1,7 @@
 """Wavefronts of a misaligned telescope by ray tracing.
 
-batoid (https://github.com/jmeyers314/batoid) traces the rays. It is imported
-here and only when a telescope is built, so that no other scene depends on it.
+batoid (https://github.com/jmeyers314/batoid) traces the rays of a telescope that
+`psfdae.stars.prescription` builds from its settings.
 
 Coordinates: z from the primary to the sky, light along −z. A field angle (x, y)
 is that of the direction in which light travels, so that a star at +x is imaged
@@ -20,12 +20,13 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from psfdae.configuration.alignment import Prescription
-from psfdae.configuration.schema import Telescope
 from psfdae.optics.zernike import noll_to_nm, zernike_basis
 
 DEGREES_OF_FREEDOM = ("decenter_x", "decenter_y", "tilt_x", "tilt_y")
 """Order of the four numbers of a state of misalignment."""
+
+FIRST_NOLL = 4
+"""Piston and tilts are left out: wavefronts refer to the image's centroid."""
 
 RIM = 0.998
 """Relative radius of the rays that look for vignetting at the pupil's rim."""
@@ -40,102 +41,13 @@ class RayTracingError(ValueError):
     """A state of misalignment or a field that the telescope cannot serve."""
 
 
-def build_optic(prescription: Prescription, telescope: Telescope, defocus: float = 0.0) -> Any:
-    """The aligned telescope as batoid traces it.
-
-    Parameters
-    ----------
-    prescription : Prescription
-        Surfaces; checked when it was read.
-    telescope : Telescope
-        Aperture and central obscuration.
-    defocus : float
-        Distance of the detector beyond best focus, in metres.
-
-    Returns
-    -------
-    batoid.CompoundOptic
-        Items M1, M2, the lenses and D.
-    """
-    import batoid
-
-    radius, p = 0.5 * telescope.diameter_m, prescription
-    annulus = batoid.ObscNegation(batoid.ObscAnnulus(telescope.obscuration * radius, radius))
-    items = [
-        batoid.Mirror(
-            batoid.Quadric(p.primary.radius_m, p.primary.conic),
-            name="M1",
-            coordSys=_at(p.primary.vertex_m),
-            obscuration=annulus if telescope.obscuration else _clear(radius),
-        ),
-        batoid.Mirror(
-            batoid.Quadric(p.secondary.radius_m, p.secondary.conic),
-            name="M2",
-            coordSys=_at(p.secondary.vertex_m),
-            obscuration=_clear(p.secondary.clear_radius_m),
-        ),
-        *_lenses(p),
-        batoid.Detector(
-            batoid.Plane(), name="D", coordSys=_at(p.best_focus_m - defocus), obscuration=None
-        ),
-    ]
-    return batoid.CompoundOptic(
-        items,
-        name=p.name,
-        backDist=p.launch_distance_m,
-        sphereRadius=p.reference_sphere_m,
-        pupilSize=telescope.diameter_m,
-        pupilObscuration=telescope.obscuration,
-        stopSurface=batoid.Interface(
-            batoid.Plane(), name="entrance pupil", coordSys=_at(p.entrance_pupil_m)
-        ),
-    )
-
-
-def _lenses(prescription: Prescription) -> list[Any]:
-    import batoid
-
-    glass, vacuum = prescription.glass, batoid.ConstMedium(1.0)
-    silica = batoid.SellmeierMedium(*glass.sellmeier_b, *glass.sellmeier_c_um2)
-    lenses = []
-    for name, lens in prescription.ordered_lenses:
-        sides = [
-            batoid.RefractiveInterface(
-                batoid.Sphere(radius),
-                name=f"{name} {side}",
-                coordSys=_at(vertex),
-                obscuration=_clear(lens.clear_radius_m),
-                inMedium=before,
-                outMedium=after,
-            )
-            for side, radius, vertex, before, after in (
-                ("front", lens.front_radius_m, lens.front_vertex_m, vacuum, silica),
-                ("back", lens.back_radius_m, lens.back_vertex_m, silica, vacuum),
-            )
-        ]
-        lenses.append(batoid.Lens(sides, name=name, medium=silica))
-    return lenses
-
-
-def _at(z: float) -> Any:
-    import batoid
-
-    return batoid.CoordSys().shiftLocal([0.0, 0.0, z])
-
-
-def _clear(radius: float) -> Any:
-    import batoid
-
-    return batoid.ObscNegation(batoid.ObscCircle(radius))
-
-
 def misaligned(optic: Any, misalignment: np.ndarray) -> Any:
     """The telescope with a displaced secondary; `optic` itself stays as it is.
 
     Parameters
     ----------
     optic : batoid.CompoundOptic
-        Result of `build_optic`.
+        With the secondary as item M2.
     misalignment : ndarray, shape (4,)
         Decentre x, y in metres, tilt about x, y in radians.
 
@@ -185,54 +97,40 @@ class ZernikeTracer:
 
     Parameters
     ----------
-    prescription, telescope : config groups
-    defocus : float
-        Distance of the detector beyond best focus, in metres.
+    optic : batoid.CompoundOptic
+        The aligned telescope; its pupil's size and obscuration and its reference
+        sphere are those of the wavefront.
+    wavelength : float
+        In metres.
     fields : ndarray, shape (F, 2)
         Field angles (x, y) in radians.
     unit : ndarray, shape (4,)
         Range of the misalignment in metres, metres, radians, radians.
     highest : int
-        Highest Noll index J.
+        Highest Noll index.
     """
 
     def __init__(
-        self,
-        prescription: Prescription,
-        telescope: Telescope,
-        defocus: float,
-        fields: np.ndarray,
-        unit: np.ndarray,
-        highest: int,
+        self, optic: Any, wavelength: float, fields: np.ndarray, unit: np.ndarray, highest: int
     ) -> None:
-        self.optic = build_optic(prescription, telescope, defocus)
+        import batoid
+
+        self.optic, self.wavelength = optic, wavelength
         self.fields = np.asarray(fields, float)
         self.unit = np.asarray(unit, float)
-        self.wavelength = telescope.wavelength_m
-        self.sphere = prescription.reference_sphere_m
-        x, y, self._weights = annulus_points(highest, telescope.obscuration)
+        x, y, self._weights = annulus_points(highest, optic.pupilObscuration)
         root = np.sqrt(self._weights)
         self._fit = np.linalg.pinv((zernike_basis(highest, x, y) * root).T) * root
         angle = 2.0 * np.pi * np.arange(RIM_RAYS) / RIM_RAYS
-        start = np.stack([np.append(x, RIM * np.cos(angle)), np.append(y, RIM * np.sin(angle))]) * (
-            0.5 * telescope.diameter_m
-        )
-        self._rays = self._launch(start)
-
-    def _launch(self, start: np.ndarray) -> Any:
-        """Rays of all fields, one field after the other, from the entrance pupil."""
-        import batoid
-
-        return batoid.concatenateRayVectors(
+        start = np.stack([np.append(x, RIM * np.cos(angle)), np.append(y, RIM * np.sin(angle))])
+        start *= 0.5 * optic.pupilSize
+        # Rays of all fields, one field after the other, from the entrance pupil.
+        self._rays = batoid.concatenateRayVectors(
             [
                 batoid.RayVector.fromStop(
-                    *start,
-                    optic=self.optic,
-                    wavelength=self.wavelength,
-                    theta_x=float(theta_x),
-                    theta_y=float(theta_y),
+                    *start, optic=optic, wavelength=wavelength, theta_x=float(x), theta_y=float(y)
                 )
-                for theta_x, theta_y in self.fields
+                for x, y in self.fields
             ]
         )
 
@@ -247,7 +145,7 @@ class ZernikeTracer:
         Returns
         -------
         ndarray, shape (n, F, J)
-            Noll 1 … J in waves.
+            From Noll index `FIRST_NOLL` to the highest, in waves.
 
         Raises
         ------
@@ -263,35 +161,29 @@ class ZernikeTracer:
         misaligned(self.optic, state * self.unit).trace(rays)
         lost = (rays.vignetted | rays.failed).reshape(len(self.fields), -1)
         if lost.any():
-            self._refuse(number, lost)
+            vignetted = lost.any(axis=1)
+            field = int(vignetted.argmax())
+            x, y = np.rad2deg(self.fields[field])
+            raise RayTracingError(
+                f"state {number}, field ({x:.6g}, {y:.6g})°: {int(lost[field].sum())} of "
+                f"{lost.shape[1]} rays are vignetted; {int(vignetted.sum())} of "
+                f"{len(lost)} fields are"
+            )
         pupil = slice(0, self._weights.size)
-        shape = (*lost.shape, 3)
-        ahead = self._ahead(
-            rays.r.reshape(shape)[:, pupil],
-            rays.v.reshape(shape)[:, pupil],
-            rays.t.reshape(lost.shape)[:, pupil],
-        )
-        return ahead @ self._fit.T
+        landing, velocity = (a.reshape(*lost.shape, 3)[:, pupil] for a in (rays.r, rays.v))
+        lead = self._lead(landing, velocity, rays.t.reshape(lost.shape)[:, pupil])
+        return (lead @ self._fit.T)[:, FIRST_NOLL - 1 :]
 
-    def _ahead(self, landing: np.ndarray, velocity: np.ndarray, path: np.ndarray) -> np.ndarray:
+    def _lead(self, landing: np.ndarray, velocity: np.ndarray, path: np.ndarray) -> np.ndarray:
         """Lead of every ray on the mean of its field at the reference sphere, in waves."""
         direction = velocity / np.linalg.norm(velocity, axis=-1, keepdims=True)
         centre = np.einsum("n,fnk->fk", self._weights, landing)
         offset = landing - centre[:, None]
         along = (offset * direction).sum(-1)
         # Back along the ray to the sphere, |offset + s·direction| = radius with s < 0.
-        beyond = (offset**2).sum(-1) - self.sphere**2
+        beyond = (offset**2).sum(-1) - self.optic.sphereRadius**2
         path = path - along - np.sqrt(along**2 - beyond)
         return (path @ self._weights[:, None] - path) / self.wavelength
-
-    def _refuse(self, number: int, lost: np.ndarray) -> None:
-        field = int(lost.any(axis=1).argmax())
-        x, y = np.rad2deg(self.fields[field])
-        raise RayTracingError(
-            f"state {number}, field ({x:.6g}, {y:.6g})°: {int(lost[field].sum())} of "
-            f"{lost.shape[1]} rays are vignetted; {int(lost.any(axis=1).sum())} of "
-            f"{len(lost)} fields are"
-        )
 
 
 def annulus_points(highest: int, obscuration: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+ARCSEC = np.pi / 180.0 / 3600.0
+"""One arc second in radians."""
+
 
 class SamplingError(ValueError):
     """The pupil grid is too coarse for a wavefront or for the stamp's position."""
@@ -44,6 +47,11 @@ def required_samples(slopes: np.ndarray, reach: np.ndarray) -> np.ndarray:
         raise SamplingError(f"wavefront {wavefront} is not finite: no grid can sample it")
     # Larger numbers would wrap around as integers; no ladder ends that high.
     return np.ceil(np.minimum(needed, 2.0**53)).astype(np.int64)
+
+
+def pixel_width(scale_arcsec: float, diameter_m: float, wavelength_m: float) -> float:
+    """Width of a pixel in units of λ/D."""
+    return scale_arcsec * ARCSEC * diameter_m / wavelength_m
 
 
 def required_nodes(pixel: float) -> int:

@@ -16,9 +16,6 @@ import numpy as np
 SEIDEL_TERMS = ("spherical", "coma", "astigmatism", "field_curvature", "distortion")
 """Order of the coefficients W040, W131, W222, W220, W311 in every array."""
 
-SLOPE_BATCH = 256
-"""Wavefronts whose slopes are held at a time: at 65² points 8 MB per axis."""
-
 MONOMIALS = ("r4", "r2x", "r2y", "xx", "xy", "yy", "x", "y")
 """Order of the pupil monomials of a Seidel wavefront (r² = x² + y²)."""
 
@@ -69,50 +66,3 @@ def monomial_images(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     x, y = np.broadcast_arrays(x, y)
     r2 = x**2 + y**2
     return np.stack([r2**2, r2 * x, r2 * y, x**2, x * y, y**2, x, y])
-
-
-def monomial_gradients(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Derivatives of the eight monomials with respect to x and to y.
-
-    Parameters are those of `monomial_images`; each returned array has shape
-    (8, ...), in waves per pupil radius for unit coefficients.
-    """
-    x, y = np.broadcast_arrays(x, y)
-    r2 = x**2 + y**2
-    zero, one = np.zeros_like(x), np.ones_like(x)
-    d_dx = np.stack([4 * r2 * x, r2 + 2 * x**2, 2 * x * y, 2 * x, y, zero, one, zero])
-    d_dy = np.stack([4 * r2 * y, 2 * x * y, r2 + 2 * y**2, zero, x, 2 * y, zero, one])
-    return d_dx, d_dy
-
-
-def gradient_ranges(coefficients: np.ndarray, points: int = 65) -> np.ndarray:
-    """Extreme slopes of Seidel wavefronts over the full pupil disc.
-
-    The gradient is sampled analytically on `points`² grid points inside the
-    disc and on its rim. The obscured centre is included: its slopes are the
-    smaller ones and never decide.
-
-    Parameters
-    ----------
-    coefficients : ndarray, shape (B, 8)
-        Monomial coefficients in waves.
-
-    Returns
-    -------
-    ndarray, shape (B, 2, 2)
-        [star, axis (x, y), (min, max)] slope in waves per pupil radius.
-    """
-    axis = np.linspace(-1.0, 1.0, points)
-    xx, yy = np.meshgrid(axis, axis)
-    inside = xx**2 + yy**2 <= 1.0
-    angle = np.linspace(0.0, 2.0 * np.pi, 8 * points, endpoint=False)
-    x = np.concatenate([xx[inside], np.cos(angle)])
-    y = np.concatenate([yy[inside], np.sin(angle)])
-    ranges = np.empty((len(coefficients), 2, 2))
-    for axis_index, gradient in enumerate(monomial_gradients(x, y)):
-        for start in range(0, len(coefficients), SLOPE_BATCH):
-            part = slice(start, start + SLOPE_BATCH)
-            slopes = coefficients[part] @ gradient
-            ranges[part, axis_index, 0] = slopes.min(axis=1)
-            ranges[part, axis_index, 1] = slopes.max(axis=1)
-    return ranges

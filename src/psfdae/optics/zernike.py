@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping, Sequence
 from math import comb
 
 import numpy as np
@@ -59,6 +60,40 @@ def zernike(j: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.sqrt(2.0 * (n + 1.0)) * radial_polynomial(n, m, r) * angular
 
 
+def zernike_images(noll: Iterable[int], x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Values of some Noll polynomials at pupil points in pupil radii, shape (J, ...)."""
+    return np.stack([zernike(j, x, y) for j in noll])
+
+
 def zernike_basis(count: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Z_1 … Z_count, shape (count, ...)."""
-    return np.stack([zernike(j, x, y) for j in range(1, count + 1)])
+    return zernike_images(range(1, count + 1), x, y)
+
+
+def field_coefficients(
+    polynomials: Sequence[Mapping[tuple[int, int], float]], field: np.ndarray
+) -> np.ndarray:
+    """Coefficients whose field dependence is polynomial, at field points.
+
+    Nodal aberration theory writes every Zernike coefficient of a telescope, aligned or
+    not, as a polynomial of the field vector (Thompson 2005, JOSA A 22, 1389). Pupil and
+    field share x and y: a coefficient of Z8 that grows with x is coma as in Seidel's theory.
+
+    Parameters
+    ----------
+    polynomials : sequence of length J
+        Per term: coefficient in waves by the powers (of x, of y) of the field.
+    field : ndarray, shape (F, 2)
+        Field vector (x, y), 1 at the edge of the field on an axis.
+
+    Returns
+    -------
+    ndarray, shape (F, J)
+        In waves.
+    """
+    x, y = field[:, 0], field[:, 1]
+    terms = [
+        sum((waves * x**a * y**b for (a, b), waves in polynomial.items()), np.zeros(len(field)))
+        for polynomial in polynomials
+    ]
+    return np.stack(terms, axis=1)

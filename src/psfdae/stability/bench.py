@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from psfdae.rng import stream
+from psfdae.stages.common import star_wavefronts
 from psfdae.stars.fields import assign_fields, draw_jitter
 from psfdae.stars.flux import FluxModel
-from psfdae.stars.framing import normalise_flux, stamp_offset
+from psfdae.stars.framing import normalise_flux
 from psfdae.stars.noise import NoiseModel
 from psfdae.stars.scene import Propagation
-from psfdae.stars.seidel_scene import star_wavefronts
 
 LEVELS = 1e-5 * np.array([3, 5, 7, 9, 30, 50, 70, 90, 100, 200, 300, 500])
 """Noise levels λ of the paper's three bands."""
@@ -115,8 +115,7 @@ def fresh_stars(config: Any, count: int) -> np.ndarray:
         config.framing,
         config.stars.search_px,
     )
-    offset = stamp_offset(propagation.brightest(), jitter)
-    return normalise_flux(propagation.stamps(config.framing.stamp_px, offset))[0]
+    return normalise_flux(propagation.framed(config.framing.stamp_px, jitter)[0])[0]
 
 
 def normalised(stamps: np.ndarray) -> np.ndarray:

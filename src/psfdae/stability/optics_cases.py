@@ -11,6 +11,7 @@ from psfdae.optics.propagation import StampPropagator
 from psfdae.optics.pupil import annular_pupil
 from psfdae.optics.sampling import SamplingError, check_opd
 from psfdae.optics.turbulence import SPECTRUM
+from psfdae.optics.wavefronts import ModalWavefronts, WavefrontSource, seidel_wavefronts
 from psfdae.stability.bench import Bench, Scene, stamp_mse
 from psfdae.stability.rows import (
     Entry,
@@ -21,10 +22,10 @@ from psfdae.stability.rows import (
     refused,
     within,
 )
+from psfdae.stages.common import template_wavefronts
 from psfdae.stars.framing import FramingError
-from psfdae.stars.scene import Propagation, WavefrontSource
-from psfdae.stars.seidel_scene import SeidelWavefronts
-from psfdae.stars.turbulence_scene import CYCLES_PER_DIAMETER, template_wavefronts
+from psfdae.stars.scene import Propagation
+from psfdae.stars.turbulence_scene import CYCLES_PER_DIAMETER
 
 FACTORS = (1, 2, 3, 5, 7, 10, 20, 30, 50, 100)
 """Factors on a wavefront."""
@@ -160,7 +161,7 @@ def pixel_scales(bench: Bench) -> Iterator[Entry]:
     """Pixels over four decades, with the configured nodes and with those they need."""
     scene, budget = bench.seidel, bench.budget(bench.seidel)
     telescope, optics = scene.config.telescope, scene.config.optics
-    source = SeidelWavefronts(np.tile(scene.config.wavefront.coefficients, (2, 1)), FIELDS[:2])
+    source = seidel_wavefronts(np.tile(scene.config.wavefront.coefficients, (2, 1)), FIELDS[:2])
     peak = _propagation(scene, source, _longer(scene)).brightest()
     reach = scene.config.stars.search_px
     for scale in PIXELS_ARCSEC:
@@ -246,9 +247,9 @@ def energy(bench: Bench) -> Iterator[Entry]:
         )
 
 
-def _seidel(coefficients: np.ndarray) -> SeidelWavefronts:
+def _seidel(coefficients: np.ndarray) -> ModalWavefronts:
     """Axis, edge and corner with the same (5,) or their own (3, 5) coefficients."""
-    return SeidelWavefronts(np.broadcast_to(coefficients, (len(FIELDS), 5)).copy(), FIELDS)
+    return seidel_wavefronts(np.broadcast_to(coefficients, (len(FIELDS), 5)).copy(), FIELDS)
 
 
 def _longer(scene: Scene) -> list[int]:

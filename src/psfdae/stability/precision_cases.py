@@ -10,14 +10,15 @@ import torch
 
 from psfdae.evaluation.metrics import mse, ssim
 from psfdae.models.dae import image_scale
+from psfdae.optics.wavefronts import WavefrontSource, seidel_wavefronts
 from psfdae.rng import stream
 from psfdae.stability.bench import Bench, Scene, stamp_mse
 from psfdae.stability.networks import rounding_of, trained_network
 from psfdae.stability.rows import Entry, at_most
+from psfdae.stages.common import template_wavefronts
+from psfdae.stars.fields import relative_field
 from psfdae.stars.framing import normalise_flux
-from psfdae.stars.scene import Propagation, WavefrontSource
-from psfdae.stars.seidel_scene import SeidelWavefronts, relative_field
-from psfdae.stars.turbulence_scene import template_wavefronts
+from psfdae.stars.scene import Propagation
 
 EPS = float(np.finfo(np.float32).eps)
 """Relative spacing of single precision."""
@@ -135,9 +136,9 @@ def _some_wavefronts(scene: Scene) -> WavefrontSource:
     if config.scene.name == "turbulence":
         grid = config.grid.model_copy(update={"points": 3})
         return template_wavefronts(config.model_copy(update={"grid": grid}))
-    _, field = relative_field(config.grid)
+    field = relative_field(config.grid)
     corner = field[:: max(1, len(field) // 12)]
-    return SeidelWavefronts(np.tile(config.wavefront.coefficients, (len(corner), 1)), corner)
+    return seidel_wavefronts(np.tile(config.wavefront.coefficients, (len(corner), 1)), corner)
 
 
 def _noisy(bench: Bench) -> np.ndarray:

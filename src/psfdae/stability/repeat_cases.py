@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 
+from psfdae.optics.wavefronts import ModalWavefronts
 from psfdae.rng import stream
 from psfdae.stability.bench import LEVELS, Bench
 from psfdae.stability.rows import Entry, at_most, equal
 from psfdae.stages import stars as stars_stage
 from psfdae.stages import templates as templates_stage
+from psfdae.stages.common import star_wavefronts
 from psfdae.stars.scene import Propagation
-from psfdae.stars.seidel_scene import SeidelWavefronts, relative_field, star_wavefronts
 
 STARS = 24
 """Stars that are simulated again and again."""
@@ -38,8 +39,7 @@ def batches_and_order(bench: Bench) -> Iterator[Entry]:
         change = np.abs(other - stamps).max() / stamps.max()
         yield at_most(case, "largest change over the peak", float(change), rounding)
     order = rng.permutation(STARS)
-    _, field = relative_field(config.grid)
-    shuffled = SeidelWavefronts(source.seidel[order], field[fields[order]])
+    shuffled = ModalWavefronts(source.modes, source.coefficients[order])
     other_peak, other = _simulate(config, shuffled, config.optics.batch)
     moved = int((other_peak != peak[order]).any(axis=1).sum())
     yield equal("stars in another order", "brightest pixels moved", moved, 0)
@@ -105,7 +105,7 @@ def same_bytes(bench: Bench) -> Iterator[Entry]:
     yield equal("stars of another seed", "same bytes", first["stars"] == other["stars"], False)
 
 
-def _simulate(config: Any, source: SeidelWavefronts, batch: int) -> tuple[np.ndarray, np.ndarray]:
+def _simulate(config: Any, source: ModalWavefronts, batch: int) -> tuple[np.ndarray, np.ndarray]:
     optics = config.optics.model_copy(update={"batch": batch})
     propagation = Propagation(
         source, config.telescope, optics, config.framing, config.stars.search_px

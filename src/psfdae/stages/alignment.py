@@ -12,20 +12,22 @@ from typing import Any, Literal
 
 import numpy as np
 
-from psfdae.belonging import OURS, STATE_STAMPS, STATES, require
-from psfdae.files import Column, Product, read_product, write_product, write_text
-from psfdae.rng import stream
-from psfdae.stages.common import limit_threads
-from psfdae.stars.alignment_model import QuadraticModel, design_states, fit_quadratic, verify
-from psfdae.stars.alignment_scene import (
+from psfdae.alignment.stamps import AlignmentStamps
+from psfdae.alignment.telescope import (
+    QuadraticModel,
+    design_states,
     field_points,
+    fit_quadratic,
     grid_states,
-    state_stamps,
-    traced_zernikes,
     uniform_states,
+    verify,
     zernike_tracer,
 )
-from psfdae.stars.alignment_stamps import AlignmentStamps
+from psfdae.belonging import OURS, STATE_STAMPS, STATES, require
+from psfdae.files import Column, Product, read_product, write_product, write_text
+from psfdae.optics.raytracing import FIRST_NOLL, ZernikeTracer
+from psfdae.rng import stream
+from psfdae.stages.common import limit_threads
 
 StateSet = Literal["grid", "uniform", "train"]
 
@@ -46,11 +48,11 @@ def model(config: Any, out: Path) -> None:
         If the model differs from ray tracing by more than the tolerance.
     """
     limit_threads(1)
-    tracer, design = zernike_tracer(config), design_states()
-    fitted = fit_quadratic(design, traced_zernikes(tracer, design))
+    tracer, design = _tracer(config), design_states()
+    fitted = fit_quadratic(design, tracer(design))
     grid = grid_states(config.alignment.grid_levels)
     tolerance = config.alignment.model_tolerance_waves
-    residual = verify(fitted, grid, traced_zernikes(tracer, grid), tolerance)
+    residual = verify(fitted, grid, tracer(grid), tolerance)
     columns = {
         "coefficients": Column(
             fitted.coefficients,
@@ -99,9 +101,9 @@ def states(config: Any, kind: StateSet, model_path: Path | None, out: Path) -> N
     limit_threads(1)  # batches run side by side, optics.threads of them
     fitted = None if model_path is None else read_model(model_path, config)
     chosen = _choose(config, kind)
-    zernikes = fitted(chosen) if fitted else traced_zernikes(zernike_tracer(config), chosen)
+    zernikes = fitted(chosen) if fitted else _tracer(config)(chosen)
     operator = AlignmentStamps(config.telescope, config.optics, config.alignment)
-    stamps, energy = state_stamps(operator, zernikes)
+    stamps, energy = operator(zernikes)
     columns = {
         "states": Column(chosen, "range", "decentre x, y and tilt x, y of the secondary"),
         "stamps": Column(
@@ -116,6 +118,10 @@ def states(config: Any, kind: StateSet, model_path: Path | None, out: Path) -> N
     write_product(out, "alignment_states", columns, config.model_dump())
 
 
+def _tracer(config: Any) -> ZernikeTracer:
+    return zernike_tracer(config.telescope, config.prescription, config.alignment)
+
+
 def _choose(config: Any, kind: StateSet) -> np.ndarray:
     alignment = config.alignment
     if kind == "grid":
@@ -127,7 +133,7 @@ def _choose(config: Any, kind: StateSet) -> np.ndarray:
 def _geometry(config: Any) -> dict[str, Column]:
     alignment = config.alignment
     fields = field_points(alignment.field_radius_deg, alignment.field_points)
-    noll = np.arange(4, alignment.highest_zernike + 1)
+    noll = np.arange(FIRST_NOLL, alignment.highest_zernike + 1)
     return {
         "fields": Column(fields, "rad", "field angle (x, y)"),
         "noll": Column(noll, "1", "Noll index of every Zernike coefficient"),

@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 
 from psfdae.alignment.fisher import coma_free_decentre, expected_abs_error
+from psfdae.alignment.stamps import AlignmentStamps
+from psfdae.alignment.telescope import design_states, fit_quadratic, zernike_tracer
 from psfdae.belonging import STATE_STAMPS, require_origin
 from psfdae.files import atomic_path, read_product, write_text
 from psfdae.reading import read_table
 from psfdae.stages.alignment_tables import read_errors, require_one_test
 from psfdae.stages.common import limit_threads, noise_model
-from psfdae.stars.alignment_model import design_states, fit_quadratic
-from psfdae.stars.alignment_scene import state_stamps, traced_zernikes, zernike_tracer
-from psfdae.stars.alignment_stamps import AlignmentStamps
 
 POSITIONS = np.linspace(-1.5, 1.5, 61)
 """Multiples of the state in the twin figure; −1 is the twin."""
@@ -145,13 +144,12 @@ def twin(config: Any, table: Path, out: Path) -> None:
 def _stamps_along(config: Any, defocus_m: float) -> tuple[np.ndarray, np.ndarray]:
     """A state and the ray-traced stamps of its multiples, with the CCD at a defocus."""
     moved = config.alignment.model_copy(update={"defocus_m": defocus_m})
-    tracer = zernike_tracer(config.model_copy(update={"alignment": moved}))
+    tracer = zernike_tracer(config.telescope, config.prescription, moved)
     operator = AlignmentStamps(config.telescope, config.optics, moved)
-    model = fit_quadratic(design_states(), traced_zernikes(tracer, design_states()))
+    model = fit_quadratic(design_states(), tracer(design_states()))
     tilt = np.array([TWIN_TILT])
     state = np.concatenate([coma_free_decentre(model, tilt, operator.noll), tilt], axis=1)[0]
-    traced = traced_zernikes(tracer, POSITIONS[:, None] * state)
-    return state, state_stamps(operator, traced)[0]
+    return state, operator(tracer(POSITIONS[:, None] * state))[0]
 
 
 def correlation(table: Path, out: Path) -> None:

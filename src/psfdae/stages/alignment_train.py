@@ -18,7 +18,6 @@ from psfdae.alignment.batches import (
     TrainingStates,
     epoch_batches,
     gaussian_states,
-    mixed,
     noise_weights,
     noisy_states,
     steps_per_epoch,
@@ -30,6 +29,7 @@ from psfdae.rng import stream
 from psfdae.stages.common import limit_threads, noise_model
 from psfdae.stages.train import as_csv, as_yaml
 from psfdae.stages.trained import CONFIG, HISTORY, WEIGHTS, trained_dae
+from psfdae.stars.noise import mixed_levels
 
 CNN_WEIGHTS = "cnn.safetensors"
 
@@ -118,7 +118,7 @@ def train_noise_trained(config: Any, train: Path, out: Path, checkpoint: Path) -
     noise, settings, product = noise_model(config), config.train_noise_trained, _read(train)
 
     def disturb(stamps: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        level = mixed(config.noise.levels, len(stamps), rng)
+        level = mixed_levels(np.asarray(config.noise.levels), len(stamps), rng)
         return gaussian_states(noise, stamps, level, rng), _weights(config, settings, level)
 
     data = TrainingStates(product["states"], product["stamps"], disturb=disturb)
@@ -146,7 +146,7 @@ def train_dae_retrained(config: Any, train: Path, dae: Path, out: Path, checkpoi
     require_origin(dae, STATE_STAMPS, product)
     states, stamps = product["states"], product["stamps"]
     rng = stream(config.seed, "cnn", "noise", "dae_retrained")
-    level = mixed(config.noise.levels, len(states), rng)
+    level = mixed_levels(np.asarray(config.noise.levels), len(states), rng)
     denoised = denoise(dae, config, noisy_states(noise_model(config), stamps, level, rng))
     settings = config.train_dae_retrained
     data = TrainingStates(states, denoised, weights=_weights(config, settings, level))

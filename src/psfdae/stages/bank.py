@@ -12,9 +12,8 @@ from psfdae.configuration.schema import Config
 from psfdae.configuration.stages import SIMULATION
 from psfdae.files import Column, write_product
 from psfdae.rng import stream
-from psfdae.stages.common import limit_threads, scene_module
+from psfdae.stages.common import drawn_columns, limit_threads, star_wavefronts
 from psfdae.stars.fields import assign_fields
-from psfdae.stars.framing import stamp_offset
 from psfdae.stars.scene import Propagation
 
 FINE_RUNGS = (158, 190)
@@ -39,23 +38,21 @@ def bank(
     fields = drawn.grid.points**2
     name, count = drawn.stars.name, drawn.stars.count
     star_field = assign_fields(count, fields, stream(drawn.seed, "field", name))
-    source = scene_module(drawn.scene.name).star_wavefronts(drawn, star_field)
+    source = star_wavefronts(drawn, star_field)
     ladder = sorted({*FINE_RUNGS, *drawn.optics.pupil_samples})
     optics = drawn.optics.model_copy(
         update={"pupil_samples": ladder, "threads": config.bounds.threads}
     )
     framing = drawn.framing
     propagation = Propagation(source, drawn.telescope, optics, framing, drawn.stars.search_px)
-    peak = propagation.brightest()
-    side = framing.stamp_px + 2 * (framing.jitter_px + MIRROR_MARGIN)
-    framed = propagation.stamps(side, stamp_offset(peak, np.zeros_like(peak)))
+    framed, peak = propagation.framed(framing.stamp_px + 2 * (framing.jitter_px + MIRROR_MARGIN))
     columns = {
         "framed": Column(
             framed.astype(np.float32), "1", "pixel flux as a fraction of the light, with margin"
         ),
         "field_index": Column(star_field, "1", "field of the star"),
         "peak": Column(peak, "pixel", "brightest pixel (row, column) from the chief ray"),
-        **source.columns(),
+        **drawn_columns(source),
         "pupil_samples": Column(propagation.samples, "1", "pupil samples N"),
     }
     write_product(out, "bank", columns, config.model_dump())

@@ -191,16 +191,14 @@ def _read_bank(path: Path, stars: Product) -> Bank:
 
 def _floor(config: Config, product: Product, tables: Tables) -> None:
     from psfdae.bounds.fisher import local_error, sensitivities
-    from psfdae.stars.framing import stamp_offset
-    from psfdae.stars.seidel_scene import relative_field
+    from psfdae.stars.fields import relative_field
 
     stars = tables.stars
-    _, field = relative_field(config.grid)
-    offset = stamp_offset(product["peak"][stars.star], product["jitter"][stars.star])
+    field = relative_field(config.grid)
     stamps, derivatives = sensitivities(
         product["seidel"][stars.star],
         field[stars.field],
-        offset,
+        product["peak"][stars.star] - product["jitter"][stars.star],
         product["pupil_samples"][stars.star],
         config.telescope,
         config.optics,

@@ -23,9 +23,9 @@ from psfdae.files import Product, read_product, write_text
 from psfdae.optics.sampling import required_nodes
 from psfdae.reading import read_table
 from psfdae.rng import stream
-from psfdae.stages.common import limit_threads, scene_module
+from psfdae.stages.common import limit_threads, star_wavefronts, template_wavefronts
 from psfdae.stars.fields import assign_fields
-from psfdae.stars.framing import normalise_flux, stamp_offset
+from psfdae.stars.framing import normalise_flux
 from psfdae.stars.noise import NoiseModel
 from psfdae.stars.scene import Propagation
 
@@ -76,20 +76,17 @@ def _images(config: Config, scale: float, r0: float | None) -> np.ndarray:
     telescope = config.telescope.model_copy(update={"pixel_scale_arcsec": scale})
     search_px = ceil(config.stars.search_px * config.telescope.pixel_scale_arcsec / scale)
     count, fields = config.calibration.stars, config.grid.points**2
-    scene = scene_module(config.scene.name)
     if r0 is None:
         star_field = assign_fields(count, fields, stream(config.seed, "scan", "field"))
-        source = scene.star_wavefronts(config, star_field)
+        source = star_wavefronts(config, star_field)
     else:
         wavefront = config.wavefront.model_copy(update={"r0_m": r0})
-        source = scene.template_wavefronts(config.model_copy(update={"wavefront": wavefront}))
+        source = template_wavefronts(config.model_copy(update={"wavefront": wavefront}))
     # The scan reaches wider pixels than the configured one.
     nodes = max(config.optics.nodes, required_nodes(telescope.pixel))
     optics = config.optics.model_copy(update={"nodes": nodes})
     propagation = Propagation(source, telescope, optics, config.framing, search_px)
-    peak = propagation.brightest()
-    stamps = propagation.stamps(config.framing.stamp_px, stamp_offset(peak, 0 * peak))
-    return normalise_flux(stamps)[0]
+    return normalise_flux(propagation.framed(config.framing.stamp_px)[0])[0]
 
 
 def _at_published_mse(

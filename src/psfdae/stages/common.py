@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from psfdae.files import Product, ProductError, read_product
+from psfdae.files import Column, Product, ProductError, read_product
 from psfdae.rng import stream
 from psfdae.stars.noise import NoiseModel
 from psfdae.stars.splits import Split, held_out_split, random_split
@@ -36,6 +36,24 @@ def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Any]) -> None
 def scene_module(name: str) -> ModuleType:
     """Module of a scene; the others are neither imported nor part of a rerun's reasons."""
     return import_module(f"psfdae.stars.{name}_scene")
+
+
+def template_wavefronts(config: Any) -> Any:
+    """Static wavefronts of all fields of a stage's scene."""
+    scene = scene_module(config.scene.name)
+    return scene.template_wavefronts(config.grid, config.telescope, config.wavefront)
+
+
+def star_wavefronts(config: Any, star_field: np.ndarray) -> Any:
+    """Wavefronts of stars with random aberrations, `star_field` the field of each."""
+    scene = scene_module(config.scene.name)
+    groups = (config.grid, config.telescope, config.wavefront, config.stars)
+    return scene.star_wavefronts(*groups, star_field, config.seed)
+
+
+def drawn_columns(source: Any) -> dict[str, Column]:
+    """What the stars' random aberrations were, as products keep it."""
+    return {name: Column(values, "wave", about) for name, (values, about) in source.drawn.items()}
 
 
 def limit_threads(threads: int) -> None:

@@ -11,7 +11,7 @@ from psfdae.benchmark.cases import Case, Scene, build_cases, error_budget
 from psfdae.files import ProductError, write_text
 from psfdae.reading import read_table
 from psfdae.rng import stream
-from psfdae.stages.common import limit_threads, scene_module
+from psfdae.stages.common import limit_threads, star_wavefronts, template_wavefronts
 from psfdae.stars.fields import assign_fields
 
 TABLES = ("propagation", "convergence", "choice", "guard", "skipping", "machine")
@@ -62,14 +62,11 @@ def run(config: Any, datasets: int, out: Path) -> None:
 
 def scene_of(config: Any) -> Scene:
     """The scene of a stage config, with the wavefronts that its stages would use."""
-    module = scene_module(config.scene.name)
-    templates = module.template_wavefronts(config)
+    templates = template_wavefronts(config)
     stars, search_px = templates, config.framing.search_px
     if config.stars.aberration_fraction > 0:
         rng = stream(config.seed, "field", config.stars.name)
-        stars = module.star_wavefronts(
-            config, assign_fields(config.stars.count, len(templates), rng)
-        )
+        stars = star_wavefronts(config, assign_fields(config.stars.count, len(templates), rng))
         search_px = config.stars.search_px
     return Scene(
         config.scene.name,
@@ -153,8 +150,7 @@ def _savings(config: Any, scene: Scene, cases: Sequence[Case], datasets: int) ->
 def _other_templates(config: Any, **wavefront: Any) -> Any:
     """The scene's static wavefronts with changed keys of the group `wavefront`."""
     changed = config.wavefront.model_copy(update=wavefront)
-    module = scene_module(config.scene.name)
-    return module.template_wavefronts(config.model_copy(update={"wavefront": changed}))
+    return template_wavefronts(config.model_copy(update={"wavefront": changed}))
 
 
 def imports(config: Any, out: Path) -> None:

@@ -16,7 +16,7 @@ from psfdae.evaluation.telescope_figure import FieldOfPsfs, field_of_psfs
 from psfdae.files import Product, atomic_path, read_product, write_text
 from psfdae.prediction.shapes import measure_shapes
 from psfdae.stages import templates
-from psfdae.stages.common import scene_module
+from psfdae.stages.common import template_wavefronts
 from psfdae.stages.figures import write_png
 
 OWN_DATASET = "_telescope"
@@ -147,13 +147,13 @@ def _wide_enough(config: Config, worst: int) -> int | None:
 
     side = LARGEST * config.framing.stamp_px
     framing = config.framing.model_copy(update={"stamp_px": side})
-    source = scene_module(config.scene.name).template_wavefronts(config)
+    source = template_wavefronts(config)
     try:
         propagation = Propagation(
             source, config.telescope, config.optics, framing, framing.search_px
         )
         field = np.array([worst])
-        stamp = propagation.stamps(side, propagation.brightest(field), field)[0]
+        stamp = propagation.framed(side, stars=field)[0][0]
     except (SamplingError, FramingError):
         return None
     for size in range(config.framing.stamp_px + 2, side + 1, 2):

@@ -11,9 +11,9 @@ import numpy as np
 from psfdae.belonging import STATIC, require
 from psfdae.files import Column, Empty, read_product, stream_product
 from psfdae.rng import stream
-from psfdae.stages.common import limit_threads, scene_module
+from psfdae.stages.common import drawn_columns, limit_threads, star_wavefronts
 from psfdae.stars.fields import assign_fields, draw_jitter, draw_phase
-from psfdae.stars.framing import crop_jittered, normalise_flux, stamp_offset
+from psfdae.stars.framing import crop_jittered, normalise_flux
 
 STARS_AT_A_TIME = 1024
 """Stars that are propagated before they are written; memory does not grow beyond them."""
@@ -96,7 +96,7 @@ def _propagation(config: Any, star_field: np.ndarray) -> Any:
     from psfdae.stars.scene import Propagation
 
     limit_threads(1)  # batches run side by side
-    source = scene_module(config.scene.name).star_wavefronts(config, star_field)
+    source = star_wavefronts(config, star_field)
     return Propagation(
         source, config.telescope, config.optics, config.framing, config.stars.search_px
     )
@@ -109,7 +109,7 @@ def _realisation_columns(config: Any, propagation: Any) -> dict[str, Column | Em
         "realisation": _images(config, "noise-free image, sum 1"),
         "energy": Empty((count,), np.float64, "1", "light inside the stamp"),
         "peak": Empty((count, 2), np.int64, "pixel", about_peak),
-        **propagation.source.columns(),
+        **drawn_columns(propagation.source),
         "pupil_samples": Column(propagation.samples, "1", "pupil samples N"),
     }
 
@@ -117,8 +117,6 @@ def _realisation_columns(config: Any, propagation: Any) -> dict[str, Column | Em
 def _realisations(
     config: Any, propagation: Any, stars: np.ndarray, jitter: np.ndarray, phase: np.ndarray
 ) -> dict[str, np.ndarray]:
-    peak = propagation.brightest(stars, phase)
-    offset = stamp_offset(peak, jitter) + phase
-    stamps = propagation.stamps(config.framing.stamp_px, offset, stars)
+    stamps, peak = propagation.framed(config.framing.stamp_px, jitter, stars, phase)
     realisation, energy = normalise_flux(stamps)
     return {"realisation": realisation, "energy": energy, "peak": peak}

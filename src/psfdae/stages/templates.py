@@ -10,9 +10,8 @@ from psfdae.cli import File, command
 from psfdae.configuration.schema import Config
 from psfdae.configuration.stages import STATIC
 from psfdae.files import Column, write_product
-from psfdae.stages.common import limit_threads, scene_module
+from psfdae.stages.common import limit_threads, template_wavefronts
 from psfdae.stars.fields import square_grid
-from psfdae.stars.framing import stamp_offset
 from psfdae.stars.scene import Propagation
 
 
@@ -24,11 +23,10 @@ def templates(
     """Propagate the static PSF of every field point."""
     limit_threads(1)  # batches run side by side
     framing = config.framing
-    source = scene_module(config.scene.name).template_wavefronts(config)
+    source = template_wavefronts(config)
     propagation = Propagation(source, config.telescope, config.optics, framing, framing.search_px)
-    peak = propagation.brightest()
     side = framing.stamp_px + 2 * framing.jitter_px
-    psf = propagation.stamps(side, stamp_offset(peak, np.zeros_like(peak)))
+    psf, peak = propagation.framed(side)
     inner = slice(framing.jitter_px, side - framing.jitter_px)
     index, angle_deg = square_grid(config.grid.points, config.grid.spacing_deg)
     columns = {

@@ -15,8 +15,8 @@ import numpy as np
 
 from psfdae.optics.propagation import StampPropagator
 from psfdae.optics.pupil import annular_pupil
+from psfdae.optics.wavefronts import seidel_wavefronts
 from psfdae.rng import stream
-from psfdae.stars.seidel_scene import SeidelWavefronts
 
 OVERSAMPLING = 3
 """Sub-pixels per pixel and axis; the seeing leaves nothing beyond their Nyquist frequency."""
@@ -148,7 +148,7 @@ def star_images(recipe: FieldRecipe, position: np.ndarray) -> np.ndarray:
     """
     fine = OVERSAMPLING * RENDER_PX
     field = position / (0.5 * recipe.side_px) - 1.0
-    source = SeidelWavefronts(np.tile(recipe.seidel, (len(field), 1)), field)
+    source = seidel_wavefronts(np.tile(recipe.seidel, (len(field), 1)), field)
     pupil = annular_pupil(128, 0.35)
     propagate = StampPropagator(pupil, fine, recipe.pixel / OVERSAMPLING, 2, "complex64")
     blur = _moffat_transfer(recipe.seeing_px * OVERSAMPLING, fine)

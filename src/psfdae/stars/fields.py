@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from psfdae.configuration.schema import Grid
+
 
 def square_grid(points: int, spacing: float) -> tuple[np.ndarray, np.ndarray]:
     """A centred square grid of field points.
@@ -27,6 +29,12 @@ def square_grid(points: int, spacing: float) -> tuple[np.ndarray, np.ndarray]:
     return index, (index - 0.5 * (points - 1)) * spacing
 
 
+def relative_field(grid: Grid) -> np.ndarray:
+    """Field vectors (h_x, h_y) of a grid's points, 1 at the edge on an axis, shape (P², 2)."""
+    _, angle_deg = square_grid(grid.points, grid.spacing_deg)
+    return angle_deg / grid.edge_deg
+
+
 def assign_fields(count: int, fields: int, rng: np.random.Generator) -> np.ndarray:
     """Field of every star: a random permutation of k mod `fields`, k = 0 … count − 1."""
     return rng.permutation(np.arange(count) % fields)
@@ -42,25 +50,31 @@ def draw_phase(count: int, rng: np.random.Generator) -> np.ndarray:
     return rng.uniform(-0.5, 0.5, size=(count, 2))
 
 
-def perturb_seidel(
-    seidel: np.ndarray, fraction: float, count: int, rng: np.random.Generator
+def perturb(
+    coefficients: np.ndarray,
+    fraction: float,
+    factors: np.random.Generator,
+    jitter_waves: float = 0.0,
+    shifts: np.random.Generator | None = None,
 ) -> np.ndarray:
-    """Random aberrations: every Seidel coefficient times (1 + fraction · N(0, 1)).
+    """Random aberrations: every coefficient times (1 + fraction · N(0, 1)) + jitter · N(0, 1).
 
-    The paper (section 3.1) gives "variance of different percentage"; `fraction`
-    is read as a standard deviation. The draws of the five terms are independent;
-    at a field point they act with the power of H of their term.
+    The paper (section 3.1) gives "variance of different percentage"; `fraction` is read
+    as a standard deviation. The jitter also moves terms that vanish, such as focus on the
+    optical axis. All draws are independent; Seidel coefficients are those of H = 1.
 
     Parameters
     ----------
-    seidel : ndarray, shape (5,)
-        Static coefficients in waves.
+    coefficients : ndarray, shape (n, J)
+        Static coefficients of every star in waves.
     fraction : float
         Relative standard deviation, ≥ 0.
-
-    Returns
-    -------
-    ndarray, shape (count, 5)
-        Coefficients in waves.
+    factors, shifts : Generator
+        Where the two kinds of draws come from.
+    jitter_waves : float
+        Standard deviation in waves, ≥ 0.
     """
-    return seidel * (1.0 + fraction * rng.standard_normal((count, seidel.size)))
+    perturbed = coefficients * (1.0 + fraction * factors.standard_normal(coefficients.shape))
+    if jitter_waves and shifts:
+        perturbed = perturbed + jitter_waves * shifts.standard_normal(coefficients.shape)
+    return perturbed

@@ -26,46 +26,24 @@ def brightest_pixel(image: np.ndarray, tie: float) -> tuple[int, int]:
     return int(row), int(column)
 
 
-def stamp_offset(peak: np.ndarray, jitter: np.ndarray) -> np.ndarray:
-    """Where the centre of a stamp lies, given its brightest pixel.
-
-    Pixel j of the focal plane spans j … j + 1 pixels from the chief ray. The
-    brightest pixel goes to the stamp's 0-based index (d/2, d/2) + jitter (d
-    even), so the centre of the stamp is `peak` − `jitter` from the chief ray.
-
-    Parameters
-    ----------
-    peak, jitter : ndarray of int, shape (B, 2)
-        (row, column).
-
-    Returns
-    -------
-    ndarray of int, shape (B, 2)
-        Offset in pixels, as `StampPropagator` takes it.
-    """
-    return np.asarray(peak) - np.asarray(jitter)
-
-
 def crop_jittered(framed: np.ndarray, jitter: np.ndarray, margin: int) -> np.ndarray:
-    """Cut stamps out of templates that were framed without jitter and with a margin.
+    """Cut stamps out of images that were framed without jitter and with a margin.
 
     Parameters
     ----------
     framed : ndarray, shape (B, d + 2·margin, d + 2·margin)
         Brightest pixel at index d/2 + margin.
-    jitter : ndarray of int, shape (B, 2)
+    jitter : ndarray of int, shape (B, 2) or (2,)
         (row, column) by which the brightest pixel moves in the stamp, |jitter| ≤ margin.
 
     Returns
     -------
     ndarray, shape (B, d, d)
     """
-    side = framed.shape[-1] - 2 * margin
-    pixels = np.arange(side)
-    rows = margin - jitter[:, 0, None] + pixels
-    columns = margin - jitter[:, 1, None] + pixels
+    pixels = np.arange(framed.shape[-1] - 2 * margin)
+    start = np.broadcast_to(margin - np.asarray(jitter), (len(framed), 2))[:, :, None] + pixels
     stars = np.arange(len(framed))[:, None, None]
-    return framed[stars, rows[:, :, None], columns[:, None, :]]
+    return framed[stars, start[:, 0, :, None], start[:, 1, None, :]]
 
 
 def normalise_flux(stamps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

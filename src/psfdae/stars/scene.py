@@ -1,20 +1,18 @@
 """What every scene delivers: framed noise-free images from wavefronts.
 
-A scene is a source of wavefronts; this module turns them into stamps. The
-wavefronts arrive as monomial coefficients or as OPD maps, both through the
-small protocol `WavefrontSource`, so that the search for the brightest pixel and
-the propagation are written once.
+A scene is a source of wavefronts; this module turns them into stamps, so that the
+search for the brightest pixel and the propagation are written once.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol
 
 import numpy as np
 
-from psfdae.configuration.schema import Framing, Optics, Telescope
-from psfdae.optics.propagation import StampPropagator
+from psfdae.configuration.schema import Framing, Optics
+from psfdae.configuration.telescope import Telescope
+from psfdae.optics.propagation import StampPropagator, in_batches
 from psfdae.optics.pupil import Pupil, annular_pupil
 from psfdae.optics.sampling import (
     SamplingError,
@@ -22,8 +20,8 @@ from psfdae.optics.sampling import (
     required_nodes,
     required_samples,
 )
+from psfdae.optics.wavefronts import WavefrontSource
 from psfdae.stars.framing import FramingError, brightest_pixel
-from psfdae.threads import side_by_side
 
 SEARCH_ERROR = 1e-3
 """Search-image pixels this far below a tie with the maximum may still be the brightest.
@@ -32,18 +30,6 @@ The search image has all nodes and errs by rounding alone, by 2e-6 of its maximu
 most (256 stars each of scene 1 at 10 and 50 %, and of scene 2). A pixel that is alone
 on the shortlist settles a star; only the others are computed exactly.
 """
-
-
-class WavefrontSource(Protocol):
-    """A batch of wavefronts that can be put on any pupil grid."""
-
-    def __len__(self) -> int: ...
-
-    def slopes(self) -> np.ndarray:
-        """[wavefront, axis, (min, max)] slope in waves per pupil radius, shape (B, 2, 2)."""
-
-    def opd(self, index: np.ndarray, pupil: Pupil, dtype: np.dtype) -> np.ndarray:
-        """OPD in waves of the wavefronts `index` on the grid of `pupil`, shape (b, M, M)."""
 
 
 class Propagation:
@@ -80,25 +66,18 @@ class Propagation:
         self.telescope = telescope
         self.optics = optics
         self.framing = framing
-        self._check_nodes()
-        self.samples = self._choose_samples()
-        self._pupils: dict[int, Pupil] = {}
-
-    def _check_nodes(self) -> None:
-        pixel, nodes = self.telescope.pixel, self.optics.nodes
-        if nodes < required_nodes(pixel):
+        pixel = telescope.pixel
+        if optics.nodes < required_nodes(pixel):
             raise SamplingError(
-                f"optics.nodes = {nodes}: a pixel of {pixel:.3g} λ/D "
-                f"(telescope.pixel_scale_arcsec = {self.telescope.pixel_scale_arcsec:g}) "
+                f"optics.nodes = {optics.nodes}: a pixel of {pixel:.3g} λ/D "
+                f"(telescope.pixel_scale_arcsec = {telescope.pixel_scale_arcsec:g}) "
                 f"needs at least {required_nodes(pixel)} nodes"
             )
-
-    def _choose_samples(self) -> np.ndarray:
-        reach = 2 * self.search_px + 0.5 * self.framing.stamp_px + self.framing.jitter_px
-        reach += 0.5 * self.framing.subpixel
-        edges = np.array([-reach, reach]) * self.telescope.pixel
-        needed = required_samples(self.source.slopes(), np.broadcast_to(edges, (2, 2)))
-        return choose_samples(needed, tuple(self.optics.pupil_samples))
+        reach = 2 * search_px + 0.5 * framing.stamp_px + framing.jitter_px + 0.5 * framing.subpixel
+        edges = np.broadcast_to([-reach * pixel, reach * pixel], (2, 2))
+        needed = required_samples(source.slopes(), edges)
+        self.samples = choose_samples(needed, tuple(optics.pupil_samples))
+        self._pupils: dict[int, Pupil] = {}
 
     def stamps(
         self, stamp_px: int, offset_px: np.ndarray, stars: np.ndarray | None = None
@@ -119,17 +98,50 @@ class Propagation:
         """
         stars = self._everyone() if stars is None else stars
         out = np.empty((len(stars), stamp_px, stamp_px))
-        for pupil, places in self._groups(stars):
+
+        def prepare(samples: int) -> Callable[[np.ndarray], None]:
+            pupil = self._pupil(samples)
             kernel = self._kernel(pupil, stamp_px, self.optics.precision)
 
-            def propagate(
-                batch: np.ndarray, pupil: Pupil = pupil, kernel: StampPropagator = kernel
-            ) -> None:
+            def propagate(batch: np.ndarray) -> None:
                 opd = self.source.opd(stars[batch], pupil, kernel.real_dtype)
                 out[batch] = kernel(opd, offset_px[batch])
 
-            self._run(propagate, places)
+            return propagate
+
+        self._run(stars, prepare)
         return out
+
+    def framed(
+        self,
+        side: int,
+        jitter: np.ndarray | int = 0,
+        stars: np.ndarray | None = None,
+        phase_px: np.ndarray | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Stamps that have their brightest pixel in the middle, up to a centring error.
+
+        Pixel j of the focal plane spans j … j + 1 pixels from the chief ray. The
+        brightest one goes to the 0-based index (side/2, side/2) + `jitter` (`side` even),
+        so the centre of the stamp is `peak` − `jitter` from the chief ray.
+
+        Parameters
+        ----------
+        side : int
+            Of the stamps.
+        jitter : ndarray of int, shape (B, 2)
+            (row, column).
+        stars, phase_px : as for `brightest`
+
+        Returns
+        -------
+        stamps : ndarray, shape (B, side, side), float64
+        peak : ndarray of int, shape (B, 2)
+            The brightest pixels.
+        """
+        peak = self.brightest(stars, phase_px)
+        offset = peak - jitter
+        return self.stamps(side, offset if phase_px is None else offset + phase_px, stars), peak
 
     def brightest(
         self, stars: np.ndarray | None = None, phase_px: np.ndarray | None = None
@@ -173,22 +185,21 @@ class Propagation:
 
     def _search(self, stars: np.ndarray, phase_px: np.ndarray, reach: int) -> np.ndarray:
         peaks = np.empty((len(stars), 2), dtype=np.int64)
-        for pupil, places in self._groups(stars):
+
+        def prepare(samples: int) -> Callable[[np.ndarray], None]:
+            pupil = self._pupil(samples)
             search = self._kernel(pupil, 2 * reach, "complex64")
             exact = self._kernel(pupil, 1, "complex128")
 
-            def find(
-                batch: np.ndarray,
-                pupil: Pupil = pupil,
-                search: StampPropagator = search,
-                exact: StampPropagator = exact,
-            ) -> None:
+            def find(batch: np.ndarray) -> None:
                 members, phase = stars[batch], phase_px[batch]
                 opd = self.source.opd(members, pupil, search.real_dtype)
                 image = search(opd, phase if phase.any() else None)
                 peaks[batch] = self._refine(members, phase, pupil, image, exact) - reach
 
-            self._run(find, places)
+            return find
+
+        self._run(stars, prepare)
         return peaks
 
     def _refine(
@@ -217,20 +228,17 @@ class Propagation:
     def _everyone(self) -> np.ndarray:
         return np.arange(len(self.source))
 
-    def _groups(self, stars: np.ndarray) -> list[tuple[Pupil, np.ndarray]]:
-        """Pupil of every grid size that the wavefronts `stars` use, and where they are in it."""
-        samples = self.samples[stars]
-        return [(self._pupil(int(n)), np.flatnonzero(samples == n)) for n in np.unique(samples)]
-
     def _pupil(self, samples: int) -> Pupil:
         if samples not in self._pupils:
             self._pupils[samples] = annular_pupil(samples, self.telescope.obscuration)
         return self._pupils[samples]
 
-    def _run(self, work: Callable[[np.ndarray], None], places: np.ndarray) -> None:
-        batches = np.array_split(places, range(self.optics.batch, places.size, self.optics.batch))
+    def _run(
+        self, stars: np.ndarray, prepare: Callable[[int], Callable[[np.ndarray], None]]
+    ) -> None:
         # torch has threads of its own, inside every product.
-        side_by_side(work, batches, 1 if self.optics.backend == "torch" else self.optics.threads)
+        threads = 1 if self.optics.backend == "torch" else self.optics.threads
+        in_batches(self.samples[stars], self.optics.batch, threads, prepare)
 
     def _kernel(self, pupil: Pupil, stamp_px: int, precision: str) -> StampPropagator:
         return StampPropagator(

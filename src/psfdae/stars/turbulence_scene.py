@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
+from psfdae.configuration.schema import Grid
+from psfdae.configuration.telescope import Telescope
+from psfdae.configuration.wavefront import VonKarman
 from psfdae.optics.pupil import Pupil, annular_pupil
 from psfdae.optics.sampling import SamplingError
 from psfdae.optics.turbulence import SPECTRUM, Footprints, draw_waves, layer_r0
@@ -60,16 +61,17 @@ class TurbulentWavefronts:
         """
         if self._slopes is None:
             pupil = annular_pupil(SLOPE_SAMPLES, 0.0, sharpen=False)
-            batches = range(0, len(self), SLOPE_BATCH)
-            everyone = np.arange(len(self))
-            measured = [
-                _difference_ranges(
-                    self.opd(everyone[start : start + SLOPE_BATCH], pupil, np.dtype(np.float32)),
-                    pupil,
-                )
-                for start in batches
-            ]
-            self._slopes = SLOPE_MARGIN * np.concatenate(measured)
+            lit = pupil.amplitude > 0
+            pairs = ((2, lit[:, 1:] & lit[:, :-1]), (1, lit[1:] & lit[:-1]))
+            slopes = np.empty((len(self), 2, 2))
+            for start in range(0, len(self), SLOPE_BATCH):
+                part = np.arange(len(self))[start : start + SLOPE_BATCH]
+                opd = self.opd(part, pupil, np.dtype(np.float32))
+                for number, (axis, both) in enumerate(pairs):
+                    step = np.diff(opd, axis=axis)[:, both] / pupil.spacing
+                    slopes[part, number, 0] = step.min(axis=1)
+                    slopes[part, number, 1] = step.max(axis=1)
+            self._slopes = SLOPE_MARGIN * slopes
         return self._slopes
 
     def opd(self, index: np.ndarray, pupil: Pupil, dtype: np.dtype) -> np.ndarray:
@@ -90,63 +92,46 @@ class TurbulentWavefronts:
         return self.footprints.opd(index, pupil.axis, dtype)
 
 
-def template_wavefronts(config: Any) -> TurbulentWavefronts:
+def template_wavefronts(
+    grid: Grid, telescope: Telescope, wavefront: VonKarman
+) -> TurbulentWavefronts:
     """Static wavefronts of all fields.
 
-    The turbulence depends on nothing but the group `wavefront` and the
-    telescope's diameter. Its r0 holds at the telescope's wavelength, in whose
-    waves the OPD is.
-
-    Parameters
-    ----------
-    config : stage config with `grid`, `telescope` and `wavefront` (von_karman)
+    The turbulence depends on nothing but `wavefront` and the telescope's diameter.
+    Its r0 holds at the telescope's wavelength, in whose waves the OPD is.
 
     Raises
     ------
-    ValueError
-        If there is not one height and one strength per layer, or the strengths
-        do not add up to 1.
     SamplingError
         If the turbulence is too strong for the highest frequency.
     """
-    turbulence, telescope = config.wavefront, config.telescope
-    cycles = turbulence.r0_m * CYCLES_PER_DIAMETER / telescope.diameter_m
+    cycles = wavefront.r0_m * CYCLES_PER_DIAMETER / telescope.diameter_m
     left_out = 1.2 * np.pi * SPECTRUM * cycles ** (-5.0 / 3.0)
     if left_out > MOST_LEFT_OUT:
         raise SamplingError(
-            f"wavefront.r0_m = {turbulence.r0_m:g}, telescope.diameter_m = "
+            f"wavefront.r0_m = {wavefront.r0_m:g}, telescope.diameter_m = "
             f"{telescope.diameter_m:g}: a phase variance of {left_out:.2g} rad² lies beyond "
             f"{CYCLES_PER_DIAMETER} cycles per diameter (at most {MOST_LEFT_OUT})"
         )
     highest = CYCLES_PER_DIAMETER / telescope.diameter_m
     layers = [
         draw_waves(
-            turbulence.waves,
+            wavefront.waves,
             r0,
-            turbulence.outer_scale_m,
+            wavefront.outer_scale_m,
             highest,
-            stream(turbulence.seed, "turbulence", layer),
+            stream(wavefront.seed, "turbulence", layer),
         )
-        for layer, r0 in enumerate(layer_r0(turbulence.r0_m, turbulence.layer_strengths))
+        for layer, r0 in enumerate(layer_r0(wavefront.r0_m, wavefront.layer_strengths))
     ]
-    _, angle_deg = square_grid(config.grid.points, config.grid.spacing_deg)
+    _, angle_deg = square_grid(grid.points, grid.spacing_deg)
     return TurbulentWavefronts(
         Footprints(
             layers,
-            turbulence.layer_heights_m,
+            wavefront.layer_heights_m,
             np.deg2rad(angle_deg),
             telescope.diameter_m,
             telescope.obscuration,
-            "tilt" if turbulence.remove_tilt else "piston",
+            "tilt" if wavefront.remove_tilt else "piston",
         )
     )
-
-
-def _difference_ranges(opd: np.ndarray, pupil: Pupil) -> np.ndarray:
-    """Smallest and largest difference of lit neighbours per axis (x, y), shape (B, 2, 2)."""
-    lit = pupil.amplitude > 0
-    pairs = ((2, lit[:, 1:] & lit[:, :-1]), (1, lit[1:] & lit[:-1]))
-    steps = [np.diff(opd, axis=axis)[:, both] / pupil.spacing for axis, both in pairs]
-    return np.stack(
-        [np.stack([step.min(axis=1), step.max(axis=1)], axis=-1) for step in steps], axis=1
-    ).astype(np.float64)

@@ -1,7 +1,13 @@
-"""Zernike coefficients as quadratic functions of a state of misalignment.
+"""Scene 3: a telescope with a misaligned secondary mirror, its states and its wavefronts.
 
-Rays are needed for 25 states only; the 15 terms of the fit then give the
-wavefront of any state within the range at once, and its exact derivatives.
+A state is four numbers in units of the range, in the order of
+`psfdae.optics.raytracing.DEGREES_OF_FREEDOM`. Its data are the stamps at a few fields.
+Wavefronts leave out piston and tilts: all fields move together with the secondary, and
+a stamp is centred on its own centroid.
+
+Rays are needed for 25 states only. Zernike coefficients are quadratic functions of a
+state, and the 15 terms of a fit give the wavefront of any state within the range at
+once, and its exact derivatives.
 """
 
 from __future__ import annotations
@@ -10,6 +16,11 @@ from dataclasses import dataclass
 from itertools import combinations_with_replacement, product
 
 import numpy as np
+
+from psfdae.configuration.alignment import Alignment
+from psfdae.configuration.prescription import Prescription
+from psfdae.configuration.telescope import Telescope
+from psfdae.optics.raytracing import ZernikeTracer
 
 PAIRS = tuple(combinations_with_replacement(range(4), 2))
 """Degrees of freedom of the ten products, in their order."""
@@ -21,14 +32,51 @@ class ModelError(RuntimeError):
     """The quadratic model does not reproduce ray tracing."""
 
 
-def quadratic_terms(states: np.ndarray) -> np.ndarray:
-    """1, the four numbers of a state and their ten products, shape (n, 15).
+def field_points(radius_deg: float, points: int) -> np.ndarray:
+    """The centre of the field and points on a circle, the first on the x axis.
 
-    Parameters
-    ----------
-    states : ndarray, shape (n, 4)
-        In units of the range.
+    Returns
+    -------
+    ndarray, shape (1 + points, 2)
+        Field angles (x, y) in radians.
     """
+    angle = 2.0 * np.pi * np.arange(points) / points
+    circle = np.deg2rad(radius_deg) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return np.concatenate([np.zeros((1, 2)), circle])
+
+
+def grid_states(levels: int) -> np.ndarray:
+    """All combinations of equidistant levels from −1 to 1, shape (levels⁴, 4)."""
+    return np.array(list(product(np.linspace(-1.0, 1.0, levels), repeat=4)))
+
+
+def uniform_states(count: int, rng: np.random.Generator) -> np.ndarray:
+    """Random states, uniform within the range, shape (count, 4)."""
+    return rng.uniform(-1.0, 1.0, size=(count, 4))
+
+
+def design_states() -> np.ndarray:
+    """States for the fit, a central composite design: corners, axes, centre; shape (25, 4)."""
+    return np.concatenate([np.zeros((1, 4)), np.eye(4), -np.eye(4), grid_states(2)])
+
+
+def zernike_tracer(
+    telescope: Telescope, prescription: Prescription, alignment: Alignment
+) -> ZernikeTracer:
+    """Ray tracer from states to Zernike coefficients (n, F, J) at the field points."""
+    from psfdae.stars.prescription import build_optic
+
+    return ZernikeTracer(
+        build_optic(prescription, telescope, alignment.defocus_m),
+        telescope.wavelength_m,
+        field_points(alignment.field_radius_deg, alignment.field_points),
+        alignment.unit,
+        alignment.highest_zernike,
+    )
+
+
+def quadratic_terms(states: np.ndarray) -> np.ndarray:
+    """1, the four numbers of states (n, 4) and their ten products, shape (n, 15)."""
     products = [states[:, a] * states[:, b] for a, b in PAIRS]
     return np.column_stack([np.ones(len(states)), states, *products])
 
@@ -42,12 +90,6 @@ def term_slopes(states: np.ndarray) -> np.ndarray:
         slopes[:, a, term] += states[:, b]
         slopes[:, b, term] += states[:, a]
     return slopes
-
-
-def design_states() -> np.ndarray:
-    """States for the fit, a central composite design: corners, axes, centre; shape (25, 4)."""
-    corners = np.array(list(product((-1.0, 1.0), repeat=4)))
-    return np.concatenate([np.zeros((1, 4)), np.eye(4), -np.eye(4), corners])
 
 
 @dataclass(frozen=True)
@@ -69,16 +111,6 @@ class QuadraticModel:
     def jacobian(self, states: np.ndarray) -> np.ndarray:
         """Derivatives by the four numbers of a state, shape (n, F, 4, J), in waves per range."""
         return np.einsum("nkt,ftj->nfkj", term_slopes(states), self.coefficients)
-
-    def residual(self, states: np.ndarray, zernikes: np.ndarray) -> np.ndarray:
-        """Difference from given coefficients (n, F, J) as a wavefront.
-
-        Returns
-        -------
-        ndarray, shape (n, F)
-            RMS over the unit circle in waves.
-        """
-        return np.sqrt(((self(states) - zernikes) ** 2).sum(axis=-1))
 
 
 def fit_quadratic(states: np.ndarray, zernikes: np.ndarray) -> QuadraticModel:
@@ -107,14 +139,14 @@ def fit_quadratic(states: np.ndarray, zernikes: np.ndarray) -> QuadraticModel:
 def verify(
     model: QuadraticModel, states: np.ndarray, zernikes: np.ndarray, tolerance: float
 ) -> np.ndarray:
-    """RMS difference from ray tracing, shape (n, F), in waves.
+    """RMS difference of a model from coefficients (n, F, J), shape (n, F), in waves.
 
     Raises
     ------
     ModelError
         If it exceeds `tolerance` anywhere; names the state, the field and the RMS.
     """
-    residual = model.residual(states, zernikes)
+    residual = np.sqrt(((model(states) - zernikes) ** 2).sum(axis=-1))
     if not residual.max() <= tolerance:
         state, field = np.unravel_index(residual.argmax(), residual.shape)
         raise ModelError(

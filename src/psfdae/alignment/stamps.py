@@ -9,31 +9,26 @@ derivative of a stamp is that of the centred stamp.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
 from psfdae.configuration.alignment import Alignment, AlignmentOptics
-from psfdae.configuration.schema import Telescope
+from psfdae.configuration.telescope import Telescope
 from psfdae.optics.derivatives import (
     ModalStamps,
     NodeSampling,
     PeriodSampling,
+    Sampling,
     normalise_with_derivatives,
 )
+from psfdae.optics.propagation import in_batches
 from psfdae.optics.pupil import annular_pupil
+from psfdae.optics.raytracing import FIRST_NOLL
 from psfdae.optics.sampling import choose_samples, required_samples
+from psfdae.optics.wavefronts import mode_slopes, slope_ranges
 from psfdae.optics.zernike import noll_to_nm, radial_polynomial, zernike
 from psfdae.stars.framing import normalise_flux
-from psfdae.threads import side_by_side
-
-FIRST_NOLL = 4
-"""Piston and tilts do not show in a centred stamp."""
-
-SLOPE_POINTS = 49
-"""Points per axis at which slopes of wavefronts are measured."""
-
-STEP = 1e-4
-"""Step of the central differences of polynomials; they err by less than 1e-6."""
 
 
 class EnergyError(ValueError):
@@ -92,12 +87,6 @@ def centred_modes(highest: int, obscuration: float, x: np.ndarray, y: np.ndarray
 class AlignmentStamps:
     """Operator from Zernike coefficients to centred stamps and their derivatives.
 
-    Parameters
-    ----------
-    telescope, optics, alignment : config groups
-
-    Notes
-    -----
     Each wavefront uses the smallest grid of the ladder that its slopes allow.
     Batches run in `optics.threads` threads; results do not depend on their number.
     """
@@ -106,27 +95,25 @@ class AlignmentStamps:
         self.telescope = telescope
         self.optics = optics
         self.alignment = alignment
-        self._operators: dict[int, ModalStamps] = {}
-        self._slopes = _slope_basis(alignment.highest_zernike, telescope.obscuration)
-
-    @property
-    def noll(self) -> np.ndarray:
+        self.noll = np.arange(FIRST_NOLL, alignment.highest_zernike + 1)
         """Noll indices of the J coefficients."""
-        return np.arange(FIRST_NOLL, self.alignment.highest_zernike + 1)
+        self._modes = partial(centred_modes, alignment.highest_zernike, telescope.obscuration)
+        self._slopes = mode_slopes(self._modes)
+        self._operators: dict[int, ModalStamps] = {}
 
     def __call__(self, zernikes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Flux-normalised stamps.
 
         Parameters
         ----------
-        zernikes : ndarray, shape (B, J)
+        zernikes : ndarray, shape (..., J)
             Noll 4 … 3 + J in waves.
 
         Returns
         -------
-        stamps : ndarray, shape (B, d, d)
+        stamps : ndarray, shape (..., d, d)
             Each sums to 1; in the configured precision.
-        energy : ndarray, shape (B,)
+        energy : ndarray, shape (...)
             Fraction of the light inside the stamp.
 
         Raises
@@ -136,35 +123,35 @@ class AlignmentStamps:
         EnergyError
             If a stamp holds less than `alignment.least_energy`.
         """
-        side = self.alignment.stamp_px
-        out = np.empty((len(zernikes), side, side), self._real)
+        shape, zernikes = zernikes.shape[:-1], zernikes.reshape(-1, zernikes.shape[-1])
+        raw = self._empty(len(zernikes))
 
         def propagate(operator: ModalStamps, part: np.ndarray) -> None:
-            out[part] = operator.stamps(zernikes[part])
+            raw[part] = operator.stamps(zernikes[part])
 
         self._run(zernikes, self.optics.batch, propagate)
-        stamps, energy = normalise_flux(out)
+        stamps, energy = normalise_flux(raw)
         self._check_energy(energy)
-        return stamps, energy
+        return stamps.reshape(*shape, *stamps.shape[1:]), energy.reshape(shape)
 
     def derivatives(
-        self, zernikes: np.ndarray, directions: np.ndarray | None = None
+        self, zernikes: np.ndarray, directions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Flux-normalised stamps and their derivatives.
 
         Parameters
         ----------
-        zernikes : ndarray, shape (B, J)
+        zernikes : ndarray, shape (..., J)
             In waves.
-        directions : ndarray, shape (B, K, J), optional
-            Changes of the coefficients per unit parameter; by default the
-            coefficients are the parameters, K = J.
+        directions : ndarray, shape (..., K, J)
+            Changes of the coefficients per unit parameter, such as
+            `psfdae.alignment.telescope.QuadraticModel.jacobian`.
 
         Returns
         -------
-        stamps : ndarray, shape (B, d, d)
+        stamps : ndarray, shape (..., d, d)
             Each sums to 1.
-        derivatives : ndarray, shape (B, K, d, d)
+        derivatives : ndarray, shape (..., K, d, d)
             Per unit parameter; each sums to 0.
 
         Raises
@@ -172,23 +159,23 @@ class AlignmentStamps:
         SamplingError, EnergyError
             As for stamps.
         """
-        side, count = self.alignment.stamp_px, len(self.noll)
-        if directions is None:
-            directions = np.broadcast_to(np.eye(count), (len(zernikes), count, count))
-        stamps = np.empty((len(zernikes), side, side), self._real)
-        slopes = np.empty((len(zernikes), directions.shape[1], side, side), self._real)
-        energy = np.empty(len(zernikes), self._real)
+        shape, count = zernikes.shape[:-1], directions.shape[-2]
+        zernikes, directions = (
+            a.reshape(-1, *a.shape[len(shape) :]) for a in (zernikes, directions)
+        )
+        stamps, energy = self._empty(len(zernikes)), np.empty(len(zernikes))
+        slopes = self._empty(len(zernikes), count)
 
         def propagate(operator: ModalStamps, part: np.ndarray) -> None:
             raw = operator.derivatives(zernikes[part], directions[part])
             stamps[part], slopes[part], energy[part] = normalise_with_derivatives(*raw)
 
-        self._run(zernikes, max(1, self.optics.batch // directions.shape[1]), propagate)
+        self._run(zernikes, max(1, self.optics.batch // count), propagate)
         self._check_energy(energy)
-        return stamps, slopes
+        return stamps.reshape(*shape, *stamps.shape[1:]), slopes.reshape(*shape, *slopes.shape[1:])
 
     def samples(self, zernikes: np.ndarray) -> np.ndarray:
-        """Pupil samples N that each wavefront gets, shape (B,).
+        """Pupil samples N of each wavefront, (B, J) to (B,).
 
         Raises
         ------
@@ -196,49 +183,39 @@ class AlignmentStamps:
             If the ladder ends below what a wavefront needs: half a wave per
             sample, and no replica of the image on the stamp.
         """
-        slopes = np.empty((len(zernikes), 2, 2))
-        for axis, basis in enumerate(self._slopes):
-            for start in range(0, len(zernikes), 1024):
-                values = zernikes[start : start + 1024] @ basis
-                slopes[start : start + 1024, axis, 0] = values.min(axis=1)
-                slopes[start : start + 1024, axis, 1] = values.max(axis=1)
         half = 0.5 * self.alignment.stamp_px * self.telescope.pixel
         reach = np.broadcast_to([-half, half], (2, 2))
-        return choose_samples(required_samples(slopes, reach), tuple(self.optics.pupil_samples))
+        needed = required_samples(slope_ranges(self._slopes, zernikes), reach)
+        return choose_samples(needed, tuple(self.optics.pupil_samples))
 
     def operator(self, samples: int) -> ModalStamps:
         """The operator on a pupil grid with N samples across; made once, then kept."""
         if samples not in self._operators:
-            telescope, optics, side = self.telescope, self.optics, self.alignment.stamp_px
-            pupil = annular_pupil(samples, telescope.obscuration)
-            x, y = pupil.axis[None, :], pupil.axis[:, None]
-            modes = centred_modes(self.alignment.highest_zernike, telescope.obscuration, x, y)
-            how = (pupil, side, telescope.pixel)
-            sampling = (
-                PeriodSampling(*how, optics.precision)
-                if optics.nodes is None
-                else NodeSampling(*how, optics.nodes, optics.precision)
+            pupil, pixel = annular_pupil(samples, self.telescope.obscuration), self.telescope.pixel
+            side, nodes, precision = (
+                self.alignment.stamp_px,
+                self.optics.nodes,
+                self.optics.precision,
             )
-            self._operators[samples] = ModalStamps(pupil, modes, sampling, telescope.pixel)
+            sampling: Sampling = (
+                PeriodSampling(pupil, side, pixel, precision)
+                if nodes is None
+                else NodeSampling(pupil, side, pixel, nodes, precision)
+            )
+            self._operators[samples] = ModalStamps(pupil, self._modes, sampling, pixel)
         return self._operators[samples]
 
-    @property
-    def _real(self) -> np.dtype:
-        return np.empty(0, self.optics.precision).real.dtype
+    def _empty(self, *count: int) -> np.ndarray:
+        side = self.alignment.stamp_px
+        return np.empty((*count, side, side), np.empty(0, self.optics.precision).real.dtype)
 
     def _run(
-        self,
-        zernikes: np.ndarray,
-        size: int,
-        work: Callable[[ModalStamps, np.ndarray], None],
+        self, zernikes: np.ndarray, size: int, work: Callable[[ModalStamps, np.ndarray], None]
     ) -> None:
-        samples = self.samples(zernikes)
-        tasks = []
-        for n in np.unique(samples):
-            members = np.flatnonzero(samples == n)
-            batches = np.array_split(members, range(size, members.size, size))
-            tasks += [(self.operator(int(n)), batch) for batch in batches]
-        side_by_side(lambda task: work(*task), tasks, self.optics.threads)
+        def prepare(samples: int) -> Callable[[np.ndarray], None]:
+            return partial(work, self.operator(samples))
+
+        in_batches(self.samples(zernikes), size, self.optics.threads, prepare)
 
     def _check_energy(self, energy: np.ndarray) -> None:
         least = self.alignment.least_energy
@@ -250,22 +227,3 @@ class AlignmentStamps:
                 f"{energy.size} stamps hold too little: alignment.stamp_px = "
                 f"{self.alignment.stamp_px} is too small for these states"
             )
-
-
-def _slope_basis(highest: int, obscuration: float) -> tuple[np.ndarray, np.ndarray]:
-    """Slopes of the centred modes over the lit annulus and its outer rim, (J, points) each."""
-    axis = np.linspace(-1.0, 1.0, SLOPE_POINTS)
-    xx, yy = np.meshgrid(axis, axis)
-    radius = np.hypot(xx, yy)
-    lit = (radius <= 1.0) & (radius >= obscuration)
-    angle = np.linspace(0.0, 2.0 * np.pi, 4 * SLOPE_POINTS, endpoint=False)
-    x = np.append(xx[lit], np.cos(angle))
-    y = np.append(yy[lit], np.sin(angle))
-
-    def modes(dx: float, dy: float) -> np.ndarray:
-        return centred_modes(highest, obscuration, x + dx, y + dy)
-
-    return (
-        (modes(STEP, 0.0) - modes(-STEP, 0.0)) / (2.0 * STEP),
-        (modes(0.0, STEP) - modes(0.0, -STEP)) / (2.0 * STEP),
-    )
