@@ -26,8 +26,7 @@ from psfdae.alignment.fisher import (
 )
 from psfdae.alignment.fit import Likelihood, fit_states, refit_twins
 from psfdae.alignment.stamps import AlignmentStamps
-from psfdae.alignment.symmetry import mirror_symmetries
-from psfdae.alignment.telescope import uniform_states
+from psfdae.alignment.telescope import mirror_symmetries, uniform_states
 from psfdae.configuration.alignment import Cnn, Fit
 from psfdae.configuration.compose import ConfigError, load
 from psfdae.models.cnn import (

@@ -6,14 +6,11 @@ import numpy as np
 import pytest
 from scipy.stats import poisson
 
-from psfdae.bounds.bank import Bank, jittered_templates, jitters, windows
-from psfdae.bounds.discrete import exact_posterior
+from psfdae.bounds.bank import Bank, jittered_templates, jitters, weights, windows
 from psfdae.bounds.efficiency import compare
-from psfdae.bounds.fisher import local_error, sensitivities
+from psfdae.bounds.floor import local_error, sensitivities
 from psfdae.bounds.growth import extrapolate, last_change, nested_means, segments
-from psfdae.bounds.likelihood import Likelihood
-from psfdae.bounds.posterior import merge, posterior_sums
-from psfdae.bounds.symmetry import SYMMETRIES, weights
+from psfdae.bounds.posterior import Likelihood, exact_posterior, merge, posterior_sums
 from psfdae.optics.propagation import StampPropagator
 from psfdae.optics.pupil import annular_pupil
 from psfdae.optics.seidel import monomial_coefficients, monomial_images
@@ -21,6 +18,7 @@ from psfdae.optics.wavefronts import seidel_wavefronts
 from psfdae.stars.fields import perturb, relative_field
 from psfdae.stars.framing import brightest_pixel, normalise_flux
 from psfdae.stars.scene import Propagation
+from psfdae.stars.symmetry import SYMMETRIES
 
 POINTS, SIDE = 3, 8
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from psfdae.alignment.symmetry import Symmetry
+from psfdae.alignment.telescope import Mirror
 from psfdae.rng import stream
 from psfdae.stars.noise import NoiseModel
 
@@ -77,7 +77,7 @@ def epoch_batches(
     batch: int,
     seed: int,
     name: str,
-    symmetries: list[Symmetry] | None = None,
+    mirrors: Sequence[Mirror] = (),
 ) -> Callable[[int], Iterator[Batch]]:
     """Batches of an epoch in an order, with mirrors and noise of its own.
 
@@ -87,7 +87,7 @@ def epoch_batches(
     batch : int
         States per batch.
     seed, name : address of the random streams
-    symmetries : list of Symmetry, optional
+    mirrors : sequence of Mirror, optional
         Each batch goes through a random one.
 
     Returns
@@ -109,9 +109,9 @@ def epoch_batches(
             images, truth, weight = data.stamps[chosen], data.states[chosen], every[chosen]
             if data.disturb is not None:
                 images, weight = data.disturb(images, rng)
-            if symmetries:
-                symmetry = symmetries[rng.integers(len(symmetries))]
-                images, truth = symmetry.stamps(images), symmetry.states(truth)
+            if mirrors:
+                mirror = mirrors[rng.integers(len(mirrors))]
+                images, truth = mirror.stamps(images), mirror.states(truth)
             yield images, truth, weight
 
     return batches

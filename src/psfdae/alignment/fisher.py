@@ -7,8 +7,6 @@ variance (κλ)² + p/F, summed over pixels and fields (Kay 1993, chapter 3).
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from psfdae.alignment.stamps import AlignmentStamps
@@ -97,7 +95,7 @@ def correlations(covariances: np.ndarray) -> np.ndarray:
     return covariances / (sigma[..., :, None] * sigma[..., None, :])
 
 
-def coma_free_decentre(model: QuadraticModel, tilts: np.ndarray, noll: Any) -> np.ndarray:
+def coma_free_decentre(model: QuadraticModel, tilts: np.ndarray, noll: np.ndarray) -> np.ndarray:
     """Decentres that cancel the field-constant coma of tilts, to first order.
 
     Along this line tilt and decentre leave hardly more than linear astigmatism,
@@ -108,7 +106,7 @@ def coma_free_decentre(model: QuadraticModel, tilts: np.ndarray, noll: Any) -> n
     model : QuadraticModel
     tilts : ndarray, shape (n, 2)
         In units of the range.
-    noll : array of int
+    noll : ndarray of int
         Noll indices of the model's coefficients.
 
     Returns
@@ -116,12 +114,12 @@ def coma_free_decentre(model: QuadraticModel, tilts: np.ndarray, noll: Any) -> n
     ndarray, shape (n, 2)
         In units of the range.
     """
-    coma = np.isin(np.asarray(noll), (7, 8))
+    coma = np.isin(noll, (7, 8))
     slopes = model.coefficients[:, 1:5][:, :, coma].mean(axis=0)
     return -np.linalg.solve(slopes[:2].T, slopes[2:].T @ tilts.T).T
 
 
-def twin_states(model: QuadraticModel, states: np.ndarray, noll: Any) -> np.ndarray:
+def twin_states(model: QuadraticModel, states: np.ndarray, noll: np.ndarray) -> np.ndarray:
     """States with the opposite tilt and the same field-constant coma, shape (n, 4).
 
     In focus their stamps hardly differ from those of `states`.

@@ -7,7 +7,8 @@ variance (κλ)² + p/F its fixed point is the maximum of the Poisson likelihood
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from copy import deepcopy
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -25,38 +26,8 @@ DAMPING_FACTOR = 10.0
 
 
 @dataclass(frozen=True)
-class FitResult:
-    """Fitted states of misalignment.
-
-    Attributes
-    ----------
-    states : ndarray, shape (n, 4)
-        In units of the range.
-    deviance : ndarray, shape (n,)
-        Twice the log-likelihood that is missing to a perfect fit; about the
-        number of pixels if the model is true.
-    evaluations : ndarray of int, shape (n,)
-        How often stamps and derivatives were computed.
-    converged : ndarray of bool, shape (n,)
-    """
-
-    states: np.ndarray
-    deviance: np.ndarray
-    evaluations: np.ndarray
-    converged: np.ndarray
-
-
-@dataclass(frozen=True)
 class Likelihood:
-    """Poisson likelihood of stamps at one noise level.
-
-    Attributes
-    ----------
-    model, operator : wavefronts and stamps of the telescope
-    noise : NoiseModel
-    level : float
-        Noise level λ, known to the fit.
-    """
+    """Poisson likelihood of stamps at one noise level λ, known to the fit."""
 
     model: QuadraticModel
     operator: AlignmentStamps
@@ -66,13 +37,9 @@ class Likelihood:
     def evaluate(
         self, images: np.ndarray, states: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Deviance (n,), score (n, 4) and Fisher matrix (n, 4, 4) at states.
+        """Deviance (n,), score (n, 4) and Fisher matrix (n, 4, 4) at states (n, 4).
 
-        Parameters
-        ----------
-        images : ndarray, shape (n, F, d, d)
-            Noisy, normalised by the true flux.
-        states : ndarray, shape (n, 4)
+        `images`, shape (n, F, d, d), are noisy and normalised by the true flux.
         """
         stamps, derivatives = self.operator.derivatives(
             self.model(states), self.model.jacobian(states)
@@ -83,40 +50,50 @@ class Likelihood:
         weighted = slopes / self.noise.variance(expected, self.level)[:, None]
         score = (weighted @ (observed - expected)[:, :, None])[:, :, 0]
         fisher = weighted @ slopes.swapaxes(1, 2)
-        return self._deviance(observed, expected), score, fisher
-
-    def _deviance(self, observed: np.ndarray, expected: np.ndarray) -> np.ndarray:
-        """2 Σ (n ln(n/μ) − (n − μ)) with n = F x + B and μ = F p + B."""
+        # 2 Σ (n ln(n/μ) − (n − μ)) with n = F x + B and μ = F p + B,
         flux, background = self.noise.flux(self.level), self.noise.background
         mean = flux * expected + background
         excess = flux * (observed - expected) / mean
-        # n ln(n/μ) − (n − μ) = μ ((1 + e) ln(1 + e) − e), without cancellation.
+        # of which each term is μ ((1 + e) ln(1 + e) − e), without cancellation.
         logarithm = np.log1p(np.maximum(excess, -1.0 + 1e-12))
-        return 2.0 * (mean * ((1.0 + excess) * logarithm - excess)).sum(axis=1)
+        deviance = 2.0 * (mean * ((1.0 + excess) * logarithm - excess)).sum(axis=1)
+        return deviance, score, fisher
 
 
 @dataclass
-class _Progress:
-    """Where every fit stands."""
+class Fits:
+    """Fits of states of misalignment, where they stand.
+
+    Attributes
+    ----------
+    states : ndarray, shape (n, 4)
+        In units of the range.
+    deviance : ndarray, shape (n,)
+        Twice the log-likelihood that is missing to a perfect fit; about the
+        number of pixels if the model is true.
+    score, fisher : ndarray, shapes (n, 4) and (n, 4, 4)
+        Slope and information of the log-likelihood at `states`.
+    evaluations : ndarray of int, shape (n,)
+        How often stamps and derivatives were computed.
+    converged : ndarray of bool, shape (n,)
+    """
 
     states: np.ndarray
     deviance: np.ndarray
     score: np.ndarray
     fisher: np.ndarray
-    damping: np.ndarray
     evaluations: np.ndarray
-    converged: np.ndarray = field(init=False)
+    converged: np.ndarray
 
-    def __post_init__(self) -> None:
-        self.converged = np.zeros(len(self.states), bool)
+    def take(self, own: np.ndarray, others: Fits, theirs: np.ndarray) -> None:
+        """Put the results `theirs` of other fits in place of those at `own`."""
+        for name in ("states", "deviance", "score", "fisher", "converged"):
+            getattr(self, name)[own] = getattr(others, name)[theirs]
 
 
 def fit_states(
-    likelihood: Likelihood,
-    images: np.ndarray,
-    start: np.ndarray,
-    settings: Fit,
-) -> FitResult:
+    likelihood: Likelihood, images: np.ndarray, start: np.ndarray, settings: Fit
+) -> Fits:
     """Fit states to noisy stamps, each from one starting point.
 
     Parameters
@@ -128,51 +105,36 @@ def fit_states(
         In units of the range; limited to ± `settings.limit`, as are all states.
     settings : config group `fit`
     """
-    states = np.clip(np.asarray(start, np.float64), -settings.limit, settings.limit)
-    now = _Progress(
-        states,
-        *likelihood.evaluate(images, states),
-        np.full(len(states), settings.damping),
-        np.ones(len(states), int),
+    count, limit = len(start), settings.limit
+    states = np.clip(np.asarray(start, np.float64), -limit, limit)
+    now = Fits(
+        states, *likelihood.evaluate(images, states), np.ones(count, int), np.zeros(count, bool)
     )
+    damping = np.full(count, settings.damping)
     for _ in range(settings.iterations):
         active = np.flatnonzero(~now.converged)
         if not active.size:
             break
-        _iterate(now, active, likelihood, images, settings)
-    return FitResult(now.states, now.deviance, now.evaluations, now.converged)
+        step = _damped_step(now, active, damping[active], limit)
+        # A step of a small part of the standard error changes nothing that matters.
+        size = np.sqrt(np.einsum("nk,nkl,nl->n", step, now.fisher[active], step))
+        states = now.states[active] + step
+        evaluated = likelihood.evaluate(images[active], states)
+        proposed = Fits(states, *evaluated, np.ones(active.size, int), size <= settings.tolerance)
+        better = proposed.deviance <= now.deviance[active] * (1.0 + ROUNDING)
+        now.take(active[better], proposed, better)
+        now.evaluations[active] += 1
+        now.converged[active] = proposed.converged
+        damping[active] *= np.where(better, 1.0 / DAMPING_FACTOR, DAMPING_FACTOR)
+    return now
 
 
-def _iterate(
-    now: _Progress,
-    active: np.ndarray,
-    likelihood: Likelihood,
-    images: np.ndarray,
-    settings: Fit,
-) -> None:
-    """One damped step of the fits that have not converged."""
-    step = _damped_step(now, active, settings.limit)
-    size = np.sqrt(np.einsum("nk,nkl,nl->n", step, now.fisher[active], step))
-    proposed = now.states[active] + step
-    deviance, score, fisher = likelihood.evaluate(images[active], proposed)
-    now.evaluations[active] += 1
-    better = deviance <= now.deviance[active] * (1.0 + ROUNDING)
-    accepted = active[better]
-    now.states[accepted] = proposed[better]
-    now.deviance[accepted] = deviance[better]
-    now.score[accepted] = score[better]
-    now.fisher[accepted] = fisher[better]
-    now.damping[active] *= np.where(better, 1.0 / DAMPING_FACTOR, DAMPING_FACTOR)
-    # A step of a small part of the standard error changes nothing that matters.
-    now.converged[active] = size <= settings.tolerance
-
-
-def _damped_step(now: _Progress, active: np.ndarray, limit: float) -> np.ndarray:
+def _damped_step(now: Fits, active: np.ndarray, damping: np.ndarray, limit: float) -> np.ndarray:
     """Steps of the active fits, cut at the limit; numbers held there leave the equations."""
     states, score, fisher = now.states[active], now.score[active], now.fisher[active].copy()
     held = ((states >= limit) & (score > 0)) | ((states <= -limit) & (score < 0))
     diagonal = np.arange(states.shape[1])
-    fisher[:, diagonal, diagonal] *= 1.0 + now.damping[active, None]
+    fisher[:, diagonal, diagonal] *= 1.0 + damping[:, None]
     fisher[held[:, :, None] | held[:, None, :]] = 0.0
     fisher[:, diagonal, diagonal] += held
     step = np.linalg.solve(fisher, np.where(held, 0.0, score)[:, :, None])[:, :, 0]
@@ -180,36 +142,30 @@ def _damped_step(now: _Progress, active: np.ndarray, limit: float) -> np.ndarray
 
 
 def refit_twins(
-    likelihood: Likelihood, images: np.ndarray, first: FitResult, noll: np.ndarray, settings: Fit
-) -> tuple[FitResult, np.ndarray]:
+    likelihood: Likelihood, images: np.ndarray, first: Fits, noll: np.ndarray, settings: Fit
+) -> tuple[Fits, np.ndarray]:
     """Fit again from the twins that lie within the limit; keep what is more likely.
 
     Parameters
     ----------
     likelihood, images, settings : see `fit_states`
-    first : FitResult
-        Fits whose twins are tried.
+    first : Fits
+        Whose twins are tried.
     noll : ndarray of int
         Noll indices of the model's coefficients.
 
     Returns
     -------
-    FitResult
+    Fits
         `evaluations` count both fits.
     tried : ndarray of bool, shape (n,)
     """
     twins = twin_states(likelihood.model, first.states, noll)
     tried = (np.abs(twins) <= settings.limit).all(axis=1)
-    if not tried.any():
-        return first, tried
-    second = fit_states(likelihood, images[tried], twins[tried], settings)
-    better = second.deviance < first.deviance[tried] * (1.0 - ROUNDING)
-    rows = np.flatnonzero(tried)[better]
-    states, deviance, converged = (
-        array.copy() for array in (first.states, first.deviance, first.converged)
-    )
-    states[rows], deviance[rows] = second.states[better], second.deviance[better]
-    converged[rows] = second.converged[better]
-    evaluations = first.evaluations.copy()
-    evaluations[tried] += second.evaluations
-    return FitResult(states, deviance, evaluations, converged), tried
+    best = deepcopy(first)
+    if tried.any():
+        second = fit_states(likelihood, images[tried], twins[tried], settings)
+        better = second.deviance < first.deviance[tried] * (1.0 - ROUNDING)
+        best.take(np.flatnonzero(tried)[better], second, better)
+        best.evaluations[tried] += second.evaluations
+    return best, tried

@@ -8,6 +8,11 @@ a stamp is centred on its own centroid.
 Rays are needed for 25 states only. Zernike coefficients are quadratic functions of a
 state, and the 15 terms of a fit give the wavefront of any state within the range at
 once, and its exact derivatives.
+
+An aligned telescope and its ring of field points look the same in a mirror through
+the axis. Its image is the telescope with the mirrored misalignment: a decentre is a
+vector; a tilt is the axial vector of a rotation, whose component along the normal of
+the mirror stays while the other turns.
 """
 
 from __future__ import annotations
@@ -21,6 +26,8 @@ from psfdae.configuration.alignment import Alignment
 from psfdae.configuration.prescription import Prescription
 from psfdae.configuration.telescope import Telescope
 from psfdae.optics.raytracing import ZernikeTracer
+from psfdae.stars.prescription import build_optic
+from psfdae.stars.symmetry import SYMMETRIES, Symmetry
 
 PAIRS = tuple(combinations_with_replacement(range(4), 2))
 """Degrees of freedom of the ten products, in their order."""
@@ -64,8 +71,6 @@ def zernike_tracer(
     telescope: Telescope, prescription: Prescription, alignment: Alignment
 ) -> ZernikeTracer:
     """Ray tracer from states to Zernike coefficients (n, F, J) at the field points."""
-    from psfdae.stars.prescription import build_optic
-
     return ZernikeTracer(
         build_optic(prescription, telescope, alignment.defocus_m),
         telescope.wavelength_m,
@@ -73,6 +78,50 @@ def zernike_tracer(
         alignment.unit,
         alignment.highest_zernike,
     )
+
+
+@dataclass(frozen=True)
+class Mirror:
+    """A symmetry of the telescope, as it acts on states, fields and stamps.
+
+    Attributes
+    ----------
+    symmetry : Symmetry
+        Of a stamp, whose rows run along y.
+    state : ndarray, shape (4, 4)
+        Signed permutation of the four numbers of a state.
+    fields : ndarray of int, shape (F,)
+        The mirrored telescope's stamp at field k is that of field `fields[k]`.
+    """
+
+    symmetry: Symmetry
+    state: np.ndarray
+    fields: np.ndarray
+
+    def states(self, states: np.ndarray) -> np.ndarray:
+        """Mirrored states, shape (n, 4)."""
+        return states @ self.state.T
+
+    def stamps(self, stamps: np.ndarray) -> np.ndarray:
+        """Stamps of the mirrored states, shape (n, F, d, d)."""
+        return self.symmetry.image(stamps[:, self.fields])
+
+
+def mirror_symmetries(points: int) -> list[Mirror]:
+    """The identity and the other symmetries that map `field_points` on themselves.
+
+    Eight, fewer if the number of points on the circle is not a multiple of 4.
+    """
+    fields, mirrors = field_points(45.0, points), []
+    for symmetry in SYMMETRIES:
+        matrix = symmetry.matrix
+        # The mirrored telescope shows at p what the telescope shows at matrix⁻¹ p.
+        distance = np.linalg.norm((fields @ matrix)[:, None] - fields, axis=2)
+        if distance.min(axis=1).max() < 1e-9:  # no field point maps between two
+            state = np.zeros((4, 4))
+            state[:2, :2], state[2:, 2:] = matrix, np.round(np.linalg.det(matrix)) * matrix
+            mirrors.append(Mirror(symmetry, state, distance.argmin(axis=1)))
+    return mirrors
 
 
 def quadratic_terms(states: np.ndarray) -> np.ndarray:

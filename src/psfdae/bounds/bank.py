@@ -7,8 +7,8 @@ from itertools import product
 
 import numpy as np
 
-from psfdae.bounds.symmetry import SYMMETRIES, weights
 from psfdae.stars.framing import crop_jittered, normalise_flux
+from psfdae.stars.symmetry import SYMMETRIES
 
 MIRROR_MARGIN = 1
 """Pixels beyond the jitter that a flipped stamp needs (`Symmetry.window`)."""
@@ -46,11 +46,6 @@ class Bank:
         """Pixels m on either side of the stamp."""
         return self.jitter_px + MIRROR_MARGIN
 
-    @property
-    def stamp_px(self) -> int:
-        """Side d of a stamp."""
-        return self.framed.shape[-1] - 2 * self.margin
-
     def take(self, stars: np.ndarray) -> Bank:
         """Some of the stars, in the order given."""
         part = (self.framed[stars], self.field[stars], self.peak[stars])
@@ -58,21 +53,48 @@ class Bank:
 
     def stamps(self, window: tuple[int, int]) -> np.ndarray:
         """Stamps cut at a window (first row, first column), sum 1, shape (M, d, d), float64."""
-        row, column = window
-        side = self.stamp_px
-        cut = self.framed[:, row : row + side, column : column + side].astype(np.float64)
-        return normalise_flux(cut)[0]
+        cut = crop_jittered(self.framed, np.subtract(self.margin, window), self.margin)
+        return normalise_flux(cut.astype(np.float64))[0]
 
     def log_weights(self) -> np.ndarray:
-        """Logarithm of `symmetry.weights`, −∞ for zero, shape (M, 8)."""
+        """Logarithm of `weights`, −∞ for zero, shape (M, 8)."""
         with np.errstate(divide="ignore"):
             return np.log(weights(self.field, self.peak, self.points))
 
 
+def weights(field: np.ndarray, peak: np.ndarray, points: int) -> np.ndarray:
+    """How often each symmetry of each star counts so that all fields stay equally likely.
+
+    At a field point on a mirror axis two symmetries (in the centre all eight) lead
+    to the same star, with its equal maxima exchanged. Only the one that frames the
+    first maximum in (row, column) order is right; it counts for all of them.
+
+    Parameters
+    ----------
+    field : ndarray of int, shape (M,)
+        Field of every star, ix + P·iy.
+    peak : ndarray of int, shape (M, 2)
+        The star's framed pixel (row, column) from the chief ray.
+    points : int
+        Field points P along a side.
+
+    Returns
+    -------
+    ndarray of int, shape (M, 8)
+        Zero, or the number of symmetries that lead to the same field; rows sum to 8.
+    """
+    target = np.stack([s.field(field, points) for s in SYMMETRIES], axis=1)
+    pixel = np.stack([s.pixel(peak) for s in SYMMETRIES], axis=1)
+    reach = 2 * int(np.abs(peak).max()) + 3
+    order = (pixel[..., 0] * reach + pixel[..., 1]) * len(SYMMETRIES) + np.arange(len(SYMMETRIES))
+    same = target[:, :, None] == target[:, None, :]
+    first = np.where(same, order[:, None, :], np.iinfo(order.dtype).max).min(axis=2)
+    return np.where(order == first, same.sum(axis=2), 0)
+
+
 def jitters(jitter_px: int) -> list[tuple[int, int]]:
     """All centring errors (row, column) of up to `jitter_px` pixels per axis."""
-    steps = range(-jitter_px, jitter_px + 1)
-    return list(product(steps, steps))
+    return list(product(range(-jitter_px, jitter_px + 1), repeat=2))
 
 
 def windows(jitter_px: int) -> dict[tuple[int, int], list[tuple[int, int]]]:
@@ -98,12 +120,6 @@ def jittered_templates(framed: np.ndarray, jitter_px: int) -> np.ndarray:
     ndarray, shape (F, J, d, d), float32
         Sum 1; order of `jitters`.
     """
-    stamps = [
-        normalise_flux(
-            crop_jittered(
-                framed.astype(np.float64), np.tile(jitter, (len(framed), 1)), margin=jitter_px
-            )
-        )[0]
-        for jitter in jitters(jitter_px)
-    ]
-    return np.stack(stamps, axis=1).astype(np.float32)
+    framed = framed.astype(np.float64)
+    cuts = [crop_jittered(framed, np.array(jitter), jitter_px) for jitter in jitters(jitter_px)]
+    return np.stack([normalise_flux(cut)[0] for cut in cuts], axis=1).astype(np.float32)

@@ -52,18 +52,7 @@ def nested_means(
 
 
 def last_change(errors: Sequence[float]) -> float:
-    """Relative change of an error over the last fourfold growth of the bank.
-
-    Parameters
-    ----------
-    errors : sequence of float
-        Error of banks that double in size, smallest first.
-
-    Returns
-    -------
-    float
-        |error(M/4)/error(M) − 1|; NaN for fewer than three sizes.
-    """
+    """|error(M/4)/error(M) − 1| of banks that double in size; NaN for fewer than three."""
     if len(errors) < 3:
         return float("nan")
     return abs(errors[-3] / errors[-1] - 1.0)

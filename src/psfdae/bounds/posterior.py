@@ -1,24 +1,37 @@
-"""Posterior mean of a star over a bank of simulated stars.
+"""Posterior mean of a star over a sample of what it could be.
 
-With the bank as a sample of the prior, the posterior mean is the average of the
-bank's images weighted with their likelihoods. It is an estimator like any other,
-so its error is an upper limit of the Bayes error, and the limit itself once the
-bank is dense enough.
+With a bank of simulated stars as a sample of the prior, the posterior mean is the
+average of the bank's images weighted with their likelihoods. It is an estimator like
+any other, so its error is an upper limit of the Bayes error, and the limit itself once
+the bank is dense enough. Where a star can only be one of a few known images (scene 2)
+the sum over them is exact.
 
-The bank is read once, in chunks; sums are kept relative to the largest
-log-likelihood so far of every star.
+A star with the noise-free image p (Σp = 1), flux F and sky B gives counts
+n ~ Poisson(F p + B). Up to terms without p,
+
+    log L(n | p) = n·ℓ(p) − F Σp,   ℓ(p) = log(1 + F p / B),
+
+a matrix product for all stars and all p at once. With counts of 10⁴ and more its
+sums reach 10⁶, where single precision cannot see differences of order 1. So the
+counts n̄ and the ℓ̄ of a mean image are taken out of both factors,
+
+    log L = (n − n̄)·(ℓ − ℓ̄) + [n̄·ℓ − F Σp] + terms without p:
+
+the bracket depends on p alone and is summed in double precision. The bank is read
+once, in chunks; sums are kept relative to the largest log-likelihood so far of every
+star.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from psfdae.bounds.bank import Bank, jitters, windows
-from psfdae.bounds.likelihood import Likelihood
-from psfdae.bounds.symmetry import SYMMETRIES, Symmetry
+from psfdae.stars.noise import NoiseModel
+from psfdae.stars.symmetry import SYMMETRIES, Symmetry
 
 DEPTH = 30.0
 """Images whose log-likelihood is this far below a star's best are left out.
@@ -28,6 +41,68 @@ Millions of them together weigh less than 1e-6 of the best one.
 
 CHUNK = 512
 """Stars of the bank per matrix product; scores of 420 test stars then fit the cache."""
+
+
+@dataclass(frozen=True)
+class Likelihood:
+    """Poisson likelihood of stars of one noise level.
+
+    Attributes
+    ----------
+    flux, background : float
+        Photons F in the stamp and B per pixel.
+    centre : ndarray, shape (P,)
+        Mean image that is taken out. It must not change under the symmetries of
+        the square, because counts and images are compared mirrored, too.
+    """
+
+    flux: float
+    background: float
+    centre: np.ndarray
+
+    @classmethod
+    def of(cls, noise: NoiseModel, level: float, images: np.ndarray) -> Likelihood:
+        """Likelihood at noise level λ, centred on images of shape (n, d, d)."""
+        mean = images.mean(axis=0, dtype=np.float64)
+        symmetric = np.mean([symmetry.image(mean) for symmetry in SYMMETRIES], axis=0)
+        return cls(float(noise.flux(level)), noise.background, symmetric.ravel())
+
+    def residuals(self, noisy: np.ndarray) -> np.ndarray:
+        """Counts n − n̄ of normalised, sky-subtracted images.
+
+        Parameters
+        ----------
+        noisy : ndarray, shape (n, d, d)
+            As `NoiseModel.draw` gives them; counts are whole numbers, so rounding
+            undoes the loss of single precision.
+
+        Returns
+        -------
+        ndarray, shape (n, P), float64
+        """
+        counts = np.rint(self.flux * noisy.reshape(len(noisy), -1).astype(np.float64))
+        return counts - self.flux * self.centre
+
+    def factors(self, stamps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """What multiplies the residuals, and what is added to the product.
+
+        Parameters
+        ----------
+        stamps : ndarray, shape (K, P), float64
+
+        Returns
+        -------
+        ratio : ndarray, shape (K, P), float64
+            ℓ − ℓ̄.
+        offset : ndarray, shape (K,), float64
+            n̄·ℓ − F Σp.
+        """
+        scale = self.flux / self.background
+        ratio = np.log1p(scale * stamps)
+        expected = self.background + self.flux * self.centre
+        offset = ratio @ expected - self.flux * stamps.sum(axis=1)
+        ratio -= np.log1p(scale * self.centre)
+        return ratio, offset
 
 
 @dataclass
@@ -55,13 +130,8 @@ class PosteriorSums:
     @classmethod
     def empty(cls, stars: int, pixels: int, fields: int, shifts: int) -> PosteriorSums:
         """Sums over nothing."""
-        return cls(
-            np.full(stars, -np.inf),
-            np.zeros(stars),
-            np.zeros(stars),
-            np.zeros((stars, pixels)),
-            np.zeros((stars, fields, shifts)),
-        )
+        zeros = (np.zeros((stars, *shape)) for shape in ((), (), (pixels,), (fields, shifts)))
+        return cls(np.full(stars, -np.inf), *zeros)
 
     @property
     def mean_image(self) -> np.ndarray:
@@ -74,17 +144,33 @@ class PosteriorSums:
         return self.total**2 / self.square
 
     def mean_template(self, templates: np.ndarray) -> np.ndarray:
-        """Posterior mean of the static PSF, shape (n, P).
-
-        Parameters
-        ----------
-        templates : ndarray, shape (F, J, d, d)
-        """
+        """Posterior mean of the static PSF, (F, J, d, d) to (n, P)."""
         weight = self.share.reshape(len(self.share), -1) / self.total[:, None]
         return weight @ templates.reshape(weight.shape[1], -1).astype(np.float64)
 
-    def raise_peak(self, peak: np.ndarray) -> None:
-        """Refer the weights to another largest log-likelihood, shape (n,)."""
+    def add(
+        self,
+        scores: np.ndarray,
+        images: np.ndarray,
+        symmetry: Symmetry,
+        field: np.ndarray,
+        jitter: int,
+    ) -> None:
+        """Add images of one symmetry and jitter.
+
+        Parameters
+        ----------
+        scores : ndarray, shape (n, K), float64
+            Log-likelihood plus log-prior.
+        images : ndarray, shape (K, P), float32
+            Images before `symmetry`.
+        field : ndarray of int, shape (K,)
+            Field after `symmetry`; equal values lie side by side.
+        """
+        peak = np.maximum(self.peak, scores.max(axis=1))
+        used = np.flatnonzero((scores > (peak - DEPTH)[:, None]).any(axis=0))
+        if not used.size:
+            return
         changed = np.flatnonzero(peak != self.peak)
         # A star without any image so far has peak −∞ and sums of zero.
         scale = np.exp(self.peak[changed] - peak[changed])
@@ -93,6 +179,14 @@ class PosteriorSums:
         self.image[changed] *= scale[:, None]
         self.share[changed] *= scale[:, None, None]
         self.peak = peak
+        weight = np.exp((scores[:, used] - peak[:, None]).astype(np.float32))
+        self.total += weight.sum(axis=1, dtype=np.float64)
+        self.square += np.einsum("nk,nk->n", weight, weight, dtype=np.float64)
+        side = int(np.sqrt(images.shape[1]))
+        added = symmetry.image((weight @ images[used]).reshape(-1, side, side))
+        self.image += added.reshape(self.image.shape)
+        start = np.flatnonzero(np.diff(field[used], prepend=-1))
+        self.share[:, field[used][start], jitter] += np.add.reduceat(weight, start, axis=1)
 
 
 def merge(parts: Sequence[PosteriorSums]) -> PosteriorSums:
@@ -132,7 +226,9 @@ def posterior_sums(
     ]
     shifts = len(jitters(bank.jitter_px))
     sums = PosteriorSums.empty(len(noisy), noisy[0].size, bank.points**2, shifts)
-    for part in _chunks(bank, chunk):
+    order = np.argsort(bank.field, kind="stable")  # stars of a field side by side
+    for start in range(0, order.size, chunk):
+        part = bank.take(order[start : start + chunk])
         log_weights = part.log_weights()
         for window, members in windows(bank.jitter_px).items():
             stamps = part.stamps(window).reshape(len(part), -1)
@@ -141,46 +237,35 @@ def posterior_sums(
             for s, jitter in members:
                 scores = mirrored[s] @ ratio_t + (offset + log_weights[:, s])
                 field = SYMMETRIES[s].field(part.field, bank.points)
-                _accumulate(sums, scores, images, SYMMETRIES[s], field, jitter)
+                sums.add(scores, images, SYMMETRIES[s], field, jitter)
     return sums
 
 
-def _chunks(bank: Bank, size: int) -> Iterator[Bank]:
-    """Parts of a bank, stars of a field side by side."""
-    order = np.argsort(bank.field, kind="stable")
-    for start in range(0, order.size, size):
-        yield bank.take(order[start : start + size])
+def exact_posterior(
+    noisy: np.ndarray, templates: np.ndarray, likelihood: Likelihood
+) -> tuple[np.ndarray, np.ndarray]:
+    """Posterior mean and probability of every template, its centring error summed out.
 
-
-def _accumulate(
-    sums: PosteriorSums,
-    scores: np.ndarray,
-    images: np.ndarray,
-    symmetry: Symmetry,
-    field: np.ndarray,
-    jitter: int,
-) -> None:
-    """Add images of one symmetry and jitter.
+    All templates and all centring errors are equally likely beforehand.
 
     Parameters
     ----------
-    scores : ndarray, shape (n, K), float64
-        Log-likelihood plus log-prior.
-    images : ndarray, shape (K, P), float32
-        Images before `symmetry`.
-    field : ndarray of int, shape (K,)
-        Field after `symmetry`; equal values lie side by side.
+    noisy : ndarray, shape (n, d, d)
+    templates : ndarray, shape (F, J, d, d)
+        Every template at every centring error.
+    likelihood : Likelihood
+        Of the images' noise level.
+
+    Returns
+    -------
+    mean : ndarray, shape (n, d, d)
+    probability : ndarray, shape (n, F)
     """
-    peak = np.maximum(sums.peak, scores.max(axis=1))
-    used = np.flatnonzero((scores > (peak - DEPTH)[:, None]).any(axis=0))
-    if not used.size:
-        return
-    sums.raise_peak(peak)
-    weight = np.exp((scores[:, used] - peak[:, None]).astype(np.float32))
-    sums.total += weight.sum(axis=1, dtype=np.float64)
-    sums.square += np.einsum("nk,nk->n", weight, weight, dtype=np.float64)
-    side = int(np.sqrt(images.shape[1]))
-    added = symmetry.image((weight @ images[used]).reshape(-1, side, side))
-    sums.image += added.reshape(sums.image.shape)
-    start = np.flatnonzero(np.diff(field[used], prepend=-1))
-    sums.share[:, field[used][start], jitter] += np.add.reduceat(weight, start, axis=1)
+    fields, shifts = templates.shape[:2]
+    images = templates.reshape(fields * shifts, -1).astype(np.float64)
+    ratio, offset = likelihood.factors(images)
+    scores = likelihood.residuals(noisy) @ ratio.T + offset
+    weight = np.exp(scores - scores.max(axis=1, keepdims=True))
+    weight /= weight.sum(axis=1, keepdims=True)
+    mean = (weight @ images).reshape(noisy.shape)
+    return mean, weight.reshape(-1, fields, shifts).sum(axis=2)

@@ -48,7 +48,7 @@ def cnn_predictor(folder: Path, config: Any) -> Callable[[np.ndarray], np.ndarra
     """
     import torch
 
-    from psfdae.alignment.symmetry import mirror_symmetries
+    from psfdae.alignment.telescope import mirror_symmetries
     from psfdae.configuration.alignment import Cnn
     from psfdae.configuration.compose import validate
     from psfdae.models.cnn import load_cnn, predict_states

@@ -182,14 +182,14 @@ def _train(
     checkpoint: Path,
 ) -> None:
     """Train one CNN and leave weights, resolved config and history in a folder."""
-    from psfdae.alignment.symmetry import mirror_symmetries
+    from psfdae.alignment.telescope import mirror_symmetries
     from psfdae.models.cnn import CnnTraining, train_cnn
     from psfdae.models.weights import save_weights
 
     limit_threads(settings.threads)
     stamps = data.stamps
     fields, side = stamps.shape[1], stamps.shape[-1]
-    mirrors = mirror_symmetries(fields - 1) if settings.mirrors else None
+    mirrors = mirror_symmetries(fields - 1) if settings.mirrors else []
     training = CnnTraining(
         epoch_batches(data, settings.batch, config.seed, name, mirrors),
         steps_per_epoch(len(data.states), settings.batch),

@@ -12,8 +12,7 @@ import numpy as np
 from psfdae.belonging import STARS, STATIC, require
 from psfdae.bounds.bank import Bank, jittered_templates
 from psfdae.bounds.growth import TIGHT, extrapolate, last_change, nested_means, segments
-from psfdae.bounds.likelihood import Likelihood
-from psfdae.bounds.posterior import PosteriorSums, posterior_sums
+from psfdae.bounds.posterior import Likelihood, PosteriorSums, exact_posterior, posterior_sums
 from psfdae.cli import File, command
 from psfdae.configuration.schema import Config
 from psfdae.configuration.stages import SIMULATION
@@ -190,7 +189,7 @@ def _read_bank(path: Path, stars: Product) -> Bank:
 
 
 def _floor(config: Config, product: Product, tables: Tables) -> None:
-    from psfdae.bounds.fisher import local_error, sensitivities
+    from psfdae.bounds.floor import local_error, sensitivities
     from psfdae.stars.fields import relative_field
 
     stars = tables.stars
@@ -280,8 +279,6 @@ def _growth_rows(
 
 def _exact(config: Config, static: np.ndarray, tables: Tables) -> None:
     """The exact posterior over the templates at all centring errors."""
-    from psfdae.bounds.discrete import exact_posterior
-
     stars = tables.stars
     for level in config.noise.levels:
         likelihood = Likelihood.of(noise_model(config), level, static[:, static.shape[1] // 2])

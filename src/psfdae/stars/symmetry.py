@@ -1,4 +1,4 @@
-"""The eight mirror images and rotations of a square field, and how they move a frame.
+"""The eight mirror images and rotations of a square, and how they move a framed image.
 
 A rotationally symmetric telescope gives, at a mirrored field point, the mirrored
 image. One propagated star therefore stands for eight: its image, transposed and
@@ -12,6 +12,7 @@ framed, before and after a flip.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
@@ -22,10 +23,6 @@ class Symmetry:
 
     Rows run along the field angle y, columns along x, so the same operation moves
     images and field points.
-
-    Attributes
-    ----------
-    transpose, flip_rows, flip_columns : bool
     """
 
     transpose: bool
@@ -34,14 +31,18 @@ class Symmetry:
 
     def image(self, stamps: np.ndarray) -> np.ndarray:
         """Move images, shape (..., h, h)."""
-        if self.transpose:
-            stamps = stamps.swapaxes(-1, -2)
-        return self._flip(stamps)
+        return self._flip(stamps.swapaxes(-1, -2) if self.transpose else stamps)
 
     def undo(self, stamps: np.ndarray) -> np.ndarray:
         """Take `image` back, shape (..., h, h)."""
         stamps = self._flip(stamps)
         return stamps.swapaxes(-1, -2) if self.transpose else stamps
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """What moves field vectors (x, y), shape (2, 2)."""
+        exchange = np.eye(2)[::-1] if self.transpose else np.eye(2)
+        return np.diag([1 - 2 * self.flip_columns, 1 - 2 * self.flip_rows]) @ exchange
 
     def pixel(self, index: np.ndarray) -> np.ndarray:
         """Move pixels (row, column) counted from the chief ray, shape (..., 2).
@@ -61,20 +62,10 @@ class Symmetry:
         return ix + points * iy
 
     def window(self, jitter: tuple[int, int], margin: int) -> tuple[int, int]:
-        """First row and column to cut from the unmoved image.
+        """First row and column to cut from an image whose brightest pixel is at d/2 + `margin`.
 
-        Parameters
-        ----------
-        jitter : (row, column) of the moved stamp
-        margin : int
-            The unmoved image has d + 2·`margin` pixels a side and its brightest one
-            at index d/2 + `margin`; |jitter| must be below `margin`.
-
-        Returns
-        -------
-        (row, column)
-            The d × d pixels from there, moved by `image`, have the brightest pixel
-            at (d/2, d/2) + `jitter`.
+        The d × d pixels from there, moved by `image`, have it at (d/2, d/2) + `jitter`;
+        |jitter| must be below `margin`.
         """
         flips = (self.flip_rows, self.flip_columns)
         start = [
@@ -89,40 +80,5 @@ class Symmetry:
         return stamps[..., ::-1] if self.flip_columns else stamps
 
 
-SYMMETRIES = tuple(
-    Symmetry(transpose, rows, columns)
-    for transpose in (False, True)
-    for rows in (False, True)
-    for columns in (False, True)
-)
+SYMMETRIES = tuple(Symmetry(*flags) for flags in product((False, True), repeat=3))
 """All eight, the identity first."""
-
-
-def weights(field: np.ndarray, peak: np.ndarray, points: int) -> np.ndarray:
-    """How often each symmetry of each star counts so that all fields stay equally likely.
-
-    At a field point on a mirror axis two symmetries (in the centre all eight) lead
-    to the same star, with its equal maxima exchanged. Only the one that frames the
-    first maximum in (row, column) order is right; it counts for all of them.
-
-    Parameters
-    ----------
-    field : ndarray of int, shape (M,)
-        Field of every star, ix + P·iy.
-    peak : ndarray of int, shape (M, 2)
-        The star's framed pixel (row, column) from the chief ray.
-    points : int
-        Field points P along a side.
-
-    Returns
-    -------
-    ndarray of int, shape (M, 8)
-        Zero, or the number of symmetries that lead to the same field; rows sum to 8.
-    """
-    target = np.stack([s.field(field, points) for s in SYMMETRIES], axis=1)
-    pixel = np.stack([s.pixel(peak) for s in SYMMETRIES], axis=1)
-    reach = 2 * int(np.abs(peak).max()) + 3
-    order = (pixel[..., 0] * reach + pixel[..., 1]) * len(SYMMETRIES) + np.arange(len(SYMMETRIES))
-    same = target[:, :, None] == target[:, None, :]
-    first = np.where(same, order[:, None, :], np.iinfo(order.dtype).max).min(axis=2)
-    return np.where(order == first, same.sum(axis=2), 0)
