@@ -103,10 +103,8 @@ reference: env ## Make the finished run in results the run of record, and renew 
 	$(SNAKEMAKE) --forcerun reference -- reference
 	@$(MAKE) --no-print-directory docs
 
-docs: env ## Render README, docs and their drawings
-	$(SNAKEMAKE) --rulegraph -- all | psfdae draw rules --out docs/figures/rules.svg
-	psfdae draw modules --out docs/figures/modules.svg
-	psfdae docs
+docs: env ## Renew the numbers in README and docs
+	python docs/tables.py
 
 site: docs ## Build the site of README and docs in site/
 	NO_MKDOCS_2_WARNING=1 mkdocs build --strict

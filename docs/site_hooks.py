@@ -1,59 +1,47 @@
-"""MkDocs hooks: pages of the root folder, and links to files that are not below docs.
-
-On GitHub a page links to the repository's files by their relative paths. The site has
-the same pages and copies of the files that they link to, so links are led there.
-"""
+"""MkDocs hooks: the site's files lie as in the repository; keys of the configuration are listed."""
 
 from __future__ import annotations
 
-import posixpath
+import json
 import re
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).resolve().parents[1]
-ROOT_PAGES = {
-    "README.md": "index.md",
-    "CONTRIBUTING.md": "contributing.md",
-    "CHANGELOG.md": "changelog.md",
-}
-LINK = re.compile(r"(\]\()([^)\s#]+)((?:#[^)\s]*)?\))")
+PUBLISHED = (
+    *("*.md", "LICENSE", "CITATION.cff", "docs/*.md", "docs/*.css", "docs/figures/*.png"),
+    *("results/reference/figures/**/*.png", "results/reference/tables/psf_metrics.csv"),
+    "src/psfdae/configuration/schema.py",
+)
+"""What pages are and link to; links are relative and the same on GitHub."""
+
+KEYS = re.compile(r"<!-- keys: (\w+) -->")
 CELL = re.compile(r"<td[^>]*>[^<]*")
 NUMBER = re.compile(r"[-+−]?\d[\d.]*e[-+]\d+")
-FENCE = re.compile(r"^(```|~~~).*?^\1", re.M | re.S)
+LIMITS = {"minimum": "≥", "exclusiveMinimum": ">", "maximum": "≤", "exclusiveMaximum": "<"}
+HEAD = ("| key | type | allowed | default | meaning |", "|---|---|---|---|---|")
+PRESETS = {"config": ["preset"], "alignment": ["cnn_train", "alignment_preset"]}
+"""Groups of options that set keys of several groups."""
+
+Schema = Mapping[str, Any]
 
 
 def on_files(files: Files, config: Any) -> Files:
-    """Add the pages of the root folder, and copies of what the pages link to."""
-    for name, page in ROOT_PAGES.items():
-        files.append(File.generated(config, page, abs_src_path=str(ROOT / name)))
-    for page in [file for file in files if file.src_uri.endswith(".md")]:
-        for target in _targets(Path(page.abs_src_path).read_text(encoding="utf-8"), page.src_uri):
-            uri = _site_uri(target)
-            # MkDocs itself names a link without a file.
-            if files.get_file_from_path(uri) is None and (ROOT / target).is_file():
-                files.append(File.generated(config, uri, abs_src_path=str(ROOT / target)))
+    """Keep what plugins and the theme add, and add the pages where the repository has them."""
+    for file in [file for file in files if file.src_dir == config.docs_dir]:
+        files.remove(file)
+    for path in sorted(path for pattern in PUBLISHED for path in ROOT.glob(pattern)):
+        uri = path.relative_to(ROOT).as_posix()
+        files.append(File.generated(config, uri, abs_src_path=str(path)))
     return files
 
 
-def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Lead relative links to where the site has the file."""
-    source = page.file.src_uri
-    folder = posixpath.dirname(source)
-
-    def led(match: re.Match[str]) -> str:
-        target = _target(match[2], source)
-        if target is None:
-            return match[0]
-        return match[1] + posixpath.relpath(_site_uri(target), folder or ".") + match[3]
-
-    pieces, end = [], 0
-    for fence in FENCE.finditer(markdown):
-        pieces += [LINK.sub(led, markdown[end : fence.start()]), fence[0]]
-        end = fence.end()
-    return "".join([*pieces, LINK.sub(led, markdown[end:])])
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """List the keys of a root of the configuration at `<!-- keys: ROOT -->`."""
+    return KEYS.sub(lambda mark: "\n".join(key_reference(mark[1])), markdown)
 
 
 def on_page_content(html: str, **_: Any) -> str:
@@ -65,20 +53,49 @@ def on_page_content(html: str, **_: Any) -> str:
     return CELL.sub(kept, html)
 
 
-def _targets(markdown: str, source: str) -> set[str]:
-    links = LINK.findall(FENCE.sub("", markdown))
-    return {target for _, link, _ in links if (target := _target(link, source)) is not None}
+def key_reference(root: str) -> Iterator[str]:
+    """Markdown of all groups of a root: their keys and, below, their options."""
+    from psfdae.configuration.compose import ROOTS, compose, config_dir
+
+    schema = ROOTS[root][0].model_json_schema()
+    tree = compose((), root)
+    for group in (*schema["properties"], *PRESETS[root]):
+        yield f"\n### `{group}`\n"
+        if group not in PRESETS[root]:
+            yield from (*HEAD, *_rows(group, schema["properties"][group], schema, tree.get(group)))
+        yield ""
+        for option in sorted((config_dir() / group).glob("[!_]*.yaml")):
+            comment = re.match(r"(?:#.*\n)*", option.read_text(encoding="utf-8"))[0]
+            lines = re.findall(r"^# ?(?! *@package)(.+)", comment, re.M)
+            yield f"- `{group}={option.stem}`{': ' if lines else ''}{' '.join(lines)}"
 
 
-def _target(link: str, source: str) -> str | None:
-    """Path of a link's file in the repository; none for other servers."""
-    if re.match(r"[a-z]+:", link):
-        return None
-    of_root = {page: name for name, page in ROOT_PAGES.items()}
-    written = of_root.get(source, posixpath.join("docs", source))
-    return posixpath.normpath(posixpath.join(posixpath.dirname(written), link))
+def _rows(key: str, about: Schema, schema: Schema, value: Any) -> Iterator[str]:
+    """Rows of a key, or of the keys of the groups that it may hold."""
+    members = [about, *about.get("anyOf", []), *about.get("oneOf", [])]
+    members += [*about.get("patternProperties", {}).values()]
+    forms = [m["$ref"].rsplit("/", 1)[-1] for m in members if "$ref" in m]
+    for form in forms:
+        group = schema["$defs"][form]
+        yield f"| **{key}** | {form} | | | {_sentence(group)} |"
+        for name, inner in group["properties"].items():
+            known = value.get(name) if isinstance(value, Mapping) else None
+            yield from _rows(f"{key}.{name}", inner, schema, known)
+    if not forms:
+        kinds = dict.fromkeys(m["type"] for m in members if "type" in m)
+        value = about.get("default") if value is None else value
+        default = "" if value is None else f"`{json.dumps(value, ensure_ascii=False)}`"
+        limits = ", ".join(limit for m in members for limit in _limits(m))
+        cells = (f"`{key}`", " or ".join(kinds), limits, default, _sentence(about))
+        yield f"| {' | '.join(cells)} |"
 
 
-def _site_uri(target: str) -> str:
-    """Where the site has a file of the repository."""
-    return ROOT_PAGES.get(target, target.removeprefix("docs/"))
+def _limits(about: Schema) -> list[str]:
+    found = [f"{sign} {about[key]:g}" for key, sign in LIMITS.items() if key in about]
+    found += [f"`{value}`" for value in about.get("enum", [about.get("const")]) if value]
+    return found + (_limits(about["items"]) if "items" in about else [])
+
+
+def _sentence(about: Schema) -> str:
+    """The meaning; a key without one stops the build."""
+    return " ".join(about["description"].split("\n\n")[0].split())

@@ -1,4 +1,4 @@
-"""README and docs as tests see them: their shell and Python blocks, links and anchors."""
+"""README and docs as tests see them: their shell and Python blocks."""
 
 from __future__ import annotations
 
@@ -52,25 +52,4 @@ def commands(text):
             words = shlex.split(line.replace(heredoc[0], "") if heredoc else line, comments=True)
             if words:
                 found.append(Command(tuple(words), "".join(written), "\n".join(typed)))
-    return found
-
-
-def prose(text):
-    """A page without its code blocks and code spans."""
-    return re.sub(r"(`+)(?!`).+?(?<!`)\1(?!`)", "", FENCE.sub("", text))
-
-
-def links(text):
-    """Targets of all links and images."""
-    return re.findall(r"\]\(([^)\s]+)\)", prose(text))
-
-
-def anchors(text):
-    """Anchors of all headings, as GitHub makes them."""
-    found = []
-    for heading in re.findall(r"^#{1,6} +(.+?) *$", FENCE.sub("", text), re.M):
-        plain = re.sub(r"\[([^\]]*)\]\([^)]*\)|[`*]", r"\1", heading)
-        anchor = re.sub(r"[^\w\- ]", "", plain.lower()).replace(" ", "-")
-        number = found.count(anchor)
-        found.append(f"{anchor}-{number}" if number else anchor)
     return found

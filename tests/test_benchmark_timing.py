@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -180,19 +178,3 @@ def test_figures_are_drawn_from_their_tables(kind, tmp_path):
     result = CliRunner().invoke(main, arguments)
     assert result.exit_code == 0, result.output
     assert out.stat().st_size > 10_000
-
-
-def test_docs_show_the_tables(tmp_path):
-    from psfdae.stages.docs import render
-
-    (tmp_path / "r/tables").mkdir(parents=True)
-    (tmp_path / "r/provenance.json").write_text("{}")
-    for kind in ("baseline", "inference", "scaling"):
-        fake_table(kind).to_csv(tmp_path / f"r/tables/benchmark_{kind}.csv", index=False)
-    part = Path(__file__).parents[1] / "docs/templates/_benchmark_throughput.md"
-    (tmp_path / "t").mkdir()
-    (tmp_path / "t/page.md.j2").write_text(part.read_text())
-    page = render(tmp_path / "r", tmp_path / "t", main)["page.md"]
-    assert "to the power\n  1.000 ± 0.000" in page
-    assert "| simulation | 1000000 | 500.00 | 180 | 2000.0 | extrapolated |" in page
-    assert "| 20 | 11 × 11 | 10 | 1.00 |" in page

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import ast
 import os
 import re
 import subprocess
 import sys
 import tomllib
 from collections import defaultdict
-from importlib.metadata import version
+from importlib.metadata import packages_distributions, version
 from pathlib import Path
 
 import pytest
@@ -23,6 +24,11 @@ CONDA_NAMES = {
     "matplotlib-base": "matplotlib",
 }
 CONDA_ONLY = {"pip", "python", "numba"}
+TRANSITIVE = {"omegaconf": "of hydra-core", "sqlalchemy": "of mlflow", "numexpr": "of poppy"}
+NOT_IMPORTED = {
+    "snakemake": "runs the workflow",
+    "snakemake-executor-plugin-slurm": "runs it on a cluster",
+}
 LOCKS = ["requirements.lock", *(f"requirements/{n}.lock" for n in ("build", "torch", "torch-cpu"))]
 
 # Stands in for python: notes what it is asked, and offers versions of torch.
@@ -72,6 +78,30 @@ def test_conda_requires_what_pyproject_requires(declared, conda, pip_part):
     assert {canonicalize_name(n): s for n, s in ours.items() if n not in CONDA_ONLY} == {
         n: r.specifier for n, r in declared.items()
     }
+
+
+def imports(path):
+    """Modules that a file imports from other packages."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and not node.level:
+            yield node.module
+
+
+def test_imports_are_declared_and_what_is_declared_is_imported(declared):
+    paths = [path for folder in ("src", "workflow") for path in (ROOT / folder).rglob("*.py")]
+    names = {name.split(".")[0] for path in paths for name in imports(path)}
+    packages = packages_distributions()
+    imported = {
+        name: {canonicalize_name(package) for package in packages.get(name, [name])}
+        for name in names - sys.stdlib_module_names - {"psfdae"}
+    }
+    known = declared.keys() | TRANSITIVE.keys()
+    assert [name for name, found in imported.items() if not found & known] == []
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    required = {canonicalize_name(Requirement(line).name) for line in project["dependencies"]}
+    assert required - set().union(*imported.values()) == NOT_IMPORTED.keys()
 
 
 def test_conda_channels(conda):

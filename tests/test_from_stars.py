@@ -306,7 +306,7 @@ def test_wrong_settings_are_named(override, message):
 @pytest.mark.workflow
 def test_commands_of_own_stars_md_run(tmp_path, monkeypatch):
     """From first to last, on a small image and a tiny network."""
-    text = (ROOT / "docs/templates/docs/own_stars.md.j2").read_text(encoding="utf-8")
+    text = (ROOT / "docs/own_stars.md").read_text(encoding="utf-8")
     lines = [
         line for block in re.findall(r"```sh\n(.*?)```", text, re.S) for line in block.split("\n")
     ]

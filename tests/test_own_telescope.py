@@ -36,7 +36,7 @@ pytestmark = pytest.mark.workflow
 @pytest.fixture(scope="module")
 def blocks():
     """The page's shell blocks."""
-    text = (ROOT / "docs/templates/docs/own_telescope.md.j2").read_text(encoding="utf-8")
+    text = (ROOT / "docs/own_telescope.md").read_text(encoding="utf-8")
     return re.findall(r"```sh\n(.*?)```", text, re.S)
 
 

@@ -379,7 +379,7 @@ def test_model_of_a_file_is_the_shipped_one():
 
 
 def test_page_lists_all_flags_and_columns():
-    text = (ROOT / "docs/templates/docs/predict.md.j2").read_text(encoding="utf-8")
+    text = (ROOT / "docs/predict.md").read_text(encoding="utf-8")
     for flag in StarFlag:
         assert f"| `{flag.name}` | {int(flag)} |" in text
     for name in ("id", *writer.COLUMNS):

@@ -1,22 +1,19 @@
-"""Run costs, the run of record, and the pages made from it."""
+"""Run costs and the run of record."""
 
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 
 import pandas as pd
 import pytest
 
-from psfdae.cli import main
 from psfdae.configuration.compose import load
 from psfdae.files import ProductError
-from psfdae.stages import docs, record
+from psfdae.stages import record
 
 ROOT = Path(__file__).resolve().parents[1]
 REFERENCE = ROOT / "results/reference"
-TEMPLATES = ROOT / "docs/templates"
 
 
 @pytest.fixture
@@ -90,40 +87,6 @@ def test_incomplete_run_leaves_the_record_alone(results, tmp_path):
     with pytest.raises(ProductError, match=r"missing\.csv: missing"):
         record.reference(results, out, [results / "missing.csv"])
     assert list(out.iterdir()) == []
-
-
-PAGES = sorted(path.stem for path in (TEMPLATES / "docs").glob("*.md.j2"))
-
-
-@pytest.fixture(scope="module")
-def rendered():
-    return docs.render(REFERENCE, TEMPLATES, main)
-
-
-@pytest.mark.parametrize("page", ["README.md", *(f"docs/{page}" for page in PAGES)])
-def test_pages_are_what_the_run_of_record_says(page, rendered):
-    assert rendered[page] == (ROOT / page).read_text(encoding="utf-8")
-
-
-def test_every_page_of_docs_has_a_template():
-    assert {path.name for path in (ROOT / "docs").glob("*.md")} == set(PAGES)
-
-
-def test_changing_a_table_changes_the_page(tmp_path, rendered):
-    changed = tmp_path / "reference"
-    shutil.copytree(REFERENCE, changed)
-    path = changed / "tables/psf_metrics.csv"
-    table = pd.read_csv(path)
-    table.loc[table.metric == "mse", "value"] *= 2
-    table.to_csv(path, index=False)
-    after = docs.render(changed, TEMPLATES, main)
-    assert rendered["docs/results.md"] != after["docs/results.md"]
-
-
-def test_pages_are_written(tmp_path):
-    pages = docs.run(REFERENCE, TEMPLATES, tmp_path, main)
-    assert tmp_path / "README.md" in pages
-    assert all(page.read_text().startswith("# ") for page in pages)
 
 
 def test_run_of_record_reaches_the_numbers_that_it_must():

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -344,24 +342,3 @@ def test_figure_shows_errors_bounds_and_refusals(tmp_path):
     )
     assert result.exit_code == 2
     assert "not a table of graded stress tests" in result.output
-
-
-def test_page_tells_what_fails(tmp_path):
-    from psfdae.cli import main
-    from psfdae.stages.docs import render
-
-    record, templates = tmp_path / "record", tmp_path / "templates"
-    (record / "tables").mkdir(parents=True)
-    templates.mkdir()
-    shutil.copy(ROOT / "docs/templates/docs/stability.md.j2", templates)
-    (record / "provenance.json").write_text("{}")
-    assert "`make stability` makes them" in render(record, templates, main)["stability.md"]
-    (record / "provenance.json").write_text(json.dumps({"on_request_s": {"stability": 1.0}}))
-    graded_table().to_csv(record / "tables/stability_graded.csv", index=False)
-    table = [rows.equal("good", "q", 1, 1), rows.equal("bad", "|q|", 1, 2)]
-    rows.write_table(record / "tables/stability.csv", table, Row)
-    page = render(record, templates, main)["stability.md"]
-    assert "1 of them fail" in page
-    assert r"| bad | \|q\| | 2 | 1 |" in page
-    rows.write_table(record / "tables/stability.csv", table[:1], Row)
-    assert "all of them pass" in render(record, templates, main)["stability.md"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TextIO
 
 import click
 
@@ -63,38 +62,3 @@ def track(
     entries = [*discover(results, dict(stars)), *(discover_alignment(results) if alignment else [])]
     entries += [entry for sweep in sweeps for entry in discover_sweep(results, sweep)]
     stage.run(entries, preset, database, database.parent / "mlartifacts", out)
-
-
-@main.command()
-@click.option("--root", type=FolderArgument, default=Path(), help="Root of the source tree.")
-def docs(root: Path) -> None:
-    """Render README and docs from the run of record."""
-    from psfdae.stages import docs as stage
-
-    for page in stage.run(root / "results/reference", root / "docs/templates", root, main):
-        click.echo(page)
-
-
-@main.group()
-def draw() -> None:
-    """Draw the architecture for docs as SVG."""
-
-
-@draw.command("rules")
-@click.option("--rules", type=FolderArgument, default=Path("workflow/rules"), show_default=True)
-@out_option("SVG.")
-@click.argument("rulegraph", type=click.File(encoding="utf-8"), default="-")
-def draw_rules(rules: Path, out: Path, rulegraph: TextIO) -> None:
-    """Draw the rules; RULEGRAPH (default: standard input) is from snakemake --rulegraph."""
-    from psfdae.stages import docs as stage
-
-    stage.draw_rules(rulegraph.read(), rules, out)
-
-
-@draw.command("modules")
-@out_option("SVG.")
-def draw_modules(out: Path) -> None:
-    """Draw the package's modules and what they import."""
-    from psfdae.stages import docs as stage
-
-    stage.draw_modules(out)

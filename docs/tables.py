@@ -1,0 +1,290 @@
+"""Numbers of README and docs, from the run of record and the configuration.
+
+A page keeps numbers between two comments, `<!-- SOURCE where … by …: TEXT -->…<!-- end -->`. SOURCE
+is a table of `results/reference`, or a function below with words for arguments; `where` picks rows
+and `by` sorts them. TEXT is an f-string over the columns. A comment at the end of its line makes a
+line of each row, below the head of the table that the page has; within a line (never at its start)
+the columns of several rows are arrays. Without TEXT, the source itself is put in.
+
+`python docs/tables.py` fills in all pages; `--check` names what has drifted.
+"""
+
+from __future__ import annotations
+
+import ast
+import json
+import re
+import subprocess
+import sys
+from functools import cache
+from pathlib import Path
+from types import SimpleNamespace
+
+import pandas as pd
+
+from psfdae.configuration.compose import compose
+from psfdae.evaluation.alignment_tables import METHOD_LABELS as ALIGNERS
+
+ROOT = Path(__file__).resolve().parents[1]
+REFERENCE = ROOT / "results/reference"
+MARK = re.compile(
+    r"<!-- (?P<name>[\w./]+)(?P<words>(?: [^\s:]+)*?)"
+    r"(?: where (?P<where>[^\n]+?))?(?: by (?P<by>-?\w+))?(?:: (?P<text>[^\n]+?))? -->"
+    r"(?P<line>\n?)(?P<old>(?:(?!<!--).)*)<!-- end -->",
+    re.S,
+)
+HEAD = re.compile(r"\|.*\n\|[-|]+\n")
+
+METHODS = {"noisy": "noisy", "pca_som": "PCA+SOM", "lmmse": "linear MMSE", "dae": "DAE"}
+SCENES = {"seidel": "scene 1", "turbulence": "scene 2", "all": "any"}
+PROPAGATORS = {
+    "kernel": "our kernel",
+    "fft": "zero-padded FFT",
+    "fft_pruned": "pruned FFT",
+    "poppy_mft": "POPPY, matrix DFT",
+    "poppy_fresnel": "POPPY, Fresnel",
+    "hcipy": "HCIPy",
+}
+STATES = ["decenter_x", "decenter_y", "tilt_x", "tilt_y"]
+CELL = ["dataset", "reference", "noise_level"]
+
+
+def filled(page, drifted):
+    """Text of a page with today's numbers; what has drifted is added to a list."""
+    text = page.read_text(encoding="utf-8")
+
+    def fill(mark):
+        new = _new(**mark.groupdict())
+        if new != mark["old"]:
+            drifted.append(f"{page.relative_to(ROOT)}: {mark['name']}{mark['words']}")
+        return mark[0][: mark.start("old") - mark.start()] + new + "<!-- end -->"
+
+    return MARK.sub(fill, text)
+
+
+def _new(name, words, where, by, text, line, old):
+    table = globals()[name](*words.split()) if name in globals() else csv(name)
+    if where:
+        table = table.query(where)
+    if by:
+        table = table.sort_values(by.lstrip("-"), ascending=by[0] != "-", kind="stable")
+    if text is None:
+        return line and f"{table}\n"
+    rows = table.to_dict("records") if isinstance(table, pd.DataFrame) else [table]
+    if line:
+        head = HEAD.match(old)
+        return (head[0] if head else "") + "".join(_written(text, row) + "\n" for row in rows)
+    return _written(text, rows[0] if len(rows) == 1 else dict(table.reset_index(drop=True)))
+
+
+def _written(text, row):
+    """An f-string over the columns of a row; what is not there stays empty."""
+    return re.sub(r"\bnan( %)?", "", eval(f'f"""{text}"""', globals() | row))
+
+
+@cache
+def csv(name):
+    """A table of the run of record; names of columns become names in Python."""
+    table = pd.read_csv(REFERENCE / name)
+    return table.rename(columns=lambda column: re.sub(r"\W", "_", column))
+
+
+def file(name):
+    """A file of the run of record as it is."""
+    return (REFERENCE / name).read_text(encoding="utf-8").strip()
+
+
+def listed(values, form=""):
+    """Values in a sentence."""
+    return ", ".join(format(value, form) for value in values)
+
+
+def _names(tree):
+    """A nested mapping by attributes."""
+    return vars(json.loads(json.dumps(tree), object_hook=lambda found: SimpleNamespace(**found)))
+
+
+def config(*overrides):
+    """Groups of a configuration of scenes 1 and 2."""
+    return _names(compose(overrides))
+
+
+def scene3():
+    """Groups of the configuration of scene 3."""
+    return _names(compose((), "alignment"))
+
+
+def datasets():
+    """Configurations of all datasets."""
+    return pd.DataFrame([config(f"dataset={d}") for d in config()["workflow"].datasets])
+
+
+def packages():
+    """First sentence of every sub-package and of every module at the top."""
+    found = {}
+    for path in sorted((ROOT / "src/psfdae").glob("[!_]*")):
+        source = path / "__init__.py" if path.is_dir() else path
+        if source.is_file() and source.suffix == ".py":
+            about = ast.get_docstring(ast.parse(source.read_text(encoding="utf-8"))) or ""
+            found[path.stem] = " ".join(about.split("\n\n", maxsplit=1)[0].split())
+    return pd.DataFrame(found.items(), columns=["name", "about"])
+
+
+def rulegraph(target):
+    """Rules that a target needs, as Snakemake draws them, by name and without its colours."""
+    line = [sys.executable, "-m", "snakemake", "--nolock", "--rulegraph", "mermaid-js", target]
+    drawn = subprocess.run(line, cwd=ROOT, check=True, capture_output=True, text=True).stdout
+    rule = dict(re.findall(r"^\t(id\d+)\[(\w+)\]$", drawn, re.M))
+    edges = re.findall(r"^\t(id\d+) --> (id\d+)$", drawn, re.M)
+    arrows = sorted(f"    {rule[start]} --> {rule[end]}" for start, end in edges)
+    return "\n".join(["```mermaid", "flowchart LR", *arrows, "```"])
+
+
+def run():
+    """How and where the run of record was made."""
+    return _names(json.loads(file("provenance.json")))
+
+
+def errors(name="tables/psf_metrics.csv"):
+    """MSE of every method by dataset, split, reference and noise level."""
+    keys = ["dataset", "split", "reference", "noise_level"]
+    table = csv(name).query("metric == 'mse'").pivot(index=keys, columns="method", values="value")
+    table["best"] = table[list(METHODS)].idxmin(axis=1).map(METHODS)
+    return table.reset_index().sort_values(keys, ascending=[True, False, True, True])
+
+
+def presets():
+    """MSE of the default preset beside that of the preset `paper`."""
+    literal = errors("paper/tables/psf_metrics.csv")
+    return errors().merge(literal, on=[*CELL, "split"], suffixes=("", "_paper"))
+
+
+def held_out():
+    """MSE on fields that no training saw beside that of the random split."""
+    split = dict(list(errors().groupby("split")))
+    return split["held_out"].merge(split["random"], on=CELL, suffixes=("", "_random"))
+
+
+def fit():
+    """What was fitted to the original-noise rows, by quantity."""
+    return {row.quantity: row for row in csv("calibration/fit.csv").itertuples()}
+
+
+def bounds():
+    """Least possible errors, the floor, and how the bank of draws grew."""
+    rows = csv("tables/psf_bounds.csv").query("metric == 'mse'").sort_values(CELL)
+    floor = rows.query("method == 'floor'")[[*CELL, "value"]]
+    table = rows.query("method == 'bayes'").merge(floor, "left", CELL, suffixes=("", "_floor"))
+    growth = csv("tables/psf_bounds_growth.csv").sort_values("draws")
+    table = table.merge(growth.drop_duplicates(CELL, keep="last"), "left", CELL)
+    table["draws"] = table.draws.map("{:.0f}".format, na_action="ignore").fillna("exact")
+    return table
+
+
+def efficiency():
+    """Bound over error of every method: against the posterior mean, in brackets the floor."""
+    rows = csv("tables/psf_efficiency.csv").dropna(subset="efficiency").sort_values("bound")
+    cells = [
+        f"({row.efficiency:.1g})" if row.bound == "floor" else f"{row.efficiency:.2g}"
+        for row in rows.itertuples()
+    ]
+    table = rows.assign(cell=cells).groupby([*CELL, "method"]).cell.agg(" ".join).unstack()
+    return bounds()[CELL].merge(table.reset_index(), "left", CELL)
+
+
+def uniform():
+    """Errors of scene 3 on uniform states, in units of the range."""
+    return csv("tables/alignment_errors.csv").query("test_set == 'uniform' and unit == 'range'")
+
+
+def mae():
+    """Mean absolute error of every method and parameter, their mean, the paper's, the bound."""
+    rows = uniform().query("noise_level > 0").set_index(["noise_level", "method"])
+    table = rows.pivot(columns="parameter", values="mean_abs_error")
+    table["mean"] = table[STATES].mean(axis=1)
+    for level in table.index.levels[0]:
+        paper = csv(f"tables/alignment_paper_{level}.csv")
+        for row in paper.query("source == 'paper' and quantity == 'mean'").to_dict("records"):
+            table.loc[(level, row["method"]), "paper"] = sum(row[s] for s in STATES) / len(STATES)
+        table.loc[level, "bound"] = table.loc[(level, "cramer_rao"), "mean"]
+    order = pd.MultiIndex.from_product([table.index.levels[0], ALIGNERS], names=table.index.names)
+    return table.reindex(order).reset_index()
+
+
+def wins(better, worse):
+    """In how many columns of the table of errors one method is better than another."""
+    table = mae().set_index("method")[STATES]
+    won = table.loc[better].to_numpy() < table.loc[worse].to_numpy()
+    return {"won": won.sum(), "of": won.size}
+
+
+def correlation(method, first, second):
+    """Correlation of two parameters' errors on uniform states, a row per noise level."""
+    picked = "test_set == 'uniform' and noise_level > 0 and method == @method"
+    rows = csv("tables/alignment_correlation.csv").query(picked)
+    return rows[(rows.parameter_a == first) & (rows.parameter_b == second)].reset_index(drop=True)
+
+
+def correlations():
+    """Correlations of all pairs of parameters on uniform states, with intervals, by method."""
+    rows = csv("tables/alignment_correlation.csv").query("test_set == 'uniform'")
+    cells = [
+        f"{row.correlation:.2f} ({row.ci_low:.2f} … {row.ci_high:.2f})" for row in rows.itertuples()
+    ]
+    rows = rows.assign(cell=cells, pair=rows.parameter_a + ", " + rows.parameter_b)
+    rows = rows.pivot(index=["noise_level", "pair"], columns="method", values="cell").reset_index()
+    pairs = rows.pair.str.replace("_", " ").str.replace("decenter", "decentre")
+    return rows.assign(pair=pairs)
+
+
+def cheapest():
+    """The fastest setting of every propagator within the budget."""
+    keys = ["scene", "aberration", "method"]
+    table = csv("tables/benchmark_propagation.csv").query("within_budget == 'yes'")
+    return table.sort_values("time_ms").drop_duplicates(keys).sort_values(keys)
+
+
+def peers():
+    """Factors by which other propagators are slower at equal error."""
+    rows = csv("tables/benchmark_peers.csv").groupby(["scene", "aberration", "method"])
+    table = rows.speedup.agg(["size", "min", "median", "max"]).join(rows.required.first())
+    return table.assign(met=rows.met.agg(lambda met: (met == "yes").sum())).reset_index()
+
+
+def inference():
+    """Stars per second of both engines, each at its best batch."""
+    keys = ["width", "stamp_px", "threads"]
+    rows = csv("tables/benchmark_inference.csv").sort_values("stars_per_s")
+    rows = rows.drop_duplicates([*keys, "engine"], keep="last").sort_values(keys)
+    engine = dict(list(rows.groupby("engine")))
+    return engine["torch"].merge(engine["onnxruntime"], on=keys, suffixes=("", "_onnx"))
+
+
+def flux():
+    """RMS errors of the sum of a stamp and of the robust flux."""
+    rows = csv("tables/stability_graded.csv").copy()
+    rows[["sample", "kind"]] = rows.case.str.split(", ", n=1, expand=True)
+    sums, robust = (rows[rows.kind == kind] for kind in ("noisy sum", "robust flux"))
+    return sums.merge(robust, on=["sample", "stress"], suffixes=("", "_robust"))
+
+
+def own_stars():
+    """MSE of bright stars made faint, by S/N and method."""
+    rows = csv("tables/from_stars.csv")
+    cells = [f"{row.mse:.2e} ± {row.mse_stderr:.0e}" for row in rows.itertuples()]
+    return rows.assign(cell=cells).pivot(index="snr", columns="method", values="cell").reset_index()
+
+
+def main():
+    """Fill in the pages, or name what has drifted."""
+    drifted: list[str] = []
+    for page in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))):
+        text = filled(page, drifted)
+        if "--check" not in sys.argv:
+            page.write_text(text, encoding="utf-8")
+    if "--check" in sys.argv and drifted:
+        sys.exit("\n".join(drifted))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,1 +1,0 @@
-"""Reference pages and drawings made from the code itself: keys, commands, rules, modules."""
