@@ -234,7 +234,7 @@ def _option(name: str, hint: Any, default: Any) -> click.Parameter:
         many = attributes.pop("multiple", False)
         return click.Argument([name], required=required, nargs=-1 if many else 1, **attributes)
     attributes["required"] = required
-    if not required and default not in (None, False, ()):
+    if not required and default is not False and default not in (None, ()):
         attributes = {"default": default, "show_default": True, **attributes}
     flag = attributes.pop("flag", f"--{name.replace('_', '-')}")
     return click.Option([flag, name], **attributes)
