@@ -7,9 +7,9 @@ import csv
 import pytest
 import yaml
 
-from psfdae.alignment_runs import NETWORKS, discover_alignment
 from psfdae.files import ProductError
 from psfdae.stages import track
+from psfdae.tracking import NETWORKS, runs_of_alignment
 
 COLUMNS = ("test_set", "noise_level", "method", "parameter", "mean_abs_error", "bias", "variance")
 
@@ -17,7 +17,7 @@ COLUMNS = ("test_set", "noise_level", "method", "parameter", "mean_abs_error", "
 @pytest.fixture
 def results(tmp_path):
     """A results folder as scene 3 leaves it, without any training."""
-    for kind, (weights, _) in NETWORKS.items():
+    for kind, weights in NETWORKS.items():
         folder = tmp_path / "alignment" / kind
         folder.mkdir(parents=True)
         (folder / weights).write_bytes(kind.encode())
@@ -37,7 +37,7 @@ def results(tmp_path):
 
 
 def test_every_network_has_its_curve_and_its_errors(results):
-    records = {entry.kind: entry.read() for entry in discover_alignment(results)}
+    records = {run.kind: run for run in runs_of_alignment(results)}
     assert set(records) == set(NETWORKS)
     for kind, record in records.items():
         values = {(p.name, p.epoch): p.value for p in record.points}
@@ -46,15 +46,14 @@ def test_every_network_has_its_curve_and_its_errors(results):
         assert values["uniform_tilt_x_bias_0.002", 0] == 0.01
         assert record.end_ms - record.start_ms == 4000
         assert "attempt" not in record.config
-        assert record.entry.name == f"alignment {kind}"
+        assert record.name == f"alignment {kind}"
     assert len({record.content_hash for record in records.values()}) == len(NETWORKS)
 
 
 def test_importing_twice_changes_nothing(results, tmp_path):
     receipt = tmp_path / "receipt.csv"
     for action in ("created", "unchanged"):
-        entries = discover_alignment(results)
-        track.run(entries, "fast", results / "mlflow.db", results / "mlartifacts", receipt)
+        track.track(results, "fast", results / "mlflow.db", receipt, alignment=True)
         rows = list(csv.DictReader(receipt.open()))
         assert [row["action"] for row in rows] == [action] * len(NETWORKS)
         assert {row["experiment"] for row in rows} == {"scene3"}
@@ -63,4 +62,4 @@ def test_importing_twice_changes_nothing(results, tmp_path):
 def test_unfinished_scene_is_refused(results):
     (results / "tables/alignment_errors.csv").unlink()
     with pytest.raises(ProductError, match="snakemake scene3"):
-        discover_alignment(results)
+        runs_of_alignment(results)

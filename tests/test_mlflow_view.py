@@ -12,7 +12,6 @@ from psfdae import mlflow_view
 from psfdae.cli import main
 from psfdae.files import atomic_path
 from psfdae.mlflow_view import damage
-from psfdae.runs import discover
 from psfdae.stages import track
 from test_track import write_tree
 
@@ -37,9 +36,7 @@ def _import(results, stars):
     patch = pytest.MonkeyPatch()
     patch.delenv("MLFLOW_TRACKING_URI", raising=False)
     patch.setenv("MLFLOW_DISABLE_TELEMETRY", "true")
-    entries = discover(results, stars)
-    database, artifacts = results / "mlflow.db", results / "mlartifacts"
-    track.run(entries, "smoke", database, artifacts, results / RECEIPT)
+    track.track(results, "smoke", results / "mlflow.db", results / RECEIPT, tuple(stars.items()))
     patch.undo()
 
 

@@ -18,9 +18,9 @@ from psfdae.stages import sweep as stage
 from psfdae.stages.alignment_train import train_noise_trained
 from psfdae.stages.common import noise_model
 from psfdae.stars.splits import random_split
-from psfdae.sweep_runs import discover_sweep
 from psfdae.sweeps.measured import Task
 from psfdae.sweeps.space import SweepError
+from psfdae.tracking import runs_of_sweep
 
 SIZES = ("parts.train_stars=160", "parts.test_stars=60", "noise.levels=[0.001,0.005]")
 TINY = ("dataset=dataset3", "preset=smoke", *SIZES, "train.epochs=3")
@@ -335,9 +335,8 @@ class Site:
         self.root, self.database = root, root / "mlflow.db"
 
     def track(self):
-        entries = discover_sweep(self.root, "tried")
         receipt = self.root / "receipt.csv"
-        track.run(entries, "smoke", self.database, self.root / "mlartifacts", receipt)
+        track.track(self.root, "smoke", self.database, receipt, sweeps=("tried",))
         with receipt.open(newline="") as file:
             return [row["action"] for row in csv.DictReader(file)]
 
@@ -382,4 +381,4 @@ def test_sweep_is_a_parent_run_with_a_child_per_point(tmp_path, monkeypatch):
 
 def test_sweep_without_summary_is_refused(tmp_path):
     with pytest.raises(ProductError, match="run `snakemake sweep --config sweep=tried`"):
-        discover_sweep(tmp_path, "tried")
+        runs_of_sweep(tmp_path, "tried")

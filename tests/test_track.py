@@ -16,8 +16,8 @@ import pytest
 import yaml
 
 from psfdae.files import Column, ProductError, write_product
-from psfdae.runs import discover, flatten, read
 from psfdae.stages import track
+from psfdae.tracking import flatten, runs_of_datasets
 
 PNG = b"\x89PNG\r\n\x1a\n"
 HISTORY = ((1, 3e-5, "nan", 1.5), (2, 2e-5, 1e-5, 3.0), (3, 1e-5, 2e-5, 4.5))
@@ -73,8 +73,7 @@ class Site:
     def track(self):
         """Import everything; actions by kind of run, as the receipt tells."""
         receipt = self.results / "runs.csv"
-        entries = discover(self.results, self.stars)
-        track.run(entries, "smoke", self.database, self.results / "mlartifacts", receipt)
+        track.track(self.results, "smoke", self.database, receipt, tuple(self.stars.items()))
         with receipt.open(newline="") as file:
             return {row["kind"]: row["action"] for row in csv.DictReader(file)}
 
@@ -219,43 +218,51 @@ def test_unreachable_server_costs_a_message(site, monkeypatch, capsys, refuses):
 @pytest.mark.parametrize("damage", ["missing", "damaged"])
 @pytest.mark.parametrize("name", ["model", "config", "history", "stars", "baseline"])
 def test_missing_or_damaged_file_is_named(tmp_path, name, damage):
-    dae, baseline = discover(tmp_path, write_tree(tmp_path))
-    path = baseline.model if name == "baseline" else getattr(dae, name)
+    stars = write_tree(tmp_path)
+    dae, baseline = runs_of_datasets(tmp_path, stars)
+    path = {
+        "model": dae.files["model/dae.safetensors"],
+        "config": dae.files["model/config.yaml"],
+        "history": dae.files["history.csv"],
+        "stars": stars["dataset3"],
+        "baseline": tmp_path / baseline.source,
+    }[name]
     if damage == "missing":
         path.unlink()
     else:
         path.write_text("[")
     if (name, damage) == ("model", "damaged"):
-        read(dae)  # weights are copied, not read
+        runs_of_datasets(tmp_path, stars)  # weights are copied, not read
         return
     with pytest.raises(ProductError, match=f"^{re.escape(str(path))}: "):
-        read(baseline if name == "baseline" else dae)
+        runs_of_datasets(tmp_path, stars)
 
 
 def test_dataset_without_evaluation_is_named(tmp_path):
     with pytest.raises(ProductError, match=r"evaluation/dataset5: no evaluations"):
-        discover(tmp_path, {"dataset5": tmp_path / "stars.h5"})
+        runs_of_datasets(tmp_path, {"dataset5": tmp_path / "stars.h5"})
 
 
 def test_unfinished_trainings_and_other_datasets_are_passed_over(tmp_path):
     stars = write_tree(tmp_path)
     (tmp_path / "dae/dataset3/held_out-template").mkdir()
     write_tree(tmp_path, dataset="dataset5")
-    assert {(e.dataset, e.split) for e in discover(tmp_path, stars)} == {("dataset3", "random")}
+    runs = runs_of_datasets(tmp_path, stars)
+    assert {(run.dataset, run.split) for run in runs} == {("dataset3", "random")}
 
 
 def test_config_hash_knows_the_stars_but_not_the_attempt(tmp_path):
     stars = write_tree(tmp_path)
-    dae = discover(tmp_path, stars)[0]
-    first = read(dae)
-    tree = yaml.safe_load(dae.config.read_text())
-    dae.config.write_text(yaml.safe_dump({**tree, "attempt": 2}))
-    attempt = read(dae)
+    first = runs_of_datasets(tmp_path, stars)[0]
+    config = first.files["model/config.yaml"]
+    tree = yaml.safe_load(config.read_text())
+    config.write_text(yaml.safe_dump({**tree, "attempt": 2}))
+    attempt = runs_of_datasets(tmp_path, stars)[0]
     assert attempt.config_hash == first.config_hash
     assert attempt.content_hash != first.content_hash
     scene = {"seed": 7, "scene": {"experiment": "scene1"}, "telescope": {"diameter_m": 2.0}}
     write_product(stars["dataset3"], "stars", {"a": Column(np.ones(2), "1", "")}, scene)
-    assert read(dae).config_hash != first.config_hash
+    assert runs_of_datasets(tmp_path, stars)[0].config_hash != first.config_hash
 
 
 def test_moved_results_are_refused(site):
@@ -279,7 +286,7 @@ def test_flatten():
 
 
 def test_mlflow_is_imported_by_the_import_only():
-    code = "import sys, psfdae.runs, psfdae.stages.track; print('mlflow' in sys.modules)"
+    code = "import sys, psfdae.tracking, psfdae.stages.track; print('mlflow' in sys.modules)"
     result = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     )

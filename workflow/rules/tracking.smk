@@ -53,7 +53,7 @@ rule track_alignment:
         results=lambda w: RESULTS,
         preset=PRESET,
         database=f"{RESULTS}/mlflow.db",
-        source=source_hash("psfdae.stages.track", "psfdae.alignment_runs"),
+        source=source_hash("psfdae.stages.track"),
     message:
         "Importing the runs of scene 3 into MLflow"
     shell:

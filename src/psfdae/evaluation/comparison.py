@@ -36,7 +36,7 @@ def config_differences(
 
     Parameters
     ----------
-    first, second : flattened configs, see `psfdae.runs.flatten`
+    first, second : flattened configs, see `psfdae.tracking.flatten`
     """
     keys = sorted(first.keys() | second.keys())
     pairs = [(key, first.get(key, ABSENT), second.get(key, ABSENT)) for key in keys]

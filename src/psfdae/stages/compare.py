@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from psfdae.cli import File, Folder, command
 from psfdae.files import ProductError, write_text
 from psfdae.reading import read_csv, read_yaml
-from psfdae.runs import flatten
+from psfdae.tracking import flatten
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -14,13 +14,14 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import psfdae
 from psfdae import mlflow_view
+from psfdae.cli import File, Folder, command
 from psfdae.files import atomic_path, write_text
-from psfdae.runs import Record, Source, flatten
 from psfdae.source import git_commit
+from psfdae.tracking import Run, flatten, runs_of_alignment, runs_of_datasets, runs_of_sweep
 
 SLOT = ("kind", "dataset", "split", "reference", "preset", "source")
 """Tags that name a place in the results folder; with `config_hash` they name a run."""
@@ -39,45 +40,46 @@ class TrackingError(RuntimeError):
     """The MLflow database cannot be used."""
 
 
-def run(
-    entries: Sequence[Source], preset: str, database: Path, artifacts: Path, receipt: Path
+@command("track")
+def track(
+    results: Annotated[Folder, "Folder that the workflow writes to."],
+    preset: Annotated[str, "Goes into the tags."],
+    database: Annotated[File, "SQLite file; mlartifacts/ lies beside it."],
+    out: Annotated[File, "CSV with the MLflow id of every run and what was done."],
+    stars: Annotated[
+        tuple[tuple[str, File], ...], "Dataset and its product of the stage stars."
+    ] = (),
+    alignment: Annotated[bool, "The networks of scene 3."] = False,
+    sweeps: Annotated[tuple[str, ...], "The points of a sweep.", {"flag": "--sweep"}] = (),
 ) -> None:
-    """Import finished runs into MLflow.
+    """Import finished runs into MLflow; MLFLOW_TRACKING_URI names a server instead.
 
     A run is known by its place in the results and its config. If it is there
     with the same files nothing is done; with other files it is replaced (MLflow
     can only append to metrics); with another config it stays for comparison,
     with the tag superseded = true, beside the new one.
 
-    `MLFLOW_TRACKING_URI` names a server or another database to use instead. If
-    that fails there is a message and no error: it must not stop a workflow.
-
-    Parameters
-    ----------
-    entries : as from `psfdae.runs.discover` and `psfdae.alignment_runs.discover_alignment`
-    preset : goes into the tags
-    database : SQLite file, made if missing
-    artifacts : folder for the runs' files
-    receipt : CSV with one row per run: its MLflow id and what was done
-
-    Raises
-    ------
-    ProductError
-        If a file of a run is missing or damaged; nothing is imported then.
-    TrackingError
-        If the database cannot be used.
+    If a server fails there is a message and no error: it must not stop a workflow.
     """
+    runs = runs_of_datasets(results, dict(stars))
+    runs += runs_of_alignment(results) if alignment else []
+    runs += [run for sweep in sweeps for run in runs_of_sweep(results, sweep)]
+    import_runs(runs, preset, database, out)
+
+
+def import_runs(runs: Sequence[Run], preset: str, database: Path, receipt: Path) -> None:
+    """Import runs; see `track`. Raises TrackingError if the database cannot be used."""
+    artifacts = database.parent / "mlartifacts"
     os.environ["MLFLOW_DISABLE_TELEMETRY"] = "true"
     # MLflow's own waits add up to minutes for a server that is away.
     os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", "20")
     os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "1")
     uri = os.environ.get("MLFLOW_TRACKING_URI", "")
-    records = [entry.read() for entry in entries]
     tags = {"preset": preset, "commit": git_commit(), "psfdae_version": psfdae.__version__}
     done: list[tuple[str, str]] = []
     with _alone(database):
         try:
-            for outcome in _import(records, tags, uri, database, artifacts):
+            for outcome in _import(runs, tags, uri, database, artifacts):
                 done.append(outcome)
         except Exception as error:
             if not _ours_to_explain(error):
@@ -89,12 +91,12 @@ def run(
                 ) from error
             print(
                 f"MLflow at {uri} cannot be used: {_first_line(error)}\n"
-                f"Not sent: {', '.join(r.entry.name for r in records[len(done) :])}\n"
+                f"Not sent: {', '.join(r.name for r in runs[len(done) :])}\n"
                 "To send later, repeat the import (snakemake --forcerun track)."
             )
-    done += [("", NOT_SENT)] * (len(records) - len(done))
-    write_text(receipt, _as_csv(records, preset, done))
-    mlflow_view.note(receipt, {} if uri else _written(records, tags, done))
+    done += [("", NOT_SENT)] * (len(runs) - len(done))
+    write_text(receipt, _as_csv(runs, preset, done))
+    mlflow_view.note(receipt, {} if uri else _written(runs, tags, done))
     counts = Counter(action for _, action in done)
     print(f"{len(done)} runs:", ", ".join(f"{n} {action}" for action, n in sorted(counts.items())))
 
@@ -111,14 +113,14 @@ def _alone(database: Path) -> Iterator[None]:
 
 
 def _import(
-    records: Sequence[Record], tags: dict[str, str], uri: str, database: Path, artifacts: Path
+    runs: Sequence[Run], tags: dict[str, str], uri: str, database: Path, artifacts: Path
 ) -> Iterator[tuple[str, str]]:
     """Id and action of one record after the other."""
     client = _client(uri, database)
     experiments: dict[str, str] = {}
     known: dict[tuple[str, ...], list[Any]] = {}
     imported: dict[str, str] = {}
-    for record in records:
+    for record in runs:
         name = record.experiment
         if name not in experiments:
             # A server decides itself where artifacts go.
@@ -133,7 +135,7 @@ def _import(
         outcome = _import_one(
             client, experiments[name], record, own, known.get((name, *_slot(own)), ())
         )
-        imported[record.entry.source] = outcome[0]
+        imported[record.source] = outcome[0]
         yield outcome
 
 
@@ -176,7 +178,7 @@ def _runs(client: Any, experiment: str) -> Iterator[Any]:
 
 
 def _import_one(
-    client: Any, experiment: str, record: Record, tags: dict[str, str], known: Sequence[Any]
+    client: Any, experiment: str, record: Run, tags: dict[str, str], known: Sequence[Any]
 ) -> tuple[str, str]:
     """Leave exactly one active run of the record; `known` are those of its slot."""
     same = [run for run in known if run.data.tags["config_hash"] == record.config_hash]
@@ -200,11 +202,11 @@ def _import_one(
     return run_id, action
 
 
-def _create(client: Any, experiment: str, record: Record, tags: dict[str, str]) -> str:
+def _create(client: Any, experiment: str, record: Run, tags: dict[str, str]) -> str:
     import yaml
     from mlflow.entities import Metric, Param
 
-    created = client.create_run(experiment, record.start_ms, tags, record.entry.name)
+    created = client.create_run(experiment, record.start_ms, tags, record.name)
     run_id = created.info.run_id
     metrics = [Metric(p.name, p.value, p.time_ms, p.epoch) for p in record.points]
     params = [Param(k, v[:PARAM_LENGTH]) for k, v in flatten(record.config).items()]
@@ -213,7 +215,7 @@ def _create(client: Any, experiment: str, record: Record, tags: dict[str, str]) 
     for i in range(0, len(metrics), 10 * BATCH):
         client.log_batch(run_id, metrics=metrics[i : i + 10 * BATCH], synchronous=True)
     with tempfile.TemporaryDirectory() as folder:
-        for name, path in record.entry.files().items():
+        for name, path in record.files.items():
             link = Path(folder, name)
             link.parent.mkdir(parents=True, exist_ok=True)
             link.symlink_to(path.resolve())
@@ -225,19 +227,18 @@ def _create(client: Any, experiment: str, record: Record, tags: dict[str, str]) 
 
 
 def _written(
-    records: Sequence[Record], tags: dict[str, str], done: Sequence[tuple[str, str]]
+    runs: Sequence[Run], tags: dict[str, str], done: Sequence[tuple[str, str]]
 ) -> dict[str, tuple[list[str], list[str]]]:
     """Names of the tags and files of each run, by its id."""
     written = {}
-    for record, (run_id, _) in zip(records, done, strict=True):
+    for record, (run_id, _) in zip(runs, done, strict=True):
         own = {*tags, *_tags(record), "content_hash", *([PARENT] if record.parent else [])}
-        written[run_id] = (sorted(own), sorted([*record.entry.files(), "config.yaml"]))
+        written[run_id] = (sorted(own), sorted([*record.files, "config.yaml"]))
     return written
 
 
-def _tags(record: Record) -> dict[str, str]:
-    entry = record.entry
-    own = {key: getattr(entry, key) for key in SLOT if key != "preset"}
+def _tags(record: Run) -> dict[str, str]:
+    own = {key: getattr(record, key) for key in SLOT if key != "preset"}
     own |= record.tags
     return {**own, "config_hash": record.config_hash, "superseded": "false"}
 
@@ -258,11 +259,11 @@ def _first_line(error: Exception) -> str:
     return str(error).strip().split("\n", 1)[0]
 
 
-def _as_csv(records: Sequence[Record], preset: str, done: Sequence[tuple[str, str]]) -> str:
+def _as_csv(runs: Sequence[Run], preset: str, done: Sequence[tuple[str, str]]) -> str:
     text = io.StringIO()
     writer = csv.DictWriter(text, COLUMNS, extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
-    for record, (run_id, action) in zip(records, done, strict=True):
+    for record, (run_id, action) in zip(runs, done, strict=True):
         row = {"run_id": run_id, "action": action, "experiment": record.experiment}
         writer.writerow({**row, "preset": preset, **_tags(record)})
     return text.getvalue()

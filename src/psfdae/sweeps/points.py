@@ -18,8 +18,8 @@ from psfdae.configuration.compose import (
     validate,
 )
 from psfdae.configuration.sweep import Sweep, load_sweep
-from psfdae.runs import hash_of
 from psfdae.sweeps.space import SweepError, changes, draws, grid, with_values
+from psfdae.tracking import hash_of
 
 NAME_LENGTH = 12
 """Hexadecimal digits of a point's name: in 1e5 points, two alike by chance once in 5e4 sweeps."""
