@@ -20,11 +20,10 @@ from matplotlib.figure import Figure
 from psfdae import files
 from psfdae.cli import main
 from psfdae.files import Column, Empty
-from psfdae.models.checkpoint import load_checkpoint, save_checkpoint
-from psfdae.models.weights import load_weights, save_weights
+from psfdae.models.weights import load_checkpoint, load_weights, save_checkpoint, save_weights
 from psfdae.observations.examples import write_cube
 from psfdae.stages.figures import write_png
-from psfdae.stages.train import as_yaml
+from psfdae.stages.trained import as_yaml
 from psfdae.stages.verify import _check_table
 
 FREE_KB = (0, 4, 8, 16, 40, 80, 128, 224, 320, 512, 1024, 3000)

@@ -7,13 +7,15 @@ import pytest
 import torch
 from torch import nn
 
-from psfdae.alignment.batches import (
+from psfdae.alignment.cnn import (
+    AlignmentCnn,
+    CnnTraining,
     TrainingStates,
-    epoch_batches,
+    build_cnn,
     gaussian_states,
     noise_weights,
     noisy_states,
-    steps_per_epoch,
+    predict_states,
 )
 from psfdae.alignment.fisher import (
     bound_covariances,
@@ -29,14 +31,7 @@ from psfdae.alignment.stamps import AlignmentStamps
 from psfdae.alignment.telescope import mirror_symmetries, uniform_states
 from psfdae.configuration.alignment import Cnn, Fit
 from psfdae.configuration.compose import ConfigError, load
-from psfdae.models.cnn import (
-    AlignmentCnn,
-    CnnTraining,
-    CnnTrainingError,
-    build_cnn,
-    predict_states,
-    train_cnn,
-)
+from psfdae.models.training import TrainingError, train
 
 EXACT = Fit(iterations=25, tolerance=1e-7, damping=1e-3, limit=1.25)
 
@@ -117,46 +112,46 @@ def _tiny():
 
 def _training(config, epochs, data, seed=3):
     stamps, states = data
-    train = config.train_original.model_copy(update={"epochs": epochs, "checkpoint_seconds": 0})
+    settings = config.train_original.model_copy(
+        update={"epochs": epochs, "batch": 3, "mirrors": True, "checkpoint_seconds": 0}
+    )
     cnn = Cnn(widths=[4] * 5, kernels=[3] * 5, strides=[1, 2, 1, 2, 2], leak=0.01)
-    batches = epoch_batches(TrainingStates(states, stamps), 3, seed, "test", mirror_symmetries(8))
-    steps = steps_per_epoch(len(states), 3)
-    return CnnTraining(batches, steps, (9, 16), cnn, train, seed, "test")
+    return CnnTraining(TrainingStates(states, stamps), cnn, settings, seed, "test")
+
+
+def _train(path, *given, report=lambda row: None):
+    return train(lambda attempt: _training(*given), path, path.name, report)
 
 
 def test_training_is_deterministic_and_resumes_where_it_was(config, tmp_path):
-    whole, again, other = (_training(config, 4, _tiny(), seed) for seed in (3, 3, 4))
-    for training, name in ((whole, "a"), (other, "b")):
-        train_cnn(training, tmp_path / name, name, lambda row: None)
-
-    class InterruptedError(Exception):
-        pass
+    whole, other = (_train(tmp_path / str(seed), config, 4, _tiny(), seed) for seed in (3, 4))
 
     def interrupt(row):
         if row["epoch"] == 3:
-            raise InterruptedError
+            raise KeyboardInterrupt
 
-    with pytest.raises(InterruptedError):
-        train_cnn(again, tmp_path / "c", "c", interrupt)
-    resumed = _training(config, 4, _tiny())
+    with pytest.raises(KeyboardInterrupt):
+        _train(tmp_path / "c", config, 4, _tiny(), report=interrupt)
     seen = []
-    train_cnn(resumed, tmp_path / "c", "c", lambda row: seen.append(row["epoch"]))
+    resumed = _train(
+        tmp_path / "c", config, 4, _tiny(), report=lambda row: seen.append(row["epoch"])
+    )
     assert seen == [3, 4]
-    for key, value in whole.model.state_dict().items():
-        assert torch.equal(value, resumed.model.state_dict()[key]), key
+    assert [row["loss"] for row in resumed.history] == [row["loss"] for row in whole.history]
+    for key, value in whole.result.items():
+        assert torch.equal(value, resumed.result[key]), key
     assert not torch.equal(whole.model.linear.weight, other.model.linear.weight)
 
 
 def test_training_refuses_what_is_not_finite(config, tmp_path):
     stamps, states = _tiny()
-    training = _training(config, 2, (stamps * np.nan, states))
-    with pytest.raises(CnnTrainingError, match=r"test: the loss is nan in epoch 1: lower lr"):
-        train_cnn(training, tmp_path / "x", "x", lambda row: None)
+    message = r"the loss is nan at step 0 \(epoch 1\): lower train_test\.lr = 0\.001"
+    with pytest.raises(TrainingError, match=message):
+        _train(tmp_path / "x", config, 2, (stamps * np.nan, states))
 
 
 def test_cnn_learns_states_from_clean_stamps(config, stamps, states, tmp_path):
-    training = _training(config, 60, (stamps, states))
-    train_cnn(training, tmp_path / "x", "x", lambda row: None)
+    training = _train(tmp_path / "x", config, 60, (stamps, states))
     error = np.abs(predict_states(training.model, stamps) - states).mean()
     assert error < 0.7 * np.abs(states).mean()
 
@@ -184,28 +179,39 @@ def test_weights_come_from_the_generator_alone(config):
 # --- batches
 
 
-def test_every_epoch_sees_every_state_once(states, stamps):
-    batches = epoch_batches(TrainingStates(states, stamps), 8, 1, "x")
-    first, second = (np.concatenate([y for _, y, _ in batches(epoch)]) for epoch in (0, 1))
-    assert sorted(first.tolist()) == sorted(states.tolist()) == sorted(second.tolist())
-    assert first.tolist() != second.tolist()
-    assert steps_per_epoch(30, 8) == len(list(batches(0))) == 4
-    # A batch of one has no variance to normalise.
-    assert (
-        steps_per_epoch(30, 29)
-        == len(list(epoch_batches(TrainingStates(states, stamps), 29, 1, "x")(0)))
-        == 1
+def _batches(config, size, data, epoch=0):
+    """Batches of an epoch without mirror images, as arrays."""
+    settings = config.train_original.model_copy(update={"batch": size})
+    training = CnnTraining(data, config.cnn, settings, 1, "x")
+    batches = [tuple(part.numpy() for part in batch) for batch in training.batches(epoch)]
+    assert len(batches) == training.steps
+    return batches
+
+
+def test_every_epoch_sees_every_state_once(config, states, stamps):
+    data = TrainingStates(states, stamps)
+    first, second = (
+        np.concatenate([truth for _, truth, _ in _batches(config, 8, data, epoch)])
+        for epoch in (0, 1)
     )
+    once = sorted(states.astype(np.float32).tolist())
+    assert sorted(first.tolist()) == sorted(second.tolist()) == once
+    assert first.tolist() != second.tolist()
+    assert len(_batches(config, 8, data)) == 4
+    # A batch of one has no variance to normalise.
+    assert len(_batches(config, 29, data)) == 1
 
 
-def test_weights_make_noise_levels_count_alike(states, stamps):
+def test_weights_make_noise_levels_count_alike(config, states, stamps):
     weights = noise_weights(np.array([0.002, 0.005, 0.005]), [0.002, 0.005])
     assert weights[0] / weights[1] == pytest.approx(6.25)
     assert weights[:2].mean() == pytest.approx(1)
     own = np.arange(30.0)
     data = TrainingStates(states, stamps, weights=own)
-    for _, truth, weight in epoch_batches(data, 8, 1, "x")(0):
-        assert (states[weight.astype(int)] == truth).all()
+    for images, truth, weight in _batches(config, 8, data):
+        chosen = weight[:, 0].astype(int)
+        assert (states[chosen].astype(np.float32) == truth).all()
+        assert (stamps[chosen].astype(np.float32) * 256 == images).all()
 
 
 def test_gaussian_noise_has_poisson_s_variance(noise, stamps):

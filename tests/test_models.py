@@ -12,12 +12,19 @@ from psfdae.configuration.schema import Dae as DaeConfig
 from psfdae.configuration.schema import Train
 from psfdae.evaluation.metrics import mse
 from psfdae.files import ProductError
-from psfdae.models.checkpoint import save_checkpoint
-from psfdae.models.dae import SingleChannelConv, build_dae, image_scale, predict
+from psfdae.models.dae import (
+    DaeTraining,
+    SingleChannelConv,
+    TrainingSet,
+    build_dae,
+    image_scale,
+    predict,
+    train_dae,
+)
 from psfdae.models.lmmse import LinearMmse
 from psfdae.models.pca_som import PcaSom, fit_pca_som
-from psfdae.models.training import Training, TrainingError, TrainingSet, train_dae
-from psfdae.models.weights import load_weights, save_weights
+from psfdae.models.training import TrainingError
+from psfdae.models.weights import load_weights, save_checkpoint, save_weights
 from psfdae.rng import stream
 
 SOM = {"rows": 4, "columns": 4, "epochs": 3, "sigma": 1.0, "learning_rate": 0.5, "seed": 1}
@@ -51,9 +58,9 @@ def data(gaussian_stars, noise):
     )
 
 
-def train(data, folder, train_config=TRAIN, report=lambda row: None, dae=DAE, tick=lambda: None):
+def train(data, folder, train_config=TRAIN, report=lambda row: None, dae=DAE):
     path = folder / "checkpoint.pt"
-    result = train_dae(data, dae, train_config, 3, path, "config", report, tick)
+    result = train_dae(data, dae, train_config, 3, path, "config", report)
     path.unlink(missing_ok=True)
     return result
 
@@ -184,7 +191,7 @@ def test_training_learns_and_repeats(data, tmp_path):
     longer = TRAIN.model_copy(update={"epochs": 12})
     first = train(data, tmp_path, longer)
     second = train(data, tmp_path, longer)
-    assert same(first.state, second.state)
+    assert same(first.result, second.result)
     errors = [row["validation_mse"] for row in first.history]
     assert errors[-1] < 0.5 * errors[0]
 
@@ -197,7 +204,7 @@ def test_interrupted_training_continues_as_if_nothing_had_happened(data, tmp_pat
     seen = []
     resumed = train(data, tmp_path, report=lambda row: seen.append(row["epoch"]))
     assert seen == [2, 3]
-    assert same(whole.state, resumed.state)
+    assert same(whole.result, resumed.result)
 
 
 def test_best_epoch_before_an_interruption_stays_the_best(data, tmp_path):
@@ -210,7 +217,7 @@ def test_best_epoch_before_an_interruption_stays_the_best(data, tmp_path):
     errors = [row["validation_mse"] for row in whole.history]
     assert errors[0] < min(errors[1:])
     interrupted(contrary, tmp_path, 2, train_config=quick)
-    assert same(whole.state, train(contrary, tmp_path, quick).state)
+    assert same(whole.result, train(contrary, tmp_path, quick).result)
 
 
 @pytest.mark.parametrize("damage", ["foreign", "garbage"])
@@ -233,7 +240,7 @@ def test_exploding_loss_stops_with_advice(data, tmp_path):
 
 
 def test_dead_network_restarts_and_then_gives_up(data, tmp_path, monkeypatch, capsys):
-    import psfdae.models.training as module
+    import psfdae.models.dae as module
 
     def dead(*args):
         model = build_dae(*args)
@@ -248,7 +255,7 @@ def test_dead_network_restarts_and_then_gives_up(data, tmp_path, monkeypatch, ca
 
 
 def test_restart_uses_other_weights(data, tmp_path, monkeypatch):
-    import psfdae.models.training as module
+    import psfdae.models.dae as module
 
     attempts = []
 
@@ -269,7 +276,7 @@ def test_restart_uses_other_weights(data, tmp_path, monkeypatch):
     resumed = train(data, tmp_path)
     assert len(attempts) == 3  # the dead one, the one that was interrupted, and that again
     assert resumed.attempt == 1
-    assert same(whole.state, resumed.state)
+    assert same(whole.result, resumed.result)
 
 
 def test_fresh_noise_every_epoch(data):
@@ -281,10 +288,9 @@ def test_fresh_noise_every_epoch(data):
 
 def test_fixed_noise_is_the_same_in_every_epoch(data):
     settings = TRAIN.model_copy(update={"noise": "fixed", "batch": 250})
-    training = Training(data, DAE, settings, 3, 0)
-    orders = [stream(3, "dae", "epoch", 0, epoch) for epoch in range(2)]
-    first, second = (next(iter(training._batches(rng)))[0] for rng in orders)
-    again = Training(data, DAE, settings, 3, 0)
+    training = DaeTraining(data, DAE, settings, 3, 0)
+    first, second = (next(training.batches(epoch))[0] for epoch in range(2))
+    again = DaeTraining(data, DAE, settings, 3, 0)
     assert torch.equal(first.sum((1, 2, 3)).sort()[0], second.sum((1, 2, 3)).sort()[0])
     assert np.array_equal(training.fixed, again.fixed)
 

@@ -7,13 +7,24 @@ size of the input.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
-from typing import Literal, Protocol
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, Protocol
 
 import numpy as np
 import torch
 from torch import nn
+
+from psfdae.models.training import DeadNetworkError, Row, Training, TrainingError, train
+from psfdae.models.weights import with_weights
+from psfdae.rng import stream
+from psfdae.stars.noise import NoiseModel, mixed_levels
+
+if TYPE_CHECKING:
+    from psfdae.configuration.schema import Dae as DaeConfig
+    from psfdae.configuration.schema import Train
 
 
 class ArraySource(Protocol):
@@ -150,3 +161,136 @@ def predict_stream(
     for start in range(0, len(noisy), rows):
         part = slice(start, min(start + rows, len(noisy)))
         yield part, predict(model, noisy[part], factor, batch)
+
+
+def load_dae(config: DaeConfig, weights: Path) -> Dae:
+    """Network of a configuration with weights from a file; raises ProductError."""
+    return with_weights(lambda: Dae(config.kernels, config.widths), weights)
+
+
+@dataclass(frozen=True)
+class TrainingSet:
+    """Noise-free stars of one dataset and what is to be estimated from them.
+
+    Attributes
+    ----------
+    images, references : ndarray, shape (n, d, d), float32
+    fit, validation : ndarray of int
+        Star indices.
+    levels : ndarray, shape (L,)
+        Noise levels λ that are mixed.
+    noise : NoiseModel
+    """
+
+    images: np.ndarray
+    references: np.ndarray
+    fit: np.ndarray
+    validation: np.ndarray
+    levels: np.ndarray
+    noise: NoiseModel
+
+    def draw(self, stars: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Noisy images of `stars`, each at a random level."""
+        return self.noise.draw(self.images[stars], mixed_levels(self.levels, stars.size, rng), rng)
+
+
+class DaeTraining(Training):
+    """Training on noisy images, with noise that is drawn anew in every epoch, or once.
+
+    The history has MSEs of flux-normalised images. Another attempt draws other weights and
+    other noise.
+    """
+
+    settings: Train
+
+    def __init__(
+        self, data: TrainingSet, dae: DaeConfig, settings: Train, seed: int, attempt: int = 0
+    ) -> None:
+        self.data, self.seed = data, seed
+        self.factor = image_scale(dae.scale, data.images.shape[-1])
+        generator = torch.Generator()
+        generator.manual_seed(int(stream(seed, "dae", "init", attempt).integers(2**62)))
+        model = build_dae(dae.kernels, dae.widths, dae.init, generator)
+        super().__init__(model, settings, -(-data.fit.size // settings.batch), attempt)
+        self.grad_clip = settings.grad_clip or self.grad_clip
+        self.fixed: np.ndarray | None = None
+        if settings.noise == "fixed":
+            stars = np.arange(len(data.images))
+            self.fixed = data.draw(stars, stream(seed, "dae", "fixed noise"))
+
+    def batches(self, epoch: int) -> Iterator[tuple[torch.Tensor, ...]]:
+        """Noisy images and what is to come of them, (B, 1, d, d) as the network sees them."""
+        rng = stream(self.seed, "dae", "epoch", self.attempt, epoch)
+        order = rng.permutation(self.data.fit)
+        for start in range(0, order.size, self.settings.batch):
+            stars = order[start : start + self.settings.batch]
+            noisy = self.data.draw(stars, rng) if self.fixed is None else self.fixed[stars]
+            yield self._tensor(noisy), self._tensor(self.data.references[stars])
+
+    def _tensor(self, images: np.ndarray) -> torch.Tensor:
+        scaled = torch.from_numpy(images)[:, None] * self.factor
+        return scaled.to(memory_format=torch.channels_last)
+
+    def loss(self, batch: tuple[torch.Tensor, ...], step: int) -> torch.Tensor:
+        """Mean squared error."""
+        noisy, target = batch
+        output = self.model(noisy)
+        if step % self.settings.dead_check_steps == 0 and not output.detach().any():
+            raise DeadNetworkError(f"all outputs are zero at step {step}")
+        return nn.functional.mse_loss(output, target)
+
+    def validate(self, epoch: int) -> float:
+        """Mean squared error of the validation stars every few epochs and after the last."""
+        if epoch % self.settings.validate_every and epoch != self.settings.epochs:
+            return float("nan")
+        stars = np.tile(self.data.validation, self.settings.validation_draws)
+        noisy = self.data.draw(stars, stream(self.seed, "dae", "validation"))
+        estimate = predict(self.model, noisy, self.factor)
+        if not estimate.any():
+            raise DeadNetworkError(f"all outputs are zero after epoch {epoch}")
+        error = float(((estimate - self.data.references[stars]) ** 2).mean(dtype=np.float64))
+        if not np.isfinite(error):
+            raise TrainingError(
+                f"the validation error is {error} after epoch {epoch}: "
+                f"look for validation stars that are not finite"
+            )
+        return error
+
+    def row(self, epoch: int, rate: float, loss: float, error: float) -> Row:
+        """Row of the history; the learning rate is that at the epoch's end."""
+        return {
+            "epoch": epoch,
+            "step": epoch * self.steps,
+            "lr": self.rate,
+            "train_mse": loss / self.factor**2,
+            "validation_mse": error,
+            "seconds": round(self.seconds, 3),
+            "cpu_seconds": round(self.cpu_seconds, 3),
+        }
+
+    def finished(self) -> bool:
+        """All epochs are done, or `patience` validations brought nothing better."""
+        scores = [row["validation_mse"] for row in self.history]
+        scores = [score for score in scores if np.isfinite(score)]
+        stale = len(scores) - 1 - int(np.argmin(scores)) if scores else 0
+        return super().finished() or 0 < self.settings.patience <= stale
+
+
+def train_dae(
+    data: TrainingSet,
+    dae: DaeConfig,
+    settings: Train,
+    seed: int,
+    checkpoint: Path,
+    fingerprint: str,
+    report: Callable[[Row], None] = lambda row: None,
+) -> Training:
+    """A trained denoising autoencoder: `result`, `history`, `attempt` of the training.
+
+    Parameters and errors are those of `train`.
+    """
+
+    def begin(attempt: int) -> Training:
+        return DaeTraining(data, dae, settings, seed, attempt)
+
+    return train(begin, checkpoint, fingerprint, report, settings.restarts)

@@ -1,8 +1,9 @@
-"""Weights of a network as a file that notices damage: safetensors with a checksum."""
+"""Files of a network that notice damage: its weights, and an interrupted training's state."""
 
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -19,6 +20,9 @@ Network = TypeVar("Network", bound="Module")
 
 ABOUT = "psfdae"
 """The one key of the metadata: safetensors would write several in random order."""
+
+MAGIC = b"psfdae checkpoint, sha256 "
+"""What a checkpoint starts with; the checksum of all that follows it comes next."""
 
 
 def digest_of(arrays: Mapping[str, np.ndarray]) -> str:
@@ -109,3 +113,38 @@ def load_weights(path: Path) -> dict[str, np.ndarray]:
     if about.get("sha256", digest_of(arrays)) != digest_of(arrays):
         raise ProductError(f"{path}: damaged (wrong checksum); delete it and run again")
     return arrays
+
+
+def save_checkpoint(path: Path, fingerprint: str, state: Mapping[str, Any]) -> None:
+    """Write tensors and plain values with their checksum and the hash of what the training sees."""
+    import torch
+
+    content = io.BytesIO()
+    torch.save({"fingerprint": fingerprint, **state}, content)
+    digest = hashlib.sha256(content.getbuffer()).hexdigest().encode()
+    # No product: it changes all the time, and guards itself.
+    with atomic_path(path, digest=False) as temporary, temporary.open("wb") as file:
+        file.write(MAGIC + digest + b"\n")
+        file.write(content.getbuffer())
+
+
+def load_checkpoint(path: Path, fingerprint: str) -> dict[str, Any] | None:
+    """The state of an interrupted training; a damaged or another one is ignored, and named."""
+    import torch
+
+    if not path.is_file():
+        return None
+    head, _, content = path.read_bytes().partition(b"\n")
+    if head != MAGIC + hashlib.sha256(content).hexdigest().encode():
+        print(f"{path}: damaged checkpoint ignored (wrong checksum)", flush=True)
+        return None
+    try:
+        state: dict[str, Any] = torch.load(io.BytesIO(content), weights_only=True)
+    except Exception as error:  # written by another version of torch
+        print(f"{path}: unreadable checkpoint ignored ({type(error).__name__})", flush=True)
+        return None
+    if state.pop("fingerprint", None) != fingerprint:
+        print(f"{path}: checkpoint of another configuration ignored", flush=True)
+        return None
+    print(f"{path}: resuming after epoch {len(state['history'])}", flush=True)
+    return state

@@ -10,16 +10,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from psfdae.models.checkpoint import save_checkpoint
-from psfdae.models.dae import Dae, image_scale, predict
-from psfdae.models.training import (
-    DeadNetworkError,
-    Training,
-    TrainingError,
-    TrainingResult,
-    TrainingSet,
-    train_dae,
-)
+from psfdae.models.dae import Dae, DaeTraining, TrainingSet, image_scale, predict, train_dae
+from psfdae.models.training import DeadNetworkError, Training, TrainingError
+from psfdae.models.weights import save_checkpoint
 from psfdae.rng import stream
 from psfdae.stability.bench import Bench
 from psfdae.stability.networks import rounding_of, trained_network, training_set
@@ -69,22 +62,22 @@ def dead_networks(bench: Bench) -> Iterator[Entry]:
     data = training_set(bench, 100)
     config = _narrow(bench)
     settings = _short(bench, dead_check_steps=1)
-    training = Training(data, config, settings, bench.seed, 0)
+    training = DaeTraining(data, config, settings, bench.seed, 0)
     _kill(training.model)
-    yield refused("dead at the first step", lambda: training.run_epoch(_nothing), DeadNetworkError)
-    fresh = Training(data, config, settings, bench.seed, 0)
+    yield refused("dead at the first step", training.run_epoch, DeadNetworkError)
+    fresh = DaeTraining(data, config, settings, bench.seed, 0)
     _kill(fresh.model)
     checkpoint = bench.folder / "dead.pt"
     save_checkpoint(checkpoint, FINGERPRINT, fresh.state())
     outcome = attempt(lambda: _train(bench, data, settings, checkpoint=checkpoint))
-    restarted = outcome.attempt if isinstance(outcome, TrainingResult) else repr(outcome)
+    restarted = outcome.attempt if isinstance(outcome, Training) else repr(outcome)
     yield equal("dead at the first step", "attempt that came through", restarted, 1)
-    late = Training(data, config, _short(bench, dead_check_steps=1000), bench.seed, 0)
-    late.run_epoch(_nothing)
+    late = DaeTraining(data, config, _short(bench, dead_check_steps=1000), bench.seed, 0)
+    late.run_epoch()
     _kill(late.model)
     yield refused(
         "dead between two looks, met by the validation",
-        lambda: late.run_epoch(_nothing),
+        late.run_epoch,
         DeadNetworkError,
     )
 
@@ -109,11 +102,11 @@ def broken_training(bench: Bench) -> Iterator[Entry]:
     data = training_set(bench, 60)
     settings = _short(bench, batch=30, epochs=2)
     for step in (0, 1):
-        training = Training(data, _narrow(bench), settings, bench.seed, 0)
+        training = DaeTraining(data, _narrow(bench), settings, bench.seed, 0)
         _spoil_gradient(training, step)
         yield refused(
             f"NaN in the gradient of step {step}",
-            lambda t=training: t.run_epoch(_nothing),
+            training.run_epoch,
             TrainingError,
         )
     for part in ("fit", "validation"):
@@ -172,24 +165,22 @@ def _short(bench: Bench, **update: Any) -> Any:
 
 def _train(
     bench: Bench, data: TrainingSet, settings: Any, seed: int = 0, checkpoint: Any = None
-) -> TrainingResult:
+) -> Training:
     path = checkpoint or bench.folder / "checkpoint.pt"
-    return train_dae(
-        data, _narrow(bench), settings, seed, path, FINGERPRINT, lambda row: None, _nothing
-    )
+    return train_dae(data, _narrow(bench), settings, seed, path, FINGERPRINT)
 
 
 def _fate(bench: Bench, data: TrainingSet, outcome: Any) -> str:
     """What became of a training, in words."""
     if isinstance(outcome, Exception):
         return type(outcome).__name__
-    if not outcome.state:
+    if not outcome.result:
         return "no network"
-    if not all(bool(torch.isfinite(value).all()) for value in outcome.state.values()):
+    if not all(bool(torch.isfinite(value).all()) for value in outcome.result.values()):
         return "a network that is not finite"
     config = _narrow(bench)
     model = Dae(config.kernels, config.widths)
-    model.load_state_dict(outcome.state)
+    model.load_state_dict(outcome.result)
     alive = predict(model, data.images[:20], _factor(bench)).any()
     return "a live network" if alive else "a dead network"
 
@@ -222,10 +213,6 @@ def _threads(count: int) -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
-
-
-def _nothing() -> None:
-    """Called after each step."""
 
 
 CASES = (forward_pass, dead_networks, exploding_rates, broken_training, thread_counts)

@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from psfdae.models.dae import Dae
-from psfdae.models.training import Training, TrainingSet
+from psfdae.models.dae import Dae, DaeTraining, TrainingSet
 from psfdae.stability.bench import Bench
 
 STARS = 250
@@ -35,9 +34,9 @@ def trained_network(bench: Bench) -> Dae:
     settings = bench.config.train.model_copy(
         update={"epochs": 3, "batch": 25, "threads": 1, "schedule": "onecycle", "patience": 0}
     )
-    training = Training(training_set(bench, STARS), bench.config.dae, settings, bench.seed, 0)
+    training = DaeTraining(training_set(bench, STARS), bench.config.dae, settings, bench.seed, 0)
     for _ in range(settings.epochs):
-        training.run_epoch(lambda: None)
+        training.run_epoch()
     return training.model.eval()
 
 

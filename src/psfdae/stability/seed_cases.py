@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from psfdae.models.training import TrainingSet, train_dae
+from psfdae.models.dae import TrainingSet, train_dae
 from psfdae.rng import stream
 from psfdae.stability.bench import Bench
 from psfdae.stability.networks import training_set
@@ -80,10 +80,8 @@ def train(job: Job) -> Score:
         job.seed,
         job.folder / f"{job.seed}.pt",
         "seeds",
-        lambda row: None,
-        lambda: None,
     )
-    weights = next(iter(result.state.values())).flatten()[:16].tolist()
+    weights = next(iter(result.result.values())).flatten()[:16].tolist()
     best = min(row["validation_mse"] for row in result.history)
     return Score(best, result.attempt, tuple(weights))
 

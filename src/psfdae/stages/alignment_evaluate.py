@@ -32,7 +32,7 @@ CLEAN = 0.0
 
 def noisy_test_states(config: Any, stamps: np.ndarray, test_set: str, level: float) -> np.ndarray:
     """Stamps of a test set at one λ, shape (n, F, d, d), float32; unchanged for λ = 0."""
-    from psfdae.alignment.batches import noisy_states
+    from psfdae.alignment.cnn import noisy_states
 
     if level == CLEAN:
         return stamps
@@ -48,10 +48,10 @@ def cnn_predictor(folder: Path, config: Any) -> Callable[[np.ndarray], np.ndarra
     """
     import torch
 
+    from psfdae.alignment.cnn import load_cnn, predict_states
     from psfdae.alignment.telescope import mirror_symmetries
     from psfdae.configuration.alignment import Cnn
     from psfdae.configuration.compose import validate
-    from psfdae.models.cnn import load_cnn, predict_states
 
     torch.set_num_threads(config.evaluation.threads)
     path = folder / CONFIG

@@ -7,29 +7,20 @@ of many states, and the DAE's output for noisy stamps of many states.
 
 from __future__ import annotations
 
-import hashlib
-import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from psfdae.alignment.batches import (
-    TrainingStates,
-    epoch_batches,
-    gaussian_states,
-    noise_weights,
-    noisy_states,
-    steps_per_epoch,
-)
-from psfdae.belonging import STATE_STAMPS, require, require_origin, write_origin
-from psfdae.configuration.compose import decisive
-from psfdae.files import Product, read_product, write_text
+from psfdae.belonging import STATE_STAMPS, require, require_origin
+from psfdae.files import Product, read_product
 from psfdae.rng import stream
 from psfdae.stages.common import limit_threads, noise_model
-from psfdae.stages.train import as_csv, as_yaml
-from psfdae.stages.trained import CONFIG, HISTORY, WEIGHTS, trained_dae
+from psfdae.stages.trained import WEIGHTS, fingerprint, keep, progress, trained_dae
 from psfdae.stars.noise import mixed_levels
+
+if TYPE_CHECKING:
+    from psfdae.alignment.cnn import TrainingStates
 
 CNN_WEIGHTS = "cnn.safetensors"
 
@@ -48,11 +39,10 @@ def train_dae_stamps(config: Any, grid: Path, train: Path, out: Path, checkpoint
         `trained_on.yaml` what the grid says of itself
     checkpoint : file that lets an interrupted training resume
 
-    Raises TrainingError as `psfdae.models.training.train_dae` does, and ProductError if the
+    Raises TrainingError as `train_dae` does, and ProductError if the
     products are of different telescopes or stamps.
     """
-    from psfdae.models.training import TrainingSet, train_dae
-    from psfdae.models.weights import save_weights
+    from psfdae.models.dae import TrainingSet, train_dae
 
     on, validating = _read(grid), _read(train)
     require(train, validating.config, STATE_STAMPS, on.config, grid)
@@ -66,25 +56,11 @@ def train_dae_stamps(config: Any, grid: Path, train: Path, out: Path, checkpoint
         levels=np.asarray(config.noise.levels),
         noise=noise_model(config),
     )
-    described = config.model_dump()
-    result = train_dae(
-        data,
-        config.dae,
-        config.dae_train,
-        config.seed,
-        checkpoint,
-        _fingerprint(described, images),
-        lambda row: print(
-            f"epoch {row['epoch']:.0f}/{config.dae_train.epochs}  train MSE "
-            f"{row['train_mse']:.3e}  validation MSE {row['validation_mse']:.3e}",
-            flush=True,
-        ),
-        lambda: None,
-    )
-    save_weights(out / WEIGHTS, result.state, described)
-    write_origin(out, on)
-    write_text(out / HISTORY, as_csv(result.history))
-    write_text(out / CONFIG, as_yaml({**described, "attempt": result.attempt}))
+    described, settings = config.model_dump(), config.dae_train
+    seen = fingerprint(described, images)
+    with progress(settings.epochs) as report:
+        done = train_dae(data, config.dae, settings, config.seed, checkpoint, seen, report)
+    keep(done, out, WEIGHTS, described, on, attempt=done.attempt)
     checkpoint.unlink(missing_ok=True)
 
 
@@ -99,8 +75,10 @@ def train_original(config: Any, grid: Path, out: Path, checkpoint: Path) -> None
         `trained_on.yaml` what the states say of themselves
     checkpoint : file that lets an interrupted training resume
 
-    Raises CnnTrainingError as `psfdae.models.cnn.train_cnn` does.
+    Raises TrainingError as `psfdae.models.training.train` does.
     """
+    from psfdae.alignment.cnn import TrainingStates
+
     product = _read(grid)
     data = TrainingStates(product["states"], product["stamps"])
     _train("original", config, config.train_original, product, data, out, checkpoint)
@@ -115,6 +93,8 @@ def train_noise_trained(config: Any, train: Path, out: Path, checkpoint: Path) -
     train : product "alignment_states"
     out, checkpoint : as for `train_original`
     """
+    from psfdae.alignment.cnn import TrainingStates, gaussian_states
+
     noise, settings, product = noise_model(config), config.train_noise_trained, _read(train)
 
     def disturb(stamps: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -142,6 +122,8 @@ def train_dae_retrained(config: Any, train: Path, dae: Path, out: Path, checkpoi
     ProductError
         If the DAE was trained on the stamps of another telescope, or of another size.
     """
+    from psfdae.alignment.cnn import TrainingStates, noisy_states
+
     product = _read(train)
     require_origin(dae, STATE_STAMPS, product)
     states, stamps = product["states"], product["stamps"]
@@ -155,6 +137,8 @@ def train_dae_retrained(config: Any, train: Path, dae: Path, out: Path, checkpoi
 
 def _weights(config: Any, settings: Any, level: np.ndarray) -> np.ndarray:
     """Weights of states in the loss, (n,)."""
+    from psfdae.alignment.cnn import noise_weights
+
     if not settings.weigh_noise:
         return np.ones(len(level))
     return noise_weights(level, config.noise.levels)
@@ -182,39 +166,20 @@ def _train(
     checkpoint: Path,
 ) -> None:
     """Train one CNN and leave weights, resolved config and history in a folder."""
-    from psfdae.alignment.telescope import mirror_symmetries
-    from psfdae.models.cnn import CnnTraining, train_cnn
-    from psfdae.models.weights import save_weights
+    from psfdae.alignment.cnn import CnnTraining
+    from psfdae.models.training import train
 
     limit_threads(settings.threads)
-    stamps = data.stamps
-    fields, side = stamps.shape[1], stamps.shape[-1]
-    mirrors = mirror_symmetries(fields - 1) if settings.mirrors else []
-    training = CnnTraining(
-        epoch_batches(data, settings.batch, config.seed, name, mirrors),
-        steps_per_epoch(len(data.states), settings.batch),
-        (fields, side),
-        config.cnn,
-        settings,
-        config.seed,
-        name,
-    )
+    fields, side = data.stamps.shape[1], data.stamps.shape[-1]
     described = {**config.model_dump(), "fields": fields, "stamp_px": side, "name": name}
     described["mirrors"] = settings.mirrors
-    train_cnn(
-        training,
-        checkpoint,
-        _fingerprint(described, stamps),
-        lambda row: print(
-            f"epoch {row['epoch']:.0f}/{settings.epochs}  loss {row['loss']:.3e}  "
-            f"{row['seconds']:.0f} s",
-            flush=True,
-        ),
-    )
-    save_weights(out / CNN_WEIGHTS, training.model.state_dict(), described)
-    write_origin(out, product)
-    write_text(out / HISTORY, as_csv(training.history))
-    write_text(out / CONFIG, as_yaml(described))
+
+    def begin(attempt: int) -> CnnTraining:
+        return CnnTraining(data, config.cnn, settings, config.seed, name)
+
+    with progress(settings.epochs) as report:
+        done = train(begin, checkpoint, fingerprint(described, data.stamps), report)
+    keep(done, out, CNN_WEIGHTS, described, product)
     checkpoint.unlink(missing_ok=True)
 
 
@@ -224,10 +189,3 @@ def _read(path: Path) -> Product:
 
 def _flat(stamps: np.ndarray) -> np.ndarray:
     return stamps.reshape(-1, *stamps.shape[-2:])
-
-
-def _fingerprint(described: dict[str, Any], stamps: np.ndarray) -> str:
-    """Hash of the images that a training sees, and of what of its configuration counts."""
-    digest = hashlib.sha256(json.dumps(decisive(described), sort_keys=True).encode())
-    digest.update(np.ascontiguousarray(stamps).tobytes())
-    return digest.hexdigest()

@@ -136,8 +136,7 @@ def _refuse_mismatch(trained: dict[str, Any], asked: dict[str, Any], path: Path)
 
 
 def _load(folder: Path, trained: dict[str, Any], stamp_px: int, batch: int) -> _Network:
-    from psfdae.models.dae import image_scale, predict
-    from psfdae.models.training import load_dae
+    from psfdae.models.dae import image_scale, load_dae, predict
 
     settings = dae_settings(folder, trained)
     model = load_dae(settings, folder / WEIGHTS)

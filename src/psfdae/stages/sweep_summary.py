@@ -123,7 +123,7 @@ def _best_yaml(
 ) -> str:
     """The best point as overrides, those of the workflow before its own."""
     from psfdae.configuration.compose import as_overrides
-    from psfdae.stages.train import as_yaml
+    from psfdae.stages.trained import as_yaml
 
     own = [override.removeprefix("++") for override in as_overrides(best["keys"])]
     tree = {

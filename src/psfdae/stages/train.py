@@ -2,21 +2,13 @@
 
 from __future__ import annotations
 
-import csv
-import hashlib
-import io
-import json
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from psfdae.belonging import write_origin
-from psfdae.configuration.compose import decisive
-from psfdae.files import write_text
 from psfdae.stages.common import noise_model, read_stars, split_stars
-from psfdae.stages.trained import CONFIG, HISTORY, WEIGHTS
+from psfdae.stages.trained import WEIGHTS, fingerprint, keep, progress
 
 
 def run(config: Any, stars: Path, split: str, reference: str, out: Path, checkpoint: Path) -> None:
@@ -33,10 +25,7 @@ def run(config: Any, stars: Path, split: str, reference: str, out: Path, checkpo
 
     Raises TrainingError as `train_dae` does.
     """
-    from tqdm import tqdm
-
-    from psfdae.models.training import TrainingSet, train_dae
-    from psfdae.models.weights import save_weights
+    from psfdae.models.dae import TrainingSet, train_dae
 
     product = read_stars(stars, reference)
     parts = split_stars(product, split, config)
@@ -49,57 +38,8 @@ def run(config: Any, stars: Path, split: str, reference: str, out: Path, checkpo
         noise=noise_model(config),
     )
     described = {**config.model_dump(), "split": split, "reference": reference}
-    epochs = config.train.epochs
-    steps = epochs * -(-parts.fit.size // config.train.batch)
-    terminal = sys.stderr.isatty()
-    with tqdm(total=steps, unit="step", disable=not terminal, desc="train") as bar:
-
-        def report(row: dict[str, float]) -> None:
-            line = (
-                f"epoch {row['epoch']:.0f}/{epochs}  train MSE {row['train_mse']:.3e}  "
-                f"validation MSE {row['validation_mse']:.3e}  {row['seconds']:.0f} s"
-            )
-            if terminal:
-                bar.set_postfix_str(f"MSE {row['train_mse']:.2e}")
-            else:
-                print(line, flush=True)
-
-        result = train_dae(
-            data,
-            config.dae,
-            config.train,
-            config.seed,
-            checkpoint,
-            _fingerprint(described, data),
-            report,
-            bar.update,
-        )
-    save_weights(out / WEIGHTS, result.state, described)
-    write_origin(out, product)
-    write_text(out / HISTORY, as_csv(result.history))
-    write_text(out / CONFIG, as_yaml({**described, "attempt": result.attempt}))
+    seen = fingerprint(described, data.images, data.references, data.fit)
+    with progress(config.train.epochs) as report:
+        done = train_dae(data, config.dae, config.train, config.seed, checkpoint, seen, report)
+    keep(done, out, WEIGHTS, described, product, attempt=done.attempt)
     checkpoint.unlink(missing_ok=True)
-
-
-def _fingerprint(described: dict[str, Any], data: Any) -> str:
-    """Hash of the images that a training sees, and of what of its configuration counts."""
-    digest = hashlib.sha256(json.dumps(decisive(described), sort_keys=True).encode())
-    for array in (data.images, data.references, data.fit):
-        digest.update(np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()
-
-
-def as_csv(rows: list[dict[str, float]]) -> str:
-    """CSV of a training's history."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, fieldnames=list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue()
-
-
-def as_yaml(tree: dict[str, Any]) -> str:
-    """YAML of a resolved configuration, keys sorted."""
-    import yaml
-
-    return yaml.safe_dump(tree, sort_keys=True)

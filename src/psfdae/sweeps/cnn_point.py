@@ -9,7 +9,7 @@ import numpy as np
 from psfdae.belonging import STATE_STAMPS, require
 from psfdae.evaluation.alignment_tables import error_rows
 from psfdae.files import read_product, write_text
-from psfdae.models.cnn import CnnTrainingError
+from psfdae.models.training import TrainingError
 from psfdae.reading import read_table, read_yaml
 from psfdae.stages import alignment_train as stage
 from psfdae.stages.alignment_evaluate import cnn_predictor, noisy_test_states
@@ -25,7 +25,7 @@ from psfdae.sweeps.measured import (
 )
 
 FILES = (stage.CNN_WEIGHTS, CONFIG, HISTORY)
-FAILURES = (CnnTrainingError,)
+FAILURES = (TrainingError,)
 
 TEST_SET = "uniform"
 """Test set of scene 3, whose noise is drawn as in the main workflow."""
@@ -39,7 +39,7 @@ def run(config: Any, task: Task) -> Measured:
     config : stage config (seed, noise, cnn, train_<CNN>, evaluation)
     task : Task; its `dataset` is the CNN, original or noise_trained
 
-    Raises CnnTrainingError if the training cannot go on, and ProductError if the products
+    Raises TrainingError if the training cannot go on, and ProductError if the products
     are of different telescopes or stamps.
     """
     import pandas as pd
