@@ -270,14 +270,14 @@ def test_streams_that_repeat_each_other_give_a_failing_row(bench, monkeypatch):
 
 
 def test_network_without_a_look_for_death_gives_failing_rows(bench, monkeypatch):
-    class Blind(network_cases.Training):
-        def _step(self, noisy, target, step):
+    class Blind(network_cases.DaeTraining):
+        def _step(self, batch, step):
             return 0.0
 
-        def _validate(self):
+        def validate(self, epoch):
             return 1.0
 
-    monkeypatch.setattr(network_cases, "Training", Blind)
+    monkeypatch.setattr(network_cases, "DaeTraining", Blind)
     bad = failing(network_cases.dead_networks, bench)
     assert "dead at the first step: error raised" in bad
 
