@@ -20,7 +20,6 @@ from psfdae.configuration.alignment import Cnn, CnnTrain
 from psfdae.models.training import Row, Training
 from psfdae.models.weights import with_weights
 from psfdae.rng import stream
-from psfdae.stars.noise import NoiseModel
 
 PARAMETERS = 4
 """Numbers of a state: decentre x, y and tilt x, y in units of the range."""
@@ -103,40 +102,6 @@ def predict_states(model: AlignmentCnn, stamps: np.ndarray, batch: int = 256) ->
         for start in range(0, len(stamps), batch)
     ]
     return np.concatenate(parts).astype(np.float64)
-
-
-def noisy_states(
-    noise: NoiseModel, stamps: np.ndarray, level: np.ndarray, rng: np.random.Generator
-) -> np.ndarray:
-    """Noisy stamps of states by Poisson's law, shape (n, F, d, d), float32.
-
-    Parameters
-    ----------
-    noise : NoiseModel
-    stamps : ndarray, shape (n, F, d, d)
-        Noise-free, each sums to 1.
-    level : ndarray, shape (n,)
-        Noise level λ of all stamps of a state.
-    rng : Generator
-    """
-    count, fields, side, _ = stamps.shape
-    flat = stamps.reshape(-1, side, side)
-    return noise.draw(flat, np.repeat(level, fields), rng).reshape(count, fields, side, side)
-
-
-def gaussian_states(
-    noise: NoiseModel, stamps: np.ndarray, level: np.ndarray, rng: np.random.Generator
-) -> np.ndarray:
-    """As `noisy_states` with Gaussian noise of the same variance, for training only.
-
-    With 1e4 photons of sky in a pixel the two laws differ by 1 % in skewness,
-    and the draw takes a tenth of the time.
-    """
-    level = np.asarray(level)[:, None, None, None]
-    sigma = np.sqrt(noise.variance(stamps, level)).astype(np.float32)
-    sigma *= rng.standard_normal(stamps.shape, dtype=np.float32)
-    sigma += stamps
-    return sigma
 
 
 def noise_weights(level: np.ndarray, levels: list[float]) -> np.ndarray:

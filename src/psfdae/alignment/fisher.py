@@ -44,8 +44,7 @@ def fisher_information(
 def by_parameter(derivatives: np.ndarray) -> np.ndarray:
     """Derivatives (n, F, K, d, d) as rows per parameter, shape (n, K, F·d²), float64."""
     count, _, parameters = derivatives.shape[:3]
-    ordered = np.moveaxis(derivatives, 2, 1).astype(np.float64)
-    return ordered.reshape(count, parameters, -1)
+    return np.moveaxis(derivatives, 2, 1).astype(np.float64).reshape(count, parameters, -1)
 
 
 def bound_covariances(
@@ -55,20 +54,12 @@ def bound_covariances(
     levels: list[float],
     states: np.ndarray,
 ) -> np.ndarray:
-    """Cramér–Rao bounds on the covariance of any unbiased estimate.
-
-    Parameters
-    ----------
-    model, operator : wavefronts and stamps of the telescope
-    noise : NoiseModel
-    levels : list of float
-        Noise levels λ, L of them.
-    states : ndarray, shape (n, 4)
+    """Cramér–Rao bounds on the covariance of any unbiased estimate of states (n, 4).
 
     Returns
     -------
     ndarray, shape (L, n, 4, 4)
-        In squared units of the range.
+        For the L noise levels λ, in squared units of the range.
     """
     out = np.empty((len(levels), len(states), 4, 4))
     for start in range(0, len(states), CHUNK):
@@ -80,39 +71,16 @@ def bound_covariances(
 
 
 def expected_abs_error(covariances: np.ndarray) -> np.ndarray:
-    """Mean absolute error of normal errors, √(2/π) σ, shape (..., K)."""
-    return np.sqrt(2.0 / np.pi) * sigmas(covariances)
-
-
-def sigmas(covariances: np.ndarray) -> np.ndarray:
-    """Standard deviations, (..., K, K) to (..., K)."""
-    return np.sqrt(np.diagonal(covariances, axis1=-2, axis2=-1))
-
-
-def correlations(covariances: np.ndarray) -> np.ndarray:
-    """Correlation matrices of covariance matrices, shape (..., K, K)."""
-    sigma = sigmas(covariances)
-    return covariances / (sigma[..., :, None] * sigma[..., None, :])
+    """Mean absolute error of normal errors, √(2/π) σ, (..., K, K) to (..., K)."""
+    return np.sqrt(2.0 / np.pi) * np.sqrt(np.diagonal(covariances, axis1=-2, axis2=-1))
 
 
 def coma_free_decentre(model: QuadraticModel, tilts: np.ndarray, noll: np.ndarray) -> np.ndarray:
-    """Decentres that cancel the field-constant coma of tilts, to first order.
+    """Decentres that cancel the field-constant coma of tilts, to first order, (n, 2) to (n, 2).
 
-    Along this line tilt and decentre leave hardly more than linear astigmatism,
-    whose sign an image in focus does not show: in focus, t and −t on it are twins.
-
-    Parameters
-    ----------
-    model : QuadraticModel
-    tilts : ndarray, shape (n, 2)
-        In units of the range.
-    noll : ndarray of int
-        Noll indices of the model's coefficients.
-
-    Returns
-    -------
-    ndarray, shape (n, 2)
-        In units of the range.
+    In units of the range; `noll` are the Noll indices of the model's coefficients. Along
+    this line tilt and decentre leave hardly more than linear astigmatism, whose sign an
+    image in focus does not show: in focus, t and −t on it are twins.
     """
     coma = np.isin(noll, (7, 8))
     slopes = model.coefficients[:, 1:5][:, :, coma].mean(axis=0)
@@ -125,6 +93,5 @@ def twin_states(model: QuadraticModel, states: np.ndarray, noll: np.ndarray) -> 
     In focus their stamps hardly differ from those of `states`.
     """
     change = -2.0 * states[:, 2:]
-    return np.concatenate(
-        [states[:, :2] + coma_free_decentre(model, change, noll), -states[:, 2:]], axis=1
-    )
+    decentre = states[:, :2] + coma_free_decentre(model, change, noll)
+    return np.concatenate([decentre, -states[:, 2:]], axis=1)

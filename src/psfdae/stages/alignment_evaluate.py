@@ -32,12 +32,10 @@ CLEAN = 0.0
 
 def noisy_test_states(config: Any, stamps: np.ndarray, test_set: str, level: float) -> np.ndarray:
     """Stamps of a test set at one λ, shape (n, F, d, d), float32; unchanged for λ = 0."""
-    from psfdae.alignment.cnn import noisy_states
-
     if level == CLEAN:
         return stamps
     rng = stream(config.seed, "alignment", "noise", test_set, f"{level:.6g}")
-    return noisy_states(noise_model(config), stamps, np.full(len(stamps), level), rng)
+    return noise_model(config).draw(stamps, level, rng)
 
 
 def cnn_predictor(folder: Path, config: Any) -> Callable[[np.ndarray], np.ndarray]:

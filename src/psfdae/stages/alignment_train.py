@@ -93,13 +93,13 @@ def train_noise_trained(config: Any, train: Path, out: Path, checkpoint: Path) -
     train : product "alignment_states"
     out, checkpoint : as for `train_original`
     """
-    from psfdae.alignment.cnn import TrainingStates, gaussian_states
+    from psfdae.alignment.cnn import TrainingStates
 
     noise, settings, product = noise_model(config), config.train_noise_trained, _read(train)
 
     def disturb(stamps: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         level = mixed_levels(np.asarray(config.noise.levels), len(stamps), rng)
-        return gaussian_states(noise, stamps, level, rng), _weights(config, settings, level)
+        return noise.draw_gaussian(stamps, level, rng), _weights(config, settings, level)
 
     data = TrainingStates(product["states"], product["stamps"], disturb=disturb)
     _train("noise_trained", config, settings, product, data, out, checkpoint)
@@ -122,14 +122,14 @@ def train_dae_retrained(config: Any, train: Path, dae: Path, out: Path, checkpoi
     ProductError
         If the DAE was trained on the stamps of another telescope, or of another size.
     """
-    from psfdae.alignment.cnn import TrainingStates, noisy_states
+    from psfdae.alignment.cnn import TrainingStates
 
     product = _read(train)
     require_origin(dae, STATE_STAMPS, product)
     states, stamps = product["states"], product["stamps"]
     rng = stream(config.seed, "cnn", "noise", "dae_retrained")
     level = mixed_levels(np.asarray(config.noise.levels), len(states), rng)
-    denoised = denoise(dae, config, noisy_states(noise_model(config), stamps, level, rng))
+    denoised = denoise(dae, config, noise_model(config).draw(stamps, level, rng))
     settings = config.train_dae_retrained
     data = TrainingStates(states, denoised, weights=_weights(config, settings, level))
     _train("dae_retrained", config, settings, product, data, out, checkpoint)

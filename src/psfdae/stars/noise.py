@@ -20,6 +20,8 @@ import numpy as np
 class NoiseModel:
     """Background-limited photon noise.
 
+    Noise-free images `psf` sum to 1; a noise level λ is a number or one per star.
+
     Attributes
     ----------
     kappa : float
@@ -36,29 +38,44 @@ class NoiseModel:
         return np.sqrt(self.background) / (self.kappa * np.asarray(level, dtype=np.float64))
 
     def variance(self, psf: np.ndarray, level: np.ndarray | float) -> np.ndarray:
-        """Pixel variance of a normalised image with the noise-free image `psf`."""
+        """Pixel variance of a normalised image; `level` broadcasts against `psf`."""
         return (self.kappa * np.asarray(level)) ** 2 + psf / self.flux(level)
 
     def draw(
         self, psf: np.ndarray, level: np.ndarray | float, rng: np.random.Generator
     ) -> np.ndarray:
-        """Noisy images of stars.
+        """Noisy images of stars, sky-subtracted and normalised by the true flux.
 
         Parameters
         ----------
-        psf : ndarray, shape (B, d, d)
-            Noise-free stamps that sum to 1.
+        psf : ndarray, shape (B, ...)
         level : float or ndarray, shape (B,)
-            Noise level λ of each star.
 
         Returns
         -------
-        ndarray, shape (B, d, d), float32
-            Sky-subtracted, normalised by the true flux.
+        ndarray, shape (B, ...), float32
         """
-        flux = np.broadcast_to(self.flux(level), (len(psf),))[:, None, None]
+        flux = _per_image(self.flux(level), psf)
         photons = rng.poisson(flux * psf + self.background)
         return ((photons - self.background) / flux).astype(np.float32)
+
+    def draw_gaussian(
+        self, psf: np.ndarray, level: np.ndarray | float, rng: np.random.Generator
+    ) -> np.ndarray:
+        """As `draw` with Gaussian noise of the same variance, for training only.
+
+        With 1e4 photons of sky in a pixel the two laws differ by 1 % in skewness,
+        and the draw takes a tenth of the time.
+        """
+        noisy = np.sqrt(self.variance(psf, _per_image(level, psf))).astype(np.float32)
+        noisy *= rng.standard_normal(psf.shape, dtype=np.float32)
+        noisy += psf
+        return noisy
+
+
+def _per_image(values: np.ndarray | float, psf: np.ndarray) -> np.ndarray:
+    """One value for each of the images (B, ...), ready to be broadcast against them."""
+    return np.broadcast_to(values, len(psf)).reshape(-1, *[1] * (psf.ndim - 1))
 
 
 def mixed_levels(levels: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
