@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.special import jv
 
+from psfdae.configuration.compose import ConfigError, load
 from psfdae.optics.pupil import annular_pupil, pupil_axis
 from psfdae.optics.sampling import SamplingError
 from psfdae.optics.turbulence import (
@@ -49,6 +50,12 @@ def scene(points=20, **changes):
 
 def waves(seed, r0=R0, highest=60.0):
     return draw_waves(512, r0, L0, highest, stream(seed, "test"))
+
+
+def phase_of(waves, position):
+    """The plain sum of plane waves in radians at positions (..., 2) in metres."""
+    argument = 2 * np.pi * position @ waves.frequency.T
+    return np.cos(argument) @ waves.amplitude.real - np.sin(argument) @ waves.amplitude.imag
 
 
 def disc(axis):
@@ -94,10 +101,16 @@ def test_layers_add_up_to_r0():
     assert sum(layers) == pytest.approx(structure_function(separation, R0, L0), rel=1e-12)
 
 
-@pytest.mark.parametrize("strengths", [(0.6, 0.3), (1.2, -0.2)])
-def test_strengths_that_do_not_add_up_are_an_error(strengths):
-    with pytest.raises(ValueError, match="add up to 1"):
-        layer_r0(R0, strengths)
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("layer_strengths=[0.6,0.25,0.1]", "must add up to 1"),
+        ("layer_heights_m=[0,4000]", "one for each of the 2 layer_heights_m"),
+    ],
+)
+def test_layers_that_do_not_fit_are_named(override, message):
+    with pytest.raises(ConfigError, match=message):
+        load(["dataset=dataset7", f"wavefront.{override}"])
 
 
 @pytest.mark.parametrize("count", [8, 100])
@@ -122,7 +135,7 @@ def test_ensemble_structure_function():
     points = np.concatenate([np.zeros((1, 2)), along_x, along_y])
     squares = []
     for seed in range(1000):
-        phase = waves(seed).phase(start + points)
+        phase = phase_of(waves(seed), start + points)
         squares.append(((phase[:, 1:] - phase[:, :1]) ** 2).mean(axis=0).reshape(2, -1))
     ratio = np.array(squares) / structure_function(separation, R0, L0)
     assert ratio.mean(axis=(0, 1)) == pytest.approx(np.ones(4), abs=0.05)
@@ -196,7 +209,7 @@ def test_footprints_equal_the_plain_sum_of_waves():
     position = 0.6 * np.stack(np.meshgrid(axis, axis), axis=-1)
     for index in (0, 4, 5):
         phase = sum(
-            layer.phase(position + height * directions[index])
+            phase_of(layer, position + height * directions[index])
             for layer, height in zip(layers, HEIGHTS, strict=True)
         )
         opd = footprints.opd(np.array([index]), axis, FLOAT64)[0]
@@ -221,11 +234,6 @@ def test_planes_in_closed_form_agree_with_a_fit():
     plane = np.stack([np.ones_like(x), x, y], axis=1)
     fitted, *_ = np.linalg.lstsq(plane, np.exp(1j * np.stack([x, y], axis=1) @ wavevector.T))
     assert np.abs(fitted_planes(wavevector, 0.4) - fitted.T).max() < 2e-3
-
-
-def test_one_height_per_layer():
-    with pytest.raises(ValueError, match="2 heights for 1 layers"):
-        Footprints([waves(1)], [0.0, 1.0], np.zeros((1, 2)), 1.0)
 
 
 # --- scene ----------------------------------------------------------------------------

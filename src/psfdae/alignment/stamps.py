@@ -36,17 +36,10 @@ class EnergyError(ValueError):
 
 
 def mean_slope(j: int, obscuration: float) -> tuple[float, float]:
-    """Mean gradient (x, y) of a Noll polynomial over an annulus, per pupil radius.
+    """Mean gradient (x, y) of Noll polynomial j over an annulus, per pupil radius.
 
     By the divergence theorem it is an integral along the two rims; only terms
     with one cycle per turn have one.
-
-    Parameters
-    ----------
-    j : int
-        Noll index.
-    obscuration : float
-        Linear central obscuration ε.
     """
     n, m = noll_to_nm(j)
     if abs(m) != 1:
@@ -57,7 +50,7 @@ def mean_slope(j: int, obscuration: float) -> tuple[float, float]:
 
 
 def centred_modes(highest: int, obscuration: float, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """OPD of unit Zernike coefficients with their centring tilts.
+    """OPD in waves of unit Zernike coefficients with their centring tilts, (highest − 3, ...).
 
     The sign turns the lead of a wavefront, which coefficients count, into an
     OPD. Stamps are then seen as the detector shows them: columns run along +x
@@ -69,13 +62,8 @@ def centred_modes(highest: int, obscuration: float, x: np.ndarray, y: np.ndarray
         Highest Noll index; the first is `FIRST_NOLL`.
     obscuration : float
         Linear central obscuration of the pupil that is centred.
-    x, y : ndarray
+    x, y : ndarray, shape (...)
         Pupil coordinates in pupil radii.
-
-    Returns
-    -------
-    ndarray, shape (highest − 3, ...)
-        In waves.
     """
     modes = []
     for j in range(FIRST_NOLL, highest + 1):
@@ -192,11 +180,8 @@ class AlignmentStamps:
         """The operator on a pupil grid with N samples across; made once, then kept."""
         if samples not in self._operators:
             pupil, pixel = annular_pupil(samples, self.telescope.obscuration), self.telescope.pixel
-            side, nodes, precision = (
-                self.alignment.stamp_px,
-                self.optics.nodes,
-                self.optics.precision,
-            )
+            side, nodes = self.alignment.stamp_px, self.optics.nodes
+            precision = self.optics.precision
             sampling: Sampling = (
                 PeriodSampling(pupil, side, pixel, precision)
                 if nodes is None

@@ -42,10 +42,7 @@ class ModelError(RuntimeError):
 def field_points(radius_deg: float, points: int) -> np.ndarray:
     """The centre of the field and points on a circle, the first on the x axis.
 
-    Returns
-    -------
-    ndarray, shape (1 + points, 2)
-        Field angles (x, y) in radians.
+    Field angles (x, y) in radians, shape (1 + points, 2).
     """
     angle = 2.0 * np.pi * np.arange(points) / points
     circle = np.deg2rad(radius_deg) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -163,14 +160,7 @@ class QuadraticModel:
 
 
 def fit_quadratic(states: np.ndarray, zernikes: np.ndarray) -> QuadraticModel:
-    """Least-squares fit of the model.
-
-    Parameters
-    ----------
-    states : ndarray, shape (n, 4)
-        In units of the range, such as `design_states`.
-    zernikes : ndarray, shape (n, F, J)
-        Their coefficients in waves.
+    """Least-squares fit of the model to states (n, 4) with coefficients (n, F, J) in waves.
 
     Raises
     ------

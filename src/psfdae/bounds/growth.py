@@ -33,12 +33,7 @@ def nested_means(
     parts : sequence of PosteriorSums
         Sums over equally large disjoint parts; their number is a power of two.
     measure : function
-        From the sums over a bank to an array.
-
-    Returns
-    -------
-    dict of int to ndarray
-        Mean of `measure` by number of parts.
+        From the sums over a bank to an array; its mean is returned by number of parts.
     """
     means: dict[int, np.ndarray] = {}
     level = list(parts)

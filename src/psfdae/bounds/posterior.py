@@ -68,34 +68,17 @@ class Likelihood:
         return cls(float(noise.flux(level)), noise.background, symmetric.ravel())
 
     def residuals(self, noisy: np.ndarray) -> np.ndarray:
-        """Counts n − n̄ of normalised, sky-subtracted images.
+        """Counts n − n̄ of images (n, d, d) that `NoiseModel.draw` gives, (n, P), float64.
 
-        Parameters
-        ----------
-        noisy : ndarray, shape (n, d, d)
-            As `NoiseModel.draw` gives them; counts are whole numbers, so rounding
-            undoes the loss of single precision.
-
-        Returns
-        -------
-        ndarray, shape (n, P), float64
+        Counts are whole numbers, so rounding undoes the loss of single precision.
         """
         counts = np.rint(self.flux * noisy.reshape(len(noisy), -1).astype(np.float64))
         return counts - self.flux * self.centre
 
     def factors(self, stamps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """What multiplies the residuals, and what is added to the product.
+        """What multiplies the residuals, and what is added to the product, for stamps (K, P).
 
-        Parameters
-        ----------
-        stamps : ndarray, shape (K, P), float64
-
-        Returns
-        -------
-        ratio : ndarray, shape (K, P), float64
-            ℓ − ℓ̄.
-        offset : ndarray, shape (K,), float64
-            n̄·ℓ − F Σp.
+        That is ℓ − ℓ̄, shape (K, P), and n̄·ℓ − F Σp, shape (K,), in float64.
         """
         scale = self.flux / self.background
         ratio = np.log1p(scale * stamps)

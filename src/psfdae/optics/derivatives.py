@@ -39,19 +39,7 @@ class Sampling(Protocol):
 
 
 class NodeSampling:
-    """Gauss–Legendre nodes in every pixel, as `StampPropagator` places them.
-
-    Parameters
-    ----------
-    pupil : Pupil
-    stamp_px : int
-        Pixels d along a side of the stamp.
-    pixel : float
-        Pixel width in λ/D.
-    nodes : int
-        Nodes per pixel and axis.
-    precision : "complex64" or "complex128"
-    """
+    """Gauss–Legendre nodes in every pixel, as `StampPropagator` places them; its parameters."""
 
     def __init__(
         self, pupil: Pupil, stamp_px: int, pixel: float, nodes: int, precision: Precision
@@ -62,7 +50,7 @@ class NodeSampling:
         self.pixels = np.kron(np.eye(stamp_px), weights).astype(self._dft.real.dtype)
 
     def fields(self, pupil_fields: np.ndarray) -> np.ndarray:
-        """Fields at the nodes, shape (..., d·nodes, d·nodes)."""
+        """See `Sampling`, m = d·nodes."""
         return self._dft.T @ (pupil_fields @ self._dft)
 
 
@@ -72,8 +60,6 @@ class PeriodSampling:
     With lags l of the pupil's samples, |E(u)|² = Σ_l c_l exp(−πi l·spacing·u); the
     integral over a pixel multiplies c_l by the pixel's width and a sinc. Twice as
     many points as samples determine all c_l.
-
-    Parameters are those of `NodeSampling`, without nodes.
     """
 
     def __init__(self, pupil: Pupil, stamp_px: int, pixel: float, precision: Precision) -> None:
@@ -91,7 +77,7 @@ class PeriodSampling:
         self.pixels = self.pixels.astype(np.empty(0, precision).real.dtype)
 
     def fields(self, pupil_fields: np.ndarray) -> np.ndarray:
-        """Fields over the period, shape (..., points, points)."""
+        """See `Sampling`, m = points."""
         rows = fft.fft(pupil_fields, self.points, axis=-1)
         return fft.fft(rows, self.points, axis=-2)
 
@@ -204,12 +190,7 @@ class ModalStamps:
 def normalise_with_derivatives(
     stamps: np.ndarray, derivatives: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Divide stamps by their own flux, and differentiate the quotient.
-
-    Parameters
-    ----------
-    stamps : ndarray, shape (..., d, d)
-    derivatives : ndarray, shape (..., K, d, d)
+    """Divide stamps (..., d, d) by their own flux, and differentiate the quotient.
 
     Returns
     -------

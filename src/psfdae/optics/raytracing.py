@@ -42,18 +42,9 @@ class RayTracingError(ValueError):
 
 
 def misaligned(optic: Any, misalignment: np.ndarray) -> Any:
-    """The telescope with a displaced secondary; `optic` itself stays as it is.
+    """The telescope with its item M2, the secondary, displaced; `optic` stays as it is.
 
-    Parameters
-    ----------
-    optic : batoid.CompoundOptic
-        With the secondary as item M2.
-    misalignment : ndarray, shape (4,)
-        Decentre x, y in metres, tilt about x, y in radians.
-
-    Returns
-    -------
-    batoid.CompoundOptic
+    `misalignment` is a decentre x, y in metres and a tilt about x, y in radians.
     """
     x, y, tilt_x, tilt_y = (float(value) for value in misalignment)
     # One turn about an axis in the mirror's plane: neither tilt comes before the other.
@@ -62,14 +53,7 @@ def misaligned(optic: Any, misalignment: np.ndarray) -> Any:
 
 
 def check_states(states: np.ndarray, unit: np.ndarray) -> None:
-    """Refuse states of misalignment outside the range.
-
-    Parameters
-    ----------
-    states : ndarray, shape (n, 4)
-        In units of the range.
-    unit : ndarray, shape (4,)
-        The range in metres, metres, radians, radians.
+    """Refuse states (n, 4), in units of the range `unit`, outside of it.
 
     Raises
     ------

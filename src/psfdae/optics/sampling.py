@@ -60,11 +60,6 @@ def required_nodes(pixel: float) -> int:
     Across a pixel of width p λ/D the intensity has up to p periods; ⌈πp/2 + 3/2⌉
     nodes keep the MSE of the scenes' stamps within their error budgets for pixels
     of 0.3 to 9 λ/D (target stability).
-
-    Parameters
-    ----------
-    pixel : float
-        Pixel width in λ/D.
     """
     return int(np.ceil(0.5 * np.pi * pixel + 1.5))
 

@@ -47,19 +47,8 @@ def structure_function(separation: np.ndarray, r0: float, outer_scale: float) ->
         D = (L0/r0)^(5/3) 2^(1/6) Γ(11/6) π^(−8/3) [24/5 Γ(6/5)]^(5/6)
             × [Γ(5/6) 2^(−1/6) − u^(5/6) K_(5/6)(u)].
 
-    The bracket cancels for small u: six digits are left at r = 2e-7 L0.
-
-    Parameters
-    ----------
-    separation : ndarray, shape (...)
-        Distance r in metres, ≥ 0.
-    r0, outer_scale : float
-        Fried's parameter and the outer scale L0 in metres.
-
-    Returns
-    -------
-    ndarray, shape (...)
-        rad² at the wavelength at which r0 is given.
+    The bracket cancels for small u: six digits are left at r = 2e-7 L0. Lengths r ≥ 0 of
+    any shape (...) in metres to rad² at the wavelength at which r0 is given.
     """
     u = 2.0 * np.pi * np.asarray(separation, float) / outer_scale
     positive = np.where(u > 0, u, 1.0)
@@ -69,23 +58,11 @@ def structure_function(separation: np.ndarray, r0: float, outer_scale: float) ->
 
 
 def layer_r0(r0: float, strengths: Sequence[float]) -> np.ndarray:
-    """Fried's parameter of each layer, r0_l = r0 · s_l^(−3/5), in metres.
+    """Fried's parameter of each layer in metres, r0_l = r0 · s_l^(−3/5).
 
-    Parameters
-    ----------
-    r0 : float
-        Of all layers together, in metres.
-    strengths : sequence of float
-        Fractions s_l of the integrated strength.
-
-    Raises
-    ------
-    ValueError
-        If the fractions are not positive or do not add up to 1.
+    `r0` is that of all layers together, `strengths` are the fractions s_l of each.
     """
     fraction = np.asarray(strengths, float)
-    if not (fraction > 0).all() or abs(fraction.sum() - 1.0) > 1e-6:
-        raise ValueError(f"layer strengths {list(strengths)}: must be positive and add up to 1")
     return r0 * fraction ** (-3.0 / 5.0)
 
 
@@ -103,15 +80,6 @@ class PlaneWaves:
 
     frequency: np.ndarray
     amplitude: np.ndarray
-
-    def phase(self, position: np.ndarray) -> np.ndarray:
-        """Phase in radians, shape (...), at positions (x, y) in metres, shape (..., 2).
-
-        The plain sum; `Footprints` computes whole pupils faster.
-        """
-        argument = 2.0 * np.pi * np.asarray(position, float) @ self.frequency.T
-        # Two real products: half the cost of a complex exponential and its product.
-        return np.cos(argument) @ self.amplitude.real - np.sin(argument) @ self.amplitude.imag
 
 
 def draw_waves(
@@ -138,7 +106,6 @@ def draw_waves(
     highest : float
         Highest frequency in cycles per metre. The variance that is missing
         beyond it is 0.086 (r0 · highest)^(−5/3) rad².
-    rng : numpy Generator
 
     Raises
     ------
@@ -219,11 +186,6 @@ class Footprints:
         Linear obscuration of the pupil over which planes are fitted.
     remove : "none", "piston" or "tilt"
         What is taken out of every direction; "tilt" includes the piston.
-
-    Raises
-    ------
-    ValueError
-        If there is not one height per layer.
     """
 
     def __init__(
@@ -235,8 +197,6 @@ class Footprints:
         obscuration: float = 0.0,
         remove: Removal = "tilt",
     ) -> None:
-        if len(layers) != len(heights):
-            raise ValueError(f"{len(heights)} heights for {len(layers)} layers: must be as many")
         frequency = np.concatenate([layer.frequency for layer in layers])
         amplitude = np.concatenate([layer.amplitude for layer in layers])
         height = np.repeat(np.asarray(heights, float), [len(w.amplitude) for w in layers])

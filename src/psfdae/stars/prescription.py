@@ -9,21 +9,10 @@ from psfdae.configuration.telescope import Telescope
 
 
 def build_optic(prescription: Prescription, telescope: Telescope, defocus: float = 0.0) -> Any:
-    """The aligned telescope; batoid is imported only here and where rays are launched.
+    """The aligned telescope with items M1, M2, the lenses and D, a batoid.CompoundOptic.
 
-    Parameters
-    ----------
-    prescription : Prescription
-        Surfaces; checked when it was read.
-    telescope : Telescope
-        Aperture and central obscuration.
-    defocus : float
-        Distance of the detector beyond best focus, in metres.
-
-    Returns
-    -------
-    batoid.CompoundOptic
-        Items M1, M2, the lenses and D.
+    `defocus` is the distance of the detector beyond best focus, in metres. batoid is
+    imported only here and where rays are launched: no other scene depends on it.
     """
     import batoid
 

@@ -82,21 +82,16 @@ class Propagation:
     def stamps(
         self, stamp_px: int, offset_px: np.ndarray, stars: np.ndarray | None = None
     ) -> np.ndarray:
-        """Pixel-integrated stamps centred `offset_px` (row, column) from the chief ray.
+        """Pixel-integrated stamps centred `offset_px` (row, column), (B, 2), from the chief ray.
 
-        Parameters
-        ----------
-        stamp_px : int
-        offset_px : ndarray, shape (B, 2)
-        stars : ndarray of int, shape (B,), optional
-            The wavefronts; all of the source by default.
+        `stars` are the B wavefronts; all of the source by default.
 
         Returns
         -------
         ndarray, shape (B, stamp_px, stamp_px), float64
             Fraction of the light through the pupil on each pixel.
         """
-        stars = self._everyone() if stars is None else stars
+        stars = np.arange(len(self.source)) if stars is None else stars
         out = np.empty((len(stars), stamp_px, stamp_px))
 
         def prepare(samples: int) -> Callable[[np.ndarray], None]:
@@ -128,7 +123,6 @@ class Propagation:
         Parameters
         ----------
         side : int
-            Of the stamps.
         jitter : ndarray of int, shape (B, 2)
             (row, column).
         stars, phase_px : as for `brightest`
@@ -166,7 +160,7 @@ class Propagation:
         FramingError
             If the brightest pixel lies on the border of that window, too.
         """
-        stars = self._everyone() if stars is None else stars
+        stars = np.arange(len(self.source)) if stars is None else stars
         phase_px = np.zeros((len(stars), 2)) if phase_px is None else phase_px
         reach = self.search_px
         peaks = self._search(stars, phase_px, reach)
@@ -224,9 +218,6 @@ class Propagation:
             opd = self.source.opd(batch[star[part]], pupil, exact.real_dtype)
             values[star[part], row[part], column[part]] = exact(opd, offsets[part])[:, 0, 0]
         return np.array([brightest_pixel(image, self.framing.tie) for image in values])
-
-    def _everyone(self) -> np.ndarray:
-        return np.arange(len(self.source))
 
     def _pupil(self, samples: int) -> Pupil:
         if samples not in self._pupils:

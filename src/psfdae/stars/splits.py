@@ -35,16 +35,9 @@ def random_split(count: int, train: int, test: int, validation_fraction: float, 
 
 
 def held_out_fields(grid: np.ndarray) -> np.ndarray:
-    """Fields never seen in training: (ix + 2·iy) mod 5 = 1, a knight's-move pattern.
+    """Fields never seen in training: (ix + 2·iy) mod 5 = 1, a knight's-move pattern, (F,).
 
-    Parameters
-    ----------
-    grid : ndarray of int, shape (F, 2)
-        (ix, iy) of every field.
-
-    Returns
-    -------
-    ndarray of bool, shape (F,)
+    `grid`, shape (F, 2), holds (ix, iy) of every field.
     """
     return (grid[:, 0] + 2 * grid[:, 1]) % 5 == 1
 
