@@ -17,11 +17,11 @@ import pandas as pd
 import torch
 from matplotlib.figure import Figure
 
+from fits_inputs import write_cube
 from psfdae import files
 from psfdae.cli import main
 from psfdae.files import Column, Empty
 from psfdae.models.weights import load_checkpoint, load_weights, save_checkpoint, save_weights
-from psfdae.observations.examples import write_cube
 from psfdae.stages.figures import write_png
 from psfdae.stages.trained import as_yaml
 from psfdae.stages.verify import _check_table

@@ -77,9 +77,9 @@ def write_good(folder):
     from astropy.io import fits
     from astropy.table import Table
 
-    from psfdae.bundle.format import shipped_path
+    from fits_inputs import write_cube, write_field
     from psfdae.models.weights import save_weights
-    from psfdae.observations.examples import write_cube, write_field
+    from psfdae.own_stars.bundle import shipped_path
 
     rng = np.random.default_rng(1)
     grid = np.arange(16) - 8
@@ -305,7 +305,7 @@ def changed(array, rng):
 
 
 def sign_bundle(text, arrays):
-    from psfdae.bundle.format import _digest
+    from psfdae.own_stars.bundle import _digest
 
     return text | {"sha256": _digest(text["info"], arrays)}
 

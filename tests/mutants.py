@@ -36,10 +36,8 @@ LIST = Path(__file__).with_suffix(".csv")
 SEED, DRAWN = 13, 40
 SCIENCE = [
     *("alignment", "bounds", "models", "optics", "stars"),
-    *(f"bundle/{name}.py" for name in ("measure", "statistics")),
     *(f"evaluation/{name}.py" for name in ("calibration", "comparison", "correlation", "metrics")),
-    *(f"observations/{name}.py" for name in ("cutting", "sky")),
-    *(f"prediction/{name}.py" for name in ("border", "centring", "photometry", "shapes")),
+    *(f"own_stars/{name}.py" for name in ("packing", "photometry", "shapes", "stamps")),
 ]
 """Where the random mutants were drawn from; no matter once they are drawn."""
 

@@ -10,10 +10,10 @@ import yaml
 from click.testing import CliRunner
 
 from psfdae.belonging import STARS, STATIC, require
-from psfdae.bundle import read_bundle, shipped_path
 from psfdae.cli import main
 from psfdae.configuration.compose import load, load_stage
 from psfdae.files import Column, ProductError, write_product
+from psfdae.own_stars.bundle import read_bundle, shipped_path
 from psfdae.stages.alignment import read_model
 from psfdae.stages.alignment_tables import require_one_test
 

@@ -17,20 +17,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.numpy import save_file
 
-from psfdae.bundle import (
+from psfdae.cli import main
+from psfdae.models.dae import build_dae, predict
+from psfdae.own_stars import packing
+from psfdae.own_stars.bundle import (
     Architecture,
     Bundle,
     BundleError,
     BundleInfo,
-    measure,
+    creation_date,
     network,
     read_bundle,
     write_bundle,
 )
-from psfdae.bundle.format import creation_date
-from psfdae.cli import main
-from psfdae.models.dae import build_dae, predict
-from psfdae.stars.flux import FluxModel, robust_flux
+from psfdae.own_stars.photometry import FluxModel, robust_flux
 
 SHAPE = Architecture(kernels=(5, 3, 5), widths=(4, 4))
 INFO = {
@@ -49,7 +49,7 @@ INFO = {
     "snr_min": 10.0,
     "snr_max": 100.0,
     "noise_equivalent_px": 100.0,
-    "components": measure.COMPONENTS,
+    "components": packing.COMPONENTS,
     "training_sha256": 64 * "0",
     "training_stars": 300,
     "source": "stars",
@@ -71,7 +71,7 @@ def handmade(model, gaussian_stars):
     return Bundle(
         info=BundleInfo(**INFO),
         weights={name: value.numpy() for name, value in model.state_dict().items()},
-        flux_model=measure.leading(FluxModel.fit(gaussian_stars), measure.COMPONENTS),
+        flux_model=packing.leading(FluxModel.fit(gaussian_stars), packing.COMPONENTS),
         noise_nodes=np.geomspace(1e-3, 1e-2, 3),
         error68=rng.random((3, 16, 16), np.float32),
         rms=rng.random((3, 16, 16), np.float32),

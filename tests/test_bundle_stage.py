@@ -11,26 +11,26 @@ import torch
 from click.testing import CliRunner
 
 from psfdae.belonging import write_origin
-from psfdae.bundle import (
-    BundleError,
-    at_noise,
-    mahalanobis,
-    measure,
-    network,
-    read_bundle,
-    shipped_path,
-    write_bundle,
-)
 from psfdae.cli import main
 from psfdae.configuration.compose import load_stage
 from psfdae.files import Column, ProductError, read_product, write_product
 from psfdae.models import export
 from psfdae.models.dae import predict
+from psfdae.own_stars import packing
+from psfdae.own_stars.bundle import (
+    BundleError,
+    at_noise,
+    mahalanobis,
+    network,
+    read_bundle,
+    shipped_path,
+    write_bundle,
+)
+from psfdae.own_stars.photometry import FluxModel
 from psfdae.rng import stream
 from psfdae.stages import bundle as stage
 from psfdae.stages import bundle_use, train
 from psfdae.stages.common import noise_model, noisy_test_images
-from psfdae.stars.flux import FluxModel
 
 TINY = [
     "noise.levels=[1e-3,3e-3,1e-2]",
@@ -145,12 +145,12 @@ def test_half_width_covers_fresh_stars_and_the_rms_too_many(tiny):
     noise = np.exp(rng.uniform(np.log(4.98e-3), np.log(4.98e-2), size=1500))
     noisy = noise_model(config).draw(images, noise / 4.98, rng)
     error = predict(network(tiny), noisy, 144.0) - images
-    covered = measure.coverage(error, noise, tiny.noise_nodes, tiny.error68)
+    covered = packing.coverage(error, noise, tiny.noise_nodes, tiny.error68)
     assert covered == pytest.approx(0.6827, abs=0.05)
     for part in np.array_split(np.argsort(noise), 3):
-        within = measure.coverage(error[part], noise[part], tiny.noise_nodes, tiny.error68)
+        within = packing.coverage(error[part], noise[part], tiny.noise_nodes, tiny.error68)
         assert within == pytest.approx(0.6827, abs=0.05)
-    assert measure.coverage(error, noise, tiny.noise_nodes, tiny.rms) > covered + 0.05
+    assert packing.coverage(error, noise, tiny.noise_nodes, tiny.rms) > covered + 0.05
     for row in tiny.info.metrics:
         assert row["coverage68"] == pytest.approx(0.6827, abs=0.05)
 
@@ -161,10 +161,10 @@ def test_signal_to_noise_is_that_of_a_matched_filter():
     noise = 0.01
     images = mean + np.random.default_rng(0).normal(0, noise, size=(20000, 12, 12))
     flux = (images * mean).sum(axis=(1, 2)) / (mean**2).sum()
-    area = measure.noise_equivalent_px(mean)
-    assert 1 / flux.std() == pytest.approx(measure.signal_to_noise(noise, area), rel=0.03)
+    area = packing.noise_equivalent_px(mean)
+    assert 1 / flux.std() == pytest.approx(packing.signal_to_noise(noise, area), rel=0.03)
     flat = np.full((12, 12), 1 / 144)
-    assert measure.noise_equivalent_px(flat) == pytest.approx(144)
+    assert packing.noise_equivalent_px(flat) == pytest.approx(144)
 
 
 def test_errors_of_some_stars_are_those_stars_errors():
@@ -172,7 +172,7 @@ def test_errors_of_some_stars_are_those_stars_errors():
     star = np.array([0, 1, 2, 3, 4, 0, 1, 2, 3, 4])
     error = np.arange(10.0)[None, :, None, None] + np.zeros((2, 10, 4, 4))
     distance = 100.0 + np.arange(20.0).reshape(2, 10)
-    some = measure.Errors(np.array([1.0, 2.0]), error, star, distance).of(
+    some = packing.Errors(np.array([1.0, 2.0]), error, star, distance).of(
         np.array([False, True, False, False, True])
     )
     assert some.star.tolist() == [1, 4, 1, 4]
@@ -185,9 +185,9 @@ def test_either_half_of_the_stars_is_judged_by_the_errors_of_the_other():
     rng, star = np.random.default_rng(0), np.tile(np.arange(400), 10)
     scale = np.where(star % 2, 3.0, 1.0)[:, None, None]
     error = rng.normal(size=(1, 4000, 8, 8)) * scale
-    errors = measure.Errors(np.array([0.01]), error, star, np.zeros((1, 4000)))
+    errors = packing.Errors(np.array([0.01]), error, star, np.zeros((1, 4000)))
     fresh = rng.normal(size=(400, 8, 8)) * scale[:400]
-    found = measure.crossed_coverage(errors, fresh, 0.01)
+    found = packing.crossed_coverage(errors, fresh, 0.01)
     expected = (0.9973 + 0.2611) / 2
     assert found == pytest.approx({"coverage68": expected, "coverage_rms": expected}, abs=0.01)
 
@@ -317,9 +317,9 @@ def test_shipped_bundle_covers_stars_that_nobody_has_seen(tmp_path):
     config = load_stage("bundle", chosen)
     noisy = noise_model(config).draw(images, noise / config.noise.kappa, rng)
     error = predict(network(bundle), noisy, bundle.info.image_scale) - images
-    covered = measure.coverage(error, noise, bundle.noise_nodes, bundle.error68)
+    covered = packing.coverage(error, noise, bundle.noise_nodes, bundle.error68)
     assert covered == pytest.approx(0.6827, abs=0.05)
-    assert measure.coverage(error, noise, bundle.noise_nodes, bundle.rms) > 0.75
+    assert packing.coverage(error, noise, bundle.noise_nodes, bundle.rms) > 0.75
 
 
 def test_ship_names_checks_and_writes(folder, tiny, tmp_path):

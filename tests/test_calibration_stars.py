@@ -3,35 +3,37 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from psfdae.rng import stream
-from psfdae.stars.calibration_stars import (
+from psfdae.own_stars.example import noise_area
+from psfdae.own_stars.selection import (
+    BrightStars,
     brightest_pixels,
     crowded,
     misfit,
+    moved,
     signal_to_noise,
     sky_around,
     star_centres,
     window_of,
 )
-from psfdae.stars.example_field import noise_area
-from psfdae.stars.from_observation import (
-    BrightStars,
+from psfdae.own_stars.stamps import cut
+from psfdae.own_stars.training_images import (
     bins_of,
-    cut,
     make_images,
-    moved,
     stacks,
     star_grid,
     star_of_images,
 )
+from psfdae.rng import stream
 from psfdae.stars.splits import held_out_fields
 
 ROOT = Path(__file__).resolve().parents[1]
 SIDE = {"side_px": 700, "bright": 60, "faint": 80, "blended": 6, "saturated": 3}
+FRAMING = SimpleNamespace(stamp_px=16, jitter_px=1)
 TINY = ["preset=smoke", "parts.train_stars=120", "parts.test_stars=30", "train.epochs=1"]
 
 
@@ -74,16 +76,16 @@ def test_sky_is_that_around_the_star():
     bad = np.zeros(wide.shape, dtype=bool)
     bad[:, 30] = True
     wide[bad] = 1e6
-    sky = sky_around(wide, bad, 16)
+    level, noise = sky_around(wide, bad, 16)
     # Of 736 pixels: 5 √(π/2/736) = 0.23 for a median, 4.3 % for a median deviation.
-    assert np.abs(sky.level - 200.0).max() < 4 * 0.23
-    assert np.abs(sky.noise / 5.0 - 1).max() < 4 * 0.043
+    assert np.abs(level - 200.0).max() < 4 * 0.23
+    assert np.abs(noise / 5.0 - 1).max() < 4 * 0.043
 
 
 def test_sky_of_a_stamp_that_is_all_bad_is_no_number_s_fault():
-    sky = sky_around(np.zeros((2, 24, 24)), np.ones((2, 24, 24), dtype=bool), 16)
-    assert (sky.level == 0).all()
-    assert (sky.noise == 0).all()
+    level, noise = sky_around(np.zeros((2, 24, 24)), np.ones((2, 24, 24), dtype=bool), 16)
+    assert (level == 0).all()
+    assert (noise == 0).all()
 
 
 def test_signal_to_noise_is_that_of_king_s_area():
@@ -176,8 +178,8 @@ def test_a_moved_star_is_the_star_rendered_there():
 
 def test_cut_puts_the_offset_in_the_middle_and_repeats_the_edge():
     wide = np.arange(400.0).reshape(1, 20, 20)
-    assert cut(wide, np.array([[2, -1]]), 8)[0, 4, 4] == wide[0, 12, 9]
-    beyond = cut(wide, np.array([[9, 0]]), 8)[0]
+    assert cut(wide, 8, np.array([[2, -1]]))[0, 4, 4] == wide[0, 12, 9]
+    beyond = cut(wide, 8, np.array([[9, 0]]))[0]
     assert (beyond[5:] == beyond[4]).all()
 
 
@@ -193,23 +195,25 @@ def test_images_are_framed_normalised_and_moved_only_where_asked():
     template = gaussians(np.zeros((10, 2)))
     star = np.repeat(np.arange(10), 40)
     subpixel = np.tile([False, True], 200)
-    found = make_images(stars, template, star, 16, 1, subpixel, stream(1, "test"))
-    assert found.realisation.sum(axis=(1, 2)) == pytest.approx(1.0, abs=1e-5)
-    peak = np.stack(np.divmod(found.realisation.reshape(400, -1).argmax(axis=1), 16), axis=1)
-    assert (peak - 8 == found.jitter).all()
-    assert set(map(tuple, found.jitter)) == {(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)}
+    realisation, made, jitter = make_images(
+        stars, template, star, FRAMING, subpixel, stream(1, "test")
+    )
+    assert realisation.sum(axis=(1, 2)) == pytest.approx(1.0, abs=1e-5)
+    peak = np.stack(np.divmod(realisation.reshape(400, -1).argmax(axis=1), 16), axis=1)
+    assert (peak - 8 == jitter).all()
+    assert set(map(tuple, jitter)) == {(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)}
     # A star that is not moved is a plain piece of the image.
     for image in np.flatnonzero(~subpixel)[::9]:
         who = star[image]
-        offset = stars.peak[who] - found.jitter[image]
-        piece = cut(stars.wide[who : who + 1], offset[None], 16)[0]
-        assert found.realisation[image] == pytest.approx(piece / piece.sum(), abs=1e-7)
+        offset = stars.peak[who] - jitter[image]
+        piece = cut(stars.wide[who : who + 1], 16, offset[None])[0]
+        assert realisation[image] == pytest.approx(piece / piece.sum(), abs=1e-7)
     # The others lie anywhere in their pixel, and so do their templates.
-    place = star_centres(found.realisation.astype(float), found.jitter, np.full(400, 1.5))
-    phase = (place - found.jitter)[subpixel]
+    place = star_centres(realisation.astype(float), jitter, np.full(400, 1.5))
+    phase = (place - jitter)[subpixel]
     assert np.abs(phase.mean(axis=0)).max() < 4 * np.sqrt(1 / 12 / 200)
     assert phase.std(axis=0) == pytest.approx(np.sqrt(1 / 12), rel=0.1)
-    again = star_centres(found.template.astype(float), found.jitter, np.full(400, 1.5))
+    again = star_centres(made.astype(float), jitter, np.full(400, 1.5))
     assert np.abs(again - place).max() < 0.03
 
 

@@ -16,11 +16,11 @@ import pytest
 from click.testing import CliRunner
 
 from docs_pages import ROOT, Command, blocks, commands, pages, read
-from psfdae.bundle import read_bundle
+from fits_inputs import write_field
 from psfdae.cli import main
 from psfdae.configuration.compose import forget
 from psfdae.files import write_text
-from psfdae.observations.examples import write_field
+from psfdae.own_stars.bundle import read_bundle
 from test_compare import errors
 from workflow_runs import QUIET, clone, environment, shell, wait_until
 

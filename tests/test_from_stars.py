@@ -9,39 +9,33 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
 import pytest
 from click.testing import CliRunner
 
-from psfdae.bundle import network, read_bundle
+from fits_inputs import write_cube
 from psfdae.cli import main
 from psfdae.configuration.compose import ConfigError, load_stage
-from psfdae.files import read_product
+from psfdae.files import read_product, write_product
 from psfdae.models.dae import predict
-from psfdae.observations.examples import write_cube
-from psfdae.rng import stream
-from psfdae.stages import example_field as example_stage
-from psfdae.stages.calibration_stars import collect, write_stars
-from psfdae.stages.common import noise_model, split_stars
-from psfdae.stages.from_stars import Exposure, _alone
-from psfdae.stars.calibration_stars import (
-    brightest_pixels,
-    star_centres,
-)
-from psfdae.stars.example_field import (
+from psfdae.own_stars.bundle import network, read_bundle
+from psfdae.own_stars.example import (
     RENDER_PX,
     FieldRecipe,
     example_field,
     noise_area,
     star_images,
 )
-from psfdae.stars.from_observation import (
-    cut,
-    make_images,
-    star_grid,
-)
+from psfdae.own_stars.selection import brightest_pixels, collect, star_centres
+from psfdae.own_stars.stamps import cut
+from psfdae.own_stars.training_images import make_images, star_grid, training_columns
+from psfdae.rng import stream
+from psfdae.stages import example_field as example_stage
+from psfdae.stages.common import noise_model, split_stars
+from psfdae.stages.from_stars import Source, _alone
 from psfdae.stars.splits import held_out_fields
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -73,7 +67,8 @@ def model(field, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def candidates(field, config):
-    return collect(Exposure(field[0], field[1]).open(16, 8), config)
+    observation = Source(field[0], field[1]).open(16, 8)
+    return collect(observation, config.calibration_stars, config.framing)
 
 
 # Measuring
@@ -136,10 +131,13 @@ def test_product_stars_is_what_the_stages_read(candidates, config, tmp_path):
     grid = star_grid(bright.position)
     held_out = held_out_fields(grid)
     out = tmp_path / "stars.h5"
-    write_stars(bright, grid, held_out, config, {}, out)
-    first = out.read_bytes()
-    write_stars(bright, grid, held_out, config, {}, out)
-    assert out.read_bytes() == first
+    written = []
+    for _ in range(2):
+        rng = stream(config.seed, "own stars")
+        shape = (config.framing, config.parts)
+        write_product(out, "stars", training_columns(bright, grid, held_out, 2, *shape, rng), {})
+        written.append(out.read_bytes())
+    assert written[0] == written[1]
     product = read_product(out, "stars")
     parts = split_stars(product, "held_out", config)
     assert parts.train.size == 120
@@ -154,18 +152,12 @@ def test_product_stars_is_what_the_stages_read(candidates, config, tmp_path):
 def test_held_out_stars_are_the_truth_but_for_their_noise(field, candidates):
     *_, made = field
     bright = candidates.bright
-    images = make_images(
-        bright,
-        bright.wide,
-        np.arange(len(bright)),
-        16,
-        0,
-        np.zeros(len(bright), dtype=bool),
-        stream(1, "t"),
+    framing = SimpleNamespace(stamp_px=16, jitter_px=0)
+    still = np.zeros(len(bright), dtype=bool)
+    images, *_ = make_images(
+        bright, bright.wide, np.arange(len(bright)), framing, still, stream(1, "t")
     )
-    for image, row, noise in zip(
-        images.realisation, bright.row, bright.noise / bright.flux, strict=True
-    ):
+    for image, row, noise in zip(images, bright.row, bright.noise / bright.flux, strict=True):
         error = best_match(made.psf[row], image)
         photons = 1 / (made.flux[row] * 256)
         assert error < 3 * (noise**2 + photons)
@@ -174,7 +166,7 @@ def test_held_out_stars_are_the_truth_but_for_their_noise(field, candidates):
 def best_match(psf, image):
     """Least MSE of an image against all pieces of the noise-free star near its middle."""
     offsets = np.array([(i, j) for i in range(-3, 4) for j in range(-3, 4)])
-    pieces = cut(np.broadcast_to(psf, (len(offsets), *psf.shape)), offsets, image.shape[-1])
+    pieces = cut(np.broadcast_to(psf, (len(offsets), *psf.shape)), image.shape[-1], offsets)
     pieces = pieces / pieces.sum(axis=(1, 2), keepdims=True)
     return np.square(pieces - image).mean(axis=(1, 2)).min()
 

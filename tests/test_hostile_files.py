@@ -15,22 +15,21 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 from astropy.io import fits
 from astropy.table import Table
 from click.testing import CliRunner
 
 import hostile_files
+from fits_inputs import open_observation, write_cube, write_field
 from psfdae import load_model
-from psfdae.bundle import BundleError, format, read_bundle, write_bundle
-from psfdae.bundle.format import shipped_path
 from psfdae.cli import main
-from psfdae.observations import ObservationError, catalogue, open_observation, tiles, unpacking
-from psfdae.observations.catalogue import read_catalogue
-from psfdae.observations.examples import write_cube, write_field
-from psfdae.prediction import engine
-from psfdae.safe_text import no_formula, one_line
+from psfdae.own_stars import bundle as format
+from psfdae.own_stars import catalogue, images
+from psfdae.own_stars import model as engine
+from psfdae.own_stars.bundle import BundleError, read_bundle, shipped_path, write_bundle
+from psfdae.own_stars.catalogue import read_catalogue
+from psfdae.own_stars.errors import ObservationError, no_formula, one_line
 
 D = 8
 
@@ -109,9 +108,9 @@ def test_a_header_without_end_is_refused_before_it_is_read(tmp_path, pack):
 @pytest.mark.parametrize("pack", PACK)
 def test_bombs_are_unpacked_to_a_limit(tmp_path, monkeypatch, pack):
     monkeypatch.setenv("TMPDIR", str(tmp_path / "room"))
-    monkeypatch.setattr(unpacking.tempfile, "tempdir", None)
+    monkeypatch.setattr(images.tempfile, "tempdir", None)
     (tmp_path / "room").mkdir()
-    monkeypatch.setattr(unpacking, "WHOLE", unpacking.Limit(3 * 10**6))
+    monkeypatch.setattr(images, "WHOLE", images.Limit(3 * 10**6))
     path = tmp_path / f"a.fits.{pack}"
     PACK[pack](path, GOOD + bytes(2 * 10**7))
     message = refused("predict", path, "--out", tmp_path / "o.fits")
@@ -121,8 +120,8 @@ def test_bombs_are_unpacked_to_a_limit(tmp_path, monkeypatch, pack):
 
 def test_unpacking_leaves_half_of_the_free_space(monkeypatch):
     usage = shutil.disk_usage(".")._replace(free=1000)
-    monkeypatch.setattr(unpacking.shutil, "disk_usage", lambda folder: usage)
-    allowed, words = unpacking.WHOLE.of(10)
+    monkeypatch.setattr(images.shutil, "disk_usage", lambda folder: usage)
+    allowed, words = images.WHOLE.of(10)
     assert allowed == 500 and "TMPDIR" in words
 
 
@@ -181,9 +180,9 @@ def test_a_zip_file_of_several_files_is_refused(tmp_path):
     ],
 )
 def test_too_many_headers_are_refused(tmp_path, monkeypatch, data, message):
-    monkeypatch.setattr(unpacking, "MOST_HDUS", 100)
+    monkeypatch.setattr(images, "MOST_HDUS", 100)
     most = 200 if "extensions" in message else 10
-    monkeypatch.setattr(unpacking, "LONGEST_HEADERS", 2880 * most)
+    monkeypatch.setattr(images, "LONGEST_HEADERS", 2880 * most)
     (tmp_path / "a.fits").write_bytes(data)
     with pytest.raises(ObservationError, match=message):
         open_observation(tmp_path / "a.fits", stamp_px=D)
@@ -197,8 +196,7 @@ def test_distortion_of_any_order_does_not_keep_us(tmp_path):
     with fits.open(tmp_path / "a.fits", mode="update") as hdus:
         header = hdus[0].header
         header.update(CTYPE1="RA---TAN-SIP", CTYPE2="DEC--TAN-SIP", A_ORDER=30_000, B_ORDER=30_000)
-    found = open_observation(tmp_path / "a.fits", stamp_px=D, catalogue=tmp_path / "s.csv",
-                             columns=("X_IMAGE", "Y_IMAGE"))  # fmt: skip
+    found = open_observation(tmp_path / "a.fits", stamp_px=D, catalogue=tmp_path / "s.csv")
     assert found.pixel_scale_arcsec is None
 
 
@@ -211,9 +209,9 @@ def test_tiles_are_decompressed_in_blocks(tmp_path, monkeypatch, tile):
     image = np.random.default_rng(1).poisson(900, (60, 70)).astype(np.int32)
     packed = fits.CompImageHDU(image, tile_shape=tile)
     fits.HDUList([fits.PrimaryHDU(), packed]).writeto(tmp_path / "a.fz")
-    monkeypatch.setattr(tiles, "BLOCK_PX", 150)
+    monkeypatch.setattr(images, "BLOCK_PX", 150)
     with fits.open(tmp_path / "a.fz") as hdus, (tmp_path / "copy").open("w+b") as copy:
-        found = tiles.decompress(tmp_path / "a.fz", hdus[1], copy)
+        found = images.decompress(tmp_path / "a.fz", hdus[1], copy)
         np.testing.assert_array_equal(found, image)
 
 
@@ -226,7 +224,7 @@ def test_only_some_tiles_of_an_image_are_in_memory(tmp_path):
     (tmp_path / "s.csv").write_text("X_IMAGE,Y_IMAGE\n2000,65\n100,4001\n")
     script = (
         "import resource, sys, hostile_files\n"
-        "from psfdae.observations import open_observation\n"
+        "from fits_inputs import open_observation\n"
         "a, s = sys.argv[1:]\n"
         "found = open_observation(a, stamp_px=8, catalogue=s)\n"
         "limit = hostile_files.data_bytes() + 40 * 2**20\n"
@@ -247,10 +245,10 @@ def test_tiles_and_images_that_are_too_large_are_refused(tmp_path, monkeypatch):
     fits.HDUList([fits.PrimaryHDU(), packed]).writeto(tmp_path / "a.fz")
     (tmp_path / "s.csv").write_text("X_IMAGE,Y_IMAGE\n20,20\n")
     options = {"stamp_px": D, "catalogue": tmp_path / "s.csv"}
-    monkeypatch.setattr(tiles, "DECOMPRESSED", unpacking.Limit(10_000, 0))
+    monkeypatch.setattr(images, "DECOMPRESSED", images.Limit(10_000, 0))
     with pytest.raises(ObservationError, match="decompresses to 16384 bytes, more than 10000"):
         list(open_observation(tmp_path / "a.fz", **options).chunks(9))
-    monkeypatch.setattr(tiles, "LARGEST_TILE", 4095)
+    monkeypatch.setattr(images, "LARGEST_TILE", 4095)
     with pytest.raises(ObservationError, match="tiles of 64×64 pixels"):
         open_observation(tmp_path / "a.fz", **options)
 
@@ -301,7 +299,7 @@ def test_a_text_table_is_read_up_to_a_limit(tmp_path, monkeypatch):
     with pytest.raises(ObservationError, match="more than 100 bytes; a FITS table may be larger"):
         read_catalogue(tmp_path / "s.csv")
     with pytest.raises(ObservationError, match="more than 100 bytes"):
-        read_catalogue("/dev/zero")
+        read_catalogue(Path("/dev/zero"))
 
 
 @pytest.mark.parametrize("suffix", ["csv", "fits"])
@@ -495,7 +493,7 @@ def test_lack_of_memory_is_one_line(tmp_path, monkeypatch):
     def fail(self, stars):
         return np.empty(2**50)
 
-    monkeypatch.setattr("psfdae.prediction.engine.Engine.block", fail)
+    monkeypatch.setattr("psfdae.own_stars.model.Engine.block", fail)
     write_cube(tmp_path / "c.fits", np.ones((2, 16, 16)), PIXSCALE=0.1)
     words = ["predict", tmp_path / "c.fits", "--out", tmp_path / "o.fits", "--quiet"]
     assert "not enough memory" in refused(*words)
@@ -522,15 +520,14 @@ def test_results_never_take_the_place_of_what_they_are_made_of(tmp_path):
 
 
 def test_formulas_are_text_in_tables_for_spreadsheets(tmp_path):
-    from psfdae.stages.calibration_stars import Candidates, write_selection
+    from psfdae.own_stars.selection import Candidates
 
     names = np.array(["=cmd|' /C calc'!A0", "+1+1", "-2+3", "@SUM(A1)", "-5", "+1e3", "star"])
     bright = type("Bright", (), {"row": np.array([0])})()
     numbers = np.zeros(len(names))
     found = Candidates(names, np.zeros((len(names), 2)), numbers, numbers,
                        np.full(len(names), "good"), bright)  # fmt: skip
-    write_selection(found, np.array([False]), tmp_path / "selection.csv")
-    written = pd.read_csv(tmp_path / "selection.csv", dtype=str)["id"].tolist()
+    written = found.table(np.array([False]))["id"].tolist()
     assert written == ["'=cmd|' /C calc'!A0", "'+1+1", "'-2+3", "'@SUM(A1)", "-5", "+1e3", "star"]
     assert no_formula("\t=1") == "'\t=1"
 

@@ -7,10 +7,9 @@ import pytest
 from astropy.io import fits
 from astropy.table import Table
 
-from psfdae.observations import ObservationError, open_observation
-from psfdae.observations.catalogue import read_catalogue
-from psfdae.observations.columns import CONVENTIONS
-from psfdae.observations.examples import write_field
+from fits_inputs import open_observation, write_field
+from psfdae.own_stars.catalogue import CONVENTIONS, read_catalogue
+from psfdae.own_stars.errors import ObservationError
 
 D = 8
 X, Y = [12.0, 20.25, 33.5], [9.0, 15.0, 21.75]
@@ -65,11 +64,11 @@ FORMATS = {
 def test_every_format_gives_the_same_stars(tmp_path, image, name):
     path = tmp_path / "stars.cat"
     FORMATS[name](rows([1e3, 2e3, 3e3]), path)
-    found = open_observation(image, stamp_px=D, catalogue=path)
+    found = open_observation(image, stamp_px=D, catalogue=path, flux_column="flux")
     np.testing.assert_allclose(found.positions, np.stack([X, Y], axis=1) - 1)
     (chunk,) = found.chunks(10)
     np.testing.assert_array_equal(chunk.id, [5, 7, 9])
-    np.testing.assert_array_equal(found.column("flux"), [1e3, 2e3, 3e3])
+    np.testing.assert_array_equal(chunk.flux, [1e3, 2e3, 3e3])
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS, ids=lambda c: c.pairs[0][0])
@@ -93,10 +92,6 @@ def test_the_best_columns_of_a_program_and_pixels_before_sky(tmp_path, image):
     table.write(tmp_path / "a.csv")
     found = open_observation(image, stamp_px=D, catalogue=tmp_path / "a.csv")
     np.testing.assert_array_equal(found.positions, [[4, 5]])
-    named = open_observation(
-        image, stamp_px=D, catalogue=tmp_path / "a.csv", columns=("x_image", "y_image")
-    )
-    np.testing.assert_array_equal(named.positions, [[0, 0]])
 
 
 def test_units_and_sexagesimal_coordinates(tmp_path):
@@ -109,11 +104,11 @@ def test_units_and_sexagesimal_coordinates(tmp_path):
         ("b.fits", ([150.0], [2.0])),
     ):
         table = read_catalogue(tmp_path / name)
-        np.testing.assert_allclose(table.sky(table.position_columns(None)), expected)
+        np.testing.assert_allclose(table.sky(table.positions()), expected)
     Table({"ra": [1.0], "dec": [2.0]}, units=["m", "deg"]).write(tmp_path / "c.fits")
     table = read_catalogue(tmp_path / "c.fits")
     with pytest.raises(ObservationError, match="column 'ra' has the unit 'm', expected an angle"):
-        table.sky(table.position_columns(None))
+        table.sky(table.positions())
 
 
 @pytest.mark.parametrize(
@@ -136,12 +131,15 @@ def test_identifiers(tmp_path, column, expected):
 
 def test_values_that_are_missing_are_nan_where_they_may_be(tmp_path, image):
     (tmp_path / "a.csv").write_text("X_IMAGE,Y_IMAGE,flux,word\n12,9,,a\n13,9,5.5,b\n")
-    found = open_observation(image, stamp_px=D, catalogue=tmp_path / "a.csv")
-    np.testing.assert_array_equal(found.column("FLUX"), [np.nan, 5.5])
-    with pytest.raises(ObservationError, match="holds 'a' in row 1, expected a number"):
-        found.column("word")
-    with pytest.raises(ObservationError, match=r"no column 'mag'; found X_IMAGE, .*word"):
-        found.column("mag")
+    options = {"stamp_px": D, "catalogue": tmp_path / "a.csv"}
+    (chunk,) = open_observation(image, **options, background_column="FLUX").chunks(9)
+    np.testing.assert_array_equal(chunk.background, [np.nan, 5.5])
+    for column, message in (
+        ("word", "holds 'a' in row 1, expected a number"),
+        ("mag", r"no column 'mag'; found X_IMAGE, .*word"),
+    ):
+        with pytest.raises(ObservationError, match=message):
+            open_observation(image, **options, flux_column=column)
 
 
 # What is refused: content of the catalogue, and words of the message.

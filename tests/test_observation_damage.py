@@ -15,9 +15,8 @@ from astropy.table import Table
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from psfdae.observations import ObservationError, open_observation
-from psfdae.observations.errors import reading
-from psfdae.observations.examples import write_cube, write_field
+from fits_inputs import open_observation, write_cube, write_field
+from psfdae.own_stars.errors import ObservationError, reading
 
 D = 8
 HEADERS = 8640
@@ -52,6 +51,7 @@ def folder(tmp_path_factory):
     for coding in ("GZIP_1", "GZIP_2"):
         tiles = fits.CompImageHDU(rng.poisson(9, (40, 60)), compression_type=coding)
         fits.HDUList([fits.PrimaryHDU(), tiles]).writeto(folder / f"{coding}.fits.fz")
+    Table.read(folder / "s.csv")["ra", "dec"].write(folder / "sky.csv")
     Table.read(folder / "s.csv").write(folder / "s.fits")
     Table.read(folder / "s.csv").write(folder / "s.ecsv")
     return folder
@@ -59,7 +59,7 @@ def folder(tmp_path_factory):
 
 CUBES = ("cube.fits", "cube16.fits", "cube.fits.fz", "cube.fits.gz")
 IMAGES = ("image.fits", "image.fits.fz", "GZIP_1.fits.fz", "GZIP_2.fits.fz")
-CATALOGUES = ("s.csv", "s.fits", "s.ecsv")
+CATALOGUES = ("s.csv", "s.fits", "s.ecsv", "sky.csv")
 
 
 def attempt(path, **options):
@@ -87,12 +87,11 @@ def attempt_all(folder, data, kind):
     """The bytes as a cube, as an image or as a catalogue."""
     path = folder / f"bad_{kind}"
     path.write_bytes(data)
-    sky = ("ra", "dec") if len(data) % 2 else ("X_IMAGE", "Y_IMAGE")
     if kind == "cube":
         return attempt(path)
     if kind == "image":
-        return attempt(path, catalogue=folder / "s.csv", columns=sky, margin=1)
-    return attempt(folder / "image.fits", catalogue=path, columns=sky)
+        return attempt(path, catalogue=folder / ("sky.csv", "s.csv")[len(data) % 2], margin=1)
+    return attempt(folder / "image.fits", catalogue=path)
 
 
 kinds = st.sampled_from(["cube", "image", "catalogue"])

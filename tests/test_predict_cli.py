@@ -13,15 +13,17 @@ from astropy.io import fits
 from astropy.table import Table
 from click.testing import CliRunner
 
+from fits_inputs import write_cube, write_field
 from prediction_stars import SKY, observe
 from psfdae import StarFlag, load_model
-from psfdae.bundle.format import shipped_path
 from psfdae.cli import main
 from psfdae.configuration.compose import load_stage
-from psfdae.observations.examples import write_cube, write_field
 from psfdae.optics.wavefronts import seidel_wavefronts
-from psfdae.prediction import engine, plot, writer
-from psfdae.prediction.model import SCALE_TOLERANCE
+from psfdae.own_stars import model as engine
+from psfdae.own_stars import plot
+from psfdae.own_stars import prediction as writer
+from psfdae.own_stars.bundle import shipped_path
+from psfdae.own_stars.model import SCALE_TOLERANCE
 from psfdae.stages import predict as stage
 from psfdae.stages import prediction as measured
 from psfdae.stars.framing import normalise_flux
@@ -310,14 +312,14 @@ def field_of(**changes):
 
 
 def test_map_shows_bright_stars_that_do_not_overlap():
-    assert plot.chosen_stars(field_of()).tolist() == [1, 3]
+    assert field_of().chosen().tolist() == [1, 3]
     spoilt = np.array([0, int(StarFlag.SATURATED), 0, 0])
-    assert plot.chosen_stars(field_of(flags=spoilt)).tolist() == [3, 0]
+    assert field_of(flags=spoilt).chosen().tolist() == [3, 0]
 
 
 def test_map_of_nothing_is_still_a_map():
     stars = field_of(flags=np.full(4, int(StarFlag.NO_FLUX)))
-    figure = plot.psf_map(np.empty((0, 16, 16)), plot.chosen_stars(stars), stars, "nothing")
+    figure = plot.psf_map(np.empty((0, 16, 16)), stars, "nothing")
     assert len(figure.axes) == 2
 
 

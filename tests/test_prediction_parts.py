@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import threading
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy import ndimage
 
 from prediction_stars import observe
-from psfdae.prediction.border import border_pixels
-from psfdae.prediction.centring import SMOOTHED_NOISE, displacement, recut, smoothed
-from psfdae.prediction.photometry import Known, Photometer
-from psfdae.prediction.shapes import measure_shapes
-from psfdae.prediction.stream import in_order
-from psfdae.stars.flux import FluxModel, robust_flux
+from psfdae.own_stars.photometry import FluxModel, Photometer, robust_flux
+from psfdae.own_stars.shapes import measure_shapes
+from psfdae.own_stars.stamps import SMOOTHED_NOISE, border_pixels, cut, displacement, smoothed
+from psfdae.threads import in_order
 
 
 def test_noise_moves_no_star(field_psfs):
@@ -38,7 +37,8 @@ def flux_model(gaussian_stars):
 
 
 def known(count, flux=np.nan, background=np.nan, noise=np.nan):
-    return Known(*(np.full(count, value) for value in (flux, background, noise)))
+    given = {"flux": flux, "background": background, "noise": noise}
+    return SimpleNamespace(**{name: np.full(count, value) for name, value in given.items()})
 
 
 @pytest.mark.parametrize("sky_known", [True, False])
@@ -113,11 +113,11 @@ def test_residuals_of_the_border_are_those_of_dense_matrices(gaussian_stars, flu
     assert found == pytest.approx(residual[:, ring], abs=1e-4)
 
 
-def test_recut_moves_the_middle():
+def test_cut_moves_the_middle():
     wide = np.arange(2 * 100).reshape(2, 10, 10)
-    cut = recut(wide, np.array([[0, 0], [-1, 2]]), 6)
-    assert np.array_equal(cut[0], wide[0, 2:8, 2:8])
-    assert np.array_equal(cut[1], wide[1, 1:7, 4:10])
+    found = cut(wide, 6, np.array([[0, 0], [-1, 2]]))
+    assert np.array_equal(found[0], wide[0, 2:8, 2:8])
+    assert np.array_equal(found[1], wide[1, 1:7, 4:10])
 
 
 def gaussians(sigma, count=50, ratio=1.0, angle=0.0):

@@ -20,6 +20,7 @@ from psfdae.files import ProductError
 from psfdae.optics.propagation import StampPropagator
 from psfdae.stability import bench as bench_module
 from psfdae.stability import (
+    flux,
     metric_cases,
     network_cases,
     optics_cases,
@@ -30,7 +31,6 @@ from psfdae.stability import (
 )
 from psfdae.stability.bench import Bench, Scene, fresh_stars
 from psfdae.stability.rows import Point, Row, StabilityError
-from psfdae.stars import flux
 
 ROOT = Path(__file__).resolve().parents[1]
 

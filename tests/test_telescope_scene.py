@@ -8,6 +8,7 @@ from click.testing import CliRunner
 
 from psfdae.alignment.stamps import AlignmentStamps, mean_slope
 from psfdae.alignment.telescope import zernike_tracer
+from fits_inputs import open_observation
 from psfdae.cli import main
 from psfdae.configuration.compose import (
     ConfigError,
@@ -18,7 +19,6 @@ from psfdae.configuration.compose import (
     stage_tree,
 )
 from psfdae.files import read_product
-from psfdae.observations import open_observation
 from psfdae.optics.pupil import annular_pupil
 from psfdae.optics.raytracing import RayTracingError
 from psfdae.optics.wavefronts import seidel_wavefronts, zernike_wavefronts

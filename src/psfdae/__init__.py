@@ -14,7 +14,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from psfdae.prediction import Prediction, PredictionError, PsfModel, StarFlag, load_model
+    from psfdae.own_stars.model import (
+        Prediction,
+        PredictionError,
+        PsfModel,
+        StarFlag,
+        load_model,
+    )
 
 __version__ = "0.1.0"
 
@@ -24,7 +30,7 @@ __all__ = ["Prediction", "PredictionError", "PsfModel", "StarFlag", "__version__
 def __getattr__(name: str) -> Any:
     """Import the model on first use (PEP 562): the command line must not wait for torch."""
     if name in __all__:
-        from psfdae import prediction
+        from psfdae.own_stars import model
 
-        return getattr(prediction, name)
+        return getattr(model, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

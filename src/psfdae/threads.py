@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
 Batch = TypeVar("Batch")
@@ -30,3 +31,27 @@ def side_by_side(
         return [work(batch) for batch in batches]
     with ThreadPoolExecutor(threads) as pool:
         return list(pool.map(work, batches))
+
+
+def in_order(
+    work: Callable[[Batch], Result], batches: Iterable[Batch], threads: int
+) -> Iterator[tuple[Batch, Result]]:
+    """Batches with their results, in the order of the batches, few of them in memory.
+
+    Batches are taken as they are needed, by the caller's thread: at most `threads` + 1
+    are under way. What `batches` or `work` raises is raised, and nothing new is begun.
+    """
+    waiting: deque[tuple[Batch, Future[Result]]] = deque()
+    with ThreadPoolExecutor(threads) as pool:
+        try:
+            for batch in batches:
+                waiting.append((batch, pool.submit(work, batch)))
+                if len(waiting) > threads:
+                    first, future = waiting.popleft()
+                    yield first, future.result()
+            while waiting:
+                first, future = waiting.popleft()
+                yield first, future.result()
+        finally:
+            for _, future in waiting:
+                future.cancel()

@@ -39,7 +39,7 @@ def make_cube(
     out : path of the cube
     """
     from psfdae.files import read_product
-    from psfdae.observations.examples import write_cube
+    from psfdae.own_stars.example import write_cube
     from psfdae.rng import stream
     from psfdae.stars.noise import NoiseModel, mixed_levels
 
@@ -53,7 +53,7 @@ def make_cube(
         flux = noise.flux(level)[:, None, None]
         cube[rows] = rng.poisson(flux * images[rows % len(images)] + background)
     scale = product.config["telescope"]["pixel_scale_arcsec"]
-    write_cube(out, cube, PIXSCALE=scale, GAIN=1.0)
+    write_cube(Path(out), cube, PIXSCALE=scale, GAIN=1.0)
 
 
 def time_prediction(
@@ -78,8 +78,7 @@ def time_prediction(
         peak_mb of the prediction, interpreter and libraries included.
     """
     from psfdae.benchmark.isolated import forget_peak, peak_mb
-    from psfdae.prediction import load_model
-    from psfdae.prediction.engine import BLOCK
+    from psfdae.own_stars.model import BLOCK, load_model
     from psfdae.stages import predict as stage
 
     model = load_model(bundle)
@@ -112,7 +111,7 @@ def _bare_rate(model: Any, stamps: int, threads: int, shared: bool) -> float:
     import torch
 
     from psfdae.models.dae import predict
-    from psfdae.prediction.engine import BLOCK, one_thread_each
+    from psfdae.own_stars.model import BLOCK, one_thread_each
     from psfdae.threads import side_by_side
 
     side, factor, network = model.info.stamp_px, model.info.image_scale, model.engine.network

@@ -55,7 +55,7 @@ def from_stars(
     from psfdae.configuration.compose import load_stage
     from psfdae.stages import from_stars as stage
 
-    exposure = stage.Exposure(
+    exposure = stage.Source(
         path=image,
         catalogue=catalogue,
         extension=name_or_number(extension),

@@ -44,7 +44,7 @@ class FieldOfPsfs:
     energy : ndarray, shape (F,)
         Fraction of the light inside the stamp.
     fwhm_arcsec, ellipticity, position_angle_deg : ndarray, shape (F,)
-        As `psfdae.prediction.shapes.Shapes`.
+        As `psfdae.own_stars.shapes.Shapes`.
     """
 
     psf: np.ndarray

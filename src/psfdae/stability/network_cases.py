@@ -15,9 +15,9 @@ from psfdae.models.training import DeadNetworkError, Training, TrainingError
 from psfdae.models.weights import save_checkpoint
 from psfdae.rng import stream
 from psfdae.stability.bench import Bench
+from psfdae.stability.flux import normalise_robustly
 from psfdae.stability.networks import rounding_of, trained_network, training_set
 from psfdae.stability.rows import Entry, at_most, attempt, equal, one_of, refused
-from psfdae.stars.flux import normalise_robustly
 
 NARROW = 4
 """Channels of the networks whose accuracy does not matter."""

@@ -8,8 +8,7 @@ import numpy as np
 
 from psfdae.rng import stream
 from psfdae.stability.bench import LEVELS, Bench
-from psfdae.stability.rows import Entry, Point, at_most, equal, refused, within
-from psfdae.stars.flux import (
+from psfdae.stability.flux import (
     CLIP,
     MARGIN,
     SLACK,
@@ -20,6 +19,7 @@ from psfdae.stars.flux import (
     robust_flux,
     sum_flux,
 )
+from psfdae.stability.rows import Entry, Point, at_most, equal, refused, within
 
 SIGMAS = 4.0
 """Sampling errors that a measured RMS may be off by."""

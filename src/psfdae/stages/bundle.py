@@ -10,8 +10,10 @@ import numpy as np
 
 import psfdae
 from psfdae.belonging import SAME_IMAGE, SAME_STARS, STARS, require_origin
-from psfdae.bundle import measure
-from psfdae.bundle.format import (
+from psfdae.configuration.compose import as_overrides
+from psfdae.files import Product, ProductError
+from psfdae.own_stars import packing
+from psfdae.own_stars.bundle import (
     Architecture,
     Bundle,
     BundleError,
@@ -19,9 +21,7 @@ from psfdae.bundle.format import (
     creation_date,
     write_bundle,
 )
-from psfdae.configuration.compose import as_overrides
-from psfdae.evaluation.metrics import all_metrics
-from psfdae.files import Product, ProductError
+from psfdae.own_stars.photometry import FluxModel
 from psfdae.reading import read_yaml
 from psfdae.rng import stream
 from psfdae.stages.common import (
@@ -32,7 +32,6 @@ from psfdae.stages.common import (
     split_stars,
 )
 from psfdae.stages.trained import CONFIG, WEIGHTS, dae_settings
-from psfdae.stars.flux import FluxModel
 
 SEEN_BY_TRAINING = ("seed", "noise", "parts")
 """Groups in which the configuration must be that of the training."""
@@ -76,10 +75,25 @@ def run(
     network = _load(dae, trained, kind["stamp_px"], config.evaluation.batch)
     parts = split_stars(product, trained["split"], config)
     images, references = product["realisation"], product[trained["reference"]]
-    held_out = measure.HeldOutStars(images[parts.test], references[parts.test], noise_model(config))
-    model = measure.leading(FluxModel.fit(images[parts.train]), measure.COMPONENTS)
-    errors = measure.measure_errors(
-        held_out, network.predict, model, _nodes(config), stream(config.seed, "noise", "bundle")
+    held_out = packing.HeldOutStars(images[parts.test], references[parts.test], noise_model(config))
+    model = packing.leading(FluxModel.fit(images[parts.train]), packing.COMPONENTS)
+    band = config.noise.kappa * np.asarray(config.noise.levels)
+    errors = packing.measure_errors(
+        held_out,
+        network.predict,
+        model,
+        packing.noise_nodes(band),
+        stream(config.seed, "noise", "bundle"),
+    )
+    reach = packing.reach(band, model.mean)
+    metrics = packing.measure_levels(
+        config.noise.levels,
+        held_out,
+        lambda level: noisy_test_images(config, held_out.images, level),
+        network.predict,
+        errors,
+        reach["noise_equivalent_px"],
+        config.evaluation.data_range,
     )
     info = BundleInfo(
         psfdae_version=psfdae.__version__,
@@ -87,14 +101,18 @@ def run(
         licence=licence,
         created=creation_date(),
         **kind,
-        **_reach(config, model),
+        **reach,
         image_scale=network.factor,
-        components=measure.COMPONENTS,
-        training_sha256=measure.checksum(images[parts.train], references[parts.train]),
+        components=packing.COMPONENTS,
+        training_sha256=packing.checksum(images[parts.train], references[parts.train]),
         training_stars=parts.train.size,
         dae=Architecture(**{key: trained["dae"][key] for key in ("kernels", "widths")}),
-        config=_all_settings(product, trained, config),
-        metrics=_metrics(config, held_out, network, errors, model),
+        config={
+            "stars": product.config,
+            "train": trained,
+            "evaluation": config.evaluation.model_dump(),
+        },
+        metrics=metrics,
     )
     maps = (errors.nodes, errors.half_width(), errors.rms(), errors.distance_limit())
     write_bundle(Bundle(info, network.weights, model, *maps), out)
@@ -104,7 +122,7 @@ def run(
 class _Network:
     """A trained network as a function, its weights, and the factor of its images."""
 
-    predict: measure.Predict
+    predict: packing.Predict
     weights: dict[str, np.ndarray]
     factor: float
 
@@ -164,60 +182,3 @@ def _kind_of_stamps(product: Product) -> dict[str, Any]:
         }
     except KeyError as error:
         raise ProductError(f"{product.path}: its configuration lacks {error}") from None
-
-
-def _band(config: Any) -> np.ndarray:
-    """Pixel RMS over the flux at the noise levels of a configuration."""
-    return config.noise.kappa * np.asarray(config.noise.levels)
-
-
-def _nodes(config: Any) -> np.ndarray:
-    band = _band(config)
-    return measure.noise_nodes(float(band.min()), float(band.max()))
-
-
-def _reach(config: Any, model: FluxModel) -> dict[str, float]:
-    """Noise and S/N that the training has covered."""
-    area = measure.noise_equivalent_px(model.mean)
-    least, most = float(_band(config).min()), float(_band(config).max())
-    return {
-        "noise_min": least,
-        "noise_max": most,
-        "snr_min": measure.signal_to_noise(most, area),
-        "snr_max": measure.signal_to_noise(least, area),
-        "noise_equivalent_px": area,
-    }
-
-
-def _all_settings(product: Product, trained: dict[str, Any], config: Any) -> dict[str, Any]:
-    evaluation = config.evaluation.model_dump()
-    return {"stars": product.config, "train": trained, "evaluation": evaluation}
-
-
-def _metrics(
-    config: Any,
-    held_out: measure.HeldOutStars,
-    network: _Network,
-    errors: measure.Errors,
-    model: FluxModel,
-) -> list[dict[str, float]]:
-    """Mean errors at each λ on the noisy images that the stage `evaluate` uses, too."""
-    rows = []
-    area = measure.noise_equivalent_px(model.mean)
-    for level, noise in zip(config.noise.levels, _band(config), strict=True):
-        noisy = noisy_test_images(config, held_out.images, level)
-        estimate = network.predict(noisy)
-        error = estimate - held_out.references
-        quality = all_metrics(estimate, held_out.references, config.evaluation.data_range)
-        rows.append(
-            {
-                "noise_level": level,
-                "noise": float(noise),
-                "snr": measure.signal_to_noise(float(noise), area),
-                "mse_noisy": float(np.square(noisy - held_out.references).mean()),
-                **{name: float(values.mean()) for name, values in quality.items()},
-                **measure.crossed_coverage(errors, error, float(noise)),
-                "stars": len(noisy),
-            }
-        )
-    return rows

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from psfdae.bundle.format import (
+from psfdae.own_stars.bundle import (
     SHIPPED,
     SUFFIX,
     Bundle,
@@ -15,7 +15,7 @@ from psfdae.bundle.format import (
     read_bundle,
     write_bundle,
 )
-from psfdae.safe_text import one_line
+from psfdae.own_stars.errors import one_line
 from psfdae.stages.common import check_outputs
 
 LARGEST_SHIPPED = 300_000

@@ -6,8 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from psfdae.observations.examples import write_field
-from psfdae.stars.example_field import ExampleField, FieldRecipe, example_field
+from psfdae.own_stars.example import ExampleField, FieldRecipe, example_field, write_field
 
 
 def run(out: Path, catalogue: Path, seed: int, **recipe: int) -> ExampleField:
@@ -24,14 +23,11 @@ def run(out: Path, catalogue: Path, seed: int, **recipe: int) -> ExampleField:
     """
     made = FieldRecipe(**recipe)
     field = example_field(made, seed)
-    nothing = np.zeros((len(field.centroid), 1, 1))
     write_field(
         out,
         catalogue,
-        nothing,
+        field.image.astype(np.float32),
         *field.centroid.T,
-        shape=field.image.shape,
-        background=field.image,
         pixel_scale_arcsec=made.pixel_scale_arcsec,
         GAIN=made.gain,
         SATURATE=float(made.saturation),

@@ -11,23 +11,19 @@ from typing import Any
 
 import numpy as np
 
-from psfdae.bundle.format import SUFFIX
-from psfdae.bundle.measure import noise_equivalent_px, signal_to_noise
 from psfdae.configuration.compose import as_overrides, part
 from psfdae.configuration.schema import Noise
-from psfdae.files import atomic_path, write_text
-from psfdae.observations import Observation, ObservationError, open_observation
+from psfdae.files import write_product, write_text
+from psfdae.own_stars.bundle import SUFFIX
+from psfdae.own_stars.errors import ObservationError
+from psfdae.own_stars.observation import Observation, Source
+from psfdae.own_stars.packing import noise_equivalent_px, signal_to_noise
+from psfdae.own_stars.selection import collect
+from psfdae.own_stars.training_images import star_grid, training_columns
 from psfdae.reading import read_table
+from psfdae.rng import stream
 from psfdae.stages import baseline, bundle, evaluate, train
-from psfdae.stages.calibration_stars import (
-    Candidates,
-    collect,
-    sky_photons,
-    write_selection,
-    write_stars,
-)
 from psfdae.stages.common import check_outputs
-from psfdae.stars.from_observation import star_grid
 from psfdae.stars.splits import held_out_fields
 
 LOCK = ".from_stars.lock"
@@ -42,39 +38,6 @@ SHOWN_STARS = 6
 
 class FolderError(RuntimeError):
     """The folder holds a model already, or another process is making one there."""
-
-
-@dataclass(frozen=True)
-class Exposure:
-    """A FITS file with stars and what is stated about it; see `open_observation`."""
-
-    path: Path
-    catalogue: Path | None = None
-    extension: str | int | None = None
-    origin: int | None = None
-    mask: str | int | Path | None = None
-    pixel_scale_arcsec: float | None = None
-    gain: float | None = None
-    saturate: float | None = None
-
-    def open(self, stamp_px: int, margin_px: int) -> Observation:
-        """Check the files; a cube may have larger stamps than asked for.
-
-        Raises
-        ------
-        ObservationError
-            If a file cannot be used or the pixel scale is unknown.
-        """
-        given = {key: value for key, value in vars(self).items() if key != "path"}
-        side = _side_of_cube(self.path, self.extension, stamp_px)
-        found = open_observation(
-            self.path, stamp_px=side or stamp_px, margin=0 if side else margin_px, **given
-        )
-        if found.pixel_scale_arcsec is None:
-            raise ObservationError(
-                self.path, "the pixel scale is neither in the header nor given (--pixel-scale)"
-            )
-        return found
 
 
 @dataclass(frozen=True)
@@ -109,7 +72,7 @@ class Folder:
 
 def run(
     config: Any,
-    exposure: Exposure,
+    exposure: Source,
     out: Path,
     *,
     name: str,
@@ -123,7 +86,7 @@ def run(
     ----------
     config : stage config (seed, calibration_stars, framing, noise, parts, dae, train,
         baseline, evaluation); the noise levels follow from the stars
-    exposure : Exposure
+    exposure : Source
     out : folder that receives
 
         - `NAME.psf.safetensors`, the model bundle,
@@ -182,33 +145,34 @@ def _alone(folder: Path) -> Iterator[None]:
 
 
 def _run(
-    config: Any, exposure: Exposure, files: Folder, licence: str, say: Callable[[str], object]
+    config: Any, exposure: Source, files: Folder, licence: str, say: Callable[[str], object]
 ) -> None:
-    out = files.path
-    observation = exposure.open(config.framing.stamp_px, config.calibration_stars.margin_px)
-    found = collect(observation, config)
+    framing, wanted = config.framing, config.calibration_stars
+    observation = exposure.open(framing.stamp_px, wanted.margin_px, larger=True)
+    if observation.pixel_scale_arcsec is None:
+        raise ObservationError(
+            exposure.path, "the pixel scale is neither in the header nor given (--pixel-scale)"
+        )
+    found = collect(observation, wanted, framing)
     grid = star_grid(found.bright.position)
     held_out = held_out_fields(grid)
     say(f"{len(found.verdict)} stars: {found.count()}")
     say(f"{int((~held_out).sum())} to learn from, {int(held_out.sum())} held out")
-    write_selection(found, held_out, out / "selection.csv")
-    described = _described(config, observation)
-    columns = write_stars(found.bright, grid, held_out, config, described, files.stars)
-    settings = _with_noise(config, found, held_out, columns, observation.gain)
-    write_text(out / "overrides.txt", _overrides(settings))
+    selection = found.table(held_out).to_csv(index=False, float_format="%.6g")
+    write_text(files.path / "selection.csv", selection)
+    rng = stream(config.seed, "own stars")
+    columns = training_columns(
+        found.bright, grid, held_out, wanted.bins, framing, config.parts, rng
+    )
+    write_product(files.stars, "stars", columns, _described(config, observation))
+    images = columns["realisation"].values[~held_out[columns["field_index"].values]]
+    sky = found.bright.sky_photons(observation.gain, config.noise.background_photons)
+    settings = {**config.model_dump(), "noise": _noise(config, images, sky)}
+    write_text(files.path / "overrides.txt", _overrides(settings))
     for line, work in _steps(settings, files, licence):
         say(line)
         work()
     report(settings, files)
-
-
-def _side_of_cube(path: Path, extension: str | int | None, stamp_px: int) -> int | None:
-    """Side of the stamps of a cube that are larger than needed."""
-    from psfdae.observations.images import find_image
-
-    shape = find_image(path, extension).shape
-    larger = len(shape) == 3 and shape[1] == shape[2] > stamp_px
-    return shape[1] if larger else None
 
 
 def _described(config: Any, observation: Observation) -> dict[str, Any]:
@@ -222,25 +186,17 @@ def _described(config: Any, observation: Observation) -> dict[str, Any]:
     }
 
 
-def _with_noise(
-    config: Any,
-    found: Candidates,
-    held_out: np.ndarray,
-    columns: dict[str, np.ndarray],
-    gain: float | None,
-) -> dict[str, Any]:
-    """The configuration as a tree, its noise levels those of the S/N asked for."""
-    training = ~held_out[columns["field_index"]]
-    area = noise_equivalent_px(columns["realisation"][training].mean(axis=0, dtype=np.float64))
-    kappa = config.noise.kappa
+def _noise(config: Any, images: np.ndarray, background: float) -> dict[str, Any]:
+    """Config group `noise` with the levels of the S/N asked for, of noise-free stars."""
+    area, kappa = noise_equivalent_px(images.mean(axis=0, dtype=np.float64)), config.noise.kappa
     levels = [1.0 / (snr * np.sqrt(area) * kappa) for snr in config.calibration_stars.snr_levels]
     noise = Noise(
         name=config.noise.name,
         levels=[float(f"{level:.9g}") for level in reversed(levels)],
         kappa=kappa,
-        background_photons=sky_photons(found.bright, gain, config.noise.background_photons),
+        background_photons=background,
     )
-    return {**config.model_dump(), "noise": noise.model_dump()}
+    return noise.model_dump()
 
 
 def _part(stage: str, settings: dict[str, Any]) -> Any:
@@ -338,6 +294,7 @@ def _draw(config: Any, files: Folder, images: np.ndarray, star: np.ndarray, area
     from psfdae.evaluation.metrics import mse
     from psfdae.files import read_product
     from psfdae.stages.common import noisy_test_images
+    from psfdae.stages.figures import write_png
 
     levels = np.asarray(config.noise.levels)
     snr = 1.0 / (config.noise.kappa * levels * np.sqrt(area))
@@ -357,9 +314,7 @@ def _draw(config: Any, files: Folder, images: np.ndarray, star: np.ndarray, area
     found = signal_to_noise(config.noise.kappa * level, area)
     columns = [f"S/N {value:.0f}" for value in product["snr"][star[shown]]]
     title = f"Bright stars that no training saw, made faint: S/N {found:.3g}"
-    figure = restoration_strip(rows, columns, title)
-    with atomic_path(files.path / "report.png") as temporary:
-        figure.savefig(temporary, format="png")
+    write_png(restoration_strip(rows, columns, title), files.path / "report.png")
 
 
 def _shown(star: np.ndarray, position: np.ndarray) -> np.ndarray:

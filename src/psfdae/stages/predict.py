@@ -3,22 +3,26 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from psfdae.observations import Observation, Stamps, open_observation
-from psfdae.prediction import Prediction, PredictionError, PsfModel, load_model
-from psfdae.prediction.engine import BLOCK, one_thread_each
-from psfdae.prediction.model import available_cores
-from psfdae.prediction.photometry import Known
-from psfdae.prediction.results import Stars
-from psfdae.prediction.stream import in_order
-from psfdae.prediction.writer import Card, writing
+from psfdae.own_stars.images import Card
+from psfdae.own_stars.model import (
+    BLOCK,
+    PredictionError,
+    PsfModel,
+    available_cores,
+    load_model,
+    one_thread_each,
+)
+from psfdae.own_stars.observation import Observation, Source
+from psfdae.own_stars.prediction import Prediction, prediction_file
+from psfdae.own_stars.stamps import Stamps, StarFlag
 from psfdae.stages.common import check_outputs
+from psfdae.threads import in_order
 
 ROWS = 4 * BLOCK
 """Stars that are read and written at a time, fewer if their stamps are large."""
@@ -27,41 +31,6 @@ MARGIN_PX = 2
 """Pixels by which a star of an image may be moved to centre it."""
 
 Tick = Callable[[int], object]
-
-
-@dataclass(frozen=True)
-class Source:
-    """Where stars come from, and what is stated about them.
-
-    Attributes are the arguments of `psfdae.observations.open_observation`, and names
-    of catalogue columns with fluxes and sky levels that are not to be estimated.
-    """
-
-    path: Path
-    catalogue: Path | None = None
-    extension: str | int | None = None
-    origin: int | None = None
-    mask: str | int | Path | None = None
-    pixel_scale_arcsec: float | None = None
-    gain: float | None = None
-    saturate: float | None = None
-    flux_column: str | None = None
-    background_column: str | None = None
-
-    def open(self, stamp_px: int) -> Observation:
-        """Check the files and describe them."""
-        return open_observation(
-            self.path,
-            stamp_px=stamp_px,
-            catalogue=self.catalogue,
-            extension=self.extension,
-            origin=self.origin,
-            mask=self.mask,
-            pixel_scale_arcsec=self.pixel_scale_arcsec,
-            gain=self.gain,
-            saturate=self.saturate,
-            margin=MARGIN_PX,
-        )
 
 
 @dataclass(frozen=True)
@@ -101,7 +70,7 @@ def run(
     Parameters
     ----------
     source : Source
-    out : path of the FITS file; see `psfdae.prediction.writer`
+    out : path of the FITS file; see `psfdae.own_stars.prediction`
     model : path of a bundle, the shipped one by default
     plot : path of a PNG with a map of the PSFs, optional
     overwrite : whether files may be replaced
@@ -118,7 +87,7 @@ def run(
     check_outputs((out, plot), (source.path, source.catalogue, source.mask, model))
     _check_targets(out, plot, overwrite)
     loaded = load_model(model)
-    observation = source.open(loaded.info.stamp_px)
+    observation = source.open(loaded.info.stamp_px, MARGIN_PX)
     loaded.check_scale(observation.pixel_scale_arcsec, str(source.path))
     if plot is not None and observation.positions is None:
         raise PredictionError(f"{source.path}: a map needs a catalogue with pixel positions")
@@ -126,7 +95,10 @@ def run(
     try:
         summary = _predict(loaded, source, observation, out, threads, history, tick)
         if plot is not None:
-            draw(out, plot)
+            from psfdae.own_stars.plot import map_of_file
+            from psfdae.stages.figures import write_png
+
+            write_png(map_of_file(out), plot)
     except OSError as error:
         raise PredictionError(f"{out}: cannot be written ({error.strerror or error})") from error
     return summary
@@ -153,61 +125,26 @@ def _predict(
     history: str,
     tick: Tick,
 ) -> Summary:
-    from psfdae.prediction import StarFlag
-
     chunks = observation.chunks(min(ROWS, 4 * model.engine.size))
     first = next(chunks)
-    known = _Known(source, observation)
     counts = np.zeros(len(StarFlag), dtype=int)
     done = clean = 0
-    header = (model.bundle, _cards(source, observation), history)
-    size = (observation.count, model.info.stamp_px, first.id.dtype)
-    numbered = known.stars(itertools.chain([first], chunks))
-    with one_thread_each(), writing(out, *size, *header) as file:
-        for (_, stamps), result in in_order(
-            lambda item: _blocks(model, item[0]), numbered, threads or available_cores()
+
+    def predict(stamps: Stamps) -> Prediction:
+        return Prediction.joined([model.engine.block(b) for b in model.engine.blocks(stamps)])
+
+    header = (model.bundle, first, observation.count, _cards(source, observation), history)
+    with one_thread_each(), prediction_file(out, *header) as file:
+        for stamps, result in in_order(
+            predict, itertools.chain([first], chunks), threads or available_cores()
         ):
-            file.write(done, result, {"id": stamps.id, "x": stamps.x, "y": stamps.y})
+            file.write(done, stamps, result)
             counts += [(result.flags & int(flag) > 0).sum() for flag in StarFlag]
             clean += int((result.flags == 0).sum())
             done += len(result)
             tick(len(result))
     flagged = {str(f.name): int(n) for f, n in zip(StarFlag, counts, strict=True) if n}
     return Summary(done, clean, flagged)
-
-
-def _blocks(model: PsfModel, stars: Stars) -> Prediction:
-    return Prediction.joined([model.engine.block(part) for part in model.engine.blocks(stars)])
-
-
-class _Known:
-    """Joins stamps with what the catalogue knows of their stars."""
-
-    def __init__(self, source: Source, observation: Observation) -> None:
-        columns = (source.flux_column, source.background_column)
-        self.flux, self.background = (
-            None if name is None else observation.column(name) for name in columns
-        )
-        self.gain = np.nan if observation.gain is None else observation.gain
-
-    def stars(self, chunks: Iterator[Stamps]) -> Iterator[tuple[Stars, Stamps]]:
-        done = 0
-        for stamps in chunks:
-            rows = slice(done, done + len(stamps))
-            unknown = np.full(len(stamps), np.nan)
-            given = [unknown if c is None else c[rows] for c in (self.flux, self.background)]
-            yield (
-                Stars(
-                    stamps.data,
-                    stamps.bad,
-                    stamps.saturated,
-                    stamps.truncated,
-                    Known(*given, unknown),
-                    np.full(len(stamps), self.gain),
-                ),
-                stamps,
-            )
-            done += len(stamps)
 
 
 def _cards(source: Source, observation: Observation) -> list[Card]:
@@ -222,31 +159,3 @@ def _cards(source: Source, observation: Observation) -> list[Card]:
     if observation.saturate is not None:
         cards.append(("SATURATE", observation.saturate, "counts of a saturated pixel"))
     return [*cards, *observation.header_cards]
-
-
-def draw(predicted: Path, out: Path) -> None:
-    """Draw the map of a prediction's PSFs.
-
-    Parameters
-    ----------
-    predicted : FITS file of this stage
-    out : path of the PNG
-    """
-    from astropy.io import fits
-
-    from psfdae.prediction.plot import FieldStars, chosen_stars, psf_map
-    from psfdae.stages.figures import write_png
-
-    with fits.open(predicted, memmap=True) as file:
-        table: Any = file["STARS"].data
-        stars = FieldStars(*(_native(table[name]) for name in FieldStars.__dataclass_fields__))
-        chosen = chosen_stars(stars)
-        psf = np.array([file["PSF"].section[int(star)] for star in chosen], dtype=np.float32)
-        drawn = len(stars.drawable())
-        title = f"{file[0].header['INFILE']}: {drawn} of {len(stars.x)} stars"
-    write_png(psf_map(psf, chosen, stars, title), out)
-
-
-def _native(column: np.ndarray) -> np.ndarray:
-    """A copy in the machine's byte order."""
-    return column.astype(column.dtype.newbyteorder("="))

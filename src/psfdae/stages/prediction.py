@@ -15,7 +15,7 @@ from psfdae.reading import read_table
 if TYPE_CHECKING:
     import pandas as pd
 
-    from psfdae.prediction import Prediction
+    from psfdae.own_stars.prediction import Prediction
 
 REQUIRED_SHARE = 0.6
 """Part of the bare network's throughput that a prediction must reach."""
@@ -126,7 +126,7 @@ def poppy(config: Any, bundle: Path, evaluation: Path, count: int, out: Path) ->
     import pandas as pd
 
     from psfdae.benchmark.poppy_stars import poppy_stars
-    from psfdae.prediction import load_model
+    from psfdae.own_stars.model import load_model
     from psfdae.rng import stream
     from psfdae.stages.common import noise_model
 
@@ -155,7 +155,7 @@ def poppy(config: Any, bundle: Path, evaluation: Path, count: int, out: Path) ->
 
 def _require_bundle(bundle: Path, config: Any) -> None:
     """Refuse a bundle whose training stars are not of the configured scene."""
-    from psfdae.bundle import read_bundle
+    from psfdae.own_stars.bundle import read_bundle
 
     trained_on = read_bundle(bundle).info.config.get("stars")
     if isinstance(trained_on, dict):

@@ -14,7 +14,7 @@ from psfdae.configuration.schema import Config
 from psfdae.configuration.stages import STATIC
 from psfdae.evaluation.telescope_figure import FieldOfPsfs, field_of_psfs
 from psfdae.files import Product, atomic_path, read_product, write_text
-from psfdae.prediction.shapes import measure_shapes
+from psfdae.own_stars.shapes import measure_shapes
 from psfdae.stages import templates
 from psfdae.stages.common import template_wavefronts
 from psfdae.stages.figures import write_png

@@ -10,7 +10,7 @@ import numpy as np
 import psfdae
 from psfdae.evaluation.telescope_figure import FieldOfPsfs
 from psfdae.files import write_fits
-from psfdae.observations.examples import write_field
+from psfdae.own_stars.example import add_stamps, write_field
 from psfdae.rng import stream
 from psfdae.stars.framing import normalise_flux
 
@@ -88,20 +88,15 @@ def write_image(
     pitch = side + MARGIN_PX
     columns, rows = fields.grid.max(axis=0) + 1
     x, y = (fields.grid * pitch + pitch // 2).T.astype(np.float64)
-    shape = (int(rows) * pitch, int(columns) * pitch)
-    expected = np.full(shape, SKY)
-    for stamp, column, row in zip(stamps, x.astype(int), y.astype(int), strict=True):
-        top, left = row - side // 2, column - side // 2
-        expected[top : top + side, left : left + side] += flux * stamp
+    expected = np.full((int(rows) * pitch, int(columns) * pitch), SKY)
+    add_stamps(expected, flux * stamps, x, y)
     rng = stream(seed, "simulated image", config.telescope.name)
     write_field(
         path,
         catalogue,
-        np.zeros((len(x), side, side)),
+        rng.poisson(expected).astype(np.float32),
         x,
         y,
-        shape=shape,
-        background=rng.poisson(expected).astype(np.float64),
         pixel_scale_arcsec=config.telescope.pixel_scale_arcsec,
         GAIN=1.0,
         TELESCOP=config.telescope.name,

@@ -146,7 +146,7 @@ def _check_table(path: Path) -> None:
 
 
 def _check_bundle(path: Path) -> None:
-    from psfdae.bundle import read_bundle
+    from psfdae.own_stars.bundle import read_bundle
 
     read_bundle(path)
 

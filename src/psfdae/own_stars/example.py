@@ -1,4 +1,4 @@
-"""A simulated exposure of a star field: an image to try the tools on, its truth known.
+"""A simulated exposure of a star field, its truth known, and small files to try things on.
 
 The optics are a slow telescope with Seidel aberrations that grow towards the edge
 of the field; a Moffat profile (Moffat 1969, A&A 3, 455) stands for seeing and
@@ -9,13 +9,18 @@ a few have a close companion.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from psfdae.files import atomic_path, write_fits
 from psfdae.optics.propagation import StampPropagator
 from psfdae.optics.pupil import annular_pupil
 from psfdae.optics.wavefronts import seidel_wavefronts
+from psfdae.own_stars.observation import central_pixel
 from psfdae.rng import stream
 
 OVERSAMPLING = 3
@@ -102,7 +107,6 @@ class ExampleField:
         nearest to the position. Companions are not in it.
     kind : ndarray of str, shape (n,)
         "bright", "faint", "saturated" or "blended".
-    recipe : FieldRecipe
     """
 
     image: np.ndarray
@@ -111,7 +115,6 @@ class ExampleField:
     flux: np.ndarray
     psf: np.ndarray
     kind: np.ndarray
-    recipe: FieldRecipe
 
 
 def example_field(recipe: FieldRecipe, seed: int) -> ExampleField:
@@ -121,16 +124,25 @@ def example_field(recipe: FieldRecipe, seed: int) -> ExampleField:
     kind = np.repeat(["bright", "faint", "saturated", "blended"], counts)
     margin = RENDER_PX / 2
     position = rng.uniform(margin, recipe.side_px - margin, size=(kind.size, 2))
-    companion = _companions(position[kind == "blended"], rng)
-    psf = star_images(recipe, np.concatenate([position, companion]))
+    # Companions are 4 to 7 px away.
+    distance = rng.uniform(4.0, 7.0, size=recipe.blended)
+    angle = rng.uniform(0.0, 2.0 * np.pi, size=recipe.blended)
+    away = distance[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    everyone = np.concatenate([position, position[kind == "blended"] + away])
+    psf = star_images(recipe, everyone)
     flux = _fluxes(recipe, kind, rng)
-    light = np.concatenate([flux, flux[kind == "blended"] / 3.0])
-    expected = _sky(recipe)
-    _add_stars(expected, np.concatenate([position, companion]), light[:, None, None] * psf)
+    light = np.zeros((recipe.side_px,) * 2)
+    each = np.concatenate([flux, flux[kind == "blended"] / 3.0])
+    add_stamps(light, each[:, None, None] * psf, *everyone.T)
+    ramp = 1.0 + recipe.sky_slope * np.linspace(-0.5, 0.5, recipe.side_px)
+    expected = recipe.sky_e * np.broadcast_to(ramp, light.shape) + light
     electrons = rng.poisson(expected) + recipe.read_noise_e * rng.standard_normal(expected.shape)
     counted = np.clip(np.rint(electrons / recipe.gain), 0, min(recipe.saturation, MAX_SIGNAL))
-    image, psf = counted.astype(np.uint16), psf[: kind.size]
-    return ExampleField(image, position, _centroids(position, psf), flux, psf, kind, recipe)
+    psf = psf[: kind.size]
+    axis = np.arange(RENDER_PX) - RENDER_PX // 2
+    centre = np.stack([psf.sum(axis=1) @ axis, psf.sum(axis=2) @ axis], axis=1)
+    centroid = np.rint(position) + centre
+    return ExampleField(counted.astype(np.uint16), position, centroid, flux, psf, kind)
 
 
 def star_images(recipe: FieldRecipe, position: np.ndarray) -> np.ndarray:
@@ -188,43 +200,71 @@ def _shift_transfer(shift: np.ndarray, side: int) -> np.ndarray:
 
 def _fluxes(recipe: FieldRecipe, kind: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Flux of every star in electrons."""
-    middle = np.full((1, 2), recipe.side_px / 2.0)
-    axis_psf = star_images(recipe, middle)[0]
+    axis_psf = star_images(recipe, np.full((1, 2), recipe.side_px / 2.0))[0]
     noise = np.sqrt((recipe.sky_e + recipe.read_noise_e**2) * noise_area(axis_psf))
     draw = rng.uniform(size=kind.size)
-    low, high = np.where(
-        (kind == "faint")[None, :],
-        np.array(recipe.faint_snr)[:, None],
-        np.array(recipe.bright_snr)[:, None],
-    )
+    faint = (kind == "faint")[:, None]
+    low, high = np.where(faint, recipe.faint_snr, recipe.bright_snr).T
     flux = noise * low * (high / low) ** draw
     # Twice to four times what fills the brightest pixel.
     full = recipe.saturation * recipe.gain / axis_psf.max()
     return np.where(kind == "saturated", full * (2.0 + 2.0 * draw), flux)
 
 
-def _companions(position: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Positions 4 to 7 px away."""
-    distance = rng.uniform(4.0, 7.0, size=len(position))
-    angle = rng.uniform(0.0, 2.0 * np.pi, size=len(position))
-    return position + distance[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+def add_stamps(image: np.ndarray, stamps: np.ndarray, x: np.ndarray, y: np.ndarray) -> None:
+    """Add stamps (n, d, d) to an image, in place; what is off the image is lost.
+
+    The stamp's pixel (d/2, d/2) goes to the pixel nearest to the 0-based position.
+    """
+    d = stamps.shape[-1]
+    rows = central_pixel(y)[:, None, None] - d // 2 + np.arange(d)[:, None]
+    columns = central_pixel(x)[:, None, None] - d // 2 + np.arange(d)
+    rows, columns = np.broadcast_arrays(rows, columns)
+    inside = (rows >= 0) & (rows < image.shape[0]) & (columns >= 0) & (columns < image.shape[1])
+    np.add.at(image, (rows[inside], columns[inside]), stamps[inside])
 
 
-def _sky(recipe: FieldRecipe) -> np.ndarray:
-    ramp = np.linspace(-0.5, 0.5, recipe.side_px)
-    return recipe.sky_e * np.broadcast_to(1.0 + recipe.sky_slope * ramp, (ramp.size,) * 2).copy()
+# Files.
 
 
-def _centroids(position: np.ndarray, psf: np.ndarray) -> np.ndarray:
-    axis = np.arange(RENDER_PX) - RENDER_PX // 2
-    columns, rows = psf.sum(axis=1) @ axis, psf.sum(axis=2) @ axis
-    return np.rint(position) + np.stack([columns, rows], axis=1)
+def write_cube(path: Path, stamps: np.ndarray, **cards: Any) -> None:
+    """Write an array, such as stamps, as a FITS image, float64 as float32, with header cards."""
+    _write_image(path, stamps, cards)
 
 
-def _add_stars(image: np.ndarray, position: np.ndarray, light: np.ndarray) -> None:
-    """Add stamps at their nearest pixels, what is outside is cut off."""
-    half, side = RENDER_PX // 2, len(image)
-    padded = np.zeros((side + 2 * half, side + 2 * half))
-    for (column, row), star in zip(np.rint(position).astype(int), light, strict=True):
-        padded[row : row + RENDER_PX, column : column + RENDER_PX] += star
-    image += padded[half : half + side, half : half + side]
+def write_field(
+    path: Path,
+    catalogue: Path,
+    image: np.ndarray,
+    x: np.ndarray,
+    y: np.ndarray,
+    pixel_scale_arcsec: float = 1.0,
+    **cards: Any,
+) -> None:
+    """Write an image with header cards, float64 as float32, and a CSV catalogue of its stars.
+
+    The image has a tangential WCS with north up; the catalogue has the columns id,
+    X_IMAGE, Y_IMAGE (1-based, as in SExtractor) and ra, dec (degrees). `x`, `y` are
+    0-based.
+    """
+    from astropy.table import Table
+    from astropy.wcs import WCS
+
+    wcs = WCS(naxis=2)
+    wcs.wcs.ctype = ["RA---TAN", "DEC--TAN"]
+    wcs.wcs.crval = (150.0, 2.0)
+    wcs.wcs.crpix = [(image.shape[1] + 1) / 2, (image.shape[0] + 1) / 2]
+    wcs.wcs.cdelt = [-pixel_scale_arcsec / 3600.0, pixel_scale_arcsec / 3600.0]
+    _write_image(path, image, {**wcs.to_header(), **cards})
+    ra, dec = wcs.all_pix2world(x, y, 0)
+    rows = {"id": np.arange(len(x)), "X_IMAGE": x + 1, "Y_IMAGE": y + 1, "ra": ra, "dec": dec}
+    with atomic_path(catalogue) as temporary:
+        formats = {"X_IMAGE": "%.4f", "Y_IMAGE": "%.4f", "ra": "%.8f", "dec": "%.8f"}
+        Table(rows).write(temporary, format="ascii.csv", formats=formats, overwrite=True)
+
+
+def _write_image(path: Path, pixels: np.ndarray, cards: Mapping[str, Any]) -> None:
+    from astropy.io import fits
+
+    pixels = pixels.astype(np.float32) if pixels.dtype == np.float64 else pixels
+    write_fits(path, fits.HDUList([fits.PrimaryHDU(pixels, fits.Header(list(cards.items())))]))

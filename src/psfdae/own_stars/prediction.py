@@ -1,4 +1,4 @@
-"""The FITS file of a prediction, written piece by piece.
+"""What comes out of a model, in memory and as a FITS file that is written piece by piece.
 
 | extension | content |
 |---|---|
@@ -14,21 +14,89 @@ extension after the other.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any, Self
 
 import numpy as np
 
 import psfdae
-from psfdae.bundle import Bundle
 from psfdae.files import atomic_path
-from psfdae.prediction.flags import MEANING
-from psfdae.prediction.results import Prediction
+from psfdae.own_stars.images import BLOCK_BYTES, Card
+from psfdae.own_stars.stamps import MEANING, Stamps
 
-BLOCK_BYTES = 2880
-"""FITS files consist of blocks of this size."""
+if TYPE_CHECKING:
+    from psfdae.own_stars.bundle import Bundle
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """PSFs of n stars and what was measured on the way; every star has its row.
+
+    Attributes
+    ----------
+    psf : ndarray, shape (n, d, d), float32
+        Noise-free image of the star without sky, in the unit of the stamps: the PSF
+        times the flux. NaN where there is no usable flux (flag NO_FLUX).
+    residual : ndarray, shape (n, d, d), float32
+        Stamp − sky − `psf`; NaN in pixels that were not used.
+    uncertainty : ndarray, shape (n, d, d), float32
+        Half-width that holds 68.27 % of the errors of `psf` at this S/N, as found on
+        the test stars of the model.
+    flux, flux_error : ndarray, shape (n,), float64
+        Flux inside the stamp, in the unit of the stamps; the error is NaN where the
+        flux was given.
+    background, noise : ndarray, shape (n,), float64
+        Sky level and RMS of the sky noise in a pixel.
+    snr : ndarray, shape (n,), float64
+        flux / (noise √A), with the model's noise-equivalent area A.
+    chi2 : ndarray, shape (n,), float64
+        Mean of (residual / σ)² over the used pixels; σ² is noise² and, if the gain is
+        known, the star's own photon noise.
+    distance : ndarray, shape (n,), float64
+        Mahalanobis distance from the training set (`psfdae.own_stars.bundle.mahalanobis`).
+    fwhm_px, ellipticity, position_angle_deg : ndarray, shape (n,), float64
+        Of the PSF (`psfdae.own_stars.shapes`).
+    shift_x, shift_y : ndarray, shape (n,), int16
+        Pixels by which the stamp was moved along columns and rows to centre the star.
+    flags : ndarray, shape (n,), uint16
+        Sum of `psfdae.StarFlag`s.
+    """
+
+    psf: np.ndarray
+    residual: np.ndarray
+    uncertainty: np.ndarray
+    flux: np.ndarray
+    flux_error: np.ndarray
+    background: np.ndarray
+    noise: np.ndarray
+    snr: np.ndarray
+    chi2: np.ndarray
+    distance: np.ndarray
+    fwhm_px: np.ndarray
+    ellipticity: np.ndarray
+    position_angle_deg: np.ndarray
+    shift_x: np.ndarray
+    shift_y: np.ndarray
+    flags: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.psf)
+
+    def first(self, count: int) -> Self:
+        """The same of the first stars."""
+        return type(self)(*(getattr(self, f.name)[:count] for f in fields(self)))
+
+    @classmethod
+    def joined(cls, parts: Sequence[Self]) -> Self:
+        """One prediction of the stars of several."""
+        if len(parts) == 1:
+            return parts[0]
+        columns = (np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(cls))
+        return cls(*columns)
+
 
 CUBES: dict[str, tuple[str, str]] = {
     "psf": ("PSF", "PSF times flux, without sky"),
@@ -59,69 +127,46 @@ COLUMNS: dict[str, tuple[str, str | None, str]] = {
 }
 """FITS format, unit and meaning of the columns of STARS, besides `id`."""
 
-Card = tuple[str, Any, str]
+OF_STAMPS = ("id", "x", "y")
+"""Columns that the stamps bring along; the others are of the prediction."""
 
 
 class PredictionFile:
-    """A file that is open and as long as it will be; `writing` makes it.
+    """A file that is open and as long as it will be; `prediction_file` makes it."""
 
-    Parameters
-    ----------
-    file : binary file, empty
-    count : int
-        Number of stars.
-    stamp_px : int
-    id_type : dtype
-        Of the identifiers: int64 or a str of fixed length.
-    bundle : Bundle
-    cards : sequence of (key, value, comment)
-        Further provenance, into the primary header.
-    history : str
-    """
-
-    def __init__(
-        self,
-        file: IO[bytes],
-        count: int,
-        stamp_px: int,
-        id_type: np.dtype,
-        bundle: Bundle,
-        cards: Sequence[Card],
-        history: str,
-    ) -> None:
+    def __init__(self, file: IO[bytes], primary: Any, example: Stamps, count: int, side: int):
         self._file = file
-        self._row = _row_type(id_type)
-        file.write(_text(_primary_header(bundle, cards, history)))
+        width = max(example.id.dtype.itemsize // 4, 1)
+        id_is_text = example.id.dtype.kind == "U"
+        big_endian = {"D": ">f8", "I": ">i2", "J": ">i4"}
+        self._row = np.dtype(
+            [
+                ("id", f"S{width}" if id_is_text else ">i8"),
+                *((name, big_endian[f]) for name, (f, _, _) in COLUMNS.items()),
+            ]
+        )
         self._offset: dict[str, int] = {}
-        cube_bytes = 4 * count * stamp_px**2
+        file.write(_text(primary))
         for name, (extension, about) in CUBES.items():
-            file.write(_text(_cube_header(extension, about, count, stamp_px)))
-            self._skip(name, cube_bytes)
-        file.write(_text(_table_header(id_type, count)))
-        self._skip("stars", count * self._row.itemsize)
+            self._append(name, _cube_header(extension, about, count, side), 4 * count * side**2)
+        header = _table_header(f"{width}A" if id_is_text else "K", count)
+        self._append("stars", header, count * self._row.itemsize)
         file.truncate(file.tell())
 
-    def _skip(self, name: str, size: int) -> None:
-        """Remember where a data unit starts, and go to its end."""
+    def _append(self, name: str, header: Any, size: int) -> None:
+        """Write the header of a data unit, remember where it starts, and go to its end."""
+        self._file.write(_text(header))
         self._offset[name] = self._file.tell()
         self._file.seek(self._offset[name] + -(-size // BLOCK_BYTES) * BLOCK_BYTES)
 
-    def write(self, start: int, prediction: Prediction, columns: Mapping[str, np.ndarray]) -> None:
-        """Write the stars from number `start` on.
-
-        Parameters
-        ----------
-        start : int
-        prediction : Prediction
-        columns : mapping
-            `id`, `x` and `y`, shape (n,) each.
-        """
+    def write(self, start: int, stamps: Stamps, prediction: Prediction) -> None:
+        """Write the stars from number `start` on."""
         for name in CUBES:
             cube = getattr(prediction, name)
             self._put(name, start * cube[0].nbytes if len(cube) else 0, cube.astype(">f4"))
         rows = np.zeros(len(prediction), dtype=self._row)
         for name in self._row.names or ():
-            value = columns[name] if name in columns else getattr(prediction, name)
+            value = getattr(stamps if name in OF_STAMPS else prediction, name)
             rows[name] = _as_ascii(value) if value.dtype.kind == "U" else value
         self._put("stars", start * self._row.itemsize, rows)
 
@@ -131,25 +176,31 @@ class PredictionFile:
 
 
 @contextmanager
-def writing(path: Path, *arguments: Any) -> Iterator[PredictionFile]:
-    """A `PredictionFile` (`arguments` are its own) that gets its name if the block succeeds."""
+def prediction_file(
+    path: Path, bundle: Bundle, example: Stamps, count: int, cards: Sequence[Card], history: str
+) -> Iterator[PredictionFile]:
+    """A `PredictionFile` that gets its name if the block succeeds.
+
+    Parameters
+    ----------
+    path : Path
+    bundle : Bundle
+    example : Stamps
+        Some of the stars, for the type of their identifiers.
+    count : int
+        Number of stars.
+    cards : sequence of (key, value, comment)
+        Further provenance, into the primary header.
+    history : str
+    """
     with atomic_path(path) as temporary, temporary.open("wb") as file:
-        yield PredictionFile(file, *arguments)
+        primary = _primary_header(bundle, cards, history)
+        yield PredictionFile(file, primary, example, count, bundle.info.stamp_px)
 
 
 def _as_ascii(text: np.ndarray) -> np.ndarray:
     """FITS tables hold ASCII; other characters become question marks."""
     return np.array([name.encode("ascii", "replace") for name in text.tolist()], dtype=bytes)
-
-
-def _row_type(id_type: np.dtype) -> np.dtype:
-    """Big-endian layout of a row of STARS."""
-    formats: dict[str, str] = {"D": ">f8", "I": ">i2", "J": ">i4"}
-    width = max(id_type.itemsize // 4, 1)
-    identifier = f"S{width}" if id_type.kind == "U" else ">i8"
-    return np.dtype(
-        [("id", identifier), *((name, formats[f]) for name, (f, _, _) in COLUMNS.items())]
-    )
 
 
 def _primary_header(bundle: Bundle, cards: Sequence[Card], history: str) -> Any:
@@ -196,11 +247,10 @@ def _cube_header(name: str, about: str, count: int, stamp_px: int) -> Any:
     return header
 
 
-def _table_header(id_type: np.dtype, count: int) -> Any:
+def _table_header(id_format: str, count: int) -> Any:
     from astropy.io import fits
 
-    width = max(id_type.itemsize // 4, 1)
-    columns = [fits.Column("id", f"{width}A" if id_type.kind == "U" else "K")]
+    columns = [fits.Column("id", id_format)]
     columns += [fits.Column(name, f, unit) for name, (f, unit, _) in COLUMNS.items()]
     header = fits.BinTableHDU.from_columns(columns, nrows=0, name="STARS").header
     header["NAXIS2"] = count

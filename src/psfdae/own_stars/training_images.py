@@ -9,75 +9,20 @@ included; those stars are used as they are.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from psfdae.stars.calibration_stars import brightest_pixels
+from psfdae.files import Column
+from psfdae.own_stars.selection import BrightStars, brightest_pixels, moved
+from psfdae.own_stars.stamps import cut
 from psfdae.stars.fields import draw_jitter, draw_phase
 
-SHIFT_ORDER = 3
-"""Cubic splines: on a star with a FWHM of 3 px they err by an MSE of 1e-8."""
+if TYPE_CHECKING:
+    from psfdae.configuration.schema import Framing, Parts
 
 IMAGES_AT_A_TIME = 512
 """Images made before they are framed; bounds the memory."""
-
-
-@dataclass(frozen=True)
-class BrightStars:
-    """Stars that are good enough to learn from.
-
-    Attributes
-    ----------
-    wide : ndarray, shape (n, s, s)
-        Sky-subtracted stamps with a margin, counts.
-    peak : ndarray of int, shape (n, 2)
-        Brightest pixel (row, column) from index (s//2, s//2).
-    centre : ndarray, shape (n, 2)
-        Centroid (row, column) from index (s//2, s//2).
-    position : ndarray, shape (n, 2)
-        (x, y) in the image, NaN where unknown.
-    flux, noise, snr : ndarray, shape (n,)
-        Counts inside the stamp, RMS of the sky per pixel in counts, signal to noise.
-    row : ndarray of int, shape (n,)
-        Row of the catalogue.
-    """
-
-    wide: np.ndarray
-    peak: np.ndarray
-    centre: np.ndarray
-    position: np.ndarray
-    flux: np.ndarray
-    noise: np.ndarray
-    snr: np.ndarray
-    row: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.wide)
-
-    def of(self, chosen: np.ndarray) -> BrightStars:
-        """Some of the stars, by a mask or by indices."""
-        return BrightStars(*(getattr(self, field.name)[chosen] for field in fields(self)))
-
-
-@dataclass(frozen=True)
-class StarImages:
-    """Noise-free images for the product "stars", one row each.
-
-    Attributes
-    ----------
-    realisation, template : ndarray, shape (n, d, d), float32
-        The star; the stack of its part of the field at the same sub-pixel phase. Sum 1.
-    star : ndarray of int, shape (n,)
-        Which star it is.
-    jitter : ndarray of int, shape (n, 2)
-        Centring error (row, column) in pixels.
-    """
-
-    realisation: np.ndarray
-    template: np.ndarray
-    star: np.ndarray
-    jitter: np.ndarray
 
 
 def star_grid(position: np.ndarray) -> np.ndarray:
@@ -147,32 +92,6 @@ def bins_of(position: np.ndarray, bins: int) -> np.ndarray:
     return place[:, 0] + bins * place[:, 1]
 
 
-def moved(wide: np.ndarray, shift: np.ndarray) -> np.ndarray:
-    """Stamps (n, s, s) moved by (row, column) pixels, splines of `SHIFT_ORDER`."""
-    from scipy import ndimage
-
-    out = np.empty(wide.shape)
-    for image, step, target in zip(wide, shift, out, strict=True):
-        ndimage.shift(image, step, target, order=SHIFT_ORDER, mode="nearest")
-    return out
-
-
-def cut(wide: np.ndarray, offset: np.ndarray, stamp_px: int) -> np.ndarray:
-    """Stamps (n, d, d) whose index (d/2, d/2) is `offset` (row, column) from (s//2, s//2).
-
-    What would lie beyond the wide stamp repeats its edge.
-    """
-    side = wide.shape[-1]
-    pixels = side // 2 - stamp_px // 2 + np.arange(stamp_px)
-    rows, columns = (np.clip(offset[:, i, None] + pixels, 0, side - 1) for i in (0, 1))
-    return wide[np.arange(len(wide))[:, None, None], rows[:, :, None], columns[:, None, :]]
-
-
-def aligned_stars(stars: BrightStars) -> np.ndarray:
-    """Stars of flux 1, moved to a common centre, index (s//2, s//2); shape (n, s, s)."""
-    return moved(stars.wide, -stars.centre) / stars.flux[:, None, None]
-
-
 def stacks(aligned: np.ndarray, snr: np.ndarray, part: np.ndarray, parts: int) -> np.ndarray:
     """Mean star of every part of the field, weighted by signal to noise, (parts, s, s).
 
@@ -204,19 +123,17 @@ def templates_of(stars: BrightStars, held_out: np.ndarray, bins: int) -> np.ndar
     """
     part = bins_of(stars.position, bins)
     training = stars.of(~held_out)
-    stacked = stacks(aligned_stars(training), training.snr, part[~held_out], bins**2)
-    return stacked[part]
+    return stacks(training.aligned(), training.snr, part[~held_out], bins**2)[part]
 
 
 def make_images(
     stars: BrightStars,
     template: np.ndarray,
     star: np.ndarray,
-    stamp_px: int,
-    jitter_px: int,
+    framing: Framing,
     subpixel: np.ndarray,
     rng: np.random.Generator,
-) -> StarImages:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Frame stars as the network will see them, at new sub-pixel phases where asked for.
 
     Every star has its brightest pixel at (d/2, d/2), moved by a random jitter, and
@@ -229,19 +146,22 @@ def make_images(
         Centre at index (s//2, s//2).
     star : ndarray of int, shape (n,)
         Star of every image.
-    stamp_px, jitter_px : int
+    framing : Framing
+        Its `stamp_px` and `jitter_px` count.
     subpixel : ndarray of bool, shape (n,)
         Images of stars that are moved by up to ± ½ pixel; the others are not interpolated.
     rng : Generator
+
+    Returns
+    -------
+    realisation, template : ndarray, shape (n, d, d), float32
+    jitter : ndarray of int, shape (n, 2)
+        Centring error (row, column) in pixels.
     """
+    side = framing.stamp_px
     phase = np.where(subpixel[:, None], draw_phase(star.size, rng), 0.0)
-    jitter = draw_jitter(star.size, jitter_px, rng)
-    out = StarImages(
-        np.empty((star.size, stamp_px, stamp_px), np.float32),
-        np.empty((star.size, stamp_px, stamp_px), np.float32),
-        star,
-        jitter,
-    )
+    jitter = draw_jitter(star.size, framing.jitter_px, rng)
+    realisations, templates = np.empty((2, star.size, side, side), np.float32)
     reach = int(np.abs(stars.peak).max()) + 1
     for start in range(0, star.size, IMAGES_AT_A_TIME):
         rows = slice(start, start + IMAGES_AT_A_TIME)
@@ -249,7 +169,47 @@ def make_images(
         wide[subpixel[rows]] = moved(wide[subpixel[rows]], phase[rows][subpixel[rows]])
         offset = brightest_pixels(wide, reach)[0] - jitter[rows]
         placed = moved(template[who], stars.centre[who] + phase[rows])
-        for source, target in ((wide, out.realisation), (placed, out.template)):
-            stamp = cut(source, offset, stamp_px)
+        for source, target in ((wide, realisations), (placed, templates)):
+            stamp = cut(source, side, offset)
             target[rows] = stamp / stamp.sum(axis=(1, 2), keepdims=True)
-    return out
+    return realisations, templates, jitter
+
+
+def training_columns(
+    bright: BrightStars,
+    grid: np.ndarray,
+    held_out: np.ndarray,
+    bins: int,
+    framing: Framing,
+    parts: Parts,
+    rng: np.random.Generator,
+) -> dict[str, Column]:
+    """Columns of the product "stars": images of bright stars, and what is known of these.
+
+    Parameters
+    ----------
+    bright : BrightStars
+    grid : ndarray, shape (n, 2)
+        Place of every star (`star_grid`).
+    held_out : ndarray of bool, shape (n,)
+    bins : int
+        Parts of the field along a side; stars of a part are stacked.
+    framing : Framing
+    parts : Parts
+    rng : Generator
+    """
+    star = star_of_images(held_out, parts.train_stars, parts.test_stars)
+    template = templates_of(bright, held_out, bins)
+    subpixel = ~held_out[star] & framing.subpixel
+    images, templates, jitter = make_images(bright, template, star, framing, subpixel, rng)
+    return {
+        "template": Column(templates, "1", "stack of the star's part of the field, sum 1"),
+        "realisation": Column(images, "1", "the star itself, sum 1"),
+        "field_index": Column(star, "1", "star that the image shows"),
+        "grid": Column(grid, "1", "place (ix, iy) of every star in the order of x and y"),
+        "jitter": Column(jitter, "pixel", "centring error (row, column)"),
+        "position": Column(bright.position, "pixel", "(x, y) of every star, 0-based"),
+        "snr": Column(bright.snr, "1", "signal to noise of every star"),
+        "noise": Column(bright.noise / bright.flux, "1", "pixel RMS over flux of every star"),
+        "row": Column(bright.row, "1", "row of every star in the catalogue"),
+    }

@@ -1,4 +1,4 @@
-"""The one error of this package, and how errors of the libraries become it."""
+"""The one error of files that observers bring, and their texts made fit to be shown."""
 
 from __future__ import annotations
 
@@ -10,10 +10,34 @@ from pathlib import Path
 
 import numpy as np
 
-from psfdae.safe_text import one_line
-
 LONGEST = 160
 """Characters of a library's message that are passed on."""
+
+FORMULA = ("=", "+", "-", "@", "\t", "\r")
+"""First characters of what a spreadsheet takes for a formula and executes."""
+
+
+def one_line(text: object) -> str:
+    """The text without line breaks and characters that do not print."""
+    words = " ".join(str(text).split())
+    return "".join(c if c.isprintable() else "?" for c in words)
+
+
+def no_formula(text: str) -> str:
+    """The text, with an apostrophe before it if a spreadsheet would execute it; numbers stay."""
+    if not text.startswith(FORMULA):
+        return text
+    try:
+        float(text)
+    except ValueError:
+        return "'" + text
+    return text
+
+
+def shorten(names: list[str], most: int = 20) -> str:
+    """A list of names for a message, cut after `most`."""
+    more = f", … ({len(names)} in all)" if len(names) > most else ""
+    return ", ".join(name[:40] for name in names[:most]) + more if names else "none"
 
 
 class ObservationError(ValueError):
@@ -33,11 +57,6 @@ def reading(path: str | Path) -> Iterator[None]:
 
     Only such calls belong inside. On damaged files astropy raises a dozen kinds of
     errors (struct, index, key, assertion, zlib, …) that no list would complete.
-
-    Raises
-    ------
-    ObservationError
-        Instead of any other error.
     """
     from astropy import log
 
@@ -62,11 +81,3 @@ def reading(path: str | Path) -> Iterator[None]:
             raise ObservationError(path, f"damaged or of a wrong format ({what})") from error
         finally:
             log.setLevel(level)
-
-
-def shorten(names: list[str], most: int = 20) -> str:
-    """A list of names for a message, cut after `most`."""
-    if not names:
-        return "none"
-    more = f", … ({len(names)} in all)" if len(names) > most else ""
-    return ", ".join(name[:40] for name in names[:most]) + more

@@ -1,26 +1,35 @@
-"""Star catalogues: FITS tables (also FITS_LDAC), CSV and other text tables, ECSV, SExtractor."""
+"""Star catalogues: FITS tables (also FITS_LDAC), CSV and other text tables, ECSV, SExtractor.
+
+Names of columns are found whatever their case. The origin is the index of the centre of
+the first pixel:
+
+| program | origin | columns, best first |
+|---|---|---|
+| SExtractor and the like | 1 | XWIN_IMAGE, XPSF_IMAGE, XMODEL_IMAGE, X_IMAGE, XPEAK_IMAGE |
+| photutils | 0 | x_fit, x_centroid, xcentroid, xcenter |
+| any | must be stated | x, xpos, x_pos, xpix, x_pix, x_pixel |
+| SExtractor, sky | degrees | ALPHAWIN_J2000, ALPHAPSF_J2000, ALPHA_J2000, …_SKY |
+| any, sky | degrees, or sexagesimal text | ra, raj2000, _raj2000, ra_icrs, ra_deg, ramean, radeg |
+
+Plain x, y are written with either origin (IRAF and DS9 count from 1, numpy and sep
+from 0); a wrong guess would shift every star by a pixel, so there is none. Pixel
+columns go before sky columns. Columns of different programs in one catalogue are
+not guessed between, either.
+"""
 
 from __future__ import annotations
 
 import csv
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from psfdae.observations.columns import (
-    ID_COLUMNS,
-    ColumnError,
-    Pair,
-    PositionColumns,
-    accepted,
-    choose_positions,
-    resolve,
-)
-from psfdae.observations.errors import ObservationError, reading, shorten
-from psfdae.observations.unpacking import UNPACK, PlainFile, open_hdus, plain_file
+from psfdae.own_stars.errors import ObservationError, reading, shorten
+from psfdae.own_stars.images import UNPACK, PlainFile, open_hdus, plain_file
 
 SEXTRACTOR_HEADER = re.compile(r"#\s*(\d+)\s+[A-Za-z_]\w*")
 SEXAGESIMAL = re.compile(r"[:hd\s]", re.IGNORECASE)
@@ -47,6 +56,107 @@ LONGEST_IDENTIFIER = 200
 
 ROWS = 10_000
 """Rows of a text table that are measured at a time."""
+
+
+@dataclass(frozen=True)
+class Convention:
+    """Position columns of one program: `pairs` from best to worst."""
+
+    pairs: tuple[tuple[str, str], ...]
+    sky: bool
+    origin: int | None = None
+
+
+def _pairs(names: str) -> tuple[tuple[str, str], ...]:
+    words = names.split()
+    return tuple(zip(words[::2], words[1::2], strict=True))
+
+
+CONVENTIONS = (
+    Convention(
+        _pairs(
+            "XWIN_IMAGE YWIN_IMAGE XPSF_IMAGE YPSF_IMAGE XMODEL_IMAGE YMODEL_IMAGE "
+            "X_IMAGE Y_IMAGE XPEAK_IMAGE YPEAK_IMAGE"
+        ),
+        sky=False,
+        origin=1,
+    ),
+    Convention(
+        _pairs("x_fit y_fit x_centroid y_centroid xcentroid ycentroid xcenter ycenter"),
+        sky=False,
+        origin=0,
+    ),
+    *(
+        Convention((pair,), sky=False)
+        for pair in _pairs("x y xpos ypos x_pos y_pos xpix ypix x_pix y_pix x_pixel y_pixel")
+    ),
+    Convention(
+        _pairs(
+            "ALPHAWIN_J2000 DELTAWIN_J2000 ALPHAPSF_J2000 DELTAPSF_J2000 ALPHA_J2000 DELTA_J2000 "
+            "ALPHAWIN_SKY DELTAWIN_SKY ALPHA_SKY DELTA_SKY"
+        ),
+        sky=True,
+    ),
+    *(
+        Convention((pair,), sky=True)
+        for pair in _pairs(
+            "ra dec RAJ2000 DEJ2000 RAJ2000 DECJ2000 _RAJ2000 _DEJ2000 RA_ICRS DE_ICRS "
+            "RA_ICRS DEC_ICRS ra_deg dec_deg raMean decMean radeg decdeg radeg dedeg"
+        )
+    ),
+)
+
+ID_COLUMNS = (
+    "id",
+    "source_id",
+    "number",
+    "star_id",
+    "objid",
+    "obj_id",
+    "object_id",
+    "label",
+    "name",
+)
+"""Columns that identify a star; the first of these that a catalogue has is used."""
+
+
+class ColumnError(ValueError):
+    """The position columns of a catalogue are missing or not the only ones."""
+
+
+@dataclass(frozen=True)
+class Positions:
+    """Which two columns hold the positions and how to read them."""
+
+    first: str
+    second: str
+    sky: bool
+    origin: int | None
+
+
+def choose_positions(names: Sequence[str]) -> Positions:
+    """Find the position columns among the names of a catalogue, or raise ColumnError."""
+    found = []
+    for convention in CONVENTIONS:
+        for pair in convention.pairs:
+            first, second = (_in_any_case(names, name) for name in pair)
+            if first is not None and second is not None:
+                found.append(Positions(first, second, convention.sky, convention.origin))
+                break
+    found = [where for where in found if not where.sky] or found
+    if not found:
+        raise ColumnError("no position columns")
+    if len(found) > 1:
+        pairs = " or ".join(f"{where.first},{where.second}" for where in found)
+        raise ColumnError(f"ambiguous position columns {pairs}; keep one pair")
+    return found[0]
+
+
+def _in_any_case(names: Sequence[str], wanted: str) -> str | None:
+    same = [name for name in names if name.strip().lower() == wanted.lower()]
+    if len(same) > 1:
+        raise ColumnError(f"columns {' and '.join(same)} differ in their case only; keep one")
+    return same[0] if same else None
 
 
 @dataclass(frozen=True)
@@ -123,17 +233,17 @@ class Catalogue:
             )
         return numbers
 
-    def position_columns(self, columns: Pair | None) -> PositionColumns:
-        """The columns with the positions, chosen as `psfdae.observations.columns` says."""
+    def positions(self) -> Positions:
+        """The columns with the positions, or an error that lists what would be accepted."""
         try:
-            return choose_positions(self.table.colnames, columns)
+            return choose_positions(self.table.colnames)
         except ColumnError as error:
+            accepted = " ".join(f"{a},{b}" for c in CONVENTIONS for a, b in c.pairs)
             raise ObservationError(
-                self.path,
-                f"{error}; found {shorten(self.table.colnames)}; accepted {accepted()}",
+                self.path, f"{error}; found {shorten(self.table.colnames)}; accepted {accepted}"
             ) from None
 
-    def sky(self, where: PositionColumns) -> tuple[np.ndarray, np.ndarray]:
+    def sky(self, where: Positions) -> tuple[np.ndarray, np.ndarray]:
         """Right ascension and declination in degrees, each shape (n,).
 
         Columns without unit are in degrees; text with colons, blanks or letters is
@@ -154,17 +264,15 @@ class Catalogue:
         """One identifier per star, int64 or str, shape (n,); row numbers from 0 without any."""
         for alias in ID_COLUMNS:
             try:
-                name = resolve(self.table.colnames, alias)
+                name = self._resolve(alias)
             except ColumnError:
                 continue
-            if name is None:
-                continue
-            column = self._column(name)
-            if column.ndim == 1:
-                return self._short(name, _as_identifiers(column))
-        return np.arange(len(self), dtype=np.int64)
-
-    def _short(self, name: str, found: np.ndarray) -> np.ndarray:
+            column = None if name is None else self._column(name)
+            if column is not None and column.ndim == 1:
+                found = _as_identifiers(column)
+                break
+        else:
+            return np.arange(len(self), dtype=np.int64)
         if found.dtype.kind == "U" and found.dtype.itemsize > 4 * LONGEST_IDENTIFIER:
             lengths = np.char.str_len(found)
             row = lengths.argmax()
@@ -175,9 +283,14 @@ class Catalogue:
             )
         return found
 
+    def _resolve(self, wanted: str) -> str | None:
+        """The one column of that name, case aside if it is not written exactly so."""
+        names = self.table.colnames
+        return wanted if wanted in names else _in_any_case(names, wanted)
+
     def _column(self, name: str) -> Any:
         try:
-            found = resolve(self.table.colnames, name)
+            found = self._resolve(name)
         except ColumnError as error:
             raise ObservationError(self.path, str(error)) from None
         if found is None:
@@ -205,6 +318,7 @@ class Catalogue:
         return numbers
 
     def _angles(self, name: str, sexagesimal_unit: str) -> np.ndarray:
+        from astropy import units
         from astropy.coordinates import Angle
 
         column = self._column(name)
@@ -219,20 +333,36 @@ class Catalogue:
         unit = getattr(column, "unit", None)
         if unit is None or is_text:
             return numbers
-        return numbers * self._degrees(name, unit)
-
-    def _degrees(self, name: str, unit: Any) -> float:
-        from astropy import units
-
         try:
-            return float(units.Unit(unit).to("deg"))
+            return numbers * float(units.Unit(unit).to("deg"))
         except (units.UnitConversionError, TypeError, ValueError):
             raise ObservationError(
                 self.path, f"column {name!r} has the unit {str(unit)!r}, expected an angle"
             ) from None
 
 
-def read_catalogue(path: str | Path) -> Catalogue:
+def _text(value: Any) -> str:
+    return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
+
+
+def _as_identifiers(column: Any) -> np.ndarray:
+    values, missing = np.ma.getdata(column), np.ma.getmaskarray(column)
+    if values.dtype.kind in "iuf" and not missing.any():
+        with np.errstate(all="ignore"):
+            whole = values.astype(np.int64)
+        # Unsigned ones beyond the largest signed one come back negative.
+        if (whole.astype(values.dtype) == values).all() and ((whole < 0) == (values < 0)).all():
+            return whole
+    texts = [
+        "" if gone else _text(v).strip() for v, gone in zip(values.tolist(), missing, strict=True)
+    ]
+    return np.array(texts, dtype=str)
+
+
+# Reading.
+
+
+def read_catalogue(path: Path) -> Catalogue:
     """Read a star catalogue.
 
     The format is told from the content: a FITS file, of which the LDAC_OBJECTS or
@@ -245,7 +375,6 @@ def read_catalogue(path: str | Path) -> Catalogue:
     ObservationError
         If the file is none of these, damaged, or has no rows.
     """
-    path = Path(path)
     with reading(path), path.open("rb") as file:
         start = file.read(16)
         fits = start.startswith((b"SIMPLE  =", *UNPACK))
@@ -307,20 +436,18 @@ def _text_table(path: Path, lines: list[str]) -> Any:
     """Table of the lines, which are gone then: they take twice the memory of the file."""
     from astropy.io import ascii as text_tables
 
+    rows = _without_comments(lines)
     if lines[0].startswith("# %ECSV"):
         kind: dict[str, Any] = {"format": "ecsv"}
-        rows = _without_comments(lines)
         if sum(map(len, lines)) - sum(map(len, rows)) > LARGEST_ECSV_HEADER:
             raise ObservationError(
                 path, f"an ECSV header of more than {LARGEST_ECSV_HEADER} characters"
             )
     elif SEXTRACTOR_HEADER.match(lines[0]):
         kind = {"format": "sextractor"}
-        rows = _without_comments(lines)
         numbered = filter(None, map(SEXTRACTOR_HEADER.match, lines))
         _check_size(path, 0, max(int(found[1][:9]) for found in numbered))
     else:
-        rows = _without_comments(lines)
         lines[:] = rows
         kind = {"format": "basic", "delimiter": _delimiter(rows)}
     if not rows:
@@ -378,24 +505,3 @@ def _without_comments(lines: list[str]) -> list[str]:
     if before and not any(c.isalpha() for c in table[0].replace("e", "").replace("E", "")):
         return [before[-1].lstrip("# \t"), *table]
     return table
-
-
-def _text(value: Any) -> str:
-    return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
-
-
-def _as_identifiers(column: Any) -> np.ndarray:
-    values, missing = np.ma.getdata(column), np.ma.getmaskarray(column)
-    if values.dtype.kind in "iu" and not missing.any():
-        within = values.dtype.kind == "i" or values.max() <= np.iinfo(np.int64).max
-        if within:
-            return values.astype(np.int64)
-    if values.dtype.kind == "f" and not missing.any():
-        with np.errstate(all="ignore"):
-            whole = values.astype(np.int64)
-        if np.array_equal(whole.astype(values.dtype), values):
-            return whole
-    texts = [
-        "" if gone else _text(v).strip() for v, gone in zip(values.tolist(), missing, strict=True)
-    ]
-    return np.array(texts, dtype=str)

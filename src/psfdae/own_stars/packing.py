@@ -9,13 +9,13 @@ bundle carries both.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from psfdae.bundle.statistics import at_noise, mahalanobis
-from psfdae.stars.flux import FluxModel
+from psfdae.own_stars.bundle import at_noise, mahalanobis
+from psfdae.own_stars.photometry import FluxModel
 from psfdae.stars.noise import NoiseModel
 
 NODES = 8
@@ -39,22 +39,11 @@ Predict = Callable[[np.ndarray], np.ndarray]
 
 @dataclass(frozen=True)
 class HeldOutStars:
-    """Noise-free stars that no training has seen.
-
-    Attributes
-    ----------
-    images, references : ndarray, shape (n, d, d)
-        Of flux 1.
-    noise : NoiseModel
-    """
+    """Noise-free stars of flux 1 that no training has seen, (n, d, d), and their noise."""
 
     images: np.ndarray
     references: np.ndarray
     noise: NoiseModel
-
-    def draws(self) -> np.ndarray:
-        """Star of every noisy image at a node."""
-        return np.tile(np.arange(len(self.images)), -(-LEAST_STARS // len(self.images)))
 
 
 @dataclass(frozen=True)
@@ -101,9 +90,10 @@ class Errors:
         return float(np.quantile(self.distance, LIMIT))
 
 
-def noise_nodes(lowest: float, highest: float, nodes: int = NODES) -> np.ndarray:
+def noise_nodes(band: np.ndarray) -> np.ndarray:
     """Noise at which errors are measured, ascending; a single one if there is no range."""
-    return np.geomspace(lowest, highest, nodes) if highest > lowest else np.array([lowest])
+    lowest, highest = float(band.min()), float(band.max())
+    return np.geomspace(lowest, highest, NODES) if highest > lowest else np.array([lowest])
 
 
 def leading(model: FluxModel, components: int) -> FluxModel:
@@ -125,6 +115,19 @@ def signal_to_noise(noise: float, area: float) -> float:
     return float(1.0 / (noise * np.sqrt(area)))
 
 
+def reach(band: np.ndarray, mean: np.ndarray) -> dict[str, float]:
+    """Range of noise and S/N of a training, from its noise levels σ and its mean PSF."""
+    area = noise_equivalent_px(mean)
+    least, most = float(band.min()), float(band.max())
+    return {
+        "noise_min": least,
+        "noise_max": most,
+        "snr_min": signal_to_noise(most, area),
+        "snr_max": signal_to_noise(least, area),
+        "noise_equivalent_px": area,
+    }
+
+
 def measure_errors(
     stars: HeldOutStars,
     predict: Predict,
@@ -144,7 +147,8 @@ def measure_errors(
         Noise: pixel RMS over the flux.
     rng : Generator
     """
-    star = stars.draws()
+    count = len(stars.images)
+    star = np.tile(np.arange(count), -(-LEAST_STARS // count))
     error = np.empty((len(nodes), star.size, *stars.images.shape[1:]), np.float32)
     distance = np.empty((len(nodes), star.size))
     for place, level in enumerate(nodes):
@@ -152,6 +156,52 @@ def measure_errors(
         error[place] = predict(noisy) - stars.references[star]
         distance[place] = mahalanobis(noisy, np.full(star.size, level), model, COMPONENTS)
     return Errors(nodes, error, star, distance)
+
+
+def measure_levels(
+    levels: Sequence[float],
+    stars: HeldOutStars,
+    draw: Callable[[float], np.ndarray],
+    predict: Predict,
+    errors: Errors,
+    area: float,
+    data_range: float,
+) -> list[dict[str, float]]:
+    """Mean errors of the test stars at noise levels λ.
+
+    Parameters
+    ----------
+    levels : sequence of float
+        λ; the pixel RMS over the flux is κλ.
+    stars : HeldOutStars
+    draw : noisy images of all test stars at a λ
+    predict : the network
+    errors : Errors
+        At the nodes, of which the coverage is told.
+    area : float
+        Noise-equivalent area in pixels.
+    data_range : float
+        As in `psfdae.evaluation.metrics.all_metrics`.
+    """
+    from psfdae.evaluation.metrics import all_metrics
+
+    rows = []
+    for level in levels:
+        noisy, noise = draw(level), stars.noise.kappa * level
+        estimate = predict(noisy)
+        quality = all_metrics(estimate, stars.references, data_range)
+        rows.append(
+            {
+                "noise_level": level,
+                "noise": noise,
+                "snr": signal_to_noise(noise, area),
+                "mse_noisy": float(np.square(noisy - stars.references).mean()),
+                **{name: float(values.mean()) for name, values in quality.items()},
+                **crossed_coverage(errors, estimate - stars.references, noise),
+                "stars": len(noisy),
+            }
+        )
+    return rows
 
 
 def coverage(error: np.ndarray, noise: np.ndarray, nodes: np.ndarray, maps: np.ndarray) -> float:

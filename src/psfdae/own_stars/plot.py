@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from psfdae.evaluation.figure_style import WIDTH_IN, new_figure, styled
-from psfdae.prediction.flags import StarFlag
+from psfdae.own_stars.stamps import StarFlag
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -34,15 +35,7 @@ SPOILT = (
 
 @dataclass(frozen=True)
 class FieldStars:
-    """Stars of a prediction as the map needs them, shape (n,) each.
-
-    Attributes
-    ----------
-    x, y : ndarray
-        Position in the image, pixels.
-    snr, fwhm_px, ellipticity, position_angle_deg, flags : ndarray
-        As in `psfdae.prediction.Prediction`.
-    """
+    """Stars of a prediction as the map needs them: columns of its file, shape (n,) each."""
 
     x: np.ndarray
     y: np.ndarray
@@ -58,40 +51,50 @@ class FieldStars:
         good = np.flatnonzero(finite & ((self.flags & int(SPOILT)) == 0))
         return good[np.argsort(-self.snr[good], kind="stable")]
 
+    def cell(self) -> float:
+        """Least distance of two stamps in pixels of the image."""
+        drawn = self.drawable()
+        extent = max((np.ptp(axis[drawn]) for axis in (self.x, self.y) if drawn.size), default=0.0)
+        return float(extent) / (CELLS - 1) if extent > 0 else 1.0
 
-def cell_size(stars: FieldStars) -> float:
-    """Least distance of two stamps in pixels of the image."""
-    drawn = stars.drawable()
-    extent = max((np.ptp(axis[drawn]) for axis in (stars.x, stars.y) if drawn.size), default=0.0)
-    return float(extent) / (CELLS - 1) if extent > 0 else 1.0
+    def chosen(self) -> np.ndarray:
+        """Bright stars far enough from each other for their stamps not to overlap, indices."""
+        left, side, chosen = self.drawable(), self.cell(), []
+        while left.size:
+            chosen.append(left[0])
+            apart = np.maximum(*(np.abs(axis[left] - axis[left[0]]) for axis in (self.x, self.y)))
+            left = left[apart >= side]
+        return np.array(chosen, dtype=int)
 
 
-def chosen_stars(stars: FieldStars) -> np.ndarray:
-    """Bright stars far enough from each other for their stamps not to overlap, indices."""
-    left, side, chosen = stars.drawable(), cell_size(stars), []
-    while left.size:
-        chosen.append(left[0])
-        apart = np.maximum(*(np.abs(axis[left] - axis[left[0]]) for axis in (stars.x, stars.y)))
-        left = left[apart >= side]
-    return np.array(chosen, dtype=int)
+def map_of_file(predicted: Path) -> Figure:
+    """The map of the PSFs in a FITS file of a prediction."""
+    from astropy.io import fits
+
+    with fits.open(predicted, memmap=True) as file:
+        table: Any = file["STARS"].data
+        columns = (table[name] for name in FieldStars.__dataclass_fields__)
+        # Copies in the machine's byte order.
+        stars = FieldStars(*(values.astype(values.dtype.newbyteorder("=")) for values in columns))
+        sections = [file["PSF"].section[int(star)] for star in stars.chosen()]
+        title = f"{file[0].header['INFILE']}: {len(stars.drawable())} of {len(stars.x)} stars"
+    return psf_map(np.array(sections, dtype=np.float32), stars, title)
 
 
 @styled
-def psf_map(psf: np.ndarray, chosen: np.ndarray, stars: FieldStars, title: str) -> Figure:
+def psf_map(psf: np.ndarray, stars: FieldStars, title: str) -> Figure:
     """Stamps at their positions, and a whisker for every star.
 
     Parameters
     ----------
     psf : ndarray, shape (k, d, d)
-        PSFs of the stars `chosen`.
-    chosen : ndarray of int, shape (k,)
-        Result of `chosen_stars`.
+        PSFs of the stars that `stars.chosen` names.
     stars : FieldStars
     title : str
     """
-    drawn = stars.drawable()
-    margin = 0.6 * cell_size(stars)
+    drawn, chosen, cell = stars.drawable(), stars.chosen(), stars.cell()
     x, y = stars.x[drawn], stars.y[drawn]
+    margin = 0.6 * cell
     box = (
         (x.min() - margin, x.max() + margin, y.min() - margin, y.max() + margin)
         if drawn.size
@@ -100,22 +103,9 @@ def psf_map(psf: np.ndarray, chosen: np.ndarray, stars: FieldStars, title: str) 
     shape = np.clip((box[3] - box[2]) / (box[1] - box[0]), 0.3, 2.0)
     figure = new_figure(0.46 * WIDTH_IN * shape + 1.5, layout="constrained")
     left, right = figure.subplots(1, 2, sharex=True, sharey=True)
-    _stamps(left, psf, stars.x[chosen], stars.y[chosen], cell_size(stars))
-    shown = _whiskers(right, stars, drawn[:WHISKERS], cell_size(stars))
-    for axes, name in ((left, "PSF, each to its maximum"), (right, "ellipticity and FWHM")):
-        axes.set(xlim=box[:2], ylim=box[2:], aspect="equal", xlabel="x (px)", title=name)
-    left.set_ylabel("y (px)")
-    if shown is not None:
-        bar = figure.colorbar(shown, ax=[left, right], location="bottom", shrink=0.6, aspect=40)
-        bar.set_label("FWHM of the PSF (px)")
-    figure.suptitle(title, parse_math=False)
-    return figure
-
-
-def _stamps(axes: Axes, psf: np.ndarray, x: np.ndarray, y: np.ndarray, cell: float) -> None:
     half = 0.46 * cell
-    for stamp, x0, y0 in zip(psf, x, y, strict=True):
-        axes.imshow(
+    for stamp, x0, y0 in zip(psf, stars.x[chosen], stars.y[chosen], strict=True):
+        left.imshow(
             np.sqrt(np.clip(stamp / stamp.max(), 0.0, 1.0)),
             origin="lower",
             extent=(x0 - half, x0 + half, y0 - half, y0 + half),
@@ -124,6 +114,15 @@ def _stamps(axes: Axes, psf: np.ndarray, x: np.ndarray, y: np.ndarray, cell: flo
             vmax=1.0,
             interpolation="nearest",
         )
+    shown = _whiskers(right, stars, drawn[:WHISKERS], cell)
+    for axes, name in ((left, "PSF, each to its maximum"), (right, "ellipticity and FWHM")):
+        axes.set(xlim=box[:2], ylim=box[2:], aspect="equal", xlabel="x (px)", title=name)
+    left.set_ylabel("y (px)")
+    if shown is not None:
+        bar = figure.colorbar(shown, ax=[left, right], location="bottom", shrink=0.6, aspect=40)
+        bar.set_label("FWHM of the PSF (px)")
+    figure.suptitle(title, parse_math=False)
+    return figure
 
 
 def _whiskers(axes: Axes, stars: FieldStars, drawn: np.ndarray, cell: float) -> Any:

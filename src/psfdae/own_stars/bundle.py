@@ -31,8 +31,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 import psfdae
 from psfdae.files import atomic_path
 from psfdae.models.weights import digest_of
-from psfdae.safe_text import one_line
-from psfdae.stars.flux import FluxModel
+from psfdae.own_stars.errors import one_line
+from psfdae.own_stars.photometry import FluxModel
 
 if TYPE_CHECKING:
     from psfdae.models.dae import Dae
@@ -99,10 +99,8 @@ class Architecture(_Described):
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Shape of every weight by its name in the network."""
         named: dict[str, tuple[int, ...]] = {}
-        channels = (1, *self.widths, 1)
-        for layer, ((inner, outer), kernel) in enumerate(
-            zip(pairwise(channels), self.kernels, strict=True)
-        ):
+        channels = pairwise((1, *self.widths, 1))
+        for layer, ((inner, outer), kernel) in enumerate(zip(channels, self.kernels, strict=True)):
             named[f"layers.{layer}.weight"] = (outer, inner, kernel, kernel)
             named[f"layers.{layer}.bias"] = (outer,)
         return named
@@ -156,8 +154,8 @@ class Bundle:
     weights : dict of ndarray, float32
         State of `psfdae.models.dae.Dae`.
     flux_model : FluxModel
-        Of the noise-free training stars; eigenvalues ascending, the last
-        `info.components` are those that were measured.
+        Of the noise-free training stars; the last `info.components` eigenvectors
+        are those that were measured.
     noise_nodes : ndarray, shape (S,)
         Noise at which the errors were measured, ascending.
     error68 : ndarray, shape (S, d, d)
@@ -165,7 +163,7 @@ class Bundle:
     rms : ndarray, shape (S, d, d)
         Root mean square of the PSF's errors, in units of the flux.
     distance_limit : float
-        99.9 % quantile of the Mahalanobis distance of test stars (`distance`).
+        99.9 % quantile of the Mahalanobis distance of test stars (`mahalanobis`).
     """
 
     info: BundleInfo
@@ -193,14 +191,69 @@ def network(bundle: Bundle) -> Dae:
     return model.to(memory_format=torch.channels_last).eval()
 
 
-def creation_date() -> str:
-    """Today in UTC as ISO 8601; SOURCE_DATE_EPOCH (seconds) makes it reproducible.
+def at_noise(noise: np.ndarray, nodes: np.ndarray, maps: np.ndarray) -> np.ndarray:
+    """Maps of errors at the noise of each star, interpolated linearly in the noise.
 
-    Raises
-    ------
-    BundleError
-        If SOURCE_DATE_EPOCH is not a whole number of seconds.
+    Linear in the noise and not in its logarithm: an error is a floor plus something
+    that grows about as fast as the noise. Outside the nodes the nearest one counts.
+
+    Parameters
+    ----------
+    noise : ndarray, shape (n,)
+        RMS of the sky noise in a pixel over the flux, such as `BundleInfo.noise_min`.
+    nodes : ndarray, shape (S,)
+        Noise at which the maps were measured, ascending.
+    maps : ndarray, shape (S, d, d)
+        `Bundle.error68` or `Bundle.rms`.
+
+    Returns
+    -------
+    ndarray, shape (n, d, d)
+        In the unit of the maps; NaN where the noise is NaN.
     """
+    noise = np.asarray(noise, dtype=np.float64)
+    place = np.interp(noise, nodes, np.arange(len(nodes), dtype=np.float64))
+    lower = np.where(np.isfinite(place), np.minimum(place, len(nodes) - 1), 0).astype(np.intp)
+    upper = np.minimum(lower + 1, len(nodes) - 1)
+    share = (place - lower).astype(maps.dtype)[:, None, None]
+    return maps[lower] * (1 - share) + maps[upper] * share
+
+
+def mahalanobis(
+    stamps: np.ndarray, noise: np.ndarray, model: FluxModel, components: int
+) -> np.ndarray:
+    """Distance of stars from the training set, in the space of its leading eigenvectors.
+
+    D² = Σ_k (e_kᵀ(x − m))² / (Λ_k + noise²) over the eigenvectors e_k with the largest
+    eigenvalues Λ_k: the distance of Mahalanobis (1936) with the noise of the star as
+    part of the covariance. Faint stars are unlike the mean by their noise, which says
+    nothing; D² of either kind of star is about `components`.
+
+    Parameters
+    ----------
+    stamps : ndarray, shape (n, d, d)
+        Sky-subtracted, repaired, of flux 1, framed as the training stars.
+    noise : ndarray, shape (n,)
+        RMS of the sky noise in a pixel over the flux.
+    model : FluxModel
+    components : int
+        Eigenvectors that count, `BundleInfo.components`.
+
+    Returns
+    -------
+    ndarray, shape (n,), float64
+    """
+    centred = stamps.reshape(len(stamps), -1) - model.mean
+    scores = centred @ model.basis[:, -components:]
+    variance = model.variance[-components:] + np.asarray(noise, dtype=np.float64)[:, None] ** 2
+    return np.sqrt((scores**2 / variance).sum(axis=1))
+
+
+# Writing.
+
+
+def creation_date() -> str:
+    """Today in UTC as ISO 8601; SOURCE_DATE_EPOCH (seconds) makes it reproducible."""
     epoch = os.environ.get("SOURCE_DATE_EPOCH")
     try:
         moment = datetime.now(UTC) if epoch is None else datetime.fromtimestamp(int(epoch), UTC)
@@ -217,20 +270,61 @@ def write_bundle(bundle: Bundle, path: Path) -> None:
     BundleError
         If its arrays do not fit together.
     """
+    tensors = _tensors(bundle)
+    _check(bundle.info, tensors, path)
+    content = packed(bundle.info.model_dump(mode="json"), tensors)
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(content)
+
+
+def packed(described: Mapping[str, Any], tensors: Mapping[str, np.ndarray]) -> bytes:
+    """Bytes of a bundle file, signed but not checked."""
     from safetensors.numpy import save
 
-    tensors = _tensors(bundle)
-    _check(bundle.info, tensors, Path(path))
-    described = bundle.info.model_dump(mode="json")
     text = {
         "kind": KIND,
-        "format_version": bundle.info.format_version,
+        "format_version": FORMAT_VERSION,
         "sha256": _digest(described, tensors),
         "info": described,
     }
     # A single key: safetensors writes several in an order that changes from run to run.
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(save(tensors, {"bundle": json.dumps(text, sort_keys=True)}))
+    return save(dict(tensors), {"bundle": json.dumps(text, sort_keys=True)})
+
+
+def _digest(described: Mapping[str, Any], tensors: Mapping[str, np.ndarray]) -> str:
+    """SHA-256 of a description without its date, and of arrays."""
+    kept = {key: value for key, value in described.items() if key != "created"}
+    text = json.dumps(kept, sort_keys=True) + digest_of(tensors)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _tensors(bundle: Bundle) -> dict[str, np.ndarray]:
+    """Arrays of the file, the covariance cut to its leading eigenvectors."""
+    model, kept = bundle.flux_model, bundle.info.components
+    rest = model.variance[: model.variance.size - kept] if model.whole else np.array([model.rest])
+    # A model that was read has equal ones; their mean could differ in the last digit.
+    even = rest[0] if rest.size and (rest == rest[0]).all() else rest.sum() / max(rest.size, 1)
+    arrays = {
+        "flux/variance": model.variance[-kept:],
+        "flux/rest": np.array(even),
+        "noise_nodes": bundle.noise_nodes,
+        "distance_limit": np.array(bundle.distance_limit),
+        "flux/mean": model.mean,
+        "flux/low": model.low,
+        "flux/high": model.high,
+        "flux/basis": model.basis[:, -kept:],
+        "error68": bundle.error68,
+        "rms": bundle.rms,
+        **{f"dae/{name}": value for name, value in bundle.weights.items()},
+    }
+    return {name: np.asarray(value, _dtype(name), order="C") for name, value in arrays.items()}
+
+
+def _dtype(name: str) -> np.dtype:
+    return np.dtype(np.float64 if name in DOUBLE else np.float32)
+
+
+# Reading.
 
 
 def shipped_path() -> Path:
@@ -239,12 +333,7 @@ def shipped_path() -> Path:
 
 
 def read_bundle(path: Path | None = None) -> Bundle:
-    """Read a bundle and check it.
-
-    Parameters
-    ----------
-    path : Path, optional
-        The shipped one by default.
+    """Read a bundle, by default the shipped one, and check it.
 
     Raises
     ------
@@ -252,18 +341,17 @@ def read_bundle(path: Path | None = None) -> Bundle:
         If the file is missing, damaged, of a newer format, or no bundle; the message
         names it.
     """
-    path = shipped_path() if path is None else Path(path)
+    path = shipped_path() if path is None else path
     try:
         text, tensors = _load(path)
         info = _described(text, tensors, path)
     except RecursionError:
         raise BundleError(f"{path}: damaged (its description is nested too deeply)") from None
     _check(info, tensors, path)
-    model = _completed(tensors)
     return Bundle(
         info=info,
         weights={name: tensors[f"dae/{name}"] for name in info.dae.shapes()},
-        flux_model=model,
+        flux_model=_completed(tensors),
         **{name: tensors[name] for name in ("noise_nodes", "error68", "rms")},
         distance_limit=float(tensors["distance_limit"]),
     )
@@ -325,51 +413,16 @@ def _described(text: Mapping[str, Any], tensors: dict[str, np.ndarray], path: Pa
     return info
 
 
-def _digest(described: Mapping[str, Any], tensors: Mapping[str, np.ndarray]) -> str:
-    """SHA-256 of a description without its date, and of arrays."""
-    kept = {key: value for key, value in described.items() if key != "created"}
-    text = json.dumps(kept, sort_keys=True) + digest_of(tensors)
-    return hashlib.sha256(text.encode()).hexdigest()
-
-
-def _tensors(bundle: Bundle) -> dict[str, np.ndarray]:
-    """Arrays of the file, the covariance cut to its leading eigenvectors."""
-    model, kept = bundle.flux_model, bundle.info.components
-    rest = model.variance[: model.variance.size - kept] if model.whole else np.array([model.rest])
-    # A model that was read has equal ones; their mean could differ in the last digit.
-    even = rest[0] if rest.size and (rest == rest[0]).all() else rest.sum() / max(rest.size, 1)
-    arrays = {
-        "flux/variance": model.variance[-kept:],
-        "flux/rest": np.array(even),
-        "noise_nodes": bundle.noise_nodes,
-        "distance_limit": np.array(bundle.distance_limit),
-    }
-    wide = {name: np.asarray(value, np.float64, order="C") for name, value in arrays.items()}
-    single = {
-        "flux/mean": model.mean,
-        "flux/low": model.low,
-        "flux/high": model.high,
-        "flux/basis": model.basis[:, -kept:],
-        "error68": bundle.error68,
-        "rms": bundle.rms,
-        **{f"dae/{name}": value for name, value in bundle.weights.items()},
-    }
-    return wide | {name: np.asarray(v, np.float32, order="C") for name, v in single.items()}
-
-
 def _check(info: BundleInfo, tensors: Mapping[str, np.ndarray], path: Path) -> None:
     """Whether arrays have the shapes that the description asks for, and are finite."""
     pixels, nodes = info.stamp_px**2, tensors["noise_nodes"].size if "noise_nodes" in tensors else 0
     expected: dict[str, tuple[int, ...]] = {
-        "flux/mean": (pixels,),
-        "flux/low": (pixels,),
-        "flux/high": (pixels,),
+        **dict.fromkeys(("flux/mean", "flux/low", "flux/high"), (pixels,)),
         "flux/variance": (info.components,),
         "flux/rest": (),
         "flux/basis": (pixels, info.components),
         "noise_nodes": (nodes,),
-        "error68": (nodes, info.stamp_px, info.stamp_px),
-        "rms": (nodes, info.stamp_px, info.stamp_px),
+        **dict.fromkeys(("error68", "rms"), (nodes, info.stamp_px, info.stamp_px)),
         "distance_limit": (),
         **{f"dae/{name}": shape for name, shape in info.dae.shapes().items()},
     }
@@ -378,14 +431,12 @@ def _check(info: BundleInfo, tensors: Mapping[str, np.ndarray], path: Path) -> N
         state = "missing" if name in expected else "unknown"
         raise BundleError(f"{path}: array {name!r} is {state}")
     for name, shape in expected.items():
-        dtype = np.dtype(np.float64 if name in DOUBLE else np.float32)
-        if tensors[name].dtype != dtype:
-            raise BundleError(f"{path}: array {name!r} of {tensors[name].dtype}, not {dtype}")
-        if tensors[name].shape != shape:
-            raise BundleError(
-                f"{path}: array {name!r} has shape {tensors[name].shape}, not {shape}"
-            )
-        if not np.isfinite(tensors[name]).all():
+        array, dtype = tensors[name], _dtype(name)
+        if array.dtype != dtype:
+            raise BundleError(f"{path}: array {name!r} of {array.dtype}, not {dtype}")
+        if array.shape != shape:
+            raise BundleError(f"{path}: array {name!r} has shape {array.shape}, not {shape}")
+        if not np.isfinite(array).all():
             raise BundleError(f"{path}: array {name!r} is not finite")
     _check_flux_model(info, tensors, path)
     if nodes < 1 or tensors["noise_nodes"][0] <= 0 or (np.diff(tensors["noise_nodes"]) <= 0).any():
@@ -425,11 +476,5 @@ def _completed(tensors: Mapping[str, np.ndarray]) -> FluxModel:
         others = np.linalg.svd(basis)[0][:, kept:]
         basis = np.concatenate([others, basis], axis=1)
         variance = np.concatenate([np.full(pixels - kept, rest), variance])
-    return FluxModel(
-        mean=tensors["flux/mean"].astype(np.float64),
-        basis=basis,
-        variance=variance,
-        low=tensors["flux/low"].astype(np.float64),
-        high=tensors["flux/high"].astype(np.float64),
-        rest=rest,
-    )
+    mean, low, high = (tensors[f"flux/{name}"].astype(float) for name in ("mean", "low", "high"))
+    return FluxModel(mean, basis, variance, low, high, rest)

@@ -1,0 +1,380 @@
+"""`PsfModel`: a model bundle applied to stamps: centring, photometry, network, uncertainty."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import fields
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from psfdae.own_stars.bundle import (
+    Bundle,
+    BundleInfo,
+    at_noise,
+    mahalanobis,
+    network,
+    read_bundle,
+)
+from psfdae.own_stars.photometry import Photometer
+from psfdae.own_stars.prediction import Prediction
+from psfdae.own_stars.shapes import measure_shapes
+from psfdae.own_stars.stamps import (
+    Stamps,
+    StarFlag,
+    border_median,
+    cut,
+    displacement,
+    raise_flag,
+)
+from psfdae.threads import side_by_side
+
+SCALE_TOLERANCE = 0.02
+"""Relative difference of the pixel scale from that of the training that is accepted."""
+
+SNR_TOLERANCE = 1.25
+"""Factor beyond the trained S/N that raises no flag: a faint star's S/N is no better known."""
+
+BLOCK = 256
+"""Stars that are computed together, always so many: other numbers would round otherwise."""
+
+BLOCK_PX = BLOCK * 32**2
+"""Pixels of a block at most; larger stamps come in smaller blocks."""
+
+BLOCK_VALUES = 64 * BLOCK_PX
+"""Numbers between two layers of the network at most: 64 channels of a block."""
+
+
+class PredictionError(ValueError):
+    """Stars that a model cannot be applied to; one line with what it takes instead."""
+
+
+def load_model(path: str | Path | None = None) -> PsfModel:
+    """A trained model, ready to predict the PSFs of stars.
+
+    Parameters
+    ----------
+    path : path-like, optional
+        Model bundle (`.psf.safetensors`); by default the one that comes with the package.
+
+    Raises
+    ------
+    BundleError
+        If the file is missing, damaged, of a newer format, or no model bundle.
+    """
+    return PsfModel(read_bundle(None if path is None else Path(path)))
+
+
+class PsfModel:
+    """A trained network with all that it takes to apply it to stars.
+
+    Parameters
+    ----------
+    bundle : Bundle
+        `load_model` reads one from a file.
+    """
+
+    def __init__(self, bundle: Bundle) -> None:
+        self.bundle = bundle
+        self.engine = Engine(bundle)
+
+    def __repr__(self) -> str:
+        info = self.info
+        return (
+            f"PsfModel({info.name!r}, {info.stamp_px}×{info.stamp_px} px of "
+            f'{info.pixel_scale_arcsec:g}", S/N {info.snr_min:.3g} … {info.snr_max:.3g})'
+        )
+
+    @property
+    def info(self) -> BundleInfo:
+        """Stamp size, pixel scale, range of S/N and all else that the bundle says."""
+        return self.bundle.info
+
+    def predict(
+        self,
+        stamps: ArrayLike,
+        *,
+        flux: ArrayLike | None = None,
+        background: ArrayLike | None = None,
+        noise: ArrayLike | None = None,
+        bad: ArrayLike | None = None,
+        saturated: ArrayLike | None = None,
+        gain: ArrayLike | None = None,
+        margin: int = 0,
+        threads: int | None = 1,
+    ) -> Prediction:
+        """PSFs of stars, with uncertainties, photometry, shapes and flags.
+
+        Stars do not influence each other; the result does not depend on the number
+        of threads, and on how many stars are passed at once in its rounding at most.
+
+        Parameters
+        ----------
+        stamps : array, shape (n, s, s) or (s, s)
+            s = `info.stamp_px` + 2 `margin`; in any unit, sky included, the star's
+            brightest pixel about [s/2, s/2] (0-based), pixels of the scale
+            `info.pixel_scale_arcsec`.
+        flux, background, noise : float or array, shape (n,), optional
+            Flux inside the stamp, sky level and RMS of the sky noise in a pixel, in
+            the unit of the stamps. What is not given, or is NaN, is estimated.
+        bad, saturated : array of bool, shape of the stamps, optional
+            Pixels that must not be used; those that are not finite never are.
+        gain : float or array, shape (n,), optional
+            Electrons per unit of the stamps: adds the star's photon noise to `chi2`
+            and `flux_error`.
+        margin : int
+            Pixels around each stamp, by which a star may be moved to centre it.
+        threads : int, optional
+            None takes all cores.
+
+        Returns
+        -------
+        Prediction
+            One row per star, also of those that are flagged.
+
+        Raises
+        ------
+        PredictionError
+            If shapes or types do not fit.
+        """
+        data = _numbers("stamps", stamps)
+        single = data.ndim == 2
+        data = data[None] if single else data
+        side = self.info.stamp_px + 2 * margin
+        if margin < 0 or data.ndim != 3 or data.shape[1:] != (side, side):
+            size = "×".join(str(n) for n in data.shape)
+            raise PredictionError(
+                f"stamps of shape {size}, but the model {self.info.name!r} takes n×{side}×{side}"
+            )
+        finite, unknown = np.isfinite(data), np.full(len(data), np.nan)
+        given = {"flux": flux, "background": background, "noise": noise, "gain": gain}
+        stars = Stamps(
+            data=data if finite.all() else np.where(finite, data, 0),
+            bad=_mask("bad", bad, data, single) | ~finite,
+            saturated=_mask("saturated", saturated, data, single),
+            truncated=np.zeros(len(data), dtype=bool),
+            id=np.arange(len(data)),
+            x=unknown,
+            y=unknown,
+            **{name: _per_star(name, value, len(data)) for name, value in given.items()},
+        )
+        blocks = self.engine.blocks(stars)
+        with one_thread_each():
+            threads = min(threads or available_cores(), max(len(blocks), 1))
+            parts = side_by_side(self.engine.block, blocks or [stars], threads)
+        return Prediction.joined(parts)
+
+    def check_scale(self, pixel_scale_arcsec: float | None, what: str) -> None:
+        """Refuse stars whose pixels are not those of the training.
+
+        Parameters
+        ----------
+        pixel_scale_arcsec : float or None
+            None if nobody knows it.
+        what : str
+            Name of the file, for the message.
+
+        Raises
+        ------
+        PredictionError
+            If the scale is unknown, or off by more than `SCALE_TOLERANCE`.
+        """
+        trained = self.info.pixel_scale_arcsec
+        if pixel_scale_arcsec is None:
+            raise PredictionError(
+                f"{what}: neither a WCS nor the header gives the pixel scale; "
+                f"state it with --pixel-scale (the model's is {trained:.6g} arcsec)"
+            )
+        if not abs(pixel_scale_arcsec / trained - 1.0) <= SCALE_TOLERANCE:
+            raise PredictionError(
+                f"{what}: pixels of {pixel_scale_arcsec:.6g} arcsec, but the model "
+                f"{self.info.name!r} was trained on {trained:.6g} arcsec "
+                f"(tolerance {100 * SCALE_TOLERANCE:g} %)"
+            )
+
+
+def _numbers(name: str, values: ArrayLike) -> np.ndarray:
+    """An array of float32 or float64 in the machine's byte order."""
+    array = np.asarray(values)
+    if array.dtype.kind not in "fiub":
+        raise PredictionError(f"{name} of type {array.dtype}, expected real numbers")
+    narrow = array.dtype.kind == "f" and array.dtype.itemsize <= 4
+    return array.astype(np.float32 if narrow else np.float64, copy=False)
+
+
+def _mask(name: str, mask: ArrayLike | None, data: np.ndarray, single: bool) -> np.ndarray:
+    if mask is None:
+        return np.zeros(data.shape, dtype=bool)
+    array = np.asarray(mask, dtype=bool)
+    array = array[None] if single else array
+    if array.shape != data.shape:
+        raise PredictionError(f"{name} of shape {array.shape}, but stamps of shape {data.shape}")
+    return array
+
+
+def _per_star(name: str, value: ArrayLike | None, count: int) -> np.ndarray:
+    """One number per star, NaN where it is not known."""
+    numbers = _numbers(name, np.nan if value is None else value).astype(np.float64)
+    if numbers.ndim > 1 or (numbers.ndim == 1 and len(numbers) != count):
+        raise PredictionError(f"{name} of shape {numbers.shape}, expected one for {count} stamps")
+    return np.broadcast_to(numbers, (count,))
+
+
+class Engine:
+    """What a bundle needs to be ready: the network and the photometry's matrices.
+
+    Safe to use from several threads.
+    """
+
+    def __init__(self, bundle: Bundle) -> None:
+        self.bundle = bundle
+        self.network = network(bundle)
+        pixels = bundle.info.stamp_px**2
+        self.size = min(BLOCK, max(1, BLOCK_PX // pixels))
+        widest = max(bundle.info.dae.widths)
+        self._images = min(self.size, max(1, BLOCK_VALUES // (widest * pixels)))
+        self._photometer = Photometer(bundle.flux_model, bundle.info.components)
+
+    def blocks(self, stars: Stamps) -> list[Stamps]:
+        """Stars in parts of `size`."""
+        return [stars.part(slice(a, a + self.size)) for a in range(0, len(stars), self.size)]
+
+    def block(self, stars: Stamps) -> Prediction:
+        """PSFs of at most `size` stars; computed as if there were just so many."""
+        count = len(stars)
+        if count < self.size:
+            stars = _filled(stars, self.bundle, self.size)
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            return self._compute(stars).first(count)
+
+    def _compute(self, stars: Stamps) -> Prediction:
+        from psfdae.models.dae import predict
+
+        bundle, info = self.bundle, self.bundle.info
+        stamps, bad, shift, flags = self._centred(stars)
+        found = self._photometer.measure(stamps, bad, border_median(stamps, bad), stars)
+        lost = (found.flags & StarFlag.NO_FLUX) > 0
+        if lost.all():  # such as the stars of a catalogue that reaches far beyond the image
+            psf = np.empty_like(found.images)
+        else:
+            psf = predict(self.network, found.images, info.image_scale, self._images)
+        psf[lost] = np.nan
+        shapes = measure_shapes(psf)
+        noise = found.noise / np.where(lost, np.nan, found.flux)
+        snr = 1.0 / (noise * info.noise_equivalent_px**0.5)
+        distance = mahalanobis(found.images, noise, bundle.flux_model, info.components)
+        flux = found.flux.astype(np.float32)[:, None, None]
+        uncertainty = at_noise(noise, bundle.noise_nodes, bundle.error68)
+        psf *= flux
+        uncertainty *= flux
+        residual = (stamps - found.background[:, None, None]).astype(np.float32) - psf
+        residual[~found.used] = np.nan
+        flags |= found.flags
+        raise_flag(flags, StarFlag.SNR_LOW, snr < info.snr_min / SNR_TOLERANCE)
+        raise_flag(flags, StarFlag.SNR_HIGH, snr > info.snr_max * SNR_TOLERANCE)
+        raise_flag(flags, StarFlag.UNLIKE_TRAINING, distance > bundle.distance_limit)
+        photons = np.nan_to_num(np.maximum(found.flux, 0.0) / stars.gain)
+        return Prediction(
+            psf=psf,
+            residual=residual,
+            uncertainty=uncertainty,
+            flux=found.flux,
+            flux_error=np.sqrt(found.flux_error**2 + photons),
+            background=found.background,
+            noise=found.noise,
+            snr=snr,
+            chi2=_chi2(residual, psf, found.noise, stars.gain),
+            distance=distance,
+            fwhm_px=shapes.fwhm_px,
+            ellipticity=shapes.ellipticity,
+            position_angle_deg=shapes.position_angle_deg,
+            shift_x=shift[:, 1],
+            shift_y=shift[:, 0],
+            flags=flags,
+        )
+
+    def _centred(self, stars: Stamps) -> tuple[np.ndarray, ...]:
+        """Stamps (n, d, d), their bad pixels, their shift (row, column), and flags so far."""
+        side = self.bundle.info.stamp_px
+        margin = (stars.data.shape[-1] - side) // 2
+        # Saturated pixels show where the star is; the others would mislead.
+        data, hidden = stars.data, stars.bad & ~stars.saturated
+        if hidden.any():
+            data = np.where(hidden, border_median(data, hidden)[:, None, None], data)
+        shift = displacement(data, self.bundle.info.jitter_px)
+        too_far = np.abs(shift).max(axis=1) > margin
+        shift[too_far] = 0
+        stamps, bad, saturated = (
+            cut(wide, side, shift) for wide in (data, stars.bad, stars.saturated)
+        )
+        flags = np.zeros(len(stamps), dtype=np.uint16)
+        raise_flag(flags, StarFlag.MASKED, bad.any(axis=(1, 2)))
+        raise_flag(flags, StarFlag.SATURATED, saturated.any(axis=(1, 2)))
+        raise_flag(flags, StarFlag.TRUNCATED, stars.truncated)
+        raise_flag(flags, StarFlag.OFF_CENTRE, too_far)
+        return stamps, bad | saturated, shift, flags
+
+
+def _chi2(residual: np.ndarray, psf: np.ndarray, noise: np.ndarray, gain: np.ndarray) -> np.ndarray:
+    """Mean of the squared residuals in units of their σ over the pixels that are not NaN."""
+    variance = (noise**2).astype(np.float32)[:, None, None]
+    if np.isfinite(gain).any():
+        per_electron = np.where(gain > 0, 1.0 / gain, 0.0).astype(np.float32)[:, None, None]
+        variance = variance + np.maximum(psf, 0.0) * per_electron
+    squares = (residual**2 / variance).reshape(len(residual), -1)
+    used = np.isfinite(squares)
+    if not used.all():
+        squares = np.where(used, squares, 0.0)
+    count = used.sum(axis=1)
+    total = squares.sum(axis=1, dtype=np.float64)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+def _filled(stars: Stamps, bundle: Bundle, size: int) -> Stamps:
+    """Stars up to `size`, the last ones being mean PSFs of which nothing is known."""
+    count, side = len(stars), bundle.info.stamp_px
+    filled = {}
+    for field in fields(stars):
+        values = getattr(stars, field.name)
+        blank = np.nan if values.dtype.kind == "f" else 0
+        more = np.full((size - count, *values.shape[1:]), blank, values.dtype)
+        filled[field.name] = np.concatenate([values, more])
+    margin = (stars.data.shape[-1] - side) // 2
+    inner = slice(margin, margin + side)
+    filled["data"][count:] = 0.0
+    filled["data"][count:, inner, inner] = bundle.flux_model.mean.reshape(side, side)
+    return Stamps(**filled)
+
+
+def available_cores() -> int:
+    """Cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+@contextmanager
+def one_thread_each() -> Iterator[None]:
+    """Linear algebra and network on one thread per calling thread, and as before afterwards."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with _libraries().limit(limits=1, user_api="blas"):
+            yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@cache
+def _libraries() -> Any:
+    """Looking for the loaded libraries takes milliseconds, hence once."""
+    from threadpoolctl import ThreadpoolController
+
+    return ThreadpoolController()

@@ -1,0 +1,432 @@
+"""Which stars of an image are good enough to learn the PSF from.
+
+Everything works on stamps (n, s, s) somewhat wider than those of the network. The
+star of a stamp lies near index (s//2, s//2).
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, fields
+from enum import StrEnum
+from itertools import repeat
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from psfdae.own_stars.errors import no_formula
+from psfdae.own_stars.observation import Observation
+from psfdae.own_stars.stamps import Stamps, cut
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from psfdae.configuration.schema import CalibrationStars, Framing
+
+ROWS = 2048
+"""Stars that are measured at a time."""
+
+SKY_CLIP = 3.0
+"""Pixels of the sky this many σ off their median belong to other stars."""
+
+REGISTRATION_ROUNDS = 10
+"""Steps of the windowed centroid; each leaves less than a fifth of the distance."""
+
+COMPANIONS = 12
+"""Nearest stars with which a star is compared."""
+
+DEFECT = 6.0
+"""Pixels this many σ below the sky are defects; they are raised to that."""
+
+LEAST_SKY = 2.0 * DEFECT**2
+"""Photons per pixel of the new noise, at least: a rate of photons cannot be negative.
+
+The deepest pixel of a star that is made fainter has B − DEFECT √B photons at most.
+"""
+
+SHIFT_ORDER = 3
+"""Cubic splines: on a star with a FWHM of 3 px they err by an MSE of 1e-8."""
+
+
+class CalibrationStarsError(ValueError):
+    """An image has too few stars to learn from, or its settings contradict each other."""
+
+
+class Verdict(StrEnum):
+    """Why a star is not used; the first reason that applies."""
+
+    GOOD = "good"
+    INCOMPLETE = "incomplete"  # pixels off the image, masked or not finite
+    SATURATED = "saturated"
+    FAINT = "faint"
+    OFF_CENTRE = "off centre"
+    CROWDED = "crowded"
+    MISFIT = "misfit"  # unlike its neighbours: a blend, a galaxy, a cosmic ray
+
+
+@dataclass(frozen=True)
+class BrightStars:
+    """Stars that are good enough to learn from.
+
+    Attributes
+    ----------
+    wide : ndarray, shape (n, s, s)
+        Sky-subtracted stamps with a margin, counts.
+    peak : ndarray of int, shape (n, 2)
+        Brightest pixel (row, column) from index (s//2, s//2).
+    centre : ndarray, shape (n, 2)
+        Centroid (row, column) from index (s//2, s//2).
+    position : ndarray, shape (n, 2)
+        (x, y) in the image, NaN where unknown.
+    flux, noise, snr : ndarray, shape (n,)
+        Counts inside the stamp, RMS of the sky per pixel in counts, signal to noise.
+    row : ndarray of int, shape (n,)
+        Row of the catalogue.
+    """
+
+    wide: np.ndarray
+    peak: np.ndarray
+    centre: np.ndarray
+    position: np.ndarray
+    flux: np.ndarray
+    noise: np.ndarray
+    snr: np.ndarray
+    row: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.wide)
+
+    def of(self, chosen: np.ndarray) -> BrightStars:
+        """Some of the stars, by a mask or by indices."""
+        return BrightStars(*(getattr(self, field.name)[chosen] for field in fields(self)))
+
+    def aligned(self) -> np.ndarray:
+        """The stars of flux 1, moved to a common centre, index (s//2, s//2); shape (n, s, s)."""
+        return moved(self.wide, -self.centre) / self.flux[:, None, None]
+
+    def sky_photons(self, gain: float | None, otherwise: float) -> float:
+        """Photons per pixel whose Poisson noise is the sky's, read noise included.
+
+        From the electrons per count; `otherwise` where they are unknown.
+        """
+        if gain is None:
+            return otherwise
+        return max(float(np.median(self.noise) * gain) ** 2, LEAST_SKY)
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """What is known of all n stars of an observation, and the bright ones among them.
+
+    Attributes
+    ----------
+    id : ndarray, shape (n,)
+    position : ndarray, shape (n, 2)
+        (x, y), NaN where unknown.
+    snr, noise : ndarray, shape (n,)
+        Signal to noise; RMS of the sky in counts per pixel.
+    verdict : ndarray of str, shape (n,)
+        A `Verdict` for every star.
+    bright : BrightStars
+        The good ones.
+    """
+
+    id: np.ndarray
+    position: np.ndarray
+    snr: np.ndarray
+    noise: np.ndarray
+    verdict: np.ndarray
+    bright: BrightStars
+
+    def count(self) -> str:
+        """How many stars there are of every verdict, in words."""
+        found = Counter(self.verdict.tolist())
+        return ", ".join(f"{found[v]} {v}" for v in map(str, Verdict) if found[v])
+
+    def table(self, held_out: np.ndarray) -> pd.DataFrame:
+        """Every star of the catalogue, and which of the good ones are held out."""
+        import pandas as pd
+
+        part = np.full(len(self.verdict), "", dtype="<U8")
+        part[self.bright.row] = np.where(held_out, "held out", "training")
+        return pd.DataFrame(
+            {
+                "id": self.id if self.id.dtype.kind == "i" else [no_formula(n) for n in self.id],
+                "x": self.position[:, 0],
+                "y": self.position[:, 1],
+                "snr": self.snr,
+                "verdict": self.verdict,
+                "part": part,
+            }
+        )
+
+
+def collect(observation: Observation, settings: CalibrationStars, framing: Framing) -> Candidates:
+    """Measure all stars and choose those that are good enough to learn from.
+
+    Only stamps of bright stars are kept in memory.
+
+    Parameters
+    ----------
+    observation : Observation
+        Of stamps with a margin (a cube: of its own, larger ones).
+    settings : CalibrationStars
+    framing : Framing
+
+    Raises
+    ------
+    CalibrationStarsError
+        If there are fewer good stars than `calibration_stars.stars_min`.
+    """
+    measured = [_measure(chunk, settings, framing) for chunk in observation.chunks(ROWS)]
+    columns, kept = zip(*measured, strict=True)
+    found = {key: np.concatenate([c[key] for c in columns]) for key in columns[0]}
+    side, verdict, noise, snr = framing.stamp_px, found["verdict"], found["noise"], found["snr"]
+    row = np.flatnonzero(verdict == Verdict.GOOD)
+    close = crowded(found["position"], snr * noise, settings.isolation_px, settings.neighbour_ratio)
+    verdict[close & (verdict == Verdict.GOOD)] = Verdict.CROWDED
+    wide, peak = (np.concatenate([k[i] for k in kept]) for i in (0, 1))
+    wide = np.maximum(wide, -DEFECT * noise[row, None, None])
+    flux = cut(wide, side, peak).sum(axis=(1, 2))
+    verdict[row[flux <= 0]] = Verdict.MISFIT
+    good = verdict[row] == Verdict.GOOD
+    wide, peak, flux, row = wide[good], peak[good], flux[good], row[good]
+    centre = star_centres(wide, peak, window_of(snr[row], flux, noise[row]))
+    bright = BrightStars(
+        wide, peak, centre, found["position"][row], flux, noise[row], snr[row], row
+    )
+    score = misfit(cut(bright.aligned(), side), bright.position, bright.noise / bright.flux)
+    verdict[row[score > settings.misfit]] = Verdict.MISFIT
+    result = Candidates(**found, bright=bright.of(score <= settings.misfit))
+    if len(result.bright) < settings.stars_min:
+        raise CalibrationStarsError(
+            f"{observation.path}: {len(result.bright)} stars are good enough to learn from, "
+            f"calibration_stars.stars_min = {settings.stars_min} are needed "
+            f"(of {len(verdict)}: {result.count()})"
+        )
+    return result
+
+
+def _measure(
+    chunk: Stamps, settings: CalibrationStars, framing: Framing
+) -> tuple[dict[str, np.ndarray], tuple[np.ndarray, ...]]:
+    """Columns for all stars of a chunk; stamps and peaks of the bright ones."""
+    side = framing.stamp_px
+    level, noise = sky_around(chunk.data, chunk.bad, side)
+    wide = np.where(chunk.bad, 0.0, chunk.data - level[:, None, None])
+    reach = min(settings.search_px, (wide.shape[-1] - 5) // 2)
+    peak, centred = brightest_pixels(wide, reach)
+    needed = side + 2 * min(reach + framing.jitter_px + 1, (wide.shape[-1] - side) // 2)
+    snr = signal_to_noise(cut(wide, side), noise)
+    verdict = np.full(len(chunk), Verdict.GOOD, dtype="<U16")
+    for reason, stars in (
+        (Verdict.OFF_CENTRE, ~centred),
+        (Verdict.FAINT, snr < settings.snr_min),
+        (Verdict.SATURATED, cut(chunk.saturated, side).any(axis=(1, 2))),
+        (Verdict.INCOMPLETE, cut(chunk.bad, needed).any(axis=(1, 2))),
+    ):
+        verdict[stars] = reason
+    columns = {
+        "id": chunk.id,
+        "position": np.stack([chunk.x, chunk.y], axis=1),
+        "snr": snr,
+        "noise": noise,
+        "verdict": verdict,
+    }
+    good = verdict == Verdict.GOOD
+    return columns, (wide[good], peak[good])
+
+
+def sky_around(wide: np.ndarray, bad: np.ndarray, stamp_px: int) -> tuple[np.ndarray, np.ndarray]:
+    """Median and scatter of the pixels outside the stamps, other stars clipped.
+
+    Without a margin (s < d + 4) the pixels are the outer two rows and columns of
+    the stamp itself; light of the star in them counts as sky then.
+
+    Parameters
+    ----------
+    wide : ndarray, shape (n, s, s)
+    bad : ndarray of bool, shape (n, s, s)
+        Pixels that do not count.
+    stamp_px : int
+        Side d.
+
+    Returns
+    -------
+    level, noise : ndarray, shape (n,)
+        In counts per pixel.
+    """
+    from astropy.stats import sigma_clipped_stats
+
+    side = wide.shape[-1]
+    inner = stamp_px if side >= stamp_px + 4 else side - 4
+    start = side // 2 - inner // 2
+    ring = np.ones((side, side), dtype=bool)
+    ring[start : start + inner, start : start + inner] = False
+    _, level, noise = sigma_clipped_stats(
+        wide[:, ring],
+        mask=bad[:, ring],
+        sigma=SKY_CLIP,
+        cenfunc="median",
+        stdfunc="mad_std",
+        axis=1,
+    )
+    level, noise = (np.nan_to_num(np.ma.filled(a, np.nan)).astype(float) for a in (level, noise))
+    return level, noise
+
+
+def signal_to_noise(stamps: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """S/N of a filter matched to the star itself, √(Σx²/σ² − P), shape (n,).
+
+    For an image x = F p the expectation of Σx² is F²Σp² + Pσ², and F/(σ √A) with
+    the noise-equivalent area A = 1/Σp² is what stays (King 1983, PASP 95, 163). No
+    PSF has to be known. 0 where the noise is 0.
+
+    Parameters
+    ----------
+    stamps : ndarray, shape (n, d, d)
+        Sky-subtracted.
+    noise : ndarray, shape (n,)
+        RMS σ of a pixel.
+    """
+    power = np.square(stamps, dtype=np.float64).sum(axis=(1, 2))
+    safe = np.where(noise > 0, noise, np.inf)
+    return np.sqrt(np.maximum(power / safe**2 - stamps[0].size, 0.0))
+
+
+def crowded(
+    position: np.ndarray, brightness: np.ndarray, distance_px: float, ratio: float
+) -> np.ndarray:
+    """Stars with a neighbour of at least `ratio` of their brightness nearby, bool, shape (n,).
+
+    Parameters
+    ----------
+    position : ndarray, shape (n, 2)
+        In pixels; a star at NaN has no neighbours.
+    brightness : ndarray, shape (n,)
+    distance_px, ratio : float
+    """
+    from scipy.spatial import cKDTree
+
+    placed = np.flatnonzero(np.isfinite(position).all(axis=1))
+    out = np.zeros(len(position), dtype=bool)
+    pairs = placed[cKDTree(position[placed]).query_pairs(distance_px, output_type="ndarray")]
+    for one, other in ((pairs[:, 0], pairs[:, 1]), (pairs[:, 1], pairs[:, 0])):
+        out[one[brightness[other] >= ratio * brightness[one]]] = True
+    return out
+
+
+def brightest_pixels(wide: np.ndarray, search_px: int) -> tuple[np.ndarray, np.ndarray]:
+    """Brightest pixel near the middle of every stamp.
+
+    Parameters
+    ----------
+    wide : ndarray, shape (n, s, s)
+    search_px : int
+        Searched within ± this of the middle.
+
+    Returns
+    -------
+    peak : ndarray of int, shape (n, 2)
+        (row, column) from index (s//2, s//2); the first in that order among equals.
+    inside : ndarray of bool, shape (n,)
+        Whether no pixel just outside the search window is brighter.
+    """
+    middle, reach = wide.shape[-1] // 2, search_px + 1
+    window = wide[:, middle - reach : middle + reach + 1, middle - reach : middle + reach + 1]
+    flat = window.reshape(len(wide), -1).argmax(axis=1)
+    peak = np.stack(np.divmod(flat, 2 * reach + 1), axis=1) - reach
+    return peak, np.abs(peak).max(axis=1, initial=0) <= search_px
+
+
+def star_centres(wide: np.ndarray, peak: np.ndarray, window_px: np.ndarray) -> np.ndarray:
+    """Centroids under a Gaussian window that follows the star (Bertin's XWIN), shape (n, 2).
+
+    Parameters
+    ----------
+    wide : ndarray, shape (n, s, s)
+        Sky-subtracted.
+    peak : ndarray, shape (n, 2)
+        Where to start, (row, column) from index (s//2, s//2).
+    window_px : ndarray, shape (n,)
+        σ of the window, about that of the star.
+
+    Returns
+    -------
+    ndarray, shape (n, 2)
+        (row, column) from index (s//2, s//2), at most 1.5 px per axis from `peak`.
+    """
+    axis = np.arange(wide.shape[-1]) - wide.shape[-1] // 2
+    centre = peak.astype(np.float64)
+    width = window_px[:, None] ** 2
+    for _ in range(REGISTRATION_ROUNDS):
+        rows, columns = (axis - centre[:, i : i + 1] for i in (0, 1))
+        weight = np.exp(-0.5 * rows**2 / width)[:, :, None]
+        light = weight * np.exp(-0.5 * columns**2 / width)[:, None, :] * wide
+        total = light.sum(axis=(1, 2))
+        moments = [np.einsum("nij,ni->n", light, rows), np.einsum("nij,nj->n", light, columns)]
+        # A window as wide as the star halves the distance of the centroid, hence the 2.
+        step = 2.0 * np.stack(moments, axis=1) / np.where(total > 0, total, np.inf)[:, None]
+        centre = np.clip(centre + step, peak - 1.5, peak + 1.5)
+    return centre
+
+
+def window_of(snr: np.ndarray, flux: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """σ in pixels of the Gaussian with the noise-equivalent area of a star, shape (n,).
+
+    A = (F / (σ_noise · S/N))² = 4π σ²; at least 0.7 px.
+    """
+    area = (flux / (noise * snr)) ** 2
+    return np.maximum(np.sqrt(area / (4.0 * np.pi)), 0.7)
+
+
+def moved(wide: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    """Stamps (n, s, s) moved by (row, column) pixels, splines of `SHIFT_ORDER`."""
+    from scipy import ndimage
+
+    out = np.empty(wide.shape)
+    for image, step, target in zip(wide, shift, out, strict=True):
+        ndimage.shift(image, step, target, order=SHIFT_ORDER, mode="nearest")
+    return out
+
+
+def misfit(aligned: np.ndarray, position: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """How unlike its neighbours each star is, in what is usual in this image, shape (n,).
+
+    A star is compared with the nearest `COMPANIONS` stars, pixel by pixel: its
+    difference from their median in units of their robust scatter, root mean square
+    over the stamp. Where the PSF varies, so do the neighbours; a companion or a cosmic
+    ray lies where they agree. The result is 1 for the median star.
+
+    Parameters
+    ----------
+    aligned : ndarray, shape (n, d, d)
+        Of flux 1, moved to a common centre.
+    position : ndarray, shape (n, 2)
+        In the image; all stars are neighbours where a position is not finite.
+    noise : ndarray, shape (n,)
+        RMS of a pixel over the flux.
+    """
+    from scipy.spatial import cKDTree
+
+    count = len(aligned)
+    if count < 4:
+        return np.ones(count)
+    if np.isfinite(position).all() and count > COMPANIONS:
+        near = cKDTree(position).query(position, k=COMPANIONS + 1)[1]
+        usual = (_usual(aligned[found[found != star]]) for star, found in enumerate(near))
+    else:
+        usual = repeat(_usual(aligned), count)
+    score = np.empty(count)
+    for star, (median, variance) in enumerate(usual):
+        square = (aligned[star] - median) ** 2 / (variance + noise[star] ** 2)
+        score[star] = np.sqrt(square.mean())
+    return score / np.median(score)
+
+
+def _usual(stars: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Median and robust variance of every pixel of some stars."""
+    median = np.median(stars, axis=0)
+    scatter = 1.4826 * np.median(np.abs(stars - median), axis=0)
+    # A dozen stars may agree in a pixel by chance.
+    return median, scatter**2 + np.median(scatter) ** 2

@@ -1,0 +1,206 @@
+"""Stamps of stars: the container, what may be said against a star, its border and its centre."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from enum import IntFlag
+from functools import cache
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Stamps:
+    """Stamps of n stars, s = stamp_px + 2·margin pixels wide, and what is known of the stars.
+
+    Attributes
+    ----------
+    data : ndarray, shape (n, s, s), float32 or float64
+        Counts, sky included; finite: 0 where a pixel is not or is off the image.
+    bad, saturated : ndarray of bool, shape (n, s, s)
+        `bad` are masked pixels, and those that `data` does not show.
+    truncated : ndarray of bool, shape (n,)
+        Part of the stamp, margin aside, is off the image.
+    id : ndarray, shape (n,), int64 or str
+    x, y : ndarray, shape (n,)
+        Position in the image, 0-based pixel centres; NaN where unknown.
+    flux, background, noise : ndarray, shape (n,)
+        Flux inside the stamp, sky level and RMS of the sky in a pixel; NaN where they
+        are to be estimated.
+    gain : ndarray, shape (n,)
+        Electrons per unit of the stamps; NaN where unknown.
+    """
+
+    data: np.ndarray
+    bad: np.ndarray
+    saturated: np.ndarray
+    truncated: np.ndarray
+    id: np.ndarray
+    x: np.ndarray
+    y: np.ndarray
+    flux: np.ndarray
+    background: np.ndarray
+    noise: np.ndarray
+    gain: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.data)
+
+    def part(self, rows: slice) -> Stamps:
+        """Some of the stars."""
+        return Stamps(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+
+class StarFlag(IntFlag):
+    """What is said against a star; flags add up. Rows are flagged, never dropped."""
+
+    MASKED = 1
+    OUTLIER = 2
+    FAINT = 4
+    NO_FLUX = 8
+    SATURATED = 16
+    TRUNCATED = 32
+    SNR_LOW = 64
+    SNR_HIGH = 128
+    OFF_CENTRE = 256
+    UNLIKE_TRAINING = 512
+
+
+MEANING: dict[StarFlag, str] = {
+    StarFlag.MASKED: "pixels that are masked, not finite or off the image; replaced",
+    StarFlag.OUTLIER: "pixels that no star of the training set can have; replaced",
+    StarFlag.FAINT: "flux below three times its error",
+    StarFlag.NO_FLUX: "no usable flux: PSF, residual and uncertainty are NaN",
+    StarFlag.SATURATED: "saturated pixels; replaced",
+    StarFlag.TRUNCATED: "part of the stamp is off the image",
+    StarFlag.SNR_LOW: "S/N less than 1/1.25 of the least that the training had",
+    StarFlag.SNR_HIGH: "S/N more than 1.25 times the largest that the training had",
+    StarFlag.OFF_CENTRE: "brightest pixel farther from the centre than the stamp could be moved",
+    StarFlag.UNLIKE_TRAINING: "farther from the training set than 99.9 % of its test stars",
+}
+"""One line for every flag."""
+
+
+def raise_flag(flags: np.ndarray, flag: StarFlag, where: np.ndarray) -> None:
+    """Add a flag to some stars of `flags`, shape (n,), uint16."""
+    flags[where] |= np.uint16(flag)
+
+
+# The border: where there is most sky and least star.
+
+
+@cache
+def border_pixels(side: int) -> np.ndarray:
+    """Flat indices of the ring at the edge of a stamp, an eighth of its side wide."""
+    width = max(1, side // 8)
+    border = np.ones((side, side), dtype=bool)
+    border[width:-width, width:-width] = False
+    return np.flatnonzero(border)
+
+
+def border_median(stamps: np.ndarray, bad: np.ndarray) -> np.ndarray:
+    """Median of the good pixels in the border of every stamp (n, s, s), shape (n,), float64.
+
+    Of all good pixels where the border has none; 0 where no pixel is good.
+    """
+    size = (len(stamps), stamps.shape[-1] ** 2)
+    flat, hidden = stamps.reshape(size), bad.reshape(size)
+    ring = border_pixels(stamps.shape[-1])
+    median = np.median(flat[:, ring], axis=1).astype(np.float64)
+    for star in np.flatnonzero(hidden.any(axis=1)):
+        good = flat[star, ring][~hidden[star, ring]]
+        good = good if good.size else flat[star][~hidden[star]]
+        median[star] = np.median(good) if good.size else 0.0
+    return median
+
+
+def border_scatter(stamps: np.ndarray) -> np.ndarray:
+    """σ of the pixels in the border of every stamp from their median deviation, (n,).
+
+    Light of the star in the border is in it.
+    """
+    side = stamps.shape[-1]
+    ring = stamps.reshape(len(stamps), side**2)[:, border_pixels(side)]
+    deviation = np.abs(ring - np.median(ring, axis=1, keepdims=True))
+    return 1.4826 * np.median(deviation, axis=1).astype(np.float64)
+
+
+# Centring, to the convention of the training: brightest pixel near (d/2, d/2).
+
+SIGNIFICANCE = 5.0
+"""Least excess of a peak elsewhere over the middle, in σ of their difference."""
+
+SMOOTHED_NOISE = 0.53
+"""σ of the difference of two pixels of the smoothed stamp, in σ of a pixel: √2 · (6/16)."""
+
+
+def smoothed(stamps: np.ndarray) -> np.ndarray:
+    """Stamps (n, s, s) convolved with [1, 2, 1]/4 along both axes; edge pixels repeated."""
+    wide = np.pad(stamps, ((0, 0), (1, 1), (1, 1)), mode="edge")
+    rows = wide[:, :-2] + 2 * wide[:, 1:-1] + wide[:, 2:]
+    return (rows[:, :, :-2] + 2 * rows[:, :, 1:-1] + rows[:, :, 2:]) / 16
+
+
+def displacement(stamps: np.ndarray, jitter_px: int) -> np.ndarray:
+    """How far each star lies off the place where the training would have put it.
+
+    The training moves stars by up to `jitter_px` whole pixels, so only a star beyond
+    that is moved. Noise must not move a star, nor may the second peak of an aberrated
+    one: the brightest pixel counts as elsewhere only if the smoothed stamp has its
+    maximum there as well, and well above all of the middle.
+
+    Parameters
+    ----------
+    stamps : ndarray, shape (n, s, s)
+        s even; bad pixels at the sky level. The sky need not be subtracted.
+    jitter_px : int
+        Distance (per axis) that the training covers.
+
+    Returns
+    -------
+    ndarray of int, shape (n, 2)
+        (row, column) of the brightest pixel from (s/2, s/2); 0 for stars that lie
+        within `jitter_px`, or of which that cannot be said.
+    """
+    middle = stamps.shape[-1] // 2
+    near = slice(middle - jitter_px, middle + jitter_px + 1)
+    smooth = smoothed(stamps)
+    brightest, second = (_peak(images) - middle for images in (stamps, smooth))
+    outside = np.abs(brightest).max(axis=1) > jitter_px
+    star = np.flatnonzero(outside & (np.abs(brightest - second).max(axis=1) <= 1))
+    out = np.zeros((len(stamps), 2), dtype=np.int16)
+    if not star.size:
+        return out
+    excess = smooth[star].max(axis=(1, 2)) - smooth[star, near, near].max(axis=(1, 2))
+    sure = excess > SIGNIFICANCE * SMOOTHED_NOISE * border_scatter(stamps[star])
+    out[star[sure]] = brightest[star[sure]]
+    return out
+
+
+def _peak(images: np.ndarray) -> np.ndarray:
+    flat = images.reshape(len(images), -1).argmax(axis=1)
+    return np.stack(np.divmod(flat, images.shape[-1]), axis=1)
+
+
+def cut(wide: np.ndarray, stamp_px: int, offset: np.ndarray | None = None) -> np.ndarray:
+    """Stamps (n, d, d) out of the middle of wider ones (n, s, s).
+
+    Parameters
+    ----------
+    wide : ndarray, shape (n, s, s)
+    stamp_px : int
+        Side d; its index (d//2, d//2) is the (s//2, s//2) of the wide stamp.
+    offset : ndarray of int, shape (n, 2), optional
+        (row, column) by which the middle moves. What would lie beyond the wide stamp
+        repeats its edge.
+    """
+    side = wide.shape[-1]
+    pixels = side // 2 - stamp_px // 2 + np.arange(stamp_px)
+    middle = wide[:, pixels[0] : pixels[-1] + 1, pixels[0] : pixels[-1] + 1]
+    star = np.flatnonzero(offset.any(axis=1)) if offset is not None else ()
+    if not len(star):
+        return np.ascontiguousarray(middle)
+    stamps = middle.copy()
+    rows, columns = (np.clip(offset[star, i, None] + pixels, 0, side - 1) for i in (0, 1))
+    stamps[star] = wide[star[:, None, None], rows[:, :, None], columns[:, None, :]]
+    return stamps

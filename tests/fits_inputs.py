@@ -1,0 +1,38 @@
+"""FITS files of stars for the tests, and their observation."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from astropy.io import fits
+
+from psfdae.own_stars import example
+from psfdae.own_stars.observation import Source
+
+
+def open_observation(path, stamp_px, margin=0, **stated):
+    return Source(Path(path), **stated).open(stamp_px, margin)
+
+
+def write_cube(path, stamps, compress=False, **cards):
+    example.write_cube(path, stamps, **cards)
+    if compress:
+        pack(path)
+
+
+def write_field(path, catalogue, stamps, x, y, shape, background=0.0, compress=False, **cards):
+    """Stamps added to an image, with a catalogue of their 0-based positions."""
+    image = np.zeros(shape) + background
+    example.add_stamps(image, stamps, x, y)
+    example.write_field(path, catalogue, image, x, y, **cards)
+    if compress:
+        pack(path)
+
+
+def pack(path):
+    """Compress the image of a file in tiles of up to 100 rows."""
+    image = fits.getdata(path)
+    tile = (min(len(image), 100), *image.shape[1:])
+    packed = fits.CompImageHDU(image, fits.getheader(path), tile_shape=tile)
+    fits.HDUList([fits.PrimaryHDU(), packed]).writeto(path, overwrite=True)
