@@ -223,9 +223,9 @@ def test_only_some_tiles_of_an_image_are_in_memory(tmp_path):
     fits.HDUList([fits.PrimaryHDU(), packed]).writeto(tmp_path / "a.fz")
     (tmp_path / "s.csv").write_text("X_IMAGE,Y_IMAGE\n2000,65\n100,4001\n")
     script = (
-        "import resource, sys, hostile_files\n"
+        "import pathlib, resource, sys, hostile_files\n"
         "from fits_inputs import open_observation\n"
-        "a, s = sys.argv[1:]\n"
+        "a, s = map(pathlib.Path, sys.argv[1:])\n"
         "found = open_observation(a, stamp_px=8, catalogue=s)\n"
         "limit = hostile_files.data_bytes() + 40 * 2**20\n"
         "resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))\n"

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from fits_inputs import open_observation
 from psfdae.alignment.stamps import AlignmentStamps, mean_slope
 from psfdae.alignment.telescope import zernike_tracer
-from fits_inputs import open_observation
 from psfdae.cli import main
 from psfdae.configuration.compose import (
     ConfigError,

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from psfdae.rng import stream
+from psfdae.stability.flux import FluxModel
 from psfdae.stages.common import star_wavefronts
 from psfdae.stars.fields import assign_fields, draw_jitter
 from psfdae.stars.framing import normalise_flux
-from psfdae.stability.flux import FluxModel
 from psfdae.stars.noise import NoiseModel
 from psfdae.stars.scene import Propagation
 
