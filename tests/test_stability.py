@@ -214,7 +214,7 @@ def test_cases_of_new_pieces_pass(bench, case):
 
 
 def test_broken_flux_gives_failing_rows(bench, monkeypatch):
-    monkeypatch.setattr(flux, "MARGIN", 1e12)
+    monkeypatch.setattr("psfdae.own_stars.photometry.MARGIN", 1e12)
     assert any("hot pixel of 1e+06" in row for row in failing(photometry_cases.hot_pixels, bench))
 
 
