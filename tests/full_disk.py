@@ -20,10 +20,9 @@ from matplotlib.figure import Figure
 from fits_inputs import write_cube
 from psfdae import files
 from psfdae.cli import main
-from psfdae.files import Column, Empty
+from psfdae.files import Column, Empty, as_yaml
 from psfdae.models.weights import load_checkpoint, load_weights, save_checkpoint, save_weights
 from psfdae.stages.figures import write_png
-from psfdae.stages.trained import as_yaml
 from psfdae.stages.verify import _check_table
 
 FREE_KB = (0, 4, 8, 16, 40, 80, 128, 224, 320, 512, 1024, 3000)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from psfdae.models.pca_som import fit_pca_som
+from psfdae.estimators.pca_som import fit_pca_som
 
 COMPONENTS = (5, 10, 20, 40)
 MAPS = (7, 11, 15)

@@ -46,3 +46,8 @@ reference_option = click.option(
     default="realisation",
     show_default=True,
 )
+
+
+@main.group()
+def figure() -> None:
+    """Draw a figure as PNG from finished products."""

@@ -7,12 +7,12 @@ from pathlib import Path
 import click
 
 from psfdae.cli.base import (
+    figure,
     input_option,
     main,
     out_option,
     overrides,
 )
-from psfdae.cli.figures import figure
 
 
 @main.command()

@@ -6,8 +6,7 @@ from pathlib import Path
 
 import click
 
-from psfdae.cli.base import FileArgument, input_option, main, out_option, overrides
-from psfdae.cli.figures import figure
+from psfdae.cli.base import FileArgument, figure, input_option, main, out_option, overrides
 
 
 @main.command()

@@ -15,14 +15,13 @@ from psfdae.configuration.base import CheckpointSeconds
 from psfdae.configuration.prescription import Prescription
 from psfdae.configuration.schema import (
     Count,
-    Dae,
     Evaluation,
     Group,
     Noise,
     Positive,
-    Train,
 )
 from psfdae.configuration.telescope import Telescope
+from psfdae.estimators.dae import DaeSettings, Train
 
 
 class AlignmentOptics(Group):
@@ -163,7 +162,7 @@ class AlignmentConfig(Group):
     alignment: Alignment
     optics: AlignmentOptics
     noise: Noise
-    dae: Dae
+    dae: DaeSettings
     dae_train: Train
     cnn: Cnn
     train_original: CnnTrain

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
 from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -32,3 +34,22 @@ class Group(BaseModel):
     """A config group: immutable, and no key beyond those declared."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class ConfigError(ValueError):
+    """The configuration is not usable; every line names a key, its value and the range."""
+
+
+def config_dir() -> Path:
+    """Folder of the configuration tree.
+
+    `PSFDAE_CONFIG` names another one; otherwise it is the copy that an installed
+    package has, or `config/` of the source tree.
+    """
+    package = Path(__file__).resolve().parents[1]
+    places = (package / "config", package.parents[1] / "config")
+    folder = next((place for place in places if place.is_dir()), places[-1])
+    folder = Path(os.environ.get("PSFDAE_CONFIG") or folder)
+    if not (folder / "config.yaml").is_file():
+        raise ConfigError(f"{folder}: no config.yaml (set PSFDAE_CONFIG to the config folder)")
+    return folder.resolve()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
@@ -14,44 +13,31 @@ from typing import Any, Literal
 from pydantic import ValidationError, create_model
 
 from psfdae.configuration.alignment import ALIGNMENT_STAGE_KEYS, AlignmentConfig
-from psfdae.configuration.base import NEUTRAL
+from psfdae.configuration.base import NEUTRAL, ConfigError, config_dir
 from psfdae.configuration.consistency import Consistent, with_derived
-from psfdae.configuration.schema import Config, Group
+from psfdae.configuration.schema import Group, whole_config
 from psfdae.configuration.stages import STAGE_KEYS, stage_model
+from psfdae.estimators import registered
 from psfdae.files import ProductError, write_text
 from psfdae.reading import parse_yaml
 
 Root = Literal["config", "alignment"]
 """Root files of the configuration: the datasets', and that of scene 3."""
 
-ROOTS: dict[Root, tuple[type[Group], dict[str, tuple[str, ...]]]] = {
-    "config": (Config, STAGE_KEYS),
-    "alignment": (AlignmentConfig, ALIGNMENT_STAGE_KEYS),
+ROOTS: dict[Root, dict[str, tuple[str, ...]]] = {
+    "config": STAGE_KEYS,
+    "alignment": ALIGNMENT_STAGE_KEYS,
 }
-"""The checked model of every root and the groups that its stages read."""
+"""The groups that the stages of every root read."""
+
+
+def model_of(root: Root) -> type[Group]:
+    """The checked model of a root."""
+    return whole_config() if root == "config" else AlignmentConfig
 
 
 LONGEST = 200
 """Characters of a wrong value that a message repeats."""
-
-
-class ConfigError(ValueError):
-    """The configuration is not usable; every line names a key, its value and the range."""
-
-
-def config_dir() -> Path:
-    """Folder of the configuration tree.
-
-    `PSFDAE_CONFIG` names another one; otherwise it is the copy that an installed
-    package has, or `config/` of the source tree.
-    """
-    package = Path(__file__).resolve().parents[1]
-    places = (package / "config", package.parents[1] / "config")
-    folder = next((place for place in places if place.is_dir()), places[-1])
-    folder = Path(os.environ.get("PSFDAE_CONFIG") or folder)
-    if not (folder / "config.yaml").is_file():
-        raise ConfigError(f"{folder}: no config.yaml (set PSFDAE_CONFIG to the config folder)")
-    return folder.resolve()
 
 
 def compose(overrides: Sequence[str] = (), root: Root = "config") -> dict[str, Any]:
@@ -80,13 +66,31 @@ def _composed(overrides: tuple[str, ...], root: Root) -> dict[str, Any]:
     GlobalHydra.instance().clear()
     try:
         with hydra.initialize_config_dir(str(folder), version_base="1.3"):
-            tree = hydra.compose(root, overrides=list(overrides))
+            tree = hydra.compose(_primary(root, folder), overrides=list(overrides))
         resolved = OmegaConf.to_container(tree, resolve=True, throw_on_missing=True)
     except Exception as error:  # what a broken file leads to inside Hydra is beyond listing
         raise ConfigError(_reason(error, folder)) from error
     if not isinstance(resolved, dict):
         raise ConfigError(f"{folder / root}.yaml: must be a mapping")
     return resolved
+
+
+def _primary(root: Root, folder: Path) -> str:
+    """Name of a root that has the settings of all methods, whether it lists them or not."""
+    from hydra.core.config_store import ConfigStore
+
+    if root != "config":
+        return root
+    tree = parse_yaml(folder / "config.yaml")
+    defaults = tree.get("defaults", [])
+    chosen = {group for entry in defaults if isinstance(entry, dict) for group in entry}
+    groups = {group for kind in registered() for group in kind.groups}
+    if not groups - chosen:
+        return root
+    # Before all others, so that datasets and presets may change them.
+    more = [{group: "default"} for group in sorted(groups - chosen)]
+    ConfigStore.instance().store("config_of_methods", {**tree, "defaults": [*more, *defaults]})
+    return "config_of_methods"
 
 
 def _reason(error: Exception, folder: Path) -> str:
@@ -113,7 +117,7 @@ def load(overrides: Sequence[str] = (), root: Root = "config") -> Any:
     ConfigError
         Names each wrong key with its value and the allowed range.
     """
-    return validate(ROOTS[root][0], compose(overrides, root))
+    return validate(model_of(root), compose(overrides, root))
 
 
 def load_groups(overrides: Sequence[str] = ()) -> Any:
@@ -130,7 +134,7 @@ def load_groups(overrides: Sequence[str] = ()) -> Any:
 @cache
 def _groups_model() -> type[Group]:
     fields: dict[str, Any] = {
-        key: (field.rebuild_annotation(), ...) for key, field in Config.model_fields.items()
+        key: (field.rebuild_annotation(), ...) for key, field in whole_config().model_fields.items()
     }
     model: type[Group] = create_model("Groups", __base__=Group, **fields)
     return model
@@ -196,7 +200,7 @@ def load_stage(
     """
     root = root_of(reads) if isinstance(reads, str) else root
     tree = compose(overrides, root)
-    unknown = sorted(set(tree) - set(ROOTS[root][0].model_fields))
+    unknown = sorted(set(tree) - set(model_of(root).model_fields))
     if unknown:
         raise ConfigError(f"{unknown[0]}: unknown key")
     return part(reads, stage_tree(reads, tree, root), root)
@@ -211,7 +215,7 @@ def load_settings(path: Path, reads: tuple[str, ...], root: Root = "config") -> 
         If the file is no YAML or holds something else; names file, key and range.
     """
     tree = parse_yaml(path)
-    model = stage_model(reads, ROOTS[root][0])
+    model = stage_model(reads, model_of(root))
     return _named(path, lambda: validate(model, tree if isinstance(tree, dict) else {}))
 
 
@@ -252,15 +256,15 @@ def part(reads: str | tuple[str, ...], tree: Any, root: Root = "config") -> Any:
         As `load`.
     """
     root = root_of(reads) if isinstance(reads, str) else root
-    keys = ROOTS[root][1][reads] if isinstance(reads, str) else reads
+    keys = ROOTS[root][reads] if isinstance(reads, str) else reads
     tree = tree if isinstance(tree, Mapping) else tree.model_dump()
     found = {key: tree[key] for key in keys if key in tree}
-    return validate(stage_model(keys, ROOTS[root][0]), found)
+    return validate(stage_model(keys, model_of(root)), found)
 
 
 def root_of(stage: str) -> Root:
     """The root whose groups a stage reads."""
-    return next(root for root, (_, keys) in ROOTS.items() if stage in keys)
+    return next(root for root, keys in ROOTS.items() if stage in keys)
 
 
 def stage_tree(
@@ -276,8 +280,8 @@ def stage_tree(
         If nothing can follow from them.
     """
     root = root_of(reads) if isinstance(reads, str) else root
-    keys = ROOTS[root][1][reads] if isinstance(reads, str) else reads
-    tree = _derived(tree) if issubclass(ROOTS[root][0], Consistent) else tree
+    keys = ROOTS[root][reads] if isinstance(reads, str) else reads
+    tree = _derived(tree) if issubclass(model_of(root), Consistent) else tree
     missing = [key for key in keys if key not in tree]
     if missing:
         raise ConfigError(f"{missing[0]}: missing")
@@ -391,8 +395,8 @@ def _neutral_keys() -> frozenset[tuple[str, str]]:
     """Group and name of the settings that cannot change a result, over all roots."""
     return frozenset(
         (group, name)
-        for model, _ in ROOTS.values()
-        for group, field in model.model_fields.items()
+        for root in ROOTS
+        for group, field in model_of(root).model_fields.items()
         if isinstance(field.annotation, type) and issubclass(field.annotation, Group)
         for name, inner in field.annotation.model_fields.items()
         if NEUTRAL in inner.metadata

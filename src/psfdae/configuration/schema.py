@@ -6,13 +6,13 @@ science code receives SI units (`Telescope.pixel_scale` is in radians).
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from functools import cache
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, create_model, model_validator
 
 from psfdae.configuration.base import (
     SEARCH,
-    CheckpointSeconds,
     Count,
     Group,
     Name,
@@ -22,6 +22,7 @@ from psfdae.configuration.base import (
 from psfdae.configuration.consistency import Consistent
 from psfdae.configuration.telescope import AnyTelescope
 from psfdae.configuration.wavefront import OfTelescope, Seidel, VonKarman
+from psfdae.estimators import Method, registered
 
 Reference = Literal["realisation", "template"]
 SplitKind = Literal["random", "held_out"]
@@ -147,76 +148,6 @@ class Dataset(Group):
     )
 
 
-class Dae(Group):
-    """The denoising autoencoder."""
-
-    kernels: Annotated[list[Annotated[int, Field(ge=1, le=31)]], Field(min_length=2)] = Field(
-        description="Kernel sizes of the convolutions, encoder then decoder; odd"
-    )
-    widths: Annotated[list[Count], Field(min_length=1)] = Field(
-        description="Channels between the convolutions, one fewer than kernels"
-    )
-    init: Literal["he", "default"] = Field(description="He (2015) or PyTorch's default")
-    scale: Literal["mean", "none"] = Field(
-        description="'mean' multiplies images by d² (mean pixel 1), 'none' leaves sum 1"
-    )
-
-    @model_validator(mode="after")
-    def _shape(self) -> Dae:
-        if any(k % 2 == 0 for k in self.kernels):
-            raise ValueError(f"kernels = {self.kernels}: must be odd")
-        if len(self.widths) != len(self.kernels) - 1:
-            raise ValueError(
-                f"widths = {self.widths}: {len(self.kernels)} kernels need "
-                f"{len(self.kernels) - 1} widths, not {len(self.widths)}"
-            )
-        return self
-
-
-class Train(Group):
-    """Optimisation of the denoising autoencoder."""
-
-    epochs: Count = Field(description="Passes over the training stars")
-    batch: Count = Field(description="Stars per step")
-    lr: Annotated[float, Field(gt=0, le=1)] = Field(
-        description="Adam's learning rate (its maximum if one-cycle)"
-    )
-    schedule: Literal["onecycle", "constant"] = Field(description="Course of the learning rate")
-    grad_clip: Annotated[float, Field(ge=0)] = Field(
-        description="Maximum norm of the gradient; 0 switches clipping off"
-    )
-    threads: Count = Field(description="Threads of one training")
-    validate_every: Count = Field(description="Epochs between validations")
-    validation_draws: Count = Field(description="Noise draws per validation star")
-    dead_check_steps: Count = Field(description="Steps between looks for a dead network")
-    restarts: Annotated[int, Field(ge=0)] = Field(
-        description="New starts from another seed if the network dies"
-    )
-    checkpoint_seconds: CheckpointSeconds = Field(
-        description="Least time between checkpoints; repeats nothing"
-    )
-    noise: Literal["fresh", "fixed"] = Field(
-        description="Noise drawn anew every epoch, or once for all epochs"
-    )
-    patience: Annotated[int, Field(ge=0)] = Field(
-        description="Stop after this many validations without a better one; 0 never stops"
-    )
-
-
-class Baseline(Group):
-    """PCA features clustered by a self-organising map."""
-
-    components: Count = Field(description="Principal components K")
-    rows: Count = Field(description="Rows of the map")
-    columns: Count = Field(description="Columns of the map")
-    epochs: Count = Field(description="Passes over the training stars, t_max")
-    sigma: Positive = Field(description="Initial neighbourhood radius in map nodes")
-    learning_rate: Annotated[float, Field(gt=0, le=1)] = Field(
-        description="Initial learning rate of the map"
-    )
-    threads: Count = Field(description="Threads of the linear algebra")
-
-
 class Evaluation(Group):
     """Image metrics."""
 
@@ -309,6 +240,16 @@ class CalibrationStars(Group):
         return self
 
 
+def _listed(name: str) -> str:
+    names = [method.name for method in registered()]
+    if name not in names:
+        raise ValueError(f"{name!r} is not in the list of config.yaml ({', '.join(names)})")
+    return name
+
+
+MethodName = Annotated[str, AfterValidator(_listed)]
+
+
 class Workflow(Group):
     """What the default target of the workflow builds."""
 
@@ -318,10 +259,17 @@ class Workflow(Group):
 
 
 class Config(Consistent):
-    """The whole configuration of one dataset."""
+    """The whole configuration of one dataset, but for the settings of methods."""
+
+    if TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any: ...
 
     seed: Annotated[int, Field(ge=0, lt=2**63)] = Field(description="Of every random draw")
     workflow: Workflow
+    methods: Annotated[list[MethodName], Field(min_length=1)] = Field(
+        description="Methods that are fitted, measured and drawn, in the order of tables"
+    )
     scene: Scene
     telescope: AnyTelescope
     grid: Grid
@@ -332,9 +280,6 @@ class Config(Consistent):
     noise: Noise
     parts: Parts
     dataset: Dataset
-    dae: Dae
-    train: Train
-    baseline: Baseline
     evaluation: Evaluation
     calibration: Calibration
     benchmark: Benchmark
@@ -360,14 +305,19 @@ class Config(Consistent):
                 "framing.subpixel = true: stars.aberration_fraction must be above 0, "
                 "stars without random aberrations are their templates"
             )
-        if self.baseline.components > self.framing.stamp_px**2:
-            raise ValueError(
-                f"baseline.components = {self.baseline.components}: must be at most "
-                f"framing.stamp_px² = {self.framing.stamp_px**2}"
-            )
-        if self.baseline.components > self.parts.train_stars:
-            raise ValueError(
-                f"baseline.components = {self.baseline.components}: must be at most "
-                f"parts.train_stars = {self.parts.train_stars}"
-            )
+        for method in registered():
+            method.check(self)
         return self
+
+
+def whole_config() -> type[Config]:
+    """`Config` with the settings of all methods."""
+    return _with_settings(registered())
+
+
+@cache
+def _with_settings(methods: tuple[type[Method], ...]) -> type[Config]:
+    groups: dict[str, Any] = {
+        name: (group, ...) for method in methods for name, group in method.groups.items()
+    }
+    return create_model("Config", __base__=Config, **groups)

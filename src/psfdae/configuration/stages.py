@@ -7,7 +7,7 @@ from functools import cache
 from pydantic import create_model
 
 from psfdae.configuration.consistency import Consistent
-from psfdae.configuration.schema import Config, Group
+from psfdae.configuration.schema import Group
 
 SIMULATION = ("seed", "scene", "telescope", "grid", "wavefront", "stars", "framing", "optics")
 """Groups that decide the noise-free stars."""
@@ -20,11 +20,11 @@ STAGE_KEYS: dict[str, tuple[str, ...]] = {
     "stars": SIMULATION,
     "baseline": ("seed", "noise", "parts", "baseline"),
     "train": ("seed", "noise", "parts", "dae", "train"),
-    "evaluate": ("seed", "noise", "parts", "evaluation"),
+    "evaluate": ("seed", "noise", "parts", "evaluation", "methods"),
     "bundle": ("seed", "noise", "parts", "evaluation"),
     "from_stars": (
         *("seed", "calibration_stars", "framing", "noise", "parts"),
-        *("dae", "train", "baseline", "evaluation"),
+        *("dae", "train", "baseline", "evaluation", "methods"),
     ),
     "knee": ("seed", "noise", "parts", "dae", "train", "evaluation"),
     "propagation": (*SIMULATION, "noise", "benchmark"),
@@ -32,7 +32,7 @@ STAGE_KEYS: dict[str, tuple[str, ...]] = {
     "timing": (*SIMULATION, "noise", "parts", "dae", "baseline", "evaluation", "benchmark"),
     "scaling": (
         *SIMULATION,
-        *("noise", "parts", "dae", "train", "baseline", "evaluation", "benchmark"),
+        *("noise", "parts", "dae", "train", "baseline", "evaluation", "methods", "benchmark"),
     ),
     "stability": (
         *SIMULATION,
@@ -45,7 +45,7 @@ STAGE_KEYS: dict[str, tuple[str, ...]] = {
 
 
 @cache
-def stage_model(keys: tuple[str, ...], root: type[Group] = Config) -> type[Group]:
+def stage_model(keys: tuple[str, ...], root: type[Group]) -> type[Group]:
     """Some config groups of a root as a model of their own."""
     fields = {key: (root.model_fields[key].rebuild_annotation(), ...) for key in keys}
     base = Consistent if issubclass(root, Consistent) else Group

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from psfdae.estimators import Method, method, oracles_last, registered
 from psfdae.evaluation.curves import METRIC_LABELS, noise_axis, readable_log_axis
 from psfdae.evaluation.figure_style import (
-    METHODS,
     REFERENCES,
     SERIES_COLORS,
     new_figure,
@@ -44,8 +44,8 @@ def errors_above_bounds(efficiency: pd.DataFrame, bounds: pd.DataFrame, dataset:
     figure, panels = _panels(limits, sharey=True)
     for axes, (reference, rows) in zip(panels, _by_reference(limits), strict=True):
         methods = ours[(ours.reference == reference) & (ours.bound == "bayes")]
-        for method, errors in methods.sort_values("noise_level").groupby("method"):
-            axes.plot(errors["noise_level"], errors["mse"], **_line(METHODS[method]))
+        for name, errors in methods.sort_values("noise_level").groupby("method"):
+            axes.plot(errors["noise_level"], errors["mse"], **_line(method(name)))
         _bayes_line(axes, rows[rows.method == "bayes"].sort_values("noise_level"))
         _finish_panel(axes, reference, np.unique(rows["noise_level"]))
     panels[0].set_yscale("log")
@@ -75,9 +75,9 @@ def efficiency_against_noise(efficiency: pd.DataFrame, dataset: str) -> Figure:
     ours = efficiency[efficiency.dataset == dataset]
     figure, panels = _panels(ours, sharey=True)
     for axes, (reference, rows) in zip(panels, _by_reference(ours), strict=True):
-        shown = rows[rows.method.isin(list(METHODS))].sort_values("noise_level")
-        for (method, bound), values in shown.groupby(["method", "bound"]):
-            style = _line(METHODS[method])
+        shown = _of_methods(rows).sort_values("noise_level")
+        for (name, bound), values in shown.groupby(["method", "bound"]):
+            style = _line(method(name))
             style |= {"ls": "-", "lw": 1.6} if bound == "bayes" else {"ls": ":", "mfc": "none"}
             axes.plot(values["noise_level"], values["efficiency"], **style)
         axes.axhline(1.0, color="black", lw=1.0)
@@ -142,8 +142,13 @@ def _by_reference(table: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
     return [(name, table[table.reference == name]) for name in REFERENCES if name in present]
 
 
-def _line(style: dict[str, str]) -> dict[str, Any]:
-    return {"color": style["color"], "marker": style["marker"], "lw": 1.4, "ms": 4.5}
+def _of_methods(table: pd.DataFrame) -> pd.DataFrame:
+    """Rows but for those of the posterior mean."""
+    return table[table.method.isin([kind.name for kind in registered()])]
+
+
+def _line(kind: type[Method]) -> dict[str, Any]:
+    return {"color": kind.color, "marker": kind.marker, "lw": 1.4, "ms": 4.5}
 
 
 def _finish_panel(axes: Axes, reference: str, levels: np.ndarray) -> None:
@@ -201,11 +206,7 @@ def _draw_floor(panels: np.ndarray, limits: pd.DataFrame) -> float | None:
 def _method_entries(methods: set[str]) -> list[Any]:
     from matplotlib.lines import Line2D
 
-    return [
-        Line2D([], [], **_line(style), label=style["label"])
-        for name, style in METHODS.items()
-        if name in methods
-    ]
+    return [Line2D([], [], **_line(kind), label=kind.label) for kind in oracles_last(methods)]
 
 
 def _bounds_legend(figure: Figure, methods: set[str], limits: pd.DataFrame) -> None:
@@ -230,7 +231,7 @@ def _efficiency_legend(figure: Figure, table: pd.DataFrame) -> None:
     from matplotlib.lines import Line2D
 
     handles = _method_entries(set(table["method"]))
-    shown = table[table.method.isin(list(METHODS))].dropna(subset=["efficiency"])
+    shown = _of_methods(table).dropna(subset=["efficiency"])
     for bound, line, label in (
         ("bayes", "-", "against the posterior mean, where tight"),
         ("floor", ":", "against the local floor"),

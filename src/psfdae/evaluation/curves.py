@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from psfdae.evaluation.figure_style import METHODS, REFERENCES, SERIES_COLORS, new_figure, styled
+from psfdae.estimators import Method, method, oracles_last
+from psfdae.evaluation.figure_style import REFERENCES, SERIES_COLORS, new_figure, styled
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -84,20 +85,20 @@ def error_against_noise(
     dataset, metric : str
         For example `dataset3`, `mse`.
     """
-    from psfdae.evaluation.paper import PAPER_ROWS
+    from psfdae.evaluation.paper import paper_rows
 
     ours = metrics[(metrics.dataset == dataset) & (metrics.metric == metric)]
     theirs = paper[(paper.dataset == dataset) & (paper.metric == metric)]
-    theirs = theirs.assign(method=theirs["method"].map(PAPER_ROWS))
+    theirs = theirs.assign(method=theirs["method"].map(paper_rows()))
     references = [name for name in REFERENCES if name in set(ours["reference"])]
     figure = new_figure(4.9, layout="constrained")
     panels = figure.subplots(1, len(references), sharey=True, squeeze=False)[0]
     levels = np.unique(ours["noise_level"])
     for axes, reference in zip(panels, references, strict=True):
-        for (method, split), rows in ours[ours.reference == reference].groupby(["method", "split"]):
-            _method_line(axes, method, split, rows)
-        for method, rows in theirs.groupby("method"):
-            axes.plot(rows["noise_level"], rows["value"], **_paper_marker(method))
+        for (name, split), rows in ours[ours.reference == reference].groupby(["method", "split"]):
+            _method_line(axes, method(name), split, rows)
+        for name, rows in theirs.groupby("method"):
+            axes.plot(rows["noise_level"], rows["value"], **_paper_marker(method(name)))
         axes.set_title(REFERENCES[reference].replace(" (", "\n("))
         noise_axis(axes, levels)
         axes.grid(True, which="major")
@@ -113,14 +114,14 @@ def error_against_noise(
     return figure
 
 
-def _method_line(axes: Axes, method: str, split: str, rows: pd.DataFrame) -> None:
-    style, rows = METHODS[method], rows.sort_values("noise_level")
+def _method_line(axes: Axes, kind: type[Method], split: str, rows: pd.DataFrame) -> None:
+    rows = rows.sort_values("noise_level")
     axes.errorbar(
         rows["noise_level"],
         rows["value"],
         yerr=rows["stderr"],
-        color=style["color"],
-        marker=style["marker"],
+        color=kind.color,
+        marker=kind.marker,
         ls=SPLIT_LINES[split],
         lw=1.4,
         ms=4.5,
@@ -128,16 +129,9 @@ def _method_line(axes: Axes, method: str, split: str, rows: pd.DataFrame) -> Non
     )
 
 
-def _paper_marker(method: str) -> dict[str, Any]:
-    style = METHODS[method]
-    return {
-        "color": style["color"],
-        "marker": style["marker"],
-        "mfc": "none",
-        "mew": 1.4,
-        "ms": 9,
-        "ls": "",
-    }
+def _paper_marker(kind: type[Method]) -> dict[str, Any]:
+    own = {"color": kind.color, "marker": kind.marker}
+    return {**own, "mfc": "none", "mew": 1.4, "ms": 9, "ls": ""}
 
 
 def _method_handles(methods: set[str], published: set[str]) -> list[Any]:
@@ -145,12 +139,12 @@ def _method_handles(methods: set[str], published: set[str]) -> list[Any]:
     from matplotlib.lines import Line2D
 
     handles = []
-    for name, style in METHODS.items():
-        color, marker, label = style["color"], style["marker"], style["label"]
-        if name in methods:
-            handles.append(Line2D([], [], color=color, marker=marker, ms=4.5, lw=1.4, label=label))
-        if name in published:
-            handles.append(Line2D([], [], **_paper_marker(name), label=f"{label}, paper"))
+    for kind in oracles_last(methods | published):
+        if kind.name in methods:
+            own = {"color": kind.color, "marker": kind.marker, "ms": 4.5, "lw": 1.4}
+            handles.append(Line2D([], [], **own, label=kind.label))
+        if kind.name in published:
+            handles.append(Line2D([], [], **_paper_marker(kind), label=f"{kind.label}, paper"))
     return handles
 
 

@@ -1,4 +1,4 @@
-"""How every figure looks: colours of the methods, type sizes, field angles."""
+"""How every figure looks: type sizes, colours, field angles."""
 
 from __future__ import annotations
 
@@ -13,14 +13,6 @@ if TYPE_CHECKING:
 
 WIDTH_IN = 8.0
 """Width of every figure in inches."""
-
-METHODS: dict[str, dict[str, str]] = {
-    "noisy": {"label": "noisy", "color": "#4d4d4d", "marker": "o"},
-    "pca_som": {"label": "PCA+SOM", "color": "#d55e00", "marker": "s"},
-    "dae": {"label": "DAE", "color": "#0072b2", "marker": "D"},
-    "lmmse": {"label": "linear MMSE (told λ)", "color": "#009e73", "marker": "^"},
-}
-"""Label, colour (Okabe & Ito's colour-blind-safe set) and marker of every method."""
 
 SERIES_COLORS = ("#0072b2", "#e69f00", "#cc79a7", "#009e73", "#56b4e9", "#d55e00")
 """Colours of lines that are not methods."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from psfdae.evaluation.bound_figures import BAYES, FLOOR
 from psfdae.evaluation.curves import METRIC_LABELS, noise_axis, readable_log_axis
-from psfdae.evaluation.figure_style import METHODS, new_figure, styled
+from psfdae.evaluation.figure_style import new_figure, styled
 from psfdae.evaluation.figures import StripRow, draw_stamp
 
 if TYPE_CHECKING:
@@ -17,14 +17,19 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-COMPARED = ("noisy", "pca_som", "dae")
+    from psfdae.estimators import Method
+
 NAMED_POINT = 1
 """The noise level at which lines have their names: there they lie apart."""
 
 
 @styled
 def headline(
-    rows: Sequence[StripRow], efficiency: pd.DataFrame, bounds: pd.DataFrame, titles: Sequence[str]
+    rows: Sequence[StripRow],
+    methods: Sequence[Method],
+    efficiency: pd.DataFrame,
+    bounds: pd.DataFrame,
+    titles: Sequence[str],
 ) -> Figure:
     """Stars in rows at the left, MSE against the noise level at the right.
 
@@ -32,6 +37,8 @@ def headline(
     ----------
     rows : sequence of StripRow
         Stamps on the colour scale of the last row, the truth, unless `own_scale`.
+    methods : sequence of Method
+        Those of the lines.
     efficiency, bounds : DataFrame
         Rows of the stages `efficiency` and `bounds`, of one dataset and reference.
     titles : (left, right)
@@ -52,20 +59,21 @@ def headline(
                 axes.set_ylabel(row.label, rotation=0, ha="right", va="center", labelpad=5)
     figure.text(left + 0.5 * columns * step, 0.92, titles[0], ha="center", fontsize=10)
     panel = figure.add_axes((0.66, bottom, 0.325, top - bottom))
-    _errors(panel, efficiency, bounds)
+    _errors(panel, methods, efficiency, bounds)
     figure.text(0.66 + 0.5 * 0.325, 0.92, titles[1], ha="center", fontsize=10)
     return figure
 
 
-def _errors(axes: Axes, efficiency: pd.DataFrame, bounds: pd.DataFrame) -> None:
+def _errors(
+    axes: Axes, methods: Sequence[Method], efficiency: pd.DataFrame, bounds: pd.DataFrame
+) -> None:
     """Errors of the methods and both bounds, each line with its name."""
-    for method in COMPARED:
-        line = efficiency[efficiency.method == method].drop_duplicates("noise_level")
+    for method in methods:
+        line = efficiency[efficiency.method == method.name].drop_duplicates("noise_level")
         line = line.sort_values("noise_level")
-        style = METHODS[method]
-        color, marker = style["color"], style["marker"]
-        axes.plot(line["noise_level"], line["mse"], color=color, marker=marker, lw=1.6, ms=5)
-        _name(axes, line["noise_level"], line["mse"], style["label"], color)
+        style = {"color": method.color, "marker": method.marker, "lw": 1.6, "ms": 5}
+        axes.plot(line["noise_level"], line["mse"], **style)
+        _name(axes, line["noise_level"], line["mse"], method.label, method.color)
     best = bounds[bounds.method == "bayes"].sort_values("noise_level")
     tight = best[best.tight == "yes"]
     axes.plot(best["noise_level"], best["value"], color=BAYES["color"], ls="--", lw=1.2)

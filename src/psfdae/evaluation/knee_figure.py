@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from psfdae.evaluation.figure_style import METHODS, new_figure, styled
+from psfdae.evaluation.figure_style import SERIES_COLORS, new_figure, styled
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -20,7 +20,7 @@ def training_knee(table: pd.DataFrame) -> Figure:
     table : DataFrame
         Columns point, cpu_s, mse, pareto, knee, used (`psfdae.stages.knee`).
     """
-    color = METHODS["dae"]["color"]
+    color = SERIES_COLORS[0]
     figure = new_figure(5.2, layout="constrained")
     axes = figure.add_subplot()
     front = table[table["pareto"] == "yes"].sort_values("cpu_s")

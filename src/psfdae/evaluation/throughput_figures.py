@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from psfdae.evaluation.figure_style import METHODS, SERIES_COLORS, new_figure, styled
+from psfdae.evaluation.figure_style import SERIES_COLORS, new_figure, styled
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -46,7 +46,7 @@ def baseline_figure(table: pd.DataFrame) -> Figure:
             text = f"K {row.components}, {row.rows}×{row.columns}, {row.epochs}"
             _label(axes, row.fit_s, getattr(row, column), text, "#4d4d4d")
         axes.plot(used["fit_s"], used[column], marker="*", ms=13, ls="", mec="black",
-                  mfc=METHODS["pca_som"]["color"], label="in use")  # fmt: skip
+                  mfc=SERIES_COLORS[-1], label="in use")  # fmt: skip
         axes.set(xscale="log", yscale="log", xlabel="time of the fit (s)")
         axes.set_title(f"against the {reference}")
         axes.margins(0.16)

@@ -8,7 +8,6 @@ size of the input.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Protocol
@@ -17,14 +16,12 @@ import numpy as np
 import torch
 from torch import nn
 
+from psfdae.estimators import TrainingSet
 from psfdae.models.training import DeadNetworkError, Row, Training, TrainingError, train
-from psfdae.models.weights import with_weights
 from psfdae.rng import stream
-from psfdae.stars.noise import NoiseModel, mixed_levels
 
 if TYPE_CHECKING:
-    from psfdae.configuration.schema import Dae as DaeConfig
-    from psfdae.configuration.schema import Train
+    from psfdae.estimators.dae import DaeSettings, Train
 
 
 class ArraySource(Protocol):
@@ -163,37 +160,6 @@ def predict_stream(
         yield part, predict(model, noisy[part], factor, batch)
 
 
-def load_dae(config: DaeConfig, weights: Path) -> Dae:
-    """Network of a configuration with weights from a file; raises ProductError."""
-    return with_weights(lambda: Dae(config.kernels, config.widths), weights)
-
-
-@dataclass(frozen=True)
-class TrainingSet:
-    """Noise-free stars of one dataset and what is to be estimated from them.
-
-    Attributes
-    ----------
-    images, references : ndarray, shape (n, d, d), float32
-    fit, validation : ndarray of int
-        Star indices.
-    levels : ndarray, shape (L,)
-        Noise levels λ that are mixed.
-    noise : NoiseModel
-    """
-
-    images: np.ndarray
-    references: np.ndarray
-    fit: np.ndarray
-    validation: np.ndarray
-    levels: np.ndarray
-    noise: NoiseModel
-
-    def draw(self, stars: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Noisy images of `stars`, each at a random level."""
-        return self.noise.draw(self.images[stars], mixed_levels(self.levels, stars.size, rng), rng)
-
-
 class DaeTraining(Training):
     """Training on noisy images, with noise that is drawn anew in every epoch, or once.
 
@@ -204,7 +170,7 @@ class DaeTraining(Training):
     settings: Train
 
     def __init__(
-        self, data: TrainingSet, dae: DaeConfig, settings: Train, seed: int, attempt: int = 0
+        self, data: TrainingSet, dae: DaeSettings, settings: Train, seed: int, attempt: int = 0
     ) -> None:
         self.data, self.seed = data, seed
         self.factor = image_scale(dae.scale, data.images.shape[-1])
@@ -278,7 +244,7 @@ class DaeTraining(Training):
 
 def train_dae(
     data: TrainingSet,
-    dae: DaeConfig,
+    dae: DaeSettings,
     settings: Train,
     seed: int,
     checkpoint: Path,

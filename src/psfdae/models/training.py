@@ -6,9 +6,13 @@ resumes after epoch e continues with exactly the numbers of an uninterrupted one
 
 from __future__ import annotations
 
+import hashlib
+import json
+import sys
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,21 +20,25 @@ import numpy as np
 import torch
 from torch.optim.lr_scheduler import LambdaLR, LRScheduler, OneCycleLR
 
+from psfdae.estimators import FitError
 from psfdae.models.weights import load_checkpoint, save_checkpoint
 
 if TYPE_CHECKING:
     from psfdae.configuration.alignment import CnnTrain
-    from psfdae.configuration.schema import Train
+    from psfdae.estimators.dae import Train
 
 Row = dict[str, float]
 """An epoch in the history of a training."""
+
+ERRORS = {"train_mse": "train MSE", "validation_mse": "validation MSE", "loss": "loss"}
+"""Columns of a history that are shown while a training runs."""
 
 LEARNING = ("model", "optimiser", "scheduler")
 REACHED = ("attempt", "seconds", "cpu_seconds", "history", "best_mse", "best_state")
 """What a checkpoint has of a training: states of torch's own, and plain values."""
 
 
-class TrainingError(RuntimeError):
+class TrainingError(FitError):
     """A training cannot go on; the message says why and what to change."""
 
 
@@ -198,3 +206,32 @@ def train(
         f"the network died in all {restarts + 1} attempts: "
         f"lower {training.key}.lr = {training.settings.lr}"
     )
+
+
+def fingerprint(described: Mapping[str, Any], *arrays: np.ndarray) -> str:
+    """Hash of what a training sees, and of what of its configuration counts."""
+    from psfdae.configuration.compose import decisive
+
+    digest = hashlib.sha256(json.dumps(decisive(described), sort_keys=True).encode())
+    for array in arrays:
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+@contextmanager
+def progress(epochs: int) -> Iterator[Callable[[Row], None]]:
+    """What a training calls after each epoch: a bar, in a log a line."""
+    from tqdm import tqdm
+
+    terminal = sys.stderr.isatty()
+
+    def report(row: Row) -> None:
+        errors = [f"{name} {row[key]:.3e}" for key, name in ERRORS.items() if key in row]
+        bar.set_postfix_str(errors[0])
+        bar.update()
+        if not terminal:
+            line = (f"epoch {row['epoch']:.0f}/{epochs}", *errors, f"{row['seconds']:.0f} s")
+            print("  ".join(line), flush=True)
+
+    with tqdm(total=epochs, unit="epoch", disable=not terminal, desc="train") as bar:
+        yield report

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from psfdae.models.pca_som import PcaSom, fit_pca_som
+from psfdae.estimators.pca_som import PcaSom, fit_pca_som
 from psfdae.rng import stream
 from psfdae.stability.bench import Bench
 from psfdae.stability.precision_cases import subspace_angle

@@ -116,8 +116,8 @@ def _simulate(config: Any, source: ModalWavefronts, batch: int) -> tuple[np.ndar
 
 def _products(config: Any, folder: Path) -> dict[str, bytes]:
     templates, stars = folder / "templates.h5", folder / "stars.h5"
-    templates_stage.run(config, templates)
-    stars_stage.run(config, templates, stars)
+    templates_stage.templates(config, templates)
+    stars_stage.stars(config, templates, stars)
     return {"templates": templates.read_bytes(), "stars": stars.read_bytes()}
 
 

@@ -15,13 +15,13 @@ import numpy as np
 
 from psfdae.alignment.stamps import AlignmentStamps
 from psfdae.belonging import STATE_STAMPS, require, require_origin
+from psfdae.estimators import CONFIG
 from psfdae.files import Column, Product, read_product, write_product, write_text
 from psfdae.reading import from_tree, read_yaml
 from psfdae.rng import stream
 from psfdae.stages.alignment import read_model
 from psfdae.stages.alignment_train import CNN_WEIGHTS, denoise
 from psfdae.stages.common import limit_threads, noise_model
-from psfdae.stages.trained import CONFIG
 
 LEARNED = ("original", "dae", "noise_trained", "dae_retrained")
 """Methods with a CNN, in the order of the product "alignment_estimates"."""

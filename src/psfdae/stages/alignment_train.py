@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from psfdae.belonging import STATE_STAMPS, require, require_origin
-from psfdae.files import Product, read_product
+from psfdae.belonging import STATE_STAMPS, require, require_origin, write_origin
+from psfdae.estimators import CONFIG, HISTORY, TrainingSet
+from psfdae.estimators.dae import Dae
+from psfdae.files import Product, as_csv, as_yaml, read_product, write_text
 from psfdae.rng import stream
 from psfdae.stages.common import limit_threads, noise_model
-from psfdae.stages.trained import WEIGHTS, fingerprint, keep, progress, trained_dae
 from psfdae.stars.noise import mixed_levels
 
 if TYPE_CHECKING:
@@ -42,8 +43,6 @@ def train_dae_stamps(config: Any, grid: Path, train: Path, out: Path, checkpoint
     Raises TrainingError as `train_dae` does, and ProductError if the
     products are of different telescopes or stamps.
     """
-    from psfdae.models.dae import TrainingSet, train_dae
-
     on, validating = _read(grid), _read(train)
     require(train, validating.config, STATE_STAMPS, on.config, grid)
     fit, validation = _flat(on["stamps"]), _flat(validating["stamps"][:VALIDATION_STATES])
@@ -55,12 +54,10 @@ def train_dae_stamps(config: Any, grid: Path, train: Path, out: Path, checkpoint
         validation=np.arange(len(fit), len(images)),
         levels=np.asarray(config.noise.levels),
         noise=noise_model(config),
+        seed=config.seed,
+        checkpoint=checkpoint,
     )
-    described, settings = config.model_dump(), config.dae_train
-    seen = fingerprint(described, images)
-    with progress(settings.epochs) as report:
-        done = train_dae(data, config.dae, settings, config.seed, checkpoint, seen, report)
-    keep(done, out, WEIGHTS, described, on, attempt=done.attempt)
+    Dae.fit(data, config.dae, config.dae_train).store(out, config.model_dump(), on)
     checkpoint.unlink(missing_ok=True)
 
 
@@ -146,14 +143,8 @@ def _weights(config: Any, settings: Any, level: np.ndarray) -> np.ndarray:
 
 def denoise(dae: Path, config: Any, stamps: np.ndarray) -> np.ndarray:
     """Output of a trained DAE for stamps (n, F, d, d), neither clipped nor renormalised."""
-    import torch
-
-    from psfdae.models.dae import image_scale, predict
-
-    torch.set_num_threads(config.evaluation.threads)
-    settings, model = trained_dae(dae)
-    factor = image_scale(settings.scale, stamps.shape[-1])
-    return predict(model, _flat(stamps), factor, config.evaluation.batch).reshape(stamps.shape)
+    network = Dae.load(dae, evaluation=config.evaluation)
+    return network.predict(_flat(stamps)).reshape(stamps.shape)
 
 
 def _train(
@@ -167,7 +158,8 @@ def _train(
 ) -> None:
     """Train one CNN and leave weights, resolved config and history in a folder."""
     from psfdae.alignment.cnn import CnnTraining
-    from psfdae.models.training import train
+    from psfdae.models.training import fingerprint, progress, train
+    from psfdae.models.weights import save_weights
 
     limit_threads(settings.threads)
     fields, side = data.stamps.shape[1], data.stamps.shape[-1]
@@ -179,7 +171,10 @@ def _train(
 
     with progress(settings.epochs) as report:
         done = train(begin, checkpoint, fingerprint(described, data.stamps), report)
-    keep(done, out, CNN_WEIGHTS, described, product)
+    save_weights(out / CNN_WEIGHTS, done.result, described)
+    write_origin(out, product)
+    write_text(out / HISTORY, as_csv(done.history))
+    write_text(out / CONFIG, as_yaml(described))
     checkpoint.unlink(missing_ok=True)
 
 

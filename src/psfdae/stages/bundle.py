@@ -11,6 +11,8 @@ import numpy as np
 import psfdae
 from psfdae.belonging import SAME_IMAGE, SAME_STARS, STARS, require_origin
 from psfdae.configuration.compose import as_overrides
+from psfdae.estimators import CONFIG
+from psfdae.estimators.dae import WEIGHTS, Dae
 from psfdae.files import Product, ProductError
 from psfdae.own_stars import packing
 from psfdae.own_stars.bundle import (
@@ -31,7 +33,6 @@ from psfdae.stages.common import (
     read_stars,
     split_stars,
 )
-from psfdae.stages.trained import CONFIG, WEIGHTS, dae_settings
 
 SEEN_BY_TRAINING = ("seed", "noise", "parts")
 """Groups in which the configuration must be that of the training."""
@@ -64,15 +65,12 @@ def run(
         If the configuration of the stars lacks what a bundle must know, or the network
         was trained on other stars.
     """
-    import torch
-
     limit_threads(config.evaluation.threads)
-    torch.set_num_threads(config.evaluation.threads)
     trained = _trained(dae, config, split)
     product = read_stars(stars, trained["reference"])
     kind = _kind_of_stamps(product)
     require_origin(dae, (*STARS, *SAME_STARS, *SAME_IMAGE), product)
-    network = _load(dae, trained, kind["stamp_px"], config.evaluation.batch)
+    network = _load(dae, kind["stamp_px"], config)
     parts = split_stars(product, trained["split"], config)
     images, references = product["realisation"], product[trained["reference"]]
     held_out = packing.HeldOutStars(images[parts.test], references[parts.test], noise_model(config))
@@ -153,14 +151,13 @@ def _refuse_mismatch(trained: dict[str, Any], asked: dict[str, Any], path: Path)
         )
 
 
-def _load(folder: Path, trained: dict[str, Any], stamp_px: int, batch: int) -> _Network:
-    from psfdae.models.dae import image_scale, load_dae, predict
+def _load(folder: Path, stamp_px: int, config: Any) -> _Network:
+    from psfdae.models.dae import image_scale
 
-    settings = dae_settings(folder, trained)
-    model = load_dae(settings, folder / WEIGHTS)
-    factor = image_scale(settings.scale, stamp_px)
-    weights = {name: value.contiguous().numpy() for name, value in model.state_dict().items()}
-    return _Network(lambda noisy: predict(model, noisy, factor, batch), weights, factor)
+    dae = Dae.load(folder, evaluation=config.evaluation)
+    state = dae.network.state_dict()
+    weights = {name: value.contiguous().numpy() for name, value in state.items()}
+    return _Network(dae.predict, weights, image_scale(dae.settings.scale, stamp_px))
 
 
 def _kind_of_stamps(product: Product) -> dict[str, Any]:

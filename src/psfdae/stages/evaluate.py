@@ -2,88 +2,68 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Mapping
+from dataclasses import make_dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
-from psfdae.belonging import require_training
+from psfdae.cli import File, Folder, Reference, Split, command
+from psfdae.configuration.schema import Config
+from psfdae.estimators import ConfigError, Estimate, Method, method, registered
 from psfdae.evaluation.metrics import all_metrics, clustered_mean
 from psfdae.files import Product, atomic_path, write_text
-from psfdae.models.lmmse import LinearMmse
-from psfdae.reading import read_yaml
-from psfdae.stages import baseline
-from psfdae.stages.common import (
-    limit_threads,
-    noise_model,
-    noisy_test_images,
-    read_stars,
-    split_stars,
+from psfdae.stages.common import limit_threads, noisy_test_images, read_stars, split_stars
+from psfdae.stages.fit import training_set
+
+READS = (
+    *("seed", "noise", "parts", "evaluation", "methods"),
+    *(group for kind in registered() if not kind.stored for group in kind.groups),
 )
-from psfdae.stages.trained import CONFIG, trained_dae
+"""Groups of the configuration on which the measurements depend, models being given."""
 
-Predictor = Callable[[np.ndarray, float], np.ndarray]
+Models: Any = make_dataclass(
+    "Models",
+    [
+        (kind.name, Annotated[(Folder if kind.files else File) | None, kind.about], None)
+        for kind in registered()
+        if kind.stored
+    ],
+)
+"""Options with the model of each method that leaves one."""
 
 
-def run(
-    config: Any,
-    dataset: str,
-    stars: Path,
-    pca_som: Path,
-    dae: Path,
-    split: str,
-    reference: str,
-    out: Path,
-    per_star: Path,
+@command("evaluate", reads=READS)
+def evaluate(
+    config: Config,
+    dataset: Annotated[str, "Name that goes into the table."],
+    stars: Annotated[File, "Product of the stage stars."],
+    models: Models,
+    split: Split = "random",
+    reference: Reference = "realisation",
+    *,
+    per_star: Annotated[File, "Parquet with every star."],
+    out: Annotated[File, "CSV with means and standard errors."],
 ) -> None:
-    """Measure noisy images, PCA+SOM, linear MMSE and DAE against the reference.
-
-    The test noise of a star depends on seed and λ only, so all methods and both
-    references see the same noisy images and their differences are paired.
-
-    Parameters
-    ----------
-    config : stage config (seed, noise, parts, evaluation)
-    dataset : name that goes into the table
-    stars, pca_som : products
-    dae : folder of a trained network
-    split, reference : as in `train`
-    out : CSV, columns dataset, split, reference, method, noise_level, metric,
-        value, stderr (clustered by field), n
-    per_star : Parquet with one row per method, λ and star
-
-    Raises
-    ------
-    ProductError
-        If a product is damaged, or models and stars do not belong together.
-    """
+    """Measure every method on the test stars at each noise level."""
     import pandas as pd
 
     limit_threads(config.evaluation.threads)
     product = read_stars(stars, reference)
-    require_models(product, config, pca_som, dae, split, reference)
-    parts = split_stars(product, split, config)
-    truth = product[reference][parts.test]
-    linear = LinearMmse.fit(
-        product["realisation"][parts.train], product[reference][parts.train], noise_model(config)
-    )
-    methods: dict[str, Predictor] = {
-        "noisy": lambda noisy, level: noisy,
-        "pca_som": _ignoring_level(baseline.load(pca_som).predict),
-        "lmmse": linear.predict,
-        "dae": dae_predictor(dae, config),
-    }
-    field = product["field_index"][parts.test]
+    methods = estimators(config, product, vars(models), split, reference)
+    test = split_stars(product, split, config).test
+    truth, field = product[reference][test], product["field_index"][test]
     key = {"dataset": dataset, "split": split, "reference": reference}
     summary, stars_table = [], []
     for level in config.noise.levels:
-        noisy = noisy_test_images(config, product["realisation"][parts.test], level)
-        for method, predict in methods.items():
-            metrics = all_metrics(predict(noisy, level), truth, config.evaluation.data_range)
-            row = {**key, "method": method, "noise_level": level}
-            summary += _summarise(row, metrics, field)
-            stars_table.append(pd.DataFrame({**row, "star": parts.test, "field": field, **metrics}))
+        # It depends on seed and λ only: methods and references are compared on the same images.
+        noisy = noisy_test_images(config, product["realisation"][test], level)
+        for name, estimator in methods.items():
+            metrics = measured(estimator.estimate(noisy, level), truth, config)
+            row = {**key, "method": name, "noise_level": level}
+            summary += summarised(row, metrics, field)
+            stars_table.append(pd.DataFrame({**row, "star": test, "field": field, **metrics}))
     write_text(out, pd.DataFrame(summary).to_csv(index=False, float_format="%.8g"))
     with atomic_path(per_star) as temporary:
         pd.concat(stars_table, ignore_index=True).to_parquet(
@@ -91,9 +71,21 @@ def run(
         )
 
 
-def _summarise(
+def measured(estimate: Estimate, truth: np.ndarray, config: Config) -> dict[str, np.ndarray]:
+    """Metrics of every star; of a method that says how sure it is, whether that is true."""
+    metrics = all_metrics(estimate.psf, truth, config.evaluation.data_range)
+    if estimate.sigma is not None:
+        inside = np.abs(estimate.psf - truth) <= estimate.sigma
+        metrics["coverage68"] = inside.mean(axis=(1, 2))
+    if estimate.evidence is not None:
+        metrics["evidence"] = estimate.evidence
+    return metrics
+
+
+def summarised(
     row: dict[str, Any], metrics: dict[str, np.ndarray], field: np.ndarray
 ) -> list[dict[str, Any]]:
+    """Mean of each metric, with its standard error clustered by field."""
     rows = []
     for metric, values in metrics.items():
         mean, stderr = clustered_mean(values, field)
@@ -101,43 +93,43 @@ def _summarise(
     return rows
 
 
-def _ignoring_level(predict: Callable[[np.ndarray], np.ndarray]) -> Predictor:
-    return lambda noisy, level: predict(noisy)
-
-
-def require_models(
-    stars: Product, config: Any, pca_som: Path, dae: Path, split: str, reference: str
-) -> None:
-    """Refuse a baseline or a network that does not belong to test stars."""
-    baseline.require_fitted(pca_som, stars, config, split)
-    require_network(stars, config, dae, split, reference)
-
-
-def require_network(stars: Product, config: Any, dae: Path, split: str, reference: str) -> None:
-    """Refuse a network that does not belong to test stars.
+def estimators(
+    config: Config,
+    stars: Product,
+    models: Mapping[str, Path | None],
+    split: str,
+    reference: str,
+    only_drawn: bool = False,
+) -> dict[str, Method]:
+    """The methods of a configuration by name, ready for the test stars of a split.
 
     Parameters
     ----------
+    config : stage config (seed, noise, parts, evaluation, methods)
     stars : product "stars"
-    config : stage config (seed, parts)
-    dae : folder of a trained network
-    split, reference : as in `train`
+    models : file or folder of each method that leaves one
+    split, reference : of the test stars
+    only_drawn : whether only those are wanted that figures of stars show
+
+    Raises
+    ------
+    ConfigError
+        If a model is not given.
+    ProductError
+        If one is damaged, or does not belong to the stars.
     """
-    trained = read_yaml(dae / CONFIG)
-    require_training(dae, trained, stars, config, split=split, reference=reference)
-
-
-def dae_predictor(folder: Path, config: Any) -> Predictor:
-    """The trained network of a folder as a function of noisy images and λ, which it ignores."""
-    import torch
-
-    from psfdae.models.dae import image_scale, predict
-
-    torch.set_num_threads(config.evaluation.threads)
-    settings, model = trained_dae(folder)
-    batch = config.evaluation.batch
-
-    def apply(noisy: np.ndarray, level: float) -> np.ndarray:
-        return predict(model, noisy, image_scale(settings.scale, noisy.shape[-1]), batch)
-
-    return apply
+    kinds = [kind for kind in map(method, config.methods) if kind.drawn or not only_drawn]
+    places: dict[str, Path] = {}
+    for kind in kinds:
+        if kind.stored:
+            place = models.get(kind.name)
+            if place is None:
+                raise ConfigError(f"--{kind.name.replace('_', '-')} is missing: it is in methods")
+            kind.require(place, stars, config, split, reference)
+            places[kind.name] = place
+    return {
+        kind.name: kind.load(places[kind.name], reference, config.evaluation)
+        if kind.stored
+        else kind.fit(training_set(config, kind, stars, split, reference), **kind.settings(config))
+        for kind in kinds
+    }

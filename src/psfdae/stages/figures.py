@@ -2,40 +2,44 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
+from psfdae.cli import AboveZero, File, Reference, command
+from psfdae.configuration.schema import Config
+from psfdae.estimators import Method
 from psfdae.files import Product, ProductError, atomic_path, read_product
 from psfdae.reading import read_table
-from psfdae.stages import baseline
 from psfdae.stages.common import limit_threads, noisy_test_images, read_stars, split_stars
-from psfdae.stages.evaluate import dae_predictor, require_models
-from psfdae.stages.tables import read_evaluations
+from psfdae.stages.evaluate import READS, Models, estimators
+from psfdae.stages.tables import Evaluations, Metric, read_evaluations
 
 if TYPE_CHECKING:
+    import pandas as pd
     from matplotlib.figure import Figure
 
     from psfdae.evaluation.figures import StripRow
 
 DPI = 150
-STRIP_STARS = 8
-"""Columns of a restoration strip."""
+STRIP_STARS, HEADLINE_STARS = 8, 5
+"""Columns of a restoration strip, and of the headline."""
+
+HEADLINE_REFERENCE = "realisation"
+
+Stars = Annotated[File, "Product of the stage stars."]
+Templates = Annotated[File, "Product of the stage templates."]
+Png = Annotated[File, "PNG."]
 
 
-def templates(templates_h5: Path, out: Path) -> None:
-    """Draw the templates of a scene at their field positions.
-
-    Parameters
-    ----------
-    templates_h5 : product "templates"
-    out : path of the PNG
-    """
+@command("figure templates")
+def figure_templates(templates: Templates, out: Png) -> None:
+    """Draw the static PSFs at their field positions."""
     from psfdae.evaluation.figures import template_map
 
-    product = read_product(templates_h5, "templates", ("psf", "grid", "field"))
+    product = read_product(templates, "templates", ("psf", "grid", "field"))
     margin = product.config["framing"]["jitter_px"]
     side = product["psf"].shape[-1] - margin
     psf = product["psf"][:, margin:side, margin:side]
@@ -46,60 +50,42 @@ def templates(templates_h5: Path, out: Path) -> None:
     write_png(template_map(psf, product["grid"], product["field"], title), out)
 
 
-def energy(templates_h5: Path, out: Path) -> None:
-    """Draw how much light the stamps of a scene hold.
-
-    Parameters
-    ----------
-    templates_h5 : product "templates"
-    out : path of the PNG
-    """
+@command("figure energy")
+def figure_energy(templates: Templates, out: Png) -> None:
+    """Draw the light inside the stamp over the field."""
     from psfdae.evaluation.figures import stamp_energy_map
 
-    product = read_product(templates_h5, "templates", ("energy", "grid", "field"))
+    product = read_product(templates, "templates", ("energy", "grid", "field"))
     stamp_px = product.config["framing"]["stamp_px"]
     write_png(stamp_energy_map(product["energy"], product["grid"], product["field"], stamp_px), out)
 
 
-def strip(
-    config: Any,
-    dataset: str,
-    stars_h5: Path,
-    pca_som_h5: Path,
-    dae_dir: Path,
-    reference: str,
-    levels: Sequence[float],
-    out: Path,
+@command("figure strip", reads=READS)
+def figure_strip(
+    config: Config,
+    dataset: Annotated[str, "Name that goes into the title."],
+    stars: Stars,
+    models: Models,
+    reference: Reference = "realisation",
+    *,
+    levels: Annotated[
+        tuple[Annotated[float, AboveZero], ...],
+        {"flag": "--level"},
+        "Noise level λ; repeat for more rows.",
+    ],
+    out: Png,
 ) -> None:
-    """Draw test stars of the split `random` before and after restoration.
-
-    The stars carry the very noise that the stage `evaluate` measures.
-
-    Parameters
-    ----------
-    config : stage config (seed, noise, parts, evaluation) of `evaluate`
-    dataset : name for the title
-    stars_h5, pca_som_h5 : products, the latter of the split `random`
-    dae_dir : folder of the network trained on that split and `reference`
-    reference : "realisation" or "template"
-    levels : noise levels λ, one group of rows each
-    out : path of the PNG
-
-    Raises
-    ------
-    ProductError
-        If models and stars do not belong together.
-    """
+    """Draw test stars of the split random before and after restoration."""
     from psfdae.evaluation.figure_style import REFERENCES, in_field_unit
     from psfdae.evaluation.figures import restoration_strip, spread_stars
 
     limit_threads(config.evaluation.threads)
-    product = read_stars(stars_h5, reference)
-    require_models(product, config, pca_som_h5, dae_dir, "random", reference)
+    product = read_stars(stars, reference)
+    methods = estimators(config, product, vars(models), "random", reference, only_drawn=True)
     test = split_stars(product, "random", config).test
     field = field_of(product)[product["field_index"][test]]
     picks = spread_stars(field, STRIP_STARS)
-    rows = strip_rows(config, product, test, picks, reference, pca_som_h5, dae_dir, levels)
+    rows = strip_rows(config, product, test, picks, reference, methods, levels)
     angle, unit = in_field_unit(field)
     columns = [f"({x:+.1f}, {y:+.1f})".replace("-", "−") for x, y in angle[picks]]
     title = (
@@ -109,54 +95,81 @@ def strip(
     write_png(restoration_strip(rows, columns, title), out)
 
 
-def curves(history_csvs: Sequence[Path], labels: Sequence[str], out: Path) -> None:
-    """Draw the training histories of the networks of a dataset.
+@command("figure headline", reads=READS)
+def figure_headline(
+    config: Config,
+    dataset: str,
+    stars: Stars,
+    models: Models,
+    level: Annotated[float, AboveZero, "Noise level λ."],
+    bounds: Annotated[File, "CSV of the stage bounds."],
+    efficiency: Annotated[File, "CSV of the stage efficiency."],
+    out: Png,
+) -> None:
+    """Draw restored stars beside the errors and their bounds."""
+    from dataclasses import replace
 
-    Parameters
-    ----------
-    history_csvs : `history.csv` of each network
-    labels : name of each network
-    out : path of the PNG
+    from psfdae.evaluation.figures import spread_stars
+    from psfdae.evaluation.headline_figure import headline
 
-    Raises
-    ------
-    ProductError
-        If the numbers of files and labels differ, or a file lacks a column.
-    """
+    limit_threads(config.evaluation.threads)
+    product = read_stars(stars, HEADLINE_REFERENCE)
+    given = (vars(models), "random", HEADLINE_REFERENCE)
+    methods = estimators(config, product, *given, only_drawn=True)
+    test = split_stars(product, "random", config).test
+    picks = spread_stars(field_of(product)[product["field_index"][test]], HEADLINE_STARS)
+    truth, *restored = strip_rows(
+        config, product, test, picks, HEADLINE_REFERENCE, methods, [level]
+    )
+    rows = [
+        replace(row, label=kind.label if kind.restores else f"{kind.label} star")
+        for row, kind in zip(restored, methods.values(), strict=True)
+    ]
+    rows.append(replace(truth, label="truth"))
+    tables = [_headline_rows(path, dataset) for path in (efficiency, bounds)]
+    titles = (f"Test stars of {dataset}, λ = {level:g}", "Error against noise")
+    write_png(headline(rows, list(methods.values()), tables[0], tables[1], titles), out)
 
+
+def _headline_rows(path: Path, dataset: str) -> pd.DataFrame:
+    table = read_table(path)
+    rows = table[(table.dataset == dataset) & (table.reference == HEADLINE_REFERENCE)]
+    if "metric" in rows:
+        rows = rows[rows.metric == "mse"]
+    if rows.empty:
+        raise ProductError(f"{path}: no rows of {dataset}, {HEADLINE_REFERENCE}")
+    return rows
+
+
+@command("figure curves")
+def figure_curves(
+    labels: Annotated[tuple[str, ...], {"flag": "--label"}, "One per history, in order."],
+    histories: Annotated[tuple[File, ...], {"argument": True}],
+    out: Png,
+) -> None:
+    """Draw training and validation error of networks."""
     from psfdae.evaluation.curves import training_curves
 
-    if len(history_csvs) != len(labels):
-        raise ProductError(f"{len(history_csvs)} histories, but {len(labels)} labels")
-    histories = {}
-    for path, label in zip(history_csvs, labels, strict=True):
-        histories[label] = read_table(path)
-        missing = {"step", "train_mse", "validation_mse"} - set(histories[label].columns)
+    if len(histories) != len(labels):
+        raise ProductError(f"{len(histories)} histories, but {len(labels)} labels")
+    tables = {}
+    for path, label in zip(histories, labels, strict=True):
+        tables[label] = read_table(path)
+        missing = {"step", "train_mse", "validation_mse"} - set(tables[label].columns)
         if missing:
             raise ProductError(f"{path}: no column {min(missing)!r}")
-    write_png(training_curves(histories, "Training of the denoising autoencoders"), out)
+    write_png(training_curves(tables, "Training of the denoising autoencoders"), out)
 
 
-def errors(metrics_csvs: Sequence[Path], dataset: str, metric: str, out: Path) -> None:
-    """Draw a metric of all methods against the noise level, with the paper's points.
-
-    Parameters
-    ----------
-    metrics_csvs : CSV files of the stages `evaluate` or `collect`
-    dataset, metric : what to draw
-    out : path of the PNG
-
-    Raises
-    ------
-    ProductError
-        If the files have no such rows.
-    """
+@command("figure errors")
+def figure_errors(dataset: str, metric: Metric, evaluations: Evaluations, out: Png) -> None:
+    """Draw a metric against the noise level, with the paper's points."""
     from psfdae.evaluation.curves import error_against_noise
     from psfdae.evaluation.paper import published
 
-    metrics = read_evaluations(metrics_csvs)
+    metrics = read_evaluations(evaluations)
     if not ((metrics.dataset == dataset) & (metrics.metric == metric)).any():
-        names = ", ".join(str(path) for path in metrics_csvs)
+        names = ", ".join(str(path) for path in evaluations)
         raise ProductError(f"{names}: no rows of {dataset}, {metric}")
     write_png(error_against_noise(metrics, published("psf"), dataset, metric), out)
 
@@ -182,18 +195,17 @@ def strip_rows(
     test: np.ndarray,
     picks: np.ndarray,
     reference: str,
-    pca_som: Path,
-    dae: Path,
+    methods: Mapping[str, Method],
     levels: Sequence[float],
 ) -> list[StripRow]:
-    """Rows of a restoration strip: the reference, then groups by noise level.
+    """Rows of a restoration strip: the reference, then the methods by noise level.
 
     Parameters
     ----------
     config : stage config of `evaluate`
     product : product "stars"
     test, picks : test stars, and those of them that are shown
-    reference, pca_som, dae, levels : as in `strip`
+    reference, methods, levels : what is drawn
     """
     from psfdae.evaluation.figures import StripRow
     from psfdae.evaluation.metrics import mse
@@ -203,14 +215,11 @@ def strip_rows(
     if reference == "template":
         noise_free = product["realisation"][test][picks]
         rows.append(StripRow("star without\nnoise", noise_free, mse(noise_free, truth)))
-    restore_pca, restore_dae = baseline.load(pca_som).predict, dae_predictor(dae, config)
     for level in levels:
         # All test stars, as the stage `evaluate` draws them, then the picked ones.
         noisy = noisy_test_images(config, product["realisation"][test], level)[picks]
-        for label, images, own in (
-            (f"noisy\nλ = {level:g}", noisy, True),
-            (f"PCA+SOM\nλ = {level:g}", restore_pca(noisy), False),
-            (f"DAE\nλ = {level:g}", restore_dae(noisy, level), False),
-        ):
-            rows.append(StripRow(label, images, mse(images, truth), own))
+        for kind in methods.values():
+            images = kind.estimate(noisy, level).psf
+            label = f"{kind.label}\nλ = {level:g}"
+            rows.append(StripRow(label, images, mse(images, truth), not kind.restores))
     return rows

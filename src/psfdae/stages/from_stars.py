@@ -13,6 +13,8 @@ import numpy as np
 
 from psfdae.configuration.compose import as_overrides, part
 from psfdae.configuration.schema import Noise
+from psfdae.estimators.dae import Dae
+from psfdae.estimators.pca_som import PcaSom
 from psfdae.files import write_product, write_text
 from psfdae.own_stars.bundle import SUFFIX
 from psfdae.own_stars.errors import ObservationError
@@ -22,8 +24,10 @@ from psfdae.own_stars.selection import collect
 from psfdae.own_stars.training_images import star_grid, training_columns
 from psfdae.reading import read_table
 from psfdae.rng import stream
-from psfdae.stages import baseline, bundle, evaluate, train
+from psfdae.stages import bundle
 from psfdae.stages.common import check_outputs
+from psfdae.stages.evaluate import Models, evaluate
+from psfdae.stages.fit import baseline, train
 from psfdae.stars.splits import held_out_fields
 
 LOCK = ".from_stars.lock"
@@ -216,21 +220,19 @@ def _steps(
     return [
         (
             "fitting PCA and SOM",
-            lambda: baseline.run(_part("baseline", settings), stars, SPLIT, files.pca_som),
+            lambda: baseline(_part("baseline", settings), stars, SPLIT, out=files.pca_som),
         ),
         (
             "training the DAE",
-            lambda: train.run(
-                *(_part("train", settings), stars, SPLIT, REFERENCE),
-                *(files.dae, files.dae / "checkpoint.pt"),
-            ),
+            lambda: train(_part("train", settings), stars, SPLIT, REFERENCE, out=files.dae),
         ),
         (
             "testing on the stars held out",
-            lambda: evaluate.run(
-                *(_part("evaluate", settings), files.name, stars, files.pca_som, files.dae),
-                *(SPLIT, REFERENCE, files.path / "evaluation.csv"),
-                files.path / "per_star.parquet",
+            lambda: evaluate(
+                *(_part("evaluate", settings), files.name, stars),
+                *(Models(pca_som=files.pca_som, dae=files.dae), SPLIT, REFERENCE),
+                per_star=files.path / "per_star.parquet",
+                out=files.path / "evaluation.csv",
             ),
         ),
         (
@@ -305,8 +307,8 @@ def _draw(config: Any, files: Folder, images: np.ndarray, star: np.ndarray, area
     truth = images[shown]
     estimates = {
         "noisy": noisy[shown],
-        "PCA+SOM": baseline.load(files.pca_som).predict(noisy)[shown],
-        "DAE": evaluate.dae_predictor(files.dae, config)(noisy, level)[shown],
+        "PCA+SOM": PcaSom.load(files.pca_som).predict(noisy)[shown],
+        "DAE": Dae.load(files.dae, evaluation=config.evaluation).predict(noisy)[shown],
     }
     rows = [StripRow("bright\nstar", truth)]
     for label, stamps in estimates.items():

@@ -10,12 +10,12 @@ import numpy as np
 
 from psfdae.benchmark.training import knee, pareto, stopping_point
 from psfdae.configuration.compose import decisive
+from psfdae.estimators import CONFIG, HISTORY
+from psfdae.estimators.dae import Dae
 from psfdae.evaluation.metrics import mse
 from psfdae.files import atomic_path, write_text
 from psfdae.reading import read_table, read_yaml
 from psfdae.stages.common import limit_threads, noisy_test_images, read_stars, split_stars
-from psfdae.stages.evaluate import dae_predictor, require_network
-from psfdae.stages.trained import CONFIG, HISTORY
 
 PATIENCE = 5
 """Validations without a better one after which a training has stopped improving."""
@@ -46,14 +46,14 @@ def run(config: Any, stars: Path, points: Mapping[str, Path], out: Path, stoppin
     limit_threads(config.evaluation.threads)
     product = read_stars(stars)
     for folder in points.values():
-        require_network(product, config, folder, "random", "realisation")
+        Dae.require(folder, product, config, "random", "realisation")
     images = product["realisation"][split_stars(product, "random", config).test]
     noisy = {level: noisy_test_images(config, images, level) for level in config.noise.levels}
     configured = decisive(config.model_dump(include={"dae", "train"}))
     rows = []
     for name, folder in points.items():
-        predict = dae_predictor(folder, config)
-        errors = [float(mse(predict(x, level), images).mean()) for level, x in noisy.items()]
+        network = Dae.load(folder, evaluation=config.evaluation)
+        errors = [float(mse(network.predict(x), images).mean()) for level, x in noisy.items()]
         labels = [f"mse_{level:g}" for level in noisy]
         rows.append(
             {

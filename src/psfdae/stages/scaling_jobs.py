@@ -44,28 +44,27 @@ def simulate(config: dict[str, Any], templates: str, out: str) -> dict[str, floa
     from psfdae.stages import stars
 
     checked = _checked("stars", config)
-    return _measure(lambda: stars.run(checked, Path(templates), Path(out)), Path(out))
+    return _measure(lambda: stars.stars(checked, Path(templates), Path(out)), Path(out))
 
 
 def predict(config: dict[str, Any], dae: str, stars: str, out: str) -> dict[str, float]:
     """Read stars piece by piece, predict and write their PSFs; costs as of `_measure`."""
     import h5py
-    import torch
 
+    from psfdae.estimators.dae import Dae
     from psfdae.files import Empty, stream_product
     from psfdae.models.dae import image_scale, predict_stream
-    from psfdae.stages.trained import trained_dae
 
-    torch.set_num_threads(_checked("evaluate", config).evaluation.threads)
+    evaluation = _checked("evaluate", config).evaluation
 
     def run() -> None:
-        settings, model = trained_dae(Path(dae))
+        network = Dae.load(Path(dae), evaluation=evaluation)
         with h5py.File(stars) as file:
             images = file["realisation"]
             columns = {"psf": Empty(images.shape, np.float32, "1", "predicted PSF")}
-            factor = image_scale(settings.scale, images.shape[-1])
+            factor = image_scale(network.settings.scale, images.shape[-1])
             with stream_product(out, "psf", columns, {}) as data:
-                for part, psf in predict_stream(model, images, factor):
+                for part, psf in predict_stream(network.network, images, factor):
                     data["psf"][part] = psf
 
     return _measure(run, Path(out))
@@ -73,20 +72,20 @@ def predict(config: dict[str, Any], dae: str, stars: str, out: str) -> dict[str,
 
 def baseline(config: dict[str, Any], stars: str, out: str) -> dict[str, float]:
     """Run the stage `baseline`; costs as of `_measure`."""
-    from psfdae.stages import baseline as stage
+    from psfdae.stages.fit import baseline as stage
 
     checked = _checked("baseline", config)
-    return _measure(lambda: stage.run(checked, Path(stars), SPLIT, Path(out)), Path(out))
+    return _measure(lambda: stage(checked, Path(stars), SPLIT, out=Path(out)), Path(out))
 
 
 def train(config: dict[str, Any], stars: str, out: str) -> dict[str, float]:
     """Run the stage `train`; costs as of `_measure`."""
-    from psfdae.stages import train as stage
+    from psfdae.stages.fit import train as stage
 
     checked, folder = _checked("train", config), Path(out)
     checkpoint = folder.with_suffix(".pt")
     return _measure(
-        lambda: stage.run(checked, Path(stars), SPLIT, REFERENCE, folder, checkpoint), folder
+        lambda: stage(checked, Path(stars), SPLIT, REFERENCE, checkpoint, out=folder), folder
     )
 
 
@@ -94,14 +93,13 @@ def evaluate(
     config: dict[str, Any], stars: str, pca_som: str, dae: str, out: str
 ) -> dict[str, float]:
     """Run the stage `evaluate`; costs as of `_measure`."""
-    from psfdae.stages import evaluate as stage
+    from psfdae.stages.evaluate import Models
+    from psfdae.stages.evaluate import evaluate as stage
 
     checked, folder = _checked("evaluate", config), Path(out)
-    inputs = (Path(stars), Path(pca_som), Path(dae))
-    outputs = (folder / "summary.csv", folder / "per_star.parquet")
-    return _measure(
-        lambda: stage.run(checked, "measured", *inputs, SPLIT, REFERENCE, *outputs), folder
-    )
+    given = (Path(stars), Models(pca_som=Path(pca_som), dae=Path(dae)), SPLIT, REFERENCE)
+    outputs = {"per_star": folder / "per_star.parquet", "out": folder / "summary.csv"}
+    return _measure(lambda: stage(checked, "measured", *given, **outputs), folder)
 
 
 def _checked(stage: str, config: dict[str, Any]) -> Any:

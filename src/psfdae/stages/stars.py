@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from psfdae.belonging import STATIC, require
+from psfdae.cli import File, command
+from psfdae.configuration.schema import Config
+from psfdae.configuration.stages import SIMULATION
 from psfdae.files import Column, Empty, read_product, stream_product
 from psfdae.rng import stream
 from psfdae.stages.common import drawn_columns, limit_threads, star_wavefronts
@@ -19,30 +21,18 @@ STARS_AT_A_TIME = 1024
 """Stars that are propagated before they are written; memory does not grow beyond them."""
 
 
-def run(config: Any, templates: Path, out: Path) -> None:
-    """Put stars on fields, perturb, propagate and frame them.
-
-    Every star gets a realisation (static and random aberrations) and a template
-    (static only), each framed on its own brightest pixel and moved by the same
-    jitter, each normalised by the flux inside its stamp (eq. 8). With
-    `framing.subpixel` the pixel grid of a realisation lies anywhere within ± half a
-    pixel of the template's, as it does for real stars. All random
-    numbers are drawn first, about 100 bytes per star; the images are made and
-    written `STARS_AT_A_TIME`.
-
-    Parameters
-    ----------
-    config : stage config (seed, telescope, grid, wavefront, stars, framing, optics)
-    templates : path of the product "templates" of the scene
-    out : path of the HDF5 product "stars"
-
-    Raises
-    ------
-    ProductError
-        If the templates are those of another scene, telescope, grid or stamp size.
-    SamplingError, FramingError
-        If the pupil grid or the search window is too small.
-    """
+@command("stars", reads=SIMULATION)
+def stars(
+    config: Config,
+    templates: Annotated[File, "Product of the stage templates."],
+    out: Annotated[File, "HDF5 product with noise-free stars."],
+) -> None:
+    """Simulate noise-free stars with random aberrations."""
+    # A realisation has static and random aberrations, a template static ones only. Both are
+    # framed on their own brightest pixel, moved by the same jitter and normalised by the flux
+    # inside the stamp (eq. 8). With `framing.subpixel` the pixel grid of a realisation lies
+    # anywhere within ± half a pixel of the template's. All random numbers are drawn first,
+    # about 100 bytes per star; images are made and written `STARS_AT_A_TIME`.
     fixed = read_product(templates, "templates", ("psf", "grid"))
     require(templates, fixed.config, STATIC, config)
     name, count, jitter_px = config.stars.name, config.stars.count, config.framing.jitter_px
@@ -67,11 +57,11 @@ def run(config: Any, templates: Path, out: Path) -> None:
         columns["realisation"] = columns["template"]
         columns["energy"] = Empty((count,), np.float64, "1", "light inside the stamp")
     with stream_product(out, "stars", columns, config.model_dump()) as data:
-        for stars in _chunks(count):
-            part = slice(stars[0], stars[-1] + 1)
-            cut = _templates(fixed["psf"][star_field[stars]], jitter[stars], jitter_px)
+        for chunk in _chunks(count):
+            part = slice(chunk[0], chunk[-1] + 1)
+            cut = _templates(fixed["psf"][star_field[chunk]], jitter[chunk], jitter_px)
             if propagation is not None:
-                cut |= _realisations(config, propagation, stars, jitter[stars], phase[stars])
+                cut |= _realisations(config, propagation, chunk, jitter[chunk], phase[chunk])
             for column, values in cut.items():
                 data[column][part] = values
 
@@ -81,7 +71,7 @@ def _chunks(count: int) -> Iterator[np.ndarray]:
         yield np.arange(start, min(start + STARS_AT_A_TIME, count))
 
 
-def _images(config: Any, about: str) -> Empty:
+def _images(config: Config, about: str) -> Empty:
     side = config.framing.stamp_px
     return Empty((config.stars.count, side, side), np.float32, "1", about)
 
@@ -92,7 +82,7 @@ def _templates(framed: np.ndarray, jitter: np.ndarray, margin: int) -> dict[str,
     return {"template": template, "energy": energy}
 
 
-def _propagation(config: Any, star_field: np.ndarray) -> Any:
+def _propagation(config: Config, star_field: np.ndarray) -> Any:
     from psfdae.stars.scene import Propagation
 
     limit_threads(1)  # batches run side by side
@@ -102,7 +92,7 @@ def _propagation(config: Any, star_field: np.ndarray) -> Any:
     )
 
 
-def _realisation_columns(config: Any, propagation: Any) -> dict[str, Column | Empty]:
+def _realisation_columns(config: Config, propagation: Any) -> dict[str, Column | Empty]:
     count = config.stars.count
     about_peak = "brightest pixel (row, column) from the chief ray"
     return {
@@ -115,7 +105,7 @@ def _realisation_columns(config: Any, propagation: Any) -> dict[str, Column | Em
 
 
 def _realisations(
-    config: Any, propagation: Any, stars: np.ndarray, jitter: np.ndarray, phase: np.ndarray
+    config: Config, propagation: Any, stars: np.ndarray, jitter: np.ndarray, phase: np.ndarray
 ) -> dict[str, np.ndarray]:
     stamps, peak = propagation.framed(config.framing.stamp_px, jitter, stars, phase)
     realisation, energy = normalise_flux(stamps)

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from psfdae.files import ProductError, write_text
+from psfdae.files import ProductError, as_yaml, write_text
 from psfdae.stages.sweep import read_cost, read_result
 from psfdae.sweeps.space import SweepError
 
@@ -123,7 +123,6 @@ def _best_yaml(
 ) -> str:
     """The best point as overrides, those of the workflow before its own."""
     from psfdae.configuration.compose import as_overrides
-    from psfdae.stages.trained import as_yaml
 
     own = [override.removeprefix("++") for override in as_overrides(best["keys"])]
     tree = {

@@ -38,7 +38,7 @@ def simulate(config: dict[str, Any], templates: str, out: str) -> dict[str, floa
 
     checked = part("stars", config)
     scene_module(checked.scene.name)
-    return _measure(lambda: stars.run(checked, Path(templates), Path(out)), Path(out))
+    return _measure(lambda: stars.stars(checked, Path(templates), Path(out)), Path(out))
 
 
 def make_templates(config: dict[str, Any], out: str) -> None:

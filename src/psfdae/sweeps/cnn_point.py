@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from psfdae.belonging import STATE_STAMPS, require
+from psfdae.estimators import CONFIG, HISTORY
 from psfdae.evaluation.alignment_tables import error_rows
 from psfdae.files import read_product, write_text
 from psfdae.models.training import TrainingError
@@ -14,7 +15,6 @@ from psfdae.reading import read_table, read_yaml
 from psfdae.stages import alignment_train as stage
 from psfdae.stages.alignment_evaluate import cnn_predictor, noisy_test_states
 from psfdae.stages.common import limit_threads
-from psfdae.stages.trained import CONFIG, HISTORY
 from psfdae.sweeps.measured import (
     EVALUATION,
     VALIDATION,

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
+from psfdae.estimators import CONFIG, HISTORY
+from psfdae.estimators.dae import WEIGHTS, Dae
 from psfdae.files import read_product
 from psfdae.models.training import TrainingError
 from psfdae.reading import read_table, read_yaml
-from psfdae.stages import train as stage
 from psfdae.stages.common import limit_threads
-from psfdae.stages.evaluate import dae_predictor
-from psfdae.stages.trained import CONFIG, HISTORY, WEIGHTS
+from psfdae.stages.fit import train
 from psfdae.sweeps.measured import Measured, Task, measure_images, stage_part
 
 FILES = (WEIGHTS, CONFIG, HISTORY)
@@ -30,10 +30,10 @@ def run(config: Any, task: Task) -> Measured:
 
     part = stage_part("train", config)
     stars = task.data["stars"]
-    stage.run(part, stars, task.split, task.reference, task.folder, task.checkpoint)
+    train(part, stars, task.split, task.reference, task.checkpoint, out=task.folder)
     limit_threads(config.evaluation.threads)
-    predict = dae_predictor(task.folder, config)
-    metrics = measure_images(config, task, "dae", predict, predict)
+    network = Dae.load(task.folder, evaluation=config.evaluation)
+    metrics = measure_images(config, task, "dae", network, network)
     described = read_yaml(task.folder / CONFIG)
     attempt = described.pop("attempt")
     last = read_table(task.folder / HISTORY).iloc[-1]

@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from psfdae.estimators import Method
+
 EVALUATION, VALIDATION = "evaluation.csv", "validation.csv"
 """Tables of a point: on the test part, as in the main workflow, and on the validation part."""
 
@@ -103,7 +105,7 @@ def image_rows(
     truth: np.ndarray,
     field: np.ndarray,
     noisy: Callable[[np.ndarray, float], np.ndarray],
-    predict: Callable[[np.ndarray, float], np.ndarray],
+    model: Method,
 ) -> list[dict[str, Any]]:
     """Rows of a table as the stage `evaluate` makes them, of one method.
 
@@ -119,20 +121,15 @@ def image_rows(
         Field of every star: standard errors are clustered by it.
     noisy : callable
         Noisy images of `images` at a noise level.
-    predict : callable
-        PSFs of noisy images at a noise level.
+    model : Method
     """
-    from psfdae.evaluation.metrics import all_metrics, clustered_mean
+    from psfdae.stages.evaluate import measured, summarised
 
     key = {"dataset": task.dataset, "split": task.split, "reference": task.reference}
     rows = []
     for level in task.levels:
-        estimate = predict(noisy(images, level), level)
-        found = all_metrics(estimate, truth, config.evaluation.data_range)
-        for metric, values in found.items():
-            mean, stderr = clustered_mean(values, field)
-            row = {**key, "method": method, "noise_level": level, "metric": metric}
-            rows.append({**row, "value": mean, "stderr": stderr, "n": values.size})
+        found = measured(model.estimate(noisy(images, level), level), truth, config)
+        rows += summarised({**key, "method": method, "noise_level": level}, found, field)
     return rows
 
 
@@ -150,8 +147,8 @@ def measure_images(
     config: Any,
     task: Task,
     method: str,
-    validate_with: Callable[[np.ndarray, float], np.ndarray],
-    test_with: Callable[[np.ndarray, float], np.ndarray],
+    validate_with: Method,
+    test_with: Method,
 ) -> dict[str, float]:
     """Measure a model on validation and test stars, and write both tables.
 
@@ -164,9 +161,8 @@ def measure_images(
     task : Task
     method : str
         Name in the tables.
-    validate_with, test_with : callables
-        PSFs of noisy images at a noise level: of a model that has not been fitted to the
-        validation stars, and of the main workflow's.
+    validate_with, test_with : Method
+        One that has not been fitted to the validation stars, and the main workflow's.
     """
     import pandas as pd
 
@@ -186,13 +182,13 @@ def measure_images(
         return noisy_test_images(config, images, level)
 
     metrics: dict[str, float] = {}
-    for part, stars, noisy, predict, name in (
+    for part, stars, noisy, model, name in (
         ("validation", parts.validation, noisy_validation, validate_with, VALIDATION),
         ("test", parts.test, noisy_test, test_with, EVALUATION),
     ):
         images, truth = (product[kind][stars] for kind in ("realisation", task.reference))
         field = product["field_index"][stars]
-        rows = image_rows(config, task, method, images, truth, field, noisy, predict)
+        rows = image_rows(config, task, method, images, truth, field, noisy, model)
         metrics |= image_metrics(part, rows)
         table = pd.DataFrame(rows).to_csv(index=False, float_format="%.8g")
         write_text(task.folder / name, table)

@@ -8,11 +8,11 @@ from functools import cached_property
 from typing import Any
 
 from psfdae.configuration.compose import (
-    ROOTS,
     ConfigError,
     compose,
     config_dir,
     decisive,
+    model_of,
     overrides_for,
     stage_tree,
     validate,
@@ -127,7 +127,7 @@ class Plan:
         where = config_dir() / "sweep" / f"{self.name}.yaml"
         try:
             tree = with_values(self.tree, keys)
-            checked = validate(ROOTS[self.sweep.root][0], tree).model_dump()
+            checked = validate(model_of(self.sweep.root), tree).model_dump()
         except (SweepError, ConfigError) as error:
             at = f" (point {', '.join(f'{k}={v}' for k, v in values.items())})" if values else ""
             raise SweepError(f"{where}: {str(error).splitlines()[0]}{at}") from None
@@ -141,7 +141,7 @@ class Plan:
 
     @cached_property
     def _base(self) -> dict[str, Any]:
-        checked: dict[str, Any] = validate(ROOTS[self.sweep.root][0], self.tree).model_dump()
+        checked: dict[str, Any] = validate(model_of(self.sweep.root), self.tree).model_dump()
         return checked
 
     def _check_range(self) -> None:

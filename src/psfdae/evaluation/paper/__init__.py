@@ -6,11 +6,12 @@ from importlib import resources
 
 import pandas as pd
 
-PAPER_ROWS = {"original_noise": "noisy", "pca": "pca_som", "dae": "dae"}
-"""Rows of the paper's tables and our name of the method."""
+from psfdae.estimators import registered
 
-LABELS = {"noisy": "original-noise", "pca_som": "PCA", "dae": "DAE"}
-"""Our name of the method and the row's label in the paper."""
+
+def paper_rows() -> dict[str, str]:
+    """Rows of the paper's tables and our name of the method."""
+    return {kind.paper[0]: kind.name for kind in registered() if kind.paper}
 
 
 def published(table: str) -> pd.DataFrame:
@@ -35,24 +36,25 @@ def paper_table(metrics: pd.DataFrame, dataset: str, metric: str) -> pd.DataFram
         Columns source (paper or psfdae), reference, method, one per noise level.
         The paper has no rows for datasets that it does not tabulate.
     """
+    labels = {kind.name: kind.paper[1] for kind in registered() if kind.paper}
     ours = metrics[
         (metrics.dataset == dataset)
         & (metrics.metric == metric)
         & (metrics.split == "random")
-        & metrics.method.isin(list(LABELS))
+        & metrics.method.isin(list(labels))
     ].assign(source="psfdae")
     paper = published("psf")
     paper = paper[(paper.dataset == dataset) & (paper.metric == metric)].assign(
         source="paper", reference="as published"
     )
-    paper["method"] = paper["method"].map(PAPER_ROWS)
+    paper["method"] = paper["method"].map(paper_rows())
     both = pd.concat([paper, ours], ignore_index=True)
-    both["order"] = both["method"].map({method: i for i, method in enumerate(LABELS)})
+    both["order"] = both["method"].map({method: i for i, method in enumerate(labels)})
     wide = both.pivot(
         index=["source", "reference", "order", "method"], columns="noise_level", values="value"
     )
     wide = wide.reset_index().drop(columns="order")
-    wide["method"] = wide["method"].map(LABELS)
+    wide["method"] = wide["method"].map(labels)
     wide.columns = [f"{c:g}" if isinstance(c, float) else c for c in wide.columns]
     return wide
 

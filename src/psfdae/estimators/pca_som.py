@@ -9,12 +9,36 @@ decomposition is scikit-learn's, the map is MiniSom's.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import isqrt
+from pathlib import Path
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
+from pydantic import Field
+
+from psfdae.belonging import require
+from psfdae.configuration.base import Count, Group, Positive
+from psfdae.estimators import FitError, Method, TrainingSet
+from psfdae.files import Product, read_product
+from psfdae.rng import stream
+
+
+class Baseline(Group):
+    """PCA features clustered by a self-organising map."""
+
+    components: Count = Field(description="Principal components K")
+    rows: Count = Field(description="Rows of the map")
+    columns: Count = Field(description="Columns of the map")
+    epochs: Count = Field(description="Passes over the training stars, t_max")
+    sigma: Positive = Field(description="Initial neighbourhood radius in map nodes")
+    learning_rate: Annotated[float, Field(gt=0, le=1)] = Field(
+        description="Initial learning rate of the map"
+    )
+    threads: Count = Field(description="Threads of the linear algebra")
 
 
 @dataclass(frozen=True)
-class PcaSom:
+class PcaSom(Method):
     """A fitted baseline: three arrays that can be stored and applied without a library.
 
     Attributes
@@ -29,10 +53,67 @@ class PcaSom:
         Mean star image of each node's cluster.
     """
 
+    label, color, marker = "PCA+SOM", "#d55e00", "s"
+    paper = ("pca", "PCA")
+    groups: ClassVar = {"baseline": Baseline}
+    rule = kind = "baseline"
+    about = "Product of the stage baseline."
+    arrays: ClassVar = {
+        "mean": ("1", "mean training image"),
+        "components": ("1", "eigenvectors, rows"),
+        "nodes": ("1", "map nodes in feature space"),
+        "psf": ("1", "mean star image of each node's cluster"),
+    }
+    minutes = 20
+
     mean: np.ndarray
     components: np.ndarray
     nodes: np.ndarray
     psf: np.ndarray
+
+    @classmethod
+    def check(cls, config: Any) -> None:
+        """Components must be fewer than pixels and stars."""
+        components, side = config.baseline.components, config.framing.stamp_px
+        if components > side**2:
+            raise ValueError(
+                f"baseline.components = {components}: must be at most framing.stamp_px² = {side**2}"
+            )
+        if components > config.parts.train_stars:
+            raise ValueError(
+                f"baseline.components = {components}: must be at most "
+                f"parts.train_stars = {config.parts.train_stars}"
+            )
+
+    @classmethod
+    def fit(cls, data: TrainingSet, baseline: Baseline) -> PcaSom:
+        """Fit noisy images of the training stars at mixed λ.
+
+        Raises
+        ------
+        FitError
+            If there are fewer stars than components.
+        """
+        without = "" if data.validation.size else " validation"
+        if baseline.components > data.train.size:
+            raise FitError(
+                f"baseline.components = {baseline.components}: must be at most "
+                f"{data.train.size}, the number of training stars"
+                f"{' without those that validate' if without else ''}"
+            )
+        noisy = data.draw(data.train, stream(data.seed, "noise", f"baseline{without}"))
+        settings = baseline.model_dump(exclude={"threads"})
+        seed = int(stream(data.seed, "baseline", "map").integers(2**31))
+        return fit_pca_som(noisy, **settings, seed=seed)
+
+    @classmethod
+    def require(cls, place: Path, stars: Product, config: Any, split: str, reference: str) -> None:
+        """As of all methods; its images must have the stars' size, too."""
+        pixels = read_product(place, cls.name, ("mean",))["mean"].size
+        sides = (isqrt(pixels), stars["realisation"].shape[-1])
+        here, there = ({"framing": {"stamp_px": side}} for side in sides)
+        require(place, here, ("framing.stamp_px",), there, stars.path)
+        super().require(place, stars, config, split, reference)
 
     def assign(self, images: np.ndarray) -> np.ndarray:
         """Winning node (eq. 7) of every image, shape (n,).

@@ -11,11 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from psfdae.estimators import Method, TrainingSet
 from psfdae.stars.noise import NoiseModel
 
 
 @dataclass(frozen=True)
-class LinearMmse:
+class LinearMmse(Method):
     """Second moments of a training set.
 
     Attributes
@@ -29,6 +30,11 @@ class LinearMmse:
     noise : NoiseModel
     """
 
+    label, color, marker = "linear MMSE (told λ)", "#009e73", "^"
+    drawn = False
+    told_level = True
+    stored = False
+
     mean_x: np.ndarray
     mean_y: np.ndarray
     cov_xx: np.ndarray
@@ -36,7 +42,12 @@ class LinearMmse:
     noise: NoiseModel
 
     @classmethod
-    def fit(cls, images: np.ndarray, references: np.ndarray, noise: NoiseModel) -> LinearMmse:
+    def fit(cls, data: TrainingSet) -> LinearMmse:
+        """Moments of the training stars."""
+        return cls.of(data.images[data.train], data.references[data.train], data.noise)
+
+    @classmethod
+    def of(cls, images: np.ndarray, references: np.ndarray, noise: NoiseModel) -> LinearMmse:
         """Moments of noise-free training images and references, both of shape (n, d, d)."""
         x = images.reshape(len(images), -1).astype(np.float64)
         y = references.reshape(len(references), -1).astype(np.float64)

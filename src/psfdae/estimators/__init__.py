@@ -1,0 +1,355 @@
+"""Methods: each restores the PSF of a star from its noisy image, and is one class.
+
+To add one takes three places: a module here with a subclass of `Method`, its settings in
+`config/<group>/default.yaml`, and the module's name in the list `methods` of
+`config/config.yaml`. Rules, tables, figures, sweeps, runs of MLflow, bundles and
+`from-stars` ask the classes for all that they must know.
+
+Modules of methods load neither torch nor scipy when they are imported: options of
+commands follow from them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cache
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Self
+
+import numpy as np
+
+from psfdae.belonging import TRAINED_ON, require_training, write_origin
+from psfdae.configuration.base import ConfigError, Group, config_dir
+from psfdae.files import (
+    Column,
+    Product,
+    ProductError,
+    as_csv,
+    read_product,
+    write_product,
+    write_text,
+)
+from psfdae.reading import parse_yaml
+from psfdae.stars.noise import NoiseModel, mixed_levels
+
+if TYPE_CHECKING:
+    from psfdae.configuration.schema import Evaluation
+
+CONFIG, HISTORY = "config.yaml", "history.csv"
+"""Resolved configuration and course of a training, in the folder of a network."""
+
+
+class FitError(RuntimeError):
+    """A method cannot be fitted; the message says why and what to change."""
+
+
+@dataclass(frozen=True)
+class TrainingSet:
+    """All that a method may learn from.
+
+    Attributes
+    ----------
+    images : ndarray, shape (n, d, d), float32
+        Noise-free stars of sum 1, the reference "realisation".
+    references : ndarray, shape (n, d, d), float32
+        What is to be restored; for one fit that serves both references, the templates.
+    fit, validation : ndarray of int
+        Star indices.
+    levels : ndarray, shape (L,)
+        Noise levels λ that are mixed.
+    noise : NoiseModel
+    seed : int
+        Of the method's random streams.
+    fresh : Product or None
+        Other draws of the simulator, with the arrays of a product "stars", if
+        `Method.fresh` asks for them.
+    checkpoint : Path or None
+        Where a long fit may keep its state; the caller removes it once the result is safe.
+    """
+
+    images: np.ndarray
+    references: np.ndarray
+    fit: np.ndarray
+    validation: np.ndarray
+    levels: np.ndarray
+    noise: NoiseModel
+    seed: int = 0
+    fresh: Product | None = None
+    checkpoint: Path | None = None
+
+    @property
+    def train(self) -> np.ndarray:
+        """All training stars, validation included, ascending."""
+        return np.sort(np.concatenate([self.fit, self.validation]))
+
+    def draw(self, stars: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Noisy images of `stars`, each at a random level."""
+        return self.noise.draw(self.images[stars], mixed_levels(self.levels, stars.size, rng), rng)
+
+    def without_validation(self) -> TrainingSet:
+        """The same stars but for those that validate."""
+        return replace(self, validation=self.validation[:0])
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """PSFs, and what a method says of them.
+
+    Attributes
+    ----------
+    psf : ndarray, shape (n, d, d)
+    sigma : ndarray, shape (n, d, d), or None
+        Standard deviation of each pixel of the PSF.
+    evidence : ndarray, shape (n,), or None
+        Logarithm of the probability density of each noisy image.
+    """
+
+    psf: np.ndarray
+    sigma: np.ndarray | None = None
+    evidence: np.ndarray | None = None
+
+
+class Method:
+    """Base of all methods; its name is that of its module.
+
+    Attributes
+    ----------
+    label, color, marker : str
+        In figures.
+    paper : (str, str) or None
+        Its row in the paper's tables as data, and as printed.
+    drawn : bool
+        Shown among restored stars.
+    restores : bool
+        False for the noisy image itself, which is drawn on its own scale.
+    told_level : bool
+        `predict` gets the noise level λ, too: of all images, or of each, shape (n,).
+    groups : mapping
+        Groups of the configuration that are its settings; `fit` gets them by name.
+    stored : bool
+        False if it is fitted where it is applied, in a moment, and leaves no file.
+    per_reference : bool
+        Of a stored one: fitted for each reference, or once for both.
+    validates : bool
+        The fit leaves out the validation stars, or only chooses by them.
+    files : tuple of str
+        Files of the folder that a fit leaves; empty if it leaves one HDF5 product.
+    diagnostics : tuple of str
+        Tables (CSV) beside them, of which a fitted method has the rows in `diagnosed`.
+    arrays : mapping
+        Attributes that are the HDF5 product, and of each its unit and what it is.
+    rule, kind : str
+        Name of its rule, and of its runs in MLflow.
+    about : str
+        What a fit leaves, for the help of commands.
+    memory_mb, minutes : int
+        What a fit takes at most.
+    """
+
+    name: ClassVar[str] = ""
+    label: ClassVar[str]
+    color: ClassVar[str]
+    marker: ClassVar[str] = "o"
+    paper: ClassVar[tuple[str, str] | None] = None
+    drawn: ClassVar[bool] = True
+    restores: ClassVar[bool] = True
+    told_level: ClassVar[bool] = False
+    groups: ClassVar[Mapping[str, type[Group]]] = {}
+    stored: ClassVar[bool] = True
+    per_reference: ClassVar[bool] = False
+    validates: ClassVar[bool] = False
+    files: ClassVar[tuple[str, ...]] = ()
+    diagnostics: ClassVar[tuple[str, ...]] = ()
+    arrays: ClassVar[Mapping[str, tuple[str, str]]] = {}
+    rule: ClassVar[str]
+    kind: ClassVar[str]
+    about: ClassVar[str]
+    memory_mb: ClassVar[int] = 1000
+    minutes: ClassVar[int] = 30
+
+    diagnosed: Mapping[str, list[dict[str, Any]]]
+
+    if TYPE_CHECKING:
+        fit: Callable[..., Any]
+        """Class method: from a `TrainingSet` and the groups of settings to a fitted method."""
+        predict: Callable[..., np.ndarray]
+        """PSFs of flux-normalised noisy images, both of shape (n, d, d)."""
+
+    def __init_subclass__(cls) -> None:
+        cls.name = cls.__module__.rpartition(".")[2]
+        own = vars(cls)
+        cls.rule = own.get("rule", f"fit_{cls.name}")
+        cls.kind = own.get("kind", cls.name)
+        cls.about = own.get("about", f"What `psfdae fit {cls.name}` leaves.")
+
+    @classmethod
+    def reads(cls) -> tuple[str, ...]:
+        """Groups of the configuration that decide a fit."""
+        return ("seed", "noise", "parts", *cls.groups)
+
+    @classmethod
+    def settings(cls, config: Any) -> dict[str, Any]:
+        """Its groups of a configuration, as `fit` takes them."""
+        return {name: getattr(config, name) for name in cls.groups}
+
+    @classmethod
+    def check(cls, config: Any) -> None:
+        """Raise ValueError if its settings contradict other groups of a configuration."""
+
+    @classmethod
+    def threads(cls, config: Any) -> int:
+        """Threads of a fit: the setting of that name, if there is one."""
+        groups = cls.settings(config).values()
+        return next((g.threads for g in groups if hasattr(g, "threads")), 1)
+
+    @classmethod
+    def fresh(cls, config: Any) -> int:
+        """Stars beyond those of the training part, which a simulation may draw; 0: none."""
+        return 0
+
+    def estimate(self, noisy: np.ndarray, level: float | np.ndarray) -> Estimate:
+        """PSFs of noisy images at a noise level λ, or one of each image, shape (n,).
+
+        A method that knows their uncertainty, or the images' evidence, gives it here.
+        """
+        return Estimate(self.predict(noisy, level) if self.told_level else self.predict(noisy))
+
+    @classmethod
+    def stem(cls, dataset: str, split: str, reference: str) -> str:
+        """What tells its fits apart, as part of a path."""
+        return f"{dataset}/{split}" + (f"-{reference}" if cls.per_reference else "")
+
+    @classmethod
+    def place(cls, dataset: str, split: str, reference: str) -> str:
+        """Folder or file of a fit, below the folder of results."""
+        return f"{cls.name}/{cls.stem(dataset, split, reference)}" + ("" if cls.files else ".h5")
+
+    @classmethod
+    def beside(cls, place: str | Path, name: str) -> Path:
+        """A further file of a fit: in its folder, or beside its product."""
+        place = Path(place)
+        return place / name if cls.files else place.with_name(f"{place.stem}.{name}")
+
+    @classmethod
+    def outputs(cls, place: str | Path) -> list[Path]:
+        """All files of a fit."""
+        own = [Path(place, name) for name in cls.files] or [Path(place)]
+        return own + [cls.beside(place, name) for name in (TRAINED_ON, *cls.diagnostics)]
+
+    def save(self, place: Path, described: Mapping[str, Any]) -> None:
+        """Write the fit with its resolved configuration."""
+        columns = {name: Column(getattr(self, name), *said) for name, said in self.arrays.items()}
+        write_product(place, self.name, columns, described)
+
+    def store(self, place: Path, described: Mapping[str, Any], stars: Product) -> None:
+        """Write all files of the fit, which is one to stars."""
+        self.save(place, described)
+        write_origin(place, stars)
+        for name in self.diagnostics:
+            write_text(self.beside(place, name), as_csv(self.diagnosed[name]))
+
+    @classmethod
+    def load(
+        cls, place: Path, reference: str = "realisation", evaluation: Evaluation | None = None
+    ) -> Self:
+        """Read a fit, ready to restore a reference.
+
+        Parameters
+        ----------
+        place : Path
+        reference : str
+            Counts for one fit that serves both.
+        evaluation : config group
+            Threads, and images at a time.
+
+        Raises
+        ------
+        ProductError
+            If a file is missing or damaged.
+        """
+        product = read_product(place, cls.name, tuple(cls.arrays))
+        return cls.restored(product.arrays, product.config, reference)
+
+    @classmethod
+    def restored(
+        cls, arrays: Mapping[str, np.ndarray], config: Mapping[str, Any], reference: str
+    ) -> Self:
+        """A fit from its arrays and the configuration that was saved with them."""
+        return cls(**arrays)
+
+    @classmethod
+    def described(cls, place: Path) -> dict[str, Any]:
+        """The resolved configuration of a fit."""
+        return read_product(place, cls.name, ()).config
+
+    @classmethod
+    def require(cls, place: Path, stars: Product, config: Any, split: str, reference: str) -> None:
+        """Refuse a fit that does not belong to test stars.
+
+        Parameters
+        ----------
+        place : Path
+        stars : product "stars" with its realisations
+        config : stage config (seed, parts)
+        split : "random" or "held_out"
+        reference : "realisation" or "template"
+
+        Raises
+        ------
+        ProductError
+            With both values of what differs.
+        """
+        options = {"split": split} | ({"reference": reference} if cls.per_reference else {})
+        require_training(place, cls.described(place), stars, config, **options)
+
+
+def method(name: str) -> type[Method]:
+    """The method of a name.
+
+    Raises
+    ------
+    ProductError
+        If there is none.
+    """
+    try:
+        module = import_module(f"psfdae.estimators.{name}")
+    except ModuleNotFoundError as error:
+        if not (error.name or "").startswith("psfdae.estimators."):
+            raise
+        raise ProductError(f"no method {name!r}: psfdae.estimators has no such module") from None
+    for kind in vars(module).values():
+        if isinstance(kind, type) and issubclass(kind, Method) and kind.name == name:
+            return kind
+    raise ProductError(f"no method {name!r}: psfdae.estimators.{name} has no class Method")
+
+
+def registered() -> tuple[type[Method], ...]:
+    """The methods that the configuration lists, in the order of tables.
+
+    Raises
+    ------
+    ConfigError
+        If the list is missing, or names something else.
+    """
+    return _listed(config_dir() / "config.yaml")
+
+
+@cache
+def _listed(path: Path) -> tuple[type[Method], ...]:
+    try:
+        tree = parse_yaml(path)
+        names = tree.get("methods") if isinstance(tree, dict) else None
+        if not isinstance(names, list) or len({*map(str, names)}) < len(names):
+            raise ProductError("methods: must be a list of different names")
+        return tuple(method(str(name)) for name in names)
+    except ProductError as error:
+        text = str(error)
+        raise ConfigError(text if text.startswith(str(path)) else f"{path}: {text}") from None
+
+
+def oracles_last(names: Any) -> list[type[Method]]:
+    """Methods among some names in the order of legends: those that are told λ at the end."""
+    kinds = [kind for kind in registered() if kind.name in set(names)]
+    return sorted(kinds, key=lambda kind: kind.told_level)

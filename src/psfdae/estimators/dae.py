@@ -1,0 +1,186 @@
+"""The denoising autoencoder as a method: its settings, its training, its files."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from psfdae.configuration.base import CheckpointSeconds, Count, Group
+from psfdae.estimators import CONFIG, HISTORY, Method, TrainingSet
+from psfdae.files import as_yaml, write_text
+from psfdae.reading import from_tree, read_yaml
+
+if TYPE_CHECKING:
+    from psfdae.configuration.schema import Evaluation
+    from psfdae.models.dae import Dae as Network
+
+WEIGHTS = "dae.safetensors"
+
+
+class DaeSettings(Group):
+    """The denoising autoencoder."""
+
+    kernels: Annotated[list[Annotated[int, Field(ge=1, le=31)]], Field(min_length=2)] = Field(
+        description="Kernel sizes of the convolutions, encoder then decoder; odd"
+    )
+    widths: Annotated[list[Count], Field(min_length=1)] = Field(
+        description="Channels between the convolutions, one fewer than kernels"
+    )
+    init: Literal["he", "default"] = Field(description="He (2015) or PyTorch's default")
+    scale: Literal["mean", "none"] = Field(
+        description="'mean' multiplies images by d² (mean pixel 1), 'none' leaves sum 1"
+    )
+
+    @model_validator(mode="after")
+    def _shape(self) -> DaeSettings:
+        if any(k % 2 == 0 for k in self.kernels):
+            raise ValueError(f"kernels = {self.kernels}: must be odd")
+        if len(self.widths) != len(self.kernels) - 1:
+            raise ValueError(
+                f"widths = {self.widths}: {len(self.kernels)} kernels need "
+                f"{len(self.kernels) - 1} widths, not {len(self.widths)}"
+            )
+        return self
+
+
+class Train(Group):
+    """Optimisation of the denoising autoencoder."""
+
+    epochs: Count = Field(description="Passes over the training stars")
+    batch: Count = Field(description="Stars per step")
+    lr: Annotated[float, Field(gt=0, le=1)] = Field(
+        description="Adam's learning rate (its maximum if one-cycle)"
+    )
+    schedule: Literal["onecycle", "constant"] = Field(description="Course of the learning rate")
+    grad_clip: Annotated[float, Field(ge=0)] = Field(
+        description="Maximum norm of the gradient; 0 switches clipping off"
+    )
+    threads: Count = Field(description="Threads of one training")
+    validate_every: Count = Field(description="Epochs between validations")
+    validation_draws: Count = Field(description="Noise draws per validation star")
+    dead_check_steps: Count = Field(description="Steps between looks for a dead network")
+    restarts: Annotated[int, Field(ge=0)] = Field(
+        description="New starts from another seed if the network dies"
+    )
+    checkpoint_seconds: CheckpointSeconds = Field(
+        description="Least time between checkpoints; repeats nothing"
+    )
+    noise: Literal["fresh", "fixed"] = Field(
+        description="Noise drawn anew every epoch, or once for all epochs"
+    )
+    patience: Annotated[int, Field(ge=0)] = Field(
+        description="Stop after this many validations without a better one; 0 never stops"
+    )
+
+
+class Dae(Method):
+    """A network, the factor of its images, and how it was trained.
+
+    Parameters
+    ----------
+    network : Network
+    settings : config group `dae`
+    batch : int
+        Images per forward pass.
+    attempt : int
+        Starts of the training before the one that succeeded.
+    history : list of dict
+        Course of the training.
+    """
+
+    label, color, marker = "DAE", "#0072b2", "D"
+    paper = ("dae", "DAE")
+    groups: ClassVar = {"dae": DaeSettings, "train": Train}
+    per_reference = True
+    validates = True
+    files = (WEIGHTS, CONFIG)
+    diagnostics = (HISTORY,)
+    rule = "train"
+    about = "Folder of a trained network."
+    memory_mb, minutes = 1500, 60
+
+    def __init__(
+        self,
+        network: Network,
+        settings: DaeSettings,
+        batch: int = 256,
+        attempt: int = 0,
+        history: list[dict[str, Any]] | None = None,
+    ) -> None:
+        self.network, self.settings, self.batch, self.attempt = network, settings, batch, attempt
+        self.diagnosed = {HISTORY: history or []}
+
+    @classmethod
+    def threads(cls, config: Any) -> int:
+        """Those of the training."""
+        return int(config.train.threads)
+
+    @classmethod
+    def fit(cls, data: TrainingSet, dae: DaeSettings, train: Train) -> Dae:
+        """Train, and keep the state with the least validation error; resumes if interrupted.
+
+        Raises
+        ------
+        TrainingError
+            As `train_dae`.
+        """
+        import torch
+
+        from psfdae.models.dae import Dae as Network
+        from psfdae.models.dae import train_dae
+        from psfdae.models.training import fingerprint, progress
+
+        described = {"dae": dae.model_dump(), "train": train.model_dump(), "seed": data.seed}
+        described["noise"] = [data.levels.tolist(), data.noise.kappa, data.noise.background]
+        seen = fingerprint(described, data.images, data.references, data.fit, data.validation)
+        with progress(train.epochs) as report:
+            assert data.checkpoint is not None
+            done = train_dae(data, dae, train, data.seed, data.checkpoint, seen, report)
+        network = Network(dae.kernels, dae.widths)
+        network.load_state_dict(done.result)
+        network = network.to(memory_format=torch.channels_last).eval()
+        return cls(network, dae, attempt=done.attempt, history=done.history)
+
+    def predict(self, noisy: np.ndarray) -> np.ndarray:
+        """PSFs, neither clipped nor renormalised, float32."""
+        from psfdae.models.dae import image_scale, predict
+
+        factor = image_scale(self.settings.scale, noisy.shape[-1])
+        return predict(self.network, noisy, factor, self.batch)
+
+    def save(self, place: Path, described: Mapping[str, Any]) -> None:
+        """Write weights, and the resolved configuration with the number of the start."""
+        from psfdae.models.weights import save_weights
+
+        save_weights(place / WEIGHTS, self.network.state_dict(), described)
+        write_text(place / CONFIG, as_yaml({**described, "attempt": self.attempt}))
+
+    @classmethod
+    def load(
+        cls, place: Path, reference: str = "realisation", evaluation: Evaluation | None = None
+    ) -> Dae:
+        """As of all methods; the two files must be of the same training."""
+        import torch
+
+        from psfdae.configuration.compose import validate
+        from psfdae.models.dae import Dae as Network
+        from psfdae.models.weights import with_weights
+
+        described, batch = cls.described(place), 256
+        settings = from_tree(
+            place / CONFIG, described, "dae", make=lambda tree: validate(DaeSettings, tree)
+        )
+        if evaluation is not None:
+            torch.set_num_threads(evaluation.threads)
+            batch = evaluation.batch
+        network = with_weights(lambda: Network(settings.kernels, settings.widths), place / WEIGHTS)
+        return cls(network, settings, batch)
+
+    @classmethod
+    def described(cls, place: Path) -> dict[str, Any]:
+        """The resolved configuration of the training."""
+        return read_yaml(place / CONFIG)

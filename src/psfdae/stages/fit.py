@@ -1,0 +1,97 @@
+"""Stage `fit`: a method for one dataset and split, and for a reference if it has one each."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import click
+import numpy as np
+
+from psfdae.cli import File, Folder, Reference, Split, command
+from psfdae.configuration.schema import Config
+from psfdae.estimators import Method, TrainingSet, method
+from psfdae.files import Product
+from psfdae.stages.common import limit_threads, noise_model, read_stars, split_stars
+
+Stars = Annotated[File, "Product of the stage stars."]
+
+
+def groups_of(name: str, **options: Any) -> tuple[str, ...]:
+    """Groups of the configuration that decide a fit of a method."""
+    return method(name).reads()
+
+
+@command("fit", reads=groups_of)
+def fit(
+    config: Config,
+    name: Annotated[str, {"argument": True, "metavar": "METHOD"}],
+    stars: Stars,
+    split: Split = "random",
+    reference: Reference = "realisation",
+    fresh: Annotated[File | None, "Product of the stage stars with other draws."] = None,
+    checkpoint: Annotated[File | None, "State of an interrupted fit, if it keeps one."] = None,
+    *,
+    out: Annotated[Path, click.Path(path_type=Path), "Folder or HDF5 product."],
+) -> None:
+    """Fit METHOD, a name of the list `methods` in config.yaml."""
+    kind = method(name)
+    limit_threads(kind.threads(config))
+    product = read_stars(stars, reference if kind.per_reference else "template")
+    more = None if fresh is None else read_stars(fresh, "template")
+    kept = checkpoint or kind.beside(out, "checkpoint.pt")
+    data = training_set(config, kind, product, split, reference, fresh=more, checkpoint=kept)
+    described = {**config.model_dump(), "split": split}
+    described |= {"reference": reference} if kind.per_reference else {}
+    kind.fit(data, **kind.settings(config)).store(out, described, product)
+    kept.unlink(missing_ok=True)
+
+
+@command("baseline", reads=groups_of("pca_som"))
+def baseline(
+    config: Config,
+    stars: Stars,
+    split: Split = "random",
+    *,
+    out: Annotated[File, "HDF5 product with the fitted PCA+SOM."],
+) -> None:
+    """Fit the PCA+SOM baseline."""
+    fit(config, "pca_som", stars, split, out=out)
+
+
+@command("train", reads=groups_of("dae"))
+def train(
+    config: Config,
+    stars: Stars,
+    split: Split = "random",
+    reference: Reference = "realisation",
+    checkpoint: Annotated[
+        File | None, "State of an interrupted training.  [default: OUT/checkpoint.pt]"
+    ] = None,
+    *,
+    out: Annotated[Folder, "Folder for weights, resolved config and history."],
+) -> None:
+    """Train a denoising autoencoder; resumes from its checkpoint."""
+    fit(config, "dae", stars, split, reference, checkpoint=checkpoint, out=out)
+
+
+def training_set(
+    config: Config,
+    kind: type[Method],
+    stars: Product,
+    split: str,
+    reference: str,
+    **more: Any,
+) -> TrainingSet:
+    """What a method learns from: the training part of a split, with a configuration's noise."""
+    parts = split_stars(stars, split, config)
+    return TrainingSet(
+        images=stars["realisation"],
+        references=stars["template" if kind.stored and not kind.per_reference else reference],
+        fit=parts.fit,
+        validation=parts.validation,
+        levels=np.asarray(config.noise.levels),
+        noise=noise_model(config),
+        seed=config.seed,
+        **more,
+    )
