@@ -31,7 +31,7 @@ def fresh_psfs(folder, count):
     overrides = ["dataset=field", "seed=7", f"stars.count={count}"]
     overrides += ["parts.train_stars=1", "parts.test_stars=1"]
     templates.templates(load_stage("templates", overrides), folder / "templates.h5")
-    stars.run(load_stage("stars", overrides), folder / "templates.h5", folder / "stars.h5")
+    stars.stars(load_stage("stars", overrides), folder / "templates.h5", folder / "stars.h5")
     product = read_product(folder / "stars.h5", "stars", ("realisation",))
     return product["realisation"].astype(np.float64)
 

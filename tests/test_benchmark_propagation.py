@@ -405,15 +405,18 @@ for name in list(sys.modules):
     if name.partition(".")[0] in unwanted:
         del sys.modules[name]
 
-from psfdae.stages import baseline, evaluate, stars, tables, templates, train
+from psfdae.stages import stars, tables, templates
+from psfdae.stages.evaluate import Models, evaluate
+from psfdae.stages.fit import baseline, train
 out = Path(sys.argv[1])
 made = {name: out / name for name in ("templates", "stars", "pca_som", "dae", "csv", "per_star")}
 templates.templates(config["templates"], made["templates"])
-stars.run(config["stars"], made["templates"], made["stars"])
-baseline.run(config["baseline"], made["stars"], "random", made["pca_som"])
-train.run(config["train"], made["stars"], "random", "realisation", made["dae"], out / "check.pt")
-evaluate.run(config["evaluate"], "dataset3", made["stars"], made["pca_som"], made["dae"],
-             "random", "realisation", made["csv"], made["per_star"])
+stars.stars(config["stars"], made["templates"], made["stars"])
+baseline(config["baseline"], made["stars"], out=made["pca_som"])
+train(config["train"], made["stars"], out=made["dae"])
+evaluate(config["evaluate"], "dataset3", made["stars"],
+         Models(pca_som=made["pca_som"], dae=made["dae"]),
+         per_star=made["per_star"], out=made["csv"])
 tables.collect([made["csv"]], out / "all.csv")
 print(imported, [name for name in unwanted if name in sys.modules])
 """

@@ -32,7 +32,7 @@ def settings(stage, dataset, *more):
 def build(folder, dataset):
     """Products and tables of a dataset's bounds, made by the stages."""
     templates.templates(settings("templates", dataset), folder / "templates.h5")
-    stars.run(settings("stars", dataset), folder / "templates.h5", folder / "stars.h5")
+    stars.stars(settings("stars", dataset), folder / "templates.h5", folder / "stars.h5")
     config = settings(bounds.bounds, dataset)
     drawn = folder / "bank.h5" if config.stars.aberration_fraction else None
     if drawn:

@@ -29,8 +29,9 @@ from psfdae.own_stars.bundle import (
 from psfdae.own_stars.photometry import FluxModel
 from psfdae.rng import stream
 from psfdae.stages import bundle as stage
-from psfdae.stages import bundle_use, train
+from psfdae.stages import bundle_use
 from psfdae.stages.common import noise_model, noisy_test_images
+from psfdae.stages.fit import train
 
 TINY = [
     "noise.levels=[1e-3,3e-3,1e-2]",
@@ -74,7 +75,7 @@ def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("bundle")
     stars = write_stars(folder / "stars.h5", STARS)
     config = load_stage("train", TINY)
-    train.run(config, stars, "random", "realisation", folder / "dae", folder / "checkpoint.pt")
+    train(config, stars, out=folder / "dae")
     pack(folder, folder / "tiny.psf.safetensors")
     return folder
 
@@ -309,7 +310,7 @@ def test_shipped_bundle_covers_stars_that_nobody_has_seen(tmp_path):
     sizes = ["seed=11", "grid.points=5", "grid.spacing_deg=2.75", "stars.count=500"]
     chosen = ["dataset=field", *sizes, "parts.train_stars=400", "parts.test_stars=100"]
     templates.templates(load_stage("templates", chosen), tmp_path / "t.h5")
-    stars.run(load_stage("stars", chosen), tmp_path / "t.h5", tmp_path / "s.h5")
+    stars.stars(load_stage("stars", chosen), tmp_path / "t.h5", tmp_path / "s.h5")
     images = read_product(tmp_path / "s.h5", "stars", ("realisation",))["realisation"]
     bundle, rng = read_bundle(), stream(11, "coverage")
     band = np.log([bundle.info.noise_min, bundle.info.noise_max])

@@ -100,7 +100,7 @@ def test_settings_that_cannot_change_a_result_are_set_apart(stage):
 def test_a_checkpoint_does_not_depend_on_how_often_it_is_written():
     import numpy as np
 
-    from psfdae.stages.trained import fingerprint
+    from psfdae.models.training import fingerprint
 
     def of(*overrides):
         return fingerprint(load(overrides).model_dump(), np.zeros(3))

@@ -24,7 +24,7 @@ pytestmark = [pytest.mark.workflow, pytest.mark.slow]
 TARGET = "results/smoke/evaluation/dataset3/random-realisation.csv"
 WEIGHTS = "results/smoke/dae/dataset3/random-realisation/dae.safetensors"
 STARS = "results/smoke/data/seidel/seidel_10pct.h5"
-CHECKPOINT = "results/smoke/checkpoints/dataset3-random-realisation.pt"
+CHECKPOINT = "results/smoke/checkpoints/dae/dataset3/random-realisation.pt"
 LOG = "results/smoke/logs/dae/dataset3/random-realisation.log"
 # Long enough for a signal to arrive in mid-training, which then resumes.
 SLOW = "train.epochs=80 train.checkpoint_seconds=0 train.batch=8"
@@ -107,7 +107,7 @@ def test_killed_worker(half_done, recovers):
     written = (half_done / STARS).stat().st_mtime_ns
     run = started(half_done)
     for child in psutil.Process(run.pid).children(recursive=True):
-        if "train" in child.cmdline() and "--checkpoint" in child.cmdline():
+        if "fit" in child.cmdline() and "--checkpoint" in child.cmdline():
             child.kill()
     ended(run, half_done)
     assert (half_done / CHECKPOINT).exists()

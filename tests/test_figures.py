@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
 import pytest
 
 from psfdae.configuration.compose import load_stage
+from psfdae.estimators.dae import Dae
+from psfdae.estimators.pca_som import PcaSom
 from psfdae.evaluation.curves import error_against_noise, training_curves
-from psfdae.evaluation.figure_style import METHODS, in_field_unit
+from psfdae.evaluation.figure_style import in_field_unit
 from psfdae.evaluation.figures import (
     StripRow,
     mosaic,
@@ -25,10 +26,12 @@ from psfdae.evaluation.paper import published
 from psfdae.files import Column, ProductError, write_product
 from psfdae.rng import stream
 from psfdae.stages import figures as stage
+from psfdae.stages.evaluate import Models
 from psfdae.stars.fields import square_grid
 from psfdae.stars.noise import NoiseModel
 from psfdae.stars.splits import random_split
 
+METHODS = ("noisy", "pca_som", "dae", "lmmse")
 LEVELS = (0.001, 0.002, 0.003, 0.005)
 
 
@@ -220,10 +223,10 @@ def test_stages_write_the_same_bytes_twice(tmp_path):
     history = pd.DataFrame({"step": [1, 2], "train_mse": [2e-5, 1e-5], "validation_mse": 1e-5})
     history.to_csv(tmp_path / "h.csv", index=False)
     draws = {
-        "templates": lambda out: stage.templates(tmp_path / "t.h5", out),
-        "energy": lambda out: stage.energy(tmp_path / "t.h5", out),
-        "curves": lambda out: stage.curves([tmp_path / "h.csv"], ["one"], out),
-        "errors": lambda out: stage.errors([tmp_path / "m.csv"], "dataset3", "mse", out),
+        "templates": lambda out: stage.figure_templates(tmp_path / "t.h5", out),
+        "energy": lambda out: stage.figure_energy(tmp_path / "t.h5", out),
+        "curves": lambda out: stage.figure_curves(["one"], [tmp_path / "h.csv"], out),
+        "errors": lambda out: stage.figure_errors("dataset3", "mse", [tmp_path / "m.csv"], out),
     }
     for name, draw in draws.items():
         one, two = tmp_path / f"{name}_1.png", tmp_path / f"{name}_2.png"
@@ -248,6 +251,13 @@ def test_a_users_matplotlibrc_changes_nothing(tmp_path):
     assert (tmp_path / "plain.png").read_bytes() == (tmp_path / "odd.png").read_bytes()
 
 
+def unchanged(kind, *place):
+    """A fit that gives images back as they are."""
+    fit = kind.__new__(kind)
+    object.__setattr__(fit, "predict", lambda noisy: noisy)
+    return fit
+
+
 def test_strip_shows_the_noise_that_evaluate_measures(tmp_path, gaussian_stars, monkeypatch):
     index, _ = square_grid(5, 1.1)
     columns = {
@@ -262,16 +272,17 @@ def test_strip_shows_the_noise_that_evaluate_measures(tmp_path, gaussian_stars, 
         "evaluate", ("dataset=dataset3", "parts.train_stars=200", "parts.test_stars=100")
     )
     shown = {}
-    monkeypatch.setattr(stage.baseline, "load", lambda path: SimpleNamespace(predict=lambda x: x))
-    monkeypatch.setattr(stage, "dae_predictor", lambda folder, config: lambda x, level: x)
-    monkeypatch.setattr(stage, "require_models", lambda *models: None)
+    for kind in (PcaSom, Dae):
+        monkeypatch.setattr(kind, "require", lambda *stars: None)
+        monkeypatch.setattr(kind, "load", classmethod(unchanged))
     monkeypatch.setattr(
         "psfdae.evaluation.figures.restoration_strip",
         lambda rows, columns, title: shown.update(rows=rows, columns=columns, title=title),
     )
     monkeypatch.setattr(stage, "write_png", lambda figure, out: None)
-    files = (tmp_path / "s.h5", tmp_path / "p.h5", tmp_path / "dae")
-    stage.strip(config, "dataset3", *files, "template", [0.002], tmp_path / "strip.png")
+    models = Models(pca_som=tmp_path / "p.h5", dae=tmp_path / "dae")
+    given = (config, "dataset3", tmp_path / "s.h5", models, "template")
+    stage.figure_strip(*given, levels=[0.002], out=tmp_path / "strip.png")
     labels = [row.label.replace("\n", " ") for row in shown["rows"]]
     models = ["noisy λ = 0.002", "PCA+SOM λ = 0.002", "DAE λ = 0.002"]
     assert labels == ["reference", "star without noise", *models]
@@ -289,12 +300,12 @@ def test_strip_shows_the_noise_that_evaluate_measures(tmp_path, gaussian_stars, 
 def test_refusals_name_the_problem(tmp_path):
     metrics_table().to_csv(tmp_path / "m.csv", index=False)
     with pytest.raises(ProductError, match="no rows of dataset5, mse"):
-        stage.errors([tmp_path / "m.csv"], "dataset5", "mse", tmp_path / "e.png")
+        stage.figure_errors("dataset5", "mse", [tmp_path / "m.csv"], tmp_path / "e.png")
     (tmp_path / "h.csv").write_text("step,train_mse\n1,2\n")
     with pytest.raises(ProductError, match="validation_mse"):
-        stage.curves([tmp_path / "h.csv"], ["one"], tmp_path / "c.png")
+        stage.figure_curves(["one"], [tmp_path / "h.csv"], tmp_path / "c.png")
     with pytest.raises(ProductError, match="1 histories, but 2 labels"):
-        stage.curves([tmp_path / "h.csv"], ["one", "two"], tmp_path / "c.png")
+        stage.figure_curves(["one", "two"], [tmp_path / "h.csv"], tmp_path / "c.png")
     assert not list(tmp_path.glob("*.png"))
 
 

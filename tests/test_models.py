@@ -8,27 +8,26 @@ import numpy as np
 import pytest
 import torch
 
-from psfdae.configuration.schema import Dae as DaeConfig
-from psfdae.configuration.schema import Train
+from psfdae.estimators import TrainingSet
+from psfdae.estimators.dae import DaeSettings, Train
+from psfdae.estimators.lmmse import LinearMmse
+from psfdae.estimators.pca_som import PcaSom, fit_pca_som
 from psfdae.evaluation.metrics import mse
 from psfdae.files import ProductError
 from psfdae.models.dae import (
     DaeTraining,
     SingleChannelConv,
-    TrainingSet,
     build_dae,
     image_scale,
     predict,
     train_dae,
 )
-from psfdae.models.lmmse import LinearMmse
-from psfdae.models.pca_som import PcaSom, fit_pca_som
 from psfdae.models.training import TrainingError
 from psfdae.models.weights import load_weights, save_checkpoint, save_weights
 from psfdae.rng import stream
 
 SOM = {"rows": 4, "columns": 4, "epochs": 3, "sigma": 1.0, "learning_rate": 0.5, "seed": 1}
-DAE = DaeConfig(kernels=[5, 3, 1, 3, 5], widths=[4] * 4, init="he", scale="mean")
+DAE = DaeSettings(kernels=[5, 3, 1, 3, 5], widths=[4] * 4, init="he", scale="mean")
 TRAIN = Train(
     epochs=3,
     batch=50,
@@ -85,7 +84,7 @@ def test_linear_mmse_is_the_posterior_mean_of_gaussian_data(noise):
     rng = np.random.default_rng(0)
     mixing = rng.normal(size=(64, 5)) * 0.01
     images = (rng.normal(size=(20000, 5)) @ mixing.T + 1 / 64).reshape(-1, 8, 8)
-    fitted = LinearMmse.fit(images[:10000], images[:10000], noise)
+    fitted = LinearMmse.of(images[:10000], images[:10000], noise)
     level = 2e-3
     sigma2 = (noise.kappa * level) ** 2 + (1 / 64) / float(noise.flux(level))
     noisy = images[10000:] + rng.normal(size=(10000, 8, 8)) * np.sqrt(sigma2)
@@ -97,7 +96,7 @@ def test_linear_mmse_is_the_posterior_mean_of_gaussian_data(noise):
 
 
 def test_linear_mmse_returns_the_mean_when_the_noise_is_overwhelming(gaussian_stars, noise):
-    fitted = LinearMmse.fit(gaussian_stars, gaussian_stars, noise)
+    fitted = LinearMmse.of(gaussian_stars, gaussian_stars, noise)
     estimate = fitted.predict(gaussian_stars[:5], 1e3)
     assert estimate == pytest.approx(
         np.broadcast_to(gaussian_stars.mean(axis=0), (5, 16, 16)), abs=1e-6
@@ -109,7 +108,7 @@ def test_linear_mmse_finds_references_that_are_another_image(noise):
     rng = np.random.default_rng(0)
     modes, images, references = rng.normal(size=(500, 4)), *rng.normal(size=(2, 4, 64)) * 1e-3
     x, y = ((1 / 64 + modes @ mixing).reshape(-1, 8, 8) for mixing in (images, references))
-    estimate = LinearMmse.fit(x[:400], y[:400], noise).predict(x[400:], 1e-8)
+    estimate = LinearMmse.of(x[:400], y[:400], noise).predict(x[400:], 1e-8)
     assert mse(estimate, y[400:]).max() < 1e-4 * y.var()
 
 

@@ -73,9 +73,9 @@ def test_unfilled_or_failed_stream_leaves_no_file(tmp_path):
 
 def test_stars_do_not_depend_on_how_many_are_made_at_a_time(cheap, tmp_path, monkeypatch):
     config, fixed = cheap
-    stars.run(config, fixed, tmp_path / "whole.h5")
+    stars.stars(config, fixed, tmp_path / "whole.h5")
     monkeypatch.setattr(stars, "STARS_AT_A_TIME", 17)
-    stars.run(config, fixed, tmp_path / "pieces.h5")
+    stars.stars(config, fixed, tmp_path / "pieces.h5")
     whole, pieces = (read_product(tmp_path / f"{n}.h5", "stars") for n in ("whole", "pieces"))
     for name in ("field_index", "jitter", "peak", "seidel", "pupil_samples"):
         assert (whole[name] == pieces[name]).all(), name

@@ -12,11 +12,13 @@ import pytest
 import yaml
 
 from psfdae.configuration.compose import compose, load, load_stage, stage_tree
+from psfdae.estimators.pca_som import PcaSom
 from psfdae.files import Column, ProductError, write_product
-from psfdae.stages import baseline, sweep_figures, sweep_summary, track, train
 from psfdae.stages import sweep as stage
+from psfdae.stages import sweep_figures, sweep_summary, track
 from psfdae.stages.alignment_train import train_noise_trained
 from psfdae.stages.common import noise_model
+from psfdae.stages.fit import baseline, train
 from psfdae.stars.splits import random_split
 from psfdae.sweeps.measured import Task
 from psfdae.sweeps.space import SweepError
@@ -77,7 +79,7 @@ def test_point_is_the_main_workflow_s_training(point, stars, tmp_path):
     assert result["status"] == "finished"
     assert (result["epochs"], result["attempt"]) == (3, 0)
     config = load_stage("train", TINY)
-    train.run(config, stars, "random", "realisation", tmp_path / "main", tmp_path / "main.pt")
+    train(config, stars, out=tmp_path / "main")
     for name in ("dae.safetensors", "config.yaml"):
         assert (tmp_path / "main" / name).read_bytes() == (point.folder / name).read_bytes()
 
@@ -146,7 +148,7 @@ def test_failed_point_is_a_result_with_its_reason(point):
 
 def test_baseline_is_the_main_workflow_s(point, stars, tmp_path):
     assert point.run(model="pca_som")["status"] == "finished"
-    baseline.run(load_stage("baseline", TINY), stars, "random", tmp_path / "main.h5")
+    baseline(load_stage("baseline", TINY), stars, out=tmp_path / "main.h5")
     assert (tmp_path / "main.h5").read_bytes() == (point.folder / "pca_som.h5").read_bytes()
 
 
@@ -164,7 +166,7 @@ def test_baseline_is_validated_on_stars_that_it_has_not_seen(tmp_path, gaussian_
     assert (errors > 0.9 / 256).all()
     config = load_stage("baseline", TINY)
     noisy = noise_model(config).draw(images[validation], 0.001, np.random.default_rng(0))
-    seen = baseline.load(point.folder / "pca_som.h5").predict(noisy)
+    seen = PcaSom.load(point.folder / "pca_som.h5").predict(noisy)
     assert ((seen - images[validation]) ** 2).mean() < 0.1 / 256
 
 

@@ -180,7 +180,7 @@ def test_seidel_telescope_is_scene_1_byte_by_byte(tmp_path):
     for name, choice in (("paper", ["stars=seidel_10pct"]), ("own", own)):
         fields, out = tmp_path / f"{name}_t.h5", tmp_path / f"{name}.h5"
         templates.templates(load_stage("templates", [*choice, *small]), fields)
-        stars.run(load_stage("stars", [*choice, *small]), fields, out)
+        stars.stars(load_stage("stars", [*choice, *small]), fields, out)
         products.append((read_product(fields, "templates"), read_product(out, "stars")))
     for paper, mine in zip(*products, strict=True):
         assert set(paper.arrays) == set(mine.arrays)
@@ -206,7 +206,7 @@ def test_random_aberrations_have_both_spreads():
 def test_stars_of_zernike_telescope_differ_from_their_template(tmp_path):
     choice = [OWN, "grid.points=3", "stars.count=20"]
     templates.templates(load_stage("templates", choice), tmp_path / "t.h5")
-    stars.run(load_stage("stars", choice), tmp_path / "t.h5", tmp_path / "s.h5")
+    stars.stars(load_stage("stars", choice), tmp_path / "t.h5", tmp_path / "s.h5")
     product = read_product(tmp_path / "s.h5", "stars")
     assert product["realisation"].sum(axis=(1, 2)) == pytest.approx(np.ones(20), abs=1e-5)
     assert np.abs(product["realisation"] - product["template"]).max() > 0.01

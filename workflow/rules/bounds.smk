@@ -1,5 +1,6 @@
 BOUNDS = f"{RESULTS}/bounds"
 HEADLINE_DATASET = "dataset3"
+HEADLINE = (HEADLINE_DATASET, "random", "realisation")
 
 
 rule bank:
@@ -185,9 +186,7 @@ rule figure_bank_growth:
 rule figure_headline:
     input:
         stars=lambda w: stars_of(HEADLINE_DATASET),
-        pca_som=f"{RESULTS}/pca_som/{HEADLINE_DATASET}/random.h5",
-        dae=f"{RESULTS}/dae/{HEADLINE_DATASET}/random-realisation/dae.safetensors",
-        dae_config=f"{RESULTS}/dae/{HEADLINE_DATASET}/random-realisation/config.yaml",
+        models=lambda w: fitted(*HEADLINE, drawn=True),
         bounds=rules.psf_bounds.output,
         efficiency=rules.psf_efficiency.output,
     output:
@@ -207,18 +206,18 @@ rule figure_headline:
         mem_mb=1000,
         runtime=5,
     params:
-        config=lambda w: stage_overrides("evaluate", f"dataset={HEADLINE_DATASET}"),
-        source=source_hash("psfdae.stages.headline"),
+        config=lambda w: settings("figure headline", f"dataset={HEADLINE_DATASET}"),
+        source=lambda w: estimators_source("psfdae.stages.figures", HEADLINE_DATASET),
         dataset=HEADLINE_DATASET,
-        dae=subpath(input.dae, parent=True),
+        models=lambda w: model_options(*HEADLINE, drawn=True),
         level=lambda w: shown_levels(HEADLINE_DATASET)[-1],
     message:
         "Drawing the figure of the README"
     shell:
-        "psfdae figure headline --dataset {params.dataset} --stars {input.stars}"
-        " --pca-som {input.pca_som} --dae {params.dae} --level {params.level}"
+        "psfdae figure headline --config {params.config} --dataset {params.dataset}"
+        " --stars {input.stars} {params.models} --level {params.level}"
         " --bounds {input.bounds} --efficiency {input.efficiency} --out {output}"
-        " {params.config:q} > {log} 2>&1"
+        " > {log} 2>&1"
 
 
 rule bounds:

@@ -2,11 +2,14 @@
 SHIPPED_DATASET = "field"
 
 
+def packed(w):
+    return model_of(method("dae"), w.dataset, w.split, w.reference)
+
+
 rule bundle:
     input:
         stars=lambda w: stars_of(w.dataset),
-        dae=rules.train.output.weights,
-        dae_config=rules.train.output.config,
+        model=lambda w: [str(p) for p in method("dae").outputs(packed(w))],
     output:
         f"{RESULTS}/bundles/{{dataset}}-{{split}}-{{reference}}.psf.safetensors",
     log:
@@ -20,7 +23,7 @@ rule bundle:
     params:
         config=lambda w: stage_overrides("bundle", f"dataset={w.dataset}"),
         source=source_hash("psfdae.stages.bundle"),
-        dae=subpath(input.dae, parent=True),
+        dae=lambda w: packed(w),
     message:
         "Packing the DAE of {wildcards.dataset}, {wildcards.split}, {wildcards.reference}"
     shell:

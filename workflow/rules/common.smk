@@ -11,6 +11,7 @@ from psfdae.configuration.compose import compose, dataset_names, decisive, load
 from psfdae.configuration.compose import load_groups, neutral, overrides_for, stage_tree
 from psfdae.configuration.compose import write_settings
 from psfdae.configuration.stages import STAGE_KEYS
+from psfdae.estimators import HISTORY, method, registered
 from psfdae.files import DIGESTS, ProductError
 from psfdae.source import source_hash
 from psfdae.sweeps.space import SweepError
@@ -80,7 +81,7 @@ def dataset_config(dataset):
 
 @cache
 @one_line()
-def settings(name, *choice, more=(), **options):
+def settings(name, /, *choice, more=(), **options):
     """File with the settings that a stage reads, where a choice is made (dataset=…).
 
     Its name follows from those that can change a result: another name repeats a job.
@@ -94,7 +95,9 @@ def settings(name, *choice, more=(), **options):
         tree = compose(ALIGNMENT_OVERRIDES, spec.root)
     folder = Path(RESULTS, ".settings")
     # As text: Snakemake does not remember params that are paths.
-    return str(write_settings(folder, name, reads, tree, spec.root, dry=workflow.dryrun))
+    return str(
+        write_settings(folder, name, reads, tree, spec.root, dry=workflow.dryrun)
+    )
 
 
 @one_line()
@@ -118,17 +121,6 @@ def free_overrides(stage, choice, more=()):
     is not a reason to repeat a job.
     """
     return as_overrides(neutral(stage_tree(stage, composed(choice, more=more))))
-
-
-def telescope_overrides(stage, dataset):
-    """As stage_overrides, for a telescope that brings its own aberrations.
-
-    Their keys differ from telescope to telescope, so that it is chosen by name, too.
-    """
-    choice = f"dataset={dataset}"
-    name = dataset_config(dataset).telescope.name
-    telescope = [f"telescope={name}"] if name in options("telescope") else []
-    return [choice, *telescope, *stage_overrides(stage, choice)[1:]]
 
 
 @cache
@@ -212,7 +204,7 @@ def figures_of(dataset):
     folder = f"{RESULTS}/figures"
     return [
         *field_figures_of(dataset),
-        f"{folder}/{dataset}/curves.png",
+        *([f"{folder}/{dataset}/curves.png"] if histories_of(dataset) else []),
         *(f"{folder}/{dataset}/errors_{metric}.png" for metric in ("mse", "ssim")),
         *(f"{folder}/{dataset}/strip_{r}.png" for r in settings.dataset.references),
     ]

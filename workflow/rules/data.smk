@@ -34,12 +34,12 @@ rule stars:
         mem_mb=1000,
         runtime=30,
     params:
-        config=lambda w: stage_overrides("stars", f"stars={w.stars}"),
+        config=lambda w: settings("stars", f"stars={w.stars}"),
         source=lambda w: source_hash(
             "psfdae.stages.stars", f"psfdae.stars.{w.scene}_scene"
         ),
     message:
         "Simulating the noise-free stars {wildcards.stars}"
     shell:
-        "psfdae stars --templates {input.templates} --out {output} {params.config:q}"
-        " > {log} 2>&1"
+        "psfdae stars --config {params.config} --templates {input.templates}"
+        " --out {output} > {log} 2>&1"

@@ -1,9 +1,7 @@
 rule evaluate:
     input:
         stars=lambda w: stars_of(w.dataset),
-        pca_som=rules.baseline.output.model,
-        dae=rules.train.output.weights,
-        dae_config=rules.train.output.config,
+        models=lambda w: fitted(w.dataset, w.split, w.reference),
     output:
         summary=f"{RESULTS}/evaluation/{{dataset}}/{{split}}-{{reference}}.csv",
         per_star=f"{RESULTS}/evaluation/{{dataset}}/{{split}}-{{reference}}.parquet",
@@ -14,18 +12,17 @@ rule evaluate:
     threads: lambda w: dataset_config(w.dataset).evaluation.threads
     resources:
         mem_mb=1500,
-        runtime=10,
     params:
-        config=lambda w: stage_overrides("evaluate", f"dataset={w.dataset}"),
-        source=source_hash("psfdae.stages.evaluate"),
-        dae=subpath(input.dae, parent=True),
+        config=lambda w: settings("evaluate", f"dataset={w.dataset}"),
+        source=lambda w: estimators_source("psfdae.stages.evaluate", w.dataset),
+        models=lambda w: model_options(w.dataset, w.split, w.reference),
     message:
         "Evaluating {wildcards.dataset}, {wildcards.split}, {wildcards.reference}"
     shell:
-        "psfdae evaluate --dataset {wildcards.dataset} --split {wildcards.split}"
-        " --reference {wildcards.reference} --stars {input.stars}"
-        " --pca-som {input.pca_som} --dae {params.dae} --per-star {output.per_star}"
-        " --out {output.summary} {params.config:q} > {log} 2>&1"
+        "psfdae evaluate --config {params.config} --dataset {wildcards.dataset}"
+        " --split {wildcards.split} --reference {wildcards.reference}"
+        " --stars {input.stars} {params.models} --per-star {output.per_star}"
+        " --out {output.summary} > {log} 2>&1"
 
 
 rule paper_tables:
@@ -45,10 +42,6 @@ rule paper_tables:
     benchmark:
         f"{RESULTS}/benchmarks/paper_tables/{{dataset}}-{{metric}}.tsv"
     localrule: True
-    threads: 1
-    resources:
-        mem_mb=500,
-        runtime=10,
     params:
         source=source_hash("psfdae.stages.tables"),
     message:
@@ -71,10 +64,6 @@ rule psf_metrics:
     benchmark:
         f"{RESULTS}/benchmarks/psf_metrics/all.tsv"
     localrule: True
-    threads: 1
-    resources:
-        mem_mb=500,
-        runtime=10,
     params:
         source=source_hash("psfdae.stages.tables"),
     message:

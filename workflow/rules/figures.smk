@@ -13,10 +13,6 @@ rule figure_templates:
         f"{RESULTS}/logs/figures/{{scene}}/templates.log",
     benchmark:
         f"{RESULTS}/benchmarks/figure_templates/{{scene}}.tsv"
-    threads: 1
-    resources:
-        mem_mb=500,
-        runtime=10,
     params:
         source=source_hash("psfdae.stages.figures"),
     message:
@@ -40,10 +36,6 @@ rule figure_energy:
         f"{RESULTS}/logs/figures/{{scene}}/energy.log",
     benchmark:
         f"{RESULTS}/benchmarks/figure_energy/{{scene}}.tsv"
-    threads: 1
-    resources:
-        mem_mb=500,
-        runtime=10,
     params:
         source=source_hash("psfdae.stages.figures"),
     message:
@@ -55,9 +47,7 @@ rule figure_energy:
 rule figure_strip:
     input:
         stars=lambda w: stars_of(w.dataset),
-        pca_som=f"{RESULTS}/pca_som/{{dataset}}/random.h5",
-        dae=f"{RESULTS}/dae/{{dataset}}/random-{{reference}}/dae.safetensors",
-        dae_config=f"{RESULTS}/dae/{{dataset}}/random-{{reference}}/config.yaml",
+        models=lambda w: fitted(w.dataset, "random", w.reference, drawn=True),
     output:
         report(
             f"{RESULTS}/figures/{{dataset}}/strip_{{reference}}.png",
@@ -73,27 +63,22 @@ rule figure_strip:
     threads: lambda w: dataset_config(w.dataset).evaluation.threads
     resources:
         mem_mb=1000,
-        runtime=10,
     params:
-        config=lambda w: stage_overrides("evaluate", f"dataset={w.dataset}"),
-        source=source_hash("psfdae.stages.figures"),
-        dae=subpath(input.dae, parent=True),
+        config=lambda w: settings("figure strip", f"dataset={w.dataset}"),
+        source=lambda w: estimators_source("psfdae.stages.figures", w.dataset),
+        models=lambda w: model_options(w.dataset, "random", w.reference, drawn=True),
         levels=lambda w: [f"--level={level:g}" for level in shown_levels(w.dataset)],
     message:
         "Drawing restored stars of {wildcards.dataset}, {wildcards.reference}"
     shell:
-        "psfdae figure strip --dataset {wildcards.dataset}"
-        " --reference {wildcards.reference} --stars {input.stars}"
-        " --pca-som {input.pca_som} --dae {params.dae} {params.levels}"
-        " --out {output} {params.config:q} > {log} 2>&1"
+        "psfdae figure strip --config {params.config} --dataset {wildcards.dataset}"
+        " --reference {wildcards.reference} --stars {input.stars} {params.models}"
+        " {params.levels} --out {output} > {log} 2>&1"
 
 
 rule figure_curves:
     input:
-        lambda w: [
-            f"{RESULTS}/dae/{w.dataset}/{split}-{reference}/history.csv"
-            for split, reference in networks_of(w.dataset)
-        ],
+        lambda w: list(histories_of(w.dataset)),
     output:
         report(
             f"{RESULTS}/figures/{{dataset}}/curves.png",
@@ -106,15 +91,8 @@ rule figure_curves:
         f"{RESULTS}/logs/figures/{{dataset}}/curves.log",
     benchmark:
         f"{RESULTS}/benchmarks/figure_curves/{{dataset}}.tsv"
-    threads: 1
-    resources:
-        mem_mb=500,
-        runtime=10,
     params:
-        labels=lambda w: [
-            f"--label={w.dataset}, {split}, {reference}"
-            for split, reference in networks_of(w.dataset)
-        ],
+        labels=lambda w: [f"--label={x}" for x in histories_of(w.dataset).values()],
         source=source_hash("psfdae.stages.figures"),
     message:
         "Drawing the training curves of {wildcards.dataset}"
@@ -137,12 +115,8 @@ rule figure_errors:
         f"{RESULTS}/logs/figures/{{dataset}}/errors_{{metric}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/figure_errors/{{dataset}}-{{metric}}.tsv"
-    threads: 1
-    resources:
-        mem_mb=500,
-        runtime=10,
     params:
-        source=source_hash("psfdae.stages.figures"),
+        source=lambda w: estimators_source("psfdae.stages.figures", w.dataset),
     message:
         "Drawing {wildcards.metric} of {wildcards.dataset} against the noise level"
     shell:

@@ -53,7 +53,7 @@ rule knee_train:
     params:
         config=lambda w: knee_overrides(w.point, stage_overrides),
         free=lambda w, threads: knee_overrides(w.point, free_overrides),
-        source=source_hash("psfdae.stages.train"),
+        source=source_hash("psfdae.stages.fit", "psfdae.estimators.dae"),
         folder=subpath(output.weights, parent=True),
         checkpoint=lambda w: f"{RESULTS}/checkpoints/knee-{w.point}.pt",
     message:

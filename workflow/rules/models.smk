@@ -1,56 +1,118 @@
-rule baseline:
-    input:
-        stars=lambda w: stars_of(w.dataset),
+def model_of(method, dataset, split, reference):
+    """Folder or file of a fit."""
+    return f"{RESULTS}/{method.place(dataset, split, reference)}"
+
+
+def methods_of(dataset):
+    """Methods of a dataset that leave a model."""
+    return [m for m in map(method, dataset_config(dataset).methods) if m.stored]
+
+
+def fitted(dataset, split, reference, drawn=False):
+    """Files of all models that restore stars of a split, or of those that figures show."""
+    return [
+        str(path)
+        for m in methods_of(dataset)
+        if m.drawn or not drawn
+        for path in m.outputs(model_of(m, dataset, split, reference))
+    ]
+
+
+def model_options(dataset, split, reference, drawn=False):
+    """Options of a command that takes these models."""
+    return [
+        f"--{m.name.replace('_', '-')}={model_of(m, dataset, split, reference)}"
+        for m in methods_of(dataset)
+        if m.drawn or not drawn
+    ]
+
+
+def estimators_source(stage, dataset):
+    """Hash of a stage that applies the methods of a dataset."""
+    names = dataset_config(dataset).methods
+    return source_hash(stage, *(f"psfdae.estimators.{name}" for name in names))
+
+
+def histories_of(dataset):
+    """Courses of the trainings of a dataset, and a label of each."""
+    trained = [m for m in methods_of(dataset) if HISTORY in m.diagnostics]
+    return {
+        str(m.beside(model_of(m, dataset, split, reference), HISTORY)): ", ".join(
+            [dataset, split, reference] + [m.label] * (len(trained) > 1)
+        )
+        for m in trained
+        for split, reference in networks_of(dataset)
+    }
+
+
+def fresh_stars(method, dataset):
+    """Product with other draws of a dataset's stars, if a method learns from some."""
+    config = dataset_config(dataset)
+    count = method.fresh(config)
+    stars = f"{RESULTS}/data/{config.scene.name}/fresh/{config.stars.name}-{count}.h5"
+    return {"fresh": stars} if count else {}
+
+
+use rule stars as more_stars with:
     output:
-        model=f"{RESULTS}/pca_som/{{dataset}}/{{split}}.h5",
-        trained_on=f"{RESULTS}/pca_som/{{dataset}}/{{split}}.trained_on.yaml",
+        f"{RESULTS}/data/{{scene}}/fresh/{{stars}}-{{count}}.h5",
     log:
-        f"{RESULTS}/logs/pca_som/{{dataset}}/{{split}}.log",
+        f"{RESULTS}/logs/stars/{{scene}}/fresh/{{stars}}-{{count}}.log",
     benchmark:
-        f"{RESULTS}/benchmarks/baseline/{{dataset}}/{{split}}.tsv"
-    threads: lambda w: dataset_config(w.dataset).baseline.threads
-    resources:
-        mem_mb=1000,
-        runtime=20,
+        f"{RESULTS}/benchmarks/more_stars/{{scene}}/{{stars}}-{{count}}.tsv"
+    wildcard_constraints:
+        count="[0-9]+",
     params:
-        config=lambda w: stage_overrides("baseline", f"dataset={w.dataset}"),
-        source=source_hash("psfdae.stages.baseline"),
-    message:
-        "Fitting PCA and SOM to {wildcards.dataset}, split {wildcards.split}"
-    shell:
-        "psfdae baseline --stars {input.stars} --split {wildcards.split}"
-        " --out {output.model} {params.config:q} > {log} 2>&1"
-
-
-rule train:
-    input:
-        stars=lambda w: stars_of(w.dataset),
-    output:
-        multiext(
-            f"{RESULTS}/dae/{{dataset}}/{{split}}-{{reference}}/",
-            weights="dae.safetensors",
-            config="config.yaml",
-            trained_on="trained_on.yaml",
-            history="history.csv",
+        # Another name is another random stream.
+        config=lambda w: settings(
+            "stars",
+            f"stars={w.stars}",
+            more=(f"stars.name={w.stars}_fresh", f"stars.count={w.count}"),
         ),
-    log:
-        f"{RESULTS}/logs/dae/{{dataset}}/{{split}}-{{reference}}.log",
-    benchmark:
-        f"{RESULTS}/benchmarks/train/{{dataset}}/{{split}}-{{reference}}.tsv"
-    threads: lambda w: dataset_config(w.dataset).train.threads
-    resources:
-        mem_mb=1500,
-        runtime=60,
-    params:
-        config=lambda w: stage_overrides("train", f"dataset={w.dataset}"),
-        free=lambda w, threads: free_overrides("train", f"dataset={w.dataset}"),
-        source=source_hash("psfdae.stages.train"),
-        folder=subpath(output.weights, parent=True),
-        # Not an output: Snakemake would delete it with a failed job's outputs.
-        checkpoint=lambda w: f"{RESULTS}/checkpoints/{w.dataset}-{w.split}-{w.reference}.pt",
+        source=lambda w: source_hash(
+            "psfdae.stages.stars", f"psfdae.stars.{w.scene}_scene"
+        ),
     message:
-        "Training the DAE of {wildcards.dataset}, {wildcards.split}, {wildcards.reference}"
-    shell:
-        "psfdae train --stars {input.stars} --split {wildcards.split}"
-        " --reference {wildcards.reference} --checkpoint {params.checkpoint}"
-        " --out {params.folder} {params.config:q} {params.free:q} > {log} 2>&1"
+        "Simulating {wildcards.count} other stars {wildcards.stars}"
+
+
+for _method in (m for m in registered() if m.stored):
+    _stem = _method.stem("{dataset}", "{split}", "{reference}")
+    _names = (f"{{wildcards.{key}}}" for key in ("dataset", "split", "reference"))
+    _place = model_of(_method, "{dataset}", "{split}", "{reference}")
+
+    rule:
+        name:
+            _method.rule
+        input:
+            unpack(lambda w, m=_method: fresh_stars(m, w.dataset)),
+            stars=lambda w: stars_of(w.dataset),
+        output:
+            [str(path) for path in _method.outputs(_place)],
+        log:
+            f"{RESULTS}/logs/{_method.name}/{_stem}.log",
+        benchmark:
+            f"{RESULTS}/benchmarks/{_method.rule}/{_stem}.tsv"
+        threads: lambda w, m=_method: m.threads(dataset_config(w.dataset))
+        resources:
+            mem_mb=_method.memory_mb,
+            runtime=_method.minutes,
+        params:
+            config=lambda w, m=_method: settings(
+                "fit", f"dataset={w.dataset}", name=m.name
+            ),
+            source=source_hash("psfdae.stages.fit", f"psfdae.estimators.{_method.name}"),
+            method=_method.name,
+            more=lambda w, input: [
+                *(f"--reference={w.reference}" for _ in w.get("reference", "")[:1]),
+                *(f"--fresh={input.fresh}" for _ in input.get("fresh", "")[:1]),
+            ],
+            place=_place,
+            # Not an output: Snakemake would delete it with a failed job's outputs.
+            checkpoint=f"{RESULTS}/checkpoints/{_method.name}/{_stem}.pt",
+        message:
+            f"Fitting {_method.label} to {_method.stem(*_names)}"
+        shell:
+            "psfdae fit {params.method} --config {params.config} --stars {input.stars}"
+            " --split {wildcards.split} {params.more} --checkpoint {params.checkpoint}"
+            " --out {params.place} > {log} 2>&1"

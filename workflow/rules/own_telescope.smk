@@ -20,7 +20,7 @@ rule telescope_templates:
         "psfdae templates --config {params.config} --out {output} > {log} 2>&1"
 
 
-rule telescope_stars:
+use rule stars as telescope_stars with:
     input:
         templates=rules.telescope_templates.output,
     output:
@@ -36,13 +36,8 @@ rule telescope_stars:
         mem_mb=1000,
         runtime=60,
     params:
-        config=lambda w: telescope_overrides("stars", w.stars),
+        config=lambda w: settings("stars", f"dataset={w.stars}"),
         source=source_hash("psfdae.stages.stars", "psfdae.stars.telescope_scene"),
-    message:
-        "Simulating the noise-free stars of {wildcards.stars}"
-    shell:
-        "psfdae stars --templates {input.templates} --out {output} {params.config:q}"
-        " > {log} 2>&1"
 
 
 rule figure_telescope:

@@ -17,7 +17,7 @@ from psfdae.configuration.base import NEUTRAL, ConfigError, config_dir
 from psfdae.configuration.consistency import Consistent, with_derived
 from psfdae.configuration.schema import Group, whole_config
 from psfdae.configuration.stages import STAGE_KEYS, stage_model
-from psfdae.estimators import registered
+from psfdae.estimators import listed, registered
 from psfdae.files import ProductError, write_text
 from psfdae.reading import parse_yaml
 
@@ -54,6 +54,7 @@ def compose(overrides: Sequence[str] = (), root: Root = "config") -> dict[str, A
 def forget() -> None:
     """Compose everything anew, for example after a change of the config folder."""
     _composed.cache_clear()
+    listed.cache_clear()
 
 
 @cache

@@ -333,11 +333,12 @@ def registered() -> tuple[type[Method], ...]:
     ConfigError
         If the list is missing, or names something else.
     """
-    return _listed(config_dir() / "config.yaml")
+    return listed(config_dir() / "config.yaml")
 
 
 @cache
-def _listed(path: Path) -> tuple[type[Method], ...]:
+def listed(path: Path) -> tuple[type[Method], ...]:
+    """The methods of a file `config.yaml`."""
     try:
         tree = parse_yaml(path)
         names = tree.get("methods") if isinstance(tree, dict) else None
