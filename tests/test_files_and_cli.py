@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from psfdae import source
 from psfdae.cli import main
 from psfdae.files import Column, ProductError, atomic_path, read_product, write_product
 
@@ -93,7 +92,7 @@ def _seconds(arguments):
     return time.monotonic() - start
 
 
-@pytest.mark.parametrize("stage", ["templates", "stars", "baseline", "train", "evaluate", "tables"])
+@pytest.mark.parametrize("stage", ["templates", "stars", "fit", "evaluate", "tables"])
 def test_stages_import_only_what_they_need(stage):
     code = (
         f"import sys, psfdae.stages.{stage};"
@@ -136,38 +135,3 @@ def test_config_command_prints_a_stage_s_groups():
     assert result.exit_code == 0
     assert "lr: 0.001" in result.output
     assert "telescope" not in result.output
-
-
-def test_source_hash_follows_imports_inside_functions():
-    reached = set(source._imports("psfdae.stages.train"))
-    assert "psfdae.models.dae" in reached
-    assert not any(name.startswith("psfdae.configuration") for name in reached)
-
-
-def test_source_hash_ignores_comments_and_docstrings(tmp_path, monkeypatch):
-    monkeypatch.setattr(source, "ROOT", tmp_path)
-    hashes = []
-    for text in (
-        '"""Doc."""\nx = 1\n',
-        '"""Other."""\nx = 1  # a comment\n',
-        "x = 2\n",
-    ):
-        (tmp_path / "m.py").write_text(text)
-        for cached in (source._tree, source._imports, source._code):
-            cached.cache_clear()
-        hashes.append(source.source_hash("psfdae.m"))
-    for cached in (source._tree, source._imports, source._code):
-        cached.cache_clear()
-    assert hashes[0] == hashes[1] != hashes[2]
-
-
-def test_optics_is_code_of_the_stars_but_not_of_the_training():
-    stars = source.source_hash("psfdae.stages.stars", "psfdae.stars.seidel_scene")
-    assert stars != source.source_hash("psfdae.stages.stars")
-    waiting, reached = ["psfdae.stages.train"], set()
-    while waiting:
-        module = waiting.pop()
-        if module not in reached:
-            reached.add(module)
-            waiting += source._imports(module)
-    assert not any(name.startswith("psfdae.optics") for name in reached)
