@@ -2,10 +2,6 @@
 SHIPPED_DATASET = "field"
 
 
-def packed(w):
-    return model_of(method("dae"), w.dataset, w.split, w.reference)
-
-
 rule bundle:
     input:
         stars=lambda w: stars_of(w.dataset),

@@ -1,0 +1,57 @@
+def model_of(method, dataset, split, reference):
+    """Folder or file of a fit."""
+    return f"{RESULTS}/{method.place(dataset, split, reference)}"
+
+
+def methods_of(dataset):
+    """Methods of a dataset that leave a model."""
+    return [m for m in map(method, dataset_config(dataset).methods) if m.stored]
+
+
+def fitted(dataset, split, reference, drawn=False):
+    """Files of all models that restore stars of a split, or of those that figures show."""
+    return [
+        str(path)
+        for m in methods_of(dataset)
+        if m.drawn or not drawn
+        for path in m.outputs(model_of(m, dataset, split, reference))
+    ]
+
+
+def model_options(dataset, split, reference, drawn=False):
+    """Options of a command that takes these models."""
+    return [
+        f"--{m.name.replace('_', '-')}={model_of(m, dataset, split, reference)}"
+        for m in methods_of(dataset)
+        if m.drawn or not drawn
+    ]
+
+
+def estimators_source(stage, dataset):
+    """Hash of a stage that applies the methods of a dataset."""
+    names = dataset_config(dataset).methods
+    return source_hash(stage, *(f"psfdae.estimators.{name}" for name in names))
+
+
+def histories_of(dataset):
+    """Courses of the trainings of a dataset, and a label of each."""
+    trained = [m for m in methods_of(dataset) if HISTORY in m.diagnostics]
+    return {
+        str(m.beside(model_of(m, dataset, split, reference), HISTORY)): ", ".join(
+            [dataset, split, reference] + [m.label] * (len(trained) > 1)
+        )
+        for m in trained
+        for split, reference in networks_of(dataset)
+    }
+
+
+def fresh_stars(method, dataset):
+    """Product with other draws of a dataset's stars, if a method learns from some."""
+    config = dataset_config(dataset)
+    count = method.fresh(config)
+    stars = f"{RESULTS}/data/{config.scene.name}/fresh/{config.stars.name}-{count}.h5"
+    return {"fresh": stars} if count else {}
+
+
+def packed(w):
+    return model_of(method("dae"), w.dataset, w.split, w.reference)
