@@ -55,9 +55,10 @@ def on_page_content(html: str, **_: Any) -> str:
 
 def key_reference(root: str) -> Iterator[str]:
     """Markdown of all groups of a root: their keys and, below, their options."""
-    from psfdae.configuration.compose import ROOTS, compose, config_dir
+    from psfdae.configuration.base import config_dir
+    from psfdae.configuration.compose import compose, model_of
 
-    schema = ROOTS[root][0].model_json_schema()
+    schema = model_of(root).model_json_schema()
     tree = compose((), root)
     for group in (*schema["properties"], *PRESETS[root]):
         yield f"\n### `{group}`\n"

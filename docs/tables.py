@@ -23,6 +23,7 @@ from types import SimpleNamespace
 import pandas as pd
 
 from psfdae.configuration.compose import compose
+from psfdae.estimators import method
 from psfdae.evaluation.alignment_tables import METHOD_LABELS as ALIGNERS
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -35,7 +36,6 @@ MARK = re.compile(
 )
 HEAD = re.compile(r"\|.*\n\|[-|]+\n")
 
-METHODS = {"noisy": "noisy", "pca_som": "PCA+SOM", "lmmse": "linear MMSE", "dae": "DAE"}
 SCENES = {"seidel": "scene 1", "turbulence": "scene 2", "all": "any"}
 PROPAGATORS = {
     "kernel": "our kernel",
@@ -149,7 +149,7 @@ def errors(name="tables/psf_metrics.csv"):
     """MSE of every method by dataset, split, reference and noise level."""
     keys = ["dataset", "split", "reference", "noise_level"]
     table = csv(name).query("metric == 'mse'").pivot(index=keys, columns="method", values="value")
-    table["best"] = table[list(METHODS)].idxmin(axis=1).map(METHODS)
+    table["best"] = table.idxmin(axis=1).map(lambda best: method(best).label)
     return table.reset_index().sort_values(keys, ascending=[True, False, True, True])
 
 
