@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from pathlib import Path
 
@@ -12,9 +13,6 @@ from workflow_runs import ROOT, planned
 pytestmark = pytest.mark.workflow
 
 TARGETS = ("dataset3", "dataset8")
-FIGURES = {
-    *("figure_curves", "figure_errors", "figure_strip", "figure_templates", "figure_energy"),
-}
 
 
 @pytest.fixture
@@ -67,17 +65,21 @@ def test_learning_rate_of_one_dataset(jobs, tree):
     }
 
 
-def test_plotting_module(jobs, tree):
-    """Figures, and their import into MLflow; nothing that computes."""
-    append(tree / "src/psfdae/evaluation/figures.py", "\nEDITED = True\n")
-    found = jobs(*TARGETS, "tables")
-    assert set(found) | {"figure_errors", "figure_curves"} >= FIGURES
-    assert set(found) <= FIGURES | {"track"}
+def edit(path: Path, name: str) -> None:
+    """Change a function or class; what it does stays as it was."""
+    assert re.search(rf"(?m)^(def|class) {name}\b", path.read_text())
+    append(path, f"\n{name} = {name}\n")
 
 
-def test_optics_module(jobs, tree):
+def test_plotting_function(jobs, tree):
+    """Its figures, and their import into MLflow; nothing that computes."""
+    edit(tree / "src/psfdae/evaluation/figures.py", "restoration_strip")
+    assert set(jobs(*TARGETS, "tables")) == {"figure_strip", "track"}
+
+
+def test_optics(jobs, tree):
     """Templates and stars, and all that is made from them."""
-    append(tree / "src/psfdae/optics/propagation.py", "\nEDITED = True\n")
+    edit(tree / "src/psfdae/optics/propagation.py", "StampPropagator")
     found = jobs(*TARGETS)
     assert found["templates"] == 2
     assert found["stars"] == 2
@@ -86,17 +88,17 @@ def test_optics_module(jobs, tree):
     assert {"baseline", "paper_tables", "track"} <= set(found)
 
 
-def test_metric_module(jobs, tree):
+def test_metric(jobs, tree):
     """Evaluations and what follows, but no training."""
-    append(tree / "src/psfdae/evaluation/metrics.py", "\nEDITED = True\n")
+    edit(tree / "src/psfdae/evaluation/metrics.py", "ssim")
     found = jobs(*TARGETS)
     assert found["evaluate"] == 6
     assert not {"templates", "stars", "train", "baseline"} & set(found)
 
 
-def test_network_module(jobs, tree):
+def test_network(jobs, tree):
     """Trainings and what follows, but no stars."""
-    append(tree / "src/psfdae/models/dae.py", "\nEDITED = True\n")
+    edit(tree / "src/psfdae/models/dae.py", "Dae")
     found = jobs(*TARGETS)
     assert found["train"] == 6
     assert found["evaluate"] == 6

@@ -3,87 +3,453 @@
 from __future__ import annotations
 
 import ast
+import gc
 import hashlib
+import re
 import subprocess
-from functools import cache
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from fnmatch import filter as matching
+from functools import cache, cached_property
+from itertools import chain
 from pathlib import Path
+from typing import Any
 
 PACKAGE = "psfdae"
 ROOT = Path(__file__).resolve().parent
 
-NOT_SCIENCE = (f"{PACKAGE}.configuration",)
-"""Left out: configuration reaches a rule through its params, value by value."""
+COMMAND = f"{PACKAGE}.cli:command"
+"""Decorator of stages. It names the groups of settings that a stage reads."""
+
+SETTINGS = {
+    "config": f"{PACKAGE}.configuration.schema:Config",
+    "alignment": f"{PACKAGE}.configuration.alignment:AlignmentConfig",
+}
+"""Models of all settings, by `root` of the decorator; who mentions one does not read all of it."""
 
 
-def source_hash(*modules: str) -> str:
-    """Hash of modules and of every module of the package that they import.
+def source_hash(*functions: str, chosen: Iterable[str] = ()) -> str:
+    """Hash of functions and of all code of the package that they reach.
 
-    Imports inside functions count; comments, docstrings and formatting do not,
-    so that rewording never retrains a network.
+    They reach functions, whole classes and constants by name, through imports anywhere and
+    attributes of modules; the classes of the settings that a stage reads; modules whose name
+    stands in a string, f-strings included; and what registers itself: subclasses of a class
+    with `__init_subclass__`, and what is decorated by a function that mentions a constant.
+
+    Names of modules, imports, comments, docstrings, formatting and annotations of functions
+    do not count: moving or rewording never retrains a network.
 
     Parameters
     ----------
-    *modules : str
-        Dotted names, for example `psfdae.stages.train`.
+    *functions : str
+        Commands, such as "figure templates"; "module:name", or "module" for all of it; or
+        "file.py:name" of a program, whose imports are looked for beside it, too.
+    chosen : iterable of str
+        Where the name of a module, of an entry of a registry or of a constant that lists them
+        decides at run time, all are taken unless some of them are among these.
+
+    Raises
+    ------
+    ValueError
+        If something named does not exist, or is chosen but not reached.
     """
-    reached: set[str] = set()
-    waiting = list(modules)
-    while waiting:
-        module = waiting.pop()
-        if module not in reached:
-            reached.add(module)
-            waiting += _imports(module)
-    digest = hashlib.sha256()
-    for module in sorted(reached):
-        digest.update(f"{module}\n{_code(module)}\n".encode())
-    return digest.hexdigest()[:16]
+    collecting = gc.isenabled()
+    gc.disable()  # Looking for cycles among syntax trees doubles the time.
+    try:
+        return code_below(ROOT).hash(functions, chosen)
+    finally:
+        if collecting:
+            gc.enable()
 
 
-def _path(module: str) -> Path | None:
-    parts = module.split(".")[1:]
-    for candidate in (
-        ROOT.joinpath(*parts).with_suffix(".py"),
-        ROOT.joinpath(*parts, "__init__.py"),
-    ):
-        if parts and candidate.is_file():
-            return candidate
-    return None
+@dataclass(frozen=True)
+class Definition:
+    """Digest of code, what it refers to, and groups of which a name chooses at run time."""
+
+    digest: str
+    references: list[str]
+    options: list[list[str]]
+    is_constant: bool
 
 
-@cache
-def _tree(module: str) -> ast.Module:
-    path = _path(module)
-    if path is None:
-        raise ValueError(f"no module {module!r} in {ROOT}")
-    return ast.parse(path.read_text(encoding="utf-8"))
+class Module:
+    """Top-level statements by the names that they make, "" if they do more; what names mean."""
+
+    def __init__(self, name: str, tree: ast.Module) -> None:
+        self.statements: dict[str, list[ast.stmt]] = {}
+        self.names: dict[str, str] = {}
+        for statement in tree.body:
+            made = _made(statement)
+            self.names |= {n: f"{name}.{n}" for n in made} | _imported(statement)
+            for n in made:
+                self.statements.setdefault(n, []).append(statement)
+                if f"{name}:{n}" in SETTINGS.values() and isinstance(statement, ast.ClassDef):
+                    fields = (s for s in statement.body if isinstance(s, ast.AnnAssign))
+                    self.statements |= {f"{n}.{ast.unparse(f.target)}": [f] for f in fields}
 
 
-@cache
-def imports(module: str) -> tuple[str, ...]:
-    """Modules of the package that a module imports, inside functions too; dotted names."""
-    names: list[str] = []
-    for node in ast.walk(_tree(module)):
+class Code:
+    """The code below a folder. A key is "module:name", or "module" for all of it."""
+
+    def __init__(self, root: Path) -> None:
+        self.root, self.paths = root, _modules(root, (PACKAGE,))
+        self.module, self.definition = cache(self._module), cache(self._definition)
+        self.resolve, self.registered = cache(self._resolve), cache(self._registered)
+
+    def hash(self, functions: Iterable[str], chosen: Iterable[str] = ()) -> str:
+        """As `source_hash`; a definition goes by the place at which it was met, not by its key."""
+        chosen = frozenset(chosen)
+        queue = [*dict.fromkeys(self.key(name) for name in functions)]
+        places = {key: place for place, key in enumerate(queue)}
+        digest = hashlib.sha256()
+        for key in queue:
+            text, references = self.reached(key, chosen)
+            for reference in references:
+                if reference not in places:
+                    places[reference] = len(queue)
+                    queue.append(reference)
+            digest.update(f"{text}{[places[r] for r in references]}\n".encode())
+        if not chosen <= places.keys():
+            raise ValueError(f"{min(chosen - places.keys())}: nothing in {functions} chooses it")
+        return digest.hexdigest()[:16]
+
+    def key(self, name: str) -> str:
+        """Key of a command, or of what is in a program; the modules beside it are then known."""
+        stem, is_file, rest = name.partition(".py")
+        if not is_file:
+            return self.commands.get(name, name)
+        path = Path(self.root.parents[1], f"{stem}.py")
+        above = next(folder for folder in path.parents if not (folder / "__init__.py").exists())
+        beside = _modules(path.parent, path.parent.relative_to(above).parts)
+        if not beside.keys() <= self.paths.keys():
+            self.paths |= beside
+            self.__dict__.pop("users", None)
+            self.registered.cache_clear()
+        own = next((n for n, found in self.paths.items() if found == path), None)
+        if own is None or any(self.paths[n] != found for n, found in beside.items()):
+            raise ValueError(f"{path}: missing, or a module beside it has the name of another one")
+        return f"{own}{rest}"
+
+    def reached(self, key: str, chosen: frozenset[str]) -> tuple[str, list[str]]:
+        """Digest of a definition and what it reaches; of options only those chosen."""
+        found = self.definition(key)
+        # What registers itself, or something else, chooses nothing of the registry.
+        others = () if key in self.users else (r for r in found.references if r != key)
+        registries = map(self.registered, others)
+        groups = [*found.options, *(group for group in registries if key not in group)]
+        every = [*found.references, *chain(*groups)]
+        if found.is_constant and not chosen.isdisjoint(every):
+            return "", [entry for entry in every if entry in chosen]
+        taken = ([option for option in group if option in chosen] or group for group in groups)
+        return found.digest, [*found.references, *chain(*taken)]
+
+    def _module(self, name: str) -> Module:
+        if name not in self.paths:
+            raise ValueError(f"no module {name!r}")
+        return Module(name, ast.parse(self.paths[name].read_bytes()))
+
+    def statements(self, key: str) -> list[ast.stmt]:
+        """Statements that make what a key means."""
+        module, _, name = key.partition(":")
+        return self.module(module).statements.get(name, []) if module in self.paths else []
+
+    def _resolve(self, dotted: str) -> tuple[str, list[str]]:
+        """Key of what a dotted name means, and the attributes left; a foreign name as it is."""
+        module, *names = dotted.split(".")
+        while module in self.paths and names:
+            content, name, inner = self.module(module), names[0], f"{module}.{names[0]}"
+            if name in content.statements:
+                return f"{module}:{name}", names[1:]
+            if inner in self.paths:
+                module, names = inner, names[1:]
+            elif name in content.names:
+                return self.resolve(".".join((content.names[name], *names[1:])))
+            elif "__getattr__" in content.statements:
+                return f"{module}:__getattr__", names
+            else:
+                raise ValueError(f"{module} has no {name!r}")
+        return (module, []) if module in self.paths else (dotted, [])
+
+    def _definition(self, key: str) -> Definition:
+        module, colon, name = key.partition(":")
+        content, reader = self.module(module), Reader(self, module)
+        statements = self.statements(key)
+        if colon and not statements:
+            raise ValueError(f"no {name!r} in {module}")
+        imported = [_imported(statement) for statement in statements]
+        reader.imported = {n for found in imported for n in found}
+        for found in imported:
+            reader.names = reader.names | found
+        reader.write(statements)
+        for own in () if colon else sorted(content.statements):
+            reader.refer(f"{key}:{own}")
+        if name and "" in content.statements:
+            reader.refer(f"{module}:")
+        digest = hashlib.sha256("\n".join(reader.parts).encode()).hexdigest()
+        is_constant = {type(s) for s in statements} in ({ast.Assign}, {ast.AnnAssign})
+        return Definition(digest, reader.references, reader.options, is_constant)
+
+    @cached_property
+    def users(self) -> dict[str, list[str]]:
+        """Definitions that have a key as their base or decorator, by that key."""
+        found: dict[str, list[str]] = {}
+        for module in self.paths:
+            reader = Reader(self, module)
+            for name, (node, *_) in self.module(module).statements.items():
+                for mark in (*getattr(node, "decorator_list", ()), *getattr(node, "bases", ())):
+                    if meant := reader.meaning(getattr(mark, "func", mark)):
+                        found.setdefault(meant[0], []).append(f"{module}:{name}")
+        return found
+
+    @cached_property
+    def commands(self) -> dict[str, str]:
+        """Keys of the functions that are commands, by the words of these."""
+        found: dict[str, str] = {}
+        for key in self.users.get(COMMAND, ()):
+            reader, node = Reader(self, key.partition(":")[0]), self.statements(key)[0]
+            for mark in getattr(node, "decorator_list", ()):
+                ours = key.startswith(f"{PACKAGE}.")
+                if ours and reader.meaning(getattr(mark, "func", mark)) == (COMMAND, []):
+                    found[ast.literal_eval(mark.args[0])] = key
+        return found
+
+    def _registered(self, key: str) -> list[str]:
+        """What registers itself with a class or, through its decorator, in a constant."""
+        module = key.partition(":")[0]
+        node = next(iter(self.statements(key)), None)
+        found = []
+        if any(getattr(n, "name", "") == "__init_subclass__" for n in getattr(node, "body", ())):
+            found = [*self.users.get(key, ())]
+        elif isinstance(node, ast.Assign | ast.AnnAssign):
+            near = (maker for maker in self.users if maker.startswith(f"{module}:"))
+            makers = (maker for maker in near if key in self.definition(maker).references)
+            found = [user for maker in makers for user in self.users[maker]]
+        for user in found:
+            found += [heir for heir in self.users.get(user, ()) if heir not in found]
+        return sorted(found, key=lambda user: user.partition(":")[2])
+
+
+code_below = cache(Code)
+
+
+class Reader:
+    """Writes down code without what does not count; collects its references and options."""
+
+    def __init__(self, code: Code, module: str) -> None:
+        self.code, self.module = code, module
+        self.names = code.module(module).names
+        self.imported: set[str] = set()
+        self.parts: list[str] = []
+        self.references: list[str] = []
+        self.options: list[list[str]] = []
+
+    def write(self, node: Any) -> None:
+        """Write a syntax tree, a list of them or a value."""
+        if type(node) in SPECIAL:
+            SPECIAL[type(node)](self, node)
+        elif isinstance(node, ast.AST):
+            self.plain(node)
+        elif isinstance(node, list):
+            for item in node:
+                if not _is_text(item):
+                    self.write(item)
+        else:
+            self.parts.append(repr(node))
+
+    def plain(self, node: ast.AST, *, decorated: bool = True) -> None:
+        """Write a node by its fields."""
+        self.parts.append(type(node).__name__)
+        for name in node._fields:
+            value = getattr(node, name, None)
+            written = decorated if name == "decorator_list" else name not in NOT_WRITTEN
+            if written and value is not None and value != []:
+                self.parts.append(name)
+                self.write(value)
+        self.parts.append(";")
+
+    def refer(self, key: str) -> None:
+        """Write a mark for a key; a foreign name, or one not to be followed, as it is."""
+        if key.partition(":")[0] in self.code.paths and key not in SETTINGS.values():
+            self.references.append(key)
+            key = "*"
+        self.parts.append(key.rpartition(":")[2])
+
+    def meaning(self, node: ast.expr) -> tuple[str, list[str]] | None:
+        """Key or foreign name of a dotted name, and the attributes left; None for a value."""
+        names: list[str] = []
+        while isinstance(node, ast.Attribute):
+            names.insert(0, node.attr)
+            node = node.value
+        target = self.names.get(node.id) if isinstance(node, ast.Name) else None
+        return self.code.resolve(".".join((target, *names))) if target else None
+
+    def name(self, node: ast.Name | ast.Attribute) -> None:
+        """A name or an attribute: what it means, or itself."""
+        if meant := self.meaning(node):
+            self.refer(meant[0])
+            self.parts += meant[1]
+        elif isinstance(node, ast.Attribute):
+            self.plain(node)
+        else:
+            self.parts.append(node.id)
+            if node.id == "__package__":
+                self.parts += _data(self.code.paths[self.module].parent)
+
+    def function(self, node: ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda) -> None:
+        """A function, whose variables hide other names but from its defaults and decorators."""
+        self.write([*node.args.defaults, *node.args.kw_defaults])
+        for mark in getattr(node, "decorator_list", ()):
+            if self.meaning(getattr(mark, "func", mark)) == (COMMAND, []):
+                self.command(mark, node.args)
+            else:
+                self.write(mark)
+        own = _assigned(node.body) - self.imported if isinstance(node.body, list) else set()
+        own |= {part.arg for part in ast.walk(node.args) if isinstance(part, ast.arg)}
+        self.inside(own, node)
+
+    def comprehension(self, node: Any) -> None:
+        """A comprehension, whose variables hide other names but from its first iterable."""
+        self.write(node.generators[0].iter)
+        targets = (name for part in node.generators for name in ast.walk(part.target))
+        self.inside({name.id for name in targets if isinstance(name, ast.Name)}, node)
+
+    def inside(self, own: set[str], node: ast.AST) -> None:
+        """Write a node that has names of its own."""
+        names = self.names
+        self.names = {name: target for name, target in names.items() if name not in own}
+        self.plain(node, decorated=False)
+        self.names = names
+
+    def command(self, mark: ast.Call, parameters: ast.arguments) -> None:
+        """Of a command: the settings that it reads and the classes of its parameters."""
+        said = self.strings([*mark.args[1:], *mark.keywords])
+        model = SETTINGS["alignment" if "alignment" in said else "config"]
+        hints = (n for n in ast.walk(parameters) if isinstance(n, ast.Name | ast.Attribute))
+        named = [meant[0] for hint in hints if (meant := self.meaning(hint))]
+        for key in (*(f"{model}.{word}" for word in said), *named):
+            if {type(s) for s in self.code.statements(key)} & {ast.ClassDef, ast.AnnAssign}:
+                self.refer(key)
+
+    def strings(self, nodes: Iterable[ast.AST]) -> list[str]:
+        """Texts in code and in what it names."""
+        found: list[str] = []
+        for node in chain(*map(ast.walk, nodes)):
+            if isinstance(node, ast.Constant):
+                found.append(str(node.value))
+            elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Load):
+                key = (self.meaning(node) or ("", []))[0]
+                if made := self.code.statements(key):
+                    found += Reader(self.code, key.partition(":")[0]).strings(made)
+        return found
+
+    def call(self, node: ast.Call) -> None:
+        """A call; what describes a field is prose."""
+        of_field = self.meaning(node.func) == ("pydantic.Field", [])
+        keywords = [k for k in node.keywords if not (of_field and k.arg == "description")]
+        self.write([node.func, "(", node.args, keywords, ")"])
+
+    def text(self, node: ast.Constant | ast.JoinedStr) -> None:
+        """A constant or an f-string, or the modules that it names."""
+        inner = node.values if isinstance(node, ast.JoinedStr) else [node]
+        pattern = "".join(str(p.value) if isinstance(p, ast.Constant) else "*" for p in inner)
+        is_name = re.fullmatch(rf"{PACKAGE}(\.[\w*]+)+", pattern)
+        named = matching(self.code.paths, pattern) if is_name else []
+        for part in inner:
+            if not isinstance(part, ast.Constant):
+                self.write(part)
+            elif not named:
+                self.parts.append(repr(part.value))
+        self.options += [named] if named else []
+
+
+# Of annotations those of variables count: among them are the fields of dataclasses and settings.
+NOT_WRITTEN = {"ctx", "kind", "type_comment", "type_params", "returns"}
+NAMED = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)
+SPECIAL: dict[type, Callable[[Reader, Any], None]] = {
+    **dict.fromkeys((ast.Import, ast.ImportFrom, ast.Pass), lambda reader, node: None),
+    **dict.fromkeys((ast.Name, ast.Attribute), Reader.name),
+    **dict.fromkeys((ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda), Reader.function),
+    **dict.fromkeys((ast.ListComp, ast.SetComp, ast.DictComp), Reader.comprehension),
+    **dict.fromkeys((ast.Constant, ast.JoinedStr), Reader.text),
+    ast.GeneratorExp: Reader.comprehension,
+    ast.Call: Reader.call,
+    ast.arg: lambda reader, node: reader.parts.append(node.arg),
+}
+
+
+def _is_text(node: Any) -> bool:
+    """Whether a statement is a text, such as a docstring."""
+    return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
+
+
+def _modules(folder: Path, above: tuple[str, ...]) -> dict[str, Path]:
+    """Files of the modules in and below a folder, which lies in a package or not."""
+    files = {
+        path: path.relative_to(folder).with_suffix("") for path in sorted(folder.rglob("*.py"))
+    }
+    return {".".join((*above, *f.parts)).removesuffix(".__init__"): p for p, f in files.items()}
+
+
+def _data(folder: Path) -> list[str]:
+    """Names and digests of the files of a package that are no code."""
+    files = [path for path in sorted(folder.iterdir()) if path.is_file() and path.suffix != ".py"]
+    return [f"{path.name} {hashlib.sha256(path.read_bytes()).hexdigest()}" for path in files]
+
+
+def _inner(nodes: Iterable[Any], *, functions: bool) -> list[Any]:
+    """Statements and all inside them, inside functions and classes if asked for."""
+    found = []
+    for node in nodes:
+        found.append(node)
+        if functions or not isinstance(node, NAMED):
+            for block in ("body", "orelse", "finalbody", "handlers", "cases"):
+                found += _inner(getattr(node, block, ()), functions=functions)
+    return found
+
+
+def _assigned(statements: Iterable[ast.stmt]) -> set[str]:
+    """Names that statements bind, but not by imports."""
+    found, elsewhere = set(), set()
+    for node in _inner(statements, functions=False):
+        if isinstance(node, NAMED):
+            found.add(node.name)
+        elif isinstance(node, ast.Global):
+            elsewhere.update(node.names)
+        targets = [*getattr(node, "targets", ()), getattr(node, "target", None)]
+        targets += [item.optional_vars for item in getattr(node, "items", ())]
+        stored = (n for target in targets if target for n in ast.walk(target))
+        found |= {n.id for n in stored if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)}
+    return found - elsewhere
+
+
+def _made(statement: ast.stmt) -> set[str]:
+    """Names that a statement of the top level makes; "" among them if it does more than that."""
+    if isinstance(statement, ast.If) and "__name__" in ast.unparse(statement.test):
+        return set()  # of a program that is run
+    inner = _inner([statement], functions=False)
+    if all(isinstance(s, ast.Import | ast.ImportFrom | ast.If) or _is_text(s) for s in inner):
+        return set()
+    names = _assigned([statement])
+    simple = isinstance(statement, (*NAMED, ast.Assign, ast.AugAssign, ast.AnnAssign))
+    return names if names and simple else names | {""}
+
+
+def _imported(statement: ast.stmt) -> dict[str, str]:
+    """Names that imports in a statement bind, with the dotted names of what they are."""
+    found: dict[str, str] = {}
+    for node in _inner([statement], functions=True):
+        pairs = []
         if isinstance(node, ast.Import):
-            names += [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
-            names += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
-    return tuple(n for n in names if n.startswith(PACKAGE + ".") and _path(n) is not None)
-
-
-@cache
-def _imports(module: str) -> tuple[str, ...]:
-    return tuple(name for name in imports(module) if not name.startswith(NOT_SCIENCE))
-
-
-@cache
-def _code(module: str) -> str:
-    tree = ast.parse(ast.unparse(_tree(module)))
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Module | ast.FunctionDef | ast.ClassDef):
-            first = node.body[0] if node.body else None
-            if isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant):
-                node.body = node.body[1:] or [ast.Pass()]
-    return ast.dump(tree)
+            tops = ((a, a.name.split(".")[0]) for a in node.names)
+            pairs = [(a.asname or top, a.name if a.asname else top) for a, top in tops]
+        elif isinstance(node, ast.ImportFrom):
+            if node.level or node.names[0].name == "*":
+                raise ValueError(f"{ast.unparse(node)}: name the module and what is imported")
+            pairs = [(a.asname or a.name, f"{node.module}.{a.name}") for a in node.names]
+        for name, target in pairs:
+            if found.setdefault(name, target) != target:
+                raise ValueError(f"{name}: imported as {found[name]} and as {target}")
+    return found
 
 
 def git_commit() -> str:

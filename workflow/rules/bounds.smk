@@ -16,7 +16,7 @@ rule bank:
         runtime=30,
     params:
         config=lambda w: settings("bank", f"stars={w.stars}"),
-        source=source_hash("psfdae.stages.bank", "psfdae.stars.seidel_scene"),
+        source=source_hash("bank", chosen=["psfdae.stars.seidel_scene"]),
     message:
         "Simulating the bank of {wildcards.stars}"
     shell:
@@ -42,7 +42,7 @@ rule dataset_bounds:
         runtime=20,
     params:
         config=lambda w: settings("bounds", f"dataset={w.dataset}"),
-        source=source_hash("psfdae.stages.bounds"),
+        source=source_hash("bounds"),
         bank=lambda w: [f"--bank={path}" for path in bank_of(w.dataset)],
     message:
         "Bounding the errors of {wildcards.dataset}"
@@ -64,7 +64,7 @@ rule psf_bounds:
         f"{RESULTS}/benchmarks_on_request/bounds/psf_bounds.tsv"
     localrule: True
     params:
-        source=source_hash("psfdae.stages.bounds"),
+        source=source_hash("collect-bounds"),
     message:
         "Collecting the bounds of all datasets"
     shell:
@@ -102,7 +102,7 @@ rule psf_efficiency:
     params:
         bounds=lambda w, input: [f"--bounds={path}" for path in input.bounds],
         best=lambda w, input: [f"--bounds-per-star={path}" for path in input.best],
-        source=source_hash("psfdae.stages.efficiency"),
+        source=source_hash("efficiency"),
     message:
         "Comparing all methods with the bounds"
     shell:
@@ -127,7 +127,7 @@ rule figure_bounds:
     benchmark:
         f"{RESULTS}/benchmarks_on_request/bounds/figure_errors-{{dataset}}.tsv"
     params:
-        source=source_hash("psfdae.stages.bound_figures"),
+        source=source_hash("figure bounds"),
     message:
         "Drawing the errors of {wildcards.dataset} above their bounds"
     shell:
@@ -151,7 +151,7 @@ rule figure_efficiency:
     benchmark:
         f"{RESULTS}/benchmarks_on_request/bounds/figure_efficiency-{{dataset}}.tsv"
     params:
-        source=source_hash("psfdae.stages.bound_figures"),
+        source=source_hash("figure efficiency"),
     message:
         "Drawing the efficiency of the methods on {wildcards.dataset}"
     shell:
@@ -175,7 +175,7 @@ rule figure_bank_growth:
     benchmark:
         f"{RESULTS}/benchmarks_on_request/bounds/figure_growth-{{dataset}}.tsv"
     params:
-        source=source_hash("psfdae.stages.bound_figures"),
+        source=source_hash("figure bank-growth"),
     message:
         "Drawing how the bound of {wildcards.dataset} depends on its bank"
     shell:

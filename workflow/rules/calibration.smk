@@ -12,8 +12,8 @@ rule scan:
     params:
         config=lambda w: settings("scan", f"dataset={w.dataset}"),
         source=lambda w: source_hash(
-            "psfdae.stages.calibrate",
-            f"psfdae.stars.{dataset_config(w.dataset).scene.name}_scene",
+            "scan",
+            chosen=[f"psfdae.stars.{dataset_config(w.dataset).scene.name}_scene"],
         ),
     message:
         "Scanning pixel scales and dynamic ranges for {wildcards.dataset}"
@@ -44,7 +44,7 @@ rule calibrate:
         runtime=10,
     params:
         config=lambda w: settings("calibrate", f"dataset={TABULATED[0]}"),
-        source=source_hash("psfdae.stages.calibrate"),
+        source=source_hash("calibrate"),
         folder=subpath(output.fit, parent=True),
         scans=lambda w, input: [f"--scan={path}" for path in input.scans],
         stars=lambda w, input: [

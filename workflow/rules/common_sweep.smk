@@ -81,7 +81,9 @@ def sweep_source(name):
     """Code that a point consists of: its model's, and the search's if there is one."""
     sweep = sweep_plan(name).sweep
     search = [ADAPTIVE_MODULE] if sweep.kind == "adaptive" else []
-    return source_hash("psfdae.stages.sweep", POINT_MODULES[sweep.model], *search)
+    return source_hash(
+        "psfdae.stages.sweep", chosen=[POINT_MODULES[sweep.model], *search]
+    )
 
 
 def sweep_results(w):

@@ -12,7 +12,7 @@ rule templates:
     params:
         config=lambda w: settings("templates", f"scene={w.scene}"),
         source=lambda w: source_hash(
-            "psfdae.stages.templates", f"psfdae.stars.{w.scene}_scene"
+            "templates", chosen=[f"psfdae.stars.{w.scene}_scene"]
         ),
     message:
         "Propagating the static PSFs of scene {wildcards.scene}"
@@ -36,7 +36,7 @@ rule stars:
     params:
         config=lambda w: settings("stars", f"stars={w.stars}"),
         source=lambda w: source_hash(
-            "psfdae.stages.stars", f"psfdae.stars.{w.scene}_scene"
+            "psfdae.stages.stars", chosen=[f"psfdae.stars.{w.scene}_scene"]
         ),
     message:
         "Simulating the noise-free stars {wildcards.stars}"

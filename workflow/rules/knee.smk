@@ -21,7 +21,7 @@ rule fresh_stars:
             # Another name is another random stream.
             ["stars.name=fresh", f"stars.count={KNEE.fresh_stars}"],
         ),
-        source=source_hash("psfdae.stages.stars", "psfdae.stars.seidel_scene"),
+        source=source_hash("psfdae.stages.stars", chosen=["psfdae.stars.seidel_scene"]),
     message:
         "Simulating other stars for the knee of the training"
     shell:

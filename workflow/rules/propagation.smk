@@ -26,7 +26,7 @@ rule propagation:
             "propagation", f"dataset={strictest_dataset(w.scene)}"
         ),
         source=lambda w: source_hash(
-            "psfdae.stages.propagation", f"psfdae.stars.{w.scene}_scene"
+            "psfdae.stages.propagation", chosen=[f"psfdae.stars.{w.scene}_scene"]
         ),
         folder=subpath(output.propagation, parent=True),
         datasets=lambda w: sharing_stars(strictest_dataset(w.scene)),

@@ -18,7 +18,7 @@ rule runtime:
         runtime=10,
     params:
         results=lambda w: RESULTS,
-        source=source_hash("psfdae.stages.record"),
+        source=source_hash("runtime"),
     message:
         "Collecting what the jobs cost"
     shell:

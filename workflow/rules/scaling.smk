@@ -19,7 +19,7 @@ rule scaling_stages:
         source=source_hash(
             "psfdae.stages.scaling_jobs",
             "psfdae.stages.scaling",
-            "psfdae.stars.seidel_scene",
+            chosen=["psfdae.stars.seidel_scene"],
         ),
     message:
         "Measuring the stages that grow with the number of stars"

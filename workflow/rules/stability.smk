@@ -21,8 +21,7 @@ rule stability_table:
         config=lambda w: stage_overrides("stability", f"dataset={STABILITY_DATASET}"),
         source=source_hash(
             "psfdae.stages.stability",
-            "psfdae.stars.seidel_scene",
-            "psfdae.stars.turbulence_scene",
+            chosen=["psfdae.stars.seidel_scene", "psfdae.stars.turbulence_scene"],
         ),
     message:
         "Stressing the whole chain"

@@ -143,7 +143,7 @@ rule track_sweep:
         results=lambda w: RESULTS,
         preset=PRESET,
         database=f"{RESULTS}/mlflow.db",
-        source=source_hash("psfdae.stages.track"),
+        source=source_hash("track"),
     message:
         "Importing sweep {wildcards.sweep} into MLflow"
     shell:

@@ -68,7 +68,7 @@ rule benchmark_scaling:
         source=source_hash(
             "psfdae.stages.timing",
             "psfdae.stages.timing_jobs",
-            "psfdae.stars.seidel_scene",
+            chosen=["psfdae.stars.seidel_scene"],
         ),
     message:
         "Measuring how simulation and inference grow"

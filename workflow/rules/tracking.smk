@@ -20,7 +20,7 @@ rule track:
         preset=PRESET,
         # Not an output: Snakemake would delete it, and with it the runs of older configs.
         database=f"{RESULTS}/mlflow.db",
-        source=source_hash("psfdae.stages.track"),
+        source=source_hash("track"),
     message:
         "Importing the runs of {wildcards.dataset} into MLflow"
     shell:
@@ -53,7 +53,7 @@ rule track_alignment:
         results=lambda w: RESULTS,
         preset=PRESET,
         database=f"{RESULTS}/mlflow.db",
-        source=source_hash("psfdae.stages.track"),
+        source=source_hash("track"),
     message:
         "Importing the runs of scene 3 into MLflow"
     shell:
