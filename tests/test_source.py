@@ -6,15 +6,15 @@ import ast
 import re
 import shutil
 from functools import cache
-from pathlib import Path
 from textwrap import dedent
 
 import pytest
 
 from psfdae.source import ROOT, Code, Reader
 
-RULES = sorted(Path(ROOT).parents[1].glob("workflow/rules/*.smk"))
-SCENES = ("seidel", "turbulence", "telescope")
+REPOSITORY = ROOT.parents[1]
+OPTIONS = {"scene": ("seidel", "turbulence", "telescope"), "method": ("dae", "pca_som")}
+METHODS = [f"psfdae.estimators.{name}" for name in ("noisy", "pca_som", "lmmse", "dae")]
 EXEMPT = {
     "psfdae.benchmark.isolated": "a function that its caller mentions",
     "psfdae.cli": "the module of the command that runs",
@@ -23,19 +23,24 @@ EXEMPT = {
 
 @cache
 def rules():
-    """Functions and chosen modules of every rule, of a rule of several scenes one by one."""
+    """Functions and chosen modules of every rule; of one for several scenes or methods, each."""
     found = {}
-    for path in RULES:
+    for path in sorted(REPOSITORY.glob("workflow/rules/*.smk")):
         text = path.read_text()
-        for rule, body in re.findall(r"(?ms)^rule (\w+):\n(.*?)(?=^\S|\Z)", text):
-            call = re.search(r"(?s)source_hash\((?:[^()]|\([^()]*\))*\)", body)
-            for scene in SCENES if call else ():
-                filled = re.sub(r"\{[^}]*\}", scene, call[0])
-                node = ast.parse(filled.replace('f"', '"'), mode="eval").body
-                functions = tuple(ast.literal_eval(argument) for argument in node.args)
-                chosen = [v for k in node.keywords for v in ast.literal_eval(k.value)]
-                name = rule if filled == call[0] else f"{rule} {scene}"
-                found[name] = (functions, frozenset(chosen))
+        for rule, body in re.findall(r"(?ms)^ *(?:use )?rule\b([^:]*):\n(.*?)(?=^\S|\Z)", text):
+            call = re.search(r"(?s)(\w+)_(hash|source)\((?:[^()]|\([^()]*\))*\)", body)
+            if call is None or call[1] == "sweep":
+                continue
+            kind = next((k for k in OPTIONS if re.search(rf"\{{[^}}]*{k}[^}}]*\}}", call[0])), "")
+            for option in OPTIONS.get(kind, ("",)):
+                node = ast.parse(re.sub(r"\{[^}]*\}", option, call[0]).replace('f"', '"')).body[0]
+                functions = [a.value for a in node.value.args if isinstance(a, ast.Constant)]
+                chosen = [v for k in node.value.keywords for v in ast.literal_eval(k.value)]
+                chosen += METHODS if call[1] == "estimators" else []
+                name = " ".join(
+                    [*re.findall(r"\w+", rule.replace(" with", ""))[-1:], option]
+                ).strip()
+                found[name] = (tuple(functions), frozenset(chosen))
     return found
 
 
@@ -68,7 +73,7 @@ def changed(tmp_path, before):
 
 
 def test_every_rule_has_a_hash(before):
-    assert {"templates seidel", "stars turbulence", "train", "evaluate"} <= before.keys()
+    assert {"templates seidel", "stars turbulence", "dae", "evaluate"} <= before.keys()
     assert len(before) > 60
 
 
@@ -78,21 +83,22 @@ def test_formula_of_the_settings(changed):
         "configuration/telescope.py", ("return pixel_width", "return 1.0 * pixel_width")
     )
     assert {"templates seidel", "templates turbulence", "bank", "dataset_bounds"} <= found
-    assert not {"train", "baseline", "evaluate", "calibrate", "track"} & found
+    assert not {"dae", "pca_som", "evaluate", "calibrate", "track"} & found
 
 
 def test_scene(changed):
     """Data of that scene, and of no other."""
     found = changed("stars/turbulence_scene.py", ("+", "-"))
     assert {"templates turbulence", "stars turbulence"} <= found
-    for name in ("templates seidel", "stars seidel", "stars telescope", "bank", "train"):
+    for name in ("templates seidel", "stars seidel", "telescope_stars", "bank", "dae"):
         assert name not in found
 
 
-def test_network(changed):
-    found = changed("models/dae.py", ("padding", "padding_"))
-    assert {"train", "evaluate"} <= found
-    assert not {"templates seidel", "stars seidel", "baseline"} & found
+def test_method(changed):
+    """The fits of one method, and what applies all of them."""
+    found = changed("estimators/pca_som.py", ("@ self.components", "@ (1 * self.components)"))
+    assert {"pca_som", "evaluate", "figure_strip"} <= found
+    assert not {"templates seidel", "stars seidel", "dae", "knee_train", "alignment_dae"} & found
 
 
 def test_words(changed):

@@ -25,7 +25,10 @@ SETTINGS = {
     "config": f"{PACKAGE}.configuration.schema:Config",
     "alignment": f"{PACKAGE}.configuration.alignment:AlignmentConfig",
 }
-"""Models of all settings, by `root` of the decorator; who mentions one does not read all of it."""
+"""Models of the settings, by `root` of the decorator."""
+
+NOT_FOLLOWED = {*SETTINGS.values(), f"{PACKAGE}.configuration.schema:whole_config"}
+"""All settings: code that mentions them does not depend on each."""
 
 
 def source_hash(*functions: str, chosen: Iterable[str] = ()) -> str:
@@ -46,7 +49,8 @@ def source_hash(*functions: str, chosen: Iterable[str] = ()) -> str:
         "file.py:name" of a program, whose imports are looked for beside it, too.
     chosen : iterable of str
         Where the name of a module, of an entry of a registry or of a constant that lists them
-        decides at run time, all are taken unless some of them are among these.
+        decides at run time, all are taken unless some of them, or their modules, are among
+        these.
 
     Raises
     ------
@@ -115,10 +119,10 @@ class Code:
 
     def key(self, name: str) -> str:
         """Key of a command, or of what is in a program; the modules beside it are then known."""
-        stem, is_file, rest = name.partition(".py")
-        if not is_file:
+        file, *function = name.split(":")
+        if not file.endswith(".py"):
             return self.commands.get(name, name)
-        path = Path(self.root.parents[1], f"{stem}.py")
+        path = Path(self.root.parents[1], file)
         above = next(folder for folder in path.parents if not (folder / "__init__.py").exists())
         beside = _modules(path.parent, path.parent.relative_to(above).parts)
         if not beside.keys() <= self.paths.keys():
@@ -128,7 +132,7 @@ class Code:
         own = next((n for n, found in self.paths.items() if found == path), None)
         if own is None or any(self.paths[n] != found for n, found in beside.items()):
             raise ValueError(f"{path}: missing, or a module beside it has the name of another one")
-        return f"{own}{rest}"
+        return ":".join((own, *function))
 
     def reached(self, key: str, chosen: frozenset[str]) -> tuple[str, list[str]]:
         """Digest of a definition and what it reaches; of options only those chosen."""
@@ -138,9 +142,10 @@ class Code:
         registries = map(self.registered, others)
         groups = [*found.options, *(group for group in registries if key not in group)]
         every = [*found.references, *chain(*groups)]
-        if found.is_constant and not chosen.isdisjoint(every):
-            return "", [entry for entry in every if entry in chosen]
-        taken = ([option for option in group if option in chosen] or group for group in groups)
+        wanted = {k for k in every if k in chosen or k.partition(":")[0] in chosen}
+        if found.is_constant and wanted:
+            return "", [entry for entry in every if entry in wanted]
+        taken = ([option for option in group if option in wanted] or group for group in groups)
         return found.digest, [*found.references, *chain(*taken)]
 
     def _module(self, name: str) -> Module:
@@ -269,12 +274,12 @@ class Reader:
 
     def refer(self, key: str) -> None:
         """Write a mark for a key; a foreign name, or one not to be followed, as it is."""
-        if key.partition(":")[0] in self.code.paths and key not in SETTINGS.values():
+        if key.partition(":")[0] in self.code.paths and key not in NOT_FOLLOWED:
             self.references.append(key)
             key = "*"
         self.parts.append(key.rpartition(":")[2])
 
-    def meaning(self, node: ast.expr) -> tuple[str, list[str]] | None:
+    def meaning(self, node: ast.AST) -> tuple[str, list[str]] | None:
         """Key or foreign name of a dotted name, and the attributes left; None for a value."""
         names: list[str] = []
         while isinstance(node, ast.Attribute):
@@ -322,7 +327,7 @@ class Reader:
 
     def command(self, mark: ast.Call, parameters: ast.arguments) -> None:
         """Of a command: the settings that it reads and the classes of its parameters."""
-        said = self.strings([*mark.args[1:], *mark.keywords])
+        said = self.strings([*mark.args[1:], *mark.keywords], (ast.Assign, ast.FunctionDef))
         model = SETTINGS["alignment" if "alignment" in said else "config"]
         hints = (n for n in ast.walk(parameters) if isinstance(n, ast.Name | ast.Attribute))
         named = [meant[0] for hint in hints if (meant := self.meaning(hint))]
@@ -330,16 +335,17 @@ class Reader:
             if {type(s) for s in self.code.statements(key)} & {ast.ClassDef, ast.AnnAssign}:
                 self.refer(key)
 
-    def strings(self, nodes: Iterable[ast.AST]) -> list[str]:
-        """Texts in code and in what it names."""
+    def strings(self, nodes: Iterable[ast.AST], followed: tuple[type, ...]) -> list[str]:
+        """Texts in code, and in definitions of some kinds that it names."""
         found: list[str] = []
         for node in chain(*map(ast.walk, nodes)):
+            key = (self.meaning(node) or ("", []))[0]
             if isinstance(node, ast.Constant):
                 found.append(str(node.value))
-            elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Load):
-                key = (self.meaning(node) or ("", []))[0]
-                if made := self.code.statements(key):
-                    found += Reader(self.code, key.partition(":")[0]).strings(made)
+            elif isinstance(getattr(node, "ctx", None), ast.Load):
+                made = [s for s in self.code.statements(key) if isinstance(s, followed)]
+                inner = Reader(self.code, key.partition(":")[0]) if made else self
+                found += inner.strings(made, (ast.Assign,))
         return found
 
     def call(self, node: ast.Call) -> None:

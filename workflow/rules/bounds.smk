@@ -207,7 +207,7 @@ rule figure_headline:
         runtime=5,
     params:
         config=lambda w: settings("figure headline", f"dataset={HEADLINE_DATASET}"),
-        source=lambda w: estimators_source("psfdae.stages.figures", HEADLINE_DATASET),
+        source=lambda w: estimators_source("figure headline", HEADLINE_DATASET),
         dataset=HEADLINE_DATASET,
         models=lambda w: model_options(*HEADLINE, drawn=True),
         level=lambda w: shown_levels(HEADLINE_DATASET)[-1],

@@ -27,10 +27,10 @@ def model_options(dataset, split, reference, drawn=False):
     ]
 
 
-def estimators_source(stage, dataset):
-    """Hash of a stage that applies the methods of a dataset."""
+def estimators_source(command, dataset):
+    """Hash of a command that applies the methods of a dataset."""
     names = dataset_config(dataset).methods
-    return source_hash(stage, *(f"psfdae.estimators.{name}" for name in names))
+    return source_hash(command, chosen=[f"psfdae.estimators.{name}" for name in names])
 
 
 def histories_of(dataset):

@@ -35,9 +35,7 @@ rule stars:
         runtime=30,
     params:
         config=lambda w: settings("stars", f"stars={w.stars}"),
-        source=lambda w: source_hash(
-            "psfdae.stages.stars", chosen=[f"psfdae.stars.{w.scene}_scene"]
-        ),
+        source=lambda w: source_hash("stars", chosen=[f"psfdae.stars.{w.scene}_scene"]),
     message:
         "Simulating the noise-free stars {wildcards.stars}"
     shell:

@@ -14,7 +14,7 @@ rule evaluate:
         mem_mb=1500,
     params:
         config=lambda w: settings("evaluate", f"dataset={w.dataset}"),
-        source=lambda w: estimators_source("psfdae.stages.evaluate", w.dataset),
+        source=lambda w: estimators_source("evaluate", w.dataset),
         models=lambda w: model_options(w.dataset, w.split, w.reference),
     message:
         "Evaluating {wildcards.dataset}, {wildcards.split}, {wildcards.reference}"
@@ -43,7 +43,7 @@ rule paper_tables:
         f"{RESULTS}/benchmarks/paper_tables/{{dataset}}-{{metric}}.tsv"
     localrule: True
     params:
-        source=source_hash("psfdae.stages.tables"),
+        source=source_hash("paper-tables"),
     message:
         "Writing the paper's {wildcards.metric} table of {wildcards.dataset}"
     shell:
@@ -65,7 +65,7 @@ rule psf_metrics:
         f"{RESULTS}/benchmarks/psf_metrics/all.tsv"
     localrule: True
     params:
-        source=source_hash("psfdae.stages.tables"),
+        source=source_hash("collect"),
     message:
         "Collecting the metrics of all datasets"
     shell:

@@ -14,7 +14,7 @@ rule figure_templates:
     benchmark:
         f"{RESULTS}/benchmarks/figure_templates/{{scene}}.tsv"
     params:
-        source=source_hash("psfdae.stages.figures"),
+        source=source_hash("figure templates"),
     message:
         "Drawing the static PSFs of scene {wildcards.scene}"
     shell:
@@ -37,7 +37,7 @@ rule figure_energy:
     benchmark:
         f"{RESULTS}/benchmarks/figure_energy/{{scene}}.tsv"
     params:
-        source=source_hash("psfdae.stages.figures"),
+        source=source_hash("figure energy"),
     message:
         "Drawing the light inside the stamps of scene {wildcards.scene}"
     shell:
@@ -65,7 +65,7 @@ rule figure_strip:
         mem_mb=1000,
     params:
         config=lambda w: settings("figure strip", f"dataset={w.dataset}"),
-        source=lambda w: estimators_source("psfdae.stages.figures", w.dataset),
+        source=lambda w: estimators_source("figure strip", w.dataset),
         models=lambda w: model_options(w.dataset, "random", w.reference, drawn=True),
         levels=lambda w: [f"--level={level:g}" for level in shown_levels(w.dataset)],
     message:
@@ -93,7 +93,7 @@ rule figure_curves:
         f"{RESULTS}/benchmarks/figure_curves/{{dataset}}.tsv"
     params:
         labels=lambda w: [f"--label={x}" for x in histories_of(w.dataset).values()],
-        source=source_hash("psfdae.stages.figures"),
+        source=source_hash("figure curves"),
     message:
         "Drawing the training curves of {wildcards.dataset}"
     shell:
@@ -116,7 +116,7 @@ rule figure_errors:
     benchmark:
         f"{RESULTS}/benchmarks/figure_errors/{{dataset}}-{{metric}}.tsv"
     params:
-        source=lambda w: estimators_source("psfdae.stages.figures", w.dataset),
+        source=lambda w: estimators_source("figure errors", w.dataset),
     message:
         "Drawing {wildcards.metric} of {wildcards.dataset} against the noise level"
     shell:

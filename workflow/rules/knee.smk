@@ -21,7 +21,7 @@ rule fresh_stars:
             # Another name is another random stream.
             ["stars.name=fresh", f"stars.count={KNEE.fresh_stars}"],
         ),
-        source=source_hash("psfdae.stages.stars", chosen=["psfdae.stars.seidel_scene"]),
+        source=source_hash("stars", chosen=["psfdae.stars.seidel_scene"]),
     message:
         "Simulating other stars for the knee of the training"
     shell:
@@ -53,7 +53,7 @@ rule knee_train:
     params:
         config=lambda w: knee_overrides(w.point, stage_overrides),
         free=lambda w, threads: knee_overrides(w.point, free_overrides),
-        source=source_hash("psfdae.stages.fit", "psfdae.estimators.dae"),
+        source=source_hash("train", chosen=["psfdae.estimators.dae"]),
         folder=subpath(output.weights, parent=True),
         checkpoint=lambda w: f"{RESULTS}/checkpoints/knee-{w.point}.pt",
     message:

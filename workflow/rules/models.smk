@@ -14,9 +14,7 @@ use rule stars as more_stars with:
             f"stars={w.stars}",
             more=(f"stars.name={w.stars}_fresh", f"stars.count={w.count}"),
         ),
-        source=lambda w: source_hash(
-            "psfdae.stages.stars", f"psfdae.stars.{w.scene}_scene"
-        ),
+        source=lambda w: source_hash("stars", chosen=[f"psfdae.stars.{w.scene}_scene"]),
     message:
         "Simulating {wildcards.count} other stars {wildcards.stars}"
 
@@ -46,7 +44,7 @@ for _method in (m for m in registered() if m.stored):
             config=lambda w, m=_method: settings(
                 "fit", f"dataset={w.dataset}", name=m.name
             ),
-            source=source_hash("psfdae.stages.fit", f"psfdae.estimators.{_method.name}"),
+            source=source_hash("fit", chosen=[f"psfdae.estimators.{_method.name}"]),
             method=_method.name,
             more=lambda w, input: [
                 *(f"--reference={w.reference}" for _ in w.get("reference", "")[:1]),

@@ -185,11 +185,6 @@ class Method:
         cls.about = own.get("about", f"What `psfdae fit {cls.name}` leaves.")
 
     @classmethod
-    def reads(cls) -> tuple[str, ...]:
-        """Groups of the configuration that decide a fit."""
-        return ("seed", "noise", "parts", *cls.groups)
-
-    @classmethod
     def settings(cls, config: Any) -> dict[str, Any]:
         """Its groups of a configuration, as `fit` takes them."""
         return {name: getattr(config, name) for name in cls.groups}

@@ -19,7 +19,7 @@ Stars = Annotated[File, "Product of the stage stars."]
 
 def groups_of(name: str, **options: Any) -> tuple[str, ...]:
     """Groups of the configuration that decide a fit of a method."""
-    return method(name).reads()
+    return ("seed", "noise", "parts", *method(name).groups)
 
 
 @command("fit", reads=groups_of)
