@@ -268,69 +268,26 @@ def test_modules_chosen_by_name(small, function):
     )
 
 
-REGISTRIES = {
-    "subclasses": """
-    class Method:
-        known = {}
-        def __init_subclass__(cls, name):
-            Method.known[name] = cls
+def test_entries_of_a_constant(small):
+    """Who looks something up depends on all that is listed, or on what the rule chooses."""
+    main = """
+    from psfdae import means, medians
 
-    def named(name):
-        return Method.known[name]
+    KNOWN = {"mean": means.Mean, "median": medians.Median}
 
-    class Mean(Method, name="mean"):
-        def fit(self):
-            return 1
-    """,
-    "decorated": """
-    KNOWN = {}
-
-    def method(name):
-        def register(made):
-            KNOWN[name] = made
-            return made
-        return register
-
-    def named(name):
-        return KNOWN[name]
-
-    @method("mean")
-    class Mean:
-        def fit(self):
-            return 1
-    """,
-    "listed": """
-    class Mean:
-        def fit(self):
-            return 1
-
-    from psfdae.other import Median
-
-    KNOWN = {"mean": Mean, "median": Median}
-
-    def named(name):
-        return KNOWN[name]
-    """,
-}
-OTHER = {
-    "subclasses": "from psfdae.methods import Method\n\nclass Median(Method, name='median'):\n",
-    "decorated": "from psfdae.methods import method\n\n@method('median')\nclass Median:\n",
-    "listed": "class Median:\n",
-}
-
-
-@pytest.mark.parametrize("kind", REGISTRIES)
-def test_registries(small, kind):
-    """Who looks something up depends on all that is registered, or on what the rule chooses."""
-    main = "from psfdae.methods import named\n\ndef run(name):\n    return named(name)().fit()\n"
-    texts = [OTHER[kind] + f"    def fit(self):\n        return {n}\n" for n in (2, 3)]
-    both = [{"main": main, "methods": REGISTRIES[kind], "other": text} for text in texts]
-    assert small(**both[0]) != small(**both[1])
-    for chosen, same in (("psfdae.methods:Mean", True), ("psfdae.other:Median", False)):
-        found = [small(chosen=[chosen], **modules) for modules in both]
+    def run(name):
+        return KNOWN[name]().fit()
+    """
+    mean = "class Mean:\n    def fit(self):\n        return 1\n"
+    medians = [f"class Median:\n    def fit(self):\n        return {n}\n" for n in (2, 3)]
+    for chosen, same in (
+        ((), False),
+        (["psfdae.means:Mean"], True),
+        (["psfdae.means"], True),
+        (["psfdae.medians"], False),
+    ):
+        found = [small(chosen=chosen, main=main, means=mean, medians=m) for m in medians]
         assert (found[0] == found[1]) == same
-    mean = [small("psfdae.methods:Mean", **modules) for modules in both]
-    assert mean[0] == mean[1]
 
 
 def test_settings_that_a_command_reads(small):

@@ -35,9 +35,9 @@ def source_hash(*functions: str, chosen: Iterable[str] = ()) -> str:
     """Hash of functions and of all code of the package that they reach.
 
     They reach functions, whole classes and constants by name, through imports anywhere and
-    attributes of modules; the classes of the settings that a stage reads; modules whose name
-    stands in a string, f-strings included; and what registers itself: subclasses of a class
-    with `__init_subclass__`, and what is decorated by a function that mentions a constant.
+    attributes of modules; the classes of the settings that a stage reads; and modules whose
+    name stands in a string, or fits an f-string. A registry that its entries fill themselves
+    is not seen: list them in a constant, or import them by name.
 
     Names of modules, imports, comments, docstrings, formatting and annotations of functions
     do not count: moving or rewording never retrains a network.
@@ -48,9 +48,8 @@ def source_hash(*functions: str, chosen: Iterable[str] = ()) -> str:
         Commands, such as "figure templates"; "module:name", or "module" for all of it; or
         "file.py:name" of a program, whose imports are looked for beside it, too.
     chosen : iterable of str
-        Where the name of a module, of an entry of a registry or of a constant that lists them
-        decides at run time, all are taken unless some of them, or their modules, are among
-        these.
+        Where a name decides at run time between modules, or between entries of a constant,
+        all are taken unless some of them, or their modules, are among these.
 
     Raises
     ------
@@ -98,7 +97,7 @@ class Code:
     def __init__(self, root: Path) -> None:
         self.root, self.paths = root, _modules(root, (PACKAGE,))
         self.module, self.definition = cache(self._module), cache(self._definition)
-        self.resolve, self.registered = cache(self._resolve), cache(self._registered)
+        self.resolve = cache(self._resolve)
 
     def hash(self, functions: Iterable[str], chosen: Iterable[str] = ()) -> str:
         """As `source_hash`; a definition goes by the place at which it was met, not by its key."""
@@ -113,8 +112,8 @@ class Code:
                     places[reference] = len(queue)
                     queue.append(reference)
             digest.update(f"{text}{[places[r] for r in references]}\n".encode())
-        if not chosen <= places.keys():
-            raise ValueError(f"{min(chosen - places.keys())}: nothing in {functions} chooses it")
+        for choice in chosen - {*places, *(key.partition(":")[0] for key in places)}:
+            raise ValueError(f"{choice}: nothing in {functions} chooses it")
         return digest.hexdigest()[:16]
 
     def key(self, name: str) -> str:
@@ -125,10 +124,7 @@ class Code:
         path = Path(self.root.parents[1], file)
         above = next(folder for folder in path.parents if not (folder / "__init__.py").exists())
         beside = _modules(path.parent, path.parent.relative_to(above).parts)
-        if not beside.keys() <= self.paths.keys():
-            self.paths |= beside
-            self.__dict__.pop("users", None)
-            self.registered.cache_clear()
+        self.paths = {**beside, **self.paths}
         own = next((n for n, found in self.paths.items() if found == path), None)
         if own is None or any(self.paths[n] != found for n, found in beside.items()):
             raise ValueError(f"{path}: missing, or a module beside it has the name of another one")
@@ -137,15 +133,13 @@ class Code:
     def reached(self, key: str, chosen: frozenset[str]) -> tuple[str, list[str]]:
         """Digest of a definition and what it reaches; of options only those chosen."""
         found = self.definition(key)
-        # What registers itself, or something else, chooses nothing of the registry.
-        others = () if key in self.users else (r for r in found.references if r != key)
-        registries = map(self.registered, others)
-        groups = [*found.options, *(group for group in registries if key not in group)]
-        every = [*found.references, *chain(*groups)]
+        every = [*found.references, *chain(*found.options)]
         wanted = {k for k in every if k in chosen or k.partition(":")[0] in chosen}
         if found.is_constant and wanted:
             return "", [entry for entry in every if entry in wanted]
-        taken = ([option for option in group if option in wanted] or group for group in groups)
+        taken = (
+            [option for option in group if option in wanted] or group for group in found.options
+        )
         return found.digest, [*found.references, *chain(*taken)]
 
     def _module(self, name: str) -> Module:
@@ -195,43 +189,16 @@ class Code:
         return Definition(digest, reader.references, reader.options, is_constant)
 
     @cached_property
-    def users(self) -> dict[str, list[str]]:
-        """Definitions that have a key as their base or decorator, by that key."""
-        found: dict[str, list[str]] = {}
-        for module in self.paths:
-            reader = Reader(self, module)
-            for name, (node, *_) in self.module(module).statements.items():
-                for mark in (*getattr(node, "decorator_list", ()), *getattr(node, "bases", ())):
-                    if meant := reader.meaning(getattr(mark, "func", mark)):
-                        found.setdefault(meant[0], []).append(f"{module}:{name}")
-        return found
-
-    @cached_property
     def commands(self) -> dict[str, str]:
         """Keys of the functions that are commands, by the words of these."""
         found: dict[str, str] = {}
-        for key in self.users.get(COMMAND, ()):
-            reader, node = Reader(self, key.partition(":")[0]), self.statements(key)[0]
-            for mark in getattr(node, "decorator_list", ()):
-                ours = key.startswith(f"{PACKAGE}.")
-                if ours and reader.meaning(getattr(mark, "func", mark)) == (COMMAND, []):
-                    found[ast.literal_eval(mark.args[0])] = key
+        for module in [m for m in self.paths if m.split(".")[0] == PACKAGE]:
+            reader = Reader(self, module)
+            for name, (node, *_) in reader.module.statements.items():
+                for mark in getattr(node, "decorator_list", ()):
+                    if reader.meaning(getattr(mark, "func", mark)) == (COMMAND, []):
+                        found[ast.literal_eval(mark.args[0])] = f"{module}:{name}"
         return found
-
-    def _registered(self, key: str) -> list[str]:
-        """What registers itself with a class or, through its decorator, in a constant."""
-        module = key.partition(":")[0]
-        node = next(iter(self.statements(key)), None)
-        found = []
-        if any(getattr(n, "name", "") == "__init_subclass__" for n in getattr(node, "body", ())):
-            found = [*self.users.get(key, ())]
-        elif isinstance(node, ast.Assign | ast.AnnAssign):
-            near = (maker for maker in self.users if maker.startswith(f"{module}:"))
-            makers = (maker for maker in near if key in self.definition(maker).references)
-            found = [user for maker in makers for user in self.users[maker]]
-        for user in found:
-            found += [heir for heir in self.users.get(user, ()) if heir not in found]
-        return sorted(found, key=lambda user: user.partition(":")[2])
 
 
 code_below = cache(Code)
@@ -241,8 +208,8 @@ class Reader:
     """Writes down code without what does not count; collects its references and options."""
 
     def __init__(self, code: Code, module: str) -> None:
-        self.code, self.module = code, module
-        self.names = code.module(module).names
+        self.code, self.path, self.module = code, code.paths[module], code.module(module)
+        self.names = self.module.names
         self.imported: set[str] = set()
         self.parts: list[str] = []
         self.references: list[str] = []
@@ -298,7 +265,7 @@ class Reader:
         else:
             self.parts.append(node.id)
             if node.id == "__package__":
-                self.parts += _data(self.code.paths[self.module].parent)
+                self.parts += _data(self.path.parent)
 
     def function(self, node: ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda) -> None:
         """A function, whose variables hide other names but from its defaults and decorators."""
