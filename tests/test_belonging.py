@@ -184,7 +184,6 @@ def test_calibration_needs_one_telescope_for_the_stars_of_a_scene(at):
     [
         ["benchmark-baseline", "--stars", "s2.h5"],
         ["benchmark-prediction", "--stars", "s2.h5", "--bundle", "none"],
-        ["stability", "--stars", "s2.h5", "--turbulence", "none", "--graded", "graded.csv"],
     ],
     ids=lambda words: words[0],
 )

@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.stats import pearsonr
 from skimage.metrics import mean_squared_error, structural_similarity
 
+from psfdae.evaluation.correlation import error_correlation
 from psfdae.evaluation.metrics import all_metrics, clustered_mean, mse, ssim
 from psfdae.evaluation.paper import as_markdown, paper_table, published
 
@@ -100,3 +102,18 @@ def test_paper_table_puts_ours_beside_the_paper_s():
     )
     assert "| paper" in as_markdown(table, "dataset3", "mse")
     assert "2.7568e-05" in as_markdown(table, "dataset3", "mse")
+
+
+def test_correlation_is_pearson_s_with_fisher_s_interval():
+    rng = np.random.default_rng(0)
+    errors = rng.standard_normal((40, 4)) @ rng.standard_normal((4, 4))
+    matrix, low, high = error_correlation(errors)
+    assert matrix == pytest.approx(np.corrcoef(errors.T), abs=1e-12)
+    expected = pearsonr(errors[:, 0], errors[:, 2]).confidence_interval(0.95)
+    assert (low[0, 2], high[0, 2]) == pytest.approx((expected.low, expected.high), rel=1e-6)
+    assert (low <= matrix).all()
+    assert (matrix <= high).all()
+    with pytest.raises(ValueError, match="finite"):
+        error_correlation(errors * np.nan)
+    with pytest.raises(ValueError, match="at least one"):
+        error_correlation(errors[:0])

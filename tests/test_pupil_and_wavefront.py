@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from psfdae.optics.pupil import annular_pupil, disc_coverage, pupil_axis
-from psfdae.optics.sampling import SamplingError, check_opd, choose_samples, required_samples
+from psfdae.optics.sampling import SamplingError, choose_samples, required_samples
 from psfdae.optics.seidel import monomial_coefficients, monomial_images
 from psfdae.optics.wavefronts import seidel_wavefronts
 from psfdae.optics.zernike import noll_to_nm, zernike, zernike_basis
@@ -98,25 +98,6 @@ def test_ladder_takes_the_first_rung_that_suffices():
 def test_too_coarse_ladder_names_the_grid_that_would_do():
     with pytest.raises(SamplingError, match="needs N ≥ 217"):
         choose_samples(np.array([100, 217]), (96, 128))
-
-
-@pytest.mark.parametrize(("slope", "fails"), [(15.9, False), (16.1, True)])
-def test_opd_guard_is_half_a_wave_per_sample(slope, fails):
-    axis = pupil_axis(64)
-    opd = slope * np.broadcast_to(axis, (64, 64))
-    lit = np.ones((64, 64))
-    if fails:
-        with pytest.raises(SamplingError, match="at least N = 65"):
-            check_opd(opd, lit)
-    else:
-        check_opd(opd, lit)
-
-
-def test_opd_guard_refuses_a_nan():
-    opd = np.zeros((8, 8))
-    opd[4, 4] = np.nan
-    with pytest.raises(SamplingError, match="not finite"):
-        check_opd(opd, np.ones((8, 8)))
 
 
 def test_noll_order_starts_as_published():

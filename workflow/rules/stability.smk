@@ -1,4 +1,7 @@
 STABILITY_DATASET, STABILITY_OTHER = "dataset3", "dataset8"
+STABILITY_READS = ("seed", "noise", "dae", "train", "baseline", "evaluation")
+STRESS = Path(workflow.basedir, "tests/stress")
+STRESS_CODE = [p.name for p in sorted(STRESS.glob("*.py")) if p.name != "figure.py"]
 
 
 # Writes the table whatever it says: a failed job would lose it.
@@ -13,22 +16,30 @@ rule stability_table:
         f"{RESULTS}/logs/stability/table.log",
     benchmark:
         f"{RESULTS}/benchmarks_on_request/stability/table.tsv"
-    threads: lambda w: dataset_config(STABILITY_DATASET).stability.threads
+    threads: 2
     resources:
         mem_mb=3000,
         runtime=20,
     params:
-        config=lambda w: stage_overrides("stability", f"dataset={STABILITY_DATASET}"),
-        source=source_hash(
-            "psfdae.stages.stability",
-            chosen=["psfdae.stars.seidel_scene", "psfdae.stars.turbulence_scene"],
+        config=lambda w: str(
+            write_settings(
+                Path(RESULTS, ".settings"),
+                "stability",
+                STABILITY_READS,
+                composed(f"dataset={STABILITY_DATASET}"),
+                dry=workflow.dryrun,
+            )
         ),
+        source=lambda w: source_hash(*(f"tests/stress/{name}" for name in STRESS_CODE)),
+        # Asks for `threads` as a sign that another place is no reason to repeat a job.
+        tests=lambda w, threads: str(STRESS),
     message:
         "Stressing the whole chain"
     shell:
-        "psfdae stability --table-only --stars {input.stars}"
-        " --turbulence {input.turbulence} --out {output.table}"
-        " --graded {output.graded} {params.config:q} > {log} 2>&1"
+        "pytest {params.tests:q} --confcutdir {params.tests:q} -p no:cacheprovider"
+        " --stars {input.stars} --turbulence {input.turbulence} --settings {params.config}"
+        " --stability-csv {output.table} --graded-csv {output.graded} > {log} 2>&1"
+        " || test $? = 1"
 
 
 rule figure_stability:
@@ -50,11 +61,12 @@ rule figure_stability:
         mem_mb=500,
         runtime=10,
     params:
-        source=source_hash("psfdae.stages.stability_report"),
+        source=lambda w: source_hash("tests/stress/figure.py"),
+        script=lambda w, threads: str(STRESS / "figure.py"),
     message:
         "Drawing error against stress"
     shell:
-        "psfdae figure stability --graded {input} --out {output} > {log} 2>&1"
+        "python {params.script:q} {input} {output} > {log} 2>&1"
 
 
 rule stability:
@@ -71,9 +83,7 @@ rule stability:
     resources:
         mem_mb=500,
         runtime=10,
-    params:
-        source=source_hash("psfdae.stability.rows"),
     message:
         "Judging the stress tests"
     shell:
-        "psfdae stability-verdict {input.table} > {log} 2>&1"
+        "! grep ',fail$' {input.table} > {log} 2>&1"

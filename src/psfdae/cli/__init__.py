@@ -276,6 +276,5 @@ from psfdae.cli import (  # noqa: E402, F401
     predict,
     prediction,
     scaling,
-    stability,
     sweep,
 )

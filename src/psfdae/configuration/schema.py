@@ -186,15 +186,6 @@ class Benchmark(Group):
     threads: Count = Field(description="Largest number of threads timed")
 
 
-class Stability(Group):
-    """Stress tests of the whole chain."""
-
-    stars: Count = Field(description="Stars simulated for the tests")
-    seeds: Annotated[int, Field(ge=2)] = Field(description="Short trainings from other seeds")
-    epochs: Count = Field(description="Epochs of a short training")
-    threads: Count = Field(description="Threads of the linear algebra")
-
-
 class Bounds(Group):
     """Best possible estimates."""
 
@@ -283,7 +274,6 @@ class Config(Consistent):
     evaluation: Evaluation
     calibration: Calibration
     benchmark: Benchmark
-    stability: Stability
     bounds: Bounds
     calibration_stars: CalibrationStars
 

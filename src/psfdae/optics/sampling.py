@@ -93,37 +93,3 @@ def choose_samples(needed: np.ndarray, ladder: tuple[int, ...]) -> np.ndarray:
         )
     rungs = np.asarray(ladder)
     return rungs[np.searchsorted(rungs, needed)]
-
-
-def check_opd(opd: np.ndarray, pupil: np.ndarray) -> None:
-    """Refuse an OPD map that changes by more than half a wave per pupil sample.
-
-    Parameters
-    ----------
-    opd : ndarray, shape (..., N, N)
-        OPD in waves.
-    pupil : ndarray, shape (N, N)
-        Amplitude transmission; steps across cells without light do not count.
-
-    Raises
-    ------
-    SamplingError
-        Names the steepest step and the N that would do.
-    """
-    samples = pupil.shape[-1]
-    lit = pupil > 0
-    steps = [
-        np.abs(np.diff(opd, axis=axis))[..., pair].max(initial=0.0)
-        for axis, pair in ((-1, lit[:, 1:] & lit[:, :-1]), (-2, lit[1:] & lit[:-1]))
-    ]
-    steepest = max(steps)
-    if not steepest <= 0.5:
-        advice = (
-            f"at least N = {int(np.ceil(samples * steepest / 0.5))} would do"
-            if np.isfinite(steepest)
-            else "the OPD is not finite"
-        )
-        raise SamplingError(
-            f"the OPD changes by {steepest:.3g} waves per sample at N = {samples} "
-            f"pupil samples (at most 0.5): {advice}"
-        )

@@ -75,6 +75,9 @@ KEPT_IF_GIVEN = StarFlag.MASKED | StarFlag.OUTLIER
 KEPT_OTHERWISE = KEPT_IF_GIVEN | StarFlag.FAINT
 """Flags of `robust_flux` that hold for a star whose flux is given, and for others."""
 
+TINY = 1.0 / float(np.finfo(np.float32).max)
+"""A flux of less than this times the brightest pixel has no image in single precision."""
+
 SCATTER_CLIP = 4.0
 """Residuals beyond this many σ do not count for the noise."""
 
@@ -520,7 +523,7 @@ class Photometer:
 
     def _normalise(self, x: np.ndarray, fit: _Fit) -> tuple[np.ndarray, np.ndarray]:
         """Images of flux 1, and which of them stay in the range of the training set."""
-        usable = fit.flux > 0
+        usable = fit.flux > TINY
         flux = np.where(usable, fit.flux, 1.0)
         images = x - fit.sky.astype(np.float32)[:, None]
         images /= flux.astype(np.float32)[:, None]
@@ -578,7 +581,8 @@ class Photometer:
         given, fitted = np.isfinite(known_flux), np.isfinite(estimate.flux[:count])
         flux = np.where(given, known_flux, estimate.flux[:count])
         fit_flags = estimate.flags[:count].copy()
-        lost = ~fitted | ~(flux > 0) | (~given & ((fit_flags & StarFlag.NO_FLUX) > 0))
+        peak = np.abs(repaired[:count]).max(axis=1)
+        lost = ~fitted | ~(flux > TINY * peak) | (~given & ((fit_flags & StarFlag.NO_FLUX) > 0))
         fit_flags &= np.where(given, *(np.uint16(kept) for kept in (KEPT_IF_GIVEN, KEPT_OTHERWISE)))
         raise_flag(fit_flags, StarFlag.NO_FLUX, lost)
         left = repaired.mean(axis=1)[:count] - np.nan_to_num(estimate.flux[:count]) / self.pixels

@@ -1,0 +1,150 @@
+"""What the stress tests share: settings, stars, error budgets, small trainings."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from psfdae.models.dae import DaeTraining, TrainingSet, image_scale
+from psfdae.own_stars.packing import COMPONENTS, leading
+from psfdae.own_stars.photometry import FluxModel, Photometer
+from psfdae.rng import stream
+from psfdae.stages import stars as stars_stage
+from psfdae.stages import templates as templates_stage
+from psfdae.stages.common import star_wavefronts
+from psfdae.stars.fields import assign_fields, draw_jitter
+from psfdae.stars.framing import normalise_flux
+from psfdae.stars.noise import NoiseModel
+from psfdae.stars.scene import Propagation
+
+THREADS = 2  # of the linear algebra, and trainings side by side
+# Noise levels λ of the paper's three bands.
+LEVELS = 1e-5 * np.array([3, 5, 7, 9, 30, 50, 70, 90, 100, 200, 300, 500])
+# The smallest that the stamps of a scene carry, over all of its datasets.
+LEAST_LEVEL = {"seidel": 3e-5, "turbulence": 3e-4}
+BUDGET = 0.01  # numerical MSE of a stamp in units of the smallest noise variance that it carries
+MODEL_STARS, TRAINING_STARS = 1000, 250  # of scene 1's flux model, of the network in the bench
+
+
+class Scene(NamedTuple):
+    """One scene's configuration and noise-free stars (n, d, d) that sum to 1, float32."""
+
+    config: Any
+    images: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Bench:
+    """What every case gets: the configuration of dataset 3, stars, scratch space."""
+
+    config: Any
+    seidel: Scene
+    turbulence: Scene
+    folder: Path
+
+    @property
+    def noise(self):
+        return NoiseModel(self.config.noise.kappa, self.config.noise.background_photons)
+
+    @property
+    def level(self):
+        return float(min(self.config.noise.levels))
+
+    def stream(self, *names):
+        return stream(self.config.seed, "stability", *names)
+
+    def budget(self, config):
+        """Largest numerical MSE that a normalised stamp of a scene may have."""
+        return BUDGET * (self.config.noise.kappa * LEAST_LEVEL[config.scene.name]) ** 2
+
+    @cached_property
+    def flux_models(self):
+        """Flux model of each scene, of stars that are not among the tested ones."""
+        # Scene 2 has no random aberrations: there it is the same PSFs, other stars.
+        half = self.turbulence.images[: len(self.turbulence.images) // 2]
+        fresh = fresh_stars(self.seidel.config, MODEL_STARS)
+        return {"seidel": FluxModel.fit(fresh), "turbulence": FluxModel.fit(half)}
+
+    def test_stars(self, scene="seidel"):
+        """Stars that the scene's flux model has not seen, shape (n, d, d)."""
+        images = getattr(self, scene).images
+        return images if scene == "seidel" else images[len(images) // 2 :]
+
+    @property
+    def factor(self):
+        return image_scale(self.config.dae.scale, self.seidel.images.shape[-1])
+
+    @cached_property
+    def photometer(self):
+        """Photometry of scene 1 with what a bundle holds of the flux model."""
+        return Photometer(leading(self.flux_models["seidel"], COMPONENTS), COMPONENTS)
+
+    def training_set(self, count):
+        """The first stars of scene 1 against themselves; one in ten validates."""
+        images = self.seidel.images[:count]
+        held, levels = max(1, len(images) // 10), np.asarray(self.config.noise.levels)
+        parts = np.arange(held, len(images)), np.arange(held)
+        return TrainingSet(images, images, *parts, levels, self.noise)
+
+    @cached_property
+    def network(self):
+        """The configured network after a few steps: weights as they occur in use."""
+        update = {"epochs": 3, "batch": 25, "threads": 1, "schedule": "onecycle", "patience": 0}
+        settings = self.config.train.model_copy(update=update)
+        data = self.training_set(TRAINING_STARS)
+        training = DaeTraining(data, self.config.dae, settings, self.config.seed)
+        for _ in range(settings.epochs):
+            training.run_epoch()
+        return training.model.eval()
+
+
+def fresh_stars(config, count):
+    """Noise-free normalised stars of scene 1 from random streams of their own."""
+    config = changed(config, stars={"name": "stability"})
+    fields, jitter = (stream(config.seed, name, "stability") for name in ("field", "jitter"))
+    field = assign_fields(count, config.grid.points**2, fields)
+    jitter = draw_jitter(count, config.framing.jitter_px, jitter)
+    kernel = propagation(config, star_wavefronts(config, field))
+    return normalise_flux(kernel.framed(config.framing.stamp_px, jitter)[0])[0]
+
+
+def simulated(config, folder):
+    """Files of templates and stars of a configuration."""
+    templates, stars = folder / "templates.h5", folder / "stars.h5"
+    templates_stage.templates(config, templates)
+    stars_stage.stars(config, templates, stars)
+    return templates, stars
+
+
+def changed(config, **groups):
+    """A configuration with other values in some groups."""
+    old = {name: getattr(config, name) for name in groups}
+    return config.model_copy(update={k: v.model_copy(update=groups[k]) for k, v in old.items()})
+
+
+def propagation(config, source, search_px=None, **optics):
+    """Propagation of wavefronts, with other values of the group optics."""
+    config, search_px = changed(config, optics=optics), search_px or config.stars.search_px
+    return Propagation(source, config.telescope, config.optics, config.framing, search_px)
+
+
+def stamp_mse(stamps, truth):
+    """Largest mean squared difference of two sets of stamps of sum 1; NaN if one is NaN."""
+    difference = normalise_flux(stamps)[0] - normalise_flux(truth)[0]
+    return float((difference**2).mean(axis=(1, 2)).max())
+
+
+def rounding_of(dae):
+    """Single-precision rounding of a forward pass over its largest output."""
+    # Every layer sums kernel² · width terms; their roundings add at random.
+    terms = sum(kernel**2 for kernel in dae.kernels) * max(dae.widths)
+    return float(np.finfo(np.float32).eps) * float(np.sqrt(terms))
+
+
+def subspace_angle(first, second):
+    """Sine of the largest principal angle between the row spaces of (K, P) arrays."""
+    a, b = (np.linalg.qr(rows.T.astype(np.float64))[0] for rows in (first, second))
+    # From the part of one that lies outside the other: cosines near 1 would lose all digits.
+    return float(np.linalg.norm(b - a @ (a.T @ b), 2))

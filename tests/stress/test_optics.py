@@ -1,0 +1,201 @@
+"""Wavefronts, sampling and propagation."""
+
+import numpy as np
+import pytest
+
+from psfdae.optics.propagation import StampPropagator
+from psfdae.optics.pupil import annular_pupil
+from psfdae.optics.sampling import SamplingError
+from psfdae.optics.turbulence import SPECTRUM
+from psfdae.optics.wavefronts import seidel_wavefronts
+from psfdae.stages.common import template_wavefronts
+from psfdae.stars.framing import FramingError
+from psfdae.stars.turbulence_scene import CYCLES_PER_DIAMETER, SLOPE_SAMPLES, TurbulentWavefronts
+from stress.bench import changed, propagation, stamp_mse
+
+FINER = (254, 318, 398, 512, 640, 800, 1024, 1280, 1600, 2048)  # N beyond the config's
+FINEST = 2700  # largest N of a converged reference; beyond it a stamp needs GBs
+# Relative field of the test stars: axis, edge, corner; and stamps about their chief rays.
+FIELDS, CENTRED = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]]), np.zeros((3, 2), int)
+PIXELS_ARCSEC = (1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.2, 0.3, 0.6, 1.0, 3.0, 10.0)
+
+
+def needed_nodes(pixel):
+    """Gauss–Legendre nodes that resolve the finest fringes across a pixel of `pixel` λ/D.
+
+    The image has no structure finer than λ/D, so the phase of its fastest fringe
+    turns by 2π·pixel across a pixel; q nodes integrate it once q exceeds half the
+    amplitude of the phase, π·pixel/2, by a few.
+    """
+    return int(np.ceil(0.5 * np.pi * pixel + 4))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [1, 2, 3, 5, 7, 10, 20, 30, 50, 100])
+def test_stronger_aberrations(bench, record, factor):
+    """Seidel aberrations times 1 … 100: within the budget or refused."""
+    config, budget = bench.seidel.config, bench.budget(bench.seidel.config)
+    static, grids = config.wavefront.coefficients, config.optics.pupil_samples
+    source, peak = seidel(factor * static), stamper(config, seidel(3 * static), 64).brightest()
+    offset = np.rint(peak * factor / 3).astype(int)
+    reach = max(config.stars.search_px, int(np.abs(offset).max()) + 8)
+    truth = reference(config, source, offset, reach)
+    case, what = f"aberrations × {factor}", "MSE of normalised stamps"
+    how = (config, source, offset, reach, truth, budget)
+    agreement(record, case, f"{what}, configured grids", *how, pupil_samples=grids)
+    error = agreement(record, case, f"{what}, grids up to 2048", *how)
+    record.point("aberrations", factor, error, budget)
+    if truth is not None:
+        # The largest configured grid, whatever the wavefront needs.
+        pupil = annular_pupil(grids[-1], config.telescope.obscuration)
+        sizes = config.framing.stamp_px, config.telescope.pixel, config.optics.nodes
+        opd = source.opd(np.arange(len(source)), pupil, np.dtype(np.float64))
+        ignored = stamp_mse(StampPropagator(pupil, *sizes)(opd, offset), truth)
+        record.point("aberrations, guard ignored", factor, ignored, budget)
+        if factor == 10:
+            # A guard that refuses what would have been right would be of no use.
+            record.within(case, f"{what} if the guard is ignored", ignored, budget, np.inf)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [1, 3, 10, 30, 100, 1000])
+def test_stronger_turbulence(bench, record, factor):
+    """Fried's parameter divided by 1 … 1000: within the budget or refused."""
+    config, budget = bench.turbulence.config, bench.budget(bench.turbulence.config)
+    r0, case = config.wavefront.r0_m / factor, f"turbulence, r0 / {factor}"
+    stronger = changed(config, grid={"points": 1}, wavefront={"r0_m": r0})
+    try:
+        source = template_wavefronts(stronger)
+    except SamplingError:
+        record.equal(case, "outcome", "SamplingError", "SamplingError")
+        record.point("turbulence", factor, None, budget)
+        return
+    how = (config, source, np.zeros((len(source), 2), int), config.framing.search_px)
+    what, truth = "MSE of normalised stamps, grids up to 2048", reference(*how)
+    error = agreement(record, case, what, *how, truth, budget)
+    record.point("turbulence", factor, error, budget)
+    if error is not None:
+        # ∫ of the spectrum beyond the last wave. This part of the light lands beyond the
+        # stamp; its square is what comes back and changes the normalised stamp.
+        highest = CYCLES_PER_DIAMETER / config.telescope.diameter_m
+        left_out = 1.2 * np.pi * SPECTRUM * (r0 * highest) ** (-5 / 3)
+        record.at_most(case, "phase variance left out (rad²)", left_out, 0.1)
+
+
+class Ramps(list):
+    """OPD maps that rise by so many waves per sample of the grid of the slopes."""
+
+    def opd(self, index, axis, dtype):
+        ramp = 0.5 * SLOPE_SAMPLES * np.broadcast_to(axis, (axis.size, axis.size))
+        return (np.array(self)[index, None, None] * ramp).astype(dtype)
+
+
+def test_broken_wavefronts(bench, record):
+    """Wavefronts that are not finite, absurdly strong or too steep for the grid."""
+    config, static = bench.seidel.config, bench.seidel.config.wavefront.coefficients
+    for label, factor in (("NaN", np.nan), ("infinite", np.inf), ("times 1e20", 1e20)):
+        bad = seidel(np.stack([static, static * factor, static]))
+        with record.refused(f"a wavefront {label} among good ones", SamplingError):
+            propagation(config, bad).stamps(16, CENTRED)
+    for label, waves in (("NaN", np.nan), ("0.51 waves per sample", 0.51)):
+        bad = TurbulentWavefronts(Ramps([waves]))
+        with record.refused(f"OPD map, {label}", SamplingError):
+            propagation(bench.turbulence.config, bad, pupil_samples=[SLOPE_SAMPLES])
+    with record.refused("brightest pixel outside the search window", FramingError):
+        stamper(config, seidel(3 * static), 4).brightest()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scale", PIXELS_ARCSEC)
+def test_pixel_scale(bench, record, scale):
+    """Pixels over four decades, with the configured nodes and with those they need."""
+    config, budget = bench.seidel.config, bench.budget(bench.seidel.config)
+    source = seidel_wavefronts(np.tile(config.wavefront.coefficients, (2, 1)), FIELDS[:2])
+    peak = stamper(config, source).brightest()
+    offset = np.rint(peak * config.telescope.pixel_scale_arcsec / scale).astype(int)
+    rescaled = changed(config, telescope={"pixel_scale_arcsec": scale})
+    needed = needed_nodes(rescaled.telescope.pixel)
+    how = (rescaled, source, offset, config.stars.search_px)
+    truth = reference(*how, needed + 4)
+    for label, nodes in (("configured nodes", config.optics.nodes), ("nodes it needs", needed)):
+        case, what = f"pixel of {scale:g} arcsec", f"MSE of normalised stamps, {label}"
+        error = agreement(record, case, what, *how, truth, budget, nodes=nodes)
+        record.point(f"pixel scale, {label}", scale, error, budget)
+
+
+@pytest.mark.slow
+def test_similar_telescopes(bench, record):
+    """Aperture and wavelength over decades at the same λ/D per pixel: the same stamps."""
+    config, telescope = bench.seidel.config, bench.seidel.config.telescope
+    source, stamps = seidel(config.wavefront.coefficients), []
+    for factor in (1.0, 1e-1, 1e1, 1e3):
+        lengths = {n: factor * getattr(telescope, n) for n in ("diameter_m", "wavelength_m")}
+        exact = stamper(changed(config, telescope=lengths), source, precision="complex128")
+        stamps.append(exact.stamps(16, CENTRED))
+    case, what = "D and λ times 0.1 … 1000", "largest relative difference of a pixel"
+    # Rounding of p = pixel · D/λ turns the phase of the outermost pixel by πN·ε at most.
+    bound = 1e3 * np.pi * 256 * np.finfo(float).eps
+    record.close(case, what, np.stack(stamps[1:]) / stamps[0], 1, bound)
+
+
+@pytest.mark.parametrize("pixels", [1, 4, 16, 64])
+def test_energy(bench, record, pixels):
+    """Parseval: one period of the image holds the light of the pupil."""
+    pupil, rng = annular_pupil(32, 0.3), np.random.default_rng(bench.config.seed)
+    pixel, opd = 2.0 / pupil.spacing / pixels, rng.uniform(-0.5, 0.5, (2, *pupil.amplitude.shape))
+    for precision, bound in (("complex128", 1e-10), ("complex64", 1e-5)):
+        kernel = StampPropagator(pupil, pixels, pixel, needed_nodes(pixel) + 16, precision)
+        total = kernel(opd.astype(kernel.real_dtype)).sum(axis=(1, 2), dtype=np.float64)
+        case = f"Parseval, pixel of {pixel:.3g} λ/D, {precision}"
+        record.close(case, "|energy − 1| over one period", total, 1, bound)
+
+
+@pytest.mark.parametrize("pixel", [1e-6, 1e-4, 1e-2])
+def test_diffraction_limited_peak(record, pixel):
+    """π/4 (1 − ε²) per (λ/D)²."""
+    fine = annular_pupil(256, 0.3)
+    stamps = StampPropagator(fine, 2, pixel, 2, "complex128")(np.zeros((1, *fine.amplitude.shape)))
+    excess = stamps[0, 0, 0] / (0.25 * np.pi * (1 - 0.3**2) * pixel**2) - 1
+    case = f"diffraction-limited peak, pixel of {pixel:g} λ/D"
+    what = "relative excess of the peak pixel over its analytic value"
+    # What an annulus diffracts beyond ±N/2 λ/D, 2/(π² N/2 (1 − ε)), the grid counts as
+    # inside; the image bends by (π p)²/4.
+    bounds = -0.25 * (np.pi * pixel) ** 2, 2 / (np.pi**2 * 128 * (1 - 0.3))
+    record.within(case, what, excess, *bounds)
+
+
+def agreement(record, case, what, config, source, offset, reach, truth, budget, **optics):
+    """Row: within the budget of the truth, or refused; MSE, None if refused, ∞ without a truth."""
+    expected, error = f"≤ {budget:.3g} or SamplingError", None
+    try:
+        stamps = stamper(config, source, reach, **optics).stamps(config.framing.stamp_px, offset)
+        error = np.inf if truth is None else stamp_mse(stamps, truth)
+        record.row(case, what, expected, f"{error:.3g}", error <= budget)
+    except SamplingError:
+        record.row(case, what, expected, "SamplingError", True)
+    return error
+
+
+def reference(config, source, offset, reach, nodes=8):
+    """Stamps at twice the samples that the guard asks for; None if that is too many."""
+    try:
+        guarded = stamper(config, source, reach, nodes=nodes, more=[FINEST]).samples.max()
+    except SamplingError:
+        return None
+    samples = min(2 * int(guarded), FINEST)
+    if samples < 1.2 * guarded:
+        return None
+    exact = {"nodes": nodes, "precision": "complex128", "pupil_samples": [samples]}
+    return stamper(config, source, reach, **exact).stamps(config.framing.stamp_px, offset)
+
+
+def stamper(config, source, search_px=None, more=(), **optics):
+    """Propagation star by star, on the configured grids, continued, by default."""
+    configured = config.optics.pupil_samples
+    grids = [*configured, *(n for n in FINER if n > configured[-1]), *more]
+    return propagation(config, source, search_px, **{"pupil_samples": grids, "batch": 1} | optics)
+
+
+def seidel(coefficients):
+    """Axis, edge and corner with the same (5,) or their own (3, 5) coefficients."""
+    return seidel_wavefronts(np.broadcast_to(coefficients, (3, 5)).copy(), FIELDS)
