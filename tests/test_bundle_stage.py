@@ -26,7 +26,7 @@ from psfdae.own_stars.bundle import (
     shipped_path,
     write_bundle,
 )
-from psfdae.own_stars.photometry import FluxModel
+from psfdae.own_stars.photometry import FluxModel, noise_equivalent_px, signal_to_noise
 from psfdae.rng import stream
 from psfdae.stages import bundle as stage
 from psfdae.stages import bundle_use
@@ -162,10 +162,10 @@ def test_signal_to_noise_is_that_of_a_matched_filter():
     noise = 0.01
     images = mean + np.random.default_rng(0).normal(0, noise, size=(20000, 12, 12))
     flux = (images * mean).sum(axis=(1, 2)) / (mean**2).sum()
-    area = packing.noise_equivalent_px(mean)
-    assert 1 / flux.std() == pytest.approx(packing.signal_to_noise(noise, area), rel=0.03)
+    area = noise_equivalent_px(mean)
+    assert 1 / flux.std() == pytest.approx(signal_to_noise(noise, area), rel=0.03)
     flat = np.full((12, 12), 1 / 144)
-    assert packing.noise_equivalent_px(flat) == pytest.approx(144)
+    assert noise_equivalent_px(flat) == pytest.approx(144)
 
 
 def test_errors_of_some_stars_are_those_stars_errors():

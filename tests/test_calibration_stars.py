@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from psfdae.own_stars.example import noise_area
+from psfdae.own_stars.photometry import noise_equivalent_px
 from psfdae.own_stars.selection import (
     BrightStars,
     brightest_pixels,
@@ -62,7 +62,7 @@ def test_window_of_a_gaussian_is_as_wide_as_it_is():
     """S/N = F / (σ √A) with A = 1/Σp² gives its width back, but no less than 0.7 px."""
     sigma = np.array([0.9, 1.5, 2.5, 0.3])
     psf = np.concatenate([gaussians([[0.2, 0.4]], sigma=s) for s in sigma])
-    area = np.array([noise_area(image / image.sum()) for image in psf])
+    area = np.array([noise_equivalent_px(image / image.sum()) for image in psf])
     flux, noise = np.array([1e4, 2e3, 5e5, 1e4]), np.array([3.0, 7.0, 2.0, 3.0])
     window = window_of(flux / (noise * np.sqrt(area)), flux, noise)
     assert window == pytest.approx(np.maximum(sigma, 0.7), rel=0.02)
@@ -93,7 +93,7 @@ def test_signal_to_noise_is_that_of_king_s_area():
     noise, flux = 3.0, 20000.0
     rng = np.random.default_rng(2)
     noisy = flux * star + rng.normal(0, noise, (400, 16, 16))
-    expected = flux / (noise * np.sqrt(noise_area(star[0])))
+    expected = flux / (noise * np.sqrt(noise_equivalent_px(star[0])))
     measured = signal_to_noise(noisy, np.full(400, noise))
     assert measured.mean() == pytest.approx(expected, rel=3e-4)
     assert measured.std() == pytest.approx(1.0, abs=0.15)  # its error is one unit

@@ -26,9 +26,9 @@ from psfdae.own_stars.example import (
     RENDER_PX,
     FieldRecipe,
     example_field,
-    noise_area,
     star_images,
 )
+from psfdae.own_stars.photometry import noise_equivalent_px
 from psfdae.own_stars.selection import brightest_pixels, collect, star_centres
 from psfdae.own_stars.stamps import cut
 from psfdae.own_stars.training_images import make_images, star_grid, training_columns
@@ -110,7 +110,9 @@ def test_example_stars_lie_where_the_catalogue_says(field):
     assert near.sum() > 10
     assert np.abs(found - expected).max() < 0.06
     bright = made.kind == "bright"
-    snr = made.flux[bright] / np.sqrt(336 * np.median([noise_area(p) for p in made.psf[bright]]))
+    snr = made.flux[bright] / np.sqrt(
+        336 * np.median([noise_equivalent_px(p) for p in made.psf[bright]])
+    )
     assert 80 < snr.min() < snr.max() < 3500
 
 

@@ -37,33 +37,18 @@ from psfdae.own_stars.photometry import FluxModel
 if TYPE_CHECKING:
     from psfdae.models.dae import Dae
 
-FORMAT_VERSION = 1
-"""Raised whenever an older psfdae could no longer read what a newer one writes."""
-
+FORMAT_VERSION = 1  # raised when an older psfdae could no longer read what a newer one writes
 SUFFIX = ".psf.safetensors"
-
-SHIPPED = "wfsat"
-"""Name of the bundle that comes with the package."""
-
-FRAMING = "brightest pixel at (d/2, d/2)"
-"""Where a star lies in a stamp of side d, 0-based (row, column), before the jitter."""
-
+SHIPPED = "wfsat"  # name of the bundle that comes with the package
+FRAMING = "brightest pixel at (d/2, d/2)"  # 0-based (row, column) in stamps of side d, unjittered
 KIND = "psfdae bundle"
 
-COMPLETED_PX = 32**2
-"""Pixels of the largest stamps whose covariance gets a whole basis."""
-
-LARGEST = 2**28
-"""Bytes of a bundle; one of stamps of 256 × 256 pixels has some 20 MB."""
-
-DOUBLE = frozenset({"flux/variance", "flux/rest", "noise_nodes", "distance_limit"})
-"""Arrays of float64; the others are float32."""
-
-TOLERANCE = 1e-3
-"""By which the stored mean PSF may miss the sum 1, and eigenvectors orthonormality."""
-
-VARIANCE = 1e6
-"""Largest variance of images of sum 1 that is no nonsense."""
+COMPLETED_PX = 32**2  # pixels of the largest stamps whose covariance gets a whole basis
+LARGEST = 2**28  # bytes; a bundle of stamps of 256 × 256 pixels has some 20 MB
+TOLERANCE = 1e-3  # by which the mean PSF may miss the sum 1, and eigenvectors orthonormality
+VARIANCE = 1e6  # largest variance of images of sum 1 that is no nonsense
+# Arrays of float64; the others are float32.
+DOUBLE = {"flux/variance", "flux/rest", "noise_nodes", "distance_limit"}
 
 Positive = Annotated[float, Field(gt=0)]
 Count = Annotated[int, Field(ge=1)]
@@ -146,33 +131,15 @@ class BundleInfo(_Described):
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
-    """A trained network, what it was trained on, and how well it does.
-
-    Attributes
-    ----------
-    info : BundleInfo
-    weights : dict of ndarray, float32
-        State of `psfdae.models.dae.Dae`.
-    flux_model : FluxModel
-        Of the noise-free training stars; the last `info.components` eigenvectors
-        are those that were measured.
-    noise_nodes : ndarray, shape (S,)
-        Noise at which the errors were measured, ascending.
-    error68 : ndarray, shape (S, d, d)
-        Half-width that holds 68.27 % of the PSF's errors, in units of the flux.
-    rms : ndarray, shape (S, d, d)
-        Root mean square of the PSF's errors, in units of the flux.
-    distance_limit : float
-        99.9 % quantile of the Mahalanobis distance of test stars (`mahalanobis`).
-    """
+    """A trained network, what it was trained on, and how well it does."""
 
     info: BundleInfo
-    weights: dict[str, np.ndarray]
-    flux_model: FluxModel
-    noise_nodes: np.ndarray
-    error68: np.ndarray
-    rms: np.ndarray
-    distance_limit: float
+    weights: dict[str, np.ndarray]  # state of the network, float32
+    flux_model: FluxModel  # of the noise-free training stars; `info.components` are measured
+    noise_nodes: np.ndarray  # (S,), noise at which the errors were measured, ascending
+    error68: np.ndarray  # (S, d, d), half-width of 68.27 % of the errors, in units of the flux
+    rms: np.ndarray  # (S, d, d), root mean square of the errors, in units of the flux
+    distance_limit: float  # 99.9 % quantile of the distance of test stars (`mahalanobis`)
 
     @property
     def sha256(self) -> str:
@@ -263,13 +230,7 @@ def creation_date() -> str:
 
 
 def write_bundle(bundle: Bundle, path: Path) -> None:
-    """Write a bundle atomically; the same bundle gives the same bytes.
-
-    Raises
-    ------
-    BundleError
-        If its arrays do not fit together.
-    """
+    """Write a bundle atomically, if its parts fit together; the same one gives the same bytes."""
     tensors = _tensors(bundle)
     _check(bundle.info, tensors, path)
     content = packed(bundle.info.model_dump(mode="json"), tensors)
@@ -333,14 +294,7 @@ def shipped_path() -> Path:
 
 
 def read_bundle(path: Path | None = None) -> Bundle:
-    """Read a bundle, by default the shipped one, and check it.
-
-    Raises
-    ------
-    BundleError
-        If the file is missing, damaged, of a newer format, or no bundle; the message
-        names it.
-    """
+    """Read a bundle, by default the shipped one, and check it, or raise BundleError."""
     path = shipped_path() if path is None else path
     try:
         text, tensors = _load(path)
@@ -445,26 +399,21 @@ def _check(info: BundleInfo, tensors: Mapping[str, np.ndarray], path: Path) -> N
 
 def _check_flux_model(info: BundleInfo, tensors: Mapping[str, np.ndarray], path: Path) -> None:
     """Whether the flux model is one: a mean of sum 1 and the eigenvectors of a covariance."""
-    total = tensors["flux/mean"].sum(dtype=np.float64)
-    basis = tensors["flux/basis"].astype(np.float64)
+    mean, variance, rest, low, high, basis = (
+        tensors[f"flux/{name}"] for name in ("mean", "variance", "rest", "low", "high", "basis")
+    )
+    basis = basis.astype(np.float64)
+    product, variances = basis.T @ basis, f"numbers from 0 to {VARIANCE:g}"
     for name, right, wanted in (
-        ("flux/mean", abs(total - 1.0) <= TOLERANCE, "a sum of 1"),
-        ("flux/variance", _variances(tensors["flux/variance"]), f"numbers from 0 to {VARIANCE:g}"),
-        ("flux/rest", _variances(tensors["flux/rest"]), f"numbers from 0 to {VARIANCE:g}"),
-        ("flux/high", (tensors["flux/low"] <= tensors["flux/high"]).all(), "at least flux/low"),
-        ("flux/basis", info.components < basis.shape[0], "fewer columns than rows"),
-        ("flux/basis", _orthonormal(basis), "orthonormal columns"),
+        ("mean", abs(mean.sum(dtype=np.float64) - 1.0) <= TOLERANCE, "a sum of 1"),
+        ("variance", (variance >= 0) & (variance <= VARIANCE), variances),
+        ("rest", (rest >= 0) & (rest <= VARIANCE), variances),
+        ("high", low <= high, "at least flux/low"),
+        ("basis", info.components < basis.shape[0], "fewer columns than rows"),
+        ("basis", np.abs(product - np.eye(len(product))) <= TOLERANCE, "orthonormal columns"),
     ):
-        if not right:
-            raise BundleError(f"{path}: array {name!r} must have {wanted}")
-
-
-def _variances(values: np.ndarray) -> bool:
-    return bool(((values >= 0) & (values <= VARIANCE)).all())
-
-
-def _orthonormal(basis: np.ndarray) -> bool:
-    return bool((np.abs(basis.T @ basis - np.eye(basis.shape[1])) <= TOLERANCE).all())
+        if not np.all(right):
+            raise BundleError(f"{path}: array 'flux/{name}' must have {wanted}")
 
 
 def _completed(tensors: Mapping[str, np.ndarray]) -> FluxModel:

@@ -1,20 +1,10 @@
 """Star catalogues: FITS tables (also FITS_LDAC), CSV and other text tables, ECSV, SExtractor.
 
-Names of columns are found whatever their case. The origin is the index of the centre of
-the first pixel:
-
-| program | origin | columns, best first |
-|---|---|---|
-| SExtractor and the like | 1 | XWIN_IMAGE, XPSF_IMAGE, XMODEL_IMAGE, X_IMAGE, XPEAK_IMAGE |
-| photutils | 0 | x_fit, x_centroid, xcentroid, xcenter |
-| any | must be stated | x, xpos, x_pos, xpix, x_pix, x_pixel |
-| SExtractor, sky | degrees | ALPHAWIN_J2000, ALPHAPSF_J2000, ALPHA_J2000, …_SKY |
-| any, sky | degrees, or sexagesimal text | ra, raj2000, _raj2000, ra_icrs, ra_deg, ramean, radeg |
-
-Plain x, y are written with either origin (IRAF and DS9 count from 1, numpy and sep
-from 0); a wrong guess would shift every star by a pixel, so there is none. Pixel
-columns go before sky columns. Columns of different programs in one catalogue are
-not guessed between, either.
+Names of columns (`CONVENTIONS`) are found whatever their case. The origin, the index of
+the centre of the first pixel, is 1 for SExtractor and 0 for photutils; plain x, y are
+written with either (IRAF and DS9 count from 1, numpy and sep from 0): a wrong guess would
+shift every star by a pixel, so there is none. Pixel columns go before sky columns.
+Columns of different programs in one catalogue are not guessed between, either.
 """
 
 from __future__ import annotations
@@ -34,90 +24,58 @@ from psfdae.own_stars.images import UNPACK, PlainFile, open_hdus, plain_file
 SEXTRACTOR_HEADER = re.compile(r"#\s*(\d+)\s+[A-Za-z_]\w*")
 SEXAGESIMAL = re.compile(r"[:hd\s]", re.IGNORECASE)
 
-MOST_STARS = 5_000_000
+MOST_STARS = 5_000_000  # rows of a catalogue
 MOST_COLUMNS = 2000
-"""Rows and columns of a catalogue."""
-
-LARGEST_TEXT = 2**26
-"""Bytes of a text table; reading takes some ten times as much memory."""
-
-LARGEST_ECSV_HEADER = 2**18
-"""Characters of an ECSV header, which is YAML and slow to read."""
-
+LARGEST_TEXT = 2**26  # bytes of a text table; reading takes some ten times as much memory
+LARGEST_ECSV_HEADER = 2**18  # characters; it is YAML and slow to read
+# Characters of all rows of a text table, each as wide as its columns' widest cells: numpy keeps
+# text in columns as wide as their longest cell, and one long cell makes every row as long.
 WIDEST = 2**27
-"""Characters of all rows of a text table, each as wide as its columns' widest cells.
-
-numpy keeps text in columns as wide as their longest cell, four bytes a character:
-one long cell makes every row as long.
-"""
-
-LONGEST_IDENTIFIER = 200
-"""Characters; each row of the prediction is as long as the longest."""
-
-ROWS = 10_000
-"""Rows of a text table that are measured at a time."""
+LONGEST_IDENTIFIER = 200  # characters; each row of the prediction is as long as the longest
+ROWS = 10_000  # rows of a text table that are measured at a time
 
 
 @dataclass(frozen=True)
 class Convention:
-    """Position columns of one program: `pairs` from best to worst."""
+    """Position columns of one program, pairs `x,y` from best to worst."""
 
-    pairs: tuple[tuple[str, str], ...]
-    sky: bool
+    names: str
+    sky: bool = False
     origin: int | None = None
 
+    @property
+    def pairs(self) -> list[list[str]]:
+        """Both names of every pair."""
+        return [pair.split(",") for pair in self.names.split()]
 
-def _pairs(names: str) -> tuple[tuple[str, str], ...]:
-    words = names.split()
-    return tuple(zip(words[::2], words[1::2], strict=True))
+
+def _each(names: str, sky: bool = False) -> list[Convention]:
+    """A convention for every pair."""
+    return [Convention(pair, sky) for pair in names.split()]
 
 
-CONVENTIONS = (
+CONVENTIONS = [
     Convention(
-        _pairs(
-            "XWIN_IMAGE YWIN_IMAGE XPSF_IMAGE YPSF_IMAGE XMODEL_IMAGE YMODEL_IMAGE "
-            "X_IMAGE Y_IMAGE XPEAK_IMAGE YPEAK_IMAGE"
-        ),
-        sky=False,
+        "XWIN_IMAGE,YWIN_IMAGE XPSF_IMAGE,YPSF_IMAGE XMODEL_IMAGE,YMODEL_IMAGE "
+        "X_IMAGE,Y_IMAGE XPEAK_IMAGE,YPEAK_IMAGE",
         origin=1,
     ),
+    Convention("x_fit,y_fit x_centroid,y_centroid xcentroid,ycentroid xcenter,ycenter", origin=0),
+    *_each("x,y xpos,ypos x_pos,y_pos xpix,ypix x_pix,y_pix x_pixel,y_pixel"),
     Convention(
-        _pairs("x_fit y_fit x_centroid y_centroid xcentroid ycentroid xcenter ycenter"),
-        sky=False,
-        origin=0,
-    ),
-    *(
-        Convention((pair,), sky=False)
-        for pair in _pairs("x y xpos ypos x_pos y_pos xpix ypix x_pix y_pix x_pixel y_pixel")
-    ),
-    Convention(
-        _pairs(
-            "ALPHAWIN_J2000 DELTAWIN_J2000 ALPHAPSF_J2000 DELTAPSF_J2000 ALPHA_J2000 DELTA_J2000 "
-            "ALPHAWIN_SKY DELTAWIN_SKY ALPHA_SKY DELTA_SKY"
-        ),
+        "ALPHAWIN_J2000,DELTAWIN_J2000 ALPHAPSF_J2000,DELTAPSF_J2000 ALPHA_J2000,DELTA_J2000 "
+        "ALPHAWIN_SKY,DELTAWIN_SKY ALPHA_SKY,DELTA_SKY",
         sky=True,
     ),
-    *(
-        Convention((pair,), sky=True)
-        for pair in _pairs(
-            "ra dec RAJ2000 DEJ2000 RAJ2000 DECJ2000 _RAJ2000 _DEJ2000 RA_ICRS DE_ICRS "
-            "RA_ICRS DEC_ICRS ra_deg dec_deg raMean decMean radeg decdeg radeg dedeg"
-        )
+    *_each(
+        "ra,dec RAJ2000,DEJ2000 RAJ2000,DECJ2000 _RAJ2000,_DEJ2000 RA_ICRS,DE_ICRS "
+        "RA_ICRS,DEC_ICRS ra_deg,dec_deg raMean,decMean radeg,decdeg radeg,dedeg",
+        sky=True,
     ),
-)
-
-ID_COLUMNS = (
-    "id",
-    "source_id",
-    "number",
-    "star_id",
-    "objid",
-    "obj_id",
-    "object_id",
-    "label",
-    "name",
-)
-"""Columns that identify a star; the first of these that a catalogue has is used."""
+]
+# Columns that identify a star; the first of these that a catalogue has is used.
+ID_COLUMNS = ("id", "source_id", "number", "star_id", "objid", "obj_id", "object_id")
+ID_COLUMNS += ("label", "name")
 
 
 class ColumnError(ValueError):
@@ -199,13 +157,7 @@ class Catalogue:
         return len(self.table)
 
     def numbers(self, name: str) -> np.ndarray:
-        """A column as float64, shape (n,); NaN where the catalogue has no value.
-
-        Raises
-        ------
-        ObservationError
-            If there is no such column, or it holds anything but real numbers.
-        """
+        """A column as float64, shape (n,); NaN where the catalogue has no value."""
         column = self._column(name)
         if column.ndim != 1:
             raise ObservationError(self.path, f"column {name!r} holds arrays, not numbers")
@@ -369,11 +321,6 @@ def read_catalogue(path: Path) -> Catalogue:
     the only table is taken; ECSV; the ASCII_HEAD format of SExtractor; or a text
     table with a line of column names, separated by commas, semicolons, tabs or
     blanks. Lines that begin with # are comments.
-
-    Raises
-    ------
-    ObservationError
-        If the file is none of these, damaged, or has no rows.
     """
     with reading(path), path.open("rb") as file:
         start = file.read(16)

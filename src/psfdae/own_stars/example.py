@@ -21,100 +21,49 @@ from psfdae.optics.propagation import StampPropagator
 from psfdae.optics.pupil import annular_pupil
 from psfdae.optics.wavefronts import seidel_wavefronts
 from psfdae.own_stars.observation import central_pixel
+from psfdae.own_stars.photometry import noise_equivalent_px
 from psfdae.rng import stream
 
-OVERSAMPLING = 3
-"""Sub-pixels per pixel and axis; the seeing leaves nothing beyond their Nyquist frequency."""
-
-RENDER_PX = 32
-"""Side of the square into which a star is drawn, in pixels."""
-
-MAX_SIGNAL = 65535
-"""Largest number of a 16-bit camera."""
-
-BATCH = 32
-"""Stars that are propagated at a time."""
+OVERSAMPLING = 3  # sub-pixels per axis; seeing leaves nothing beyond their Nyquist frequency
+RENDER_PX = 32  # side of the square into which a star is drawn
+MAX_SIGNAL = 65535  # largest number of a 16-bit camera
+BATCH = 32  # stars that are propagated at a time
 
 
 @dataclass(frozen=True)
 class FieldRecipe:
-    """What the exposure shows.
-
-    Attributes
-    ----------
-    side_px : int
-        Side of the image.
-    bright, faint : int
-        Stars of either kind. The bright ones follow a uniform distribution in
-        log(signal to noise).
-    saturated, blended : int
-        Further bright stars: above the camera's limit, and with a companion of a
-        third of their flux at 4 to 7 px.
-    bright_snr, faint_snr : (float, float)
-        Range of signal to noise, F / (σ √A), with A the noise-equivalent area of the
-        PSF on the optical axis.
-    seeing_px : float
-        FWHM of the Moffat profile, exponent 3.
-    pixel : float
-        Pixel width in λ/D.
-    seidel : tuple of float
-        W040, W131, W222, W220, W311 in waves at the middle of an edge.
-    sky_e, sky_slope : float
-        Sky in electrons per pixel in the middle, and its relative rise from left to right.
-    read_noise_e : float
-        Electrons per pixel.
-    gain : float
-        Electrons per count.
-    saturation : int
-        Counts at which the camera clips.
-    pixel_scale_arcsec : float
-    """
+    """What the exposure shows."""
 
     side_px: int = 1500
-    bright: int = 300
+    bright: int = 300  # stars, uniform in the logarithm of their signal to noise
     faint: int = 700
-    saturated: int = 6
-    blended: int = 20
+    saturated: int = 6  # further bright stars, above the camera's limit
+    blended: int = 20  # further ones with a companion of a third of their flux at 4 to 7 px
+    # Range of F / (σ √A), with A the noise-equivalent area of the PSF on the optical axis.
     bright_snr: tuple[float, float] = (120.0, 3000.0)
     faint_snr: tuple[float, float] = (5.0, 100.0)
-    seeing_px: float = 2.2
-    pixel: float = 2.0
+    seeing_px: float = 2.2  # FWHM of the Moffat profile, exponent 3
+    pixel: float = 2.0  # width in λ/D
+    # W040, W131, W222, W220, W311 in waves at the middle of an edge.
     seidel: tuple[float, ...] = (0.1, 1.6, 0.5, 0.5, 0.0)
-    sky_e: float = 300.0
-    sky_slope: float = 0.1
-    read_noise_e: float = 6.0
-    gain: float = 1.6
-    saturation: int = 60000
+    sky_e: float = 300.0  # electrons per pixel in the middle
+    sky_slope: float = 0.1  # relative rise from left to right
+    read_noise_e: float = 6.0  # electrons per pixel
+    gain: float = 1.6  # electrons per count
+    saturation: int = 60000  # counts at which the camera clips
     pixel_scale_arcsec: float = 1.2
 
 
 @dataclass(frozen=True)
 class ExampleField:
-    """An exposure with its truth.
+    """An exposure with its truth."""
 
-    Attributes
-    ----------
-    image : ndarray, shape (side, side), uint16
-        Counts.
-    position : ndarray, shape (n, 2)
-        (x, y) of the chief ray of every star, 0-based pixel centres.
-    centroid : ndarray, shape (n, 2)
-        (x, y) of the centre of light, as a catalogue would have it.
-    flux : ndarray, shape (n,)
-        Electrons of every star.
-    psf : ndarray, shape (n, RENDER_PX, RENDER_PX), float32
-        Noise-free star, sum 1; its pixel [RENDER_PX/2, RENDER_PX/2] is the one
-        nearest to the position. Companions are not in it.
-    kind : ndarray of str, shape (n,)
-        "bright", "faint", "saturated" or "blended".
-    """
-
-    image: np.ndarray
-    position: np.ndarray
-    centroid: np.ndarray
-    flux: np.ndarray
-    psf: np.ndarray
-    kind: np.ndarray
+    image: np.ndarray  # counts, uint16
+    position: np.ndarray  # (n, 2), x, y of the chief ray, 0-based pixel centres
+    centroid: np.ndarray  # (n, 2), x, y of the centre of light, as a catalogue would have it
+    flux: np.ndarray  # (n,), electrons
+    psf: np.ndarray  # as of `star_images`, without companions
+    kind: np.ndarray  # "bright", "faint", "saturated" or "blended"
 
 
 def example_field(recipe: FieldRecipe, seed: int) -> ExampleField:
@@ -178,11 +127,6 @@ def star_images(recipe: FieldRecipe, position: np.ndarray) -> np.ndarray:
     return out
 
 
-def noise_area(psf: np.ndarray) -> float:
-    """Noise-equivalent area 1/Σp² of a PSF of sum 1, in pixels (King 1983, PASP 95, 163)."""
-    return float(1.0 / (psf.astype(np.float64) ** 2).sum())
-
-
 def _moffat_transfer(fwhm: float, side: int) -> np.ndarray:
     """Fourier transform of a centred Moffat profile of exponent 3, sum 1."""
     core = 0.5 * fwhm / np.sqrt(2.0 ** (1.0 / 3.0) - 1.0)
@@ -201,7 +145,7 @@ def _shift_transfer(shift: np.ndarray, side: int) -> np.ndarray:
 def _fluxes(recipe: FieldRecipe, kind: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Flux of every star in electrons."""
     axis_psf = star_images(recipe, np.full((1, 2), recipe.side_px / 2.0))[0]
-    noise = np.sqrt((recipe.sky_e + recipe.read_noise_e**2) * noise_area(axis_psf))
+    noise = np.sqrt((recipe.sky_e + recipe.read_noise_e**2) * noise_equivalent_px(axis_psf))
     draw = rng.uniform(size=kind.size)
     faint = (kind == "faint")[:, None]
     low, high = np.where(faint, recipe.faint_snr, recipe.bright_snr).T

@@ -34,35 +34,17 @@ import numpy as np
 
 from psfdae.own_stars.errors import ObservationError, reading, shorten
 
-BLOCK_BYTES = 2880
-"""FITS files consist of blocks of this size."""
-
-LONGEST_HEADERS = 8_000 * BLOCK_BYTES
-"""Bytes of all headers of a file, 288 000 cards; astropy takes some ten times the memory."""
-
+BLOCK_BYTES = 2880  # FITS files consist of blocks of this size
+LONGEST_HEADERS = 8_000 * BLOCK_BYTES  # of a file, 288 000 cards; astropy takes ten times as much
+MOST_HDUS = 3000  # those of multi-object spectrographs have two thousand
+# Axes and columns, by the standard; astropy goes on for as long as a header says, and wcslib
+# reads and writes outside its memory for tens of thousands of axes.
 LARGEST_COUNT = 999
-"""Of axes and of columns, by the standard; astropy goes on for as long as a header says.
-
-wcslib reads and writes outside its memory for tens of thousands of axes.
-"""
-
-MOST_HDUS = 3000
-"""Extensions of a file; those of multi-object spectrographs have two thousand."""
-
-MOST_COMPRESSED = 2000
-"""Pixels per byte of file that no compression reaches; a header that claims more is damaged."""
-
-LARGEST_ORDER = 9
-"""Of the distortion polynomials (SIP); astropy would take any number and be busy for ever."""
-
-LARGEST_TILE = 2**24
-"""Pixels of a tile, 4096²; decompressing takes some 30 bytes for each."""
-
-BLOCK_PX = 2**22
-"""Pixels that are decompressed at a time, if a tile is no larger."""
-
-PIECE = 2**20
-"""Bytes that are unpacked at a time."""
+MOST_COMPRESSED = 2000  # pixels per byte of file that no compression reaches
+LARGEST_ORDER = 9  # of distortion polynomials (SIP); astropy would be busy for ever with any number
+LARGEST_TILE = 2**24  # pixels, 4096²; decompressing takes some 30 bytes for each
+BLOCK_PX = 2**22  # pixels that are decompressed at a time, if a tile is no larger
+PIECE = 2**20  # bytes that are unpacked at a time
 
 FIRST_CARD = re.compile(rb"SIMPLE  = *T[ /]")
 COUNT_CARD = re.compile(rb"(?:Z?NAXIS|TFIELDS|WCSAXES) *= *\+?([0-9]+)")
@@ -70,32 +52,21 @@ SIZE_CARD = re.compile(rb"Z?NAXIS[0-9]+ *= *'")
 END_CARD = re.compile(rb"(?:.{80})*?END(?![A-Z0-9_-])", re.DOTALL)
 
 SAFE_TILES = ("RICE_1", "RICE_ONE", "GZIP_1", "GZIP_2", "NOCOMPRESS")
-
-RICE = {"BLOCKSIZE": (32, (16, 32)), "BYTEPIX": (4, (1, 2, 4))}
-"""Settings of the coding: default and what is accepted."""
+RICE = {"BLOCKSIZE": (32, (16, 32)), "BYTEPIX": (4, (1, 2, 4))}  # default, and what is accepted
 
 MASKS = {"DQ", "MASK", "BPM", "FLAG", "FLAGS"}
 ERRORS = {"ERR", "ERROR", "SIGMA", "STDDEV", "RMS", "VAR", "VARIANCE", "IVAR", "UNCERT"}
 EXTRAS = {"WEIGHT", "WHT", "WGT", "BKG", "BACKGROUND", "SKY", "CTX", "SAMP", "TIME"}
-NOT_SCIENCE = MASKS | ERRORS | EXTRAS
-"""Names of extensions that go with an image; they are read on demand only."""
+NOT_SCIENCE = MASKS | ERRORS | EXTRAS  # extensions that go with an image
 
-GAIN_KEYS = ("EGAIN", "GAIN")
-"""EGAIN first: cameras that write both put a setting without unit into GAIN."""
-
+GAIN_KEYS = ("EGAIN", "GAIN")  # cameras that write both put a setting without unit into GAIN
 SATURATION_KEYS = ("SATURATE", "SATLEVEL")
+SCALE_KEYS = ("PIXSCALE", "PIXELSCL", "SECPIX", "SECPIX1")  # arcseconds; the second is POPPY's
+# Where stamps come from, copied to whatever is made of them.
+PROVENANCE_KEYS = ("OBJECT", "TELESCOP", "INSTRUME", "OBSERVER", "FILTER")
+PROVENANCE_KEYS += ("DATE-OBS", "MJD-OBS", "EXPTIME", "AIRMASS")
 
-SCALE_KEYS = ("PIXSCALE", "PIXELSCL", "SECPIX", "SECPIX1")
-"""Arcseconds per pixel; PIXELSCL is written by POPPY."""
-
-PROVENANCE_KEYS = (
-    *("OBJECT", "TELESCOP", "INSTRUME", "OBSERVER", "FILTER"),
-    *("DATE-OBS", "MJD-OBS", "EXPTIME", "AIRMASS"),
-)
-"""Cards that say where stamps come from, copied to whatever is made of them."""
-
-Card = tuple[str, Any, str]
-"""Key, value and comment."""
+Card = tuple[str, Any, str]  # key, value and comment
 
 
 @dataclass(frozen=True)
@@ -115,11 +86,8 @@ class Limit:
         return allowed, f"{allowed} bytes, the most for {packed} packed ones"
 
 
-WHOLE = Limit(2**29)
-"""Of files compressed as a whole."""
-
-DECOMPRESSED = Limit(2**31)
-"""Of images of tiles of which pixels are needed at random."""
+WHOLE = Limit(2**29)  # of files compressed as a whole
+DECOMPRESSED = Limit(2**31)  # of images of tiles of which pixels are needed at random
 
 
 # Files.
@@ -133,13 +101,13 @@ def _only_member(file: IO[bytes]) -> IO[bytes]:
     return packed.open(names[0])
 
 
+# How files compressed as a whole are read, by their first bytes.
 UNPACK: dict[bytes, Callable[[IO[bytes]], Any]] = {
     b"\x1f\x8b": gzip.open,
     b"BZh": bz2.BZ2File,
     b"\xfd7zXZ\x00": lzma.LZMAFile,
     b"PK\x03\x04": _only_member,
 }
-"""How files compressed as a whole are read, by their first bytes."""
 
 
 @dataclass(frozen=True)
@@ -326,21 +294,10 @@ def card_value(header: Any, key: str) -> Any:
 def find_image(path: Path | PlainFile, extension: str | int | None = None) -> ImageFile:
     """Find an image in a FITS file and check that its data are all there.
 
-    Parameters
-    ----------
-    path : Path or PlainFile
-        FITS file, also tile-compressed (.fz) or compressed as a whole (.gz, .bz2, .xz,
-        .zip with one file).
-    extension : str or int, optional
-        Name (case does not matter), "NAME,version" or number (0 is the primary
-        one) of the extension. Without it the only image that is not a mask, an
-        error or the like (`NOT_SCIENCE`) is taken.
-
-    Raises
-    ------
-    ObservationError
-        If the file is no FITS file, damaged or truncated, has no such image or
-        several, or the image is neither 2- nor 3-dimensional or without pixels.
+    The file may be tile-compressed (.fz) or compressed as a whole (.gz, .bz2, .xz, .zip with
+    one file). The extension is a name (case does not matter), "NAME,version" or a number (0
+    is the primary one); without it the only image is taken that is not a mask, an error or
+    the like (`NOT_SCIENCE`).
     """
     file = path if isinstance(path, PlainFile) else plain_file(path)
     path = file.name
@@ -520,22 +477,27 @@ def decompress(path: Path, hdu: Any, copy: IO[bytes]) -> np.ndarray:
 # Pixels.
 
 
+@dataclass(frozen=True)
+class Pixels:
+    """Physical values of an array or section of stored ones."""
+
+    stored: Any
+    image: ImageFile
+
+    def __getitem__(self, key: Any) -> np.ndarray:
+        key = key if isinstance(key, tuple) else (key,)
+        with reading(self.image.path):
+            stored = np.asarray(self.stored[(0,) * self.image.leading + key])
+            return self.image.physical(stored)
+
+
 @contextmanager
 def open_pixels(image: ImageFile, *, whole: bool) -> Iterator[Pixels]:
     """The values of an image as something to index, without the leading axes.
 
-    Parameters
-    ----------
-    image : ImageFile
-    whole : bool
-        True: an array, mapped into memory where the file allows, for access at
-        random; False: for slices `[start:stop]` along the first axis, of which
-        only what is asked for is read.
-
-    Raises
-    ------
-    ObservationError
-        If the file has become unreadable; also when indexing.
+    As a `whole` it is an array, mapped into memory where the file allows, for access at
+    random; else for slices `[start:stop]` along the first axis, of which only what is
+    asked for is read.
     """
     from astropy.io import fits
 
@@ -553,16 +515,3 @@ def open_pixels(image: ImageFile, *, whole: bool) -> Iterator[Pixels]:
             else:
                 stored = hdu.data
         yield Pixels(stored, image)
-
-
-@dataclass(frozen=True)
-class Pixels:
-    """Physical values of an array or section of stored ones."""
-
-    stored: Any
-    image: ImageFile
-
-    def __getitem__(self, key: Any) -> np.ndarray:
-        key = key if isinstance(key, tuple) else (key,)
-        with reading(self.image.path):
-            return self.image.physical(np.asarray(self.stored[(0,) * self.image.leading + key]))

@@ -34,20 +34,11 @@ from psfdae.own_stars.stamps import (
 )
 from psfdae.threads import side_by_side
 
-SCALE_TOLERANCE = 0.02
-"""Relative difference of the pixel scale from that of the training that is accepted."""
-
-SNR_TOLERANCE = 1.25
-"""Factor beyond the trained S/N that raises no flag: a faint star's S/N is no better known."""
-
-BLOCK = 256
-"""Stars that are computed together, always so many: other numbers would round otherwise."""
-
-BLOCK_PX = BLOCK * 32**2
-"""Pixels of a block at most; larger stamps come in smaller blocks."""
-
-BLOCK_VALUES = 64 * BLOCK_PX
-"""Numbers between two layers of the network at most: 64 channels of a block."""
+SCALE_TOLERANCE = 0.02  # relative difference of the pixel scale from that of the training
+SNR_TOLERANCE = 1.25  # beyond the trained S/N without a flag: a faint star's is no better known
+BLOCK = 256  # stars that are computed together, always so many: other numbers round otherwise
+BLOCK_PX = BLOCK * 32**2  # larger stamps come in smaller blocks
+BLOCK_VALUES = 64 * BLOCK_PX  # between two layers of the network at most: 64 channels of a block
 
 
 class PredictionError(ValueError):

@@ -32,58 +32,30 @@ from psfdae.own_stars.images import (
 )
 from psfdae.own_stars.stamps import Stamps
 
-FAR = 2**30
-"""Positions are clipped to ± this many pixels, far off any image."""
-
-NEAR = 1.0
-"""Stars farther off the image than this many image sizes are not corrected for distortion."""
+FAR = 2**30  # positions are clipped to ± this many pixels, far off any image
+NEAR = 1.0  # stars farther off by this many image sizes are not corrected for distortion
 
 
 @dataclass(frozen=True)
 class Source:
-    """A FITS file with stars, and what is stated about it.
+    """A FITS file with stars, and what is stated about it."""
 
-    Attributes
-    ----------
-    path : FITS cube of stamps, or FITS image; see `images.find_image`
-    catalogue : star list, see `catalogue.read_catalogue`
-        Needed for an image; gives the stamps of a cube positions and identifiers.
-    extension : name or number of the extension with the stars
-    origin : index of the centre of the first pixel in the catalogue, 0 or 1
-        By default that of the program that writes such columns.
-    mask : extension of the same file, or a FITS file; pixels other than 0 are bad
-        As large as the image; one mask (d, d) may serve all stamps of a cube.
-    pixel_scale_arcsec, gain, saturate : go before those of the header
-        Arcseconds, electrons per count, counts from which a pixel is saturated.
-    flux_column, background_column : columns of the catalogue
-        Fluxes inside the stamps and sky levels per pixel that are not to be estimated.
-    """
-
-    path: Path
-    catalogue: Path | None = None
-    extension: str | int | None = None
-    origin: int | None = None
-    mask: str | int | Path | None = None
-    pixel_scale_arcsec: float | None = None
-    gain: float | None = None
-    saturate: float | None = None
-    flux_column: str | None = None
-    background_column: str | None = None
+    path: Path  # FITS cube of stamps, or FITS image
+    catalogue: Path | None = None  # needed for an image; positions and identifiers of a cube
+    extension: str | int | None = None  # with the stars
+    origin: int | None = None  # of the catalogue's pixels; by default that of its program
+    mask: str | int | Path | None = None  # as large as the image; or (d, d) for all of a cube
+    pixel_scale_arcsec: float | None = None  # what is given goes before the header
+    gain: float | None = None  # electrons per count
+    saturate: float | None = None  # counts
+    flux_column: str | None = None  # of the catalogue: fluxes that are not to be estimated
+    background_column: str | None = None  # the same for sky levels per pixel
 
     def open(self, stamp_px: int, margin: int = 0, larger: bool = False) -> Observation:
         """Check all that can be checked without reading pixels.
 
-        Parameters
-        ----------
-        stamp_px : side d of the stamps
-        margin : pixels to add around each stamp of an image
-        larger : whether a cube's stamps may be larger than d; they keep their size then
-
-        Raises
-        ------
-        ObservationError
-            If an argument is out of range, a file is missing, damaged or of a wrong
-            form, all stars are off the image, or more are on it than it has pixels.
+        Stamps of an image get a margin of so many pixels. Stamps of a cube may be `larger`
+        than `stamp_px` if so asked, and keep their size then.
         """
         self._check(stamp_px, margin)
         image = find_image(self.path, self.extension)
@@ -100,16 +72,16 @@ class Source:
             identifiers = table.identifiers()
         scale, gain, saturate = self._stated(image)
         return Observation(
-            path=self.path,
-            count=count,
-            stamp_px=stamp_px,
+            self.path,
+            count,
+            stamp_px,
+            margin=0 if is_cube else margin,
+            shape=None if is_cube else shape,
             pixel_scale_arcsec=scale,
             gain=gain,
             saturate=saturate,
-            shape=None if is_cube else shape,
             positions=positions,
             header_cards=image.provenance(),
-            margin=0 if is_cube else margin,
             _id=identifiers,
             _flux=self._column(table, self.flux_column, count),
             _background=self._column(table, self.background_column, count),
@@ -126,12 +98,8 @@ class Source:
             raise ObservationError(
                 self.path, f"origin {self.origin!r} of pixel coordinates, expected 0 or 1"
             )
-        stated = {
-            "pixel scale": self.pixel_scale_arcsec,
-            "gain": self.gain,
-            "saturation": self.saturate,
-        }
-        for name, value in stated.items():
+        stated = (self.pixel_scale_arcsec, self.gain, self.saturate)
+        for name, value in zip(("pixel scale", "gain", "saturation"), stated, strict=True):
             if value is not None and not (math.isfinite(value) and value > 0):
                 raise ObservationError(self.path, f"{name} {value!r}, expected a number above 0")
 
@@ -240,39 +208,18 @@ def _find_mask(image: ImageFile, mask: str | int | Path) -> ImageFile:
 
 @dataclass(frozen=True)
 class Observation:
-    """Stars of one FITS file. `Source.open` makes it.
-
-    Attributes
-    ----------
-    path : Path
-    count : int
-        Number of stars, none is ever left out.
-    stamp_px : int
-    pixel_scale_arcsec : float or None
-        Given, of the WCS, or of the header, in this order.
-    gain : float or None
-        Electrons per count.
-    saturate : float or None
-        Counts from which a pixel is saturated.
-    shape : (rows, columns) of the image, None for a cube
-    positions : ndarray, shape (n, 2), or None
-        (x, y), 0-based pixel centres; NaN for stars that the WCS cannot place.
-    header_cards : list of (key, value, comment)
-        Provenance to copy into what is made of the stars.
-    margin : int
-        Pixels around each stamp in a chunk, 0 for cubes.
-    """
+    """Stars of one FITS file. `Source.open` makes it."""
 
     path: Path
-    count: int
+    count: int  # of stars, none is ever left out
     stamp_px: int
-    pixel_scale_arcsec: float | None
-    gain: float | None
-    saturate: float | None
-    shape: tuple[int, ...] | None
-    positions: np.ndarray | None
-    header_cards: list[Card]
-    margin: int
+    margin: int  # pixels around each stamp, 0 for cubes
+    shape: tuple[int, ...] | None  # (rows, columns) of the image, None for a cube
+    pixel_scale_arcsec: float | None  # given, of the WCS, or of the header, in this order
+    gain: float | None  # electrons per count
+    saturate: float | None  # counts from which a pixel is saturated
+    positions: np.ndarray | None  # (n, 2), 0-based x, y; NaN where the WCS cannot place a star
+    header_cards: list[Card]  # provenance to copy into what is made of the stars
     _id: np.ndarray = field(repr=False)
     _flux: np.ndarray = field(repr=False)
     _background: np.ndarray = field(repr=False)
@@ -284,11 +231,6 @@ class Observation:
 
         Only the pixels of a chunk are read. Tile-compressed cubes are decompressed
         chunk by chunk, tile-compressed images once per call, to a temporary file.
-
-        Raises
-        ------
-        ObservationError
-            If the pixels cannot be read.
         """
         if rows < 1:
             raise ValueError(f"rows is {rows}, expected at least 1")
@@ -355,27 +297,21 @@ def central_pixel(position: np.ndarray) -> np.ndarray:
 def cut_image(
     pixels: Any, shape: tuple[int, int], x: np.ndarray, y: np.ndarray, stamp_px: int, margin: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Cut a stamp around each star, with the star's pixel at index (d/2, d/2) + margin.
+    """Cut a stamp around each star, with the star's pixel at index d//2 + margin.
 
     Parameters
     ----------
-    pixels : array-like (h, w), indexed once with arrays of rows and columns
-    shape : (h, w)
+    pixels : array-like of that shape, indexed once with arrays of rows and columns
     x, y : ndarray, shape (n,)
         0-based positions; NaN is off the image.
-    stamp_px : int
-        d; for odd d the index is (d − 1)/2.
-    margin : int
-        Pixels added on every side.
+    stamp_px, margin : int
+        d, and pixels added on every side.
 
     Returns
     -------
-    stamps : ndarray, shape (n, d + 2·margin, d + 2·margin)
-        0 off the image.
-    inside : ndarray of bool, the same shape
-        Whether a pixel is on the image.
-    truncated : ndarray of bool, shape (n,)
-        Part of the d × d stamp, without margin, is off the image.
+    stamps : ndarray, shape (n, d + 2·margin, d + 2·margin), 0 off the image
+    inside : ndarray of bool, the same shape: the pixel is on the image
+    truncated : ndarray of bool, shape (n,): a pixel of the stamp, margin aside, is not
     """
     side = np.arange(stamp_px + 2 * margin) - stamp_px // 2 - margin
     rows = central_pixel(y)[:, None] + side
@@ -405,14 +341,10 @@ def sky_to_pixel(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Positions of stars in an image (rows, columns) from their ICRS coordinates in degrees.
 
-    Distortions are inverted by iteration, and only for stars near the image: far
-    from it their polynomials fold back, and a star degrees away would seem to be
-    in the image (Shupe et al. 2005, ASP Conf. 347, 491 define them for the image).
-
-    Returns
-    -------
-    x, y : ndarray, shape (n,)
-        0-based pixel centres; NaN for stars that the projection cannot show.
+    0-based x and y, shape (n,); NaN for stars that the projection cannot show. Distortions
+    are inverted by iteration, and only for stars near the image: far from it their
+    polynomials fold back, and a star degrees away would seem to be in the image (Shupe et
+    al. 2005, ASP Conf. 347, 491 define them for the image).
     """
     from astropy.coordinates import SkyCoord
     from astropy.wcs import NoConvergence

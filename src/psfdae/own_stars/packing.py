@@ -15,23 +15,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from psfdae.own_stars.bundle import at_noise, mahalanobis
-from psfdae.own_stars.photometry import FluxModel
+from psfdae.own_stars.photometry import FluxModel, noise_equivalent_px, signal_to_noise
 from psfdae.stars.noise import NoiseModel
 
-NODES = 8
-"""Noise levels at which errors are measured, equidistant in the logarithm."""
-
-COMPONENTS = 48
-"""Leading eigenvectors that a bundle stores."""
-
-COVERAGE = 0.6827
-"""Part of the errors within ± `error68`; that of a normal variable within ± 1 σ."""
-
-LIMIT = 0.999
-"""Part of the test stars within the limit of the Mahalanobis distance."""
-
-LEAST_STARS = 2000
-"""Noisy images per node; few test stars are seen several times with new noise."""
+NODES = 8  # noise levels at which errors are measured, equidistant in the logarithm
+COMPONENTS = 48  # leading eigenvectors that a bundle stores
+COVERAGE = 0.6827  # part of the errors within ± `error68`; of a normal variable within ± 1 σ
+LIMIT = 0.999  # part of the test stars within the limit of the Mahalanobis distance
+LEAST_STARS = 2000  # noisy images per node; few test stars are seen several times with new noise
 
 Predict = Callable[[np.ndarray], np.ndarray]
 """The network: normalised noisy images to PSFs, both (n, d, d)."""
@@ -48,34 +39,17 @@ class HeldOutStars:
 
 @dataclass(frozen=True)
 class Errors:
-    """Errors of the PSFs of test stars at the nodes.
+    """Errors of the PSFs of test stars at S nodes of noise."""
 
-    Attributes
-    ----------
-    nodes : ndarray, shape (S,)
-        Noise: pixel RMS over the flux.
-    error : ndarray, shape (S, N, d, d), float32
-        PSF minus reference.
-    star : ndarray of int, shape (N,)
-        Star of every error.
-    distance : ndarray, shape (S, N)
-        Mahalanobis distance of the noisy images.
-    """
-
-    nodes: np.ndarray
-    error: np.ndarray
-    star: np.ndarray
-    distance: np.ndarray
+    nodes: np.ndarray  # (S,), pixel RMS over the flux
+    error: np.ndarray  # (S, N, d, d), float32: PSF minus reference
+    star: np.ndarray  # (N,), of every error
+    distance: np.ndarray  # (S, N), Mahalanobis', of the noisy images
 
     def of(self, chosen: np.ndarray) -> Errors:
         """Those of some stars, from a mask over stars."""
         kept = chosen[self.star]
-        return replace(
-            self,
-            error=self.error[:, kept],
-            star=self.star[kept],
-            distance=self.distance[:, kept],
-        )
+        return Errors(self.nodes, self.error[:, kept], self.star[kept], self.distance[:, kept])
 
     def half_width(self) -> np.ndarray:
         """Half-width of the interval around 0 that holds 68.27 %, shape (S, d, d)."""
@@ -105,16 +79,6 @@ def leading(model: FluxModel, components: int) -> FluxModel:
     return replace(model, variance=variance)
 
 
-def noise_equivalent_px(mean: np.ndarray) -> float:
-    """Noise-equivalent area A = 1/Σm² of a PSF m of sum 1 (King 1983, PASP 95, 163)."""
-    return 1.0 / float(np.square(mean).sum())
-
-
-def signal_to_noise(noise: float, area: float) -> float:
-    """S/N of a star from the pixel RMS over its flux and the noise-equivalent area in pixels."""
-    return float(1.0 / (noise * np.sqrt(area)))
-
-
 def reach(band: np.ndarray, mean: np.ndarray) -> dict[str, float]:
     """Range of noise and S/N of a training, from its noise levels σ and its mean PSF."""
     area = noise_equivalent_px(mean)
@@ -135,18 +99,7 @@ def measure_errors(
     nodes: np.ndarray,
     rng: np.random.Generator,
 ) -> Errors:
-    """Errors and distances of noisy test stars at every node.
-
-    Parameters
-    ----------
-    stars : HeldOutStars
-    predict : the network
-    model : FluxModel
-        Of the training stars.
-    nodes : ndarray, shape (S,)
-        Noise: pixel RMS over the flux.
-    rng : Generator
-    """
+    """Errors and distances of noisy test stars at every node (S,), pixel RMS over the flux."""
     count = len(stars.images)
     star = np.tile(np.arange(count), -(-LEAST_STARS // count))
     error = np.empty((len(nodes), star.size, *stars.images.shape[1:]), np.float32)
@@ -167,21 +120,10 @@ def measure_levels(
     area: float,
     data_range: float,
 ) -> list[dict[str, float]]:
-    """Mean errors of the test stars at noise levels λ.
+    """Mean errors of the test stars at noise levels λ, and what `errors` at the nodes cover.
 
-    Parameters
-    ----------
-    levels : sequence of float
-        λ; the pixel RMS over the flux is κλ.
-    stars : HeldOutStars
-    draw : noisy images of all test stars at a λ
-    predict : the network
-    errors : Errors
-        At the nodes, of which the coverage is told.
-    area : float
-        Noise-equivalent area in pixels.
-    data_range : float
-        As in `psfdae.evaluation.metrics.all_metrics`.
+    `draw` gives noisy images of all test stars at a λ; `area` is the noise-equivalent one
+    in pixels, `data_range` that of `psfdae.evaluation.metrics.all_metrics`.
     """
     from psfdae.evaluation.metrics import all_metrics
 
@@ -212,18 +154,8 @@ def coverage(error: np.ndarray, noise: np.ndarray, nodes: np.ndarray, maps: np.n
 def crossed_coverage(errors: Errors, error: np.ndarray, noise: float) -> dict[str, float]:
     """Coverage at another noise, of either half of the stars by the errors of the other.
 
-    Parameters
-    ----------
-    errors : Errors
-        At the nodes.
-    error : ndarray, shape (n, d, d)
-        Of every star once, at `noise`.
-    noise : float
-
-    Returns
-    -------
-    dict
-        `coverage68` of the half-width and `coverage_rms` of the root mean square.
+    `error` (n, d, d) holds every star once, at `noise`. Told are `coverage68` of the
+    half-width and `coverage_rms` of the root mean square.
     """
     even = np.arange(len(error)) % 2 == 0
     found: dict[str, list[float]] = {"coverage68": [], "coverage_rms": []}

@@ -26,60 +26,34 @@ that are known should be NaN. No star influences another one.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from psfdae.own_stars.stamps import Stamps, StarFlag, border_pixels, raise_flag
 
-FAINT_SNR = 3.0
-"""Flux in units of its error below which a star is faint."""
-
-CLIP = 5.0
-"""Pixels may leave the range of the training set by this many σ of the noise."""
-
-MARGIN = 1.5
-"""Factor by which the range of the training set is widened, for PSFs it does not hold."""
-
-SLACK = 0.01
-"""Excursions up to this part of the brightest training pixel are no outliers, either."""
-
-NOISE_FLOOR = 1e-6
-"""Least σ in units of a star's median pixel; images without noise have none of their own."""
+FAINT_SNR = 3.0  # flux in units of its error below which a star is faint
+CLIP = 5.0  # σ of the noise by which pixels may leave the range of the training set
+MARGIN = 1.5  # factor by which that range is widened, for PSFs that the set does not hold
+SLACK = 0.01  # excursions up to this part of the brightest training pixel are no outliers, either
+NOISE_FLOOR = 1e-6  # least σ in units of a star's median pixel; images may have no noise
 
 # Of `robust_flux`.
-
-KEPT = 0.5
-"""Part of the pixels that must be left for a fit."""
-
-ROUNDS = 5
-"""Fits per star; flux, noise and outliers settle in three or four."""
-
-LARGEST = 1e15
-"""Pixels are cut at this many times the median pixel, so that no square overflows."""
+KEPT = 0.5  # part of the pixels that must be left for a fit
+ROUNDS = 5  # fits per star; flux, noise and outliers settle in three or four
+LARGEST = 1e15  # pixels are cut at this many times the median pixel, so that no square overflows
 
 # Of `Photometer`.
-
-UPDATES = 4
-"""Updates of flux and noise; they settle in three."""
-
-CLEAR = 2.0
-"""Stars of less flux than this times its error are fitted carefully."""
-
-GROUP = 16
-"""Stars per careful fit, always filled: other sizes would round otherwise."""
-
-FREE_SKY = 1e4
-"""Variance of an unknown sky in units of the flux squared: as good as infinite."""
-
+UPDATES = 4  # of flux and noise; they settle in three
+CLEAR = 2.0  # stars of less flux than this times its error are fitted carefully
+GROUP = 16  # stars per careful fit, always filled: other sizes would round otherwise
+FREE_SKY = 1e4  # variance of an unknown sky in units of the flux squared: as good as infinite
+SCATTER_CLIP = 4.0  # residuals beyond this many σ do not count for the noise
+# Flags of `robust_flux` that hold for a star whose flux is given, and for others.
 KEPT_IF_GIVEN = StarFlag.MASKED | StarFlag.OUTLIER
 KEPT_OTHERWISE = KEPT_IF_GIVEN | StarFlag.FAINT
-"""Flags of `robust_flux` that hold for a star whose flux is given, and for others."""
-
+# A flux of less than this times the brightest pixel has no image in single precision.
 TINY = 1.0 / float(np.finfo(np.float32).max)
-"""A flux of less than this times the brightest pixel has no image in single precision."""
-
-SCATTER_CLIP = 4.0
-"""Residuals beyond this many σ do not count for the noise."""
 
 
 @dataclass(frozen=True)
@@ -149,31 +123,28 @@ class FluxModel:
         return replace(self, basis=basis, variance=np.maximum(variance, 0.0))
 
 
+def noise_equivalent_px(mean: np.ndarray) -> float:
+    """Noise-equivalent area A = 1/Σm² of a PSF m of sum 1 (King 1983, PASP 95, 163)."""
+    return 1.0 / float(np.square(mean, dtype=np.float64).sum())
+
+
+def signal_to_noise(noise: float, area: float) -> float:
+    """S/N of a star from the pixel RMS over its flux and the noise-equivalent area in pixels."""
+    return float(1.0 / (noise * np.sqrt(area)))
+
+
 # Few stars with care.
 
 
 @dataclass(frozen=True)
 class FluxEstimate:
-    """Fluxes of stars, in the unit of their images.
-
-    Attributes
-    ----------
-    flux, error : ndarray, shape (n,), float64
-        Estimate and standard error (sky noise and PSF variation; the star's own
-        photons are not in it). NaN where no fit was possible.
-    noise : ndarray, shape (n,), float64
-        RMS σ of a pixel's noise, from the residuals. NaN where no fit was possible.
-    flags : ndarray, shape (n,), uint16
-        MASKED, OUTLIER, FAINT or NO_FLUX of `StarFlag`.
-    images : ndarray, shape (n, d, d), float64
-        The stamps with bad pixels replaced; zero where no fit was possible.
-    """
+    """Fluxes of n stars; NaN and an image of zeros where no fit was possible."""
 
     flux: np.ndarray
-    error: np.ndarray
-    noise: np.ndarray
-    flags: np.ndarray
-    images: np.ndarray
+    error: np.ndarray  # standard: sky noise and PSF variation, but not the star's own photons
+    noise: np.ndarray  # RMS of a pixel, from the residuals
+    flags: np.ndarray  # MASKED, OUTLIER, FAINT or NO_FLUX, uint16
+    images: np.ndarray  # (n, d, d), float64, with bad pixels replaced
 
 
 def robust_flux(images: np.ndarray, model: FluxModel) -> FluxEstimate:
@@ -340,32 +311,18 @@ def _reduced(rows: np.ndarray, weight: np.ndarray, common: float) -> tuple[np.nd
 
 @dataclass(frozen=True)
 class Photometry:
-    """What a stamp says of its star, in the unit of the stamps.
-
-    Attributes
-    ----------
-    flux, flux_error, background, noise : ndarray, shape (n,), float64
-        The error is NaN where the flux was given. All are NaN where nothing could
-        be estimated.
-    images : ndarray, shape (n, d, d), float32
-        Sky-subtracted, repaired, of flux 1; zero where there is no usable flux.
-    used : ndarray of bool, shape (n, d, d)
-        Pixels that were measured; the others are repaired.
-    flags : ndarray, shape (n,), uint16
-        Sum of `StarFlag`s.
-    """
+    """What n stamps say of their stars, in the unit of the stamps; NaN where they say nothing."""
 
     flux: np.ndarray
-    flux_error: np.ndarray
+    flux_error: np.ndarray  # NaN where the flux was given
     background: np.ndarray
     noise: np.ndarray
-    images: np.ndarray
-    used: np.ndarray
-    flags: np.ndarray
+    images: np.ndarray  # (n, d, d), float32: sky-subtracted, repaired, of flux 1; zero without flux
+    used: np.ndarray  # (n, d, d): pixels that were measured; the others are repaired
+    flags: np.ndarray  # uint16
 
 
-@dataclass(frozen=True)
-class _Fit:
+class _Fit(NamedTuple):
     """Flux, error, noise and sky left over, in units of each star's scale."""
 
     flux: np.ndarray
@@ -377,12 +334,8 @@ class _Fit:
 class Photometer:
     """Measures stars against the training set of a network.
 
-    Parameters
-    ----------
-    model : FluxModel
-    components : int
-        Leading eigenvectors that the fast fit knows of; what the star has beyond
-        them counts as noise, so that of a very bright star is overestimated.
+    The fast fit knows of as many leading eigenvectors as `components`; what the star has
+    beyond them counts as noise, so that of a very bright star is overestimated.
     """
 
     def __init__(self, model: FluxModel, components: int) -> None:
@@ -414,18 +367,11 @@ class Photometer:
     def measure(
         self, stamps: np.ndarray, bad: np.ndarray, start: np.ndarray, known: Stamps
     ) -> Photometry:
-        """Photometry of stamps.
+        """Photometry of stamps (n, d, d) in any unit, sky included, finite.
 
-        Parameters
-        ----------
-        stamps : ndarray, shape (n, d, d)
-            In any unit, sky included; finite.
-        bad : ndarray of bool, shape (n, d, d)
-            Pixels that are not to be used.
-        start : ndarray, shape (n,)
-            Sky to start from (`border_median`).
-        known : Stamps
-            `flux`, `background` and `noise` are taken, where they are not NaN.
+        `bad` pixels (n, d, d) are not used; `start` (n,) is the sky to start from
+        (`border_median`). `flux`, `background` and `noise` of `known` are taken where they
+        are not NaN.
         """
         count = len(stamps)
         hidden = bad.reshape(count, -1)

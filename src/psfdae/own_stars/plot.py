@@ -15,11 +15,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-CELLS = 9
-"""Stamps along the longer side of the field."""
-
-WHISKERS = 2500
-"""Stars with a whisker, at most; more would be a carpet."""
+CELLS = 9  # stamps along the longer side of the field
+WHISKERS = 2500  # stars with a whisker, at most; more would be a carpet
 
 SPOILT = (
     StarFlag.NO_FLUX
@@ -83,15 +80,7 @@ def map_of_file(predicted: Path) -> Figure:
 
 @styled
 def psf_map(psf: np.ndarray, stars: FieldStars, title: str) -> Figure:
-    """Stamps at their positions, and a whisker for every star.
-
-    Parameters
-    ----------
-    psf : ndarray, shape (k, d, d)
-        PSFs of the stars that `stars.chosen` names.
-    stars : FieldStars
-    title : str
-    """
+    """Stamps (k, d, d) of the stars `stars.chosen` at their positions, a whisker for every star."""
     drawn, chosen, cell = stars.drawable(), stars.chosen(), stars.cell()
     x, y = stars.x[drawn], stars.y[drawn]
     margin = 0.6 * cell

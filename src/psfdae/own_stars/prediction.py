@@ -24,6 +24,7 @@ import numpy as np
 
 import psfdae
 from psfdae.files import atomic_path
+from psfdae.own_stars.errors import one_line
 from psfdae.own_stars.images import BLOCK_BYTES, Card
 from psfdae.own_stars.stamps import MEANING, Stamps
 
@@ -105,8 +106,7 @@ CUBES: dict[str, tuple[str, str]] = {
 }
 """Arrays of a prediction with the name and the meaning of their extensions."""
 
-UNIT = "adu"
-"""Of the pixels: counts, as in the input."""
+UNIT = "adu"  # of the pixels: counts, as in the input
 
 COLUMNS: dict[str, tuple[str, str | None, str]] = {
     "x": ("D", "pix", "position in the image, 0-based, columns"),
@@ -127,8 +127,7 @@ COLUMNS: dict[str, tuple[str, str | None, str]] = {
 }
 """FITS format, unit and meaning of the columns of STARS, besides `id`."""
 
-OF_STAMPS = ("id", "x", "y")
-"""Columns that the stamps bring along; the others are of the prediction."""
+OF_STAMPS = ("id", "x", "y")  # columns that the stamps bring along
 
 
 class PredictionFile:
@@ -179,19 +178,10 @@ class PredictionFile:
 def prediction_file(
     path: Path, bundle: Bundle, example: Stamps, count: int, cards: Sequence[Card], history: str
 ) -> Iterator[PredictionFile]:
-    """A `PredictionFile` that gets its name if the block succeeds.
+    """A `PredictionFile` for so many stars that gets its name if the block succeeds.
 
-    Parameters
-    ----------
-    path : Path
-    bundle : Bundle
-    example : Stamps
-        Some of the stars, for the type of their identifiers.
-    count : int
-        Number of stars.
-    cards : sequence of (key, value, comment)
-        Further provenance, into the primary header.
-    history : str
+    `example` are some of the stars, for the type of their identifiers; `cards` are further
+    provenance.
     """
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         primary = _primary_header(bundle, cards, history)
@@ -223,17 +213,14 @@ def _primary_header(bundle: Bundle, cards: Sequence[Card], history: str) -> Any:
         # A long value leaves no room for its comment, which astropy reports.
         warnings.simplefilter("ignore", fits.verify.VerifyWarning)
         for key, value, comment in (*own, *cards):
-            header[key] = (_printable(value), _printable(comment))
-        header["HISTORY"] = _printable(history)
+            header[key] = (_ascii(value) if isinstance(value, str) else value, _ascii(comment))
+        header["HISTORY"] = _ascii(history)
         header.tostring()
     return header
 
 
-def _printable(value: Any) -> Any:
-    if not isinstance(value, str):
-        return value
-    text = " ".join(value.split()).encode("ascii", "replace").decode()
-    return "".join(c if c.isprintable() else "?" for c in text)
+def _ascii(text: str) -> str:
+    return one_line(text).encode("ascii", "replace").decode()
 
 
 def _cube_header(name: str, about: str, count: int, stamp_px: int) -> Any:

@@ -16,36 +16,22 @@ import numpy as np
 
 from psfdae.own_stars.errors import no_formula
 from psfdae.own_stars.observation import Observation
-from psfdae.own_stars.stamps import Stamps, cut
+from psfdae.own_stars.stamps import Stamps, cut, peaks
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from psfdae.configuration.schema import CalibrationStars, Framing
 
-ROWS = 2048
-"""Stars that are measured at a time."""
-
-SKY_CLIP = 3.0
-"""Pixels of the sky this many σ off their median belong to other stars."""
-
-REGISTRATION_ROUNDS = 10
-"""Steps of the windowed centroid; each leaves less than a fifth of the distance."""
-
-COMPANIONS = 12
-"""Nearest stars with which a star is compared."""
-
-DEFECT = 6.0
-"""Pixels this many σ below the sky are defects; they are raised to that."""
-
+ROWS = 2048  # stars that are measured at a time
+SKY_CLIP = 3.0  # pixels of the sky this many σ off their median belong to other stars
+REGISTRATION_ROUNDS = 10  # of the windowed centroid; each leaves less than a fifth of the distance
+COMPANIONS = 12  # nearest stars with which a star is compared
+DEFECT = 6.0  # pixels this many σ below the sky are defects; they are raised to that
+# Photons per pixel of the new noise, at least: no rate of photons is negative, and the deepest
+# pixel of a star that is made fainter has B − DEFECT √B at most.
 LEAST_SKY = 2.0 * DEFECT**2
-"""Photons per pixel of the new noise, at least: a rate of photons cannot be negative.
-
-The deepest pixel of a star that is made fainter has B − DEFECT √B photons at most.
-"""
-
-SHIFT_ORDER = 3
-"""Cubic splines: on a star with a FWHM of 3 px they err by an MSE of 1e-8."""
+SHIFT_ORDER = 3  # splines; on a star with a FWHM of 3 px they err by an MSE of 1e-8
 
 
 class CalibrationStarsError(ValueError):
@@ -66,32 +52,16 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True)
 class BrightStars:
-    """Stars that are good enough to learn from.
+    """Stars that are good enough to learn from."""
 
-    Attributes
-    ----------
-    wide : ndarray, shape (n, s, s)
-        Sky-subtracted stamps with a margin, counts.
-    peak : ndarray of int, shape (n, 2)
-        Brightest pixel (row, column) from index (s//2, s//2).
-    centre : ndarray, shape (n, 2)
-        Centroid (row, column) from index (s//2, s//2).
-    position : ndarray, shape (n, 2)
-        (x, y) in the image, NaN where unknown.
-    flux, noise, snr : ndarray, shape (n,)
-        Counts inside the stamp, RMS of the sky per pixel in counts, signal to noise.
-    row : ndarray of int, shape (n,)
-        Row of the catalogue.
-    """
-
-    wide: np.ndarray
-    peak: np.ndarray
-    centre: np.ndarray
-    position: np.ndarray
-    flux: np.ndarray
-    noise: np.ndarray
-    snr: np.ndarray
-    row: np.ndarray
+    wide: np.ndarray  # (n, s, s), sky-subtracted stamps with a margin, counts
+    peak: np.ndarray  # (n, 2), brightest pixel (row, column) from index (s//2, s//2)
+    centre: np.ndarray  # (n, 2), centroid from the same index
+    position: np.ndarray  # (n, 2), x, y in the image, NaN where unknown
+    flux: np.ndarray  # (n,), counts inside the stamp
+    noise: np.ndarray  # (n,), RMS of the sky per pixel in counts
+    snr: np.ndarray  # (n,)
+    row: np.ndarray  # (n,), of the catalogue
 
     def __len__(self) -> int:
         return len(self.wide)
@@ -116,27 +86,14 @@ class BrightStars:
 
 @dataclass(frozen=True)
 class Candidates:
-    """What is known of all n stars of an observation, and the bright ones among them.
-
-    Attributes
-    ----------
-    id : ndarray, shape (n,)
-    position : ndarray, shape (n, 2)
-        (x, y), NaN where unknown.
-    snr, noise : ndarray, shape (n,)
-        Signal to noise; RMS of the sky in counts per pixel.
-    verdict : ndarray of str, shape (n,)
-        A `Verdict` for every star.
-    bright : BrightStars
-        The good ones.
-    """
+    """What is known of all n stars of an observation, and the bright ones among them."""
 
     id: np.ndarray
-    position: np.ndarray
+    position: np.ndarray  # (n, 2), x, y, NaN where unknown
     snr: np.ndarray
-    noise: np.ndarray
-    verdict: np.ndarray
-    bright: BrightStars
+    noise: np.ndarray  # RMS of the sky in counts per pixel
+    verdict: np.ndarray  # a `Verdict` for every star
+    bright: BrightStars  # the good ones
 
     def count(self) -> str:
         """How many stars there are of every verdict, in words."""
@@ -164,19 +121,9 @@ class Candidates:
 def collect(observation: Observation, settings: CalibrationStars, framing: Framing) -> Candidates:
     """Measure all stars and choose those that are good enough to learn from.
 
-    Only stamps of bright stars are kept in memory.
-
-    Parameters
-    ----------
-    observation : Observation
-        Of stamps with a margin (a cube: of its own, larger ones).
-    settings : CalibrationStars
-    framing : Framing
-
-    Raises
-    ------
-    CalibrationStarsError
-        If there are fewer good stars than `calibration_stars.stars_min`.
+    The observation has stamps with a margin (a cube: its own, larger ones), of which only
+    those of bright stars are kept in memory. CalibrationStarsError says that there are
+    fewer good ones than `calibration_stars.stars_min`.
     """
     measured = [_measure(chunk, settings, framing) for chunk in observation.chunks(ROWS)]
     columns, kept = zip(*measured, strict=True)
@@ -328,14 +275,13 @@ def brightest_pixels(wide: np.ndarray, search_px: int) -> tuple[np.ndarray, np.n
     Returns
     -------
     peak : ndarray of int, shape (n, 2)
-        (row, column) from index (s//2, s//2); the first in that order among equals.
+        (row, column) from index (s//2, s//2).
     inside : ndarray of bool, shape (n,)
         Whether no pixel just outside the search window is brighter.
     """
     middle, reach = wide.shape[-1] // 2, search_px + 1
-    window = wide[:, middle - reach : middle + reach + 1, middle - reach : middle + reach + 1]
-    flat = window.reshape(len(wide), -1).argmax(axis=1)
-    peak = np.stack(np.divmod(flat, 2 * reach + 1), axis=1) - reach
+    near = slice(middle - reach, middle + reach + 1)
+    peak = peaks(wide[:, near, near]) - reach
     return peak, np.abs(peak).max(axis=1, initial=0) <= search_px
 
 

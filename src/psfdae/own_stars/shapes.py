@@ -16,14 +16,9 @@ import numpy as np
 
 FWHM_OF_SIGMA = 2.0 * np.sqrt(2.0 * np.log(2.0))
 
-ROUNDS = 16
-"""Updates of the weight. A Gaussian needs two, the most aberrated PSF some 30 for 1e-4."""
-
-WIDER_PX2 = 0.5
-"""Variance by which the weight is wider than the PSF, px²: narrower ones fall between pixels."""
-
-LEAST_PX2 = 0.08
-"""Least variance along an axis, px²: that of the pixel itself."""
+ROUNDS = 16  # updates of the weight; a Gaussian needs two, the most aberrated PSF 30 for 1e-4
+WIDER_PX2 = 0.5  # variance by which the weight is wider: narrow PSFs fall between pixels
+LEAST_PX2 = 0.08  # least variance along an axis, that of the pixel itself
 
 
 @dataclass(frozen=True)

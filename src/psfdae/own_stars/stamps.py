@@ -11,37 +11,19 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Stamps:
-    """Stamps of n stars, s = stamp_px + 2·margin pixels wide, and what is known of the stars.
+    """Stamps of n stars, s = stamp_px + 2·margin pixels wide, and what is known of the stars."""
 
-    Attributes
-    ----------
-    data : ndarray, shape (n, s, s), float32 or float64
-        Counts, sky included; finite: 0 where a pixel is not or is off the image.
-    bad, saturated : ndarray of bool, shape (n, s, s)
-        `bad` are masked pixels, and those that `data` does not show.
-    truncated : ndarray of bool, shape (n,)
-        Part of the stamp, margin aside, is off the image.
-    id : ndarray, shape (n,), int64 or str
-    x, y : ndarray, shape (n,)
-        Position in the image, 0-based pixel centres; NaN where unknown.
-    flux, background, noise : ndarray, shape (n,)
-        Flux inside the stamp, sky level and RMS of the sky in a pixel; NaN where they
-        are to be estimated.
-    gain : ndarray, shape (n,)
-        Electrons per unit of the stamps; NaN where unknown.
-    """
-
-    data: np.ndarray
-    bad: np.ndarray
-    saturated: np.ndarray
-    truncated: np.ndarray
-    id: np.ndarray
-    x: np.ndarray
+    data: np.ndarray  # (n, s, s), counts, sky included; 0 where not finite or off the image
+    bad: np.ndarray  # (n, s, s), masked pixels, and those that `data` does not show
+    saturated: np.ndarray  # (n, s, s)
+    truncated: np.ndarray  # (n,), part of the stamp, margin aside, is off the image
+    id: np.ndarray  # (n,), int64 or str
+    x: np.ndarray  # (n,), position in the image, 0-based pixel centres; NaN where unknown
     y: np.ndarray
-    flux: np.ndarray
-    background: np.ndarray
-    noise: np.ndarray
-    gain: np.ndarray
+    flux: np.ndarray  # (n,), inside the stamp; NaN where it is to be estimated
+    background: np.ndarray  # (n,), sky level, likewise
+    noise: np.ndarray  # (n,), RMS of the sky in a pixel, likewise
+    gain: np.ndarray  # (n,), electrons per unit of the stamps; NaN where unknown
 
     def __len__(self) -> int:
         return len(self.data)
@@ -127,11 +109,8 @@ def border_scatter(stamps: np.ndarray) -> np.ndarray:
 
 # Centring, to the convention of the training: brightest pixel near (d/2, d/2).
 
-SIGNIFICANCE = 5.0
-"""Least excess of a peak elsewhere over the middle, in σ of their difference."""
-
-SMOOTHED_NOISE = 0.53
-"""σ of the difference of two pixels of the smoothed stamp, in σ of a pixel: √2 · (6/16)."""
+SIGNIFICANCE = 5.0  # least excess of a peak elsewhere over the middle, in σ of their difference
+SMOOTHED_NOISE = 0.53  # √2 · (6/16): that σ of two pixels of a smoothed stamp, in σ of a pixel
 
 
 def smoothed(stamps: np.ndarray) -> np.ndarray:
@@ -165,7 +144,7 @@ def displacement(stamps: np.ndarray, jitter_px: int) -> np.ndarray:
     middle = stamps.shape[-1] // 2
     near = slice(middle - jitter_px, middle + jitter_px + 1)
     smooth = smoothed(stamps)
-    brightest, second = (_peak(images) - middle for images in (stamps, smooth))
+    brightest, second = (peaks(images) - middle for images in (stamps, smooth))
     outside = np.abs(brightest).max(axis=1) > jitter_px
     star = np.flatnonzero(outside & (np.abs(brightest - second).max(axis=1) <= 1))
     out = np.zeros((len(stamps), 2), dtype=np.int16)
@@ -177,22 +156,17 @@ def displacement(stamps: np.ndarray, jitter_px: int) -> np.ndarray:
     return out
 
 
-def _peak(images: np.ndarray) -> np.ndarray:
+def peaks(images: np.ndarray) -> np.ndarray:
+    """(row, column) of the brightest pixel of every image, the first in that order among equals."""
     flat = images.reshape(len(images), -1).argmax(axis=1)
     return np.stack(np.divmod(flat, images.shape[-1]), axis=1)
 
 
 def cut(wide: np.ndarray, stamp_px: int, offset: np.ndarray | None = None) -> np.ndarray:
-    """Stamps (n, d, d) out of the middle of wider ones (n, s, s).
+    """Stamps (n, d, d) out of wider ones (n, s, s), index d//2 from s//2 + offset (n, 2).
 
-    Parameters
-    ----------
-    wide : ndarray, shape (n, s, s)
-    stamp_px : int
-        Side d; its index (d//2, d//2) is the (s//2, s//2) of the wide stamp.
-    offset : ndarray of int, shape (n, 2), optional
-        (row, column) by which the middle moves. What would lie beyond the wide stamp
-        repeats its edge.
+    The offset is (row, column), none by default. What would lie beyond the wide stamp
+    repeats its edge.
     """
     side = wide.shape[-1]
     pixels = side // 2 - stamp_px // 2 + np.arange(stamp_px)

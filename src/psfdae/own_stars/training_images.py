@@ -21,8 +21,7 @@ from psfdae.stars.fields import draw_jitter, draw_phase
 if TYPE_CHECKING:
     from psfdae.configuration.schema import Framing, Parts
 
-IMAGES_AT_A_TIME = 512
-"""Images made before they are framed; bounds the memory."""
+IMAGES_AT_A_TIME = 512  # made before they are framed; bounds the memory
 
 
 def star_grid(position: np.ndarray) -> np.ndarray:
@@ -56,33 +55,19 @@ def star_grid(position: np.ndarray) -> np.ndarray:
 
 
 def star_of_images(held_out: np.ndarray, train: int, test: int) -> np.ndarray:
-    """Star of every image: each star of a part as often as the others, or once more.
+    """Star of every image, shape (images,): the training stars, then those held out.
 
-    Parameters
-    ----------
-    held_out : ndarray of bool, shape (n_stars,)
-    train, test : int
-        Images wanted of the stars for training and of those held out; at least one
-        of each star.
-
-    Returns
-    -------
-    ndarray of int, shape (n,)
-        Training stars first.
+    So many images are wanted to train and to test, but at least one of each star; each
+    star of a part comes as often as the others, or once more.
     """
     parts = ((np.flatnonzero(~held_out), train), (np.flatnonzero(held_out), test))
     return np.concatenate([np.resize(stars, max(wanted, stars.size)) for stars, wanted in parts])
 
 
 def bins_of(position: np.ndarray, bins: int) -> np.ndarray:
-    """Square part of the field that every star is in, ix + bins·iy, shape (n,).
+    """Which of bins × bins parts of the field every star is in, ix + bins·iy, shape (n,).
 
-    Parameters
-    ----------
-    position : ndarray, shape (n, 2)
-        (x, y); where one is not finite, all stars are in the first part.
-    bins : int
-        Parts along a side.
+    Where a position (n, 2) is not finite, all stars are in the first part.
     """
     if not np.isfinite(position).all():
         return np.zeros(len(position), dtype=np.int64)
@@ -186,17 +171,8 @@ def training_columns(
 ) -> dict[str, Column]:
     """Columns of the product "stars": images of bright stars, and what is known of these.
 
-    Parameters
-    ----------
-    bright : BrightStars
-    grid : ndarray, shape (n, 2)
-        Place of every star (`star_grid`).
-    held_out : ndarray of bool, shape (n,)
-    bins : int
-        Parts of the field along a side; stars of a part are stacked.
-    framing : Framing
-    parts : Parts
-    rng : Generator
+    `grid` (n, 2) is their place (`star_grid`); stars of each of `bins`² parts of the field
+    are stacked.
     """
     star = star_of_images(held_out, parts.train_stars, parts.test_stars)
     template = templates_of(bright, held_out, bins)

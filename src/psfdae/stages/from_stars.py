@@ -19,7 +19,7 @@ from psfdae.files import write_product, write_text
 from psfdae.own_stars.bundle import SUFFIX
 from psfdae.own_stars.errors import ObservationError
 from psfdae.own_stars.observation import Observation, Source
-from psfdae.own_stars.packing import noise_equivalent_px, signal_to_noise
+from psfdae.own_stars.photometry import noise_equivalent_px, signal_to_noise
 from psfdae.own_stars.selection import collect
 from psfdae.own_stars.training_images import star_grid, training_columns
 from psfdae.reading import read_table

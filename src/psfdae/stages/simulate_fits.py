@@ -11,6 +11,7 @@ import psfdae
 from psfdae.evaluation.telescope_figure import FieldOfPsfs
 from psfdae.files import write_fits
 from psfdae.own_stars.example import add_stamps, write_field
+from psfdae.own_stars.photometry import noise_equivalent_px
 from psfdae.rng import stream
 from psfdae.stars.framing import normalise_flux
 
@@ -83,8 +84,7 @@ def write_image(
     """
     stamps, _ = normalise_flux(fields.psf.astype(np.float64))
     side = stamps.shape[-1]
-    area = 1.0 / (stamps.mean(axis=0) ** 2).sum()
-    flux = snr * np.sqrt(SKY * area)
+    flux = snr * np.sqrt(SKY * noise_equivalent_px(stamps.mean(axis=0)))
     pitch = side + MARGIN_PX
     columns, rows = fields.grid.max(axis=0) + 1
     x, y = (fields.grid * pitch + pitch // 2).T.astype(np.float64)
