@@ -19,8 +19,7 @@ from fits_inputs import open_observation, write_cube, write_field
 from psfdae.own_stars.errors import ObservationError, reading
 
 D = 8
-HEADERS = 8640
-"""Bytes at the start of the files here that hold their headers and some data."""
+HEADERS = 8640  # bytes at the start of the files here that hold their headers and some data
 
 
 def examples(count):
@@ -45,21 +44,22 @@ def folder(tmp_path_factory):
     write_cube(folder / "cube.fits.fz", stamps, compress=True)
     (folder / "cube.fits.gz").write_bytes(gzip.compress((folder / "cube.fits").read_bytes()))
     for name, compress in (("image.fits", False), ("image.fits.fz", True)):
-        write_field(
-            folder / name, folder / "s.csv", stamps, x, y, shape=(40, 60), compress=compress
-        )
+        write_field(folder / name, folder / "s.csv", stamps, x, y, (40, 60), compress=compress)
     for coding in ("GZIP_1", "GZIP_2"):
         tiles = fits.CompImageHDU(rng.poisson(9, (40, 60)), compression_type=coding)
         fits.HDUList([fits.PrimaryHDU(), tiles]).writeto(folder / f"{coding}.fits.fz")
-    Table.read(folder / "s.csv")["ra", "dec"].write(folder / "sky.csv")
-    Table.read(folder / "s.csv").write(folder / "s.fits")
-    Table.read(folder / "s.csv").write(folder / "s.ecsv")
+    table = Table.read(folder / "s.csv")
+    table["ra", "dec"].write(folder / "sky.csv")
+    table.write(folder / "s.fits")
+    table.write(folder / "s.ecsv")
     return folder
 
 
-CUBES = ("cube.fits", "cube16.fits", "cube.fits.fz", "cube.fits.gz")
-IMAGES = ("image.fits", "image.fits.fz", "GZIP_1.fits.fz", "GZIP_2.fits.fz")
-CATALOGUES = ("s.csv", "s.fits", "s.ecsv", "sky.csv")
+FILES = {
+    "cube": ("cube.fits", "cube16.fits", "cube.fits.fz", "cube.fits.gz"),
+    "image": ("image.fits", "image.fits.fz", "GZIP_1.fits.fz", "GZIP_2.fits.fz"),
+    "catalogue": ("s.csv", "s.fits", "s.ecsv", "sky.csv"),
+}
 
 
 def attempt(path, **options):
@@ -67,7 +67,7 @@ def attempt(path, **options):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         try:
-            found = open_observation(path, stamp_px=D, **options)
+            found = open_observation(path, D, **options)
             chunks = list(found.chunks(7))
         except ObservationError as error:
             text = str(error)
@@ -94,55 +94,43 @@ def attempt_all(folder, data, kind):
     return attempt(folder / "image.fits", catalogue=path)
 
 
-kinds = st.sampled_from(["cube", "image", "catalogue"])
-files = st.one_of(
-    st.tuples(st.just("cube"), st.sampled_from(CUBES)),
-    st.tuples(st.just("image"), st.sampled_from(IMAGES)),
-    st.tuples(st.just("catalogue"), st.sampled_from(CATALOGUES)),
-)
-card_bytes = st.sampled_from(list(b"0123456789 'TFABX-.E/=,"))
-
-
 def test_the_good_files_are_read(folder):
-    for kind, names in (("cube", CUBES), ("image", IMAGES[:2]), ("catalogue", CATALOGUES)):
-        for name in names:
-            assert attempt_all(folder, (folder / name).read_bytes(), kind), name
+    for kind, name in ((kind, name) for kind, names in FILES.items() for name in names):
+        good = attempt_all(folder, (folder / name).read_bytes(), kind)
+        assert good or name.startswith("GZIP"), name  # no WCS for the sky coordinates
 
 
-@examples(100)
-@given(kind=kinds, start=st.sampled_from([b"", b"SIMPLE  =", b"# %ECSV 1.0\n"]), rest=st.binary())
-def test_random_bytes(folder, capfd, kind, start, rest):
-    assert not attempt_all(folder, start + rest, kind)
-    assert capfd.readouterr() == ("", "")
-
-
-@examples(120)
-@given(file=files, part=st.floats(0, 1))
-def test_truncated_files(folder, capfd, file, part):
-    data = (folder / file[1]).read_bytes()
-    attempt_all(folder, data[: int(part * len(data))], file[0])
-    assert capfd.readouterr() == ("", "")
-
-
-@examples(200)
-@given(
-    file=files,
-    changes=st.lists(st.tuples(st.floats(0, 1), card_bytes), min_size=1, max_size=6),
+card_bytes = st.sampled_from(list(b"0123456789 'TFABX-.E/=,"))
+damages = st.one_of(
+    st.tuples(st.just("nothing of it"), st.sampled_from([b"", b"SIMPLE  =", b"# %ECSV 1.0\n"])),
+    st.tuples(st.just("truncated"), st.floats(0, 1)),
+    st.tuples(
+        st.just("headers"), st.lists(st.tuples(st.floats(0, 1), card_bytes), min_size=1, max_size=6)
+    ),
+    st.tuples(st.just("replaced"), st.tuples(st.floats(0, 1), st.integers(0, 200))),
 )
-def test_changed_headers(folder, capfd, file, changes):
-    data = bytearray((folder / file[1]).read_bytes())
-    for place, byte in changes:
-        data[int(place * (min(HEADERS, len(data)) - 1))] = byte
-    attempt_all(folder, bytes(data), file[0])
-    assert capfd.readouterr() == ("", "")
 
 
-@examples(120)
-@given(file=files, place=st.floats(0, 1), removed=st.integers(0, 200), added=st.binary(max_size=99))
-def test_bytes_changed_removed_and_added_anywhere(folder, capfd, file, place, removed, added):
-    data = (folder / file[1]).read_bytes()
-    start = int(place * len(data))
-    attempt_all(folder, data[:start] + added + data[start + removed :], file[0])
+@examples(500)
+@given(
+    file=st.sampled_from([(kind, name) for kind, names in FILES.items() for name in names]),
+    damage=damages,
+    more=st.binary(max_size=99),
+)
+def test_any_damage_is_silent_and_one_line_at_most(folder, capfd, file, damage, more):
+    (what, how), data = damage, bytearray((folder / file[1]).read_bytes())
+    if what == "nothing of it":
+        data = how + more
+    elif what == "truncated":
+        data = data[: int(how * len(data))]
+    elif what == "headers":
+        for place, byte in how:
+            data[int(place * (min(HEADERS, len(data)) - 1))] = byte
+    else:
+        start = int(how[0] * len(data))
+        data = data[:start] + more + data[start + how[1] :]
+    read = attempt_all(folder, bytes(data), file[0])
+    assert not (read and what == "nothing of it")
     assert capfd.readouterr() == ("", "")
 
 
@@ -170,19 +158,24 @@ def test_catalogues_of_any_content(folder, capfd, header, rows):
 # Damage and misuse that have their own words.
 
 
-def test_what_is_not_there_or_not_fits(tmp_path, folder):
-    (tmp_path / "empty.fits").write_bytes(b"")
-    (tmp_path / "text.fits").write_text("hello")
-    for name, message in (
-        ("nowhere.fits", "no such file"),
-        ("empty.fits", "the file is empty"),
-        ("text.fits", "not a FITS file"),
-        ("", "a folder, not a file"),
-    ):
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("nowhere.fits", None, "no such file"),
+        ("empty.fits", b"", "the file is empty"),
+        ("text.fits", b"hello", "not a FITS file"),
+        ("", None, "a folder, not a file"),
+    ],
+)
+def test_what_is_not_there_or_not_fits(tmp_path, folder, name, content, message):
+    if content is not None:
+        (tmp_path / name).write_bytes(content)
+    with pytest.raises(ObservationError, match=f": {message}$"):
+        open_observation(tmp_path / name, D)
+    if not name.startswith("text"):
+        message = "the catalogue is empty" if content == b"" else message
         with pytest.raises(ObservationError, match=f": {message}$"):
-            open_observation(tmp_path / name, stamp_px=D)
-    with pytest.raises(ObservationError, match=r"nowhere\.csv: no such file"):
-        open_observation(folder / "image.fits", stamp_px=D, catalogue=tmp_path / "nowhere.csv")
+            open_observation(folder / "image.fits", D, catalogue=tmp_path / name)
 
 
 @pytest.mark.parametrize(
@@ -199,7 +192,7 @@ def test_what_is_not_there_or_not_fits(tmp_path, folder):
 def test_wrong_dimensions_name_both_numbers(tmp_path, shape, message):
     fits.PrimaryHDU(np.zeros(shape, dtype=np.float32)).writeto(tmp_path / "a.fits")
     with pytest.raises(ObservationError, match=message):
-        open_observation(tmp_path / "a.fits", stamp_px=D)
+        open_observation(tmp_path / "a.fits", D)
 
 
 def test_a_truncated_cube_is_refused_before_any_pixel(tmp_path, folder):
@@ -207,7 +200,7 @@ def test_a_truncated_cube_is_refused_before_any_pixel(tmp_path, folder):
     end = 2880 + 4 * 30 * D * D
     (tmp_path / "a.fits").write_bytes(data[: end - 10])
     with pytest.raises(ObservationError, match="truncated: the last 10 bytes are missing"):
-        open_observation(tmp_path / "a.fits", stamp_px=D)
+        open_observation(tmp_path / "a.fits", D)
     (tmp_path / "b.fits").write_bytes(data[:end])  # only the padding of the last block is missing
     assert attempt(tmp_path / "b.fits")
 
@@ -215,31 +208,13 @@ def test_a_truncated_cube_is_refused_before_any_pixel(tmp_path, folder):
 def test_a_file_that_changes_after_opening_is_noticed(tmp_path, folder):
     path = tmp_path / "a.fits"
     path.write_bytes((folder / "cube.fits").read_bytes())
-    found = open_observation(path, stamp_px=D)
+    found = open_observation(path, D)
     write_cube(path, np.zeros((3, D, D)))
     with pytest.raises(ObservationError, match="has changed"):
         list(found.chunks(10))
     path.unlink()
     with pytest.raises(ObservationError, match="no such file"):
         list(found.chunks(10))
-
-
-@pytest.mark.parametrize("coding", ["HCOMPRESS_1", "PLIO_1"])
-def test_tiles_whose_decoder_is_not_safe_are_refused(tmp_path, coding):
-    tiles = fits.CompImageHDU(np.ones((16, 16), dtype=np.int32), compression_type=coding)
-    fits.HDUList([fits.PrimaryHDU(), tiles]).writeto(tmp_path / "a.fits.fz")
-    with pytest.raises(ObservationError, match=f"compressed with {coding}, accepted are RICE_1"):
-        open_observation(tmp_path / "a.fits.fz", stamp_px=16)
-
-
-@pytest.mark.parametrize(("card", "value"), [("ZVAL1", 0), ("ZVAL2", 8), ("ZNAXIS2", 9999)])
-def test_damaged_settings_of_tiles_are_refused(tmp_path, card, value):
-    tiles = fits.CompImageHDU(np.ones((16, 16), dtype=np.int32))
-    fits.HDUList([fits.PrimaryHDU(), tiles]).writeto(tmp_path / "a.fits.fz")
-    with fits.open(tmp_path / "a.fits.fz", mode="update", disable_image_compression=True) as hdus:
-        hdus[1].header[card] = value
-    with pytest.raises(ObservationError, match="damaged: "):
-        open_observation(tmp_path / "a.fits.fz", stamp_px=16)
 
 
 @pytest.mark.parametrize(
@@ -256,11 +231,6 @@ def test_damaged_settings_of_tiles_are_refused(tmp_path, card, value):
 def test_options_out_of_range(folder, option):
     with pytest.raises(ObservationError, match=r"cube\.fits: .*expected"):
         open_observation(folder / "cube.fits", **({"stamp_px": D} | option))
-
-
-def test_no_rows_at_a_time_is_refused(folder):
-    with pytest.raises(ValueError, match="rows is 0"):
-        next(open_observation(folder / "cube.fits", stamp_px=D).chunks(0))
 
 
 def test_threads_leave_warnings_and_log_as_they_were(tmp_path):

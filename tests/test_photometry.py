@@ -1,0 +1,362 @@
+"""Fluxes of noisy and of broken stars; centring, and shapes of PSFs."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from prediction_stars import observe
+from psfdae.own_stars import photometry as module
+from psfdae.own_stars.photometry import FluxModel, Photometer, robust_flux
+from psfdae.own_stars.shapes import measure_shapes
+from psfdae.own_stars.stamps import (
+    SMOOTHED_NOISE,
+    StarFlag,
+    border_pixels,
+    cut,
+    displacement,
+    smoothed,
+)
+
+MASKED, OUTLIER, FAINT, NO_FLUX = StarFlag(1), StarFlag(2), StarFlag(4), StarFlag(8)
+
+
+@pytest.fixture(scope="module")
+def model(gaussian_stars):
+    return FluxModel.fit(gaussian_stars[:200])
+
+
+@pytest.fixture(scope="module")
+def stars(gaussian_stars):
+    return gaussian_stars[200:]
+
+
+@pytest.fixture
+def noisy(stars, noise):
+    return noise.draw(stars, 1e-3, np.random.default_rng(1)).astype(np.float64)
+
+
+def rms(values):
+    return np.sqrt(np.mean(values**2))
+
+
+def put(value, *place):
+    """Change of a star: another value at a place, or everywhere."""
+
+    def change(star):
+        star[place or ...] = value
+
+    return change
+
+
+def broken(noisy, change):
+    """The batch with its star 3 changed."""
+    batch = noisy.copy()
+    change(batch[3])
+    return batch
+
+
+# Flux
+
+
+def test_faint_stars_are_measured_far_better_than_by_their_sum(stars, model, noise):
+    """With PSFs that hardly vary, nearly as well as if each PSF were known."""
+    images = noise.draw(stars, 5e-3, np.random.default_rng(0))
+    found = rms(robust_flux(images, model).flux - 1)
+    spread = 1 / np.sqrt((stars.astype(np.float64) ** 2).sum(axis=(1, 2)))
+    limit = rms(noise.kappa * 5e-3 * spread)
+    assert 0.8 * limit < found < 1.6 * limit
+    assert found < 0.6 * rms(images.sum(axis=(1, 2)) - 1)
+
+
+def test_bright_stars_are_measured_as_well_as_by_their_sum(stars, model, noise):
+    images = noise.draw(stars, 1e-5, np.random.default_rng(0))
+    assert rms(robust_flux(images, model).flux - 1) < 1.3 * rms(images.sum(axis=(1, 2)) - 1)
+
+
+def test_stated_error_is_the_scatter(stars, model, noise):
+    images = noise.draw(np.tile(stars, (10, 1, 1)), 2e-3, np.random.default_rng(0))
+    estimate = robust_flux(images, model)
+    assert rms((estimate.flux - 1) / estimate.error) == pytest.approx(1.0, abs=0.2)
+    assert np.mean(estimate.flux - 1) == pytest.approx(0.0, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("change", "flags"),
+    [
+        (put(np.nan, 4, 9), MASKED),
+        (put(np.inf, 8, 8), MASKED),
+        (put(np.nan, 5), MASKED),
+        (put(50.0, 3, 3), OUTLIER),
+        (put(50.0, 8, 8), OUTLIER),
+        (put(1e300, 8, 8), OUTLIER),
+        (put(-0.5, 8, 7), OUTLIER),
+        (put(9.0, slice(2, 5), slice(2, 5)), OUTLIER),
+    ],
+)
+def test_bad_pixels_are_marked_and_repaired(noisy, stars, model, noise, change, flags):
+    clean, estimate = robust_flux(noisy, model), robust_flux(broken(noisy, change), model)
+    assert estimate.flags[3] == flags
+    assert abs(estimate.flux[3] - clean.flux[3]) < 2 * estimate.error[3]
+    wrong = estimate.images[3] != noisy[3]
+    assert wrong.any()
+    # What is put in is closer to the truth than a measured pixel would be, on average.
+    assert rms((estimate.images[3] - stars[3])[wrong]) < 2 * noise.kappa * 1e-3
+
+
+@pytest.mark.parametrize(
+    ("change", "flags"),
+    [
+        (put(0.0), NO_FLUX),
+        (put(4.2), NO_FLUX),
+        (put(np.nan), NO_FLUX | MASKED),
+        (put(np.inf, slice(0, 9)), NO_FLUX | MASKED),
+        (lambda star: np.negative(star, star), NO_FLUX | OUTLIER),
+    ],
+)
+def test_hopeless_stars_are_marked_and_their_neighbours_do_not_notice(noisy, model, change, flags):
+    before, after = robust_flux(noisy, model), robust_flux(broken(noisy, change), model)
+    assert after.flags[3] == flags
+    if OUTLIER in flags:
+        assert after.flux[3] < 0
+    else:
+        assert np.isnan(after.flux[3]) and not after.images[3].any()
+    others = np.delete(np.arange(len(noisy)), 3)
+    for name in ("images", "flux", "flags"):
+        assert np.array_equal(getattr(after, name)[others], getattr(before, name)[others])
+
+
+@pytest.mark.parametrize("unit", [1e-300, 1e-30, 1e30, 1e300])
+def test_unit_does_not_matter(noisy, model, unit):
+    before, after = robust_flux(noisy, model), robust_flux(noisy * unit, model)
+    assert after.flux / unit == pytest.approx(before.flux, rel=1e-12)
+    assert after.images / unit == pytest.approx(before.images, rel=1e-12)
+    assert np.array_equal(after.flags, before.flags)
+
+
+def test_sky_without_a_star_is_marked_and_good_stars_are_not(stars, model, noise):
+    sky = np.random.default_rng(0).normal(size=(400, 16, 16))
+    # A flux of three times its error happens by chance once in 740 stars.
+    assert ((robust_flux(sky, model).flags & (NO_FLUX | FAINT)) > 0).mean() > 0.98
+    for level in (3e-5, 1e-3):
+        images = noise.draw(stars, level, np.random.default_rng(0))
+        assert (robust_flux(images, model).flags > 0).mean() < 0.03
+
+
+def test_inputs_are_left_alone(noisy, model):
+    batch = broken(noisy, put(np.nan, 8, 8))
+    before = batch.copy()
+    robust_flux(batch, model)
+    assert np.array_equal(batch, before, equal_nan=True)
+
+
+def test_training_stars_may_have_any_flux(stars):
+    scale = np.random.default_rng(0).uniform(0.1, 1e4, size=(len(stars), 1, 1))
+    plain, scaled = FluxModel.fit(stars), FluxModel.fit(stars.astype(np.float64) * scale)
+    for name in ("mean", "variance", "low", "high"):
+        assert getattr(scaled, name) == pytest.approx(getattr(plain, name), rel=1e-5, abs=1e-8)
+
+
+@pytest.mark.parametrize(("factor", "flags"), [(1.3, 0), (1.8, OUTLIER)])
+def test_pixels_may_leave_the_range_of_the_training_by_half(stars, model, noise, factor, flags):
+    batch = noise.draw(stars, 1e-5, np.random.default_rng(1)).astype(np.float64)
+    pixel = model.high.argmax()
+    batch[3].flat[pixel] = factor * model.high[pixel]
+    assert robust_flux(batch, model).flags[3] == flags
+
+
+def test_noise_of_a_noise_free_star_is_a_millionth_of_its_median_pixel(model):
+    images = np.array([1.0, 300.0])[:, None, None] * model.mean.reshape(16, 16)
+    expected = 1e-6 * np.median(images, axis=(1, 2))
+    assert robust_flux(images, model).noise == pytest.approx(expected, rel=1e-3)
+
+
+def test_one_fit_is_the_one_of_dense_matrices(stars, model):
+    """Flux, error, leave-one-out residuals and repaired pixels of the formulae over used pixels."""
+    rng = np.random.default_rng(1)
+    x = 2.0 * stars[:4].reshape(4, -1).astype(np.float64) + rng.normal(0, 0.01, (4, 256))
+    used = rng.random((4, 256)) > np.array([0.0, 0.01, 0.2, 0.4])[:, None]
+    prior, sigma = np.array([4.0, 3.0, 5.0, 4.0]), np.array([0.01, 0.02, 0.01, 0.005])
+    found = module._generalised_least_squares(x, used, prior, sigma, model)
+    covariance = (model.basis * model.variance) @ model.basis.T
+    for star, (flux, error, score, repaired) in enumerate(zip(*found, strict=True)):
+        whole = prior[star] * covariance + sigma[star] ** 2 * np.eye(256)
+        kept, lost = np.flatnonzero(used[star]), np.flatnonzero(~used[star])
+        inverse = np.linalg.inv(whole[np.ix_(kept, kept)])
+        mean = model.mean[kept]
+        information = mean @ inverse @ mean
+        assert flux == pytest.approx(mean @ inverse @ x[star, kept] / information, rel=1e-6)
+        assert error == pytest.approx(information**-0.5, rel=1e-6)
+        residual = inverse @ (x[star, kept] - flux * mean)
+        expected = np.abs(residual) / np.sqrt(np.diag(inverse))
+        assert score[kept] == pytest.approx(expected, rel=1e-5, abs=1e-8)
+        filled = flux * model.mean[lost] + whole[np.ix_(lost, kept)] @ residual
+        assert repaired[kept] == pytest.approx(x[star, kept], abs=0)
+        assert repaired[lost] == pytest.approx(filled, rel=1e-5, abs=1e-8)
+
+
+def test_model_refuses_stars_without_flux_and_stamps_of_another_size(stars, model):
+    with pytest.raises(ValueError, match="finite and of positive sum"):
+        FluxModel.fit(np.concatenate([stars[:5], 0 * stars[:1]]))
+    with pytest.raises(ValueError, match="stamps of 196 px, but the flux model has 256"):
+        robust_flux(stars[:, 1:-1, 1:-1], model)
+
+
+# Many stars at once
+
+
+@pytest.fixture(scope="module")
+def whole_model(gaussian_stars):
+    return FluxModel.fit(gaussian_stars)
+
+
+def measure(model, stamps, start, bad=False, **known):
+    """Photometry of stamps of which some is known."""
+    unknown = dict.fromkeys(("flux", "background", "noise"), np.nan)
+    given = {name: np.full(len(stamps), value) for name, value in (unknown | known).items()}
+    bad = np.zeros(stamps.shape, dtype=bool) | bad
+    start = np.full(len(stamps), start)
+    return Photometer(model, 48).measure(stamps, bad, start, SimpleNamespace(**given))
+
+
+@pytest.mark.parametrize("sky_known", [True, False])
+def test_flux_is_the_one_of_dense_matrices(gaussian_stars, whole_model, sky_known):
+    """F = mᵀQx / mᵀQm with Q = S⁻¹, without its part along the sky where that is unknown."""
+    stars, sky, sigma = gaussian_stars[:40].astype(np.float64), 70.0, 8.0
+    stamps = 1e3 * stars + sky + np.random.default_rng(5).normal(0, sigma, stars.shape)
+    known = {"noise": sigma} | ({"background": sky} if sky_known else {})
+    found = measure(whole_model, stamps, sky + 3.0, **known)
+    covariance = (whole_model.basis * whole_model.variance) @ whole_model.basis.T
+    mean, one = whole_model.mean, np.ones(256)
+    for star in range(40):
+        prior = found.flux[star] ** 2 + sigma**2 / (mean @ mean)
+        inverse = np.linalg.inv(prior * covariance + sigma**2 * np.eye(256))
+        if not sky_known:
+            inverse -= np.outer(inverse @ one, inverse @ one) / (one @ inverse @ one)
+        x, information = stamps[star].ravel() - sky, mean @ inverse @ mean
+        error = information**-0.5
+        assert found.flux_error[star] == pytest.approx(error, rel=0.01)
+        assert found.flux[star] == pytest.approx(mean @ inverse @ x / information, abs=0.05 * error)
+        left = 0.0 if sky_known else (x.sum() - found.flux[star]) / 256
+        assert found.background[star] == pytest.approx(sky + left, abs=1e-3)
+        image = (x - left) / found.flux[star]
+        assert found.images[star].ravel() == pytest.approx(image, abs=1e-5)
+
+
+@pytest.mark.parametrize("sigma", [0.1, 1.0, 10.0])
+def test_noise_of_bright_and_of_faint_stars_is_that_of_the_sky(gaussian_stars, whole_model, sigma):
+    """Signal to noise from 20 to 2000: the light of a star is no noise."""
+    stamps = 1e3 * gaussian_stars[:200].astype(np.float64) + 70.0
+    stamps += np.random.default_rng(5).normal(0, sigma, stamps.shape)
+    assert measure(whole_model, stamps, 72.0).noise.mean() == pytest.approx(sigma, rel=0.05)
+
+
+@pytest.mark.parametrize("sky", [-4.0, 0.0, 4.0])
+def test_sky_that_is_given_is_believed_in_stamps_with_bad_pixels(gaussian_stars, whole_model, sky):
+    """Of flux_of(x − b) nothing is left but what the good pixels say at that sky."""
+    stamps = 1e3 * gaussian_stars[:20].astype(np.float64)
+    stamps += np.random.default_rng(6).normal(0, 8.0, stamps.shape)
+    bad = np.zeros(stamps.shape, dtype=bool)
+    bad[:, 2:5, 3:9] = True
+    found = measure(whole_model, stamps, 0.0, bad, background=sky)
+    alone = robust_flux(np.where(bad, np.nan, stamps - sky), whole_model)
+    assert found.flux == pytest.approx(alone.flux, rel=1e-6)
+    assert found.flux_error == pytest.approx(alone.error, rel=1e-6)
+    assert found.background == pytest.approx(sky, abs=1e-12)
+
+
+@pytest.mark.parametrize("sky_known", [True, False])
+def test_residuals_of_the_border_are_those_of_dense_matrices(
+    gaussian_stars, whole_model, sky_known
+):
+    """Q(x − Fm) over the root of the diagonal of Q, Q as above."""
+    sigma, flux = 0.01, np.array([1.1, 0.9, 1.0])
+    stars = gaussian_stars[:3].reshape(3, -1).astype(np.float64) + 0.004
+    stars += np.random.default_rng(7).normal(0, sigma, stars.shape)
+    total = stars.sum(axis=1)
+    x = stars - total[:, None] / 256
+    leading, variance = whole_model.basis[:, -48:], whole_model.variance[-48:]
+    weight = np.tile(1 / (variance + sigma**2), (3, 1))
+    found = Photometer(whole_model, 48)._border_scores(
+        x, x @ leading, total, flux, weight, np.full(3, sigma**2), np.full(3, sky_known)
+    )
+    inverse = np.linalg.inv((leading * variance) @ leading.T + sigma**2 * np.eye(256))
+    if not sky_known:
+        beyond = inverse @ np.ones(256)
+        inverse -= np.outer(beyond, beyond) / beyond.sum()
+    residual = (stars - flux[:, None] * whole_model.mean) @ inverse / np.sqrt(np.diag(inverse))
+    assert found == pytest.approx(residual[:, border_pixels(16)], abs=1e-4)
+
+
+# Centring
+
+
+@pytest.mark.parametrize("level", [3e-3, 1e-2])
+def test_noise_moves_no_star(field_psfs, level):
+    stars = observe(field_psfs, level, seed=4)
+    assert displacement(stars.stamps, 1).any(axis=1).mean() < 0.01
+
+
+def test_smoothing_is_by_a_quarter_a_half_a_quarter_and_repeats_the_edge():
+    stamps = np.random.default_rng(0).normal(size=(40, 16, 16))
+    kernel = np.outer([1, 2, 1], [1, 2, 1])[None] / 16
+    expected = ndimage.convolve(stamps, kernel, mode="nearest")
+    assert smoothed(stamps) == pytest.approx(expected, abs=1e-12)
+    many = smoothed(np.random.default_rng(1).normal(size=(4000, 16, 16)))
+    assert (many[:, 3, 3] - many[:, 9, 9]).std() == pytest.approx(SMOOTHED_NOISE, rel=0.05)
+
+
+def test_cut_moves_the_middle_and_repeats_the_edge():
+    wide = np.arange(2 * 100).reshape(2, 10, 10)
+    assert np.array_equal(cut(wide, 6), wide[:, 2:8, 2:8])
+    found = cut(wide, 6, np.array([[0, 0], [-1, 2]]))
+    assert np.array_equal(found[0], wide[0, 2:8, 2:8])
+    assert np.array_equal(found[1], wide[1, 1:7, 4:10])
+    beyond = cut(wide, 6, np.array([[4, 0], [0, 0]]))[0]
+    assert (beyond[4:] == wide[0, 9, 2:8]).all()
+
+
+# Shapes
+
+
+def gaussians(sigma, count=50, ratio=1.0, angle=0.0):
+    """Gaussians at random sub-pixel positions, integrated over fine sub-pixels."""
+    rng, q = np.random.default_rng(1), 5
+    grid = (np.arange(16 * q) + 0.5) / q - 8
+    x0, y0 = rng.uniform(-1, 1, (2, count, 1, 1))
+    x, y = grid[None, None, :] - x0, grid[None, :, None] - y0
+    u, v = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)
+    fine = np.exp(-0.5 * (u**2 + (v / ratio) ** 2) / sigma**2)
+    return fine.reshape(count, 16, q, 16, q).sum(axis=(2, 4))
+
+
+@pytest.mark.parametrize("fwhm", [2.0, 3.0, 5.0])
+def test_width_of_a_gaussian_with_its_pixel(fwhm):
+    sigma = fwhm / 2.3548
+    shapes = measure_shapes(gaussians(sigma))
+    assert shapes.fwhm_px == pytest.approx(2.3548 * np.hypot(sigma, 12**-0.5), rel=0.01)
+    assert shapes.ellipticity.max() < 0.02
+
+
+@pytest.mark.parametrize("degrees", [-60.0, 0.0, 30.0, 89.0])
+def test_axes_of_an_ellipse(degrees):
+    shapes = measure_shapes(gaussians(2.4, ratio=0.6, angle=np.deg2rad(degrees)))
+    major, minor = np.hypot(2.4, 12**-0.5), np.hypot(0.6 * 2.4, 12**-0.5)
+    assert shapes.ellipticity == pytest.approx(1 - minor / major, abs=0.01)
+    assert shapes.fwhm_px == pytest.approx(2.3548 * (major * minor) ** 0.5, rel=0.01)
+    off = (shapes.position_angle_deg - degrees + 90) % 180 - 90
+    assert np.abs(off).max() < 0.5
+
+
+def test_shapes_of_nothing_are_nan_and_of_anything_finite():
+    square = np.ones((16, 16))
+    odd = np.random.default_rng(0).random((16, 16)) ** 8
+    spikes = [square, odd, 1e30 * np.eye(16), np.eye(16)[:1] * square]
+    shapes = measure_shapes(np.stack([0 * square, -square, np.nan * square, *spikes]))
+    assert np.isnan(shapes.fwhm_px[:3]).all()
+    for values in vars(shapes).values():
+        assert np.isfinite(values[3:]).all()
+    assert (shapes.ellipticity[3:] >= 0).all()
