@@ -31,7 +31,7 @@ SUMMARY_FILES = ("summary.csv", "cost.csv", "best.yaml", "sweep.yaml")
 MODEL_FILES = ("dae.safetensors", "cnn.safetensors", "pca_som.h5", "config.yaml")
 POINT_FILES = (
     "result.json",
-    "cost.csv",
+    "cost.json",
     "evaluation.csv",
     "validation.csv",
     *MODEL_FILES,
