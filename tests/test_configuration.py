@@ -97,6 +97,29 @@ def test_settings_that_cannot_change_a_result_are_set_apart(stage):
     assert sorted([*free, *as_overrides(compose.decisive(tree))]) == as_overrides(tree)
 
 
+def test_a_file_of_settings_is_named_by_what_decides_a_result(tmp_path):
+    reads = ("seed", "noise", "parts", "dae", "train")
+
+    def written(*overrides):
+        tree = compose.compose(("preset=smoke", *overrides))
+        return compose.write_settings(tmp_path, "train", reads, tree)
+
+    path = written()
+    assert written("train.checkpoint_seconds=1.5") == path
+    assert compose.load_settings(path, reads).train.checkpoint_seconds == 1.5
+    assert written("train.lr=1e-3") != path
+    assert compose.load_settings(path, reads) == load_stage(
+        reads, ("preset=smoke", "train.checkpoint_seconds=1.5")
+    )
+
+
+def test_a_file_of_settings_that_is_damaged_is_named(tmp_path):
+    path = tmp_path / "train.yaml"
+    path.write_text("seed: -1\n")
+    with pytest.raises(ConfigError, match=r"train\.yaml: seed = -1: .*greater than or equal to 0"):
+        compose.load_settings(path, ("seed",))
+
+
 def test_a_checkpoint_does_not_depend_on_how_often_it_is_written():
     import numpy as np
 

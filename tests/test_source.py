@@ -59,14 +59,16 @@ def changed(tmp_path, before):
     """Rules whose hash differs after a text of a module is replaced."""
 
     def edit(module, *replaced):
-        shutil.copytree(ROOT, tmp_path / "psfdae", ignore=shutil.ignore_patterns("__pycache__"))
-        path = tmp_path / "psfdae" / module
+        package, stress = tmp_path / "src/psfdae", "tests/stress"
+        shutil.copytree(ROOT, package, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(REPOSITORY / stress, tmp_path / stress)
+        path = package / module
         text = path.read_text()
         for old, new in replaced:
             assert old in text
             text = text.replace(old, new)
         path.write_text(text)
-        after = hashes(tmp_path / "psfdae")
+        after = hashes(package)
         return {rule for rule in before if before[rule] != after[rule]}
 
     return edit
