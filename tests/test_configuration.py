@@ -105,6 +105,9 @@ def test_a_file_of_settings_is_named_by_what_decides_a_result(tmp_path):
         return compose.write_settings(tmp_path, "train", reads, tree)
 
     path = written()
+    whole = path.read_bytes()
+    path.write_bytes(b"\xff" + whole[1:])
+    assert written() == path and path.read_bytes() == whole
     assert written("train.checkpoint_seconds=1.5") == path
     assert compose.load_settings(path, reads).train.checkpoint_seconds == 1.5
     assert written("train.lr=1e-3") != path

@@ -243,7 +243,8 @@ def write_settings(
     digest = hashlib.sha256(json.dumps(decisive(checked), sort_keys=True).encode()).hexdigest()
     path = folder / f"{stage.replace(' ', '-')}-{digest[:16]}.yaml"
     text = yaml.safe_dump(checked, sort_keys=True, allow_unicode=True)
-    if not dry and not (path.is_file() and path.read_text(encoding="utf-8") == text):
+    # Damaged ones are written again: a view, which needs no digest.
+    if not dry and not (path.is_file() and path.read_bytes() == text.encode()):
         write_text(path, text)
     return path
 
