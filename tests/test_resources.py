@@ -35,7 +35,7 @@ def plan(tmp_path_factory):
     shutil.copy(ROOT / "Snakefile", folder)
     # A job with a message of its own does not print its resources.
     for rules in folder.glob("workflow/rules/*.smk"):
-        text = re.sub(r"^    message:\n(?:        .*\n)+", "", rules.read_text(), flags=re.M)
+        text = re.sub(r"^( +)message:\n(?:\1    .*\n)+", "", rules.read_text(), flags=re.M)
         rules.write_text(text)
 
     def jobs(profile, *arguments):
