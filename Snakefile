@@ -30,13 +30,10 @@ include: "workflow/rules/alignment_figures.smk"
 include: "workflow/rules/tracking.smk"
 include: "workflow/rules/bounds.smk"
 include: "workflow/rules/stability.smk"
-include: "workflow/rules/propagation.smk"
-include: "workflow/rules/timing.smk"
+include: "workflow/rules/benchmarks.smk"
 include: "workflow/rules/knee.smk"
 include: "workflow/rules/sweep.smk"
-include: "workflow/rules/prediction.smk"
 include: "workflow/rules/record.smk"
-include: "workflow/rules/scaling.smk"
 
 
 # Where the digests of the products go: `psfdae verify` compares.

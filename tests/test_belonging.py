@@ -9,8 +9,11 @@ import pytest
 import yaml
 from click.testing import CliRunner
 
+import baseline
+import prediction
+import trainings
 from psfdae.belonging import STARS, STATIC, require
-from psfdae.cli import main
+from psfdae.cli import Careful, as_click, main
 from psfdae.configuration.compose import load, load_stage
 from psfdae.files import Column, ProductError, write_product
 from psfdae.own_stars.bundle import read_bundle, shipped_path
@@ -23,7 +26,11 @@ SMALL = ("telescope.pixel_scale_arcsec=0.15", *SIZES)
 
 
 def psfdae(*words):
-    return CliRunner().invoke(main, [str(word) for word in words])
+    """Run a command of ours, or one of a program, which begins with its function."""
+    first, *rest = words
+    group = Careful(commands=[as_click(first)]) if callable(first) else main
+    name = first.stage.name if callable(first) else first
+    return CliRunner().invoke(group, [name, *map(str, rest)])
 
 
 def done(*words):
@@ -98,7 +105,7 @@ def evaluate(at, stars="s.h5", dae="dae"):
     [
         (evaluate, "pca_som.trained_on.yaml"),
         (lambda at, s: ("bundle", "--stars", at / s, "--dae", at / "dae", *SIZES), "dae"),
-        (lambda at, s: ("training-knee", "--stars", at / s, f"--point=a={at / 'dae'}"), "dae"),
+        (lambda at, s: (trainings.knee_table, "--stars", at / s, f"--point=a={at / 'dae'}"), "dae"),
         (
             lambda at, s: (
                 *("figure", "strip", "--dataset", "d", "--stars", at / s, "--level=1e-3"),
@@ -122,7 +129,7 @@ def test_models_need_stars_of_their_own_kind(at, stage, file):
     words = [*stage(at, "s2.h5"), *SIZES]
     if "--out" not in words:
         words += ["--out", at / "out"]
-    if words[0] == "training-knee":
+    if words[0] is trainings.knee_table:
         words += ["--stopping", at / "stopping.csv"]
     refused(at, *words, file=file, **SCALE)
 
@@ -182,13 +189,13 @@ def test_calibration_needs_one_telescope_for_the_stars_of_a_scene(at):
 @pytest.mark.parametrize(
     "words",
     [
-        ["benchmark-baseline", "--stars", "s2.h5"],
-        ["benchmark-prediction", "--stars", "s2.h5", "--bundle", "none"],
+        [baseline.baseline, "--stars", "s2.h5"],
+        [prediction.throughput, "--stars", "s2.h5", "--bundle", "none"],
     ],
-    ids=lambda words: words[0],
+    ids=lambda words: str(words[0]),
 )
 def test_measurements_need_the_stars_of_their_configuration(at, words):
-    words = [at / word if "." in word else word for word in words]
+    words = [at / word if isinstance(word, str) and "." in word else word for word in words]
     values = SCALE["values"][::-1]
     options = {"file": at / "s2.h5", "key": SCALE["key"], "values": values}
     refused(at, *words, "--out", at / "out.csv", *SIZES, **options)
@@ -197,9 +204,9 @@ def test_measurements_need_the_stars_of_their_configuration(at, words):
 @pytest.mark.parametrize(
     ("words", "key", "values"),
     [
-        (["benchmark-prediction", "--stars", "s.h5"], "framing.subpixel", (True, False)),
+        ([prediction.throughput, "--stars", "s.h5"], "framing.subpixel", (True, False)),
         (
-            ["predict-poppy", "--evaluation", "e.csv", "telescope.diameter_m=2"],
+            [prediction.poppy, "--evaluation", "e.csv", "telescope.diameter_m=2"],
             "telescope.diameter_m",
             (1.0, 2.0),
         ),
@@ -212,7 +219,7 @@ def test_predictions_are_measured_with_the_bundle_of_their_scene(at, words, key,
     if "--stars" in words:
         done("templates", "--out", at / "t.h5", *sizes)
         done("stars", "--templates", at / "t.h5", "--out", at / "s.h5", *sizes)
-    words = [at / word if word.endswith((".h5", ".csv")) else word for word in words]
+    words = [at / word if str(word).endswith((".h5", ".csv")) else word for word in words]
     words += ["--bundle", shipped_path(), "--out", at / "out.csv", *sizes]
     refused(at, *words, file=shipped_path(), key=key, values=values)
 

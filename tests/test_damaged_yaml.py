@@ -11,11 +11,11 @@ from click.testing import CliRunner
 
 from psfdae.cli import main
 from psfdae.configuration.compose import ConfigError, config_dir, forget, load
-from psfdae.configuration.knee import load_knee
 from psfdae.files import ProductError
 from psfdae.reading import read_csv, read_json, read_table, read_yaml
 from psfdae.sweeps.points import plan_sweep
 from psfdae.sweeps.space import SweepError
+from trainings import load_knee
 from yaml_mutants import mutants
 
 DATASET = ["config"]

@@ -99,7 +99,7 @@ def _seconds(arguments):
 def test_stages_import_only_what_they_need(stage):
     code = (
         f"import sys, psfdae.stages.{stage};"
-        "print([m for m in ('torch','mlflow','hydra','snakemake','poppy','batoid','aotools') "
+        "print([m for m in ('torch','mlflow','hydra','snakemake','poppy','batoid') "
         "if m in sys.modules])"
     )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -116,6 +116,48 @@ def test_simulation_never_imports_torch(tmp_path):
     )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert out.stdout.strip() == "[]"
+
+
+RUN_TINY_STAGES = """
+import importlib, pkgutil, sys
+from pathlib import Path
+import psfdae.stages
+from psfdae.configuration.compose import load_stage
+
+unwanted = ("poppy", "batoid", "mlflow", "hydra", "snakemake")
+for module in pkgutil.iter_modules(psfdae.stages.__path__):
+    importlib.import_module(f"psfdae.stages.{module.name}")
+imported = [name for name in unwanted if name in sys.modules]
+
+from psfdae.stages.evaluate import Models, evaluate
+from psfdae.stages.fit import baseline, train
+from psfdae.stages.stars import stars
+from psfdae.stages.templates import templates
+tiny = ["preset=smoke", "grid.points=3", "stars.count=60", "parts.train_stars=40",
+        "parts.test_stars=12", "train.epochs=1", "dataset=dataset3", "baseline.epochs=1"]
+config = {f: load_stage(f.stage.reads, tiny) for f in (templates, stars, baseline, train, evaluate)}
+# Composing a configuration is what the command line does; the stages themselves must not.
+for name in list(sys.modules):
+    if name.partition(".")[0] in unwanted:
+        del sys.modules[name]
+made = {name: Path(sys.argv[1], name) for name in ("t", "s", "pca_som", "dae", "csv", "per_star")}
+templates(config[templates], made["t"])
+stars(config[stars], made["t"], made["s"])
+baseline(config[baseline], made["s"], out=made["pca_som"])
+train(config[train], made["s"], out=made["dae"])
+evaluate(config[evaluate], "dataset3", made["s"],
+         Models(pca_som=made["pca_som"], dae=made["dae"]),
+         per_star=made["per_star"], out=made["csv"])
+print(imported, [name for name in unwanted if name in sys.modules])
+"""
+
+
+def test_stages_never_load_heavy_packages(tmp_path):
+    """Neither importing nor running the stages of scenes 1 and 2 loads what they do without."""
+    command = [sys.executable, "-c", RUN_TINY_STAGES, str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1] == "[] []"
 
 
 def test_wrong_config_is_one_message_and_exit_code_2(tmp_path):

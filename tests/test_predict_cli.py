@@ -7,7 +7,6 @@ import struct
 import warnings
 
 import numpy as np
-import pandas as pd
 import pytest
 from astropy.io import fits
 from astropy.table import Table
@@ -17,18 +16,13 @@ from fits_inputs import write_cube, write_field
 from prediction_stars import SKY, observe
 from psfdae import StarFlag, load_model
 from psfdae.cli import main
-from psfdae.configuration.compose import load_stage
-from psfdae.optics.wavefronts import seidel_wavefronts
 from psfdae.own_stars import model as engine
 from psfdae.own_stars import plot
 from psfdae.own_stars import prediction as writer
 from psfdae.own_stars.bundle import shipped_path
 from psfdae.own_stars.model import SCALE_TOLERANCE
 from psfdae.stages import predict as stage
-from psfdae.stages import prediction as measured
-from psfdae.stars.framing import normalise_flux
-from psfdae.stars.scene import Propagation
-from workflow_runs import ROOT, snakemake
+from workflow_runs import ROOT
 
 SIDE = 320
 
@@ -321,59 +315,6 @@ def test_map_of_nothing_is_still_a_map():
     stars = field_of(flags=np.full(4, int(StarFlag.NO_FLUX)))
     figure = plot.psf_map(np.empty((0, 16, 16)), stars, "nothing")
     assert len(figure.axes) == 2
-
-
-def test_poppy_simulates_the_same_stars():
-    """The recipe given to POPPY is ours: independent optics, the same image."""
-    pytest.importorskip("poppy")
-    from psfdae.benchmark import poppy_stars as module
-
-    config = load_stage("prediction", ["dataset=dataset3"])
-    telescope, framing = config.telescope, config.framing
-    seidel, field = config.wavefront.coefficients * 1.1, np.array([0.6, -0.4])
-    image = module._Telescope(telescope, 66).image(seidel, field)
-    stamp = module._framed(image, np.array([1, -1]), framing, 24)
-    source = seidel_wavefronts(seidel[None], field[None])
-    ours = Propagation(source, telescope, config.optics, framing, 24)
-    expected = normalise_flux(ours.framed(16, np.array([[1, -1]]))[0])[0]
-    assert np.mean((normalise_flux(stamp[None])[0] - expected) ** 2) < 1e-8
-
-
-def test_poppy_table(tmp_path, monkeypatch, field_psfs, shipped):
-    from psfdae.benchmark import poppy_stars as module
-
-    monkeypatch.setattr(module, "poppy_stars", lambda config, count: field_psfs[:count])
-    config = load_stage("prediction", ["dataset=field", "noise.levels=[1.0e-3,3.0e-3]"])
-    table = pd.DataFrame(
-        {"method": "dae", "metric": "mse", "noise_level": [1e-3, 3e-3], "value": [2.8e-6, 1.0e-5]}
-    )
-    table.to_csv(tmp_path / "evaluation.csv", index=False)
-    arguments = (config, shipped_path(), tmp_path / "evaluation.csv", 300, tmp_path / "out.csv")
-    measured.poppy(*arguments)
-    found = pd.read_csv(tmp_path / "out.csv")
-    assert found["noise_level"].tolist() == [1e-3, 3e-3]
-    assert (found["met"] == "yes").all()
-    assert (found["ratio_estimated"] > found["ratio_given"]).all()
-    assert found["coverage_given"].between(0.63, 0.73).all()
-    assert (found["stars"] == 300).all()
-    table.iloc[:1].to_csv(tmp_path / "evaluation.csv", index=False)
-    with pytest.raises(RuntimeError, match=r"evaluation\.csv: 0 rows.*0\.003"):
-        measured.poppy(*arguments)
-
-
-@pytest.mark.slow
-@pytest.mark.workflow
-def test_target_prediction(smoke):
-    folder, _ = smoke
-    snakemake(folder, "prediction")
-    table = pd.read_csv(folder / "results/tables/predict_poppy.csv")
-    assert table["noise_level"].tolist() == [0.001, 0.002, 0.003, 0.005]
-    assert (table["stars"] == 50).all()
-    (row,) = pd.read_csv(folder / "results/tables/predict_throughput.csv").to_dict("records")
-    assert row["stamps"] == 64
-    assert row["bare_per_s"] == max(row["bare_shared_per_s"], row["bare_parallel_per_s"])
-    assert row["share"] == pytest.approx(row["predict_per_s"] / row["bare_per_s"], rel=1e-4)
-    assert 50 < row["peak_mb"] < 1000
 
 
 def test_model_of_a_file_is_the_shipped_one():

@@ -16,7 +16,6 @@ REPOSITORY = ROOT.parents[1]
 OPTIONS = {"scene": ("seidel", "turbulence", "telescope"), "method": ("dae", "pca_som")}
 METHODS = [f"psfdae.estimators.{name}" for name in ("noisy", "pca_som", "lmmse", "dae")]
 EXEMPT = {
-    "psfdae.benchmark.isolated": "a function that its caller mentions",
     "psfdae.cli": "the module of the command that runs",
 }
 
@@ -59,16 +58,16 @@ def changed(tmp_path, before):
     """Rules whose hash differs after a text of a module is replaced."""
 
     def edit(module, *replaced):
-        package, stress = tmp_path / "src/psfdae", "tests/stress"
-        shutil.copytree(ROOT, package, ignore=shutil.ignore_patterns("__pycache__"))
-        shutil.copytree(REPOSITORY / stress, tmp_path / stress)
-        path = package / module
+        for folder in ("src/psfdae", "workflow/benchmarks", "tests/stress"):
+            ignored = shutil.ignore_patterns("__pycache__")
+            shutil.copytree(REPOSITORY / folder, tmp_path / folder, ignore=ignored)
+        path = tmp_path / "src/psfdae" / module
         text = path.read_text()
         for old, new in replaced:
             assert old in text
             text = text.replace(old, new)
         path.write_text(text)
-        after = hashes(package)
+        after = hashes(tmp_path / "src/psfdae")
         return {rule for rule in before if before[rule] != after[rule]}
 
     return edit

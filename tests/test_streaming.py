@@ -6,12 +6,14 @@ import h5py
 import numpy as np
 import pytest
 
-from psfdae.benchmark.isolated import MeasurementError, run_isolated
-from psfdae.configuration.compose import load_stage, stage_tree
+import speed
+from measure import alone, cost_of_command
+from prediction import make_cube
+from psfdae.configuration.compose import compose, load_stage
 from psfdae.files import Column, Empty, ProductError, read_product, stream_product, write_product
 from psfdae.optics.seidel import monomial_images
 from psfdae.optics.wavefronts import ModalWavefronts
-from psfdae.stages import stars, templates, timing_jobs
+from psfdae.stages import stars, templates
 from psfdae.stages.common import template_wavefronts
 from psfdae.stars.framing import brightest_pixel
 from psfdae.stars.scene import Propagation
@@ -109,29 +111,27 @@ def test_search_is_exact_for_large_pixels():
 
 @pytest.fixture(scope="module")
 def memory(cheap, tmp_path_factory):
-    """Peak memory of simulation and inference of 4000 and of 40 000 stars, MB."""
-    config, fixed = cheap
+    """Memory that simulation and prediction of 4000 and of 40 000 stars take, MB."""
     folder = tmp_path_factory.mktemp("memory")
-    path, psf = str(folder / "stars.h5"), str(folder / "psf.h5")
-    found = {"simulate": [], "infer": []}
+    tree = dict(compose([*CHEAP, "dae.kernels=[3,3]", "dae.widths=[2]"]))
+    stars, cube, bundle = (folder / name for name in ("stars.h5", "stars.fits", "m.safetensors"))
+    found = {"simulate": [], "predict": []}
     for count in (4000, 40_000):
-        tree = stage_tree("stars", config.model_dump())
-        tree["stars"]["count"] = count
-        job = run_isolated(timing_jobs.simulate, 1, config=tree, templates=str(fixed), out=path)
-        found["simulate"].append(job["peak_mb"])
-        network = {"kernels": [3, 3], "widths": [2], "scale": "mean"}
-        job = run_isolated(timing_jobs.infer, 1, **network, stars=path, out=psf)
-        found["infer"].append(job["peak_mb"])
+        tree["stars"] = {**tree["stars"], "count": count}
+        costs = {
+            "simulate": alone(1, cost_of_command, ["stars", "--templates", cheap[1]], stars, tree)
+        }
+        speed.untrained_bundle(tree, stars, bundle)
+        make_cube(tree, stars, count, cube)
+        words = ["predict", cube, "--model", bundle, "--threads", 1, "--overwrite", "--quiet"]
+        costs["predict"] = alone(1, cost_of_command, words, folder / "psf.fits")
+        for job, cost in costs.items():
+            found[job].append((cost["peak_b"] - cost["resting_b"]) / 2**20)
     return found
 
 
-@pytest.mark.parametrize("job", ["simulate", "infer"])
+@pytest.mark.parametrize("job", ["simulate", "predict"])
 def test_memory_does_not_grow_with_the_stars(memory, job):
     few, many = memory[job]
     # Images alone would need 37 000 × 3 kB = 110 MB more; the drawn numbers 100 bytes a star.
     assert many - few < 25
-
-
-def test_failing_process_is_an_error():
-    with pytest.raises(MeasurementError, match="simulate"):
-        run_isolated(timing_jobs.simulate, 1, config={}, templates="", out="")

@@ -1,7 +1,9 @@
+import os
 import shlex
 import sys
 from contextlib import contextmanager
 from functools import cache
+from importlib import import_module
 
 from snakemake.utils import validate
 
@@ -46,6 +48,22 @@ def options(group):
     return sorted(path.stem for path in config_dir().glob(f"{group}/[!_]*.yaml"))
 
 
+BENCHMARKS = os.path.relpath(Path(workflow.basedir, "workflow/benchmarks"))
+sys.path.append(os.path.abspath(BENCHMARKS))
+
+
+def program(name):
+    """Param with program and command; it asks for threads, lest another folder repeat the job."""
+    file, command = name.split(".")
+    return lambda w, threads: f"{BENCHMARKS}/{file}.py {command}"
+
+
+def program_code(name, stages):
+    """Hash of a command of a program, and of the modules of stages that it runs."""
+    function = f"workflow/benchmarks/{name.replace('.', '.py:')}"
+    return source_hash(function, chosen=[f"psfdae.stages.{name}" for name in stages])
+
+
 # Stars of an image are not simulated: own_stars.smk.
 OWN_STARS = "from_stars"
 ALL_DATASETS = [name for name in dataset_names() if name != OWN_STARS]
@@ -84,10 +102,12 @@ def dataset_config(dataset):
 def settings(name, /, *choice, more=(), **options):
     """File with the settings that a stage reads, where a choice is made (dataset=…).
 
+    The name is that of a command, or module and function of a program of `BENCHMARKS`.
     Its name follows from those that can change a result: another name repeats a job.
     Options are those of the command on which it depends what is read.
     """
-    spec = stage(name).stage
+    program, _, function = name.rpartition(".")
+    spec = (getattr(import_module(program), function) if program else stage(name)).stage
     reads = spec.reads(**options) if callable(spec.reads) else spec.reads
     if spec.root == "config":
         tree = composed(*choice, more=more)

@@ -1,10 +1,9 @@
-from psfdae.configuration.knee import load_knee
-
 with one_line():
-    KNEE = load_knee()
+    KNEE = import_module("trainings").load_knee()
     ALIGNMENT_OVERRIDES = overrides_for("alignment", GIVEN)
 FRESH = "fresh_realisations"
-KNEE_DATASET = "dataset3"
+KNEE_DATASET = TIMED_DATASET = "dataset3"
+POPPY_STARS = 500
 ALIGNMENT_DATA = f"{RESULTS}/data/alignment"
 ALIGNMENT = f"{RESULTS}/alignment"
 ALIGNMENT_SETS = ["uniform", "grid"]
@@ -34,13 +33,13 @@ def bound_figures_of(dataset):
     return [f"{RESULTS}/figures/bounds/{dataset}_{kind}.png" for kind in kinds]
 
 
-def knee_overrides(point, overrides):
-    """Overrides of a point, its own last so that they win; the fresh stars have no test part."""
+def knee_overrides(point):
+    """What a point changes; the fresh stars have no test part."""
     own = list(KNEE.points[point])
     if point == FRESH:
         own += [f"parts.train_stars={KNEE.fresh_stars - 1}", "parts.test_stars=1"]
         own += [f"stars.count={KNEE.fresh_stars}"]
-    return overrides("train", f"dataset={KNEE_DATASET}", own)
+    return tuple(own)
 
 
 @cache
@@ -66,6 +65,11 @@ def sharing_stars(dataset):
 def timed_threads(w):
     """A timing takes as many cores as it may use, so that no other job disturbs it."""
     return dataset_config(ALL_DATASETS[0]).benchmark.threads
+
+
+def poppy_stars(w):
+    """A small preset has small test parts; POPPY takes its time for each star."""
+    return min(POPPY_STARS, dataset_config(TIMED_DATASET).parts.test_stars)
 
 
 @cache

@@ -35,9 +35,6 @@ rule reference:
                 "tables/benchmark_stopping.csv",
                 "figures/benchmark/training.png",
                 "tables/scaling_stages.csv",
-                "tables/scaling_dag.csv",
-                "tables/scaling_plan.csv",
-                "tables/scaling_limits.csv",
             )
         ],
     message:

@@ -30,13 +30,6 @@ for _dataset in ALL_DATASETS:
         localrule: True
 
 
-rule benchmark:
-    input:
-        PROPAGATION_PRODUCTS,
-        TIMING_PRODUCTS,
-    localrule: True
-
-
 rule scene3:
     input:
         ALIGNMENT_PRODUCTS,

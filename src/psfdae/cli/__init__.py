@@ -70,8 +70,36 @@ def command(
     return mark
 
 
-class Commands(click.Group):
-    """The commands of all stages; a mistake is one message and exit code 2."""
+class Careful(click.Group):
+    """Commands whose mistakes are one message and exit code 2."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run the command; a refusal of ours is a message, a bug stays a traceback.
+
+        So is a file that the system does not let us read or write, and a lack of memory.
+        """
+        try:
+            return super().invoke(ctx)
+        except OSError as error:
+            if error.errno is None:
+                raise
+            click.echo(f"psfdae: {error}", err=True)
+            ctx.exit(2)
+        except MemoryError as error:
+            click.echo(f"psfdae: not enough memory ({error or 'no more is known'})", err=True)
+            ctx.exit(2)
+        except (RuntimeError, ValueError) as error:
+            # HDF5 reports a full disk as a RuntimeError without a number of its own.
+            # So does torch a lack of memory, as its own RuntimeError.
+            ours = type(error).__module__.startswith("psfdae")
+            if not ours and not re.search("errno = |not enough memory", str(error)):
+                raise
+            click.echo(f"psfdae: {' '.join(str(error).split()) if not ours else error}", err=True)
+            ctx.exit(2)
+
+
+class Commands(Careful):
+    """The commands of all stages."""
 
     def __init__(self, prefix: str = "", **more: Any) -> None:
         super().__init__(**more)
@@ -99,30 +127,6 @@ class Commands(click.Group):
         width = formatter.width - 6 - max(map(len, names))
         with formatter.section("Commands"):
             formatter.write_dl([(n.split()[-1], _shortened(_about(n), width)) for n in names])
-
-    def invoke(self, ctx: click.Context) -> Any:
-        """Run the command; a refusal of ours is a message, a bug stays a traceback.
-
-        So is a file that the system does not let us read or write, and a lack of memory.
-        """
-        try:
-            return super().invoke(ctx)
-        except OSError as error:
-            if error.errno is None:
-                raise
-            click.echo(f"psfdae: {error}", err=True)
-            ctx.exit(2)
-        except MemoryError as error:
-            click.echo(f"psfdae: not enough memory ({error or 'no more is known'})", err=True)
-            ctx.exit(2)
-        except (RuntimeError, ValueError) as error:
-            # HDF5 reports a full disk as a RuntimeError without a number of its own.
-            # So does torch a lack of memory, as its own RuntimeError.
-            ours = type(error).__module__.startswith("psfdae")
-            if not ours and not re.search("errno = |not enough memory", str(error)):
-                raise
-            click.echo(f"psfdae: {' '.join(str(error).split()) if not ours else error}", err=True)
-            ctx.exit(2)
 
 
 @click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"]})
@@ -204,6 +208,11 @@ def as_click(function: Callable[..., Any]) -> click.Command:
     return click.Command(spec.name.split()[-1], callback=run, params=parameters, help=help_text)
 
 
+def program(*functions: Callable[..., Any]) -> None:
+    """Run commands of a program outside the package, as those of `workflow/benchmarks` are."""
+    Careful(commands=[as_click(function) for function in functions])()
+
+
 def _settings(
     spec: Stage, given: dict[str, Any], file: Path | None, overrides: Sequence[str]
 ) -> Any:
@@ -268,13 +277,8 @@ def _unfolded(hint: Any) -> tuple[Any, dict[str, Any]]:
 from psfdae.cli import (  # noqa: E402, F401
     alignment,
     alignment_methods,
-    benchmark_propagation,
-    benchmark_timing,
     bundle,
     from_stars,
-    knee,
     predict,
-    prediction,
-    scaling,
     sweep,
 )

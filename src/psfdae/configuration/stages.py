@@ -26,14 +26,6 @@ STAGE_KEYS: dict[str, tuple[str, ...]] = {
         *("seed", "calibration_stars", "framing", "noise", "parts"),
         *("dae", "train", "baseline", "evaluation", "methods"),
     ),
-    "knee": ("seed", "noise", "parts", "dae", "train", "evaluation"),
-    "propagation": (*SIMULATION, "noise", "benchmark"),
-    "prediction": (*SIMULATION, "noise", "benchmark"),
-    "timing": (*SIMULATION, "noise", "parts", "dae", "baseline", "evaluation", "benchmark"),
-    "scaling": (
-        *SIMULATION,
-        *("noise", "parts", "dae", "train", "baseline", "evaluation", "methods", "benchmark"),
-    ),
     "sweep_dae": ("seed", "noise", "parts", "dae", "train", "evaluation"),
     "sweep_pca_som": ("seed", "noise", "parts", "baseline", "evaluation"),
 }

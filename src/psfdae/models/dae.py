@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, Protocol
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import torch
@@ -22,14 +22,6 @@ from psfdae.rng import stream
 
 if TYPE_CHECKING:
     from psfdae.estimators.dae import DaeSettings, Train
-
-
-class ArraySource(Protocol):
-    """Whatever gives rows of an array by slicing."""
-
-    def __len__(self) -> int: ...
-
-    def __getitem__(self, rows: slice) -> np.ndarray: ...
 
 
 class SingleChannelConv(nn.Conv2d):
@@ -134,30 +126,6 @@ def predict(model: Dae, noisy: np.ndarray, factor: float, batch: int = 256) -> n
         scaled = (images[:, None] * factor).to(memory_format=torch.channels_last)
         out[start : start + batch] = (model(scaled)[:, 0] / factor).numpy()
     return out
-
-
-def predict_stream(
-    model: Dae, noisy: ArraySource, factor: float, rows: int = 1024, batch: int = 64
-) -> Iterator[tuple[slice, np.ndarray]]:
-    """PSFs of noisy star images, a piece at a time.
-
-    Parameters
-    ----------
-    model, factor, batch
-        As for `predict`.
-    noisy : array, memory map or HDF5 dataset, shape (n, d, d)
-        Flux-normalised images, of which only `rows` are in memory at a time.
-    rows : int
-        Stars per piece.
-
-    Yields
-    ------
-    rows : slice
-    psf : ndarray, shape (rows, d, d), float32
-    """
-    for start in range(0, len(noisy), rows):
-        part = slice(start, min(start + rows, len(noisy)))
-        yield part, predict(model, noisy[part], factor, batch)
 
 
 class DaeTraining(Training):

@@ -17,7 +17,6 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from psfdae.benchmark.timing import cpu_model
 from psfdae.cli import File, Folder, command
 from psfdae.files import ProductError, write_text
 from psfdae.source import git_commit
@@ -138,6 +137,16 @@ def provenance(results: Path, config: Config) -> dict[str, Any]:
         "cpu_s": round(float(costs.cpu_s.sum()), 1),
         "peak_mb": round(float(costs.peak_mb.max()), 1),
     }
+
+
+def cpu_model() -> str:
+    """Model of the processor as the operating system names it."""
+    info = Path("/proc/cpuinfo")
+    if info.is_file():
+        for line in info.read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    return platform.processor() or platform.machine()
 
 
 def matrix_product_speed(size: int = 1024, repeats: int = 5) -> float:

@@ -1,0 +1,272 @@
+"""The benchmark of the optics: its references, its choices, its peers, and what stages skip."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import choice
+import figures
+import kernel
+import peers
+import propagation
+import savings
+import scenes
+from psfdae.configuration.compose import load_stage
+from psfdae.files import ProductError
+from psfdae.optics.propagation import StampPropagator
+from psfdae.optics.pupil import annular_pupil
+from psfdae.optics.sampling import SamplingError
+from psfdae.optics.seidel import monomial_coefficients, monomial_images
+from psfdae.optics.wavefronts import seidel_wavefronts
+from psfdae.stars.framing import normalise_flux
+from workflow_runs import ROOT
+
+RECORD = ROOT / "results/reference/tables"
+COMATIC, FIELD = np.array([0.3, 0.8, 0.6, 0.4, -0.1]), np.array([0.6, -0.4])
+SCENES = {
+    # Datasets whose stars must fit the least noise; the stars that `screen` finds to be worst.
+    "seidel": ("dataset4", [7144, 642, 6364, 3655, 4373, 4061, 7637, 1962]),
+    "turbulence": ("dataset7", [286, 365, 157, 153, 368, 223]),
+}
+
+
+@pytest.fixture(scope="module")
+def both():
+    """Both scenes with the configuration that the benchmark gets."""
+    return {
+        name: scenes.Scene.of(load_stage(scenes.READS, [f"dataset={dataset}"]))
+        for name, (dataset, _) in SCENES.items()
+    }
+
+
+@pytest.fixture(scope="module")
+def case():
+    """A comatic star well off the chief ray, with its exact stamp."""
+    source, fine = seidel_wavefronts(COMATIC[None], FIELD[None]), annular_pupil(512, 0.3)
+    offset = np.array([[3, -5]])
+    exact = StampPropagator(fine, 10, 0.88, nodes=6)
+    opd = source.opd(np.zeros(1, int), fine, np.dtype(float))
+    truth = normalise_flux(exact(opd, offset))[0][0]
+    return scenes.Case("seidel", "mild", source, offset, 160, 10, 0.88, 0.3, 1e-9, truth)
+
+
+@pytest.mark.parametrize("method", ["fft", "fft_pruned", "poppy_mft", "poppy_fresnel", "hcipy"])
+def test_peers_converge_to_our_stamp_with_their_subsamples(case, method):
+    """Same orientation, same place, and an error that falls as 1/subsamples²."""
+
+    def error(subsamples):
+        _, propagate = peers.build(case, peers.Peer(method, case.samples, subsamples), threads=1)
+        return scenes.relative_to_peak(propagate(), case.truth)
+
+    coarse, fine = error(4), error(8)
+    assert fine < 2.5e-3
+    assert coarse / fine == pytest.approx(4.0, rel=0.2)
+
+
+@pytest.mark.parametrize("pixel", [0.88148, 1.58667])
+@pytest.mark.parametrize(("subsamples", "multiple"), [(2, 2), (4, 4), (8, 16)])
+def test_padded_grid_hits_the_pixels(pixel, subsamples, multiple):
+    samples, padded = peers.commensurate_grid(222, pixel, subsamples, multiple)
+    assert 222 <= samples <= 1.3 * 222 + 2
+    assert padded % multiple == samples % 2 == 0
+    assert samples / padded * subsamples == pytest.approx(pixel, rel=2e-4)
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_references_have_converged(both, scene):
+    """The two coarser references agree with the finest far below the budget."""
+    found, convergence = scenes.build_cases(both[scene])
+    assert [c.aberration for c in found] == ["mild", "strong"]
+    mild, strong = (np.abs(c.source.slopes()).max() for c in found)
+    assert mild < 0.7 * strong
+    table = pd.DataFrame(convergence)
+    assert len(table) == 4
+    assert (table.mse < 0.01 * table.budget).all()
+    assert all(c.truth.sum() == pytest.approx(1) for c in found)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_configured_settings_stay_within_the_budget_and_two_nodes_fewer_are_refused(both, name):
+    scene, stars = both[name], np.array(SCENES[name][1])
+    some = scenes.Selection(scene.stars, stars)
+    way = scene.propagation(some, scene.search_px)
+    stamps, offset = way.framed(scene.framing.stamp_px)
+    exact = scenes.stamps_at(scene, some, offset, *choice.REFERENCE)
+    assert scenes.stamp_mse(normalise_flux(stamps)[0], exact).max() <= scene.budget
+    with pytest.raises(SamplingError, match=r"needs at least \d nodes"):
+        scene.propagation(some, scene.search_px, nodes=scene.optics.nodes - 2)
+
+
+@pytest.mark.parametrize(
+    ("time", "error", "chosen"),
+    [
+        ([3.0, 1.0, 2.0], [0.1, 9.0, 0.5], 2),  # the cheapest is not good enough
+        ([3.0, 1.0, 2.0], [0.1, 1.0, 0.5], 1),  # on the budget is within it
+        ([np.nan, 3.0], [0.1, 0.1], 1),  # what was not timed cannot be chosen
+        ([2.0, 2.0], [0.5, 0.1], 0),
+        ([1.0], [2.0], None),
+    ],
+)
+def test_cheapest_within_budget(time, error, chosen):
+    assert choice.cheapest_within(np.array(time), np.array(error), 1.0) == chosen
+
+
+@pytest.mark.parametrize(("time", "cheapest"), [(1.01, 1), (1.05, 0)])
+def test_configured_setting_stays_among_equal_times(time, cheapest):
+    rows = {"time_ms": [1.0, time, 0.1], "mse": [0.5, 0.9, 9.0], "configured": ["no", "yes", "no"]}
+    blank = {name: 0 for name in "abcdefgh"}
+    table = choice.mark_cheapest(pd.DataFrame({**rows, **blank}), 1.0)
+    assert table.index[table.cheapest == "yes"].tolist() == [cheapest]
+    assert set(table.config_is_cheapest) == {"yes" if cheapest == 1 else "no"}
+
+
+def test_first_lasting_value_ignores_lucky_coarse_grids():
+    fine = np.array([[1, 0, 1, 1], [1, 1, 1, 1], [1, 1, 1, 0]], bool)
+    found = choice.first_lasting(fine, np.array([94.0, 126.0, 158.0, 222.0]))
+    assert found[:2].tolist() == [158.0, 94.0]
+    assert np.isnan(found[2])
+
+
+def test_spread_takes_the_extremes_of_every_rung():
+    needed = np.array([100, 90, 210, 130, 120, 190, 110])
+    picks = choice.spread(needed, (126, 222), per_rung=2)
+    assert sorted(needed[picks]) == [90, 120, 130, 210]
+
+
+def rows_of(values):
+    names = "scene aberration method samples nodes precision backend threads batch time_ms mse"
+    return pd.DataFrame(values, columns=names.split()).assign(within_budget="yes")
+
+
+KERNEL = ("kernel", 94, 2, "complex64", "numpy")
+TABLE = [
+    ("seidel", "mild", *KERNEL, 2, 16, 0.1, 1e-8),
+    ("seidel", "mild", *KERNEL, 2, 1, 0.3, 1e-10),
+    ("seidel", "mild", *KERNEL, 1, 16, 0.05, 1e-10),
+    ("seidel", "mild", "kernel", 94, 2, "complex64", "torch", 2, 16, 0.01, 1e-10),
+    ("seidel", "strong", *KERNEL, 2, 16, 0.2, 1e-12),
+    ("seidel", "mild", "poppy_mft", 94, 4, "complex128", "numpy", 2, 1, 9.0, 1e-9),
+    ("seidel", "mild", "hcipy", 94, 4, "complex128", "numpy", 2, 1, 1.0, 1e-11),
+]
+
+
+def test_peers_are_compared_at_equal_error_in_one_process():
+    found = peers.compare(rows_of(TABLE))
+    assert found.method.tolist() == ["poppy_mft"]  # nothing of ours is as good as the other
+    assert found.kernel_time_ms.tolist() == [0.3]  # same threads and backend, no larger error
+    assert found.speedup.tolist() == pytest.approx([30.0])
+    assert found.met.tolist() == ["no"]
+
+
+def test_pareto_front_and_setting_in_use_are_marked():
+    setting = kernel.Setting(94, 2, "complex64", "numpy", 2, 1)
+    used = {"mild": setting, "strong": replace(setting, batch=16)}
+    table = kernel.finish(rows_of(TABLE).to_dict("records"), used)
+    assert table.index[table.used == "yes"].tolist() == [1, 4]
+    assert table.index[table.pareto == "yes"].tolist() == [3, 4, 6]
+
+
+def test_zernike_fit_is_exact_and_piston_does_not_matter(case):
+    monomials = monomial_coefficients(COMATIC, FIELD)
+    x, y = np.meshgrid(*[np.linspace(-0.7, 0.7, 9)] * 2)
+    fitted = np.tensordot(savings.zernike_fit(monomials), savings.ZERNIKES(x, y), axes=1)
+    assert fitted == pytest.approx(np.tensordot(monomials, monomial_images(x, y), axes=1), abs=1e-9)
+    pupil = annular_pupil(96, 0.3)
+    propagate = StampPropagator(pupil, 10, 0.88, nodes=3)
+    lean = savings.equal_stars(monomial_images, monomials, 2)
+    full = savings.equal_stars(savings.with_piston, np.append(monomials, 0.37), 2)
+    stamps, others = (propagate(opd_of(pupil, np.dtype(float))) for opd_of in (lean, full))
+    assert scenes.relative_to_peak(stamps, others) < 1e-12
+
+
+def test_times_are_those_of_one_stamp(case, monkeypatch):
+    """A run of 5 batches of 8 stamps that takes 80 ms: 2 ms per stamp."""
+    timed = np.array([[0.08, 0.04, 0.16, 0.08, 0.08]])
+    monkeypatch.setattr(kernel, "time_in_rounds", lambda builders, repeats: timed)
+    setting = kernel.Setting(126, 4, "complex64", "numpy", 2, 8)
+    trial = kernel.Trial(case, "kernel", setting, case.truth, None, batches=5)
+    (row,) = kernel.time_trials([trial], repeats=5)
+    assert [row[f"time_ms{end}"] for end in ("", "_low", "_high")] == pytest.approx([2, 2, 2])
+    assert (row["repeats"], row["mse"], row["within_budget"]) == (5, 0.0, "yes")
+
+
+def test_a_timing_runs_as_much_as_its_time_is_divided_by(case, monkeypatch):
+    """Batches of the kernel beside each other, stamps of a peer."""
+    ran = []
+    monkeypatch.setattr(
+        kernel, "side_by_side", lambda _, batches, threads: ran.append((len(batches), threads))
+    )
+    rest = ("complex64", "numpy")
+    settings = [kernel.Setting(62, 4, *rest, t, batch) for t, batch in ((1, 8), (2, 8), (2, 64))]
+    trials = kernel.kernel_trials([case], [settings], stamps=64)
+    for trial in trials:
+        trial.build()()
+    assert [trial.batches for trial in trials] == [8, 8, 2]
+    assert ran[1::2] == [(8, 1), (8, 2), (2, 2)]  # after the warm-up of each
+    monkeypatch.setattr(peers, "build", lambda *_: (62, lambda: ran.append(1) or case.truth))
+    chosen = [peers.Peer("poppy_mft", 62, 2), peers.Peer("poppy_fresnel", 62, 2)]
+    for trial, stamps in zip(peers.peer_trials([case], [chosen], 1, 5), (5, 1), strict=True):
+        run = trial.build()
+        ran.clear()
+        run()
+        assert len(ran) == trial.batches == stamps
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory):
+    """The whole benchmark on a tiny scene 2, in this process, and its joined tables."""
+    folder = tmp_path_factory.mktemp("tiny")
+    small = ["preset=smoke", "grid.points=3", "benchmark.threads=1", "optics.threads=1"]
+    config = load_stage(scenes.READS, ["dataset=dataset7", *small])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(propagation, "alone", lambda threads, f, *arguments: f(*arguments))
+        patch.setattr(propagation, "PACKAGES", ("colorsys", "no_such_package"))
+        patch.setattr(scenes, "REFERENCES", ((126, 3), (158, 4), (190, 5)))
+        patch.setattr(choice, "REFERENCE", (190, 5))
+        propagation.measure(config, folder / "turbulence", 2)
+        propagation.tables(config, folder / "tables", (folder / "turbulence",))
+    return folder / "tables"
+
+
+def test_every_table_is_that_of_the_record(tiny):
+    """Names and columns are those that docs and users know."""
+    tables = {path.name: pd.read_csv(path) for path in tiny.glob("*.csv")}
+    assert set(tables) == {f"benchmark_{name}.csv" for name in (*propagation.TABLES, "peers")}
+    for name, table in tables.items():
+        assert list(table.columns) == list(pd.read_csv(RECORD / name).columns), name
+    times = tables["benchmark_propagation.csv"]
+    assert set(times.backend) == {"numpy", "torch"}
+    assert (times.time_ms > 0).all()
+    used = times[times.used == "yes"]
+    assert used.aberration.tolist() == ["mild", "strong"]
+    assert (used.within_budget == "yes").all()
+    chosen = tables["benchmark_choice.csv"]
+    assert (chosen.cheapest == "yes").sum() == (chosen.configured == "yes").sum() == 1
+    assert chosen.time_ms.notna().all()
+
+
+def test_savings_change_nothing_that_matters(tiny):
+    table = pd.read_csv(tiny / "benchmark_skipping.csv", keep_default_na=False)
+    rows = table.set_index("item")
+    assert rows.saving["Stamps anew for each λ"] == pytest.approx(8)  # two datasets, four λ
+    assert rows.change["Stamps anew for each λ"] == 0
+    for item in ("Pixels outside the stamp", "Templates anew for each star"):
+        assert rows.change[item] < 1e-5
+    assert rows.change["Tilt of the turbulence"] > 0.01
+    assert rows.scene["Import of colorsys"] == "all"
+    assert "Import of no_such_package" not in rows.index
+    budget = pd.read_csv(tiny / "benchmark_choice.csv").budget[0]
+    assert (rows.change[rows.unit == savings.AS_MSE] < budget).all()
+
+
+def test_figures_are_drawn(tiny, tmp_path):
+    times, out = tiny / "benchmark_propagation.csv", tmp_path / "drawn.png"
+    for kind, scene in (("propagation", "turbulence"), ("skipping", None)):
+        figures.draw(kind, tiny / f"benchmark_{kind}.csv", out, scene)
+        assert out.stat().st_size > 10_000
+    with pytest.raises(ProductError, match="no rows of scene seidel"):
+        figures.draw("propagation", times, out, "seidel")

@@ -1,0 +1,225 @@
+"""Benchmarks of the network, the baseline, the trainings, the prediction and of growing sizes."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import baseline
+import figures
+import measure
+import plan
+import poppy_stars
+import prediction
+import speed
+import trainings
+from psfdae.configuration.compose import load_stage
+from psfdae.optics.wavefronts import seidel_wavefronts
+from psfdae.own_stars.bundle import shipped_path
+from psfdae.stars.framing import normalise_flux
+from psfdae.stars.scene import Propagation
+from workflow_runs import ROOT, planned, snakemake
+
+RECORD = ROOT / "results/reference/tables"
+SMALL = ("preset=smoke", "grid.points=3", "optics.threads=1", "benchmark.threads=1")
+
+
+def columns(name):
+    return list(pd.read_csv(RECORD / f"{name}.csv").columns)
+
+
+# Measuring
+
+
+def test_calls_are_warmed_up_and_rounds_take_turns():
+    events = []
+
+    def builder(name):
+        return lambda: events.append(f"build {name}") or (lambda: events.append(name))
+
+    assert measure.time_calls(lambda: events.append("call"), repeats=3, calls=4) >= 0
+    assert events == ["call"] * (1 + 3 * 4)
+    events.clear()
+    assert measure.time_in_rounds([builder("a"), builder("b")], repeats=2).shape == (2, 2)
+    assert events == ["build a", "a", "build b", "b"] * 2
+
+
+def test_a_process_of_its_own_has_its_own_threads(monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    assert measure.alone(3, os.getpid) != os.getpid()
+    assert measure.alone(3, os.getenv, "OMP_NUM_THREADS") == "3"
+    assert os.environ["OMP_NUM_THREADS"] == "1"
+
+
+def test_what_is_timed_is_the_command_that_users_run(tmp_path):
+    """Its product is left behind and its size is that of the files; a refusal is an error."""
+    tree, out = load_stage(speed.growth.stage.reads, SMALL).model_dump(), tmp_path / "t.h5"
+    cost = measure.cost_of_command(["templates"], out, tree)
+    assert cost["disk_b"] == out.stat().st_size
+    assert 0 < cost["resting_b"] <= cost["peak_b"]
+    with pytest.raises(RuntimeError, match="psfdae stars: ends with 2"):
+        measure.cost_of_command(["stars", "--templates", tmp_path / "none.h5"], out, tree)
+
+
+# Network and baseline
+
+
+def test_engines_run_apart_and_fill_the_table(tmp_path):
+    small = ("benchmark.repeats=1", "benchmark.stamp_sizes=[8,10]", "benchmark.stamps=1")
+    config = load_stage(speed.inference.stage.reads, [*small, "benchmark.threads=1"])
+    config.dae.widths[:] = [2] * len(config.dae.widths)
+    speed.inference(config, tmp_path / "t.csv")
+    table = pd.read_csv(tmp_path / "t.csv")
+    assert list(table.columns) == columns("benchmark_inference")
+    assert len(table) == 2 * 3 * 2 * 2  # engines, widths, sides, batches
+    assert (table.stars_per_s_low <= table.stars_per_s).all()
+
+
+def test_grid_has_the_point_in_use_first_and_respects_the_limit():
+    grid = baseline.grid_around((20, 11, 11, 10), 256)
+    assert grid[0] == (20, 11, 11, 10)
+    assert len(set(grid)) == len(grid)
+    assert {(40, 11, 11, 10), (20, 15, 15, 10), (20, 11, 11, 50)} <= set(grid)
+    assert max(k for k, *_ in baseline.grid_around((8, 4, 4, 2), 10)) == 10
+
+
+def test_baseline_point_reports_the_error_of_its_predictions(gaussian_stars):
+    fit = {"components": 4, "rows": 3, "columns": 3, "epochs": 2}
+    fit |= {"sigma": 1.0, "learning_rate": 0.5, "seed": 1}
+    truths = {"realisation": gaussian_stars, "template": 0 * gaussian_stars}
+    point = baseline.time_point(gaussian_stars, [gaussian_stars], truths, fit, 2)
+    assert 0 < point["mse_realisation"] < (gaussian_stars**2).mean() < 2 * point["mse_template"]
+
+
+# Growth
+
+
+def test_a_million_stars_are_extrapolated():
+    x = np.array([1e3, 1e4, 1e5])
+    rows = {"what": "simulation", "stars": x, "stamp_px": 16, "time_s": 5e-4 * x}
+    rows |= {"peak_mb": 80 + 1e-4 * x, "disk_mb": 2e-3 * x}
+    table = speed.with_exponents(pd.DataFrame(rows), "stars")
+    assert [*table.columns, "threads"] == columns("benchmark_scaling")
+    *measured, last = table.itertuples()
+    assert {row.measured for row in measured} == {"yes"}
+    assert (last.stars, last.measured) == (1_000_000, "extrapolated")
+    assert (last.time_s, last.peak_mb, last.disk_mb) == pytest.approx((500, 180, 2000))
+    assert (last.exponent, last.exponent_stderr) == pytest.approx((1, 0), abs=1e-9)
+
+
+def test_costs_of_the_plan_have_a_fixed_part_and_one_per_star_that_are_not_negative():
+    rows = [
+        {"stage": stage, "stars": n, "time_s": 3 + 2e-3 * n, "cpu_s": n**2, "peak_mb": 9 - n**0.1}
+        | {"disk_mb": 1e-3 * n}
+        for stage in ("simulate", "train")
+        for n in (1e2, 1e3, 1e4)
+    ]
+    first, second = plan.planned(rows)
+    assert (first["stage"], second["stage"], first["stars"]) == ("simulate", "train", 1e9)
+    assert (first["time_s"], first["disk_mb"]) == pytest.approx((2e6 + 3, 1e6))
+    assert first["cpu_s"] > 1e9  # no fixed part below zero
+    assert 0 < first["peak_mb"] < 9  # nor a part per star
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="CPUs cannot be chosen here")
+def test_the_plan_is_measured_on_one_cpu():
+    before = os.sched_getaffinity(0)
+    with plan.one_cpu():
+        assert len(os.sched_getaffinity(0)) == 1
+    assert os.sched_getaffinity(0) == before
+
+
+# Trainings
+
+
+def test_front_holds_what_nothing_beats():
+    time, error = np.array([4.0, 1.0, 2.0, 3.0, 4.0]), np.array([0.5, 1.0, 0.6, 0.7, 0.4])
+    assert measure.pareto(time, error).tolist() == [1, 2, 4]
+
+
+@pytest.mark.parametrize(
+    ("gains", "chosen"),
+    [
+        ([0.5, 0.5, 0.5], 3),  # every doubling pays
+        ([0.5, 0.95, 0.95], 1),  # only the first
+        ([0.95, 0.6, 0.95], 2),  # a flat stretch may be crossed for a later gain
+        ([0.99, 0.99, 0.99], 0),
+    ],
+)
+def test_knee_is_where_doublings_stop_paying(gains, chosen):
+    time, error = 2.0 ** np.arange(4), np.r_[1.0, np.cumprod(gains)]
+    shuffled = np.array([2, 0, 3, 1])
+    assert shuffled[trainings.knee(time[shuffled], error[shuffled])] == chosen
+
+
+@pytest.mark.parametrize(
+    ("scores", "patience", "stop"),
+    [([5, 4, 3, 3.5, 3.2, 3.1, 2], 2, 4), ([5, 4, 3, 2], 2, 3), ([5, 5, 5], 2, 2)],
+)
+def test_patience_on_a_history(scores, patience, stop):
+    assert trainings.stopping_point(np.array(scores, float), patience) == stop
+
+
+# Prediction
+
+
+def test_poppy_simulates_the_same_stars():
+    """The recipe given to POPPY is ours: independent optics, the same image."""
+    config = load_stage(prediction.READS, ["dataset=dataset3"])
+    telescope, framing = config.telescope, config.framing
+    seidel, field = config.wavefront.coefficients * 1.1, np.array([0.6, -0.4])
+    image = poppy_stars.poppy_telescope(telescope, 66)(seidel, field)
+    stamp = poppy_stars.framed(image, np.array([1, -1]), framing, 24)
+    source = seidel_wavefronts(seidel[None], field[None])
+    ours = Propagation(source, telescope, config.optics, framing, 24)
+    expected = normalise_flux(ours.framed(16, np.array([[1, -1]]))[0])[0]
+    assert np.mean((normalise_flux(stamp[None])[0] - expected) ** 2) < 1e-8
+
+
+def test_poppy_table(tmp_path, monkeypatch, field_psfs):
+    monkeypatch.setattr(prediction, "poppy_stars", lambda config, count: field_psfs[:count])
+    config = load_stage(prediction.READS, ["dataset=field", "noise.levels=[1.0e-3,3.0e-3]"])
+    table = pd.DataFrame(
+        {"method": "dae", "metric": "mse", "noise_level": [1e-3, 3e-3], "value": [2.8e-6, 1.0e-5]}
+    )
+    table.to_csv(tmp_path / "evaluation.csv", index=False)
+    arguments = (config, shipped_path(), tmp_path / "evaluation.csv", tmp_path / "out.csv", 300)
+    prediction.poppy(*arguments)
+    found = pd.read_csv(tmp_path / "out.csv")
+    assert list(found.columns) == columns("predict_poppy")
+    assert found["noise_level"].tolist() == [1e-3, 3e-3]
+    assert (found["met"] == "yes").all()
+    assert (found["ratio_estimated"] > found["ratio_given"]).all()
+    assert found["coverage_given"].between(0.63, 0.73).all()
+    table.iloc[:1].to_csv(tmp_path / "evaluation.csv", index=False)
+    with pytest.raises(RuntimeError, match=r"evaluation\.csv: 0 rows.*0\.003"):
+        prediction.poppy(*arguments)
+
+
+# Figures and targets
+
+
+@pytest.mark.parametrize("kind", ["training", "baseline", "inference", "scaling"])
+def test_figures_are_drawn_from_the_tables_of_the_record(kind, tmp_path):
+    figures.draw(kind, RECORD / f"benchmark_{kind}.csv", tmp_path / "drawn.png")
+    assert (tmp_path / "drawn.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+@pytest.mark.workflow
+def test_targets_prediction_and_scaling(smoke):
+    folder, _ = smoke
+    snakemake(folder, "prediction", "scaling")
+    tables = {p.stem: pd.read_csv(p) for p in (folder / "results/tables").glob("*.csv")}
+    for name in ("predict_poppy", "predict_throughput", "scaling_stages"):
+        assert list(tables[name].columns) == columns(name)
+    (row,) = tables["predict_throughput"].to_dict("records")
+    assert row["stamps"] == 64
+    assert row["share"] == pytest.approx(row["predict_per_s"] / row["bare_per_s"], rel=1e-4)
+    stages = tables["scaling_stages"]
+    assert set(stages.stage) == {"simulate", "predict", "baseline", "train", "evaluate"}
+    assert (stages[["time_s", "cpu_s", "peak_mb", "disk_mb"]] > 0).all().all()
+    assert planned(folder, "prediction", "scaling") == {}

@@ -1,0 +1,235 @@
+"""Figures of the benchmarks, each from its table."""
+
+from typing import Annotated, Literal
+
+import numpy as np
+
+from psfdae.cli import File, command, program
+from psfdae.evaluation.figure_style import SERIES_COLORS, new_figure, styled
+from psfdae.files import ProductError
+from psfdae.reading import read_table
+from psfdae.stages.figures import write_png
+
+WAYS = {
+    "kernel numpy": ("our kernel, numpy", "#0072b2", "o"),
+    "kernel torch": ("our kernel, torch", "#56b4e9", "D"),
+    "hcipy numpy": ("HCIPy, matrix DFT", "#009e73", "^"),
+    "fft_pruned numpy": ("FFT, pruned", "#e69f00", "v"),
+    "fft numpy": ("FFT, zero-padded", "#d55e00", "s"),
+    "poppy_mft numpy": ("POPPY, matrix DFT", "#cc79a7", "P"),
+    "poppy_fresnel numpy": ("POPPY, Fresnel", "#4d4d4d", "X"),
+}
+"""Label, colour and marker of every method and backend."""
+
+SCENES = {"seidel": "scene 1", "turbulence": "scene 2"}
+ENGINES = {"torch": ("o", "-"), "onnxruntime": ("s", "--")}
+COLORS = {"simulation": SERIES_COLORS[0], "inference": SERIES_COLORS[1]}
+COSTS = {"time_s": "time (s)", "peak_mb": "peak memory (MB)", "disk_mb": "disk (MB)"}
+SIZES = {"components": "components K", "rows": "side of the map", "epochs": "epochs"}
+LOGS = {"xscale": "log", "yscale": "log"}
+USED = {"marker": "*", "ms": 15, "mfc": "#f0e442", "mec": "black", "ls": "", "zorder": 5}
+
+
+@command("draw")
+def draw(
+    kind: Literal["propagation", "skipping", "training", "baseline", "inference", "scaling"],
+    table: Annotated[File, "Table of that benchmark."],
+    out: Annotated[File, "PNG."],
+    scene: Annotated[str | None, "Scene whose rows are drawn."] = None,
+) -> None:
+    """Draw what a benchmark has measured."""
+    rows = read_table(table, keep_default_na=kind != "skipping")
+    if scene is not None:
+        rows = rows[rows["scene"] == scene]
+        if rows.empty:
+            raise ProductError(f"{table}: no rows of scene {scene}")
+    write_png(styled(globals()[kind])(rows), out)
+
+
+def labelled(axes, x, y, text, shift=3, **style):
+    """A small text beside a point."""
+    place = {"xytext": (shift, 4), "textcoords": "offset points", "fontsize": 7}
+    axes.annotate(text, (x, y), **place, **style)
+
+
+def entry(label, **style):
+    """An entry of a legend."""
+    from matplotlib.lines import Line2D
+
+    return Line2D([], [], label=label, **style)
+
+
+def propagation(table):
+    """Numerical MSE of a stamp against its time, one panel per aberration."""
+    figure = new_figure(5.2, layout="constrained")
+    panels = figure.subplots(1, table["aberration"].nunique(), sharex=True, sharey=True)
+    table = table.assign(way=table["method"] + " " + table["backend"])
+    for axes, name in zip(np.atleast_1d(panels), sorted({*table["aberration"]}), strict=True):
+        rows = table[table["aberration"] == name]
+        for way, mine in rows.groupby("way"):
+            _, color, marker = WAYS[way]
+            dots = {"color": color, "marker": marker, "ls": "", "ms": 5, "alpha": 0.75, "mew": 0}
+            axes.plot(mine["time_ms"], mine["mse"], **dots)
+        front = rows[rows["pareto"] == "yes"].sort_values("time_ms")
+        axes.plot(front["time_ms"], front["mse"], color="black", lw=1.0)
+        used = rows[rows["used"] == "yes"]
+        axes.plot(used["time_ms"], used["mse"], **USED)
+        axes.axhline(rows["budget"].iloc[0], color="black", lw=1.2, ls="--")
+        axes.set(**LOGS, xlabel="time per stamp (ms)", title=f"{name} aberration")
+        axes.grid(True)
+    np.atleast_1d(panels)[0].set_ylabel("numerical MSE of the stamp (sum 1)")
+    ways = [WAYS[way] for way in WAYS if way in set(table["way"])]
+    handles = [entry(label, ls="", color=color, marker=marker) for label, color, marker in ways]
+    handles += [entry("Pareto front", color="black", lw=1.0), entry("setting in use", **USED)]
+    handles += [entry("budget", color="black", lw=1.2, ls="--")]
+    figure.legend(handles=handles, loc="outside lower center", ncols=4)
+    threads = "–".join(map(str, sorted({table["threads"].min(), table["threads"].max()})))
+    name = table["scene"].iloc[0]
+    title = f"{SCENES.get(name, name)}: error of a stamp against its time, threads: {threads}"
+    figure.suptitle(title.capitalize())
+    return figure
+
+
+def skipping(table):
+    """Time with and without superfluous work, one pair of bars per item, by saving."""
+    rows = table.sort_values("saving", ignore_index=True)
+    where = rows["scene"].map(SCENES).add(", ").fillna("") + "per " + rows["per"]
+    figure = new_figure(1.4 + 0.32 * len(rows), layout="constrained")
+    axes = figure.add_subplot()
+    bars = rows[["without_s", "with_s"]].set_axis(rows["item"] + " (" + where + ")")
+    bars.columns = ["without it", "with it"]
+    bars.plot.barh(ax=axes, logx=True, width=0.76, color=["#0072b2", "#d55e00"])
+    for i, row in rows.iterrows():
+        text = f"{row['saving']:.{0 if row['saving'] >= 10 else 2}f}×"
+        kept = "" if row["skipped"] == "yes" else ", kept"
+        labelled(axes, bars.iloc[i].max(), i, text + kept, va="center")
+    axes.set(xlabel="time (s) per star, set or process")
+    axes.set_title("What is not computed: time with and without it")
+    axes.margins(x=0.12)
+    axes.grid(True, axis="x")
+    axes.set_axisbelow(True)
+    return figure
+
+
+def training(table):
+    """Test MSE of trainings against their CPU time, with Pareto front and knee."""
+    color = SERIES_COLORS[0]
+    figure = new_figure(5.2, layout="constrained")
+    axes = figure.add_subplot()
+    axes.plot(table["cpu_s"], table["mse"], ls="", marker="o", ms=5, color=color, alpha=0.7)
+    marked = {"ls": "", "mfc": "none", "mec": "black"}
+    for column, label, style in (
+        ("pareto", "Pareto front", {"color": color, "lw": 1.2}),
+        ("knee", "knee", {"marker": "*", "ms": 17, **marked}),
+        ("used", "used by the preset", {"marker": "s", "ms": 13, **marked}),
+    ):
+        rows = table[table[column] == "yes"].sort_values("cpu_s")
+        axes.plot(rows["cpu_s"], rows["mse"], label=label, **style)
+    for row in table.itertuples():
+        labelled(axes, row.cpu_s, row.mse, row.point, 6)
+    axes.set(**LOGS, xlabel="CPU time of the training's one thread (s)")
+    axes.set_ylabel("test MSE, geometric mean over λ")
+    axes.set_title("Training on dataset 3: error against time")
+    axes.margins(x=0.12)
+    axes.grid(True, which="both")
+    axes.legend(loc="upper right")
+    return figure
+
+
+def baseline(table):
+    """Test error of PCA+SOM against the time of its fit, one panel per reference."""
+    figure = new_figure(4.0, layout="constrained")
+    panels = figure.subplots(1, 2, sharex=True)
+    used = table[table["used"] == "yes"].iloc[0]
+    for axes, reference in zip(panels, ("realisation", "template"), strict=True):
+        column, rest = f"mse_{reference}", table.drop(index=used.name)
+        for (size, label), color in zip(SIZES.items(), SERIES_COLORS, strict=False):
+            others = [name for name in SIZES if name != size]
+            line = table[(table[others] == used[others]).all(axis=1)].sort_values(size)
+            rest = rest.drop(index=line.index, errors="ignore")
+            style = {"marker": "o", "ms": 4, "lw": 1.2, "color": color}
+            axes.plot(line["fit_s"], line[column], label=f"{label} varied", **style)
+            for row in line.drop(index=used.name).to_dict("records"):
+                labelled(axes, row["fit_s"], row[column], str(row[size]), color=color)
+        axes.plot(rest["fit_s"], rest[column], ls="", marker="x", color="#4d4d4d")
+        for row in rest.to_dict("records"):
+            text = f"K {row['components']}, {row['rows']}×{row['columns']}, {row['epochs']}"
+            # The slow one stands at the right edge.
+            side = {"shift": -4, "ha": "right"} if row["fit_s"] > used["fit_s"] else {}
+            labelled(axes, row["fit_s"], row[column], text, **side)
+        axes.plot(used["fit_s"], used[column], **USED, label="in use")
+        axes.set(**LOGS, xlabel="time of the fit (s)", title=f"against the {reference}")
+        axes.margins(0.16)
+        axes.grid(True)
+    panels[0].set_ylabel("MSE per pixel, mean over the noise levels")
+    panels[0].legend()
+    figure.suptitle("PCA+SOM: test error against the time of the fit")
+    return figure
+
+
+def inference(table):
+    """Stars per second against the batch: columns are stamps, rows numbers of threads."""
+    batches, widths = (sorted(table[name].unique()) for name in ("batch", "width"))
+    colors = dict(zip(widths, SERIES_COLORS, strict=False))
+    figure = new_figure(1.0 + 2.6 * table["threads"].nunique(), layout="constrained")
+    shape = (table["threads"].nunique(), table["stamp_px"].nunique())
+    panels = figure.subplots(*shape, sharex=True, sharey=True, squeeze=False)
+    groups = table.groupby(["threads", "stamp_px"])
+    for axes, ((count, side), part) in zip(panels.flat, groups, strict=True):
+        for (engine, width), rows in part.sort_values("batch").groupby(["engine", "width"]):
+            marker, style = ENGINES[engine]
+            low, high = rows["stars_per_s_low"], rows["stars_per_s_high"]
+            axes.fill_between(rows["batch"], low, high, color=colors[width], alpha=0.15, lw=0)
+            line = {"marker": marker, "ms": 4, "ls": style, "lw": 1.3, "color": colors[width]}
+            axes.plot(rows["batch"], rows["stars_per_s"], **line)
+        axes.set(**LOGS, title=f"{side} × {side} px, {count} thread{'s' if count > 1 else ''}")
+        axes.set_xticks(batches, batches)
+        axes.minorticks_off()
+        axes.grid(True)
+    for axes in panels[-1]:
+        axes.set_xlabel("stars per batch")
+    for axes in panels[:, 0]:
+        axes.set_ylabel("stars per second")
+    handles = [entry(f"width {width}", color=colors[width], lw=2) for width in widths]
+    for engine, (marker, style) in ENGINES.items():
+        handles.append(entry(engine, color="black", marker=marker, ls=style, ms=4))
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
+    figure.suptitle("Speed of the network (median, band: all repeats)")
+    return figure
+
+
+def scaling(table):
+    """Time, memory and disk against the stars, and time per star against the stamp's side."""
+    figure = new_figure(6.0, layout="constrained")
+    *panels, by_side = figure.subplots(2, 2).flat
+    for (what, against), part in table.groupby(["what", "against"], sort=False):
+        style = {"color": COLORS[what], "marker": "o", "lw": 1.4}
+        label = f"{what}: exponent {part['exponent'].iloc[0]:.2f}"
+        if against == "stamp_px":
+            per_star = 1e3 * part["time_s"] / part["stars"]
+            by_side.plot(part["stamp_px"], per_star, label=label, **style)
+            continue
+        measured = part[part["measured"] == "yes"]
+        for axes, cost in zip(panels, COSTS, strict=True):
+            axes.plot(part["stars"], part[cost], **style | {"ls": ":", "mfc": "white"})
+            name = label if cost == "time_s" else what
+            axes.plot(measured["stars"], measured[cost], label=name, **style)
+            axes.set(xlabel="stars", ylabel=COSTS[cost])
+    by_side.set(xlabel="side of the stamp (px)", ylabel="ms per star")
+    for axes in (*panels, by_side):
+        axes.set(**LOGS)
+        axes.grid(True)
+        axes.legend()
+    sides = sorted(table["stamp_px"].unique())
+    by_side.set_xticks(sides, sides)
+    by_side.minorticks_off()
+    # Memory hardly changes: a range of two decades shows that rather than its noise.
+    low, high = panels[1].get_ylim()
+    middle = (low * high) ** 0.5
+    panels[1].set_ylim(min(low, middle / 10), max(high, middle * 10))
+    figure.suptitle("Growth of the costs (open: extrapolated)")
+    return figure
+
+
+if __name__ == "__main__":
+    program(draw)

@@ -1,0 +1,218 @@
+"""Stars per second of the network, and how the costs of simulation and prediction grow."""
+
+from dataclasses import replace
+from functools import partial
+from itertools import product
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from timeit import Timer
+from typing import Annotated
+
+import numpy as np
+
+from measure import alone, cost_of_command, write
+from prediction import make_cube
+from psfdae.cli import File, command, program
+from psfdae.configuration.schema import Config
+from psfdae.configuration.stages import SIMULATION
+from psfdae.rng import stream
+
+BATCHES = (1, 16, 64, 256, 1024)
+LARGEST_BATCH_PER_STAMP = 16  # larger ones than this times `benchmark.stamps` are left out
+LEAST_S = 0.03  # a timing calls as often as it takes to last this long
+PREDICTED_STARS = 1_000_000  # for which time, memory and disk are extrapolated
+FEW = 16  # stars of a first run, whose imports cost time and memory
+COSTS = ("time_s", "peak_mb", "disk_mb")
+
+
+@command("inference", reads=("dae", "benchmark"))
+def inference(config: Config, out: Annotated[File, "CSV with stars per second."]) -> None:
+    """Time the network in torch and in onnxruntime, on a quiet machine.
+
+    Speed does not depend on the values of the weights, so random networks do. Widths are
+    half, once and twice the configured one; stamps are the two smallest of the config.
+    """
+    settings, width = config.benchmark, max(config.dae.widths)
+    sizes = list(product((width // 2, width, 2 * width), settings.stamp_sizes[:2]))
+    most = LARGEST_BATCH_PER_STAMP * settings.stamps
+    batches = [batch for batch in BATCHES if batch <= most]
+    dae, rows = config.dae.model_dump(), []
+    with TemporaryDirectory() as folder:
+        alone(1, export_networks, dae, sizes, Path(folder))
+        for threads in sorted({1, settings.threads}):
+            for engine in ENGINES:
+                work = (engine, dae, Path(folder), sizes, batches, threads, settings.repeats)
+                rows += alone(threads, time_networks, *work)
+    write(out, rows)
+
+
+def random_network(dae, width, side):
+    """A network of one width with random weights, and the factor of its images."""
+    import torch
+
+    from psfdae.models.dae import build_dae, image_scale
+
+    widths, seed = [width] * len(dae["widths"]), torch.Generator().manual_seed(width)
+    return build_dae(dae["kernels"], widths, "he", seed), image_scale(dae["scale"], side)
+
+
+def onnx_path(folder, width, side):
+    """Name of an exported network."""
+    return folder / f"width{width}_stamp{side}.onnx"
+
+
+def export_networks(dae, sizes, folder):
+    """Export random networks of each width and side of the stamps."""
+    from psfdae.models.export import export_onnx
+
+    for size in sizes:
+        export_onnx(*random_network(dae, *size), size[1], onnx_path(folder, *size))
+
+
+def torch_network(dae, folder, size, threads):
+    """`predict` as every stage calls it."""
+    import torch
+
+    from psfdae.models.dae import predict
+
+    torch.set_num_threads(threads)
+    model, factor = random_network(dae, *size)
+    return lambda images: predict(model, images, factor, len(images))
+
+
+def onnx_network(dae, folder, size, threads):
+    """An exported network."""
+    from psfdae.models.export import session
+
+    run = session(onnx_path(folder, *size), threads).run
+    return lambda images: run(None, {"images": images})[0]
+
+
+ENGINES = {"torch": torch_network, "onnxruntime": onnx_network}
+
+
+def time_networks(engine, dae, folder, sizes, batches, threads, repeats):
+    """Rows of an engine in this process, with median and extremes of the repeats."""
+    rows = []
+    for (width, side), batch in product(sizes, batches):
+        apply = ENGINES[engine](dae, folder, (width, side), threads)
+        noise = stream(0, "throughput").normal(0.0, 0.005, (batch, side, side))
+        timer = Timer(partial(apply, (noise + side**-2.0).astype(np.float32)))
+        timer.timeit(1)
+        calls = max(1, round(LEAST_S / timer.timeit(1)))
+        rates = calls * batch / np.array(timer.repeat(repeats, calls))
+        row = {"engine": engine, "width": width, "stamp_px": side, "threads": threads}
+        row |= {"batch": batch, "repeats": repeats, "stars_per_s": np.median(rates)}
+        rows.append(row | {"stars_per_s_low": rates.min(), "stars_per_s_high": rates.max()})
+    return rows
+
+
+@command("growth", reads=(*SIMULATION, "noise", "dae", "benchmark"))
+def growth(
+    config: Config, out: Annotated[File, "CSV with time, memory and disk over stars and side."]
+) -> None:
+    """Measure how simulation and prediction grow, on a quiet machine."""
+    import pandas as pd
+
+    counts, sides = config.benchmark.star_counts, config.benchmark.stamp_sizes
+    frames = []
+    with TemporaryDirectory() as folder:
+        for against, sizes in (
+            ("stars", [(count, config.framing.stamp_px) for count in counts]),
+            ("stamp_px", [(counts[0], side) for side in sides]),
+        ):
+            rows = [row for size in sizes for row in chain(config, *size, Path(folder))]
+            for _, part in pd.DataFrame(rows).groupby("what", sort=False):
+                frames.append(with_exponents(part, against))
+    write(out, pd.concat(frames).assign(threads=config.benchmark.threads))
+
+
+def chain(config, count, side, folder):
+    """Simulate stars, then predict their PSFs, one row each."""
+    threads, tree = config.benchmark.threads, config.model_dump()
+    tree["framing"]["stamp_px"], tree["optics"]["threads"] = side, threads
+    trees = [{**tree, "stars": {**tree["stars"], "count": n}} for n in (FEW, count)]
+    names = ("templates.h5", "stars.h5", "model.psf.safetensors", "stars.fits", "psf.fits")
+    templates, stars, bundle, cube, psf = (folder / name for name in names)
+    alone(threads, cost_of_command, ["templates"], templates, tree)
+    simulate = ["stars", "--templates", templates]
+    costs = {"simulation": alone(threads, last_cost, [(simulate, stars, t) for t in trees])}
+    alone(1, untrained_bundle, tree, stars, bundle)
+    few = cube.with_name("few.fits")
+    for number, path in ((FEW, few), (count, cube)):
+        alone(1, make_cube, tree, stars, number, path)
+    options = ["--model", bundle, "--threads", threads, "--overwrite", "--quiet"]
+    predict = [(["predict", path, *options], psf) for path in (few, cube)]
+    costs["inference"] = alone(threads, last_cost, predict)
+    rows = []
+    for what, cost in costs.items():
+        # Where the peak cannot be started anew, that of the imports may be the larger one.
+        peak_mb = max((cost["peak_b"] - cost["resting_b"]) / 2**20, 0.1)
+        row = {"what": what, "stars": count, "stamp_px": side, "time_s": cost["time_s"]}
+        rows.append(row | {"peak_mb": peak_mb, "disk_mb": cost["disk_b"] / 2**20})
+    return rows
+
+
+def last_cost(runs):
+    """Cost of the last of some commands; imports of the first ones count no longer."""
+    return [cost_of_command(*run) for run in runs][-1]
+
+
+def untrained_bundle(tree, stars, out):
+    """The shipped model with a random network and these stars' size of stamps."""
+    from psfdae.files import read_product
+    from psfdae.own_stars.bundle import Architecture, read_bundle, write_bundle
+    from psfdae.own_stars.packing import leading, noise_equivalent_px
+    from psfdae.own_stars.photometry import FluxModel
+
+    images, dae, shipped = read_product(stars, "stars")["realisation"], tree["dae"], read_bundle()
+    side, model = images.shape[-1], FluxModel.fit(images[:1000])
+    network, factor = random_network(dae, max(dae["widths"]), side)
+    errors = np.ones((len(shipped.noise_nodes), side, side), np.float32)
+    about = {
+        "stamp_px": side,
+        "pixel_scale_arcsec": tree["telescope"]["pixel_scale_arcsec"],
+        "image_scale": factor,
+        "noise_equivalent_px": noise_equivalent_px(model.mean),
+        "dae": Architecture(kernels=dae["kernels"], widths=dae["widths"]),
+    }
+    bundle = replace(
+        shipped,
+        info=shipped.info.model_copy(update=about),
+        weights={k: v.contiguous().numpy() for k, v in network.state_dict().items()},
+        flux_model=leading(model, shipped.info.components),
+        error68=errors,
+        rms=errors,
+    )
+    write_bundle(bundle, out)
+
+
+def with_exponents(part, against):
+    """Measured rows with the exponents of their costs and, over stars, a predicted row.
+
+    Time is predicted from the last measurement with the fitted exponent; memory and disk,
+    which are a fixed part and so many bytes per star, by a straight line.
+    """
+    import pandas as pd
+    from scipy.stats import linregress
+
+    x = part[against].to_numpy(float)
+    laws = {name: linregress(np.log(x), np.log(part[name])) for name in COSTS}
+    table = part.assign(measured="yes")
+    if against == "stars":
+        row = part.iloc[-1].to_dict() | {"stars": PREDICTED_STARS, "measured": "extrapolated"}
+        row["time_s"] *= (PREDICTED_STARS / x[-1]) ** laws["time_s"].slope
+        for name in ("peak_mb", "disk_mb"):
+            line = linregress(x, part[name])
+            row[name] = line.intercept + line.slope * PREDICTED_STARS
+        table = pd.concat([table, pd.DataFrame([row])])
+    table.insert(1, "against", against)
+    # Two points leave the error of the exponent open.
+    stderr = laws["time_s"].stderr if len(x) > 2 else np.nan
+    table = table.assign(exponent=laws["time_s"].slope, exponent_stderr=stderr)
+    exponents = {f"{name}_exponent": laws[f"{name}_mb"].slope for name in ("peak", "disk")}
+    return table.assign(**exponents)
+
+
+if __name__ == "__main__":
+    program(inference, growth)

@@ -1,0 +1,139 @@
+"""Test error against training time on one dataset: which training is long enough."""
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field
+
+from measure import pareto, write, yes
+from psfdae.cli import File, command, program
+from psfdae.configuration.base import Group
+from psfdae.configuration.compose import config_dir, decisive, load_file
+from psfdae.configuration.schema import Config
+from psfdae.reading import read_table, read_yaml
+
+PATIENCE = 5  # validations without a better one after which a training no longer improves
+WORTHWHILE = 0.9  # fraction to which each doubling of the time must bring the error
+
+
+class Knee(Group):
+    """Trainings whose test errors are set against their time (`config/knee/points.yaml`)."""
+
+    fresh_stars: Annotated[int, Field(ge=2)]
+    points: Annotated[
+        dict[Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+$")], list[str]], Field(min_length=1)
+    ]
+
+
+def load_knee():
+    """Read and check the file; raises ConfigError."""
+    return load_file(Knee, config_dir() / "knee" / "points.yaml")
+
+
+@command("knee", reads=("seed", "noise", "parts", "dae", "train", "evaluation"))
+def knee_table(
+    config: Config,
+    stars: Annotated[File, "Product of the stage stars."],
+    points: Annotated[tuple[str, ...], {"flag": "--point", "metavar": "NAME=FOLDER"}, "Training."],
+    out: Annotated[File, "CSV with time and test error of every training."],
+    stopping: Annotated[File, "CSV: what stopping saves."],
+) -> None:
+    """Compare trainings of one dataset by test error and time.
+
+    The time is the CPU time of the training's one thread, which is its wall time on a quiet
+    core; start-up and simulation are not in it.
+    """
+    import pandas as pd
+
+    from psfdae.estimators import HISTORY
+    from psfdae.estimators.dae import Dae
+    from psfdae.evaluation.metrics import mse
+    from psfdae.stages import common
+
+    common.limit_threads(config.evaluation.threads)
+    folders = {name: Path(folder) for name, _, folder in (p.partition("=") for p in points)}
+    product = common.read_stars(stars)
+    for folder in folders.values():
+        Dae.require(folder, product, config, "random", "realisation")
+    images = product["realisation"][common.split_stars(product, "random", config).test]
+    noisy = {
+        level: common.noisy_test_images(config, images, level) for level in config.noise.levels
+    }
+    configured = decisive(config.model_dump(include={"dae", "train"}))
+    rows, idle = [], []
+    for name, folder in folders.items():
+        network, history = (
+            Dae.load(folder, evaluation=config.evaluation),
+            read_table(folder / HISTORY),
+        )
+        errors = {level: mse(network.predict(x), images).mean() for level, x in noisy.items()}
+        row = {"point": name, **settings_of(folder, configured)}
+        last = history.iloc[-1]
+        row |= {"steps": int(last["step"]), "cpu_s": last["cpu_seconds"], "wall_s": last["seconds"]}
+        row |= {f"mse_{level:g}": error for level, error in errors.items()}
+        rows.append({**row, "mse": np.exp(np.mean(np.log([*errors.values()]))), "n": len(images)})
+        if row["schedule"] == "constant":
+            idle.append(idle_steps(name, history.dropna(subset=["validation_mse"])))
+    table = pd.DataFrame(rows)
+    # Other stars cost simulation time that is not in the column: shown, but not a candidate.
+    same = np.flatnonzero(table["stars"] == "same")
+    time, error = table["cpu_s"].to_numpy()[same], table["mse"].to_numpy()[same]
+    for name, found in (("pareto", pareto(time, error)), ("knee", [knee(time, error)])):
+        table[name] = np.where(np.isin(table.index, same[found]), "yes", "no")
+    write(out, table)
+    write(stopping, idle)
+
+
+def settings_of(folder, configured):
+    """What a training was, and whether it is the one that the configuration uses."""
+    from psfdae.estimators import CONFIG
+
+    tree = decisive(read_yaml(folder / CONFIG))
+    same = tree["parts"]["test_stars"] > 1
+    row = {"width": max(tree["dae"]["widths"])}
+    row |= {key: tree["train"][key] for key in ("epochs", "batch", "lr", "schedule", "noise")}
+    used = same and all(tree[key] == configured[key] for key in configured)
+    return row | {"stars": "same" if same else "fresh", "used": yes(used)}
+
+
+def idle_steps(name, validations):
+    """What stopping early would save in a training of constant rate, and cost in error."""
+    scores = validations["validation_mse"].to_numpy()
+    stop = stopping_point(scores, PATIENCE)
+    with_s, without_s = validations["cpu_seconds"].iloc[[-1, stop]]
+    change = scores[: stop + 1].min() / scores.min() - 1.0
+    row = {"item": f"training that has stopped improving ({name})", "scene": "seidel"}
+    row |= {"per": "training", "with_s": with_s, "without_s": without_s}
+    row |= {"saving": with_s / without_s, "change": change, "unit": "relative validation MSE"}
+    return row | {"skipped": yes(stop < scores.size - 1)}
+
+
+def knee(time, error, worthwhile=WORTHWHILE):
+    """The point of the front beyond which more time is not worth it.
+
+    From the cheapest point on, a later point of the front is taken if it lowers the error to
+    `worthwhile` or less per doubling of the time.
+    """
+    front = pareto(time, error)
+    chosen = front[0]
+    for candidate in front[1:]:
+        doublings = np.log2(time[candidate] / time[chosen])
+        if error[candidate] / error[chosen] <= worthwhile**doublings:
+            chosen = candidate
+    return int(chosen)
+
+
+def stopping_point(scores, patience):
+    """Index of the validation after which a training with this patience stops.
+
+    A training is deterministic, so a full history tells what `train.patience` would have done.
+    """
+    best = np.minimum.accumulate(scores)
+    since = np.arange(scores.size) - np.searchsorted(-best, -best, side="left")
+    stale = np.flatnonzero(since >= patience)
+    return int(stale[0]) if stale.size else scores.size - 1
+
+
+if __name__ == "__main__":
+    program(knee_table)
