@@ -363,8 +363,7 @@ def command(kind, path, out, rng):
 
 def run(words):
     """The command in this process; never returns."""
-    from psfdae.cli import main
-    from psfdae.cli.base import StageGroup
+    from psfdae.cli import Commands, main
 
     if words[0] == "load":
         import click
@@ -373,7 +372,7 @@ def run(words):
 
         path = Path(words.pop())
         load = click.Command("load", callback=lambda: load_weights(path))
-        main = StageGroup(commands={"load": load})
+        main = Commands(commands={"load": load})
     code = 1
     try:
         main(words, prog_name="psfdae")

@@ -313,11 +313,16 @@ def _described(text: Mapping[str, Any], tensors: dict[str, np.ndarray], path: Pa
     if not isinstance(described, dict) or text.get("sha256") != _digest(described, tensors):
         raise BundleError(f"{path}: damaged (the checksum differs)")
     try:
-        return BundleInfo.model_validate(described)
+        info = BundleInfo.model_validate(described)
     except ValidationError as error:
         first = error.errors(include_input=False)[0]
         where = ".".join(str(part) for part in first["loc"])
         raise BundleError(f"{path}: damaged ({where[:80]}: {first['msg']})") from None
+    try:
+        info.model_dump(mode="json")
+    except ValueError:
+        raise BundleError(f"{path}: damaged (its description is nested too deeply)") from None
+    return info
 
 
 def _digest(described: Mapping[str, Any], tensors: Mapping[str, np.ndarray]) -> str:

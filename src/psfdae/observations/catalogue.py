@@ -325,6 +325,9 @@ def _text_table(path: Path, lines: list[str]) -> Any:
         kind = {"format": "basic", "delimiter": _delimiter(rows)}
     if not rows:
         raise ObservationError(path, "the catalogue has no stars")
+    # astropy looks for the end of the quotation through the whole file, many times.
+    if rows[0].count('"') % 2:
+        raise ObservationError(path, "not a text table (a quote without an end in its header)")
     _check_widths(path, rows)
     # The line break at the end is what tells a table from the name of a file.
     text = "\n".join(lines) + "\n"

@@ -30,13 +30,17 @@ LONGEST_HEADERS = 8_000 * BLOCK_BYTES
 """Bytes of all headers of a file, 288 000 cards; astropy takes some ten times the memory."""
 
 LARGEST_COUNT = 999
-"""Of axes and of columns, by the standard; astropy goes on for as long as a header says."""
+"""Of axes and of columns, by the standard; astropy goes on for as long as a header says.
+
+wcslib reads and writes outside its memory for tens of thousands of axes.
+"""
 
 MOST_HDUS = 3000
 """Extensions of a file; those of multi-object spectrographs have two thousand."""
 
 FIRST_CARD = re.compile(rb"SIMPLE  = *T[ /]")
-COUNT_CARD = re.compile(rb"(?:Z?NAXIS|TFIELDS) *= *\+?([0-9]+)")
+COUNT_CARD = re.compile(rb"(?:Z?NAXIS|TFIELDS|WCSAXES) *= *\+?([0-9]+)")
+SIZE_CARD = re.compile(rb"Z?NAXIS[0-9]+ *= *'")
 END_CARD = re.compile(rb"(?:.{80})*?END(?![A-Z0-9_-])", re.DOTALL)
 
 PIECE = 2**20
@@ -176,6 +180,10 @@ def _header_bytes(name: Path, raw: IO[bytes], place: int, before: int) -> int:
         for card in COUNT_CARD.finditer(block):
             if card.start() % 80 == 0 and int(card[1]) > LARGEST_COUNT:
                 raise ObservationError(name, f"damaged: {card[0].decode()}")
+        for card in SIZE_CARD.finditer(block):  # astropy would repeat the text so many times
+            if card.start() % 80 == 0:
+                text = block[card.start() :][:80].decode("ascii", "replace").rstrip()
+                raise ObservationError(name, f"damaged: {text}, expected a number")
         if len(block) < BLOCK_BYTES or END_CARD.match(block):
             return size
     raise ObservationError(name, f"damaged: headers of more than {LONGEST_HEADERS} bytes")
