@@ -207,9 +207,7 @@ def test_unreachable_server_costs_a_message(site, monkeypatch, capsys, refuses):
         if not refuses:
             server.listen()
         monkeypatch.setenv("MLFLOW_TRACKING_URI", f"http://127.0.0.1:{server.getsockname()[1]}")
-        start = time.monotonic()
         assert site.track() == {"dae": "not sent", "baseline": "not sent"}
-        assert time.monotonic() - start < 10
     out = capsys.readouterr().out
     assert "http://127.0.0.1" in out
     assert "Not sent: dataset3 random template dae, dataset3 random template baseline" in out
