@@ -363,7 +363,8 @@ def command(kind, path, out, rng):
 
 def run(words):
     """The command in this process; never returns."""
-    from psfdae.cli import Commands, main
+    from psfdae.cli import main
+    from psfdae.cli.base import StageGroup
 
     if words[0] == "load":
         import click
@@ -372,7 +373,7 @@ def run(words):
 
         path = Path(words.pop())
         load = click.Command("load", callback=lambda: load_weights(path))
-        main = Commands(commands={"load": load})
+        main = StageGroup(commands={"load": load})
     code = 1
     try:
         main(words, prog_name="psfdae")

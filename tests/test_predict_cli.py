@@ -363,7 +363,7 @@ def test_poppy_table(tmp_path, monkeypatch, field_psfs, shipped):
 @pytest.mark.slow
 @pytest.mark.workflow
 def test_target_prediction(smoke):
-    folder, _ = smoke
+    folder = smoke
     snakemake(folder, "prediction")
     table = pd.read_csv(folder / "results/tables/predict_poppy.csv")
     assert table["noise_level"].tolist() == [0.001, 0.002, 0.003, 0.005]

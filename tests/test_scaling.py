@@ -251,7 +251,7 @@ def test_a_dry_run_that_fails_says_why(tmp_path):
 @pytest.mark.slow
 @pytest.mark.workflow
 def test_target_scaling(smoke):
-    folder, _ = smoke
+    folder = smoke
     snakemake(folder, "scaling")
     tables = folder / "results/tables"
     stages = pd.read_csv(tables / "scaling_stages.csv")
