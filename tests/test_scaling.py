@@ -60,6 +60,13 @@ def test_a_limit_is_reached_where_the_cost_is_the_limit():
     assert line.reaches(1.0) == 0.0
 
 
+@pytest.mark.parametrize("exponent", [-0.01, 0.0, 1e-4])
+def test_a_law_that_hardly_grows_is_never_reached(exponent):
+    """Two noisy times of small workflows can give any exponent."""
+    assert PowerLaw(1.0, exponent, np.nan).reaches(600.0) == np.inf
+    assert PowerLaw(2.0, 0.5, np.nan).reaches(6.0) == pytest.approx(9.0)
+
+
 def test_a_job_takes_at_most_half_of_walltime_and_memory():
     fast, slow = stage(1e-3), stage(0.1)
     share = cost.stars_per_job([fast, slow], SITE)

@@ -293,10 +293,13 @@ def dag_limits(
         Mean CPU time of its jobs: where a start takes as long, half of the cluster waits.
     site : Site
     """
-    law = planning.seconds
-    patient = (site.patience_s / law.scale) ** (1.0 / law.exponent)
     found = [
-        ("snakemake", "dry run", f"{site.patience_s / 60:g} min", patient),
+        (
+            "snakemake",
+            "dry run",
+            f"{site.patience_s / 60:g} min",
+            planning.seconds.reaches(site.patience_s),
+        ),
         ("snakemake", "start of a job", f"{work_s:.3g} s", planning.start_s.reaches(work_s)),
         (
             "snakemake",

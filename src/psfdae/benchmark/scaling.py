@@ -26,6 +26,13 @@ class PowerLaw:
         """Value at x."""
         return float(self.scale * x**self.exponent)
 
+    def reaches(self, limit: float) -> float:
+        """x at which y is `limit`; infinite if it never is, or beyond what a float holds."""
+        if self.exponent <= 0:
+            return 0.0 if limit <= self.scale else np.inf
+        with np.errstate(over="ignore"):
+            return float(np.exp(np.log(limit / self.scale) / self.exponent))
+
 
 def fit_power_law(x: np.ndarray, y: np.ndarray) -> PowerLaw:
     """Least squares of log y over log x.
