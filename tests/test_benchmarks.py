@@ -211,7 +211,7 @@ def test_figures_are_drawn_from_the_tables_of_the_record(kind, tmp_path):
 @pytest.mark.slow
 @pytest.mark.workflow
 def test_targets_prediction_and_scaling(smoke):
-    folder, _ = smoke
+    folder = smoke
     snakemake(folder, "prediction", "scaling")
     tables = {p.stem: pd.read_csv(p) for p in (folder / "results/tables").glob("*.csv")}
     for name in ("predict_poppy", "predict_throughput", "scaling_stages"):

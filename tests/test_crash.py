@@ -41,7 +41,7 @@ def reproduce(folder):
 
 def with_stars(smoke, folder):
     """A house with the stars, but without network and evaluation."""
-    shutil.copytree(smoke[0] / "results/data", clone(folder) / "results/smoke/data")
+    shutil.copytree(smoke / "results/data", clone(folder) / "results/smoke/data")
     return folder
 
 

@@ -58,7 +58,7 @@ def flip(path, rng):
 def flipped(smoke, tmp_path_factory):
     """The folder of a run that was damaged and repeated, what was flipped, and what was said."""
     folder = tmp_path_factory.mktemp("flipped")
-    shutil.copytree(smoke[0], folder, dirs_exist_ok=True, symlinks=True)
+    shutil.copytree(smoke, folder, dirs_exist_ok=True, symlinks=True)
     # A user's own, which no job can build again.
     write_text(folder / "results" / OWN, "1\n")
     chosen = one_of_each(folder / "results") | {("own",): folder / "results" / OWN}
@@ -91,10 +91,10 @@ def test_every_kind_is_noticed_or_harmless(flipped):
 
 def test_everything_is_what_it_was(smoke, flipped):
     folder, *_ = flipped
-    whole = [path for path in (smoke[0] / "results").rglob("*") if path.is_file()]
+    whole = [path for path in (smoke / "results").rglob("*") if path.is_file()]
     compared = 0
     for path in whole:
-        name = path.relative_to(smoke[0])
+        name = path.relative_to(smoke)
         if name.parts[1] in (*HARMLESS, "mlartifacts", "mlflow", ".digests"):
             continue
         assert (folder / name).is_file(), name

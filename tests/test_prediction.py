@@ -11,6 +11,8 @@ import pytest
 
 from prediction_stars import KAPPA, SKY, observe
 from psfdae import Prediction, PredictionError, StarFlag
+from psfdae.models import dae
+from psfdae.own_stars import photometry
 from psfdae.own_stars.model import BLOCK
 from psfdae.own_stars.stamps import MEANING, cut
 from psfdae.threads import in_order
@@ -194,6 +196,29 @@ def test_broken_stamps_are_flagged_and_their_neighbours_do_not_notice(shipped, m
     assert np.isfinite(found.psf[~lost]).all()
     assert np.isfinite(found.uncertainty[~lost]).all()
     assert same(found, clean, slice(len(BROKEN), None))
+
+
+def test_a_block_without_a_good_pixel_is_that_of_each_star_and_asks_nothing(
+    shipped, medium, monkeypatch
+):
+    """The stars of a catalogue that reaches far beyond the image."""
+    stamps = medium.stamps[:BLOCK]
+    bad = np.ones(stamps.shape, dtype=bool)
+    known = {"flux": np.where(np.arange(BLOCK) % 3, np.nan, 500.0)}
+    known["background"] = np.where(np.arange(BLOCK) % 2, np.nan, SKY)
+    alone = [
+        shipped.predict(stamps[[k]], bad=bad[[k]], **{n: v[[k]] for n, v in known.items()})
+        for k in range(6)
+    ]
+    fits = []
+    monkeypatch.setattr(dae, "predict", None)
+    careful = photometry.robust_flux
+    monkeypatch.setattr(photometry, "robust_flux", lambda *a: fits.append(a) or careful(*a))
+    found = shipped.predict(stamps, bad=bad, **known)
+    assert np.isnan(found.psf).all() and has(found, StarFlag.NO_FLUX).all()
+    for k, one in enumerate(alone):
+        assert same(one, found, slice(k, k + 1))
+    assert len(fits) == 2  # sky given, sky free
 
 
 def test_good_stars_carry_no_flag(shipped, field_psfs, clean):

@@ -31,7 +31,7 @@ def tree(tmp_path):
 @pytest.fixture
 def jobs(smoke, tree):
     """Jobs that the smoke run would repeat with the edited copy."""
-    return lambda *targets: planned(smoke[0], *targets, root=tree)
+    return lambda *targets: planned(smoke, *targets, root=tree)
 
 
 def append(path: Path, text: str) -> None:

@@ -98,7 +98,7 @@ def _fields(line):
 
 
 def test_products_are_those_of_the_local_run(smoke, run):
-    local, folder = smoke[0], run[0]
+    local, folder = smoke, run[0]
     products = [path for path in (folder / "results").rglob("*") if path.suffix in SUFFIXES]
     products += (folder / "results/tables").glob("*.csv")
     products += (folder / "results/evaluation").rglob("*.csv")

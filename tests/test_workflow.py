@@ -17,7 +17,7 @@ pytestmark = pytest.mark.workflow
 
 
 def test_smoke_builds_everything(smoke):
-    folder, _ = smoke
+    folder = smoke
     metrics = pd.read_csv(folder / "results/tables/psf_metrics.csv")
     assert list(metrics.columns) == (
         ["dataset", "split", "reference", "method", "noise_level", "metric", "value", "stderr", "n"]
@@ -29,7 +29,7 @@ def test_smoke_builds_everything(smoke):
 
 
 def test_original_noise_rows_are_the_noise_that_was_added(smoke):
-    folder, _ = smoke
+    folder = smoke
     metrics = pd.read_csv(folder / "results/tables/psf_metrics.csv")
     rows = metrics[
         (metrics.metric == "mse")
@@ -41,13 +41,13 @@ def test_original_noise_rows_are_the_noise_that_was_added(smoke):
 
 
 def test_everything_is_up_to_date_afterwards(smoke):
-    folder, _ = smoke
+    folder = smoke
     assert planned(folder) == {}
 
 
 @pytest.mark.slow
 def test_second_run_gives_identical_bytes(smoke, tmp_path):
-    folder, _ = smoke
+    folder = smoke
     snakemake(tmp_path, "results/tables/dataset3_mse.csv", "results/tables/dataset8_mse.csv")
     compared = 0
     for suffix in ("h5", "safetensors", "csv", "md", "parquet"):
@@ -81,19 +81,19 @@ def test_scene_3_touches_nothing_of_the_others(tmp_path):
 
 
 def test_changing_one_learning_rate_reruns_its_training_and_tables_only(smoke):
-    folder, _ = smoke
+    folder = smoke
     jobs = planned(folder, overrides="train.lr=0.002")
     assert not set(jobs) & {"templates", "stars", "baseline", "scan", "calibrate"}
     assert {"train", "evaluate", "psf_metrics"} <= set(jobs)
 
 
 def test_same_value_in_another_format_reruns_nothing(smoke):
-    folder, _ = smoke
+    folder = smoke
     assert planned(folder, overrides="train.lr=0.0040 noise.kappa=4.980") == {}
 
 
 def test_interval_of_checkpoints_reruns_nothing_but_reaches_the_trainings(smoke, tmp_path):
-    folder, _ = smoke
+    folder = smoke
     groups = ("dae_train", "train_original", "train_dae_retrained")
     given = [f"{group}.checkpoint_seconds=1.5" for group in ("train", *groups)]
     assert planned(folder, overrides=" ".join(given)) == {}
@@ -121,7 +121,7 @@ def test_command_of_the_readme_with_another_telescope(tmp_path):
 
 def test_keys_of_one_scene_leave_the_others_alone(smoke):
     """The README's SET with a key of scene 1 alone, and one that is too small for scene 2."""
-    folder, _ = smoke
+    folder = smoke
     jobs = planned(folder, "scene1", "scene2", overrides="wavefront.coma=3.5")
     assert jobs["templates"] == jobs["stars"] - 1 == 1
     for scene, r0 in (("scene1", {}), ("scene2", {"templates": 1, "stars": 1})):
@@ -188,7 +188,7 @@ def test_what_is_no_plain_word_or_unknown_is_refused(tmp_path, word):
 @pytest.mark.slow
 def test_two_whole_runs_give_identical_bytes(smoke, tmp_path):
     """As above, for every data product, model and table of the default target."""
-    folder, _ = smoke
+    folder = smoke
     snakemake(tmp_path)
     suffixes = {".h5", ".safetensors", ".parquet", ".png", ".md"}
     # Those of the second run: other tests have built other targets in the folder of the first.
@@ -205,7 +205,7 @@ def test_two_whole_runs_give_identical_bytes(smoke, tmp_path):
 @pytest.mark.slow
 def test_targets_on_request(smoke):
     """Benchmark, stress tests and bounds of the tiny run."""
-    folder, _ = smoke
+    folder = smoke
     snakemake(folder, "benchmark", "stability", "bounds")
     tables = folder / "results/tables"
     stability = pd.read_csv(tables / "stability.csv")

@@ -362,7 +362,6 @@ class Photometer:
         self._high = (MARGIN * model.high + limit).astype(np.float32)
         self._low = (model.low / MARGIN - limit).astype(np.float32)
         self._free_sky = model.with_free_sky()
-        self._nothing: dict[int, FluxEstimate] = {}
 
     def measure(
         self, stamps: np.ndarray, bad: np.ndarray, start: np.ndarray, known: Stamps
@@ -491,24 +490,19 @@ class Photometer:
         """Fit some stars with `robust_flux` and overwrite their rows of `out`."""
         free = ~np.isfinite(known.background[stars])
         for model, members in ((self._free_sky, stars[free]), (self.model, stars[~free])):
+            nothing = None
             for begin in range(0, members.size, GROUP):
                 group = members[begin : begin + GROUP]
                 x = np.tile(self.model.mean, (GROUP, 1))
                 flat = stamps[group].reshape(group.size, -1).astype(np.float64)
                 x[: group.size] = np.where(hidden[group], np.nan, flat - sky[group, None])
-                if hidden[group].all():  # many at once, where a catalogue exceeds the image
-                    estimate = self._of_nothing(model)
-                else:
+                # Groups without a good pixel, the stars beyond an image, are all the same.
+                blind = group.size == GROUP and hidden[group].all()
+                estimate = nothing if blind else None
+                if estimate is None:
                     estimate = robust_flux(x.reshape(-1, self.side, self.side), model)
+                    nothing = estimate if blind else nothing
                 self._overwrite(out, group, x, estimate, sky[group], known)
-
-    def _of_nothing(self, model: FluxModel) -> FluxEstimate:
-        """What `robust_flux` finds in stamps without a good pixel."""
-        found = self._nothing.get(id(model))
-        if found is None:
-            found = robust_flux(np.full((GROUP, self.side, self.side), np.nan), model)
-            self._nothing[id(model)] = found
-        return found
 
     def _overwrite(
         self,
