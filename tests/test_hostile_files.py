@@ -1,8 +1,8 @@
 """Files of an enemy: one line and exit code 2, in little memory and time."""
 
-from __future__ import gc
-import annotations
+from __future__ import annotations
 
+import gc
 import json
 import os
 import shutil
