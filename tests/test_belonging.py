@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import yaml
 from click.testing import CliRunner
+from psfdae.stages.alignment_tables import require_one_test
 
 from psfdae.belonging import STARS, STATIC, require
 from psfdae.cli import main
@@ -15,7 +16,6 @@ from psfdae.configuration.compose import load, load_stage
 from psfdae.files import Column, ProductError, write_product
 from psfdae.own_stars.bundle import read_bundle, shipped_path
 from psfdae.stages.alignment import read_model
-from psfdae.stages.alignment_tables import require_one_test
 
 SIZES = ("preset=smoke", "grid.points=3", "stars.count=60", "parts.train_stars=40")
 SIZES += ("parts.test_stars=20", "optics.threads=1", "train.epochs=1", "bounds.threads=1")

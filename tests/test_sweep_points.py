@@ -10,13 +10,13 @@ import numpy as np
 import pandas as pd
 import pytest
 import yaml
+from psfdae.stages.alignment_train import train_noise_trained
 
 from psfdae.configuration.compose import compose, load, load_stage, stage_tree
 from psfdae.estimators.pca_som import PcaSom
 from psfdae.files import Column, ProductError, write_product
 from psfdae.stages import sweep as stage
 from psfdae.stages import sweep_figures, sweep_summary, track
-from psfdae.stages.alignment_train import train_noise_trained
 from psfdae.stages.common import noise_model
 from psfdae.stages.fit import baseline, train
 from psfdae.stars.splits import random_split

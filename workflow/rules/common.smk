@@ -5,6 +5,7 @@ from functools import cache
 
 from snakemake.utils import validate
 
+from psfdae.alignment.methods import CNNS, METHODS
 from psfdae.cli import stage
 from psfdae.configuration.compose import ConfigError, as_overrides, config_dir
 from psfdae.configuration.compose import compose, dataset_names, decisive, load
@@ -92,7 +93,7 @@ def settings(name, /, *choice, more=(), **options):
     if spec.root == "config":
         tree = composed(*choice, more=more)
     else:
-        tree = compose(ALIGNMENT_OVERRIDES, spec.root)
+        tree = compose((*ALIGNMENT_OVERRIDES, *more), spec.root)
     folder = Path(RESULTS, ".settings")
     # As text: Snakemake does not remember params that are paths.
     return str(

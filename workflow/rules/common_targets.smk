@@ -2,13 +2,8 @@ from psfdae.configuration.knee import load_knee
 
 with one_line():
     KNEE = load_knee()
-    ALIGNMENT_OVERRIDES = overrides_for("alignment", GIVEN)
 FRESH = "fresh_realisations"
 KNEE_DATASET = "dataset3"
-ALIGNMENT_DATA = f"{RESULTS}/data/alignment"
-ALIGNMENT = f"{RESULTS}/alignment"
-ALIGNMENT_SETS = ["uniform", "grid"]
-ALIGNMENT_CNNS = ["original", "noise_trained", "dae_retrained"]
 
 
 def has_bank(dataset):
@@ -66,35 +61,3 @@ def sharing_stars(dataset):
 def timed_threads(w):
     """A timing takes as many cores as it may use, so that no other job disturbs it."""
     return dataset_config(ALL_DATASETS[0]).benchmark.threads
-
-
-@cache
-@one_line()
-def alignment_config():
-    """Checked configuration of scene 3; a wrong key stops before any job."""
-    return load(ALIGNMENT_OVERRIDES, "alignment")
-
-
-@one_line()
-def alignment_stage(stage, part=decisive):
-    """The groups that a stage of scene 3 reads, as overrides; part=neutral: free_overrides."""
-    tree = stage_tree(stage, compose(ALIGNMENT_OVERRIDES, "alignment"))
-    return as_overrides(part(tree))
-
-
-def alignment_levels():
-    return [f"{level:g}" for level in alignment_config().noise.levels]
-
-
-def cnn_inputs(w):
-    """Clean grid stamps for the paper's CNN, the large set for ours, and the DAE."""
-    kind = "grid" if w.cnn == "original" else "train"
-    named = {"states": f"{ALIGNMENT_DATA}/{kind}.h5"}
-    if w.cnn == "dae_retrained":
-        named["dae"] = f"{ALIGNMENT}/dae/dae.safetensors"
-    return named
-
-
-def alignment_fits(test_sets=ALIGNMENT_SETS, what="fit"):
-    path = getattr(rules.alignment_fit.output, what)
-    return expand(path, test_set=test_sets, level=alignment_levels())
