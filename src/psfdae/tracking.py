@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from psfdae.alignment.methods import CNNS
 from psfdae.belonging import STARS, require_origin
 from psfdae.files import ProductError, read_product
 from psfdae.reading import number, read_csv, read_yaml
@@ -17,12 +18,7 @@ from psfdae.reading import number, read_csv, read_yaml
 METHODS = {"dae": "dae", "baseline": "pca_som"}
 """Kind of a run, and its name in the column `method` of an evaluation."""
 
-NETWORKS = {
-    "dae": "dae.safetensors",
-    "original": "cnn.safetensors",
-    "noise_trained": "cnn.safetensors",
-    "dae_retrained": "cnn.safetensors",
-}
+NETWORKS = {"dae": "dae.safetensors", **dict.fromkeys(CNNS, "cnn.safetensors")}
 """Networks of scene 3 and the files of their weights."""
 
 STATISTICS = ("mean_abs_error", "bias", "variance")

@@ -7,6 +7,7 @@ from importlib import import_module
 
 from snakemake.utils import validate
 
+from psfdae.alignment.methods import CNNS, METHODS
 from psfdae.cli import stage
 from psfdae.configuration.compose import ConfigError, as_overrides, config_dir
 from psfdae.configuration.compose import compose, dataset_names, decisive, load
@@ -112,7 +113,7 @@ def settings(name, /, *choice, more=(), **options):
     if spec.root == "config":
         tree = composed(*choice, more=more)
     else:
-        tree = compose(ALIGNMENT_OVERRIDES, spec.root)
+        tree = compose((*ALIGNMENT_OVERRIDES, *more), spec.root)
     folder = Path(RESULTS, ".settings")
     # As text: Snakemake does not remember params that are paths.
     return str(

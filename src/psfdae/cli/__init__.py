@@ -275,8 +275,6 @@ def _unfolded(hint: Any) -> tuple[Any, dict[str, Any]]:
 
 # The commands that are not yet in the stages.
 from psfdae.cli import (  # noqa: E402, F401
-    alignment,
-    alignment_methods,
     bundle,
     from_stars,
     predict,

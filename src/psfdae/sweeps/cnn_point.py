@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 
 from psfdae.belonging import STATE_STAMPS, require
+from psfdae.configuration.compose import part
 from psfdae.estimators import CONFIG, HISTORY
 from psfdae.evaluation.alignment_tables import error_rows
 from psfdae.files import read_product, write_text
 from psfdae.models.training import TrainingError
 from psfdae.reading import read_table, read_yaml
-from psfdae.stages import alignment_train as stage
-from psfdae.stages.alignment_evaluate import cnn_predictor, noisy_test_states
+from psfdae.stages.alignment_methods import CNN_WEIGHTS, cnn_predictor, noisy_test_states, train_cnn
 from psfdae.stages.common import limit_threads
 from psfdae.sweeps.measured import (
     EVALUATION,
@@ -21,10 +21,9 @@ from psfdae.sweeps.measured import (
     Measured,
     Task,
     geometric_mean,
-    stage_part,
 )
 
-FILES = (stage.CNN_WEIGHTS, CONFIG, HISTORY)
+FILES = (CNN_WEIGHTS, CONFIG, HISTORY)
 FAILURES = (TrainingError,)
 
 TEST_SET = "uniform"
@@ -48,9 +47,8 @@ def run(config: Any, task: Task) -> Measured:
     for role in ("validation", "test"):
         product = read_product(task.data[role], "alignment_states", ())
         require(product.path, product.config, STATE_STAMPS, trained_on.config, trained_on.path)
-    train = {"original": stage.train_original, "noise_trained": stage.train_noise_trained}
-    part = stage_part(f"alignment_{task.dataset}", config)
-    train[task.dataset](part, task.data["states"], task.folder, task.checkpoint)
+    settings = part(train_cnn.stage.reads(task.dataset), config, "alignment")
+    train_cnn(settings, task.dataset, task.data["states"], task.checkpoint, task.folder)
     limit_threads(config.evaluation.threads)
     metrics: dict[str, float] = {}
     for role, name in (("validation", VALIDATION), ("test", EVALUATION)):
