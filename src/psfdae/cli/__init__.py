@@ -29,7 +29,7 @@ Split = Literal["random", "held_out"]
 Reference = Literal["realisation", "template"]
 
 GROUPS = {
-    "alignment": "Scene 3: misalignment of the secondary mirror from its PSFs.",
+    "alignment": "Scene 3: alignment of a secondary mirror (config/alignment.yaml).",
     "alignment figure": "Draw a figure of scene 3 as PNG.",
     "figure": "Draw a figure as PNG from finished products.",
     "sweep": "Train many variants of a model and compare them (config/sweep).",

@@ -133,7 +133,13 @@ def telescope(
     import pandas as pd
 
     fitted = read_product(model, "alignment_model")
+    sets = {
+        name: read_product(path, "alignment_states", ("energy", "stamps"))
+        for name, path in (("grid", grid), ("uniform", uniform))
+    }
     require(model, fitted.config, STATES, config)
+    for product in sets.values():
+        require(product.path, product.config, STATE_STAMPS, config)
     coefficients, residual, noll = (fitted[k] for k in ("coefficients", "residual", "noll"))
     # How well the states are separated, and the aligned telescope's defocus.
     sensitivity = np.moveaxis(coefficients[:, 1:5], 1, -1).reshape(-1, 4)
@@ -149,9 +155,7 @@ def telescope(
         ("defocus_edge", defocus[1:].mean(), "wave"),
         ("sensitivity_condition", np.linalg.cond(sensitivity), "1"),
     ]
-    for name, path in (("grid", grid), ("uniform", uniform)):
-        product = read_product(path, "alignment_states", ("energy", "stamps"))
-        require(path, product.config, STATE_STAMPS, config)
+    for name, product in sets.items():
         energy, peak = product["energy"], product["stamps"].max(axis=(2, 3))
         rows += [
             (f"energy_least_{name}", energy.min(), "1"),
