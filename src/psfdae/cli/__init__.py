@@ -277,5 +277,4 @@ from psfdae.cli import (  # noqa: E402, F401
     prediction,
     scaling,
     stability,
-    sweep,
 )

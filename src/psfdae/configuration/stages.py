@@ -38,8 +38,6 @@ STAGE_KEYS: dict[str, tuple[str, ...]] = {
         *SIMULATION,
         *("noise", "parts", "dae", "train", "baseline", "evaluation", "stability"),
     ),
-    "sweep_dae": ("seed", "noise", "parts", "dae", "train", "evaluation"),
-    "sweep_pca_som": ("seed", "noise", "parts", "baseline", "evaluation"),
 }
 """The groups that each stage reads; nothing else can influence its result."""
 
