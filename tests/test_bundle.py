@@ -26,7 +26,7 @@ from psfdae.own_stars.bundle import (
     BundleError,
     BundleInfo,
     creation_date,
-    network,
+    estimator,
     read_bundle,
     write_bundle,
 )
@@ -253,7 +253,7 @@ def test_a_wrong_source_date_epoch_is_named(monkeypatch):
 
 
 def test_network_of_a_bundle_is_the_one_that_was_packed(file, model, gaussian_stars):
-    found = predict(network(read_bundle(file)), gaussian_stars, 256.0)
+    found = estimator(read_bundle(file)).predict(gaussian_stars)
     assert (found == predict(model, gaussian_stars, 256.0)).all()
 
 

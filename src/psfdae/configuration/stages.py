@@ -21,11 +21,6 @@ STAGE_KEYS: dict[str, tuple[str, ...]] = {
     "baseline": ("seed", "noise", "parts", "baseline"),
     "train": ("seed", "noise", "parts", "dae", "train"),
     "evaluate": ("seed", "noise", "parts", "evaluation", "methods"),
-    "bundle": ("seed", "noise", "parts", "evaluation"),
-    "from_stars": (
-        *("seed", "calibration_stars", "framing", "noise", "parts"),
-        *("dae", "train", "baseline", "evaluation", "methods"),
-    ),
     "knee": ("seed", "noise", "parts", "dae", "train", "evaluation"),
     "propagation": (*SIMULATION, "noise", "benchmark"),
     "prediction": (*SIMULATION, "noise", "benchmark"),
