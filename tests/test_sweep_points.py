@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 from psfdae.configuration.compose import compose, load, load_stage, stage_tree
-from psfdae.configuration.sweep import groups_of
+from psfdae.configuration.sweep import point_groups
 from psfdae.estimators.pca_som import PcaSom
 from psfdae.files import Column, ProductError, write_product
 from psfdae.stages import sweep as stage
@@ -62,7 +62,7 @@ class Point:
         )
 
     def run(self, *overrides, model="dae", values=None, keys=None, trial=None, source="1"):
-        config = load_stage(groups_of(model), (*TINY, *overrides))
+        config = load_stage(point_groups(model), (*TINY, *overrides))
         stage.point(config, model, values or {}, keys or {}, self.task, trial, source)
         return self.result()
 
@@ -208,7 +208,7 @@ def test_cnn_is_the_main_workflow_s_and_measured_on_other_states(tmp_path):
         checkpoint=tmp_path / "sweep.pt",
     )
     stage.point(
-        load_stage(groups_of("noise_trained"), given, "alignment"), "noise_trained", {}, {}, task
+        load_stage(point_groups("noise_trained"), given, "alignment"), "noise_trained", {}, {}, task
     )
     config = load_stage("alignment_noise_trained", given)
     train_noise_trained(config, data["states"], tmp_path / "main", tmp_path / "main.pt")

@@ -22,9 +22,7 @@ for _method in (m for m in registered() if m.stored and m.bundled):
             mem_mb=1500,
         params:
             config=lambda w: settings("bundle", f"dataset={w.dataset}"),
-            source=source_hash(
-                "psfdae.stages.bundle", f"psfdae.estimators.{_method.name}"
-            ),
+            source=source_hash("bundle", chosen=[f"psfdae.estimators.{_method.name}"]),
             model=lambda w, m=_method: option_of(m, w.dataset, w.split, w.reference),
         message:
             f"Packing {_method.label} of {{wildcards.dataset}}, {{wildcards.split}}, {{wildcards.reference}}"
@@ -47,12 +45,7 @@ rule bundles:
 # The shipped model is committed, so nothing but an explicit request renews it.
 rule shipped:
     input:
-        expand(
-            rules.bundle.output,
-            dataset=SHIPPED_DATASET,
-            split="random",
-            reference="realisation",
-        ),
+        f"{RESULTS}/bundles/{SHIPPED_DATASET}-random-realisation.psf.safetensors",
     output:
         touch(f"{RESULTS}/.shipped_renewed"),
     log:

@@ -10,7 +10,7 @@ from pydantic import AfterValidator, Field, model_validator
 from psfdae.configuration.base import Count, Finite, Group, Name
 from psfdae.configuration.compose import ConfigError, Root, config_dir, load_file
 from psfdae.configuration.schema import Reference, SplitKind
-from psfdae.estimators import method, registered
+from psfdae.estimators import groups_of, method, registered
 
 Scalar = bool | int | float | str
 Value = Scalar | list[Scalar]
@@ -143,7 +143,7 @@ class Sweep(Group):
     @property
     def reads(self) -> tuple[str, ...]:
         """Groups of the configuration that decide a point."""
-        return groups_of(self.model)
+        return point_groups(self.model)
 
     @property
     def varied(self) -> tuple[str, ...]:
@@ -188,11 +188,11 @@ class Sweep(Group):
         return self
 
 
-def groups_of(model: str) -> tuple[str, ...]:
+def point_groups(model: str) -> tuple[str, ...]:
     """Groups of the configuration that a point of a model reads."""
     if model in CNNS:
         return ("seed", "noise", "cnn", f"train_{model}", "evaluation")
-    return (*method(model).reads(), "evaluation")
+    return (*groups_of(model), "evaluation")
 
 
 def sweep_names() -> list[str]:

@@ -326,6 +326,11 @@ class Method:
         require_training(place, cls.described(place), stars, config, **options)
 
 
+def groups_of(name: str, **options: Any) -> tuple[str, ...]:
+    """Groups of the configuration that decide a fit of a method."""
+    return ("seed", "noise", "parts", *method(name).groups)
+
+
 def method(name: str) -> type[Method]:
     """The method of a name.
 

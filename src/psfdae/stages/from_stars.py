@@ -15,7 +15,7 @@ import numpy as np
 from psfdae.cli import AboveZero, File, Folder, NameOrNumber, command
 from psfdae.configuration.compose import as_overrides, part
 from psfdae.configuration.schema import Config, Noise
-from psfdae.estimators import Method, method, registered
+from psfdae.estimators import Method, groups_of, method, registered
 from psfdae.files import Product, write_product, write_text
 from psfdae.own_stars.bundle import SUFFIX
 from psfdae.own_stars.errors import ObservationError
@@ -183,7 +183,7 @@ def _make(config: Config, exposure: Source, files: Made, licence: str) -> None:
     write_text(files.path / "overrides.txt", _overrides(settings))
     for kind in files.kinds:
         print(f"fitting {kind.label}")
-        own = part(kind.reads(), settings)
+        own = part(groups_of(kind.name), settings)
         fit(own, kind.name, files.stars, SPLIT, REFERENCE, out=files.fit(kind))
     print("testing on the stars held out")
     checked = part(READS, settings)

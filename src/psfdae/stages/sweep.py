@@ -15,7 +15,7 @@ import click
 
 from psfdae.cli import File, Folder, Reference, Split, command
 from psfdae.configuration.compose import Root, decisive, load_stage
-from psfdae.configuration.sweep import CNNS, groups_of, models
+from psfdae.configuration.sweep import CNNS, models, point_groups
 from psfdae.estimators import FitError
 from psfdae.files import ProductError, write_text
 from psfdae.reading import from_tree, read_json
@@ -134,7 +134,7 @@ def sweep_point(
     if slot is not None and search is not None and journal is not None:
         trial = Trial(slot, search, known, journal)
     task = Task(dataset, split, reference, dict(data), levels, out, checkpoint)
-    config = load_stage(groups_of(model), overrides, root)
+    config = load_stage(point_groups(model), overrides, root)
     point(config, model, values or {}, keys or {}, task, trial, source)
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from psfdae.configuration.compose import part
-from psfdae.estimators import HISTORY, Method, method
+from psfdae.estimators import HISTORY, Method, groups_of, method
 from psfdae.files import read_product
 from psfdae.reading import read_table
 from psfdae.stages.common import limit_threads, read_stars
@@ -44,7 +44,7 @@ def run(config: Any, task: Task, name: str) -> Measured:
         If it cannot be fitted.
     """
     kind = method(name)
-    own = part(kind.reads(), config)
+    own = part(groups_of(name), config)
     stars, place = task.data["stars"], place_of(kind, task.folder)
     limit_threads(kind.threads(own))
     validated = None
