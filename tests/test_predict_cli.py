@@ -219,7 +219,7 @@ def bad(folder):
         (["plain.fits", "--catalogue", "sky.csv"], "plain.fits", ["WCS"]),
         (["image.fits", "--catalogue", "empty.csv"], "empty.csv", []),
         (["image.fits", "--catalogue", "outside.csv"], "outside.csv", ["none of the 2 stars"]),
-        (["cube.fits", "--model", "newer.psf.safetensors"], "newer.psf", ["format 99", "format 1"]),
+        (["cube.fits", "--model", "newer.psf.safetensors"], "newer.psf", ["format 99", "format 2"]),
         (["cube.fits", "--model", "cube.npy"], "cube.npy", []),
         (["cube.fits", "--flux-column", "flux"], "cube.fits", ["no catalogue"]),
         (["image.fits", "--catalogue", "stars.csv", "--flux-column", "f"], "stars.csv", ["'f'"]),

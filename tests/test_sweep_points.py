@@ -12,6 +12,7 @@ import pytest
 import yaml
 
 from psfdae.configuration.compose import compose, load, load_stage, stage_tree
+from psfdae.configuration.sweep import point_groups
 from psfdae.estimators.pca_som import PcaSom
 from psfdae.files import Column, ProductError, write_product
 from psfdae.stages import sweep as stage
@@ -61,7 +62,7 @@ class Point:
         )
 
     def run(self, *overrides, model="dae", values=None, keys=None, trial=None, source="1"):
-        config = load_stage(f"sweep_{model}", (*TINY, *overrides))
+        config = load_stage(point_groups(model), (*TINY, *overrides))
         stage.point(config, model, values or {}, keys or {}, self.task, trial, source)
         return self.result()
 
@@ -206,7 +207,9 @@ def test_cnn_is_the_main_workflow_s_and_measured_on_other_states(tmp_path):
         folder=folder,
         checkpoint=tmp_path / "sweep.pt",
     )
-    stage.point(load_stage("sweep_noise_trained", given), "noise_trained", {}, {}, task)
+    stage.point(
+        load_stage(point_groups("noise_trained"), given, "alignment"), "noise_trained", {}, {}, task
+    )
     config = load_stage("alignment_noise_trained", given)
     train_noise_trained(config, data["states"], tmp_path / "main", tmp_path / "main.pt")
     for name in ("cnn.safetensors", "config.yaml"):
@@ -324,7 +327,7 @@ def test_best_of_a_sweep_that_was_not_run_says_what_to_do(tmp_path):
 def test_figures_are_drawn_with_failed_points_and_the_same_again(tmp_path, kind):
     out = summarise(tmp_path)
     for name in ("a.png", "b.png"):
-        sweep_figures.run(kind, out / "sweep.yaml", out / "summary.csv", tmp_path / name)
+        sweep_figures.sweep_figure(kind, out / "sweep.yaml", out / "summary.csv", tmp_path / name)
     image = (tmp_path / "a.png").read_bytes()
     assert image.startswith(b"\x89PNG")
     assert image == (tmp_path / "b.png").read_bytes()

@@ -232,12 +232,9 @@ def figures_of(dataset):
 
 def products_of(dataset):
     """Everything that a dataset's target builds."""
-    bundles = [
-        f"{RESULTS}/bundles/{dataset}-{split}-{reference}.psf.safetensors"
-        for split, reference in networks_of(dataset)
-    ]
+    networks = networks_of(dataset)
     return [
-        *(bundles if has_own_telescope(dataset) else []),
+        *(bundles_of(dataset, networks) if has_own_telescope(dataset) else []),
         *evaluations_of(dataset),
         *paper_tables_of(dataset),
         *figures_of(dataset),

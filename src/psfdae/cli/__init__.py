@@ -25,6 +25,18 @@ import psfdae
 File = Annotated[Path, click.Path(path_type=Path, dir_okay=False)]
 Folder = Annotated[Path, click.Path(path_type=Path, file_okay=False)]
 AboveZero = click.FloatRange(min=0, min_open=True)
+
+
+class NameOrNumber(click.ParamType):
+    """An extension of a FITS file: its number, in plain digits, or its name."""
+
+    name = "text"
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> str | int:
+        """A number from digits; any other text as it is."""
+        return int(value) if re.fullmatch("[0-9]{1,6}", str(value)) else value
+
+
 Split = Literal["random", "held_out"]
 Reference = Literal["realisation", "template"]
 
@@ -46,17 +58,20 @@ class Stage:
     name: str
     reads: tuple[str, ...] | Callable[..., tuple[str, ...]]
     root: Literal["config", "alignment"]
+    start: tuple[str, ...] = ()
 
 
 def command(
     name: str,
     reads: tuple[str, ...] | Callable[..., tuple[str, ...]] = (),
     root: Literal["config", "alignment"] = "config",
+    start: tuple[str, ...] = (),
 ) -> Callable[..., Any]:
     """Make a function the command `psfdae NAME`.
 
     A parameter `config` receives the groups of the configuration in `reads`, checked, from
-    trailing overrides or a file of settings; which groups may depend on the options. Other
+    trailing overrides, those of `start` before them, or a file of settings; which groups may
+    depend on the options. Other
     parameters are options: required without a default, repeatable as `tuple[X, ...]`, a
     flag as bool, all fields of a dataclass. `Annotated` adds help (a text), a click type,
     or a dict of what click's option takes, where "flag" names it and "argument" makes it
@@ -64,7 +79,7 @@ def command(
     """
 
     def mark(function: Callable[..., Any]) -> Callable[..., Any]:
-        function.stage = Stage(name, reads, root)  # type: ignore[attr-defined]
+        function.stage = Stage(name, reads, root, start)  # type: ignore[attr-defined]
         return function
 
     return mark
@@ -220,7 +235,7 @@ def _settings(
 
     reads = spec.reads(**given) if callable(spec.reads) else spec.reads
     if file is None:
-        return load_stage(reads, overrides, spec.root)
+        return load_stage(reads, (*spec.start, *overrides), spec.root)
     if overrides:
         raise click.UsageError("--config and overrides exclude each other")
     return load_settings(file, reads, spec.root)
@@ -277,8 +292,5 @@ def _unfolded(hint: Any) -> tuple[Any, dict[str, Any]]:
 from psfdae.cli import (  # noqa: E402, F401
     alignment,
     alignment_methods,
-    bundle,
-    from_stars,
     predict,
-    sweep,
 )

@@ -184,7 +184,5 @@ ALIGNMENT_STAGE_KEYS: dict[str, tuple[str, ...]] = {
     "alignment_fit": ("seed", "telescope", "alignment", "optics", "noise", "fit", "evaluation"),
     "alignment_bound": ("telescope", "alignment", "optics", "noise"),
     "alignment_twin": ("telescope", "prescription", "alignment", "optics", "noise"),
-    "sweep_original": ("seed", "noise", "cnn", "train_original", "evaluation"),
-    "sweep_noise_trained": ("seed", "noise", "cnn", "train_noise_trained", "evaluation"),
 }
 """The groups that each stage of scene 3 reads; nothing else can influence its result."""
