@@ -252,7 +252,8 @@ def test_missing_network_is_one_line_and_exit_code_2(folder, tmp_path):
     result = CliRunner().invoke(main, [*arguments, "--out", str(tmp_path / "x")])
     assert result.exit_code == 2
     assert (
-        result.output == f"psfdae: {tmp_path}/config.yaml: no such file; psfdae train writes it\n"
+        result.output
+        == f"psfdae: {tmp_path}/dae.safetensors: no such file; psfdae train writes it\n"
     )
 
 
