@@ -292,5 +292,4 @@ def _unfolded(hint: Any) -> tuple[Any, dict[str, Any]]:
 from psfdae.cli import (  # noqa: E402, F401
     alignment,
     alignment_methods,
-    predict,
 )

@@ -9,10 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-import click
 import numpy as np
 
-from psfdae.cli import AboveZero, File, Folder, NameOrNumber, command
+from psfdae.cli import File, Folder, command
 from psfdae.configuration.compose import as_overrides, part
 from psfdae.configuration.schema import Config, Noise
 from psfdae.estimators import Method, groups_of, method, registered
@@ -29,6 +28,7 @@ from psfdae.stages.bundle import bundle
 from psfdae.stages.common import check_outputs
 from psfdae.stages.evaluate import READS, Models, estimators, evaluate
 from psfdae.stages.fit import fit
+from psfdae.stages.predict import Stated
 from psfdae.stars.splits import held_out_fields
 
 LOCK = ".from_stars.lock"
@@ -88,23 +88,7 @@ class Made:
 def from_stars(
     config: Config,
     image: Annotated[File, {"argument": True}],
-    catalogue: Annotated[File | None, "Star list of an image, FITS or CSV."] = None,
-    pixel_scale: Annotated[
-        float | None, AboveZero, "Arcseconds per pixel.  [default: the WCS's]"
-    ] = None,
-    origin: Annotated[
-        int | None, click.IntRange(0, 1), "Index of the first pixel's centre."
-    ] = None,
-    extension: Annotated[
-        str | int | None, NameOrNumber(), "Name or number of the extension with the stars."
-    ] = None,
-    mask: Annotated[
-        str | int | None, NameOrNumber(), "Extension or FITS file; pixels other than 0 are bad."
-    ] = None,
-    gain: Annotated[
-        float | None, AboveZero, "Electrons per count.  [default: the header's]"
-    ] = None,
-    saturate: Annotated[float | None, AboveZero, "Counts of a saturated pixel."] = None,
+    stated: Stated,
     name: Annotated[str | None, "Name of the model.  [default: the image's]"] = None,
     licence: Annotated[str, "Of the model."] = "not stated",
     *,
@@ -116,11 +100,10 @@ def from_stars(
     IMAGE is a FITS image with --catalogue, or a FITS cube of stamps. Some stars are
     held out and made faint to test the model.
     """
-    stated = (extension, origin, mask, pixel_scale, gain, saturate)
-    exposure = Source(image, catalogue, *stated)
+    exposure = stated.source(image)
     kinds = tuple(kind for kind in map(method, config.methods) if kind.stored)
     files = Made(out, name or image.name.split(".")[0], kinds)
-    check_outputs(files.written(), (image, catalogue, mask))
+    check_outputs(files.written(), (image, exposure.catalogue, exposure.mask))
     with _alone(out):
         finished = sorted(out.glob(f"*{SUFFIX}"))
         if finished and not overwrite:
