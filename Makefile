@@ -112,6 +112,7 @@ site: docs ## Build the site of README and docs in site/
 lint: env ## Check style of Python and Snakemake files
 	ruff check .
 	ruff format --check .
+	lint-imports --no-cache
 	snakefmt --check Snakefile workflow
 	snakemake --lint
 

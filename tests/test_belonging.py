@@ -227,7 +227,7 @@ def test_predictions_are_measured_with_the_bundle_of_their_scene(at, words, key,
 def test_runs_are_tracked_with_their_own_stars(at):
     shutil.copytree(at / "dae", at / "dae/dataset3/random-realisation")
     (at / "evaluation/dataset3").mkdir(parents=True)
-    (at / "evaluation/dataset3/random-realisation.csv").touch()
+    (at / "evaluation/dataset3/random-realisation.csv").write_text("method\ndae\n")
     (at / "pca_som/dataset3").mkdir(parents=True)
     shutil.copy(at / "pca_som.h5", at / "pca_som/dataset3/random.h5")
     words = ("track", "--results", at, "--preset", "smoke", "--database", at / "mlflow.db")

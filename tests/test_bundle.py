@@ -26,7 +26,7 @@ from psfdae.own_stars.bundle import (
     BundleError,
     BundleInfo,
     creation_date,
-    network,
+    estimator,
     read_bundle,
     write_bundle,
 )
@@ -168,7 +168,7 @@ def test_newer_format_is_refused_with_both_versions(file, tmp_path):
     raw = file.read_bytes()
     path = tmp_path / "new.psf.safetensors"
     path.write_bytes(with_text(raw, lambda text: text.update(format_version=7, info="other")))
-    assert "format 7, but psfdae 0.1.0 reads up to format 1" in refused(path)
+    assert "format 7, but psfdae 0.1.0 reads up to format 2" in refused(path)
     result = CliRunner().invoke(main, ["describe", str(path)])
     assert result.exit_code == 2
     assert result.output.startswith(f"psfdae: {path}: format 7")
@@ -253,7 +253,7 @@ def test_a_wrong_source_date_epoch_is_named(monkeypatch):
 
 
 def test_network_of_a_bundle_is_the_one_that_was_packed(file, model, gaussian_stars):
-    found = predict(network(read_bundle(file)), gaussian_stars, 256.0)
+    found = estimator(read_bundle(file)).predict(gaussian_stars)
     assert (found == predict(model, gaussian_stars, 256.0)).all()
 
 

@@ -15,13 +15,12 @@ from psfdae.cli import main
 from psfdae.configuration.compose import load_stage
 from psfdae.files import Column, ProductError, read_product, write_product
 from psfdae.models import export
-from psfdae.models.dae import predict
 from psfdae.own_stars import packing
 from psfdae.own_stars.bundle import (
     BundleError,
     at_noise,
+    estimator,
     mahalanobis,
-    network,
     read_bundle,
     shipped_path,
     write_bundle,
@@ -29,8 +28,8 @@ from psfdae.own_stars.bundle import (
 from psfdae.own_stars.photometry import FluxModel, noise_equivalent_px, signal_to_noise
 from psfdae.rng import stream
 from psfdae.stages import bundle as stage
-from psfdae.stages import bundle_use
 from psfdae.stages.common import noise_model, noisy_test_images
+from psfdae.stages.evaluate import Models
 from psfdae.stages.fit import train
 
 TINY = [
@@ -82,8 +81,9 @@ def folder(tmp_path_factory):
 
 def pack(folder, out, overrides=(), **options):
     chosen = {"stars": folder / "stars.h5", "split": None, "name": "tiny", "licence": "MIT"}
-    config = load_stage("bundle", [*TINY, *overrides])
-    stage.run(config, dae=folder / "dae", out=out, **(chosen | options))
+    chosen["models"] = Models(dae=options.pop("dae", folder / "dae"))
+    config = load_stage(stage.bundle.stage.reads, [*TINY, *overrides])
+    stage.bundle(config, out=out, **(chosen | options))
 
 
 @pytest.fixture(scope="module")
@@ -127,25 +127,25 @@ def test_unknown_optics_have_no_diffraction_limit(folder, tmp_path):
 
 
 def test_metrics_are_those_of_the_stage_evaluate(folder, tiny):
-    config = load_stage("bundle", TINY)
+    config = load_stage(stage.bundle.stage.reads, TINY)
     images = gaussians(1400, 1)
-    from psfdae.stars.splits import random_split
+    from psfdae.stars.fields import random_split
 
     test = random_split(1400, 1000, 400, config.parts.validation_fraction, config.seed).test
     for row in tiny.info.metrics:
         noisy = noisy_test_images(config, images[test], row["noise_level"])
-        estimate = predict(network(tiny), noisy, 144.0)
+        estimate = estimator(tiny).predict(noisy)
         assert row["mse"] == pytest.approx(np.square(estimate - images[test]).mean(), rel=1e-4)
         assert row["mse"] < row["mse_noisy"]
 
 
 def test_half_width_covers_fresh_stars_and_the_rms_too_many(tiny):
-    config = load_stage("bundle", TINY)
+    config = load_stage(stage.bundle.stage.reads, TINY)
     images = gaussians(1500, 99)
     rng = np.random.default_rng(5)
     noise = np.exp(rng.uniform(np.log(4.98e-3), np.log(4.98e-2), size=1500))
     noisy = noise_model(config).draw(images, noise / 4.98, rng)
-    error = predict(network(tiny), noisy, 144.0) - images
+    error = estimator(tiny).predict(noisy) - images
     covered = packing.coverage(error, noise, tiny.noise_nodes, tiny.error68)
     assert covered == pytest.approx(0.6827, abs=0.05)
     for part in np.array_split(np.argsort(noise), 3):
@@ -252,7 +252,8 @@ def test_missing_network_is_one_line_and_exit_code_2(folder, tmp_path):
     result = CliRunner().invoke(main, [*arguments, "--out", str(tmp_path / "x")])
     assert result.exit_code == 2
     assert (
-        result.output == f"psfdae: {tmp_path}/config.yaml: no such file; psfdae train writes it\n"
+        result.output
+        == f"psfdae: {tmp_path}/dae.safetensors: no such file; psfdae train writes it\n"
     )
 
 
@@ -270,7 +271,7 @@ def test_commands_pack_describe_and_export(folder, tmp_path):
     assert result.exit_code == 0, result.output
     images = gaussians(5, 11)
     found = export.session(onnx, threads=1).run(None, {"images": images})[0]
-    expected = predict(network(read_bundle(path)), images, 144.0)
+    expected = estimator(read_bundle(path)).predict(images)
     assert np.abs(found - expected).max() <= export.TOLERANCE * expected.max()
 
 
@@ -284,14 +285,14 @@ def test_export_of_a_wrong_network_fails_and_leaves_no_file(folder, tmp_path, mo
 
     monkeypatch.setattr(export, "_plain", wrong)
     with pytest.raises(export.ExportError, match="differs from torch"):
-        bundle_use.export(folder / "tiny.psf.safetensors", tmp_path / "x.onnx")
+        stage.export(folder / "tiny.psf.safetensors", out=tmp_path / "x.onnx")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_shipped_bundle_is_small_and_wide():
     bundle = read_bundle()
     assert bundle.info.name == "wfsat"
-    assert shipped_path().stat().st_size <= bundle_use.LARGEST_SHIPPED
+    assert shipped_path().stat().st_size <= stage.LARGEST_SHIPPED
     assert bundle.info.subpixel
     assert bundle.info.snr_min < 5
     assert bundle.info.snr_max > 500
@@ -315,20 +316,21 @@ def test_shipped_bundle_covers_stars_that_nobody_has_seen(tmp_path):
     bundle, rng = read_bundle(), stream(11, "coverage")
     band = np.log([bundle.info.noise_min, bundle.info.noise_max])
     noise = np.exp(rng.uniform(*band, size=len(images)))
-    config = load_stage("bundle", chosen)
+    config = load_stage(stage.bundle.stage.reads, chosen)
     noisy = noise_model(config).draw(images, noise / config.noise.kappa, rng)
-    error = predict(network(bundle), noisy, bundle.info.image_scale) - images
+    error = estimator(bundle).predict(noisy) - images
     covered = packing.coverage(error, noise, bundle.noise_nodes, bundle.error68)
     assert covered == pytest.approx(0.6827, abs=0.05)
     assert packing.coverage(error, noise, bundle.noise_nodes, bundle.rms) > 0.75
 
 
 def test_ship_names_checks_and_writes(folder, tiny, tmp_path):
-    out = bundle_use.ship(folder / "tiny.psf.safetensors", tmp_path / "bundles")
+    stage.ship(folder / "tiny.psf.safetensors", tmp_path / "bundles")
+    (out,) = (tmp_path / "bundles").iterdir()
     assert out.name == "wfsat.psf.safetensors"
     assert read_bundle(out).info.licence == "MIT"
     rows = [row | {"coverage68": 0.5} for row in tiny.info.metrics]
     poor = replace(tiny, info=tiny.info.model_copy(update={"metrics": rows}))
     write_bundle(poor, tmp_path / "poor.psf.safetensors")
     with pytest.raises(BundleError, match=r"error68 holds 50\.0% of the errors"):
-        bundle_use.ship(tmp_path / "poor.psf.safetensors", tmp_path / "bundles")
+        stage.ship(tmp_path / "poor.psf.safetensors", tmp_path / "bundles")

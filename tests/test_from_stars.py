@@ -20,8 +20,7 @@ from fits_inputs import write_cube
 from psfdae.cli import main
 from psfdae.configuration.compose import ConfigError, load_stage
 from psfdae.files import read_product, write_product
-from psfdae.models.dae import predict
-from psfdae.own_stars.bundle import network, read_bundle
+from psfdae.own_stars.bundle import estimator, read_bundle
 from psfdae.own_stars.example import (
     RENDER_PX,
     FieldRecipe,
@@ -35,8 +34,8 @@ from psfdae.own_stars.training_images import make_images, star_grid, training_co
 from psfdae.rng import stream
 from psfdae.stages import example_field as example_stage
 from psfdae.stages.common import noise_model, split_stars
-from psfdae.stages.from_stars import Source, _alone
-from psfdae.stars.splits import held_out_fields
+from psfdae.stages.from_stars import Source, _alone, from_stars
+from psfdae.stars.fields import held_out_fields
 
 ROOT = Path(__file__).resolve().parents[1]
 SIDE = {"side_px": 700, "bright": 60, "faint": 80, "blended": 6, "saturated": 3}
@@ -45,7 +44,7 @@ TINY = ["preset=smoke", "parts.train_stars=120", "parts.test_stars=30", "train.e
 
 @pytest.fixture(scope="module")
 def config():
-    return load_stage("from_stars", ["dataset=from_stars", *TINY])
+    return load_stage(from_stars.stage.reads, ["dataset=from_stars", *TINY])
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +52,7 @@ def field(tmp_path_factory):
     """A small simulated image with its star list, and the truth."""
     folder = tmp_path_factory.mktemp("field")
     paths = folder / "image.fits", folder / "stars.csv"
-    return *paths, example_stage.run(*paths, seed=5, **SIDE)
+    return *paths, example_stage.write_example(*paths, seed=5, **SIDE)
 
 
 @pytest.fixture(scope="module")
@@ -293,7 +292,7 @@ def test_what_cannot_be_used_ends_in_one_line(field, tmp_path):
 )
 def test_wrong_settings_are_named(override, message):
     with pytest.raises(ConfigError, match=message):
-        load_stage("from_stars", ["dataset=from_stars", override])
+        load_stage(from_stars.stage.reads, ["dataset=from_stars", override])
 
 
 @pytest.mark.slow
@@ -332,7 +331,7 @@ def test_target_from_stars_example_is_planned(tmp_path):
 def test_one_command_beats_the_noisy_star_and_the_baseline(tmp_path):
     """Show 4: 300 bright stars, 16 × 16 px, held-out stars at S/N 10, minutes of one core."""
     image, catalogue, out = (tmp_path / name for name in ("i.fits", "s.csv", "model"))
-    made = example_stage.run(image, catalogue, seed=1)
+    made = example_stage.write_example(image, catalogue, seed=1)
     words = ["from-stars", image, "--catalogue", catalogue, "--out", out]
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     subprocess.run([sys.executable, "-m", "psfdae", *map(str, words)], check=True)
@@ -352,7 +351,7 @@ def test_one_command_beats_the_noisy_star_and_the_baseline(tmp_path):
     test = split_stars(product, "held_out", config).test
     level = min(config.noise.levels, key=lambda v: abs(v - noisy.noise[ten]))
     drawn = noise_model(config).draw(product["realisation"][test], level, stream(9, "exact"))
-    estimate = predict(network(bundle), drawn, bundle.info.image_scale)
+    estimate = estimator(bundle).predict(drawn)
     row = product["row"][product["field_index"][test]]
     exact = [best_match(made.psf[r], e) for r, e in zip(row, estimate, strict=True)]
     assert np.mean(exact) < dae.mse[ten]

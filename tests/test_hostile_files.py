@@ -328,7 +328,7 @@ def test_columns_of_fits_tables_are_what_astropy_reads(tmp_path):
 def signed(path, change=lambda info: None, **arrays):
     """The shipped bundle with another description and other arrays."""
     bundle = read_bundle()
-    tensors, info = module._tensors(bundle), bundle.info.model_dump(mode="json")
+    tensors, info = module._tensors(bundle), bundle.info.described()
     for name, make in arrays.items():
         tensors[name] = np.asarray(make(tensors[name]))
     path.write_bytes(module.packed(change(info) or info, tensors))

@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 import struct
 import warnings
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
+import tqdm
 from astropy.io import fits
 from astropy.table import Table
 from click.testing import CliRunner
@@ -124,7 +126,7 @@ def test_chunks_and_threads_do_not_show(folder, monkeypatch):
     for rows, threads in ((engine.BLOCK, 1), (4 * engine.BLOCK, 2), (engine.BLOCK, 3)):
         monkeypatch.setattr(stage, "ROWS", rows)
         out = folder / f"rows{rows}_{threads}.fits"
-        stage.run(stage.Source(folder / "cube.fits"), out, threads=threads)
+        stage.predict(folder / "cube.fits", stage.Stated(), threads=threads, out=out)
         files.append(out.read_bytes())
     assert files[0] == files[1] == files[2]
 
@@ -219,7 +221,7 @@ def bad(folder):
         (["plain.fits", "--catalogue", "sky.csv"], "plain.fits", ["WCS"]),
         (["image.fits", "--catalogue", "empty.csv"], "empty.csv", []),
         (["image.fits", "--catalogue", "outside.csv"], "outside.csv", ["none of the 2 stars"]),
-        (["cube.fits", "--model", "newer.psf.safetensors"], "newer.psf", ["format 99", "format 1"]),
+        (["cube.fits", "--model", "newer.psf.safetensors"], "newer.psf", ["format 99", "format 2"]),
         (["cube.fits", "--model", "cube.npy"], "cube.npy", []),
         (["cube.fits", "--flux-column", "flux"], "cube.fits", ["no catalogue"]),
         (["image.fits", "--catalogue", "stars.csv", "--flux-column", "f"], "stars.csv", ["'f'"]),
@@ -255,7 +257,7 @@ def test_failure_in_the_middle_leaves_no_file(folder, tmp_path, monkeypatch):
 
     monkeypatch.setattr(engine.Engine, "block", fail)
     with pytest.raises(MemoryError):
-        stage.run(stage.Source(folder / "cube.fits"), tmp_path / "psf.fits")
+        stage.predict(folder / "cube.fits", stage.Stated(), out=tmp_path / "psf.fits")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -282,12 +284,19 @@ def test_memory_does_not_grow_with_the_stars(folder, monkeypatch):
     monkeypatch.setattr(stage.Observation, "chunks", counted)
     done = []
 
-    def tick(stars):
-        done.append(stars)
-        alive.discard(len(done) - 1)
+    class Bar(nullcontext):
+        def __enter__(self):
+            return self
 
-    out = folder / "few.fits"
-    stage.run(stage.Source(folder / "cube.fits"), out, threads=2, tick=tick)
+        def reset(self, stars):
+            assert stars == 300
+
+        def update(self, stars):
+            done.append(stars)
+            alive.discard(len(done) - 1)
+
+    monkeypatch.setattr(tqdm, "tqdm", lambda **options: Bar())
+    stage.predict(folder / "cube.fits", stage.Stated(), threads=2, out=folder / "few.fits")
     assert sum(done) == 300
     assert most <= 4
 

@@ -12,6 +12,7 @@ import pytest
 import yaml
 
 from psfdae.configuration.compose import compose, load, load_stage, stage_tree
+from psfdae.configuration.sweep import point_groups
 from psfdae.estimators.pca_som import PcaSom
 from psfdae.files import Column, ProductError, write_product
 from psfdae.stages import sweep as stage
@@ -19,7 +20,7 @@ from psfdae.stages import sweep_figures, sweep_summary, track
 from psfdae.stages.alignment_methods import train_cnn
 from psfdae.stages.common import noise_model
 from psfdae.stages.fit import baseline, train
-from psfdae.stars.splits import random_split
+from psfdae.stars.fields import random_split
 from psfdae.sweeps.measured import Task
 from psfdae.sweeps.space import SweepError
 from psfdae.tracking import runs_of_sweep
@@ -61,7 +62,7 @@ class Point:
         )
 
     def run(self, *overrides, model="dae", values=None, keys=None, trial=None, source="1"):
-        config = load_stage(f"sweep_{model}", (*TINY, *overrides))
+        config = load_stage(point_groups(model), (*TINY, *overrides))
         stage.point(config, model, values or {}, keys or {}, self.task, trial, source)
         return self.result()
 
@@ -206,7 +207,8 @@ def test_cnn_is_the_main_workflow_s_and_measured_on_other_states(tmp_path):
         folder=folder,
         checkpoint=tmp_path / "sweep.pt",
     )
-    stage.point(load_stage("sweep_noise_trained", given), "noise_trained", {}, {}, task)
+    settings = load_stage(point_groups("noise_trained"), given, "alignment")
+    stage.point(settings, "noise_trained", {}, {}, task)
     config = load_stage(train_cnn.stage.reads("noise_trained"), given, "alignment")
     main = tmp_path / "main"
     train_cnn(config, "noise_trained", data["states"], tmp_path / "main.pt", main)
@@ -325,7 +327,7 @@ def test_best_of_a_sweep_that_was_not_run_says_what_to_do(tmp_path):
 def test_figures_are_drawn_with_failed_points_and_the_same_again(tmp_path, kind):
     out = summarise(tmp_path)
     for name in ("a.png", "b.png"):
-        sweep_figures.run(kind, out / "sweep.yaml", out / "summary.csv", tmp_path / name)
+        sweep_figures.sweep_figure(kind, out / "sweep.yaml", out / "summary.csv", tmp_path / name)
     image = (tmp_path / "a.png").read_bytes()
     assert image.startswith(b"\x89PNG")
     assert image == (tmp_path / "b.png").read_bytes()

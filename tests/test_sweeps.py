@@ -120,7 +120,7 @@ def test_points_are_measured_at_the_dataset_s_levels_whatever_they_train_on():
         ({"colour": "blue"}, "colour: unknown key"),
         ({"trials": 5}, "trials: random and adaptive sweeps need it"),
         ({"kind": "random"}, "trials: random and adaptive sweeps need it"),
-        ({"dataset": None}, "dataset: dae and pca_som need one"),
+        ({"dataset": None}, "dataset: methods need one"),
         ({"model": "original"}, "dataset: .* scene 3's CNNs have none"),
         ({"metric": "validation_mae"}, "model dae has validation_mse or validation_ssim"),
         ({"space": {}}, "space = {}"),

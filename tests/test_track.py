@@ -209,7 +209,7 @@ def test_unreachable_server_costs_a_message(site, monkeypatch, capsys, refuses):
         assert site.track() == {"dae": "not sent", "baseline": "not sent"}
     out = capsys.readouterr().out
     assert "http://127.0.0.1" in out
-    assert "Not sent: dataset3 random template dae, dataset3 random template baseline" in out
+    assert "Not sent: dataset3 random template baseline, dataset3 random template dae" in out
     assert site.sizes()["runs"] == 0
 
 
@@ -217,7 +217,7 @@ def test_unreachable_server_costs_a_message(site, monkeypatch, capsys, refuses):
 @pytest.mark.parametrize("name", ["model", "config", "history", "stars", "baseline"])
 def test_missing_or_damaged_file_is_named(tmp_path, name, damage):
     stars = write_tree(tmp_path)
-    dae, baseline = runs_of_datasets(tmp_path, stars)
+    baseline, dae = runs_of_datasets(tmp_path, stars)
     path = {
         "model": dae.files["model/dae.safetensors"],
         "config": dae.files["model/config.yaml"],
@@ -251,16 +251,16 @@ def test_unfinished_trainings_and_other_datasets_are_passed_over(tmp_path):
 
 def test_config_hash_knows_the_stars_but_not_the_attempt(tmp_path):
     stars = write_tree(tmp_path)
-    first = runs_of_datasets(tmp_path, stars)[0]
+    first = runs_of_datasets(tmp_path, stars)[1]
     config = first.files["model/config.yaml"]
     tree = yaml.safe_load(config.read_text())
     config.write_text(yaml.safe_dump({**tree, "attempt": 2}))
-    attempt = runs_of_datasets(tmp_path, stars)[0]
+    attempt = runs_of_datasets(tmp_path, stars)[1]
     assert attempt.config_hash == first.config_hash
     assert attempt.content_hash != first.content_hash
     scene = {"seed": 7, "scene": {"experiment": "scene1"}, "telescope": {"diameter_m": 2.0}}
     write_product(stars["dataset3"], "stars", {"a": Column(np.ones(2), "1", "")}, scene)
-    assert runs_of_datasets(tmp_path, stars)[0].config_hash != first.config_hash
+    assert runs_of_datasets(tmp_path, stars)[1].config_hash != first.config_hash
 
 
 def test_moved_results_are_refused(site):

@@ -12,11 +12,9 @@ from typing import Any, NamedTuple
 
 from psfdae.alignment.methods import CNNS
 from psfdae.belonging import STARS, require_origin
+from psfdae.estimators import HISTORY, Method, method, registered
 from psfdae.files import ProductError, read_product
 from psfdae.reading import number, read_csv, read_yaml
-
-METHODS = {"dae": "dae", "baseline": "pca_som"}
-"""Kind of a run, and its name in the column `method` of an evaluation."""
 
 NETWORKS = {"dae": "dae.safetensors", **dict.fromkeys(CNNS, "cnn.safetensors")}
 """Networks of scene 3 and the files of their weights."""
@@ -24,16 +22,8 @@ NETWORKS = {"dae": "dae.safetensors", **dict.fromkeys(CNNS, "cnn.safetensors")}
 STATISTICS = ("mean_abs_error", "bias", "variance")
 
 SUMMARY_FILES = ("summary.csv", "cost.csv", "best.yaml", "sweep.yaml")
-MODEL_FILES = ("dae.safetensors", "cnn.safetensors", "pca_som.h5", "config.yaml")
-POINT_FILES = (
-    "result.json",
-    "cost.json",
-    "evaluation.csv",
-    "validation.csv",
-    *MODEL_FILES,
-    "history.csv",
-)
-"""Files that a point of a sweep may have; a failed one has the first two only."""
+POINT_FILES = ("result.json", "cost.json", "evaluation.csv", "validation.csv")
+"""Files that a point of a sweep may have beside its model; a failed one has the first."""
 
 CONTENT = 1
 """Goes into every content hash: raise it when what is taken from the files changes."""
@@ -98,9 +88,9 @@ def runs_of_datasets(results: Path, datasets: Mapping[str, Path]) -> list[Run]:
     """Finished runs of some datasets.
 
     An evaluation is the last file of a run, so it is what counts: models still in
-    training are passed over. The baseline is fitted once per split but measured
-    against every reference; each of these measurements is a run, so that the
-    metrics of a baseline and a network with the same tags can be compared.
+    training are passed over. A method that is fitted once for both references is measured
+    against each of them; each of these measurements is a run, so that the metrics of all
+    methods with the same tags can be compared.
 
     Parameters
     ----------
@@ -123,19 +113,17 @@ def runs_of_datasets(results: Path, datasets: Mapping[str, Path]) -> list[Run]:
             split, reference = path.stem.split("-", 1)
             key = {"dataset": dataset, "split": split, "reference": reference}
             figures = _figures(results / "figures" / dataset, split, reference)
-            for kind, source in (
-                ("dae", f"dae/{dataset}/{path.stem}"),
-                ("baseline", f"pca_som/{dataset}/{split}.h5"),
-            ):
-                runs.append(_of_stars(results, kind, key, source, stars, path, figures))
+            measured = {row["method"] for row in read_csv(path, "method")}
+            for kind in registered():
+                if kind.stored and kind.name in measured:
+                    runs.append(_of_stars(results, kind, key, stars, path, figures))
     return runs
 
 
 def _of_stars(
     results: Path,
-    kind: str,
+    kind: type[Method],
     key: dict[str, str],
-    source: str,
     stars: Path,
     evaluation: Path,
     figures: Mapping[str, Path],
@@ -145,50 +133,51 @@ def _of_stars(
     Its config is that of the model together with that of its stars: a network trained on
     the stars of another telescope is another run.
     """
+    source = kind.place(**key)
     model = results / source
-    weights = model / "dae.safetensors" if kind == "dae" else model
-    files = {f"model/{weights.name}": weights, "evaluation.csv": evaluation}
-    if kind == "dae":
-        files |= {"model/config.yaml": model / "config.yaml", "history.csv": model / "history.csv"}
-    files |= figures
+    files = _model_files(kind, model) | {"evaluation.csv": evaluation} | figures
     contents = _contents(files)
     product = read_product(stars, "stars", ())
     require_origin(model, STARS, product)
-    if kind == "dae":
-        own = read_yaml(model / "config.yaml")
-        # Which start succeeded is an outcome, not a setting.
-        own.pop("attempt", None)
-        epochs = _epochs(model / "history.csv", "train_mse", "validation_mse")
-    else:
-        own, epochs = read_product(model, "pca_som", ()).config, []
+    own = kind.described(model)
+    # Which start succeeded is an outcome, not a setting.
+    own.pop("attempt", None)
+    epochs = []
+    if HISTORY in kind.diagnostics:
+        epochs = _epochs(kind.beside(model, HISTORY), "train_mse", "validation_mse")
     try:
         experiment = str(product.config["scene"]["experiment"])
     except (KeyError, TypeError):
         raise ProductError(f"{stars}: its config has no scene.experiment") from None
-    start_ms, end_ms = _span_ms(weights, epochs)
+    start_ms, end_ms = _span_ms(kind.outputs(model)[0], epochs)
     points = _epoch_points(epochs, start_ms)
-    tested = len(points)
     for row in read_csv(evaluation, "method", "noise_level", "metric", "value", "stderr"):
-        if row["method"] == METHODS[kind]:
+        if row["method"] == kind.name:
             metric, level = row["metric"], f"{number(evaluation, row['noise_level']):g}"
             for name, column in ((metric, "value"), (f"{metric}_stderr", "stderr")):
                 value = number(evaluation, row[column])
                 points.append(Point(f"test_{name}_{level}", value, 0, end_ms))
-    if len(points) == tested:
-        raise ProductError(f"{evaluation}: no rows of method {METHODS[kind]!r}")
     return _run(
         files,
         contents,
         {**product.config, **own},
         points,
         **key,
-        kind=kind,
+        kind=kind.kind,
         source=source,
-        name=" ".join([*key.values(), kind]),
+        name=" ".join([*key.values(), kind.kind]),
         experiment=experiment,
         start_ms=start_ms,
         end_ms=end_ms,
     )
+
+
+def _model_files(kind: type[Method], place: Path) -> dict[str, Path]:
+    """Files of a fit by their names within the run; `model/` is what the method loads."""
+    own = [place / name for name in kind.files] or [place]
+    return {f"model/{path.name}": path for path in own} | {
+        name: kind.beside(place, name) for name in kind.diagnostics
+    }
 
 
 def _figures(folder: Path, split: str, reference: str) -> dict[str, Path]:
@@ -223,16 +212,15 @@ def runs_of_alignment(results: Path) -> list[Run]:
     return [_of_states(results / "alignment" / kind, errors, figures) for kind in NETWORKS]
 
 
+def _network_files(folder: Path, weights: str) -> dict[str, Path]:
+    model = {f"model/{name}": folder / name for name in (weights, "config.yaml")}
+    return {**model, "history.csv": folder / "history.csv"}
+
+
 def _of_states(folder: Path, errors: Path, figures: Mapping[str, Path]) -> Run:
     kind = folder.name
     weights = NETWORKS[kind]
-    files = {
-        f"model/{weights}": folder / weights,
-        "model/config.yaml": folder / "config.yaml",
-        "history.csv": folder / "history.csv",
-        "evaluation.csv": errors,
-        **figures,
-    }
+    files = {**_network_files(folder, weights), "evaluation.csv": errors, **figures}
     contents = _contents(files)
     config = read_yaml(folder / "config.yaml")
     config.pop("attempt", None)
@@ -273,7 +261,14 @@ def runs_of_sweep(results: Path, name: str) -> list[Run]:
     ProductError
         If the sweep has no summary, or a point no result.
     """
+    from psfdae.configuration.sweep import CNNS
     from psfdae.stages.sweep import read_cost, read_result
+    from psfdae.sweeps.method_point import place_of
+
+    def model_files(model: str, place: Path) -> dict[str, Path]:
+        if model in CNNS:
+            return _network_files(place, NETWORKS[model])
+        return _model_files(method(model), place_of(method(model), place))
 
     folder = results / "sweeps" / name
     summary = folder / "summary.csv"
@@ -284,9 +279,9 @@ def runs_of_sweep(results: Path, name: str) -> list[Run]:
     points = []
     for row in read_csv(summary, "point", "status"):
         place = folder / "points" / row["point"]
-        found = [file for file in POINT_FILES if (place / file).is_file()]
-        files = {f"model/{f}" if f in MODEL_FILES else f: place / f for f in found}
         result = read_result(place / "result.json")
+        files = {file: place / file for file in POINT_FILES} | model_files(result["model"], place)
+        files = {file: path for file, path in files.items() if path.is_file()}
         contents = _contents(files)
         end_ms = int((place / "result.json").stat().st_mtime * 1000)
         start_ms = end_ms - int(1000 * read_cost(place)["seconds"])

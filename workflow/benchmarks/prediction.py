@@ -104,7 +104,11 @@ def bare_rate(model, stamps, threads, way):
     from psfdae.own_stars.model import BLOCK, one_thread_each
     from psfdae.threads import side_by_side
 
-    side, factor, network = model.info.stamp_px, model.info.image_scale, model.engine.network
+    side, factor, network = (
+        model.info.stamp_px,
+        model.info.image_scale,
+        model.engine.estimator.network,
+    )
     mean = model.bundle.flux_model.mean.reshape(1, side, side).astype(np.float32)
     images = np.repeat(mean, min(BARE_STAMPS, stamps), axis=0)
     rounds = -(-stamps // len(images))

@@ -2,51 +2,50 @@
 SHIPPED_DATASET = "field"
 
 
-rule bundle:
-    input:
-        stars=lambda w: stars_of(w.dataset),
-        model=lambda w: [str(p) for p in method("dae").outputs(packed(w))],
-    output:
-        f"{RESULTS}/bundles/{{dataset}}-{{split}}-{{reference}}.psf.safetensors",
-    log:
-        f"{RESULTS}/logs/bundles/{{dataset}}-{{split}}-{{reference}}.log",
-    benchmark:
-        f"{RESULTS}/benchmarks_on_request/bundles/{{dataset}}-{{split}}-{{reference}}.tsv"
-    threads: lambda w: dataset_config(w.dataset).evaluation.threads
-    resources:
-        mem_mb=1500,
-        runtime=10,
-    params:
-        config=lambda w: stage_overrides("bundle", f"dataset={w.dataset}"),
-        source=source_hash("psfdae.stages.bundle"),
-        dae=lambda w: packed(w),
-    message:
-        "Packing the DAE of {wildcards.dataset}, {wildcards.split}, {wildcards.reference}"
-    shell:
-        "psfdae bundle --stars {input.stars} --dae {params.dae} --split {wildcards.split}"
-        " --licence MIT --out {output} {params.config:q} > {log} 2>&1"
+for _method in (m for m in registered() if m.stored and m.bundled):
+    _stem = f"{{dataset}}-{{split}}-{{reference}}{_method.suffix}"
+
+    rule:
+        name:
+            f"bundle{_method.suffix}".replace("-", "_")
+        input:
+            stars=lambda w: stars_of(w.dataset),
+            model=lambda w, m=_method: files_of(m, w.dataset, w.split, w.reference),
+        output:
+            f"{RESULTS}/bundles/{_stem}.psf.safetensors",
+        log:
+            f"{RESULTS}/logs/bundles/{_stem}.log",
+        benchmark:
+            f"{RESULTS}/benchmarks_on_request/bundles/{_stem}.tsv"
+        threads: lambda w: dataset_config(w.dataset).evaluation.threads
+        resources:
+            mem_mb=1500,
+        params:
+            config=lambda w: settings("bundle", f"dataset={w.dataset}"),
+            source=source_hash("bundle", chosen=[f"psfdae.estimators.{_method.name}"]),
+            model=lambda w, m=_method: option_of(m, w.dataset, w.split, w.reference),
+        message:
+            f"Packing {_method.label} of {{wildcards.dataset}}, {{wildcards.split}}, {{wildcards.reference}}"
+        shell:
+            "psfdae bundle --config {params.config} --stars {input.stars} {params.model}"
+            " --split {wildcards.split} --reference {wildcards.reference} --licence MIT"
+            " --out {output} > {log} 2>&1"
 
 
 rule bundles:
     input:
-        expand(
-            rules.bundle.output,
-            dataset=default_datasets(),
-            split="random",
-            reference="realisation",
-        ),
+        lambda w: [
+            path
+            for dataset in default_datasets()
+            for path in bundles_of(dataset, [("random", "realisation")])
+        ],
     localrule: True
 
 
 # The shipped model is committed, so nothing but an explicit request renews it.
 rule shipped:
     input:
-        expand(
-            rules.bundle.output,
-            dataset=SHIPPED_DATASET,
-            split="random",
-            reference="realisation",
-        ),
+        f"{RESULTS}/bundles/{SHIPPED_DATASET}-random-realisation.psf.safetensors",
     output:
         touch(f"{RESULTS}/.shipped_renewed"),
     log:

@@ -2,20 +2,12 @@ import json
 
 from snakemake.exceptions import WorkflowError
 
-from psfdae.configuration.sweep import sweep_names
-from psfdae.stages.sweep import ADAPTIVE_MODULE, POINT_MODULES
+from psfdae.configuration.sweep import CNNS, sweep_names
+from psfdae.stages.sweep import ADAPTIVE_MODULE, module_of
 from psfdae.sweeps.points import plan_sweep
 
 SWEEPS = f"{RESULTS}/sweeps"
 SWEEP_FIGURES = ["parallel", "response"]
-
-# Group with the threads of each model's training.
-SWEEP_TRAINING = {
-    "dae": "train",
-    "pca_som": "baseline",
-    "original": "train_original",
-    "noise_trained": "train_noise_trained",
-}
 
 
 @cache
@@ -53,9 +45,8 @@ def sweep_known(w):
 
 
 def sweep_threads(w):
-    point, model = sweep_point_of(w), sweep_plan(w.sweep).sweep.model
-    training = point.config[SWEEP_TRAINING[model]]["threads"]
-    return max(training, point.config["evaluation"]["threads"])
+    groups = [g for g in sweep_point_of(w).config.values() if isinstance(g, dict)]
+    return max(group.get("threads", 1) for group in groups)
 
 
 def sweep_options(w):
@@ -81,9 +72,8 @@ def sweep_source(name):
     """Code that a point consists of: its model's, and the search's if there is one."""
     sweep = sweep_plan(name).sweep
     search = [ADAPTIVE_MODULE] if sweep.kind == "adaptive" else []
-    return source_hash(
-        "psfdae.stages.sweep", chosen=[POINT_MODULES[sweep.model], *search]
-    )
+    own = [] if sweep.model in CNNS else [f"psfdae.estimators.{sweep.model}"]
+    return source_hash("sweep point", chosen=[module_of(sweep.model), *own, *search])
 
 
 def sweep_results(w):

@@ -14,7 +14,7 @@ rule example_field:
         mem_mb=500,
         runtime=10,
     params:
-        source=source_hash("psfdae.stages.example_field"),
+        source=source_hash("example-field"),
     message:
         "Simulating an image of a star field"
     shell:
@@ -38,21 +38,20 @@ rule own_stars:
         f"{RESULTS}/logs/own_stars/model.log",
     benchmark:
         f"{RESULTS}/benchmarks_on_request/own_stars/model.tsv"
-    threads: lambda w: dataset_config(OWN_STARS).train.threads
+    threads: lambda w: fit_threads(OWN_STARS)
     resources:
         mem_mb=1500,
         runtime=30,
     params:
-        config=lambda w: stage_overrides("from_stars", f"dataset={OWN_STARS}"),
-        free=lambda w, threads: free_overrides("from_stars", f"dataset={OWN_STARS}"),
-        source=source_hash("psfdae.stages.from_stars"),
+        config=lambda w: settings("from-stars", f"dataset={OWN_STARS}"),
+        source=lambda w: estimators_source("from-stars", OWN_STARS),
         folder=subpath(output.bundle, parent=True),
     message:
         "Training on the bright stars of the image"
     shell:
-        "psfdae from-stars {input.image} --catalogue {input.catalogue} --name example"
-        " --licence MIT --overwrite --out {params.folder} {params.config:q}"
-        " {params.free:q} > {log} 2>&1"
+        "psfdae from-stars {input.image} --config {params.config} --name example"
+        " --catalogue {input.catalogue} --licence MIT --overwrite --out {params.folder}"
+        " > {log} 2>&1"
 
 
 rule from_stars_example:

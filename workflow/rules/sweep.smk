@@ -76,7 +76,7 @@ rule sweep_summary:
     params:
         given=GIVEN,
         definition=lambda w: sweep_plan(w.sweep).sweep.model_dump_json(),
-        source=source_hash("psfdae.stages.sweep_summary"),
+        source=source_hash("sweep summary"),
         points=lambda w: f"{SWEEPS}/{w.sweep}/points",
         folder=subpath(output.summary, parent=True),
     message:
@@ -107,7 +107,7 @@ rule figure_sweep:
     resources:
         mem_mb=500,
     params:
-        source=source_hash("psfdae.stages.sweep_figures"),
+        source=source_hash("sweep figure"),
     message:
         "Drawing the figure {wildcards.sweep_figure} of sweep {wildcards.sweep}"
     shell:

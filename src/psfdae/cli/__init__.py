@@ -25,6 +25,18 @@ import psfdae
 File = Annotated[Path, click.Path(path_type=Path, dir_okay=False)]
 Folder = Annotated[Path, click.Path(path_type=Path, file_okay=False)]
 AboveZero = click.FloatRange(min=0, min_open=True)
+
+
+class NameOrNumber(click.ParamType):
+    """An extension of a FITS file: its number, in plain digits, or its name."""
+
+    name = "text"
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> str | int:
+        """A number from digits; any other text as it is."""
+        return int(value) if re.fullmatch("[0-9]{1,6}", str(value)) else value
+
+
 Split = Literal["random", "held_out"]
 Reference = Literal["realisation", "template"]
 
@@ -46,17 +58,20 @@ class Stage:
     name: str
     reads: tuple[str, ...] | Callable[..., tuple[str, ...]]
     root: Literal["config", "alignment"]
+    start: tuple[str, ...] = ()
 
 
 def command(
     name: str,
     reads: tuple[str, ...] | Callable[..., tuple[str, ...]] = (),
     root: Literal["config", "alignment"] = "config",
+    start: tuple[str, ...] = (),
 ) -> Callable[..., Any]:
     """Make a function the command `psfdae NAME`.
 
     A parameter `config` receives the groups of the configuration in `reads`, checked, from
-    trailing overrides or a file of settings; which groups may depend on the options. Other
+    trailing overrides, those of `start` before them, or a file of settings; which groups may
+    depend on the options. Other
     parameters are options: required without a default, repeatable as `tuple[X, ...]`, a
     flag as bool, all fields of a dataclass. `Annotated` adds help (a text), a click type,
     or a dict of what click's option takes, where "flag" names it and "argument" makes it
@@ -64,7 +79,7 @@ def command(
     """
 
     def mark(function: Callable[..., Any]) -> Callable[..., Any]:
-        function.stage = Stage(name, reads, root)  # type: ignore[attr-defined]
+        function.stage = Stage(name, reads, root, start)  # type: ignore[attr-defined]
         return function
 
     return mark
@@ -110,16 +125,14 @@ class Commands(Careful):
         size = len(self.prefix.split())
         names = [name.split() for name in found()]
         words = {w[size] for w in names if w[:size] == self.prefix.split() and w[size:]}
-        return sorted(words | set(self.commands))
+        return sorted(words)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """A group, or the command of a stage, whose module is imported now."""
         name = f"{self.prefix} {cmd_name}".strip()
         if name in GROUPS:
-            old = self.commands.get(cmd_name)
-            more = old.commands if isinstance(old, click.Group) else {}
-            return Commands(name, name=cmd_name, help=GROUPS[name], commands=more)
-        return as_click(stage(name)) if name in found() else self.commands.get(cmd_name)
+            return Commands(name, name=cmd_name, help=GROUPS[name])
+        return as_click(stage(name)) if name in found() else None
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """As click does, with help from the modules' text."""
@@ -166,8 +179,6 @@ def _about(name: str) -> str:
     """First paragraph of a command's help, nothing being imported."""
     if name in GROUPS:
         return GROUPS[name]
-    if name not in found():
-        return main.commands[name].help or ""
     for node in ast.parse(found()[name].read_text(encoding="utf-8")).body:
         for call in getattr(node, "decorator_list", []):
             if isinstance(call, ast.Call) and ast.unparse(call).startswith(f"command('{name}'"):
@@ -220,7 +231,7 @@ def _settings(
 
     reads = spec.reads(**given) if callable(spec.reads) else spec.reads
     if file is None:
-        return load_stage(reads, overrides, spec.root)
+        return load_stage(reads, (*spec.start, *overrides), spec.root)
     if overrides:
         raise click.UsageError("--config and overrides exclude each other")
     return load_settings(file, reads, spec.root)
@@ -271,12 +282,3 @@ def _unfolded(hint: Any) -> tuple[Any, dict[str, Any]]:
             return kind, {**attributes, "multiple": True}
         return tuple(_unfolded(part)[0] for part in inner), {}
     return hint, {}
-
-
-# The commands that are not yet in the stages.
-from psfdae.cli import (  # noqa: E402, F401
-    bundle,
-    from_stars,
-    predict,
-    sweep,
-)

@@ -170,10 +170,3 @@ class AlignmentConfig(Group):
     train_dae_retrained: CnnTrain
     evaluation: Evaluation
     fit: Fit
-
-
-ALIGNMENT_STAGE_KEYS: dict[str, tuple[str, ...]] = {
-    "sweep_original": ("seed", "noise", "cnn", "train_original", "evaluation"),
-    "sweep_noise_trained": ("seed", "noise", "cnn", "train_noise_trained", "evaluation"),
-}
-"""The groups that the points of a sweep read; other stages say theirs themselves."""

@@ -21,13 +21,6 @@ STAGE_KEYS: dict[str, tuple[str, ...]] = {
     "baseline": ("seed", "noise", "parts", "baseline"),
     "train": ("seed", "noise", "parts", "dae", "train"),
     "evaluate": ("seed", "noise", "parts", "evaluation", "methods"),
-    "bundle": ("seed", "noise", "parts", "evaluation"),
-    "from_stars": (
-        *("seed", "calibration_stars", "framing", "noise", "parts"),
-        *("dae", "train", "baseline", "evaluation", "methods"),
-    ),
-    "sweep_dae": ("seed", "noise", "parts", "dae", "train", "evaluation"),
-    "sweep_pca_som": ("seed", "noise", "parts", "baseline", "evaluation"),
 }
 """The groups that each stage reads; nothing else can influence its result."""
 

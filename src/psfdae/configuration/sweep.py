@@ -5,26 +5,38 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from psfdae.configuration.base import Count, Finite, Group, Name
 from psfdae.configuration.compose import ConfigError, Root, config_dir, load_file
 from psfdae.configuration.schema import Reference, SplitKind
+from psfdae.estimators import groups_of, method, registered
 
 Scalar = bool | int | float | str
 Value = Scalar | list[Scalar]
 
 AxisName = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_.]*$")]
-Model = Literal["dae", "pca_som", "original", "noise_trained"]
 Metric = Literal["validation_mse", "validation_ssim", "validation_mae"]
 
-VARIED: dict[Model, tuple[str, ...]] = {
-    "dae": ("dae", "train", "noise.levels"),
-    "pca_som": ("baseline", "noise.levels"),
+CNNS = {
     "original": ("cnn", "train_original"),
     "noise_trained": ("cnn", "train_noise_trained", "noise.levels"),
 }
-"""What a sweep of a model may change; all points share their stars and their parts."""
+"""CNNs of scene 3 that a sweep may train, and what it may change of them."""
+
+
+def models() -> tuple[str, ...]:
+    """What a sweep may train: methods that are fitted to a file, and CNNs of scene 3."""
+    return (*(kind.name for kind in registered() if kind.stored), *CNNS)
+
+
+def _trainable(name: str) -> str:
+    if name not in models():
+        raise ValueError(f"{name!r} is not one of {', '.join(models())}")
+    return name
+
+
+Model = Annotated[str, AfterValidator(_trainable)]
 
 METRICS: dict[Root, tuple[Metric, ...]] = {
     "config": ("validation_mse", "validation_ssim"),
@@ -106,7 +118,7 @@ class Sweep(Group):
     kind: Literal["grid", "random", "adaptive"] = Field(
         description="Every combination, random draws, or draws that learn from earlier ones"
     )
-    model: Model = Field(description="DAE, PCA+SOM, or one of scene 3's CNNs")
+    model: Model = Field(description="Method, or one of scene 3's CNNs")
     dataset: Name | None = Field(default=None, description="Dataset; none for scene 3's CNNs")
     split: SplitKind = Field(default="random", description="Split of the stars")
     reference: Reference = Field(default="realisation", description="What the DAE is to restore")
@@ -126,19 +138,24 @@ class Sweep(Group):
     @property
     def root(self) -> Root:
         """Root of the configuration that the model is part of."""
-        return "config" if self.model in ("dae", "pca_som") else "alignment"
+        return "alignment" if self.model in CNNS else "config"
 
     @property
-    def stage(self) -> str:
-        """Name of the model's entry in the table of stages."""
-        return f"sweep_{self.model}"
+    def reads(self) -> tuple[str, ...]:
+        """Groups of the configuration that decide a point."""
+        return point_groups(self.model)
+
+    @property
+    def varied(self) -> tuple[str, ...]:
+        """Keys and groups that may differ; all points share their stars and their parts."""
+        return CNNS.get(self.model) or (*method(self.model).groups, "noise.levels")
 
     @model_validator(mode="after")
     def _fits_together(self) -> Sweep:
         if (self.kind == "grid") != (self.trials is None):
             raise ValueError("trials: random and adaptive sweeps need it, a grid has none")
         if (self.root == "config") != (self.dataset is not None):
-            raise ValueError("dataset: dae and pca_som need one, scene 3's CNNs have none")
+            raise ValueError("dataset: methods need one, scene 3's CNNs have none")
         if self.metric not in METRICS[self.root]:
             allowed = " or ".join(METRICS[self.root])
             raise ValueError(f"metric = {self.metric}: model {self.model} has {allowed}")
@@ -157,7 +174,7 @@ class Sweep(Group):
 
     @model_validator(mode="after")
     def _keys_fit(self) -> Sweep:
-        allowed = VARIED[self.model]
+        allowed = self.varied
         keys = list(self.overrides)
         for name, axis in self.space.items():
             # A range has the same keys at every value.
@@ -169,6 +186,13 @@ class Sweep(Group):
             if keys.count(key) > 1:
                 raise ValueError(f"{key}: set more than once")
         return self
+
+
+def point_groups(model: str) -> tuple[str, ...]:
+    """Groups of the configuration that a point of a model reads."""
+    if model in CNNS:
+        return ("seed", "noise", "cnn", f"train_{model}", "evaluation")
+    return (*groups_of(model), "evaluation")
 
 
 def sweep_names() -> list[str]:

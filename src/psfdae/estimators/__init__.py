@@ -36,6 +36,7 @@ from psfdae.stars.noise import NoiseModel, mixed_levels
 
 if TYPE_CHECKING:
     from psfdae.configuration.schema import Evaluation
+    from psfdae.own_stars.bundle import BundleInfo
 
 CONFIG, HISTORY = "config.yaml", "history.csv"
 """Resolved configuration and course of a training, in the folder of a network."""
@@ -144,6 +145,10 @@ class Method:
         Name of its rule, and of its runs in MLflow.
     about : str
         What a fit leaves, for the help of commands.
+    bundled : bool
+        Packed as a model that `psfdae predict` takes.
+    suffix : str
+        Ends the names of its bundles.
     memory_mb, minutes : int
         What a fit takes at most.
     """
@@ -166,6 +171,8 @@ class Method:
     rule: ClassVar[str]
     kind: ClassVar[str]
     about: ClassVar[str]
+    bundled: ClassVar[bool] = True
+    suffix: ClassVar[str]
     memory_mb: ClassVar[int] = 1000
     minutes: ClassVar[int] = 30
 
@@ -183,6 +190,7 @@ class Method:
         cls.rule = own.get("rule", f"fit_{cls.name}")
         cls.kind = own.get("kind", cls.name)
         cls.about = own.get("about", f"What `psfdae fit {cls.name}` leaves.")
+        cls.suffix = own.get("suffix", f"-{cls.name}")
 
     @classmethod
     def settings(cls, config: Any) -> dict[str, Any]:
@@ -274,6 +282,24 @@ class Method:
         """A fit from its arrays and the configuration that was saved with them."""
         return cls(**arrays)
 
+    def pack(self, stamp_px: int) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Arrays for a bundle, and fields of its `BundleInfo` that say what they are."""
+        return {name: np.asarray(getattr(self, name)) for name in self.arrays}, {}
+
+    @classmethod
+    def shapes(cls, info: BundleInfo) -> Mapping[str, tuple[int, ...] | None]:
+        """Arrays that a bundle must have, with their shapes; None: any."""
+        return dict.fromkeys(cls.arrays)
+
+    @classmethod
+    def unpack(cls, arrays: Mapping[str, np.ndarray], info: BundleInfo) -> Self:
+        """A fit from a bundle."""
+        return cls.restored(arrays, info.config["train"], info.reference or "realisation")
+
+    def export(self, stamp_px: int, path: Path) -> None:
+        """Write it as ONNX, if it is a network."""
+        raise FitError(f"{self.label}: is no network, ONNX has no form for it")
+
     @classmethod
     def described(cls, place: Path) -> dict[str, Any]:
         """The resolved configuration of a fit."""
@@ -298,6 +324,11 @@ class Method:
         """
         options = {"split": split} | ({"reference": reference} if cls.per_reference else {})
         require_training(place, cls.described(place), stars, config, **options)
+
+
+def groups_of(name: str, **options: Any) -> tuple[str, ...]:
+    """Groups of the configuration that decide a fit of a method."""
+    return ("seed", "noise", "parts", *method(name).groups)
 
 
 def method(name: str) -> type[Method]:

@@ -17,8 +17,12 @@ from psfdae.reading import from_tree, read_yaml
 if TYPE_CHECKING:
     from psfdae.configuration.schema import Evaluation
     from psfdae.models.dae import Dae as Network
+    from psfdae.own_stars.bundle import BundleInfo
 
 WEIGHTS = "dae.safetensors"
+
+BLOCK_VALUES = 64 * 256 * 32**2
+"""Numbers between two layers of a bundle's network at most: 64 channels of 256 stamps."""
 
 
 class DaeSettings(Group):
@@ -83,7 +87,8 @@ class Dae(Method):
     Parameters
     ----------
     network : Network
-    settings : config group `dae`
+    scale : "mean", "none" or float
+        Of images for the network: as the setting, or the factor itself.
     batch : int
         Images per forward pass.
     attempt : int
@@ -100,18 +105,19 @@ class Dae(Method):
     files = (WEIGHTS, CONFIG)
     diagnostics = (HISTORY,)
     rule = "train"
+    suffix = ""
     about = "Folder of a trained network."
     memory_mb, minutes = 1500, 60
 
     def __init__(
         self,
         network: Network,
-        settings: DaeSettings,
+        scale: Literal["mean", "none"] | float,
         batch: int = 256,
         attempt: int = 0,
         history: list[dict[str, Any]] | None = None,
     ) -> None:
-        self.network, self.settings, self.batch, self.attempt = network, settings, batch, attempt
+        self.network, self.scale, self.batch, self.attempt = network, scale, batch, attempt
         self.diagnosed = {HISTORY: history or []}
 
     @classmethod
@@ -143,14 +149,19 @@ class Dae(Method):
         network = Network(dae.kernels, dae.widths)
         network.load_state_dict(done.result)
         network = network.to(memory_format=torch.channels_last).eval()
-        return cls(network, dae, attempt=done.attempt, history=done.history)
+        return cls(network, dae.scale, attempt=done.attempt, history=done.history)
 
     def predict(self, noisy: np.ndarray) -> np.ndarray:
         """PSFs, neither clipped nor renormalised, float32."""
-        from psfdae.models.dae import image_scale, predict
+        from psfdae.models.dae import predict
 
-        factor = image_scale(self.settings.scale, noisy.shape[-1])
-        return predict(self.network, noisy, factor, self.batch)
+        return predict(self.network, noisy, self.factor(noisy.shape[-1]), self.batch)
+
+    def factor(self, stamp_px: int) -> float:
+        """From images of sum 1 to those that the network sees."""
+        from psfdae.models.dae import image_scale
+
+        return self.scale if isinstance(self.scale, float) else image_scale(self.scale, stamp_px)
 
     def save(self, place: Path, described: Mapping[str, Any]) -> None:
         """Write weights, and the resolved configuration with the number of the start."""
@@ -178,7 +189,39 @@ class Dae(Method):
             torch.set_num_threads(evaluation.threads)
             batch = evaluation.batch
         network = with_weights(lambda: Network(settings.kernels, settings.widths), place / WEIGHTS)
-        return cls(network, settings, batch)
+        return cls(network, settings.scale, batch)
+
+    def pack(self, stamp_px: int) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Weights, and the network's shape."""
+        state = self.network.state_dict()
+        shape = {"kernels": self.network.kernels, "widths": self.network.widths}
+        arrays = {name: value.contiguous().numpy() for name, value in state.items()}
+        return arrays, {"dae": shape, "image_scale": self.factor(stamp_px)}
+
+    @classmethod
+    def shapes(cls, info: BundleInfo) -> Mapping[str, tuple[int, ...] | None]:
+        """Those of the weights."""
+        return info.dae.shapes() if info.dae else {}
+
+    @classmethod
+    def unpack(cls, arrays: Mapping[str, np.ndarray], info: BundleInfo) -> Dae:
+        """The network of a bundle, which takes as many images at once as memory should hold."""
+        import torch
+
+        from psfdae.models.dae import Dae as Network
+
+        assert info.dae is not None and info.image_scale is not None
+        network = Network(info.dae.kernels, info.dae.widths)
+        network.load_state_dict({k: torch.from_numpy(v.copy()) for k, v in arrays.items()})
+        network = network.to(memory_format=torch.channels_last).eval()
+        batch = max(1, BLOCK_VALUES // (max(info.dae.widths) * info.stamp_px**2))
+        return cls(network, float(info.image_scale), batch)
+
+    def export(self, stamp_px: int, path: Path) -> None:
+        """Write the network as ONNX and check it against torch; raises ExportError."""
+        from psfdae.models.export import export_onnx
+
+        export_onnx(self.network, self.factor(stamp_px), stamp_px, path)
 
     @classmethod
     def described(cls, place: Path) -> dict[str, Any]:

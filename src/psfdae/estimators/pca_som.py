@@ -64,6 +64,7 @@ class PcaSom(Method):
         "nodes": ("1", "map nodes in feature space"),
         "psf": ("1", "mean star image of each node's cluster"),
     }
+    bundled = False
     minutes = 20
 
     mean: np.ndarray

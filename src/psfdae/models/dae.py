@@ -56,6 +56,7 @@ class Dae(nn.Module):
 
     def __init__(self, kernels: Sequence[int], widths: Sequence[int]) -> None:
         super().__init__()
+        self.kernels, self.widths = tuple(kernels), tuple(widths)
         channels = [1, *widths, 1]
         self.layers = nn.ModuleList(
             (nn.Conv2d if outer > 1 else SingleChannelConv)(

@@ -23,21 +23,21 @@ from datetime import UTC, datetime
 from importlib.resources import files
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 import psfdae
-from psfdae.files import atomic_path
+from psfdae.estimators import Method, method
+from psfdae.files import ProductError, atomic_path
 from psfdae.models.weights import digest_of
 from psfdae.own_stars.errors import one_line
 from psfdae.own_stars.photometry import FluxModel
 
-if TYPE_CHECKING:
-    from psfdae.models.dae import Dae
-
-FORMAT_VERSION = 1  # raised when an older psfdae could no longer read what a newer one writes
+FORMAT_VERSION = 2  # raised when an older psfdae could no longer read what a newer one writes
+# Fields that one format has alone: the first knows no method but the network.
+ONLY = {1: ("dae", "image_scale"), 2: ("method", "reference")}
 SUFFIX = ".psf.safetensors"
 SHIPPED = "wfsat"  # name of the bundle that comes with the package
 FRAMING = "brightest pixel at (d/2, d/2)"  # 0-based (row, column) in stamps of side d, unjittered
@@ -109,7 +109,9 @@ class BundleInfo(_Described):
     pixel_scale_arcsec: Positive
     pixel_lambda_d: Positive | None = Field(description="None where the optics are unknown")
     normalisation: Literal["flux"] = Field("flux", description="stamps have the flux 1")
-    image_scale: Positive = Field(description="factor from normalised stamps to the network's")
+    image_scale: Positive | None = Field(
+        None, description="factor from normalised stamps to the network's"
+    )
     framing: str = FRAMING
     jitter_px: Annotated[int, Field(ge=0)]
     subpixel: bool = Field(description="stars lay anywhere in their pixels")
@@ -124,17 +126,51 @@ class BundleInfo(_Described):
     training_sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
     training_stars: Count
     source: Literal["simulated", "stars"]
-    dae: Architecture
+    dae: Architecture | None = None
+    method: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=40)] = "dae"
+    reference: Literal["realisation", "template"] | None = Field(
+        None, description="What is restored, if the method serves both"
+    )
     config: dict[str, Any] = Field(description="resolved configuration of all stages")
     metrics: list[dict[str, float]] = Field(description="errors of the test stars by noise level")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _format(cls, given: Any) -> Any:
+        """A new one is of the first format that can say what it is."""
+        if isinstance(given, Mapping) and "format_version" not in given:
+            return {**given, "format_version": 1 if "dae" in given else 2}
+        return given
+
+    @model_validator(mode="after")
+    def _of_its_format(self) -> BundleInfo:
+        first, (network, named) = self.format_version == 1, ONLY.values()
+        given = [key for key in (*network, *named) if key in self.model_fields_set]
+        wanted = network if first else named
+        if sorted(given) != sorted(wanted):
+            raise ValueError(f"format {self.format_version} has {' and '.join(wanted)}")
+        return self
+
+    @property
+    def kappa(self) -> float:
+        """Noise, as above, of the noise level λ = 1 of the training."""
+        try:
+            return float(self.config["train"]["noise"]["kappa"])
+        except (LookupError, TypeError, ValueError):
+            return 1.0
+
+    def described(self) -> dict[str, Any]:
+        """What a file of its format says."""
+        other = ONLY[2 if self.format_version == 1 else 1]
+        return self.model_dump(mode="json", exclude=set(other))
 
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
-    """A trained network, what it was trained on, and how well it does."""
+    """A fitted method, what it was fitted to, and how well it does."""
 
     info: BundleInfo
-    weights: dict[str, np.ndarray]  # state of the network, float32
+    weights: dict[str, np.ndarray]  # what `Method.pack` gives
     flux_model: FluxModel  # of the noise-free training stars; `info.components` are measured
     noise_nodes: np.ndarray  # (S,), noise at which the errors were measured, ascending
     error68: np.ndarray  # (S, d, d), half-width of 68.27 % of the errors, in units of the flux
@@ -144,18 +180,30 @@ class Bundle:
     @property
     def sha256(self) -> str:
         """Checksum of everything but the date."""
-        return _digest(self.info.model_dump(mode="json"), _tensors(self))
+        return _digest(self.info.described(), _tensors(self))
 
 
-def network(bundle: Bundle) -> Dae:
-    """The network of a bundle, ready to predict."""
-    import torch
+def estimator(bundle: Bundle) -> Method:
+    """The method of a bundle, ready to predict.
 
-    from psfdae.models.dae import Dae
-
-    model = Dae(bundle.info.dae.kernels, bundle.info.dae.widths)
-    model.load_state_dict({k: torch.from_numpy(v.copy()) for k, v in bundle.weights.items()})
-    return model.to(memory_format=torch.channels_last).eval()
+    Raises
+    ------
+    BundleError
+        If its arrays do not fit together.
+    """
+    info = bundle.info
+    found = method(info.method)
+    if info.format_version == 1:
+        return found.unpack(bundle.weights, info)
+    # Their shapes are the method's own affair: it must be able to work with them.
+    blank = np.zeros((1, info.stamp_px, info.stamp_px), np.float32)
+    try:
+        fitted = found.unpack(bundle.weights, info)
+        if fitted.estimate(blank, np.array([info.noise_max])).psf.shape != blank.shape:
+            raise ValueError("its PSFs have not the size of stamps")
+    except (ValueError, TypeError, LookupError) as error:
+        raise BundleError(f"{info.name}: damaged ({info.method}: {error})") from None
+    return fitted
 
 
 def at_noise(noise: np.ndarray, nodes: np.ndarray, maps: np.ndarray) -> np.ndarray:
@@ -233,7 +281,7 @@ def write_bundle(bundle: Bundle, path: Path) -> None:
     """Write a bundle atomically, if its parts fit together; the same one gives the same bytes."""
     tensors = _tensors(bundle)
     _check(bundle.info, tensors, path)
-    content = packed(bundle.info.model_dump(mode="json"), tensors)
+    content = packed(bundle.info.described(), tensors)
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
 
@@ -244,7 +292,7 @@ def packed(described: Mapping[str, Any], tensors: Mapping[str, np.ndarray]) -> b
 
     text = {
         "kind": KIND,
-        "format_version": FORMAT_VERSION,
+        "format_version": described["format_version"],
         "sha256": _digest(described, tensors),
         "info": described,
     }
@@ -276,9 +324,11 @@ def _tensors(bundle: Bundle) -> dict[str, np.ndarray]:
         "flux/basis": model.basis[:, -kept:],
         "error68": bundle.error68,
         "rms": bundle.rms,
-        **{f"dae/{name}": value for name, value in bundle.weights.items()},
     }
-    return {name: np.asarray(value, _dtype(name), order="C") for name, value in arrays.items()}
+    ours = {name: np.asarray(value, _dtype(name), order="C") for name, value in arrays.items()}
+    # The method's own are as they are.
+    own = {name: np.asarray(value, order="C") for name, value in bundle.weights.items()}
+    return ours | {f"{bundle.info.method}/{name}": value for name, value in own.items()}
 
 
 def _dtype(name: str) -> np.dtype:
@@ -304,7 +354,11 @@ def read_bundle(path: Path | None = None) -> Bundle:
     _check(info, tensors, path)
     return Bundle(
         info=info,
-        weights={name: tensors[f"dae/{name}"] for name in info.dae.shapes()},
+        weights={
+            name.partition("/")[2]: value
+            for name, value in tensors.items()
+            if name.startswith(f"{info.method}/")
+        },
         flux_model=_completed(tensors),
         **{name: tensors[name] for name in ("noise_nodes", "error68", "rms")},
         distance_limit=float(tensors["distance_limit"]),
@@ -378,15 +432,16 @@ def _check(info: BundleInfo, tensors: Mapping[str, np.ndarray], path: Path) -> N
         "noise_nodes": (nodes,),
         **dict.fromkeys(("error68", "rms"), (nodes, info.stamp_px, info.stamp_px)),
         "distance_limit": (),
-        **{f"dae/{name}": shape for name, shape in info.dae.shapes().items()},
     }
+    expected |= _of_method(info, tensors, path)
     if set(tensors) != set(expected):
         name = min(set(tensors) ^ set(expected))
         state = "missing" if name in expected else "unknown"
         raise BundleError(f"{path}: array {name!r} is {state}")
     for name, shape in expected.items():
         array, dtype = tensors[name], _dtype(name)
-        if array.dtype != dtype:
+        free = info.format_version > 1 and name.startswith(f"{info.method}/")
+        if array.dtype != dtype and not (free and array.dtype == np.float64):
             raise BundleError(f"{path}: array {name!r} of {array.dtype}, not {dtype}")
         if array.shape != shape:
             raise BundleError(f"{path}: array {name!r} has shape {array.shape}, not {shape}")
@@ -395,6 +450,21 @@ def _check(info: BundleInfo, tensors: Mapping[str, np.ndarray], path: Path) -> N
     _check_flux_model(info, tensors, path)
     if nodes < 1 or tensors["noise_nodes"][0] <= 0 or (np.diff(tensors["noise_nodes"]) <= 0).any():
         raise BundleError(f"{path}: noise_nodes must be positive and ascending")
+
+
+def _of_method(
+    info: BundleInfo, tensors: Mapping[str, np.ndarray], path: Path
+) -> dict[str, tuple[int, ...]]:
+    """Shapes of the method's arrays; those that are free are as they are."""
+    try:
+        shapes = method(info.method).shapes(info)
+    except ProductError as error:
+        raise BundleError(f"{path}: {error}; a newer psfdae would do") from None
+    named = {f"{info.method}/{name}": shape for name, shape in shapes.items()}
+    return {
+        name: tensors[name].shape if shape is None and name in tensors else shape or ()
+        for name, shape in named.items()
+    }
 
 
 def _check_flux_model(info: BundleInfo, tensors: Mapping[str, np.ndarray], path: Path) -> None:

@@ -17,8 +17,8 @@ from psfdae.own_stars.bundle import (
     Bundle,
     BundleInfo,
     at_noise,
+    estimator,
     mahalanobis,
-    network,
     read_bundle,
 )
 from psfdae.own_stars.photometry import Photometer
@@ -217,18 +217,15 @@ def _per_star(name: str, value: ArrayLike | None, count: int) -> np.ndarray:
 
 
 class Engine:
-    """What a bundle needs to be ready: the network and the photometry's matrices.
+    """What a bundle needs to be ready: the method and the photometry's matrices.
 
     Safe to use from several threads.
     """
 
     def __init__(self, bundle: Bundle) -> None:
         self.bundle = bundle
-        self.network = network(bundle)
-        pixels = bundle.info.stamp_px**2
-        self.size = min(BLOCK, max(1, BLOCK_PX // pixels))
-        widest = max(bundle.info.dae.widths)
-        self._images = min(self.size, max(1, BLOCK_VALUES // (widest * pixels)))
+        self.estimator = estimator(bundle)
+        self.size = min(BLOCK, max(1, BLOCK_PX // bundle.info.stamp_px**2))
         self._photometer = Photometer(bundle.flux_model, bundle.info.components)
 
     def blocks(self, stars: Stamps) -> list[Stamps]:
@@ -244,23 +241,19 @@ class Engine:
             return self._compute(stars).first(count)
 
     def _compute(self, stars: Stamps) -> Prediction:
-        from psfdae.models.dae import predict
-
         bundle, info = self.bundle, self.bundle.info
         stamps, bad, shift, flags = self._centred(stars)
         found = self._photometer.measure(stamps, bad, border_median(stamps, bad), stars)
         lost = (found.flags & StarFlag.NO_FLUX) > 0
-        if lost.all():  # such as the stars of a catalogue that reaches far beyond the image
-            psf = np.empty_like(found.images)
-        else:
-            psf = predict(self.network, found.images, info.image_scale, self._images)
-        psf[lost] = np.nan
-        shapes = measure_shapes(psf)
         noise = found.noise / np.where(lost, np.nan, found.flux)
+        psf, sigma = self._estimate(found.images, noise, lost)
+        shapes = measure_shapes(psf)
         snr = 1.0 / (noise * info.noise_equivalent_px**0.5)
         distance = mahalanobis(found.images, noise, bundle.flux_model, info.components)
         flux = found.flux.astype(np.float32)[:, None, None]
-        uncertainty = at_noise(noise, bundle.noise_nodes, bundle.error68)
+        uncertainty = sigma
+        if uncertainty is None:
+            uncertainty = at_noise(noise, bundle.noise_nodes, bundle.error68)
         psf *= flux
         uncertainty *= flux
         residual = (stamps - found.background[:, None, None]).astype(np.float32) - psf
@@ -288,6 +281,25 @@ class Engine:
             shift_y=shift[:, 0],
             flags=flags,
         )
+
+    def _estimate(
+        self, images: np.ndarray, noise: np.ndarray, lost: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray | None]:
+        """PSFs of flux 1 and, if the method knows it, their σ; NaN where there is no flux."""
+        info = self.bundle.info
+        if lost.all():  # such as the stars of a catalogue that reaches far beyond the image
+            return np.full_like(images, np.nan), None
+        if lost.any():
+            mean = self.bundle.flux_model.mean.reshape(images.shape[1:])
+            images = np.where(lost[:, None, None], mean, images).astype(images.dtype)
+        level = np.where(lost, info.noise_max, noise) / info.kappa
+        found = self.estimator.estimate(images, level)
+        parts = (found.psf, found.sigma)
+        psf, sigma = (None if x is None else np.array(x, np.float32) for x in parts)
+        for array in (psf, sigma):
+            if array is not None:
+                array[lost] = np.nan
+        return psf, sigma  # type: ignore[return-value]
 
     def _centred(self, stars: Stamps) -> tuple[np.ndarray, ...]:
         """Stamps (n, d, d), their bad pixels, their shift (row, column), and flags so far."""

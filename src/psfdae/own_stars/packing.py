@@ -24,8 +24,8 @@ COVERAGE = 0.6827  # part of the errors within ± `error68`; of a normal variabl
 LIMIT = 0.999  # part of the test stars within the limit of the Mahalanobis distance
 LEAST_STARS = 2000  # noisy images per node; few test stars are seen several times with new noise
 
-Predict = Callable[[np.ndarray], np.ndarray]
-"""The network: normalised noisy images to PSFs, both (n, d, d)."""
+Predict = Callable[[np.ndarray, float], np.ndarray]
+"""The method: normalised noisy images of a noise level λ to PSFs, both (n, d, d)."""
 
 
 @dataclass(frozen=True)
@@ -104,10 +104,11 @@ def measure_errors(
     star = np.tile(np.arange(count), -(-LEAST_STARS // count))
     error = np.empty((len(nodes), star.size, *stars.images.shape[1:]), np.float32)
     distance = np.empty((len(nodes), star.size))
-    for place, level in enumerate(nodes):
-        noisy = stars.noise.draw(stars.images[star], level / stars.noise.kappa, rng)
-        error[place] = predict(noisy) - stars.references[star]
-        distance[place] = mahalanobis(noisy, np.full(star.size, level), model, COMPONENTS)
+    for place, noise in enumerate(nodes):
+        level = noise / stars.noise.kappa
+        noisy = stars.noise.draw(stars.images[star], level, rng)
+        error[place] = predict(noisy, level) - stars.references[star]
+        distance[place] = mahalanobis(noisy, np.full(star.size, noise), model, COMPONENTS)
     return Errors(nodes, error, star, distance)
 
 
@@ -130,7 +131,7 @@ def measure_levels(
     rows = []
     for level in levels:
         noisy, noise = draw(level), stars.noise.kappa * level
-        estimate = predict(noisy)
+        estimate = predict(noisy, level)
         quality = all_metrics(estimate, stars.references, data_range)
         rows.append(
             {

@@ -1,110 +1,138 @@
-"""Stage `bundle`: a trained network with all that it takes to apply it, in one file."""
+"""Stages `bundle`, `export`, `describe` and `ship`: a fitted method in one file, for use."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 import psfdae
 from psfdae.belonging import SAME_IMAGE, SAME_STARS, STARS, require_origin
+from psfdae.cli import File, Folder, Reference, Split, command
 from psfdae.configuration.compose import as_overrides
-from psfdae.estimators import CONFIG
-from psfdae.estimators.dae import WEIGHTS, Dae
+from psfdae.configuration.schema import Config
+from psfdae.estimators import CONFIG, Method, method
 from psfdae.files import Product, ProductError
 from psfdae.own_stars import packing
 from psfdae.own_stars.bundle import (
-    Architecture,
+    SHIPPED,
+    SUFFIX,
     Bundle,
     BundleError,
     BundleInfo,
     creation_date,
+    estimator,
+    read_bundle,
     write_bundle,
 )
+from psfdae.own_stars.errors import one_line
 from psfdae.own_stars.photometry import FluxModel
-from psfdae.reading import read_yaml
 from psfdae.rng import stream
 from psfdae.stages.common import (
+    check_outputs,
     limit_threads,
     noise_model,
     noisy_test_images,
     read_stars,
     split_stars,
 )
+from psfdae.stages.evaluate import Models
 
 SEEN_BY_TRAINING = ("seed", "noise", "parts")
 """Groups in which the configuration must be that of the training."""
 
+LARGEST_SHIPPED = 300_000
+"""Bytes of the bundle that comes with the package, at most."""
 
-def run(
-    config: Any, stars: Path, dae: Path, split: str | None, name: str, licence: str, out: Path
+LICENCE = "MIT"
+"""Of the shipped bundle, as of the package: its stars are simulated."""
+
+WELL_COVERED = (0.63, 0.73)
+"""Coverage of `error68` that a shipped bundle must have at every noise level."""
+
+METRICS = {
+    "noise_level": ("λ", ".2g"),
+    "noise": ("noise/flux", ".2e"),
+    "snr": ("S/N", ".1f"),
+    "mse_noisy": ("MSE noisy", ".2e"),
+    "mse": ("MSE", ".2e"),
+    "gain": ("gain", ".3g"),
+    "ssim": ("SSIM", ".4f"),
+    "coverage68": ("in error68", ".1%"),
+    "coverage_rms": ("in rms", ".1%"),
+}
+"""Columns of the table: key, heading, format."""
+
+
+Packed = Annotated[File | None, {"argument": True}]
+
+
+@command("bundle", reads=(*SEEN_BY_TRAINING, "evaluation"))
+def bundle(
+    config: Config,
+    stars: Annotated[File, "Product of the stage stars that the network was trained on."],
+    models: Models,
+    split: Annotated[
+        Split | None, "Refuse a network of another split.  [default: that of the training]"
+    ] = None,
+    reference: Annotated[
+        Reference | None, "Of a method that serves both.  [default: realisation]"
+    ] = None,
+    name: Annotated[str | None, "Name of the model.  [default: the file's]"] = None,
+    licence: Annotated[str, "Of the model."] = "not stated",
+    *,
+    out: Annotated[File, "Bundle, a file NAME.psf.safetensors."],
 ) -> None:
-    """Measure a network on the test stars of its split and write the bundle.
-
-    The configuration inside the product "stars" says what kind of stamps they are:
-    `telescope` holds `pixel_scale_arcsec`, and `diameter_m` and `wavelength_m` where
-    the optics are known; `framing` holds `jitter_px` and `subpixel`; `source` is
-    "stars" for those that are not simulated.
-
-    Parameters
-    ----------
-    config : stage config (seed, noise, parts, evaluation)
-    stars : product "stars" that the network was trained on
-    dae : folder of a trained network
-    split : "random" or "held_out"; None for that of the training
-    name, licence : what the bundle says of itself
-    out : path of the bundle
-
-    Raises
-    ------
-    BundleError
-        If the network was trained with another seed, noise, parts or split.
-    ProductError
-        If the configuration of the stars lacks what a bundle must know, or the network
-        was trained on other stars.
-    """
+    """Pack a trained network with its errors and all that it takes to apply it."""
+    # The configuration inside the product "stars" says what kind of stamps they are.
     limit_threads(config.evaluation.threads)
-    trained = _trained(dae, config, split)
-    product = read_stars(stars, trained["reference"])
-    kind = _kind_of_stamps(product)
-    require_origin(dae, (*STARS, *SAME_STARS, *SAME_IMAGE), product)
-    network = _load(dae, kind["stamp_px"], config)
+    given = {key: place for key, place in vars(models).items() if place is not None}
+    if len(given) != 1:
+        options = " or ".join(f"--{key.replace('_', '-')}" for key in vars(models))
+        raise BundleError(f"one model makes a bundle: {options}")
+    ((key, place),) = given.items()
+    kind = method(key)
+    trained = _trained(kind, place, config, split)
+    restored = trained.get("reference") or reference or "realisation"
+    product = read_stars(stars, restored)
+    stamps = _kind_of_stamps(product)
+    require_origin(place, (*STARS, *SAME_STARS, *SAME_IMAGE), product)
+    fitted = kind.load(place, restored, config.evaluation)
+    arrays, said = fitted.pack(stamps["stamp_px"])
     parts = split_stars(product, trained["split"], config)
-    images, references = product["realisation"], product[trained["reference"]]
+    images, references = product["realisation"], product[restored]
     held_out = packing.HeldOutStars(images[parts.test], references[parts.test], noise_model(config))
     model = packing.leading(FluxModel.fit(images[parts.train]), packing.COMPONENTS)
     band = config.noise.kappa * np.asarray(config.noise.levels)
-    errors = packing.measure_errors(
-        held_out,
-        network.predict,
-        model,
-        packing.noise_nodes(band),
-        stream(config.seed, "noise", "bundle"),
-    )
+
+    def predict(noisy: np.ndarray, level: float) -> np.ndarray:
+        return fitted.estimate(noisy, level).psf
+
+    nodes, rng = packing.noise_nodes(band), stream(config.seed, "noise", "bundle")
+    errors = packing.measure_errors(held_out, predict, model, nodes, rng)
     reach = packing.reach(band, model.mean)
     metrics = packing.measure_levels(
         config.noise.levels,
         held_out,
         lambda level: noisy_test_images(config, held_out.images, level),
-        network.predict,
+        predict,
         errors,
         reach["noise_equivalent_px"],
         config.evaluation.data_range,
     )
     info = BundleInfo(
         psfdae_version=psfdae.__version__,
-        name=name,
+        name=name or out.name.removesuffix(SUFFIX),
         licence=licence,
         created=creation_date(),
-        **kind,
+        **stamps,
         **reach,
-        image_scale=network.factor,
         components=packing.COMPONENTS,
         training_sha256=packing.checksum(images[parts.train], references[parts.train]),
         training_stars=parts.train.size,
-        dae=Architecture(**{key: trained["dae"][key] for key in ("kernels", "widths")}),
+        **(said or {"method": kind.name, "reference": restored}),
         config={
             "stars": product.config,
             "train": trained,
@@ -113,29 +141,22 @@ def run(
         metrics=metrics,
     )
     maps = (errors.nodes, errors.half_width(), errors.rms(), errors.distance_limit())
-    write_bundle(Bundle(info, network.weights, model, *maps), out)
+    write_bundle(Bundle(info, arrays, model, *maps), out)
 
 
-@dataclass(frozen=True)
-class _Network:
-    """A trained network as a function, its weights, and the factor of its images."""
-
-    predict: packing.Predict
-    weights: dict[str, np.ndarray]
-    factor: float
-
-
-def _trained(folder: Path, config: Any, split: str | None) -> dict[str, Any]:
-    """Configuration of a training, if it is that of the stage."""
-    for path in (folder / CONFIG, folder / WEIGHTS):
+def _trained(kind: type[Method], place: Path, config: Config, split: str | None) -> dict[str, Any]:
+    """Configuration of a fit, if it is that of the stage."""
+    for path in [place / name for name in kind.files] or [place]:
         if not path.is_file():
-            raise BundleError(f"{path}: no such file; psfdae train writes it")
-    trained = read_yaml(folder / CONFIG)
-    lacking = {*SEEN_BY_TRAINING, "dae", "split", "reference"} - set(trained)
+            command = kind.rule.replace("_", " ", 1)
+            raise BundleError(f"{path}: no such file; psfdae {command} writes it")
+    path, trained = place / CONFIG if kind.files else place, kind.described(place)
+    lacking = {*SEEN_BY_TRAINING, *kind.groups, "split"} - set(trained)
+    lacking |= {"reference"} - set(trained) if kind.per_reference else set()
     if lacking:
-        raise BundleError(f"{folder / CONFIG}: key {min(lacking)!r} is missing")
+        raise BundleError(f"{path}: key {min(lacking)!r} is missing")
     asked = config.model_dump(include={*SEEN_BY_TRAINING}) | {"split": split or trained["split"]}
-    _refuse_mismatch({key: trained[key] for key in asked}, asked, folder / CONFIG)
+    _refuse_mismatch({key: trained[key] for key in asked}, asked, path)
     return trained
 
 
@@ -149,15 +170,6 @@ def _refuse_mismatch(trained: dict[str, Any], asked: dict[str, Any], path: Path)
             f"{path}: the network was trained with {differing[0]}, "
             f"but the bundle is asked for with {other}"
         )
-
-
-def _load(folder: Path, stamp_px: int, config: Any) -> _Network:
-    from psfdae.models.dae import image_scale
-
-    dae = Dae.load(folder, evaluation=config.evaluation)
-    state = dae.network.state_dict()
-    weights = {name: value.contiguous().numpy() for name, value in state.items()}
-    return _Network(dae.predict, weights, image_scale(dae.settings.scale, stamp_px))
 
 
 def _kind_of_stamps(product: Product) -> dict[str, Any]:
@@ -179,3 +191,111 @@ def _kind_of_stamps(product: Product) -> dict[str, Any]:
         }
     except KeyError as error:
         raise ProductError(f"{product.path}: its configuration lacks {error}") from None
+
+
+@command("export")
+def export(bundle: Packed = None, *, out: Annotated[File, "ONNX file."]) -> None:
+    """Export the network of BUNDLE (default: the shipped one) to ONNX and check it."""
+    import logging
+    import warnings
+
+    check_outputs((out,), (bundle,))
+    packed = read_bundle(bundle)
+    # The exporter speaks of optional packages and of its own internals.
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)
+        estimator(packed).export(packed.info.stamp_px, out)
+
+
+@command("describe")
+def describe(bundle: Packed = None) -> None:
+    """Say what BUNDLE (default: the shipped one) was trained for and how well it does."""
+    print(description(read_bundle(bundle)))
+
+
+@command("ship")
+def ship(
+    bundle: Annotated[File, {"argument": True}],
+    out: Annotated[Folder, "Folder of the package's bundles."],
+) -> None:
+    """Make BUNDLE the one that comes with the package."""
+    packed = read_bundle(bundle)
+    low, high = WELL_COVERED
+    for row in packed.info.metrics:
+        if not low <= row.get("coverage68", 0.0) <= high:
+            raise BundleError(
+                f"{bundle}: at noise level {row.get('noise_level', 0.0):g} error68 holds "
+                f"{row.get('coverage68', 0.0):.1%} of the errors ({low:.0%} to {high:.0%} allowed)"
+            )
+    info = packed.info.model_copy(update={"name": SHIPPED, "licence": LICENCE})
+    if bundle.stat().st_size > LARGEST_SHIPPED:
+        raise BundleError(f"{bundle}: {bundle.stat().st_size} bytes, at most {LARGEST_SHIPPED}")
+    shipped = out / f"{SHIPPED}{SUFFIX}"
+    write_bundle(replace(packed, info=info), shipped)
+    print(shipped)
+
+
+def description(packed: Bundle) -> str:
+    """What a bundle says of itself, for people."""
+    facts = _facts(packed)
+    width = max(len(name) for name in facts)
+    lines = [f"{name:<{width}}  {one_line(value)}" for name, value in facts.items()]
+    return "\n".join([*lines, "", "Errors of the test stars:", _table(packed.info)])
+
+
+def _facts(packed: Bundle) -> dict[str, str]:
+    info = packed.info
+    scale = f"{info.pixel_scale_arcsec:g} arcsec"
+    if info.pixel_lambda_d is not None:
+        scale += f" ({info.pixel_lambda_d:.3g} λ/D)"
+    framing = f"{info.framing}, ± {info.jitter_px} px"
+    count = sum(array.size for array in packed.weights.values())
+    normalisation = f"{info.normalisation} 1"
+    if info.dae:
+        normalisation += f"; the network sees it × {info.image_scale:g}"
+        shape = f"kernels {_list(info.dae.kernels)}; widths {_list(info.dae.widths)}"
+        network = {"Network": f"{shape}; {count} weights"}
+    else:
+        network = {"Method": f"{method(info.method).label}; {count} numbers"}
+    return {
+        "Name": info.name,
+        "Format": f"{info.format_version}, written {info.created} by psfdae {info.psfdae_version}",
+        "Licence": info.licence,
+        "SHA-256": packed.sha256,
+        "Stamp": f"{info.stamp_px} × {info.stamp_px} px of {scale}",
+        "Framing": framing + (", any sub-pixel position" if info.subpixel else ""),
+        "Normalisation": normalisation,
+        "S/N": f"{info.snr_min:.3g} to {info.snr_max:.3g}",
+        "Noise-equivalent area": f"{info.noise_equivalent_px:.3g} px",
+        **network,
+        "Trained on": f"{info.training_stars} {_KINDS[info.source]}, "
+        f"SHA-256 {info.training_sha256[:16]}…",
+        "Distance limit": f"{packed.distance_limit:.3g} in {info.components} components",
+    }
+
+
+_KINDS = {"simulated": "simulated stars", "stars": "stars of an image"}
+
+
+def _list(values: tuple[int, ...]) -> str:
+    return " ".join(str(value) for value in values)
+
+
+def _gain(row: dict[str, float]) -> dict[str, float]:
+    """How many times the error of the stamp itself; below 1 the network is no use."""
+    noisy, mse = row.get("mse_noisy"), row.get("mse")
+    return {"gain": noisy / mse} if noisy and mse else {}
+
+
+def _table(info: BundleInfo) -> str:
+    from tabulate import tabulate
+
+    metrics = [row | _gain(row) for row in info.metrics]
+    shown = [key for key in METRICS if any(key in row for row in metrics)]
+    rows = [
+        [format(row[key], METRICS[key][1]) if key in row else "" for key in shown]
+        for row in metrics
+    ]
+    headings = [METRICS[key][0] for key in shown]
+    return str(tabulate(rows, headings, tablefmt="plain", disable_numparse=True, stralign="right"))

@@ -8,14 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from psfdae.cli import File, Folder, command
+from psfdae.estimators import CONFIG, HISTORY, registered
 from psfdae.files import ProductError, write_text
 from psfdae.reading import read_csv, read_yaml
 from psfdae.tracking import flatten
 
 if TYPE_CHECKING:
     import pandas as pd
-
-CONFIG, HISTORY = "config.yaml", "history.csv"
 
 
 class ComparisonError(ValueError):
@@ -59,12 +58,14 @@ def _groups(folders: Sequence[Path]) -> list[list[tuple[Path, Path]]]:
     """(Folder of the network, table of its errors) of the runs that belong together."""
     if all((folder / CONFIG).is_file() for folder in folders):
         return [[(folder, errors_of(folder)) for folder in folders]]
+    networks = [kind.name for kind in registered() if CONFIG in kind.files]
     places = []
     for folder in folders:
-        found = {p.parent.relative_to(folder) for p in folder.glob(f"dae/*/*/{CONFIG}")}
+        paths = [path for name in networks for path in folder.glob(f"{name}/*/*/{CONFIG}")]
+        found = {path.parent.relative_to(folder) for path in paths}
         if not found:
             raise ComparisonError(
-                f"{folder}: no {CONFIG} and no dae/DATASET/RUN/{CONFIG} in it, "
+                f"{folder}: no {CONFIG} and no {' or '.join(networks)}/DATASET/RUN/{CONFIG} in it, "
                 "hence neither a trained network nor a folder of results"
             )
         places.append(found)

@@ -10,16 +10,11 @@ import numpy as np
 
 from psfdae.cli import File, Folder, Reference, Split, command
 from psfdae.configuration.schema import Config
-from psfdae.estimators import Method, TrainingSet, method
+from psfdae.estimators import Method, TrainingSet, groups_of, method
 from psfdae.files import Product
 from psfdae.stages.common import limit_threads, noise_model, read_stars, split_stars
 
 Stars = Annotated[File, "Product of the stage stars."]
-
-
-def groups_of(name: str, **options: Any) -> tuple[str, ...]:
-    """Groups of the configuration that decide a fit of a method."""
-    return ("seed", "noise", "parts", *method(name).groups)
 
 
 @command("fit", reads=groups_of)

@@ -1,21 +1,21 @@
-"""Stage `from_stars`: from an image and its star list to a model of its own, in one go."""
+"""Stage `from-stars`: from an image and its star list to a model of its own, in one go."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
+from psfdae.cli import File, Folder, command
 from psfdae.configuration.compose import as_overrides, part
-from psfdae.configuration.schema import Noise
-from psfdae.estimators.dae import Dae
-from psfdae.estimators.pca_som import PcaSom
-from psfdae.files import write_product, write_text
+from psfdae.configuration.schema import Config, Noise
+from psfdae.estimators import Method, groups_of, method, registered
+from psfdae.files import Product, write_product, write_text
 from psfdae.own_stars.bundle import SUFFIX
 from psfdae.own_stars.errors import ObservationError
 from psfdae.own_stars.observation import Observation, Source
@@ -24,11 +24,12 @@ from psfdae.own_stars.selection import collect
 from psfdae.own_stars.training_images import star_grid, training_columns
 from psfdae.reading import read_table
 from psfdae.rng import stream
-from psfdae.stages import bundle
+from psfdae.stages.bundle import bundle
 from psfdae.stages.common import check_outputs
-from psfdae.stages.evaluate import Models, evaluate
-from psfdae.stages.fit import baseline, train
-from psfdae.stars.splits import held_out_fields
+from psfdae.stages.evaluate import READS, Models, estimators, evaluate
+from psfdae.stages.fit import fit
+from psfdae.stages.predict import Stated
+from psfdae.stars.fields import held_out_fields
 
 LOCK = ".from_stars.lock"
 
@@ -45,78 +46,69 @@ class FolderError(RuntimeError):
 
 
 @dataclass(frozen=True)
-class Folder:
-    """Files that the stage leaves."""
+class Made:
+    """Files that the stage leaves in a folder."""
 
     path: Path
     name: str
-
-    def written(self) -> list[Path]:
-        """Files of the folder itself."""
-        names = ("selection.csv", "overrides.txt", "evaluation.csv", "per_star.parquet")
-        more = ("report.csv", "report.png")
-        return [self.stars, self.pca_som, self.bundle, *(self.path / n for n in (*names, *more))]
+    kinds: tuple[type[Method], ...]
 
     @property
     def stars(self) -> Path:
         return self.path / "stars.h5"
 
-    @property
-    def pca_som(self) -> Path:
-        return self.path / "pca_som.h5"
+    def fit(self, kind: type[Method]) -> Path:
+        return self.path / (kind.name if kind.files else f"{kind.name}.h5")
 
-    @property
-    def dae(self) -> Path:
-        return self.path / "dae"
+    def bundle(self, kind: type[Method]) -> Path:
+        return self.path / f"{self.name}{kind.suffix}{SUFFIX}"
 
-    @property
-    def bundle(self) -> Path:
-        return self.path / f"{self.name}{SUFFIX}"
+    def models(self) -> Any:
+        """What the stage `evaluate` takes."""
+        return Models(**{kind.name: self.fit(kind) for kind in self.kinds})
+
+    def written(self) -> list[Path]:
+        """Files of the folder itself."""
+        names = ("selection.csv", "overrides.txt", "evaluation.csv", "per_star.parquet")
+        own = [self.path / name for name in (*names, "report.csv", "report.png")]
+        for kind in self.kinds:
+            own += [self.bundle(kind), *(path for path in kind.outputs(self.fit(kind)))]
+        return [self.stars, *own]
 
 
-def run(
-    config: Any,
-    exposure: Source,
-    out: Path,
+@command(
+    "from-stars",
+    start=("dataset=from_stars",),
+    reads=(
+        *("seed", "calibration_stars", "framing", "noise", "parts"),
+        *(group for kind in registered() for group in kind.groups),
+        *("evaluation", "methods"),
+    ),
+)
+def from_stars(
+    config: Config,
+    image: Annotated[File, {"argument": True}],
+    stated: Stated,
+    name: Annotated[str | None, "Name of the model.  [default: the image's]"] = None,
+    licence: Annotated[str, "Of the model."] = "not stated",
     *,
-    name: str,
-    licence: str = "not stated",
-    overwrite: bool = False,
-    say: Callable[[str], object] = lambda line: None,
+    out: Annotated[Folder, "Folder for the model, its report and what they are made of."],
+    overwrite: Annotated[bool, "Replace a model that the folder holds."] = False,
 ) -> None:
-    """Train a network on the bright stars of an exposure, test it, and pack it.
+    """Train a model on the bright stars of IMAGE.
 
-    Parameters
-    ----------
-    config : stage config (seed, calibration_stars, framing, noise, parts, dae, train,
-        baseline, evaluation); the noise levels follow from the stars
-    exposure : Source
-    out : folder that receives
-
-        - `NAME.psf.safetensors`, the model bundle,
-        - `report.csv` (columns snr, noise, method, mse, mse_stderr, ssim, images, stars,
-          truth_mse) and `report.png`,
-        - `selection.csv` with every star of the catalogue and why it was not used,
-        - `stars.h5`, `pca_som.h5`, `dae/`, `evaluation.csv`, `per_star.parquet`, as the
-          stages leave them, and `overrides.txt`, with which they can be run again.
-    name, licence : what the bundle says of itself
-    overwrite : whether a model in the folder may be replaced
-    say : called with a line of progress
-
-    Raises
-    ------
-    ObservationError, CalibrationStarsError, BundleError, TrainingError, OutputError
-    FolderError
-        If the folder holds a model that may not be replaced, or another process is
-        making one there.
+    IMAGE is a FITS image with --catalogue, or a FITS cube of stamps. Some stars are
+    held out and made faint to test the model.
     """
-    files = Folder(out, name)
-    check_outputs(files.written(), (exposure.path, exposure.catalogue, exposure.mask))
+    exposure = stated.source(image)
+    kinds = tuple(kind for kind in map(method, config.methods) if kind.stored)
+    files = Made(out, name or image.name.split(".")[0], kinds)
+    check_outputs(files.written(), (image, exposure.catalogue, exposure.mask))
     with _alone(out):
         finished = sorted(out.glob(f"*{SUFFIX}"))
         if finished and not overwrite:
             raise FolderError(f"{finished[0]}: a model is there already; --overwrite replaces it")
-        _run(config, exposure, files, licence, say)
+        _make(config, exposure, files, licence)
 
 
 @contextmanager
@@ -148,9 +140,8 @@ def _alone(folder: Path) -> Iterator[None]:
             folder.rmdir()
 
 
-def _run(
-    config: Any, exposure: Source, files: Folder, licence: str, say: Callable[[str], object]
-) -> None:
+def _make(config: Config, exposure: Source, files: Made, licence: str) -> None:
+    # The noise levels follow from the stars.
     framing, wanted = config.framing, config.calibration_stars
     observation = exposure.open(framing.stamp_px, wanted.margin_px, larger=True)
     if observation.pixel_scale_arcsec is None:
@@ -160,8 +151,8 @@ def _run(
     found = collect(observation, wanted, framing)
     grid = star_grid(found.bright.position)
     held_out = held_out_fields(grid)
-    say(f"{len(found.verdict)} stars: {found.count()}")
-    say(f"{int((~held_out).sum())} to learn from, {int(held_out.sum())} held out")
+    print(f"{len(found.verdict)} stars: {found.count()}")
+    print(f"{int((~held_out).sum())} to learn from, {int(held_out.sum())} held out")
     selection = found.table(held_out).to_csv(index=False, float_format="%.6g")
     write_text(files.path / "selection.csv", selection)
     rng = stream(config.seed, "own stars")
@@ -173,10 +164,25 @@ def _run(
     sky = found.bright.sky_photons(observation.gain, config.noise.background_photons)
     settings = {**config.model_dump(), "noise": _noise(config, images, sky)}
     write_text(files.path / "overrides.txt", _overrides(settings))
-    for line, work in _steps(settings, files, licence):
-        say(line)
-        work()
-    report(settings, files)
+    for kind in files.kinds:
+        print(f"fitting {kind.label}")
+        own = part(groups_of(kind.name), settings)
+        fit(own, kind.name, files.stars, SPLIT, REFERENCE, out=files.fit(kind))
+    print("testing on the stars held out")
+    checked = part(READS, settings)
+    evaluate(
+        *(checked, files.name, files.stars, files.models(), SPLIT, REFERENCE),
+        per_star=files.path / "per_star.parquet",
+        out=files.path / "evaluation.csv",
+    )
+    for kind in files.kinds:
+        if kind.bundled:
+            print(f"packing {kind.label}")
+            own = part(bundle.stage.reads, settings)  # type: ignore[attr-defined]
+            models = Models(**{kind.name: files.fit(kind)})
+            path = files.bundle(kind)
+            bundle(own, files.stars, models, SPLIT, REFERENCE, licence=licence, out=path)
+    report(checked, files)
 
 
 def _described(config: Any, observation: Observation) -> dict[str, Any]:
@@ -203,55 +209,17 @@ def _noise(config: Any, images: np.ndarray, background: float) -> dict[str, Any]
     return noise.model_dump()
 
 
-def _part(stage: str, settings: dict[str, Any]) -> Any:
-    """Checked configuration of another stage."""
-    return part(stage, settings)
-
-
 def _overrides(settings: dict[str, Any]) -> str:
     tree = {key: value for key, value in settings.items() if key != "calibration_stars"}
     return "\n".join(["dataset=from_stars", *as_overrides(tree)]) + "\n"
 
 
-def _steps(
-    settings: dict[str, Any], files: Folder, licence: str
-) -> list[tuple[str, Callable[[], None]]]:
-    stars = files.stars
-    return [
-        (
-            "fitting PCA and SOM",
-            lambda: baseline(_part("baseline", settings), stars, SPLIT, out=files.pca_som),
-        ),
-        (
-            "training the DAE",
-            lambda: train(_part("train", settings), stars, SPLIT, REFERENCE, out=files.dae),
-        ),
-        (
-            "testing on the stars held out",
-            lambda: evaluate(
-                *(_part("evaluate", settings), files.name, stars),
-                *(Models(pca_som=files.pca_som, dae=files.dae), SPLIT, REFERENCE),
-                per_star=files.path / "per_star.parquet",
-                out=files.path / "evaluation.csv",
-            ),
-        ),
-        (
-            "packing the model",
-            lambda: bundle.run(
-                *(_part("bundle", settings), stars, files.dae, SPLIT, files.name),
-                *(licence, files.bundle),
-            ),
-        ),
-    ]
-
-
-def report(settings: dict[str, Any], files: Folder) -> None:
+def report(config: Any, files: Made) -> None:
     """Table and figure of the errors on the stars held out."""
     import pandas as pd
 
     from psfdae.stages.common import read_stars, split_stars
 
-    config = _part("evaluate", settings)
     product = read_stars(files.stars, REFERENCE)
     parts = split_stars(product, SPLIT, config)
     images = product["realisation"]
@@ -271,10 +239,10 @@ def report(settings: dict[str, Any], files: Folder) -> None:
     table["images"] = parts.test.size
     table["stars"] = np.unique(product["field_index"][parts.test]).size
     table["truth_mse"] = _noise_of_truth(files.stars, parts.test, config.noise.background_photons)
-    order = {method: place for place, method in enumerate(("noisy", "pca_som", "lmmse", "dae"))}
+    order = {name: place for place, name in enumerate(config.methods)}
     table = table.sort_values(["snr", "method"], key=lambda c: c.map(order).fillna(c))
     write_text(files.path / "report.csv", table.to_csv(index=False, float_format="%.6g"))
-    _draw(config, files, images[parts.test], product["field_index"][parts.test], area)
+    _draw(config, files, product, parts.test, area)
 
 
 def _noise_of_truth(stars: Path, test: np.ndarray, sky: float) -> float:
@@ -290,7 +258,7 @@ def _noise_of_truth(stars: Path, test: np.ndarray, sky: float) -> float:
     return float((noise**2 + noise / np.sqrt(sky) / pixels).mean())
 
 
-def _draw(config: Any, files: Folder, images: np.ndarray, star: np.ndarray, area: float) -> None:
+def _draw(config: Any, files: Made, stars: Product, test: np.ndarray, area: float) -> None:
     """Strip of stars held out, made faint, and what the methods make of them."""
     from psfdae.evaluation.figures import StripRow, restoration_strip
     from psfdae.evaluation.metrics import mse
@@ -301,18 +269,16 @@ def _draw(config: Any, files: Folder, images: np.ndarray, star: np.ndarray, area
     levels = np.asarray(config.noise.levels)
     snr = 1.0 / (config.noise.kappa * levels * np.sqrt(area))
     level = float(levels[np.abs(np.log(snr / SHOWN_SNR)).argmin()])
+    images, star = stars["realisation"][test], stars["field_index"][test]
     noisy = noisy_test_images(config, images, level)
     product = read_product(files.stars, "stars", ("position", "snr"))
     shown = _shown(star, product["position"])
     truth = images[shown]
-    estimates = {
-        "noisy": noisy[shown],
-        "PCA+SOM": PcaSom.load(files.pca_som).predict(noisy)[shown],
-        "DAE": Dae.load(files.dae, evaluation=config.evaluation).predict(noisy)[shown],
-    }
     rows = [StripRow("bright\nstar", truth)]
-    for label, stamps in estimates.items():
-        rows.append(StripRow(label, stamps, mse(stamps, truth), own_scale=label == "noisy"))
+    methods = estimators(config, stars, vars(files.models()), SPLIT, REFERENCE, only_drawn=True)
+    for kind in methods.values():
+        stamps = kind.estimate(noisy, level).psf[shown]
+        rows.append(StripRow(kind.label, stamps, mse(stamps, truth), own_scale=not kind.restores))
     found = signal_to_noise(config.noise.kappa * level, area)
     columns = [f"S/N {value:.0f}" for value in product["snr"][star[shown]]]
     title = f"Bright stars that no training saw, made faint: S/N {found:.3g}"

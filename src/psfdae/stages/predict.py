@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import itertools
+import sys
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
+import click
 import numpy as np
 
+from psfdae.cli import AboveZero, File, NameOrNumber, command
 from psfdae.own_stars.images import Card
 from psfdae.own_stars.model import (
     BLOCK,
@@ -30,60 +34,58 @@ ROWS = 4 * BLOCK
 MARGIN_PX = 2
 """Pixels by which a star of an image may be moved to centre it."""
 
-Tick = Callable[[int], object]
-
 
 @dataclass(frozen=True)
-class Summary:
-    """What a prediction has come to.
+class Stated:
+    """What is said of an image beside its header."""
 
-    Attributes
-    ----------
-    stars : int
-    flagged : dict of str to int
-        Stars with each flag.
-    without : int
-        Stars without any flag.
-    """
+    catalogue: Annotated[File | None, "Star list of an image, FITS or CSV."] = None
+    pixel_scale: Annotated[
+        float | None, AboveZero, "Arcseconds per pixel.  [default: the WCS's]"
+    ] = None
+    origin: Annotated[int | None, click.IntRange(0, 1), "Index of the first pixel's centre."] = None
+    extension: Annotated[
+        str | int | None, NameOrNumber(), "Name or number of the extension with the stars."
+    ] = None
+    mask: Annotated[
+        str | int | None, NameOrNumber(), "Extension or FITS file; pixels other than 0 are bad."
+    ] = None
+    gain: Annotated[float | None, AboveZero, "Electrons per count.  [default: the header's]"] = None
+    saturate: Annotated[float | None, AboveZero, "Counts of a saturated pixel."] = None
 
-    stars: int = 0
-    without: int = 0
-    flagged: dict[str, int] = field(default_factory=dict)
+    def source(self, path: Path, **more: str | None) -> Source:
+        """The file with all that is stated about it."""
+        stated = vars(self).copy()
+        return Source(path, pixel_scale_arcsec=stated.pop("pixel_scale"), **stated, **more)
 
 
-def run(
-    source: Source,
-    out: Path,
+@command("predict")
+def predict(
+    stars: Annotated[File, {"argument": True, "metavar": "INPUT"}],
+    stated: Stated,
+    flux_column: Annotated[
+        str | None, "Fluxes inside the stamp; estimated where not given."
+    ] = None,
+    background_column: Annotated[
+        str | None, "Sky levels per pixel; estimated where not given."
+    ] = None,
+    model: Annotated[File | None, "Model bundle.  [default: the shipped one]"] = None,
+    plot: Annotated[File | None, "PNG with a map of the PSF over the field."] = None,
+    overwrite: Annotated[bool, "Replace files that exist."] = False,
+    threads: Annotated[int | None, click.IntRange(min=1), "[default: all cores]"] = None,
+    quiet: Annotated[bool, "Neither progress nor summary."] = False,
     *,
-    model: Path | None = None,
-    plot: Path | None = None,
-    overwrite: bool = False,
-    threads: int | None = None,
-    history: str = "",
-    started: Callable[[int], object] = lambda count: None,
-    tick: Tick = lambda stars: None,
-) -> Summary:
-    """Predict the PSFs of all stars of a file.
+    out: Annotated[File, "FITS file for PSFs, residuals, uncertainties and a table of stars."],
+) -> None:
+    """Predict the PSFs of the stars in INPUT.
 
-    Everything that can be checked is checked before the first star.
-
-    Parameters
-    ----------
-    source : Source
-    out : path of the FITS file; see `psfdae.own_stars.prediction`
-    model : path of a bundle, the shipped one by default
-    plot : path of a PNG with a map of the PSFs, optional
-    overwrite : whether files may be replaced
-    threads : all cores by default
-    history : goes into the header
-    started : called with the number of stars, before the first one
-    tick : called with a number of stars that are done
-
-    Raises
-    ------
-    PredictionError, ObservationError, BundleError, OutputError
-        In one line that names the file.
+    INPUT is a FITS cube of stamps, or a FITS image with --catalogue. Stars are
+    flagged, never dropped. Files that cannot be used end with one line and exit
+    code 2.
     """
+    from tqdm import tqdm
+
+    source = stated.source(stars, flux_column=flux_column, background_column=background_column)
     check_outputs((out, plot), (source.path, source.catalogue, source.mask, model))
     _check_targets(out, plot, overwrite)
     loaded = load_model(model)
@@ -91,17 +93,22 @@ def run(
     loaded.check_scale(observation.pixel_scale_arcsec, str(source.path))
     if plot is not None and observation.positions is None:
         raise PredictionError(f"{source.path}: a map needs a catalogue with pixel positions")
-    started(observation.count)
-    try:
-        summary = _predict(loaded, source, observation, out, threads, history, tick)
-        if plot is not None:
-            from psfdae.own_stars.plot import map_of_file
-            from psfdae.stages.figures import write_png
+    with tqdm(unit="star", unit_scale=True, desc="predict", disable=quiet or None) as bar:
+        bar.reset(observation.count)
+        try:
+            counts, clean = _predict(loaded, source, observation, out, threads, bar.update)
+            if plot is not None:
+                from psfdae.own_stars.plot import map_of_file
+                from psfdae.stages.figures import write_png
 
-            write_png(map_of_file(out), plot)
-    except OSError as error:
-        raise PredictionError(f"{out}: cannot be written ({error.strerror or error})") from error
-    return summary
+                write_png(map_of_file(out), plot)
+        except OSError as error:
+            said = error.strerror or error
+            raise PredictionError(f"{out}: cannot be written ({said})") from error
+    if not quiet:
+        flagged = zip(StarFlag, counts, strict=True)
+        flags = "".join(f"\n  {flag.name}: {count}" for flag, count in flagged if count)
+        print(f"{out}: {observation.count} stars, {clean} without a flag{flags}")
 
 
 def _check_targets(out: Path, plot: Path | None, overwrite: bool) -> None:
@@ -122,29 +129,29 @@ def _predict(
     observation: Observation,
     out: Path,
     threads: int | None,
-    history: str,
-    tick: Tick,
-) -> Summary:
+    tick: Callable[[int], object],
+) -> tuple[np.ndarray, int]:
+    """Write the file; number of stars with each flag, and of those without any."""
     chunks = observation.chunks(min(ROWS, 4 * model.engine.size))
     first = next(chunks)
     counts = np.zeros(len(StarFlag), dtype=int)
     done = clean = 0
 
-    def predict(stamps: Stamps) -> Prediction:
+    def restored(stamps: Stamps) -> Prediction:
         return Prediction.joined([model.engine.block(b) for b in model.engine.blocks(stamps)])
 
+    history = " ".join(["psfdae", *sys.argv[1:]])  # without the folder of the program
     header = (model.bundle, first, observation.count, _cards(source, observation), history)
     with one_thread_each(), prediction_file(out, *header) as file:
         for stamps, result in in_order(
-            predict, itertools.chain([first], chunks), threads or available_cores()
+            restored, itertools.chain([first], chunks), threads or available_cores()
         ):
             file.write(done, stamps, result)
             counts += [(result.flags & int(flag) > 0).sum() for flag in StarFlag]
             clean += int((result.flags == 0).sum())
             done += len(result)
             tick(len(result))
-    flagged = {str(f.name): int(n) for f, n in zip(StarFlag, counts, strict=True) if n}
-    return Summary(done, clean, flagged)
+    return counts, clean
 
 
 def _cards(source: Source, observation: Observation) -> list[Card]:

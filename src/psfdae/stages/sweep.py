@@ -9,9 +9,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
-from psfdae.configuration.compose import decisive
+import click
+
+from psfdae.cli import File, Folder, Reference, Split, command
+from psfdae.configuration.compose import Root, decisive, load_stage
+from psfdae.configuration.sweep import CNNS, models, point_groups
+from psfdae.estimators import FitError
 from psfdae.files import ProductError, write_text
 from psfdae.reading import from_tree, read_json
 from psfdae.sweeps.measured import EVALUATION, VALIDATION, Task
@@ -27,15 +32,15 @@ incomplete and deletes their results; the copy keeps these trainings from being 
 CHECKSUM = "sha256"
 """Key of the checksum of all other keys in a result."""
 
-POINT_MODULES = {
-    "dae": "psfdae.sweeps.dae_point",
-    "pca_som": "psfdae.sweeps.pca_som_point",
-    "original": "psfdae.sweeps.cnn_point",
-    "noise_trained": "psfdae.sweeps.cnn_point",
-}
-"""Module that trains and measures each model; a point's rule depends on its own only."""
-
 ADAPTIVE_MODULE = "psfdae.sweeps.adaptive"
+
+ROLES = {"config": {"stars"}, "alignment": {"states", "validation", "test"}}
+"""Products that the points of a root need."""
+
+
+def module_of(model: str) -> str:
+    """Module that trains and measures a model."""
+    return f"psfdae.sweeps.{'cnn' if model in CNNS else 'method'}_point"
 
 
 @dataclass(frozen=True)
@@ -61,6 +66,78 @@ class Trial:
     journal: Path
 
 
+class JsonType(click.ParamType):
+    """A JSON object as one argument."""
+
+    name = "json"
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> Any:
+        """Parse; a wrong text is a usage error."""
+        if isinstance(value, dict):
+            return value
+        try:
+            tree = json.loads(value)
+        except json.JSONDecodeError as error:
+            self.fail(f"{value!r} is no JSON: {error}", param, ctx)
+        if not isinstance(tree, dict):
+            self.fail(f"{value!r} is no JSON object", param, ctx)
+        return tree
+
+
+Json = Annotated[dict[str, Any], JsonType()]
+Overrides = Annotated[tuple[str, ...], {"argument": True}]
+
+
+@command("sweep list")
+def sweep_list(name: Annotated[str, {"argument": True}], overrides: Overrides = ()) -> None:
+    """List the points of a sweep as tab-separated text, without running it."""
+    from psfdae.sweeps.points import plan_sweep
+
+    for each in plan_sweep(name, overrides).points.values():
+        values = each.values or {"trial": each.slot}
+        print("\t".join([each.name, *(f"{k}={json.dumps(v)}" for k, v in values.items())]))
+
+
+@command("sweep point")
+def sweep_point(
+    model: Annotated[str, click.Choice(models()), "What is trained."],
+    dataset: Annotated[str, "Name that goes into the tables."],
+    split: Split = "random",
+    reference: Reference = "realisation",
+    *,
+    data: Annotated[
+        tuple[tuple[Literal["stars", "states", "validation", "test"], File], ...],
+        "Role and product: stars; for scene 3 states, validation and test.",
+    ],
+    levels: Annotated[tuple[float, ...], {"flag": "--level"}, "Noise level λ."],
+    values: Annotated[Json | None, "Value of every axis, as JSON."] = None,
+    keys: Annotated[Json | None, "Keys that were changed, as JSON."] = None,
+    checkpoint: Annotated[File, "State of an interrupted training."],
+    slot: Annotated[int | None, "Number of a trial of an adaptive sweep."] = None,
+    search: Annotated[Json | None, "Space and settings of an adaptive sweep, as JSON."] = None,
+    journal: Annotated[File | None, "Optuna's journal of an adaptive sweep."] = None,
+    source: Annotated[
+        str, "Hash of the code, with which a result is kept.", {"show_default": False}
+    ] = "",
+    known: Annotated[tuple[str, ...], "Point of an earlier trial, beside OUT."] = (),
+    out: Annotated[Folder, "Folder that receives the point's files; its name is the point's."],
+    overrides: Overrides = (),
+) -> None:
+    """Train one point of a sweep and measure it."""
+    given = (slot is not None, search is not None, journal is not None)
+    if any(given) and not all(given):
+        raise click.UsageError("--slot, --search and --journal go together")
+    root: Root = "alignment" if model in CNNS else "config"
+    if {role for role, _ in data} != ROLES[root]:
+        raise click.UsageError(f"--data: {model} needs {', '.join(sorted(ROLES[root]))}")
+    trial = None
+    if slot is not None and search is not None and journal is not None:
+        trial = Trial(slot, search, known, journal)
+    task = Task(dataset, split, reference, dict(data), levels, out, checkpoint)
+    config = load_stage(point_groups(model), overrides, root)
+    point(config, model, values or {}, keys or {}, task, trial, source)
+
+
 def point(
     config: Any,
     model: str,
@@ -78,8 +155,8 @@ def point(
 
     Parameters
     ----------
-    config : stage config `sweep_<model>`
-    model : "dae", "pca_som", "original" or "noise_trained"
+    config : groups that a point of the model reads
+    model : method, or CNN of scene 3
     values : value of every axis; those of a trial are asked for here
     keys : configuration keys that differ from the dataset's
     task : Task
@@ -93,7 +170,8 @@ def point(
     ConfigError
         If a trial asks for values that the configuration does not allow.
     """
-    module = import_module(POINT_MODULES[model])
+    module = import_module(module_of(model))
+    files = module.files_of(model)
     if trial is not None:
         adaptive, space = _open(trial)
         values = _asked(adaptive, space, trial, task.folder)
@@ -108,9 +186,9 @@ def point(
         task.described(),
     ]
     fingerprint = _digest(content)
-    result = _finished(task.folder, fingerprint, module.FILES)
+    result = _finished(task.folder, fingerprint, files)
     if result is None:
-        for stale in (*module.FILES, EVALUATION, VALIDATION, COST, RESULT, FINISHED):
+        for stale in (*files, EVALUATION, VALIDATION, COST, RESULT, FINISHED):
             (task.folder / stale).unlink(missing_ok=True)
         result = {
             "point": task.folder.name,
@@ -121,7 +199,7 @@ def point(
             "reference": task.reference,
             "values": dict(values),
             "keys": dict(keys),
-            **_outcome(module, config, task),
+            **_outcome(module, config, task, model),
             "fingerprint": fingerprint,
         }
         write_text(task.folder / FINISHED, as_json(result))
@@ -154,12 +232,12 @@ def _digest(tree: Any) -> str:
     return hashlib.sha256(json.dumps(tree, sort_keys=True).encode()).hexdigest()
 
 
-def _outcome(module: Any, config: Any, task: Task) -> dict[str, Any]:
+def _outcome(module: Any, config: Any, task: Task, model: str) -> dict[str, Any]:
     """Status, metrics and configuration of a point; its cost goes to a file of its own."""
     started, started_cpu = time.monotonic(), time.process_time()
     try:
-        done = module.run(config, task)
-    except module.FAILURES as error:
+        done = module.run(config, task, model)
+    except FitError as error:
         reason = str(error).splitlines()[0]
         print(f"failed: {reason}", flush=True)
         task.checkpoint.unlink(missing_ok=True)

@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from typing import Annotated, Literal
 
+from psfdae.cli import File, command
 from psfdae.files import atomic_path
 from psfdae.reading import read_table, read_yaml
 
 
-def run(kind: str, definition: Path, table: Path, out: Path) -> None:
-    """Draw the summary of a sweep.
-
-    Parameters
-    ----------
-    kind : "parallel" or "response"
-    definition : `sweep.yaml`
-    table : `summary.csv`
-    out : PNG
-    """
-
+@command("sweep figure")
+def sweep_figure(
+    kind: Annotated[Literal["parallel", "response"], {"argument": True}],
+    definition: Annotated[File, "sweep.yaml of the command `sweep summary`."],
+    table: Annotated[File, "summary.csv of the same."],
+    out: Annotated[File, "PNG."],
+) -> None:
+    """Draw all points at once, or the metric against each axis."""
     from psfdae.configuration.compose import validate
     from psfdae.configuration.sweep import Axis
     from psfdae.evaluation import sweep_figures

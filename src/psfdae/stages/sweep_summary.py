@@ -5,14 +5,39 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+from psfdae.cli import Folder, command
 from psfdae.files import ProductError, as_yaml, write_text
-from psfdae.stages.sweep import read_cost, read_result
+from psfdae.stages.sweep import RESULT, read_cost, read_result
 from psfdae.sweeps.space import SweepError
 
 SUMMARY, COSTS, BEST, DEFINITION = "summary.csv", "cost.csv", "best.yaml", "sweep.yaml"
 JOURNAL = "study.journal"
+
+
+@command("sweep summary")
+def sweep_summary(
+    name: Annotated[str, {"argument": True}],
+    points: Annotated[Folder, "Folder with a folder for each point."],
+    out: Annotated[Folder, "Folder for summary.csv, cost.csv, best.yaml and sweep.yaml."],
+    overrides: Annotated[tuple[str, ...], {"argument": True}] = (),
+) -> None:
+    """Tabulate the points of a sweep and choose the best."""
+    from psfdae.sweeps.points import plan_sweep
+
+    plan = plan_sweep(name, overrides)
+    files = [points / point / RESULT for point in plan.points]
+    summary(name, plan.sweep.model_dump(exclude_none=True), overrides, files, out)
+
+
+@command("best")
+def best(
+    name: Annotated[str, {"argument": True}],
+    results: Annotated[Folder, "Folder that the workflow writes to."] = Path("results"),
+) -> None:
+    """Print the best point of a sweep as overrides: make reproduce SET="$(psfdae best NAME)"."""
+    print(" ".join(best_overrides(results, name)))
 
 
 def summary(
@@ -45,11 +70,11 @@ def summary(
     import yaml
 
     results = [read_result(path) for path in points]
-    best = choose(results, definition["metric"], definition["direction"])
-    if best is None:
+    chosen = choose(results, definition["metric"], definition["direction"])
+    if chosen is None:
         failed = f"{results[0]['point']}: {results[0]['reason']}"
         raise SweepError(f"all {len(results)} points of sweep {name} failed; the first, {failed}")
-    rows = [_row(result, definition["space"], result is best) for result in results]
+    rows = [_row(result, definition["space"], result is chosen) for result in results]
     write_text(out / SUMMARY, pd.DataFrame(rows).to_csv(index=False, float_format="%.8g"))
     costs = [
         {"point": result["point"], **read_cost(path.parent)}
@@ -59,7 +84,7 @@ def summary(
     described = {"sweep": name, "given": list(given), **definition}
     # Unsorted: the order of the axes is that of the figures.
     write_text(out / DEFINITION, yaml.safe_dump(described, sort_keys=False))
-    write_text(out / BEST, _best_yaml(name, definition, given, best))
+    write_text(out / BEST, _best_yaml(name, definition, given, chosen))
     if definition["kind"] == "adaptive":
         _complete_journal(out / JOURNAL, definition, results)
 

@@ -11,7 +11,6 @@ from psfdae.configuration.compose import part
 from psfdae.estimators import CONFIG, HISTORY
 from psfdae.evaluation.alignment_tables import error_rows
 from psfdae.files import read_product, write_text
-from psfdae.models.training import TrainingError
 from psfdae.reading import read_table, read_yaml
 from psfdae.stages.alignment_methods import CNN_WEIGHTS, cnn_predictor, noisy_test_states, train_cnn
 from psfdae.stages.common import limit_threads
@@ -23,20 +22,23 @@ from psfdae.sweeps.measured import (
     geometric_mean,
 )
 
-FILES = (CNN_WEIGHTS, CONFIG, HISTORY)
-FAILURES = (TrainingError,)
-
 TEST_SET = "uniform"
 """Test set of scene 3, whose noise is drawn as in the main workflow."""
 
 
-def run(config: Any, task: Task) -> Measured:
+def files_of(name: str) -> tuple[str, ...]:
+    """Names of the files of a point's training."""
+    return (CNN_WEIGHTS, CONFIG, HISTORY)
+
+
+def run(config: Any, task: Task, name: str) -> Measured:
     """Train as the stage of the same CNN does, and measure.
 
     Parameters
     ----------
     config : stage config (seed, noise, cnn, train_<CNN>, evaluation)
-    task : Task; its `dataset` is the CNN, original or noise_trained
+    task : Task
+    name : of the CNN, original or noise_trained
 
     Raises TrainingError if the training cannot go on, and ProductError if the products
     are of different telescopes or stamps.
@@ -47,14 +49,14 @@ def run(config: Any, task: Task) -> Measured:
     for role in ("validation", "test"):
         product = read_product(task.data[role], "alignment_states", ())
         require(product.path, product.config, STATE_STAMPS, trained_on.config, trained_on.path)
-    settings = part(train_cnn.stage.reads(task.dataset), config, "alignment")
-    train_cnn(settings, task.dataset, task.data["states"], task.checkpoint, task.folder)
+    settings = part(train_cnn.stage.reads(name), config, "alignment")  # type: ignore[attr-defined]
+    train_cnn(settings, name, task.data["states"], task.checkpoint, task.folder)
     limit_threads(config.evaluation.threads)
     metrics: dict[str, float] = {}
-    for role, name in (("validation", VALIDATION), ("test", EVALUATION)):
+    for role, file in (("validation", VALIDATION), ("test", EVALUATION)):
         rows = _rows(config, task, role)
         metrics |= _metrics(role, rows)
-        write_text(task.folder / name, pd.DataFrame(rows).to_csv(index=False, float_format="%.8g"))
+        write_text(task.folder / file, pd.DataFrame(rows).to_csv(index=False, float_format="%.8g"))
     described = read_yaml(task.folder / CONFIG)
     history = read_table(task.folder / HISTORY)
     return Measured(

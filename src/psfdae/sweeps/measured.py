@@ -85,13 +85,6 @@ class Measured:
     attempt: int = 0
 
 
-def stage_part(stage: str, config: Any) -> Any:
-    """The groups that a stage reads, checked, out of a sweep's configuration."""
-    from psfdae.configuration.compose import part
-
-    return part(stage, config)
-
-
 def geometric_mean(values: Sequence[float]) -> float:
     """Mean over noise levels in which every level counts alike."""
     return float(np.exp(np.mean(np.log(values))))

@@ -131,7 +131,7 @@ class Plan:
         except (SweepError, ConfigError) as error:
             at = f" (point {', '.join(f'{k}={v}' for k, v in values.items())})" if values else ""
             raise SweepError(f"{where}: {str(error).splitlines()[0]}{at}") from None
-        return stage_tree(self.sweep.stage, checked)
+        return stage_tree(self.sweep.reads, checked, self.sweep.root)
 
     @cached_property
     def _data(self) -> dict[str, Any]:
