@@ -12,10 +12,9 @@ from psfdae.alignment.telescope import uniform_states
 from psfdae.configuration.compose import load
 from psfdae.optics.derivatives import ModalStamps, NodeSampling, PeriodSampling
 from psfdae.optics.propagation import StampPropagator, pixel_nodes
-from psfdae.optics.pupil import annular_pupil
+from psfdae.optics.pupil import SamplingError, annular_pupil
 from psfdae.optics.raytracing import annulus_points, misaligned
-from psfdae.optics.sampling import SamplingError
-from psfdae.optics.seidel import monomial_coefficients, monomial_images
+from psfdae.optics.wavefronts import monomial_coefficients, monomial_images
 
 OBSCURATION = 0.42
 SHOWN = [((0, 0, 0, 0), 0), ((0.6, -0.3, 0.2, 0.8), 2), ((1, 1, 1, 1), 7)]

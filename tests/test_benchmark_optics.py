@@ -18,10 +18,8 @@ import scenes
 from psfdae.configuration.compose import load_stage
 from psfdae.files import ProductError
 from psfdae.optics.propagation import StampPropagator
-from psfdae.optics.pupil import annular_pupil
-from psfdae.optics.sampling import SamplingError
-from psfdae.optics.seidel import monomial_coefficients, monomial_images
-from psfdae.optics.wavefronts import seidel_wavefronts
+from psfdae.optics.pupil import SamplingError, annular_pupil
+from psfdae.optics.wavefronts import monomial_coefficients, monomial_images, seidel_wavefronts
 from psfdae.stars.framing import normalise_flux
 from workflow_runs import ROOT
 

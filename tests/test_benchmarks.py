@@ -19,8 +19,7 @@ import trainings
 from psfdae.configuration.compose import load_stage
 from psfdae.optics.wavefronts import seidel_wavefronts
 from psfdae.own_stars.bundle import shipped_path
-from psfdae.stars.framing import normalise_flux
-from psfdae.stars.scene import Propagation
+from psfdae.stars.framing import Propagation, normalise_flux
 from workflow_runs import ROOT, planned, snakemake
 
 RECORD = ROOT / "results/reference/tables"

@@ -13,11 +13,9 @@ from psfdae.bounds.growth import extrapolate, last_change, nested_means, segment
 from psfdae.bounds.posterior import Likelihood, exact_posterior, merge, posterior_sums
 from psfdae.optics.propagation import StampPropagator
 from psfdae.optics.pupil import annular_pupil
-from psfdae.optics.seidel import monomial_coefficients, monomial_images
-from psfdae.optics.wavefronts import seidel_wavefronts
+from psfdae.optics.wavefronts import monomial_coefficients, monomial_images, seidel_wavefronts
 from psfdae.stars.fields import perturb, relative_field
-from psfdae.stars.framing import brightest_pixel, normalise_flux
-from psfdae.stars.scene import Propagation
+from psfdae.stars.framing import Propagation, brightest_pixel, normalise_flux
 from psfdae.stars.symmetry import SYMMETRIES
 
 POINTS, SIDE = 3, 8

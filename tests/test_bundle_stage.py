@@ -129,7 +129,7 @@ def test_unknown_optics_have_no_diffraction_limit(folder, tmp_path):
 def test_metrics_are_those_of_the_stage_evaluate(folder, tiny):
     config = load_stage(stage.bundle.stage.reads, TINY)
     images = gaussians(1400, 1)
-    from psfdae.stars.splits import random_split
+    from psfdae.stars.fields import random_split
 
     test = random_split(1400, 1000, 400, config.parts.validation_fraction, config.seed).test
     for row in tiny.info.metrics:

@@ -29,7 +29,7 @@ from psfdae.own_stars.training_images import (
     star_of_images,
 )
 from psfdae.rng import stream
-from psfdae.stars.splits import held_out_fields
+from psfdae.stars.fields import held_out_fields
 
 ROOT = Path(__file__).resolve().parents[1]
 SIDE = {"side_px": 700, "bright": 60, "faint": 80, "blended": 6, "saturated": 3}

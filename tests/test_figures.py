@@ -27,9 +27,8 @@ from psfdae.files import Column, ProductError, write_product
 from psfdae.rng import stream
 from psfdae.stages import figures as stage
 from psfdae.stages.evaluate import Models
-from psfdae.stars.fields import square_grid
+from psfdae.stars.fields import random_split, square_grid
 from psfdae.stars.noise import NoiseModel
-from psfdae.stars.splits import random_split
 
 METHODS = ("noisy", "pca_som", "dae", "lmmse")
 LEVELS = (0.001, 0.002, 0.003, 0.005)

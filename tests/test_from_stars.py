@@ -35,7 +35,7 @@ from psfdae.rng import stream
 from psfdae.stages import example_field as example_stage
 from psfdae.stages.common import noise_model, split_stars
 from psfdae.stages.from_stars import Source, _alone, from_stars
-from psfdae.stars.splits import held_out_fields
+from psfdae.stars.fields import held_out_fields
 
 ROOT = Path(__file__).resolve().parents[1]
 SIDE = {"side_px": 700, "bright": 60, "faint": 80, "blended": 6, "saturated": 3}

@@ -12,7 +12,7 @@ from scipy.special import j0, j1
 
 from psfdae.optics.propagation import StampPropagator, pixel_nodes
 from psfdae.optics.pupil import Pupil, annular_pupil, pupil_axis
-from psfdae.optics.seidel import monomial_coefficients, monomial_images
+from psfdae.optics.wavefronts import monomial_coefficients, monomial_images
 
 ARCSEC = np.pi / 180 / 3600
 COMATIC = monomial_coefficients(np.array([0.5, 4.0, 4.196, 1.813, -0.113]), np.array([0.6, 0.4]))
@@ -147,7 +147,7 @@ def test_scene_settings_stay_within_the_error_budget(scene1):
     """1 % of the smallest noise variance that a stamp of scene 1 will carry."""
     from psfdae.optics.wavefronts import seidel_wavefronts
     from psfdae.stars.fields import perturb, relative_field
-    from psfdae.stars.scene import Propagation
+    from psfdae.stars.framing import Propagation
 
     budget = 0.01 * (scene1.noise.kappa * 3e-5) ** 2
     field = relative_field(scene1.grid)
@@ -170,7 +170,7 @@ def test_scene_settings_stay_within_the_error_budget(scene1):
 def test_scene_2_settings_stay_within_the_error_budget():
     from psfdae.configuration.compose import load
     from psfdae.stages.common import template_wavefronts
-    from psfdae.stars.scene import Propagation
+    from psfdae.stars.framing import Propagation
 
     config = load(["dataset=dataset7", "grid.points=6"])
     budget = 0.01 * (config.noise.kappa * min(config.noise.levels)) ** 2

@@ -5,11 +5,22 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from psfdae.optics.pupil import annular_pupil, disc_coverage, pupil_axis
-from psfdae.optics.sampling import SamplingError, choose_samples, required_samples
-from psfdae.optics.seidel import monomial_coefficients, monomial_images
-from psfdae.optics.wavefronts import seidel_wavefronts
-from psfdae.optics.zernike import noll_to_nm, zernike, zernike_basis
+from psfdae.optics.pupil import (
+    SamplingError,
+    annular_pupil,
+    choose_samples,
+    disc_coverage,
+    pupil_axis,
+    required_samples,
+)
+from psfdae.optics.wavefronts import (
+    monomial_coefficients,
+    monomial_images,
+    noll_to_nm,
+    seidel_wavefronts,
+    zernike,
+    zernike_basis,
+)
 
 STATIC = np.array([0.5, 4.0, 4.196, 1.813, -0.113])
 

@@ -32,7 +32,8 @@ def rules():
                 continue
             kind = next((k for k in OPTIONS if re.search(rf"\{{[^}}]*{k}[^}}]*\}}", call[0])), "")
             for option in OPTIONS.get(kind, ("",)):
-                node = ast.parse(re.sub(r"\{[^}]*\}", option, call[0]).replace('f"', '"')).body[0]
+                said = re.sub(r"\{[^}]*\.title\(\)\}", option.title(), call[0])
+                node = ast.parse(re.sub(r"\{[^}]*\}", option, said).replace('f"', '"')).body[0]
                 functions = [a.value for a in node.value.args if isinstance(a, ast.Constant)]
                 chosen = [v for k in node.value.keywords for v in ast.literal_eval(k.value)]
                 chosen += METHODS if call[1] == "estimators" else []
@@ -89,7 +90,7 @@ def test_formula_of_the_settings(changed):
 
 def test_scene(changed):
     """Data of that scene, and of no other."""
-    found = changed("stars/turbulence_scene.py", ("+", "-"))
+    found = changed("stars/scenes.py", ("SLOPE_MARGIN * slopes", "slopes * SLOPE_MARGIN"))
     assert {"templates turbulence", "stars turbulence"} <= found
     for name in ("templates seidel", "stars seidel", "telescope_stars", "bank", "dae"):
         assert name not in found

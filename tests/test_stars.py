@@ -13,19 +13,21 @@ from psfdae.stars.fields import (
     assign_fields,
     draw_jitter,
     draw_phase,
+    held_out_fields,
+    held_out_split,
     perturb,
+    random_split,
     relative_field,
     square_grid,
 )
 from psfdae.stars.framing import (
     FramingError,
+    Propagation,
     brightest_pixel,
     crop_jittered,
     normalise_flux,
 )
 from psfdae.stars.noise import mixed_levels
-from psfdae.stars.scene import Propagation
-from psfdae.stars.splits import held_out_fields, held_out_split, random_split
 
 
 @pytest.fixture(scope="module")

@@ -11,12 +11,10 @@ from measure import alone, cost_of_command
 from prediction import make_cube
 from psfdae.configuration.compose import compose, load_stage
 from psfdae.files import Column, Empty, ProductError, read_product, stream_product, write_product
-from psfdae.optics.seidel import monomial_images
-from psfdae.optics.wavefronts import ModalWavefronts
+from psfdae.optics.wavefronts import ModalWavefronts, monomial_images
 from psfdae.stages import stars, templates
 from psfdae.stages.common import template_wavefronts
-from psfdae.stars.framing import brightest_pixel
-from psfdae.stars.scene import Propagation
+from psfdae.stars.framing import Propagation, brightest_pixel
 
 CHEAP = (
     *("grid.points=3", "optics.pupil_samples=[40,80]", "optics.nodes=3", "optics.threads=1"),

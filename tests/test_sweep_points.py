@@ -20,7 +20,7 @@ from psfdae.stages import sweep_figures, sweep_summary, track
 from psfdae.stages.alignment_train import train_noise_trained
 from psfdae.stages.common import noise_model
 from psfdae.stages.fit import baseline, train
-from psfdae.stars.splits import random_split
+from psfdae.stars.fields import random_split
 from psfdae.sweeps.measured import Task
 from psfdae.sweeps.space import SweepError
 from psfdae.tracking import runs_of_sweep

@@ -21,14 +21,17 @@ from psfdae.configuration.compose import (
 from psfdae.files import read_product
 from psfdae.optics.pupil import annular_pupil
 from psfdae.optics.raytracing import RayTracingError
-from psfdae.optics.wavefronts import seidel_wavefronts, zernike_wavefronts
-from psfdae.optics.zernike import field_coefficients, zernike_images
+from psfdae.optics.wavefronts import (
+    field_coefficients,
+    seidel_wavefronts,
+    zernike_images,
+    zernike_wavefronts,
+)
 from psfdae.stages import stars, templates
 from psfdae.stages.common import star_wavefronts, template_wavefronts
 from psfdae.stars.fields import relative_field
-from psfdae.stars.framing import normalise_flux
-from psfdae.stars.scene import Propagation
-from psfdae.stars.telescope_scene import static_terms
+from psfdae.stars.framing import Propagation, normalise_flux
+from psfdae.stars.scenes import static_terms
 
 OWN = "dataset=_telescope"
 Z4, Z5, Z8, Z11 = 2 * np.sqrt(3), np.sqrt(6), 3 * np.sqrt(8), 6 * np.sqrt(5)

@@ -9,8 +9,7 @@ import pytest
 from scipy.special import jv
 
 from psfdae.configuration.compose import ConfigError, load
-from psfdae.optics.pupil import annular_pupil, pupil_axis
-from psfdae.optics.sampling import SamplingError
+from psfdae.optics.pupil import SamplingError, annular_pupil, pupil_axis
 from psfdae.optics.turbulence import (
     SPECTRUM,
     STRENGTH,
@@ -20,10 +19,10 @@ from psfdae.optics.turbulence import (
     layer_r0,
     structure_function,
 )
-from psfdae.optics.zernike import zernike_basis
+from psfdae.optics.wavefronts import zernike_basis
 from psfdae.rng import stream
 from psfdae.stars.fields import square_grid
-from psfdae.stars.turbulence_scene import template_wavefronts
+from psfdae.stars.scenes import TurbulenceScene
 
 R0, L0, HEIGHTS, STRENGTHS = 0.2, 25.0, (0.0, 4000.0, 10000.0), (0.6, 0.25, 0.15)
 FLOAT64 = np.dtype(np.float64)
@@ -41,11 +40,11 @@ def scene(points=20, **changes):
         "waves": 512,
         "remove_tilt": True,
     }
-    return template_wavefronts(
+    return TurbulenceScene(
         SimpleNamespace(points=points, spacing_deg=14 / 60 / 19),
         SimpleNamespace(diameter_m=1.0, obscuration=0.0),
         SimpleNamespace(**(wavefront | changes)),
-    )
+    ).templates()
 
 
 def waves(seed, r0=R0, highest=60.0):

@@ -15,9 +15,8 @@ from psfdae.stages import stars as stars_stage
 from psfdae.stages import templates as templates_stage
 from psfdae.stages.common import star_wavefronts
 from psfdae.stars.fields import assign_fields, draw_jitter
-from psfdae.stars.framing import normalise_flux
+from psfdae.stars.framing import Propagation, normalise_flux
 from psfdae.stars.noise import NoiseModel
-from psfdae.stars.scene import Propagation
 
 THREADS = 2  # of the linear algebra, and trainings side by side
 # Noise levels λ of the paper's three bands.

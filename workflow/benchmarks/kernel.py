@@ -10,7 +10,7 @@ import numpy as np
 
 from measure import pareto, time_in_rounds, use_threads, yes
 from psfdae.optics.propagation import StampPropagator
-from psfdae.optics.sampling import SamplingError
+from psfdae.optics.pupil import SamplingError
 from psfdae.stars.framing import normalise_flux
 from psfdae.threads import side_by_side
 from scenes import Case, pupil_of

@@ -16,7 +16,7 @@ import numpy as np
 
 from kernel import Setting, Trial, kernel_trials, time_trials
 from measure import use_threads, yes
-from psfdae.optics.sampling import ARCSEC
+from psfdae.optics.pupil import ARCSEC
 from psfdae.stars.framing import normalise_flux
 from scenes import pupil_of
 

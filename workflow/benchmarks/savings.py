@@ -14,11 +14,9 @@ from measure import time_calls, use_threads
 from peers import Peer, build, fresnel_grid
 from psfdae.configuration.compose import part
 from psfdae.optics.propagation import StampPropagator
-from psfdae.optics.sampling import choose_samples
-from psfdae.optics.seidel import MONOMIALS, monomial_images
+from psfdae.optics.pupil import choose_samples
 from psfdae.optics.turbulence import structure_function
-from psfdae.optics.wavefronts import ModalWavefronts
-from psfdae.optics.zernike import zernike_images
+from psfdae.optics.wavefronts import MONOMIALS, ModalWavefronts, monomial_images, zernike_images
 from psfdae.stages.common import template_wavefronts
 from psfdae.stars.framing import crop_jittered
 from scenes import READS, Selection, pupil_of, relative_to_peak, spread_evenly, stamp_mse

@@ -15,8 +15,7 @@ from psfdae.optics.wavefronts import WavefrontSource
 from psfdae.rng import stream
 from psfdae.stages.common import star_wavefronts, template_wavefronts
 from psfdae.stars.fields import assign_fields
-from psfdae.stars.framing import normalise_flux
-from psfdae.stars.scene import Propagation
+from psfdae.stars.framing import Propagation, normalise_flux
 
 READS = (*SIMULATION, "noise", "benchmark")
 BUDGET = 0.01  # numerical MSE of a stamp in units of the smallest noise variance it carries

@@ -27,7 +27,7 @@ rule propagation:
         ),
         source=lambda w: source_hash(
             "workflow/benchmarks/propagation.py:measure",
-            chosen=[f"psfdae.stars.{w.scene}_scene"],
+            chosen=[f"psfdae.stars.scenes:{w.scene.title()}Scene"],
         ),
         program=program("propagation.measure"),
         folder=subpath(output.propagation, parent=True),

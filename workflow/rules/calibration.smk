@@ -13,7 +13,9 @@ rule scan:
         config=lambda w: settings("scan", f"dataset={w.dataset}"),
         source=lambda w: source_hash(
             "scan",
-            chosen=[f"psfdae.stars.{dataset_config(w.dataset).scene.name}_scene"],
+            chosen=[
+                f"psfdae.stars.scenes:{dataset_config(w.dataset).scene.name.title()}Scene"
+            ],
         ),
     message:
         "Scanning pixel scales and dynamic ranges for {wildcards.dataset}"

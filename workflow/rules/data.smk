@@ -12,7 +12,7 @@ rule templates:
     params:
         config=lambda w: settings("templates", f"scene={w.scene}"),
         source=lambda w: source_hash(
-            "templates", chosen=[f"psfdae.stars.{w.scene}_scene"]
+            "templates", chosen=[f"psfdae.stars.scenes:{w.scene.title()}Scene"]
         ),
     message:
         "Propagating the static PSFs of scene {wildcards.scene}"
@@ -35,7 +35,9 @@ rule stars:
         runtime=30,
     params:
         config=lambda w: settings("stars", f"stars={w.stars}"),
-        source=lambda w: source_hash("stars", chosen=[f"psfdae.stars.{w.scene}_scene"]),
+        source=lambda w: source_hash(
+            "stars", chosen=[f"psfdae.stars.scenes:{w.scene.title()}Scene"]
+        ),
     message:
         "Simulating the noise-free stars {wildcards.stars}"
     shell:

@@ -21,7 +21,7 @@ use rule stars as fresh_stars with:
             # Another name is another random stream.
             more=("stars.name=fresh", f"stars.count={KNEE.fresh_stars}"),
         ),
-        source=source_hash("stars", chosen=["psfdae.stars.seidel_scene"]),
+        source=source_hash("stars", chosen=["psfdae.stars.scenes:SeidelScene"]),
     message:
         "Simulating other stars for the knee of the training"
 

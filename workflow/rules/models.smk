@@ -14,7 +14,9 @@ use rule stars as more_stars with:
             f"stars={w.stars}",
             more=(f"stars.name={w.stars}_fresh", f"stars.count={w.count}"),
         ),
-        source=lambda w: source_hash("stars", chosen=[f"psfdae.stars.{w.scene}_scene"]),
+        source=lambda w: source_hash(
+            "stars", chosen=[f"psfdae.stars.scenes:{w.scene.title()}Scene"]
+        ),
     message:
         "Simulating {wildcards.count} other stars {wildcards.stars}"
 

@@ -13,7 +13,7 @@ rule telescope_templates:
         runtime=10,
     params:
         config=lambda w: settings("templates", f"dataset={w.stars}"),
-        source=source_hash("templates", chosen=["psfdae.stars.telescope_scene"]),
+        source=source_hash("templates", chosen=["psfdae.stars.scenes:TelescopeScene"]),
     message:
         "Propagating the static PSFs of the telescope of {wildcards.stars}"
     shell:
@@ -37,7 +37,7 @@ use rule stars as telescope_stars with:
         runtime=60,
     params:
         config=lambda w: settings("stars", f"dataset={w.stars}"),
-        source=source_hash("stars", chosen=["psfdae.stars.telescope_scene"]),
+        source=source_hash("stars", chosen=["psfdae.stars.scenes:TelescopeScene"]),
 
 
 rule figure_telescope:

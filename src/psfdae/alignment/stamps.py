@@ -23,11 +23,15 @@ from psfdae.optics.derivatives import (
     normalise_with_derivatives,
 )
 from psfdae.optics.propagation import in_batches
-from psfdae.optics.pupil import annular_pupil
+from psfdae.optics.pupil import annular_pupil, choose_samples, required_samples
 from psfdae.optics.raytracing import FIRST_NOLL
-from psfdae.optics.sampling import choose_samples, required_samples
-from psfdae.optics.wavefronts import mode_slopes, slope_ranges
-from psfdae.optics.zernike import noll_to_nm, radial_polynomial, zernike
+from psfdae.optics.wavefronts import (
+    mode_slopes,
+    noll_to_nm,
+    radial_polynomial,
+    slope_ranges,
+    zernike,
+)
 from psfdae.stars.framing import normalise_flux
 
 

@@ -25,8 +25,7 @@ import numpy as np
 from psfdae.configuration.alignment import Alignment
 from psfdae.configuration.prescription import Prescription
 from psfdae.configuration.telescope import Telescope
-from psfdae.optics.raytracing import ZernikeTracer
-from psfdae.stars.prescription import build_optic
+from psfdae.optics.raytracing import ZernikeTracer, build_optic
 from psfdae.stars.symmetry import SYMMETRIES, Symmetry
 
 PAIRS = tuple(combinations_with_replacement(range(4), 2))

@@ -18,7 +18,7 @@ from psfdae.configuration.telescope import Telescope
 from psfdae.optics.derivatives import ModalStamps, NodeSampling, normalise_with_derivatives
 from psfdae.optics.propagation import in_batches
 from psfdae.optics.pupil import annular_pupil
-from psfdae.optics.seidel import SEIDEL_TERMS, monomial_coefficients, monomial_images
+from psfdae.optics.wavefronts import SEIDEL_TERMS, monomial_coefficients, monomial_images
 
 BATCH = 16
 """Stars at a time, to bound the memory."""

@@ -10,7 +10,7 @@ from pydantic import ValidationError, model_validator
 
 from psfdae.configuration.base import SEARCH, Group
 from psfdae.configuration.telescope import Telescope, has_own_aberrations
-from psfdae.optics.sampling import required_nodes
+from psfdae.optics.pupil import required_nodes
 
 OWN_SCENE = "telescope"
 """The scene of a telescope that brings its own aberrations."""

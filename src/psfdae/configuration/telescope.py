@@ -9,7 +9,7 @@ from pydantic import BeforeValidator, Field
 
 from psfdae.configuration.base import Fraction, Group, Name, Positive
 from psfdae.configuration.wavefront import Raytraced, Seidel, Zernike
-from psfdae.optics.sampling import pixel_width
+from psfdae.optics.pupil import pixel_width
 
 ABERRATIONS: dict[str, type[Group]] = {
     "seidel": Seidel,

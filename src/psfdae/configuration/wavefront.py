@@ -10,7 +10,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from psfdae.configuration.base import Finite, Group, Positive
 from psfdae.configuration.prescription import Prescription
-from psfdae.optics.seidel import SEIDEL_TERMS
+from psfdae.optics.wavefronts import SEIDEL_TERMS
 
 HIGHEST_NOLL = 45
 HIGHEST_POWER = 6

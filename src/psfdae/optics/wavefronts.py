@@ -2,19 +2,175 @@
 
 A mode is the OPD in waves of a unit coefficient: a Seidel monomial, a Zernike
 polynomial. Scenes differ in their modes and in how they draw coefficients, no more.
+
+The third-order (Seidel) wavefront of a telescope over its field is
+
+W(H, ρ, φ) = W040 ρ⁴ + W131 H ρ³cosφ + W222 H²ρ²cos²φ + W220 H²ρ² + W311 H³ρcosφ
+
+with φ counted from the direction of the field point and H = 1 at the edge of
+the field on an axis. Written with the field vector h = (h_x, h_y), |h| = H,
+every term is a polynomial in the pupil's (x, y), so one set of eight monomial
+images serves all field points and no angle has to be formed (it would be
+undefined on axis). Zernike polynomials are in Noll's order and normalisation
+(Noll 1976, JOSA 66, 207).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
+from math import comb
 from typing import Protocol
 
 import numpy as np
 
 from psfdae.optics.pupil import Pupil
-from psfdae.optics.seidel import monomial_coefficients, monomial_images
-from psfdae.optics.zernike import zernike_images
+
+SEIDEL_TERMS = ("spherical", "coma", "astigmatism", "field_curvature", "distortion")
+"""Order of the coefficients W040, W131, W222, W220, W311 in every array."""
+
+MONOMIALS = ("r4", "r2x", "r2y", "xx", "xy", "yy", "x", "y")
+"""Order of the pupil monomials of a Seidel wavefront (r² = x² + y²)."""
+
+
+def monomial_coefficients(seidel: np.ndarray, field: np.ndarray) -> np.ndarray:
+    """Seidel coefficients at field points, as coefficients of pupil monomials.
+
+    Parameters
+    ----------
+    seidel : ndarray, shape (..., 5)
+        Coefficients in waves in the order of `SEIDEL_TERMS`.
+    field : ndarray, shape (..., 2)
+        Field vector (h_x, h_y), 1 at the edge of the field on an axis.
+
+    Returns
+    -------
+    ndarray, shape (..., 8)
+        Coefficients in waves in the order of `MONOMIALS`.
+    """
+    w040, w131, w222, w220, w311 = np.moveaxis(np.asarray(seidel, float), -1, 0)
+    hx, hy = np.moveaxis(np.asarray(field, float), -1, 0)
+    h2 = hx**2 + hy**2
+    terms = (
+        w040,
+        w131 * hx,
+        w131 * hy,
+        w222 * hx**2 + w220 * h2,
+        2.0 * w222 * hx * hy,
+        w222 * hy**2 + w220 * h2,
+        w311 * h2 * hx,
+        w311 * h2 * hy,
+    )
+    return np.stack(np.broadcast_arrays(*terms), axis=-1)
+
+
+def monomial_images(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Values of the eight monomials at pupil points.
+
+    Parameters
+    ----------
+    x, y : ndarray, broadcastable to one shape (...)
+        Pupil coordinates in units of the pupil radius.
+
+    Returns
+    -------
+    ndarray, shape (8, ...)
+    """
+    x, y = np.broadcast_arrays(x, y)
+    r2 = x**2 + y**2
+    return np.stack([r2**2, r2 * x, r2 * y, x**2, x * y, y**2, x, y])
+
+
+def noll_to_nm(j: int) -> tuple[int, int]:
+    """Radial order n and signed azimuthal order m of Noll index j ≥ 1.
+
+    m > 0 marks cosine terms, m < 0 sine terms; even j are cosines.
+
+    Raises
+    ------
+    ValueError
+        If j < 1.
+    """
+    if j < 1:
+        raise ValueError(f"Noll index {j}: must be at least 1")
+    n = 0
+    while (n + 1) * (n + 2) // 2 < j:
+        n += 1
+    position = j - n * (n + 1) // 2 - 1
+    m = 2 * ((position + 1) // 2) if n % 2 == 0 else 2 * (position // 2) + 1
+    return n, m if j % 2 == 0 else -m
+
+
+def radial_polynomial(n: int, m: int, r: np.ndarray) -> np.ndarray:
+    """R_n^|m|(r), 1 at r = 1."""
+    m = abs(m)
+    return sum(
+        (-1) ** k * comb(n - k, k) * comb(n - 2 * k, (n - m) // 2 - k) * r ** (n - 2 * k)
+        for k in range((n - m) // 2 + 1)
+    )
+
+
+def zernike(j: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Noll polynomial Z_j on the unit disc, of RMS 1 there.
+
+    Parameters
+    ----------
+    j : int
+        Noll index.
+    x, y : ndarray
+        Pupil coordinates in pupil radii; values outside the disc are those of
+        the polynomial.
+
+    Returns
+    -------
+    ndarray of the broadcast shape of x and y
+    """
+    n, m = noll_to_nm(j)
+    r, theta = np.hypot(x, y), np.arctan2(y, x)
+    if m == 0:
+        return np.sqrt(n + 1.0) * radial_polynomial(n, 0, r)
+    angular = np.cos(m * theta) if m > 0 else np.sin(-m * theta)
+    return np.sqrt(2.0 * (n + 1.0)) * radial_polynomial(n, m, r) * angular
+
+
+def zernike_images(noll: Iterable[int], x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Values of some Noll polynomials at pupil points in pupil radii, shape (J, ...)."""
+    return np.stack([zernike(j, x, y) for j in noll])
+
+
+def zernike_basis(count: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Z_1 … Z_count, shape (count, ...)."""
+    return zernike_images(range(1, count + 1), x, y)
+
+
+def field_coefficients(
+    polynomials: Sequence[Mapping[tuple[int, int], float]], field: np.ndarray
+) -> np.ndarray:
+    """Coefficients whose field dependence is polynomial, at field points.
+
+    Nodal aberration theory writes every Zernike coefficient of a telescope, aligned or
+    not, as a polynomial of the field vector (Thompson 2005, JOSA A 22, 1389). Pupil and
+    field share x and y: a coefficient of Z8 that grows with x is coma as in Seidel's theory.
+
+    Parameters
+    ----------
+    polynomials : sequence of length J
+        Per term: coefficient in waves by the powers (of x, of y) of the field.
+    field : ndarray, shape (F, 2)
+        Field vector (x, y), 1 at the edge of the field on an axis.
+
+    Returns
+    -------
+    ndarray, shape (F, J)
+        In waves.
+    """
+    x, y = field[:, 0], field[:, 1]
+    terms = [
+        sum((waves * x**a * y**b for (a, b), waves in polynomial.items()), np.zeros(len(field)))
+        for polynomial in polynomials
+    ]
+    return np.stack(terms, axis=1)
+
 
 Modes = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Modes at pupil points (x, y) in pupil radii, shapes (...) to (J, ...)."""
@@ -129,7 +285,7 @@ def seidel_wavefronts(seidel: np.ndarray, field: np.ndarray) -> ModalWavefronts:
     Parameters
     ----------
     seidel : ndarray, shape (B, 5)
-        Coefficients in waves in the order of `psfdae.optics.seidel.SEIDEL_TERMS`.
+        Coefficients in waves in the order of `SEIDEL_TERMS`.
     field : ndarray, shape (B, 2)
         Relative field vector (h_x, h_y).
     """

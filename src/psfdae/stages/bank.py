@@ -14,7 +14,7 @@ from psfdae.files import Column, write_product
 from psfdae.rng import stream
 from psfdae.stages.common import drawn_columns, limit_threads, star_wavefronts
 from psfdae.stars.fields import assign_fields
-from psfdae.stars.scene import Propagation
+from psfdae.stars.framing import Propagation
 
 FINE_RUNGS = (158, 190)
 """Pupil samples that a bank may use besides `optics.pupil_samples`.

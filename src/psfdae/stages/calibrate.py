@@ -20,14 +20,13 @@ from psfdae.evaluation.calibration import (
 )
 from psfdae.evaluation.metrics import mse, ssim
 from psfdae.files import Product, read_product, write_text
-from psfdae.optics.sampling import required_nodes
+from psfdae.optics.pupil import required_nodes
 from psfdae.reading import read_table
 from psfdae.rng import stream
 from psfdae.stages.common import limit_threads, star_wavefronts, template_wavefronts
 from psfdae.stars.fields import assign_fields
-from psfdae.stars.framing import normalise_flux
+from psfdae.stars.framing import Propagation, normalise_flux
 from psfdae.stars.noise import NoiseModel
-from psfdae.stars.scene import Propagation
 
 
 @command("scan", reads=(*SIMULATION, "noise", "calibration"))

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from importlib import import_module
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 
 from psfdae.files import Column, Product, ProductError, read_product
 from psfdae.rng import stream
+from psfdae.stars.fields import Split, held_out_split, random_split
 from psfdae.stars.noise import NoiseModel
-from psfdae.stars.splits import Split, held_out_split, random_split
 
 
 class OutputError(ValueError):
@@ -33,22 +31,21 @@ def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Any]) -> None
             raise OutputError(f"{out}: is an input, too; choose another name")
 
 
-def scene_module(name: str) -> ModuleType:
-    """Module of a scene; the others are neither imported nor part of a rerun's reasons."""
-    return import_module(f"psfdae.stars.{name}_scene")
+def scene_of(config: Any) -> Any:
+    """The scene of a stage's config."""
+    from psfdae.stars.scenes import SCENES
+
+    return SCENES[config.scene.name](config.grid, config.telescope, config.wavefront)
 
 
 def template_wavefronts(config: Any) -> Any:
     """Static wavefronts of all fields of a stage's scene."""
-    scene = scene_module(config.scene.name)
-    return scene.template_wavefronts(config.grid, config.telescope, config.wavefront)
+    return scene_of(config).templates()
 
 
 def star_wavefronts(config: Any, star_field: np.ndarray) -> Any:
     """Wavefronts of stars with random aberrations, `star_field` the field of each."""
-    scene = scene_module(config.scene.name)
-    groups = (config.grid, config.telescope, config.wavefront, config.stars)
-    return scene.star_wavefronts(*groups, star_field, config.seed)
+    return scene_of(config).stars(config.stars, star_field, config.seed)
 
 
 def drawn_columns(source: Any) -> dict[str, Column]:

@@ -29,7 +29,7 @@ from psfdae.stages.common import check_outputs
 from psfdae.stages.evaluate import READS, Models, estimators, evaluate
 from psfdae.stages.fit import fit
 from psfdae.stages.predict import Stated
-from psfdae.stars.splits import held_out_fields
+from psfdae.stars.fields import held_out_fields
 
 LOCK = ".from_stars.lock"
 

@@ -141,9 +141,8 @@ def _light(config: Config, fields: FieldOfPsfs, least_energy: float) -> list[str
 
 def _wide_enough(config: Config, worst: int) -> int | None:
     """Least even stamp that holds enough light of the field that needs the widest one."""
-    from psfdae.optics.sampling import SamplingError
-    from psfdae.stars.framing import FramingError
-    from psfdae.stars.scene import Propagation
+    from psfdae.optics.pupil import SamplingError
+    from psfdae.stars.framing import FramingError, Propagation
 
     side = LARGEST * config.framing.stamp_px
     framing = config.framing.model_copy(update={"stamp_px": side})

@@ -83,7 +83,7 @@ def _templates(framed: np.ndarray, jitter: np.ndarray, margin: int) -> dict[str,
 
 
 def _propagation(config: Config, star_field: np.ndarray) -> Any:
-    from psfdae.stars.scene import Propagation
+    from psfdae.stars.framing import Propagation
 
     limit_threads(1)  # batches run side by side
     source = star_wavefronts(config, star_field)

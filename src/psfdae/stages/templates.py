@@ -12,7 +12,7 @@ from psfdae.configuration.stages import STATIC
 from psfdae.files import Column, write_product
 from psfdae.stages.common import limit_threads, template_wavefronts
 from psfdae.stars.fields import square_grid
-from psfdae.stars.scene import Propagation
+from psfdae.stars.framing import Propagation
 
 
 @command("templates", reads=STATIC)
