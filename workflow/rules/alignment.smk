@@ -1,4 +1,6 @@
 # Scene 3: states of misalignment, their stamps, the networks, estimates, fits and bounds.
+from psfdae.alignment.methods import CNNS, METHODS
+
 with one_line():
     ALIGNMENT_OVERRIDES = overrides_for("alignment", GIVEN)
 ALIGNMENT_DATA = f"{RESULTS}/data/alignment"

@@ -7,7 +7,6 @@ from importlib import import_module
 
 from snakemake.utils import validate
 
-from psfdae.alignment.methods import CNNS, METHODS
 from psfdae.cli import stage
 from psfdae.configuration.compose import ConfigError, as_overrides, config_dir
 from psfdae.configuration.compose import compose, dataset_names, decisive, load
