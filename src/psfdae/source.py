@@ -233,14 +233,29 @@ class Reader:
 
     def write(self, node: Any) -> None:
         """Write a syntax tree, a list of them or a value."""
-        if isinstance(node, ast.AST):
-            getattr(self, f"visit_{type(node).__name__}", self.plain)(node)
-        elif isinstance(node, list):
-            for item in node:
-                if not _is_text(item):
-                    self.write(item)
-        else:
-            self.parts.append(repr(node))
+        match node:
+            case ast.Import() | ast.ImportFrom() | ast.Pass():
+                pass
+            case ast.Name() | ast.Attribute():
+                self.name(node)
+            case ast.FunctionDef() | ast.AsyncFunctionDef() | ast.Lambda():
+                self.function(node)
+            case ast.ListComp() | ast.SetComp() | ast.DictComp() | ast.GeneratorExp():
+                self.comprehension(node)
+            case ast.Constant() | ast.JoinedStr():
+                self.text(node)
+            case ast.Call():
+                self.call(node)
+            case ast.arg():
+                self.parts.append(node.arg)
+            case ast.AST():
+                self.plain(node)
+            case list():
+                for item in node:
+                    if not _is_text(item):
+                        self.write(item)
+            case _:
+                self.parts.append(repr(node))
 
     def plain(self, node: ast.AST, *, decorated: bool = True) -> None:
         """Write a node by its fields."""
@@ -347,20 +362,6 @@ class Reader:
             elif not named:
                 self.parts.append(repr(part.value))
         self.options += [named] if named else []
-
-    def nothing(self, node: ast.AST) -> None:
-        """What does not count: names tell what they mean, wherever that is imported."""
-
-    def argument(self, node: ast.arg) -> None:
-        """A parameter without its annotation."""
-        self.parts.append(node.arg)
-
-    visit_Import = visit_ImportFrom = visit_Pass = nothing
-    visit_Name = visit_Attribute = name
-    visit_FunctionDef = visit_AsyncFunctionDef = visit_Lambda = function
-    visit_ListComp = visit_SetComp = visit_DictComp = visit_GeneratorExp = comprehension
-    visit_Constant = visit_JoinedStr = text
-    visit_Call, visit_arg = call, argument
 
 
 # Of annotations those of variables count: among them are the fields of dataclasses and settings.
