@@ -147,7 +147,7 @@ class BundleInfo(_Described):
         first, (network, named) = self.format_version == 1, ONLY.values()
         given = [key for key in (*network, *named) if key in self.model_fields_set]
         wanted = network if first else named
-        if sorted(given) != sorted(wanted):
+        if sorted(given) != sorted(wanted) or any(getattr(self, key) is None for key in wanted):
             raise ValueError(f"format {self.format_version} has {' and '.join(wanted)}")
         return self
 
