@@ -306,11 +306,11 @@ def test_shipped_bundle_is_small_and_wide():
 def test_shipped_bundle_covers_stars_that_nobody_has_seen(tmp_path):
     """New stars of the same telescope, from another seed."""
     from psfdae.files import read_product
-    from psfdae.stages import stars, templates
+    from psfdae.stages import stars
 
     sizes = ["seed=11", "grid.points=5", "grid.spacing_deg=2.75", "stars.count=500"]
     chosen = ["dataset=field", *sizes, "parts.train_stars=400", "parts.test_stars=100"]
-    templates.templates(load_stage("templates", chosen), tmp_path / "t.h5")
+    stars.templates(load_stage("templates", chosen), tmp_path / "t.h5")
     stars.stars(load_stage("stars", chosen), tmp_path / "t.h5", tmp_path / "s.h5")
     images = read_product(tmp_path / "s.h5", "stars", ("realisation",))["realisation"]
     bundle, rng = read_bundle(), stream(11, "coverage")
