@@ -9,7 +9,7 @@ import pytest
 from matplotlib.collections import PolyCollection
 
 from psfdae.configuration.compose import load_stage
-from psfdae.evaluation.bound_figures import (
+from psfdae.evaluation.curves import (
     bank_growth,
     efficiency_against_noise,
     errors_above_bounds,

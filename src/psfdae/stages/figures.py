@@ -112,8 +112,8 @@ def figure_headline(
     """Draw restored stars beside the errors and their bounds."""
     from dataclasses import replace
 
+    from psfdae.evaluation.curves import headline
     from psfdae.evaluation.figures import spread_stars
-    from psfdae.evaluation.headline_figure import headline
 
     limit_threads(config.evaluation.threads)
     product = read_stars(stars, HEADLINE_REFERENCE)
@@ -227,7 +227,7 @@ def figure_bounds(
     out: Png,
 ) -> None:
     """Draw the methods' errors above the bounds."""
-    from psfdae.evaluation.bound_figures import errors_above_bounds
+    from psfdae.evaluation.curves import errors_above_bounds
 
     tables = (rows_of(efficiency, dataset), rows_of(bounds, dataset))
     write_png(errors_above_bounds(*tables, dataset), out)
@@ -240,7 +240,7 @@ def figure_efficiency(
     out: Png,
 ) -> None:
     """Draw the methods' efficiency against the noise level."""
-    from psfdae.evaluation.bound_figures import efficiency_against_noise
+    from psfdae.evaluation.curves import efficiency_against_noise
 
     write_png(efficiency_against_noise(rows_of(efficiency, dataset), dataset), out)
 
@@ -252,7 +252,7 @@ def figure_bank_growth(
     out: Png,
 ) -> None:
     """Draw the posterior mean's error against the size of the bank."""
-    from psfdae.evaluation.bound_figures import bank_growth
+    from psfdae.evaluation.curves import bank_growth
 
     write_png(bank_growth(rows_of(growth, dataset), dataset), out)
 

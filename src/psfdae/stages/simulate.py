@@ -13,7 +13,7 @@ import psfdae
 from psfdae.cli import File, Folder, command
 from psfdae.configuration.schema import Config
 from psfdae.configuration.stages import STATIC
-from psfdae.evaluation.telescope_figure import FieldOfPsfs, field_of_psfs
+from psfdae.evaluation.figures import FieldOfPsfs, field_of_psfs
 from psfdae.files import Product, atomic_path, read_product, write_fits, write_text
 from psfdae.own_stars.example import add_stamps, write_field
 from psfdae.own_stars.photometry import noise_equivalent_px
