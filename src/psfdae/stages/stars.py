@@ -102,9 +102,8 @@ def stars(
             cropped = crop_jittered(framed, jitter[part], framing.jitter_px)
             made = dict(zip(("template", "energy"), normalise_flux(cropped), strict=True))
             if propagation is not None:
-                stamps, made["peak"] = propagation.framed(
-                    framing.stamp_px, jitter[part], part, phase[part]
-                )
+                stamps, peak = propagation.framed(framing.stamp_px, jitter[part], part, phase[part])
                 made["realisation"], made["energy"] = normalise_flux(stamps)
+                made["peak"] = peak
             for column, values in made.items():
                 data[column][start : start + STARS_AT_A_TIME] = values
