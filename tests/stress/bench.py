@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from psfdae.models.dae import DaeTraining, TrainingSet, image_scale
+from psfdae.estimators.dae_network import DaeTraining, TrainingSet, image_scale
 from psfdae.own_stars.packing import COMPONENTS, leading
 from psfdae.own_stars.photometry import FluxModel, Photometer
 from psfdae.rng import stream

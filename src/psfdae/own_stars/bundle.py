@@ -30,8 +30,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 import psfdae
 from psfdae.estimators import Method, method
+from psfdae.estimators.weights import digest_of
 from psfdae.files import ProductError, atomic_path
-from psfdae.models.weights import digest_of
 from psfdae.own_stars.errors import one_line
 from psfdae.own_stars.photometry import FluxModel
 
