@@ -98,7 +98,7 @@ def test_metric(jobs, tree):
 
 def test_network(jobs, tree):
     """Trainings and what follows, but no stars."""
-    edit(tree / "src/psfdae/models/dae.py", "Dae")
+    edit(tree / "src/psfdae/estimators/dae_network.py", "Dae")
     found = jobs(*TARGETS)
     assert found["train"] == 6
     assert found["evaluate"] == 6

@@ -7,7 +7,7 @@ import gc
 import hashlib
 import re
 import subprocess
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from fnmatch import filter as matching
 from functools import cache, cached_property
@@ -233,29 +233,14 @@ class Reader:
 
     def write(self, node: Any) -> None:
         """Write a syntax tree, a list of them or a value."""
-        match node:
-            case ast.Import() | ast.ImportFrom() | ast.Pass():
-                pass
-            case ast.Name() | ast.Attribute():
-                self.name(node)
-            case ast.FunctionDef() | ast.AsyncFunctionDef() | ast.Lambda():
-                self.function(node)
-            case ast.ListComp() | ast.SetComp() | ast.DictComp() | ast.GeneratorExp():
-                self.comprehension(node)
-            case ast.Constant() | ast.JoinedStr():
-                self.text(node)
-            case ast.Call():
-                self.call(node)
-            case ast.arg():
-                self.parts.append(node.arg)
-            case ast.AST():
-                self.plain(node)
-            case list():
-                for item in node:
-                    if not _is_text(item):
-                        self.write(item)
-            case _:
-                self.parts.append(repr(node))
+        if isinstance(node, list):
+            for item in node:
+                if not _is_text(item):
+                    self.write(item)
+        elif isinstance(node, ast.AST):
+            SPECIAL.get(type(node), Reader.plain)(self, node)
+        else:
+            self.parts.append(repr(node))
 
     def plain(self, node: ast.AST, *, decorated: bool = True) -> None:
         """Write a node by its fields."""
@@ -366,6 +351,16 @@ class Reader:
 
 # Of annotations those of variables count: among them are the fields of dataclasses and settings.
 NOT_WRITTEN = {"ctx", "kind", "type_comment", "type_params", "returns"}
+SPECIAL: dict[type, Callable[..., None]] = {
+    **dict.fromkeys((ast.Import, ast.ImportFrom, ast.Pass), lambda reader, node: None),
+    **dict.fromkeys((ast.Name, ast.Attribute), Reader.name),
+    **dict.fromkeys((ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda), Reader.function),
+    **dict.fromkeys((ast.ListComp, ast.SetComp, ast.DictComp), Reader.comprehension),
+    **dict.fromkeys((ast.Constant, ast.JoinedStr), Reader.text),
+    ast.GeneratorExp: Reader.comprehension,
+    ast.Call: Reader.call,
+    ast.arg: lambda reader, node: reader.parts.append(node.arg),
+}
 TARGETS = ("targets", "target", "annotation")
 NAMED = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)
 

@@ -102,8 +102,8 @@ def train_cnn(
 ) -> None:
     """Train a CNN that estimates states of misalignment."""
     from psfdae.alignment.cnn import CnnTraining, MixedNoise, TrainingStates
-    from psfdae.models.training import fingerprint, progress, train
-    from psfdae.models.weights import save_weights
+    from psfdae.estimators.training import fingerprint, progress, train
+    from psfdae.estimators.weights import save_weights
 
     if METHODS[kind].denoised != (dae is not None):
         raise click.UsageError(f"--dae goes with --kind {DENOISED}, and only with it")
