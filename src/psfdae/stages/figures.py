@@ -43,9 +43,7 @@ def figure_templates(templates: Templates, out: Png) -> None:
     from psfdae.evaluation.figures import template_map
 
     product = read_product(templates, "templates", ("psf", "grid", "field"))
-    margin = product.config["framing"]["jitter_px"]
-    side = product["psf"].shape[-1] - margin
-    psf = product["psf"][:, margin:side, margin:side]
+    psf = without_margin(product)
     title = (
         f"Static PSFs of scene {product.config['scene']['name']}: {len(psf)} field points, "
         f"stamps of {psf.shape[-1]} × {psf.shape[-1]} px"
@@ -173,6 +171,13 @@ def write_png(figure: Figure, out: Path) -> None:
     with atomic_path(out) as temporary:
         # The temporary name ends in .tmp; the default metadata names matplotlib's version.
         figure.savefig(temporary, format="png", dpi=DPI, metadata={"Software": None})
+
+
+def without_margin(templates: Product) -> np.ndarray:
+    """Static PSFs as they look in the middle of a stamp, shape (F, d, d)."""
+    margin = templates.config["framing"]["jitter_px"]
+    side = templates["psf"].shape[-1] - margin
+    return templates["psf"][:, margin:side, margin:side]
 
 
 def field_of(stars: Product) -> np.ndarray:
