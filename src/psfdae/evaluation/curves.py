@@ -9,7 +9,7 @@ import numpy as np
 
 from psfdae.estimators import Method, method, oracles_last, registered
 from psfdae.evaluation.figure_style import REFERENCES, SERIES_COLORS, new_figure, styled
-from psfdae.evaluation.figures import StripRow, draw_stamp
+from psfdae.evaluation.figures import StripRow, draw_cell
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -392,14 +392,9 @@ def headline(
     step, tall = 0.395 / columns, (top - bottom) / len(rows)
     peak = rows[-1].images.max(axis=(1, 2))
     for number, row in enumerate(rows):
-        scale = row.images.max(axis=(1, 2)) if row.own_scale else peak
-        for i, image in enumerate(row.images):
-            lower = top - (number + 1) * tall
-            axes = figure.add_axes((left + i * step, lower, 0.96 * step, 0.96 * tall))
-            axes.set(xticks=[], yticks=[])
-            draw_stamp(axes, image, scale[i])
-            if i == 0:
-                axes.set_ylabel(row.label, rotation=0, ha="right", va="center", labelpad=5)
+        lower = top - (number + 1) * tall
+        for i in range(columns):
+            draw_cell(figure, (left + i * step, lower, 0.96 * step, 0.96 * tall), row, i, peak)
     figure.text(left + 0.5 * columns * step, 0.92, titles[0], ha="center", fontsize=10)
     panel = figure.add_axes((0.66, bottom, 0.325, top - bottom))
     _errors(panel, methods, efficiency, bounds)

@@ -282,18 +282,14 @@ def restoration_strip(rows: Sequence[StripRow], columns: Sequence[str], title: s
     peak = rows[0].images.max(axis=(1, 2))
     for number, row in enumerate(rows):
         y -= cell
-        scale = row.images.max(axis=(1, 2)) if row.own_scale else peak
-        for i, image in enumerate(row.images):
+        for i in range(len(row.images)):
             box = ((left + i * step) / width, y / height, 0.97 * step / width, 0.97 * cell / height)
-            axes = figure.add_axes(box, xticks=[], yticks=[])
-            draw_stamp(axes, image, scale[i])
+            axes = draw_cell(figure, box, row, i, peak)
             if number == 0:
                 axes.set_title(columns[i], fontsize=8, pad=3)
             if row.mse is not None:
                 number_text = f"{1e6 * row.mse[i]:#.3g}".rstrip(".")
                 axes.set_xlabel(number_text, fontsize=8, labelpad=1.5)
-            if i == 0:
-                axes.set_ylabel(row.label, rotation=0, ha="right", va="center", labelpad=5)
         y -= text if row.mse is not None else 0.0
     figure.suptitle(title, y=1.0 - 0.12 / height, va="top")
     figure.text(
@@ -308,12 +304,24 @@ def restoration_strip(rows: Sequence[StripRow], columns: Sequence[str], title: s
     return figure
 
 
-def draw_stamp(axes: Axes, image: np.ndarray, scale: float) -> Any:
-    """A stamp on a square-root scale that ends at `scale`."""
-    shown = np.sqrt(np.clip(image / scale, 0.0, 1.0))
-    return axes.imshow(
-        shown, origin="lower", cmap=STAMP_MAP, vmin=0.0, vmax=1.0, interpolation="nearest"
+def draw_cell(
+    figure: Figure, box: tuple[float, ...], row: StripRow, column: int, peak: np.ndarray
+) -> Axes:
+    """A stamp of a row on a square-root scale up to `peak`, (n,); the first one has the label."""
+    image = row.images[column]
+    scale = image.max() if row.own_scale else peak[column]
+    axes = figure.add_axes(box, xticks=[], yticks=[])
+    axes.imshow(
+        np.sqrt(np.clip(image / scale, 0.0, 1.0)),
+        origin="lower",
+        cmap=STAMP_MAP,
+        vmin=0.0,
+        vmax=1.0,
+        interpolation="nearest",
     )
+    if column == 0:
+        axes.set_ylabel(row.label, rotation=0, ha="right", va="center", labelpad=5)
+    return axes
 
 
 def _draw_psfs(axes: Axes, psf: np.ndarray, grid: np.ndarray, field: np.ndarray) -> Any:
