@@ -46,11 +46,7 @@ NAMED_POINT = 1
 def training_curves(histories: Mapping[str, pd.DataFrame], title: str) -> Figure:
     """Training and validation error of each network of a dataset.
 
-    Parameters
-    ----------
-    histories : mapping of label to DataFrame
-        Columns step, train_mse, validation_mse (NaN where there was none).
-    title : str
+    Histories by label: columns step, train_mse, validation_mse (NaN where there was none).
     """
     from matplotlib.lines import Line2D
 
@@ -90,14 +86,8 @@ def error_against_noise(
 ) -> Figure:
     """A metric of every method against the noise level, one panel per reference.
 
-    Parameters
-    ----------
-    metrics : DataFrame
-        Rows of the stage `evaluate`; those of other datasets are left out.
-    paper : DataFrame
-        `psfdae.evaluation.paper.published("psf")`; drawn where it has the dataset.
-    dataset, metric : str
-        For example `dataset3`, `mse`.
+    `metrics` are rows of the stage `evaluate`, those of other datasets are left out; `paper` is
+    `psfdae.evaluation.paper.published("psf")`, drawn where it has the dataset.
     """
     from matplotlib.lines import Line2D
 
@@ -178,13 +168,7 @@ def readable_log_axis(axes: Axes) -> None:
 def errors_above_bounds(efficiency: pd.DataFrame, bounds: pd.DataFrame, dataset: str) -> Figure:
     """MSE of every method against the noise level, with both bounds, one panel per reference.
 
-    Parameters
-    ----------
-    efficiency : DataFrame
-        Rows of the stage `efficiency`; those of other datasets are left out.
-    bounds : DataFrame
-        Rows of the stage `bounds`.
-    dataset : str
+    Tables of the stages `efficiency` and `bounds`; rows of other datasets are left out.
     """
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
@@ -227,11 +211,7 @@ def errors_above_bounds(efficiency: pd.DataFrame, bounds: pd.DataFrame, dataset:
 def efficiency_against_noise(efficiency: pd.DataFrame, dataset: str) -> Figure:
     """Bound over MSE of every method against the noise level, one panel per reference.
 
-    Parameters
-    ----------
-    efficiency : DataFrame
-        Rows of the stage `efficiency`; those of other datasets are left out.
-    dataset : str
+    A table of the stage `efficiency`; rows of other datasets are left out.
     """
     from matplotlib.lines import Line2D
 
@@ -268,11 +248,7 @@ def efficiency_against_noise(efficiency: pd.DataFrame, dataset: str) -> Figure:
 def bank_growth(growth: pd.DataFrame, dataset: str) -> Figure:
     """Error of the posterior mean against the size of the bank, one panel per reference.
 
-    Parameters
-    ----------
-    growth : DataFrame
-        Growth table of the stage `bounds`; rows of other datasets are left out.
-    dataset : str
+    The growth table of the stage `bounds`; rows of other datasets are left out.
     """
     from matplotlib.lines import Line2D
 
@@ -374,17 +350,10 @@ def headline(
     bounds: pd.DataFrame,
     titles: Sequence[str],
 ) -> Figure:
-    """Stars in rows at the left, MSE against the noise level at the right.
+    """Stars in rows at the left, MSE of methods against the noise level at the right.
 
-    Parameters
-    ----------
-    rows : sequence of StripRow
-        Stamps on the colour scale of the last row, the truth, unless `own_scale`.
-    methods : sequence of Method
-        Those of the lines.
-    efficiency, bounds : DataFrame
-        Rows of the stages `efficiency` and `bounds`, of one dataset and reference.
-    titles : (left, right)
+    Stamps are on the colour scale of the last row, the truth, unless `own_scale`. Tables of the
+    stages `efficiency` and `bounds` are of one dataset and reference; `titles` (left, right).
     """
     figure = new_figure(3.7)
     left, bottom, top = 0.115, 0.13, 0.86

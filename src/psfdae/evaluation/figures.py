@@ -147,17 +147,9 @@ def spread_stars(position: np.ndarray, count: int) -> np.ndarray:
 
 @styled
 def template_map(psf: np.ndarray, grid: np.ndarray, field: np.ndarray, title: str) -> Figure:
-    """All templates at their field positions, as one mosaic.
+    """All templates (F, d, d) at their field positions, as one mosaic.
 
-    Parameters
-    ----------
-    psf : ndarray, shape (F, d, d)
-        Stamps, [row, column] with y along the rows.
-    grid : ndarray of int, shape (F, 2)
-        Grid index (ix, iy).
-    field : ndarray, shape (F, 2)
-        Field angle (x, y) in radians.
-    title : str
+    `grid` holds grid indices (ix, iy), `field` angles (x, y) in radians, both of shape (F, 2).
     """
     figure = new_figure(7.1, layout="constrained")
     axes = figure.add_subplot()
@@ -174,18 +166,9 @@ def template_map(psf: np.ndarray, grid: np.ndarray, field: np.ndarray, title: st
 def stamp_energy_map(
     energy: np.ndarray, grid: np.ndarray, field: np.ndarray, stamp_px: int
 ) -> Figure:
-    """Fraction of a star's light that its stamp holds, over the field.
+    """Fraction of a star's light that its stamp holds, 0 … 1, shape (F,), over the field.
 
-    Parameters
-    ----------
-    energy : ndarray, shape (F,)
-        Fraction of the light through the pupil, 0 … 1.
-    grid : ndarray of int, shape (F, 2)
-        Grid index (ix, iy).
-    field : ndarray, shape (F, 2)
-        Field angle (x, y) in radians.
-    stamp_px : int
-        Side of the stamp, for the title.
+    `grid` and `field` as for `template_map`.
     """
     figure = new_figure(7.1, layout="constrained")
     axes = figure.add_subplot()
@@ -207,14 +190,7 @@ def field_of_psfs(fields: FieldOfPsfs, name: str, pixel_scale_arcsec: float) -> 
     """Mosaic of all stamps; beside it maps of the light in the stamp and of the FWHM.
 
     Whiskers in the map of the FWHM show the direction of the longer axis, their
-    length the ellipticity.
-
-    Parameters
-    ----------
-    fields : FieldOfPsfs
-    name : str
-        The telescope, for the title.
-    pixel_scale_arcsec : float
+    length the ellipticity. `name` is the telescope's.
     """
     figure = new_figure(5.3, layout="constrained")
     grid = figure.add_gridspec(2, 2, width_ratios=(2.1, 1.0))
@@ -260,18 +236,10 @@ def _small_map(axes: Axes, fields: FieldOfPsfs, values: np.ndarray, cmap: str, t
 
 @styled
 def restoration_strip(rows: Sequence[StripRow], columns: Sequence[str], title: str) -> Figure:
-    """Stars before and after restoration, as in the paper.
+    """Stars before and after restoration, as in the paper; the first row is the reference.
 
     All stamps of a column share the colour scale 0 … maximum of the first row,
-    on a square-root scale, except rows with `own_scale`.
-
-    Parameters
-    ----------
-    rows : sequence of StripRow
-        The first one is the reference.
-    columns : sequence of str
-        Heading of each star.
-    title : str
+    on a square-root scale, except rows with `own_scale`. `columns` are headings of the stars.
     """
     left, right, top, bottom, cell, text = 1.0, 0.1, 0.85, 0.35, 0.86, 0.17
     height = top + bottom + len(rows) * cell + text * sum(row.mse is not None for row in rows)

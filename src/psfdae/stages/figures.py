@@ -199,12 +199,7 @@ def strip_rows(
 ) -> list[StripRow]:
     """Rows of a restoration strip: the reference, then the methods by noise level.
 
-    Parameters
-    ----------
-    config : stage config of `evaluate`
-    product : product "stars"
-    test, picks : test stars, and those of them that are shown
-    reference, methods, levels : what is drawn
+    `config` is that of the stage `evaluate`; `test` are the test stars, `picks` those shown.
     """
     from psfdae.evaluation.figures import StripRow
     from psfdae.evaluation.metrics import mse
