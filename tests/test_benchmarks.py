@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-import baseline
+import trainings as baseline
 import figures
 import measure
 import plan

@@ -6,8 +6,8 @@ from itertools import product
 
 import numpy as np
 
-from kernel import PRECISIONS, candidate_nodes, candidate_samples
 from measure import yes
+from propagators import PRECISIONS, candidate_nodes, candidate_samples
 from psfdae.optics.pupil import SamplingError, choose_samples, required_nodes
 from psfdae.stars.framing import normalise_flux
 from scenes import Selection, spread_evenly, stamp_mse, stamps_at

@@ -56,10 +56,6 @@ rule figure_stability:
         f"{RESULTS}/logs/figures/stability/graded.log",
     benchmark:
         f"{RESULTS}/benchmarks_on_request/stability/figure.tsv"
-    threads: 1
-    resources:
-        mem_mb=500,
-        runtime=10,
     params:
         source=lambda w: source_hash("tests/stress/figure.py"),
         script=lambda w, threads: str(STRESS / "figure.py"),
@@ -79,10 +75,6 @@ rule stability:
     log:
         f"{RESULTS}/logs/stability/verdict.log",
     localrule: True
-    threads: 1
-    resources:
-        mem_mb=500,
-        runtime=10,
     message:
         "Judging the stress tests"
     shell:
