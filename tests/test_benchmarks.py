@@ -195,9 +195,10 @@ def test_poppy_table(tmp_path, monkeypatch, field_psfs):
 # Figures and targets
 
 
-@pytest.mark.parametrize("kind", ["training", "baseline", "inference", "scaling"])
+@pytest.mark.parametrize("kind", ["training", "baseline", "inference", "scaling", "graded"])
 def test_figures_are_drawn_from_the_tables_of_the_record(kind, tmp_path):
-    figures.draw(kind, RECORD / f"benchmark_{kind}.csv", tmp_path / "drawn.png")
+    table = "stability_graded" if kind == "graded" else f"benchmark_{kind}"
+    figures.draw(kind, RECORD / f"{table}.csv", tmp_path / "drawn.png")
     assert (tmp_path / "drawn.png").stat().st_size > 10_000
 
 

@@ -1,7 +1,7 @@
 STABILITY_DATASET, STABILITY_OTHER = "dataset3", "dataset8"
 STABILITY_READS = ("seed", "noise", "dae", "train", "baseline", "evaluation")
 STRESS = Path(workflow.basedir, "tests/stress")
-STRESS_CODE = [p.name for p in sorted(STRESS.glob("*.py")) if p.name != "figure.py"]
+STRESS_CODE = [p.name for p in sorted(STRESS.glob("*.py"))]
 
 
 # Writes the table whatever it says: a failed job would lose it.
@@ -57,12 +57,13 @@ rule figure_stability:
     benchmark:
         f"{RESULTS}/benchmarks_on_request/stability/figure.tsv"
     params:
-        source=lambda w: source_hash("tests/stress/figure.py"),
-        script=lambda w, threads: str(STRESS / "figure.py"),
+        source=source_hash("workflow/benchmarks/figures.py:graded"),
+        program=program("figures.draw"),
     message:
         "Drawing error against stress"
     shell:
-        "python {params.script:q} {input} {output} > {log} 2>&1"
+        "python {params.program} --kind graded --table {input} --out {output}"
+        " > {log} 2>&1"
 
 
 rule stability:
