@@ -114,10 +114,8 @@ def stamp_timer(benchmark, scene, case, opd_of):
     """Time of a star from its wavefront to its stamp, and the stamps of a batch."""
     used = configured_setting(scene.optics, benchmark, case.samples)
     propagate, _ = kernel(case, used, case.stamp_px)
-    pupil, offset = (
-        pupil_of(case.samples, case.obscuration),
-        np.repeat(case.offset_px, used.batch, 0),
-    )
+    pupil = pupil_of(case.samples, case.obscuration)
+    offset = np.repeat(case.offset_px, used.batch, axis=0)
 
     def run():
         return propagate(opd_of(pupil, propagate.real_dtype), offset)

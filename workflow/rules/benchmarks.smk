@@ -169,16 +169,14 @@ rule benchmark:
     localrule: True
 
 
-rule prediction:
-    input:
-        [file for name, file in TIMED_TABLES.items() if TIMED[name][0] == "prediction"],
-    localrule: True
+for _wanted in ("prediction", "scaling"):
 
-
-rule scaling:
-    input:
-        TIMED_TABLES["scaling_stages"],
-    localrule: True
+    rule:
+        name:
+            _wanted
+        input:
+            [file for name, file in TIMED_TABLES.items() if TIMED[name][0] == _wanted],
+        localrule: True
 
 
 KNEE_FOLDER = f"{RESULTS}/knee/{{point}}"
