@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import shutil
 
+import baseline
 import numpy as np
 import pytest
 import yaml
 from click.testing import CliRunner
 
-import baseline
 import prediction
 import trainings
 from psfdae.belonging import STARS, STATIC, require
