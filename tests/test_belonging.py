@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 
-import baseline
 import numpy as np
 import pytest
 import yaml
@@ -189,7 +188,7 @@ def test_calibration_needs_one_telescope_for_the_stars_of_a_scene(at):
 @pytest.mark.parametrize(
     "words",
     [
-        [baseline.baseline, "--stars", "s2.h5"],
+        [trainings.baseline, "--stars", "s2.h5"],
         [prediction.throughput, "--stars", "s2.h5", "--bundle", "none"],
     ],
     ids=lambda words: str(words[0]),
