@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -306,8 +303,3 @@ def test_refusals_name_the_problem(tmp_path):
     with pytest.raises(ProductError, match="1 histories, but 2 labels"):
         stage.figure_curves(["one", "two"], [tmp_path / "h.csv"], tmp_path / "c.png")
     assert not list(tmp_path.glob("*.png"))
-
-
-def test_importing_the_stage_does_not_import_matplotlib():
-    code = "import sys, psfdae.stages.figures; sys.exit('matplotlib' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
