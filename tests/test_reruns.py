@@ -39,11 +39,8 @@ def append(path: Path, text: str) -> None:
     path.write_text(path.read_text() + text)
 
 
-def test_a_copy_alone_repeats_nothing(jobs):
+def test_a_copy_and_comments_repeat_nothing(jobs, tree):
     assert jobs() == {}
-
-
-def test_comments_repeat_nothing(jobs, tree):
     append(tree / "config/train/onecycle.yaml", "# A thought.\n")
     append(tree / "config/dataset/dataset3.yaml", "# Another.\n")
     append(tree / "src/psfdae/optics/propagation.py", "# And a third.\n")
