@@ -33,19 +33,6 @@ def columns(name):
 # Measuring
 
 
-def test_calls_are_warmed_up_and_rounds_take_turns():
-    events = []
-
-    def builder(name):
-        return lambda: events.append(f"build {name}") or (lambda: events.append(name))
-
-    assert measure.time_calls(lambda: events.append("call"), repeats=3, calls=4) >= 0
-    assert events == ["call"] * (1 + 3 * 4)
-    events.clear()
-    assert measure.time_in_rounds([builder("a"), builder("b")], repeats=2).shape == (2, 2)
-    assert events == ["build a", "a", "build b", "b"] * 2
-
-
 def test_a_process_of_its_own_has_its_own_threads(monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     assert measure.alone(3, os.getpid) != os.getpid()
@@ -123,20 +110,7 @@ def test_costs_of_the_plan_have_a_fixed_part_and_one_per_star_that_are_not_negat
     assert 0 < first["peak_mb"] < 9  # nor a part per star
 
 
-@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="CPUs cannot be chosen here")
-def test_the_plan_is_measured_on_one_cpu():
-    before = os.sched_getaffinity(0)
-    with plan.one_cpu():
-        assert len(os.sched_getaffinity(0)) == 1
-    assert os.sched_getaffinity(0) == before
-
-
 # Trainings
-
-
-def test_front_holds_what_nothing_beats():
-    time, error = np.array([4.0, 1.0, 2.0, 3.0, 4.0]), np.array([0.5, 1.0, 0.6, 0.7, 0.4])
-    assert measure.pareto(time, error).tolist() == [1, 2, 4]
 
 
 @pytest.mark.parametrize(

@@ -80,12 +80,6 @@ def test_mosaic_places_stamps_unflipped():
     assert (canvas[4:6, 7:9] == stamps[field]).all()
 
 
-def test_mosaic_leaves_missing_fields_empty():
-    canvas = mosaic(np.ones((2, 2, 2)), np.array([[0, 0], [1, 1]]), gap=0)
-    assert np.isnan(canvas[:2, 2:]).all()
-    assert np.nansum(canvas) == 8
-
-
 @pytest.mark.parametrize(("row", "column"), [(3, 0), (0, 3)])
 def test_template_map_shows_the_bright_pixel_where_it_belongs(row, column):
     index, field = small_field()
@@ -121,11 +115,6 @@ def test_energy_map_has_numbers_at_their_fields():
     assert axes.texts[2].get_position() == pytest.approx((1.1, -1.1))
     assert (axes.images[0].get_array()[0] == energy[:3]).all()
     assert "min 0.10, median 0.50, max 0.90" in axes.get_title()
-
-
-def test_large_energy_map_has_no_numbers():
-    index, field = small_field(points=20, spacing_deg=0.02)
-    assert not stamp_energy_map(np.linspace(0, 1, 400), index, field, 16).axes[0].texts
 
 
 def test_spread_stars_are_distinct_and_even():

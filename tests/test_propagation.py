@@ -8,7 +8,7 @@ from scipy.special import j0, j1
 
 from psfdae.optics.propagation import StampPropagator, pixel_nodes
 from psfdae.optics.pupil import Pupil, annular_pupil, pupil_axis
-from psfdae.optics.seidel import monomial_coefficients, monomial_images
+from psfdae.optics.wavefronts import monomial_coefficients, monomial_images
 
 ARCSEC = np.pi / 180 / 3600
 COMATIC = monomial_coefficients(np.array([0.5, 4.0, 4.196, 1.813, -0.113]), np.array([0.6, 0.4]))
