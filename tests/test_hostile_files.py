@@ -6,7 +6,6 @@ import gc
 import json
 import os
 import shutil
-import subprocess
 import sys
 import zipfile
 from dataclasses import replace
@@ -29,6 +28,7 @@ from psfdae.own_stars.catalogue import read_catalogue
 from psfdae.own_stars.errors import ObservationError, no_formula, one_line
 from psfdae.own_stars.model import BLOCK
 from psfdae.own_stars.selection import Candidates
+from workflow_runs import captured
 
 D = 8
 
@@ -47,7 +47,7 @@ EXTENSION = cards("XTENSION= 'IMAGE   '", *PRIMARY, "PCOUNT  = 0", "GCOUNT  = 1"
 def hostile(count, seed, folder):
     script = Path(hostile_files.__file__)
     words = [sys.executable, script, str(count), str(seed), folder]
-    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    done = captured(words)
     assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-2000:]
     return json.loads(done.stdout)
 
@@ -197,7 +197,7 @@ def test_only_some_tiles_of_an_image_are_in_memory(tmp_path):
     where = os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
     env = {**os.environ, "PYTHONPATH": where, "OMP_NUM_THREADS": "1"}
     words = [sys.executable, "-c", script, path]
-    done = subprocess.run(words, capture_output=True, text=True, check=False, env=env)
+    done = captured(words, env=env)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout) == image[64, 1995:2003].tolist()
 

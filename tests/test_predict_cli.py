@@ -5,11 +5,9 @@ from __future__ import annotations
 import json
 import struct
 import warnings
-from contextlib import nullcontext
 
 import numpy as np
 import pytest
-import tqdm
 from astropy.io import fits
 from astropy.table import Table
 
@@ -238,39 +236,6 @@ def test_full_disk_is_one_line(folder, tmp_path):
     result = run(folder / "cube.fits", "--out", tmp_path / "file" / "psf.fits")
     assert result.exit_code == 2
     assert "cannot be written" in result.output
-
-
-def test_memory_does_not_grow_with_the_stars(folder, monkeypatch):
-    """Stamps are taken as they are needed and let go when written."""
-    alive, most = set(), 0
-    chunks = stage.Observation.chunks
-
-    def counted(self, rows):
-        nonlocal most
-        for number, stamps in enumerate(chunks(self, rows)):
-            alive.add(number)
-            most = max(most, len(alive))
-            yield stamps
-
-    monkeypatch.setattr(stage, "ROWS", 50)
-    monkeypatch.setattr(stage.Observation, "chunks", counted)
-    done = []
-
-    class Bar(nullcontext):
-        def __enter__(self):
-            return self
-
-        def reset(self, stars):
-            assert stars == 300
-
-        def update(self, stars):
-            done.append(stars)
-            alive.discard(len(done) - 1)
-
-    monkeypatch.setattr(tqdm, "tqdm", lambda **options: Bar())
-    stage.predict(folder / "cube.fits", stage.Stated(), threads=2, out=folder / "few.fits")
-    assert sum(done) == 300
-    assert most <= 4
 
 
 def field_of(**changes):

@@ -11,7 +11,7 @@ import pandas as pd
 import psutil
 import pytest
 
-from workflow_runs import ROOT, environment
+from workflow_runs import ROOT, captured, environment
 
 pytestmark = [pytest.mark.workflow, pytest.mark.slow]
 
@@ -41,13 +41,7 @@ def plan(tmp_path_factory):
         line = ["snakemake", "--dry-run", "--directory", str(folder)]
         line += ["--snakefile", str(folder / "Snakefile")]
         line += ["--workflow-profile", str(PROFILES / profile), *arguments, "all", *ON_REQUEST]
-        out = subprocess.run(
-            [*line, "--config", "results=results"],
-            env=environment(),
-            capture_output=True,
-            text=True,
-            check=False,
-        ).stdout
+        out = captured([*line, "--config", "results=results"], env=environment()).stdout
         return [_job(part) for part in re.findall(r"^rule .*\n(?:    .*\n)+", out, re.M)]
 
     return jobs
