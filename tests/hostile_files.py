@@ -78,7 +78,7 @@ def write_good(folder):
     from astropy.table import Table
 
     from fits_inputs import write_cube, write_field
-    from psfdae.models.weights import save_weights
+    from psfdae.estimators.weights import save_weights
     from psfdae.own_stars.bundle import shipped_path
 
     rng = np.random.default_rng(1)
@@ -313,7 +313,7 @@ def sign_bundle(text, arrays):
 
 
 def sign_weights(text, arrays):
-    from psfdae.models.weights import digest_of
+    from psfdae.estimators.weights import digest_of
 
     return text | {"sha256": digest_of(arrays)}
 
@@ -370,7 +370,7 @@ def run(words):
     if words[0] == "load":
         import click
 
-        from psfdae.models.weights import load_weights
+        from psfdae.estimators.weights import load_weights
 
         path = Path(words.pop())
         load = click.Command("load", callback=lambda: load_weights(path))

@@ -35,8 +35,8 @@ ROOT = Path(__file__).resolve().parents[1]
 LIST = Path(__file__).with_suffix(".csv")
 SEED, DRAWN = 13, 40
 SCIENCE = [
-    *("alignment", "bounds", "models", "optics", "stars"),
-    *(f"evaluation/{name}.py" for name in ("calibration", "comparison", "correlation", "metrics")),
+    *("alignment", "bounds", "estimators", "optics", "stars"),
+    *(f"evaluation/{name}.py" for name in ("calibration", "comparison", "metrics")),
     *(f"own_stars/{name}.py" for name in ("packing", "photometry", "shapes", "stamps")),
 ]
 """Where the random mutants were drawn from; no matter once they are drawn."""

@@ -27,7 +27,7 @@ from psfdae.alignment.stamps import AlignmentStamps
 from psfdae.alignment.telescope import mirror_symmetries, uniform_states
 from psfdae.configuration.alignment import Cnn, Fit
 from psfdae.configuration.compose import ConfigError, load
-from psfdae.models.training import TrainingError, train
+from psfdae.estimators.training import TrainingError, train
 
 EXACT = Fit(iterations=25, tolerance=1e-7, damping=1e-3, limit=1.25)
 

@@ -6,11 +6,22 @@ import numpy as np
 import pytest
 from scipy.stats import poisson
 
-from psfdae.bounds.bank import Bank, jittered_templates, jitters, weights, windows
-from psfdae.bounds.efficiency import compare
-from psfdae.bounds.floor import local_error, sensitivities
-from psfdae.bounds.growth import extrapolate, last_change, nested_means, segments
-from psfdae.bounds.posterior import Likelihood, exact_posterior, merge, posterior_sums
+from psfdae.bounds.floor import compare, local_error, sensitivities
+from psfdae.bounds.posterior import (
+    Bank,
+    Likelihood,
+    exact_posterior,
+    extrapolate,
+    jittered_templates,
+    jitters,
+    last_change,
+    merge,
+    nested_means,
+    posterior_sums,
+    segments,
+    weights,
+    windows,
+)
 from psfdae.optics.propagation import StampPropagator
 from psfdae.optics.pupil import annular_pupil
 from psfdae.optics.wavefronts import monomial_coefficients, monomial_images, seidel_wavefronts

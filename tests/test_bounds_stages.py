@@ -9,12 +9,12 @@ import pytest
 from matplotlib.collections import PolyCollection
 
 from psfdae.configuration.compose import load_stage
-from psfdae.evaluation.bound_figures import (
+from psfdae.evaluation.curves import (
     efficiency_against_noise,
     errors_above_bounds,
 )
 from psfdae.files import ProductError, read_product
-from psfdae.stages import bank, bound_figures, bounds, efficiency, stars, templates
+from psfdae.stages import bounds, figures, stars
 from psfdae.stages.common import noisy_test_images, split_stars
 
 LEVELS = (0.001, 0.003, 0.01, 0.1)
@@ -30,12 +30,12 @@ def settings(stage, dataset, *more):
 
 def build(folder, dataset):
     """Products and tables of a dataset's bounds, made by the stages."""
-    templates.templates(settings("templates", dataset), folder / "templates.h5")
+    stars.templates(settings("templates", dataset), folder / "templates.h5")
     stars.stars(settings("stars", dataset), folder / "templates.h5", folder / "stars.h5")
     config = settings(bounds.bounds, dataset)
     drawn = folder / "bank.h5" if config.stars.aberration_fraction else None
     if drawn:
-        bank.bank(config, drawn)
+        bounds.bank(config, drawn)
     products = (folder / "stars.h5", folder / "templates.h5")
     tables = [folder / name for name in ("growth.csv", "bounds.parquet", "bounds.csv")]
     bounds.bounds(config, dataset, *products, *tables, drawn)
@@ -67,7 +67,7 @@ def evaluated(folder, dataset, factor):
 
 def compared(folder, dataset, factor):
     inputs = ([folder / "bounds.csv"], [folder / "bounds.parquet"])
-    efficiency.efficiency(*inputs, folder / "efficiency.csv", [evaluated(folder, dataset, factor)])
+    bounds.efficiency(*inputs, folder / "efficiency.csv", [evaluated(folder, dataset, factor)])
     return pd.read_csv(folder / "efficiency.csv")
 
 
@@ -134,7 +134,7 @@ def test_bounded_stars_are_the_first_test_stars_with_their_noise(scene_1):
 
 
 def test_a_bank_of_other_stars_is_refused(scene_1, tmp_path):
-    bank.bank(settings(bounds.bounds, "dataset3", "bounds.bank_stars=9"), tmp_path / "bank.h5")
+    bounds.bank(settings(bounds.bounds, "dataset3", "bounds.bank_stars=9"), tmp_path / "bank.h5")
     outputs = [tmp_path / name for name in ("a.csv", "b.csv", "c.parquet")]
     products = (scene_1 / "stars.h5", scene_1 / "templates.h5")
     config = settings(bounds.bounds, "dataset6")
@@ -162,7 +162,7 @@ def test_scene_2_is_exact(scene_2):
 @pytest.mark.parametrize(("factor", "verdict"), [(1.5, "ok"), (1e-3, "beaten")])
 def test_efficiency_of_a_known_method(scene_1, factor, verdict):
     table = compared(scene_1, "dataset6", factor)
-    assert list(table.columns) == efficiency.COLUMNS
+    assert list(table.columns) == bounds.EFFICIENCY_COLUMNS
     assert set(table.n) == {24}
     method = table[table.method == "lmmse"]
     tight = method[(method.bound == "bayes") & (method.tight == "yes")]
@@ -192,13 +192,13 @@ def test_methods_must_cover_the_bounded_stars(scene_1, tmp_path):
     rows[rows.star != rows.star.min()].to_parquet(tmp_path / "e.parquet")
     inputs = ([scene_1 / "bounds.csv"], [scene_1 / "bounds.parquet"])
     with pytest.raises(ProductError, match="lmmse lacks 1 of the bounded stars"):
-        efficiency.efficiency(*inputs, tmp_path / "x.csv", [tmp_path / "e.parquet"])
+        bounds.efficiency(*inputs, tmp_path / "x.csv", [tmp_path / "e.parquet"])
     rows.assign(field=rows.field + 1).to_parquet(tmp_path / "e.parquet")
     with pytest.raises(ProductError, match=r"star \d+ of lmmse lies in field \d, but that of the"):
-        efficiency.efficiency(*inputs, tmp_path / "x.csv", [tmp_path / "e.parquet"])
+        bounds.efficiency(*inputs, tmp_path / "x.csv", [tmp_path / "e.parquet"])
     rows.assign(dataset="dataset1").to_parquet(tmp_path / "e.parquet")
     with pytest.raises(ProductError, match="no method was evaluated"):
-        efficiency.efficiency(*inputs, tmp_path / "x.csv", [tmp_path / "e.parquet"])
+        bounds.efficiency(*inputs, tmp_path / "x.csv", [tmp_path / "e.parquet"])
 
 
 def test_collect_joins_tables_of_one_kind(scene_1, scene_2, tmp_path):
@@ -216,7 +216,7 @@ def test_collect_joins_tables_of_one_kind(scene_1, scene_2, tmp_path):
 
 
 def test_same_config_gives_the_same_bytes(scene_1, tmp_path):
-    bank.bank(settings(bounds.bounds, "dataset6"), tmp_path / "bank.h5")
+    bounds.bank(settings(bounds.bounds, "dataset6"), tmp_path / "bank.h5")
     with h5py.File(tmp_path / "bank.h5") as one, h5py.File(scene_1 / "bank.h5") as two:
         assert (one["framed"][()] == two["framed"][()]).all()
 
@@ -263,10 +263,10 @@ def test_efficiency_figure_keeps_its_axis_without_values(scene_1):
 def test_figure_stages_write_png_and_name_what_is_missing(scene_1, tmp_path):
     compared(scene_1, "dataset6", 1.5)
     tables = (scene_1 / "bounds.csv", scene_1 / "efficiency.csv")
-    bound_figures.figure_bounds("dataset6", *tables, tmp_path / "e.png")
-    bound_figures.figure_efficiency("dataset6", tables[1], tmp_path / "f.png")
-    bound_figures.figure_bank_growth("dataset6", scene_1 / "growth.csv", tmp_path / "g.png")
+    figures.figure_bounds("dataset6", *tables, tmp_path / "e.png")
+    figures.figure_efficiency("dataset6", tables[1], tmp_path / "f.png")
+    figures.figure_bank_growth("dataset6", scene_1 / "growth.csv", tmp_path / "g.png")
     for name in "efg":
         assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
     with pytest.raises(ProductError, match="no rows of dataset1"):
-        bound_figures.figure_bank_growth("dataset1", scene_1 / "growth.csv", tmp_path / "h.png")
+        figures.figure_bank_growth("dataset1", scene_1 / "growth.csv", tmp_path / "h.png")

@@ -13,8 +13,8 @@ from click.testing import CliRunner
 from psfdae.belonging import write_origin
 from psfdae.cli import main
 from psfdae.configuration.compose import load_stage
+from psfdae.estimators import dae_onnx
 from psfdae.files import Column, ProductError, read_product, write_product
-from psfdae.models import export
 from psfdae.own_stars import packing
 from psfdae.own_stars.bundle import (
     BundleError,
@@ -270,21 +270,21 @@ def test_commands_pack_describe_and_export(folder, tmp_path):
     result = runner.invoke(main, ["export", str(path), "--out", str(onnx)])
     assert result.exit_code == 0, result.output
     images = gaussians(5, 11)
-    found = export.session(onnx, threads=1).run(None, {"images": images})[0]
+    found = dae_onnx.session(onnx, threads=1).run(None, {"images": images})[0]
     expected = estimator(read_bundle(path)).predict(images)
-    assert np.abs(found - expected).max() <= export.TOLERANCE * expected.max()
+    assert np.abs(found - expected).max() <= dae_onnx.TOLERANCE * expected.max()
 
 
 def test_export_of_a_wrong_network_fails_and_leaves_no_file(folder, tmp_path, monkeypatch):
-    plain = export._plain
+    plain = dae_onnx._plain
 
     def wrong(layer):
         changed = plain(layer)
         changed.weight = torch.nn.Parameter(changed.weight * 1.001)
         return changed
 
-    monkeypatch.setattr(export, "_plain", wrong)
-    with pytest.raises(export.ExportError, match="differs from torch"):
+    monkeypatch.setattr(dae_onnx, "_plain", wrong)
+    with pytest.raises(dae_onnx.ExportError, match="differs from torch"):
         stage.export(folder / "tiny.psf.safetensors", out=tmp_path / "x.onnx")
     assert list(tmp_path.iterdir()) == []
 
@@ -306,11 +306,11 @@ def test_shipped_bundle_is_small_and_wide():
 def test_shipped_bundle_covers_stars_that_nobody_has_seen(tmp_path):
     """New stars of the same telescope, from another seed."""
     from psfdae.files import read_product
-    from psfdae.stages import stars, templates
+    from psfdae.stages import stars
 
     sizes = ["seed=11", "grid.points=5", "grid.spacing_deg=2.75", "stars.count=500"]
     chosen = ["dataset=field", *sizes, "parts.train_stars=400", "parts.test_stars=100"]
-    templates.templates(load_stage("templates", chosen), tmp_path / "t.h5")
+    stars.templates(load_stage("templates", chosen), tmp_path / "t.h5")
     stars.stars(load_stage("stars", chosen), tmp_path / "t.h5", tmp_path / "s.h5")
     images = read_product(tmp_path / "s.h5", "stars", ("realisation",))["realisation"]
     bundle, rng = read_bundle(), stream(11, "coverage")

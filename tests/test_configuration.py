@@ -126,7 +126,7 @@ def test_a_file_of_settings_that_is_damaged_is_named(tmp_path):
 def test_a_checkpoint_does_not_depend_on_how_often_it_is_written():
     import numpy as np
 
-    from psfdae.models.training import fingerprint
+    from psfdae.estimators.training import fingerprint
 
     def of(*overrides):
         return fingerprint(load(overrides).model_dump(), np.zeros(3))

@@ -8,8 +8,7 @@ import pytest
 from scipy.stats import pearsonr
 from skimage.metrics import mean_squared_error, structural_similarity
 
-from psfdae.evaluation.correlation import error_correlation
-from psfdae.evaluation.metrics import all_metrics, clustered_mean, mse, ssim
+from psfdae.evaluation.metrics import all_metrics, clustered_mean, error_correlation, mse, ssim
 from psfdae.evaluation.paper import as_markdown, paper_table
 
 

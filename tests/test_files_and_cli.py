@@ -120,8 +120,7 @@ done("verify", "torch", "mlflow", "h5py", "pandas", "pyarrow")
 
 import psfdae
 assert psfdae.__version__ and callable(psfdae.load_model)
-from psfdae.stages.stars import stars
-from psfdae.stages.templates import templates
+from psfdae.stages.stars import stars, templates
 done("import of the simulation", *PACKAGES)
 of_templates, of_stars = settings(templates, stars)
 templates(of_templates, folder / "t")

@@ -343,6 +343,7 @@ def test_numbers_that_no_training_leaves_are_refused(tmp_path, name, change, mes
     ("change", "message"),
     [
         (lambda info: info["dae"]["kernels"].__setitem__(0, 8), "must be odd"),
+        (lambda info: info.update(image_scale=None), "has dae and image_scale"),
         (lambda info: info["config"].update(a=hostile_files.deep(300)), "nested too deeply"),
         (lambda info: {**info, "\x1b]0;title\x07": 1}, "]0;title?"),
     ],

@@ -10,11 +10,7 @@ import torch
 
 from psfdae.estimators import TrainingSet
 from psfdae.estimators.dae import DaeSettings, Train
-from psfdae.estimators.lmmse import LinearMmse
-from psfdae.estimators.pca_som import PcaSom, fit_pca_som
-from psfdae.evaluation.metrics import mse
-from psfdae.files import ProductError
-from psfdae.models.dae import (
+from psfdae.estimators.dae_network import (
     DaeTraining,
     SingleChannelConv,
     build_dae,
@@ -22,8 +18,12 @@ from psfdae.models.dae import (
     predict,
     train_dae,
 )
-from psfdae.models.training import TrainingError
-from psfdae.models.weights import load_weights, save_checkpoint, save_weights
+from psfdae.estimators.lmmse import LinearMmse
+from psfdae.estimators.pca_som import PcaSom, fit_pca_som
+from psfdae.estimators.training import TrainingError
+from psfdae.estimators.weights import load_weights, save_checkpoint, save_weights
+from psfdae.evaluation.metrics import mse
+from psfdae.files import ProductError
 from psfdae.rng import stream
 
 SOM = {"rows": 4, "columns": 4, "epochs": 3, "sigma": 1.0, "learning_rate": 0.5, "seed": 1}
@@ -234,7 +234,7 @@ def test_exploding_loss_stops_with_advice(data, tmp_path):
 
 
 def test_dead_network_restarts_and_then_gives_up(data, tmp_path, monkeypatch, capsys):
-    import psfdae.models.dae as module
+    import psfdae.estimators.dae_network as module
 
     def dead(*args):
         model = build_dae(*args)
@@ -249,7 +249,7 @@ def test_dead_network_restarts_and_then_gives_up(data, tmp_path, monkeypatch, ca
 
 
 def test_restart_uses_other_weights(data, tmp_path, monkeypatch):
-    import psfdae.models.dae as module
+    import psfdae.estimators.dae_network as module
 
     attempts = []
 

@@ -10,7 +10,7 @@ import pytest
 
 from prediction_stars import KAPPA, SKY, observe
 from psfdae import Prediction, PredictionError, StarFlag
-from psfdae.models import dae
+from psfdae.estimators import dae_network
 from psfdae.own_stars import photometry
 from psfdae.own_stars.model import BLOCK
 from psfdae.own_stars.stamps import MEANING, cut
@@ -210,7 +210,7 @@ def test_a_block_without_a_good_pixel_is_that_of_each_star_and_asks_nothing(
         for k in range(6)
     ]
     fits = []
-    monkeypatch.setattr(dae, "predict", None)
+    monkeypatch.setattr(dae_network, "predict", None)
     careful = photometry.robust_flux
     monkeypatch.setattr(photometry, "robust_flux", lambda *a: fits.append(a) or careful(*a))
     found = shipped.predict(stamps, bad=bad, **known)

@@ -82,7 +82,7 @@ LEARNED = {"train": 6, "evaluate": 6}
     ("module", "name", "repeated", "left"),
     [
         ("optics/propagation", "StampPropagator", SIMULATED | {"baseline": 4} | LEARNED, ()),
-        ("models/dae", "Dae", LEARNED, SIMULATED),
+        ("estimators/dae_network", "Dae", LEARNED, SIMULATED),
         ("evaluation/metrics", "ssim", {"evaluate": 6}, (*SIMULATED, "baseline", "train")),
     ],
 )

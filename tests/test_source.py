@@ -255,6 +255,25 @@ def listed(name):
 """
 
 
+CHOSEN = """
+BASE = 2
+WIDEST = 3 * BASE
+SIDES = (WIDEST, 7)
+
+def draw():
+    return sum(SIDES)
+"""
+
+
+@pytest.mark.parametrize("old", ["= 2", "= 3", ", 7"])
+def test_constants_of_a_chosen_module(small, old):
+    """Those that are made of other ones, too: no choice is made between them."""
+    modules = {**COLOURS, "main": BY_NAME, "red_scene": CHOSEN}
+    before = small(chosen=["psfdae.red_scene"], **modules)
+    modules["red_scene"] = CHOSEN.replace(old, old.replace(old[-1], "5"))
+    assert small(chosen=["psfdae.red_scene"], **modules) != before
+
+
 @pytest.mark.parametrize("function", ["psfdae.main:run", "psfdae.main:listed"])
 def test_modules_chosen_by_name(small, function):
     """All of them count, unless the rule says which."""
@@ -393,5 +412,6 @@ def test_no_module_is_chosen_unseen():
                 )
                 reader = Reader(code, name)
                 reader.write(given)
-                groups = [code.definition(key).options for key in reader.references]
+                known = [code.definition(key) for key in reader.references]
+                groups = [part.options for d in known for part in (d, *d.entries)]
                 assert reader.options or any(groups) or name in EXEMPT, ast.unparse(node)

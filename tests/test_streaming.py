@@ -12,7 +12,7 @@ from prediction import make_cube
 from psfdae.configuration.compose import compose, load_stage
 from psfdae.files import Column, Empty, ProductError, read_product, stream_product, write_product
 from psfdae.optics.wavefronts import ModalWavefronts, monomial_images
-from psfdae.stages import stars, templates
+from psfdae.stages import stars
 from psfdae.stages.common import template_wavefronts
 from psfdae.stars.framing import Propagation, brightest_pixel
 
@@ -27,7 +27,7 @@ CHEAP = (
 def cheap(tmp_path_factory):
     """Config of 50 stars with weak aberrations on small pupils, and their templates."""
     path = tmp_path_factory.mktemp("cheap") / "templates.h5"
-    templates.templates(load_stage("templates", CHEAP), path)
+    stars.templates(load_stage("templates", CHEAP), path)
     return load_stage("stars", [*CHEAP, "stars.count=50"]), path
 
 

@@ -28,7 +28,7 @@ from psfdae.optics.wavefronts import (
     zernike_images,
     zernike_wavefronts,
 )
-from psfdae.stages import stars, templates
+from psfdae.stages import stars
 from psfdae.stages.common import star_wavefronts, template_wavefronts
 from psfdae.stars.fields import relative_field
 from psfdae.stars.framing import Propagation, normalise_flux
@@ -183,7 +183,7 @@ def test_seidel_telescope_is_scene_1_byte_by_byte(tmp_path):
     products = []
     for name, choice in (("paper", ["stars=seidel_10pct"]), ("own", own)):
         fields, out = tmp_path / f"{name}_t.h5", tmp_path / f"{name}.h5"
-        templates.templates(load_stage("templates", [*choice, *small]), fields)
+        stars.templates(load_stage("templates", [*choice, *small]), fields)
         stars.stars(load_stage("stars", [*choice, *small]), fields, out)
         products.append((read_product(fields, "templates"), read_product(out, "stars")))
     for paper, mine in zip(*products, strict=True):
@@ -209,7 +209,7 @@ def test_random_aberrations_have_both_spreads():
 
 def test_stars_of_zernike_telescope_differ_from_their_template(tmp_path):
     choice = [OWN, "grid.points=3", "stars.count=20"]
-    templates.templates(load_stage("templates", choice), tmp_path / "t.h5")
+    stars.templates(load_stage("templates", choice), tmp_path / "t.h5")
     stars.stars(load_stage("stars", choice), tmp_path / "t.h5", tmp_path / "s.h5")
     product = read_product(tmp_path / "s.h5", "stars")
     assert product["realisation"].sum(axis=(1, 2)) == pytest.approx(np.ones(20), abs=1e-5)
@@ -283,7 +283,7 @@ def test_simulate_writes_what_the_stage_writes(tmp_path):
     assert result.exit_code == 0, result.output
     names = {"templates.h5", "psfs.png", "fields.csv", "psfs.fits", "image.fits", "stars.csv"}
     assert {path.name for path in (tmp_path / "mine").iterdir()} == names
-    templates.templates(load_stage("templates", [OWN, *CHOICE]), tmp_path / "t.h5")
+    stars.templates(load_stage("templates", [OWN, *CHOICE]), tmp_path / "t.h5")
     assert (tmp_path / "mine/templates.h5").read_bytes() == (tmp_path / "t.h5").read_bytes()
     table = np.genfromtxt(tmp_path / "mine/fields.csv", delimiter=",", names=True)
     assert sorted(set(table["x_deg"])) == [-1, 0, 1]

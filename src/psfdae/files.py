@@ -180,6 +180,17 @@ def write_text(path: str | Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
+def write_csv(path: str | Path, table: Any, digits: int = 8) -> None:
+    """Write a DataFrame as CSV, numbers with so many digits, atomically."""
+    write_text(path, table.to_csv(index=False, float_format=f"%.{digits}g"))
+
+
+def write_parquet(path: str | Path, table: Any) -> None:
+    """Write a DataFrame as Parquet with checksums, atomically."""
+    with atomic_path(path) as temporary:
+        table.to_parquet(temporary, index=False, write_page_checksum=True)
+
+
 def as_csv(rows: Sequence[Mapping[str, Any]]) -> str:
     """CSV of rows with equal keys, the numbers in full."""
     text = io.StringIO()

@@ -8,7 +8,7 @@ import hashlib
 import re
 import subprocess
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fnmatch import filter as matching
 from functools import cache, cached_property
 from itertools import chain
@@ -67,12 +67,20 @@ def source_hash(*functions: str, chosen: Iterable[str] = ()) -> str:
 
 @dataclass(frozen=True)
 class Definition:
-    """Digest of code, what it refers to, and groups of which a name chooses at run time."""
+    """Digest of code, what it refers to, and groups of which a name chooses at run time.
+
+    A constant that is written as a table has its entries apart.
+    """
 
     digest: str
     references: list[str]
     options: list[list[str]]
-    is_constant: bool
+    entries: tuple[Definition, ...] = ()
+
+    @property
+    def every(self) -> list[str]:
+        """All keys that it may reach."""
+        return [*self.references, *chain(*self.options)]
 
 
 class Module:
@@ -131,16 +139,23 @@ class Code:
         return ":".join((own, *function))
 
     def reached(self, key: str, chosen: frozenset[str]) -> tuple[str, list[str]]:
-        """Digest of a definition and what it reaches; of options only those chosen."""
+        """Digest of a definition and what it reaches; of options and entries only those chosen."""
+
+        def wanted(keys: Iterable[str]) -> list[str]:
+            return [k for k in keys if k in chosen or k.partition(":")[0] in chosen]
+
         found = self.definition(key)
-        every = [*found.references, *chain(*found.options)]
-        wanted = {k for k in every if k in chosen or k.partition(":")[0] in chosen}
-        if found.is_constant and wanted:
-            return "", [entry for entry in every if entry in wanted]
-        taken = (
-            [option for option in group if option in wanted] or group for group in found.options
-        )
-        return found.digest, [*found.references, *chain(*taken)]
+        # Entries that name functions, classes or modules; numbers and texts all count.
+        choice = [e for e in found.entries if any(map(self.is_code, e.every))]
+        taken = [e for e in choice if wanted(e.every)] or choice
+        parts = [found, *(e for e in found.entries if e not in choice or e in taken)]
+        reached = [k for p in parts for k in p.references]
+        reached += [k for p in parts for o in p.options for k in wanted(o) or o]
+        return " ".join(part.digest for part in parts), reached
+
+    def is_code(self, key: str) -> bool:
+        """Whether a key is a module, a class or a function."""
+        return ":" not in key or any(isinstance(s, NAMED) for s in self.statements(key))
 
     def _module(self, name: str) -> Module:
         if name not in self.paths:
@@ -171,22 +186,17 @@ class Code:
 
     def _definition(self, key: str) -> Definition:
         module, colon, name = key.partition(":")
-        content, reader = self.module(module), Reader(self, module)
         statements = self.statements(key)
         if colon and not statements:
             raise ValueError(f"no {name!r} in {module}")
-        imported = [_imported(statement) for statement in statements]
-        reader.imported = {n for found in imported for n in found}
-        for found in imported:
-            reader.names = reader.names | found
-        reader.write(statements)
-        for own in () if colon else sorted(content.statements):
-            reader.refer(f"{key}:{own}")
-        if name and "" in content.statements:
+        reader, own = Reader(self, module, statements), self.module(module).statements
+        for part in () if colon else sorted(own):
+            reader.refer(f"{key}:{part}")
+        if name and "" in own:
             reader.refer(f"{module}:")
-        digest = hashlib.sha256("\n".join(reader.parts).encode()).hexdigest()
-        is_constant = {type(s) for s in statements} in ({ast.Assign}, {ast.AnnAssign})
-        return Definition(digest, reader.references, reader.options, is_constant)
+        frame, entries = _table(statements)
+        apart = tuple(Reader(self, module).written(entry) for entry in entries)
+        return replace(reader.written(frame), entries=apart)
 
     @cached_property
     def commands(self) -> dict[str, str]:
@@ -207,24 +217,28 @@ code_below = cache(Code)
 class Reader:
     """Writes down code without what does not count; collects its references and options."""
 
-    def __init__(self, code: Code, module: str) -> None:
-        self.code, self.path, self.module = code, code.paths[module], code.module(module)
-        self.names = self.module.names
-        self.imported: set[str] = set()
+    def __init__(self, code: Code, module: str, statements: Iterable[ast.stmt] = ()) -> None:
+        self.code, self.module, self.path = code, code.module(module), code.paths[module]
+        imported = {n: t for statement in statements for n, t in _imported(statement).items()}
+        self.names, self.imported = self.module.names | imported, set(imported)
         self.parts: list[str] = []
         self.references: list[str] = []
         self.options: list[list[str]] = []
 
+    def written(self, node: Any) -> Definition:
+        """What a node is."""
+        self.write(node)
+        digest = hashlib.sha256("\n".join(self.parts).encode()).hexdigest()
+        return Definition(digest, self.references, self.options)
+
     def write(self, node: Any) -> None:
         """Write a syntax tree, a list of them or a value."""
-        if type(node) in SPECIAL:
-            SPECIAL[type(node)](self, node)
-        elif isinstance(node, ast.AST):
-            self.plain(node)
-        elif isinstance(node, list):
+        if isinstance(node, list):
             for item in node:
                 if not _is_text(item):
                     self.write(item)
+        elif isinstance(node, ast.AST):
+            SPECIAL.get(type(node), Reader.plain)(self, node)
         else:
             self.parts.append(repr(node))
 
@@ -337,8 +351,7 @@ class Reader:
 
 # Of annotations those of variables count: among them are the fields of dataclasses and settings.
 NOT_WRITTEN = {"ctx", "kind", "type_comment", "type_params", "returns"}
-NAMED = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)
-SPECIAL: dict[type, Callable[[Reader, Any], None]] = {
+SPECIAL: dict[type, Callable[..., None]] = {
     **dict.fromkeys((ast.Import, ast.ImportFrom, ast.Pass), lambda reader, node: None),
     **dict.fromkeys((ast.Name, ast.Attribute), Reader.name),
     **dict.fromkeys((ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda), Reader.function),
@@ -348,6 +361,8 @@ SPECIAL: dict[type, Callable[[Reader, Any], None]] = {
     ast.Call: Reader.call,
     ast.arg: lambda reader, node: reader.parts.append(node.arg),
 }
+TARGETS = ("targets", "target", "annotation")
+NAMED = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)
 
 
 def _is_text(node: Any) -> bool:
@@ -361,6 +376,19 @@ def _modules(folder: Path, above: tuple[str, ...]) -> dict[str, Path]:
         path: path.relative_to(folder).with_suffix("") for path in sorted(folder.rglob("*.py"))
     }
     return {".".join((*above, *f.parts)).removesuffix(".__init__"): p for p, f in files.items()}
+
+
+def _table(statements: list[ast.stmt]) -> tuple[list[Any], list[Any]]:
+    """What makes a constant, without its entries if it is written as a table; these."""
+    value = getattr(statements[0], "value", None) if len(statements) == 1 else None
+    if isinstance(value, ast.Dict):
+        entries: list[Any] = [list(pair) for pair in zip(value.keys, value.values, strict=True)]
+    elif isinstance(value, ast.List | ast.Tuple | ast.Set):
+        entries = value.elts
+    else:
+        return statements, []
+    node = statements[0]
+    return [type(value).__name__, *(getattr(node, name, None) for name in TARGETS)], entries
 
 
 def _data(folder: Path) -> list[str]:

@@ -7,12 +7,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from psfdae.models.dae import DaeTraining, TrainingSet, image_scale
+from psfdae.estimators.dae_network import DaeTraining, TrainingSet, image_scale
 from psfdae.own_stars.packing import COMPONENTS, leading
 from psfdae.own_stars.photometry import FluxModel, Photometer
 from psfdae.rng import stream
 from psfdae.stages import stars as stars_stage
-from psfdae.stages import templates as templates_stage
 from psfdae.stages.common import star_wavefronts
 from psfdae.stars.fields import assign_fields, draw_jitter
 from psfdae.stars.framing import Propagation, normalise_flux
@@ -112,7 +111,7 @@ def fresh_stars(config, count):
 def simulated(config, folder):
     """Files of templates and stars of a configuration."""
     templates, stars = folder / "templates.h5", folder / "stars.h5"
-    templates_stage.templates(config, templates)
+    stars_stage.templates(config, templates)
     stars_stage.stars(config, templates, stars)
     return templates, stars
 

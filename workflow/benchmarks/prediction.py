@@ -100,7 +100,7 @@ def bare_rate(model, stamps, threads, way):
     """Stamps per second of the network alone, on images that are in memory."""
     import torch
 
-    from psfdae.models.dae import predict
+    from psfdae.estimators.dae_network import predict
     from psfdae.own_stars.model import BLOCK, one_thread_each
     from psfdae.threads import side_by_side
 

@@ -50,7 +50,7 @@ def random_network(dae, width, side):
     """A network of one width with random weights, and the factor of its images."""
     import torch
 
-    from psfdae.models.dae import build_dae, image_scale
+    from psfdae.estimators.dae_network import build_dae, image_scale
 
     widths, seed = [width] * len(dae["widths"]), torch.Generator().manual_seed(width)
     return build_dae(dae["kernels"], widths, "he", seed), image_scale(dae["scale"], side)
@@ -63,7 +63,7 @@ def onnx_path(folder, width, side):
 
 def export_networks(dae, sizes, folder):
     """Export random networks of each width and side of the stamps."""
-    from psfdae.models.export import export_onnx
+    from psfdae.estimators.dae_onnx import export_onnx
 
     for size in sizes:
         export_onnx(*random_network(dae, *size), size[1], onnx_path(folder, *size))
@@ -73,7 +73,7 @@ def torch_network(dae, folder, size, threads):
     """`predict` as every stage calls it."""
     import torch
 
-    from psfdae.models.dae import predict
+    from psfdae.estimators.dae_network import predict
 
     torch.set_num_threads(threads)
     model, factor = random_network(dae, *size)
@@ -82,7 +82,7 @@ def torch_network(dae, folder, size, threads):
 
 def onnx_network(dae, folder, size, threads):
     """An exported network."""
-    from psfdae.models.export import session
+    from psfdae.estimators.dae_onnx import session
 
     run = session(onnx_path(folder, *size), threads).run
     return lambda images: run(None, {"images": images})[0]

@@ -17,8 +17,8 @@ from torch import nn
 
 from psfdae.alignment.telescope import mirror_symmetries
 from psfdae.configuration.alignment import Cnn, CnnTrain
-from psfdae.models.training import Row, Training
-from psfdae.models.weights import with_weights
+from psfdae.estimators.training import Row, Training
+from psfdae.estimators.weights import with_weights
 from psfdae.rng import stream
 
 PARAMETERS = 4

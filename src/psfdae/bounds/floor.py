@@ -10,11 +10,13 @@ Estimation Theory, chapter 11). It is a local approximation, not a strict bound.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
 from psfdae.configuration.schema import Optics
 from psfdae.configuration.telescope import Telescope
+from psfdae.evaluation.metrics import clustered_mean
 from psfdae.optics.derivatives import ModalStamps, NodeSampling, normalise_with_derivatives
 from psfdae.optics.propagation import in_batches
 from psfdae.optics.pupil import annular_pupil
@@ -103,3 +105,52 @@ def local_error(derivatives: np.ndarray, prior_sd: np.ndarray, variance: np.ndar
     spread = jacobian @ jacobian.swapaxes(1, 2)
     trace = np.trace(np.linalg.solve(information, spread), axis1=1, axis2=2)
     return trace / jacobian.shape[-1]
+
+
+TOLERANCE = 0.05
+"""Part of a bound by which an estimator may lie below it: its approximation and its noise."""
+
+STANDARD_ERRORS = 2.0
+"""Standard errors of the paired difference by which it may lie below it besides."""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """An estimator's errors beside a bound, over the same stars.
+
+    Attributes
+    ----------
+    mse, bound : float
+        Mean squared error of the estimator, and the bound.
+    difference, stderr : float
+        Mean of their paired difference and its standard error, clustered by field.
+    """
+
+    mse: float
+    bound: float
+    difference: float
+    stderr: float
+
+    @property
+    def efficiency(self) -> float:
+        """Bound divided by MSE; NaN where the bound is 0."""
+        return self.bound / self.mse if self.bound > 0 and self.mse > 0 else float("nan")
+
+    @property
+    def beaten(self) -> bool:
+        """Whether the estimator is below the bound by more than the tolerance."""
+        return self.difference < -(STANDARD_ERRORS * self.stderr + TOLERANCE * self.bound)
+
+
+def compare(errors: np.ndarray, bounds: np.ndarray, field: np.ndarray) -> Comparison:
+    """Compare an estimator with a bound.
+
+    Parameters
+    ----------
+    errors, bounds : ndarray, shape (n,)
+        Squared error and bound of every star.
+    field : ndarray of int, shape (n,)
+        Field of every star.
+    """
+    difference, stderr = clustered_mean(errors - bounds, field)
+    return Comparison(float(errors.mean()), float(bounds.mean()), difference, stderr)

@@ -1,37 +1,134 @@
-"""Posterior mean of a star over a sample of what it could be.
-
-With a bank of simulated stars as a sample of the prior, the posterior mean is the
-average of the bank's images weighted with their likelihoods. It is an estimator like
-any other, so its error is an upper limit of the Bayes error, and the limit itself once
-the bank is dense enough. Where a star can only be one of a few known images (scene 2)
-the sum over them is exact.
-
-A star with the noise-free image p (Σp = 1), flux F and sky B gives counts
-n ~ Poisson(F p + B). Up to terms without p,
-
-    log L(n | p) = n·ℓ(p) − F Σp,   ℓ(p) = log(1 + F p / B),
-
-a matrix product for all stars and all p at once. With counts of 10⁴ and more its
-sums reach 10⁶, where single precision cannot see differences of order 1. So the
-counts n̄ and the ℓ̄ of a mean image are taken out of both factors,
-
-    log L = (n − n̄)·(ℓ − ℓ̄) + [n̄·ℓ − F Σp] + terms without p:
-
-the bracket depends on p alone and is summed in double precision. The bank is read
-once, in chunks; sums are kept relative to the largest log-likelihood so far of every
-star.
-"""
+"""A bank of simulated stars: the prior of the test stars, as a sample."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
-from psfdae.bounds.bank import Bank, jitters, windows
+from psfdae.stars.framing import crop_jittered, normalise_flux
 from psfdae.stars.noise import NoiseModel
 from psfdae.stars.symmetry import SYMMETRIES, Symmetry
+
+MIRROR_MARGIN = 1
+"""Pixels beyond the jitter that a flipped stamp needs (`Symmetry.window`)."""
+
+
+@dataclass(frozen=True)
+class Bank:
+    """Propagated stars from which those at other jitters and mirrored fields are cut.
+
+    Attributes
+    ----------
+    framed : ndarray, shape (M, d + 2m, d + 2m), float32
+        Intensities, brightest pixel at index d/2 + m, m = `jitter_px` + 1.
+    field : ndarray of int, shape (M,)
+        Field of every star, ix + P·iy.
+    peak : ndarray of int, shape (M, 2)
+        Brightest pixel (row, column) from the chief ray.
+    points : int
+        Field points P along a side.
+    jitter_px : int
+        Largest centring error in pixels per axis.
+    """
+
+    framed: np.ndarray
+    field: np.ndarray
+    peak: np.ndarray
+    points: int
+    jitter_px: int
+
+    def __len__(self) -> int:
+        return len(self.framed)
+
+    @property
+    def margin(self) -> int:
+        """Pixels m on either side of the stamp."""
+        return self.jitter_px + MIRROR_MARGIN
+
+    def take(self, stars: np.ndarray) -> Bank:
+        """Some of the stars, in the order given."""
+        part = (self.framed[stars], self.field[stars], self.peak[stars])
+        return Bank(*part, self.points, self.jitter_px)
+
+    def stamps(self, window: tuple[int, int]) -> np.ndarray:
+        """Stamps cut at a window (first row, first column), sum 1, shape (M, d, d), float64."""
+        row, column = window
+        side = self.framed.shape[-1] - 2 * self.margin
+        # A slice: the same place in all stars needs no list of pixels for each.
+        cut = self.framed[:, row : row + side, column : column + side]
+        return normalise_flux(cut.astype(np.float64))[0]
+
+    def log_weights(self) -> np.ndarray:
+        """Logarithm of `weights`, −∞ for zero, shape (M, 8)."""
+        with np.errstate(divide="ignore"):
+            return np.log(weights(self.field, self.peak, self.points))
+
+
+def weights(field: np.ndarray, peak: np.ndarray, points: int) -> np.ndarray:
+    """How often each symmetry of each star counts so that all fields stay equally likely.
+
+    At a field point on a mirror axis two symmetries (in the centre all eight) lead
+    to the same star, with its equal maxima exchanged. Only the one that frames the
+    first maximum in (row, column) order is right; it counts for all of them.
+
+    Parameters
+    ----------
+    field : ndarray of int, shape (M,)
+        Field of every star, ix + P·iy.
+    peak : ndarray of int, shape (M, 2)
+        The star's framed pixel (row, column) from the chief ray.
+    points : int
+        Field points P along a side.
+
+    Returns
+    -------
+    ndarray of int, shape (M, 8)
+        Zero, or the number of symmetries that lead to the same field; rows sum to 8.
+    """
+    target = np.stack([s.field(field, points) for s in SYMMETRIES], axis=1)
+    pixel = np.stack([s.pixel(peak) for s in SYMMETRIES], axis=1)
+    reach = 2 * int(np.abs(peak).max()) + 3
+    order = (pixel[..., 0] * reach + pixel[..., 1]) * len(SYMMETRIES) + np.arange(len(SYMMETRIES))
+    same = target[:, :, None] == target[:, None, :]
+    first = np.where(same, order[:, None, :], np.iinfo(order.dtype).max).min(axis=2)
+    return np.where(order == first, same.sum(axis=2), 0)
+
+
+def jitters(jitter_px: int) -> list[tuple[int, int]]:
+    """All centring errors (row, column) of up to `jitter_px` pixels per axis."""
+    return list(product(range(-jitter_px, jitter_px + 1), repeat=2))
+
+
+def windows(jitter_px: int) -> dict[tuple[int, int], list[tuple[int, int]]]:
+    """Which stamps share a window: (row, column) → list of (symmetry, jitter) numbers."""
+    margin = jitter_px + MIRROR_MARGIN
+    found: dict[tuple[int, int], list[tuple[int, int]]] = {}
+    for s, symmetry in enumerate(SYMMETRIES):
+        for j, jitter in enumerate(jitters(jitter_px)):
+            found.setdefault(symmetry.window(jitter, margin), []).append((s, j))
+    return found
+
+
+def jittered_templates(framed: np.ndarray, jitter_px: int) -> np.ndarray:
+    """Static PSFs at all centring errors, as the stage `stars` cuts them.
+
+    Parameters
+    ----------
+    framed : ndarray, shape (F, d + 2·jitter_px, d + 2·jitter_px)
+        Array `psf` of the product "templates".
+
+    Returns
+    -------
+    ndarray, shape (F, J, d, d), float32
+        Sum 1; order of `jitters`.
+    """
+    framed = framed.astype(np.float64)
+    cuts = [crop_jittered(framed, np.array(jitter), jitter_px) for jitter in jitters(jitter_px)]
+    return np.stack([normalise_flux(cut)[0] for cut in cuts], axis=1).astype(np.float32)
+
 
 DEPTH = 30.0
 """Images whose log-likelihood is this far below a star's best are left out.
@@ -252,3 +349,81 @@ def exact_posterior(
     weight /= weight.sum(axis=1, keepdims=True)
     mean = (weight @ images).reshape(noisy.shape)
     return mean, weight.reshape(-1, fields, shifts).sum(axis=2)
+
+
+TIGHT = 0.05
+"""A bank is dense enough if its last fourfold growth changes the error by at most this."""
+
+FITTED_POINTS = 4
+"""Least number of bank sizes to which three parameters are fitted."""
+
+
+def segments(count: int, largest: int = 16) -> int:
+    """Number of equal parts of a bank: the largest power of two up to `largest` and `count`."""
+    return 1 << (min(largest, count).bit_length() - 1)
+
+
+def nested_means(
+    parts: Sequence[PosteriorSums], measure: Callable[[PosteriorSums], np.ndarray]
+) -> dict[int, np.ndarray]:
+    """A per-star quantity for banks of one, two, four … parts.
+
+    A bank of k parts can be had several times from the same parts; the mean over
+    those disjoint banks is taken, which steadies the small sizes.
+
+    Parameters
+    ----------
+    parts : sequence of PosteriorSums
+        Sums over equally large disjoint parts; their number is a power of two.
+    measure : function
+        From the sums over a bank to an array; its mean is returned by number of parts.
+    """
+    means: dict[int, np.ndarray] = {}
+    level = list(parts)
+    size = 1
+    while True:
+        means[size] = np.mean([measure(sums) for sums in level], axis=0)
+        if len(level) == 1:
+            return means
+        level = [merge(level[i : i + 2]) for i in range(0, len(level), 2)]
+        size *= 2
+
+
+def last_change(errors: Sequence[float]) -> float:
+    """|error(M/4)/error(M) − 1| of banks that double in size; NaN for fewer than three."""
+    if len(errors) < 3:
+        return float("nan")
+    return abs(errors[-3] / errors[-1] - 1.0)
+
+
+def extrapolate(draws: np.ndarray, errors: np.ndarray) -> tuple[float, float, float]:
+    """Fit error(M) = a + b M^−c and return a, c and the RMS of the relative residuals.
+
+    Parameters
+    ----------
+    draws : ndarray, shape (k,)
+        Bank sizes M.
+    errors : ndarray, shape (k,)
+        Mean squared errors, all positive.
+
+    Returns
+    -------
+    limit, exponent, residual : float
+        NaN if there are fewer than four sizes. The limit lies between 0 and the
+        smallest error: the fit extrapolates, it proves nothing.
+    """
+    from scipy.optimize import least_squares
+
+    if len(draws) < FITTED_POINTS:
+        return (float("nan"),) * 3
+    size = np.asarray(draws, float) / draws[-1]
+    scale = float(np.min(errors))
+    ratio = np.asarray(errors) / scale
+
+    def misfit(parameters: np.ndarray) -> np.ndarray:
+        limit, excess, exponent = parameters
+        return (limit + excess * size**-exponent) / ratio - 1.0
+
+    start = (0.9, max(ratio[-1] - 0.9, 1e-3), 0.7)
+    fit = least_squares(misfit, start, bounds=((0.0, 0.0, 0.05), (1.0, np.inf, 3.0)), xtol=1e-12)
+    return scale * fit.x[0], float(fit.x[2]), float(np.sqrt(np.mean(fit.fun**2)))

@@ -16,7 +16,7 @@ from psfdae.reading import from_tree, read_yaml
 
 if TYPE_CHECKING:
     from psfdae.configuration.schema import Evaluation
-    from psfdae.models.dae import Dae as Network
+    from psfdae.estimators.dae_network import Dae as Network
     from psfdae.own_stars.bundle import BundleInfo
 
 WEIGHTS = "dae.safetensors"
@@ -136,9 +136,9 @@ class Dae(Method):
         """
         import torch
 
-        from psfdae.models.dae import Dae as Network
-        from psfdae.models.dae import train_dae
-        from psfdae.models.training import fingerprint, progress
+        from psfdae.estimators.dae_network import Dae as Network
+        from psfdae.estimators.dae_network import train_dae
+        from psfdae.estimators.training import fingerprint, progress
 
         described = {"dae": dae.model_dump(), "train": train.model_dump(), "seed": data.seed}
         described["noise"] = [data.levels.tolist(), data.noise.kappa, data.noise.background]
@@ -153,19 +153,19 @@ class Dae(Method):
 
     def predict(self, noisy: np.ndarray) -> np.ndarray:
         """PSFs, neither clipped nor renormalised, float32."""
-        from psfdae.models.dae import predict
+        from psfdae.estimators.dae_network import predict
 
         return predict(self.network, noisy, self.factor(noisy.shape[-1]), self.batch)
 
     def factor(self, stamp_px: int) -> float:
         """From images of sum 1 to those that the network sees."""
-        from psfdae.models.dae import image_scale
+        from psfdae.estimators.dae_network import image_scale
 
         return self.scale if isinstance(self.scale, float) else image_scale(self.scale, stamp_px)
 
     def save(self, place: Path, described: Mapping[str, Any]) -> None:
         """Write weights, and the resolved configuration with the number of the start."""
-        from psfdae.models.weights import save_weights
+        from psfdae.estimators.weights import save_weights
 
         save_weights(place / WEIGHTS, self.network.state_dict(), described)
         write_text(place / CONFIG, as_yaml({**described, "attempt": self.attempt}))
@@ -178,8 +178,8 @@ class Dae(Method):
         import torch
 
         from psfdae.configuration.compose import validate
-        from psfdae.models.dae import Dae as Network
-        from psfdae.models.weights import with_weights
+        from psfdae.estimators.dae_network import Dae as Network
+        from psfdae.estimators.weights import with_weights
 
         described, batch = cls.described(place), 256
         settings = from_tree(
@@ -208,7 +208,7 @@ class Dae(Method):
         """The network of a bundle, which takes as many images at once as memory should hold."""
         import torch
 
-        from psfdae.models.dae import Dae as Network
+        from psfdae.estimators.dae_network import Dae as Network
 
         assert info.dae is not None and info.image_scale is not None
         network = Network(info.dae.kernels, info.dae.widths)
@@ -219,7 +219,7 @@ class Dae(Method):
 
     def export(self, stamp_px: int, path: Path) -> None:
         """Write the network as ONNX and check it against torch; raises ExportError."""
-        from psfdae.models.export import export_onnx
+        from psfdae.estimators.dae_onnx import export_onnx
 
         export_onnx(self.network, self.factor(stamp_px), stamp_px, path)
 

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from psfdae.alignment.fisher import expected_abs_error
-from psfdae.evaluation.correlation import error_correlation
+from psfdae.evaluation.metrics import error_correlation
 from psfdae.evaluation.paper import published
 
 PARAMETERS = ("decenter_x", "decenter_y", "tilt_x", "tilt_y")

@@ -1,19 +1,23 @@
-"""Figures made of curves: how a training went, how the error grows with the noise."""
+"""Figures made of curves: a training, errors and bounds against the noise, the headline."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence, Set
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from psfdae.estimators import Method, method, oracles_last
+from psfdae.estimators import Method, method, oracles_last, registered
 from psfdae.evaluation.figure_style import REFERENCES, SERIES_COLORS, new_figure, styled
+from psfdae.evaluation.figures import StripRow, draw_stamp
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from psfdae.estimators import Method
+
 
 SPLIT_LINES = {"random": "-", "held_out": "--"}
 SPLIT_LABELS = {
@@ -26,6 +30,16 @@ METRIC_LABELS = {
     "ssim_unit": "SSIM, data range 1",
     "ssim_peak": "SSIM, data range of each reference",
 }
+
+
+BAYES = {"color": "black", "marker": "o", "label": "posterior mean (Bayes)"}
+"""Look of the posterior mean; its marker is open where the bank is too thin."""
+
+FLOOR = {"color": "#7f7f7f", "label": "local floor: field and centring known"}
+"""Look of the floor."""
+
+NAMED_POINT = 1
+"""The noise level at which lines have their names: there they lie apart."""
 
 
 @styled
@@ -85,18 +99,20 @@ def error_against_noise(
     dataset, metric : str
         For example `dataset3`, `mse`.
     """
+    from matplotlib.lines import Line2D
+
     from psfdae.evaluation.paper import paper_rows
 
     ours = metrics[(metrics.dataset == dataset) & (metrics.metric == metric)]
     theirs = paper[(paper.dataset == dataset) & (paper.metric == metric)]
     theirs = theirs.assign(method=theirs["method"].map(paper_rows()))
-    references = [name for name in REFERENCES if name in set(ours["reference"])]
-    figure = new_figure(4.9, layout="constrained")
-    panels = figure.subplots(1, len(references), sharey=True, squeeze=False)[0]
+    figure, panels = _panels(ours)
     levels = np.unique(ours["noise_level"])
-    for axes, reference in zip(panels, references, strict=True):
-        for (name, split), rows in ours[ours.reference == reference].groupby(["method", "split"]):
-            _method_line(axes, method(name), split, rows)
+    for axes, (reference, measured) in zip(panels, _by_reference(ours), strict=True):
+        for (name, split), rows in measured.groupby(["method", "split"]):
+            line = rows.sort_values("noise_level")
+            style = {**_line(method(name)), "ls": SPLIT_LINES[split], "capsize": 3}
+            axes.errorbar(line["noise_level"], line["value"], yerr=line["stderr"], **style)
         for name, rows in theirs.groupby("method"):
             axes.plot(rows["noise_level"], rows["value"], **_paper_marker(method(name)))
         axes.set_title(REFERENCES[reference].replace(" (", "\n("))
@@ -109,63 +125,44 @@ def error_against_noise(
     figure.suptitle(f"{metric.upper().replace('_', ' ')} of {dataset} against the noise level")
     handles = _method_handles(set(ours["method"]), set(theirs["method"]))
     if "held_out" in set(ours["split"]):
-        handles += _split_handles()
+        handles += [
+            Line2D([], [], color="black", ls=line, lw=1.4, label=SPLIT_LABELS[split])
+            for split, line in SPLIT_LINES.items()
+        ]
     figure.legend(handles=handles, loc="outside lower center", ncols=4)
     return figure
 
 
-def _method_line(axes: Axes, kind: type[Method], split: str, rows: pd.DataFrame) -> None:
-    rows = rows.sort_values("noise_level")
-    axes.errorbar(
-        rows["noise_level"],
-        rows["value"],
-        yerr=rows["stderr"],
-        color=kind.color,
-        marker=kind.marker,
-        ls=SPLIT_LINES[split],
-        lw=1.4,
-        ms=4.5,
-        capsize=3,
-    )
-
-
 def _paper_marker(kind: type[Method]) -> dict[str, Any]:
-    own = {"color": kind.color, "marker": kind.marker}
-    return {**own, "mfc": "none", "mew": 1.4, "ms": 9, "ls": ""}
+    return {**_line(kind), "mfc": "none", "mew": 1.4, "ms": 9, "ls": ""}
 
 
-def _method_handles(methods: set[str], published: set[str]) -> list[Any]:
+def _method_handles(methods: set[str], published: Set[str] = frozenset()) -> list[Any]:
     """Legend entries of our methods, each with the paper's open marker below it."""
     from matplotlib.lines import Line2D
 
     handles = []
     for kind in oracles_last(methods | published):
         if kind.name in methods:
-            own = {"color": kind.color, "marker": kind.marker, "ms": 4.5, "lw": 1.4}
-            handles.append(Line2D([], [], **own, label=kind.label))
+            handles.append(Line2D([], [], **_line(kind), label=kind.label))
         if kind.name in published:
             handles.append(Line2D([], [], **_paper_marker(kind), label=f"{kind.label}, paper"))
     return handles
 
 
-def _split_handles() -> list[Any]:
-    from matplotlib.lines import Line2D
-
-    return [
-        Line2D([], [], color="black", ls=line, lw=1.4, label=SPLIT_LABELS[split])
-        for split, line in SPLIT_LINES.items()
-    ]
-
-
 def noise_axis(axes: Axes, levels: np.ndarray) -> None:
     """Logarithmic axis with a tick at each noise level and the common power of ten outside."""
+    power = int(np.floor(np.log10(levels.min()) + 1e-9))
+    _log_axis(axes, levels, [f"{level / 10.0**power:g}" for level in levels])
+    axes.set_xlabel(rf"noise level λ ($\times 10^{{{power}}}$)")
+
+
+def _log_axis(axes: Axes, ticks: np.ndarray, labels: list[str]) -> None:
     from matplotlib.ticker import NullLocator
 
-    power = int(np.floor(np.log10(levels.min()) + 1e-9))
     axes.set_xscale("log")
     axes.xaxis.set_minor_locator(NullLocator())
-    axes.set_xticks(levels, labels=[f"{level / 10.0**power:g}" for level in levels])
-    axes.set_xlabel(rf"noise level λ ($\times 10^{{{power}}}$)")
+    axes.set_xticks(ticks, labels=labels)
 
 
 def readable_log_axis(axes: Axes) -> None:
@@ -175,3 +172,275 @@ def readable_log_axis(axes: Axes) -> None:
     axes.yaxis.set_major_locator(LogLocator(base=10, subs=(1.0, 2.0, 5.0)))
     axes.yaxis.set_major_formatter(LogFormatterSciNotation(minor_thresholds=(10, 10)))
     axes.yaxis.set_minor_formatter(NullFormatter())
+
+
+@styled
+def errors_above_bounds(efficiency: pd.DataFrame, bounds: pd.DataFrame, dataset: str) -> Figure:
+    """MSE of every method against the noise level, with both bounds, one panel per reference.
+
+    Parameters
+    ----------
+    efficiency : DataFrame
+        Rows of the stage `efficiency`; those of other datasets are left out.
+    bounds : DataFrame
+        Rows of the stage `bounds`.
+    dataset : str
+    """
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    ours = efficiency[efficiency.dataset == dataset]
+    limits = bounds[(bounds.dataset == dataset) & (bounds.metric == "mse")]
+    figure, panels = _panels(limits)
+    for axes, (reference, rows) in zip(panels, _by_reference(limits), strict=True):
+        methods = ours[(ours.reference == reference) & (ours.bound == "bayes")]
+        for name, errors in methods.sort_values("noise_level").groupby("method"):
+            axes.plot(errors["noise_level"], errors["mse"], **_line(method(name)))
+        _bayes_line(axes, rows[rows.method == "bayes"].sort_values("noise_level"))
+        _finish_panel(axes, reference, np.unique(rows["noise_level"]))
+    panels[0].set_yscale("log")
+    bottom = _draw_floor(panels, limits)
+    if bottom is not None:
+        panels[0].set_ylim(bottom=bottom)
+    if (limits["value"] == 0).any():
+        # Room for the zeros, which are written at the bottom.
+        panels[0].set_ylim(bottom=0.5 * panels[0].get_ylim()[0])
+    readable_log_axis(panels[0])
+    panels[0].set_ylabel(METRIC_LABELS["mse"])
+    figure.suptitle(f"{dataset}: errors and bounds, n = {limits['n'].max()} test stars")
+    handles = _method_handles(set(ours["method"]))
+    best = limits[limits.method == "bayes"]
+    for tight, fill, label in (
+        ("yes", BAYES["color"], BAYES["label"]),
+        ("no", "white", "posterior mean, bank too thin: upper limit"),
+    ):
+        if tight in set(best["tight"]):
+            style = {"color": BAYES["color"], "marker": BAYES["marker"], "mfc": fill, "ms": 6}
+            handles.append(Line2D([], [], ls="--", lw=1.2, label=label, **style))
+    if "floor" in set(limits["method"]):
+        handles.append(Patch(facecolor=FLOOR["color"], alpha=0.35, label=FLOOR["label"]))
+    figure.legend(handles=handles, loc="outside lower center", ncols=3)
+    return figure
+
+
+@styled
+def efficiency_against_noise(efficiency: pd.DataFrame, dataset: str) -> Figure:
+    """Bound over MSE of every method against the noise level, one panel per reference.
+
+    Parameters
+    ----------
+    efficiency : DataFrame
+        Rows of the stage `efficiency`; those of other datasets are left out.
+    dataset : str
+    """
+    from matplotlib.lines import Line2D
+
+    ours = efficiency[efficiency.dataset == dataset]
+    figure, panels = _panels(ours)
+    for axes, (reference, rows) in zip(panels, _by_reference(ours), strict=True):
+        shown = _of_methods(rows).sort_values("noise_level")
+        for (name, bound), values in shown.groupby(["method", "bound"]):
+            style = _line(method(name))
+            style |= {"ls": "-", "lw": 1.6} if bound == "bayes" else {"ls": ":", "mfc": "none"}
+            axes.plot(values["noise_level"], values["efficiency"], **style)
+        axes.axhline(1.0, color="black", lw=1.0)
+        if shown["efficiency"].isna().all():
+            axes.text(0.5, 0.5, "no tight bound above 0", transform=axes.transAxes, ha="center")
+        _finish_panel(axes, reference, np.unique(rows["noise_level"]))
+    panels[0].set_yscale("log")
+    panels[0].set_ylim(top=2.0)
+    readable_log_axis(panels[0])
+    panels[0].set_ylabel("efficiency: bound / MSE")
+    figure.suptitle(f"{dataset}: efficiency against the noise level, 1 = no better is possible")
+    handles = _method_handles(set(ours["method"]))
+    drawn = set(_of_methods(ours).dropna(subset=["efficiency"])["bound"])
+    for bound, line, label in (
+        ("bayes", "-", "against the posterior mean, where tight"),
+        ("floor", ":", "against the local floor"),
+    ):
+        if bound in drawn:
+            handles.append(Line2D([], [], color="black", ls=line, lw=1.6, label=label))
+    figure.legend(handles=handles, loc="outside lower center", ncols=3)
+    return figure
+
+
+@styled
+def bank_growth(growth: pd.DataFrame, dataset: str) -> Figure:
+    """Error of the posterior mean against the size of the bank, one panel per reference.
+
+    Parameters
+    ----------
+    growth : DataFrame
+        Growth table of the stage `bounds`; rows of other datasets are left out.
+    dataset : str
+    """
+    from matplotlib.lines import Line2D
+
+    ours = growth[growth.dataset == dataset]
+    figure, panels = _panels(ours)
+    levels = np.unique(ours["noise_level"])
+    colors = dict(zip(levels, np.resize(SERIES_COLORS, levels.size), strict=True))
+    for axes, (reference, rows) in zip(panels, _by_reference(ours), strict=True):
+        for level, sizes in rows.sort_values("draws").groupby("noise_level"):
+            color = colors[level]
+            axes.plot(sizes["draws"], sizes["mse"], color=color, marker="o", ms=4.5, lw=1.4)
+            axes.axhline(sizes["limit"].iloc[0], color=color, ls="--", lw=1.0)
+        draws = np.unique(rows["draws"])
+        _log_axis(axes, draws, [f"{count:d}" for count in draws])
+        axes.set_xlabel("draws of the simulator in the bank")
+        axes.set_title(REFERENCES[reference].replace(" (", "\n("))
+        axes.grid(True, which="major")
+    panels[0].set_yscale("log")
+    readable_log_axis(panels[0])
+    panels[0].set_ylabel(METRIC_LABELS["mse"])
+    figure.suptitle(f"{dataset}: the posterior mean over banks of growing size")
+    handles = [
+        Line2D([], [], color=color, marker="o", ms=4.5, lw=1.4, label=f"λ = {level:g}")
+        for level, color in colors.items()
+    ]
+    handles.append(Line2D([], [], color="black", ls="--", lw=1.0, label="limit of the fit"))
+    figure.legend(handles=handles, loc="outside lower center", ncols=5)
+    return figure
+
+
+def _panels(table: pd.DataFrame) -> tuple[Figure, np.ndarray]:
+    """A figure with one panel per reference of a table."""
+    figure = new_figure(4.9, layout="constrained")
+    count = len(_by_reference(table))
+    return figure, figure.subplots(1, count, squeeze=False, sharey=True)[0]
+
+
+def _by_reference(table: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
+    present = set(table["reference"])
+    return [(name, table[table.reference == name]) for name in REFERENCES if name in present]
+
+
+def _of_methods(table: pd.DataFrame) -> pd.DataFrame:
+    """Rows but for those of the posterior mean."""
+    return table[table.method.isin([kind.name for kind in registered()])]
+
+
+def _line(kind: type[Method]) -> dict[str, Any]:
+    return {"color": kind.color, "marker": kind.marker, "lw": 1.4, "ms": 4.5}
+
+
+def _finish_panel(axes: Axes, reference: str, levels: np.ndarray) -> None:
+    axes.set_title(REFERENCES[reference].replace(" (", "\n("))
+    noise_axis(axes, levels)
+    # Levels without a value belong on the axis, too.
+    room = max(levels.max() / levels.min(), 2.0) ** 0.05
+    axes.set_xlim(levels.min() / room, levels.max() * room)
+    axes.grid(True, which="major")
+
+
+def _bayes_line(axes: Axes, rows: pd.DataFrame) -> None:
+    """Posterior mean with its confidence intervals; errors of 0 as a remark at the bottom."""
+    for level in rows["noise_level"][rows.value == 0]:
+        axes.text(
+            level, 0.02, "0", transform=axes.get_xaxis_transform(), ha="center", weight="bold"
+        )
+    rows = rows[rows.value > 0]
+    level, value = rows["noise_level"].to_numpy(), rows["value"].to_numpy()
+    reach = np.maximum([value - rows["ci_low"], rows["ci_high"] - value], 0.0)
+    color = BAYES["color"]
+    axes.errorbar(level, value, yerr=reach, color=color, ls="--", lw=1.2, capsize=3)
+    tight = (rows["tight"] == "yes").to_numpy()
+    for chosen, fill in ((tight, color), (~tight, "white")):
+        style = {"color": color, "marker": BAYES["marker"], "mfc": fill, "ms": 6, "ls": ""}
+        axes.plot(level[chosen], value[chosen], zorder=3, **style)
+
+
+def _draw_floor(panels: np.ndarray, limits: pd.DataFrame) -> float | None:
+    """Shade what lies below the floor; returns where the axis should end."""
+    floor = limits[limits.method == "floor"].sort_values("noise_level")
+    if floor.empty:
+        return None
+    bottom = 0.5 * float(floor["value"].min())
+    for axes, (reference, _) in zip(panels, _by_reference(limits), strict=True):
+        rows = floor[floor.reference == reference]
+        if rows.empty:
+            continue
+        level, value = rows["noise_level"], rows["value"]
+        axes.fill_between(level, bottom, value, color=FLOOR["color"], alpha=0.25, lw=0)
+        axes.plot(level, value, color=FLOOR["color"], lw=1.6)
+    return bottom
+
+
+@styled
+def headline(
+    rows: Sequence[StripRow],
+    methods: Sequence[Method],
+    efficiency: pd.DataFrame,
+    bounds: pd.DataFrame,
+    titles: Sequence[str],
+) -> Figure:
+    """Stars in rows at the left, MSE against the noise level at the right.
+
+    Parameters
+    ----------
+    rows : sequence of StripRow
+        Stamps on the colour scale of the last row, the truth, unless `own_scale`.
+    methods : sequence of Method
+        Those of the lines.
+    efficiency, bounds : DataFrame
+        Rows of the stages `efficiency` and `bounds`, of one dataset and reference.
+    titles : (left, right)
+    """
+    figure = new_figure(3.7)
+    left, bottom, top = 0.115, 0.13, 0.86
+    columns = len(rows[0].images)
+    step, tall = 0.395 / columns, (top - bottom) / len(rows)
+    peak = rows[-1].images.max(axis=(1, 2))
+    for number, row in enumerate(rows):
+        scale = row.images.max(axis=(1, 2)) if row.own_scale else peak
+        for i, image in enumerate(row.images):
+            lower = top - (number + 1) * tall
+            axes = figure.add_axes((left + i * step, lower, 0.96 * step, 0.96 * tall))
+            axes.set(xticks=[], yticks=[])
+            draw_stamp(axes, image, scale[i])
+            if i == 0:
+                axes.set_ylabel(row.label, rotation=0, ha="right", va="center", labelpad=5)
+    figure.text(left + 0.5 * columns * step, 0.92, titles[0], ha="center", fontsize=10)
+    panel = figure.add_axes((0.66, bottom, 0.325, top - bottom))
+    _errors(panel, methods, efficiency, bounds)
+    figure.text(0.66 + 0.5 * 0.325, 0.92, titles[1], ha="center", fontsize=10)
+    return figure
+
+
+def _errors(
+    axes: Axes, methods: Sequence[Method], efficiency: pd.DataFrame, bounds: pd.DataFrame
+) -> None:
+    """Errors of the methods and both bounds, each line with its name."""
+    for kind in methods:
+        line = efficiency[efficiency.method == kind.name].drop_duplicates("noise_level")
+        line = line.sort_values("noise_level")
+        style = {**_line(type(kind)), "lw": 1.6, "ms": 5}
+        axes.plot(line["noise_level"], line["mse"], **style)
+        _name(axes, line["noise_level"], line["mse"], kind.label, kind.color)
+    best = bounds[bounds.method == "bayes"].sort_values("noise_level")
+    tight = best[best.tight == "yes"]
+    axes.plot(best["noise_level"], best["value"], color=BAYES["color"], ls="--", lw=1.2)
+    axes.plot(tight["noise_level"], tight["value"], color=BAYES["color"], marker="o", ls="", ms=5)
+    _name(axes, best["noise_level"], best["value"], "least possible", BAYES["color"], below=True)
+    floor = bounds[bounds.method == "floor"].sort_values("noise_level")
+    axes.set_yscale("log")
+    if not floor.empty:
+        bottom = 0.6 * float(floor["value"].min())
+        level, value = floor["noise_level"], floor["value"]
+        axes.fill_between(level, bottom, value, color=FLOOR["color"], alpha=0.25, lw=0)
+        axes.set_ylim(bottom=bottom)
+        _name(axes, level, 0.7 * value, "local floor", "#555555", below=True)
+    noise_axis(axes, np.unique(best["noise_level"]))
+    readable_log_axis(axes)
+    axes.grid(True, which="major")
+    axes.set_ylabel(METRIC_LABELS["mse"], fontsize=8)
+
+
+def _name(
+    axes: Axes, level: pd.Series, value: pd.Series, name: str, color: str, *, below: bool = False
+) -> None:
+    point = min(NAMED_POINT, len(level) - 1)
+    place = (float(level.iloc[point]), float(value.iloc[point]))
+    style = {"ha": "left", "va": "top"} if below else {"ha": "right", "va": "bottom"}
+    offset = (6, -3) if below else (-2, 5)
+    axes.annotate(name, place, offset, textcoords="offset points", color=color, **style)

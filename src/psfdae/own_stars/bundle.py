@@ -30,8 +30,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 import psfdae
 from psfdae.estimators import Method, method
+from psfdae.estimators.weights import digest_of
 from psfdae.files import ProductError, atomic_path
-from psfdae.models.weights import digest_of
 from psfdae.own_stars.errors import one_line
 from psfdae.own_stars.photometry import FluxModel
 
@@ -147,7 +147,7 @@ class BundleInfo(_Described):
         first, (network, named) = self.format_version == 1, ONLY.values()
         given = [key for key in (*network, *named) if key in self.model_fields_set]
         wanted = network if first else named
-        if sorted(given) != sorted(wanted):
+        if sorted(given) != sorted(wanted) or any(getattr(self, key) is None for key in wanted):
             raise ValueError(f"format {self.format_version} has {' and '.join(wanted)}")
         return self
 

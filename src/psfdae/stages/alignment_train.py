@@ -72,7 +72,7 @@ def train_original(config: Any, grid: Path, out: Path, checkpoint: Path) -> None
         `trained_on.yaml` what the states say of themselves
     checkpoint : file that lets an interrupted training resume
 
-    Raises TrainingError as `psfdae.models.training.train` does.
+    Raises TrainingError as `psfdae.estimators.training.train` does.
     """
     from psfdae.alignment.cnn import TrainingStates
 
@@ -158,8 +158,8 @@ def _train(
 ) -> None:
     """Train one CNN and leave weights, resolved config and history in a folder."""
     from psfdae.alignment.cnn import CnnTraining
-    from psfdae.models.training import fingerprint, progress, train
-    from psfdae.models.weights import save_weights
+    from psfdae.estimators.training import fingerprint, progress, train
+    from psfdae.estimators.weights import save_weights
 
     limit_threads(settings.threads)
     fields, side = data.stamps.shape[1], data.stamps.shape[-1]

@@ -19,7 +19,7 @@ from psfdae.evaluation.calibration import (
     residuals_by_scale,
 )
 from psfdae.evaluation.metrics import mse, ssim
-from psfdae.files import Product, read_product, write_text
+from psfdae.files import Product, read_product, write_csv
 from psfdae.optics.pupil import required_nodes
 from psfdae.reading import read_table
 from psfdae.rng import stream
@@ -67,7 +67,7 @@ def scan(
                     }
                     for data_range in config.calibration.data_ranges
                 ]
-    write_text(out, pd.DataFrame(table).to_csv(index=False, float_format="%.8g"))
+    write_csv(out, pd.DataFrame(table))
 
 
 def _images(config: Config, scale: float, r0: float | None) -> np.ndarray:
@@ -139,7 +139,7 @@ def calibrate(
         ),
     }
     for name, frame in frames.items():
-        write_text(out / name, frame.to_csv(index=False, float_format="%.6g"))
+        write_csv(out / name, frame, 6)
 
 
 def _configured_rms(columns) -> float:  # type: ignore[no-untyped-def]

@@ -1,11 +1,11 @@
-"""Stage `evaluate`: every method on every test star at each noise level."""
+"""Stages `evaluate`, `collect` and `paper-tables`: every method on every test star, as tables."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import make_dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 
@@ -13,9 +13,14 @@ from psfdae.cli import File, Folder, Reference, Split, command
 from psfdae.configuration.schema import Config
 from psfdae.estimators import ConfigError, Estimate, Method, method, registered
 from psfdae.evaluation.metrics import all_metrics, clustered_mean
-from psfdae.files import Product, atomic_path, write_text
+from psfdae.files import Product, ProductError, write_csv, write_parquet, write_text
+from psfdae.reading import read_table
 from psfdae.stages.common import limit_threads, noisy_test_images, read_stars, split_stars
 from psfdae.stages.fit import training_set
+
+if TYPE_CHECKING:
+    import pandas as pd
+
 
 READS = (
     *("seed", "noise", "parts", "evaluation", "methods"),
@@ -64,11 +69,8 @@ def evaluate(
             row = {**key, "method": name, "noise_level": level}
             summary += summarised(row, metrics, field)
             stars_table.append(pd.DataFrame({**row, "star": test, "field": field, **metrics}))
-    write_text(out, pd.DataFrame(summary).to_csv(index=False, float_format="%.8g"))
-    with atomic_path(per_star) as temporary:
-        pd.concat(stars_table, ignore_index=True).to_parquet(
-            temporary, index=False, write_page_checksum=True
-        )
+    write_csv(out, pd.DataFrame(summary))
+    write_parquet(per_star, pd.concat(stars_table, ignore_index=True))
 
 
 def measured(estimate: Estimate, truth: np.ndarray, config: Config) -> dict[str, np.ndarray]:
@@ -133,3 +135,44 @@ def estimators(
         else kind.fit(training_set(config, kind, stars, split, reference), **kind.settings(config))
         for kind in kinds
     }
+
+
+COLUMNS = ["dataset", "split", "reference", "method", "noise_level", "metric"]
+COLUMNS += ["value", "stderr", "n"]
+
+Evaluations = Annotated[tuple[File, ...], {"argument": True}]
+Metric = Literal["mse", "ssim"]
+
+
+@command("collect")
+def collect(evaluations: Evaluations, out: Annotated[File, "Tidy CSV."]) -> None:
+    """Join evaluations into one tidy table."""
+    write_csv(out, read_evaluations(evaluations))
+
+
+@command("paper-tables")
+def paper_tables(
+    dataset: str,
+    metric: Metric,
+    evaluations: Evaluations,
+    out: Annotated[File, "CSV; the Markdown goes beside it."],
+) -> None:
+    """Write one of the paper's tables, ours beside the paper's."""
+    from psfdae.evaluation.paper import as_markdown, paper_table
+
+    table = paper_table(read_evaluations(evaluations), dataset, metric)
+    write_csv(out, table, 6)
+    write_text(out.with_suffix(".md"), as_markdown(table, dataset, metric))
+
+
+def read_evaluations(evaluations: Sequence[Path]) -> pd.DataFrame:
+    """Join CSV files of the stage `evaluate`; raises ProductError if one has other columns."""
+    import pandas as pd
+
+    parts = []
+    for path in evaluations:
+        part = read_table(path)
+        if list(part.columns) != COLUMNS:
+            raise ProductError(f"{path}: columns {list(part.columns)}, expected {COLUMNS}")
+        parts.append(part)
+    return pd.concat(parts, ignore_index=True)

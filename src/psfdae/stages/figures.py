@@ -14,14 +14,14 @@ from psfdae.estimators import Method
 from psfdae.files import Product, ProductError, atomic_path, read_product
 from psfdae.reading import read_table
 from psfdae.stages.common import limit_threads, noisy_test_images, read_stars, split_stars
-from psfdae.stages.evaluate import READS, Models, estimators
-from psfdae.stages.tables import Evaluations, Metric, read_evaluations
+from psfdae.stages.evaluate import READS, Evaluations, Metric, Models, estimators, read_evaluations
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
     from psfdae.evaluation.figures import StripRow
+
 
 DPI = 150
 STRIP_STARS, HEADLINE_STARS = 8, 5
@@ -32,6 +32,9 @@ HEADLINE_REFERENCE = "realisation"
 Stars = Annotated[File, "Product of the stage stars."]
 Templates = Annotated[File, "Product of the stage templates."]
 Png = Annotated[File, "PNG."]
+DatasetName = Annotated[str, "Name in the tables."]
+Bounds = Annotated[File, "CSV of the stage bounds."]
+Efficiency = Annotated[File, "CSV of the stage efficiency."]
 
 
 @command("figure templates")
@@ -102,15 +105,15 @@ def figure_headline(
     stars: Stars,
     models: Models,
     level: Annotated[float, AboveZero, "Noise level λ."],
-    bounds: Annotated[File, "CSV of the stage bounds."],
-    efficiency: Annotated[File, "CSV of the stage efficiency."],
+    bounds: Bounds,
+    efficiency: Efficiency,
     out: Png,
 ) -> None:
     """Draw restored stars beside the errors and their bounds."""
     from dataclasses import replace
 
+    from psfdae.evaluation.curves import headline
     from psfdae.evaluation.figures import spread_stars
-    from psfdae.evaluation.headline_figure import headline
 
     limit_threads(config.evaluation.threads)
     product = read_stars(stars, HEADLINE_REFERENCE)
@@ -126,19 +129,10 @@ def figure_headline(
         for row, kind in zip(restored, methods.values(), strict=True)
     ]
     rows.append(replace(truth, label="truth"))
-    tables = [_headline_rows(path, dataset) for path in (efficiency, bounds)]
+    errors, limits = (rows_of(p, dataset, HEADLINE_REFERENCE) for p in (efficiency, bounds))
+    limits = limits[limits.metric == "mse"]
     titles = (f"Test stars of {dataset}, λ = {level:g}", "Error against noise")
-    write_png(headline(rows, list(methods.values()), tables[0], tables[1], titles), out)
-
-
-def _headline_rows(path: Path, dataset: str) -> pd.DataFrame:
-    table = read_table(path)
-    rows = table[(table.dataset == dataset) & (table.reference == HEADLINE_REFERENCE)]
-    if "metric" in rows:
-        rows = rows[rows.metric == "mse"]
-    if rows.empty:
-        raise ProductError(f"{path}: no rows of {dataset}, {HEADLINE_REFERENCE}")
-    return rows
+    write_png(headline(rows, list(methods.values()), errors, limits, titles), out)
 
 
 @command("figure curves")
@@ -222,4 +216,53 @@ def strip_rows(
             images = kind.estimate(noisy, level).psf
             label = f"{kind.label}\nλ = {level:g}"
             rows.append(StripRow(label, images, mse(images, truth), not kind.restores))
+    return rows
+
+
+@command("figure bounds")
+def figure_bounds(
+    dataset: DatasetName,
+    bounds: Bounds,
+    efficiency: Efficiency,
+    out: Png,
+) -> None:
+    """Draw the methods' errors above the bounds."""
+    from psfdae.evaluation.curves import errors_above_bounds
+
+    tables = (rows_of(efficiency, dataset), rows_of(bounds, dataset))
+    write_png(errors_above_bounds(*tables, dataset), out)
+
+
+@command("figure efficiency")
+def figure_efficiency(
+    dataset: DatasetName,
+    efficiency: Efficiency,
+    out: Png,
+) -> None:
+    """Draw the methods' efficiency against the noise level."""
+    from psfdae.evaluation.curves import efficiency_against_noise
+
+    write_png(efficiency_against_noise(rows_of(efficiency, dataset), dataset), out)
+
+
+@command("figure bank-growth")
+def figure_bank_growth(
+    dataset: DatasetName,
+    growth: Annotated[File, "CSV of the stage bounds: error by size of the bank."],
+    out: Png,
+) -> None:
+    """Draw the posterior mean's error against the size of the bank."""
+    from psfdae.evaluation.curves import bank_growth
+
+    write_png(bank_growth(rows_of(growth, dataset), dataset), out)
+
+
+def rows_of(path: Path, dataset: str, reference: str | None = None) -> pd.DataFrame:
+    """Rows of a dataset, and of a reference if one is given; raises ProductError without any."""
+    table = read_table(path)
+    rows = table[table.dataset == dataset]
+    if reference is not None:
+        rows = rows[rows.reference == reference]
+    if rows.empty:
+        raise ProductError(f"{path}: no rows of {', '.join(filter(None, (dataset, reference)))}")
     return rows

@@ -18,7 +18,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from psfdae.cli import File, Folder, command
-from psfdae.files import ProductError, write_text
+from psfdae.files import ProductError, write_csv, write_text
 from psfdae.source import git_commit
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ def runtime(
     out: Annotated[File, "CSV with the cost of every job."],
 ) -> None:
     """Collect wall time, CPU time and memory of a run's jobs."""
-    write_text(out, _costs(results).to_csv(index=False, float_format="%.6g"))
+    write_csv(out, _costs(results), 6)
 
 
 def _costs(results: Path):  # type: ignore[no-untyped-def]

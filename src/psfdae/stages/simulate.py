@@ -4,20 +4,25 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import click
 import numpy as np
 
+import psfdae
 from psfdae.cli import File, Folder, command
 from psfdae.configuration.schema import Config
 from psfdae.configuration.stages import STATIC
-from psfdae.evaluation.telescope_figure import FieldOfPsfs, field_of_psfs
-from psfdae.files import Product, atomic_path, read_product, write_text
+from psfdae.evaluation.figures import FieldOfPsfs, field_of_psfs
+from psfdae.files import Product, atomic_path, read_product, write_fits, write_text
+from psfdae.own_stars.example import add_stamps, write_field
+from psfdae.own_stars.photometry import noise_equivalent_px
 from psfdae.own_stars.shapes import measure_shapes
-from psfdae.stages import templates
+from psfdae.rng import stream
 from psfdae.stages.common import template_wavefronts
 from psfdae.stages.figures import write_png
+from psfdae.stages.stars import templates
+from psfdae.stars.framing import normalise_flux
 
 OWN_DATASET = "_telescope"
 """The dataset that a telescope of one's own is put into."""
@@ -56,7 +61,6 @@ def simulate(
     Writes templates.h5, psfs.png and fields.csv.
     """
     from psfdae.configuration.compose import load_stage
-    from psfdae.stages import simulate_fits
 
     if not any(word.startswith(("dataset=", "scene=", "stars=")) for word in overrides):
         overrides = (f"dataset={OWN_DATASET}", *overrides)
@@ -64,17 +68,17 @@ def simulate(
     folder = out or Path(config.telescope.name)
     # No file is written if the PSFs do not fit.
     with atomic_path(folder / "templates.h5") as temporary:
-        templates.templates(config, temporary)
+        templates(config, temporary)
         fields = measure_fields(read_product(temporary, "templates"))
         warnings = [*_light(config, fields, least_energy), *_sampling(config, fields)]
     figure_telescope(folder / "templates.h5", folder / "fields.csv", folder / "psfs.png")
     written = ["templates.h5", "psfs.png", "fields.csv"]
     if fits:
-        simulate_fits.write_psfs(config, fields, folder / "psfs.fits")
+        write_psfs(config, fields, folder / "psfs.fits")
         written.append("psfs.fits")
     if image_snr:
         image, catalogue = folder / "image.fits", folder / "stars.csv"
-        simulate_fits.write_image(config, fields, image_snr, seed, image, catalogue)
+        write_image(config, fields, image_snr, seed, image, catalogue)
         written += ["image.fits", "stars.csv"]
     for line in warnings:
         print(f"psfdae: {line}", file=sys.stderr)
@@ -188,3 +192,91 @@ def _table(fields: FieldOfPsfs, pupil_samples: np.ndarray) -> str:
         ",".join(f"{value:.6g}" for value in row) for row in zip(*columns.values(), strict=True)
     )
     return "\n".join([",".join(columns), *rows]) + "\n"
+
+
+SKY = 1000.0
+"""Photons per pixel of the sky."""
+
+MARGIN_PX = 8
+"""Sky between stamps."""
+
+
+def write_psfs(config: Any, fields: FieldOfPsfs, path: Path) -> None:
+    """Write the static PSFs as a cube, with a table of where they are.
+
+    The primary HDU holds the fraction of the light on each pixel, (F, d, d), the
+    table FIELDS one row per PSF. Both carry no date: the same PSFs, the same bytes.
+
+    Parameters
+    ----------
+    config : stage config of `templates`
+    fields : FieldOfPsfs
+    path : path of the FITS file
+    """
+    from astropy.io import fits
+
+    telescope = config.telescope
+    cube = fits.PrimaryHDU(fields.psf.astype(np.float32))
+    for card in (
+        ("TELESCOP", telescope.name, "telescope of the configuration"),
+        ("PIXSCALE", telescope.pixel_scale_arcsec, "[arcsec] width of a pixel"),
+        ("WAVELEN", telescope.wavelength_m, "[m] wavelength"),
+        ("APERTURE", telescope.diameter_m, "[m] diameter"),
+        ("BUNIT", "1", "fraction of the light of the star"),
+        ("CREATOR", f"psfdae {psfdae.__version__}", ""),
+    ):
+        cube.header.append(card)
+    x, y = np.rad2deg(fields.field).T
+    columns = (
+        ("id", "K", None, np.arange(len(fields.psf))),
+        ("x_deg", "D", "deg", x),
+        ("y_deg", "D", "deg", y),
+        ("energy", "D", None, fields.energy),
+        ("fwhm", "D", "arcsec", fields.fwhm_arcsec),
+        ("ellipticity", "D", None, fields.ellipticity),
+        ("position_angle", "D", "deg", fields.position_angle_deg),
+    )
+    table = fits.BinTableHDU.from_columns(
+        [fits.Column(name=n, format=f, unit=u, array=a) for n, f, u, a in columns], name="FIELDS"
+    )
+    write_fits(path, fits.HDUList([cube, table]))
+
+
+def write_image(
+    config: Any, fields: FieldOfPsfs, snr: float, seed: int, path: Path, catalogue: Path
+) -> None:
+    """Write an image with one noisy star per field, and its catalogue.
+
+    The stars are moved together, so that little sky lies between them; their order
+    on the detector is that of the field. Their flux is F = snr √(B A), with the sky B
+    and the noise-equivalent area A of the mean PSF (King 1983, PASP 95, 163): the
+    S/N of a matched filter that is limited by the sky.
+
+    Parameters
+    ----------
+    config : stage config of `templates`
+    fields : FieldOfPsfs
+    snr : float
+        > 0.
+    seed : int
+    path, catalogue : FITS image and CSV
+    """
+    stamps, _ = normalise_flux(fields.psf.astype(np.float64))
+    side = stamps.shape[-1]
+    flux = snr * np.sqrt(SKY * noise_equivalent_px(stamps.mean(axis=0)))
+    pitch = side + MARGIN_PX
+    columns, rows = fields.grid.max(axis=0) + 1
+    x, y = (fields.grid * pitch + pitch // 2).T.astype(np.float64)
+    expected = np.full((int(rows) * pitch, int(columns) * pitch), SKY)
+    add_stamps(expected, flux * stamps, x, y)
+    rng = stream(seed, "simulated image", config.telescope.name)
+    write_field(
+        path,
+        catalogue,
+        rng.poisson(expected).astype(np.float32),
+        x,
+        y,
+        pixel_scale_arcsec=config.telescope.pixel_scale_arcsec,
+        GAIN=1.0,
+        TELESCOP=config.telescope.name,
+    )

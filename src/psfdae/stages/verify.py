@@ -13,6 +13,7 @@ import click
 
 from psfdae import mlflow_view
 from psfdae.cli import File, Folder, command
+from psfdae.estimators.weights import load_weights
 from psfdae.files import (
     DIGESTS,
     UNDIGESTED,
@@ -22,7 +23,6 @@ from psfdae.files import (
     digest_path,
     sweep_stale,
 )
-from psfdae.models.weights import load_weights
 
 ASIDE = ".damaged"
 """Suffix that a damaged file gets; it is overwritten by the next one of its name."""

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import nn
 
+from psfdae.estimators.dae_network import Dae, predict
 from psfdae.files import atomic_path
-from psfdae.models.dae import Dae, predict
 from psfdae.rng import stream
 
 TOLERANCE = 1e-5

@@ -1,4 +1,4 @@
-"""The denoising autoencoder of the paper's section 2.2.
+"""The network of the paper's section 2.2, a denoising autoencoder, and its training.
 
 Ten convolutions with "same" padding and ReLU after each, kernels 9, 7, 5, 3, 1
 as the encoder and 1, 3, 5, 7, 9 as the decoder, no pooling; the output has the
@@ -17,7 +17,7 @@ import torch
 from torch import nn
 
 from psfdae.estimators import TrainingSet
-from psfdae.models.training import DeadNetworkError, Row, Training, TrainingError, train
+from psfdae.estimators.training import DeadNetworkError, Row, Training, TrainingError, train
 from psfdae.rng import stream
 
 if TYPE_CHECKING:

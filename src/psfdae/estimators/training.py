@@ -21,7 +21,7 @@ import torch
 from torch.optim.lr_scheduler import LambdaLR, LRScheduler, OneCycleLR
 
 from psfdae.estimators import FitError
-from psfdae.models.weights import load_checkpoint, save_checkpoint
+from psfdae.estimators.weights import load_checkpoint, save_checkpoint
 
 if TYPE_CHECKING:
     from psfdae.configuration.alignment import CnnTrain

@@ -1,1 +1,0 @@
-"""Estimators of the point spread function from a noisy star image."""

@@ -1,0 +1,165 @@
+"""A method of one's own: a class, its settings, and a name in the list, and it is everywhere."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+
+import pandas as pd
+import pytest
+import yaml
+from astropy.io import fits
+
+from workflow_runs import ROOT, environment, snakemake
+
+pytestmark = [pytest.mark.workflow, pytest.mark.slow]
+
+CLASS = '''
+"""Toy: images drawn towards the mean of the training references."""
+
+from dataclasses import dataclass
+from typing import Annotated, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from psfdae.configuration.base import Group
+from psfdae.estimators import Method
+
+
+class Settings(Group):
+    """How far."""
+
+    weight: Annotated[float, Field(ge=0, le=1)] = Field(description="0 gives the mean")
+
+
+@dataclass(frozen=True)
+class Shrunk(Method):
+    """Toy."""
+
+    label, color, marker = "toy", "#aa3377", "v"
+    groups: ClassVar = {"shrunk": Settings}
+    arrays: ClassVar = {"mean": ("flux", "mean reference"), "weight": ("", "of the image")}
+
+    mean: np.ndarray
+    weight: np.ndarray
+
+    @classmethod
+    def fit(cls, data, shrunk):
+        mean = data.references[data.train].mean(axis=0, dtype=np.float64)
+        return cls(mean.astype(np.float32), np.array([shrunk.weight], np.float32))
+
+    def predict(self, noisy):
+        return self.mean + self.weight * (noisy - self.mean)
+'''
+REFERENCES = ("realisation", "template")
+SWEEP = {
+    **{"kind": "grid", "model": "shrunk", "dataset": "dataset3"},
+    **{"metric": "validation_mse", "direction": "minimize"},
+    "space": {"shrunk.weight": [0.0, 0.25, 1.0]},
+}
+LEGENDS = """
+import sys
+from matplotlib.legend import Legend
+from psfdae.cli import main
+from psfdae.stages import figures
+figures.write_png = lambda figure, out: print(
+    *(text.get_text() for legend in figure.findobj(Legend) for text in legend.get_texts()),
+)
+main(sys.argv[1:])
+"""
+
+
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory):
+    """The sources with the toy in them."""
+    root = tmp_path_factory.mktemp("tree")
+    for name in ("src", "config", "workflow", "profiles"):
+        ignored = shutil.ignore_patterns("__pycache__")
+        shutil.copytree(ROOT / name, root / name, ignore=ignored)
+    shutil.copy(ROOT / "Snakefile", root)
+    (root / "src/psfdae/estimators/shrunk.py").write_text(CLASS)
+    (root / "config/shrunk").mkdir()
+    (root / "config/shrunk/default.yaml").write_text("weight: 0.5\n")
+    path = root / "config/config.yaml"
+    text = path.read_text()
+    assert text.count("lmmse, dae]") == 1
+    path.write_text(text.replace("lmmse, dae]", "lmmse, dae, shrunk]"))
+    (root / "config/sweep/tried.yaml").write_text(yaml.safe_dump(SWEEP))
+    return root
+
+
+@pytest.fixture(scope="module")
+def run(tree, tmp_path_factory):
+    """Folder of a tiny run of dataset 3 and of the sweep."""
+    folder = tmp_path_factory.mktemp("run")
+    wanted = ("mlflow/dataset3.csv", "tables/psf_metrics.csv", "mlflow/sweep_tried.csv")
+    bundles = [f"bundles/dataset3-random-{ref}-shrunk.psf.safetensors" for ref in REFERENCES]
+    targets = [f"results/{name}" for name in (*wanted, *bundles, "tables/from_stars.csv")]
+    snakemake(folder, *targets, root=tree, overrides="workflow.datasets=[dataset3]")
+    return folder
+
+
+def psfdae(tree, folder, *words, program=("-m", "psfdae")):
+    done = subprocess.run(
+        [sys.executable, *program, *map(str, words)],
+        cwd=folder,
+        env=environment(PYTHONPATH=str(tree / "src")),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_toy_is_in_the_table_of_metrics(run):
+    table = pd.read_csv(run / "results/tables/psf_metrics.csv")
+    mine = table[table["method"] == "shrunk"]
+    assert set(mine["reference"]) == set(REFERENCES) and set(mine["split"]) == {
+        "random",
+        "held_out",
+    }
+    assert len(mine) == len(table[table["method"] == "dae"])
+
+
+def test_toy_is_in_the_figures(run, tree):
+    evaluations = sorted((run / "results/evaluation/dataset3").glob("*.csv"))
+    words = ("figure", "errors", "--dataset", "dataset3", "--metric", "mse", "--out", "x.png")
+    said = psfdae(tree, run, *words, *evaluations, program=("-c", LEGENDS))
+    assert "toy" in said.split()
+
+
+def test_runs_of_the_toy_are_in_mlflow(run):
+    runs = pd.concat(
+        pd.read_csv(run / f"results/mlflow/{n}.csv") for n in ("dataset3", "sweep_tried")
+    )
+    mine = runs[runs["source"].str.startswith(("shrunk/", "sweeps/tried"))]
+    assert len(mine) >= 4 + 3
+
+
+def test_toy_is_swept(run):
+    summary = pd.read_csv(run / "results/sweeps/tried/summary.csv")
+    assert summary["shrunk.weight"].tolist() == [0.0, 0.25, 1.0]
+    assert (summary["status"] == "finished").all() and summary["validation_mse"].nunique() == 3
+
+
+@pytest.mark.parametrize(
+    ("made", "scale"),
+    [("bundles/dataset3-random-realisation", 0.1), ("own_stars/example/model/example", 1.2)],
+)
+def test_predict_takes_the_toy(run, tree, made, scale):
+    bundle = run / f"results/{made}-shrunk.psf.safetensors"
+    assert "toy" in psfdae(tree, run, "describe", bundle)
+    example, out = run / "results/own_stars/example", run / f"{bundle.name}.fits"
+    psfdae(
+        *(tree, run, "predict", example / "image.fits", "--catalogue", example / "stars.csv"),
+        *("--model", bundle, "--pixel-scale", scale, "--out", out, "--quiet"),
+    )
+    assert fits.getdata(out).shape[1:] == (16, 16)
+
+
+def test_from_stars_reports_the_toy(run):
+    table = pd.read_csv(run / "results/tables/from_stars.csv")
+    assert {"noisy", "pca_som", "dae", "shrunk"} <= set(table["method"])
