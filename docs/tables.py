@@ -22,9 +22,9 @@ from types import SimpleNamespace
 
 import pandas as pd
 
+from psfdae.alignment import methods as scene3
 from psfdae.configuration.compose import compose
 from psfdae.estimators import method
-from psfdae.evaluation.alignment_tables import METHOD_LABELS as ALIGNERS
 
 ROOT = Path(__file__).resolve().parents[1]
 REFERENCE = ROOT / "results/reference"
@@ -36,6 +36,7 @@ MARK = re.compile(
 )
 HEAD = re.compile(r"\|.*\n\|[-|]+\n")
 
+ALIGNERS = {m.name: m.label for m in scene3.METHODS.values() if m.name != "cramer_rao_pooled"}
 SCENES = {"seidel": "scene 1", "turbulence": "scene 2", "all": "any"}
 PROPAGATORS = {
     "kernel": "our kernel",

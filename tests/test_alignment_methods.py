@@ -199,7 +199,7 @@ def test_every_epoch_sees_every_state_once(config, states, stamps):
 
 
 def test_weights_make_noise_levels_count_alike(config, states, stamps):
-    weights = noise_weights(np.array([0.002, 0.005, 0.005]), [0.002, 0.005])
+    weights = noise_weights(np.array([0.002, 0.005, 0.005]), np.array([0.002, 0.005]))
     assert weights[0] / weights[1] == pytest.approx(6.25)
     assert weights[:2].mean() == pytest.approx(1)
     own = np.arange(30.0)

@@ -10,7 +10,16 @@ import numpy as np
 import pytest
 
 import psfdae
-from psfdae.alignment.telescope import field_points, grid_states, uniform_states, zernike_tracer
+from psfdae.alignment.telescope import (
+    ModelError,
+    design_states,
+    field_points,
+    fit_quadratic,
+    grid_states,
+    uniform_states,
+    verify,
+    zernike_tracer,
+)
 from psfdae.configuration.compose import ConfigError, load
 from psfdae.optics.raytracing import (
     DEGREES_OF_FREEDOM,
@@ -246,3 +255,37 @@ def test_batoid_is_imported_by_ray_tracing_only():
     assert importing == {"optics/raytracing.py"}
     code = "import sys, psfdae.stages.alignment as s; sys.exit('batoid' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_quadratic_model_reproduces_ray_tracing(model, grid, tracer):
+    """25 states of the fit, 600 others of the grid, uniform ones: 5e-4 waves RMS at most."""
+    states, zernikes = grid
+    assert states.shape == (625, 4)
+    assert verify(model, states, zernikes, 5e-4).shape == (625, 9)
+    uniform = uniform_states(100, np.random.default_rng(1))
+    residual = verify(model, uniform, tracer(uniform), 5e-4)
+    assert np.sqrt((residual**2).mean()) < 2e-4
+
+
+def test_linear_terms_alone_do_not(model, grid):
+    states, zernikes = grid
+    coefficients = model.coefficients.copy()
+    coefficients[:, 5:] = 0
+    message = r"quadratic model: 0\.\d+ waves RMS .*\(at most 0\.0005\)"
+    with pytest.raises(ModelError, match=message):
+        verify(type(model)(coefficients), states, zernikes, 5e-4)
+
+
+def test_too_few_states_do_not_determine_the_model(tracer):
+    states = design_states()[:9]
+    with pytest.raises(ModelError, match=r"9 states determine 9 of the 15 quadratic terms"):
+        fit_quadratic(states, tracer(states))
+
+
+def test_jacobian_of_the_model_is_that_of_the_rays(model, tracer):
+    states = uniform_states(3, np.random.default_rng(2)) * 0.9
+    jacobian = model.jacobian(states)
+    assert jacobian.shape == (3, 9, 4, 19)
+    for axis, step in enumerate(0.05 * np.eye(4)):
+        plus, minus = (tracer(states + s * step) for s in (1, -1))
+        assert jacobian[:, :, axis] == pytest.approx((plus - minus) / 0.1, abs=1e-3)

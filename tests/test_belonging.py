@@ -13,12 +13,12 @@ import baseline
 import prediction
 import trainings
 from psfdae.belonging import STARS, STATIC, require
-from psfdae.cli import Careful, as_click, main
+from psfdae.cli import Careful, as_click, main, stage
 from psfdae.configuration.compose import load, load_stage
 from psfdae.files import Column, ProductError, write_product
 from psfdae.own_stars.bundle import read_bundle, shipped_path
 from psfdae.stages.alignment import read_model
-from psfdae.stages.alignment_tables import require_one_test
+from psfdae.stages.alignment_results import require_one_test
 
 SIZES = ("preset=smoke", "grid.points=3", "stars.count=60", "parts.train_stars=40")
 SIZES += ("parts.test_stars=20", "optics.threads=1", "train.epochs=1", "bounds.threads=1")
@@ -313,8 +313,13 @@ def test_a_missing_aberration_is_none_and_what_is_not_stated_is_unknown(tmp_path
 # Scene 3, of which the headers are enough to be refused
 
 
-def tree_of(stage, *overrides):
-    return load_stage(stage, ("alignment_preset=smoke", *overrides)).model_dump()
+def settings_of(name, *overrides):
+    reads = stage(f"alignment {name}").stage.reads
+    return load_stage(reads, ("alignment_preset=smoke", *overrides), "alignment")
+
+
+def tree_of(name, *overrides):
+    return settings_of(name, *overrides).model_dump()
 
 
 def write(path, kind, config, **arrays):
@@ -326,13 +331,13 @@ def write_states(path, *overrides):
     stamps = np.full((4, 9, 16, 16), 1 / 256, np.float32)
     arrays = {"states": np.zeros((4, 4)), "stamps": stamps, "energy": np.ones((4, 9))}
     arrays |= {"noll": np.arange(4, 23), "unit": np.ones(4)}
-    write(path, "alignment_states", tree_of("alignment_states", *overrides), **arrays)
+    write(path, "alignment_states", tree_of("states", *overrides), **arrays)
 
 
 def write_network(folder, *overrides, **config):
     folder.mkdir()
     (folder / "config.yaml").write_text(yaml.safe_dump(config), encoding="utf-8")
-    trained_on = yaml.safe_dump(tree_of("alignment_states", *overrides))
+    trained_on = yaml.safe_dump(tree_of("states", *overrides))
     (folder / "trained_on.yaml").write_text(trained_on, encoding="utf-8")
 
 
@@ -345,7 +350,7 @@ def mirror(tmp_path_factory):
     """Products of scene 3; those called other have smaller pixels."""
     at = tmp_path_factory.mktemp("mirror")
     for name, more in (("", []), ("other_", [OTHER]), ("far_", ["alignment.defocus_m=1e-4"])):
-        model = tree_of("alignment_model", *more)
+        model = tree_of("model", *more)
         write(at / f"{name}model.h5", "alignment_model", model, coefficients=np.zeros((9, 15, 19)))
         write_states(at / f"{name}states.h5", *more)
         write_network(at / f"{name}dae", *more)
@@ -427,12 +432,12 @@ def test_states_that_choose_between_cnns_are_those_of_their_stamps(mirror):
 
 
 def test_the_model_of_the_wavefront_serves_every_detector(mirror):
-    config = load_stage("alignment_states", [OTHER, "alignment.stamp_px=24", "seed=2"])
+    config = settings_of("states", OTHER, "alignment.stamp_px=24", "seed=2")
     assert read_model(mirror / "model.h5", config).coefficients.shape == (9, 15, 19)
 
 
 def write_test(path, kind, states, *overrides):
-    config = tree_of(f"alignment_{kind}", *overrides)
+    config = tree_of(kind, *overrides)
     write(path, f"alignment_{kind}", {**config, "test_set": "uniform"}, states=states)
 
 
@@ -442,7 +447,7 @@ def test_tables_of_scene_3_are_of_one_test(tmp_path):
     write(
         estimates,
         "alignment_estimates",
-        {**tree_of("alignment_estimate"), "test_set": "uniform"},
+        {**tree_of("estimate"), "test_set": "uniform"},
         states=states,
     )
     write_test(fit, "fit", states)

@@ -7,6 +7,7 @@ import pytest
 from psfdae.configuration import compose
 from psfdae.configuration.compose import ConfigError, as_overrides, config_dir, load, load_stage
 from psfdae.configuration.stages import STAGE_KEYS
+from psfdae.stages.alignment_methods import train_cnn, train_dae
 
 DATASETS = sorted(p.stem for p in config_dir().glob("dataset/[!_]*.yaml"))
 PRESETS = sorted(p.stem for p in config_dir().glob("preset/*.yaml"))
@@ -89,9 +90,16 @@ def test_search_distances_follow_from_the_telescope():
         load(["stars.search_lambda_d=-1"])
 
 
-@pytest.mark.parametrize("stage", ["train", "alignment_dae", "alignment_original"])
-def test_settings_that_cannot_change_a_result_are_set_apart(stage):
-    tree = compose.stage_tree(stage, compose.compose((), compose.root_of(stage)))
+@pytest.mark.parametrize(
+    ("groups", "root"),
+    [
+        (("seed", "noise", "parts", "dae", "train"), "config"),
+        (train_dae.stage.reads, "alignment"),
+        (train_cnn.stage.reads("original"), "alignment"),
+    ],
+)
+def test_settings_that_cannot_change_a_result_are_set_apart(groups, root):
+    tree = compose.stage_tree(groups, compose.compose((), root), root)
     free = as_overrides(compose.neutral(tree))
     assert [text.split(".", 1)[1] for text in free] == ["checkpoint_seconds=20.0"]
     assert sorted([*free, *as_overrides(compose.decisive(tree))]) == as_overrides(tree)

@@ -13,7 +13,11 @@ import pytest
 from psfdae.source import ROOT, Code, Reader
 
 REPOSITORY = ROOT.parents[1]
-OPTIONS = {"scene": ("seidel", "turbulence", "telescope"), "method": ("dae", "pca_som")}
+OPTIONS = {
+    "scene": ("seidel", "turbulence", "telescope"),
+    "method": ("dae", "pca_som"),
+    "_figure": ("predicted", "errors", "correlation"),
+}
 METHODS = [f"psfdae.estimators.{name}" for name in ("noisy", "pca_som", "lmmse", "dae")]
 EXEMPT = {
     "psfdae.cli": "the module of the command that runs",

@@ -17,7 +17,7 @@ from psfdae.estimators.pca_som import PcaSom
 from psfdae.files import Column, ProductError, write_product
 from psfdae.stages import sweep as stage
 from psfdae.stages import sweep_figures, sweep_summary, track
-from psfdae.stages.alignment_train import train_noise_trained
+from psfdae.stages.alignment_methods import train_cnn
 from psfdae.stages.common import noise_model
 from psfdae.stages.fit import baseline, train
 from psfdae.stars.fields import random_split
@@ -207,13 +207,13 @@ def test_cnn_is_the_main_workflow_s_and_measured_on_other_states(tmp_path):
         folder=folder,
         checkpoint=tmp_path / "sweep.pt",
     )
-    stage.point(
-        load_stage(point_groups("noise_trained"), given, "alignment"), "noise_trained", {}, {}, task
-    )
-    config = load_stage("alignment_noise_trained", given)
-    train_noise_trained(config, data["states"], tmp_path / "main", tmp_path / "main.pt")
+    settings = load_stage(point_groups("noise_trained"), given, "alignment")
+    stage.point(settings, "noise_trained", {}, {}, task)
+    config = load_stage(train_cnn.stage.reads("noise_trained"), given, "alignment")
+    main = tmp_path / "main"
+    train_cnn(config, "noise_trained", data["states"], tmp_path / "main.pt", main)
     for name in ("cnn.safetensors", "config.yaml"):
-        assert (tmp_path / "main" / name).read_bytes() == (folder / name).read_bytes()
+        assert (main / name).read_bytes() == (folder / name).read_bytes()
     metrics = stage.read_result(folder / stage.RESULT)["metrics"]
     for role, name in (("validation", "validation.csv"), ("test", "evaluation.csv")):
         table = pd.read_csv(folder / name)

@@ -57,14 +57,10 @@ def test_same_value_in_another_format_reruns_nothing(smoke):
     assert planned(smoke, overrides="train.lr=0.0040 noise.kappa=4.980") == {}
 
 
-def test_interval_of_checkpoints_reruns_nothing_but_reaches_the_trainings(smoke, tmp_path):
-    groups = ("dae_train", "train_original", "train_dae_retrained")
-    given = [f"{group}.checkpoint_seconds=1.5" for group in ("train", *groups)]
+def test_interval_of_checkpoints_reruns_nothing(smoke):
+    groups = ("train", "dae_train", "train_original", "train_dae_retrained")
+    given = [f"{group}.checkpoint_seconds=1.5" for group in groups]
     assert planned(smoke, overrides=" ".join(given)) == {}
-    out = snakemake(tmp_path, "--dry-run", "--printshellcmds", "all", overrides=" ".join(given))
-    for group in groups:
-        assert f"++{group}.checkpoint_seconds=1.5" in out
-    assert "++train_noise_trained.checkpoint_seconds=20.0" in out
 
 
 def test_command_of_the_readme_with_another_telescope(tmp_path):

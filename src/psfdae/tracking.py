@@ -10,17 +10,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from psfdae.alignment.methods import CNNS
 from psfdae.belonging import STARS, require_origin
 from psfdae.estimators import HISTORY, Method, method, registered
 from psfdae.files import ProductError, read_product
 from psfdae.reading import number, read_csv, read_yaml
 
-NETWORKS = {
-    "dae": "dae.safetensors",
-    "original": "cnn.safetensors",
-    "noise_trained": "cnn.safetensors",
-    "dae_retrained": "cnn.safetensors",
-}
+NETWORKS = {"dae": "dae.safetensors", **dict.fromkeys(CNNS, "cnn.safetensors")}
 """Networks of scene 3 and the files of their weights."""
 
 STATISTICS = ("mean_abs_error", "bias", "variance")

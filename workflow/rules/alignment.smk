@@ -1,3 +1,44 @@
+# Scene 3: states of misalignment, their stamps, the networks, estimates, fits and bounds.
+from psfdae.alignment.methods import CNNS, METHODS
+
+with one_line():
+    ALIGNMENT_OVERRIDES = overrides_for("alignment", GIVEN)
+ALIGNMENT_DATA = f"{RESULTS}/data/alignment"
+ALIGNMENT = f"{RESULTS}/alignment"
+ALIGNMENT_SETS = ["uniform", "grid"]
+
+
+wildcard_constraints:
+    states="grid|uniform|train",
+    test_set="|".join(ALIGNMENT_SETS),
+    cnn="|".join(CNNS),
+    level=r"[0-9.e-]+",
+
+
+@cache
+@one_line()
+def alignment_config():
+    """Checked configuration of scene 3; a wrong key stops before any job."""
+    return load(ALIGNMENT_OVERRIDES, "alignment")
+
+
+def as_options(wildcards, input):
+    """Named inputs as options of these names; weights stand for the network's folder."""
+    options = []
+    for name, found in input.items():
+        for path in [found] if isinstance(found, str) else found:
+            value = Path(path).parent if path.endswith(".safetensors") else path
+            options.append(f"--{name.replace('_', '-')}={value}")
+    return options
+
+
+def network_files(name, weights):
+    """What a training of scene 3 leaves."""
+    files = ("config.yaml", "trained_on.yaml", "history.csv")
+    named = {file.partition(".")[0]: f"{ALIGNMENT}/{name}/{file}" for file in files}
+    return {"weights": f"{ALIGNMENT}/{name}/{weights}", **named}
+
+
 rule alignment_model:
     output:
         f"{ALIGNMENT_DATA}/model.h5",
@@ -5,63 +46,38 @@ rule alignment_model:
         f"{RESULTS}/logs/alignment/model.log",
     benchmark:
         f"{RESULTS}/benchmarks/alignment/model.tsv"
-    threads: 1
-    resources:
-        mem_mb=500,
-        runtime=10,
     params:
-        config=lambda w: alignment_stage("alignment_model"),
-        source=source_hash("psfdae.stages.alignment"),
+        config=lambda w: settings("alignment model"),
+        source=source_hash("alignment model"),
     message:
         "Fitting the wavefront of scene 3 to ray-traced states"
     shell:
-        "psfdae alignment model --out {output} {params.config:q} > {log} 2>&1"
+        "psfdae alignment model --config {params.config} --out {output} > {log} 2>&1"
 
 
+# The many states that networks are trained on take their wavefronts from the model.
 rule alignment_states:
+    input:
+        model=lambda w: rules.alignment_model.output if w.states == "train" else [],
     output:
         f"{ALIGNMENT_DATA}/{{states}}.h5",
     log:
         f"{RESULTS}/logs/alignment/{{states}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/alignment/{{states}}.tsv"
-    wildcard_constraints:
-        states="grid|uniform",
-    threads: lambda w: alignment_config().optics.threads
-    resources:
-        mem_mb=500,
-        runtime=10,
-    params:
-        config=lambda w: alignment_stage("alignment_states"),
-        source=source_hash("psfdae.stages.alignment"),
-    message:
-        "Tracing rays and propagating the stamps of scene 3, set {wildcards.states}"
-    shell:
-        "psfdae alignment states --set {wildcards.states} --out {output} {params.config:q}"
-        " > {log} 2>&1"
-
-
-rule alignment_train_states:
-    input:
-        model=rules.alignment_model.output,
-    output:
-        f"{ALIGNMENT_DATA}/train.h5",
-    log:
-        f"{RESULTS}/logs/alignment/train.log",
-    benchmark:
-        f"{RESULTS}/benchmarks/alignment/train.tsv"
     threads: lambda w: alignment_config().optics.threads
     resources:
         mem_mb=1000,
-        runtime=10,
     params:
-        config=lambda w: alignment_stage("alignment_states"),
-        source=source_hash("psfdae.stages.alignment"),
+        kind=lambda w: w.states,
+        config=lambda w: settings("alignment states"),
+        inputs=as_options,
+        source=source_hash("alignment states"),
     message:
-        "Propagating the stamps of scene 3, uniform states for training"
+        "Simulating the stamps of scene 3, set {wildcards.states}"
     shell:
-        "psfdae alignment states --set train --model {input.model} --out {output}"
-        " {params.config:q} > {log} 2>&1"
+        "psfdae alignment states --config {params.config} --set {params.kind}"
+        " {params.inputs:q} --out {output} > {log} 2>&1"
 
 
 rule alignment_telescope:
@@ -75,15 +91,129 @@ rule alignment_telescope:
         f"{RESULTS}/logs/alignment/telescope.log",
     benchmark:
         f"{RESULTS}/benchmarks/alignment/telescope.tsv"
-    threads: 1
-    resources:
-        mem_mb=500,
-        runtime=10,
     params:
-        config=lambda w: alignment_stage("alignment_telescope"),
-        source=source_hash("psfdae.stages.alignment"),
+        config=lambda w: settings("alignment telescope"),
+        inputs=as_options,
+        source=source_hash("alignment telescope"),
     message:
         "Tabulating key figures of scene 3"
     shell:
-        "psfdae alignment telescope --model {input.model} --grid {input.grid}"
-        " --uniform {input.uniform} --out {output} {params.config:q} > {log} 2>&1"
+        "psfdae alignment telescope --config {params.config} {params.inputs:q}"
+        " --out {output} > {log} 2>&1"
+
+
+rule alignment_dae:
+    input:
+        grid=f"{ALIGNMENT_DATA}/grid.h5",
+        train=f"{ALIGNMENT_DATA}/train.h5",
+    output:
+        **network_files("dae", "dae.safetensors"),
+    log:
+        f"{RESULTS}/logs/alignment/dae.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/alignment/dae.tsv"
+    threads: lambda w: alignment_config().dae_train.threads
+    resources:
+        mem_mb=1500,
+        runtime=60,
+    params:
+        command="train-dae",
+        config=lambda w: settings("alignment train-dae"),
+        inputs=as_options,
+        source=source_hash("alignment train-dae"),
+        folder=subpath(output.weights, parent=True),
+        # Not an output: Snakemake would delete it with a failed job's outputs.
+        checkpoint=f"{RESULTS}/checkpoints/alignment-dae.pt",
+    message:
+        "Training the DAE of scene 3"
+    shell:
+        "psfdae alignment {params.command} --config {params.config} {params.inputs:q}"
+        " --checkpoint {params.checkpoint} --out {params.folder} > {log} 2>&1"
+
+
+use rule alignment_dae as alignment_cnn with:
+    input:
+        states=lambda w: f"{ALIGNMENT_DATA}/{METHODS[w.cnn].states}.h5",
+        dae=lambda w: [f"{ALIGNMENT}/dae/dae.safetensors"] * METHODS[w.cnn].denoised,
+    output:
+        **network_files("{cnn}", "cnn.safetensors"),
+    log:
+        f"{RESULTS}/logs/alignment/{{cnn}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/alignment/{{cnn}}.tsv"
+    threads: lambda w: getattr(alignment_config(), f"train_{w.cnn}").threads
+    params:
+        command=lambda w: f"train-cnn --kind {w.cnn}",
+        config=lambda w: settings("alignment train-cnn", kind=w.cnn),
+        source=source_hash("alignment train-cnn"),
+        checkpoint=lambda w: f"{RESULTS}/checkpoints/alignment-{w.cnn}.pt",
+    message:
+        "Training the CNN {wildcards.cnn} of scene 3"
+
+
+rule alignment_bound:
+    input:
+        states=f"{ALIGNMENT_DATA}/{{test_set}}.h5",
+        model=rules.alignment_model.output,
+    output:
+        out=f"{ALIGNMENT}/bounds/{{test_set}}.h5",
+    log:
+        f"{RESULTS}/logs/alignment/bound_{{test_set}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/alignment/bound_{{test_set}}.tsv"
+    resources:
+        mem_mb=1500,
+        runtime=20,
+    params:
+        command="bound",
+        # One thread of its own per job: the jobs fill the machine.
+        config=lambda w: settings("alignment bound", more=("optics.threads=1",)),
+        inputs=as_options,
+        outputs=lambda w, output: as_options(w, output),
+        source=source_hash("alignment bound"),
+    message:
+        "Bounding the errors of misalignments, set {wildcards.test_set}"
+    shell:
+        "psfdae alignment {params.command} --config {params.config}"
+        " --set {wildcards.test_set} {params.inputs:q} {params.outputs:q} > {log} 2>&1"
+
+
+use rule alignment_bound as alignment_estimate with:
+    input:
+        **{cnn: f"{ALIGNMENT}/{cnn}/cnn.safetensors" for cnn in CNNS},
+        states=f"{ALIGNMENT_DATA}/{{test_set}}.h5",
+        dae=rules.alignment_dae.output.weights,
+    output:
+        out=f"{ALIGNMENT}/estimates/{{test_set}}.h5",
+        times=f"{ALIGNMENT}/estimates/{{test_set}}_times.csv",
+    log:
+        f"{RESULTS}/logs/alignment/estimate_{{test_set}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/alignment/estimate_{{test_set}}.tsv"
+    threads: lambda w: alignment_config().evaluation.threads
+    params:
+        command="estimate",
+        config=lambda w: settings("alignment estimate"),
+        source=source_hash("alignment estimate"),
+    message:
+        "Estimating misalignments with the networks, set {wildcards.test_set}"
+
+
+use rule alignment_bound as alignment_fit with:
+    input:
+        states=f"{ALIGNMENT_DATA}/{{test_set}}.h5",
+        model=rules.alignment_model.output,
+        cnn=f"{ALIGNMENT}/{METHODS['max_likelihood'].cnn}/cnn.safetensors",
+    output:
+        out=f"{ALIGNMENT}/fits/{{test_set}}_{{level}}.h5",
+        times=f"{ALIGNMENT}/fits/{{test_set}}_{{level}}_times.csv",
+    log:
+        f"{RESULTS}/logs/alignment/fit_{{test_set}}_{{level}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/alignment/fit_{{test_set}}_{{level}}.tsv"
+    params:
+        command=lambda w: f"fit --level {w.level}",
+        config=lambda w: settings("alignment fit", more=("optics.threads=1",)),
+        source=source_hash("alignment fit"),
+    message:
+        "Fitting misalignments by maximum likelihood, {wildcards.test_set}, λ = {wildcards.level}"

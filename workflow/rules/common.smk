@@ -10,9 +10,8 @@ from snakemake.utils import validate
 from psfdae.cli import stage
 from psfdae.configuration.compose import ConfigError, as_overrides, config_dir
 from psfdae.configuration.compose import compose, dataset_names, decisive, load
-from psfdae.configuration.compose import load_groups, neutral, overrides_for, stage_tree
+from psfdae.configuration.compose import load_groups, neutral, overrides_for
 from psfdae.configuration.compose import write_settings
-from psfdae.configuration.stages import STAGE_KEYS
 from psfdae.estimators import HISTORY, method, registered
 from psfdae.files import DIGESTS, ProductError
 from psfdae.source import source_hash
@@ -112,35 +111,12 @@ def settings(name, /, *choice, more=(), **options):
     if spec.root == "config":
         tree = composed(*choice, more=more)
     else:
-        tree = compose(ALIGNMENT_OVERRIDES, spec.root)
+        tree = compose((*ALIGNMENT_OVERRIDES, *more), spec.root)
     folder = Path(RESULTS, ".settings")
     # As text: Snakemake does not remember params that are paths.
     return str(
         write_settings(folder, name, reads, tree, spec.root, dry=workflow.dryrun)
     )
-
-
-@one_line()
-def stage_overrides(stage, choice, more=()):
-    """The groups that a stage reads, as overrides: command line and rerun trigger in one.
-
-    A stage that reads the scene starts from the option that chose it, because scenes
-    differ in their keys; for the others every key is pinned but those that cannot
-    change a result (free_overrides).
-    """
-    base = [choice] if "wavefront" in STAGE_KEYS[stage] else []
-    tree = stage_tree(stage, composed(choice, more=more))
-    return base + as_overrides(decisive(tree))
-
-
-@one_line()
-def free_overrides(stage, choice, more=()):
-    """The settings of a stage that cannot change a result, as overrides.
-
-    A param of its own that asks for `threads`: Snakemake takes it for derived, which
-    is not a reason to repeat a job.
-    """
-    return as_overrides(neutral(stage_tree(stage, composed(choice, more=more))))
 
 
 @cache

@@ -1,13 +1,8 @@
 with one_line():
     KNEE = import_module("trainings").load_knee()
-    ALIGNMENT_OVERRIDES = overrides_for("alignment", GIVEN)
 FRESH = "fresh_realisations"
 KNEE_DATASET = TIMED_DATASET = "dataset3"
 POPPY_STARS = 500
-ALIGNMENT_DATA = f"{RESULTS}/data/alignment"
-ALIGNMENT = f"{RESULTS}/alignment"
-ALIGNMENT_SETS = ["uniform", "grid"]
-ALIGNMENT_CNNS = ["original", "noise_trained", "dae_retrained"]
 
 
 def has_bank(dataset):
@@ -70,35 +65,3 @@ def timed_threads(w):
 def poppy_stars(w):
     """A small preset has small test parts; POPPY takes its time for each star."""
     return min(POPPY_STARS, dataset_config(TIMED_DATASET).parts.test_stars)
-
-
-@cache
-@one_line()
-def alignment_config():
-    """Checked configuration of scene 3; a wrong key stops before any job."""
-    return load(ALIGNMENT_OVERRIDES, "alignment")
-
-
-@one_line()
-def alignment_stage(stage, part=decisive):
-    """The groups that a stage of scene 3 reads, as overrides; part=neutral: free_overrides."""
-    tree = stage_tree(stage, compose(ALIGNMENT_OVERRIDES, "alignment"))
-    return as_overrides(part(tree))
-
-
-def alignment_levels():
-    return [f"{level:g}" for level in alignment_config().noise.levels]
-
-
-def cnn_inputs(w):
-    """Clean grid stamps for the paper's CNN, the large set for ours, and the DAE."""
-    kind = "grid" if w.cnn == "original" else "train"
-    named = {"states": f"{ALIGNMENT_DATA}/{kind}.h5"}
-    if w.cnn == "dae_retrained":
-        named["dae"] = f"{ALIGNMENT}/dae/dae.safetensors"
-    return named
-
-
-def alignment_fits(test_sets=ALIGNMENT_SETS, what="fit"):
-    path = getattr(rules.alignment_fit.output, what)
-    return expand(path, test_set=test_sets, level=alignment_levels())

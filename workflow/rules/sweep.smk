@@ -3,7 +3,7 @@ wildcard_constraints:
 
 
 # States of their own choose between CNNs: all others train or test.
-rule sweep_validation_states:
+use rule alignment_states as sweep_validation_states with:
     input:
         model=rules.alignment_model.output,
     output:
@@ -12,20 +12,13 @@ rule sweep_validation_states:
         f"{RESULTS}/logs/alignment/validation.log",
     benchmark:
         f"{RESULTS}/benchmarks_on_request/sweep/validation_states.tsv"
-    threads: lambda w: alignment_config().optics.threads
-    resources:
-        mem_mb=500,
     params:
-        config=lambda w: [
-            *alignment_stage("alignment_states"),
-            f"++seed={alignment_config().seed + 1}",
-        ],
-        source=source_hash("psfdae.stages.alignment"),
+        kind="uniform",
+        config=lambda w: settings(
+            "alignment states", more=(f"seed={alignment_config().seed + 1}",)
+        ),
     message:
         "Propagating the stamps of scene 3, uniform states that choose between CNNs"
-    shell:
-        "psfdae alignment states --set uniform --model {input.model} --out {output}"
-        " {params.config:q} > {log} 2>&1"
 
 
 rule sweep_point:

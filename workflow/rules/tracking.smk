@@ -33,7 +33,7 @@ rule track_alignment:
     input:
         rules.alignment_tables.output.errors,
         rules.alignment_dae.output,
-        expand(rules.alignment_cnn.output, cnn=ALIGNMENT_CNNS),
+        expand(rules.alignment_cnn.output, cnn=CNNS),
         rules.figure_alignment_predicted.output,
         rules.figure_alignment_errors.output,
         rules.figure_alignment_correlation.output,

@@ -7,7 +7,7 @@ strides are not in the paper's text; the configuration names them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,17 +15,15 @@ import numpy as np
 import torch
 from torch import nn
 
-from psfdae.alignment.telescope import mirror_symmetries
+from psfdae.alignment.telescope import Mirror, mirror_symmetries
 from psfdae.configuration.alignment import Cnn, CnnTrain
 from psfdae.estimators.training import Row, Training
 from psfdae.estimators.weights import with_weights
 from psfdae.rng import stream
+from psfdae.stars.noise import NoiseModel, mixed_levels
 
 PARAMETERS = 4
 """Numbers of a state: decentre x, y and tilt x, y in units of the range."""
-
-Disturb = Callable[[np.ndarray, np.random.Generator], tuple[np.ndarray, np.ndarray]]
-"""From noise-free stamps and a generator to noisy stamps and weights."""
 
 
 class AlignmentCnn(nn.Module):
@@ -87,16 +85,23 @@ def load_cnn(config: Cnn, fields: int, stamp_px: int, weights: Path) -> Alignmen
 
 def _scaled(stamps: np.ndarray) -> torch.Tensor:
     """Flux-normalised stamps as the network sees them, with a mean of 1."""
-    images = torch.from_numpy(np.ascontiguousarray(stamps, np.float32)) * float(
-        stamps.shape[-1] ** 2
-    )
-    return images.to(memory_format=torch.channels_last)
+    images = torch.from_numpy(np.ascontiguousarray(stamps, np.float32))
+    return (images * float(stamps.shape[-1] ** 2)).to(memory_format=torch.channels_last)
 
 
 @torch.inference_mode()
-def predict_states(model: AlignmentCnn, stamps: np.ndarray, batch: int = 256) -> np.ndarray:
-    """States of flux-normalised stamps (n, fields, d, d), shape (n, 4), float64."""
+def predict_states(
+    model: AlignmentCnn, stamps: np.ndarray, batch: int = 256, mirrors: Sequence[Mirror] = ()
+) -> np.ndarray:
+    """States of flux-normalised stamps (n, fields, d, d), shape (n, 4), float64.
+
+    With mirrors the mean of the estimates from all mirror images of the stamps.
+    """
     model.eval()
+    if mirrors:
+        # The inverse of an orthogonal matrix is its transpose.
+        each = [predict_states(model, m.stamps(stamps), batch) @ m.state for m in mirrors]
+        return np.mean(each, axis=0)
     parts = [
         model(_scaled(stamps[start : start + batch])).numpy()
         for start in range(0, len(stamps), batch)
@@ -104,9 +109,27 @@ def predict_states(model: AlignmentCnn, stamps: np.ndarray, batch: int = 256) ->
     return np.concatenate(parts).astype(np.float64)
 
 
-def noise_weights(level: np.ndarray, levels: list[float]) -> np.ndarray:
+def noise_weights(level: np.ndarray, levels: np.ndarray) -> np.ndarray:
     """Weights ∝ 1/λ² with mean 1 over the levels of a band, shape (n,)."""
-    return np.asarray(level) ** -2.0 / np.mean(np.asarray(levels) ** -2.0)
+    return level**-2.0 / np.mean(levels**-2.0)
+
+
+@dataclass(frozen=True)
+class MixedNoise:
+    """Noise of random levels λ of a band, and weights of the states' errors, if they differ."""
+
+    noise: NoiseModel
+    levels: np.ndarray
+    weigh: bool
+
+    def __call__(
+        self, stamps: np.ndarray, rng: np.random.Generator, gaussian: bool = True
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Noisy stamps of states, by the faster law or by Poisson's, and weights (n,)."""
+        level = mixed_levels(self.levels, len(stamps), rng)
+        draw = self.noise.draw_gaussian if gaussian else self.noise.draw
+        noisy = draw(stamps, level, rng)
+        return noisy, noise_weights(level, self.levels) if self.weigh else np.ones(len(level))
 
 
 @dataclass(frozen=True)
@@ -119,14 +142,14 @@ class TrainingStates:
     stamps : ndarray, shape (n, F, d, d)
     weights : ndarray, shape (n,), optional
         Weights of their errors; 1 by default.
-    disturb : callable, optional
-        Makes noisy stamps, and their weights, anew for every batch.
+    noise : MixedNoise, optional
+        Is drawn anew for every batch.
     """
 
     states: np.ndarray
     stamps: np.ndarray
     weights: np.ndarray | None = None
-    disturb: Disturb | None = None
+    noise: MixedNoise | None = None
 
 
 class CnnTraining(Training):
@@ -173,8 +196,8 @@ class CnnTraining(Training):
             chosen = order[start : start + self.settings.batch]
             images, truth = data.stamps[chosen], data.states[chosen]
             weight = np.ones(chosen.size) if data.weights is None else data.weights[chosen]
-            if data.disturb is not None:
-                images, weight = data.disturb(images, rng)
+            if data.noise is not None:
+                images, weight = data.noise(images, rng)
             if self.mirrors:
                 mirror = self.mirrors[rng.integers(len(self.mirrors))]
                 images, truth = mirror.stamps(images), mirror.states(truth)

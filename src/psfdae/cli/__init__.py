@@ -41,7 +41,7 @@ Split = Literal["random", "held_out"]
 Reference = Literal["realisation", "template"]
 
 GROUPS = {
-    "alignment": "Scene 3: misalignment of the secondary mirror from its PSFs.",
+    "alignment": "Scene 3: alignment of a secondary mirror (config/alignment.yaml).",
     "alignment figure": "Draw a figure of scene 3 as PNG.",
     "figure": "Draw a figure as PNG from finished products.",
     "sweep": "Train many variants of a model and compare them (config/sweep).",
@@ -125,16 +125,14 @@ class Commands(Careful):
         size = len(self.prefix.split())
         names = [name.split() for name in found()]
         words = {w[size] for w in names if w[:size] == self.prefix.split() and w[size:]}
-        return sorted(words | set(self.commands))
+        return sorted(words)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """A group, or the command of a stage, whose module is imported now."""
         name = f"{self.prefix} {cmd_name}".strip()
         if name in GROUPS:
-            old = self.commands.get(cmd_name)
-            more = old.commands if isinstance(old, click.Group) else {}
-            return Commands(name, name=cmd_name, help=GROUPS[name], commands=more)
-        return as_click(stage(name)) if name in found() else self.commands.get(cmd_name)
+            return Commands(name, name=cmd_name, help=GROUPS[name])
+        return as_click(stage(name)) if name in found() else None
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """As click does, with help from the modules' text."""
@@ -181,8 +179,6 @@ def _about(name: str) -> str:
     """First paragraph of a command's help, nothing being imported."""
     if name in GROUPS:
         return GROUPS[name]
-    if name not in found():
-        return main.commands[name].help or ""
     for node in ast.parse(found()[name].read_text(encoding="utf-8")).body:
         for call in getattr(node, "decorator_list", []):
             if isinstance(call, ast.Call) and ast.unparse(call).startswith(f"command('{name}'"):
@@ -286,10 +282,3 @@ def _unfolded(hint: Any) -> tuple[Any, dict[str, Any]]:
             return kind, {**attributes, "multiple": True}
         return tuple(_unfolded(part)[0] for part in inner), {}
     return hint, {}
-
-
-# The commands that are not yet in the stages.
-from psfdae.cli import (  # noqa: E402, F401
-    alignment,
-    alignment_methods,
-)

@@ -170,19 +170,3 @@ class AlignmentConfig(Group):
     train_dae_retrained: CnnTrain
     evaluation: Evaluation
     fit: Fit
-
-
-ALIGNMENT_STAGE_KEYS: dict[str, tuple[str, ...]] = {
-    "alignment_model": ("telescope", "prescription", "alignment"),
-    "alignment_states": ("seed", "telescope", "prescription", "alignment", "optics"),
-    "alignment_telescope": ("telescope", "alignment"),
-    "alignment_dae": ("seed", "noise", "dae", "dae_train"),
-    "alignment_original": ("seed", "cnn", "train_original"),
-    "alignment_noise_trained": ("seed", "noise", "cnn", "train_noise_trained"),
-    "alignment_dae_retrained": ("seed", "noise", "cnn", "train_dae_retrained", "evaluation"),
-    "alignment_estimate": ("seed", "noise", "evaluation"),
-    "alignment_fit": ("seed", "telescope", "alignment", "optics", "noise", "fit", "evaluation"),
-    "alignment_bound": ("telescope", "alignment", "optics", "noise"),
-    "alignment_twin": ("telescope", "prescription", "alignment", "optics", "noise"),
-}
-"""The groups that each stage of scene 3 reads; nothing else can influence its result."""

@@ -8,11 +8,11 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from pydantic import ValidationError, create_model
 
-from psfdae.configuration.alignment import ALIGNMENT_STAGE_KEYS, AlignmentConfig
+from psfdae.configuration.alignment import AlignmentConfig
 from psfdae.configuration.base import NEUTRAL, ConfigError, config_dir
 from psfdae.configuration.consistency import Consistent, with_derived
 from psfdae.configuration.schema import Group, whole_config
@@ -24,11 +24,7 @@ from psfdae.reading import parse_yaml
 Root = Literal["config", "alignment"]
 """Root files of the configuration: the datasets', and that of scene 3."""
 
-ROOTS: dict[Root, dict[str, tuple[str, ...]]] = {
-    "config": STAGE_KEYS,
-    "alignment": ALIGNMENT_STAGE_KEYS,
-}
-"""The groups that the stages of every root read."""
+ROOTS: tuple[Root, ...] = get_args(Root)
 
 
 def model_of(root: Root) -> type[Group]:
@@ -199,7 +195,6 @@ def load_stage(
     ConfigError
         As `load`; an unknown group at the top is refused, too.
     """
-    root = root_of(reads) if isinstance(reads, str) else root
     tree = compose(overrides, root)
     unknown = sorted(set(tree) - set(model_of(root).model_fields))
     if unknown:
@@ -257,16 +252,10 @@ def part(reads: str | tuple[str, ...], tree: Any, root: Root = "config") -> Any:
     ConfigError
         As `load`.
     """
-    root = root_of(reads) if isinstance(reads, str) else root
-    keys = ROOTS[root][reads] if isinstance(reads, str) else reads
+    keys = STAGE_KEYS[reads] if isinstance(reads, str) else reads
     tree = tree if isinstance(tree, Mapping) else tree.model_dump()
     found = {key: tree[key] for key in keys if key in tree}
     return validate(stage_model(keys, model_of(root)), found)
-
-
-def root_of(stage: str) -> Root:
-    """The root whose groups a stage reads."""
-    return next(root for root, keys in ROOTS.items() if stage in keys)
 
 
 def stage_tree(
@@ -281,8 +270,7 @@ def stage_tree(
     ConfigError
         If nothing can follow from them.
     """
-    root = root_of(reads) if isinstance(reads, str) else root
-    keys = ROOTS[root][reads] if isinstance(reads, str) else reads
+    keys = STAGE_KEYS[reads] if isinstance(reads, str) else reads
     tree = _derived(tree) if issubclass(model_of(root), Consistent) else tree
     missing = [key for key in keys if key not in tree]
     if missing:

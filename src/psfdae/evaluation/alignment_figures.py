@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from psfdae.evaluation.alignment_tables import METHOD_LABELS, PARAMETERS
+from psfdae.alignment.methods import METHODS
+from psfdae.evaluation.alignment_tables import PARAMETERS
 from psfdae.evaluation.curves import readable_log_axis
 from psfdae.evaluation.figure_style import SERIES_COLORS, new_figure, styled
 
@@ -20,14 +21,6 @@ NAMES = dict(zip(PARAMETERS, ("decentre x", "decentre y", "tilt x", "tilt y"), s
 SHORT = ("dx", "dy", "tx", "ty")
 """Parameters on the axes of small panels."""
 
-COLORS = {
-    "original": "#4d4d4d",
-    "dae": "#0072b2",
-    "noise_trained": "#d55e00",
-    "dae_retrained": "#cc79a7",
-    "max_likelihood": "#009e73",
-    "cramer_rao": "black",
-}
 BINS = 6
 GAMMA = 0.5
 """Exponent of the grey scale of stamps: wings show, too."""
@@ -98,7 +91,7 @@ def predicted_against_true(
             cell.set_xlim(-1.1, 1.1)
             cell.set_ylim(-1.6, 1.6)
             cell.grid(True)
-        line[0].set_ylabel(METHOD_LABELS[method].replace(" on ", "\non ").replace(", ", ",\n"))
+        line[0].set_ylabel(METHODS[method].label.replace(" on ", "\non ").replace(", ", ",\n"))
     for parameter, top, bottom in zip(PARAMETERS, axes[0], axes[-1], strict=True):
         top.set_title(NAMES[parameter])
         bottom.set_xlabel("true / range")
@@ -130,7 +123,7 @@ def errors_against_size(
     for axes, (level, methods) in zip(panels, curves.items(), strict=True):
         for method, (size, error) in methods.items():
             x, y, half = binned(size, error)
-            style = {"color": COLORS[method], "label": METHOD_LABELS[method], "lw": 1.4}
+            style = {"color": METHODS[method].color, "label": METHODS[method].label, "lw": 1.4}
             if method == "cramer_rao":
                 axes.plot(x, y, ls="--", **style)
             else:
@@ -203,13 +196,15 @@ def correlation_matrices(panels: Sequence[Sequence[tuple[str, np.ndarray]]]) -> 
 
     Parameters
     ----------
-    panels : rows of (title, matrix of shape (4, 4))
+    panels : rows of (title, matrix of shape (4, 4)); the longest fills the width
     """
     figure = new_figure(2.15 * len(panels), layout="constrained")
-    axes = figure.subplots(len(panels), len(panels[0]), squeeze=False)
+    axes = figure.subplots(len(panels), max(map(len, panels)), squeeze=False)
     image: Any = None
     for line, row in zip(axes, panels, strict=True):
-        for cell, (title, matrix) in zip(line, row, strict=True):
+        for cell in line[len(row) :]:
+            cell.set_axis_off()
+        for cell, (title, matrix) in zip(line, row, strict=False):
             image = cell.imshow(matrix, cmap="RdBu_r", vmin=-1.0, vmax=1.0)
             cell.set_title(title, fontsize=8)
             cell.set_xticks(range(4), SHORT)

@@ -9,25 +9,12 @@ import numpy as np
 import pandas as pd
 
 from psfdae.alignment.fisher import expected_abs_error
+from psfdae.alignment.methods import METHODS
 from psfdae.evaluation.metrics import error_correlation
 from psfdae.evaluation.paper import published
 
 PARAMETERS = ("decenter_x", "decenter_y", "tilt_x", "tilt_y")
 SI_UNITS = ("m", "m", "rad", "rad")
-
-METHOD_LABELS = {
-    "constant": "always the middle",
-    "original": "CNN, noisy stamps",
-    "dae": "CNN, DAE output",
-    "noise_trained": "CNN trained on noisy stamps",
-    "dae_retrained": "CNN trained on DAE output",
-    "max_likelihood": "maximum likelihood",
-    "cramer_rao": "Cramér–Rao bound",
-}
-"""Methods in the order of the tables, and what they are."""
-
-PAPER_LABELS = {"dae": "DAE PSF", "original": "Original data"}
-"""Our name of a method and the row's label in the paper."""
 
 CORRELATED = ("decenter_x-tilt_y", "decenter_y-tilt_y", "tilt_x-tilt_y")
 """The pairs that the paper tabulates."""
@@ -190,7 +177,7 @@ def paper_correlations(correlations: pd.DataFrame) -> pd.DataFrame:
 
 def _wide(table: pd.DataFrame, across: str, order: list[str], index: list[str]) -> pd.DataFrame:
     """One row per index, columns in a given order, methods in the order of the tables."""
-    methods = [*METHOD_LABELS, "cramer_rao_pooled"]
+    methods = list(METHODS)
     wide = table.pivot(index=index, columns=across, values="value")[order].reset_index()
     wide.columns.name = None
     keys = [wide["method"].map(methods.index) if name == "method" else wide[name] for name in index]
@@ -217,7 +204,7 @@ def as_markdown(table: pd.DataFrame, title: str, digits: dict[str, str]) -> str:
             for value, kind in zip(table[column], kinds, strict=True)
         ]
     shown["method"] = [
-        PAPER_LABELS[m] if source == "paper" else METHOD_LABELS.get(m, "Cramér–Rao, all states")
+        METHODS[m].paper if source == "paper" else METHODS[m].label
         for m, source in zip(table["method"], table["source"], strict=True)
     ]
     return f"{title}\n\n{shown.to_markdown(index=False, disable_numparse=True)}\n"

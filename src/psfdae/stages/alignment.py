@@ -8,7 +8,7 @@ too, beside the set of uniform states.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
@@ -24,29 +24,24 @@ from psfdae.alignment.telescope import (
     zernike_tracer,
 )
 from psfdae.belonging import OURS, STATE_STAMPS, STATES, require
-from psfdae.files import Column, Product, read_product, write_product, write_text
+from psfdae.cli import File, command
+from psfdae.configuration.alignment import AlignmentConfig
+from psfdae.files import Column, read_product, write_product, write_text
 from psfdae.optics.raytracing import FIRST_NOLL, ZernikeTracer
 from psfdae.rng import stream
 from psfdae.stages.common import limit_threads
 
-StateSet = Literal["grid", "uniform", "train"]
+ModelFile = Annotated[File, "Product of `alignment model`."]
+StatesFile = Annotated[File, "Product of `alignment states`."]
+TestSet = Annotated[Literal["grid", "uniform"], {"flag": "--set"}]
 
 
-def model(config: Any, out: Path) -> None:
-    """Fit the quadratic model to few ray-traced states and verify it on the grid.
-
-    Parameters
-    ----------
-    config : stage config (telescope, prescription, alignment)
-    out : path of the HDF5 product "alignment_model"
-
-    Raises
-    ------
-    RayTracingError
-        If a field is vignetted.
-    ModelError
-        If the model differs from ray tracing by more than the tolerance.
-    """
+@command("alignment model", reads=("telescope", "prescription", "alignment"), root="alignment")
+def model(
+    config: AlignmentConfig,
+    out: Annotated[File, "HDF5 product with the quadratic model of the wavefront."],
+) -> None:
+    """Fit the quadratic model to few ray-traced states, verify it on the grid."""
     limit_threads(1)
     tracer, design = _tracer(config), design_states()
     fitted = fit_quadratic(design, tracer(design))
@@ -66,44 +61,37 @@ def model(config: Any, out: Path) -> None:
 
 
 def read_model(path: Path, wanted: Any, whose: object = OURS) -> QuadraticModel:
-    """The quadratic model of a product "alignment_model".
-
-    Parameters
-    ----------
-    path : product "alignment_model"
-    wanted, whose : what it must be a model of, as in `psfdae.belonging.require`
-    """
+    """The quadratic model of a product; `wanted` and `whose` as in `psfdae.belonging.require`."""
     product = read_product(path, "alignment_model", ("coefficients",))
     require(path, product.config, STATES, wanted, whose)
     return QuadraticModel(product["coefficients"])
 
 
-def states(config: Any, kind: StateSet, model_path: Path | None, out: Path) -> None:
-    """Simulate the noise-free stamps of a set of states at all fields.
-
-    The grid and the uniform test states are ray-traced. The many states of the
-    training set come from the quadratic model if one is given.
-
-    Parameters
-    ----------
-    config : stage config (seed, telescope, prescription, alignment, optics)
-    kind : "grid", "uniform" or "train"
-    model_path : path of the product "alignment_model", or None to trace rays
-    out : path of the HDF5 product "alignment_states"
-
-    Raises
-    ------
-    RayTracingError, SamplingError, EnergyError
-        If a field is vignetted, the pupil grid too coarse or a stamp too small.
-    ProductError
-        If the model is that of another telescope or range.
-    """
+@command(
+    "alignment states",
+    reads=("seed", "telescope", "prescription", "alignment", "optics"),
+    root="alignment",
+)
+def states(
+    config: AlignmentConfig,
+    kind: Annotated[Literal["grid", "uniform", "train"], {"flag": "--set"}],
+    out: Annotated[File, "HDF5 product with states and their noise-free stamps."],
+    model: Annotated[
+        File | None,
+        "Product of `alignment model`: take wavefronts from it instead of tracing rays.",
+    ] = None,
+) -> None:
+    """Simulate the noise-free stamps of a set of states."""
     limit_threads(1)  # batches run side by side, optics.threads of them
-    fitted = None if model_path is None else read_model(model_path, config)
-    chosen = _choose(config, kind)
+    alignment = config.alignment
+    fitted = None if model is None else read_model(model, config)
+    if kind == "grid":
+        chosen = grid_states(alignment.grid_levels)
+    else:
+        count = alignment.test_states if kind == "uniform" else alignment.train_states
+        chosen = uniform_states(count, stream(config.seed, "alignment", "states", kind))
     zernikes = fitted(chosen) if fitted else _tracer(config)(chosen)
-    operator = AlignmentStamps(config.telescope, config.optics, config.alignment)
-    stamps, energy = operator(zernikes)
+    stamps, energy = AlignmentStamps(config.telescope, config.optics, alignment)(zernikes)
     columns = {
         "states": Column(chosen, "range", "decentre x, y and tilt x, y of the secondary"),
         "stamps": Column(
@@ -118,19 +106,11 @@ def states(config: Any, kind: StateSet, model_path: Path | None, out: Path) -> N
     write_product(out, "alignment_states", columns, config.model_dump())
 
 
-def _tracer(config: Any) -> ZernikeTracer:
+def _tracer(config: AlignmentConfig) -> ZernikeTracer:
     return zernike_tracer(config.telescope, config.prescription, config.alignment)
 
 
-def _choose(config: Any, kind: StateSet) -> np.ndarray:
-    alignment = config.alignment
-    if kind == "grid":
-        return grid_states(alignment.grid_levels)
-    count = {"uniform": alignment.test_states, "train": alignment.train_states}[kind]
-    return uniform_states(count, stream(config.seed, "alignment", "states", kind))
-
-
-def _geometry(config: Any) -> dict[str, Column]:
+def _geometry(config: AlignmentConfig) -> dict[str, Column]:
     alignment = config.alignment
     fields = field_points(alignment.field_radius_deg, alignment.field_points)
     noll = np.arange(FIRST_NOLL, alignment.highest_zernike + 1)
@@ -141,60 +121,48 @@ def _geometry(config: Any) -> dict[str, Column]:
     }
 
 
-def telescope(config: Any, model_path: Path, grid: Path, uniform: Path, out: Path) -> None:
-    """Key figures of telescope, model and stamps as a table.
-
-    Parameters
-    ----------
-    config : stage config (telescope, alignment)
-    model_path : product "alignment_model"
-    grid, uniform : products "alignment_states"
-    out : CSV, columns quantity, value, unit
-
-    Raises
-    ------
-    ProductError
-        If products and configuration do not belong together.
-    """
+@command("alignment telescope", reads=("telescope", "alignment"), root="alignment")
+def telescope(
+    config: AlignmentConfig,
+    model: ModelFile,
+    grid: Annotated[File, "Product of `alignment states --set grid`."],
+    uniform: Annotated[File, "Product of `alignment states --set uniform`."],
+    out: Annotated[File, "CSV with key figures."],
+) -> None:
+    """Tabulate key figures of telescope, model and stamps."""
     import pandas as pd
 
-    fitted = read_product(model_path, "alignment_model")
+    fitted = read_product(model, "alignment_model")
     sets = {
         name: read_product(path, "alignment_states", ("energy", "stamps"))
         for name, path in (("grid", grid), ("uniform", uniform))
     }
-    require(model_path, fitted.config, STATES, config)
+    require(model, fitted.config, STATES, config)
     for product in sets.values():
         require(product.path, product.config, STATE_STAMPS, config)
+    coefficients, residual, noll = (fitted[k] for k in ("coefficients", "residual", "noll"))
+    # How well the states are separated, and the aligned telescope's defocus.
+    sensitivity = np.moveaxis(coefficients[:, 1:5], 1, -1).reshape(-1, 4)
+    defocus = coefficients[:, 0, noll == 4][:, 0]
     pixel = config.telescope.pixel
     rows = [
         ("pixel", pixel, "lambda/D"),
         ("lambda_over_d", config.telescope.pixel_scale_arcsec / pixel, "arcsec"),
-        *_model_figures(fitted),
+        ("model_rms", np.sqrt((residual**2).mean()), "wave"),
+        ("model_rms_greatest", residual.max(), "wave"),
+        ("model_states", len(design_states()), "1"),
+        ("defocus_centre", defocus[0], "wave"),
+        ("defocus_edge", defocus[1:].mean(), "wave"),
+        ("sensitivity_condition", np.linalg.cond(sensitivity), "1"),
     ]
     for name, product in sets.items():
-        peak = product["stamps"].max(axis=(2, 3))
+        energy, peak = product["energy"], product["stamps"].max(axis=(2, 3))
         rows += [
-            (f"energy_least_{name}", product["energy"].min(), "1"),
-            (f"energy_mean_{name}", product["energy"].mean(), "1"),
+            (f"energy_least_{name}", energy.min(), "1"),
+            (f"energy_mean_{name}", energy.mean(), "1"),
             (f"peak_least_{name}", peak.min(), "1"),
             (f"peak_greatest_{name}", peak.max(), "1"),
-            (f"stamps_{name}", product["energy"].size, "1"),
+            (f"stamps_{name}", energy.size, "1"),
         ]
     table = pd.DataFrame(rows, columns=["quantity", "value", "unit"])
     write_text(out, table.to_csv(index=False, float_format="%.6g"))
-
-
-def _model_figures(fitted: Product) -> list[tuple[str, float, str]]:
-    """How well the model fits, the aligned defocus, how well the states are separated."""
-    coefficients, residual, noll = (fitted[k] for k in ("coefficients", "residual", "noll"))
-    sensitivity = np.moveaxis(coefficients[:, 1:5], 1, -1).reshape(-1, 4)
-    defocus = coefficients[:, 0, noll == 4][:, 0]
-    return [
-        ("model_rms", float(np.sqrt((residual**2).mean())), "wave"),
-        ("model_rms_greatest", float(residual.max()), "wave"),
-        ("model_states", float(len(design_states())), "1"),
-        ("defocus_centre", float(defocus[0]), "wave"),
-        ("defocus_edge", float(defocus[1:].mean()), "wave"),
-        ("sensitivity_condition", float(np.linalg.cond(sensitivity)), "1"),
-    ]

@@ -1,34 +1,50 @@
-"""Stage `config`: what the configuration says, checked and resolved."""
+"""Stages `config` and `alignment config`: what the configuration says, checked and resolved."""
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 import click
 
-from psfdae.cli import Stage, command, found, stage
+from psfdae.cli import command, found, stage
+
+Overrides = Annotated[tuple[str, ...], {"argument": True}]
+Only = Annotated[str | None, "Only the groups that this stage reads.", {"flag": "--stage"}]
 
 
 @command("config")
-def config(
-    overrides: Annotated[tuple[str, ...], {"argument": True}] = (),
-    only: Annotated[
-        str | None, "Only the groups that this stage reads.", {"flag": "--stage"}
-    ] = None,
-) -> None:
+def config(overrides: Overrides = (), only: Only = None) -> None:
     """Check the configuration and print it, resolved, as YAML."""
+    _print("config", overrides, only)
+
+
+@command("alignment config")
+def alignment_config(only: Only = None, overrides: Overrides = ()) -> None:
+    """Check the configuration of scene 3 and print it, resolved, as YAML."""
+    _print("alignment", overrides, only)
+
+
+def _print(
+    root: Literal["config", "alignment"], overrides: tuple[str, ...], only: str | None
+) -> None:
     import yaml
 
     from psfdae.configuration.compose import load, load_stage
     from psfdae.configuration.stages import STAGE_KEYS
 
+    stages = {_key(name): name for name in found()}
     if only is None:
-        checked = load(overrides)
-    elif only.replace("-", "_") in STAGE_KEYS and only not in found():
-        checked = load_stage(only.replace("-", "_"), overrides)
-    elif only not in found():
-        raise click.BadParameter(f"{only!r} is not one of {', '.join(sorted(found()))}")
+        checked = load(overrides, root)
+    elif _key(only) in stages and (spec := stage(stages[_key(only)]).stage).root == root:
+        reads = spec.reads() if callable(spec.reads) else spec.reads
+        checked = load_stage(reads, overrides, root)
+    elif root == "config" and _key(only) in STAGE_KEYS:
+        checked = load_stage(_key(only), overrides)
     else:
-        spec: Stage = stage(only).stage  # type: ignore[attr-defined]
-        checked = load_stage(spec.reads, overrides, spec.root)  # type: ignore[arg-type]
+        names = [name for name in found() if name.startswith("alignment ") == (root != "config")]
+        raise click.BadParameter(f"{only!r} is not one of {', '.join(sorted(names))}")
     click.echo(yaml.safe_dump(checked.model_dump(), sort_keys=False), nl=False)
+
+
+def _key(name: str) -> str:
+    return name.replace(" ", "_").replace("-", "_")

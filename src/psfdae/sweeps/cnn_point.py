@@ -12,8 +12,7 @@ from psfdae.estimators import CONFIG, HISTORY
 from psfdae.evaluation.alignment_tables import error_rows
 from psfdae.files import read_product, write_text
 from psfdae.reading import read_table, read_yaml
-from psfdae.stages import alignment_train as stage
-from psfdae.stages.alignment_evaluate import cnn_predictor, noisy_test_states
+from psfdae.stages.alignment_methods import CNN_WEIGHTS, cnn_predictor, noisy_test_states, train_cnn
 from psfdae.stages.common import limit_threads
 from psfdae.sweeps.measured import (
     EVALUATION,
@@ -29,7 +28,7 @@ TEST_SET = "uniform"
 
 def files_of(name: str) -> tuple[str, ...]:
     """Names of the files of a point's training."""
-    return (stage.CNN_WEIGHTS, CONFIG, HISTORY)
+    return (CNN_WEIGHTS, CONFIG, HISTORY)
 
 
 def run(config: Any, task: Task, name: str) -> Measured:
@@ -50,9 +49,8 @@ def run(config: Any, task: Task, name: str) -> Measured:
     for role in ("validation", "test"):
         product = read_product(task.data[role], "alignment_states", ())
         require(product.path, product.config, STATE_STAMPS, trained_on.config, trained_on.path)
-    train = {"original": stage.train_original, "noise_trained": stage.train_noise_trained}
-    groups = part(f"alignment_{name}", config)
-    train[name](groups, task.data["states"], task.folder, task.checkpoint)
+    settings = part(train_cnn.stage.reads(name), config, "alignment")  # type: ignore[attr-defined]
+    train_cnn(settings, name, task.data["states"], task.checkpoint, task.folder)
     limit_threads(config.evaluation.threads)
     metrics: dict[str, float] = {}
     for role, file in (("validation", VALIDATION), ("test", EVALUATION)):

@@ -136,8 +136,12 @@ class Plan:
     @cached_property
     def _data(self) -> dict[str, Any]:
         """Configuration of the images that all points share."""
-        stage = "stars" if self.sweep.root == "config" else "alignment_states"
-        return stage_tree(stage, self._base)
+        if self.sweep.root == "config":
+            return stage_tree("stars", self._base)
+        from psfdae.stages.alignment import states
+
+        reads = states.stage.reads  # type: ignore[attr-defined]
+        return stage_tree(reads, self._base, "alignment")
 
     @cached_property
     def _base(self) -> dict[str, Any]:

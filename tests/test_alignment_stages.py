@@ -1,0 +1,273 @@
+"""Stages of scene 3 by the command line, on tiny sizes: states, networks, tables, figures."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+from click.testing import CliRunner
+
+from psfdae.alignment.methods import CNNS, ESTIMATORS, LEARNED, METHODS
+from psfdae.cli import main
+from psfdae.configuration.compose import ConfigError, config_dir, load, load_stage, overrides_for
+from psfdae.evaluation import alignment_tables
+from psfdae.files import read_product
+from psfdae.stages.alignment import states
+
+PRESET = ("alignment_preset=smoke", "alignment.grid_levels=2")
+
+
+def test_rows_of_the_tables():
+    rng = np.random.default_rng(0)
+    covariance = np.array([[4, 0, 0, -3], [0, 4, 3, 0], [0, 3, 4, 0], [-3, 0, 0, 4]]) * 1e-4
+    errors = rng.multivariate_normal(np.zeros(4), covariance, 4000)
+    key = {"test_set": "uniform", "noise_level": 0.002, "method": "dae"}
+    unit = np.array([1e-3, 1e-3, 2e-3, 2e-3])
+    table = pd.DataFrame(alignment_tables.error_rows(key, errors, unit))
+    assert list(table.columns) == [
+        *("test_set", "noise_level", "method", "parameter", "mean_abs_error", "bias"),
+        *("variance", "variance_abs", "unit", "n"),
+    ]
+    assert len(table) == 8
+    ranges = table[table.unit == "range"].set_index("parameter")
+    metres = table[table.unit == "m"].set_index("parameter")
+    assert metres.mean_abs_error["decenter_x"] == pytest.approx(
+        1e-3 * ranges.mean_abs_error["decenter_x"]
+    )
+    assert metres.variance["decenter_y"] == pytest.approx(1e-6 * ranges.variance["decenter_y"])
+    # Normal errors: the absolute error has 1 − 2/π of the variance.
+    ratio = ranges.variance_abs / ranges.variance
+    assert ratio.to_numpy() == pytest.approx(1 - 2 / np.pi, abs=0.03)
+    bound = pd.DataFrame(
+        alignment_tables.bound_rows(key, np.broadcast_to(covariance, (5, 4, 4)), unit)
+    )
+    same = bound[bound.unit == "range"].set_index("parameter")
+    assert ranges.mean_abs_error.to_numpy() == pytest.approx(same.mean_abs_error, rel=0.05)
+    assert ranges.variance_abs.to_numpy() == pytest.approx(same.variance_abs, rel=0.1)
+
+
+def test_measured_correlations_are_those_predicted():
+    rng = np.random.default_rng(0)
+    covariance = np.array([[4, 0, 0, -3], [0, 4, 3, 0], [0, 3, 4, 0], [-3, 0, 0, 4]]) * 1e-4
+    errors = rng.multivariate_normal(np.zeros(4), covariance, 600)
+    key = {"test_set": "uniform", "noise_level": 0.002}
+    measured = pd.DataFrame(alignment_tables.measured_correlations(key, errors))
+    predicted = pd.DataFrame(
+        alignment_tables.predicted_correlations(key, np.broadcast_to(covariance, (600, 4, 4)))
+    )
+    assert len(measured) == 16
+    pooled = predicted[predicted.method == "cramer_rao_pooled"].reset_index(drop=True)
+    assert pooled.correlation[3] == pytest.approx(-0.75)
+    assert pooled.correlation[6] == pytest.approx(0.75)
+    off = measured.parameter_a != measured.parameter_b
+    assert (measured.ci_low[off] < pooled.correlation[off]).mean() > 0.8
+    assert (measured.ci_high[off] > pooled.correlation[off]).mean() > 0.8
+    assert (pooled.ci_low[3] < -0.75) and (pooled.ci_high[3] > -0.75)
+
+
+def _run(*arguments):
+    result = CliRunner().invoke(main, ["alignment", *map(str, arguments)], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+
+
+@pytest.fixture(scope="module")
+def products(tmp_path_factory):
+    """Model, states and key figures."""
+    at = tmp_path_factory.mktemp("scene3")
+    model = ("--model", at / "model.h5")
+    _run("model", "--out", at / "model.h5", *PRESET)
+    for kind in ("grid", "uniform", "train"):
+        given = model if kind == "train" else ()
+        _run("states", "--set", kind, "--out", at / f"{kind}.h5", *given, *PRESET)
+    sets = ("--grid", at / "grid.h5", "--uniform", at / "uniform.h5")
+    _run("telescope", *model, *sets, "--out", at / "telescope.csv", *PRESET)
+    return at
+
+
+@pytest.fixture(scope="module")
+def tables(products):
+    """Networks, estimates, fits and bounds of the uniform states, and their tables."""
+    at = products
+    data = ("--grid", at / "grid.h5", "--train", at / "train.h5", "--checkpoint", at / "c")
+    _run("train-dae", *data, "--out", at / "dae", *PRESET)
+    for name in CNNS:
+        given = ("--kind", name, "--states", at / f"{METHODS[name].states}.h5")
+        given += ("--dae", at / "dae") if METHODS[name].denoised else ()
+        _run("train-cnn", *given, "--checkpoint", at / "c", "--out", at / name, *PRESET)
+    networks = [w for n in ("dae", *CNNS) for w in (f"--{n.replace('_', '-')}", at / n)]
+    test = ("--set", "uniform", "--states", at / "uniform.h5")
+    model = ("--model", at / "model.h5")
+    times = ("--times", at / "estimates.csv")
+    _run("estimate", *test, *networks, "--out", at / "estimates.h5", *times, *PRESET)
+    _run("bound", *test, *model, "--out", at / "bound.h5", *PRESET)
+    given = ["--estimates", at / "estimates.h5", "--bound", at / "bound.h5"]
+    for level in ("0.002", "0.005"):
+        out = at / f"fit_{level}.h5"
+        chosen = ("--level", level, "--cnn", at / "noise_trained", "--out", out)
+        times = ("--times", out.with_suffix(".csv"))
+        _run("fit", *test, *model, *chosen, *times, *PRESET, "fit.iterations=1")
+        given += ["--fit", out]
+    out = ("--errors", at / "errors.csv", "--correlation", at / "correlation.csv")
+    _run("tables", "--states", at / "uniform.h5", *given, *out)
+    return at
+
+
+def test_sets_of_states(products):
+    grid, uniform, train = (
+        read_product(products / f"{name}.h5", "alignment_states")
+        for name in ("grid", "uniform", "train")
+    )
+    assert grid["stamps"].shape == (16, 9, 16, 16)
+    assert sorted(set(grid["states"].ravel())) == [-1, 1]
+    assert uniform["stamps"].shape == (12, 9, 16, 16)
+    assert train["stamps"].shape == (40, 9, 16, 16)
+    assert train["zernikes"].shape == (40, 9, 19)
+    assert np.abs(train["states"]).max() <= 1
+    assert not np.isin(uniform["states"], train["states"]).any()
+    for product in (grid, uniform, train):
+        assert product["stamps"].dtype == np.float32
+        assert product["stamps"].sum(axis=(2, 3)) == pytest.approx(1, abs=1e-5)
+        assert product["unit"] == pytest.approx([1e-3, 1e-3, *np.deg2rad([0.1, 0.1])])
+        assert product["noll"].tolist() == list(range(4, 23))
+        assert product.config["seed"] == 20200611
+
+
+def _states_config(*overrides):
+    return load_stage(states.stage.reads, (*PRESET, *overrides), "alignment")
+
+
+def test_model_and_rays_give_the_same_training_stamps(products, tmp_path):
+    states(_states_config(), "train", tmp_path / "traced.h5")
+    traced, modelled = (
+        read_product(path, "alignment_states")
+        for path in (tmp_path / "traced.h5", products / "train.h5")
+    )
+    assert (traced["states"] == modelled["states"]).all()
+    assert np.abs(traced["zernikes"] - modelled["zernikes"]).max() < 5e-4
+    assert modelled["stamps"] == pytest.approx(traced["stamps"], abs=1e-3)
+
+
+def test_key_figures(products):
+    table = pd.read_csv(products / "telescope.csv").set_index("quantity")
+    assert list(table.columns) == ["value", "unit"]
+    value = table["value"]
+    assert value["pixel"] == pytest.approx(7.27, abs=0.01)
+    assert value["lambda_over_d"] == pytest.approx(0.0825, abs=1e-4)
+    assert value["sensitivity_condition"] == pytest.approx(3.05, abs=0.02)
+    assert value["defocus_centre"] == pytest.approx(0.32, abs=0.01)
+    assert value["defocus_edge"] == pytest.approx(0.36, abs=0.01)
+    assert value["model_rms_greatest"] < 5e-4
+    assert value["energy_least_uniform"] > 0.99
+
+
+def test_same_configuration_gives_the_same_bytes(products, tmp_path):
+    states(_states_config("optics.threads=1"), "uniform", tmp_path / "again.h5")
+    one, two = (
+        read_product(path, "alignment_states")
+        for path in (tmp_path / "again.h5", products / "uniform.h5")
+    )
+    assert all((one[name] == two[name]).all() for name in one.arrays)
+    states(_states_config("seed=1"), "uniform", tmp_path / "other.h5")
+    other = read_product(tmp_path / "other.h5", "alignment_states")
+    assert not np.isin(other["states"], one["states"]).any()
+
+
+@pytest.mark.parametrize("preset", [p.stem for p in config_dir().glob("preset/*.yaml")])
+def test_every_preset_of_the_datasets_has_one_here(preset):
+    chosen = overrides_for("alignment", [f"preset={preset}"])
+    assert load(chosen, "alignment").alignment.field_points == 8
+
+
+def test_overrides_reach_the_roots_that_know_them():
+    given = ["preset=smoke", "noise.kappa=5", "train.lr=1e-3", "alignment.test_states=9"]
+    given += ["telescope=wfsat_literal", "trian.lr=1"]
+    assert overrides_for("alignment", given) == (
+        *("alignment_preset=smoke", "noise.kappa=5", "alignment.test_states=9", "trian.lr=1"),
+    )
+    assert overrides_for("config", given) == (
+        *("preset=smoke", "noise.kappa=5", "train.lr=1e-3", "telescope=wfsat_literal"),
+        "trian.lr=1",
+    )
+    with pytest.raises(ConfigError, match=r"trian\.lr"):
+        load(["trian.lr=1"], "alignment")
+
+
+def test_command_line_names_what_is_wrong(tmp_path):
+    arguments = ["alignment", "model", "--out", str(tmp_path / "x.h5")]
+    result = CliRunner().invoke(main, [*arguments, "alignment.field_radius_deg=0.8"])
+    assert result.exit_code == 2
+    assert "field (0.8, 0)°" in result.output
+    assert not (tmp_path / "x.h5").exists()
+
+
+def test_tables_hold_every_method(tables):
+    errors = pd.read_csv(tables / "errors.csv")
+    noisy = errors[errors.noise_level > 0]
+    cells = noisy.groupby(["noise_level", "method"]).size()
+    assert (cells == 8).all()
+    assert set(noisy.method) == set(METHODS) - {"cramer_rao_pooled"}
+    assert set(noisy.noise_level) == {0.002, 0.005}
+    clean = set(errors[errors.noise_level == 0].method)
+    assert clean == {"constant", *(method.name for method in LEARNED)}
+    correlation = pd.read_csv(tables / "correlation.csv")
+    assert len(correlation) == 16 * (2 * 7 + 4)
+    diagonal = correlation[correlation.parameter_a == correlation.parameter_b]
+    assert diagonal.correlation.to_numpy() == pytest.approx(1)
+
+
+def test_paper_s_rows_stand_beside_ours(tables):
+    given = ("--errors", tables / "errors.csv", "--correlation", tables / "correlation.csv")
+    _run("paper-tables", *given, "--out", tables / "paper")
+    table = pd.read_csv(tables / "paper" / "alignment_paper_0.005.csv")
+    paper = table[(table.source == "paper") & (table.quantity == "mean")].set_index("method")
+    assert paper.decenter_y.to_dict() == {"original": 0.802, "dae": 0.0262}
+    ours = table[(table.source == "psfdae") & (table.quantity == "variance")].set_index("method")
+    errors = pd.read_csv(tables / "errors.csv").query("noise_level == 0.005 and unit == 'range'")
+    own = errors.query("method == 'dae' and parameter == 'tilt_x'").variance_abs.item()
+    assert ours.tilt_x["dae"] == pytest.approx(own, rel=1e-4)
+    text = (tables / "paper" / "alignment_paper_correlation.md").read_text()
+    assert "| 0.379 " in text
+
+
+def test_time_table(tables):
+    given = [f"--history={n}={tables / n}/history.csv" for n in ("dae", *CNNS)]
+    given += [f"--times={tables / name}" for name in ("estimates.csv", "fit_0.002.csv")]
+    _run("time-table", *given, "--out", tables / "time.csv")
+    table = pd.read_csv(tables / "time.csv").set_index("method")
+    assert list(table.index) == [method.name for method in ESTIMATORS]
+    assert table.training_seconds["dae"] >= table.training_seconds["original"]
+    assert table.states["max_likelihood"] == 12
+
+
+@pytest.mark.parametrize("kind", ["predicted", "errors", "correlation", "stamps"])
+def test_figures(tables, kind):
+    fits = [f"--fit={tables / f'fit_{level}.h5'}" for level in ("0.002", "0.005")]
+    estimates = f"--estimates={tables / 'estimates.h5'}"
+    given = {
+        "predicted": [estimates, *fits],
+        "errors": [estimates, *fits, f"--bound={tables / 'bound.h5'}"],
+        "correlation": [f"--correlation={tables / 'correlation.csv'}"],
+        "stamps": [f"--states={tables / 'uniform.h5'}", f"--dae={tables / 'dae'}", *PRESET],
+    }[kind]
+    _run("figure", kind, *given, "--out", tables / f"{kind}.png")
+    assert (tables / f"{kind}.png").stat().st_size > 10_000
+
+
+def test_twin_is_closer_in_focus(tmp_path):
+    arguments = ["figure", "twin", "--table", tmp_path / "twin.csv", "--out", tmp_path / "twin.png"]
+    _run(*arguments)
+    table = pd.read_csv(tmp_path / "twin.csv")
+    near = table[np.isclose(table.position, -1) & np.isclose(table.noise_level, 0.002)]
+    chi2 = near.set_index("defocus_mm").chi2
+    assert chi2[0.2] > 10 * chi2[0.0]
+    own = table[np.isclose(table.position, 1)]
+    assert own.chi2.to_numpy() == pytest.approx(0, abs=1e-6)
+
+
+def test_dae_option_goes_with_its_kind(tmp_path):
+    arguments = ["alignment", "train-cnn", "--kind", "dae_retrained", "--states", "x.h5"]
+    result = CliRunner().invoke(
+        main, [*arguments, "--checkpoint", str(tmp_path / "c"), "--out", str(tmp_path / "o")]
+    )
+    assert result.exit_code == 2
+    assert "--dae goes with --kind dae_retrained" in result.output
