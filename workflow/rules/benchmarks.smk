@@ -82,7 +82,7 @@ TIMED = {
     "benchmark_inference": ("benchmark", "speed.inference", {}, 3000, 30, []),
     "benchmark_scaling": (
         *("benchmark", "speed.growth", {}, 2000, 30),
-        ["templates", "stars", "predict"],
+        ["stars", "predict"],
     ),
     "predict_throughput": (
         *("prediction", "prediction.throughput", {**STARS, "bundle": BUNDLE}),
@@ -94,7 +94,7 @@ TIMED = {
     ),
     "scaling_stages": (
         *("scaling", "plan.stages", {}, 4000, 60),
-        ["templates", "stars", "fit", "evaluate", "predict"],
+        ["stars", "fit", "evaluate", "predict"],
     ),
 }
 

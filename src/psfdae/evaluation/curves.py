@@ -9,7 +9,7 @@ import numpy as np
 
 from psfdae.estimators import Method, method, oracles_last, registered
 from psfdae.evaluation.figure_style import REFERENCES, SERIES_COLORS, new_figure, styled
-from psfdae.evaluation.figures import StripRow, draw_stamp
+from psfdae.evaluation.figures import StripRow, draw_cell
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -46,11 +46,7 @@ NAMED_POINT = 1
 def training_curves(histories: Mapping[str, pd.DataFrame], title: str) -> Figure:
     """Training and validation error of each network of a dataset.
 
-    Parameters
-    ----------
-    histories : mapping of label to DataFrame
-        Columns step, train_mse, validation_mse (NaN where there was none).
-    title : str
+    Histories by label: columns step, train_mse, validation_mse (NaN where there was none).
     """
     from matplotlib.lines import Line2D
 
@@ -90,14 +86,8 @@ def error_against_noise(
 ) -> Figure:
     """A metric of every method against the noise level, one panel per reference.
 
-    Parameters
-    ----------
-    metrics : DataFrame
-        Rows of the stage `evaluate`; those of other datasets are left out.
-    paper : DataFrame
-        `psfdae.evaluation.paper.published("psf")`; drawn where it has the dataset.
-    dataset, metric : str
-        For example `dataset3`, `mse`.
+    `metrics` are rows of the stage `evaluate`, those of other datasets are left out; `paper` is
+    `psfdae.evaluation.paper.published("psf")`, drawn where it has the dataset.
     """
     from matplotlib.lines import Line2D
 
@@ -178,13 +168,7 @@ def readable_log_axis(axes: Axes) -> None:
 def errors_above_bounds(efficiency: pd.DataFrame, bounds: pd.DataFrame, dataset: str) -> Figure:
     """MSE of every method against the noise level, with both bounds, one panel per reference.
 
-    Parameters
-    ----------
-    efficiency : DataFrame
-        Rows of the stage `efficiency`; those of other datasets are left out.
-    bounds : DataFrame
-        Rows of the stage `bounds`.
-    dataset : str
+    Tables of the stages `efficiency` and `bounds`; rows of other datasets are left out.
     """
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
@@ -227,11 +211,7 @@ def errors_above_bounds(efficiency: pd.DataFrame, bounds: pd.DataFrame, dataset:
 def efficiency_against_noise(efficiency: pd.DataFrame, dataset: str) -> Figure:
     """Bound over MSE of every method against the noise level, one panel per reference.
 
-    Parameters
-    ----------
-    efficiency : DataFrame
-        Rows of the stage `efficiency`; those of other datasets are left out.
-    dataset : str
+    A table of the stage `efficiency`; rows of other datasets are left out.
     """
     from matplotlib.lines import Line2D
 
@@ -268,11 +248,7 @@ def efficiency_against_noise(efficiency: pd.DataFrame, dataset: str) -> Figure:
 def bank_growth(growth: pd.DataFrame, dataset: str) -> Figure:
     """Error of the posterior mean against the size of the bank, one panel per reference.
 
-    Parameters
-    ----------
-    growth : DataFrame
-        Growth table of the stage `bounds`; rows of other datasets are left out.
-    dataset : str
+    The growth table of the stage `bounds`; rows of other datasets are left out.
     """
     from matplotlib.lines import Line2D
 
@@ -374,17 +350,10 @@ def headline(
     bounds: pd.DataFrame,
     titles: Sequence[str],
 ) -> Figure:
-    """Stars in rows at the left, MSE against the noise level at the right.
+    """Stars in rows at the left, MSE of methods against the noise level at the right.
 
-    Parameters
-    ----------
-    rows : sequence of StripRow
-        Stamps on the colour scale of the last row, the truth, unless `own_scale`.
-    methods : sequence of Method
-        Those of the lines.
-    efficiency, bounds : DataFrame
-        Rows of the stages `efficiency` and `bounds`, of one dataset and reference.
-    titles : (left, right)
+    Stamps are on the colour scale of the last row, the truth, unless `own_scale`. Tables of the
+    stages `efficiency` and `bounds` are of one dataset and reference; `titles` (left, right).
     """
     figure = new_figure(3.7)
     left, bottom, top = 0.115, 0.13, 0.86
@@ -392,14 +361,9 @@ def headline(
     step, tall = 0.395 / columns, (top - bottom) / len(rows)
     peak = rows[-1].images.max(axis=(1, 2))
     for number, row in enumerate(rows):
-        scale = row.images.max(axis=(1, 2)) if row.own_scale else peak
-        for i, image in enumerate(row.images):
-            lower = top - (number + 1) * tall
-            axes = figure.add_axes((left + i * step, lower, 0.96 * step, 0.96 * tall))
-            axes.set(xticks=[], yticks=[])
-            draw_stamp(axes, image, scale[i])
-            if i == 0:
-                axes.set_ylabel(row.label, rotation=0, ha="right", va="center", labelpad=5)
+        lower = top - (number + 1) * tall
+        for i in range(columns):
+            draw_cell(figure, (left + i * step, lower, 0.96 * step, 0.96 * tall), row, i, peak)
     figure.text(left + 0.5 * columns * step, 0.92, titles[0], ha="center", fontsize=10)
     panel = figure.add_axes((0.66, bottom, 0.325, top - bottom))
     _errors(panel, methods, efficiency, bounds)

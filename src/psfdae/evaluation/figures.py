@@ -147,17 +147,9 @@ def spread_stars(position: np.ndarray, count: int) -> np.ndarray:
 
 @styled
 def template_map(psf: np.ndarray, grid: np.ndarray, field: np.ndarray, title: str) -> Figure:
-    """All templates at their field positions, as one mosaic.
+    """All templates (F, d, d) at their field positions, as one mosaic.
 
-    Parameters
-    ----------
-    psf : ndarray, shape (F, d, d)
-        Stamps, [row, column] with y along the rows.
-    grid : ndarray of int, shape (F, 2)
-        Grid index (ix, iy).
-    field : ndarray, shape (F, 2)
-        Field angle (x, y) in radians.
-    title : str
+    `grid` holds grid indices (ix, iy), `field` angles (x, y) in radians, both of shape (F, 2).
     """
     figure = new_figure(7.1, layout="constrained")
     axes = figure.add_subplot()
@@ -174,18 +166,9 @@ def template_map(psf: np.ndarray, grid: np.ndarray, field: np.ndarray, title: st
 def stamp_energy_map(
     energy: np.ndarray, grid: np.ndarray, field: np.ndarray, stamp_px: int
 ) -> Figure:
-    """Fraction of a star's light that its stamp holds, over the field.
+    """Fraction of a star's light that its stamp holds, 0 … 1, shape (F,), over the field.
 
-    Parameters
-    ----------
-    energy : ndarray, shape (F,)
-        Fraction of the light through the pupil, 0 … 1.
-    grid : ndarray of int, shape (F, 2)
-        Grid index (ix, iy).
-    field : ndarray, shape (F, 2)
-        Field angle (x, y) in radians.
-    stamp_px : int
-        Side of the stamp, for the title.
+    `grid` and `field` as for `template_map`.
     """
     figure = new_figure(7.1, layout="constrained")
     axes = figure.add_subplot()
@@ -207,14 +190,7 @@ def field_of_psfs(fields: FieldOfPsfs, name: str, pixel_scale_arcsec: float) -> 
     """Mosaic of all stamps; beside it maps of the light in the stamp and of the FWHM.
 
     Whiskers in the map of the FWHM show the direction of the longer axis, their
-    length the ellipticity.
-
-    Parameters
-    ----------
-    fields : FieldOfPsfs
-    name : str
-        The telescope, for the title.
-    pixel_scale_arcsec : float
+    length the ellipticity. `name` is the telescope's.
     """
     figure = new_figure(5.3, layout="constrained")
     grid = figure.add_gridspec(2, 2, width_ratios=(2.1, 1.0))
@@ -260,18 +236,10 @@ def _small_map(axes: Axes, fields: FieldOfPsfs, values: np.ndarray, cmap: str, t
 
 @styled
 def restoration_strip(rows: Sequence[StripRow], columns: Sequence[str], title: str) -> Figure:
-    """Stars before and after restoration, as in the paper.
+    """Stars before and after restoration, as in the paper; the first row is the reference.
 
     All stamps of a column share the colour scale 0 … maximum of the first row,
-    on a square-root scale, except rows with `own_scale`.
-
-    Parameters
-    ----------
-    rows : sequence of StripRow
-        The first one is the reference.
-    columns : sequence of str
-        Heading of each star.
-    title : str
+    on a square-root scale, except rows with `own_scale`. `columns` are headings of the stars.
     """
     left, right, top, bottom, cell, text = 1.0, 0.1, 0.85, 0.35, 0.86, 0.17
     height = top + bottom + len(rows) * cell + text * sum(row.mse is not None for row in rows)
@@ -282,18 +250,14 @@ def restoration_strip(rows: Sequence[StripRow], columns: Sequence[str], title: s
     peak = rows[0].images.max(axis=(1, 2))
     for number, row in enumerate(rows):
         y -= cell
-        scale = row.images.max(axis=(1, 2)) if row.own_scale else peak
-        for i, image in enumerate(row.images):
+        for i in range(len(row.images)):
             box = ((left + i * step) / width, y / height, 0.97 * step / width, 0.97 * cell / height)
-            axes = figure.add_axes(box, xticks=[], yticks=[])
-            draw_stamp(axes, image, scale[i])
+            axes = draw_cell(figure, box, row, i, peak)
             if number == 0:
                 axes.set_title(columns[i], fontsize=8, pad=3)
             if row.mse is not None:
                 number_text = f"{1e6 * row.mse[i]:#.3g}".rstrip(".")
                 axes.set_xlabel(number_text, fontsize=8, labelpad=1.5)
-            if i == 0:
-                axes.set_ylabel(row.label, rotation=0, ha="right", va="center", labelpad=5)
         y -= text if row.mse is not None else 0.0
     figure.suptitle(title, y=1.0 - 0.12 / height, va="top")
     figure.text(
@@ -308,12 +272,24 @@ def restoration_strip(rows: Sequence[StripRow], columns: Sequence[str], title: s
     return figure
 
 
-def draw_stamp(axes: Axes, image: np.ndarray, scale: float) -> Any:
-    """A stamp on a square-root scale that ends at `scale`."""
-    shown = np.sqrt(np.clip(image / scale, 0.0, 1.0))
-    return axes.imshow(
-        shown, origin="lower", cmap=STAMP_MAP, vmin=0.0, vmax=1.0, interpolation="nearest"
+def draw_cell(
+    figure: Figure, box: tuple[float, ...], row: StripRow, column: int, peak: np.ndarray
+) -> Axes:
+    """A stamp of a row on a square-root scale up to `peak`, (n,); the first one has the label."""
+    image = row.images[column]
+    scale = image.max() if row.own_scale else peak[column]
+    axes = figure.add_axes(box, xticks=[], yticks=[])
+    axes.imshow(
+        np.sqrt(np.clip(image / scale, 0.0, 1.0)),
+        origin="lower",
+        cmap=STAMP_MAP,
+        vmin=0.0,
+        vmax=1.0,
+        interpolation="nearest",
     )
+    if column == 0:
+        axes.set_ylabel(row.label, rotation=0, ha="right", va="center", labelpad=5)
+    return axes
 
 
 def _draw_psfs(axes: Axes, psf: np.ndarray, grid: np.ndarray, field: np.ndarray) -> Any:

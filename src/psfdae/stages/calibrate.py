@@ -114,17 +114,23 @@ def calibrate(
     columns = pd.DataFrame(
         [_column(row, products[row.dataset], config) for row in original_noise_rows().itertuples()]
     )
-    by_r0 = {r0: _fit_at(scan_table, r0) for r0 in sorted(scan_table.r0_m.dropna().unique())}
+    scanned = scan_table.r0_m
+    by_r0 = {
+        r0: fit_scales(scan_table[scanned.isna() | (scanned == r0)])
+        for r0 in sorted(scanned.dropna().unique())
+    }
     fit = by_r0[min(by_r0, key=lambda r0: abs(r0 - configured["r0_m"]))]
     # Least squares of log MSE: every column counts alike.
-    kappa = float(np.exp(np.log(columns.kappa[columns.fitted]).mean()))
+    used = columns[columns.fitted]
+    kappa = float(np.exp(np.log(used.kappa).mean()))
+    rms = float(np.sqrt(((used.ssim_at_published_mse - used.ssim_paper) ** 2).mean()))
     table = [
         ("kappa", kappa, config.noise.kappa, "1"),
         ("data_range", fit.data_range, config.evaluation.data_range, "1"),
         ("pixel_scale_scene1", fit.pixel_scale["scene1"], configured["scene1"], "arcsec"),
         ("pixel_scale_scene2", fit.pixel_scale["scene2"], configured["scene2"], "arcsec"),
         ("r0_scene2", min(by_r0, key=lambda r0: by_r0[r0].rms), configured["r0_m"], "m"),
-        ("ssim_residual_rms", fit.rms, _configured_rms(columns), "1"),
+        ("ssim_residual_rms", fit.rms, rms, "1"),
     ]
     degeneracy = [
         (r0, other.pixel_scale["scene2"], other.data_range, other.rms)
@@ -140,16 +146,6 @@ def calibrate(
     }
     for name, frame in frames.items():
         write_csv(out / name, frame, 6)
-
-
-def _configured_rms(columns) -> float:  # type: ignore[no-untyped-def]
-    """RMS of the SSIM residuals of the fitted columns with the configured values."""
-    used = columns[columns.fitted]
-    return float(np.sqrt(((used.ssim_at_published_mse - used.ssim_paper) ** 2).mean()))
-
-
-def _fit_at(scan_table, r0: float):  # type: ignore[no-untyped-def]
-    return fit_scales(scan_table[scan_table.r0_m.isna() | (scan_table.r0_m == r0)])
 
 
 def _configured(stars: dict[str, Path]) -> dict[str, float]:
@@ -175,15 +171,15 @@ def _column(row: Any, path: Path, config: Config) -> dict[str, Any]:
     noise = NoiseModel(config.noise.kappa, background)
     ours = noise.draw(images, row.noise_level, rng)
     matched = _at_published_mse(images, row.mse, row.noise_level, config)
-    data_range = config.evaluation.data_range
+    data_range, error = config.evaluation.data_range, mse(ours, images).mean()
     return {
         "dataset": row.dataset,
         "noise_level": row.noise_level,
         "fitted": row.fitted,
         "kappa": float(kappa_of_mse(row.mse, row.noise_level, images[0].size, background)),
         "mse_paper": row.mse,
-        "mse": mse(ours, images).mean(),
-        "mse_ratio": mse(ours, images).mean() / row.mse,
+        "mse": error,
+        "mse_ratio": error / row.mse,
         "ssim_paper": row.ssim,
         "ssim_at_published_mse": ssim(matched, images, data_range).mean(),
         "ssim_at_kappa": ssim(ours, images, data_range).mean(),

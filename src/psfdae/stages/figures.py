@@ -43,9 +43,7 @@ def figure_templates(templates: Templates, out: Png) -> None:
     from psfdae.evaluation.figures import template_map
 
     product = read_product(templates, "templates", ("psf", "grid", "field"))
-    margin = product.config["framing"]["jitter_px"]
-    side = product["psf"].shape[-1] - margin
-    psf = product["psf"][:, margin:side, margin:side]
+    psf = without_margin(product)
     title = (
         f"Static PSFs of scene {product.config['scene']['name']}: {len(psf)} field points, "
         f"stamps of {psf.shape[-1]} × {psf.shape[-1]} px"
@@ -175,6 +173,13 @@ def write_png(figure: Figure, out: Path) -> None:
         figure.savefig(temporary, format="png", dpi=DPI, metadata={"Software": None})
 
 
+def without_margin(templates: Product) -> np.ndarray:
+    """Static PSFs as they look in the middle of a stamp, shape (F, d, d)."""
+    margin = templates.config["framing"]["jitter_px"]
+    side = templates["psf"].shape[-1] - margin
+    return templates["psf"][:, margin:side, margin:side]
+
+
 def field_of(stars: Product) -> np.ndarray:
     """Field angle (x, y) of every field point in radians, shape (F, 2)."""
     from psfdae.stars.fields import square_grid
@@ -194,12 +199,7 @@ def strip_rows(
 ) -> list[StripRow]:
     """Rows of a restoration strip: the reference, then the methods by noise level.
 
-    Parameters
-    ----------
-    config : stage config of `evaluate`
-    product : product "stars"
-    test, picks : test stars, and those of them that are shown
-    reference, methods, levels : what is drawn
+    `config` is that of the stage `evaluate`; `test` are the test stars, `picks` those shown.
     """
     from psfdae.evaluation.figures import StripRow
     from psfdae.evaluation.metrics import mse

@@ -166,7 +166,8 @@ def matrix_product_speed(size: int = 1024, repeats: int = 5) -> float:
 def _busy_seconds(benchmarks: Path) -> float:
     """Wall time during which at least one job ran; a later visit adds its own time only."""
     files = benchmarks.rglob("*.tsv")
-    spans = sorted((p.stat().st_mtime - _seconds(p), p.stat().st_mtime) for p in files)
+    ends = ((p.stat().st_mtime, np.nan_to_num(_cost(p, "s")[0])) for p in files)
+    spans = sorted((end - float(seconds), end) for end, seconds in ends)
     busy, until = 0.0, float("-inf")
     for start, end in spans:
         busy += max(0.0, end - max(start, until))
@@ -199,7 +200,3 @@ def _test_seconds(report: Path) -> float | None:
         print(f"{report}: damaged ({error}); left out", file=sys.stderr, flush=True)
         return None
     return None if suite is None else round(float(suite.get("time", "nan")), 1)
-
-
-def _seconds(benchmark: Path) -> float:
-    return float(np.nan_to_num(_cost(benchmark, "s")[0]))

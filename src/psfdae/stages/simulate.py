@@ -1,4 +1,4 @@
-"""Stage `simulate`: what a telescope does to a star, everywhere in its field."""
+"""Stages `simulate`, `figure telescope`: what a telescope does to a star, all over its field."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from psfdae.cli import File, Folder, command
 from psfdae.configuration.schema import Config
 from psfdae.configuration.stages import STATIC
 from psfdae.evaluation.figures import FieldOfPsfs, field_of_psfs
-from psfdae.files import Product, atomic_path, read_product, write_fits, write_text
+from psfdae.files import Product, atomic_path, read_product, write_csv, write_fits
 from psfdae.own_stars.example import add_stamps, write_field
 from psfdae.own_stars.photometry import noise_equivalent_px
 from psfdae.own_stars.shapes import measure_shapes
 from psfdae.rng import stream
 from psfdae.stages.common import template_wavefronts
-from psfdae.stages.figures import write_png
+from psfdae.stages.figures import without_margin, write_png
 from psfdae.stages.stars import templates
 from psfdae.stars.framing import normalise_flux
 
@@ -35,6 +35,12 @@ LARGEST = 4
 
 LEAST_FWHM_PX = 1.5
 """A narrower PSF looks different in every place of a pixel."""
+
+SKY = 1000.0
+"""Photons per pixel of the sky."""
+
+MARGIN_PX = 8
+"""Sky between stamps."""
 
 
 class FitError(ValueError):
@@ -98,17 +104,27 @@ def figure_telescope(
     out: Annotated[File, "PNG."],
 ) -> None:
     """Draw the static PSFs of a telescope with their light and their width."""
+    import pandas as pd
+
     product = read_product(templates, "templates")
     fields, telescope = measure_fields(product), product.config["telescope"]
-    write_text(table, _table(fields, product["pupil_samples"]))
+    x, y = np.rad2deg(fields.field).T
+    columns = {
+        "x_deg": x,
+        "y_deg": y,
+        "energy": fields.energy,
+        "fwhm_arcsec": fields.fwhm_arcsec,
+        "ellipticity": fields.ellipticity,
+        "position_angle_deg": fields.position_angle_deg,
+        "pupil_samples": product["pupil_samples"],
+    }
+    write_csv(table, pd.DataFrame(columns), 6)
     write_png(field_of_psfs(fields, telescope["name"], telescope["pixel_scale_arcsec"]), out)
 
 
 def measure_fields(product: Product) -> FieldOfPsfs:
     """Stamps of the product "templates" without their margin, and their shapes."""
-    margin = product.config["framing"]["jitter_px"]
-    side = product["psf"].shape[-1] - margin
-    psf = product["psf"][:, margin:side, margin:side]
+    psf = without_margin(product)
     shapes = measure_shapes(psf)
     return FieldOfPsfs(
         psf,
@@ -174,31 +190,6 @@ def _sampling(config: Config, fields: FieldOfPsfs) -> list[str]:
         f"the PSFs are {width:.2f} px wide (median FWHM, the pixel included): undersampled, what "
         "a star looks like depends on its place in the pixel more than on the optics"
     ]
-
-
-def _table(fields: FieldOfPsfs, pupil_samples: np.ndarray) -> str:
-    """CSV of the field points."""
-    x, y = np.rad2deg(fields.field).T
-    columns = {
-        "x_deg": x,
-        "y_deg": y,
-        "energy": fields.energy,
-        "fwhm_arcsec": fields.fwhm_arcsec,
-        "ellipticity": fields.ellipticity,
-        "position_angle_deg": fields.position_angle_deg,
-        "pupil_samples": pupil_samples,
-    }
-    rows = (
-        ",".join(f"{value:.6g}" for value in row) for row in zip(*columns.values(), strict=True)
-    )
-    return "\n".join([",".join(columns), *rows]) + "\n"
-
-
-SKY = 1000.0
-"""Photons per pixel of the sky."""
-
-MARGIN_PX = 8
-"""Sky between stamps."""
 
 
 def write_psfs(config: Any, fields: FieldOfPsfs, path: Path) -> None:
