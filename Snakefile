@@ -30,7 +30,6 @@ include: "workflow/rules/tracking.smk"
 include: "workflow/rules/bounds.smk"
 include: "workflow/rules/stability.smk"
 include: "workflow/rules/benchmarks.smk"
-include: "workflow/rules/knee.smk"
 include: "workflow/rules/sweep.smk"
 include: "workflow/rules/record.smk"
 

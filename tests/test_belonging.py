@@ -9,7 +9,6 @@ import pytest
 import yaml
 from click.testing import CliRunner
 
-import baseline
 import prediction
 import trainings
 from psfdae.belonging import STARS, STATIC, require
@@ -189,7 +188,7 @@ def test_calibration_needs_one_telescope_for_the_stars_of_a_scene(at):
 @pytest.mark.parametrize(
     "words",
     [
-        [baseline.baseline, "--stars", "s2.h5"],
+        [trainings.baseline, "--stars", "s2.h5"],
         [prediction.throughput, "--stars", "s2.h5", "--bundle", "none"],
     ],
     ids=lambda words: str(words[0]),

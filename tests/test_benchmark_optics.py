@@ -10,9 +10,8 @@ import pytest
 
 import choice
 import figures
-import kernel
-import peers
 import propagation
+import propagators
 import savings
 import scenes
 from psfdae.configuration.compose import load_stage
@@ -57,7 +56,8 @@ def test_peers_converge_to_our_stamp_with_their_subsamples(case, method):
     """Same orientation, same place, and an error that falls as 1/subsamples²."""
 
     def error(subsamples):
-        _, propagate = peers.build(case, peers.Peer(method, case.samples, subsamples), threads=1)
+        setting = propagators.Setting(method, case.samples, subsamples)
+        _, propagate = propagators.build(case, setting)
         return scenes.relative_to_peak(propagate(), case.truth)
 
     coarse, fine = error(4), error(8)
@@ -68,7 +68,7 @@ def test_peers_converge_to_our_stamp_with_their_subsamples(case, method):
 @pytest.mark.parametrize("pixel", [0.88148, 1.58667])
 @pytest.mark.parametrize(("subsamples", "multiple"), [(2, 2), (4, 4), (8, 16)])
 def test_padded_grid_hits_the_pixels(pixel, subsamples, multiple):
-    samples, padded = peers.commensurate_grid(222, pixel, subsamples, multiple)
+    samples, padded = propagators.commensurate_grid(222, pixel, subsamples, multiple)
     assert 222 <= samples <= 1.3 * 222 + 2
     assert padded % multiple == samples % 2 == 0
     assert samples / padded * subsamples == pytest.approx(pixel, rel=2e-4)
@@ -100,26 +100,22 @@ def test_configured_settings_stay_within_the_budget_and_two_nodes_fewer_are_refu
 
 
 @pytest.mark.parametrize(
-    ("time", "error", "chosen"),
+    ("time", "error", "cheapest"),
     [
-        ([3.0, 1.0, 2.0], [0.1, 9.0, 0.5], 2),  # the cheapest is not good enough
-        ([3.0, 1.0, 2.0], [0.1, 1.0, 0.5], 1),  # on the budget is within it
-        ([np.nan, 3.0], [0.1, 0.1], 1),  # what was not timed cannot be chosen
-        ([2.0, 2.0], [0.5, 0.1], 0),
-        ([1.0], [2.0], None),
+        ([1.0, 1.01, 0.1], [0.5, 0.9, 9.0], [1]),  # the configured one of equal times
+        ([1.0, 1.05, 0.1], [0.5, 0.9, 9.0], [0]),  # the cheapest is not good enough
+        ([3.0, 2.0, 1.0], [0.1, 0.5, 1.0], [2]),  # on the budget is within it
+        ([np.nan, np.nan, 3.0], [0.1, 0.1, 0.1], [2]),  # what was not timed cannot be chosen
+        ([2.0, 5.0, 2.0], [0.5, 0.1, 0.1], [0]),
+        ([1.0, 1.0, 1.0], [2.0, 2.0, 2.0], []),
     ],
 )
-def test_cheapest_within_budget(time, error, chosen):
-    assert choice.cheapest_within(np.array(time), np.array(error), 1.0) == chosen
-
-
-@pytest.mark.parametrize(("time", "cheapest"), [(1.01, 1), (1.05, 0)])
-def test_configured_setting_stays_among_equal_times(time, cheapest):
-    rows = {"time_ms": [1.0, time, 0.1], "mse": [0.5, 0.9, 9.0], "configured": ["no", "yes", "no"]}
+def test_cheapest_within_budget(time, error, cheapest):
+    rows = {"time_ms": time, "mse": error, "configured": ["no", "yes", "no"]}
     blank = {name: 0 for name in "abcdefgh"}
     table = choice.mark_cheapest(pd.DataFrame({**rows, **blank}), 1.0)
-    assert table.index[table.cheapest == "yes"].tolist() == [cheapest]
-    assert set(table.config_is_cheapest) == {"yes" if cheapest == 1 else "no"}
+    assert table.index[table.cheapest == "yes"].tolist() == cheapest
+    assert set(table.config_is_cheapest) == {"yes" if cheapest == [1] else "no"}
 
 
 def test_first_lasting_value_ignores_lucky_coarse_grids():
@@ -153,7 +149,7 @@ TABLE = [
 
 
 def test_peers_are_compared_at_equal_error_in_one_process():
-    found = peers.compare(rows_of(TABLE))
+    found = propagators.compare(rows_of(TABLE))
     assert found.method.tolist() == ["poppy_mft"]  # nothing of ours is as good as the other
     assert found.kernel_time_ms.tolist() == [0.3]  # same threads and backend, no larger error
     assert found.speedup.tolist() == pytest.approx([30.0])
@@ -161,9 +157,9 @@ def test_peers_are_compared_at_equal_error_in_one_process():
 
 
 def test_pareto_front_and_setting_in_use_are_marked():
-    setting = kernel.Setting(94, 2, "complex64", "numpy", 2, 1)
+    setting = propagators.Setting("kernel", 94, 2, "complex64", "numpy", 2, 1)
     used = {"mild": setting, "strong": replace(setting, batch=16)}
-    table = kernel.finish(rows_of(TABLE).to_dict("records"), used)
+    table = propagators.finish(rows_of(TABLE).to_dict("records"), used)
     assert table.index[table.used == "yes"].tolist() == [1, 4]
     assert table.index[table.pareto == "yes"].tolist() == [3, 4, 6]
 
@@ -181,37 +177,34 @@ def test_zernike_fit_is_exact_and_piston_does_not_matter(case):
     assert scenes.relative_to_peak(stamps, others) < 1e-12
 
 
-def test_times_are_those_of_one_stamp(case, monkeypatch):
-    """A run of 5 batches of 8 stamps that takes 80 ms: 2 ms per stamp."""
-    timed = np.array([[0.08, 0.04, 0.16, 0.08, 0.08]])
-    monkeypatch.setattr(kernel, "time_in_rounds", lambda builders, repeats: timed)
-    setting = kernel.Setting(126, 4, "complex64", "numpy", 2, 8)
-    trial = kernel.Trial(case, "kernel", setting, case.truth, None, batches=5)
-    (row,) = kernel.time_trials([trial], repeats=5)
-    assert [row[f"time_ms{end}"] for end in ("", "_low", "_high")] == pytest.approx([2, 2, 2])
-    assert (row["repeats"], row["mse"], row["within_budget"]) == (5, 0.0, "yes")
-
-
-def test_a_timing_runs_as_much_as_its_time_is_divided_by(case, monkeypatch):
-    """Batches of the kernel beside each other, stamps of a peer."""
+def test_times_are_those_of_one_stamp_of_all_that_ran(case, monkeypatch):
+    """Batches of the kernel beside each other, stamps of a peer; each run takes 80 ms."""
     ran = []
-    monkeypatch.setattr(
-        kernel, "side_by_side", lambda _, batches, threads: ran.append((len(batches), threads))
-    )
-    rest = ("complex64", "numpy")
-    settings = [kernel.Setting(62, 4, *rest, t, batch) for t, batch in ((1, 8), (2, 8), (2, 64))]
-    trials = kernel.kernel_trials([case], [settings], stamps=64)
-    for trial in trials:
-        trial.build()()
-    assert [trial.batches for trial in trials] == [8, 8, 2]
-    assert ran[1::2] == [(8, 1), (8, 2), (2, 2)]  # after the warm-up of each
-    monkeypatch.setattr(peers, "build", lambda *_: (62, lambda: ran.append(1) or case.truth))
-    chosen = [peers.Peer("poppy_mft", 62, 2), peers.Peer("poppy_fresnel", 62, 2)]
-    for trial, stamps in zip(peers.peer_trials([case], [chosen], 1, 5), (5, 1), strict=True):
-        run = trial.build()
+
+    def rounds(builders, repeats):
+        runs = [build() for build in builders]
         ran.clear()
-        run()
-        assert len(ran) == trial.batches == stamps
+        for run in runs:
+            run()
+        return np.tile([0.08, 0.04, 0.16, 0.08, 0.08], (len(runs), 1))
+
+    def beside(work, batches, threads):
+        ran.append((len(batches), threads))
+
+    monkeypatch.setattr(propagators, "time_in_rounds", rounds)
+    monkeypatch.setattr(propagators, "side_by_side", beside)
+    rest = ("complex64", "numpy")
+    sizes = ((1, 8), (2, 8), (2, 64))
+    chosen = [propagators.Setting("kernel", 62, 4, *rest, *size) for size in sizes]
+    chosen.append(propagators.Setting("fft", 62, 2, *rest, threads=2))
+    # Nobody looks at these images.
+    case = replace(case, source=seidel_wavefronts(0.1 * COMATIC[None], FIELD[None]))
+    rows = propagators.time_settings([(case, setting) for setting in chosen], 5, 16)
+    assert ran == [(8, 1), (8, 2), (2, 2), (1, 1)]
+    stamps = [64, 64, 128, 1]
+    for end in ("", "_low", "_high"):
+        times = [row[f"time_ms{end}"] for row in rows]
+        assert times == pytest.approx([80 / n for n in stamps])
 
 
 @pytest.fixture(scope="module")

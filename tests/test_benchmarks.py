@@ -8,11 +8,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-import baseline
 import figures
 import measure
-import plan
-import poppy_stars
 import prediction
 import speed
 import trainings
@@ -31,6 +28,16 @@ def columns(name):
 
 
 # Measuring
+
+
+def test_rounds_take_turns():
+    events = []
+
+    def builder(name):
+        return lambda: events.append(f"build {name}") or (lambda: events.append(name))
+
+    assert measure.time_in_rounds([builder("a"), builder("b")], repeats=2).shape == (2, 2)
+    assert events == ["build a", "a", "build b", "b"] * 2
 
 
 def test_a_process_of_its_own_has_its_own_threads(monkeypatch):
@@ -65,18 +72,18 @@ def test_engines_run_apart_and_fill_the_table(tmp_path):
 
 
 def test_grid_has_the_point_in_use_first_and_respects_the_limit():
-    grid = baseline.grid_around((20, 11, 11, 10), 256)
+    grid = trainings.grid_around((20, 11, 11, 10), 256)
     assert grid[0] == (20, 11, 11, 10)
     assert len(set(grid)) == len(grid)
     assert {(40, 11, 11, 10), (20, 15, 15, 10), (20, 11, 11, 50)} <= set(grid)
-    assert max(k for k, *_ in baseline.grid_around((8, 4, 4, 2), 10)) == 10
+    assert max(k for k, *_ in trainings.grid_around((8, 4, 4, 2), 10)) == 10
 
 
 def test_baseline_point_reports_the_error_of_its_predictions(gaussian_stars):
     fit = {"components": 4, "rows": 3, "columns": 3, "epochs": 2}
     fit |= {"sigma": 1.0, "learning_rate": 0.5, "seed": 1}
     truths = {"realisation": gaussian_stars, "template": 0 * gaussian_stars}
-    point = baseline.time_point(gaussian_stars, [gaussian_stars], truths, fit, 2)
+    point = trainings.time_point(gaussian_stars, [gaussian_stars], truths, fit, 2)
     assert 0 < point["mse_realisation"] < (gaussian_stars**2).mean() < 2 * point["mse_template"]
 
 
@@ -103,14 +110,27 @@ def test_costs_of_the_plan_have_a_fixed_part_and_one_per_star_that_are_not_negat
         for stage in ("simulate", "train")
         for n in (1e2, 1e3, 1e4)
     ]
-    first, second = plan.planned(rows)
+    first, second = speed.planned(rows)
     assert (first["stage"], second["stage"], first["stars"]) == ("simulate", "train", 1e9)
     assert (first["time_s"], first["disk_mb"]) == pytest.approx((2e6 + 3, 1e6))
     assert first["cpu_s"] > 1e9  # no fixed part below zero
     assert 0 < first["peak_mb"] < 9  # nor a part per star
 
 
+@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="CPUs cannot be chosen here")
+def test_the_plan_is_measured_on_one_cpu():
+    before = os.sched_getaffinity(0)
+    with speed.one_cpu():
+        assert len(os.sched_getaffinity(0)) == 1
+    assert os.sched_getaffinity(0) == before
+
+
 # Trainings
+
+
+def test_front_holds_what_nothing_beats():
+    time, error = np.array([4.0, 1.0, 2.0, 3.0, 4.0]), np.array([0.5, 1.0, 0.6, 0.7, 0.4])
+    assert measure.pareto(time, error).tolist() == [1, 2, 4]
 
 
 @pytest.mark.parametrize(
@@ -144,8 +164,8 @@ def test_poppy_simulates_the_same_stars():
     config = load_stage(prediction.READS, ["dataset=dataset3"])
     telescope, framing = config.telescope, config.framing
     seidel, field = config.wavefront.coefficients * 1.1, np.array([0.6, -0.4])
-    image = poppy_stars.poppy_telescope(telescope, 66)(seidel, field)
-    stamp = poppy_stars.framed(image, np.array([1, -1]), framing, 24)
+    image = prediction.poppy_telescope(telescope, 66)(seidel, field)
+    stamp = prediction.framed(image, np.array([1, -1]), framing, 24)
     source = seidel_wavefronts(seidel[None], field[None])
     ours = Propagation(source, telescope, config.optics, framing, 24)
     expected = normalise_flux(ours.framed(16, np.array([[1, -1]]))[0])[0]
@@ -175,9 +195,10 @@ def test_poppy_table(tmp_path, monkeypatch, field_psfs):
 # Figures and targets
 
 
-@pytest.mark.parametrize("kind", ["training", "baseline", "inference", "scaling"])
+@pytest.mark.parametrize("kind", ["training", "baseline", "inference", "scaling", "graded"])
 def test_figures_are_drawn_from_the_tables_of_the_record(kind, tmp_path):
-    figures.draw(kind, RECORD / f"benchmark_{kind}.csv", tmp_path / "drawn.png")
+    table = "stability_graded" if kind == "graded" else f"benchmark_{kind}"
+    figures.draw(kind, RECORD / f"{table}.csv", tmp_path / "drawn.png")
     assert (tmp_path / "drawn.png").stat().st_size > 10_000
 
 

@@ -6,8 +6,8 @@ from itertools import product
 
 import numpy as np
 
-from kernel import PRECISIONS, candidate_nodes, candidate_samples
 from measure import yes
+from propagators import PRECISIONS, candidate_nodes, candidate_samples
 from psfdae.optics.pupil import SamplingError, choose_samples, required_nodes
 from psfdae.stars.framing import normalise_flux
 from scenes import Selection, spread_evenly, stamp_mse, stamps_at
@@ -119,12 +119,6 @@ def ladders(optics, grids):
     return list(dict.fromkeys(found))
 
 
-def cheapest_within(time, error, budget):
-    """Index of the least known time whose error is within the budget; of equal times the first."""
-    allowed = np.flatnonzero((error <= budget) & np.isfinite(time))
-    return None if allowed.size == 0 else int(allowed[np.argmin(time[allowed])])
-
-
 def choose(scene, sample, time_ms):
     """Worst error and mean time of every candidate, the cheapest one and the configured one.
 
@@ -156,14 +150,12 @@ def choose(scene, sample, time_ms):
 
 def mark_cheapest(table, budget):
     """Times within `SAME_TIME` are equal; among equal candidates the configured one stays."""
-    best = cheapest_within(table["time_ms"].to_numpy(), table["mse"].to_numpy(), budget)
-    good = (table["configured"] == "yes") & (table["mse"] <= budget)
-    for configured in table.index[good]:
-        if table.loc[configured, "time_ms"] <= (1.0 + SAME_TIME) * table.loc[best, "time_ms"]:
-            best = int(configured)
-    table.insert(10, "cheapest", [yes(i == best) for i in range(len(table))])
-    agrees = best is not None and table.loc[best, "configured"] == "yes"
-    return table.assign(config_is_cheapest=yes(agrees))
+    timed = table[(table["mse"] <= budget) & table["time_ms"].notna()]
+    equal = timed[timed["time_ms"] <= (1.0 + SAME_TIME) * timed["time_ms"].min()]
+    configured = equal.index[equal["configured"] == "yes"].tolist()
+    best = configured or timed.nsmallest(1, "time_ms").index.tolist()
+    table.insert(10, "cheapest", np.where(table.index.isin(best), "yes", "no"))
+    return table.assign(config_is_cheapest=yes(configured))
 
 
 def guard_or_budget(scene, sample):

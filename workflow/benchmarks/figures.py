@@ -1,4 +1,4 @@
-"""Figures of the benchmarks, each from its table."""
+"""Figures of the benchmarks and of the stress tests, each from its table."""
 
 from typing import Annotated, Literal
 
@@ -28,11 +28,36 @@ COSTS = {"time_s": "time (s)", "peak_mb": "peak memory (MB)", "disk_mb": "disk (
 SIZES = {"components": "components K", "rows": "side of the map", "epochs": "epochs"}
 LOGS = {"xscale": "log", "yscale": "log"}
 USED = {"marker": "*", "ms": 15, "mfc": "#f0e442", "mec": "black", "ls": "", "zorder": 5}
+MSE, FLUX = "MSE of normalised stamps", "relative error of the flux, RMS"
+HOT = "excess of the pixel over the star's flux"
+# Title, x and y axes, place of the legend.
+STRESS = (
+    ("Stronger wavefronts", "factor on the aberrations, or on 1/r0", MSE, "center right"),
+    ("Other pixel scales (scene 1)", "pixel scale (arcsec)", MSE, "upper left"),
+    ("Flux of noisy stars", "noise level λ", FLUX, "upper left"),
+    ("Flux of stars with a hot pixel (scene 1)", HOT, FLUX, "upper left"),
+)
+# By panel of the stress tests: case, label, whether its bound is shown.
+SERIES = (
+    (0, "aberrations", "aberrations", True),
+    (0, "aberrations, guard ignored", "aberrations, guard ignored", False),
+    (0, "turbulence", "turbulence", True),
+    (1, "pixel scale, configured nodes", "configured nodes", True),
+    (1, "pixel scale, nodes it needs", "as many nodes as it needs", False),
+    (2, "seidel, noisy sum", "scene 1, sum (eq. 8)", True),
+    (2, "seidel, robust flux", "scene 1, robust", False),
+    (2, "turbulence, noisy sum", "scene 2, sum (eq. 8)", True),
+    (2, "turbulence, robust flux", "scene 2, robust", False),
+    (3, "hot pixel, noisy sum", "sum (eq. 8)", False),
+    (3, "hot pixel, robust flux", "robust", True),
+)
 
 
 @command("draw")
 def draw(
-    kind: Literal["propagation", "skipping", "training", "baseline", "inference", "scaling"],
+    kind: Literal[
+        "propagation", "skipping", "training", "baseline", "inference", "scaling", "graded"
+    ],
     table: Annotated[File, "Table of that benchmark."],
     out: Annotated[File, "PNG."],
     scene: Annotated[str | None, "Scene whose rows are drawn."] = None,
@@ -228,6 +253,38 @@ def scaling(table):
     middle = (low * high) ** 0.5
     panels[1].set_ylim(min(low, middle / 10), max(high, middle * 10))
     figure.suptitle("Growth of the costs (open: extrapolated)")
+    return figure
+
+
+def graded(table):
+    """Error under growing stress (NaN where the input was refused) with its bounds."""
+    figure = new_figure(7.4, layout="constrained")
+    for number, axes in enumerate(figure.subplots(2, 2).flat):
+        title, xlabel, ylabel, place = STRESS[number]
+        axes.set(**LOGS, title=title, xlabel=xlabel, ylabel=ylabel)
+        refused, series = False, [rest for panel, *rest in SERIES if panel == number]
+        for (case, label, bounded), color in zip(series, SERIES_COLORS, strict=False):
+            rows = table[table["case"] == case].sort_values("stress")
+            gone = rows["error"].isna()
+            measured, lost = rows[~gone], rows.loc[gone, "stress"]
+            style = {"lw": 1.3, "color": color, "label": label}
+            axes.plot(measured["stress"], measured["error"], "o-", ms=4, **style)
+            if bounded:
+                axes.plot(rows["stress"], rows["bound"], "--", lw=1.0, color=color)
+            # Marks of what is refused are near the upper edge, in room made for them.
+            height = np.full(len(lost), 0.96 - 0.04 * SERIES_COLORS.index(color))
+            transform = axes.get_xaxis_transform()
+            axes.plot(lost, height, "x", ms=6, mew=1.6, color=color, transform=transform)
+            refused |= gone.any()
+        axes.plot([], [], "--", lw=1.0, color="0.4", label="bound")
+        if refused:
+            axes.plot([], [], "x", ms=6, mew=1.6, color="0.4", label="refused")
+            low, high = np.log10(axes.get_ylim())
+            axes.set_ylim(10**low, 10 ** (high + 0.2 * (high - low)))
+        axes.grid(True, which="major")
+        shift = (0.0, 0.13, 1.0, 1.0) if place == "center right" else None
+        axes.legend(fontsize=7, loc=place, bbox_to_anchor=shift)
+    figure.suptitle("Error under growing stress, its bound, and what is refused")
     return figure
 
 

@@ -5,9 +5,16 @@ from typing import Annotated, Any
 import click
 
 from choice import choose, guard_or_budget, take_sample
-from kernel import configured_setting, finish, kernel_settings, kernel_times
 from measure import alone, machine, write
-from peers import compare, peers_of, time_methods
+from propagators import (
+    compare,
+    configured_setting,
+    finish,
+    kernel_settings,
+    kernel_times,
+    peers_of,
+    time_settings,
+)
 from psfdae.cli import Folder, command, program
 from psfdae.configuration.schema import Config
 from psfdae.reading import read_table
@@ -67,15 +74,20 @@ def time_everything(config, cases):
     numpy, so that ratios hold.
     """
     optics, benchmark = config.optics, config.benchmark
+    peers = [(case, peer) for case in cases for peer in peers_of(case, benchmark)]
     rows = []
     for backend in ("numpy", "torch"):
-        settings = [kernel_settings(optics, benchmark, case.samples, backend) for case in cases]
-        for threads in sorted({s.threads for some in settings for s in some}):
-            chosen = [[s for s in some if s.threads == threads] for some in settings]
-            with_peers = (backend, threads) == ("numpy", benchmark.threads)
-            peers = [peers_of(case, benchmark.peers) if with_peers else [] for case in cases]
-            load = (threads, benchmark.repeats, benchmark.stamps)
-            rows += alone(threads, time_methods, cases, chosen, peers, *load)
+        pairs = [
+            (case, setting)
+            for case in cases
+            for setting in kernel_settings(optics, benchmark, case.samples, backend)
+        ]
+        for threads in sorted({setting.threads for _, setting in pairs}):
+            chosen = [pair for pair in pairs if pair[1].threads == threads]
+            if (backend, threads) == ("numpy", benchmark.threads):
+                chosen += peers
+            work = (time_settings, chosen, benchmark.repeats, benchmark.stamps)
+            rows += alone(threads, *work)
     used = {case.aberration: configured_setting(optics, benchmark, case.samples) for case in cases}
     return finish(rows, used)
 

@@ -9,11 +9,9 @@ from importlib.util import find_spec
 import numpy as np
 from scipy.special import j0
 
-from kernel import batch_of
 from measure import time_calls, use_threads
-from peers import Peer, build, fresnel_grid
+from propagators import Setting, build, configured_setting, fresnel_grid, kernel
 from psfdae.configuration.compose import part
-from psfdae.optics.propagation import StampPropagator
 from psfdae.optics.pupil import choose_samples
 from psfdae.optics.turbulence import structure_function
 from psfdae.optics.wavefronts import MONOMIALS, ModalWavefronts, monomial_images, zernike_images
@@ -58,37 +56,31 @@ def timed_savings(tree, scene, cases, datasets):
     return [*rows, *kind(config, scene, case)]
 
 
-def kernel_of(scene, case, stamp_px):
-    """The kernel with the scene's settings for a case."""
-    pupil, optics = pupil_of(case.samples, case.obscuration), scene.optics
-    settings = (optics.nodes, optics.precision, optics.backend)
-    return StampPropagator(pupil, stamp_px, case.pixel, *settings)
-
-
 def superfluous_optics(benchmark, scene, case):
     """Planes between pupil and focus, pixels outside the stamp, and a padded grid."""
+    threads = benchmark.threads
     if benchmark.peers:
-        peer = Peer("poppy_fresnel", case.samples, 4)
+        peer = Setting("poppy_fresnel", case.samples, 4, threads=threads)
         samples, padded, _ = fresnel_grid(case, peer)
         # The pixel that the padded array really has, so that both look at the same points.
         same = replace(case, pixel=peer.nodes * samples / padded)
         planes, direct = (
-            build(same, replace(peer, method=method, samples=samples), benchmark.threads)[1]
+            build(same, replace(peer, method=method, samples=samples))[1]
             for method in ("poppy_fresnel", "poppy_mft")
         )
         seconds = [time_calls(way, benchmark.repeats) for way in (planes, direct)]
         yield saving("Fresnel planes", seconds, relative_to_peak(direct(), planes()))
     side = 2 * int(case.samples / case.pixel / 2)
-    small, large = kernel_of(scene, case, case.stamp_px), kernel_of(scene, case, side)
-    opd = case.batch(pupil_of(case.samples, case.obscuration), 1, small.real_dtype)
+    used = replace(configured_setting(scene.optics, benchmark, case.samples), batch=1)
+    (small, opd), (large, _) = (kernel(case, used, px) for px in (case.stamp_px, side))
     row, column = (case.offset_px[0] + (side - case.stamp_px) // 2).astype(int)
     cut = np.s_[:, row : row + case.stamp_px, column : column + case.stamp_px]
-    fft = Peer("fft", case.samples, 8, scene.optics.precision)
-    padded_fft = build(case, fft, benchmark.threads)[1]
+    fft = Setting("fft", case.samples, 8, scene.optics.precision, threads=threads)
+    _, padded_fft = build(case, fft)
     lean, calls = partial(small, opd, case.offset_px), max(1, benchmark.stamps // 16)
     for item, way, stamps in (
         ("Pixels outside the stamp", partial(large, opd), large(opd)[cut]),
-        ("Zero-padded grid", padded_fft, padded_fft()[None]),
+        ("Zero-padded grid", padded_fft, padded_fft()),
     ):
         repeats = benchmark.repeats
         seconds = (time_calls(way, repeats), time_calls(lean, repeats, calls))
@@ -120,14 +112,16 @@ def repeated_work(config, scene, times):
 
 def stamp_timer(benchmark, scene, case, opd_of):
     """Time of a star from its wavefront to its stamp, and the stamps of a batch."""
-    kernel, pupil = kernel_of(scene, case, case.stamp_px), pupil_of(case.samples, case.obscuration)
-    batch = batch_of(scene.optics, benchmark)
-    offset = np.repeat(case.offset_px, batch, axis=0)
+    used = configured_setting(scene.optics, benchmark, case.samples)
+    propagate, _ = kernel(case, used, case.stamp_px)
+    pupil = pupil_of(case.samples, case.obscuration)
+    offset = np.repeat(case.offset_px, used.batch, axis=0)
 
     def run():
-        return kernel(opd_of(pupil, kernel.real_dtype), offset)
+        return propagate(opd_of(pupil, propagate.real_dtype), offset)
 
-    return time_calls(run, benchmark.repeats, max(1, benchmark.stamps // batch)) / batch, run()
+    calls = max(1, benchmark.stamps // used.batch)
+    return time_calls(run, benchmark.repeats, calls) / used.batch, run()
 
 
 def equal_stars(modes, coefficients, count):
@@ -163,7 +157,7 @@ def seidel_terms(config, scene, case):
     monomials, tilts = scene.stars.coefficients[case.source.index[0]], MONOMIALS.index("x")
 
     def timed(modes, coefficients):
-        opd_of = equal_stars(modes, coefficients, batch_of(scene.optics, config.benchmark))
+        opd_of = equal_stars(modes, coefficients, min(config.optics.batch, config.benchmark.stamps))
         return stamp_timer(config.benchmark, scene, case, opd_of)
 
     lean_s, stamps = timed(monomial_images, monomials)
@@ -184,7 +178,7 @@ def turbulent_waves(config, scene, case):
     benchmark, turbulence, plain = config.benchmark, config.wavefront, scene.templates
     tilted = other_templates(config, remove_tilt=False)
     doubled = other_templates(config, waves=2 * turbulence.waves)
-    stars = np.arange(batch_of(scene.optics, benchmark)) % len(plain)
+    stars = np.arange(min(config.optics.batch, benchmark.stamps)) % len(plain)
 
     def timed(source):
         opds = [partial(wavefronts.opd, stars) for wavefronts in (source, plain)]

@@ -26,11 +26,6 @@ REFERENCES = ((512, 5), (768, 6), (1024, 8))
 pupil_of = lru_cache(maxsize=32)(annular_pupil)  # a sweep asks for the same pupils again
 
 
-def error_budget(kappa, levels):
-    """Largest allowed numerical MSE of a stamp of sum 1 at noise levels λ of RMS κλ a pixel."""
-    return BUDGET * (kappa * min(levels)) ** 2
-
-
 @dataclass(frozen=True)
 class Scene:
     """A scene; everything in it can be sent to another process.
@@ -58,7 +53,8 @@ class Scene:
             rng = stream(config.seed, "field", config.stars.name)
             fields = assign_fields(config.stars.count, len(templates), rng)
             stars, search_px = star_wavefronts(config, fields), config.stars.search_px
-        budget = error_budget(config.noise.kappa, config.noise.levels)
+        # Levels λ have an RMS of κλ a pixel.
+        budget = BUDGET * (config.noise.kappa * min(config.noise.levels)) ** 2
         groups = (config.telescope, config.optics, config.framing)
         return cls(config.scene.name, *groups, templates, stars, search_px, budget)
 

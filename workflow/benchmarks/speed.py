@@ -1,5 +1,7 @@
-"""Stars per second of the network, and how the costs of simulation and prediction grow."""
+"""Stars per second of the network, and how the costs of the stages grow."""
 
+import os
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from itertools import product
@@ -23,6 +25,9 @@ LEAST_S = 0.03  # a timing calls as often as it takes to last this long
 PREDICTED_STARS = 1_000_000  # for which time, memory and disk are extrapolated
 FEW = 16  # stars of a first run, whose imports cost time and memory
 COSTS = ("time_s", "peak_mb", "disk_mb")
+PLANNED_STARS = 1_000_000_000
+TRAINED_EPOCHS = 1  # the cost of more is that of their stars times epochs
+SIMULATED = 2  # of the numbers of stars, the smallest, simulation and prediction are measured
 
 
 @command("inference", reads=("dae", "benchmark"))
@@ -40,7 +45,7 @@ def inference(config: Config, out: Annotated[File, "CSV with stars per second."]
     with TemporaryDirectory() as folder:
         alone(1, export_networks, dae, sizes, Path(folder))
         for threads in sorted({1, settings.threads}):
-            for engine in ENGINES:
+            for engine in ("torch", "onnxruntime"):
                 work = (engine, dae, Path(folder), sizes, batches, threads, settings.repeats)
                 rows += alone(threads, time_networks, *work)
     write(out, rows)
@@ -69,8 +74,13 @@ def export_networks(dae, sizes, folder):
         export_onnx(*random_network(dae, *size), size[1], onnx_path(folder, *size))
 
 
-def torch_network(dae, folder, size, threads):
-    """`predict` as every stage calls it."""
+def network(engine, dae, folder, size, threads):
+    """An exported network, or in torch `predict` as every stage calls it."""
+    if engine == "onnxruntime":
+        from psfdae.estimators.dae_onnx import session
+
+        run = session(onnx_path(folder, *size), threads).run
+        return lambda images: run(None, {"images": images})[0]
     import torch
 
     from psfdae.estimators.dae_network import predict
@@ -80,22 +90,11 @@ def torch_network(dae, folder, size, threads):
     return lambda images: predict(model, images, factor, len(images))
 
 
-def onnx_network(dae, folder, size, threads):
-    """An exported network."""
-    from psfdae.estimators.dae_onnx import session
-
-    run = session(onnx_path(folder, *size), threads).run
-    return lambda images: run(None, {"images": images})[0]
-
-
-ENGINES = {"torch": torch_network, "onnxruntime": onnx_network}
-
-
 def time_networks(engine, dae, folder, sizes, batches, threads, repeats):
     """Rows of an engine in this process, with median and extremes of the repeats."""
     rows = []
     for (width, side), batch in product(sizes, batches):
-        apply = ENGINES[engine](dae, folder, (width, side), threads)
+        apply = network(engine, dae, folder, (width, side), threads)
         noise = stream(0, "throughput").normal(0.0, 0.005, (batch, side, side))
         timer = Timer(partial(apply, (noise + side**-2.0).astype(np.float32)))
         timer.timeit(1)
@@ -214,5 +213,100 @@ def with_exponents(part, against):
     return table.assign(**exponents)
 
 
+READS = ("parts", "dae", "train", "baseline", "evaluation", "methods", "benchmark")
+
+
+@command("stages", reads=(*SIMULATION, "noise", *READS))
+def stages(config: Config, out: Annotated[File, "CSV with measured and planned costs."]) -> None:
+    """Measure the stages that grow with the number of stars, on one CPU."""
+    with TemporaryDirectory() as folder, one_cpu():
+        rows = measured(config, Path(folder))
+    write(out, rows + planned(rows))
+
+
+def measured(config, folder):
+    """Costs of every stage at the numbers benchmark.star_counts, four fifths for training."""
+    threads, tree, rows = config.optics.threads, config.model_dump(), []
+    tree["train"]["epochs"] = TRAINED_EPOCHS
+    names = ("templates.h5", "simulated.h5", "stars.h5", "pca_som.h5", "dae", "stars.fits")
+    templates, simulated, stars, pca_som, dae, cube = (folder / name for name in names)
+    bundle = folder / "model.psf.safetensors"
+    alone(threads, cost_of_command, ["templates"], templates, tree)
+
+    def cost(stage, words, out, reads=tree):
+        found = alone(threads if stage == "simulate" else 1, cost_of_command, words, out, reads)
+        row = {"stage": stage, "stars": count, "epochs": TRAINED_EPOCHS * (stage == "train")}
+        row |= {name: found[name] for name in ("time_s", "cpu_s")}
+        row |= {f"{name}_mb": found[f"{name}_b"] / 1e6 for name in ("peak", "disk")}
+        rows.append(row | {"measured": "yes"})
+
+    for count in config.benchmark.star_counts[:SIMULATED]:
+        tree["stars"]["count"] = count
+        cost("simulate", ["stars", "--templates", templates], simulated)
+    given = ["--stars", stars]
+    for i, count in enumerate(config.benchmark.star_counts):
+        tree["parts"] |= {"train_stars": 4 * count // 5, "test_stars": count - 4 * count // 5}
+        alone(1, repeat_stars, simulated, count, stars)
+        cost("baseline", ["baseline", *given], pca_som)
+        cost("train", ["train", *given, "--checkpoint", folder / "train.pt"], dae)
+        models = ["--dataset", "measured", "--pca-som", pca_som, "--dae", dae]
+        per_star = ["--per-star", folder / "per_star.parquet"]
+        cost("evaluate", ["evaluate", *given, *models, *per_star], folder / "summary.csv")
+        if i < SIMULATED:
+            alone(1, untrained_bundle, tree, stars, bundle)
+            alone(1, make_cube, tree, stars, count, cube)
+            options = ["--model", bundle, "--threads", 1, "--overwrite", "--quiet"]
+            cost("predict", ["predict", cube, *options], folder / "psf.fits", None)
+    return rows
+
+
+def repeat_stars(stars, count, out):
+    """Write as many stars as asked for by repeating those of a product.
+
+    What the stages cost does not depend on what the stars look like.
+    """
+    from psfdae.files import Column, read_product, write_product
+
+    per_star = ("realisation", "template", "field_index")
+    product = read_product(stars, "stars", (*per_star, "grid"))
+    rows = np.arange(count) % len(product["field_index"])
+    columns = {name: Column(product[name][rows], "1", "repeated") for name in per_star}
+    columns["grid"] = Column(product["grid"], "1", "as of the product that is repeated")
+    write_product(out, "stars", columns, product.config)
+
+
+@contextmanager
+def one_cpu():
+    """Keep this process and those it starts on one CPU, as a job of the SLURM profile is."""
+    if not hasattr(os, "sched_setaffinity"):
+        yield
+        return
+    allowed = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {max(allowed)})
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, allowed)
+
+
+def planned(rows):
+    """A row of `PLANNED_STARS` per stage: a fixed part and a part per star, neither negative.
+
+    Least squares of relative deviations, so that small and large sizes count alike.
+    """
+    from scipy.optimize import nnls
+
+    found = []
+    for stage in dict.fromkeys(row["stage"] for row in rows):
+        part = [row for row in rows if row["stage"] == stage]
+        row = {**part[0], "stars": PLANNED_STARS, "measured": "extrapolated"}
+        for name in ("cpu_s", *COSTS):
+            relative = [(1.0 / r[name], r["stars"] / r[name]) for r in part]
+            fixed, each = nnls(np.array(relative), np.ones(len(part)))[0]
+            row[name] = fixed + each * PLANNED_STARS
+        found.append(row)
+    return found
+
+
 if __name__ == "__main__":
-    program(inference, growth)
+    program(inference, growth, stages)

@@ -1,20 +1,33 @@
-"""Test error against training time on one dataset: which training is long enough."""
+"""Test error against fitting time: which training, which PCA+SOM is large enough."""
 
 from pathlib import Path
+from time import perf_counter
 from typing import Annotated
 
 import numpy as np
 from pydantic import Field
 
-from measure import pareto, write, yes
+from measure import alone, pareto, write, yes
+from psfdae.belonging import STARS, require
 from psfdae.cli import File, command, program
 from psfdae.configuration.base import Group
-from psfdae.configuration.compose import config_dir, decisive, load_file
+from psfdae.configuration.compose import config_dir, decisive, load_file, part
 from psfdae.configuration.schema import Config
+from psfdae.configuration.stages import SIMULATION
+from psfdae.files import read_product
 from psfdae.reading import read_table, read_yaml
+from psfdae.rng import stream
+from psfdae.stages import common
+from psfdae.stars.noise import mixed_levels
 
 PATIENCE = 5  # validations without a better one after which a training no longer improves
 WORTHWHILE = 0.9  # fraction to which each doubling of the time must bring the error
+
+SIZES = ("components", "rows", "columns", "epochs")
+COMPONENTS, MAPS, EPOCHS = (5, 10, 20, 40), (7, 11, 15), (2, 10, 50)
+CHEAP_S = 3.0  # within which a fit of PCA+SOM is repeated
+
+READS = (*SIMULATION, "noise", "parts", "baseline", "benchmark")
 
 
 class Knee(Group):
@@ -49,7 +62,6 @@ def knee_table(
     from psfdae.estimators import HISTORY
     from psfdae.estimators.dae import Dae
     from psfdae.evaluation.metrics import mse
-    from psfdae.stages import common
 
     common.limit_threads(config.evaluation.threads)
     folders = {name: Path(folder) for name, _, folder in (p.partition("=") for p in points)}
@@ -63,10 +75,8 @@ def knee_table(
     configured = decisive(config.model_dump(include={"dae", "train"}))
     rows, idle = [], []
     for name, folder in folders.items():
-        network, history = (
-            Dae.load(folder, evaluation=config.evaluation),
-            read_table(folder / HISTORY),
-        )
+        network = Dae.load(folder, evaluation=config.evaluation)
+        history = read_table(folder / HISTORY)
         errors = {level: mse(network.predict(x), images).mean() for level, x in noisy.items()}
         row = {"point": name, **settings_of(folder, configured)}
         last = history.iloc[-1]
@@ -135,5 +145,80 @@ def stopping_point(scores, patience):
     return int(stale[0]) if stale.size else scores.size - 1
 
 
+@command("baseline", reads=READS)
+def baseline(
+    config: Config,
+    stars: Annotated[File, "Product of the stage stars."],
+    out: Annotated[File, "CSV with time and error of PCA+SOM over its sizes."],
+) -> None:
+    """Time PCA+SOM over components, map and epochs, on a quiet machine."""
+    require(stars, read_product(stars, "stars", ()).config, STARS, config)
+    rows = alone(config.baseline.threads, time_points, config.model_dump(), stars)
+    write(out, [{**row, "threads": config.baseline.threads} for row in rows])
+
+
+def grid_around(used, most_components):
+    """Points (components, rows, columns, epochs): `used`, one size changed, the two extremes."""
+    components, rows, columns, epochs = used
+    points = [used]
+    points += [(k, rows, columns, epochs) for k in COMPONENTS]
+    points += [(components, side, side, epochs) for side in MAPS]
+    points += [(components, rows, columns, t) for t in EPOCHS]
+    points += [(COMPONENTS[i], MAPS[i], MAPS[i], EPOCHS[i]) for i in (0, -1)]
+    return [point for point in dict.fromkeys(points) if point[0] <= most_components]
+
+
+def time_points(tree, stars):
+    """Fit and test settings on the training and test stars of the split random."""
+    # Imported before the clock starts.
+    import minisom  # noqa: F401
+    import sklearn.decomposition  # noqa: F401
+
+    config = part(READS, tree)
+    settings, levels = config.baseline, config.noise.levels
+    common.limit_threads(settings.threads)
+    product = common.read_stars(stars, "template")
+    parts = common.split_stars(product, "random", config)
+    # The draws of the stage `baseline`: the point in use is the very model of the tables.
+    rng = stream(config.seed, "noise", "baseline")
+    drawn = mixed_levels(np.asarray(levels), parts.train.size, rng)
+    train = common.noise_model(config).draw(product["realisation"][parts.train], drawn, rng)
+    truths = {name: product[name][parts.test] for name in ("realisation", "template")}
+    clean = truths["realisation"]
+    tests = [common.noisy_test_images(config, clean, level) for level in levels]
+    shared = {"sigma": settings.sigma, "learning_rate": settings.learning_rate}
+    shared["seed"] = int(stream(config.seed, "baseline", "map").integers(2**31))
+    used = tuple(getattr(settings, size) for size in SIZES)
+    rows = []
+    for point in grid_around(used, min(config.parts.train_stars, config.framing.stamp_px**2)):
+        sizes = dict(zip(SIZES, point, strict=True))
+        measured = time_point(train, tests, truths, sizes | shared, config.benchmark.repeats)
+        rows.append({**sizes, "used": yes(point == used), **measured, "n": len(clean)})
+    return rows
+
+
+def time_point(train, tests, truths, fit, repeats):
+    """Fit noisy images and restore tests of each λ: median times and mean errors."""
+    from psfdae.estimators.pca_som import fit_pca_som
+
+    model, fit_s, done = median_time(lambda: fit_pca_som(train, **fit), repeats)
+    estimates, predict_s, _ = median_time(lambda: [model.predict(x) for x in tests], repeats)
+    row = {"fit_s": fit_s, "predict_stars_per_s": sum(len(x) for x in tests) / predict_s}
+    row["repeats"] = done
+    for name, truth in truths.items():
+        row[f"mse_{name}"] = np.mean([((found - truth) ** 2).mean() for found in estimates])
+    return row
+
+
+def median_time(call, repeats):
+    """Result, median seconds and number of repeats; fewer if they take long."""
+    times: list[float] = []
+    while not times or (len(times) < repeats and sum(times) + times[0] < CHEAP_S):
+        start = perf_counter()
+        result = call()
+        times.append(perf_counter() - start)
+    return result, np.median(times), len(times)
+
+
 if __name__ == "__main__":
-    program(knee_table)
+    program(knee_table, baseline)

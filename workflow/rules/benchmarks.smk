@@ -1,18 +1,11 @@
 PROPAGATION = f"{RESULTS}/benchmark/propagation/{{scene}}/"
 SCENES = options("scene")
+OPTICS = ["propagation", "convergence", "choice", "guard", "skipping", "machine"]
 
 
 rule propagation:
     output:
-        multiext(
-            PROPAGATION,
-            propagation="propagation.csv",
-            convergence="convergence.csv",
-            choice="choice.csv",
-            guard="guard.csv",
-            skipping="skipping.csv",
-            machine="machine.csv",
-        ),
+        multiext(PROPAGATION, *(f"{name}.csv" for name in OPTICS)),
     log:
         f"{RESULTS}/logs/propagation/{{scene}}.log",
     benchmark:
@@ -30,7 +23,7 @@ rule propagation:
             chosen=[f"psfdae.stars.scenes:{w.scene.title()}Scene"],
         ),
         program=program("propagation.measure"),
-        folder=subpath(output.propagation, parent=True),
+        folder=subpath(output[0], parent=True),
         datasets=lambda w: sharing_stars(strictest_dataset(w.scene)),
     message:
         "Timing the optics of scene {wildcards.scene} against its error"
@@ -41,17 +34,11 @@ rule propagation:
 
 rule propagation_tables:
     input:
-        expand(rules.propagation.output.propagation, scene=SCENES),
+        expand(rules.propagation.output[0], scene=SCENES),
     output:
         multiext(
             f"{RESULTS}/tables/benchmark_",
-            propagation="propagation.csv",
-            peers="peers.csv",
-            convergence="convergence.csv",
-            choice="choice.csv",
-            guard="guard.csv",
-            skipping="skipping.csv",
-            machine="machine.csv",
+            *(f"{name}.csv" for name in [*OPTICS, "peers"]),
         ),
     log:
         f"{RESULTS}/logs/propagation/tables.log",
@@ -64,7 +51,7 @@ rule propagation_tables:
         config=lambda w: settings("propagation.tables", f"dataset={TIMED_DATASET}"),
         source=source_hash("workflow/benchmarks/propagation.py:tables"),
         program=program("propagation.tables"),
-        folder=subpath(output.propagation, parent=True),
+        folder=subpath(output[0], parent=True),
         scenes=lambda w, input: [f"--scene={Path(path).parent}" for path in input],
     message:
         "Joining the tables of the optics benchmark and timing imports"
@@ -78,7 +65,7 @@ TESTED = f"{RESULTS}/evaluation/{TIMED_DATASET}/random-realisation.csv"
 STARS = {"stars": lambda w: stars_of(TIMED_DATASET)}
 # By table: target, command, inputs, MB, minutes, stages that it runs as users do.
 TIMED = {
-    "benchmark_baseline": ("benchmark", "baseline.baseline", STARS, 1500, 20, []),
+    "benchmark_baseline": ("benchmark", "trainings.baseline", STARS, 1500, 20, []),
     "benchmark_inference": ("benchmark", "speed.inference", {}, 3000, 30, []),
     "benchmark_scaling": (
         *("benchmark", "speed.growth", {}, 2000, 30),
@@ -93,7 +80,7 @@ TIMED = {
         *(1500, 20, []),
     ),
     "scaling_stages": (
-        *("scaling", "plan.stages", {}, 4000, 60),
+        *("scaling", "speed.stages", {}, 4000, 60),
         ["stars", "fit", "evaluate", "predict"],
     ),
 }
@@ -182,13 +169,107 @@ rule benchmark:
     localrule: True
 
 
-rule prediction:
-    input:
-        [file for name, file in TIMED_TABLES.items() if TIMED[name][0] == "prediction"],
-    localrule: True
+for _wanted in ("prediction", "scaling"):
+
+    rule:
+        name:
+            _wanted
+        input:
+            [file for name, file in TIMED_TABLES.items() if TIMED[name][0] == _wanted],
+        localrule: True
 
 
-rule scaling:
+KNEE_FOLDER = f"{RESULTS}/knee/{{point}}"
+
+
+use rule stars as fresh_stars with:
     input:
-        TIMED_TABLES["scaling_stages"],
+        templates=lambda w: templates_of(dataset_config(KNEE_DATASET).stars.name),
+    output:
+        f"{RESULTS}/knee/fresh_stars.h5",
+    log:
+        f"{RESULTS}/logs/knee/fresh_stars.log",
+    benchmark:
+        f"{RESULTS}/benchmarks_on_request/training_knee/fresh_stars.tsv"
+    threads: lambda w: dataset_config(KNEE_DATASET).optics.threads
+    resources:
+        mem_mb=3000,
+        runtime=20,
+    params:
+        config=lambda w: settings(
+            "stars",
+            f"dataset={KNEE_DATASET}",
+            # Another name is another random stream.
+            more=("stars.name=fresh", f"stars.count={KNEE.fresh_stars}"),
+        ),
+        source=source_hash("stars", chosen=["psfdae.stars.scenes:SeidelScene"]),
+    message:
+        "Simulating other stars for the knee of the training"
+
+
+rule knee_train:
+    input:
+        stars=lambda w: (
+            rules.fresh_stars.output[0] if w.point == FRESH else stars_of(KNEE_DATASET)
+        ),
+    output:
+        multiext(
+            f"{KNEE_FOLDER}/",
+            weights="dae.safetensors",
+            config="config.yaml",
+            trained_on="trained_on.yaml",
+            history="history.csv",
+        ),
+    log:
+        f"{RESULTS}/logs/knee/{{point}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks_on_request/training_knee/{{point}}.tsv"
+    resources:
+        mem_mb=2000,
+        runtime=60,
+    params:
+        config=lambda w: settings(
+            "train", f"dataset={KNEE_DATASET}", more=knee_overrides(w.point)
+        ),
+        source=source_hash("train", chosen=["psfdae.estimators.dae"]),
+        folder=subpath(output.weights, parent=True),
+        checkpoint=lambda w: f"{RESULTS}/checkpoints/knee-{w.point}.pt",
+    message:
+        "Training point {wildcards.point} of the knee"
+    shell:
+        "psfdae train --config {params.config} --stars {input.stars}"
+        " --checkpoint {params.checkpoint} --out {params.folder} > {log} 2>&1"
+
+
+rule knee_table:
+    input:
+        expand(rules.knee_train.output, point=KNEE.points),
+        stars=lambda w: stars_of(KNEE_DATASET),
+    output:
+        table=f"{RESULTS}/tables/benchmark_training.csv",
+        stopping=f"{RESULTS}/tables/benchmark_stopping.csv",
+    log:
+        f"{RESULTS}/logs/knee/table.log",
+    benchmark:
+        f"{RESULTS}/benchmarks_on_request/training_knee/table.tsv"
+    threads: lambda w: dataset_config(KNEE_DATASET).evaluation.threads
+    resources:
+        mem_mb=1500,
+    params:
+        config=lambda w: settings("trainings.knee_table", f"dataset={KNEE_DATASET}"),
+        source=source_hash("workflow/benchmarks/trainings.py:knee_table"),
+        program=program("trainings.knee"),
+        points=[f"--point={p}={KNEE_FOLDER.format(point=p)}" for p in KNEE.points],
+    message:
+        "Testing the trainings of the knee"
+    shell:
+        "python {params.program} --config {params.config}"
+        " --stars {input.stars} {params.points:q} --stopping {output.stopping}"
+        " --out {output.table} > {log} 2>&1"
+
+
+rule training_knee:
+    input:
+        rules.knee_table.output,
+        expand(rules.figure_benchmark.output, drawn="training"),
     localrule: True

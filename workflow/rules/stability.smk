@@ -1,7 +1,7 @@
 STABILITY_DATASET, STABILITY_OTHER = "dataset3", "dataset8"
 STABILITY_READS = ("seed", "noise", "dae", "train", "baseline", "evaluation")
 STRESS = Path(workflow.basedir, "tests/stress")
-STRESS_CODE = [p.name for p in sorted(STRESS.glob("*.py")) if p.name != "figure.py"]
+STRESS_CODE = [p.name for p in sorted(STRESS.glob("*.py"))]
 
 
 # Writes the table whatever it says: a failed job would lose it.
@@ -56,17 +56,16 @@ rule figure_stability:
         f"{RESULTS}/logs/figures/stability/graded.log",
     benchmark:
         f"{RESULTS}/benchmarks_on_request/stability/figure.tsv"
-    threads: 1
-    resources:
-        mem_mb=500,
-        runtime=10,
     params:
-        source=lambda w: source_hash("tests/stress/figure.py"),
-        script=lambda w, threads: str(STRESS / "figure.py"),
+        source=source_hash(
+            *(f"workflow/benchmarks/figures.py:{name}" for name in ("draw", "graded"))
+        ),
+        program=program("figures.draw"),
     message:
         "Drawing error against stress"
     shell:
-        "python {params.script:q} {input} {output} > {log} 2>&1"
+        "python {params.program} --kind graded --table {input} --out {output}"
+        " > {log} 2>&1"
 
 
 rule stability:
@@ -79,10 +78,6 @@ rule stability:
     log:
         f"{RESULTS}/logs/stability/verdict.log",
     localrule: True
-    threads: 1
-    resources:
-        mem_mb=500,
-        runtime=10,
     message:
         "Judging the stress tests"
     shell:
