@@ -73,7 +73,7 @@ def deep(depth):
 
 
 def write_good(folder):
-    """Cubes, images, catalogues, a bundle and weights; the names by kind."""
+    """Cubes, images, catalogues, a bundle and weights, as `GOOD` lists them."""
     from astropy.io import fits
     from astropy.table import Table
 
@@ -102,6 +102,7 @@ def write_good(folder):
         fits.HDUList([fits.PrimaryHDU(), tiles]).writeto(folder / f"{coding}.fz")
     table = Table.read(folder / "s.csv")
     table["name"] = [f"star {k}" for k in range(12)]
+    table["ra", "dec"].write(folder / "sky.csv")
     table.write(folder / "s.fits")
     table.write(folder / "s.ecsv")
     lines = [f"# {k + 1} {name}" for k, name in enumerate(("NUMBER", "X_IMAGE", "Y_IMAGE"))]
@@ -113,13 +114,6 @@ def write_good(folder):
         {"layers.0.weight": Tensor(rng.normal(size=(1, 1, 3, 3)).astype(np.float32))},
         {"dae": {"kernels": [3, 3], "widths": [1]}},
     )
-    return {
-        "cube": ["cube.fits", "cube16.fits", "cube.fz", *(f"cube.{pack}" for pack in PACK)],
-        "image": ["image.fits", "image.fz", "GZIP_1.fz", "GZIP_2.fz"],
-        "catalogue": ["s.csv", "s.fits", "s.ecsv", "s.cat"],
-        "bundle": ["bundle.psf.safetensors"],
-        "weights": ["dae.safetensors"],
-    }
 
 
 @dataclass(frozen=True)
@@ -144,6 +138,14 @@ PACK = {
     "bz2": bz2.compress,
     "xz": lzma.compress,
     "zip": _zip,
+}
+
+GOOD = {
+    "cube": ["cube.fits", "cube16.fits", "cube.fz", *(f"cube.{pack}" for pack in PACK)],
+    "image": ["image.fits", "image.fz", "GZIP_1.fz", "GZIP_2.fz"],
+    "catalogue": ["s.csv", "s.fits", "s.ecsv", "s.cat"],
+    "bundle": ["bundle.psf.safetensors"],
+    "weights": ["dae.safetensors"],
 }
 
 # Mutations: bytes to bytes.
@@ -438,13 +440,13 @@ def hostile(count, seed, kept):
     with tempfile.TemporaryDirectory() as name:
         os.chdir(name)
         folder = Path(name)
-        good = write_good(folder)
-        raw = {name: (folder / name).read_bytes() for names in good.values() for name in names}
-        warm_up(good, folder)
+        write_good(folder)
+        raw = {path.name: path.read_bytes() for path in folder.iterdir()}
+        warm_up(folder)
         for number in range(count):
             rng = random.Random(f"{seed} {number}")
             kind = rng.choice(["cube", "image", "catalogue", "bundle", "bundle", "weights"])
-            source = rng.choice(good[kind])
+            source = rng.choice(GOOD[kind])
             path = folder / f"bad_{source}"
             path.write_bytes(mutated(raw[source], source, kind, rng))
             out = folder / "out.fits"
@@ -473,24 +475,22 @@ def hostile(count, seed, kept):
     }
 
 
-def warm_up(good, folder):
+def warm_up(folder):
     """Import all that a command imports; good files are accepted."""
-    from click.testing import CliRunner
-
-    from psfdae.cli import main
+    from command_line import psfdae
 
     rng = random.Random(0)
     for kind in ("cube", "image", "catalogue", "bundle"):
-        for name in good[kind]:
+        for name in GOOD[kind]:
             out = folder / "out.fits"
             words = command(kind, folder / name, out, rng)
             if kind == "image":
                 words += ["--mask", "image.fits", "--pixel-scale", "0.1"]
-            result = CliRunner().invoke(main, words)
-            assert result.exit_code == 0, (words, result.output, result.exception)
+            result = psfdae(*words)
+            assert result.exit_code == 0, (words, result.output)
             out.unlink(missing_ok=True)
             if kind == "bundle":
-                CliRunner().invoke(main, ["describe", str(folder / name)])
+                psfdae("describe", folder / name)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ from matplotlib.collections import PolyCollection
 
 from psfdae.configuration.compose import load_stage
 from psfdae.evaluation.curves import (
-    bank_growth,
     efficiency_against_noise,
     errors_above_bounds,
 )
@@ -259,13 +258,6 @@ def test_efficiency_figure_keeps_its_axis_without_values(scene_1):
     assert left.get_xlim() == right.get_xlim()
     assert [text.get_text() for text in right.texts] == ["no tight bound above 0"]
     assert not left.texts
-
-
-def test_growth_figure_has_a_line_per_level(scene_1):
-    figure = bank_growth(pd.read_csv(scene_1 / "growth.csv"), "dataset6")
-    for axes in figure.axes:
-        assert sum(line.get_marker() == "o" for line in axes.lines) == len(LEVELS)
-        assert axes.get_xscale() == "log"
 
 
 def test_figure_stages_write_png_and_name_what_is_missing(scene_1, tmp_path):

@@ -50,13 +50,6 @@ def scan(rows):
     return pd.DataFrame(grid)
 
 
-def test_paper_has_twelve_columns_and_one_outlier():
-    rows = original_noise_rows()
-    assert len(rows) == 12
-    outlier = rows[~rows.fitted]
-    assert outlier[["dataset", "noise_level"]].to_numpy().tolist() == [["dataset8", 0.002]]
-
-
 def test_kappa_of_the_noise_model_s_own_error(noise, gaussian_stars):
     level = 3e-5
     expected = noise.variance(gaussian_stars, level).mean()

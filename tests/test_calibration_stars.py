@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -31,10 +30,7 @@ from psfdae.own_stars.training_images import (
 from psfdae.rng import stream
 from psfdae.stars.fields import held_out_fields
 
-ROOT = Path(__file__).resolve().parents[1]
-SIDE = {"side_px": 700, "bright": 60, "faint": 80, "blended": 6, "saturated": 3}
 FRAMING = SimpleNamespace(stamp_px=16, jitter_px=1)
-TINY = ["preset=smoke", "parts.train_stars=120", "parts.test_stars=30", "train.epochs=1"]
 
 
 def gaussians(centre, side=32, sigma=1.5):
@@ -176,13 +172,6 @@ def test_a_moved_star_is_the_star_rendered_there():
     assert np.square(error).mean() < 1e-8
 
 
-def test_cut_puts_the_offset_in_the_middle_and_repeats_the_edge():
-    wide = np.arange(400.0).reshape(1, 20, 20)
-    assert cut(wide, 8, np.array([[2, -1]]))[0, 4, 4] == wide[0, 12, 9]
-    beyond = cut(wide, 8, np.array([[9, 0]]))[0]
-    assert (beyond[5:] == beyond[4]).all()
-
-
 def test_stacks_are_weighted_by_signal_to_noise():
     aligned = np.stack([np.full((4, 4), v) for v in (1.0, 4.0, 10.0)])
     found = stacks(aligned, np.array([2.0, 1.0, 1.0]), np.array([0, 0, 2]), 4)
@@ -215,6 +204,3 @@ def test_images_are_framed_normalised_and_moved_only_where_asked():
     assert phase.std(axis=0) == pytest.approx(np.sqrt(1 / 12), rel=0.1)
     again = star_centres(made.astype(float), jitter, np.full(400, 1.5))
     assert np.abs(again - place).max() < 0.03
-
-
-# The simulated image

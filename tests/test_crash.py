@@ -17,7 +17,7 @@ import time
 import psutil
 import pytest
 
-from workflow_runs import PATH, QUIET, clone, job_counts, wait_until
+from workflow_runs import PATH, QUIET, captured, clone, job_counts, wait_until
 
 pytestmark = [pytest.mark.workflow, pytest.mark.slow]
 
@@ -64,12 +64,7 @@ def recovers(undisturbed, record_property):
 
     def repeat(folder, **more):
         start = time.monotonic()
-        run = subprocess.run(
-            **{**reproduce(folder), **more},
-            capture_output=True,
-            text=True,
-            check=False,
-        )
+        run = captured(**{**reproduce(folder), **more})
         assert run.returncode == 0, run.stdout + run.stderr
         seconds = round(time.monotonic() - start, 1)
         record_property("recovery_s", seconds)
@@ -156,13 +151,7 @@ def test_full_disk(half_done, recovers):
     def limit():
         resource.setrlimit(resource.RLIMIT_FSIZE, (TOO_LARGE, resource.RLIM_INFINITY))
 
-    run = subprocess.run(
-        **reproduce(half_done),
-        preexec_fn=limit,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    run = captured(**reproduce(half_done), preexec_fn=limit)
     assert run.returncode != 0
     assert not (half_done / STARS).exists()
     log = (half_done / "results/smoke/logs/stars/seidel/seidel_10pct.log").read_text()
@@ -180,7 +169,7 @@ def test_read_only_results(half_done, recovers):
     if os.geteuid() == 0:
         # Root may write anywhere, unless it gives up that capability.
         arguments["args"] = ["setpriv", "--bounding-set=-dac_override", *arguments["args"]]
-    run = subprocess.run(**arguments, capture_output=True, text=True, check=False)
+    run = captured(**arguments)
     assert run.returncode != 0
     assert "Permission denied" in run.stdout + run.stderr
     assert not (half_done / WEIGHTS).exists()

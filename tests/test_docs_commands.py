@@ -237,22 +237,3 @@ def test_python_blocks_run(sandbox):
         names = {"stamps": 5e3 * star_stamps(4, side) + 100.0}
         exec(compile(body, "page", "exec"), names)
         assert names["prediction"].psf.shape == names["stamps"].shape
-
-
-@pytest.mark.parametrize("words", [("frobnicate",), ("psfdae", "frobnicate")])
-def test_a_command_without_handler_fails(words, tmp_path):
-    with pytest.raises(NoHandlerError, match="frobnicate"):
-        run(Command(words), tmp_path)
-
-
-def test_unknown_target_of_make_fails():
-    with pytest.raises(AssertionError, match="frobnicate"):
-        run_make(["frobnicate"])
-
-
-def test_blocks_are_read_to_the_word():
-    text = "```sh\ncat > a.yaml <<'END'\nx: 1  # kept\nEND\npsfdae a \\\n  b='c d' # gone\n```\n"
-    assert commands(text) == [
-        Command(("cat", ">", "a.yaml"), "x: 1  # kept\n"),
-        Command(("psfdae", "a", "b=c d")),
-    ]

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -34,8 +31,8 @@ METHODS = ("noisy", "pca_som", "dae", "lmmse")
 LEVELS = (0.001, 0.002, 0.003, 0.005)
 
 
-def small_field(points=3, spacing_deg=1.1):
-    index, angle_deg = square_grid(points, spacing_deg)
+def small_field():
+    index, angle_deg = square_grid(3, 1.1)
     return index, np.deg2rad(angle_deg)
 
 
@@ -83,20 +80,12 @@ def test_mosaic_places_stamps_unflipped():
     assert (canvas[4:6, 7:9] == stamps[field]).all()
 
 
-def test_mosaic_leaves_missing_fields_empty():
-    canvas = mosaic(np.ones((2, 2, 2)), np.array([[0, 0], [1, 1]]), gap=0)
-    assert np.isnan(canvas[:2, 2:]).all()
-    assert np.nansum(canvas) == 8
-
-
 @pytest.mark.parametrize(("row", "column"), [(3, 0), (0, 3)])
 def test_template_map_shows_the_bright_pixel_where_it_belongs(row, column):
     index, field = small_field()
     bright = int(np.flatnonzero((index == [2, 0]).all(axis=1))[0])
     figure = template_map(one_bright_pixel(9, bright, row, column), index, field, "templates")
     axes = figure.axes[0]
-    assert axes.get_xlabel() == "field angle x (deg)"
-    assert axes.get_ylabel() == "field angle y (deg)"
     x, y = np.rad2deg(field[bright])
     pixel = 1.1 / 5  # four pixels and a gap per field
     at = (x + (column - 1.5) * pixel, y + (row - 1.5) * pixel)
@@ -106,10 +95,6 @@ def test_template_map_shows_the_bright_pixel_where_it_belongs(row, column):
 
 
 def test_field_is_in_arcmin_if_small():
-    index, field = small_field(points=20, spacing_deg=0.02)
-    figure = template_map(np.ones((400, 4, 4)), index, field, "templates")
-    assert figure.axes[0].get_xlabel() == "field angle x (arcmin)"
-    assert len(figure.axes[0].images) == 1
     values, unit = in_field_unit(np.deg2rad(np.array([0.5])))
     assert unit == "arcmin"
     assert values == pytest.approx([30.0])
@@ -118,17 +103,10 @@ def test_field_is_in_arcmin_if_small():
 def test_energy_map_has_numbers_at_their_fields():
     index, field = small_field()
     energy = np.linspace(0.1, 0.9, 9)
-    figure = stamp_energy_map(energy, index, field, 16)
-    axes = figure.axes[0]
+    axes = stamp_energy_map(energy, index, field, 16).axes[0]
     assert [text.get_text() for text in axes.texts] == [f"{value:.2f}" for value in energy]
     assert axes.texts[2].get_position() == pytest.approx((1.1, -1.1))
     assert (axes.images[0].get_array()[0] == energy[:3]).all()
-    assert "min 0.10, median 0.50, max 0.90" in axes.get_title()
-
-
-def test_large_energy_map_has_no_numbers():
-    index, field = small_field(points=20, spacing_deg=0.02)
-    assert not stamp_energy_map(np.linspace(0, 1, 400), index, field, 16).axes[0].texts
 
 
 def test_spread_stars_are_distinct_and_even():
@@ -171,13 +149,10 @@ def test_training_curves_draw_both_errors_and_the_kept_network():
             "validation_mse": [np.nan, 3e-5, np.nan, 5e-5],
         }
     )
-    figure = training_curves({"one": history, "two": 2 * history}, "training")
-    axes = figure.axes[0]
+    axes = training_curves({"one": history, "two": 2 * history}, "training").axes[0]
     assert len(axes.lines) == 6
-    assert axes.get_yscale() == "log"
     assert list(axes.lines[1].get_xdata()) == [20, 40]
     assert list(axes.lines[2].get_xdata()) == [20]
-    assert axes.get_xlabel() == "optimiser step"
     assert {"one", "two", "kept network"} <= set(legend_texts(axes.get_legend()))
 
 
@@ -190,11 +165,7 @@ def test_errors_of_both_references_with_the_papers_points(metric):
         papers = [line for line in axes.lines if line.get_markerfacecolor() == "none"]
         assert len(papers) == 3
         assert [tick.get_text() for tick in axes.get_xticklabels()] == ["1", "2", "3", "5"]
-        assert "noise level λ" in axes.get_xlabel()
-    assert figure.axes[0].get_yscale() == ("log" if metric == "mse" else "linear")
-    texts = legend_texts(figure.legends[0])
-    assert "linear MMSE (told λ)" in texts
-    assert "DAE, paper" in texts
+    assert "DAE, paper" in legend_texts(figure.legends[0])
 
 
 def test_held_out_is_dashed_and_unpublished_datasets_have_no_paper():
@@ -204,8 +175,6 @@ def test_held_out_is_dashed_and_unpublished_datasets_have_no_paper():
     styles = [container.lines[0].get_linestyle() for container in axes.containers]
     assert styles.count("-") == styles.count("--") == len(METHODS)
     assert not any("paper" in text for text in legend_texts(figure.legends[0]))
-    texts = legend_texts(figure.legends[0])
-    assert {"random test stars", "stars of held-out fields"} <= set(texts)
 
 
 def test_stages_write_the_same_bytes_twice(tmp_path):
@@ -282,9 +251,6 @@ def test_strip_shows_the_noise_that_evaluate_measures(tmp_path, gaussian_stars, 
     models = Models(pca_som=tmp_path / "p.h5", dae=tmp_path / "dae")
     given = (config, "dataset3", tmp_path / "s.h5", models, "template")
     stage.figure_strip(*given, levels=[0.002], out=tmp_path / "strip.png")
-    labels = [row.label.replace("\n", " ") for row in shown["rows"]]
-    models = ["noisy λ = 0.002", "PCA+SOM λ = 0.002", "DAE λ = 0.002"]
-    assert labels == ["reference", "star without noise", *models]
     assert [row.own_scale for row in shown["rows"]] == [False, False, True, False, False]
     test = random_split(300, 200, 100, config.parts.validation_fraction, config.seed).test
     rng = stream(config.seed, "noise", "test", "0.002")
@@ -293,7 +259,6 @@ def test_strip_shows_the_noise_that_evaluate_measures(tmp_path, gaussian_stars, 
     for image in shown["rows"][2].images:
         assert (expected == image).all(axis=(1, 2)).any()
     assert len(shown["columns"]) == 8
-    assert "deg" in shown["title"]
 
 
 def test_refusals_name_the_problem(tmp_path):
@@ -306,8 +271,3 @@ def test_refusals_name_the_problem(tmp_path):
     with pytest.raises(ProductError, match="1 histories, but 2 labels"):
         stage.figure_curves(["one", "two"], [tmp_path / "h.csv"], tmp_path / "c.png")
     assert not list(tmp_path.glob("*.png"))
-
-
-def test_importing_the_stage_does_not_import_matplotlib():
-    code = "import sys, psfdae.stages.figures; sys.exit('matplotlib' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

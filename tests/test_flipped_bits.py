@@ -5,12 +5,11 @@ from __future__ import annotations
 import os
 import random
 import shutil
-import subprocess
 
 import pytest
 
 from psfdae.files import write_text
-from workflow_runs import VARYING, locked
+from workflow_runs import VARYING, captured, locked
 
 pytestmark = [pytest.mark.workflow, pytest.mark.slow]
 
@@ -65,7 +64,7 @@ def flipped(smoke, tmp_path_factory):
     rng = random.Random(4)
     for path in chosen.values():
         flip(path, rng)
-    run = subprocess.run(**locked(folder), capture_output=True, text=True, check=False)
+    run = captured(**locked(folder))
     assert run.returncode == 0, run.stdout + run.stderr
     return folder, chosen, run.stderr
 
@@ -106,12 +105,6 @@ def test_everything_is_what_it_was(smoke, flipped):
 
 def test_nothing_is_left_to_find(flipped):
     folder, *_ = flipped
-    done = subprocess.run(
-        ["psfdae", "verify", "results"],
-        cwd=folder,
-        env=locked(folder)["env"],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert (done.stdout, done.stderr) == (f"results/{OWN}\n", "")
+    verify = {**locked(folder), "args": ["psfdae", "verify", "results"]}
+    done = captured(**verify)
+    assert (done.returncode, done.stdout, done.stderr) == (0, f"results/{OWN}\n", "")

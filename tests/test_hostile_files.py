@@ -6,7 +6,6 @@ import gc
 import json
 import os
 import shutil
-import subprocess
 import sys
 import zipfile
 from dataclasses import replace
@@ -16,13 +15,12 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import Table
-from click.testing import CliRunner
 
 import hostile_files
+from command_line import psfdae, refused
 from fits_inputs import open_observation, write_cube, write_field
 from hostile_files import PACK
 from psfdae import load_model
-from psfdae.cli import main
 from psfdae.own_stars import bundle as module
 from psfdae.own_stars import catalogue, images
 from psfdae.own_stars.bundle import BundleError, read_bundle, shipped_path, write_bundle
@@ -30,6 +28,7 @@ from psfdae.own_stars.catalogue import read_catalogue
 from psfdae.own_stars.errors import ObservationError, no_formula, one_line
 from psfdae.own_stars.model import BLOCK
 from psfdae.own_stars.selection import Candidates
+from workflow_runs import captured
 
 D = 8
 
@@ -45,25 +44,10 @@ GOOD, NEVER = (cards(f"SIMPLE  =                    {value}", *PRIMARY) for valu
 EXTENSION = cards("XTENSION= 'IMAGE   '", *PRIMARY, "PCOUNT  = 0", "GCOUNT  = 1")
 
 
-def command(*words):
-    """What `psfdae` says and its exit code."""
-    result = CliRunner().invoke(main, list(map(str, words)))
-    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
-    return result.exit_code, result.output
-
-
-def refused(*words):
-    """The one line of a command that ends with code 2."""
-    code, output = command(*words)
-    assert code == 2, output
-    assert len(output.splitlines()) == 1 and output.startswith("psfdae: "), output
-    return output
-
-
 def hostile(count, seed, folder):
     script = Path(hostile_files.__file__)
     words = [sys.executable, script, str(count), str(seed), folder]
-    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    done = captured(words)
     assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-2000:]
     return json.loads(done.stdout)
 
@@ -213,7 +197,7 @@ def test_only_some_tiles_of_an_image_are_in_memory(tmp_path):
     where = os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
     env = {**os.environ, "PYTHONPATH": where, "OMP_NUM_THREADS": "1"}
     words = [sys.executable, "-c", script, path]
-    done = subprocess.run(words, capture_output=True, text=True, check=False, env=env)
+    done = captured(words, env=env)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout) == image[64, 1995:2003].tolist()
 
@@ -382,9 +366,9 @@ def test_descriptions_are_printed_without_escape_sequences(tmp_path):
         tmp_path / "x.psf.safetensors",
         lambda info: info.update(name="a\x1b[31mb", licence="c\nLicence  MIT\x07"),
     )
-    code, output = command("describe", path)
-    assert code == 0 and "\x1b" not in output and "\x07" not in output
-    assert "a?[31mb" in output and "c Licence MIT?" in output
+    said = psfdae("describe", path)
+    assert said.exit_code == 0 and "\x1b" not in said.output and "\x07" not in said.output
+    assert "a?[31mb" in said.output and "c Licence MIT?" in said.output
 
 
 def test_a_bundle_of_any_size_is_not_read(monkeypatch):
@@ -502,5 +486,5 @@ def test_names_of_files_are_no_formulas_of_the_map(tmp_path):
     place = np.full((2, 1), 20.0)
     write_field(path, stars, 1e4 * star[None], *place, (40, 40), pixel_scale_arcsec=0.1)
     words = ["predict", path, "--catalogue", stars, "--plot", tmp_path / "a.png"]
-    code, output = command(*words, "--out", tmp_path / "o.fits", "--quiet")
-    assert code == 0, output
+    said = psfdae(*words, "--out", tmp_path / "o.fits", "--quiet")
+    assert said.exit_code == 0, said.output

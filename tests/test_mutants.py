@@ -37,17 +37,6 @@ def test_list_has_forty_drawn_mutants_besides_the_equivalent():
     assert len(set(read_list())) == len(read_list())
 
 
-def test_mutant_is_found_by_name_in_whatever_module(tmp_path):
-    path = tmp_path / "sub" / "moved.py"
-    path.parent.mkdir()
-    path.write_text(SOURCE, encoding="utf-8")
-    second = Mutant("Model.fit", "2 * x", "3 * x", 1, "", "")
-    text = apply(*find(units_of(tmp_path), second), second.mutated)
-    assert text == SOURCE.replace("(2 * x)", "((3 * x))")
-    named = Mutant("Model.name", "2 * self.x", "self.x", 0, "", "")
-    assert apply(*find(units_of(tmp_path), named), named.mutated).endswith('return "λ", (self.x)\n')
-
-
 @pytest.mark.parametrize(
     "change", [{"function": "Model.fits"}, {"occurrence": 2}, {"original": "2"}]
 )

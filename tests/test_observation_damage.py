@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import gzip
 import threading
 import warnings
 
@@ -11,14 +10,14 @@ import numpy as np
 import pytest
 from astropy import log
 from astropy.io import fits
-from astropy.table import Table
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from fits_inputs import open_observation, write_cube, write_field
+from fits_inputs import open_observation, write_cube
+from hostile_files import GOOD, write_good
 from psfdae.own_stars.errors import ObservationError, reading
 
-D = 8
+D = 16
 HEADERS = 8640  # bytes at the start of the files here that hold their headers and some data
 
 
@@ -36,30 +35,12 @@ def examples(count):
 def folder(tmp_path_factory):
     """Cubes, images and catalogues of every kind, all of them good."""
     folder = tmp_path_factory.mktemp("good")
-    rng = np.random.default_rng(1)
-    stamps = rng.normal(200, 20, (30, D, D))
-    x, y = rng.uniform(0, 60, 30), rng.uniform(0, 40, 30)
-    write_cube(folder / "cube.fits", stamps, PIXSCALE=1.0)
-    write_cube(folder / "cube16.fits", stamps.astype(np.uint16))
-    write_cube(folder / "cube.fits.fz", stamps, compress=True)
-    (folder / "cube.fits.gz").write_bytes(gzip.compress((folder / "cube.fits").read_bytes()))
-    for name, compress in (("image.fits", False), ("image.fits.fz", True)):
-        write_field(folder / name, folder / "s.csv", stamps, x, y, (40, 60), compress=compress)
-    for coding in ("GZIP_1", "GZIP_2"):
-        tiles = fits.CompImageHDU(rng.poisson(9, (40, 60)), compression_type=coding)
-        fits.HDUList([fits.PrimaryHDU(), tiles]).writeto(folder / f"{coding}.fits.fz")
-    table = Table.read(folder / "s.csv")
-    table["ra", "dec"].write(folder / "sky.csv")
-    table.write(folder / "s.fits")
-    table.write(folder / "s.ecsv")
+    write_good(folder)
     return folder
 
 
-FILES = {
-    "cube": ("cube.fits", "cube16.fits", "cube.fits.fz", "cube.fits.gz"),
-    "image": ("image.fits", "image.fits.fz", "GZIP_1.fits.fz", "GZIP_2.fits.fz"),
-    "catalogue": ("s.csv", "s.fits", "s.ecsv", "sky.csv"),
-}
+FILES = [(kind, name) for kind in ("cube", "image", "catalogue") for name in GOOD[kind]]
+FILES += [("catalogue", "sky.csv")]
 
 
 def attempt(path, **options):
@@ -95,7 +76,7 @@ def attempt_all(folder, data, kind):
 
 
 def test_the_good_files_are_read(folder):
-    for kind, name in ((kind, name) for kind, names in FILES.items() for name in names):
+    for kind, name in FILES:
         good = attempt_all(folder, (folder / name).read_bytes(), kind)
         assert good or name.startswith("GZIP"), name  # no WCS for the sky coordinates
 
@@ -113,7 +94,7 @@ damages = st.one_of(
 
 @examples(500)
 @given(
-    file=st.sampled_from([(kind, name) for kind, names in FILES.items() for name in names]),
+    file=st.sampled_from(FILES),
     damage=damages,
     more=st.binary(max_size=99),
 )
@@ -192,12 +173,12 @@ def test_what_is_not_there_or_not_fits(tmp_path, folder, name, content, message)
 def test_wrong_dimensions_name_both_numbers(tmp_path, shape, message):
     fits.PrimaryHDU(np.zeros(shape, dtype=np.float32)).writeto(tmp_path / "a.fits")
     with pytest.raises(ObservationError, match=message):
-        open_observation(tmp_path / "a.fits", D)
+        open_observation(tmp_path / "a.fits", 8)
 
 
 def test_a_truncated_cube_is_refused_before_any_pixel(tmp_path, folder):
     data = (folder / "cube.fits").read_bytes()
-    end = 2880 + 4 * 30 * D * D
+    end = 2880 + 4 * 12 * D * D
     (tmp_path / "a.fits").write_bytes(data[: end - 10])
     with pytest.raises(ObservationError, match="truncated: the last 10 bytes are missing"):
         open_observation(tmp_path / "a.fits", D)

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import re
-import shlex
 import shutil
-from pathlib import Path
 
 import pytest
 from astropy.io import fits
 from click.testing import CliRunner
 
+from docs_pages import commands, read
 from psfdae.cli import main
 from psfdae.configuration.compose import config_dir, forget
-from test_workflow import planned
+from workflow_runs import planned
 
-ROOT = Path(__file__).resolve().parents[1]
-HEREDOC = re.compile(r"cat > (\S+) <<'END'\n(.*?)\nEND\n", re.S)
 STARS = ["grid.points=3", "stars.count=200"]
 TINY = {
     "simulate": ["grid.points=3"],
@@ -34,20 +30,19 @@ pytestmark = pytest.mark.workflow
 
 
 @pytest.fixture(scope="module")
-def blocks():
-    """The page's shell blocks."""
-    text = (ROOT / "docs/own_telescope.md").read_text(encoding="utf-8")
-    return re.findall(r"```sh\n(.*?)```", text, re.S)
+def lines():
+    """The page's commands."""
+    return commands(read("docs/own_telescope.md"))
 
 
 @pytest.fixture(scope="module")
-def workshop(blocks, tmp_path_factory):
+def workshop(lines, tmp_path_factory):
     """A copy of the configuration with the files that the page writes."""
     folder = tmp_path_factory.mktemp("own")
     shutil.copytree(config_dir(), folder / "config")
-    for block in blocks:
-        for name, text in HEREDOC.findall(block):
-            (folder / name).write_text(text + "\n", encoding="utf-8")
+    for line in lines:
+        if line.words[0] == "cat":
+            (folder / line.words[-1]).write_text(line.heredoc, encoding="utf-8")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PSFDAE_CONFIG", str(folder / "config"))
         patch.chdir(folder)
@@ -56,18 +51,16 @@ def workshop(blocks, tmp_path_factory):
     forget()
 
 
-def commands(blocks, program):
-    lines = [line for block in blocks for line in HEREDOC.sub("", block).splitlines()]
-    return [shlex.split(line)[1:] for line in lines if line.startswith(f"{program} ")]
+def words(lines, program):
+    return [list(line.words[1:]) for line in lines if line.words[0] == program]
 
 
-def test_every_line_is_run_by_a_test(blocks):
-    left = [line for block in blocks for line in HEREDOC.sub("", block).splitlines()]
-    assert {line.split()[0] for line in left if line.strip()} == {"psfdae", "snakemake"}
+def test_every_line_is_run_by_a_test(lines):
+    assert {line.words[0] for line in lines} == {"cat", "psfdae", "snakemake"}
 
 
-def test_page_from_the_telescope_s_file_to_restored_stars(blocks, workshop):
-    steps = commands(blocks, "psfdae")
+def test_page_from_the_telescope_s_file_to_restored_stars(lines, workshop):
+    steps = words(lines, "psfdae")
     assert {"simulate", "stars", "train", "bundle", "predict"} == {step[0] for step in steps}
     for step in steps:
         result = CliRunner().invoke(main, [*step, *TINY[step[0]]])
@@ -79,8 +72,8 @@ def test_page_from_the_telescope_s_file_to_restored_stars(blocks, workshop):
         assert len(restored["STARS"].data) == 9
 
 
-def test_page_s_dataset_is_a_target(blocks, workshop):
-    targets = commands(blocks, "snakemake")
+def test_page_s_dataset_is_a_target(lines, workshop):
+    targets = words(lines, "snakemake")
     assert targets == [["mytarget"]]
     jobs = planned(workshop, *targets[0])
     assert {"telescope_templates", "telescope_stars", "figure_telescope"} <= set(jobs)

@@ -5,19 +5,16 @@ from __future__ import annotations
 import json
 import struct
 import warnings
-from contextlib import nullcontext
 
 import numpy as np
 import pytest
-import tqdm
 from astropy.io import fits
 from astropy.table import Table
-from click.testing import CliRunner
 
+from command_line import psfdae
 from fits_inputs import write_cube, write_field
 from prediction_stars import SKY, observe
-from psfdae import StarFlag, load_model
-from psfdae.cli import main
+from psfdae import StarFlag
 from psfdae.own_stars import model as engine
 from psfdae.own_stars import plot
 from psfdae.own_stars import prediction as writer
@@ -30,9 +27,7 @@ SIDE = 320
 
 
 def run(*words):
-    result = CliRunner().invoke(main, ["predict", *map(str, words)])
-    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
-    return result
+    return psfdae("predict", *words)
 
 
 @pytest.fixture(scope="module")
@@ -142,14 +137,11 @@ def test_blemished_stamps_keep_their_rows(folder):
     write_cube(folder / "odd.fits", stamps, PIXSCALE=0.1, SATURATE=5e4)
     assert run(folder / "odd.fits", "--out", folder / "odd_psf.fits").exit_code == 0
     cubes, table, _ = read(folder / "odd_psf.fits")
-    flags = [StarFlag(int(value)) for value in table["flags"]]
-    assert StarFlag.MASKED in flags[0]
-    assert StarFlag.MASKED | StarFlag.NO_FLUX in flags[1]
-    assert StarFlag.NO_FLUX in flags[2]
-    assert StarFlag.NO_FLUX in flags[3]
-    assert StarFlag.SATURATED in flags[4]
-    assert StarFlag.OFF_CENTRE in flags[5]
-    assert flags[6] == flags[7] == StarFlag(0)
+    masked, lost = StarFlag.MASKED, StarFlag.NO_FLUX
+    expected = (masked, masked | lost, lost, lost, StarFlag.SATURATED, StarFlag.OFF_CENTRE)
+    for flags, flag in zip(table["flags"], expected, strict=False):
+        assert flag in StarFlag(int(flags))
+    assert (table["flags"][6:] == 0).all()
     assert np.isnan(cubes["PSF"][[1, 2, 3]]).all()
     assert np.isfinite(cubes["PSF"][[0, 4, 6, 7]]).all()
 
@@ -192,16 +184,8 @@ def newer_bundle(path):
 def bad(folder):
     """Files that cannot be used."""
     stamps = np.load(folder / "cube.npy")[:4]
-    raw = (folder / "cube.fits").read_bytes()
-    (folder / "damaged.fits").write_bytes(raw[: len(raw) // 2])
-    (folder / "text.fits").write_text("no FITS file")
     write_cube(folder / "coarse.fits", stamps, PIXSCALE=0.2)
     write_cube(folder / "unknown.fits", stamps)
-    write_cube(folder / "large.fits", np.zeros((3, 24, 24)), PIXSCALE=0.1)
-    write_cube(folder / "plain.fits", np.zeros((SIDE, SIDE)), PIXSCALE=0.1)
-    (folder / "empty.csv").write_text("x,y\n")
-    (folder / "outside.csv").write_text("X_IMAGE,Y_IMAGE\n5000,5000\n6000,100\n")
-    (folder / "sky.csv").write_text("ra,dec\n150.0,2.0\n")
     newer_bundle(folder / "newer.psf.safetensors")
     (folder / "exists.fits").write_text("precious")
     return folder
@@ -210,24 +194,16 @@ def bad(folder):
 @pytest.mark.parametrize(
     ("words", "named", "texts"),
     [
-        (["damaged.fits"], "damaged.fits", []),
-        (["text.fits"], "text.fits", []),
         (["nowhere.fits"], "nowhere.fits", ["no such file"]),
         (["coarse.fits"], "coarse.fits", ["0.2 arcsec", "0.1 arcsec"]),
-        (["cube.fits", "--pixel-scale", "0.11"], "cube.fits", ["0.11 arcsec", "0.1 arcsec"]),
         (["unknown.fits"], "unknown.fits", ["--pixel-scale"]),
-        (["large.fits"], "large.fits", ["24×24", "16×16"]),
-        (["plain.fits"], "plain.fits", ["catalogue"]),
-        (["plain.fits", "--catalogue", "sky.csv"], "plain.fits", ["WCS"]),
-        (["image.fits", "--catalogue", "empty.csv"], "empty.csv", []),
-        (["image.fits", "--catalogue", "outside.csv"], "outside.csv", ["none of the 2 stars"]),
+        (["image.fits"], "image.fits", ["catalogue"]),
         (["cube.fits", "--model", "newer.psf.safetensors"], "newer.psf", ["format 99", "format 2"]),
         (["cube.fits", "--model", "cube.npy"], "cube.npy", []),
         (["cube.fits", "--flux-column", "flux"], "cube.fits", ["no catalogue"]),
         (["image.fits", "--catalogue", "stars.csv", "--flux-column", "f"], "stars.csv", ["'f'"]),
         (["cube.fits", "--plot", "x.png"], "cube.fits", ["map"]),
         (["cube.fits", "--out", "exists.fits"], "exists.fits", ["--overwrite"]),
-        (["cube.fits", "--out", "cube.fits", "--overwrite"], "cube.fits", ["input"]),
         (["cube.fits", "--out", "."], ".", []),
         (["cube.fits", "--plot", "out.fits"], "out.fits", []),
     ],
@@ -245,12 +221,6 @@ def test_what_cannot_be_used_ends_in_one_line_and_code_2(bad, monkeypatch, words
     assert (bad / "exists.fits").read_text() == "precious"
 
 
-def test_scale_within_two_per_cent_is_taken(bad, tmp_path):
-    for words in (["cube.fits", "--pixel-scale", 0.1015], ["unknown.fits", "--pixel-scale", 0.1]):
-        out = tmp_path / f"{words[2]}.fits"
-        assert run(bad / words[0], *words[1:], "--out", out).exit_code == 0
-
-
 def test_failure_in_the_middle_leaves_no_file(folder, tmp_path, monkeypatch):
     def fail(self, stars):
         raise MemoryError
@@ -266,39 +236,6 @@ def test_full_disk_is_one_line(folder, tmp_path):
     result = run(folder / "cube.fits", "--out", tmp_path / "file" / "psf.fits")
     assert result.exit_code == 2
     assert "cannot be written" in result.output
-
-
-def test_memory_does_not_grow_with_the_stars(folder, monkeypatch):
-    """Stamps are taken as they are needed and let go when written."""
-    alive, most = set(), 0
-    chunks = stage.Observation.chunks
-
-    def counted(self, rows):
-        nonlocal most
-        for number, stamps in enumerate(chunks(self, rows)):
-            alive.add(number)
-            most = max(most, len(alive))
-            yield stamps
-
-    monkeypatch.setattr(stage, "ROWS", 50)
-    monkeypatch.setattr(stage.Observation, "chunks", counted)
-    done = []
-
-    class Bar(nullcontext):
-        def __enter__(self):
-            return self
-
-        def reset(self, stars):
-            assert stars == 300
-
-        def update(self, stars):
-            done.append(stars)
-            alive.discard(len(done) - 1)
-
-    monkeypatch.setattr(tqdm, "tqdm", lambda **options: Bar())
-    stage.predict(folder / "cube.fits", stage.Stated(), threads=2, out=folder / "few.fits")
-    assert sum(done) == 300
-    assert most <= 4
 
 
 def field_of(**changes):
@@ -324,10 +261,6 @@ def test_map_of_nothing_is_still_a_map():
     stars = field_of(flags=np.full(4, int(StarFlag.NO_FLUX)))
     figure = plot.psf_map(np.empty((0, 16, 16)), stars, "nothing")
     assert len(figure.axes) == 2
-
-
-def test_model_of_a_file_is_the_shipped_one():
-    assert load_model(shipped_path()).bundle.sha256 == load_model().bundle.sha256
 
 
 def test_page_lists_all_flags_and_columns():

@@ -39,11 +39,8 @@ def append(path: Path, text: str) -> None:
     path.write_text(path.read_text() + text)
 
 
-def test_a_copy_alone_repeats_nothing(jobs):
+def test_a_copy_and_comments_repeat_nothing(jobs, tree):
     assert jobs() == {}
-
-
-def test_comments_repeat_nothing(jobs, tree):
     append(tree / "config/train/onecycle.yaml", "# A thought.\n")
     append(tree / "config/dataset/dataset3.yaml", "# Another.\n")
     append(tree / "src/psfdae/optics/propagation.py", "# And a third.\n")
@@ -77,29 +74,22 @@ def test_plotting_function(jobs, tree):
     assert set(jobs(*TARGETS, "tables")) == {"figure_strip", "track"}
 
 
-def test_optics(jobs, tree):
-    """Templates and stars, and all that is made from them."""
-    edit(tree / "src/psfdae/optics/propagation.py", "StampPropagator")
+SIMULATED = {"templates": 2, "stars": 2}
+LEARNED = {"train": 6, "evaluate": 6}
+
+
+@pytest.mark.parametrize(
+    ("module", "name", "repeated", "left"),
+    [
+        ("optics/propagation", "StampPropagator", SIMULATED | {"baseline": 4} | LEARNED, ()),
+        ("estimators/dae_network", "Dae", LEARNED, SIMULATED),
+        ("evaluation/metrics", "ssim", {"evaluate": 6}, (*SIMULATED, "baseline", "train")),
+    ],
+)
+def test_what_computes(jobs, tree, module, name, repeated, left):
+    """All that is made with it and from that, and nothing before."""
+    edit(tree / f"src/psfdae/{module}.py", name)
     found = jobs(*TARGETS)
-    assert found["templates"] == 2
-    assert found["stars"] == 2
-    assert found["train"] == 6
-    assert found["evaluate"] == 6
-    assert {"baseline", "paper_tables", "track"} <= set(found)
-
-
-def test_metric(jobs, tree):
-    """Evaluations and what follows, but no training."""
-    edit(tree / "src/psfdae/evaluation/metrics.py", "ssim")
-    found = jobs(*TARGETS)
-    assert found["evaluate"] == 6
-    assert not {"templates", "stars", "train", "baseline"} & set(found)
-
-
-def test_network(jobs, tree):
-    """Trainings and what follows, but no stars."""
-    edit(tree / "src/psfdae/estimators/dae_network.py", "Dae")
-    found = jobs(*TARGETS)
-    assert found["train"] == 6
-    assert found["evaluate"] == 6
-    assert not {"templates", "stars"} & set(found)
+    assert found == {**found, **repeated}
+    assert {"paper_tables", "track"} <= set(found)
+    assert not set(left) & set(found)

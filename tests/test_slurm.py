@@ -12,7 +12,7 @@ import subprocess
 import pytest
 
 from slurm_cluster import ask, cluster, obstacle, states, wait_for
-from workflow_runs import ROOT, environment
+from workflow_runs import ROOT, captured, environment
 
 pytestmark = [pytest.mark.workflow, pytest.mark.slow]
 
@@ -134,11 +134,6 @@ def test_databases_and_joined_tables_stay_at_home(run):
 
 def test_nothing_is_left_to_do_at_home(run):
     folder = run[0]
-    done = subprocess.run(
-        [*command(folder, *TARGETS), "--executor", "local", "--cores", "2", "--dry-run"],
-        env=environment(),
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    line = [*command(folder, *TARGETS), "--executor", "local", "--cores", "2", "--dry-run"]
+    done = captured(line, env=environment())
     assert "Nothing to be done" in done.stdout + done.stderr, done.stdout + done.stderr

@@ -157,11 +157,6 @@ def test_noise_has_the_paper_s_rms_and_the_star_s_photons(noise, gaussian_stars,
     assert (error**2).mean() == pytest.approx(expected.mean(), rel=0.01)
 
 
-def test_star_photons_add_a_quarter_at_the_lowest_level(noise, gaussian_stars):
-    mean = noise.variance(gaussian_stars, 3e-5).mean()
-    assert mean / (4.98 * 3e-5) ** 2 == pytest.approx(1.26, abs=0.01)
-
-
 def test_every_level_of_a_band_is_drawn_as_often():
     levels = np.array([3e-4, 5e-4, 7e-4, 9e-4])
     drawn = mixed_levels(levels, 40000, stream(1, "levels"))

@@ -26,6 +26,11 @@ def environment(**more):
     return {**kept, "PATH": PATH, **more}
 
 
+def captured(args, **options):
+    """A finished program with what it said, whether it succeeded or not."""
+    return subprocess.run(args, capture_output=True, text=True, check=False, **options)
+
+
 def clone(folder):
     """A fresh copy of the source tree in `folder`, with the environment of this one."""
     environment_of_make = Path(sys.prefix)
@@ -68,13 +73,8 @@ def command(folder, *arguments, overrides="", preset="smoke", root=ROOT):
 
 def snakemake(folder, *arguments, check=True, **options):
     """Output of a run; fails the test if the run fails, unless told otherwise."""
-    result = subprocess.run(
-        command(folder, *arguments, **options),
-        env=environment(PYTHONPATH=str(options.get("root", ROOT) / "src")),
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    source = str(options.get("root", ROOT) / "src")
+    result = captured(command(folder, *arguments, **options), env=environment(PYTHONPATH=source))
     if check:
         assert result.returncode == 0, result.stdout + result.stderr
     return result.stdout + result.stderr

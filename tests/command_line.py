@@ -1,0 +1,23 @@
+"""`psfdae` in this process: what it says, and the one line with which it refuses."""
+
+from __future__ import annotations
+
+from click.testing import CliRunner
+
+from psfdae.cli import main
+
+
+def psfdae(*words):
+    """A command's result; a test fails on a traceback."""
+    result = CliRunner().invoke(main, list(map(str, words)))
+    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
+    return result
+
+
+def refused(*words):
+    """The one line of a command that ends with code 2."""
+    result = psfdae(*words)
+    assert result.exit_code == 2, result.output
+    assert len(result.output.splitlines()) == 1, result.output
+    assert result.output.startswith("psfdae: "), result.output
+    return result.output
