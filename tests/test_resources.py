@@ -23,7 +23,13 @@ ON_REQUEST = (
 )
 PROFILES = ROOT / "profiles"
 RULES = "".join(path.read_text() for path in (ROOT / "workflow/rules").glob("*.smk"))
-LOCAL = set(re.findall(r"^rule (\w+):\n(?:(?!rule ).*\n)*?    localrule: True", RULES, re.M))
+LOCAL = set(
+    re.findall(
+        r"^(?:use rule \w+ as|rule) (\w+)(?: with)?:\n(?:(?!(?:use )?rule ).*\n)*?    localrule: True",
+        RULES,
+        re.M,
+    )
+)
 
 
 @pytest.fixture(scope="module")

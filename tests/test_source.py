@@ -17,6 +17,7 @@ OPTIONS = {
     "scene": ("seidel", "turbulence", "telescope"),
     "method": ("dae", "pca_som"),
     "_figure": ("predicted", "errors", "correlation"),
+    "_command": ("bounds", "efficiency", "bank-growth"),
 }
 METHODS = [f"psfdae.estimators.{name}" for name in ("noisy", "pca_som", "lmmse", "dae")]
 EXEMPT = {

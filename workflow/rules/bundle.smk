@@ -51,10 +51,6 @@ rule shipped:
     log:
         f"{RESULTS}/logs/bundles/shipped.log",
     localrule: True
-    threads: 1
-    resources:
-        mem_mb=500,
-        runtime=10,
     params:
         folder="src/psfdae/bundles",
     message:

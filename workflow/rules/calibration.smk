@@ -43,7 +43,6 @@ rule calibrate:
     threads: lambda w: dataset_config(TABULATED[0]).evaluation.threads
     resources:
         mem_mb=2000,
-        runtime=10,
     params:
         config=lambda w: settings("calibrate", f"dataset={TABULATED[0]}"),
         source=source_hash("calibrate"),

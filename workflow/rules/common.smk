@@ -185,21 +185,15 @@ def has_own_telescope(dataset):
     return dataset_config(dataset).scene.name == "telescope"
 
 
-def field_figures_of(dataset):
-    """Figures of the scene of a dataset, or of its own telescope."""
-    settings = dataset_config(dataset)
-    if has_own_telescope(dataset):
-        return [f"{RESULTS}/figures/telescope/{settings.stars.name}.png"]
-    folder = f"{RESULTS}/figures/{settings.scene.name}"
-    return [f"{folder}/templates.png", f"{folder}/energy.png"]
-
-
 def figures_of(dataset):
-    """Figures of a dataset and of its scene."""
-    settings = dataset_config(dataset)
-    folder = f"{RESULTS}/figures"
+    """Figures of a dataset and of its scene, or of its own telescope."""
+    settings, folder = dataset_config(dataset), f"{RESULTS}/figures"
+    if has_own_telescope(dataset):
+        fields = [f"telescope/{settings.stars.name}"]
+    else:
+        fields = [f"{settings.scene.name}/{name}" for name in ("templates", "energy")]
     return [
-        *field_figures_of(dataset),
+        *(f"{folder}/{field}.png" for field in fields),
         *([f"{folder}/{dataset}/curves.png"] if histories_of(dataset) else []),
         *(f"{folder}/{dataset}/errors_{metric}.png" for metric in ("mse", "ssim")),
         *(f"{folder}/{dataset}/strip_{r}.png" for r in settings.dataset.references),

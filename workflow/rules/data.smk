@@ -6,9 +6,6 @@ rule templates:
     benchmark:
         f"{RESULTS}/benchmarks/templates/{{scene}}.tsv"
     threads: lambda w: composed(f"scene={w.scene}")["optics"]["threads"]
-    resources:
-        mem_mb=500,
-        runtime=10,
     params:
         config=lambda w: settings("templates", f"scene={w.scene}"),
         source=lambda w: source_hash(

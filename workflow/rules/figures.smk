@@ -14,16 +14,15 @@ rule figure_templates:
     benchmark:
         f"{RESULTS}/benchmarks/figure_templates/{{scene}}.tsv"
     params:
+        kind="templates",
         source=source_hash("figure templates"),
     message:
         "Drawing the static PSFs of scene {wildcards.scene}"
     shell:
-        "psfdae figure templates --templates {input} --out {output} > {log} 2>&1"
+        "psfdae figure {params.kind} --templates {input} --out {output} > {log} 2>&1"
 
 
-rule figure_energy:
-    input:
-        rules.templates.output,
+use rule figure_templates as figure_energy with:
     output:
         report(
             f"{RESULTS}/figures/{{scene}}/energy.png",
@@ -37,11 +36,10 @@ rule figure_energy:
     benchmark:
         f"{RESULTS}/benchmarks/figure_energy/{{scene}}.tsv"
     params:
+        kind="energy",
         source=source_hash("figure energy"),
     message:
         "Drawing the light inside the stamps of scene {wildcards.scene}"
-    shell:
-        "psfdae figure energy --templates {input} --out {output} > {log} 2>&1"
 
 
 rule figure_strip:

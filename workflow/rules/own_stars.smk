@@ -9,10 +9,6 @@ rule example_field:
         f"{RESULTS}/logs/own_stars/example_field.log",
     benchmark:
         f"{RESULTS}/benchmarks_on_request/own_stars/example_field.tsv"
-    threads: 1
-    resources:
-        mem_mb=500,
-        runtime=10,
     params:
         source=source_hash("example-field"),
     message:
@@ -73,10 +69,6 @@ rule from_stars_example:
     benchmark:
         f"{RESULTS}/benchmarks_on_request/own_stars/table.tsv"
     localrule: True
-    threads: 1
-    resources:
-        mem_mb=500,
-        runtime=10,
     message:
         "Collecting what was learnt from the image"
     shell:

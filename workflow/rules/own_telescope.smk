@@ -1,4 +1,4 @@
-rule telescope_templates:
+use rule templates as telescope_templates with:
     output:
         f"{OWN_TELESCOPES}/{{stars}}/templates.h5",
     log:
@@ -10,14 +10,11 @@ rule telescope_templates:
     threads: lambda w: dataset_config(w.stars).optics.threads
     resources:
         mem_mb=1000,
-        runtime=10,
     params:
         config=lambda w: settings("templates", f"dataset={w.stars}"),
         source=source_hash("templates", chosen=["psfdae.stars.scenes:TelescopeScene"]),
     message:
         "Propagating the static PSFs of the telescope of {wildcards.stars}"
-    shell:
-        "psfdae templates --config {params.config} --out {output} > {log} 2>&1"
 
 
 use rule stars as telescope_stars with:
@@ -58,10 +55,6 @@ rule figure_telescope:
         f"{RESULTS}/benchmarks/figure_telescope/{{stars}}.tsv"
     wildcard_constraints:
         stars="|".join(ALL_DATASETS),
-    threads: 1
-    resources:
-        mem_mb=500,
-        runtime=10,
     params:
         source=source_hash("figure telescope"),
     message:

@@ -12,10 +12,6 @@ rule runtime:
     log:
         f"{RESULTS}/logs/runtime/all.log",
     localrule: True
-    threads: 1
-    resources:
-        mem_mb=500,
-        runtime=10,
     params:
         results=lambda w: RESULTS,
         source=source_hash("runtime"),

@@ -19,10 +19,6 @@ rule reference:
     log:
         f"{RESULTS}/logs/reference/all.log",
     localrule: True
-    threads: 1
-    resources:
-        mem_mb=500,
-        runtime=10,
     params:
         results=lambda w: RESULTS,
         folder="results/reference",

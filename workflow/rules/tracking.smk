@@ -11,11 +11,8 @@ rule track:
         f"{RESULTS}/benchmarks/track/{{dataset}}.tsv"
     # SQLite takes one machine; jobs that meet on it wait for each other.
     localrule: True
-    threads: 1
-    resources:
-        mem_mb=500,
-        runtime=10,
     params:
+        what=lambda w, input: f"--stars {w.dataset} {input.stars}",
         results=lambda w: RESULTS,
         preset=PRESET,
         # Not an output: Snakemake would delete it, and with it the runs of older configs.
@@ -25,11 +22,10 @@ rule track:
         "Importing the runs of {wildcards.dataset} into MLflow"
     shell:
         "psfdae track --results {params.results} --preset {params.preset}"
-        " --database {params.database} --stars {wildcards.dataset} {input.stars}"
-        " --out {output} > {log} 2>&1"
+        " --database {params.database} {params.what} --out {output} > {log} 2>&1"
 
 
-rule track_alignment:
+use rule track as track_alignment with:
     input:
         rules.alignment_tables.output.errors,
         rules.alignment_dae.output,
@@ -45,17 +41,11 @@ rule track_alignment:
     benchmark:
         f"{RESULTS}/benchmarks/track/alignment.tsv"
     localrule: True
-    threads: 1
-    resources:
-        mem_mb=500,
-        runtime=10,
     params:
+        what="--alignment",
         results=lambda w: RESULTS,
         preset=PRESET,
         database=f"{RESULTS}/mlflow.db",
         source=source_hash("track"),
     message:
         "Importing the runs of scene 3 into MLflow"
-    shell:
-        "psfdae track --results {params.results} --preset {params.preset}"
-        " --database {params.database} --alignment --out {output} > {log} 2>&1"
