@@ -23,13 +23,9 @@ ON_REQUEST = (
 )
 PROFILES = ROOT / "profiles"
 RULES = "".join(path.read_text() for path in (ROOT / "workflow/rules").glob("*.smk"))
-LOCAL = set(
-    re.findall(
-        r"^(?:use rule \w+ as|rule) (\w+)(?: with)?:\n(?:(?!(?:use )?rule ).*\n)*?    localrule: True",
-        RULES,
-        re.M,
-    )
-)
+HEAD = r"(?:use rule \w+ as|rule) (\w+)(?: with)?:\n"
+LOCAL = set(re.findall(rf"^{HEAD}(?:(?!{HEAD}).*\n)*?    localrule: True", RULES, re.M))
+LOCAL = {names[0] for names in LOCAL}
 
 
 @pytest.fixture(scope="module")
