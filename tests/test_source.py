@@ -260,6 +260,19 @@ def listed(name):
 """
 
 
+def test_function_of_a_module_chosen_by_name(small):
+    """Of the module only that function counts."""
+    red = COLOURS["red_scene"]
+
+    def hashed(more):
+        modules = {**COLOURS, "red_scene": red + more}
+        return small(chosen=["psfdae.red_scene:draw"], main=BY_NAME, **modules)
+
+    before = hashed("")
+    assert hashed("\ndef other():\n    return 3\n") == before
+    assert hashed("\n@print\ndef draw():\n    return 3\n") != before
+
+
 CHOSEN = """
 BASE = 2
 WIDEST = 3 * BASE

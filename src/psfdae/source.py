@@ -49,7 +49,7 @@ def source_hash(*functions: str, chosen: Iterable[str] = ()) -> str:
         "file.py:name" of a program, whose imports are looked for beside it, too.
     chosen : iterable of str
         Where a name decides at run time between modules, or between entries of a constant,
-        all are taken unless some of them, or their modules, are among these.
+        all are taken unless some of them, their modules or what is in them are among these.
 
     Raises
     ------
@@ -109,7 +109,7 @@ class Code:
 
     def hash(self, functions: Iterable[str], chosen: Iterable[str] = ()) -> str:
         """As `source_hash`; a definition goes by the place at which it was met, not by its key."""
-        chosen = frozenset(chosen)
+        chosen = frozenset(self.commands.get(choice, choice) for choice in chosen)
         queue = [*dict.fromkeys(self.key(name) for name in functions)]
         places = {key: place for place, key in enumerate(queue)}
         digest = hashlib.sha256()
@@ -142,7 +142,9 @@ class Code:
         """Digest of a definition and what it reaches; of options and entries only those chosen."""
 
         def wanted(keys: Iterable[str]) -> list[str]:
-            return [k for k in keys if k in chosen or k.partition(":")[0] in chosen]
+            inside = {k: sorted(c for c in chosen if c.startswith(f"{k}:")) for k in keys}
+            own = {k for k in inside if k in chosen or k.partition(":")[0] in chosen}
+            return [c for k, cs in inside.items() for c in ([k] if k in own else cs)]
 
         found = self.definition(key)
         # Entries that name functions, classes or modules; numbers and texts all count.

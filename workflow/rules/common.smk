@@ -58,9 +58,9 @@ def program(name):
 
 
 def program_code(name, stages):
-    """Hash of a command of a program, and of the modules of stages that it runs."""
+    """Hash of a command of a program, and of the stages that it runs."""
     function = f"workflow/benchmarks/{name.replace('.', '.py:')}"
-    return source_hash(function, chosen=[f"psfdae.stages.{name}" for name in stages])
+    return source_hash(function, chosen=stages)
 
 
 # Stars of an image are not simulated: own_stars.smk.
