@@ -69,7 +69,7 @@ TIMED = {
     "benchmark_inference": ("benchmark", "speed.inference", {}, 3000, 30, []),
     "benchmark_scaling": (
         *("benchmark", "speed.growth", {}, 2000, 30),
-        ["stars", "predict"],
+        ["templates", "stars", "predict"],
     ),
     "predict_throughput": (
         *("prediction", "prediction.throughput", {**STARS, "bundle": BUNDLE}),
@@ -81,7 +81,7 @@ TIMED = {
     ),
     "scaling_stages": (
         *("scaling", "speed.stages", {}, 4000, 60),
-        ["stars", "fit", "evaluate", "predict"],
+        ["templates", "stars", "fit", "evaluate", "predict"],
     ),
 }
 
