@@ -13,7 +13,6 @@ container: "docker://condaforge/miniforge3:25.3.1-0"
 
 
 include: "workflow/rules/common.smk"
-include: "workflow/rules/common_models.smk"
 include: "workflow/rules/common_targets.smk"
 include: "workflow/rules/common_sweep.smk"
 include: "workflow/rules/data.smk"

@@ -1,42 +1,9 @@
 # Scene 3: states of misalignment, their stamps, the networks, estimates, fits and bounds.
-from psfdae.alignment.methods import CNNS, METHODS
-
-with one_line():
-    ALIGNMENT_OVERRIDES = overrides_for("alignment", GIVEN)
-ALIGNMENT_DATA = f"{RESULTS}/data/alignment"
-ALIGNMENT = f"{RESULTS}/alignment"
-ALIGNMENT_SETS = ["uniform", "grid"]
-
-
 wildcard_constraints:
     states="grid|uniform|train",
     test_set="|".join(ALIGNMENT_SETS),
     cnn="|".join(CNNS),
     level=r"[0-9.e-]+",
-
-
-@cache
-@one_line()
-def alignment_config():
-    """Checked configuration of scene 3; a wrong key stops before any job."""
-    return load(ALIGNMENT_OVERRIDES, "alignment")
-
-
-def as_options(wildcards, input):
-    """Named inputs as options of these names; weights stand for the network's folder."""
-    options = []
-    for name, found in input.items():
-        for path in [found] if isinstance(found, str) else found:
-            value = Path(path).parent if path.endswith(".safetensors") else path
-            options.append(f"--{name.replace('_', '-')}={value}")
-    return options
-
-
-def network_files(name, weights):
-    """What a training of scene 3 leaves."""
-    files = ("config.yaml", "trained_on.yaml", "history.csv")
-    named = {file.partition(".")[0]: f"{ALIGNMENT}/{name}/{file}" for file in files}
-    return {"weights": f"{ALIGNMENT}/{name}/{weights}", **named}
 
 
 rule alignment_model:

@@ -1,20 +1,4 @@
 # Tables and figures of scene 3.
-def fits_of(*test_sets, what="out"):
-    """Fits of test sets, or their times, at all noise levels."""
-    levels = [f"{level:g}" for level in alignment_config().noise.levels]
-    path = getattr(rules.alignment_fit.output, what)
-    return expand(path, test_set=test_sets, level=levels)
-
-
-def of_scene3(name, part, shown, caption=None):
-    """A product of scene 3 in the report."""
-    return report(
-        f"{RESULTS}/{name}",
-        caption=f"../report/{caption or f'figure_alignment_{Path(name).stem}'}.rst",
-        category="Scene 3: alignment of a mirror",
-        subcategory=part,
-        labels={"figure": shown},
-    )
 
 
 rule alignment_tables:

@@ -1,3 +1,5 @@
+from psfdae.alignment.methods import CNNS, METHODS
+
 with one_line():
     KNEE = import_module("trainings").load_knee()
 FRESH = "fresh_realisations"
@@ -65,3 +67,52 @@ def timed_threads(w):
 def poppy_stars(w):
     """A small preset has small test parts; POPPY takes its time for each star."""
     return min(POPPY_STARS, dataset_config(TIMED_DATASET).parts.test_stars)
+
+
+with one_line():
+    ALIGNMENT_OVERRIDES = overrides_for("alignment", GIVEN)
+ALIGNMENT_DATA = f"{RESULTS}/data/alignment"
+ALIGNMENT = f"{RESULTS}/alignment"
+ALIGNMENT_SETS = ["uniform", "grid"]
+
+
+@cache
+@one_line()
+def alignment_config():
+    """Checked configuration of scene 3; a wrong key stops before any job."""
+    return load(ALIGNMENT_OVERRIDES, "alignment")
+
+
+def as_options(wildcards, input):
+    """Named inputs as options of these names; weights stand for the network's folder."""
+    options = []
+    for name, found in input.items():
+        for path in [found] if isinstance(found, str) else found:
+            value = Path(path).parent if path.endswith(".safetensors") else path
+            options.append(f"--{name.replace('_', '-')}={value}")
+    return options
+
+
+def network_files(name, weights):
+    """What a training of scene 3 leaves."""
+    files = ("config.yaml", "trained_on.yaml", "history.csv")
+    named = {file.partition(".")[0]: f"{ALIGNMENT}/{name}/{file}" for file in files}
+    return {"weights": f"{ALIGNMENT}/{name}/{weights}", **named}
+
+
+def fits_of(*test_sets, what="out"):
+    """Fits of test sets, or their times, at all noise levels."""
+    levels = [f"{level:g}" for level in alignment_config().noise.levels]
+    path = getattr(rules.alignment_fit.output, what)
+    return expand(path, test_set=test_sets, level=levels)
+
+
+def of_scene3(name, part, shown, caption=None):
+    """A product of scene 3 in the report."""
+    return report(
+        f"{RESULTS}/{name}",
+        caption=f"../report/{caption or f'figure_alignment_{Path(name).stem}'}.rst",
+        category="Scene 3: alignment of a mirror",
+        subcategory=part,
+        labels={"figure": shown},
+    )
