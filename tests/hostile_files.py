@@ -365,7 +365,7 @@ def command(kind, path, out, rng):
 
 def run(words):
     """The command in this process; never returns."""
-    from psfdae.cli import Commands, main
+    from psfdae.cli import Careful, main
 
     if words[0] == "load":
         import click
@@ -374,7 +374,7 @@ def run(words):
 
         path = Path(words.pop())
         load = click.Command("load", callback=lambda: load_weights(path))
-        main = Commands(commands={"load": load})
+        main = Careful(commands={"load": load})
     code = 1
     try:
         main(words, prog_name="psfdae")
