@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from psfdae.configuration.compose import load_stage
+from psfdae.configuration.consistency import SIMULATION, STATIC
 from psfdae.files import read_product
 from psfdae.stages import stars
 
@@ -30,8 +31,8 @@ def fresh_psfs(folder, count):
     """Noise-free stars of flux 1 with aberrations that no training has seen, float64."""
     overrides = ["dataset=field", "seed=7", f"stars.count={count}"]
     overrides += ["parts.train_stars=1", "parts.test_stars=1"]
-    stars.templates(load_stage("templates", overrides), folder / "templates.h5")
-    stars.stars(load_stage("stars", overrides), folder / "templates.h5", folder / "stars.h5")
+    stars.templates(load_stage(STATIC, overrides), folder / "templates.h5")
+    stars.stars(load_stage(SIMULATION, overrides), folder / "templates.h5", folder / "stars.h5")
     product = read_product(folder / "stars.h5", "stars", ("realisation",))
     return product["realisation"].astype(np.float64)
 

@@ -13,7 +13,8 @@ from click.testing import CliRunner
 from psfdae.belonging import write_origin
 from psfdae.cli import main
 from psfdae.configuration.compose import load_stage
-from psfdae.estimators import dae_onnx
+from psfdae.configuration.consistency import SIMULATION, STATIC
+from psfdae.estimators import dae_onnx, groups_of
 from psfdae.files import Column, ProductError, read_product, write_product
 from psfdae.own_stars import packing
 from psfdae.own_stars.bundle import (
@@ -73,7 +74,7 @@ def folder(tmp_path_factory):
     """Stars, a network trained on them, and its bundle."""
     folder = tmp_path_factory.mktemp("bundle")
     stars = write_stars(folder / "stars.h5", STARS)
-    config = load_stage("train", TINY)
+    config = load_stage(groups_of("dae"), TINY)
     train(config, stars, out=folder / "dae")
     pack(folder, folder / "tiny.psf.safetensors")
     return folder
@@ -310,8 +311,8 @@ def test_shipped_bundle_covers_stars_that_nobody_has_seen(tmp_path):
 
     sizes = ["seed=11", "grid.points=5", "grid.spacing_deg=2.75", "stars.count=500"]
     chosen = ["dataset=field", *sizes, "parts.train_stars=400", "parts.test_stars=100"]
-    stars.templates(load_stage("templates", chosen), tmp_path / "t.h5")
-    stars.stars(load_stage("stars", chosen), tmp_path / "t.h5", tmp_path / "s.h5")
+    stars.templates(load_stage(STATIC, chosen), tmp_path / "t.h5")
+    stars.stars(load_stage(SIMULATION, chosen), tmp_path / "t.h5", tmp_path / "s.h5")
     images = read_product(tmp_path / "s.h5", "stars", ("realisation",))["realisation"]
     bundle, rng = read_bundle(), stream(11, "coverage")
     band = np.log([bundle.info.noise_min, bundle.info.noise_max])

@@ -19,6 +19,7 @@ from click.testing import CliRunner
 from fits_inputs import write_cube
 from psfdae.cli import main
 from psfdae.configuration.compose import ConfigError, load_stage
+from psfdae.estimators import groups_of
 from psfdae.files import read_product, write_product
 from psfdae.own_stars.bundle import estimator, read_bundle
 from psfdae.own_stars.example import (
@@ -34,6 +35,7 @@ from psfdae.own_stars.training_images import make_images, star_grid, training_co
 from psfdae.rng import stream
 from psfdae.stages import example_field as example_stage
 from psfdae.stages.common import noise_model, split_stars
+from psfdae.stages.evaluate import READS
 from psfdae.stages.from_stars import Source, _alone, from_stars
 from psfdae.stars.fields import held_out_fields
 
@@ -203,7 +205,7 @@ def test_command_leaves_a_model_and_a_report(model):
 
 def test_settings_can_be_used_by_hand(model, tmp_path):
     out, _ = model
-    config = load_stage("train", (out / "overrides.txt").read_text().split())
+    config = load_stage(groups_of("dae"), (out / "overrides.txt").read_text().split())
     assert config.noise.kappa == 1.0
     assert len(config.noise.levels) == 4
     by_hand = [*("train", "--stars", str(out / "stars.h5"), "--split", "held_out")]
@@ -347,7 +349,7 @@ def test_one_command_beats_the_noisy_star_and_the_baseline(tmp_path):
     # Against what the simulation knows, too, and not only the bright star's own image.
     product = read_product(out / "stars.h5", "stars")
     bundle = read_bundle(out / "i.psf.safetensors")
-    config = load_stage("evaluate", (out / "overrides.txt").read_text().split())
+    config = load_stage(READS, (out / "overrides.txt").read_text().split())
     test = split_stars(product, "held_out", config).test
     level = min(config.noise.levels, key=lambda v: abs(v - noisy.noise[ten]))
     drawn = noise_model(config).draw(product["realisation"][test], level, stream(9, "exact"))

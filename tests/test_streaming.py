@@ -10,6 +10,7 @@ import speed
 from measure import alone, cost_of_command
 from prediction import make_cube
 from psfdae.configuration.compose import compose, load_stage
+from psfdae.configuration.consistency import SIMULATION, STATIC
 from psfdae.files import Column, Empty, ProductError, read_product, stream_product, write_product
 from psfdae.optics.wavefronts import ModalWavefronts, monomial_images
 from psfdae.stages import stars
@@ -27,8 +28,8 @@ CHEAP = (
 def cheap(tmp_path_factory):
     """Config of 50 stars with weak aberrations on small pupils, and their templates."""
     path = tmp_path_factory.mktemp("cheap") / "templates.h5"
-    stars.templates(load_stage("templates", CHEAP), path)
-    return load_stage("stars", [*CHEAP, "stars.count=50"]), path
+    stars.templates(load_stage(STATIC, CHEAP), path)
+    return load_stage(SIMULATION, [*CHEAP, "stars.count=50"]), path
 
 
 def test_streamed_product_is_that_of_one_write(tmp_path):
@@ -92,7 +93,7 @@ def test_slopes_do_not_depend_on_the_batch():
 
 def test_search_is_exact_for_large_pixels():
     """Scene 2's pixel is 1.6 λ/D wide: fewer nodes in the search shift its brightest pixels."""
-    config = load_stage("templates", ["scene=turbulence", "optics.threads=1"])
+    config = load_stage(STATIC, ["scene=turbulence", "optics.threads=1"])
     source = template_wavefronts(config)
     # Measuring 400 slopes takes longer than the test; the largest grid serves all.
     source.slopes = lambda: np.zeros((len(source), 2, 2))  # type: ignore[method-assign]

@@ -13,6 +13,7 @@ import yaml
 
 from psfdae.configuration.compose import compose, load, load_stage, stage_tree
 from psfdae.configuration.sweep import point_groups
+from psfdae.estimators import groups_of
 from psfdae.estimators.pca_som import PcaSom
 from psfdae.files import Column, ProductError, write_product
 from psfdae.stages import sweep as stage
@@ -79,7 +80,7 @@ def test_point_is_the_main_workflow_s_training(point, stars, tmp_path):
     result = point.run()
     assert result["status"] == "finished"
     assert (result["epochs"], result["attempt"]) == (3, 0)
-    config = load_stage("train", TINY)
+    config = load_stage(groups_of("dae"), TINY)
     train(config, stars, out=tmp_path / "main")
     for name in ("dae.safetensors", "config.yaml"):
         assert (tmp_path / "main" / name).read_bytes() == (point.folder / name).read_bytes()
@@ -149,7 +150,7 @@ def test_failed_point_is_a_result_with_its_reason(point):
 
 def test_baseline_is_the_main_workflow_s(point, stars, tmp_path):
     assert point.run(model="pca_som")["status"] == "finished"
-    baseline(load_stage("baseline", TINY), stars, out=tmp_path / "main.h5")
+    baseline(load_stage(groups_of("pca_som"), TINY), stars, out=tmp_path / "main.h5")
     assert (tmp_path / "main.h5").read_bytes() == (point.folder / "pca_som.h5").read_bytes()
 
 
@@ -165,7 +166,7 @@ def test_baseline_is_validated_on_stars_that_it_has_not_seen(tmp_path, gaussian_
     errors = table[table.metric == "mse"].value
     # The spike alone, missed, is 1/256 per pixel.
     assert (errors > 0.9 / 256).all()
-    config = load_stage("baseline", TINY)
+    config = load_stage(groups_of("pca_som"), TINY)
     noisy = noise_model(config).draw(images[validation], 0.001, np.random.default_rng(0))
     seen = PcaSom.load(point.folder / "pca_som.h5").predict(noisy)
     assert ((seen - images[validation]) ** 2).mean() < 0.1 / 256
@@ -313,7 +314,7 @@ def test_best_overrides_are_what_the_point_was(tmp_path):
     summarise(tmp_path)
     text = " ".join(sweep_summary.best_overrides(tmp_path, "tried"))
     assert text == "train.epochs=3 dae.widths=[8,8,8,8,8,8,8,8,8] train.lr=0.004"
-    tree = stage_tree("train", compose(("preset=smoke", *shlex.split(text))))
+    tree = stage_tree(groups_of("dae"), compose(("preset=smoke", *shlex.split(text))))
     assert (tree["train"]["lr"], tree["train"]["epochs"]) == (0.004, 3)
     assert tree["dae"]["widths"] == [8] * 9
 

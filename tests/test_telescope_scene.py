@@ -19,6 +19,7 @@ from psfdae.configuration.compose import (
     load_stage,
     stage_tree,
 )
+from psfdae.configuration.consistency import SIMULATION, STATIC
 from psfdae.files import read_product
 from psfdae.optics.pupil import annular_pupil
 from psfdae.optics.raytracing import RayTracingError
@@ -183,8 +184,8 @@ def test_seidel_telescope_is_scene_1_byte_by_byte(tmp_path):
     products = []
     for name, choice in (("paper", ["stars=seidel_10pct"]), ("own", own)):
         fields, out = tmp_path / f"{name}_t.h5", tmp_path / f"{name}.h5"
-        stars.templates(load_stage("templates", [*choice, *small]), fields)
-        stars.stars(load_stage("stars", [*choice, *small]), fields, out)
+        stars.templates(load_stage(STATIC, [*choice, *small]), fields)
+        stars.stars(load_stage(SIMULATION, [*choice, *small]), fields, out)
         products.append((read_product(fields, "templates"), read_product(out, "stars")))
     for paper, mine in zip(*products, strict=True):
         assert set(paper.arrays) == set(mine.arrays)
@@ -209,8 +210,8 @@ def test_random_aberrations_have_both_spreads():
 
 def test_stars_of_zernike_telescope_differ_from_their_template(tmp_path):
     choice = [OWN, "grid.points=3", "stars.count=20"]
-    stars.templates(load_stage("templates", choice), tmp_path / "t.h5")
-    stars.stars(load_stage("stars", choice), tmp_path / "t.h5", tmp_path / "s.h5")
+    stars.templates(load_stage(STATIC, choice), tmp_path / "t.h5")
+    stars.stars(load_stage(SIMULATION, choice), tmp_path / "t.h5", tmp_path / "s.h5")
     product = read_product(tmp_path / "s.h5", "stars")
     assert product["realisation"].sum(axis=(1, 2)) == pytest.approx(np.ones(20), abs=1e-5)
     assert np.abs(product["realisation"] - product["template"]).max() > 0.01
@@ -229,7 +230,7 @@ def test_what_follows_from_the_telescope():
 
 def test_other_scenes_keep_their_groups():
     """Their products hold the configuration; a new key would change their bytes."""
-    dumped = load_stage("templates", ["scene=seidel"]).model_dump()
+    dumped = load_stage(STATIC, ["scene=seidel"]).model_dump()
     keys = {"name", "diameter_m", "obscuration", "wavelength_m", "pixel_scale_arcsec"}
     assert set(dumped["telescope"]) == keys
     assert dumped["wavefront"]["kind"] == "seidel"
@@ -240,8 +241,10 @@ def test_workflow_s_overrides_reproduce_the_configuration(telescope):
     """Options that differ in their keys are chosen by name, then every key is pinned."""
     option = f"telescope=example_{telescope}"
     chosen = (OWN, option, "preset=smoke")
-    tree = stage_tree("stars", compose(chosen))
-    assert load_stage("stars", [OWN, option, *as_overrides(tree)]) == load_stage("stars", chosen)
+    tree = stage_tree(SIMULATION, compose(chosen))
+    assert load_stage(SIMULATION, [OWN, option, *as_overrides(tree)]) == load_stage(
+        SIMULATION, chosen
+    )
 
 
 TERMS = "telescope.aberrations.terms"
@@ -283,7 +286,7 @@ def test_simulate_writes_what_the_stage_writes(tmp_path):
     assert result.exit_code == 0, result.output
     names = {"templates.h5", "psfs.png", "fields.csv", "psfs.fits", "image.fits", "stars.csv"}
     assert {path.name for path in (tmp_path / "mine").iterdir()} == names
-    stars.templates(load_stage("templates", [OWN, *CHOICE]), tmp_path / "t.h5")
+    stars.templates(load_stage(STATIC, [OWN, *CHOICE]), tmp_path / "t.h5")
     assert (tmp_path / "mine/templates.h5").read_bytes() == (tmp_path / "t.h5").read_bytes()
     table = np.genfromtxt(tmp_path / "mine/fields.csv", delimiter=",", names=True)
     assert sorted(set(table["x_deg"])) == [-1, 0, 1]

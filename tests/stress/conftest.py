@@ -17,7 +17,7 @@ import torch
 from threadpoolctl import threadpool_limits
 
 from psfdae.configuration.compose import load, load_settings, part
-from psfdae.configuration.stages import SIMULATION
+from psfdae.configuration.consistency import SIMULATION
 from psfdae.files import read_product, write_text
 from stress.bench import THREADS, Bench, Scene, simulated
 

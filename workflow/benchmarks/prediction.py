@@ -18,8 +18,8 @@ from measure import alone, cost_of_command, write, yes
 from psfdae.belonging import STARS, require
 from psfdae.cli import File, command, program
 from psfdae.configuration.compose import ConfigError
+from psfdae.configuration.consistency import SIMULATION
 from psfdae.configuration.schema import Config
-from psfdae.configuration.stages import SIMULATION
 from psfdae.files import ProductError, read_product
 from psfdae.reading import read_table
 from psfdae.rng import stream

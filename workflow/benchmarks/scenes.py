@@ -6,8 +6,8 @@ from functools import lru_cache
 
 import numpy as np
 
+from psfdae.configuration.consistency import SIMULATION
 from psfdae.configuration.schema import Framing, Optics
-from psfdae.configuration.stages import SIMULATION
 from psfdae.configuration.telescope import Telescope
 from psfdae.optics.propagation import StampPropagator
 from psfdae.optics.pupil import annular_pupil

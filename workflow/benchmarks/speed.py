@@ -15,8 +15,8 @@ import numpy as np
 from measure import alone, cost_of_command, write
 from prediction import make_cube
 from psfdae.cli import File, command, program
+from psfdae.configuration.consistency import SIMULATION
 from psfdae.configuration.schema import Config
-from psfdae.configuration.stages import SIMULATION
 from psfdae.rng import stream
 
 BATCHES = (1, 16, 64, 256, 1024)

@@ -12,8 +12,8 @@ from psfdae.belonging import STARS, require
 from psfdae.cli import File, command, program
 from psfdae.configuration.base import Group
 from psfdae.configuration.compose import config_dir, decisive, load_file, part
+from psfdae.configuration.consistency import SIMULATION
 from psfdae.configuration.schema import Config
-from psfdae.configuration.stages import SIMULATION
 from psfdae.files import read_product
 from psfdae.reading import read_table, read_yaml
 from psfdae.rng import stream

@@ -14,9 +14,8 @@ from pydantic import ValidationError, create_model
 
 from psfdae.configuration.alignment import AlignmentConfig
 from psfdae.configuration.base import NEUTRAL, ConfigError, config_dir
-from psfdae.configuration.consistency import Consistent, with_derived
+from psfdae.configuration.consistency import Consistent, stage_model, with_derived
 from psfdae.configuration.schema import Group, whole_config
-from psfdae.configuration.stages import STAGE_KEYS, stage_model
 from psfdae.estimators import listed, registered
 from psfdae.files import ProductError, write_text
 from psfdae.reading import parse_yaml
@@ -181,9 +180,7 @@ def validate(model: type[Any], tree: Mapping[str, Any]) -> Any:
         raise ConfigError("\n".join(_finding(e) for e in error.errors())) from None
 
 
-def load_stage(
-    reads: str | tuple[str, ...], overrides: Sequence[str] = (), root: Root = "config"
-) -> Any:
+def load_stage(reads: tuple[str, ...], overrides: Sequence[str] = (), root: Root = "config") -> Any:
     """Compose the configuration and check the groups that a stage reads.
 
     Returns
@@ -244,7 +241,7 @@ def write_settings(
     return path
 
 
-def part(reads: str | tuple[str, ...], tree: Any, root: Root = "config") -> Any:
+def part(reads: tuple[str, ...], tree: Any, root: Root = "config") -> Any:
     """Some groups of a configuration, a tree or a model, checked.
 
     Raises
@@ -252,14 +249,13 @@ def part(reads: str | tuple[str, ...], tree: Any, root: Root = "config") -> Any:
     ConfigError
         As `load`.
     """
-    keys = STAGE_KEYS[reads] if isinstance(reads, str) else reads
     tree = tree if isinstance(tree, Mapping) else tree.model_dump()
-    found = {key: tree[key] for key in keys if key in tree}
-    return validate(stage_model(keys, model_of(root)), found)
+    found = {key: tree[key] for key in reads if key in tree}
+    return validate(stage_model(reads, model_of(root)), found)
 
 
 def stage_tree(
-    reads: str | tuple[str, ...], tree: Mapping[str, Any], root: Root = "config"
+    reads: tuple[str, ...], tree: Mapping[str, Any], root: Root = "config"
 ) -> dict[str, Any]:
     """The part of a configuration tree that a stage reads.
 
@@ -270,12 +266,11 @@ def stage_tree(
     ConfigError
         If nothing can follow from them.
     """
-    keys = STAGE_KEYS[reads] if isinstance(reads, str) else reads
     tree = _derived(tree) if issubclass(model_of(root), Consistent) else tree
-    missing = [key for key in keys if key not in tree]
+    missing = [key for key in reads if key not in tree]
     if missing:
         raise ConfigError(f"{missing[0]}: missing")
-    return {key: tree[key] for key in keys}
+    return {key: tree[key] for key in reads}
 
 
 def _derived(tree: Mapping[str, Any]) -> dict[str, Any]:

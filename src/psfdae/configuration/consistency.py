@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
 from typing import Any
 
 import numpy as np
-from pydantic import ValidationError, model_validator
+from pydantic import ValidationError, create_model, model_validator
 
 from psfdae.configuration.base import SEARCH, Group
 from psfdae.configuration.telescope import Telescope, has_own_aberrations
 from psfdae.optics.pupil import required_nodes
+
+SIMULATION = ("seed", "scene", "telescope", "grid", "wavefront", "stars", "framing", "optics")
+"""Groups that decide the noise-free stars."""
+
+STATIC = ("scene", "telescope", "grid", "wavefront", "framing", "optics")
+"""Groups that decide the static PSFs."""
 
 OWN_SCENE = "telescope"
 """The scene of a telescope that brings its own aberrations."""
@@ -145,3 +152,11 @@ def _space(grid: dict[str, Any]) -> None:
     if grid.get("spacing_deg", 0) is None and isinstance(edge, int | float):
         # One point has no neighbour; any distance will do.
         grid["spacing_deg"] = 2.0 * edge / max(points - 1, 1) if isinstance(points, int) else edge
+
+
+@cache
+def stage_model(keys: tuple[str, ...], root: type[Group]) -> type[Group]:
+    """Some config groups of a root as a model of their own."""
+    fields = {key: (root.model_fields[key].rebuild_annotation(), ...) for key in keys}
+    base = Consistent if issubclass(root, Consistent) else Group
+    return create_model("Settings", __base__=base, **fields)  # type: ignore[call-overload]

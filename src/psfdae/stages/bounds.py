@@ -26,8 +26,8 @@ from psfdae.bounds.posterior import (
     segments,
 )
 from psfdae.cli import File, command
+from psfdae.configuration.consistency import SIMULATION
 from psfdae.configuration.schema import Config
-from psfdae.configuration.stages import SIMULATION
 from psfdae.evaluation.metrics import clustered_mean, mse
 from psfdae.files import (
     Column,

@@ -10,8 +10,8 @@ import numpy as np
 
 from psfdae.belonging import STATIC, require
 from psfdae.cli import File, Folder, command
+from psfdae.configuration.consistency import SIMULATION
 from psfdae.configuration.schema import Config
-from psfdae.configuration.stages import SIMULATION
 from psfdae.evaluation.calibration import (
     fit_scales,
     kappa_of_mse,

@@ -30,7 +30,6 @@ def _print(
     import yaml
 
     from psfdae.configuration.compose import load, load_stage
-    from psfdae.configuration.stages import STAGE_KEYS
 
     stages = {_key(name): name for name in found()}
     if only is None:
@@ -38,8 +37,6 @@ def _print(
     elif _key(only) in stages and (spec := stage(stages[_key(only)]).stage).root == root:
         reads = spec.reads() if callable(spec.reads) else spec.reads
         checked = load_stage(reads, overrides, root)
-    elif root == "config" and _key(only) in STAGE_KEYS:
-        checked = load_stage(_key(only), overrides)
     else:
         names = [name for name in found() if name.startswith("alignment ") == (root != "config")]
         raise click.BadParameter(f"{only!r} is not one of {', '.join(sorted(names))}")

@@ -11,8 +11,8 @@ import numpy as np
 
 import psfdae
 from psfdae.cli import File, Folder, command
+from psfdae.configuration.consistency import STATIC
 from psfdae.configuration.schema import Config
-from psfdae.configuration.stages import STATIC
 from psfdae.evaluation.figures import FieldOfPsfs, field_of_psfs
 from psfdae.files import Product, atomic_path, read_product, write_csv, write_fits
 from psfdae.own_stars.example import add_stamps, write_field

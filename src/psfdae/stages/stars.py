@@ -8,8 +8,8 @@ import numpy as np
 
 from psfdae import belonging
 from psfdae.cli import File, command
+from psfdae.configuration.consistency import SIMULATION, STATIC
 from psfdae.configuration.schema import Config
-from psfdae.configuration.stages import SIMULATION, STATIC
 from psfdae.files import Column, Empty, read_product, stream_product, write_product
 from psfdae.rng import stream
 from psfdae.stages.common import drawn_columns, limit_threads, star_wavefronts, template_wavefronts

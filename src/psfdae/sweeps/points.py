@@ -17,6 +17,7 @@ from psfdae.configuration.compose import (
     stage_tree,
     validate,
 )
+from psfdae.configuration.consistency import SIMULATION
 from psfdae.configuration.sweep import Sweep, load_sweep
 from psfdae.sweeps.space import SweepError, changes, draws, grid, with_values
 from psfdae.tracking import hash_of
@@ -137,7 +138,7 @@ class Plan:
     def _data(self) -> dict[str, Any]:
         """Configuration of the images that all points share."""
         if self.sweep.root == "config":
-            return stage_tree("stars", self._base)
+            return stage_tree(SIMULATION, self._base)
         from psfdae.stages.alignment import states
 
         reads = states.stage.reads  # type: ignore[attr-defined]
