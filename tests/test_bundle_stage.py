@@ -14,7 +14,7 @@ from psfdae.belonging import write_origin
 from psfdae.cli import main
 from psfdae.configuration.compose import load_stage
 from psfdae.configuration.consistency import SIMULATION, STATIC
-from psfdae.estimators import dae_onnx, groups_of
+from psfdae.estimators import dae_network, groups_of
 from psfdae.files import Column, ProductError, read_product, write_product
 from psfdae.own_stars import packing
 from psfdae.own_stars.bundle import (
@@ -271,21 +271,21 @@ def test_commands_pack_describe_and_export(folder, tmp_path):
     result = runner.invoke(main, ["export", str(path), "--out", str(onnx)])
     assert result.exit_code == 0, result.output
     images = gaussians(5, 11)
-    found = dae_onnx.session(onnx, threads=1).run(None, {"images": images})[0]
+    found = dae_network.session(onnx, threads=1).run(None, {"images": images})[0]
     expected = estimator(read_bundle(path)).predict(images)
-    assert np.abs(found - expected).max() <= dae_onnx.TOLERANCE * expected.max()
+    assert np.abs(found - expected).max() <= dae_network.ONNX_TOLERANCE * expected.max()
 
 
 def test_export_of_a_wrong_network_fails_and_leaves_no_file(folder, tmp_path, monkeypatch):
-    plain = dae_onnx._plain
+    plain = dae_network._plain
 
     def wrong(layer):
         changed = plain(layer)
         changed.weight = torch.nn.Parameter(changed.weight * 1.001)
         return changed
 
-    monkeypatch.setattr(dae_onnx, "_plain", wrong)
-    with pytest.raises(dae_onnx.ExportError, match="differs from torch"):
+    monkeypatch.setattr(dae_network, "_plain", wrong)
+    with pytest.raises(dae_network.ExportError, match="differs from torch"):
         stage.export(folder / "tiny.psf.safetensors", out=tmp_path / "x.onnx")
     assert list(tmp_path.iterdir()) == []
 

@@ -13,8 +13,7 @@ from command_line import psfdae
 from psfdae.configuration.compose import ConfigError, config_dir, forget, load
 from psfdae.files import ProductError
 from psfdae.reading import read_csv, read_json, read_table, read_yaml
-from psfdae.sweeps.points import plan_sweep
-from psfdae.sweeps.space import SweepError
+from psfdae.sweeps.points import SweepError, plan_sweep
 from trainings import load_knee
 
 DATASET = ["config"]

@@ -33,7 +33,7 @@ from psfdae.own_stars.selection import brightest_pixels, collect, star_centres
 from psfdae.own_stars.stamps import cut
 from psfdae.own_stars.training_images import make_images, star_grid, training_columns
 from psfdae.rng import stream
-from psfdae.stages import example_field as example_stage
+from psfdae.stages import simulate
 from psfdae.stages.common import noise_model, split_stars
 from psfdae.stages.evaluate import READS
 from psfdae.stages.from_stars import Source, _alone, from_stars
@@ -54,7 +54,7 @@ def field(tmp_path_factory):
     """A small simulated image with its star list, and the truth."""
     folder = tmp_path_factory.mktemp("field")
     paths = folder / "image.fits", folder / "stars.csv"
-    return *paths, example_stage.write_example(*paths, seed=5, **SIDE)
+    return *paths, simulate.write_example(*paths, seed=5, **SIDE)
 
 
 @pytest.fixture(scope="module")
@@ -333,7 +333,7 @@ def test_target_from_stars_example_is_planned(tmp_path):
 def test_one_command_beats_the_noisy_star_and_the_baseline(tmp_path):
     """Show 4: 300 bright stars, 16 × 16 px, held-out stars at S/N 10, minutes of one core."""
     image, catalogue, out = (tmp_path / name for name in ("i.fits", "s.csv", "model"))
-    made = example_stage.write_example(image, catalogue, seed=1)
+    made = simulate.write_example(image, catalogue, seed=1)
     words = ["from-stars", image, "--catalogue", catalogue, "--out", out]
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     subprocess.run([sys.executable, "-m", "psfdae", *map(str, words)], check=True)

@@ -17,13 +17,13 @@ from psfdae.estimators import groups_of
 from psfdae.estimators.pca_som import PcaSom
 from psfdae.files import Column, ProductError, write_product
 from psfdae.stages import sweep as stage
-from psfdae.stages import sweep_figures, sweep_summary, track
+from psfdae.stages import sweep_summary, track
 from psfdae.stages.alignment_methods import train_cnn
 from psfdae.stages.common import noise_model
 from psfdae.stages.fit import baseline, train
 from psfdae.stars.fields import random_split
 from psfdae.sweeps.measured import Task
-from psfdae.sweeps.space import SweepError
+from psfdae.sweeps.points import SweepError
 from psfdae.tracking import runs_of_sweep
 
 SIZES = ("parts.train_stars=160", "parts.test_stars=60", "noise.levels=[0.001,0.005]")
@@ -328,7 +328,7 @@ def test_best_of_a_sweep_that_was_not_run_says_what_to_do(tmp_path):
 def test_figures_are_drawn_with_failed_points_and_the_same_again(tmp_path, kind):
     out = summarise(tmp_path)
     for name in ("a.png", "b.png"):
-        sweep_figures.sweep_figure(kind, out / "sweep.yaml", out / "summary.csv", tmp_path / name)
+        sweep_summary.sweep_figure(kind, out / "sweep.yaml", out / "summary.csv", tmp_path / name)
     image = (tmp_path / "a.png").read_bytes()
     assert image.startswith(b"\x89PNG")
     assert image == (tmp_path / "b.png").read_bytes()

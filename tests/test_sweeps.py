@@ -14,8 +14,7 @@ from psfdae.configuration import compose
 from psfdae.configuration.compose import ConfigError, config_dir, load
 from psfdae.configuration.sweep import Axis, load_sweep, sweep_names
 from psfdae.sweeps import adaptive
-from psfdae.sweeps.points import plan_sweep
-from psfdae.sweeps.space import SweepError, draws, grid, tidy, with_values
+from psfdae.sweeps.points import SweepError, draws, grid, plan_sweep, tidy, with_values
 
 PRESETS = sorted(p.stem for p in config_dir().glob("preset/*.yaml"))
 GRID = {

@@ -68,7 +68,7 @@ def onnx_path(folder, width, side):
 
 def export_networks(dae, sizes, folder):
     """Export random networks of each width and side of the stamps."""
-    from psfdae.estimators.dae_onnx import export_onnx
+    from psfdae.estimators.dae_network import export_onnx
 
     for size in sizes:
         export_onnx(*random_network(dae, *size), size[1], onnx_path(folder, *size))
@@ -77,7 +77,7 @@ def export_networks(dae, sizes, folder):
 def network(engine, dae, folder, size, threads):
     """An exported network, or in torch `predict` as every stage calls it."""
     if engine == "onnxruntime":
-        from psfdae.estimators.dae_onnx import session
+        from psfdae.estimators.dae_network import session
 
         run = session(onnx_path(folder, *size), threads).run
         return lambda images: run(None, {"images": images})[0]

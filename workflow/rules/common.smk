@@ -15,7 +15,7 @@ from psfdae.configuration.compose import write_settings
 from psfdae.estimators import HISTORY, method, registered
 from psfdae.files import DIGESTS, ProductError
 from psfdae.source import source_hash
-from psfdae.sweeps.space import SweepError
+from psfdae.sweeps.points import SweepError
 
 validate(config, "../schemas/command_line.schema.yaml")
 

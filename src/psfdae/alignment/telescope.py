@@ -23,8 +23,8 @@ from itertools import combinations_with_replacement, product
 import numpy as np
 
 from psfdae.configuration.alignment import Alignment
-from psfdae.configuration.prescription import Prescription
 from psfdae.configuration.telescope import Telescope
+from psfdae.configuration.wavefront import Prescription
 from psfdae.optics.raytracing import ZernikeTracer, build_optic
 from psfdae.stars.symmetry import SYMMETRIES, Symmetry
 

@@ -12,7 +12,6 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from psfdae.configuration.base import CheckpointSeconds
-from psfdae.configuration.prescription import Prescription
 from psfdae.configuration.schema import (
     Count,
     Evaluation,
@@ -21,6 +20,7 @@ from psfdae.configuration.schema import (
     Positive,
 )
 from psfdae.configuration.telescope import Telescope
+from psfdae.configuration.wavefront import Prescription
 from psfdae.estimators.dae import DaeSettings, Train
 
 

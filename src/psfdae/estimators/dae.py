@@ -219,7 +219,7 @@ class Dae(Method):
 
     def export(self, stamp_px: int, path: Path) -> None:
         """Write the network as ONNX and check it against torch; raises ExportError."""
-        from psfdae.estimators.dae_onnx import export_onnx
+        from psfdae.estimators.dae_network import export_onnx
 
         export_onnx(self.network, self.factor(stamp_px), stamp_px, path)
 

@@ -23,8 +23,8 @@ from scipy.spatial.transform import Rotation
 from psfdae.optics.wavefronts import noll_to_nm, zernike_basis
 
 if TYPE_CHECKING:
-    from psfdae.configuration.prescription import Lens, Prescription
     from psfdae.configuration.telescope import Telescope
+    from psfdae.configuration.wavefront import Lens, Prescription
 
 DEGREES_OF_FREEDOM = ("decenter_x", "decenter_y", "tilt_x", "tilt_y")
 """Order of the four numbers of a state of misalignment."""

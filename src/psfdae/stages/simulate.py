@@ -15,11 +15,12 @@ from psfdae.configuration.consistency import STATIC
 from psfdae.configuration.schema import Config
 from psfdae.evaluation.figures import FieldOfPsfs, field_of_psfs
 from psfdae.files import Product, atomic_path, read_product, write_csv, write_fits
-from psfdae.own_stars.example import add_stamps, write_field
+from psfdae.own_stars.example import ExampleField, FieldRecipe, add_stamps, write_field
+from psfdae.own_stars.example import example_field as simulated
 from psfdae.own_stars.photometry import noise_equivalent_px
 from psfdae.own_stars.shapes import measure_shapes
 from psfdae.rng import stream
-from psfdae.stages.common import template_wavefronts
+from psfdae.stages.common import check_outputs, template_wavefronts
 from psfdae.stages.figures import without_margin, write_png
 from psfdae.stages.stars import templates
 from psfdae.stars.framing import normalise_flux
@@ -271,3 +272,41 @@ def write_image(
         GAIN=1.0,
         TELESCOP=config.telescope.name,
     )
+
+
+@command("example-field")
+def example_field(
+    catalogue: Annotated[File, "CSV file for the star list."],
+    seed: Annotated[int, click.IntRange(min=0)] = 1,
+    side: Annotated[
+        int | None, click.IntRange(min=100), "Pixels along a side.  [default: 1500]"
+    ] = None,
+    bright: Annotated[int | None, click.IntRange(min=1), "Bright stars.  [default: 300]"] = None,
+    faint: Annotated[int | None, click.IntRange(min=0), "Faint stars.  [default: 700]"] = None,
+    *,
+    out: Annotated[File, "FITS image."],
+) -> None:
+    """Simulate an image of a star field with its star list, to try things on."""
+    check_outputs((out,), (catalogue,))
+    asked = {"side_px": side, "bright": bright, "faint": faint}
+    write_example(out, catalogue, seed, **{k: v for k, v in asked.items() if v is not None})
+
+
+def write_example(out: Path, catalogue: Path, seed: int, **recipe: int) -> ExampleField:
+    """Write an image and its star list; `recipe` are attributes of `FieldRecipe`.
+
+    The image has a WCS and the cards GAIN and SATURATE; the list has pixel (1-based)
+    and sky coordinates of all stars but the companions of blended ones.
+    """
+    made = FieldRecipe(**recipe)
+    field = simulated(made, seed)
+    write_field(
+        out,
+        catalogue,
+        field.image.astype(np.float32),
+        *field.centroid.T,
+        pixel_scale_arcsec=made.pixel_scale_arcsec,
+        GAIN=made.gain,
+        SATURATE=float(made.saturation),
+    )
+    return field

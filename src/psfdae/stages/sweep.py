@@ -20,7 +20,7 @@ from psfdae.estimators import FitError
 from psfdae.files import ProductError, write_text
 from psfdae.reading import from_tree, read_json
 from psfdae.sweeps.measured import EVALUATION, VALIDATION, Task
-from psfdae.sweeps.space import changes, with_values
+from psfdae.sweeps.points import changes, with_values
 
 RESULT, COST, FINISHED = "result.json", "cost.json", "finished.json"
 """Result and cost of a point, and a copy of its result that a workflow does not know.

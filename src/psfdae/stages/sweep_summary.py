@@ -1,16 +1,17 @@
-"""Stage `sweep summary`: what the points of a sweep have found."""
+"""Stages `sweep summary`, `sweep figure` and `best`: what the points of a sweep have found."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
-from psfdae.cli import Folder, command
-from psfdae.files import ProductError, as_yaml, write_text
+from psfdae.cli import File, Folder, command
+from psfdae.files import ProductError, as_yaml, atomic_path, write_text
+from psfdae.reading import read_table, read_yaml
 from psfdae.stages.sweep import RESULT, read_cost, read_result
-from psfdae.sweeps.space import SweepError
+from psfdae.sweeps.points import SweepError
 
 SUMMARY, COSTS, BEST, DEFINITION = "summary.csv", "cost.csv", "best.yaml", "sweep.yaml"
 JOURNAL = "study.journal"
@@ -162,3 +163,28 @@ def _best_yaml(
         "metrics": {key: float(f"{value:.8g}") for key, value in best["metrics"].items()},
     }
     return as_yaml(tree)
+
+
+@command("sweep figure")
+def sweep_figure(
+    kind: Annotated[Literal["parallel", "response"], {"argument": True}],
+    definition: Annotated[File, "sweep.yaml of the command `sweep summary`."],
+    table: Annotated[File, "summary.csv of the same."],
+    out: Annotated[File, "PNG."],
+) -> None:
+    """Draw all points at once, or the metric against each axis."""
+    from psfdae.configuration.compose import validate
+    from psfdae.configuration.sweep import Axis
+    from psfdae.evaluation import sweep_figures
+
+    described = read_yaml(definition)
+    logarithmic = [n for n, axis in described["space"].items() if validate(Axis, axis).log]
+    draw = {
+        "parallel": sweep_figures.parallel_coordinates,
+        "response": sweep_figures.response_curves,
+    }[kind]
+    axes = list(described["space"])
+    text = dict.fromkeys(axes, str)
+    drawn = draw(read_table(table, dtype=text), described, axes, logarithmic)
+    with atomic_path(out) as temporary:
+        drawn.savefig(temporary, format="png")

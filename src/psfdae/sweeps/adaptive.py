@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from psfdae.rng import stream
-from psfdae.sweeps.space import tidy
+from psfdae.sweeps.points import tidy
 
 FINISHED = ("finished", "stopped")
 """States of a point that has a result."""
