@@ -74,3 +74,12 @@ def test_versions_agree():
     assert cited["version"] == psfdae.__version__
     changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
     assert re.search(r"^## (\S+)", changes, re.M)[1] == psfdae.__version__
+
+
+def test_the_way_of_a_star_is_short_and_names_files():
+    page = (ROOT / "docs/architecture.md").read_text()
+    way = re.findall(
+        r"^\| `([^`]+)` \|", page.partition("way of one star")[2].partition("## ")[0], re.M
+    )
+    assert 20 <= len(way) <= 25 and len(set(way)) == len(way)
+    assert all((ROOT / path).is_file() for path in way)
