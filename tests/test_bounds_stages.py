@@ -9,6 +9,7 @@ import pytest
 from matplotlib.collections import PolyCollection
 
 from psfdae.configuration.compose import load_stage
+from psfdae.configuration.consistency import SIMULATION, STATIC
 from psfdae.evaluation.curves import (
     efficiency_against_noise,
     errors_above_bounds,
@@ -24,14 +25,14 @@ SIZES += (f"noise.levels={list(LEVELS)}", "bounds.threads=1", "optics.threads=1"
 
 
 def settings(stage, dataset, *more):
-    reads = stage if isinstance(stage, str) else stage.stage.reads
+    reads = stage if isinstance(stage, tuple) else stage.stage.reads
     return load_stage(reads, (f"dataset={dataset}", *SIZES, *more))
 
 
 def build(folder, dataset):
     """Products and tables of a dataset's bounds, made by the stages."""
-    stars.templates(settings("templates", dataset), folder / "templates.h5")
-    stars.stars(settings("stars", dataset), folder / "templates.h5", folder / "stars.h5")
+    stars.templates(settings(STATIC, dataset), folder / "templates.h5")
+    stars.stars(settings(SIMULATION, dataset), folder / "templates.h5", folder / "stars.h5")
     config = settings(bounds.bounds, dataset)
     drawn = folder / "bank.h5" if config.stars.aberration_fraction else None
     if drawn:

@@ -23,7 +23,7 @@ from psfdae.evaluation.paper import published
 from psfdae.files import Column, ProductError, write_product
 from psfdae.rng import stream
 from psfdae.stages import figures as stage
-from psfdae.stages.evaluate import Models
+from psfdae.stages.evaluate import READS, Models
 from psfdae.stars.fields import random_split, square_grid
 from psfdae.stars.noise import NoiseModel
 
@@ -237,7 +237,7 @@ def test_strip_shows_the_noise_that_evaluate_measures(tmp_path, gaussian_stars, 
     grid = {"points": 5, "spacing_deg": 1.1, "edge_deg": 2.2}
     write_product(tmp_path / "s.h5", "stars", columns, {"grid": grid})
     config = load_stage(
-        "evaluate", ("dataset=dataset3", "parts.train_stars=200", "parts.test_stars=100")
+        READS, ("dataset=dataset3", "parts.train_stars=200", "parts.test_stars=100")
     )
     shown = {}
     for kind in (PcaSom, Dae):
