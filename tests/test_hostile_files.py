@@ -339,11 +339,21 @@ def test_numbers_that_no_training_leaves_are_refused(tmp_path, name, change, mes
     refused("predict", tmp_path / "c.fits", "--model", path, "--out", tmp_path / "o.fits")
 
 
+def told(info, noise):
+    """The description of a method that is told λ, of format 2."""
+    kept = {key: value for key, value in info.items() if key not in ("dae", "image_scale")}
+    own = {"format_version": 2, "method": "lmmse", "reference": "realisation"}
+    return {**kept, **own, "config": {"train": {"noise": noise}}}
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         (lambda info: info["dae"]["kernels"].__setitem__(0, 8), "must be odd"),
         (lambda info: info.update(image_scale=None), "has dae and image_scale"),
+        (lambda info: told(info, {"kappa": 0.0}), "kappa: must be above 0"),
+        (lambda info: told(info, {"kappa": 1e999}), "kappa: must be above 0"),
+        (lambda info: told(info, {}), "kappa: must be above 0"),
         (lambda info: info["config"].update(a=hostile_files.deep(300)), "nested too deeply"),
         (lambda info: {**info, "\x1b]0;title\x07": 1}, "]0;title?"),
     ],

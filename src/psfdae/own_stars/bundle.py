@@ -22,6 +22,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.resources import files
 from itertools import pairwise
+from math import isfinite
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -149,6 +150,8 @@ class BundleInfo(_Described):
         wanted = network if first else named
         if sorted(given) != sorted(wanted) or any(getattr(self, key) is None for key in wanted):
             raise ValueError(f"format {self.format_version} has {' and '.join(wanted)}")
+        if not (first or (self.kappa > 0 and isfinite(self.kappa))):
+            raise ValueError("config.train.noise.kappa: must be above 0, methods are told λ by it")
         return self
 
     @property
@@ -157,7 +160,7 @@ class BundleInfo(_Described):
         try:
             return float(self.config["train"]["noise"]["kappa"])
         except (LookupError, TypeError, ValueError):
-            return 1.0
+            return 1.0 if self.format_version == 1 else 0.0  # the network is told no λ
 
     def described(self) -> dict[str, Any]:
         """What a file of its format says."""

@@ -26,7 +26,7 @@ from psfdae.alignment.telescope import (
 from psfdae.belonging import OURS, STATE_STAMPS, STATES, require
 from psfdae.cli import File, command
 from psfdae.configuration.alignment import AlignmentConfig
-from psfdae.files import Column, read_product, write_product, write_text
+from psfdae.files import Column, read_product, write_csv, write_product
 from psfdae.optics.raytracing import FIRST_NOLL, ZernikeTracer
 from psfdae.rng import stream
 from psfdae.stages.common import limit_threads
@@ -165,4 +165,4 @@ def telescope(
             (f"stamps_{name}", energy.size, "1"),
         ]
     table = pd.DataFrame(rows, columns=["quantity", "value", "unit"])
-    write_text(out, table.to_csv(index=False, float_format="%.6g"))
+    write_csv(out, table, digits=6)

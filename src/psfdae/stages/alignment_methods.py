@@ -25,7 +25,16 @@ from psfdae.cli import AboveZero, File, Folder, command
 from psfdae.configuration.alignment import AlignmentConfig, CnnTrain
 from psfdae.estimators import CONFIG, HISTORY, TrainingSet
 from psfdae.estimators.dae import Dae
-from psfdae.files import Column, Product, as_csv, as_yaml, read_product, write_product, write_text
+from psfdae.files import (
+    Column,
+    Product,
+    as_csv,
+    as_yaml,
+    read_product,
+    write_csv,
+    write_product,
+    write_text,
+)
 from psfdae.reading import from_tree, read_yaml
 from psfdae.rng import stream
 from psfdae.stages.alignment import ModelFile, StatesFile, TestSet, read_model
@@ -235,7 +244,7 @@ def _write_times(path: Path, rows: list[tuple[str, float, str, float, int]]) -> 
 
     columns = ["test_set", "noise_level", "method", "seconds", "states"]
     table = pd.DataFrame(rows, columns=columns)
-    write_text(path, table.to_csv(index=False, float_format="%.6g"))
+    write_csv(path, table, digits=6)
 
 
 @command(

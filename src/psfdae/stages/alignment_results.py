@@ -16,7 +16,7 @@ from psfdae.alignment.telescope import design_states, fit_quadratic, zernike_tra
 from psfdae.belonging import STATE_STAMPS, require, require_origin
 from psfdae.cli import File, Folder, command
 from psfdae.configuration.alignment import AlignmentConfig
-from psfdae.files import Product, ProductError, read_product, write_text
+from psfdae.files import Product, ProductError, read_product, write_csv, write_text
 from psfdae.reading import read_table
 from psfdae.stages.alignment import StatesFile
 from psfdae.stages.alignment_methods import DaeFolder, denoise, noisy_test_states
@@ -132,7 +132,7 @@ def tables(
             key=lambda c: c.map(order.index) if c.name == "method" else c,
             kind="stable",
         )
-        write_text(path, frame.to_csv(index=False, float_format="%.8g"))
+        write_csv(path, frame)
 
 
 @command("alignment paper-tables")
@@ -147,7 +147,7 @@ def paper_tables(
 
     def write(name: str, table: Any, title: str, digits: dict[str, str]) -> None:
         path = out / f"alignment_paper_{name}.csv"
-        write_text(path, table.to_csv(index=False, float_format="%.6g"))
+        write_csv(path, table, digits=6)
         write_text(path.with_suffix(".md"), rows.as_markdown(table, title, digits))
 
     ours = read_table(errors)
@@ -183,7 +183,7 @@ def time_table(
         trained = sum(training[name] for name in (method.cnn, "dae" * method.denoised) if name)
         rows.append((method.name, seconds / states, int(states), trained))
     columns = ["method", "seconds_per_state", "states", "training_seconds"]
-    write_text(out, pd.DataFrame(rows, columns=columns).to_csv(index=False, float_format="%.4g"))
+    write_csv(out, pd.DataFrame(rows, columns=columns), digits=4)
 
 
 @command("alignment figure stamps", reads=("seed", "noise", "evaluation"), root="alignment")
@@ -274,7 +274,7 @@ def twin(
                 for position, value in zip(POSITIONS, chi2, strict=True)
             ]
     curves = pd.DataFrame(rows, columns=["noise_level", "defocus_mm", "position", "chi2"])
-    write_text(table, curves.to_csv(index=False, float_format="%.6g"))
+    write_csv(table, curves, digits=6)
     write_png(twin_ambiguity(curves, shown, state), out)
 
 

@@ -15,7 +15,7 @@ from psfdae.cli import File, Folder, command
 from psfdae.configuration.compose import as_overrides, part
 from psfdae.configuration.schema import Config, Noise
 from psfdae.estimators import Method, groups_of, method, registered
-from psfdae.files import Product, write_product, write_text
+from psfdae.files import Product, write_csv, write_product, write_text
 from psfdae.own_stars.bundle import SUFFIX
 from psfdae.own_stars.errors import ObservationError
 from psfdae.own_stars.observation import Observation, Source
@@ -153,8 +153,7 @@ def _make(config: Config, exposure: Source, files: Made, licence: str) -> None:
     held_out = held_out_fields(grid)
     print(f"{len(found.verdict)} stars: {found.count()}")
     print(f"{int((~held_out).sum())} to learn from, {int(held_out.sum())} held out")
-    selection = found.table(held_out).to_csv(index=False, float_format="%.6g")
-    write_text(files.path / "selection.csv", selection)
+    write_csv(files.path / "selection.csv", found.table(held_out), digits=6)
     rng = stream(config.seed, "own stars")
     columns = training_columns(
         found.bright, grid, held_out, wanted.bins, framing, config.parts, rng
@@ -241,7 +240,7 @@ def report(config: Any, files: Made) -> None:
     table["truth_mse"] = _noise_of_truth(files.stars, parts.test, config.noise.background_photons)
     order = {name: place for place, name in enumerate(config.methods)}
     table = table.sort_values(["snr", "method"], key=lambda c: c.map(order).fillna(c))
-    write_text(files.path / "report.csv", table.to_csv(index=False, float_format="%.6g"))
+    write_csv(files.path / "report.csv", table, digits=6)
     _draw(config, files, product, parts.test, area)
 
 

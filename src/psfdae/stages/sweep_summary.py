@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from psfdae.cli import File, Folder, command
-from psfdae.files import ProductError, as_yaml, atomic_path, write_text
+from psfdae.files import ProductError, as_yaml, write_csv, write_text
 from psfdae.reading import read_table, read_yaml
 from psfdae.stages.sweep import RESULT, read_cost, read_result
 from psfdae.sweeps.points import SweepError
@@ -76,7 +76,7 @@ def summary(
         failed = f"{results[0]['point']}: {results[0]['reason']}"
         raise SweepError(f"all {len(results)} points of sweep {name} failed; the first, {failed}")
     rows = [_row(result, definition["space"], result is chosen) for result in results]
-    write_text(out / SUMMARY, pd.DataFrame(rows).to_csv(index=False, float_format="%.8g"))
+    write_csv(out / SUMMARY, pd.DataFrame(rows))
     costs = [
         {"point": result["point"], **read_cost(path.parent)}
         for result, path in zip(results, points, strict=True)
@@ -176,6 +176,7 @@ def sweep_figure(
     from psfdae.configuration.compose import validate
     from psfdae.configuration.sweep import Axis
     from psfdae.evaluation import sweep_figures
+    from psfdae.stages.figures import write_png
 
     described = read_yaml(definition)
     logarithmic = [n for n, axis in described["space"].items() if validate(Axis, axis).log]
@@ -186,5 +187,4 @@ def sweep_figure(
     axes = list(described["space"])
     text = dict.fromkeys(axes, str)
     drawn = draw(read_table(table, dtype=text), described, axes, logarithmic)
-    with atomic_path(out) as temporary:
-        drawn.savefig(temporary, format="png")
+    write_png(drawn, out)

@@ -10,7 +10,7 @@ from psfdae.belonging import STATE_STAMPS, require
 from psfdae.configuration.compose import part
 from psfdae.estimators import CONFIG, HISTORY
 from psfdae.evaluation.alignment_tables import error_rows
-from psfdae.files import read_product, write_text
+from psfdae.files import read_product, write_csv
 from psfdae.reading import read_table, read_yaml
 from psfdae.stages.alignment_methods import CNN_WEIGHTS, cnn_predictor, noisy_test_states, train_cnn
 from psfdae.stages.common import limit_threads
@@ -56,7 +56,7 @@ def run(config: Any, task: Task, name: str) -> Measured:
     for role, file in (("validation", VALIDATION), ("test", EVALUATION)):
         rows = _rows(config, task, role)
         metrics |= _metrics(role, rows)
-        write_text(task.folder / file, pd.DataFrame(rows).to_csv(index=False, float_format="%.8g"))
+        write_csv(task.folder / file, pd.DataFrame(rows))
     described = read_yaml(task.folder / CONFIG)
     history = read_table(task.folder / HISTORY)
     return Measured(

@@ -159,7 +159,7 @@ def measure_images(
     """
     import pandas as pd
 
-    from psfdae.files import write_text
+    from psfdae.files import write_csv
     from psfdae.rng import stream
     from psfdae.stages.common import noise_model, noisy_test_images, read_stars, split_stars
 
@@ -183,6 +183,5 @@ def measure_images(
         field = product["field_index"][stars]
         rows = image_rows(config, task, method, images, truth, field, noisy, model)
         metrics |= image_metrics(part, rows)
-        table = pd.DataFrame(rows).to_csv(index=False, float_format="%.8g")
-        write_text(task.folder / name, table)
+        write_csv(task.folder / name, pd.DataFrame(rows))
     return metrics
