@@ -34,17 +34,11 @@ STEP = 0.1
 """Of ln s between noise variances that share a factorisation; where they differ, it is
 that of a prior which is wrong by half of it, and the error grows by the square."""
 
-LEAST = 1e-4
-"""Weight of a cluster that is left out."""
+NEAREST = 64
+"""Clusters that are summed over; the others of 512 hold less than 1 % of the weight."""
 
-FEW = 64
-"""Clusters that are all weighed in all coordinates; more of them first in the leading ones."""
-
-LEADING = 32
-"""Coordinates in which many clusters are weighed first."""
-
-MARGIN = 10.0
-"""By which the logarithm of a weight may be better in all coordinates than in these."""
+LEADING = 64
+"""Coordinates in which they are found."""
 
 EXACT = 8
 """Noise variances that are so few have factors of their own."""
@@ -117,7 +111,7 @@ class GaussianMixture(Method):
     cross: np.ndarray
     shrinkage: np.ndarray
     noise: NoiseModel
-    _roots: dict[tuple[int, float, int | None], tuple[np.ndarray, float]] = field(
+    _roots: dict[tuple[int, float], tuple[np.ndarray, float]] = field(
         default_factory=dict, init=False, repr=False
     )
 
@@ -222,42 +216,59 @@ class GaussianMixture(Method):
         return Estimate(psf.reshape(noisy.shape), evidence=evidence)
 
     def _posterior(self, flat: np.ndarray, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Posterior mean and evidence of images (n, P) of noise variance s, shape (n,)."""
-        z, clusters = (flat @ self.axes).astype(np.float32), range(len(self.count))
-        log = np.full((len(z), len(clusters)), -np.inf)
-        if len(clusters) > FEW:
-            for k in clusters:
-                log[:, k] = self._solved(k, z, s, LEADING)[2]
-            candidate = log > log.max(axis=1, keepdims=True) + np.log(LEAST) - MARGIN
-            log[:] = -np.inf
-        else:
-            candidate = np.ones(log.shape, bool)
-        for k in clusters:
-            (stars,) = candidate[:, k].nonzero()
-            if stars.size:
-                log[stars, k] = self._solved(k, z[stars], s[stars])[2]
-        peak = log.max(axis=1, keepdims=True)
-        weight = np.exp(log - peak)
-        evidence = peak[:, 0] + np.log(weight.sum(axis=1)) - 0.5 * z.shape[1] * np.log(2 * np.pi)
-        weight[weight < LEAST * weight.max(axis=1, keepdims=True)] = 0.0
-        weight /= weight.sum(axis=1, keepdims=True)
+        """Posterior mean and evidence of images (n, P) of noise variance s, shape (n,).
+
+        Sums over clusters are kept relative to the largest weight so far of every star.
+        """
+        z = (flat @ self.axes).astype(np.float32)
+        nodes, node = np.unique(s, return_inverse=True)
+        if nodes.size > EXACT:
+            nodes, node = np.unique(np.rint(np.log(s) / STEP), return_inverse=True)
+            nodes = np.exp(nodes * STEP)
+        peak, total = np.full(len(z), -np.inf), np.zeros(len(z))
         gain, psf = np.zeros_like(z), np.zeros_like(z)
-        for k in clusters:
-            (stars,) = weight[:, k].nonzero()
+        likely = self._likely(z, s)
+        for k, (own, within, common, _) in enumerate(map(self._cluster, range(len(self.count)))):
+            (stars,) = likely[:, k].nonzero()
             if not stars.size:
                 continue
-            u, inner, _ = self._solved(k, z[stars], s[stars])
-            own, within, common, _ = self._cluster(k)
-            w = weight[stars, k, None].astype(np.float32)
-            inner *= w
-            g = w * u - (inner @ own) / (common * self.variance + s[stars, None])
+            d = (common * self.variance + s[stars, None]).astype(np.float32)
+            r = z[stars] - self.mean[k]
+            u = r / d
+            inner = u @ own.T
+            log = -0.5 * np.einsum("ij,ij->i", r, u, dtype=np.float64)
+            for place in np.unique(node[stars]):
+                there = node[stars] == place
+                root, constant = self._root(k, float(nodes[place]))
+                half = inner[there] @ root.T
+                inner[there] = half @ root
+                log[there] += constant + 0.5 * np.einsum("ij,ij->i", half, half, dtype=np.float64)
+            new = np.maximum(peak[stars], log)
+            fade, w = np.exp(peak[stars] - new), np.exp(log - new)
+            peak[stars], total[stars] = new, fade * total[stars] + w
+            fade, w = (a[:, None].astype(np.float32) for a in (fade, w))
+            g = u - (inner @ own) / d
             if len(self.cross):
-                psf[stars] += w * self.mean_reference[k] + inner @ within
+                psf[stars] = fade * psf[stars] + w * (self.mean_reference[k] + inner @ within)
                 g *= common
-            gain[stars] += g
+            gain[stars] = fade * gain[stars] + w * g
+        gain /= total[:, None]
+        evidence = peak + np.log(total) - 0.5 * z.shape[1] * np.log(2 * np.pi)
         if len(self.cross):
-            return psf + gain @ self.cross.T, evidence
+            return psf / total[:, None] + gain @ self.cross.T, evidence
         return flat - s[:, None] * (gain @ self.axes.T), evidence
+
+    def _likely(self, z: np.ndarray, s: np.ndarray) -> np.ndarray:
+        """Clusters that are nearest by the common covariance, (n, K) of bool."""
+        if len(self.count) <= NEAREST:
+            return np.ones((len(z), len(self.count)), bool)
+        weight = 1.0 / (self.variance[:LEADING] + s[:, None])
+        z, mean = (a[:, :LEADING].astype(np.float64) for a in (z, self.mean))
+        distance = weight @ (mean**2).T - 2.0 * (z * weight) @ mean.T
+        near = np.argpartition(distance, NEAREST, axis=1)[:, :NEAREST]
+        likely = np.zeros(distance.shape, bool)
+        np.put_along_axis(likely, near, True, axis=1)
+        return likely
 
     def _cluster(self, k: int) -> tuple[np.ndarray, np.ndarray, float, float]:
         """Deviations X_k and Y_k, and the factors of S and of X_kᵀX_k in C_k."""
@@ -266,44 +277,22 @@ class GaussianMixture(Method):
         common = float(self.shrinkage[0]) / total
         return self.deviation[stars], self.deviation_reference[stars], common, 1.0 / total
 
-    def _solved(
-        self, k: int, z: np.ndarray, s: np.ndarray, width: int | None = None
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Of the leading coordinates: D⁻¹(z − μ), M⁻¹X D⁻¹(z − μ), and ln π N(z; μ, C + s).
+    def _root(self, k: int, s: float) -> tuple[np.ndarray, float]:
+        """L⁻¹ with L Lᵀ = M, and ln π − ½ ln det(C + s), at a noise variance.
 
         C + s = D + b XᵀX with the diagonal D, and M = 1/b + X D⁻¹Xᵀ.
         """
-        own, _, common, _ = self._cluster(k)
-        r = z[:, :width] - self.mean[k, :width]
-        u = r / (common * self.variance[:width] + s[:, None]).astype(np.float32)
-        inner = u @ own[:, :width].T
-        nodes, node = np.unique(s, return_inverse=True)
-        if nodes.size > EXACT:
-            nodes, node = np.unique(np.rint(np.log(s) / STEP), return_inverse=True)
-            nodes = np.exp(nodes * STEP)
-        square, ln_det = np.einsum("ij,ij->i", r, u, dtype=np.float64), np.empty(len(z))
-        for place, value in enumerate(nodes):
-            stars = node == place
-            root, ln_det[stars] = self._root(k, float(value), width)
-            half = inner[stars] @ root.T
-            square[stars] -= np.einsum("ij,ij->i", half, half, dtype=np.float64)
-            inner[stars] = half @ root
-        return u, inner, np.log(self.count[k] / self.count.sum()) - 0.5 * (square + ln_det)
-
-    def _root(self, k: int, s: float, width: int | None) -> tuple[np.ndarray, float]:
-        """L⁻¹ with L Lᵀ = M, and ln det(C + s), at a noise variance."""
-        key = (k, s, width)
-        if key not in self._roots:
+        if (k, s) not in self._roots:
             from scipy.linalg import solve_triangular
 
-            own, _, common, factor = self._cluster(k)
-            x = own[:, :width].astype(np.float64)
-            d = common * self.variance[:width] + s
-            lower = np.linalg.cholesky(np.eye(len(x)) / factor + (x / d) @ x.T)
-            ln_det = np.log(d).sum() + 2 * np.log(lower.diagonal()).sum() + len(x) * np.log(factor)
+            own, _, common, b = self._cluster(k)
+            x, d = own.astype(np.float64), common * self.variance + s
+            lower = np.linalg.cholesky(np.eye(len(x)) / b + (x / d) @ x.T)
             root = solve_triangular(lower, np.eye(len(x)), lower=True).astype(np.float32)
-            self._roots[key] = root, float(ln_det)
-        return self._roots[key]
+            half_det = np.log(lower.diagonal()).sum() + 0.5 * len(x) * np.log(b)
+            constant = np.log(self.count[k] / self.count.sum()) - half_det - 0.5 * np.log(d).sum()
+            self._roots[k, s] = root, float(constant)
+        return self._roots[k, s]
 
 
 def _k_means(x: np.ndarray, clusters: int, principal: int, seed: int) -> np.ndarray:
