@@ -124,17 +124,18 @@ class GaussianMixture(Method):
         FitError
             If every K exceeds the number of stars.
         """
-        learn, judge = data.fit, data.validation
-        if not judge.size:  # nothing is left out for a choice, so some of the others serve
+        searched = len(gmm.components) * len(gmm.shrinkage) > 1
+        learn, judge = (data.fit, data.validation) if searched else (data.train, data.train[:0])
+        if searched and not judge.size:  # nothing is left out for a choice: some others serve
             judge, learn = learn[::10], np.delete(learn, np.s_[::10])
         sizes = [k for k in gmm.components if k <= learn.size]
         if not sizes:
             raise FitError(
-                f"gmm.components = {gmm.components}: must be at most {learn.size}, the training "
-                "stars without those that choose"
+                f"gmm.components = {gmm.components}: must be at most {learn.size}, the number of "
+                "training stars" + " without those that choose" * searched
             )
         best = (np.inf, sizes[0], gmm.shrinkage[0])
-        if len(sizes) * len(gmm.shrinkage) > 1:
+        if searched:
             rng = stream(data.seed, "noise", "gmm validation")
             noisy = [data.noise.draw(data.images[judge], level, rng) for level in data.levels]
             for k in sizes:
