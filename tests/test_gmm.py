@@ -16,7 +16,7 @@ from psfdae.stars.noise import NoiseModel
 NOISE = NoiseModel(kappa=5.0, background=1e4)
 D = 6
 LEVEL = 2e-3
-ONE = {"components": [1], "shrinkage": [20.0], "principal": 8, "threads": 1}
+ONE = {"components": [1], "shrinkage": [20.0], "principal": 8, "place": 1.0, "threads": 1}
 
 
 def stars(count, seed=1):
@@ -58,8 +58,9 @@ def dense(mixture, noisy, level):
     s = (NOISE.kappa * level) ** 2 + 1.0 / z.shape[1] / NOISE.flux(level)
     axes, log, estimates = mixture.axes.astype(float), [], []
     for k, count in enumerate(mixture.count):
-        x, y, common, own = (np.asarray(a, float) for a in mixture._cluster(k))
-        x = x @ axes.T
+        cluster = mixture._clusters[k]
+        common, own = cluster.common, cluster.scale
+        x, y = cluster.own @ axes.T, cluster.own_reference.astype(float)
         pooled = (axes * mixture.variance) @ axes.T
         y, cross = (y, mixture.cross @ axes.T) if len(mixture.cross) else (x, pooled)
         covariance = common * pooled + own * x.T @ x + s * np.eye(z.shape[1])
@@ -77,7 +78,9 @@ def dense(mixture, noisy, level):
 
 @pytest.mark.parametrize("same", [True, False])
 @pytest.mark.parametrize("level", [1e-4, LEVEL, 0.05])
-def test_sums_are_those_of_dense_matrices(same, level):
+def test_sums_are_those_of_dense_matrices(same, level, monkeypatch):
+    monkeypatch.setattr(module, "FLAT", 0.0)
+    monkeypatch.setattr(module, "LEAST", 0.0)
     mixture = fitted(same=same, components=[12])
     noisy = NOISE.draw(stars(50, seed=2)[0], level, np.random.default_rng(3))
     mean, evidence = dense(mixture, noisy, level)

@@ -12,7 +12,7 @@ commands follow from them.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -63,6 +63,8 @@ class TrainingSet:
     noise : NoiseModel
     seed : int
         Of the method's random streams.
+    positions : ndarray, shape (n, 2)
+        Where the stars stand in the field, any unit; empty where nobody knows.
     fresh : Product or None
         Other draws of the simulator, with the arrays of a product "stars", if
         `Method.fresh` asks for them.
@@ -77,6 +79,7 @@ class TrainingSet:
     levels: np.ndarray
     noise: NoiseModel
     seed: int = 0
+    positions: np.ndarray = field(default_factory=lambda: np.empty((0, 2)))
     fresh: Product | None = None
     checkpoint: Path | None = None
 
@@ -127,6 +130,8 @@ class Method:
         False for the noisy image itself, which is drawn on its own scale.
     told_level : bool
         `predict` gets the noise level λ, too: of all images, or of each, shape (n,).
+    told_position : bool
+        `predict` gets the positions in the field as well, shape (n, 2).
     groups : mapping
         Groups of the configuration that are its settings; `fit` gets them by name.
     stored : bool
@@ -161,6 +166,7 @@ class Method:
     drawn: ClassVar[bool] = True
     restores: ClassVar[bool] = True
     told_level: ClassVar[bool] = False
+    told_position: ClassVar[bool] = False
     groups: ClassVar[Mapping[str, type[Group]]] = {}
     stored: ClassVar[bool] = True
     per_reference: ClassVar[bool] = False
@@ -212,12 +218,15 @@ class Method:
         """Stars beyond those of the training part, which a simulation may draw; 0: none."""
         return 0
 
-    def estimate(self, noisy: np.ndarray, level: float | np.ndarray) -> Estimate:
+    def estimate(
+        self, noisy: np.ndarray, level: float | np.ndarray, position: np.ndarray | None = None
+    ) -> Estimate:
         """PSFs of noisy images at a noise level λ, or one of each image, shape (n,).
 
         A method that knows their uncertainty, or the images' evidence, gives it here.
         """
-        return Estimate(self.predict(noisy, level) if self.told_level else self.predict(noisy))
+        told = (level,) * self.told_level + (position,) * self.told_position
+        return Estimate(self.predict(noisy, *told))
 
     @classmethod
     def stem(cls, dataset: str, split: str, reference: str) -> str:

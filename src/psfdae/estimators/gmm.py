@@ -14,13 +14,19 @@ All covariances of a cluster of n_k stars are shrunk towards those within all cl
 C_k = (X_kᵀX_k + ν S) / (n_k + ν), X_k the deviations of its stars from their mean. In the
 eigenvectors of S this is a diagonal and a matrix of rank n_k; by Woodbury's identity its
 inverse takes matrices of n_k × n_k alone, and no C_k is ever made.
+
+A method that is told where the star stands has two more numbers p in the observed vector,
+without noise. Given p, everything above holds again: π_k becomes π_k N(p; p_k, P_k), μ_k
+follows p linearly, and X_k are the deviations that p leaves, with two rows more for what
+the slope of the cluster differs from that of all.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any, ClassVar
+from functools import cached_property
+from typing import Annotated, Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from pydantic import Field
@@ -34,16 +40,20 @@ STEP = 0.1
 """Of ln s between noise variances that share a factorisation; where they differ, it is
 that of a prior which is wrong by half of it, and the error grows by the square."""
 
-NEAREST = 64
-"""Clusters that are summed over; the others of 512 hold less than 1 % of the weight."""
-
-LEADING = 64
-"""Coordinates in which they are found."""
-
 EXACT = 8
 """Noise variances that are so few have factors of their own."""
 
-AT_ONCE = 1024
+NEAREST, LEADING = 64, 64
+"""Clusters that are looked at, and coordinates in which they are found; the others of 512
+hold less than 1 % of the weight."""
+
+LEAST = 1e-3
+"""Weight of a cluster that is summed over."""
+
+FLAT = 0.005
+"""Variance of a coordinate, as a part of s, below which all clusters share one normal law."""
+
+AT_ONCE = 4096
 """Images that are restored together."""
 
 
@@ -54,10 +64,66 @@ class Gmm(Group):
         description="Clusters K that are tried; more than stars are not"
     )
     shrinkage: Annotated[list[Positive], Field(min_length=1)] = Field(
-        description="Stars ν that the covariance of all clusters counts for in each"
+        description="Stars ν that the covariance of all clusters counts for in each; "
+        "the first one is used to choose K"
     )
     principal: Count = Field(description="Principal components in which stars are clustered")
+    place: Positive = Field(
+        description="RMS of the field position beside that of the principal components, "
+        "for methods that are told it"
+    )
     threads: Count = Field(description="Threads of the linear algebra")
+
+
+class Cluster(NamedTuple):
+    """One cluster of a mixture with its covariances (all given the position).
+
+    Attributes
+    ----------
+    own, own_reference : ndarray, shape (r, P)
+        Deviations X_k in the axes and Y_k in pixels, or rows of the same products if these
+        are fewer.
+    square : ndarray, shape (P,)
+        Diagonal of YᵀY.
+    slope, slope_reference : ndarray, shape (q, P)
+        Change of the means per unit of the position.
+    spread : ndarray, shape (q, q)
+        Inverse of the Cholesky factor of P_k.
+    common, scale : float
+        Factors of S and of XᵀX in C_k.
+    """
+
+    own: np.ndarray
+    own_reference: np.ndarray
+    square: np.ndarray
+    slope: np.ndarray
+    slope_reference: np.ndarray
+    spread: np.ndarray
+    common: float
+    scale: float
+
+
+class Factor(NamedTuple):
+    """(C_k + s)⁻¹ = diag(inverse) − AᵀA, A in the leading m coordinates.
+
+    Attributes
+    ----------
+    inverse : ndarray, shape (P,)
+    low : ndarray, shape (r, m)
+        A.
+    low_reference : ndarray, shape (r, P)
+        What Aᵀ becomes in C_yx (C_k + s)⁻¹, of references that are not the images.
+    shared : ndarray, shape (P,)
+        Factor of S in C_k, by coordinate.
+    constant : float
+        ln π_k − ½ ln det(C_k + s) of the determinant in units of 2π.
+    """
+
+    inverse: np.ndarray
+    low: np.ndarray
+    low_reference: np.ndarray
+    shared: np.ndarray
+    constant: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +146,14 @@ class GaussianMixture(Method):
         The same of the references in pixels; none where they are the images.
     cross : ndarray, shape (P, P), or (0, P)
         Covariance within clusters of references (pixels) and images (axes).
+    variance_reference : ndarray, shape (P,), or (0,)
+        Variance of the references within clusters.
+    whitening : ndarray, shape (2, q)
+        To positions of unit variance within clusters; q = 2 where they are told, else 0.
+    center, deviation_center : ndarray, shape (K, q) and (n, q)
+        Mean whitened position of each cluster, and each star's deviation from it.
+    slope, slope_reference : ndarray, shape (q, P)
+        Change with position that is common to all clusters; deviations are without it.
     shrinkage : ndarray, shape (1,)
         ν.
     noise : NoiseModel
@@ -98,6 +172,12 @@ class GaussianMixture(Method):
         "deviation": ("1", "images less the mean of their cluster, in the axes"),
         "deviation_reference": ("1", "references less the mean of their cluster"),
         "cross": ("1", "covariance of references and images (in the axes) within clusters"),
+        "variance_reference": ("1", "variance of references within clusters"),
+        "whitening": ("1", "to positions of unit variance within clusters"),
+        "center": ("1", "mean whitened position of each cluster"),
+        "deviation_center": ("1", "whitened positions less that of their cluster"),
+        "slope": ("1", "common change of images (in the axes) with whitened position"),
+        "slope_reference": ("1", "common change of references with whitened position"),
         "shrinkage": ("1", "stars that the common covariance counts for"),
     }
 
@@ -109,15 +189,19 @@ class GaussianMixture(Method):
     deviation: np.ndarray
     deviation_reference: np.ndarray
     cross: np.ndarray
+    variance_reference: np.ndarray
+    whitening: np.ndarray
+    center: np.ndarray
+    deviation_center: np.ndarray
+    slope: np.ndarray
+    slope_reference: np.ndarray
     shrinkage: np.ndarray
     noise: NoiseModel
-    _roots: dict[tuple[int, float], tuple[np.ndarray, float]] = field(
-        default_factory=dict, init=False, repr=False
-    )
+    _factors: dict[tuple[int, float], Factor] = field(default_factory=dict, init=False, repr=False)
 
     @classmethod
-    def fit(cls, data: TrainingSet, gmm: Gmm) -> GaussianMixture:
-        """Choose K and ν on the validation stars, then fit all training stars.
+    def fit(cls, data: TrainingSet, gmm: Gmm) -> Self:
+        """Choose K, then ν, on the validation stars, and fit all training stars.
 
         Raises
         ------
@@ -134,40 +218,60 @@ class GaussianMixture(Method):
                 f"gmm.components = {gmm.components}: must be at most {learn.size}, the number of "
                 "training stars" + " without those that choose" * searched
             )
-        best = (np.inf, sizes[0], gmm.shrinkage[0])
+        clusters, shrinkage = sizes[0], gmm.shrinkage[0]
         if searched:
             rng = stream(data.seed, "noise", "gmm validation")
             noisy = [data.noise.draw(data.images[judge], level, rng) for level in data.levels]
-            for k in sizes:
-                tried = cls._clustered(data, learn, k, gmm)
-                for shrinkage in gmm.shrinkage:
-                    one = replace(tried, shrinkage=np.array([shrinkage]))
-                    errors = [
-                        np.square(one.predict(z, level) - data.references[judge]).mean()
-                        for z, level in zip(noisy, data.levels, strict=True)
-                    ]
-                    best = min(best, (float(np.log(errors).mean()), k, shrinkage))
-        final = cls._clustered(data, data.train, best[1], gmm)
-        return replace(final, shrinkage=np.array([best[2]]))
+
+            def error(tried: Self) -> float:
+                """Mean logarithm of the error on the stars that choose."""
+                truth, where = data.references[judge], cls._told(data, judge)
+                return float(
+                    np.mean(
+                        [
+                            np.log(np.square(tried.predict(z, level, where) - truth).mean())
+                            for z, level in zip(noisy, data.levels, strict=True)
+                        ]
+                    )
+                )
+
+            tried = {k: cls._clustered(data, learn, k, gmm) for k in sizes}
+            errors = {k: error(one) for k, one in tried.items()}
+            clusters = min(errors, key=errors.__getitem__)
+            by_shrinkage = {shrinkage: errors[clusters]}
+            if clusters > 1:  # in one cluster ν has no effect
+                for other in gmm.shrinkage[1:]:
+                    one = replace(tried[clusters], shrinkage=np.array([other]))
+                    by_shrinkage[other] = error(one)
+            shrinkage = min(by_shrinkage, key=by_shrinkage.__getitem__)
+        final = cls._clustered(data, data.train, clusters, gmm)
+        return replace(final, shrinkage=np.array([shrinkage]))
 
     @classmethod
-    def _clustered(
-        cls, data: TrainingSet, stars: np.ndarray, clusters: int, gmm: Gmm
-    ) -> GaussianMixture:
+    def _clustered(cls, data: TrainingSet, stars: np.ndarray, clusters: int, gmm: Gmm) -> Self:
         """Moments of the clusters of some stars."""
         x, y = (
             a[stars].reshape(stars.size, -1).astype(np.float64)
             for a in (data.images, data.references)
         )
-        cluster = _k_means(x, clusters, gmm.principal, data.seed)
+        p = cls._told(data, stars).astype(np.float64)
+        cluster = _k_means(x, gmm.place * _standard(p), clusters, gmm.principal, data.seed)
         order = np.argsort(cluster, kind="stable")
-        x, y = x[order], y[order]
-        same = np.array_equal(x, y)
         count = np.unique(cluster, return_counts=True)[1]
         start = np.concatenate([[0], count.cumsum()[:-1]])
-        mean_x, mean_y = (np.add.reduceat(a, start) / count[:, None] for a in (x, y))
-        x -= np.repeat(mean_x, count, axis=0)
-        y -= np.repeat(mean_y, count, axis=0)
+        same = np.array_equal(x, y)
+
+        def about_means(a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            a = a[order]
+            mean = np.add.reduceat(a, start) / count[:, None]
+            return mean, a - np.repeat(mean, count, axis=0)
+
+        (mean_p, p), (mean_x, x), (mean_y, y) = map(about_means, (p, x, y))
+        whitening = _whitening(p)
+        p = p @ whitening
+        slope, slope_y = (p.T @ a / len(a) for a in (x, y))
+        x -= p @ slope
+        y -= p @ slope_y
         variance, axes = np.linalg.eigh(x.T @ x / len(x))
         variance, axes = np.maximum(variance[::-1], 0.0), axes[:, ::-1]
         x = x @ axes
@@ -181,129 +285,277 @@ class GaussianMixture(Method):
             deviation=x.astype(np.float32),
             deviation_reference=none if same else y.astype(np.float32),
             cross=none if same else (y.T @ x / len(x)).astype(np.float32),
+            variance_reference=none[:, 0] if same else np.square(y).mean(axis=0),
+            whitening=whitening,
+            center=mean_p @ whitening,
+            deviation_center=p,
+            slope=(slope @ axes).astype(np.float32),
+            slope_reference=slope_y.astype(np.float32),
             shrinkage=np.array([gmm.shrinkage[0]]),
             noise=data.noise,
         )
 
     @classmethod
+    def _told(cls, data: TrainingSet, stars: np.ndarray) -> np.ndarray:
+        """Positions of some stars, (n, q)."""
+        return data.positions[stars] if cls.told_position else np.empty((len(stars), 0))
+
+    @classmethod
     def restored(
         cls, arrays: Mapping[str, np.ndarray], config: Mapping[str, Any], reference: str
-    ) -> GaussianMixture:
+    ) -> Self:
         """As of all methods; the noise is that of the configuration."""
         noise = config["noise"]
         return cls(**arrays, noise=NoiseModel(noise["kappa"], noise["background_photons"]))
 
-    def predict(self, noisy: np.ndarray, level: float | np.ndarray) -> np.ndarray:
+    def predict(
+        self, noisy: np.ndarray, level: float | np.ndarray, position: np.ndarray | None = None
+    ) -> np.ndarray:
         """PSFs, float32; raises as `estimate`."""
-        return self.estimate(noisy, level).psf
+        return self._estimate(noisy, level, position, sure=False).psf
 
-    def estimate(self, noisy: np.ndarray, level: float | np.ndarray) -> Estimate:
-        """PSFs, float32, and the evidence of every image.
+    def estimate(
+        self, noisy: np.ndarray, level: float | np.ndarray, position: np.ndarray | None = None
+    ) -> Estimate:
+        """PSFs, float32, their standard deviation, and the evidence of every image.
 
         Raises
         ------
         ValueError
             If a pixel is not finite.
         """
+        return self._estimate(noisy, level, position, sure=True)
+
+    def _estimate(
+        self,
+        noisy: np.ndarray,
+        level: float | np.ndarray,
+        position: np.ndarray | None,
+        sure: bool,
+    ) -> Estimate:
         flat = noisy.reshape(len(noisy), -1)
         if not np.isfinite(flat).all():
             raise ValueError("noisy images must be finite")
+        where = np.empty((len(flat), 0)) if position is None else position @ self.whitening
         even = np.full(len(flat), 1.0 / flat.shape[1])
-        s = self.noise.variance(even, np.asarray(level, np.float64))
-        psf, evidence = np.empty(flat.shape, np.float32), np.empty(len(flat))
-        for start in range(0, len(flat), AT_ONCE):
-            part = slice(start, start + AT_ONCE)
-            psf[part], evidence[part] = self._posterior(flat[part], s[part])
-        return Estimate(psf.reshape(noisy.shape), evidence=evidence)
+        s, node = np.unique(self.noise.variance(even, np.asarray(level)), return_inverse=True)
+        if s.size > EXACT:
+            rounded, again = np.unique(np.rint(np.log(s) / STEP), return_inverse=True)
+            s, node = np.exp(rounded * STEP), again[node]
+        psf, sigma = (np.empty(flat.shape, np.float32) for _ in range(2))
+        evidence = np.empty(len(flat))
+        for place, variance in enumerate(s):
+            (stars,) = (node == place).nonzero()
+            for part in np.array_split(stars, -(-stars.size // AT_ONCE)):
+                found = self._posterior(flat[part], where[part], float(variance), sure)
+                psf[part], sigma[part], evidence[part] = found
+            if s.size > EXACT:
+                self._factors.clear()
+        shaped = psf.reshape(noisy.shape), sigma.reshape(noisy.shape) if sure else None
+        return Estimate(*shaped, evidence=evidence)
 
-    def _posterior(self, flat: np.ndarray, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Posterior mean and evidence of images (n, P) of noise variance s, shape (n,).
-
-        Sums over clusters are kept relative to the largest weight so far of every star.
-        """
+    def _posterior(
+        self, flat: np.ndarray, where: np.ndarray, s: float, sure: bool
+    ) -> tuple[np.ndarray, np.ndarray | float, np.ndarray]:
+        """Posterior mean, its standard deviation and evidence of images (n, P) of variance s."""
         z = (flat @ self.axes).astype(np.float32)
-        nodes, node = np.unique(s, return_inverse=True)
-        if nodes.size > EXACT:
-            nodes, node = np.unique(np.rint(np.log(s) / STEP), return_inverse=True)
-            nodes = np.exp(nodes * STEP)
-        peak, total = np.full(len(z), -np.inf), np.zeros(len(z))
-        gain, psf = np.zeros_like(z), np.zeros_like(z)
-        likely = self._likely(z, s)
-        for k, (own, within, common, _) in enumerate(map(self._cluster, range(len(self.count)))):
-            (stars,) = likely[:, k].nonzero()
+        log = np.full((len(z), len(self.count)), -np.inf)
+        near = self._near(z, where, s)
+        for k in range(len(self.count)):
+            (stars,) = near[:, k].nonzero()
+            if stars.size:
+                _, residual, half = self._against(k, z[stars], where[stars], s)
+                factor = self._factor(k, s)
+                off = (where[stars] - self.center[k]) @ self._clusters[k].spread.T
+                log[stars, k] = factor.constant - 0.5 * (
+                    np.einsum("ij,ij,j->i", residual, residual, factor.inverse, dtype=np.float64)
+                    - np.einsum("ij,ij->i", half, half, dtype=np.float64)
+                    + np.einsum("ij,ij->i", off, off)
+                )
+        peak = log.max(axis=1)
+        weight = np.exp(log - peak[:, None])
+        total = weight.sum(axis=1)
+        evidence = peak + np.log(total) - 0.5 * z.shape[1] * np.log(2 * np.pi)
+        weight[weight < LEAST * total[:, None]] = 0.0
+        weight = (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)
+        gain, own = np.zeros_like(z), np.zeros_like(z)
+        second = np.zeros(flat.shape) if sure else 0.0
+        for k in range(len(self.count)):
+            (stars,) = weight[:, k].nonzero()
             if not stars.size:
                 continue
-            d = (common * self.variance + s[stars, None]).astype(np.float32)
-            r = z[stars] - self.mean[k]
-            u = r / d
-            inner = u @ own.T
-            log = -0.5 * np.einsum("ij,ij->i", r, u, dtype=np.float64)
-            for place in np.unique(node[stars]):
-                there = node[stars] == place
-                root, constant = self._root(k, float(nodes[place]))
-                half = inner[there] @ root.T
-                inner[there] = half @ root
-                log[there] += constant + 0.5 * np.einsum("ij,ij->i", half, half, dtype=np.float64)
-            new = np.maximum(peak[stars], log)
-            fade, w = np.exp(peak[stars] - new), np.exp(log - new)
-            peak[stars], total[stars] = new, fade * total[stars] + w
-            fade, w = (a[:, None].astype(np.float32) for a in (fade, w))
-            g = u - (inner @ own) / d
+            w = weight[stars, k, None]
+            factor = self._factor(k, s)
+            at, residual, half = self._against(k, z[stars], where[stars], s)
+            g = residual * factor.inverse
+            g[:, : factor.low.shape[1]] -= half @ factor.low
+            mean = 0.0
             if len(self.cross):
-                psf[stars] = fade * psf[stars] + w * (self.mean_reference[k] + inner @ within)
-                g *= common
-            gain[stars] = fade * gain[stars] + w * g
-        gain /= total[:, None]
-        evidence = peak + np.log(total) - 0.5 * z.shape[1] * np.log(2 * np.pi)
-        if len(self.cross):
-            return psf / total[:, None] + gain @ self.cross.T, evidence
-        return flat - s[:, None] * (gain @ self.axes.T), evidence
+                g *= factor.shared
+                mean = self.mean_reference[k] + half @ factor.low_reference
+                mean += at @ self._clusters[k].slope_reference
+                own[stars] += w * mean
+            gain[stars] += w * g
+            if sure:
+                one = self._restored(flat[stars], g, mean, s).astype(np.float64)
+                second[stars] += w * (self._uncertain(k, s) + one**2)
+        psf = self._restored(flat, gain, own, s)
+        if not sure:
+            return psf, np.nan, evidence
+        return psf, np.sqrt(np.maximum(second - psf.astype(np.float64) ** 2, 0.0)), evidence
 
-    def _likely(self, z: np.ndarray, s: np.ndarray) -> np.ndarray:
+    def _restored(
+        self, flat: np.ndarray, gain: np.ndarray, own: np.ndarray | float, s: float
+    ) -> np.ndarray:
+        """Images or references from (C + s)⁻¹(z − μ) in the axes."""
+        return own + gain @ self.cross.T if len(self.cross) else flat - s * (gain @ self.axes.T)
+
+    def _against(
+        self, k: int, z: np.ndarray, where: np.ndarray, s: float
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Position from the cluster's, image less its mean there, and A times that."""
+        low = self._factor(k, s).low
+        at = (where - self.center[k]).astype(np.float32)
+        residual = z - self.mean[k]
+        if at.size:
+            residual -= at @ self._clusters[k].slope
+        return at, residual, residual[:, : low.shape[1]] @ low.T
+
+    def _near(self, z: np.ndarray, where: np.ndarray, s: float) -> np.ndarray:
         """Clusters that are nearest by the common covariance, (n, K) of bool."""
         if len(self.count) <= NEAREST:
             return np.ones((len(z), len(self.count)), bool)
-        weight = 1.0 / (self.variance[:LEADING] + s[:, None])
-        z, mean = (a[:, :LEADING].astype(np.float64) for a in (z, self.mean))
-        distance = weight @ (mean**2).T - 2.0 * (z * weight) @ mean.T
-        near = np.argpartition(distance, NEAREST, axis=1)[:, :NEAREST]
-        likely = np.zeros(distance.shape, bool)
-        np.put_along_axis(likely, near, True, axis=1)
-        return likely
+        weight = 1.0 / np.sqrt(self.variance[:LEADING] + s)
+        star, mean = (
+            np.hstack([(a - p @ self.slope)[:, :LEADING] * weight, p])
+            for a, p in ((z, where), (self.mean, self.center))
+        )
+        distance = np.square(mean).sum(axis=1) - 2.0 * star @ mean.T
+        nearest = np.argpartition(distance, NEAREST, axis=1)[:, :NEAREST]
+        near = np.zeros(distance.shape, bool)
+        np.put_along_axis(near, nearest, True, axis=1)
+        return near
 
-    def _cluster(self, k: int) -> tuple[np.ndarray, np.ndarray, float, float]:
-        """Deviations X_k and Y_k, and the factors of S and of X_kᵀX_k in C_k."""
-        stars = slice(int(self.count[:k].sum()), int(self.count[: k + 1].sum()))
-        total = float(self.count[k] + self.shrinkage[0])
-        common = float(self.shrinkage[0]) / total
-        return self.deviation[stars], self.deviation_reference[stars], common, 1.0 / total
+    @cached_property
+    def _clusters(self) -> list[Cluster]:
+        """Each cluster with its own slope, by the same shrinkage as its covariances."""
+        ends = self.count.cumsum()
+        return [self._cluster(slice(b - n, b)) for b, n in zip(ends, self.count, strict=True)]
 
-    def _root(self, k: int, s: float) -> tuple[np.ndarray, float]:
-        """L⁻¹ with L Lᵀ = M, and ln π − ½ ln det(C + s), at a noise variance.
+    def _cluster(self, stars: slice) -> Cluster:
+        p = self.deviation_center[stars]
+        nu, total = float(self.shrinkage[0]), len(p) + float(self.shrinkage[0])
+        scatter = p.T @ p + nu * np.eye(p.shape[1])
 
-        C + s = D + b XᵀX with the diagonal D, and M = 1/b + X D⁻¹Xᵀ.
-        """
-        if (k, s) not in self._roots:
+        def sloped(a: np.ndarray, common: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            """Deviations without the slope of the cluster, and that slope.
+
+            What it differs from that of all counts as rows of its own, of weight ν.
+            """
+            if not (p.size and len(a)):
+                return a, common
+            own = np.linalg.solve(scatter, p.T @ a).astype(np.float32)
+            rows = np.vstack([a - p.astype(np.float32) @ own, np.float32(np.sqrt(nu)) * own])
+            return rows, common + own
+
+        own, slope = sloped(self.deviation[stars], self.slope)
+        own_reference, slope_reference = sloped(
+            self.deviation_reference[stars if len(self.cross) else slice(0)], self.slope_reference
+        )
+        square = np.square(own_reference).sum(axis=0)
+        if len(own) > own.shape[1]:
+            rotation, own = np.linalg.qr(own)
+            own_reference = rotation.T @ own_reference if len(own_reference) else own_reference
+        spread = np.linalg.inv(np.linalg.cholesky(scatter / total))
+        return Cluster(
+            own, own_reference, square, slope, slope_reference, spread, nu / total, 1 / total
+        )
+
+    def _factor(self, k: int, s: float) -> Factor:
+        """C_k + s factorised: D + b XᵀX with the diagonal D, and M = 1/b + X D⁻¹Xᵀ = L Lᵀ."""
+        if (k, s) not in self._factors:
             from scipy.linalg import solve_triangular
 
-            own, _, common, b = self._cluster(k)
-            x, d = own.astype(np.float64), common * self.variance + s
-            lower = np.linalg.cholesky(np.eye(len(x)) / b + (x / d) @ x.T)
-            root = solve_triangular(lower, np.eye(len(x)), lower=True).astype(np.float32)
-            half_det = np.log(lower.diagonal()).sum() + 0.5 * len(x) * np.log(b)
-            constant = np.log(self.count[k] / self.count.sum()) - half_det - 0.5 * np.log(d).sum()
-            self._roots[k, s] = root, float(constant)
-        return self._roots[k, s]
+            cluster = self._clusters[k]
+            leading = int(np.count_nonzero(np.maximum.accumulate(self._total[::-1]) > FLAT * s))
+            shared = np.ones(len(self.variance))
+            shared[:leading] = cluster.common
+            d = shared * self.variance + s
+            x = cluster.own[:, :leading].astype(np.float64)
+            low = np.linalg.cholesky(np.eye(len(x)) / cluster.scale + (x / d[:leading]) @ x.T)
+            y = cluster.own_reference
+            both = np.hstack([x / d[:leading], y]) if len(y) else x / d[:leading]
+            both = solve_triangular(low, both, lower=True)
+            half_det = np.log(low.diagonal()).sum() + 0.5 * len(x) * np.log(cluster.scale)
+            self._factors[k, s] = Factor(
+                inverse=(1.0 / d).astype(np.float32),
+                low=np.ascontiguousarray(both[:, :leading], np.float32),
+                low_reference=np.ascontiguousarray(both[:, leading:], np.float32),
+                shared=shared.astype(np.float32),
+                constant=float(
+                    np.log(self.count[k] / self.count.sum())
+                    - half_det
+                    - 0.5 * np.log(d).sum()
+                    + np.log(cluster.spread.diagonal()).sum()
+                ),
+            )
+        return self._factors[k, s]
+
+    @cached_property
+    def _total(self) -> np.ndarray:
+        """Variance of all stars along the axes."""
+        mean = np.average(self.mean, axis=0, weights=self.count)
+        between = np.average(np.square(self.mean - mean), axis=0, weights=self.count)
+        return self.variance + between + np.square(self.slope).sum(axis=0)
+
+    def _uncertain(self, k: int, s: float) -> np.ndarray:
+        """Variance of each pixel inside a cluster once the image is known, shape (P,)."""
+        factor, cluster = self._factor(k, s), self._clusters[k]
+        leading = factor.low.shape[1]
+        if not len(self.cross):
+            known = np.square(self.axes) @ factor.inverse
+            known -= np.square(factor.low @ self.axes[:, :leading].T).sum(axis=0)
+            return np.maximum(s - s**2 * known, 0.0)
+        own, cross = cluster.own_reference, self.cross * factor.shared
+        cross[:, :leading] += cluster.scale * own.T @ cluster.own[:, :leading]
+        prior = cluster.common * self.variance_reference + cluster.scale * np.square(own).sum(
+            axis=0
+        )
+        known = np.square(cross) @ factor.inverse
+        known -= np.square(cross[:, :leading] @ factor.low.T).sum(axis=1)
+        return np.maximum(prior - known, 0.0)
 
 
-def _k_means(x: np.ndarray, clusters: int, principal: int, seed: int) -> np.ndarray:
-    """Cluster of each star (n, P), by k-means in the leading principal components."""
+def _standard(p: np.ndarray) -> np.ndarray:
+    """Columns of zero mean and unit variance; one that does not vary is 0."""
+    spread = p.std(axis=0)
+    return (p - p.mean(axis=0)) / np.where(spread > 0, spread, 1.0)
+
+
+def _whitening(p: np.ndarray) -> np.ndarray:
+    """Matrix W (q, q) that gives positions p (n, q) of zero mean unit covariance.
+
+    A direction in which the field does not vary becomes 0.
+    """
+    variance, axes = np.linalg.eigh(p.T @ p / len(p))
+    real = variance > 1e-12 * max(variance.max(initial=0.0), 1e-300)
+    return np.asarray(axes * np.where(real, 1.0 / np.sqrt(np.where(real, variance, 1.0)), 0.0))
+
+
+def _k_means(
+    x: np.ndarray, place: np.ndarray, clusters: int, principal: int, seed: int
+) -> np.ndarray:
+    """Cluster of each star (n, P), by k-means in the leading principal components.
+
+    `place`, shape (n, q), joins them, in units of their RMS.
+    """
     from sklearn.cluster import KMeans
     from sklearn.decomposition import PCA
 
     if clusters == 1:
         return np.zeros(len(x), int)
     found = PCA(min(principal, *x.shape), svd_solver="full").fit_transform(x)
+    scale = np.sqrt(np.square(found).sum() / len(x) / max(place.shape[1], 1))
     draw = int(stream(seed, "gmm", "clusters").integers(2**31))
-    means = KMeans(clusters, n_init=1, random_state=draw).fit(found.astype(np.float32))
-    return np.asarray(means.labels_)
+    features = np.hstack([found, scale * place]).astype(np.float32)
+    return np.asarray(KMeans(clusters, n_init=1, random_state=draw).fit(features).labels_)

@@ -88,5 +88,6 @@ def training_set(
         levels=np.asarray(config.noise.levels),
         noise=noise_model(config),
         seed=config.seed,
+        positions=stars["grid"][stars["field_index"]],
         **more,
     )
