@@ -139,11 +139,11 @@ def stars_of(dataset):
     return f"{RESULTS}/data/{tree.scene.name}/{tree.stars.name}.h5"
 
 
-def evaluations_of(dataset, splits=None):
+def evaluations_of(dataset, splits=None, folder="evaluation"):
     """Evaluation CSVs of a dataset, of all its splits unless some are named."""
     settings = dataset_config(dataset).dataset
     return [
-        f"{RESULTS}/evaluation/{dataset}/{split}-{reference}.csv"
+        f"{RESULTS}/{folder}/{dataset}/{split}-{reference}.csv"
         for split in settings.splits
         for reference in settings.references
         if splits is None or split in splits
@@ -217,9 +217,16 @@ def model_of(method, dataset, split, reference):
     return f"{RESULTS}/{method.place(dataset, split, reference)}"
 
 
-def methods_of(dataset):
+def names_of(dataset, on_request=False):
+    """Names of a dataset's methods, or of those on request."""
+    config = dataset_config(dataset)
+    asked = config.workflow.on_request
+    return [m for m in asked if dataset in asked[m]] if on_request else config.methods
+
+
+def methods_of(dataset, on_request=False):
     """Methods of a dataset that leave a model."""
-    return [m for m in map(method, dataset_config(dataset).methods) if m.stored]
+    return [m for m in map(method, names_of(dataset, on_request)) if m.stored]
 
 
 def files_of(method, dataset, split, reference):
@@ -233,15 +240,15 @@ def option_of(method, dataset, split, reference):
     return f"--{method.name.replace('_', '-')}={place}"
 
 
-def fitted(dataset, split, reference, drawn=False):
+def fitted(dataset, split, reference, drawn=False, on_request=False):
     """Files of all models that restore stars of a split, or of those that figures show."""
-    wanted = [m for m in methods_of(dataset) if m.drawn or not drawn]
+    wanted = [m for m in methods_of(dataset, on_request) if m.drawn or not drawn]
     return [path for m in wanted for path in files_of(m, dataset, split, reference)]
 
 
-def model_options(dataset, split, reference, drawn=False):
+def model_options(dataset, split, reference, drawn=False, on_request=False):
     """Options of a command that takes these models."""
-    wanted = [m for m in methods_of(dataset) if m.drawn or not drawn]
+    wanted = [m for m in methods_of(dataset, on_request) if m.drawn or not drawn]
     return [option_of(m, dataset, split, reference) for m in wanted]
 
 
@@ -255,9 +262,9 @@ def bundles_of(dataset, networks):
     ]
 
 
-def estimators_source(command, dataset):
+def estimators_source(command, dataset, on_request=False):
     """Hash of a command that applies the methods of a dataset."""
-    names = dataset_config(dataset).methods
+    names = names_of(dataset, on_request)
     return source_hash(command, chosen=[f"psfdae.estimators.{name}" for name in names])
 
 

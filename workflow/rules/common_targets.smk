@@ -25,6 +25,20 @@ def per_star_of(dataset):
     ]
 
 
+def asked_datasets():
+    """Datasets that methods on request are fitted to."""
+    return [d for d in default_datasets() if names_of(d, on_request=True)]
+
+
+def on_request_of(suffix):
+    """Evaluations of the methods on request, all fields seen in training."""
+    return [
+        csv.removesuffix("csv") + suffix
+        for dataset in asked_datasets()
+        for csv in evaluations_of(dataset, ["random"], "on_request")
+    ]
+
+
 def bound_figures_of(dataset):
     kinds = ["errors", "efficiency"] + (["growth"] if has_bank(dataset) else [])
     return [f"{RESULTS}/figures/bounds/{dataset}_{kind}.png" for kind in kinds]

@@ -1,24 +1,24 @@
 use rule stars as more_stars with:
     output:
-        f"{RESULTS}/data/{{scene}}/fresh/{{stars}}-{{count}}.h5",
+        f"{RESULTS}/data/{{scene}}/fresh/{{stars}}-{{fresh}}.h5",
     log:
-        f"{RESULTS}/logs/stars/{{scene}}/fresh/{{stars}}-{{count}}.log",
+        f"{RESULTS}/logs/stars/{{scene}}/fresh/{{stars}}-{{fresh}}.log",
     benchmark:
-        f"{RESULTS}/benchmarks/more_stars/{{scene}}/{{stars}}-{{count}}.tsv"
+        f"{RESULTS}/benchmarks/more_stars/{{scene}}/{{stars}}-{{fresh}}.tsv"
     wildcard_constraints:
-        count="[0-9]+",
+        fresh="[0-9]+",
     params:
         # Another name is another random stream.
         config=lambda w: settings(
             "stars",
             f"stars={w.stars}",
-            more=(f"stars.name={w.stars}_fresh", f"stars.count={w.count}"),
+            more=(f"stars.name={w.stars}_fresh", f"stars.count={w.fresh}"),
         ),
         source=lambda w: source_hash(
             "stars", chosen=[f"psfdae.stars.scenes:{w.scene.title()}Scene"]
         ),
     message:
-        "Simulating {wildcards.count} other stars {wildcards.stars}"
+        "Simulating {wildcards.fresh} other stars {wildcards.stars}"
 
 
 for _method in (m for m in registered() if m.stored):

@@ -247,6 +247,9 @@ class Workflow(Group):
     datasets: Annotated[list[Name], Field(min_length=1)] = Field(
         description="Options of the group dataset"
     )
+    on_request: dict[MethodName, list[Name]] = Field(
+        description="Methods of the target on_request, and the datasets that they are fitted to"
+    )
 
 
 class Config(Consistent):

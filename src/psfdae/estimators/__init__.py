@@ -55,7 +55,8 @@ class TrainingSet:
     images : ndarray, shape (n, d, d), float32
         Noise-free stars of sum 1, the reference "realisation".
     references : ndarray, shape (n, d, d), float32
-        What is to be restored; for one fit that serves both references, the templates.
+        What is to be restored: the product's array `reference`, but for one fit that
+        serves both references the templates.
     fit, validation : ndarray of int
         Star indices.
     levels : ndarray, shape (L,)
@@ -63,6 +64,8 @@ class TrainingSet:
     noise : NoiseModel
     seed : int
         Of the method's random streams.
+    reference : str
+        "realisation" or "template".
     positions : ndarray, shape (n, 2)
         Where the stars stand in the field, any unit; empty where nobody knows.
     fresh : Product or None
@@ -79,6 +82,7 @@ class TrainingSet:
     levels: np.ndarray
     noise: NoiseModel
     seed: int = 0
+    reference: str = "realisation"
     positions: np.ndarray = field(default_factory=lambda: np.empty((0, 2)))
     fresh: Product | None = None
     checkpoint: Path | None = None
@@ -95,6 +99,29 @@ class TrainingSet:
     def without_validation(self) -> TrainingSet:
         """The same stars but for those that validate."""
         return replace(self, validation=self.validation[:0])
+
+    def on_fresh_stars(self) -> TrainingSet:
+        """The fresh stars as those that are fitted, in fields of the training part only.
+
+        Raises
+        ------
+        FitError
+            If there are none.
+        """
+        if self.fresh is None:
+            raise FitError("it learns from fresh stars: give a product of the stage stars")
+        grid, field = self.fresh["grid"], self.fresh["field_index"]
+        known = (grid[:, None] == np.unique(self.positions[self.train], axis=0)).all(-1).any(1)
+        drawn, kept = known[field].nonzero()[0], self.validation
+        return replace(
+            self,
+            images=np.concatenate([self.fresh["realisation"][drawn], self.images[kept]]),
+            references=np.concatenate([self.fresh[self.reference][drawn], self.references[kept]]),
+            positions=np.concatenate([grid[field[drawn]], self.positions[kept]]),
+            fit=np.arange(drawn.size),
+            validation=drawn.size + np.arange(kept.size),
+            fresh=None,
+        )
 
 
 @dataclass(frozen=True)
@@ -361,7 +388,7 @@ def method(name: str) -> type[Method]:
 
 
 def registered() -> tuple[type[Method], ...]:
-    """The methods that the configuration lists, in the order of tables.
+    """The methods that the configuration lists, in the order of tables; those on request last.
 
     Raises
     ------
@@ -377,9 +404,12 @@ def listed(path: Path) -> tuple[type[Method], ...]:
     try:
         tree = parse_yaml(path)
         names = tree.get("methods") if isinstance(tree, dict) else None
-        if not isinstance(names, list) or len({*map(str, names)}) < len(names):
+        if not isinstance(names, list):
             raise ProductError("methods: must be a list of different names")
-        return tuple(method(str(name)) for name in names)
+        names = [*map(str, names), *(tree.get("workflow") or {}).get("on_request", ())]
+        if len({*names}) < len(names):
+            raise ProductError("methods, workflow.on_request: must be different names")
+        return tuple(map(method, names))
     except ProductError as error:
         text = str(error)
         raise ConfigError(text if text.startswith(str(path)) else f"{path}: {text}") from None

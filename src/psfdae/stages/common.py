@@ -69,6 +69,11 @@ def read_stars(path: Path, *references: str) -> Product:
     return read_product(path, "stars", names)
 
 
+def field_positions(stars: Product) -> np.ndarray:
+    """Where each star stands, in steps of the field's grid, shape (n, 2)."""
+    return stars["grid"][stars["field_index"]]
+
+
 def split_stars(stars: Product, kind: str, config: Any) -> Split:
     """Training, validation and test stars of a split.
 

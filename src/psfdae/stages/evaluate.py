@@ -15,7 +15,13 @@ from psfdae.estimators import ConfigError, Estimate, Method, method, registered
 from psfdae.evaluation.metrics import all_metrics, clustered_mean
 from psfdae.files import Product, ProductError, write_csv, write_parquet, write_text
 from psfdae.reading import read_table
-from psfdae.stages.common import limit_threads, noisy_test_images, read_stars, split_stars
+from psfdae.stages.common import (
+    field_positions,
+    limit_threads,
+    noisy_test_images,
+    read_stars,
+    split_stars,
+)
 from psfdae.stages.fit import training_set
 
 if TYPE_CHECKING:
@@ -59,13 +65,14 @@ def evaluate(
     methods = estimators(config, product, vars(models), split, reference)
     test = split_stars(product, split, config).test
     truth, field = product[reference][test], product["field_index"][test]
+    position = field_positions(product)[test]
     key = {"dataset": dataset, "split": split, "reference": reference}
     summary, stars_table = [], []
     for level in config.noise.levels:
         # It depends on seed and λ only: methods and references are compared on the same images.
         noisy = noisy_test_images(config, product["realisation"][test], level)
         for name, estimator in methods.items():
-            metrics = measured(estimator.estimate(noisy, level), truth, config)
+            metrics = measured(estimator.estimate(noisy, level, position), truth, config)
             row = {**key, "method": name, "noise_level": level}
             summary += summarised(row, metrics, field)
             stars_table.append(pd.DataFrame({**row, "star": test, "field": field, **metrics}))

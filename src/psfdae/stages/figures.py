@@ -13,7 +13,13 @@ from psfdae.configuration.schema import Config
 from psfdae.estimators import Method
 from psfdae.files import Product, ProductError, atomic_path, read_product
 from psfdae.reading import read_table
-from psfdae.stages.common import limit_threads, noisy_test_images, read_stars, split_stars
+from psfdae.stages.common import (
+    field_positions,
+    limit_threads,
+    noisy_test_images,
+    read_stars,
+    split_stars,
+)
 from psfdae.stages.evaluate import READS, Evaluations, Metric, Models, estimators, read_evaluations
 
 if TYPE_CHECKING:
@@ -204,7 +210,7 @@ def strip_rows(
     from psfdae.evaluation.figures import StripRow
     from psfdae.evaluation.metrics import mse
 
-    truth = product[reference][test][picks]
+    truth, position = product[reference][test][picks], field_positions(product)[test][picks]
     rows = [StripRow("reference", truth)]
     if reference == "template":
         noise_free = product["realisation"][test][picks]
@@ -213,7 +219,7 @@ def strip_rows(
         # All test stars, as the stage `evaluate` draws them, then the picked ones.
         noisy = noisy_test_images(config, product["realisation"][test], level)[picks]
         for kind in methods.values():
-            images = kind.estimate(noisy, level).psf
+            images = kind.estimate(noisy, level, position).psf
             label = f"{kind.label}\nλ = {level:g}"
             rows.append(StripRow(label, images, mse(images, truth), not kind.restores))
     return rows

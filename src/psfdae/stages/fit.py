@@ -12,7 +12,13 @@ from psfdae.cli import File, Folder, Reference, Split, command
 from psfdae.configuration.schema import Config
 from psfdae.estimators import Method, TrainingSet, groups_of, method
 from psfdae.files import Product
-from psfdae.stages.common import limit_threads, noise_model, read_stars, split_stars
+from psfdae.stages.common import (
+    field_positions,
+    limit_threads,
+    noise_model,
+    read_stars,
+    split_stars,
+)
 
 Stars = Annotated[File, "Product of the stage stars."]
 
@@ -88,6 +94,7 @@ def training_set(
         levels=np.asarray(config.noise.levels),
         noise=noise_model(config),
         seed=config.seed,
-        positions=stars["grid"][stars["field_index"]],
+        reference=reference,
+        positions=field_positions(stars),
         **more,
     )

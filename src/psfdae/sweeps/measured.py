@@ -6,11 +6,14 @@ import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from psfdae.estimators import Method
+
+if TYPE_CHECKING:
+    from psfdae.files import Product
 
 EVALUATION, VALIDATION = "evaluation.csv", "validation.csv"
 """Tables of a point: on the test part, as in the main workflow, and on the validation part."""
@@ -94,9 +97,8 @@ def image_rows(
     config: Any,
     task: Task,
     method: str,
-    images: np.ndarray,
-    truth: np.ndarray,
-    field: np.ndarray,
+    product: Product,
+    stars: np.ndarray,
     noisy: Callable[[np.ndarray, float], np.ndarray],
     model: Method,
 ) -> list[dict[str, Any]]:
@@ -108,20 +110,22 @@ def image_rows(
     task : Task
     method : str
         Name in the table.
-    images, truth : ndarray, shape (n, d, d)
-        Noise-free images and references.
-    field : ndarray of int, shape (n,)
-        Field of every star: standard errors are clustered by it.
+    product : product "stars" with the reference
+    stars : ndarray of int, shape (n,)
+        Those that are measured; standard errors are clustered by their fields.
     noisy : callable
-        Noisy images of `images` at a noise level.
+        Noisy images of noise-free ones at a noise level.
     model : Method
     """
+    from psfdae.stages.common import field_positions
     from psfdae.stages.evaluate import measured, summarised
 
+    images, truth = (product[kind][stars] for kind in ("realisation", task.reference))
+    field, position = product["field_index"][stars], field_positions(product)[stars]
     key = {"dataset": task.dataset, "split": task.split, "reference": task.reference}
     rows = []
     for level in task.levels:
-        found = measured(model.estimate(noisy(images, level), level), truth, config)
+        found = measured(model.estimate(noisy(images, level), level, position), truth, config)
         rows += summarised({**key, "method": method, "noise_level": level}, found, field)
     return rows
 
@@ -179,9 +183,7 @@ def measure_images(
         ("validation", parts.validation, noisy_validation, validate_with, VALIDATION),
         ("test", parts.test, noisy_test, test_with, EVALUATION),
     ):
-        images, truth = (product[kind][stars] for kind in ("realisation", task.reference))
-        field = product["field_index"][stars]
-        rows = image_rows(config, task, method, images, truth, field, noisy, model)
+        rows = image_rows(config, task, method, product, stars, noisy, model)
         metrics |= image_metrics(part, rows)
         write_csv(task.folder / name, pd.DataFrame(rows))
     return metrics

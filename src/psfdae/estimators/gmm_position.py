@@ -1,0 +1,17 @@
+"""The Gaussian mixture that is told where in the field a star stands, as an observer knows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from psfdae.estimators.gmm import GaussianMixture
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedMixture(GaussianMixture):
+    """A mixture of images, references and positions."""
+
+    label, color, marker = "Gaussian mixture (told λ, position)", "#882255", "X"
+    drawn = False
+    told_position = True
+    bundled = False

@@ -1,0 +1,16 @@
+"""The Gaussian mixture of many fresh stars that is told where a star stands."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from psfdae.estimators.gmm_simulated import SimulatedMixture
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedSimulatedMixture(SimulatedMixture):
+    """A mixture of fresh images, references and positions."""
+
+    label, color, marker = "Gaussian mixture of fresh stars (told λ, position)", "#661100", "*"
+    told_position = True
+    bundled = False
