@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from psfdae.estimators import FitError, TrainingSet
+from psfdae.estimators import TrainingSet
 from psfdae.estimators import gmm as module
 from psfdae.estimators.gmm import GaussianMixture, Gmm
 from psfdae.stars.noise import NoiseModel
@@ -16,7 +16,14 @@ from psfdae.stars.noise import NoiseModel
 NOISE = NoiseModel(kappa=5.0, background=1e4)
 D = 6
 LEVEL = 2e-3
-ONE = {"components": [1], "shrinkage": [20.0], "principal": 8, "place": 1.0, "threads": 1}
+ONE = {
+    "stars": None,
+    "components": [1],
+    "shrinkage": [20.0],
+    "principal": 8,
+    "place": 1.0,
+    "threads": 1,
+}
 
 
 def stars(count, seed=1):
@@ -34,6 +41,15 @@ def stars(count, seed=1):
     return images(width), images(1.1 * width)
 
 
+class Placed(GaussianMixture):
+    told_position = True
+
+
+def where(count, seed=1):
+    """Positions that have to do with the stars' kinds."""
+    return stars(count, seed)[0][:, 3, 3:5] + np.random.default_rng(seed).normal(0, 0.1, (count, 2))
+
+
 def training(count=400, same=True, images=None):
     x, y = stars(count) if images is None else (images, images)
     part = np.arange(len(x))
@@ -45,47 +61,66 @@ def training(count=400, same=True, images=None):
         validation=judge,
         levels=np.array([LEVEL, 4 * LEVEL]),
         noise=NOISE,
+        positions=where(len(x)),
     )
 
 
-def fitted(count=400, same=True, **changed):
-    return GaussianMixture.fit(training(count, same), Gmm(**{**ONE, **changed}))
+def fitted(count=400, same=True, kind=GaussianMixture, **changed):
+    return kind.fit(training(count, same), Gmm(**{**ONE, **changed}))
 
 
-def dense(mixture, noisy, level):
-    """Posterior mean and evidence with whole covariance matrices."""
-    z = noisy.reshape(len(noisy), -1).astype(float)
-    s = (NOISE.kappa * level) ** 2 + 1.0 / z.shape[1] / NOISE.flux(level)
-    axes, log, estimates = mixture.axes.astype(float), [], []
-    for k, count in enumerate(mixture.count):
-        cluster = mixture._clusters[k]
-        common, own = cluster.common, cluster.scale
-        x, y = cluster.own @ axes.T, cluster.own_reference.astype(float)
-        pooled = (axes * mixture.variance) @ axes.T
-        y, cross = (y, mixture.cross @ axes.T) if len(mixture.cross) else (x, pooled)
-        covariance = common * pooled + own * x.T @ x + s * np.eye(z.shape[1])
-        mean = mixture.mean[k] @ axes.T
-        log.append(
-            multivariate_normal(mean, covariance).logpdf(z) + np.log(count / mixture.count.sum())
-        )
-        gain = np.linalg.solve(covariance, (z - mean).T)
-        estimates.append(mixture.mean_reference[k] + ((common * cross + own * y.T @ x) @ gain).T)
+def dense(mixture, noisy, level, position):
+    """Posterior mean, standard deviation and evidence with whole covariance matrices.
+
+    They are those of the joint vector of image, position and reference.
+    """
+    axes, pixels = mixture.axes.astype(float), D * D
+    told = mixture.center.shape[1]
+    place = position @ mixture.whitening if told else position[:, :0]
+    z = np.hstack([noisy.reshape(len(noisy), -1), place])
+    noise = np.zeros(z.shape[1])
+    noise[:pixels] = (NOISE.kappa * level) ** 2 + 1.0 / pixels / NOISE.flux(level)
+    p = mixture.deviation_center
+    x = (mixture.deviation + p @ mixture.slope) @ axes.T
+    y = mixture.deviation_reference + p @ mixture.slope_reference if len(mixture.cross) else x
+    joint = np.hstack([x, p, y])
+    pooled, nu = joint.T @ joint / len(joint), mixture.shrinkage[0]
+    log, means, squares = [], [], []
+    for k, last in enumerate(mixture.count.cumsum()):
+        own = joint[last - mixture.count[k] : last]
+        covariance = (own.T @ own + nu * pooled) / (len(own) + nu)
+        seen, hidden = slice(z.shape[1]), slice(z.shape[1], None)
+        observed = covariance[seen, seen] + np.diag(noise)
+        mean = np.concatenate([mixture.mean[k] @ axes.T, mixture.center[k]])
+        law = multivariate_normal(mean, observed, allow_singular=True)
+        log.append(law.logpdf(z) + np.log(mixture.count[k] / len(joint)))
+        gain = np.linalg.solve(observed, covariance[seen, hidden]).T
+        means.append(mixture.mean_reference[k] + (z - mean) @ gain.T)
+        inside = np.diag(covariance[hidden, hidden] - gain @ covariance[seen, hidden])
+        squares.append(means[-1] ** 2 + inside)
     peak = np.max(log, axis=0)
     weight = np.exp(log - peak)
-    mean = np.einsum("kn,knp->np", weight / weight.sum(axis=0), estimates)
-    return mean.reshape(noisy.shape), peak + np.log(weight.sum(axis=0))
+    evidence = peak + np.log(weight.sum(axis=0)) + 0.5 * told * np.log(2 * np.pi)
+    mean, square = (
+        np.einsum("kn,knp->np", weight / weight.sum(axis=0), a) for a in (means, squares)
+    )
+    shaped = (a.reshape(noisy.shape) for a in (mean, np.sqrt(square - mean**2)))
+    return *shaped, evidence
 
 
 @pytest.mark.parametrize("same", [True, False])
+@pytest.mark.parametrize("kind", [GaussianMixture, Placed])
 @pytest.mark.parametrize("level", [1e-4, LEVEL, 0.05])
-def test_sums_are_those_of_dense_matrices(same, level, monkeypatch):
+@pytest.mark.parametrize("clusters", [1, 12])
+def test_sums_are_those_of_dense_matrices(same, kind, level, clusters, monkeypatch):
     monkeypatch.setattr(module, "FLAT", 0.0)
     monkeypatch.setattr(module, "LEAST", 0.0)
-    mixture = fitted(same=same, components=[12])
+    mixture = fitted(same=same, kind=kind, components=[clusters])
     noisy = NOISE.draw(stars(50, seed=2)[0], level, np.random.default_rng(3))
-    mean, evidence = dense(mixture, noisy, level)
-    found = mixture.estimate(noisy, level)
+    mean, sigma, evidence = dense(mixture, noisy, level, where(50, seed=2))
+    found = mixture.estimate(noisy, level, where(50, seed=2))
     np.testing.assert_allclose(found.psf, mean, atol=2e-4 * mean.max())
+    np.testing.assert_allclose(found.sigma**2, sigma**2, rtol=0.04, atol=3e-6)
     np.testing.assert_allclose(found.evidence, evidence, atol=0.05)
 
 
@@ -100,15 +135,6 @@ def test_one_cluster_is_linear_mmse():
     residual = noisy.reshape(20, -1) - x.mean(axis=0)
     wanted = y.mean(axis=0) + (dy.T @ dx / len(x) @ np.linalg.solve(system, residual.T)).T
     np.testing.assert_allclose(mixture.predict(noisy, LEVEL).reshape(20, -1), wanted, atol=1e-5)
-
-
-def test_without_noise_it_gives_the_image_and_in_noise_the_mean():
-    mixture, images = fitted(components=[12]), stars(20, seed=2)[0]
-    np.testing.assert_allclose(mixture.predict(images, 1e-9), images, atol=3e-6)
-    weight = mixture.count / mixture.count.sum()
-    mean = np.einsum("k,kp->p", weight, mixture.mean_reference)
-    lost = mixture.predict(images, 1e4).reshape(20, -1)
-    np.testing.assert_allclose(lost, np.broadcast_to(mean, lost.shape), atol=1e-6)
 
 
 def test_levels_of_their_own_are_those_of_all():
@@ -147,31 +173,6 @@ def test_validation_stars_choose():
         training().without_validation(), Gmm(**{**ONE, "components": [1, 12]})
     )
     assert len(other.count) == 12 and other.count.sum() == 350
-
-
-def test_few_and_equal_stars():
-    noisy = NOISE.draw(stars(5, seed=2)[0], LEVEL, np.random.default_rng(3))
-    one = GaussianMixture.fit(training(images=stars(1)[0]), Gmm(**ONE))
-    np.testing.assert_allclose(
-        one.predict(noisy, LEVEL), np.repeat(stars(1)[0], 5, axis=0), atol=1e-6
-    )
-    equal = training(images=np.repeat(stars(1)[0], 30, axis=0))
-    found = GaussianMixture.fit(equal, Gmm(**{**ONE, "components": [1, 4]}))
-    np.testing.assert_allclose(
-        found.predict(noisy, LEVEL), np.repeat(stars(1)[0], 5, axis=0), atol=1e-6
-    )
-    lonely = np.concatenate([stars(30)[0], np.eye(D * D, dtype=np.float32)[:1].reshape(1, D, D)])
-    apart = GaussianMixture.fit(training(images=lonely), Gmm(**{**ONE, "components": [2]}))
-    assert 1 in apart.count and np.isfinite(apart.predict(noisy, LEVEL)).all()
-    with pytest.raises(FitError, match=r"gmm\.components = \[500\]: must be at most 30"):
-        GaussianMixture.fit(training(30), Gmm(**{**ONE, "components": [500]}))
-
-
-def test_an_image_that_is_not_finite_is_refused():
-    noisy = stars(3)[0]
-    noisy[1, 2, 3] = np.nan
-    with pytest.raises(ValueError, match="must be finite"):
-        fitted().predict(noisy, LEVEL)
 
 
 def test_it_is_stored_and_the_same_again(tmp_path):

@@ -17,6 +17,7 @@ from prediction import make_cube
 from psfdae.cli import File, command, program
 from psfdae.configuration.consistency import SIMULATION
 from psfdae.configuration.schema import Config
+from psfdae.estimators import method, registered
 from psfdae.rng import stream
 
 BATCHES = (1, 16, 64, 256, 1024)
@@ -213,7 +214,8 @@ def with_exponents(part, against):
     return table.assign(**exponents)
 
 
-READS = ("parts", "dae", "train", "baseline", "evaluation", "methods", "benchmark")
+FITS = (group for kind in registered() for group in kind.groups)
+READS = tuple(dict.fromkeys(("parts", *FITS, "evaluation", "methods", "benchmark")))
 
 
 @command("stages", reads=(*SIMULATION, "noise", *READS))
@@ -228,8 +230,9 @@ def measured(config, folder):
     """Costs of every stage at the numbers benchmark.star_counts, four fifths for training."""
     threads, tree, rows = config.optics.threads, config.model_dump(), []
     tree["train"]["epochs"] = TRAINED_EPOCHS
-    names = ("templates.h5", "simulated.h5", "stars.h5", "pca_som.h5", "dae", "stars.fits")
-    templates, simulated, stars, pca_som, dae, cube = (folder / name for name in names)
+    names = ("templates.h5", "simulated.h5", "stars.h5", "stars.fits")
+    templates, simulated, stars, cube = (folder / name for name in names)
+    fits = {kind: folder / kind.name for kind in map(method, config.methods) if kind.stored}
     bundle = folder / "model.psf.safetensors"
     alone(threads, cost_of_command, ["templates"], templates, tree)
 
@@ -247,9 +250,11 @@ def measured(config, folder):
     for i, count in enumerate(config.benchmark.star_counts):
         tree["parts"] |= {"train_stars": 4 * count // 5, "test_stars": count - 4 * count // 5}
         alone(1, repeat_stars, simulated, count, stars)
-        cost("baseline", ["baseline", *given], pca_som)
-        cost("train", ["train", *given, "--checkpoint", folder / "train.pt"], dae)
-        models = ["--dataset", "measured", "--pca-som", pca_som, "--dae", dae]
+        models = ["--dataset", "measured"]
+        for kind, place in fits.items():
+            own = ["--checkpoint", folder / "fit.pt"]
+            cost(kind.rule, ["fit", kind.name, *given, *own], place)
+            models += [f"--{kind.name.replace('_', '-')}", place]
         per_star = ["--per-star", folder / "per_star.parquet"]
         cost("evaluate", ["evaluate", *given, *models, *per_star], folder / "summary.csv")
         if i < SIMULATED:

@@ -60,6 +60,7 @@ AT_ONCE = 4096
 class Gmm(Group):
     """Mixture of Gaussians; of several values the validation stars choose."""
 
+    stars: Count | None = Field(description="Training stars that are learnt from; null: all")
     components: Annotated[list[Count], Field(min_length=1)] = Field(
         description="Clusters K that are tried; more than stars are not"
     )
@@ -148,7 +149,7 @@ class GaussianMixture(Method):
         Covariance within clusters of references (pixels) and images (axes).
     variance_reference : ndarray, shape (P,), or (0,)
         Variance of the references within clusters.
-    whitening : ndarray, shape (2, q)
+    whitening : ndarray, shape (q, q)
         To positions of unit variance within clusters; q = 2 where they are told, else 0.
     center, deviation_center : ndarray, shape (K, q) and (n, q)
         Mean whitened position of each cluster, and each star's deviation from it.
@@ -210,6 +211,7 @@ class GaussianMixture(Method):
         """
         searched = len(gmm.components) * len(gmm.shrinkage) > 1
         learn, judge = (data.fit, data.validation) if searched else (data.train, data.train[:0])
+        learn = learn[: gmm.stars]
         if searched and not judge.size:  # nothing is left out for a choice: some others serve
             judge, learn = learn[::10], np.delete(learn, np.s_[::10])
         sizes = [k for k in gmm.components if k <= learn.size]
@@ -244,7 +246,7 @@ class GaussianMixture(Method):
                     one = replace(tried[clusters], shrinkage=np.array([other]))
                     by_shrinkage[other] = error(one)
             shrinkage = min(by_shrinkage, key=by_shrinkage.__getitem__)
-        final = cls._clustered(data, data.train, clusters, gmm)
+        final = cls._clustered(data, data.train[: gmm.stars], clusters, gmm)
         return replace(final, shrinkage=np.array([shrinkage]))
 
     @classmethod
@@ -336,7 +338,7 @@ class GaussianMixture(Method):
         flat = noisy.reshape(len(noisy), -1)
         if not np.isfinite(flat).all():
             raise ValueError("noisy images must be finite")
-        where = np.empty((len(flat), 0)) if position is None else position @ self.whitening
+        where = position @ self.whitening if self.whitening.size else np.empty((len(flat), 0))
         even = np.full(len(flat), 1.0 / flat.shape[1])
         s, node = np.unique(self.noise.variance(even, np.asarray(level)), return_inverse=True)
         if s.size > EXACT:
