@@ -53,6 +53,9 @@ LEAST = 1e-3
 FLAT = 0.005
 """Variance of a coordinate, as a part of s, below which all clusters share one normal law."""
 
+WORSE = 1.05
+"""Times the least error so far, with which the search for more clusters ends."""
+
 AT_ONCE = 4096
 """Images that are restored together."""
 
@@ -62,7 +65,7 @@ class Gmm(Group):
 
     stars: Count | None = Field(description="Training stars that are learnt from; null: all")
     components: Annotated[list[Count], Field(min_length=1)] = Field(
-        description="Clusters K that are tried; more than stars are not"
+        description="Clusters K that are tried, in this order; more than stars are not"
     )
     shrinkage: Annotated[list[Positive], Field(min_length=1)] = Field(
         description="Stars ν that the covariance of all clusters counts for in each; "
@@ -220,43 +223,51 @@ class GaussianMixture(Method):
                 f"gmm.components = {gmm.components}: must be at most {learn.size}, the number of "
                 "training stars" + " without those that choose" * searched
             )
-        clusters, shrinkage = sizes[0], gmm.shrinkage[0]
+        best = sizes[0], cls.told_position
+        shrinkage = gmm.shrinkage[0]
         if searched:
             rng = stream(data.seed, "noise", "gmm validation")
             noisy = [data.noise.draw(data.images[judge], level, rng) for level in data.levels]
 
             def error(tried: Self) -> float:
-                """Mean logarithm of the error on the stars that choose."""
+                """Geometric mean of the errors on the stars that choose."""
                 truth, where = data.references[judge], cls._told(data, judge)
-                return float(
-                    np.mean(
-                        [
-                            np.log(np.square(tried.predict(z, level, where) - truth).mean())
-                            for z, level in zip(noisy, data.levels, strict=True)
-                        ]
-                    )
-                )
+                errors = [
+                    np.square(tried.predict(z, level, where) - truth).mean()
+                    for z, level in zip(noisy, data.levels, strict=True)
+                ]
+                return float(np.exp(np.mean(np.log(errors))))
 
-            tried = {k: cls._clustered(data, learn, k, gmm) for k in sizes}
-            errors = {k: error(one) for k, one in tried.items()}
-            clusters = min(errors, key=errors.__getitem__)
-            by_shrinkage = {shrinkage: errors[clusters]}
-            if clusters > 1:  # in one cluster ν has no effect
-                for other in gmm.shrinkage[1:]:
-                    one = replace(tried[clusters], shrinkage=np.array([other]))
-                    by_shrinkage[other] = error(one)
+            tried: dict[tuple[int, bool], Self] = {}
+            errors: dict[tuple[int, bool], float] = {}
+            # What is told may be left aside, if that is better for stars that did not learn it.
+            for told in (True, False) if cls.told_position else (False,):
+                least = np.inf
+                for k in sizes:
+                    tried[k, told] = cls._clustered(data, learn, k, gmm, told)
+                    errors[k, told] = error(tried[k, told])
+                    least = min(least, errors[k, told])
+                    if errors[k, told] > WORSE * least:
+                        break
+            best = min(errors, key=errors.__getitem__)
+            by_shrinkage = {shrinkage: errors[best]}
+            if best[0] > 1:  # in one cluster ν has no effect
+                for nu in gmm.shrinkage[1:]:
+                    by_shrinkage[nu] = error(replace(tried[best], shrinkage=np.array([nu])))
             shrinkage = min(by_shrinkage, key=by_shrinkage.__getitem__)
-        final = cls._clustered(data, data.train[: gmm.stars], clusters, gmm)
+        final = cls._clustered(data, data.train[: gmm.stars], best[0], gmm, best[1])
         return replace(final, shrinkage=np.array([shrinkage]))
 
     @classmethod
-    def _clustered(cls, data: TrainingSet, stars: np.ndarray, clusters: int, gmm: Gmm) -> Self:
-        """Moments of the clusters of some stars."""
+    def _clustered(
+        cls, data: TrainingSet, stars: np.ndarray, clusters: int, gmm: Gmm, told: bool
+    ) -> Self:
+        """Moments of the clusters of some stars, and how they follow the position if it is told."""
         x, y = (
             a[stars].reshape(stars.size, -1).astype(np.float64)
             for a in (data.images, data.references)
         )
-        p = cls._told(data, stars).astype(np.float64)
+        p = cls._told(data, stars).astype(np.float64) * told
         cluster = _k_means(x, gmm.place * _standard(p), clusters, gmm.principal, data.seed)
         order = np.argsort(cluster, kind="stable")
         count = np.unique(cluster, return_counts=True)[1]
