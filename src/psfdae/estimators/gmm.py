@@ -223,40 +223,43 @@ class GaussianMixture(Method):
                 f"gmm.components = {gmm.components}: must be at most {learn.size}, the number of "
                 "training stars" + " without those that choose" * searched
             )
-        best = sizes[0], cls.told_position
-        shrinkage = gmm.shrinkage[0]
+        clusters, told, shrinkage = sizes[0], cls.told_position, gmm.shrinkage[0]
         if searched:
-            rng = stream(data.seed, "noise", "gmm validation")
-            noisy = [data.noise.draw(data.images[judge], level, rng) for level in data.levels]
-
-            def error(tried: Self) -> float:
-                """Geometric mean of the errors on the stars that choose."""
-                truth, where = data.references[judge], cls._told(data, judge)
-                errors = [
-                    np.square(tried.predict(z, level, where) - truth).mean()
-                    for z, level in zip(noisy, data.levels, strict=True)
-                ]
-                return float(np.exp(np.mean(np.log(errors))))
-
-            tried: dict[tuple[int, bool], Self] = {}
-            errors: dict[tuple[int, bool], float] = {}
-            # What is told may be left aside, if that is better for stars that did not learn it.
-            for told in (True, False) if cls.told_position else (False,):
-                least = np.inf
-                for k in sizes:
-                    tried[k, told] = cls._clustered(data, learn, k, gmm, told)
-                    errors[k, told] = error(tried[k, told])
-                    least = min(least, errors[k, told])
-                    if errors[k, told] > WORSE * least:
-                        break
-            best = min(errors, key=errors.__getitem__)
-            by_shrinkage = {shrinkage: errors[best]}
-            if best[0] > 1:  # in one cluster ν has no effect
-                for nu in gmm.shrinkage[1:]:
-                    by_shrinkage[nu] = error(replace(tried[best], shrinkage=np.array([nu])))
-            shrinkage = min(by_shrinkage, key=by_shrinkage.__getitem__)
-        final = cls._clustered(data, data.train[: gmm.stars], best[0], gmm, best[1])
+            clusters, told, shrinkage = cls._chosen(data, learn, judge, sizes, gmm)
+        final = cls._clustered(data, data.train[: gmm.stars], clusters, gmm, told)
         return replace(final, shrinkage=np.array([shrinkage]))
+
+    @classmethod
+    def _chosen(
+        cls, data: TrainingSet, learn: np.ndarray, judge: np.ndarray, sizes: list[int], gmm: Gmm
+    ) -> tuple[int, bool, float]:
+        """K, whether the position is used, and ν, by the error on the stars that judge."""
+        rng = stream(data.seed, "noise", "gmm validation")
+        noisy = [data.noise.draw(data.images[judge], level, rng) for level in data.levels]
+        truth, where = data.references[judge], cls._told(data, judge)
+
+        def error(tried: Self) -> float:
+            """Geometric mean over the noise levels."""
+            pairs = zip(noisy, data.levels, strict=True)
+            errors = [np.square(tried.predict(z, s, where) - truth).mean() for z, s in pairs]
+            return float(np.exp(np.mean(np.log(errors))))
+
+        tried: list[tuple[float, int, bool, Self]] = []
+        # What is told may be left aside, where stars in other places are worse for it.
+        for told in (True, False) if cls.told_position else (False,):
+            least = np.inf
+            for k in sizes:
+                one = cls._clustered(data, learn, k, gmm, told)
+                tried.append((error(one), k, told, one))
+                least = min(least, tried[-1][0])
+                if tried[-1][0] > WORSE * least:
+                    break
+        first, clusters, told, one = min(tried, key=lambda row: row[0])
+        by_shrinkage = {gmm.shrinkage[0]: first}
+        if clusters > 1:  # in one cluster ν has no effect
+            for nu in gmm.shrinkage[1:]:
+                by_shrinkage[nu] = error(replace(one, shrinkage=np.array([nu])))
+        return clusters, told, min(by_shrinkage, key=by_shrinkage.__getitem__)
 
     @classmethod
     def _clustered(
