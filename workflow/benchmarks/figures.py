@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 import numpy as np
 
 from psfdae.cli import File, command, program
+from psfdae.estimators import method
 from psfdae.evaluation.figure_style import SERIES_COLORS, new_figure, styled
 from psfdae.files import ProductError
 from psfdae.reading import read_table
@@ -56,7 +57,8 @@ SERIES = (
 @command("draw")
 def draw(
     kind: Literal[
-        "propagation", "skipping", "training", "baseline", "inference", "scaling", "graded"
+        *("propagation", "skipping", "training", "baseline", "methods", "inference"),
+        *("scaling", "graded"),
     ],
     table: Annotated[File, "Table of that benchmark."],
     out: Annotated[File, "PNG."],
@@ -189,6 +191,26 @@ def baseline(table):
     panels[0].set_ylabel("MSE per pixel, mean over the noise levels")
     panels[0].legend()
     figure.suptitle("PCA+SOM: test error against the time of the fit")
+    return figure
+
+
+def methods(table):
+    """Test error of all methods against the time of their fit and of a star."""
+    figure = new_figure(4.0, layout="constrained")
+    panels = figure.subplots(1, 2, sharey=True)
+    table = table.assign(star_ms=1e3 / table["stars_per_s"], mse=np.log(table["mse"]))
+    for name, rows in table.groupby("method", sort=False):
+        kind, mean = method(name), rows.mean(numeric_only=True)
+        for axes, column in zip(panels, ("fit_cpu_s", "star_ms"), strict=True):
+            style = {"marker": kind.marker, "color": kind.color, "ls": "", "ms": 9}
+            axes.plot(mean[column], np.exp(mean["mse"]), label=kind.label, **style)
+    panels[0].set(**LOGS, xlabel="CPU time of the fit, its choices included (s)")
+    panels[1].set(**LOGS, xlabel="CPU time of a star (ms)")
+    panels[0].set_ylabel("test MSE, geometric mean over λ")
+    for axes in panels:
+        axes.grid(True, which="both")
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    figure.suptitle("All methods on dataset 3: error against time")
     return figure
 
 

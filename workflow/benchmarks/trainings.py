@@ -1,7 +1,8 @@
 """Test error against fitting time: which training, which PCA+SOM is large enough."""
 
 from pathlib import Path
-from time import perf_counter
+from tempfile import TemporaryDirectory
+from time import perf_counter, process_time
 from typing import Annotated
 
 import numpy as np
@@ -14,10 +15,12 @@ from psfdae.configuration.base import Group
 from psfdae.configuration.compose import config_dir, decisive, load_file, part
 from psfdae.configuration.consistency import SIMULATION
 from psfdae.configuration.schema import Config
+from psfdae.estimators import method, registered
 from psfdae.files import read_product
 from psfdae.reading import read_table, read_yaml
 from psfdae.rng import stream
 from psfdae.stages import common
+from psfdae.stages.fit import training_set
 from psfdae.stars.noise import mixed_levels
 
 PATIENCE = 5  # validations without a better one after which a training no longer improves
@@ -28,6 +31,8 @@ COMPONENTS, MAPS, EPOCHS = (5, 10, 20, 40), (7, 11, 15), (2, 10, 50)
 CHEAP_S = 3.0  # within which a fit of PCA+SOM is repeated
 
 READS = (*SIMULATION, "noise", "parts", "baseline", "benchmark")
+FITS = dict.fromkeys(group for kind in registered() for group in kind.groups)
+METHODS = (*SIMULATION, "noise", "parts", "methods", *FITS)
 
 
 class Knee(Group):
@@ -220,5 +225,43 @@ def median_time(call, repeats):
     return result, np.median(times), len(times)
 
 
+@command("methods", reads=METHODS)
+def methods(
+    config: Config,
+    stars: Annotated[File, "Product of the stage stars."],
+    out: Annotated[File, "CSV with the times of every method, and its error."],
+) -> None:
+    """Time fit and inference of all methods on one thread, on a quiet machine."""
+    require(stars, read_product(stars, "stars", ()).config, STARS, config)
+    write(out, alone(1, time_methods, config.model_dump(), stars))
+
+
+def time_methods(tree, stars):
+    """CPU time of each method's fit, stars per second and errors, λ by λ."""
+    config = part(METHODS, tree)
+    common.limit_threads(1)
+    product = common.read_stars(stars, "template")
+    test = common.split_stars(product, "random", config).test
+    clean, position = product["realisation"][test], common.field_positions(product)[test]
+    rows = []
+    for kind in (m for m in map(method, config.methods) if m.restores):
+        with TemporaryDirectory() as folder:
+            given = config, kind, product, "random", "realisation"
+            data = training_set(*given, checkpoint=Path(folder, "checkpoint"))
+            start = process_time()
+            fitted = kind.fit(data, **kind.settings(config))
+            fit_s = process_time() - start
+        for level in config.noise.levels:
+            noisy = common.noisy_test_images(config, clean, level)
+            # What is made once for a level, such as factorisations, is not of the stars.
+            fitted.restore(noisy[:1], level, position[:1])
+            start = process_time()
+            found = fitted.restore(noisy, level, position)
+            rate = len(noisy) / (process_time() - start)
+            row = {"method": kind.name, "noise_level": level, "fit_cpu_s": fit_s}
+            rows.append(row | {"stars_per_s": rate, "mse": ((found - clean) ** 2).mean()})
+    return rows
+
+
 if __name__ == "__main__":
-    program(knee_table, baseline)
+    program(knee_table, baseline, methods)

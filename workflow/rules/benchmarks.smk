@@ -66,6 +66,7 @@ STARS = {"stars": lambda w: stars_of(TIMED_DATASET)}
 # By table: target, command, inputs, MB, minutes, stages that it runs as users do.
 TIMED = {
     "benchmark_baseline": ("benchmark", "trainings.baseline", STARS, 1500, 20, []),
+    "benchmark_methods": ("benchmark", "trainings.methods", STARS, 1500, 20, ["fit"]),
     "benchmark_inference": ("benchmark", "speed.inference", {}, 3000, 30, []),
     "benchmark_scaling": (
         *("benchmark", "speed.growth", {}, 2000, 30),
@@ -125,6 +126,7 @@ DRAWN = {
     "skipping": "what is not computed",
     "baseline": "baseline: error against time",
     "inference": "speed of the network",
+    "methods": "all methods: error against time",
     "scaling": "growth of the costs",
     "training": "training error against time",
 }

@@ -252,8 +252,14 @@ class Method:
 
         A method that knows their uncertainty, or the images' evidence, gives it here.
         """
+        return Estimate(self.restore(noisy, level, position))
+
+    def restore(
+        self, noisy: np.ndarray, level: float | np.ndarray, position: np.ndarray | None = None
+    ) -> np.ndarray:
+        """`predict`, told what the method wants to know."""
         told = (level,) * self.told_level + (position,) * self.told_position
-        return Estimate(self.predict(noisy, *told))
+        return self.predict(noisy, *told)
 
     @classmethod
     def stem(cls, dataset: str, split: str, reference: str) -> str:

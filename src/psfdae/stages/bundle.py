@@ -108,7 +108,7 @@ def bundle(
     band = config.noise.kappa * np.asarray(config.noise.levels)
 
     def predict(noisy: np.ndarray, level: float) -> np.ndarray:
-        return fitted.estimate(noisy, level).psf
+        return fitted.restore(noisy, level)
 
     nodes, rng = packing.noise_nodes(band), stream(config.seed, "noise", "bundle")
     errors = packing.measure_errors(held_out, predict, model, nodes, rng)

@@ -219,7 +219,7 @@ def strip_rows(
         # All test stars, as the stage `evaluate` draws them, then the picked ones.
         noisy = noisy_test_images(config, product["realisation"][test], level)[picks]
         for kind in methods.values():
-            images = kind.estimate(noisy, level, position).psf
+            images = kind.restore(noisy, level, position)
             label = f"{kind.label}\nλ = {level:g}"
             rows.append(StripRow(label, images, mse(images, truth), not kind.restores))
     return rows

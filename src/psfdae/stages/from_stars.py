@@ -276,7 +276,7 @@ def _draw(config: Any, files: Made, stars: Product, test: np.ndarray, area: floa
     rows = [StripRow("bright\nstar", truth)]
     methods = estimators(config, stars, vars(files.models()), SPLIT, REFERENCE, only_drawn=True)
     for kind in methods.values():
-        stamps = kind.estimate(noisy, level).psf[shown]
+        stamps = kind.restore(noisy, level)[shown]
         rows.append(StripRow(kind.label, stamps, mse(stamps, truth), own_scale=not kind.restores))
     found = signal_to_noise(config.noise.kappa * level, area)
     columns = [f"S/N {value:.0f}" for value in product["snr"][star[shown]]]
