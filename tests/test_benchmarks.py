@@ -14,7 +14,7 @@ import measure
 import prediction
 import speed
 import trainings
-from psfdae.configuration.compose import load_stage
+from psfdae.configuration.compose import load, load_stage
 from psfdae.optics.wavefronts import seidel_wavefronts
 from psfdae.own_stars.bundle import shipped_path
 from psfdae.stars.framing import Propagation, normalise_flux
@@ -203,6 +203,18 @@ def test_figures_are_drawn_from_the_tables_of_the_record(kind, tmp_path):
     assert (tmp_path / "drawn.png").stat().st_size > 10_000
 
 
+@pytest.mark.workflow
+def test_all_methods_are_timed_and_drawn(smoke, tmp_path):
+    config = load(["preset=smoke", "dataset=dataset3", "train.epochs=1"])
+    stars = smoke / "results/data/seidel/seidel_10pct.h5"
+    rows = pd.DataFrame(trainings.time_methods(config.model_dump(), stars))
+    assert set(rows.method) == {*config.methods} - {"noisy"}
+    assert (rows[["fit_cpu_s", "stars_per_s", "mse"]] > 0).all().all()
+    rows.to_csv(tmp_path / "table.csv", index=False)
+    figures.draw("methods", tmp_path / "table.csv", tmp_path / "drawn.png")
+    assert (tmp_path / "drawn.png").stat().st_size > 10_000
+
+
 @pytest.mark.slow
 @pytest.mark.workflow
 def test_targets_prediction_and_scaling(smoke, tmp_path):
@@ -216,6 +228,7 @@ def test_targets_prediction_and_scaling(smoke, tmp_path):
     assert row["stamps"] == 64
     assert row["share"] == pytest.approx(row["predict_per_s"] / row["bare_per_s"], rel=1e-4)
     stages = tables["scaling_stages"]
-    assert set(stages.stage) == {"simulate", "predict", "baseline", "train", "evaluate"}
+    fits = {"baseline", "train", "fit_gmm", "fit_gmm_position"}
+    assert set(stages.stage) == {"simulate", *fits, "evaluate", "predict"}
     assert (stages[["time_s", "cpu_s", "peak_mb", "disk_mb"]] > 0).all().all()
     assert planned(folder, "prediction", "scaling") == {}
