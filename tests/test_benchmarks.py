@@ -207,8 +207,10 @@ def test_figures_are_drawn_from_the_tables_of_the_record(kind, tmp_path):
 def test_all_methods_are_timed_and_drawn(smoke, tmp_path):
     config = load(["preset=smoke", "dataset=dataset3", "train.epochs=1"])
     stars = smoke / "results/data/seidel/seidel_10pct.h5"
-    rows = pd.DataFrame(trainings.time_methods(config.model_dump(), stars))
+    rows = pd.DataFrame(trainings.time_methods(config.model_dump(), stars, [1, 2]))
     assert set(rows.method) == {*config.methods} - {"noisy"}
+    spread = rows.groupby(["method", "noise_level"]).mse.std()
+    assert (spread["lmmse"] == 0).all() and (spread["dae"] > 0).all()
     assert (rows[["fit_cpu_s", "stars_per_s", "mse"]] > 0).all().all()
     rows.to_csv(tmp_path / "table.csv", index=False)
     figures.draw("methods", tmp_path / "table.csv", tmp_path / "drawn.png")

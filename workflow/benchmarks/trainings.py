@@ -1,5 +1,7 @@
 """Test error against fitting time: which training, which PCA+SOM is large enough."""
 
+from dataclasses import replace
+from itertools import product as product_of
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import perf_counter, process_time
@@ -233,21 +235,39 @@ def methods(
 ) -> None:
     """Time fit and inference of all methods on one thread, on a quiet machine."""
     require(stars, read_product(stars, "stars", ()).config, STARS, config)
-    write(out, alone(1, time_methods, config.model_dump(), stars))
+    write(out, alone(1, time_methods, config.model_dump(), stars, [config.seed]))
 
 
-def time_methods(tree, stars):
-    """CPU time of each method's fit, stars per second and errors, λ by λ."""
+@command("seeds", reads=METHODS)
+def seeds(
+    config: Config,
+    stars: Annotated[File, "Product of the stage stars."],
+    out: Annotated[File, "CSV with the errors of every method and seed."],
+    count: Annotated[int, "Seeds, those of the configuration and the next ones."] = 5,
+) -> None:
+    """Fit all methods with other seeds of their own to the same stars."""
+    require(stars, read_product(stars, "stars", ()).config, STARS, config)
+    tried = [config.seed + i for i in range(count)]
+    write(out, alone(1, time_methods, config.model_dump(), stars, tried))
+
+
+def time_methods(tree, stars, seeds):
+    """CPU time of each method's fit by seed, stars per second and errors, λ by λ."""
+    from psfdae.evaluation.metrics import clustered_mean, mse
+
     config = part(METHODS, tree)
     common.limit_threads(1)
     product = common.read_stars(stars, "template")
     test = common.split_stars(product, "random", config).test
-    clean, position = product["realisation"][test], common.field_positions(product)[test]
+    clean, field = product["realisation"][test], product["field_index"][test]
+    position = common.field_positions(product)[test]
     rows = []
-    for kind in (m for m in map(method, config.methods) if m.restores):
+    restoring = (kind for kind in map(method, config.methods) if kind.restores)
+    for kind, seed in product_of(restoring, seeds):
         with TemporaryDirectory() as folder:
             given = config, kind, product, "random", "realisation"
             data = training_set(*given, checkpoint=Path(folder, "checkpoint"))
+            data = replace(data, seed=seed)
             start = process_time()
             fitted = kind.fit(data, **kind.settings(config))
             fit_s = process_time() - start
@@ -258,10 +278,11 @@ def time_methods(tree, stars):
             start = process_time()
             found = fitted.restore(noisy, level, position)
             rate = len(noisy) / (process_time() - start)
-            row = {"method": kind.name, "noise_level": level, "fit_cpu_s": fit_s}
-            rows.append(row | {"stars_per_s": rate, "mse": ((found - clean) ** 2).mean()})
+            row = {"method": kind.name, "seed": seed, "noise_level": level, "fit_cpu_s": fit_s}
+            mean, stderr = clustered_mean(mse(found, clean), field)
+            rows.append(row | {"stars_per_s": rate, "mse": mean, "stderr": stderr})
     return rows
 
 
 if __name__ == "__main__":
-    program(knee_table, baseline, methods)
+    program(knee_table, baseline, methods, seeds)

@@ -275,3 +275,37 @@ rule training_knee:
         rules.knee_table.output,
         expand(rules.figure_benchmark.output, drawn="training"),
     localrule: True
+
+
+# The scatter of each method over its own random draws, for the same stars.
+SEEDS = f"{RESULTS}/tables/seeds_{{dataset}}.csv"
+SEEDED_DATASETS = ["dataset3", "dataset5"]
+
+
+rule method_seeds:
+    input:
+        stars=lambda w: stars_of(w.dataset),
+    output:
+        SEEDS,
+    log:
+        f"{RESULTS}/logs/benchmark/seeds_{{dataset}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks_on_request/seeds/{{dataset}}.tsv"
+    resources:
+        mem_mb=1500,
+        runtime=60,
+    params:
+        config=lambda w: settings("trainings.seeds", f"dataset={w.dataset}"),
+        source=program_code("trainings.seeds", ["fit"]),
+        program=program("trainings.seeds"),
+    message:
+        "Fitting all methods of {wildcards.dataset} with other seeds"
+    shell:
+        "python {params.program} --config {params.config} --stars {input.stars}"
+        " --out {output} > {log} 2>&1"
+
+
+rule seeds:
+    input:
+        expand(SEEDS, dataset=SEEDED_DATASETS),
+    localrule: True
