@@ -242,19 +242,23 @@ class GaussianMixture(Method):
             """Geometric mean over the noise levels."""
             pairs = zip(noisy, data.levels, strict=True)
             errors = [np.square(tried.predict(z, s, where) - truth).mean() for z, s in pairs]
+            tried._factors.clear()
             return float(np.exp(np.mean(np.log(errors))))
 
-        tried: list[tuple[float, int, bool, Self]] = []
+        best: tuple[float, int, bool, Self] | None = None
         # What is told may be left aside, where stars in other places are worse for it.
         for told in (True, False) if cls.told_position else (False,):
             least = np.inf
             for k in sizes:
                 one = cls._clustered(data, learn, k, gmm, told)
-                tried.append((error(one), k, told, one))
-                least = min(least, tried[-1][0])
-                if tried[-1][0] > WORSE * least:
+                found = error(one)
+                least = min(least, found)
+                if best is None or found < best[0]:
+                    best = found, k, told, one
+                if found > WORSE * least:
                     break
-        first, clusters, told, one = min(tried, key=lambda row: row[0])
+        assert best is not None
+        first, clusters, told, one = best
         by_shrinkage = {gmm.shrinkage[0]: first}
         if clusters > 1:  # in one cluster ν has no effect
             for nu in gmm.shrinkage[1:]:
@@ -266,28 +270,28 @@ class GaussianMixture(Method):
         cls, data: TrainingSet, stars: np.ndarray, clusters: int, gmm: Gmm, told: bool
     ) -> Self:
         """Moments of the clusters of some stars, and how they follow the position if it is told."""
-        x, y = (
-            a[stars].reshape(stars.size, -1).astype(np.float64)
-            for a in (data.images, data.references)
-        )
+        images, references = data.images[stars], data.references[stars]
+        same = np.array_equal(images, references)
+        x = images.reshape(stars.size, -1).astype(np.float64)
+        y = x if same else references.reshape(stars.size, -1).astype(np.float64)
         p = cls._told(data, stars).astype(np.float64) * told
         cluster = _k_means(x, gmm.place * _standard(p), clusters, gmm.principal, data.seed)
         order = np.argsort(cluster, kind="stable")
         count = np.unique(cluster, return_counts=True)[1]
         start = np.concatenate([[0], count.cumsum()[:-1]])
-        same = np.array_equal(x, y)
 
         def about_means(a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             a = a[order]
             mean = np.add.reduceat(a, start) / count[:, None]
             return mean, a - np.repeat(mean, count, axis=0)
 
-        (mean_p, p), (mean_x, x), (mean_y, y) = map(about_means, (p, x, y))
+        (mean_p, p), (mean_x, x) = about_means(p), about_means(x)
+        mean_y, y = (mean_x, x) if same else about_means(y)
         whitening = _whitening(p)
         p = p @ whitening
         slope, slope_y = (p.T @ a / len(a) for a in (x, y))
         x -= p @ slope
-        y -= p @ slope_y
+        y -= 0.0 if same else p @ slope_y  # of the same, it is gone
         variance, axes = np.linalg.eigh(x.T @ x / len(x))
         variance, axes = np.maximum(variance[::-1], 0.0), axes[:, ::-1]
         x = x @ axes
@@ -570,7 +574,7 @@ def _k_means(
 
     if clusters == 1:
         return np.zeros(len(x), int)
-    found = PCA(min(principal, *x.shape), svd_solver="full").fit_transform(x)
+    found = PCA(min(principal, *x.shape), svd_solver="covariance_eigh").fit_transform(x)
     scale = np.sqrt(np.square(found).sum() / len(x) / max(place.shape[1], 1))
     draw = int(stream(seed, "gmm", "clusters").integers(2**31))
     features = np.hstack([found, scale * place]).astype(np.float32)
