@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -104,12 +104,26 @@ def bank(
 ) -> None:
     """Simulate the bank of fresh stars behind the posterior mean."""
     limit_threads(1)  # batches run side by side
+    parts = [
+        _fresh_stars(config, name, count)
+        for name, count in (
+            ("bank", config.bounds.bank_stars),
+            ("bank_position", config.bounds.position_stars),
+        )
+    ]
+    columns = {
+        name: replace(column, values=np.concatenate([part[name].values for part in parts]))
+        for name, column in parts[0].items()
+    }
+    write_product(out, "bank", columns, config.model_dump())
+
+
+def _fresh_stars(config: Config, suffix: str, count: int) -> dict[str, Column]:
     # Another name gives other random streams: no training or test star is in the bank.
-    named = {"name": f"{config.stars.name}_bank", "count": config.bounds.bank_stars}
+    named = {"name": f"{config.stars.name}_{suffix}", "count": count}
     drawn = config.model_copy(update={"stars": config.stars.model_copy(update=named)})
-    fields = drawn.grid.points**2
-    name, count = drawn.stars.name, drawn.stars.count
-    star_field = assign_fields(count, fields, stream(drawn.seed, "field", name))
+    rng = stream(drawn.seed, "field", drawn.stars.name)
+    star_field = assign_fields(count, drawn.grid.points**2, rng)
     source = star_wavefronts(drawn, star_field)
     ladder = sorted({*FINE_RUNGS, *drawn.optics.pupil_samples})
     optics = drawn.optics.model_copy(
@@ -118,7 +132,7 @@ def bank(
     framing = drawn.framing
     propagation = Propagation(source, drawn.telescope, optics, framing, drawn.stars.search_px)
     framed, peak = propagation.framed(framing.stamp_px + 2 * (framing.jitter_px + MIRROR_MARGIN))
-    columns = {
+    return {
         "framed": Column(
             framed.astype(np.float32), "1", "pixel flux as a fraction of the light, with margin"
         ),
@@ -127,7 +141,6 @@ def bank(
         **drawn_columns(source),
         "pupil_samples": Column(propagation.samples, "1", "pupil samples N"),
     }
-    write_product(out, "bank", columns, config.model_dump())
 
 
 @dataclass(frozen=True)
@@ -221,12 +234,13 @@ def bounds(
         require(bank, drawn.config, STARS, product.config, stars)
         sizes = (drawn.config["grid"]["points"], drawn.config["framing"]["jitter_px"])
         sample = Bank(drawn["framed"], drawn["field_index"], drawn["peak"], *sizes)
-        if len(sample) < sample.points**2:
+        count, fields = drawn.config["bounds"]["bank_stars"], sample.points**2
+        if count < fields:
             raise ProductError(
-                f"{bank}: bounds.bank_stars = {len(sample)}, must be at least "
-                f"{sample.points**2}, a star for every field"
+                f"{bank}: bounds.bank_stars = {count}, must be at least {fields}, "
+                "a star for every field"
             )
-        _sampled(config, sample, static, tables)
+        _sampled(config, sample.take(np.arange(count)), sample, static, tables)
     write_csv(out, pd.DataFrame(tables.summary, columns=COLUMNS))
     write_csv(growth, pd.DataFrame(tables.growth, columns=GROWTH_COLUMNS))
     write_parquet(per_star, pd.concat(tables.per_star, ignore_index=True))
@@ -280,14 +294,17 @@ def _floor(config: Config, product: Product, tables: Tables) -> None:
         tables.add("realisation", "floor", level, {"mse": error}, tight=False)
 
 
-def _sampled(config: Config, bank: Bank, static: np.ndarray, tables: Tables) -> None:
-    """Posterior means over a bank, and how they change with the bank's size."""
+def _sampled(config: Config, bank: Bank, larger: Bank, static: np.ndarray, tables: Tables) -> None:
+    """Posterior means over a bank, and how they change with its size.
+
+    In a single field the larger one is needed, and in a moment weighed.
+    """
     for level in config.noise.levels:
         likelihood = Likelihood.of(noise_model(config), level, bank.stamps((bank.margin,) * 2))
         for method, told in POSTERIOR_MEANS.items():
             start = time.monotonic()
-            measured = _told_the_field if told else _anywhere
-            sizes = measured(bank, static, tables.stars, level, likelihood)
+            measured, drawn = (_told_the_field, larger) if told else (_anywhere, bank)
+            sizes = measured(drawn, static, tables.stars, level, likelihood)
             _tabulate(tables, method, level, sizes)
             seconds = time.monotonic() - start
             print(f"λ = {level:g}, {method}: {max(sizes)} draws, {seconds:.1f} s", flush=True)
