@@ -37,7 +37,11 @@ BAYES = {"color": "black", "marker": "o", "label": "posterior mean (Bayes)"}
 
 MEANS = {
     "bayes": BAYES,
-    "bayes_position": {"color": "#8c510a", "marker": "D", "label": "the same, told the field"},
+    "bayes_position": {
+        "color": "#8c510a",
+        "marker": "v",
+        "label": "posterior mean, told the field",
+    },
 }
 """Looks of both posterior means."""
 
