@@ -171,13 +171,14 @@ def fit():
     return {row.quantity: row for row in csv("calibration/fit.csv").itertuples()}
 
 
-def bounds():
-    """Least possible errors, the floor, and how the bank of draws grew."""
+def bounds(method="bayes"):
+    """Least possible errors, the floor, and how the bank of draws grew, of one posterior mean."""
     rows = csv("tables/psf_bounds.csv").query("metric == 'mse'").sort_values(CELL)
     floor = rows.query("method == 'floor'")[[*CELL, "value"]]
-    table = rows.query("method == 'bayes'").merge(floor, "left", CELL, suffixes=("", "_floor"))
+    table = rows.query("method == @method").merge(floor, "left", CELL, suffixes=("", "_floor"))
     growth = csv("tables/psf_bounds_growth.csv").sort_values("draws")
-    table = table.merge(growth.drop_duplicates(CELL, keep="last"), "left", CELL)
+    keys = [key for key in (*CELL, "method") if key in growth]
+    table = table.merge(growth.drop_duplicates(keys, keep="last"), "left", keys)
     table["draws"] = table.draws.map("{:.0f}".format, na_action="ignore").fillna("exact")
     return table
 

@@ -27,7 +27,7 @@ from psfdae.optics.pupil import annular_pupil
 from psfdae.optics.wavefronts import monomial_coefficients, monomial_images, seidel_wavefronts
 from psfdae.stars.fields import perturb, relative_field
 from psfdae.stars.framing import Propagation, brightest_pixel, normalise_flux
-from psfdae.stars.symmetry import SYMMETRIES
+from psfdae.stars.symmetry import SYMMETRIES, orbit
 
 POINTS, SIDE = 3, 8
 
@@ -215,6 +215,66 @@ def test_posterior_mean_is_that_of_the_poisson_distribution(level, bank, members
     assert (sums.effective_size < 1.01).all() if level < 1e-4 else True
 
 
+@pytest.mark.parametrize("level", [1e-3, 2e-2])
+def test_told_the_field_only_its_images_count(level, bank, members, noise):
+    """The centre is its own orbit; corners are mirror images of each other."""
+    images, field, _, weight = members
+    for corners in (np.array([4]), np.array([0, 2, 6, 8])):
+        few = bank.take(np.flatnonzero(np.isin(bank.field, corners)))
+        for told in corners:
+            noisy = noise.draw(images[field == told][[3, 50]], level, np.random.default_rng(2))
+            likelihood = Likelihood.of(noise, level, bank.stamps((2, 2)))
+            sums = posterior_sums(few, noisy, likelihood, chunk=7, told=np.array([told, told]))
+            own = (images, field, None, weight * (field == told))
+            w = brute_force(own, noisy, likelihood.flux, noise.background)
+            expected = np.einsum("nk,khw->nhw", w, images).reshape(2, -1)
+            assert np.abs(sums.mean_image - expected).max() < 1e-4 * expected.max()
+            assert sums.share.sum(axis=(0, 2)).nonzero()[0].tolist() == [told]
+            assert (orbit(corners, POINTS) == corners[0]).all()
+
+
+@pytest.mark.parametrize(("field", "symmetries"), [(1, 1), (2, 2), (6, 2), (12, 8)])
+def test_off_the_mirror_axes_only_the_identity_stays_in_the_field(field, symmetries, noise):
+    """Where more do, a star counts once all the same: they only exchange equal maxima."""
+    rng = np.random.default_rng(3)
+    framed = np.array([framed_image(5, rng) for _ in range(6)], np.float32)
+    own = Bank(framed, np.full(6, field), np.tile([2, -4], (6, 1)), 5, 1)
+    staying = [s.field(field, 5) == field for s in SYMMETRIES]
+    assert (staying[0], sum(staying)) == (True, symmetries)
+    assert (own.log_weights()[:, staying] > -np.inf).sum(axis=1).tolist() == [1] * 6
+    # So noisy that all images are alike.
+    dark = Likelihood.of(noise, 1e3, own.stamps((2, 2)))
+    noisy = noise.draw(own.stamps((2, 2))[:2], 1e3, rng)
+    sums = posterior_sums(own, noisy, dark, told=np.full(2, field))
+    assert sums.effective_size == pytest.approx([6 * 9] * 2, rel=1e-3)
+    if symmetries == 1:
+        cuts = [own.stamps(SYMMETRIES[0].window(jitter, own.margin)) for jitter in jitters(1)]
+        mean = np.mean(cuts, axis=(0, 1)).ravel()
+        assert sums.mean_image == pytest.approx(np.tile(mean, (2, 1)), abs=1e-4)
+
+
+@pytest.mark.parametrize("level", [1e-3, 3e-3, 1e-2, 1e-1])
+def test_told_the_field_is_never_worse(level, bank, members, noise):
+    """Stars are drawn from the prior itself, so both means are the best possible."""
+    images, field, _, weight = members
+    rng = np.random.default_rng(11)
+    drawn = rng.choice(len(images), 300, p=weight / weight.sum())
+    noisy = noise.draw(images[drawn], level, rng)
+    likelihood = Likelihood.of(noise, level, bank.stamps((2, 2)))
+    free = posterior_sums(bank, noisy, likelihood).mean_image
+    told = np.empty_like(free)
+    for home in np.unique(orbit(field, POINTS)):
+        star = np.flatnonzero(orbit(field[drawn], POINTS) == home)
+        few = bank.take(np.flatnonzero(orbit(bank.field, POINTS) == home))
+        sums = posterior_sums(few, noisy[star], likelihood, told=field[drawn[star]])
+        told[star] = sums.mean_image
+    truth = images[drawn].reshape(len(drawn), -1)
+    gain = ((free - truth) ** 2 - (told - truth) ** 2).mean(axis=1)
+    assert gain.mean() > -2 * gain.std() / np.sqrt(gain.size)
+    if level == 1e-2:
+        assert gain.mean() > 3 * gain.std() / np.sqrt(gain.size)
+
+
 def test_chunks_and_parts_change_nothing(bank, stars, noise):
     noisy = noise.draw(stars, 3e-3, np.random.default_rng(2))
     likelihood = Likelihood.of(noise, 3e-3, stars)
@@ -274,6 +334,13 @@ def test_exact_posterior_is_the_poisson_one(noise, members):
         right = probability[np.arange(4), [0, 1, 2, 0]]
         assert (right > 0.99).all() == known
     assert probability == pytest.approx(np.full((4, 3), 1 / 3), abs=0.02)
+    told = np.array([0, 1, 2, 0])
+    mean, probability = exact_posterior(noisy, templates, likelihood, told)
+    assert probability == pytest.approx(np.eye(3)[told])
+    for star, found in enumerate(mean):
+        own = (templates[told[star]], None, None, np.ones(9))
+        w = brute_force(own, noisy[star : star + 1], likelihood.flux, noise.background)
+        assert found == pytest.approx(np.einsum("k,khw->hw", w[0], own[0]), abs=1e-8)
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,9 @@ from matplotlib.collections import PolyCollection
 
 from psfdae.configuration.compose import load_stage
 from psfdae.configuration.consistency import SIMULATION, STATIC
+from psfdae.estimators import method
 from psfdae.evaluation.curves import (
+    MEANS,
     efficiency_against_noise,
     errors_above_bounds,
 )
@@ -21,6 +23,7 @@ from psfdae.stages.common import noisy_test_images, split_stars
 LEVELS = (0.001, 0.003, 0.01, 0.1)
 SIZES = ("preset=smoke", "grid.points=3", "stars.count=60", "parts.train_stars=20")
 SIZES += ("parts.test_stars=40", "bounds.bank_stars=80", "bounds.test_stars=24")
+SIZES += ("bounds.position_stars=40",)
 SIZES += (f"noise.levels={list(LEVELS)}", "bounds.threads=1", "optics.threads=1")
 
 
@@ -53,10 +56,10 @@ def scene_2(tmp_path_factory):
     return build(tmp_path_factory.mktemp("scene2"), "dataset8")
 
 
-def evaluated(folder, dataset, factor):
-    """Per-star errors of a made-up method, `factor` times the posterior mean's."""
+def evaluated(folder, dataset, factor, mean="bayes"):
+    """Per-star errors of a made-up method, `factor` times those of a posterior mean."""
     best = pd.read_parquet(folder / "bounds.parquet")
-    best = best[best.method == "bayes"].assign(method="lmmse", dataset=dataset)
+    best = best[best.method == mean].assign(method="lmmse", dataset=dataset)
     best["mse"] *= factor
     # The stage evaluate knows all test stars, in its own order, and other splits.
     extra = best.assign(star=best.star + 1000, mse=1.0)
@@ -66,20 +69,22 @@ def evaluated(folder, dataset, factor):
     return path
 
 
-def compared(folder, dataset, factor):
+def compared(folder, dataset, factor, mean="bayes"):
     inputs = ([folder / "bounds.csv"], [folder / "bounds.parquet"])
-    bounds.efficiency(*inputs, folder / "efficiency.csv", [evaluated(folder, dataset, factor)])
+    made_up = evaluated(folder, dataset, factor, mean)
+    bounds.efficiency(*inputs, folder / "efficiency.csv", [made_up])
     return pd.read_csv(folder / "efficiency.csv")
 
 
 def test_bank_holds_none_of_the_stars(scene_1):
     drawn = read_product(scene_1 / "bank.h5", "bank")
     ours = read_product(scene_1 / "stars.h5", "stars", ("seidel",))["seidel"]
-    assert drawn["seidel"].shape == (80, 5)
+    assert drawn["seidel"].shape == (120, 5)
+    assert len(np.unique(drawn["seidel"], axis=0)) == 120
     assert not np.isin(drawn["seidel"], ours).any()
-    assert np.bincount(drawn["field_index"]).tolist() == [9] * 8 + [8]
-    assert drawn["framed"].shape == (80, 20, 20)
-    central = drawn["framed"][:, 2:-2, 2:-2].reshape(80, -1)
+    assert np.bincount(drawn["field_index"][:80]).tolist() == [9] * 8 + [8]
+    assert drawn["framed"].shape == (120, 20, 20)
+    central = drawn["framed"][:, 2:-2, 2:-2].reshape(120, -1)
     assert (central.argmax(axis=1) == 8 * 16 + 8).mean() > 0.8  # the rest are exact ties
 
 
@@ -90,14 +95,19 @@ def test_bounds_of_scene_1(scene_1):
     assert set(table.metric) == {"mse"}
     assert sorted(set(zip(table.reference, table.method, strict=True))) == [
         ("realisation", "bayes"),
+        ("realisation", "bayes_position"),
         ("realisation", "floor"),
         ("template", "bayes"),
+        ("template", "bayes_position"),
     ]
     cells = table.set_index(["reference", "method", "noise_level"]).value
     for level in LEVELS:
         assert cells["realisation", "floor", level] < cells["realisation", "bayes", level]
         noisy = (4.98 * level) ** 2
         assert cells["realisation", "bayes", level] < noisy
+    # Where the bank is dense enough, to be told the field helps.
+    for reference in ("realisation", "template"):
+        assert cells[reference, "bayes_position", 0.1] < cells[reference, "bayes", 0.1]
     assert (table.ci_low < table.value).all()
     assert (table.ci_high > table.value).all()
 
@@ -106,17 +116,21 @@ def test_growth_ends_with_the_error_of_the_table(scene_1):
     growth = pd.read_csv(scene_1 / "growth.csv")
     assert list(growth.columns) == bounds.GROWTH_COLUMNS
     table = pd.read_csv(scene_1 / "bounds.csv")
-    best = table[table.method == "bayes"].set_index(["reference", "noise_level"])
-    for key, sizes in growth.groupby(["reference", "noise_level"]):
-        # 80 draws, or a quarter of them where the bank is hopelessly thin.
-        assert sizes.draws.tolist() in ([5, 10, 20, 40, 80], [5, 10, 20])
+    keys = ["reference", "method", "noise_level"]
+    best = table[table.method != "floor"].set_index(keys)
+    for key, sizes in growth.groupby(keys):
+        # 80 draws, or a quarter of them where the bank is hopelessly thin; told the field, 40
+        # more, in eight parts, because a dozen of them stand in the middle.
+        told = key[1] == "bayes_position"
+        allowed = ([15, 30, 60, 120],) if told else ([5, 10, 20, 40, 80], [5, 10, 20])
+        assert sizes.draws.tolist() in allowed
         assert sizes.mse.iloc[-1] == pytest.approx(best.value[key])
         change = abs(sizes.mse.iloc[-3] / sizes.mse.iloc[-1] - 1)
         # The quotient of two numbers of six digits.
         assert sizes.last_change.tolist() == pytest.approx([change] * len(sizes), abs=3e-6)
         assert best.tight[key] == ("yes" if change <= 0.05 else "no")
     assert growth.ess_mean.min() >= 1
-    assert growth.draws.max() == 80
+    assert growth.draws.max() == 120
 
 
 def test_bounded_stars_are_the_first_test_stars_with_their_noise(scene_1):
@@ -144,19 +158,25 @@ def test_a_bank_of_other_stars_is_refused(scene_1, tmp_path):
         bounds.bounds(config, "dataset6", *products, *outputs, tmp_path / "bank.h5")
     with pytest.raises(ProductError, match="a bank is needed"):
         bounds.bounds(config, "dataset6", *products, *outputs)
+    bounds.bank(settings(bounds.bounds, "dataset6", "bounds.bank_stars=8"), tmp_path / "bank.h5")
+    with pytest.raises(ProductError, match=r"bank\.h5: bounds\.bank_stars = 8, must be at least 9"):
+        bounds.bounds(config, "dataset6", *products, *outputs, tmp_path / "bank.h5")
     assert not outputs[0].exists()
 
 
 def test_scene_2_is_exact(scene_2):
     table = pd.read_csv(scene_2 / "bounds.csv")
-    assert set(table.method) == {"bayes"}
+    assert set(table.method) == {"bayes", "bayes_position"}
     assert set(table.tight) == {"yes"}
     right = table[table.metric == "p_right"].sort_values("noise_level").value
     assert (np.diff(right) < 0).all()
     assert right.iloc[0] > 0.999
-    error = table[table.metric == "mse"].sort_values("noise_level").value.to_numpy()
-    assert error[0] == 0.0
-    assert error[-1] > 1e-9
+    errors = table[table.metric == "mse"].sort_values("noise_level").groupby("method").value
+    free, told = (errors.get_group(name).to_numpy() for name in ("bayes", "bayes_position"))
+    assert free[0] == 0.0
+    assert free[-1] > 1e-9
+    assert (told <= free).all()
+    assert told[-1] < free[-1]  # only its centring is left to find
     assert pd.read_csv(scene_2 / "growth.csv").empty
 
 
@@ -165,15 +185,16 @@ def test_efficiency_of_a_known_method(scene_1, factor, verdict):
     table = compared(scene_1, "dataset6", factor)
     assert list(table.columns) == bounds.EFFICIENCY_COLUMNS
     assert set(table.n) == {24}
-    method = table[table.method == "lmmse"]
-    tight = method[(method.bound == "bayes") & (method.tight == "yes")]
+    ours = table[table.method == "lmmse"]
+    assert set(ours.bound) == {"bayes", "floor"}
+    tight = ours[(ours.bound == "bayes") & (ours.tight == "yes")]
     assert tight.efficiency.to_numpy() == pytest.approx(1 / factor, rel=1e-5)
-    floor = method[method.bound == "floor"]
+    floor = ours[ours.bound == "floor"]
     assert set(floor.reference) == {"realisation"}
     assert len(floor) == len(LEVELS)
     assert floor.efficiency.to_numpy() == pytest.approx(floor.mse_bound / floor.mse, rel=1e-5)
     assert set(pd.concat([tight, floor]).verdict) == {verdict}
-    thin = method[(method.bound == "bayes") & (method.tight == "no")]
+    thin = ours[(ours.bound == "bayes") & (ours.tight == "no")]
     assert thin.verdict.isna().all()
     assert thin.efficiency.isna().all()
     assert len(tight)
@@ -182,10 +203,25 @@ def test_efficiency_of_a_known_method(scene_1, factor, verdict):
 
 def test_the_posterior_mean_respects_the_floor(scene_1):
     table = compared(scene_1, "dataset6", 1.5)
-    rows = table[table.method == "bayes"]
-    assert len(rows) == len(LEVELS)
+    rows = table[table.method.isin(bounds.POSTERIOR_MEANS)]
+    assert len(rows) == 2 * len(LEVELS)
+    assert set(rows.bound) == {"floor"}
     assert set(rows.verdict) == {"ok"}
     assert (rows.efficiency < 1).all()
+
+
+@pytest.mark.parametrize(("factor", "verdict"), [(1.0, "ok"), (1e-3, "beaten")])
+def test_a_method_told_the_field_is_judged_by_the_mean_told_it(
+    scene_1, monkeypatch, factor, verdict
+):
+    monkeypatch.setattr(method("lmmse"), "told_position", True)
+    table = compared(scene_1, "dataset6", factor, "bayes_position")
+    rows = table[table.method == "lmmse"]
+    assert set(rows.bound) == {"bayes_position", "floor"}
+    tight = rows[rows.tight == "yes"]
+    assert len(tight)
+    assert set(tight.verdict) == {verdict}
+    assert tight.efficiency.to_numpy() == pytest.approx(1 / factor, rel=1e-5)
 
 
 def test_methods_must_cover_the_bounded_stars(scene_1, tmp_path):
@@ -227,17 +263,18 @@ def test_markers_are_filled_where_the_bound_is_tight(scene_1):
     figure = errors_above_bounds(compared(scene_1, "dataset6", 1.5), table, "dataset6")
     assert len(figure.axes) == 2
     for axes, reference in zip(figure.axes, ("realisation", "template"), strict=True):
-        best = table[(table.reference == reference) & (table.method == "bayes")]
-        drawn = {
-            fill: sum(
-                len(line.get_xdata())
-                for line in axes.lines
-                if line.get_marker() == "o" and line.get_markerfacecolor() == fill
-            )
-            for fill in ("black", "white")
-        }
-        tight = int((best.tight == "yes").sum())
-        assert drawn == {"black": tight, "white": len(best) - tight}
+        for name, look in MEANS.items():
+            best = table[(table.reference == reference) & (table.method == name)]
+            drawn = [
+                sum(
+                    len(line.get_xdata())
+                    for line in axes.lines
+                    if line.get_marker() == look["marker"] and line.get_markerfacecolor() == fill
+                )
+                for fill in (look["color"], "white")
+            ]
+            tight = int((best.tight == "yes").sum())
+            assert drawn == [tight, len(best) - tight]
         shaded = sum(isinstance(item, PolyCollection) for item in axes.collections)
         assert shaded == (1 if reference == "realisation" else 0)
 
@@ -245,7 +282,8 @@ def test_markers_are_filled_where_the_bound_is_tight(scene_1):
 def test_a_bound_of_zero_is_written_not_drawn(scene_2):
     table = pd.read_csv(scene_2 / "bounds.csv")
     figure = errors_above_bounds(compared(scene_2, "dataset8", 1.5), table, "dataset8")
-    zero = table[(table.metric == "mse") & (table.value == 0)].noise_level.tolist()
+    zero = table[(table.metric == "mse") & (table.value == 0)]
+    zero = zero.sort_values("method", kind="stable").noise_level.tolist()
     assert zero
     texts = [(text.get_text(), text.get_position()[0]) for text in figure.axes[0].texts]
     assert texts == [("0", level) for level in zero]

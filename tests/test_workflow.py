@@ -166,7 +166,7 @@ def test_targets_on_request(smoke):
     assert (stability.verdict == "pass").all()
     bounds = pd.read_csv(tables / "psf_bounds.csv")
     assert list(bounds.columns) == [*COLUMNS, "ci_low", "ci_high", "tight"]
-    assert set(bounds.method) == {"bayes", "floor"}
+    assert set(bounds.method) == {"bayes", "bayes_position", "floor"}
     choice = pd.read_csv(tables / "benchmark_choice.csv")
     assert (choice.configured == "yes").groupby(choice.scene).any().all()
     assert planned(smoke, "benchmark", "stability", "bounds") == {}

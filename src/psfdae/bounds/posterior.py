@@ -259,7 +259,9 @@ class PosteriorSums:
         self.image[changed] *= scale[:, None]
         self.share[changed] *= scale[:, None, None]
         self.peak = peak
-        weight = np.exp((scores[:, used] - peak[:, None]).astype(np.float32))
+        # A star of which no image is possible so far keeps weights of zero.
+        above = scores[:, used] - np.maximum(peak, np.finfo(float).min)[:, None]
+        weight = np.exp(above.astype(np.float32))
         self.total += weight.sum(axis=1, dtype=np.float64)
         self.square += np.einsum("nk,nk->n", weight, weight, dtype=np.float64)
         side = int(np.sqrt(images.shape[1]))
@@ -284,7 +286,11 @@ def merge(parts: Sequence[PosteriorSums]) -> PosteriorSums:
 
 
 def posterior_sums(
-    bank: Bank, noisy: np.ndarray, likelihood: Likelihood, chunk: int = CHUNK
+    bank: Bank,
+    noisy: np.ndarray,
+    likelihood: Likelihood,
+    chunk: int = CHUNK,
+    told: np.ndarray | None = None,
 ) -> PosteriorSums:
     """Weigh all stars of a bank, at all jitters and symmetries, by noisy images.
 
@@ -297,6 +303,9 @@ def posterior_sums(
         Of that noise level.
     chunk : int
         Stars of the bank per matrix product; does not change the result.
+    told : ndarray of int, shape (n,), optional
+        Field of every noisy image: only stars that a symmetry takes there count. Each star
+        of the bank must have one that does.
     """
     residuals = likelihood.residuals(noisy).reshape(noisy.shape)
     # Instead of mirroring every image of the bank, the test stars are mirrored back.
@@ -317,12 +326,17 @@ def posterior_sums(
             for s, jitter in members:
                 scores = mirrored[s] @ ratio_t + (offset + log_weights[:, s])
                 field = SYMMETRIES[s].field(part.field, bank.points)
+                if told is not None:
+                    scores[told[:, None] != field] = -np.inf
                 sums.add(scores, images, SYMMETRIES[s], field, jitter)
     return sums
 
 
 def exact_posterior(
-    noisy: np.ndarray, templates: np.ndarray, likelihood: Likelihood
+    noisy: np.ndarray,
+    templates: np.ndarray,
+    likelihood: Likelihood,
+    told: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Posterior mean and probability of every template, its centring error summed out.
 
@@ -335,6 +349,8 @@ def exact_posterior(
         Every template at every centring error.
     likelihood : Likelihood
         Of the images' noise level.
+    told : ndarray of int, shape (n,), optional
+        Field of every noisy image: only its template counts.
 
     Returns
     -------
@@ -345,6 +361,8 @@ def exact_posterior(
     images = templates.reshape(fields * shifts, -1).astype(np.float64)
     ratio, offset = likelihood.factors(images)
     scores = likelihood.residuals(noisy) @ ratio.T + offset
+    if told is not None:
+        scores[told[:, None] != np.repeat(np.arange(fields), shifts)] = -np.inf
     weight = np.exp(scores - scores.max(axis=1, keepdims=True))
     weight /= weight.sum(axis=1, keepdims=True)
     mean = (weight @ images).reshape(noisy.shape)

@@ -190,6 +190,9 @@ class Bounds(Group):
     """Best possible estimates."""
 
     bank_stars: Count = Field(description="Fresh draws of the simulator in the bank")
+    position_stars: Count = Field(
+        description="Further draws, which only the bound uses that is told the field"
+    )
     test_stars: Count = Field(description="Test stars that are bounded, the first of the part")
     threads: Count = Field(description="Threads of the linear algebra")
 

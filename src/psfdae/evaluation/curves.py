@@ -35,6 +35,16 @@ METRIC_LABELS = {
 BAYES = {"color": "black", "marker": "o", "label": "posterior mean (Bayes)"}
 """Look of the posterior mean; its marker is open where the bank is too thin."""
 
+MEANS = {
+    "bayes": BAYES,
+    "bayes_position": {
+        "color": "#8c510a",
+        "marker": "v",
+        "label": "posterior mean, told the field",
+    },
+}
+"""Looks of both posterior means."""
+
 FLOOR = {"color": "#7f7f7f", "label": "local floor: field and centring known"}
 """Look of the floor."""
 
@@ -177,10 +187,12 @@ def errors_above_bounds(efficiency: pd.DataFrame, bounds: pd.DataFrame, dataset:
     limits = bounds[(bounds.dataset == dataset) & (bounds.metric == "mse")]
     figure, panels = _panels(limits)
     for axes, (reference, rows) in zip(panels, _by_reference(limits), strict=True):
-        methods = ours[(ours.reference == reference) & (ours.bound == "bayes")]
+        # Beside the floor, rows come again, and posterior means are among them.
+        methods = ours[(ours.reference == reference) & (ours.bound != "floor")]
         for name, errors in methods.sort_values("noise_level").groupby("method"):
             axes.plot(errors["noise_level"], errors["mse"], **_line(method(name)))
-        _bayes_line(axes, rows[rows.method == "bayes"].sort_values("noise_level"))
+        for name, look in MEANS.items():
+            _bayes_line(axes, rows[rows.method == name].sort_values("noise_level"), look)
         _finish_panel(axes, reference, np.unique(rows["noise_level"]))
     panels[0].set_yscale("log")
     bottom = _draw_floor(panels, limits)
@@ -193,14 +205,13 @@ def errors_above_bounds(efficiency: pd.DataFrame, bounds: pd.DataFrame, dataset:
     panels[0].set_ylabel(METRIC_LABELS["mse"])
     figure.suptitle(f"{dataset}: errors and bounds, n = {limits['n'].max()} test stars")
     handles = _method_handles(set(ours["method"]))
-    best = limits[limits.method == "bayes"]
-    for tight, fill, label in (
-        ("yes", BAYES["color"], BAYES["label"]),
-        ("no", "white", "posterior mean, bank too thin: upper limit"),
-    ):
-        if tight in set(best["tight"]):
-            style = {"color": BAYES["color"], "marker": BAYES["marker"], "mfc": fill, "ms": 6}
-            handles.append(Line2D([], [], ls="--", lw=1.2, label=label, **style))
+    for name, look in MEANS.items():
+        found = set(limits["tight"][limits.method == name])
+        if found:
+            handles.append(Line2D([], [], ls="--", lw=1.2, ms=6, **look))
+        if "no" in found:
+            style = {**look, "mfc": "white", "label": "its bank too thin: upper limit"}
+            handles.append(Line2D([], [], ls="--", lw=1.2, ms=6, **style))
     if "floor" in set(limits["method"]):
         handles.append(Patch(facecolor=FLOOR["color"], alpha=0.35, label=FLOOR["label"]))
     figure.legend(handles=handles, loc="outside lower center", ncols=3)
@@ -221,7 +232,7 @@ def efficiency_against_noise(efficiency: pd.DataFrame, dataset: str) -> Figure:
         shown = _of_methods(rows).sort_values("noise_level")
         for (name, bound), values in shown.groupby(["method", "bound"]):
             style = _line(method(name))
-            style |= {"ls": "-", "lw": 1.6} if bound == "bayes" else {"ls": ":", "mfc": "none"}
+            style |= {"ls": ":", "mfc": "none"} if bound == "floor" else {"ls": "-", "lw": 1.6}
             axes.plot(values["noise_level"], values["efficiency"], **style)
         axes.axhline(1.0, color="black", lw=1.0)
         if shown["efficiency"].isna().all():
@@ -233,12 +244,12 @@ def efficiency_against_noise(efficiency: pd.DataFrame, dataset: str) -> Figure:
     panels[0].set_ylabel("efficiency: bound / MSE")
     figure.suptitle(f"{dataset}: efficiency against the noise level, 1 = no better is possible")
     handles = _method_handles(set(ours["method"]))
-    drawn = set(_of_methods(ours).dropna(subset=["efficiency"])["bound"])
-    for bound, line, label in (
-        ("bayes", "-", "against the posterior mean, where tight"),
-        ("floor", ":", "against the local floor"),
+    to_floor = _of_methods(ours).dropna(subset=["efficiency"])["bound"] == "floor"
+    for found, line, label in (
+        (~to_floor, "-", "against the posterior mean, where tight"),
+        (to_floor, ":", "against the local floor"),
     ):
-        if bound in drawn:
+        if found.any():
             handles.append(Line2D([], [], color="black", ls=line, lw=1.6, label=label))
     figure.legend(handles=handles, loc="outside lower center", ncols=3)
     return figure
@@ -257,9 +268,9 @@ def bank_growth(growth: pd.DataFrame, dataset: str) -> Figure:
     levels = np.unique(ours["noise_level"])
     colors = dict(zip(levels, np.resize(SERIES_COLORS, levels.size), strict=True))
     for axes, (reference, rows) in zip(panels, _by_reference(ours), strict=True):
-        for level, sizes in rows.sort_values("draws").groupby("noise_level"):
-            color = colors[level]
-            axes.plot(sizes["draws"], sizes["mse"], color=color, marker="o", ms=4.5, lw=1.4)
+        for (level, name), sizes in rows.sort_values("draws").groupby(["noise_level", "method"]):
+            color, marker = colors[level], MEANS[name]["marker"]
+            axes.plot(sizes["draws"], sizes["mse"], color=color, marker=marker, ms=4.5, lw=1.4)
             axes.axhline(sizes["limit"].iloc[0], color=color, ls="--", lw=1.0)
         draws = np.unique(rows["draws"])
         _log_axis(axes, draws, [f"{count:d}" for count in draws])
@@ -274,8 +285,11 @@ def bank_growth(growth: pd.DataFrame, dataset: str) -> Figure:
         Line2D([], [], color=color, marker="o", ms=4.5, lw=1.4, label=f"λ = {level:g}")
         for level, color in colors.items()
     ]
+    handles += [
+        Line2D([], [], ls="", ms=4.5, **look | {"color": "black"}) for look in MEANS.values()
+    ]
     handles.append(Line2D([], [], color="black", ls="--", lw=1.0, label="limit of the fit"))
-    figure.legend(handles=handles, loc="outside lower center", ncols=5)
+    figure.legend(handles=handles, loc="outside lower center", ncols=4)
     return figure
 
 
@@ -309,20 +323,19 @@ def _finish_panel(axes: Axes, reference: str, levels: np.ndarray) -> None:
     axes.grid(True, which="major")
 
 
-def _bayes_line(axes: Axes, rows: pd.DataFrame) -> None:
+def _bayes_line(axes: Axes, rows: pd.DataFrame, look: Mapping[str, str]) -> None:
     """Posterior mean with its confidence intervals; errors of 0 as a remark at the bottom."""
+    color = look["color"]
+    side = {"ha": "right" if look is BAYES else "left", "weight": "bold", "color": color}
     for level in rows["noise_level"][rows.value == 0]:
-        axes.text(
-            level, 0.02, "0", transform=axes.get_xaxis_transform(), ha="center", weight="bold"
-        )
+        axes.text(level, 0.02, "0", transform=axes.get_xaxis_transform(), **side)
     rows = rows[rows.value > 0]
     level, value = rows["noise_level"].to_numpy(), rows["value"].to_numpy()
     reach = np.maximum([value - rows["ci_low"], rows["ci_high"] - value], 0.0)
-    color = BAYES["color"]
     axes.errorbar(level, value, yerr=reach, color=color, ls="--", lw=1.2, capsize=3)
     tight = (rows["tight"] == "yes").to_numpy()
     for chosen, fill in ((tight, color), (~tight, "white")):
-        style = {"color": color, "marker": BAYES["marker"], "mfc": fill, "ms": 6, "ls": ""}
+        style = {"color": color, "marker": look["marker"], "mfc": fill, "ms": 6, "ls": ""}
         axes.plot(level[chosen], value[chosen], zorder=3, **style)
 
 

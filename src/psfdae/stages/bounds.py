@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
@@ -28,6 +29,7 @@ from psfdae.bounds.posterior import (
 from psfdae.cli import File, command
 from psfdae.configuration.consistency import SIMULATION
 from psfdae.configuration.schema import Config
+from psfdae.estimators import method as method_named
 from psfdae.evaluation.metrics import clustered_mean, mse
 from psfdae.files import (
     Column,
@@ -50,6 +52,7 @@ from psfdae.stages.common import (
 )
 from psfdae.stars.fields import assign_fields, relative_field
 from psfdae.stars.framing import Propagation
+from psfdae.stars.symmetry import orbit
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -64,11 +67,14 @@ COLUMNS += ["stderr", "n", "ci_low", "ci_high", "tight"]
 EFFICIENCY_COLUMNS = ["dataset", "reference", "noise_level", "method", "bound", "tight", "mse"]
 EFFICIENCY_COLUMNS += ["mse_bound", "efficiency", "difference", "stderr", "n", "verdict"]
 
+POSTERIOR_MEANS = {"bayes": False, "bayes_position": True}
+"""Bounds that are posterior means, and whether they are told the star's field."""
+
 COLUMN_OF_TABLE = ["dataset", "split", "reference", "noise_level"]
 """What one column of the paper's tables is: methods are compared inside it."""
 
-GROWTH_COLUMNS = ["dataset", "reference", "noise_level", "draws", "mse", "ess_mean", "ess_median"]
-GROWTH_COLUMNS += ["last_change", "limit", "exponent", "fit_rms"]
+GROWTH_COLUMNS = ["dataset", "reference", "method", "noise_level", "draws", "mse", "ess_mean"]
+GROWTH_COLUMNS += ["ess_median", "last_change", "limit", "exponent", "fit_rms"]
 
 HOPELESS_ESS = 2.0
 """A quarter of the bank with a smaller median effective sample size is not extended."""
@@ -98,12 +104,26 @@ def bank(
 ) -> None:
     """Simulate the bank of fresh stars behind the posterior mean."""
     limit_threads(1)  # batches run side by side
+    parts = [
+        _fresh_stars(config, name, count)
+        for name, count in (
+            ("bank", config.bounds.bank_stars),
+            ("bank_position", config.bounds.position_stars),
+        )
+    ]
+    columns = {
+        name: replace(column, values=np.concatenate([part[name].values for part in parts]))
+        for name, column in parts[0].items()
+    }
+    write_product(out, "bank", columns, config.model_dump())
+
+
+def _fresh_stars(config: Config, suffix: str, count: int) -> dict[str, Column]:
     # Another name gives other random streams: no training or test star is in the bank.
-    named = {"name": f"{config.stars.name}_bank", "count": config.bounds.bank_stars}
+    named = {"name": f"{config.stars.name}_{suffix}", "count": count}
     drawn = config.model_copy(update={"stars": config.stars.model_copy(update=named)})
-    fields = drawn.grid.points**2
-    name, count = drawn.stars.name, drawn.stars.count
-    star_field = assign_fields(count, fields, stream(drawn.seed, "field", name))
+    rng = stream(drawn.seed, "field", drawn.stars.name)
+    star_field = assign_fields(count, drawn.grid.points**2, rng)
     source = star_wavefronts(drawn, star_field)
     ladder = sorted({*FINE_RUNGS, *drawn.optics.pupil_samples})
     optics = drawn.optics.model_copy(
@@ -112,7 +132,7 @@ def bank(
     framing = drawn.framing
     propagation = Propagation(source, drawn.telescope, optics, framing, drawn.stars.search_px)
     framed, peak = propagation.framed(framing.stamp_px + 2 * (framing.jitter_px + MIRROR_MARGIN))
-    columns = {
+    return {
         "framed": Column(
             framed.astype(np.float32), "1", "pixel flux as a fraction of the light, with margin"
         ),
@@ -121,7 +141,6 @@ def bank(
         **drawn_columns(source),
         "pupil_samples": Column(propagation.samples, "1", "pupil samples N"),
     }
-    write_product(out, "bank", columns, config.model_dump())
 
 
 @dataclass(frozen=True)
@@ -142,6 +161,14 @@ class BoundedStars:
     field: np.ndarray
     truth: dict[str, np.ndarray]
     noisy: dict[float, np.ndarray]
+
+    def take(self, stars: np.ndarray) -> BoundedStars:
+        """Some of the stars, in the order given."""
+        truth, noisy = (
+            {key: images[stars] for key, images in kind.items()}
+            for kind in (self.truth, self.noisy)
+        )
+        return BoundedStars(self.star[stars], self.field[stars], truth, noisy)
 
 
 class Tables:
@@ -207,7 +234,13 @@ def bounds(
         require(bank, drawn.config, STARS, product.config, stars)
         sizes = (drawn.config["grid"]["points"], drawn.config["framing"]["jitter_px"])
         sample = Bank(drawn["framed"], drawn["field_index"], drawn["peak"], *sizes)
-        _sampled(config, sample, static, tables)
+        count, fields = drawn.config["bounds"]["bank_stars"], sample.points**2
+        if count < fields:
+            raise ProductError(
+                f"{bank}: bounds.bank_stars = {count}, must be at least {fields}, "
+                "a star for every field"
+            )
+        _sampled(config, sample.take(np.arange(count)), sample, static, tables)
     write_csv(out, pd.DataFrame(tables.summary, columns=COLUMNS))
     write_csv(growth, pd.DataFrame(tables.growth, columns=GROWTH_COLUMNS))
     write_parquet(per_star, pd.concat(tables.per_star, ignore_index=True))
@@ -261,56 +294,92 @@ def _floor(config: Config, product: Product, tables: Tables) -> None:
         tables.add("realisation", "floor", level, {"mse": error}, tight=False)
 
 
-def _sampled(config: Config, bank: Bank, static: np.ndarray, tables: Tables) -> None:
-    """The posterior mean over a bank, and how it changes with the bank's size."""
+def _sampled(config: Config, bank: Bank, larger: Bank, static: np.ndarray, tables: Tables) -> None:
+    """Posterior means over a bank, and how they change with its size.
+
+    In a single field the larger one is needed, and in a moment weighed.
+    """
     for level in config.noise.levels:
-        start = time.monotonic()
-        parts, draws = _bank_sums(config, bank, tables.stars, level)
-        sizes = nested_means(parts, lambda sums: _errors(sums, static, tables.stars))
-        draws_by_size = np.rint(draws / len(parts) * np.array(list(sizes))).astype(int)
-        last = sizes[len(parts)]
-        for i, reference in enumerate(tables.stars.truth):
-            errors = np.array([values[i].mean() for values in sizes.values()])
-            change = last_change(errors)
-            values = {"mse": last[i], "ess": last[-1]}
-            tables.add(reference, "bayes", level, values, tight=change <= TIGHT)
-            limit, exponent, residual = extrapolate(draws_by_size, errors)
-            tables.growth += [
-                {
-                    "dataset": tables.dataset,
-                    "reference": reference,
-                    "noise_level": level,
-                    "draws": count,
-                    "mse": error,
-                    "ess_mean": values[-1].mean(),
-                    "ess_median": np.median(values[-1]),
-                    "last_change": change,
-                    "limit": limit,
-                    "exponent": exponent,
-                    "fit_rms": residual,
-                }
-                for count, error, values in zip(draws_by_size, errors, sizes.values(), strict=True)
-            ]
-        seconds = time.monotonic() - start
-        print(f"λ = {level:g}: {draws} draws, {seconds:.1f} s", flush=True)
+        likelihood = Likelihood.of(noise_model(config), level, bank.stamps((bank.margin,) * 2))
+        for method, told in POSTERIOR_MEANS.items():
+            start = time.monotonic()
+            measured, drawn = (_told_the_field, larger) if told else (_anywhere, bank)
+            sizes = measured(drawn, static, tables.stars, level, likelihood)
+            _tabulate(tables, method, level, sizes)
+            seconds = time.monotonic() - start
+            print(f"λ = {level:g}, {method}: {max(sizes)} draws, {seconds:.1f} s", flush=True)
 
 
-def _bank_sums(
-    config: Config, bank: Bank, stars: BoundedStars, level: float
-) -> tuple[list[PosteriorSums], int]:
-    """Sums over equal parts of the bank, and the number of draws in them.
+def _tabulate(tables: Tables, method: str, level: float, sizes: dict[int, np.ndarray]) -> None:
+    """Rows of one posterior mean, whose `_errors` are given by number of draws."""
+    draws, last = np.array(list(sizes)), sizes[max(sizes)]
+    for i, reference in enumerate(tables.stars.truth):
+        errors = np.array([values[i].mean() for values in sizes.values()])
+        change = last_change(errors)
+        values = {"mse": last[i], "ess": last[-1]}
+        tables.add(reference, method, level, values, tight=change <= TIGHT)
+        limit, exponent, residual = extrapolate(draws, errors)
+        tables.growth += [
+            {
+                "dataset": tables.dataset,
+                "reference": reference,
+                "method": method,
+                "noise_level": level,
+                "draws": count,
+                "mse": error,
+                "ess_mean": values[-1].mean(),
+                "ess_median": np.median(values[-1]),
+                "last_change": change,
+                "limit": limit,
+                "exponent": exponent,
+                "fit_rms": residual,
+            }
+            for count, error, values in zip(draws, errors, sizes.values(), strict=True)
+        ]
+
+
+def _anywhere(
+    bank: Bank, static: np.ndarray, stars: BoundedStars, level: float, likelihood: Likelihood
+) -> dict[int, np.ndarray]:
+    """`_errors` of the posterior mean over all fields, by number of draws.
 
     A bank that is hopelessly thin for its noise level is left after a quarter.
     """
     cuts = np.array_split(np.arange(len(bank)), segments(len(bank)))
-    likelihood = Likelihood.of(noise_model(config), level, bank.stamps((bank.margin,) * 2))
     noisy = stars.noisy[level]
     quarter = max(1, len(cuts) // 4)
     parts = [posterior_sums(bank.take(cut), noisy, likelihood) for cut in cuts[:quarter]]
     sizes = nested_means(parts, lambda sums: sums.effective_size)
     if np.median(sizes[quarter]) >= HOPELESS_ESS:
         parts += [posterior_sums(bank.take(cut), noisy, likelihood) for cut in cuts[quarter:]]
-    return parts, sum(cut.size for cut in cuts[: len(parts)])
+    draws = sum(cut.size for cut in cuts[: len(parts)])
+    means = nested_means(parts, partial(_errors, static=static, stars=stars))
+    return {round(draws / len(parts) * size): values for size, values in means.items()}
+
+
+def _told_the_field(
+    bank: Bank, static: np.ndarray, stars: BoundedStars, level: float, likelihood: Likelihood
+) -> dict[int, np.ndarray]:
+    """The same over the draws that the symmetries take to each star's own field.
+
+    Fields that are mirror images of each other share theirs. Every part of the bank has
+    as many of them, and the draws that are counted are those of the bank in all fields.
+    """
+    ours, theirs = orbit(stars.field, bank.points), orbit(bank.field, bank.points)
+    groups = [(np.flatnonzero(ours == o), np.flatnonzero(theirs == o)) for o in np.unique(ours)]
+    pieces = segments(min(draws.size for _, draws in groups))
+    means: dict[int, np.ndarray] = {}
+    for group, draws in groups:
+        few = stars.take(group)
+        weigh = partial(
+            posterior_sums, noisy=few.noisy[level], likelihood=likelihood, told=few.field
+        )
+        parts = [weigh(bank.take(cut)) for cut in np.array_split(draws, pieces)]
+        measure = partial(_errors, static=static, stars=few)
+        for size, values in nested_means(parts, measure).items():
+            total = means.setdefault(size, np.empty((len(values), stars.field.size)))
+            total[:, group] = values
+    return {round(len(bank) / pieces * size): values for size, values in means.items()}
 
 
 def _errors(sums: PosteriorSums, static: np.ndarray, stars: BoundedStars) -> np.ndarray:
@@ -326,13 +395,16 @@ def _exact(config: Config, static: np.ndarray, tables: Tables) -> None:
     stars = tables.stars
     for level in config.noise.levels:
         likelihood = Likelihood.of(noise_model(config), level, static[:, static.shape[1] // 2])
-        mean, probability = exact_posterior(stars.noisy[level], static, likelihood)
-        error = mse(mean, stars.truth["realisation"])
-        if error.mean() < NEGLIGIBLE_MSE:
-            error = np.zeros_like(error)
-        right = probability[np.arange(stars.field.size), stars.field]
-        values = {"mse": error, "p_right": right}
-        tables.add("realisation", "bayes", level, values, tight=True)
+        for method, told in POSTERIOR_MEANS.items():
+            known = stars.field if told else None
+            mean, probability = exact_posterior(stars.noisy[level], static, likelihood, known)
+            error = mse(mean, stars.truth["realisation"])
+            if error.mean() < NEGLIGIBLE_MSE:
+                error = np.zeros_like(error)
+            values = {"mse": error}
+            if not told:
+                values["p_right"] = probability[np.arange(stars.field.size), stars.field]
+            tables.add("realisation", method, level, values, tight=True)
 
 
 @command("efficiency")
@@ -347,28 +419,31 @@ def efficiency(
     """Compare methods with the bounds; PARTS are the evaluations' Parquet files.
 
     They are paired by star; the methods' errors are those of the bounded stars alone.
-    The posterior mean is compared with the floor, too. An efficiency is given for the
-    floor and where the posterior mean is tight; the verdict is `beaten` if a method's
-    error is below such a bound by more than two standard errors of the difference and
-    5 % of the bound, otherwise `ok`. Both are empty where a posterior mean is not tight.
+    Methods that are told the star's field have a posterior mean of their own; all are
+    compared with the floor, and so are the posterior means. An efficiency is given for the
+    floor and where the posterior mean is tight; the verdict is `beaten` if a method's error
+    is below such a bound by more than two standard errors of the difference and 5 % of the
+    bound, otherwise `ok`. Both are empty where a posterior mean is not tight.
     """
     import pandas as pd
 
     limits = pd.concat([read_table(path) for path in bounds], ignore_index=True)
-    sure = (limits.method == "bayes") & (limits.metric == "mse") & (limits.tight == "yes")
+    sure = limits.method.isin(POSTERIOR_MEANS) & (limits.metric == "mse") & (limits.tight == "yes")
     tight = {
-        (row.dataset, row.reference, f"{row.noise_level:.6g}") for row in limits[sure].itertuples()
+        (row.dataset, row.reference, row.method, f"{row.noise_level:.6g}")
+        for row in limits[sure].itertuples()
     }
     best = pd.concat([pd.read_parquet(path) for path in bounds_per_star], ignore_index=True)
     wanted = [*COLUMN_OF_TABLE, "method", "star", "field", "mse"]
     methods = pd.concat([pd.read_parquet(path, columns=wanted) for path in parts])
     # The posterior mean over a bank is an estimator and must respect the floor.
-    methods = pd.concat([methods, best[best.method == "bayes"][wanted]], ignore_index=True)
+    means = best[best.method.isin(POSTERIOR_MEANS)][wanted]
+    methods = pd.concat([methods, means], ignore_index=True)
     by_column = dict(list(methods.groupby(COLUMN_OF_TABLE, sort=False)))
     rows: list[dict[str, Any]] = []
     for key, bounded in best.groupby(COLUMN_OF_TABLE, sort=False):
         found = by_column[key]
-        if not (found.method != "bayes").any():
+        if found.method.isin(POSTERIOR_MEANS).all():
             raise ProductError(f"{', '.join(map(str, key))}: bounded, but no method was evaluated")
         rows += _column(dict(zip(COLUMN_OF_TABLE, key, strict=True)), found, bounded, tight)
     write_csv(out, pd.DataFrame(rows, columns=EFFICIENCY_COLUMNS))
@@ -377,12 +452,15 @@ def efficiency(
 def _column(
     key: dict[str, Any], methods: pd.DataFrame, bounded: pd.DataFrame, tight: set[tuple[Any, ...]]
 ) -> Iterator[dict[str, Any]]:
-    """Rows of one dataset, reference and λ: every method beside every bound."""
+    """Rows of one dataset, reference and λ: every method beside every bound it has to respect."""
     place = f"{key['dataset']}, {key['reference']}, λ = {key['noise_level']:g}"
     for bound, limits in bounded.groupby("method", sort=False):
-        sharp = (key["dataset"], key["reference"], f"{key['noise_level']:.6g}") in tight
+        sharp = (key["dataset"], key["reference"], bound, f"{key['noise_level']:.6g}") in tight
         for method, errors in methods.groupby("method", sort=False):
-            if method == bound:
+            if bound != "floor" and (
+                method in POSTERIOR_MEANS
+                or POSTERIOR_MEANS[bound] != method_named(method).told_position
+            ):
                 continue
             paired = limits.merge(errors, on="star", suffixes=("_bound", ""), validate="1:1")
             if len(paired) < len(limits):
@@ -403,7 +481,7 @@ def _column(
                 **key,
                 "method": method,
                 "bound": bound,
-                "tight": "yes" if bound == "bayes" and sharp else "no",
+                "tight": "yes" if sharp else "no",
                 "mse": found.mse,
                 "mse_bound": found.bound,
                 "efficiency": found.efficiency if judged else None,

@@ -82,3 +82,8 @@ class Symmetry:
 
 SYMMETRIES = tuple(Symmetry(*flags) for flags in product((False, True), repeat=3))
 """All eight, the identity first."""
+
+
+def orbit(field: np.ndarray, points: int) -> np.ndarray:
+    """First of the fields to which the symmetries take each field: the same for all of them."""
+    return np.min([symmetry.field(field, points) for symmetry in SYMMETRIES], axis=0)
