@@ -20,7 +20,7 @@ from psfdae.estimators.dae_network import (
 )
 from psfdae.estimators.lmmse import LinearMmse
 from psfdae.estimators.pca_som import PcaSom, fit_pca_som
-from psfdae.estimators.training import TrainingError
+from psfdae.estimators.training import TrainingError, orthogonal
 from psfdae.estimators.weights import load_weights, save_checkpoint, save_weights
 from psfdae.evaluation.metrics import mse
 from psfdae.files import ProductError
@@ -33,6 +33,8 @@ TRAIN = Train(
     batch=50,
     lr=3e-3,
     schedule="onecycle",
+    optimiser="adam",
+    level_weight=0.0,
     grad_clip=1.0,
     threads=1,
     validate_every=1,
@@ -275,8 +277,8 @@ def test_restart_uses_other_weights(data, tmp_path, monkeypatch):
 
 def test_fresh_noise_every_epoch(data):
     stars = np.arange(10)
-    first = data.draw(stars, stream(1, "dae", "epoch", 0, 0))
-    second = data.draw(stars, stream(1, "dae", "epoch", 0, 1))
+    first, _ = data.draw(stars, stream(1, "dae", "epoch", 0, 0))
+    second, _ = data.draw(stars, stream(1, "dae", "epoch", 0, 1))
     assert (first != second).any(axis=(1, 2)).all()
 
 
@@ -286,7 +288,52 @@ def test_fixed_noise_is_the_same_in_every_epoch(data):
     first, second = (next(training.batches(epoch))[0] for epoch in range(2))
     again = DaeTraining(data, DAE, settings, 3, 0)
     assert torch.equal(first.sum((1, 2, 3)).sort()[0], second.sum((1, 2, 3)).sort()[0])
-    assert np.array_equal(training.fixed, again.fixed)
+    assert all(map(np.array_equal, training.fixed, again.fixed))
+
+
+def test_errors_of_faint_stars_count_less_by_a_power_of_their_noise(data):
+    settings = TRAIN.model_copy(update={"level_weight": 1.0, "batch": 250})
+    training = DaeTraining(data, DAE, settings, 3, 0)
+    noisy, target, weight = next(training.batches(0))
+    assert sorted(set(weight.ravel().tolist())) == pytest.approx(
+        sorted((1 / data.levels) / np.mean(1 / data.levels)), rel=1e-6
+    )
+    errors = ((training.model(noisy) - target) ** 2).mean(dim=(1, 2, 3))
+    wanted = (errors * weight.ravel()).mean().item()
+    assert training.loss((noisy, target, weight), 1).item() == pytest.approx(wanted, rel=1e-5)
+
+
+@pytest.mark.parametrize("shape", [(8, 200), (200, 8), (16, 16)])
+def test_steps_of_muon_are_along_orthogonal_matrices(shape):
+    generator = torch.Generator().manual_seed(1)
+    singular = torch.linalg.svdvals(orthogonal(torch.randn(shape, generator=generator)))
+    assert singular.min() > 0.5 and singular.max() < 1.3
+
+
+def test_muon_steps_as_far_as_adam_and_leaves_the_rest_to_it(data):
+    steps = {}
+    for optimiser in ("adam", "muon"):
+        settings = TRAIN.model_copy(update={"optimiser": optimiser, "schedule": "constant"})
+        training = DaeTraining(data, DAE, settings, 3, 0)
+        before = [p.detach().clone() for p in training.model.parameters()]
+        training._step(next(training.batches(0)), 1)
+        pairs = zip(training.model.parameters(), before, strict=True)
+        steps[optimiser] = [(p - b).detach() for p, b in pairs]
+    inner = [f"layers.{i}.weight" for i in range(1, len(training.model.layers) - 1)]
+    for (name, _), a, m in zip(training.model.named_parameters(), *steps.values(), strict=True):
+        if name in inner:
+            assert not torch.equal(a, m)
+            # Adam's first step is the learning rate in every element.
+            assert 0.1 < (m.square().mean() / a.square().mean()).sqrt() < 0.4
+        else:
+            assert torch.equal(a, m)
+
+
+def test_interrupted_muon_continues_as_if_nothing_had_happened(data, tmp_path):
+    settings = TRAIN.model_copy(update={"optimiser": "muon"})
+    whole = train(data, tmp_path, settings)
+    interrupted(data, tmp_path, 2, train_config=settings)
+    assert same(whole.result, train(data, tmp_path, settings).result)
 
 
 def test_patience_stops_a_training_that_no_longer_improves(data, tmp_path):

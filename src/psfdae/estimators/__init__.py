@@ -92,9 +92,10 @@ class TrainingSet:
         """All training stars, validation included, ascending."""
         return np.sort(np.concatenate([self.fit, self.validation]))
 
-    def draw(self, stars: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Noisy images of `stars`, each at a random level."""
-        return self.noise.draw(self.images[stars], mixed_levels(self.levels, stars.size, rng), rng)
+    def draw(self, stars: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """Noisy images of `stars`, each at a random level, and these levels."""
+        level = mixed_levels(self.levels, stars.size, rng)
+        return self.noise.draw(self.images[stars], level, rng), level
 
     def without_validation(self) -> TrainingSet:
         """The same stars but for those that validate."""

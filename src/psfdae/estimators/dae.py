@@ -59,6 +59,12 @@ class Train(Group):
     lr: Annotated[float, Field(gt=0, le=1)] = Field(
         description="Adam's learning rate (its maximum if one-cycle)"
     )
+    optimiser: Literal["adam", "muon"] = Field(
+        description="Of the inner layers' weights; all else is Adam's"
+    )
+    level_weight: Annotated[float, Field(ge=0, le=2)] = Field(
+        description="Power p by which the squared error of a star counts 1/λ^p; 0: all alike"
+    )
     schedule: Literal["onecycle", "constant"] = Field(description="Course of the learning rate")
     grad_clip: Annotated[float, Field(ge=0)] = Field(
         description="Maximum norm of the gradient; 0 switches clipping off"

@@ -17,7 +17,7 @@ import torch
 from torch import nn
 
 from psfdae.estimators import TrainingSet
-from psfdae.estimators.training import DeadNetworkError, Row, Training, TrainingError, train
+from psfdae.estimators.training import DeadNetworkError, Muon, Row, Training, TrainingError, train
 from psfdae.files import atomic_path
 from psfdae.rng import stream
 
@@ -149,38 +149,55 @@ class DaeTraining(Training):
         model = build_dae(dae.kernels, dae.widths, dae.init, generator)
         super().__init__(model, settings, -(-data.fit.size // settings.batch), attempt)
         self.grad_clip = settings.grad_clip or self.grad_clip
-        self.fixed: np.ndarray | None = None
+        self.fixed: tuple[np.ndarray, ...] | None = None
         if settings.noise == "fixed":
             stars = np.arange(len(data.images))
             self.fixed = data.draw(stars, stream(seed, "dae", "fixed noise"))
 
+    def begin(self, lr: float) -> torch.optim.Optimizer:
+        """Muon for the weights of the inner layers, Adam for the others; or Adam for all."""
+        if self.settings.optimiser == "adam":
+            return super().begin(lr)
+        inner = [layer.weight for layer in self.model.layers[1:-1]]
+        others = [p for p in self.model.parameters() if all(p is not w for w in inner)]
+        return Muon([{"params": others}, {"params": inner, "orthogonal": True}], lr=lr)
+
     def batches(self, epoch: int) -> Iterator[tuple[torch.Tensor, ...]]:
-        """Noisy images and what is to come of them, (B, 1, d, d) as the network sees them."""
+        """Noisy images and what is to come of them, (B, 1, d, d) as the network sees them.
+
+        The third is the weight of each star's error, (B, 1, 1, 1), of mean 1 over the levels.
+        """
         rng = stream(self.seed, "dae", "epoch", self.attempt, epoch)
         order = rng.permutation(self.data.fit)
         for start in range(0, order.size, self.settings.batch):
             stars = order[start : start + self.settings.batch]
-            noisy = self.data.draw(stars, rng) if self.fixed is None else self.fixed[stars]
-            yield self._tensor(noisy), self._tensor(self.data.references[stars])
+            if self.fixed is None:
+                noisy, level = self.data.draw(stars, rng)
+            else:
+                noisy, level = (fixed[stars] for fixed in self.fixed)
+            power = -self.settings.level_weight
+            weight = level**power / np.mean(self.data.levels**power)
+            weighted = torch.from_numpy(weight.astype(np.float32))[:, None, None, None]
+            yield self._tensor(noisy), self._tensor(self.data.references[stars]), weighted
 
     def _tensor(self, images: np.ndarray) -> torch.Tensor:
         scaled = torch.from_numpy(images)[:, None] * self.factor
         return scaled.to(memory_format=torch.channels_last)
 
     def loss(self, batch: tuple[torch.Tensor, ...], step: int) -> torch.Tensor:
-        """Mean squared error."""
-        noisy, target = batch
+        """Mean squared error, weighted by star."""
+        noisy, target, weight = batch
         output = self.model(noisy)
         if step % self.settings.dead_check_steps == 0 and not output.detach().any():
             raise DeadNetworkError(f"all outputs are zero at step {step}")
-        return nn.functional.mse_loss(output, target)
+        return (weight * (output - target) ** 2).mean()
 
     def validate(self, epoch: int) -> float:
         """Mean squared error of the validation stars every few epochs and after the last."""
         if epoch % self.settings.validate_every and epoch != self.settings.epochs:
             return float("nan")
         stars = np.tile(self.data.validation, self.settings.validation_draws)
-        noisy = self.data.draw(stars, stream(self.seed, "dae", "validation"))
+        noisy, _ = self.data.draw(stars, stream(self.seed, "dae", "validation"))
         estimate = predict(self.model, noisy, self.factor)
         if not estimate.any():
             raise DeadNetworkError(f"all outputs are zero after epoch {epoch}")

@@ -102,7 +102,7 @@ class PcaSom(Method):
                 f"{data.train.size}, the number of training stars"
                 f"{' without those that validate' if without else ''}"
             )
-        noisy = data.draw(data.train, stream(data.seed, "noise", f"baseline{without}"))
+        noisy, _ = data.draw(data.train, stream(data.seed, "noise", f"baseline{without}"))
         settings = baseline.model_dump(exclude={"threads"})
         seed = int(stream(data.seed, "baseline", "map").integers(2**31))
         return fit_pca_som(noisy, **settings, seed=seed)

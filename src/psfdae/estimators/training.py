@@ -46,6 +46,41 @@ class DeadNetworkError(RuntimeError):
     """All outputs of the network are zero: no gradient will ever revive it."""
 
 
+class Muon(torch.optim.Adam):
+    """Adam; matrices of groups marked `orthogonal` take steps along orthogonal matrices.
+
+    The momentum of a matrix (out, in) is replaced by the nearest semi-orthogonal matrix, by
+    five steps of a Newton–Schulz iteration (K. Jordan et al. 2024, "Muon"), scaled so that
+    its elements have the RMS of Adam's steps (Liu et al. 2025, arXiv:2502.16982).
+    """
+
+    @torch.no_grad()
+    def step(self, closure: None = None) -> None:  # type: ignore[override]
+        """One step; gradients of the matrices are None afterwards."""
+        for group in self.param_groups:
+            for weight in group["params"] if group.get("orthogonal") else ():
+                state, beta = self.state[weight], group["betas"][0]
+                if not state:  # Adam wants a step in every state that it restores
+                    state |= {"step": torch.tensor(0.0), "momentum": torch.zeros_like(weight)}
+                momentum = state["momentum"]
+                momentum.lerp_(weight.grad, 1 - beta)
+                step = orthogonal(weight.grad.lerp(momentum, beta).flatten(1))
+                scale = 0.2 * max(step.shape) ** 0.5
+                weight.add_(step.view_as(weight), alpha=-group["lr"] * scale)
+                weight.grad = None
+        super().step()
+
+
+def orthogonal(matrix: torch.Tensor) -> torch.Tensor:
+    """About the semi-orthogonal factor of the polar decomposition; singular values 0.7 … 1.2."""
+    wide = matrix if matrix.shape[0] <= matrix.shape[1] else matrix.T
+    x = wide / (wide.norm() + 1e-7)
+    for _ in range(5):
+        square = x @ x.T
+        x = 3.4445 * x + (-4.7750 * square + 2.0315 * square @ square) @ x
+    return x if wide is matrix else x.T
+
+
 class Training(ABC):
     """One training; a kind of network says what its batches, its loss and its history are.
 
@@ -71,7 +106,7 @@ class Training(ABC):
     ) -> None:
         self.model, self.settings, self.steps = model, settings, steps
         self.attempt, self.key = attempt, key
-        self.optimiser = torch.optim.Adam(model.parameters(), lr=settings.lr)
+        self.optimiser = self.begin(settings.lr)
         self.scheduler: LRScheduler
         if settings.schedule == "onecycle":
             total = max(settings.epochs * steps, 2)
@@ -82,6 +117,10 @@ class Training(ABC):
         self.history: list[Row] = []
         self.best_mse = float("inf")
         self.best_state: dict[str, torch.Tensor] = {}
+
+    def begin(self, lr: float) -> torch.optim.Optimizer:
+        """The optimiser."""
+        return torch.optim.Adam(self.model.parameters(), lr=lr)
 
     @abstractmethod
     def batches(self, epoch: int) -> Iterator[tuple[torch.Tensor, ...]]:
