@@ -63,10 +63,11 @@ rule propagation_tables:
 BUNDLE = f"{RESULTS}/bundles/{TIMED_DATASET}-random-realisation.psf.safetensors"
 TESTED = f"{RESULTS}/evaluation/{TIMED_DATASET}/random-realisation.csv"
 STARS = {"stars": lambda w: stars_of(TIMED_DATASET)}
-# By table: target, command, inputs, MB, minutes, stages that it runs as users do.
+FITTED = [f"psfdae.estimators.{name}" for name in names_of(TIMED_DATASET)]
+# By table: target, command, inputs, MB, minutes, stages that it runs or modules that it chooses.
 TIMED = {
     "benchmark_baseline": ("benchmark", "trainings.baseline", STARS, 1500, 20, []),
-    "benchmark_methods": ("benchmark", "trainings.methods", STARS, 1500, 20, ["fit"]),
+    "benchmark_methods": ("benchmark", "trainings.methods", STARS, 1500, 20, FITTED),
     "benchmark_inference": ("benchmark", "speed.inference", {}, 3000, 30, []),
     "benchmark_scaling": (
         *("benchmark", "speed.growth", {}, 2000, 30),
@@ -296,7 +297,7 @@ rule method_seeds:
         runtime=60,
     params:
         config=lambda w: settings("trainings.seeds", f"dataset={w.dataset}"),
-        source=program_code("trainings.seeds", ["fit"]),
+        source=program_code("trainings.seeds", FITTED),
         program=program("trainings.seeds"),
     message:
         "Fitting all methods of {wildcards.dataset} with other seeds"
