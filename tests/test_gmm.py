@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from psfdae.estimators import TrainingSet
+from psfdae.estimators import FitError, TrainingSet
 from psfdae.estimators import gmm as module
 from psfdae.estimators.gmm import GaussianMixture, Gmm
+from psfdae.estimators.gmm_simulated import Simulated, SimulatedMixture
+from psfdae.files import Product
 from psfdae.stars.noise import NoiseModel
 
 NOISE = NoiseModel(kappa=5.0, background=1e4)
@@ -47,7 +50,9 @@ class Placed(GaussianMixture):
 
 def where(count, seed=1):
     """Positions that have to do with the stars' kinds."""
-    return stars(count, seed)[0][:, 3, 3:5] + np.random.default_rng(seed).normal(0, 0.1, (count, 2))
+    return stars(count, seed)[0][:, 3, 3:5] + np.random.default_rng(seed).normal(
+        0, 0.01, (count, 2)
+    )
 
 
 def training(count=400, same=True, images=None):
@@ -185,3 +190,44 @@ def test_it_is_stored_and_the_same_again(tmp_path):
         np.array_equal(getattr(twice, n), getattr(mixture, n)) for n in GaussianMixture.arrays
     )
     assert replace(mixture, shrinkage=np.array([1.0])).shrinkage == [1.0]
+
+
+def test_the_position_is_used_where_it_tells_something():
+    """Positions decide the kind of the star; or they are those of other stars."""
+    data, settings = training(), Gmm(**{**ONE, "components": [4, 12]})
+    truth, place = stars(400, seed=2)[0], where(400, seed=2)
+    noisy = NOISE.draw(truth, 4 * LEVEL, np.random.default_rng(3))
+    told, untold = (kind.fit(data, settings) for kind in (Placed, GaussianMixture))
+    errors = [np.square(m.predict(noisy, 4 * LEVEL, place) - truth).mean() for m in (told, untold)]
+    assert errors[0] < 0.9 * errors[1]
+    # Learnt on one half of the field, it is wrong on the other.
+    misled = data.positions.copy()
+    misled[data.validation] = misled[data.validation[::-1]] * [-1.0, 3.0]
+    kept = Placed.fit(replace(data, positions=misled), settings)
+    np.testing.assert_allclose(
+        kept.predict(noisy, LEVEL, place), kept.predict(noisy, LEVEL, -place), atol=1e-7
+    )
+
+
+@pytest.mark.parametrize("reference", ["realisation", "template"])
+def test_fresh_stars_are_of_fields_that_the_training_part_has(reference):
+    grid, field = np.array([[0, 0], [0, 1], [1, 0]]), np.arange(60) % 3
+    x, y = stars(60, seed=5)
+    arrays = {"realisation": x, "template": y, "grid": grid, "field_index": field}
+    data = replace(
+        training(same=False),
+        positions=grid[np.arange(400) % 2],
+        reference=reference,
+        fresh=Product(Path("fresh.h5"), {}, arrays),
+    )
+    found = data.on_fresh_stars()
+    known = field < 2
+    np.testing.assert_array_equal(found.images[found.fit], x[known])
+    wanted = (x if reference == "realisation" else y)[known]
+    np.testing.assert_array_equal(found.references[found.fit], wanted)
+    np.testing.assert_array_equal(found.positions[found.fit], grid[field[known]])
+    np.testing.assert_array_equal(found.images[found.validation], data.images[data.validation])
+    mixture = SimulatedMixture.fit(data, Simulated(**{**ONE, "stars": 90}))
+    assert mixture.count.sum() == known.sum() + data.validation.size
+    with pytest.raises(FitError, match="learns from fresh stars"):
+        training().on_fresh_stars()
