@@ -245,25 +245,25 @@ class GaussianMixture(Method):
             tried._factors.clear()
             return float(np.exp(np.mean(np.log(errors))))
 
-        best: tuple[float, int, bool, Self] | None = None
-        # What is told may be left aside, where stars in other places are worse for it.
-        for told in (True, False) if cls.told_position else (False,):
-            least = np.inf
+        def search(told: bool) -> tuple[float, int, bool, float]:
+            """K at the first ν, until more clusters are worse; then ν at the best K."""
+            tried: dict[int, float] = {}
             for k in sizes:
                 one = cls._clustered(data, learn, k, gmm, told)
-                found = error(one)
-                least = min(least, found)
-                if best is None or found < best[0]:
-                    best = found, k, told, one
-                if found > WORSE * least:
+                tried[k] = error(one)
+                if tried[k] == min(tried.values()):
+                    best = one
+                if tried[k] > WORSE * min(tried.values()):
                     break
-        assert best is not None
-        first, clusters, told, one = best
-        by_shrinkage = {gmm.shrinkage[0]: first}
-        if clusters > 1:  # in one cluster ν has no effect
-            for nu in gmm.shrinkage[1:]:
-                by_shrinkage[nu] = error(replace(one, shrinkage=np.array([nu])))
-        return clusters, told, min(by_shrinkage, key=by_shrinkage.__getitem__)
+            k = min(tried, key=tried.__getitem__)
+            found = [(tried[k], k, told, gmm.shrinkage[0])]
+            for nu in gmm.shrinkage[1:] if k > 1 else ():  # in one cluster it has no effect
+                found.append((error(replace(best, shrinkage=np.array([nu]))), k, told, nu))
+            return min(found)
+
+        # What is told may be left aside, where stars in other places are worse for it.
+        told = (True, False) if cls.told_position else (False,)
+        return min(map(search, told))[1:]
 
     @classmethod
     def _clustered(
