@@ -163,7 +163,7 @@ class GaussianMixture(Method):
     noise : NoiseModel
     """
 
-    label, color, marker = "Gaussian mixture (told λ)", "#cc79a7", "P"
+    label, color, marker = "GMM (told λ)", "#cc79a7", "P"
     told_level = True
     per_reference = True
     groups: ClassVar = {"gmm": Gmm}
