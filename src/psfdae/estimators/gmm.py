@@ -36,12 +36,12 @@ from psfdae.estimators import Estimate, FitError, Method, TrainingSet
 from psfdae.rng import stream
 from psfdae.stars.noise import NoiseModel
 
-STEP = 0.1
-"""Of ln s between noise variances that share a factorisation; where they differ, it is
-that of a prior which is wrong by half of it, and the error grows by the square."""
+STEP = 0.2
+"""Of ln s between noise variances of single stars, which share a factorisation; s is then
+wrong by half of it at most, and the error grows by the square."""
 
-EXACT = 8
-"""Noise variances that are so few have factors of their own."""
+KEPT = 256e6
+"""Bytes of factorisations that are kept for further stars."""
 
 NEAREST, LEADING = 64, 64
 """Clusters that are looked at, and coordinates in which they are found; the others of 512
@@ -197,7 +197,7 @@ class GaussianMixture(Method):
     slope_reference: np.ndarray
     shrinkage: np.ndarray
     noise: NoiseModel
-    _factors: dict[tuple[int, float], Factor] = field(default_factory=dict, init=False, repr=False)
+    _nodes: dict[float, dict[int, Factor]] = field(default_factory=dict, init=False, repr=False)
 
     @classmethod
     def fit(cls, data: TrainingSet, gmm: Gmm) -> Self:
@@ -338,10 +338,10 @@ class GaussianMixture(Method):
             raise ValueError("noisy images must be finite")
         where = np.empty((len(flat), 0)) if position is None else position @ self.whitening
         even = np.full(len(flat), 1.0 / flat.shape[1])
-        s, node = np.unique(self.noise.variance(even, np.asarray(level)), return_inverse=True)
-        if s.size > EXACT:
-            rounded, again = np.unique(np.rint(np.log(s) / STEP), return_inverse=True)
-            s, node = np.exp(rounded * STEP), again[node]
+        s = self.noise.variance(even, np.asarray(level))
+        if np.ndim(level):  # not by how many there are: stars do not influence each other
+            s = np.exp(np.rint(np.log(s) / STEP) * STEP)
+        s, node = np.unique(s, return_inverse=True)
         psf, sigma = (np.empty(flat.shape, np.float32) for _ in range(2))
         evidence = np.empty(len(flat))
         for place, variance in enumerate(s):
@@ -349,8 +349,8 @@ class GaussianMixture(Method):
             for part in np.array_split(stars, -(-stars.size // AT_ONCE)):
                 found = self._posterior(flat[part], where[part], float(variance), sure)
                 psf[part], sigma[part], evidence[part] = found
-            if s.size > EXACT:
-                self._factors.clear()
+            for old in list(self._nodes)[: -self._most]:
+                self._nodes.pop(old, None)
         shaped = psf.reshape(noisy.shape), sigma.reshape(noisy.shape) if sure else None
         return Estimate(*shaped, evidence=evidence)
 
@@ -403,6 +403,11 @@ class GaussianMixture(Method):
         if not sure:
             return psf, np.nan, evidence
         return psf, np.sqrt(np.maximum(second - psf.astype(np.float64) ** 2, 0.0)), evidence
+
+    @cached_property
+    def _most(self) -> int:
+        """Noise variances whose factorisations are kept."""
+        return max(1, int(KEPT // (self.deviation.nbytes + self.deviation_reference.nbytes + 1)))
 
     def _restored(
         self, flat: np.ndarray, gain: np.ndarray, own: np.ndarray | float, s: float
@@ -473,7 +478,8 @@ class GaussianMixture(Method):
 
     def _factor(self, k: int, s: float) -> Factor:
         """C_k + s factorised: D + b XᵀX with the diagonal D, and M = 1/b + X D⁻¹Xᵀ = L Lᵀ."""
-        if (k, s) not in self._factors:
+        node = self._nodes.setdefault(s, {})  # whole, whatever another thread drops
+        if k not in node:
             from scipy.linalg import solve_triangular
 
             cluster = self._clusters[k]
@@ -487,7 +493,7 @@ class GaussianMixture(Method):
             both = np.hstack([x / d[:leading], y]) if len(y) else x / d[:leading]
             both = solve_triangular(low, both, lower=True)
             half_det = np.log(low.diagonal()).sum() + 0.5 * len(x) * np.log(cluster.scale)
-            self._factors[k, s] = Factor(
+            node[k] = Factor(
                 inverse=(1.0 / d).astype(np.float32),
                 low=np.ascontiguousarray(both[:, :leading], np.float32),
                 low_reference=np.ascontiguousarray(both[:, leading:], np.float32),
@@ -499,7 +505,7 @@ class GaussianMixture(Method):
                     + np.log(cluster.spread.diagonal()).sum()
                 ),
             )
-        return self._factors[k, s]
+        return node[k]
 
     @cached_property
     def _total(self) -> np.ndarray:
