@@ -251,9 +251,12 @@ class Engine:
         snr = 1.0 / (noise * info.noise_equivalent_px**0.5)
         distance = mahalanobis(found.images, noise, bundle.flux_model, info.components)
         flux = found.flux.astype(np.float32)[:, None, None]
-        uncertainty = sigma
-        if uncertainty is None:
-            uncertainty = at_noise(noise, bundle.noise_nodes, bundle.error68)
+        uncertainty = at_noise(noise, bundle.noise_nodes, bundle.error68)
+        if sigma is not None:
+            uncertainty *= sigma
+        ratio95 = np.full(len(noise), np.nan)
+        if bundle.ratio95 is not None:
+            ratio95 = np.interp(noise, bundle.noise_nodes, bundle.ratio95)
         psf *= flux
         uncertainty *= flux
         residual = (stamps - found.background[:, None, None]).astype(np.float32) - psf
@@ -267,6 +270,7 @@ class Engine:
             psf=psf,
             residual=residual,
             uncertainty=uncertainty,
+            ratio95=ratio95,
             flux=found.flux,
             flux_error=np.sqrt(found.flux_error**2 + photons),
             background=found.background,

@@ -45,7 +45,9 @@ class Prediction:
         Stamp − sky − `psf`; NaN in pixels that were not used.
     uncertainty : ndarray, shape (n, d, d), float32
         Half-width that holds 68.27 % of the errors of `psf` at this S/N, as found on
-        the test stars of the model.
+        the test stars of the model; in units of the star's own σ where the model knows it.
+    ratio95 : ndarray, shape (n,), float64
+        `uncertainty` times this holds 95 % of the errors; NaN where the model does not say.
     flux, flux_error : ndarray, shape (n,), float64
         Flux inside the stamp, in the unit of the stamps; the error is NaN where the
         flux was given.
@@ -69,6 +71,7 @@ class Prediction:
     psf: np.ndarray
     residual: np.ndarray
     uncertainty: np.ndarray
+    ratio95: np.ndarray
     flux: np.ndarray
     flux_error: np.ndarray
     background: np.ndarray
@@ -116,6 +119,7 @@ COLUMNS: dict[str, tuple[str, str | None, str]] = {
     "background": ("D", UNIT, "sky per pixel"),
     "noise": ("D", UNIT, "RMS of the sky noise in a pixel"),
     "snr": ("D", None, "flux / (noise sqrt(A))"),
+    "ratio95": ("D", None, "UNCERT times this holds 95 % of the errors"),
     "chi2": ("D", None, "mean squared residual over its variance"),
     "distance": ("D", None, "Mahalanobis distance from the training set"),
     "fwhm_px": ("D", "pix", "of the PSF, adaptive moments"),
