@@ -167,6 +167,27 @@ def test_few_and_equal_stars():
         GaussianMixture.fit(training(30), Gmm(**{**ONE, "components": [500]}))
 
 
+@pytest.mark.parametrize("clusters", [1, 8])
+def test_noise_of_the_training_stars_is_no_part_of_the_prior(clusters):
+    rng, images = np.random.default_rng(4), stars(3000)[0]
+    sky = 0.01
+    own = images + rng.normal(0, sky, images.shape).astype(np.float32)
+    chosen = Gmm(**{**ONE, "components": [clusters]})
+    clean, raw = (GaussianMixture.fit(training(images=x), chosen) for x in (images, own))
+
+    def covariance(which, mean):
+        return (which.size - 1) * sky**2 * np.eye(mean.size)
+
+    data = replace(training(images=own), own_noise=covariance)
+    less = GaussianMixture.fit(data, chosen)
+    excess = [m.variance.sum() / clean.variance.sum() - 1 for m in (raw, less)]
+    assert excess[0] > 0.1 and abs(excess[1]) < 0.2 * excess[0]
+    truth = stars(400, seed=2)[0]
+    noisy = NOISE.draw(truth, LEVEL, np.random.default_rng(3))
+    errors = [np.square(m.predict(noisy, LEVEL) - truth).mean() for m in (raw, less)]
+    assert errors[1] < errors[0]
+
+
 def test_an_image_that_is_not_finite_is_refused():
     noisy = stars(3)[0]
     noisy[1, 2, 3] = np.nan

@@ -68,6 +68,9 @@ class TrainingSet:
     fresh : Product or None
         Other draws of the simulator, with the arrays of a product "stars", if
         `Method.fresh` asks for them.
+    own_noise : callable or None
+        Of images that are not noise-free: from star indices (m,) and their mean image (P,)
+        to what noise adds to their scatter (P, P) about it.
     checkpoint : Path or None
         Where a long fit may keep its state; the caller removes it once the result is safe.
     """
@@ -81,6 +84,7 @@ class TrainingSet:
     seed: int = 0
     positions: np.ndarray = field(default_factory=lambda: np.empty((0, 2)))
     fresh: Product | None = None
+    own_noise: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
     checkpoint: Path | None = None
 
     @property

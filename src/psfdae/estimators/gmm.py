@@ -10,6 +10,9 @@ TIP 21, 2481),
 with the noise variance s of a pixel: (κλ)², and the star's own photons spread evenly,
 which costs less than 1 % of the error. Linear MMSE is the case of one cluster.
 
+Where the images have noise of their own, as bright stars do, its covariance is taken off
+S and every XᵀX, and what would be negative is 0.
+
 All covariances of a cluster of n_k stars are shrunk towards those within all clusters:
 C_k = (X_kᵀX_k + ν S) / (n_k + ν), X_k the deviations of its stars from their mean. In the
 eigenvectors of S this is a diagonal and a matrix of rank n_k; by Woodbury's identity its
@@ -272,7 +275,13 @@ class GaussianMixture(Method):
         slope, slope_y = (p.T @ a / len(a) for a in (x, y))
         x -= p @ slope
         y -= p @ slope_y
-        variance, axes = np.linalg.eigh(x.T @ x / len(x))
+        scatter = x.T @ x
+        if data.own_noise is not None and same and not p.size:
+            for a, b, mean in zip(start, start + count, mean_x, strict=True):
+                noise = data.own_noise(stars[order[a:b]], mean)
+                scatter -= noise
+                x[a:b] = _less(x[a:b], noise)
+        variance, axes = np.linalg.eigh(scatter / len(x))
         variance, axes = np.maximum(variance[::-1], 0.0), axes[:, ::-1]
         x = x @ axes
         none = np.empty((0, x.shape[1]), np.float32)
@@ -530,6 +539,15 @@ class GaussianMixture(Method):
         known = np.square(cross) @ factor.inverse
         known -= np.square(cross[:, :leading] @ factor.low.T).sum(axis=1)
         return np.maximum(prior - known, 0.0)
+
+
+def _less(x: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """Rows (n, P) whose products xᵀx are less by a covariance (P, P), but in no direction < 0."""
+    variance, axes = np.linalg.eigh(x.T @ x - noise)
+    most = min(x.shape)
+    rows = np.zeros_like(x)
+    rows[:most] = (np.sqrt(np.maximum(variance, 0.0)) * axes)[:, ::-1].T[:most]
+    return rows
 
 
 def _standard(p: np.ndarray) -> np.ndarray:
