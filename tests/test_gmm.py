@@ -89,6 +89,27 @@ def test_sums_are_those_of_dense_matrices(same, level, monkeypatch):
     np.testing.assert_allclose(found.evidence, evidence, atol=0.05)
 
 
+@pytest.mark.parametrize("same", [True, False])
+def test_a_flux_that_is_an_estimate_is_found(same, monkeypatch):
+    monkeypatch.setattr(module, "FLAT", 0.0)
+    monkeypatch.setattr(module, "LEAST", 0.0)
+    mixture, rng, pixels = fitted(same=same, components=[12]), np.random.default_rng(3), D * D
+    images, wider = stars(300, seed=2)
+    flux = rng.normal(1.0, 0.1, (300, 1, 1))
+    noisy = NOISE.draw(images, LEVEL / 5, rng) + (flux - 1) * (images - 1 / pixels)
+    noisy += ((1 - noisy.sum(axis=(1, 2))) / pixels)[:, None, None]
+    free = mixture.free_flux()
+    found, mean = free.estimate(noisy, LEVEL / 5), dense(free, noisy, LEVEL / 5)[0]
+    sky = ((found.flux - 1) / pixels if same else 0 * found.flux)[:, None, None]
+    np.testing.assert_allclose(found.psf, mean + sky, atol=2e-4 * mean.max())
+    np.testing.assert_allclose(found.psf.sum(axis=(1, 2)), found.flux, atol=2e-3)
+    assert np.std(found.flux - flux.ravel()) < 0.5 * np.std(flux)
+    truth = images if same else wider
+    errors = [found.psf / found.flux[:, None, None], mixture.predict(noisy, LEVEL / 5)] - truth
+    assert np.square(errors[0]).mean() < 0.9 * np.square(errors[1]).mean()
+    assert free.free_flux().loose == free.loose and mixture.estimate(noisy, LEVEL / 5).flux is None
+
+
 def test_one_cluster_is_linear_mmse():
     data = training(same=False)
     mixture = GaussianMixture.fit(data, Gmm(**ONE))

@@ -112,11 +112,15 @@ class Estimate:
         Standard deviation of each pixel of the PSF.
     evidence : ndarray, shape (n,), or None
         Logarithm of the probability density of each noisy image.
+    flux : ndarray, shape (n,), or None
+        Flux of the star in that by which its image was divided, if the method was to find it;
+        the PSF has this sum.
     """
 
     psf: np.ndarray
     sigma: np.ndarray | None = None
     evidence: np.ndarray | None = None
+    flux: np.ndarray | None = None
 
 
 class Method:
@@ -231,6 +235,13 @@ class Method:
         """
         told = (level,) * self.told_level + (position,) * self.told_position
         return Estimate(self.predict(noisy, *told))
+
+    def free_flux(self) -> Self:
+        """The same for images whose flux and sky are estimates, and their sum therefore 1.
+
+        A method that can finds a better flux (`Estimate.flux`).
+        """
+        return self
 
     @classmethod
     def stem(cls, dataset: str, split: str, reference: str) -> str:

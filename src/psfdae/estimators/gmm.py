@@ -22,6 +22,10 @@ A method that is told where the star stands has two more numbers p in the observ
 without noise. Given p, everything above holds again: π_k becomes π_k N(p; p_k, P_k), μ_k
 follows p linearly, and X_k are the deviations that p leaves, with two rows more for what
 the slope of the cluster differs from that of all.
+
+An image whose flux and sky are estimates is a x + (1 − a)/P with a factor a about 1, for
+its sum is 1. Little is known of a; it is one more row of X_k, LOOSE (μ_k − 1/P), and of
+Y_k, LOOSE μ_y,k. Fluxes come out a third better than those by which images were divided.
 """
 
 from __future__ import annotations
@@ -52,6 +56,9 @@ hold less than 1 % of the weight."""
 
 LEAST = 1e-3
 """Weight of a cluster that is summed over."""
+
+LOOSE = 0.2
+"""Standard deviation of the flux in that by which an image was divided."""
 
 FLAT = 0.005
 """Variance of a coordinate, as a part of s, below which all clusters share one normal law."""
@@ -160,6 +167,8 @@ class GaussianMixture(Method):
     shrinkage : ndarray, shape (1,)
         ν.
     noise : NoiseModel
+    loose : float
+        LOOSE, or 0 where fluxes are known.
     """
 
     label, color, marker = "Gaussian mixture (told λ)", "#cc79a7", "P"
@@ -200,6 +209,7 @@ class GaussianMixture(Method):
     slope_reference: np.ndarray
     shrinkage: np.ndarray
     noise: NoiseModel
+    loose: float = 0.0
     _nodes: dict[float, dict[int, Factor]] = field(default_factory=dict, init=False, repr=False)
 
     @classmethod
@@ -317,6 +327,10 @@ class GaussianMixture(Method):
         noise = config["noise"]
         return cls(**arrays, noise=NoiseModel(noise["kappa"], noise["background_photons"]))
 
+    def free_flux(self) -> Self:
+        """As of all methods."""
+        return replace(self, loose=LOOSE)
+
     def predict(
         self, noisy: np.ndarray, level: float | np.ndarray, position: np.ndarray | None = None
     ) -> np.ndarray:
@@ -352,21 +366,21 @@ class GaussianMixture(Method):
             s = np.exp(np.rint(np.log(s) / STEP) * STEP)
         s, node = np.unique(s, return_inverse=True)
         psf, sigma = (np.empty(flat.shape, np.float32) for _ in range(2))
-        evidence = np.empty(len(flat))
+        evidence, flux = np.empty((2, len(flat)))
         for place, variance in enumerate(s):
             (stars,) = (node == place).nonzero()
             for part in np.array_split(stars, -(-stars.size // AT_ONCE)):
                 found = self._posterior(flat[part], where[part], float(variance), sure)
-                psf[part], sigma[part], evidence[part] = found
+                psf[part], sigma[part], evidence[part], flux[part] = found
             for old in list(self._nodes)[: -self._most]:
                 self._nodes.pop(old, None)
         shaped = psf.reshape(noisy.shape), sigma.reshape(noisy.shape) if sure else None
-        return Estimate(*shaped, evidence=evidence)
+        return Estimate(*shaped, evidence, flux if self.loose else None)
 
     def _posterior(
         self, flat: np.ndarray, where: np.ndarray, s: float, sure: bool
-    ) -> tuple[np.ndarray, np.ndarray | float, np.ndarray]:
-        """Posterior mean, its standard deviation and evidence of images (n, P) of variance s."""
+    ) -> tuple[np.ndarray, np.ndarray | float, np.ndarray, np.ndarray]:
+        """Posterior mean, its σ, evidence and flux of images (n, P) of variance s."""
         z = (flat @ self.axes).astype(np.float32)
         log = np.full((len(z), len(self.count)), -np.inf)
         near = self._near(z, where, s)
@@ -389,6 +403,7 @@ class GaussianMixture(Method):
         weight = (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)
         gain, own = np.zeros_like(z), np.zeros_like(z)
         second = np.zeros(flat.shape) if sure else 0.0
+        flux = np.ones(len(z))
         for k in range(len(self.count)):
             (stars,) = weight[:, k].nonzero()
             if not stars.size:
@@ -398,6 +413,8 @@ class GaussianMixture(Method):
             at, residual, half = self._against(k, z[stars], where[stars], s)
             g = residual * factor.inverse
             g[:, : factor.low.shape[1]] -= half @ factor.low
+            if self.loose:
+                flux[stars] += w[:, 0] * self.loose**2 * (g @ self._contrast[k])
             mean = 0.0
             if len(self.cross):
                 g *= factor.shared
@@ -409,9 +426,15 @@ class GaussianMixture(Method):
                 one = self._restored(flat[stars], g, mean, s).astype(np.float64)
                 second[stars] += w * (self._uncertain(k, s) + one**2)
         psf = self._restored(flat, gain, own, s)
-        if not sure:
-            return psf, np.nan, evidence
-        return psf, np.sqrt(np.maximum(second - psf.astype(np.float64) ** 2, 0.0)), evidence
+        sigma = np.sqrt(np.maximum(second - psf.astype(np.float64) ** 2, 0.0)) if sure else np.nan
+        if not len(self.cross):  # the sky of the image is no part of the star
+            psf += ((flux - 1.0) / z.shape[1]).astype(np.float32)[:, None]
+        return psf, sigma, evidence, flux
+
+    @cached_property
+    def _contrast(self) -> np.ndarray:
+        """Mean of each cluster less an even sky of the same sum, in the axes, (K, P)."""
+        return np.asarray(self.mean - self.axes.mean(axis=0))
 
     @cached_property
     def _most(self) -> int:
@@ -454,9 +477,12 @@ class GaussianMixture(Method):
     def _clusters(self) -> list[Cluster]:
         """Each cluster with its own slope, by the same shrinkage as its covariances."""
         ends = self.count.cumsum()
-        return [self._cluster(slice(b - n, b)) for b, n in zip(ends, self.count, strict=True)]
+        return [
+            self._cluster(k, slice(b - n, b))
+            for k, (b, n) in enumerate(zip(ends, self.count, strict=True))
+        ]
 
-    def _cluster(self, stars: slice) -> Cluster:
+    def _cluster(self, k: int, stars: slice) -> Cluster:
         p = self.deviation_center[stars]
         nu, total = float(self.shrinkage[0]), len(p) + float(self.shrinkage[0])
         scatter = p.T @ p + nu * np.eye(p.shape[1])
@@ -476,6 +502,12 @@ class GaussianMixture(Method):
         own_reference, slope_reference = sloped(
             self.deviation_reference[stars if len(self.cross) else slice(0)], self.slope_reference
         )
+        if self.loose:
+            weight = np.float32(self.loose * np.sqrt(total))
+            own = np.vstack([own, weight * self._contrast[k]])
+            if len(own_reference):
+                row = weight * self.mean_reference[k]
+                own_reference = np.vstack([own_reference, row])
         square = np.square(own_reference).sum(axis=0)
         if len(own) > own.shape[1]:
             rotation, own = np.linalg.qr(own)
@@ -521,7 +553,8 @@ class GaussianMixture(Method):
         """Variance of all stars along the axes."""
         mean = np.average(self.mean, axis=0, weights=self.count)
         between = np.average(np.square(self.mean - mean), axis=0, weights=self.count)
-        return self.variance + between + np.square(self.slope).sum(axis=0)
+        loose = np.square(self.loose * self._contrast).max(axis=0)
+        return self.variance + between + np.square(self.slope).sum(axis=0) + loose
 
     def _uncertain(self, k: int, s: float) -> np.ndarray:
         """Variance of each pixel inside a cluster once the image is known, shape (P,)."""
