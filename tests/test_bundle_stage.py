@@ -158,7 +158,7 @@ def test_half_width_covers_fresh_stars_and_the_rms_too_many(tiny):
         assert row["coverage68"] == pytest.approx(0.6827, abs=0.05)
 
 
-def test_a_method_that_knows_how_sure_it_is_covers_68_and_95_per_cent(folder, tmp_path):
+def test_a_method_that_knows_how_sure_it_is_covers_68_and_95_per_cent(folder, tiny, tmp_path):
     """Its σ tells stars apart; the bundle's table corrects it. Threads change nothing."""
     small = ["gmm.components=[24]", "gmm.shrinkage=[10.0]"]
     fit(
@@ -184,6 +184,14 @@ def test_a_method_that_knows_how_sure_it_is_covers_68_and_95_per_cent(folder, tm
     surest, least = np.array_split(np.argsort(doubt), 2)
     assert wrong[least].mean() > 1.3 * wrong[surest].mean()
     assert all((getattr(again, name) == getattr(found, name)).all() for name in ("psf", "snr"))
+    free, dae = (PsfModel(b).predict(noisy + 3.0, noise=noise) for b in (bundle, tiny))
+    bright = noise < 0.01
+    errors = [np.sqrt(np.square(found.flux[bright] - 1).mean()) for found in (free, dae)]
+    assert errors[0] < 0.9 * errors[1]
+    kept = np.isfinite(free.psf).all(axis=(1, 2))
+    assert free.psf[kept].sum(axis=(1, 2)) == pytest.approx(free.flux[kept], rel=1e-3)
+    light = free.flux + 144 * free.background
+    assert light == pytest.approx(dae.flux + 144 * dae.background, nan_ok=True)
     one = PsfModel(bundle).predict(noisy[7], flux=1.0, background=0.0, noise=noise[7])
     np.testing.assert_allclose(one.psf[0], found.psf[7], atol=1e-6)
 
