@@ -188,6 +188,24 @@ def test_few_and_equal_stars():
         GaussianMixture.fit(training(30), Gmm(**{**ONE, "components": [500]}))
 
 
+@pytest.mark.parametrize("free", [False, True])
+def test_strangeness_of_one_cluster_is_the_square_of_mahalanobis_distance(free, monkeypatch):
+    monkeypatch.setattr(module, "FLAT", 0.0)
+    monkeypatch.setattr(module, "TELLING", 10)
+    mixture = fitted(same=False)
+    mixture = mixture.free_flux() if free else mixture
+    noisy = NOISE.draw(stars(20, seed=2)[0], LEVEL, np.random.default_rng(3))
+    s = np.exp(np.rint(np.log(NOISE.variance(1.0 / D**2, LEVEL)) / module.STEP) * module.STEP)
+    residual = (noisy.reshape(20, -1) @ mixture.axes - mixture.mean[0])[:, :10].astype(float)
+    row = mixture.loose * mixture._contrast[0, :10].astype(float)
+    usual = np.diag(mixture._total[:10] + s)
+    covariance = np.diag(mixture.variance[:10] + s) + np.outer(row, row)
+    wanted = np.einsum("ni,ij,nj->n", residual, np.linalg.inv(covariance), residual)
+    wanted += np.linalg.slogdet(covariance)[1] - np.linalg.slogdet(usual)[1]
+    found = mixture.strangeness(noisy, np.full(20, LEVEL))
+    np.testing.assert_allclose(found, wanted, rtol=2e-3, atol=0.05)
+
+
 @pytest.mark.parametrize("clusters", [1, 8])
 def test_noise_of_the_training_stars_is_no_part_of_the_prior(clusters):
     rng, images = np.random.default_rng(4), stars(3000)[0]

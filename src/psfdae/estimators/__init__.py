@@ -236,6 +236,13 @@ class Method:
         told = (level,) * self.told_level + (position,) * self.told_position
         return Estimate(self.predict(noisy, *told))
 
+    def strangeness(self, noisy: np.ndarray, level: np.ndarray) -> np.ndarray | None:
+        """How unlike all training stars images (n, d, d) are, if the method has a law of them.
+
+        For a normal law it is the square of Mahalanobis' distance.
+        """
+        return None
+
     def free_flux(self) -> Self:
         """The same for images whose flux and sky are estimates, and their sum therefore 1.
 

@@ -60,6 +60,9 @@ LEAST = 1e-3
 LOOSE = 0.2
 """Standard deviation of the flux in that by which an image was divided."""
 
+TELLING, LEADING_ARRAYS = 48, ("axes", "variance", "mean", "deviation", "slope")
+"""Coordinates that tell strange stars, and arrays whose last axis they are."""
+
 FLAT = 0.005
 """Variance of a coordinate, as a part of s, below which all clusters share one normal law."""
 
@@ -326,6 +329,25 @@ class GaussianMixture(Method):
         """As of all methods; the noise is that of the configuration."""
         noise = config["noise"]
         return cls(**arrays, noise=NoiseModel(noise["kappa"], noise["background_photons"]))
+
+    def strangeness(self, noisy: np.ndarray, level: np.ndarray) -> np.ndarray:
+        """As of all methods, from the evidence of the leading `TELLING` coordinates.
+
+        The others hold noise, which is an estimate: their χ² would say that it is wrong.
+        """
+        some = self._telling
+        s = self.noise.variance(np.full(len(noisy), 1.0 / self.axes.shape[0]), np.asarray(level))
+        usual = np.log(2 * np.pi * (some._total + s[:, None])).sum(axis=1)
+        evidence = some._estimate(noisy, level, None, sure=False).evidence
+        assert evidence is not None
+        return -2.0 * evidence - usual
+
+    @cached_property
+    def _telling(self) -> Self:
+        """The law of the leading coordinates."""
+        none = np.empty((0, 0), np.float32)
+        cut = {n: np.ascontiguousarray(getattr(self, n)[..., :TELLING]) for n in LEADING_ARRAYS}
+        return replace(self, **cut, cross=none, deviation_reference=none, slope_reference=none)
 
     def free_flux(self) -> Self:
         """As of all methods."""
