@@ -10,6 +10,7 @@ import pytest
 import torch
 from click.testing import CliRunner
 
+from psfdae import StarFlag
 from psfdae.belonging import write_origin
 from psfdae.cli import main
 from psfdae.configuration.compose import load_stage
@@ -192,6 +193,14 @@ def test_a_method_that_knows_how_sure_it_is_covers_68_and_95_per_cent(folder, ti
     assert free.psf[kept].sum(axis=(1, 2)) == pytest.approx(free.flux[kept], rel=1e-3)
     light = free.flux + 144 * free.background
     assert light == pytest.approx(dae.flux + 144 * dae.background, nan_ok=True)
+    assert (free.flags[bright] & StarFlag.UNLIKE_TRAINING > 0).mean() < 0.02
+    blends = 0.7 * noisy + 0.3 * np.roll(noisy, 5, axis=2)
+    strange, far = (
+        PsfModel(b).predict(blends[bright], noise=noise[bright]) for b in (bundle, tiny)
+    )
+    both = [(found.flags & StarFlag.UNLIKE_TRAINING > 0).mean() for found in (strange, far)]
+    assert both[0] > 0.1 > both[1]
+    assert np.isfinite(strange.strangeness).mean() > 0.9 and np.isnan(far.strangeness).all()
     one = PsfModel(bundle).predict(noisy[7], flux=1.0, background=0.0, noise=noise[7])
     np.testing.assert_allclose(one.psf[0], found.psf[7], atol=1e-6)
 

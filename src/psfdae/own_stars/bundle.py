@@ -49,7 +49,7 @@ LARGEST = 2**28  # bytes; a bundle of stamps of 256 × 256 pixels has some 20 MB
 TOLERANCE = 1e-3  # by which the mean PSF may miss the sum 1, and eigenvectors orthonormality
 VARIANCE = 1e6  # largest variance of images of sum 1 that is no nonsense
 # Arrays of float64; the others are float32.
-DOUBLE = {"flux/variance", "flux/rest", "noise_nodes", "distance_limit", "ratio95"}
+DOUBLE = {"flux/variance", "flux/rest", "noise_nodes", "distance_limit", "ratio95", "strange_limit"}
 
 Positive = Annotated[float, Field(gt=0)]
 Count = Annotated[int, Field(ge=1)]
@@ -181,6 +181,8 @@ class Bundle:
     rms: np.ndarray  # (S, d, d), root mean square
     distance_limit: float  # 99.9 % quantile of the distance of test stars (`mahalanobis`)
     ratio95: np.ndarray | None = None  # (S,), error68 times this holds 95 %; not in format 1
+    # (S,), 99.9 % quantile of `Method.strangeness`, if the method knows it
+    strange_limit: np.ndarray | None = None
 
     @property
     def sha256(self) -> str:
@@ -329,8 +331,9 @@ def _tensors(bundle: Bundle) -> dict[str, np.ndarray]:
         "flux/basis": model.basis[:, -kept:],
         "error68": bundle.error68,
         "rms": bundle.rms,
-        **({} if bundle.ratio95 is None else {"ratio95": bundle.ratio95}),
     }
+    free = {name: getattr(bundle, name) for name in ("ratio95", "strange_limit")}
+    arrays |= {name: values for name, values in free.items() if values is not None}
     ours = {name: np.asarray(value, _dtype(name), order="C") for name, value in arrays.items()}
     # The method's own are as they are.
     own = {name: np.asarray(value, order="C") for name, value in bundle.weights.items()}
@@ -369,6 +372,7 @@ def read_bundle(path: Path | None = None) -> Bundle:
         **{name: tensors[name] for name in ("noise_nodes", "error68", "rms")},
         distance_limit=float(tensors["distance_limit"]),
         ratio95=tensors.get("ratio95"),
+        strange_limit=tensors.get("strange_limit"),
     )
 
 
@@ -439,8 +443,10 @@ def _check(info: BundleInfo, tensors: Mapping[str, np.ndarray], path: Path) -> N
         "noise_nodes": (nodes,),
         **dict.fromkeys(("error68", "rms"), (nodes, info.stamp_px, info.stamp_px)),
         "distance_limit": (),
-        **({"ratio95": (nodes,)} if info.format_version > 1 else {}),
     }
+    if info.format_version > 1:
+        given = [name for name in ("strange_limit",) if name in tensors]
+        expected |= dict.fromkeys(("ratio95", *given), (nodes,))
     expected |= _of_method(info, tensors, path)
     if set(tensors) != set(expected):
         name = min(set(tensors) ^ set(expected))

@@ -267,7 +267,12 @@ class Engine:
         flags |= found.flags
         raise_flag(flags, StarFlag.SNR_LOW, snr < info.snr_min / SNR_TOLERANCE)
         raise_flag(flags, StarFlag.SNR_HIGH, snr > info.snr_max * SNR_TOLERANCE)
-        raise_flag(flags, StarFlag.UNLIKE_TRAINING, distance > bundle.distance_limit)
+        unlike, strangeness = distance > bundle.distance_limit, np.full(len(noise), np.nan)
+        if bundle.strange_limit is not None and not lost.all():
+            level = noise[~lost] / info.kappa
+            strangeness[~lost] = self.free_flux.strangeness(found.images[~lost], level)
+            unlike |= strangeness > np.interp(noise, bundle.noise_nodes, bundle.strange_limit)
+        raise_flag(flags, StarFlag.UNLIKE_TRAINING, unlike)
         photons = np.nan_to_num(np.maximum(found.flux, 0.0) / stars.gain)
         return Prediction(
             psf=psf,
@@ -281,6 +286,7 @@ class Engine:
             snr=snr,
             chi2=_chi2(residual, psf, found.noise, stars.gain),
             distance=distance,
+            strangeness=strangeness,
             fwhm_px=shapes.fwhm_px,
             ellipticity=shapes.ellipticity,
             position_angle_deg=shapes.position_angle_deg,

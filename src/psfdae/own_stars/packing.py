@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from psfdae.estimators import Estimate
+from psfdae.estimators import Estimate, Method
 from psfdae.own_stars.bundle import at_noise, mahalanobis
 from psfdae.own_stars.photometry import FluxModel, noise_equivalent_px, signal_to_noise
 from psfdae.stars.noise import NoiseModel
@@ -50,6 +50,7 @@ class Errors:
     error: np.ndarray  # (S, N, d, d), float32
     star: np.ndarray  # (N,), of every error
     distance: np.ndarray  # (S, N), Mahalanobis', of the noisy images
+    strangeness: np.ndarray | None = None  # (S, N), if the method knows it
 
     def of(self, chosen: np.ndarray) -> Errors:
         """Those of some stars, from a mask over stars."""
@@ -68,6 +69,18 @@ class Errors:
     def rms(self) -> np.ndarray:
         """Root mean square per pixel, shape (S, d, d)."""
         return np.sqrt(np.stack([np.square(node).mean(axis=0) for node in self.error]))
+
+    def strange_limit(self) -> np.ndarray | None:
+        """What 0.1 % of the stars exceed at every node, shape (S,).
+
+        The excess over a node's median is taken to be as usual at all of them.
+        """
+        if self.strangeness is None:
+            return None
+        usual = np.median(self.strangeness, axis=1)
+        spread = np.median(np.abs(self.strangeness - usual[:, None]), axis=1)
+        excess = (self.strangeness - usual[:, None]) / np.maximum(spread, 1e-12)[:, None]
+        return np.asarray(usual + spread * np.quantile(excess, LIMIT))
 
     def distance_limit(self) -> float:
         """Distance that 0.1 % of the stars of all nodes exceed."""
@@ -104,7 +117,7 @@ def reach(band: np.ndarray, mean: np.ndarray) -> dict[str, float]:
 
 def measure_errors(
     stars: HeldOutStars,
-    restore: Restore,
+    fitted: Method,
     model: FluxModel,
     nodes: np.ndarray,
     rng: np.random.Generator,
@@ -114,12 +127,15 @@ def measure_errors(
     star = np.tile(np.arange(count), -(-LEAST_STARS // count))
     error = np.empty((len(nodes), star.size, *stars.images.shape[1:]), np.float32)
     distance = np.empty((len(nodes), star.size))
+    strangeness, free = [], fitted.free_flux()
     for place, noise in enumerate(nodes):
         level = noise / stars.noise.kappa
         noisy = stars.noise.draw(stars.images[star], level, rng)
-        error[place] = errors_of(restore(noisy, level), stars.references[star])
+        error[place] = errors_of(fitted.estimate(noisy, level), stars.references[star])
+        strangeness.append(free.strangeness(noisy, np.full(star.size, level)))
         distance[place] = mahalanobis(noisy, np.full(star.size, noise), model, COMPONENTS)
-    return Errors(nodes, error, star, distance)
+    known = [node for node in strangeness if node is not None]
+    return Errors(nodes, error, star, distance, np.stack(known) if known else None)
 
 
 def errors_of(estimate: Estimate, references: np.ndarray) -> np.ndarray:

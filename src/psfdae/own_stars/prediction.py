@@ -60,6 +60,8 @@ class Prediction:
         known, the star's own photon noise.
     distance : ndarray, shape (n,), float64
         Mahalanobis distance from the training set (`psfdae.own_stars.bundle.mahalanobis`).
+    strangeness : ndarray, shape (n,), float64
+        The same, squared, by the model's own law of stars; NaN where it has none.
     fwhm_px, ellipticity, position_angle_deg : ndarray, shape (n,), float64
         Of the PSF (`psfdae.own_stars.shapes`).
     shift_x, shift_y : ndarray, shape (n,), int16
@@ -79,6 +81,7 @@ class Prediction:
     snr: np.ndarray
     chi2: np.ndarray
     distance: np.ndarray
+    strangeness: np.ndarray
     fwhm_px: np.ndarray
     ellipticity: np.ndarray
     position_angle_deg: np.ndarray
@@ -122,6 +125,7 @@ COLUMNS: dict[str, tuple[str, str | None, str]] = {
     "ratio95": ("D", None, "UNCERT times this holds 95 % of the errors"),
     "chi2": ("D", None, "mean squared residual over its variance"),
     "distance": ("D", None, "Mahalanobis distance from the training set"),
+    "strangeness": ("D", None, "its square by the model's own law of stars"),
     "fwhm_px": ("D", "pix", "of the PSF, adaptive moments"),
     "ellipticity": ("D", None, "1 - b/a of the PSF"),
     "position_angle_deg": ("D", "deg", "of the major axis, from +x to +y"),

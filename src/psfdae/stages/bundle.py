@@ -108,7 +108,7 @@ def bundle(
     model = packing.leading(FluxModel.fit(images[parts.train]), packing.COMPONENTS)
     band = config.noise.kappa * np.asarray(config.noise.levels)
     nodes, rng = packing.noise_nodes(band), stream(config.seed, "noise", "bundle")
-    errors = packing.measure_errors(held_out, fitted.estimate, model, nodes, rng)
+    errors = packing.measure_errors(held_out, fitted, model, nodes, rng)
     reach = packing.reach(band, model.mean)
     metrics = packing.measure_levels(
         config.noise.levels,
@@ -139,7 +139,7 @@ def bundle(
     )
     maps = (errors.nodes, errors.half_width(), errors.rms(), errors.distance_limit())
     ratio95 = errors.ratio95() if info.format_version > 1 else None
-    write_bundle(Bundle(info, arrays, model, *maps, ratio95), out)
+    write_bundle(Bundle(info, arrays, model, *maps, ratio95, errors.strange_limit()), out)
 
 
 def _trained(kind: type[Method], place: Path, config: Config, split: str | None) -> dict[str, Any]:
