@@ -162,6 +162,8 @@ class Method:
         Packed as a model that `psfdae predict` takes.
     suffix : str
         Ends the names of its bundles.
+    together : int
+        Small images that `psfdae predict` has restored at once.
     memory_mb, minutes : int
         What a fit takes at most.
     """
@@ -187,6 +189,7 @@ class Method:
     about: ClassVar[str]
     bundled: ClassVar[bool] = True
     suffix: ClassVar[str]
+    together: ClassVar[int] = 256
     memory_mb: ClassVar[int] = 1000
     minutes: ClassVar[int] = 30
 

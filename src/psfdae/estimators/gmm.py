@@ -176,6 +176,7 @@ class GaussianMixture(Method):
 
     label, color, marker = "Gaussian mixture (told λ)", "#cc79a7", "P"
     told_level = True
+    together = 1024
     per_reference = True
     groups: ClassVar = {"gmm": Gmm}
     arrays: ClassVar = {

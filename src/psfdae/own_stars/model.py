@@ -37,7 +37,7 @@ from psfdae.threads import side_by_side
 SCALE_TOLERANCE = 0.02  # relative difference of the pixel scale from that of the training
 SNR_TOLERANCE = 1.25  # beyond the trained S/N without a flag: a faint star's is no better known
 FLUX_FACTOR = (0.5, 2.0)  # by which a method may correct the flux of a star
-BLOCK = 256  # stars that are computed together, always so many: other numbers round otherwise
+BLOCK = 256  # stars that a network computes together, always so many: other numbers round otherwise
 BLOCK_PX = BLOCK * 32**2  # larger stamps come in smaller blocks
 BLOCK_VALUES = 64 * BLOCK_PX  # between two layers of the network at most: 64 channels of a block
 
@@ -227,7 +227,7 @@ class Engine:
         self.bundle = bundle
         self.estimator = estimator(bundle)
         self.free_flux = self.estimator.free_flux()
-        self.size = min(BLOCK, max(1, BLOCK_PX // bundle.info.stamp_px**2))
+        self.size = min(self.estimator.together, max(1, BLOCK_PX // bundle.info.stamp_px**2))
         self._photometer = Photometer(bundle.flux_model, bundle.info.components)
 
     def blocks(self, stars: Stamps) -> list[Stamps]:
