@@ -10,6 +10,7 @@ import pytest
 import torch
 from click.testing import CliRunner
 
+from psfdae import StarFlag
 from psfdae.belonging import write_origin
 from psfdae.cli import main
 from psfdae.configuration.compose import load_stage
@@ -26,12 +27,13 @@ from psfdae.own_stars.bundle import (
     shipped_path,
     write_bundle,
 )
+from psfdae.own_stars.model import PsfModel
 from psfdae.own_stars.photometry import FluxModel, noise_equivalent_px, signal_to_noise
 from psfdae.rng import stream
 from psfdae.stages import bundle as stage
 from psfdae.stages.common import noise_model, noisy_test_images
 from psfdae.stages.evaluate import Models
-from psfdae.stages.fit import train
+from psfdae.stages.fit import fit, train
 
 TINY = [
     "noise.levels=[1e-3,3e-3,1e-2]",
@@ -157,6 +159,52 @@ def test_half_width_covers_fresh_stars_and_the_rms_too_many(tiny):
         assert row["coverage68"] == pytest.approx(0.6827, abs=0.05)
 
 
+def test_a_method_that_knows_how_sure_it_is_covers_68_and_95_per_cent(folder, tiny, tmp_path):
+    """Its σ tells stars apart; the bundle's table corrects it. Threads change nothing."""
+    small = ["gmm.components=[24]", "gmm.shrinkage=[10.0]"]
+    fit(
+        load_stage(groups_of("gmm"), [*TINY, *small]),
+        "gmm",
+        folder / "stars.h5",
+        out=tmp_path / "g",
+    )
+    pack(folder, tmp_path / "g.psf.safetensors", models=Models(gmm=tmp_path / "g"))
+    bundle, images = read_bundle(tmp_path / "g.psf.safetensors"), gaussians(1500, 99)
+    rng = np.random.default_rng(5)
+    noise = np.exp(rng.uniform(np.log(4.98e-3), np.log(4.98e-2), size=1500))
+    noisy = images + rng.normal(size=images.shape) * noise[:, None, None]
+    known = {"flux": 1.0, "background": 0.0, "noise": noise}
+    found, again = (PsfModel(bundle).predict(noisy, **known, threads=n) for n in (1, 2))
+    error, width = np.abs(found.psf - images), found.uncertainty
+    for part in np.array_split(np.argsort(noise), 3):
+        assert (error[part] <= width[part]).mean() == pytest.approx(0.683, abs=0.05)
+        wide = width[part] * found.ratio95[part, None, None]
+        assert (error[part] <= wide).mean() == pytest.approx(0.95, abs=0.02)
+    assert bundle.info.metrics[0]["coverage95"] == pytest.approx(0.95, abs=0.02)
+    wrong, doubt = (np.square(a / noise[:, None, None]).mean(axis=(1, 2)) for a in (error, width))
+    surest, least = np.array_split(np.argsort(doubt), 2)
+    assert wrong[least].mean() > 1.3 * wrong[surest].mean()
+    assert all((getattr(again, name) == getattr(found, name)).all() for name in ("psf", "snr"))
+    free, dae = (PsfModel(b).predict(noisy + 3.0, noise=noise) for b in (bundle, tiny))
+    bright = noise < 0.01
+    errors = [np.sqrt(np.square(found.flux[bright] - 1).mean()) for found in (free, dae)]
+    assert errors[0] < 0.9 * errors[1]
+    kept = np.isfinite(free.psf).all(axis=(1, 2))
+    assert free.psf[kept].sum(axis=(1, 2)) == pytest.approx(free.flux[kept], rel=1e-3)
+    light = free.flux + 144 * free.background
+    assert light == pytest.approx(dae.flux + 144 * dae.background, nan_ok=True)
+    assert (free.flags[bright] & StarFlag.UNLIKE_TRAINING > 0).mean() < 0.02
+    blends = 0.7 * noisy + 0.3 * np.roll(noisy, 5, axis=2)
+    strange, far = (
+        PsfModel(b).predict(blends[bright], noise=noise[bright]) for b in (bundle, tiny)
+    )
+    both = [(found.flags & StarFlag.UNLIKE_TRAINING > 0).mean() for found in (strange, far)]
+    assert both[0] > 0.1 > both[1]
+    assert np.isfinite(strange.strangeness).mean() > 0.9 and np.isnan(far.strangeness).all()
+    one = PsfModel(bundle).predict(noisy[7], flux=1.0, background=0.0, noise=noise[7])
+    np.testing.assert_allclose(one.psf[0], found.psf[7], atol=1e-6)
+
+
 def test_signal_to_noise_is_that_of_a_matched_filter():
     """The flux of the mean PSF in white noise scatters by 1 / (S/N) of itself."""
     mean = gaussians(1, 3)[0].astype(np.float64)
@@ -191,7 +239,8 @@ def test_either_half_of_the_stars_is_judged_by_the_errors_of_the_other():
     fresh = rng.normal(size=(400, 8, 8)) * scale[:400]
     found = packing.crossed_coverage(errors, fresh, 0.01)
     expected = (0.9973 + 0.2611) / 2
-    assert found == pytest.approx({"coverage68": expected, "coverage_rms": expected}, abs=0.01)
+    wanted = {"coverage68": expected, "coverage_rms": expected, "coverage95": (1 + 0.4865) / 2}
+    assert found == pytest.approx(wanted, abs=0.01)
 
 
 def test_errors_between_nodes_are_interpolated_and_held_outside():

@@ -184,7 +184,7 @@ def test_images_are_framed_normalised_and_moved_only_where_asked():
     template = gaussians(np.zeros((10, 2)))
     star = np.repeat(np.arange(10), 40)
     subpixel = np.tile([False, True], 200)
-    realisation, made, jitter = make_images(
+    realisation, made, jitter, _ = make_images(
         stars, template, star, FRAMING, subpixel, stream(1, "test")
     )
     assert realisation.sum(axis=(1, 2)) == pytest.approx(1.0, abs=1e-5)

@@ -19,7 +19,7 @@ from click.testing import CliRunner
 from fits_inputs import write_cube
 from psfdae.cli import main
 from psfdae.configuration.compose import ConfigError, load_stage
-from psfdae.estimators import groups_of
+from psfdae.estimators import groups_of, method
 from psfdae.files import read_product, write_product
 from psfdae.own_stars.bundle import estimator, read_bundle
 from psfdae.own_stars.example import (
@@ -29,9 +29,9 @@ from psfdae.own_stars.example import (
     star_images,
 )
 from psfdae.own_stars.photometry import noise_equivalent_px
-from psfdae.own_stars.selection import brightest_pixels, collect, star_centres
+from psfdae.own_stars.selection import brightest_pixels, collect, moved, star_centres
 from psfdae.own_stars.stamps import cut
-from psfdae.own_stars.training_images import make_images, star_grid, training_columns
+from psfdae.own_stars.training_images import OwnNoise, make_images, star_grid, training_columns
 from psfdae.rng import stream
 from psfdae.stages import simulate
 from psfdae.stages.common import noise_model, split_stars
@@ -201,6 +201,41 @@ def test_command_leaves_a_model_and_a_report(model):
     assert bundle.info.pixel_scale_arcsec == pytest.approx(1.2)
     assert bundle.info.pixel_lambda_d is None
     assert bundle.info.snr_min == pytest.approx(5, rel=1e-3)
+    errors = dict(re.findall(r"(.+): MSE (\S+) on validation stars", said))
+    taken = method(bundle.info.method).label
+    assert len(errors) == 2 and float(errors[taken]) == min(map(float, errors.values()))
+
+
+def test_the_method_may_be_named(field, tmp_path):
+    image, catalogue, _ = field
+    words = [image, "--catalogue", catalogue, "--out", tmp_path / "model", *TINY]
+    wrong = run(*words, "--method", "pca_som")
+    assert wrong.exit_code == 2 and wrong.output.endswith("--method takes one of these: dae, gmm\n")
+    result = run(*words, "--method", "dae")
+    assert result.exit_code == 0 and "validation stars" not in result.output
+    (path,) = (tmp_path / "model").glob("*.psf.safetensors")
+    assert read_bundle(path).info.method == "dae"
+
+
+def test_own_noise_is_what_moving_and_dividing_leave_of_it():
+    """Of many noisy images of one star, and of few stars in many images."""
+    rng, grid, count = np.random.default_rng(3), np.arange(24) - 12, 6000
+    wide = np.exp(-(grid[:, None] ** 2 + grid**2) / 8)
+    wide /= cut(wide[None], 8).sum()
+    sky, background = 0.004, 1.0
+    rms = np.sqrt(sky**2 + sky / background**0.5 * wide)
+    phase = rng.uniform(-0.5, 0.5, (count, 2))
+    noise = moved(rms * rng.normal(size=(count, 24, 24)), phase)
+    clean, noisy = (cut(moved(wide[None].repeat(count, 0), phase) + n, 8) for n in (0.0, noise))
+    error = noisy / noisy.sum((1, 2), keepdims=True) - clean / clean.sum((1, 2), keepdims=True)
+    found = error.reshape(count, -1).T @ error.reshape(count, -1)
+    everyone, alone = np.arange(count), np.full(count, sky)
+    mean = clean.mean(axis=0).ravel()
+    model = OwnNoise(alone, background, phase, everyone)(everyone, mean / mean.sum())
+    assert np.trace(model) == pytest.approx(np.trace(found), rel=0.05)
+    assert np.abs(model - found).max() < 0.1 * found.max()
+    few = OwnNoise(alone, background, phase, everyone % 4)(everyone, mean / mean.sum())
+    assert few == pytest.approx(0.75 * model, rel=0.1, abs=0.01 * model.max())
 
 
 def test_settings_can_be_used_by_hand(model, tmp_path):

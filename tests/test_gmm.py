@@ -94,6 +94,10 @@ def dense(mixture, noisy, level, position):
     for k, last in enumerate(mixture.count.cumsum()):
         own = joint[last - mixture.count[k] : last]
         covariance = (own.T @ own + nu * pooled) / (len(own) + nu)
+        star = mixture.mean[k] @ axes.T - 1 / pixels
+        other = mixture.mean_reference[k] if len(mixture.cross) else star
+        free = mixture.loose * np.concatenate([star, np.zeros(told), other])
+        covariance += np.outer(free, free)
         seen, hidden = slice(z.shape[1]), slice(z.shape[1], None)
         observed = covariance[seen, seen] + np.diag(noise)
         mean = np.concatenate([mixture.mean[k] @ axes.T, mixture.center[k]])
@@ -127,6 +131,27 @@ def test_sums_are_those_of_dense_matrices(same, kind, level, clusters, monkeypat
     np.testing.assert_allclose(found.psf, mean, atol=2e-4 * mean.max())
     np.testing.assert_allclose(found.sigma**2, sigma**2, rtol=0.04, atol=3e-6)
     np.testing.assert_allclose(found.evidence, evidence, atol=0.05)
+
+
+@pytest.mark.parametrize("same", [True, False])
+def test_a_flux_that_is_an_estimate_is_found(same, monkeypatch):
+    monkeypatch.setattr(module, "FLAT", 0.0)
+    monkeypatch.setattr(module, "LEAST", 0.0)
+    mixture, rng, pixels = fitted(same=same, components=[12]), np.random.default_rng(3), D * D
+    images, wider = stars(300, seed=2)
+    flux = rng.normal(1.0, 0.1, (300, 1, 1))
+    noisy = NOISE.draw(images, LEVEL / 5, rng) + (flux - 1) * (images - 1 / pixels)
+    noisy += ((1 - noisy.sum(axis=(1, 2))) / pixels)[:, None, None]
+    free = mixture.free_flux()
+    found, mean = free.estimate(noisy, LEVEL / 5), dense(free, noisy, LEVEL / 5, where(300))[0]
+    sky = ((found.flux - 1) / pixels if same else 0 * found.flux)[:, None, None]
+    np.testing.assert_allclose(found.psf, mean + sky, atol=2e-4 * mean.max())
+    np.testing.assert_allclose(found.psf.sum(axis=(1, 2)), found.flux, atol=2e-3)
+    assert np.std(found.flux - flux.ravel()) < 0.5 * np.std(flux)
+    truth = images if same else wider
+    errors = [found.psf / found.flux[:, None, None], mixture.predict(noisy, LEVEL / 5)] - truth
+    assert np.square(errors[0]).mean() < 0.9 * np.square(errors[1]).mean()
+    assert free.free_flux().loose == free.loose and mixture.estimate(noisy, LEVEL / 5).flux is None
 
 
 def test_one_cluster_is_linear_mmse():
@@ -178,6 +203,45 @@ def test_validation_stars_choose():
         training().without_validation(), Gmm(**{**ONE, "components": [1, 12]})
     )
     assert len(other.count) == 12 and other.count.sum() == 350
+
+
+@pytest.mark.parametrize("free", [False, True])
+def test_strangeness_of_one_cluster_is_the_square_of_mahalanobis_distance(free, monkeypatch):
+    monkeypatch.setattr(module, "FLAT", 0.0)
+    monkeypatch.setattr(module, "TELLING", 10)
+    mixture = fitted(same=False)
+    mixture = mixture.free_flux() if free else mixture
+    noisy = NOISE.draw(stars(20, seed=2)[0], LEVEL, np.random.default_rng(3))
+    s = np.exp(np.rint(np.log(NOISE.variance(1.0 / D**2, LEVEL)) / module.STEP) * module.STEP)
+    residual = (noisy.reshape(20, -1) @ mixture.axes - mixture.mean[0])[:, :10].astype(float)
+    row = mixture.loose * mixture._contrast[0, :10].astype(float)
+    usual = np.diag(mixture._total[:10] + s)
+    covariance = np.diag(mixture.variance[:10] + s) + np.outer(row, row)
+    wanted = np.einsum("ni,ij,nj->n", residual, np.linalg.inv(covariance), residual)
+    wanted += np.linalg.slogdet(covariance)[1] - np.linalg.slogdet(usual)[1]
+    found = mixture.strangeness(noisy, np.full(20, LEVEL))
+    np.testing.assert_allclose(found, wanted, rtol=2e-3, atol=0.05)
+
+
+@pytest.mark.parametrize("clusters", [1, 8])
+def test_noise_of_the_training_stars_is_no_part_of_the_prior(clusters):
+    rng, images = np.random.default_rng(4), stars(3000)[0]
+    sky = 0.01
+    own = images + rng.normal(0, sky, images.shape).astype(np.float32)
+    chosen = Gmm(**{**ONE, "components": [clusters]})
+    clean, raw = (GaussianMixture.fit(training(images=x), chosen) for x in (images, own))
+
+    def covariance(which, mean):
+        return (which.size - 1) * sky**2 * np.eye(mean.size)
+
+    data = replace(training(images=own), own_noise=covariance)
+    less = GaussianMixture.fit(data, chosen)
+    excess = [m.variance.sum() / clean.variance.sum() - 1 for m in (raw, less)]
+    assert excess[0] > 0.1 and abs(excess[1]) < 0.2 * excess[0]
+    truth = stars(400, seed=2)[0]
+    noisy = NOISE.draw(truth, LEVEL, np.random.default_rng(3))
+    errors = [np.square(m.predict(noisy, LEVEL) - truth).mean() for m in (raw, less)]
+    assert errors[1] < errors[0]
 
 
 def test_it_is_stored_and_the_same_again(tmp_path):

@@ -71,6 +71,9 @@ class TrainingSet:
     fresh : Product or None
         Other draws of the simulator, with the arrays of a product "stars", if
         `Method.fresh` asks for them.
+    own_noise : callable or None
+        Of images that are not noise-free: from star indices (m,) and their mean image (P,)
+        to what noise adds to their scatter (P, P) about it.
     checkpoint : Path or None
         Where a long fit may keep its state; the caller removes it once the result is safe.
     """
@@ -85,6 +88,7 @@ class TrainingSet:
     reference: str = "realisation"
     positions: np.ndarray = field(default_factory=lambda: np.empty((0, 2)))
     fresh: Product | None = None
+    own_noise: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
     checkpoint: Path | None = None
 
     @property
@@ -136,11 +140,15 @@ class Estimate:
         Standard deviation of each pixel of the PSF.
     evidence : ndarray, shape (n,), or None
         Logarithm of the probability density of each noisy image.
+    flux : ndarray, shape (n,), or None
+        Flux of the star in that by which its image was divided, if the method was to find it;
+        the PSF has this sum.
     """
 
     psf: np.ndarray
     sigma: np.ndarray | None = None
     evidence: np.ndarray | None = None
+    flux: np.ndarray | None = None
 
 
 class Method:
@@ -182,6 +190,8 @@ class Method:
         Packed as a model that `psfdae predict` takes.
     suffix : str
         Ends the names of its bundles.
+    together : int
+        Small images that `psfdae predict` has restored at once.
     memory_mb, minutes : int
         What a fit takes at most.
     """
@@ -207,6 +217,7 @@ class Method:
     about: ClassVar[str]
     bundled: ClassVar[bool] = True
     suffix: ClassVar[str]
+    together: ClassVar[int] = 256
     memory_mb: ClassVar[int] = 1000
     minutes: ClassVar[int] = 30
 
@@ -261,6 +272,20 @@ class Method:
         """`predict`, told what the method wants to know."""
         told = (level,) * self.told_level + (position,) * self.told_position
         return self.predict(noisy, *told)
+
+    def strangeness(self, noisy: np.ndarray, level: np.ndarray) -> np.ndarray | None:
+        """How unlike all training stars images (n, d, d) are, if the method has a law of them.
+
+        For a normal law it is the square of Mahalanobis' distance.
+        """
+        return None
+
+    def free_flux(self) -> Self:
+        """The same for images whose flux and sky are estimates, and their sum therefore 1.
+
+        A method that can finds a better flux (`Estimate.flux`).
+        """
+        return self
 
     @classmethod
     def stem(cls, dataset: str, split: str, reference: str) -> str:

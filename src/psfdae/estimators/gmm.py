@@ -10,6 +10,9 @@ TIP 21, 2481),
 with the noise variance s of a pixel: (κλ)², and the star's own photons spread evenly,
 which costs less than 1 % of the error. Linear MMSE is the case of one cluster.
 
+Where the images have noise of their own, as bright stars do, its covariance is taken off
+S and every XᵀX, and what would be negative is 0.
+
 All covariances of a cluster of n_k stars are shrunk towards those within all clusters:
 C_k = (X_kᵀX_k + ν S) / (n_k + ν), X_k the deviations of its stars from their mean. In the
 eigenvectors of S this is a diagonal and a matrix of rank n_k; by Woodbury's identity its
@@ -19,6 +22,10 @@ A method that is told where the star stands has two more numbers p in the observ
 without noise. Given p, everything above holds again: π_k becomes π_k N(p; p_k, P_k), μ_k
 follows p linearly, and X_k are the deviations that p leaves, with two rows more for what
 the slope of the cluster differs from that of all.
+
+An image whose flux and sky are estimates is a x + (1 − a)/P with a factor a about 1, for
+its sum is 1. Little is known of a; it is one more row of X_k, LOOSE (μ_k − 1/P), and of
+Y_k, LOOSE μ_y,k. Fluxes come out a third better than those by which images were divided.
 """
 
 from __future__ import annotations
@@ -36,12 +43,12 @@ from psfdae.estimators import Estimate, FitError, Method, TrainingSet
 from psfdae.rng import stream
 from psfdae.stars.noise import NoiseModel
 
-STEP = 0.1
-"""Of ln s between noise variances that share a factorisation; where they differ, it is
-that of a prior which is wrong by half of it, and the error grows by the square."""
+STEP = 0.2
+"""Of ln s between noise variances of single stars, which share a factorisation; s is then
+wrong by half of it at most, and the error grows by the square."""
 
-EXACT = 8
-"""Noise variances that are so few have factors of their own."""
+KEPT = 256e6
+"""Bytes of factorisations that are kept for further stars."""
 
 NEAREST, LEADING = 64, 64
 """Clusters that are looked at, and coordinates in which they are found; the others of 512
@@ -49,6 +56,12 @@ hold less than 1 % of the weight."""
 
 LEAST = 1e-3
 """Weight of a cluster that is summed over."""
+
+LOOSE = 0.2
+"""Standard deviation of the flux in that by which an image was divided."""
+
+TELLING, LEADING_ARRAYS = 48, ("axes", "variance", "mean", "deviation", "slope")
+"""Coordinates that tell strange stars, and arrays whose last axis they are."""
 
 FLAT = 0.005
 """Variance of a coordinate, as a part of s, below which all clusters share one normal law."""
@@ -161,10 +174,13 @@ class GaussianMixture(Method):
     shrinkage : ndarray, shape (1,)
         ν.
     noise : NoiseModel
+    loose : float
+        LOOSE, or 0 where fluxes are known.
     """
 
     label, color, marker = "GMM (told λ)", "#cc79a7", "P"
     told_level = True
+    together = 1024
     per_reference = True
     groups: ClassVar = {"gmm": Gmm}
     arrays: ClassVar = {
@@ -201,7 +217,8 @@ class GaussianMixture(Method):
     slope_reference: np.ndarray
     shrinkage: np.ndarray
     noise: NoiseModel
-    _factors: dict[tuple[int, float], Factor] = field(default_factory=dict, init=False, repr=False)
+    loose: float = 0.0
+    _nodes: dict[float, dict[int, Factor]] = field(default_factory=dict, init=False, repr=False)
 
     @classmethod
     def fit(cls, data: TrainingSet, gmm: Gmm) -> Self:
@@ -242,7 +259,7 @@ class GaussianMixture(Method):
             """Geometric mean over the noise levels."""
             pairs = zip(noisy, data.levels, strict=True)
             errors = [np.square(tried.predict(z, s, where) - truth).mean() for z, s in pairs]
-            tried._factors.clear()
+            tried._nodes.clear()
             return float(np.exp(np.mean(np.log(errors))))
 
         def search(told: bool) -> tuple[float, int, bool, float]:
@@ -292,7 +309,13 @@ class GaussianMixture(Method):
         slope, slope_y = (p.T @ a / len(a) for a in (x, y))
         x -= p @ slope
         y -= 0.0 if same else p @ slope_y  # of the same, it is gone
-        variance, axes = np.linalg.eigh(x.T @ x / len(x))
+        scatter = x.T @ x
+        if data.own_noise is not None and same and not p.size:
+            for a, b, mean in zip(start, start + count, mean_x, strict=True):
+                noise = data.own_noise(stars[order[a:b]], mean)
+                scatter -= noise
+                x[a:b] = _less(x[a:b], noise)
+        variance, axes = np.linalg.eigh(scatter / len(x))
         variance, axes = np.maximum(variance[::-1], 0.0), axes[:, ::-1]
         x = x @ axes
         none = np.empty((0, x.shape[1]), np.float32)
@@ -328,6 +351,29 @@ class GaussianMixture(Method):
         noise = config["noise"]
         return cls(**arrays, noise=NoiseModel(noise["kappa"], noise["background_photons"]))
 
+    def strangeness(self, noisy: np.ndarray, level: np.ndarray) -> np.ndarray:
+        """As of all methods, from the evidence of the leading `TELLING` coordinates.
+
+        The others hold noise, which is an estimate: their χ² would say that it is wrong.
+        """
+        some = self._telling
+        s = self.noise.variance(np.full(len(noisy), 1.0 / self.axes.shape[0]), np.asarray(level))
+        usual = np.log(2 * np.pi * (some._total + s[:, None])).sum(axis=1)
+        evidence = some._estimate(noisy, level, None, sure=False).evidence
+        assert evidence is not None
+        return -2.0 * evidence - usual
+
+    @cached_property
+    def _telling(self) -> Self:
+        """The law of the leading coordinates."""
+        none = np.empty((0, 0), np.float32)
+        cut = {n: np.ascontiguousarray(getattr(self, n)[..., :TELLING]) for n in LEADING_ARRAYS}
+        return replace(self, **cut, cross=none, deviation_reference=none, slope_reference=none)
+
+    def free_flux(self) -> Self:
+        """As of all methods."""
+        return replace(self, loose=LOOSE)
+
     def predict(
         self, noisy: np.ndarray, level: float | np.ndarray, position: np.ndarray | None = None
     ) -> np.ndarray:
@@ -358,26 +404,26 @@ class GaussianMixture(Method):
             raise ValueError("noisy images must be finite")
         where = position @ self.whitening if self.whitening.size else np.empty((len(flat), 0))
         even = np.full(len(flat), 1.0 / flat.shape[1])
-        s, node = np.unique(self.noise.variance(even, np.asarray(level)), return_inverse=True)
-        if s.size > EXACT:
-            rounded, again = np.unique(np.rint(np.log(s) / STEP), return_inverse=True)
-            s, node = np.exp(rounded * STEP), again[node]
+        s = self.noise.variance(even, np.asarray(level))
+        if np.ndim(level):  # not by how many there are: stars do not influence each other
+            s = np.exp(np.rint(np.log(s) / STEP) * STEP)
+        s, node = np.unique(s, return_inverse=True)
         psf, sigma = (np.empty(flat.shape, np.float32) for _ in range(2))
-        evidence = np.empty(len(flat))
+        evidence, flux = np.empty((2, len(flat)))
         for place, variance in enumerate(s):
             (stars,) = (node == place).nonzero()
             for part in np.array_split(stars, -(-stars.size // AT_ONCE)):
                 found = self._posterior(flat[part], where[part], float(variance), sure)
-                psf[part], sigma[part], evidence[part] = found
-            if s.size > EXACT:
-                self._factors.clear()
+                psf[part], sigma[part], evidence[part], flux[part] = found
+            for old in list(self._nodes)[: -self._most]:
+                self._nodes.pop(old, None)
         shaped = psf.reshape(noisy.shape), sigma.reshape(noisy.shape) if sure else None
-        return Estimate(*shaped, evidence=evidence)
+        return Estimate(*shaped, evidence, flux if self.loose else None)
 
     def _posterior(
         self, flat: np.ndarray, where: np.ndarray, s: float, sure: bool
-    ) -> tuple[np.ndarray, np.ndarray | float, np.ndarray]:
-        """Posterior mean, its standard deviation and evidence of images (n, P) of variance s."""
+    ) -> tuple[np.ndarray, np.ndarray | float, np.ndarray, np.ndarray]:
+        """Posterior mean, its σ, evidence and flux of images (n, P) of variance s."""
         z = (flat @ self.axes).astype(np.float32)
         log = np.full((len(z), len(self.count)), -np.inf)
         near = self._near(z, where, s)
@@ -400,6 +446,7 @@ class GaussianMixture(Method):
         weight = (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)
         gain, own = np.zeros_like(z), np.zeros_like(z)
         second = np.zeros(flat.shape) if sure else 0.0
+        flux = np.ones(len(z))
         for k in range(len(self.count)):
             (stars,) = weight[:, k].nonzero()
             if not stars.size:
@@ -409,6 +456,8 @@ class GaussianMixture(Method):
             at, residual, half = self._against(k, z[stars], where[stars], s)
             g = residual * factor.inverse
             g[:, : factor.low.shape[1]] -= half @ factor.low
+            if self.loose:
+                flux[stars] += w[:, 0] * self.loose**2 * (g @ self._contrast[k])
             mean = 0.0
             if len(self.cross):
                 g *= factor.shared
@@ -420,9 +469,20 @@ class GaussianMixture(Method):
                 one = self._restored(flat[stars], g, mean, s).astype(np.float64)
                 second[stars] += w * (self._uncertain(k, s) + one**2)
         psf = self._restored(flat, gain, own, s)
-        if not sure:
-            return psf, np.nan, evidence
-        return psf, np.sqrt(np.maximum(second - psf.astype(np.float64) ** 2, 0.0)), evidence
+        sigma = np.sqrt(np.maximum(second - psf.astype(np.float64) ** 2, 0.0)) if sure else np.nan
+        if not len(self.cross):  # the sky of the image is no part of the star
+            psf += ((flux - 1.0) / z.shape[1]).astype(np.float32)[:, None]
+        return psf, sigma, evidence, flux
+
+    @cached_property
+    def _contrast(self) -> np.ndarray:
+        """Mean of each cluster less an even sky of the same sum, in the axes, (K, P)."""
+        return np.asarray(self.mean - self.axes.mean(axis=0))
+
+    @cached_property
+    def _most(self) -> int:
+        """Noise variances whose factorisations are kept."""
+        return max(1, int(KEPT // (self.deviation.nbytes + self.deviation_reference.nbytes + 1)))
 
     def _restored(
         self, flat: np.ndarray, gain: np.ndarray, own: np.ndarray | float, s: float
@@ -460,9 +520,12 @@ class GaussianMixture(Method):
     def _clusters(self) -> list[Cluster]:
         """Each cluster with its own slope, by the same shrinkage as its covariances."""
         ends = self.count.cumsum()
-        return [self._cluster(slice(b - n, b)) for b, n in zip(ends, self.count, strict=True)]
+        return [
+            self._cluster(k, slice(b - n, b))
+            for k, (b, n) in enumerate(zip(ends, self.count, strict=True))
+        ]
 
-    def _cluster(self, stars: slice) -> Cluster:
+    def _cluster(self, k: int, stars: slice) -> Cluster:
         p = self.deviation_center[stars]
         nu, total = float(self.shrinkage[0]), len(p) + float(self.shrinkage[0])
         scatter = p.T @ p + nu * np.eye(p.shape[1])
@@ -482,6 +545,12 @@ class GaussianMixture(Method):
         own_reference, slope_reference = sloped(
             self.deviation_reference[stars if len(self.cross) else slice(0)], self.slope_reference
         )
+        if self.loose:
+            weight = np.float32(self.loose * np.sqrt(total))
+            own = np.vstack([own, weight * self._contrast[k]])
+            if len(own_reference):
+                row = weight * self.mean_reference[k]
+                own_reference = np.vstack([own_reference, row])
         square = np.square(own_reference).sum(axis=0)
         if len(own) > own.shape[1]:
             rotation, own = np.linalg.qr(own)
@@ -493,7 +562,8 @@ class GaussianMixture(Method):
 
     def _factor(self, k: int, s: float) -> Factor:
         """C_k + s factorised: D + b XᵀX with the diagonal D, and M = 1/b + X D⁻¹Xᵀ = L Lᵀ."""
-        if (k, s) not in self._factors:
+        node = self._nodes.setdefault(s, {})  # whole, whatever another thread drops
+        if k not in node:
             from scipy.linalg import solve_triangular
 
             cluster = self._clusters[k]
@@ -507,7 +577,7 @@ class GaussianMixture(Method):
             both = np.hstack([x / d[:leading], y]) if len(y) else x / d[:leading]
             both = solve_triangular(low, both, lower=True)
             half_det = np.log(low.diagonal()).sum() + 0.5 * len(x) * np.log(cluster.scale)
-            self._factors[k, s] = Factor(
+            node[k] = Factor(
                 inverse=(1.0 / d).astype(np.float32),
                 low=np.ascontiguousarray(both[:, :leading], np.float32),
                 low_reference=np.ascontiguousarray(both[:, leading:], np.float32),
@@ -519,14 +589,15 @@ class GaussianMixture(Method):
                     + np.log(cluster.spread.diagonal()).sum()
                 ),
             )
-        return self._factors[k, s]
+        return node[k]
 
     @cached_property
     def _total(self) -> np.ndarray:
         """Variance of all stars along the axes."""
         mean = np.average(self.mean, axis=0, weights=self.count)
         between = np.average(np.square(self.mean - mean), axis=0, weights=self.count)
-        return self.variance + between + np.square(self.slope).sum(axis=0)
+        loose = np.square(self.loose * self._contrast).max(axis=0)
+        return self.variance + between + np.square(self.slope).sum(axis=0) + loose
 
     def _uncertain(self, k: int, s: float) -> np.ndarray:
         """Variance of each pixel inside a cluster once the image is known, shape (P,)."""
@@ -544,6 +615,15 @@ class GaussianMixture(Method):
         known = np.square(cross) @ factor.inverse
         known -= np.square(cross[:, :leading] @ factor.low.T).sum(axis=1)
         return np.maximum(prior - known, 0.0)
+
+
+def _less(x: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """Rows (n, P) whose products xᵀx are less by a covariance (P, P), but in no direction < 0."""
+    variance, axes = np.linalg.eigh(x.T @ x - noise)
+    most = min(x.shape)
+    rows = np.zeros_like(x)
+    rows[:most] = (np.sqrt(np.maximum(variance, 0.0)) * axes)[:, ::-1].T[:most]
+    return rows
 
 
 def _standard(p: np.ndarray) -> np.ndarray:

@@ -49,7 +49,7 @@ LARGEST = 2**28  # bytes; a bundle of stamps of 256 × 256 pixels has some 20 MB
 TOLERANCE = 1e-3  # by which the mean PSF may miss the sum 1, and eigenvectors orthonormality
 VARIANCE = 1e6  # largest variance of images of sum 1 that is no nonsense
 # Arrays of float64; the others are float32.
-DOUBLE = {"flux/variance", "flux/rest", "noise_nodes", "distance_limit"}
+DOUBLE = {"flux/variance", "flux/rest", "noise_nodes", "distance_limit", "ratio95", "strange_limit"}
 
 Positive = Annotated[float, Field(gt=0)]
 Count = Annotated[int, Field(ge=1)]
@@ -176,9 +176,13 @@ class Bundle:
     weights: dict[str, np.ndarray]  # what `Method.pack` gives
     flux_model: FluxModel  # of the noise-free training stars; `info.components` are measured
     noise_nodes: np.ndarray  # (S,), noise at which the errors were measured, ascending
-    error68: np.ndarray  # (S, d, d), half-width of 68.27 % of the errors, in units of the flux
-    rms: np.ndarray  # (S, d, d), root mean square of the errors, in units of the flux
+    # Of errors in units of the flux, or of σ if the method says it (`Estimate.sigma`):
+    error68: np.ndarray  # (S, d, d), half-width of 68.27 %
+    rms: np.ndarray  # (S, d, d), root mean square
     distance_limit: float  # 99.9 % quantile of the distance of test stars (`mahalanobis`)
+    ratio95: np.ndarray | None = None  # (S,), error68 times this holds 95 %; not in format 1
+    # (S,), 99.9 % quantile of `Method.strangeness`, if the method knows it
+    strange_limit: np.ndarray | None = None
 
     @property
     def sha256(self) -> str:
@@ -328,6 +332,8 @@ def _tensors(bundle: Bundle) -> dict[str, np.ndarray]:
         "error68": bundle.error68,
         "rms": bundle.rms,
     }
+    free = {name: getattr(bundle, name) for name in ("ratio95", "strange_limit")}
+    arrays |= {name: values for name, values in free.items() if values is not None}
     ours = {name: np.asarray(value, _dtype(name), order="C") for name, value in arrays.items()}
     # The method's own are as they are.
     own = {name: np.asarray(value, order="C") for name, value in bundle.weights.items()}
@@ -365,6 +371,8 @@ def read_bundle(path: Path | None = None) -> Bundle:
         flux_model=_completed(tensors),
         **{name: tensors[name] for name in ("noise_nodes", "error68", "rms")},
         distance_limit=float(tensors["distance_limit"]),
+        ratio95=tensors.get("ratio95"),
+        strange_limit=tensors.get("strange_limit"),
     )
 
 
@@ -436,6 +444,9 @@ def _check(info: BundleInfo, tensors: Mapping[str, np.ndarray], path: Path) -> N
         **dict.fromkeys(("error68", "rms"), (nodes, info.stamp_px, info.stamp_px)),
         "distance_limit": (),
     }
+    if info.format_version > 1:
+        given = [name for name in ("strange_limit",) if name in tensors]
+        expected |= dict.fromkeys(("ratio95", *given), (nodes,))
     expected |= _of_method(info, tensors, path)
     if set(tensors) != set(expected):
         name = min(set(tensors) ^ set(expected))
@@ -444,7 +455,7 @@ def _check(info: BundleInfo, tensors: Mapping[str, np.ndarray], path: Path) -> N
     for name, shape in expected.items():
         array, dtype = tensors[name], _dtype(name)
         free = info.format_version > 1 and name.startswith(f"{info.method}/")
-        if array.dtype != dtype and not (free and array.dtype == np.float64):
+        if array.dtype != dtype and not (free and array.dtype in (np.float64, np.int64)):
             raise BundleError(f"{path}: array {name!r} of {array.dtype}, not {dtype}")
         if array.shape != shape:
             raise BundleError(f"{path}: array {name!r} has shape {array.shape}, not {shape}")

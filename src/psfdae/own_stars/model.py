@@ -21,7 +21,7 @@ from psfdae.own_stars.bundle import (
     mahalanobis,
     read_bundle,
 )
-from psfdae.own_stars.photometry import Photometer
+from psfdae.own_stars.photometry import Photometer, Photometry
 from psfdae.own_stars.prediction import Prediction
 from psfdae.own_stars.shapes import measure_shapes
 from psfdae.own_stars.stamps import (
@@ -36,7 +36,8 @@ from psfdae.threads import side_by_side
 
 SCALE_TOLERANCE = 0.02  # relative difference of the pixel scale from that of the training
 SNR_TOLERANCE = 1.25  # beyond the trained S/N without a flag: a faint star's is no better known
-BLOCK = 256  # stars that are computed together, always so many: other numbers round otherwise
+FLUX_FACTOR = (0.5, 2.0)  # by which a method may correct the flux of a star
+BLOCK = 256  # stars that a network computes together, always so many: other numbers round otherwise
 BLOCK_PX = BLOCK * 32**2  # larger stamps come in smaller blocks
 BLOCK_VALUES = 64 * BLOCK_PX  # between two layers of the network at most: 64 channels of a block
 
@@ -225,7 +226,8 @@ class Engine:
     def __init__(self, bundle: Bundle) -> None:
         self.bundle = bundle
         self.estimator = estimator(bundle)
-        self.size = min(BLOCK, max(1, BLOCK_PX // bundle.info.stamp_px**2))
+        self.free_flux = self.estimator.free_flux()
+        self.size = min(self.estimator.together, max(1, BLOCK_PX // bundle.info.stamp_px**2))
         self._photometer = Photometer(bundle.flux_model, bundle.info.components)
 
     def blocks(self, stars: Stamps) -> list[Stamps]:
@@ -245,15 +247,19 @@ class Engine:
         stamps, bad, shift, flags = self._centred(stars)
         found = self._photometer.measure(stamps, bad, border_median(stamps, bad), stars)
         lost = (found.flags & StarFlag.NO_FLUX) > 0
+        free = np.isnan(stars.flux) & np.isnan(stars.background)
+        psf, sigma, found = self._estimate(found, free, lost)
         noise = found.noise / np.where(lost, np.nan, found.flux)
-        psf, sigma = self._estimate(found.images, noise, lost)
         shapes = measure_shapes(psf)
         snr = 1.0 / (noise * info.noise_equivalent_px**0.5)
         distance = mahalanobis(found.images, noise, bundle.flux_model, info.components)
         flux = found.flux.astype(np.float32)[:, None, None]
-        uncertainty = sigma
-        if uncertainty is None:
-            uncertainty = at_noise(noise, bundle.noise_nodes, bundle.error68)
+        uncertainty = at_noise(noise, bundle.noise_nodes, bundle.error68)
+        if sigma is not None:
+            uncertainty *= sigma
+        ratio95 = np.full(len(noise), np.nan)
+        if bundle.ratio95 is not None:
+            ratio95 = np.interp(noise, bundle.noise_nodes, bundle.ratio95)
         psf *= flux
         uncertainty *= flux
         residual = (stamps - found.background[:, None, None]).astype(np.float32) - psf
@@ -261,12 +267,18 @@ class Engine:
         flags |= found.flags
         raise_flag(flags, StarFlag.SNR_LOW, snr < info.snr_min / SNR_TOLERANCE)
         raise_flag(flags, StarFlag.SNR_HIGH, snr > info.snr_max * SNR_TOLERANCE)
-        raise_flag(flags, StarFlag.UNLIKE_TRAINING, distance > bundle.distance_limit)
+        unlike, strangeness = distance > bundle.distance_limit, np.full(len(noise), np.nan)
+        if bundle.strange_limit is not None and not lost.all():
+            level = noise[~lost] / info.kappa
+            strangeness[~lost] = self.free_flux.strangeness(found.images[~lost], level)
+            unlike |= strangeness > np.interp(noise, bundle.noise_nodes, bundle.strange_limit)
+        raise_flag(flags, StarFlag.UNLIKE_TRAINING, unlike)
         photons = np.nan_to_num(np.maximum(found.flux, 0.0) / stars.gain)
         return Prediction(
             psf=psf,
             residual=residual,
             uncertainty=uncertainty,
+            ratio95=ratio95,
             flux=found.flux,
             flux_error=np.sqrt(found.flux_error**2 + photons),
             background=found.background,
@@ -274,6 +286,7 @@ class Engine:
             snr=snr,
             chi2=_chi2(residual, psf, found.noise, stars.gain),
             distance=distance,
+            strangeness=strangeness,
             fwhm_px=shapes.fwhm_px,
             ellipticity=shapes.ellipticity,
             position_angle_deg=shapes.position_angle_deg,
@@ -283,23 +296,38 @@ class Engine:
         )
 
     def _estimate(
-        self, images: np.ndarray, noise: np.ndarray, lost: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray | None]:
-        """PSFs of flux 1 and, if the method knows it, their σ; NaN where there is no flux."""
-        info = self.bundle.info
+        self, found: Photometry, free: np.ndarray, lost: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray | None, Photometry]:
+        """PSFs of flux 1 and, if the method knows it, their σ; NaN where there is no flux.
+
+        Where flux and sky are `free`, the method may find better ones.
+        """
+        info, images = self.bundle.info, found.images
         if lost.all():  # such as the stars of a catalogue that reaches far beyond the image
-            return np.full_like(images, np.nan), None
+            return np.full_like(images, np.nan), None, found
         if lost.any():
             mean = self.bundle.flux_model.mean.reshape(images.shape[1:])
             images = np.where(lost[:, None, None], mean, images).astype(images.dtype)
+        noise = found.noise / np.where(lost, np.nan, found.flux)
         level = np.where(lost, info.noise_max, noise) / info.kappa
-        found = self.estimator.estimate(images, level)
-        parts = (found.psf, found.sigma)
-        psf, sigma = (None if x is None else np.array(x, np.float32) for x in parts)
+        free = free & ~lost & (self.free_flux is not self.estimator)
+        asked = ((self.estimator, ~free), (self.free_flux, free))
+        estimates = [one.estimate(images, level) for one, rows in asked if rows.any()]
+        first, last = estimates[0], estimates[-1]
+        psf, sigma = (
+            None if a is None else np.where(free[:, None, None], b, a).astype(np.float32)
+            for a, b in ((first.psf, last.psf), (first.sigma, last.sigma))
+        )
+        if free.any() and last.flux is not None:
+            factor = np.where(free, np.clip(last.flux, *FLUX_FACTOR), 1.0)
+            for array in (psf, sigma):
+                if array is not None:
+                    np.divide(array, factor.astype(np.float32)[:, None, None], out=array)
+            found = found.with_flux(factor)
         for array in (psf, sigma):
             if array is not None:
                 array[lost] = np.nan
-        return psf, sigma  # type: ignore[return-value]
+        return psf, sigma, found  # type: ignore[return-value]
 
     def _centred(self, stars: Stamps) -> tuple[np.ndarray, ...]:
         """Stamps (n, d, d), their bad pixels, their shift (row, column), and flags so far."""

@@ -3,7 +3,9 @@
 Errors are per pixel and per noise level. They are not normally distributed: the core
 of a PSF, its wings and the rare star that is unlike all others share a pixel, and the
 root mean square is then wider than the interval that holds 68 % of the errors. A
-bundle carries both.
+bundle carries both, and by how much the interval that holds 95 % is wider. Where a
+method says how sure it is of every pixel, all of them are in units of that: they
+correct its σ, which knows the star, by what came true.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from psfdae.estimators import Estimate, Method
 from psfdae.own_stars.bundle import at_noise, mahalanobis
 from psfdae.own_stars.photometry import FluxModel, noise_equivalent_px, signal_to_noise
 from psfdae.stars.noise import NoiseModel
@@ -21,11 +24,13 @@ from psfdae.stars.noise import NoiseModel
 NODES = 8  # noise levels at which errors are measured, equidistant in the logarithm
 COMPONENTS = 48  # leading eigenvectors that a bundle stores
 COVERAGE = 0.6827  # part of the errors within ± `error68`; of a normal variable within ± 1 σ
+WIDE = 0.95  # part of them within ± `error68` times `ratio95`
+LEAST_SIGMA = 1e-12  # of the flux; equal stars leave a method no doubt
 LIMIT = 0.999  # part of the test stars within the limit of the Mahalanobis distance
 LEAST_STARS = 2000  # noisy images per node; few test stars are seen several times with new noise
 
-Predict = Callable[[np.ndarray, float], np.ndarray]
-"""The method: normalised noisy images of a noise level λ to PSFs, both (n, d, d)."""
+Restore = Callable[[np.ndarray, float], Estimate]
+"""The method: normalised noisy images (n, d, d) of a noise level λ to PSFs."""
 
 
 @dataclass(frozen=True)
@@ -39,12 +44,13 @@ class HeldOutStars:
 
 @dataclass(frozen=True)
 class Errors:
-    """Errors of the PSFs of test stars at S nodes of noise."""
+    """Errors of the PSFs of test stars at S nodes of noise, as `errors_of` gives them."""
 
     nodes: np.ndarray  # (S,), pixel RMS over the flux
-    error: np.ndarray  # (S, N, d, d), float32: PSF minus reference
+    error: np.ndarray  # (S, N, d, d), float32
     star: np.ndarray  # (N,), of every error
     distance: np.ndarray  # (S, N), Mahalanobis', of the noisy images
+    strangeness: np.ndarray | None = None  # (S, N), if the method knows it
 
     def of(self, chosen: np.ndarray) -> Errors:
         """Those of some stars, from a mask over stars."""
@@ -55,9 +61,26 @@ class Errors:
         """Half-width of the interval around 0 that holds 68.27 %, shape (S, d, d)."""
         return np.stack([np.quantile(np.abs(node), COVERAGE, axis=0) for node in self.error])
 
+    def ratio95(self) -> np.ndarray:
+        """By how much the interval that holds 95 % of all pixels is wider, shape (S,)."""
+        scaled = np.abs(self.error) / np.maximum(self.half_width(), LEAST_SIGMA)[:, None]
+        return np.array([np.quantile(node, WIDE) for node in scaled], np.float64)
+
     def rms(self) -> np.ndarray:
         """Root mean square per pixel, shape (S, d, d)."""
         return np.sqrt(np.stack([np.square(node).mean(axis=0) for node in self.error]))
+
+    def strange_limit(self) -> np.ndarray | None:
+        """What 0.1 % of the stars exceed at every node, shape (S,).
+
+        The excess over a node's median is taken to be as usual at all of them.
+        """
+        if self.strangeness is None:
+            return None
+        usual = np.median(self.strangeness, axis=1)
+        spread = np.median(np.abs(self.strangeness - usual[:, None]), axis=1)
+        excess = (self.strangeness - usual[:, None]) / np.maximum(spread, 1e-12)[:, None]
+        return np.asarray(usual + spread * np.quantile(excess, LIMIT))
 
     def distance_limit(self) -> float:
         """Distance that 0.1 % of the stars of all nodes exceed."""
@@ -94,7 +117,7 @@ def reach(band: np.ndarray, mean: np.ndarray) -> dict[str, float]:
 
 def measure_errors(
     stars: HeldOutStars,
-    predict: Predict,
+    fitted: Method,
     model: FluxModel,
     nodes: np.ndarray,
     rng: np.random.Generator,
@@ -104,19 +127,28 @@ def measure_errors(
     star = np.tile(np.arange(count), -(-LEAST_STARS // count))
     error = np.empty((len(nodes), star.size, *stars.images.shape[1:]), np.float32)
     distance = np.empty((len(nodes), star.size))
+    strangeness, free = [], fitted.free_flux()
     for place, noise in enumerate(nodes):
         level = noise / stars.noise.kappa
         noisy = stars.noise.draw(stars.images[star], level, rng)
-        error[place] = predict(noisy, level) - stars.references[star]
+        error[place] = errors_of(fitted.estimate(noisy, level), stars.references[star])
+        strangeness.append(free.strangeness(noisy, np.full(star.size, level)))
         distance[place] = mahalanobis(noisy, np.full(star.size, noise), model, COMPONENTS)
-    return Errors(nodes, error, star, distance)
+    known = [node for node in strangeness if node is not None]
+    return Errors(nodes, error, star, distance, np.stack(known) if known else None)
+
+
+def errors_of(estimate: Estimate, references: np.ndarray) -> np.ndarray:
+    """PSFs minus references (n, d, d), in units of σ if the method says it, else of the flux."""
+    error = estimate.psf - references
+    return error if estimate.sigma is None else error / np.maximum(estimate.sigma, LEAST_SIGMA)
 
 
 def measure_levels(
     levels: Sequence[float],
     stars: HeldOutStars,
     draw: Callable[[float], np.ndarray],
-    predict: Predict,
+    restore: Restore,
     errors: Errors,
     area: float,
     data_range: float,
@@ -131,8 +163,8 @@ def measure_levels(
     rows = []
     for level in levels:
         noisy, noise = draw(level), stars.noise.kappa * level
-        estimate = predict(noisy, level)
-        quality = all_metrics(estimate, stars.references, data_range)
+        estimate = restore(noisy, level)
+        quality = all_metrics(estimate.psf, stars.references, data_range)
         rows.append(
             {
                 "noise_level": level,
@@ -140,7 +172,7 @@ def measure_levels(
                 "snr": signal_to_noise(noise, area),
                 "mse_noisy": float(np.square(noisy - stars.references).mean()),
                 **{name: float(values.mean()) for name, values in quality.items()},
-                **crossed_coverage(errors, estimate - stars.references, noise),
+                **crossed_coverage(errors, errors_of(estimate, stars.references), noise),
                 "stars": len(noisy),
             }
         )
@@ -156,18 +188,22 @@ def crossed_coverage(errors: Errors, error: np.ndarray, noise: float) -> dict[st
     """Coverage at another noise, of either half of the stars by the errors of the other.
 
     `error` (n, d, d) holds every star once, at `noise`. Told are `coverage68` of the
-    half-width and `coverage_rms` of the root mean square.
+    half-width, `coverage95` of the wider one and `coverage_rms` of the root mean square.
     """
     even = np.arange(len(error)) % 2 == 0
-    found: dict[str, list[float]] = {"coverage68": [], "coverage_rms": []}
+    found: dict[str, list[float]] = {}
     for half in (even, ~even):
         if not half.any() or half.all():
             continue
         other = errors.of(~half)
         level = np.full(int(half.sum()), noise)
-        for name, maps in (("coverage68", other.half_width()), ("coverage_rms", other.rms())):
-            found[name].append(coverage(error[half], level, errors.nodes, maps))
-    return {name: float(np.mean(values)) for name, values in found.items() if values}
+        half_width = other.half_width()
+        wide = (half_width * other.ratio95()[:, None, None]).astype(half_width.dtype)
+        of = {"coverage68": half_width, "coverage95": wide, "coverage_rms": other.rms()}
+        for name, maps in of.items():
+            covered = coverage(error[half], level, errors.nodes, maps)
+            found.setdefault(name, []).append(covered)
+    return {name: float(np.mean(values)) for name, values in found.items()}
 
 
 def checksum(images: np.ndarray, references: np.ndarray) -> str:

@@ -321,6 +321,16 @@ class Photometry:
     used: np.ndarray  # (n, d, d): pixels that were measured; the others are repaired
     flags: np.ndarray  # uint16
 
+    def with_flux(self, factor: np.ndarray) -> Photometry:
+        """The same light with fluxes times a factor (n,), the rest of it being sky."""
+        sky, scale = (1.0 - factor) / self.images[0].size, factor[:, None, None]
+        return replace(
+            self,
+            flux=self.flux * factor,
+            background=self.background + self.flux * sky,
+            images=((self.images - sky[:, None, None]) / scale).astype(self.images.dtype),
+        )
+
 
 class _Fit(NamedTuple):
     """Flux, error, noise and sky left over, in units of each star's scale."""

@@ -45,7 +45,9 @@ class Prediction:
         Stamp − sky − `psf`; NaN in pixels that were not used.
     uncertainty : ndarray, shape (n, d, d), float32
         Half-width that holds 68.27 % of the errors of `psf` at this S/N, as found on
-        the test stars of the model.
+        the test stars of the model; in units of the star's own σ where the model knows it.
+    ratio95 : ndarray, shape (n,), float64
+        `uncertainty` times this holds 95 % of the errors; NaN where the model does not say.
     flux, flux_error : ndarray, shape (n,), float64
         Flux inside the stamp, in the unit of the stamps; the error is NaN where the
         flux was given.
@@ -58,6 +60,8 @@ class Prediction:
         known, the star's own photon noise.
     distance : ndarray, shape (n,), float64
         Mahalanobis distance from the training set (`psfdae.own_stars.bundle.mahalanobis`).
+    strangeness : ndarray, shape (n,), float64
+        The same, squared, by the model's own law of stars; NaN where it has none.
     fwhm_px, ellipticity, position_angle_deg : ndarray, shape (n,), float64
         Of the PSF (`psfdae.own_stars.shapes`).
     shift_x, shift_y : ndarray, shape (n,), int16
@@ -69,6 +73,7 @@ class Prediction:
     psf: np.ndarray
     residual: np.ndarray
     uncertainty: np.ndarray
+    ratio95: np.ndarray
     flux: np.ndarray
     flux_error: np.ndarray
     background: np.ndarray
@@ -76,6 +81,7 @@ class Prediction:
     snr: np.ndarray
     chi2: np.ndarray
     distance: np.ndarray
+    strangeness: np.ndarray
     fwhm_px: np.ndarray
     ellipticity: np.ndarray
     position_angle_deg: np.ndarray
@@ -116,8 +122,10 @@ COLUMNS: dict[str, tuple[str, str | None, str]] = {
     "background": ("D", UNIT, "sky per pixel"),
     "noise": ("D", UNIT, "RMS of the sky noise in a pixel"),
     "snr": ("D", None, "flux / (noise sqrt(A))"),
+    "ratio95": ("D", None, "UNCERT times this holds 95 % of the errors"),
     "chi2": ("D", None, "mean squared residual over its variance"),
     "distance": ("D", None, "Mahalanobis distance from the training set"),
+    "strangeness": ("D", None, "its square by the model's own law of stars"),
     "fwhm_px": ("D", "pix", "of the PSF, adaptive moments"),
     "ellipticity": ("D", None, "1 - b/a of the PSF"),
     "position_angle_deg": ("D", "deg", "of the major axis, from +x to +y"),

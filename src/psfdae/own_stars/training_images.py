@@ -9,12 +9,14 @@ included; those stars are used as they are.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from psfdae.files import Column
-from psfdae.own_stars.selection import BrightStars, brightest_pixels, moved
+from psfdae.own_stars.selection import SHIFT_ORDER, BrightStars, brightest_pixels, moved
 from psfdae.own_stars.stamps import cut
 from psfdae.stars.fields import draw_jitter, draw_phase
 
@@ -22,6 +24,8 @@ if TYPE_CHECKING:
     from psfdae.configuration.schema import Framing, Parts
 
 IMAGES_AT_A_TIME = 512  # made before they are framed; bounds the memory
+TINY = 1e-300
+PHASES = 17  # from 0 to ½ pixel, at which the correlation of moved noise is known
 
 
 def star_grid(position: np.ndarray) -> np.ndarray:
@@ -118,7 +122,7 @@ def make_images(
     framing: Framing,
     subpixel: np.ndarray,
     rng: np.random.Generator,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Frame stars as the network will see them, at new sub-pixel phases where asked for.
 
     Every star has its brightest pixel at (d/2, d/2), moved by a random jitter, and
@@ -142,6 +146,8 @@ def make_images(
     realisation, template : ndarray, shape (n, d, d), float32
     jitter : ndarray of int, shape (n, 2)
         Centring error (row, column) in pixels.
+    phase : ndarray, shape (n, 2)
+        Part of a pixel (row, column) by which the star was moved.
     """
     side = framing.stamp_px
     phase = np.where(subpixel[:, None], draw_phase(star.size, rng), 0.0)
@@ -157,7 +163,63 @@ def make_images(
         for source, target in ((wide, realisations), (placed, templates)):
             stamp = cut(source, side, offset)
             target[rows] = stamp / stamp.sum(axis=(1, 2), keepdims=True)
-    return realisations, templates, jitter
+    return realisations, templates, jitter, phase
+
+
+@dataclass(frozen=True)
+class OwnNoise:
+    """Noise of bright stars in their own images.
+
+    Attributes
+    ----------
+    noise : ndarray, shape (n,)
+        RMS of the sky in a pixel over the flux, of every image before it was moved.
+    background : float
+        Sky level in photons per pixel.
+    phase : ndarray, shape (n, 2)
+        Part of a pixel by which the image was moved.
+    star : ndarray of int, shape (n,)
+        Star of every image; its images share their noise.
+    """
+
+    noise: np.ndarray
+    background: float
+    phase: np.ndarray
+    star: np.ndarray
+
+    def __call__(self, images: np.ndarray, mean: np.ndarray) -> np.ndarray:
+        """What noise adds to the scatter (P, P) of some images about their mean (P,), of sum 1.
+
+        Splines mix neighbouring pixels, along rows and columns alike, and dividing by the
+        sum takes noise along the star away. Pixels have the variance of the sky and of the
+        star's photons (`psfdae.stars.noise`), these of the mean image.
+        """
+        _, same, count = np.unique(self.star[images], return_inverse=True, return_counts=True)
+        part = 1.0 - count[same] / images.size  # the mean has its own share of each star's noise
+        noise, side = self.noise[images], round(mean.size**0.5)
+        sky = part * noise**2
+        place = np.rint(2 * (PHASES - 1) * np.abs(self.phase[images])).astype(int)
+        share = np.zeros((PHASES, PHASES))
+        np.add.at(share, (place[:, 0], place[:, 1]), sky / max(sky.sum(), TINY))
+        along = moved_noise(side)
+        pairs = np.einsum("pac,pbd->abcd", along, np.tensordot(share, along, 1))
+        photons = (part * noise).sum() / np.sqrt(self.background) * np.maximum(mean, 0.0)
+        rms = np.sqrt(sky.sum() + photons)
+        covariance = pairs.reshape(mean.size, mean.size) * rms * rms[:, None]
+        kept = np.eye(mean.size) - mean[:, None]
+        return np.asarray(kept @ covariance @ kept.T)
+
+
+@cache
+def moved_noise(side: int) -> np.ndarray:
+    """Covariance of white noise along an axis that was moved by 0 … ½ pixel, (PHASES, d, d)."""
+    from scipy import ndimage
+
+    impulses = np.eye(3 * side)
+    phases = np.linspace(0.0, 0.5, PHASES)
+    moved_by = [ndimage.shift(impulses, (p, 0.0), order=SHIFT_ORDER) for p in phases]
+    rows = np.stack(moved_by)[:, side : 2 * side]
+    return np.asarray(rows @ rows.transpose(0, 2, 1))
 
 
 def training_columns(
@@ -177,13 +239,14 @@ def training_columns(
     star = star_of_images(held_out, parts.train_stars, parts.test_stars)
     template = templates_of(bright, held_out, bins)
     subpixel = ~held_out[star] & framing.subpixel
-    images, templates, jitter = make_images(bright, template, star, framing, subpixel, rng)
+    images, templates, jitter, phase = make_images(bright, template, star, framing, subpixel, rng)
     return {
         "template": Column(templates, "1", "stack of the star's part of the field, sum 1"),
         "realisation": Column(images, "1", "the star itself, sum 1"),
         "field_index": Column(star, "1", "star that the image shows"),
         "grid": Column(grid, "1", "place (ix, iy) of every star in the order of x and y"),
         "jitter": Column(jitter, "pixel", "centring error (row, column)"),
+        "phase": Column(phase, "pixel", "(row, column) that splines moved the star"),
         "position": Column(bright.position, "pixel", "(x, y) of every star, 0-based"),
         "snr": Column(bright.snr, "1", "signal to noise of every star"),
         "noise": Column(bright.noise / bright.flux, "1", "pixel RMS over flux of every star"),

@@ -61,6 +61,7 @@ METRICS = {
     "gain": ("gain", ".3g"),
     "ssim": ("SSIM", ".4f"),
     "coverage68": ("in error68", ".1%"),
+    "coverage95": ("in 95 %", ".1%"),
     "coverage_rms": ("in rms", ".1%"),
 }
 """Columns of the table: key, heading, format."""
@@ -106,18 +107,14 @@ def bundle(
     held_out = packing.HeldOutStars(images[parts.test], references[parts.test], noise_model(config))
     model = packing.leading(FluxModel.fit(images[parts.train]), packing.COMPONENTS)
     band = config.noise.kappa * np.asarray(config.noise.levels)
-
-    def predict(noisy: np.ndarray, level: float) -> np.ndarray:
-        return fitted.restore(noisy, level)
-
     nodes, rng = packing.noise_nodes(band), stream(config.seed, "noise", "bundle")
-    errors = packing.measure_errors(held_out, predict, model, nodes, rng)
+    errors = packing.measure_errors(held_out, fitted, model, nodes, rng)
     reach = packing.reach(band, model.mean)
     metrics = packing.measure_levels(
         config.noise.levels,
         held_out,
         lambda level: noisy_test_images(config, held_out.images, level),
-        predict,
+        fitted.estimate,
         errors,
         reach["noise_equivalent_px"],
         config.evaluation.data_range,
@@ -141,7 +138,8 @@ def bundle(
         metrics=metrics,
     )
     maps = (errors.nodes, errors.half_width(), errors.rms(), errors.distance_limit())
-    write_bundle(Bundle(info, arrays, model, *maps), out)
+    ratio95 = errors.ratio95() if info.format_version > 1 else None
+    write_bundle(Bundle(info, arrays, model, *maps, ratio95, errors.strange_limit()), out)
 
 
 def _trained(kind: type[Method], place: Path, config: Config, split: str | None) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import click
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from psfdae.cli import File, Folder, Reference, Split, command
 from psfdae.configuration.schema import Config
 from psfdae.estimators import Method, TrainingSet, groups_of, method
-from psfdae.files import Product
+from psfdae.files import Product, read_product
 from psfdae.stages.common import (
     field_positions,
     limit_threads,
@@ -19,6 +19,9 @@ from psfdae.stages.common import (
     read_stars,
     split_stars,
 )
+
+if TYPE_CHECKING:
+    from psfdae.own_stars.training_images import OwnNoise
 
 Stars = Annotated[File, "Product of the stage stars."]
 
@@ -86,6 +89,8 @@ def training_set(
 ) -> TrainingSet:
     """What a method learns from: the training part of a split, with a configuration's noise."""
     parts = split_stars(stars, split, config)
+    if stars.config.get("source") == "stars":
+        more["own_noise"] = _own_noise(stars, config.noise.background_photons)
     return TrainingSet(
         images=stars["realisation"],
         references=stars["template" if kind.stored and not kind.per_reference else reference],
@@ -98,3 +103,12 @@ def training_set(
         positions=field_positions(stars),
         **more,
     )
+
+
+def _own_noise(stars: Product, background: float) -> OwnNoise:
+    """Noise of the bright stars of an image, which their images have kept."""
+    from psfdae.own_stars.training_images import OwnNoise
+
+    known = read_product(stars.path, "stars", ("noise", "phase"))
+    star = stars["field_index"]
+    return OwnNoise(known["noise"][star], background, known["phase"], star)

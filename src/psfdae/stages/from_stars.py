@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 
 from psfdae.cli import File, Folder, command
+from psfdae.configuration.base import ConfigError
 from psfdae.configuration.compose import as_overrides, part
 from psfdae.configuration.schema import Config, Noise
 from psfdae.estimators import Method, groups_of, method, registered
@@ -27,9 +28,12 @@ from psfdae.rng import stream
 from psfdae.stages.bundle import bundle
 from psfdae.stages.common import check_outputs
 from psfdae.stages.evaluate import READS, Models, estimators, evaluate
-from psfdae.stages.fit import fit
+from psfdae.stages.fit import fit, training_set
 from psfdae.stages.predict import Stated
 from psfdae.stars.fields import held_out_fields
+
+INNER = 10
+"""Of so many stars that a method may learn from, one serves its own choices."""
 
 LOCK = ".from_stars.lock"
 
@@ -60,8 +64,9 @@ class Made:
     def fit(self, kind: type[Method]) -> Path:
         return self.path / (kind.name if kind.files else f"{kind.name}.h5")
 
-    def bundle(self, kind: type[Method]) -> Path:
-        return self.path / f"{self.name}{kind.suffix}{SUFFIX}"
+    @property
+    def bundle(self) -> Path:
+        return self.path / f"{self.name}{SUFFIX}"
 
     def models(self) -> Any:
         """What the stage `evaluate` takes."""
@@ -72,8 +77,8 @@ class Made:
         names = ("selection.csv", "overrides.txt", "evaluation.csv", "per_star.parquet")
         own = [self.path / name for name in (*names, "report.csv", "report.png")]
         for kind in self.kinds:
-            own += [self.bundle(kind), *(path for path in kind.outputs(self.fit(kind)))]
-        return [self.stars, *own]
+            own += kind.outputs(self.fit(kind))
+        return [self.stars, self.bundle, *own]
 
 
 @command(
@@ -91,24 +96,33 @@ def from_stars(
     stated: Stated,
     name: Annotated[str | None, "Name of the model.  [default: the image's]"] = None,
     licence: Annotated[str, "Of the model."] = "not stated",
+    taken: Annotated[
+        str | None,
+        {"flag": "--method"},
+        "Method of the model.  [default: that which errs least on validation stars]",
+    ] = None,
     *,
     out: Annotated[Folder, "Folder for the model, its report and what they are made of."],
     overwrite: Annotated[bool, "Replace a model that the folder holds."] = False,
 ) -> None:
     """Train a model on the bright stars of IMAGE.
 
-    IMAGE is a FITS image with --catalogue, or a FITS cube of stamps. Some stars are
-    held out and made faint to test the model.
+    IMAGE is a FITS image with --catalogue, or a FITS cube of stamps. Some stars choose
+    the method of the model; others are held out and made faint to test it.
     """
     exposure = stated.source(image)
     kinds = tuple(kind for kind in map(method, config.methods) if kind.stored)
     files = Made(out, name or image.name.split(".")[0], kinds)
+    allowed = {kind.name: kind for kind in kinds if kind.bundled and not kind.told_position}
+    if not allowed or taken not in {None, *allowed}:
+        known = ", ".join(allowed) or "none, for no method of the list makes a model"
+        raise ConfigError(f"methods = {config.methods}: --method takes one of these: {known}")
     check_outputs(files.written(), (image, exposure.catalogue, exposure.mask))
     with _alone(out):
         finished = sorted(out.glob(f"*{SUFFIX}"))
         if finished and not overwrite:
             raise FolderError(f"{finished[0]}: a model is there already; --overwrite replaces it")
-        _make(config, exposure, files, licence)
+        _make(config, exposure, files, licence, [allowed[taken]] if taken else [*allowed.values()])
 
 
 @contextmanager
@@ -140,7 +154,9 @@ def _alone(folder: Path) -> Iterator[None]:
             folder.rmdir()
 
 
-def _make(config: Config, exposure: Source, files: Made, licence: str) -> None:
+def _make(
+    config: Config, exposure: Source, files: Made, licence: str, allowed: list[type[Method]]
+) -> None:
     # The noise levels follow from the stars.
     framing, wanted = config.framing, config.calibration_stars
     observation = exposure.open(framing.stamp_px, wanted.margin_px, larger=True)
@@ -174,14 +190,38 @@ def _make(config: Config, exposure: Source, files: Made, licence: str) -> None:
         per_star=files.path / "per_star.parquet",
         out=files.path / "evaluation.csv",
     )
-    for kind in files.kinds:
-        if kind.bundled:
-            print(f"packing {kind.label}")
-            own = part(bundle.stage.reads, settings)  # type: ignore[attr-defined]
-            models = Models(**{kind.name: files.fit(kind)})
-            path = files.bundle(kind)
-            bundle(own, files.stars, models, SPLIT, REFERENCE, licence=licence, out=path)
+    taken = allowed[0] if len(allowed) == 1 else best(settings, files, allowed)
+    print(f"packing {taken.label}")
+    own = part(bundle.stage.reads, settings)  # type: ignore[attr-defined]
+    models = Models(**{taken.name: files.fit(taken)})
+    bundle(own, files.stars, models, SPLIT, REFERENCE, licence=licence, out=files.bundle)
     report(checked, files)
+
+
+def best(settings: Any, files: Made, kinds: Iterable[type[Method]]) -> type[Method]:
+    """The method that errs least on validation stars, which no fit that is asked has seen.
+
+    Every S/N counts alike: the geometric mean of the errors decides.
+    """
+    from psfdae.stages.common import noise_model, read_stars, split_stars
+
+    errors = {}
+    for kind in kinds:
+        config = part((*groups_of(kind.name), "evaluation"), settings)
+        product = read_stars(files.stars, REFERENCE)
+        data = training_set(config, kind, product, SPLIT, REFERENCE)
+        star, judges = product["field_index"], split_stars(product, SPLIT, config).validation
+        fitted = kind.load(files.fit(kind), REFERENCE, config.evaluation)
+        if not kind.validates:  # it has learnt from these stars; others choose its settings
+            inner = np.isin(star[data.fit], np.unique(star[data.fit])[::INNER])
+            some = replace(data, fit=data.fit[~inner], validation=data.fit[inner])
+            fitted = kind.fit(some, **kind.settings(config))
+        truth, rng = product["realisation"][judges], stream(config.seed, "noise", "own stars")
+        noisy = [noise_model(config).draw(truth, level, rng) for level in data.levels]
+        found = (fitted.estimate(*some).psf for some in zip(noisy, data.levels, strict=True))
+        errors[kind] = float(np.mean([np.log(np.square(psf - truth).mean()) for psf in found]))
+        print(f"{kind.label}: MSE {np.exp(errors[kind]):.3g} on validation stars")
+    return min(errors, key=errors.__getitem__)
 
 
 def _described(config: Any, observation: Observation) -> dict[str, Any]:
