@@ -43,9 +43,7 @@ use rule evaluate as evaluate_on_request with:
             more=(f"methods={names_of(w.dataset, on_request=True)}",),
         ),
         source=lambda w: estimators_source("evaluate", w.dataset, on_request=True),
-        models=lambda w: model_options(
-            w.dataset, w.split, w.reference, on_request=True
-        ),
+        models=lambda w: model_options(w.dataset, w.split, w.reference, on_request=True),
     message:
         "Evaluating methods on request: {wildcards.dataset}, {wildcards.reference}"
 
