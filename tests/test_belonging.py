@@ -93,10 +93,13 @@ def test_stars_need_templates_of_their_own_scene(at, override, key, values):
 SCALE = {"key": "telescope.pixel_scale_arcsec", "values": (0.1, 0.15)}
 
 
+METHODS = "methods=[noisy,pca_som,lmmse,dae]"
+
+
 def evaluate(at, stars="s.h5", dae="dae"):
     models = ("--pca-som", at / "pca_som.h5", "--dae", at / dae)
     out = ("--per-star", at / "out.parquet", "--out", at / "out.csv")
-    return ("evaluate", "--dataset", "d", "--stars", at / stars, *models, *out, *SIZES)
+    return ("evaluate", "--dataset", "d", "--stars", at / stars, *models, *out, *SIZES, METHODS)
 
 
 @pytest.mark.parametrize(
@@ -108,14 +111,14 @@ def evaluate(at, stars="s.h5", dae="dae"):
         (
             lambda at, s: (
                 *("figure", "strip", "--dataset", "d", "--stars", at / s, "--level=1e-3"),
-                *("--pca-som", at / "pca_som.h5", "--dae", at / "dae"),
+                *("--pca-som", at / "pca_som.h5", "--dae", at / "dae", METHODS),
             ),
             "pca_som.trained_on.yaml",
         ),
         (
             lambda at, s: (
                 *("figure", "headline", "--dataset", "d", "--stars", at / s, "--level=1e-3"),
-                *("--pca-som", at / "pca_som.h5", "--dae", at / "dae"),
+                *("--pca-som", at / "pca_som.h5", "--dae", at / "dae", METHODS),
                 *("--bounds", at / "b.csv", "--efficiency", at / "e.csv"),
             ),
             "pca_som.trained_on.yaml",

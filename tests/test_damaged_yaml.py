@@ -177,6 +177,7 @@ def trained(tmp_path_factory):
     t, s, b, dae, other = (str(folder / n) for n in ("t.h5", "s.h5", "b.h5", "dae", "other"))
     out = [f"--out={folder}/e.csv", f"--per-star={dae}/evaluation.parquet"]
     evaluate = ["evaluate", "--dataset=d", f"--stars={s}", f"--pca-som={b}", *out, *tiny]
+    evaluate += ["methods=[noisy,pca_som,lmmse,dae]"]
     for step in (
         ["templates", f"--out={t}", *tiny],
         ["stars", f"--templates={t}", f"--out={s}", *tiny],

@@ -237,7 +237,11 @@ def test_strip_shows_the_noise_that_evaluate_measures(tmp_path, gaussian_stars, 
     grid = {"points": 5, "spacing_deg": 1.1, "edge_deg": 2.2}
     write_product(tmp_path / "s.h5", "stars", columns, {"grid": grid})
     config = load_stage(
-        READS, ("dataset=dataset3", "parts.train_stars=200", "parts.test_stars=100")
+        READS,
+        (
+            *("dataset=dataset3", "parts.train_stars=200", "parts.test_stars=100"),
+            "methods=[noisy,pca_som,dae,lmmse]",
+        ),
     )
     shown = {}
     for kind in (PcaSom, Dae):

@@ -92,7 +92,8 @@ from pathlib import Path
 folder, found = Path(sys.argv[1]), {}
 PACKAGES = ("poppy", "batoid", "mlflow", "hydra", "snakemake")
 TINY = ["preset=smoke", "grid.points=3", "stars.count=60", "parts.train_stars=40",
-        "parts.test_stars=12", "train.epochs=1", "dataset=dataset3", "baseline.epochs=1"]
+        "parts.test_stars=12", "train.epochs=1", "dataset=dataset3", "baseline.epochs=1",
+        "methods=[noisy,pca_som,lmmse,dae]"]
 
 def done(step, *unwanted):
     found[step] = [name for name in unwanted if name in sys.modules]
