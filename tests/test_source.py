@@ -10,6 +10,7 @@ from textwrap import dedent
 
 import pytest
 
+from psfdae.estimators import registered
 from psfdae.source import ROOT, Code, Reader
 
 REPOSITORY = ROOT.parents[1]
@@ -19,7 +20,7 @@ OPTIONS = {
     "_figure": ("predicted", "errors", "correlation"),
     "_command": ("bounds", "efficiency", "bank-growth"),
 }
-METHODS = [f"psfdae.estimators.{name}" for name in ("noisy", "pca_som", "lmmse", "dae")]
+METHODS = [kind.__module__ for kind in registered()]
 EXEMPT = {
     "psfdae.cli": "the module of the command that runs",
 }
@@ -40,7 +41,8 @@ def rules():
                 said = re.sub(r"\{[^}]*\.title\(\)\}", option.title(), call[0])
                 node = ast.parse(re.sub(r"\{[^}]*\}", option, said).replace('f"', '"')).body[0]
                 functions = [a.value for a in node.value.args if isinstance(a, ast.Constant)]
-                chosen = [v for k in node.value.keywords for v in ast.literal_eval(k.value)]
+                words = {k.arg: k.value for k in node.value.keywords}
+                chosen = ast.literal_eval(words["chosen"]) if "chosen" in words else []
                 chosen += METHODS if call[1] == "estimators" else []
                 name = " ".join(
                     [*re.findall(r"\w+", rule.replace(" with", ""))[-1:], option]
