@@ -56,6 +56,7 @@ DRY = {
     "make reproduce TARGETS=dataset3 SET=train.lr=2e-3 telescope=wfsat_literal": LONG,
     "snakemake sweep --cores all --config sweep=dae_width": LONG,
     "make reproduce TARGETS=dataset3 SET=$(psfdae best dae_width)": LONG,
+    "make report": LONG,
     "snakemake tracking --forcerun track track_alignment": LONG,
     **dict.fromkeys(("make test", "make test-all", "make test-docs"), "would run this test"),
 }

@@ -84,8 +84,8 @@ def tree(tmp_path_factory):
     (root / "config/shrunk/default.yaml").write_text("weight: 0.5\n")
     path = root / "config/config.yaml"
     text = path.read_text()
-    assert text.count("lmmse, dae]") == 1
-    path.write_text(text.replace("lmmse, dae]", "lmmse, dae, shrunk]"))
+    assert text.count("gmm_position]") == 1
+    path.write_text(text.replace("gmm_position]", "gmm_position, shrunk]"))
     (root / "config/sweep/tried.yaml").write_text(yaml.safe_dump(SWEEP))
     return root
 

@@ -111,9 +111,12 @@ def from_stars(
     the method of the model; others are held out and made faint to test it.
     """
     exposure = stated.source(image)
-    kinds = tuple(kind for kind in map(method, config.methods) if kind.stored)
+    # Nothing tells a model of one's own where a star stands.
+    methods = [name for name in config.methods if not method(name).told_position]
+    config = config.model_copy(update={"methods": methods})
+    kinds = tuple(kind for kind in map(method, methods) if kind.stored)
     files = Made(out, name or image.name.split(".")[0], kinds)
-    allowed = {kind.name: kind for kind in kinds if kind.bundled and not kind.told_position}
+    allowed = {kind.name: kind for kind in kinds if kind.bundled}
     if not allowed or taken not in {None, *allowed}:
         known = ", ".join(allowed) or "none, for no method of the list makes a model"
         raise ConfigError(f"methods = {config.methods}: --method takes one of these: {known}")
