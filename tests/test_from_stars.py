@@ -388,7 +388,7 @@ def test_one_command_beats_the_noisy_star_and_the_baseline(tmp_path):
     test = split_stars(product, "held_out", config).test
     level = min(config.noise.levels, key=lambda v: abs(v - noisy.noise[ten]))
     drawn = noise_model(config).draw(product["realisation"][test], level, stream(9, "exact"))
-    estimate = estimator(bundle).predict(drawn)
+    estimate = estimator(bundle).restore(drawn, level)
     row = product["row"][product["field_index"][test]]
     exact = [best_match(made.psf[r], e) for r, e in zip(row, estimate, strict=True)]
     assert np.mean(exact) < dae.mse[ten]

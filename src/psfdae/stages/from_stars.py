@@ -211,7 +211,7 @@ def best(settings: Any, files: Made, kinds: Iterable[type[Method]]) -> type[Meth
     errors = {}
     for kind in kinds:
         config = part((*groups_of(kind.name), "evaluation"), settings)
-        product = read_stars(files.stars, REFERENCE)
+        product = read_stars(files.stars, "template")
         data = training_set(config, kind, product, SPLIT, REFERENCE)
         star, judges = product["field_index"], split_stars(product, SPLIT, config).validation
         fitted = kind.load(files.fit(kind), REFERENCE, config.evaluation)
@@ -221,7 +221,7 @@ def best(settings: Any, files: Made, kinds: Iterable[type[Method]]) -> type[Meth
             fitted = kind.fit(some, **kind.settings(config))
         truth, rng = product["realisation"][judges], stream(config.seed, "noise", "own stars")
         noisy = [noise_model(config).draw(truth, level, rng) for level in data.levels]
-        found = (fitted.estimate(*some).psf for some in zip(noisy, data.levels, strict=True))
+        found = (fitted.restore(*pair) for pair in zip(noisy, data.levels, strict=True))
         errors[kind] = float(np.mean([np.log(np.square(psf - truth).mean()) for psf in found]))
         print(f"{kind.label}: MSE {np.exp(errors[kind]):.3g} on validation stars")
     return min(errors, key=errors.__getitem__)
