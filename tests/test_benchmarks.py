@@ -219,10 +219,10 @@ def test_all_methods_are_timed_and_drawn(smoke, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.workflow
-def test_targets_prediction_and_scaling(smoke, tmp_path):
+def test_targets_on_request(smoke, tmp_path):
     # Other tests want the folder as the default target leaves it.
     folder = shutil.copytree(smoke, tmp_path / "run", symlinks=True)
-    snakemake(folder, "prediction", "scaling")
+    snakemake(folder, "prediction", "scaling", "on_request", "seeds")
     tables = {p.stem: pd.read_csv(p) for p in (folder / "results/tables").glob("*.csv")}
     for name in ("predict_poppy", "predict_throughput", "scaling_stages"):
         assert list(tables[name].columns) == columns(name)
@@ -233,4 +233,9 @@ def test_targets_prediction_and_scaling(smoke, tmp_path):
     fits = {"baseline", "train", "fit_gmm", "fit_gmm_position"}
     assert set(stages.stage) == {"simulate", *fits, "evaluate", "predict"}
     assert (stages[["time_s", "cpu_s", "peak_mb", "disk_mb"]] > 0).all().all()
-    assert planned(folder, "prediction", "scaling") == {}
+    seeds = tables["seeds_dataset3"]
+    assert set(seeds.groupby("method").seed.nunique()) == {5}
+    asked = {"gmm_simulated", "gmm_simulated_position", "dae_simulated"}
+    for name in ("psf_metrics_on_request", "psf_efficiency_on_request"):
+        assert asked <= set(tables[name].method)
+    assert planned(folder, "prediction", "scaling", "on_request", "seeds") == {}

@@ -17,7 +17,7 @@ from prediction import make_cube
 from psfdae.cli import File, command, program
 from psfdae.configuration.consistency import SIMULATION
 from psfdae.configuration.schema import Config
-from psfdae.estimators import method, registered
+from psfdae.estimators import all_groups, method
 from psfdae.rng import stream
 
 BATCHES = (1, 16, 64, 256, 1024)
@@ -214,8 +214,7 @@ def with_exponents(part, against):
     return table.assign(**exponents)
 
 
-FITS = (group for kind in registered() for group in kind.groups)
-READS = tuple(dict.fromkeys(("parts", *FITS, "evaluation", "methods", "benchmark")))
+READS = ("parts", *all_groups(), "evaluation", "methods", "benchmark")
 
 
 @command("stages", reads=(*SIMULATION, "noise", *READS))

@@ -17,7 +17,7 @@ from psfdae.configuration.base import Group
 from psfdae.configuration.compose import config_dir, decisive, load_file, part
 from psfdae.configuration.consistency import SIMULATION
 from psfdae.configuration.schema import Config
-from psfdae.estimators import method, registered
+from psfdae.estimators import all_groups, method
 from psfdae.files import read_product
 from psfdae.reading import read_table, read_yaml
 from psfdae.rng import stream
@@ -33,8 +33,7 @@ COMPONENTS, MAPS, EPOCHS = (5, 10, 20, 40), (7, 11, 15), (2, 10, 50)
 CHEAP_S = 3.0  # within which a fit of PCA+SOM is repeated
 
 READS = (*SIMULATION, "noise", "parts", "baseline", "benchmark")
-FITS = dict.fromkeys(group for kind in registered() for group in kind.groups)
-METHODS = (*SIMULATION, "noise", "parts", "methods", *FITS)
+METHODS = (*SIMULATION, "noise", "parts", "methods", *all_groups())
 
 
 class Knee(Group):
@@ -232,22 +231,11 @@ def methods(
     config: Config,
     stars: Annotated[File, "Product of the stage stars."],
     out: Annotated[File, "CSV with the times of every method, and its error."],
+    seeds: Annotated[int, "Of the methods' own draws: the configuration's, and the next ones."] = 1,
 ) -> None:
     """Time fit and inference of all methods on one thread, on a quiet machine."""
     require(stars, read_product(stars, "stars", ()).config, STARS, config)
-    write(out, alone(1, time_methods, config.model_dump(), stars, [config.seed]))
-
-
-@command("seeds", reads=METHODS)
-def seeds(
-    config: Config,
-    stars: Annotated[File, "Product of the stage stars."],
-    out: Annotated[File, "CSV with the errors of every method and seed."],
-    count: Annotated[int, "Seeds, those of the configuration and the next ones."] = 5,
-) -> None:
-    """Fit all methods with other seeds of their own to the same stars."""
-    require(stars, read_product(stars, "stars", ()).config, STARS, config)
-    tried = [config.seed + i for i in range(count)]
+    tried = [config.seed + i for i in range(seeds)]
     write(out, alone(1, time_methods, config.model_dump(), stars, tried))
 
 
@@ -285,4 +273,4 @@ def time_methods(tree, stars, seeds):
 
 
 if __name__ == "__main__":
-    program(knee_table, baseline, methods, seeds)
+    program(knee_table, baseline, methods)

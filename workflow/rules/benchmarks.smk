@@ -296,14 +296,14 @@ rule method_seeds:
         mem_mb=1500,
         runtime=60,
     params:
-        config=lambda w: settings("trainings.seeds", f"dataset={w.dataset}"),
-        source=program_code("trainings.seeds", FITTED),
-        program=program("trainings.seeds"),
+        config=lambda w: settings("trainings.methods", f"dataset={w.dataset}"),
+        source=program_code("trainings.methods", FITTED),
+        program=program("trainings.methods"),
     message:
         "Fitting all methods of {wildcards.dataset} with other seeds"
     shell:
         "python {params.program} --config {params.config} --stars {input.stars}"
-        " --out {output} > {log} 2>&1"
+        " --seeds 5 --out {output} > {log} 2>&1"
 
 
 rule seeds:

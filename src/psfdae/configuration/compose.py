@@ -16,7 +16,7 @@ from psfdae.configuration.alignment import AlignmentConfig
 from psfdae.configuration.base import NEUTRAL, ConfigError, config_dir
 from psfdae.configuration.consistency import Consistent, stage_model, with_derived
 from psfdae.configuration.schema import Group, whole_config
-from psfdae.estimators import listed, registered
+from psfdae.estimators import all_groups, listed
 from psfdae.files import ProductError, write_text
 from psfdae.reading import parse_yaml
 
@@ -80,7 +80,7 @@ def _primary(root: Root, folder: Path) -> str:
     tree = parse_yaml(folder / "config.yaml")
     defaults = tree.get("defaults", [])
     chosen = {group for entry in defaults if isinstance(entry, dict) for group in entry}
-    groups = {group for kind in registered() for group in kind.groups}
+    groups = set(all_groups())
     if not groups - chosen:
         return root
     # Before all others, so that datasets and presets may change them.

@@ -447,6 +447,11 @@ def listed(path: Path) -> tuple[type[Method], ...]:
         raise ConfigError(text if text.startswith(str(path)) else f"{path}: {text}") from None
 
 
+def all_groups() -> tuple[str, ...]:
+    """Groups of the configuration that are settings of methods."""
+    return tuple(dict.fromkeys(group for kind in registered() for group in kind.groups))
+
+
 def oracles_last(names: Any) -> list[type[Method]]:
     """Methods among some names in the order of legends: those that are told λ at the end."""
     kinds = [kind for kind in registered() if kind.name in set(names)]

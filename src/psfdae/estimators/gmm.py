@@ -25,7 +25,7 @@ the slope of the cluster differs from that of all.
 
 An image whose flux and sky are estimates is a x + (1 − a)/P with a factor a about 1, for
 its sum is 1. Little is known of a; it is one more row of X_k, LOOSE (μ_k − 1/P), and of
-Y_k, LOOSE μ_y,k. Fluxes come out a third better than those by which images were divided.
+Y_k, LOOSE μ_y,k.
 """
 
 from __future__ import annotations
@@ -237,8 +237,10 @@ class GaussianMixture(Method):
         sizes = [k for k in gmm.components if k <= learn.size]
         if not sizes:
             raise FitError(
-                f"gmm.components = {gmm.components}: must be at most {learn.size}, the number of "
-                "training stars" + " without those that choose" * searched
+                f"{next(iter(cls.groups))}.components = {gmm.components}: "
+                f"must be at most {learn.size}, the number of training stars"
+                + " without those that choose"
+                * searched
             )
         clusters, told, shrinkage = sizes[0], cls.told_position, gmm.shrinkage[0]
         if searched:
@@ -609,9 +611,7 @@ class GaussianMixture(Method):
             return np.maximum(s - s**2 * known, 0.0)
         own, cross = cluster.own_reference, self.cross * factor.shared
         cross[:, :leading] += cluster.scale * own.T @ cluster.own[:, :leading]
-        prior = cluster.common * self.variance_reference + cluster.scale * np.square(own).sum(
-            axis=0
-        )
+        prior = cluster.common * self.variance_reference + cluster.scale * cluster.square
         known = np.square(cross) @ factor.inverse
         known -= np.square(cross[:, :leading] @ factor.low.T).sum(axis=1)
         return np.maximum(prior - known, 0.0)

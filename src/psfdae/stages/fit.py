@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import click
 import numpy as np
@@ -19,9 +21,6 @@ from psfdae.stages.common import (
     read_stars,
     split_stars,
 )
-
-if TYPE_CHECKING:
-    from psfdae.own_stars.training_images import OwnNoise
 
 Stars = Annotated[File, "Product of the stage stars."]
 
@@ -105,10 +104,18 @@ def training_set(
     )
 
 
-def _own_noise(stars: Product, background: float) -> OwnNoise:
-    """Noise of the bright stars of an image, which their images have kept."""
-    from psfdae.own_stars.training_images import OwnNoise
+def _own_noise(stars: Product, background: float) -> Callable[..., np.ndarray]:
+    """Noise of the bright stars of an image; read only if a method asks for it."""
 
-    known = read_product(stars.path, "stars", ("noise", "phase"))
-    star = stars["field_index"]
-    return OwnNoise(known["noise"][star], background, known["phase"], star)
+    @cache
+    def known() -> Callable[..., np.ndarray]:
+        from psfdae.own_stars.training_images import OwnNoise
+
+        kept = read_product(stars.path, "stars", ("noise", "phase"))
+        star = stars["field_index"]
+        return OwnNoise(kept["noise"][star], background, kept["phase"], star)
+
+    def own_noise(images: np.ndarray, mean: np.ndarray) -> np.ndarray:
+        return known()(images, mean)
+
+    return own_noise

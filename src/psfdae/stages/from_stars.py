@@ -15,7 +15,7 @@ from psfdae.cli import File, Folder, command
 from psfdae.configuration.base import ConfigError
 from psfdae.configuration.compose import as_overrides, part
 from psfdae.configuration.schema import Config, Noise
-from psfdae.estimators import Method, groups_of, method, registered
+from psfdae.estimators import Method, all_groups, groups_of, method
 from psfdae.files import Product, write_csv, write_product, write_text
 from psfdae.own_stars.bundle import SUFFIX
 from psfdae.own_stars.errors import ObservationError
@@ -86,8 +86,7 @@ class Made:
     start=("dataset=from_stars",),
     reads=(
         *("seed", "calibration_stars", "framing", "noise", "parts"),
-        *(group for kind in registered() for group in kind.groups),
-        *("evaluation", "methods"),
+        *(*all_groups(), "evaluation", "methods"),
     ),
 )
 def from_stars(
