@@ -122,7 +122,8 @@ format: env ## Format Python and Snakemake files
 	snakefmt Snakefile workflow
 
 test: lint ## Lint, unit tests and the smoke workflow
-	pytest -m "not slow and not written" --junitxml results/tests.xml
+	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 pytest -m "not slow and not written" \
+	  --numprocesses logical --maxprocesses 4 --dist worksteal --junitxml results/tests.xml
 
 test-all: test ## The tests, then the slow ones
 	pytest -m slow

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import fcntl
+
 import numpy as np
 import pytest
 
@@ -12,6 +14,9 @@ from psfdae.configuration.compose import load
 from psfdae.optics.pupil import annular_pupil
 from psfdae.stars.noise import NoiseModel
 from workflow_runs import snakemake
+
+FINISHED = ".built"
+"""File in the folder of the smoke run once it is whole."""
 
 
 @pytest.fixture(scope="session")
@@ -66,10 +71,20 @@ def grid(tracer):
 
 
 @pytest.fixture(scope="session")
-def smoke(tmp_path_factory):
-    """Folder of the whole DAG on tiny sizes."""
-    folder = tmp_path_factory.mktemp("smoke")
+def smoke(tmp_path_factory, worker_id):
+    """Folder of the whole DAG on tiny sizes, made by one process of the tests for all."""
+    if worker_id == "master":
+        return built(tmp_path_factory.mktemp("smoke"))
+    shared = tmp_path_factory.getbasetemp().parent / "smoke"
+    with shared.with_suffix(".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        return shared if (shared / FINISHED).exists() else built(shared)
+
+
+def built(folder):
+    folder.mkdir(exist_ok=True)
     snakemake(folder)
+    (folder / FINISHED).touch()
     return folder
 
 

@@ -194,7 +194,7 @@ def test_calibration_needs_one_telescope_for_the_stars_of_a_scene(at):
         [trainings.baseline, "--stars", "s2.h5"],
         [prediction.throughput, "--stars", "s2.h5", "--bundle", "none"],
     ],
-    ids=lambda words: str(words[0]),
+    ids=["baseline", "throughput"],
 )
 def test_measurements_need_the_stars_of_their_configuration(at, words):
     words = [at / word if isinstance(word, str) and "." in word else word for word in words]
