@@ -61,6 +61,7 @@ def test_what_is_timed_is_the_command_that_users_run(tmp_path):
 # Network and baseline
 
 
+@pytest.mark.slow
 def test_engines_run_apart_and_fill_the_table(tmp_path):
     small = ("benchmark.repeats=1", "benchmark.stamp_sizes=[8,10]", "benchmark.stamps=1")
     config = load_stage(speed.inference.stage.reads, [*small, "benchmark.threads=1"])

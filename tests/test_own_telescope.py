@@ -59,6 +59,7 @@ def test_every_line_is_run_by_a_test(lines):
     assert {line.words[0] for line in lines} == {"cat", "psfdae", "snakemake"}
 
 
+@pytest.mark.slow
 def test_page_from_the_telescope_s_file_to_restored_stars(lines, workshop):
     steps = words(lines, "psfdae")
     assert {"simulate", "stars", "train", "bundle", "predict"} == {step[0] for step in steps}
@@ -72,6 +73,7 @@ def test_page_from_the_telescope_s_file_to_restored_stars(lines, workshop):
         assert len(restored["STARS"].data) == 9
 
 
+@pytest.mark.slow
 def test_page_s_dataset_is_a_target(lines, workshop):
     targets = words(lines, "snakemake")
     assert targets == [["mytarget"]]

@@ -56,6 +56,7 @@ def test_reference_keeps_the_layout_and_says_where_it_comes_from(results, tmp_pa
     assert provenance["versions"]["torch"].startswith("2.")
 
 
+@pytest.mark.slow
 def test_record_keeps_what_was_not_renewed_and_says_since_when(results, tmp_path):
     out = tmp_path / "reference"
     slow = results / "tables/slow.csv"

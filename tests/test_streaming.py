@@ -129,6 +129,7 @@ def memory(cheap, tmp_path_factory):
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("job", ["simulate", "predict"])
 def test_memory_does_not_grow_with_the_stars(memory, job):
     few, many = memory[job]

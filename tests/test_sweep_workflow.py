@@ -156,6 +156,7 @@ def states(journal):
     return [trial.state.name for trial in trials]
 
 
+@pytest.mark.slow
 def test_sweep_lists_its_points_figures_and_import(tmp_path, monkeypatch):
     monkeypatch.delenv("PSFDAE_CONFIG", raising=False)
     for name, points in (("dae_width", 12), ("som", 12)):

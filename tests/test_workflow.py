@@ -60,12 +60,14 @@ def test_same_value_in_another_format_reruns_nothing(smoke):
     assert planned(smoke, overrides="train.lr=0.0040 noise.kappa=4.980") == {}
 
 
+@pytest.mark.slow
 def test_interval_of_checkpoints_reruns_nothing(smoke):
     groups = ("train", "dae_train", "train_original", "train_dae_retrained")
     given = [f"{group}.checkpoint_seconds=1.5" for group in groups]
     assert planned(smoke, overrides=" ".join(given)) == {}
 
 
+@pytest.mark.slow
 def test_command_of_the_readme_with_another_telescope(tmp_path):
     """Templates and stars are made; all that follows is planned."""
     (given,) = re.findall(r'SET="(.*wfsat_literal)"', (ROOT / "README.md").read_text())
@@ -91,6 +93,7 @@ def test_keys_of_one_scene_leave_the_others_alone(smoke):
         assert {rule: n for rule, n in found.items() if rule in ("templates", "stars")} == r0
 
 
+@pytest.mark.slow
 def test_sizes_have_to_fit_together_where_a_dataset_is_built(tmp_path):
     options = {"overrides": "stars.count=9000", "preset": "fast"}
     assert planned(tmp_path, "dataset3", **options)["stars"] == 1
