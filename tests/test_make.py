@@ -13,7 +13,7 @@ import pytest
 from workflow_runs import ROOT, VARYING, clone, shell, wait_until
 
 REPRODUCE = "make reproduce PRESET=smoke"
-JOBS = 100
+JOBS = 80
 """Such a run has a few more; a kill comes after a number of jobs below this."""
 
 
