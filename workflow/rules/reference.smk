@@ -1,10 +1,9 @@
 # The run of record is committed, so nothing but an explicit request renews it.
 rule reference:
     input:
-        rules.psf_metrics.output,
+        rules.tables.input,
         rules.calibrate.output,
         rules.runtime.output,
-        [file for dataset in TABULATED for file in paper_tables_of(dataset)],
         lambda w: [
             file for dataset in default_datasets() for file in figures_of(dataset)
         ],

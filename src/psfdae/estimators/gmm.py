@@ -239,8 +239,7 @@ class GaussianMixture(Method):
             raise FitError(
                 f"{next(iter(cls.groups))}.components = {gmm.components}: "
                 f"must be at most {learn.size}, the number of training stars"
-                + " without those that choose"
-                * searched
+                f"{' without those that choose' if searched else ''}"
             )
         clusters, told, shrinkage = sizes[0], cls.told_position, gmm.shrinkage[0]
         if searched:
