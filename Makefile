@@ -90,7 +90,7 @@ shipped: env ## Train the model that comes with the package and renew it
 
 report: env ## Gather the figures of a finished run in results/report.html
 	@mkdir -p .snakemake
-	@set -f; flock .snakemake/psfdae.lock \
+	@set -f; export PYTHONWARNINGS='ignore:coroutine:RuntimeWarning'; flock .snakemake/psfdae.lock \
 	  $(SNAKEMAKE) --report "$$PSFDAE_RESULTS/.report.html" -- $${TARGETS:-$(REPORTED)}
 	@mv "$$PSFDAE_RESULTS/.report.html" "$$PSFDAE_RESULTS/report.html"
 

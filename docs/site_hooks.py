@@ -23,7 +23,7 @@ CELL = re.compile(r"<td[^>]*>[^<]*")
 NUMBER = re.compile(r"[-+−]?\d[\d.]*e[-+]\d+")
 LIMITS = {"minimum": "≥", "exclusiveMinimum": ">", "maximum": "≤", "exclusiveMaximum": "<"}
 HEAD = ("| key | type | allowed | default | meaning |", "|---|---|---|---|---|")
-PRESETS = {"config": ["preset"], "alignment": ["cnn_train", "alignment_preset"]}
+PRESETS = {"config": ["preset"], "alignment": ["network_train", "alignment_preset"]}
 """Groups of options that set keys of several groups."""
 
 Schema = Mapping[str, Any]

@@ -17,9 +17,11 @@ import re
 import subprocess
 import sys
 from functools import cache
+from itertools import combinations
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pandas as pd
 
 from psfdae.alignment import methods as scene3
@@ -146,6 +148,68 @@ def run():
     return _names(json.loads(file("provenance.json")))
 
 
+def poppy(name):
+    """Errors on POPPY's stars, with the labels of the methods, which end the bundles' names."""
+    table = csv(name)
+    ends = table.bundle.str.extract(r"-realisation-(\w+)$", expand=False).fillna(table.method)
+    return table.assign(label=[method(m).label for m in ends])
+
+
+def strange():
+    """Stars found by either measure, by kind and noise level."""
+    table = csv("tables/predict_strange.csv").query("kind != 'usual'")
+    wide = table.pivot_table("found", ["kind", "noise_level"], "measure", sort=False)
+    return wide.reset_index()
+
+
+def real_sky():
+    """Errors on a real image by S/N: ours, the better setting of each package, and the fluxes."""
+    table = csv("tables/real_sky.csv")
+    table["family"] = table.package.str.rstrip("0123456789")
+    rows = []
+    for snr, cell in table.groupby("snr"):
+        better = cell.loc[cell.groupby("family").mse.idxmin()].set_index("family")
+        errors = (f"{m:.2e} ± {s:.0e}" for m, s in zip(better.mse, better.stderr, strict=True))
+        row = {"snr": snr} | dict(zip(better.index, errors, strict=True))
+        ours, others = better.loc["psfdae"], cell[cell.family != "psfdae"]
+        row |= dict(ours[["ratio", "ratio_stderr", "flux_bias", "bias_stderr", "flux_scatter"]])
+        rows.append(row | {"least_scatter": others.flux_scatter.min()})
+    return pd.DataFrame(rows)
+
+
+def _seeded():
+    """Errors of all methods by dataset, noise level and seed."""
+    names = ("dataset3", "dataset5")
+    return pd.concat(csv(f"tables/seeds_{name}.csv").assign(dataset=name) for name in names)
+
+
+def seeds():
+    """Mean over seeds, error of the stars and relative scatter of every method."""
+    cells = _seeded().groupby(["dataset", "method", "noise_level"], sort=False)
+    table = cells.agg(mse=("mse", "mean"), stderr=("stderr", "mean"), scatter=("mse", "std"))
+    table = table.assign(scatter=table.scatter / table.mse).reset_index()
+    return table.assign(label=[method(m).label for m in table.method])
+
+
+def ordering():
+    """Pairs of methods that differ by 3 standard errors in the record, seed by seed."""
+    recorded = csv("tables/psf_metrics.csv").query(
+        "split == 'random' and reference == 'realisation' and metric == 'mse'"
+    )
+    rows = []
+    for (dataset, level), cell in _seeded().groupby(["dataset", "noise_level"]):
+        tried = cell.pivot_table("mse", "seed", "method")
+        known = recorded[(recorded.dataset == dataset) & (recorded.noise_level == level)]
+        known = known.set_index("method").loc[tried.columns].sort_values("value")
+        for (one, a), (other, b) in combinations(known.iterrows(), 2):
+            if b.value - a.value > 3 * np.hypot(a.stderr, b.stderr):
+                row = {"dataset": dataset, "noise_level": level, "seeds": len(tried)}
+                row |= {"better": method(one).label, "worse": method(other).label}
+                row |= {"ratio": b.value / a.value, "kept": (tried[one] < tried[other]).sum()}
+                rows.append(row)
+    return pd.DataFrame(rows)
+
+
 def errors(name="tables/psf_metrics.csv"):
     """MSE of every method by dataset, split, reference and noise level."""
     keys = ["dataset", "split", "reference", "noise_level"]
@@ -160,10 +224,18 @@ def presets():
     return errors().merge(literal, on=[*CELL, "split"], suffixes=("", "_paper"))
 
 
-def held_out():
-    """MSE on fields that no training saw beside that of the random split."""
-    split = dict(list(errors().groupby("split")))
-    return split["held_out"].merge(split["random"], on=CELL, suffixes=("", "_random"))
+def readings():
+    """PCA+SOM as the paper can be read: rise with λ², errors over the paper's and the usual."""
+    table = csv("tables/baseline_readings.csv")
+    usual = table.query("reading == 'map' and per_level == 'yes'")
+    usual = usual.set_index(CELL).mse.rename("usual")
+    keys, rows = ["dataset", "reference", "reading", "per_level"], []
+    for key, column in table.join(usual, CELL).groupby(keys, sort=False):
+        row = dict(zip(keys, key, strict=True)) | {"over_paper": column.over_paper.tolist()}
+        for name in ("mse", "mse_paper"):
+            row[name] = np.polyfit(column.noise_level**2, column[name], 1)[0]
+        rows.append(row | {"over_usual": (column.mse / column.usual).iloc[0]})
+    return pd.DataFrame(rows)
 
 
 def fit():
@@ -178,7 +250,12 @@ def bounds(method="bayes"):
     table = rows.query("method == @method").merge(floor, "left", CELL, suffixes=("", "_floor"))
     growth = csv("tables/psf_bounds_growth.csv").sort_values("draws")
     keys = [key for key in (*CELL, "method") if key in growth]
-    table = table.merge(growth.drop_duplicates(keys, keep="last"), "left", keys)
+    growth = growth.drop_duplicates(keys, keep="last")
+    # Of a record made before stars were drawn around matches, only the bank's growth tells more.
+    table = table.merge(growth, "left", keys, suffixes=("", "_bank"))
+    bank = table.draws.notna().map({True: "bank", False: "sum"})
+    table = table.reindex(columns=[*dict.fromkeys([*table, "found", "missed"])])
+    table["found"] = table.found.astype(object).fillna(bank)
     table["draws"] = table.draws.map("{:.0f}".format, na_action="ignore").fillna("exact")
     return table
 
@@ -210,7 +287,7 @@ def mae():
             table.loc[(level, row["method"]), "paper"] = sum(row[s] for s in STATES) / len(STATES)
         table.loc[level, "bound"] = table.loc[(level, "cramer_rao"), "mean"]
     order = pd.MultiIndex.from_product([table.index.levels[0], ALIGNERS], names=table.index.names)
-    return table.reindex(order).reset_index()
+    return table.reindex(order.intersection(table.index, sort=False)).reset_index()
 
 
 def wins(better, worse):

@@ -11,8 +11,8 @@ from psfdae.own_stars import example
 from psfdae.own_stars.observation import Source
 
 
-def open_observation(path, stamp_px, margin=0, larger=False, **stated):
-    return Source(Path(path), **stated).open(stamp_px, margin, larger)
+def open_observation(path, stamp_px, margin=0, **stated):
+    return Source(Path(path), **stated).open(stamp_px, margin)
 
 
 def write_cube(path, stamps, compress=False, **cards):

@@ -7,29 +7,32 @@ import pytest
 import torch
 from torch import nn
 
-from psfdae.alignment.cnn import (
-    AlignmentCnn,
-    CnnTraining,
-    TrainingStates,
-    build_cnn,
-    noise_weights,
-    predict_states,
-)
 from psfdae.alignment.fisher import (
     bound_covariances,
     coma_free_decentre,
     expected_abs_error,
-    fisher_information,
+    parameters_of,
+    score_and_information,
+    stamps_and_slopes,
     twin_states,
 )
 from psfdae.alignment.fit import Likelihood, fit_states, refit_twins
+from psfdae.alignment.networks import (
+    AlignmentCnn,
+    NetworkTraining,
+    TrainingStates,
+    build_network,
+    noise_weights,
+    predict_states,
+)
 from psfdae.alignment.stamps import AlignmentStamps
 from psfdae.alignment.telescope import mirror_symmetries, uniform_states
-from psfdae.configuration.alignment import Cnn, Fit
+from psfdae.configuration.alignment import Cnn, Perceptron
 from psfdae.configuration.compose import ConfigError, load
 from psfdae.estimators.training import TrainingError, train
 
-EXACT = Fit(iterations=25, tolerance=1e-7, damping=1e-3, limit=1.25)
+FIT = load((), "alignment").fit
+EXACT = FIT.model_copy(update={"iterations": 25, "tolerance": 1e-7})
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +81,10 @@ def test_eight_symmetries_are_different(states, stamps):
     assert len(mirror_symmetries(6)) == 4
 
 
-# --- CNN
+# --- networks
+
+CNN = Cnn(widths=[4] * 5, kernels=[3] * 5, strides=[1, 2, 1, 2, 2], leak=0.01)
+PERCEPTRON = Perceptron(components=10, widths=[16, 8])
 
 
 def test_cnn_is_the_paper_s(config):
@@ -106,31 +112,35 @@ def _tiny():
     return rng.random((6, 9, 16, 16), dtype=np.float32), rng.uniform(-1, 1, (6, 4))
 
 
-def _training(config, epochs, data, seed=3):
+def _training(config, epochs, data, seed=3, network=CNN):
     stamps, states = data
-    settings = config.train_original.model_copy(
+    usual = config.train_original if network is CNN else config.train_noise_trained
+    settings = usual.model_copy(
         update={"epochs": epochs, "batch": 3, "mirrors": True, "checkpoint_seconds": 0}
     )
-    cnn = Cnn(widths=[4] * 5, kernels=[3] * 5, strides=[1, 2, 1, 2, 2], leak=0.01)
-    return CnnTraining(TrainingStates(states, stamps), cnn, settings, seed, "test")
+    return NetworkTraining(TrainingStates(states, stamps), network, settings, seed, "test")
 
 
 def _train(path, *given, report=lambda row: None):
     return train(lambda attempt: _training(*given), path, path.name, report)
 
 
-def test_training_is_deterministic_and_resumes_where_it_was(config, tmp_path):
-    whole, other = (_train(tmp_path / str(seed), config, 4, _tiny(), seed) for seed in (3, 4))
+@pytest.mark.parametrize("network", [CNN, PERCEPTRON])
+def test_training_is_deterministic_and_resumes_where_it_was(config, network, tmp_path):
+    whole, other, *_ = (
+        _train(tmp_path / str(seed), config, 4, _tiny(), seed, network) for seed in (3, 4)
+    )
 
     def interrupt(row):
         if row["epoch"] == 3:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        _train(tmp_path / "c", config, 4, _tiny(), report=interrupt)
+        _train(tmp_path / "c", config, 4, _tiny(), 3, network, report=interrupt)
     seen = []
     resumed = _train(
-        tmp_path / "c", config, 4, _tiny(), report=lambda row: seen.append(row["epoch"])
+        *(tmp_path / "c", config, 4, _tiny(), 3, network),
+        report=lambda row: seen.append(row["epoch"]),
     )
     assert seen == [3, 4]
     assert [row["loss"] for row in resumed.history] == [row["loss"] for row in whole.history]
@@ -146,10 +156,24 @@ def test_training_refuses_what_is_not_finite(config, tmp_path):
         _train(tmp_path / "x", config, 2, (stamps * np.nan, states))
 
 
-def test_cnn_learns_states_from_clean_stamps(config, stamps, states, tmp_path):
-    training = _train(tmp_path / "x", config, 60, (stamps, states))
+@pytest.mark.parametrize("network", [CNN, PERCEPTRON])
+def test_networks_learn_states_from_clean_stamps(config, stamps, states, network, tmp_path):
+    training = _train(tmp_path / "x", config, 60, (stamps, states), 3, network)
     error = np.abs(predict_states(training.model, stamps) - states).mean()
     assert error < 0.7 * np.abs(states).mean()
+
+
+def test_perceptron_sees_uncorrelated_numbers_of_variance_1(config, stamps, states):
+    model = _training(config, 1, (stamps, states), network=PERCEPTRON).model
+    seen = np.concatenate([m.stamps(stamps) for m in mirror_symmetries(8)])
+    scaled = torch.from_numpy(seen).flatten(1) * stamps.shape[-1] ** 2
+    features = ((scaled - model.mean) @ model.axes).numpy()
+    assert np.cov(features.T) == pytest.approx(np.eye(10), abs=1e-3)
+    assert features.mean(axis=0) == pytest.approx(np.zeros(10), abs=1e-3)
+    # No other ten numbers hold more of the stamps.
+    kept = np.square(features / np.linalg.norm(model.axes.numpy(), axis=0)).sum()
+    largest = np.linalg.svd(scaled.numpy() - model.mean.numpy(), compute_uv=False)[:10]
+    assert kept == pytest.approx(np.square(largest).sum(), rel=1e-3)
 
 
 def test_configuration_names_what_is_wrong():
@@ -163,7 +187,7 @@ def test_weights_come_from_the_generator_alone(config):
     def weights(seed):
         generator = torch.Generator()
         generator.manual_seed(seed)
-        return build_cnn(config.cnn, 9, 16, generator).linear.weight
+        return build_network(config.cnn, 9, 16, generator).linear.weight
 
     torch.manual_seed(0)
     first = weights(1)
@@ -178,7 +202,7 @@ def test_weights_come_from_the_generator_alone(config):
 def _batches(config, size, data, epoch=0):
     """Batches of an epoch without mirror images, as arrays."""
     settings = config.train_original.model_copy(update={"batch": size})
-    training = CnnTraining(data, config.cnn, settings, 1, "x")
+    training = NetworkTraining(data, config.cnn, settings, 1, "x")
     batches = [tuple(part.numpy() for part in batch) for batch in training.batches(epoch)]
     assert len(batches) == training.steps
     return batches
@@ -228,9 +252,8 @@ def test_gaussian_noise_has_poisson_s_variance(noise, stamps):
 
 def test_fisher_matrix_against_finite_differences(model, exact_operator, noise):
     state = np.array([[0.3, -0.5, 0.4, 0.2]])
-    fisher = fisher_information(
-        *exact_operator.derivatives(model(state), model.jacobian(state)), noise, 0.002
-    )
+    stamps, slopes = stamps_and_slopes(model, exact_operator, state)
+    _, fisher = score_and_information(0 * stamps, slopes, noise.variance(stamps, 0.002))
     step = 1e-4
     plus, minus = (exact_operator(model(state + sign * step * np.eye(4)))[0] for sign in (1, -1))
     slopes = ((plus - minus) / (2 * step)).reshape(4, -1)
@@ -285,29 +308,144 @@ def test_score_is_the_slope_of_the_likelihood(model, exact_operator, noise, stat
         assert score[axis] == pytest.approx(-(plus - minus) / (4 * step), rel=1e-3, abs=1e-2)
 
 
-def test_scatter_of_the_fit_is_the_bound(model, operator, noise, states, stamps):
+@pytest.mark.parametrize("movable", [False, True])
+def test_scatter_of_the_fit_is_the_bound(model, config, noise, states, stamps, movable):
     """At low noise the estimator is efficient: χ² of 30 × 4 errors within its 99.9 % range."""
+    operator = AlignmentStamps(config.telescope, config.optics, config.alignment, movable)
     level = 2e-4
     images = noise.draw(stamps, level, np.random.default_rng(7))
     likelihood = Likelihood(model, operator, noise, level)
-    settings = Fit(iterations=8, tolerance=0.05, damping=1e-3, limit=1.25)
-    found = fit_states(likelihood, images, states + 0.01, settings)
+    found = fit_states(likelihood, images, states + 0.01, FIT)
     covariances = bound_covariances(model, operator, noise, [level], states)[0]
-    error = found.states - states
+    error = found.states[:, :4] - states
     chi2 = np.einsum("nk,nkl,nl->", error, np.linalg.inv(covariances), error)
     assert 75 < chi2 < 177
     # Pixels minus parameters, with the spread √(2 N) of χ².
-    pixels = 9 * 16 * 16
-    assert found.deviance.mean() == pytest.approx(pixels - 4, abs=5 * np.sqrt(2 * pixels / 30))
+    pixels, free = 9 * 16 * 16, 4 + 27 * movable
+    assert found.deviance.mean() == pytest.approx(pixels - free, abs=5 * np.sqrt(2 * pixels / 30))
+
+
+class Uphill(Likelihood):
+    """Every step makes it worse, the shorter the less."""
+
+    def evaluate(self, images, states):
+        count, fisher = len(states), np.eye(4)
+        return (states**2).sum(axis=1), states, np.broadcast_to(fisher, (count, 4, 4)).copy()
+
+
+def test_a_step_that_damping_made_small_is_no_convergence(model, operator, noise, stamps):
+    start = np.array([[0.5, 0.5, 0.5, 0.5], [0.01, 0.01, 0.01, 0.01]])
+    settings = FIT.model_copy(update={"tolerance": 0.05})
+    found = fit_states(Uphill(model, operator, noise, 0.002), stamps[:2], start, settings)
+    assert found.converged.tolist() == [False, True]
+    # A short step is taken without another look.
+    assert found.states == pytest.approx(np.array([start[0], 2 * start[1]]))
+    assert found.evaluations.tolist() == [13, 1]
+
+
+def test_free_flux_and_place_are_recovered(model, exact_operator, config, noise):
+    """Noise-free stamps of another flux and place, from the true state: exactly those."""
+    truth = np.array([[0.3, -0.5, 0.4, 0.2]])
+    movable = _movable(config, "complex128")
+    given = parameters_of(model, movable, truth)
+    given[0, 4:] = np.random.default_rng(4).uniform(-0.2, 0.2, 27)
+    images, _ = stamps_and_slopes(model, movable, given)
+    still = exact_operator(model(truth))[0]
+    assert images.sum(axis=(2, 3))[0] == pytest.approx(1 + given[0, 4::3])
+    assert np.abs(images - still).max() > 0.01
+    found = fit_states(Likelihood(model, movable, noise, 0.002), images, truth + 0.08, EXACT)
+    assert found.converged.all()
+    assert found.states == pytest.approx(given, abs=1e-6)
+
+
+def _movable(config, precision="complex64"):
+    optics = config.optics.model_copy(update={"precision": precision})
+    return AlignmentStamps(config.telescope, optics, config.alignment, movable=True)
+
+
+def test_free_parameters_slopes_against_finite_differences(model, config, noise, states):
+    movable, step = _movable(config, "complex128"), 1e-5
+    given = parameters_of(model, movable, states[:1])
+    given[0, 4:] = np.random.default_rng(4).uniform(-0.2, 0.2, 27)
+    _, slopes = stamps_and_slopes(model, movable, given)
+    for axis, field in ((0, 3), (4, 0), (8, 1), (9, 1), (30, 8)):
+        move = step * np.eye(31)[axis]
+        plus, minus = (stamps_and_slopes(model, movable, given + s * move)[0][0] for s in (1, -1))
+        own = axis if axis < 4 else 4 + (axis - 4) % 3
+        expected = (plus - minus) / (2 * step)
+        assert slopes[0, field, own] == pytest.approx(expected[field], abs=1e-7)
+        assert axis < 4 or not np.delete(expected, field, axis=0).any()
+
+
+def test_what_is_free_costs_precision(model, config, operator, noise, states):
+    """By a quarter to a third, and never gains in any direction."""
+    told, free = (
+        bound_covariances(model, stamps, noise, [0.002], states)[0]
+        for stamps in (operator, _movable(config))
+    )
+    ratio = expected_abs_error(free).mean() / expected_abs_error(told).mean()
+    assert 1.2 < ratio < 1.35
+    assert np.linalg.eigvalsh(free - told).min() > -1e-9
 
 
 def test_fit_stays_near_the_range(model, operator, noise):
     truth = np.array([[1.0, -1.0, 1.0, 1.0]])
     stamps = operator(model(truth))[0]
     images = noise.draw(stamps, 0.02, np.random.default_rng(3))
-    settings = Fit(iterations=8, tolerance=0.05, damping=1e-3, limit=1.0)
+    settings = FIT.model_copy(update={"limit": 1.0})
     found = fit_states(Likelihood(model, operator, noise, 0.02), images, truth, settings)
     assert np.abs(found.states).max() <= 1.0
+
+
+@pytest.fixture(scope="module")
+def coarse(config):
+    """The optics of all steps but the last."""
+    optics = config.optics.model_copy(update={"pupil_samples": FIT.pupil_samples})
+    return AlignmentStamps(config.telescope, optics, config.alignment, narrow=True)
+
+
+def test_coarse_optics_err_by_a_part_of_a_standard_error(
+    model, operator, coarse, noise, states, stamps
+):
+    """By what their stamps move a fit, and by what their slopes make noise of it."""
+    slopes, theirs = (stamps_and_slopes(model, o, states)[1] for o in (operator, coarse))
+    error, variance = coarse(model(states))[0] - stamps, noise.variance(stamps, 0.002)
+    score, fisher = score_and_information(error, slopes, variance)
+    covariance = np.linalg.inv(fisher)
+    shift = np.sqrt(np.einsum("nk,nkl,nl->n", score, covariance, score))
+    assert 0.02 < np.median(shift) < 0.25
+    assert shift.max() < 1.0
+    spread = score_and_information(error, theirs - slopes, variance)[1]
+    wander = np.sqrt(np.einsum("nkl,nlk->n", spread, covariance))
+    assert 0.01 < np.median(wander) < 0.2
+
+
+def test_last_step_reaches_the_maximum_of_the_exact_optics(
+    model, config, operator, coarse, noise, states, stamps
+):
+    states, level = states[:10], 0.002
+    images = noise.draw(stamps[:10], level, np.random.default_rng(8))
+    mixed = AlignmentStamps(config.telescope, config.optics, config.alignment, coarse=coarse)
+    near, last, exact = (Likelihood(model, o, noise, level) for o in (coarse, mixed, operator))
+    first = fit_states(near, images, states + 0.02, FIT)
+    found = fit_states(last, images, first.states, FIT)
+    best = fit_states(exact, images, found.states, FIT.model_copy(update={"tolerance": 0.01}))
+    assert found.converged.all()
+    assert found.evaluations.mean() < 1.5
+    sigma = np.sqrt(np.diagonal(np.linalg.inv(best.fisher), axis1=1, axis2=2))
+    off = [np.sqrt(np.mean(((f.states - best.states) / sigma) ** 2)) for f in (first, found)]
+    assert off[1] < 0.05 < off[0]
+    # The gain of a step that is not looked at.
+    assert found.deviance == pytest.approx(best.deviance, abs=0.05)
+
+
+def test_start_far_beyond_the_range_is_safe(model, coarse, noise, stamps):
+    images, start = stamps[:2], np.array([[9.0, -9.0, 9.0, -9.0], [1.25, 1.25, 1.25, 1.25]])
+    likelihood = Likelihood(model, coarse, noise, 0.005)
+    found = fit_states(likelihood, images, start, FIT)
+    before = likelihood.evaluate(images, np.clip(start, -FIT.limit, FIT.limit))[0]
+    assert np.abs(found.states).max() <= FIT.limit
+    assert (found.deviance < before).all()
 
 
 def test_twin_keeps_the_coma_and_turns_the_tilt(model, config):
@@ -324,13 +462,15 @@ def test_twin_keeps_the_coma_and_turns_the_tilt(model, config):
     )
 
 
-def test_wrong_twin_is_left_for_the_more_likely_state(model, operator, noise):
+@pytest.mark.parametrize("movable", [False, True])
+def test_wrong_twin_is_left_for_the_more_likely_state(model, config, noise, movable):
+    operator = AlignmentStamps(config.telescope, config.optics, config.alignment, movable)
     noll = np.arange(4, 23)
     tilt = np.array([[0.1, 0.12]])
     truth = np.hstack([coma_free_decentre(model, tilt, noll), tilt])
-    images = operator(model(truth))[0]
+    images, _ = stamps_and_slopes(model, operator, parameters_of(model, operator, truth))
     likelihood = Likelihood(model, operator, noise, 0.002)
-    settings = Fit(iterations=12, tolerance=0.05, damping=1e-3, limit=1.25)
+    settings = FIT.model_copy(update={"tolerance": 0.05})
     # A fit that stopped at the twin.
     stuck = fit_states(
         likelihood,
@@ -340,5 +480,5 @@ def test_wrong_twin_is_left_for_the_more_likely_state(model, operator, noise):
     )
     found, tried = refit_twins(likelihood, images, stuck, noll, settings)
     assert tried.all()
-    assert found.states == pytest.approx(truth, abs=2e-3)
+    assert found.states[:, :4] == pytest.approx(truth, abs=2e-3)
     assert found.deviance[0] < stuck.deviance[0]

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 from click.testing import CliRunner
 
-from psfdae.alignment.methods import CNNS, ESTIMATORS, LEARNED, METHODS
+from psfdae.alignment.methods import ESTIMATORS, LEARNED, METHODS, TRAINED
 from psfdae.cli import main
 from psfdae.configuration.compose import ConfigError, config_dir, load, load_stage, overrides_for
 from psfdae.evaluation import alignment_tables
@@ -90,11 +90,11 @@ def tables(products):
     at = products
     data = ("--grid", at / "grid.h5", "--train", at / "train.h5", "--checkpoint", at / "c")
     _run("train-dae", *data, "--out", at / "dae", *PRESET)
-    for name in CNNS:
+    for name in TRAINED:
         given = ("--kind", name, "--states", at / f"{METHODS[name].states}.h5")
         given += ("--dae", at / "dae") if METHODS[name].denoised else ()
-        _run("train-cnn", *given, "--checkpoint", at / "c", "--out", at / name, *PRESET)
-    networks = [w for n in ("dae", *CNNS) for w in (f"--{n.replace('_', '-')}", at / n)]
+        _run("train-network", *given, "--checkpoint", at / "c", "--out", at / name, *PRESET)
+    networks = [w for n in ("dae", *TRAINED) for w in (f"--{n.replace('_', '-')}", at / n)]
     test = ("--set", "uniform", "--states", at / "uniform.h5")
     model = ("--model", at / "model.h5")
     times = ("--times", at / "estimates.csv")
@@ -103,7 +103,7 @@ def tables(products):
     given = ["--estimates", at / "estimates.h5", "--bound", at / "bound.h5"]
     for level in ("0.002", "0.005"):
         out = at / f"fit_{level}.h5"
-        chosen = ("--level", level, "--cnn", at / "noise_trained", "--out", out)
+        chosen = ("--level", level, "--network", at / "noise_trained", "--out", out)
         times = ("--times", out.with_suffix(".csv"))
         _run("fit", *test, *model, *chosen, *times, *PRESET, "fit.iterations=1")
         given += ["--fit", out]
@@ -210,7 +210,7 @@ def test_tables_hold_every_method(tables):
     clean = set(errors[errors.noise_level == 0].method)
     assert clean == {"constant", *(method.name for method in LEARNED)}
     correlation = pd.read_csv(tables / "correlation.csv")
-    assert len(correlation) == 16 * (2 * 7 + 4)
+    assert len(correlation) == 16 * (2 * 8 + 4)
     diagonal = correlation[correlation.parameter_a == correlation.parameter_b]
     assert diagonal.correlation.to_numpy() == pytest.approx(1)
 
@@ -230,13 +230,13 @@ def test_paper_s_rows_stand_beside_ours(tables):
 
 
 def test_time_table(tables):
-    given = [f"--history={n}={tables / n}/history.csv" for n in ("dae", *CNNS)]
+    given = [f"--history={n}={tables / n}/history.csv" for n in ("dae", *TRAINED)]
     given += [f"--times={tables / name}" for name in ("estimates.csv", "fit_0.002.csv")]
     _run("time-table", *given, "--out", tables / "time.csv")
     table = pd.read_csv(tables / "time.csv").set_index("method")
     assert list(table.index) == [method.name for method in ESTIMATORS]
     assert table.training_seconds["dae"] >= table.training_seconds["original"]
-    assert table.states["max_likelihood"] == 12
+    assert table.states["max_likelihood"] == table.states["max_likelihood_free"] == 12
 
 
 @pytest.mark.parametrize("kind", ["predicted", "errors", "correlation", "stamps"])
@@ -265,7 +265,7 @@ def test_twin_is_closer_in_focus(tmp_path):
 
 
 def test_dae_option_goes_with_its_kind(tmp_path):
-    arguments = ["alignment", "train-cnn", "--kind", "dae_retrained", "--states", "x.h5"]
+    arguments = ["alignment", "train-network", "--kind", "dae_retrained", "--states", "x.h5"]
     result = CliRunner().invoke(
         main, [*arguments, "--checkpoint", str(tmp_path / "c"), "--out", str(tmp_path / "o")]
     )

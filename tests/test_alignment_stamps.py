@@ -63,7 +63,8 @@ def test_centroid_of_the_whole_image_is_in_the_stamp_s_centre(tracer, config):
         sampling = PeriodSampling(pupil, samples, pixel, "complex128")
         modes = partial(centred_modes, 22, OBSCURATION)
         images = ModalStamps(pupil, modes, sampling, pixel).stamps(zernikes)
-        assert images.sum(axis=(1, 2)) == pytest.approx(1, abs=1e-12)
+        parseval = (pupil.amplitude**2).sum() / pupil.amplitude.sum()
+        assert images.sum(axis=(1, 2)) == pytest.approx(parseval, abs=1e-12)
         position = (np.arange(samples) - 0.5 * (samples - 1)) * pixel / config.telescope.pixel
         centroids = [images.sum(axis=axis) @ position for axis in (1, 2)]
         worst.append(np.abs(centroids).max())
@@ -96,6 +97,22 @@ def test_period_sampling_integrates_pixels_exactly(tracer, exact, config):
     assert errors[0] < 1e-3
     assert errors[1] < 1e-5
     assert errors[2] < 1e-7
+
+
+def test_pixels_beyond_the_period_stay_dark(tracer, exact, config):
+    """A narrow period repeats nothing inside the stamp, and holds all light."""
+    zernikes, pixel = shown_zernikes(tracer)[:1] * 0.5, config.telescope.pixel
+    pupil = annular_pupil(62, OBSCURATION)
+    sampling = PeriodSampling(pupil, 16, pixel, "complex128", narrow=True)
+    stamp = ModalStamps(pupil, partial(centred_modes, 22, OBSCURATION), sampling, pixel).stamps(
+        zernikes
+    )[0]
+    dark = np.abs((np.arange(16) - 7.5) * pixel) > 31
+    assert dark.sum() == 8
+    assert not stamp[dark].any() and not stamp[:, dark].any()
+    inside = np.ix_(~dark, ~dark)
+    whole = exact.operator(254).stamps(zernikes)[0]
+    assert stamp[inside] == pytest.approx(whole[inside], abs=3e-3 * whole.max())
 
 
 @pytest.mark.parametrize("kind", ["nodes", "period"])

@@ -229,7 +229,7 @@ def test_no_state_of_the_grid_is_vignetted(tracer):
         ("alignment.decenter_range_m=0", r"alignment\.decenter_range_m = 0: .*greater than 0"),
         ("alignment.grid_levels=1", r"alignment\.grid_levels = 1: .*greater than or equal to 2"),
         ("alignment.stamp_px=15", r"alignment\.stamp_px = 15: .*multiple of 2"),
-        ("optics.pupil_samples=[158,126]", r"pupil_samples = \[158, 126\]: must be ascending"),
+        ("optics.pupil_samples=[158,126]", r"pupil_samples: \[158, 126\] must be ascending"),
     ],
 )
 def test_wrong_configuration_is_named(override, message):

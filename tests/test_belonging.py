@@ -208,7 +208,7 @@ def test_measurements_need_the_stars_of_their_configuration(at, words):
     [
         ([prediction.throughput, "--stars", "s.h5"], "framing.subpixel", (True, False)),
         (
-            [prediction.poppy, "--evaluation", "e.csv", "telescope.diameter_m=2"],
+            [prediction.poppy, "telescope.diameter_m=2"],
             "telescope.diameter_m",
             (1.0, 2.0),
         ),
@@ -344,7 +344,7 @@ def write_network(folder, *overrides, **config):
 
 
 OTHER = "telescope.pixel_scale_arcsec=0.4"
-CNNS = ("original", "noise_trained", "dae_retrained")
+TRAINED = ("original", "noise_trained", "dae_retrained")
 
 
 @pytest.fixture(scope="module")
@@ -356,8 +356,8 @@ def mirror(tmp_path_factory):
         write(at / f"{name}model.h5", "alignment_model", model, coefficients=np.zeros((9, 15, 19)))
         write_states(at / f"{name}states.h5", *more)
         write_network(at / f"{name}dae", *more)
-        for cnn in CNNS:
-            write_network(at / f"{name}{cnn}", *more, name=cnn, fields=9, stamp_px=16)
+        for network in TRAINED:
+            write_network(at / f"{name}{network}", *more, name=network, fields=9, stamp_px=16)
     write_network(at / "large", name="original", fields=9, stamp_px=24)
     return at
 
@@ -367,12 +367,12 @@ DEFOCUS = ("alignment.defocus_m", (0.0001, 0.0002))
 
 
 def estimate(**changed):
-    used = {"dae": "dae", **{cnn: cnn for cnn in CNNS}, **changed}
+    used = {"dae": "dae", **{name: name for name in TRAINED}, **changed}
     networks = [f"--{role.replace('_', '-')}=@{folder}" for role, folder in used.items()]
     return ["estimate", "--set=uniform", "--states=@states.h5", *networks, "--times=@t.csv"]
 
 
-FIT = ["fit", "--set=uniform", "--level=2e-3", "--times=@t.csv", "--cnn=@original"]
+FIT = ["fit", "--set=uniform", "--level=2e-3", "--times=@t.csv", "--network=@original"]
 
 
 @pytest.mark.parametrize(
@@ -391,7 +391,7 @@ FIT = ["fit", "--set=uniform", "--level=2e-3", "--times=@t.csv", "--cnn=@origina
         ),
         (
             [
-                *("train-cnn", "--kind=dae_retrained", "--states=@states.h5"),
+                *("train-network", "--kind=dae_retrained", "--states=@states.h5"),
                 *("--dae=@other_dae", "--checkpoint=@c.pt"),
             ],
             "other_dae/trained_on.yaml",
@@ -424,7 +424,7 @@ def test_products_of_scene_3_are_of_one_telescope(mirror, words, file, found):
     refused(mirror, *words, file=file, key=found[0], values=found[1])
 
 
-def test_states_that_choose_between_cnns_are_those_of_their_stamps(mirror):
+def test_states_that_choose_between_networks_are_those_of_their_stamps(mirror):
     data = {"states": "states.h5", "validation": "states.h5", "test": "other_states.h5"}
     roles = [word for role, name in data.items() for word in ("--data", role, mirror / name)]
     words = ("sweep", "point", "--model=original", "--dataset=original", *roles, "--level=2e-3")

@@ -15,8 +15,12 @@ import prediction
 import speed
 import trainings
 from psfdae.configuration.compose import load, load_stage
+from psfdae.estimators import TrainingSet
+from psfdae.estimators.pca_som import Baseline
+from psfdae.files import Column, write_product
 from psfdae.optics.wavefronts import seidel_wavefronts
-from psfdae.own_stars.bundle import shipped_path
+from psfdae.own_stars.bundle import read_bundle, shipped_path
+from psfdae.stars.fields import square_grid
 from psfdae.stars.framing import Propagation, normalise_flux
 from workflow_runs import ROOT, planned, snakemake
 
@@ -81,12 +85,38 @@ def test_grid_has_the_point_in_use_first_and_respects_the_limit():
     assert max(k for k, *_ in trainings.grid_around((8, 4, 4, 2), 10)) == 10
 
 
-def test_baseline_point_reports_the_error_of_its_predictions(gaussian_stars):
-    fit = {"components": 4, "rows": 3, "columns": 3, "epochs": 2}
-    fit |= {"sigma": 1.0, "learning_rate": 0.5, "seed": 1}
+def test_baseline_point_reports_the_error_of_its_predictions(gaussian_stars, noise):
+    settings = {"components": 4, "rows": 3, "columns": 3, "epochs": 2, "threads": 1}
+    settings |= {"sigma": 1.0, "learning_rate": 0.5, "reading": "map", "per_level": True}
     truths = {"realisation": gaussian_stars, "template": 0 * gaussian_stars}
-    point = trainings.time_point(gaussian_stars, [gaussian_stars], truths, fit, 2)
+    stars = np.arange(len(gaussian_stars))
+    data = TrainingSet(gaussian_stars, gaussian_stars, stars, stars[:0], np.array([1e-5]), noise)
+    point = trainings.time_point(data, Baseline(**settings), {1e-5: gaussian_stars}, truths, 2)
     assert 0 < point["mse_realisation"] < (gaussian_stars**2).mean() < 2 * point["mse_template"]
+
+
+def test_readings_of_the_baseline_stand_beside_the_paper_s(tmp_path, gaussian_stars):
+    columns = {
+        "realisation": Column(gaussian_stars, "1", "stars"),
+        "template": Column(gaussian_stars, "1", "templates"),
+        "field_index": Column(np.arange(300) % 25, "1", "field"),
+        "grid": Column(square_grid(5, 1.0)[0], "1", "grid"),
+    }
+    given = ("dataset=dataset3", "preset=smoke", "baseline.components=4")
+    given += ("parts.train_stars=200", "parts.test_stars=100")
+    config = load_stage(trainings.readings.stage.reads, given)
+    write_product(tmp_path / "s.h5", "stars", columns, config.model_dump())
+    trainings.readings(config, tmp_path / "s.h5", tmp_path / "t.csv")
+    table = pd.read_csv(tmp_path / "t.csv")
+    assert len(table) == 2 * 3 * 4
+    errors = table.set_index(["reference", "reading", "per_level", "noise_level"])
+    assert errors.over_paper.to_numpy() == pytest.approx(errors.mse / errors.mse_paper, rel=1e-5)
+    assert errors.mse_paper["realisation", "map", "yes", 0.005] == 5.2028e-5
+    # A fit of quiet stars beats one of mixed stars there.
+    assert (
+        errors.mse["realisation", "map", "yes", 0.001]
+        < errors.mse["realisation", "map", "no", 0.001]
+    )
 
 
 # Growth
@@ -176,22 +206,30 @@ def test_poppy_simulates_the_same_stars():
 
 def test_poppy_table(tmp_path, monkeypatch, field_psfs):
     monkeypatch.setattr(prediction, "poppy_stars", lambda config, count: field_psfs[:count])
-    config = load_stage(prediction.READS, ["dataset=field", "noise.levels=[1.0e-3,3.0e-3]"])
-    table = pd.DataFrame(
-        {"method": "dae", "metric": "mse", "noise_level": [1e-3, 3e-3], "value": [2.8e-6, 1.0e-5]}
-    )
-    table.to_csv(tmp_path / "evaluation.csv", index=False)
-    arguments = (config, shipped_path(), tmp_path / "evaluation.csv", tmp_path / "out.csv", 300)
-    prediction.poppy(*arguments)
+    config = load_stage(prediction.READS, ["dataset=field"])
+    prediction.poppy(config, (shipped_path(),), tmp_path / "out.csv", 300)
     found = pd.read_csv(tmp_path / "out.csv")
-    assert list(found.columns) == columns("predict_poppy")
-    assert found["noise_level"].tolist() == [1e-3, 3e-3]
-    assert (found["met"] == "yes").all()
-    assert (found["ratio_estimated"] > found["ratio_given"]).all()
-    assert found["coverage_given"].between(0.63, 0.73).all()
-    table.iloc[:1].to_csv(tmp_path / "evaluation.csv", index=False)
-    with pytest.raises(RuntimeError, match=r"evaluation\.csv: 0 rows.*0\.003"):
-        prediction.poppy(*arguments)
+    assert found["noise_level"].tolist() == config.noise.levels
+    middle = found[found["snr"].between(10, 200)]
+    assert len(middle) >= 3 and (middle["met"] == "yes").all()
+    assert (middle["ratio_estimated"] > middle["ratio_given"]).all()
+    assert middle["coverage_given"].between(0.63, 0.73).all()
+    knows = read_bundle().ratio95 is not None
+    assert middle["coverage95_given"].between(0.92, 0.97).all() == knows
+
+
+def test_strange_stars_are_made_of_usual_ones(field_psfs):
+    """Each kind has flux 1; a companion adds light to the stars and a turn moves it."""
+    kinds = prediction.unlike(field_psfs, np.random.default_rng(1))
+    assert next(iter(kinds)) == "usual" and kinds["usual"] is not field_psfs
+    for images in kinds.values():
+        np.testing.assert_allclose(images.sum(axis=(1, 2)), 1.0, rtol=1e-5)
+    np.testing.assert_allclose(kinds["turned"], np.rot90(kinds["usual"], axes=(1, 2)), rtol=1e-5)
+    light = kinds["companion"] * (1 + prediction.COMPANION_FLUX) - kinds["usual"]
+    assert light.min() > -1e-6
+    struck = kinds["cosmic ray"] * (1 + prediction.RAY_PX * prediction.RAY_FLUX)
+    bright = (struck - kinds["usual"] > 0.5 * prediction.RAY_FLUX).sum(axis=(1, 2))
+    assert (bright == prediction.RAY_PX).all()
 
 
 # Figures and targets
@@ -223,10 +261,18 @@ def test_all_methods_are_timed_and_drawn(smoke, tmp_path):
 def test_targets_on_request(smoke, tmp_path):
     # Other tests want the folder as the default target leaves it.
     folder = shutil.copytree(smoke, tmp_path / "run", symlinks=True)
-    snakemake(folder, "prediction", "scaling", "on_request", "seeds")
+    snakemake(folder, "prediction", "scaling", "on_request", "seeds", "readings")
     tables = {p.stem: pd.read_csv(p) for p in (folder / "results/tables").glob("*.csv")}
-    for name in ("predict_poppy", "predict_throughput", "scaling_stages"):
+    for name in ("predict_throughput", "scaling_stages"):
         assert list(tables[name].columns) == columns(name)
+    poppy = tables["predict_poppy"]
+    # A DAE that was trained on fresh stars is a DAE; the bundle's name tells them apart.
+    assert set(poppy.method) == {"dae", "gmm", "gmm_simulated"}
+    assert poppy.bundle.nunique() == 4
+    assert poppy.coverage95_given.isna().equals(poppy.method.str.startswith("dae"))
+    assert set(tables["predict_poppy_field"].method) == {"dae", "gmm"}
+    usual = tables["predict_strange"].query("kind == 'usual'")
+    assert (usual.found - usual.false_alarms).abs().max() < 0.02
     (row,) = tables["predict_throughput"].to_dict("records")
     assert row["stamps"] == 64
     assert row["share"] == pytest.approx(row["predict_per_s"] / row["bare_per_s"], rel=1e-4)
@@ -236,7 +282,9 @@ def test_targets_on_request(smoke, tmp_path):
     assert (stages[["time_s", "cpu_s", "peak_mb", "disk_mb"]] > 0).all().all()
     seeds = tables["seeds_dataset3"]
     assert set(seeds.groupby("method").seed.nunique()) == {5}
+    readings = tables["baseline_readings"]
+    assert set(readings.groupby(["dataset", "noise_level"]).size()) == {3, 6}
     asked = {"gmm_simulated", "gmm_simulated_position", "dae_simulated"}
     for name in ("psf_metrics_on_request", "psf_efficiency_on_request"):
         assert asked <= set(tables[name].method)
-    assert planned(folder, "prediction", "scaling", "on_request", "seeds") == {}
+    assert planned(folder, "prediction", "scaling", "on_request", "seeds", "readings") == {}

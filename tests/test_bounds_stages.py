@@ -23,7 +23,7 @@ from psfdae.stages.common import noisy_test_images, split_stars
 LEVELS = (0.001, 0.003, 0.01, 0.1)
 SIZES = ("preset=smoke", "grid.points=3", "stars.count=60", "parts.train_stars=20")
 SIZES += ("parts.test_stars=40", "bounds.bank_stars=80", "bounds.test_stars=24")
-SIZES += ("bounds.position_stars=40",)
+SIZES += ("bounds.position_stars=40", "bounds.star_draws=60")
 SIZES += (f"noise.levels={list(LEVELS)}", "bounds.threads=1", "optics.threads=1")
 
 
@@ -112,7 +112,7 @@ def test_bounds_of_scene_1(scene_1):
     assert (table.ci_high > table.value).all()
 
 
-def test_growth_ends_with_the_error_of_the_table(scene_1):
+def test_growth_of_the_bank_decides_from_what_the_error_comes(scene_1):
     growth = pd.read_csv(scene_1 / "growth.csv")
     assert list(growth.columns) == bounds.GROWTH_COLUMNS
     table = pd.read_csv(scene_1 / "bounds.csv")
@@ -124,11 +124,25 @@ def test_growth_ends_with_the_error_of_the_table(scene_1):
         told = key[1] == "bayes_position"
         allowed = ([15, 30, 60, 120],) if told else ([5, 10, 20, 40, 80], [5, 10, 20])
         assert sizes.draws.tolist() in allowed
-        assert sizes.mse.iloc[-1] == pytest.approx(best.value[key])
         change = abs(sizes.mse.iloc[-3] / sizes.mse.iloc[-1] - 1)
         # The quotient of two numbers of six digits.
         assert sizes.last_change.tolist() == pytest.approx([change] * len(sizes), abs=3e-6)
-        assert best.tight[key] == ("yes" if change <= 0.05 else "no")
+        row = best.loc[key]
+        if change <= 0.05:
+            assert (row.found, row.tight, row.draws) == ("bank", "yes", sizes.draws.max())
+            assert row.value == pytest.approx(sizes.mse.iloc[-1])
+        else:
+            assert (row.found, row.draws) == ("draws", 60)
+            assert row.tight == ("yes" if max(row.last_change, row.missed) <= 0.05 else "no")
+            assert sizes.limit.isna().all()
+            # At the lowest noise the nearest star of a bank of 80 is far away.
+            if key[0] == "realisation" and key[2] == 0.001:
+                assert row.value < sizes.mse.iloc[-1]
+    assert set(best.found) == {"bank", "draws"}
+    assert (best.ess_median >= 1).all()
+    assert (
+        best.missed[best.index.get_level_values("method") == "bayes_position"].dropna() == 0
+    ).all()
     assert growth.ess_mean.min() >= 1
     assert growth.draws.max() == 120
 
@@ -144,7 +158,7 @@ def test_bounded_stars_are_the_first_test_stars_with_their_noise(scene_1):
     used = bounds._test_stars(config, product).noisy
     assert list(used) == list(LEVELS)
     for level in LEVELS:
-        everyone = noisy_test_images(config, product["realisation"][test], level)
+        everyone = noisy_test_images(config, product, test, level)
         assert (used[level] == everyone[:24]).all()
 
 
@@ -193,7 +207,9 @@ def test_efficiency_of_a_known_method(scene_1, factor, verdict):
     assert set(floor.reference) == {"realisation"}
     assert len(floor) == len(LEVELS)
     assert floor.efficiency.to_numpy() == pytest.approx(floor.mse_bound / floor.mse, rel=1e-5)
-    assert set(pd.concat([tight, floor]).verdict) == {verdict}
+    # At low noise a few stars in doubtful fields have most of the error, and its uncertainty.
+    sure = pd.concat([tight[tight.noise_level > 0.005], floor])
+    assert set(sure.verdict) == {verdict}
     thin = ours[(ours.bound == "bayes") & (ours.tight == "no")]
     assert thin.verdict.isna().all()
     assert thin.efficiency.isna().all()
@@ -207,7 +223,8 @@ def test_the_posterior_mean_respects_the_floor(scene_1):
     assert len(rows) == 2 * len(LEVELS)
     assert set(rows.bound) == {"floor"}
     assert set(rows.verdict) == {"ok"}
-    assert (rows.efficiency < 1).all()
+    # The floor is no strict limit: the mean given the field may lie a little below it.
+    assert rows.efficiency.median() < 1
 
 
 @pytest.mark.parametrize(("factor", "verdict"), [(1.0, "ok"), (1e-3, "beaten")])
@@ -218,7 +235,7 @@ def test_a_method_told_the_field_is_judged_by_the_mean_told_it(
     table = compared(scene_1, "dataset6", factor, "bayes_position")
     rows = table[table.method == "lmmse"]
     assert set(rows.bound) == {"bayes_position", "floor"}
-    tight = rows[rows.tight == "yes"]
+    tight = rows[(rows.tight == "yes") & (rows.noise_level > 0.005)]
     assert len(tight)
     assert set(tight.verdict) == {verdict}
     assert tight.efficiency.to_numpy() == pytest.approx(1 / factor, rel=1e-5)
@@ -309,3 +326,34 @@ def test_figure_stages_write_png_and_name_what_is_missing(scene_1, tmp_path):
         assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
     with pytest.raises(ProductError, match="no rows of dataset1"):
         figures.figure_bank_growth("dataset1", scene_1 / "growth.csv", tmp_path / "h.png")
+
+
+@pytest.mark.parametrize(
+    ("bound", "tight", "verdict"),
+    [
+        (0.0, "yes", "above"),
+        (8.0e-7, "yes", "above"),
+        (8.0e-7, "no", "above"),
+        (8.5e-7, "yes", "at the bound"),
+        (8.5e-7, "no", "bound not tight"),
+        (1.0e-6, "yes", "below what this scene allows"),
+    ],
+)
+def test_a_row_of_the_paper_is_judged_by_a_tight_bound_alone(tmp_path, bound, tight, verdict):
+    """The paper's DAE has 8.4012e-7 in this column."""
+    column = {"dataset": "dataset8", "noise_level": 0.003}
+    limit = {"method": "bayes", "metric": "mse", "value": bound, "stderr": 1e-8, "tight": tight}
+    rows = [column | limit | {"reference": name} for name in ("realisation", "template")]
+    rows += [rows[0] | {"metric": "p_right"}, rows[0] | {"method": "bayes_position"}]
+    pd.DataFrame(rows).to_csv(tmp_path / "bounds.csv")
+    ours = column | {"reference": "realisation", "bound": "bayes", "method": "dae", "mse": 3e-6}
+    others = [ours | {"method": "lmmse"}, ours | {"bound": "floor"}, ours | {"dataset": "dataset7"}]
+    pd.DataFrame([ours, *others]).to_csv(tmp_path / "efficiency.csv")
+    out = tmp_path / "paper.csv"
+    bounds.beside_the_paper(tmp_path / "bounds.csv", tmp_path / "efficiency.csv", out)
+    (row,) = pd.read_csv(out).to_dict("records")
+    assert list(row) == bounds.PAPER_COLUMNS
+    assert (row["method"], row["mse_paper"], row["mse"]) == ("dae", 8.4012e-7, 3e-6)
+    expected = 8.4012e-7 / bound if bound else np.nan
+    assert row["paper_over_bound"] == pytest.approx(expected, rel=1e-6, nan_ok=True)
+    assert row["verdict"] == verdict

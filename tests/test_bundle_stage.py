@@ -31,7 +31,7 @@ from psfdae.own_stars.model import PsfModel
 from psfdae.own_stars.photometry import FluxModel, noise_equivalent_px, signal_to_noise
 from psfdae.rng import stream
 from psfdae.stages import bundle as stage
-from psfdae.stages.common import noise_model, noisy_test_images
+from psfdae.stages.common import noise_model, noisy_test_images, read_stars
 from psfdae.stages.evaluate import Models
 from psfdae.stages.fit import fit, train
 
@@ -62,10 +62,12 @@ def gaussians(count, seed):
 
 def write_stars(path, config):
     images = gaussians(1400, 1)
+    grid = np.stack([np.arange(25) % 5, np.arange(25) // 5], axis=1)
     columns = {
         "realisation": Column(images, "1", "noise-free image"),
         "field_index": Column(np.arange(1400) % 25, "1", "field"),
-        "grid": Column(np.stack([np.arange(25) % 5, np.arange(25) // 5], axis=1), "1", "index"),
+        "grid": Column(grid, "1", "index"),
+        "position": Column(100.0 * grid, "pixel", "of stars of an image"),
     }
     write_product(path, "stars", columns, config)
     return path
@@ -135,8 +137,9 @@ def test_metrics_are_those_of_the_stage_evaluate(folder, tiny):
     from psfdae.stars.fields import random_split
 
     test = random_split(1400, 1000, 400, config.parts.validation_fraction, config.seed).test
+    stars = read_stars(folder / "stars.h5")
     for row in tiny.info.metrics:
-        noisy = noisy_test_images(config, images[test], row["noise_level"])
+        noisy = noisy_test_images(config, stars, test, row["noise_level"])
         estimate = estimator(tiny).predict(noisy)
         assert row["mse"] == pytest.approx(np.square(estimate - images[test]).mean(), rel=1e-4)
         assert row["mse"] < row["mse_noisy"]
@@ -368,14 +371,26 @@ def test_shipped_bundle_covers_stars_that_nobody_has_seen(tmp_path):
     noise = np.exp(rng.uniform(*band, size=len(images)))
     config = load_stage(stage.bundle.stage.reads, chosen)
     noisy = noise_model(config).draw(images, noise / config.noise.kappa, rng)
-    error = estimator(bundle).predict(noisy) - images
+    level = noise / config.noise.kappa
+    error = packing.errors_of(estimator(bundle).estimate(noisy, level), images)
     covered = packing.coverage(error, noise, bundle.noise_nodes, bundle.error68)
     assert covered == pytest.approx(0.6827, abs=0.05)
     assert packing.coverage(error, noise, bundle.noise_nodes, bundle.rms) > 0.75
 
 
-def test_ship_names_checks_and_writes(folder, tiny, tmp_path):
-    stage.ship(folder / "tiny.psf.safetensors", tmp_path / "bundles")
+def test_ship_names_checks_and_writes(folder, tiny, tmp_path, capsys):
+    """The bundle that errs least on the validation stars, of a fit that has not seen them."""
+    config = load_stage(stage.ship.stage.reads, TINY)
+    given = {"stars": folder / "stars.h5", "out": tmp_path / "bundles"}
+    weights = {name: 0 * array for name, array in tiny.weights.items()}
+    write_bundle(replace(tiny, weights=weights), tmp_path / "none.psf.safetensors")
+    worse, better = tmp_path / "none.psf.safetensors", folder / "tiny.psf.safetensors"
+    stage.ship(config, (worse, better), **given)
+    said = [
+        float(line.split("MSE ")[1].split()[0]) for line in capsys.readouterr().out.splitlines()[:2]
+    ]
+    assert said[0] > 2 * said[1]
+    assert read_bundle(tmp_path / "bundles/wfsat.psf.safetensors").weights.keys() == weights.keys()
     (out,) = (tmp_path / "bundles").iterdir()
     assert out.name == "wfsat.psf.safetensors"
     assert read_bundle(out).info.licence == "MIT"
@@ -383,4 +398,4 @@ def test_ship_names_checks_and_writes(folder, tiny, tmp_path):
     poor = replace(tiny, info=tiny.info.model_copy(update={"metrics": rows}))
     write_bundle(poor, tmp_path / "poor.psf.safetensors")
     with pytest.raises(BundleError, match=r"error68 holds 50\.0% of the errors"):
-        stage.ship(tmp_path / "poor.psf.safetensors", tmp_path / "bundles")
+        stage.ship(config, (tmp_path / "poor.psf.safetensors",), **given)

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+from itertools import combinations
+
 import numpy as np
 import pandas as pd
 import pytest
 
 from command_line import psfdae, refused
-from psfdae.evaluation.comparison import compare_errors, config_differences, training_summary
+from psfdae.evaluation.comparison import (
+    compare_errors,
+    config_differences,
+    held_out_ratios,
+    training_summary,
+)
 from psfdae.files import write_text
 
 FIELDS, STARS = 20, 400
@@ -29,15 +36,15 @@ def errors(seed, dae, noise_seed=1):
 def test_equal_networks_are_the_same_and_a_better_one_is_better():
     verdicts = []
     for seed in range(40):
-        table = compare_errors(errors(100 + seed, 1e-5), errors(200 + seed, 1e-5))
+        table = compare_errors(errors(100 + seed, 1e-5), errors(200 + seed, 1e-5), {})
         verdicts += list(table[table.method == "dae"].verdict)
     assert verdicts.count("same") >= 0.9 * len(verdicts)
-    table = compare_errors(errors(1, 1e-5), errors(2, 0.8e-5)).set_index(["method", "metric"])
+    table = compare_errors(errors(1, 1e-5), errors(2, 0.8e-5), {}).set_index(["method", "metric"])
     assert table.verdict["dae", "mse"] == "better"
     assert table.verdict["dae", "ssim"] == "better"
     assert table.verdict["noisy", "mse"] == "same"
     assert table.difference["dae", "mse"] == pytest.approx(-2e-6, rel=0.2)
-    other_way = compare_errors(errors(2, 0.8e-5), errors(1, 1e-5))
+    other_way = compare_errors(errors(2, 0.8e-5), errors(1, 1e-5), {})
     assert set(other_way[other_way.method == "dae"].verdict) == {"worse"}
 
 
@@ -46,13 +53,55 @@ def test_pairs_of_stars_show_what_independent_samples_hide():
     first = errors(1, 1e-5)
     second = first.copy()
     second.loc[second.method == "dae", "mse"] *= 0.98
-    paired = compare_errors(first, second)
+    paired = compare_errors(first, second, {})
     assert paired[(paired.metric == "mse") & (paired.method == "dae")].verdict.item() == "better"
     noisy = second.method == "noisy"
     second.loc[noisy, "mse"] = errors(1, 1e-5, noise_seed=9)[noisy].mse
-    unpaired = compare_errors(first, second)
+    unpaired = compare_errors(first, second, {})
     row = unpaired[(unpaired.metric == "mse") & (unpaired.method == "dae")]
     assert row.verdict.item() == "same"
+
+
+def test_seeds_count_beside_the_stars():
+    """Five trainings of one setting are the same; without their scatter few of them are."""
+    draws = np.random.default_rng(4).normal(1.0, 0.03, 5)
+    trained = []
+    for factor in draws:
+        table = errors(1, 1e-5)
+        table.loc[table.method == "dae", "mse"] *= factor
+        table.ssim = 1 - 1e3 * table.mse
+        trained.append(table)
+
+    def different(scatter):
+        tables = [compare_errors(a, b, scatter) for a, b in combinations(trained, 2)]
+        return [(t[t.method == "dae"].verdict != "same").sum() for t in tables]
+
+    assert sum(different({"dae": 0.03})) <= 1 and sum(different({})) > 10
+    half = trained[0].copy()
+    half.loc[half.method == "dae", "mse"] *= 0.5
+    row = compare_errors(trained[0], half, {"dae": 0.03}).query("method == 'dae' & metric == 'mse'")
+    assert row.verdict.item() == "better"
+    assert row.seed_stderr.item() == pytest.approx(0.03 * np.hypot(row["first"], row.second).item())
+
+
+def test_held_out_fields_are_compared_on_the_stars_that_both_splits_test():
+    """Each split has stars of its own besides: easy ones there, hard ones here."""
+    both = errors(1, 1e-5).assign(reference="realisation")
+    seen = both[both.star < 300].assign(split="random")
+    unseen = both[both.star >= 100].assign(split="held_out")
+    seen.loc[seen.star < 100, "mse"] = 1.0
+    network = unseen.method == "dae"
+    unseen.loc[network, "mse"] *= 1.25
+    unseen.loc[unseen.star >= 300, "mse"] = 0.0
+    alone = seen.assign(dataset="one split only")
+    table = held_out_ratios(pd.concat([seen, unseen, alone])).set_index("method")
+    assert set(table.dataset) == {"d"}
+    assert table.ratio.to_dict() == pytest.approx({"noisy": 1.0, "dae": 1.25})
+    assert table.stderr.to_numpy() == pytest.approx([0, 0], abs=1e-12)
+    assert set(table.n) == {200}
+    assert set(table.fields) == {FIELDS}
+    assert table.mse_held_out["dae"] == pytest.approx(1.25 * table.mse_random["dae"])
+    assert held_out_ratios(alone).empty
 
 
 def test_settings_and_curves():

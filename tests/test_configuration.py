@@ -8,7 +8,7 @@ from psfdae.configuration import compose
 from psfdae.configuration.compose import ConfigError, as_overrides, config_dir, load, load_stage
 from psfdae.configuration.consistency import SIMULATION
 from psfdae.estimators import groups_of
-from psfdae.stages.alignment_methods import train_cnn, train_dae
+from psfdae.stages.alignment_methods import train_dae, train_network
 from psfdae.stages.evaluate import READS
 
 DATASETS = sorted(p.stem for p in config_dir().glob("dataset/[!_]*.yaml"))
@@ -61,7 +61,7 @@ def test_paper_preset_has_the_paper_s_hyper_parameters():
         ("telescope.obscuration=1.0", r"telescope\.obscuration = 1\.0: .*less than 1"),
         ("dae.widths=[8,8]", r"dae: widths = \[8, 8\]: 10 kernels need 9 widths"),
         ("dae.kernels=[4,4]", r"dae: kernels = \[4, 4\]: must be odd"),
-        ("optics.pupil_samples=[300,200]", r"pupil_samples = \[300, 200\]: must be ascending"),
+        ("optics.pupil_samples=[300,200]", r"pupil_samples: \[300, 200\] must be ascending"),
         ("parts.train_stars=19", r"baseline\.components = 20: must be at most .* 19"),
         ("baseline.components=300", r"baseline\.components = 300: must be at most .* 256"),
         ("+train.momentum=0.9", r"train\.momentum: unknown key"),
@@ -97,7 +97,7 @@ def test_search_distances_follow_from_the_telescope():
     [
         (("seed", "noise", "parts", "dae", "train"), "config"),
         (train_dae.stage.reads, "alignment"),
-        (train_cnn.stage.reads("original"), "alignment"),
+        (train_network.stage.reads("original"), "alignment"),
     ],
 )
 def test_settings_that_cannot_change_a_result_are_set_apart(groups, root):

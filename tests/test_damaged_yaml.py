@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from command_line import psfdae
+from psfdae.configuration import compose
 from psfdae.configuration.compose import ConfigError, config_dir, forget, load
 from psfdae.files import ProductError
 from psfdae.reading import read_csv, read_json, read_table, read_yaml
@@ -34,7 +35,7 @@ SHOWN = {
     "telescope/example_zernike.yaml": [*DATASET, "dataset=_telescope"],
     "alignment.yaml": SCENE3,
     "prescription/rc15.yaml": SCENE3,
-    "cnn_train/denoised.yaml": SCENE3,
+    "network_train/denoised.yaml": SCENE3,
 }
 """Files, and the command that reads each."""
 
@@ -275,3 +276,20 @@ def test_a_wrong_value_is_repeated_only_in_part(folder):
     with pytest.raises(ConfigError) as refusal:
         load()
     assert len(str(refusal.value).splitlines()[0]) < 400
+
+
+def test_a_kept_composition_is_whole_and_up_to_date(folder, tmp_path, monkeypatch):
+    monkeypatch.setattr(compose, "KEPT", [tmp_path / "kept"])
+    first = load()
+    (kept,) = (tmp_path / "kept").iterdir()
+    forget()
+    with monkeypatch.context() as patch:
+        patch.setattr(compose, "_by_hydra", None)
+        assert load() == first
+    kept.write_bytes(kept.read_bytes().replace(b"0", b"1", 1))
+    forget()
+    assert load() == first
+    path = folder / "config.yaml"
+    path.write_text(path.read_text().replace(f"seed: {first.seed}", "seed: 7"))
+    forget()
+    assert load().seed == 7

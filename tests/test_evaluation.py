@@ -8,7 +8,14 @@ import pytest
 from scipy.stats import pearsonr
 from skimage.metrics import mean_squared_error, structural_similarity
 
-from psfdae.evaluation.metrics import all_metrics, clustered_mean, error_correlation, mse, ssim
+from psfdae.evaluation.metrics import (
+    all_metrics,
+    clustered_mean,
+    clustered_ratio,
+    error_correlation,
+    mse,
+    ssim,
+)
 from psfdae.evaluation.paper import as_markdown, paper_table
 
 
@@ -70,6 +77,20 @@ def test_clustered_error_counts_fields_where_stars_repeat():
 
 def test_one_cluster_has_no_error():
     assert np.isnan(clustered_mean(np.ones(5), np.zeros(5, dtype=int))[1])
+
+
+def test_error_of_a_paired_ratio_is_its_scatter():
+    """Stars of a field share a factor; the stars' own scatter cancels in the ratio."""
+    rng = np.random.default_rng(2)
+    field = np.repeat(np.arange(40), 10)
+    found = []
+    for _ in range(300):
+        stars = rng.gamma(1.0, 1.0, field.size)
+        worse = 1.1 * stars * rng.normal(1, 0.1, 40)[field]
+        found.append(clustered_ratio(worse, stars, field))
+    ratio, stderr = np.transpose(found)
+    assert ratio.mean() == pytest.approx(1.1, abs=0.005)
+    assert stderr.mean() == pytest.approx(ratio.std(), rel=0.15)
 
 
 def test_paper_table_puts_ours_beside_the_paper_s():

@@ -21,11 +21,10 @@ from psfdae.evaluation.figures import (
 )
 from psfdae.evaluation.paper import published
 from psfdae.files import Column, ProductError, write_product
-from psfdae.rng import stream
 from psfdae.stages import figures as stage
+from psfdae.stages.common import noisy_test_images, read_stars
 from psfdae.stages.evaluate import READS, Models
 from psfdae.stars.fields import random_split, square_grid
-from psfdae.stars.noise import NoiseModel
 
 METHODS = ("noisy", "pca_som", "dae", "lmmse")
 LEVELS = (0.001, 0.002, 0.003, 0.005)
@@ -54,14 +53,14 @@ def rgb_at(figure, axes, x, y):
 
 def metrics_table(splits=("random",), references=("realisation", "template"), dataset="dataset3"):
     rows = [
-        (dataset, split, reference, method, level, metric, 10.0 * level + 0.01 * i, 1e-3, 7)
+        (dataset, split, reference, method, level, metric, 10.0 * level + 0.01 * i, 1e-3, 0.0, 7)
         for split in splits
         for reference in references
         for i, method in enumerate(METHODS)
         for level in LEVELS
         for metric in ("mse", "ssim")
     ]
-    names = "dataset split reference method noise_level metric value stderr n"
+    names = "dataset split reference method noise_level metric value stderr seed_stderr n"
     return pd.DataFrame(rows, columns=names.split())
 
 
@@ -194,7 +193,7 @@ def test_stages_write_the_same_bytes_twice(tmp_path):
         "templates": lambda out: stage.figure_templates(tmp_path / "t.h5", out),
         "energy": lambda out: stage.figure_energy(tmp_path / "t.h5", out),
         "curves": lambda out: stage.figure_curves(["one"], [tmp_path / "h.csv"], out),
-        "errors": lambda out: stage.figure_errors("dataset3", "mse", [tmp_path / "m.csv"], out),
+        "errors": lambda out: stage.figure_errors("dataset3", [tmp_path / "m.csv"], [("mse", out)]),
     }
     for name, draw in draws.items():
         one, two = tmp_path / f"{name}_1.png", tmp_path / f"{name}_2.png"
@@ -222,7 +221,7 @@ def test_a_users_matplotlibrc_changes_nothing(tmp_path):
 def unchanged(kind, *place):
     """A fit that gives images back as they are."""
     fit = kind.__new__(kind)
-    object.__setattr__(fit, "predict", lambda noisy: noisy)
+    object.__setattr__(fit, "predict", lambda noisy, *told: noisy)
     return fit
 
 
@@ -257,9 +256,7 @@ def test_strip_shows_the_noise_that_evaluate_measures(tmp_path, gaussian_stars, 
     stage.figure_strip(*given, levels=[0.002], out=tmp_path / "strip.png")
     assert [row.own_scale for row in shown["rows"]] == [False, False, True, False, False]
     test = random_split(300, 200, 100, config.parts.validation_fraction, config.seed).test
-    rng = stream(config.seed, "noise", "test", "0.002")
-    noise = NoiseModel(config.noise.kappa, config.noise.background_photons)
-    expected = noise.draw(gaussian_stars[test], 0.002, rng)
+    expected = noisy_test_images(config, read_stars(tmp_path / "s.h5"), test, 0.002)
     for image in shown["rows"][2].images:
         assert (expected == image).all(axis=(1, 2)).any()
     assert len(shown["columns"]) == 8
@@ -268,7 +265,7 @@ def test_strip_shows_the_noise_that_evaluate_measures(tmp_path, gaussian_stars, 
 def test_refusals_name_the_problem(tmp_path):
     metrics_table().to_csv(tmp_path / "m.csv", index=False)
     with pytest.raises(ProductError, match="no rows of dataset5, mse"):
-        stage.figure_errors("dataset5", "mse", [tmp_path / "m.csv"], tmp_path / "e.png")
+        stage.figure_errors("dataset5", [tmp_path / "m.csv"], [("mse", tmp_path / "e.png")])
     (tmp_path / "h.csv").write_text("step,train_mse\n1,2\n")
     with pytest.raises(ProductError, match="validation_mse"):
         stage.figure_curves(["one"], [tmp_path / "h.csv"], tmp_path / "c.png")

@@ -29,6 +29,7 @@ from psfdae.own_stars.example import (
     star_images,
 )
 from psfdae.own_stars.photometry import noise_equivalent_px
+from psfdae.own_stars.report import MEAN_PSF
 from psfdae.own_stars.selection import brightest_pixels, collect, moved, star_centres
 from psfdae.own_stars.stamps import cut
 from psfdae.own_stars.training_images import OwnNoise, make_images, star_grid, training_columns
@@ -42,6 +43,7 @@ from psfdae.stars.fields import held_out_fields
 ROOT = Path(__file__).resolve().parents[1]
 SIDE = {"side_px": 700, "bright": 60, "faint": 80, "blended": 6, "saturated": 3}
 TINY = ["preset=smoke", "parts.train_stars=120", "parts.test_stars=30", "train.epochs=1"]
+TINY += ["methods=[noisy,pca_som,lmmse,dae,gmm,field]"]
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +63,8 @@ def field(tmp_path_factory):
 def model(field, tmp_path_factory):
     """Folder of the command on the small image, and what it said."""
     out = tmp_path_factory.mktemp("own") / "model"
-    result = run(field[0], "--catalogue", field[1], "--out", out, *TINY)
+    page = out.with_name("page.html")
+    result = run(field[0], "--catalogue", field[1], "--out", out, "--report", page, *TINY)
     assert result.exit_code == 0, result.output
     return out, result.output
 
@@ -127,6 +130,22 @@ def test_selection_keeps_good_stars_only(field, candidates):
     assert (candidates.bright.row == np.flatnonzero(good)).all()
     measured = candidates.snr[good]
     assert measured.min() >= 100.0
+
+
+def test_what_the_list_says_against_a_star_counts(field, candidates, config, tmp_path):
+    """SExtractor's flags, and rows without a position; the other stars stay good."""
+    listed = pd.read_csv(field[1]).assign(FLAGS=0)
+    good = candidates.bright.row[:5]
+    listed.loc[good[:4], "FLAGS"] = [1, 2, 7, 8]
+    listed.loc[good[4], "X_IMAGE"] = np.nan
+    listed.drop(columns=["ra", "dec"]).to_csv(tmp_path / "stars.csv", index=False)
+    observation = Source(field[0], tmp_path / "stars.csv").open(16, 8)
+    found = collect(observation, config.calibration_stars, config.framing)
+    said = ["good", "blended", "saturated", "incomplete", "no position"]
+    assert found.verdict[good].tolist() == said
+    others = np.setdiff1d(candidates.bright.row, good)
+    assert (found.verdict[others] == "good").mean() > 0.95
+    assert f"no position in row {good[4] + 1}: flagged" in observation.said()
 
 
 def test_product_stars_is_what_the_stages_read(candidates, config, tmp_path):
@@ -203,14 +222,45 @@ def test_command_leaves_a_model_and_a_report(model):
     assert bundle.info.snr_min == pytest.approx(5, rel=1e-3)
     errors = dict(re.findall(r"(.+): MSE (\S+) on validation stars", said))
     taken = method(bundle.info.method).label
-    assert len(errors) == 2 and float(errors[taken]) == min(map(float, errors.values()))
+    assert len(errors) == 3 and float(errors[taken]) == min(map(float, errors.values()))
+
+
+def test_command_ends_with_how_good_the_model_is_and_what_comes_next(field, model, tmp_path):
+    out, said = model
+    report = pd.read_csv(out / "report.csv").pivot(index="snr", columns="method", values="mse")
+    bundle = read_bundle(out / "image.psf.safetensors")
+    ratio = report[bundle.info.method] / report[MEAN_PSF]
+    *_, before, last = said.splitlines()
+    assert before.startswith(f"{method(bundle.info.method).label}: at S/N 10 the MSE is ")
+    assert float(re.search(r"is (\S+) times that of one mean PSF", before)[1]) == pytest.approx(
+        ratio[ratio.index[1]], abs=0.006
+    )
+    words = ["predict", str(field[0]), "--catalogue", str(field[1]), "--model"]
+    assert shlex.split(last)[:2] == ["next:", "psfdae"]
+    assert shlex.split(last)[2:7] == words
+    done = CliRunner().invoke(main, [*shlex.split(last)[2:-1], str(tmp_path / "psf.fits")])
+    assert done.exit_code == 0, done.output
+
+
+def test_page_shows_whether_to_trust_the_model(model):
+    out, _ = model
+    page = out.with_name("page.html").read_text(encoding="utf-8")
+    assert page.count("<img") == 7
+    report = pd.read_csv(out / "report.csv")
+    assert f"<td>{report.stars[0]}</td>" in page
+    counts = pd.read_csv(out / "selection.csv").verdict.value_counts()
+    for verdict, count in counts.items():
+        assert f"<td>{verdict}</td><td>{count}</td>" in page
+    assert "gain 1.6 electrons per count (GAIN)" in page
 
 
 def test_the_method_may_be_named(field, tmp_path):
     image, catalogue, _ = field
     words = [image, "--catalogue", catalogue, "--out", tmp_path / "model", *TINY]
     wrong = run(*words, "--method", "pca_som")
-    assert wrong.exit_code == 2 and wrong.output.endswith("--method takes one of these: dae, gmm\n")
+    assert wrong.exit_code == 2 and wrong.output.endswith(
+        "--method takes one of these: dae, gmm, field\n"
+    )
     result = run(*words, "--method", "dae")
     assert result.exit_code == 0 and "validation stars" not in result.output
     (path,) = (tmp_path / "model").glob("*.psf.safetensors")
@@ -315,7 +365,7 @@ def test_what_cannot_be_used_ends_in_one_line(field, tmp_path):
     write_cube(tmp_path / "cube.fits", stamps)
     result = run(tmp_path / "cube.fits", "--out", out, *TINY)
     assert result.exit_code == 2
-    assert "--pixel-scale" in result.output
+    assert "(of 4: 4 faint)" in result.output
     assert not out.exists()
 
 
@@ -369,7 +419,8 @@ def test_one_command_beats_the_noisy_star_and_the_baseline(tmp_path):
     """Show 4: 300 bright stars, 16 × 16 px, held-out stars at S/N 10, minutes of one core."""
     image, catalogue, out = (tmp_path / name for name in ("i.fits", "s.csv", "model"))
     made = simulate.write_example(image, catalogue, seed=1)
-    words = ["from-stars", image, "--catalogue", catalogue, "--out", out]
+    words = ["from-stars", image, "--catalogue", catalogue, "--out", out, "--method", "dae"]
+    words += ["methods=[noisy,pca_som,dae]"]
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     subprocess.run([sys.executable, "-m", "psfdae", *map(str, words)], check=True)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)

@@ -19,14 +19,16 @@ from psfdae.estimators.dae_network import (
     train_dae,
 )
 from psfdae.estimators.lmmse import LinearMmse
-from psfdae.estimators.pca_som import PcaSom, fit_pca_som
-from psfdae.estimators.training import TrainingError, orthogonal
+from psfdae.estimators.pca_som import Baseline, PcaFit, PcaSom, fit_pca_som
+from psfdae.estimators.training import TrainingError, orthogonal, progress
 from psfdae.estimators.weights import load_weights, save_checkpoint, save_weights
 from psfdae.evaluation.metrics import mse
 from psfdae.files import ProductError
 from psfdae.rng import stream
 
 SOM = {"rows": 4, "columns": 4, "epochs": 3, "sigma": 1.0, "learning_rate": 0.5, "seed": 1}
+BASELINE = {key: value for key, value in SOM.items() if key != "seed"}
+BASELINE |= {"components": 4, "threads": 1}
 DAE = DaeSettings(kernels=[5, 3, 1, 3, 5], widths=[4] * 4, init="he", scale="mean")
 TRAIN = Train(
     epochs=3,
@@ -122,7 +124,7 @@ def test_baseline_assigns_the_nearest_node():
     features = (images.reshape(-1, 64) - mean) @ components.T
     nearest = np.linalg.norm(features[:, None] - nodes, axis=2).argmin(axis=1)
     assert len(set(nearest)) > 10
-    assert (PcaSom(mean, components, nodes, np.empty((20, 64))).assign(images) == nearest).all()
+    assert (PcaFit(mean, components, nodes, np.empty((20, 64))).assign(images) == nearest).all()
 
 
 def test_baseline_recovers_separate_classes():
@@ -157,6 +159,39 @@ def test_baseline_refuses_stars_that_are_not_finite(gaussian_stars):
     broken[7, 0, 0], broken[9, 3, 3] = np.nan, np.inf
     with pytest.raises(ValueError, match=r"2 of \d+ .* not finite, the first is number 7"):
         fitted.predict(broken)
+
+
+@pytest.mark.parametrize("reading", ["map", "projection"])
+def test_baseline_of_each_level_has_that_level_s_noise(data, tmp_path, reading):
+    """Cluster means and projections carry noise of the fit's own stars."""
+    settings = Baseline(**BASELINE, reading=reading, per_level=True)
+    fitted = PcaSom.fit(data, settings)
+    assert fitted.level.tolist() == [1e-3, 5e-3]
+    low, high = (fit.predict(data.images) for fit in fitted.fits)
+    assert (low != high).any(axis=(1, 2)).all()
+    near = np.where(np.arange(len(data.images)) % 2, 2e-3, 3e-3)
+    found = fitted.predict(data.images, near)
+    assert (found == np.where(near[:, None, None] < 2.2e-3, low, high)).all()
+    assert (fitted.predict(data.images, 1.0) == high).all()
+    fitted.save(tmp_path / "fit.h5", {})
+    assert (PcaSom.load(tmp_path / "fit.h5").predict(data.images, near) == found).all()
+    assert fitted.fits[0].components.shape == (4, 256)
+    assert len(fitted.fits[0].nodes) == 0 or reading == "map"
+
+
+def test_baseline_of_mixed_levels_ignores_the_level(data):
+    mixed = PcaSom.fit(data, Baseline(**BASELINE, reading="map", per_level=False))
+    assert (mixed.predict(data.images, 1e-5) == mixed.predict(data.images, 1.0)).all()
+
+
+def test_a_projection_on_k_of_p_components_keeps_k_of_p_of_the_noise(noise):
+    images = np.full((2000, 16, 16), 1 / 256)
+    stars = np.arange(2000)
+    data = TrainingSet(images, images, stars, stars[:0], np.array([5e-3]), noise)
+    fitted = PcaSom.fit(data, Baseline(**BASELINE, reading="projection", per_level=True))
+    noisy = noise.draw(images, 5e-3, np.random.default_rng(0))
+    left = mse(fitted.predict(noisy, 5e-3), images).mean()
+    assert left == pytest.approx(4 / 256 * mse(noisy, images).mean(), rel=0.1)
 
 
 def test_dae_keeps_the_size_and_is_never_negative(gaussian_stars):
@@ -378,3 +413,14 @@ def test_weights_come_back_and_damage_is_noticed(tmp_path):
     path.unlink()
     with pytest.raises(ProductError, match="no such file"):
         load_weights(path)
+
+
+def test_progress_says_what_was_measured_and_how_long_it_takes(capsys):
+    row = {"epoch": 1, "train_mse": 2e-5, "validation_mse": np.nan, "seconds": 3.0}
+    with progress(4) as report:
+        report(row)
+        report({**row, "epoch": 2, "validation_mse": 1e-5})
+    assert capsys.readouterr().out.splitlines() == [
+        "epoch 1/4  train MSE 2.000e-05  3 s, 9 s left at most",
+        "epoch 2/4  train MSE 2.000e-05  validation MSE 1.000e-05  3 s, 3 s left at most",
+    ]

@@ -126,7 +126,7 @@ def test_toy_is_in_the_table_of_metrics(run):
 
 def test_toy_is_in_the_figures(run, tree):
     evaluations = sorted((run / "results/evaluation/dataset3").glob("*.csv"))
-    words = ("figure", "errors", "--dataset", "dataset3", "--metric", "mse", "--out", "x.png")
+    words = ("figure", "errors", "--dataset", "dataset3", "--out", "mse", "x.png")
     said = psfdae(tree, run, *words, *evaluations, program=("-c", LEGENDS))
     assert "toy" in said.split()
 

@@ -10,6 +10,7 @@ from astropy.table import Table
 from fits_inputs import open_observation, write_field
 from psfdae.own_stars.catalogue import CONVENTIONS, read_catalogue
 from psfdae.own_stars.errors import ObservationError
+from psfdae.own_stars.stamps import StarFlag
 
 D = 8
 X, Y = [12.0, 20.25, 33.5], [9.0, 15.0, 21.75]
@@ -129,6 +130,42 @@ def test_values_that_are_missing_are_nan_where_they_may_be(tmp_path):
         found.numbers("mag")
 
 
+@pytest.mark.parametrize(
+    "content",
+    [
+        "X_IMAGE,Y_IMAGE\n12,9\n,9\n12,inf\nfoo,9\n13,9\n",
+        "ALPHA_J2000,DELTA_J2000\n150,2\n,2\n150,95\nfoo,2\n150,2.0001\n",
+        "ra,dec\n10:00:00,2:00:00\n,2:00:00\n10:00:00,99:00:00\n,\n10:00:01,2:00:00\n",
+    ],
+)
+def test_a_row_without_a_position_is_kept_flagged_and_named(tmp_path, image, content):
+    path = tmp_path / "stars.csv"
+    path.write_text(content)
+    found = open_observation(image, D, catalogue=path)
+    assert found.unplaced().tolist() == [False, True, True, True, False]
+    assert f"{path}: no position in row 2, 3, 4: flagged" in found.said()
+    stamps = next(found.chunks(5))
+    assert ((stamps.flags & StarFlag.TRUNCATED) > 0).tolist() == found.unplaced().tolist()
+    assert stamps.bad[1:4].all()
+
+
+def test_sextractor_says_what_is_wrong_with_a_star(tmp_path, image):
+    names = {"X_IMAGE": 20.0, "Y_IMAGE": 15.0}
+    table = Table({"FLAGS": np.array([0, 1, 2, 7, 24])})
+    for name, value in names.items():
+        table[name] = value
+    table.write(tmp_path / "s.csv")
+    table.rename_columns(list(names), ["x_fit", "y_fit"])
+    table.write(tmp_path / "other.csv")
+    blended, saturated, truncated = StarFlag.BLENDED, StarFlag.SATURATED, StarFlag.TRUNCATED
+    for name, flags in (
+        ("s.csv", [0, 0, blended, blended | saturated, truncated]),
+        ("other.csv", [0] * 5),
+    ):
+        found = open_observation(image, D, catalogue=tmp_path / name)
+        assert next(found.chunks(5)).flags.tolist() == flags
+
+
 # What is refused: content of the catalogue, and words of the message.
 REFUSED = {
     "empty file": ("", "catalogue is empty"),
@@ -144,10 +181,11 @@ REFUSED = {
     ),
     "two skies": ("ra,dec,RAJ2000,DEJ2000\n1,1,1,1\n", "ambiguous position columns ra,dec or"),
     "case only": ("x,X,y\n1,1,1\n", "x and X differ in their case only"),
-    "text": ("X_IMAGE,Y_IMAGE\n12,9\nfoo,9\n", "'foo' in row 2"),
-    "nan": ("X_IMAGE,Y_IMAGE\n12,9\n12,nan\n", "no finite number in 1 of 2 rows.*row 2"),
-    "gap": ("X_IMAGE,Y_IMAGE\n,9\n12,9\n", "column 'X_IMAGE' has no finite number.*row 1"),
+    "text": ("X_IMAGE,Y_IMAGE\nbar,9\nfoo,9\n", "'X_IMAGE' has no finite number in any row"),
+    "nan": ("X_IMAGE,Y_IMAGE\n12,nan\n12,nan\n", "'Y_IMAGE' has no finite number in any row"),
+    "never both": ("X_IMAGE,Y_IMAGE\n,9\n12,\n", "none of the 2 stars is on the image"),
     "infinite": ("X_IMAGE,Y_IMAGE\ninf,9\n", "no finite number"),
+    "flags": ("X_IMAGE,Y_IMAGE,FLAGS\n12,9,a\n", "'FLAGS' holds 'a' in row 1"),
     "declination": ("ra,dec\n10,95\n", "95° in row 1, expected -90 … 90"),
     "sexagesimal": ("ra,dec\n10:99:00,1:2:3\n", "stars.csv: "),
     "ragged": ("X_IMAGE,Y_IMAGE\n1,2,3\n", "stars.csv: "),

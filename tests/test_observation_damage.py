@@ -60,7 +60,7 @@ def attempt(path, **options):
     for chunk in chunks:
         assert chunk.data.dtype == np.float32 and np.isfinite(chunk.data).all()
         assert chunk.data.shape == chunk.bad.shape == chunk.saturated.shape
-        assert chunk.id.shape == chunk.x.shape == chunk.y.shape == chunk.truncated.shape
+        assert chunk.id.shape == chunk.x.shape == chunk.y.shape == chunk.flags.shape
     return True
 
 
@@ -162,7 +162,7 @@ def test_what_is_not_there_or_not_fits(tmp_path, folder, name, content, message)
 @pytest.mark.parametrize(
     ("shape", "message"),
     [
-        ((4, 9, 9), "stamps of 9×9 pixels, expected 8×8 pixels"),
+        ((4, 7, 7), "stamps of 7×7 pixels, expected 8×8 pixels or larger"),
         ((4, 8, 9), "stamps of 8×9 pixels, expected 8×8 pixels"),
         ((30, 40), "an image of 30×40 pixels needs a star catalogue"),
         ((2, 3, 8, 8), "an image of 4 dimensions, expected 2 or 3"),

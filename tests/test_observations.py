@@ -13,6 +13,7 @@ from astropy.wcs import WCS
 from fits_inputs import open_observation, pack, write_cube, write_field
 from psfdae.own_stars import example
 from psfdae.own_stars.errors import ObservationError
+from psfdae.own_stars.stamps import StarFlag
 
 D = 8
 
@@ -33,10 +34,11 @@ def cube(tmp_path, stamps):
 def read(observation, rows=7):
     """All chunks, each column joined."""
     chunks = list(observation.chunks(rows))
-    return {
+    got = {
         name: np.concatenate([getattr(chunk, name) for chunk in chunks])
-        for name in ("data", "bad", "saturated", "id", "x", "y", "truncated")
+        for name in ("data", "bad", "saturated", "id", "x", "y", "flags")
     }
+    return got | {"truncated": (got["flags"] & StarFlag.TRUNCATED) > 0}
 
 
 def write_ramp(path, **cards):
@@ -129,11 +131,21 @@ def test_a_catalogue_gives_a_cube_positions_and_identifiers(tmp_path, cube):
         open_observation(cube, D, catalogue=tmp_path / "c.csv")
 
 
-def test_larger_stamps_of_a_cube_are_kept_on_request(cube):
-    with pytest.raises(ObservationError, match="stamps of 8×8 pixels, expected 6×6 pixels"):
-        open_observation(cube, 6)
-    found = open_observation(cube, 6, margin=2, larger=True)
-    assert (found.stamp_px, found.margin, found.count) == (8, 0, 40)
+@pytest.mark.parametrize(
+    ("stored", "margin", "start", "side"),
+    [(8, 0, 1, 6), (8, 2, 0, 8), (9, 0, 1, 6), (9, 5, 0, 8), (11, 1, 1, 8), (40, 2, 15, 10)],
+)
+def test_larger_stamps_of_a_cube_are_cut_about_their_middle(tmp_path, stored, margin, start, side):
+    """The star stands at index s//2, also of stamps of an odd side."""
+    pixels = np.random.default_rng(1).normal(size=(3, stored, stored)).astype(np.float32)
+    mask = np.zeros((stored, stored))
+    mask[stored // 2, stored // 2] = 1
+    write_cube(tmp_path / "odd.fits", pixels)
+    write_cube(tmp_path / "mask.fits", mask)
+    found = open_observation(tmp_path / "odd.fits", 6, margin, mask=tmp_path / "mask.fits")
+    got, part = read(found), slice(start, start + side)
+    np.testing.assert_array_equal(got["data"], pixels[:, part, part])
+    assert (np.argwhere(got["bad"][0]) == side // 2).all() and got["bad"].sum() == 3
 
 
 # What headers say

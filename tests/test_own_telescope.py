@@ -66,7 +66,9 @@ def test_page_from_the_telescope_s_file_to_restored_stars(lines, workshop):
     for step in steps:
         result = CliRunner().invoke(main, [*step, *TINY[step[0]]])
         assert result.exit_code == 0, (step, result.output, result.exception)
-    for name in ("mine/psfs.png", "mine/psfs.fits", "example_seidel/psfs.png", "night/map.png"):
+    examples = [f"example_{kind}" for kind in ("seidel", "newtonian", "ritchey_chretien")]
+    drawn = [f"{folder}/psfs.png" for folder in (*examples, "mine", "hazy")]
+    for name in (*drawn, "mine/psfs.fits", "night/map.png"):
         assert (workshop / name).stat().st_size > 5000
     with fits.open(workshop / "night/restored.fits") as restored:
         assert restored["PSF"].data.shape == (9, 16, 16)

@@ -222,7 +222,7 @@ def test_what_cannot_be_used_ends_in_one_line_and_code_2(bad, monkeypatch, words
 
 
 def test_failure_in_the_middle_leaves_no_file(folder, tmp_path, monkeypatch):
-    def fail(self, stars):
+    def fail(self, stars, fixed):
         raise MemoryError
 
     monkeypatch.setattr(engine.Engine, "block", fail)

@@ -311,8 +311,8 @@ def test_scale_of_a_pixel_is_checked(shipped):
     for scale in (0.1, 0.1019, 0.0981):
         shipped.check_scale(scale, "x.fits")
     for scale, text in (
-        (0.1021, r"x\.fits: pixels of 0\.1021 arcsec.*trained on 0\.1 arcsec"),
-        (None, r"x\.fits: .*--pixel-scale"),
+        (0.1021, r"x\.fits: pixels of 0\.1021 arcsec.*trained on 0\.1 arcsec.*psfdae from-stars"),
+        (None, r"x\.fits: .*--pixel-scale.*psfdae from-stars trains one"),
         (np.nan, r"x\.fits: pixels of nan"),
     ):
         with pytest.raises(PredictionError, match=text):

@@ -20,7 +20,7 @@ TARGETS = (
     "dataset8",
     "results/tables/dataset3_mse.csv",
     "results/tables/alignment_telescope.csv",
-    "results/alignment/original/cnn.safetensors",
+    "results/alignment/original/network.safetensors",
 )
 QUICK = [
     # A cluster without accounting answers squeue only; the rest is for jobs of a second.
@@ -127,7 +127,7 @@ def test_every_job_fits_a_node_of_one_cpu(run):
 def test_databases_and_joined_tables_stay_at_home(run):
     folder, jobs, _ = run
     rules = {re.match(r"rule_(.*?)(_wildcards|$)", job["Comment"])[1] for job in jobs.values()}
-    assert {"stars", "train", "evaluate", "alignment_cnn"} <= rules
+    assert {"stars", "train", "evaluate", "alignment_network"} <= rules
     assert not rules & {"track", "paper_tables"}
     assert (folder / "results/mlflow.db").is_file()
 

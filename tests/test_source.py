@@ -42,7 +42,8 @@ def rules():
                 node = ast.parse(re.sub(r"\{[^}]*\}", option, said).replace('f"', '"')).body[0]
                 functions = [a.value for a in node.value.args if isinstance(a, ast.Constant)]
                 words = {k.arg: k.value for k in node.value.keywords}
-                chosen = ast.literal_eval(words["chosen"]) if "chosen" in words else []
+                named = words.get("chosen", ast.List([]))
+                chosen = ast.literal_eval(named) if isinstance(named, ast.List) else [*METHODS]
                 chosen += METHODS if call[1] == "estimators" else []
                 name = " ".join(
                     [*re.findall(r"\w+", rule.replace(" with", ""))[-1:], option]

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from psfdae.configuration.compose import load
+from psfdae.files import Product
 from psfdae.optics.wavefronts import seidel_wavefronts
 from psfdae.rng import stream
-from psfdae.stages.common import template_wavefronts
+from psfdae.stages.common import noisy_test_images, template_wavefronts
 from psfdae.stars.fields import (
     assign_fields,
     draw_jitter,
@@ -155,6 +158,21 @@ def test_noise_has_the_paper_s_rms_and_the_star_s_photons(noise, gaussian_stars,
     )
     assert error.mean() == pytest.approx(0, abs=5 * np.sqrt(expected.mean() / error.size))
     assert (error**2).mean() == pytest.approx(expected.mean(), rel=0.01)
+
+
+def test_noise_is_that_of_the_star_in_every_split_and_independent_between_sets(
+    scene1, gaussian_stars
+):
+    def noise_of(name, test, level=0.003):
+        product = Product(Path("s.h5"), {"stars": {"name": name}}, {"realisation": gaussian_stars})
+        return noisy_test_images(scene1, product, np.array(test), level) - gaussian_stars[test]
+
+    ours, other = noise_of("seidel_10pct", [3, 7, 8]), noise_of("seidel_50pct", [3, 7, 8])
+    assert (noise_of("seidel_10pct", [8, 250, 3])[[2, 0]] == ours[[0, 2]]).all()
+    further = noise_of("seidel_10pct", [3, 7, 8], 0.005)
+    for noise in (other, further):
+        correlation = np.corrcoef(ours.ravel(), noise.ravel())[0, 1]
+        assert abs(correlation) < 4 / np.sqrt(ours.size)
 
 
 def test_every_level_of_a_band_is_drawn_as_often():

@@ -18,7 +18,7 @@ from psfdae.estimators.pca_som import PcaSom
 from psfdae.files import Column, ProductError, write_product
 from psfdae.stages import sweep as stage
 from psfdae.stages import sweep_summary, track
-from psfdae.stages.alignment_methods import train_cnn
+from psfdae.stages.alignment_methods import train_network
 from psfdae.stages.common import noise_model
 from psfdae.stages.fit import baseline, train
 from psfdae.stars.fields import random_split
@@ -168,7 +168,7 @@ def test_baseline_is_validated_on_stars_that_it_has_not_seen(tmp_path, gaussian_
     assert (errors > 0.9 / 256).all()
     config = load_stage(groups_of("pca_som"), TINY)
     noisy = noise_model(config).draw(images[validation], 0.001, np.random.default_rng(0))
-    seen = PcaSom.load(point.folder / "pca_som.h5").predict(noisy)
+    seen = PcaSom.load(point.folder / "pca_som.h5").predict(noisy, 0.001)
     assert ((seen - images[validation]) ** 2).mean() < 0.1 / 256
 
 
@@ -199,8 +199,11 @@ def test_cnn_is_the_main_workflow_s_and_measured_on_other_states(tmp_path):
     roles = {"states": 200, "validation": 60, "test": 50}
     data = {role: write_states(tmp_path / f"{role}.h5", rng, n) for role, n in roles.items()}
     folder = tmp_path / "points/0123456789ab"
-    given = ("alignment_preset=smoke", "train_noise_trained.mirrors=false", "cnn.widths=[8,8,8]")
-    given += ("cnn.kernels=[5,3,3]", "cnn.strides=[2,2,2]")
+    given = (
+        "alignment_preset=smoke",
+        "train_noise_trained.mirrors=false",
+        "perceptron.widths=[8,8]",
+    )
     task = Task(
         *("noise_trained", "random", "realisation"),
         data=data,
@@ -210,10 +213,10 @@ def test_cnn_is_the_main_workflow_s_and_measured_on_other_states(tmp_path):
     )
     settings = load_stage(point_groups("noise_trained"), given, "alignment")
     stage.point(settings, "noise_trained", {}, {}, task)
-    config = load_stage(train_cnn.stage.reads("noise_trained"), given, "alignment")
+    config = load_stage(train_network.stage.reads("noise_trained"), given, "alignment")
     main = tmp_path / "main"
-    train_cnn(config, "noise_trained", data["states"], tmp_path / "main.pt", main)
-    for name in ("cnn.safetensors", "config.yaml"):
+    train_network(config, "noise_trained", data["states"], tmp_path / "main.pt", main)
+    for name in ("network.safetensors", "config.yaml"):
         assert (main / name).read_bytes() == (folder / name).read_bytes()
     metrics = stage.read_result(folder / stage.RESULT)["metrics"]
     for role, name in (("validation", "validation.csv"), ("test", "evaluation.csv")):

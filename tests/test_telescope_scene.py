@@ -236,7 +236,7 @@ def test_other_scenes_keep_their_groups():
     assert dumped["wavefront"]["kind"] == "seidel"
 
 
-@pytest.mark.parametrize("telescope", ["zernike", "seidel", "raytraced"])
+@pytest.mark.parametrize("telescope", ["zernike", "seidel", "raytraced", "newtonian"])
 def test_workflow_s_overrides_reproduce_the_configuration(telescope):
     """Options that differ in their keys are chosen by name, then every key is pinned."""
     option = f"telescope=example_{telescope}"

@@ -15,7 +15,7 @@ from workflow_runs import PATH, ROOT, captured, command, planned, snakemake
 pytestmark = pytest.mark.workflow
 
 COLUMNS = ["dataset", "split", "reference", "method", "noise_level", "metric"]
-COLUMNS += ["value", "stderr", "n"]
+COLUMNS += ["value", "stderr", "seed_stderr", "n"]
 
 
 def test_smoke_builds_everything(smoke):
@@ -26,7 +26,8 @@ def test_smoke_builds_everything(smoke):
     found = {"mse", "ssim", "ssim_unit", "ssim_peak"}
     assert set(metrics.metric[~sure]) == found
     assert set(metrics.metric[sure]) == found | {"coverage68", "evidence"}
-    assert metrics.notna().all().all()
+    assert metrics.drop(columns="seed_stderr").notna().all().all()
+    assert (metrics.seed_stderr.notna() == metrics.metric.isin(found)).all()
     assert (metrics[metrics.split == "random"].n == 50).all()
 
 
@@ -46,7 +47,7 @@ def test_original_noise_rows_are_the_noise_that_was_added(smoke):
     [
         ("dataset3", "dataset3", "dataset[1245678]|50pct|turbulence"),
         ("scene2", "dataset8", "dataset[1-7]|seidel"),
-        ("scene3", "alignment_cnn", "dataset[1-8]|seidel|turbulence"),
+        ("scene3", "alignment_network", "dataset[1-8]|seidel|turbulence"),
     ],
 )
 def test_a_target_lists_no_job_of_another(tmp_path, target, own, others):
@@ -57,7 +58,7 @@ def test_a_target_lists_no_job_of_another(tmp_path, target, own, others):
 
 def test_same_value_in_another_format_reruns_nothing(smoke):
     assert planned(smoke) == {}
-    assert planned(smoke, overrides="train.lr=0.0040 noise.kappa=4.980") == {}
+    assert planned(smoke, overrides="train.lr=0.0060 noise.kappa=4.980") == {}
 
 
 @pytest.mark.slow
@@ -177,7 +178,8 @@ def test_targets_on_request(smoke):
     assert list(stability.columns) == ["case", "quantity", "expected", "measured", "verdict"]
     assert (stability.verdict == "pass").all()
     bounds = pd.read_csv(tables / "psf_bounds.csv")
-    assert list(bounds.columns) == [*COLUMNS, "ci_low", "ci_high", "tight"]
+    found = {"ci_low", "ci_high", "tight", "found", "draws", "ess_median", "last_change", "missed"}
+    assert set(bounds.columns) == {*COLUMNS, *found} - {"seed_stderr"}
     assert set(bounds.method) == {"bayes", "bayes_position", "floor"}
     choice = pd.read_csv(tables / "benchmark_choice.csv")
     assert (choice.configured == "yes").groupby(choice.scene).any().all()

@@ -17,7 +17,7 @@ if command -v flock >/dev/null 2>&1; then
     fi
     program=$1
     shift
-    "$program" --unlock "$@" >/dev/null 2>&1 || true
+    [ -z "$(ls .snakemake/locks 2>/dev/null)" ] || "$program" --unlock "$@" >/dev/null 2>&1 || true
     # Damaged files of an earlier run are set aside and named. They are forced, because Snakemake
     # does not miss a file as long as what was made from it is there.
     damaged=$([ -z "${PSFDAE_RESULTS:-}" ] || psfdae verify "$PSFDAE_RESULTS")

@@ -63,8 +63,13 @@ STATE_STAMPS = (*STATES, "telescope.pixel_scale_arcsec", "alignment.stamp_px")
 ONLY_IF_NAMED = ("name", "jitter_waves")
 """Last part of keys that a group does not bring along: titles, and what static PSFs lack."""
 
-WHOLE = ("wavefront", "telescope.aberrations", "prescription")
-"""Groups of which a configuration has all or nothing: a term that is missing is not there."""
+WHOLE = {
+    "wavefront": "wavefront",
+    "telescope.aberrations": "telescope.aberrations",
+    "telescope.seeing": "telescope.aberrations",
+    "prescription": "prescription",
+}
+"""Groups whose missing terms are not there, if the configuration has the other group at all."""
 
 TRAINED_ON = "trained_on.yaml"
 """Configuration of the stars or states that a network was trained on, in its folder."""
@@ -204,7 +209,7 @@ def _value(leaves: Mapping[str, Any], key: str) -> Any:
     """Value of a key; None if nothing is stated."""
     if key in leaves:
         return leaves[key]
-    group = next((group for group in WHOLE if key.startswith(f"{group}.")), None)
+    group = next((WHOLE[group] for group in WHOLE if key.startswith(f"{group}.")), None)
     if group is None or not any(leaf.startswith(f"{group}.") for leaf in leaves):
         return None
     return 0.0 if ".terms." in key else "nothing"

@@ -95,22 +95,26 @@ class Careful(click.Group):
         """
         try:
             return super().invoke(ctx)
-        except OSError as error:
-            if error.errno is None:
+        except (OSError, MemoryError, RuntimeError, ValueError) as error:
+            said = refusal(error)
+            if said is None:
                 raise
-            click.echo(f"psfdae: {error}", err=True)
+            click.echo(f"psfdae: {said}", err=True)
             ctx.exit(2)
-        except MemoryError as error:
-            click.echo(f"psfdae: not enough memory ({error or 'no more is known'})", err=True)
-            ctx.exit(2)
-        except (RuntimeError, ValueError) as error:
-            # HDF5 reports a full disk as a RuntimeError without a number of its own.
-            # So does torch a lack of memory, as its own RuntimeError.
-            ours = type(error).__module__.startswith("psfdae")
-            if not ours and not re.search("errno = |not enough memory", str(error)):
-                raise
-            click.echo(f"psfdae: {' '.join(str(error).split()) if not ours else error}", err=True)
-            ctx.exit(2)
+
+
+def refusal(error: Exception) -> str | None:
+    """What to say of an error that is no bug; None if it is one."""
+    if isinstance(error, MemoryError):
+        return f"not enough memory ({error or 'no more is known'})"
+    if isinstance(error, OSError):
+        return None if error.errno is None else str(error)
+    if type(error).__module__.startswith("psfdae"):
+        return str(error)
+    # HDF5 reports a full disk as a RuntimeError without a number of its own.
+    # So does torch a lack of memory, as its own RuntimeError.
+    known = re.search("errno = |not enough memory", str(error))
+    return " ".join(str(error).split()) if known else None
 
 
 class Commands(Careful):

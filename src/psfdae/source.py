@@ -147,6 +147,8 @@ class Code:
             return [c for k, cs in inside.items() for c in ([k] if k in own else cs)]
 
         found = self.definition(key)
+        if not (found.entries or found.options):
+            return found.digest, found.references
         # Entries that name functions, classes or modules; numbers and texts all count.
         choice = [e for e in found.entries if any(map(self.is_code, e.every))]
         taken = [e for e in choice if wanted(e.every)] or choice

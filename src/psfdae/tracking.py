@@ -10,13 +10,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from psfdae.alignment.methods import CNNS
+from psfdae.alignment.methods import TRAINED
 from psfdae.belonging import STARS, require_origin
 from psfdae.estimators import HISTORY, Method, method, registered
 from psfdae.files import ProductError, read_product
 from psfdae.reading import number, read_csv, read_yaml
 
-NETWORKS = {"dae": "dae.safetensors", **dict.fromkeys(CNNS, "cnn.safetensors")}
+NETWORKS = {"dae": "dae.safetensors", **dict.fromkeys(TRAINED, "network.safetensors")}
 """Networks of scene 3 and the files of their weights."""
 
 STATISTICS = ("mean_abs_error", "bias", "variance")
@@ -261,12 +261,12 @@ def runs_of_sweep(results: Path, name: str) -> list[Run]:
     ProductError
         If the sweep has no summary, or a point no result.
     """
-    from psfdae.configuration.sweep import CNNS
+    from psfdae.configuration.sweep import TRAINED
     from psfdae.stages.sweep import read_cost, read_result
     from psfdae.sweeps.method_point import place_of
 
     def model_files(model: str, place: Path) -> dict[str, Path]:
-        if model in CNNS:
+        if model in TRAINED:
             return _network_files(place, NETWORKS[model])
         return _model_files(method(model), place_of(method(model), place))
 

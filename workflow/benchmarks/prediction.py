@@ -20,9 +20,9 @@ from psfdae.cli import File, command, program
 from psfdae.configuration.compose import ConfigError
 from psfdae.configuration.consistency import SIMULATION
 from psfdae.configuration.schema import Config
-from psfdae.files import ProductError, read_product
-from psfdae.reading import read_table
+from psfdae.files import read_product
 from psfdae.rng import stream
+from psfdae.stages import common
 from psfdae.stars.fields import assign_fields, draw_jitter, perturb, relative_field
 from psfdae.stars.framing import brightest_pixel, crop_jittered, normalise_flux
 from psfdae.stars.noise import NoiseModel, mixed_levels
@@ -34,17 +34,20 @@ REPEATS = 3  # timings at most; each takes as long as three predictions
 WARM_UP = 4  # blocks of stars that are computed before the clock starts
 BARE_STAMPS = 8192  # that the bare network sees over and over: it must not fill the memory
 SAMPLES = 256  # of POPPY across the pupil
+FALSE_ALARMS = 0.01  # part of the usual stars above a limit
+COMPANION_FLUX, COMPANION_PX = 0.3, 3.0  # of a neighbour, in units of the star's, and its distance
+RAY_FLUX, RAY_PX = 0.03, 3  # of a cosmic ray in a pixel, and its length
 OVERSAMPLING = 4  # its sub-samples per pixel and axis; their error falls with the square
 
 READS = (*SIMULATION, "noise", "benchmark")
-Bundle = Annotated[File, "Model bundle of the dataset."]
+TESTED = (*READS, "parts")
 
 
 @command("throughput", reads=READS)
 def throughput(
     config: Config,
     stars: Annotated[File, "Product of the stage stars."],
-    bundle: Bundle,
+    bundle: Annotated[File, "Model bundle of the dataset, of a network."],
     out: Annotated[File, "CSV with stamps per second and memory."],
 ) -> None:
     """Time predict from FITS to FITS beside the bare network, on a quiet machine."""
@@ -140,37 +143,43 @@ def bare_rate(model, stamps, threads, way):
 @command("poppy", reads=READS)
 def poppy(
     config: Config,
-    bundle: Bundle,
-    evaluation: Annotated[File, "CSV of the stage evaluate for the same network."],
-    out: Annotated[File, "CSV with the errors at each noise level."],
+    bundles: Annotated[tuple[File, ...], {"flag": "--bundle"}, "Model bundles of the dataset."],
+    out: Annotated[File, "CSV with the errors of each bundle at each noise level."],
     count: Annotated[int, click.IntRange(min=2), "Stars that POPPY simulates."] = 500,
 ) -> None:
-    """Predict stars that POPPY has simulated and compare with the workflow's table.
+    """Predict stars that POPPY has simulated and compare with the bundles' own test stars.
 
-    Once with flux and sky level given, as in the workflow's tables, and once with both
-    estimated. Stars without a usable flux (lost) are left out of the estimated columns.
+    Once with flux and sky level given, as for the test stars, and once with both estimated.
+    Stars without a usable flux (lost) are left out of the estimated columns.
     """
+    for bundle in bundles:
+        require_bundle(bundle, config)
+    truth = poppy_stars(config, count)
+    write(out, [row for bundle in bundles for row in bundle_errors(bundle, truth, config)])
+
+
+def bundle_errors(bundle, truth, config):
+    """Errors of a bundle on noise-free stars of flux 1, a row for each noise level."""
     from psfdae.own_stars.model import load_model
 
-    require_bundle(bundle, config)
-    table, levels = read_table(evaluation), config.noise.levels
-    expected = {level: table_mse(table, level, evaluation) for level in levels}
-    model, truth, rows = load_model(bundle), poppy_stars(config, count), []
-    noise = NoiseModel(config.noise.kappa, config.noise.background_photons)
-    for level, mse in expected.items():
+    model, noise = (
+        load_model(bundle),
+        NoiseModel(config.noise.kappa, config.noise.background_photons),
+    )
+    for tested in model.info.metrics:
+        level = tested["noise_level"]
         rng = stream(config.seed, "poppy", "noise", f"{level:.6g}")
         flux = float(noise.flux(level))
         stamps = rng.poisson(flux * truth + noise.background).astype(np.float32)
         given = model.predict(stamps, flux=flux, background=noise.background, gain=1.0)
         estimated = model.predict(stamps, gain=1.0)
-        snr = 1.0 / (noise.kappa * level * model.info.noise_equivalent_px**0.5)
-        row = {"noise_level": level, "snr": snr, "stars": count, "mse_table": mse}
-        row |= quality(given, truth, flux, mse, "given")
-        row |= quality(estimated, truth, flux, mse, "estimated")
+        row = {"bundle": model.info.name, "method": model.info.method, "noise_level": level}
+        row |= {"snr": tested["snr"], "stars": len(truth), "mse_table": tested["mse"]}
+        row |= quality(given, truth, flux, tested["mse"], "given")
+        row |= quality(estimated, truth, flux, tested["mse"], "estimated")
         row["lost"] = np.isnan(estimated.psf).any(axis=(1, 2)).sum()
         row["allowed_ratio"] = ALLOWED_RATIO
-        rows.append(row | {"met": yes(abs(row["ratio_given"] - 1.0) <= ALLOWED_RATIO)})
-    write(out, rows)
+        yield row | {"met": yes(abs(row["ratio_given"] - 1.0) <= ALLOWED_RATIO)}
 
 
 def require_bundle(bundle, config):
@@ -183,22 +192,84 @@ def require_bundle(bundle, config):
 
 
 def quality(found, truth, flux, expected, which):
-    """Mean errors of PSFs of flux 1, and how many pixels are within the uncertainty."""
+    """Mean errors of PSFs of flux 1, and how many pixels are within the uncertainty.
+
+    `coverage95` is of `UNCERT` times `ratio95`, which a network does not say.
+    """
     kept = np.isfinite(found.psf).all(axis=(1, 2))
-    psf, error = found.psf[kept], found.uncertainty[kept]
+    psf, width = found.psf[kept], found.uncertainty[kept]
+    wide = width * found.ratio95[kept, None, None]
     squares = np.square(psf / found.flux[kept, None, None] - truth[kept]).mean(axis=(1, 2))
-    inside, mse = np.abs(psf - flux * truth[kept]) <= error, squares.mean()
+    error, mse = np.abs(psf - flux * truth[kept]), squares.mean()
     row = {"mse": mse, "stderr": squares.std(ddof=1) / squares.size**0.5, "ratio": mse / expected}
-    return {f"{name}_{which}": value for name, value in {**row, "coverage": inside.mean()}.items()}
+    row |= {"coverage": (error <= width).mean()}
+    row |= {"coverage95": np.nan if np.isnan(wide).all() else (error <= wide).mean()}
+    return {f"{name}_{which}": value for name, value in row.items()}
 
 
-def table_mse(table, level, path):
-    """MSE of the DAE in a table of the stage `evaluate`."""
-    wanted = (table["method"] == "dae") & (table["metric"] == "mse")
-    values = table.loc[wanted & np.isclose(table["noise_level"], level), "value"]
-    if len(values) != 1:
-        raise ProductError(f"{path}: {len(values)} rows with the DAE's MSE at λ = {level:g}")
-    return float(values.iloc[0])
+@command("strange", reads=TESTED)
+def strange(
+    config: Config,
+    stars: Annotated[File, "Product of the stage stars."],
+    bundle: Annotated[File, "Model bundle of a method that knows how strange a star is."],
+    out: Annotated[File, "CSV with the stars found, by kind and noise level."],
+) -> None:
+    """Find stars unlike the training by `distance` and by `strangeness`, at equal false alarms.
+
+    Of the test stars a part of `FALSE_ALARMS` is above either limit. Then each of them gets a
+    companion, or is hit by a cosmic ray, or is turned by 90 degrees, or gives way to a Gaussian as
+    wide as the mean star.
+    """
+    from psfdae.own_stars.model import load_model
+
+    product = common.read_stars(stars, "realisation")
+    require(stars, product.config, STARS, config)
+    require_bundle(bundle, config)
+    model, noise = (
+        load_model(bundle),
+        NoiseModel(config.noise.kappa, config.noise.background_photons),
+    )
+    images = product["realisation"][common.split_stars(product, "random", config).test]
+    rows = []
+    for level in config.noise.levels:
+        limits = {}
+        for kind, changed in unlike(images, stream(config.seed, "strange", "draws")).items():
+            rng = stream(config.seed, "strange", "noise", f"{level:.6g}", kind)
+            flux = noise.flux(level)
+            stamps = rng.poisson(flux * changed + noise.background).astype(np.float32)
+            found = model.predict(stamps, gain=1.0)
+            for measure in ("distance", "strangeness"):
+                values = getattr(found, measure)
+                values = values[np.isfinite(values)]
+                limits.setdefault(measure, np.quantile(values, 1.0 - FALSE_ALARMS))
+                row = {"noise_level": level, "kind": kind, "measure": measure}
+                row |= {"stars": values.size, "false_alarms": FALSE_ALARMS}
+                rows.append(row | {"found": (values > limits[measure]).mean()})
+    write(out, rows)
+
+
+def unlike(images, rng):
+    """Stars as they are, then others by kind, each of flux 1; shape (n, d, d)."""
+    count, side = len(images), images.shape[-1]
+    place = np.arange(side) - side // 2
+    angle, where = rng.uniform(0, 2 * np.pi, count), rng.integers(3, side - 3, (count, 2))
+    shift = np.rint(COMPANION_PX * np.stack([np.sin(angle), np.cos(angle)], axis=1)).astype(int)
+    moved = [np.roll(star, by, axis=(0, 1)) for star, by in zip(images[::-1], shift, strict=True)]
+    hit = images.copy()
+    for along in range(RAY_PX):  # a straight one, along a row
+        hit[np.arange(count), where[:, 0], np.minimum(where[:, 1] + along, side - 1)] += RAY_FLUX
+    radius2 = np.square(place[:, None]) + np.square(place)
+    width2 = np.mean((images * radius2).sum(axis=(1, 2))) / 2.0
+    kinds = {
+        "usual": images,
+        "companion": images + COMPANION_FLUX * np.stack(moved),
+        "cosmic ray": hit,
+        "turned": np.rot90(images, axes=(1, 2)),
+        "Gaussian": np.broadcast_to(np.exp(-0.5 * radius2 / width2), images.shape),
+    }
+    return {
+        kind: changed / changed.sum(axis=(1, 2))[:, None, None] for kind, changed in kinds.items()
+    }
 
 
 def poppy_stars(config, count):
@@ -284,4 +355,4 @@ def poppy_telescope(telescope, side_px):
 
 
 if __name__ == "__main__":
-    program(throughput, poppy)
+    program(throughput, poppy, strange)

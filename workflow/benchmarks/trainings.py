@@ -20,10 +20,8 @@ from psfdae.configuration.schema import Config
 from psfdae.estimators import all_groups, method
 from psfdae.files import read_product
 from psfdae.reading import read_table, read_yaml
-from psfdae.rng import stream
 from psfdae.stages import common
 from psfdae.stages.fit import training_set
-from psfdae.stars.noise import mixed_levels
 
 PATIENCE = 5  # validations without a better one after which a training no longer improves
 WORTHWHILE = 0.9  # fraction to which each doubling of the time must bring the error
@@ -31,6 +29,8 @@ WORTHWHILE = 0.9  # fraction to which each doubling of the time must bring the e
 SIZES = ("components", "rows", "columns", "epochs")
 COMPONENTS, MAPS, EPOCHS = (5, 10, 20, 40), (7, 11, 15), (2, 10, 50)
 CHEAP_S = 3.0  # within which a fit of PCA+SOM is repeated
+
+READINGS = (("map", True), ("map", False), ("projection", True))
 
 READS = (*SIMULATION, "noise", "parts", "baseline", "benchmark")
 METHODS = (*SIMULATION, "noise", "parts", "methods", *all_groups())
@@ -58,7 +58,7 @@ def knee_table(
     out: Annotated[File, "CSV with time and test error of every training."],
     stopping: Annotated[File, "CSV: what stopping saves."],
 ) -> None:
-    """Compare trainings of one dataset by test error and time.
+    """Compare trainings of one dataset by error and time; validation stars find the knee.
 
     The time is the CPU time of the training's one thread, which is its wall time on a quiet
     core; start-up and simulation are not in it.
@@ -74,10 +74,9 @@ def knee_table(
     product = common.read_stars(stars)
     for folder in folders.values():
         Dae.require(folder, product, config, "random", "realisation")
-    images = product["realisation"][common.split_stars(product, "random", config).test]
-    noisy = {
-        level: common.noisy_test_images(config, images, level) for level in config.noise.levels
-    }
+    test = common.split_stars(product, "random", config).test
+    images, levels = product["realisation"][test], config.noise.levels
+    noisy = {level: common.noisy_test_images(config, product, test, level) for level in levels}
     configured = decisive(config.model_dump(include={"dae", "train"}))
     rows, idle = [], []
     for name, folder in folders.items():
@@ -88,13 +87,14 @@ def knee_table(
         last = history.iloc[-1]
         row |= {"steps": int(last["step"]), "cpu_s": last["cpu_seconds"], "wall_s": last["seconds"]}
         row |= {f"mse_{level:g}": error for level, error in errors.items()}
+        row["validation_mse"] = history["validation_mse"].min()
         rows.append({**row, "mse": np.exp(np.mean(np.log([*errors.values()]))), "n": len(images)})
         if row["schedule"] == "constant":
             idle.append(idle_steps(name, history.dropna(subset=["validation_mse"])))
     table = pd.DataFrame(rows)
     # Other stars cost simulation time that is not in the column: shown, but not a candidate.
     same = np.flatnonzero(table["stars"] == "same")
-    time, error = table["cpu_s"].to_numpy()[same], table["mse"].to_numpy()[same]
+    time, error = (table[name].to_numpy()[same] for name in ("cpu_s", "validation_mse"))
     for name, found in (("pareto", pareto(time, error)), ("knee", [knee(time, error)])):
         table[name] = np.where(np.isin(table.index, same[found]), "yes", "no")
     write(out, table)
@@ -180,40 +180,82 @@ def time_points(tree, stars):
     import minisom  # noqa: F401
     import sklearn.decomposition  # noqa: F401
 
+    from psfdae.estimators.pca_som import PcaSom
+
     config = part(READS, tree)
     settings, levels = config.baseline, config.noise.levels
     common.limit_threads(settings.threads)
     product = common.read_stars(stars, "template")
     parts = common.split_stars(product, "random", config)
-    # The draws of the stage `baseline`: the point in use is the very model of the tables.
-    rng = stream(config.seed, "noise", "baseline")
-    drawn = mixed_levels(np.asarray(levels), parts.train.size, rng)
-    train = common.noise_model(config).draw(product["realisation"][parts.train], drawn, rng)
+    # As the stage `baseline` does it: the point in use is the very model of the tables.
+    data = training_set(config, PcaSom, product, "random", "realisation")
     truths = {name: product[name][parts.test] for name in ("realisation", "template")}
     clean = truths["realisation"]
-    tests = [common.noisy_test_images(config, clean, level) for level in levels]
-    shared = {"sigma": settings.sigma, "learning_rate": settings.learning_rate}
-    shared["seed"] = int(stream(config.seed, "baseline", "map").integers(2**31))
+    tests = {
+        level: common.noisy_test_images(config, product, parts.test, level) for level in levels
+    }
     used = tuple(getattr(settings, size) for size in SIZES)
     rows = []
     for point in grid_around(used, min(config.parts.train_stars, config.framing.stamp_px**2)):
         sizes = dict(zip(SIZES, point, strict=True))
-        measured = time_point(train, tests, truths, sizes | shared, config.benchmark.repeats)
+        fit = settings.model_copy(update=sizes)
+        measured = time_point(data, fit, tests, truths, config.benchmark.repeats)
         rows.append({**sizes, "used": yes(point == used), **measured, "n": len(clean)})
     return rows
 
 
-def time_point(train, tests, truths, fit, repeats):
-    """Fit noisy images and restore tests of each λ: median times and mean errors."""
-    from psfdae.estimators.pca_som import fit_pca_som
+def time_point(data, settings, tests, truths, repeats):
+    """Fit a training set and restore the test images of each λ: median times and mean errors."""
+    from psfdae.estimators.pca_som import PcaSom
 
-    model, fit_s, done = median_time(lambda: fit_pca_som(train, **fit), repeats)
-    estimates, predict_s, _ = median_time(lambda: [model.predict(x) for x in tests], repeats)
-    row = {"fit_s": fit_s, "predict_stars_per_s": sum(len(x) for x in tests) / predict_s}
+    model, fit_s, done = median_time(lambda: PcaSom.fit(data, settings), repeats)
+    estimates, predict_s, _ = median_time(
+        lambda: [model.predict(images, level) for level, images in tests.items()], repeats
+    )
+    row = {"fit_s": fit_s, "predict_stars_per_s": sum(map(len, estimates)) / predict_s}
     row["repeats"] = done
     for name, truth in truths.items():
         row[f"mse_{name}"] = np.mean([((found - truth) ** 2).mean() for found in estimates])
     return row
+
+
+@command("readings", reads=(*SIMULATION, "dataset", "noise", "parts", "baseline"))
+def readings(
+    config: Config,
+    stars: Annotated[File, "Product of the stage stars."],
+    out: Annotated[File, "CSV: errors of PCA+SOM as the paper can be read, beside its own."],
+) -> None:
+    """Fit PCA+SOM in every reading of the paper and measure it on the random test stars."""
+    from psfdae.estimators.pca_som import PcaSom
+    from psfdae.evaluation.metrics import clustered_mean, mse
+    from psfdae.evaluation.paper import published
+
+    common.limit_threads(config.baseline.threads)
+    product = common.read_stars(stars, "template")
+    require(stars, product.config, STARS, config)
+    test = common.split_stars(product, "random", config).test
+    field, dataset = product["field_index"][test], config.dataset.name
+    paper = published("psf").query("dataset == @dataset and metric == 'mse' and method == 'pca'")
+    paper = paper.set_index("noise_level").value
+    data = training_set(config, PcaSom, product, "random", "realisation")
+    rows = []
+    for reading, per_level in READINGS:
+        changed = {"reading": reading, "per_level": per_level}
+        fitted = PcaSom.fit(data, config.baseline.model_copy(update=changed))
+        for level in config.noise.levels:
+            noisy = common.noisy_test_images(config, product, test, level)
+            found = fitted.predict(noisy, level)
+            for name in config.dataset.references:
+                mean, stderr = clustered_mean(mse(found, product[name][test]), field)
+                row = {"dataset": dataset, "reference": name, "reading": reading}
+                row |= {"per_level": yes(per_level), "noise_level": level}
+                row |= {"mse": mean, "stderr": stderr, "n": test.size}
+                row |= {
+                    "mse_paper": paper.get(level),
+                    "over_paper": mean / paper.get(level, np.nan),
+                }
+                rows.append(row)
+    write(out, rows)
 
 
 def median_time(call, repeats):
@@ -260,7 +302,7 @@ def time_methods(tree, stars, seeds):
             fitted = kind.fit(data, **kind.settings(config))
             fit_s = process_time() - start
         for level in config.noise.levels:
-            noisy = common.noisy_test_images(config, clean, level)
+            noisy = common.noisy_test_images(config, product, test, level)
             # What is made once for a level, such as factorisations, is not of the stars.
             fitted.restore(noisy[:1], level, position[:1])
             start = process_time()
@@ -273,4 +315,4 @@ def time_methods(tree, stars, seeds):
 
 
 if __name__ == "__main__":
-    program(knee_table, baseline, methods)
+    program(knee_table, baseline, readings, methods)

@@ -2,7 +2,7 @@
 wildcard_constraints:
     states="grid|uniform|train",
     test_set="|".join(ALIGNMENT_SETS),
-    cnn="|".join(CNNS),
+    network="|".join(TRAINED),
     level=r"[0-9.e-]+",
 
 
@@ -98,24 +98,24 @@ rule alignment_dae:
         " --checkpoint {params.checkpoint} --out {params.folder} > {log} 2>&1"
 
 
-use rule alignment_dae as alignment_cnn with:
+use rule alignment_dae as alignment_network with:
     input:
-        states=lambda w: f"{ALIGNMENT_DATA}/{METHODS[w.cnn].states}.h5",
-        dae=lambda w: [f"{ALIGNMENT}/dae/dae.safetensors"] * METHODS[w.cnn].denoised,
+        states=lambda w: f"{ALIGNMENT_DATA}/{METHODS[w.network].states}.h5",
+        dae=lambda w: [f"{ALIGNMENT}/dae/dae.safetensors"] * METHODS[w.network].denoised,
     output:
-        **network_files("{cnn}", "cnn.safetensors"),
+        **network_files("{network}", "network.safetensors"),
     log:
-        f"{RESULTS}/logs/alignment/{{cnn}}.log",
+        f"{RESULTS}/logs/alignment/{{network}}.log",
     benchmark:
-        f"{RESULTS}/benchmarks/alignment/{{cnn}}.tsv"
-    threads: lambda w: getattr(alignment_config(), f"train_{w.cnn}").threads
+        f"{RESULTS}/benchmarks/alignment/{{network}}.tsv"
+    threads: lambda w: getattr(alignment_config(), f"train_{w.network}").threads
     params:
-        command=lambda w: f"train-cnn --kind {w.cnn}",
-        config=lambda w: settings("alignment train-cnn", kind=w.cnn),
-        source=source_hash("alignment train-cnn"),
-        checkpoint=lambda w: f"{RESULTS}/checkpoints/alignment-{w.cnn}.pt",
+        command=lambda w: f"train-network --kind {w.network}",
+        config=lambda w: settings("alignment train-network", kind=w.network),
+        source=source_hash("alignment train-network"),
+        checkpoint=lambda w: f"{RESULTS}/checkpoints/alignment-{w.network}.pt",
     message:
-        "Training the CNN {wildcards.cnn} of scene 3"
+        "Training the network {wildcards.network} of scene 3"
 
 
 rule alignment_bound:
@@ -147,7 +147,7 @@ rule alignment_bound:
 
 use rule alignment_bound as alignment_estimate with:
     input:
-        **{cnn: f"{ALIGNMENT}/{cnn}/cnn.safetensors" for cnn in CNNS},
+        **{network: f"{ALIGNMENT}/{network}/network.safetensors" for network in TRAINED},
         states=f"{ALIGNMENT_DATA}/{{test_set}}.h5",
         dae=rules.alignment_dae.output.weights,
     output:
@@ -170,7 +170,7 @@ use rule alignment_bound as alignment_fit with:
     input:
         states=f"{ALIGNMENT_DATA}/{{test_set}}.h5",
         model=rules.alignment_model.output,
-        cnn=f"{ALIGNMENT}/{METHODS['max_likelihood'].cnn}/cnn.safetensors",
+        network=f"{ALIGNMENT}/{METHODS['max_likelihood'].network}/network.safetensors",
     output:
         out=f"{ALIGNMENT}/fits/{{test_set}}_{{level}}.h5",
         times=f"{ALIGNMENT}/fits/{{test_set}}_{{level}}_times.csv",

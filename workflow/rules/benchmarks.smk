@@ -61,8 +61,8 @@ rule propagation_tables:
 
 
 BUNDLE = f"{RESULTS}/bundles/{TIMED_DATASET}-random-realisation.psf.safetensors"
-TESTED = f"{RESULTS}/evaluation/{TIMED_DATASET}/random-realisation.csv"
 STARS = {"stars": lambda w: stars_of(TIMED_DATASET)}
+MIXED = BUNDLE.replace("realisation", f"realisation{method('gmm').suffix}")
 FITTED = [f"psfdae.estimators.{name}" for name in names_of(TIMED_DATASET)]
 # By table: target, command, inputs, MB, minutes, stages that it runs or modules that it chooses.
 TIMED = {
@@ -78,8 +78,27 @@ TIMED = {
         *(1500, 20, ["predict"]),
     ),
     "predict_poppy": (
-        *("prediction", "prediction.poppy", {"bundle": BUNDLE, "evaluation": TESTED}),
-        *(1500, 20, []),
+        *(
+            "prediction",
+            "prediction.poppy",
+            {"bundle": every_bundle_of_timed},
+            1500,
+            20,
+            [],
+        ),
+    ),
+    "predict_poppy_field": (
+        *(
+            "prediction",
+            "prediction.poppy",
+            {"bundle": rivals_of_shipped},
+            1500,
+            20,
+            [],
+        ),
+    ),
+    "predict_strange": (
+        *("prediction", "prediction.strange", {**STARS, "bundle": MIXED}, 1500, 20, []),
     ),
     "scaling_stages": (
         *("scaling", "speed.stages", {}, 4000, 60),
@@ -108,10 +127,13 @@ for _table, (_target, _run, _inputs, _mb, _minutes, _stages) in TIMED.items():
             runtime=_minutes,
             disk_mb=2000,
         params:
-            config=lambda w, run=_run: settings(run, f"dataset={TIMED_DATASET}"),
+            config=lambda w, run=_run, table=_table: settings(
+                run,
+                f"dataset={SHIPPED_DATASET if table.endswith('_field') else TIMED_DATASET}",
+            ),
             source=program_code(_run, _stages),
             program=program(_run),
-            inputs=lambda w, input: [f"--{name}={path}" for name, path in input.items()],
+            inputs=as_options,
             limit=lambda w, run=_run: (
                 [f"--count={poppy_stars(w)}"] if run.endswith("poppy") else []
             ),
@@ -309,4 +331,50 @@ rule method_seeds:
 rule seeds:
     input:
         expand(SEEDS, dataset=SEEDED_DATASETS),
+    localrule: True
+
+
+# What the paper leaves open about its PCA, by its own rows.
+READINGS = f"{RESULTS}/readings/{{dataset}}.csv"
+
+
+rule readings_of:
+    input:
+        stars=lambda w: stars_of(w.dataset),
+    output:
+        READINGS,
+    log:
+        f"{RESULTS}/logs/benchmark/readings_{{dataset}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks_on_request/readings/{{dataset}}.tsv"
+    resources:
+        mem_mb=1500,
+        runtime=20,
+    params:
+        config=lambda w: settings("trainings.readings", f"dataset={w.dataset}"),
+        source=program_code("trainings.readings", ["psfdae.estimators.pca_som"]),
+        program=program("trainings.readings"),
+    message:
+        "Fitting PCA+SOM of {wildcards.dataset} in every reading of the paper"
+    shell:
+        "python {params.program} --config {params.config} --stars {input.stars}"
+        " --out {output} > {log} 2>&1"
+
+
+use rule psf_bounds as baseline_readings with:
+    input:
+        expand(READINGS, dataset=TABULATED),
+    output:
+        f"{RESULTS}/tables/baseline_readings.csv",
+    log:
+        f"{RESULTS}/logs/benchmark/baseline_readings.log",
+    benchmark:
+        f"{RESULTS}/benchmarks_on_request/readings/all.tsv"
+    message:
+        "Collecting the readings of PCA+SOM"
+
+
+rule readings:
+    input:
+        rules.baseline_readings.output,
     localrule: True

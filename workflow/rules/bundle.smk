@@ -1,7 +1,3 @@
-# The stars and the training of the model that comes with the package.
-SHIPPED_DATASET = "field"
-
-
 for _method in (m for m in registered() if m.stored and m.bundled):
     _stem = f"{{dataset}}-{{split}}-{{reference}}{_method.suffix}"
 
@@ -19,7 +15,7 @@ for _method in (m for m in registered() if m.stored and m.bundled):
             f"{RESULTS}/benchmarks_on_request/bundles/{_stem}.tsv"
         threads: lambda w: dataset_config(w.dataset).evaluation.threads
         resources:
-            mem_mb=1500,
+            mem_mb=max(1500, _method.memory_mb),
         params:
             config=lambda w: settings("bundle", f"dataset={w.dataset}"),
             source=source_hash("bundle", chosen=[f"psfdae.estimators.{_method.name}"]),
@@ -37,7 +33,7 @@ rule bundles:
         lambda w: [
             path
             for dataset in default_datasets()
-            for path in bundles_of(dataset, [("random", "realisation")])
+            for path in bundles_of(dataset, PACKED)
         ],
     localrule: True
 
@@ -45,15 +41,20 @@ rule bundles:
 # The shipped model is committed, so nothing but an explicit request renews it.
 rule shipped:
     input:
-        f"{RESULTS}/bundles/{SHIPPED_DATASET}-random-realisation.psf.safetensors",
+        stars=lambda w: stars_of(SHIPPED_DATASET),
+        bundles=lambda w: bundles_of(SHIPPED_DATASET, PACKED),
     output:
         touch(f"{RESULTS}/.shipped_renewed"),
     log:
         f"{RESULTS}/logs/bundles/shipped.log",
     localrule: True
     params:
+        config=lambda w: settings("ship", f"dataset={SHIPPED_DATASET}"),
+        source=lambda w: source_hash("ship"),
         folder="src/psfdae/bundles",
+        bundles=lambda w, input: [f"--bundle={file}" for file in input.bundles],
     message:
         "Renewing the model that comes with the package"
     shell:
-        "psfdae ship {input} --out {params.folder} > {log} 2>&1"
+        "psfdae ship --config {params.config} --stars {input.stars} {params.bundles}"
+        " --out {params.folder} > {log} 2>&1"

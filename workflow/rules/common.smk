@@ -10,13 +10,14 @@ from snakemake.utils import validate
 from psfdae.cli import stage
 from psfdae.configuration.compose import ConfigError, as_overrides, config_dir
 from psfdae.configuration.compose import compose, dataset_names, decisive, load
-from psfdae.configuration.compose import load_groups, neutral, overrides_for
+from psfdae.configuration.compose import keep_in, load_groups, neutral, overrides_for
 from psfdae.configuration.compose import write_settings
 from psfdae.estimators import HISTORY, method, registered
 from psfdae.files import DIGESTS, ProductError
 from psfdae.source import source_hash
 from psfdae.sweeps.points import SweepError
 
+keep_in(Path(".snakemake/compositions"))
 validate(config, "../schemas/command_line.schema.yaml")
 
 PRESET = config["preset"]
@@ -73,6 +74,7 @@ SCENE_HEADINGS = {
     "scene2": "Scene 2: static turbulence",
     "own_telescope": "Own telescopes",
 }
+METRICS = ("ssim", "mse")
 # The datasets that the paper tabulates; calibration compares with their rows.
 TABULATED = ["dataset3", "dataset5", "dataset8"]
 
@@ -83,7 +85,6 @@ wildcard_constraints:
     reference="realisation|template",
     scene="|".join(options("scene")),
     stars="|".join(options("stars")),
-    metric="mse|ssim",
 
 
 @cache
@@ -153,9 +154,14 @@ def evaluations_of(dataset, splits=None, folder="evaluation"):
 def paper_tables_of(dataset):
     return [
         f"{RESULTS}/tables/{dataset}_{metric}.{suffix}"
-        for metric in ("ssim", "mse")
+        for metric in METRICS
         for suffix in ("csv", "md")
     ]
+
+
+def by_metric(w, output):
+    """Options of a command that makes a file of each metric."""
+    return [f"--out {metric} {output[metric]}" for metric in METRICS]
 
 
 def category_of(w):
@@ -195,7 +201,7 @@ def figures_of(dataset):
     return [
         *(f"{folder}/{field}.png" for field in fields),
         *([f"{folder}/{dataset}/curves.png"] if histories_of(dataset) else []),
-        *(f"{folder}/{dataset}/errors_{metric}.png" for metric in ("mse", "ssim")),
+        *(f"{folder}/{dataset}/errors_{metric}.png" for metric in METRICS),
         *(f"{folder}/{dataset}/strip_{r}.png" for r in settings.dataset.references),
     ]
 
@@ -252,11 +258,11 @@ def model_options(dataset, split, reference, drawn=False, on_request=False):
     return [option_of(m, dataset, split, reference) for m in wanted]
 
 
-def bundles_of(dataset, networks):
+def bundles_of(dataset, networks, on_request=False):
     """Bundles of a dataset's methods, of some splits and references."""
     return [
         f"{RESULTS}/bundles/{dataset}-{split}-{reference}{m.suffix}.psf.safetensors"
-        for m in methods_of(dataset)
+        for m in methods_of(dataset, on_request)
         if m.bundled
         for split, reference in networks
     ]

@@ -1,9 +1,13 @@
-from psfdae.alignment.methods import CNNS, METHODS
+from psfdae.alignment.methods import TRAINED, METHODS
+from psfdae.own_stars.bundle import SUFFIX, shipped_path
 
 with one_line():
     KNEE = import_module("trainings").load_knee()
 FRESH = "fresh_realisations"
 KNEE_DATASET = TIMED_DATASET = "dataset3"
+# The stars and the training of the model that comes with the package.
+SHIPPED_DATASET = "field"
+PACKED = [("random", "realisation")]
 POPPY_STARS = 500
 
 
@@ -17,11 +21,10 @@ def bank_of(dataset):
     return [f"{BOUNDS}/bank/{stars}.h5"] if has_bank(dataset) else []
 
 
-def per_star_of(dataset):
-    """Errors of the methods on the test stars of the split that is bounded."""
+def per_star_of(dataset, splits=None):
+    """Errors of the methods on single test stars, of all splits unless some are named."""
     return [
-        csv.removesuffix(".csv") + ".parquet"
-        for csv in evaluations_of(dataset, ["random"])
+        csv.removesuffix(".csv") + ".parquet" for csv in evaluations_of(dataset, splits)
     ]
 
 
@@ -78,6 +81,18 @@ def timed_threads(w):
     return dataset_config(ALL_DATASETS[0]).benchmark.threads
 
 
+def every_bundle_of_timed(w):
+    """Bundles of the methods of the timed dataset, those on request, too."""
+    some = [bundles_of(TIMED_DATASET, PACKED, asked) for asked in (False, True)]
+    return sum(some, [])
+
+
+def rivals_of_shipped(w):
+    """The model that comes with the package, of the preset fast, and those that may follow it."""
+    shipped = [str(shipped_path())] if PRESET == "fast" else []
+    return bundles_of(SHIPPED_DATASET, PACKED) + shipped
+
+
 def poppy_stars(w):
     """A small preset has small test parts; POPPY takes its time for each star."""
     return min(POPPY_STARS, dataset_config(TIMED_DATASET).parts.test_stars)
@@ -102,7 +117,8 @@ def as_options(wildcards, input):
     options = []
     for name, found in input.items():
         for path in [found] if isinstance(found, str) else found:
-            value = Path(path).parent if path.endswith(".safetensors") else path
+            weights = path.endswith(".safetensors") and not path.endswith(SUFFIX)
+            value = Path(path).parent if weights else path
             options.append(f"--{name.replace('_', '-')}={value}")
     return options
 

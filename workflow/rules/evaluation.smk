@@ -52,26 +52,52 @@ rule paper_tables:
     input:
         lambda w: evaluations_of(w.dataset, ["random"]),
     output:
-        csv=report(
-            f"{RESULTS}/tables/{{dataset}}_{{metric}}.csv",
-            caption="../report/paper_tables.rst",
-            category=category_of,
-            subcategory="{dataset}",
-            labels={"figure": "table of {metric}"},
+        **{
+            metric: report(
+                f"{RESULTS}/tables/{{dataset}}_{metric}.csv",
+                caption="../report/paper_tables.rst",
+                category=category_of,
+                subcategory="{dataset}",
+                labels={"figure": f"table of {metric}"},
+            )
+            for metric in METRICS
+        },
+        markdown=expand(
+            f"{RESULTS}/tables/{{{{dataset}}}}_{{metric}}.md", metric=METRICS
         ),
-        markdown=f"{RESULTS}/tables/{{dataset}}_{{metric}}.md",
     log:
-        f"{RESULTS}/logs/tables/{{dataset}}_{{metric}}.log",
+        f"{RESULTS}/logs/tables/{{dataset}}.log",
     benchmark:
-        f"{RESULTS}/benchmarks/paper_tables/{{dataset}}-{{metric}}.tsv"
+        f"{RESULTS}/benchmarks/paper_tables/{{dataset}}.tsv"
     localrule: True
     params:
         source=source_hash("paper-tables"),
+        out=by_metric,
     message:
-        "Writing the paper's {wildcards.metric} table of {wildcards.dataset}"
+        "Writing the paper's tables of {wildcards.dataset}"
     shell:
-        "psfdae paper-tables --dataset {wildcards.dataset} --metric {wildcards.metric}"
-        " --out {output.csv} {input} > {log} 2>&1"
+        "psfdae paper-tables --dataset {wildcards.dataset} {params.out} {input}"
+        " > {log} 2>&1"
+
+
+rule held_out:
+    input:
+        lambda w: [
+            path for dataset in default_datasets() for path in per_star_of(dataset)
+        ],
+    output:
+        f"{RESULTS}/tables/psf_held_out.csv",
+    log:
+        f"{RESULTS}/logs/tables/psf_held_out.log",
+    benchmark:
+        f"{RESULTS}/benchmarks/held_out/all.tsv"
+    localrule: True
+    params:
+        source=source_hash("held-out"),
+    message:
+        "Comparing held-out with seen fields, star by star"
+    shell:
+        "psfdae held-out --out {output} {input} > {log} 2>&1"
 
 
 rule psf_metrics:

@@ -102,21 +102,25 @@ rule figure_errors:
     input:
         lambda w: evaluations_of(w.dataset),
     output:
-        report(
-            f"{RESULTS}/figures/{{dataset}}/errors_{{metric}}.png",
-            caption="../report/figure_errors.rst",
-            category=category_of,
-            subcategory="{dataset}",
-            labels={"figure": "{metric} against noise"},
-        ),
+        **{
+            metric: report(
+                f"{RESULTS}/figures/{{dataset}}/errors_{metric}.png",
+                caption="../report/figure_errors.rst",
+                category=category_of,
+                subcategory="{dataset}",
+                labels={"figure": f"{metric} against noise"},
+            )
+            for metric in METRICS
+        },
     log:
-        f"{RESULTS}/logs/figures/{{dataset}}/errors_{{metric}}.log",
+        f"{RESULTS}/logs/figures/{{dataset}}/errors.log",
     benchmark:
-        f"{RESULTS}/benchmarks/figure_errors/{{dataset}}-{{metric}}.tsv"
+        f"{RESULTS}/benchmarks/figure_errors/{{dataset}}.tsv"
     params:
         source=lambda w: estimators_source("figure errors", w.dataset),
+        out=by_metric,
     message:
-        "Drawing {wildcards.metric} of {wildcards.dataset} against the noise level"
+        "Drawing errors of {wildcards.dataset} against the noise level"
     shell:
-        "psfdae figure errors --dataset {wildcards.dataset} --metric {wildcards.metric}"
-        " --out {output} {input} > {log} 2>&1"
+        "psfdae figure errors --dataset {wildcards.dataset} {params.out} {input}"
+        " > {log} 2>&1"

@@ -1,4 +1,12 @@
 OWN_STARS_EXAMPLE = f"{RESULTS}/own_stars/example"
+# All methods are compared here, those that the command leaves out for their time, too.
+OWN_STARS_METHODS = [
+    *dict.fromkeys(
+        name
+        for dataset in (default_datasets()[0], OWN_STARS)
+        for name in names_of(dataset)
+    )
+]
 
 
 rule example_field:
@@ -39,8 +47,14 @@ rule own_stars:
         mem_mb=1500,
         runtime=30,
     params:
-        config=lambda w: settings("from-stars", f"dataset={OWN_STARS}"),
-        source=lambda w: estimators_source("from-stars", OWN_STARS),
+        config=lambda w: settings(
+            "from-stars",
+            f"dataset={OWN_STARS}",
+            more=(f"methods=[{','.join(OWN_STARS_METHODS)}]",),
+        ),
+        source=source_hash(
+            "from-stars", chosen=[f"psfdae.estimators.{m}" for m in OWN_STARS_METHODS]
+        ),
         folder=subpath(output.bundle, parent=True),
     message:
         "Training on the bright stars of the image"

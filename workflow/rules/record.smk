@@ -4,6 +4,7 @@ rule runtime:
             file for dataset in default_datasets() for file in products_of(dataset)
         ],
         rules.psf_metrics.output,
+        rules.held_out.output,
         rules.calibrate.output,
         ALIGNMENT_PRODUCTS,
         rules.track_alignment.output,

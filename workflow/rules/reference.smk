@@ -9,6 +9,7 @@ rule reference:
         ],
         ALIGNMENT_PRODUCTS,
         rules.benchmark.input,
+        rules.baseline_readings.output,
         rules.stability.input,
         rules.bounds.input,
         rules.prediction.input,
@@ -30,6 +31,18 @@ rule reference:
                 "tables/benchmark_stopping.csv",
                 "figures/benchmark/training.png",
                 "tables/scaling_stages.csv",
+                *(
+                    f"tables/psf_{name}_on_request.csv"
+                    for name in ("metrics", "efficiency")
+                ),
+                *(f"tables/seeds_{dataset}.csv" for dataset in SEEDED_DATASETS),
+                "tables/real_sky.csv",
+                "sweeps/gmm/summary.csv",
+                *(
+                    f"sweeps/{name}/{table}.csv"
+                    for name in ("dae_training", "network_epochs")
+                    for table in ("summary", "cost")
+                ),
             )
         ],
     message:

@@ -2,7 +2,7 @@ wildcard_constraints:
     sweep="|".join(sweep_names()) or "none",
 
 
-# States of their own choose between CNNs: all others train or test.
+# States of their own choose between networks: all others train or test.
 use rule alignment_states as sweep_validation_states with:
     input:
         model=rules.alignment_model.output,
@@ -18,7 +18,7 @@ use rule alignment_states as sweep_validation_states with:
             "alignment states", more=(f"seed={alignment_config().seed + 1}",)
         ),
     message:
-        "Propagating the stamps of scene 3, uniform states that choose between CNNs"
+        "Propagating the stamps of scene 3, uniform states that choose between networks"
 
 
 rule sweep_point:

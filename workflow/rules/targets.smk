@@ -1,6 +1,7 @@
 rule tables:
     input:
         rules.psf_metrics.output,
+        rules.held_out.output,
         lambda w: [
             file
             for dataset in TABULATED

@@ -3,6 +3,11 @@
 Photon counts are Poisson, n ~ Poisson(F p + B). Their Fisher information about
 the state t, per pixel F² ∂p ∂pᵀ / (F p + B), is that of a Gaussian with the
 variance (κλ)² + p/F, summed over pixels and fields (Kay 1993, chapter 3).
+
+Nobody is told the flux and the centroid of a star. With an operator of movable
+stamps they are parameters, too: (n, 4) states become (n, 4 + 3F) parameters, after
+the state the three of each stamp in turn, what is missing to its flux relative to
+1, and its star's place (x, y) in pixels.
 """
 
 from __future__ import annotations
@@ -17,34 +22,63 @@ CHUNK = 64
 """States whose derivatives are in memory at a time."""
 
 
-def fisher_information(
-    stamps: np.ndarray, derivatives: np.ndarray, noise: NoiseModel, level: float
+def parameters_of(
+    model: QuadraticModel, operator: AlignmentStamps, states: np.ndarray
 ) -> np.ndarray:
-    """Fisher matrices of states.
+    """States (n, 4) with all that is free, flux 1 and the star in the stamp's centre.
+
+    Parameters that are complete are given back.
+    """
+    size = 4 + 3 * len(model.coefficients) * operator.movable
+    return np.pad(states, ((0, 0), (0, size - states.shape[1])))
+
+
+def stamps_and_slopes(
+    model: QuadraticModel, operator: AlignmentStamps, parameters: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Stamps (n, F, d, d), and their derivatives by the k parameters of each, (n, F, k, d, d).
+
+    These are the four of the state and, if the stamps are movable, the stamp's own three.
+    """
+    states, own = parameters[:, :4], parameters[:, 4:]
+    zernikes, directions = model(states), model.jacobian(states)
+    if not operator.movable:
+        return operator.derivatives(zernikes, directions)
+    own = own.reshape(*zernikes.shape[:2], 3)
+    zernikes = np.concatenate([zernikes, own[:, :, 1:]], axis=2)
+    directions = np.pad(directions, ((0, 0), (0, 0), (0, 2), (0, 2)))
+    directions[:, :, [4, 5], [-2, -1]] = 1.0
+    shapes, slopes = operator.derivatives(zernikes, directions)
+    flux = 1.0 + own[:, :, :1, None]
+    slopes = np.concatenate([slopes[:, :, :4], shapes[:, :, None], slopes[:, :, 4:]], axis=2)
+    slopes[:, :, [0, 1, 2, 3, 5, 6]] *= flux[:, :, None]
+    return flux * shapes, slopes
+
+
+def score_and_information(
+    residuals: np.ndarray, slopes: np.ndarray, variance: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Slope of the log-likelihood, (n, K), and Fisher matrix, (n, K, K), by all K parameters.
 
     Parameters
     ----------
-    stamps : ndarray, shape (n, F, d, d)
-        Noise-free, each sums to 1.
-    derivatives : ndarray, shape (n, F, K, d, d)
-        By the K parameters.
-    noise : NoiseModel
-    level : float
-        Noise level λ.
-
-    Returns
-    -------
-    ndarray, shape (n, K, K)
+    residuals, variance : ndarray, shape (n, F, d, d)
+        What is observed less what is expected, and the variance that is expected.
+    slopes : ndarray, shape (n, F, k, d, d)
+        By the parameters of each stamp: the first four are shared by all.
     """
-    slopes = by_parameter(derivatives)
-    weight = 1.0 / noise.variance(stamps.reshape(len(stamps), 1, -1).astype(np.float64), level)
-    return (slopes * weight) @ slopes.swapaxes(1, 2)
-
-
-def by_parameter(derivatives: np.ndarray) -> np.ndarray:
-    """Derivatives (n, F, K, d, d) as rows per parameter, shape (n, K, F·d²), float64."""
-    count, _, parameters = derivatives.shape[:3]
-    return np.moveaxis(derivatives, 2, 1).astype(np.float64).reshape(count, parameters, -1)
+    count, fields, k = slopes.shape[:3]
+    slopes = slopes.reshape(count, fields, k, -1).astype(np.float64)
+    weighted = slopes / variance.reshape(count, fields, 1, -1)
+    score = (weighted @ residuals.reshape(count, fields, -1, 1))[..., 0]
+    information = weighted @ slopes.swapaxes(2, 3)
+    size = 4 + fields * (k - 4)
+    all_scores, joint = np.zeros((count, size)), np.zeros((count, size, size))
+    for field in range(fields):
+        place = np.r_[0:4, 4 + field * (k - 4) : 4 + (field + 1) * (k - 4)]
+        all_scores[:, place] += score[:, field]
+        joint[:, place[:, None], place] += information[:, field]
+    return all_scores, joint
 
 
 def bound_covariances(
@@ -56,6 +90,8 @@ def bound_covariances(
 ) -> np.ndarray:
     """Cramér–Rao bounds on the covariance of any unbiased estimate of states (n, 4).
 
+    If the operator's stamps are movable, nobody knows the flux and the place of any star.
+
     Returns
     -------
     ndarray, shape (L, n, 4, 4)
@@ -64,9 +100,12 @@ def bound_covariances(
     out = np.empty((len(levels), len(states), 4, 4))
     for start in range(0, len(states), CHUNK):
         part = slice(start, start + CHUNK)
-        images, slopes = operator.derivatives(model(states[part]), model.jacobian(states[part]))
+        free = parameters_of(model, operator, states[part])
+        images, slopes = stamps_and_slopes(model, operator, free)
         for index, level in enumerate(levels):
-            out[index, part] = np.linalg.inv(fisher_information(images, slopes, noise, level))
+            variance = noise.variance(images.astype(np.float64), level)
+            fisher = score_and_information(np.zeros_like(images), slopes, variance)[1]
+            out[index, part] = np.linalg.inv(fisher)[:, :4, :4]
     return out
 
 
@@ -90,8 +129,8 @@ def coma_free_decentre(model: QuadraticModel, tilts: np.ndarray, noll: np.ndarra
 def twin_states(model: QuadraticModel, states: np.ndarray, noll: np.ndarray) -> np.ndarray:
     """States with the opposite tilt and the same field-constant coma, shape (n, 4).
 
-    In focus their stamps hardly differ from those of `states`.
+    In focus their stamps hardly differ from those of `states`; what follows the four is kept.
     """
-    change = -2.0 * states[:, 2:]
-    decentre = states[:, :2] + coma_free_decentre(model, change, noll)
-    return np.concatenate([decentre, -states[:, 2:]], axis=1)
+    tilts = states[:, 2:4]
+    decentre = states[:, :2] + coma_free_decentre(model, -2.0 * tilts, noll)
+    return np.concatenate([decentre, -tilts, states[:, 4:]], axis=1)

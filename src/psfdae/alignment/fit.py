@@ -3,6 +3,10 @@
 Fisher scoring: Gauss–Newton steps with the Fisher matrix of the current state,
 damped after Levenberg where a step does not raise the likelihood. With the
 variance (κλ)² + p/F its fixed point is the maximum of the Poisson likelihood.
+
+Most of the way goes by a coarse sampling of the pupil, which costs a fraction and whose
+maximum is a part of a standard error off; the last step goes by stamps of the optics that
+made the data.
 """
 
 from __future__ import annotations
@@ -12,7 +16,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from psfdae.alignment.fisher import by_parameter, twin_states
+from psfdae.alignment.fisher import (
+    parameters_of,
+    score_and_information,
+    stamps_and_slopes,
+    twin_states,
+)
 from psfdae.alignment.stamps import AlignmentStamps
 from psfdae.alignment.telescope import QuadraticModel
 from psfdae.configuration.alignment import Fit
@@ -37,26 +46,22 @@ class Likelihood:
     def evaluate(
         self, images: np.ndarray, states: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Deviance (n,), score (n, 4) and Fisher matrix (n, 4, 4) at states (n, 4).
+        """Deviance (n,), score (n, K) and Fisher matrix (n, K, K) at states (n, K).
 
-        `images`, shape (n, F, d, d), are noisy and normalised by the true flux.
+        `images`, shape (n, F, d, d), are noisy and normalised by the true flux. K is 4,
+        or more with movable stamps (`psfdae.alignment.fisher`).
         """
-        stamps, derivatives = self.operator.derivatives(
-            self.model(states), self.model.jacobian(states)
-        )
-        slopes = by_parameter(derivatives)
-        expected = stamps.reshape(len(states), -1).astype(np.float64)
-        observed = images.reshape(len(states), -1).astype(np.float64)
-        weighted = slopes / self.noise.variance(expected, self.level)[:, None]
-        score = (weighted @ (observed - expected)[:, :, None])[:, :, 0]
-        fisher = weighted @ slopes.swapaxes(1, 2)
+        stamps, slopes = stamps_and_slopes(self.model, self.operator, states)
+        expected, observed = stamps.astype(np.float64), images.astype(np.float64)
+        variance = self.noise.variance(expected, self.level)
+        score, fisher = score_and_information(observed - expected, slopes, variance)
         # 2 Σ (n ln(n/μ) − (n − μ)) with n = F x + B and μ = F p + B,
         flux, background = self.noise.flux(self.level), self.noise.background
         mean = flux * expected + background
         excess = flux * (observed - expected) / mean
         # of which each term is μ ((1 + e) ln(1 + e) − e), without cancellation.
         logarithm = np.log1p(np.maximum(excess, -1.0 + 1e-12))
-        deviance = 2.0 * (mean * ((1.0 + excess) * logarithm - excess)).sum(axis=1)
+        deviance = 2.0 * (mean * ((1.0 + excess) * logarithm - excess)).sum(axis=(1, 2, 3))
         return deviance, score, fisher
 
 
@@ -66,13 +71,13 @@ class Fits:
 
     Attributes
     ----------
-    states : ndarray, shape (n, 4)
-        In units of the range.
+    states : ndarray, shape (n, K)
+        In units of the range; after the four what else is free (`psfdae.alignment.fisher`).
     deviance : ndarray, shape (n,)
         Twice the log-likelihood that is missing to a perfect fit; about the
         number of pixels if the model is true.
-    score, fisher : ndarray, shapes (n, 4) and (n, 4, 4)
-        Slope and information of the log-likelihood at `states`.
+    score, fisher : ndarray, shapes (n, K) and (n, K, K)
+        Slope and information of the log-likelihood before the last step.
     evaluations : ndarray of int, shape (n,)
         How often stamps and derivatives were computed.
     converged : ndarray of bool, shape (n,)
@@ -96,35 +101,52 @@ def fit_states(
 ) -> Fits:
     """Fit states to noisy stamps, each from one starting point.
 
+    A step of at most `settings.tolerance` standard errors of the state is the last: it is taken,
+    and its gain is what the score and the Fisher matrix say, without another look.
+
     Parameters
     ----------
     likelihood : Likelihood
     images : ndarray, shape (n, F, d, d)
         Noisy stamps, normalised by the true flux.
-    start : ndarray, shape (n, 4)
-        In units of the range; limited to ± `settings.limit`, as are all states.
+    start : ndarray, shape (n, 4) or (n, K)
+        In units of the range; limited to ± `settings.limit`, as are all parameters.
     settings : config group `fit`
     """
     count, limit = len(start), settings.limit
-    states = np.clip(np.asarray(start, np.float64), -limit, limit)
+    states = parameters_of(likelihood.model, likelihood.operator, np.asarray(start, np.float64))
+    states = np.clip(states, -limit, limit)
     now = Fits(
         states, *likelihood.evaluate(images, states), np.ones(count, int), np.zeros(count, bool)
     )
     damping = np.full(count, settings.damping)
     for _ in range(settings.iterations):
         active = np.flatnonzero(~now.converged)
+        # What damping makes small says nothing about how far the maximum is.
+        whole = _damped_step(now, active, np.zeros(active.size), limit)
+        fisher = now.fisher[active]
+        gain = np.einsum("nk,nk->n", whole, 2.0 * now.score[active])
+        gain -= np.einsum("nk,nkl,nl->n", whole, fisher, whole)
+        # Standard errors of the state, whatever else is free.
+        own = np.linalg.inv(np.linalg.inv(fisher)[:, :4, :4])
+        size = np.einsum("nk,nkl,nl->n", whole[:, :4], own, whole[:, :4])
+        last = size <= settings.tolerance**2
+        now.states[active[last]] += whole[last]
+        now.deviance[active[last]] -= gain[last]
+        now.converged[active] = last
+        active = active[~last]
         if not active.size:
             break
-        step = _damped_step(now, active, damping[active], limit)
-        # A step of a small part of the standard error changes nothing that matters.
-        size = np.sqrt(np.einsum("nk,nkl,nl->n", step, now.fisher[active], step))
-        states = now.states[active] + step
-        evaluated = likelihood.evaluate(images[active], states)
-        proposed = Fits(states, *evaluated, np.ones(active.size, int), size <= settings.tolerance)
+        states = now.states[active] + _damped_step(now, active, damping[active], limit)
+        proposed = Fits(
+            states,
+            *likelihood.evaluate(images[active], states),
+            np.ones(active.size, int),
+            np.zeros(active.size, bool),
+        )
         better = proposed.deviance <= now.deviance[active] * (1.0 + ROUNDING)
         now.take(active[better], proposed, better)
         now.evaluations[active] += 1
-        now.converged[active] = proposed.converged
         damping[active] *= np.where(better, 1.0 / DAMPING_FACTOR, DAMPING_FACTOR)
     return now
 

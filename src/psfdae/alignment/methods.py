@@ -10,7 +10,7 @@ from typing import Literal
 class Method:
     """How states are estimated, or how well they can be.
 
-    To add a CNN is to add one of these with `states`, and its settings `train_<name>` to the
+    To add a network is to add one of these with `states`, and its settings `train_<name>` to the
     configuration.
 
     Attributes
@@ -20,13 +20,15 @@ class Method:
     paper : str
         What the paper calls it, if it is one of the paper's.
     states : str
-        Set of states that the CNN of this name is trained on; empty if there is none.
+        Set of states that the network of this name is trained on; empty if there is none.
     noisy, denoised : bool
-        The CNN is trained on noisy stamps; it sees what the DAE makes of stamps.
+        The network is trained on noisy stamps; it sees what the DAE makes of stamps.
     other : str
-        CNN of another method that this one takes: to estimate, or to start a fit.
+        Network of another method that this one takes: to estimate, or to start a fit.
     fitted : bool
         Every state is fitted.
+    free : bool
+        Nobody tells it the flux and the place of the stars in their stamps.
     """
 
     name: str
@@ -39,10 +41,11 @@ class Method:
     denoised: bool = False
     other: str = ""
     fitted: bool = False
+    free: bool = False
 
     @property
-    def cnn(self) -> str:
-        """Name of the CNN that it takes; empty if none."""
+    def network(self) -> str:
+        """Name of the network that it takes; empty if none."""
         return self.name if self.states else self.other
 
 
@@ -67,7 +70,7 @@ _METHODS = [
     ),
     Method(
         "noise_trained",
-        "CNN trained on noisy stamps",
+        "network trained on noisy stamps",
         "noise-trained",
         "#d55e00",
         states="train",
@@ -75,7 +78,7 @@ _METHODS = [
     ),
     Method(
         "dae_retrained",
-        "CNN trained on DAE output",
+        "network trained on DAE output",
         "DAE, retrained",
         "#cc79a7",
         states="train",
@@ -90,12 +93,26 @@ _METHODS = [
         other="noise_trained",
         fitted=True,
     ),
+    Method(
+        "max_likelihood_free",
+        "maximum likelihood, flux and place free",
+        other="noise_trained",
+        fitted=True,
+        free=True,
+    ),
     Method("cramer_rao", "Cramér–Rao bound"),
     Method("cramer_rao_pooled", "Cramér–Rao, all states", "Fisher"),
+    Method("cramer_rao_free", "Cramér–Rao bound, flux and place free", free=True),
 ]
 METHODS = {method.name: method for method in _METHODS}
-ESTIMATORS = [method for method in METHODS.values() if method.cnn]
+ESTIMATORS = [method for method in METHODS.values() if method.network]
 LEARNED = [method for method in ESTIMATORS if not method.fitted]
 """Methods of the product "alignment_estimates", in its order."""
 
-CNNS = [method.name for method in METHODS.values() if method.states]
+FITTED = [method for method in ESTIMATORS if method.fitted]
+"""Methods of the product "alignment_fit", in its order."""
+
+BOUNDS = [METHODS["cramer_rao"], METHODS["cramer_rao_free"]]
+"""Bounds of the product "alignment_bound", in its order."""
+
+TRAINED = [method.name for method in METHODS.values() if method.states]

@@ -26,6 +26,7 @@ from psfdae.optics.propagation import in_batches
 from psfdae.optics.pupil import annular_pupil, choose_samples, required_samples
 from psfdae.optics.raytracing import FIRST_NOLL
 from psfdae.optics.wavefronts import (
+    Modes,
     mode_slopes,
     noll_to_nm,
     radial_polynomial,
@@ -76,20 +77,53 @@ def centred_modes(highest: int, obscuration: float, x: np.ndarray, y: np.ndarray
     return np.stack(modes)
 
 
+def movable_modes(
+    modes: Modes, pixel: float, x: np.ndarray | float, y: np.ndarray | float
+) -> np.ndarray:
+    """Modes, (J, ...), and two tilts that move the image by a pixel along x and y, (J + 2, ...)."""
+    tilts = 0.5 * pixel * np.stack(np.broadcast_arrays(x, y))
+    return np.concatenate([modes(x, y), tilts])
+
+
 class AlignmentStamps:
     """Operator from Zernike coefficients to centred stamps and their derivatives.
 
     Each wavefront uses the smallest grid of the ladder that its slopes allow.
     Batches run in `optics.threads` threads; results do not depend on their number.
+
+    Parameters
+    ----------
+    telescope, optics, alignment : config groups
+    movable : bool
+        Two more coefficients, the last, move the stamp's star along x and y, in pixels.
+    narrow : bool
+        The period of a grid may be narrower than the stamp, whose outer pixels stay dark then.
+    coarse : AlignmentStamps, optional
+        Of which the derivatives are, which may err more than stamps.
     """
 
-    def __init__(self, telescope: Telescope, optics: AlignmentOptics, alignment: Alignment) -> None:
+    def __init__(
+        self,
+        telescope: Telescope,
+        optics: AlignmentOptics,
+        alignment: Alignment,
+        movable: bool = False,
+        narrow: bool = False,
+        coarse: AlignmentStamps | None = None,
+    ) -> None:
         self.telescope = telescope
         self.optics = optics
         self.alignment = alignment
         self.noll = np.arange(FIRST_NOLL, alignment.highest_zernike + 1)
         """Noll indices of the J coefficients."""
-        self._modes = partial(centred_modes, alignment.highest_zernike, telescope.obscuration)
+        self.movable = movable
+        self.narrow = narrow
+        self.coarse = coarse
+        self._modes: Modes = partial(
+            centred_modes, alignment.highest_zernike, telescope.obscuration
+        )
+        if movable:
+            self._modes = partial(movable_modes, self._modes, telescope.pixel)
         self._slopes = mode_slopes(self._modes)
         self._operators: dict[int, ModalStamps] = {}
 
@@ -151,6 +185,8 @@ class AlignmentStamps:
         SamplingError, EnergyError
             As for stamps.
         """
+        if self.coarse:
+            return self(zernikes)[0], self.coarse.derivatives(zernikes, directions)[1]
         shape, count = zernikes.shape[:-1], directions.shape[-2]
         zernikes, directions = (
             a.reshape(-1, *a.shape[len(shape) :]) for a in (zernikes, directions)
@@ -173,9 +209,11 @@ class AlignmentStamps:
         ------
         SamplingError
             If the ladder ends below what a wavefront needs: half a wave per
-            sample, and no replica of the image on the stamp.
+            sample, and no replica of the image on what is lit of the stamp.
         """
         half = 0.5 * self.alignment.stamp_px * self.telescope.pixel
+        if self.narrow:
+            half = min(half, 0.5 * self.optics.pupil_samples[0])
         reach = np.broadcast_to([-half, half], (2, 2))
         needed = required_samples(slope_ranges(self._slopes, zernikes), reach)
         return choose_samples(needed, tuple(self.optics.pupil_samples))
@@ -187,7 +225,7 @@ class AlignmentStamps:
             side, nodes = self.alignment.stamp_px, self.optics.nodes
             precision = self.optics.precision
             sampling: Sampling = (
-                PeriodSampling(pupil, side, pixel, precision)
+                PeriodSampling(pupil, side, pixel, precision, self.narrow)
                 if nodes is None
                 else NodeSampling(pupil, side, pixel, nodes, precision)
             )

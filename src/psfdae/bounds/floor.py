@@ -4,7 +4,8 @@ Then only the Seidel coefficients c are open. Near the true ones the image is
 linear in c, p(c + δ) ≈ p + Jδ, and the posterior covariance of c is that of a
 linear Gaussian problem, (JᵀΣ⁻¹J + P⁻¹)⁻¹ with noise covariance Σ and prior
 covariance P (e.g. Kay 1993, Fundamentals of Statistical Signal Processing:
-Estimation Theory, chapter 11). It is a local approximation, not a strict bound.
+Estimation Theory, chapter 11). It is a local approximation and no lower limit: where the
+image bends within the width of the posterior, the posterior mean can lie below it.
 """
 
 from __future__ import annotations
@@ -110,6 +111,9 @@ def local_error(derivatives: np.ndarray, prior_sd: np.ndarray, variance: np.ndar
 TOLERANCE = 0.05
 """Part of a bound by which an estimator may lie below it: its approximation and its noise."""
 
+FLOOR_TOLERANCE = 0.2
+"""The same part of a local floor, which the posterior mean itself may undercut by 15 %."""
+
 STANDARD_ERRORS = 2.0
 """Standard errors of the paired difference by which it may lie below it besides."""
 
@@ -124,12 +128,15 @@ class Comparison:
         Mean squared error of the estimator, and the bound.
     difference, stderr : float
         Mean of their paired difference and its standard error, clustered by field.
+    tolerance : float
+        Part of the bound by which the estimator may lie below it.
     """
 
     mse: float
     bound: float
     difference: float
     stderr: float
+    tolerance: float = TOLERANCE
 
     @property
     def efficiency(self) -> float:
@@ -139,10 +146,12 @@ class Comparison:
     @property
     def beaten(self) -> bool:
         """Whether the estimator is below the bound by more than the tolerance."""
-        return self.difference < -(STANDARD_ERRORS * self.stderr + TOLERANCE * self.bound)
+        return self.difference < -(STANDARD_ERRORS * self.stderr + self.tolerance * self.bound)
 
 
-def compare(errors: np.ndarray, bounds: np.ndarray, field: np.ndarray) -> Comparison:
+def compare(
+    errors: np.ndarray, bounds: np.ndarray, field: np.ndarray, tolerance: float = TOLERANCE
+) -> Comparison:
     """Compare an estimator with a bound.
 
     Parameters
@@ -151,6 +160,8 @@ def compare(errors: np.ndarray, bounds: np.ndarray, field: np.ndarray) -> Compar
         Squared error and bound of every star.
     field : ndarray of int, shape (n,)
         Field of every star.
+    tolerance : float
+        As in `Comparison`.
     """
     difference, stderr = clustered_mean(errors - bounds, field)
-    return Comparison(float(errors.mean()), float(bounds.mean()), difference, stderr)
+    return Comparison(float(errors.mean()), float(bounds.mean()), difference, stderr, tolerance)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -169,8 +169,12 @@ class Likelihood:
 
         Counts are whole numbers, so rounding undoes the loss of single precision.
         """
-        counts = np.rint(self.flux * noisy.reshape(len(noisy), -1).astype(np.float64))
-        return counts - self.flux * self.centre
+        return self.counts(noisy) - self.background - self.flux * self.centre
+
+    def counts(self, noisy: np.ndarray) -> np.ndarray:
+        """Photons of the images, sky included, shape (n, P), float64."""
+        signal = np.rint(self.flux * noisy.reshape(len(noisy), -1).astype(np.float64))
+        return signal + self.background
 
     def factors(self, stamps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """What multiplies the residuals, and what is added to the product, for stamps (K, P).
@@ -213,19 +217,26 @@ class PosteriorSums:
         zeros = (np.zeros((stars, *shape)) for shape in ((), (), (pixels,), (fields, shifts)))
         return cls(np.full(stars, -np.inf), *zeros)
 
+    @classmethod
+    def stack(cls, parts: Sequence[PosteriorSums]) -> PosteriorSums:
+        """Sums of several groups of test stars, one after the other."""
+        return cls(*(np.concatenate([getattr(p, key) for p in parts]) for key in vars(parts[0])))
+
     @property
     def mean_image(self) -> np.ndarray:
-        """Posterior mean of the noise-free image, shape (n, P)."""
-        return self.image / self.total[:, None]
+        """Posterior mean of the noise-free image, shape (n, P); NaN where none was possible."""
+        with np.errstate(invalid="ignore"):
+            return self.image / self.total[:, None]
 
     @property
     def effective_size(self) -> np.ndarray:
         """Effective sample size 1/Σw² of the normalised weights, shape (n,)."""
-        return self.total**2 / self.square
+        return self.total**2 / np.maximum(self.square, np.finfo(float).tiny)
 
     def mean_template(self, templates: np.ndarray) -> np.ndarray:
-        """Posterior mean of the static PSF, (F, J, d, d) to (n, P)."""
-        weight = self.share.reshape(len(self.share), -1) / self.total[:, None]
+        """Posterior mean of the static PSF, (F, J, d, d) to (n, P); NaN as `mean_image`."""
+        with np.errstate(invalid="ignore"):
+            weight = self.share.reshape(len(self.share), -1) / self.total[:, None]
         return weight @ templates.reshape(weight.shape[1], -1).astype(np.float64)
 
     def add(
@@ -277,12 +288,62 @@ def merge(parts: Sequence[PosteriorSums]) -> PosteriorSums:
     whole = PosteriorSums.empty(first.total.size, first.image.shape[1], *first.share.shape[1:])
     whole.peak = np.max([part.peak for part in parts], axis=0)
     for part in parts:
-        scale = np.exp(part.peak - whole.peak)
+        # Where no image was possible in any part, the sums stay zero.
+        scale = np.exp(part.peak - np.maximum(whole.peak, np.finfo(float).min))
         whole.total += scale * part.total
         whole.square += scale**2 * part.square
         whole.image += scale[:, None] * part.image
         whole.share += scale[:, None, None] * part.share
     return whole
+
+
+@dataclass(frozen=True)
+class Scored:
+    """Stars of a bank at one symmetry and jitter, weighed by noisy images.
+
+    Attributes
+    ----------
+    star, field : ndarray of int, shape (K,)
+        Their places in the bank and their fields after `symmetry`; equal fields lie side by side.
+    symmetry, jitter : int
+        Numbers in `SYMMETRIES` and `jitters`.
+    images : ndarray, shape (K, P), float32
+        Before `symmetry`.
+    scores : ndarray, shape (n, K), float64
+        Log-likelihood plus log-prior.
+    """
+
+    star: np.ndarray
+    field: np.ndarray
+    symmetry: int
+    jitter: int
+    images: np.ndarray
+    scores: np.ndarray
+
+
+def scored(
+    bank: Bank, noisy: np.ndarray, likelihood: Likelihood, chunk: int = CHUNK
+) -> Iterator[Scored]:
+    """All stars of a bank at all jitters and symmetries; parameters as in `posterior_sums`."""
+    residuals = likelihood.residuals(noisy).reshape(noisy.shape)
+    # Instead of mirroring every image of the bank, the test stars are mirrored back.
+    mirrored = [
+        symmetry.undo(residuals).reshape(len(noisy), -1).astype(np.float32)
+        for symmetry in SYMMETRIES
+    ]
+    order = np.argsort(bank.field, kind="stable")  # stars of a field side by side
+    for start in range(0, order.size, chunk):
+        stars = order[start : start + chunk]
+        part = bank.take(stars)
+        log_weights = part.log_weights()
+        for window, members in windows(bank.jitter_px).items():
+            stamps = part.stamps(window).reshape(len(part), -1)
+            ratio, offset = likelihood.factors(stamps)
+            images, ratio_t = stamps.astype(np.float32), ratio.T.astype(np.float32)
+            for s, jitter in members:
+                scores = mirrored[s] @ ratio_t + (offset + log_weights[:, s])
+                field = SYMMETRIES[s].field(part.field, bank.points)
+                yield Scored(stars, field, s, jitter, images, scores)
 
 
 def posterior_sums(
@@ -307,28 +368,13 @@ def posterior_sums(
         Field of every noisy image: only stars that a symmetry takes there count. Each star
         of the bank must have one that does.
     """
-    residuals = likelihood.residuals(noisy).reshape(noisy.shape)
-    # Instead of mirroring every image of the bank, the test stars are mirrored back.
-    mirrored = [
-        symmetry.undo(residuals).reshape(len(noisy), -1).astype(np.float32)
-        for symmetry in SYMMETRIES
-    ]
     shifts = len(jitters(bank.jitter_px))
     sums = PosteriorSums.empty(len(noisy), noisy[0].size, bank.points**2, shifts)
-    order = np.argsort(bank.field, kind="stable")  # stars of a field side by side
-    for start in range(0, order.size, chunk):
-        part = bank.take(order[start : start + chunk])
-        log_weights = part.log_weights()
-        for window, members in windows(bank.jitter_px).items():
-            stamps = part.stamps(window).reshape(len(part), -1)
-            ratio, offset = likelihood.factors(stamps)
-            images, ratio_t = stamps.astype(np.float32), ratio.T.astype(np.float32)
-            for s, jitter in members:
-                scores = mirrored[s] @ ratio_t + (offset + log_weights[:, s])
-                field = SYMMETRIES[s].field(part.field, bank.points)
-                if told is not None:
-                    scores[told[:, None] != field] = -np.inf
-                sums.add(scores, images, SYMMETRIES[s], field, jitter)
+    for part in scored(bank, noisy, likelihood, chunk):
+        if told is not None:
+            part.scores[told[:, None] != part.field] = -np.inf
+        symmetry = SYMMETRIES[part.symmetry]
+        sums.add(part.scores, part.images, symmetry, part.field, part.jitter)
     return sums
 
 

@@ -9,9 +9,9 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
-from psfdae.configuration.base import CheckpointSeconds
+from psfdae.configuration.base import CheckpointSeconds, PupilSamples
 from psfdae.configuration.schema import (
     Count,
     Evaluation,
@@ -27,8 +27,8 @@ from psfdae.estimators.dae import DaeSettings, Train
 class AlignmentOptics(Group):
     """Numerical settings of the propagation; pixels are wide, which allows another way."""
 
-    pupil_samples: Annotated[list[Annotated[int, Field(ge=16, le=8192)]], Field(min_length=1)] = (
-        Field(description="Ladder of grid sizes N; each wavefront takes the first that suffices")
+    pupil_samples: PupilSamples = Field(
+        description="Ladder of grid sizes N; each wavefront takes the first that suffices"
     )
     nodes: Annotated[int, Field(ge=1, le=32)] | None = Field(
         description="Gauss-Legendre nodes per pixel and axis; null: whole-period Fourier transform"
@@ -36,12 +36,6 @@ class AlignmentOptics(Group):
     precision: Literal["complex64", "complex128"] = Field(description="Of the propagation")
     batch: Count = Field(description="Wavefronts per batch")
     threads: Count = Field(description="Batches at once")
-
-    @model_validator(mode="after")
-    def _ascending(self) -> AlignmentOptics:
-        if sorted(set(self.pupil_samples)) != self.pupil_samples:
-            raise ValueError(f"pupil_samples = {self.pupil_samples}: must be ascending")
-        return self
 
 
 class Alignment(Group):
@@ -88,7 +82,7 @@ class Alignment(Group):
 
 
 class Cnn(Group):
-    """The network that estimates a state from its stamps."""
+    """Convolutions and a linear layer, the paper's network."""
 
     widths: Annotated[list[Count], Field(min_length=1)] = Field(
         description="Channels after every convolution"
@@ -115,9 +109,23 @@ class Cnn(Group):
         return self
 
 
-class CnnTrain(Group):
-    """Optimisation of one CNN."""
+class Perceptron(Group):
+    """Fully connected layers behind the stamps' leading principal components."""
 
+    components: Count = Field(description="Principal components of all stamps of a state together")
+    widths: Annotated[list[Count], Field(min_length=1)] = Field(
+        description="Neurons of every inner layer"
+    )
+
+
+NETWORKS = {"cnn": Cnn, "perceptron": Perceptron}
+"""Groups of the configuration that are the settings of a network."""
+
+
+class NetworkTrain(Group):
+    """Optimisation of one network."""
+
+    network: Literal["cnn", "perceptron"] = Field(description="Which one is trained")
     epochs: Count = Field(description="Passes over the training states")
     batch: Annotated[int, Field(ge=2)] = Field(description="States per step")
     lr: Annotated[float, Field(gt=0, le=1)] = Field(
@@ -134,6 +142,10 @@ class CnnTrain(Group):
     mirrors: bool = Field(
         description="Train on the telescope's mirror images and average estimates over them"
     )
+    noise_draws: Count = Field(
+        description="Draws of a state's noise where the DAE's output is learnt, whose computation "
+        "takes long; noisy stamps get new noise in every epoch"
+    )
     threads: Count = Field(description="Threads of the training")
     checkpoint_seconds: CheckpointSeconds = Field(
         description="Least time between checkpoints; repeats nothing"
@@ -143,9 +155,12 @@ class CnnTrain(Group):
 class Fit(Group):
     """Maximum-likelihood fit of a state."""
 
+    pupil_samples: PupilSamples = Field(
+        description="Ladder of grid sizes N of all but the last step"
+    )
     iterations: Count = Field(description="Most steps of a fit")
     tolerance: Positive = Field(
-        description="A fit ends with a step of this many standard errors or fewer"
+        description="A step of this many standard errors or fewer is the last"
     )
     damping: Positive = Field(description="Levenberg damping of the first step")
     limit: Annotated[float, Field(ge=1, le=2)] = Field(
@@ -153,20 +168,27 @@ class Fit(Group):
     )
 
 
+def _misaligned(prescription: Prescription) -> Prescription:
+    if prescription.secondary is None:
+        raise ValueError("secondary: missing, nothing else can be misaligned")
+    return prescription
+
+
 class AlignmentConfig(Group):
     """The whole configuration of scene 3."""
 
     seed: Annotated[int, Field(ge=0, lt=2**63)] = Field(description="Of every random draw")
     telescope: Telescope
-    prescription: Prescription
+    prescription: Annotated[Prescription, AfterValidator(_misaligned)]
     alignment: Alignment
     optics: AlignmentOptics
     noise: Noise
     dae: DaeSettings
     dae_train: Train
     cnn: Cnn
-    train_original: CnnTrain
-    train_noise_trained: CnnTrain
-    train_dae_retrained: CnnTrain
+    perceptron: Perceptron
+    train_original: NetworkTrain
+    train_noise_trained: NetworkTrain
+    train_dae_retrained: NetworkTrain
     evaluation: Evaluation
     fit: Fit

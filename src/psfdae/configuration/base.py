@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 SEARCH = 48.0
 """λ/D around the chief ray within which brightest pixels are searched by default.
@@ -23,6 +23,16 @@ Count = Annotated[int, Field(ge=1)]
 SearchDistance = Annotated[float, Field(gt=0, allow_inf_nan=False, exclude=True)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_]+$")]
 
+
+def _ascending(ladder: list[int]) -> list[int]:
+    if sorted(set(ladder)) != ladder:
+        raise ValueError(f"{ladder} must be ascending")
+    return ladder
+
+
+PupilSamples = Annotated[
+    list[Annotated[int, Field(ge=16, le=8192)]], Field(min_length=1), AfterValidator(_ascending)
+]
 
 NEUTRAL = "cannot change a result"
 """Marks a setting of which no byte of a result depends: another value repeats no job."""

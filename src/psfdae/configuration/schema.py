@@ -17,6 +17,7 @@ from psfdae.configuration.base import (
     Group,
     Name,
     Positive,
+    PupilSamples,
     SearchDistance,
 )
 from psfdae.configuration.consistency import Consistent
@@ -92,8 +93,8 @@ class Framing(Group):
 class Optics(Group):
     """Numerical settings of the propagation."""
 
-    pupil_samples: Annotated[list[Annotated[int, Field(ge=16, le=8192)]], Field(min_length=1)] = (
-        Field(description="Ladder of grid sizes N; each wavefront takes the first that suffices")
+    pupil_samples: PupilSamples = Field(
+        description="Ladder of grid sizes N; each wavefront takes the first that suffices"
     )
     nodes: Annotated[int, Field(ge=1, le=32)] = Field(
         description="Gauss-Legendre nodes per pixel and axis; null: as many as the pixel needs"
@@ -102,12 +103,6 @@ class Optics(Group):
     backend: Literal["numpy", "torch"] = Field(description="Library of the matrix products")
     batch: Count = Field(description="Wavefronts per batch")
     threads: Count = Field(description="Threads of the linear algebra")
-
-    @model_validator(mode="after")
-    def _ascending(self) -> Optics:
-        if sorted(set(self.pupil_samples)) != self.pupil_samples:
-            raise ValueError(f"pupil_samples = {self.pupil_samples}: must be ascending")
-        return self
 
 
 class Noise(Group):
@@ -192,6 +187,9 @@ class Bounds(Group):
     bank_stars: Count = Field(description="Fresh draws of the simulator in the bank")
     position_stars: Count = Field(
         description="Further draws, which only the bound uses that is told the field"
+    )
+    star_draws: Annotated[int, Field(ge=20)] = Field(
+        description="Draws around the best matches of each star, where the bank is too thin"
     )
     test_stars: Count = Field(description="Test stars that are bounded, the first of the part")
     threads: Count = Field(description="Threads of the linear algebra")

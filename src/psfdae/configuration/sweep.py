@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
+from psfdae.configuration.alignment import NETWORKS
 from psfdae.configuration.base import Count, Finite, Group, Name
 from psfdae.configuration.compose import ConfigError, Root, config_dir, load_file
 from psfdae.configuration.schema import Reference, SplitKind
@@ -18,16 +19,16 @@ Value = Scalar | list[Scalar]
 AxisName = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_.]*$")]
 Metric = Literal["validation_mse", "validation_ssim", "validation_mae"]
 
-CNNS = {
+TRAINED = {
     "original": ("cnn", "train_original"),
-    "noise_trained": ("cnn", "train_noise_trained", "noise.levels"),
+    "noise_trained": ("cnn", "perceptron", "train_noise_trained", "noise.levels"),
 }
-"""CNNs of scene 3 that a sweep may train, and what it may change of them."""
+"""Networks of scene 3 that a sweep may train, and what it may change of them."""
 
 
 def models() -> tuple[str, ...]:
-    """What a sweep may train: methods that are fitted to a file, and CNNs of scene 3."""
-    return (*(kind.name for kind in registered() if kind.stored), *CNNS)
+    """What a sweep may train: methods that are fitted to a file, and networks of scene 3."""
+    return (*(kind.name for kind in registered() if kind.stored), *TRAINED)
 
 
 def _trainable(name: str) -> str:
@@ -118,8 +119,8 @@ class Sweep(Group):
     kind: Literal["grid", "random", "adaptive"] = Field(
         description="Every combination, random draws, or draws that learn from earlier ones"
     )
-    model: Model = Field(description="Method, or one of scene 3's CNNs")
-    dataset: Name | None = Field(default=None, description="Dataset; none for scene 3's CNNs")
+    model: Model = Field(description="Method, or one of scene 3's networks")
+    dataset: Name | None = Field(default=None, description="Dataset; none for scene 3's networks")
     split: SplitKind = Field(default="random", description="Split of the stars")
     reference: Reference = Field(default="realisation", description="What the DAE is to restore")
     metric: Metric = Field(description="Chooses the best point: over all noise levels")
@@ -138,7 +139,7 @@ class Sweep(Group):
     @property
     def root(self) -> Root:
         """Root of the configuration that the model is part of."""
-        return "alignment" if self.model in CNNS else "config"
+        return "alignment" if self.model in TRAINED else "config"
 
     @property
     def reads(self) -> tuple[str, ...]:
@@ -148,14 +149,14 @@ class Sweep(Group):
     @property
     def varied(self) -> tuple[str, ...]:
         """Keys and groups that may differ; all points share their stars and their parts."""
-        return CNNS.get(self.model) or (*method(self.model).groups, "noise.levels")
+        return TRAINED.get(self.model) or (*method(self.model).groups, "noise.levels")
 
     @model_validator(mode="after")
     def _fits_together(self) -> Sweep:
         if (self.kind == "grid") != (self.trials is None):
             raise ValueError("trials: random and adaptive sweeps need it, a grid has none")
         if (self.root == "config") != (self.dataset is not None):
-            raise ValueError("dataset: methods need one, scene 3's CNNs have none")
+            raise ValueError("dataset: methods need one, scene 3's networks have none")
         if self.metric not in METRICS[self.root]:
             allowed = " or ".join(METRICS[self.root])
             raise ValueError(f"metric = {self.metric}: model {self.model} has {allowed}")
@@ -190,8 +191,8 @@ class Sweep(Group):
 
 def point_groups(model: str) -> tuple[str, ...]:
     """Groups of the configuration that a point of a model reads."""
-    if model in CNNS:
-        return ("seed", "noise", "cnn", f"train_{model}", "evaluation")
+    if model in TRAINED:
+        return ("seed", "noise", *NETWORKS, f"train_{model}", "evaluation")
     return (*groups_of(model), "evaluation")
 
 

@@ -68,18 +68,22 @@ class Glass(Group):
 
 
 class Prescription(Group):
-    """A two-mirror telescope with a lens corrector; z up, light along −z."""
+    """One or two mirrors, and lenses behind the second; z up, light along −z.
+
+    Without a secondary the light is focused above the primary. A flat mirror that folds it,
+    as in a Newtonian, is left out: it is nothing but the telescope's obscuration.
+    """
 
     name: Name = Field(description="For titles and messages")
     entrance_pupil_m: Finite = Field(description="z of the plane that holds the pupil")
     launch_distance_m: Positive = Field(description="Start of the rays above that plane")
     reference_sphere_m: Positive = Field(description="Radius of the wavefront's reference")
     primary: Mirror
-    secondary: Secondary
-    lenses: Annotated[dict[Name, Lens], Field(min_length=1)] = Field(
-        description="Lenses of the corrector, by name"
+    secondary: Secondary | None = Field(default=None, description="Null: none, or a flat one")
+    lenses: dict[Name, Lens] = Field(
+        default_factory=dict, description="Lenses of the corrector, by name"
     )
-    glass: Glass
+    glass: Glass | None = Field(default=None, description="Of all lenses")
     best_focus_m: Finite = Field(description="z of the detector in focus")
 
     @property
@@ -88,23 +92,32 @@ class Prescription(Group):
         return sorted(self.lenses.items(), key=lambda item: -item[1].front_vertex_m)
 
     @model_validator(mode="after")
+    def _complete(self) -> Prescription:
+        if self.lenses and self.secondary is None:
+            raise ValueError(f"lenses = {list(self.lenses)}: must lie behind a secondary")
+        if bool(self.lenses) != (self.glass is not None):
+            raise ValueError("glass: must be given for lenses, and for nothing else")
+        return self
+
+    @model_validator(mode="after")
     def _in_order(self) -> Prescription:
-        along = [("secondary", self.secondary.vertex_m)]
-        for name, lens in self.ordered_lenses:
-            along += [(f"front of {name}", lens.front_vertex_m)]
-            along += [(f"back of {name}", lens.back_vertex_m)]
-        along += [("best focus", self.best_focus_m)]
-        for (above, z_above), (below, z_below) in pairwise(along):
-            if not z_above > z_below:
-                raise ValueError(
-                    f"distance from {above} to {below} = {z_above - z_below:.6g} m: "
-                    "must be greater than 0"
-                )
-        if not self.secondary.vertex_m > self.primary.vertex_m:
-            raise ValueError(
-                f"distance from primary to secondary = "
-                f"{self.secondary.vertex_m - self.primary.vertex_m:.6g} m: must be greater than 0"
-            )
+        primary = ("primary", self.primary.vertex_m)
+        focus = ("best focus", self.best_focus_m)
+        upwards, downwards = [primary, focus], []
+        if self.secondary is not None:
+            secondary = ("secondary", self.secondary.vertex_m)
+            upwards, downwards = [primary, secondary], [secondary]
+            for name, lens in self.ordered_lenses:
+                downwards += [(f"front of {name}", lens.front_vertex_m)]
+                downwards += [(f"back of {name}", lens.back_vertex_m)]
+            downwards += [focus]
+        for sign, path in ((1, upwards), (-1, downwards)):
+            for (start, z_start), (end, z_end) in pairwise(path):
+                distance = sign * (z_end - z_start)
+                if not distance > 0:
+                    raise ValueError(
+                        f"distance from {start} to {end} = {distance:.6g} m: must be greater than 0"
+                    )
         return self
 
 

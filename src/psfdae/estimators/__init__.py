@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 
@@ -44,6 +44,37 @@ CONFIG, HISTORY = "config.yaml", "history.csv"
 
 class FitError(RuntimeError):
     """A method cannot be fitted; the message says why and what to change."""
+
+
+class BrightStamps(NamedTuple):
+    """The bright stars of an image as they are in it.
+
+    Attributes
+    ----------
+    wide : ndarray, shape (n, s, s)
+        Sky-subtracted, of flux 1 in the stamp, with a margin.
+    peak : ndarray of int, shape (n, 2)
+        Brightest pixel (row, column) from index (s//2, s//2).
+    listed : ndarray, shape (n, 2)
+        Centre that the star list says, likewise; NaN where none does.
+    position : ndarray, shape (n, 2)
+        (x, y) in the image; NaN where unknown.
+    noise : ndarray, shape (n,)
+        RMS of the sky in a pixel over the flux.
+    star : ndarray of int
+        Star of every image of the training set.
+    """
+
+    wide: np.ndarray
+    peak: np.ndarray
+    listed: np.ndarray
+    position: np.ndarray
+    noise: np.ndarray
+    star: np.ndarray
+
+    def of(self, chosen: np.ndarray) -> BrightStamps:
+        """Some of the stars."""
+        return BrightStamps(*(array[chosen] for array in self[:-1]), self.star)
 
 
 @dataclass(frozen=True)
@@ -74,6 +105,8 @@ class TrainingSet:
     own_noise : callable or None
         Of images that are not noise-free: from star indices (m,) and their mean image (P,)
         to what noise adds to their scatter (P, P) about it.
+    bright : BrightStamps or None
+        The stars of which the images were made, if these are an image's.
     checkpoint : Path or None
         Where a long fit may keep its state; the caller removes it once the result is safe.
     """
@@ -89,6 +122,7 @@ class TrainingSet:
     positions: np.ndarray = field(default_factory=lambda: np.empty((0, 2)))
     fresh: Product | None = None
     own_noise: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
+    bright: BrightStamps | None = None
     checkpoint: Path | None = None
 
     @property
@@ -130,6 +164,25 @@ class TrainingSet:
 
 
 @dataclass(frozen=True)
+class Measured:
+    """What a method measures of stars besides their PSFs, in the unit of their stamps.
+
+    Attributes
+    ----------
+    flux, background : ndarray, shape (n,)
+    centre : ndarray, shape (n, 2)
+        (row, column) from pixel (d//2, d//2).
+    covariance : ndarray, shape (n, 4, 4)
+        Of flux, background, row and column.
+    """
+
+    flux: np.ndarray
+    background: np.ndarray
+    centre: np.ndarray
+    covariance: np.ndarray
+
+
+@dataclass(frozen=True)
 class Estimate:
     """PSFs, and what a method says of them.
 
@@ -143,12 +196,15 @@ class Estimate:
     flux : ndarray, shape (n,), or None
         Flux of the star in that by which its image was divided, if the method was to find it;
         the PSF has this sum.
+    measured : Measured or None
+        Of a method that measures stars itself; its PSFs have the sum 1.
     """
 
     psf: np.ndarray
     sigma: np.ndarray | None = None
     evidence: np.ndarray | None = None
     flux: np.ndarray | None = None
+    measured: Measured | None = None
 
 
 class Method:
@@ -168,6 +224,9 @@ class Method:
         `predict` gets the noise level λ, too: of all images, or of each, shape (n,).
     told_position : bool
         `predict` gets the positions in the field as well, shape (n, 2).
+    measures : bool
+        It measures flux, sky and centre of a star with its PSF: `measure` does, of stamps, and
+        a model of it takes no photometry from elsewhere.
     groups : mapping
         Groups of the configuration that are its settings; `fit` gets them by name.
     stored : bool
@@ -192,8 +251,13 @@ class Method:
         Ends the names of its bundles.
     together : int
         Small images that `psfdae predict` has restored at once.
+    padded : bool
+        Fewer are made up to as many: other numbers of them round otherwise.
     memory_mb, minutes : int
         What a fit takes at most.
+    seed_scatter : float
+        Standard deviation of its mean squared error between seeds, over that error: the
+        largest that the target `seeds` has found at any noise level.
     """
 
     name: ClassVar[str] = ""
@@ -205,6 +269,7 @@ class Method:
     restores: ClassVar[bool] = True
     told_level: ClassVar[bool] = False
     told_position: ClassVar[bool] = False
+    measures: ClassVar[bool] = False
     groups: ClassVar[Mapping[str, type[Group]]] = {}
     stored: ClassVar[bool] = True
     per_reference: ClassVar[bool] = False
@@ -218,8 +283,10 @@ class Method:
     bundled: ClassVar[bool] = True
     suffix: ClassVar[str]
     together: ClassVar[int] = 256
+    padded: ClassVar[bool] = True
     memory_mb: ClassVar[int] = 1000
     minutes: ClassVar[int] = 30
+    seed_scatter: ClassVar[float] = 0.0
 
     diagnosed: Mapping[str, list[dict[str, Any]]]
 
@@ -228,6 +295,8 @@ class Method:
         """Class method: from a `TrainingSet` and the groups of settings to a fitted method."""
         predict: Callable[..., np.ndarray]
         """PSFs of flux-normalised noisy images, both of shape (n, d, d)."""
+        measure: Callable[..., Estimate]
+        """PSFs of stamps; see `psfdae.estimators.field`, if `measures`."""
 
     def __init_subclass__(cls) -> None:
         cls.name = cls.__module__.rpartition(".")[2]
@@ -286,6 +355,10 @@ class Method:
         A method that can finds a better flux (`Estimate.flux`).
         """
         return self
+
+    def psf_at(self, position: np.ndarray, oversampling: int = 1) -> np.ndarray:
+        """PSFs at positions (n, 2), of a method that knows them between the stars."""
+        raise FitError(f"{self.label}: knows the PSF of a star alone, not that of a place")
 
     @classmethod
     def stem(cls, dataset: str, split: str, reference: str) -> str:
@@ -350,8 +423,11 @@ class Method:
         """A fit from its arrays and the configuration that was saved with them."""
         return cls(**arrays)
 
-    def pack(self, stamp_px: int) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Arrays for a bundle, and fields of its `BundleInfo` that say what they are."""
+    def pack(self, stamp_px: int, noise: float) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Arrays for a bundle, and fields of its `BundleInfo` that say what they are.
+
+        `noise` is the least RMS per pixel, over the flux, that they are for.
+        """
         return {name: np.asarray(getattr(self, name)) for name in self.arrays}, {}
 
     @classmethod
@@ -427,11 +503,11 @@ def registered() -> tuple[type[Method], ...]:
     ConfigError
         If the list is missing, or names something else.
     """
-    return listed(config_dir() / "config.yaml")
+    return methods_in(config_dir() / "config.yaml")
 
 
 @cache
-def listed(path: Path) -> tuple[type[Method], ...]:
+def methods_in(path: Path) -> tuple[type[Method], ...]:
     """The methods of a file `config.yaml`."""
     try:
         tree = parse_yaml(path)

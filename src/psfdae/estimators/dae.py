@@ -114,6 +114,7 @@ class Dae(Method):
     suffix = ""
     about = "Folder of a trained network."
     memory_mb, minutes = 1500, 60
+    seed_scatter = 0.03
 
     def __init__(
         self,
@@ -197,7 +198,7 @@ class Dae(Method):
         network = with_weights(lambda: Network(settings.kernels, settings.widths), place / WEIGHTS)
         return cls(network, settings.scale, batch)
 
-    def pack(self, stamp_px: int) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    def pack(self, stamp_px: int, noise: float) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Weights, and the network's shape."""
         state = self.network.state_dict()
         shape = {"kernels": self.network.kernels, "widths": self.network.widths}

@@ -43,14 +43,14 @@ from psfdae.estimators import Estimate, FitError, Method, TrainingSet
 from psfdae.rng import stream
 from psfdae.stars.noise import NoiseModel
 
-STEP = 0.2
+STEP = 0.4
 """Of ln s between noise variances of single stars, which share a factorisation; s is then
 wrong by half of it at most, and the error grows by the square."""
 
-KEPT = 256e6
+KEPT = 400e6
 """Bytes of factorisations that are kept for further stars."""
 
-NEAREST, LEADING = 64, 64
+NEAREST, LEADING = 32, 64
 """Clusters that are looked at, and coordinates in which they are found; the others of 512
 hold less than 1 % of the weight."""
 
@@ -155,10 +155,15 @@ class GaussianMixture(Method):
         Eigenvalues of S.
     count : ndarray of int, shape (K,)
         Stars of each cluster.
-    mean, mean_reference : ndarray, shape (K, P)
-        μ_x in the axes, and μ_y in pixels.
+    rows : ndarray of int, shape (K,)
+        Rows of `deviation` of each cluster: its stars, or fewer with the same products.
+    mean : ndarray, shape (K, P)
+        μ_x in the axes.
+    mean_reference : ndarray, shape (K, P), or (0, P)
+        μ_y in pixels; none where the references are the images.
     deviation : ndarray, shape (n, P)
-        Stars less their cluster's mean, in the axes, cluster by cluster.
+        Stars less their cluster's mean, in the axes, cluster by cluster; in a bundle
+        the main axes of each, times the root of the sum of squares along them.
     deviation_reference : ndarray, shape (n, P), or (0, P)
         The same of the references in pixels; none where they are the images.
     cross : ndarray, shape (P, P), or (0, P)
@@ -180,13 +185,14 @@ class GaussianMixture(Method):
 
     label, color, marker = "GMM (told λ)", "#cc79a7", "P"
     told_level = True
-    together = 1024
+    together, padded = 4096, False
     per_reference = True
     groups: ClassVar = {"gmm": Gmm}
     arrays: ClassVar = {
         "axes": ("1", "eigenvectors of the covariance within clusters, columns"),
         "variance": ("1", "its eigenvalues"),
         "count": ("1", "stars of each cluster"),
+        "rows": ("1", "rows of deviation of each cluster"),
         "mean": ("1", "mean image of each cluster, in the axes"),
         "mean_reference": ("1", "mean reference of each cluster"),
         "deviation": ("1", "images less the mean of their cluster, in the axes"),
@@ -204,6 +210,7 @@ class GaussianMixture(Method):
     axes: np.ndarray
     variance: np.ndarray
     count: np.ndarray
+    rows: np.ndarray
     mean: np.ndarray
     mean_reference: np.ndarray
     deviation: np.ndarray
@@ -324,8 +331,9 @@ class GaussianMixture(Method):
             axes=axes.astype(np.float32),
             variance=variance,
             count=count,
+            rows=count,
             mean=(mean_x @ axes).astype(np.float32),
-            mean_reference=mean_y.astype(np.float32),
+            mean_reference=none if same else mean_y.astype(np.float32),
             deviation=x.astype(np.float32),
             deviation_reference=none if same else y.astype(np.float32),
             cross=none if same else (y.T @ x / len(x)).astype(np.float32),
@@ -349,8 +357,26 @@ class GaussianMixture(Method):
         cls, arrays: Mapping[str, np.ndarray], config: Mapping[str, Any], reference: str
     ) -> Self:
         """As of all methods; the noise is that of the configuration."""
-        noise = config["noise"]
-        return cls(**arrays, noise=NoiseModel(noise["kappa"], noise["background_photons"]))
+        noise = NoiseModel(config["noise"]["kappa"], config["noise"]["background_photons"])
+        rows = arrays["deviation"].astype(np.float32)
+        return cls(**{**arrays, "deviation": rows}, noise=noise)
+
+    def pack(self, stamp_px: int, noise: float) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """As of all methods; where the references are the images, clusters by their main axes.
+
+        Axes with a variance below FLAT of that of the noise are left out.
+        """
+        arrays, said = super().pack(stamp_px, noise)
+        if len(self.cross) or self.whitening.size:
+            return arrays, said
+        kept, width = [], self.free_flux()._leading(noise**2)
+        for cluster in self._clusters:
+            _, size, axis = np.linalg.svd(cluster.own[:, :width], full_matrices=False)
+            kept.append((size[:, None] * axis)[cluster.scale * size**2 > FLAT * noise**2])
+        arrays["rows"] = np.array([len(rows) for rows in kept])
+        arrays["deviation"] = np.vstack(kept).astype(np.float16)
+        arrays["deviation_center"] = np.empty((len(arrays["deviation"]), 0))
+        return arrays, said
 
     def strangeness(self, noisy: np.ndarray, level: np.ndarray) -> np.ndarray:
         """As of all methods, from the evidence of the leading `TELLING` coordinates.
@@ -520,15 +546,15 @@ class GaussianMixture(Method):
     @cached_property
     def _clusters(self) -> list[Cluster]:
         """Each cluster with its own slope, by the same shrinkage as its covariances."""
-        ends = self.count.cumsum()
+        ends = self.rows.cumsum()
         return [
             self._cluster(k, slice(b - n, b))
-            for k, (b, n) in enumerate(zip(ends, self.count, strict=True))
+            for k, (b, n) in enumerate(zip(ends, self.rows, strict=True))
         ]
 
-    def _cluster(self, k: int, stars: slice) -> Cluster:
-        p = self.deviation_center[stars]
-        nu, total = float(self.shrinkage[0]), len(p) + float(self.shrinkage[0])
+    def _cluster(self, k: int, rows: slice) -> Cluster:
+        p = self.deviation_center[rows]
+        nu, total = float(self.shrinkage[0]), self.count[k] + float(self.shrinkage[0])
         scatter = p.T @ p + nu * np.eye(p.shape[1])
 
         def sloped(a: np.ndarray, common: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -542,13 +568,13 @@ class GaussianMixture(Method):
             rows = np.vstack([a - p.astype(np.float32) @ own, np.float32(np.sqrt(nu)) * own])
             return rows, common + own
 
-        own, slope = sloped(self.deviation[stars], self.slope)
+        own, slope = sloped(self.deviation[rows], self.slope)
         own_reference, slope_reference = sloped(
-            self.deviation_reference[stars if len(self.cross) else slice(0)], self.slope_reference
+            self.deviation_reference[rows if len(self.cross) else slice(0)], self.slope_reference
         )
         if self.loose:
             weight = np.float32(self.loose * np.sqrt(total))
-            own = np.vstack([own, weight * self._contrast[k]])
+            own = np.vstack([own, weight * self._contrast[k, : own.shape[1]]])
             if len(own_reference):
                 row = weight * self.mean_reference[k]
                 own_reference = np.vstack([own_reference, row])
@@ -568,7 +594,7 @@ class GaussianMixture(Method):
             from scipy.linalg import solve_triangular
 
             cluster = self._clusters[k]
-            leading = int(np.count_nonzero(np.maximum.accumulate(self._total[::-1]) > FLAT * s))
+            leading = min(self._leading(s), cluster.own.shape[1])
             shared = np.ones(len(self.variance))
             shared[:leading] = cluster.common
             d = shared * self.variance + s
@@ -591,6 +617,10 @@ class GaussianMixture(Method):
                 ),
             )
         return node[k]
+
+    def _leading(self, s: float) -> int:
+        """Coordinates in which clusters differ at a noise variance s."""
+        return int(np.count_nonzero(np.maximum.accumulate(self._total[::-1]) > FLAT * s))
 
     @cached_property
     def _total(self) -> np.ndarray:

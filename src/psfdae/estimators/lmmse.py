@@ -2,7 +2,7 @@
 
 ŷ = ȳ + C_yx (C_xx + N)⁻¹ (x − x̄) with the mean and the (cross-)covariance of the
 noise-free training stars and their references, and the noise variance of the
-star's own λ on the diagonal of N. It is told λ, which the other methods are not.
+star's own λ on the diagonal of N, which it is told.
 """
 
 from __future__ import annotations

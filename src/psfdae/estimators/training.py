@@ -24,7 +24,7 @@ from psfdae.estimators import FitError
 from psfdae.estimators.weights import load_checkpoint, save_checkpoint
 
 if TYPE_CHECKING:
-    from psfdae.configuration.alignment import CnnTrain
+    from psfdae.configuration.alignment import NetworkTrain
     from psfdae.estimators.dae import Train
 
 Row = dict[str, float]
@@ -98,7 +98,7 @@ class Training(ABC):
     def __init__(
         self,
         model: torch.nn.Module,
-        settings: Train | CnnTrain,
+        settings: Train | NetworkTrain,
         steps: int,
         attempt: int = 0,
         key: str = "train",
@@ -265,12 +265,15 @@ def progress(epochs: int) -> Iterator[Callable[[Row], None]]:
     terminal = sys.stderr.isatty()
 
     def report(row: Row) -> None:
-        errors = [f"{name} {row[key]:.3e}" for key, name in ERRORS.items() if key in row]
+        # Not every epoch is validated.
+        known = {key: name for key, name in ERRORS.items() if np.isfinite(row.get(key, np.nan))}
+        errors = [f"{name} {row[key]:.3e}" for key, name in known.items()]
         bar.set_postfix_str(errors[0])
         bar.update()
         if not terminal:
-            line = (f"epoch {row['epoch']:.0f}/{epochs}", *errors, f"{row['seconds']:.0f} s")
-            print("  ".join(line), flush=True)
+            left = row["seconds"] * (epochs / row["epoch"] - 1)
+            time = f"{row['seconds']:.0f} s, {left:.0f} s left at most"
+            print(f"epoch {row['epoch']:.0f}/{epochs}", *errors, time, sep="  ", flush=True)
 
     with tqdm(total=epochs, unit="epoch", disable=not terminal, desc="train") as bar:
         yield report

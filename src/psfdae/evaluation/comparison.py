@@ -1,4 +1,4 @@
-"""Two trained networks side by side: settings, training curves, errors star by star."""
+"""Errors side by side, star by star: of two trained networks, of seen and of held-out fields."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from psfdae.evaluation.metrics import clustered_mean
+from psfdae.evaluation.metrics import clustered_mean, clustered_ratio, seed_stderr
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -20,7 +20,7 @@ SHARES = (0.25, 0.5, 0.75, 1.0)
 
 COLUMNS = [
     *("metric", "method", "noise_level", "first", "second"),
-    *("difference", "stderr", "sigmas", "verdict"),
+    *("difference", "stderr", "seed_stderr", "sigmas", "verdict"),
 ]
 
 SMALLER_IS_BETTER = {"mse": True, "ssim": False}
@@ -85,22 +85,26 @@ def same_noisy_stars(first: pd.DataFrame, second: pd.DataFrame) -> bool:
     return one.index.equals(other.index) and bool(np.allclose(one, other, rtol=1e-5, atol=0.0))
 
 
-def compare_errors(first: pd.DataFrame, second: pd.DataFrame) -> pd.DataFrame:
+def compare_errors(
+    first: pd.DataFrame, second: pd.DataFrame, scatter: Mapping[str, float]
+) -> pd.DataFrame:
     """Mean errors of two evaluations and how sure their difference is.
 
     Paired star by star where both saw the same noisy images, else as independent
-    samples; standard errors are clustered by field (`clustered_mean`).
+    samples; standard errors are clustered by field (`clustered_mean`). Two trainings of one
+    setting differ by their seeds, too: `seed_stderr`.
 
     Parameters
     ----------
     first, second : as for `same_noisy_stars`
+    scatter : mapping of method to `Method.seed_scatter`; none for methods that have no seed
 
     Returns
     -------
     DataFrame
-        metric, method, noise_level, first, second, difference (second − first), stderr,
-        sigmas, verdict: "better", "worse" (the second) or "same", for methods and levels
-        that both have.
+        metric, method, noise_level, first, second, difference (second − first), stderr (of
+        the stars), seed_stderr (of both trainings), sigmas (of both errors), verdict:
+        "better", "worse" (the second) or "same", for methods and levels that both have.
     """
     import pandas as pd
 
@@ -113,14 +117,14 @@ def compare_errors(first: pd.DataFrame, second: pd.DataFrame) -> pd.DataFrame:
         if other is None:
             continue
         for metric in SMALLER_IS_BETTER:
-            values = _difference(one, other, metric, paired)
+            values = _difference(one, other, metric, paired, scatter.get(str(method), 0.0))
             rows.append({"metric": metric, "method": method, "noise_level": level, **values})
     table = pd.DataFrame(rows, columns=COLUMNS)
     return table.sort_values(["metric", "method", "noise_level"], ignore_index=True)
 
 
 def _difference(
-    one: pd.DataFrame, other: pd.DataFrame, metric: str, paired: bool
+    one: pd.DataFrame, other: pd.DataFrame, metric: str, paired: bool, scatter: float
 ) -> dict[str, float | str]:
     if paired:
         one, other = (table.sort_values("star") for table in (one, other))
@@ -133,12 +137,16 @@ def _difference(
         ]
         difference = means[1][0] - means[0][0]
         stderr = float(np.hypot(means[0][1], means[1][1]))
-    sigmas = difference / stderr if stderr > 0 else 0.0 if difference == 0 else np.inf
+    first, second = (float(table[metric].mean()) for table in (one, other))
+    seeds = float(np.hypot(*(seed_stderr(scatter, metric, mean) for mean in (first, second))))
+    error = np.hypot(stderr, seeds)
+    sigmas = 0.0 if difference == 0 else difference / error if error > 0 else np.inf
     return {
-        "first": float(one[metric].mean()),
-        "second": float(other[metric].mean()),
+        "first": first,
+        "second": second,
         "difference": difference,
         "stderr": stderr,
+        "seed_stderr": seeds,
         "sigmas": float(sigmas),
         "verdict": _verdict(float(sigmas), SMALLER_IS_BETTER[metric]),
     }
@@ -148,3 +156,40 @@ def _verdict(sigmas: float, smaller_is_better: bool) -> str:
     if not abs(sigmas) >= SIGNIFICANT:
         return "same"
     return "better" if (sigmas < 0) == smaller_is_better else "worse"
+
+
+HELD_OUT_COLUMNS = ["dataset", "reference", "method", "noise_level", "mse_random", "mse_held_out"]
+HELD_OUT_COLUMNS += ["ratio", "stderr", "n", "fields"]
+
+
+def held_out_ratios(stars: pd.DataFrame) -> pd.DataFrame:
+    """What it costs that a star's field was not seen in training, on the very same stars.
+
+    These are the stars that both splits test: they stand in held-out fields, and the split
+    `random` neither fits nor validates with them.
+
+    Parameters
+    ----------
+    stars : DataFrame
+        Errors per star of both splits: dataset, split, reference, method, noise_level,
+        star, field, mse.
+
+    Returns
+    -------
+    DataFrame
+        `HELD_OUT_COLUMNS`: mean errors, their ratio (held out over random) with its
+        standard error clustered by field, numbers of stars and of fields.
+    """
+    import pandas as pd
+
+    rows = []
+    keys = HELD_OUT_COLUMNS[:4]
+    for key, errors in stars.groupby(keys, sort=False):
+        seen, unseen = (errors[errors.split == split] for split in ("random", "held_out"))
+        both = seen.merge(unseen, on=["star", "field"], suffixes=("_random", "_held_out"))
+        if len(both):
+            pair = both.mse_held_out.to_numpy(), both.mse_random.to_numpy()
+            ratio, stderr = clustered_ratio(*pair, both.field.to_numpy())
+            means = (pair[1].mean(), pair[0].mean())
+            rows.append((*key, *means, ratio, stderr, len(both), both.field.nunique()))
+    return pd.DataFrame(rows, columns=HELD_OUT_COLUMNS)

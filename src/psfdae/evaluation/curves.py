@@ -210,7 +210,7 @@ def errors_above_bounds(efficiency: pd.DataFrame, bounds: pd.DataFrame, dataset:
         if found:
             handles.append(Line2D([], [], ls="--", lw=1.2, ms=6, **look))
         if "no" in found:
-            style = {**look, "mfc": "white", "label": "its bank too thin: upper limit"}
+            style = {**look, "mfc": "white", "label": "its draws too few: upper limit"}
             handles.append(Line2D([], [], ls="--", lw=1.2, ms=6, **style))
     if "floor" in set(limits["method"]):
         handles.append(Patch(facecolor=FLOOR["color"], alpha=0.35, label=FLOOR["label"]))
@@ -393,7 +393,11 @@ def _errors(
         line = line.sort_values("noise_level")
         style = {**_line(type(kind)), "lw": 1.6, "ms": 5}
         axes.plot(line["noise_level"], line["mse"], **style)
-        _name(axes, line["noise_level"], line["mse"], kind.label, kind.color)
+        # The lowest line is near the one above, and has room below where noise is least.
+        last = kind is methods[-1]
+        named = line[:1] if last else line
+        name = kind.label.partition(" (")[0]  # what it is told stands beside its stars
+        _name(axes, named["noise_level"], named["mse"], name, kind.color, below=last)
     best = bounds[bounds.method == "bayes"].sort_values("noise_level")
     tight = best[best.tight == "yes"]
     axes.plot(best["noise_level"], best["value"], color=BAYES["color"], ls="--", lw=1.2)

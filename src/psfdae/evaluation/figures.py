@@ -288,7 +288,8 @@ def draw_cell(
         interpolation="nearest",
     )
     if column == 0:
-        axes.set_ylabel(row.label, rotation=0, ha="right", va="center", labelpad=5)
+        label = row.label.replace(" (", "\n(")
+        axes.set_ylabel(label, rotation=0, ha="right", va="center", ma="right", labelpad=5)
     return axes
 
 

@@ -59,19 +59,27 @@ class PeriodSampling:
 
     With lags l of the pupil's samples, |E(u)|² = Σ_l c_l exp(−πi l·spacing·u); the
     integral over a pixel multiplies c_l by the pixel's width and a sinc. Twice as
-    many points as samples determine all c_l.
+    many points as samples determine all c_l. Pixels beyond the period repeat those
+    inside; `narrow` leaves them dark.
     """
 
-    def __init__(self, pupil: Pupil, stamp_px: int, pixel: float, precision: Precision) -> None:
+    def __init__(
+        self,
+        pupil: Pupil,
+        stamp_px: int,
+        pixel: float,
+        precision: Precision,
+        narrow: bool = False,
+    ) -> None:
         samples = pupil.axis.size
         self.points = fft.next_fast_len(2 * samples)
         lags = np.arange(1 - samples, samples)
         frequency = 0.5 * pupil.spacing * lags
+        centres = _centres(stamp_px, pixel)
         to_pixels = (
-            pixel
-            * np.sinc(frequency * pixel)
-            * np.exp(-2j * np.pi * np.outer(_centres(stamp_px, pixel), frequency))
+            pixel * np.sinc(frequency * pixel) * np.exp(-2j * np.pi * np.outer(centres, frequency))
         )
+        to_pixels[narrow & (np.abs(centres) * pupil.spacing > 1.0)] = 0.0
         from_points = np.exp(2j * np.pi * np.outer(lags, np.arange(self.points)) / self.points)
         self.pixels = (to_pixels @ from_points).real / self.points
         self.pixels = self.pixels.astype(np.empty(0, precision).real.dtype)
@@ -108,9 +116,7 @@ class ModalStamps:
         self._axis = pupil.axis.astype(dtype)
         images = modes(pupil.axis[None, :], pupil.axis[:, None])
         self._modes = np.ascontiguousarray(images.reshape(len(images), -1), dtype)
-        # Parseval, as in StampPropagator: the whole image plane sums to 1.
-        total = (2.0 / pupil.spacing) ** 2 * float((pupil.amplitude**2).sum())
-        self._amplitude = (pupil.amplitude / np.sqrt(total)).astype(dtype)
+        self._amplitude = (pupil.amplitude / np.sqrt(pupil.light)).astype(dtype)
 
     def stamps(self, coefficients: np.ndarray, offset_px: np.ndarray | None = None) -> np.ndarray:
         """Stamps of a batch.

@@ -82,9 +82,7 @@ class StampPropagator:
         # Of an odd grid the middle sample is its own mirror image and counts once.
         self._cos = self._array(np.cos(angle) * np.where(axis == 0.0, 0.5, 1.0)[:, None])
         self._sin = self._array(np.sin(angle))
-        # Parseval: one period of the image, (2/spacing)² (λ/D)², holds (2/spacing)² ΣA².
-        total = (2.0 / pupil.spacing) ** 2 * float((pupil.amplitude**2).sum())
-        bins = weights / np.sqrt(total)
+        bins = weights / np.sqrt(pupil.light)
         # Products with these add up the nodes of every pixel of a half and of both halves.
         self._bins_x, self._bins_y = self._array(bins), self._array(np.kron(np.eye(2), bins).T)
         self._amplitude = self._array(pupil.amplitude)

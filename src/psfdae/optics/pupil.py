@@ -27,6 +27,16 @@ class Pupil:
         """Distance of two samples in pupil radii; the image repeats every 2/spacing λ/D."""
         return float(self.axis[1] - self.axis[0])
 
+    @property
+    def light(self) -> float:
+        """Light of the whole image plane, in the image's unit |Σ A exp(…)|² times (λ/D)².
+
+        (2/spacing)² Σ A, because a grey cell passes light by its lit area. By Parseval one
+        period of the image holds Σ A² instead, a few thousandths less: that is the grey
+        pupil, whose image lacks faint outer light and agrees with the true one inside.
+        """
+        return (2.0 / self.spacing) ** 2 * float(self.amplitude.sum())
+
 
 def pupil_axis(samples: int, guard: int = 0) -> np.ndarray:
     """Cell-centred coordinates of a pupil grid along one axis.

@@ -24,7 +24,7 @@ from psfdae.optics.wavefronts import noll_to_nm, zernike_basis
 
 if TYPE_CHECKING:
     from psfdae.configuration.telescope import Telescope
-    from psfdae.configuration.wavefront import Lens, Prescription
+    from psfdae.configuration.wavefront import Lens, Mirror, Prescription
 
 DEGREES_OF_FREEDOM = ("decenter_x", "decenter_y", "tilt_x", "tilt_y")
 """Order of the four numbers of a state of misalignment."""
@@ -48,8 +48,11 @@ class RayTracingError(ValueError):
 def misaligned(optic: Any, misalignment: np.ndarray) -> Any:
     """The telescope with its item M2, the secondary, displaced; `optic` stays as it is.
 
-    `misalignment` is a decentre x, y in metres and a tilt about x, y in radians.
+    `misalignment` is a decentre x, y in metres and a tilt about x, y in radians; 0 is the
+    only one of a telescope without secondary.
     """
+    if not np.any(misalignment):
+        return optic
     x, y, tilt_x, tilt_y = (float(value) for value in misalignment)
     # One turn about an axis in the mirror's plane: neither tilt comes before the other.
     turn = Rotation.from_rotvec([tilt_x, tilt_y, 0.0]).as_matrix()
@@ -203,7 +206,7 @@ def annulus_points(highest: int, obscuration: float) -> tuple[np.ndarray, np.nda
 
 
 def build_optic(prescription: Prescription, telescope: Telescope, defocus: float = 0.0) -> Any:
-    """The aligned telescope with items M1, M2, the lenses and D, a batoid.CompoundOptic.
+    """The aligned telescope, a batoid.CompoundOptic with items M1, D, and M2 and lenses if any.
 
     `defocus` is the distance of the detector beyond best focus, in metres. batoid is
     imported only here and where rays are launched: no other scene depends on it.
@@ -219,11 +222,16 @@ def build_optic(prescription: Prescription, telescope: Telescope, defocus: float
     radius, p = 0.5 * telescope.diameter_m, prescription
     annulus = batoid.ObscNegation(batoid.ObscAnnulus(telescope.obscuration * radius, radius))
     vacuum = batoid.ConstMedium(1.0)
-    silica = batoid.SellmeierMedium(*p.glass.sellmeier_b, *p.glass.sellmeier_c_um2)
+    glass = p.glass and batoid.SellmeierMedium(*p.glass.sellmeier_b, *p.glass.sellmeier_c_um2)
+
+    def conic(mirror: Mirror) -> Any:
+        if mirror.conic == -1.0:  # of which Quadric finds no point on the axis
+            return batoid.Paraboloid(mirror.radius_m)
+        return batoid.Quadric(mirror.radius_m, mirror.conic)
 
     def built(name: str, lens: Lens) -> Any:
-        front = (lens.front_radius_m, lens.front_vertex_m, vacuum, silica)
-        back = (lens.back_radius_m, lens.back_vertex_m, silica, vacuum)
+        front = (lens.front_radius_m, lens.front_vertex_m, vacuum, glass)
+        back = (lens.back_radius_m, lens.back_vertex_m, glass, vacuum)
         sides = [
             batoid.RefractiveInterface(
                 batoid.Sphere(radius),
@@ -235,26 +243,30 @@ def build_optic(prescription: Prescription, telescope: Telescope, defocus: float
             )
             for side, (radius, vertex, before, after) in (("front", front), ("back", back))
         ]
-        return batoid.Lens(sides, name=name, medium=silica)
+        return batoid.Lens(sides, name=name, medium=glass)
 
     items = [
         batoid.Mirror(
-            batoid.Quadric(p.primary.radius_m, p.primary.conic),
+            conic(p.primary),
             name="M1",
             coordSys=at(p.primary.vertex_m),
             obscuration=annulus if telescope.obscuration else clear(radius),
         ),
-        batoid.Mirror(
-            batoid.Quadric(p.secondary.radius_m, p.secondary.conic),
-            name="M2",
-            coordSys=at(p.secondary.vertex_m),
-            obscuration=clear(p.secondary.clear_radius_m),
-        ),
-        *(built(*item) for item in p.ordered_lenses),
-        batoid.Detector(
-            batoid.Plane(), name="D", coordSys=at(p.best_focus_m - defocus), obscuration=None
-        ),
     ]
+    beyond = 1.0  # a single mirror sends the light up
+    if p.secondary:
+        beyond = -1.0
+        items.append(
+            batoid.Mirror(
+                conic(p.secondary),
+                name="M2",
+                coordSys=at(p.secondary.vertex_m),
+                obscuration=clear(p.secondary.clear_radius_m),
+            )
+        )
+    items += [built(*item) for item in p.ordered_lenses]
+    detector = at(p.best_focus_m + beyond * defocus)
+    items.append(batoid.Detector(batoid.Plane(), name="D", coordSys=detector, obscuration=None))
     return batoid.CompoundOptic(
         items,
         name=p.name,

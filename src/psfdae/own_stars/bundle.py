@@ -162,6 +162,14 @@ class BundleInfo(_Described):
         except (LookupError, TypeError, ValueError):
             return 1.0 if self.format_version == 1 else 0.0  # the network is told no λ
 
+    @property
+    def scale_assumed(self) -> bool:
+        """Whether nothing said the pixel scale of the image that it was trained on."""
+        try:
+            return bool(self.config["stars"]["telescope"]["assumed"])
+        except (LookupError, TypeError):
+            return False
+
     def described(self) -> dict[str, Any]:
         """What a file of its format says."""
         other = ONLY[2 if self.format_version == 1 else 1]
@@ -455,7 +463,9 @@ def _check(info: BundleInfo, tensors: Mapping[str, np.ndarray], path: Path) -> N
     for name, shape in expected.items():
         array, dtype = tensors[name], _dtype(name)
         free = info.format_version > 1 and name.startswith(f"{info.method}/")
-        if array.dtype != dtype and not (free and array.dtype in (np.float64, np.int64)):
+        if array.dtype != dtype and not (
+            free and array.dtype in (np.float16, np.float64, np.int64)
+        ):
             raise BundleError(f"{path}: array {name!r} of {array.dtype}, not {dtype}")
         if array.shape != shape:
             raise BundleError(f"{path}: array {name!r} has shape {array.shape}, not {shape}")

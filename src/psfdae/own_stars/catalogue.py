@@ -20,6 +20,7 @@ import numpy as np
 
 from psfdae.own_stars.errors import ObservationError, reading, shorten
 from psfdae.own_stars.images import UNPACK, PlainFile, open_hdus, plain_file
+from psfdae.own_stars.stamps import StarFlag, raise_flag
 
 SEXTRACTOR_HEADER = re.compile(r"#\s*(\d+)\s+[A-Za-z_]\w*")
 SEXAGESIMAL = re.compile(r"[:hd\s]", re.IGNORECASE)
@@ -42,6 +43,7 @@ class Convention:
     names: str
     sky: bool = False
     origin: int | None = None
+    flags: str | None = None  # its column with the bits `FLAGGED`
 
     @property
     def pairs(self) -> list[list[str]]:
@@ -59,6 +61,7 @@ CONVENTIONS = [
         "XWIN_IMAGE,YWIN_IMAGE XPSF_IMAGE,YPSF_IMAGE XMODEL_IMAGE,YMODEL_IMAGE "
         "X_IMAGE,Y_IMAGE XPEAK_IMAGE,YPEAK_IMAGE",
         origin=1,
+        flags="FLAGS",
     ),
     Convention("x_fit,y_fit x_centroid,y_centroid xcentroid,ycentroid xcenter,ycenter", origin=0),
     *_each("x,y xpos,ypos x_pos,y_pos xpix,ypix x_pix,y_pix x_pixel,y_pixel"),
@@ -66,6 +69,7 @@ CONVENTIONS = [
         "ALPHAWIN_J2000,DELTAWIN_J2000 ALPHAPSF_J2000,DELTAPSF_J2000 ALPHA_J2000,DELTA_J2000 "
         "ALPHAWIN_SKY,DELTAWIN_SKY ALPHA_SKY,DELTA_SKY",
         sky=True,
+        flags="FLAGS",
     ),
     *_each(
         "ra,dec RAJ2000,DEJ2000 RAJ2000,DECJ2000 _RAJ2000,_DEJ2000 RA_ICRS,DE_ICRS "
@@ -73,6 +77,8 @@ CONVENTIONS = [
         sky=True,
     ),
 ]
+# SExtractor's bits that say something against a star; 1, a neighbour nearby, is no reason.
+FLAGGED = {2: StarFlag.BLENDED, 4: StarFlag.SATURATED, 8: StarFlag.TRUNCATED}
 # Columns that identify a star; the first of these that a catalogue has is used.
 ID_COLUMNS = ("id", "source_id", "number", "star_id", "objid", "obj_id", "object_id")
 ID_COLUMNS += ("label", "name")
@@ -90,6 +96,7 @@ class Positions:
     second: str
     sky: bool
     origin: int | None
+    flags: str | None
 
 
 def choose_positions(names: Sequence[str]) -> Positions:
@@ -99,7 +106,8 @@ def choose_positions(names: Sequence[str]) -> Positions:
         for pair in convention.pairs:
             first, second = (_in_any_case(names, name) for name in pair)
             if first is not None and second is not None:
-                found.append(Positions(first, second, convention.sky, convention.origin))
+                how = (convention.sky, convention.origin, convention.flags)
+                found.append(Positions(first, second, *how))
                 break
     found = [where for where in found if not where.sky] or found
     if not found:
@@ -156,8 +164,11 @@ class Catalogue:
     def __len__(self) -> int:
         return len(self.table)
 
-    def numbers(self, name: str) -> np.ndarray:
-        """A column as float64, shape (n,); NaN where the catalogue has no value."""
+    def numbers(self, name: str, strict: bool = True) -> np.ndarray:
+        """A column as float64, shape (n,); NaN where the catalogue has no value.
+
+        A text that is no number is refused, or NaN unless `strict`.
+        """
         column = self._column(name)
         if column.ndim != 1:
             raise ObservationError(self.path, f"column {name!r} holds arrays, not numbers")
@@ -166,24 +177,29 @@ class Catalogue:
         if values.dtype.kind in "iuf":
             numbers = values.astype(np.float64)
         elif values.dtype.kind in "SUO":
-            numbers = self._parsed(name, values, missing)
+            numbers = self._parsed(name, values, missing, strict)
         else:
             raise ObservationError(self.path, f"column {name!r} does not hold numbers")
         if missing is not None:
             numbers[missing] = np.nan
         return numbers
 
-    def finite(self, name: str) -> np.ndarray:
-        """As `numbers`, and an error where a value is missing or not finite."""
-        numbers = self.numbers(name)
-        bad = np.flatnonzero(~np.isfinite(numbers))
-        if len(bad):
-            raise ObservationError(
-                self.path,
-                f"column {name!r} has no finite number in {len(bad)} of {len(numbers)} rows, "
-                f"the first is row {bad[0] + 1}",
-            )
-        return numbers
+    def coordinates(self, name: str) -> np.ndarray:
+        """As `numbers`, NaN where they are not finite; an error if none is."""
+        numbers = self.numbers(name, strict=False)
+        finite = np.isfinite(numbers)
+        if not finite.any():
+            raise ObservationError(self.path, f"column {name!r} has no finite number in any row")
+        return np.where(finite, numbers, np.nan)
+
+    def flags(self, where: Positions) -> np.ndarray:
+        """What the list's own program says against its stars, as `StarFlag`s, (n,), uint16."""
+        flags = np.zeros(len(self), dtype=np.uint16)
+        if where.flags is not None and where.flags in self.table.colnames:
+            said = np.nan_to_num(self.numbers(where.flags), posinf=0, neginf=0).astype(np.int64)
+            for bit, flag in FLAGGED.items():
+                raise_flag(flags, flag, (said & bit) > 0)
+        return flags
 
     def positions(self) -> Positions:
         """The columns with the positions, or an error that lists what would be accepted."""
@@ -199,18 +215,19 @@ class Catalogue:
         """Right ascension and declination in degrees, each shape (n,).
 
         Columns without unit are in degrees; text with colons, blanks or letters is
-        sexagesimal, then right ascensions are in hours.
+        sexagesimal, then right ascensions are in hours. Declinations off the sphere are NaN,
+        and an error if all are.
         """
         ra = self._angles(where.first, "hourangle")
         dec = self._angles(where.second, "deg")
-        off = np.flatnonzero(np.abs(dec) > 90)
-        if len(off):
+        on = np.abs(dec) <= 90
+        if not on.any():
+            row = np.flatnonzero(np.isfinite(dec))[0]
             raise ObservationError(
                 self.path,
-                f"column {where.second!r} is {dec[off[0]]:g}° in row {off[0] + 1}, "
-                "expected -90 … 90",
+                f"column {where.second!r} is {dec[row]:g}° in row {row + 1}, expected -90 … 90",
             )
-        return ra, dec
+        return ra, np.where(on, dec, np.nan)
 
     def identifiers(self) -> np.ndarray:
         """One identifier per star, int64 or str, shape (n,); row numbers from 0 without any."""
@@ -254,7 +271,9 @@ class Catalogue:
             raise ObservationError(self.path, f"column {name!r} does not hold plain numbers")
         return column
 
-    def _parsed(self, name: str, values: np.ndarray, missing: np.ndarray | None) -> np.ndarray:
+    def _parsed(
+        self, name: str, values: np.ndarray, missing: np.ndarray | None, strict: bool
+    ) -> np.ndarray:
         numbers = np.full(len(values), np.nan)
         for row, value in enumerate(values):
             if missing is not None and missing[row]:
@@ -262,6 +281,8 @@ class Catalogue:
             try:
                 numbers[row] = float(_text(value))
             except ValueError:
+                if not strict:
+                    continue
                 raise ObservationError(
                     self.path,
                     f"column {name!r} holds {_text(value)[:40]!r} in row {row + 1}, "
@@ -276,12 +297,15 @@ class Catalogue:
         column = self._column(name)
         values = np.asarray(np.ma.getdata(column))
         is_text = values.dtype.kind in "SUO"
-        if is_text and column.ndim == 1 and not np.ma.getmaskarray(column).any():
-            texts = [_text(value).strip() for value in values]
+        if is_text and column.ndim == 1:
+            there = ~np.ma.getmaskarray(column)
+            texts = [_text(value).strip() for value in values[there]]
             if any(SEXAGESIMAL.search(text) for text in texts):
+                angles = np.full(len(values), np.nan)
                 with reading(self.path):
-                    return np.asarray(Angle(texts, unit=sexagesimal_unit).deg, dtype=np.float64)
-        numbers = self.finite(name)
+                    angles[there] = Angle(texts, unit=sexagesimal_unit).deg
+                return angles
+        numbers = self.coordinates(name)
         unit = getattr(column, "unit", None)
         if unit is None or is_text:
             return numbers

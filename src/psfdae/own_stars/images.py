@@ -59,14 +59,20 @@ ERRORS = {"ERR", "ERROR", "SIGMA", "STDDEV", "RMS", "VAR", "VARIANCE", "IVAR", "
 EXTRAS = {"WEIGHT", "WHT", "WGT", "BKG", "BACKGROUND", "SKY", "CTX", "SAMP", "TIME"}
 NOT_SCIENCE = MASKS | ERRORS | EXTRAS  # extensions that go with an image
 
-GAIN_KEYS = ("EGAIN", "GAIN")  # cameras that write both put a setting without unit into GAIN
-SATURATION_KEYS = ("SATURATE", "SATLEVEL")
-SCALE_KEYS = ("PIXSCALE", "PIXELSCL", "SECPIX", "SECPIX1")  # arcseconds; the second is POPPY's
+# Electrons per count; cameras that write the first two put a setting without unit into GAIN.
+GAIN_KEYS = ("EGAIN", "GAIN", "ESO DET OUT1 CONAD", "ATODGAIN", "CCDGAIN", "GAIN1", "GAINA")
+READ_NOISE_KEYS = ("RDNOISE", "READNOIS", "READNOISE", "RON", "ENOISE", "ESO DET OUT1 RON")
+READ_NOISE_KEYS += ("CCDNOISE", "RDNOISE1", "RDNOISEA")  # electrons
+SATURATION_KEYS = ("SATURATE", "SATLEVEL", "SATURATA", "MAXLIN")  # counts
+# Arcseconds; the second is POPPY's.
+SCALE_KEYS = ("PIXSCALE", "PIXELSCL", "SECPIX", "SECPIX1", "PIXSCAL1", "IM_SCALE", "SCALE")
+LENS_KEYS = ("XPIXSZ", "FOCALLEN")  # micrometres and millimetres, of amateurs' cameras
 # Where stamps come from, copied to whatever is made of them.
 PROVENANCE_KEYS = ("OBJECT", "TELESCOP", "INSTRUME", "OBSERVER", "FILTER")
 PROVENANCE_KEYS += ("DATE-OBS", "MJD-OBS", "EXPTIME", "AIRMASS")
 
 Card = tuple[str, Any, str]  # key, value and comment
+Said = tuple[float | None, str]  # a number, and the card that says it; or None, and words for that
 
 
 @dataclass(frozen=True)
@@ -233,29 +239,31 @@ class ImageFile:
         """The file's own name, for messages."""
         return self.file.name
 
-    def physical(self, stored: np.ndarray) -> np.ndarray:
-        """Physical values of stored ones, float32 in native byte order, same shape."""
+    def physical(self, stored: np.ndarray, dtype: Any = np.float32) -> np.ndarray:
+        """Physical values of stored ones, in native byte order, same shape."""
         if self.bscale == 1.0 and self.bzero == 0.0:
-            values = stored.astype(np.float32)
+            values = stored.astype(dtype)
         else:
-            values = (stored.astype(np.float64) * self.bscale + self.bzero).astype(np.float32)
+            values = (stored.astype(np.float64) * self.bscale + self.bzero).astype(dtype)
         if self.blank is not None and stored.dtype.kind in "iu":
             values[stored == self.blank] = np.nan
         return values
 
-    def positive(self, keys: Sequence[str]) -> float | None:
+    def positive(self, keys: Sequence[str]) -> Said:
         """First finite positive number under one of the keys, in the order of the keys."""
         for key in keys:
             for header in self.headers:
                 value = card_value(header, key)
-                if isinstance(value, int | float) and not isinstance(value, bool):
-                    number = float(value)
-                    if np.isfinite(number) and number > 0:
-                        return number
-        return None
+                try:
+                    number = float("nan" if isinstance(value, bool) else value)
+                except (TypeError, ValueError):
+                    continue
+                if np.isfinite(number) and number > 0:
+                    return number, key
+        return None, "not known"
 
-    def gain(self) -> float | None:
-        """Electrons per count; None if unknown.
+    def gain(self) -> Said:
+        """Electrons per count.
 
         Images in electrons (BUNIT) have 1 whatever the camera's gain was; for images
         of a rate, counts per second, the gain of the camera is not that of the pixels.
@@ -265,11 +273,19 @@ class ImageFile:
             if isinstance(unit, str) and unit.strip():
                 name = unit.strip().lower().replace(" ", "")
                 if name in {"electron", "electrons", "e-", "e"}:
-                    return 1.0
+                    return 1.0, "BUNIT"
                 if name.endswith(("/s", "/sec", "/second", "s-1", "s**-1", "s^-1")):
-                    return None
+                    return None, "not known, the image is a rate"
                 break
         return self.positive(GAIN_KEYS)
+
+    def scale(self) -> Said:
+        """Arcseconds per pixel by the header's cards, the WCS aside."""
+        width, focus = (self.positive((key,))[0] for key in LENS_KEYS)
+        found = self.positive(SCALE_KEYS)
+        if found[0] is None and width and focus:
+            return float(np.rad2deg(width * 1e-3 / focus)) * 3600.0, " and ".join(LENS_KEYS)
+        return found
 
     def provenance(self) -> list[Card]:
         """Cards of `PROVENANCE_KEYS`, those that can be parsed."""
@@ -320,6 +336,22 @@ def find_image(path: Path | PlainFile, extension: str | int | None = None) -> Im
         raise ObservationError(path, "BSCALE or BZERO is not a number")
     blank = blank if isinstance(blank, int) else None
     return ImageFile(file, index, shape, leading, float(bscale), float(bzero), blank, headers, wcs)
+
+
+def science_images(path: Path) -> dict[str, int]:
+    """Numbers of all images of a file but masks, errors and the like, by a name for files.
+
+    That is the extension's own, or its number where it has none of its own.
+    """
+    with reading(path), open_hdus(plain_file(path)) as hdus:
+        found = {k: hdu.name for k, hdu in enumerate(hdus) if _has_pixels(hdu)}
+    found = {k: name for k, name in found.items() if name.upper() not in NOT_SCIENCE}
+    if not found:
+        raise ObservationError(path, "no image")
+    names = list(found.values())
+    plain = re.compile("[A-Za-z0-9_+-]+")
+    own = {k for k, name in found.items() if names.count(name) == 1 and plain.fullmatch(name)}
+    return {name if k in own else str(k): k for k, name in found.items()}
 
 
 _AS_STORED = {"do_not_scale_image_data": True, "uint": False, "ignore_blank": True}
@@ -483,16 +515,17 @@ class Pixels:
 
     stored: Any
     image: ImageFile
+    dtype: Any = np.float32
 
     def __getitem__(self, key: Any) -> np.ndarray:
         key = key if isinstance(key, tuple) else (key,)
         with reading(self.image.path):
             stored = np.asarray(self.stored[(0,) * self.image.leading + key])
-            return self.image.physical(stored)
+            return self.image.physical(stored, self.dtype)
 
 
 @contextmanager
-def open_pixels(image: ImageFile, *, whole: bool) -> Iterator[Pixels]:
+def open_pixels(image: ImageFile, *, whole: bool, dtype: Any = np.float32) -> Iterator[Pixels]:
     """The values of an image as something to index, without the leading axes.
 
     As a `whole` it is an array, mapped into memory where the file allows, for access at
@@ -514,4 +547,4 @@ def open_pixels(image: ImageFile, *, whole: bool) -> Iterator[Pixels]:
                 stored = decompress(image.path, hdu, copy)
             else:
                 stored = hdu.data
-        yield Pixels(stored, image)
+        yield Pixels(stored, image, dtype)

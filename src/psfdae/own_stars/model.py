@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from psfdae.estimators import FitError
 from psfdae.own_stars.bundle import (
     Bundle,
     BundleInfo,
@@ -21,8 +22,8 @@ from psfdae.own_stars.bundle import (
     mahalanobis,
     read_bundle,
 )
-from psfdae.own_stars.photometry import Photometer, Photometry
-from psfdae.own_stars.prediction import Prediction
+from psfdae.own_stars.photometry import FAINT_SNR, KEPT, NOISE_FLOOR, Photometer, Photometry
+from psfdae.own_stars.prediction import Prediction, measured_of, unmeasured
 from psfdae.own_stars.shapes import measure_shapes
 from psfdae.own_stars.stamps import (
     Stamps,
@@ -38,8 +39,8 @@ SCALE_TOLERANCE = 0.02  # relative difference of the pixel scale from that of th
 SNR_TOLERANCE = 1.25  # beyond the trained S/N without a flag: a faint star's is no better known
 FLUX_FACTOR = (0.5, 2.0)  # by which a method may correct the flux of a star
 BLOCK = 256  # stars that a network computes together, always so many: other numbers round otherwise
-BLOCK_PX = BLOCK * 32**2  # larger stamps come in smaller blocks
-BLOCK_VALUES = 64 * BLOCK_PX  # between two layers of the network at most: 64 channels of a block
+MOST_OVERSAMPLED = 32  # values per pixel and axis
+WHOLE_PX = 32  # larger stamps come in smaller blocks
 
 
 class PredictionError(ValueError):
@@ -97,6 +98,9 @@ class PsfModel:
         bad: ArrayLike | None = None,
         saturated: ArrayLike | None = None,
         gain: ArrayLike | None = None,
+        position: ArrayLike | None = None,
+        centre: ArrayLike | None = None,
+        fixed: bool = False,
         margin: int = 0,
         threads: int | None = 1,
     ) -> Prediction:
@@ -119,6 +123,13 @@ class PsfModel:
         gain : float or array, shape (n,), optional
             Electrons per unit of the stamps: adds the star's photon noise to `chi2`
             and `flux_error`.
+        position : array, shape (n, 2), optional
+            (x, y) of the stars in the image of the training, 0-based; NaN where unknown.
+        centre : array, shape (n, 2), optional
+            (x, y) of the stars' centres that a list says, from index s//2; NaN where unknown.
+            Like the position, for models that measure centres (`psfdae.estimators.field`).
+        fixed : bool
+            These centres are exact.
         margin : int
             Pixels around each stamp, by which a star may be moved to centre it.
         threads : int, optional
@@ -143,23 +154,69 @@ class PsfModel:
             raise PredictionError(
                 f"stamps of shape {size}, but the model {self.info.name!r} takes n×{side}×{side}"
             )
-        finite, unknown = np.isfinite(data), np.full(len(data), np.nan)
+        finite = np.isfinite(data)
+        x, y = _pairs("position", position, len(data)).T
         given = {"flux": flux, "background": background, "noise": noise, "gain": gain}
         stars = Stamps(
             data=data if finite.all() else np.where(finite, data, 0),
             bad=_mask("bad", bad, data, single) | ~finite,
             saturated=_mask("saturated", saturated, data, single),
-            truncated=np.zeros(len(data), dtype=bool),
+            flags=np.zeros(len(data), dtype=np.uint16),
             id=np.arange(len(data)),
-            x=unknown,
-            y=unknown,
+            x=x,
+            y=y,
+            listed=_pairs("centre", centre, len(data))[:, ::-1],
             **{name: _per_star(name, value, len(data)) for name, value in given.items()},
         )
         blocks = self.engine.blocks(stars)
         with one_thread_each():
             threads = min(threads or available_cores(), max(len(blocks), 1))
-            parts = side_by_side(self.engine.block, blocks or [stars], threads)
+            work = (lambda block: self.engine.block(block, fixed), blocks or [stars], threads)
+            parts = side_by_side(*work)
         return Prediction.joined(parts)
+
+    def psf_at(self, x: ArrayLike, y: ArrayLike, oversampling: int = 4) -> np.ndarray:
+        """PSFs at places of the image of the training, where no star need be.
+
+        Parameters
+        ----------
+        x, y : float or array, shape (n,)
+            0-based pixel coordinates. The PSF lies at their sub-pixel phase.
+        oversampling : int
+            Values per pixel and axis; each is what a whole pixel there would get.
+
+        Returns
+        -------
+        ndarray, shape (m, m) or (n, m, m), float64
+            m is the stamp's side d for an oversampling o of 1, else o d + 1. Index m//2 is the
+            middle of the pixel of the position, and the sum is o².
+
+        Raises
+        ------
+        PredictionError
+            If the model's method knows no PSF between the stars, or a number is not usable.
+        """
+        position = np.stack(np.broadcast_arrays(_numbers("x", x), _numbers("y", y)), axis=-1)
+        if position.ndim > 2 or not np.isfinite(position).all():
+            raise PredictionError("positions must be finite, one x and y or arrays of as many")
+        if not 1 <= oversampling <= MOST_OVERSAMPLED:
+            raise PredictionError(f"oversampling {oversampling}: 1 to {MOST_OVERSAMPLED}")
+        try:
+            found = self.engine.estimator.psf_at(position.reshape(-1, 2), oversampling)
+        except FitError as error:
+            raise PredictionError(
+                f"the model {self.info.name!r}: {error}; psfdae from-stars --method field makes "
+                "one that does"
+            ) from None
+        return found if position.ndim == 2 else found[0]
+
+    def field_range(self) -> tuple[np.ndarray, np.ndarray]:
+        """Least and greatest position (x, y) of the training stars; raises as `psf_at`."""
+        self.psf_at(0.0, 0.0, 1)
+        low, high = (np.asarray(self.bundle.weights[name]) for name in ("low", "high"))
+        if not (high > low).all():
+            raise PredictionError(f"the model {self.info.name!r} knows no places of its stars")
+        return low, high
 
     def check_scale(self, pixel_scale_arcsec: float | None, what: str) -> None:
         """Refuse stars whose pixels are not those of the training.
@@ -177,16 +234,18 @@ class PsfModel:
             If the scale is unknown, or off by more than `SCALE_TOLERANCE`.
         """
         trained = self.info.pixel_scale_arcsec
+        other = "; psfdae from-stars trains one on an image of yours"
         if pixel_scale_arcsec is None:
             raise PredictionError(
                 f"{what}: neither a WCS nor the header gives the pixel scale; "
-                f"state it with --pixel-scale (the model's is {trained:.6g} arcsec)"
+                f"state it with --pixel-scale (the model's is {trained:.6g} arcsec){other}"
             )
         if not abs(pixel_scale_arcsec / trained - 1.0) <= SCALE_TOLERANCE:
+            assumed = ", assumed" if self.info.scale_assumed else ""
             raise PredictionError(
                 f"{what}: pixels of {pixel_scale_arcsec:.6g} arcsec, but the model "
-                f"{self.info.name!r} was trained on {trained:.6g} arcsec "
-                f"(tolerance {100 * SCALE_TOLERANCE:g} %)"
+                f"{self.info.name!r} was trained on {trained:.6g} arcsec{assumed} "
+                f"(tolerance {100 * SCALE_TOLERANCE:g} %){other}"
             )
 
 
@@ -209,6 +268,14 @@ def _mask(name: str, mask: ArrayLike | None, data: np.ndarray, single: bool) -> 
     return array
 
 
+def _pairs(name: str, values: ArrayLike | None, count: int) -> np.ndarray:
+    """Two numbers per star, NaN where they are not known."""
+    numbers = _numbers(name, np.full((count, 2), np.nan) if values is None else values)
+    if numbers.shape != (count, 2):
+        raise PredictionError(f"{name} of shape {numbers.shape}, expected ({count}, 2)")
+    return numbers.astype(np.float64)
+
+
 def _per_star(name: str, value: ArrayLike | None, count: int) -> np.ndarray:
     """One number per star, NaN where it is not known."""
     numbers = _numbers(name, np.nan if value is None else value).astype(np.float64)
@@ -227,28 +294,36 @@ class Engine:
         self.bundle = bundle
         self.estimator = estimator(bundle)
         self.free_flux = self.estimator.free_flux()
-        self.size = min(self.estimator.together, max(1, BLOCK_PX // bundle.info.stamp_px**2))
+        together = self.estimator.together
+        self.size = min(together, max(1, together * WHOLE_PX**2 // bundle.info.stamp_px**2))
         self._photometer = Photometer(bundle.flux_model, bundle.info.components)
 
     def blocks(self, stars: Stamps) -> list[Stamps]:
         """Stars in parts of `size`."""
         return [stars.part(slice(a, a + self.size)) for a in range(0, len(stars), self.size)]
 
-    def block(self, stars: Stamps) -> Prediction:
-        """PSFs of at most `size` stars; computed as if there were just so many."""
+    def block(self, stars: Stamps, fixed: bool = False) -> Prediction:
+        """PSFs of at most `size` stars, whose listed centres are exact if `fixed`."""
         count = len(stars)
-        if count < self.size:
+        if count < self.size and self.estimator.padded:
             stars = _filled(stars, self.bundle, self.size)
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            return self._compute(stars).first(count)
+            return self._compute(stars, fixed).first(count)
 
-    def _compute(self, stars: Stamps) -> Prediction:
+    def _compute(self, stars: Stamps, fixed: bool) -> Prediction:
         bundle, info = self.bundle, self.bundle.info
-        stamps, bad, shift, flags = self._centred(stars)
-        found = self._photometer.measure(stamps, bad, border_median(stamps, bad), stars)
-        lost = (found.flags & StarFlag.NO_FLUX) > 0
-        free = np.isnan(stars.flux) & np.isnan(stars.background)
-        psf, sigma, found = self._estimate(found, free, lost)
+        exact = fixed & np.isfinite(stars.listed).all(axis=1)
+        stamps, bad, shift, flags = self._centred(stars, exact)
+        start = border_median(stamps, bad)
+        found = self._photometer.measure(stamps, bad, start, stars)
+        told: dict[str, np.ndarray] = {}
+        if self.estimator.measures:
+            psf, sigma, found, told = self._measured(stars, stamps, bad, shift, start, exact, found)
+            lost = (found.flags & StarFlag.NO_FLUX) > 0
+        else:
+            lost = (found.flags & StarFlag.NO_FLUX) > 0
+            free = np.isnan(stars.flux) & np.isnan(stars.background)
+            psf, sigma, found = self._estimate(found, free, lost)
         noise = found.noise / np.where(lost, np.nan, found.flux)
         shapes = measure_shapes(psf)
         snr = 1.0 / (noise * info.noise_equivalent_px**0.5)
@@ -293,7 +368,72 @@ class Engine:
             shift_x=shift[:, 1],
             shift_y=shift[:, 0],
             flags=flags,
+            **(told or unmeasured(len(stars))),
         )
+
+    def _measured(
+        self,
+        stars: Stamps,
+        stamps: np.ndarray,
+        bad: np.ndarray,
+        shift: np.ndarray,
+        start: np.ndarray,
+        exact: np.ndarray,
+        found: Photometry,
+    ) -> tuple[np.ndarray, np.ndarray, Photometry, dict[str, np.ndarray]]:
+        """PSFs of flux 1, their σ and what the method measures in place of the photometry.
+
+        `found` repairs bad pixels and tells the noise, `start` (n,) is a rough sky; listed
+        centres are `exact` or not.
+        """
+        pixels = stamps[0].size
+        given, unseen = np.isfinite(stars.flux), (found.flags & StarFlag.NO_FLUX) > 0
+        level = start[:, None, None]
+        repaired = found.images * found.flux[:, None, None] + found.background[:, None, None]
+        repaired = np.where(unseen[:, None, None], np.where(bad, level, stamps), repaired)
+        data = np.where(found.used & ~bad, stamps, repaired).astype(np.float64) - level
+        size = np.abs(data).max(axis=(1, 2))
+        nothing = ~((bad.mean(axis=(1, 2)) <= 1 - KEPT) & (size > 0) & np.isfinite(size))
+        nothing |= (np.ptp(data, axis=(1, 2)) <= 0) | ~np.isfinite(found.noise)
+        data = np.where(nothing[:, None, None], 0.0, data)
+        noise = np.where(found.noise > NOISE_FLOOR * size, found.noise, NOISE_FLOOR * size)
+        photons = np.nan_to_num(np.maximum(found.flux, 0.0) / stars.gain / pixels)
+        noise = np.where(nothing, 1.0, np.sqrt(noise**2 + photons))
+        estimate = self.estimator.measure(
+            data,
+            noise,
+            np.stack([stars.x, stars.y], axis=1),
+            stars.listed - shift,
+            exact,
+            flux=stars.flux,
+            sky=stars.background - start,
+        )
+        told = estimate.measured
+        assert told is not None and estimate.sigma is not None
+        error = np.sqrt(told.covariance[:, 0, 0])
+        flux = np.where(given, stars.flux, told.flux)
+        lost = nothing | np.where(given, unseen, ~(flux > error))
+        flags = found.flags & np.uint16(StarFlag.MASKED | StarFlag.OUTLIER)
+        raise_flag(flags, StarFlag.NO_FLUX, lost)
+        raise_flag(flags, StarFlag.FAINT, ~given & ~lost & (flux < FAINT_SNR * error))
+        sky = start + told.background
+        unit = np.where(lost, 1.0, flux)[:, None, None]
+        images = (data - told.background[:, None, None]) / unit
+        better = replace(
+            found,
+            flux=np.where(nothing, np.nan, flux),
+            flux_error=np.where(given | nothing, np.nan, error),
+            background=np.where(nothing, found.background, sky),
+            images=np.where(lost[:, None, None], 0.0, images).astype(np.float32),
+            flags=flags,
+        )
+        # The pixel at the middle of the stamp as it was given, in the image if that is known.
+        middle = np.stack([stars.y, stars.x], axis=1) - stars.listed
+        middle = np.where(np.isfinite(middle), middle, stars.data.shape[-1] // 2)
+        measured = measured_of(middle + shift + told.centre, told.covariance)
+        psf, sigma = estimate.psf, estimate.sigma
+        psf[lost] = sigma[lost] = np.nan
+        return psf, sigma, better, {k: np.where(lost, np.nan, v) for k, v in measured.items()}
 
     def _estimate(
         self, found: Photometry, free: np.ndarray, lost: np.ndarray
@@ -329,8 +469,11 @@ class Engine:
                 array[lost] = np.nan
         return psf, sigma, found  # type: ignore[return-value]
 
-    def _centred(self, stars: Stamps) -> tuple[np.ndarray, ...]:
-        """Stamps (n, d, d), their bad pixels, their shift (row, column), and flags so far."""
+    def _centred(self, stars: Stamps, exact: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Stamps (n, d, d), their bad pixels, their shift (row, column), and flags so far.
+
+        Stars (n,) whose place is `exact` are not moved.
+        """
         side = self.bundle.info.stamp_px
         margin = (stars.data.shape[-1] - side) // 2
         # Saturated pixels show where the star is; the others would mislead.
@@ -338,15 +481,15 @@ class Engine:
         if hidden.any():
             data = np.where(hidden, border_median(data, hidden)[:, None, None], data)
         shift = displacement(data, self.bundle.info.jitter_px)
+        shift[exact] = 0
         too_far = np.abs(shift).max(axis=1) > margin
         shift[too_far] = 0
         stamps, bad, saturated = (
             cut(wide, side, shift) for wide in (data, stars.bad, stars.saturated)
         )
-        flags = np.zeros(len(stamps), dtype=np.uint16)
+        flags = stars.flags.copy()
         raise_flag(flags, StarFlag.MASKED, bad.any(axis=(1, 2)))
         raise_flag(flags, StarFlag.SATURATED, saturated.any(axis=(1, 2)))
-        raise_flag(flags, StarFlag.TRUNCATED, stars.truncated)
         raise_flag(flags, StarFlag.OFF_CENTRE, too_far)
         return stamps, bad | saturated, shift, flags
 

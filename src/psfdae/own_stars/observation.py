@@ -2,8 +2,9 @@
 
 | input | stamps | positions |
 |---|---|---|
-| cube (n, d, d), or one stamp (d, d) | as stored | from the catalogue, row by row, or NaN |
+| cube (n, s, s), or one stamp (s, s) | their middle | from the catalogue, row by row, or NaN |
 | image (h, w) and a catalogue | cut at the rounded position | of the catalogue |
+| image (h, w) to be searched | the same | of the stars found (`detection`) |
 
 Whatever is wrong with a file ends in one `ObservationError` of one line that names it.
 """
@@ -12,28 +13,33 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from contextlib import ExitStack
-from dataclasses import dataclass, field
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from psfdae.own_stars.catalogue import Catalogue, read_catalogue
-from psfdae.own_stars.errors import ObservationError, reading
+from psfdae.own_stars.catalogue import Catalogue, Positions, read_catalogue
+from psfdae.own_stars.detection import Sky, sky_of
+from psfdae.own_stars.errors import ObservationError, reading, shorten
 from psfdae.own_stars.images import (
+    READ_NOISE_KEYS,
     SATURATION_KEYS,
-    SCALE_KEYS,
     Card,
     ImageFile,
     Pixels,
+    Said,
     find_image,
     open_pixels,
 )
-from psfdae.own_stars.stamps import Stamps
+from psfdae.own_stars.stamps import Stamps, StarFlag, cut, raise_flag
 
 FAR = 2**30  # positions are clipped to ± this many pixels, far off any image
 NEAR = 1.0  # stars farther off by this many image sizes are not corrected for distortion
+ASSUMED_SCALE = 1.0  # arcseconds per pixel where nothing says it
+SEEN = 2.0  # σ above the sky from which a position of a list is on a source
+SAME_PX = 0.1  # nearer to each other than this, two rows of a list are one star
 
 
 @dataclass(frozen=True)
@@ -41,52 +47,73 @@ class Source:
     """A FITS file with stars, and what is stated about it."""
 
     path: Path  # FITS cube of stamps, or FITS image
-    catalogue: Path | None = None  # needed for an image; positions and identifiers of a cube
+    catalogue: Path | None = None  # of an image; positions and identifiers of a cube
+    detect: float | None = None  # in its place: σ above the sky from which stars are searched
     extension: str | int | None = None  # with the stars
+    on_image: bool = False  # stars of the catalogue that are off the image are left out
     origin: int | None = None  # of the catalogue's pixels; by default that of its program
     mask: str | int | Path | None = None  # as large as the image; or (d, d) for all of a cube
+    bad_bits: int | None = None  # of the mask; any by default
+    weight: str | int | Path | None = None  # 1/σ² of every pixel of an image, but for a factor
+    variance: str | int | Path | None = None  # σ² in its place
     pixel_scale_arcsec: float | None = None  # what is given goes before the header
     gain: float | None = None  # electrons per count
+    read_noise: float | None = None  # electrons
     saturate: float | None = None  # counts
     flux_column: str | None = None  # of the catalogue: fluxes that are not to be estimated
     background_column: str | None = None  # the same for sky levels per pixel
 
-    def open(self, stamp_px: int, margin: int = 0, larger: bool = False) -> Observation:
+    def files(self) -> tuple[Any, ...]:
+        """All that is read."""
+        return (self.path, self.catalogue, self.mask, self.weight, self.variance)
+
+    def open(self, stamp_px: int, margin: int = 0) -> Observation:
         """Check all that can be checked without reading pixels.
 
-        Stamps of an image get a margin of so many pixels. Stamps of a cube may be `larger`
-        than `stamp_px` if so asked, and keep their size then.
+        Pixels are read to find stars, and where there is a map of noise. Stamps get a margin
+        of so many pixels, those of a cube as many of these as they have.
         """
         self._check(stamp_px, margin)
         image = find_image(self.path, self.extension)
         shape = image.shape
-        if larger and len(shape) == 3 and shape[1] == shape[2] > stamp_px:
-            stamp_px = shape[1]
         is_cube = self._is_cube(image, stamp_px)
+        if self.detect is not None and (is_cube or self.catalogue or self.origin is not None):
+            raise ObservationError(
+                self.path, "--detect takes an image, no cube; no list, and no origin of one"
+            )
+        camera = self._camera(image)
+        layers = self._layers(image, is_cube, camera)
         table = None if self.catalogue is None else read_catalogue(self.catalogue)
+        if self.detect is not None or layers.noise is not None:
+            sky = layers.sky()
+            if layers.noise is not None:
+                layers = replace(layers, noise_scale=sky.noise_scale)
+            table = table if self.detect is None else self._detected(sky)
         count = len(table) if table is not None else shape[0] if len(shape) == 3 else 1
         identifiers = np.arange(count, dtype=np.int64)
-        positions = None
+        positions, flags = None, np.zeros(count, dtype=np.uint16)
         if table is not None:
-            positions = self._positions(image, table, is_cube)
-            identifiers = table.identifiers()
-        scale, gain, saturate = self._stated(image)
+            where = table.positions()
+            positions = self._positions(image, table, where, is_cube)
+            identifiers, flags = table.identifiers(), table.flags(where)
+        known = (self._column(table, c, count) for c in (self.flux_column, self.background_column))
+        columns = [identifiers, *known, flags]
+        if self.on_image and positions is not None and not is_cube:
+            kept = _inside(positions, shape)
+            columns, positions = [column[kept] for column in columns], positions[kept]
         return Observation(
             self.path,
-            count,
+            len(columns[0]),
             stamp_px,
-            margin=0 if is_cube else margin,
+            margin=min(margin, (shape[-1] - stamp_px) // 2) if is_cube else margin,
             shape=None if is_cube else shape,
-            pixel_scale_arcsec=scale,
-            gain=gain,
-            saturate=saturate,
+            camera=camera,
             positions=positions,
             header_cards=image.provenance(),
-            _id=identifiers,
-            _flux=self._column(table, self.flux_column, count),
-            _background=self._column(table, self.background_column, count),
-            _image=image,
-            _mask=None if self.mask is None else _find_mask(image, self.mask),
+            catalogue=self.catalogue,
+            found=table if self.detect is not None else None,
+            _columns=columns,
+            _layers=layers,
         )
 
     def _check(self, stamp_px: int, margin: int) -> None:
@@ -98,27 +125,33 @@ class Source:
             raise ObservationError(
                 self.path, f"origin {self.origin!r} of pixel coordinates, expected 0 or 1"
             )
-        stated = (self.pixel_scale_arcsec, self.gain, self.saturate)
-        for name, value in zip(("pixel scale", "gain", "saturation"), stated, strict=True):
+        for name, value in (*self._given().items(), ("threshold", self.detect)):
             if value is not None and not (math.isfinite(value) and value > 0):
                 raise ObservationError(self.path, f"{name} {value!r}, expected a number above 0")
 
     def _is_cube(self, image: ImageFile, stamp_px: int) -> bool:
         shape = image.shape
-        if len(shape) == 2 and self.catalogue is not None:
+        if len(shape) == 2 and (self.catalogue is not None or self.detect is not None):
             return False
-        if shape[-2:] == (stamp_px, stamp_px):
+        square = shape[-2] == shape[-1] >= stamp_px
+        if square and (len(shape) == 3 or shape[-1] == stamp_px):
             return True
         size = f"{shape[-2]}×{shape[-1]}"
         if len(shape) == 2:
-            raise ObservationError(image.path, f"an image of {size} pixels needs a star catalogue")
+            raise ObservationError(
+                image.path, f"an image of {size} pixels needs a star catalogue, or --detect"
+            )
         raise ObservationError(
-            image.path, f"stamps of {size} pixels, expected {stamp_px}×{stamp_px} pixels"
+            image.path, f"stamps of {size} pixels, expected {stamp_px}×{stamp_px} pixels or larger"
         )
 
-    def _positions(self, image: ImageFile, table: Catalogue, is_cube: bool) -> np.ndarray | None:
-        """Positions (n, 2) of the catalogue's stars; None for a cube if they are on the sky."""
-        where = table.positions()
+    def _positions(
+        self, image: ImageFile, table: Catalogue, where: Positions, is_cube: bool
+    ) -> np.ndarray | None:
+        """Positions (n, 2) of the catalogue's stars; None for a cube if they are on the sky.
+
+        NaN in rows without one.
+        """
         if is_cube and len(table) != image.shape[0]:
             raise ObservationError(
                 table.path, f"{len(table)} stars for the {image.shape[0]} stamps of {image.path}"
@@ -143,24 +176,68 @@ class Source:
                     f"the origin of columns {where.first},{where.second} must be stated: "
                     "is the centre of the first pixel 0 or 1?",
                 )
-            columns = [table.finite(name) for name in (where.first, where.second)]
+            columns = [table.coordinates(name) for name in (where.first, where.second)]
             positions = np.stack(columns, axis=1) - origin
         if not is_cube:
             _check_overlap(image, table, positions)
         return positions
 
-    def _stated(self, image: ImageFile) -> tuple[float | None, float | None, float | None]:
-        """Pixel scale, gain and saturation: what is given, else what the headers say."""
-        scale, gain, saturate = self.pixel_scale_arcsec, self.gain, self.saturate
-        if scale is None and image.wcs is not None:
+    def _given(self) -> dict[str, float | None]:
+        return {
+            "pixel scale": self.pixel_scale_arcsec,
+            "gain": self.gain,
+            "read noise": self.read_noise,
+            "saturation": self.saturate,
+        }
+
+    def _camera(self, image: ImageFile) -> dict[str, Said]:
+        """What is given, else what the WCS and the headers say, and who says it."""
+        scale = image.scale()
+        if image.wcs is not None:
             with reading(image.path):
-                scale = pixel_scale(image.wcs)
-            scale = scale if math.isfinite(scale) and scale > 0 else None
-        return (
-            image.positive(SCALE_KEYS) if scale is None else scale,
-            image.gain() if gain is None else gain,
-            image.positive(SATURATION_KEYS) if saturate is None else saturate,
-        )
+                found = pixel_scale(image.wcs)
+            scale = (found, "WCS") if math.isfinite(found) and found > 0 else scale
+        saturation, noise = map(image.positive, (SATURATION_KEYS, READ_NOISE_KEYS))
+        headers = dict(zip(self._given(), (scale, image.gain(), noise, saturation), strict=True))
+        given = {name: (v, "given") for name, v in self._given().items() if v is not None}
+        return headers | given
+
+    def _layers(self, image: ImageFile, is_cube: bool, camera: dict[str, Said]) -> Layers:
+        mask = None if self.mask is None else _find_beside(image, self.mask, "a mask")
+        if self.bad_bits is not None and mask is None:
+            raise ObservationError(self.path, "bits are given, but no mask that has them")
+        gain, read_noise = (camera[name][0] for name in ("gain", "read noise"))
+        least = read_noise / gain if read_noise and gain else 0.0
+        maps = {"a weight map": self.weight, "a variance map": self.variance}
+        given = [(what, place) for what, place in maps.items() if place is not None]
+        if not given:
+            return Layers(image, mask, self.bad_bits, least_noise=least)
+        if len(given) > 1 or is_cube:
+            raise ObservationError(
+                self.path, "an image takes one map of weight or variance, a cube of stamps none"
+            )
+        what, place = given[0]
+        noise = _find_beside(image, place, what)
+        with open_pixels(noise, whole=True) as pixels:
+            wrong = np.count_nonzero(pixels[:] <= 0)
+        if wrong:
+            raise ObservationError(
+                noise.path,
+                f"{what} of which {wrong} of {math.prod(noise.shape)} pixels are not above 0; "
+                "NaN is for bad pixels, or a mask",
+            )
+        inverse = self.weight is not None
+        return Layers(image, mask, self.bad_bits, noise, inverse, least_noise=least)
+
+    def _detected(self, sky: Sky) -> Catalogue:
+        """The stars of an image."""
+        from astropy.table import Table
+
+        with reading(self.path):
+            table = Table(sky.stars(self.detect))
+        if len(table) == 0:
+            raise ObservationError(self.path, f"no star {self.detect:g} σ above the sky")
+        return Catalogue(self.path, table)
 
     def _column(self, table: Catalogue | None, name: str | None, count: int) -> np.ndarray:
         """A numeric column of the catalogue, NaN where it has no value or is not asked for."""
@@ -173,8 +250,7 @@ class Source:
 
 def _check_overlap(image: ImageFile, table: Catalogue, positions: np.ndarray) -> None:
     rows, columns = image.shape
-    column, row = central_pixel(positions.T)
-    found = np.count_nonzero((column >= 0) & (column < columns) & (row >= 0) & (row < rows))
+    found = np.count_nonzero(_inside(positions, image.shape))
     if found > rows * columns:
         raise ObservationError(
             table.path,
@@ -196,14 +272,77 @@ def _check_overlap(image: ImageFile, table: Catalogue, positions: np.ndarray) ->
     )
 
 
-def _find_mask(image: ImageFile, mask: str | int | Path) -> ImageFile:
-    outside = isinstance(mask, Path) or (isinstance(mask, str) and Path(mask).is_file())
-    found = find_image(Path(mask)) if outside else find_image(image.file, mask)
+def _inside(positions: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Which positions (n, 2), x and y, are on an image (rows, columns)."""
+    place = central_pixel(positions[:, ::-1])
+    return ((place >= 0) & (place < shape)).all(axis=1)
+
+
+def _find_beside(image: ImageFile, place: str | int | Path, what: str) -> ImageFile:
+    """An extension, or another file, with a pixel for every one of the image."""
+    outside = isinstance(place, Path) or (isinstance(place, str) and Path(place).is_file())
+    found = find_image(Path(place)) if outside else find_image(image.file, place)
     wanted = image.shape
     if found.shape != wanted and not (len(wanted) == 3 and found.shape == wanted[1:]):
         sizes = ["×".join(str(n) for n in shape) for shape in (found.shape, wanted)]
-        raise ObservationError(found.path, f"a mask of {sizes[0]} pixels, expected {sizes[1]}")
+        raise ObservationError(found.path, f"{what} of {sizes[0]} pixels, expected {sizes[1]}")
     return found
+
+
+@dataclass(frozen=True)
+class Layers:
+    """An image, what lies beside it, and how that is read."""
+
+    image: ImageFile
+    mask: ImageFile | None = None
+    bad_bits: int | None = None
+    noise: ImageFile | None = None  # weight or variance
+    inverse: bool = False  # weight
+    noise_scale: float = 1.0  # of σ by this map
+    least_noise: float = 0.0  # counts; the read noise
+
+    @contextmanager
+    def open(self, whole: bool) -> Iterator[tuple[Any, Any, Any]]:
+        """Pixels of the image, the mask and the map of noise, None for what there is not."""
+        with ExitStack() as files:
+            # Bits of whole numbers do not fit into the mantissa of a float32.
+            kinds = ((self.image, np.float32), (self.mask, np.float64), (self.noise, np.float32))
+            yield tuple(
+                image and files.enter_context(open_pixels(image, whole=whole, dtype=dtype))
+                for image, dtype in kinds
+            )  # type: ignore[misc]
+
+    def bad(self, values: np.ndarray) -> np.ndarray:
+        """Which pixels the mask calls bad; those without a value are."""
+        if self.bad_bits is None:
+            return values != 0
+        return (np.nan_to_num(values, nan=-1).astype(np.int64) & self.bad_bits) != 0
+
+    def sigma(self, values: np.ndarray) -> np.ndarray:
+        """σ of pixels by the map, NaN where it has none."""
+        with np.errstate(all="ignore"):
+            variance = 1.0 / values if self.inverse else values
+            known = np.isfinite(variance) & (variance > 0)
+        return self.noise_scale * np.sqrt(np.where(known, variance, np.nan))
+
+    def sky(self) -> Sky:
+        """The image as a whole with its sky."""
+        everything = (slice(None), slice(None))
+        with self.open(whole=True) as (pixels, mask, noise):
+            image = pixels[everything]
+            bad = ~np.isfinite(image)
+            sigma = None
+            if mask is not None:
+                bad |= self.bad(mask[everything])
+            if noise is not None:
+                sigma = self.sigma(noise[everything])
+                bad |= np.isnan(sigma)
+        with reading(self.image.path):
+            try:
+                return sky_of(image, bad, sigma, self.least_noise)
+            except ValueError:  # nothing to measure the sky on
+                problem = "too few pixels of the image have a value that is not masked"
+                raise ObservationError(self.image.path, problem) from None
 
 
 @dataclass(frozen=True)
@@ -213,18 +352,90 @@ class Observation:
     path: Path
     count: int  # of stars, none is ever left out
     stamp_px: int
-    margin: int  # pixels around each stamp, 0 for cubes
+    margin: int  # pixels around each stamp
     shape: tuple[int, ...] | None  # (rows, columns) of the image, None for a cube
-    pixel_scale_arcsec: float | None  # given, of the WCS, or of the header, in this order
-    gain: float | None  # electrons per count
-    saturate: float | None  # counts from which a pixel is saturated
-    positions: np.ndarray | None  # (n, 2), 0-based x, y; NaN where the WCS cannot place a star
+    camera: dict[str, Said]  # given, of the WCS, or of the header, in this order, and which
+    positions: np.ndarray | None  # (n, 2), 0-based x, y; NaN where neither list nor WCS has one
     header_cards: list[Card]  # provenance to copy into what is made of the stars
-    _id: np.ndarray = field(repr=False)
-    _flux: np.ndarray = field(repr=False)
-    _background: np.ndarray = field(repr=False)
-    _image: ImageFile = field(repr=False)
-    _mask: ImageFile | None = field(repr=False)
+    catalogue: Path | None  # the star list
+    found: Catalogue | None  # that made in its place
+    _columns: list[np.ndarray] = field(repr=False)  # identifiers, flux, sky and flags of the list
+    _layers: Layers = field(repr=False)
+
+    @property
+    def pixel_scale_arcsec(self) -> float | None:
+        return self.camera["pixel scale"][0]
+
+    @property
+    def gain(self) -> float | None:
+        """Electrons per count."""
+        return self.camera["gain"][0]
+
+    @property
+    def saturate(self) -> float | None:
+        """Counts from which a pixel is saturated."""
+        return self.camera["saturation"][0]
+
+    @property
+    def least_noise(self) -> float:
+        """Read noise in counts; 0 where it or the gain is not known."""
+        return self._layers.least_noise
+
+    @property
+    def scale_assumed(self) -> bool:
+        return self.camera["pixel scale"][1] == "assumed"
+
+    def assuming(self) -> Observation:
+        """The same with `ASSUMED_SCALE` if nothing says the scale."""
+        if self.pixel_scale_arcsec is not None:
+            return self
+        return replace(self, camera=self.camera | {"pixel scale": (ASSUMED_SCALE, "assumed")})
+
+    def said(self) -> str:
+        """What is known of the camera and who says it, in words."""
+        units = ("arcsec", "electrons per count", "electrons", "counts")
+        words = []
+        for (name, (value, origin)), unit in zip(self.camera.items(), units, strict=True):
+            words.append(f"{name} {origin if value is None else f'{value:.6g} {unit} ({origin})'}")
+        said = f"{self.path}: {', '.join(words)}"
+        lost = self.unplaced()
+        if lost.any():
+            rows = shorten([str(row + 1) for row in np.flatnonzero(lost)])
+            said += f"\n{self.catalogue}: no position in row {rows}: flagged, and not learnt from"
+        return said
+
+    def unplaced(self) -> np.ndarray:
+        """Which stars have no position though the list has others, bool, shape (n,)."""
+        if self.positions is None or self.found is not None:
+            return np.zeros(self.count, dtype=bool)
+        return ~np.isfinite(self.positions).all(axis=1)
+
+    def check_list(self) -> None:
+        """Refuse a star list of another image, and one with a star twice.
+
+        At least half of its positions must be on a source.
+        """
+        from scipy.spatial import cKDTree
+
+        if self.shape is None or self.catalogue is None:
+            return
+        placed = np.flatnonzero(np.isfinite(self.positions).all(axis=1))
+        pairs = cKDTree(self.positions[placed]).query_pairs(SAME_PX, output_type="ndarray")
+        if len(pairs):
+            one, other = placed[pairs[np.lexsort(pairs.T[::-1])[0]]] + 1
+            raise ObservationError(
+                self.catalogue,
+                f"rows {one} and {other} are the same star; {len(pairs)} such pairs in all",
+            )
+        sky = self._layers.sky()
+        with reading(self.path):
+            seen = int(sky.covered(*central_pixel(self.positions.T), SEEN).sum())
+        if seen < 0.5 * placed.size:
+            raise ObservationError(
+                self.catalogue,
+                f"{seen} of {placed.size} positions are on a source of {self.path}, at least half "
+                "are expected: a list of another image, or with stars too faint for this one?",
+            )
 
     def chunks(self, rows: int) -> Iterator[Stamps]:
         """Stream the stars in their order, at most `rows` at a time.
@@ -234,36 +445,47 @@ class Observation:
         """
         if rows < 1:
             raise ValueError(f"rows is {rows}, expected at least 1")
-        cut = self._of_cube if self.shape is None else self._of_image
-        with ExitStack() as files:
-            pixels, mask = (
-                image and files.enter_context(open_pixels(image, whole=self.shape is not None))
-                for image in (self._image, self._mask)
-            )
+        stamps_of = self._of_cube if self.shape is None else self._of_image
+        with self._layers.open(whole=self.shape is not None) as opened:
             for start in range(0, self.count, rows):
                 part = slice(start, min(start + rows, self.count))
-                yield self._stamps(part, *cut(part, pixels, mask))
+                yield self._stamps(part, *stamps_of(part, *opened))
 
-    def _of_cube(self, part: slice, pixels: Pixels, mask: Pixels | None) -> tuple[np.ndarray, ...]:
-        """Pixels, which of them are masked, and which stars are truncated."""
-        size = (part.stop - part.start, self.stamp_px, self.stamp_px)
-        data = _rows(pixels, part).reshape(size)
-        masked = np.zeros(size, dtype=bool)
+    def _of_cube(
+        self, part: slice, pixels: Pixels, mask: Pixels | None, _: None
+    ) -> tuple[np.ndarray, ...]:
+        """Pixels, which of them are masked, which stars are truncated, and their noise."""
+        side, count = self.stamp_px + 2 * self.margin, part.stop - part.start
+        data = cut(_rows(pixels, part), side)
+        masked = np.zeros(data.shape, dtype=bool)
         if mask is not None:
-            masked |= _rows(mask, part if len(mask.image.shape) == 3 else slice(0, 1)) != 0
-        return data, masked, np.zeros(size[0], dtype=bool)
+            each = part if len(mask.image.shape) == 3 else slice(0, 1)
+            masked |= self._layers.bad(cut(_rows(mask, each), side))
+        return data, masked, np.zeros(count, dtype=bool), np.full(count, np.nan)
 
-    def _of_image(self, part: slice, pixels: Pixels, mask: Pixels | None) -> tuple[np.ndarray, ...]:
+    def _of_image(
+        self, part: slice, pixels: Pixels, mask: Pixels | None, noise: Pixels | None
+    ) -> tuple[np.ndarray, ...]:
         x, y = self.positions[part].T
         where = (self.shape, x, y, self.stamp_px, self.margin)
         data, inside, truncated = cut_image(pixels, *where)
-        masked = ~inside
+        masked, level = ~inside, np.full(len(data), np.nan)
         if mask is not None:
-            masked |= cut_image(mask, *where)[0] != 0
-        return data, masked, truncated
+            masked |= self._layers.bad(cut_image(mask, *where)[0])
+        if noise is not None:
+            sigma = self._layers.sigma(cut_image(noise, *where)[0])
+            masked |= np.isnan(sigma)
+            each = np.ma.array(sigma, mask=masked)
+            level = np.ma.median(each, axis=(1, 2)).filled(np.nan).astype(float)
+        return data, masked, truncated, level
 
     def _stamps(
-        self, part: slice, data: np.ndarray, masked: np.ndarray, truncated: np.ndarray
+        self,
+        part: slice,
+        data: np.ndarray,
+        masked: np.ndarray,
+        truncated: np.ndarray,
+        noise: np.ndarray,
     ) -> Stamps:
         if self.saturate is None:
             saturated = np.zeros(data.shape, dtype=bool)
@@ -276,8 +498,13 @@ class Observation:
         unknown = np.full(len(data), np.nan)
         x, y = (unknown, unknown) if self.positions is None else self.positions[part].T
         gain = unknown if self.gain is None else np.full(len(data), self.gain)
-        known = (self._flux[part], self._background[part], unknown, gain)
-        return Stamps(data, masked, saturated, truncated, self._id[part], x, y, *known)
+        listed = np.full((len(data), 2), np.nan)
+        if self.shape is not None:
+            listed = np.stack([y - central_pixel(y), x - central_pixel(x)], axis=1)
+        ids, flux, background, flags = (column[part].copy() for column in self._columns)
+        raise_flag(flags, StarFlag.TRUNCATED, truncated)
+        known = (flux, background, noise, gain, listed)
+        return Stamps(data, masked, saturated, flags, ids, x, y, *known)
 
 
 def _rows(pixels: Pixels, part: slice) -> np.ndarray:

@@ -35,11 +35,12 @@ Restore = Callable[[np.ndarray, float], Estimate]
 
 @dataclass(frozen=True)
 class HeldOutStars:
-    """Noise-free stars of flux 1 that no training has seen, (n, d, d), and their noise."""
+    """Noise-free stars of flux 1 that no training has seen, (n, d, d), noise, and places (n, 2)."""
 
     images: np.ndarray
     references: np.ndarray
     noise: NoiseModel
+    position: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -131,7 +132,8 @@ def measure_errors(
     for place, noise in enumerate(nodes):
         level = noise / stars.noise.kappa
         noisy = stars.noise.draw(stars.images[star], level, rng)
-        error[place] = errors_of(fitted.estimate(noisy, level), stars.references[star])
+        estimate = fitted.estimate(noisy, level, stars.position[star])
+        error[place] = errors_of(estimate, stars.references[star])
         strangeness.append(free.strangeness(noisy, np.full(star.size, level)))
         distance[place] = mahalanobis(noisy, np.full(star.size, noise), model, COMPONENTS)
     known = [node for node in strangeness if node is not None]

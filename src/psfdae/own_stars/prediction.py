@@ -17,6 +17,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
+from itertools import combinations
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Self
 
@@ -64,6 +65,13 @@ class Prediction:
         The same, squared, by the model's own law of stars; NaN where it has none.
     fwhm_px, ellipticity, position_angle_deg : ndarray, shape (n,), float64
         Of the PSF (`psfdae.own_stars.shapes`).
+    x_fit, y_fit : ndarray, shape (n,), float64
+        Centre of the star, 0-based: in the image where the star was cut from one, else in
+        its stamp. NaN if the model's method measures none, and so all that follows.
+    x_error, y_error, background_error : ndarray, shape (n,), float64
+        Standard errors.
+    corr_* : ndarray, shape (n,), float64
+        Correlations of two errors each.
     shift_x, shift_y : ndarray, shape (n,), int16
         Pixels by which the stamp was moved along columns and rows to centre the star.
     flags : ndarray, shape (n,), uint16
@@ -88,6 +96,17 @@ class Prediction:
     shift_x: np.ndarray
     shift_y: np.ndarray
     flags: np.ndarray
+    x_fit: np.ndarray
+    y_fit: np.ndarray
+    x_error: np.ndarray
+    y_error: np.ndarray
+    background_error: np.ndarray
+    corr_flux_background: np.ndarray
+    corr_flux_y: np.ndarray
+    corr_flux_x: np.ndarray
+    corr_background_y: np.ndarray
+    corr_background_x: np.ndarray
+    corr_y_x: np.ndarray
 
     def __len__(self) -> int:
         return len(self.psf)
@@ -103,6 +122,27 @@ class Prediction:
             return parts[0]
         columns = (np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(cls))
         return cls(*columns)
+
+
+def measured_of(centre: np.ndarray, covariance: np.ndarray) -> dict[str, np.ndarray]:
+    """Columns from centres (row, column) and the covariance of `estimators.Measured`.
+
+    A number that is known has the error 0, and correlates with nothing.
+    """
+    errors = np.sqrt(np.maximum(np.einsum("nii->ni", covariance), 0.0))
+    names = ("flux", "background", "y", "x")
+    columns = {"y_fit": centre[:, 0], "x_fit": centre[:, 1]}
+    columns |= {f"{name}_error": errors[:, i] for i, name in enumerate(names) if i}
+    for i, j in combinations(range(4), 2):
+        product = errors[:, i] * errors[:, j]
+        share = covariance[:, i, j] / np.where(product > 0, product, 1.0)
+        columns[f"corr_{names[i]}_{names[j]}"] = np.where(product > 0, share, 0.0)
+    return columns
+
+
+def unmeasured(count: int) -> dict[str, np.ndarray]:
+    """The same columns of a method that measures nothing."""
+    return dict.fromkeys(measured_of(np.zeros((0, 2)), np.zeros((0, 4, 4))), np.full(count, np.nan))
 
 
 CUBES: dict[str, tuple[str, str]] = {
@@ -129,6 +169,17 @@ COLUMNS: dict[str, tuple[str, str | None, str]] = {
     "fwhm_px": ("D", "pix", "of the PSF, adaptive moments"),
     "ellipticity": ("D", None, "1 - b/a of the PSF"),
     "position_angle_deg": ("D", "deg", "of the major axis, from +x to +y"),
+    "x_fit": ("D", "pix", "centre of the star, columns, 0-based"),
+    "y_fit": ("D", "pix", "centre of the star, rows, 0-based"),
+    "x_error": ("D", "pix", "standard error of x_fit"),
+    "y_error": ("D", "pix", "standard error of y_fit"),
+    "background_error": ("D", UNIT, "standard error of background"),
+    "corr_flux_background": ("D", None, "correlation of errors"),
+    "corr_flux_y": ("D", None, "correlation of errors"),
+    "corr_flux_x": ("D", None, "correlation of errors"),
+    "corr_background_y": ("D", None, "correlation of errors"),
+    "corr_background_x": ("D", None, "correlation of errors"),
+    "corr_y_x": ("D", None, "correlation of errors"),
     "shift_x": ("I", "pix", "stamp moved along columns"),
     "shift_y": ("I", "pix", "stamp moved along rows"),
     "flags": ("J", None, "sum of the FLAG values in this header"),

@@ -6,6 +6,7 @@ star of a stamp lies near index (s//2, s//2).
 
 from __future__ import annotations
 
+import warnings
 from collections import Counter
 from dataclasses import dataclass, fields
 from enum import StrEnum
@@ -16,7 +17,7 @@ import numpy as np
 
 from psfdae.own_stars.errors import no_formula
 from psfdae.own_stars.observation import Observation
-from psfdae.own_stars.stamps import Stamps, cut, peaks
+from psfdae.own_stars.stamps import Stamps, StarFlag, cut, peaks
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -31,6 +32,11 @@ DEFECT = 6.0  # pixels this many σ below the sky are defects; they are raised t
 # Photons per pixel of the new noise, at least: no rate of photons is negative, and the deepest
 # pixel of a star that is made fainter has B − DEFECT √B at most.
 LEAST_SKY = 2.0 * DEFECT**2
+CORE_PX = 8  # or half of the stamp, if that is more: no place for a faint neighbour
+LOCAL = 1.2  # the worst pixels of good stars scatter more than their stamps as a whole
+# Stars are saturated if at least so many have brightest pixels that agree to this part, which is
+# less of their light, by this factor, than in stars at least so bright.
+PILE, PILE_WIDTH, PILE_SHARPNESS, PILE_FROM = 3, 0.03, 0.9, 0.1
 SHIFT_ORDER = 3  # splines; on a star with a FWHM of 3 px they err by an MSE of 1e-8
 
 
@@ -42,8 +48,10 @@ class Verdict(StrEnum):
     """Why a star is not used; the first reason that applies."""
 
     GOOD = "good"
+    UNPLACED = "no position"
     INCOMPLETE = "incomplete"  # pixels off the image, masked or not finite
     SATURATED = "saturated"
+    BLENDED = "blended"  # by the star list
     FAINT = "faint"
     OFF_CENTRE = "off centre"
     CROWDED = "crowded"
@@ -62,6 +70,7 @@ class BrightStars:
     noise: np.ndarray  # (n,), RMS of the sky per pixel in counts
     snr: np.ndarray  # (n,)
     row: np.ndarray  # (n,), of the catalogue
+    listed: np.ndarray  # (n, 2), centre by the catalogue from index (s//2, s//2), NaN if unknown
 
     def __len__(self) -> int:
         return len(self.wide)
@@ -92,6 +101,8 @@ class Candidates:
     position: np.ndarray  # (n, 2), x, y, NaN where unknown
     snr: np.ndarray
     noise: np.ndarray  # RMS of the sky in counts per pixel
+    sky: np.ndarray  # its level, likewise
+    brightest: np.ndarray  # pixel in counts, sky included; -inf off centre
     verdict: np.ndarray  # a `Verdict` for every star
     bright: BrightStars  # the good ones
 
@@ -125,22 +136,28 @@ def collect(observation: Observation, settings: CalibrationStars, framing: Frami
     those of bright stars are kept in memory. CalibrationStarsError says that there are
     fewer good ones than `calibration_stars.stars_min`.
     """
-    measured = [_measure(chunk, settings, framing) for chunk in observation.chunks(ROWS)]
+    observation.check_list()
+    least = observation.least_noise
+    measured = [_measure(chunk, settings, framing, least) for chunk in observation.chunks(ROWS)]
     columns, kept = zip(*measured, strict=True)
     found = {key: np.concatenate([c[key] for c in columns]) for key in columns[0]}
     side, verdict, noise, snr = framing.stamp_px, found["verdict"], found["noise"], found["snr"]
     row = np.flatnonzero(verdict == Verdict.GOOD)
+    if observation.saturate is None:
+        flat = found["brightest"] >= piled_up(found["brightest"], found["sky"], snr * noise)
+        verdict[flat & (verdict == Verdict.GOOD)] = Verdict.SATURATED
     close = crowded(found["position"], snr * noise, settings.isolation_px, settings.neighbour_ratio)
     verdict[close & (verdict == Verdict.GOOD)] = Verdict.CROWDED
-    wide, peak = (np.concatenate([k[i] for k in kept]) for i in (0, 1))
+    verdict[observation.unplaced()] = Verdict.UNPLACED
+    wide, peak, listed = (np.concatenate([k[i] for k in kept]) for i in range(3))
     wide = np.maximum(wide, -DEFECT * noise[row, None, None])
     flux = cut(wide, side, peak).sum(axis=(1, 2))
     verdict[row[flux <= 0]] = Verdict.MISFIT
     good = verdict[row] == Verdict.GOOD
-    wide, peak, flux, row = wide[good], peak[good], flux[good], row[good]
+    wide, peak, listed, flux, row = (a[good] for a in (wide, peak, listed, flux, row))
     centre = star_centres(wide, peak, window_of(snr[row], flux, noise[row]))
     bright = BrightStars(
-        wide, peak, centre, found["position"][row], flux, noise[row], snr[row], row
+        wide, peak, centre, found["position"][row], flux, noise[row], snr[row], row, listed
     )
     score = misfit(cut(bright.aligned(), side), bright.position, bright.noise / bright.flux)
     verdict[row[score > settings.misfit]] = Verdict.MISFIT
@@ -155,22 +172,28 @@ def collect(observation: Observation, settings: CalibrationStars, framing: Frami
 
 
 def _measure(
-    chunk: Stamps, settings: CalibrationStars, framing: Framing
+    chunk: Stamps, settings: CalibrationStars, framing: Framing, least_noise: float
 ) -> tuple[dict[str, np.ndarray], tuple[np.ndarray, ...]]:
-    """Columns for all stars of a chunk; stamps and peaks of the bright ones."""
+    """Columns for all stars of a chunk; stamps, peaks and listed centres of the bright ones."""
     side = framing.stamp_px
     level, noise = sky_around(chunk.data, chunk.bad, side)
+    noise = np.where(np.isfinite(chunk.noise), chunk.noise, np.maximum(noise, least_noise))
     wide = np.where(chunk.bad, 0.0, chunk.data - level[:, None, None])
     reach = min(settings.search_px, (wide.shape[-1] - 5) // 2)
     peak, centred = brightest_pixels(wide, reach)
     needed = side + 2 * min(reach + framing.jitter_px + 1, (wide.shape[-1] - side) // 2)
     snr = signal_to_noise(cut(wide, side), noise)
     verdict = np.full(len(chunk), Verdict.GOOD, dtype="<U16")
+
+    def said(flag: StarFlag) -> np.ndarray:
+        return (chunk.flags & np.uint16(flag)) > 0
+
     for reason, stars in (
         (Verdict.OFF_CENTRE, ~centred),
         (Verdict.FAINT, snr < settings.snr_min),
-        (Verdict.SATURATED, cut(chunk.saturated, side).any(axis=(1, 2))),
-        (Verdict.INCOMPLETE, cut(chunk.bad, needed).any(axis=(1, 2))),
+        (Verdict.BLENDED, said(StarFlag.BLENDED)),
+        (Verdict.SATURATED, cut(chunk.saturated, side).any(axis=(1, 2)) | said(StarFlag.SATURATED)),
+        (Verdict.INCOMPLETE, cut(chunk.bad, needed).any(axis=(1, 2)) | said(StarFlag.TRUNCATED)),
     ):
         verdict[stars] = reason
     columns = {
@@ -178,10 +201,43 @@ def _measure(
         "position": np.stack([chunk.x, chunk.y], axis=1),
         "snr": snr,
         "noise": noise,
+        "sky": level,
+        "brightest": level + np.where(centred, _at(wide, peak), -np.inf),
         "verdict": verdict,
     }
     good = verdict == Verdict.GOOD
-    return columns, (wide[good], peak[good])
+    return columns, (wide[good], peak[good], chunk.listed[good])
+
+
+def _at(wide: np.ndarray, peak: np.ndarray) -> np.ndarray:
+    """Pixels of stamps (n, s, s) at (row, column) from index (s//2, s//2), shape (n,)."""
+    row, column = (peak + wide.shape[-1] // 2).T
+    return wide[np.arange(len(wide)), row, column]
+
+
+def piled_up(brightest: np.ndarray, sky: np.ndarray, brightness: np.ndarray) -> float:
+    """Counts at which the brightest pixels of stars pile up; infinite if they do not.
+
+    Stars of the same brightness have the same brightest pixels, too. Of those that are cut
+    off, the brightest pixel is less of the star than in others.
+
+    Parameters
+    ----------
+    brightest : ndarray, shape (n,)
+        Pixel of every star, counts, sky included.
+    sky, brightness : ndarray, shape (n,)
+        Level in counts, and light of the star in any unit.
+    """
+    height = brightest - sky
+    top = height.max(initial=0.0)
+    piled = height >= (1.0 - PILE_WIDTH) * top
+    others = (height >= PILE_FROM * top) & ~piled
+    if top <= 0 or piled.sum() < PILE or not others.any():
+        return np.inf
+    sharpness = height / np.where(brightness > 0, brightness, 1.0)
+    if np.median(sharpness[piled]) > PILE_SHARPNESS * np.median(sharpness[others]):
+        return np.inf
+    return float(brightest[piled].min())
 
 
 def sky_around(wide: np.ndarray, bad: np.ndarray, stamp_px: int) -> tuple[np.ndarray, np.ndarray]:
@@ -210,14 +266,16 @@ def sky_around(wide: np.ndarray, bad: np.ndarray, stamp_px: int) -> tuple[np.nda
     start = side // 2 - inner // 2
     ring = np.ones((side, side), dtype=bool)
     ring[start : start + inner, start : start + inner] = False
-    _, level, noise = sigma_clipped_stats(
-        wide[:, ring],
-        mask=bad[:, ring],
-        sigma=SKY_CLIP,
-        cenfunc="median",
-        stdfunc="mad_std",
-        axis=1,
-    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # stars off the image have no pixels
+        _, level, noise = sigma_clipped_stats(
+            wide[:, ring],
+            mask=bad[:, ring],
+            sigma=SKY_CLIP,
+            cenfunc="median",
+            stdfunc="mad_std",
+            axis=1,
+        )
     level, noise = (np.nan_to_num(np.ma.filled(a, np.nan)).astype(float) for a in (level, noise))
     return level, noise
 
@@ -341,8 +399,10 @@ def misfit(aligned: np.ndarray, position: np.ndarray, noise: np.ndarray) -> np.n
 
     A star is compared with the nearest `COMPANIONS` stars, pixel by pixel: its
     difference from their median in units of their robust scatter, root mean square
-    over the stamp. Where the PSF varies, so do the neighbours; a companion or a cosmic
-    ray lies where they agree. The result is 1 for the median star.
+    over the stamp, or over the worst 3 × 3 pixels of its core: a close companion and a core that is
+    flat or hollow are no more than that. Where the PSF varies, so do the neighbours; a
+    companion or a cosmic ray lies where they agree. The median star has 1, in its worst
+    pixels 1/`LOCAL`.
 
     Parameters
     ----------
@@ -353,6 +413,7 @@ def misfit(aligned: np.ndarray, position: np.ndarray, noise: np.ndarray) -> np.n
     noise : ndarray, shape (n,)
         RMS of a pixel over the flux.
     """
+    from scipy import ndimage
     from scipy.spatial import cKDTree
 
     count = len(aligned)
@@ -363,11 +424,14 @@ def misfit(aligned: np.ndarray, position: np.ndarray, noise: np.ndarray) -> np.n
         usual = (_usual(aligned[found[found != star]]) for star, found in enumerate(near))
     else:
         usual = repeat(_usual(aligned), count)
-    score = np.empty(count)
+    score, side = np.empty((count, 2)), aligned.shape[-1]
+    core = min(side, max(side // 2, CORE_PX))
     for star, (median, variance) in enumerate(usual):
         square = (aligned[star] - median) ** 2 / (variance + noise[star] ** 2)
-        score[star] = np.sqrt(square.mean())
-    return score / np.median(score)
+        patches = ndimage.uniform_filter(square, 3)[None]
+        score[star] = square.mean(), cut(patches, core).max()
+    score = np.sqrt(score)
+    return (score / np.median(score, axis=0) / (1.0, LOCAL)).max(axis=1)
 
 
 def _usual(stars: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -16,7 +16,9 @@ class Stamps:
     data: np.ndarray  # (n, s, s), counts, sky included; 0 where not finite or off the image
     bad: np.ndarray  # (n, s, s), masked pixels, and those that `data` does not show
     saturated: np.ndarray  # (n, s, s)
-    truncated: np.ndarray  # (n,), part of the stamp, margin aside, is off the image
+    flags: (
+        np.ndarray
+    )  # (n,), uint16, `StarFlag`s of the list; TRUNCATED: off the image, margin aside
     id: np.ndarray  # (n,), int64 or str
     x: np.ndarray  # (n,), position in the image, 0-based pixel centres; NaN where unknown
     y: np.ndarray
@@ -24,6 +26,8 @@ class Stamps:
     background: np.ndarray  # (n,), sky level, likewise
     noise: np.ndarray  # (n,), RMS of the sky in a pixel, likewise
     gain: np.ndarray  # (n,), electrons per unit of the stamps; NaN where unknown
+    # (n, 2), centre (row, column) from index s//2 that a list says; NaN where unknown
+    listed: np.ndarray
 
     def __len__(self) -> int:
         return len(self.data)
@@ -46,6 +50,7 @@ class StarFlag(IntFlag):
     SNR_HIGH = 128
     OFF_CENTRE = 256
     UNLIKE_TRAINING = 512
+    BLENDED = 1024
 
 
 MEANING: dict[StarFlag, str] = {
@@ -53,12 +58,13 @@ MEANING: dict[StarFlag, str] = {
     StarFlag.OUTLIER: "pixels that no star of the training set can have; replaced",
     StarFlag.FAINT: "flux below three times its error",
     StarFlag.NO_FLUX: "no usable flux: PSF, residual and uncertainty are NaN",
-    StarFlag.SATURATED: "saturated pixels; replaced",
-    StarFlag.TRUNCATED: "part of the stamp is off the image",
+    StarFlag.SATURATED: "saturated pixels, replaced; or the star list says so",
+    StarFlag.TRUNCATED: "part of the stamp is off the image; or the star list says so",
     StarFlag.SNR_LOW: "S/N less than 1/1.25 of the least that the training had",
     StarFlag.SNR_HIGH: "S/N more than 1.25 times the largest that the training had",
     StarFlag.OFF_CENTRE: "brightest pixel farther from the centre than the stamp could be moved",
     StarFlag.UNLIKE_TRAINING: "farther from the training set than 99.9 % of its test stars",
+    StarFlag.BLENDED: "the star list says that it was parted from a neighbour",
 }
 """One line for every flag."""
 

@@ -115,6 +115,13 @@ def templates_of(stars: BrightStars, held_out: np.ndarray, bins: int) -> np.ndar
     return stacks(training.aligned(), training.snr, part[~held_out], bins**2)[part]
 
 
+def single_psf(stars: BrightStars, held_out: np.ndarray) -> np.ndarray:
+    """The stack of all training stars, (s, s), centre at index (s//2, s//2)."""
+    training = stars.of(~held_out)
+    everyone = np.zeros(len(training), dtype=int)
+    return stacks(training.aligned(), training.snr, everyone, 1)[0]
+
+
 def make_images(
     stars: BrightStars,
     template: np.ndarray,
@@ -240,6 +247,7 @@ def training_columns(
     template = templates_of(bright, held_out, bins)
     subpixel = ~held_out[star] & framing.subpixel
     images, templates, jitter, phase = make_images(bright, template, star, framing, subpixel, rng)
+    wide = (bright.wide / bright.flux[:, None, None]).astype(np.float32)
     return {
         "template": Column(templates, "1", "stack of the star's part of the field, sum 1"),
         "realisation": Column(images, "1", "the star itself, sum 1"),
@@ -251,4 +259,7 @@ def training_columns(
         "snr": Column(bright.snr, "1", "signal to noise of every star"),
         "noise": Column(bright.noise / bright.flux, "1", "pixel RMS over flux of every star"),
         "row": Column(bright.row, "1", "row of every star in the catalogue"),
+        "wide": Column(wide, "1", "the bright stars with a margin, of flux 1"),
+        "peak": Column(bright.peak, "pixel", "brightest pixel (row, column) from the middle's"),
+        "listed": Column(bright.listed, "pixel", "centre by the catalogue, likewise"),
     }

@@ -1,14 +1,15 @@
 """Stages of scene 3 that train its networks, estimate the states of test sets, bound the errors.
 
-The CNNs have one architecture and differ in what they are trained on: clean stamps of the
-grid (the paper's, used as "original" and as "dae"), noisy stamps of many states, and the
-DAE's output for noisy stamps of many states. The noise of a test set depends on seed, set
+The networks differ in what they are trained on: the paper's CNN on clean stamps of the grid
+(used as "original" and as "dae"), ours on noisy stamps of many states, and on the DAE's
+output for noisy stamps of many states. The noise of a test set depends on seed, set
 and λ only, so all methods see the same stamps and their differences are paired.
 """
 
 from __future__ import annotations
 
 import time
+from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import asdict, make_dataclass, replace
 from functools import partial
@@ -18,11 +19,11 @@ from typing import Annotated, Any
 import click
 import numpy as np
 
-from psfdae.alignment.methods import CNNS, LEARNED, METHODS
+from psfdae.alignment.methods import BOUNDS, FITTED, LEARNED, METHODS, TRAINED, Method
 from psfdae.alignment.stamps import AlignmentStamps
 from psfdae.belonging import STATE_STAMPS, require, require_origin, write_origin
 from psfdae.cli import AboveZero, File, Folder, command
-from psfdae.configuration.alignment import AlignmentConfig, CnnTrain
+from psfdae.configuration.alignment import NETWORKS, AlignmentConfig, NetworkTrain
 from psfdae.estimators import CONFIG, HISTORY, TrainingSet
 from psfdae.estimators.dae import Dae
 from psfdae.files import (
@@ -40,7 +41,7 @@ from psfdae.rng import stream
 from psfdae.stages.alignment import ModelFile, StatesFile, TestSet, read_model
 from psfdae.stages.common import limit_threads, noise_model
 
-CNN_WEIGHTS = "cnn.safetensors"
+NETWORK_WEIGHTS = "network.safetensors"
 
 VALIDATION_STATES = 100
 """States of the large set that choose the DAE's best epoch; it is not trained on them."""
@@ -48,16 +49,17 @@ VALIDATION_STATES = 100
 Checkpoint = Annotated[File, "File that lets an interrupted training resume."]
 Trained = Annotated[Folder, "Folder for weights, config and history."]
 
-DENOISED = ", ".join(name for name in CNNS if METHODS[name].denoised)
-"""CNNs that are trained on the DAE's output."""
+DENOISED = ", ".join(name for name in TRAINED if METHODS[name].denoised)
+"""Networks that are trained on the DAE's output."""
 
 CLEAN = 0.0
 """Noise level of the rows without noise."""
 
 OF_DAE = "Folder of `alignment train-dae`."
 DaeFolder = Annotated[Folder, OF_DAE]
-CnnFolders = make_dataclass(
-    "CnnFolders", [(name, Annotated[Folder, "Folder of the CNN of that name."]) for name in CNNS]
+NetworkFolders = make_dataclass(
+    "NetworkFolders",
+    [(name, Annotated[Folder, "Folder of the network of that name."]) for name in TRAINED],
 )
 
 
@@ -91,32 +93,34 @@ def train_dae(
 
 
 def _groups(kind: str = "", **_: Any) -> tuple[str, ...]:
-    """Config groups of the training of one CNN, or of all."""
-    kinds = [kind] if kind else CNNS
+    """Config groups of the training of one network, or of all."""
+    kinds = [kind] if kind else TRAINED
     noise = ["noise"] if any(METHODS[name].noisy for name in kinds) else []
     dae = ["evaluation"] if any(METHODS[name].denoised for name in kinds) else []
-    return ("seed", *noise, "cnn", *(f"train_{name}" for name in kinds), *dae)
+    return ("seed", *noise, *NETWORKS, *(f"train_{name}" for name in kinds), *dae)
 
 
-@command("alignment train-cnn", reads=_groups, root="alignment")
-def train_cnn(
+@command("alignment train-network", reads=_groups, root="alignment")
+def train_network(
     config: AlignmentConfig,
     kind: Annotated[
-        str, click.Choice(CNNS), "Clean stamps, noisy stamps, or the DAE's output for noisy stamps."
+        str,
+        click.Choice(TRAINED),
+        "Clean stamps, noisy stamps, or the DAE's output for noisy stamps.",
     ],
     states: Annotated[File, "Product of `alignment states`: the grid or the large set."],
     checkpoint: Checkpoint,
     out: Trained,
     dae: Annotated[DaeFolder | None, f"{OF_DAE} For {DENOISED} only."] = None,
 ) -> None:
-    """Train a CNN that estimates states of misalignment."""
-    from psfdae.alignment.cnn import CnnTraining, MixedNoise, TrainingStates
+    """Train a network that estimates states of misalignment."""
+    from psfdae.alignment.networks import MixedNoise, NetworkTraining, TrainingStates
     from psfdae.estimators.training import fingerprint, progress, train
     from psfdae.estimators.weights import save_weights
 
     if METHODS[kind].denoised != (dae is not None):
         raise click.UsageError(f"--dae goes with --kind {DENOISED}, and only with it")
-    settings: CnnTrain = getattr(config, f"train_{kind}")
+    settings: NetworkTrain = getattr(config, f"train_{kind}")
     product = read_product(states, "alignment_states", ("states", "stamps"))
     if dae:
         require_origin(dae, STATE_STAMPS, product)
@@ -125,21 +129,23 @@ def train_cnn(
         levels = np.asarray(config.noise.levels)
         data = replace(data, noise=MixedNoise(noise_model(config), levels, settings.weigh_noise))
     if dae and data.noise:
-        # The DAE takes most of an epoch's time, so that its noise is drawn once.
         rng = stream(config.seed, "cnn", "noise", kind)
-        noisy, weights = data.noise(data.stamps, rng, gaussian=False)
-        data = TrainingStates(data.states, denoise(dae, config, noisy), weights)
+        count = settings.noise_draws
+        drawn = [data.noise(data.stamps, rng, gaussian=False) for _ in range(count)]
+        noisy, weights = (np.concatenate(parts) for parts in zip(*drawn, strict=True))
+        stamps = denoise(dae, config, noisy)
+        data = TrainingStates(np.tile(data.states, (count, 1)), stamps, weights)
     limit_threads(settings.threads)
     fields, side = data.stamps.shape[1], data.stamps.shape[-1]
     described = {**config.model_dump(), "fields": fields, "stamp_px": side, "name": kind}
-    described["mirrors"] = settings.mirrors
+    described |= {"network": settings.network, "mirrors": settings.mirrors}
 
-    def begin(attempt: int) -> CnnTraining:
-        return CnnTraining(data, config.cnn, settings, config.seed, kind)
+    def begin(attempt: int) -> NetworkTraining:
+        return NetworkTraining(data, getattr(config, settings.network), settings, config.seed, kind)
 
     with progress(settings.epochs) as report:
         done = train(begin, checkpoint, fingerprint(described, data.stamps), report)
-    save_weights(out / CNN_WEIGHTS, done.result, described)
+    save_weights(out / NETWORK_WEIGHTS, done.result, described)
     write_origin(out, product)
     write_text(out / HISTORY, as_csv(done.history))
     write_text(out / CONFIG, as_yaml(described))
@@ -164,23 +170,29 @@ def noisy_test_states(config: Any, stamps: np.ndarray, test_set: str, level: flo
     return noise_model(config).draw(stamps, level, rng)
 
 
-def cnn_predictor(folder: Path, config: Any) -> Callable[[np.ndarray], np.ndarray]:
-    """The trained CNN of a folder, from stamps (n, F, d, d) to states (n, 4)."""
+def network_predictor(folder: Path, config: Any) -> Callable[[np.ndarray], np.ndarray]:
+    """The trained network of a folder, from stamps (n, F, d, d) to states (n, 4)."""
     import torch
 
-    from psfdae.alignment.cnn import load_cnn, predict_states
+    from psfdae.alignment.networks import load_network, predict_states
     from psfdae.alignment.telescope import mirror_symmetries
-    from psfdae.configuration.alignment import Cnn
     from psfdae.configuration.compose import validate
 
     torch.set_num_threads(config.evaluation.threads)
     path = folder / CONFIG
     described = read_yaml(path)
     fields, side = (from_tree(path, described, key, make=_size) for key in ("fields", "stamp_px"))
-    settings = from_tree(path, described, "cnn", make=lambda tree: validate(Cnn, tree))
-    model = load_cnn(settings, fields, side, folder / CNN_WEIGHTS)
+    kind = from_tree(path, described, "network", make=_kind)
+    settings = from_tree(path, described, kind, make=lambda tree: validate(NETWORKS[kind], tree))
+    model = load_network(settings, fields, side, folder / NETWORK_WEIGHTS)
     mirrors = mirror_symmetries(fields - 1) if from_tree(path, described, "mirrors") else []
     return partial(predict_states, model, batch=config.evaluation.batch, mirrors=mirrors)
+
+
+def _kind(value: Any) -> str:
+    if value not in NETWORKS:
+        raise ValueError(f"{value!r} must be one of {', '.join(NETWORKS)}")
+    return str(value)
 
 
 def _size(value: Any) -> int:
@@ -189,8 +201,8 @@ def _size(value: Any) -> int:
     return value
 
 
-def require_cnn(folder: Path, states: Product, name: str | None = None) -> None:
-    """Refuse a CNN that does not belong to states with stamps, or is not the one of a name."""
+def require_network(folder: Path, states: Product, name: str | None = None) -> None:
+    """Refuse a network that does not belong to states with stamps, or is not the one of a name."""
     _, fields, _, side = states["stamps"].shape
     said, keys = read_yaml(folder / CONFIG), ("fields", "stamp_px")
     require(folder / CONFIG, said, keys, {"fields": fields, "stamp_px": side}, states.path)
@@ -205,7 +217,7 @@ def estimate(
     test_set: TestSet,
     states: StatesFile,
     dae: DaeFolder,
-    cnns: CnnFolders,
+    networks: NetworkFolders,
     out: Annotated[File, "HDF5 product with the estimates of all learned methods."],
     times: Annotated[File, "CSV that receives the run times."],
 ) -> None:
@@ -213,10 +225,10 @@ def estimate(
     limit_threads(config.evaluation.threads)
     product = read_product(states, "alignment_states", ("states", "stamps"))
     require_origin(dae, STATE_STAMPS, product)
-    folders: dict[str, Path] = asdict(cnns)
+    folders: dict[str, Path] = asdict(networks)
     for name, folder in folders.items():
-        require_cnn(folder, product, name)
-    predict = {name: cnn_predictor(folder, config) for name, folder in folders.items()}
+        require_network(folder, product, name)
+    predict = {name: network_predictor(folder, config) for name, folder in folders.items()}
     levels = [CLEAN, *config.noise.levels]
     found = np.empty((len(levels), len(LEARNED), *product["states"].shape))
     rows = []
@@ -225,18 +237,21 @@ def estimate(
         for column, method in enumerate(LEARNED):
             started = time.perf_counter()
             stamps = denoise(dae, config, noisy) if method.denoised else noisy
-            found[row, column] = predict[method.cnn](stamps)
+            found[row, column] = predict[method.network](stamps)
             seconds = time.perf_counter() - started
             rows.append((test_set, level, method.name, seconds, len(stamps)))
-    names = ", ".join(method.name for method in LEARNED)
     columns = {
         "states": Column(product["states"], "range", "true states"),
         "levels": Column(np.array(levels), "1", "noise levels λ"),
-        "estimates": Column(found, "range", f"[λ, method, state, number]; {names}"),
+        "estimates": Column(found, "range", f"[λ, method, state, number]; {_names(LEARNED)}"),
     }
     described = {**config.model_dump(), "test_set": test_set}
     write_product(out, "alignment_estimates", columns, described)
     _write_times(times, rows)
+
+
+def _names(methods: list[Method]) -> str:
+    return ", ".join(method.name for method in methods)
 
 
 def _write_times(path: Path, rows: list[tuple[str, float, str, float, int]]) -> None:
@@ -258,7 +273,7 @@ def fit(
     level: Annotated[float, AboveZero, "Noise level λ."],
     states: StatesFile,
     model: ModelFile,
-    cnn: Annotated[Folder, "Folder of the CNN that starts the fit."],
+    network: Annotated[Folder, "Folder of the network that starts the fit."],
     out: Annotated[File, "HDF5 product with the fits."],
     times: Annotated[File, "CSV that receives the run time."],
 ) -> None:
@@ -269,32 +284,51 @@ def fit(
     product = read_product(states, "alignment_states", ("states", "stamps", "noll"))
     require(states, product.config, STATE_STAMPS, config)
     wavefronts = read_model(model, product.config, states)
-    require_cnn(cnn, product)
-    predict = cnn_predictor(cnn, config)
+    require_network(network, product)
+    predict = network_predictor(network, config)
     stamps = noisy_test_states(config, product["stamps"], test_set, level)
-    operator = AlignmentStamps(config.telescope, config.optics, config.alignment)
-    likelihood = Likelihood(wavefronts, operator, noise_model(config), level)
-    started = time.perf_counter()
-    start = predict(stamps)
-    first = fit_states(likelihood, stamps, start, config.fit)
-    # In focus, a state and its twin have nearly the same stamps.
-    found, twins = refit_twins(likelihood, stamps, first, product["noll"], config.fit)
-    seconds = time.perf_counter() - started
+    fits: dict[str, list[np.ndarray]] = defaultdict(list)
+    rows = []
+    sampled = config.optics.model_copy(
+        update={"pupil_samples": config.fit.pupil_samples, "nodes": None}
+    )
+    operator = partial(AlignmentStamps, config.telescope, alignment=config.alignment)
+    for method in FITTED:
+        rough = operator(sampled, movable=method.free, narrow=True)
+        operators = rough, operator(config.optics, movable=method.free, coarse=rough)
+        coarse, exact = (Likelihood(wavefronts, o, noise_model(config), level) for o in operators)
+        started = time.perf_counter()
+        start = predict(stamps)
+        first = fit_states(coarse, stamps, start, config.fit)
+        # In focus, a state and its twin have nearly the same stamps.
+        best, twins = refit_twins(coarse, stamps, first, product["noll"], config.fit)
+        found = fit_states(exact, stamps, best.states, config.fit)
+        seconds = time.perf_counter() - started
+        rows.append((test_set, level, method.name, seconds, len(stamps)))
+        fits["estimates"].append(found.states[:, :4])
+        fits["deviance"].append(found.deviance)
+        fits["evaluations"].append([best.evaluations, found.evaluations])
+        fits["converged"].append(found.converged)
+        fits["twin_tried"].append(twins)
+        fits["twin_won"].append(best.states[:, 0] != first.states[:, 0])
+    about = {
+        "estimates": f"[method, state, number] maximum of the likelihood; {_names(FITTED)}",
+        "deviance": "twice the log-likelihood missing to a perfect fit",
+        "evaluations": "[method, (coarse, exact), state] stamps and derivatives computed",
+        "converged": "ended by the tolerance",
+        "twin_tried": "the twin was a starting point, too",
+        "twin_won": "and the better one",
+    }
     columns = {
         "states": Column(product["states"], "range", "true states"),
-        "estimates": Column(found.states, "range", "maximum of the likelihood"),
-        "start": Column(start, "range", "estimate of the CNN"),
-        "deviance": Column(
-            found.deviance, "1", "twice the log-likelihood missing to a perfect fit"
-        ),
-        "evaluations": Column(found.evaluations, "1", "stamps and derivatives computed"),
-        "converged": Column(found.converged, "1", "ended by the tolerance"),
-        "twin_tried": Column(twins, "1", "the twin was a starting point, too"),
-        "twin_won": Column(found.states[:, 0] != first.states[:, 0], "1", "and the better one"),
+        "start": Column(start, "range", "estimate of the network"),
     }
+    for name, text in about.items():
+        unit = "range" if name == "estimates" else "1"
+        columns[name] = Column(np.array(fits[name]), unit, text)
     described = {**config.model_dump(), "test_set": test_set, "level": level}
     write_product(out, "alignment_fit", columns, described)
-    _write_times(times, [(test_set, level, "max_likelihood", seconds, len(stamps))])
+    _write_times(times, rows)
 
 
 @command("alignment bound", reads=("telescope", "alignment", "optics", "noise"), root="alignment")
@@ -312,13 +346,18 @@ def bound(
     product = read_product(states, "alignment_states", ("states",))
     require(states, product.config, STATE_STAMPS, config)
     wavefronts = read_model(model, product.config, states)
-    operator = AlignmentStamps(config.telescope, config.optics, config.alignment)
     noise, levels, truth = noise_model(config), config.noise.levels, product["states"]
-    covariances = bound_covariances(wavefronts, operator, noise, levels, truth)
+    covariances = []
+    for method in BOUNDS:
+        operator = AlignmentStamps(
+            config.telescope, config.optics, config.alignment, movable=method.free
+        )
+        covariances.append(bound_covariances(wavefronts, operator, noise, levels, truth))
+    about = f"[method, λ, state, number, number] of the bound; {_names(BOUNDS)}"
     columns = {
         "states": Column(truth, "range", "true states"),
         "levels": Column(np.array(levels), "1", "noise levels λ"),
-        "covariances": Column(covariances, "range^2", "[λ, state, number, number] of the bound"),
+        "covariances": Column(np.array(covariances), "range^2", about),
     }
     described = {**config.model_dump(), "test_set": test_set}
     write_product(out, "alignment_bound", columns, described)

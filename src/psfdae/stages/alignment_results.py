@@ -10,7 +10,14 @@ from typing import Annotated, Any
 import numpy as np
 
 from psfdae.alignment.fisher import coma_free_decentre, expected_abs_error
-from psfdae.alignment.methods import ESTIMATORS, LEARNED, METHODS, Method
+from psfdae.alignment.methods import (
+    BOUNDS,
+    ESTIMATORS,
+    FITTED,
+    LEARNED,
+    METHODS,
+    Method,
+)
 from psfdae.alignment.stamps import AlignmentStamps
 from psfdae.alignment.telescope import design_states, fit_quadratic, zernike_tracer
 from psfdae.belonging import STATE_STAMPS, require, require_origin
@@ -35,7 +42,7 @@ SHOWN_STATES = 2
 TWIN_TILT = (0.20, 0.25)
 """Tilts x, y of the state of the twin figure; its decentre cancels the constant coma."""
 
-DRAWN = [method.name for method in ESTIMATORS]
+DRAWN = [method.name for method in ESTIMATORS if not method.free]
 
 Png = Annotated[File, "PNG."]
 
@@ -55,16 +62,18 @@ def read_errors(
     for path in fits:
         product = read_product(path, "alignment_fit", ("states", "estimates"))
         key = {"test_set": product.config["test_set"], "noise_level": product.config["level"]}
-        yield {**key, "method": "max_likelihood"}, product["states"], product["estimates"]
+        for method, found in zip(FITTED, product["estimates"], strict=True):
+            yield {**key, "method": method.name}, product["states"], found
 
 
 def read_bounds(bounds: Sequence[Path]) -> Iterator[tuple[dict[str, Any], np.ndarray, np.ndarray]]:
-    """Key (test_set, noise_level), true states (n, 4) and covariances (n, 4, 4)."""
+    """Key (test_set, noise_level, method), true states (n, 4) and covariances (n, 4, 4)."""
     for path in bounds:
         product = read_product(path, "alignment_bound", ("states", "levels", "covariances"))
-        for level, covariances in zip(product["levels"], product["covariances"], strict=True):
-            key = {"test_set": product.config["test_set"], "noise_level": float(level)}
-            yield key, product["states"], covariances
+        for method, levels in zip(BOUNDS, product["covariances"], strict=True):
+            for level, covariances in zip(product["levels"], levels, strict=True):
+                key = {"test_set": product.config["test_set"], "noise_level": float(level)}
+                yield {**key, "method": method.name}, product["states"], covariances
 
 
 SAME_TEST = ("noise.kappa", "noise.background_photons", *STATE_STAMPS)
@@ -123,8 +132,9 @@ def tables(
         if key["method"] != "constant":
             found[correlation] += rows.measured_correlations(key, estimate - truth)
     for key, _, covariances in read_bounds(bounds):
-        found[errors] += rows.bound_rows({**key, "method": "cramer_rao"}, covariances, unit)
-        found[correlation] += rows.predicted_correlations(key, covariances)
+        found[errors] += rows.bound_rows(key, covariances, unit)
+        if key["method"] == "cramer_rao":
+            found[correlation] += rows.predicted_correlations(key, covariances)
     order = list(METHODS)
     for path, table in found.items():
         frame = pd.DataFrame(table).sort_values(
@@ -180,7 +190,7 @@ def time_table(
     for method in ESTIMATORS:
         seconds, states = total.loc[method.name]
         # With the trainings of all networks that the method needs.
-        trained = sum(training[name] for name in (method.cnn, "dae" * method.denoised) if name)
+        trained = sum(training[name] for name in (method.network, "dae" * method.denoised) if name)
         rows.append((method.name, seconds / states, int(states), trained))
     columns = ["method", "seconds_per_state", "states", "training_seconds"]
     write_csv(out, pd.DataFrame(rows, columns=columns), digits=4)
@@ -237,8 +247,9 @@ def errors(estimates: Estimates, fits: Fits, bounds: Bounds, out: Png) -> None:
             curves[key["noise_level"]][key["method"]] = (size_of(truth), error)
     count = 0
     for key, truth, covariances in read_bounds(bounds):
-        error, count = expected_abs_error(covariances).mean(axis=1), len(truth)
-        curves[key["noise_level"]]["cramer_rao"] = (size_of(truth), error)
+        if key["method"] == "cramer_rao":
+            error, count = expected_abs_error(covariances).mean(axis=1), len(truth)
+            curves[key["noise_level"]]["cramer_rao"] = (size_of(truth), error)
     title = f"Errors against misalignment, {count} uniform states"
     write_png(errors_against_size(curves, title), out)
 

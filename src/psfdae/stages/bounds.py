@@ -1,4 +1,4 @@
-"""Stages `bank`, `bounds` and `efficiency`: the best estimates, and ours beside them."""
+"""Stages `bank`, `bounds`, `efficiency`, `paper-rows`: the best estimates, and others beside."""
 
 from __future__ import annotations
 
@@ -11,7 +11,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 
 from psfdae.belonging import STARS, STATIC, require
-from psfdae.bounds.floor import compare, local_error, sensitivities
+from psfdae.bounds.floor import (
+    FLOOR_TOLERANCE,
+    TOLERANCE,
+    Comparison,
+    compare,
+    local_error,
+    sensitivities,
+)
 from psfdae.bounds.posterior import (
     MIRROR_MARGIN,
     TIGHT,
@@ -26,6 +33,7 @@ from psfdae.bounds.posterior import (
     posterior_sums,
     segments,
 )
+from psfdae.bounds.sampling import Sampled, StampModel, sample
 from psfdae.cli import File, command
 from psfdae.configuration.consistency import SIMULATION
 from psfdae.configuration.schema import Config
@@ -63,9 +71,13 @@ SPLIT = "random"
 
 COLUMNS = ["dataset", "split", "reference", "method", "noise_level", "metric", "value"]
 COLUMNS += ["stderr", "n", "ci_low", "ci_high", "tight"]
+COLUMNS += ["found", "draws", "ess_median", "last_change", "missed"]
 
 EFFICIENCY_COLUMNS = ["dataset", "reference", "noise_level", "method", "bound", "tight", "mse"]
 EFFICIENCY_COLUMNS += ["mse_bound", "efficiency", "difference", "stderr", "n", "verdict"]
+
+PAPER_COLUMNS = ["dataset", "method", "noise_level", "mse_paper", "mse", "mse_bound", "stderr"]
+PAPER_COLUMNS += ["tight", "paper_over_bound", "verdict"]
 
 POSTERIOR_MEANS = {"bayes": False, "bayes_position": True}
 """Bounds that are posterior means, and whether they are told the star's field."""
@@ -182,10 +194,24 @@ class Tables:
         self.growth: list[dict[str, Any]] = []
 
     def add(
-        self, reference: str, method: str, level: float, values: dict[str, np.ndarray], tight: bool
+        self,
+        reference: str,
+        method: str,
+        level: float,
+        values: dict[str, np.ndarray],
+        tight: bool,
+        found: str,
+        **reached: float,
     ) -> None:
-        """Per-star metrics of one bound and noise level; `ess` goes to the Parquet only."""
+        """Per-star metrics of one bound and noise level.
+
+        `found` says from what. Of the effective sample sizes `ess` the table has the median;
+        `reached` are its columns `draws`, `last_change` and `missed`.
+        """
         import pandas as pd
+
+        if "ess" in values:
+            reached["ess_median"] = float(np.median(values["ess"]))
 
         key = {"dataset": self.dataset, "split": SPLIT, "reference": reference, "method": method}
         key["noise_level"] = level
@@ -196,7 +222,8 @@ class Tables:
             half = NORMAL_95 * stderr
             row = {"metric": metric, "value": mean, "stderr": stderr, "n": value.size}
             row |= {"ci_low": mean - half, "ci_high": mean + half}
-            self.summary.append({**key, **row, "tight": "yes" if tight else "no"})
+            row |= {"tight": "yes" if tight else "no", "found": found}
+            self.summary.append({**key, **row, **reached})
         stars = {"star": self.stars.star, "field": self.stars.field}
         self.per_star.append(pd.DataFrame({**key, **stars, **values}))
 
@@ -230,17 +257,17 @@ def bounds(
         raise ProductError(f"{stars}: the stars have random aberrations, a bank is needed")
     else:
         _floor(config, product, tables)
-        drawn = read_product(bank, "bank", ("framed", "field_index", "peak"))
+        drawn = read_product(bank, "bank", ("framed", "field_index", "peak", "seidel"))
         require(bank, drawn.config, STARS, product.config, stars)
         sizes = (drawn.config["grid"]["points"], drawn.config["framing"]["jitter_px"])
-        sample = Bank(drawn["framed"], drawn["field_index"], drawn["peak"], *sizes)
-        count, fields = drawn.config["bounds"]["bank_stars"], sample.points**2
+        everything = Bank(drawn["framed"], drawn["field_index"], drawn["peak"], *sizes)
+        count, fields = drawn.config["bounds"]["bank_stars"], everything.points**2
         if count < fields:
             raise ProductError(
                 f"{bank}: bounds.bank_stars = {count}, must be at least {fields}, "
                 "a star for every field"
             )
-        _sampled(config, sample.take(np.arange(count)), sample, static, tables)
+        _over_bank(config, everything.take(np.arange(count)), everything, drawn, static, tables)
     write_csv(out, pd.DataFrame(tables.summary, columns=COLUMNS))
     write_csv(growth, pd.DataFrame(tables.growth, columns=GROWTH_COLUMNS))
     write_parquet(per_star, pd.concat(tables.per_star, ignore_index=True))
@@ -263,15 +290,12 @@ def collect_bounds(
 
 def _test_stars(config: Config, product: Product) -> BoundedStars:
     test = split_stars(product, SPLIT, config).test
-    first = slice(0, config.bounds.test_stars)
-    kept = test[first]
-    # The noise is drawn for all test stars, as the stage `evaluate` does, then cut.
-    images = product["realisation"][test]
+    kept = test[: config.bounds.test_stars]
     return BoundedStars(
         star=kept,
         field=product["field_index"][kept],
         truth={name: product[name][kept] for name in ("realisation", "template")},
-        noisy={lvl: noisy_test_images(config, images, lvl)[first] for lvl in config.noise.levels},
+        noisy={lvl: noisy_test_images(config, product, kept, lvl) for lvl in config.noise.levels},
     )
 
 
@@ -291,34 +315,57 @@ def _floor(config: Config, product: Product, tables: Tables) -> None:
     for level in config.noise.levels:
         variance = noise_model(config).variance(stamps, level)
         error = local_error(derivatives, spread, variance)
-        tables.add("realisation", "floor", level, {"mse": error}, tight=False)
+        tables.add("realisation", "floor", level, {"mse": error}, tight=False, found="derivatives")
 
 
-def _sampled(config: Config, bank: Bank, larger: Bank, static: np.ndarray, tables: Tables) -> None:
-    """Posterior means over a bank, and how they change with its size.
+def _over_bank(
+    config: Config,
+    bank: Bank,
+    larger: Bank,
+    drawn: Product,
+    static: np.ndarray,
+    tables: Tables,
+) -> None:
+    """Posterior means over a bank, how they change with its size, and better ones.
 
-    In a single field the larger one is needed, and in a moment weighed.
+    In a single field the larger bank is needed, and in a moment weighed. Where a bank is too
+    thin, draws around the star's own matches take its place.
     """
     for level in config.noise.levels:
+        start = time.monotonic()
         likelihood = Likelihood.of(noise_model(config), level, bank.stamps((bank.margin,) * 2))
+        thin = {}
         for method, told in POSTERIOR_MEANS.items():
-            start = time.monotonic()
-            measured, drawn = (_told_the_field, larger) if told else (_anywhere, bank)
-            sizes = measured(drawn, static, tables.stars, level, likelihood)
-            _tabulate(tables, method, level, sizes)
-            seconds = time.monotonic() - start
-            print(f"λ = {level:g}, {method}: {max(sizes)} draws, {seconds:.1f} s", flush=True)
+            measured, stars = (_told_the_field, larger) if told else (_anywhere, bank)
+            sizes = measured(stars, static, tables.stars, level, likelihood)
+            thin[method] = _tabulate(tables, method, level, sizes)
+        if any(thin.values()):
+            found = _draws(config, bank, drawn["seidel"], tables.stars, level, likelihood)
+            _replace(tables, level, found, config.bounds.star_draws, static, thin)
+        seconds = time.monotonic() - start
+        means = ", ".join(f"{m} {'/'.join(t) or 'bank'}" for m, t in thin.items())
+        print(f"λ = {level:g}, drawn around matches: {means}, {seconds:.1f} s", flush=True)
 
 
-def _tabulate(tables: Tables, method: str, level: float, sizes: dict[int, np.ndarray]) -> None:
-    """Rows of one posterior mean, whose `_errors` are given by number of draws."""
+def _tabulate(tables: Tables, method: str, level: float, sizes: dict[int, np.ndarray]) -> list[str]:
+    """Rows of one posterior mean over a bank, whose `_errors` are given by number of draws.
+
+    References for which the bank is too thin are returned, and have rows in `growth` alone.
+    """
     draws, last = np.array(list(sizes)), sizes[max(sizes)]
+    thin = []
     for i, reference in enumerate(tables.stars.truth):
         errors = np.array([values[i].mean() for values in sizes.values()])
         change = last_change(errors)
-        values = {"mse": last[i], "ess": last[-1]}
-        tables.add(reference, method, level, values, tight=change <= TIGHT)
         limit, exponent, residual = extrapolate(draws, errors)
+        if change <= TIGHT:
+            reached = {"draws": max(sizes), "last_change": change}
+            values = {"mse": last[i], "ess": last[-1]}
+            tables.add(reference, method, level, values, tight=True, found="bank", **reached)
+        else:
+            # Far from convergence the fit extrapolates to anything, down to zero.
+            thin.append(reference)
+            limit = float("nan")
         tables.growth += [
             {
                 "dataset": tables.dataset,
@@ -336,6 +383,52 @@ def _tabulate(tables: Tables, method: str, level: float, sizes: dict[int, np.nda
             }
             for count, error, values in zip(draws, errors, sizes.values(), strict=True)
         ]
+    return thin
+
+
+def _draws(
+    config: Config,
+    bank: Bank,
+    seidel: np.ndarray,
+    stars: BoundedStars,
+    level: float,
+    likelihood: Likelihood,
+) -> Sampled:
+    """Draws around the best matches of every star; each star has a random stream of its own."""
+    mean = np.array(config.wavefront.coefficients)
+    spread = config.stars.aberration_fraction * np.abs(mean)
+    field = relative_field(config.grid)
+    model = StampModel(mean, spread, field, config.telescope, config.optics, config.framing)
+    names = ("bounds", config.stars.name, f"{level:.6g}")
+    rngs = [stream(config.seed, *names, int(star)) for star in stars.star]
+    noisy, draws = stars.noisy[level], config.bounds.star_draws
+    return sample(bank, seidel, noisy, stars.field, likelihood, model, draws, rngs)
+
+
+def _replace(
+    tables: Tables,
+    level: float,
+    found: Sampled,
+    draws: int,
+    static: np.ndarray,
+    thin: dict[str, list[str]],
+) -> None:
+    """Rows of the posterior means over draws, for the references `thin` of every method."""
+    stars = tables.stars
+    helped = _errors(found.helped, static, stars)
+    for method, parts in zip(POSTERIOR_MEANS, (found.free, found.told), strict=True):
+        sizes = nested_means(parts, partial(_errors, static=static, stars=stars))
+        last = sizes[max(sizes)]
+        for i, reference in enumerate(stars.truth):
+            if reference not in thin[method]:
+                continue
+            change = last_change([values[i].mean() for values in sizes.values()])
+            # Who is told the field cannot have missed it.
+            missed = 0.0 if POSTERIOR_MEANS[method] else 1.0 - helped[i].mean() / last[i].mean()
+            values = {"mse": last[i], "ess": last[-1]}
+            reached = {"draws": draws, "last_change": change, "missed": missed}
+            tight = max(change, missed) <= TIGHT
+            tables.add(reference, method, level, values, tight, found="draws", **reached)
 
 
 def _anywhere(
@@ -404,7 +497,7 @@ def _exact(config: Config, static: np.ndarray, tables: Tables) -> None:
             values = {"mse": error}
             if not told:
                 values["p_right"] = probability[np.arange(stars.field.size), stars.field]
-            tables.add("realisation", method, level, values, tight=True)
+            tables.add("realisation", method, level, values, tight=True, found="sum")
 
 
 @command("efficiency")
@@ -423,7 +516,8 @@ def efficiency(
     compared with the floor, and so are the posterior means. An efficiency is given for the
     floor and where the posterior mean is tight; the verdict is `beaten` if a method's error
     is below such a bound by more than two standard errors of the difference and 5 % of the
-    bound, otherwise `ok`. Both are empty where a posterior mean is not tight.
+    bound (of the floor, which is no lower limit, 20 %), otherwise `ok`. Both are empty where a
+    posterior mean is not tight.
     """
     import pandas as pd
 
@@ -474,7 +568,8 @@ def _column(
                     f"but that of the bounds in {bounded_in}"
                 )
             found = compare(
-                paired["mse"].to_numpy(), paired["mse_bound"].to_numpy(), paired["field"].to_numpy()
+                *(paired[column].to_numpy() for column in ("mse", "mse_bound", "field")),
+                FLOOR_TOLERANCE if bound == "floor" else TOLERANCE,
             )
             judged = bound == "floor" or sharp
             yield {
@@ -490,3 +585,47 @@ def _column(
                 "n": len(paired),
                 "verdict": ("beaten" if found.beaten else "ok") if judged else None,
             }
+
+
+@command("paper-rows")
+def beside_the_paper(
+    bounds: Annotated[File, "CSV of the bounds of all datasets."],
+    efficiency: Annotated[File, "CSV of the stage efficiency."],
+    out: Annotated[File, "CSV: the paper's errors, ours and the least possible ones."],
+) -> None:
+    """Set the paper's errors beside the posterior mean of our scenes, reference realisation.
+
+    Ours and the bound are means over the bounded stars; `stderr` is that of the bound. The
+    paper's error is `below what this scene allows` if it is below a tight bound as in the stage
+    efficiency. A bound that is not tight is above the least possible error: an error below it
+    proves nothing.
+    """
+    from psfdae.evaluation.paper import paper_rows, published
+
+    column = ["dataset", "noise_level"]
+    paper = published("psf").query("metric == 'mse'").replace({"method": paper_rows()})
+    ours = read_table(efficiency).query("bound == 'bayes' and reference == 'realisation'")
+    limits = read_table(bounds).query(
+        "method == 'bayes' and reference == 'realisation' and metric == 'mse'"
+    )
+    table = paper[[*column, "method", "value"]].rename(columns={"value": "mse_paper"})
+    table = table.merge(ours[[*column, "method", "mse"]], on=[*column, "method"])
+    table = table.merge(
+        limits[[*column, "value", "stderr", "tight"]].rename(columns={"value": "mse_bound"}),
+        on=column,
+    )
+    found = [
+        Comparison(row.mse_paper, row.mse_bound, row.mse_paper - row.mse_bound, row.stderr)
+        for row in table.itertuples()
+    ]
+    table["paper_over_bound"] = [1 / each.efficiency for each in found]
+    table["verdict"] = list(map(_paper_verdict, found, table.tight == "yes"))
+    write_csv(out, table[PAPER_COLUMNS])
+
+
+def _paper_verdict(paper: Comparison, tight: bool) -> str:
+    if paper.difference >= 0:
+        return "above"
+    if not tight:
+        return "bound not tight"
+    return "below what this scene allows" if paper.beaten else "at the bound"

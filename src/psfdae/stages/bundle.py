@@ -13,7 +13,7 @@ from psfdae.belonging import SAME_IMAGE, SAME_STARS, STARS, require_origin
 from psfdae.cli import File, Folder, Reference, Split, command
 from psfdae.configuration.compose import as_overrides
 from psfdae.configuration.schema import Config
-from psfdae.estimators import CONFIG, Method, method
+from psfdae.estimators import CONFIG, Method, all_groups, method
 from psfdae.files import Product, ProductError
 from psfdae.own_stars import packing
 from psfdae.own_stars.bundle import (
@@ -28,10 +28,12 @@ from psfdae.own_stars.bundle import (
     write_bundle,
 )
 from psfdae.own_stars.errors import one_line
+from psfdae.own_stars.model import PsfModel
 from psfdae.own_stars.photometry import FluxModel
 from psfdae.rng import stream
 from psfdae.stages.common import (
     check_outputs,
+    field_positions,
     limit_threads,
     noise_model,
     noisy_test_images,
@@ -39,11 +41,12 @@ from psfdae.stages.common import (
     split_stars,
 )
 from psfdae.stages.evaluate import Models
+from psfdae.stages.fit import fit_apart, training_set
 
 SEEN_BY_TRAINING = ("seed", "noise", "parts")
 """Groups in which the configuration must be that of the training."""
 
-LARGEST_SHIPPED = 300_000
+LARGEST_SHIPPED = 5_000_000
 """Bytes of the bundle that comes with the package, at most."""
 
 LICENCE = "MIT"
@@ -101,20 +104,23 @@ def bundle(
     stamps = _kind_of_stamps(product)
     require_origin(place, (*STARS, *SAME_STARS, *SAME_IMAGE), product)
     fitted = kind.load(place, restored, config.evaluation)
-    arrays, said = fitted.pack(stamps["stamp_px"])
     parts = split_stars(product, trained["split"], config)
     images, references = product["realisation"], product[restored]
-    held_out = packing.HeldOutStars(images[parts.test], references[parts.test], noise_model(config))
+    where = field_positions(product)[parts.test]
+    held_out = packing.HeldOutStars(
+        images[parts.test], references[parts.test], noise_model(config), where
+    )
     model = packing.leading(FluxModel.fit(images[parts.train]), packing.COMPONENTS)
     band = config.noise.kappa * np.asarray(config.noise.levels)
+    arrays, said = fitted.pack(stamps["stamp_px"], float(band.min()))
     nodes, rng = packing.noise_nodes(band), stream(config.seed, "noise", "bundle")
     errors = packing.measure_errors(held_out, fitted, model, nodes, rng)
     reach = packing.reach(band, model.mean)
     metrics = packing.measure_levels(
         config.noise.levels,
         held_out,
-        lambda level: noisy_test_images(config, held_out.images, level),
-        fitted.estimate,
+        lambda level: noisy_test_images(config, product, parts.test, level),
+        lambda noisy, level: fitted.estimate(noisy, level, where),
         errors,
         reach["noise_equivalent_px"],
         config.evaluation.data_range,
@@ -212,26 +218,54 @@ def describe(bundle: Packed = None) -> None:
     print(description(read_bundle(bundle)))
 
 
-@command("ship")
+@command("ship", reads=(*SEEN_BY_TRAINING, *all_groups()))
 def ship(
-    bundle: Annotated[File, {"argument": True}],
+    config: Config,
+    bundle: Annotated[tuple[File, ...], "Model bundle to choose from; several times."],
+    stars: Annotated[File, "Product of the stage stars that they were trained on."],
     out: Annotated[Folder, "Folder of the package's bundles."],
 ) -> None:
-    """Make BUNDLE the one that comes with the package."""
-    packed = read_bundle(bundle)
+    """Make that bundle which errs least on validation stars the package's own.
+
+    Flux and sky of these stars are estimated, and every noise level counts alike.
+    """
+    product, errors = read_stars(stars), {}
+    for path in bundle:
+        errors[path] = _validation_error(read_bundle(path), product, config)
+        print(f"{path.name}: MSE {errors[path]:.3g} on validation stars")
+    best = min(errors, key=errors.__getitem__)
+    packed = read_bundle(best)
     low, high = WELL_COVERED
     for row in packed.info.metrics:
         if not low <= row.get("coverage68", 0.0) <= high:
             raise BundleError(
-                f"{bundle}: at noise level {row.get('noise_level', 0.0):g} error68 holds "
+                f"{best}: at noise level {row.get('noise_level', 0.0):g} error68 holds "
                 f"{row.get('coverage68', 0.0):.1%} of the errors ({low:.0%} to {high:.0%} allowed)"
             )
     info = packed.info.model_copy(update={"name": SHIPPED, "licence": LICENCE})
-    if bundle.stat().st_size > LARGEST_SHIPPED:
-        raise BundleError(f"{bundle}: {bundle.stat().st_size} bytes, at most {LARGEST_SHIPPED}")
+    if best.stat().st_size > LARGEST_SHIPPED:
+        raise BundleError(f"{best}: {best.stat().st_size} bytes, at most {LARGEST_SHIPPED}")
     shipped = out / f"{SHIPPED}{SUFFIX}"
     write_bundle(replace(packed, info=info), shipped)
     print(shipped)
+
+
+def _validation_error(bundle: Bundle, stars: Product, config: Config) -> float:
+    """Geometric mean over the noise levels of the MSE of PSFs of flux 1."""
+    kind = method(bundle.info.method)
+    data = training_set(config, kind, stars, "random", "realisation")
+    if not kind.validates:
+        apart = fit_apart(kind, data, np.arange(len(data.images)), config)
+        weights, _ = apart.pack(bundle.info.stamp_px, bundle.info.noise_min)
+        bundle = replace(bundle, weights=weights)
+    model, truth, noise = PsfModel(bundle), data.images[data.validation], noise_model(config)
+    logs = []
+    for level in data.levels:
+        rng, flux = stream(config.seed, "noise", "ship", f"{level:.6g}"), noise.flux(level)
+        stamps = rng.poisson(flux * truth + noise.background).astype(np.float32)
+        found = model.predict(stamps, gain=1.0)
+        logs.append(np.log(np.nanmean(np.square(found.psf / found.flux[:, None, None] - truth))))
+    return float(np.exp(np.mean(logs)))
 
 
 def description(packed: Bundle) -> str:
@@ -244,7 +278,7 @@ def description(packed: Bundle) -> str:
 
 def _facts(packed: Bundle) -> dict[str, str]:
     info = packed.info
-    scale = f"{info.pixel_scale_arcsec:g} arcsec"
+    scale = f"{info.pixel_scale_arcsec:g} arcsec{', assumed' if info.scale_assumed else ''}"
     if info.pixel_lambda_d is not None:
         scale += f" ({info.pixel_lambda_d:.3g} λ/D)"
     framing = f"{info.framing}, ± {info.jitter_px} px"

@@ -55,6 +55,8 @@ def scan(
             for row in rows.itertuples():
                 level = row.noise_level
                 noisy = _at_published_mse(images, row.mse, level, config)
+                ranges = config.calibration.data_ranges
+                similar = np.atleast_2d(ssim(noisy, images, *ranges))
                 table += [
                     {
                         "experiment": config.scene.experiment,
@@ -63,9 +65,9 @@ def scan(
                         "r0_m": r0,
                         "noise_level": level,
                         "data_range": data_range,
-                        "ssim": ssim(noisy, images, data_range).mean(),
+                        "ssim": values.mean(),
                     }
-                    for data_range in config.calibration.data_ranges
+                    for data_range, values in zip(ranges, similar, strict=True)
                 ]
     write_csv(out, pd.DataFrame(table))
 

@@ -70,7 +70,12 @@ def read_stars(path: Path, *references: str) -> Product:
 
 
 def field_positions(stars: Product) -> np.ndarray:
-    """Where each star stands, in steps of the field's grid, shape (n, 2)."""
+    """Where each star stands, shape (n, 2): in steps of the field's grid, or pixels of an image.
+
+    NaN where an image's list does not say it.
+    """
+    if stars.config.get("source") == "stars":
+        return read_product(stars.path, "stars", ("position",))["position"][stars["field_index"]]
     return stars["grid"][stars["field_index"]]
 
 
@@ -102,7 +107,13 @@ def noise_model(config: Any) -> NoiseModel:
     return NoiseModel(config.noise.kappa, config.noise.background_photons)
 
 
-def noisy_test_images(config: Any, images: np.ndarray, level: float) -> np.ndarray:
-    """Noisy images of the test stars at one λ; the noise depends on seed and λ only."""
-    rng = stream(config.seed, "noise", "test", f"{level:.6g}")
-    return noise_model(config).draw(images, level, rng)
+def noisy_test_images(config: Any, stars: Product, test: np.ndarray, level: float) -> np.ndarray:
+    """Noisy images of test stars, numbers `test` of a product "stars", at one λ.
+
+    The noise of a star depends on seed, set of stars, λ and star only. Datasets differ in
+    set or λ, so that their columns are independent; methods, references, bounds and splits
+    share it, so that what they make of a star is compared on one image.
+    """
+    of = stars.config.get("stars", {}).get("name", "own")
+    rng = stream(config.seed, "noise", "test", of, f"{level:.6g}")
+    return noise_model(config).draw(stars["realisation"], level, rng)[test]

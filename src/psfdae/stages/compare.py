@@ -113,7 +113,9 @@ def describe(first: Run, second: Run) -> str:
     )
 
     curves = [training_summary(run.history) for run in (first, second)]
-    errors = compare_errors(first.errors, second.errors)
+    errors = compare_errors(
+        first.errors, second.errors, {kind.name: kind.seed_scatter for kind in registered()}
+    )
     paired = same_noisy_stars(first.errors, second.errors)
     references = {run.config.get("reference", "") for run in (first, second)}
     warning = "The runs have different references: not the same question.\n\n"
@@ -127,17 +129,21 @@ def describe(first: Run, second: Run) -> str:
             _table([(key, curves[0][key], curves[1][key]) for key in curves[0]], ["", "A", "B"]),
             f"## Errors, {how}",
             ("" if len(references) == 1 else warning)
-            + f"B − A ± standard error clustered by field; {SIGNIFICANT:g} of them make B "
-            "better or worse.",
+            + f"B − A ± standard error clustered by field ± scatter between seeds; {SIGNIFICANT:g} "
+            "times both together make B better or worse.",
             _table(
                 [
-                    (*row[:5], f"{row.difference:+.3g} ± {row.stderr:.2g}", *row[7:])
+                    (*row[:5], _change(row), row.sigmas, row.verdict)
                     for row in errors.itertuples(index=False)
                 ],
                 ["metric", "method", "λ", "A", "B", "B − A", "standard errors", "B is"],
             ),
         ]
     )
+
+
+def _change(row: Any) -> str:
+    return f"{row.difference:+.3g} ± {row.stderr:.2g} ± {row.seed_stderr:.2g}"
 
 
 def _table(rows: Sequence[Sequence[Any]], headers: Sequence[str]) -> str:

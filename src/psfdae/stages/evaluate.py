@@ -1,4 +1,4 @@
-"""Stages `evaluate`, `collect` and `paper-tables`: every method on every test star, as tables."""
+"""Stages `evaluate`, `collect`, `held-out` and `paper-tables`: all methods on test stars."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from psfdae.cli import File, Folder, Reference, Split, command
 from psfdae.configuration.schema import Config
 from psfdae.estimators import ConfigError, Estimate, Method, method, registered
-from psfdae.evaluation.metrics import all_metrics, clustered_mean
+from psfdae.evaluation.metrics import all_metrics, clustered_mean, seed_stderr
 from psfdae.files import Product, ProductError, write_csv, write_parquet, write_text
 from psfdae.reading import read_table
 from psfdae.stages.common import (
@@ -69,8 +69,7 @@ def evaluate(
     key = {"dataset": dataset, "split": split, "reference": reference}
     summary, stars_table = [], []
     for level in config.noise.levels:
-        # It depends on seed and λ only: methods and references are compared on the same images.
-        noisy = noisy_test_images(config, product["realisation"][test], level)
+        noisy = noisy_test_images(config, product, test, level)
         for name, estimator in methods.items():
             metrics = measured(estimator.estimate(noisy, level, position), truth, config)
             row = {**key, "method": name, "noise_level": level}
@@ -94,11 +93,13 @@ def measured(estimate: Estimate, truth: np.ndarray, config: Config) -> dict[str,
 def summarised(
     row: dict[str, Any], metrics: dict[str, np.ndarray], field: np.ndarray
 ) -> list[dict[str, Any]]:
-    """Mean of each metric, with its standard error clustered by field."""
+    """Mean of each metric with its standard errors: of the stars, by field, and of the seed."""
     rows = []
     for metric, values in metrics.items():
         mean, stderr = clustered_mean(values, field)
-        rows.append({**row, "metric": metric, "value": mean, "stderr": stderr, "n": values.size})
+        scatter = seed_stderr(method(row["method"]).seed_scatter, metric, mean)
+        found = {"metric": metric, "value": mean, "stderr": stderr, "seed_stderr": scatter}
+        rows.append({**row, **found, "n": values.size})
     return rows
 
 
@@ -145,7 +146,7 @@ def estimators(
 
 
 COLUMNS = ["dataset", "split", "reference", "method", "noise_level", "metric"]
-COLUMNS += ["value", "stderr", "n"]
+COLUMNS += ["value", "stderr", "seed_stderr", "n"]
 
 Evaluations = Annotated[tuple[File, ...], {"argument": True}]
 Metric = Literal["mse", "ssim"]
@@ -157,19 +158,40 @@ def collect(evaluations: Evaluations, out: Annotated[File, "Tidy CSV."]) -> None
     write_csv(out, read_evaluations(evaluations))
 
 
+@command("held-out")
+def held_out(
+    per_star: Annotated[tuple[File, ...], {"argument": True}],
+    out: Annotated[File, "CSV: held-out over seen fields, on the stars that both splits test."],
+) -> None:
+    """Compare fields that a training has not seen with those that it has, star by star.
+
+    PER_STAR are the evaluations' Parquet files of both splits.
+    """
+    import pandas as pd
+
+    from psfdae.evaluation.comparison import HELD_OUT_COLUMNS, held_out_ratios
+
+    wanted = [*HELD_OUT_COLUMNS[:4], "split", "star", "field", "mse"]
+    parts = [pd.read_parquet(path, columns=wanted) for path in per_star]
+    write_csv(out, held_out_ratios(pd.concat(parts)))
+
+
 @command("paper-tables")
 def paper_tables(
     dataset: str,
-    metric: Metric,
     evaluations: Evaluations,
-    out: Annotated[File, "CSV; the Markdown goes beside it."],
+    out: Annotated[
+        tuple[tuple[Metric, File], ...], "Metric and its CSV, the Markdown beside; repeat for more."
+    ],
 ) -> None:
-    """Write one of the paper's tables, ours beside the paper's."""
+    """Write the paper's tables, ours beside the paper's."""
     from psfdae.evaluation.paper import as_markdown, paper_table
 
-    table = paper_table(read_evaluations(evaluations), dataset, metric)
-    write_csv(out, table, 6)
-    write_text(out.with_suffix(".md"), as_markdown(table, dataset, metric))
+    measured = read_evaluations(evaluations)
+    for metric, path in out:
+        table = paper_table(measured, dataset, metric)
+        write_csv(path, table, 6)
+        write_text(path.with_suffix(".md"), as_markdown(table, dataset, metric))
 
 
 def read_evaluations(evaluations: Sequence[Path]) -> pd.DataFrame:

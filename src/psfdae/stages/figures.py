@@ -160,16 +160,21 @@ def figure_curves(
 
 
 @command("figure errors")
-def figure_errors(dataset: str, metric: Metric, evaluations: Evaluations, out: Png) -> None:
-    """Draw a metric against the noise level, with the paper's points."""
+def figure_errors(
+    dataset: str,
+    evaluations: Evaluations,
+    out: Annotated[tuple[tuple[Metric, File], ...], "Metric and its PNG; repeat for more."],
+) -> None:
+    """Draw metrics against the noise level, with the paper's points."""
     from psfdae.evaluation.curves import error_against_noise
     from psfdae.evaluation.paper import published
 
     metrics = read_evaluations(evaluations)
-    if not ((metrics.dataset == dataset) & (metrics.metric == metric)).any():
-        names = ", ".join(str(path) for path in evaluations)
-        raise ProductError(f"{names}: no rows of {dataset}, {metric}")
-    write_png(error_against_noise(metrics, published("psf"), dataset, metric), out)
+    for metric, path in out:
+        if not ((metrics.dataset == dataset) & (metrics.metric == metric)).any():
+            names = ", ".join(str(path) for path in evaluations)
+            raise ProductError(f"{names}: no rows of {dataset}, {metric}")
+        write_png(error_against_noise(metrics, published("psf"), dataset, metric), path)
 
 
 def write_png(figure: Figure, out: Path) -> None:
@@ -216,8 +221,7 @@ def strip_rows(
         noise_free = product["realisation"][test][picks]
         rows.append(StripRow("star without\nnoise", noise_free, mse(noise_free, truth)))
     for level in levels:
-        # All test stars, as the stage `evaluate` draws them, then the picked ones.
-        noisy = noisy_test_images(config, product["realisation"][test], level)[picks]
+        noisy = noisy_test_images(config, product, test[picks], level)
         for kind in methods.values():
             images = kind.restore(noisy, level, position)
             label = f"{kind.label}\nλ = {level:g}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,7 +13,7 @@ import numpy as np
 
 from psfdae.cli import File, Folder, Reference, Split, command
 from psfdae.configuration.schema import Config
-from psfdae.estimators import Method, TrainingSet, groups_of, method
+from psfdae.estimators import BrightStamps, Method, TrainingSet, groups_of, method
 from psfdae.files import Product, read_product
 from psfdae.stages.common import (
     field_positions,
@@ -21,6 +22,9 @@ from psfdae.stages.common import (
     read_stars,
     split_stars,
 )
+
+INNER = 10
+"""One of so many stars chooses the settings of a fit that has not seen the validation stars."""
 
 Stars = Annotated[File, "Product of the stage stars."]
 
@@ -90,6 +94,10 @@ def training_set(
     parts = split_stars(stars, split, config)
     if stars.config.get("source") == "stars":
         more["own_noise"] = _own_noise(stars, config.noise.background_photons)
+        if kind.measures:
+            *names, _ = BrightStamps._fields
+            kept = read_product(stars.path, "stars", tuple(names))
+            more["bright"] = BrightStamps(*map(kept.__getitem__, names), stars["field_index"])
     return TrainingSet(
         images=stars["realisation"],
         references=stars["template" if kind.stored and not kind.per_reference else reference],
@@ -102,6 +110,16 @@ def training_set(
         positions=field_positions(stars),
         **more,
     )
+
+
+def fit_apart(kind: type[Method], data: TrainingSet, star: np.ndarray, config: Any) -> Method:
+    """A fit that has learnt nothing from the validation stars, for methods that else do.
+
+    Some stars of `fit` choose its settings instead; `star` says which images are of the same.
+    """
+    inner = np.isin(star[data.fit], np.unique(star[data.fit])[::INNER])
+    some = replace(data, fit=data.fit[~inner], validation=data.fit[inner])
+    return kind.fit(some, **kind.settings(config))
 
 
 def _own_noise(stars: Product, background: float) -> Callable[..., np.ndarray]:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
+import shlex
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
@@ -17,23 +18,26 @@ from psfdae.configuration.compose import as_overrides, part
 from psfdae.configuration.schema import Config, Noise
 from psfdae.estimators import Method, all_groups, groups_of, method
 from psfdae.files import Product, write_csv, write_product, write_text
+from psfdae.own_stars.advice import advice
 from psfdae.own_stars.bundle import SUFFIX
-from psfdae.own_stars.errors import ObservationError
 from psfdae.own_stars.observation import Observation, Source
 from psfdae.own_stars.photometry import noise_equivalent_px, signal_to_noise
+from psfdae.own_stars.report import MEAN_PSF, fitted_mean, standing
 from psfdae.own_stars.selection import collect
-from psfdae.own_stars.training_images import star_grid, training_columns
+from psfdae.own_stars.training_images import single_psf, star_grid, training_columns
 from psfdae.reading import read_table
 from psfdae.rng import stream
 from psfdae.stages.bundle import bundle
 from psfdae.stages.common import check_outputs
 from psfdae.stages.evaluate import READS, Models, estimators, evaluate
-from psfdae.stages.fit import fit, training_set
-from psfdae.stages.predict import Stated
+from psfdae.stages.fit import fit, fit_apart, training_set
+from psfdae.stages.mosaic import each, images_of, with_name
+from psfdae.stages.predict import Stated, write_list
+from psfdae.stages.quality import told
 from psfdae.stars.fields import held_out_fields
 
-INNER = 10
-"""Of so many stars that a method may learn from, one serves its own choices."""
+if TYPE_CHECKING:
+    import pandas as pd
 
 LOCK = ".from_stars.lock"
 
@@ -60,6 +64,10 @@ class Made:
     @property
     def stars(self) -> Path:
         return self.path / "stars.h5"
+
+    @property
+    def list(self) -> Path:
+        return self.path / "stars.csv"
 
     def fit(self, kind: type[Method]) -> Path:
         return self.path / (kind.name if kind.files else f"{kind.name}.h5")
@@ -102,16 +110,57 @@ def from_stars(
     ] = None,
     *,
     out: Annotated[Folder, "Folder for the model, its report and what they are made of."],
+    page: Annotated[
+        File | None, {"flag": "--report"}, "HTML page that shows whether to trust the model."
+    ] = None,
     overwrite: Annotated[bool, "Replace a model that the folder holds."] = False,
 ) -> None:
     """Train a model on the bright stars of IMAGE.
 
-    IMAGE is a FITS image with --catalogue, or a FITS cube of stamps. Some stars choose
+    IMAGE is a FITS image with --catalogue or --detect, or a FITS cube of stamps. Some stars choose
     the method of the model; others are held out and made faint to test it.
     """
+    job = dict(locals())
+    if not stated.all_extensions:
+        print(trained(**job))
+    else:
+        stem = name or image.name.split(".")[0]
+        jobs = {
+            extension: {
+                **job,
+                "config": config.model_dump(),
+                "stated": of_image,
+                "name": f"{stem}_{extension}",
+                "out": out / extension,
+                "page": with_name(page, extension),
+            }
+            for extension, of_image in images_of(image, stated).items()
+        }
+        each(trained, jobs, image)
+    print(f"next: {shlex.join(_next(image, stated, out, name))}")
+
+
+def trained(
+    config: Any,
+    image: Path,
+    stated: Stated,
+    name: str | None,
+    licence: str,
+    taken: str | None,
+    out: Path,
+    page: Path | None,
+    overwrite: bool,
+) -> str:
+    """Train a model on the stars of one image; how good it is, in a sentence.
+
+    `config` is what `from_stars` receives, or its tree.
+    """
+    config = part(from_stars.stage.reads, config)  # type: ignore[attr-defined]
     exposure = stated.source(image)
-    # Nothing tells a model of one's own where a star stands.
-    methods = [name for name in config.methods if not method(name).told_position]
+    # Those that are told a place on the grid of a simulation know none of an image.
+    methods = [n for n in config.methods if method(n).bundled or not method(n).told_position]
+    if taken is not None and taken not in methods:
+        methods.append(method(taken).name)
     config = config.model_copy(update={"methods": methods})
     kinds = tuple(kind for kind in map(method, methods) if kind.stored)
     files = Made(out, name or image.name.split(".")[0], kinds)
@@ -119,12 +168,24 @@ def from_stars(
     if not allowed or taken not in {None, *allowed}:
         known = ", ".join(allowed) or "none, for no method of the list makes a model"
         raise ConfigError(f"methods = {config.methods}: --method takes one of these: {known}")
-    check_outputs(files.written(), (image, exposure.catalogue, exposure.mask))
+    made = [*files.written(), *([files.list] if exposure.detect is not None else []), page]
+    check_outputs(made, exposure.files())
+    if page is not None and page.exists() and not overwrite:
+        raise FolderError(f"{page}: exists already; --overwrite replaces it")
     with _alone(out):
         finished = sorted(out.glob(f"*{SUFFIX}"))
         if finished and not overwrite:
             raise FolderError(f"{finished[0]}: a model is there already; --overwrite replaces it")
-        _make(config, exposure, files, licence, [allowed[taken]] if taken else [*allowed.values()])
+        tried = [allowed[taken]] if taken else [*allowed.values()]
+        return _make(config, exposure, files, licence, tried, page)
+
+
+def _next(image: Path, stated: Stated, out: Path, name: str | None) -> list[str]:
+    """The command that applies the models to all stars of their image."""
+    name = name or image.name.split(".")[0]
+    model = out if stated.all_extensions else Made(out, name, ()).bundle
+    where = ["--model", str(model), "--out", str(out / f"{name}_psf.fits")]
+    return ["psfdae", "predict", str(image), *stated.words(), *where]
 
 
 @contextmanager
@@ -157,20 +218,26 @@ def _alone(folder: Path) -> Iterator[None]:
 
 
 def _make(
-    config: Config, exposure: Source, files: Made, licence: str, allowed: list[type[Method]]
-) -> None:
+    config: Config,
+    exposure: Source,
+    files: Made,
+    licence: str,
+    allowed: list[type[Method]],
+    page: Path | None,
+) -> str:
+    """Make all files; how good the model is, in a sentence."""
     # The noise levels follow from the stars.
     framing, wanted = config.framing, config.calibration_stars
-    observation = exposure.open(framing.stamp_px, wanted.margin_px, larger=True)
-    if observation.pixel_scale_arcsec is None:
-        raise ObservationError(
-            exposure.path, "the pixel scale is neither in the header nor given (--pixel-scale)"
-        )
+    observation = exposure.open(framing.stamp_px, wanted.margin_px).assuming()
     found = collect(observation, wanted, framing)
+    notes = [observation.said(), *advice(found, observation, framing.stamp_px)]
+    print(*notes, sep="\n")
     grid = star_grid(found.bright.position)
     held_out = held_out_fields(grid)
     print(f"{len(found.verdict)} stars: {found.count()}")
     print(f"{int((~held_out).sum())} to learn from, {int(held_out.sum())} held out")
+    if exposure.detect is not None:
+        write_list(observation, files.list)
     write_csv(files.path / "selection.csv", found.table(held_out), digits=6)
     rng = stream(config.seed, "own stars")
     columns = training_columns(
@@ -197,7 +264,13 @@ def _make(
     own = part(bundle.stage.reads, settings)  # type: ignore[attr-defined]
     models = Models(**{taken.name: files.fit(taken)})
     bundle(own, files.stars, models, SPLIT, REFERENCE, licence=licence, out=files.bundle)
-    report(checked, files)
+    restored = tested(checked, files, taken, single_psf(found.bright, held_out), framing.jitter_px)
+    errors = report(checked, files, restored)
+    if page is not None:
+        print(f"writing {page}")
+        selection = found.table(held_out)
+        write_text(page, told(exposure, files, taken, (errors, restored, selection), notes))
+    return standing(errors, taken.name, taken.label)
 
 
 def best(settings: Any, files: Made, kinds: Iterable[type[Method]]) -> type[Method]:
@@ -214,14 +287,18 @@ def best(settings: Any, files: Made, kinds: Iterable[type[Method]]) -> type[Meth
         data = training_set(config, kind, product, SPLIT, REFERENCE)
         star, judges = product["field_index"], split_stars(product, SPLIT, config).validation
         fitted = kind.load(files.fit(kind), REFERENCE, config.evaluation)
-        if not kind.validates:  # it has learnt from these stars; others choose its settings
-            inner = np.isin(star[data.fit], np.unique(star[data.fit])[::INNER])
-            some = replace(data, fit=data.fit[~inner], validation=data.fit[inner])
-            fitted = kind.fit(some, **kind.settings(config))
+        if not kind.validates:
+            fitted = fit_apart(kind, data, star, config)
         truth, rng = product["realisation"][judges], stream(config.seed, "noise", "own stars")
         noisy = [noise_model(config).draw(truth, level, rng) for level in data.levels]
-        found = (fitted.restore(*pair) for pair in zip(noisy, data.levels, strict=True))
-        errors[kind] = float(np.mean([np.log(np.square(psf - truth).mean()) for psf in found]))
+        where = data.positions[judges]
+        free = fitted.free_flux()  # as of the stars that the model is for
+        logs = []
+        for images, level in zip(noisy, data.levels, strict=True):
+            psf = free.restore(images, level, where)
+            psf = psf / psf.sum(axis=(1, 2), keepdims=True)
+            logs.append(np.log(np.square(psf - truth).mean()))
+        errors[kind] = float(np.mean(logs))
         print(f"{kind.label}: MSE {np.exp(errors[kind]):.3g} on validation stars")
     return min(errors, key=errors.__getitem__)
 
@@ -233,7 +310,10 @@ def _described(config: Any, observation: Observation) -> dict[str, Any]:
         **kept,
         "source": "stars",
         "image": observation.path.name,
-        "telescope": {"pixel_scale_arcsec": observation.pixel_scale_arcsec},
+        "telescope": {
+            "pixel_scale_arcsec": observation.pixel_scale_arcsec,
+            **({"assumed": True} if observation.scale_assumed else {}),
+        },
     }
 
 
@@ -255,17 +335,53 @@ def _overrides(settings: dict[str, Any]) -> str:
     return "\n".join(["dataset=from_stars", *as_overrides(tree)]) + "\n"
 
 
-def report(config: Any, files: Made) -> None:
-    """Table and figure of the errors on the stars held out."""
+def tested(
+    config: Any, files: Made, kind: type[Method], mean: np.ndarray, jitter_px: int
+) -> dict[float, dict[str, np.ndarray]]:
+    """By noise level λ: stars held out, and what the model and one mean PSF make of them faint."""
+    from psfdae.stages.common import (
+        field_positions,
+        noisy_test_images,
+        read_stars,
+        split_stars,
+    )
+
+    product = read_stars(files.stars, REFERENCE)
+    test = split_stars(product, SPLIT, config).test
+    place = field_positions(product)[test]
+    fitted = kind.load(files.fit(kind), REFERENCE, config.evaluation)
+    restored = {}
+    for level in config.noise.levels:
+        noisy = noisy_test_images(config, product, test, level)
+        restored[level] = {
+            "truth": product["realisation"][test],
+            "model": fitted.estimate(noisy, level, place).psf,
+            MEAN_PSF: fitted_mean(noisy, mean, jitter_px + 1.0),
+        }
+    return restored
+
+
+def report(config: Any, files: Made, restored: dict[float, dict[str, np.ndarray]]) -> pd.DataFrame:
+    """Table and figure of the errors on the stars held out; the table."""
     import pandas as pd
 
+    from psfdae.evaluation.metrics import all_metrics, clustered_mean
     from psfdae.stages.common import read_stars, split_stars
 
     product = read_stars(files.stars, REFERENCE)
     parts = split_stars(product, SPLIT, config)
     images = product["realisation"]
     area = noise_equivalent_px(images[parts.train].mean(axis=0, dtype=np.float64))
-    rows = read_table(files.path / "evaluation.csv")
+    rows = [read_table(files.path / "evaluation.csv")]
+    star = product["field_index"][parts.test]
+    for level, found in restored.items():
+        metrics = all_metrics(found[MEAN_PSF], found["truth"], config.evaluation.data_range)
+        means = {name: clustered_mean(values, star) for name, values in metrics.items()}
+        mean = pd.DataFrame(means.values(), columns=["value", "stderr"])
+        rows.append(mean.assign(noise_level=level, method=MEAN_PSF, metric=[*means]))
+    rows = pd.concat(rows)
+    # A table keeps eight digits of a level.
+    rows["noise_level"] = [float(f"{level:.8g}") for level in rows["noise_level"]]
     wide = rows.pivot(index=["noise_level", "method"], columns="metric", values=["value", "stderr"])
     table = pd.DataFrame(
         {
@@ -278,12 +394,13 @@ def report(config: Any, files: Made) -> None:
     table.insert(0, "noise", noise)
     table.insert(0, "snr", [signal_to_noise(level, area) for level in noise])
     table["images"] = parts.test.size
-    table["stars"] = np.unique(product["field_index"][parts.test]).size
+    table["stars"] = np.unique(star).size
     table["truth_mse"] = _noise_of_truth(files.stars, parts.test, config.noise.background_photons)
-    order = {name: place for place, name in enumerate(config.methods)}
+    order = {name: place for place, name in enumerate([*config.methods, MEAN_PSF])}
     table = table.sort_values(["snr", "method"], key=lambda c: c.map(order).fillna(c))
     write_csv(files.path / "report.csv", table, digits=6)
     _draw(config, files, product, parts.test, area)
+    return table
 
 
 def _noise_of_truth(stars: Path, test: np.ndarray, sky: float) -> float:
@@ -304,21 +421,21 @@ def _draw(config: Any, files: Made, stars: Product, test: np.ndarray, area: floa
     from psfdae.evaluation.figures import StripRow, restoration_strip
     from psfdae.evaluation.metrics import mse
     from psfdae.files import read_product
-    from psfdae.stages.common import noisy_test_images
+    from psfdae.stages.common import field_positions, noisy_test_images
     from psfdae.stages.figures import write_png
 
     levels = np.asarray(config.noise.levels)
     snr = 1.0 / (config.noise.kappa * levels * np.sqrt(area))
     level = float(levels[np.abs(np.log(snr / SHOWN_SNR)).argmin()])
     images, star = stars["realisation"][test], stars["field_index"][test]
-    noisy = noisy_test_images(config, images, level)
+    noisy = noisy_test_images(config, stars, test, level)
     product = read_product(files.stars, "stars", ("position", "snr"))
     shown = _shown(star, product["position"])
     truth = images[shown]
     rows = [StripRow("bright\nstar", truth)]
     methods = estimators(config, stars, vars(files.models()), SPLIT, REFERENCE, only_drawn=True)
     for kind in methods.values():
-        stamps = kind.restore(noisy, level)[shown]
+        stamps = kind.restore(noisy, level, field_positions(stars)[test])[shown]
         rows.append(StripRow(kind.label, stamps, mse(stamps, truth), own_scale=not kind.restores))
     found = signal_to_noise(config.noise.kappa * level, area)
     columns = [f"S/N {value:.0f}" for value in product["snr"][star[shown]]]

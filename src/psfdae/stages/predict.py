@@ -5,14 +5,16 @@ from __future__ import annotations
 import itertools
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated
 
 import click
 import numpy as np
 
-from psfdae.cli import AboveZero, File, NameOrNumber, command
+from psfdae.cli import File, NameOrNumber, command
+from psfdae.files import atomic_path
+from psfdae.own_stars.bundle import SUFFIX
 from psfdae.own_stars.images import Card
 from psfdae.own_stars.model import (
     BLOCK,
@@ -26,6 +28,7 @@ from psfdae.own_stars.observation import Observation, Source
 from psfdae.own_stars.prediction import Prediction, prediction_file
 from psfdae.own_stars.stamps import Stamps, StarFlag
 from psfdae.stages.common import check_outputs
+from psfdae.stages.mosaic import each, images_of, with_name
 from psfdae.threads import in_order
 
 ROWS = 4 * BLOCK
@@ -40,23 +43,58 @@ class Stated:
     """What is said of an image beside its header."""
 
     catalogue: Annotated[File | None, "Star list of an image, FITS or CSV."] = None
-    pixel_scale: Annotated[
-        float | None, AboveZero, "Arcseconds per pixel.  [default: the WCS's]"
-    ] = None
+    detect: Annotated[bool, "Find the stars of an image; the list is written, too."] = False
+    on_image: Annotated[bool, "Leave out stars of the list that are off the image."] = False
+    threshold: Annotated[float, "Of --detect, in σ above the sky."] = 5.0
+    pixel_scale: Annotated[float | None, "Arcseconds per pixel.  [default: the WCS's]"] = None
     origin: Annotated[int | None, click.IntRange(0, 1), "Index of the first pixel's centre."] = None
     extension: Annotated[
         str | int | None, NameOrNumber(), "Name or number of the extension with the stars."
     ] = None
+    all_extensions: Annotated[
+        bool, "All images of the file, each by itself and in parallel; OUT gets their names."
+    ] = False
     mask: Annotated[
         str | int | None, NameOrNumber(), "Extension or FITS file; pixels other than 0 are bad."
     ] = None
-    gain: Annotated[float | None, AboveZero, "Electrons per count.  [default: the header's]"] = None
-    saturate: Annotated[float | None, AboveZero, "Counts of a saturated pixel."] = None
+    bad_bits: Annotated[
+        int | None, click.IntRange(min=1), "Sum of the mask's bits that are bad.  [default: all]"
+    ] = None
+    weight: Annotated[
+        str | int | None, NameOrNumber(), "Extension or FITS file with 1/variance of the pixels."
+    ] = None
+    variance: Annotated[
+        str | int | None, NameOrNumber(), "Extension or FITS file with their variance."
+    ] = None
+    gain: Annotated[float | None, "Electrons per count.  [default: the header's]"] = None
+    read_noise: Annotated[float | None, "Electrons.  [default: the header's]"] = None
+    saturate: Annotated[float | None, "Counts of a saturated pixel.  [default: the header's]"] = (
+        None
+    )
+
+    def words(self) -> list[str]:
+        """The options that state it, as they are typed."""
+        words = []
+        for option in fields(self):
+            value = getattr(self, option.name)
+            if value != option.default:
+                flag = f"--{option.name.replace('_', '-')}"
+                words += [flag] if value is True else [flag, str(value)]
+        return words
 
     def source(self, path: Path, **more: str | None) -> Source:
         """The file with all that is stated about it."""
         stated = vars(self).copy()
-        return Source(path, pixel_scale_arcsec=stated.pop("pixel_scale"), **stated, **more)
+        threshold, scale = stated.pop("threshold"), stated.pop("pixel_scale")
+        del stated["all_extensions"]
+        stated["detect"] = threshold if stated["detect"] else None
+        return Source(path, pixel_scale_arcsec=scale, **stated, **more)
+
+
+def write_list(observation: Observation, path: Path) -> None:
+    """The stars that were found, as a star list."""
+    with atomic_path(path) as temporary:
+        observation.found.table.write(temporary, format="ascii.csv", overwrite=True)
 
 
 @command("predict")
@@ -69,7 +107,14 @@ def predict(
     background_column: Annotated[
         str | None, "Sky levels per pixel; estimated where not given."
     ] = None,
-    model: Annotated[File | None, "Model bundle.  [default: the shipped one]"] = None,
+    fixed_positions: Annotated[
+        bool, "The star list's centres are exact; for models that measure centres (field)."
+    ] = False,
+    model: Annotated[
+        Path | None,
+        click.Path(path_type=Path),
+        "Model bundle, or folder of from-stars --all-extensions.  [default: the shipped one]",
+    ] = None,
     plot: Annotated[File | None, "PNG with a map of the PSF over the field."] = None,
     overwrite: Annotated[bool, "Replace files that exist."] = False,
     threads: Annotated[int | None, click.IntRange(min=1), "[default: all cores]"] = None,
@@ -79,24 +124,81 @@ def predict(
 ) -> None:
     """Predict the PSFs of the stars in INPUT.
 
-    INPUT is a FITS cube of stamps, or a FITS image with --catalogue. Stars are
-    flagged, never dropped. Files that cannot be used end with one line and exit
-    code 2.
+    INPUT is a FITS cube of stamps, or a FITS image with --catalogue or --detect.
+    Stars are flagged, never dropped. Files that cannot be used end with one line
+    and exit code 2.
     """
+    job = dict(locals())
+    if not stated.all_extensions:
+        said = restored(**job)
+        if not quiet:
+            print(said)
+        return
+    jobs = {
+        name: {
+            **job,
+            "stated": of_image,
+            "model": bundle_of(model, name),
+            "plot": with_name(plot, name),
+            "threads": 1,
+            "quiet": True,
+            "out": with_name(out, name),
+        }
+        for name, of_image in images_of(stars, stated).items()
+    }
+    each(restored, jobs, stars)
+
+
+def bundle_of(model: Path | None, name: str) -> Path | None:
+    """The bundle of an image, if the model is a folder with one for each."""
+    if model is None or not model.is_dir():
+        return model
+    found = sorted((model / name).glob(f"*{SUFFIX}"))
+    if len(found) != 1:
+        raise PredictionError(f"{model / name}: {len(found)} models, expected one")
+    return found[0]
+
+
+def restored(
+    stars: Path,
+    stated: Stated,
+    flux_column: str | None,
+    background_column: str | None,
+    fixed_positions: bool,
+    model: Path | None,
+    plot: Path | None,
+    overwrite: bool,
+    threads: int | None,
+    quiet: bool,
+    out: Path,
+) -> str:
+    """Predict the stars of one image; what there is to say of it."""
     from tqdm import tqdm
 
     source = stated.source(stars, flux_column=flux_column, background_column=background_column)
-    check_outputs((out, plot), (source.path, source.catalogue, source.mask, model))
-    _check_targets(out, plot, overwrite)
+    found = out.with_name(f"{out.stem}_stars.csv") if stated.detect else None
+    check_outputs((out, plot, found), (*source.files(), model))
+    _check_targets(out, plot, found, overwrite)
     loaded = load_model(model)
     observation = source.open(loaded.info.stamp_px, MARGIN_PX)
-    loaded.check_scale(observation.pixel_scale_arcsec, str(source.path))
+    if loaded.info.source == "stars":  # which may have been trained without knowing it, too
+        observation = observation.assuming()
+    assumed = " (scale assumed, --pixel-scale states it)" if observation.scale_assumed else ""
+    loaded.check_scale(observation.pixel_scale_arcsec, f"{source.path}{assumed}")
+    if fixed_positions and not (loaded.engine.estimator.measures and observation.shape):
+        raise PredictionError(
+            f"{source.path}: --fixed-positions takes an image with a star list, and a model of "
+            "psfdae from-stars --method field"
+        )
     if plot is not None and observation.positions is None:
         raise PredictionError(f"{source.path}: a map needs a catalogue with pixel positions")
     with tqdm(unit="star", unit_scale=True, desc="predict", disable=quiet or None) as bar:
         bar.reset(observation.count)
         try:
-            counts, clean = _predict(loaded, source, observation, out, threads, bar.update)
+            done = (loaded, source, observation, out, threads, bar.update, fixed_positions)
+            counts, clean = write_prediction(*done)
+            if found is not None:
+                write_list(observation, found)
             if plot is not None:
                 from psfdae.own_stars.plot import map_of_file
                 from psfdae.stages.figures import write_png
@@ -105,14 +207,14 @@ def predict(
         except OSError as error:
             said = error.strerror or error
             raise PredictionError(f"{out}: cannot be written ({said})") from error
-    if not quiet:
-        flagged = zip(StarFlag, counts, strict=True)
-        flags = "".join(f"\n  {flag.name}: {count}" for flag, count in flagged if count)
-        print(f"{out}: {observation.count} stars, {clean} without a flag{flags}")
+    flagged = zip(StarFlag, counts, strict=True)
+    flags = "".join(f"\n  {flag.name}: {count}" for flag, count in flagged if count)
+    clean_of = f"{out}: {observation.count} stars, {clean} without a flag{flags}"
+    return f"{observation.said()}\n{clean_of}"
 
 
-def _check_targets(out: Path, plot: Path | None, overwrite: bool) -> None:
-    for target in (out, plot):
+def _check_targets(out: Path, plot: Path | None, found: Path | None, overwrite: bool) -> None:
+    for target in (out, plot, found):
         if target is None:
             continue
         if target.is_dir():
@@ -123,28 +225,31 @@ def _check_targets(out: Path, plot: Path | None, overwrite: bool) -> None:
         raise PredictionError(f"{plot}: is the name of the FITS file, too")
 
 
-def _predict(
+def write_prediction(
     model: PsfModel,
     source: Source,
     observation: Observation,
     out: Path,
     threads: int | None,
-    tick: Callable[[int], object],
+    tick: Callable[[int], object] = lambda done: None,
+    fixed: bool = False,
 ) -> tuple[np.ndarray, int]:
     """Write the file; number of stars with each flag, and of those without any."""
-    chunks = observation.chunks(min(ROWS, 4 * model.engine.size))
+    size = model.engine.size
+    chunks = observation.chunks(max(size, min(ROWS, 4 * size)))
     first = next(chunks)
     counts = np.zeros(len(StarFlag), dtype=int)
     done = clean = 0
 
-    def restored(stamps: Stamps) -> Prediction:
-        return Prediction.joined([model.engine.block(b) for b in model.engine.blocks(stamps)])
+    def predicted(stamps: Stamps) -> Prediction:
+        blocks = model.engine.blocks(stamps)
+        return Prediction.joined([model.engine.block(block, fixed) for block in blocks])
 
     history = " ".join(["psfdae", *sys.argv[1:]])  # without the folder of the program
     header = (model.bundle, first, observation.count, _cards(source, observation), history)
     with one_thread_each(), prediction_file(out, *header) as file:
         for stamps, result in in_order(
-            restored, itertools.chain([first], chunks), threads or available_cores()
+            predicted, itertools.chain([first], chunks), threads or available_cores()
         ):
             file.write(done, stamps, result)
             counts += [(result.flags & int(flag) > 0).sum() for flag in StarFlag]
@@ -157,7 +262,10 @@ def _predict(
 def _cards(source: Source, observation: Observation) -> list[Card]:
     cards: list[Card] = [
         ("INFILE", source.path.name, "stars"),
-        ("PIXSCALE", observation.pixel_scale_arcsec, "[arcsec] width of a pixel"),
+        (
+            *("PIXSCALE", observation.pixel_scale_arcsec),
+            f"[arcsec] width of a pixel{', assumed' if observation.scale_assumed else ''}",
+        ),
     ]
     if source.catalogue is not None:
         cards.append(("CATALOG", source.catalogue.name, "star list"))

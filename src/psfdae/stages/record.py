@@ -24,7 +24,7 @@ from psfdae.source import git_commit
 if TYPE_CHECKING:
     from psfdae.configuration.schema import Config
 
-VERSIONED = ("psfdae", "numpy", "scipy", "torch", "scikit-image", "scikit-learn", "minisom")
+VERSIONED = ("psfdae", "numpy", "scipy", "torch", "scikit-learn", "minisom")
 """Packages whose versions can change a number; recorded with the run."""
 
 ON_REQUEST = "benchmarks_on_request"

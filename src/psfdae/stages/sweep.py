@@ -15,7 +15,7 @@ import click
 
 from psfdae.cli import File, Folder, Reference, Split, command
 from psfdae.configuration.compose import Root, decisive, load_stage
-from psfdae.configuration.sweep import CNNS, models, point_groups
+from psfdae.configuration.sweep import TRAINED, models, point_groups
 from psfdae.estimators import FitError
 from psfdae.files import ProductError, write_text
 from psfdae.reading import from_tree, read_json
@@ -40,7 +40,7 @@ ROLES = {"config": {"stars"}, "alignment": {"states", "validation", "test"}}
 
 def module_of(model: str) -> str:
     """Module that trains and measures a model."""
-    return f"psfdae.sweeps.{'cnn' if model in CNNS else 'method'}_point"
+    return f"psfdae.sweeps.{'network' if model in TRAINED else 'method'}_point"
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ def sweep_point(
     given = (slot is not None, search is not None, journal is not None)
     if any(given) and not all(given):
         raise click.UsageError("--slot, --search and --journal go together")
-    root: Root = "alignment" if model in CNNS else "config"
+    root: Root = "alignment" if model in TRAINED else "config"
     if {role for role, _ in data} != ROLES[root]:
         raise click.UsageError(f"--data: {model} needs {', '.join(sorted(ROLES[root]))}")
     trial = None
@@ -156,7 +156,7 @@ def point(
     Parameters
     ----------
     config : groups that a point of the model reads
-    model : method, or CNN of scene 3
+    model : method, or network of scene 3
     values : value of every axis; those of a trial are asked for here
     keys : configuration keys that differ from the dataset's
     task : Task

@@ -12,7 +12,7 @@ import numpy as np
 
 from psfdae.configuration.schema import Framing, Optics
 from psfdae.configuration.telescope import Telescope
-from psfdae.optics.propagation import StampPropagator, in_batches
+from psfdae.optics.propagation import Precision, StampPropagator, in_batches
 from psfdae.optics.pupil import (
     Pupil,
     SamplingError,
@@ -21,7 +21,10 @@ from psfdae.optics.pupil import (
     required_nodes,
     required_samples,
 )
+from psfdae.optics.seeing import BlurredPropagator
 from psfdae.optics.wavefronts import WavefrontSource
+
+Propagator = StampPropagator | BlurredPropagator
 
 
 class FramingError(ValueError):
@@ -130,8 +133,17 @@ class Propagation:
                 f"needs at least {required_nodes(pixel)} nodes"
             )
         reach = 2 * search_px + 0.5 * framing.stamp_px + framing.jitter_px + 0.5 * framing.subpixel
-        edges = np.broadcast_to([-reach * pixel, reach * pixel], (2, 2))
-        needed = required_samples(source.slopes(), edges)
+        edge = reach * pixel
+        self._blur = getattr(telescope, "blur", None)
+        if self._blur is not None:
+            edge += self._blur.reach
+            if edge > optics.pupil_samples[-1]:
+                raise SamplingError(
+                    f"telescope.seeing.fwhm_arcsec = {telescope.seeing.fwhm_arcsec:g}: its wings "
+                    f"around the stamps need N ≥ {edge:.0f} pupil samples; "
+                    f"optics.pupil_samples = {optics.pupil_samples}"
+                )
+        needed = required_samples(source.slopes(), np.broadcast_to([-edge, edge], (2, 2)))
         self.samples = choose_samples(needed, tuple(optics.pupil_samples))
         self._pupils: dict[int, Pupil] = {}
 
@@ -258,7 +270,7 @@ class Propagation:
         phase_px: np.ndarray,
         pupil: Pupil,
         image: np.ndarray,
-        exact: StampPropagator,
+        exact: Propagator,
     ) -> np.ndarray:
         """Brightest pixel of every search image; exact values where several compete."""
         half = image.shape[-1] // 2
@@ -287,15 +299,11 @@ class Propagation:
         threads = 1 if self.optics.backend == "torch" else self.optics.threads
         in_batches(self.samples[stars], self.optics.batch, threads, prepare)
 
-    def _kernel(self, pupil: Pupil, stamp_px: int, precision: str) -> StampPropagator:
-        return StampPropagator(
-            pupil,
-            stamp_px,
-            self.telescope.pixel,
-            self.optics.nodes,
-            precision,  # type: ignore[arg-type]
-            self.optics.backend,
-        )
+    def _kernel(self, pupil: Pupil, stamp_px: int, precision: Precision) -> Propagator:
+        common = (pupil, stamp_px, self.telescope.pixel)
+        if self._blur is not None:
+            return BlurredPropagator(*common, self._blur, precision)
+        return StampPropagator(*common, self.optics.nodes, precision, self.optics.backend)
 
 
 def _touches(peaks: np.ndarray, reach: int) -> np.ndarray:

@@ -149,8 +149,8 @@ def measure_images(
 ) -> dict[str, float]:
     """Measure a model on validation and test stars, and write both tables.
 
-    The noise of a part depends on seed and λ only, so all points of a sweep see the
-    same noisy images; that of the test part is the main workflow's.
+    The noise of a part is the same for all points of a sweep; that of the test part is
+    the main workflow's.
 
     Parameters
     ----------
@@ -176,7 +176,7 @@ def measure_images(
         return noise.draw(images, level, rng)
 
     def noisy_test(images: np.ndarray, level: float) -> np.ndarray:
-        return noisy_test_images(config, images, level)
+        return noisy_test_images(config, product, parts.test, level)
 
     metrics: dict[str, float] = {}
     for part, stars, noisy, model, name in (

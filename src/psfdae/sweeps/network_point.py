@@ -1,4 +1,4 @@
-"""A point of a sweep over the CNNs of scene 3."""
+"""A point of a sweep over the networks of scene 3."""
 
 from __future__ import annotations
 
@@ -12,7 +12,12 @@ from psfdae.estimators import CONFIG, HISTORY
 from psfdae.evaluation.alignment_tables import error_rows
 from psfdae.files import read_product, write_csv
 from psfdae.reading import read_table, read_yaml
-from psfdae.stages.alignment_methods import CNN_WEIGHTS, cnn_predictor, noisy_test_states, train_cnn
+from psfdae.stages.alignment_methods import (
+    NETWORK_WEIGHTS,
+    network_predictor,
+    noisy_test_states,
+    train_network,
+)
 from psfdae.stages.common import limit_threads
 from psfdae.sweeps.measured import (
     EVALUATION,
@@ -28,17 +33,17 @@ TEST_SET = "uniform"
 
 def files_of(name: str) -> tuple[str, ...]:
     """Names of the files of a point's training."""
-    return (CNN_WEIGHTS, CONFIG, HISTORY)
+    return (NETWORK_WEIGHTS, CONFIG, HISTORY)
 
 
 def run(config: Any, task: Task, name: str) -> Measured:
-    """Train as the stage of the same CNN does, and measure.
+    """Train as the stage of the same network does, and measure.
 
     Parameters
     ----------
-    config : stage config (seed, noise, cnn, train_<CNN>, evaluation)
+    config : stage config (seed, noise, cnn, perceptron, train_<name>, evaluation)
     task : Task
-    name : of the CNN, original or noise_trained
+    name : of the network, original or noise_trained
 
     Raises TrainingError if the training cannot go on, and ProductError if the products
     are of different telescopes or stamps.
@@ -49,8 +54,8 @@ def run(config: Any, task: Task, name: str) -> Measured:
     for role in ("validation", "test"):
         product = read_product(task.data[role], "alignment_states", ())
         require(product.path, product.config, STATE_STAMPS, trained_on.config, trained_on.path)
-    settings = part(train_cnn.stage.reads(name), config, "alignment")  # type: ignore[attr-defined]
-    train_cnn(settings, name, task.data["states"], task.checkpoint, task.folder)
+    settings = part(train_network.stage.reads(name), config, "alignment")  # type: ignore[attr-defined]
+    train_network(settings, name, task.data["states"], task.checkpoint, task.folder)
     limit_threads(config.evaluation.threads)
     metrics: dict[str, float] = {}
     for role, file in (("validation", VALIDATION), ("test", EVALUATION)):
@@ -69,9 +74,9 @@ def run(config: Any, task: Task, name: str) -> Measured:
 
 
 def _rows(config: Any, task: Task, role: str) -> list[dict[str, Any]]:
-    """Rows of the table of errors as the main workflow makes them, of one CNN."""
+    """Rows of the table of errors as the main workflow makes them, of one network."""
     product = read_product(task.data[role], "alignment_states", ("states", "stamps", "unit"))
-    predict = cnn_predictor(task.folder, config)
+    predict = network_predictor(task.folder, config)
     test_set = TEST_SET if role == "test" else role
     rows = []
     for level in task.levels:

@@ -1,0 +1,343 @@
+"""The PSF as a function of the place in the field, from the bright stars of an image.
+
+What a detector shows of a star whose centre lies at u from a pixel is f(u; x, y), pixel
+included (Anderson & King 2000, PASP 112, 1360). Here f is a sum of cubic B-splines in u,
+of knots finer than a pixel, whose coefficients are polynomials in the position (x, y).
+Stars lie at all phases of the pixel grid, hence f is known between the pixels. Weighted
+least squares by conjugate gradients alternate with the flux and the centre of every star
+(Gauss-Newton); stars that are unlike the others do not count. How far the polynomial goes
+is what stars that were left out are predicted best with.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+ROUNDS = 3  # of splines, centres and fluxes; with more, centres follow what splines cannot
+CENTRES = 2  # Gauss-Newton steps of a round
+WINDOW = 1.2  # px, σ of the window of the first centroids
+FARTHEST = 1.5  # px of a centre from the brightest pixel
+STEP = 0.3  # px of a Gauss-Newton step, at most
+SLOPE = 0.02  # px, for differences
+MODEL_ERROR = 0.02  # of a pixel's light, which no polynomial follows
+LEAST = 1e-4  # of the flux: error of any pixel
+HIGHER = 10.0  # as much smoother are the terms beyond the constant
+RIDGE = 10.0  # 1/flux²
+UNLIKE = 8.0  # times the median χ², from which a star does not count
+FOLDS = 5
+TOLERANCE, ITERATIONS = 1e-4, 150  # of the conjugate gradients
+JUDGED = 5  # Gauss-Newton steps for a star that was left out
+
+
+class Frames(NamedTuple):
+    """Bright stars, each with its brightest pixel at index (s//2, s//2).
+
+    Attributes
+    ----------
+    images : ndarray, shape (n, s, s)
+        Sky-subtracted, of flux about 1; 0 where not seen.
+    seen : ndarray of bool, shape (n, s, s)
+    noise : ndarray, shape (n,)
+        RMS of the sky in a pixel over the flux.
+    photons : ndarray, shape (n,)
+        Flux in photons.
+    position : ndarray, shape (n, 2)
+        Any unit; NaN where unknown.
+    """
+
+    images: np.ndarray
+    seen: np.ndarray
+    noise: np.ndarray
+    photons: np.ndarray
+    position: np.ndarray
+
+    def of(self, chosen: np.ndarray) -> Frames:
+        """Some of them."""
+        return Frames(*(array[chosen] for array in self))
+
+
+@dataclass(frozen=True)
+class FieldModel:
+    """A PSF at every place of a field.
+
+    Attributes
+    ----------
+    coefficients : ndarray, shape (K, N, N)
+        Of the splines, for each of the K terms of the polynomial.
+    low, high : ndarray, shape (2,)
+        Range of the positions; beyond it the PSF is that of its edge.
+    spacing : float
+        Of the knots, in pixels.
+    """
+
+    coefficients: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    spacing: float
+
+    @property
+    def order(self) -> int:
+        """Of the polynomial, which has (order + 1)(order + 2)/2 terms."""
+        return round((8 * len(self.coefficients) + 1) ** 0.5 - 3) // 2
+
+    def terms(self, position: np.ndarray) -> np.ndarray:
+        """Terms of the polynomial at positions (n, 2), shape (n, K); NaN where unknown."""
+        return _terms(position, self.low, self.high, self.order)
+
+    def images(
+        self, terms: np.ndarray, centre: np.ndarray, side: int, oversampling: int = 1
+    ) -> np.ndarray:
+        """The field with the star `centre` (n, 2) (row, column) px off the middle, (n, m, m).
+
+        Pixels are every 1/oversampling, that at m//2 = oversampling · (side//2) is the middle;
+        m is side, and one more if oversampled, so that both edges are there. Values are
+        those of whole pixels.
+        """
+        count = side if oversampling == 1 else oversampling * side + 1
+        axis = (np.arange(count) - oversampling * (side // 2)) / oversampling
+        splines = np.tensordot(terms, self.coefficients, 1)
+        return _drawn(splines, axis, centre, self.spacing)
+
+
+class FieldFit(NamedTuple):
+    """A model, and what it makes of the stars that it was fitted to."""
+
+    model: FieldModel
+    flux: np.ndarray  # (n,), in units of the images'
+    centre: np.ndarray  # (n, 2), (row, column) from index s//2
+    good: np.ndarray  # (n,) of bool
+    residual: np.ndarray  # (n, s, s), of flux 1; 0 where not seen
+
+
+def fit_field(
+    stars: Frames,
+    orders: Sequence[int],
+    stamp_px: int,
+    spacing: float,
+    smoothness: float,
+) -> FieldFit:
+    """Fit orders of the polynomial, ascending, until the next is no better, and take the best.
+
+    Parameters
+    ----------
+    stars : Frames
+        Only order 0 is fitted if a position is not known.
+    orders : sequence of int
+    stamp_px : int
+        Side of the stamps in which stars have flux 1, and in which they are predicted.
+    spacing : float
+        Of the knots, in pixels.
+    smoothness : float
+        Weight of the squared second differences of the coefficients, 1/flux².
+    """
+    known = np.isfinite(stars.position).all()
+    alternating = _Alternating(stars, stamp_px, spacing, smoothness)
+    best, least = None, np.inf
+    for order in sorted(orders) if known else [0]:
+        fit = alternating.fit(order)
+        if len(orders) == 1:
+            return fit
+        error = alternating.crossed_error(fit)
+        if error >= least:
+            break
+        best, least = fit, error
+    assert best is not None
+    return best
+
+
+class _Alternating:
+    """Rounds of a fit to stars."""
+
+    def __init__(self, stars: Frames, stamp_px: int, spacing: float, smoothness: float) -> None:
+        self.stars, self.stamp_px = stars, stamp_px
+        self.spacing, self.smoothness = spacing, smoothness
+        side = stars.images.shape[-1]
+        self.axis = np.arange(side) - side // 2.0
+        self.knots = int((side + 1) / spacing) - 1
+        known = stars.position[np.isfinite(stars.position).all(axis=1)]
+        known = known if len(known) else np.zeros((1, 2))
+        self.low, self.high = known.min(axis=0), known.max(axis=0)
+        bend = np.diff(np.eye(self.knots), 2, axis=0)
+        self.bend = bend.T @ bend
+
+    def fit(self, order: int) -> FieldFit:
+        """All stars."""
+        stars = self.stars
+        terms = _terms(stars.position, self.low, self.high, order)
+        good, flux = np.ones(len(terms), bool), stars.images.sum(axis=(1, 2))
+        centre = _centroids(stars.images, self.axis)
+        found = None
+        for turn in range(ROUNDS):
+            data = stars.images / flux[:, None, None]
+            weight = self._weight(flux)
+            found = self._splines(terms, data, weight * good[:, None, None], centre, found)
+            splines = np.tensordot(terms, found, 1)
+            factor, centre, _ = _adjusted(
+                splines, data, weight, centre, self.axis, self.spacing, CENTRES
+            )
+            middle = found[:1] if order == 0 else np.tensordot(terms.mean(axis=0)[None], found, 1)
+            sides = np.arange(self.stamp_px) - self.stamp_px // 2.0
+            total = float(_drawn(middle, sides, np.zeros((1, 2)), self.spacing).sum())
+            found, flux = found / total, flux * factor * total
+            model = np.tensordot(terms, found, 1)
+            drawn = _drawn(model, self.axis, centre, self.spacing)
+            residual = np.where(stars.seen, stars.images / flux[:, None, None] - drawn, 0.0)
+            chi2 = (residual**2 * weight).mean(axis=(1, 2))
+            if turn:
+                good = chi2 < UNLIKE * np.median(chi2)
+        model = FieldModel(found, self.low, self.high, self.spacing)
+        return FieldFit(model, flux, centre, good, residual)
+
+    def crossed_error(self, fit: FieldFit) -> float:
+        """Geometric mean of the squared errors of stars that were left out, fold by fold.
+
+        Flux, sky and centre of these are fitted to them.
+        """
+        stars, terms = self.stars, fit.model.terms(self.stars.position)
+        data = stars.images / fit.flux[:, None, None]
+        weight = self._weight(fit.flux)
+        fold, errors = np.arange(len(terms)) % FOLDS, []
+        inner = np.abs(self.axis + 0.5) < self.stamp_px / 2
+        box = np.ix_(range(len(terms)), inner, inner)
+        for left_out in range(FOLDS):
+            used = weight * ((fold != left_out) & fit.good)[:, None, None]
+            found = self._splines(terms, data, used, fit.centre, None)
+            judged = np.flatnonzero((fold == left_out) & fit.good)
+            images, even = data[box][judged], stars.seen[box][judged].astype(float)
+            splines = np.tensordot(terms[judged], found, 1)
+            _, _, left = _adjusted(
+                *(splines, images, even, fit.centre[judged]),
+                *(self.axis[inner], self.spacing, JUDGED),
+                sky=True,
+            )
+            errors.append(np.log((left**2 * even).sum(axis=(1, 2)) / even.sum(axis=(1, 2))))
+        return float(np.exp(np.concatenate(errors).mean()))
+
+    def _weight(self, flux: np.ndarray) -> np.ndarray:
+        """1/variance of the pixels of flux 1; 0 where not seen."""
+        stars, factor = self.stars, 1.0 / flux[:, None, None]
+        light = np.maximum(stars.images * factor, 0.0)
+        noise, photons = (a[:, None, None] for a in (stars.noise, stars.photons))
+        variance = (noise * factor) ** 2 + light * factor / photons
+        return np.where(stars.seen, 1.0 / (variance + (MODEL_ERROR * light) ** 2 + LEAST**2), 0.0)
+
+    def _splines(
+        self,
+        terms: np.ndarray,
+        data: np.ndarray,
+        weight: np.ndarray,
+        centre: np.ndarray,
+        start: np.ndarray | None,
+    ) -> np.ndarray:
+        """Coefficients (K, N, N) of weighted least squares at given centres."""
+        from scipy.sparse.linalg import LinearOperator, cg
+
+        used = weight.any(axis=(1, 2))
+        terms, data, weight, centre = terms[used], data[used], weight[used], centre[used]
+        shape = (terms.shape[1], self.knots, self.knots)
+        rows, columns = (
+            _splines_at(self.axis[None] - centre[:, i, None], self.knots, self.spacing)
+            for i in (0, 1)
+        )
+        rows_t, columns_t = rows.transpose(0, 2, 1), columns.transpose(0, 2, 1)
+        penalty = np.full(shape[0], HIGHER * self.smoothness)
+        penalty[0] = self.smoothness
+        penalty = penalty[:, None, None]
+
+        def normal(flat: np.ndarray) -> np.ndarray:
+            c = flat.reshape(shape)
+            image = rows @ (terms @ c.reshape(shape[0], -1)).reshape(-1, *shape[1:]) @ columns_t
+            back = (rows_t @ (weight * image) @ columns).reshape(len(terms), -1)
+            smooth = penalty * (self.bend @ c + c @ self.bend) + RIDGE * c
+            return ((terms.T @ back).reshape(shape) + smooth).ravel()
+
+        wanted = (rows_t @ (weight * data) @ columns).reshape(len(terms), -1)
+        diagonal = (rows_t**2 @ weight @ columns**2).reshape(len(terms), -1)
+        diagonal = ((terms**2).T @ diagonal).reshape(shape) + 6 * penalty + RIDGE
+        size = (diagonal.size,) * 2
+        found, _ = cg(
+            LinearOperator(size, matvec=normal, dtype=float),
+            (terms.T @ wanted).ravel(),
+            None if start is None else start.ravel(),
+            rtol=TOLERANCE,
+            maxiter=ITERATIONS,
+            M=LinearOperator(size, matvec=lambda v: v / diagonal.ravel(), dtype=float),
+        )
+        return np.asarray(found).reshape(shape)
+
+
+def _terms(position: np.ndarray, low: np.ndarray, high: np.ndarray, order: int) -> np.ndarray:
+    """Monomials x^a y^b, a + b ≤ order, of positions scaled to ±1, shape (n, K)."""
+    if order == 0:
+        return np.ones((len(position), 1))
+    width = np.where(high > low, high - low, 1.0)
+    x, y = np.clip(2.0 * (position - low) / width - 1.0, -1.0, 1.0).T
+    powers = [(a, total - a) for total in range(order + 1) for a in range(total, -1, -1)]
+    return np.stack([x**a * y**b for a, b in powers], axis=1)
+
+
+def _splines_at(place: np.ndarray, knots: int, spacing: float) -> np.ndarray:
+    """Cubic B-splines about `knots` equidistant places around 0 at `place` (…), (…, knots)."""
+    middle = (np.arange(knots) - (knots - 1) / 2) * spacing
+    t = np.abs(place[..., None] - middle) / spacing
+    return np.where(t < 1, 2 / 3 - t**2 + t**3 / 2, np.maximum(2 - t, 0.0) ** 3 / 6)
+
+
+def _drawn(splines: np.ndarray, axis: np.ndarray, centre: np.ndarray, spacing: float) -> np.ndarray:
+    """Images (n, m, m) on an axis (m,) of coefficients (n, N, N), moved to centres (n, 2)."""
+    rows, columns = (
+        _splines_at(axis[None] - centre[:, i, None], splines.shape[-1], spacing) for i in (0, 1)
+    )
+    return np.asarray(rows @ splines @ columns.transpose(0, 2, 1))
+
+
+def slopes(draw: Callable[[np.ndarray], np.ndarray], centre: np.ndarray) -> list[np.ndarray]:
+    """Change of drawn images with the row and the column of their centre (n, 2), per pixel."""
+    steps = SLOPE * np.eye(2)
+    return [(draw(centre + e) - draw(centre - e)) / (2 * SLOPE) for e in steps]
+
+
+def _adjusted(
+    splines: np.ndarray,
+    data: np.ndarray,
+    weight: np.ndarray,
+    centre: np.ndarray,
+    axis: np.ndarray,
+    spacing: float,
+    steps: int,
+    sky: bool = False,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Flux, centre (n, 2) and, if asked for, sky of stars, and residuals over the flux."""
+
+    def draw(place: np.ndarray) -> np.ndarray:
+        return _drawn(splines, axis, place, spacing)
+
+    count, flat = len(data), data.reshape(len(data), -1, 1)
+    for _ in range(steps):
+        parts = [draw(centre), *slopes(draw, centre)]
+        parts += [np.ones_like(data)] * sky
+        design = np.stack(parts, axis=-1).reshape(count, -1, len(parts))
+        left = (design * weight.reshape(count, -1, 1)).transpose(0, 2, 1)
+        found = np.linalg.solve(left @ design, left @ flat)[..., 0]
+        flux = found[:, 0]
+        move = np.clip(found[:, 1:3] / flux[:, None], -STEP, STEP)
+        centre = np.clip(centre + move, -FARTHEST, FARTHEST)
+    level = found[:, 3, None, None] if sky else 0.0
+    return flux, centre, (data - level) / flux[:, None, None] - draw(centre)
+
+
+def _centroids(images: np.ndarray, axis: np.ndarray) -> np.ndarray:
+    """Centroids under a Gaussian window that follows the star, shape (n, 2)."""
+    centre = np.zeros((len(images), 2))
+    for _ in range(4):
+        rows, columns = (axis[None] - centre[:, i, None] for i in (0, 1))
+        window = [np.exp(-0.5 * (a / WINDOW) ** 2) for a in (rows, columns)]
+        light = window[0][:, :, None] * window[1][:, None, :] * images
+        total = light.sum(axis=(1, 2))
+        moments = [np.einsum("nij,ni->n", light, rows), np.einsum("nij,nj->n", light, columns)]
+        centre = np.clip(centre + 2 * np.stack(moments, axis=1) / total[:, None], -1.0, 1.0)
+    return centre

@@ -1,0 +1,150 @@
+"""Importance sampling of single stars against the posterior mean over a fine grid."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from psfdae.bounds import sampling
+from psfdae.bounds.posterior import Likelihood, jitters, merge
+from psfdae.bounds.sampling import Modes, StampModel, climb, sampled_sums, twins
+from psfdae.optics.wavefronts import seidel_wavefronts
+from psfdae.rng import stream
+from psfdae.stars.framing import Propagation, crop_jittered, normalise_flux
+
+LEVEL = 3e-3
+FIELDS = np.array([[0.4, 0.2], [0.416, 0.208], [-0.4, 0.6]])
+OPEN = (1, 2)
+"""Coefficients that vary: coma and astigmatism."""
+
+GRID = np.linspace(-3.6, 3.6, 25)
+
+
+@pytest.fixture(scope="module")
+def model(scene1):
+    mean = np.array(scene1.wavefront.coefficients)
+    spread = np.where(np.isin(np.arange(5), OPEN), 0.04 * np.abs(mean), 0.0)
+    return StampModel(mean, spread, FIELDS, scene1.telescope, scene1.optics, scene1.framing)
+
+
+def simulated(model, z, field):
+    """Stamps at all jitters and brightest pixels, framed by the simulator itself."""
+    source = seidel_wavefronts(model.mean + model.sd * z, model.field[field])
+    propagation = Propagation(source, model.telescope, model.optics, model.framing, 24)
+    framed, peak = propagation.framed(model.framing.stamp_px + 2)
+    cuts = [crop_jittered(framed, np.array(jitter), 1) for jitter in jitters(1)]
+    return np.stack([normalise_flux(cut)[0] for cut in cuts], axis=1), peak
+
+
+@pytest.fixture(scope="module")
+def stars(model, noise):
+    """Four stars of the first field: truth, noisy images and where their stamps are centred."""
+    z = np.zeros((4, 5))
+    z[:, OPEN] = np.random.default_rng(1).standard_normal((4, 2))
+    images, peak = simulated(model, z, np.zeros(4, int))
+    jitter = np.array([0, 4, 5, 8])
+    truth = images[np.arange(4), jitter]
+    noisy = noise.draw(truth, LEVEL, np.random.default_rng(2))
+    return z, truth, noisy, peak - np.array(jitters(1))[jitter]
+
+
+@pytest.fixture(scope="module")
+def exact(model, stars, noise):
+    """Posterior mean and probability of field and jitter, summed over a grid."""
+    z = np.zeros((GRID.size**2, 5))
+    z[:, OPEN] = np.stack(np.meshgrid(GRID, GRID), axis=-1).reshape(-1, 2)
+    field = np.repeat(np.arange(len(FIELDS)), len(z))
+    z = np.tile(z, (len(FIELDS), 1))
+    images, _ = simulated(model, z, field)
+    images = images.reshape(len(z) * 9, -1)
+    likelihood = Likelihood.of(noise, LEVEL, stars[1])
+    ratio, offset = likelihood.factors(images)
+    scores = likelihood.residuals(stars[2]) @ ratio.T + offset
+    scores -= 0.5 * np.repeat((z**2).sum(axis=1), 9)
+    weight = np.exp(scores - scores.max(axis=1, keepdims=True))
+    weight /= weight.sum(axis=1, keepdims=True)
+    share = weight.reshape(4, len(FIELDS), -1, 9).sum(axis=2)
+    own = np.where(np.repeat(field, 9) == 0, weight, 0.0)
+    return weight @ images, share, own @ images / own.sum(axis=1, keepdims=True)
+
+
+@pytest.fixture(scope="module")
+def modes(model, stars, noise):
+    """Modes found from one start in the right field, at no aberration."""
+    count, eye = 4, np.tile(np.eye(5), (4, 1, 1))
+    start = Modes(
+        *(np.arange(count), np.zeros(count, int), stars[3], np.ones(count, bool)),
+        *(np.zeros((count, 5)), eye, np.zeros(count)),
+    )
+    likelihood = Likelihood.of(noise, LEVEL, stars[1])
+    counts = likelihood.counts(stars[2])
+    found = climb(start, counts, likelihood, model)
+    return climb(found + twins(found, likelihood, model), counts, likelihood, model)
+
+
+def sampled(model, modes, stars, noise, draws=2000):
+    likelihood = Likelihood.of(noise, LEVEL, stars[1])
+    rngs = [stream(1, "test", star) for star in range(4)]
+    rounds = [draws // 4, draws // 4, draws // 2]
+    return sampled_sums(modes, stars[2], np.zeros(4, int), likelihood, model, rounds, rngs)
+
+
+def test_draws_have_the_posterior_mean_of_the_grid(model, modes, stars, noise, exact):
+    found = sampled(model, modes, stars, noise)
+    mean, share, told = exact
+    free = merge(found.free)
+    error = ((mean - stars[1].reshape(4, -1)) ** 2).mean()
+    assert ((free.mean_image - mean) ** 2).mean() < 0.01 * error
+    assert ((merge(found.told).mean_image - told) ** 2).mean() < 0.01 * error
+    assert free.share / free.total[:, None, None] == pytest.approx(share, abs=0.03)
+    # Fields in one direction can give nearly the same image.
+    assert (share[:, 1].sum(axis=1) > 0.01).any()
+    assert (merge(found.told).share[:, 1:] == 0).all()
+    assert found.helped.mean_image == pytest.approx(free.mean_image, abs=1e-12)
+
+
+def test_effective_size_is_that_of_the_weights(model, modes, stars, noise):
+    found = sampled(model, modes, stars, noise, 400)
+    whole = merge(found.free).effective_size
+    assert (whole > 100).all()
+    assert (whole < 400 + len(modes.star) * 3).all()
+    parts = np.mean([part.effective_size for part in found.free], axis=0)
+    assert whole / parts == pytest.approx(np.full(4, len(found.free)), rel=0.4)
+
+
+def test_same_streams_give_the_same_bytes_in_any_blocks(model, modes, stars, noise, monkeypatch):
+    one, two = (sampled(model, modes, stars, noise, 80).helped for _ in range(2))
+    assert one.image.tobytes() == two.image.tobytes()
+    monkeypatch.setattr(sampling, "BLOCK", 1)
+    single = sampled(model, modes, stars, noise, 80).helped
+    assert single.mean_image == pytest.approx(one.mean_image, abs=1e-6)
+
+
+def test_stamps_are_those_of_the_simulator(model, stars):
+    z, truth, _, offset = stars
+    assert model.stamps(z, np.zeros(4, int), offset) == pytest.approx(truth, abs=1e-4)
+    assert ((model.stamps(z, np.zeros(4, int), offset) - truth) ** 2).mean() < 1e-9
+
+
+def test_twins_give_the_same_image(model, noise):
+    """Twice as far from the axis: half the coma, a quarter of the astigmatism."""
+    field = np.array([[0.4, 0.2], [0.8, 0.4], [-0.4, 0.6]])
+    wide = replace(model, mean=np.zeros(5), sd=np.ones(5), field=field)
+    near = np.array([[0.0, 0.8, 0.4, 0.8, 0.0]])
+    far = near / [1, 2, 4, 4, 8]
+    middle = np.array([[1, 2]])
+    images = [wide.stamps(z, np.array([k]), middle) for k, z in enumerate((near, far))]
+    assert images[1] == pytest.approx(images[0], abs=1e-5)
+    odd = near * [-1, 1, -1, -1, 1]  # the even part negated
+    assert wide.stamps(odd, np.array([0]), middle) == pytest.approx(images[0], abs=1e-5)
+    start = Modes(
+        *(np.zeros(1, int), np.zeros(1, int), middle, np.ones(1, bool)),
+        *(near, np.eye(5)[None], np.zeros(1)),
+    )
+    found = twins(start, Likelihood.of(noise, 1e-4, images[0]), wide)
+    there = (found.field == 1) & (found.offset == middle).all(axis=1)
+    assert found.z[there][0] == pytest.approx(far[0], abs=0.02)
+    # A pixel aside is a tilt, which distortion can make up for where it is large.
+    assert len(found.star) > 1

@@ -1,0 +1,424 @@
+"""The mixture over sub-pixel centres about a model of the field, on stars of a known field."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.table import Table
+from click.testing import CliRunner
+from photutils.psf import GriddedPSFModel, PSFPhotometry
+
+from psfdae import load_model
+from psfdae.cli import main
+from psfdae.configuration.compose import load_stage
+from psfdae.estimators import BrightStamps, FitError, TrainingSet
+from psfdae.estimators.field import FieldMixture
+from psfdae.own_stars.example import add_stamps, write_field
+from psfdae.own_stars.model import PredictionError
+from psfdae.own_stars.shapes import measure_shapes
+from psfdae.stars.noise import NoiseModel
+
+SIDE, WIDE, FIELD = 10, 26, 1000.0
+SNR = (5.0, 10.0, 20.0, 50.0)
+
+
+def truth(position, centre, side, spread=0.0, seed=0):
+    """PSFs of a field whose width and ellipticity change with the place, pixels integrated.
+
+    Two Gaussians; `spread` is the RMS of what the width of a star has of its own.
+    """
+    from scipy.special import erf
+
+    u = 2 * np.asarray(position) / FIELD - 1
+    own = 1 + spread * np.random.default_rng(seed).standard_normal(len(u))
+    width = (1.05 + 0.12 * u[:, 0] + 0.08 * u[:, 1] ** 2) * own
+    edges = np.arange(side + 1) - side // 2 - 0.5
+    images = 0.0
+    for part, size in ((0.8, 1.0), (0.2, 1.9)):
+        axes = []
+        for axis, stretch in ((0, 1 + 0.1 * u[:, 1]), (1, 1 - 0.1 * u[:, 1])):
+            sigma = (width * stretch * size)[:, None]
+            axes.append(np.diff(erf((edges - centre[:, axis, None]) / (np.sqrt(2) * sigma))) / 2)
+        images = images + part * axes[0][:, :, None] * axes[1][:, None, :]
+    return images
+
+
+def unit(images):
+    return images / images.sum(axis=(1, 2), keepdims=True)
+
+
+def bright(count=150, seed=1, spread=0.02, varied=True):
+    """Bright stars with their margin, framed by their brightest pixel."""
+    rng = np.random.default_rng(seed)
+    position = rng.uniform(0, FIELD, (count, 2))
+    centre = rng.uniform(-0.5, 0.5, (count, 2))
+    where = position if varied else np.full((count, 2), FIELD / 2)
+    images = truth(where, centre, WIDE, spread, seed)
+    noise = 10 ** rng.uniform(-3.5, -3, count)
+    images = images + noise[:, None, None] * rng.standard_normal(images.shape)
+    inner = images[:, 8:18, 8:18].sum(axis=(1, 2))
+    images, noise = images / inner[:, None, None], noise / inner
+    peak = np.zeros((count, 2), int)
+    listed = centre + 0.1 + 0.05 * rng.standard_normal((count, 2))
+    return BrightStamps(images, peak, listed, position, noise, np.arange(count))
+
+
+def fitted(stars, orders=(2,), **changed):
+    images = stars.wide[:, 8:18, 8:18].astype(np.float32)
+    some = np.arange(len(images))
+    noise = NoiseModel(1.0, 1e6)
+    data = TrainingSet(images, images, some, some[:0], np.array([0.01]), noise, bright=stars)
+    config = load_stage(("field",), [])
+    settings = config.field.model_copy(update={"orders": list(orders), **changed})
+    return FieldMixture.fit(data, field=settings)
+
+
+@pytest.fixture(scope="module")
+def stars():
+    return bright()
+
+
+@pytest.fixture(scope="module")
+def field(stars):
+    return fitted(stars)
+
+
+class Faint:
+    """Stars of flux 1000 on a sky of 3, their frames moved by up to a pixel."""
+
+    def __init__(self, count, snr, seed=7):
+        rng = np.random.default_rng((seed, int(snr)))
+        self.position = rng.uniform(0, FIELD, (count, 2))
+        self.centre = rng.uniform(-0.5, 0.5, (count, 2)) + rng.integers(-1, 2, (count, 2))
+        self.psf = unit(truth(self.position, self.centre, SIDE, 0.02, seed + 1))
+        area = 1 / np.square(self.psf).sum(axis=(1, 2)).mean()
+        self.sigma = np.full(count, 1000 / (snr * np.sqrt(area)))
+        self.noise = self.sigma[:, None, None] * rng.standard_normal(self.psf.shape)
+        self.stamps = 1000 * self.psf + 3 + self.noise
+
+    def measured(self, field, **told):
+        return field.measure(self.stamps, self.sigma, self.position, **told)
+
+    def mse(self, estimate):
+        return float(np.square(estimate.psf - self.psf).mean())
+
+
+def size(images):
+    """Width of stars by adaptive moments."""
+    return measure_shapes(images.astype(np.float32)).fwhm_px
+
+
+@pytest.mark.parametrize("snr", SNR)
+def test_flux_sky_centre_and_size_are_unbiased_and_as_sure_as_said(field, snr):
+    some = Faint(1000, snr)
+    found = some.measured(field)
+    told = found.measured
+    error = np.sqrt(np.einsum("nii->ni", told.covariance))
+    off = np.stack([told.flux - 1000, told.background - 3, *(told.centre.T - some.centre.T)], 1)
+    # The centres are those of the list of the training stars, which are 0.1 px off.
+    off[:, 2:] -= 0.1
+    sure = 3 * off.std(axis=0) / np.sqrt(len(off))
+    assert abs(off[:, 0].mean()) < (30 if snr == 5 else 10) + sure[0]
+    assert abs(off[:, 1].mean()) < 0.1 + sure[1]
+    assert (np.abs(off[:, 2:].mean(axis=0)) < 0.02 + sure[2:]).all()
+    # A centre in a wrong node is rare, and not normal.
+    pull = np.quantile(np.abs(off / error), 0.68, axis=0)
+    assert ((pull > 0.85) & (pull < 1.2)).all(), pull
+    if snr > 5:
+        ratio = size(found.psf) / size(some.psf) - 1
+        assert abs(np.median(ratio)) < 0.02 + 3 * 1.25 * ratio.std() / np.sqrt(len(ratio))
+    inside = (np.abs(found.psf - some.psf) <= found.sigma).mean()
+    assert 0.62 < inside < 0.87  # of a wing, few large errors make the variance
+    assert some.mse(found) == pytest.approx(np.square(found.sigma, dtype=float).mean(), rel=0.2)
+    flux_and_sky = told.covariance[:, 0, 1] / (error[:, 0] * error[:, 1])
+    assert np.corrcoef(off[:, 0], off[:, 1])[0, 1] == pytest.approx(flux_and_sky.mean(), abs=0.12)
+
+
+def test_known_place_is_better_than_a_list_and_a_list_better_than_nothing(field):
+    some = Faint(400, 5.0)
+    rng = np.random.default_rng(3)
+    listed = some.centre + 0.1 + 0.05 * rng.standard_normal(some.centre.shape)
+    exact = some.mse(some.measured(field, centre=some.centre + 0.1, fixed=True))
+    near = some.mse(some.measured(field, centre=listed))
+    assert exact < near < 0.7 * some.mse(some.measured(field))
+    # A list that is wrong by a pixel does not spoil the brighter stars.
+    bright_ones = Faint(200, 20.0)
+    wrong = bright_ones.measured(field, centre=bright_ones.centre + 1.0)
+    assert bright_ones.mse(wrong) < 1.2 * bright_ones.mse(bright_ones.measured(field))
+
+
+def test_positions_help_and_are_not_needed(field):
+    some = Faint(400, 20.0)
+    without = field.measure(some.stamps, some.sigma, np.full((400, 2), np.nan))
+    assert some.mse(some.measured(field)) < some.mse(without) < 5e-5
+
+
+def test_without_noise_the_data_come_back_and_without_data_the_field(field):
+    some = Faint(20, 1e5)
+    found = some.measured(field, flux=np.full(20, 1e3), sky=np.full(20, 3.0))
+    assert found.psf == pytest.approx(some.psf, abs=2e-4 * some.psf.max())
+    hopeless = field.measure(
+        some.stamps,
+        1e5 * np.ones(20),
+        some.position,
+        some.centre + 0.1,
+        True,
+        flux=np.full(20, 1e3),
+    )
+    expected = field.model.images(field.model.terms(some.position), some.centre, SIDE)
+    assert hopeless.psf == pytest.approx(unit(expected), abs=0.01 * some.psf.max())
+    assert (hopeless.sigma > found.sigma).all()
+
+
+def test_flux_and_sky_that_are_known_are_taken(field):
+    some = Faint(300, 5.0)
+    known = some.measured(field, flux=np.full(300, 1000.0), sky=np.full(300, 3.0))
+    assert some.mse(known) < some.mse(some.measured(field))
+    assert known.measured.flux == pytest.approx(1000, rel=0.02)
+    assert known.measured.background == pytest.approx(3.0)
+    assert (known.measured.covariance[:, 1, 1] == 0).all()
+    # A method of flux 1 is that, and the same as other methods see it.
+    restored = field.restore((some.stamps - 3) / 1000, some.sigma / 1000, some.position)
+    assert restored == pytest.approx(known.psf, abs=2e-3)
+
+
+def test_stars_do_not_influence_each_other(field):
+    some = Faint(40, 10.0)
+    every = some.measured(field)
+    half = field.measure(some.stamps[::2], some.sigma[::2], some.position[::2])
+    assert half.psf == pytest.approx(every.psf[::2], abs=1e-7)
+    assert half.measured.flux == pytest.approx(every.measured.flux[::2], rel=1e-9)
+
+
+def test_bad_stamps_are_refused(field):
+    stamps = np.zeros((2, SIDE, SIDE))
+    stamps[1, 3, 3] = np.nan
+    with pytest.raises(ValueError, match="finite"):
+        field.measure(stamps, np.ones(2))
+    with pytest.raises(ValueError, match="expected 100"):
+        field.measure(np.zeros((2, 8, 8)), np.ones(2))
+
+
+def test_order_is_what_the_field_has(stars):
+    assert fitted(bright(varied=False), (0, 1, 2)).model.order == 0
+    assert fitted(stars, (0, 1, 2, 3)).model.order >= 1
+    nowhere = stars._replace(position=np.full((len(stars.peak), 2), np.nan))
+    alone = fitted(nowhere, (0, 1, 2))
+    assert alone.model.order == 0
+    some = Faint(50, 20.0)
+    assert np.isfinite(some.measured(alone).psf).all()
+
+
+def test_same_stars_give_the_same_fit(stars, field):
+    again = fitted(stars)
+    for name in FieldMixture.arrays:
+        assert getattr(again, name).tobytes() == getattr(field, name).tobytes(), name
+
+
+def test_list_of_the_training_is_known(field):
+    assert field.listed[0] == pytest.approx([-0.1, -0.1], abs=0.03)
+    assert field.listed[1] == pytest.approx([0.05, 0.05], rel=0.5)
+
+
+def test_packed_is_the_same_to_half_precision(field):
+    arrays, _ = field.pack(SIDE, 1e-3)
+    config = {
+        "noise": {"kappa": 1.0, "background_photons": 1e6},
+        "field": field.settings.model_dump(),
+    }
+    some = Faint(50, 10.0)
+    found = some.measured(FieldMixture.restored(arrays, config, "realisation"))
+    assert found.psf == pytest.approx(some.measured(field).psf, abs=1e-4)
+
+
+def test_psf_between_the_stars_is_the_fields(field):
+    rng = np.random.default_rng(5)
+    position = np.rint(rng.uniform(50, FIELD - 50, (30, 2))) + rng.uniform(-0.4, 0.4, (30, 2))
+    phase = (position - np.floor(position + 0.5))[:, ::-1]
+    expected = unit(truth(position, phase, SIDE))
+    position += 0.1  # as the list of the training is
+    found = field.psf_at(position)
+    assert found.sum(axis=(1, 2)) == pytest.approx(1.0)
+    assert np.square(found - expected).mean() < 1e-6
+    fine = field.psf_at(position, 4)
+    assert fine.shape == (30, 41, 41) and fine.sum(axis=(1, 2)) == pytest.approx(16.0)
+    native = fine[:, 0:40:4, 0:40:4]
+    assert unit(native) == pytest.approx(found, abs=1e-6)
+    # Beyond the stars it stays that of the edge.
+    assert field.psf_at(np.array([[-500.0, 300.0]])) == pytest.approx(
+        field.psf_at(np.array([[field.low[0] // 1 - 1, 300.0]])), abs=1e-3
+    )
+
+
+def test_only_bright_stars_make_a_field(stars):
+    images = stars.wide[:, 8:18, 8:18].astype(np.float32)
+    some = np.arange(len(images))
+    data = TrainingSet(images, images, some, some[:0], np.array([0.01]), NoiseModel(1.0, 1e4))
+    with pytest.raises(FitError, match="from-stars"):
+        FieldMixture.fit(data, field=load_stage(("field",), []).field)
+
+
+# The commands, on an image of which every star is known.
+
+
+def run(*words):
+    return CliRunner().invoke(main, [str(word) for word in words])
+
+
+@pytest.fixture(scope="module")
+def image(tmp_path_factory):
+    """Bright and faint stars on a lattice, a list of each, and a model of the bright ones."""
+    folder, rng = tmp_path_factory.mktemp("field"), np.random.default_rng(11)
+    axis = np.arange(30.0, 930, 30)
+    lattice = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    position = lattice + rng.uniform(-0.5, 0.5, lattice.shape)
+    is_bright = rng.permutation(len(position)) % 6 == 0
+    area = 1 / np.square(truth(position, np.zeros_like(position), SIDE)).sum(axis=(1, 2)).mean()
+    flux = np.where(is_bright, 2000, 50) * np.sqrt(area)  # σ of the sky is 1
+    centre = (position - np.floor(position + 0.5))[:, ::-1]
+    stamps = flux[:, None, None] * truth(position, centre, 20)
+    pixels = np.full((960, 960), 100.0) + rng.standard_normal((960, 960))
+    add_stamps(pixels, stamps, *position.T)
+    for name, rows in (("bright", is_bright), ("faint", ~is_bright)):
+        write_field(folder / "i.fits", folder / f"{name}.csv", pixels, *position[rows].T)
+    words = ("framing.stamp_px=10", "parts.train_stars=150", "parts.test_stars=30")
+    done = run(
+        *("from-stars", folder / "i.fits", "--catalogue", folder / "bright.csv"),
+        *("--out", folder / "model", "--method", "field", "methods=[noisy,field]", *words),
+    )
+    assert done.exit_code == 0, done.output
+    inside = flux * truth(position, centre, SIDE).sum(axis=(1, 2))
+    known = {"position": position, "flux": flux, "inside": inside}
+    known = {name: values[~is_bright] for name, values in known.items()}
+    return folder, folder / "model/i.psf.safetensors", known
+
+
+def predicted(image, *more):
+    folder, model, _ = image
+    out = folder / f"out{len(more)}.fits"
+    words = ("--catalogue", folder / "faint.csv", "--model", model, "--out", out, "--overwrite")
+    done = run("predict", folder / "i.fits", *words, "--quiet", *more)
+    assert done.exit_code == 0, done.output
+    return Table.read(out, hdu="STARS"), fits.getdata(out, "UNCERT")
+
+
+def test_predict_measures_flux_and_centre_with_their_errors(image):
+    """The bundle is small, and the list of the training says how good this one is."""
+    stars, uncertainty = predicted(image)
+    known = image[2]
+    assert image[1].stat().st_size < 5e6
+    assert (stars["flags"] == 0).mean() > 0.95
+    assert abs(np.mean(stars["flux"] / known["inside"]) - 1) < 0.005
+    for column, true in (
+        ("flux", known["inside"]),
+        ("x_fit", known["position"][:, 0]),
+        ("y_fit", known["position"][:, 1]),
+    ):
+        error = stars[f"{column.removesuffix('_fit')}_error"]
+        pull = np.quantile(np.abs(stars[column] - true) / error, 0.68)
+        assert 0.6 < pull < 1.3, (column, pull)
+    assert (np.abs(stars["corr_flux_background"]) <= 1).all()
+    assert np.median(stars["corr_flux_background"]) < -0.1
+    assert np.isfinite(uncertainty).all()
+
+
+def test_fixed_positions_are_kept(image):
+    stars, _ = predicted(image, "--fixed-positions")
+    position = image[2]["position"]
+    assert stars["x_fit"].data == pytest.approx(position[:, 0], abs=1e-3)
+    assert (stars["x_error"] == 0).all() and (stars["corr_flux_x"] == 0).all()
+    free, _ = predicted(image)
+    inside = image[2]["inside"]
+    assert np.std(stars["flux"] / inside) < 1.02 * np.std(free["flux"] / inside)
+
+
+def test_python_takes_positions_and_centres(image):
+    model = load_model(image[1])
+    some = Faint(200, 5.0)
+    nothing, placed, exact = (
+        model.predict(some.stamps, **told)
+        for told in (
+            {},
+            {"position": some.position},
+            {"position": some.position, "centre": some.centre[:, ::-1], "fixed": True},
+        )
+    )
+
+    def mse(found):
+        assert not (found.flags & 8).any()
+        return np.square(found.psf / found.flux[:, None, None] - some.psf).mean()
+
+    assert mse(exact) < 0.5 * mse(placed) < 0.6 * mse(nothing)
+    with pytest.raises(PredictionError, match="position of shape"):
+        model.predict(some.stamps, position=some.position[:3])
+    blind = model.predict(np.full((1, SIDE, SIDE), 7.0))
+    assert blind.flags[0] & 8 and np.isnan(blind.psf).all() and np.isnan(blind.x_fit).all()
+
+
+def test_bad_pixels_are_left_out(image):
+    model, some = load_model(image[1]), Faint(100, 50.0)
+    spoilt = some.stamps.copy()
+    spoilt[:, 5, 6] = np.nan
+    clean, found = (model.predict(s, position=some.position) for s in (some.stamps, spoilt))
+    assert np.median(np.abs(found.flux / clean.flux - 1)) < 0.03
+    assert (found.flags & 1).all()
+
+
+def test_psf_writes_what_photutils_reads(image):
+    folder, path, _ = image
+    model = load_model(path)
+    assert run("psf", path, "--grid", "4x3", "--out", folder / "grid.fits").exit_code == 0
+    grid = GriddedPSFModel.read(folder / "grid.fits")
+    assert grid.data.shape == (12, 41, 41) and list(grid.oversampling) == [4, 4]
+    low, high = model.field_range()
+    assert grid.grid_xypos.min(axis=0) == pytest.approx(low, rel=1e-5)
+    assert grid.grid_xypos.max(axis=0) == pytest.approx(high, rel=1e-5)
+    assert grid.data[5] == pytest.approx(model.psf_at(*np.rint(grid.grid_xypos[5])), abs=1e-6)
+    words = ("--at", "310.4,122", "--oversampling", 1, "--out", folder / "one.fits")
+    assert run("psf", path, *words).exit_code == 0
+    one = fits.getdata(folder / "one.fits")
+    assert one.shape == (1, SIDE, SIDE) and one.sum() == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--grid", "9"), "expected COLUMNSxROWS"),
+        (("--grid", "1x5"), "expected COLUMNSxROWS"),
+        (("--at", "1;2"), "expected X,Y"),
+        (("--at", "1,2", "--grid", "3x3"), "says where"),
+        ((), "says where"),
+    ],
+)
+def test_wrong_places_are_one_line(image, tmp_path, words, message):
+    done = run("psf", image[1], *words, "--out", tmp_path / "x.fits")
+    assert done.exit_code == 2 and message in done.output
+    assert len(done.output.strip().splitlines()) == 1
+
+
+def test_models_without_a_field_say_so(image, tmp_path):
+    shipped = load_model()
+    with pytest.raises(PredictionError, match="from-stars --method field"):
+        shipped.psf_at(1.0, 2.0)
+    folder, path, _ = image
+    with pytest.raises(PredictionError, match="finite"):
+        load_model(path).psf_at(np.nan, 2.0)
+    words = ("--catalogue", folder / "faint.csv", "--fixed-positions", "--out", tmp_path / "x.fits")
+    done = run("predict", folder / "i.fits", *words, "--pixel-scale", "0.9264")
+    assert done.exit_code == 2
+
+
+@pytest.mark.slow
+def test_photometry_of_photutils_with_the_grid_is_unbiased(image):
+    """Show 6: isolated stars of S/N 50, mean bias below 0.5 %."""
+    folder, path, known = image
+    out = folder / "photometry.fits"
+    assert run("psf", path, "--grid", "7x7", "--out", out).exit_code == 0
+    start = Table(known["position"], names=("x", "y"))
+    photometry = PSFPhotometry(GriddedPSFModel.read(out), (9, 9), aperture_radius=4)
+    found = photometry(fits.getdata(folder / "i.fits").astype(float) - 100.0, init_params=start)
+    ratio = found["flux_fit"] / known["flux"]
+    assert len(ratio) >= 400
+    assert abs(np.mean(ratio) - 1) < 0.005
+    assert np.std(ratio) < 0.03

@@ -1,0 +1,145 @@
+"""All CCDs of a mosaic in one call of `from-stars` and `predict`."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.table import Table
+
+from command_line import psfdae, refused
+from psfdae.own_stars import example
+from psfdae.own_stars.bundle import read_bundle
+from psfdae.own_stars.errors import ObservationError
+from psfdae.own_stars.images import science_images
+from psfdae.own_stars.observation import Source
+from psfdae.stages import mosaic, simulate
+from psfdae.stages.predict import Stated
+
+TINY = ["preset=smoke", "parts.train_stars=120", "parts.test_stars=30", "train.epochs=1"]
+SIDE = {"side_px": 700, "bright": 60, "faint": 80, "blended": 6, "saturated": 3}
+NUMBERS = {"CCD1": 1, "CCD2": 2, "5": 5, "6": 6}
+
+
+def mosaic_file(path, *images):
+    """A FITS file with named images, None for a table, and no primary one."""
+    made = [
+        fits.BinTableHDU(Table({"x": [1.0]}), name=name)
+        if pixels is None
+        else fits.ImageHDU(np.asarray(pixels, np.float32), header, name=name)
+        for name, pixels, header in images
+    ]
+    fits.HDUList([fits.PrimaryHDU(), *made]).writeto(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def ccds(tmp_path_factory):
+    """Two CCDs with their stars' sky list in one, a mask, a table, and twice the same name."""
+    folder = tmp_path_factory.mktemp("mosaic")
+    rng, images, lists = np.random.default_rng(1), [], []
+    for k in (1, 2):
+        image, catalogue = folder / f"{k}.fits", folder / f"{k}.csv"
+        x, y = rng.uniform(20, 180, (2, 5))
+        pixels = rng.normal(100, 1, (200, 200))
+        example.add_stamps(pixels, np.full((5, 4, 4), 50.0), x, y)
+        example.write_field(image, catalogue, pixels, x, y)
+        header = fits.getheader(image)
+        header["CRVAL2"] += k  # fields of the sky of their own
+        table = Table.read(catalogue)
+        table["dec"] += k
+        table["id"] += 10 * k
+        lists.append(table["id", "ra", "dec"])
+        images.append((f"CCD{k}", pixels, header))
+    rows = Table({name: np.concatenate([t[name] for t in lists]) for name in ("id", "ra", "dec")})
+    rows.write(folder / "sky.csv")
+    same = np.ones((9, 9))
+    others = [("DQ", same, None), ("CAT", None, None), ("SCI", same, None), ("SCI", same, None)]
+    return mosaic_file(folder / "m.fits", *images, *others), folder / "sky.csv"
+
+
+def test_images_are_called_by_their_own_names_where_they_have_one(ccds, tmp_path):
+    assert science_images(ccds[0]) == NUMBERS
+    path = mosaic_file(tmp_path / "odd.fits", ("a/../b", np.ones((3, 3)), None))
+    assert science_images(path) == {"1": 1}
+    with pytest.raises(ObservationError, match="no image"):
+        science_images(mosaic_file(tmp_path / "none.fits", ("CAT", None, None)))
+
+
+def test_stars_of_a_sky_list_belong_to_the_image_on_which_they_are(ccds):
+    image, catalogue = ccds
+    stated = mosaic.images_of(image, Stated(catalogue=catalogue, all_extensions=True, gain=2.0))
+    assert {name: of.extension for name, of in stated.items()} == NUMBERS
+    for k in (1, 2):
+        of = stated[f"CCD{k}"]
+        assert (of.all_extensions, of.gain) == (False, 2.0)
+        found = of.source(image).open(4)
+        assert found.count == 5
+        assert next(found.chunks(9)).id.tolist() == [10 * k + n for n in range(5)]
+    # The list reaches beyond an image, which alone keeps and flags all of them.
+    assert Source(image, catalogue, extension=1).open(4).count == 10
+
+
+def twice(word):
+    print("not shown")
+    if word == "nothing":
+        raise ObservationError("f", "no star")
+    return {"x": "xx"}[word]
+
+
+def test_images_that_fail_are_named_at_the_end(tmp_path, capfd):
+    jobs = {"A": {"word": "x"}, "B": {"word": "nothing"}}
+    with pytest.raises(mosaic.MosaicError, match=r"m: 1 of 2 images failed: B$"):
+        mosaic.each(twice, jobs, "m")
+    assert capfd.readouterr() == ("m: 2 images: A, B\nA: xx\nB: f: no star\n", "")
+    with pytest.raises(KeyError):  # a bug stays one
+        mosaic.each(twice, {"A": {"word": "bug"}}, "m")
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (["--detect", "--mask", "DQ"], "m.fits: --all-extensions excludes --mask"),
+        (["--detect", "--extension", 1], "--all-extensions excludes --extension"),
+        (["--catalogue", "1.csv"], "1.csv: --all-extensions takes a list with sky coordinates"),
+        (["--catalogue", "nowhere.csv"], "nowhere.csv: no such file"),
+    ],
+)
+@pytest.mark.parametrize("command", ["from-stars", "predict"])
+def test_what_cannot_be_said_of_several_images_is_refused(ccds, monkeypatch, command, words, named):
+    monkeypatch.chdir(ccds[0].parent)
+    assert named in refused(command, "m.fits", "--all-extensions", *words, "--out", "out")
+
+
+def test_a_folder_of_models_has_one_for_each_image(ccds, tmp_path):
+    words = ["--all-extensions", "--detect", "--model", tmp_path, "--out", tmp_path / "psf.fits"]
+    assert "CCD1: 0 models, expected one" in refused("predict", ccds[0], *words)
+
+
+@pytest.mark.slow
+def test_a_mosaic_from_its_stars_to_their_psfs(tmp_path):
+    images = []
+    for k in (1, 2):
+        simulate.write_example(tmp_path / "i.fits", tmp_path / "s.csv", seed=k, **SIDE)
+        header = fits.getheader(tmp_path / "i.fits")
+        images.append((f"CCD{k}", fits.getdata(tmp_path / "i.fits"), header))
+    empty = ("EMPTY", np.random.default_rng(1).normal(100, 3, (300, 300)), images[0][2])
+    image = mosaic_file(tmp_path / "m.fits", *images, empty)
+    out = tmp_path / "model"
+    words = [image, "--all-extensions", "--detect"]
+    said = psfdae("from-stars", *words, "--out", out, "--report", tmp_path / "page.html", *TINY)
+    assert said.exit_code == 2
+    last = said.output.splitlines()
+    assert last[0].endswith("3 images: CCD1, CCD2, EMPTY")
+    assert "EMPTY: " in last[3] and "no star 5 σ" in last[3]
+    assert last[-1].endswith("1 of 3 images failed: EMPTY")
+    for k in (1, 2):
+        assert read_bundle(out / f"CCD{k}/m_CCD{k}.psf.safetensors").info.source == "stars"
+        assert (tmp_path / f"page_CCD{k}.html").is_file()
+    whole = mosaic_file(tmp_path / "two.fits", *images)
+    words = [whole, "--all-extensions", "--detect", "--model", out]
+    done = psfdae("predict", *words, "--out", tmp_path / "psf.fits")
+    assert done.exit_code == 0, done.output
+    for k in (1, 2):
+        stars = Table.read(tmp_path / f"psf_CCD{k}.fits", hdu="STARS")
+        assert len(stars) == len(Table.read(tmp_path / f"psf_CCD{k}_stars.csv")) > 100
