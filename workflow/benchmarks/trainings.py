@@ -1,6 +1,7 @@
 """Test error against fitting time: which training, which PCA+SOM is large enough."""
 
 from dataclasses import replace
+from itertools import permutations
 from itertools import product as product_of
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -33,7 +34,7 @@ CHEAP_S = 3.0  # within which a fit of PCA+SOM is repeated
 READINGS = (("map", True), ("map", False), ("projection", True))
 
 READS = (*SIMULATION, "noise", "parts", "baseline", "benchmark")
-METHODS = (*SIMULATION, "noise", "parts", "methods", *all_groups())
+METHODS = (*SIMULATION, "noise", "parts", "methods", "evaluation", *all_groups())
 
 
 class Knee(Group):
@@ -282,8 +283,11 @@ def methods(
 
 
 def time_methods(tree, stars, seeds):
-    """CPU time of each method's fit by seed, stars per second and errors, λ by λ."""
-    from psfdae.evaluation.metrics import clustered_mean, mse
+    """CPU time of each method's fit by seed, stars per second and errors, λ by λ.
+
+    `different` counts the other seeds that `psfdae compare` calls another method's.
+    """
+    from psfdae.evaluation.metrics import all_metrics, clustered_mean
 
     config = part(METHODS, tree)
     common.limit_threads(1)
@@ -291,7 +295,7 @@ def time_methods(tree, stars, seeds):
     test = common.split_stars(product, "random", config).test
     clean, field = product["realisation"][test], product["field_index"][test]
     position = common.field_positions(product)[test]
-    rows = []
+    rows, measured = [], {seed: [] for seed in seeds}
     restoring = (kind for kind in map(method, config.methods) if kind.restores)
     for kind, seed in product_of(restoring, seeds):
         with TemporaryDirectory() as folder:
@@ -309,9 +313,29 @@ def time_methods(tree, stars, seeds):
             found = fitted.restore(noisy, level, position)
             rate = len(noisy) / (process_time() - start)
             row = {"method": kind.name, "seed": seed, "noise_level": level, "fit_cpu_s": fit_s}
-            mean, stderr = clustered_mean(mse(found, clean), field)
+            errors = all_metrics(found, clean, config.evaluation.data_range)
+            errors = {"method": kind.name, "noise_level": level, "field": field, **errors}
+            measured[seed].append(errors | {"star": test})
+            mean, stderr = clustered_mean(errors["mse"], field)
             rows.append(row | {"stars_per_s": rate, "mse": mean, "stderr": stderr})
-    return rows
+    return [row | {"different": n} for row, n in zip(rows, different(rows, measured), strict=True)]
+
+
+def different(rows, measured):
+    """For each row, how many other seeds `psfdae compare` says are better or worse than its own."""
+    import pandas as pd
+
+    from psfdae.evaluation.comparison import SEED_SCATTER, compare_errors
+
+    keys = ["method", "noise_level"]
+    tables = {seed: pd.concat(map(pd.DataFrame, errors)) for seed, errors in measured.items()}
+    counts = dict.fromkeys(((row["seed"], *(row[key] for key in keys)) for row in rows), 0)
+    for one, other in permutations(tables, 2):
+        verdicts = compare_errors(tables[one], tables[other], SEED_SCATTER)
+        changed = verdicts[(verdicts.metric == "mse") & (verdicts.verdict != "same")]
+        for row in changed.itertuples():
+            counts[one, row.method, row.noise_level] += 1
+    return counts.values()
 
 
 if __name__ == "__main__":

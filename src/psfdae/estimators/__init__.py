@@ -255,9 +255,6 @@ class Method:
         Fewer are made up to as many: other numbers of them round otherwise.
     memory_mb, minutes : int
         What a fit takes at most.
-    seed_scatter : float
-        Standard deviation of its mean squared error between seeds, over that error: the
-        largest that the target `seeds` has found at any noise level.
     """
 
     name: ClassVar[str] = ""
@@ -286,7 +283,6 @@ class Method:
     padded: ClassVar[bool] = True
     memory_mb: ClassVar[int] = 1000
     minutes: ClassVar[int] = 30
-    seed_scatter: ClassVar[float] = 0.0
 
     diagnosed: Mapping[str, list[dict[str, Any]]]
 

@@ -70,6 +70,9 @@ class Train(Group):
         description="Maximum norm of the gradient; 0 switches clipping off"
     )
     threads: Count = Field(description="Threads of one training")
+    precision: Literal["float32", "bfloat16"] = Field(
+        description="Of the convolutions' products while training; weights stay float32"
+    )
     validate_every: Count = Field(description="Epochs between validations")
     validation_draws: Count = Field(description="Noise draws per validation star")
     dead_check_steps: Count = Field(description="Steps between looks for a dead network")
@@ -114,7 +117,6 @@ class Dae(Method):
     suffix = ""
     about = "Folder of a trained network."
     memory_mb, minutes = 1500, 60
-    seed_scatter = 0.03
 
     def __init__(
         self,

@@ -38,6 +38,7 @@ class SingleChannelConv(nn.Conv2d):
         """Map (B, C, h, w) to (B, 1, h, w)."""
         if x.device.type != "cpu":
             return super().forward(x)
+        x = x.float()
         flipped = self.weight.flip(2, 3).transpose(0, 1)
         return torch.ops.aten.slow_conv_transpose2d(
             x, flipped, self.kernel_size, self.bias, [1, 1], self.padding, [0, 0], [1, 1]
@@ -187,7 +188,9 @@ class DaeTraining(Training):
     def loss(self, batch: tuple[torch.Tensor, ...], step: int) -> torch.Tensor:
         """Mean squared error, weighted by star."""
         noisy, target, weight = batch
-        output = self.model(noisy)
+        half = self.settings.precision == "bfloat16"
+        with torch.autocast("cpu", torch.bfloat16, enabled=half):
+            output = self.model(noisy)
         if step % self.settings.dead_check_steps == 0 and not output.detach().any():
             raise DeadNetworkError(f"all outputs are zero at step {step}")
         return (weight * (output - target) ** 2).mean()

@@ -15,6 +15,10 @@ if TYPE_CHECKING:
 SIGNIFICANT = 3.0
 """A difference of so many standard errors is called one; 1 of 370 is chance."""
 
+SEED_SCATTER = {"pca_som": 0.012, "dae": 0.022, "gmm": 0.005, "gmm_position": 0.01}
+"""Standard deviation of a method's MSE between seeds over that MSE: the largest that the target
+`seeds` has found at any noise level (tables/seeds_*.csv of the run of record), rounded up."""
+
 SHARES = (0.25, 0.5, 0.75, 1.0)
 """Parts of a training at which the validation errors are shown."""
 
@@ -97,7 +101,7 @@ def compare_errors(
     Parameters
     ----------
     first, second : as for `same_noisy_stars`
-    scatter : mapping of method to `Method.seed_scatter`; none for methods that have no seed
+    scatter : mapping of method to the scatter of its MSE between seeds, such as `SEED_SCATTER`
 
     Returns
     -------

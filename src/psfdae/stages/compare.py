@@ -105,6 +105,7 @@ def read_run(folder: Path, errors: Path) -> Run:
 def describe(first: Run, second: Run) -> str:
     """Markdown with the differences between two runs."""
     from psfdae.evaluation.comparison import (
+        SEED_SCATTER,
         SIGNIFICANT,
         compare_errors,
         config_differences,
@@ -113,9 +114,7 @@ def describe(first: Run, second: Run) -> str:
     )
 
     curves = [training_summary(run.history) for run in (first, second)]
-    errors = compare_errors(
-        first.errors, second.errors, {kind.name: kind.seed_scatter for kind in registered()}
-    )
+    errors = compare_errors(first.errors, second.errors, SEED_SCATTER)
     paired = same_noisy_stars(first.errors, second.errors)
     references = {run.config.get("reference", "") for run in (first, second)}
     warning = "The runs have different references: not the same question.\n\n"

@@ -12,6 +12,7 @@ import numpy as np
 from psfdae.cli import File, Folder, Reference, Split, command
 from psfdae.configuration.schema import Config
 from psfdae.estimators import ConfigError, Estimate, Method, method, registered
+from psfdae.evaluation.comparison import SEED_SCATTER
 from psfdae.evaluation.metrics import all_metrics, clustered_mean, seed_stderr
 from psfdae.files import Product, ProductError, write_csv, write_parquet, write_text
 from psfdae.reading import read_table
@@ -97,7 +98,7 @@ def summarised(
     rows = []
     for metric, values in metrics.items():
         mean, stderr = clustered_mean(values, field)
-        scatter = seed_stderr(method(row["method"]).seed_scatter, metric, mean)
+        scatter = seed_stderr(SEED_SCATTER.get(row["method"], 0.0), metric, mean)
         found = {"metric": metric, "value": mean, "stderr": stderr, "seed_stderr": scatter}
         rows.append({**row, **found, "n": values.size})
     return rows
