@@ -218,6 +218,23 @@ def errors(name="tables/psf_metrics.csv"):
     return table.reset_index().sort_values(keys, ascending=[True, False, True, True])
 
 
+def more_stars():
+    """Errors of methods on request beside those of the same methods on the paper's stars."""
+    rows = csv("tables/psf_efficiency_on_request.csv")
+    rows = rows.query("method == 'gmm_simulated' and bound == 'bayes' and tight == 'yes'")
+    over = (1.0 / rows.set_index(CELL).efficiency).rename("over")
+    table = errors("tables/psf_metrics_on_request.csv").drop(columns="best")
+    table = table.merge(errors().drop(columns="best"), on=[*CELL, "split"])
+    return table.join(over, CELL)
+
+
+def networks():
+    """Networks of scene 3 on noisy stamps: what they took, and errors on validation states."""
+    folder = "sweeps/network_epochs"
+    table = csv(f"{folder}/summary.csv").merge(csv(f"{folder}/cost.csv"), on="point")
+    return table.sort_values("cpu_seconds")
+
+
 def presets():
     """MSE of the default preset beside that of the preset `paper`."""
     literal = errors("paper/tables/psf_metrics.csv")
