@@ -186,7 +186,8 @@ def _seeded():
 def seeds():
     """Mean over seeds, error of the stars and relative scatter of every method."""
     cells = _seeded().groupby(["dataset", "method", "noise_level"], sort=False)
-    table = cells.agg(mse=("mse", "mean"), stderr=("stderr", "mean"), scatter=("mse", "std"))
+    means = {name: (name, "mean") for name in ("mse", "stderr")}
+    table = cells.agg(**means, scatter=("mse", "std"), different=("different", "sum"))
     table = table.assign(scatter=table.scatter / table.mse).reset_index()
     return table.assign(label=[method(m).label for m in table.method])
 

@@ -251,6 +251,7 @@ def test_all_methods_are_timed_and_drawn(smoke, tmp_path):
     spread = rows.groupby(["method", "noise_level"]).mse.std()
     assert (spread["lmmse"] == 0).all() and (spread["dae"] > 0).all()
     assert (rows[["fit_cpu_s", "stars_per_s", "mse"]] > 0).all().all()
+    assert (rows[rows.method == "lmmse"].different == 0).all()
     rows.to_csv(tmp_path / "table.csv", index=False)
     figures.draw("methods", tmp_path / "table.csv", tmp_path / "drawn.png")
     assert (tmp_path / "drawn.png").stat().st_size > 10_000

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -10,6 +11,7 @@ import pytest
 
 from command_line import psfdae, refused
 from psfdae.evaluation.comparison import (
+    SEED_SCATTER,
     compare_errors,
     config_differences,
     held_out_ratios,
@@ -18,6 +20,7 @@ from psfdae.evaluation.comparison import (
 from psfdae.files import write_text
 
 FIELDS, STARS = 20, 400
+RECORD = Path(__file__).resolve().parents[1] / "results/reference"
 
 
 def errors(seed, dae, noise_seed=1):
@@ -82,6 +85,15 @@ def test_seeds_count_beside_the_stars():
     row = compare_errors(trained[0], half, {"dae": 0.03}).query("method == 'dae' & metric == 'mse'")
     assert row.verdict.item() == "better"
     assert row.seed_stderr.item() == pytest.approx(0.03 * np.hypot(row["first"], row.second).item())
+
+
+def test_scatter_between_seeds_is_what_the_record_has():
+    tables = [pd.read_csv(path) for path in RECORD.glob("tables/seeds_*.csv")]
+    cells = pd.concat(tables, keys=range(len(tables)), names=["dataset"])
+    cells = cells.groupby(["dataset", "method", "noise_level"]).mse
+    largest = (cells.std() / cells.mean()).groupby("method").max()
+    for name, found in largest.items():
+        assert found <= SEED_SCATTER.get(name, 0.0) <= 1.15 * found, name
 
 
 def test_held_out_fields_are_compared_on_the_stars_that_both_splits_test():
