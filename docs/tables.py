@@ -192,6 +192,14 @@ def seeds():
     return table.assign(label=[method(m).label for m in table.method])
 
 
+def costs():
+    """CPU time of each method's fit, and stars per second at its slowest noise level."""
+    cells = csv("tables/seeds_dataset3.csv").groupby(["method", "noise_level"], sort=False)
+    cells = cells[["fit_cpu_s", "stars_per_s"]].mean().groupby("method", sort=False)
+    table = cells.agg({"fit_cpu_s": "first", "stars_per_s": "min"}).reset_index()
+    return table.assign(label=[method(m).label for m in table.method])
+
+
 def ordering():
     """Pairs of methods that differ by 3 standard errors in the record, seed by seed."""
     recorded = csv("tables/psf_metrics.csv").query(
