@@ -36,6 +36,7 @@ TRAIN = Train(
     lr=3e-3,
     schedule="onecycle",
     optimiser="adam",
+    precision="float32",
     level_weight=0.0,
     grad_clip=1.0,
     threads=1,
@@ -369,6 +370,18 @@ def test_interrupted_muon_continues_as_if_nothing_had_happened(data, tmp_path):
     whole = train(data, tmp_path, settings)
     interrupted(data, tmp_path, 2, train_config=settings)
     assert same(whole.result, train(data, tmp_path, settings).result)
+
+
+def test_training_in_bfloat16_repeats_and_stays_near_float32(data, tmp_path):
+    """The products have 8 bits; weights, their steps and the trained network have all."""
+    trained = {}
+    for place, precision in ((1, "float32"), (2, "bfloat16"), (3, "bfloat16")):
+        settings = TRAIN.model_copy(update={"precision": precision, "optimiser": "muon"})
+        trained[place] = train(data, tmp_path / str(place), settings)
+    assert same(trained[2].result, trained[3].result)
+    assert {weight.dtype for weight in trained[2].result.values()} == {torch.float32}
+    ratio = trained[2].best_mse / trained[1].best_mse
+    assert ratio == pytest.approx(1.0, abs=0.1) and ratio != 1.0
 
 
 def test_patience_stops_a_training_that_no_longer_improves(data, tmp_path):
