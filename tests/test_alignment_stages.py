@@ -7,12 +7,13 @@ import pandas as pd
 import pytest
 from click.testing import CliRunner
 
-from psfdae.alignment.methods import ESTIMATORS, LEARNED, METHODS, TRAINED
+from psfdae.alignment.methods import ESTIMATORS, FITTED, LEARNED, METHODS, TRAINED, of_set
 from psfdae.cli import main
 from psfdae.configuration.compose import ConfigError, config_dir, load, load_stage, overrides_for
 from psfdae.evaluation import alignment_tables
 from psfdae.files import read_product
 from psfdae.stages.alignment import states
+from psfdae.stages.alignment_results import read_bounds
 
 PRESET = ("alignment_preset=smoke", "alignment.grid_levels=2")
 
@@ -213,6 +214,17 @@ def test_tables_hold_every_method(tables):
     assert len(correlation) == 16 * (2 * 8 + 4)
     diagonal = correlation[correlation.parameter_a == correlation.parameter_b]
     assert diagonal.correlation.to_numpy() == pytest.approx(1)
+
+
+def test_flux_and_place_are_free_for_uniform_states_only(products, tmp_path):
+    given = ("--set", "grid", "--states", products / "grid.h5", "--model", products / "model.h5")
+    _run("bound", *given, "--out", tmp_path / "bound.h5", *PRESET)
+    assert read_product(tmp_path / "bound.h5", "alignment_bound")["covariances"].shape[0] == 1
+    assert [key["method"] for key, _, _ in read_bounds([tmp_path / "bound.h5"])] == 2 * [
+        "cramer_rao"
+    ]
+    assert of_set(FITTED, "uniform") == FITTED
+    assert of_set(FITTED, "grid") == [METHODS["max_likelihood"]]
 
 
 def test_paper_s_rows_stand_beside_ours(tables):

@@ -115,4 +115,10 @@ FITTED = [method for method in ESTIMATORS if method.fitted]
 BOUNDS = [METHODS["cramer_rao"], METHODS["cramer_rao_free"]]
 """Bounds of the product "alignment_bound", in its order."""
 
+
+def of_set(methods: list[Method], test_set: str) -> list[Method]:
+    """What a test set is for: flux and place are free for uniform states only, as pages quote."""
+    return [method for method in methods if test_set == "uniform" or not method.free]
+
+
 TRAINED = [method.name for method in METHODS.values() if method.states]

@@ -34,6 +34,9 @@ PARAMETERS = 4
 EXAMPLES = 1500
 """States whose stamps, with their mirror images, tell the principal components."""
 
+PART = 1000
+"""States whose photons are counted at a time."""
+
 
 class AlignmentCnn(nn.Module):
     """Regression of a state of misalignment from the stamps of all fields.
@@ -92,9 +95,10 @@ class AlignmentPerceptron(nn.Module):
         """
         flat = clean.flatten(1)
         self.mean.copy_(flat.mean(dim=0))
-        centred = flat - self.mean
+        flat = flat - self.mean
         count = self.axes.shape[1]
-        axes = torch.linalg.eigh(centred.T @ centred)[1][:, -count:].flip(1)
+        axes = torch.linalg.eigh(flat.T @ flat)[1][:, -count:].flip(1)
+        del flat  # seen takes as much memory
         spread = ((seen.flatten(1) - self.mean) @ axes).std(dim=0)
         self.axes.copy_(axes / spread.clamp_min(torch.finfo(spread.dtype).tiny))
 
@@ -137,7 +141,8 @@ def load_network(config: Cnn | Perceptron, fields: int, stamp_px: int, weights: 
 def _scaled(stamps: np.ndarray) -> torch.Tensor:
     """Flux-normalised stamps as the network sees them, with a mean of 1."""
     images = torch.from_numpy(np.ascontiguousarray(stamps, np.float32))
-    return (images * float(stamps.shape[-1] ** 2)).to(memory_format=torch.channels_last)
+    own = images.to(memory_format=torch.channels_last, copy=True)
+    return own.mul_(float(stamps.shape[-1] ** 2))
 
 
 @torch.inference_mode()
@@ -178,8 +183,12 @@ class MixedNoise:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Noisy stamps of states, by the faster law or by Poisson's, and weights (n,)."""
         level = mixed_levels(self.levels, len(stamps), rng)
-        draw = self.noise.draw_gaussian if gaussian else self.noise.draw
-        noisy = draw(stamps, level, rng)
+        if gaussian:
+            noisy = self.noise.draw_gaussian(stamps, level, rng)
+        else:  # Poisson's numbers are wide: a part at a time, which draws the same
+            noisy = np.empty(stamps.shape, np.float32)
+            for part in np.array_split(np.arange(len(level)), -(-len(level) // PART)):
+                noisy[part] = self.noise.draw(stamps[part], level[part], rng)
         return noisy, noise_weights(level, self.levels) if self.weigh else np.ones(len(level))
 
 
@@ -267,8 +276,10 @@ class NetworkTraining(Training):
         clean = self.data.stamps[rng.permutation(len(self.data.stamps))[:EXAMPLES]]
         if self.mirrors:
             clean = np.concatenate([mirror.stamps(clean) for mirror in self.mirrors])
-        seen = clean if self.data.noise is None else self.data.noise(clean, rng)[0]
-        return _scaled(clean), _scaled(seen)
+        scaled = _scaled(clean)
+        if self.data.noise is None:
+            return scaled, scaled
+        return scaled, _scaled(self.data.noise(clean, rng)[0])
 
     def loss(self, batch: tuple[torch.Tensor, ...], step: int) -> torch.Tensor:
         """Weighted mean squared error."""

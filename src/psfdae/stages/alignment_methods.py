@@ -19,7 +19,15 @@ from typing import Annotated, Any
 import click
 import numpy as np
 
-from psfdae.alignment.methods import BOUNDS, FITTED, LEARNED, METHODS, TRAINED, Method
+from psfdae.alignment.methods import (
+    BOUNDS,
+    FITTED,
+    LEARNED,
+    METHODS,
+    TRAINED,
+    Method,
+    of_set,
+)
 from psfdae.alignment.stamps import AlignmentStamps
 from psfdae.belonging import STATE_STAMPS, require, require_origin, write_origin
 from psfdae.cli import AboveZero, File, Folder, command
@@ -128,13 +136,19 @@ def train_network(
     if METHODS[kind].noisy:
         levels = np.asarray(config.noise.levels)
         data = replace(data, noise=MixedNoise(noise_model(config), levels, settings.weigh_noise))
+    draws = [data.stamps]
     if dae and data.noise:
         rng = stream(config.seed, "cnn", "noise", kind)
-        count = settings.noise_draws
-        drawn = [data.noise(data.stamps, rng, gaussian=False) for _ in range(count)]
-        noisy, weights = (np.concatenate(parts) for parts in zip(*drawn, strict=True))
-        stamps = denoise(dae, config, noisy)
-        data = TrainingStates(np.tile(data.states, (count, 1)), stamps, weights)
+        many = np.empty((settings.noise_draws, *data.stamps.shape), np.float32)
+        weights = []
+        for draw in many:  # one by one, for the sake of memory
+            draw[:], weight = data.noise(data.stamps, rng, gaussian=False)
+            draw[:] = denoise(dae, config, draw)
+            weights.append(weight)
+        stamps, draws = many.reshape(-1, *data.stamps.shape[1:]), list(many)
+        states = np.tile(data.states, (len(many), 1))
+        data = TrainingStates(states, stamps, np.concatenate(weights))
+        product.arrays.clear()  # only what it says of itself is still needed
     limit_threads(settings.threads)
     fields, side = data.stamps.shape[1], data.stamps.shape[-1]
     described = {**config.model_dump(), "fields": fields, "stamp_px": side, "name": kind}
@@ -144,7 +158,7 @@ def train_network(
         return NetworkTraining(data, getattr(config, settings.network), settings, config.seed, kind)
 
     with progress(settings.epochs) as report:
-        done = train(begin, checkpoint, fingerprint(described, data.stamps), report)
+        done = train(begin, checkpoint, fingerprint(described, *draws), report)
     save_weights(out / NETWORK_WEIGHTS, done.result, described)
     write_origin(out, product)
     write_text(out / HISTORY, as_csv(done.history))
@@ -288,12 +302,12 @@ def fit(
     predict = network_predictor(network, config)
     stamps = noisy_test_states(config, product["stamps"], test_set, level)
     fits: dict[str, list[np.ndarray]] = defaultdict(list)
-    rows = []
+    rows, methods = [], of_set(FITTED, test_set)
     sampled = config.optics.model_copy(
         update={"pupil_samples": config.fit.pupil_samples, "nodes": None}
     )
     operator = partial(AlignmentStamps, config.telescope, alignment=config.alignment)
-    for method in FITTED:
+    for method in methods:
         rough = operator(sampled, movable=method.free, narrow=True)
         operators = rough, operator(config.optics, movable=method.free, coarse=rough)
         coarse, exact = (Likelihood(wavefronts, o, noise_model(config), level) for o in operators)
@@ -312,7 +326,7 @@ def fit(
         fits["twin_tried"].append(twins)
         fits["twin_won"].append(best.states[:, 0] != first.states[:, 0])
     about = {
-        "estimates": f"[method, state, number] maximum of the likelihood; {_names(FITTED)}",
+        "estimates": f"[method, state, number] maximum of the likelihood; {_names(methods)}",
         "deviance": "twice the log-likelihood missing to a perfect fit",
         "evaluations": "[method, (coarse, exact), state] stamps and derivatives computed",
         "converged": "ended by the tolerance",
@@ -347,13 +361,13 @@ def bound(
     require(states, product.config, STATE_STAMPS, config)
     wavefronts = read_model(model, product.config, states)
     noise, levels, truth = noise_model(config), config.noise.levels, product["states"]
-    covariances = []
-    for method in BOUNDS:
+    covariances, methods = [], of_set(BOUNDS, test_set)
+    for method in methods:
         operator = AlignmentStamps(
             config.telescope, config.optics, config.alignment, movable=method.free
         )
         covariances.append(bound_covariances(wavefronts, operator, noise, levels, truth))
-    about = f"[method, λ, state, number, number] of the bound; {_names(BOUNDS)}"
+    about = f"[method, λ, state, number, number] of the bound; {_names(methods)}"
     columns = {
         "states": Column(truth, "range", "true states"),
         "levels": Column(np.array(levels), "1", "noise levels λ"),

@@ -17,6 +17,7 @@ from psfdae.alignment.methods import (
     LEARNED,
     METHODS,
     Method,
+    of_set,
 )
 from psfdae.alignment.stamps import AlignmentStamps
 from psfdae.alignment.telescope import design_states, fit_quadratic, zernike_tracer
@@ -61,8 +62,9 @@ def read_errors(
                 yield {**key, "method": method.name}, truth, product["estimates"][row, column]
     for path in fits:
         product = read_product(path, "alignment_fit", ("states", "estimates"))
-        key = {"test_set": product.config["test_set"], "noise_level": product.config["level"]}
-        for method, found in zip(FITTED, product["estimates"], strict=True):
+        test_set = product.config["test_set"]
+        key = {"test_set": test_set, "noise_level": product.config["level"]}
+        for method, found in zip(of_set(FITTED, test_set), product["estimates"], strict=True):
             yield {**key, "method": method.name}, product["states"], found
 
 
@@ -70,9 +72,10 @@ def read_bounds(bounds: Sequence[Path]) -> Iterator[tuple[dict[str, Any], np.nda
     """Key (test_set, noise_level, method), true states (n, 4) and covariances (n, 4, 4)."""
     for path in bounds:
         product = read_product(path, "alignment_bound", ("states", "levels", "covariances"))
-        for method, levels in zip(BOUNDS, product["covariances"], strict=True):
+        test_set = product.config["test_set"]
+        for method, levels in zip(of_set(BOUNDS, test_set), product["covariances"], strict=True):
             for level, covariances in zip(product["levels"], levels, strict=True):
-                key = {"test_set": product.config["test_set"], "noise_level": float(level)}
+                key = {"test_set": test_set, "noise_level": float(level)}
                 yield {**key, "method": method.name}, product["states"], covariances
 
 
