@@ -77,8 +77,12 @@ CONJUGATE = np.array([1 - 2 * (name in ("r4", "xx", "xy", "yy")) for name in MON
 STUCK = 1e6
 """Damping at which a climb is given up."""
 
-FAR = 8.0
-"""Modes whose evidence is this far (in its logarithm) below a star's best are left out."""
+FAR = 50.0
+"""Modes whose evidence is this far (in its logarithm) below a star's best are left out.
+
+The evidence is that of a Gaussian, which errs by tens along a bent ridge of the posterior: with
+8, a star in sixty lost the mode that the draws then find to hold its mass.
+"""
 
 PRIOR_DRAWS = 10.0
 """Effective draws of a mode that change its scale half way to theirs."""
