@@ -73,6 +73,17 @@ def test_record_keeps_what_was_not_renewed_and_says_since_when(results, tmp_path
         assert kept == {"tables/slow.csv": "first"}
 
 
+def test_what_a_run_cost_stays_with_its_times(results, tmp_path):
+    out = tmp_path / "reference"
+    out.mkdir()
+    (out / "runtime.csv").write_text("rule\n")
+    (out / "provenance.json").write_text('{"commit": "first", "wall_s": 1.5, "cores": 64}')
+    record.reference(results, out, [results / "tables/t.csv"], [Path("runtime.csv")])
+    described = json.loads((out / "provenance.json").read_text())
+    assert described["kept"] == {"runtime.csv": "first"}
+    assert described["wall_s"] == 1.5 and described["cores"] != 64
+
+
 def test_targets_on_request_are_not_part_of_the_run(results, tmp_path):
     path = results / record.ON_REQUEST / "stability/stability.tsv"
     path.parent.mkdir(parents=True)

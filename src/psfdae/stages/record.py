@@ -9,7 +9,7 @@ import platform
 import shutil
 import sys
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -26,6 +26,9 @@ if TYPE_CHECKING:
 
 VERSIONED = ("psfdae", "numpy", "scipy", "torch", "scikit-learn", "minisom")
 """Packages whose versions can change a number; recorded with the run."""
+
+COSTS = ("wall_s", "cpu_s", "peak_mb", "on_request_s", "results_mb", "matrix_product_gflops")
+"""What provenance says of the cost of a run."""
 
 ON_REQUEST = "benchmarks_on_request"
 """Folder with the cost of the targets that are not part of `make reproduce`."""
@@ -78,7 +81,8 @@ def reference(
 ) -> None:
     """Replace the committed run of record by a finished run.
 
-    Provenance names each file that stays with the commit that it was recorded at.
+    Provenance names each file that stays with the commit that it was recorded at. If `runtime.csv`
+    stays, so does what provenance says of the run's cost.
     """
     from psfdae.configuration.compose import load
 
@@ -94,17 +98,24 @@ def reference(
         target = staging / name
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(path, target)
-    described = provenance(results, load()) | {"kept": _kept_since(out, kept)}
+    before = _before(out)
+    described = provenance(results, load()) | {"kept": _kept_since(before, kept)}
+    if Path("runtime.csv") in kept:  # what a run costs is said by one run alone
+        described |= {key: before[key] for key in COSTS if key in before}
     text = json.dumps(described, indent=2, sort_keys=True)
     write_text(staging / "provenance.json", text + "\n")
     shutil.rmtree(out, ignore_errors=True)
     staging.rename(out)
 
 
-def _kept_since(out: Path, kept: Iterable[Path]) -> dict[str, str]:
-    """Commit at which each kept file was recorded."""
+def _before(out: Path) -> dict[str, Any]:
+    """Provenance of the record before."""
     described = out / "provenance.json"
-    before = json.loads(described.read_text()) if described.is_file() else {}
+    return json.loads(described.read_text()) if described.is_file() else {}
+
+
+def _kept_since(before: Mapping[str, Any], kept: Iterable[Path]) -> dict[str, str]:
+    """Commit at which each kept file was recorded."""
     earlier, last = before.get("kept", {}), before.get("commit", "unknown")
     return {str(path): earlier.get(str(path), last) for path in kept}
 
