@@ -459,17 +459,16 @@ def test_last_step_reaches_the_maximum_of_the_exact_optics(
 
 def test_emulator_of_few_states(model, operator, states, stamps):
     """Stamps that it was given come back, in all mirror images; derivatives are differences."""
-    settings = FIT.model_copy(update={"outer_states": 5})
+    settings = FIT.model_copy(update={"outer_states": 5, "neighbours": 1000})
     emulator = StampEmulator(model, operator, states, stamps, settings)
     mirror = mirror_symmetries(8)[3]
     known, slopes = emulator(mirror.states(states))
     assert known == pytest.approx(mirror.stamps(stamps), abs=2e-3)
     assert slopes.sum(axis=(-2, -1)) == pytest.approx(0, abs=1e-3)
-    step, axis = 1e-2, 2
-    asked = states[:4] * 0.9
-    plus, minus = (emulator(asked + s * step * np.eye(4)[axis])[0] for s in (1, -1))
-    expected = (plus - minus) / (2 * step)
-    assert emulator(asked)[1][:, :, axis] == pytest.approx(expected, abs=0.03 * np.ptp(expected))
+    step, asked = 1e-2 * np.eye(4)[2], states[:4] * 0.9
+    expected = (emulator(asked + step)[0] - emulator(asked - step)[0]) / 0.02
+    off = np.abs(emulator(asked)[1][:, :, 2] - expected)
+    assert off.max() < 0.05 * np.abs(expected).max()
 
 
 def test_start_far_beyond_the_range_is_safe(model, operator, noise, stamps):
