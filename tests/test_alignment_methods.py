@@ -459,16 +459,16 @@ def test_last_step_reaches_the_maximum_of_the_exact_optics(
 
 def test_emulator_of_few_states(model, operator, states, stamps):
     """Stamps that it was given come back, in all mirror images; derivatives are differences."""
-    settings = FIT.model_copy(update={"outer_states": 5, "neighbours": 1000})
+    settings = FIT.model_copy(update={"outer_states": 5})
     emulator = StampEmulator(model, operator, states, stamps, settings)
     mirror = mirror_symmetries(8)[3]
     known, slopes = emulator(mirror.states(states))
     assert known == pytest.approx(mirror.stamps(stamps), abs=2e-3)
     assert slopes.sum(axis=(-2, -1)) == pytest.approx(0, abs=1e-3)
-    step, asked = 1e-2 * np.eye(4)[2], states[:4] * 0.9
-    expected = (emulator(asked + step)[0] - emulator(asked - step)[0]) / 0.02
+    step, asked = 1e-3 * np.eye(4)[2], states[:4] * 0.9
+    expected = (emulator(asked + step)[0] - emulator(asked - step)[0]) / 2e-3
     off = np.abs(emulator(asked)[1][:, :, 2] - expected)
-    assert off.max() < 0.05 * np.abs(expected).max()
+    assert off.max() < 0.1 * np.abs(expected).max()
 
 
 def test_start_far_beyond_the_range_is_safe(model, operator, noise, stamps):
