@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
 from torch import nn
 
+from psfdae.alignment.emulator import StampEmulator
 from psfdae.alignment.fisher import (
     bound_covariances,
     coma_free_decentre,
@@ -33,6 +36,10 @@ from psfdae.estimators.training import TrainingError, train
 
 FIT = load((), "alignment").fit
 EXACT = FIT.model_copy(update={"iterations": 25, "tolerance": 1e-7})
+
+
+def _likelihood(model, operator, noise, level, emulator=None, kind=Likelihood):
+    return kind(partial(stamps_and_slopes, model, operator, emulator=emulator), noise, level)
 
 
 @pytest.fixture(scope="module")
@@ -287,7 +294,7 @@ def test_decentre_and_tilt_errors_are_correlated_with_the_signs_of_coma(
 def test_gauss_newton_recovers_a_noise_free_state(model, exact_operator, noise):
     truth = np.array([[0.3, -0.5, 0.4, 0.2], [0.9, 0.8, -0.7, -0.95]])
     images = exact_operator(model(truth))[0]
-    likelihood = Likelihood(model, exact_operator, noise, 0.002)
+    likelihood = _likelihood(model, exact_operator, noise, 0.002)
     found = fit_states(likelihood, images, truth + 0.08, EXACT)
     assert found.converged.all()
     assert found.states == pytest.approx(truth, abs=1e-6)
@@ -299,7 +306,7 @@ def test_score_is_the_slope_of_the_likelihood(model, exact_operator, noise, stat
     rng = np.random.default_rng(2)
     stamps = exact_operator(model(truth))[0]
     images = noise.draw(stamps, 0.005, rng)
-    likelihood = Likelihood(model, exact_operator, noise, 0.005)
+    likelihood = _likelihood(model, exact_operator, noise, 0.005)
     score = likelihood.evaluate(images, truth)[1][0]
     step = 1e-5
     for axis in range(4):
@@ -314,8 +321,8 @@ def test_scatter_of_the_fit_is_the_bound(model, config, noise, states, stamps, m
     operator = AlignmentStamps(config.telescope, config.optics, config.alignment, movable)
     level = 2e-4
     images = noise.draw(stamps, level, np.random.default_rng(7))
-    likelihood = Likelihood(model, operator, noise, level)
-    found = fit_states(likelihood, images, states + 0.01, FIT)
+    likelihood = _likelihood(model, operator, noise, level)
+    found = fit_states(likelihood, images, parameters_of(model, operator, states + 0.01), FIT)
     covariances = bound_covariances(model, operator, noise, [level], states)[0]
     error = found.states[:, :4] - states
     chi2 = np.einsum("nk,nkl,nl->", error, np.linalg.inv(covariances), error)
@@ -336,7 +343,9 @@ class Uphill(Likelihood):
 def test_a_step_that_damping_made_small_is_no_convergence(model, operator, noise, stamps):
     start = np.array([[0.5, 0.5, 0.5, 0.5], [0.01, 0.01, 0.01, 0.01]])
     settings = FIT.model_copy(update={"tolerance": 0.05})
-    found = fit_states(Uphill(model, operator, noise, 0.002), stamps[:2], start, settings)
+    found = fit_states(
+        _likelihood(model, operator, noise, 0.002, kind=Uphill), stamps[:2], start, settings
+    )
     assert found.converged.tolist() == [False, True]
     # A short step is taken without another look.
     assert found.states == pytest.approx(np.array([start[0], 2 * start[1]]))
@@ -353,7 +362,8 @@ def test_free_flux_and_place_are_recovered(model, exact_operator, config, noise)
     still = exact_operator(model(truth))[0]
     assert images.sum(axis=(2, 3))[0] == pytest.approx(1 + given[0, 4::3])
     assert np.abs(images - still).max() > 0.01
-    found = fit_states(Likelihood(model, movable, noise, 0.002), images, truth + 0.08, EXACT)
+    start = parameters_of(model, movable, truth + 0.08)
+    found = fit_states(_likelihood(model, movable, noise, 0.002), images, start, EXACT)
     assert found.converged.all()
     assert found.states == pytest.approx(given, abs=1e-6)
 
@@ -393,55 +403,77 @@ def test_fit_stays_near_the_range(model, operator, noise):
     stamps = operator(model(truth))[0]
     images = noise.draw(stamps, 0.02, np.random.default_rng(3))
     settings = FIT.model_copy(update={"limit": 1.0})
-    found = fit_states(Likelihood(model, operator, noise, 0.02), images, truth, settings)
+    found = fit_states(_likelihood(model, operator, noise, 0.02), images, truth, settings)
     assert np.abs(found.states).max() <= 1.0
 
 
 @pytest.fixture(scope="module")
-def coarse(config):
-    """The optics of all steps but the last."""
-    optics = config.optics.model_copy(update={"pupil_samples": FIT.pupil_samples})
-    return AlignmentStamps(config.telescope, optics, config.alignment, narrow=True)
+def emulator(model, config, operator):
+    """Of all steps but the last, as the workflow makes it but for the states' numbers."""
+    train = uniform_states(config.alignment.train_states, np.random.default_rng(1))
+    return StampEmulator(model, operator, train, operator(model(train))[0], FIT)
 
 
-def test_coarse_optics_err_by_a_part_of_a_standard_error(
-    model, operator, coarse, noise, states, stamps
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("scale", "least", "most", "noisy"), [(1.0, 0.03, 0.07, 0.15), (1.1, 0.05, 0.3, 0.5)]
+)
+def test_emulator_errs_by_a_part_of_a_standard_error(
+    model, operator, emulator, noise, scale, least, most, noisy
 ):
-    """By what their stamps move a fit, and by what their slopes make noise of it."""
-    slopes, theirs = (stamps_and_slopes(model, o, states)[1] for o in (operator, coarse))
-    error, variance = coarse(model(states))[0] - stamps, noise.variance(stamps, 0.002)
-    score, fisher = score_and_information(error, slopes, variance)
+    """By what its stamps move a fit, and by what its slopes make noise of it."""
+    states = scale * uniform_states(150, np.random.default_rng(6))
+    stamps, slopes = stamps_and_slopes(model, operator, states)
+    about, theirs = emulator(states)
+    variance = noise.variance(stamps.astype(np.float64), 0.002)
+    score, fisher = score_and_information(about - stamps, slopes, variance)
     covariance = np.linalg.inv(fisher)
-    shift = np.sqrt(np.einsum("nk,nkl,nl->n", score, covariance, score))
-    assert 0.02 < np.median(shift) < 0.25
-    assert shift.max() < 1.0
-    spread = score_and_information(error, theirs - slopes, variance)[1]
+    sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    shift = np.einsum("nkl,nl->nk", covariance, score) / sigma
+    assert least < np.sqrt(np.mean(shift**2)) < most
+    assert np.median(np.abs(shift)) < 0.05
+    assert np.abs(shift).max() < 1.0
+    spread = score_and_information(about - stamps, theirs - slopes, variance)[1]
     wander = np.sqrt(np.einsum("nkl,nlk->n", spread, covariance))
-    assert 0.01 < np.median(wander) < 0.2
+    assert 0.05 < np.median(wander) < noisy
 
 
+@pytest.mark.slow
 def test_last_step_reaches_the_maximum_of_the_exact_optics(
-    model, config, operator, coarse, noise, states, stamps
+    model, operator, emulator, noise, states, stamps
 ):
-    states, level = states[:10], 0.002
-    images = noise.draw(stamps[:10], level, np.random.default_rng(8))
-    mixed = AlignmentStamps(config.telescope, config.optics, config.alignment, coarse=coarse)
-    near, last, exact = (Likelihood(model, o, noise, level) for o in (coarse, mixed, operator))
-    first = fit_states(near, images, states + 0.02, FIT)
+    level = 0.002
+    images = noise.draw(stamps, level, np.random.default_rng(8))
+    last, exact = (_likelihood(model, operator, noise, level, e) for e in (emulator, None))
+    first = fit_states(Likelihood(emulator, noise, level), images, states + 0.02, FIT)
     found = fit_states(last, images, first.states, FIT)
     best = fit_states(exact, images, found.states, FIT.model_copy(update={"tolerance": 0.01}))
     assert found.converged.all()
-    assert found.evaluations.mean() < 1.5
+    assert found.evaluations.mean() < 1.2
     sigma = np.sqrt(np.diagonal(np.linalg.inv(best.fisher), axis1=1, axis2=2))
     off = [np.sqrt(np.mean(((f.states - best.states) / sigma) ** 2)) for f in (first, found)]
-    assert off[1] < 0.05 < off[0]
+    assert 0.01 < off[1] < 0.06 < off[0] < 0.12
     # The gain of a step that is not looked at.
-    assert found.deviance == pytest.approx(best.deviance, abs=0.05)
+    assert found.deviance == pytest.approx(best.deviance, abs=0.3)
 
 
-def test_start_far_beyond_the_range_is_safe(model, coarse, noise, stamps):
+def test_emulator_of_few_states(model, operator, states, stamps):
+    """Stamps that it was given come back, in all mirror images; derivatives are differences."""
+    settings = FIT.model_copy(update={"outer_states": 5})
+    emulator = StampEmulator(model, operator, states, stamps, settings)
+    mirror = mirror_symmetries(8)[3]
+    known, slopes = emulator(mirror.states(states))
+    assert known == pytest.approx(mirror.stamps(stamps), abs=2e-3)
+    assert slopes.sum(axis=(-2, -1)) == pytest.approx(0, abs=1e-3)
+    step, asked = 1e-3 * np.eye(4)[2], states[:4] * 0.9
+    expected = (emulator(asked + step)[0] - emulator(asked - step)[0]) / 2e-3
+    off = np.abs(emulator(asked)[1][:, :, 2] - expected)
+    assert off.max() < 0.1 * np.abs(expected).max()
+
+
+def test_start_far_beyond_the_range_is_safe(model, operator, noise, stamps):
     images, start = stamps[:2], np.array([[9.0, -9.0, 9.0, -9.0], [1.25, 1.25, 1.25, 1.25]])
-    likelihood = Likelihood(model, coarse, noise, 0.005)
+    likelihood = _likelihood(model, operator, noise, 0.005)
     found = fit_states(likelihood, images, start, FIT)
     before = likelihood.evaluate(images, np.clip(start, -FIT.limit, FIT.limit))[0]
     assert np.abs(found.states).max() <= FIT.limit
@@ -469,16 +501,14 @@ def test_wrong_twin_is_left_for_the_more_likely_state(model, config, noise, mova
     tilt = np.array([[0.1, 0.12]])
     truth = np.hstack([coma_free_decentre(model, tilt, noll), tilt])
     images, _ = stamps_and_slopes(model, operator, parameters_of(model, operator, truth))
-    likelihood = Likelihood(model, operator, noise, 0.002)
+    likelihood = _likelihood(model, operator, noise, 0.002)
     settings = FIT.model_copy(update={"tolerance": 0.05})
     # A fit that stopped at the twin.
-    stuck = fit_states(
-        likelihood,
-        images,
-        twin_states(model, truth, noll),
-        settings.model_copy(update={"iterations": 1}),
-    )
-    found, tried = refit_twins(likelihood, images, stuck, noll, settings)
+    twin = parameters_of(model, operator, twin_states(model, truth, noll))
+    once = settings.model_copy(update={"iterations": 1})
+    stuck = fit_states(likelihood, images, twin, once)
+    others = twin_states(model, stuck.states, noll)
+    found, tried = refit_twins(likelihood, images, stuck, others, settings)
     assert tried.all()
     assert found.states[:, :4] == pytest.approx(truth, abs=2e-3)
     assert found.deviance[0] < stuck.deviance[0]

@@ -106,7 +106,17 @@ def tables(products):
         out = at / f"fit_{level}.h5"
         chosen = ("--level", level, "--network", at / "noise_trained", "--out", out)
         times = ("--times", out.with_suffix(".csv"))
-        _run("fit", *test, *model, *chosen, *times, *PRESET, "fit.iterations=1")
+        _run(
+            "fit",
+            *test,
+            *model,
+            "--train",
+            at / "train.h5",
+            *chosen,
+            *times,
+            *PRESET,
+            "fit.iterations=1",
+        )
         given += ["--fit", out]
     out = ("--errors", at / "errors.csv", "--correlation", at / "correlation.csv")
     _run("tables", "--states", at / "uniform.h5", *given, *out)

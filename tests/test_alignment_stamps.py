@@ -99,22 +99,6 @@ def test_period_sampling_integrates_pixels_exactly(tracer, exact, config):
     assert errors[2] < 1e-7
 
 
-def test_pixels_beyond_the_period_stay_dark(tracer, exact, config):
-    """A narrow period repeats nothing inside the stamp, and holds all light."""
-    zernikes, pixel = shown_zernikes(tracer)[:1] * 0.5, config.telescope.pixel
-    pupil = annular_pupil(62, OBSCURATION)
-    sampling = PeriodSampling(pupil, 16, pixel, "complex128", narrow=True)
-    stamp = ModalStamps(pupil, partial(centred_modes, 22, OBSCURATION), sampling, pixel).stamps(
-        zernikes
-    )[0]
-    dark = np.abs((np.arange(16) - 7.5) * pixel) > 31
-    assert dark.sum() == 8
-    assert not stamp[dark].any() and not stamp[:, dark].any()
-    inside = np.ix_(~dark, ~dark)
-    whole = exact.operator(254).stamps(zernikes)[0]
-    assert stamp[inside] == pytest.approx(whole[inside], abs=3e-3 * whole.max())
-
-
 @pytest.mark.parametrize("kind", ["nodes", "period"])
 def test_derivatives_by_coefficients_are_differences(kind):
     pupil = annular_pupil(48, 0.3)

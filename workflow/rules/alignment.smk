@@ -173,6 +173,7 @@ use rule alignment_bound as alignment_estimate with:
 use rule alignment_bound as alignment_fit with:
     input:
         states=f"{ALIGNMENT_DATA}/{{test_set}}.h5",
+        train=f"{ALIGNMENT_DATA}/train.h5",
         model=rules.alignment_model.output,
         network=f"{ALIGNMENT}/{METHODS['max_likelihood'].network}/network.safetensors",
     output:

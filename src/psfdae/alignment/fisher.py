@@ -12,11 +12,16 @@ the state the three of each stamp in turn, what is missing to its flux relative 
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from psfdae.alignment.stamps import AlignmentStamps
 from psfdae.alignment.telescope import QuadraticModel
 from psfdae.stars.noise import NoiseModel
+
+Stamps = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+"""Of parameters (n, K) stamps and derivatives, as `stamps_and_slopes` gives them."""
 
 CHUNK = 64
 """States whose derivatives are in memory at a time."""
@@ -34,21 +39,30 @@ def parameters_of(
 
 
 def stamps_and_slopes(
-    model: QuadraticModel, operator: AlignmentStamps, parameters: np.ndarray
+    model: QuadraticModel,
+    operator: AlignmentStamps,
+    parameters: np.ndarray,
+    emulator: Stamps | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Stamps (n, F, d, d), and their derivatives by the k parameters of each, (n, F, k, d, d).
 
     These are the four of the state and, if the stamps are movable, the stamp's own three.
+    Those by the state are an emulator's, if there is one, and then of stars in their place.
     """
     states, own = parameters[:, :4], parameters[:, 4:]
     zernikes, directions = model(states), model.jacobian(states)
-    if not operator.movable:
-        return operator.derivatives(zernikes, directions)
-    own = own.reshape(*zernikes.shape[:2], 3)
-    zernikes = np.concatenate([zernikes, own[:, :, 1:]], axis=2)
-    directions = np.pad(directions, ((0, 0), (0, 0), (0, 2), (0, 2)))
-    directions[:, :, [4, 5], [-2, -1]] = 1.0
+    if emulator is not None:
+        directions = directions[:, :, :0]
+    if operator.movable:
+        own = own.reshape(*zernikes.shape[:2], 3)
+        zernikes = np.concatenate([zernikes, own[:, :, 1:]], axis=2)
+        directions = np.pad(directions, ((0, 0), (0, 0), (0, 2), (0, 2)))
+        directions[:, :, [-2, -1], [-2, -1]] = 1.0
     shapes, slopes = operator.derivatives(zernikes, directions)
+    if emulator is not None:
+        slopes = np.concatenate([emulator(states)[1], slopes], axis=2)
+    if not operator.movable:
+        return shapes, slopes
     flux = 1.0 + own[:, :, :1, None]
     slopes = np.concatenate([slopes[:, :, :4], shapes[:, :, None], slopes[:, :, 4:]], axis=2)
     slopes[:, :, [0, 1, 2, 3, 5, 6]] *= flux[:, :, None]

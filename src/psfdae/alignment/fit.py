@@ -4,9 +4,8 @@ Fisher scoring: Gauss–Newton steps with the Fisher matrix of the current state
 damped after Levenberg where a step does not raise the likelihood. With the
 variance (κλ)² + p/F its fixed point is the maximum of the Poisson likelihood.
 
-Most of the way goes by a coarse sampling of the pupil, which costs a fraction and whose
-maximum is a part of a standard error off; the last step goes by stamps of the optics that
-made the data.
+It knows stamps by a function: an emulator takes it most of the way, whose maximum is a part
+of a standard error off; the last step goes by stamps of the optics that made the data.
 """
 
 from __future__ import annotations
@@ -16,14 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from psfdae.alignment.fisher import (
-    parameters_of,
-    score_and_information,
-    stamps_and_slopes,
-    twin_states,
-)
-from psfdae.alignment.stamps import AlignmentStamps
-from psfdae.alignment.telescope import QuadraticModel
+from psfdae.alignment.fisher import Stamps, score_and_information
 from psfdae.configuration.alignment import Fit
 from psfdae.stars.noise import NoiseModel
 
@@ -38,8 +30,7 @@ DAMPING_FACTOR = 10.0
 class Likelihood:
     """Poisson likelihood of stamps at one noise level λ, known to the fit."""
 
-    model: QuadraticModel
-    operator: AlignmentStamps
+    stamps: Stamps
     noise: NoiseModel
     level: float
 
@@ -51,7 +42,7 @@ class Likelihood:
         `images`, shape (n, F, d, d), are noisy and normalised by the true flux. K is 4,
         or more with movable stamps (`psfdae.alignment.fisher`).
         """
-        stamps, slopes = stamps_and_slopes(self.model, self.operator, states)
+        stamps, slopes = self.stamps(states)
         expected, observed = stamps.astype(np.float64), images.astype(np.float64)
         variance = self.noise.variance(expected, self.level)
         score, fisher = score_and_information(observed - expected, slopes, variance)
@@ -109,13 +100,12 @@ def fit_states(
     likelihood : Likelihood
     images : ndarray, shape (n, F, d, d)
         Noisy stamps, normalised by the true flux.
-    start : ndarray, shape (n, 4) or (n, K)
+    start : ndarray, shape (n, K)
         In units of the range; limited to ± `settings.limit`, as are all parameters.
     settings : config group `fit`
     """
     count, limit = len(start), settings.limit
-    states = parameters_of(likelihood.model, likelihood.operator, np.asarray(start, np.float64))
-    states = np.clip(states, -limit, limit)
+    states = np.clip(np.asarray(start, np.float64), -limit, limit)
     now = Fits(
         states, *likelihood.evaluate(images, states), np.ones(count, int), np.zeros(count, bool)
     )
@@ -164,7 +154,7 @@ def _damped_step(now: Fits, active: np.ndarray, damping: np.ndarray, limit: floa
 
 
 def refit_twins(
-    likelihood: Likelihood, images: np.ndarray, first: Fits, noll: np.ndarray, settings: Fit
+    likelihood: Likelihood, images: np.ndarray, first: Fits, twins: np.ndarray, settings: Fit
 ) -> tuple[Fits, np.ndarray]:
     """Fit again from the twins that lie within the limit; keep what is more likely.
 
@@ -172,9 +162,8 @@ def refit_twins(
     ----------
     likelihood, images, settings : see `fit_states`
     first : Fits
-        Whose twins are tried.
-    noll : ndarray of int
-        Noll indices of the model's coefficients.
+    twins : ndarray, shape (n, K)
+        Of their states.
 
     Returns
     -------
@@ -182,7 +171,6 @@ def refit_twins(
         `evaluations` count both fits.
     tried : ndarray of bool, shape (n,)
     """
-    twins = twin_states(likelihood.model, first.states, noll)
     tried = (np.abs(twins) <= settings.limit).all(axis=1)
     best = deepcopy(first)
     if tried.any():

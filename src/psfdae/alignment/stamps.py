@@ -96,10 +96,6 @@ class AlignmentStamps:
     telescope, optics, alignment : config groups
     movable : bool
         Two more coefficients, the last, move the stamp's star along x and y, in pixels.
-    narrow : bool
-        The period of a grid may be narrower than the stamp, whose outer pixels stay dark then.
-    coarse : AlignmentStamps, optional
-        Of which the derivatives are, which may err more than stamps.
     """
 
     def __init__(
@@ -108,8 +104,6 @@ class AlignmentStamps:
         optics: AlignmentOptics,
         alignment: Alignment,
         movable: bool = False,
-        narrow: bool = False,
-        coarse: AlignmentStamps | None = None,
     ) -> None:
         self.telescope = telescope
         self.optics = optics
@@ -117,8 +111,6 @@ class AlignmentStamps:
         self.noll = np.arange(FIRST_NOLL, alignment.highest_zernike + 1)
         """Noll indices of the J coefficients."""
         self.movable = movable
-        self.narrow = narrow
-        self.coarse = coarse
         self._modes: Modes = partial(
             centred_modes, alignment.highest_zernike, telescope.obscuration
         )
@@ -171,7 +163,7 @@ class AlignmentStamps:
             In waves.
         directions : ndarray, shape (..., K, J)
             Changes of the coefficients per unit parameter, such as
-            `psfdae.alignment.telescope.QuadraticModel.jacobian`.
+            `psfdae.alignment.telescope.QuadraticModel.jacobian`; of none, stamps alone are made.
 
         Returns
         -------
@@ -185,9 +177,9 @@ class AlignmentStamps:
         SamplingError, EnergyError
             As for stamps.
         """
-        if self.coarse:
-            return self(zernikes)[0], self.coarse.derivatives(zernikes, directions)[1]
         shape, count = zernikes.shape[:-1], directions.shape[-2]
+        if not count:
+            return self(zernikes)[0], self._empty(*shape, 0)
         zernikes, directions = (
             a.reshape(-1, *a.shape[len(shape) :]) for a in (zernikes, directions)
         )
@@ -209,11 +201,9 @@ class AlignmentStamps:
         ------
         SamplingError
             If the ladder ends below what a wavefront needs: half a wave per
-            sample, and no replica of the image on what is lit of the stamp.
+            sample, and no replica of the image on the stamp.
         """
         half = 0.5 * self.alignment.stamp_px * self.telescope.pixel
-        if self.narrow:
-            half = min(half, 0.5 * self.optics.pupil_samples[0])
         reach = np.broadcast_to([-half, half], (2, 2))
         needed = required_samples(slope_ranges(self._slopes, zernikes), reach)
         return choose_samples(needed, tuple(self.optics.pupil_samples))
@@ -225,7 +215,7 @@ class AlignmentStamps:
             side, nodes = self.alignment.stamp_px, self.optics.nodes
             precision = self.optics.precision
             sampling: Sampling = (
-                PeriodSampling(pupil, side, pixel, precision, self.narrow)
+                PeriodSampling(pupil, side, pixel, precision)
                 if nodes is None
                 else NodeSampling(pupil, side, pixel, nodes, precision)
             )

@@ -155,9 +155,10 @@ class NetworkTrain(Group):
 class Fit(Group):
     """Maximum-likelihood fit of a state."""
 
-    pupil_samples: PupilSamples = Field(
-        description="Ladder of grid sizes N of all but the last step"
+    neighbours: Annotated[int, Field(ge=5, le=1000)] = Field(
+        description="Computed states that a stamp is interpolated from, in all but the last step"
     )
+    outer_states: Count = Field(description="States beyond the range that are computed for it")
     iterations: Count = Field(description="Most steps of a fit")
     tolerance: Positive = Field(
         description="A step of this many standard errors or fewer is the last"

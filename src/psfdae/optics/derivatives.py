@@ -60,17 +60,10 @@ class PeriodSampling:
     With lags l of the pupil's samples, |E(u)|² = Σ_l c_l exp(−πi l·spacing·u); the
     integral over a pixel multiplies c_l by the pixel's width and a sinc. Twice as
     many points as samples determine all c_l. Pixels beyond the period repeat those
-    inside; `narrow` leaves them dark.
+    inside.
     """
 
-    def __init__(
-        self,
-        pupil: Pupil,
-        stamp_px: int,
-        pixel: float,
-        precision: Precision,
-        narrow: bool = False,
-    ) -> None:
+    def __init__(self, pupil: Pupil, stamp_px: int, pixel: float, precision: Precision) -> None:
         samples = pupil.axis.size
         self.points = fft.next_fast_len(2 * samples)
         lags = np.arange(1 - samples, samples)
@@ -79,7 +72,6 @@ class PeriodSampling:
         to_pixels = (
             pixel * np.sinc(frequency * pixel) * np.exp(-2j * np.pi * np.outer(centres, frequency))
         )
-        to_pixels[narrow & (np.abs(centres) * pupil.spacing > 1.0)] = 0.0
         from_points = np.exp(2j * np.pi * np.outer(lags, np.arange(self.points)) / self.points)
         self.pixels = (to_pixels @ from_points).real / self.points
         self.pixels = self.pixels.astype(np.empty(0, precision).real.dtype)

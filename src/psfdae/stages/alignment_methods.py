@@ -286,36 +286,44 @@ def fit(
     test_set: TestSet,
     level: Annotated[float, AboveZero, "Noise level λ."],
     states: StatesFile,
+    train: Annotated[File, "Product of `alignment states --set train`: most steps go by it."],
     model: ModelFile,
     network: Annotated[Folder, "Folder of the network that starts the fit."],
     out: Annotated[File, "HDF5 product with the fits."],
     times: Annotated[File, "CSV that receives the run time."],
 ) -> None:
     """Fit the states of a test set by maximum likelihood."""
+    from psfdae.alignment.emulator import StampEmulator
+    from psfdae.alignment.fisher import parameters_of, stamps_and_slopes, twin_states
     from psfdae.alignment.fit import Likelihood, fit_states, refit_twins
 
     limit_threads(1)
-    product = read_product(states, "alignment_states", ("states", "stamps", "noll"))
-    require(states, product.config, STATE_STAMPS, config)
+    product, many = (
+        read_product(path, "alignment_states", ("states", "stamps", "noll"))
+        for path in (states, train)
+    )
+    for given in (product, many):
+        require(given.path, given.config, STATE_STAMPS, config)
     wavefronts = read_model(model, product.config, states)
     require_network(network, product)
     predict = network_predictor(network, config)
     stamps = noisy_test_states(config, product["stamps"], test_set, level)
     fits: dict[str, list[np.ndarray]] = defaultdict(list)
     rows, methods = [], of_set(FITTED, test_set)
-    sampled = config.optics.model_copy(
-        update={"pupil_samples": config.fit.pupil_samples, "nodes": None}
-    )
-    operator = partial(AlignmentStamps, config.telescope, alignment=config.alignment)
+    operator = partial(AlignmentStamps, config.telescope, config.optics, config.alignment)
+    emulator = StampEmulator(wavefronts, operator(), many["states"], many["stamps"], config.fit)
     for method in methods:
-        rough = operator(sampled, movable=method.free, narrow=True)
-        operators = rough, operator(config.optics, movable=method.free, coarse=rough)
-        coarse, exact = (Likelihood(wavefronts, o, noise_model(config), level) for o in operators)
+        own = operator(movable=method.free)
+        optics = partial(stamps_and_slopes, wavefronts, own, emulator=emulator)
+        exact = Likelihood(optics, noise_model(config), level)
+        # The emulator knows stars in their place only.
+        near = exact if method.free else replace(exact, stamps=emulator)
         started = time.perf_counter()
         start = predict(stamps)
-        first = fit_states(coarse, stamps, start, config.fit)
+        first = fit_states(near, stamps, parameters_of(wavefronts, own, start), config.fit)
         # In focus, a state and its twin have nearly the same stamps.
-        best, twins = refit_twins(coarse, stamps, first, product["noll"], config.fit)
+        others = twin_states(wavefronts, first.states, product["noll"])
+        best, twins = refit_twins(near, stamps, first, others, config.fit)
         found = fit_states(exact, stamps, best.states, config.fit)
         seconds = time.perf_counter() - started
         rows.append((test_set, level, method.name, seconds, len(stamps)))
@@ -328,7 +336,7 @@ def fit(
     about = {
         "estimates": f"[method, state, number] maximum of the likelihood; {_names(methods)}",
         "deviance": "twice the log-likelihood missing to a perfect fit",
-        "evaluations": "[method, (coarse, exact), state] stamps and derivatives computed",
+        "evaluations": "[method, (before, last step), state] stamps and derivatives computed",
         "converged": "ended by the tolerance",
         "twin_tried": "the twin was a starting point, too",
         "twin_won": "and the better one",
