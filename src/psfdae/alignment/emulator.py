@@ -25,7 +25,7 @@ NUGGET = 1e-8
 
 
 class StampEmulator:
-    """Stamps of states and their derivatives, at a twentieth of the cost of the optics.
+    """Stamps of states and their derivatives, at a small part of the cost of the optics.
 
     Parameters
     ----------
