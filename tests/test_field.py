@@ -171,6 +171,15 @@ def test_without_noise_the_data_come_back_and_without_data_the_field(field):
     assert (hopeless.sigma > found.sigma).all()
 
 
+def test_bright_stars_are_as_sure_as_said(field):
+    """A sky that is not known costs them little."""
+    some = Faint(100, 2000.0)
+    free, known = (some.measured(field, sky=sky) for sky in (None, np.full(100, 3.0)))
+    ratio = np.median(free.sigma / known.sigma, axis=(1, 2))
+    assert ((ratio > 0.9) & (ratio < 1.3)).all()
+    assert 0.5 < some.mse(free) / np.square(free.sigma, dtype=float).mean() < 2
+
+
 def test_flux_and_sky_that_are_known_are_taken(field):
     some = Faint(300, 5.0)
     known = some.measured(field, flux=np.full(300, 1000.0), sky=np.full(300, 3.0))
@@ -189,6 +198,16 @@ def test_stars_do_not_influence_each_other(field):
     half = field.measure(some.stamps[::2], some.sigma[::2], some.position[::2])
     assert half.psf == pytest.approx(every.psf[::2], abs=1e-7)
     assert half.measured.flux == pytest.approx(every.measured.flux[::2], rel=1e-9)
+
+
+def test_stars_are_restored_in_groups_that_do_not_matter(field, monkeypatch):
+    each = [Faint(40, snr) for snr in (5.0, 50.0, 500.0, 5000.0)]
+    told = [np.concatenate([getattr(some, n) for some in each]) for n in ("stamps", "sigma")]
+    whole = field.measure(*told)
+    monkeypatch.setattr("psfdae.estimators.field.KEPT", 1.0)
+    few = fitted(bright()).measure(*told)
+    assert few.psf == pytest.approx(whole.psf, abs=1e-7)
+    assert few.measured.flux == pytest.approx(whole.measured.flux, rel=1e-9)
 
 
 def test_bad_stamps_are_refused(field):

@@ -430,7 +430,7 @@ class FieldMixture(Method):
         return node[k]
 
     def _factored(self, node: Node, kind: Kind) -> Factor:
-        from scipy.linalg import solve_triangular
+        from scipy.linalg.blas import dtrsm
 
         s, pixels = float(np.exp(STEP * kind.number)), len(node.diagonal)
         # A sky of the whole flux in each pixel is as good as unknown.
@@ -438,8 +438,9 @@ class FieldMixture(Method):
         latent = width[:, None] * np.vstack([np.ones(pixels), node.slope])
         rows = np.vstack([latent, node.rows, *([] if kind.placed else [node.spread])])
         d = node.diagonal + s
-        cholesky = np.linalg.cholesky(np.eye(len(rows)) + (rows / d) @ rows.T)
-        low = solve_triangular(cholesky, rows / d, lower=True)
+        weighted = rows / d
+        cholesky = np.linalg.cholesky(np.eye(len(rows)) + weighted @ rows.T)
+        low = dtrsm(1.0, cholesky.T, weighted.T, side=1).T  # a third of solve_triangular's time
         factor = Factor(
             s=s,
             inverse=1.0 / d,
@@ -451,8 +452,10 @@ class FieldMixture(Method):
             variance=d,
         )
         solved = factor.solve(latent, latent @ low.T)
-        left = np.eye(3) - latent @ solved.T
-        inverse = factor.inverse - np.square(low).sum(axis=0)  # diagonal of S⁻¹
+        # The same as I − latent S⁻¹ latentᵀ, which loses all digits for bright stars.
+        root = dtrsm(1.0, cholesky, np.eye(len(rows), 3), lower=1)
+        left = root.T @ root
+        inverse = factor.inverse - np.einsum("ij,ij->j", low, low)  # diagonal of S⁻¹
         variance = s - s**2 * inverse + width[0] ** 2 * left[0, 0] - 2 * s * width[0] * solved[0]
         return factor._replace(latent_left=left, variance=np.maximum(variance, 0.0))
 
@@ -548,7 +551,12 @@ class FieldMixture(Method):
                     near = np.square(self.places - at[part, None]).sum(axis=-1).argmin(axis=1)
                     alone = np.where(np.arange(len(self.places)) == near[:, None], 0.0, -np.inf)
                     some = some._replace(centre=at[part], prior=alone)
-                found[part], covariance[part] = self._restored(some)
+                start = self._start(some)
+                for alike in self._alike(some, start[0]):
+                    rest = (a[alike] for a in start)
+                    found[part[alike]], covariance[part[alike]] = self._restored(
+                        some.of(alike), *rest
+                    )
         values, psf, sigma = np.split(found, [5, 5 + images.shape[1]], axis=1)
         measured = Measured(
             flux=values[:, 1],
@@ -608,9 +616,19 @@ class FieldMixture(Method):
         near = np.isfinite(score) & (score >= least[:, None])
         return flux[rows, best], near, 1.0 / np.sqrt(square[rows, best])
 
-    def _restored(self, stars: Stars) -> tuple[np.ndarray, np.ndarray]:
-        """Evidence, flux, sky, row and column, PSF and its σ (n, 5 + 2P); covariance (n, 4, 4)."""
-        guess, near, width = self._start(stars)
+    def _alike(self, stars: Stars, guess: np.ndarray) -> list[np.ndarray]:
+        """Numbers of stars whose kinds of factorisations are kept through all rounds."""
+        number = np.log(stars.noise / np.maximum(guess, stars.noise)) * 2 / STEP
+        _, which = np.unique(number // max(1, self._most - 2), return_inverse=True)
+        return [np.flatnonzero(which == index) for index in range(which.max(initial=-1) + 1)]
+
+    def _restored(
+        self, stars: Stars, guess: np.ndarray, near: np.ndarray, width: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Evidence, flux, sky, row and column, PSF and its σ (n, 5 + 2P); covariance (n, 4, 4).
+
+        The rest is what `_start` has for these stars.
+        """
         known = np.isfinite(stars.flux) & (stars.flux > 0)
         precision = np.where(known, SURE, LOOSE) ** -2.0
         for _ in range(ROUNDS):
