@@ -180,6 +180,20 @@ def test_bright_stars_are_as_sure_as_said(field):
     assert 0.5 < some.mse(free) / np.square(free.sigma, dtype=float).mean() < 2
 
 
+@pytest.mark.parametrize("snr", SNR)
+def test_strangeness_has_the_law_of_chi2_and_tells_blends(field, snr):
+    some = Faint(400, snr)
+    rows = 2 + len(field.modes[0])  # those of the centre, and modes
+    here, nowhere = some.measured(field), field.measure(some.stamps, some.sigma)
+    for found in (here, nowhere):
+        assert np.median(found.strangeness) == pytest.approx(rows, rel=0.2)
+        assert (found.strangeness < rows + 8 * np.sqrt(2 * rows)).mean() > 0.99
+    blend = 0.8 * some.psf + 0.2 * np.roll(some.psf, 3, axis=2)
+    strange = field.measure(1000 * (blend + some.noise / 1000), some.sigma, some.position)
+    if snr == 50:
+        assert np.median(strange.strangeness) > np.quantile(here.strangeness, 0.99)
+
+
 def test_flux_and_sky_that_are_known_are_taken(field):
     some = Faint(300, 5.0)
     known = some.measured(field, flux=np.full(300, 1000.0), sky=np.full(300, 3.0))
@@ -326,6 +340,7 @@ def test_predict_measures_flux_and_centre_with_their_errors(image):
     """The bundle is small, and the list of the training says how good this one is."""
     stars, uncertainty = predicted(image)
     known = image[2]
+    assert np.isfinite(stars["strangeness"]).all()
     assert image[1].stat().st_size < 5e6
     assert (stars["flags"] == 0).mean() > 0.95
     assert abs(np.mean(stars["flux"] / known["inside"]) - 1) < 0.005

@@ -77,6 +77,9 @@ LISTED = 5
 AT_ONCE = 1024
 """Stars that are restored together."""
 
+LEAST_SEEN = 1e-9
+"""Variance of a mode over that of noise in it."""
+
 KEPT = 200e6
 """Bytes of factorisations that are kept for further stars."""
 
@@ -151,6 +154,8 @@ class Factor(NamedTuple):
         Covariance of these once the star is seen, and a known.
     variance : ndarray, shape (P,)
         The same of the pixels of the star.
+    whitening : ndarray, shape (R, R)
+        Its solution for `low` times a star is white, if the star follows the law of the rows.
     """
 
     s: float
@@ -161,6 +166,7 @@ class Factor(NamedTuple):
     scale: np.ndarray
     latent_left: np.ndarray
     variance: np.ndarray
+    whitening: np.ndarray
 
     def solve(self, rows: np.ndarray, low: np.ndarray) -> np.ndarray:
         """S⁻¹ of rows (n, P) of which `low` times them (n, R) is known."""
@@ -450,6 +456,9 @@ class FieldMixture(Method):
             scale=width,
             latent_left=np.eye(3),
             variance=d,
+            whitening=np.linalg.cholesky(
+                cholesky.T @ cholesky - (1.0 - LEAST_SEEN) * np.eye(len(rows))
+            ),
         )
         solved = factor.solve(latent, latent @ low.T)
         # The same as I − latent S⁻¹ latentᵀ, which loses all digits for bright stars.
@@ -542,7 +551,7 @@ class FieldMixture(Method):
             *(self._prior(listed), None, flux, np.isfinite(sky)),
         )
         known = np.isfinite(listed).all(axis=1) & fixed
-        found = np.empty((count, 5 + 2 * images.shape[1]))
+        found = np.empty((count, 6 + 2 * images.shape[1]))
         covariance = np.empty((count, 4, 4))
         for at, rows in ((None, ~known), (listed, known)):
             for part in _parts(np.flatnonzero(rows)):
@@ -557,11 +566,11 @@ class FieldMixture(Method):
                     found[part[alike]], covariance[part[alike]] = self._restored(
                         some.of(alike), *rest
                     )
-        values, psf, sigma = np.split(found, [5, 5 + images.shape[1]], axis=1)
+        values, psf, sigma = np.split(found, [6, 6 + images.shape[1]], axis=1)
         measured = Measured(
             flux=values[:, 1],
             background=values[:, 2] + level,
-            centre=values[:, 3:] - self._list_offset,
+            centre=values[:, 3:5] - self._list_offset,
             covariance=covariance,
         )
         return Estimate(
@@ -569,6 +578,7 @@ class FieldMixture(Method):
             sigma=sigma.reshape(stamps.shape).astype(np.float32),
             evidence=values[:, 0],
             measured=measured,
+            strangeness=values[:, 5],
         )
 
     @cached_property
@@ -625,9 +635,10 @@ class FieldMixture(Method):
     def _restored(
         self, stars: Stars, guess: np.ndarray, near: np.ndarray, width: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Evidence, flux, sky, row and column, PSF and its σ (n, 5 + 2P); covariance (n, 4, 4).
+        """What stars are (n, 6 + 2P), and the covariance of four of it (n, 4, 4).
 
-        The rest is what `_start` has for these stars.
+        These are evidence, flux, sky, row and column, strangeness, PSF and its σ. The rest is what
+        `_start` has for these stars.
         """
         known = np.isfinite(stars.flux) & (stars.flux > 0)
         precision = np.where(known, SURE, LOOSE) ** -2.0
@@ -647,10 +658,10 @@ class FieldMixture(Method):
             weight /= weight.sum(axis=1, keepdims=True)
             near = weight > 0
             guess = flux * (weight * factor).sum(axis=1)
-        values, covariance, psf, sigma = self._summed(scaled, number, weight, precision)
+        values, covariance, strange, psf, sigma = self._summed(scaled, number, weight, precision)
         evidence = peak + np.log(total) - scaled.images.shape[1] * np.log(np.sqrt(2 * np.pi) * flux)
         unit = np.stack([flux, flux, *np.ones((2, len(flux)))], axis=1)
-        found = np.hstack([evidence[:, None], values * unit, psf, sigma])
+        found = np.hstack([evidence[:, None], values * unit, strange[:, None], psf, sigma])
         return found, covariance * unit[:, :, None] * unit[:, None, :]
 
     def _asked(
@@ -695,14 +706,17 @@ class FieldMixture(Method):
     def _summed(
         self, stars: Stars, number: np.ndarray, weight: np.ndarray, precision: np.ndarray
     ) -> tuple[np.ndarray, ...]:
-        """Mean (n, 4) and covariance of flux, sky, row and column; PSF (n, P) and its σ.
+        """Mean (n, 4) and covariance of flux, sky, row and column; strangeness; PSF (n, P) and σ.
 
-        Of stars over a guess of their flux, which is the unit of flux and sky.
+        Of stars over a guess of their flux, which is the unit of flux and sky. Strangeness is the
+        square of Mahalanobis' distance in the rows of C, with the noise in them; what an unknown
+        place adds on average is taken off.
         """
         count, pixels = stars.images.shape
         first, second = np.zeros((count, 4)), np.zeros((count, 4, 4))
         star, square, with_flux, inside, with_slope = np.zeros((5, count, pixels))
         total, total2, unsure = np.zeros((3, count, 1))
+        strange = np.zeros(count)
         for k, kind, rows in self._asked(stars, number, weight > 0):
             factor, w = self._factor(k, kind), weight[rows, k, None]
             fit = self._against(k, kind, stars, rows, precision)
@@ -717,6 +731,11 @@ class FieldMixture(Method):
                 more = (fit.factor[:, None] - flux) / pixels
                 one, sky, flux = one + more, sky - more, fit.factor[:, None]
                 change += (1.0 - change.sum(axis=1, keepdims=True)) / pixels
+            white = np.linalg.solve(
+                factor.whitening, (fit.low - (fit.factor - 1.0)[:, None] * fit.low_mean).T
+            )
+            more = 0 if kind.placed else len(self._nodes[k].spread)
+            strange[rows] += w[:, 0] * (np.square(white).sum(axis=0) - more)
             doubt = w * fit.variance[:, None]
             star[rows] += w * one
             square[rows] += w * one**2
@@ -738,7 +757,7 @@ class FieldMixture(Method):
         variance = square + inside - 2 * psf * (with_flux + with_slope)
         variance += psf**2 * (total2 + unsure)
         sigma = np.sqrt(np.maximum(variance, 0.0)) / np.abs(total)
-        return first, second - first[:, :, None] * first[:, None, :], psf, sigma
+        return first, second - first[:, :, None] * first[:, None, :], strange, psf, sigma
 
 
 def _parts(rows: np.ndarray) -> list[np.ndarray]:
