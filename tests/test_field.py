@@ -13,7 +13,7 @@ from psfdae import load_model
 from psfdae.cli import main
 from psfdae.configuration.compose import load_stage
 from psfdae.estimators import BrightStamps, FitError, TrainingSet
-from psfdae.estimators.field import FieldMixture
+from psfdae.estimators.field import TELLING, FieldMixture
 from psfdae.own_stars.example import add_stamps, write_field
 from psfdae.own_stars.model import PredictionError
 from psfdae.own_stars.shapes import measure_shapes
@@ -183,11 +183,10 @@ def test_bright_stars_are_as_sure_as_said(field):
 @pytest.mark.parametrize("snr", SNR)
 def test_strangeness_has_the_law_of_chi2_and_tells_blends(field, snr):
     some = Faint(400, snr)
-    rows = 2 + len(field.modes[0])  # those of the centre, and modes
     here, nowhere = some.measured(field), field.measure(some.stamps, some.sigma)
     for found in (here, nowhere):
-        assert np.median(found.strangeness) == pytest.approx(rows, rel=0.2)
-        assert (found.strangeness < rows + 8 * np.sqrt(2 * rows)).mean() > 0.99
+        assert np.median(found.strangeness) == pytest.approx(TELLING, rel=0.25)
+        assert (found.strangeness < TELLING + 8 * np.sqrt(2 * TELLING)).mean() > 0.98
     blend = 0.8 * some.psf + 0.2 * np.roll(some.psf, 3, axis=2)
     strange = field.measure(1000 * (blend + some.noise / 1000), some.sigma, some.position)
     if snr == 50:

@@ -77,8 +77,9 @@ LISTED = 5
 AT_ONCE = 1024
 """Stars that are restored together."""
 
-LEAST_SEEN = 1e-9
-"""Variance of a mode over that of noise in it."""
+TELLING, LEAST_SEEN = 12, 1e-9
+"""Leading modes that tell strange stars, as the others tell the training stars from all others;
+and the least variance of one over that of the noise in it."""
 
 KEPT = 200e6
 """Bytes of factorisations that are kept for further stars."""
@@ -154,8 +155,8 @@ class Factor(NamedTuple):
         Covariance of these once the star is seen, and a known.
     variance : ndarray, shape (P,)
         The same of the pixels of the star.
-    whitening : ndarray, shape (R, R)
-        Its solution for `low` times a star is white, if the star follows the law of the rows.
+    whitening : ndarray, shape (T, T)
+        Its solution for the last T of `low` times a star is white if the star is as the others.
     """
 
     s: float
@@ -442,10 +443,13 @@ class FieldMixture(Method):
         # A sky of the whole flux in each pixel is as good as unknown.
         width = np.array([0.0 if kind.sky else 1.0, *[0.0 if kind.centred else self._part] * 2])
         latent = width[:, None] * np.vstack([np.ones(pixels), node.slope])
-        rows = np.vstack([latent, node.rows, *([] if kind.placed else [node.spread])])
+        # Leading modes are the last ones: their law is the last block of the factor.
+        spread = [] if kind.placed else [node.spread]
+        rows = np.vstack([latent, *spread, node.rows[::-1]])
         d = node.diagonal + s
         weighted = rows / d
         cholesky = np.linalg.cholesky(np.eye(len(rows)) + weighted @ rows.T)
+        last = cholesky[-TELLING:, -TELLING:]
         low = dtrsm(1.0, cholesky.T, weighted.T, side=1).T  # a third of solve_triangular's time
         factor = Factor(
             s=s,
@@ -456,9 +460,7 @@ class FieldMixture(Method):
             scale=width,
             latent_left=np.eye(3),
             variance=d,
-            whitening=np.linalg.cholesky(
-                cholesky.T @ cholesky - (1.0 - LEAST_SEEN) * np.eye(len(rows))
-            ),
+            whitening=np.linalg.cholesky(last.T @ last - (1.0 - LEAST_SEEN) * np.eye(len(last))),
         )
         solved = factor.solve(latent, latent @ low.T)
         # The same as I − latent S⁻¹ latentᵀ, which loses all digits for bright stars.
@@ -709,8 +711,7 @@ class FieldMixture(Method):
         """Mean (n, 4) and covariance of flux, sky, row and column; strangeness; PSF (n, P) and σ.
 
         Of stars over a guess of their flux, which is the unit of flux and sky. Strangeness is the
-        square of Mahalanobis' distance in the rows of C, with the noise in them; what an unknown
-        place adds on average is taken off.
+        square of Mahalanobis' distance in the leading modes of C, with the noise in them.
         """
         count, pixels = stars.images.shape
         first, second = np.zeros((count, 4)), np.zeros((count, 4, 4))
@@ -731,11 +732,9 @@ class FieldMixture(Method):
                 more = (fit.factor[:, None] - flux) / pixels
                 one, sky, flux = one + more, sky - more, fit.factor[:, None]
                 change += (1.0 - change.sum(axis=1, keepdims=True)) / pixels
-            white = np.linalg.solve(
-                factor.whitening, (fit.low - (fit.factor - 1.0)[:, None] * fit.low_mean).T
-            )
-            more = 0 if kind.placed else len(self._nodes[k].spread)
-            strange[rows] += w[:, 0] * (np.square(white).sum(axis=0) - more)
+            leading = fit.low - (fit.factor - 1.0)[:, None] * fit.low_mean
+            white = np.linalg.solve(factor.whitening, leading[:, -TELLING:].T)
+            strange[rows] += w[:, 0] * np.square(white).sum(axis=0)
             doubt = w * fit.variance[:, None]
             star[rows] += w * one
             square[rows] += w * one**2
