@@ -39,6 +39,7 @@ TINY = {
 TESTED_ELSEWHERE = {
     "docs/own_stars.md": "test_from_stars.py",
     "docs/own_telescope.md": "test_own_telescope.py",
+    "docs/tutorial.md": "test_from_stars.py",
 }
 """Pages whose commands another test runs from first to last."""
 

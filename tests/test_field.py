@@ -13,7 +13,7 @@ from psfdae import load_model
 from psfdae.cli import main
 from psfdae.configuration.compose import load_stage
 from psfdae.estimators import BrightStamps, FitError, TrainingSet
-from psfdae.estimators.field import FieldMixture
+from psfdae.estimators.field import TELLING, FieldMixture
 from psfdae.own_stars.example import add_stamps, write_field
 from psfdae.own_stars.model import PredictionError
 from psfdae.own_stars.shapes import measure_shapes
@@ -171,6 +171,28 @@ def test_without_noise_the_data_come_back_and_without_data_the_field(field):
     assert (hopeless.sigma > found.sigma).all()
 
 
+def test_bright_stars_are_as_sure_as_said(field):
+    """A sky that is not known costs them little."""
+    some = Faint(100, 2000.0)
+    free, known = (some.measured(field, sky=sky) for sky in (None, np.full(100, 3.0)))
+    ratio = np.median(free.sigma / known.sigma, axis=(1, 2))
+    assert ((ratio > 0.9) & (ratio < 1.3)).all()
+    assert 0.5 < some.mse(free) / np.square(free.sigma, dtype=float).mean() < 2
+
+
+@pytest.mark.parametrize("snr", SNR)
+def test_strangeness_has_the_law_of_chi2_and_tells_blends(field, snr):
+    some = Faint(400, snr)
+    here, nowhere = some.measured(field), field.measure(some.stamps, some.sigma)
+    for found in (here, nowhere):
+        assert np.median(found.strangeness) == pytest.approx(TELLING, rel=0.25)
+        assert (found.strangeness < TELLING + 8 * np.sqrt(2 * TELLING)).mean() > 0.98
+    blend = 0.8 * some.psf + 0.2 * np.roll(some.psf, 3, axis=2)
+    strange = field.measure(1000 * (blend + some.noise / 1000), some.sigma, some.position)
+    if snr == 50:
+        assert np.median(strange.strangeness) > np.quantile(here.strangeness, 0.99)
+
+
 def test_flux_and_sky_that_are_known_are_taken(field):
     some = Faint(300, 5.0)
     known = some.measured(field, flux=np.full(300, 1000.0), sky=np.full(300, 3.0))
@@ -189,6 +211,16 @@ def test_stars_do_not_influence_each_other(field):
     half = field.measure(some.stamps[::2], some.sigma[::2], some.position[::2])
     assert half.psf == pytest.approx(every.psf[::2], abs=1e-7)
     assert half.measured.flux == pytest.approx(every.measured.flux[::2], rel=1e-9)
+
+
+def test_stars_are_restored_in_groups_that_do_not_matter(field, monkeypatch):
+    each = [Faint(40, snr) for snr in (5.0, 50.0, 500.0, 5000.0)]
+    told = [np.concatenate([getattr(some, n) for some in each]) for n in ("stamps", "sigma")]
+    whole = field.measure(*told)
+    monkeypatch.setattr("psfdae.estimators.field.KEPT", 1.0)
+    few = fitted(bright()).measure(*told)
+    assert few.psf == pytest.approx(whole.psf, abs=1e-7)
+    assert few.measured.flux == pytest.approx(whole.measured.flux, rel=1e-9)
 
 
 def test_bad_stamps_are_refused(field):
@@ -307,6 +339,7 @@ def test_predict_measures_flux_and_centre_with_their_errors(image):
     """The bundle is small, and the list of the training says how good this one is."""
     stars, uncertainty = predicted(image)
     known = image[2]
+    assert np.isfinite(stars["strangeness"]).all()
     assert image[1].stat().st_size < 5e6
     assert (stars["flags"] == 0).mean() > 0.95
     assert abs(np.mean(stars["flux"] / known["inside"]) - 1) < 0.005

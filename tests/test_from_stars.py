@@ -8,14 +8,15 @@ import shlex
 import shutil
 import subprocess
 import sys
-from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
 from click.testing import CliRunner
 
+from docs_pages import blocks, commands, read
 from fits_inputs import write_cube
 from psfdae.cli import main
 from psfdae.configuration.compose import ConfigError, load_stage
@@ -40,7 +41,6 @@ from psfdae.stages.evaluate import READS
 from psfdae.stages.from_stars import Source, _alone, from_stars
 from psfdae.stars.fields import held_out_fields
 
-ROOT = Path(__file__).resolve().parents[1]
 SIDE = {"side_px": 700, "bright": 60, "faint": 80, "blended": 6, "saturated": 3}
 TINY = ["preset=smoke", "parts.train_stars=120", "parts.test_stars=30", "train.epochs=1"]
 TINY += ["methods=[noisy,pca_som,lmmse,dae,gmm,field]"]
@@ -384,14 +384,12 @@ def test_wrong_settings_are_named(override, message):
 
 @pytest.mark.slow
 @pytest.mark.workflow
-def test_commands_of_own_stars_md_run(tmp_path, monkeypatch):
+@pytest.mark.parametrize("page", ["docs/own_stars.md", "docs/tutorial.md"])
+def test_commands_of_pages_run(page, tmp_path, monkeypatch):
     """From first to last, on a small image and a tiny network."""
-    text = (ROOT / "docs/own_stars.md").read_text(encoding="utf-8")
-    lines = [
-        line for block in re.findall(r"```sh\n(.*?)```", text, re.S) for line in block.split("\n")
-    ]
-    steps = [shlex.split(line, comments=True) for line in lines if line.startswith("psfdae ")]
-    assert {"example-field", "from-stars", "predict", "describe"} <= {step[1] for step in steps}
+    text = read(page)
+    steps = [line.words for line in commands(text) if line.words[0] == "psfdae"]
+    assert {"example-field", "from-stars", "predict", "psf"} <= {step[1] for step in steps}
     small = {
         "example-field": ["--side=700", "--bright=60", "--faint=80"],
         "from-stars": TINY,
@@ -404,6 +402,13 @@ def test_commands_of_own_stars_md_run(tmp_path, monkeypatch):
         words = [name, *rest, *small.get(name, [])]
         result = CliRunner().invoke(main, words)
         assert result.exit_code == 0, (words, result.output)
+    names: dict[str, Any] = {}
+    for body in blocks(text, "python"):
+        exec(compile(body, page, "exec"), names)
+    if "fluxes" in names:
+        assert np.median(names["fluxes"]["flux_fit"] / names["stars"]["flux"]) == pytest.approx(
+            1.0, abs=0.05
+        )
 
 
 @pytest.mark.workflow

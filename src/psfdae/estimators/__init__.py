@@ -198,6 +198,8 @@ class Estimate:
         the PSF has this sum.
     measured : Measured or None
         Of a method that measures stars itself; its PSFs have the sum 1.
+    strangeness : ndarray, shape (n,), or None
+        As `Method.strangeness`, of a method that finds it on the way.
     """
 
     psf: np.ndarray
@@ -205,6 +207,7 @@ class Estimate:
     evidence: np.ndarray | None = None
     flux: np.ndarray | None = None
     measured: Measured | None = None
+    strangeness: np.ndarray | None = None
 
 
 class Method:

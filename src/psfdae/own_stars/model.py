@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from psfdae.estimators import FitError
+from psfdae.estimators import Estimate, FitError
 from psfdae.own_stars.bundle import (
     Bundle,
     BundleInfo,
@@ -318,9 +318,11 @@ class Engine:
         found = self._photometer.measure(stamps, bad, start, stars)
         told: dict[str, np.ndarray] = {}
         if self.estimator.measures:
-            psf, sigma, found, told = self._measured(stars, stamps, bad, shift, start, exact, found)
+            estimate, found, told = self._measured(stars, stamps, bad, shift, start, exact, found)
+            psf, sigma = estimate.psf, estimate.sigma
             lost = (found.flags & StarFlag.NO_FLUX) > 0
         else:
+            estimate = None
             lost = (found.flags & StarFlag.NO_FLUX) > 0
             free = np.isnan(stars.flux) & np.isnan(stars.background)
             psf, sigma, found = self._estimate(found, free, lost)
@@ -345,7 +347,11 @@ class Engine:
         unlike, strangeness = distance > bundle.distance_limit, np.full(len(noise), np.nan)
         if bundle.strange_limit is not None and not lost.all():
             level = noise[~lost] / info.kappa
-            strangeness[~lost] = self.free_flux.strangeness(found.images[~lost], level)
+            strangeness[~lost] = (
+                self.free_flux.strangeness(found.images[~lost], level)
+                if estimate is None
+                else estimate.strangeness[~lost]
+            )
             unlike |= strangeness > np.interp(noise, bundle.noise_nodes, bundle.strange_limit)
         raise_flag(flags, StarFlag.UNLIKE_TRAINING, unlike)
         photons = np.nan_to_num(np.maximum(found.flux, 0.0) / stars.gain)
@@ -380,7 +386,7 @@ class Engine:
         start: np.ndarray,
         exact: np.ndarray,
         found: Photometry,
-    ) -> tuple[np.ndarray, np.ndarray, Photometry, dict[str, np.ndarray]]:
+    ) -> tuple[Estimate, Photometry, dict[str, np.ndarray]]:
         """PSFs of flux 1, their σ and what the method measures in place of the photometry.
 
         `found` repairs bad pixels and tells the noise, `start` (n,) is a rough sky; listed
@@ -431,9 +437,8 @@ class Engine:
         middle = np.stack([stars.y, stars.x], axis=1) - stars.listed
         middle = np.where(np.isfinite(middle), middle, stars.data.shape[-1] // 2)
         measured = measured_of(middle + shift + told.centre, told.covariance)
-        psf, sigma = estimate.psf, estimate.sigma
-        psf[lost] = sigma[lost] = np.nan
-        return psf, sigma, better, {k: np.where(lost, np.nan, v) for k, v in measured.items()}
+        estimate.psf[lost] = estimate.sigma[lost] = np.nan
+        return estimate, better, {k: np.where(lost, np.nan, v) for k, v in measured.items()}
 
     def _estimate(
         self, found: Photometry, free: np.ndarray, lost: np.ndarray

@@ -134,7 +134,10 @@ def measure_errors(
         noisy = stars.noise.draw(stars.images[star], level, rng)
         estimate = fitted.estimate(noisy, level, stars.position[star])
         error[place] = errors_of(estimate, stars.references[star])
-        strangeness.append(free.strangeness(noisy, np.full(star.size, level)))
+        found = estimate.strangeness
+        if found is None:
+            found = free.strangeness(noisy, np.full(star.size, level))
+        strangeness.append(found)
         distance[place] = mahalanobis(noisy, np.full(star.size, noise), model, COMPONENTS)
     known = [node for node in strangeness if node is not None]
     return Errors(nodes, error, star, distance, np.stack(known) if known else None)
