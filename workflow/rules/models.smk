@@ -4,7 +4,7 @@ use rule stars as more_stars with:
     log:
         f"{RESULTS}/logs/stars/{{scene}}/fresh/{{stars}}-{{fresh}}.log",
     benchmark:
-        f"{RESULTS}/benchmarks/more_stars/{{scene}}/{{stars}}-{{fresh}}.tsv"
+        f"{RESULTS}/benchmarks_on_request/more_stars/{{scene}}/{{stars}}-{{fresh}}.tsv"
     wildcard_constraints:
         fresh="[0-9]+",
     params:
@@ -21,10 +21,14 @@ use rule stars as more_stars with:
         "Simulating {wildcards.fresh} other stars {wildcards.stars}"
 
 
+with one_line():
+    ASKED = load_groups(overrides_for("config", GIVEN)).workflow.on_request
+
 for _method in (m for m in registered() if m.stored):
     _stem = _method.stem("{dataset}", "{split}", "{reference}")
     _names = (f"{{wildcards.{key}}}" for key in ("dataset", "split", "reference"))
     _place = model_of(_method, "{dataset}", "{split}", "{reference}")
+    _costs = "benchmarks_on_request" if _method.name in ASKED else "benchmarks"
 
     rule:
         name:
@@ -37,7 +41,7 @@ for _method in (m for m in registered() if m.stored):
         log:
             f"{RESULTS}/logs/{_method.name}/{_stem}.log",
         benchmark:
-            f"{RESULTS}/benchmarks/{_method.rule}/{_stem}.tsv"
+            f"{RESULTS}/{_costs}/{_method.rule}/{_stem}.tsv"
         threads: lambda w, m=_method: m.threads(dataset_config(w.dataset))
         resources:
             mem_mb=_method.memory_mb,
