@@ -187,7 +187,9 @@ def seeds():
     """Mean over seeds, error of the stars and relative scatter of every method."""
     cells = _seeded().groupby(["dataset", "method", "noise_level"], sort=False)
     means = {name: (name, "mean") for name in ("mse", "stderr")}
-    table = cells.agg(**means, scatter=("mse", "std"), different=("different", "sum"))
+    table = cells.agg(**means, scatter=("mse", "std"))
+    # Of a pair, both seeds count the other; a record of before does not count.
+    table["different"] = 0.5 * cells.different.sum(min_count=1)
     table = table.assign(scatter=table.scatter / table.mse).reset_index()
     return table.assign(label=[method(m).label for m in table.method])
 
@@ -235,13 +237,6 @@ def more_stars():
     table = errors("tables/psf_metrics_on_request.csv").drop(columns="best")
     table = table.merge(errors().drop(columns="best"), on=[*CELL, "split"])
     return table.join(over, CELL)
-
-
-def networks():
-    """Networks of scene 3 on noisy stamps: what they took, and errors on validation states."""
-    folder = "sweeps/network_epochs"
-    table = csv(f"{folder}/summary.csv").merge(csv(f"{folder}/cost.csv"), on="point")
-    return table.sort_values("cpu_seconds")
 
 
 def presets():

@@ -416,7 +416,7 @@ def emulator(model, config, operator):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("scale", "least", "most", "noisy"), [(1.0, 0.03, 0.07, 0.15), (1.1, 0.05, 0.3, 0.5)]
+    ("scale", "least", "most", "noisy"), [(1.0, 0.02, 0.05, 0.15), (1.1, 0.04, 0.3, 0.5)]
 )
 def test_emulator_errs_by_a_part_of_a_standard_error(
     model, operator, emulator, noise, scale, least, most, noisy
