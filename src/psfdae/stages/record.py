@@ -27,7 +27,8 @@ if TYPE_CHECKING:
 VERSIONED = ("psfdae", "numpy", "scipy", "torch", "scikit-learn", "minisom")
 """Packages whose versions can change a number; recorded with the run."""
 
-COSTS = ("wall_s", "cpu_s", "peak_mb", "on_request_s", "results_mb", "matrix_product_gflops")
+COSTS = ("wall_s", "cpu_s", "peak_mb", "on_request_s", "results_mb", "tests_s")
+COSTS += ("matrix_product_gflops",)
 """What provenance says of the cost of a run."""
 
 ON_REQUEST = "benchmarks_on_request"
