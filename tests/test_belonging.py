@@ -373,6 +373,7 @@ def estimate(**changed):
 
 
 FIT = ["fit", "--set=uniform", "--level=2e-3", "--times=@t.csv", "--network=@original"]
+FIT += ["--train=@states.h5"]
 
 
 @pytest.mark.parametrize(
@@ -406,6 +407,11 @@ FIT = ["fit", "--set=uniform", "--level=2e-3", "--times=@t.csv", "--network=@ori
             ("name", ("dae_retrained", "original")),
         ),
         ([*FIT, "--states=@other_states.h5", "--model=@model.h5"], "other_states.h5", PIXELS),
+        (
+            [*FIT[:-1], "--train=@other_states.h5", "--states=@states.h5", "--model=@model.h5"],
+            "other_states.h5",
+            PIXELS,
+        ),
         ([*FIT, "--states=@states.h5", "--model=@far_model.h5"], "far_model.h5", DEFOCUS),
         (
             ["bound", "--set=uniform", "--states=@states.h5", "--model=@far_model.h5"],
