@@ -242,6 +242,23 @@ def test_figures_are_drawn_from_the_tables_of_the_record(kind, tmp_path):
     assert (tmp_path / "drawn.png").stat().st_size > 10_000
 
 
+def test_a_seed_that_errs_more_differs_from_all_others():
+    errors = np.random.default_rng(1).gamma(4.0, 1e-6, 400)
+    star = {
+        "method": "dae",
+        "noise_level": 1e-3,
+        "star": np.arange(400),
+        "field": np.arange(400) % 20,
+    }
+    scale = {1: 1.0, 2: 1.02, 3: 1.3}
+    measured = {
+        seed: [star | {"mse": by * errors, "ssim": 1 - 1e3 * by * errors}]
+        for seed, by in scale.items()
+    }
+    counts = trainings.different(measured)
+    assert [counts[seed, "dae", 1e-3] for seed in scale] == [1, 1, 2]
+
+
 @pytest.mark.workflow
 def test_all_methods_are_timed_and_drawn(smoke, tmp_path):
     config = load(["preset=smoke", "dataset=dataset3", "train.epochs=1"])

@@ -1,5 +1,6 @@
 """Test error against fitting time: which training, which PCA+SOM is large enough."""
 
+from collections import Counter
 from dataclasses import replace
 from itertools import permutations
 from itertools import product as product_of
@@ -318,24 +319,29 @@ def time_methods(tree, stars, seeds):
             measured[seed].append(errors | {"star": test})
             mean, stderr = clustered_mean(errors["mse"], field)
             rows.append(row | {"stars_per_s": rate, "mse": mean, "stderr": stderr})
-    return [row | {"different": n} for row, n in zip(rows, different(rows, measured), strict=True)]
+    counts = different(measured)
+    return [
+        row | {"different": counts[row["seed"], row["method"], row["noise_level"]]} for row in rows
+    ]
 
 
-def different(rows, measured):
-    """For each row, how many other seeds `psfdae compare` says are better or worse than its own."""
+def different(measured):
+    """By seed, method and level: the other seeds that `psfdae compare` calls better or worse.
+
+    `measured` has, for every seed, errors of the same noisy stars as mappings of columns.
+    """
     import pandas as pd
 
     from psfdae.evaluation.comparison import SEED_SCATTER, compare_errors
 
-    keys = ["method", "noise_level"]
     tables = {seed: pd.concat(map(pd.DataFrame, errors)) for seed, errors in measured.items()}
-    counts = dict.fromkeys(((row["seed"], *(row[key] for key in keys)) for row in rows), 0)
+    counts = Counter()
     for one, other in permutations(tables, 2):
         verdicts = compare_errors(tables[one], tables[other], SEED_SCATTER)
         changed = verdicts[(verdicts.metric == "mse") & (verdicts.verdict != "same")]
         for row in changed.itertuples():
             counts[one, row.method, row.noise_level] += 1
-    return counts.values()
+    return counts
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ from psfdae.alignment.telescope import QuadraticModel, design_states, mirror_sym
 from psfdae.configuration.alignment import Fit
 
 LENGTH = 3.0
-"""Length of the correlation in distances of the farthest neighbour; half or twice does as well."""
+"""Length of the correlation in distances of the farthest neighbour."""
 
 NUGGET = 1e-8
 """Variance of the rounding of stamps, in that of the process."""

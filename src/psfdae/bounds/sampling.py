@@ -80,8 +80,8 @@ STUCK = 1e6
 FAR = 50.0
 """Modes whose evidence is this far (in its logarithm) below a star's best are left out.
 
-The evidence is that of a Gaussian, which errs by tens along a bent ridge of the posterior: with
-8, a star in sixty lost the mode that the draws then find to hold its mass.
+The evidence is that of a Gaussian, which errs by much along a bent ridge of the posterior: a nearer
+limit leaves out modes that the draws then find to hold the mass.
 """
 
 PRIOR_DRAWS = 10.0

@@ -27,8 +27,10 @@ if TYPE_CHECKING:
 VERSIONED = ("psfdae", "numpy", "scipy", "torch", "scikit-learn", "minisom")
 """Packages whose versions can change a number; recorded with the run."""
 
-COSTS = ("wall_s", "cpu_s", "peak_mb", "on_request_s", "results_mb", "tests_s")
-COSTS += ("matrix_product_gflops",)
+COSTS = (
+    *("wall_s", "cpu_s", "peak_mb", "on_request_s"),
+    *("results_mb", "tests_s", "matrix_product_gflops"),
+)
 """What provenance says of the cost of a run."""
 
 ON_REQUEST = "benchmarks_on_request"
@@ -99,7 +101,8 @@ def reference(
         target = staging / name
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(path, target)
-    before = _before(out)
+    last = out / "provenance.json"
+    before = json.loads(last.read_text()) if last.is_file() else {}
     described = provenance(results, load()) | {"kept": _kept_since(before, kept)}
     if Path("runtime.csv") in kept:  # what a run costs is said by one run alone
         described |= {key: before[key] for key in COSTS if key in before}
@@ -107,12 +110,6 @@ def reference(
     write_text(staging / "provenance.json", text + "\n")
     shutil.rmtree(out, ignore_errors=True)
     staging.rename(out)
-
-
-def _before(out: Path) -> dict[str, Any]:
-    """Provenance of the record before."""
-    described = out / "provenance.json"
-    return json.loads(described.read_text()) if described.is_file() else {}
 
 
 def _kept_since(before: Mapping[str, Any], kept: Iterable[Path]) -> dict[str, str]:
