@@ -38,7 +38,7 @@ class SingleChannelConv(nn.Conv2d):
         """Map (B, C, h, w) to (B, 1, h, w)."""
         if x.device.type != "cpu":
             return super().forward(x)
-        x = x.float()
+        x = x.to(self.weight.dtype)  # autocast hands on its own
         flipped = self.weight.flip(2, 3).transpose(0, 1)
         return torch.ops.aten.slow_conv_transpose2d(
             x, flipped, self.kernel_size, self.bias, [1, 1], self.padding, [0, 0], [1, 1]
