@@ -162,6 +162,13 @@ def strange():
     return wide.reset_index()
 
 
+def networks():
+    """Networks of scene 3 on noisy stamps: what they took, and errors on validation states."""
+    folder = "sweeps/network_epochs"
+    table = csv(f"{folder}/summary.csv").merge(csv(f"{folder}/cost.csv"), on="point")
+    return table.sort_values("cpu_seconds")
+
+
 def real_sky():
     """Errors on a real image by S/N: ours, the better setting of each package, and the fluxes."""
     table = csv("tables/real_sky.csv")

@@ -268,6 +268,7 @@ class GaussianMixture(Method):
             pairs = zip(noisy, data.levels, strict=True)
             errors = [np.square(tried.predict(z, s, where) - truth).mean() for z, s in pairs]
             tried._nodes.clear()
+            tried.__dict__.pop("_clusters", None)  # another ν has others
             return float(np.exp(np.mean(np.log(errors))))
 
         def search(told: bool) -> tuple[float, int, bool, float]:
@@ -278,6 +279,7 @@ class GaussianMixture(Method):
                 tried[k] = error(one)
                 if tried[k] == min(tried.values()):
                     best = one
+                del one  # before the next takes as much memory
                 if tried[k] > WORSE * min(tried.values()):
                     break
             k = min(tried, key=tried.__getitem__)
@@ -295,10 +297,12 @@ class GaussianMixture(Method):
         cls, data: TrainingSet, stars: np.ndarray, clusters: int, gmm: Gmm, told: bool
     ) -> Self:
         """Moments of the clusters of some stars, and how they follow the position if it is told."""
-        images, references = data.images[stars], data.references[stars]
-        same = np.array_equal(images, references)
-        x = images.reshape(stars.size, -1).astype(np.float64)
-        y = x if same else references.reshape(stars.size, -1).astype(np.float64)
+        x, y = (
+            a[stars].reshape(stars.size, -1).astype(np.float64)
+            for a in (data.images, data.references)
+        )
+        same = np.array_equal(x, y)
+        y = x if same else y
         p = cls._told(data, stars).astype(np.float64) * told
         cluster = _k_means(x, gmm.place * _standard(p), clusters, gmm.principal, data.seed)
         order = np.argsort(cluster, kind="stable")
@@ -308,7 +312,9 @@ class GaussianMixture(Method):
         def about_means(a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             a = a[order]
             mean = np.add.reduceat(a, start) / count[:, None]
-            return mean, a - np.repeat(mean, count, axis=0)
+            for rows, own in zip(np.split(a, start[1:]), mean, strict=True):
+                rows -= own
+            return mean, a
 
         (mean_p, p), (mean_x, x) = about_means(p), about_means(x)
         mean_y, y = (mean_x, x) if same else about_means(y)
