@@ -313,7 +313,7 @@ class GaussianMixture(Method):
             a = a[order]
             mean = np.add.reduceat(a, start) / count[:, None]
             for rows, own in zip(np.split(a, start[1:]), mean, strict=True):
-                rows -= own
+                np.subtract(rows, own, out=rows)
             return mean, a
 
         (mean_p, p), (mean_x, x) = about_means(p), about_means(x)
