@@ -67,7 +67,7 @@ FLAT = 0.005
 """Variance of a coordinate, as a part of s, below which all clusters share one normal law."""
 
 WORSE = 1.05
-"""Times the least error so far, with which the search for more clusters ends."""
+"""Times the least error so far, with which a search ends, of more clusters or without places."""
 
 AT_ONCE = 4096
 """Images that are restored together."""
@@ -288,9 +288,14 @@ class GaussianMixture(Method):
                 found.append((error(replace(best, shrinkage=np.array([nu]))), k, told, nu))
             return min(found)
 
-        # What is told may be left aside, where stars in other places are worse for it.
-        told = (True, False) if cls.told_position else (False,)
-        return min(map(search, told))[1:]
+        best = search(cls.told_position)
+        if cls.told_position:
+            # What is told may be left aside, where stars in other places are worse for it.
+            least, k, _, nu = best
+            without = cls._clustered(data, learn, k, gmm, False)
+            if error(replace(without, shrinkage=np.array([nu]))) < WORSE * least:
+                best = min(best, search(False))
+        return best[1:]
 
     @classmethod
     def _clustered(
