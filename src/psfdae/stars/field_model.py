@@ -258,16 +258,23 @@ class _Alternating:
             return ((terms.T @ back).reshape(shape) + smooth).ravel()
 
         wanted = (rows_t @ (weight * data) @ columns).reshape(len(terms), -1)
-        diagonal = (rows_t**2 @ weight @ columns**2).reshape(len(terms), -1)
-        diagonal = ((terms**2).T @ diagonal).reshape(shape) + 6 * penalty + RIDGE
-        size = (diagonal.size,) * 2
+        # Terms of a knot are solved for together: they are far from orthogonal.
+        seen = (rows_t**2 @ weight @ columns**2).reshape(len(terms), -1)
+        pairs = (terms[:, :, None] * terms[:, None]).reshape(len(terms), -1)
+        blocks = (seen.T @ pairs).reshape(-1, shape[0], shape[0])
+        blocks += np.diag(6 * penalty.ravel() + RIDGE)
+        inverse, size = np.linalg.inv(blocks), (int(np.prod(shape)),) * 2
+
+        def nearly(flat: np.ndarray) -> np.ndarray:
+            return (inverse @ flat.reshape(shape[0], -1).T[..., None])[..., 0].T.ravel()
+
         found, _ = cg(
             LinearOperator(size, matvec=normal, dtype=float),
             (terms.T @ wanted).ravel(),
             None if start is None else start.ravel(),
             rtol=TOLERANCE,
             maxiter=ITERATIONS,
-            M=LinearOperator(size, matvec=lambda v: v / diagonal.ravel(), dtype=float),
+            M=LinearOperator(size, matvec=nearly, dtype=float),
         )
         return np.asarray(found).reshape(shape)
 
