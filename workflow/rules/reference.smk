@@ -37,6 +37,8 @@ rule reference:
                 ),
                 *(f"tables/seeds_{dataset}.csv" for dataset in SEEDED_DATASETS),
                 "tables/real_sky.csv",
+                "tables/simulated_sky.csv",
+                "tables/simulated_sky_scatter.csv",
                 "sweeps/gmm/summary.csv",
                 *(
                     f"sweeps/{name}/{table}.csv"

@@ -91,7 +91,7 @@ PACKED = 3e6
 class FieldSettings(Group):
     """Mixture about a model of the field."""
 
-    orders: Annotated[list[Annotated[int, Field(ge=0, le=6)]], Field(min_length=1)] = Field(
+    orders: Annotated[list[Annotated[int, Field(ge=0, le=10)]], Field(min_length=1)] = Field(
         description="Of the polynomial in the position, tried upwards until the next one "
         "predicts stars that were left out no better"
     )
