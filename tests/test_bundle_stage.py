@@ -190,9 +190,21 @@ def test_a_method_that_knows_how_sure_it_is_covers_68_and_95_per_cent(folder, ti
     assert all((getattr(again, name) == getattr(found, name)).all() for name in ("psf", "snr"))
     free, dae = (PsfModel(b).predict(noisy + 3.0, noise=noise) for b in (bundle, tiny))
     bright = noise < 0.01
+    kept = np.isfinite(free.psf).all(axis=(1, 2))
+    write_bundle(replace(bundle, widening=None), tmp_path / "old.psf.safetensors")
+    old = PsfModel(read_bundle(tmp_path / "old.psf.safetensors"))
+    narrow = old.predict(noisy + 3.0, noise=noise)
+    for part in np.array_split(np.argsort(noise), 3):
+        some = part[kept[part]]
+        error = np.abs(free.psf[some] - images[some])
+        (less, few), (inside, most) = (
+            [(error <= f.uncertainty[some] * r).mean() for r in (1, f.ratio95[some, None, None])]
+            for f in (narrow, free)
+        )
+        assert less < 0.65 and inside == pytest.approx(0.683, abs=0.03)
+        assert few < 0.91 and most == pytest.approx(0.95, abs=0.035)
     errors = [np.sqrt(np.square(found.flux[bright] - 1).mean()) for found in (free, dae)]
     assert errors[0] < 0.9 * errors[1]
-    kept = np.isfinite(free.psf).all(axis=(1, 2))
     assert free.psf[kept].sum(axis=(1, 2)) == pytest.approx(free.flux[kept], rel=1e-3)
     light = free.flux + 144 * free.background
     assert light == pytest.approx(dae.flux + 144 * dae.background, nan_ok=True)

@@ -213,7 +213,7 @@ def test_strangeness_of_one_cluster_is_the_square_of_mahalanobis_distance(free, 
     mixture = fitted(same=False)
     mixture = mixture.free_flux() if free else mixture
     noisy = NOISE.draw(stars(20, seed=2)[0], LEVEL, np.random.default_rng(3))
-    s = np.exp(np.rint(np.log(NOISE.variance(1.0 / D**2, LEVEL)) / module.STEP) * module.STEP)
+    s = np.exp(np.rint(np.log(NOISE.variance(1.0 / D**2, LEVEL)) / module.FINE) * module.FINE)
     residual = (noisy.reshape(20, -1) @ mixture.axes - mixture.mean[0])[:, :10].astype(float)
     row = mixture.loose * mixture._contrast[0, :10].astype(float)
     usual = np.diag(mixture._total[:10] + s)

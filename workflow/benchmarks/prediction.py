@@ -35,6 +35,7 @@ WARM_UP = 4  # blocks of stars that are computed before the clock starts
 BARE_STAMPS = 8192  # that the bare network sees over and over: it must not fill the memory
 SAMPLES = 256  # of POPPY across the pupil
 FALSE_ALARMS = 0.01  # part of the usual stars above a limit
+NOISY_EACH = 4  # noisy images of each star: of one each, too few would make the limit
 COMPANION_FLUX, COMPANION_PX = 0.3, 3.0  # of a neighbour, in units of the star's, and its distance
 RAY_FLUX, RAY_PX = 0.03, 3  # of a cosmic ray in a pixel, and its length
 OVERSAMPLING = 4  # its sub-samples per pixel and axis; their error falls with the square
@@ -145,7 +146,7 @@ def poppy(
     config: Config,
     bundles: Annotated[tuple[File, ...], {"flag": "--bundle"}, "Model bundles of the dataset."],
     out: Annotated[File, "CSV with the errors of each bundle at each noise level."],
-    count: Annotated[int, click.IntRange(min=2), "Stars that POPPY simulates."] = 500,
+    count: Annotated[int, click.IntRange(min=2), "Stars that POPPY simulates."] = 1500,
 ) -> None:
     """Predict stars that POPPY has simulated and compare with the bundles' own test stars.
 
@@ -230,6 +231,7 @@ def strange(
         NoiseModel(config.noise.kappa, config.noise.background_photons),
     )
     images = product["realisation"][common.split_stars(product, "random", config).test]
+    images = np.tile(images, (NOISY_EACH, 1, 1))
     rows = []
     for level in config.noise.levels:
         limits = {}

@@ -8,7 +8,7 @@ KNEE_DATASET = TIMED_DATASET = "dataset3"
 # The stars and the training of the model that comes with the package.
 SHIPPED_DATASET = "field"
 PACKED = [("random", "realisation")]
-POPPY_STARS = 500
+POPPY_STARS = 1500
 
 
 def has_bank(dataset):

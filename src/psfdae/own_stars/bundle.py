@@ -49,7 +49,8 @@ LARGEST = 2**28  # bytes; a bundle of stamps of 256 × 256 pixels has some 20 MB
 TOLERANCE = 1e-3  # by which the mean PSF may miss the sum 1, and eigenvectors orthonormality
 VARIANCE = 1e6  # largest variance of images of sum 1 that is no nonsense
 # Arrays of float64; the others are float32.
-DOUBLE = {"flux/variance", "flux/rest", "noise_nodes", "distance_limit", "ratio95", "strange_limit"}
+DOUBLE = {"flux/variance", "flux/rest", "noise_nodes", "distance_limit"}
+DOUBLE |= {"ratio95", "strange_limit", "widening"}
 
 Positive = Annotated[float, Field(gt=0)]
 Count = Annotated[int, Field(ge=1)]
@@ -191,6 +192,8 @@ class Bundle:
     ratio95: np.ndarray | None = None  # (S,), error68 times this holds 95 %; not in format 1
     # (S,), 99.9 % quantile of `Method.strangeness`, if the method knows it
     strange_limit: np.ndarray | None = None
+    # (S, 2), by how much 68 % and 95 % of the errors are wider where flux or sky is estimated
+    widening: np.ndarray | None = None
 
     @property
     def sha256(self) -> str:
@@ -340,7 +343,7 @@ def _tensors(bundle: Bundle) -> dict[str, np.ndarray]:
         "error68": bundle.error68,
         "rms": bundle.rms,
     }
-    free = {name: getattr(bundle, name) for name in ("ratio95", "strange_limit")}
+    free = {name: getattr(bundle, name) for name in ("ratio95", "strange_limit", "widening")}
     arrays |= {name: values for name, values in free.items() if values is not None}
     ours = {name: np.asarray(value, _dtype(name), order="C") for name, value in arrays.items()}
     # The method's own are as they are.
@@ -381,6 +384,7 @@ def read_bundle(path: Path | None = None) -> Bundle:
         distance_limit=float(tensors["distance_limit"]),
         ratio95=tensors.get("ratio95"),
         strange_limit=tensors.get("strange_limit"),
+        widening=tensors.get("widening"),
     )
 
 
@@ -453,8 +457,9 @@ def _check(info: BundleInfo, tensors: Mapping[str, np.ndarray], path: Path) -> N
         "distance_limit": (),
     }
     if info.format_version > 1:
-        given = [name for name in ("strange_limit",) if name in tensors]
-        expected |= dict.fromkeys(("ratio95", *given), (nodes,))
+        free = {"strange_limit": (nodes,), "widening": (nodes, 2)}
+        expected |= {name: shape for name, shape in free.items() if name in tensors}
+        expected["ratio95"] = (nodes,)
     expected |= _of_method(info, tensors, path)
     if set(tensors) != set(expected):
         name = min(set(tensors) ^ set(expected))

@@ -337,6 +337,14 @@ class Engine:
         ratio95 = np.full(len(noise), np.nan)
         if bundle.ratio95 is not None:
             ratio95 = np.interp(noise, bundle.noise_nodes, bundle.ratio95)
+        if bundle.widening is not None:
+            known = np.isfinite(stars.flux) & np.isfinite(stars.background)
+            wider, widest = (
+                np.where(known, 1.0, np.interp(noise, bundle.noise_nodes, factor))
+                for factor in bundle.widening.T
+            )
+            uncertainty *= wider.astype(np.float32)[:, None, None]
+            ratio95 *= widest / wider
         psf *= flux
         uncertainty *= flux
         residual = (stamps - found.background[:, None, None]).astype(np.float32) - psf

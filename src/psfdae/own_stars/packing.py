@@ -6,6 +6,9 @@ root mean square is then wider than the interval that holds 68 % of the errors. 
 bundle carries both, and by how much the interval that holds 95 % is wider. Where a
 method says how sure it is of every pixel, all of them are in units of that: they
 correct its σ, which knows the star, by what came true.
+
+Test stars tell this for known flux and sky. Where these are estimates, errors are larger and
+of another distribution: two factors per node, which validation stars tell, make up for it.
 """
 
 from __future__ import annotations
@@ -17,7 +20,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from psfdae.estimators import Estimate, Method
-from psfdae.own_stars.bundle import at_noise, mahalanobis
+from psfdae.own_stars.bundle import Bundle, at_noise, mahalanobis
+from psfdae.own_stars.model import SNR_TOLERANCE, PsfModel
 from psfdae.own_stars.photometry import FluxModel, noise_equivalent_px, signal_to_noise
 from psfdae.stars.noise import NoiseModel
 
@@ -89,9 +93,12 @@ class Errors:
 
 
 def noise_nodes(band: np.ndarray) -> np.ndarray:
-    """Noise at which errors are measured, ascending; a single one if there is no range."""
-    lowest, highest = float(band.min()), float(band.max())
-    return np.geomspace(lowest, highest, NODES) if highest > lowest else np.array([lowest])
+    """Noise at which errors are measured, ascending.
+
+    They reach as far as stars go without a flag: fluxes are estimates, and half of the faintest
+    stars look fainter than they are.
+    """
+    return np.geomspace(band.min() / SNR_TOLERANCE, band.max() * SNR_TOLERANCE, NODES)
 
 
 def leading(model: FluxModel, components: int) -> FluxModel:
@@ -147,6 +154,29 @@ def errors_of(estimate: Estimate, references: np.ndarray) -> np.ndarray:
     """PSFs minus references (n, d, d), in units of σ if the method says it, else of the flux."""
     error = estimate.psf - references
     return error if estimate.sigma is None else error / np.maximum(estimate.sigma, LEAST_SIGMA)
+
+
+def with_photometry(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -> Bundle:
+    """The bundle with its `widening`: half-widths with flux and sky estimated over those with both
+    given, of the same noisy stars.
+
+    In their ratio it does not matter that the method has learnt from stars that validate.
+    """
+    model, count = PsfModel(bundle), len(stars.images)
+    star = np.tile(np.arange(count), -(-LEAST_STARS // count))
+    widening = np.ones((len(bundle.noise_nodes), 2))
+    for place, noise in enumerate(bundle.noise_nodes):
+        noisy = stars.noise.draw(stars.images[star], noise / stars.noise.kappa, rng)
+        widths = []
+        for known in ({"flux": 1.0, "background": 0.0}, {}):
+            found = model.predict(noisy, **known)
+            usable = np.isfinite(found.psf).all(axis=(1, 2))
+            error = np.abs(found.psf - stars.references[star])[usable]
+            error /= np.maximum(found.uncertainty[usable], LEAST_SIGMA)
+            widths.append(np.quantile(error, (COVERAGE, WIDE)) if usable.any() else np.ones(2))
+        given, estimated = np.maximum(widths, LEAST_SIGMA)
+        widening[place] = estimated / given
+    return replace(bundle, widening=widening)
 
 
 def measure_levels(

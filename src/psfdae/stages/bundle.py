@@ -106,9 +106,11 @@ def bundle(
     fitted = kind.load(place, restored, config.evaluation)
     parts = split_stars(product, trained["split"], config)
     images, references = product["realisation"], product[restored]
-    where = field_positions(product)[parts.test]
-    held_out = packing.HeldOutStars(
-        images[parts.test], references[parts.test], noise_model(config), where
+    held_out, validation = (
+        packing.HeldOutStars(
+            images[some], references[some], noise_model(config), field_positions(product)[some]
+        )
+        for some in (parts.test, parts.validation)
     )
     model = packing.leading(FluxModel.fit(images[parts.train]), packing.COMPONENTS)
     band = config.noise.kappa * np.asarray(config.noise.levels)
@@ -120,7 +122,7 @@ def bundle(
         config.noise.levels,
         held_out,
         lambda level: noisy_test_images(config, product, parts.test, level),
-        lambda noisy, level: fitted.estimate(noisy, level, where),
+        lambda noisy, level: fitted.estimate(noisy, level, held_out.position),
         errors,
         reach["noise_equivalent_px"],
         config.evaluation.data_range,
@@ -145,7 +147,11 @@ def bundle(
     )
     maps = (errors.nodes, errors.half_width(), errors.rms(), errors.distance_limit())
     ratio95 = errors.ratio95() if info.format_version > 1 else None
-    write_bundle(Bundle(info, arrays, model, *maps, ratio95, errors.strange_limit()), out)
+    made = Bundle(info, arrays, model, *maps, ratio95, errors.strange_limit())
+    # A method that measures stars knows how sure it is of flux and sky.
+    if info.format_version > 1 and parts.validation.size and not kind.measures:
+        made = packing.with_photometry(made, validation, rng)
+    write_bundle(made, out)
 
 
 def _trained(kind: type[Method], place: Path, config: Config, split: str | None) -> dict[str, Any]:
