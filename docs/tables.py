@@ -162,6 +162,21 @@ def strange():
     return wide.reset_index()
 
 
+def rules():
+    """What the jobs of each rule took in the run of record, and in one before; scene 3 job by job."""
+    runs = []
+    for name in ("runtime.csv", "runtime_before.csv"):
+        table = csv(name)
+        small = table.rule.eq("alignment") & table.wildcards.str.contains("figure|table|time|telesc")
+        own = table.rule.eq("alignment") & ~small
+        rule = table.rule.where(~own, "scene 3: " + table.wildcards.str.replace("_", " "))
+        grouped = table.assign(jobs=1).groupby(rule.where(~small, "scene 3: tables, figures"))
+        runs.append(grouped.agg({"jobs": "sum", "wall_s": "sum", "cpu_s": "sum", "peak_mb": "max"}))
+    both = runs[0].join(runs[1], rsuffix="_before", how="outer")
+    both.loc["together"] = both.sum().where(~both.columns.str.startswith("peak"), both.max())
+    return both.rename_axis("rule").reset_index().sort_values("cpu_s", ascending=False)
+
+
 def networks():
     """Networks of scene 3 on noisy stamps: what they took, and errors on validation states."""
     folder = "sweeps/network_epochs"

@@ -27,6 +27,7 @@ rule reference:
             f"--keep={file}"
             for file in (
                 "paper/tables/psf_metrics.csv",
+                "runtime_before.csv",
                 "tables/benchmark_training.csv",
                 "tables/benchmark_stopping.csv",
                 "figures/benchmark/training.png",
