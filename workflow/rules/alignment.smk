@@ -110,8 +110,7 @@ use rule alignment_dae as alignment_network with:
         f"{RESULTS}/benchmarks/alignment/{{network}}.tsv"
     threads: lambda w: getattr(alignment_config(), f"train_{w.network}").threads
     resources:
-        # Several draws of the DAE's output are in memory.
-        mem_mb=lambda w: 2500 if METHODS[w.network].denoised else 1500,
+        mem_mb=1600,
         runtime=60,
     params:
         command=lambda w: f"train-network --kind {w.network}",
