@@ -163,11 +163,13 @@ def strange():
 
 
 def rules():
-    """What the jobs of each rule took in the run of record, and in one before; scene 3 job by job."""
+    """What the jobs of each rule took in the run of record, and before; scene 3 job by job."""
     runs = []
     for name in ("runtime.csv", "runtime_before.csv"):
         table = csv(name)
-        small = table.rule.eq("alignment") & table.wildcards.str.contains("figure|table|time|telesc")
+        small = table.rule.eq("alignment") & table.wildcards.str.contains(
+            "figure|table|time|telesc"
+        )
         own = table.rule.eq("alignment") & ~small
         rule = table.rule.where(~own, "scene 3: " + table.wildcards.str.replace("_", " "))
         grouped = table.assign(jobs=1).groupby(rule.where(~small, "scene 3: tables, figures"))

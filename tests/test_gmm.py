@@ -14,6 +14,8 @@ from psfdae.estimators import gmm as module
 from psfdae.estimators.gmm import GaussianMixture, Gmm
 from psfdae.estimators.gmm_simulated import Simulated, SimulatedMixture
 from psfdae.files import Product
+from psfdae.own_stars.bundle import BundleError
+from psfdae.own_stars.packing import packed
 from psfdae.stars.noise import NoiseModel
 
 NOISE = NoiseModel(kappa=5.0, background=1e4)
@@ -271,6 +273,17 @@ def test_a_bundle_has_the_main_axes_of_each_cluster():
     np.testing.assert_allclose(some.evidence, whole.evidence, atol=0.5)
     much = GaussianMixture.restored(mixture.pack(D, 0.1)[0], config, "realisation")
     assert len(much.deviation) < 0.6 * len(arrays["deviation"])
+    size = sum(array.nbytes for array in arrays.values())
+    assert (
+        packed(mixture, D, NOISE.kappa * LEVEL, np.inf)[0]["rows"].tolist()
+        == arrays["rows"].tolist()
+    )
+    smaller = packed(mixture, D, NOISE.kappa * LEVEL, 0.8 * size)[0]
+    assert 0.6 * size < sum(array.nbytes for array in smaller.values()) <= 0.8 * size
+    less = GaussianMixture.restored(smaller, config, "realisation").estimate(noisy, LEVEL)
+    assert np.square(less.psf - truth).mean() < 1.1 * np.square(whole.psf - truth).mean()
+    with pytest.raises(BundleError, match=r"GMM .*: takes more than 0.001 MB"):
+        packed(mixture, D, NOISE.kappa * LEVEL, 1e3)
 
 
 def test_the_position_is_used_where_it_tells_something():

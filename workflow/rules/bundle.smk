@@ -20,12 +20,14 @@ for _method in (m for m in registered() if m.stored and m.bundled):
             config=lambda w: settings("bundle", f"dataset={w.dataset}"),
             source=source_hash("bundle", chosen=[f"psfdae.estimators.{_method.name}"]),
             model=lambda w, m=_method: option_of(m, w.dataset, w.split, w.reference),
+            # A model that comes with a package is small.
+            size=lambda w: ["--largest-mb=4.8"] * (w.dataset == SHIPPED_DATASET),
         message:
             f"Packing {_method.label} of {{wildcards.dataset}}, {{wildcards.split}}, {{wildcards.reference}}"
         shell:
             "psfdae bundle --config {params.config} --stars {input.stars} {params.model}"
             " --split {wildcards.split} --reference {wildcards.reference} --licence MIT"
-            " --out {output} > {log} 2>&1"
+            " {params.size} --out {output} > {log} 2>&1"
 
 
 rule bundles:

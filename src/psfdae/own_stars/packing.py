@@ -14,13 +14,16 @@ of another distribution: two factors per node, which validation stars tell, make
 from __future__ import annotations
 
 import hashlib
+from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any
 
 import numpy as np
 
 from psfdae.estimators import Estimate, Method
-from psfdae.own_stars.bundle import Bundle, at_noise, mahalanobis
+from psfdae.own_stars.bundle import Bundle, BundleError, at_noise, mahalanobis
 from psfdae.own_stars.model import SNR_TOLERANCE, PsfModel
 from psfdae.own_stars.photometry import FluxModel, noise_equivalent_px, signal_to_noise
 from psfdae.stars.noise import NoiseModel
@@ -31,6 +34,7 @@ COVERAGE = 0.6827  # part of the errors within ± `error68`; of a normal variabl
 WIDE = 0.95  # part of them within ± `error68` times `ratio95`
 LEAST_SIGMA = 1e-12  # of the flux; equal stars leave a method no doubt
 LIMIT = 0.999  # part of the test stars within the limit of the Mahalanobis distance
+STEPS = 64  # of the noise up to that of the flux in every pixel, of a model that is to be small
 LEAST_STARS = 2000  # noisy images per node; few test stars are seen several times with new noise
 
 Restore = Callable[[np.ndarray, float], Estimate]
@@ -90,6 +94,31 @@ class Errors:
     def distance_limit(self) -> float:
         """Distance that 0.1 % of the stars of all nodes exceed."""
         return float(np.quantile(self.distance, LIMIT))
+
+
+def packed(
+    fitted: Method, stamp_px: int, noise: float, largest: float
+) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """What a fit packs for this noise, or for the least above it for which it takes few bytes.
+
+    Raises
+    ------
+    BundleError
+        If it takes more than the largest number of bytes in any case.
+    """
+    tried = np.geomspace(noise, max(1.0, noise), STEPS)
+
+    @cache
+    def made(step: int) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        return fitted.pack(stamp_px, float(tried[step]))
+
+    def small(step: int) -> bool:
+        return sum(array.nbytes for array in made(step)[0].values()) <= largest
+
+    least = bisect_left(range(STEPS), True, key=small)
+    if least == STEPS:
+        raise BundleError(f"{fitted.label}: takes more than {largest / 1e6:.2g} MB")
+    return made(least)
 
 
 def noise_nodes(band: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 
 import psfdae
 from psfdae.belonging import SAME_IMAGE, SAME_STARS, STARS, require_origin
-from psfdae.cli import File, Folder, Reference, Split, command
+from psfdae.cli import AboveZero, File, Folder, Reference, Split, command
 from psfdae.configuration.compose import as_overrides
 from psfdae.configuration.schema import Config
 from psfdae.estimators import CONFIG, Method, all_groups, method
@@ -86,6 +86,9 @@ def bundle(
     ] = None,
     name: Annotated[str | None, "Name of the model.  [default: the file's]"] = None,
     licence: Annotated[str, "Of the model."] = "not stated",
+    largest_mb: Annotated[
+        float | None, AboveZero, "Size of the model, for which a mixture leaves out fine axes."
+    ] = None,
     *,
     out: Annotated[File, "Bundle, a file NAME.psf.safetensors."],
 ) -> None:
@@ -103,7 +106,6 @@ def bundle(
     product = read_stars(stars, restored)
     stamps = _kind_of_stamps(product)
     require_origin(place, (*STARS, *SAME_STARS, *SAME_IMAGE), product)
-    fitted = kind.load(place, restored, config.evaluation)
     parts = split_stars(product, trained["split"], config)
     images, references = product["realisation"], product[restored]
     held_out, validation = (
@@ -114,19 +116,13 @@ def bundle(
     )
     model = packing.leading(FluxModel.fit(images[parts.train]), packing.COMPONENTS)
     band = config.noise.kappa * np.asarray(config.noise.levels)
-    arrays, said = fitted.pack(stamps["stamp_px"], float(band.min()))
-    nodes, rng = packing.noise_nodes(band), stream(config.seed, "noise", "bundle")
-    errors = packing.measure_errors(held_out, fitted, model, nodes, rng)
-    reach = packing.reach(band, model.mean)
-    metrics = packing.measure_levels(
-        config.noise.levels,
-        held_out,
-        lambda level: noisy_test_images(config, product, parts.test, level),
-        lambda noisy, level: fitted.estimate(noisy, level, held_out.position),
-        errors,
-        reach["noise_equivalent_px"],
-        config.evaluation.data_range,
+    arrays, said = packing.packed(
+        kind.load(place, restored, config.evaluation),
+        stamps["stamp_px"],
+        float(band.min()),
+        1e6 * (largest_mb or np.inf),
     )
+    reach = packing.reach(band, model.mean)
     info = BundleInfo(
         psfdae_version=psfdae.__version__,
         name=name or out.name.removesuffix(SUFFIX),
@@ -143,8 +139,21 @@ def bundle(
             "train": trained,
             "evaluation": config.evaluation.model_dump(),
         },
-        metrics=metrics,
+        metrics=[],
     )
+    fitted = kind.unpack(arrays, info)  # what it errs as packed
+    nodes, rng = packing.noise_nodes(band), stream(config.seed, "noise", "bundle")
+    errors = packing.measure_errors(held_out, fitted, model, nodes, rng)
+    metrics = packing.measure_levels(
+        config.noise.levels,
+        held_out,
+        lambda level: noisy_test_images(config, product, parts.test, level),
+        lambda noisy, level: fitted.estimate(noisy, level, held_out.position),
+        errors,
+        reach["noise_equivalent_px"],
+        config.evaluation.data_range,
+    )
+    info = info.model_copy(update={"metrics": metrics})
     maps = (errors.nodes, errors.half_width(), errors.rms(), errors.distance_limit())
     ratio95 = errors.ratio95() if info.format_version > 1 else None
     made = Bundle(info, arrays, model, *maps, ratio95, errors.strange_limit())
@@ -262,7 +271,8 @@ def _validation_error(bundle: Bundle, stars: Product, config: Config) -> float:
     data = training_set(config, kind, stars, "random", "realisation")
     if not kind.validates:
         apart = fit_apart(kind, data, np.arange(len(data.images)), config)
-        weights, _ = apart.pack(bundle.info.stamp_px, bundle.info.noise_min)
+        size = sum(array.nbytes for array in bundle.weights.values())
+        weights, _ = packing.packed(apart, bundle.info.stamp_px, bundle.info.noise_min, size)
         bundle = replace(bundle, weights=weights)
     model, truth, noise = PsfModel(bundle), data.images[data.validation], noise_model(config)
     logs = []
