@@ -183,7 +183,7 @@ def networks():
     """Networks of scene 3 on noisy stamps: what they took, and errors on validation states."""
     folder = "sweeps/network_epochs"
     table = csv(f"{folder}/summary.csv").merge(csv(f"{folder}/cost.csv"), on="point")
-    return table.sort_values("cpu_seconds")
+    return table.sort_values("seconds")
 
 
 def real_sky():
