@@ -152,7 +152,8 @@ def poppy(name):
     """Errors on POPPY's stars, with the labels of the methods, which end the bundles' names."""
     table = csv(name)
     ends = table.bundle.str.extract(r"-realisation-(\w+)$", expand=False).fillna(table.method)
-    return table.assign(label=[method(m).label for m in ends])
+    before = table.bundle.eq("wfsat").map({True: ", in the package before", False: ""})
+    return table.assign(label=[method(m).label for m in ends] + before)
 
 
 def strange():
