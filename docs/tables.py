@@ -152,8 +152,8 @@ def poppy(name):
     """Errors on POPPY's stars, with the labels of the methods, which end the bundles' names."""
     table = csv(name)
     ends = table.bundle.str.extract(r"-realisation-(\w+)$", expand=False).fillna(table.method)
-    before = table.bundle.eq("wfsat").map({True: ", in the package before", False: ""})
-    return table.assign(label=[method(m).label for m in ends] + before)
+    shipped = table.bundle.eq("wfsat").map({True: ", in the package", False: ""})
+    return table.assign(label=[method(m).label for m in ends] + shipped)
 
 
 def strange():
@@ -175,7 +175,7 @@ def rules():
         rule = table.rule.where(~own, "scene 3: " + table.wildcards.str.replace("_", " "))
         grouped = table.assign(jobs=1).groupby(rule.where(~small, "scene 3: tables, figures"))
         runs.append(grouped.agg({"jobs": "sum", "wall_s": "sum", "cpu_s": "sum", "peak_mb": "max"}))
-    both = runs[0].join(runs[1], rsuffix="_before", how="outer")
+    both = runs[0].join(runs[1].add_suffix("_before"), how="outer")
     both.loc["together"] = both.sum().where(~both.columns.str.startswith("peak"), both.max())
     return both.rename_axis("rule").reset_index().sort_values("cpu_s", ascending=False)
 

@@ -325,3 +325,10 @@ def test_fresh_stars_are_of_fields_that_the_training_part_has(reference):
     assert mixture.count.sum() == known.sum() + data.validation.size
     with pytest.raises(FitError, match="learns from fresh stars"):
         training().on_fresh_stars()
+
+
+def test_no_stars_have_no_psfs():
+    none, mixture = np.empty((0, D, D), np.float32), fitted(components=[4])
+    found = mixture.estimate(none, np.empty(0))
+    assert found.psf.shape == found.sigma.shape == none.shape
+    assert mixture.strangeness(none, np.empty(0)).shape == (0,)

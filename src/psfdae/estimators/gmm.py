@@ -30,6 +30,7 @@ Y_k, LOOSE μ_y,k.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -446,7 +447,7 @@ class GaussianMixture(Method):
         position: np.ndarray | None,
         sure: bool,
     ) -> Estimate:
-        flat = noisy.reshape(len(noisy), -1)
+        flat = noisy.reshape(len(noisy), math.prod(noisy.shape[1:]))
         if not np.isfinite(flat).all():
             raise ValueError("noisy images must be finite")
         where = position @ self.whitening if self.whitening.size else np.empty((len(flat), 0))
