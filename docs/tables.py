@@ -27,6 +27,7 @@ import pandas as pd
 from psfdae.alignment import methods as scene3
 from psfdae.configuration.compose import compose
 from psfdae.estimators import method
+from psfdae.own_stars.bundle import SHIPPED
 
 ROOT = Path(__file__).resolve().parents[1]
 REFERENCE = ROOT / "results/reference"
@@ -152,7 +153,7 @@ def poppy(name):
     """Errors on POPPY's stars, with the labels of the methods, which end the bundles' names."""
     table = csv(name)
     ends = table.bundle.str.extract(r"-realisation-(\w+)$", expand=False).fillna(table.method)
-    shipped = table.bundle.eq("wfsat").map({True: ", in the package", False: ""})
+    shipped = table.bundle.eq(SHIPPED).map({True: ", in the package", False: ""})
     return table.assign(label=[method(m).label for m in ends] + shipped)
 
 
