@@ -153,8 +153,8 @@ def poppy(name):
     """Errors on POPPY's stars, with the labels of the methods, which end the bundles' names."""
     table = csv(name)
     ends = table.bundle.str.extract(r"-realisation-(\w+)$", expand=False).fillna(table.method)
-    shipped = table.bundle.eq(SHIPPED).map({True: ", in the package", False: ""})
-    return table.assign(label=[method(m).label for m in ends] + shipped)
+    before = table.bundle.eq(SHIPPED).map({True: ", in the package before", False: ""})
+    return table.assign(label=[method(m).label for m in ends] + before)
 
 
 def strange():
@@ -181,9 +181,9 @@ def rules():
     return both.rename_axis("rule").reset_index().sort_values("cpu_s", ascending=False)
 
 
-def networks():
-    """Networks of scene 3 on noisy stamps: what they took, and errors on validation states."""
-    folder = "sweeps/network_epochs"
+def sweep(name):
+    """Points of a sweep with what they took, the shortest first."""
+    folder = f"sweeps/{name}"
     table = csv(f"{folder}/summary.csv").merge(csv(f"{folder}/cost.csv"), on="point")
     return table.sort_values("seconds")
 

@@ -7,11 +7,12 @@ import fcntl
 import numpy as np
 import pytest
 
-from prediction_stars import fresh_psfs
+from prediction_stars import fresh_psfs, with_network
 from psfdae import load_model
 from psfdae.alignment.telescope import design_states, fit_quadratic, grid_states, zernike_tracer
 from psfdae.configuration.compose import load
 from psfdae.optics.pupil import annular_pupil
+from psfdae.own_stars.model import PsfModel
 from psfdae.stars.noise import NoiseModel
 from workflow_runs import snakemake
 
@@ -92,6 +93,12 @@ def built(folder):
 def shipped():
     """The model that comes with the package."""
     return load_model()
+
+
+@pytest.fixture(scope="session")
+def network(shipped):
+    """The same photometry with a network of random weights."""
+    return PsfModel(with_network(shipped.bundle))
 
 
 @pytest.fixture(scope="session")

@@ -78,8 +78,9 @@ def write_good(folder):
     from astropy.table import Table
 
     from fits_inputs import write_cube, write_field
+    from prediction_stars import with_network
     from psfdae.estimators.weights import save_weights
-    from psfdae.own_stars.bundle import shipped_path
+    from psfdae.own_stars.bundle import read_bundle, shipped_path, write_bundle
 
     rng = np.random.default_rng(1)
     grid = np.arange(16) - 8
@@ -108,7 +109,8 @@ def write_good(folder):
     lines = [f"# {k + 1} {name}" for k, name in enumerate(("NUMBER", "X_IMAGE", "Y_IMAGE"))]
     lines += [f"{row['id']} {row['X_IMAGE']} {row['Y_IMAGE']}" for row in table]
     (folder / "s.cat").write_text("\n".join(lines))
-    shutil.copy(shipped_path(), folder / "bundle.psf.safetensors")
+    shutil.copy(shipped_path(), folder / "mixture.psf.safetensors")
+    write_bundle(with_network(read_bundle()), folder / "network.psf.safetensors")
     save_weights(
         folder / "dae.safetensors",
         {"layers.0.weight": Tensor(rng.normal(size=(1, 1, 3, 3)).astype(np.float32))},
@@ -144,7 +146,7 @@ GOOD = {
     "cube": ["cube.fits", "cube16.fits", "cube.fz", *(f"cube.{pack}" for pack in PACK)],
     "image": ["image.fits", "image.fz", "GZIP_1.fz", "GZIP_2.fz"],
     "catalogue": ["s.csv", "s.fits", "s.ecsv", "s.cat"],
-    "bundle": ["bundle.psf.safetensors"],
+    "bundle": ["network.psf.safetensors", "mixture.psf.safetensors"],
     "weights": ["dae.safetensors"],
 }
 
@@ -223,7 +225,7 @@ def tensors(raw, rng, sign):
     ((key, text),) = json.loads(raw[8 : 8 + size])["__metadata__"].items()
     text, arrays = json.loads(text), dict(load(raw))
     changes = rng.choice([1, 1, 2, 3])
-    if "info" in text and rng.random() < 0.25:
+    if "dae" in text.get("info", {}) and rng.random() < 0.25:
         text["info"], arrays = another_size(text["info"], arrays, rng)
         changes = rng.choice([0, 0, 1])
     for _ in range(changes):

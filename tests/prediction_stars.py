@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 
 from psfdae.configuration.compose import load_stage
 from psfdae.configuration.consistency import SIMULATION, STATIC
+from psfdae.estimators.dae_network import build_dae
 from psfdae.files import read_product
+from psfdae.own_stars.bundle import Architecture, BundleInfo
 from psfdae.stages import stars
 
 KAPPA, SKY = 4.98, 1e4
@@ -42,3 +45,19 @@ def observe(psf, level, seed=0):
     flux = SKY**0.5 / (KAPPA * level)
     stamps = np.random.default_rng(seed).poisson(flux * psf + SKY).astype(np.float32)
     return Observed(stamps, flux, psf)
+
+
+def with_network(bundle):
+    """The bundle with a network of random weights in place of its method."""
+    shape = Architecture(kernels=(5, 3, 5), widths=(4, 4))
+    network = build_dae(shape.kernels, shape.widths, "he", torch.Generator().manual_seed(1))
+    told = bundle.info.model_dump(exclude={"method", "reference", "misfit"})
+    told |= {"format_version": 1, "dae": shape, "image_scale": 256.0}
+    return replace(
+        bundle,
+        info=BundleInfo(**told),
+        weights={name: value.contiguous().numpy() for name, value in network.state_dict().items()},
+        ratio95=None,
+        strange_limit=None,
+        widening=None,
+    )

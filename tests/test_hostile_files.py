@@ -20,6 +20,7 @@ import hostile_files
 from command_line import psfdae, refused
 from fits_inputs import open_observation, write_cube, write_field
 from hostile_files import PACK
+from prediction_stars import with_network
 from psfdae import load_model
 from psfdae.own_stars import bundle as module
 from psfdae.own_stars import catalogue, images
@@ -310,8 +311,8 @@ def test_columns_of_fits_tables_are_what_astropy_reads(tmp_path):
 
 
 def signed(path, change=lambda info: None, **arrays):
-    """The shipped bundle with another description and other arrays."""
-    bundle = read_bundle()
+    """A bundle of a network with another description and other arrays."""
+    bundle = with_network(read_bundle())
     tensors, info = module._tensors(bundle), bundle.info.described()
     for name, make in arrays.items():
         tensors[name] = np.asarray(make(tensors[name]))
@@ -388,8 +389,8 @@ def test_a_bundle_of_any_size_is_not_read(monkeypatch):
 
 
 def large(side, path):
-    """A bundle of large stamps with four eigenvectors."""
-    bundle, kept = read_bundle(), 4
+    """A network's bundle of large stamps with four eigenvectors."""
+    bundle, kept = with_network(read_bundle()), 4
     grid = np.arange(side) - side // 2
     mean = np.exp(-(grid[:, None] ** 2 + grid**2) / 50.0).ravel()
     mean /= mean.sum()

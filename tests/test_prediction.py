@@ -10,7 +10,6 @@ import pytest
 
 from prediction_stars import KAPPA, SKY, observe
 from psfdae import Prediction, PredictionError, StarFlag
-from psfdae.estimators import dae_network
 from psfdae.own_stars import photometry
 from psfdae.own_stars.model import BLOCK
 from psfdae.own_stars.stamps import MEANING, cut
@@ -31,6 +30,15 @@ def has(found, flag):
 def same(a, b, rows=slice(None)):
     pairs = ((getattr(a, name)[rows], getattr(b, name)[rows]) for name in COLUMNS)
     return all(np.array_equal(*pair, equal_nan=True) for pair in pairs)
+
+
+def close(a, b, rows=slice(None)):
+    """The same but for rounding, of which the angle of a round PSF has most."""
+    for name in COLUMNS:
+        of = {"rel": 1e-3, "abs": 0.05 if name == "position_angle_deg" else 1e-3}
+        wanted = pytest.approx(getattr(b, name)[rows], nan_ok=True, **of)
+        assert getattr(a, name)[rows] == wanted, name
+    return True
 
 
 @pytest.fixture(scope="module")
@@ -125,17 +133,18 @@ def test_any_unit_gives_the_same_psf(shipped, medium, clean, unit):
     assert np.mean(found.flags == clean.flags[:100]) > 0.99
 
 
-def test_result_depends_neither_on_threads_nor_on_company(shipped, medium, clean):
+@pytest.mark.parametrize("name", ["shipped", "network"])
+def test_result_depends_neither_on_threads_nor_on_company(name, medium, request):
+    model = request.getfixturevalue(name)
+    clean = model.predict(medium.stamps)
     assert len(medium.stamps) > BLOCK
     for threads in (2, None):
-        assert same(shipped.predict(medium.stamps, threads=threads), clean)
+        assert same(model.predict(medium.stamps, threads=threads), clean)
     order = np.random.default_rng(0).permutation(len(medium.stamps))
     for rows in (slice(5, 8), slice(300, 301), order):
-        found = shipped.predict(medium.stamps[rows])
-        for name in COLUMNS:
-            close = pytest.approx(getattr(clean, name)[rows], rel=1e-4, abs=1e-3, nan_ok=True)
-            assert getattr(found, name) == close, name
-    assert shipped.predict(medium.stamps[300]).psf.shape == (1, 16, 16)
+        picked = replace(clean, **{n: getattr(clean, n)[rows] for n in COLUMNS})
+        assert close(model.predict(medium.stamps[rows]), picked)
+    assert model.predict(medium.stamps[300]).psf.shape == (1, 16, 16)
 
 
 @pytest.mark.parametrize("kind", [">f4", np.int32, ">i2", list])
@@ -183,18 +192,19 @@ BROKEN = {
 }
 
 
-def test_broken_stamps_are_flagged_and_their_neighbours_do_not_notice(shipped, medium, clean):
-    stamps = medium.stamps.copy()
+@pytest.mark.parametrize(("name", "alike"), [("shipped", close), ("network", same)])
+def test_broken_stamps_are_flagged_and_their_neighbours_do_not_notice(name, alike, medium, request):
+    model, stamps = request.getfixturevalue(name), medium.stamps.copy()
     for stamp, (_, change) in zip(stamps, BROKEN.values(), strict=False):
         change(stamp)
-    found = shipped.predict(stamps)
+    found = model.predict(stamps)
     for row, (kind, (flag, _)) in enumerate(BROKEN.items()):
         assert (found.flags[row] & int(flag)) == int(flag), kind
     lost = has(found, StarFlag.NO_FLUX)
     assert np.isnan(found.psf[lost]).all()
     assert np.isfinite(found.psf[~lost]).all()
     assert np.isfinite(found.uncertainty[~lost]).all()
-    assert same(found, clean, slice(len(BROKEN), None))
+    assert alike(found, model.predict(medium.stamps), slice(len(BROKEN), None))
 
 
 def test_a_block_without_a_good_pixel_is_that_of_each_star_and_asks_nothing(
@@ -210,7 +220,7 @@ def test_a_block_without_a_good_pixel_is_that_of_each_star_and_asks_nothing(
         for k in range(6)
     ]
     fits = []
-    monkeypatch.setattr(dae_network, "predict", None)
+    monkeypatch.setattr(type(shipped.engine.estimator), "estimate", None)
     careful = photometry.robust_flux
     monkeypatch.setattr(photometry, "robust_flux", lambda *a: fits.append(a) or careful(*a))
     found = shipped.predict(stamps, bad=bad, **known)

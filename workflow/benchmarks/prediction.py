@@ -49,17 +49,19 @@ def throughput(
     config: Config,
     stars: Annotated[File, "Product of the stage stars."],
     bundle: Annotated[File, "Model bundle of the dataset, of a network."],
+    mixture: Annotated[File, "Another, of a mixture."],
     out: Annotated[File, "CSV with stamps per second and memory."],
 ) -> None:
     """Time predict from FITS to FITS beside the bare network, on a quiet machine."""
     require(stars, read_product(stars, "stars", ()).config, STARS, config)
-    require_bundle(bundle, config)
+    for model in (bundle, mixture):
+        require_bundle(model, config)
     settings = config.benchmark
     work = (settings.star_counts[-1], settings.threads, min(settings.repeats, REPEATS))
     with TemporaryDirectory() as folder:
         cube = Path(folder, "stars.fits")
         alone(1, make_cube, config.model_dump(), stars, work[0], cube)
-        rates, peak_mb = alone(settings.threads, time_prediction, cube, bundle, *work)
+        rates, peak_mb = alone(settings.threads, time_prediction, cube, bundle, mixture, *work)
     bare = max(rates["bare_shared_per_s"], rates["bare_parallel_per_s"])
     share = rates["predict_per_s"] / bare
     row = {"stamps": work[0], "stamp_px": config.framing.stamp_px, "threads": work[1]}
@@ -85,8 +87,10 @@ def make_cube(tree, stars, count, out):
     write_cube(out, cube, PIXSCALE=tree["telescope"]["pixel_scale_arcsec"], GAIN=1.0)
 
 
-def time_prediction(cube, bundle, stamps, threads, repeats):
+def time_prediction(cube, bundle, mixture, stamps, threads, repeats):
     """Medians of stamps per second of `psfdae predict` and of the bare network, in turn.
+
+    Those of the mixture are from one run.
 
     The bare network runs in one forward pass at a time on all threads ("shared"), and in as
     many passes as threads beside each other. Then the memory of the prediction in MB,
@@ -105,6 +109,9 @@ def time_prediction(cube, bundle, stamps, threads, repeats):
         rates["predict"].append(stamps / cost["time_s"])
         for way in ("shared", "parallel"):
             rates[f"bare_{way}"].append(bare_rate(model, stamps, threads, way))
+    options[1] = mixture
+    cost = cost_of_command(["predict", cube, *options], cube.with_name("psf.fits"))
+    peak, rates["mixture"] = max(peak, cost["peak_b"]), [stamps / cost["time_s"]]
     medians = {f"{name}_per_s": np.median(values) for name, values in rates.items()}
     return medians, peak / 2**20
 

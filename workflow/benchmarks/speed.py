@@ -161,7 +161,7 @@ def last_cost(runs):
 def untrained_bundle(tree, stars, out):
     """The shipped model with a random network and these stars' size of stamps."""
     from psfdae.files import read_product
-    from psfdae.own_stars.bundle import Architecture, read_bundle, write_bundle
+    from psfdae.own_stars.bundle import Architecture, BundleInfo, read_bundle, write_bundle
     from psfdae.own_stars.packing import leading, noise_equivalent_px
     from psfdae.own_stars.photometry import FluxModel
 
@@ -170,6 +170,8 @@ def untrained_bundle(tree, stars, out):
     network, factor = random_network(dae, max(dae["widths"]), side)
     errors = np.ones((len(shipped.noise_nodes), side, side), np.float32)
     about = {
+        **shipped.info.model_dump(exclude={"method", "reference", "misfit"}),
+        "format_version": 1,
         "stamp_px": side,
         "pixel_scale_arcsec": tree["telescope"]["pixel_scale_arcsec"],
         "image_scale": factor,
@@ -178,11 +180,14 @@ def untrained_bundle(tree, stars, out):
     }
     bundle = replace(
         shipped,
-        info=shipped.info.model_copy(update=about),
+        info=BundleInfo(**about),
         weights={k: v.contiguous().numpy() for k, v in network.state_dict().items()},
         flux_model=leading(model, shipped.info.components),
         error68=errors,
         rms=errors,
+        ratio95=None,
+        strange_limit=None,
+        widening=None,
     )
     write_bundle(bundle, out)
 

@@ -74,7 +74,7 @@ TIMED = {
         ["templates", "stars", "predict"],
     ),
     "predict_throughput": (
-        *("prediction", "prediction.throughput", {**STARS, "bundle": BUNDLE}),
+        *("prediction", "prediction.throughput", {**STARS, "bundle": BUNDLE, "mixture": MIXED}),
         *(1500, 20, ["predict"]),
     ),
     "predict_poppy": (

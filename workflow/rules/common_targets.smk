@@ -1,5 +1,5 @@
 from psfdae.alignment.methods import TRAINED, METHODS
-from psfdae.own_stars.bundle import SUFFIX, shipped_path
+from psfdae.own_stars.bundle import SUFFIX
 
 with one_line():
     KNEE = import_module("trainings").load_knee()
@@ -88,9 +88,9 @@ def every_bundle_of_timed(w):
 
 
 def rivals_of_shipped(w):
-    """The model that comes with the package, of the preset fast, and those that may follow it."""
-    shipped = [str(shipped_path())] if PRESET == "fast" else []
-    return bundles_of(SHIPPED_DATASET, PACKED) + shipped
+    """The models that may come with the package, and the network that came with it before."""
+    before = ["workflow/benchmarks/wfsat_before.psf.safetensors"] if PRESET == "fast" else []
+    return bundles_of(SHIPPED_DATASET, PACKED) + before
 
 
 def poppy_stars(w):

@@ -43,7 +43,7 @@ rule reference:
                 "sweeps/gmm/summary.csv",
                 *(
                     f"sweeps/{name}/{table}.csv"
-                    for name in ("dae_training", "network_epochs")
+                    for name in ("dae_training", "dae_crop", "network_epochs")
                     for table in ("summary", "cost")
                 ),
             )

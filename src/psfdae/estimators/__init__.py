@@ -351,9 +351,13 @@ class Method:
     def free_flux(self) -> Self:
         """The same for images whose flux and sky are estimates, and their sum therefore 1.
 
-        A method that can finds a better flux (`Estimate.flux`).
+        A method that can finds the `flux` of these.
         """
         return self
+
+    def flux(self, noisy: np.ndarray, level: np.ndarray) -> np.ndarray:
+        """Flux of each star in that by which its image was divided, shape (n,), if it is free."""
+        return np.ones(len(noisy))
 
     def psf_at(self, position: np.ndarray, oversampling: int = 1) -> np.ndarray:
         """PSFs at positions (n, 2), of a method that knows them between the stars."""

@@ -61,6 +61,9 @@ LEAST = 1e-3
 LOOSE = 0.2
 """Standard deviation of the flux in that by which an image was divided."""
 
+ROWS = 4096
+"""Stars that are turned into other axes at once; all would take as much memory again."""
+
 TELLING, LEADING_ARRAYS = 40, ("axes", "variance", "mean", "deviation", "slope")
 """Coordinates that tell strange stars, and arrays whose last axis they are. More of them find
 more strange stars that are bright, and fewer that are faint."""
@@ -310,32 +313,31 @@ class GaussianMixture(Method):
         cls, data: TrainingSet, stars: np.ndarray, clusters: int, gmm: Gmm, told: bool
     ) -> Self:
         """Moments of the clusters of some stars, and how they follow the position if it is told."""
-        x, y = (
-            a[stars].reshape(stars.size, -1).astype(np.float64)
-            for a in (data.images, data.references)
-        )
-        same = np.array_equal(x, y)
-        y = x if same else y
+        same = np.array_equal(data.images[stars], data.references[stars])
         p = cls._told(data, stars).astype(np.float64) * told
+        x = data.images[stars].reshape(stars.size, -1).astype(np.float64)
         cluster = _k_means(x, gmm.place * _standard(p), clusters, gmm.principal, data.seed)
+        del x  # before it is there in another order
         order = np.argsort(cluster, kind="stable")
         count = np.unique(cluster, return_counts=True)[1]
         start = np.concatenate([[0], count.cumsum()[:-1]])
 
         def about_means(a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            a = a[order]
+            a = a.reshape(len(a), math.prod(a.shape[1:])).astype(np.float64)
             mean = np.add.reduceat(a, start) / count[:, None]
             for rows, own in zip(np.split(a, start[1:]), mean, strict=True):
                 np.subtract(rows, own, out=rows)
             return mean, a
 
-        (mean_p, p), (mean_x, x) = about_means(p), about_means(x)
-        mean_y, y = (mean_x, x) if same else about_means(y)
+        (mean_p, p), (mean_x, x) = about_means(p[order]), about_means(data.images[stars[order]])
+        mean_y, y = (mean_x, x) if same else about_means(data.references[stars[order]])
         whitening = _whitening(p)
         p = p @ whitening
         slope, slope_y = (p.T @ a / len(a) for a in (x, y))
-        x -= p @ slope
-        y -= 0.0 if same else p @ slope_y  # of the same, it is gone
+        parts = [slice(a, a + ROWS) for a in range(0, len(x), ROWS)]
+        for rows in parts:
+            x[rows] -= p[rows] @ slope
+            y[rows] -= 0.0 if same else p[rows] @ slope_y  # of the same, it is gone
         scatter = x.T @ x
         if data.own_noise is not None and same and not p.size:
             for a, b, mean in zip(start, start + count, mean_x, strict=True):
@@ -344,7 +346,8 @@ class GaussianMixture(Method):
                 x[a:b] = _less(x[a:b], noise)
         variance, axes = np.linalg.eigh(scatter / len(x))
         variance, axes = np.maximum(variance[::-1], 0.0), axes[:, ::-1]
-        x = x @ axes
+        for rows in parts:
+            x[rows] = x[rows] @ axes
         none = np.empty((0, x.shape[1]), np.float32)
         return cls(
             axes=axes.astype(np.float32),
@@ -421,6 +424,11 @@ class GaussianMixture(Method):
     def free_flux(self) -> Self:
         """As of all methods."""
         return replace(self, loose=LOOSE)
+
+    def flux(self, noisy: np.ndarray, level: np.ndarray) -> np.ndarray:
+        """As of all methods."""
+        flux = self._estimate(noisy, level, None, sure=False).flux
+        return super().flux(noisy, level) if flux is None else flux
 
     def predict(
         self, noisy: np.ndarray, level: float | np.ndarray, position: np.ndarray | None = None

@@ -133,6 +133,9 @@ class BundleInfo(_Described):
     reference: Literal["realisation", "template"] | None = Field(
         None, description="What is restored, if the method serves both"
     )
+    misfit: Annotated[float, Field(ge=0, allow_inf_nan=False)] = Field(
+        0.0, description="what the method takes for noise besides where it finds the flux"
+    )
     config: dict[str, Any] = Field(description="resolved configuration of all stages")
     metrics: list[dict[str, float]] = Field(description="errors of the test stars by noise level")
 
@@ -173,8 +176,8 @@ class BundleInfo(_Described):
 
     def described(self) -> dict[str, Any]:
         """What a file of its format says."""
-        other = ONLY[2 if self.format_version == 1 else 1]
-        return self.model_dump(mode="json", exclude=set(other))
+        other = {*ONLY[2 if self.format_version == 1 else 1], *(() if self.misfit else ("misfit",))}
+        return self.model_dump(mode="json", exclude=other)
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,7 +195,8 @@ class Bundle:
     ratio95: np.ndarray | None = None  # (S,), error68 times this holds 95 %; not in format 1
     # (S,), 99.9 % quantile of `Method.strangeness`, if the method knows it
     strange_limit: np.ndarray | None = None
-    # (S, 2), by how much 68 % and 95 % of the errors are wider where flux or sky is estimated
+    # (S, 7), by how much 68 % and 95 % of the errors are wider than that where the noise is
+    # estimated, the flux, too, and the sky; then the scatter of the flux over its error
     widening: np.ndarray | None = None
 
     @property
@@ -457,7 +461,7 @@ def _check(info: BundleInfo, tensors: Mapping[str, np.ndarray], path: Path) -> N
         "distance_limit": (),
     }
     if info.format_version > 1:
-        free = {"strange_limit": (nodes,), "widening": (nodes, 2)}
+        free = {"strange_limit": (nodes,), "widening": (nodes, 7)}
         expected |= {name: shape for name, shape in free.items() if name in tensors}
         expected["ratio95"] = (nodes,)
     expected |= _of_method(info, tensors, path)

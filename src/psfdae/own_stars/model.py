@@ -305,8 +305,9 @@ class Engine:
     def block(self, stars: Stamps, fixed: bool = False) -> Prediction:
         """PSFs of at most `size` stars, whose listed centres are exact if `fixed`."""
         count = len(stars)
-        if count < self.size and self.estimator.padded:
-            stars = _filled(stars, self.bundle, self.size)
+        size = self.size if self.estimator.padded else 1
+        if count < size:
+            stars = _filled(stars, self.bundle, size)
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             return self._compute(stars, fixed).first(count)
 
@@ -338,13 +339,10 @@ class Engine:
         if bundle.ratio95 is not None:
             ratio95 = np.interp(noise, bundle.noise_nodes, bundle.ratio95)
         if bundle.widening is not None:
-            known = np.isfinite(stars.flux) & np.isfinite(stars.background)
-            wider, widest = (
-                np.where(known, 1.0, np.interp(noise, bundle.noise_nodes, factor))
-                for factor in bundle.widening.T
-            )
+            wider, widest, of_flux = self._widening(noise, stars)
             uncertainty *= wider.astype(np.float32)[:, None, None]
             ratio95 *= widest / wider
+            found = replace(found, flux_error=found.flux_error * of_flux)
         psf *= flux
         uncertainty *= flux
         residual = (stamps - found.background[:, None, None]).astype(np.float32) - psf
@@ -384,6 +382,24 @@ class Engine:
             flags=flags,
             **(told or unmeasured(len(stars))),
         )
+
+    def _widening(self, noise: np.ndarray, stars: Stamps) -> tuple[np.ndarray, ...]:
+        """Factors of the half-widths of 68 % and 95 % and of the error of the flux, each (n,).
+
+        They are those of what was estimated: the noise, the flux, the sky.
+        """
+        nodes, table = self.bundle.noise_nodes, self.bundle.widening
+        assert table is not None
+        *widths, of_flux = (np.interp(noise, nodes, factor) for factor in table.T)
+        noise_too, flux_too, sky_too = (
+            np.isnan(known) for known in (stars.noise, stars.flux, stars.background)
+        )
+        case = np.where(sky_too, 2, np.where(flux_too, 1, 0))
+        wider, widest = (
+            np.choose(case, of) / np.where(noise_too, 1.0, of[0])
+            for of in (widths[::2], widths[1::2])
+        )
+        return wider, widest, np.where(flux_too & sky_too, of_flux, 1.0)
 
     def _measured(
         self,
@@ -453,34 +469,32 @@ class Engine:
     ) -> tuple[np.ndarray, np.ndarray | None, Photometry]:
         """PSFs of flux 1 and, if the method knows it, their σ; NaN where there is no flux.
 
-        Where flux and sky are `free`, the method may find better ones.
+        Where flux and sky are `free`, the method may find better ones first. It takes the noise
+        for larger then: what it does not know of a bright star would pass for flux.
         """
-        info, images = self.bundle.info, found.images
+        info = self.bundle.info
         if lost.all():  # such as the stars of a catalogue that reaches far beyond the image
-            return np.full_like(images, np.nan), None, found
-        if lost.any():
-            mean = self.bundle.flux_model.mean.reshape(images.shape[1:])
-            images = np.where(lost[:, None, None], mean, images).astype(images.dtype)
-        noise = found.noise / np.where(lost, np.nan, found.flux)
-        level = np.where(lost, info.noise_max, noise) / info.kappa
-        free = free & ~lost & (self.free_flux is not self.estimator)
-        asked = ((self.estimator, ~free), (self.free_flux, free))
-        estimates = [one.estimate(images, level) for one, rows in asked if rows.any()]
-        first, last = estimates[0], estimates[-1]
-        psf, sigma = (
-            None if a is None else np.where(free[:, None, None], b, a).astype(np.float32)
-            for a, b in ((first.psf, last.psf), (first.sigma, last.sigma))
-        )
-        if free.any() and last.flux is not None:
-            factor = np.where(free, np.clip(last.flux, *FLUX_FACTOR), 1.0)
-            for array in (psf, sigma):
-                if array is not None:
-                    np.divide(array, factor.astype(np.float32)[:, None, None], out=array)
-            found = found.with_flux(factor)
-        for array in (psf, sigma):
+            return np.full_like(found.images, np.nan), None, found
+        mean = self.bundle.flux_model.mean.reshape(found.images.shape[1:])
+
+        def told() -> tuple[np.ndarray, np.ndarray]:
+            images = found.images
+            if lost.any():
+                images = np.where(lost[:, None, None], mean, images).astype(images.dtype)
+            noise = found.noise / np.where(lost, np.nan, found.flux)
+            return images, np.where(lost, info.noise_max, noise)
+
+        free = free & ~lost
+        if free.any() and self.free_flux is not self.estimator:
+            images, noise = told()
+            flux = self.free_flux.flux(images, np.hypot(noise, info.misfit) / info.kappa)
+            found = found.with_flux(np.where(free, np.clip(flux, *FLUX_FACTOR), 1.0))
+        images, noise = told()
+        estimate = self.estimator.estimate(images, noise / info.kappa)
+        for array in (estimate.psf, estimate.sigma):
             if array is not None:
                 array[lost] = np.nan
-        return psf, sigma, found  # type: ignore[return-value]
+        return estimate.psf.astype(np.float32, copy=False), estimate.sigma, found
 
     def _centred(self, stars: Stamps, exact: np.ndarray) -> tuple[np.ndarray, ...]:
         """Stamps (n, d, d), their bad pixels, their shift (row, column), and flags so far.

@@ -7,8 +7,8 @@ bundle carries both, and by how much the interval that holds 95 % is wider. Wher
 method says how sure it is of every pixel, all of them are in units of that: they
 correct its σ, which knows the star, by what came true.
 
-Test stars tell this for known flux and sky. Where these are estimates, errors are larger and
-of another distribution: two factors per node, which validation stars tell, make up for it.
+All this is for known flux and sky. Where these are estimates, errors are larger and of another
+distribution: two factors per node, of the same stars, make up for it.
 """
 
 from __future__ import annotations
@@ -33,9 +33,11 @@ COMPONENTS = 48  # leading eigenvectors that a bundle stores
 COVERAGE = 0.6827  # part of the errors within ± `error68`; of a normal variable within ± 1 σ
 WIDE = 0.95  # part of them within ± `error68` times `ratio95`
 LEAST_SIGMA = 1e-12  # of the flux; equal stars leave a method no doubt
+NORMAL_WIDE = 1.96  # σ within which a normal variable has as much
 LIMIT = 0.999  # part of the test stars within the limit of the Mahalanobis distance
 STEPS = 64  # of the noise up to that of the flux in every pixel, of a model that is to be small
 LEAST_STARS = 2000  # noisy images per node; few test stars are seen several times with new noise
+FEW_STARS = 500  # of them, for a choice
 
 Restore = Callable[[np.ndarray, float], Estimate]
 """The method: normalised noisy images (n, d, d) of a noise level λ to PSFs."""
@@ -161,8 +163,7 @@ def measure_errors(
     rng: np.random.Generator,
 ) -> Errors:
     """Errors and distances of noisy test stars at every node (S,), pixel RMS over the flux."""
-    count = len(stars.images)
-    star = np.tile(np.arange(count), -(-LEAST_STARS // count))
+    star = np.tile(np.arange(len(stars.images)), -(-LEAST_STARS // len(stars.images)))
     error = np.empty((len(nodes), star.size, *stars.images.shape[1:]), np.float32)
     distance = np.empty((len(nodes), star.size))
     strangeness, free = [], fitted.free_flux()
@@ -187,27 +188,74 @@ def errors_of(estimate: Estimate, references: np.ndarray) -> np.ndarray:
 
 
 def with_photometry(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -> Bundle:
-    """The bundle with its `widening`: half-widths with flux and sky estimated over those with both
-    given, of the same noisy stars.
+    """The bundle with the `misfit` and the `widening` of a method that does not measure stars.
 
-    That the method has learnt from stars that validate cancels in the ratio, but where noise is
-    far below the errors that it makes on other stars: there intervals come out too wide.
+    No training must have seen them: where noise is far below the errors that a method makes on
+    other stars, those on its own tell neither.
     """
-    model, count = PsfModel(bundle), len(stars.images)
-    star = np.tile(np.arange(count), -(-LEAST_STARS // count))
-    widening = np.ones((len(bundle.noise_nodes), 2))
-    for place, noise in enumerate(bundle.noise_nodes):
-        noisy = stars.noise.draw(stars.images[star], noise / stars.noise.kappa, rng)
-        widths = []
-        for known in ({"flux": 1.0, "background": 0.0}, {}):
-            found = model.predict(noisy, **known)
-            usable = np.isfinite(found.psf).all(axis=(1, 2))
-            error = np.abs(found.psf - stars.references[star])[usable]
-            error /= np.maximum(found.uncertainty[usable], LEAST_SIGMA)
-            widths.append(np.quantile(error, (COVERAGE, WIDE)) if usable.any() else np.ones(2))
-        given, estimated = np.maximum(widths, LEAST_SIGMA)
-        widening[place] = estimated / given
-    return replace(bundle, widening=widening)
+    bundle = replace(
+        bundle, info=bundle.info.model_copy(update={"misfit": misfit(bundle, stars, rng)})
+    )
+    model, nodes = PsfModel(bundle), bundle.noise_nodes
+    cases = ({"flux": 1.0, "background": 0.0}, {"background": 0.0}, {})
+    found = np.ones((len(cases), len(nodes), 4))  # noise, half-widths, and scatter of the flux
+    for place, node in enumerate(nodes):
+        noisy, star = _noisy(stars, node, LEAST_STARS, rng)
+        for row, known in enumerate(cases):
+            told = model.predict(noisy, **known)
+            usable = np.isfinite(told.psf).all(axis=(1, 2))
+            if not usable.any():
+                found[row, place, 0] = node
+                continue
+            error = np.abs(told.psf - stars.references[star])[usable]
+            error /= np.maximum(told.uncertainty[usable], LEAST_SIGMA)
+            noise = np.median((told.noise / told.flux)[usable])
+            scatter = np.abs(told.flux - 1.0)[usable] / told.flux_error[usable]
+            widths = np.quantile(error, (COVERAGE, WIDE))
+            found[row, place] = noise, *widths, np.quantile(scatter, WIDE) / NORMAL_WIDE
+    # Where a star has light that the photometry does not know, its noise is found too large.
+    noise = np.maximum.accumulate(found[..., 0], axis=1)
+    wanted = [(row, column) for row in range(len(cases)) for column in (1, 2)] + [(2, 3)]
+    columns = [np.interp(nodes, noise[row], found[row, :, column]) for row, column in wanted]
+    return replace(bundle, widening=np.stack(columns, axis=1))
+
+
+def misfit(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -> float:
+    """Noise over the flux with which the method finds the flux of bright stars best.
+
+    What the method does not know of a star's shape would pass for flux, if there is little noise
+    beside it. Tried are none and the nodes of the noise.
+    """
+    nodes, errors = bundle.noise_nodes, []
+    few = HeldOutStars(
+        stars.images[:FEW_STARS],
+        stars.references[:FEW_STARS],
+        stars.noise,
+        stars.position[:FEW_STARS],
+    )
+    noisy = [_noisy(few, node, FEW_STARS, rng) for node in nodes[: len(nodes) // 2]]
+    tried = (0.0, *nodes)
+    for value in tried:
+        model = PsfModel(replace(bundle, info=bundle.info.model_copy(update={"misfit": value})))
+        if model.engine.free_flux is model.engine.estimator:
+            break
+        told = [(model.predict(images), stars.references[star]) for images, star in noisy]
+        logs = [
+            np.log(np.nanmean(np.square(t.psf / t.flux[:, None, None] - truth)))
+            for t, truth in told
+        ]
+        errors.append(float(np.mean(logs)))
+        if errors[-1] > min(errors):
+            break
+    return float(tried[int(np.argmin(errors))]) if errors else 0.0
+
+
+def _noisy(
+    stars: HeldOutStars, noise: float, least: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """At least so many noisy images (n, d, d) of flux 1, and which stars they show, (n,)."""
+    star = np.tile(np.arange(len(stars.images)), -(-least // len(stars.images)))
+    return stars.noise.draw(stars.images[star], noise / stars.noise.kappa, rng), star
 
 
 def measure_levels(

@@ -108,11 +108,11 @@ def bundle(
     require_origin(place, (*STARS, *SAME_STARS, *SAME_IMAGE), product)
     parts = split_stars(product, trained["split"], config)
     images, references = product["realisation"], product[restored]
-    held_out, validation = (
-        packing.HeldOutStars(
-            images[some], references[some], noise_model(config), field_positions(product)[some]
-        )
-        for some in (parts.test, parts.validation)
+    held_out = packing.HeldOutStars(
+        images[parts.test],
+        references[parts.test],
+        noise_model(config),
+        field_positions(product)[parts.test],
     )
     model = packing.leading(FluxModel.fit(images[parts.train]), packing.COMPONENTS)
     band = config.noise.kappa * np.asarray(config.noise.levels)
@@ -158,8 +158,8 @@ def bundle(
     ratio95 = errors.ratio95() if info.format_version > 1 else None
     made = Bundle(info, arrays, model, *maps, ratio95, errors.strange_limit())
     # A method that measures stars knows how sure it is of flux and sky.
-    if info.format_version > 1 and parts.validation.size and not kind.measures:
-        made = packing.with_photometry(made, validation, rng)
+    if info.format_version > 1 and not kind.measures:
+        made = packing.with_photometry(made, held_out, rng)
     write_bundle(made, out)
 
 
@@ -213,8 +213,10 @@ def _kind_of_stamps(product: Product) -> dict[str, Any]:
 
 
 @command("export")
-def export(bundle: Packed = None, *, out: Annotated[File, "ONNX file."]) -> None:
-    """Export the network of BUNDLE (default: the shipped one) to ONNX and check it."""
+def export(
+    bundle: Annotated[File, {"argument": True}], *, out: Annotated[File, "ONNX file."]
+) -> None:
+    """Export the network of BUNDLE to ONNX and check it."""
     import logging
     import warnings
 
