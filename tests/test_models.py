@@ -360,6 +360,8 @@ def test_training_begins_with_the_middle_of_the_stamps(data):
         ):
             edge = (16 - side) // 2
             assert torch.equal(part, full[:, :, edge : 16 - edge, edge : 16 - edge])
+    of_templates = DaeTraining(replace(data, reference="template"), DAE, settings, 3, 0)
+    assert next(of_templates.batches(0))[0].shape[-1] == 16
 
 
 def test_muon_steps_as_far_as_adam_and_leaves_the_rest_to_it(data):

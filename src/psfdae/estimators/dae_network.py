@@ -159,7 +159,9 @@ class DaeTraining(Training):
         model = build_dae(dae.kernels, dae.widths, dae.init, generator)
         super().__init__(model, settings, -(-data.fit.size // settings.batch), attempt)
         self.grad_clip = settings.grad_clip or self.grad_clip
-        self.cropped = round(settings.crop_epochs * settings.epochs)
+        # A template is told from all of a stamp.
+        own = data.reference == "realisation"
+        self.cropped = round(settings.crop_epochs * settings.epochs) if own else 0
         self.fixed: tuple[np.ndarray, ...] | None = None
         if settings.noise == "fixed":
             stars = np.arange(len(data.images))
