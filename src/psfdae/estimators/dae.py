@@ -85,6 +85,10 @@ class Train(Group):
     noise: Literal["fresh", "fixed"] = Field(
         description="Noise drawn anew every epoch, or once for all epochs"
     )
+    crop_epochs: Annotated[float, Field(ge=0, lt=1)] = Field(
+        description="First part of the epochs, which sees the middle of stamps alone where "
+        "realisations are learnt; 0: none"
+    )
     patience: Annotated[int, Field(ge=0)] = Field(
         description="Stop after this many validations without a better one; 0 never stops"
     )

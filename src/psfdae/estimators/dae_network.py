@@ -103,6 +103,14 @@ def image_scale(scale: Literal["mean", "none"], stamp_px: int) -> float:
     return float(stamp_px**2) if scale == "mean" else 1.0
 
 
+def crop_px(stamp_px: int) -> int:
+    """Side of the middle of stamps in which a training begins, as even or odd as theirs.
+
+    Most of a star's light is there, and all that a convolution has to learn but the border.
+    """
+    return stamp_px - 2 * round(0.2 * stamp_px)
+
+
 @torch.inference_mode()
 def predict(model: Dae, noisy: np.ndarray, factor: float, batch: int = 256) -> np.ndarray:
     """PSFs of noisy star images.
@@ -134,7 +142,8 @@ def predict(model: Dae, noisy: np.ndarray, factor: float, batch: int = 256) -> n
 class DaeTraining(Training):
     """Training on noisy images, with noise that is drawn anew in every epoch, or once.
 
-    The history has MSEs of flux-normalised images. Another attempt draws other weights and
+    It may begin with the middle of the stamps, where an epoch takes 0.45 of the time. The
+    history has MSEs of flux-normalised images. Another attempt draws other weights and
     other noise.
     """
 
@@ -150,6 +159,9 @@ class DaeTraining(Training):
         model = build_dae(dae.kernels, dae.widths, dae.init, generator)
         super().__init__(model, settings, -(-data.fit.size // settings.batch), attempt)
         self.grad_clip = settings.grad_clip or self.grad_clip
+        # A template is told from all of a stamp.
+        own = data.reference == "realisation"
+        self.cropped = round(settings.crop_epochs * settings.epochs) if own else 0
         self.fixed: tuple[np.ndarray, ...] | None = None
         if settings.noise == "fixed":
             stars = np.arange(len(data.images))
@@ -169,6 +181,8 @@ class DaeTraining(Training):
         The third is the weight of each star's error, (B, 1, 1, 1), of mean 1 over the levels.
         """
         rng = stream(self.seed, "dae", "epoch", self.attempt, epoch)
+        side = self.data.images.shape[-1]
+        edge = (side - crop_px(side)) // 2 if epoch < self.cropped else 0
         order = rng.permutation(self.data.fit)
         for start in range(0, order.size, self.settings.batch):
             stars = order[start : start + self.settings.batch]
@@ -179,10 +193,12 @@ class DaeTraining(Training):
             power = -self.settings.level_weight
             weight = level**power / np.mean(self.data.levels**power)
             weighted = torch.from_numpy(weight.astype(np.float32))[:, None, None, None]
-            yield self._tensor(noisy), self._tensor(self.data.references[stars]), weighted
+            references = self.data.references[stars]
+            yield self._tensor(noisy, edge), self._tensor(references, edge), weighted
 
-    def _tensor(self, images: np.ndarray) -> torch.Tensor:
-        scaled = torch.from_numpy(images)[:, None] * self.factor
+    def _tensor(self, images: np.ndarray, edge: int) -> torch.Tensor:
+        inner = slice(edge, images.shape[-1] - edge)
+        scaled = torch.from_numpy(images[:, inner, inner])[:, None] * self.factor
         return scaled.to(memory_format=torch.channels_last)
 
     def loss(self, batch: tuple[torch.Tensor, ...], step: int) -> torch.Tensor:

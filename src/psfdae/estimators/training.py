@@ -11,13 +11,14 @@ import json
 import sys
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from torch import nn
 from torch.optim.lr_scheduler import LambdaLR, LRScheduler, OneCycleLR
 
 from psfdae.estimators import FitError
@@ -58,27 +59,40 @@ class Muon(torch.optim.Adam):
     def step(self, closure: None = None) -> None:  # type: ignore[override]
         """One step; gradients of the matrices are None afterwards."""
         for group in self.param_groups:
-            for weight in group["params"] if group.get("orthogonal") else ():
-                state, beta = self.state[weight], group["betas"][0]
+            weights, beta = group["params"] if group.get("orthogonal") else (), group["betas"][0]
+            steps = []
+            for weight in weights:
+                state = self.state[weight]
                 if not state:  # Adam wants a step in every state that it restores
                     state |= {"step": torch.tensor(0.0), "momentum": torch.zeros_like(weight)}
                 momentum = state["momentum"]
                 momentum.lerp_(weight.grad, 1 - beta)
-                step = orthogonal(weight.grad.lerp(momentum, beta).flatten(1))
+                steps.append(weight.grad.lerp(momentum, beta).flatten(1))
+            for weight, step in zip(weights, orthogonal(steps), strict=True):
                 scale = 0.2 * max(step.shape) ** 0.5
                 weight.add_(step.view_as(weight), alpha=-group["lr"] * scale)
                 weight.grad = None
         super().step()
 
 
-def orthogonal(matrix: torch.Tensor) -> torch.Tensor:
-    """About the semi-orthogonal factor of the polar decomposition; singular values 0.7 … 1.2."""
-    wide = matrix if matrix.shape[0] <= matrix.shape[1] else matrix.T
-    x = wide / (wide.norm() + 1e-7)
+def orthogonal(matrices: Sequence[torch.Tensor]) -> list[torch.Tensor]:
+    """About the semi-orthogonal factors of polar decompositions; singular values 0.7 … 1.2.
+
+    A step multiplies a matrix by a polynomial of its Gram matrix, and that by its square: the
+    small Gram matrices are iterated, all together, and each matrix is multiplied once.
+    """
+    if not matrices:
+        return []
+    wide = [(m if m.shape[0] <= m.shape[1] else m.T) / (m.norm() + 1e-7) for m in matrices]
+    side = max(len(m) for m in wide)
+    gram = torch.stack([nn.functional.pad(m @ m.T, (0, side - len(m)) * 2) for m in wide])
+    one = torch.eye(side).expand_as(gram)
+    product = one
     for _ in range(5):
-        square = x @ x.T
-        x = 3.4445 * x + (-4.7750 * square + 2.0315 * square @ square) @ x
-    return x if wide is matrix else x.T
+        factor = 3.4445 * one - 4.7750 * gram + 2.0315 * gram @ gram
+        product, gram = factor @ product, factor @ gram @ factor
+    parts = [p[: len(m), : len(m)] @ m for p, m in zip(product, wide, strict=True)]
+    return [p if p.shape == m.shape else p.T for p, m in zip(parts, matrices, strict=True)]
 
 
 class Training(ABC):
@@ -97,7 +111,7 @@ class Training(ABC):
 
     def __init__(
         self,
-        model: torch.nn.Module,
+        model: nn.Module,
         settings: Train | NetworkTrain,
         steps: int,
         attempt: int = 0,
@@ -175,7 +189,7 @@ class Training(ABC):
         value = self._finite("loss", loss.item(), step)
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
-        norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), self.grad_clip)
+        norm = nn.utils.clip_grad_norm_(self.model.parameters(), self.grad_clip)
         self._finite("gradient's norm", norm.item(), step)
         self.optimiser.step()
         self.scheduler.step()
