@@ -142,9 +142,8 @@ def predict(model: Dae, noisy: np.ndarray, factor: float, batch: int = 256) -> n
 class DaeTraining(Training):
     """Training on noisy images, with noise that is drawn anew in every epoch, or once.
 
-    It may begin with the middle of the stamps, where an epoch takes 0.45 of the time. The
-    history has MSEs of flux-normalised images. Another attempt draws other weights and
-    other noise.
+    It may begin with the middle of the stamps, where an epoch takes half of the time. The history
+    has MSEs of flux-normalised images. Another attempt draws other weights and other noise.
     """
 
     settings: Train
