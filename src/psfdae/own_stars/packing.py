@@ -211,7 +211,8 @@ def with_photometry(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generato
             error /= np.maximum(told.uncertainty[usable], LEAST_SIGMA)
             noise = np.median((told.noise / told.flux)[usable])
             scatter = np.abs(told.flux - 1.0)[usable] / told.flux_error[usable]
-            widths = np.quantile(error, (COVERAGE, WIDE))
+            wide = error / told.ratio95[usable, None, None]
+            widths = np.quantile(error, COVERAGE), np.quantile(wide, WIDE)
             found[row, place] = noise, *widths, np.quantile(scatter, WIDE) / NORMAL_WIDE
     # Where a star has light that the photometry does not know, its noise is found too large.
     noise = np.maximum.accumulate(found[..., 0], axis=1)
