@@ -192,7 +192,7 @@ def test_calibration_needs_one_telescope_for_the_stars_of_a_scene(at):
     "words",
     [
         [trainings.baseline, "--stars", "s2.h5"],
-        [prediction.throughput, "--stars", "s2.h5", "--bundle", "none"],
+        [prediction.throughput, "--stars", "s2.h5", "--bundle", "none", "--mixture", "none"],
     ],
     ids=["baseline", "throughput"],
 )
@@ -206,7 +206,11 @@ def test_measurements_need_the_stars_of_their_configuration(at, words):
 @pytest.mark.parametrize(
     ("words", "key", "values"),
     [
-        ([prediction.throughput, "--stars", "s.h5"], "framing.subpixel", (True, False)),
+        (
+            [prediction.throughput, "--stars", "s.h5", "--mixture", "none"],
+            "framing.subpixel",
+            (True, False),
+        ),
         (
             [prediction.poppy, "telescope.diameter_m=2"],
             "telescope.diameter_m",

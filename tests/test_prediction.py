@@ -11,7 +11,7 @@ import pytest
 from prediction_stars import KAPPA, SKY, observe
 from psfdae import Prediction, PredictionError, StarFlag
 from psfdae.own_stars import photometry
-from psfdae.own_stars.model import BLOCK
+from psfdae.own_stars.model import BLOCK, PsfModel
 from psfdae.own_stars.stamps import MEANING, cut
 from psfdae.threads import in_order
 
@@ -109,6 +109,14 @@ def test_noise_of_very_bright_stars_is_never_too_small(shipped, field_psfs):
     found = shipped.predict(observe(field_psfs, 3e-5).stamps)
     assert found.noise.min() > 0.8 * SKY**0.5
     assert not has(found, StarFlag.SNR_HIGH).any()
+
+
+def test_flux_of_bright_stars_is_found_with_more_noise_than_there_is(shipped, field_psfs):
+    """What the model does not know of a star's shape would pass for flux."""
+    told = replace(shipped.bundle, info=shipped.info.model_copy(update={"misfit": 0.0}))
+    stars = observe(field_psfs, 3e-5)
+    with_misfit, without = (m.predict(stars.stamps).flux for m in (shipped, PsfModel(told)))
+    assert rms(with_misfit / stars.flux - 1) < 0.7 * rms(without / stars.flux - 1)
 
 
 def test_residual_is_what_is_left_of_the_stamp(medium, clean):
