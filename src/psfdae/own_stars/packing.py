@@ -228,12 +228,8 @@ def misfit(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -> flo
     beside it. Tried are none and the nodes of the noise.
     """
     nodes, errors = bundle.noise_nodes, []
-    few = HeldOutStars(
-        stars.images[:FEW_STARS],
-        stars.references[:FEW_STARS],
-        stars.noise,
-        stars.position[:FEW_STARS],
-    )
+    some = {name: getattr(stars, name)[:FEW_STARS] for name in ("images", "references", "position")}
+    few = replace(stars, **some)
     noisy = [_noisy(few, node, FEW_STARS, rng) for node in nodes[: len(nodes) // 2]]
     tried = (0.0, *nodes)
     for value in tried:
