@@ -345,9 +345,9 @@ def test_steps_of_muon_are_along_orthogonal_matrices():
     matrices = [torch.randn(shape, generator=generator) for shape in shapes]
     for matrix, step in zip(matrices, orthogonal(matrices), strict=True):
         assert step.shape == matrix.shape
-        left, singular, right = torch.linalg.svd(matrix, full_matrices=False)
+        left, _, right = torch.linalg.svd(matrix, full_matrices=False)
         along = left.T @ step @ right.T
-        assert along.diagonal() == pytest.approx(np.ones(len(singular)), abs=0.35)
+        assert along.diagonal().min() > 0.65 and along.diagonal().max() < 1.3
         assert (along - along.diagonal().diag()).abs().max() < 1e-3
 
 

@@ -32,10 +32,10 @@ def same(a, b, rows=slice(None)):
     return all(np.array_equal(*pair, equal_nan=True) for pair in pairs)
 
 
-def close(a, b, rows=slice(None)):
+def close(a, b, rows=slice(None), rel=1e-3):
     """The same but for rounding, of which the angle of a round PSF has most."""
     for name in COLUMNS:
-        of = {"rel": 1e-3, "abs": 0.05 if name == "position_angle_deg" else 1e-3}
+        of = {"rel": rel, "abs": 50 * rel if name == "position_angle_deg" else 1e-3}
         wanted = pytest.approx(getattr(b, name)[rows], nan_ok=True, **of)
         assert getattr(a, name)[rows] == wanted, name
     return True
@@ -141,8 +141,8 @@ def test_any_unit_gives_the_same_psf(shipped, medium, clean, unit):
     assert np.mean(found.flags == clean.flags[:100]) > 0.99
 
 
-@pytest.mark.parametrize("name", ["shipped", "network"])
-def test_result_depends_neither_on_threads_nor_on_company(name, medium, request):
+@pytest.mark.parametrize(("name", "rel"), [("shipped", 1e-3), ("network", 1e-4)])
+def test_result_depends_neither_on_threads_nor_on_company(name, rel, medium, request):
     model = request.getfixturevalue(name)
     clean = model.predict(medium.stamps)
     assert len(medium.stamps) > BLOCK
@@ -151,7 +151,7 @@ def test_result_depends_neither_on_threads_nor_on_company(name, medium, request)
     order = np.random.default_rng(0).permutation(len(medium.stamps))
     for rows in (slice(5, 8), slice(300, 301), order):
         picked = replace(clean, **{n: getattr(clean, n)[rows] for n in COLUMNS})
-        assert close(model.predict(medium.stamps[rows]), picked)
+        assert close(model.predict(medium.stamps[rows]), picked, rel=rel)
     assert model.predict(medium.stamps[300]).psf.shape == (1, 16, 16)
 
 
