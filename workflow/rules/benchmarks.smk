@@ -74,7 +74,11 @@ TIMED = {
         ["templates", "stars", "predict"],
     ),
     "predict_throughput": (
-        *("prediction", "prediction.throughput", {**STARS, "bundle": BUNDLE, "mixture": MIXED}),
+        *(
+            "prediction",
+            "prediction.throughput",
+            {**STARS, "bundle": BUNDLE, "mixture": MIXED},
+        ),
         *(1500, 20, ["predict"]),
     ),
     "predict_poppy": (

@@ -89,7 +89,9 @@ def every_bundle_of_timed(w):
 
 def rivals_of_shipped(w):
     """The models that may come with the package, and the network that came with it before."""
-    before = ["workflow/benchmarks/wfsat_before.psf.safetensors"] if PRESET == "fast" else []
+    before = (
+        ["workflow/benchmarks/wfsat_before.psf.safetensors"] if PRESET == "fast" else []
+    )
     return bundles_of(SHIPPED_DATASET, PACKED) + before
 
 
