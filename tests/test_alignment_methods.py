@@ -25,7 +25,6 @@ from psfdae.alignment.networks import (
     NetworkTraining,
     TrainingStates,
     build_network,
-    noise_weights,
     predict_states,
 )
 from psfdae.alignment.stamps import AlignmentStamps
@@ -105,7 +104,7 @@ def test_cnn_is_the_paper_s(config):
     assert network(torch.zeros(3, 9, 16, 16)).shape == (3, 4)
     train = config.train_original
     assert (train.batch, train.epochs, train.lr) == (10, 100, 1e-3)
-    assert not train.mirrors and not train.weigh_noise
+    assert not train.mirrors
 
 
 def test_learning_rate_falls_every_30_epochs(config):
@@ -218,8 +217,7 @@ def _batches(config, size, data, epoch=0):
 def test_every_epoch_sees_every_state_once(config, states, stamps):
     data = TrainingStates(states, stamps)
     first, second = (
-        np.concatenate([truth for _, truth, _ in _batches(config, 8, data, epoch)])
-        for epoch in (0, 1)
+        np.concatenate([truth for _, truth in _batches(config, 8, data, epoch)]) for epoch in (0, 1)
     )
     once = sorted(states.astype(np.float32).tolist())
     assert sorted(first.tolist()) == sorted(second.tolist()) == once
@@ -229,16 +227,19 @@ def test_every_epoch_sees_every_state_once(config, states, stamps):
     assert len(_batches(config, 29, data)) == 1
 
 
-def test_weights_make_noise_levels_count_alike(config, states, stamps):
-    weights = noise_weights(np.array([0.002, 0.005, 0.005]), np.array([0.002, 0.005]))
-    assert weights[0] / weights[1] == pytest.approx(6.25)
-    assert weights[:2].mean() == pytest.approx(1)
-    own = np.arange(30.0)
-    data = TrainingStates(states, stamps, weights=own)
-    for images, truth, weight in _batches(config, 8, data):
-        chosen = weight[:, 0].astype(int)
-        assert (states[chosen].astype(np.float32) == truth).all()
-        assert (stamps[chosen].astype(np.float32) * 256 == images).all()
+def test_every_field_shows_a_draw_of_its_own(config, states, stamps):
+    draws = np.stack([stamps, -stamps, 3 * stamps]).astype(np.float32)
+    signs = []
+    for images, truth in _batches(config, 8, TrainingStates(states, draws)):
+        chosen = [
+            np.flatnonzero((states.astype(np.float32) == one).all(axis=1))[0] for one in truth
+        ]
+        factor = images.sum(axis=(2, 3)) / (256 * stamps[chosen].sum(axis=(2, 3)))
+        signs.append(np.round(factor).astype(int))
+        assert factor == pytest.approx(signs[-1], rel=1e-4)
+    signs = np.concatenate(signs)
+    assert set(signs.ravel()) == {1, -1, 3}
+    assert any(len(set(fields)) > 1 for fields in signs)
 
 
 def test_gaussian_noise_has_poisson_s_variance(noise, stamps):

@@ -136,8 +136,7 @@ rule alignment_bound:
         runtime=20,
     params:
         command="bound",
-        # One thread of its own per job: the jobs fill the machine.
-        config=lambda w: settings("alignment bound", more=("optics.threads=1",)),
+        config=lambda w: settings("alignment bound"),
         inputs=as_options,
         outputs=lambda w, output: as_options(w, output),
         source=source_hash("alignment bound"),
@@ -184,7 +183,7 @@ use rule alignment_bound as alignment_fit with:
         f"{RESULTS}/benchmarks/alignment/fit_{{test_set}}_{{level}}.tsv"
     params:
         command=lambda w: f"fit --level {w.level}",
-        config=lambda w: settings("alignment fit", more=("optics.threads=1",)),
+        config=lambda w: settings("alignment fit"),
         source=source_hash("alignment fit"),
     message:
         "Fitting misalignments by maximum likelihood, {wildcards.test_set}, λ = {wildcards.level}"

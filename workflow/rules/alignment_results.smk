@@ -164,7 +164,7 @@ use rule figure_alignment_stamps as figure_alignment_twin with:
     threads: 1
     params:
         figure="twin",
-        config=lambda w: settings("alignment figure twin", more=("optics.threads=1",)),
+        config=lambda w: settings("alignment figure twin"),
         source=source_hash("alignment figure twin"),
     message:
         "Drawing the twin ambiguity"

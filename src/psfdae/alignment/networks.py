@@ -34,9 +34,6 @@ PARAMETERS = 4
 EXAMPLES = 1500
 """States whose stamps, with their mirror images, tell the principal components."""
 
-PART = 1000
-"""States whose photons are counted at a time."""
-
 
 class AlignmentCnn(nn.Module):
     """Regression of a state of misalignment from the stamps of all fields.
@@ -165,31 +162,16 @@ def predict_states(
     return np.concatenate(parts).astype(np.float64)
 
 
-def noise_weights(level: np.ndarray, levels: np.ndarray) -> np.ndarray:
-    """Weights ∝ 1/λ² with mean 1 over the levels of a band, shape (n,)."""
-    return level**-2.0 / np.mean(levels**-2.0)
-
-
 @dataclass(frozen=True)
 class MixedNoise:
-    """Noise of random levels λ of a band, and weights of the states' errors, if they differ."""
+    """Noise of random levels λ of a band, by the faster law."""
 
     noise: NoiseModel
     levels: np.ndarray
-    weigh: bool
 
-    def __call__(
-        self, stamps: np.ndarray, rng: np.random.Generator, gaussian: bool = True
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Noisy stamps of states, by the faster law or by Poisson's, and weights (n,)."""
-        level = mixed_levels(self.levels, len(stamps), rng)
-        if gaussian:
-            noisy = self.noise.draw_gaussian(stamps, level, rng)
-        else:  # Poisson's numbers are wide: a part at a time, which draws the same
-            noisy = np.empty(stamps.shape, np.float32)
-            for part in np.array_split(np.arange(len(level)), -(-len(level) // PART)):
-                noisy[part] = self.noise.draw(stamps[part], level[part], rng)
-        return noisy, noise_weights(level, self.levels) if self.weigh else np.ones(len(level))
+    def __call__(self, stamps: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Noisy stamps of states, of one level each."""
+        return self.noise.draw_gaussian(stamps, mixed_levels(self.levels, len(stamps), rng), rng)
 
 
 @dataclass(frozen=True)
@@ -199,23 +181,21 @@ class TrainingStates:
     Attributes
     ----------
     states : ndarray, shape (n, 4)
-    stamps : ndarray, shape (n, F, d, d)
-    weights : ndarray, shape (n,), optional
-        Weights of their errors; 1 by default.
+    stamps : ndarray, shape (n, F, d, d) or (D, n, F, d, d)
+        Of D draws of a noise, every field shows one at random.
     noise : MixedNoise, optional
         Is drawn anew for every batch.
     """
 
     states: np.ndarray
     stamps: np.ndarray
-    weights: np.ndarray | None = None
     noise: MixedNoise | None = None
 
 
 class NetworkTraining(Training):
     """Training of a network; order, noise and mirror images are drawn anew in every epoch.
 
-    The history has the weighted mean squared error in units of the range.
+    The history has the mean squared error in units of the range.
 
     Parameters
     ----------
@@ -237,7 +217,7 @@ class NetworkTraining(Training):
         name: str,
     ) -> None:
         self.data, self.seed, self.name = data, seed, name
-        fields, side = data.stamps.shape[1], data.stamps.shape[-1]
+        fields, side = data.stamps.shape[-3], data.stamps.shape[-1]
         self.mirrors = mirror_symmetries(fields - 1) if settings.mirrors else []
         generator = torch.Generator()
         generator.manual_seed(int(stream(seed, "cnn", "init", name).integers(2**62)))
@@ -255,42 +235,46 @@ class NetworkTraining(Training):
         )
 
     def batches(self, epoch: int) -> Iterator[tuple[torch.Tensor, ...]]:
-        """Stamps (B, fields, d, d), states (B, 4) and weights (B, 1)."""
+        """Stamps (B, fields, d, d) and states (B, 4)."""
         data = self.data
         rng = stream(self.seed, "cnn", "epoch", self.name, epoch)
         order = rng.permutation(len(data.states))
         for start in range(0, order.size, self.settings.batch)[: self.steps]:
             chosen = order[start : start + self.settings.batch]
-            images, truth = data.stamps[chosen], data.states[chosen]
-            weight = np.ones(chosen.size) if data.weights is None else data.weights[chosen]
+            images, truth = self._shown(chosen, rng), data.states[chosen]
             if data.noise is not None:
-                images, weight = data.noise(images, rng)
+                images = data.noise(images, rng)
             if self.mirrors:
                 mirror = self.mirrors[rng.integers(len(self.mirrors))]
                 images, truth = mirror.stamps(images), mirror.states(truth)
-            yield _scaled(images), _single(truth), _single(weight)[:, None]
+            yield _scaled(images), torch.from_numpy(truth.astype(np.float32))
+
+    def _shown(self, chosen: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Stamps of chosen states, in one of the draws if there are several."""
+        stamps = self.data.stamps
+        if stamps.ndim == 4:
+            return stamps[chosen]
+        fields = np.arange(stamps.shape[2])
+        return stamps[
+            rng.integers(len(stamps), size=(chosen.size, fields.size)), chosen[:, None], fields
+        ]
 
     def _examples(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Stamps in all mirror images, as they are and as the network sees them."""
         rng = stream(self.seed, "cnn", "examples", self.name)
-        clean = self.data.stamps[rng.permutation(len(self.data.stamps))[:EXAMPLES]]
+        clean = self._shown(rng.permutation(len(self.data.states))[:EXAMPLES], rng)
         if self.mirrors:
             clean = np.concatenate([mirror.stamps(clean) for mirror in self.mirrors])
         scaled = _scaled(clean)
         if self.data.noise is None:
             return scaled, scaled
-        return scaled, _scaled(self.data.noise(clean, rng)[0])
+        return scaled, _scaled(self.data.noise(clean, rng))
 
     def loss(self, batch: tuple[torch.Tensor, ...], step: int) -> torch.Tensor:
-        """Weighted mean squared error."""
-        stamps, states, weights = batch
-        squares = nn.functional.mse_loss(self.model(stamps), states, reduction="none")
-        return (weights * squares).mean()
+        """Mean squared error."""
+        stamps, states = batch
+        return nn.functional.mse_loss(self.model(stamps), states)
 
     def row(self, epoch: int, rate: float, loss: float, error: float) -> Row:
         """Row of the history; the learning rate is that at the epoch's start."""
         return {"epoch": epoch, "lr": rate, "loss": loss, "seconds": round(self.seconds, 3)}
-
-
-def _single(values: np.ndarray) -> torch.Tensor:
-    return torch.from_numpy(values.astype(np.float32))

@@ -131,9 +131,6 @@ class NetworkTrain(Group):
     lr: Annotated[float, Field(gt=0, le=1)] = Field(
         description="Adam's learning rate (its maximum if one-cycle)"
     )
-    weigh_noise: bool = Field(
-        description="Weigh a state's error by 1/λ², so that every noise level counts alike"
-    )
     schedule: Literal["steps", "onecycle"] = Field(description="Course of the learning rate")
     decay: Annotated[float, Field(gt=0, le=1)] = Field(
         description="Factor of the learning rate at each step of the schedule"
@@ -143,8 +140,8 @@ class NetworkTrain(Group):
         description="Train on the telescope's mirror images and average estimates over them"
     )
     noise_draws: Count = Field(
-        description="Draws of a state's noise where the DAE's output is learnt, whose computation "
-        "takes long; noisy stamps get new noise in every epoch"
+        description="Draws of each field's noise where the DAE's output is learnt, whose "
+        "computation takes long; noisy stamps get new noise in every epoch"
     )
     threads: Count = Field(description="Threads of the training")
     checkpoint_seconds: CheckpointSeconds = Field(

@@ -25,6 +25,10 @@ if TYPE_CHECKING:
     from psfdae.estimators.dae import DaeSettings, Train
 
 
+MOST_ZERO = 0.5
+"""Part of the validation stars without any output above which a network is dead."""
+
+
 class SingleChannelConv(nn.Conv2d):
     """Convolution to one channel, computed as a transposed convolution.
 
@@ -217,8 +221,9 @@ class DaeTraining(Training):
         stars = np.tile(self.data.validation, self.settings.validation_draws)
         noisy, _ = self.data.draw(stars, stream(self.seed, "dae", "validation"))
         estimate = predict(self.model, noisy, self.factor)
-        if not estimate.any():
-            raise DeadNetworkError(f"all outputs are zero after epoch {epoch}")
+        zero = 1.0 - estimate.any(axis=(1, 2)).mean()
+        if zero > MOST_ZERO:
+            raise DeadNetworkError(f"{zero:.0%} of the outputs are zero after epoch {epoch}")
         error = float(((estimate - self.data.references[stars]) ** 2).mean(dtype=np.float64))
         if not np.isfinite(error):
             raise TrainingError(

@@ -44,7 +44,7 @@ class TrainingError(FitError):
 
 
 class DeadNetworkError(RuntimeError):
-    """All outputs of the network are zero: no gradient will ever revive it."""
+    """All outputs of the network are zero, or most: no gradient will ever revive it."""
 
 
 class Muon(torch.optim.Adam):

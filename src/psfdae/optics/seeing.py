@@ -15,7 +15,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import fft
 
 from psfdae.optics.propagation import Precision
 from psfdae.optics.pupil import Pupil
@@ -85,6 +84,8 @@ class BlurredPropagator:
         profile: Profile,
         precision: Precision = "complex128",
     ) -> None:
+        from scipy import fft  # here, because every configuration knows the profiles
+
         self.real_dtype = np.dtype(np.float32 if precision == "complex64" else np.float64)
         self._complex = np.dtype(precision)
         self._points = n = fft.next_fast_len(2 * pupil.axis.size)
@@ -105,6 +106,8 @@ class BlurredPropagator:
         return np.stack([self._stamp(*star) for star in zip(opd, offset_px, strict=True)])
 
     def _stamp(self, opd: np.ndarray, offset_px: np.ndarray) -> np.ndarray:
+        from scipy import fft
+
         phase = (2.0 * np.pi) * opd.astype(self.real_dtype)
         pupil_field = np.empty(phase.shape, self._complex)
         pupil_field.real, pupil_field.imag = np.cos(phase), np.sin(phase)

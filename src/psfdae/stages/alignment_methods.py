@@ -14,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import asdict, make_dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import click
 import numpy as np
@@ -48,6 +48,10 @@ from psfdae.reading import from_tree, read_yaml
 from psfdae.rng import stream
 from psfdae.stages.alignment import ModelFile, StatesFile, TestSet, read_model
 from psfdae.stages.common import limit_threads, noise_model
+from psfdae.stars.noise import mixed_levels
+
+if TYPE_CHECKING:
+    from psfdae.alignment.networks import TrainingStates
 
 NETWORK_WEIGHTS = "network.safetensors"
 
@@ -59,6 +63,9 @@ Trained = Annotated[Folder, "Folder for weights, config and history."]
 
 DENOISED = ", ".join(name for name in TRAINED if METHODS[name].denoised)
 """Networks that are trained on the DAE's output."""
+
+PART = 1000
+"""States whose photons are counted at a time."""
 
 CLEAN = 0.0
 """Noise level of the rows without noise."""
@@ -134,23 +141,12 @@ def train_network(
         require_origin(dae, STATE_STAMPS, product)
     data = TrainingStates(product["states"], product["stamps"])
     if METHODS[kind].noisy:
-        levels = np.asarray(config.noise.levels)
-        data = replace(data, noise=MixedNoise(noise_model(config), levels, settings.weigh_noise))
-    draws = [data.stamps]
+        data = replace(data, noise=MixedNoise(noise_model(config), np.asarray(config.noise.levels)))
     if dae and data.noise:
-        rng = stream(config.seed, "cnn", "noise", kind)
-        many = np.empty((settings.noise_draws, *data.stamps.shape), np.float32)
-        weights = []
-        for draw in many:  # one by one, for the sake of memory
-            draw[:], weight = data.noise(data.stamps, rng, gaussian=False)
-            draw[:] = denoise(dae, config, draw)
-            weights.append(weight)
-        stamps, draws = many.reshape(-1, *data.stamps.shape[1:]), list(many)
-        states = np.tile(data.states, (len(many), 1))
-        data = TrainingStates(states, stamps, np.concatenate(weights))
+        data = denoised_draws(data, Dae.load(dae, evaluation=config.evaluation), config, kind)
         product.arrays.clear()  # only what it says of itself is still needed
     limit_threads(settings.threads)
-    fields, side = data.stamps.shape[1], data.stamps.shape[-1]
+    fields, side = data.stamps.shape[-3], data.stamps.shape[-1]
     described = {**config.model_dump(), "fields": fields, "stamp_px": side, "name": kind}
     described |= {"network": settings.network, "mirrors": settings.mirrors}
 
@@ -158,12 +154,27 @@ def train_network(
         return NetworkTraining(data, getattr(config, settings.network), settings, config.seed, kind)
 
     with progress(settings.epochs) as report:
-        done = train(begin, checkpoint, fingerprint(described, *draws), report)
+        done = train(begin, checkpoint, fingerprint(described, data.stamps), report)
     save_weights(out / NETWORK_WEIGHTS, done.result, described)
     write_origin(out, product)
     write_text(out / HISTORY, as_csv(done.history))
     write_text(out / CONFIG, as_yaml(described))
     checkpoint.unlink(missing_ok=True)
+
+
+def denoised_draws(data: TrainingStates, dae: Dae, config: Any, kind: str) -> TrainingStates:
+    """States with the DAE's output for a few draws of their noise, each state at one level."""
+    assert data.noise is not None
+    rng = stream(config.seed, "cnn", "noise", kind)
+    count = getattr(config, f"train_{kind}").noise_draws
+    level = mixed_levels(data.noise.levels, len(data.states), rng)
+    many = np.empty((count, *data.stamps.shape), np.float32)
+    for draw in many:
+        for start in range(0, len(level), PART):
+            part = slice(start, start + PART)
+            noisy = data.noise.noise.draw(data.stamps[part], level[part], rng)
+            draw[part] = dae.predict(_flat(noisy)).reshape(noisy.shape)
+    return replace(data, stamps=many, noise=None)
 
 
 def denoise(dae: Path, config: Any, stamps: np.ndarray) -> np.ndarray:

@@ -20,7 +20,8 @@ from psfdae.evaluation.calibration import (
 )
 from psfdae.evaluation.metrics import mse, ssim
 from psfdae.files import Product, read_product, write_csv
-from psfdae.optics.pupil import required_nodes
+from psfdae.optics.pupil import Pupil, required_nodes
+from psfdae.optics.wavefronts import WavefrontSource
 from psfdae.reading import read_table
 from psfdae.rng import stream
 from psfdae.stages.common import limit_threads, star_wavefronts, template_wavefronts
@@ -50,8 +51,9 @@ def scan(
     # The configured r0 is always scanned: its fit is set beside the configured scale.
     scanned = {*config.calibration.r0_m, config.wavefront.r0_m} if turbulent else {float("nan")}
     for r0 in sorted(scanned):
+        source = _source(config, r0 if turbulent else None)
         for scale in config.calibration.pixel_scales_arcsec:
-            images = _images(config, scale, r0 if turbulent else None)
+            images = _images(config, source, scale)
             for row in rows.itertuples():
                 level = row.noise_level
                 noisy = _at_published_mse(images, row.mse, level, config)
@@ -72,17 +74,41 @@ def scan(
     write_csv(out, pd.DataFrame(table))
 
 
-def _images(config: Config, scale: float, r0: float | None) -> np.ndarray:
-    """Noise-free, framed, normalised stars at another pixel scale (and r0)."""
+class _Kept:
+    """Turbulent wavefronts whose OPD is formed once for each grid, not for each pixel scale."""
+
+    def __init__(self, source: WavefrontSource) -> None:
+        self.source, self.slopes = source, source.slopes
+        self._opd: dict[int, np.ndarray] = {}
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+    def opd(self, index: np.ndarray, pupil: Pupil, dtype: np.dtype) -> np.ndarray:
+        """As of the source; double precision, which few stars need, is not kept."""
+        if dtype != np.float32:
+            return self.source.opd(index, pupil, dtype)
+        if pupil.axis.size not in self._opd:
+            every = np.arange(len(self))
+            self._opd[pupil.axis.size] = self.source.opd(every, pupil, dtype)
+        return self._opd[pupil.axis.size][index]
+
+
+def _source(config: Config, r0: float | None) -> WavefrontSource:
+    """Wavefronts of the scanned stars, or of all fields behind turbulence of an r0."""
+    if r0 is None:
+        count, fields = config.calibration.stars, config.grid.points**2
+        return star_wavefronts(
+            config, assign_fields(count, fields, stream(config.seed, "scan", "field"))
+        )
+    wavefront = config.wavefront.model_copy(update={"r0_m": r0})
+    return _Kept(template_wavefronts(config.model_copy(update={"wavefront": wavefront})))
+
+
+def _images(config: Config, source: WavefrontSource, scale: float) -> np.ndarray:
+    """Noise-free, framed, normalised stars at another pixel scale."""
     telescope = config.telescope.model_copy(update={"pixel_scale_arcsec": scale})
     search_px = ceil(config.stars.search_px * config.telescope.pixel_scale_arcsec / scale)
-    count, fields = config.calibration.stars, config.grid.points**2
-    if r0 is None:
-        star_field = assign_fields(count, fields, stream(config.seed, "scan", "field"))
-        source = star_wavefronts(config, star_field)
-    else:
-        wavefront = config.wavefront.model_copy(update={"r0_m": r0})
-        source = template_wavefronts(config.model_copy(update={"wavefront": wavefront}))
     # The scan reaches wider pixels than the configured one.
     nodes = max(config.optics.nodes, required_nodes(telescope.pixel))
     optics = config.optics.model_copy(update={"nodes": nodes})
