@@ -154,6 +154,18 @@ def test_stars_of_the_training_are_no_test(at, words, file, key, values):
     refused(at, *evaluate(at), *words, file=at / file, key=key, values=values)
 
 
+def test_templates_go_on_from_the_realisations_of_the_same_training_part(at):
+    words = ("fit", "dae", "--stars", at / "s.h5", "--start", at / "dae", "--out", at / "on")
+    sizes = (*SIZES, "train.epochs=4", "train.continued_epochs=0.5")
+    parts = {"file": at / "dae/config.yaml", "key": "parts.train_stars", "values": (40, 30)}
+    refused(at, *words, "--reference=template", *sizes, "parts.train_stars=30", **parts)
+    assert "--start" in psfdae(*words, *sizes).stderr
+    anew = psfdae(*words, "--reference=template", *SIZES, "train.continued_epochs=0")
+    assert anew.exit_code == 2 and "--start" in anew.stderr
+    done(*words, "--reference=template", *sizes)
+    assert len((at / "on/history.csv").read_text().splitlines()) == 1 + 2
+
+
 def test_a_bundle_holds_the_very_stars_of_the_training(at):
     words = ("bundle", "--stars", at / "fresh.h5", "--dae", at / "dae", "--out", at / "out")
     values = ("seidel_10pct", "fresh")

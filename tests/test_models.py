@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from psfdae.estimators import TrainingSet
+from psfdae.estimators.dae import Dae as Fitted
 from psfdae.estimators.dae import DaeSettings, Train
 from psfdae.estimators.dae_network import (
     DaeTraining,
@@ -47,6 +48,7 @@ TRAIN = Train(
     checkpoint_seconds=0.0,
     noise="fresh",
     crop_epochs=0.0,
+    continued_epochs=0.0,
     patience=0,
 )
 
@@ -362,6 +364,16 @@ def test_training_begins_with_the_middle_of_the_stamps(data):
             assert torch.equal(part, full[:, :, edge : 16 - edge, edge : 16 - edge])
     of_templates = DaeTraining(replace(data, reference="template"), DAE, settings, 3, 0)
     assert next(of_templates.batches(0))[0].shape[-1] == 16
+
+
+def test_training_goes_on_from_another_network(data):
+    anew = DaeTraining(data, DAE, TRAIN, 3, 0)
+    known = DaeTraining(data, DAE, TRAIN, 4, 0).model
+    training = DaeTraining(replace(data, start=Fitted(known, "mean")), DAE, TRAIN, 3, 0)
+    for started, weight in zip(training.model.parameters(), known.parameters(), strict=True):
+        assert torch.equal(started, weight) and started.data_ptr() != weight.data_ptr()
+    assert not torch.equal(anew.model.layers[1].weight, known.layers[1].weight)
+    assert torch.equal(next(training.batches(0))[0], next(anew.batches(0))[0])
 
 
 def test_muon_steps_as_far_as_adam_and_leaves_the_rest_to_it(data):

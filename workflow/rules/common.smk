@@ -298,3 +298,11 @@ def fresh_stars(method, dataset):
     count = method.fresh(config)
     stars = f"{RESULTS}/data/{config.scene.name}/fresh/{config.stars.name}-{count}.h5"
     return {"fresh": stars} if count else {}
+
+
+def start_of(method, w):
+    """Fit to the realisations from which that to the templates goes on, if one does."""
+    goes_on = method.continues(dataset_config(w.dataset))
+    if not goes_on or w.get("reference") != "template":
+        return {}
+    return {"start": files_of(method, w.dataset, w.split, "realisation")}

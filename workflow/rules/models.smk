@@ -35,6 +35,7 @@ for _method in (m for m in registered() if m.stored):
             _method.rule
         input:
             unpack(lambda w, m=_method: fresh_stars(m, w.dataset)),
+            unpack(lambda w, m=_method: start_of(m, w)),
             stars=lambda w: stars_of(w.dataset),
         output:
             [str(path) for path in _method.outputs(_place)],
@@ -52,9 +53,13 @@ for _method in (m for m in registered() if m.stored):
             ),
             source=source_hash("fit", chosen=[f"psfdae.estimators.{_method.name}"]),
             method=_method.name,
-            more=lambda w, input: [
+            more=lambda w, input, m=_method: [
                 *(f"--reference={w.reference}" for _ in w.get("reference", "")[:1]),
                 *(f"--fresh={input.fresh}" for _ in input.get("fresh", "")[:1]),
+                *(
+                    f"--start={model_of(m, w.dataset, w.split, 'realisation')}"
+                    for _ in input.get("start", "")[:1]
+                ),
             ],
             place=_place,
             # Not an output: Snakemake would delete it with a failed job's outputs.

@@ -107,6 +107,9 @@ class TrainingSet:
         to what noise adds to their scatter (P, P) about it.
     bright : BrightStamps or None
         The stars of which the images were made, if these are an image's.
+    start : Method or None
+        Fit of the method to the realisations of the same stars, from which that to their
+        templates goes on.
     checkpoint : Path or None
         Where a long fit may keep its state; the caller removes it once the result is safe.
     """
@@ -123,6 +126,7 @@ class TrainingSet:
     fresh: Product | None = None
     own_noise: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
     bright: BrightStamps | None = None
+    start: Method | None = None
     checkpoint: Path | None = None
 
     @property
@@ -324,6 +328,11 @@ class Method:
     def fresh(cls, config: Any) -> int:
         """Stars beyond those of the training part, which a simulation may draw; 0: none."""
         return 0
+
+    @classmethod
+    def continues(cls, config: Any) -> bool:
+        """Whether a fit to templates goes on from that to the realisations."""
+        return False
 
     def estimate(
         self, noisy: np.ndarray, level: float | np.ndarray, position: np.ndarray | None = None

@@ -89,6 +89,10 @@ class Train(Group):
         description="First part of the epochs, which sees the middle of stamps alone where "
         "realisations are learnt; 0: none"
     )
+    continued_epochs: Annotated[float, Field(ge=0, le=1)] = Field(
+        description="Part of the epochs in which a network of templates goes on from that of the "
+        "realisations; 0: all of them, from a start of its own"
+    )
     patience: Annotated[int, Field(ge=0)] = Field(
         description="Stop after this many validations without a better one; 0 never stops"
     )
@@ -139,6 +143,11 @@ class Dae(Method):
         return int(config.train.threads)
 
     @classmethod
+    def continues(cls, config: Any) -> bool:
+        """As set."""
+        return bool(config.train.continued_epochs)
+
+    @classmethod
     def fit(cls, data: TrainingSet, dae: DaeSettings, train: Train) -> Dae:
         """Train, and keep the state with the least validation error; resumes if interrupted.
 
@@ -155,7 +164,12 @@ class Dae(Method):
 
         described = {"dae": dae.model_dump(), "train": train.model_dump(), "seed": data.seed}
         described["noise"] = [data.levels.tolist(), data.noise.kappa, data.noise.background]
-        seen = fingerprint(described, data.images, data.references, data.fit, data.validation)
+        sees = [data.images, data.references, data.fit, data.validation]
+        if isinstance(data.start, Dae):
+            epochs = max(1, round(train.continued_epochs * train.epochs))
+            train = train.model_copy(update={"epochs": epochs})
+            sees += [value.numpy() for value in data.start.network.state_dict().values()]
+        seen = fingerprint(described, *sees)
         with progress(train.epochs) as report:
             assert data.checkpoint is not None
             done = train_dae(data, dae, train, data.seed, data.checkpoint, seen, report)

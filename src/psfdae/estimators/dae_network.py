@@ -160,6 +160,8 @@ class DaeTraining(Training):
         generator = torch.Generator()
         generator.manual_seed(int(stream(seed, "dae", "init", attempt).integers(2**62)))
         model = build_dae(dae.kernels, dae.widths, dae.init, generator)
+        if data.start is not None:
+            model.load_state_dict(data.start.network.state_dict())
         super().__init__(model, settings, -(-data.fit.size // settings.batch), attempt)
         self.grad_clip = settings.grad_clip or self.grad_clip
         # A template is told from all of a stamp.

@@ -37,6 +37,9 @@ def fit(
     split: Split = "random",
     reference: Reference = "realisation",
     fresh: Annotated[File | None, "Product of the stage stars with other draws."] = None,
+    start: Annotated[
+        Folder | None, "Fit to the realisations, from which one to templates goes on."
+    ] = None,
     checkpoint: Annotated[File | None, "State of an interrupted fit, if it keeps one."] = None,
     *,
     out: Annotated[Path, click.Path(path_type=Path), "Folder or HDF5 product."],
@@ -48,6 +51,11 @@ def fit(
     more = None if fresh is None else read_stars(fresh, "template")
     kept = checkpoint or kind.beside(out, "checkpoint.pt")
     data = training_set(config, kind, product, split, reference, fresh=more, checkpoint=kept)
+    if start is not None:
+        if reference != "template" or not kind.continues(config):
+            raise click.UsageError("--start: nothing that goes on from a fit is fitted")
+        kind.require(start, product, config, split, "realisation")
+        data = replace(data, start=kind.load(start))
     described = {**config.model_dump(), "split": split}
     described |= {"reference": reference} if kind.per_reference else {}
     kind.fit(data, **kind.settings(config)).store(out, described, product)
