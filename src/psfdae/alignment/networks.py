@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.linalg import eigh
 from torch import nn
 
 from psfdae.alignment.telescope import Mirror, mirror_symmetries
@@ -94,8 +95,11 @@ class AlignmentPerceptron(nn.Module):
         self.mean.copy_(flat.mean(dim=0))
         flat = flat - self.mean
         count = self.axes.shape[1]
-        axes = torch.linalg.eigh(flat.T @ flat)[1][:, -count:].flip(1)
-        del flat  # seen takes as much memory
+        # In double precision: pixels that a DAE leaves empty make the matrix singular.
+        products, last = (flat.T @ flat).double().numpy(), flat.shape[1] - 1
+        leading = eigh(products, subset_by_index=[last + 1 - count, last], overwrite_a=True)[1]
+        axes = torch.from_numpy(leading[:, ::-1].astype(np.float32))
+        del flat, products  # seen takes as much memory
         spread = ((seen.flatten(1) - self.mean) @ axes).std(dim=0)
         self.axes.copy_(axes / spread.clamp_min(torch.finfo(spread.dtype).tiny))
 
