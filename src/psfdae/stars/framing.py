@@ -82,6 +82,10 @@ def normalise_flux(stamps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return stamps / flux[..., None, None], flux
 
 
+RAY_MARGIN, RUNG = 3.0, 8
+"""Pixels beyond the outermost ray in which the brightest pixel is looked for, and steps of the
+sizes of search images."""
+
 SEARCH_ERROR = 1e-3
 """Search-image pixels this far below a tie with the maximum may still be the brightest.
 
@@ -143,8 +147,17 @@ class Propagation:
                     f"around the stamps need N ≥ {edge:.0f} pupil samples; "
                     f"optics.pupil_samples = {optics.pupil_samples}"
                 )
-        needed = required_samples(source.slopes(), np.broadcast_to([-edge, edge], (2, 2)))
+        slopes = source.slopes()
+        needed = required_samples(slopes, np.broadcast_to([-edge, edge], (2, 2)))
         self.samples = choose_samples(needed, tuple(optics.pupil_samples))
+        # Rays land at twice the slope, in λ/D; here (row, column) and (min, max) in pixels.
+        rays = 2.0 * slopes[:, ::-1] / pixel
+        half = 0.5 * np.ptp(rays, axis=2).max(axis=1) + RAY_MARGIN
+        self._centre = np.rint(rays.mean(axis=2)).astype(np.int64)
+        self._reach = (RUNG * np.ceil(half / RUNG)).astype(np.int64)
+        far = self._reach + np.abs(self._centre).max(axis=1) > 2 * search_px
+        far |= self._reach > search_px
+        self._centre[far], self._reach[far] = 0, search_px
         self._pupils: dict[int, Pupil] = {}
 
     def stamps(
@@ -212,8 +225,9 @@ class Propagation:
 
         A single-precision search image shortlists pixels; those are then computed
         in complex128, and the first in (row, column) order within the tie
-        tolerance is taken. Wavefronts whose peak touches the window's border are
-        searched again at twice the distance.
+        tolerance is taken. The image shows where the wavefront's rays land, or the
+        whole window. Wavefronts whose peak touches its border are searched again in the
+        whole window, and then in one of twice the size.
 
         Parameters
         ----------
@@ -230,19 +244,24 @@ class Propagation:
         """
         stars = np.arange(len(self.source)) if stars is None else stars
         phase_px = np.zeros((len(stars), 2)) if phase_px is None else phase_px
-        reach = self.search_px
-        peaks = self._search(stars, phase_px, reach)
-        border = np.flatnonzero(_touches(peaks, reach))
-        if border.size:
-            reach *= 2
-            peaks[border] = self._search(stars[border], phase_px[border], reach)
-            outside = border[_touches(peaks[border], reach)]
+        centre, reach = self._centre[stars], self._reach[stars]
+        peaks = np.empty((len(stars), 2), dtype=np.int64)
+        border = np.arange(len(stars))
+        while border.size:
+            for distance in np.unique(reach[border]):
+                own = border[reach[border] == distance]
+                offset = phase_px[own] + centre[own]
+                peaks[own] = centre[own] + self._search(stars[own], offset, int(distance))
+            border = border[_touches(peaks[border] - centre[border], reach[border])]
+            outside = border[reach[border] > self.search_px]
             if outside.size:
                 raise FramingError(
                     f"search_px = {self.search_px}: the brightest pixel of {outside.size} of "
-                    f"{len(peaks)} wavefronts lies {reach} px or more from the chief ray "
-                    f"(the first is wavefront {stars[outside[0]]}); a larger value would do"
+                    f"{len(peaks)} wavefronts lies {2 * self.search_px} px or more from the chief "
+                    f"ray (the first is wavefront {stars[outside[0]]}); a larger value would do"
                 )
+            whole = (reach[border] == self.search_px) & ~centre[border].any(axis=1)
+            reach[border], centre[border] = np.where(whole, 2, 1) * self.search_px, 0
         return peaks
 
     def _search(self, stars: np.ndarray, phase_px: np.ndarray, reach: int) -> np.ndarray:
@@ -306,6 +325,7 @@ class Propagation:
         return StampPropagator(*common, self.optics.nodes, precision, self.optics.backend)
 
 
-def _touches(peaks: np.ndarray, reach: int) -> np.ndarray:
-    """Which brightest pixels lie on the border of a window of ± `reach` pixels."""
+def _touches(peaks: np.ndarray, reach: np.ndarray) -> np.ndarray:
+    """Which brightest pixels (n, 2) lie on the border of a window of ± `reach` pixels, (n,)."""
+    reach = reach[:, None]
     return ((peaks == -reach) | (peaks == reach - 1)).any(axis=1)
