@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from psfdae.configuration.base import CheckpointSeconds, Count, Group
-from psfdae.estimators import CONFIG, HISTORY, Method, TrainingSet
+from psfdae.estimators import CONFIG, HISTORY, FitError, Method, TrainingSet
 from psfdae.files import as_yaml, write_text
 from psfdae.reading import from_tree, read_yaml
 
@@ -155,6 +155,8 @@ class Dae(Method):
         ------
         TrainingError
             As `train_dae`.
+        FitError
+            If it is to go on from a network of another shape.
         """
         import torch
 
@@ -166,9 +168,15 @@ class Dae(Method):
         described["noise"] = [data.levels.tolist(), data.noise.kappa, data.noise.background]
         sees = [data.images, data.references, data.fit, data.validation]
         if isinstance(data.start, Dae):
+            known, shape = data.start.network, (tuple(dae.kernels), tuple(dae.widths))
+            if (known.kernels, known.widths) != shape:
+                raise FitError(
+                    f"dae.kernels, dae.widths = {shape}: the network to go on from has "
+                    f"{known.kernels, known.widths}"
+                )
             epochs = max(1, round(train.continued_epochs * train.epochs))
             train = train.model_copy(update={"epochs": epochs})
-            sees += [value.numpy() for value in data.start.network.state_dict().values()]
+            sees += [value.numpy() for value in known.state_dict().values()]
         seen = fingerprint(described, *sees)
         with progress(train.epochs) as report:
             assert data.checkpoint is not None
