@@ -134,8 +134,8 @@ def test_deep_nesting_is_one_line(folder):
 
 
 def test_a_list_is_no_group(folder):
-    (folder / "train/onecycle.yaml").write_text("- epochs\n")
-    assert refused(["config"]).startswith("psfdae: train = ['epochs']: ")
+    (folder / "gmm/default.yaml").write_text("- stars\n")
+    assert refused(["config"]).startswith("psfdae: gmm = ['stars']: ")
 
 
 @pytest.mark.parametrize(

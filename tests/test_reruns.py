@@ -49,7 +49,7 @@ def test_a_copy_and_comments_repeat_nothing(jobs, tree):
 
 def test_learning_rate_of_one_dataset(jobs, tree):
     """Its four trainings and evaluations, its tables and figures, its import; no more."""
-    append(tree / "config/dataset/dataset3.yaml", "train:\n  lr: 0.002\n")
+    append(tree / "config/dataset/dataset3.yaml", "  lr: 0.002\n")  # ends with train
     assert jobs(*TARGETS, "tables") == {
         "train": 4,
         "evaluate": 4,
