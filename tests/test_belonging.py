@@ -162,8 +162,9 @@ def test_templates_go_on_from_the_realisations_of_the_same_training_part(at):
     assert "--start" in psfdae(*words, *sizes).stderr
     anew = psfdae(*words, "--reference=template", *SIZES, "train.continued_epochs=0")
     assert anew.exit_code == 2 and "--start" in anew.stderr
-    other = psfdae(*words, "--reference=template", *sizes, f"dae.widths={[3] * 9}")
-    assert other.exit_code == 2 and "dae.widths" in other.stderr
+    for change in (f"dae.widths={[3] * 9}", "dae.scale=none"):
+        other = psfdae(*words, "--reference=template", *sizes, change)
+        assert other.exit_code == 2 and change.partition("=")[0] in other.stderr
     done(*words, "--reference=template", *sizes)
     assert len((at / "on/history.csv").read_text().splitlines()) == 1 + 2
 

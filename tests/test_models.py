@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from psfdae.estimators import TrainingSet
+from psfdae.estimators import TrainingSet, dae_network
 from psfdae.estimators.dae import Dae as Fitted
 from psfdae.estimators.dae import DaeSettings, Train
 from psfdae.estimators.dae_network import (
@@ -21,7 +22,7 @@ from psfdae.estimators.dae_network import (
 )
 from psfdae.estimators.lmmse import LinearMmse
 from psfdae.estimators.pca_som import Baseline, PcaFit, PcaSom, fit_pca_som
-from psfdae.estimators.training import TrainingError, orthogonal, progress
+from psfdae.estimators.training import DeadNetworkError, TrainingError, orthogonal, progress
 from psfdae.estimators.weights import load_weights, save_checkpoint, save_weights
 from psfdae.evaluation.metrics import mse
 from psfdae.files import ProductError
@@ -374,6 +375,16 @@ def test_training_goes_on_from_another_network(data):
         assert torch.equal(started, weight) and started.data_ptr() != weight.data_ptr()
     assert not torch.equal(anew.model.layers[1].weight, known.layers[1].weight)
     assert torch.equal(next(training.batches(0))[0], next(anew.batches(0))[0])
+
+
+@pytest.mark.parametrize(("empty", "dead"), [(24, False), (26, True)])
+def test_network_without_output_for_most_stars_is_dead(data, monkeypatch, empty, dead):
+    output = np.ones((50, 16, 16), np.float32)
+    output[:empty] = 0.0
+    monkeypatch.setattr(dae_network, "predict", lambda *_: output)
+    training = DaeTraining(data, DAE, TRAIN, 3, 0)
+    with pytest.raises(DeadNetworkError, match="52%") if dead else nullcontext():
+        assert np.isfinite(training.validate(1))
 
 
 def test_muon_steps_as_far_as_adam_and_leaves_the_rest_to_it(data):

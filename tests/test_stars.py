@@ -9,7 +9,7 @@ import pytest
 
 from psfdae.configuration.compose import load
 from psfdae.files import Product
-from psfdae.optics.wavefronts import seidel_wavefronts
+from psfdae.optics.wavefronts import seidel_wavefronts, zernike_wavefronts
 from psfdae.rng import stream
 from psfdae.stages.common import noisy_test_images, template_wavefronts
 from psfdae.stars.fields import (
@@ -116,6 +116,23 @@ def test_search_agrees_with_a_full_search(scene1):
     images = exact.stamps(80, np.zeros((121, 2), dtype=int))
     expected = np.array([brightest_pixel(image, 1e-4) for image in images]) - 40
     assert (wavefronts.brightest() == expected).all()
+
+
+def test_search_image_is_where_the_rays_land(scene1, monkeypatch):
+    """Tilts move a spot, by (row, column) as (y, x), and make no larger image of it."""
+    tilts = np.array([[0.0, 0.0], [8.0, 0.0], [0.0, -8.0], [-6.0, 3.0]])
+    source = zernike_wavefronts((2, 3), tilts)
+    wavefronts = Propagation(source, scene1.telescope, scene1.optics, scene1.framing, 40)
+    seen, search = [], Propagation._search
+
+    def counted(self, stars, phase_px, reach):
+        seen.extend([reach] * len(stars))
+        return search(self, stars, phase_px, reach)
+
+    monkeypatch.setattr(Propagation, "_search", counted)
+    expected = 4.0 * tilts[:, ::-1] / scene1.telescope.pixel
+    assert np.abs(wavefronts.brightest() + 0.5 - expected).max() <= 1.0
+    assert seen == [8] * len(tilts)  # each once
 
 
 def test_peak_outside_a_small_window_is_found_by_a_second_search(scene1, templates):

@@ -156,7 +156,7 @@ class Dae(Method):
         TrainingError
             As `train_dae`.
         FitError
-            If it is to go on from a network of another shape.
+            If it is to go on from a network of another shape or scale of images.
         """
         import torch
 
@@ -168,11 +168,13 @@ class Dae(Method):
         described["noise"] = [data.levels.tolist(), data.noise.kappa, data.noise.background]
         sees = [data.images, data.references, data.fit, data.validation]
         if isinstance(data.start, Dae):
-            known, shape = data.start.network, (tuple(dae.kernels), tuple(dae.widths))
-            if (known.kernels, known.widths) != shape:
+            known = data.start.network
+            found = (known.kernels, known.widths, data.start.scale)
+            wanted = (tuple(dae.kernels), tuple(dae.widths), dae.scale)
+            if found != wanted:
                 raise FitError(
-                    f"dae.kernels, dae.widths = {shape}: the network to go on from has "
-                    f"{known.kernels, known.widths}"
+                    f"dae.kernels, dae.widths, dae.scale = {wanted}: the network to go on from "
+                    f"has {found}"
                 )
             epochs = max(1, round(train.continued_epochs * train.epochs))
             train = train.model_copy(update={"epochs": epochs})

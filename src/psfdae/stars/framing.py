@@ -89,7 +89,7 @@ sizes of search images."""
 SEARCH_ERROR = 1e-3
 """Search-image pixels this far below a tie with the maximum may still be the brightest.
 
-The search image has all nodes and errs by rounding alone, by 2e-6 of its maximum at
+The search image has all nodes and errs by rounding alone, by 4e-6 of its maximum at
 most (256 stars each of scene 1 at 10 and 50 %, and of scene 2). A pixel that is alone
 on the shortlist settles a star; only the others are computed exactly.
 """
