@@ -10,8 +10,8 @@ import pytest
 from psfdae.alignment.stamps import AlignmentStamps, EnergyError, centred_modes, mean_slope
 from psfdae.alignment.telescope import uniform_states
 from psfdae.configuration.compose import load
-from psfdae.optics.derivatives import ModalStamps, NodeSampling, PeriodSampling
-from psfdae.optics.propagation import StampPropagator, pixel_nodes
+from psfdae.optics.derivatives import ModalStamps, PointSampling, PeriodSampling
+from psfdae.optics.propagation import StampPropagator
 from psfdae.optics.pupil import SamplingError, annular_pupil
 from psfdae.optics.raytracing import annulus_points, misaligned
 from psfdae.optics.wavefronts import monomial_coefficients, monomial_images
@@ -72,39 +72,39 @@ def test_centroid_of_the_whole_image_is_in_the_stamp_s_centre(tracer, config):
     assert worst[1] < 0.6 * worst[0]
 
 
-def test_node_sampling_is_the_stamp_propagator():
+def test_point_sampling_is_the_stamp_propagator():
     pupil = annular_pupil(64, 0.3)
     seidel = np.array([[0.1, 0.4, 0.4, 0.2, 0.0], [0.2, 0.1, 0.5, -0.3, 0.1]])
     coefficients = monomial_coefficients(seidel, np.array([[0.6, 0.4], [-1.0, 0.2]]))
     offset = np.array([[2, -1], [0, 3]])
-    kernel = StampPropagator(pupil, 8, 0.9, nodes=3)
-    modal = ModalStamps(pupil, monomial_images, NodeSampling(pupil, 8, 0.9, 3, "complex128"), 0.9)
+    kernel = StampPropagator(pupil, 8, 0.9)
+    modal = ModalStamps(pupil, monomial_images, PointSampling(pupil, 8, 0.9, 6, "complex128"), 0.9)
     expected = kernel(modal.opd(coefficients), offset)
     assert modal.stamps(coefficients, offset) == pytest.approx(expected, abs=1e-14)
     assert modal.derivatives(coefficients, None, offset)[0] == pytest.approx(expected, abs=1e-14)
 
 
 def test_period_sampling_integrates_pixels_exactly(tracer, exact, config):
-    """The stamp propagator approaches it spectrally as its nodes increase."""
+    """The stamp propagator approaches it spectrally as its points increase."""
     zernikes = shown_zernikes(tracer)
     modal = exact.operator(254)
     pupil = annular_pupil(254, OBSCURATION)
     stamps = modal.stamps(zernikes)
     errors = []
-    for nodes in (14, 18, 22):
-        kernel = StampPropagator(pupil, 16, config.telescope.pixel, nodes)
+    for extra in (6, 12, 18):
+        kernel = StampPropagator(pupil, 16, config.telescope.pixel, extra)
         errors.append(np.abs(kernel(modal.opd(zernikes)) - stamps).max() / stamps.max())
     assert errors[0] < 1e-3
     assert errors[1] < 1e-5
     assert errors[2] < 1e-7
 
 
-@pytest.mark.parametrize("kind", ["nodes", "period"])
+@pytest.mark.parametrize("kind", ["points", "period"])
 def test_derivatives_by_coefficients_are_differences(kind):
     pupil = annular_pupil(48, 0.3)
     sampling = (
-        NodeSampling(pupil, 8, 2.0, 4, "complex128")
-        if kind == "nodes"
+        PointSampling(pupil, 8, 2.0, 6, "complex128")
+        if kind == "points"
         else PeriodSampling(pupil, 8, 2.0, "complex128")
     )
     modal = ModalStamps(pupil, partial(centred_modes, 11, 0.3), sampling, 2.0)
@@ -222,7 +222,7 @@ def huygens_stamp(tracer, state, field, telescope, nodes=14, rays_across=160):
     start = rays.amplitude(centre, rays.t[0])[lit]
     scale = drdth(optic, *theta, wavelength)
     pixel = np.deg2rad(telescope.pixel_scale_arcsec / 3600)
-    inside, weights = pixel_nodes(pixel, nodes)
+    inside, weights = 0.5 * pixel * np.array(np.polynomial.legendre.leggauss(nodes))
     angle = ((np.arange(16) - 7.5)[:, None] * pixel + inside).ravel()
     wave_x, wave_y = (np.exp(1j * np.outer(angle, k)) for k in (rays.k[lit][:, :2] @ scale).T)
     intensity = np.abs((wave_y * start) @ wave_x.T) ** 2

@@ -18,7 +18,7 @@ from psfdae.stages.common import template_wavefronts
 from psfdae.stars.framing import Propagation, brightest_pixel
 
 CHEAP = (
-    *("grid.points=3", "optics.pupil_samples=[40,80]", "optics.nodes=3", "optics.threads=1"),
+    *("grid.points=3", "optics.pupil_samples=[40,80]", "optics.threads=1"),
     *("wavefront.spherical=0.05", "wavefront.coma=0.2", "wavefront.astigmatism=0.2"),
     *("wavefront.field_curvature=0.1", "stars.search_px=6", "framing.search_px=6"),
 )
@@ -92,7 +92,7 @@ def test_slopes_do_not_depend_on_the_batch():
 
 
 def test_search_is_exact_for_large_pixels():
-    """Scene 2's pixel is 1.6 λ/D wide: fewer nodes in the search shift its brightest pixels."""
+    """Scene 2's pixel is 1.6 λ/D wide: a search of point samples would shift its brightest pixels."""
     config = load_stage(STATIC, ["scene=turbulence", "optics.threads=1"])
     source = template_wavefronts(config)
     # Measuring 400 slopes takes longer than the test; the largest grid serves all.

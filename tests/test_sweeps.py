@@ -160,7 +160,7 @@ def test_other_keys_of_the_tree_stay():
     new = with_values(tree, {"train.lr": 5})
     assert new == {"train": {"lr": 5, "batch": 2}, "dae": {"widths": [4]}}
     assert tree["train"]["lr"] == 1
-    for key in ("train.rate", "train", "train.lr.x", "optics.nodes"):
+    for key in ("train.rate", "train", "train.lr.x", "optics.batch"):
         with pytest.raises(SweepError, match="unknown key"):
             with_values(tree, {key: 1})
 

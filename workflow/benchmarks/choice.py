@@ -1,4 +1,4 @@
-"""Which (pupil samples, nodes, precision) a scene should use: the cheapest within its budget."""
+"""Which (pupil samples, points, precision) a scene should use: the cheapest within its budget."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -7,12 +7,12 @@ from itertools import product
 import numpy as np
 
 from measure import yes
-from propagators import PRECISIONS, candidate_nodes, candidate_samples
-from psfdae.optics.pupil import SamplingError, choose_samples, required_nodes
+from propagators import PRECISIONS, candidate_points, candidate_samples
+from psfdae.optics.pupil import SamplingError, choose_samples
 from psfdae.stars.framing import normalise_flux
 from scenes import Selection, spread_evenly, stamp_mse, stamps_at
 
-REFERENCE = (768, 6)  # samples and nodes of exact stamps; `build_cases` shows that they suffice
+REFERENCE = (768, 12)  # samples and points of exact stamps; `build_cases` shows: they suffice
 SCREENED = 32  # stars that are screened for large errors where not all are
 SAME_TIME = 0.02  # relative difference of times that says nothing: repeats spread by more
 EVERY_GRID = list(range(16, 2049))  # to ask the sampling guard what it needs
@@ -23,7 +23,7 @@ class Sample:
     """n stars of a scene with their stamps (n, d, d) of sum 1 at every candidate setting.
 
     `needed` are the pupil samples that the sampling guard asks for each star, `population`
-    those for all stars of the scene. `stamps` are by (samples, nodes, precision), where the
+    those for all stars of the scene. `stamps` are by (samples, points, precision), where the
     grid does not alias the wavefront's own spectrum. `even` tells the stars that are spread
     evenly; the others were taken for their large errors.
     """
@@ -34,9 +34,9 @@ class Sample:
     truth: np.ndarray
     even: np.ndarray
 
-    def at(self, samples, nodes, precision):
+    def at(self, samples, points, precision):
         """Stamps with each star on a grid of its own, shape (n, d, d)."""
-        return np.stack([self.stamps[int(n), nodes, precision][i] for i, n in enumerate(samples)])
+        return np.stack([self.stamps[int(n), points, precision][i] for i, n in enumerate(samples)])
 
 
 def spread(needed, ladder, per_rung):
@@ -65,46 +65,45 @@ def take_sample(scene, stars, thorough):
     source = Selection(scene.stars, index)
     offset = scene.propagation(source, scene.search_px).brightest()
     stamps = {}
-    least = required_nodes(scene.telescope.pixel)
-    allowed = [q for q in candidate_nodes(scene.optics, thorough) if q >= least]
+    tried = candidate_points(scene.optics, thorough)
     for samples in candidate_samples(scene.optics, thorough):
-        for nodes, precision in product(allowed, PRECISIONS):
+        for points, precision in product(tried, PRECISIONS):
             try:
-                found = stamps_at(scene, source, offset, samples, nodes, precision)
+                found = stamps_at(scene, source, offset, samples, points, precision)
             except SamplingError:
                 break
-            stamps[samples, nodes, precision] = found
+            stamps[samples, points, precision] = found
     truth = stamps_at(scene, source, offset, *REFERENCE)
     return Sample(population[index], population, stamps, truth, np.isin(index, even))
 
 
 def screen(scene, needed, kept, thorough):
-    """Stars whose stamps change most on coarser grids or with fewer nodes, ascending.
+    """Stars whose stamps change most on coarser grids or with fewer points, ascending.
 
-    `kept` per grid size and number of nodes, of all stars or, if not thorough, of `SCREENED`.
+    `kept` per grid size and number of points, of all stars or, if not thorough, of `SCREENED`.
     """
     looked_at = spread_evenly(needed.size, needed.size if thorough else SCREENED)
     slopes, optics, everyone = scene.stars.slopes(), scene.optics, np.arange(looked_at.size)
     together = Selection(scene.stars, looked_at, slopes)
     offset = scene.propagation(together, scene.search_px).brightest()
 
-    def stamps(members, samples, nodes):
+    def stamps(members, samples, points):
         some = Selection(scene.stars, looked_at[members], slopes)
-        settings = {"pupil_samples": [samples], "nodes": nodes}
+        settings = {"pupil_samples": [samples], "extra_points": points}
         propagation = scene.propagation(some, scene.search_px, **settings)
         return normalise_flux(propagation.stamps(scene.framing.stamp_px, offset[members]))[0]
 
     finest = int(choose_samples(needed[looked_at].max(keepdims=True), optics.pupil_samples)[0])
-    exact = stamps(everyone, finest, optics.nodes)
-    integrated = stamps(everyone, finest, optics.nodes + 2)
+    exact = stamps(everyone, finest, optics.extra_points)
+    integrated = stamps(everyone, finest, optics.extra_points + 2)
     changes = [(everyone, stamp_mse(exact, integrated))]
-    # The stars that fewer nodes spoil most are others.
-    for nodes in range(required_nodes(scene.telescope.pixel), optics.nodes):
-        changes.append((everyone, stamp_mse(stamps(everyone, finest, nodes), integrated)))
+    # The stars that fewer points spoil most are others.
+    for points in range(0, optics.extra_points, 2):
+        changes.append((everyone, stamp_mse(stamps(everyone, finest, points), integrated)))
     for samples in candidate_samples(optics, thorough):
         members = np.flatnonzero(needed[looked_at] <= samples)
         if members.size and samples <= optics.pupil_samples[0]:
-            coarse = stamps(members, samples, optics.nodes)
+            coarse = stamps(members, samples, optics.extra_points)
             changes.append((members, stamp_mse(coarse, exact[members])))
     worst = [members[np.argsort(change)[-kept:]] for members, change in changes]
     return looked_at[np.unique(np.concatenate(worst))]
@@ -122,29 +121,29 @@ def ladders(optics, grids):
 def choose(scene, sample, time_ms):
     """Worst error and mean time of every candidate, the cheapest one and the configured one.
 
-    A candidate is a ladder, a number of nodes and a precision; every star takes the first
+    A candidate is a ladder, a number of points and a precision; every star takes the first
     rung that the sampling guard allows it. The error is that of the worst star of the sample,
     the time the mean over all stars of the scene.
     """
     import pandas as pd
 
     optics, rows = scene.optics, []
-    grids, nodes_tried, _ = (sorted(set(values)) for values in zip(*sample.stamps, strict=True))
+    grids, points_tried, _ = (sorted(set(values)) for values in zip(*sample.stamps, strict=True))
     for ladder in ladders(optics, grids):
         if ladder[-1] < sample.population.max():
             continue
         own = choose_samples(sample.needed, ladder)
         everyone, count = np.unique(choose_samples(sample.population, ladder), return_counts=True)
-        for nodes, precision in product(nodes_tried, PRECISIONS):
-            worst = float(stamp_mse(sample.at(own, nodes, precision), sample.truth).max())
-            times = [time_ms.get((int(n), nodes, precision), np.nan) for n in everyone]
-            used = (optics.pupil_samples, optics.nodes, optics.precision)
+        for points, precision in product(points_tried, PRECISIONS):
+            worst = float(stamp_mse(sample.at(own, points, precision), sample.truth).max())
+            times = [time_ms.get((int(n), points, precision), np.nan) for n in everyone]
+            used = (optics.pupil_samples, optics.extra_points, optics.precision)
             row = {"scene": scene.name, "ladder": "-".join(map(str, ladder))}
-            row |= {"first_rung": ladder[0], "nodes": nodes, "precision": precision}
+            row |= {"first_rung": ladder[0], "points": points, "precision": precision}
             row |= {"stars": len(own), "mse": worst, "budget": scene.budget}
             row |= {"within_budget": yes(worst <= scene.budget)}
             row |= {"time_ms": np.average(times, weights=count)}
-            rows.append({**row, "configured": yes((list(ladder), nodes, precision) == used)})
+            rows.append({**row, "configured": yes((list(ladder), points, precision) == used)})
     return mark_cheapest(pd.DataFrame(rows), scene.budget)
 
 
@@ -163,13 +162,13 @@ def guard_or_budget(scene, sample):
 
     A row per rung in use: its share of all stars, the stars of the sample, the N that the
     guard asks for (guard_min, guard_max), the N from which on a star stays within the budget
-    with the configured nodes and precision (budget_min, budget_max; NaN if it never does), and
+    with the configured points and precision (budget_min, budget_max; NaN if it never does), and
     the share of the evenly spread stars for which the budget asks for more.
     """
     import pandas as pd
 
     optics, grids = scene.optics, tuple(sorted({samples for samples, *_ in sample.stamps}))
-    stamps = [sample.stamps[n, optics.nodes, optics.precision] for n in grids]
+    stamps = [sample.stamps[n, optics.extra_points, optics.precision] for n in grids]
     error = np.stack([stamp_mse(s, sample.truth) for s in stamps], axis=1)
     by_budget = first_lasting(error <= scene.budget, np.array(grids, float))
     more = ~(by_budget <= choose_samples(sample.needed, grids))

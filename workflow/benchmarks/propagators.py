@@ -22,7 +22,8 @@ from psfdae.stars.framing import normalise_flux
 from psfdae.threads import side_by_side
 from scenes import pupil_of
 
-COARSE_SAMPLES = (94, 126, 158, 190)  # tried below the ladder; with guard cells multiples of 32
+GRIDS = range(62, 400, 32)  # pupil samples tried beside the ladder; with guard cells multiples of 32
+EXTRA_POINTS = range(-2, 8, 2)  # of the kernel
 BATCHES = (1, 4, 16, 64)  # stamps per call
 PRECISIONS = ("complex64", "complex128")
 WAVELENGTH_M = 1e-6  # any will do: OPDs are in waves and angles in λ/D of a 1 m pupil
@@ -32,18 +33,18 @@ REQUIRED_SPEEDUP = {"poppy_mft": 40.0, "poppy_fresnel": 400.0}  # of the kernel 
 KERNEL_STAMPS = 4  # per timing of the kernel in units of `benchmark.stamps`
 
 EQUAL = ["scene", "aberration", "threads"]
-PEER_COLUMNS = ["scene", "aberration", "method", "samples", "nodes", "precision", "threads"]
+PEER_COLUMNS = ["scene", "aberration", "method", "samples", "points", "precision", "threads"]
 PEER_COLUMNS += ["time_ms", "mse", "within_budget"]
-KERNEL_COLUMNS = ["samples", "nodes", "precision", "batch", "time_ms", "mse"]
+KERNEL_COLUMNS = ["samples", "points", "precision", "batch", "time_ms", "mse"]
 
 
 @dataclass(frozen=True)
 class Setting:
-    """One way to run a method: `nodes` are sub-samples per pixel where it has no nodes."""
+    """One way to run a method; `points` are a pixel's sub-samples, of the kernel the extra points."""
 
     method: str
     samples: int
-    nodes: int
+    points: int
     precision: str = "complex128"
     backend: str = "numpy"
     threads: int = 1
@@ -51,15 +52,16 @@ class Setting:
 
 
 def candidate_samples(optics, thorough):
-    """Grid sizes N to try: the configured ladder and coarser ones, ascending."""
-    coarse = [n for n in COARSE_SAMPLES if n < optics.pupil_samples[0]]
-    return (*(coarse if thorough else coarse[-1:]), *optics.pupil_samples)
+    """Grid sizes N to try: the configured ladder, coarser ones and those between, ascending."""
+    least, *_, most = optics.pupil_samples
+    others = GRIDS if thorough else [n for n in GRIDS if n < least][-1:]
+    return sorted({*(n for n in others if n < most), *optics.pupil_samples})
 
 
-def candidate_nodes(optics, thorough):
-    """Numbers of nodes to try around the configured one, which is among them."""
-    lowest = max(1, optics.nodes - 1)
-    return tuple(range(lowest, optics.nodes + 3)) if thorough else (optics.nodes, optics.nodes + 2)
+def candidate_points(optics, thorough):
+    """Numbers of extra points to try, the configured one and two more among them."""
+    used = {optics.extra_points, optics.extra_points + 2}
+    return sorted(used.union(EXTRA_POINTS) if thorough else used)
 
 
 def configured_setting(optics, benchmark, samples):
@@ -68,22 +70,22 @@ def configured_setting(optics, benchmark, samples):
     Its batch is the configured one, but no more than are timed.
     """
     batch = min(optics.batch, benchmark.stamps)
-    rest = (optics.nodes, optics.precision, optics.backend, optics.threads, batch)
+    rest = (optics.extra_points, optics.precision, optics.backend, optics.threads, batch)
     return Setting("kernel", samples, *rest)
 
 
 def kernel_settings(optics, benchmark, samples, backend):
     """Settings that are timed for a wavefront that is given N `samples`.
 
-    The whole product of grid sizes, nodes and precisions at the configured batch and all
+    The whole product of grid sizes, points and precisions at the configured batch and all
     threads; then batches and threads around the setting in use.
     """
     used = replace(configured_setting(optics, benchmark, samples), backend=backend)
     grids = candidate_samples(optics, benchmark.peers)
-    nodes = candidate_nodes(optics, benchmark.peers)
+    points = candidate_points(optics, benchmark.peers)
     threads, batches = sorted({1, benchmark.threads}), BATCHES if benchmark.peers else (1,)
     rest = (backend, benchmark.threads, used.batch)
-    chosen = [Setting("kernel", *point, *rest) for point in product(grids, nodes, PRECISIONS)]
+    chosen = [Setting("kernel", *point, *rest) for point in product(grids, points, PRECISIONS)]
     for precision, t, batch in product(PRECISIONS, threads, batches):
         chosen.append(replace(used, precision=precision, threads=t, batch=batch))
     return list(dict.fromkeys([*chosen, used]))
@@ -167,13 +169,13 @@ def build(case, setting):
         import_module("numexpr").set_num_threads(setting.threads)
     builders = {"poppy_mft": poppy_mft, "poppy_fresnel": poppy_fresnel, "hcipy": hcipy_fraunhofer}
     samples, fine_image = builders.get(setting.method, padded_fft)(case, setting)
-    return samples, lambda: _bin(fine_image(), setting.nodes)[None]
+    return samples, lambda: _bin(fine_image(), setting.points)[None]
 
 
 def kernel(case, setting, stamp_px):
     """Our propagation to stamps of a side, and the OPDs of a batch."""
     pupil = pupil_of(setting.samples, case.obscuration)
-    settings = (setting.nodes, setting.precision, setting.backend)
+    settings = (setting.points, setting.precision, setting.backend)
     propagate = StampPropagator(pupil, stamp_px, case.pixel, *settings)
     return propagate, case.batch(pupil, setting.batch, propagate.real_dtype)
 
@@ -226,12 +228,12 @@ def padded_fft(case, peer):
     """
     from scipy import fft
 
-    samples, padded = commensurate_grid(peer.samples, case.pixel, peer.nodes)
+    samples, padded = commensurate_grid(peer.samples, case.pixel, peer.points)
     pupil, precision = pupil_of(samples, case.obscuration), np.dtype(peer.precision)
     opd = case.batch(pupil, 1, np.zeros(0, precision).real.dtype)[0]
     ramp = np.exp(2j * np.pi * _towards_stamp(case, pupil, samples / padded))
     amplitude = (pupil.amplitude * ramp).astype(precision)
-    seen, size = _subsamples(case, peer.nodes) % padded, pupil.axis.size
+    seen, size = _subsamples(case, peer.points) % padded, pupil.axis.size
 
     def whole():
         grid = np.zeros((padded, padded), precision)
@@ -256,7 +258,7 @@ def poppy_mft(case, peer):
     system = poppy.OpticalSystem(npix=pupil.axis.size, pupil_diameter=width * u.m, verbose=False)
     image = _poppy_image(system, system.add_pupil, case, peer, pupil)
     scale = case.pixel * WAVELENGTH_M / ARCSEC
-    system.add_detector(pixelscale=scale, fov_pixels=case.stamp_px, oversample=peer.nodes)
+    system.add_detector(pixelscale=scale, fov_pixels=case.stamp_px, oversample=peer.points)
     return peer.samples, lambda: image()[::-1, ::-1]
 
 
@@ -278,14 +280,14 @@ def poppy_fresnel(case, peer):
     system.add_optic(poppy.QuadraticLens(focal_length))
     focus = poppy.ScalarTransmission(planetype=poppy.poppy_core.PlaneType.image, name="focus")
     system.add_optic(focus, distance=focal_length)
-    seen = np.ix_(*[padded // 2 - _subsamples(case, peer.nodes)] * 2)
+    seen = np.ix_(*[padded // 2 - _subsamples(case, peer.points)] * 2)
     return samples, lambda: image()[seen]
 
 
 def fresnel_grid(case, peer):
     """Pupil samples, samples of the whole padded array, and padding factor (a power of two)."""
-    padding = 2 ** int(np.log2(peer.nodes / case.pixel))
-    return *commensurate_grid(peer.samples, case.pixel, peer.nodes, 2 * padding), padding
+    padding = 2 ** int(np.log2(peer.points / case.pixel))
+    return *commensurate_grid(peer.samples, case.pixel, peer.points, 2 * padding), padding
 
 
 def _poppy_image(system, add, case, peer, pupil, step=0.0):
@@ -319,7 +321,7 @@ def hcipy_fraunhofer(case, peer):
     pupil = pupil_of(peer.samples, case.obscuration)
     opd = case.batch(pupil, 1, np.zeros(0, peer.precision).real.dtype)[0].ravel()
     grid = hcipy.make_pupil_grid(pupil.axis.size, pupil.axis.size * pupil.spacing / 2.0)
-    side, step = case.stamp_px * peer.nodes, case.pixel / peer.nodes
+    side, step = case.stamp_px * peer.points, case.pixel / peer.points
     corner = case.pixel * case.offset_px[0, ::-1] - 0.5 * (side - 1) * step
     image_grid = hcipy.CartesianGrid(hcipy.RegularCoords([step] * 2, [side] * 2, corner))
     propagator = hcipy.FraunhoferPropagator(grid, image_grid, focal_length=1.0)
@@ -346,14 +348,14 @@ def finish(rows, used):
 
 
 def kernel_times(table, optics, benchmark):
-    """Time of a stamp in ms by (samples, nodes, precision), mean over the cases.
+    """Time of a stamp in ms by (samples, points, precision), mean over the cases.
 
     Backend and batch are the configured ones, threads the benchmark's.
     """
     used = asdict(configured_setting(optics, benchmark, 0)) | {"threads": benchmark.threads}
     wanted = ["method", "backend", "threads", "batch"]
     rows = table[(table[wanted] == [used[name] for name in wanted]).all(axis=1)]
-    return dict(rows.groupby(["samples", "nodes", "precision"])["time_ms"].mean())
+    return dict(rows.groupby(["samples", "points", "precision"])["time_ms"].mean())
 
 
 def compare(table):

@@ -63,7 +63,7 @@ def superfluous_optics(benchmark, scene, case):
         peer = Setting("poppy_fresnel", case.samples, 4, threads=threads)
         samples, padded, _ = fresnel_grid(case, peer)
         # The pixel that the padded array really has, so that both look at the same points.
-        same = replace(case, pixel=peer.nodes * samples / padded)
+        same = replace(case, pixel=peer.points * samples / padded)
         planes, direct = (
             build(same, replace(peer, method=method, samples=samples))[1]
             for method in ("poppy_fresnel", "poppy_mft")
@@ -219,23 +219,23 @@ def framed_change(scene, changed, right, stars):
 
 
 def finer_than_needed(scene, sample, time_ms):
-    """Rows on grids, nodes and digits beyond the budget, from the errors of a sample."""
+    """Rows on grids, points and digits beyond the budget, from the errors of a sample."""
     optics, ladder = scene.optics, tuple(scene.optics.pupil_samples)
     own, everyone = (choose_samples(n, ladder) for n in (sample.needed, sample.population))
     rungs, count = np.unique(everyone, return_counts=True)
 
-    def way(finest, nodes, precision):
+    def way(finest, points, precision):
         """Mean seconds of all stars, and the stamps of the sample."""
         of_all, of_sample = (np.full_like(n, ladder[-1]) if finest else n for n in (rungs, own))
-        times = [time_ms[int(n), nodes, precision] for n in of_all]
-        stamps = sample.at(of_sample, nodes, precision)
+        times = [time_ms[int(n), points, precision] for n in of_all]
+        stamps = sample.at(of_sample, points, precision)
         return 1e-3 * np.average(times, weights=count), stamps
 
-    without_s, configured = way(False, optics.nodes, optics.precision)
+    without_s, configured = way(False, optics.extra_points, optics.precision)
     for item, *setting in (
-        ("Every star on the finest grid", True, optics.nodes, optics.precision),
-        ("Two nodes more per axis", False, optics.nodes + 2, optics.precision),
-        ("Double precision", False, optics.nodes, "complex128"),
+        ("Every star on the finest grid", True, optics.extra_points, optics.precision),
+        ("Two points more per axis", False, optics.extra_points + 2, optics.precision),
+        ("Double precision", False, optics.extra_points, "complex128"),
     ):
         with_s, stamps = way(*setting)
         yield saving(item, (with_s, without_s), stamp_mse(stamps, configured).max(), AS_MSE)

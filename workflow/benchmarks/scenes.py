@@ -20,8 +20,8 @@ from psfdae.stars.framing import Propagation, normalise_flux
 READS = (*SIMULATION, "noise", "benchmark")
 BUDGET = 0.01  # numerical MSE of a stamp in units of the smallest noise variance it carries
 
-# Pupil samples and nodes of the reference; the last is used, the others show convergence.
-REFERENCES = ((512, 5), (768, 6), (1024, 8))
+# Pupil samples and extra points of the reference; the last is used, the others show convergence.
+REFERENCES = ((512, 8), (768, 12), (1024, 16))
 
 pupil_of = lru_cache(maxsize=32)(annular_pupil)  # a sweep asks for the same pupils again
 
@@ -110,11 +110,11 @@ class Case:
         return np.repeat(opd, count, axis=0)
 
 
-def stamps_at(scene, source, offset_px, samples, nodes, precision="complex128"):
+def stamps_at(scene, source, offset_px, samples, points, precision="complex128"):
     """Stamps of sum 1 of all wavefronts at one setting; SamplingError if it is too coarse."""
     pupil = pupil_of(samples, scene.telescope.obscuration)
     size = scene.framing.stamp_px
-    kernel = StampPropagator(pupil, size, scene.telescope.pixel, nodes, precision)
+    kernel = StampPropagator(pupil, size, scene.telescope.pixel, points, precision)
     out = np.empty((len(source), size, size))
     step = max(1, scene.optics.batch // 4)
     for start in range(0, len(source), step):
@@ -160,9 +160,9 @@ def build_cases(scene):
         samples, truth = int(propagation.samples[0]), stamps[-1][0]
         place = (one, offset, samples, *geometry, scene.budget, truth)
         cases.append(Case(scene.name, aberration, *place))
-        for (samples, nodes), stamp in zip(REFERENCES[:-1], stamps, strict=False):
+        for (samples, points), stamp in zip(REFERENCES[:-1], stamps, strict=False):
             row = {"scene": scene.name, "aberration": aberration}
-            row |= {"samples": samples, "nodes": nodes}
-            row |= {"finest_samples": REFERENCES[-1][0], "finest_nodes": REFERENCES[-1][1]}
+            row |= {"samples": samples, "points": points}
+            row |= {"finest_samples": REFERENCES[-1][0], "finest_points": REFERENCES[-1][1]}
             rows.append({**row, "mse": stamp_mse(stamp, stamps[-1])[0], "budget": scene.budget})
     return cases, rows

@@ -15,13 +15,7 @@ import numpy as np
 
 from psfdae.configuration.alignment import Alignment, AlignmentOptics
 from psfdae.configuration.telescope import Telescope
-from psfdae.optics.derivatives import (
-    ModalStamps,
-    NodeSampling,
-    PeriodSampling,
-    Sampling,
-    normalise_with_derivatives,
-)
+from psfdae.optics.derivatives import ModalStamps, PeriodSampling, normalise_with_derivatives
 from psfdae.optics.propagation import in_batches
 from psfdae.optics.pupil import annular_pupil, choose_samples, required_samples
 from psfdae.optics.raytracing import FIRST_NOLL
@@ -212,13 +206,7 @@ class AlignmentStamps:
         """The operator on a pupil grid with N samples across; made once, then kept."""
         if samples not in self._operators:
             pupil, pixel = annular_pupil(samples, self.telescope.obscuration), self.telescope.pixel
-            side, nodes = self.alignment.stamp_px, self.optics.nodes
-            precision = self.optics.precision
-            sampling: Sampling = (
-                PeriodSampling(pupil, side, pixel, precision)
-                if nodes is None
-                else NodeSampling(pupil, side, pixel, nodes, precision)
-            )
+            sampling = PeriodSampling(pupil, self.alignment.stamp_px, pixel, self.optics.precision)
             self._operators[samples] = ModalStamps(pupil, self._modes, sampling, pixel)
         return self._operators[samples]
 

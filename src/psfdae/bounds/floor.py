@@ -18,7 +18,7 @@ import numpy as np
 from psfdae.configuration.schema import Optics
 from psfdae.configuration.telescope import Telescope
 from psfdae.evaluation.metrics import clustered_mean
-from psfdae.optics.derivatives import ModalStamps, NodeSampling, normalise_with_derivatives
+from psfdae.optics.derivatives import ModalStamps, PointSampling, normalise_with_derivatives
 from psfdae.optics.propagation import in_batches
 from psfdae.optics.pupil import annular_pupil
 from psfdae.optics.wavefronts import SEIDEL_TERMS, monomial_coefficients, monomial_images
@@ -66,7 +66,7 @@ def sensitivities(
 
     def prepare(count: int) -> Callable[[np.ndarray], None]:
         pupil, pixel = annular_pupil(count, telescope.obscuration), telescope.pixel
-        sampling = NodeSampling(pupil, stamp_px, pixel, optics.nodes, "complex128")
+        sampling = PointSampling(pupil, stamp_px, pixel, optics.extra_points, "complex128")
         operator = ModalStamps(pupil, monomial_images, sampling, pixel)
 
         def differentiate(star: np.ndarray) -> None:

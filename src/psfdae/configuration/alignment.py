@@ -25,13 +25,10 @@ from psfdae.estimators.dae import DaeSettings, Train
 
 
 class AlignmentOptics(Group):
-    """Numerical settings of the propagation; pixels are wide, which allows another way."""
+    """Numerical settings of the propagation by the whole period of the image."""
 
     pupil_samples: PupilSamples = Field(
         description="Ladder of grid sizes N; each wavefront takes the first that suffices"
-    )
-    nodes: Annotated[int, Field(ge=1, le=32)] | None = Field(
-        description="Gauss-Legendre nodes per pixel and axis; null: whole-period Fourier transform"
     )
     precision: Literal["complex64", "complex128"] = Field(description="Of the propagation")
     batch: Count = Field(description="Wavefronts per batch")

@@ -11,7 +11,6 @@ from pydantic import ValidationError, create_model, model_validator
 
 from psfdae.configuration.base import SEARCH, Group
 from psfdae.configuration.telescope import Telescope, has_own_aberrations
-from psfdae.optics.pupil import required_nodes
 
 SIMULATION = ("seed", "scene", "telescope", "grid", "wavefront", "stars", "framing", "optics")
 """Groups that decide the noise-free stars."""
@@ -22,9 +21,6 @@ STATIC = ("scene", "telescope", "grid", "wavefront", "framing", "optics")
 OWN_SCENE = "telescope"
 """The scene of a telescope that brings its own aberrations."""
 
-MOST_NODES = 32
-"""Quadrature nodes per pixel that `optics.nodes` allows."""
-
 SEARCH_PX = (4, 256)
 """Least and largest distance in pixels that follows from one in λ/D."""
 
@@ -33,8 +29,8 @@ class Consistent(Group):
     """Base of models that hold several groups.
 
     Some values may be null in the files, because they follow from other groups:
-    edge and spacing of the field points, quadrature nodes per pixel, and the search
-    distances of brightest pixels, which have the telescope's pixels.
+    edge and spacing of the field points, and the search distances of brightest
+    pixels, which have the telescope's pixels.
     """
 
     @model_validator(mode="before")
@@ -62,11 +58,6 @@ class Consistent(Group):
 
 def with_derived(tree: Mapping[str, Any]) -> dict[str, Any]:
     """A whole configuration with values in place of those nulls that follow from other groups.
-
-    Raises
-    ------
-    ValueError
-        If the pixels are too wide for any number of nodes.
     """
     filled = {name: _filled(group, _derived_values(name, tree)) for name, group in tree.items()}
     if isinstance(filled.get("grid"), dict):
@@ -110,8 +101,6 @@ def _derived_values(name: str, tree: Mapping[str, Any]) -> dict[str, Any]:
         return {"edge_deg": telescope.get("field_edge_deg")}
     if name in ("framing", "stars"):
         return {"search_px": _search(tree[name], _pixel(telescope))}
-    if name == "optics" and "nodes" in tree["optics"] and tree["optics"]["nodes"] is None:
-        return {"nodes": _nodes(telescope)}
     return {}
 
 
@@ -130,20 +119,6 @@ def _pixel(telescope: Mapping[str, Any]) -> float | None:
         return Telescope.model_validate({key: telescope[key] for key in keys}).pixel
     except ValidationError:
         return None
-
-
-def _nodes(telescope: Mapping[str, Any]) -> int:
-    pixel = _pixel(telescope)
-    nodes = required_nodes(pixel) if pixel else 1
-    if nodes > MOST_NODES:
-        scale = telescope["pixel_scale_arcsec"]
-        widest = scale / pixel * (MOST_NODES - 1.5) * 2.0 / np.pi
-        raise ValueError(
-            f"telescope.pixel_scale_arcsec = {scale:g}: a pixel {pixel:.3g} λ/D wide needs "
-            f"{nodes} quadrature nodes; at most {MOST_NODES}, that is {widest:.3g} arcsec at "
-            "this diameter and wavelength"
-        )
-    return nodes
 
 
 def _space(grid: dict[str, Any]) -> None:

@@ -96,8 +96,8 @@ class Optics(Group):
     pupil_samples: PupilSamples = Field(
         description="Ladder of grid sizes N; each wavefront takes the first that suffices"
     )
-    nodes: Annotated[int, Field(ge=1, le=32)] = Field(
-        description="Gauss-Legendre nodes per pixel and axis; null: as many as the pixel needs"
+    extra_points: Annotated[int, Field(ge=-8, le=32)] = Field(
+        description="Points along a side of the image beyond two per λ/D"
     )
     precision: Literal["complex64", "complex128"] = Field(description="Of the propagation")
     backend: Literal["numpy", "torch"] = Field(description="Library of the matrix products")

@@ -9,11 +9,11 @@ and each costs about as much as a stamp.
 Two ways lead from the pupil to the pixels. Both sample the image on a separable
 set of points and turn the intensities there into pixels with one matrix:
 
-- `NodeSampling`: quadrature nodes in every pixel and a matrix DFT, for pixels
-  that are not much wider than λ/D;
+- `PointSampling`: the points of `StampPropagator` and a matrix DFT, for stamps
+  narrower than the image's period;
 - `PeriodSampling`: the whole period of the image by a Fourier transform. The
   intensity is a trigonometric polynomial, which its samples determine, so pixels
-  are integrated exactly. It is the faster one for pixels several λ/D wide.
+  are integrated exactly. It is the faster one for stamps nearly as wide as it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from typing import Protocol
 import numpy as np
 from scipy import fft
 
-from psfdae.optics.propagation import Precision, pixel_nodes
+from psfdae.optics.propagation import Precision, image_points
 from psfdae.optics.pupil import Pupil
 from psfdae.optics.wavefronts import Modes
 
@@ -38,19 +38,22 @@ class Sampling(Protocol):
         """Fields at the points, (..., M, M) to (..., m, m), up to a common phase per point."""
 
 
-class NodeSampling:
-    """Gauss–Legendre nodes in every pixel, as `StampPropagator` places them; its parameters."""
+class PointSampling:
+    """The points of `image_points` on both sides of the chief ray; its parameters."""
 
     def __init__(
-        self, pupil: Pupil, stamp_px: int, pixel: float, nodes: int, precision: Precision
+        self, pupil: Pupil, stamp_px: int, pixel: float, extra: int, precision: Precision
     ) -> None:
-        inside, weights = pixel_nodes(pixel, nodes)
-        points = (_centres(stamp_px, pixel)[:, None] + inside).ravel()
+        half, even, odd = image_points(pupil, stamp_px, pixel, extra)
+        points = np.concatenate([-half[::-1], half])
         self._dft = np.exp(-1j * np.pi * np.outer(pupil.axis, points)).astype(precision)
-        self.pixels = np.kron(np.eye(stamp_px), weights).astype(self._dft.real.dtype)
+        above = 0.5 * np.hstack([(even - odd)[::-1].T, (even + odd).T])
+        # The middle pixel of an odd stamp is its own mirror image.
+        below = above[::-1, ::-1][: stamp_px // 2]
+        self.pixels = np.vstack([below, above]).astype(self._dft.real.dtype)
 
     def fields(self, pupil_fields: np.ndarray) -> np.ndarray:
-        """See `Sampling`, m = d·nodes."""
+        """See `Sampling`, m = all points."""
         return self._dft.T @ (pupil_fields @ self._dft)
 
 

@@ -177,16 +177,6 @@ def pixel_width(scale_arcsec: float, diameter_m: float, wavelength_m: float) -> 
     return scale_arcsec * ARCSEC * diameter_m / wavelength_m
 
 
-def required_nodes(pixel: float) -> int:
-    """Gauss–Legendre nodes per axis that integrate the image over a pixel.
-
-    Across a pixel of width p λ/D the intensity has up to p periods; ⌈πp/2 + 3/2⌉
-    nodes keep the MSE of the scenes' stamps within their error budgets for pixels
-    of 0.3 to 9 λ/D (target stability).
-    """
-    return int(np.ceil(0.5 * np.pi * pixel + 1.5))
-
-
 def choose_samples(needed: np.ndarray, ladder: tuple[int, ...]) -> np.ndarray:
     """Smallest rung of a ladder of grid sizes that serves each wavefront.
 

@@ -111,7 +111,7 @@ def star_images(recipe: FieldRecipe, position: np.ndarray) -> np.ndarray:
     field = position / (0.5 * recipe.side_px) - 1.0
     source = seidel_wavefronts(np.tile(recipe.seidel, (len(field), 1)), field)
     pupil = annular_pupil(128, 0.35)
-    propagate = StampPropagator(pupil, fine, recipe.pixel / OVERSAMPLING, 2, "complex64")
+    propagate = StampPropagator(pupil, fine, recipe.pixel / OVERSAMPLING, precision="complex64")
     blur = _moffat_transfer(recipe.seeing_px * OVERSAMPLING, fine)
     # The chief ray is at the corner between the two middle sub-pixels of the fine image.
     shift = position - np.rint(position) + 0.5

@@ -20,7 +20,7 @@ from psfdae.evaluation.calibration import (
 )
 from psfdae.evaluation.metrics import mse, ssim
 from psfdae.files import Product, read_product, write_csv
-from psfdae.optics.pupil import Pupil, required_nodes
+from psfdae.optics.pupil import Pupil
 from psfdae.optics.wavefronts import WavefrontSource
 from psfdae.reading import read_table
 from psfdae.rng import stream
@@ -109,10 +109,7 @@ def _images(config: Config, source: WavefrontSource, scale: float) -> np.ndarray
     """Noise-free, framed, normalised stars at another pixel scale."""
     telescope = config.telescope.model_copy(update={"pixel_scale_arcsec": scale})
     search_px = ceil(config.stars.search_px * config.telescope.pixel_scale_arcsec / scale)
-    # The scan reaches wider pixels than the configured one.
-    nodes = max(config.optics.nodes, required_nodes(telescope.pixel))
-    optics = config.optics.model_copy(update={"nodes": nodes})
-    propagation = Propagation(source, telescope, optics, config.framing, search_px)
+    propagation = Propagation(source, telescope, config.optics, config.framing, search_px)
     return normalise_flux(propagation.framed(config.framing.stamp_px)[0])[0]
 
 

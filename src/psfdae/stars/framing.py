@@ -18,7 +18,6 @@ from psfdae.optics.pupil import (
     SamplingError,
     annular_pupil,
     choose_samples,
-    required_nodes,
     required_samples,
 )
 from psfdae.optics.seeing import BlurredPropagator
@@ -89,7 +88,7 @@ sizes of search images."""
 SEARCH_ERROR = 1e-3
 """Search-image pixels this far below a tie with the maximum may still be the brightest.
 
-The search image has all nodes and errs by rounding alone, by 4e-6 of its maximum at
+The search image is as exact as a stamp and errs by rounding alone, by 4e-6 of its maximum at
 most (256 stars each of scene 1 at 10 and 50 %, and of scene 2). A pixel that is alone
 on the shortlist settles a star; only the others are computed exactly.
 """
@@ -112,8 +111,7 @@ class Propagation:
     Raises
     ------
     SamplingError
-        If the ladder ends below what a wavefront needs, or the pixels are too wide
-        for the nodes.
+        If the ladder ends below what a wavefront needs.
     """
 
     def __init__(
@@ -130,12 +128,6 @@ class Propagation:
         self.optics = optics
         self.framing = framing
         pixel = telescope.pixel
-        if optics.nodes < required_nodes(pixel):
-            raise SamplingError(
-                f"optics.nodes = {optics.nodes}: a pixel of {pixel:.3g} λ/D "
-                f"(telescope.pixel_scale_arcsec = {telescope.pixel_scale_arcsec:g}) "
-                f"needs at least {required_nodes(pixel)} nodes"
-            )
         reach = 2 * search_px + 0.5 * framing.stamp_px + framing.jitter_px + 0.5 * framing.subpixel
         edge = reach * pixel
         self._blur = getattr(telescope, "blur", None)
@@ -322,7 +314,7 @@ class Propagation:
         common = (pupil, stamp_px, self.telescope.pixel)
         if self._blur is not None:
             return BlurredPropagator(*common, self._blur, precision)
-        return StampPropagator(*common, self.optics.nodes, precision, self.optics.backend)
+        return StampPropagator(*common, self.optics.extra_points, precision, self.optics.backend)
 
 
 def _touches(peaks: np.ndarray, reach: np.ndarray) -> np.ndarray:
