@@ -372,7 +372,8 @@ def cheapest():
 
 def peers():
     """Factors by which other propagators are slower at equal error."""
-    rows = csv("tables/benchmark_peers.csv").groupby(["scene", "aberration", "method"])
+    table = csv("tables/benchmark_peers.csv")
+    rows = table.groupby(["processes", "scene", "aberration", "method"])
     table = rows.speedup.agg(["size", "min", "median", "max"]).join(rows.required.first())
     return table.assign(met=rows.met.agg(lambda met: (met == "yes").sum())).reset_index()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -14,10 +15,11 @@ import propagation
 import propagators
 import savings
 import scenes
+from measure import alone, time_in_rounds
 from psfdae.configuration.compose import load_stage
 from psfdae.files import ProductError
 from psfdae.optics.propagation import StampPropagator
-from psfdae.optics.pupil import SamplingError, annular_pupil
+from psfdae.optics.pupil import annular_pupil
 from psfdae.optics.wavefronts import monomial_coefficients, monomial_images, seidel_wavefronts
 from psfdae.stars.framing import normalise_flux
 from workflow_runs import ROOT
@@ -131,7 +133,8 @@ def test_spread_takes_the_extremes_of_every_rung():
 
 def rows_of(values):
     names = "scene aberration method samples points precision backend threads batch time_ms mse"
-    return pd.DataFrame(values, columns=names.split()).assign(within_budget="yes")
+    table = pd.DataFrame(values, columns=names.split())
+    return table.assign(within_budget="yes", processes=1)
 
 
 KERNEL = ("kernel", 94, 2, "complex64", "numpy")
@@ -203,6 +206,33 @@ def test_times_are_those_of_one_stamp_of_all_that_ran(case, monkeypatch):
     for end in ("", "_low", "_high"):
         times = [row[f"time_ms{end}"] for row in rows]
         assert times == pytest.approx([80 / n for n in stamps])
+
+
+def test_stamps_of_processes_side_by_side_count_together(monkeypatch):
+    found = [[{"time_ms": t, "time_ms_low": t, "time_ms_high": 2 * t}] for t in (3.0, 5.0)]
+    monkeypatch.setattr(propagators, "alone", lambda *a, processes: found[:processes])
+    (row,) = propagators.in_processes([], 5, 16, 2)
+    assert row == {"time_ms": 2.0, "time_ms_low": 2.0, "time_ms_high": 4.0, "processes": 2}
+
+
+def test_processes_begin_every_timing_together():
+    """Neither is done with a later timing before the other has begun it."""
+    found = alone(1, begun_and_ended, 5, processes=2)
+    (begun, ended), (other_begun, other_ended) = (np.array(times).T for times in found)
+    assert (np.maximum(begun, other_begun)[:-1] < np.minimum(begun, other_begun)[1:] + 1e-3).all()
+    assert (np.maximum(begun, other_begun) < np.minimum(ended, other_ended)).all()
+
+
+def begun_and_ended(count):
+    times = []
+
+    def work():
+        start = time.monotonic()
+        time.sleep(0.05)
+        times.append((start, time.monotonic()))
+
+    time_in_rounds([lambda: work] * count, 1)
+    return times
 
 
 @pytest.fixture(scope="module")

@@ -43,8 +43,7 @@ SERIES = (
     (0, "aberrations", "aberrations", True),
     (0, "aberrations, guard ignored", "aberrations, guard ignored", False),
     (0, "turbulence", "turbulence", True),
-    (1, "pixel scale, configured nodes", "configured nodes", True),
-    (1, "pixel scale, nodes it needs", "as many nodes as it needs", False),
+    (1, "pixel scale", "pixel scale", True),
     (2, "seidel, noisy sum", "scene 1, sum (eq. 8)", True),
     (2, "seidel, robust flux", "scene 1, robust", False),
     (2, "turbulence, noisy sum", "scene 2, sum (eq. 8)", True),
@@ -112,7 +111,7 @@ def propagation(table):
     figure.legend(handles=handles, loc="outside lower center", ncols=4)
     threads = "–".join(map(str, sorted({table["threads"].min(), table["threads"].max()})))
     name = table["scene"].iloc[0]
-    title = f"{SCENES.get(name, name)}: error of a stamp against its time, threads: {threads}"
+    title = f"{SCENES.get(name, name)}: error of a stamp against its time, threads or processes: {threads}"
     figure.suptitle(title.capitalize())
     return figure
 

@@ -23,6 +23,7 @@ from psfdae.stages.record import cpu_model
 VERSIONED = ("psfdae", "numpy", "scipy", "torch", "numexpr", "poppy", "hcipy")
 """Packages whose versions can change a time; recorded where they are installed."""
 
+PATIENCE_S = 600.0  # until a process gives up to wait for those beside it
 THREAD_VARIABLES = [f"{name}_NUM_THREADS" for name in ("OMP", "OPENBLAS", "MKL", "NUMEXPR")]
 
 
@@ -38,21 +39,41 @@ def time_in_rounds(builders, repeats):
 
     A machine that others share is slower for seconds at a time; rounds spread the repeats of
     every callable over the whole run. Builders set up what is timed and warm it up, anew in
-    every round.
+    every round. Processes that run side by side (see `alone`) begin every timing together.
     """
-    return np.array([[Timer(build()).timeit(1) for build in builders] for _ in range(repeats)]).T
+    return np.array([[_timed(build()) for build in builders] for _ in range(repeats)]).T
 
 
-def alone(threads, function, *arguments):
-    """Result of a module's function in an interpreter of its own with so many threads.
+_together = None  # the barrier of processes that run side by side
+
+
+def _timed(function):
+    if _together is not None:
+        _together.wait(timeout=PATIENCE_S)
+    return Timer(function).timeit(1)
+
+
+def _meet(barrier):
+    global _together
+    _together = barrier
+
+
+def alone(threads, function, *arguments, processes=1):
+    """Results of a module's function in interpreters of their own with so many threads.
+
+    That of one process as it is, those of several that run side by side as a list.
 
     Idle threads of one linear algebra library spin and slow those of another, a library that
     has started with some threads does not always obey a new number, and the peak of a
     process's memory never falls.
     """
-    pool = ProcessPoolExecutor(1, mp_context=get_context("spawn"), max_tasks_per_child=1)
+    context = get_context("spawn")
+    meeting = (context.Barrier(processes),) if processes > 1 else (None,)
+    pool = ProcessPoolExecutor(processes, context, _meet, meeting, max_tasks_per_child=1)
     with patch.dict(os.environ, dict.fromkeys(THREAD_VARIABLES, str(threads))), pool:
-        return pool.submit(function, *arguments).result()
+        running = [pool.submit(function, *arguments) for _ in range(processes)]
+        found = [task.result() for task in running]
+    return found if processes > 1 else found[0]
 
 
 def cost_of_command(words, out, tree=None):

@@ -1,5 +1,6 @@
 """Time against error of the optics: kernel, peers, cheapest setting, and what is left out."""
 
+from dataclasses import replace
 from typing import Annotated, Any
 
 import click
@@ -10,6 +11,7 @@ from propagators import (
     compare,
     configured_setting,
     finish,
+    in_processes,
     kernel_settings,
     kernel_times,
     peers_of,
@@ -71,7 +73,7 @@ def time_everything(config, cases):
     """Both backends and the peers as one table.
 
     Every backend and number of threads is timed in a process of its own, the peers in that of
-    numpy, so that ratios hold.
+    numpy, so that ratios hold; then as many processes as threads, side by side.
     """
     optics, benchmark = config.optics, config.benchmark
     peers = [(case, peer) for case in cases for peer in peers_of(case, benchmark)]
@@ -86,8 +88,11 @@ def time_everything(config, cases):
             chosen = [pair for pair in pairs if pair[1].threads == threads]
             if (backend, threads) == ("numpy", benchmark.threads):
                 chosen += peers
+                beside = [(case, replace(setting, threads=1)) for case, setting in chosen]
             work = (time_settings, chosen, benchmark.repeats, benchmark.stamps)
             rows += alone(threads, *work)
+    if benchmark.threads > 1:
+        rows += in_processes(beside, benchmark.repeats, benchmark.stamps, benchmark.threads)
     used = {case.aberration: configured_setting(optics, benchmark, case.samples) for case in cases}
     return finish(rows, used)
 

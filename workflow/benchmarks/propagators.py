@@ -15,7 +15,7 @@ from itertools import product
 
 import numpy as np
 
-from measure import pareto, time_in_rounds, use_threads, yes
+from measure import alone, pareto, time_in_rounds, use_threads, yes
 from psfdae.optics.propagation import StampPropagator
 from psfdae.optics.pupil import ARCSEC, SamplingError
 from psfdae.stars.framing import normalise_flux
@@ -32,9 +32,10 @@ GRID_TOLERANCE = 5e-5  # relative error of the pixel scale of an FFT's grid
 REQUIRED_SPEEDUP = {"poppy_mft": 40.0, "poppy_fresnel": 400.0}  # of the kernel at equal error
 KERNEL_STAMPS = 4  # per timing of the kernel in units of `benchmark.stamps`
 
-EQUAL = ["scene", "aberration", "threads"]
+EQUAL = ["scene", "aberration", "threads", "processes"]
 PEER_COLUMNS = ["scene", "aberration", "method", "samples", "points", "precision", "threads"]
-PEER_COLUMNS += ["time_ms", "mse", "within_budget"]
+PEER_COLUMNS += ["processes", "time_ms", "mse", "within_budget"]
+TIMES = ["time_ms", "time_ms_low", "time_ms_high"]
 KERNEL_COLUMNS = ["samples", "points", "precision", "batch", "time_ms", "mse"]
 
 
@@ -49,6 +50,7 @@ class Setting:
     backend: str = "numpy"
     threads: int = 1
     batch: int = 1
+    processes: int = 1
 
 
 def candidate_samples(optics, thorough):
@@ -138,6 +140,19 @@ def time_settings(chosen, repeats, stamps):
         row |= {"repeats": repeats, "time_ms": median, "time_ms_low": low, "time_ms_high": high}
         row |= {"error_peak": np.abs(difference).max() / case.truth.max(), "mse": mse}
         rows.append({**row, "budget": case.budget, "within_budget": yes(mse <= case.budget)})
+    return rows
+
+
+def in_processes(chosen, repeats, stamps, processes):
+    """Rows of `time_settings` where so many processes of one thread run side by side.
+
+    The time of a stamp is that of one process over their number.
+    """
+    found = alone(1, time_settings, chosen, repeats, stamps, processes=processes)
+    rows = []
+    for same in zip(*found, strict=True):
+        times = {key: np.mean([r[key] for r in same]) / processes for key in TIMES}
+        rows.append({**same[0], **times, "processes": processes})
     return rows
 
 
@@ -353,7 +368,7 @@ def kernel_times(table, optics, benchmark):
     Backend and batch are the configured ones, threads the benchmark's.
     """
     used = asdict(configured_setting(optics, benchmark, 0)) | {"threads": benchmark.threads}
-    wanted = ["method", "backend", "threads", "batch"]
+    wanted = ["method", "backend", "threads", "batch", "processes"]
     rows = table[(table[wanted] == [used[name] for name in wanted]).all(axis=1)]
     return dict(rows.groupby(["samples", "points", "precision"])["time_ms"].mean())
 
@@ -361,8 +376,8 @@ def kernel_times(table, optics, benchmark):
 def compare(table):
     """Every setting of a peer beside our cheapest setting that errs no more.
 
-    Both were timed in one process (backend numpy) with the same threads. Peers that err less
-    than every setting of ours are left out.
+    Both were timed in the same way (backend numpy), in one process with the same threads or
+    in as many processes. Peers that err less than every setting of ours are left out.
     """
     ours = table[(table["method"] == "kernel") & (table["backend"] == "numpy")]
     ours = ours[[*EQUAL, *KERNEL_COLUMNS]]
