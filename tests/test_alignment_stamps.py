@@ -10,7 +10,7 @@ import pytest
 from psfdae.alignment.stamps import AlignmentStamps, EnergyError, centred_modes, mean_slope
 from psfdae.alignment.telescope import uniform_states
 from psfdae.configuration.compose import load
-from psfdae.optics.derivatives import ModalStamps, PointSampling, PeriodSampling
+from psfdae.optics.derivatives import ModalStamps, PeriodSampling, PointSampling
 from psfdae.optics.propagation import StampPropagator
 from psfdae.optics.pupil import SamplingError, annular_pupil
 from psfdae.optics.raytracing import annulus_points, misaligned

@@ -92,7 +92,7 @@ def test_slopes_do_not_depend_on_the_batch():
 
 
 def test_search_is_exact_for_large_pixels():
-    """Scene 2's pixel is 1.6 λ/D wide: a search of point samples would shift its brightest pixels."""
+    """Scene 2's pixel is 1.6 λ/D wide: point samples would shift its brightest pixels."""
     config = load_stage(STATIC, ["scene=turbulence", "optics.threads=1"])
     source = template_wavefronts(config)
     # Measuring 400 slopes takes longer than the test; the largest grid serves all.

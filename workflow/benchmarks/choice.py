@@ -7,9 +7,9 @@ from itertools import product
 import numpy as np
 
 from measure import yes
-from propagators import PRECISIONS, candidate_points, candidate_samples
+from propagators import POINTS, PRECISIONS, candidate_samples
+from psfdae.optics.propagation import EXTRA_POINTS
 from psfdae.optics.pupil import SamplingError, choose_samples
-from psfdae.stars.framing import normalise_flux
 from scenes import Selection, spread_evenly, stamp_mse, stamps_at
 
 REFERENCE = (768, 12)  # samples and points of exact stamps; `build_cases` shows: they suffice
@@ -65,9 +65,8 @@ def take_sample(scene, stars, thorough):
     source = Selection(scene.stars, index)
     offset = scene.propagation(source, scene.search_px).brightest()
     stamps = {}
-    tried = candidate_points(scene.optics, thorough)
     for samples in candidate_samples(scene.optics, thorough):
-        for points, precision in product(tried, PRECISIONS):
+        for points, precision in product(POINTS[-2:], PRECISIONS):
             try:
                 found = stamps_at(scene, source, offset, samples, points, precision)
             except SamplingError:
@@ -78,9 +77,9 @@ def take_sample(scene, stars, thorough):
 
 
 def screen(scene, needed, kept, thorough):
-    """Stars whose stamps change most on coarser grids or with fewer points, ascending.
+    """Stars whose stamps change most on coarser grids or with more points, ascending.
 
-    `kept` per grid size and number of points, of all stars or, if not thorough, of `SCREENED`.
+    `kept` per grid size and for more points, of all stars or, if not thorough, of `SCREENED`.
     """
     looked_at = spread_evenly(needed.size, needed.size if thorough else SCREENED)
     slopes, optics, everyone = scene.stars.slopes(), scene.optics, np.arange(looked_at.size)
@@ -89,21 +88,15 @@ def screen(scene, needed, kept, thorough):
 
     def stamps(members, samples, points):
         some = Selection(scene.stars, looked_at[members], slopes)
-        settings = {"pupil_samples": [samples], "extra_points": points}
-        propagation = scene.propagation(some, scene.search_px, **settings)
-        return normalise_flux(propagation.stamps(scene.framing.stamp_px, offset[members]))[0]
+        return stamps_at(scene, some, offset[members], samples, points, optics.precision)
 
     finest = int(choose_samples(needed[looked_at].max(keepdims=True), optics.pupil_samples)[0])
-    exact = stamps(everyone, finest, optics.extra_points)
-    integrated = stamps(everyone, finest, optics.extra_points + 2)
-    changes = [(everyone, stamp_mse(exact, integrated))]
-    # The stars that fewer points spoil most are others.
-    for points in range(0, optics.extra_points, 2):
-        changes.append((everyone, stamp_mse(stamps(everyone, finest, points), integrated)))
+    exact, finer = (stamps(everyone, finest, points) for points in POINTS[-2:])
+    changes = [(everyone, stamp_mse(exact, finer))]
     for samples in candidate_samples(optics, thorough):
         members = np.flatnonzero(needed[looked_at] <= samples)
         if members.size and samples <= optics.pupil_samples[0]:
-            coarse = stamps(members, samples, optics.extra_points)
+            coarse = stamps(members, samples, EXTRA_POINTS)
             changes.append((members, stamp_mse(coarse, exact[members])))
     worst = [members[np.argsort(change)[-kept:]] for members, change in changes]
     return looked_at[np.unique(np.concatenate(worst))]
@@ -137,7 +130,7 @@ def choose(scene, sample, time_ms):
         for points, precision in product(points_tried, PRECISIONS):
             worst = float(stamp_mse(sample.at(own, points, precision), sample.truth).max())
             times = [time_ms.get((int(n), points, precision), np.nan) for n in everyone]
-            used = (optics.pupil_samples, optics.extra_points, optics.precision)
+            used = (optics.pupil_samples, EXTRA_POINTS, optics.precision)
             row = {"scene": scene.name, "ladder": "-".join(map(str, ladder))}
             row |= {"first_rung": ladder[0], "points": points, "precision": precision}
             row |= {"stars": len(own), "mse": worst, "budget": scene.budget}
@@ -162,13 +155,13 @@ def guard_or_budget(scene, sample):
 
     A row per rung in use: its share of all stars, the stars of the sample, the N that the
     guard asks for (guard_min, guard_max), the N from which on a star stays within the budget
-    with the configured points and precision (budget_min, budget_max; NaN if it never does), and
-    the share of the evenly spread stars for which the budget asks for more.
+    with the configured precision (budget_min, budget_max; NaN if it never does), and the share
+    of the evenly spread stars for which the budget asks for more.
     """
     import pandas as pd
 
     optics, grids = scene.optics, tuple(sorted({samples for samples, *_ in sample.stamps}))
-    stamps = [sample.stamps[n, optics.extra_points, optics.precision] for n in grids]
+    stamps = [sample.stamps[n, EXTRA_POINTS, optics.precision] for n in grids]
     error = np.stack([stamp_mse(s, sample.truth) for s in stamps], axis=1)
     by_budget = first_lasting(error <= scene.budget, np.array(grids, float))
     more = ~(by_budget <= choose_samples(sample.needed, grids))

@@ -111,8 +111,8 @@ def propagation(table):
     figure.legend(handles=handles, loc="outside lower center", ncols=4)
     threads = "–".join(map(str, sorted({table["threads"].min(), table["threads"].max()})))
     name = table["scene"].iloc[0]
-    title = f"{SCENES.get(name, name)}: error of a stamp against its time, threads or processes: {threads}"
-    figure.suptitle(title.capitalize())
+    title = f"{SCENES.get(name, name)}: error of a stamp against its time"
+    figure.suptitle(f"{title}, threads or processes: {threads}".capitalize())
     return figure
 
 

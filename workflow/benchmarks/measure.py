@@ -44,18 +44,17 @@ def time_in_rounds(builders, repeats):
     return np.array([[_timed(build()) for build in builders] for _ in range(repeats)]).T
 
 
-_together = None  # the barrier of processes that run side by side
+_BARRIERS: list = []  # where a process waits for those that run beside it
 
 
 def _timed(function):
-    if _together is not None:
-        _together.wait(timeout=PATIENCE_S)
+    for barrier in _BARRIERS:
+        barrier.wait(timeout=PATIENCE_S)
     return Timer(function).timeit(1)
 
 
 def _meet(barrier):
-    global _together
-    _together = barrier
+    _BARRIERS.append(barrier)
 
 
 def alone(threads, function, *arguments, processes=1):
@@ -68,8 +67,8 @@ def alone(threads, function, *arguments, processes=1):
     process's memory never falls.
     """
     context = get_context("spawn")
-    meeting = (context.Barrier(processes),) if processes > 1 else (None,)
-    pool = ProcessPoolExecutor(processes, context, _meet, meeting, max_tasks_per_child=1)
+    meeting = (_meet, (context.Barrier(processes),))
+    pool = ProcessPoolExecutor(processes, context, *meeting, max_tasks_per_child=1)
     with patch.dict(os.environ, dict.fromkeys(THREAD_VARIABLES, str(threads))), pool:
         running = [pool.submit(function, *arguments) for _ in range(processes)]
         found = [task.result() for task in running]

@@ -16,14 +16,14 @@ from itertools import product
 import numpy as np
 
 from measure import alone, pareto, time_in_rounds, use_threads, yes
-from psfdae.optics.propagation import StampPropagator
+from psfdae.optics.propagation import EXTRA_POINTS, StampPropagator
 from psfdae.optics.pupil import ARCSEC, SamplingError
 from psfdae.stars.framing import normalise_flux
 from psfdae.threads import side_by_side
 from scenes import pupil_of
 
-GRIDS = range(62, 400, 32)  # pupil samples tried beside the ladder; with guard cells multiples of 32
-EXTRA_POINTS = range(-2, 8, 2)  # of the kernel
+GRIDS = (62, 94, 126, 158, 190, 286)  # pupil samples tried beside the ladder; even with guard cells
+POINTS = (0, 2, 4, EXTRA_POINTS, EXTRA_POINTS + 2)  # extra points of the kernel
 BATCHES = (1, 4, 16, 64)  # stamps per call
 PRECISIONS = ("complex64", "complex128")
 WAVELENGTH_M = 1e-6  # any will do: OPDs are in waves and angles in λ/D of a 1 m pupil
@@ -41,7 +41,7 @@ KERNEL_COLUMNS = ["samples", "points", "precision", "batch", "time_ms", "mse"]
 
 @dataclass(frozen=True)
 class Setting:
-    """One way to run a method; `points` are a pixel's sub-samples, of the kernel the extra points."""
+    """One way to run a method: `points` are sub-samples per pixel, or the kernel's extra points."""
 
     method: str
     samples: int
@@ -60,19 +60,13 @@ def candidate_samples(optics, thorough):
     return sorted({*(n for n in others if n < most), *optics.pupil_samples})
 
 
-def candidate_points(optics, thorough):
-    """Numbers of extra points to try, the configured one and two more among them."""
-    used = {optics.extra_points, optics.extra_points + 2}
-    return sorted(used.union(EXTRA_POINTS) if thorough else used)
-
-
 def configured_setting(optics, benchmark, samples):
     """The kernel of the config for a wavefront that is given N `samples`.
 
     Its batch is the configured one, but no more than are timed.
     """
     batch = min(optics.batch, benchmark.stamps)
-    rest = (optics.extra_points, optics.precision, optics.backend, optics.threads, batch)
+    rest = (EXTRA_POINTS, optics.precision, optics.backend, optics.threads, batch)
     return Setting("kernel", samples, *rest)
 
 
@@ -84,7 +78,7 @@ def kernel_settings(optics, benchmark, samples, backend):
     """
     used = replace(configured_setting(optics, benchmark, samples), backend=backend)
     grids = candidate_samples(optics, benchmark.peers)
-    points = candidate_points(optics, benchmark.peers)
+    points = POINTS if benchmark.peers else POINTS[-2:]
     threads, batches = sorted({1, benchmark.threads}), BATCHES if benchmark.peers else (1,)
     rest = (backend, benchmark.threads, used.batch)
     chosen = [Setting("kernel", *point, *rest) for point in product(grids, points, PRECISIONS)]

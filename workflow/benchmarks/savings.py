@@ -12,6 +12,7 @@ from scipy.special import j0
 from measure import time_calls, use_threads
 from propagators import Setting, build, configured_setting, fresnel_grid, kernel
 from psfdae.configuration.compose import part
+from psfdae.optics.propagation import EXTRA_POINTS
 from psfdae.optics.pupil import choose_samples
 from psfdae.optics.turbulence import structure_function
 from psfdae.optics.wavefronts import MONOMIALS, ModalWavefronts, monomial_images, zernike_images
@@ -231,11 +232,11 @@ def finer_than_needed(scene, sample, time_ms):
         stamps = sample.at(of_sample, points, precision)
         return 1e-3 * np.average(times, weights=count), stamps
 
-    without_s, configured = way(False, optics.extra_points, optics.precision)
+    without_s, configured = way(False, EXTRA_POINTS, optics.precision)
     for item, *setting in (
-        ("Every star on the finest grid", True, optics.extra_points, optics.precision),
-        ("Two points more per axis", False, optics.extra_points + 2, optics.precision),
-        ("Double precision", False, optics.extra_points, "complex128"),
+        ("Every star on the finest grid", True, EXTRA_POINTS, optics.precision),
+        ("Two points more per axis", False, EXTRA_POINTS + 2, optics.precision),
+        ("Double precision", False, EXTRA_POINTS, "complex128"),
     ):
         with_s, stamps = way(*setting)
         yield saving(item, (with_s, without_s), stamp_mse(stamps, configured).max(), AS_MSE)

@@ -67,7 +67,7 @@ def field(
     source = seidel_wavefronts(seidel, 2.0 * position / side - 1.0)
     pupil = annular_pupil(max(optics.pupil_samples), telescope.obscuration)
     width = pixel_width(scale, telescope.diameter_m, telescope.wavelength_m)
-    propagate = StampPropagator(pupil, SIDE, width, optics.extra_points, optics.precision)
+    propagate = StampPropagator(pupil, SIDE, width, precision=optics.precision)
     # The middle of an even stamp is the corner of four pixels.
     off = (pixel - 0.5 - position)[:, ::-1]
     parts = np.array_split(np.arange(stars), -(-stars // optics.batch))

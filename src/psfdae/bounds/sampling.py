@@ -124,7 +124,6 @@ class StampModel:
     def stamps(self, z: np.ndarray, field: np.ndarray, offset: np.ndarray) -> np.ndarray:
         """Stamps of sum 1 around pixels `offset` (n, 2) from the chief ray, (n, d, d), float32."""
         side, pixel = self.framing.stamp_px, self.telescope.pixel
-        extra = self.optics.extra_points
         coefficients = self.coefficients(z, field).astype(np.float32)
         out = np.empty((len(z), side, side), np.float32)
 
@@ -132,7 +131,7 @@ class StampModel:
             pupil = annular_pupil(samples, self.telescope.obscuration)
             images = monomial_images(pupil.axis[None, :], pupil.axis[:, None])
             modes = images.reshape(len(images), -1).astype(np.float32)
-            kernel = StampPropagator(pupil, side, pixel, extra, "complex64")
+            kernel = StampPropagator(pupil, side, pixel, precision="complex64")
 
             def propagate(draw: np.ndarray) -> None:
                 opd = (coefficients[draw] @ modes).reshape(-1, *images.shape[1:])
@@ -152,13 +151,12 @@ class StampModel:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Stamps in float64, (n, P), and derivatives (n, K, P) along `directions`, (n, K, 8)."""
         side, pixel = self.framing.stamp_px, self.telescope.pixel
-        extra = self.optics.extra_points
         stamps = np.empty((len(offset), side, side))
         slopes = np.empty((*directions.shape[:2], side, side))
 
         def prepare(samples: int) -> Callable[[np.ndarray], None]:
             pupil = annular_pupil(samples, self.telescope.obscuration)
-            sampling = PointSampling(pupil, side, pixel, extra, "complex64")
+            sampling = PointSampling(pupil, side, pixel, precision="complex64")
             operator = ModalStamps(pupil, monomial_images, sampling, pixel)
 
             def differentiate(draw: np.ndarray) -> None:

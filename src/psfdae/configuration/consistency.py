@@ -57,8 +57,7 @@ class Consistent(Group):
 
 
 def with_derived(tree: Mapping[str, Any]) -> dict[str, Any]:
-    """A whole configuration with values in place of those nulls that follow from other groups.
-    """
+    """A whole configuration with values in place of those nulls that follow from other groups."""
     filled = {name: _filled(group, _derived_values(name, tree)) for name, group in tree.items()}
     if isinstance(filled.get("grid"), dict):
         _space(filled["grid"])

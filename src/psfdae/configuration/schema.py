@@ -96,9 +96,6 @@ class Optics(Group):
     pupil_samples: PupilSamples = Field(
         description="Ladder of grid sizes N; each wavefront takes the first that suffices"
     )
-    extra_points: Annotated[int, Field(ge=-8, le=32)] = Field(
-        description="Points along a side of the image beyond two per λ/D"
-    )
     precision: Literal["complex64", "complex128"] = Field(description="Of the propagation")
     backend: Literal["numpy", "torch"] = Field(description="Library of the matrix products")
     batch: Count = Field(description="Wavefronts per batch")

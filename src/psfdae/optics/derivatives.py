@@ -23,7 +23,7 @@ from typing import Protocol
 import numpy as np
 from scipy import fft
 
-from psfdae.optics.propagation import Precision, image_points
+from psfdae.optics.propagation import EXTRA_POINTS, Precision, image_points
 from psfdae.optics.pupil import Pupil
 from psfdae.optics.wavefronts import Modes
 
@@ -42,7 +42,12 @@ class PointSampling:
     """The points of `image_points` on both sides of the chief ray; its parameters."""
 
     def __init__(
-        self, pupil: Pupil, stamp_px: int, pixel: float, extra: int, precision: Precision
+        self,
+        pupil: Pupil,
+        stamp_px: int,
+        pixel: float,
+        extra: int = EXTRA_POINTS,
+        precision: Precision = "complex128",
     ) -> None:
         half, even, odd = image_points(pupil, stamp_px, pixel, extra)
         points = np.concatenate([-half[::-1], half])

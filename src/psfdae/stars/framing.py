@@ -12,7 +12,7 @@ import numpy as np
 
 from psfdae.configuration.schema import Framing, Optics
 from psfdae.configuration.telescope import Telescope
-from psfdae.optics.propagation import Precision, StampPropagator, in_batches
+from psfdae.optics.propagation import EXTRA_POINTS, Precision, StampPropagator, in_batches
 from psfdae.optics.pupil import (
     Pupil,
     SamplingError,
@@ -88,9 +88,9 @@ sizes of search images."""
 SEARCH_ERROR = 1e-3
 """Search-image pixels this far below a tie with the maximum may still be the brightest.
 
-The search image is as exact as a stamp and errs by rounding alone, by 4e-6 of its maximum at
-most (256 stars each of scene 1 at 10 and 50 %, and of scene 2). A pixel that is alone
-on the shortlist settles a star; only the others are computed exactly.
+The search image errs by 8e-5 of its maximum at most (256 stars each of scene 1 at 10 and
+50 %, and of scene 2). A pixel that is alone on the shortlist settles a star; only the
+others are computed exactly.
 """
 
 
@@ -262,7 +262,7 @@ class Propagation:
         def prepare(samples: int) -> Callable[[np.ndarray], None]:
             pupil = self._pupil(samples)
             search = self._kernel(pupil, 2 * reach, "complex64")
-            exact = self._kernel(pupil, 1, "complex128")
+            exact = self._kernel(pupil, 1, "complex128", 2 * EXTRA_POINTS)
 
             def find(batch: np.ndarray) -> None:
                 members, phase = stars[batch], phase_px[batch]
@@ -310,11 +310,13 @@ class Propagation:
         threads = 1 if self.optics.backend == "torch" else self.optics.threads
         in_batches(self.samples[stars], self.optics.batch, threads, prepare)
 
-    def _kernel(self, pupil: Pupil, stamp_px: int, precision: Precision) -> Propagator:
+    def _kernel(
+        self, pupil: Pupil, stamp_px: int, precision: Precision, extra: int = EXTRA_POINTS
+    ) -> Propagator:
         common = (pupil, stamp_px, self.telescope.pixel)
         if self._blur is not None:
             return BlurredPropagator(*common, self._blur, precision)
-        return StampPropagator(*common, self.optics.extra_points, precision, self.optics.backend)
+        return StampPropagator(*common, extra, precision, self.optics.backend)
 
 
 def _touches(peaks: np.ndarray, reach: np.ndarray) -> np.ndarray:
