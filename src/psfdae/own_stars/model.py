@@ -488,6 +488,7 @@ class Engine:
         if free.any() and self.free_flux is not self.estimator:
             images, noise = told()
             flux = self.free_flux.flux(images, np.hypot(noise, info.misfit) / info.kappa)
+            free &= np.isfinite(flux)  # a damaged model may find none
             found = found.with_flux(np.where(free, np.clip(flux, *FLUX_FACTOR), 1.0))
         images, noise = told()
         estimate = self.estimator.estimate(images, noise / info.kappa)
