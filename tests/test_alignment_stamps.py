@@ -78,7 +78,7 @@ def test_point_sampling_is_the_stamp_propagator():
     coefficients = monomial_coefficients(seidel, np.array([[0.6, 0.4], [-1.0, 0.2]]))
     offset = np.array([[2, -1], [0, 3]])
     kernel = StampPropagator(pupil, 8, 0.9)
-    modal = ModalStamps(pupil, monomial_images, PointSampling(pupil, 8, 0.9, 6, "complex128"), 0.9)
+    modal = ModalStamps(pupil, monomial_images, PointSampling(pupil, 8, 0.9, "complex128"), 0.9)
     expected = kernel(modal.opd(coefficients), offset)
     assert modal.stamps(coefficients, offset) == pytest.approx(expected, abs=1e-14)
     assert modal.derivatives(coefficients, None, offset)[0] == pytest.approx(expected, abs=1e-14)
@@ -103,7 +103,7 @@ def test_period_sampling_integrates_pixels_exactly(tracer, exact, config):
 def test_derivatives_by_coefficients_are_differences(kind):
     pupil = annular_pupil(48, 0.3)
     sampling = (
-        PointSampling(pupil, 8, 2.0, 6, "complex128")
+        PointSampling(pupil, 8, 2.0, "complex128")
         if kind == "points"
         else PeriodSampling(pupil, 8, 2.0, "complex128")
     )

@@ -57,7 +57,7 @@ def test_airy_encircled_energy(samples, operator):
         image = StampPropagator(pupil, side, pixel)(flat(pupil))[0]
     else:
         sampling = (
-            PointSampling(pupil, side, pixel, 6, "complex128")
+            PointSampling(pupil, side, pixel, "complex128")
             if operator == "points"
             else PeriodSampling(pupil, side, pixel, "complex128")
         )
@@ -75,7 +75,7 @@ def test_parseval_light_is_conserved(backend):
     period = 2 / pupil.spacing
     kernel = StampPropagator(pupil, 64, period / 64, extra=24, backend=backend)
     total = kernel(opd_of(0.3 * COMATIC, pupil)).sum() * pupil.amplitude.sum()
-    assert total == pytest.approx((pupil.amplitude**2).sum(), rel=1e-9)
+    assert total == pytest.approx((pupil.amplitude**2).sum(), rel=1e-10)
 
 
 @pytest.mark.parametrize("tilt", [0.8, -1.7])
@@ -91,9 +91,9 @@ def test_tilt_moves_the_image_along_its_own_sign(tilt):
 
 def test_offset_looks_at_that_place(pupil):
     opd = opd_of(0.2 * COMATIC, pupil)
-    wide = StampPropagator(pupil, 32, 0.7, extra=20)(opd)[0]
-    moved = StampPropagator(pupil, 8, 0.7, extra=20)(opd, np.array([[5, -3]]))[0]
-    assert moved == pytest.approx(wide[12 + 5 : 20 + 5, 12 - 3 : 20 - 3], abs=1e-11)
+    wide = StampPropagator(pupil, 32, 0.7, extra=24)(opd)[0]
+    moved = StampPropagator(pupil, 8, 0.7, extra=24)(opd, np.array([[5, -3]]))[0]
+    assert moved == pytest.approx(wide[12 + 5 : 20 + 5, 12 - 3 : 20 - 3], abs=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -128,7 +128,7 @@ def test_halves_add_up_to_the_plain_sum(samples, side, backend):
     size = pupil.axis.size
     opd = np.random.default_rng(3).normal(size=(2, size, size))
     offset = np.array([[0, 0], [3, -2]])
-    sampling, plain = PointSampling(pupil, side, 0.88, 6, "complex128"), []
+    sampling, plain = PointSampling(pupil, side, 0.88, "complex128"), []
     half = image_points(pupil, side, 0.88)[0]
     points = np.concatenate([-half[::-1], half])
     for wavefront, (row, column) in zip(opd, 0.88 * offset, strict=True):
@@ -176,7 +176,7 @@ def test_against_the_transfer_function_method(pupil):
     opd = opd_of(0.4 * COMATIC, pupil)[0]
     ours = StampPropagator(pupil, 16, 0.88, extra=24)(opd[None])[0]
     exact = autocorrelation_stamp(pupil, opd, 16, 0.88)
-    assert np.abs(ours - exact).max() / exact.max() < 1e-10
+    assert np.abs(ours - exact).max() / exact.max() < 1e-12
 
 
 def poppy_fraunhofer(element, samples, pixel, side):

@@ -150,13 +150,18 @@ def test_every_stress_test_passes():
     assert (table.verdict == "pass").all()
 
 
-def test_settings_are_nearly_the_cheapest_of_the_benchmark():
-    """A fifth of the stamps' time is not worth another ladder, which makes all stars anew."""
+MORE_RUNGS = pytest.mark.xfail(
+    strict=True, reason="a ladder with more rungs is cheaper; it needs new stars and a new record"
+)
+
+
+@pytest.mark.parametrize("scene", [pytest.param("seidel", marks=MORE_RUNGS), "turbulence"])
+def test_settings_are_those_that_the_benchmark_chose(scene):
     choice = pd.read_csv(REFERENCE / "tables/benchmark_choice.csv")
-    for scene, rows in choice.groupby("scene"):
-        times = [rows.time_ms[rows[mark] == "yes"].item() for mark in ("configured", "cheapest")]
-        assert times[0] <= 1.2 * times[1], scene
-        assert (rows.within_budget[rows.configured == "yes"] == "yes").all(), scene
+    assert (choice.config_is_cheapest[choice.scene == scene] == "yes").all()
+
+
+def test_training_in_use_is_the_knee():
     training = pd.read_csv(REFERENCE / "tables/benchmark_training.csv")
     assert (training[training.used == "yes"].knee == "yes").all()
 

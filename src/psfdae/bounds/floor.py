@@ -66,7 +66,7 @@ def sensitivities(
 
     def prepare(count: int) -> Callable[[np.ndarray], None]:
         pupil, pixel = annular_pupil(count, telescope.obscuration), telescope.pixel
-        sampling = PointSampling(pupil, stamp_px, pixel)
+        sampling = PointSampling(pupil, stamp_px, pixel, "complex128")
         operator = ModalStamps(pupil, monomial_images, sampling, pixel)
 
         def differentiate(star: np.ndarray) -> None:

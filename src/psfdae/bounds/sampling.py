@@ -156,7 +156,7 @@ class StampModel:
 
         def prepare(samples: int) -> Callable[[np.ndarray], None]:
             pupil = annular_pupil(samples, self.telescope.obscuration)
-            sampling = PointSampling(pupil, side, pixel, precision="complex64")
+            sampling = PointSampling(pupil, side, pixel, "complex64")
             operator = ModalStamps(pupil, monomial_images, sampling, pixel)
 
             def differentiate(draw: np.ndarray) -> None:

@@ -23,7 +23,7 @@ from typing import Protocol
 import numpy as np
 from scipy import fft
 
-from psfdae.optics.propagation import EXTRA_POINTS, Precision, image_points
+from psfdae.optics.propagation import Precision, image_points
 from psfdae.optics.pupil import Pupil
 from psfdae.optics.wavefronts import Modes
 
@@ -41,15 +41,8 @@ class Sampling(Protocol):
 class PointSampling:
     """The points of `image_points` on both sides of the chief ray; its parameters."""
 
-    def __init__(
-        self,
-        pupil: Pupil,
-        stamp_px: int,
-        pixel: float,
-        extra: int = EXTRA_POINTS,
-        precision: Precision = "complex128",
-    ) -> None:
-        half, even, odd = image_points(pupil, stamp_px, pixel, extra)
+    def __init__(self, pupil: Pupil, stamp_px: int, pixel: float, precision: Precision) -> None:
+        half, even, odd = image_points(pupil, stamp_px, pixel)
         points = np.concatenate([-half[::-1], half])
         self._dft = np.exp(-1j * np.pi * np.outer(pupil.axis, points)).astype(precision)
         above = 0.5 * np.hstack([(even - odd)[::-1].T, (even + odd).T])
