@@ -237,7 +237,7 @@ class FieldMixture(Method):
         `estimate` finds flux and sky.
     """
 
-    label, color, marker = "field (told λ, position)", "#117733", "D"
+    label, color, marker = "field", "#117733", "D"
     told_level = told_position = True
     measures = True
     together, padded = 1024, False

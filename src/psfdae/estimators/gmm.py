@@ -193,7 +193,7 @@ class GaussianMixture(Method):
         STEP, or FINE.
     """
 
-    label, color, marker = "GMM (told λ)", "#cc79a7", "P"
+    label, color, marker = "GMM", "#cc79a7", "P"
     told_level = True
     together, padded = 4096, False
     per_reference = True
