@@ -100,7 +100,7 @@ mlflow: env ## Compare the tracked runs in a browser (PORT=n)
 	  --artifacts-destination "$$PSFDAE_RESULTS/mlartifacts"
 
 reference: env ## Make the finished run in results the run of record, and renew the docs
-	$(SNAKEMAKE) --forcerun reference -- reference
+	@sh workflow/reference.sh
 	@$(MAKE) --no-print-directory docs
 
 docs: env ## Renew the numbers in README and docs
