@@ -208,8 +208,9 @@ def _since(name: str, before: Mapping[str, Any]) -> dict[str, str]:
 
 def _said(path: Path) -> dict[str, str]:
     """Commit and date in the columns of a table; ProductError without."""
-    table = read_table(path, needed=("commit", "date"))
-    return {key: str(table[key].iloc[0]) for key in ("commit", "date")}
+    columns = {"commit": str, "date": str}
+    row = read_table(path, usecols=list(columns), dtype=columns).iloc[0]
+    return {key: str(row[key]) for key in columns}
 
 
 def _require_history(name: str, found: Mapping[str, str]) -> None:
