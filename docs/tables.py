@@ -6,6 +6,10 @@ and `by` sorts them. TEXT is an f-string over the columns. A comment at the end 
 line of each row, below the head of the table that the page has; within a line (never at its start)
 the columns of several rows are arrays. Without TEXT, the source itself is put in.
 
+What stays from an earlier record (`kept` in its provenance) gets its date and commit beside it:
+a line below a table, words behind a number whose section has no such table. Files of two commits
+are not joined.
+
 `python docs/tables.py` fills in all pages; `--check` names what has drifted.
 """
 
@@ -17,7 +21,6 @@ import re
 import subprocess
 import sys
 from functools import cache
-from itertools import combinations
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -53,17 +56,48 @@ STATES = ["decenter_x", "decenter_y", "tilt_x", "tilt_y"]
 CELL = ["dataset", "reference", "noise_level"]
 
 
+READ: set[str] = set()
+"""Files of the run of record that the source in hand has read."""
+
+
 def filled(page, drifted):
     """Text of a page with today's numbers; what has drifted is added to a list."""
-    text = page.read_text(encoding="utf-8")
+    sections = re.split(r"^(?=##+ )", page.read_text(encoding="utf-8"), flags=re.M)
+    return "".join(_section(page.relative_to(ROOT), text, drifted) for text in sections)
 
-    def fill(mark):
-        new = _new(**mark.groupdict())
-        if new != mark["old"]:
-            drifted.append(f"{page.relative_to(ROOT)}: {mark['name']}{mark['words']}")
-        return mark[0][: mark.start("old") - mark.start()] + new + "<!-- end -->"
 
-    return MARK.sub(fill, text)
+def _section(page, text, drifted):
+    """A section with today's numbers, and marks at what is of an earlier record."""
+    marks, new = list(MARK.finditer(text)), []
+    for mark in marks:
+        READ.clear()
+        new.append((mark, _new(**mark.groupdict()), _since(*sorted(READ), where=page)))
+    below = {since for mark, _, since in new if mark["line"]}
+    for figure in re.findall(r"results/reference/([\w/.-]+\.png)\)", text):
+        if (since := _since(figure, where=page)) and since not in below:
+            sys.exit(f"{page}: {figure} is of an earlier record, and no table beside it says so")
+    parts, end = [], 0
+    for mark, filling, since in new:
+        if since and mark["line"]:
+            filling += f"\n*Recorded {since}, not with the run of record.*\n"
+        elif since and since not in below:
+            filling += f" (recorded {since})"
+        if filling != mark["old"]:
+            drifted.append(f"{page}: {mark['name']}{mark['words']}")
+        parts += [text[end : mark.start("old")], filling, "<!-- end -->"]
+        end = mark.end()
+    return "".join([*parts, text[end:]])
+
+
+def _since(*names, where):
+    """Date and commit of files of an earlier record; nothing of those of the record itself."""
+    kept = json.loads(file("provenance.json")).get("kept", {})
+    found = {tuple(kept[n].values()) if n in kept else () for n in names if n != "provenance.json"}
+    if len(found) > 1:
+        sys.exit(f"{where}: {', '.join(names)} are of two commits, and joined")
+    return "".join(
+        f"{kept[n]['date']} at commit {kept[n]['commit']:.12}" for n in names[:1] if n in kept
+    )
 
 
 def _new(name, words, where, by, text, line, old):
@@ -86,15 +120,21 @@ def _written(text, row):
     return re.sub(r"\bnan( %)?", "", eval(f'f"""{text}"""', globals() | row))
 
 
-@cache
 def csv(name):
     """A table of the run of record; names of columns become names in Python."""
+    READ.add(name)
+    return _table(name)
+
+
+@cache
+def _table(name):
     table = pd.read_csv(REFERENCE / name)
     return table.rename(columns=lambda column: re.sub(r"\W", "_", column))
 
 
 def file(name):
     """A file of the run of record as it is."""
+    READ.add(name)
     return (REFERENCE / name).read_text(encoding="utf-8").strip()
 
 
@@ -165,20 +205,16 @@ def strange():
 
 
 def rules():
-    """What the jobs of each rule took in the run of record, and before; scene 3 job by job."""
-    runs = []
-    for name in ("runtime.csv", "runtime_before.csv"):
-        table = csv(name)
-        small = table.rule.eq("alignment") & table.wildcards.str.contains(
-            "figure|table|time|telesc"
-        )
-        own = table.rule.eq("alignment") & ~small
-        rule = table.rule.where(~own, "scene 3: " + table.wildcards.str.replace("_", " "))
-        grouped = table.assign(jobs=1).groupby(rule.where(~small, "scene 3: tables, figures"))
-        runs.append(grouped.agg({"jobs": "sum", "wall_s": "sum", "cpu_s": "sum", "peak_mb": "max"}))
-    both = runs[0].join(runs[1].add_suffix("_before"), how="outer")
-    both.loc["together"] = both.sum().where(~both.columns.str.startswith("peak"), both.max())
-    return both.rename_axis("rule").reset_index().sort_values("cpu_s", ascending=False)
+    """What the jobs of each rule took together; scene 3 job by job."""
+    table = csv("runtime.csv")
+    small = table.rule.eq("alignment") & table.wildcards.str.contains("figure|table|time|telesc")
+    own = table.rule.eq("alignment") & ~small
+    rule = table.rule.where(~own, "scene 3: " + table.wildcards.str.replace("_", " "))
+    grouped = table.assign(jobs=1).groupby(rule.where(~small, "scene 3: tables, figures"))
+    table = grouped.agg({"jobs": "sum", "wall_s": "sum", "cpu_s": "sum", "peak_mb": "max"})
+    table.loc["together"] = table.sum()
+    table.loc["together", "peak_mb"] = table.peak_mb[:-1].max()
+    return table.rename_axis("rule").reset_index().sort_values("cpu_s", ascending=False)
 
 
 def sweep(name):
@@ -203,20 +239,15 @@ def real_sky():
     return pd.DataFrame(rows)
 
 
-def _seeded():
-    """Errors of all methods by dataset, noise level and seed."""
-    names = ("dataset3", "dataset5")
-    return pd.concat(csv(f"tables/seeds_{name}.csv").assign(dataset=name) for name in names)
-
-
-def seeds():
+def seeds(dataset):
     """Mean over seeds, error of the stars and relative scatter of every method."""
-    cells = _seeded().groupby(["dataset", "method", "noise_level"], sort=False)
+    cells = csv(f"tables/seeds_{dataset}.csv").groupby(["method", "noise_level"], sort=False)
     means = {name: (name, "mean") for name in ("mse", "stderr")}
     table = cells.agg(**means, scatter=("mse", "std"))
     # Of a pair, both seeds count the other; a record of before does not count.
-    table["different"] = 0.5 * cells.different.sum(min_count=1)
-    table = table.assign(scatter=table.scatter / table.mse).reset_index()
+    counted = cells.different.sum(min_count=1) if "different" in cells.obj else np.nan
+    table["different"] = 0.5 * counted
+    table = table.assign(scatter=table.scatter / table.mse, dataset=dataset).reset_index()
     return table.assign(label=[method(m).label for m in table.method])
 
 
@@ -228,47 +259,12 @@ def costs():
     return table.assign(label=[method(m).label for m in table.method])
 
 
-def ordering():
-    """Pairs of methods that differ by 3 standard errors in the record, seed by seed."""
-    recorded = csv("tables/psf_metrics.csv").query(
-        "split == 'random' and reference == 'realisation' and metric == 'mse'"
-    )
-    rows = []
-    for (dataset, level), cell in _seeded().groupby(["dataset", "noise_level"]):
-        tried = cell.pivot_table("mse", "seed", "method")
-        known = recorded[(recorded.dataset == dataset) & (recorded.noise_level == level)]
-        known = known.set_index("method").loc[tried.columns].sort_values("value")
-        for (one, a), (other, b) in combinations(known.iterrows(), 2):
-            if b.value - a.value > 3 * np.hypot(a.stderr, b.stderr):
-                row = {"dataset": dataset, "noise_level": level, "seeds": len(tried)}
-                row |= {"better": method(one).label, "worse": method(other).label}
-                row |= {"ratio": b.value / a.value, "kept": (tried[one] < tried[other]).sum()}
-                rows.append(row)
-    return pd.DataFrame(rows)
-
-
 def errors(name="tables/psf_metrics.csv"):
     """MSE of every method by dataset, split, reference and noise level."""
     keys = ["dataset", "split", "reference", "noise_level"]
     table = csv(name).query("metric == 'mse'").pivot(index=keys, columns="method", values="value")
     table["best"] = table.idxmin(axis=1).map(lambda best: method(best).label)
     return table.reset_index().sort_values(keys, ascending=[True, False, True, True])
-
-
-def more_stars():
-    """Errors of methods on request beside those of the same methods on the paper's stars."""
-    rows = csv("tables/psf_efficiency_on_request.csv")
-    rows = rows.query("method == 'gmm_simulated' and bound == 'bayes' and tight == 'yes'")
-    over = (1.0 / rows.set_index(CELL).efficiency).rename("over")
-    table = errors("tables/psf_metrics_on_request.csv").drop(columns="best")
-    table = table.merge(errors().drop(columns="best"), on=[*CELL, "split"])
-    return table.join(over, CELL)
-
-
-def presets():
-    """MSE of the default preset beside that of the preset `paper`."""
-    literal = errors("paper/tables/psf_metrics.csv")
-    return errors().merge(literal, on=[*CELL, "split"], suffixes=("", "_paper"))
 
 
 def readings():

@@ -135,6 +135,19 @@ def test_a_million_stars_are_extrapolated():
     assert (last.exponent, last.exponent_stderr) == pytest.approx((1, 0), abs=1e-9)
 
 
+def test_both_pages_extrapolate_alike():
+    """A start-up of 0.15 s bends the law of powers: from it, a million stars took 56 s once."""
+    rows = [
+        {"stage": "predict", "what": "inference", "stars": n, "stamp_px": 16, "peak_mb": 9.0}
+        | {"disk_mb": 1e-3 * n, "time_s": 0.15 + 8.7e-5 * n, "cpu_s": 0.15 + 8.7e-5 * n}
+        for n in (1e3, 1e4, 1e5)
+    ]
+    few = speed.with_exponents(pd.DataFrame(rows), "stars").iloc[-1]
+    (many,) = speed.planned(rows)
+    assert few.time_s == pytest.approx(0.15 + 8.7e-5 * 1e6, rel=1e-3)
+    assert many["time_s"] / many["stars"] == pytest.approx(few.time_s / few.stars, rel=1e-2)
+
+
 def test_costs_of_the_plan_have_a_fixed_part_and_one_per_star_that_are_not_negative():
     rows = [
         {"stage": stage, "stars": n, "time_s": 3 + 2e-3 * n, "cpu_s": n**2, "peak_mb": 9 - n**0.1}
