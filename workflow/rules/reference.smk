@@ -36,7 +36,7 @@ rule reference:
                     f"tables/psf_{name}_on_request.csv"
                     for name in ("metrics", "efficiency")
                 ),
-                *(f"tables/seeds_{dataset}.csv" for dataset in SEEDED_DATASETS),
+                "tables/seed_scatter.csv",
                 "tables/real_sky.csv",
                 "tables/simulated_sky.csv",
                 "tables/simulated_sky_scatter.csv",
