@@ -76,6 +76,8 @@ $(VENV)/.complete: requirements.lock $(wildcard requirements/*.lock) pyproject.t
 reproduce: env ## Build everything of the preset: datasets, models, tables, report
 	@$(LOCKED) $(LONGEST_FIRST) -- $$TARGETS
 	@$(MAKE) --no-print-directory report
+	@[ "$$PSFDAE_RESULTS" != results ] || [ ! -d results/evaluation ] || \
+	  psfdae compare results results/reference || true
 
 benchmark: env ## Run time against error, on a quiet machine
 stability: env ## Stress tests of the whole chain

@@ -77,14 +77,15 @@ def _section(page, text, drifted):
         if (since := _since(figure, where=page)) and since not in below:
             sys.exit(f"{page}: {figure} is of an earlier record, and no table beside it says so")
     parts, end = [], 0
-    for mark, filling, since in new:
+    for mark, filled_in, since in new:
+        beside = ""
         if since and mark["line"]:
-            filling += f"\n*Recorded {since}, not with the run of record.*\n"
+            beside = f"\n*Recorded {since}, not with the run of record.*\n"
         elif since and since not in below:
-            filling += f" (recorded {since})"
-        if filling != mark["old"]:
+            beside = f" (recorded {since})"
+        if filled_in + beside != mark["old"]:
             drifted.append(f"{page}: {mark['name']}{mark['words']}")
-        parts += [text[end : mark.start("old")], filling, "<!-- end -->"]
+        parts += [text[end : mark.start("old")], filled_in, beside, "<!-- end -->"]
         end = mark.end()
     return "".join([*parts, text[end:]])
 
@@ -92,12 +93,10 @@ def _section(page, text, drifted):
 def _since(*names, where):
     """Date and commit of files of an earlier record; nothing of those of the record itself."""
     kept = json.loads(file("provenance.json")).get("kept", {})
-    found = {tuple(kept[n].values()) if n in kept else () for n in names if n != "provenance.json"}
+    found = {json.dumps(kept.get(name)): kept.get(name) for name in names}
     if len(found) > 1:
         sys.exit(f"{where}: {', '.join(names)} are of two commits, and joined")
-    return "".join(
-        f"{kept[n]['date']} at commit {kept[n]['commit']:.12}" for n in names[:1] if n in kept
-    )
+    return "".join(f"{of['date']} at commit {of['commit']:.12}" for of in found.values() if of)
 
 
 def _new(name, words, where, by, text, line, old):
@@ -134,7 +133,7 @@ def _table(name):
 
 def file(name):
     """A file of the run of record as it is."""
-    READ.add(name)
+    READ.update({name} - {"provenance.json"})
     return (REFERENCE / name).read_text(encoding="utf-8").strip()
 
 
