@@ -7,8 +7,8 @@ line of each row, below the head of the table that the page has; within a line (
 the columns of several rows are arrays. Without TEXT, the source itself is put in.
 
 What stays from an earlier record (`kept` in its provenance) gets its date and commit beside it:
-a line below a table, words behind a number whose section has no such table. Files of two commits
-are not joined.
+a line below a table; words behind the first number of a section that has no such table. Files of
+two commits are not joined.
 
 `python docs/tables.py` fills in all pages; `--check` names what has drifted.
 """
@@ -30,6 +30,7 @@ import pandas as pd
 from psfdae.alignment import methods as scene3
 from psfdae.configuration.compose import compose
 from psfdae.estimators import method
+from psfdae.evaluation.comparison import FITTED, SIGNIFICANT, seed_scatter, with_seed_stderr
 from psfdae.own_stars.bundle import SHIPPED
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -72,17 +73,18 @@ def _section(page, text, drifted):
     for mark in marks:
         READ.clear()
         new.append((mark, _new(**mark.groupdict()), _since(*sorted(READ), where=page)))
-    below = {since for mark, _, since in new if mark["line"]}
+    said = {since for mark, _, since in new if mark["line"]}
     for figure in re.findall(r"results/reference/([\w/.-]+\.png)\)", text):
-        if (since := _since(figure, where=page)) and since not in below:
+        if (since := _since(figure, where=page)) and since not in said:
             sys.exit(f"{page}: {figure} is of an earlier record, and no table beside it says so")
     parts, end = [], 0
     for mark, filled_in, since in new:
         beside = ""
         if since and mark["line"]:
             beside = f"\n*Recorded {since}, not with the run of record.*\n"
-        elif since and since not in below:
+        elif since and since not in said:
             beside = f" (recorded {since})"
+            said.add(since)
         if filled_in + beside != mark["old"]:
             drifted.append(f"{page}: {mark['name']}{mark['words']}")
         parts += [text[end : mark.start("old")], filled_in, beside, "<!-- end -->"]
@@ -238,32 +240,42 @@ def real_sky():
     return pd.DataFrame(rows)
 
 
-def seeds(dataset):
-    """Mean over seeds, error of the stars and relative scatter of every method."""
-    cells = csv(f"tables/seeds_{dataset}.csv").groupby(["method", "noise_level"], sort=False)
-    means = {name: (name, "mean") for name in ("mse", "stderr")}
-    table = cells.agg(**means, scatter=("mse", "std"))
-    # Of a pair, both seeds count the other; a record of before does not count.
-    counted = cells.different.sum(min_count=1) if "different" in cells.obj else np.nan
-    table["different"] = 0.5 * counted
-    table = table.assign(scatter=table.scatter / table.mse, dataset=dataset).reset_index()
-    return table.assign(label=[method(m).label for m in table.method])
+def seeds():
+    """Relative scatter of the MSE between seeds of every method, by dataset and reference."""
+    table = pd.Series(seed_scatter()).rename_axis(FITTED).unstack()
+    return table.reset_index().sort_values(["dataset", "reference"])
 
 
 def costs():
     """CPU time of each method's fit, and stars per second at its slowest noise level."""
-    cells = csv("tables/seeds_dataset3.csv").groupby(["method", "noise_level"], sort=False)
+    name = "tables/benchmark_methods.csv"
+    # A record of before has several seeds in a table of its own.
+    name = name if (REFERENCE / name).is_file() else "tables/seeds_dataset3.csv"
+    cells = csv(name).groupby(["method", "noise_level"], sort=False)
     cells = cells[["fit_cpu_s", "stars_per_s"]].mean().groupby("method", sort=False)
     table = cells.agg({"fit_cpu_s": "first", "stars_per_s": "min"}).reset_index()
     return table.assign(label=[method(m).label for m in table.method])
 
 
 def errors(name="tables/psf_metrics.csv"):
-    """MSE of every method by dataset, split, reference and noise level."""
+    """MSE of every method with its scatter between seeds (`…_sd`), and the best of a row."""
     keys = ["dataset", "split", "reference", "noise_level"]
-    table = csv(name).query("metric == 'mse'").pivot(index=keys, columns="method", values="value")
-    table["best"] = table.idxmin(axis=1).map(lambda best: method(best).label)
-    return table.reset_index().sort_values(keys, ascending=[True, False, True, True])
+    rows = with_seed_stderr(csv(name).query("metric == 'mse'"), seed_scatter())
+    mse, sd = (rows.pivot(index=keys, columns="method", values=v) for v in ("value", "seed_stderr"))
+    best = [_best(mse.loc[key], sd.loc[key]) for key in mse.index]
+    table = mse.assign(best=best).join(sd.add_suffix("_sd")).reset_index()
+    return table.sort_values(keys, ascending=[True, False, True, True])
+
+
+def _best(mse, sd):
+    """The method that errs least, or all that do so within the scatter between seeds."""
+    least = mse.idxmin()
+    allowed = SIGNIFICANT * np.hypot(sd, sd[least]).drop(least)
+    equal = [least, *mse.drop(least).index[mse.drop(least) - mse[least] <= allowed]]
+    names = ", ".join(method(name).label for name in equal)
+    if len(equal) > 1:
+        return f"equal within the scatter: {names}"
+    return names + ", scatter not measured" * bool(allowed.isna().any())
 
 
 def readings():
