@@ -213,11 +213,13 @@ def test_a_plan_of_something_else_is_no_record(results, history, tmp_path):
 
 TOY = """rule reference:
     input: "results/runtime.csv", "results/tables/a.csv"
-rule on_request:
-    input: "results/tables/psf_a_on_request.csv"
+rule psf_metrics_on_request:
+    output: "results/tables/psf_metrics_on_request.csv"
+    params: source=HASH
+    shell: "echo {params.source} > {output}"
 rule:
     output: "results/{name}"
-    wildcard_constraints: name=".*csv"
+    wildcard_constraints: name="(runtime|.*a).csv"
     params: source=HASH
     shell: "echo {params.source} > {output}"
 """
@@ -240,7 +242,7 @@ def test_make_reference_refuses_a_run_of_two_commits(history, tmp_path):
             assert done.returncode == 0, done.stderr
         return commit, captured(line, **options)
 
-    first, done = renewed("1", "reference", "on_request")
+    first, done = renewed("1", "reference", "psf_metrics_on_request")
     assert done.returncode == 0, done.stderr
     assert recorded(tmp_path / "results/reference")["commit"] == first
     _, done = renewed("2", "results/runtime.csv")
@@ -249,9 +251,7 @@ def test_make_reference_refuses_a_run_of_two_commits(history, tmp_path):
     assert done.returncode == 0, done.stderr
     found = recorded(tmp_path / "results/reference")
     assert found["commit"] == second
-    assert found["kept"] == {
-        "tables/psf_a_on_request.csv": {"commit": first, "date": found["date"]}
-    }
+    assert found["kept"] == {SLOW: {"commit": first, "date": found["date"]}}
 
 
 def test_targets_on_request_are_not_part_of_the_run(results):
@@ -260,6 +260,19 @@ def test_targets_on_request_are_not_part_of_the_run(results):
     described = record.provenance(results, load())
     assert described["on_request_s"] == {"stability": 100.0}
     assert described["wall_s"] < 20
+
+
+@pytest.mark.xfail(strict=True, reason="the table of HAT-P-32 waits for the next record")
+def test_record_is_of_commits_in_the_history():
+    found = recorded(REFERENCE)
+    commits = {found["commit"], *(of["commit"] for of in found["kept"].values())}
+    if (
+        source.git_commit() == "unknown"
+        or source.git("rev-parse", "--is-shallow-repository") == "true"
+    ):
+        pytest.skip("no history")
+    for commit in commits:
+        source.git("merge-base", "--is-ancestor", commit, "HEAD")
 
 
 def test_run_of_record_reaches_the_numbers_that_it_must():
