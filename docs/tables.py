@@ -17,7 +17,6 @@ import re
 import subprocess
 import sys
 from functools import cache
-from itertools import combinations
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -27,6 +26,7 @@ import pandas as pd
 from psfdae.alignment import methods as scene3
 from psfdae.configuration.compose import compose
 from psfdae.estimators import method
+from psfdae.evaluation.comparison import FITTED, SIGNIFICANT, seed_scatter, with_seed_stderr
 from psfdae.own_stars.bundle import SHIPPED
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -203,56 +203,42 @@ def real_sky():
     return pd.DataFrame(rows)
 
 
-def _seeded():
-    """Errors of all methods by dataset, noise level and seed."""
-    names = ("dataset3", "dataset5")
-    return pd.concat(csv(f"tables/seeds_{name}.csv").assign(dataset=name) for name in names)
-
-
 def seeds():
-    """Mean over seeds, error of the stars and relative scatter of every method."""
-    cells = _seeded().groupby(["dataset", "method", "noise_level"], sort=False)
-    means = {name: (name, "mean") for name in ("mse", "stderr")}
-    table = cells.agg(**means, scatter=("mse", "std"))
-    # Of a pair, both seeds count the other; a record of before does not count.
-    table["different"] = 0.5 * cells.different.sum(min_count=1)
-    table = table.assign(scatter=table.scatter / table.mse).reset_index()
-    return table.assign(label=[method(m).label for m in table.method])
+    """Relative scatter of the MSE between seeds of every method, by dataset and reference."""
+    table = pd.Series(seed_scatter()).rename_axis(FITTED).unstack()
+    return table.reset_index().sort_values(["dataset", "reference"])
 
 
 def costs():
     """CPU time of each method's fit, and stars per second at its slowest noise level."""
-    cells = csv("tables/seeds_dataset3.csv").groupby(["method", "noise_level"], sort=False)
+    name = "tables/benchmark_methods.csv"
+    # A record of before has several seeds in a table of its own.
+    name = name if (REFERENCE / name).is_file() else "tables/seeds_dataset3.csv"
+    cells = csv(name).groupby(["method", "noise_level"], sort=False)
     cells = cells[["fit_cpu_s", "stars_per_s"]].mean().groupby("method", sort=False)
     table = cells.agg({"fit_cpu_s": "first", "stars_per_s": "min"}).reset_index()
     return table.assign(label=[method(m).label for m in table.method])
 
 
-def ordering():
-    """Pairs of methods that differ by 3 standard errors in the record, seed by seed."""
-    recorded = csv("tables/psf_metrics.csv").query(
-        "split == 'random' and reference == 'realisation' and metric == 'mse'"
-    )
-    rows = []
-    for (dataset, level), cell in _seeded().groupby(["dataset", "noise_level"]):
-        tried = cell.pivot_table("mse", "seed", "method")
-        known = recorded[(recorded.dataset == dataset) & (recorded.noise_level == level)]
-        known = known.set_index("method").loc[tried.columns].sort_values("value")
-        for (one, a), (other, b) in combinations(known.iterrows(), 2):
-            if b.value - a.value > 3 * np.hypot(a.stderr, b.stderr):
-                row = {"dataset": dataset, "noise_level": level, "seeds": len(tried)}
-                row |= {"better": method(one).label, "worse": method(other).label}
-                row |= {"ratio": b.value / a.value, "kept": (tried[one] < tried[other]).sum()}
-                rows.append(row)
-    return pd.DataFrame(rows)
-
-
 def errors(name="tables/psf_metrics.csv"):
-    """MSE of every method by dataset, split, reference and noise level."""
+    """MSE of every method with its scatter between seeds (`…_sd`), and the best of a row."""
     keys = ["dataset", "split", "reference", "noise_level"]
-    table = csv(name).query("metric == 'mse'").pivot(index=keys, columns="method", values="value")
-    table["best"] = table.idxmin(axis=1).map(lambda best: method(best).label)
-    return table.reset_index().sort_values(keys, ascending=[True, False, True, True])
+    rows = with_seed_stderr(csv(name).query("metric == 'mse'"), seed_scatter())
+    mse, sd = (rows.pivot(index=keys, columns="method", values=v) for v in ("value", "seed_stderr"))
+    best = [_best(mse.loc[key], sd.loc[key]) for key in mse.index]
+    table = mse.assign(best=best).join(sd.add_suffix("_sd")).reset_index()
+    return table.sort_values(keys, ascending=[True, False, True, True])
+
+
+def _best(mse, sd):
+    """The method that errs least, or all that do so within the scatter between seeds."""
+    least = mse.idxmin()
+    allowed = SIGNIFICANT * np.hypot(sd, sd[least]).drop(least)
+    equal = [least, *mse.drop(least).index[mse.drop(least) - mse[least] <= allowed]]
+    names = ", ".join(method(name).label for name in equal)
+    if len(equal) > 1:
+        return f"equal within the scatter: {names}"
+    return names + ", scatter not measured" * bool(allowed.isna().any())
 
 
 def more_stars():

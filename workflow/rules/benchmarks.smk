@@ -323,7 +323,7 @@ for _method in registered():
         output:
             f"{SEEDS}/{_method.name}.csv",
         log:
-            f"{RESULTS}/logs/seeds/{{dataset}}/{_method.name}.log",
+            f"{RESULTS}/logs/seeds/{{dataset}}-{_method.name}.log",
         benchmark:
             f"{RESULTS}/benchmarks_on_request/seeds/{{dataset}}-{_method.name}.tsv"
         # What takes longest is started first.
