@@ -9,13 +9,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
+import trainings
 from command_line import psfdae, refused
 from psfdae.evaluation import comparison
 from psfdae.evaluation.comparison import (
     compare_errors,
     config_differences,
     held_out_ratios,
-    scatter_between_seeds,
     seed_scatter,
     training_summary,
 )
@@ -115,7 +115,7 @@ def test_scatter_is_pooled_over_noise_levels():
         for level, found in factors.items()
         for seed, factor in enumerate(found)
     ]
-    (row,) = scatter_between_seeds(pd.DataFrame(rows)).to_dict("records")
+    (row,) = trainings.pooled(pd.DataFrame(rows)).to_dict("records")
     assert row == pytest.approx(key | {"seeds": 3, "scatter": np.sqrt((0.03**2 + 0.04**2) / 2)})
 
 
