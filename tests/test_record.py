@@ -118,7 +118,7 @@ def test_cpu_time_of_a_short_job_is_that_of_all_its_processes(tmp_path):
 @pytest.mark.workflow
 def test_every_job_of_a_run_has_its_cpu_time(smoke):
     jobs = pd.read_csv(smoke / "results/runtime.csv")
-    assert len(jobs) > 80
+    assert len(jobs) >= 80
     assert (jobs.cpu_s > 0.1).all()
     assert (jobs.cpu_s < 2.2 * jobs.wall_s + 0.5).all()
 

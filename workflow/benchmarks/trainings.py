@@ -381,9 +381,17 @@ def scatter(
     """Pool ERRORS, tables of the command seeds, over the noise levels."""
     import pandas as pd
 
-    from psfdae.evaluation.comparison import scatter_between_seeds
+    write_csv(out, pooled(pd.concat(map(read_table, errors))), 3)
 
-    write_csv(out, scatter_between_seeds(pd.concat(map(read_table, errors))), 3)
+
+def pooled(errors):
+    """Root mean square over λ of the standard deviation over the seeds divided by their mean."""
+    from psfdae.evaluation.comparison import FITTED
+
+    cells = errors.groupby([*FITTED, "noise_level"], sort=False)
+    relative = (cells.mse.std() / cells.mse.mean()).groupby(FITTED, sort=False)
+    table = cells.seed.nunique().groupby(FITTED, sort=False).min().rename("seeds").to_frame()
+    return table.assign(scatter=relative.agg(lambda s: np.sqrt((s**2).mean()))).reset_index()
 
 
 if __name__ == "__main__":

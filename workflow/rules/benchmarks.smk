@@ -323,7 +323,7 @@ for _method in registered():
         output:
             f"{SEEDS}/{_method.name}.csv",
         log:
-            f"{RESULTS}/logs/seeds/{{dataset}}/{_method.name}.log",
+            f"{RESULTS}/logs/seeds/{{dataset}}-{_method.name}.log",
         benchmark:
             f"{RESULTS}/benchmarks_on_request/seeds/{{dataset}}-{_method.name}.tsv"
         # What takes longest is started first.
@@ -336,12 +336,12 @@ for _method in registered():
             config=lambda w, m=_method: settings(
                 "trainings.seeds", f"dataset={w.dataset}", name=m.name
             ),
-            source=program_code(
-                "trainings.seeds", [f"psfdae.estimators.{_method.name}"]
+            source=lambda w, m=_method: program_code(
+                "trainings.seeds", [f"psfdae.estimators.{m.name}"]
             ),
             program=program("trainings.seeds"),
             method=_method.name,
-            results=RESULTS,
+            results=lambda w: RESULTS,
             references=lambda w: [
                 f"--reference={r}"
                 for r in dataset_config(w.dataset).dataset.references

@@ -50,26 +50,6 @@ def seed_scatter() -> Scatter:
         return dict(pd.read_csv(file, index_col=FITTED)["scatter"])
 
 
-def scatter_between_seeds(errors: pd.DataFrame) -> pd.DataFrame:
-    """Relative scatter of the MSE between fits that differ by nothing but their seed.
-
-    Parameters
-    ----------
-    errors : DataFrame
-        dataset, reference, method, seed, noise_level, mse (mean over the same noisy stars).
-
-    Returns
-    -------
-    DataFrame
-        dataset, reference, method, seeds, and scatter: the root mean square over the noise
-        levels of the sample standard deviation over the seeds divided by their mean.
-    """
-    cells = errors.groupby([*FITTED, "noise_level"], sort=False)
-    relative = (cells.mse.std() / cells.mse.mean()).groupby(FITTED, sort=False)
-    table = cells.seed.nunique().groupby(FITTED, sort=False).min().rename("seeds").to_frame()
-    return table.assign(scatter=relative.agg(lambda s: np.sqrt((s**2).mean()))).reset_index()
-
-
 def config_differences(
     first: Mapping[str, str], second: Mapping[str, str]
 ) -> list[tuple[str, str, str]]:

@@ -193,20 +193,21 @@ def describe_tables(first: Path, second: Path) -> str:
     names = " < ".join(method(name).paper[1] for name in PAPER_ORDER)  # type: ignore[index]
     said = {
         "equal": "are equal to the last digit",
-        "within": f"differ by at most {SIGNIFICANT:g} standard deviations of the difference that "
-        "two seeds make",
+        "within": f"differ within the scatter between seeds ({SIGNIFICANT:g} standard deviations "
+        "of the difference of two fits)",
         "beyond": "differ by more",
-        "not measured": "differ, and what seeds change there was not measured",
+        "not measured": "differ, but their scatter between seeds was not measured",
     }
     lines = [f"# {first} (A) and {second} (B)", ""]
     lines += [f"{len(rows)} mean errors are in both (A has {len(both[0])}, B {len(both[1])})."]
     for verdict, text in said.items():
         found = rows[rows.verdict == verdict]
-        lines += [f"- {len(found)} {text}"] * bool(len(found) or verdict == "beyond")
+        lines += [f"- {len(found)} {text}"]
         lines += [f"  - {name}" for name in _named(found)] * (verdict in ("beyond", "not measured"))
     lines += [
-        f"- {names} by MSE in {order['first'].sum()} of {len(order)} columns of A and "
-        f"{order['second'].sum()} of B; two of them are exchanged in {order.exchanged.sum()}"
+        f"- The paper's order by MSE, {names}, holds in {order['first'].sum()} of {len(order)} "
+        f"columns of A and in {order['second'].sum()} of B; {order.exchanged.sum()} have two of "
+        "them exchanged, beyond the scatter"
     ]
     lines += [f"  - {_cell(key)}" for key in order.index[order.exchanged]]
     return "\n".join(lines)
@@ -216,16 +217,17 @@ def _named(rows: pd.DataFrame) -> list[str]:
     """Rows of a table of errors by dataset, split and reference, in words."""
     lines = []
     for key, cell in rows.groupby(["dataset", "split", "reference"], sort=False):
-        found = []
+        metrics: dict[str, list[str]] = {}
         for (name, metric), part in cell.groupby(["method", "metric"], sort=False):
             levels = ", ".join(f"{level:g}" for level in part.noise_level)
-            found.append(f"{name} {metric} at λ = {levels}")
+            metrics.setdefault(f"{name} at λ = {levels}", []).append(metric)
+        found = (f"{name} ({', '.join(of)})" for name, of in metrics.items())
         lines.append(f"{_cell(key)}: {'; '.join(found)}")
     return lines
 
 
 def _cell(key: Sequence[Any]) -> str:
-    """Column of a table of errors, in words."""
+    """Dataset, split, reference and, if given, noise level in words."""
     return ", ".join([*key[:3], *(f"λ = {level:g}" for level in key[3:])])
 
 
