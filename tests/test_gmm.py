@@ -208,6 +208,22 @@ def test_validation_stars_choose():
     assert len(other.count) == 12 and other.count.sum() == 350
 
 
+@pytest.mark.parametrize("kind", [GaussianMixture, Placed])
+def test_another_seed_keeps_what_the_search_has_chosen(kind):
+    data = training()
+    if kind is Placed:  # stars stand anywhere: the search leaves the position aside
+        data = replace(data, positions=np.random.default_rng(3).normal(size=(400, 2)))
+    settings = Gmm(**{**ONE, "components": [1, 3], "shrinkage": [20.0, 5.0]})
+    found = kind.fit(data, settings)
+    same, other = (found.again(replace(data, seed=seed), settings) for seed in (data.seed, 5))
+    for name in kind.arrays:
+        np.testing.assert_array_equal(getattr(same, name), getattr(found, name))
+    assert len(other.count) == len(found.count) == 3
+    assert other.shrinkage == found.shrinkage
+    assert other.whitening.any() == found.whitening.any()
+    assert not np.array_equal(other.mean, found.mean)
+
+
 @pytest.mark.parametrize("free", [False, True])
 def test_strangeness_of_one_cluster_is_the_square_of_mahalanobis_distance(free, monkeypatch):
     monkeypatch.setattr(module, "FLAT", 0.0)

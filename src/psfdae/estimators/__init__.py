@@ -402,6 +402,10 @@ class Method:
         own = [Path(place, name) for name in cls.files] or [Path(place)]
         return own + [cls.beside(place, name) for name in (TRAINED_ON, *cls.diagnostics)]
 
+    def again(self, data: TrainingSet, **settings: Any) -> Self:
+        """A fit to `data` with its seed; settings that this fit has searched for are kept."""
+        return type(self).fit(data, **settings)  # type: ignore[no-any-return]
+
     def save(self, place: Path, described: Mapping[str, Any]) -> None:
         """Write the fit with its resolved configuration."""
         columns = {name: Column(getattr(self, name), *said) for name, said in self.arrays.items()}

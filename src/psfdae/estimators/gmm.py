@@ -265,6 +265,12 @@ class GaussianMixture(Method):
         final = cls._clustered(data, data.train[: gmm.stars], clusters, gmm, told)
         return replace(final, shrinkage=np.array([shrinkage]))
 
+    def again(self, data: TrainingSet, gmm: Gmm) -> Self:
+        """As of all methods: K, ν and the use of the position are kept."""
+        told = bool(self.whitening.any())
+        one = self._clustered(data, data.train[: gmm.stars], len(self.count), gmm, told)
+        return replace(one, shrinkage=self.shrinkage)
+
     @classmethod
     def _chosen(
         cls, data: TrainingSet, learn: np.ndarray, judge: np.ndarray, sizes: list[int], gmm: Gmm

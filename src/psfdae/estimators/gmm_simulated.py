@@ -36,3 +36,7 @@ class SimulatedMixture(GaussianMixture):
     def fit(cls, data: TrainingSet, simulated: Simulated) -> Self:
         """As any mixture; raises FitError without fresh stars, too."""
         return super().fit(data.on_fresh_stars(), simulated)
+
+    def again(self, data: TrainingSet, simulated: Simulated) -> Self:
+        """As any mixture, of fresh stars."""
+        return super().again(data.on_fresh_stars(), simulated)
