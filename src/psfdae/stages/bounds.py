@@ -21,7 +21,6 @@ from psfdae.bounds.floor import (
 )
 from psfdae.bounds.posterior import (
     MIRROR_MARGIN,
-    TIGHT,
     Bank,
     Likelihood,
     PosteriorSums,
@@ -33,7 +32,8 @@ from psfdae.bounds.posterior import (
     posterior_sums,
     segments,
 )
-from psfdae.bounds.sampling import Sampled, StampModel, sample
+from psfdae.bounds.sampling import TRUTH, Modes, Sampled, StampModel, sample
+from psfdae.bounds.tight import FEW, Evidence, calibration
 from psfdae.cli import File, command
 from psfdae.configuration.consistency import SIMULATION
 from psfdae.configuration.schema import Config
@@ -70,11 +70,13 @@ SPLIT = "random"
 """The split that is bounded: its test stars lie in all fields."""
 
 COLUMNS = ["dataset", "split", "reference", "method", "noise_level", "metric", "value"]
-COLUMNS += ["stderr", "n", "ci_low", "ci_high", "tight"]
-COLUMNS += ["found", "draws", "ess_median", "last_change", "missed"]
+COLUMNS += ["stderr", "n", "ci_low", "ci_high", "median", "variance", "calibration"]
+COLUMNS += ["missing", "missing_stars", "tight", "found", "draws"]
+COLUMNS += ["ess_median", "ess_low", "last_change", "undetected"]
 
 EFFICIENCY_COLUMNS = ["dataset", "reference", "noise_level", "method", "bound", "tight", "mse"]
-EFFICIENCY_COLUMNS += ["mse_bound", "efficiency", "difference", "stderr", "n", "verdict"]
+EFFICIENCY_COLUMNS += ["mse_bound", "efficiency", "difference", "stderr", "n", "median"]
+EFFICIENCY_COLUMNS += ["median_bound", "variance_bound", "verdict"]
 
 PAPER_COLUMNS = ["dataset", "method", "noise_level", "mse_paper", "mse", "mse_bound", "stderr"]
 PAPER_COLUMNS += ["tight", "paper_over_bound", "verdict"]
@@ -205,27 +207,46 @@ class Tables:
     ) -> None:
         """Per-star metrics of one bound and noise level.
 
-        `found` says from what. Of the effective sample sizes `ess` the table has the median;
-        `reached` are its columns `draws`, `last_change` and `missed`.
+        `found` says from what. Stars without an estimate, whose `mse` is NaN, are named and left
+        out of every mean. Of the posterior variances `variance` the table has the mean;
+        `reached` are other columns.
         """
         import pandas as pd
 
-        if "ess" in values:
-            reached["ess_median"] = float(np.median(values["ess"]))
-
         key = {"dataset": self.dataset, "split": SPLIT, "reference": reference, "method": method}
         key["noise_level"] = level
-        for metric, value in values.items():
-            if metric == "ess":
-                continue
-            mean, stderr = clustered_mean(value, self.stars.field)
+        known = np.isfinite(values["mse"])
+        field = self.stars.field[known]
+        common: dict[str, Any] = {"n": field.size, "missing": int((~known).sum()), **reached}
+        common["missing_stars"] = " ".join(map(str, self.stars.star[~known]))
+        common |= {"tight": "yes" if tight else "no", "found": found}
+        for metric in [name for name in ("mse", "p_right") if name in values]:
+            value = values[metric][known]
+            mean, stderr = clustered_mean(value, field) if value.size else (np.nan, np.nan)
             half = NORMAL_95 * stderr
-            row = {"metric": metric, "value": mean, "stderr": stderr, "n": value.size}
+            row = {"metric": metric, "value": mean, "stderr": stderr}
             row |= {"ci_low": mean - half, "ci_high": mean + half}
-            row |= {"tight": "yes" if tight else "no", "found": found}
-            self.summary.append({**key, **row, **reached})
+            if value.size:
+                row["median"] = float(np.median(value))
+            if metric == "mse" and "variance" in values and value.size:
+                row["variance"] = values["variance"][known].mean()
+            self.summary.append({**key, **row, **common})
         stars = {"star": self.stars.star, "field": self.stars.field}
         self.per_star.append(pd.DataFrame({**key, **stars, **values}))
+
+    def add_mean(
+        self,
+        reference: str,
+        method: str,
+        level: float,
+        values: dict[str, np.ndarray],
+        evidence: Evidence,
+        found: str,
+        draws: int,
+    ) -> None:
+        """The same of a posterior mean over `draws` samples, tight or not by its evidence."""
+        reached = {"draws": draws, "ess_median": float(np.median(values["ess"])), **vars(evidence)}
+        self.add(reference, method, level, values, evidence.tight, found, **reached)
 
 
 @command("bounds", reads=(*SIMULATION, "noise", "parts", "bounds"))
@@ -267,7 +288,9 @@ def bounds(
                 f"{bank}: bounds.bank_stars = {count}, must be at least {fields}, "
                 "a star for every field"
             )
-        _over_bank(config, everything.take(np.arange(count)), everything, drawn, static, tables)
+        _over_bank(
+            config, everything.take(np.arange(count)), everything, drawn, product, static, tables
+        )
     write_csv(out, pd.DataFrame(tables.summary, columns=COLUMNS))
     write_csv(growth, pd.DataFrame(tables.growth, columns=GROWTH_COLUMNS))
     write_parquet(per_star, pd.concat(tables.per_star, ignore_index=True))
@@ -323,13 +346,14 @@ def _over_bank(
     bank: Bank,
     larger: Bank,
     drawn: Product,
+    product: Product,
     static: np.ndarray,
     tables: Tables,
 ) -> None:
     """Posterior means over a bank, how they change with its size, and better ones.
 
     In a single field the larger bank is needed, and in a moment weighed. Where a bank is too
-    thin, draws around the star's own matches take its place.
+    thin, importance samples around the star's own matches take its place.
     """
     for level in config.noise.levels:
         start = time.monotonic()
@@ -340,28 +364,30 @@ def _over_bank(
             sizes = measured(stars, static, tables.stars, level, likelihood)
             thin[method] = _tabulate(tables, method, level, sizes)
         if any(thin.values()):
-            found = _draws(config, bank, drawn["seidel"], tables.stars, level, likelihood)
+            found = _samples(
+                *(config, bank, drawn["seidel"], product, tables.stars, level, likelihood)
+            )
             _replace(tables, level, found, config.bounds.star_draws, static, thin)
         seconds = time.monotonic() - start
         means = ", ".join(f"{m} {'/'.join(t) or 'bank'}" for m, t in thin.items())
-        print(f"λ = {level:g}, drawn around matches: {means}, {seconds:.1f} s", flush=True)
+        print(f"λ = {level:g}, importance samples: {means}, {seconds:.1f} s", flush=True)
 
 
 def _tabulate(tables: Tables, method: str, level: float, sizes: dict[int, np.ndarray]) -> list[str]:
-    """Rows of one posterior mean over a bank, whose `_errors` are given by number of draws.
+    """Rows of one posterior mean over a bank, whose `_measures` are given by number of draws.
 
     References for which the bank is too thin are returned, and have rows in `growth` alone.
     """
     draws, last = np.array(list(sizes)), sizes[max(sizes)]
     thin = []
     for i, reference in enumerate(tables.stars.truth):
-        errors = np.array([values[i].mean() for values in sizes.values()])
+        errors = _by_size(sizes, i)
         change = last_change(errors)
         limit, exponent, residual = extrapolate(draws, errors)
-        if change <= TIGHT:
-            reached = {"draws": max(sizes), "last_change": change}
-            values = {"mse": last[i], "ess": last[-1]}
-            tables.add(reference, method, level, values, tight=True, found="bank", **reached)
+        values = _of_reference(last, i)
+        evidence = Evidence.of(**values, field=tables.stars.field, last_change=change)
+        if evidence.tight:
+            tables.add_mean(reference, method, level, values, evidence, "bank", max(sizes))
         else:
             # Far from convergence the fit extrapolates to anything, down to zero.
             thin.append(reference)
@@ -374,27 +400,28 @@ def _tabulate(tables: Tables, method: str, level: float, sizes: dict[int, np.nda
                 "noise_level": level,
                 "draws": count,
                 "mse": error,
-                "ess_mean": values[-1].mean(),
-                "ess_median": np.median(values[-1]),
+                "ess_mean": sampled[-1].mean(),
+                "ess_median": np.median(sampled[-1]),
                 "last_change": change,
                 "limit": limit,
                 "exponent": exponent,
                 "fit_rms": residual,
             }
-            for count, error, values in zip(draws, errors, sizes.values(), strict=True)
+            for count, error, sampled in zip(draws, errors, sizes.values(), strict=True)
         ]
     return thin
 
 
-def _draws(
+def _samples(
     config: Config,
     bank: Bank,
     seidel: np.ndarray,
+    product: Product,
     stars: BoundedStars,
     level: float,
     likelihood: Likelihood,
 ) -> Sampled:
-    """Draws around the best matches of every star; each star has a random stream of its own."""
+    """Importance samples around the best matches of every star, from a stream of its own."""
     mean = np.array(config.wavefront.coefficients)
     spread = config.stars.aberration_fraction * np.abs(mean)
     field = relative_field(config.grid)
@@ -402,7 +429,15 @@ def _draws(
     names = ("bounds", config.stars.name, f"{level:.6g}")
     rngs = [stream(config.seed, *names, int(star)) for star in stars.star]
     noisy, draws = stars.noisy[level], config.bounds.star_draws
-    return sample(bank, seidel, noisy, stars.field, likelihood, model, draws, rngs)
+    count = stars.star.size
+    truth = Modes.at(
+        np.arange(count),
+        stars.field,
+        product["peak"][stars.star] - product["jitter"][stars.star],
+        np.full(count, TRUTH),
+        model.standardised(product["seidel"][stars.star]),
+    )
+    return sample(bank, seidel, noisy, truth, likelihood, model, draws, rngs)
 
 
 def _replace(
@@ -413,28 +448,31 @@ def _replace(
     static: np.ndarray,
     thin: dict[str, list[str]],
 ) -> None:
-    """Rows of the posterior means over draws, for the references `thin` of every method."""
+    """Rows of the posterior means over samples, for the references `thin` of every method."""
     stars = tables.stars
-    helped = _errors(found.helped, static, stars)
-    for method, parts in zip(POSTERIOR_MEANS, (found.free, found.told), strict=True):
-        sizes = nested_means(parts, partial(_errors, static=static, stars=stars))
-        last = sizes[max(sizes)]
+    sampled = ((found.free, found.free_helped), (found.told, found.told_helped))
+    for method, (parts, whole) in zip(POSTERIOR_MEANS, sampled, strict=True):
+        sizes = nested_means(parts, partial(_measures, static=static, stars=stars))
+        last, helped = sizes[max(sizes)], _measures(whole, static, stars)
         for i, reference in enumerate(stars.truth):
             if reference not in thin[method]:
                 continue
-            change = last_change([values[i].mean() for values in sizes.values()])
-            # Who is told the field cannot have missed it.
-            missed = 0.0 if POSTERIOR_MEANS[method] else 1.0 - helped[i].mean() / last[i].mean()
-            values = {"mse": last[i], "ess": last[-1]}
-            reached = {"draws": draws, "last_change": change, "missed": missed}
-            tight = max(change, missed) <= TIGHT
-            tables.add(reference, method, level, values, tight, found="draws", **reached)
+            values = _of_reference(last, i)
+            # Who is given the field cannot miss it, but a mode in it.
+            without, complete = _by_size({0: last, 1: helped}, i)
+            evidence = Evidence.of(
+                **values,
+                field=stars.field,
+                last_change=last_change(_by_size(sizes, i)),
+                undetected=1.0 - complete / without,
+            )
+            tables.add_mean(reference, method, level, values, evidence, "samples", draws)
 
 
 def _anywhere(
     bank: Bank, static: np.ndarray, stars: BoundedStars, level: float, likelihood: Likelihood
 ) -> dict[int, np.ndarray]:
-    """`_errors` of the posterior mean over all fields, by number of draws.
+    """`_measures` of the posterior mean over all fields, by number of draws.
 
     A bank that is hopelessly thin for its noise level is left after a quarter.
     """
@@ -446,7 +484,7 @@ def _anywhere(
     if np.median(sizes[quarter]) >= HOPELESS_ESS:
         parts += [posterior_sums(bank.take(cut), noisy, likelihood) for cut in cuts[quarter:]]
     draws = sum(cut.size for cut in cuts[: len(parts)])
-    means = nested_means(parts, partial(_errors, static=static, stars=stars))
+    means = nested_means(parts, partial(_measures, static=static, stars=stars))
     return {round(draws / len(parts) * size): values for size, values in means.items()}
 
 
@@ -468,19 +506,35 @@ def _told_the_field(
             posterior_sums, noisy=few.noisy[level], likelihood=likelihood, told=few.field
         )
         parts = [weigh(bank.take(cut)) for cut in np.array_split(draws, pieces)]
-        measure = partial(_errors, static=static, stars=few)
+        measure = partial(_measures, static=static, stars=few)
         for size, values in nested_means(parts, measure).items():
             total = means.setdefault(size, np.empty((len(values), stars.field.size)))
             total[:, group] = values
     return {round(len(bank) / pieces * size): values for size, values in means.items()}
 
 
-def _errors(sums: PosteriorSums, static: np.ndarray, stars: BoundedStars) -> np.ndarray:
-    """MSE against realisation and template, and effective sample size, shape (3, n)."""
+def _measures(sums: PosteriorSums, static: np.ndarray, stars: BoundedStars) -> np.ndarray:
+    """MSE and posterior variance by reference, and effective sample size, shape (2, 2, n)+(n,).
+
+    Rows: errors against realisation and template, variances of both, size; shape (5, n).
+    """
     shape = stars.truth["realisation"].shape
-    means = {"realisation": sums.mean_image, "template": sums.mean_template(static)}
+    template, spread = sums.template(static)
+    means = {"realisation": sums.mean_image, "template": template}
     errors = [mse(means[name].reshape(shape), truth) for name, truth in stars.truth.items()]
-    return np.stack([*errors, sums.effective_size])
+    return np.stack([*errors, sums.variance_image, spread, sums.effective_size])
+
+
+def _of_reference(measures: np.ndarray, number: int) -> dict[str, np.ndarray]:
+    """What `_measures` has of one reference."""
+    return {"mse": measures[number], "variance": measures[2 + number], "ess": measures[-1]}
+
+
+def _by_size(sizes: dict[int, np.ndarray], number: int) -> np.ndarray:
+    """Mean error of one reference by size, over the stars with an estimate at all sizes."""
+    errors = np.array([measures[number] for measures in sizes.values()])
+    known = np.isfinite(errors).all(axis=0)
+    return errors[:, known].mean(axis=1) if known.any() else np.full(len(errors), np.nan)
 
 
 def _exact(config: Config, static: np.ndarray, tables: Tables) -> None:
@@ -490,14 +544,17 @@ def _exact(config: Config, static: np.ndarray, tables: Tables) -> None:
         likelihood = Likelihood.of(noise_model(config), level, static[:, static.shape[1] // 2])
         for method, told in POSTERIOR_MEANS.items():
             known = stars.field if told else None
-            mean, probability = exact_posterior(stars.noisy[level], static, likelihood, known)
+            mean, variance, probability = exact_posterior(
+                stars.noisy[level], static, likelihood, known
+            )
             error = mse(mean, stars.truth["realisation"])
             if error.mean() < NEGLIGIBLE_MSE:
-                error = np.zeros_like(error)
-            values = {"mse": error}
+                error, variance = np.zeros_like(error), np.zeros_like(error)
+            values = {"mse": error, "variance": variance}
             if not told:
                 values["p_right"] = probability[np.arange(stars.field.size), stars.field]
-            tables.add("realisation", method, level, values, tight=True, found="sum")
+            score = calibration(error, variance, stars.field)
+            tables.add("realisation", method, level, values, True, "sum", calibration=score)
 
 
 @command("efficiency")
@@ -517,7 +574,8 @@ def efficiency(
     floor and where the posterior mean is tight; the verdict is `beaten` if a method's error
     is below such a bound by more than two standard errors of the difference and 5 % of the
     bound (of the floor, which is no lower limit, 20 %), otherwise `ok`. Both are empty where a
-    posterior mean is not tight.
+    posterior mean is not tight. Stars without a posterior mean are left out on both sides; both
+    are empty, too, where these are more than 1 %.
     """
     import pandas as pd
 
@@ -567,11 +625,15 @@ def _column(
                     f"{place}: star {star} of {method} lies in field {field}, "
                     f"but that of the bounds in {bounded_in}"
                 )
+            estimated = paired.mse_bound.notna()
+            if method in POSTERIOR_MEANS:
+                estimated &= paired.mse.notna()
+            judged = (bound == "floor" or sharp) and (~estimated).mean() <= FEW
+            paired = paired[estimated]
             found = compare(
                 *(paired[column].to_numpy() for column in ("mse", "mse_bound", "field")),
                 FLOOR_TOLERANCE if bound == "floor" else TOLERANCE,
             )
-            judged = bound == "floor" or sharp
             yield {
                 **key,
                 "method": method,
@@ -583,6 +645,9 @@ def _column(
                 "difference": found.difference,
                 "stderr": found.stderr,
                 "n": len(paired),
+                "median": paired.mse.median(),
+                "median_bound": paired.mse_bound.median(),
+                "variance_bound": paired.variance.mean(),
                 "verdict": ("beaten" if found.beaten else "ok") if judged else None,
             }
 
