@@ -36,32 +36,31 @@ class Evidence:
     last_change : float
         Relative change of the error by the last fourfold growth of the samples.
     undetected : float
-        Relative change of the error if modes are added that only the truth leads to; NaN
-        where no modes are sought.
+        Part of the error that vanishes if modes are added that only the truth leads to.
     """
 
     ess_low: float
     calibration: float
     last_change: float
-    undetected: float = float("nan")
+    undetected: float
 
     @classmethod
     def of(
         cls,
-        error: np.ndarray,
+        mse: np.ndarray,
         variance: np.ndarray,
         ess: np.ndarray,
         field: np.ndarray,
         last_change: float,
-        undetected: float = float("nan"),
+        undetected: float,
     ) -> Evidence:
         """Evidence from squared errors, posterior variances, sizes and fields of stars (n,).
 
-        Stars without an estimate have an error of NaN.
+        Stars without an estimate have an `mse` of NaN.
         """
-        known = np.isfinite(error)
+        known = np.isfinite(mse)
         low = float(np.quantile(np.where(known, ess, 0.0), FEW, method="lower"))
-        deviation = calibration(error[known], variance[known], field[known])
+        deviation = calibration(mse[known], variance[known], field[known])
         return cls(low, deviation, last_change, undetected)
 
     @property
@@ -71,7 +70,7 @@ class Evidence:
             self.ess_low >= LEAST_ESS
             and abs(self.calibration) <= STANDARD_ERRORS
             and self.last_change <= CHANGE
-            and not abs(self.undetected) > UNDETECTED
+            and abs(self.undetected) <= UNDETECTED
         )
 
 

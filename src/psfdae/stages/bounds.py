@@ -71,7 +71,7 @@ SPLIT = "random"
 
 COLUMNS = ["dataset", "split", "reference", "method", "noise_level", "metric", "value"]
 COLUMNS += ["stderr", "n", "ci_low", "ci_high", "median", "variance", "calibration"]
-COLUMNS += ["missing", "missing_stars", "tight", "found", "draws"]
+COLUMNS += ["missing", "missing_stars", "tight", "found", "draws", "sampled"]
 COLUMNS += ["ess_median", "ess_low", "last_change", "undetected"]
 
 EFFICIENCY_COLUMNS = ["dataset", "reference", "noise_level", "method", "bound", "tight", "mse"]
@@ -92,6 +92,12 @@ GROWTH_COLUMNS += ["ess_median", "last_change", "limit", "exponent", "fit_rms"]
 
 HOPELESS_ESS = 2.0
 """A quarter of the bank with a smaller median effective sample size is not extended."""
+
+ENOUGH_ESS = 50.0
+"""Effective sample size below which a star gets importance samples of its own.
+
+The error of a mean over so many is 2 % above that of the exact mean.
+"""
 
 NEGLIGIBLE_MSE = 1e-9
 """Errors below this are written as 0 where only a few images are possible.
@@ -235,18 +241,15 @@ class Tables:
         self.per_star.append(pd.DataFrame({**key, **stars, **values}))
 
     def add_mean(
-        self,
-        reference: str,
-        method: str,
-        level: float,
-        values: dict[str, np.ndarray],
-        evidence: Evidence,
-        found: str,
-        draws: int,
+        self, method: str, level: float, estimates: Estimates, found: str, **reached: float
     ) -> None:
-        """The same of a posterior mean over `draws` samples, tight or not by its evidence."""
-        reached = {"draws": draws, "ess_median": float(np.median(values["ess"])), **vars(evidence)}
-        self.add(reference, method, level, values, evidence.tight, found, **reached)
+        """The same of a posterior mean over samples for all references, tight by its evidence."""
+        reached["ess_median"] = float(np.median(estimates.ess))
+        for number, reference in enumerate(self.stars.truth):
+            values = estimates.values(number)
+            evidence = estimates.evidence(number, self.stars.field)
+            found_by = {**reached, **vars(evidence)}
+            self.add(reference, method, level, values, evidence.tight, found, **found_by)
 
 
 @command("bounds", reads=(*SIMULATION, "noise", "parts", "bounds"))
@@ -352,45 +355,115 @@ def _over_bank(
 ) -> None:
     """Posterior means over a bank, how they change with its size, and better ones.
 
-    In a single field the larger bank is needed, and in a moment weighed. Where a bank is too
-    thin, importance samples around the star's own matches take its place.
+    In a single field the larger bank is needed, and in a moment weighed. Stars for which a bank
+    is too thin get importance samples around their own matches.
     """
+    stars = tables.stars
     for level in config.noise.levels:
         start = time.monotonic()
         likelihood = Likelihood.of(noise_model(config), level, bank.stamps((bank.margin,) * 2))
-        thin = {}
+        over_banks, thin = {}, np.zeros(stars.star.size, bool)
         for method, told in POSTERIOR_MEANS.items():
-            measured, stars = (_told_the_field, larger) if told else (_anywhere, bank)
-            sizes = measured(stars, static, tables.stars, level, likelihood)
-            thin[method] = _tabulate(tables, method, level, sizes)
-        if any(thin.values()):
-            found = _samples(
-                *(config, bank, drawn["seidel"], product, tables.stars, level, likelihood)
-            )
-            _replace(tables, level, found, config.bounds.star_draws, static, thin)
+            measured, draws = (_told_the_field, larger) if told else (_anywhere, bank)
+            sizes = measured(draws, static, stars, level, likelihood)
+            _grown(tables, method, level, sizes)
+            over_banks[method] = max(sizes), Estimates.over_bank(sizes)
+            thin |= over_banks[method][1].ess < ENOUGH_ESS
+        few, sampled = np.flatnonzero(thin), {}
+        if few.size:
+            some = stars.take(few)
+            found = _samples(config, bank, drawn["seidel"], product, some, level, likelihood)
+            sums = ((found.free, found.free_helped), (found.told, found.told_helped))
+            for method, (parts, helped) in zip(POSTERIOR_MEANS, sums, strict=True):
+                sampled[method] = Estimates.over_samples(parts, helped, static, some)
+        for method, (draws, over_bank) in over_banks.items():
+            best, chosen = over_bank.improved(few, sampled.get(method))
+            source = {0: "bank", stars.star.size: "samples"}.get(chosen, "both")
+            count = config.bounds.star_draws if source == "samples" else draws
+            tables.add_mean(method, level, best, source, draws=count, sampled=chosen)
         seconds = time.monotonic() - start
-        means = ", ".join(f"{m} {'/'.join(t) or 'bank'}" for m, t in thin.items())
-        print(f"λ = {level:g}, importance samples: {means}, {seconds:.1f} s", flush=True)
+        print(f"λ = {level:g}: {few.size} stars sampled, {seconds:.1f} s", flush=True)
 
 
-def _tabulate(tables: Tables, method: str, level: float, sizes: dict[int, np.ndarray]) -> list[str]:
-    """Rows of one posterior mean over a bank, whose `_measures` are given by number of draws.
+@dataclass(frozen=True)
+class Estimates:
+    """`_measures`, shape (5, n), of one posterior mean.
 
-    References for which the bank is too thin are returned, and have rows in `growth` alone.
+    Attributes
+    ----------
+    full, quarter : ndarray, shape (5, n)
+        Of all samples, and of a quarter of them.
+    helped : ndarray, shape (5, n)
+        Of all samples and those around modes that only the truth leads to.
     """
-    draws, last = np.array(list(sizes)), sizes[max(sizes)]
-    thin = []
-    for i, reference in enumerate(tables.stars.truth):
-        errors = _by_size(sizes, i)
-        change = last_change(errors)
+
+    full: np.ndarray
+    quarter: np.ndarray
+    helped: np.ndarray
+
+    @classmethod
+    def over_bank(cls, sizes: dict[int, np.ndarray]) -> Estimates:
+        """From `_measures` by number of draws, each twice that before."""
+        nested = list(sizes.values())
+        quarter = nested[-3] if len(nested) > 2 else np.full_like(nested[-1], np.nan)
+        return cls(nested[-1], quarter, nested[-1])
+
+    @classmethod
+    def over_samples(
+        cls,
+        parts: list[PosteriorSums],
+        helped: PosteriorSums,
+        static: np.ndarray,
+        stars: BoundedStars,
+    ) -> Estimates:
+        """From sums over importance samples in four parts, and those with the truth's modes."""
+        measure = partial(_measures, static=static, stars=stars)
+        quarter, _, full = nested_means(parts, measure).values()
+        return cls(full, quarter, measure(helped))
+
+    @property
+    def ess(self) -> np.ndarray:
+        """Effective sample size of every star."""
+        return self.full[-1]
+
+    def improved(self, few: np.ndarray, other: Estimates | None) -> tuple[Estimates, int]:
+        """With another one of the stars `few` where it has more samples, and for how many."""
+        if other is None:
+            return self, 0
+        better = (self.ess[few] < ENOUGH_ESS) & (other.ess > self.ess[few])
+        changed = {name: values.copy() for name, values in vars(self).items()}
+        for name, values in changed.items():
+            values[:, few[better]] = getattr(other, name)[:, better]
+        return Estimates(**changed), int(better.sum())
+
+    def values(self, number: int) -> dict[str, np.ndarray]:
+        """Error and variance of every star by one reference, and the effective sample size."""
+        return {"mse": self.full[number], "variance": self.full[2 + number], "ess": self.ess}
+
+    def evidence(self, number: int, field: np.ndarray) -> Evidence:
+        """Whether the mean of one reference is near the exact one."""
+        return Evidence.of(
+            **self.values(number),
+            field=field,
+            last_change=abs(_change(self.quarter[number], self.full[number])),
+            undetected=-_change(self.helped[number], self.full[number]),
+        )
+
+
+def _change(errors: np.ndarray, full: np.ndarray) -> float:
+    """Relative difference of mean errors, over the stars that have both."""
+    known = np.isfinite(errors) & np.isfinite(full)
+    return float(errors[known].mean() / full[known].mean() - 1.0) if known.any() else np.nan
+
+
+def _grown(tables: Tables, method: str, level: float, sizes: dict[int, np.ndarray]) -> None:
+    """Rows of `growth`: `_measures` of one posterior mean over a bank by number of draws."""
+    draws, bank = np.array(list(sizes)), Estimates.over_bank(sizes)
+    for number, reference in enumerate(tables.stars.truth):
+        errors = np.array([measures[number].mean() for measures in sizes.values()])
         limit, exponent, residual = extrapolate(draws, errors)
-        values = _of_reference(last, i)
-        evidence = Evidence.of(**values, field=tables.stars.field, last_change=change)
-        if evidence.tight:
-            tables.add_mean(reference, method, level, values, evidence, "bank", max(sizes))
-        else:
+        if not bank.evidence(number, tables.stars.field).tight:
             # Far from convergence the fit extrapolates to anything, down to zero.
-            thin.append(reference)
             limit = float("nan")
         tables.growth += [
             {
@@ -400,16 +473,15 @@ def _tabulate(tables: Tables, method: str, level: float, sizes: dict[int, np.nda
                 "noise_level": level,
                 "draws": count,
                 "mse": error,
-                "ess_mean": sampled[-1].mean(),
-                "ess_median": np.median(sampled[-1]),
-                "last_change": change,
+                "ess_mean": measures[-1].mean(),
+                "ess_median": np.median(measures[-1]),
+                "last_change": last_change(errors),
                 "limit": limit,
                 "exponent": exponent,
                 "fit_rms": residual,
             }
-            for count, error, sampled in zip(draws, errors, sizes.values(), strict=True)
+            for count, error, measures in zip(draws, errors, sizes.values(), strict=True)
         ]
-    return thin
 
 
 def _samples(
@@ -438,35 +510,6 @@ def _samples(
         model.standardised(product["seidel"][stars.star]),
     )
     return sample(bank, seidel, noisy, truth, likelihood, model, draws, rngs)
-
-
-def _replace(
-    tables: Tables,
-    level: float,
-    found: Sampled,
-    draws: int,
-    static: np.ndarray,
-    thin: dict[str, list[str]],
-) -> None:
-    """Rows of the posterior means over samples, for the references `thin` of every method."""
-    stars = tables.stars
-    sampled = ((found.free, found.free_helped), (found.told, found.told_helped))
-    for method, (parts, whole) in zip(POSTERIOR_MEANS, sampled, strict=True):
-        sizes = nested_means(parts, partial(_measures, static=static, stars=stars))
-        last, helped = sizes[max(sizes)], _measures(whole, static, stars)
-        for i, reference in enumerate(stars.truth):
-            if reference not in thin[method]:
-                continue
-            values = _of_reference(last, i)
-            # Who is given the field cannot miss it, but a mode in it.
-            without, complete = _by_size({0: last, 1: helped}, i)
-            evidence = Evidence.of(
-                **values,
-                field=stars.field,
-                last_change=last_change(_by_size(sizes, i)),
-                undetected=1.0 - complete / without,
-            )
-            tables.add_mean(reference, method, level, values, evidence, "samples", draws)
 
 
 def _anywhere(
@@ -514,27 +557,12 @@ def _told_the_field(
 
 
 def _measures(sums: PosteriorSums, static: np.ndarray, stars: BoundedStars) -> np.ndarray:
-    """MSE and posterior variance by reference, and effective sample size, shape (2, 2, n)+(n,).
-
-    Rows: errors against realisation and template, variances of both, size; shape (5, n).
-    """
+    """MSE against realisation and template, variances of both, effective sample size, (5, n)."""
     shape = stars.truth["realisation"].shape
     template, spread = sums.template(static)
     means = {"realisation": sums.mean_image, "template": template}
     errors = [mse(means[name].reshape(shape), truth) for name, truth in stars.truth.items()]
     return np.stack([*errors, sums.variance_image, spread, sums.effective_size])
-
-
-def _of_reference(measures: np.ndarray, number: int) -> dict[str, np.ndarray]:
-    """What `_measures` has of one reference."""
-    return {"mse": measures[number], "variance": measures[2 + number], "ess": measures[-1]}
-
-
-def _by_size(sizes: dict[int, np.ndarray], number: int) -> np.ndarray:
-    """Mean error of one reference by size, over the stars with an estimate at all sizes."""
-    errors = np.array([measures[number] for measures in sizes.values()])
-    known = np.isfinite(errors).all(axis=0)
-    return errors[:, known].mean(axis=1) if known.any() else np.full(len(errors), np.nan)
 
 
 def _exact(config: Config, static: np.ndarray, tables: Tables) -> None:
