@@ -59,7 +59,7 @@ class Evidence:
         Stars without an estimate have an `mse` of NaN.
         """
         known = np.isfinite(mse)
-        low = float(np.quantile(np.where(known, ess, 0.0), FEW, method="lower"))
+        low = float(np.sort(np.where(known, ess, 0.0))[int(FEW * ess.size)])
         deviation = calibration(mse[known], variance[known], field[known])
         return cls(low, deviation, last_change, undetected)
 

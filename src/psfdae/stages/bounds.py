@@ -82,7 +82,7 @@ PAPER_COLUMNS = ["dataset", "method", "noise_level", "mse_paper", "mse", "mse_bo
 PAPER_COLUMNS += ["tight", "paper_over_bound", "verdict"]
 
 POSTERIOR_MEANS = {"bayes": False, "bayes_position": True}
-"""Bounds that are posterior means, and whether they are told the star's field."""
+"""Bounds that are posterior means, and whether they are given the star's field."""
 
 COLUMN_OF_TABLE = ["dataset", "split", "reference", "noise_level"]
 """What one column of the paper's tables is: methods are compared inside it."""
@@ -363,9 +363,9 @@ def _over_bank(
         start = time.monotonic()
         likelihood = Likelihood.of(noise_model(config), level, bank.stamps((bank.margin,) * 2))
         over_banks, thin = {}, np.zeros(stars.star.size, bool)
-        for method, told in POSTERIOR_MEANS.items():
-            measured, draws = (_told_the_field, larger) if told else (_anywhere, bank)
-            sizes = measured(draws, static, stars, level, likelihood)
+        for method, given in POSTERIOR_MEANS.items():
+            draws = larger if given else bank
+            sizes = _weighed(draws, given, static, stars, level, likelihood)
             _grown(tables, method, level, sizes)
             over_banks[method] = max(sizes), Estimates.over_bank(sizes)
             thin |= over_banks[method][1].ess < ENOUGH_ESS
@@ -512,45 +512,54 @@ def _samples(
     return sample(bank, seidel, noisy, truth, likelihood, model, draws, rngs)
 
 
-def _anywhere(
-    bank: Bank, static: np.ndarray, stars: BoundedStars, level: float, likelihood: Likelihood
-) -> dict[int, np.ndarray]:
-    """`_measures` of the posterior mean over all fields, by number of draws.
-
-    A bank that is hopelessly thin for its noise level is left after a quarter.
-    """
-    cuts = np.array_split(np.arange(len(bank)), segments(len(bank)))
-    noisy = stars.noisy[level]
-    quarter = max(1, len(cuts) // 4)
-    parts = [posterior_sums(bank.take(cut), noisy, likelihood) for cut in cuts[:quarter]]
-    sizes = nested_means(parts, lambda sums: sums.effective_size)
-    if np.median(sizes[quarter]) >= HOPELESS_ESS:
-        parts += [posterior_sums(bank.take(cut), noisy, likelihood) for cut in cuts[quarter:]]
-    draws = sum(cut.size for cut in cuts[: len(parts)])
-    means = nested_means(parts, partial(_measures, static=static, stars=stars))
-    return {round(draws / len(parts) * size): values for size, values in means.items()}
+def _anywhere(stars: BoundedStars, bank: Bank) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Test stars and the draws that they are weighed with: all with all."""
+    return [(np.arange(stars.field.size), np.arange(len(bank)))]
 
 
-def _told_the_field(
-    bank: Bank, static: np.ndarray, stars: BoundedStars, level: float, likelihood: Likelihood
-) -> dict[int, np.ndarray]:
-    """The same over the draws that the symmetries take to each star's own field.
+def _in_the_field(stars: BoundedStars, bank: Bank) -> list[tuple[np.ndarray, np.ndarray]]:
+    """The same for draws that the symmetries take to each star's own field.
 
-    Fields that are mirror images of each other share theirs. Every part of the bank has
-    as many of them, and the draws that are counted are those of the bank in all fields.
+    Fields that are mirror images of each other share theirs.
     """
     ours, theirs = orbit(stars.field, bank.points), orbit(bank.field, bank.points)
-    groups = [(np.flatnonzero(ours == o), np.flatnonzero(theirs == o)) for o in np.unique(ours)]
+    return [(np.flatnonzero(ours == o), np.flatnonzero(theirs == o)) for o in np.unique(ours)]
+
+
+def _weighed(
+    bank: Bank, given: bool, static: np.ndarray, stars: BoundedStars, level: float, like: Likelihood
+) -> dict[int, np.ndarray]:
+    """`_measures` of the posterior mean over a bank, with the field given or not, by its size.
+
+    Every part of the bank has as many draws of every group, and those that are counted are
+    the draws in all fields. A bank that is hopelessly thin for its noise level is left after a
+    quarter.
+    """
+    groups = _in_the_field(stars, bank) if given else _anywhere(stars, bank)
     pieces = segments(min(draws.size for _, draws in groups))
+    quarter = max(1, pieces // 4)
+    several = [(stars.take(group), np.array_split(draws, pieces)) for group, draws in groups]
+
+    def weigh(first: int, end: int) -> list[list[PosteriorSums]]:
+        return [
+            [
+                posterior_sums(
+                    *(bank.take(cut), few.noisy[level], like),
+                    told=few.field if given else None,
+                )
+                for cut in cuts[first:end]
+            ]
+            for few, cuts in several
+        ]
+
+    parts = weigh(0, quarter)
+    sizes = [nested_means(part, lambda sums: sums.effective_size)[quarter] for part in parts]
+    if np.median(np.concatenate(sizes)) >= HOPELESS_ESS:
+        parts = [old + new for old, new in zip(parts, weigh(quarter, pieces), strict=True)]
     means: dict[int, np.ndarray] = {}
-    for group, draws in groups:
-        few = stars.take(group)
-        weigh = partial(
-            posterior_sums, noisy=few.noisy[level], likelihood=likelihood, told=few.field
-        )
-        parts = [weigh(bank.take(cut)) for cut in np.array_split(draws, pieces)]
+    for (group, _), (few, _), part in zip(groups, several, parts, strict=True):
         measure = partial(_measures, static=static, stars=few)
-        for size, values in nested_means(parts, measure).items():
+        for size, values in nested_means(part, measure).items():
             total = means.setdefault(size, np.empty((len(values), stars.field.size)))
             total[:, group] = values
     return {round(len(bank) / pieces * size): values for size, values in means.items()}
