@@ -18,6 +18,7 @@ from psfdae.bounds.sampling import (
     neighbours,
     sampled_sums,
     twins,
+    unexplained,
 )
 from psfdae.optics.wavefronts import seidel_wavefronts
 from psfdae.rng import stream
@@ -172,7 +173,8 @@ def aside(stars, model, noise, level, shift):
 
 def test_a_star_that_no_mode_explains_is_sought_beside_its_best_one(stars, model, noise):
     wrong, truth, _, problem = aside(stars, model, noise, 1e-4, (2, -1))
-    starts = neighbours(wrong, *problem)
+    assert unexplained(wrong, *problem).tolist() == [0]
+    starts = neighbours(wrong, unexplained(wrong, *problem))
     assert len(starts.star) == 49
     found = climb(wrong + starts, *problem)
     right = climb(truth, *problem)
@@ -180,7 +182,7 @@ def test_a_star_that_no_mode_explains_is_sought_beside_its_best_one(stars, model
     assert (found.offset[best] == right.offset[0]).all()
     assert found.evidence[best] == pytest.approx(right.evidence[0], abs=0.1)
     assert found.given[best] == FIELD
-    assert not neighbours(right, *problem).star.size
+    assert not unexplained(right, *problem).size
 
 
 def test_a_mode_undetected_with_the_field_given_shows(stars, model, noise):

@@ -48,7 +48,8 @@ FARTHEST = 6.0
 the tails of the proposals reach beyond what can be sampled."""
 
 MATCHES = 16
-"""Fields of the bank's best matches from which modes are sought."""
+"""Best matches of the bank from which modes are sought: in as many fields, and in the own one at
+as many offsets."""
 
 ROUNDS = (0.2, 0.3, 0.5)
 """Parts of the draws before the mixture is adapted once, twice, and after."""
@@ -323,7 +324,9 @@ def sample(
     draws: int,
     rngs: Sequence[np.random.Generator],
 ) -> Sampled:
-    """Matches, modes, their neighbours and twins, and `draws` samples a star around them.
+    """Matches, modes, their twins, and `draws` samples a star around them.
+
+    Stars that no mode explains get more starts: all other matches, then all offsets around.
 
     Parameters
     ----------
@@ -336,10 +339,13 @@ def sample(
     draws : int
     """
     problem = (likelihood.counts(noisy), likelihood, model)
-    modes = climb(
-        best_matches(bank, seidel, noisy, likelihood, model, MATCHES, truth.field), *problem
-    )
-    modes = climb(modes + neighbours(modes, *problem), *problem)
+    matches = best_matches(bank, seidel, noisy, likelihood, model, truth.field)
+    best = _first(2 * matches.star + matches.given, matches.evidence, MATCHES)
+    modes = climb(matches.take(best), *problem)
+    others = matches.take(np.setdiff1d(np.arange(len(matches.star)), best))
+    poor = unexplained(modes, *problem)
+    modes = climb(modes + others.take(np.flatnonzero(np.isin(others.star, poor))), *problem)
+    modes = climb(modes + neighbours(modes, unexplained(modes, *problem)), *problem)
     modes = climb(modes + twins(modes, likelihood, model), *problem)
     modes = _separate(modes + climb(truth, *problem))
     rounds = [round(share * draws) for share in ROUNDS]
@@ -369,13 +375,12 @@ def best_matches(
     noisy: np.ndarray,
     likelihood: Likelihood,
     model: StampModel,
-    count: int,
     own: np.ndarray,
 ) -> Modes:
-    """The best star of the bank in each of the `count` best fields of every image.
+    """The best star of the bank in each field for every image.
 
-    For those who are told the field, the best at each of as many offsets in the stars' `own`
-    fields, (n,), are added. Mirrored stars keep their coefficients.
+    With the field given, the best at each offset in the stars' `own` fields, (n,), are added.
+    Mirrored stars keep their coefficients. `evidence` is the log-likelihood up to a constant.
 
     Parameters
     ----------
@@ -402,18 +407,20 @@ def best_matches(
     offsets = (peaks[:, :, None] - shifts).reshape(len(bank), -1, 2)
     rows = []
     for star, scores in enumerate(best):
-        top = np.argsort(-scores.max(axis=1), kind="stable")[:count]
-        rows += [(star, field, scores[field].argmax(), NOTHING) for field in top]
+        rows += [(star, field, place, NOTHING) for field, place in enumerate(scores.argmax(axis=1))]
         mine, seen = own[star], set()
         for column in np.argsort(-scores[mine], kind="stable"):
             offset = tuple(offsets[which[star, mine, column], column])
-            if np.isfinite(scores[mine, column]) and offset not in seen and len(seen) < count:
+            if offset not in seen:
                 seen.add(offset)
                 rows.append((star, mine, column, FIELD))
+    rows = [row for row in rows if np.isfinite(best[row[:3]])]
     star, field, place, given = np.array(rows).T
     chosen = which[star, field, place]
-    z = model.standardised(seidel[chosen])
-    return Modes.at(star, field, offsets[chosen, place], given, z)
+    starts = Modes.at(
+        star, field, offsets[chosen, place], given, model.standardised(seidel[chosen])
+    )
+    return replace(starts, evidence=best[star, field, place])
 
 
 def log_posterior(
@@ -475,14 +482,13 @@ def climb(modes: Modes, counts: np.ndarray, likelihood: Likelihood, model: Stamp
     return _separate(replace(modes, z=z, factor=factor, evidence=evidence))
 
 
-def neighbours(
+def unexplained(
     modes: Modes, counts: np.ndarray, likelihood: Likelihood, model: StampModel
-) -> Modes:
-    """Starts at other offsets for stars which no mode explains: (n, P) counts of every star.
+) -> np.ndarray:
+    """Stars with an image that their best mode does not explain, without or with the field given.
 
-    χ² of the right mode has the mean P and the variance 2P. Where that of the best mode is
-    larger by `POOR_FIT` standard deviations, the coefficients of the best modes, without and
-    with the field given, are tried at all offsets in their neighbourhood.
+    χ² of the right mode has the mean P and the variance 2P for P pixels; they are those where it
+    is larger by `POOR_FIT` standard deviations.
 
     Parameters
     ----------
@@ -493,10 +499,16 @@ def neighbours(
     expected = likelihood.flux * stamps.astype(np.float64) + likelihood.background
     misfit = ((counts[best.star] - expected) ** 2 / expected).sum(axis=1)
     pixels = counts.shape[1]
-    poor = misfit > pixels + POOR_FIT * np.sqrt(2.0 * pixels)
+    return np.unique(best.star[misfit > pixels + POOR_FIT * np.sqrt(2.0 * pixels)])
+
+
+def neighbours(modes: Modes, stars: np.ndarray) -> Modes:
+    """The best modes of some stars, without and with the field given, at all offsets around."""
+    best = modes.take(_first(2 * modes.star + modes.given, modes.evidence, 1))
     shifts = np.array(jitters(NEIGHBOURHOOD))
-    source = best.take(np.repeat(np.flatnonzero(poor), len(shifts)))
-    offset = source.offset + np.tile(shifts, (np.count_nonzero(poor), 1))
+    some = np.flatnonzero(np.isin(best.star, stars))
+    source = best.take(np.repeat(some, len(shifts)))
+    offset = source.offset + np.tile(shifts, (some.size, 1))
     return Modes.at(source.star, source.field, offset, source.given, source.z)
 
 
