@@ -326,7 +326,7 @@ def sample(
 ) -> Sampled:
     """Matches, modes, their twins, and `draws` samples a star around them.
 
-    Stars that no mode explains get more starts: all other matches, then all offsets around.
+    Stars that no mode explains get more starts: all offsets around their best modes and matches.
 
     Parameters
     ----------
@@ -339,13 +339,11 @@ def sample(
     draws : int
     """
     problem = (likelihood.counts(noisy), likelihood, model)
-    matches = best_matches(bank, seidel, noisy, likelihood, model, truth.field)
-    best = _first(2 * matches.star + matches.given, matches.evidence, MATCHES)
-    modes = climb(matches.take(best), *problem)
-    others = matches.take(np.setdiff1d(np.arange(len(matches.star)), best))
+    matches = best_matches(bank, seidel, noisy, likelihood, model, MATCHES, truth.field)
+    modes = climb(matches, *problem)
     poor = unexplained(modes, *problem)
-    modes = climb(modes + others.take(np.flatnonzero(np.isin(others.star, poor))), *problem)
-    modes = climb(modes + neighbours(modes, unexplained(modes, *problem)), *problem)
+    beside = neighbours(modes, poor) + neighbours(matches, poor)
+    modes = climb(modes + beside, *problem)
     modes = climb(modes + twins(modes, likelihood, model), *problem)
     modes = _separate(modes + climb(truth, *problem))
     rounds = [round(share * draws) for share in ROUNDS]
@@ -375,12 +373,14 @@ def best_matches(
     noisy: np.ndarray,
     likelihood: Likelihood,
     model: StampModel,
+    count: int,
     own: np.ndarray,
 ) -> Modes:
-    """The best star of the bank in each field for every image.
+    """The best star of the bank in each of the `count` best fields of every image.
 
-    With the field given, the best at each offset in the stars' `own` fields, (n,), are added.
-    Mirrored stars keep their coefficients. `evidence` is the log-likelihood up to a constant.
+    With the field given, the best at each of as many offsets in the stars' `own` fields, (n,),
+    are added. Mirrored stars keep their coefficients. `evidence` is the log-likelihood up to a
+    constant.
 
     Parameters
     ----------
@@ -407,14 +407,14 @@ def best_matches(
     offsets = (peaks[:, :, None] - shifts).reshape(len(bank), -1, 2)
     rows = []
     for star, scores in enumerate(best):
-        rows += [(star, field, place, NOTHING) for field, place in enumerate(scores.argmax(axis=1))]
+        top = np.argsort(-scores.max(axis=1), kind="stable")[:count]
+        rows += [(star, field, scores[field].argmax(), NOTHING) for field in top]
         mine, seen = own[star], set()
         for column in np.argsort(-scores[mine], kind="stable"):
             offset = tuple(offsets[which[star, mine, column], column])
-            if offset not in seen:
+            if np.isfinite(scores[mine, column]) and offset not in seen and len(seen) < count:
                 seen.add(offset)
                 rows.append((star, mine, column, FIELD))
-    rows = [row for row in rows if np.isfinite(best[row[:3]])]
     star, field, place, given = np.array(rows).T
     chosen = which[star, field, place]
     starts = Modes.at(
@@ -503,7 +503,11 @@ def unexplained(
 
 
 def neighbours(modes: Modes, stars: np.ndarray) -> Modes:
-    """The best modes of some stars, without and with the field given, at all offsets around."""
+    """The best modes of some stars, without and with the field given, at all offsets around.
+
+    So for matches, from which modes are sought: the best may be near a mode of another offset
+    and lead to a wrong one at its own.
+    """
     best = modes.take(_first(2 * modes.star + modes.given, modes.evidence, 1))
     shifts = np.array(jitters(NEIGHBOURHOOD))
     some = np.flatnonzero(np.isin(best.star, stars))
