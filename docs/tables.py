@@ -298,20 +298,18 @@ def fit():
 
 
 def bounds(method="bayes"):
-    """Least possible errors, the floor, and how the bank of draws grew, of one posterior mean."""
+    """Least possible errors of one posterior mean, what it rests on, and the floor."""
     rows = csv("tables/psf_bounds.csv").query("metric == 'mse'").sort_values(CELL)
+    # A record made before these columns leaves them empty.
+    since = ["variance", "calibration", "ess_low", "undetected", "missing", "missing_stars"]
+    rows = rows.reindex(columns=[*dict.fromkeys([*rows, *since])])
     floor = rows.query("method == 'floor'")[[*CELL, "value"]]
-    table = rows.query("method == @method").merge(floor, "left", CELL, suffixes=("", "_floor"))
-    growth = csv("tables/psf_bounds_growth.csv").sort_values("draws")
-    keys = [key for key in (*CELL, "method") if key in growth]
-    growth = growth.drop_duplicates(keys, keep="last")
-    # Of a record made before stars were drawn around matches, only the bank's growth tells more.
-    table = table.merge(growth, "left", keys, suffixes=("", "_bank"))
-    bank = table.draws.notna().map({True: "bank", False: "sum"})
-    table = table.reindex(columns=[*dict.fromkeys([*table, "found", "missed"])])
-    table["found"] = table.found.astype(object).fillna(bank)
-    table["draws"] = table.draws.map("{:.0f}".format, na_action="ignore").fillna("exact")
-    return table
+    return rows.query("method == @method").merge(floor, "left", CELL, suffixes=("", "_floor"))
+
+
+def unbounded():
+    """Posterior means that some stars do not have."""
+    return pd.concat([bounds(), bounds("bayes_position")]).query("missing > 0")
 
 
 def efficiency():
