@@ -324,6 +324,20 @@ class FieldMixture(Method):
         arrays["listed"] = self.listed if np.isfinite(self.listed).all() else np.empty((0, 2))
         return arrays, said
 
+    def lawful(self) -> Iterator[tuple[str, str, Any]]:
+        """As of all methods; the star of the middle has the sum 1, and residuals are smaller."""
+        terms, spread = len(self.coefficients), self.spread
+        usual = self.model.images(self.usual[None], np.zeros((1, 2)), self.side)
+        yield "coefficients", "a mean star of the sum 1", abs(usual.sum() - 1) < 0.1
+        yield "high", "at least low", self.low <= self.high
+        yield "usual", "terms from -1 to 1", self.usual.shape == (terms,) and abs(self.usual) <= 1
+        least = np.linalg.eigvalsh(spread)[0] if spread.shape == (terms, terms) else -1.0
+        yield "spread", "a covariance", (spread == spread.T) & (least > -1e-6)
+        yield "modes", "squares below 1", np.square(self.modes, dtype=float).sum(axis=1) < 1
+        yield "offset", "numbers from -1 to 1", abs(self.offset) <= 1
+        yield "diagonal", "numbers from 0 to 1", (self.diagonal > 0) & (self.diagonal < 1)
+        yield "listed", "an error above 0, if any", self.listed[1:] > 0
+
     def free_flux(self) -> Self:
         """As of all methods: flux and sky are found."""
         return replace(self, free=True)
