@@ -259,7 +259,7 @@ def test_a_killed_command_ends_well_if_typed_again(folder, tmp_path, monkeypatch
     assert sorted(tmp_path.iterdir()) == sorted([out, listed, plotted])
     assert "exists already" in run(*words).output
     out.unlink()
-    assert "psf_stars.csv: exists already" in run(*words).output  # it may be anybody's
+    assert "exists already" in run(*words).output  # these may be anybody's
 
 
 def test_full_disk_is_one_line(folder, tmp_path):
