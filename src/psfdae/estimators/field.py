@@ -359,13 +359,15 @@ class FieldMixture(Method):
         """The field's PSFs (n, m, m) at positions (n, 2), as `FieldModel.images` draws them.
 
         Positions are meant as those of the training's list. Stars lie in their sub-pixel phase
-        beside the middle, which is the pixel of their position; the sum of the pixels is
-        oversampling².
+        beside the middle, which is the pixel of their position. Their flux is that for which a
+        star in the middle of its pixel has the sum 1 in its stamp: a PSF keeps it where it moves
+        with its star, as it does in photometry, though some light then crosses the stamp's edge.
         """
         terms = self._terms(position)[0]
-        phase = (position - np.floor(position + 0.5))[:, ::-1] + self._list_offset
-        images = self.model.images(terms, phase, self.side, oversampling)
-        return images * (oversampling**2 / images.sum(axis=(1, 2), keepdims=True))
+        phase = (position - np.floor(position + 0.5))[:, ::-1]
+        images = self.model.images(terms, phase + self._list_offset, self.side, oversampling)
+        whole = self.model.images(terms, 0.0 * phase + self._list_offset, self.side)
+        return images / whole.sum(axis=(1, 2), keepdims=True)
 
     def _terms(self, position: np.ndarray | None, count: int = 0) -> tuple[np.ndarray, np.ndarray]:
         """Terms of the field of each star, the usual ones where no position is known, and where."""
