@@ -289,7 +289,7 @@ LIST = ["--catalogue", "stars.csv"]
         (["image.fits", *LIST, "--weight", "nan.fits"], "too few pixels of the image have a value"),
         (["image.fits", *LIST, "--weight", "1.fits"], "no extension '1.fits'"),
         (["image.fits", *LIST, "--name", "../../x"], "--name ../../x: expected the start of a"),
-        (["image.fits", *LIST, "--name", 300 * "x"], "at most 238 bytes, and no folder"),
+        (["image.fits", *LIST, "--name", 300 * "x"], "at most 239 bytes, and no folder"),
         (["image.fits", *LIST, "--gain", 0], "image.fits: gain 0.0, expected a number above 0"),
         (["image.fits", *LIST, "--gain", -1], "image.fits: gain -1.0, expected"),
         (["image.fits", *LIST, "--read-noise", 0], "read noise 0.0, expected"),
