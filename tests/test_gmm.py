@@ -302,6 +302,30 @@ def test_a_bundle_has_the_main_axes_of_each_cluster():
         packed(mixture, D, NOISE.kappa * LEVEL, 1e3)
 
 
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("axes", lambda a: 1.1 * a),
+        ("variance", lambda a: -a),
+        ("count", lambda a: a * (np.arange(a.size) > 0)),
+        ("rows", lambda a: a + 1),
+        ("mean", lambda a: 2 * a),
+        ("deviation", lambda a: 300 * a),
+        ("shrinkage", lambda a: 0 * a),
+    ],
+)
+def test_arrays_that_no_fit_leaves_are_known(name, change):
+    arrays = fitted(components=[4]).pack(D, NOISE.kappa * LEVEL)[0]
+    config = {"noise": {"kappa": NOISE.kappa, "background_photons": NOISE.background}}
+
+    def wrong(arrays):
+        laws = GaussianMixture.restored(arrays, config, "realisation").lawful()
+        return [law for law, _, right in laws if not np.all(right)]
+
+    assert wrong(arrays) == []
+    assert wrong(arrays | {name: change(arrays[name])})[0] == name
+
+
 def test_the_position_is_used_where_it_tells_something():
     """Positions decide the kind of the star; or they are those of other stars."""
     data, settings = training(), Gmm(**{**ONE, "components": [4, 12]})

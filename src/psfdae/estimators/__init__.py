@@ -11,7 +11,7 @@ commands follow from them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib import import_module
@@ -463,6 +463,10 @@ class Method:
     def unpack(cls, arrays: Mapping[str, np.ndarray], info: BundleInfo) -> Self:
         """A fit from a bundle."""
         return cls.restored(arrays, info.config["train"], info.reference or "realisation")
+
+    def lawful(self) -> Iterator[tuple[str, str, Any]]:
+        """What arrays of a bundle must have: name, words, and whether they have it, bool."""
+        return iter(())
 
     def export(self, stamp_px: int, path: Path) -> None:
         """Write it as ONNX, if it is a network."""
