@@ -33,12 +33,13 @@ from psfdae.own_stars.images import (
     find_image,
     open_pixels,
 )
-from psfdae.own_stars.stamps import Stamps, StarFlag, cut, raise_flag
+from psfdae.own_stars.stamps import Stamps, StarFlag, cut, raise_flag, sky_around
 
 FAR = 2**30  # positions are clipped to ± this many pixels, far off any image
 NEAR = 1.0  # stars farther off by this many image sizes are not corrected for distortion
 ASSUMED_SCALE = 1.0  # arcseconds per pixel where nothing says it
 SEEN = 2.0  # σ above the sky from which a position of a list is on a source
+RING_PX = 8  # around a stamp, at least: there the noise of the sky is that of no star
 SAME_PX = 0.1  # nearer to each other than this, two rows of a list are one star
 
 
@@ -467,17 +468,23 @@ class Observation:
         self, part: slice, pixels: Pixels, mask: Pixels | None, noise: Pixels | None
     ) -> tuple[np.ndarray, ...]:
         x, y = self.positions[part].T
-        where = (self.shape, x, y, self.stamp_px, self.margin)
+        wide = max(self.margin, RING_PX)
+        where = (self.shape, x, y, self.stamp_px, wide)
         data, inside, truncated = cut_image(pixels, *where)
-        masked, level = ~inside, np.full(len(data), np.nan)
+        masked = ~inside
         if mask is not None:
             masked |= self._layers.bad(cut_image(mask, *where)[0])
+        own = slice(wide - self.margin, wide + self.stamp_px + self.margin)
         if noise is not None:
             sigma = self._layers.sigma(cut_image(noise, *where)[0])
             masked |= np.isnan(sigma)
-            each = np.ma.array(sigma, mask=masked)
+            each = np.ma.array(sigma, mask=masked)[:, own, own]
             level = np.ma.median(each, axis=(1, 2)).filled(np.nan).astype(float)
-        return data, masked, truncated, level
+        else:
+            # In the stamp of a bright star, light that no PSF explains would pass for noise.
+            _, level = sky_around(data, masked | ~np.isfinite(data), self.stamp_px)
+            level = np.where(level > 0, np.maximum(level, self.least_noise), np.nan)
+        return data[:, own, own], masked[:, own, own], truncated, level
 
     def _stamps(
         self,

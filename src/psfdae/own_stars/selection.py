@@ -6,7 +6,6 @@ star of a stamp lies near index (s//2, s//2).
 
 from __future__ import annotations
 
-import warnings
 from collections import Counter
 from dataclasses import dataclass, fields
 from enum import StrEnum
@@ -17,7 +16,7 @@ import numpy as np
 
 from psfdae.own_stars.errors import no_formula
 from psfdae.own_stars.observation import Observation
-from psfdae.own_stars.stamps import Stamps, StarFlag, cut, peaks
+from psfdae.own_stars.stamps import Stamps, StarFlag, cut, peaks, sky_around
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -25,7 +24,6 @@ if TYPE_CHECKING:
     from psfdae.configuration.schema import CalibrationStars, Framing
 
 ROWS = 2048  # stars that are measured at a time
-SKY_CLIP = 3.0  # pixels of the sky this many σ off their median belong to other stars
 REGISTRATION_ROUNDS = 10  # of the windowed centroid; each leaves less than a fifth of the distance
 COMPANIONS = 12  # nearest stars with which a star is compared
 DEFECT = 6.0  # pixels this many σ below the sky are defects; they are raised to that
@@ -78,6 +76,10 @@ class BrightStars:
     def of(self, chosen: np.ndarray) -> BrightStars:
         """Some of the stars, by a mask or by indices."""
         return BrightStars(*(getattr(self, field.name)[chosen] for field in fields(self)))
+
+    def area(self) -> np.ndarray:
+        """Noise-equivalent area A = (F / (σ S/N))² of each star in pixels, shape (n,)."""
+        return (self.flux / (self.noise * self.snr)) ** 2
 
     def aligned(self) -> np.ndarray:
         """The stars of flux 1, moved to a common centre, index (s//2, s//2); shape (n, s, s)."""
@@ -238,46 +240,6 @@ def piled_up(brightest: np.ndarray, sky: np.ndarray, brightness: np.ndarray) -> 
     if np.median(sharpness[piled]) > PILE_SHARPNESS * np.median(sharpness[others]):
         return np.inf
     return float(brightest[piled].min())
-
-
-def sky_around(wide: np.ndarray, bad: np.ndarray, stamp_px: int) -> tuple[np.ndarray, np.ndarray]:
-    """Median and scatter of the pixels outside the stamps, other stars clipped.
-
-    Without a margin (s < d + 4) the pixels are the outer two rows and columns of
-    the stamp itself; light of the star in them counts as sky then.
-
-    Parameters
-    ----------
-    wide : ndarray, shape (n, s, s)
-    bad : ndarray of bool, shape (n, s, s)
-        Pixels that do not count.
-    stamp_px : int
-        Side d.
-
-    Returns
-    -------
-    level, noise : ndarray, shape (n,)
-        In counts per pixel.
-    """
-    from astropy.stats import sigma_clipped_stats
-
-    side = wide.shape[-1]
-    inner = stamp_px if side >= stamp_px + 4 else side - 4
-    start = side // 2 - inner // 2
-    ring = np.ones((side, side), dtype=bool)
-    ring[start : start + inner, start : start + inner] = False
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # stars off the image have no pixels
-        _, level, noise = sigma_clipped_stats(
-            wide[:, ring],
-            mask=bad[:, ring],
-            sigma=SKY_CLIP,
-            cenfunc="median",
-            stdfunc="mad_std",
-            axis=1,
-        )
-    level, noise = (np.nan_to_num(np.ma.filled(a, np.nan)).astype(float) for a in (level, noise))
-    return level, noise
 
 
 def signal_to_noise(stamps: np.ndarray, noise: np.ndarray) -> np.ndarray:

@@ -21,9 +21,9 @@ from psfdae.files import Product, write_csv, write_product, write_text
 from psfdae.own_stars.advice import advice
 from psfdae.own_stars.bundle import SUFFIX
 from psfdae.own_stars.observation import Observation, Source
-from psfdae.own_stars.photometry import noise_equivalent_px, signal_to_noise
+from psfdae.own_stars.photometry import signal_to_noise
 from psfdae.own_stars.report import MEAN_PSF, fitted_mean, standing
-from psfdae.own_stars.selection import collect
+from psfdae.own_stars.selection import BrightStars, collect
 from psfdae.own_stars.training_images import single_psf, star_grid, training_columns
 from psfdae.reading import read_table
 from psfdae.rng import stream
@@ -244,9 +244,8 @@ def _make(
         found.bright, grid, held_out, wanted.bins, framing, config.parts, rng
     )
     write_product(files.stars, "stars", columns, _described(config, observation))
-    images = columns["realisation"].values[~held_out[columns["field_index"].values]]
     sky = found.bright.sky_photons(observation.gain, config.noise.background_photons)
-    settings = {**config.model_dump(), "noise": _noise(config, images, sky)}
+    settings = {**config.model_dump(), "noise": _noise(config, found.bright, sky)}
     write_text(files.path / "overrides.txt", _overrides(settings))
     for kind in files.kinds:
         print(f"fitting {kind.label}")
@@ -317,10 +316,10 @@ def _described(config: Any, observation: Observation) -> dict[str, Any]:
     }
 
 
-def _noise(config: Any, images: np.ndarray, background: float) -> dict[str, Any]:
+def _noise(config: Any, bright: BrightStars, background: float) -> dict[str, Any]:
     """Config group `noise` with the levels of the S/N asked for, of noise-free stars."""
-    area, kappa = noise_equivalent_px(images.mean(axis=0, dtype=np.float64)), config.noise.kappa
-    levels = [1.0 / (snr * np.sqrt(area) * kappa) for snr in config.calibration_stars.snr_levels]
+    area, kappa = float(np.median(bright.area())), config.noise.kappa
+    levels = [1.0 / (snr * np.sqrt(area) * kappa) for snr in config.calibration_stars.degraded()]
     noise = Noise(
         name=config.noise.name,
         levels=[float(f"{level:.9g}") for level in reversed(levels)],
@@ -366,12 +365,11 @@ def report(config: Any, files: Made, restored: dict[float, dict[str, np.ndarray]
     import pandas as pd
 
     from psfdae.evaluation.metrics import all_metrics, clustered_mean
-    from psfdae.stages.common import read_stars, split_stars
+    from psfdae.stages.common import read_stars, split_stars, star_area
 
     product = read_stars(files.stars, REFERENCE)
     parts = split_stars(product, SPLIT, config)
-    images = product["realisation"]
-    area = noise_equivalent_px(images[parts.train].mean(axis=0, dtype=np.float64))
+    area = star_area(product, parts.train)
     rows = [read_table(files.path / "evaluation.csv")]
     star = product["field_index"][parts.test]
     for level, found in restored.items():
