@@ -29,6 +29,7 @@ from psfdae.own_stars.stamps import (
     Stamps,
     StarFlag,
     border_median,
+    border_scatter,
     cut,
     displacement,
     raise_flag,
@@ -37,6 +38,7 @@ from psfdae.threads import side_by_side
 
 SCALE_TOLERANCE = 0.02  # relative difference of the pixel scale from that of the training
 SNR_TOLERANCE = 1.25  # beyond the trained S/N without a flag: a faint star's is no better known
+SKY_SIGMA = 5.0  # scatter of the border by which its median may differ from a sky that is given
 FLUX_FACTOR = (0.5, 2.0)  # by which a method may correct the flux of a star
 BLOCK = 256  # stars that a network computes together, always so many: other numbers round otherwise
 MOST_OVERSAMPLED = 32  # values per pixel and axis
@@ -317,6 +319,8 @@ class Engine:
         exact = fixed & np.isfinite(stars.listed).all(axis=1)
         stamps, bad, shift, flags = self._centred(stars, exact)
         start = border_median(stamps, bad)
+        unlike_sky = np.abs(start - stars.background) > SKY_SIGMA * border_scatter(stamps)
+        raise_flag(flags, StarFlag.SKY_OFF, unlike_sky)
         found = self._photometer.measure(stamps, bad, start, stars)
         told: dict[str, np.ndarray] = {}
         if self.estimator.measures:

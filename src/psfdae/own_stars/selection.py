@@ -104,7 +104,8 @@ class Candidates:
     snr: np.ndarray
     noise: np.ndarray  # RMS of the sky in counts per pixel
     sky: np.ndarray  # its level, likewise
-    brightest: np.ndarray  # pixel in counts, sky included; -inf off centre
+    brightest: np.ndarray  # pixel of the star in counts, sky included; -inf off centre
+    highest: np.ndarray  # pixel of the stamp, likewise; -inf if none can be used
     verdict: np.ndarray  # a `Verdict` for every star
     bright: BrightStars  # the good ones
 
@@ -146,7 +147,7 @@ def collect(observation: Observation, settings: CalibrationStars, framing: Frami
     side, verdict, noise, snr = framing.stamp_px, found["verdict"], found["noise"], found["snr"]
     row = np.flatnonzero(verdict == Verdict.GOOD)
     if observation.saturate is None:
-        flat = found["brightest"] >= piled_up(found["brightest"], found["sky"], snr * noise)
+        flat = found["highest"] >= piled_up(found["brightest"], found["sky"], snr * noise)
         verdict[flat & (verdict == Verdict.GOOD)] = Verdict.SATURATED
     close = crowded(found["position"], snr * noise, settings.isolation_px, settings.neighbour_ratio)
     verdict[close & (verdict == Verdict.GOOD)] = Verdict.CROWDED
@@ -205,6 +206,7 @@ def _measure(
         "noise": noise,
         "sky": level,
         "brightest": level + np.where(centred, _at(wide, peak), -np.inf),
+        "highest": cut(np.where(chunk.bad, -np.inf, chunk.data), side).max(axis=(1, 2)),
         "verdict": verdict,
     }
     good = verdict == Verdict.GOOD
@@ -218,7 +220,7 @@ def _at(wide: np.ndarray, peak: np.ndarray) -> np.ndarray:
 
 
 def piled_up(brightest: np.ndarray, sky: np.ndarray, brightness: np.ndarray) -> float:
-    """Counts at which the brightest pixels of stars pile up; infinite if they do not.
+    """Counts, of six digits, from which brightest pixels of stars pile up; infinite if none do.
 
     Stars of the same brightness have the same brightest pixels, too. Of those that are cut
     off, the brightest pixel is less of the star than in others.
@@ -239,7 +241,13 @@ def piled_up(brightest: np.ndarray, sky: np.ndarray, brightness: np.ndarray) -> 
     sharpness = height / np.where(brightness > 0, brightness, 1.0)
     if np.median(sharpness[piled]) > PILE_SHARPNESS * np.median(sharpness[others]):
         return np.inf
-    return float(brightest[piled].min())
+    return _rounded_down(float(brightest[piled].min()))
+
+
+def _rounded_down(value: float) -> float:
+    """Six digits, so that a level that is printed is the one that is meant."""
+    unit = 10.0 ** (np.floor(np.log10(value)) - 5) if value > 0 else 1.0
+    return float(f"{np.floor(value / unit * (1 + 1e-12)) * unit:.6g}")
 
 
 def signal_to_noise(stamps: np.ndarray, noise: np.ndarray) -> np.ndarray:

@@ -52,6 +52,7 @@ class StarFlag(IntFlag):
     OFF_CENTRE = 256
     UNLIKE_TRAINING = 512
     BLENDED = 1024
+    SKY_OFF = 2048
 
 
 MEANING: dict[StarFlag, str] = {
@@ -66,6 +67,7 @@ MEANING: dict[StarFlag, str] = {
     StarFlag.OFF_CENTRE: "brightest pixel farther from the centre than the stamp could be moved",
     StarFlag.UNLIKE_TRAINING: "farther from the training set than 99.9 % of its test stars",
     StarFlag.BLENDED: "the star list says that it was parted from a neighbour",
+    StarFlag.SKY_OFF: "the sky that was given is over 5 sigma off the border of the stamp",
 }
 """One line for every flag."""
 

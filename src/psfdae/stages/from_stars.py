@@ -20,7 +20,7 @@ from psfdae.estimators import Method, all_groups, groups_of, method
 from psfdae.files import Product, write_csv, write_product, write_text
 from psfdae.own_stars.advice import advice
 from psfdae.own_stars.bundle import SUFFIX
-from psfdae.own_stars.observation import Observation, Source
+from psfdae.own_stars.observation import Observation, Source, list_offset
 from psfdae.own_stars.photometry import signal_to_noise
 from psfdae.own_stars.report import MEAN_PSF, fitted_mean, standing
 from psfdae.own_stars.selection import BrightStars, collect
@@ -230,7 +230,9 @@ def _make(
     framing, wanted = config.framing, config.calibration_stars
     observation = exposure.open(framing.stamp_px, wanted.margin_px).assuming()
     found = collect(observation, wanted, framing)
-    notes = [observation.said(), *advice(found, observation, framing.stamp_px)]
+    off = (found.bright.centre - found.bright.listed)[:, ::-1]
+    notes = [observation.said(), list_offset(exposure.catalogue, off, exposure.accept_offset)]
+    notes = [*filter(None, notes), *advice(found, observation, framing.stamp_px)]
     print(*notes, sep="\n")
     grid = star_grid(found.bright.position)
     held_out = held_out_fields(grid)
@@ -263,7 +265,9 @@ def _make(
     own = part(bundle.stage.reads, settings)  # type: ignore[attr-defined]
     models = Models(**{taken.name: files.fit(taken)})
     bundle(own, files.stars, models, SPLIT, REFERENCE, licence=licence, out=files.bundle)
-    restored = tested(checked, files, taken, single_psf(found.bright, held_out), framing.jitter_px)
+    fitted = taken.load(files.fit(taken), REFERENCE, checked.evaluation)
+    print("".join(f"{taken.label}: {fact}\n" for fact in fitted.facts().values()), end="")
+    restored = tested(checked, files, fitted, single_psf(found.bright, held_out), framing.jitter_px)
     errors = report(checked, files, restored)
     if page is not None:
         print(f"writing {page}")
@@ -309,6 +313,7 @@ def _described(config: Any, observation: Observation) -> dict[str, Any]:
         **kept,
         "source": "stars",
         "image": observation.path.name,
+        **({"image_px": [*reversed(observation.shape)]} if observation.shape else {}),
         "telescope": {
             "pixel_scale_arcsec": observation.pixel_scale_arcsec,
             **({"assumed": True} if observation.scale_assumed else {}),
@@ -335,7 +340,7 @@ def _overrides(settings: dict[str, Any]) -> str:
 
 
 def tested(
-    config: Any, files: Made, kind: type[Method], mean: np.ndarray, jitter_px: int
+    config: Any, files: Made, fitted: Method, mean: np.ndarray, jitter_px: int
 ) -> dict[float, dict[str, np.ndarray]]:
     """By noise level λ: stars held out, and what the model and one mean PSF make of them faint."""
     from psfdae.stages.common import (
@@ -348,7 +353,6 @@ def tested(
     product = read_stars(files.stars, REFERENCE)
     test = split_stars(product, SPLIT, config).test
     place = field_positions(product)[test]
-    fitted = kind.load(files.fit(kind), REFERENCE, config.evaluation)
     restored = {}
     for level in config.noise.levels:
         noisy = noisy_test_images(config, product, test, level)

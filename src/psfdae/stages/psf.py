@@ -44,7 +44,10 @@ def psf(
     places = np.array([_place(text) for text in at]) if at else _grid(str(grid), loaded)
     # About the middle of a pixel: what comes out is centred.
     x, y = np.rint(places).T
-    write(out, loaded, places, loaded.psf_at(x, y, oversampling), oversampling)
+    images = loaded.psf_at(x, y, oversampling)
+    for note in _notes(loaded, places):
+        print(f"{model}: {note}")
+    write(out, loaded, places, images, oversampling)
 
 
 def _place(text: str) -> tuple[float, float]:
@@ -55,6 +58,32 @@ def _place(text: str) -> tuple[float, float]:
         return float(found[1]), float(found[2])
     except ValueError:
         raise PredictionError(f"--at {text!r}: expected X,Y, such as 100,250.5") from None
+
+
+def _notes(model: PsfModel, places: np.ndarray) -> list[str]:
+    """What is to be said of places (n, 2); PredictionError if one is off the image."""
+    low, high = np.array(model.bundle.weights["low"]), np.array(model.bundle.weights["high"])
+    said = model.info.config.get("stars", {}).get("image_px")
+    if said is not None:
+        off = ((places < -0.5) | (places >= np.array(said) - 0.5)).any(axis=1)
+        for x, y in places[off][:1]:
+            raise PredictionError(
+                f"{x:g},{y:g} is off the image of {said[0]} columns and {said[1]} rows, of which "
+                f"the model {model.info.name!r} is"
+            )
+    field, notes = model.engine.estimator, []
+    beyond = int(((places < low) | (places > high)).any(axis=1).sum())
+    if beyond and (high > low).all():
+        x, y = (
+            f"{a} {least:.6g} … {most:.6g}" for a, least, most in zip("xy", low, high, strict=True)
+        )
+        notes.append(
+            f"{beyond} of {len(places)} places are beyond the training stars, {x}, {y}; the PSF "
+            "there is that of their edge"
+        )
+    if len(places) > 1 and field.model.order == 0:
+        notes.append(f"{field.facts()['Field']}: all {len(places)} PSFs are equal")
+    return notes
 
 
 def _grid(text: str, model: PsfModel) -> np.ndarray:

@@ -41,6 +41,7 @@ def told(
         exposure = replace(exposure, detect=None, catalogue=files.list)
     model = load_model(files.bundle)
     info = model.info
+    exposure = replace(exposure, accept_offset=True)  # as far as the training did
     observation = exposure.open(info.stamp_px, MARGIN_PX).assuming()
     held = np.flatnonzero(selection.part == "held out")
     place = selection[["x", "y"]].to_numpy()[held]
@@ -72,5 +73,6 @@ def told(
             bright=psf + residual,
             strip=(files.path / "report.png").read_bytes(),
             field=field,
+            facts=[*model.engine.estimator.facts().values()],
         )
     )
