@@ -42,12 +42,11 @@ def psf(
         raise PredictionError("--at X,Y or --grid COLUMNSxROWS says where")
     loaded = load_model(model)
     places = np.array([_place(text) for text in at]) if at else _grid(str(grid), loaded)
-    # About the middle of a pixel: what comes out is centred.
-    x, y = np.rint(places).T
-    images = loaded.psf_at(x, y, oversampling)
     for note in _notes(loaded, places):
         print(f"{model}: {note}")
-    write(out, loaded, places, images, oversampling)
+    # About the middle of a pixel: what comes out is centred.
+    x, y = np.rint(places).T
+    write(out, loaded, places, loaded.psf_at(x, y, oversampling), oversampling)
 
 
 def _place(text: str) -> tuple[float, float]:
@@ -62,14 +61,15 @@ def _place(text: str) -> tuple[float, float]:
 
 def _notes(model: PsfModel, places: np.ndarray) -> list[str]:
     """What is to be said of places (n, 2); PredictionError if one is off the image."""
+    model.psf_at(0.0, 0.0, 1)  # or it has no field
     low, high = np.array(model.bundle.weights["low"]), np.array(model.bundle.weights["high"])
-    said = model.info.config.get("stars", {}).get("image_px")
-    if said is not None:
-        off = ((places < -0.5) | (places >= np.array(said) - 0.5)).any(axis=1)
+    size = model.info.config.get("stars", {}).get("image_px")
+    if size is not None:
+        off = ((places < -0.5) | (places >= np.array(size) - 0.5)).any(axis=1)
         for x, y in places[off][:1]:
             raise PredictionError(
-                f"{x:g},{y:g} is off the image of {said[0]} columns and {said[1]} rows, of which "
-                f"the model {model.info.name!r} is"
+                f"{x:g},{y:g} is off the image of {size[0]} columns and {size[1]} rows that the "
+                f"model {model.info.name!r} was trained on"
             )
     field, notes = model.engine.estimator, []
     beyond = int(((places < low) | (places > high)).any(axis=1).sum())
