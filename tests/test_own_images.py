@@ -122,7 +122,7 @@ def test_chi2_of_bright_stars_is_about_one(sky):
     for low, high in ((5, 10), (10, 100), (100, 3500)):
         some = unseen & (sky.snr > low) & (sky.snr < high)
         assert some.sum() >= 5
-        assert 0.8 < np.median(sky.stars["chi2"][some]) < 1.3, low
+        assert 0.65 < np.median(sky.stars["chi2"][some]) < 1.3, low
     page = sky.page.read_text(encoding="utf-8")
     assert re.search(r"median \d\.\d\d at S/N from 100 \(\d+ stars\)", page)
 
@@ -245,17 +245,19 @@ def test_defaults_of_fields_are_those_of_the_configuration():
 
 def test_the_advised_saturation_flags_as_many_stars_as_it_says(sky, tmp_path):
     """Stamps with a saturated neighbour, too; a cut that is not sharp, as of a plate."""
-    level = np.quantile(sky.pixels, 0.9995)
+    level = np.quantile(sky.pixels, 0.9990)
     over = np.maximum(sky.pixels - level, 0.0)
     plate = np.minimum(sky.pixels, level) + 0.01 * level * (1 - np.exp(-over / level))
+    x, y = np.rint(sky.position[sky.snr < 10][:3]).astype(int).T
+    plate[y, x + 7] = plate.max()  # a neighbour that is saturated
     path = tmp_path / "plate.fits"
     fits.PrimaryHDU(plate.astype(np.float32)).writeto(path)
-    config = load_stage(from_stars.stage.reads, ["dataset=from_stars", "framing.stamp_px=48"])
+    config = load_stage(from_stars.stage.reads, ["dataset=from_stars", "framing.stamp_px=22"])
     stars = config.calibration_stars.model_copy(update={"stars_min": 10})
-    found = collect(Source(path, sky.list).open(48, 8), stars, config.framing)
+    found = collect(Source(path, sky.list).open(22, 8), stars, config.framing)
     said = re.search(r"(\d+) stamps have .*--saturate (\S+) ", saturation_advice(found))
     assert (found.verdict == "saturated").sum() <= int(said[1])
-    observation = Source(path, sky.list, saturate=float(said[2])).open(48, 0)
+    observation = Source(path, sky.list, saturate=float(said[2])).open(22, 0)
     flagged = np.concatenate([s.saturated.any(axis=(1, 2)) for s in observation.chunks(64)])
     assert flagged.sum() == int(said[1]) > (found.brightest >= float(said[2])).sum()
 
