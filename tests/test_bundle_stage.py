@@ -68,6 +68,8 @@ def write_stars(path, config):
         "field_index": Column(np.arange(1400) % 25, "1", "field"),
         "grid": Column(grid, "1", "index"),
         "position": Column(100.0 * grid, "pixel", "of stars of an image"),
+        "noise": Column(np.full(25, 1e-3), "1", "of stars of an image"),
+        "snr": Column(np.full(25, 250.0), "1", "of stars of an image"),
     }
     write_product(path, "stars", columns, config)
     return path
@@ -129,6 +131,8 @@ def test_unknown_optics_have_no_diffraction_limit(folder, tmp_path):
     info = read_bundle(tmp_path / "own").info
     assert (info.pixel_lambda_d, info.source, info.subpixel) == (None, "stars", False)
     assert info.pixel_scale_arcsec == 2.0
+    assert info.noise_equivalent_px == pytest.approx((1e-3 * 250) ** -2)
+    assert info.training_stars == 25  # and not the 1000 images of them
 
 
 def test_metrics_are_those_of_the_stage_evaluate(folder, tiny):

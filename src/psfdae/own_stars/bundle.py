@@ -98,8 +98,8 @@ class BundleInfo(_Described):
 
     Noise is the RMS of the sky noise in a pixel divided by the flux of the star
     inside its stamp, κλ in the words of the simulation. The signal to noise ratio is
-    that of a matched filter on the mean PSF, 1 / (noise · √A), with the
-    noise-equivalent area A (King 1983, PASP 95, 163).
+    that of a filter matched to the star, 1 / (noise · √A), with the noise-equivalent
+    area A (King 1983, PASP 95, 163) of the typical star of the training.
     """
 
     format_version: Count = FORMAT_VERSION
@@ -121,7 +121,7 @@ class BundleInfo(_Described):
     noise_max: Positive
     snr_min: Positive
     snr_max: Positive
-    noise_equivalent_px: Positive = Field(description="A = 1 / Σ(mean PSF)²")
+    noise_equivalent_px: Positive = Field(description="A = 1 / ΣPSF² of the typical star")
     components: Annotated[int, Field(ge=1, le=1024)] = Field(
         description="leading eigenvectors: stored, and in the distance"
     )

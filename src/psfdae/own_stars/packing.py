@@ -25,7 +25,7 @@ import numpy as np
 from psfdae.estimators import Estimate, Method
 from psfdae.own_stars.bundle import Bundle, BundleError, at_noise, mahalanobis
 from psfdae.own_stars.model import SNR_TOLERANCE, PsfModel
-from psfdae.own_stars.photometry import FluxModel, noise_equivalent_px, signal_to_noise
+from psfdae.own_stars.photometry import FluxModel, signal_to_noise
 from psfdae.stars.noise import NoiseModel
 
 NODES = 8  # noise levels at which errors are measured, equidistant in the logarithm
@@ -142,9 +142,8 @@ def leading(model: FluxModel, components: int) -> FluxModel:
     return replace(model, variance=variance)
 
 
-def reach(band: np.ndarray, mean: np.ndarray) -> dict[str, float]:
-    """Range of noise and S/N of a training, from its noise levels σ and its mean PSF."""
-    area = noise_equivalent_px(mean)
+def reach(band: np.ndarray, area: float) -> dict[str, float]:
+    """Range of noise and S/N of a training, from its noise levels σ and its stars' area A in px."""
     least, most = float(band.min()), float(band.max())
     return {
         "noise_min": least,

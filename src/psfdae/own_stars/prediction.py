@@ -55,10 +55,12 @@ class Prediction:
     background, noise : ndarray, shape (n,), float64
         Sky level and RMS of the sky noise in a pixel.
     snr : ndarray, shape (n,), float64
-        flux / (noise √A), with the model's noise-equivalent area A.
+        Of a filter matched to the star as restored, √Σ psf² / noise: flux / (noise √A), with
+        its own noise-equivalent area A.
     chi2 : ndarray, shape (n,), float64
-        Mean of (residual / σ)² over the used pixels; σ² is noise² and, if the gain is
-        known, the star's own photon noise.
+        Mean of (residual / σ)² over the used pixels, divided by what is expected of it, which is
+        below 1 where the restored star follows its own noise; σ² is noise² and, if the gain is
+        known, the star's own photon noise. Stars that a model has learnt from have less than 1.
     distance : ndarray, shape (n,), float64
         Mahalanobis distance from the training set (`psfdae.own_stars.bundle.mahalanobis`).
     strangeness : ndarray, shape (n,), float64
@@ -161,9 +163,9 @@ COLUMNS: dict[str, tuple[str, str | None, str]] = {
     "flux_error": ("D", UNIT, "standard error; NaN if the flux was given"),
     "background": ("D", UNIT, "sky per pixel"),
     "noise": ("D", UNIT, "RMS of the sky noise in a pixel"),
-    "snr": ("D", None, "flux / (noise sqrt(A))"),
+    "snr": ("D", None, "of a matched filter, sqrt(sum of PSF^2) / noise"),
     "ratio95": ("D", None, "UNCERT times this holds 95 % of the errors"),
-    "chi2": ("D", None, "mean squared residual over its variance"),
+    "chi2": ("D", None, "squared residuals over their expectation"),
     "distance": ("D", None, "Mahalanobis distance from the training set"),
     "strangeness": ("D", None, "its square by the model's own law of stars"),
     "fwhm_px": ("D", "pix", "of the PSF, adaptive moments"),
@@ -263,7 +265,7 @@ def _primary_header(bundle: Bundle, cards: Sequence[Card], history: str) -> Any:
         ("PSFSHA", bundle.sha256, ""),
         ("PSFFORM", info.format_version, "format of the bundle"),
         ("STAMPPX", info.stamp_px, "[pix] side of the stamps"),
-        ("NOISEAPX", info.noise_equivalent_px, "[pix] noise-equivalent area A of the S/N"),
+        ("NOISEAPX", info.noise_equivalent_px, "[pix] noise-equivalent area of a typical star"),
         ("SNRMIN", info.snr_min, "least S/N of the training"),
         ("SNRMAX", info.snr_max, "largest S/N of the training"),
         ("DISTMAX", bundle.distance_limit, "largest distance that raises no flag"),

@@ -39,6 +39,7 @@ from psfdae.stages.common import (
     noisy_test_images,
     read_stars,
     split_stars,
+    star_area,
 )
 from psfdae.stages.evaluate import Models
 from psfdae.stages.fit import fit_apart, training_set
@@ -122,7 +123,7 @@ def bundle(
         float(band.min()),
         1e6 * (largest_mb or np.inf),
     )
-    reach = packing.reach(band, model.mean)
+    reach = packing.reach(band, star_area(product, parts.train))
     info = BundleInfo(
         psfdae_version=psfdae.__version__,
         name=name or out.name.removesuffix(SUFFIX),
@@ -132,7 +133,7 @@ def bundle(
         **reach,
         components=packing.COMPONENTS,
         training_sha256=packing.checksum(images[parts.train], references[parts.train]),
-        training_stars=parts.train.size,
+        training_stars=_trained_on(product, parts.train),
         **(said or {"method": kind.name, "reference": restored}),
         config={
             "stars": product.config,
@@ -189,6 +190,12 @@ def _refuse_mismatch(trained: dict[str, Any], asked: dict[str, Any], path: Path)
             f"{path}: the network was trained with {differing[0]}, "
             f"but the bundle is asked for with {other}"
         )
+
+
+def _trained_on(product: Product, train: np.ndarray) -> int:
+    """Stars of the training; those of an image are in several of its images each."""
+    own = product.config.get("source") == "stars"
+    return len(np.unique(product["field_index"][train])) if own else len(train)
 
 
 def _kind_of_stamps(product: Product) -> dict[str, Any]:
@@ -308,6 +315,7 @@ def _facts(packed: Bundle) -> dict[str, str]:
         network = {"Network": f"{shape}; {count} weights"}
     else:
         network = {"Method": f"{method(info.method).label}; {count} numbers"}
+    own = {} if info.dae else estimator(packed).facts()
     return {
         "Name": info.name,
         "Format": f"{info.format_version}, written {info.created} by psfdae {info.psfdae_version}",
@@ -319,6 +327,7 @@ def _facts(packed: Bundle) -> dict[str, str]:
         "S/N": f"{info.snr_min:.3g} to {info.snr_max:.3g}",
         "Noise-equivalent area": f"{info.noise_equivalent_px:.3g} px",
         **network,
+        **own,
         "Trained on": f"{info.training_stars} {_KINDS[info.source]}, "
         f"SHA-256 {info.training_sha256[:16]}…",
         "Distance limit": f"{packed.distance_limit:.3g} in {info.components} components",
