@@ -76,6 +76,7 @@ def handmade(model, gaussian_stars):
         error68=rng.random((3, 16, 16), np.float32),
         rms=rng.random((3, 16, 16), np.float32),
         distance_limit=9.5,
+        ratio95=np.full(3, 1.9),
     )
 
 
@@ -168,7 +169,7 @@ def test_newer_format_is_refused_with_both_versions(file, tmp_path):
     raw = file.read_bytes()
     path = tmp_path / "new.psf.safetensors"
     path.write_bytes(with_text(raw, lambda text: text.update(format_version=7, info="other")))
-    assert "format 7, but psfdae 0.1.0 reads up to format 2" in refused(path)
+    assert "format 7, but psfdae 0.1.0 reads up to format 3" in refused(path)
     result = CliRunner().invoke(main, ["describe", str(path)])
     assert result.exit_code == 2
     assert result.output.startswith(f"psfdae: {path}: format 7")

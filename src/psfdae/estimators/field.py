@@ -753,9 +753,8 @@ class FieldMixture(Method):
             second[rows] += w[..., None] * (alone + told[:, :, None] * told[:, None, :])
             second[rows] += doubt[..., None] * with_a[:, :, None] * with_a[:, None, :]
         psf = star / total
-        variance = square + inside - 2 * psf * (with_flux + with_slope)
-        variance += psf**2 * (total2 + unsure)
-        sigma = np.sqrt(np.maximum(variance, 0.0)) / np.abs(total)
+        # Of the star as it is: the doubt about its flux is in its pixels.
+        sigma = np.sqrt(np.maximum(square + inside - star**2, 0.0)) / np.abs(total)
         return first, second - first[:, :, None] * first[:, None, :], strange, psf, sigma
 
 
