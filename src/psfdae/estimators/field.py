@@ -715,8 +715,8 @@ class FieldMixture(Method):
         """
         count, pixels = stars.images.shape
         first, second = np.zeros((count, 4)), np.zeros((count, 4, 4))
-        star, square, with_flux, inside, with_slope = np.zeros((5, count, pixels))
-        total, total2, unsure = np.zeros((3, count, 1))
+        star, square, inside = np.zeros((3, count, pixels))
+        total = np.zeros((count, 1))
         strange = np.zeros(count)
         for k, kind, rows in self._asked(stars, number, weight > 0):
             factor, w = self._factor(k, kind), weight[rows, k, None]
@@ -738,12 +738,8 @@ class FieldMixture(Method):
             doubt = w * fit.variance[:, None]
             star[rows] += w * one
             square[rows] += w * one**2
-            with_flux[rows] += w * flux * one
             inside[rows] += w * factor.variance + doubt * change**2
-            with_slope[rows] += doubt * change
             total[rows] += w * flux
-            total2[rows] += w * flux**2
-            unsure[rows] += doubt
             place = self.places[k] if stars.centre is None else stars.centre[rows]
             told = np.hstack([flux, sky, place + factor.scale[1:] * latent[:, 1:]])
             with_a = np.hstack([np.ones_like(flux), -factor.scale * pull])

@@ -476,7 +476,9 @@ def _check(info: BundleInfo, tensors: Mapping[str, np.ndarray], path: Path) -> N
     }
     if info.format_version > 1:
         wanted = {"ratio95", *(SCALES if set(SCALES) & set(tensors) else ())}
-        wanted |= set(FREE) & set(tensors) - set(SCALES if info.format_version < 3 else ("widening",))
+        wanted |= set(FREE) & set(tensors) - set(
+            SCALES if info.format_version < 3 else ("widening",)
+        )
         expected |= {name: (nodes, *FREE[name]) for name in wanted}
     expected |= _of_method(info, tensors, path)
     if set(tensors) != set(expected):
