@@ -223,14 +223,12 @@ def test_a_method_that_knows_how_sure_it_is_covers_68_and_95_per_cent(folder, ti
 
 
 def test_bright_pixels_are_covered_as_the_others_are(tiny):
-    """Of unseen stars whose flux and sky are found; in bright ones a network errs by more."""
+    """Of unseen stars whose flux and sky are found."""
     images, rng = gaussians(1500, 99), np.random.default_rng(5)
     model = PsfModel(tiny)
-    same = [np.repeat(t[..., :1], 2, axis=-1) for t in (tiny.scale68, tiny.scale95)]
-    flat = PsfModel(replace(tiny, scale68=same[0], scale95=same[1]))
     for noise in (6e-3, 1.5e-2):
         noisy = images + noise * rng.normal(size=images.shape) + 3.0
-        found, by_one = model.predict(noisy), flat.predict(noisy)
+        found = model.predict(noisy)
         kept = np.isfinite(found.psf).all(axis=(1, 2))
         error, width = np.abs(found.psf - images)[kept], found.uncertainty[kept]
         bright = brightest(found.psf[kept])
@@ -240,7 +238,6 @@ def test_bright_pixels_are_covered_as_the_others_are(tiny):
             wide = width * ratio[kept, None, None]
             assert (error <= width)[pixels].mean() == pytest.approx(0.683, abs=0.03)
             assert (error <= wide)[pixels].mean() == pytest.approx(0.95, abs=0.02)
-        assert (error <= by_one.uncertainty[kept])[bright].mean() < 0.6
 
 
 def test_signal_to_noise_is_that_of_a_matched_filter():
