@@ -195,7 +195,8 @@ class Estimate:
     ----------
     psf : ndarray, shape (n, d, d)
     sigma : ndarray, shape (n, d, d), or None
-        Standard deviation of each pixel of the PSF.
+        Standard deviation of each pixel of the PSF; of a method that measures stars, of the star
+        over its flux, the doubt about the flux included.
     evidence : ndarray, shape (n,), or None
         Logarithm of the probability density of each noisy image.
     flux : ndarray, shape (n,), or None

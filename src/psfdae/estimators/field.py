@@ -748,8 +748,8 @@ class FieldMixture(Method):
         """
         count, pixels = stars.images.shape
         first, second = np.zeros((count, 4)), np.zeros((count, 4, 4))
-        star, square, with_flux, inside, with_slope = np.zeros((5, count, pixels))
-        total, total2, unsure = np.zeros((3, count, 1))
+        star, square, inside = np.zeros((3, count, pixels))
+        total = np.zeros((count, 1))
         strange = np.zeros(count)
         for k, kind, rows in self._asked(stars, number, weight > 0):
             factor, w = self._factor(k, kind), weight[rows, k, None]
@@ -771,12 +771,8 @@ class FieldMixture(Method):
             doubt = w * fit.variance[:, None]
             star[rows] += w * one
             square[rows] += w * one**2
-            with_flux[rows] += w * flux * one
             inside[rows] += w * factor.variance + doubt * change**2
-            with_slope[rows] += doubt * change
             total[rows] += w * flux
-            total2[rows] += w * flux**2
-            unsure[rows] += doubt
             place = self.places[k] if stars.centre is None else stars.centre[rows]
             told = np.hstack([flux, sky, place + factor.scale[1:] * latent[:, 1:]])
             with_a = np.hstack([np.ones_like(flux), -factor.scale * pull])
@@ -786,9 +782,8 @@ class FieldMixture(Method):
             second[rows] += w[..., None] * (alone + told[:, :, None] * told[:, None, :])
             second[rows] += doubt[..., None] * with_a[:, :, None] * with_a[:, None, :]
         psf = star / total
-        variance = square + inside - 2 * psf * (with_flux + with_slope)
-        variance += psf**2 * (total2 + unsure)
-        sigma = np.sqrt(np.maximum(variance, 0.0)) / np.abs(total)
+        # Of the star as it is: the doubt about its flux is in its pixels.
+        sigma = np.sqrt(np.maximum(square + inside - star**2, 0.0)) / np.abs(total)
         return first, second - first[:, :, None] * first[:, None, :], strange, psf, sigma
 
 

@@ -18,6 +18,7 @@ from psfdae.own_stars.bundle import (
     Bundle,
     BundleInfo,
     at_noise,
+    brightest,
     estimator,
     mahalanobis,
     read_bundle,
@@ -344,10 +345,12 @@ class Engine:
         ratio95 = np.full(len(noise), np.nan)
         if bundle.ratio95 is not None:
             ratio95 = np.interp(noise, bundle.noise_nodes, bundle.ratio95)
-        if bundle.widening is not None:
-            wider, widest, of_flux = self._widening(noise, stars)
-            uncertainty *= wider.astype(np.float32)[:, None, None]
-            ratio95 *= widest / wider
+        ratios = np.stack([ratio95, ratio95], axis=1)
+        if (tables := bundle.scales()) is not None:
+            wider, widest, of_flux = self._scales(tables, noise, stars)
+            faint, bright = wider.T.astype(np.float32)[:, :, None, None]
+            uncertainty *= np.where(brightest(psf), bright, faint)
+            ratios *= widest / wider
             found = replace(found, flux_error=found.flux_error * of_flux)
         psf *= flux
         uncertainty *= flux
@@ -373,7 +376,8 @@ class Engine:
             psf=psf,
             residual=residual,
             uncertainty=uncertainty,
-            ratio95=ratio95,
+            ratio95=ratios[:, 0],
+            ratio95_bright=ratios[:, 1],
             flux=found.flux,
             flux_error=np.sqrt(found.flux_error**2 + photons),
             background=found.background,
@@ -391,21 +395,30 @@ class Engine:
             **(told or unmeasured(len(stars))),
         )
 
-    def _widening(self, noise: np.ndarray, stars: Stamps) -> tuple[np.ndarray, ...]:
-        """Factors of the half-widths of 68 % and 95 % and of the error of the flux, each (n,).
+    def _scales(
+        self, tables: list[np.ndarray], noise: np.ndarray, stars: Stamps
+    ) -> tuple[np.ndarray, ...]:
+        """Factors of the half-widths of 68 % and 95 %, (n, 2), and of the error of the flux, (n,).
 
         They are those of what was estimated: the noise, the flux, the sky.
         """
-        nodes, table = self.bundle.noise_nodes, self.bundle.widening
-        assert table is not None
-        *widths, of_flux = (np.interp(noise, nodes, factor) for factor in table.T)
+        nodes = self.bundle.noise_nodes
         noise_too, flux_too, sky_too = (
             np.isnan(known) for known in (stars.noise, stars.flux, stars.background)
         )
-        case = np.where(sky_too, 2, np.where(flux_too, 1, 0))
+        case, star = np.where(sky_too, 3, np.where(flux_too, 2, 1)), np.arange(len(noise))
+
+        def at(table: np.ndarray) -> np.ndarray:
+            """A table (S, …) at the noise of each star."""
+            columns = table.reshape(len(nodes), -1).T
+            found = np.stack([np.interp(noise, nodes, column) for column in columns], axis=1)
+            return found.reshape(-1, *table.shape[1:])
+
+        *widths, of_flux = map(at, tables)
+        # What the estimated noise has for its part is between the first two cases.
         wider, widest = (
-            np.choose(case, of) / np.where(noise_too, 1.0, of[0])
-            for of in (widths[::2], widths[1::2])
+            np.where(noise_too[:, None], t[star, case], t[star, case] * t[:, 0] / t[:, 1])
+            for t in widths
         )
         return wider, widest, np.where(flux_too & sky_too, of_flux, 1.0)
 

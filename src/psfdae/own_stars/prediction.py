@@ -45,10 +45,11 @@ class Prediction:
     residual : ndarray, shape (n, d, d), float32
         Stamp − sky − `psf`; NaN in pixels that were not used.
     uncertainty : ndarray, shape (n, d, d), float32
-        Half-width that holds 68.27 % of the errors of `psf` at this S/N, as found on
-        the test stars of the model; in units of the star's own σ where the model knows it.
-    ratio95 : ndarray, shape (n,), float64
-        `uncertainty` times this holds 95 % of the errors; NaN where the model does not say.
+        Half-width that holds 68.27 % of the errors of `psf` at this S/N, of the brightest
+        pixels (`psfdae.own_stars.bundle.brightest`) and of the others, as found on test stars.
+    ratio95, ratio95_bright : ndarray, shape (n,), float64
+        `uncertainty` times this holds 95 % of the errors, in the brightest pixels the second
+        one; NaN where the model does not say.
     flux, flux_error : ndarray, shape (n,), float64
         Flux inside the stamp, in the unit of the stamps; the error is NaN where the
         flux was given.
@@ -84,6 +85,7 @@ class Prediction:
     residual: np.ndarray
     uncertainty: np.ndarray
     ratio95: np.ndarray
+    ratio95_bright: np.ndarray
     flux: np.ndarray
     flux_error: np.ndarray
     background: np.ndarray
@@ -165,6 +167,7 @@ COLUMNS: dict[str, tuple[str, str | None, str]] = {
     "noise": ("D", UNIT, "RMS of the sky noise in a pixel"),
     "snr": ("D", None, "of a matched filter, sqrt(sum of PSF^2) / noise"),
     "ratio95": ("D", None, "UNCERT times this holds 95 % of the errors"),
+    "ratio95_bright": ("D", None, "the same in the brightest 8 % of the pixels"),
     "chi2": ("D", None, "squared residuals over their expectation"),
     "distance": ("D", None, "Mahalanobis distance from the training set"),
     "strangeness": ("D", None, "its square by the model's own law of stars"),

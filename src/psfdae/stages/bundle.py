@@ -144,7 +144,9 @@ def bundle(
     )
     fitted = kind.unpack(arrays, info)  # what it errs as packed
     nodes, rng = packing.noise_nodes(band), stream(config.seed, "noise", "bundle")
-    errors = packing.measure_errors(held_out, fitted, model, nodes, rng)
+    nothing = np.zeros((nodes.size, *images.shape[1:]), np.float32)
+    made = Bundle(info, arrays, model, nodes, nothing, nothing, 0.0)
+    made, errors = packing.calibrated(made, fitted, held_out, rng)
     metrics = packing.measure_levels(
         config.noise.levels,
         held_out,
@@ -154,14 +156,8 @@ def bundle(
         reach["noise_equivalent_px"],
         config.evaluation.data_range,
     )
-    info = info.model_copy(update={"metrics": metrics})
-    maps = (errors.nodes, errors.half_width(), errors.rms(), errors.distance_limit())
-    ratio95 = errors.ratio95() if info.format_version > 1 else None
-    made = Bundle(info, arrays, model, *maps, ratio95, errors.strange_limit())
-    # A method that measures stars knows how sure it is of flux and sky.
-    if info.format_version > 1 and not kind.measures:
-        made = packing.with_photometry(made, held_out, rng)
-    write_bundle(made, out)
+    info = made.info.model_copy(update={"metrics": metrics})
+    write_bundle(replace(made, info=info), out)
 
 
 def _trained(kind: type[Method], place: Path, config: Config, split: str | None) -> dict[str, Any]:
