@@ -10,8 +10,8 @@ import sys
 
 import numpy as np
 import pandas as pd
-
 from faint import SNR
+
 from psfdae import load_model
 
 

@@ -2,10 +2,10 @@
 
 usage: peers.py PACKAGE SAMPLING ORDER IMAGE SELECTION FAINT.npz OUT.npz
 
-PACKAGE is piff, psfex or epsf; SAMPLING the samples' distance in pixels (1 or 0.5); ORDER that of the
-polynomial over the field (epsf has none). OUT has, of every copy and S/N, the PSF at the fitted centre
-(`fitted<S/N>`), its average over the posterior of the centre (`averaged<S/N>`) and the fitted flux.
-Flux, sky and centre are unknown to it; the noise, which weighs the centres, is given.
+PACKAGE is piff, psfex or epsf; SAMPLING the samples' distance in pixels (1 or 0.5); ORDER that of
+the polynomial over the field (epsf has none). OUT has, of every copy and S/N, the PSF at the fitted
+centre (`fitted<S/N>`), its average over the posterior of the centre (`averaged<S/N>`) and the
+fitted flux. Flux, sky and centre are unknown to it; the noise, which weighs the centres, is given.
 """
 
 import subprocess
@@ -16,9 +16,8 @@ from pathlib import Path
 import numpy as np
 from astropy.io import fits
 from astropy.table import Table
-from scipy.interpolate import make_interp_spline
-
 from faint import SNR, around, brightest, padded
+from scipy.interpolate import make_interp_spline
 
 STEP, REACH = 0.25, 3  # px: of drawn centres, which go that far from the middle
 FIELD = 40  # px beyond the image
@@ -73,8 +72,24 @@ def psfex(image, selection, side, sampling, order):
             f"{columns} SNR_WIN VIGNET(27,27)".replace(" ", "\n")
         )
         run = ["source-extractor", str(Path(image).resolve()), "-c", "/dev/null"]
-        run += "-CATALOG_NAME all.cat -CATALOG_TYPE FITS_LDAC -PARAMETERS_NAME sex.param".split()
-        run += "-FILTER N -DETECT_THRESH 5 -ANALYSIS_THRESH 5 -SATUR_LEVEL 4000".split()
+        run += [
+            "-CATALOG_NAME",
+            "all.cat",
+            "-CATALOG_TYPE",
+            "FITS_LDAC",
+            "-PARAMETERS_NAME",
+            "sex.param",
+        ]
+        run += [
+            "-FILTER",
+            "N",
+            "-DETECT_THRESH",
+            "5",
+            "-ANALYSIS_THRESH",
+            "5",
+            "-SATUR_LEVEL",
+            "4000",
+        ]
         subprocess.run(run, cwd=folder, check=True, capture_output=True)
         with fits.open(f"{folder}/all.cat") as file:
             found = file[2].data
@@ -87,8 +102,17 @@ def psfex(image, selection, side, sampling, order):
         run = ["psfex", "train.cat", "-c", "/dev/null", "-PSF_SIZE", f"{samples},{samples}"]
         run += ["-PSF_SAMPLING", f"{sampling}", "-PSFVAR_DEGREES", f"{order}"]
         # All stars of the list.
-        run += "-SAMPLE_AUTOSELECT N -SAMPLE_MAXELLIP 1 -SAMPLE_FWHMRANGE 0.1,100".split()
-        run += "-SAMPLE_MINSN 1 -CHECKPLOT_TYPE NONE -CHECKIMAGE_TYPE NONE -WRITE_XML N".split()
+        run += ["-SAMPLE_AUTOSELECT", "N", "-SAMPLE_MAXELLIP", "1", "-SAMPLE_FWHMRANGE", "0.1,100"]
+        run += [
+            "-SAMPLE_MINSN",
+            "1",
+            "-CHECKPLOT_TYPE",
+            "NONE",
+            "-CHECKIMAGE_TYPE",
+            "NONE",
+            "-WRITE_XML",
+            "N",
+        ]
         done = subprocess.run(run, cwd=folder, check=True, capture_output=True, text=True)
         print(*[line for line in done.stderr.splitlines() if "train" in line][-1:])
         model = DES_PSFEx("train.psf", dir=folder)
