@@ -76,6 +76,8 @@ $(VENV)/.complete: requirements.lock $(wildcard requirements/*.lock) pyproject.t
 reproduce: env ## Build everything of the preset: datasets, models, tables, report
 	@$(LOCKED) $(LONGEST_FIRST) -- $$TARGETS
 	@$(MAKE) --no-print-directory report
+	@[ "$$PSFDAE_RESULTS" != results ] || [ ! -d results/evaluation ] || \
+	  psfdae compare results results/reference || true
 
 benchmark: env ## Run time against error, on a quiet machine
 stability: env ## Stress tests of the whole chain
@@ -100,7 +102,7 @@ mlflow: env ## Compare the tracked runs in a browser (PORT=n)
 	  --artifacts-destination "$$PSFDAE_RESULTS/mlartifacts"
 
 reference: env ## Make the finished run in results the run of record, and renew the docs
-	$(SNAKEMAKE) --forcerun reference -- reference
+	@sh workflow/reference.sh
 	@$(MAKE) --no-print-directory docs
 
 docs: env ## Renew the numbers in README and docs

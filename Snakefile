@@ -2,7 +2,7 @@
 
 from snakemake.utils import min_version
 
-min_version("9.0")
+min_version("9.20")
 
 
 report: "workflow/report/workflow.rst"
@@ -12,6 +12,7 @@ report: "workflow/report/workflow.rst"
 container: "docker://condaforge/miniforge3:25.3.1-0"
 
 
+include: "workflow/rules/cpu_time.smk"
 include: "workflow/rules/common.smk"
 include: "workflow/rules/common_targets.smk"
 include: "workflow/rules/common_sweep.smk"

@@ -6,6 +6,10 @@ and `by` sorts them. TEXT is an f-string over the columns. A comment at the end 
 line of each row, below the head of the table that the page has; within a line (never at its start)
 the columns of several rows are arrays. Without TEXT, the source itself is put in.
 
+What stays from an earlier record (`kept` in its provenance) gets its date and commit beside it:
+a line below a table; words behind the first number of a section that has no such table. Files of
+two commits are not joined.
+
 `python docs/tables.py` fills in all pages; `--check` names what has drifted.
 """
 
@@ -17,7 +21,6 @@ import re
 import subprocess
 import sys
 from functools import cache
-from itertools import combinations
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -27,6 +30,7 @@ import pandas as pd
 from psfdae.alignment import methods as scene3
 from psfdae.configuration.compose import compose
 from psfdae.estimators import method
+from psfdae.evaluation.comparison import FITTED, SIGNIFICANT, seed_scatter, with_seed_stderr
 from psfdae.own_stars.bundle import SHIPPED
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -53,17 +57,48 @@ STATES = ["decenter_x", "decenter_y", "tilt_x", "tilt_y"]
 CELL = ["dataset", "reference", "noise_level"]
 
 
+READ: set[str] = set()
+"""Files of the run of record that the source in hand has read."""
+
+
 def filled(page, drifted):
     """Text of a page with today's numbers; what has drifted is added to a list."""
-    text = page.read_text(encoding="utf-8")
+    sections = re.split(r"^(?=##+ )", page.read_text(encoding="utf-8"), flags=re.M)
+    return "".join(_section(page.relative_to(ROOT), text, drifted) for text in sections)
 
-    def fill(mark):
-        new = _new(**mark.groupdict())
-        if new != mark["old"]:
-            drifted.append(f"{page.relative_to(ROOT)}: {mark['name']}{mark['words']}")
-        return mark[0][: mark.start("old") - mark.start()] + new + "<!-- end -->"
 
-    return MARK.sub(fill, text)
+def _section(page, text, drifted):
+    """A section with today's numbers, and marks at what is of an earlier record."""
+    marks, new = list(MARK.finditer(text)), []
+    for mark in marks:
+        READ.clear()
+        new.append((mark, _new(**mark.groupdict()), _since(*sorted(READ), where=page)))
+    said = {since for mark, _, since in new if mark["line"]}
+    for figure in re.findall(r"results/reference/([\w/.-]+\.png)\)", text):
+        if (since := _since(figure, where=page)) and since not in said:
+            sys.exit(f"{page}: {figure} is of an earlier record, and no table beside it says so")
+    parts, end = [], 0
+    for mark, filled_in, since in new:
+        beside = ""
+        if since and mark["line"]:
+            beside = f"\n*Recorded {since}, not with the run of record.*\n"
+        elif since and since not in said:
+            beside = f" (recorded {since})"
+            said.add(since)
+        if filled_in + beside != mark["old"]:
+            drifted.append(f"{page}: {mark['name']}{mark['words']}")
+        parts += [text[end : mark.start("old")], filled_in, beside, "<!-- end -->"]
+        end = mark.end()
+    return "".join([*parts, text[end:]])
+
+
+def _since(*names, where):
+    """Date and commit of files of an earlier record; nothing of those of the record itself."""
+    kept = json.loads(file("provenance.json")).get("kept", {})
+    found = {json.dumps(kept.get(name)): kept.get(name) for name in names}
+    if len(found) > 1:
+        sys.exit(f"{where}: {', '.join(names)} are of two commits, and joined")
+    return "".join(f"{of['date']} at commit {of['commit']:.12}" for of in found.values() if of)
 
 
 def _new(name, words, where, by, text, line, old):
@@ -86,15 +121,21 @@ def _written(text, row):
     return re.sub(r"\bnan( %)?", "", eval(f'f"""{text}"""', globals() | row))
 
 
-@cache
 def csv(name):
     """A table of the run of record; names of columns become names in Python."""
+    READ.add(name)
+    return _table(name)
+
+
+@cache
+def _table(name):
     table = pd.read_csv(REFERENCE / name)
     return table.rename(columns=lambda column: re.sub(r"\W", "_", column))
 
 
 def file(name):
     """A file of the run of record as it is."""
+    READ.update({name} - {"provenance.json"})
     return (REFERENCE / name).read_text(encoding="utf-8").strip()
 
 
@@ -165,20 +206,16 @@ def strange():
 
 
 def rules():
-    """What the jobs of each rule took in the run of record, and before; scene 3 job by job."""
-    runs = []
-    for name in ("runtime.csv", "runtime_before.csv"):
-        table = csv(name)
-        small = table.rule.eq("alignment") & table.wildcards.str.contains(
-            "figure|table|time|telesc"
-        )
-        own = table.rule.eq("alignment") & ~small
-        rule = table.rule.where(~own, "scene 3: " + table.wildcards.str.replace("_", " "))
-        grouped = table.assign(jobs=1).groupby(rule.where(~small, "scene 3: tables, figures"))
-        runs.append(grouped.agg({"jobs": "sum", "wall_s": "sum", "cpu_s": "sum", "peak_mb": "max"}))
-    both = runs[0].join(runs[1].add_suffix("_before"), how="outer")
-    both.loc["together"] = both.sum().where(~both.columns.str.startswith("peak"), both.max())
-    return both.rename_axis("rule").reset_index().sort_values("cpu_s", ascending=False)
+    """What the jobs of each rule took together; scene 3 job by job."""
+    table = csv("runtime.csv")
+    small = table.rule.eq("alignment") & table.wildcards.str.contains("figure|table|time|telesc")
+    own = table.rule.eq("alignment") & ~small
+    rule = table.rule.where(~own, "scene 3: " + table.wildcards.str.replace("_", " "))
+    grouped = table.assign(jobs=1).groupby(rule.where(~small, "scene 3: tables, figures"))
+    table = grouped.agg({"jobs": "sum", "wall_s": "sum", "cpu_s": "sum", "peak_mb": "max"})
+    table.loc["together"] = table.sum()
+    table.loc["together", "peak_mb"] = table.peak_mb[:-1].max()
+    return table.rename_axis("rule").reset_index().sort_values("cpu_s", ascending=False)
 
 
 def sweep(name):
@@ -203,72 +240,42 @@ def real_sky():
     return pd.DataFrame(rows)
 
 
-def _seeded():
-    """Errors of all methods by dataset, noise level and seed."""
-    names = ("dataset3", "dataset5")
-    return pd.concat(csv(f"tables/seeds_{name}.csv").assign(dataset=name) for name in names)
-
-
 def seeds():
-    """Mean over seeds, error of the stars and relative scatter of every method."""
-    cells = _seeded().groupby(["dataset", "method", "noise_level"], sort=False)
-    means = {name: (name, "mean") for name in ("mse", "stderr")}
-    table = cells.agg(**means, scatter=("mse", "std"))
-    # Of a pair, both seeds count the other; a record of before does not count.
-    table["different"] = 0.5 * cells.different.sum(min_count=1)
-    table = table.assign(scatter=table.scatter / table.mse).reset_index()
-    return table.assign(label=[method(m).label for m in table.method])
+    """Relative scatter of the MSE between seeds of every method, by dataset and reference."""
+    table = pd.Series(seed_scatter()).rename_axis(FITTED).unstack()
+    return table.reset_index().sort_values(["dataset", "reference"])
 
 
 def costs():
     """CPU time of each method's fit, and stars per second at its slowest noise level."""
-    cells = csv("tables/seeds_dataset3.csv").groupby(["method", "noise_level"], sort=False)
+    name = "tables/benchmark_methods.csv"
+    # A record of before has several seeds in a table of its own.
+    name = name if (REFERENCE / name).is_file() else "tables/seeds_dataset3.csv"
+    cells = csv(name).groupby(["method", "noise_level"], sort=False)
     cells = cells[["fit_cpu_s", "stars_per_s"]].mean().groupby("method", sort=False)
     table = cells.agg({"fit_cpu_s": "first", "stars_per_s": "min"}).reset_index()
     return table.assign(label=[method(m).label for m in table.method])
 
 
-def ordering():
-    """Pairs of methods that differ by 3 standard errors in the record, seed by seed."""
-    recorded = csv("tables/psf_metrics.csv").query(
-        "split == 'random' and reference == 'realisation' and metric == 'mse'"
-    )
-    rows = []
-    for (dataset, level), cell in _seeded().groupby(["dataset", "noise_level"]):
-        tried = cell.pivot_table("mse", "seed", "method")
-        known = recorded[(recorded.dataset == dataset) & (recorded.noise_level == level)]
-        known = known.set_index("method").loc[tried.columns].sort_values("value")
-        for (one, a), (other, b) in combinations(known.iterrows(), 2):
-            if b.value - a.value > 3 * np.hypot(a.stderr, b.stderr):
-                row = {"dataset": dataset, "noise_level": level, "seeds": len(tried)}
-                row |= {"better": method(one).label, "worse": method(other).label}
-                row |= {"ratio": b.value / a.value, "kept": (tried[one] < tried[other]).sum()}
-                rows.append(row)
-    return pd.DataFrame(rows)
-
-
 def errors(name="tables/psf_metrics.csv"):
-    """MSE of every method by dataset, split, reference and noise level."""
+    """MSE of every method with its scatter between seeds (`…_sd`), and the best of a row."""
     keys = ["dataset", "split", "reference", "noise_level"]
-    table = csv(name).query("metric == 'mse'").pivot(index=keys, columns="method", values="value")
-    table["best"] = table.idxmin(axis=1).map(lambda best: method(best).label)
-    return table.reset_index().sort_values(keys, ascending=[True, False, True, True])
+    rows = with_seed_stderr(csv(name).query("metric == 'mse'"), seed_scatter())
+    mse, sd = (rows.pivot(index=keys, columns="method", values=v) for v in ("value", "seed_stderr"))
+    best = [_best(mse.loc[key], sd.loc[key]) for key in mse.index]
+    table = mse.assign(best=best).join(sd.add_suffix("_sd")).reset_index()
+    return table.sort_values(keys, ascending=[True, False, True, True])
 
 
-def more_stars():
-    """Errors of methods on request beside those of the same methods on the paper's stars."""
-    rows = csv("tables/psf_efficiency_on_request.csv")
-    rows = rows.query("method == 'gmm_simulated' and bound == 'bayes' and tight == 'yes'")
-    over = (1.0 / rows.set_index(CELL).efficiency).rename("over")
-    table = errors("tables/psf_metrics_on_request.csv").drop(columns="best")
-    table = table.merge(errors().drop(columns="best"), on=[*CELL, "split"])
-    return table.join(over, CELL)
-
-
-def presets():
-    """MSE of the default preset beside that of the preset `paper`."""
-    literal = errors("paper/tables/psf_metrics.csv")
-    return errors().merge(literal, on=[*CELL, "split"], suffixes=("", "_paper"))
+def _best(mse, sd):
+    """The method that errs least, or all that do so within the scatter between seeds."""
+    least = mse.idxmin()
+    allowed = SIGNIFICANT * np.hypot(sd, sd[least]).drop(least)
+    equal = [least, *mse.drop(least).index[mse.drop(least) - mse[least] <= allowed]]
+    names = ", ".join(method(name).label for name in equal)
+    if len(equal) > 1:
+        return f"equal within the scatter: {names}"
+    return names + ", scatter not measured" * bool(allowed.isna().any())
 
 
 def readings():
@@ -291,20 +298,18 @@ def fit():
 
 
 def bounds(method="bayes"):
-    """Least possible errors, the floor, and how the bank of draws grew, of one posterior mean."""
+    """Least possible errors of one posterior mean, what it rests on, and the floor."""
     rows = csv("tables/psf_bounds.csv").query("metric == 'mse'").sort_values(CELL)
+    # A record made before these columns leaves them empty.
+    since = ["variance", "calibration", "ess_low", "undetected", "missing", "missing_stars"]
+    rows = rows.reindex(columns=[*dict.fromkeys([*rows, *since])])
     floor = rows.query("method == 'floor'")[[*CELL, "value"]]
-    table = rows.query("method == @method").merge(floor, "left", CELL, suffixes=("", "_floor"))
-    growth = csv("tables/psf_bounds_growth.csv").sort_values("draws")
-    keys = [key for key in (*CELL, "method") if key in growth]
-    growth = growth.drop_duplicates(keys, keep="last")
-    # Of a record made before stars were drawn around matches, only the bank's growth tells more.
-    table = table.merge(growth, "left", keys, suffixes=("", "_bank"))
-    bank = table.draws.notna().map({True: "bank", False: "sum"})
-    table = table.reindex(columns=[*dict.fromkeys([*table, "found", "missed"])])
-    table["found"] = table.found.astype(object).fillna(bank)
-    table["draws"] = table.draws.map("{:.0f}".format, na_action="ignore").fillna("exact")
-    return table
+    return rows.query("method == @method").merge(floor, "left", CELL, suffixes=("", "_floor"))
+
+
+def unbounded():
+    """Posterior means that some stars do not have."""
+    return pd.concat([bounds(), bounds("bayes_position")]).query("missing > 0")
 
 
 def efficiency():

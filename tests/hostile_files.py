@@ -6,6 +6,11 @@ makes so many inputs from good ones, by seeded mutation, and runs `psfdae` on ea
 a process of its own, forked from one that has imported everything. What must hold: exit
 code 0, or 2 with one line; no more than 1 GB of data, no more than 20 s. Inputs
 that break it are kept in FOLDER.
+
+    python tests/hostile_files.py own 1000 [SEED] [FOLDER]
+
+takes inputs of `from-stars`, mosaics, lists, `psf` and field models, and looks at what comes out,
+too: a star or PSF without a flag is finite, positive, in the middle, has its flux, and χ² < 10.
 """
 
 from __future__ import annotations
@@ -34,7 +39,7 @@ from pathlib import Path
 
 import numpy as np
 
-BYTES, SECONDS = 2**30, 20
+BYTES, SECONDS = 2**30, 40
 
 LARGEST = 2**24
 """Bytes by which a line is repeated at most; an input must not fill our own memory."""
@@ -362,6 +367,118 @@ def command(kind, path, out, rng):
     return ["load", str(path)]
 
 
+# Own stars: models of an image, and what they make of it.
+
+OWN = ["preset=smoke", "parts.train_stars=60", "parts.test_stars=20", "framing.stamp_px=10"]
+OWN += ["methods=[noisy,field]", "field.orders=[1]", "--method", "field"]
+
+
+def write_own(folder):
+    """An image with its lists, of two chips, and a model of it."""
+    from astropy.io import fits
+    from astropy.table import Table
+
+    from command_line import psfdae
+    from psfdae.stages import mosaic, simulate
+
+    small = {"side_px": 420, "bright": 45, "faint": 10, "blended": 2, "saturated": 1}
+    simulate.write_example(folder / "own.fits", folder / "own.csv", seed=5, **small)
+    table = Table.read(folder / "own.csv")
+    table["X_IMAGE", "Y_IMAGE"].write(folder / "own_list.fits")
+    data, header = fits.getdata(folder / "own.fits", header=True)
+    chips = [fits.ImageHDU(data, header, name=f"CHIP{n}") for n in (1, 2)]
+    fits.HDUList([fits.PrimaryHDU(), *chips]).writeto(folder / "mosaic.fits")
+    words = ["from-stars", "own.fits", "--catalogue", "own.csv", "--out", "model", *OWN]
+    done = psfdae(*words)
+    assert done.exit_code == 0, done.output
+    (folder / "model" / "own.psf.safetensors").rename(folder / "own.psf.safetensors")
+    shutil.rmtree(folder / "model")
+    mosaic._pool = lambda processes: AtOnce()  # a process of its own would take seconds
+
+
+class AtOnce(contextlib.nullcontext):
+    """An executor that does what it is given, here."""
+
+    def __enter__(self):
+        return self
+
+    def submit(self, work, *args):
+        from concurrent.futures import Future
+
+        done = Future()
+        done.set_result(work(*args))
+        return done
+
+
+OWN_GOOD = {
+    "image": ["own.fits"],
+    "catalogue": ["own.csv", "own_list.fits"],
+    "mosaic": ["mosaic.fits"],
+    "bundle": ["own.psf.safetensors"],
+    "psf": ["own.psf.safetensors"],
+    "stars": ["own.fits", "own.csv"],
+}
+
+
+def own_command(kind, path, out, rng):
+    """What a user types."""
+    use = ["--model", "own.psf.safetensors", "--out", str(out), "--threads", "1", "--quiet"]
+    lists = rng.choice([["--catalogue", "own.csv"], ["--detect"]])
+    more = rng.choice([[], [], ["--gain", "1e12"], ["--saturate", "3e4"], ["--weight", "0"]])
+    if kind == "image":
+        return ["predict", str(path), *lists, *more, *use]
+    if kind == "catalogue":
+        fixed = rng.choice([[], ["--fixed-positions"]])
+        return ["predict", "own.fits", "--catalogue", str(path), *fixed, *use]
+    if kind == "mosaic":
+        return ["predict", str(path), "--all-extensions", "--detect", *use]
+    if kind == "bundle":
+        return ["predict", "own.fits", *lists, "--model", str(path), *use[2:]]
+    if kind == "psf":
+        place = rng.choice(["--grid=3x2", "--at=200,100.4", "--at=1e300,-5", "--grid=15x9"])
+        step = rng.choice([[], ["--oversampling", "1"], ["--oversampling", "7"]])
+        return ["psf", str(path), place, *step, "--out", str(out)]
+    image, listed = ("own.fits", path) if path.suffix == ".csv" else (path, "own.csv")
+    words = ["--catalogue", str(listed)] if path.suffix == ".csv" else lists
+    return ["from-stars", str(image), *words, *more, "--out", str(out.with_suffix("")), *OWN]
+
+
+def unlikely(path):
+    """What is wrong with stars or PSFs that a file shows without a flag, or None."""
+    from astropy.io import fits
+
+    with fits.open(path) as hdus:
+        if len(hdus) == 1:
+            psf, step = hdus[0].data.astype(float), int(hdus[0].header["OVERSAMP"])
+            side = psf.shape[-1] - (step > 1)
+            flux, reach = np.ones(len(psf)), 2 * step
+            inside = psf[:, :side:step, :side:step]
+        else:
+            stars = hdus["STARS"].data
+            good = stars["flags"] == 0
+            inside = psf = hdus["PSF"].data[good].astype(float)
+            flux, reach = stars["flux"][good].astype(float), 2
+            numbers = [stars[n][good] for n in ("noise", "snr", "chi2", "flux_error")]
+            doubt = hdus["UNCERT"].data[good]
+            if not (np.isfinite(doubt).all() and (doubt >= 0).all()):
+                return "UNCERT is not finite, or negative"
+            if not all(np.isfinite(n).all() and (n > 0).all() for n in numbers[:3]):
+                return "numbers are not finite, or not positive"
+            if (numbers[2] >= 10).any():
+                return f"chi2 of {numbers[2].max():.3g}"
+    if not (np.isfinite(psf).all() and np.isfinite(flux).all() and (flux > 0).all()):
+        return "not finite, or no flux"
+    if not len(psf):
+        return None
+    total = inside.sum(axis=(1, 2)) / flux
+    if np.abs(total - 1).max() > 0.05:
+        return f"sums from {total.min():.4g} to {total.max():.4g}"
+    peak = np.stack(np.unravel_index(psf.reshape(len(psf), -1).argmax(axis=1), psf.shape[1:]))
+    if np.abs(peak - psf.shape[-1] // 2).max() > reach:
+        return "peak is not in the middle"
+    return None
+
+
 # Running.
 
 
@@ -425,6 +542,7 @@ def verdict(code, text):
         return f"killed by signal {-code}"
     if "Traceback" in text or code not in (0, 2):
         return f"exit code {code}"
+    lines = [line for line in lines if line.startswith("psfdae: ")] if "images:" in text else lines
     if code == 2 and (len(lines) != 1 or not lines[0].startswith("psfdae: ")):
         return f"{len(lines)} lines"
     if code == 2 and re.search("fit into memory|not enough memory", text):
@@ -434,36 +552,50 @@ def verdict(code, text):
     return None
 
 
-def hostile(count, seed, kept):
+def hostile(count, seed, kept, own=False):
     """Try so many inputs; a summary as a dict."""
+    good, typed = (OWN_GOOD, own_command) if own else (GOOD, command)
+    kinds = (
+        [*good, "catalogue", "bundle", "psf"]
+        if own
+        else ["cube", "image", "catalogue", "bundle", "bundle", "weights"]
+    )
     kept = Path(kept)
     kept.mkdir(parents=True, exist_ok=True)
     tally, broken, slowest = Counter(), [], 0.0
     with tempfile.TemporaryDirectory() as name:
         os.chdir(name)
         folder = Path(name)
-        write_good(folder)
+        (write_own if own else write_good)(folder)
         raw = {path.name: path.read_bytes() for path in folder.iterdir()}
-        warm_up(folder)
+        if not own:
+            warm_up(folder)
         for number in range(count):
             rng = random.Random(f"{seed} {number}")
-            kind = rng.choice(["cube", "image", "catalogue", "bundle", "bundle", "weights"])
-            source = rng.choice(GOOD[kind])
+            kind = rng.choice(kinds)
+            source = rng.choice(good[kind])
             path = folder / f"bad_{source}"
-            path.write_bytes(mutated(raw[source], source, kind, rng))
+            made = mutated(raw[source], source, "bundle" if kind == "psf" else kind, rng)
+            path.write_bytes(made)
             out = folder / "out.fits"
-            words = command(kind, path, out, rng)
+            words = typed(kind, path, out, rng)
             wrong, code, seconds = attempt(words, folder / "log")
             slowest = max(slowest, seconds)
-            if wrong is None and (code == 0) != out.exists() and words[0] == "predict":
+            if own:
+                for file in folder.glob("out*.fits"):
+                    wrong = wrong or (None if kind == "mosaic" and code else unlikely(file))
+            elif wrong is None and (code == 0) != out.exists() and words[0] == "predict":
                 wrong = "out.fits beside an error" if code else "no out.fits"
             tally[f"{kind} {code}"] += 1
             if wrong:
                 shutil.copy(path, kept / f"{number}_{source}")
                 text = (folder / "log").read_text(errors="replace")[-400:]
                 broken.append({"number": number, "words": words, "wrong": wrong, "log": text})
+                print(broken[-1], file=sys.stderr, flush=True)
             out.unlink(missing_ok=True)
             path.unlink()
+            for left in folder.glob("out*") if own else ():
+                shutil.rmtree(left) if left.is_dir() else left.unlink()
             for left in folder.iterdir():
                 if left.name not in raw and left.name != "log":
                     broken.append({"number": number, "wrong": f"left {left.name}"})
@@ -496,7 +628,8 @@ def warm_up(folder):
 
 
 if __name__ == "__main__":
-    number, seed, kept = (sys.argv[1:] + ["1", "hostile"][len(sys.argv) - 2 :])[:3]
-    found = hostile(int(number), int(seed), kept)
+    asked = [word for word in sys.argv[1:] if word != "own"]
+    number, seed, kept = (asked + ["1", "hostile"][len(asked) - 1 :])[:3]
+    found = hostile(int(number), int(seed), kept, "own" in sys.argv)
     print(json.dumps(found, indent=1))
     sys.exit(bool(found["broken"]))

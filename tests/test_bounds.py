@@ -209,7 +209,14 @@ def test_posterior_mean_is_that_of_the_poisson_distribution(level, bank, members
     assert sums.effective_size == pytest.approx(1 / (w**2).sum(axis=1), rel=2e-2)
     templates = np.random.default_rng(3).random((POINTS**2, 9, SIDE, SIDE))
     static = np.einsum("nk,khw->nhw", w, templates[field, jitter]).reshape(len(stars), -1)
-    assert sums.mean_template(templates) == pytest.approx(static, rel=1e-2)
+    mean, variance = sums.template(templates)
+    assert mean == pytest.approx(static, rel=1e-2)
+    flat = templates[field, jitter].reshape(len(images), -1)
+    expected = (w @ (flat**2) - (w @ flat) ** 2).mean(axis=1)
+    assert variance == pytest.approx(expected, rel=2e-2, abs=1e-6)
+    flat = images.reshape(len(images), -1)
+    expected = (w @ (flat**2) - (w @ flat) ** 2).mean(axis=1)
+    assert sums.variance_image == pytest.approx(expected, rel=2e-2, abs=1e-9)
     # At the highest noise the data say little, at the lowest everything.
     assert (sums.effective_size > 50).all() if level > 1e-2 else True
     assert (sums.effective_size < 1.01).all() if level < 1e-4 else True
@@ -326,16 +333,18 @@ def test_exact_posterior_is_the_poisson_one(noise, members):
     for level, known in ((1e-3, True), (1e-2, False), (10.0, False)):
         noisy = noise.draw(truth, level, np.random.default_rng(4))
         likelihood = Likelihood.of(noise, level, truth)
-        mean, probability = exact_posterior(noisy, templates, likelihood)
+        mean, variance, probability = exact_posterior(noisy, templates, likelihood)
         flat = (templates.reshape(27, SIDE, SIDE), None, None, np.ones(27))
         w = brute_force(flat, noisy, likelihood.flux, noise.background)
         assert probability == pytest.approx(w.reshape(4, 3, 9).sum(axis=2), abs=1e-8)
         assert mean == pytest.approx(np.einsum("nk,khw->nhw", w, flat[0]), abs=1e-8)
+        spread = ((flat[0] - mean[:, None]) ** 2).mean(axis=(2, 3))
+        assert variance == pytest.approx((w * spread).sum(axis=1), abs=1e-12)
         right = probability[np.arange(4), [0, 1, 2, 0]]
         assert (right > 0.99).all() == known
     assert probability == pytest.approx(np.full((4, 3), 1 / 3), abs=0.02)
     told = np.array([0, 1, 2, 0])
-    mean, probability = exact_posterior(noisy, templates, likelihood, told)
+    mean, _, probability = exact_posterior(noisy, templates, likelihood, told)
     assert probability == pytest.approx(np.eye(3)[told])
     for star, found in enumerate(mean):
         own = (templates[told[star]], None, None, np.ones(9))

@@ -9,7 +9,17 @@ import pytest
 
 from psfdae.bounds import sampling
 from psfdae.bounds.posterior import Likelihood, jitters, merge
-from psfdae.bounds.sampling import Modes, StampModel, climb, sampled_sums, twins
+from psfdae.bounds.sampling import (
+    FIELD,
+    TRUTH,
+    Modes,
+    StampModel,
+    climb,
+    neighbours,
+    sampled_sums,
+    twins,
+    unexplained,
+)
 from psfdae.optics.wavefronts import seidel_wavefronts
 from psfdae.rng import stream
 from psfdae.stars.framing import Propagation, crop_jittered, normalise_flux
@@ -75,7 +85,7 @@ def modes(model, stars, noise):
     """Modes found from one start in the right field, at no aberration."""
     count, eye = 4, np.tile(np.eye(5), (4, 1, 1))
     start = Modes(
-        *(np.arange(count), np.zeros(count, int), stars[3], np.ones(count, bool)),
+        *(np.arange(count), np.zeros(count, int), stars[3], np.zeros(count, int)),
         *(np.zeros((count, 5)), eye, np.zeros(count)),
     )
     likelihood = Likelihood.of(noise, LEVEL, stars[1])
@@ -102,7 +112,7 @@ def test_draws_have_the_posterior_mean_of_the_grid(model, modes, stars, noise, e
     # Fields in one direction can give nearly the same image.
     assert (share[:, 1].sum(axis=1) > 0.01).any()
     assert (merge(found.told).share[:, 1:] == 0).all()
-    assert found.helped.mean_image == pytest.approx(free.mean_image, abs=1e-12)
+    assert found.free_helped.mean_image == pytest.approx(free.mean_image, abs=1e-12)
 
 
 def test_effective_size_is_that_of_the_weights(model, modes, stars, noise):
@@ -115,10 +125,10 @@ def test_effective_size_is_that_of_the_weights(model, modes, stars, noise):
 
 
 def test_same_streams_give_the_same_bytes_in_any_blocks(model, modes, stars, noise, monkeypatch):
-    one, two = (sampled(model, modes, stars, noise, 80).helped for _ in range(2))
+    one, two = (sampled(model, modes, stars, noise, 80).free_helped for _ in range(2))
     assert one.image.tobytes() == two.image.tobytes()
     monkeypatch.setattr(sampling, "BLOCK", 1)
-    single = sampled(model, modes, stars, noise, 80).helped
+    single = sampled(model, modes, stars, noise, 80).free_helped
     assert single.mean_image == pytest.approx(one.mean_image, abs=1e-6)
 
 
@@ -140,7 +150,7 @@ def test_twins_give_the_same_image(model, noise):
     odd = near * [-1, 1, -1, -1, 1]  # the even part negated
     assert wide.stamps(odd, np.array([0]), middle) == pytest.approx(images[0], abs=1e-5)
     start = Modes(
-        *(np.zeros(1, int), np.zeros(1, int), middle, np.ones(1, bool)),
+        *(np.zeros(1, int), np.zeros(1, int), middle, np.zeros(1, int)),
         *(near, np.eye(5)[None], np.zeros(1)),
     )
     found = twins(start, Likelihood.of(noise, 1e-4, images[0]), wide)
@@ -148,3 +158,55 @@ def test_twins_give_the_same_image(model, noise):
     assert found.z[there][0] == pytest.approx(far[0], abs=0.02)
     # A pixel aside is a tilt, which distortion can make up for where it is large.
     assert len(found.star) > 1
+
+
+def aside(stars, model, noise, level, shift):
+    """A star in the noise of `level`, its mode `shift` pixels beside the right one, the problem."""
+    z, truth, _, offset = (part[:1] for part in stars)
+    noisy = noise.draw(truth, level, np.random.default_rng(7))
+    likelihood = Likelihood.of(noise, level, truth)
+    problem = (likelihood.counts(noisy), likelihood, model)
+    own = np.zeros(1, int)
+    start = Modes.at(own, own, offset + shift, np.full(1, FIELD), z)
+    return climb(start, *problem), Modes.at(own, own, offset, np.full(1, TRUTH), z), noisy, problem
+
+
+def test_a_star_that_no_mode_explains_is_sought_beside_its_best_one(stars, model, noise):
+    wrong, truth, _, problem = aside(stars, model, noise, 1e-4, (2, -1))
+    assert unexplained(wrong, *problem).tolist() == [0]
+    starts = neighbours(wrong, unexplained(wrong, *problem))
+    assert len(starts.star) == 49
+    found = climb(wrong + starts, *problem)
+    right = climb(truth, *problem)
+    best = found.evidence.argmax()
+    assert (found.offset[best] == right.offset[0]).all()
+    assert found.evidence[best] == pytest.approx(right.evidence[0], abs=0.1)
+    assert found.given[best] == FIELD
+    assert not unexplained(right, *problem).size
+
+
+def test_a_mode_undetected_with_the_field_given_shows(stars, model, noise):
+    """No sample around the mode beside it is framed as the star is."""
+    wrong, truth, noisy, problem = aside(stars, model, noise, 1e-4, (0, 4))
+    right = climb(truth, *problem)
+    rngs = [stream(1, "test", 0)]
+    arguments = (noisy, np.zeros(1, int), *problem[1:], [50, 50], rngs)
+    lost = sampled_sums(wrong + right, *arguments)
+    assert np.isnan(merge(lost.told).mean_image).all()
+    error = ((lost.told_helped.mean_image - stars[1][:1].reshape(1, -1)) ** 2).mean()
+    assert error < 1e-7
+    assert 0 < lost.told_helped.variance_image[0] < 1e-7
+    found = sampled_sums(replace(right, given=np.full(1, FIELD)), *arguments)
+    assert found.told_helped.mean_image == pytest.approx(merge(found.told).mean_image, abs=1e-9)
+
+
+def test_what_is_found_without_the_truth_does_not_depend_on_it(stars, model, noise):
+    wrong, truth, noisy, problem = aside(stars, model, noise, 1e-3, (0, 1))
+    both = wrong + climb(truth, *problem)
+    one, two = (
+        sampled_sums(modes, noisy, np.zeros(1, int), *problem[1:], [50, 50], [stream(1, "test", 0)])
+        for modes in (wrong, both)
+    )
+    for part, other in zip(one.told, two.told, strict=True):
+        assert part.image.tobytes() == other.image.tobytes()
+    assert two.told_helped.image.tobytes() != one.told_helped.image.tobytes()

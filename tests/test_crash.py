@@ -25,7 +25,7 @@ TARGET = "results/smoke/evaluation/dataset3/random-realisation.csv"
 WEIGHTS = "results/smoke/dae/dataset3/random-realisation/dae.safetensors"
 STARS = "results/smoke/data/seidel/seidel_10pct.h5"
 CHECKPOINT = "results/smoke/checkpoints/dae/dataset3/random-realisation.pt"
-LOG = "results/smoke/logs/dae/dataset3/random-realisation.log"
+LOG = "results/smoke/logs/train/dataset3/random-realisation.log"
 # Long enough for a signal to arrive in mid-training, which then resumes.
 SLOW = "train.epochs=80 train.checkpoint_seconds=0 train.batch=8"
 TOO_LARGE = 150_000

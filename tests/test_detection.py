@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -194,6 +195,26 @@ def test_a_map_says_the_noise_but_for_a_factor(field, tmp_path, kind):
     assert (spurious > 8).sum() <= 2
 
 
+def test_pixels_without_weight_are_bad_and_counted(field, tmp_path):
+    """SWarp and SExtractor write 0 where there are no data."""
+    weight = np.ones((700, 700))
+    weight[100:110, 100:110] = 0
+    path = write(tmp_path / "image.fits", pixels(field))
+    beside = write(tmp_path / "map.fits", weight)
+    found = opened(path, detect=5.0, weight=str(beside))
+    assert found.said().splitlines()[1] == f"{beside}: weight 0, bad pixels: 100"
+    assert found._layers.sky().bad.sum() == 100
+    assert not (np.abs(found.positions - 104.5) < 4).all(axis=1).any()
+
+
+def test_a_star_is_found_in_silence(field, tmp_path, capfd):
+    """photutils 3.0 shows how far it is, unless it is told not to; 4.0 will not be told."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        opened(write(tmp_path / "image.fits", pixels(field)), detect=5.0)
+    assert capfd.readouterr() == ("", "")
+
+
 def test_bits_of_a_mask(field, tmp_path):
     flags = np.zeros((700, 700), np.int32)
     flags[10, 10], flags[20, 20], flags[30, 30] = 1, 4, 2**30 + 2
@@ -207,6 +228,10 @@ def test_bits_of_a_mask(field, tmp_path):
     assert bad() == [True, True, True]
     assert bad(bad_bits=1) == [True, False, False]
     assert bad(bad_bits=6) == [False, True, True]
+    assert bad(bad_bits=2**63 - 1) == [True, True, True]
+    words = ["predict", path, "--detect", "--mask", "DQ", "--out", tmp_path / "x.fits"]
+    said = psfdae(*words, "--bad-bits", 2**63)
+    assert said.exit_code == 2 and "is not in the range" in said.output
 
 
 # What cannot be used: one line and code 2
@@ -222,9 +247,11 @@ def bad(field):
     write(folder / "constant.fits", np.full((300, 300), 7.0))
     write(folder / "nan.fits", np.full((700, 700), np.nan))
     write(folder / "small.fits", np.ones((10, 10)))
-    zero = np.ones(image.shape)
-    zero[3, 4] = 0
-    write(folder / "zero.fits", zero)
+    some = np.ones(image.shape)
+    some[3, 4] = 0
+    write(folder / "zero.fits", some)
+    some[3, 4] = -1
+    write(folder / "below.fits", some)
     write(folder / "negative.fits", -np.ones(image.shape))
     write(folder / "cube.fits", np.ones((4, 16, 16)), PIXSCALE=1.0)
     listed = Table.read(folder / "stars.csv")
@@ -253,10 +280,16 @@ LIST = ["--catalogue", "stars.csv"]
         (["nan.fits", "--detect"], "nan.fits: too few pixels of the image have a value"),
         (["nan.fits", *LIST], "nan.fits: too few pixels of the image have a value"),
         (["image.fits", *LIST, "--weight", "small.fits"], "small.fits: a weight map of 10×10"),
-        (["image.fits", *LIST, "--weight", "zero.fits"], "zero.fits: a weight map of which 1 of"),
+        (["image.fits", *LIST, "--weight", "below.fits"], "below.fits: a weight map of which 1 of"),
+        (
+            ["image.fits", *LIST, "--variance", "zero.fits"],
+            "of which 1 of 490000 pixels are not ab",
+        ),
         (["image.fits", *LIST, "--variance", "negative.fits"], "a variance map of which 490000"),
         (["image.fits", *LIST, "--weight", "nan.fits"], "too few pixels of the image have a value"),
         (["image.fits", *LIST, "--weight", "1.fits"], "no extension '1.fits'"),
+        (["image.fits", *LIST, "--name", "../../x"], "--name ../../x: expected the start of a"),
+        (["image.fits", *LIST, "--name", 300 * "x"], "at most 239 bytes, and no folder"),
         (["image.fits", *LIST, "--gain", 0], "image.fits: gain 0.0, expected a number above 0"),
         (["image.fits", *LIST, "--gain", -1], "image.fits: gain -1.0, expected"),
         (["image.fits", *LIST, "--read-noise", 0], "read noise 0.0, expected"),
@@ -284,7 +317,7 @@ def test_from_stars_refuses_in_one_line(bad, monkeypatch, words, named):
     ("words", "named"),
     [
         (["--weight", "small.fits"], "a weight map of 10×10"),
-        (["--weight", "zero.fits"], "1 of 490000 pixels are not above 0"),
+        (["--weight", "below.fits"], "1 of 490000 pixels are not at least 0"),
         (["--mask", "small.fits"], "a mask of 10×10"),
         (["--gain", 0], "gain 0.0"),
     ],

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import importlib.util
+import json
 import os
 import re
 import subprocess
 import sys
 
+import pandas as pd
 import pytest
 import yaml
 
@@ -40,6 +43,68 @@ def test_a_typed_number_is_named(tmp_path):
     assert (found.returncode, found.stderr) == (1, "README.md: tables/stability.csv\n")
     subprocess.run([sys.executable, str(tmp_path / "docs/tables.py")], check=True)
     assert (tmp_path / "README.md").read_text() == f"Rows: {mark}0<!-- end -->.\n"
+
+
+@pytest.fixture
+def fill(tmp_path, monkeypatch):
+    """Text of a page, and what has drifted, by a record of which two tables and a figure stay."""
+    spec = importlib.util.spec_from_file_location("tables", TABLES)
+    tables = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(tables)
+    record = tmp_path / "results/reference"
+    record.mkdir(parents=True)
+    for name in ("new", "old", "older"):
+        (record / f"{name}.csv").write_text("a,b\n1,2\n")
+    kept = {"old.csv": {"commit": "1" * 40, "date": "2026-01-02"}}
+    kept |= {"figures/old.png": kept["old.csv"]}
+    kept |= {"older.csv": {"commit": "2" * 40, "date": "2026-01-01"}}
+    (record / "provenance.json").write_text(json.dumps({"commit": "3" * 40, "kept": kept}))
+    monkeypatch.setattr(tables, "ROOT", tmp_path)
+    monkeypatch.setattr(tables, "REFERENCE", record)
+    tables.joined = lambda *names: pd.concat([tables.csv(name) for name in names])
+
+    def filled(text):
+        drifted = []
+        (tmp_path / "README.md").write_text(text)
+        return tables.filled(tmp_path / "README.md", drifted), drifted
+
+    return filled
+
+
+HEADED = "| a |\n|---|\n"
+TABLE = f"<!-- {{}}.csv: | {{{{a}}}} | -->\n{HEADED}| 1 |\n<!-- end -->\n"
+
+
+@pytest.mark.parametrize(
+    ("page", "mark"),
+    [
+        (TABLE, "\n*Recorded 2026-01-02 at commit 111111111111, not with the run of record.*\n"),
+        (
+            "Of <!-- {}.csv: {{a}} -->1<!-- end --> stars.\n",
+            " (recorded 2026-01-02 at commit 111111111111)",
+        ),
+    ],
+)
+def test_what_is_of_an_earlier_record_is_marked(fill, page, mark):
+    assert fill(page.format("new")) == (page.format("new"), [])
+    text, drifted = fill(page.format("old"))
+    assert drifted == ["README.md: old.csv"]
+    assert text == page.format("old").replace("<!-- end -->", f"{mark}<!-- end -->")
+    assert fill(text) == (text, [])
+
+
+@pytest.mark.parametrize("names", ["new.csv old.csv", "old.csv older.csv"])
+def test_tables_of_two_commits_are_not_joined(fill, names):
+    with pytest.raises(SystemExit, match=r"README\.md: .* two commits"):
+        fill(f"<!-- joined {names}: {{a.sum()}} -->2<!-- end -->\n")
+
+
+def test_a_figure_of_an_earlier_record_has_a_mark_beside_it(fill):
+    figure = "![x](results/reference/figures/old.png)\n"
+    for beside in ("", TABLE.format("new"), TABLE.format("older"), f"{TABLE.format('old')}## On\n"):
+        with pytest.raises(SystemExit, match=r"figures/old\.png"):
+            fill(beside + figure)
+    fill(TABLE.format("old") + figure)
 
 
 @pytest.fixture(scope="module")

@@ -80,6 +80,19 @@ def test_conda_requires_what_pyproject_requires(declared, conda, pip_part):
     }
 
 
+def test_snakefile_asks_for_the_snakemake_of_pyproject(declared):
+    asked = re.search(r'^min_version\("([0-9.]+)"\)', (ROOT / "Snakefile").read_text(), re.M)[1]
+    assert f">={asked}" in map(str, declared["snakemake"].specifier)
+
+
+@pytest.mark.parametrize(
+    ("name", "vulnerable"),
+    [("hydra-core", "1.3.3"), ("mlflow", "3.15.2"), ("snakemake", "9.16.3")],
+)
+def test_versions_with_known_vulnerabilities_are_refused(declared, name, vulnerable):
+    assert not declared[name].specifier.contains(vulnerable)
+
+
 def imports(path):
     """Modules that a file imports from other packages."""
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):

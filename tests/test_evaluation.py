@@ -8,6 +8,7 @@ import pytest
 from scipy.stats import pearsonr
 from skimage.metrics import mean_squared_error, structural_similarity
 
+from psfdae.estimators import registered
 from psfdae.evaluation.metrics import (
     all_metrics,
     clustered_mean,
@@ -104,12 +105,17 @@ def test_paper_table_puts_ours_beside_the_paper_s():
     columns += ["value", "stderr", "n"]
     table = paper_table(pd.DataFrame(rows, columns=columns), "dataset3", "mse")
     assert list(table.columns[3:]) == ["0.001", "0.002", "0.003", "0.005"]
-    assert (
-        table.groupby(["source", "reference"]).method.agg(list).tolist()
-        == [["original-noise", "PCA", "DAE"]] * 3
-    )
+    given = [["original-noise", pca, "DAE"] for pca in ("PCA", *["PCA (given λ)"] * 2)]
+    assert table.groupby(["source", "reference"]).method.agg(list).tolist() == given
     assert "| paper" in as_markdown(table, "dataset3", "mse")
     assert "2.7568e-05" in as_markdown(table, "dataset3", "mse")
+
+
+def test_labels_say_what_a_method_is_given_beside_the_image():
+    ends = {kind.name: kind.label.partition(" (")[2] for kind in registered()}
+    assert ends["dae"] == ends["noisy"] == ""
+    assert ends["lmmse"] == ends["pca_som"] == ends["gmm"] == "given λ)"
+    assert ends["gmm_position"] == ends["field"] == "given λ, position)"
 
 
 def test_correlation_is_pearson_s_with_fisher_s_interval():

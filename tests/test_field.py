@@ -2,21 +2,33 @@
 
 from __future__ import annotations
 
+import resource
+import shutil
+import subprocess
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
+import photutils
 import pytest
 from astropy.io import fits
 from astropy.table import Table
 from click.testing import CliRunner
+from packaging.version import Version
 from photutils.psf import GriddedPSFModel, PSFPhotometry
 
+from photutils_grid import drawn, gridded
 from psfdae import load_model
 from psfdae.cli import main
 from psfdae.configuration.compose import load_stage
 from psfdae.estimators import BrightStamps, FitError, TrainingSet
 from psfdae.estimators.field import TELLING, FieldMixture
+from psfdae.own_stars.bundle import read_bundle, write_bundle
 from psfdae.own_stars.example import add_stamps, write_field
 from psfdae.own_stars.model import PredictionError
 from psfdae.own_stars.shapes import measure_shapes
+from psfdae.stages import psf
 from psfdae.stars.noise import NoiseModel
 
 SIDE, WIDE, FIELD = 10, 26, 1000.0
@@ -287,12 +299,13 @@ def test_psf_between_the_stars_is_the_fields(field):
     expected = unit(truth(position, phase, SIDE))
     position += 0.1  # as the list of the training is
     found = field.psf_at(position)
-    assert found.sum(axis=(1, 2)) == pytest.approx(1.0)
-    assert np.square(found - expected).mean() < 1e-6
+    assert np.square(unit(found) - expected).mean() < 1e-6
+    # Stars in the middle of their pixel have the sum 1, others what is left of it in the stamp.
+    assert field.psf_at(np.rint(position)).sum(axis=(1, 2)) == pytest.approx(1.0)
+    assert found.sum(axis=(1, 2)) == pytest.approx(1.0, abs=0.01)
     fine = field.psf_at(position, 4)
-    assert fine.shape == (30, 41, 41) and fine.sum(axis=(1, 2)) == pytest.approx(16.0)
-    native = fine[:, 0:40:4, 0:40:4]
-    assert unit(native) == pytest.approx(found, abs=1e-6)
+    assert fine.shape == (30, 41, 41)
+    assert fine[:, 0:40:4, 0:40:4] == pytest.approx(found, abs=1e-9)
     # Beyond the stars it stays that of the edge.
     assert field.psf_at(np.array([[-500.0, 300.0]])) == pytest.approx(
         field.psf_at(np.array([[field.low[0] // 1 - 1, 300.0]])), abs=1e-3
@@ -414,20 +427,116 @@ def test_bad_pixels_are_left_out(image):
     assert (found.flags & 1).all()
 
 
-def test_psf_writes_what_photutils_reads(image):
-    folder, path, _ = image
-    model = load_model(path)
-    assert run("psf", path, "--grid", "4x3", "--out", folder / "grid.fits").exit_code == 0
-    grid = GriddedPSFModel.read(folder / "grid.fits")
+@pytest.fixture(scope="module")
+def oblong(image):
+    """The model of a field that is wider than it is high."""
+    path = image[0] / "oblong.psf.safetensors"
+    bundle = read_bundle(image[1])
+    ends = {"low": np.array([50.0, 300.0]), "high": np.array([950.0, 700.0])}
+    write_bundle(replace(bundle, weights=bundle.weights | ends), path)
+    return path
+
+
+def test_psf_writes_what_photutils_reads(oblong, tmp_path):
+    """Files of STScI say y before x; releases before 3.1 stop at them instead of mixing them up."""
+    model, out = load_model(oblong), tmp_path / "grid.fits"
+    assert run("psf", oblong, "--grid", "4x3", "--out", out).exit_code == 0
+    grid = gridded(out)
+    if Version(photutils.__version__) >= Version("3.1"):
+        assert (GriddedPSFModel.read(out).grid_xypos == grid.grid_xypos).all()
+    else:
+        with pytest.raises(ValueError, match=r"needs photutils 3\.1"):
+            GriddedPSFModel.read(out)
     assert grid.data.shape == (12, 41, 41) and list(grid.oversampling) == [4, 4]
-    low, high = model.field_range()
-    assert grid.grid_xypos.min(axis=0) == pytest.approx(low, rel=1e-5)
-    assert grid.grid_xypos.max(axis=0) == pytest.approx(high, rel=1e-5)
+    x, y = np.linspace(50, 950, 4), np.linspace(300, 700, 3)
+    assert grid.grid_xypos.tolist() == [[a, b] for b in y for a in x]
     assert grid.data[5] == pytest.approx(model.psf_at(*np.rint(grid.grid_xypos[5])), abs=1e-6)
-    words = ("--at", "310.4,122", "--oversampling", 1, "--out", folder / "one.fits")
-    assert run("psf", path, *words).exit_code == 0
-    one = fits.getdata(folder / "one.fits")
+    words = ("--at", "310.4,422", "--oversampling", 1, "--out", tmp_path / "one.fits")
+    assert run("psf", oblong, *words).exit_code == 0
+    one = fits.getdata(tmp_path / "one.fits")
     assert one.shape == (1, SIDE, SIDE) and one.sum() == pytest.approx(1.0)
+
+
+TEN = np.random.default_rng(1).uniform((50, 300), (950, 700), (10, 2))
+
+
+def test_psfs_at_a_place_are_the_same_whoever_is_asked(oblong, tmp_path):
+    """`psf_at`, `psf --at` and `psf --grid`, which photutils interpolates, also in pixels."""
+    assert run("psf", oblong, "--grid", "40x20", "--out", tmp_path / "g.fits").exit_code == 0
+    at = [word for x, y in TEN for word in ("--at", f"{x},{y}")]
+    assert run("psf", oblong, *at, "--out", tmp_path / "at.fits").exit_code == 0
+    model, found = load_model(oblong), drawn(tmp_path / "g.fits", TEN)
+    for (x, y), grid, one in zip(TEN, found, fits.getdata(tmp_path / "at.fits"), strict=True):
+        for asked, other in (((x, y), grid), ((np.rint(x), np.rint(y)), one)):
+            wanted = model.psf_at(*asked)
+            inside = other != 0  # photutils draws nothing beyond the edge of a PSF that moved
+            assert inside.mean() > 0.9
+            assert np.abs(other - wanted)[inside].max() < 1e-3 * wanted.max()
+        pixels, drawn_there = model.psf_at(x, y, 1), grid[:40:4, :40:4]
+        off = np.abs(drawn_there - pixels)[drawn_there != 0]
+        assert off.max() < 1e-3 * pixels.max()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("release", ["3.0.0", "3.1.1"])
+def test_releases_of_photutils_read_the_same_places(oblong, tmp_path, release):
+    """In an environment of their own; 3.1 asks for Python 3.12."""
+    python = with_photutils(release, tmp_path)
+    assert run("psf", oblong, "--grid", "40x20", "--out", tmp_path / "g.fits").exit_code == 0
+    np.save(tmp_path / "places.npy", TEN)
+    script = Path(__file__).with_name("photutils_grid.py")
+    subprocess.run([python, script, "g.fits", "places.npy", "out.npy"], cwd=tmp_path, check=True)
+    wanted = np.stack([load_model(oblong).psf_at(x, y) for x, y in TEN])
+    found = np.load(tmp_path / "out.npy")
+    assert np.abs(found - wanted)[found != 0].max() < 1e-3 * wanted.max()
+
+
+def with_photutils(release, folder):
+    """A Python with that release; skips where there is none to be had."""
+    pythons = [*Path("~/.pyenv/versions").expanduser().glob("3.1[23].*/bin/python")]
+    pythons += filter(None, map(shutil.which, ("python3.13", "python3.12")))
+    if not pythons:
+        pytest.skip("no Python 3.12 or 3.13")
+    subprocess.run([pythons[0], "-m", "venv", folder / "venv"], check=True)
+    python = folder / "venv/bin/python"
+    words = [python, "-m", "pip", "install", "--quiet", f"photutils=={release}", "scipy"]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    if done.returncode:
+        pytest.skip(f"photutils {release} cannot be installed: {done.stderr[-200:]}")
+    return python
+
+
+def test_thousands_of_places_take_a_line_each_in_the_header_and_no_warning(oblong, tmp_path):
+    """Linear in time, and in pieces: the header of astropy's own `extend` takes the square."""
+    made = []
+    model = load_model(oblong)
+    draw = model.psf_at
+
+    def watched(x, y, oversampling):
+        made.append(np.size(x))
+        return draw(x, y, oversampling)
+
+    model.psf_at = watched
+    places = np.random.default_rng(1).uniform(100, 900, (3000, 2))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        psf.write(tmp_path / "many.fits", model, places, 4)
+    header = fits.getheader(tmp_path / "many.fits")
+    y, x = (float(v) for v in header["DET_YX2999"].strip("()").split(","))
+    assert (x, y) == pytest.approx(places[-1], rel=1e-6)
+    assert sum(made[1:]) == 3000 and max(made) < 1000
+
+
+def test_psfs_on_a_full_disk_end_in_one_line(oblong, tmp_path):
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (30_000, hard))
+    try:
+        done = run("psf", oblong, "--grid", "4x3", "--out", tmp_path / "x.fits")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert done.exit_code == 2 and done.output.count("\n") == 1
+    assert "x.fits" in done.output and "File too large" in done.output
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(
@@ -465,7 +574,7 @@ def test_photometry_of_photutils_with_the_grid_is_unbiased(image):
     out = folder / "photometry.fits"
     assert run("psf", path, "--grid", "7x7", "--out", out).exit_code == 0
     start = Table(known["position"], names=("x", "y"))
-    photometry = PSFPhotometry(GriddedPSFModel.read(out), (9, 9), aperture_radius=4)
+    photometry = PSFPhotometry(gridded(out), (9, 9), aperture_radius=4)
     found = photometry(fits.getdata(folder / "i.fits").astype(float) - 100.0, init_params=start)
     ratio = found["flux_fit"] / known["flux"]
     assert len(ratio) >= 400

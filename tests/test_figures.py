@@ -53,14 +53,14 @@ def rgb_at(figure, axes, x, y):
 
 def metrics_table(splits=("random",), references=("realisation", "template"), dataset="dataset3"):
     rows = [
-        (dataset, split, reference, method, level, metric, 10.0 * level + 0.01 * i, 1e-3, 0.0, 7)
+        (dataset, split, reference, method, level, metric, 10.0 * level + 0.01 * i, 1e-3, 7)
         for split in splits
         for reference in references
         for i, method in enumerate(METHODS)
         for level in LEVELS
         for metric in ("mse", "ssim")
     ]
-    names = "dataset split reference method noise_level metric value stderr seed_stderr n"
+    names = "dataset split reference method noise_level metric value stderr n"
     return pd.DataFrame(rows, columns=names.split())
 
 

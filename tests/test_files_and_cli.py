@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import resource
 import subprocess
 import sys
@@ -13,7 +14,15 @@ import numpy as np
 import pytest
 
 from command_line import psfdae, refused
-from psfdae.files import Column, ProductError, atomic_path, read_product, write_product
+from psfdae.files import (
+    Column,
+    ProductError,
+    atomic_path,
+    read_product,
+    write_product,
+    write_text,
+)
+from psfdae.stages import verify
 
 
 def write(path, values=None):
@@ -153,6 +162,26 @@ def test_nothing_loads_packages_that_it_does_without(tmp_path):
     found = json.loads(done.stdout.splitlines()[-1])
     assert len(found) == 6
     assert not any(found.values()), found
+
+
+@pytest.mark.parametrize("instead", ["pipe", "folder", "pipe of the digest"])
+def test_what_is_no_file_any_more_is_set_aside_and_nothing_waits_for_it(tmp_path, instead):
+    write_text(tmp_path / "before.csv", "1\n")  # of a folder without digests
+    (tmp_path / ".digests").mkdir()
+    os.mkfifo(tmp_path / "of somebody else")
+    path = tmp_path / "table.csv"
+    for _ in range(2):  # what was set aside before gives way
+        write_text(path, "1\n")
+        digest = tmp_path / ".digests" / "table.csv.sha256"
+        (digest if "digest" in instead else path).unlink()
+        if instead == "folder":
+            (path / "in it").mkdir(parents=True)
+        else:
+            os.mkfifo(digest if "digest" in instead else path)
+        assert [found for found, _ in verify.set_aside(tmp_path)] == [path]
+        assert verify.missing(tmp_path) == [path]
+    write_text(path, "1\n")
+    assert verify.set_aside(tmp_path) == [] == verify.missing(tmp_path)
 
 
 def test_wrong_config_and_missing_input_are_one_message_and_exit_code_2(tmp_path):

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import re
 import resource
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -35,6 +37,7 @@ from psfdae.own_stars.selection import brightest_pixels, collect, moved, star_ce
 from psfdae.own_stars.stamps import cut
 from psfdae.own_stars.training_images import OwnNoise, make_images, star_grid, training_columns
 from psfdae.rng import stream
+from psfdae.stages import from_stars as stage
 from psfdae.stages import simulate
 from psfdae.stages.common import noise_model, split_stars
 from psfdae.stages.evaluate import READS
@@ -316,6 +319,43 @@ def test_a_model_is_replaced_on_request_only(field, model, tmp_path):
     after = {path: path.stat().st_mtime_ns for path in out.rglob("*")}
     assert after.keys() == before.keys()
     assert all(after[path] > before[path] for path in before if path.is_file())
+
+
+@pytest.mark.parametrize("last", ["report", "write_text"])
+def test_a_killed_command_ends_well_if_typed_again(field, model, tmp_path, monkeypatch, last):
+    """The bundle comes last, and says that all is there."""
+    image, catalogue, _ = field
+    out, page = tmp_path / "model", tmp_path / "page.html"
+    shutil.copytree(model[0], out)
+    made = out / "image.psf.safetensors"
+    kept = made.rename(tmp_path / made.name)
+    for name in ("fit", "evaluate"):  # what they leave is there
+        monkeypatch.setattr(stage, name, lambda *args, **more: None)
+
+    def packed(*args, out, **more):
+        shutil.copy(kept, out)
+
+    packed.stage = stage.bundle.stage
+    monkeypatch.setattr(stage, "bundle", packed)
+    words = [image, "--catalogue", catalogue, "--out", out, "--report", page, "--method", "gmm"]
+    child = os.fork()
+    if child == 0:
+        after = getattr(stage, last)
+
+        def killed(*args):
+            after(*args)
+            if last == "report" or args[0] == page:
+                os.kill(os.getpid(), signal.SIGKILL)
+
+        monkeypatch.setattr(stage, last, killed)
+        run(*words, *TINY)
+        os._exit(1)
+    assert os.waitpid(child, 0)[1] == signal.SIGKILL
+    assert not made.exists() and page.exists() == (last == "write_text")
+    done = run(*words, *TINY)
+    assert done.exit_code == 0, done.output
+    assert made.read_bytes() == kept.read_bytes() and page.exists()
+    assert not list(out.glob(".*"))
 
 
 def test_one_process_at_a_time_works_in_a_folder(field, tmp_path):

@@ -208,6 +208,22 @@ def test_validation_stars_choose():
     assert len(other.count) == 12 and other.count.sum() == 350
 
 
+@pytest.mark.parametrize("kind", [GaussianMixture, Placed])
+def test_another_seed_keeps_what_the_search_has_chosen(kind):
+    data = training()
+    if kind is Placed:  # stars stand anywhere: the search leaves the position aside
+        data = replace(data, positions=np.random.default_rng(3).normal(size=(400, 2)))
+    settings = Gmm(**{**ONE, "components": [1, 3], "shrinkage": [20.0, 5.0]})
+    found = kind.fit(data, settings)
+    same, other = (found.again(replace(data, seed=seed), settings) for seed in (data.seed, 5))
+    for name in kind.arrays:
+        np.testing.assert_array_equal(getattr(same, name), getattr(found, name))
+    assert len(other.count) == len(found.count) == 3
+    assert other.shrinkage == found.shrinkage
+    assert other.whitening.any() == found.whitening.any()
+    assert not np.array_equal(other.mean, found.mean)
+
+
 @pytest.mark.parametrize("free", [False, True])
 def test_strangeness_of_one_cluster_is_the_square_of_mahalanobis_distance(free, monkeypatch):
     monkeypatch.setattr(module, "FLAT", 0.0)
@@ -284,6 +300,30 @@ def test_a_bundle_has_the_main_axes_of_each_cluster():
     assert np.square(less.psf - truth).mean() < 1.1 * np.square(whole.psf - truth).mean()
     with pytest.raises(BundleError, match=r"GMM .*: takes more than 0.001 MB"):
         packed(mixture, D, NOISE.kappa * LEVEL, 1e3)
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("axes", lambda a: 1.1 * a),
+        ("variance", lambda a: -a),
+        ("count", lambda a: a * (np.arange(a.size) > 0)),
+        ("rows", lambda a: a + 1),
+        ("mean", lambda a: 2 * a),
+        ("deviation", lambda a: 300 * a),
+        ("shrinkage", lambda a: 0 * a),
+    ],
+)
+def test_arrays_that_no_fit_leaves_are_known(name, change):
+    arrays = fitted(components=[4]).pack(D, NOISE.kappa * LEVEL)[0]
+    config = {"noise": {"kappa": NOISE.kappa, "background_photons": NOISE.background}}
+
+    def wrong(arrays):
+        laws = GaussianMixture.restored(arrays, config, "realisation").lawful()
+        return [law for law, _, right in laws if not np.all(right)]
+
+    assert wrong(arrays) == []
+    assert wrong(arrays | {name: change(arrays[name])})[0] == name
 
 
 def test_the_position_is_used_where_it_tells_something():

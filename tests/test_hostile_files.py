@@ -330,6 +330,7 @@ def signed(path, change=lambda info: None, **arrays):
         ("flux/rest", lambda a: a - 1, "must have numbers from 0 to 1e+06"),
         ("flux/high", lambda a: a - 9, "must have at least flux/low"),
         ("rms", lambda a: a.astype(np.float64), "of float64, not float32"),
+        ("error68", lambda a: -a, "must have numbers of at least 0"),
     ],
 )
 def test_numbers_that_no_training_leaves_are_refused(tmp_path, name, change, message):
@@ -338,6 +339,24 @@ def test_numbers_that_no_training_leaves_are_refused(tmp_path, name, change, mes
     assert name in line and message in line
     write_cube(tmp_path / "c.fits", np.ones((2, 16, 16)), PIXSCALE=0.1)
     refused("predict", tmp_path / "c.fits", "--model", path, "--out", tmp_path / "o.fits")
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "message"),
+    [
+        ("axes", lambda a: 1.1 * a, "orthonormal columns"),
+        ("variance", lambda a: -a, "numbers from 0 to 1"),
+        ("count", lambda a: 0 * a, "a star or more in each cluster"),
+    ],
+)
+def test_arrays_of_a_mixture_that_no_training_leaves_are_refused(tmp_path, name, change, message):
+    bundle, path = read_bundle(), tmp_path / "x.psf.safetensors"
+    array = bundle.weights[name]
+    weights = bundle.weights | {name: np.asarray(change(array), array.dtype)}
+    write_bundle(replace(bundle, weights=weights), path)
+    write_cube(tmp_path / "c.fits", np.ones((2, 16, 16)), PIXSCALE=0.1)
+    words = ["predict", tmp_path / "c.fits", "--model", path, "--out", tmp_path / "o.fits"]
+    assert f"damaged (gmm: array '{name}' must have {message})" in refused(*words)
 
 
 def told(info, noise):

@@ -56,6 +56,24 @@ def test_what_make_is_given_stays_a_text(pretended, variable, text):
     assert not list(pretended.rglob("pwned"))
 
 
+@pytest.mark.parametrize(("preset", "finished"), [("fast", True), ("fast", False), ("smoke", True)])
+def test_reproduce_ends_with_what_the_record_says(pretended, preset, finished):
+    """Only where there is something to compare, and never by failing."""
+    results = pretended / ("results" if preset == "fast" else f"results/{preset}")
+    (results / "evaluation").mkdir(parents=True)
+    (results / ".report.html").touch()
+    if not finished:
+        (results / "evaluation").rmdir()
+    with (pretended / ".venv/bin/psfdae").open("a") as program:
+        program.write('[ "$1" != compare ] || exit 2\n')
+    run = shell(pretended, f"make reproduce PRESET={preset}", stdout=subprocess.DEVNULL)
+    assert run.wait() == 0
+    said = (pretended / "said").read_text().splitlines()
+    compared = ["compare", "results", "results/reference"]
+    assert (said[-3:] == compared) == (finished and preset == "fast")
+    assert said.count("compare") == (finished and preset == "fast")
+
+
 def snapshot(results):
     """Bytes of the products of a run: no times, no logs, no views of other products."""
     # MLflow draws the names of its runs, which its receipts and their notes hold.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import sqlite3
 from contextlib import closing
@@ -127,6 +128,13 @@ def test_a_damaged_note_counts_as_damage(results):
     for old, new in (('"sha256": "', '"sha256": "0'), ('"tags"', '"tagt"'), ("{", "["), ("a", "b")):
         noted.write_text(whole.replace(old, new, 1))
         assert damage(results).startswith("not what was imported ("), new
+
+
+def test_a_pipe_is_no_view(results):
+    """It would be read for ever."""
+    (results / "mlflow.db").unlink()
+    os.mkfifo(results / "mlflow.db")
+    assert damage(results) == "missing"
 
 
 def test_a_damaged_view_is_set_aside_and_imported_anew(imported, results):

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import signal
+
 import numpy as np
 import pytest
 from astropy.io import fits
@@ -62,6 +65,9 @@ def test_images_are_called_by_their_own_names_where_they_have_one(ccds, tmp_path
     assert science_images(ccds[0]) == NUMBERS
     path = mosaic_file(tmp_path / "odd.fits", ("a/../b", np.ones((3, 3)), None))
     assert science_images(path) == {"1": 1}
+    ones = np.ones((3, 3))
+    path = mosaic_file(tmp_path / "2.fits", ("2", ones, None), ("", ones, None), ("2A", ones, None))
+    assert science_images(path) == {"1": 1, "2": 2, "2A": 3}
     with pytest.raises(ObservationError, match="no image"):
         science_images(mosaic_file(tmp_path / "none.fits", ("CAT", None, None)))
 
@@ -82,6 +88,8 @@ def test_stars_of_a_sky_list_belong_to_the_image_on_which_they_are(ccds):
 
 def twice(word):
     print("not shown")
+    if word == "killed":
+        os.kill(os.getpid(), signal.SIGKILL)
     if word == "nothing":
         raise ObservationError("f", "no star")
     return {"x": "xx"}[word]
@@ -94,6 +102,14 @@ def test_images_that_fail_are_named_at_the_end(tmp_path, capfd):
     assert capfd.readouterr() == ("m: 2 images: A, B\nA: xx\nB: f: no star\n", "")
     with pytest.raises(KeyError):  # a bug stays one
         mosaic.each(twice, {"A": {"word": "bug"}}, "m")
+
+
+def test_a_killed_process_takes_no_other_image_with_it(capfd):
+    jobs = {name: {"word": "killed" if name == "B" else "x"} for name in "ABCD"}
+    with pytest.raises(mosaic.MosaicError, match=r"m: 1 of 4 images failed: B$"):
+        mosaic.each(twice, jobs, "m")
+    said = "B: its process was killed, perhaps for lack of memory"
+    assert capfd.readouterr().out.splitlines()[1:] == ["A: xx", said, "C: xx", "D: xx"]
 
 
 @pytest.mark.parametrize(

@@ -283,6 +283,14 @@ def test_origins(ramp, tmp_path, names, origin):
     np.testing.assert_array_equal(found.positions, [[12 - assumed, 9 - assumed]])
 
 
+def test_places_beyond_any_image_are_none(ramp, tmp_path):
+    """Their distances to others would not even be numbers."""
+    stars = catalogue(tmp_path / "s.csv", [9.0, 1e160, -1e300], [9.0, 9.0, 9.0])
+    found = open_observation(ramp, D, catalogue=stars)
+    assert np.isnan(found.positions).tolist() == [[False, False], [True, False], [True, False]]
+    assert "no position in row 2, 3" in found.said()
+
+
 def test_stars_at_the_edge_and_off_the_image_are_flagged_and_kept(ramp, tmp_path):
     x, y = [20, 1, 39, 20, -50, 1e300], [15, 15, 28, -3, 15, 1]
     stars = catalogue(tmp_path / "c.csv", x, y, ("xcenter", "ycenter"))

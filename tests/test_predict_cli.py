@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 import struct
 import warnings
 
@@ -20,6 +22,7 @@ from psfdae.own_stars import plot
 from psfdae.own_stars import prediction as writer
 from psfdae.own_stars.bundle import shipped_path
 from psfdae.own_stars.model import SCALE_TOLERANCE
+from psfdae.stages import figures
 from psfdae.stages import predict as stage
 from workflow_runs import ROOT
 
@@ -229,6 +232,34 @@ def test_failure_in_the_middle_leaves_no_file(folder, tmp_path, monkeypatch):
     with pytest.raises(MemoryError):
         stage.predict(folder / "cube.fits", stage.Stated(), out=tmp_path / "psf.fits")
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("last", ["list", "map"])
+def test_a_killed_command_ends_well_if_typed_again(folder, tmp_path, monkeypatch, last):
+    """Whatever files it has left: that of the PSFs comes last, and says that all are there."""
+    out, listed, plotted = (tmp_path / name for name in ("psf.fits", "psf_stars.csv", "map.png"))
+    words = [folder / "image.fits", "--detect", "--out", out, "--plot", plotted, "--quiet"]
+
+    def killed(after):
+        def both(*args):
+            after(*args)
+            os.kill(os.getpid(), signal.SIGKILL)
+
+        return both
+
+    child = os.fork()
+    if child == 0:
+        place = (stage, "write_list") if last == "list" else (figures, "write_png")
+        monkeypatch.setattr(*place, killed(getattr(*place)))
+        run(*words)
+        os._exit(1)
+    assert os.waitpid(child, 0)[1] == signal.SIGKILL
+    assert listed.exists() and plotted.exists() == (last == "map") and not out.exists()
+    assert run(*words).exit_code == 0
+    assert sorted(tmp_path.iterdir()) == sorted([out, listed, plotted])
+    assert "exists already" in run(*words).output
+    out.unlink()
+    assert "exists already" in run(*words).output  # these may be anybody's
 
 
 def test_full_disk_is_one_line(folder, tmp_path):

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import json
+import os
+import shutil
+import sys
 from pathlib import Path
 
 import pandas as pd
 import pytest
 
+from psfdae import source
 from psfdae.configuration.compose import load
 from psfdae.files import ProductError
 from psfdae.stages import record
+from workflow_runs import PATH, captured, environment
 
 ROOT = Path(__file__).resolve().parents[1]
 REFERENCE = ROOT / "results/reference"
@@ -18,18 +23,56 @@ REFERENCE = ROOT / "results/reference"
 
 @pytest.fixture
 def results(tmp_path):
-    """A finished run with two jobs and one table."""
+    """A finished run with two jobs, one table and what Snakemake says of them."""
     header = "s\th:m:s\tmax_rss\tmax_vms\tmax_uss\tmax_pss\tio_in\tio_out\tmean_load\tcpu_time\n"
     for name, seconds in (("train/dataset3/random-template", 12.5), ("runtime/all", 0.4)):
         path = tmp_path / "results/benchmarks" / f"{name}.tsv"
         path.parent.mkdir(parents=True)
         memory = "-" if seconds < 1 else "812.5"
-        row = f"{seconds}\t0:00:12\t{memory}\t1\t1\t1\t0\t0\t99\t{2 * seconds}\n"
+        row = f"{seconds}\t0:00:12\t{memory}\t1\t1\t1\t0\t0\t99\t0.3\n"
         path.write_text(header + row)
-    table = tmp_path / "results/tables/t.csv"
-    table.parent.mkdir()
-    table.write_text("a\n1\n")
+        log = tmp_path / "results/logs" / f"{name}.log"
+        log.parent.mkdir(parents=True)
+        log.write_text(f"said\n0m0.002s 0m0.001s\n0m{seconds:.3f}s 1m0.250s\n")
+    written(tmp_path / "results/tables/t.csv", "a\n1\n")
+    written(tmp_path / "results/runtime.csv", "rule\n")
     return tmp_path / "results"
+
+
+def written(path, text):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+    return path
+
+
+def plan(results, **status):
+    """What `snakemake --summary` would say; files that are not named are up to date."""
+    rows = {"runtime.csv": "no update", "data/stars.h5": "update pending"} | status
+    lines = [f"{results / name}\t-\trule\t-\tok\t{said}\n" for name, said in rows.items()]
+    head = "output_file\tdate\trule\tlog-file(s)\tstatus\tplan\n"
+    return written(results.parent / "plan.tsv", head + "".join(lines))
+
+
+@pytest.fixture
+def history(tmp_path, monkeypatch):
+    """Git in the folder of the test, as if the package lay there; commits what is in it."""
+    monkeypatch.setattr(source, "ROOT", tmp_path / "src/psfdae")
+    written(tmp_path / "src/psfdae/a.py", "")
+    for name in ("name", "email"):
+        for who in ("AUTHOR", "COMMITTER"):
+            monkeypatch.setenv(f"GIT_{who}_{name.upper()}", "nobody")
+    source.git("init", "--quiet")
+
+    def commit():
+        source.git("add", "src")
+        source.git("commit", "--quiet", "--allow-empty", "--message", "some")
+        return source.git("rev-parse", "HEAD")
+
+    return commit
+
+
+def recorded(out):
+    return json.loads((out / "provenance.json").read_text())
 
 
 def test_runtime_lists_every_job(results, tmp_path):
@@ -37,68 +80,199 @@ def test_runtime_lists_every_job(results, tmp_path):
     table = pd.read_csv(tmp_path / "runtime.csv")
     assert list(table.columns) == ["rule", "wildcards", "wall_s", "cpu_s", "peak_mb"]
     row = table.set_index("rule").loc["train"]
-    assert (row.wildcards, row.wall_s, row.cpu_s) == ("dataset3/random-template", 12.5, 25.0)
+    assert (row.wildcards, row.wall_s, row.cpu_s) == ("dataset3/random-template", 12.5, 72.75)
     assert row.peak_mb == 812.5
 
 
-def test_reference_keeps_the_layout_and_says_where_it_comes_from(results, tmp_path):
+BURNER = """#!{python}
+import subprocess, sys, time
+while time.process_time() < 0.5:
+    pass
+if len(sys.argv) == 1:
+    subprocess.run([sys.executable, __file__, "child"])
+"""
+ONE_JOB = """include: "{rules}/cpu_time.smk"
+rule:
+    output: "made"
+    log: "logs/burn/all.log"
+    benchmark: "benchmarks/burn/all.tsv"
+    shell: "psfdae > {{log}} 2>&1; touch {{output}}"
+"""
+
+
+@pytest.mark.workflow
+def test_cpu_time_of_a_short_job_is_that_of_all_its_processes(tmp_path):
+    """Snakemake samples after 15 s for the first time."""
+    program = written(tmp_path / "bin/psfdae", BURNER.format(python=sys.executable))
+    program.chmod(0o755)
+    written(tmp_path / "Snakefile", ONE_JOB.format(rules=ROOT / "workflow/rules"))
+    path = f"{program.parent}{os.pathsep}{PATH}"
+    done = captured(["snakemake", "--cores", "1"], cwd=tmp_path, env=environment(PATH=path))
+    assert done.returncode == 0, done.stderr
+    record.runtime(tmp_path, tmp_path / "runtime.csv")
+    (job,) = pd.read_csv(tmp_path / "runtime.csv").itertuples()
+    assert 1.0 <= job.cpu_s < 1.3
+    assert job.cpu_s <= 1.1 * job.wall_s
+
+
+@pytest.mark.workflow
+def test_every_job_of_a_run_has_its_cpu_time(smoke):
+    jobs = pd.read_csv(smoke / "results/runtime.csv")
+    assert len(jobs) >= 80
+    assert (jobs.cpu_s > 0.1).all()
+    assert (jobs.cpu_s < 2.2 * jobs.wall_s + 0.5).all()
+
+
+def test_reference_keeps_the_layout_and_says_where_it_comes_from(results, history, tmp_path):
     out = tmp_path / "reference"
-    (out / "tables").mkdir(parents=True)
-    (out / "tables/old.csv").write_text("stale")
-    record.reference(results, out, [results / "tables/t.csv"])
+    written(out / "tables/old.csv", "stale")
+    commit = history()
+    record.reference(results, out, [plan(results, **{"tables/t.csv": "no update"})])
     assert (out / "tables/t.csv").read_text() == "a\n1\n"
     assert not (out / "tables/old.csv").exists()
-    provenance = json.loads((out / "provenance.json").read_text())
+    assert not (out / "data").exists()
+    provenance = recorded(out)
+    assert provenance["commit"] == commit
+    assert provenance["kept"] == {}
     assert provenance["peak_mb"] == 812.5
-    assert provenance["cpu_s"] == pytest.approx(25.8)
+    assert provenance["cpu_s"] == pytest.approx(133.4)
     assert provenance["wall_s"] >= 12.5
     assert provenance["matrix_product_gflops"] > 0
     assert provenance["versions"]["torch"].startswith("2.")
 
 
-@pytest.mark.slow
-def test_record_keeps_what_was_not_renewed_and_says_since_when(results, tmp_path):
-    out = tmp_path / "reference"
-    slow = results / "tables/slow.csv"
-    slow.write_text("b\n2\n")
-    files, keep = [results / "tables/t.csv"], [Path("tables/slow.csv"), Path("tables/never.csv")]
-    record.reference(results, out, files, keep)
-    slow.unlink()
-    assert json.loads((out / "provenance.json").read_text())["kept"] == {}
-    (out / "provenance.json").write_text('{"commit": "first"}')
+SLOW = "tables/psf_metrics_on_request.csv"
+
+
+@pytest.mark.parametrize("pending", [{SLOW: "update pending"}, {}])
+def test_record_keeps_what_takes_long_and_says_since_when(results, history, tmp_path, pending):
+    out, first = tmp_path / "reference", history()
+    written(results / SLOW, "b\n2\n")
+    record.reference(results, out, [plan(results, **{SLOW: "no update"})])
+    assert recorded(out)["kept"] == {}
+    day = recorded(out)["date"]
+    written(results / SLOW, "b\n3\n")
     for _ in range(2):
-        record.reference(results, out, files, keep)
-        assert (out / "tables/slow.csv").read_text() == "b\n2\n"
-        kept = json.loads((out / "provenance.json").read_text())["kept"]
-        assert kept == {"tables/slow.csv": "first"}
+        commit = history()
+        record.reference(results, out, [plan(results, **pending)])
+        assert (out / SLOW).read_text() == "b\n2\n"
+        assert recorded(out)["kept"] == {SLOW: {"commit": first, "date": day}}
+        assert recorded(out)["commit"] == commit != first
 
 
-def test_what_a_run_cost_stays_with_its_times(results, tmp_path):
-    out = tmp_path / "reference"
-    out.mkdir()
-    (out / "runtime.csv").write_text("rule\n")
-    (out / "provenance.json").write_text('{"commit": "first", "wall_s": 1.5, "cores": 64}')
-    record.reference(results, out, [results / "tables/t.csv"], [Path("runtime.csv")])
-    described = json.loads((out / "provenance.json").read_text())
-    assert described["kept"] == {"runtime.csv": "first"}
-    assert described["wall_s"] == 1.5 and described["cores"] != 64
+def test_files_of_another_commit_are_refused(results, history, tmp_path):
+    out, _ = tmp_path / "reference", history()
+    written(out / "tables/t.csv", "before")
+    with pytest.raises(ProductError, match=r"tables/t\.csv: missing, or not what this commit"):
+        record.reference(results, out, [plan(results, **{"tables/t.csv": "update pending"})])
+    assert (out / "tables/t.csv").read_text() == "before"
 
 
-def test_targets_on_request_are_not_part_of_the_run(results, tmp_path):
-    path = results / record.ON_REQUEST / "stability/stability.tsv"
-    path.parent.mkdir(parents=True)
-    path.write_text("s\n100.0\n")
+@pytest.mark.parametrize("where", ["src/psfdae/a.py", "workflow/new.smk", "config/b.yaml"])
+def test_changes_that_are_not_committed_are_refused(results, history, tmp_path, where):
+    history()
+    written(tmp_path / where, "new = 1\n")
+    with pytest.raises(ProductError, match="differs from commit"):
+        record.reference(results, tmp_path / "reference", [plan(results)])
+    assert not (tmp_path / "reference").exists()
+
+
+def test_what_is_kept_is_of_a_commit_in_the_history(results, history, tmp_path):
+    out, kept = tmp_path / "reference", {}
+    history()
+    source.git("checkout", "--quiet", "-b", "side")
+    kept[SLOW] = {"commit": history(), "date": "2026-01-01"}
+    source.git("checkout", "--quiet", "-")
+    written(out / SLOW, "b\n")
+    written(out / "provenance.json", json.dumps({"kept": kept}))
+    for commit in (kept[SLOW]["commit"], "f" * 40):
+        kept[SLOW]["commit"] = commit
+        with pytest.raises(ProductError, match=r"on_request\.csv: .* not in the history"):
+            record.reference(results, out, [plan(results)])
+
+
+def test_table_that_no_rule_makes_says_its_commit(results, history, tmp_path):
+    out, name = tmp_path / "reference", "tables/real_sky.csv"
+    first = history()
+    head = history()
+    table = written(results / name, f"mse,commit,date\n1,{first},2026-01-02\n")
+    record.reference(results, out, [plan(results)])
+    assert recorded(out)["kept"] == {name: {"commit": first, "date": "2026-01-02"}}
+    for text in ("mse\n1\n", f"mse,commit,date\n1,{head}-dirty,2026-01-02\n"):
+        table.write_text(text)
+        with pytest.raises(ProductError, match="real_sky"):
+            record.reference(results, out, [plan(results)])
+
+
+def test_a_plan_of_something_else_is_no_record(results, history, tmp_path):
+    history()
+    other = written(tmp_path / "other.tsv", "output_file\tplan\n")
+    with pytest.raises(ProductError, match=r"runtime\.csv"):
+        record.reference(results, tmp_path / "reference", [other])
+
+
+TOY = """rule reference:
+    input: "results/runtime.csv", "results/tables/a.csv"
+rule psf_metrics_on_request:
+    output: "results/tables/psf_metrics_on_request.csv"
+    params: source=HASH
+    shell: "echo {params.source} > {output}"
+rule:
+    output: "results/{name}"
+    wildcard_constraints: name="(runtime|.*a).csv"
+    params: source=HASH
+    shell: "echo {params.source} > {output}"
+"""
+
+
+@pytest.mark.workflow
+def test_make_reference_refuses_a_run_of_two_commits(history, tmp_path):
+    """With Snakemake's own word for it, in a workflow of three files."""
+    for folder in ("config", "src/psfdae"):
+        shutil.copytree(ROOT / folder, tmp_path / folder, dirs_exist_ok=True)
+    line = ["sh", str(ROOT / "workflow/reference.sh")]
+    options = {"cwd": tmp_path, "env": environment(PYTHONPATH=str(tmp_path / "src"))}
+
+    def renewed(code, *made):
+        written(tmp_path / "Snakefile", TOY.replace("HASH", code))
+        source.git("add", "config", "Snakefile")
+        commit = history()
+        for target in made:
+            done = captured(["snakemake", "--cores", "1", target], **options)
+            assert done.returncode == 0, done.stderr
+        return commit, captured(line, **options)
+
+    first, done = renewed("1", "reference", "psf_metrics_on_request")
+    assert done.returncode == 0, done.stderr
+    assert recorded(tmp_path / "results/reference")["commit"] == first
+    _, done = renewed("2", "results/runtime.csv")
+    assert (done.returncode, done.stderr.count("results/tables/a.csv: missing, or")) == (2, 1)
+    second, done = renewed("2", "reference")
+    assert done.returncode == 0, done.stderr
+    found = recorded(tmp_path / "results/reference")
+    assert found["commit"] == second
+    assert found["kept"] == {SLOW: {"commit": first, "date": found["date"]}}
+
+
+def test_targets_on_request_are_not_part_of_the_run(results):
+    for name in ("stability/stability.tsv", "sweep/dae_width/one.tsv"):
+        written(results / record.ON_REQUEST / name, "s\n100.0\n")
     described = record.provenance(results, load())
     assert described["on_request_s"] == {"stability": 100.0}
     assert described["wall_s"] < 20
 
 
-def test_incomplete_run_leaves_the_record_alone(results, tmp_path):
-    out = tmp_path / "reference"
-    out.mkdir()
-    with pytest.raises(ProductError, match=r"missing\.csv: missing"):
-        record.reference(results, out, [results / "missing.csv"])
-    assert list(out.iterdir()) == []
+@pytest.mark.xfail(strict=True, reason="the table of HAT-P-32 waits for the next record")
+def test_record_is_of_commits_in_the_history():
+    found = recorded(REFERENCE)
+    commits = {found["commit"], *(of["commit"] for of in found["kept"].values())}
+    if (
+        source.git_commit() == "unknown"
+        or source.git("rev-parse", "--is-shallow-repository") == "true"
+    ):
+        pytest.skip("no history")
+    for commit in commits:
+        source.git("merge-base", "--is-ancestor", commit, "HEAD")
 
 
 def test_run_of_record_reaches_the_numbers_that_it_must():

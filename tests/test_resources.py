@@ -80,6 +80,17 @@ def test_measured_jobs_of_the_record_fit_into_what_they_ask_for(everything):
     assert compared > 100
 
 
+def test_a_job_of_the_run_has_one_name_for_its_log_and_its_costs(everything):
+    """Its CPU time stands in the log, wall time and memory in the benchmark."""
+    costs = [
+        job for job in everything if job.get("benchmark", "").startswith("results/benchmarks/")
+    ]
+    assert len(costs) > 150
+    for job in costs:
+        name = job["benchmark"].removeprefix("results/benchmarks/").removesuffix(".tsv")
+        assert job["log"] == f"results/logs/{name}.log"
+
+
 def test_what_writes_sqlite_or_only_joins_tables_stays_at_home(everything):
     local = {job["rule"] for job in everything if job["local"]}
     tables = {"runtime", "paper_tables", "psf_metrics", "held_out"}

@@ -273,15 +273,32 @@ def test_a_streamed_product_takes_no_more_than_it_needs(tmp_path):
     assert (tmp_path / "s.h5").stat().st_size < 1.2 * 4 * 16 * 16 * 1000
 
 
-@pytest.mark.parametrize("damage", ["", "s\n", "s\tcpu_time\tmax_rss\n1\tx\t3\n", "\xff"])
+@pytest.mark.parametrize("damage", ["", "s\n", "s\tmax_rss\n1\tx\n", "\xff"])
 def test_a_damaged_benchmark_costs_its_numbers_only(tmp_path, capsys, damage):
     folder = tmp_path / "benchmarks/train"
     folder.mkdir(parents=True)
     (folder / "a.tsv").write_text("s\th:m:s\tmax_rss\tcpu_time\n1.5\t0:00:01\t-\t1.25\n")
     (folder / "b.tsv").write_bytes(damage.encode("latin1"))
+    logs = tmp_path / "logs/train"
+    logs.mkdir(parents=True)
+    for name in "ab":
+        (logs / f"{name}.log").write_text("0m0.002s 0m0.001s\n0m1.150s 0m0.100s\n")
     record.runtime(tmp_path, tmp_path / "runtime.csv")
     said = capsys.readouterr().err
     assert said.count("\n") == 1
     assert said.startswith(f"{folder / 'b.tsv'}: damaged")
     rows = (tmp_path / "runtime.csv").read_text().splitlines()
-    assert rows[1:] == ["train,a,1.5,1.25,", "train,b,,,"]
+    assert rows[1:] == ["train,a,1.5,1.25,", "train,b,,1.25,"]
+
+
+@pytest.mark.parametrize("log", [None, "", "killed\n", "0m1.150s\n", "\xff"])
+def test_a_log_without_cpu_time_costs_that_number_only(tmp_path, capsys, log):
+    (tmp_path / "benchmarks/train").mkdir(parents=True)
+    (tmp_path / "benchmarks/train/a.tsv").write_text("s\tmax_rss\n1.5\t3\n")
+    (tmp_path / "logs/train").mkdir(parents=True)
+    path = tmp_path / "logs/train/a.log"
+    if log is not None:
+        path.write_bytes(log.encode("latin1"))
+    record.runtime(tmp_path, tmp_path / "runtime.csv")
+    assert capsys.readouterr().err.startswith(f"{path}: no CPU time")
+    assert (tmp_path / "runtime.csv").read_text().splitlines()[1:] == ["train,a,1.5,,3"]

@@ -53,10 +53,8 @@ def atomic_path(path: str | Path, digest: bool = True) -> Iterator[Path]:
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    # Of 255 bytes that a name may have; a character takes up to four.
-    stem = f".{path.name[:40]}"
-    sweep_stale(path.parent, stem)
-    temporary = path.with_name(f"{stem}.{_writer()}-{secrets.token_hex(4)}.tmp")
+    sweep_stale(path.parent, _stem(path))
+    temporary = path.with_name(f"{_stem(path)}.{_writer()}-{secrets.token_hex(4)}.tmp")
     os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o666))
     try:
         yield temporary
@@ -75,6 +73,12 @@ def atomic_path(path: str | Path, digest: bool = True) -> Iterator[Path]:
         raise
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _stem(path: Path) -> str:
+    """What names of temporary files of a path start with."""
+    # Of 255 bytes that a name may have; a character takes up to four.
+    return f".{path.name[:40]}"
 
 
 def _to_disk(path: Path) -> None:
@@ -156,10 +160,23 @@ def sweep_stale(folder: Path, stem: str) -> None:
     stem : str
         What the names start with.
     """
+    for path in _stale(folder, stem):
+        path.unlink(missing_ok=True)
+
+
+def _stale(folder: Path, stem: str) -> Iterator[Path]:
     for entry in os.scandir(folder):
         found = _STALE.search(entry.name) if entry.name.startswith(stem) else None
         if found and found[1] == _machine() and _ended(int(found[2]), found[3]):
-            Path(entry.path).unlink(missing_ok=True)
+            yield Path(entry.path)
+
+
+def interrupted(path: Path) -> bool:
+    """Whether a killed writer of a file has left its temporary one.
+
+    What else that run was to leave may be there already then.
+    """
+    return path.parent.is_dir() and any(_stale(path.parent, _stem(path)))
 
 
 def _ended(pid: int, started: str) -> bool:

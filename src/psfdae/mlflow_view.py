@@ -59,7 +59,7 @@ def damage(results: Path) -> str:
     imports = _imports(results)
     if not imports:
         return ""
-    if not (results / DATABASE).exists():
+    if not (results / DATABASE).is_file():
         return "missing"
     changed = ""
     try:
@@ -98,6 +98,8 @@ def _open(results: Path) -> Any:
 
 def _changed(database: sqlite3.Connection, results: Path, receipt: Path) -> str:
     """Name of the first run of an import that is another one now."""
+    if not _noted(receipt).is_file():  # a pipe would be read for ever
+        return receipt.stem
     with receipt.open(newline="", encoding="utf-8") as file:
         imported = [row["run_id"] for row in csv.DictReader(file)]
     try:
@@ -140,6 +142,7 @@ def _hash(
 
 def _sha256(results: Path, run: str, name: str) -> str | None:
     for path in (results / ARTIFACTS).glob(f"*/{run}/artifacts/{name}"):
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
+        if path.is_file():
+            with path.open("rb") as file:
+                return hashlib.file_digest(file, "sha256").hexdigest()
     return None

@@ -465,11 +465,6 @@ def _imported(statement: ast.stmt) -> dict[str, str]:
 def git_commit() -> str:
     """Commit of the source tree; "-dirty" if it differs from it, "unknown" outside git."""
     root = ROOT.parents[1]
-
-    def git(*arguments: str) -> str:
-        command = ["git", "-C", str(root), *arguments]
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
-
     try:
         # Installed into an environment inside somebody else's repository, it is not ours.
         if Path(git("rev-parse", "--show-toplevel")).resolve() != root:
@@ -478,3 +473,9 @@ def git_commit() -> str:
         return git("rev-parse", "HEAD") + dirty
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
+
+
+def git(*arguments: str) -> str:
+    """What git says of the folder that the package lies in; CalledProcessError, OSError."""
+    command = ["git", "-C", str(ROOT.parents[1]), *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()

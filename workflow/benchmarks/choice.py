@@ -56,8 +56,8 @@ def spread(needed, ladder, per_rung):
 def take_sample(scene, stars, thorough):
     """Stars of each rung, with their stamps at all candidate settings or the next ones.
 
-    The sample is spread over the rungs, and holds the stars whose errors are the largest of
-    all (see `screen`), because the worst star of a set decides.
+    The sample is spread over the rungs, and holds the stars with the largest errors of those
+    that `screen` looks at, because the worst star of a set decides.
     """
     population = scene.propagation(scene.stars, scene.search_px, pupil_samples=EVERY_GRID).samples
     even = spread(population, scene.optics.pupil_samples, stars)

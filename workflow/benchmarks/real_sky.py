@@ -17,6 +17,7 @@ from psfdae.cli import File, command, program
 from psfdae.files import atomic_path
 from psfdae.reading import read_table
 from psfdae.rng import stream
+from psfdae.source import git_commit
 
 SNR = (5, 10, 20, 50)  # of the copies, by a matched filter
 FLUX = 1000.0  # of every copy, counts
@@ -114,7 +115,7 @@ def compare(
             row |= {"flux_bias": np.nanmean(flux), "flux_scatter": np.nanstd(flux)}
             row |= {"bias_stderr": standard_error(mean_of_copies(flux, star))}
             row |= {"lost": int(np.isnan(flux).sum()), "own_mse": np.square(known["own"]).mean()}
-            row["date"] = date.today().isoformat()
+            row |= {"date": date.today().isoformat(), "commit": git_commit()}
             rows.append(row)
     write(out, rows)
 

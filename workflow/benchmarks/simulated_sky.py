@@ -21,6 +21,7 @@ from psfdae.own_stars.example import add_stamps, write_field
 from psfdae.own_stars.observation import central_pixel
 from psfdae.reading import read_table
 from psfdae.rng import stream
+from psfdae.source import git_commit
 from psfdae.stars.field_model import slopes
 from real_sky import standard_error
 
@@ -148,7 +149,7 @@ def places(
         row = {"package": package, "stars": len(held), "learnt": sum(table["part"] == "training")}
         row |= {"mse": error.mean(), "stderr": standard_error(error)}
         row |= {"over": over, "over_stderr": standard_error(paired)}
-        rows.append(row | {"date": date.today().isoformat()})
+        rows.append(row | {"date": date.today().isoformat(), "commit": git_commit()})
     write(out, rows)
 
 

@@ -193,11 +193,7 @@ def untrained_bundle(tree, stars, out):
 
 
 def with_exponents(part, against):
-    """Measured rows with the exponents of their costs and, over stars, a predicted row.
-
-    Time is predicted from the last measurement with the fitted exponent; memory and disk,
-    which are a fixed part and so many bytes per star, by a straight line.
-    """
+    """Measured rows with the exponents of their costs and, over stars, a predicted row."""
     import pandas as pd
     from scipy.stats import linregress
 
@@ -206,10 +202,7 @@ def with_exponents(part, against):
     table = part.assign(measured="yes")
     if against == "stars":
         row = part.iloc[-1].to_dict() | {"stars": PREDICTED_STARS, "measured": "extrapolated"}
-        row["time_s"] *= (PREDICTED_STARS / x[-1]) ** laws["time_s"].slope
-        for name in ("peak_mb", "disk_mb"):
-            line = linregress(x, part[name])
-            row[name] = line.intercept + line.slope * PREDICTED_STARS
+        row |= beyond(part.to_dict("records"), COSTS, PREDICTED_STARS)
         table = pd.concat([table, pd.DataFrame([row])])
     table.insert(1, "against", against)
     # Two points leave the error of the exponent open.
@@ -217,6 +210,21 @@ def with_exponents(part, against):
     table = table.assign(exponent=laws["time_s"].slope, exponent_stderr=stderr)
     exponents = {f"{name}_exponent": laws[f"{name}_mb"].slope for name in ("peak", "disk")}
     return table.assign(**exponents)
+
+
+def beyond(rows, names, stars):
+    """Costs of more stars than measured: a fixed part and a part per star, neither negative.
+
+    Least squares of relative deviations, so that small and large sizes count alike.
+    """
+    from scipy.optimize import nnls
+
+    costs = {}
+    for name in names:
+        relative = [(1.0 / row[name], row["stars"] / row[name]) for row in rows]
+        fixed, each = nnls(np.array(relative), np.ones(len(rows)))[0]
+        costs[name] = fixed + each * stars
+    return costs
 
 
 READS = ("parts", *all_groups(), "evaluation", "methods", "benchmark")
@@ -299,22 +307,15 @@ def one_cpu():
 
 
 def planned(rows):
-    """A row of `PLANNED_STARS` per stage: a fixed part and a part per star, neither negative.
-
-    Least squares of relative deviations, so that small and large sizes count alike.
-    """
-    from scipy.optimize import nnls
-
-    found = []
-    for stage in dict.fromkeys(row["stage"] for row in rows):
-        part = [row for row in rows if row["stage"] == stage]
-        row = {**part[0], "stars": PLANNED_STARS, "measured": "extrapolated"}
-        for name in ("cpu_s", *COSTS):
-            relative = [(1.0 / r[name], r["stars"] / r[name]) for r in part]
-            fixed, each = nnls(np.array(relative), np.ones(len(part)))[0]
-            row[name] = fixed + each * PLANNED_STARS
-        found.append(row)
-    return found
+    """A row of `PLANNED_STARS` per stage."""
+    stages = {}
+    for row in rows:
+        stages.setdefault(row["stage"], []).append(row)
+    return [
+        {**part[0], "stars": PLANNED_STARS, "measured": "extrapolated"}
+        | beyond(part, ("cpu_s", *COSTS), PLANNED_STARS)
+        for part in stages.values()
+    ]
 
 
 if __name__ == "__main__":

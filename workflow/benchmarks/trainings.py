@@ -1,9 +1,6 @@
 """Test error against fitting time: which training, which PCA+SOM is large enough."""
 
-from collections import Counter
 from dataclasses import replace
-from itertools import permutations
-from itertools import product as product_of
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import perf_counter, process_time
@@ -14,13 +11,13 @@ from pydantic import Field
 
 from measure import alone, pareto, write, yes
 from psfdae.belonging import STARS, require
-from psfdae.cli import File, command, program
+from psfdae.cli import File, Folder, Reference, command, program
 from psfdae.configuration.base import Group
 from psfdae.configuration.compose import config_dir, decisive, load_file, part
 from psfdae.configuration.consistency import SIMULATION
 from psfdae.configuration.schema import Config
-from psfdae.estimators import all_groups, method
-from psfdae.files import read_product
+from psfdae.estimators import all_groups, groups_of, method
+from psfdae.files import read_product, write_csv
 from psfdae.reading import read_table, read_yaml
 from psfdae.stages import common
 from psfdae.stages.fit import training_set
@@ -33,6 +30,8 @@ COMPONENTS, MAPS, EPOCHS = (5, 10, 20, 40), (7, 11, 15), (2, 10, 50)
 CHEAP_S = 3.0  # within which a fit of PCA+SOM is repeated
 
 READINGS = (("map", True), ("map", False), ("projection", True))
+
+SEEDS = 5  # of each method: that of the configuration and the next ones
 
 READS = (*SIMULATION, "noise", "parts", "baseline", "benchmark")
 METHODS = (*SIMULATION, "noise", "parts", "methods", "evaluation", *all_groups())
@@ -275,20 +274,15 @@ def methods(
     config: Config,
     stars: Annotated[File, "Product of the stage stars."],
     out: Annotated[File, "CSV with the times of every method, and its error."],
-    seeds: Annotated[int, "Of the methods' own draws: the configuration's, and the next ones."] = 1,
 ) -> None:
     """Time fit and inference of all methods on one thread, on a quiet machine."""
     require(stars, read_product(stars, "stars", ()).config, STARS, config)
-    tried = [config.seed + i for i in range(seeds)]
-    write(out, alone(1, time_methods, config.model_dump(), stars, tried))
+    write(out, alone(1, time_methods, config.model_dump(), stars))
 
 
-def time_methods(tree, stars, seeds):
-    """CPU time of each method's fit by seed, stars per second and errors, λ by λ.
-
-    `different` counts the other seeds that `psfdae compare` calls another method's.
-    """
-    from psfdae.evaluation.metrics import all_metrics, clustered_mean
+def time_methods(tree, stars):
+    """CPU time of each method's fit, stars per second and errors, λ by λ."""
+    from psfdae.evaluation.metrics import clustered_mean, mse
 
     config = part(METHODS, tree)
     common.limit_threads(1)
@@ -296,13 +290,11 @@ def time_methods(tree, stars, seeds):
     test = common.split_stars(product, "random", config).test
     clean, field = product["realisation"][test], product["field_index"][test]
     position = common.field_positions(product)[test]
-    rows, measured = [], {seed: [] for seed in seeds}
-    restoring = (kind for kind in map(method, config.methods) if kind.restores)
-    for kind, seed in product_of(restoring, seeds):
+    rows = []
+    for kind in (kind for kind in map(method, config.methods) if kind.restores):
         with TemporaryDirectory() as folder:
             given = config, kind, product, "random", "realisation"
             data = training_set(*given, checkpoint=Path(folder, "checkpoint"))
-            data = replace(data, seed=seed)
             start = process_time()
             fitted = kind.fit(data, **kind.settings(config))
             fit_s = process_time() - start
@@ -313,36 +305,94 @@ def time_methods(tree, stars, seeds):
             start = process_time()
             found = fitted.restore(noisy, level, position)
             rate = len(noisy) / (process_time() - start)
-            row = {"method": kind.name, "seed": seed, "noise_level": level, "fit_cpu_s": fit_s}
-            errors = all_metrics(found, clean, config.evaluation.data_range)
-            errors = {"method": kind.name, "noise_level": level, "field": field, **errors}
-            measured[seed].append(errors | {"star": test})
-            mean, stderr = clustered_mean(errors["mse"], field)
+            row = {"method": kind.name, "noise_level": level, "fit_cpu_s": fit_s}
+            mean, stderr = clustered_mean(mse(found, clean), field)
             rows.append(row | {"stars_per_s": rate, "mse": mean, "stderr": stderr})
-    counts = different(measured)
-    return [
-        row | {"different": counts[row["seed"], row["method"], row["noise_level"]]} for row in rows
-    ]
+    return rows
 
 
-def different(measured):
-    """By seed, method and level: the other seeds that `psfdae compare` calls better or worse.
+@command("seeds", reads=lambda name, **options: (*groups_of(name), "evaluation"))
+def seeds(
+    config: Config,
+    name: Annotated[str, {"argument": True, "metavar": "METHOD"}],
+    dataset: Annotated[str, "Name that goes into the table."],
+    reference: tuple[Reference, ...],
+    stars: Annotated[File, "Product of the stage stars."],
+    results: Annotated[Folder, "Folder of the run with the method's own fits."],
+    out: Annotated[File, "CSV with the mean error of every seed."],
+) -> None:
+    """Repeat the fits of METHOD with other seeds, and test all of them on the same noisy stars."""
+    from psfdae.evaluation.metrics import mse
 
-    `measured` has, for every seed, errors of the same noisy stars as mappings of columns.
-    """
+    kind, product = method(name), common.read_stars(stars, "template")
+    common.limit_threads(kind.threads(config))
+    test = common.split_stars(product, "random", config).test
+    position = common.field_positions(product)[test]
+    noisy = {x: common.noisy_test_images(config, product, test, x) for x in config.noise.levels}
+    own = own_fits(config, kind, dataset, reference, product, results)
+    rows = []
+    for seed in range(config.seed, config.seed + SEEDS):
+        fits = own if seed == config.seed else other_fits(config, kind, own, product, seed)
+        for target, fitted in fits.items():
+            row = {"dataset": dataset, "reference": target, "method": name, "seed": seed}
+            for level, images in noisy.items():
+                found = fitted.restore(images, level, position)
+                error = mse(found, product[target][test]).mean()
+                rows.append({**row, "noise_level": level, "mse": error})
+    write(out, rows)
+
+
+def own_fits(config, kind, dataset, references, product, results):
+    """The fits of the workflow by reference; where they leave no file, the same again."""
+    fits = {}
+    for reference in references:
+        if kind.stored:
+            place = results / kind.place(dataset, "random", reference)
+            kind.require(place, product, config, "random", reference)
+            fits[reference] = kind.load(place, reference, config.evaluation)
+        else:
+            data = training_set(config, kind, product, "random", reference)
+            fits[reference] = kind.fit(data, **kind.settings(config))
+    return fits
+
+
+def other_fits(config, kind, own, product, seed):
+    """Fits that differ from the given ones by nothing but their seed."""
+    fits = {}
+    for reference, fitted in own.items():
+        if fits and kind.stored and not kind.per_reference:
+            fits[reference] = next(iter(fits.values()))  # one serves all
+            continue
+        with TemporaryDirectory() as folder:
+            data = training_set(
+                *(config, kind, product, "random", reference),
+                checkpoint=Path(folder, "checkpoint"),
+                start=fits.get("realisation") if kind.continues(config) else None,
+            )
+            fits[reference] = fitted.again(replace(data, seed=seed), **kind.settings(config))
+    return fits
+
+
+@command("scatter")
+def scatter(
+    errors: Annotated[tuple[File, ...], {"argument": True}],
+    out: Annotated[File, "CSV: relative scatter of every method, pooled over λ."],
+) -> None:
+    """Pool ERRORS, tables of the command seeds, over the noise levels."""
     import pandas as pd
 
-    from psfdae.evaluation.comparison import SEED_SCATTER, compare_errors
+    write_csv(out, pooled(pd.concat(map(read_table, errors))), 3)
 
-    tables = {seed: pd.concat(map(pd.DataFrame, errors)) for seed, errors in measured.items()}
-    counts = Counter()
-    for one, other in permutations(tables, 2):
-        verdicts = compare_errors(tables[one], tables[other], SEED_SCATTER)
-        changed = verdicts[(verdicts.metric == "mse") & (verdicts.verdict != "same")]
-        for row in changed.itertuples():
-            counts[one, row.method, row.noise_level] += 1
-    return counts
+
+def pooled(errors):
+    """Root mean square over λ of the standard deviation over the seeds divided by their mean."""
+    from psfdae.evaluation.comparison import FITTED
+
+    cells = errors.groupby([*FITTED, "noise_level"], sort=False)
+    relative = (cells.mse.std() / cells.mse.mean()).groupby(FITTED, sort=False)
+    table = cells.seed.nunique().groupby(FITTED, sort=False).min().rename("seeds").to_frame()
+    return table.assign(scatter=relative.agg(lambda s: np.sqrt((s**2).mean()))).reset_index()
 
 
 if __name__ == "__main__":
-    program(knee_table, baseline, readings, methods)
+    program(knee_table, baseline, readings, methods, seeds, scatter)

@@ -105,7 +105,7 @@ for _figure, _shown, _inputs in (
         output:
             of_scene3(f"figures/alignment/{_figure}.png", "estimates", _shown),
         log:
-            f"{RESULTS}/logs/figures/alignment/{_figure}.log",
+            f"{RESULTS}/logs/alignment/figure_{_figure}.log",
         benchmark:
             f"{RESULTS}/benchmarks/alignment/figure_{_figure}.tsv"
         params:
@@ -130,7 +130,7 @@ rule figure_alignment_stamps:
             "stamps before and after the DAE",
         ),
     log:
-        f"{RESULTS}/logs/figures/alignment/stamps.log",
+        f"{RESULTS}/logs/alignment/figure_stamps.log",
     benchmark:
         f"{RESULTS}/benchmarks/alignment/figure_stamps.tsv"
     threads: lambda w: alignment_config().evaluation.threads
@@ -158,7 +158,7 @@ use rule figure_alignment_stamps as figure_alignment_twin with:
             "figures/alignment/twin.png", "telescope and stamps", "twin ambiguity"
         ),
     log:
-        f"{RESULTS}/logs/figures/alignment/twin.log",
+        f"{RESULTS}/logs/alignment/figure_twin.log",
     benchmark:
         f"{RESULTS}/benchmarks/alignment/figure_twin.tsv"
     threads: 1

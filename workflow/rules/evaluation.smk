@@ -6,7 +6,7 @@ rule evaluate:
         summary=f"{RESULTS}/evaluation/{{dataset}}/{{split}}-{{reference}}.csv",
         per_star=f"{RESULTS}/evaluation/{{dataset}}/{{split}}-{{reference}}.parquet",
     log:
-        f"{RESULTS}/logs/evaluation/{{dataset}}/{{split}}-{{reference}}.log",
+        f"{RESULTS}/logs/evaluate/{{dataset}}/{{split}}-{{reference}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/evaluate/{{dataset}}/{{split}}-{{reference}}.tsv"
     threads: lambda w: dataset_config(w.dataset).evaluation.threads
@@ -66,7 +66,7 @@ rule paper_tables:
             f"{RESULTS}/tables/{{{{dataset}}}}_{{metric}}.md", metric=METRICS
         ),
     log:
-        f"{RESULTS}/logs/tables/{{dataset}}.log",
+        f"{RESULTS}/logs/paper_tables/{{dataset}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/paper_tables/{{dataset}}.tsv"
     localrule: True
@@ -88,7 +88,7 @@ rule held_out:
     output:
         f"{RESULTS}/tables/psf_held_out.csv",
     log:
-        f"{RESULTS}/logs/tables/psf_held_out.log",
+        f"{RESULTS}/logs/held_out/all.log",
     benchmark:
         f"{RESULTS}/benchmarks/held_out/all.tsv"
     localrule: True
@@ -109,7 +109,7 @@ rule psf_metrics:
     output:
         f"{RESULTS}/tables/psf_metrics.csv",
     log:
-        f"{RESULTS}/logs/tables/psf_metrics.log",
+        f"{RESULTS}/logs/psf_metrics/all.log",
     benchmark:
         f"{RESULTS}/benchmarks/psf_metrics/all.tsv"
     localrule: True

@@ -10,7 +10,7 @@ rule figure_templates:
             labels={"figure": "static PSFs"},
         ),
     log:
-        f"{RESULTS}/logs/figures/{{scene}}/templates.log",
+        f"{RESULTS}/logs/figure_templates/{{scene}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/figure_templates/{{scene}}.tsv"
     params:
@@ -32,7 +32,7 @@ use rule figure_templates as figure_energy with:
             labels={"figure": "light in the stamp"},
         ),
     log:
-        f"{RESULTS}/logs/figures/{{scene}}/energy.log",
+        f"{RESULTS}/logs/figure_energy/{{scene}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/figure_energy/{{scene}}.tsv"
     params:
@@ -55,7 +55,7 @@ rule figure_strip:
             labels={"figure": "restored stars, {reference}"},
         ),
     log:
-        f"{RESULTS}/logs/figures/{{dataset}}/strip_{{reference}}.log",
+        f"{RESULTS}/logs/figure_strip/{{dataset}}-{{reference}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/figure_strip/{{dataset}}-{{reference}}.tsv"
     threads: lambda w: dataset_config(w.dataset).evaluation.threads
@@ -86,7 +86,7 @@ rule figure_curves:
             labels={"figure": "training"},
         ),
     log:
-        f"{RESULTS}/logs/figures/{{dataset}}/curves.log",
+        f"{RESULTS}/logs/figure_curves/{{dataset}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/figure_curves/{{dataset}}.tsv"
     params:
@@ -113,7 +113,7 @@ rule figure_errors:
             for metric in METRICS
         },
     log:
-        f"{RESULTS}/logs/figures/{{dataset}}/errors.log",
+        f"{RESULTS}/logs/figure_errors/{{dataset}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/figure_errors/{{dataset}}.tsv"
     params:

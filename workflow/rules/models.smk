@@ -40,7 +40,7 @@ for _method in (m for m in registered() if m.stored):
         output:
             [str(path) for path in _method.outputs(_place)],
         log:
-            f"{RESULTS}/logs/{_method.name}/{_stem}.log",
+            f"{RESULTS}/logs/{_method.rule}/{_stem}.log",
         benchmark:
             f"{RESULTS}/{_costs}/{_method.rule}/{_stem}.tsv"
         threads: lambda w, m=_method: m.threads(dataset_config(w.dataset))

@@ -50,7 +50,7 @@ rule figure_telescope:
         ),
         table=f"{RESULTS}/tables/telescope/{{stars}}.csv",
     log:
-        f"{RESULTS}/logs/figures/telescope/{{stars}}.log",
+        f"{RESULTS}/logs/figure_telescope/{{stars}}.log",
     benchmark:
         f"{RESULTS}/benchmarks/figure_telescope/{{stars}}.tsv"
     wildcard_constraints:

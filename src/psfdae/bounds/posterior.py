@@ -199,8 +199,10 @@ class PosteriorSums:
         Largest log-likelihood of every test star.
     total, square : ndarray, shape (n,)
         Σw and Σw².
+    power : ndarray, shape (n,)
+        Σw |p|², p the bank's images.
     image : ndarray, shape (n, P)
-        Σw p, p the bank's images.
+        Σw p.
     share : ndarray, shape (n, F, J)
         Σw by field and jitter.
     """
@@ -208,13 +210,14 @@ class PosteriorSums:
     peak: np.ndarray
     total: np.ndarray
     square: np.ndarray
+    power: np.ndarray
     image: np.ndarray
     share: np.ndarray
 
     @classmethod
     def empty(cls, stars: int, pixels: int, fields: int, shifts: int) -> PosteriorSums:
         """Sums over nothing."""
-        zeros = (np.zeros((stars, *shape)) for shape in ((), (), (pixels,), (fields, shifts)))
+        zeros = (np.zeros((stars, *shape)) for shape in ((), (), (), (pixels,), (fields, shifts)))
         return cls(np.full(stars, -np.inf), *zeros)
 
     @classmethod
@@ -233,11 +236,22 @@ class PosteriorSums:
         """Effective sample size 1/Σw² of the normalised weights, shape (n,)."""
         return self.total**2 / np.maximum(self.square, np.finfo(float).tiny)
 
-    def mean_template(self, templates: np.ndarray) -> np.ndarray:
-        """Posterior mean of the static PSF, (F, J, d, d) to (n, P); NaN as `mean_image`."""
+    @property
+    def variance_image(self) -> np.ndarray:
+        """Posterior variance of the noise-free image, mean of its pixels, (n,); NaN as above."""
+        with np.errstate(invalid="ignore"):
+            return _variance(self.power / self.total, self.mean_image)
+
+    def template(self, templates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Posterior mean (n, P) and variance (n,) of the static PSF; NaN as `mean_image`.
+
+        Parameters
+        ----------
+        templates : ndarray, shape (F, J, d, d)
+        """
         with np.errstate(invalid="ignore"):
             weight = self.share.reshape(len(self.share), -1) / self.total[:, None]
-        return weight @ templates.reshape(weight.shape[1], -1).astype(np.float64)
+        return mixture(weight, templates.reshape(weight.shape[1], -1).astype(np.float64))
 
     def add(
         self,
@@ -267,6 +281,7 @@ class PosteriorSums:
         scale = np.exp(self.peak[changed] - peak[changed])
         self.total[changed] *= scale
         self.square[changed] *= scale**2
+        self.power[changed] *= scale
         self.image[changed] *= scale[:, None]
         self.share[changed] *= scale[:, None, None]
         self.peak = peak
@@ -275,11 +290,24 @@ class PosteriorSums:
         weight = np.exp(above.astype(np.float32))
         self.total += weight.sum(axis=1, dtype=np.float64)
         self.square += np.einsum("nk,nk->n", weight, weight, dtype=np.float64)
+        power = np.einsum("kp,kp->k", images[used], images[used], dtype=np.float64)
+        self.power += weight.astype(np.float64) @ power
         side = int(np.sqrt(images.shape[1]))
         added = symmetry.image((weight @ images[used]).reshape(-1, side, side))
         self.image += added.reshape(self.image.shape)
         start = np.flatnonzero(np.diff(field[used], prepend=-1))
         self.share[:, field[used][start], jitter] += np.add.reduceat(weight, start, axis=1)
+
+
+def mixture(weight: np.ndarray, images: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean (n, P) and variance (n,), the mean over pixels, of images (K, P) by weights (n, K)."""
+    mean = weight @ images
+    return mean, _variance(weight @ (images**2).sum(axis=1), mean)
+
+
+def _variance(power: np.ndarray, mean: np.ndarray) -> np.ndarray:
+    """(⟨|p|²⟩ − |⟨p⟩|²)/P; rounding makes none of it negative."""
+    return np.maximum(power - (mean**2).sum(axis=1), 0.0) / mean.shape[1]
 
 
 def merge(parts: Sequence[PosteriorSums]) -> PosteriorSums:
@@ -292,6 +320,7 @@ def merge(parts: Sequence[PosteriorSums]) -> PosteriorSums:
         scale = np.exp(part.peak - np.maximum(whole.peak, np.finfo(float).min))
         whole.total += scale * part.total
         whole.square += scale**2 * part.square
+        whole.power += scale * part.power
         whole.image += scale[:, None] * part.image
         whole.share += scale[:, None, None] * part.share
     return whole
@@ -383,8 +412,8 @@ def exact_posterior(
     templates: np.ndarray,
     likelihood: Likelihood,
     told: np.ndarray | None = None,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Posterior mean and probability of every template, its centring error summed out.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Posterior mean, variance and probability of the templates, centring errors summed out.
 
     All templates and all centring errors are equally likely beforehand.
 
@@ -401,6 +430,8 @@ def exact_posterior(
     Returns
     -------
     mean : ndarray, shape (n, d, d)
+    variance : ndarray, shape (n,)
+        Posterior variance, mean of the pixels.
     probability : ndarray, shape (n, F)
     """
     fields, shifts = templates.shape[:2]
@@ -411,12 +442,10 @@ def exact_posterior(
         scores[told[:, None] != np.repeat(np.arange(fields), shifts)] = -np.inf
     weight = np.exp(scores - scores.max(axis=1, keepdims=True))
     weight /= weight.sum(axis=1, keepdims=True)
-    mean = (weight @ images).reshape(noisy.shape)
-    return mean, weight.reshape(-1, fields, shifts).sum(axis=2)
+    mean, variance = mixture(weight, images)
+    share = weight.reshape(-1, fields, shifts).sum(axis=2)
+    return mean.reshape(noisy.shape), variance, share
 
-
-TIGHT = 0.05
-"""A bank is dense enough if its last fourfold growth changes the error by at most this."""
 
 FITTED_POINTS = 4
 """Least number of bank sizes to which three parameters are fitted."""

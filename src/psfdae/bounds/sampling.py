@@ -48,7 +48,8 @@ FARTHEST = 6.0
 the tails of the proposals reach beyond what can be sampled."""
 
 MATCHES = 16
-"""Fields of the bank's best matches from which modes are sought."""
+"""Best matches of the bank from which modes are sought: in as many fields, and in the own one at
+as many offsets."""
 
 ROUNDS = (0.2, 0.3, 0.5)
 """Parts of the draws before the mixture is adapted once, twice, and after."""
@@ -64,6 +65,14 @@ CONVERGED = 0.02
 
 SOURCES = 3
 """Best modes of a star whose twins in other fields are sought."""
+
+POOR_FIT = 2.0
+"""Standard deviations of χ² by which a star's best mode must fit worse than the truth would,
+for more modes to be sought beside it. Chance alone makes 3 % of the stars."""
+
+NEIGHBOURHOOD = 3
+"""Pixels by which the offsets of these modes differ at most. At low noise an offset that the bank
+does not have in a star's field is a mode that no match leads to."""
 
 OFFSETS = 1
 """Offsets that are tried in a field around every source."""
@@ -116,6 +125,11 @@ class StampModel:
     telescope: Telescope
     optics: Optics
     framing: Framing
+
+    def standardised(self, seidel: np.ndarray) -> np.ndarray:
+        """z of coefficients in waves, both (n, 5); 0 where they cannot vary."""
+        varies = self.sd > 0
+        return np.where(varies, (seidel - self.mean) / np.where(varies, self.sd, 1.0), 0.0)
 
     def coefficients(self, z: np.ndarray, field: np.ndarray) -> np.ndarray:
         """Monomial coefficients in waves, shape (n, 8), of z (n, 5) at fields (n,)."""
@@ -185,6 +199,10 @@ class StampModel:
         return choose_samples(needed, tuple(ladder))
 
 
+NOTHING, FIELD, TRUTH = range(3)
+"""What is given to the search for modes; who has more, has less, too."""
+
+
 @dataclass(frozen=True)
 class Modes:
     """Places (f, o, z) of stars' posteriors, M in all, and what is known there.
@@ -194,8 +212,8 @@ class Modes:
     star, field : ndarray of int, shape (M,)
     offset : ndarray of int, shape (M, 2)
         Middle of the stamp (row, column) from the chief ray, in pixels.
-    blind : ndarray of bool, shape (M,)
-        Found without being told the star's field.
+    given : ndarray of int, shape (M,)
+        What had to be given for the mode to be found: NOTHING, FIELD or TRUTH.
     z : ndarray, shape (M, 5)
         Standardised coefficients.
     factor : ndarray, shape (M, 5, 5)
@@ -207,10 +225,23 @@ class Modes:
     star: np.ndarray
     field: np.ndarray
     offset: np.ndarray
-    blind: np.ndarray
+    given: np.ndarray
     z: np.ndarray
     factor: np.ndarray
     evidence: np.ndarray
+
+    @classmethod
+    def at(
+        cls,
+        star: np.ndarray,
+        field: np.ndarray,
+        offset: np.ndarray,
+        given: np.ndarray,
+        z: np.ndarray,
+    ) -> Modes:
+        """Places from which modes are sought: nothing is known there yet."""
+        known = (np.tile(np.eye(TERMS), (len(z), 1, 1)), np.zeros(len(z)))
+        return cls(star, field, offset, given, z, *known)
 
     def take(self, modes: np.ndarray) -> Modes:
         """Some of the modes, in the order given."""
@@ -287,30 +318,36 @@ def sample(
     bank: Bank,
     seidel: np.ndarray,
     noisy: np.ndarray,
-    own: np.ndarray,
+    truth: Modes,
     likelihood: Likelihood,
     model: StampModel,
     draws: int,
     rngs: Sequence[np.random.Generator],
 ) -> Sampled:
-    """Matches, modes, their twins, and `draws` draws a star around them.
+    """Matches, modes, their twins, and `draws` samples a star around them.
+
+    Stars that no mode explains get more starts: all offsets around their best modes and matches.
 
     Parameters
     ----------
     bank : Bank
     seidel : ndarray, shape (M, 5)
         Coefficients of the bank's stars in waves.
-    noisy, own, likelihood, model, rngs : as for `sampled_sums`
+    truth : Modes
+        Where each of the stars was simulated.
+    noisy, likelihood, model, rngs : as for `sampled_sums`
     draws : int
     """
-    counts = likelihood.counts(noisy)
-    modes = climb(
-        best_matches(bank, seidel, noisy, likelihood, model, MATCHES, own),
-        *(counts, likelihood, model),
-    )
-    modes = climb(modes + twins(modes, likelihood, model), counts, likelihood, model)
+    problem = (likelihood.counts(noisy), likelihood, model)
+    matches = best_matches(bank, seidel, noisy, likelihood, model, MATCHES, truth.field)
+    modes = climb(matches, *problem)
+    poor = unexplained(modes, *problem)
+    beside = neighbours(modes, poor) + neighbours(matches, poor)
+    modes = climb(modes + beside, *problem)
+    modes = climb(modes + twins(modes, likelihood, model), *problem)
+    modes = _separate(modes + climb(truth, *problem))
     rounds = [round(share * draws) for share in ROUNDS]
-    return sampled_sums(modes, noisy, own, likelihood, model, rounds, rngs)
+    return sampled_sums(modes, noisy, truth.field, likelihood, model, rounds, rngs)
 
 
 def _log_student(distance: np.ndarray, factor: np.ndarray) -> np.ndarray:
@@ -341,9 +378,9 @@ def best_matches(
 ) -> Modes:
     """The best star of the bank in each of the `count` best fields of every image.
 
-    For those who are told the field, the best at each of as many offsets in the stars' `own`
-    fields, (n,), are added. Mirrored stars keep their coefficients. Factors are left at 1;
-    `evidence` is the log-likelihood up to a constant.
+    With the field given, the best at each of as many offsets in the stars' `own` fields, (n,),
+    are added. Mirrored stars keep their coefficients. `evidence` is the log-likelihood up to a
+    constant.
 
     Parameters
     ----------
@@ -371,19 +408,19 @@ def best_matches(
     rows = []
     for star, scores in enumerate(best):
         top = np.argsort(-scores.max(axis=1), kind="stable")[:count]
-        rows += [(star, field, scores[field].argmax(), True) for field in top]
+        rows += [(star, field, scores[field].argmax(), NOTHING) for field in top]
         mine, seen = own[star], set()
         for column in np.argsort(-scores[mine], kind="stable"):
             offset = tuple(offsets[which[star, mine, column], column])
             if np.isfinite(scores[mine, column]) and offset not in seen and len(seen) < count:
                 seen.add(offset)
-                rows.append((star, mine, column, False))
-    star, field, place, blind = np.array(rows).T
+                rows.append((star, mine, column, FIELD))
+    star, field, place, given = np.array(rows).T
     chosen = which[star, field, place]
-    z = np.where(model.sd > 0, (seidel[chosen] - model.mean) / np.maximum(model.sd, 1e-300), 0.0)
-    eye = np.tile(np.eye(TERMS), (len(star), 1, 1))
-    offset = offsets[chosen, place]
-    return Modes(star, field, offset, blind.astype(bool), z, eye, best[star, field, place])
+    starts = Modes.at(
+        star, field, offsets[chosen, place], given, model.standardised(seidel[chosen])
+    )
+    return replace(starts, evidence=best[star, field, place])
 
 
 def log_posterior(
@@ -445,6 +482,40 @@ def climb(modes: Modes, counts: np.ndarray, likelihood: Likelihood, model: Stamp
     return _separate(replace(modes, z=z, factor=factor, evidence=evidence))
 
 
+def unexplained(
+    modes: Modes, counts: np.ndarray, likelihood: Likelihood, model: StampModel
+) -> np.ndarray:
+    """Stars with an image that their best mode does not explain, without or with the field given.
+
+    χ² of the right mode has the mean P and the variance 2P for P pixels; they are those where it
+    is larger by `POOR_FIT` standard deviations.
+
+    Parameters
+    ----------
+    modes, counts, likelihood, model : as for `climb`, whose results the modes are
+    """
+    best = modes.take(_first(2 * modes.star + modes.given, modes.evidence, 1))
+    stamps = model.stamps(best.z, best.field, best.offset).reshape(len(best.star), -1)
+    expected = likelihood.flux * stamps.astype(np.float64) + likelihood.background
+    misfit = ((counts[best.star] - expected) ** 2 / expected).sum(axis=1)
+    pixels = counts.shape[1]
+    return np.unique(best.star[misfit > pixels + POOR_FIT * np.sqrt(2.0 * pixels)])
+
+
+def neighbours(modes: Modes, stars: np.ndarray) -> Modes:
+    """The best modes of some stars, without and with the field given, at all offsets around.
+
+    So for matches, from which modes are sought: the best may be near a mode of another offset
+    and lead to a wrong one at its own.
+    """
+    best = modes.take(_first(2 * modes.star + modes.given, modes.evidence, 1))
+    shifts = np.array(jitters(NEIGHBOURHOOD))
+    some = np.flatnonzero(np.isin(best.star, stars))
+    source = best.take(np.repeat(some, len(shifts)))
+    offset = source.offset + np.tile(shifts, (some.size, 1))
+    return Modes.at(source.star, source.field, offset, source.given, source.z)
+
+
 def twins(modes: Modes, likelihood: Likelihood, model: StampModel) -> Modes:
     """Where else nearly the same image can come from: other fields and offsets of every star.
 
@@ -458,11 +529,11 @@ def twins(modes: Modes, likelihood: Likelihood, model: StampModel) -> Modes:
     Parameters
     ----------
     modes : Modes
-        Results of `climb`; those found blindly are used.
+        Results of `climb`; those found without the field are used.
     likelihood : Likelihood
     model : StampModel
     """
-    blind = modes.take(np.flatnonzero(modes.blind))
+    blind = modes.take(np.flatnonzero(modes.given == NOTHING))
     source = blind.take(_first(blind.star, blind.evidence, SOURCES))
     middle = model.coefficients(source.z, source.field)
     each = np.tile(np.eye(len(MONOMIALS)), (len(middle), 1, 1))
@@ -493,9 +564,9 @@ def twins(modes: Modes, likelihood: Likelihood, model: StampModel) -> Modes:
     fields_of = keys[:, 0] * len(model.field) + keys[:, 1]
     kept = _first(fields_of, value, OFFSETS)
     kept = kept[_first(keys[kept, 0], value[kept], MOST_TWINS)]
-    keys, value, z = keys[kept], value[kept], z[kept]
-    eye, blind = np.tile(np.eye(TERMS), (len(z), 1, 1)), np.ones(len(z), bool)
-    return Modes(keys[:, 0], keys[:, 1], keys[:, 2:], blind, z, eye, value)
+    keys = keys[kept]
+    given = np.full(len(keys), NOTHING)
+    return Modes.at(keys[:, 0], keys[:, 1], keys[:, 2:], given, z[kept])
 
 
 def _first(group: np.ndarray, value: np.ndarray, count: int) -> np.ndarray:
@@ -521,9 +592,9 @@ def _projected(
 
 
 def _best(modes: Modes, score: np.ndarray) -> np.ndarray:
-    """Best score of each mode's star: among all, or among those told the field, shape (M,)."""
-    group = 2 * modes.star + modes.blind
-    best = np.full(group.max() + 2, -np.inf)
+    """Best score of each mode's star among modes found with as much given, shape (M,)."""
+    group = (TRUTH + 1) * modes.star + modes.given
+    best = np.full(group.max() + 1, -np.inf)
     np.maximum.at(best, group, score)
     return best[group]
 
@@ -532,35 +603,38 @@ def _separate(modes: Modes) -> Modes:
     """Modes with any mass, each once."""
     near = np.flatnonzero(modes.evidence > _best(modes, modes.evidence) - FAR)
     kept: dict[tuple[int, ...], list[int]] = {}
-    blind = modes.blind.copy()
+    given = modes.given.copy()
     for m in near[np.argsort(-modes.evidence[near], kind="stable")]:
         others = kept.setdefault((modes.star[m], modes.field[m], *modes.offset[m]), [])
         for k in others:
             apart = np.linalg.solve(modes.factor[k], modes.z[m] - modes.z[k])
             if apart @ apart < 1.0:
-                blind[k] |= blind[m]
+                given[k] = min(given[k], given[m])
                 break
         else:
             others.append(int(m))
-    return replace(modes, blind=blind).take(np.sort(np.concatenate(list(kept.values()))))
+    return replace(modes, given=given).take(np.sort(np.concatenate(list(kept.values()))))
 
 
 @dataclass(frozen=True)
 class Sampled:
-    """Posterior sums over draws around modes.
+    """Posterior sums over importance samples around modes.
 
     Attributes
     ----------
     free, told : list of PosteriorSums
-        In `PARTS` equal parts: over the fields that were found blindly, over the own one.
-    helped : PosteriorSums
-        Over both together. Where a star's own field was not found, its mean is better than
-        any that can be had without being told; elsewhere it is that of `free`.
+        In `PARTS` equal parts: over the fields that were found, and over the own one for who
+        is given the field.
+    free_helped, told_helped : PosteriorSums
+        The same in one part with all modes found with more given, those climbed from the truth
+        among them. The truth is one draw from the posterior, so what the search does not detect
+        of the posterior shows in the difference.
     """
 
     free: list[PosteriorSums]
     told: list[PosteriorSums]
-    helped: PosteriorSums
+    free_helped: PosteriorSums
+    told_helped: PosteriorSums
 
 
 def sampled_sums(
@@ -572,7 +646,9 @@ def sampled_sums(
     rounds: Sequence[int],
     rngs: Sequence[np.random.Generator],
 ) -> Sampled:
-    """Draw around modes, weigh the draws and adapt the mixture, for several rounds.
+    """Draw around modes, weigh the samples and adapt the mixture, for several rounds.
+
+    Stars with a mode that only the truth leads to are sampled again with it.
 
     Parameters
     ----------
@@ -585,26 +661,31 @@ def sampled_sums(
     likelihood : Likelihood
     model : StampModel
     rounds : sequence of int
-        Draws a star in every round; every mode has one at least.
+        Samples a star in every round; every mode has one at least.
     rngs : sequence of n Generators
     """
     counts = likelihood.counts(noisy)
-    parts: list[list[PosteriorSums]] = []
-    for stars in np.array_split(np.arange(len(noisy)), -(-len(noisy) // BLOCK)):
+
+    def sampled(stars: np.ndarray, modes: Modes) -> list[_Sampler]:
         samplers = [
             _Sampler(modes.take(np.flatnonzero(modes.star == s)), int(own[s]), counts[s], rngs[s])
             for s in stars
         ]
-        for count in rounds:
+        for count in rounds if samplers else ():
             _draw(samplers, count, likelihood, model)
-        parts.append(
-            [
-                PosteriorSums.stack(kind)
-                for kind in zip(*(s.sums(model) for s in samplers), strict=True)
-            ]
-        )
-    *halves, helped = (PosteriorSums.stack(kind) for kind in zip(*parts, strict=True))
-    return Sampled(halves[:PARTS], halves[PARTS:], helped)
+        return samplers
+
+    found = modes.take(np.flatnonzero(modes.given != TRUTH))
+    undetected = np.unique(modes.star[modes.given == TRUTH])
+    kinds: list[tuple[PosteriorSums, ...]] = []
+    for stars in np.array_split(np.arange(len(noisy)), -(-len(noisy) // BLOCK)):
+        samplers = sampled(stars, found)
+        lost = stars[np.isin(stars, undetected)]
+        again = dict(zip(lost, sampled(lost, modes), strict=True))
+        for star, sampler in zip(stars, samplers, strict=True):
+            kinds.append((*sampler.parts(model), *again.get(star, sampler).whole(model)))
+    *halves, free, told = (PosteriorSums.stack(kind) for kind in zip(*kinds, strict=True))
+    return Sampled(halves[:PARTS], halves[PARTS:], free, told)
 
 
 def _draw(samplers: list[_Sampler], count: int, likelihood: Likelihood, model: StampModel) -> None:
@@ -628,7 +709,7 @@ class _Sampler:
         self, modes: Modes, own: int, counts: np.ndarray, rng: np.random.Generator
     ) -> None:
         self.modes, self.own, self.counts, self.rng = modes, own, counts, rng
-        self.seen_blind = bool((modes.blind & (modes.field == own)).any())
+        self.found_own = bool(((modes.given == NOTHING) & (modes.field == own)).any())
         self.mixtures: list[tuple[Modes, np.ndarray]] = []
         self.draws = Draws(np.empty(0, int), np.empty((0, 2), int), np.empty((0, TERMS)))
         self.images = np.empty((0, counts.size), np.float32)
@@ -668,20 +749,27 @@ class _Sampler:
             ]
         return self.height - np.logaddexp.reduce(np.concatenate(parts), axis=0)
 
-    def sums(self, model: StampModel) -> list[PosteriorSums]:
-        """Sums of every part without and with the field told, and those over all draws."""
-        log_weight = self.log_weight()
+    def parts(self, model: StampModel) -> list[PosteriorSums]:
+        """Sums of every part without the field, then of every part with the field given."""
         own, part = self.draws.field == self.own, np.arange(self.height.size) % PARTS
-        blind = ~own | self.seen_blind
-        counted = [kind & (part == k) for kind in (blind, own) for k in range(PARTS)]
-        counted.append(np.ones(own.size, bool))
+        blind = ~own | self.found_own
+        kinds = [kind & (part == k) for kind in (blind, own) for k in range(PARTS)]
+        return self._sums(kinds, model)
+
+    def whole(self, model: StampModel) -> list[PosteriorSums]:
+        """Sums over all draws, and over those in the own field."""
+        own = self.draws.field == self.own
+        return self._sums([np.ones(own.size, bool), own], model)
+
+    def _sums(self, kinds: Sequence[np.ndarray], model: StampModel) -> list[PosteriorSums]:
+        log_weight = self.log_weight()
         fields, shifts = len(model.field), (2 * model.framing.jitter_px + 1) ** 2
         return [
-            self._sums(np.flatnonzero(draws & np.isfinite(log_weight)), log_weight, fields, shifts)
-            for draws in counted
+            self._over(np.flatnonzero(kind & np.isfinite(log_weight)), log_weight, fields, shifts)
+            for kind in kinds
         ]
 
-    def _sums(
+    def _over(
         self, draws: np.ndarray, log_weight: np.ndarray, fields: int, shifts: int
     ) -> PosteriorSums:
         sums = PosteriorSums.empty(1, self.counts.size, fields, shifts)
@@ -690,6 +778,8 @@ class _Sampler:
             weight = np.exp(log_weight[draws] - sums.peak)
             sums.total[:] = weight.sum()
             sums.square[:] = (weight**2).sum()
-            sums.image[:] = weight @ self.images[draws]
+            images = self.images[draws].astype(np.float64)
+            sums.power[:] = weight @ (images**2).sum(axis=1)
+            sums.image[:] = weight @ images
             np.add.at(sums.share[0], (self.draws.field[draws], self.jitter[draws]), weight)
         return sums

@@ -11,7 +11,7 @@ commands follow from them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib import import_module
@@ -220,7 +220,7 @@ class Method:
     Attributes
     ----------
     label, color, marker : str
-        In figures.
+        In figures. What the method is given beside the image is added to its label.
     paper : (str, str) or None
         Its row in the paper's tables as data, and as printed.
     drawn : bool
@@ -304,10 +304,18 @@ class Method:
     def __init_subclass__(cls) -> None:
         cls.name = cls.__module__.rpartition(".")[2]
         own = vars(cls)
+        if "label" in own:
+            cls.label += cls.given()
         cls.rule = own.get("rule", f"fit_{cls.name}")
         cls.kind = own.get("kind", cls.name)
         cls.about = own.get("about", f"What `psfdae fit {cls.name}` leaves.")
         cls.suffix = own.get("suffix", f"-{cls.name}")
+
+    @classmethod
+    def given(cls) -> str:
+        """What it is given beside the image, as the end of a label: " (given λ, position)"."""
+        names = ["λ"] * cls.told_level + ["position"] * cls.told_position
+        return f" (given {', '.join(names)})" if names else ""
 
     @classmethod
     def settings(cls, config: Any) -> dict[str, Any]:
@@ -346,7 +354,7 @@ class Method:
     def restore(
         self, noisy: np.ndarray, level: float | np.ndarray, position: np.ndarray | None = None
     ) -> np.ndarray:
-        """`predict`, told what the method wants to know."""
+        """`predict`, given what the method wants to know beside the image."""
         told = (level,) * self.told_level + (position,) * self.told_position
         return self.predict(noisy, *told)
 
@@ -393,6 +401,10 @@ class Method:
         """All files of a fit."""
         own = [Path(place, name) for name in cls.files] or [Path(place)]
         return own + [cls.beside(place, name) for name in (TRAINED_ON, *cls.diagnostics)]
+
+    def again(self, data: TrainingSet, **settings: Any) -> Self:
+        """A fit to `data` with its seed; settings that this fit has searched for are kept."""
+        return type(self).fit(data, **settings)  # type: ignore[no-any-return]
 
     def save(self, place: Path, described: Mapping[str, Any]) -> None:
         """Write the fit with its resolved configuration."""
@@ -451,6 +463,10 @@ class Method:
     def unpack(cls, arrays: Mapping[str, np.ndarray], info: BundleInfo) -> Self:
         """A fit from a bundle."""
         return cls.restored(arrays, info.config["train"], info.reference or "realisation")
+
+    def lawful(self) -> Iterator[tuple[str, str, Any]]:
+        """What arrays of a bundle must have: name, words, and whether they have it, bool."""
+        return iter(())
 
     def export(self, stamp_px: int, path: Path) -> None:
         """Write it as ONNX, if it is a network."""
@@ -541,6 +557,6 @@ def all_groups() -> tuple[str, ...]:
 
 
 def oracles_last(names: Any) -> list[type[Method]]:
-    """Methods among some names in the order of legends: those that are told λ at the end."""
+    """Methods among some names in the order of legends: those that are given λ at the end."""
     kinds = [kind for kind in registered() if kind.name in set(names)]
     return sorted(kinds, key=lambda kind: kind.told_level)

@@ -237,7 +237,7 @@ class FieldMixture(Method):
         `estimate` finds flux and sky.
     """
 
-    label, color, marker = "field (told λ, position)", "#117733", "D"
+    label, color, marker = "field", "#117733", "D"
     told_level = told_position = True
     measures = True
     together, padded = 1024, False
@@ -324,6 +324,20 @@ class FieldMixture(Method):
         arrays["listed"] = self.listed if np.isfinite(self.listed).all() else np.empty((0, 2))
         return arrays, said
 
+    def lawful(self) -> Iterator[tuple[str, str, Any]]:
+        """As of all methods; the star of the middle has the sum 1, and residuals are smaller."""
+        terms, spread = len(self.coefficients), self.spread
+        usual = self.model.images(self.usual[None], np.zeros((1, 2)), self.side)
+        yield "coefficients", "a mean star of the sum 1", abs(usual.sum() - 1) < 0.1
+        yield "high", "at least low", self.low <= self.high
+        yield "usual", "terms from -1 to 1", self.usual.shape == (terms,) and abs(self.usual) <= 1
+        least = np.linalg.eigvalsh(spread)[0] if spread.shape == (terms, terms) else -1.0
+        yield "spread", "a covariance", (spread == spread.T) & (least > -1e-6)
+        yield "modes", "squares below 1", np.square(self.modes, dtype=float).sum(axis=1) < 1
+        yield "offset", "numbers from -1 to 1", abs(self.offset) <= 1
+        yield "diagonal", "numbers from 0 to 1", (self.diagonal > 0) & (self.diagonal < 1)
+        yield "listed", "an error above 0, if any", self.listed[1:] > 0
+
     def free_flux(self) -> Self:
         """As of all methods: flux and sky are found."""
         return replace(self, free=True)
@@ -345,13 +359,15 @@ class FieldMixture(Method):
         """The field's PSFs (n, m, m) at positions (n, 2), as `FieldModel.images` draws them.
 
         Positions are meant as those of the training's list. Stars lie in their sub-pixel phase
-        beside the middle, which is the pixel of their position; the sum of the pixels is
-        oversampling².
+        beside the middle, which is the pixel of their position. Their flux is that for which a
+        star in the middle of its pixel has the sum 1 in its stamp: a PSF keeps it where it moves
+        with its star, as it does in photometry, though some light then crosses the stamp's edge.
         """
         terms = self._terms(position)[0]
-        phase = (position - np.floor(position + 0.5))[:, ::-1] + self._list_offset
-        images = self.model.images(terms, phase, self.side, oversampling)
-        return images * (oversampling**2 / images.sum(axis=(1, 2), keepdims=True))
+        phase = (position - np.floor(position + 0.5))[:, ::-1]
+        images = self.model.images(terms, phase + self._list_offset, self.side, oversampling)
+        whole = self.model.images(terms, 0.0 * phase + self._list_offset, self.side)
+        return images / whole.sum(axis=(1, 2), keepdims=True)
 
     def _terms(self, position: np.ndarray | None, count: int = 0) -> tuple[np.ndarray, np.ndarray]:
         """Terms of the field of each star, the usual ones where no position is known, and where."""

@@ -31,10 +31,10 @@ Y_k, LOOSE μ_y,k.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Annotated, Any, ClassVar, NamedTuple, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from pydantic import Field
@@ -43,6 +43,9 @@ from psfdae.configuration.base import Count, Group, Positive
 from psfdae.estimators import Estimate, FitError, Method, TrainingSet
 from psfdae.rng import stream
 from psfdae.stars.noise import NoiseModel
+
+if TYPE_CHECKING:
+    from psfdae.own_stars.bundle import BundleInfo
 
 STEP = 0.4
 """Of ln s between noise variances of single stars, which share a factorisation; s is then
@@ -193,7 +196,7 @@ class GaussianMixture(Method):
         STEP, or FINE.
     """
 
-    label, color, marker = "GMM (told λ)", "#cc79a7", "P"
+    label, color, marker = "GMM", "#cc79a7", "P"
     told_level = True
     together, padded = 4096, False
     per_reference = True
@@ -264,6 +267,12 @@ class GaussianMixture(Method):
             clusters, told, shrinkage = cls._chosen(data, learn, judge, sizes, gmm)
         final = cls._clustered(data, data.train[: gmm.stars], clusters, gmm, told)
         return replace(final, shrinkage=np.array([shrinkage]))
+
+    def again(self, data: TrainingSet, gmm: Gmm) -> Self:
+        """As of all methods: K, ν and the use of the position are kept."""
+        told = bool(self.whitening.any())
+        one = self._clustered(data, data.train[: gmm.stars], len(self.count), gmm, told)
+        return replace(one, shrinkage=self.shrinkage)
 
     @classmethod
     def _chosen(
@@ -399,6 +408,26 @@ class GaussianMixture(Method):
         arrays["deviation"] = np.vstack(kept).astype(np.float16)
         arrays["deviation_center"] = np.empty((len(arrays["deviation"]), 0))
         return arrays, said
+
+    @classmethod
+    def shapes(cls, info: BundleInfo) -> Mapping[str, tuple[int, ...] | None]:
+        """As of all methods; the others follow from these."""
+        pixels = info.stamp_px**2
+        return dict.fromkeys(cls.arrays) | {"axes": (pixels, pixels), "variance": (pixels,)}
+
+    def lawful(self) -> Iterator[tuple[str, str, Any]]:
+        """As of all methods; images have the sum 1 and no large negative pixels."""
+        total, power = self.axes.sum(axis=0), np.square(self.deviation, dtype=np.float64).sum()
+        some = stream(0, "gmm", "axes").standard_normal((len(self.axes), 4))
+        same = self.axes.T @ (self.axes @ some)  # the product of all takes seconds
+        yield "axes", "orthonormal columns", np.abs(same - some) < 1e-2
+        yield "variance", "numbers from 0 to 1", (self.variance >= 0) & (self.variance <= 1)
+        yield "count", "a star or more in each cluster", self.count >= 1
+        whole = self.rows.shape == self.count.shape and self.rows.sum() == len(self.deviation)
+        yield "rows", "the rows of the deviations", whole and (self.rows >= 0)
+        yield "mean", "images of the sum 1", np.abs(self.mean @ total - 1) < 1e-2
+        yield "deviation", "images of the sum 1", power <= 4.0 * self.count.sum()
+        yield "shrinkage", "a number above 0", self.shrinkage.shape == (1,) and self.shrinkage > 0
 
     def strangeness(self, noisy: np.ndarray, level: np.ndarray) -> np.ndarray:
         """As of all methods, from the evidence of the leading `TELLING` coordinates.

@@ -11,7 +11,7 @@ from psfdae.estimators.gmm import GaussianMixture
 class PlacedMixture(GaussianMixture):
     """A mixture of images, references and positions."""
 
-    label, color, marker = "GMM (told λ, position)", "#882255", "X"
+    label, color, marker = "GMM", "#882255", "X"
     drawn = False
     told_position = True
     bundled = False

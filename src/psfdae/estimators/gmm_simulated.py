@@ -22,7 +22,7 @@ class Simulated(Gmm):
 class SimulatedMixture(GaussianMixture):
     """A mixture of fresh stars; the validation stars are those of the dataset."""
 
-    label, color, marker = "GMM of fresh stars (told λ)", "#aa4499", "p"
+    label, color, marker = "GMM of fresh stars", "#aa4499", "p"
     drawn = False
     groups: ClassVar = {"simulated": Simulated}
     memory_mb = 2000
@@ -36,3 +36,7 @@ class SimulatedMixture(GaussianMixture):
     def fit(cls, data: TrainingSet, simulated: Simulated) -> Self:
         """As any mixture; raises FitError without fresh stars, too."""
         return super().fit(data.on_fresh_stars(), simulated)
+
+    def again(self, data: TrainingSet, simulated: Simulated) -> Self:
+        """As any mixture, of fresh stars."""
+        return super().again(data.on_fresh_stars(), simulated)

@@ -11,6 +11,6 @@ from psfdae.estimators.gmm_simulated import SimulatedMixture
 class PlacedSimulatedMixture(SimulatedMixture):
     """A mixture of fresh images, references and positions."""
 
-    label, color, marker = "GMM of fresh stars (told λ, position)", "#661100", "*"
+    label, color, marker = "GMM of fresh stars", "#661100", "*"
     told_position = True
     bundled = False

@@ -30,7 +30,7 @@ class LinearMmse(Method):
     noise : NoiseModel
     """
 
-    label, color, marker = "linear MMSE (told λ)", "#009e73", "^"
+    label, color, marker = "linear MMSE", "#009e73", "^"
     drawn = False
     told_level = True
     stored = False

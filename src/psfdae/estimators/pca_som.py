@@ -109,7 +109,7 @@ class PcaSom(Method):
     fits : tuple of PcaFit
     """
 
-    label, color, marker = "PCA+SOM (told λ)", "#d55e00", "s"
+    label, color, marker = "PCA+SOM", "#d55e00", "s"
     paper = ("pca", "PCA")
     told_level = True
     groups: ClassVar = {"baseline": Baseline}

@@ -19,6 +19,12 @@ SI_UNITS = ("m", "m", "rad", "rad")
 CORRELATED = ("decenter_x-tilt_y", "decenter_y-tilt_y", "tilt_x-tilt_y")
 """The pairs that the paper tabulates."""
 
+TEST_SETS = (
+    "Test set `grid`: the very states that the networks were trained on, with new noise; "
+    "`uniform`: other states of the same range."
+)
+"""What the paper's tables beside ours say of their column `test_set`."""
+
 
 def error_rows(key: dict[str, Any], errors: np.ndarray, unit: np.ndarray) -> list[dict[str, Any]]:
     """Rows of the error table of one method.

@@ -1,8 +1,11 @@
-"""Errors side by side, star by star: of two trained networks, of seen and of held-out fields."""
+"""Errors side by side: of two trained networks, of two tables, of seen and of held-out fields."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
+from importlib import resources
+from itertools import combinations
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,9 +18,14 @@ if TYPE_CHECKING:
 SIGNIFICANT = 3.0
 """A difference of so many standard errors is called one; 1 of 370 is chance."""
 
-SEED_SCATTER = {"pca_som": 0.012, "dae": 0.022, "gmm": 0.005, "gmm_position": 0.01}
-"""Standard deviation of a method's MSE between seeds over that MSE: the largest that the target
-`seeds` has found at any noise level (tables/seeds_*.csv of the run of record), rounded up."""
+Scatter = Mapping[tuple[str, str, str], float]
+"""Relative scatter of a method's MSE between seeds by dataset, reference and method."""
+
+FITTED = ["dataset", "reference", "method"]
+CELL = ["dataset", "split", "reference", "noise_level"]
+
+PAPER_ORDER = ("dae", "pca_som", "noisy")
+"""The paper's methods by ascending error, as it concludes."""
 
 SHARES = (0.25, 0.5, 0.75, 1.0)
 """Parts of a training at which the validation errors are shown."""
@@ -31,6 +39,15 @@ SMALLER_IS_BETTER = {"mse": True, "ssim": False}
 """Metrics that are compared."""
 
 ABSENT = "–"
+
+
+@cache
+def seed_scatter() -> Scatter:
+    """What the target `seeds` has found, `seed_scatter.csv`; what has no row was not measured."""
+    import pandas as pd
+
+    with resources.files(__package__).joinpath("seed_scatter.csv").open() as file:
+        return dict(pd.read_csv(file, index_col=FITTED)["scatter"])
 
 
 def config_differences(
@@ -89,9 +106,7 @@ def same_noisy_stars(first: pd.DataFrame, second: pd.DataFrame) -> bool:
     return one.index.equals(other.index) and bool(np.allclose(one, other, rtol=1e-5, atol=0.0))
 
 
-def compare_errors(
-    first: pd.DataFrame, second: pd.DataFrame, scatter: Mapping[str, float]
-) -> pd.DataFrame:
+def compare_errors(first: pd.DataFrame, second: pd.DataFrame, scatter: Scatter) -> pd.DataFrame:
     """Mean errors of two evaluations and how sure their difference is.
 
     Paired star by star where both saw the same noisy images, else as independent
@@ -100,15 +115,16 @@ def compare_errors(
 
     Parameters
     ----------
-    first, second : as for `same_noisy_stars`
-    scatter : mapping of method to the scatter of its MSE between seeds, such as `SEED_SCATTER`
+    first, second : as for `same_noisy_stars`, with dataset and reference
+    scatter : as of `seed_scatter`
 
     Returns
     -------
     DataFrame
         metric, method, noise_level, first, second, difference (second − first), stderr (of
-        the stars), seed_stderr (of both trainings), sigmas (of both errors), verdict:
-        "better", "worse" (the second) or "same", for methods and levels that both have.
+        the stars), seed_stderr (of both trainings; NaN if not measured), sigmas (of both
+        errors, or of that of the stars alone), verdict: "better", "worse" (the second) or
+        "same", for methods and levels that both have.
     """
     import pandas as pd
 
@@ -121,14 +137,14 @@ def compare_errors(
         if other is None:
             continue
         for metric in SMALLER_IS_BETTER:
-            values = _difference(one, other, metric, paired, scatter.get(str(method), 0.0))
+            values = _difference(one, other, metric, paired, scatter)
             rows.append({"metric": metric, "method": method, "noise_level": level, **values})
     table = pd.DataFrame(rows, columns=COLUMNS)
     return table.sort_values(["metric", "method", "noise_level"], ignore_index=True)
 
 
 def _difference(
-    one: pd.DataFrame, other: pd.DataFrame, metric: str, paired: bool, scatter: float
+    one: pd.DataFrame, other: pd.DataFrame, metric: str, paired: bool, scatter: Scatter
 ) -> dict[str, float | str]:
     if paired:
         one, other = (table.sort_values("star") for table in (one, other))
@@ -142,8 +158,10 @@ def _difference(
         difference = means[1][0] - means[0][0]
         stderr = float(np.hypot(means[0][1], means[1][1]))
     first, second = (float(table[metric].mean()) for table in (one, other))
-    seeds = float(np.hypot(*(seed_stderr(scatter, metric, mean) for mean in (first, second))))
-    error = np.hypot(stderr, seeds)
+    fitted = (tuple(table[FITTED].iloc[0]) for table in (one, other))
+    each = zip(fitted, (first, second), strict=True)
+    seeds = float(np.hypot(*(seed_stderr(scatter.get(f, np.nan), metric, m) for f, m in each)))
+    error = np.hypot(stderr, np.nan_to_num(seeds))
     sigmas = 0.0 if difference == 0 else difference / error if error > 0 else np.inf
     return {
         "first": first,
@@ -160,6 +178,70 @@ def _verdict(sigmas: float, smaller_is_better: bool) -> str:
     if not abs(sigmas) >= SIGNIFICANT:
         return "same"
     return "better" if (sigmas < 0) == smaller_is_better else "worse"
+
+
+def with_seed_stderr(table: pd.DataFrame, scatter: Scatter) -> pd.DataFrame:
+    """Rows as of `psf_metrics.csv` with the column `seed_stderr`; NaN where not measured."""
+    rows = zip(*(table[name] for name in (*FITTED, "metric", "value")), strict=True)
+    found = [seed_stderr(scatter.get(tuple(f), np.nan), metric, v) for *f, metric, v in rows]
+    return table.assign(seed_stderr=found)
+
+
+def compare_tables(
+    first: pd.DataFrame, second: pd.DataFrame, scatter: Scatter
+) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Rows that two tables of mean errors both have, and the order of the paper's methods.
+
+    Parameters
+    ----------
+    first, second : DataFrame
+        Rows as of `psf_metrics.csv`.
+    scatter : as of `seed_scatter`
+
+    Returns
+    -------
+    rows : DataFrame
+        The keys, value_first, value_second, and verdict: "equal"; "within" `SIGNIFICANT`
+        standard deviations of the difference of two fits with different seeds; "beyond" that;
+        "not measured" of rows that differ, but whose scatter is not known.
+    order : DataFrame
+        By column of the tables: whether errors ascend as in `PAPER_ORDER` in the `first` and in
+        the `second`, and whether two methods are `exchanged`, by more than the scatter in both.
+    """
+    import pandas as pd
+
+    both = [with_seed_stderr(table, scatter) for table in (first, second)]
+    keys = [*CELL, "method", "metric"]
+    kept = [table[[*keys, "value", "seed_stderr"]] for table in both]
+    rows = kept[0].merge(kept[1], on=keys, suffixes=("_first", "_second"))
+    gap = (rows.value_second - rows.value_first).abs()
+    allowed = SIGNIFICANT * np.hypot(rows.pop("seed_stderr_first"), rows.pop("seed_stderr_second"))
+    rows["verdict"] = np.select(
+        [gap == 0, allowed.isna(), gap <= allowed], ["equal", "not measured", "within"], "beyond"
+    )
+    signs = [_signs(table) for table in both]
+    signs = [s.reindex(signs[0].index.intersection(signs[1].index)) for s in signs]
+    order = {name: (s < 0).all(axis=1) for name, s in zip(("first", "second"), signs, strict=True)}
+    order["exchanged"] = (signs[0] * signs[1] < 0).any(axis=1)
+    return rows, pd.DataFrame(order)
+
+
+def _signs(table: pd.DataFrame) -> pd.DataFrame:
+    """Of each pair of `PAPER_ORDER`: −1 if the first one's MSE is less, 1 if more, 0 if equal.
+
+    Equal are errors that differ by less than `SIGNIFICANT` times their scatter between seeds.
+    """
+    import pandas as pd
+
+    wide = table[table.metric == "mse"].pivot(index=CELL, columns="method")
+    wide = wide.reindex(columns=pd.MultiIndex.from_product([["value", "seed_stderr"], PAPER_ORDER]))
+    value, scatter = wide["value"].dropna(), wide["seed_stderr"].fillna(0.0)
+    signs = {}
+    for one, other in combinations(PAPER_ORDER, 2):
+        gap = value[one] - value[other]
+        sure = gap.abs() > SIGNIFICANT * np.hypot(scatter[one], scatter[other])
+        signs[one, other] = np.sign(gap).where(sure, 0.0)
+    return pd.DataFrame(signs, index=value.index)
 
 
 HELD_OUT_COLUMNS = ["dataset", "reference", "method", "noise_level", "mse_random", "mse_held_out"]

@@ -396,7 +396,7 @@ def _errors(
         # The lowest line is near the one above, and has room below where noise is least.
         last = kind is methods[-1]
         named = line[:1] if last else line
-        name = kind.label.partition(" (")[0]  # what it is told stands beside its stars
+        name = kind.label.partition(" (")[0]  # what it is given stands beside its stars
         _name(axes, named["noise_level"], named["mse"], name, kind.color, below=last)
     best = bounds[bounds.method == "bayes"].sort_values("noise_level")
     tight = best[best.tight == "yes"]

@@ -203,7 +203,8 @@ def error_correlation(
 def seed_stderr(scatter: float, metric: str, mean: float) -> float:
     """Standard deviation of a mean error between seeds, from that of the MSE over the MSE.
 
-    What SSIM misses of 1 is nearly proportional to the squared error; NaN for other metrics.
+    What SSIM misses of 1 is nearly proportional to the squared error; NaN for other metrics, and
+    where the scatter is NaN, not measured.
     """
     lost = mean if metric == "mse" else 1.0 - mean if metric.startswith("ssim") else np.nan
     return scatter * lost

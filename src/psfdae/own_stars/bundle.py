@@ -221,9 +221,12 @@ def estimator(bundle: Bundle) -> Method:
     blank = np.zeros((1, info.stamp_px, info.stamp_px), np.float32)
     try:
         fitted = found.unpack(bundle.weights, info)
+        for name, wanted, right in fitted.lawful():
+            if not np.all(right):
+                raise ValueError(f"array {name!r} must have {wanted}")
         if fitted.estimate(blank, np.array([info.noise_max])).psf.shape != blank.shape:
             raise ValueError("its PSFs have not the size of stamps")
-    except (ValueError, TypeError, LookupError) as error:
+    except (ValueError, TypeError, LookupError, ArithmeticError) as error:
         raise BundleError(f"{info.name}: damaged ({info.method}: {error})") from None
     return fitted
 
@@ -480,6 +483,8 @@ def _check(info: BundleInfo, tensors: Mapping[str, np.ndarray], path: Path) -> N
             raise BundleError(f"{path}: array {name!r} has shape {array.shape}, not {shape}")
         if not np.isfinite(array).all():
             raise BundleError(f"{path}: array {name!r} is not finite")
+        if name in ("error68", "rms", "ratio95", "widening") and (array < 0).any():
+            raise BundleError(f"{path}: array {name!r} must have numbers of at least 0")
     _check_flux_model(info, tensors, path)
     if nodes < 1 or tensors["noise_nodes"][0] <= 0 or (np.diff(tensors["noise_nodes"]) <= 0).any():
         raise BundleError(f"{path}: noise_nodes must be positive and ascending")

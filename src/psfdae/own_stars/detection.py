@@ -45,7 +45,8 @@ class Sky:
         from photutils.segmentation import SourceCatalog, SourceFinder
 
         smooth, limit = self._above(threshold)
-        finder = SourceFinder(LEAST_PX, n_levels=LEVELS, contrast=CONTRAST, progress_bar=False)
+        finder = SourceFinder(LEAST_PX, n_levels=LEVELS, contrast=CONTRAST)
+        finder.progress_bar = False  # photutils 3.0 shows one; the argument goes in 4.0
         parts = finder(smooth, limit, mask=self.bad)
         if parts is None:
             return {"id": np.empty(0, np.int64)}

@@ -23,6 +23,11 @@ def one_line(text: object) -> str:
     return "".join(c if c.isprintable() else "?" for c in words)
 
 
+def ascii_line(text: object) -> str:
+    """The same in the characters that FITS headers hold, others as question marks."""
+    return one_line(text).encode("ascii", "replace").decode()
+
+
 def no_formula(text: str) -> str:
     """The text, with an apostrophe before it if a spreadsheet would execute it; numbers stay."""
     if not text.startswith(FORMULA):

@@ -341,7 +341,8 @@ def find_image(path: Path | PlainFile, extension: str | int | None = None) -> Im
 def science_images(path: Path) -> dict[str, int]:
     """Numbers of all images of a file but masks, errors and the like, by a name for files.
 
-    That is the extension's own, or its number where it has none of its own.
+    That is the extension's own, or its number where it has none of its own, or one that looks
+    like the number of another.
     """
     with reading(path), open_hdus(plain_file(path)) as hdus:
         found = {k: hdu.name for k, hdu in enumerate(hdus) if _has_pixels(hdu)}
@@ -349,7 +350,7 @@ def science_images(path: Path) -> dict[str, int]:
     if not found:
         raise ObservationError(path, "no image")
     names = list(found.values())
-    plain = re.compile("[A-Za-z0-9_+-]+")
+    plain = re.compile("(?![0-9]+$)[A-Za-z0-9_+-]+")
     own = {k for k, name in found.items() if names.count(name) == 1 and plain.fullmatch(name)}
     return {name if k in own else str(k): k for k, name in found.items()}
 

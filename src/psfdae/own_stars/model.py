@@ -189,7 +189,8 @@ class PsfModel:
         -------
         ndarray, shape (m, m) or (n, m, m), float64
             m is the stamp's side d for an oversampling o of 1, else o d + 1. Index m//2 is the
-            middle of the pixel of the position, and the sum is o².
+            middle of the pixel of the position. The flux is that for which a star in the middle
+            of its pixel has the sum 1 in the d × d pixels of its stamp.
 
         Raises
         ------

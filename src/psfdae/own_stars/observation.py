@@ -178,6 +178,8 @@ class Source:
                 )
             columns = [table.coordinates(name) for name in (where.first, where.second)]
             positions = np.stack(columns, axis=1) - origin
+        # What is beyond any image is no position: its squares would not even be numbers.
+        positions = np.where(np.abs(positions) < FAR, positions, np.nan)
         if not is_cube:
             _check_overlap(image, table, positions)
         return positions
@@ -218,16 +220,17 @@ class Source:
             )
         what, place = given[0]
         noise = _find_beside(image, place, what)
+        inverse = self.weight is not None
         with open_pixels(noise, whole=True) as pixels:
-            wrong = np.count_nonzero(pixels[:] <= 0)
-        if wrong:
+            values = pixels[:]
+        wrong, empty = np.count_nonzero(values < 0), np.count_nonzero(values == 0)
+        if wrong or (empty and not inverse):
             raise ObservationError(
                 noise.path,
-                f"{what} of which {wrong} of {math.prod(noise.shape)} pixels are not above 0; "
-                "NaN is for bad pixels, or a mask",
+                f"{what} of which {wrong + (not inverse) * empty} of {values.size} pixels are not "
+                f"{'at least' if inverse else 'above'} 0; NaN is for bad pixels, or a mask",
             )
-        inverse = self.weight is not None
-        return Layers(image, mask, self.bad_bits, noise, inverse, least_noise=least)
+        return Layers(image, mask, self.bad_bits, noise, inverse, empty, least_noise=least)
 
     def _detected(self, sky: Sky) -> Catalogue:
         """The stars of an image."""
@@ -298,6 +301,7 @@ class Layers:
     bad_bits: int | None = None
     noise: ImageFile | None = None  # weight or variance
     inverse: bool = False  # weight
+    empty: int = 0  # pixels of the weight 0, which are bad
     noise_scale: float = 1.0  # of σ by this map
     least_noise: float = 0.0  # counts; the read noise
 
@@ -316,7 +320,8 @@ class Layers:
         """Which pixels the mask calls bad; those without a value are."""
         if self.bad_bits is None:
             return values != 0
-        return (np.nan_to_num(values, nan=-1).astype(np.int64) & self.bad_bits) != 0
+        with np.errstate(invalid="ignore"):  # what is beyond any number has no bits
+            return (np.nan_to_num(values, nan=-1).astype(np.int64) & self.bad_bits) != 0
 
     def sigma(self, values: np.ndarray) -> np.ndarray:
         """σ of pixels by the map, NaN where it has none."""
@@ -398,6 +403,8 @@ class Observation:
         for (name, (value, origin)), unit in zip(self.camera.items(), units, strict=True):
             words.append(f"{name} {origin if value is None else f'{value:.6g} {unit} ({origin})'}")
         said = f"{self.path}: {', '.join(words)}"
+        if empty := self._layers.empty:
+            said += f"\n{self._layers.noise.path}: weight 0, bad pixels: {empty}"  # type: ignore
         lost = self.unplaced()
         if lost.any():
             rows = shorten([str(row + 1) for row in np.flatnonzero(lost)])

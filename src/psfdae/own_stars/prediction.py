@@ -25,7 +25,7 @@ import numpy as np
 
 import psfdae
 from psfdae.files import atomic_path
-from psfdae.own_stars.errors import one_line
+from psfdae.own_stars.errors import ascii_line
 from psfdae.own_stars.images import BLOCK_BYTES, Card
 from psfdae.own_stars.stamps import MEANING, Stamps
 
@@ -272,14 +272,13 @@ def _primary_header(bundle: Bundle, cards: Sequence[Card], history: str) -> Any:
         # A long value leaves no room for its comment, which astropy reports.
         warnings.simplefilter("ignore", fits.verify.VerifyWarning)
         for key, value, comment in (*own, *cards):
-            header[key] = (_ascii(value) if isinstance(value, str) else value, _ascii(comment))
-        header["HISTORY"] = _ascii(history)
+            header[key] = (
+                ascii_line(value) if isinstance(value, str) else value,
+                ascii_line(comment),
+            )
+        header["HISTORY"] = ascii_line(history)
         header.tostring()
     return header
-
-
-def _ascii(text: str) -> str:
-    return one_line(text).encode("ascii", "replace").decode()
 
 
 def _cube_header(name: str, about: str, count: int, stamp_px: int) -> Any:

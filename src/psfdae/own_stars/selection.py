@@ -31,7 +31,7 @@ COMPANIONS = 12  # nearest stars with which a star is compared
 DEFECT = 6.0  # pixels this many σ below the sky are defects; they are raised to that
 # Photons per pixel of the new noise, at least: no rate of photons is negative, and the deepest
 # pixel of a star that is made fainter has B − DEFECT √B at most.
-LEAST_SKY = 2.0 * DEFECT**2
+LEAST_SKY, MOST_SKY = 2.0 * DEFECT**2, 1e12
 CORE_PX = 8  # or half of the stamp, if that is more: no place for a faint neighbour
 LOCAL = 1.2  # the worst pixels of good stars scatter more than their stamps as a whole
 # Stars are saturated if at least so many have brightest pixels that agree to this part, which is
@@ -86,11 +86,12 @@ class BrightStars:
     def sky_photons(self, gain: float | None, otherwise: float) -> float:
         """Photons per pixel whose Poisson noise is the sky's, read noise included.
 
-        From the electrons per count; `otherwise` where they are unknown.
+        From the electrons per count; `otherwise` where they are unknown. At most `MOST_SKY`, beside
+        which no star has photons that count.
         """
         if gain is None:
             return otherwise
-        return max(float(np.median(self.noise) * gain) ** 2, LEAST_SKY)
+        return float(np.clip(np.median(self.noise) * gain, LEAST_SKY**0.5, MOST_SKY**0.5) ** 2)
 
 
 @dataclass(frozen=True)

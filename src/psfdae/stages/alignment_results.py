@@ -161,7 +161,8 @@ def paper_tables(
     def write(name: str, table: Any, title: str, digits: dict[str, str]) -> None:
         path = out / f"alignment_paper_{name}.csv"
         write_csv(path, table, digits=6)
-        write_text(path.with_suffix(".md"), rows.as_markdown(table, title, digits))
+        text = rows.as_markdown(table, f"{title}. {rows.TEST_SETS}", digits)
+        write_text(path.with_suffix(".md"), text)
 
     ours = read_table(errors)
     for level in sorted(published("alignment").noise_level.unique()):

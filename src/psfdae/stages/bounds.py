@@ -21,7 +21,6 @@ from psfdae.bounds.floor import (
 )
 from psfdae.bounds.posterior import (
     MIRROR_MARGIN,
-    TIGHT,
     Bank,
     Likelihood,
     PosteriorSums,
@@ -33,7 +32,8 @@ from psfdae.bounds.posterior import (
     posterior_sums,
     segments,
 )
-from psfdae.bounds.sampling import Sampled, StampModel, sample
+from psfdae.bounds.sampling import TRUTH, Modes, Sampled, StampModel, sample
+from psfdae.bounds.tight import FEW, Evidence, calibration
 from psfdae.cli import File, command
 from psfdae.configuration.consistency import SIMULATION
 from psfdae.configuration.schema import Config
@@ -70,17 +70,19 @@ SPLIT = "random"
 """The split that is bounded: its test stars lie in all fields."""
 
 COLUMNS = ["dataset", "split", "reference", "method", "noise_level", "metric", "value"]
-COLUMNS += ["stderr", "n", "ci_low", "ci_high", "tight"]
-COLUMNS += ["found", "draws", "ess_median", "last_change", "missed"]
+COLUMNS += ["stderr", "n", "ci_low", "ci_high", "median", "variance", "calibration"]
+COLUMNS += ["missing", "missing_stars", "tight", "found", "draws", "sampled"]
+COLUMNS += ["ess_median", "ess_low", "last_change", "undetected"]
 
 EFFICIENCY_COLUMNS = ["dataset", "reference", "noise_level", "method", "bound", "tight", "mse"]
-EFFICIENCY_COLUMNS += ["mse_bound", "efficiency", "difference", "stderr", "n", "verdict"]
+EFFICIENCY_COLUMNS += ["mse_bound", "efficiency", "difference", "stderr", "n", "median"]
+EFFICIENCY_COLUMNS += ["median_bound", "variance_bound", "verdict"]
 
 PAPER_COLUMNS = ["dataset", "method", "noise_level", "mse_paper", "mse", "mse_bound", "stderr"]
 PAPER_COLUMNS += ["tight", "paper_over_bound", "verdict"]
 
 POSTERIOR_MEANS = {"bayes": False, "bayes_position": True}
-"""Bounds that are posterior means, and whether they are told the star's field."""
+"""Bounds that are posterior means, and whether they are given the star's field."""
 
 COLUMN_OF_TABLE = ["dataset", "split", "reference", "noise_level"]
 """What one column of the paper's tables is: methods are compared inside it."""
@@ -90,6 +92,12 @@ GROWTH_COLUMNS += ["ess_median", "last_change", "limit", "exponent", "fit_rms"]
 
 HOPELESS_ESS = 2.0
 """A quarter of the bank with a smaller median effective sample size is not extended."""
+
+ENOUGH_ESS = 50.0
+"""Effective sample size below which a star gets importance samples of its own.
+
+The error of a mean over so many is 2 % above that of the exact mean.
+"""
 
 NEGLIGIBLE_MSE = 1e-9
 """Errors below this are written as 0 where only a few images are possible.
@@ -205,27 +213,43 @@ class Tables:
     ) -> None:
         """Per-star metrics of one bound and noise level.
 
-        `found` says from what. Of the effective sample sizes `ess` the table has the median;
-        `reached` are its columns `draws`, `last_change` and `missed`.
+        `found` says from what. Stars without an estimate, whose `mse` is NaN, are named and left
+        out of every mean. Of the posterior variances `variance` the table has the mean;
+        `reached` are other columns.
         """
         import pandas as pd
 
-        if "ess" in values:
-            reached["ess_median"] = float(np.median(values["ess"]))
-
         key = {"dataset": self.dataset, "split": SPLIT, "reference": reference, "method": method}
         key["noise_level"] = level
-        for metric, value in values.items():
-            if metric == "ess":
-                continue
-            mean, stderr = clustered_mean(value, self.stars.field)
+        known = np.isfinite(values["mse"])
+        field = self.stars.field[known]
+        common: dict[str, Any] = {"n": field.size, "missing": int((~known).sum()), **reached}
+        common["missing_stars"] = " ".join(map(str, self.stars.star[~known]))
+        common |= {"tight": "yes" if tight else "no", "found": found}
+        for metric in [name for name in ("mse", "p_right") if name in values]:
+            value = values[metric][known]
+            mean, stderr = clustered_mean(value, field) if value.size else (np.nan, np.nan)
             half = NORMAL_95 * stderr
-            row = {"metric": metric, "value": mean, "stderr": stderr, "n": value.size}
+            row = {"metric": metric, "value": mean, "stderr": stderr}
             row |= {"ci_low": mean - half, "ci_high": mean + half}
-            row |= {"tight": "yes" if tight else "no", "found": found}
-            self.summary.append({**key, **row, **reached})
+            if value.size:
+                row["median"] = float(np.median(value))
+            if metric == "mse" and "variance" in values and value.size:
+                row["variance"] = values["variance"][known].mean()
+            self.summary.append({**key, **row, **common})
         stars = {"star": self.stars.star, "field": self.stars.field}
         self.per_star.append(pd.DataFrame({**key, **stars, **values}))
+
+    def add_mean(
+        self, method: str, level: float, estimates: Estimates, found: str, **reached: float
+    ) -> None:
+        """The same of a posterior mean over samples for all references, tight by its evidence."""
+        reached["ess_median"] = float(np.median(estimates.ess))
+        for number, reference in enumerate(self.stars.truth):
+            values = estimates.values(number)
+            evidence = estimates.evidence(number, self.stars.field)
+            found_by = {**reached, **vars(evidence)}
+            self.add(reference, method, level, values, evidence.tight, found, **found_by)
 
 
 @command("bounds", reads=(*SIMULATION, "noise", "parts", "bounds"))
@@ -267,7 +291,9 @@ def bounds(
                 f"{bank}: bounds.bank_stars = {count}, must be at least {fields}, "
                 "a star for every field"
             )
-        _over_bank(config, everything.take(np.arange(count)), everything, drawn, static, tables)
+        _over_bank(
+            config, everything.take(np.arange(count)), everything, drawn, product, static, tables
+        )
     write_csv(out, pd.DataFrame(tables.summary, columns=COLUMNS))
     write_csv(growth, pd.DataFrame(tables.growth, columns=GROWTH_COLUMNS))
     write_parquet(per_star, pd.concat(tables.per_star, ignore_index=True))
@@ -323,48 +349,121 @@ def _over_bank(
     bank: Bank,
     larger: Bank,
     drawn: Product,
+    product: Product,
     static: np.ndarray,
     tables: Tables,
 ) -> None:
     """Posterior means over a bank, how they change with its size, and better ones.
 
-    In a single field the larger bank is needed, and in a moment weighed. Where a bank is too
-    thin, draws around the star's own matches take its place.
+    In a single field the larger bank is needed, and in a moment weighed. Stars for which a bank
+    is too thin get importance samples around their own matches.
     """
+    stars = tables.stars
     for level in config.noise.levels:
         start = time.monotonic()
         likelihood = Likelihood.of(noise_model(config), level, bank.stamps((bank.margin,) * 2))
-        thin = {}
-        for method, told in POSTERIOR_MEANS.items():
-            measured, stars = (_told_the_field, larger) if told else (_anywhere, bank)
-            sizes = measured(stars, static, tables.stars, level, likelihood)
-            thin[method] = _tabulate(tables, method, level, sizes)
-        if any(thin.values()):
-            found = _draws(config, bank, drawn["seidel"], tables.stars, level, likelihood)
-            _replace(tables, level, found, config.bounds.star_draws, static, thin)
+        over_banks, thin = {}, np.zeros(stars.star.size, bool)
+        for method, given in POSTERIOR_MEANS.items():
+            draws = larger if given else bank
+            sizes = _weighed(draws, given, static, stars, level, likelihood)
+            _grown(tables, method, level, sizes)
+            over_banks[method] = max(sizes), Estimates.over_bank(sizes)
+            thin |= over_banks[method][1].ess < ENOUGH_ESS
+        few, sampled = np.flatnonzero(thin), {}
+        if few.size:
+            some = stars.take(few)
+            found = _samples(config, bank, drawn["seidel"], product, some, level, likelihood)
+            sums = ((found.free, found.free_helped), (found.told, found.told_helped))
+            for method, (parts, helped) in zip(POSTERIOR_MEANS, sums, strict=True):
+                sampled[method] = Estimates.over_samples(parts, helped, static, some)
+        for method, (draws, over_bank) in over_banks.items():
+            best, chosen = over_bank.improved(few, sampled.get(method))
+            source = {0: "bank", stars.star.size: "samples"}.get(chosen, "both")
+            count = config.bounds.star_draws if source == "samples" else draws
+            tables.add_mean(method, level, best, source, draws=count, sampled=chosen)
         seconds = time.monotonic() - start
-        means = ", ".join(f"{m} {'/'.join(t) or 'bank'}" for m, t in thin.items())
-        print(f"λ = {level:g}, drawn around matches: {means}, {seconds:.1f} s", flush=True)
+        print(f"λ = {level:g}: {few.size} stars sampled, {seconds:.1f} s", flush=True)
 
 
-def _tabulate(tables: Tables, method: str, level: float, sizes: dict[int, np.ndarray]) -> list[str]:
-    """Rows of one posterior mean over a bank, whose `_errors` are given by number of draws.
+@dataclass(frozen=True)
+class Estimates:
+    """`_measures`, shape (5, n), of one posterior mean.
 
-    References for which the bank is too thin are returned, and have rows in `growth` alone.
+    Attributes
+    ----------
+    full, quarter : ndarray, shape (5, n)
+        Of all samples, and of a quarter of them.
+    helped : ndarray, shape (5, n)
+        Of all samples and those around modes that only the truth leads to.
     """
-    draws, last = np.array(list(sizes)), sizes[max(sizes)]
-    thin = []
-    for i, reference in enumerate(tables.stars.truth):
-        errors = np.array([values[i].mean() for values in sizes.values()])
-        change = last_change(errors)
+
+    full: np.ndarray
+    quarter: np.ndarray
+    helped: np.ndarray
+
+    @classmethod
+    def over_bank(cls, sizes: dict[int, np.ndarray]) -> Estimates:
+        """From `_measures` by number of draws, each twice that before."""
+        nested = list(sizes.values())
+        quarter = nested[-3] if len(nested) > 2 else np.full_like(nested[-1], np.nan)
+        return cls(nested[-1], quarter, nested[-1])
+
+    @classmethod
+    def over_samples(
+        cls,
+        parts: list[PosteriorSums],
+        helped: PosteriorSums,
+        static: np.ndarray,
+        stars: BoundedStars,
+    ) -> Estimates:
+        """From sums over importance samples in four parts, and those with the truth's modes."""
+        measure = partial(_measures, static=static, stars=stars)
+        quarter, _, full = nested_means(parts, measure).values()
+        return cls(full, quarter, measure(helped))
+
+    @property
+    def ess(self) -> np.ndarray:
+        """Effective sample size of every star."""
+        return self.full[-1]
+
+    def improved(self, few: np.ndarray, other: Estimates | None) -> tuple[Estimates, int]:
+        """With another one of the stars `few` where it has more samples, and for how many."""
+        if other is None:
+            return self, 0
+        better = (self.ess[few] < ENOUGH_ESS) & (other.ess > self.ess[few])
+        changed = {name: values.copy() for name, values in vars(self).items()}
+        for name, values in changed.items():
+            values[:, few[better]] = getattr(other, name)[:, better]
+        return Estimates(**changed), int(better.sum())
+
+    def values(self, number: int) -> dict[str, np.ndarray]:
+        """Error and variance of every star by one reference, and the effective sample size."""
+        return {"mse": self.full[number], "variance": self.full[2 + number], "ess": self.ess}
+
+    def evidence(self, number: int, field: np.ndarray) -> Evidence:
+        """Whether the mean of one reference is near the exact one."""
+        return Evidence.of(
+            **self.values(number),
+            field=field,
+            last_change=abs(_change(self.quarter[number], self.full[number])),
+            undetected=-_change(self.helped[number], self.full[number]),
+        )
+
+
+def _change(errors: np.ndarray, full: np.ndarray) -> float:
+    """Relative difference of mean errors, over the stars that have both."""
+    known = np.isfinite(errors) & np.isfinite(full)
+    return float(errors[known].mean() / full[known].mean() - 1.0) if known.any() else np.nan
+
+
+def _grown(tables: Tables, method: str, level: float, sizes: dict[int, np.ndarray]) -> None:
+    """Rows of `growth`: `_measures` of one posterior mean over a bank by number of draws."""
+    draws, bank = np.array(list(sizes)), Estimates.over_bank(sizes)
+    for number, reference in enumerate(tables.stars.truth):
+        errors = np.array([measures[number].mean() for measures in sizes.values()])
         limit, exponent, residual = extrapolate(draws, errors)
-        if change <= TIGHT:
-            reached = {"draws": max(sizes), "last_change": change}
-            values = {"mse": last[i], "ess": last[-1]}
-            tables.add(reference, method, level, values, tight=True, found="bank", **reached)
-        else:
+        if not bank.evidence(number, tables.stars.field).tight:
             # Far from convergence the fit extrapolates to anything, down to zero.
-            thin.append(reference)
             limit = float("nan")
         tables.growth += [
             {
@@ -374,27 +473,27 @@ def _tabulate(tables: Tables, method: str, level: float, sizes: dict[int, np.nda
                 "noise_level": level,
                 "draws": count,
                 "mse": error,
-                "ess_mean": values[-1].mean(),
-                "ess_median": np.median(values[-1]),
-                "last_change": change,
+                "ess_mean": measures[-1].mean(),
+                "ess_median": np.median(measures[-1]),
+                "last_change": last_change(errors),
                 "limit": limit,
                 "exponent": exponent,
                 "fit_rms": residual,
             }
-            for count, error, values in zip(draws, errors, sizes.values(), strict=True)
+            for count, error, measures in zip(draws, errors, sizes.values(), strict=True)
         ]
-    return thin
 
 
-def _draws(
+def _samples(
     config: Config,
     bank: Bank,
     seidel: np.ndarray,
+    product: Product,
     stars: BoundedStars,
     level: float,
     likelihood: Likelihood,
 ) -> Sampled:
-    """Draws around the best matches of every star; each star has a random stream of its own."""
+    """Importance samples around the best matches of every star, from a stream of its own."""
     mean = np.array(config.wavefront.coefficients)
     spread = config.stars.aberration_fraction * np.abs(mean)
     field = relative_field(config.grid)
@@ -402,85 +501,77 @@ def _draws(
     names = ("bounds", config.stars.name, f"{level:.6g}")
     rngs = [stream(config.seed, *names, int(star)) for star in stars.star]
     noisy, draws = stars.noisy[level], config.bounds.star_draws
-    return sample(bank, seidel, noisy, stars.field, likelihood, model, draws, rngs)
+    count = stars.star.size
+    truth = Modes.at(
+        np.arange(count),
+        stars.field,
+        product["peak"][stars.star] - product["jitter"][stars.star],
+        np.full(count, TRUTH),
+        model.standardised(product["seidel"][stars.star]),
+    )
+    return sample(bank, seidel, noisy, truth, likelihood, model, draws, rngs)
 
 
-def _replace(
-    tables: Tables,
-    level: float,
-    found: Sampled,
-    draws: int,
-    static: np.ndarray,
-    thin: dict[str, list[str]],
-) -> None:
-    """Rows of the posterior means over draws, for the references `thin` of every method."""
-    stars = tables.stars
-    helped = _errors(found.helped, static, stars)
-    for method, parts in zip(POSTERIOR_MEANS, (found.free, found.told), strict=True):
-        sizes = nested_means(parts, partial(_errors, static=static, stars=stars))
-        last = sizes[max(sizes)]
-        for i, reference in enumerate(stars.truth):
-            if reference not in thin[method]:
-                continue
-            change = last_change([values[i].mean() for values in sizes.values()])
-            # Who is told the field cannot have missed it.
-            missed = 0.0 if POSTERIOR_MEANS[method] else 1.0 - helped[i].mean() / last[i].mean()
-            values = {"mse": last[i], "ess": last[-1]}
-            reached = {"draws": draws, "last_change": change, "missed": missed}
-            tight = max(change, missed) <= TIGHT
-            tables.add(reference, method, level, values, tight, found="draws", **reached)
+def _anywhere(stars: BoundedStars, bank: Bank) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Test stars and the draws that they are weighed with: all with all."""
+    return [(np.arange(stars.field.size), np.arange(len(bank)))]
 
 
-def _anywhere(
-    bank: Bank, static: np.ndarray, stars: BoundedStars, level: float, likelihood: Likelihood
-) -> dict[int, np.ndarray]:
-    """`_errors` of the posterior mean over all fields, by number of draws.
+def _in_the_field(stars: BoundedStars, bank: Bank) -> list[tuple[np.ndarray, np.ndarray]]:
+    """The same for draws that the symmetries take to each star's own field.
 
-    A bank that is hopelessly thin for its noise level is left after a quarter.
-    """
-    cuts = np.array_split(np.arange(len(bank)), segments(len(bank)))
-    noisy = stars.noisy[level]
-    quarter = max(1, len(cuts) // 4)
-    parts = [posterior_sums(bank.take(cut), noisy, likelihood) for cut in cuts[:quarter]]
-    sizes = nested_means(parts, lambda sums: sums.effective_size)
-    if np.median(sizes[quarter]) >= HOPELESS_ESS:
-        parts += [posterior_sums(bank.take(cut), noisy, likelihood) for cut in cuts[quarter:]]
-    draws = sum(cut.size for cut in cuts[: len(parts)])
-    means = nested_means(parts, partial(_errors, static=static, stars=stars))
-    return {round(draws / len(parts) * size): values for size, values in means.items()}
-
-
-def _told_the_field(
-    bank: Bank, static: np.ndarray, stars: BoundedStars, level: float, likelihood: Likelihood
-) -> dict[int, np.ndarray]:
-    """The same over the draws that the symmetries take to each star's own field.
-
-    Fields that are mirror images of each other share theirs. Every part of the bank has
-    as many of them, and the draws that are counted are those of the bank in all fields.
+    Fields that are mirror images of each other share theirs.
     """
     ours, theirs = orbit(stars.field, bank.points), orbit(bank.field, bank.points)
-    groups = [(np.flatnonzero(ours == o), np.flatnonzero(theirs == o)) for o in np.unique(ours)]
+    return [(np.flatnonzero(ours == o), np.flatnonzero(theirs == o)) for o in np.unique(ours)]
+
+
+def _weighed(
+    bank: Bank, given: bool, static: np.ndarray, stars: BoundedStars, level: float, like: Likelihood
+) -> dict[int, np.ndarray]:
+    """`_measures` of the posterior mean over a bank, with the field given or not, by its size.
+
+    Every part of the bank has as many draws of every group, and those that are counted are
+    the draws in all fields. A bank that is hopelessly thin for its noise level is left after a
+    quarter.
+    """
+    groups = _in_the_field(stars, bank) if given else _anywhere(stars, bank)
     pieces = segments(min(draws.size for _, draws in groups))
+    quarter = max(1, pieces // 4)
+    several = [(stars.take(group), np.array_split(draws, pieces)) for group, draws in groups]
+
+    def weigh(first: int, end: int) -> list[list[PosteriorSums]]:
+        return [
+            [
+                posterior_sums(
+                    *(bank.take(cut), few.noisy[level], like),
+                    told=few.field if given else None,
+                )
+                for cut in cuts[first:end]
+            ]
+            for few, cuts in several
+        ]
+
+    parts = weigh(0, quarter)
+    sizes = [nested_means(part, lambda sums: sums.effective_size)[quarter] for part in parts]
+    if np.median(np.concatenate(sizes)) >= HOPELESS_ESS:
+        parts = [old + new for old, new in zip(parts, weigh(quarter, pieces), strict=True)]
     means: dict[int, np.ndarray] = {}
-    for group, draws in groups:
-        few = stars.take(group)
-        weigh = partial(
-            posterior_sums, noisy=few.noisy[level], likelihood=likelihood, told=few.field
-        )
-        parts = [weigh(bank.take(cut)) for cut in np.array_split(draws, pieces)]
-        measure = partial(_errors, static=static, stars=few)
-        for size, values in nested_means(parts, measure).items():
+    for (group, _), (few, _), part in zip(groups, several, parts, strict=True):
+        measure = partial(_measures, static=static, stars=few)
+        for size, values in nested_means(part, measure).items():
             total = means.setdefault(size, np.empty((len(values), stars.field.size)))
             total[:, group] = values
     return {round(len(bank) / pieces * size): values for size, values in means.items()}
 
 
-def _errors(sums: PosteriorSums, static: np.ndarray, stars: BoundedStars) -> np.ndarray:
-    """MSE against realisation and template, and effective sample size, shape (3, n)."""
+def _measures(sums: PosteriorSums, static: np.ndarray, stars: BoundedStars) -> np.ndarray:
+    """MSE against realisation and template, variances of both, effective sample size, (5, n)."""
     shape = stars.truth["realisation"].shape
-    means = {"realisation": sums.mean_image, "template": sums.mean_template(static)}
+    template, spread = sums.template(static)
+    means = {"realisation": sums.mean_image, "template": template}
     errors = [mse(means[name].reshape(shape), truth) for name, truth in stars.truth.items()]
-    return np.stack([*errors, sums.effective_size])
+    return np.stack([*errors, sums.variance_image, spread, sums.effective_size])
 
 
 def _exact(config: Config, static: np.ndarray, tables: Tables) -> None:
@@ -490,14 +581,17 @@ def _exact(config: Config, static: np.ndarray, tables: Tables) -> None:
         likelihood = Likelihood.of(noise_model(config), level, static[:, static.shape[1] // 2])
         for method, told in POSTERIOR_MEANS.items():
             known = stars.field if told else None
-            mean, probability = exact_posterior(stars.noisy[level], static, likelihood, known)
+            mean, variance, probability = exact_posterior(
+                stars.noisy[level], static, likelihood, known
+            )
             error = mse(mean, stars.truth["realisation"])
             if error.mean() < NEGLIGIBLE_MSE:
-                error = np.zeros_like(error)
-            values = {"mse": error}
+                error, variance = np.zeros_like(error), np.zeros_like(error)
+            values = {"mse": error, "variance": variance}
             if not told:
                 values["p_right"] = probability[np.arange(stars.field.size), stars.field]
-            tables.add("realisation", method, level, values, tight=True, found="sum")
+            score = calibration(error, variance, stars.field)
+            tables.add("realisation", method, level, values, True, "sum", calibration=score)
 
 
 @command("efficiency")
@@ -517,7 +611,8 @@ def efficiency(
     floor and where the posterior mean is tight; the verdict is `beaten` if a method's error
     is below such a bound by more than two standard errors of the difference and 5 % of the
     bound (of the floor, which is no lower limit, 20 %), otherwise `ok`. Both are empty where a
-    posterior mean is not tight.
+    posterior mean is not tight. Stars without a posterior mean are left out on both sides; both
+    are empty, too, where these are more than 1 %.
     """
     import pandas as pd
 
@@ -567,11 +662,15 @@ def _column(
                     f"{place}: star {star} of {method} lies in field {field}, "
                     f"but that of the bounds in {bounded_in}"
                 )
+            estimated = paired.mse_bound.notna()
+            if method in POSTERIOR_MEANS:
+                estimated &= paired.mse.notna()
+            judged = (bound == "floor" or sharp) and (~estimated).mean() <= FEW
+            paired = paired[estimated]
             found = compare(
                 *(paired[column].to_numpy() for column in ("mse", "mse_bound", "field")),
                 FLOOR_TOLERANCE if bound == "floor" else TOLERANCE,
             )
-            judged = bound == "floor" or sharp
             yield {
                 **key,
                 "method": method,
@@ -583,6 +682,9 @@ def _column(
                 "difference": found.difference,
                 "stderr": found.stderr,
                 "n": len(paired),
+                "median": paired.mse.median(),
+                "median_bound": paired.mse_bound.median(),
+                "variance_bound": paired.variance.mean(),
                 "verdict": ("beaten" if found.beaten else "ok") if judged else None,
             }
 

@@ -1,4 +1,4 @@
-"""Stage `compare`: finished networks side by side, as Markdown."""
+"""Stage `compare`: finished networks or tables of errors side by side, as Markdown."""
 
 from __future__ import annotations
 
@@ -8,13 +8,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from psfdae.cli import File, Folder, command
-from psfdae.estimators import CONFIG, HISTORY, registered
+from psfdae.estimators import CONFIG, HISTORY, method, registered
 from psfdae.files import ProductError, write_text
-from psfdae.reading import read_csv, read_yaml
+from psfdae.reading import read_csv, read_table, read_yaml
 from psfdae.tracking import flatten
 
 if TYPE_CHECKING:
     import pandas as pd
+
+
+TABLE = "tables/psf_metrics.csv"
+"""Mean errors of all methods, in a folder of results and in the run of record."""
 
 
 class ComparisonError(ValueError):
@@ -40,32 +44,46 @@ def compare(
 
     A run is the folder of a trained network, such as results/dae/dataset3/random-realisation
     or a point of a sweep; two folders of results compare all networks that both hold. Shown
-    are settings that differ, the trainings, and errors with their significance.
+    are settings that differ, the trainings, and errors with their significance. Where a folder has
+    tables alone, such as results/reference, the mean errors are compared: which are equal, and
+    which differ by more than seeds do.
     """
     if len(runs) < 2:
         raise ComparisonError("name at least two runs to compare")
-    blocks = []
-    for group in _groups(runs):
-        first, *others = (read_run(*found) for found in group)
-        blocks += [describe(first, other) for other in others]
+    if all(map(_tables, runs)) and not all(map(_networks, runs)):
+        first, *others = runs
+        blocks = [describe_tables(first, other) for other in others]
+    else:
+        groups = ([read_run(*found) for found in group] for group in _groups(runs))
+        blocks = [describe(first, other) for first, *others in groups for other in others]
     text = "\n\n".join(blocks) + "\n"
     if out is not None:
         write_text(out, text)
     print(text, end="")
 
 
+def _networks(folder: Path) -> set[Path]:
+    """Folders of trained networks below a folder of results."""
+    kinds = (kind.name for kind in registered() if CONFIG in kind.files)
+    paths = (path for name in kinds for path in folder.glob(f"{name}/*/*/{CONFIG}"))
+    return {path.parent.relative_to(folder) for path in paths}
+
+
+def _tables(folder: Path) -> list[Path]:
+    """Tables of mean errors: of each evaluation of a run, or the joined one of a record."""
+    joined = [path for path in [folder / TABLE] if path.is_file()]
+    return sorted(folder.glob("evaluation/*/*.csv")) or joined
+
+
 def _groups(folders: Sequence[Path]) -> list[list[tuple[Path, Path]]]:
     """(Folder of the network, table of its errors) of the runs that belong together."""
     if all((folder / CONFIG).is_file() for folder in folders):
         return [[(folder, errors_of(folder)) for folder in folders]]
-    networks = [kind.name for kind in registered() if CONFIG in kind.files]
     places = []
     for folder in folders:
-        paths = [path for name in networks for path in folder.glob(f"{name}/*/*/{CONFIG}")]
-        found = {path.parent.relative_to(folder) for path in paths}
-        if not found:
+        if not (found := _networks(folder)):
             raise ComparisonError(
-                f"{folder}: no {CONFIG} and no {' or '.join(networks)}/DATASET/RUN/{CONFIG} in it, "
+                f"{folder}: no {CONFIG}, no METHOD/DATASET/RUN/{CONFIG} and no {TABLE} in it, "
                 "hence neither a trained network nor a folder of results"
             )
         places.append(found)
@@ -105,16 +123,16 @@ def read_run(folder: Path, errors: Path) -> Run:
 def describe(first: Run, second: Run) -> str:
     """Markdown with the differences between two runs."""
     from psfdae.evaluation.comparison import (
-        SEED_SCATTER,
         SIGNIFICANT,
         compare_errors,
         config_differences,
         same_noisy_stars,
+        seed_scatter,
         training_summary,
     )
 
     curves = [training_summary(run.history) for run in (first, second)]
-    errors = compare_errors(first.errors, second.errors, SEED_SCATTER)
+    errors = compare_errors(first.errors, second.errors, seed_scatter())
     paired = same_noisy_stars(first.errors, second.errors)
     references = {run.config.get("reference", "") for run in (first, second)}
     warning = "The runs have different references: not the same question.\n\n"
@@ -129,7 +147,8 @@ def describe(first: Run, second: Run) -> str:
             f"## Errors, {how}",
             ("" if len(references) == 1 else warning)
             + f"B − A ± standard error clustered by field ± scatter between seeds; {SIGNIFICANT:g} "
-            "times both together make B better or worse.",
+            "times both together make B better or worse. Where the second was not measured "
+            "(`snakemake seeds`), it is missing, and the first alone decides.",
             _table(
                 [
                     (*row[:5], _change(row), row.sigmas, row.verdict)
@@ -142,7 +161,74 @@ def describe(first: Run, second: Run) -> str:
 
 
 def _change(row: Any) -> str:
-    return f"{row.difference:+.3g} ± {row.stderr:.2g} ± {row.seed_stderr:.2g}"
+    of_seeds = "" if row.seed_stderr != row.seed_stderr else f" ± {row.seed_stderr:.2g}"
+    return f"{row.difference:+.3g} ± {row.stderr:.2g}{of_seeds}"
+
+
+def read_errors(folder: Path) -> pd.DataFrame:
+    """Mean errors of all methods in a folder of results; raises ProductError."""
+    import pandas as pd
+
+    from psfdae.evaluation.comparison import CELL
+
+    wanted = [*CELL, "method", "metric", "value"]
+    parts = {path: read_table(path) for path in _tables(folder)}
+    for path, part in parts.items():
+        if lacking := [name for name in wanted if name not in part]:
+            raise ProductError(f"{path}: column {lacking[0]!r} is missing")
+    return pd.concat([part[wanted] for part in parts.values()], ignore_index=True)
+
+
+def describe_tables(first: Path, second: Path) -> str:
+    """Markdown: which mean errors of two runs are equal, and which differ by more than seeds do."""
+    from psfdae.evaluation.comparison import (
+        PAPER_ORDER,
+        SIGNIFICANT,
+        compare_tables,
+        seed_scatter,
+    )
+
+    both = [read_errors(folder) for folder in (first, second)]
+    rows, order = compare_tables(*both, seed_scatter())
+    names = " < ".join(method(name).paper[1] for name in PAPER_ORDER)  # type: ignore[index]
+    said = {
+        "equal": "are equal to the last digit",
+        "within": f"differ within the scatter between seeds ({SIGNIFICANT:g} standard deviations "
+        "of the difference of two fits)",
+        "beyond": "differ by more",
+        "not measured": "differ, but their scatter between seeds was not measured",
+    }
+    lines = [f"# {first} (A) and {second} (B)", ""]
+    lines += [f"{len(rows)} mean errors are in both (A has {len(both[0])}, B {len(both[1])})."]
+    for verdict, text in said.items():
+        found = rows[rows.verdict == verdict]
+        lines += [f"- {len(found)} {text}"]
+        lines += [f"  - {name}" for name in _named(found)] * (verdict in ("beyond", "not measured"))
+    lines += [
+        f"- The paper's order by MSE, {names}, holds in {order['first'].sum()} of {len(order)} "
+        f"columns of A and in {order['second'].sum()} of B; {order.exchanged.sum()} have two of "
+        "them exchanged, beyond the scatter"
+    ]
+    lines += [f"  - {_cell(key)}" for key in order.index[order.exchanged]]
+    return "\n".join(lines)
+
+
+def _named(rows: pd.DataFrame) -> list[str]:
+    """Rows of a table of errors by dataset, split and reference, in words."""
+    lines = []
+    for key, cell in rows.groupby(["dataset", "split", "reference"], sort=False):
+        metrics: dict[str, list[str]] = {}
+        for (name, metric), part in cell.groupby(["method", "metric"], sort=False):
+            levels = ", ".join(f"{level:g}" for level in part.noise_level)
+            metrics.setdefault(f"{name} at λ = {levels}", []).append(metric)
+        found = (f"{name} ({', '.join(of)})" for name, of in metrics.items())
+        lines.append(f"{_cell(key)}: {'; '.join(found)}")
+    return lines
+
+
+def _cell(key: Sequence[Any]) -> str:
+    """Dataset, split, reference and, if given, noise level in words."""
+    return ", ".join([*key[:3], *(f"λ = {level:g}" for level in key[3:])])
 
 
 def _table(rows: Sequence[Sequence[Any]], headers: Sequence[str]) -> str:

@@ -12,8 +12,7 @@ import numpy as np
 from psfdae.cli import File, Folder, Reference, Split, command
 from psfdae.configuration.schema import Config
 from psfdae.estimators import ConfigError, Estimate, Method, method, registered
-from psfdae.evaluation.comparison import SEED_SCATTER
-from psfdae.evaluation.metrics import all_metrics, clustered_mean, seed_stderr
+from psfdae.evaluation.metrics import all_metrics, clustered_mean
 from psfdae.files import Product, ProductError, write_csv, write_parquet, write_text
 from psfdae.reading import read_table
 from psfdae.stages.common import (
@@ -94,12 +93,11 @@ def measured(estimate: Estimate, truth: np.ndarray, config: Config) -> dict[str,
 def summarised(
     row: dict[str, Any], metrics: dict[str, np.ndarray], field: np.ndarray
 ) -> list[dict[str, Any]]:
-    """Mean of each metric with its standard errors: of the stars, by field, and of the seed."""
+    """Mean of each metric with its standard error by field."""
     rows = []
     for metric, values in metrics.items():
         mean, stderr = clustered_mean(values, field)
-        scatter = seed_stderr(SEED_SCATTER.get(row["method"], 0.0), metric, mean)
-        found = {"metric": metric, "value": mean, "stderr": stderr, "seed_stderr": scatter}
+        found = {"metric": metric, "value": mean, "stderr": stderr}
         rows.append({**row, **found, "n": values.size})
     return rows
 
@@ -147,7 +145,7 @@ def estimators(
 
 
 COLUMNS = ["dataset", "split", "reference", "method", "noise_level", "metric"]
-COLUMNS += ["value", "stderr", "seed_stderr", "n"]
+COLUMNS += ["value", "stderr", "n"]
 
 Evaluations = Annotated[tuple[File, ...], {"argument": True}]
 Metric = Literal["mse", "ssim"]
@@ -155,8 +153,11 @@ Metric = Literal["mse", "ssim"]
 
 @command("collect")
 def collect(evaluations: Evaluations, out: Annotated[File, "Tidy CSV."]) -> None:
-    """Join evaluations into one tidy table."""
-    write_csv(out, read_evaluations(evaluations))
+    """Join evaluations into one tidy table, with the scatter of each method between seeds."""
+    from psfdae.evaluation.comparison import seed_scatter, with_seed_stderr
+
+    table = with_seed_stderr(read_evaluations(evaluations), seed_scatter())
+    write_csv(out, table[[*COLUMNS[:-1], "seed_stderr", "n"]])
 
 
 @command("held-out")

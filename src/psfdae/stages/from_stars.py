@@ -17,7 +17,14 @@ from psfdae.configuration.base import ConfigError
 from psfdae.configuration.compose import as_overrides, part
 from psfdae.configuration.schema import Config, Noise
 from psfdae.estimators import Method, all_groups, groups_of, method
-from psfdae.files import Product, write_csv, write_product, write_text
+from psfdae.files import (
+    Product,
+    atomic_path,
+    interrupted,
+    write_csv,
+    write_product,
+    write_text,
+)
 from psfdae.own_stars.advice import advice
 from psfdae.own_stars.bundle import SUFFIX
 from psfdae.own_stars.observation import Observation, Source
@@ -47,6 +54,9 @@ SHOWN_SNR = 10.0
 """The figure shows stars at the S/N nearest to this."""
 
 SHOWN_STARS = 6
+
+LONGEST_NAME = 255
+"""Bytes of a file's name."""
 
 
 class FolderError(RuntimeError):
@@ -121,10 +131,10 @@ def from_stars(
     the method of the model; others are held out and made faint to test it.
     """
     job = dict(locals())
+    stem = _stem(image, name)
     if not stated.all_extensions:
         print(trained(**job))
     else:
-        stem = name or image.name.split(".")[0]
         jobs = {
             extension: {
                 **job,
@@ -163,14 +173,14 @@ def trained(
         methods.append(method(taken).name)
     config = config.model_copy(update={"methods": methods})
     kinds = tuple(kind for kind in map(method, methods) if kind.stored)
-    files = Made(out, name or image.name.split(".")[0], kinds)
+    files = Made(out, _stem(image, name), kinds)
     allowed = {kind.name: kind for kind in kinds if kind.bundled}
     if not allowed or taken not in {None, *allowed}:
         known = ", ".join(allowed) or "none, for no method of the list makes a model"
         raise ConfigError(f"methods = {config.methods}: --method takes one of these: {known}")
     made = [*files.written(), *([files.list] if exposure.detect is not None else []), page]
     check_outputs(made, exposure.files())
-    if page is not None and page.exists() and not overwrite:
+    if page is not None and page.exists() and not (overwrite or interrupted(files.bundle)):
         raise FolderError(f"{page}: exists already; --overwrite replaces it")
     with _alone(out):
         finished = sorted(out.glob(f"*{SUFFIX}"))
@@ -180,9 +190,18 @@ def trained(
         return _make(config, exposure, files, licence, tried, page)
 
 
+def _stem(image: Path, name: str | None) -> str:
+    """The name of a model, with which names of its files start; FolderError if they cannot."""
+    name = name or image.name.split(".")[0] or "model"
+    if "/" in name or len(f"{name}{SUFFIX}".encode()) > LONGEST_NAME:
+        said = f"at most {LONGEST_NAME - len(SUFFIX)} bytes, and no folder"
+        raise FolderError(f"--name {name}: expected the start of a file's name, {said}")
+    return name
+
+
 def _next(image: Path, stated: Stated, out: Path, name: str | None) -> list[str]:
     """The command that applies the models to all stars of their image."""
-    name = name or image.name.split(".")[0]
+    name = _stem(image, name)
     model = out if stated.all_extensions else Made(out, name, ()).bundle
     where = ["--model", str(model), "--out", str(out / f"{name}_psf.fits")]
     return ["psfdae", "predict", str(image), *stated.words(), *where]
@@ -263,13 +282,16 @@ def _make(
     print(f"packing {taken.label}")
     own = part(bundle.stage.reads, settings)  # type: ignore[attr-defined]
     models = Models(**{taken.name: files.fit(taken)})
-    bundle(own, files.stars, models, SPLIT, REFERENCE, licence=licence, out=files.bundle)
-    restored = tested(checked, files, taken, single_psf(found.bright, held_out), framing.jitter_px)
-    errors = report(checked, files, restored)
-    if page is not None:
-        print(f"writing {page}")
-        selection = found.table(held_out)
-        write_text(page, told(exposure, files, taken, (errors, restored, selection), notes))
+    # Its name is the last one to be there: it says that all is done.
+    with atomic_path(files.bundle) as model:
+        bundle(own, files.stars, models, SPLIT, REFERENCE, files.name, licence, out=model)
+        mean = single_psf(found.bright, held_out)
+        restored = tested(checked, files, taken, mean, framing.jitter_px)
+        errors = report(checked, files, restored)
+        if page is not None:
+            print(f"writing {page}")
+            tables = (errors, restored, found.table(held_out))
+            write_text(page, told(exposure, files, model, taken, tables, notes))
     return standing(errors, taken.name, taken.label)
 
 

@@ -6,6 +6,7 @@ import multiprocessing
 import os
 from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
 from pathlib import Path
@@ -60,16 +61,32 @@ def each(work: Callable[..., str], jobs: Mapping[str, Mapping[str, Any]], path: 
     failed = []
     print(f"{path}: {len(jobs)} images: {', '.join(jobs)}")
     processes = min(len(jobs), available_cores())
-    with ProcessPoolExecutor(processes, multiprocessing.get_context("spawn")) as pool:
+    with _pool(processes) as pool:
         futures = {name: pool.submit(_quietly, work, job) for name, job in jobs.items()}
         for name, future in futures.items():
-            good, said = future.result()
+            try:
+                good, said = future.result()
+            except BrokenProcessPool:  # with it all that were not done
+                good, said = _alone(work, jobs[name])
             failed += [] if good else [name]
             print(f"{name}: {said}", flush=True)
     if failed:
         raise MosaicError(
             f"{path}: {len(failed)} of {len(jobs)} images failed: {', '.join(failed)}"
         )
+
+
+def _pool(processes: int) -> ProcessPoolExecutor:
+    return ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"))
+
+
+def _alone(work: Callable[..., str], job: Mapping[str, Any]) -> tuple[bool, str]:
+    """`_quietly` in a process of its own, with all memory for it."""
+    with _pool(1) as pool:
+        try:
+            return pool.submit(_quietly, work, job).result()
+        except BrokenProcessPool:
+            return False, "its process was killed, perhaps for lack of memory"
 
 
 def _quietly(work: Callable[..., str], job: Mapping[str, Any]) -> tuple[bool, str]:

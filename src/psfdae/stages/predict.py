@@ -13,7 +13,7 @@ import click
 import numpy as np
 
 from psfdae.cli import File, NameOrNumber, command
-from psfdae.files import atomic_path
+from psfdae.files import atomic_path, interrupted
 from psfdae.own_stars.bundle import SUFFIX
 from psfdae.own_stars.images import Card
 from psfdae.own_stars.model import (
@@ -58,7 +58,9 @@ class Stated:
         str | int | None, NameOrNumber(), "Extension or FITS file; pixels other than 0 are bad."
     ] = None
     bad_bits: Annotated[
-        int | None, click.IntRange(min=1), "Sum of the mask's bits that are bad.  [default: all]"
+        int | None,
+        click.IntRange(1, 2**63 - 1),
+        "Sum of the mask's bits that are bad.  [default: all]",
     ] = None
     weight: Annotated[
         str | int | None, NameOrNumber(), "Extension or FITS file with 1/variance of the pixels."
@@ -195,15 +197,17 @@ def restored(
     with tqdm(unit="star", unit_scale=True, desc="predict", disable=quiet or None) as bar:
         bar.reset(observation.count)
         try:
-            done = (loaded, source, observation, out, threads, bar.update, fixed_positions)
-            counts, clean = write_prediction(*done)
-            if found is not None:
-                write_list(observation, found)
-            if plot is not None:
-                from psfdae.own_stars.plot import map_of_file
-                from psfdae.stages.figures import write_png
+            # Its name is the last one to be there: it says that all is done.
+            with atomic_path(out) as unfinished:
+                done = (loaded, source, observation, unfinished, threads, bar.update)
+                counts, clean = write_prediction(*done, fixed_positions)
+                if found is not None:
+                    write_list(observation, found)
+                if plot is not None:
+                    from psfdae.own_stars.plot import map_of_file
+                    from psfdae.stages.figures import write_png
 
-                write_png(map_of_file(out), plot)
+                    write_png(map_of_file(unfinished), plot)
         except OSError as error:
             said = error.strerror or error
             raise PredictionError(f"{out}: cannot be written ({said})") from error
@@ -214,12 +218,13 @@ def restored(
 
 
 def _check_targets(out: Path, plot: Path | None, found: Path | None, overwrite: bool) -> None:
+    ours = overwrite or (not out.exists() and interrupted(out))
     for target in (out, plot, found):
         if target is None:
             continue
         if target.is_dir():
             raise PredictionError(f"{target}: is a folder, not a file")
-        if target.exists() and not overwrite:
+        if target.exists() and not ours:
             raise PredictionError(f"{target}: exists already; --overwrite replaces it")
     if plot is not None and plot.resolve() == out.resolve():
         raise PredictionError(f"{plot}: is the name of the FITS file, too")

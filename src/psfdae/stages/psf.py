@@ -12,11 +12,16 @@ import numpy as np
 import psfdae
 from psfdae.cli import File, command
 from psfdae.files import atomic_path
+from psfdae.own_stars.errors import ascii_line
+from psfdae.own_stars.images import BLOCK_BYTES
 from psfdae.own_stars.model import PredictionError, PsfModel, load_model
 from psfdae.stages.common import check_outputs
 
 PLACE = re.compile(r"([-+0-9.eE]+),([-+0-9.eE]+)")
 GRID = re.compile(r"([0-9]{1,3})x([0-9]{1,3})")
+
+AT_ONCE = 2**20
+"""Values of PSFs that are made before they are written."""
 
 
 @command("psf")
@@ -32,8 +37,8 @@ def psf(
     """Write the PSFs of MODEL, of from-stars --method field, at places of the image.
 
     Each image of the cube is a PSF of flux 1 with its centre in the middle, sampled at parts of
-    a pixel. The header names the places, as photutils and WebbPSF do; photutils wants one, or
-    a grid.
+    a pixel. The header names the places, y before x, as the files of STScI's STPSF do; photutils
+    3.1 reads one, or a grid.
     """
     check_outputs((out,), (model,))
     if out.exists() and not overwrite:
@@ -42,9 +47,7 @@ def psf(
         raise PredictionError("--at X,Y or --grid COLUMNSxROWS says where")
     loaded = load_model(model)
     places = np.array([_place(text) for text in at]) if at else _grid(str(grid), loaded)
-    # About the middle of a pixel: what comes out is centred.
-    x, y = np.rint(places).T
-    write(out, loaded, places, loaded.psf_at(x, y, oversampling), oversampling)
+    write(out, loaded, places, oversampling)
 
 
 def _place(text: str) -> tuple[float, float]:
@@ -68,19 +71,33 @@ def _grid(text: str, model: PsfModel) -> np.ndarray:
     return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
 
-def write(
-    path: Path, model: PsfModel, places: np.ndarray, images: np.ndarray, oversampling: int
-) -> None:
-    """A cube of PSFs (n, m, m) with the keywords that photutils.psf.webbpsf_reader asks for."""
+def write(path: Path, model: PsfModel, places: np.ndarray, oversampling: int) -> None:
+    """A cube of PSFs (n, m, m) at places (n, 2), x and y, as STPSF's `psf_grid` lays it out."""
     from astropy.io import fits
 
-    primary = fits.PrimaryHDU(images.astype(np.float32))
-    header = primary.header
-    header["CREATOR"] = (f"psfdae {psfdae.__version__}", "program that made this file")
-    header["PSFMODEL"] = (model.info.name, "model bundle")
-    header["PSFSHA"] = model.bundle.sha256
-    header["OVERSAMP"] = (oversampling, "values per pixel and axis")
-    for number, (x, y) in enumerate(places.tolist()):
-        header[f"DET_YX{number}"] = (f"({x:.6g}, {y:.6g})", "x, y, 0-based")
-    with atomic_path(path) as temporary:
-        primary.writeto(temporary, overwrite=True)
+    # About the middle of a pixel: what comes out is centred.
+    x, y = np.rint(places).T
+    first = model.psf_at(x[0], y[0], oversampling)
+    header = fits.PrimaryHDU(first[None].astype(np.float32)).header
+    header["NAXIS3"] = len(places)
+    cards = [
+        *header.cards,
+        ("CREATOR", f"psfdae {psfdae.__version__}", "program that made this file"),
+        ("PSFMODEL", ascii_line(model.info.name), "model bundle"),
+        ("PSFSHA", model.bundle.sha256, ""),
+        ("OVERSAMP", oversampling, "values per pixel and axis"),
+        # photutils 3.0 takes every key with these letters, in any case, for a place, and would
+        # exchange x and y without a word: now it stops at this one. Others look for capitals.
+        ("HIERARCH Det_yx for photutils 3.0", "this needs photutils 3.1 or newer", ""),
+    ]
+    for number, (column, row) in enumerate(places.tolist()):
+        key = f"DET_YX{number}" if number < 100 else f"HIERARCH DET_YX{number}"
+        cards.append((key, f"({row:.8g}, {column:.8g})", "y, x, 0-based"))
+    header = fits.Header(cards)  # `extend` takes the square of the time
+    step = max(1, AT_ONCE // first.size)
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        file.write(header.tostring().encode("ascii"))
+        for start in range(0, len(places), step):
+            part = slice(start, start + step)
+            file.write(model.psf_at(x[part], y[part], oversampling).astype(">f4").tobytes())
+        file.truncate(-(-file.tell() // BLOCK_BYTES) * BLOCK_BYTES)

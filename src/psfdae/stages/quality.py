@@ -26,11 +26,12 @@ if TYPE_CHECKING:
 def told(
     exposure: Source,
     files: Any,
+    bundle: Path,
     kind: type[Method],
     found: tuple[pd.DataFrame, dict[float, dict[str, np.ndarray]], pd.DataFrame],
     notes: Sequence[str],
 ) -> str:
-    """The page of a model in `files` that a method made of an exposure.
+    """The page of a model, a bundle, that a method made of an exposure with other `files`.
 
     `found` are `report.csv`, held-out stars restored by noise level λ, and `selection.csv`.
     """
@@ -39,7 +40,7 @@ def told(
     errors, restored, selection = found
     if exposure.detect is not None:
         exposure = replace(exposure, detect=None, catalogue=files.list)
-    model = load_model(files.bundle)
+    model = load_model(bundle)
     info = model.info
     observation = exposure.open(info.stamp_px, MARGIN_PX).assuming()
     held = np.flatnonzero(selection.part == "held out")

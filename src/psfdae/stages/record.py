@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import csv
 import hashlib
 import json
 import os
 import platform
+import re
 import shutil
+import subprocess
 import sys
 import time
 from collections.abc import Iterable, Mapping
+from datetime import date
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -19,7 +23,8 @@ import numpy as np
 
 from psfdae.cli import File, Folder, command
 from psfdae.files import ProductError, write_csv, write_text
-from psfdae.source import git_commit
+from psfdae.reading import read_table
+from psfdae.source import git
 
 if TYPE_CHECKING:
     from psfdae.configuration.schema import Config
@@ -27,14 +32,33 @@ if TYPE_CHECKING:
 VERSIONED = ("psfdae", "numpy", "scipy", "torch", "scikit-learn", "minisom")
 """Packages whose versions can change a number; recorded with the run."""
 
-COSTS = (
-    *("wall_s", "cpu_s", "peak_mb", "on_request_s"),
-    *("results_mb", "tests_s", "matrix_product_gflops"),
-)
-"""What provenance says of the cost of a run."""
-
 ON_REQUEST = "benchmarks_on_request"
 """Folder with the cost of the targets that are not part of `make reproduce`."""
+
+TARGETS = (
+    *("benchmark", "bounds", "own_stars", "prediction"),
+    *("readings", "scaling", "stability", "training_knee"),
+)
+"""Those targets that a record is made of."""
+
+DECISIVE = ("Snakefile", "config", "src", "workflow")
+"""What decides over the products of a run."""
+
+RECORDED = re.compile(
+    r"runtime\.csv|(tables|figures)/.+|calibration/(fit|columns|scales|degeneracy)\.csv"
+    r"|sweeps/\w+/(summary|cost)\.csv|paper/tables/psf_metrics\.csv"
+)
+"""Products that the record holds."""
+
+BY_HAND = tuple(
+    f"tables/{name}.csv" for name in ("real_sky", "simulated_sky", "simulated_sky_scatter")
+)
+"""Tables that no rule makes: they need packages that are not ours to distribute."""
+
+MAY_STAY = re.compile(
+    "|".join((r"(sweeps|paper)/.+", r"tables/psf_metrics_on_request\.csv", *BY_HAND))
+)
+"""What takes too long to be made for every record."""
 
 
 @command("runtime")
@@ -42,7 +66,11 @@ def runtime(
     results: Annotated[Folder, "Folder of a run."],
     out: Annotated[File, "CSV with the cost of every job."],
 ) -> None:
-    """Collect wall time, CPU time and memory of a run's jobs."""
+    """Collect wall time, CPU time and memory of a run's jobs.
+
+    Wall time and memory are Snakemake's; the CPU time of all of a job's processes stands in the
+    last line of its log (`workflow/rules/cpu_time.smk`), which has the name of its benchmark.
+    """
     write_csv(out, _costs(results), 6)
 
 
@@ -52,8 +80,11 @@ def _costs(results: Path):  # type: ignore[no-untyped-def]
     folder = results / "benchmarks"
     rows = []
     for path in sorted(folder.rglob("*.tsv")):
-        rule, *wildcards = path.relative_to(folder).with_suffix("").parts
-        rows.append((rule, "/".join(wildcards), *_cost(path, "s", "cpu_time", "max_rss")))
+        job = path.relative_to(folder).with_suffix("")
+        rule, *wildcards = job.parts
+        wall_s, peak_mb = _cost(path, "s", "max_rss")
+        cpu_s = _cpu_seconds(results / "logs" / job.with_name(f"{job.name}.log"))
+        rows.append((rule, "/".join(wildcards), wall_s, cpu_s, peak_mb))
     return pd.DataFrame(rows, columns=["rule", "wildcards", "wall_s", "cpu_s", "peak_mb"])
 
 
@@ -73,49 +104,125 @@ def _cost(path: Path, *names: str) -> list[float]:
         return [float("nan")] * len(names)
 
 
+def _cpu_seconds(log: Path) -> float:
+    """User and system time in the last line of a log, as bash's `times` writes them; else NaN."""
+    try:
+        *_, last = log.read_text(encoding="utf-8").splitlines()
+        minutes = re.findall(r"(\d+)m(\d+)[.,](\d{3})s", last)
+        user, system = (60.0 * int(m) + int(s) + 1e-3 * int(ms) for m, s, ms in minutes)
+        return user + system
+    except (OSError, ValueError) as error:
+        print(f"{log}: no CPU time ({error}); it is left out", file=sys.stderr, flush=True)
+        return float("nan")
+
+
 @command("reference")
 def reference(
     results: Annotated[Folder, "Folder of a finished run."],
     out: Annotated[Folder, "Folder of the run of record."],
-    files: Annotated[tuple[File, ...], {"argument": True}],
-    keep: Annotated[
-        tuple[File, ...], "File, relative to the results, that may stay from the record before."
-    ] = (),
+    plans: Annotated[
+        tuple[File, ...],
+        {"flag": "--plan"},
+        "What `snakemake --summary` says of the files that the record holds.",
+    ],
 ) -> None:
     """Replace the committed run of record by a finished run.
 
-    Provenance names each file that stays with the commit that it was recorded at. If `runtime.csv`
-    stays, so does what provenance says of the run's cost.
+    The new record is that of the commit checked out: refused unless code, workflow and settings
+    are as committed and Snakemake finds every file up to date with them, wherever it was made.
+    What takes long (`MAY_STAY`) stays from the record before if it is not; provenance names it
+    with the commit it was recorded at, which has to be in the history, and the commit's date.
+    Tables that no rule makes (`BY_HAND`) say in their columns what they are of.
     """
     from psfdae.configuration.compose import load
 
-    missing = [path for path in files if not path.is_file()]
-    if missing:
-        raise ProductError(f"{missing[0]}: missing; run `make reproduce` first")
+    commit = _commit_in_use()
+    renewed = _up_to_date(results, plans)
+    by_hand = [path for path in BY_HAND if (results / path).is_file()]
+    last = out / "provenance.json"
+    before = json.loads(last.read_text()) if last.is_file() else {}
+    stays = (path for path in sorted(out.rglob("*")) if path.is_file() and path != last)
+    kept = {
+        name: _since(name, before)
+        for name in (path.relative_to(out).as_posix() for path in stays)
+        if name not in (*renewed, *by_hand) and MAY_STAY.fullmatch(name)
+    }
+    sources = {name: results / name for name in (*renewed, *by_hand)}
+    sources |= {name: out / name for name in kept}
+    kept |= {name: _said(results / name) for name in by_hand}
+    for name, found in kept.items():
+        _require_history(name, found)
     staging = out.with_name(f".{out.name}.new")
     shutil.rmtree(staging, ignore_errors=True)
-    renewable = [*files, *(results / path for path in keep if (results / path).is_file())]
-    renewed = {path.relative_to(results): path for path in renewable}
-    kept = {path: out / path for path in keep if path not in renewed and (out / path).is_file()}
-    for name, path in (renewed | kept).items():
+    for name, path in sources.items():
         target = staging / name
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(path, target)
-    last = out / "provenance.json"
-    before = json.loads(last.read_text()) if last.is_file() else {}
-    described = provenance(results, load()) | {"kept": _kept_since(before, kept)}
-    if Path("runtime.csv") in kept:  # what a run costs is said by one run alone
-        described |= {key: before[key] for key in COSTS if key in before}
+    described = provenance(results, load()) | {"commit": commit, "kept": kept}
     text = json.dumps(described, indent=2, sort_keys=True)
     write_text(staging / "provenance.json", text + "\n")
     shutil.rmtree(out, ignore_errors=True)
     staging.rename(out)
 
 
-def _kept_since(before: Mapping[str, Any], kept: Iterable[Path]) -> dict[str, str]:
-    """Commit at which each kept file was recorded."""
-    earlier, last = before.get("kept", {}), before.get("commit", "unknown")
-    return {str(path): earlier.get(str(path), last) for path in kept}
+def _commit_in_use() -> str:
+    """The commit checked out; ProductError if code, workflow or settings differ from it."""
+    try:
+        changed = git("status", "--porcelain", "--", *DECISIVE)
+        commit = git("rev-parse", "HEAD")
+    except (OSError, subprocess.CalledProcessError) as error:
+        raise ProductError(
+            f"the run of record belongs to a commit, and git fails: {error}"
+        ) from None
+    if changed:
+        raise ProductError(f"{changed.split()[-1]}: differs from commit {commit:.12}; commit first")
+    return commit
+
+
+def _up_to_date(results: Path, plans: Iterable[Path]) -> list[str]:
+    """Files for the record that Snakemake would not make anew; ProductError if others must be."""
+    found: dict[str, str] = {}
+    for plan in plans:
+        for row in csv.DictReader(plan.read_text(encoding="utf-8").splitlines(), delimiter="\t"):
+            path = Path(row["output_file"])
+            if path.is_relative_to(results):
+                found[path.relative_to(results).as_posix()] = row["plan"]
+    if "runtime.csv" not in found:
+        raise ProductError(
+            f"{', '.join(map(str, plans)) or 'no plan'}: says nothing of runtime.csv"
+        )
+    recorded = {name: plan for name, plan in found.items() if RECORDED.fullmatch(name)}
+    due = {name for name, plan in recorded.items() if plan != "no update"}
+    refused = sorted(name for name in due if not MAY_STAY.fullmatch(name))
+    if refused:
+        raise ProductError(
+            f"{results / refused[0]}: missing, or not what this commit makes (so are"
+            f" {len(refused)} files of {len(recorded)}); run the targets of the record first"
+        )
+    return [name for name in recorded if name not in due]
+
+
+def _since(name: str, before: Mapping[str, Any]) -> dict[str, str]:
+    """Commit and date at which a file of the record before was recorded."""
+    earlier = before.get("kept", {}).get(name)
+    return earlier or {key: before.get(key, "unknown") for key in ("commit", "date")}
+
+
+def _said(path: Path) -> dict[str, str]:
+    """Commit and date in the columns of a table; ProductError without."""
+    columns = {"commit": str, "date": str}
+    row = read_table(path, usecols=list(columns), dtype=columns).iloc[0]
+    return {key: str(row[key]) for key in columns}
+
+
+def _require_history(name: str, found: Mapping[str, str]) -> None:
+    try:
+        git("merge-base", "--is-ancestor", found["commit"], "HEAD")
+    except subprocess.CalledProcessError:
+        raise ProductError(
+            f"{name}: of commit {found['commit']:.12}, which is not in the history;"
+            " make it anew, or remove it from the record"
+        ) from None
 
 
 def provenance(results: Path, config: Config) -> dict[str, Any]:
@@ -123,7 +230,7 @@ def provenance(results: Path, config: Config) -> dict[str, Any]:
     costs = _costs(results)
     canonical = json.dumps(config.model_dump(), sort_keys=True)
     return {
-        "commit": git_commit(),
+        "date": date.today().isoformat(),
         "config_sha256": hashlib.sha256(canonical.encode()).hexdigest(),
         "cpu": cpu_model(),
         "cores": os.cpu_count(),
@@ -137,8 +244,9 @@ def provenance(results: Path, config: Config) -> dict[str, Any]:
         "matrix_product_gflops": round(matrix_product_speed(), 1),
         "wall_s": round(_busy_seconds(results / "benchmarks"), 1),
         "on_request_s": {
-            target.name: round(_busy_seconds(target), 1)
-            for target in sorted((results / ON_REQUEST).glob("*/"))
+            name: round(_busy_seconds(results / ON_REQUEST / name), 1)
+            for name in TARGETS
+            if (results / ON_REQUEST / name).is_dir()
         },
         **_installation(),
         "results_mb": round(_size_mb(results), 1),

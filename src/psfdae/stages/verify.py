@@ -64,7 +64,7 @@ def set_aside(results: Path) -> list[tuple[Path, str]]:
     """
     found = list(damaged(results))
     for path, _ in found:
-        path.replace(path.with_name(path.name + ASIDE))
+        _set_aside(path)
     if reason := mlflow_view.damage(results):
         for path in mlflow_view.files(results):
             _set_aside(path)
@@ -74,8 +74,10 @@ def set_aside(results: Path) -> list[tuple[Path, str]]:
 
 def _set_aside(path: Path) -> None:
     aside = path.with_name(path.name + ASIDE)
-    if aside.is_dir():
+    if aside.is_dir() and not aside.is_symlink():
         shutil.rmtree(aside)
+    else:
+        aside.unlink(missing_ok=True)
     path.replace(aside)
 
 
@@ -100,22 +102,35 @@ def damaged(results: Path) -> Iterator[tuple[Path, str]]:
     for folder, folders, names in os.walk(results):
         here = Path(folder)
         # Another preset has results of its own.
-        folders[:] = sorted(
+        inner = sorted(
             name for name in folders if name not in SKIPPED and not (here / name / DIGESTS).is_dir()
         )
+        # One in the place of a product is looked at as such.
+        folders[:] = [name for name in inner if not _noted(here / name)]
+        products = {*names, *inner} - {*folders}
         sweep_stale(here, ".")
-        for path in (here / name for name in sorted(names) if not name.startswith(".")):
+        for path in (here / name for name in sorted(products) if not name.startswith(".")):
             if reason := _damage(path):
                 yield path, reason
 
 
+def _noted(path: Path) -> bool:
+    """Whether there is a digest of a product, in whatever state."""
+    digest = digest_path(path)
+    return digest is not None and os.path.lexists(digest)
+
+
 def _damage(path: Path) -> str:
     """What is wrong with a product; empty if nothing is known."""
-    digest = digest_path(path)
     check = CHECKS.get("".join(path.suffixes[-2:]), CHECKS.get(path.suffix))
+    if not (_noted(path) or check):
+        return ""
+    if path.exists() and not path.is_file():  # such as a pipe, which would be read for ever
+        return "a folder" if path.is_dir() else "no file"
     try:
-        if digest and digest.exists():
-            same = digest.read_bytes() == digest_line(path, path.name).encode()
+        if _noted(path):
+            digest = digest_path(path)
+            same = digest.is_file() and digest.read_bytes() == digest_line(path, path.name).encode()
             return "" if same else "not what was written (wrong checksum)"
         if check:
             check(path)

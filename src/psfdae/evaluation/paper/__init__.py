@@ -34,9 +34,11 @@ def paper_table(metrics: pd.DataFrame, dataset: str, metric: str) -> pd.DataFram
     -------
     DataFrame
         Columns source (paper or psfdae), reference, method, one per noise level.
-        The paper has no rows for datasets that it does not tabulate.
+        The paper has no rows for datasets that it does not tabulate. Our methods say in brackets
+        what they are given beside the image; of the paper's that is not known.
     """
-    labels = {kind.name: kind.paper[1] for kind in registered() if kind.paper}
+    kinds = {kind.name: kind for kind in registered() if kind.paper}
+    labels = {name: kind.paper[1] for name, kind in kinds.items()}
     ours = metrics[
         (metrics.dataset == dataset)
         & (metrics.metric == metric)
@@ -54,7 +56,8 @@ def paper_table(metrics: pd.DataFrame, dataset: str, metric: str) -> pd.DataFram
         index=["source", "reference", "order", "method"], columns="noise_level", values="value"
     )
     wide = wide.reset_index().drop(columns="order")
-    wide["method"] = wide["method"].map(labels)
+    given = wide["method"].map({name: kind.given() for name, kind in kinds.items()})
+    wide["method"] = wide["method"].map(labels) + given.where(wide["source"] == "psfdae", "")
     wide.columns = [f"{c:g}" if isinstance(c, float) else c for c in wide.columns]
     return wide
 
