@@ -201,6 +201,66 @@ def test_ninth_dataset_is_one_small_file(tmp_path, monkeypatch):
         compose.forget()
 
 
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A copy of the configuration that a test may change."""
+    import shutil
+
+    folder = tmp_path / "config"
+    shutil.copytree(config_dir(), folder)
+    monkeypatch.setenv("PSFDAE_CONFIG", str(folder))
+    compose.forget()
+    yield folder
+    compose.forget()
+
+
+OWN = (
+    "# @package _global_\ndefaults:\n  - {base}\n  - _self_\nseed: {seed}\n"
+    "dataset:\n  name: {name}\nnoise:\n  levels: [{seed}.0e-4, 2e-3]\n"
+)
+
+
+def test_datasets_that_differ_in_their_values_are_composed_once(folder, monkeypatch):
+    calls = []
+    by_hydra = compose._by_hydra
+    monkeypatch.setattr(compose, "_by_hydra", lambda *a: calls.append(a) or by_hydra(*a))
+    for seed in range(1, 21):
+        text = OWN.format(base=f"dataset{3 + seed % 2}", seed=seed, name=f"own{seed}")
+        (folder / f"dataset/own{seed}.yaml").write_text(text)
+    for seed in range(1, 21):
+        config = load([f"dataset=own{seed}", "preset=fast"])
+        assert (config.seed, config.dataset.name) == (seed, f"own{seed}")
+        assert config.noise.levels == [float(f"{seed}e-4"), 2e-3]
+    assert len(calls) == 2  # as many as there are datasets to start from
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "seed: 1\ndataset:\n  name: own\n",
+        "seed: 1\ndataset:\n  name: own_${noise.name}\n",
+        "seed: 1\ndataset:\n  name: own\nstars:\n  name: ${dataset.name}\n",
+        "seed: 1\ndataset:\n  name: own\nstars:\n  name: of_${dataset.name}\n",
+        "seed: 1\ndataset:\n  name: ${oc.env:HOME}\n",
+        "seed: ~\nparts: {}\ntrain: 3\n",
+        "noise:\n  levels: [1e-3, 4e-3]\n  name: ''\n",
+    ],
+)
+def test_a_composition_by_outline_is_hydra_s_own(folder, text):
+    defaults = "defaults:\n  - dataset3\n  - override /train: onecycle\n  - _self_\n"
+    (folder / "dataset/own.yaml").write_text(f"# @package _global_\n{defaults}{text}")
+    words = ("dataset=own", "preset=smoke", "seed=5", "~parts.test_stars")
+    found = compose.compose(words)
+    own = compose._by_hydra(words, "config")
+    assert (found, list(found)) == (own, list(own))
+
+
+def test_every_dataset_s_outline_composes_as_its_file():
+    for name in ("dataset1", "dataset8", "field", "from_stars"):
+        words = (f"dataset={name}", "preset=fast")
+        assert compose.compose(words) == compose._by_hydra(words, "config")
+
+
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory):
     """A folder into which the wheel of this source tree has been installed."""

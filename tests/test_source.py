@@ -11,7 +11,7 @@ from textwrap import dedent
 import pytest
 
 from psfdae.estimators import registered
-from psfdae.source import ROOT, Code, Reader
+from psfdae.source import ROOT, Code, Reader, source_hash
 
 REPOSITORY = ROOT.parents[1]
 OPTIONS = {
@@ -436,3 +436,11 @@ def test_no_module_is_chosen_unseen():
                 known = [code.definition(key) for key in reader.references]
                 groups = [part.options for d in known for part in (d, *d.entries)]
                 assert reader.options or any(groups) or name in EXEMPT, ast.unparse(node)
+
+
+def test_the_same_question_is_answered_once(monkeypatch):
+    asked = []
+    monkeypatch.setattr(Code, "hash", lambda self, *words: asked.append(words) or "hash")
+    words = {"chosen": ["psfdae.estimators.gmm", "nobody_else"]}
+    assert {source_hash("evaluate", **words) for _ in range(20)} == {"hash"}
+    assert len(asked) == 1

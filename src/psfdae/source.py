@@ -56,6 +56,11 @@ def source_hash(*functions: str, chosen: Iterable[str] = ()) -> str:
     ValueError
         If something named does not exist, or is chosen but not reached.
     """
+    return _source_hash(functions, tuple(chosen))
+
+
+@cache
+def _source_hash(functions: tuple[str, ...], chosen: tuple[str, ...]) -> str:
     collecting = gc.isenabled()
     gc.disable()  # Looking for cycles among syntax trees doubles the time.
     try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from functools import cache
 from pathlib import Path
 from typing import Annotated
 
@@ -56,10 +57,15 @@ def config_dir() -> Path:
     `PSFDAE_CONFIG` names another one; otherwise it is the copy that an installed
     package has, or `config/` of the source tree.
     """
+    return _folder(os.environ.get("PSFDAE_CONFIG", ""))
+
+
+@cache  # Looking for it takes longer than all else in most calls.
+def _folder(named: str) -> Path:
     package = Path(__file__).resolve().parents[1]
     places = (package / "config", package.parents[1] / "config")
     folder = next((place for place in places if place.is_dir()), places[-1])
-    folder = Path(os.environ.get("PSFDAE_CONFIG") or folder)
+    folder = Path(named or folder)
     if not (folder / "config.yaml").is_file():
         raise ConfigError(f"{folder}: no config.yaml (set PSFDAE_CONFIG to the config folder)")
     return folder.resolve()

@@ -6,6 +6,7 @@ import hashlib
 import json
 import re
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -16,6 +17,7 @@ from pydantic import ValidationError, create_model
 from psfdae.configuration.alignment import AlignmentConfig
 from psfdae.configuration.base import NEUTRAL, ConfigError, config_dir
 from psfdae.configuration.consistency import Consistent, stage_model, with_derived
+from psfdae.configuration.outline import filled, outline_of
 from psfdae.configuration.schema import Group, whole_config
 from psfdae.estimators import all_groups, methods_in
 from psfdae.files import ProductError, write_text
@@ -50,6 +52,7 @@ def compose(overrides: Sequence[str] = (), root: Root = "config") -> dict[str, A
 def forget() -> None:
     """Compose everything anew, for example after a change of the config folder."""
     _composed.cache_clear()
+    _kept.cache_clear()
     methods_in.cache_clear()
 
 
@@ -68,26 +71,45 @@ KEPT: list[Path] = []
 
 @cache
 def _composed(overrides: tuple[str, ...], root: Root) -> dict[str, Any]:
-    name = _made_of(overrides, root) if KEPT else ""
-    if not name:
-        return _by_hydra(overrides, root)
+    chosen = [word for word in overrides if re.fullmatch(r"dataset=\w+", word)]
+    if root == "config" and len(chosen) == 1:
+        found = outline_of(config_dir() / f"dataset/{chosen[0].removeprefix('dataset=')}.yaml")
+        if found:
+            words = tuple(f"dataset={OUTLINE}" if word in chosen else word for word in overrides)
+            with suppress(ConfigError, KeyError):  # composed as it is, it says what is wrong
+                return dict(filled(_kept(words, root, json.dumps(found[0])), found[1]))
+    return _kept(overrides, root)
+
+
+OUTLINE = "_outline"
+"""Option of the group dataset that stands for all files of one outline."""
+
+
+@cache
+def _kept(overrides: tuple[str, ...], root: Root, outline: str = "") -> dict[str, Any]:
+    """A composition from the folder where they are kept, or by Hydra, then kept there."""
+    name = _made_of(overrides, root, outline) if KEPT or outline else ""
+    if outline and not name:
+        raise ConfigError("a resolver may look at values that an outline does not have")
+    if not (name and KEPT):
+        return _by_hydra(overrides, root, outline)
     path = Path(KEPT[-1], name)
     digest, _, text = path.read_bytes().partition(b"\n") if path.is_file() else (b"", b"", b"")
     if digest.decode("latin1") == hashlib.sha256(text).hexdigest():
         kept: dict[str, Any] = json.loads(text)
         return kept
-    tree = _by_hydra(overrides, root)
+    tree = _by_hydra(overrides, root, outline)
     written = json.dumps(tree)
     # Somebody may have edited the configuration meanwhile.
-    if json.loads(written) == tree and _made_of(overrides, root) == name:
+    if json.loads(written) == tree and _made_of(overrides, root, outline) == name:
         write_text(path, f"{hashlib.sha256(written.encode()).hexdigest()}\n{written}")
     return tree
 
 
-def _made_of(overrides: tuple[str, ...], root: Root) -> str:
+def _made_of(overrides: tuple[str, ...], root: Root, outline: str) -> str:
     """Hash of all that a composition is made of, "" if a resolver may add more."""
     folder = config_dir()
-    words = (overrides, root, all_groups(), version("hydra-core"), version("omegaconf"))
+    words = (overrides, root, outline, all_groups(), version("hydra-core"), version("omegaconf"))
     parts = [repr(words).encode(), Path(__file__).read_bytes()]
     for path in sorted(folder.rglob("*.yaml")):
         parts += [str(path.relative_to(folder)).encode(), path.read_bytes()]
@@ -95,13 +117,16 @@ def _made_of(overrides: tuple[str, ...], root: Root) -> str:
     return "" if resolves else hashlib.sha256(b"\0".join(parts)).hexdigest()
 
 
-def _by_hydra(overrides: tuple[str, ...], root: Root) -> dict[str, Any]:
+def _by_hydra(overrides: tuple[str, ...], root: Root, outline: str = "") -> dict[str, Any]:
     import hydra
+    from hydra.core.config_store import ConfigStore
     from hydra.core.global_hydra import GlobalHydra
     from omegaconf import OmegaConf
 
     folder = config_dir()
     GlobalHydra.instance().clear()
+    if outline:
+        ConfigStore.instance().store(OUTLINE, json.loads(outline), "dataset", "_global_")
     try:
         with hydra.initialize_config_dir(str(folder), version_base="1.3"):
             tree = hydra.compose(_primary(root, folder), overrides=list(overrides))
@@ -276,10 +301,11 @@ def write_settings(
     checked = part(reads, stage_tree(reads, tree, root), root).model_dump()
     digest = hashlib.sha256(json.dumps(decisive(checked), sort_keys=True).encode()).hexdigest()
     path = folder / f"{stage.replace(' ', '-')}-{digest[:16]}.yaml"
-    text = yaml.safe_dump(checked, sort_keys=True, allow_unicode=True)
-    # Damaged ones are written again: a view, which needs no digest.
-    if not dry and not (path.is_file() and path.read_bytes() == text.encode()):
-        write_text(path, text)
+    if not dry:
+        text = yaml.safe_dump(checked, sort_keys=True, allow_unicode=True)
+        # Damaged ones are written again: a view, which needs no digest.
+        if not (path.is_file() and path.read_bytes() == text.encode()):
+            write_text(path, text)
     return path
 
 

@@ -1,0 +1,243 @@
+"""PSFs of faint copies by another package, learnt from the training stars of the same list.
+
+usage: peers.py PACKAGE SAMPLING ORDER IMAGE SELECTION FAINT.npz OUT.npz
+
+PACKAGE is piff, psfex or epsf; SAMPLING the samples' distance in pixels (1 or 0.5); ORDER that of
+the polynomial over the field (epsf has none). OUT has, of every copy and S/N, the PSF at the fitted
+centre (`fitted<S/N>`), its average over the posterior of the centre (`averaged<S/N>`) and the
+fitted flux. Flux, sky and centre are unknown to it; the noise, which weighs the centres, is given.
+"""
+
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from astropy.io import fits
+from astropy.table import Table
+from faint import SNR, around, brightest, padded
+from scipy.interpolate import make_interp_spline
+
+STEP, REACH = 0.25, 3  # px: of drawn centres, which go that far from the middle
+FIELD = 40  # px beyond the image
+
+
+def training(image, selection, half=10):
+    """Training stars: (x, y), brightest pixel, stamp without sky, noise."""
+    data, stars = padded(image, FIELD), Table.read(selection, format="ascii.csv")
+    for s in stars[stars["part"] == "training"]:
+        px, py = brightest(data, s["x"], s["y"], FIELD)
+        yield (s["x"], s["y"]), (px, py), *around(data, px, py, half, FIELD)
+
+
+def piff(image, selection, side, sampling, order):
+    """Piff's PixelGrid with a polynomial over the field, as wide as the stamps."""
+    import galsim
+    import piff
+
+    stars, half = [], side // 2 + 2
+    for (x, y), (px, py), stamp, sigma in training(image, selection, half):
+        frame = galsim.Image(stamp, xmin=int(px) - half + 1, ymin=int(py) - half + 1, scale=1.0)
+        # Photons as of two electrons a count, and one per cent of the star that no model fits.
+        variance = sigma**2 + 0.5 * stamp.clip(0) + (0.01 * stamp) ** 2
+        weight = galsim.Image(1 / variance, xmin=frame.xmin, ymin=frame.ymin, scale=1.0)
+        place = galsim.PositionD(float(x) + 1, float(y) + 1)
+        stars.append(piff.Star(piff.StarData(frame, place, weight=weight), None))
+    model = piff.PixelGrid(sampling, round(side / sampling) + 1)
+    outliers = [piff.ChisqOutliers(nsigma=6, max_remove=0.02)]
+    psf = piff.SimplePSF(model, piff.BasisPolynomial(order), outliers=outliers)
+    psf.fit(stars, {0: galsim.PixelScale(1.0)}, None)
+
+    def draw(x, y, dx, dy, width):
+        frame = galsim.Image(width, width, scale=1.0)
+        frame.setOrigin(int(x) + 1 - width // 2, int(y) + 1 - width // 2)
+        centre = (x + 1 + dx, y + 1 + dy)
+        return psf.draw(x=x + 1, y=y + 1, image=frame, center=centre, chipnum=0, flux=1.0).array
+
+    return draw
+
+
+def psfex(image, selection, side, sampling, order):
+    """PSFEx on source-extractor's catalogue of the image, cut to the training stars."""
+    import galsim
+    from galsim.des import DES_PSFEx
+    from scipy.spatial import cKDTree
+
+    wanted = np.array([place for place, *_ in training(image, selection)]) + 1.0
+    samples = 25 if sampling == 1 else 51
+    columns = "NUMBER X_IMAGE Y_IMAGE FLUX_RADIUS FLUX_APER(1) FLUXERR_APER(1) ELONGATION FLAGS"
+    with tempfile.TemporaryDirectory() as folder:
+        (Path(folder) / "sex.param").write_text(
+            f"{columns} SNR_WIN VIGNET(27,27)".replace(" ", "\n")
+        )
+        run = ["source-extractor", str(Path(image).resolve()), "-c", "/dev/null"]
+        run += [
+            "-CATALOG_NAME",
+            "all.cat",
+            "-CATALOG_TYPE",
+            "FITS_LDAC",
+            "-PARAMETERS_NAME",
+            "sex.param",
+        ]
+        run += [
+            "-FILTER",
+            "N",
+            "-DETECT_THRESH",
+            "5",
+            "-ANALYSIS_THRESH",
+            "5",
+            "-SATUR_LEVEL",
+            "4000",
+        ]
+        subprocess.run(run, cwd=folder, check=True, capture_output=True)
+        with fits.open(f"{folder}/all.cat") as file:
+            found = file[2].data
+            tree = cKDTree(np.stack([found["X_IMAGE"], found["Y_IMAGE"]], axis=1))
+            distance, row = tree.query(wanted)
+            file[2].data = found[np.unique(row[distance < 2.0])]
+            file[2].data["FLAGS"][:] = 0
+            print(f"psfex: {len(file[2].data)} of {len(wanted)} training stars")
+            file.writeto(f"{folder}/train.cat")
+        run = ["psfex", "train.cat", "-c", "/dev/null", "-PSF_SIZE", f"{samples},{samples}"]
+        run += ["-PSF_SAMPLING", f"{sampling}", "-PSFVAR_DEGREES", f"{order}"]
+        # All stars of the list.
+        run += ["-SAMPLE_AUTOSELECT", "N", "-SAMPLE_MAXELLIP", "1", "-SAMPLE_FWHMRANGE", "0.1,100"]
+        run += [
+            "-SAMPLE_MINSN",
+            "1",
+            "-CHECKPLOT_TYPE",
+            "NONE",
+            "-CHECKIMAGE_TYPE",
+            "NONE",
+            "-WRITE_XML",
+            "N",
+        ]
+        done = subprocess.run(run, cwd=folder, check=True, capture_output=True, text=True)
+        print(*[line for line in done.stderr.splitlines() if "train" in line][-1:])
+        model = DES_PSFEx("train.psf", dir=folder)
+
+    def draw(x, y, dx, dy, width):
+        frame = galsim.Image(width, width, scale=1.0)
+        profile = model.getPSF(galsim.PositionD(x + 1 + dx, y + 1 + dy))
+        # The true centre of an even image is half a pixel before its middle pixel.
+        offset = (dx + 0.5, dy + 0.5)
+        return profile.drawImage(image=frame, method="no_pixel", offset=offset).array
+
+    return draw
+
+
+def epsf(image, selection, side, sampling, order):
+    """photutils' EPSFBuilder, the same PSF all over the field."""
+    from photutils.psf import EPSFBuilder, EPSFStar, EPSFStars
+
+    stars = [
+        EPSFStar(stamp[3:-2, 3:-2], cutout_center=(x - px + 7, y - py + 7))
+        for (x, y), (px, py), stamp, _ in training(image, selection)
+    ]
+    builder = EPSFBuilder(oversampling=round(1 / sampling), progress_bar=False)
+    built = builder(EPSFStars(stars))
+    model = getattr(built, "epsf", None) or built[0]
+
+    def draw(x, y, dx, dy, width):
+        rows, columns = np.mgrid[:width, :width]
+        return model.evaluate(columns, rows, 1.0, width // 2 + dx, width // 2 + dy)
+
+    return draw
+
+
+class Centres:
+    """PSFs of sum 1 of a place at any centre, (dy, dx) from the middle: cubic splines."""
+
+    def __init__(self, draw, x, y, side):
+        wide, parts, cache = side + 2 * REACH, round(1 / STEP), {}
+        count = 2 * REACH * parts - parts + 1
+        self.offsets = (np.arange(count) - count // 2) * STEP
+        self.psfs = np.empty((count, count, side, side))
+        for i, dy in enumerate(self.offsets):
+            for j, dx in enumerate(self.offsets):
+                whole = np.floor([dy, dx]).astype(int)
+                part = (dy - whole[0], dx - whole[1])
+                if part not in cache:
+                    cache[part] = np.array(draw(x, y, part[1], part[0], wide), np.float64)
+                row, column = REACH - whole
+                self.psfs[i, j] = cache[part][row : row + side, column : column + side]
+        self.psfs /= self.psfs.sum(axis=(2, 3), keepdims=True)
+        self.free = self.psfs - self.psfs.mean(axis=(2, 3), keepdims=True)  # of the sky
+        self.norm = np.square(self.free).sum(axis=(2, 3))
+        self.spline = make_interp_spline(self.offsets, np.eye(count), k=3)
+
+    def between(self, centres, *tables):
+        """Values of tables over the offsets at centres (n, 2)."""
+        inside = np.clip(centres, self.offsets[0], self.offsets[-1])
+        rows, columns = self.spline(inside[:, 0]), self.spline(inside[:, 1])
+        return [((rows @ table) * columns).sum(axis=1) for table in tables]
+
+    def mean(self, centres, weight):
+        """Weighted mean of the PSFs at centres."""
+        rows, columns = self.spline(centres[:, 0]), self.spline(centres[:, 1])
+        return np.tensordot((rows * weight[:, None]).T @ columns / weight.sum(), self.psfs, 2)
+
+
+def lattice(centre, shape, count):
+    """Centres (count², 2) about one; `shape` (2, 2) takes ±1 to the edge."""
+    line = np.linspace(-1.0, 1.0, count)
+    return centre + np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2) @ shape.T
+
+
+def restored(centres, stamp, sigma):
+    """PSF at the fitted centre, its average over the posterior of the centre, and the flux."""
+    product = np.tensordot(centres.free, stamp.astype(np.float64), 2)
+
+    def gain(points):
+        """By how much χ² falls with the star, and the norm of its PSF; flux and sky are free."""
+        match, norm = centres.between(points, product, centres.norm)
+        return np.maximum(match, 0.0) ** 2 / (norm * sigma**2), norm, match / norm
+
+    points = lattice(np.zeros(2), np.eye(2) * 2.0, 17)
+    centre = points[gain(points)[0].argmax()]
+    for step in (0.25, 0.0625, 0.0156, 0.0039):
+        near = lattice(centre, np.eye(2) * step, 9)
+        centre = near[gain(near)[0].argmax()]
+    fitted = centres.mean(centre[None], np.ones(1))
+    # Four standard errors about it, of a parabola: then the posterior itself weighs.
+    at = centre + 0.05 * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, -1]])
+    peak, up, down, right, left, both, neither = gain(at)[0]
+    mixed = (both + neither - up - down - right - left + 2 * peak) / 2
+    bend = -np.array([[up + down - 2 * peak, mixed], [mixed, right + left - 2 * peak]]) / 0.05**2
+    value, axes = np.linalg.eigh(bend)  # of χ², twice the inverse variance
+    near = lattice(centre, axes * np.clip(4.0 / np.sqrt(value.clip(1e-9) / 2), 0.02, 2.0), 17)
+    near = near[np.abs(near).max(axis=1) <= centres.offsets[-1]]
+    found, norm, _ = gain(near)
+    weight = np.exp((found - found.max()) / 2) / np.sqrt(norm)
+    return fitted, centres.mean(near, weight), gain(centre[None])[2][0]
+
+
+def main(package, sampling, order, image, selection, faint, out):
+    known = np.load(faint)
+    side = known["truth"].shape[-1]
+    make = {"piff": piff, "psfex": psfex, "epsf": epsf}[package]
+    draw = make(image, selection, side, float(sampling), int(order))
+    found = {
+        f"{name}{snr}": np.empty(known["truth"].shape[: 1 if name == "flux" else 3])
+        for snr in SNR
+        for name in ("fitted", "averaged", "flux")
+    }
+    for star, (x, y) in enumerate(known["at"]):
+        centres = Centres(draw, x, y, side)
+        for snr in SNR:
+            for copy in np.flatnonzero(known["star"] == star):
+                stamp = known[f"noisy{snr}"][copy]
+                fitted, mean, flux = restored(centres, stamp, float(known[f"sigma{snr}"]))
+                found[f"fitted{snr}"][copy], found[f"averaged{snr}"][copy] = fitted, mean
+                found[f"flux{snr}"][copy] = flux
+    np.savez_compressed(out, **found)
+    for snr in SNR:
+        errors = [
+            np.square(found[f"{n}{snr}"] - known["truth"]).mean() for n in ("fitted", "averaged")
+        ]
+        print(package, sampling, order, snr, *(f"{error:.3e}" for error in errors))
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
