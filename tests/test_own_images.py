@@ -104,8 +104,8 @@ def test_signal_to_noise_is_that_of_each_star(sky):
     assert area == pytest.approx(np.median(sky.area), rel=0.05)
     five = (sky.snr > 4.8) & (sky.snr < 6.0)
     assert five.sum() > 10
-    # What is measured scatters by more than 1, and 4 is the limit.
-    assert ((sky.stars["flags"][five] & StarFlag.SNR_LOW) > 0).mean() < 0.4
+    # What is measured scatters by about 1, and 4 is the limit.
+    assert ((sky.stars["flags"][five] & StarFlag.SNR_LOW) > 0).mean() < 0.15
 
 
 def test_bright_stars_are_good_stars(sky):
@@ -122,7 +122,7 @@ def test_chi2_of_bright_stars_is_about_one(sky):
     for low, high in ((5, 10), (10, 100), (100, 3500)):
         some = unseen & (sky.snr > low) & (sky.snr < high)
         assert some.sum() >= 5
-        assert 0.65 < np.median(sky.stars["chi2"][some]) < 1.3, low
+        assert 0.8 < np.median(sky.stars["chi2"][some]) < 1.3, low
     page = sky.page.read_text(encoding="utf-8")
     assert re.search(r"median \d\.\d\d at S/N from 100 \(\d+ stars\)", page)
 
