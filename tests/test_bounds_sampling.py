@@ -181,7 +181,7 @@ def test_the_twin_of_a_mode_at_its_own_place_weighs_as_the_mode(model, noise):
             for f, o in zip(2 * number, middle, strict=True)
         ]
         assert at[first] < at[1 - first]
-        assert other.z[at] == pytest.approx(found.z, abs=0.02)
+        assert other.z[at] == pytest.approx(found.z, abs=0.1)
 
 
 def test_draws_have_the_density_of_students_t():
