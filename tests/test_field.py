@@ -477,6 +477,17 @@ def test_python_takes_positions_and_centres(image):
     assert blind.flags[0] & 8 and np.isnan(blind.psf).all() and np.isnan(blind.x_fit).all()
 
 
+def test_a_flux_below_its_error_is_none_and_below_three_times_it_is_faint(image):
+    some = Faint(300, 2.0)
+    stamps = some.stamps - np.linspace(0, 1500, 300)[:, None, None] * some.psf
+    found = load_model(image[1]).predict(stamps, position=some.position)
+    ratio = found.flux / found.flux_error
+    assert (ratio < 1).sum() > 20 and ((ratio > 1) & (ratio < 3)).sum() > 20
+    assert np.array_equal((found.flags & 8) > 0, ~(ratio > 1))
+    assert np.array_equal((found.flags & 4) > 0, (ratio > 1) & (ratio < 3))
+    assert np.isnan(found.psf[ratio < 1]).all() and np.isfinite(found.psf[ratio > 1]).all()
+
+
 def test_bad_pixels_are_left_out(image):
     model, some = load_model(image[1]), Faint(100, 50.0)
     spoilt = some.stamps.copy()
