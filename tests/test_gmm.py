@@ -166,7 +166,7 @@ def test_total_variance_is_that_of_the_stars_and_with_a_free_flux_of_no_less():
     plain, moved = ((a @ mixture.axes).astype(float).var(axis=0) for a in (flat, loose))
     assert mixture._total == pytest.approx(plain, rel=1e-3, abs=1e-3 * plain.max())
     assert (mixture.free_flux()._total > 0.9 * moved - 1e-3 * plain.max()).all()
-    assert moved.sum() > 1.05 * plain.sum()
+    assert (moved > 1.2 * plain).any()
 
 
 def test_one_cluster_is_linear_mmse():
