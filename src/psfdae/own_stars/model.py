@@ -357,10 +357,7 @@ class Engine:
                 if estimate is None
                 else estimate.strangeness[~lost]
             )
-            limit = np.interp(noise, bundle.noise_nodes, bundle.strange_limit)
-            if estimate is not None:
-                limit *= _concentrated(psf, found.noise, stars.gain)
-            unlike |= strangeness > limit
+            unlike |= strangeness > np.interp(noise, bundle.noise_nodes, bundle.strange_limit)
         raise_flag(flags, StarFlag.UNLIKE_TRAINING, unlike)
         photons = np.nan_to_num(np.maximum(found.flux, 0.0) / stars.gain)
         return Prediction(
@@ -533,18 +530,6 @@ class Engine:
         raise_flag(flags, StarFlag.SATURATED, saturated.any(axis=(1, 2)))
         raise_flag(flags, StarFlag.OFF_CENTRE, too_far)
         return stamps, bad | saturated, shift, flags
-
-
-def _concentrated(psf: np.ndarray, noise: np.ndarray, gain: np.ndarray) -> np.ndarray:
-    """Variance of noise where stars (n, d, d) are bright, over its mean in their stamps, (n,).
-
-    What measures stars takes their photon noise to be the same in all pixels.
-    """
-    light = np.maximum(psf, 0.0, dtype=np.float64) / gain[:, None, None]
-    where = np.square(psf, dtype=np.float64)
-    bright = (where * light).sum(axis=(1, 2)) / where.sum(axis=(1, 2))
-    found = (noise**2 + bright) / (noise**2 + light.mean(axis=(1, 2)))
-    return np.where(np.isfinite(found), np.maximum(found, 1.0), 1.0)
 
 
 def _chi2(
