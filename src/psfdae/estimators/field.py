@@ -830,8 +830,7 @@ def _residuals(
 
     They are those of the fit's good `stars`, which splines move there; `usual` (K,) are the mean
     terms of the field. A star counts by how much of its residual is no noise. What noise of sky
-    and star adds to the scatter is taken off. In units of this noise, of P pixels and n stars, a
-    mode of the variance ℓ is found with about ℓ + P/n (Paul 2007, Stat. Sinica 17, 1617).
+    and star adds to the scatter is taken off: in units of it, it is the same in all directions.
     """
     from scipy import ndimage
 
@@ -843,7 +842,6 @@ def _residuals(
     signal = np.median(np.maximum(np.square(inner).sum(axis=(1, 2)) - own, 0.0))
     weight = (signal + 1e-12) / (signal + 1e-12 + own)
     weight /= weight.sum()
-    noise_only = 1.0 + residual[0].size * float(np.square(weight).sum())
     sky, light = (OWN_NOISE * float(weight @ part) for part in (sky, light))
     phases, impulses = _phases(settings.step_px), np.eye(side)
 
@@ -865,7 +863,7 @@ def _residuals(
             noise = np.sqrt(sky + light * np.maximum(star, 0.0))
             scatter = np.sqrt(weight)[:, None] * (moved - mean) / noise
             _, size, axes = np.linalg.svd(scatter, full_matrices=False)
-            modes = np.sqrt(np.maximum(size**2 - noise_only, 0.0))[:, None] * axes * noise
+            modes = np.sqrt(np.maximum(size**2 - 1.0, 0.0))[:, None] * axes * noise
             variance = np.square(modes).sum(axis=0)
             modes = np.sqrt(1.0 - settings.diagonal) * modes[: settings.modes]
             diagonal = variance - np.square(modes).sum(axis=0)
