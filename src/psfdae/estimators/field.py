@@ -294,7 +294,7 @@ class FieldMixture(Method):
         fit = fit_field(stars, field.orders, side, field.spacing_px, field.smoothness)
         used = stars.of(fit.good)
         terms = fit.model.terms(used.position)
-        offset, modes, diagonal = _residuals(fit, used, terms.mean(axis=0), field)
+        offset, modes, diagonal = _residuals(fit, used.noise / fit.flux[fit.good], field)
         return cls(
             coefficients=fit.model.coefficients.astype(np.float32),
             low=fit.model.low,
@@ -824,25 +824,23 @@ def _window(side: int, whole: np.ndarray) -> np.ndarray:
 
 
 def _residuals(
-    fit: FieldFit, stars: Frames, usual: np.ndarray, settings: FieldSettings
+    fit: FieldFit, noise: np.ndarray, settings: FieldSettings
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Mean, modes and remaining variance of the residuals in every phase of a pixel.
 
-    They are those of the fit's good `stars`, which splines move there; `usual` (K,) are the mean
-    terms of the field. A star counts by how much of its residual is no noise. What noise of sky
-    and star adds to the scatter is taken off: in units of it, it is the same in all directions.
+    Splines move them there. A star counts by how much of its residual is no `noise` (n,),
+    which is the RMS of a pixel of flux 1, and what noise adds to their scatter is taken off.
     """
     from scipy import ndimage
 
-    residual, centre, flux = fit.residual[fit.good], fit.centre[fit.good], fit.flux[fit.good]
+    residual, centre = fit.residual[fit.good], fit.centre[fit.good]
     side = residual.shape[-1]
     inner = residual[:, 1:-1, 1:-1]
-    sky, light = np.square(stars.noise / flux), 1.0 / (stars.photons * flux)
-    own = sky * inner[0].size + light
+    own = noise**2 * inner[0].size
     signal = np.median(np.maximum(np.square(inner).sum(axis=(1, 2)) - own, 0.0))
     weight = (signal + 1e-12) / (signal + 1e-12 + own)
     weight /= weight.sum()
-    sky, light = (OWN_NOISE * float(weight @ part) for part in (sky, light))
+    left = OWN_NOISE * float(weight @ noise**2)
     phases, impulses = _phases(settings.step_px), np.eye(side)
 
     def along(axis: int) -> np.ndarray:
@@ -854,16 +852,14 @@ def _residuals(
 
     rows, columns = along(0), along(1).transpose(0, 1, 3, 2)
     found = []
-    for row, down in zip(rows, phases, strict=True):
+    for row in rows:
         half = row @ residual
-        for column, right in zip(columns, phases, strict=True):
+        for column in columns:
             moved = (half @ column).reshape(len(residual), -1)
             mean = weight @ moved
-            star = fit.model.images(usual[None], np.array([[down, right]]), side).ravel()
-            noise = np.sqrt(sky + light * np.maximum(star, 0.0))
-            scatter = np.sqrt(weight)[:, None] * (moved - mean) / noise
+            scatter = np.sqrt(weight)[:, None] * (moved - mean)
             _, size, axes = np.linalg.svd(scatter, full_matrices=False)
-            modes = np.sqrt(np.maximum(size**2 - 1.0, 0.0))[:, None] * axes * noise
+            modes = np.sqrt(np.maximum(size**2 - left, 0.0))[:, None] * axes
             variance = np.square(modes).sum(axis=0)
             modes = np.sqrt(1.0 - settings.diagonal) * modes[: settings.modes]
             diagonal = variance - np.square(modes).sum(axis=0)
