@@ -524,7 +524,7 @@ def unlikely(path, judged):
                 return "numbers are not finite, or not positive"
             if (numbers[2] >= 10).any():
                 return f"chi2 of {numbers[2].max():.3g}"
-    judged.update({"files": 1, "stars" if len(numbers) else "psfs": len(psf)})
+    judged.update({"files": 1, "stars" if numbers else "psfs": len(psf)})
     if not (np.isfinite(psf).all() and np.isfinite(flux).all() and (flux > 0).all()):
         return "not finite, or no flux"
     if not len(psf):
@@ -536,6 +536,18 @@ def unlikely(path, judged):
     if np.abs(peak - psf.shape[-1] // 2).max() > reach:
         return "peak is not in the middle"
     return None
+
+
+def seen(folder, judged):
+    """What is wrong with files that a command has left, and with what its models make, or None."""
+    wrong = None
+    for model in folder.glob("out/*.psf.safetensors"):
+        use = ["--model", str(model), "--out", str(folder / "out.fits"), "--threads", "1"]
+        again = ["predict", "own.fits", "--catalogue", "own.csv", *use]
+        wrong = wrong or attempt(again, folder / "log")[0]
+    for file in folder.glob("out*.fits"):
+        wrong = wrong or unlikely(file, judged)
+    return wrong
 
 
 # Running.
@@ -638,15 +650,12 @@ def hostile(count, seed, kept, own=False):
             wrong, code, seconds = attempt(words, folder / "log")
             slowest = max(slowest, seconds)
             if own:
-                for model in folder.glob("out/*.psf.safetensors") if not wrong else ():
-                    use = ["--model", str(model), "--out", str(out), "--threads", "1"]
-                    again = ["predict", "own.fits", "--catalogue", "own.csv", *use]
-                    wrong = attempt(again, folder / "log")[0]
-                for file in folder.glob("out*.fits"):
-                    wrong = wrong or unlikely(file, judged)
+                wrong = wrong or seen(folder, judged)
             elif wrong is None and (code == 0) != out.exists() and words[0] == "predict":
                 wrong = "out.fits beside an error" if code else "no out.fits"
             tally[f"{kind} {code}"] += 1
+            if number % 50 == 49:
+                print(number + 1, dict(tally), dict(judged), file=sys.stderr, flush=True)
             if wrong:
                 shutil.copy(path, kept / f"{number}_{source}")
                 text = (folder / "log").read_text(errors="replace")[-400:]
