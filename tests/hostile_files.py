@@ -11,6 +11,7 @@ that break it are kept in FOLDER.
 
 takes inputs of `from-stars`, mosaics, lists, `psf` and field models, and looks at what comes out,
 too: a star or PSF without a flag is finite, positive, in the middle, has its flux, and χ² < 10.
+Of what it has looked at it counts the files, and the stars and PSFs without a flag (`judged`).
 """
 
 from __future__ import annotations
@@ -222,8 +223,9 @@ def cells(raw, rng):
     return "\n".join(lines).encode("utf-8", "surrogatepass")
 
 
-def tensors(raw, rng, sign):
+def tensors(raw, rng, sign, changed=None):
     """A safetensors file with another description or other arrays, signed anew."""
+    changed = changed or another
     from safetensors.numpy import load, save
 
     size = struct.unpack("<Q", raw[:8])[0]
@@ -234,7 +236,7 @@ def tensors(raw, rng, sign):
         text["info"], arrays = another_size(text["info"], arrays, rng)
         changes = rng.choice([0, 0, 1])
     for _ in range(changes):
-        if rng.random() < 0.5:
+        if changed is another and rng.random() < 0.5:
             node = text.get("info", text)
             while True:
                 name = rng.choice(list(node))
@@ -289,7 +291,24 @@ def another_size(info, arrays, rng):
     return info | sizes | {"dae": {"kernels": kernels, "widths": widths}}, made | variance | same
 
 
-def changed(array, rng):
+def nudged(array, rng):
+    """Nearly the same array: what a fit might have left."""
+    numbers = np.random.default_rng(rng.randrange(10**6))
+    size = rng.choice([1e-6, 1e-4, 1e-3, 1e-2, 0.1])
+    what = rng.randrange(4)
+    if what == 0:
+        found = array * (1 + size)
+    elif what == 1:
+        found = array * (1 + size * numbers.standard_normal(array.shape))
+    elif what == 2:
+        found = array + size * np.abs(array).max(initial=0) * numbers.standard_normal(array.shape)
+    else:
+        found = array.copy()
+        found.reshape(-1)[rng.randrange(max(array.size, 1)) :][:1] *= 1 + 10 * size
+    return np.asarray(found, array.dtype)
+
+
+def another(array, rng):
     """Another array."""
     what = rng.randrange(8)
     if what == 0:
@@ -327,6 +346,8 @@ def sign_weights(text, arrays):
 
 def mutated(raw, name, kind, rng):
     """The file's bytes, changed."""
+    if kind == "nudged":
+        return tensors(raw, rng, sign_bundle, nudged)
     if kind in ("bundle", "weights"):
         if rng.random() < 0.3:
             return any_bytes(raw, rng)
@@ -370,52 +391,62 @@ def command(kind, path, out, rng):
 # Own stars: models of an image, and what they make of it.
 
 OWN = ["preset=smoke", "parts.train_stars=60", "parts.test_stars=20", "framing.stamp_px=10"]
-OWN += ["methods=[noisy,field]", "field.orders=[1]", "--method", "field"]
+OWN += ["methods=[noisy,field]", "--method", "field"]
+OWN += ["field.orders=[1]", "field.step_px=0.5", "field.modes=10"]  # a fourth of the work each
+
+FEW = {"LEAST_STARS": 60, "FEW_STARS": 40, "NODES": 4}
+"""Of `psfdae.own_stars.packing`: a model that is trained in a second says little of its errors."""
 
 
 def write_own(folder):
-    """An image with its lists, of two chips, and a model of it."""
+    """An image with its lists and maps, of two chips, and a model of it."""
+    import multiprocessing
+    from concurrent.futures import ProcessPoolExecutor
+
     from astropy.io import fits
     from astropy.table import Table
 
     from command_line import psfdae
+    from psfdae.own_stars import packing
     from psfdae.stages import mosaic, simulate
 
-    small = {"side_px": 420, "bright": 45, "faint": 10, "blended": 2, "saturated": 1}
+    for name, value in FEW.items():
+        setattr(packing, name, value)
+    small = {"side_px": 320, "bright": 34, "faint": 8, "blended": 1, "saturated": 1}
     simulate.write_example(folder / "own.fits", folder / "own.csv", seed=5, **small)
     table = Table.read(folder / "own.csv")
     table["X_IMAGE", "Y_IMAGE"].write(folder / "own_list.fits")
+    table["ra", "dec"].write(folder / "own_sky.csv")
     data, header = fits.getdata(folder / "own.fits", header=True)
     chips = [fits.ImageHDU(data, header, name=f"CHIP{n}") for n in (1, 2)]
     fits.HDUList([fits.PrimaryHDU(), *chips]).writeto(folder / "mosaic.fits")
+    holes = np.ones(data.shape, np.float32)
+    holes[100:140, 60:200] = holes[:, 17] = 0.0
+    for name, values in (("holes", holes), ("zeros", 0 * holes), ("sigma2", 400 * holes + 1)):
+        fits.writeto(folder / f"{name}.fits", values, overwrite=True)
     words = ["from-stars", "own.fits", "--catalogue", "own.csv", "--out", "model", *OWN]
     done = psfdae(*words)
     assert done.exit_code == 0, done.output
     (folder / "model" / "own.psf.safetensors").rename(folder / "own.psf.safetensors")
     shutil.rmtree(folder / "model")
-    mosaic._pool = lambda processes: AtOnce()  # a process of its own would take seconds
-
-
-class AtOnce(contextlib.nullcontext):
-    """An executor that does what it is given, here."""
-
-    def __enter__(self):
-        return self
-
-    def submit(self, work, *args):
-        from concurrent.futures import Future
-
-        done = Future()
-        done.set_result(work(*args))
-        return done
+    # Workers that have imported everything, as their parent has: others would take seconds.
+    forked = multiprocessing.get_context("fork")
+    mosaic._pool = lambda processes: ProcessPoolExecutor(processes, forked)
+    rng = random.Random(0)
+    for kind in OWN_GOOD:
+        psfdae(*own_command(kind, folder / OWN_GOOD[kind][0], folder / "warm.fits", rng))
+    for left in folder.glob("warm*"):
+        shutil.rmtree(left) if left.is_dir() else left.unlink()
 
 
 OWN_GOOD = {
     "image": ["own.fits"],
-    "catalogue": ["own.csv", "own_list.fits"],
+    "catalogue": ["own.csv", "own_list.fits", "own_sky.csv"],
     "mosaic": ["mosaic.fits"],
     "bundle": ["own.psf.safetensors"],
+    "nudged": ["own.psf.safetensors"],
     "psf": ["own.psf.safetensors"],
+    "map": ["holes.fits", "sigma2.fits"],
     "stars": ["own.fits", "own.csv"],
 }
 
@@ -424,34 +455,61 @@ def own_command(kind, path, out, rng):
     """What a user types."""
     use = ["--model", "own.psf.safetensors", "--out", str(out), "--threads", "1", "--quiet"]
     lists = rng.choice([["--catalogue", "own.csv"], ["--detect"]])
-    more = rng.choice([[], [], ["--gain", "1e12"], ["--saturate", "3e4"], ["--weight", "0"]])
+    more = rng.choice(
+        [
+            *([], [], ["--gain", "1e12"], ["--saturate", "3e4"], ["--weight", "0"]),
+            *(["--weight", "holes.fits"], ["--weight", "zeros.fits"], ["--mask", "holes.fits"]),
+            *(["--variance", "sigma2.fits"], ["--mask", "zeros.fits", "--bad-bits", "4"]),
+        ]
+    )
+    place = rng.choice(["--grid=3x2", "--at=200,100.4", "--at=1e300,-5", "--grid=15x9"])
+    step = rng.choice([[], ["--oversampling", "1"], ["--oversampling", "7"]])
     if kind == "image":
         return ["predict", str(path), *lists, *more, *use]
+    if kind == "map":
+        option = rng.choice(["--weight", "--variance", "--mask"])
+        return ["predict", "own.fits", *lists, option, str(path), *use]
     if kind == "catalogue":
         fixed = rng.choice([[], ["--fixed-positions"]])
         return ["predict", "own.fits", "--catalogue", str(path), *fixed, *use]
     if kind == "mosaic":
-        return ["predict", str(path), "--all-extensions", "--detect", *use]
-    if kind == "bundle":
-        return ["predict", "own.fits", *lists, "--model", str(path), *use[2:]]
-    if kind == "psf":
-        place = rng.choice(["--grid=3x2", "--at=200,100.4", "--at=1e300,-5", "--grid=15x9"])
-        step = rng.choice([[], ["--oversampling", "1"], ["--oversampling", "7"]])
+        lists = rng.choice([["--catalogue", "own_sky.csv"], ["--detect"]])
+        if rng.random() < 0.1:
+            return [
+                "from-stars",
+                str(path),
+                "--all-extensions",
+                *lists,
+                *_trained(out, rng.random() < 0.2),
+            ]
+        return ["predict", str(path), "--all-extensions", *lists, *use]
+    if kind == "psf" or (kind == "nudged" and rng.random() < 0.5):
         return ["psf", str(path), place, *step, "--out", str(out)]
-    image, listed = ("own.fits", path) if path.suffix == ".csv" else (path, "own.csv")
-    words = ["--catalogue", str(listed)] if path.suffix == ".csv" else lists
-    return ["from-stars", str(image), *words, *more, "--out", str(out.with_suffix("")), *OWN]
+    if kind in ("bundle", "nudged"):
+        return ["predict", "own.fits", *lists, "--model", str(path), *use[2:]]
+    words = ["--catalogue", str(path)] if path.suffix == ".csv" else lists
+    image = "own.fits" if path.suffix == ".csv" else path
+    return ["from-stars", str(image), *words, *more, *_trained(out, rng.random() < 0.2)]
 
 
-def unlikely(path):
-    """What is wrong with stars or PSFs that a file shows without a flag, or None."""
+def _trained(out, page):
+    """What `from-stars` is told."""
+    more = ["--report", str(out.with_suffix(".html"))] if page else []
+    return ["--out", str(out.with_suffix("")), *more, *OWN]
+
+
+def unlikely(path, judged):
+    """What is wrong with stars or PSFs that a file shows without a flag, or None.
+
+    These are counted.
+    """
     from astropy.io import fits
 
     with fits.open(path) as hdus:
         if len(hdus) == 1:
             psf, step = hdus[0].data.astype(float), int(hdus[0].header["OVERSAMP"])
             side = psf.shape[-1] - (step > 1)
-            flux, reach = np.ones(len(psf)), 2 * step
+            flux, reach, numbers = np.ones(len(psf)), 2 * step, []
             inside = psf[:, :side:step, :side:step]
         else:
             stars = hdus["STARS"].data
@@ -466,6 +524,7 @@ def unlikely(path):
                 return "numbers are not finite, or not positive"
             if (numbers[2] >= 10).any():
                 return f"chi2 of {numbers[2].max():.3g}"
+    judged.update({"files": 1, "stars" if numbers else "psfs": len(psf)})
     if not (np.isfinite(psf).all() and np.isfinite(flux).all() and (flux > 0).all()):
         return "not finite, or no flux"
     if not len(psf):
@@ -477,6 +536,18 @@ def unlikely(path):
     if np.abs(peak - psf.shape[-1] // 2).max() > reach:
         return "peak is not in the middle"
     return None
+
+
+def seen(folder, judged):
+    """What is wrong with files that a command has left, and with what its models make, or None."""
+    wrong = None
+    for model in folder.glob("out/*.psf.safetensors"):
+        use = ["--model", str(model), "--out", str(folder / "out.fits"), "--threads", "1"]
+        again = ["predict", "own.fits", "--catalogue", "own.csv", *use]
+        wrong = wrong or attempt(again, folder / "log")[0]
+    for file in folder.glob("out*.fits"):
+        wrong = wrong or unlikely(file, judged)
+    return wrong
 
 
 # Running.
@@ -526,7 +597,7 @@ def attempt(words, log):
         os.dup2(file, 2)
         run(words)
     while (done := os.wait4(child, os.WNOHANG))[0] == 0:
-        time.sleep(0.002)
+        time.sleep(0.005)
         if time.monotonic() - start > 60 * SECONDS:  # hangs without working
             os.kill(child, 9)
     seconds = done[2].ru_utime + done[2].ru_stime
@@ -555,14 +626,11 @@ def verdict(code, text):
 def hostile(count, seed, kept, own=False):
     """Try so many inputs; a summary as a dict."""
     good, typed = (OWN_GOOD, own_command) if own else (GOOD, command)
-    kinds = (
-        [*good, "catalogue", "bundle", "psf"]
-        if own
-        else ["cube", "image", "catalogue", "bundle", "bundle", "weights"]
-    )
+    kinds = ["cube", "image", "catalogue", "bundle", "bundle", "weights"]
+    kinds = [*good, "catalogue", "nudged", "psf"] if own else kinds
     kept = Path(kept)
     kept.mkdir(parents=True, exist_ok=True)
-    tally, broken, slowest = Counter(), [], 0.0
+    tally, judged, broken, slowest = Counter(), Counter(), [], 0.0
     with tempfile.TemporaryDirectory() as name:
         os.chdir(name)
         folder = Path(name)
@@ -582,11 +650,12 @@ def hostile(count, seed, kept, own=False):
             wrong, code, seconds = attempt(words, folder / "log")
             slowest = max(slowest, seconds)
             if own:
-                for file in folder.glob("out*.fits"):
-                    wrong = wrong or (None if kind == "mosaic" and code else unlikely(file))
+                wrong = wrong or seen(folder, judged)
             elif wrong is None and (code == 0) != out.exists() and words[0] == "predict":
                 wrong = "out.fits beside an error" if code else "no out.fits"
             tally[f"{kind} {code}"] += 1
+            if number % 50 == 49:
+                print(number + 1, dict(tally), dict(judged), file=sys.stderr, flush=True)
             if wrong:
                 shutil.copy(path, kept / f"{number}_{source}")
                 text = (folder / "log").read_text(errors="replace")[-400:]
@@ -604,6 +673,7 @@ def hostile(count, seed, kept, own=False):
     return {
         "inputs": count,
         "ends": dict(sorted(tally.items())),
+        "judged": judged,
         "slowest_s": slowest,
         "broken": broken,
     }

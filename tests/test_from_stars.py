@@ -33,7 +33,13 @@ from psfdae.own_stars.example import (
 )
 from psfdae.own_stars.photometry import noise_equivalent_px
 from psfdae.own_stars.report import MEAN_PSF
-from psfdae.own_stars.selection import brightest_pixels, collect, moved, star_centres
+from psfdae.own_stars.selection import (
+    BrightStars,
+    brightest_pixels,
+    collect,
+    moved,
+    star_centres,
+)
 from psfdae.own_stars.stamps import cut
 from psfdae.own_stars.training_images import OwnNoise, make_images, star_grid, training_columns
 from psfdae.rng import stream
@@ -43,6 +49,7 @@ from psfdae.stages.common import noise_model, split_stars
 from psfdae.stages.evaluate import READS
 from psfdae.stages.from_stars import Source, _alone, from_stars
 from psfdae.stars.fields import held_out_fields
+from psfdae.stars.noise import NoiseModel
 
 SIDE = {"side_px": 700, "bright": 60, "faint": 80, "blended": 6, "saturated": 3}
 TINY = ["preset=smoke", "parts.train_stars=120", "parts.test_stars=30", "train.epochs=1"]
@@ -356,6 +363,16 @@ def test_a_killed_command_ends_well_if_typed_again(field, model, tmp_path, monke
     assert done.exit_code == 0, done.output
     assert made.read_bytes() == kept.read_bytes() and page.exists()
     assert not list(out.glob(".*"))
+
+
+@pytest.mark.parametrize("gain", [1e-9, 1.6, 1e12, 1e300])
+def test_the_sky_of_any_gain_can_be_drawn(gain):
+    """A header may say GAIN = 1e12: nothing draws 1e26 photons."""
+    stars = BrightStars(*[np.ones(30)] * 9)
+    noise = NoiseModel(1.0, stars.sky_photons(gain, 1e4))
+    psf = np.full((20, 16, 16), 1 / 256)
+    left = noise.draw(psf, 0.05, stream(1, "gain")) - psf
+    assert left.std() == pytest.approx(np.sqrt(noise.variance(psf, 0.05).mean()), rel=0.05)
 
 
 def test_one_process_at_a_time_works_in_a_folder(field, tmp_path):
