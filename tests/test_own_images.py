@@ -121,7 +121,9 @@ def test_bright_stars_are_good_stars(sky):
     assert np.median(sky.stars["noise"][sky.snr > 1000]) == pytest.approx(NOISE, rel=0.05)
 
 
-@pytest.mark.xfail(reason="0.75 for 20 stars: photon noise of bright stars is in the covariance")
+@pytest.mark.xfail(
+    strict=True, reason="0.75 for 20 stars: photon noise of bright stars is in the covariance"
+)
 def test_chi2_of_bright_stars_is_about_one(sky):
     """Of those that were not learnt from; the page looks at these, at every S/N."""
     unseen = (sky.selection.part != "training").to_numpy() & (sky.stars["flags"] == 0)

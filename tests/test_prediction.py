@@ -35,10 +35,10 @@ def same(a, b, rows=slice(None)):
 def close(a, b, rows=slice(None), rel=1e-3):
     """The same but for rounding, of which the angle of a round PSF has most.
 
-    A residual is what little is left of hundreds of counts in single precision: to 1e-4 of the
+    A residual is what little is left of hundreds of counts in single precision: to 2e-5 of the
     sky's RMS.
     """
-    least = {"position_angle_deg": 50 * rel, "residual": 1e-4 * SKY**0.5}
+    least = {"position_angle_deg": 50 * rel, "residual": 2e-5 * SKY**0.5}
     for name in COLUMNS:
         of = {"rel": rel, "abs": least.get(name, 1e-3)}
         wanted = pytest.approx(getattr(b, name)[rows], nan_ok=True, **of)

@@ -313,7 +313,7 @@ class FieldMixture(Method):
     def restored(
         cls, arrays: Mapping[str, np.ndarray], config: Mapping[str, Any], reference: str
     ) -> Self:
-        """As of all methods; noise and settings are those of the configuration.
+        """Estimator of a bundle; noise and settings are those of the configuration.
 
         Settings that this release does not know change no number of a fit that is done.
         """
@@ -335,7 +335,7 @@ class FieldMixture(Method):
         return arrays, said
 
     def lawful(self) -> Iterator[tuple[str, str, Any]]:
-        """As of all methods; the star of the middle has the sum 1, and residuals are smaller."""
+        """Conditions that any fit fulfils: a mean star of the sum 1, residuals smaller than it."""
         terms, spread = len(self.coefficients), self.spread
         usual = self.model.images(self.usual[None], np.zeros((1, 2)), self.side)
         yield "coefficients", "a mean star of the sum 1", abs(usual.sum() - 1) < 0.1
@@ -376,7 +376,7 @@ class FieldMixture(Method):
         terms = self._terms(position)[0]
         phase = (position - np.floor(position + 0.5))[:, ::-1]
         images = self.model.images(terms, phase + self._list_offset, self.side, oversampling)
-        whole = self.model.images(terms, 0.0 * phase + self._list_offset, self.side)
+        whole = self.model.images(terms, np.broadcast_to(self._list_offset, phase.shape), self.side)
         return images / whole.sum(axis=(1, 2), keepdims=True)
 
     def facts(self) -> dict[str, str]:

@@ -277,7 +277,7 @@ class GaussianMixture(Method):
         return replace(final, shrinkage=np.array([shrinkage]))
 
     def again(self, data: TrainingSet, gmm: Gmm) -> Self:
-        """As of all methods: K, ν and the use of the position are kept."""
+        """Fit to other stars, with the K, the ν and the use of the position of this one."""
         told = bool(self.whitening.any())
         one = self._clustered(data, data.train[: gmm.stars], len(self.count), gmm, told)
         return replace(one, shrinkage=self.shrinkage)
@@ -427,12 +427,12 @@ class GaussianMixture(Method):
 
     @classmethod
     def shapes(cls, info: BundleInfo) -> Mapping[str, tuple[int, ...] | None]:
-        """As of all methods; the others follow from these."""
+        """Arrays that a bundle keeps; the others follow from these."""
         pixels = info.stamp_px**2
         return dict.fromkeys(cls.arrays) | {"axes": (pixels, pixels), "variance": (pixels,)}
 
     def lawful(self) -> Iterator[tuple[str, str, Any]]:
-        """As of all methods; images have the sum 1 and no large negative pixels."""
+        """Conditions that any fit fulfils: images of the sum 1, without large negative pixels."""
         total, power = self.axes.sum(axis=0), np.square(self.deviation, dtype=np.float64).sum()
         some = stream(0, "gmm", "axes").standard_normal((len(self.axes), 4))
         same = self.axes.T @ (self.axes @ some)  # the product of all takes seconds

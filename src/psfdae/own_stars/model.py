@@ -320,8 +320,9 @@ class Engine:
         exact = fixed & np.isfinite(stars.listed).all(axis=1)
         stamps, bad, shift, flags = self._centred(stars, exact)
         start = border_median(stamps, bad)
-        unlike_sky = np.abs(start - stars.background) > SKY_SIGMA * border_scatter(stamps)
-        raise_flag(flags, StarFlag.SKY_OFF, unlike_sky)
+        if np.isfinite(stars.background).any():
+            unlike_sky = np.abs(start - stars.background) > SKY_SIGMA * border_scatter(stamps)
+            raise_flag(flags, StarFlag.SKY_OFF, unlike_sky)
         found = self._photometer.measure(stamps, bad, start, stars)
         told: dict[str, np.ndarray] = {}
         if self.estimator.measures:

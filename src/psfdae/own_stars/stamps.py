@@ -112,10 +112,11 @@ def border_scatter(stamps: np.ndarray) -> np.ndarray:
 
     Light of the star in the border is in it.
     """
+    from astropy.stats import mad_std
+
     side = stamps.shape[-1]
     ring = stamps.reshape(len(stamps), side**2)[:, border_pixels(side)]
-    deviation = np.abs(ring - np.median(ring, axis=1, keepdims=True))
-    return 1.4826 * np.median(deviation, axis=1).astype(np.float64)
+    return mad_std(ring, axis=1).astype(np.float64)
 
 
 def sky_around(wide: np.ndarray, bad: np.ndarray, stamp_px: int) -> tuple[np.ndarray, np.ndarray]:

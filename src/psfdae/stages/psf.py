@@ -123,6 +123,7 @@ def write(path: Path, model: PsfModel, places: np.ndarray, oversampling: int) ->
         key = f"DET_YX{number}" if number < 100 else f"HIERARCH DET_YX{number}"
         cards.append((key, f"({row:.8g}, {column:.8g})", "y, x, 0-based"))
     header = fits.Header(cards)  # `extend` takes the square of the time
+    # Not by astropy's StreamingHDU: its error on a full disk has no cause and no file.
     step = max(1, AT_ONCE // first.size)
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         file.write(header.tostring().encode("ascii"))
