@@ -45,7 +45,7 @@ def brightest(data, x, y, reach):
     return x + column - 2, y + row - 2
 
 
-def main(image, selection, out, side=10, copies=4):
+def main(image, selection, out, side=10, copies=10):
     side, copies = int(side), int(copies)
     half, reach = side // 2 + MOVE, side // 2 + MOVE + RING + 3
     data, stars = padded(image, reach), Table.read(selection, format="ascii.csv")

@@ -5,12 +5,15 @@ usage: peers.py PACKAGE SAMPLING ORDER IMAGE SELECTION FAINT.npz OUT.npz
 PACKAGE is piff, psfex or epsf; SAMPLING the samples' distance in pixels (1 or 0.5); ORDER that of
 the polynomial over the field (epsf has none). OUT has, of every copy and S/N, the PSF at the fitted
 centre (`fitted<S/N>`), its average over the posterior of the centre (`averaged<S/N>`) and the
-fitted flux. Flux, sky and centre are unknown to it; the noise, which weighs the centres, is given.
+fitted flux (`flux<S/N>`); and of the package its `version` and `fit_cpu_s`, what its fit took.
+Flux, sky and centre are unknown to it; the noise, which weighs the centres, is given.
 """
 
+import os
 import subprocess
 import sys
 import tempfile
+from importlib import metadata
 from pathlib import Path
 
 import numpy as np
@@ -67,29 +70,12 @@ def psfex(image, selection, side, sampling, order):
     wanted = np.array([place for place, *_ in training(image, selection)]) + 1.0
     samples = 25 if sampling == 1 else 51
     columns = "NUMBER X_IMAGE Y_IMAGE FLUX_RADIUS FLUX_APER(1) FLUXERR_APER(1) ELONGATION FLAGS"
+    columns = f"{columns} SNR_WIN VIGNET(27,27)".replace(" ", "\n")
     with tempfile.TemporaryDirectory() as folder:
-        (Path(folder) / "sex.param").write_text(
-            f"{columns} SNR_WIN VIGNET(27,27)".replace(" ", "\n")
-        )
-        run = ["source-extractor", str(Path(image).resolve()), "-c", "/dev/null"]
-        run += [
-            "-CATALOG_NAME",
-            "all.cat",
-            "-CATALOG_TYPE",
-            "FITS_LDAC",
-            "-PARAMETERS_NAME",
-            "sex.param",
-        ]
-        run += [
-            "-FILTER",
-            "N",
-            "-DETECT_THRESH",
-            "5",
-            "-ANALYSIS_THRESH",
-            "5",
-            "-SATUR_LEVEL",
-            "4000",
-        ]
+        (Path(folder) / "sex.param").write_text(columns)
+        words = "-c /dev/null -CATALOG_NAME all.cat -CATALOG_TYPE FITS_LDAC -FILTER N"
+        words += " -PARAMETERS_NAME sex.param -DETECT_THRESH 5 -ANALYSIS_THRESH 5 -SATUR_LEVEL 4000"
+        run = ["source-extractor", str(Path(image).resolve()), *words.split()]
         subprocess.run(run, cwd=folder, check=True, capture_output=True)
         with fits.open(f"{folder}/all.cat") as file:
             found = file[2].data
@@ -99,22 +85,12 @@ def psfex(image, selection, side, sampling, order):
             file[2].data["FLAGS"][:] = 0
             print(f"psfex: {len(file[2].data)} of {len(wanted)} training stars")
             file.writeto(f"{folder}/train.cat")
-        run = ["psfex", "train.cat", "-c", "/dev/null", "-PSF_SIZE", f"{samples},{samples}"]
-        run += ["-PSF_SAMPLING", f"{sampling}", "-PSFVAR_DEGREES", f"{order}"]
+        words = f"train.cat -c /dev/null -PSF_SIZE {samples},{samples} -PSF_SAMPLING {sampling}"
         # All stars of the list.
-        run += ["-SAMPLE_AUTOSELECT", "N", "-SAMPLE_MAXELLIP", "1", "-SAMPLE_FWHMRANGE", "0.1,100"]
-        run += [
-            "-SAMPLE_MINSN",
-            "1",
-            "-CHECKPLOT_TYPE",
-            "NONE",
-            "-CHECKIMAGE_TYPE",
-            "NONE",
-            "-WRITE_XML",
-            "N",
-        ]
-        done = subprocess.run(run, cwd=folder, check=True, capture_output=True, text=True)
-        print(*[line for line in done.stderr.splitlines() if "train" in line][-1:])
+        words += " -SAMPLE_AUTOSELECT N -SAMPLE_MAXELLIP 1 -SAMPLE_FWHMRANGE 0.1,100"
+        words += " -SAMPLE_MINSN 1 -CHECKPLOT_TYPE NONE -CHECKIMAGE_TYPE NONE -WRITE_XML N"
+        run = ["psfex", *words.split(), "-PSFVAR_DEGREES", f"{order}"]
+        subprocess.run(run, cwd=folder, check=True, capture_output=True)
         model = DES_PSFEx("train.psf", dir=folder)
 
     def draw(x, y, dx, dy, width):
@@ -213,12 +189,20 @@ def restored(centres, stamp, sigma):
     return fitted, centres.mean(near, weight), gain(centre[None])[2][0]
 
 
+def version(package):
+    """Release of a package in use."""
+    if package == "psfex":
+        said = subprocess.run(["psfex", "--version"], check=True, capture_output=True, text=True)
+        return said.stdout.split()[2]
+    return metadata.version({"epsf": "photutils"}.get(package, package))
+
+
 def main(package, sampling, order, image, selection, faint, out):
     known = np.load(faint)
     side = known["truth"].shape[-1]
     make = {"piff": piff, "psfex": psfex, "epsf": epsf}[package]
     draw = make(image, selection, side, float(sampling), int(order))
-    found = {
+    found = {"version": version(package), "fit_cpu_s": sum(os.times()[:4])} | {
         f"{name}{snr}": np.empty(known["truth"].shape[: 1 if name == "flux" else 3])
         for snr in SNR
         for name in ("fitted", "averaged", "flux")
