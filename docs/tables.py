@@ -198,6 +198,18 @@ def poppy(name):
     return table.assign(label=[method(m).label for m in ends] + before)
 
 
+def coverage():
+    """Part of the pixels within the uncertainty, by model, S/N and brightness of the pixel."""
+    if not (REFERENCE / "tables/predict_coverage.csv").is_file():
+        return pd.DataFrame()  # a record of before
+    keys = ["bundle", "method", "noise_level", "snr", "stars"]
+    wide = poppy("tables/predict_coverage.csv").pivot(
+        index=[*keys, "label"], columns="pixels", values=["coverage68", "coverage95"]
+    )
+    wide.columns = [f"{pixels}_{part[-2:]}" for part, pixels in wide.columns]
+    return wide.reset_index().sort_values(["bundle", "noise_level"])
+
+
 def strange():
     """Stars found by either measure, by kind and noise level."""
     table = csv("tables/predict_strange.csv").query("kind != 'usual'")

@@ -11,7 +11,7 @@ from psfdae.configuration.compose import load_stage
 from psfdae.configuration.consistency import SIMULATION, STATIC
 from psfdae.estimators.dae_network import build_dae
 from psfdae.files import read_product
-from psfdae.own_stars.bundle import Architecture, BundleInfo
+from psfdae.own_stars.bundle import FREE, Architecture, BundleInfo
 from psfdae.stages import stars
 
 KAPPA, SKY = 4.98, 1e4
@@ -57,7 +57,5 @@ def with_network(bundle):
         bundle,
         info=BundleInfo(**told),
         weights={name: value.contiguous().numpy() for name, value in network.state_dict().items()},
-        ratio95=None,
-        strange_limit=None,
-        widening=None,
+        **dict.fromkeys(FREE),
     )

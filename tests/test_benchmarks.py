@@ -280,7 +280,10 @@ def test_targets_on_request(smoke, tmp_path):
     # A DAE that was trained on fresh stars is a DAE; the bundle's name tells them apart.
     assert set(poppy.method) == {"dae", "gmm", "gmm_simulated"}
     assert poppy.bundle.nunique() == 4
-    assert poppy.coverage95_given.isna().equals(poppy.method.str.startswith("dae"))
+    assert poppy.coverage95_given.notna().all()
+    cover = tables["predict_coverage"]
+    assert set(cover.bundle) == {*poppy.bundle, "example"}
+    assert (cover.groupby(["bundle", "noise_level"]).pixels.nunique() == 2).all()
     assert set(tables["predict_poppy_field"].method) == {"dae", "gmm"}
     usual = tables["predict_strange"].query("kind == 'usual'")
     assert (usual.found - usual.false_alarms).abs().max() < 0.02

@@ -30,6 +30,7 @@ from psfdae.own_stars.bundle import (
     read_bundle,
     write_bundle,
 )
+from psfdae.own_stars.model import PsfModel
 from psfdae.own_stars.photometry import FluxModel, robust_flux
 
 SHAPE = Architecture(kernels=(5, 3, 5), widths=(4, 4))
@@ -76,6 +77,7 @@ def handmade(model, gaussian_stars):
         error68=rng.random((3, 16, 16), np.float32),
         rms=rng.random((3, 16, 16), np.float32),
         distance_limit=9.5,
+        ratio95=np.full(3, 1.9),
     )
 
 
@@ -168,7 +170,7 @@ def test_newer_format_is_refused_with_both_versions(file, tmp_path):
     raw = file.read_bytes()
     path = tmp_path / "new.psf.safetensors"
     path.write_bytes(with_text(raw, lambda text: text.update(format_version=7, info="other")))
-    assert "format 7, but psfdae 0.1.0 reads up to format 2" in refused(path)
+    assert "format 7, but psfdae 0.1.0 reads up to format 3" in refused(path)
     result = CliRunner().invoke(main, ["describe", str(path)])
     assert result.exit_code == 2
     assert result.output.startswith(f"psfdae: {path}: format 7")
@@ -264,6 +266,23 @@ def test_completed_covariance_measures_fluxes_as_the_whole_one(file, gaussian_st
     noisy = 1e4 * gaussian_stars + np.random.default_rng(10).normal(0, 50, gaussian_stars.shape)
     first, second = (robust_flux(noisy, m).flux for m in (whole, model))
     assert second == pytest.approx(first, rel=1e-4)
+
+
+def test_a_bundle_of_format_2_predicts_as_it_did():
+    """It and its predictions were written by the code that made it."""
+    folder = Path(__file__).parent / "data"
+    model, before = (
+        PsfModel(read_bundle(folder / "format2.psf.safetensors")),
+        np.load(folder / "format2.npz"),
+    )
+    assert model.info.format_version == 2 and model.bundle.widening is not None
+    sky, known = {"background": 100.0}, {"flux": 1e4, "background": 100.0, "noise": 40.0}
+    for case, told in {"free": {}, "sky": sky, "known": known}.items():
+        found = model.predict(before["stamps"], **told)
+        for name in ("psf", "uncertainty", "ratio95", "flux", "flux_error"):
+            expected = before[f"{case}_{name}"]
+            np.testing.assert_allclose(getattr(found, name), expected, rtol=1e-4, atol=1e-2)
+        np.testing.assert_array_equal(found.ratio95_bright, found.ratio95)
 
 
 def test_arrays_of_another_program_are_no_bundle(tmp_path):

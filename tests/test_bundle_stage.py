@@ -19,8 +19,10 @@ from psfdae.estimators import dae_network, groups_of
 from psfdae.files import Column, ProductError, read_product, write_product
 from psfdae.own_stars import packing
 from psfdae.own_stars.bundle import (
+    SCALES,
     BundleError,
     at_noise,
+    brightest,
     estimator,
     mahalanobis,
     read_bundle,
@@ -68,6 +70,8 @@ def write_stars(path, config):
         "field_index": Column(np.arange(1400) % 25, "1", "field"),
         "grid": Column(grid, "1", "index"),
         "position": Column(100.0 * grid, "pixel", "of stars of an image"),
+        "noise": Column(np.full(25, 1e-3), "1", "of stars of an image"),
+        "snr": Column(np.full(25, 250.0), "1", "of stars of an image"),
     }
     write_product(path, "stars", columns, config)
     return path
@@ -129,6 +133,8 @@ def test_unknown_optics_have_no_diffraction_limit(folder, tmp_path):
     info = read_bundle(tmp_path / "own").info
     assert (info.pixel_lambda_d, info.source, info.subpixel) == (None, "stars", False)
     assert info.pixel_scale_arcsec == 2.0
+    assert info.noise_equivalent_px == pytest.approx((1e-3 * 250) ** -2)
+    assert info.training_stars == 25  # and not the 1000 images of them
 
 
 def test_metrics_are_those_of_the_stage_evaluate(folder, tiny):
@@ -191,7 +197,7 @@ def test_a_method_that_knows_how_sure_it_is_covers_68_and_95_per_cent(folder, ti
     free, dae = (PsfModel(b).predict(noisy + 3.0, noise=noise) for b in (bundle, tiny))
     bright = noise < 0.01
     kept = np.isfinite(free.psf).all(axis=(1, 2))
-    write_bundle(replace(bundle, widening=None), tmp_path / "old.psf.safetensors")
+    write_bundle(replace(bundle, **dict.fromkeys(SCALES)), tmp_path / "old.psf.safetensors")
     old = PsfModel(read_bundle(tmp_path / "old.psf.safetensors"))
     narrow = old.predict(noisy + 3.0, noise=noise)
     for part in np.array_split(np.argsort(noise), 3):
@@ -218,6 +224,24 @@ def test_a_method_that_knows_how_sure_it_is_covers_68_and_95_per_cent(folder, ti
     assert np.isfinite(strange.strangeness).mean() > 0.9 and np.isnan(far.strangeness).all()
     one = PsfModel(bundle).predict(noisy[7], flux=1.0, background=0.0, noise=noise[7])
     np.testing.assert_allclose(one.psf[0], found.psf[7], atol=1e-6)
+
+
+def test_bright_pixels_are_covered_as_the_others_are(tiny):
+    """Of unseen stars whose flux and sky are found."""
+    images, rng = gaussians(1500, 99), np.random.default_rng(5)
+    model = PsfModel(tiny)
+    for noise in (6e-3, 1.5e-2):
+        noisy = images + noise * rng.normal(size=images.shape) + 3.0
+        found = model.predict(noisy)
+        kept = np.isfinite(found.psf).all(axis=(1, 2))
+        error, width = np.abs(found.psf - images)[kept], found.uncertainty[kept]
+        bright = brightest(found.psf[kept])
+        assert bright.mean() == pytest.approx(20 / 256, abs=0.01)
+        both = (found.ratio95_bright, bright), (found.ratio95, ~bright)
+        for ratio, pixels in both:
+            wide = width * ratio[kept, None, None]
+            assert (error <= width)[pixels].mean() == pytest.approx(0.683, abs=0.03)
+            assert (error <= wide)[pixels].mean() == pytest.approx(0.95, abs=0.02)
 
 
 def test_signal_to_noise_is_that_of_a_matched_filter():

@@ -156,9 +156,12 @@ def test_flux_sky_centre_and_size_are_unbiased_and_as_sure_as_said(field, snr):
     if snr > 5:
         ratio = size(found.psf) / size(some.psf) - 1
         assert abs(np.median(ratio)) < 0.02 + 3 * 1.25 * ratio.std() / np.sqrt(len(ratio))
-    inside = (np.abs(found.psf - some.psf) <= found.sigma).mean()
+    star = found.psf * told.flux[:, None, None] / 1000  # in the doubt of which that of its flux is
+    inside = (np.abs(star - some.psf) <= found.sigma).mean()
     assert 0.62 < inside < 0.87  # of a wing, few large errors make the variance
-    assert some.mse(found) == pytest.approx(np.square(found.sigma, dtype=float).mean(), rel=0.2)
+    assert np.square(star - some.psf).mean() == pytest.approx(
+        np.square(found.sigma, dtype=float).mean(), rel=0.2
+    )
     flux_and_sky = told.covariance[:, 0, 1] / (error[:, 0] * error[:, 1])
     assert np.corrcoef(off[:, 0], off[:, 1])[0, 1] == pytest.approx(flux_and_sky.mean(), abs=0.12)
 
@@ -580,3 +583,15 @@ def test_photometry_of_photutils_with_the_grid_is_unbiased(image):
     assert len(ratio) >= 400
     assert abs(np.mean(ratio) - 1) < 0.005
     assert np.std(ratio) < 0.03
+
+
+@pytest.mark.parametrize("snr", [5.0, 20.0])
+def test_sigma_knows_the_doubt_about_the_flux(field, snr):
+    """Flux and sky found: the nine brightest pixels are within σ as often as of a normal law."""
+    some = Faint(500, snr)
+    found = some.measured(field)
+    error = np.abs(found.measured.flux[:, None, None] * found.psf - 1000 * some.psf)
+    sigma = found.measured.flux[:, None, None] * found.sigma
+    bright = found.psf >= np.sort(found.psf.reshape(500, -1))[:, -9, None, None]
+    for width, part in ((1.0, 0.683), (1.96, 0.95)):
+        assert (error <= width * sigma)[bright].mean() == pytest.approx(part, abs=0.04)

@@ -224,6 +224,29 @@ def test_another_seed_keeps_what_the_search_has_chosen(kind):
     assert not np.array_equal(other.mean, found.mean)
 
 
+def test_a_search_goes_both_ways_and_more_clusters_must_pay():
+    asked = []
+
+    def climbed(errors, start, pays=0.0):
+        asked.clear()
+        return module.climbed([*errors], start, lambda k: asked.append(k) or errors[k], pays)
+
+    falling = {1: 9.0, 4: 5.0, 16: 4.0, 64: 3.98, 256: 1.0}
+    assert climbed(falling, 4, pays=0.02) == 16 and 256 not in asked and 1 not in asked
+    assert climbed(falling, 4) == 256
+    assert climbed({1: 3.99, 4: 4.0, 16: 4.1, 64: 1.0}, 4, pays=0.02) == 1 and 64 not in asked
+    assert climbed({1: 2.0, 4: 2.0, 16: 2.0}, 4) == 4
+
+
+def test_a_search_that_ends_at_the_last_value_says_so(capsys):
+    fitted(components=[4, 1, 12], shrinkage=[20.0, 5.0])
+    assert "ν = 5; K = 12, ν = 5: last that were tried" in capsys.readouterr().out
+    fitted(components=[12, 1, 350])
+    assert "last that were tried" not in capsys.readouterr().out
+    fitted(components=[12])
+    assert capsys.readouterr().out == ""
+
+
 @pytest.mark.parametrize("free", [False, True])
 def test_strangeness_of_one_cluster_is_the_square_of_mahalanobis_distance(free, monkeypatch):
     monkeypatch.setattr(module, "FLAT", 0.0)

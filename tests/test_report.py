@@ -211,6 +211,7 @@ def exposed(flux, full=np.inf, sky=200.0, noise=10.0):
     count = np.full(len(flux), 1.0)
     return SimpleNamespace(
         brightest=np.minimum(peak + sky, full),
+        highest=np.minimum(peak + sky, full),
         sky=sky * count,
         noise=noise * count,
         snr=(flux - 3 * lost) / (3.54 * 1.6) / noise,
@@ -223,7 +224,7 @@ def test_stars_that_are_cut_off_at_one_level_give_it_away():
     level = piled_up(found.brightest, found.sky, found.snr * found.noise)
     assert level == 30_000
     said = advice.saturation_advice(found)
-    assert "agree at 30000 counts" in said and "--saturate 29400" in said
+    assert "agree from 30000 counts on" in said and "--saturate 30000" in said
     whole = exposed(flux)
     assert f"none is seen up to {whole.brightest.max():.6g}" in advice.saturation_advice(whole)
     # Stars of one brightness have one brightest pixel, and no pedestal makes it agree.

@@ -17,7 +17,7 @@ import numpy as np
 from measure import alone, cost_of_command, write, yes
 from psfdae.belonging import STARS, require
 from psfdae.cli import File, command, program
-from psfdae.configuration.compose import ConfigError
+from psfdae.configuration.compose import ConfigError, part
 from psfdae.configuration.consistency import SIMULATION
 from psfdae.configuration.schema import Config
 from psfdae.files import read_product
@@ -34,6 +34,7 @@ REPEATS = 3  # timings at most; each takes as long as three predictions
 WARM_UP = 4  # blocks of stars that are computed before the clock starts
 BARE_STAMPS = 8192  # that the bare network sees over and over: it must not fill the memory
 SAMPLES = 256  # of POPPY across the pupil
+BRIGHTNESS = ("brightest", "others")  # of the pixels of a star
 FALSE_ALARMS = 0.01  # part of the usual stars above a limit
 NOISY_EACH = 4  # noisy images of each star: of one each, too few would make the limit
 COMPANION_FLUX, COMPANION_PX = 0.3, 3.0  # of a neighbour, in units of the star's, and its distance
@@ -202,17 +203,90 @@ def require_bundle(bundle, config):
 def quality(found, truth, flux, expected, which):
     """Mean errors of PSFs of flux 1, and how many pixels are within the uncertainty.
 
-    `coverage95` is of `UNCERT` times `ratio95`, which a network does not say.
+    `coverage95` is of `UNCERT` times `ratio95`, which networks of older bundles do not say.
     """
+    from psfdae.own_stars.bundle import brightest
+
     kept = np.isfinite(found.psf).all(axis=(1, 2))
     psf, width = found.psf[kept], found.uncertainty[kept]
-    wide = width * found.ratio95[kept, None, None]
+    ratio = found.ratio95[kept, None, None], found.ratio95_bright[kept, None, None]
+    wide = width * np.where(brightest(psf), *ratio[::-1])
     squares = np.square(psf / found.flux[kept, None, None] - truth[kept]).mean(axis=(1, 2))
     error, mse = np.abs(psf - flux * truth[kept]), squares.mean()
     row = {"mse": mse, "stderr": squares.std(ddof=1) / squares.size**0.5, "ratio": mse / expected}
     row |= {"coverage": (error <= width).mean()}
     row |= {"coverage95": np.nan if np.isnan(wide).all() else (error <= wide).mean()}
     return {f"{name}_{which}": value for name, value in row.items()}
+
+
+@command("coverage", reads=TESTED)
+def coverage(
+    config: Config,
+    stars: Annotated[tuple[File, ...], {"flag": "--stars"}, "Products of the stage stars."],
+    bundles: Annotated[tuple[File, ...], {"flag": "--bundle"}, "Model bundles of these stars."],
+    out: Annotated[File, "CSV with the coverage by bundle, noise level and brightness."],
+) -> None:
+    """How many pixels of test stars are within `UNCERT`, and within `ratio95` times it.
+
+    Either half of the stars, with flux and sky found, by what the other half says of the errors.
+    """
+    from psfdae.own_stars.bundle import read_bundle
+
+    products = [common.read_stars(path, "template") for path in stars]
+    rows = []
+    for path in bundles:
+        bundle = read_bundle(path)
+        own = (p for p in products if p.config == bundle.info.config["stars"])
+        product = next(own, None) or refuse(path, stars)
+        rows += covered(bundle, product, stream(config.seed, "coverage", bundle.info.name))
+    write(out, rows)
+
+
+def refuse(bundle, stars):
+    """Say that none of the products has the stars of a bundle."""
+    raise ConfigError(f"{bundle}: was trained on other stars than {', '.join(map(str, stars))}")
+
+
+def covered(bundle, product, rng):
+    """Rows of a bundle: noise level, S/N, brightness, and part of the pixels that is covered."""
+    from psfdae.own_stars import packing
+    from psfdae.own_stars.bundle import brightest, estimator
+    from psfdae.own_stars.model import PsfModel
+
+    trained, fitted = bundle.info.config["train"], estimator(bundle)
+    said = part(("seed", "noise", "parts"), trained)
+    noise, reference = common.noise_model(said), bundle.info.reference or trained.get("reference")
+    test = common.split_stars(product, trained["split"], said).test
+    # Images of one star of an image are of one half.
+    star = product["field_index"][test] if trained["split"] == "held_out" else test
+    odd = np.unique(star, return_inverse=True)[1] % 2 == 1
+    columns = product["realisation"], product[reference], common.field_positions(product)
+    halves = [
+        packing.HeldOutStars(*(c[test[half]] for c in columns[:2]), noise, columns[2][test[half]])
+        for half in (odd, ~odd)
+    ]
+    found = {}
+    for judges, judged in (halves, halves[::-1]):
+        model = packing.calibrated(bundle, fitted, judges, rng)[0]
+        for tested in bundle.info.metrics:
+            level = tested["noise_level"]
+            flux = float(noise.flux(level))
+            stamps = rng.poisson(flux * judged.images + noise.background).astype(np.float32)
+            told = PsfModel(model).predict(stamps, gain=1.0, position=judged.position)
+            kept = np.isfinite(told.psf).all(axis=(1, 2))
+            error = np.abs(told.psf - flux * judged.references)[kept] / told.uncertainty[kept]
+            bright = brightest(told.psf[kept])
+            ratios = told.ratio95_bright, told.ratio95
+            for name, pixels, ratio in zip(BRIGHTNESS, (bright, ~bright), ratios, strict=True):
+                inside = (error <= 1), (error <= ratio[kept, None, None])
+                key = level, tested["snr"], name
+                found.setdefault(key, []).append([kept.sum(), *(i[pixels].mean() for i in inside)])
+    for (level, snr, name), parts in found.items():
+        of_half = np.array(parts)
+        row = {"bundle": bundle.info.name, "method": bundle.info.method, "noise_level": level}
+        row |= {"snr": snr, "pixels": name, "stars": int(of_half[:, 0].sum())}
+        shares = np.average(of_half[:, 1:], axis=0, weights=of_half[:, 0])
+        yield row | dict(zip(("coverage68", "coverage95"), shares, strict=True))
 
 
 @command("strange", reads=TESTED)
@@ -364,4 +438,4 @@ def poppy_telescope(telescope, side_px):
 
 
 if __name__ == "__main__":
-    program(throughput, poppy, strange)
+    program(throughput, poppy, coverage, strange)

@@ -161,9 +161,9 @@ def last_cost(runs):
 def untrained_bundle(tree, stars, out):
     """The shipped model with a random network and these stars' size of stamps."""
     from psfdae.files import read_product
-    from psfdae.own_stars.bundle import Architecture, BundleInfo, read_bundle, write_bundle
-    from psfdae.own_stars.packing import leading, noise_equivalent_px
-    from psfdae.own_stars.photometry import FluxModel
+    from psfdae.own_stars.bundle import FREE, Architecture, BundleInfo, read_bundle, write_bundle
+    from psfdae.own_stars.packing import leading
+    from psfdae.own_stars.photometry import FluxModel, noise_equivalent_px
 
     images, dae, shipped = read_product(stars, "stars")["realisation"], tree["dae"], read_bundle()
     side, model = images.shape[-1], FluxModel.fit(images[:1000])
@@ -185,9 +185,7 @@ def untrained_bundle(tree, stars, out):
         flux_model=leading(model, shipped.info.components),
         error68=errors,
         rms=errors,
-        ratio95=None,
-        strange_limit=None,
-        widening=None,
+        **dict.fromkeys(FREE),
     )
     write_bundle(bundle, out)
 

@@ -62,6 +62,7 @@ rule propagation_tables:
 
 BUNDLE = f"{RESULTS}/bundles/{TIMED_DATASET}-random-realisation.psf.safetensors"
 STARS = {"stars": lambda w: stars_of(TIMED_DATASET)}
+OWN_MODEL = f"{RESULTS}/own_stars/example/model"
 MIXED = BUNDLE.replace("realisation", f"realisation{method('gmm').suffix}")
 FITTED = [f"psfdae.estimators.{name}" for name in names_of(TIMED_DATASET)]
 # By table: target, command, inputs, MB, minutes, stages that it runs or modules that it chooses.
@@ -98,6 +99,22 @@ TIMED = {
             {"bundle": rivals_of_shipped},
             1500,
             20,
+            [],
+        ),
+    ),
+    "predict_coverage": (
+        *(
+            "prediction",
+            "prediction.coverage",
+            {
+                "stars": lambda w: [stars_of(TIMED_DATASET), f"{OWN_MODEL}/stars.h5"],
+                "bundle": lambda w: [
+                    *every_bundle_of_timed(w),
+                    f"{OWN_MODEL}/example.psf.safetensors",
+                ],
+            },
+            1500,
+            30,
             [],
         ),
     ),

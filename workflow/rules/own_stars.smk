@@ -34,6 +34,7 @@ rule own_stars:
         multiext(
             f"{OWN_STARS_EXAMPLE}/model/",
             bundle="example.psf.safetensors",
+            stars="stars.h5",
             report="report.csv",
             selection="selection.csv",
             picture="report.png",

@@ -214,19 +214,19 @@ class CalibrationStars(Group):
         description="Parts of the field along a side; stars of a part are stacked"
     )
     snr_levels: Annotated[list[Positive], Field(min_length=1)] = Field(
-        description="S/N to which bright stars are degraded, ascending"
+        description="S/N to which bright stars are degraded, ascending; those above snr_min / 2, "
+        "where the stars' own noise would count, are that"
     )
 
     @model_validator(mode="after")
     def _levels(self) -> CalibrationStars:
         if sorted(set(self.snr_levels)) != self.snr_levels:
             raise ValueError(f"snr_levels = {self.snr_levels}: must be ascending")
-        if self.snr_levels[-1] > 0.5 * self.snr_min:
-            raise ValueError(
-                f"snr_levels = {self.snr_levels}: must end at snr_min / 2 = "
-                f"{0.5 * self.snr_min:g}, or the stars' own noise counts"
-            )
         return self
+
+    def degraded(self) -> list[float]:
+        """S/N to which bright stars are degraded, ascending, none above snr_min / 2."""
+        return sorted({min(level, 0.5 * self.snr_min) for level in self.snr_levels})
 
 
 def _listed(name: str) -> str:

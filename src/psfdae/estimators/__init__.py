@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 
@@ -194,7 +195,8 @@ class Estimate:
     ----------
     psf : ndarray, shape (n, d, d)
     sigma : ndarray, shape (n, d, d), or None
-        Standard deviation of each pixel of the PSF.
+        Standard deviation of each pixel of the PSF; of a method that measures stars, of the star
+        over its flux, the doubt about the flux included.
     evidence : ndarray, shape (n,), or None
         Logarithm of the probability density of each noisy image.
     flux : ndarray, shape (n,), or None
@@ -380,6 +382,10 @@ class Method:
         """PSFs at positions (n, 2), of a method that knows them between the stars."""
         raise FitError(f"{self.label}: knows the PSF of a star alone, not that of a place")
 
+    def facts(self) -> Mapping[str, str]:
+        """What a fit knows of itself that its user should: a title and words for each."""
+        return {}
+
     @classmethod
     def stem(cls, dataset: str, split: str, reference: str) -> str:
         """What tells its fits apart, as part of a path."""
@@ -516,11 +522,21 @@ def method(name: str) -> type[Method]:
     except ModuleNotFoundError as error:
         if not (error.name or "").startswith("psfdae.estimators."):
             raise
-        raise ProductError(f"no method {name!r}: psfdae.estimators has no such module") from None
+        raise ProductError(f"no method {name!r}; there are {', '.join(_known())}") from None
     for kind in vars(module).values():
         if isinstance(kind, type) and issubclass(kind, Method) and kind.name == name:
             return kind
     raise ProductError(f"no method {name!r}: psfdae.estimators.{name} has no class Method")
+
+
+def _known() -> list[str]:
+    """Names that the configuration lists and that have a module, without loading one."""
+    try:
+        tree = parse_yaml(config_dir() / "config.yaml")
+        names = [*tree["methods"], *tree["workflow"].get("on_request", ())]
+        return [n for n in map(str, names) if find_spec(f"psfdae.estimators.{n}")]
+    except (ConfigError, LookupError, TypeError, ValueError):
+        return []
 
 
 def registered() -> tuple[type[Method], ...]:

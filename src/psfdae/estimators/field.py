@@ -89,26 +89,32 @@ PACKED = 3e6
 
 
 class FieldSettings(Group):
-    """Mixture about a model of the field."""
+    """Mixture about a model of the field.
+
+    Models that were packed before a setting was there have its default.
+    """
 
     orders: Annotated[list[Annotated[int, Field(ge=0, le=10)]], Field(min_length=1)] = Field(
+        [0, 1, 2, 3, 4, 6, 8],
         description="Of the polynomial in the position, tried upwards until the next one "
-        "predicts stars that were left out no better"
+        "predicts stars that were left out no better",
     )
     spacing_px: Annotated[float, Field(gt=0.1, le=2)] = Field(
-        description="Distance of the knots of the field's splines"
+        0.5, description="Distance of the knots of the field's splines"
     )
-    smoothness: Positive = Field(description="Of the splines: weight of their second differences")
-    step_px: Annotated[float, Field(gt=0, le=1)] = Field(description="Between two nodes")
+    smoothness: Positive = Field(
+        100.0, description="Of the splines: weight of their second differences"
+    )
+    step_px: Annotated[float, Field(gt=0, le=1)] = Field(0.25, description="Between two nodes")
     reach_px: Annotated[float, Field(gt=0, lt=MARGIN)] = Field(
-        description="Distance, per axis, of the outermost nodes from the stamp's middle"
+        1.75, description="Distance, per axis, of the outermost nodes from the stamp's middle"
     )
     centring_px: Annotated[float, Field(gt=0, lt=MARGIN)] = Field(
-        description="Distance, per axis, from the middle that centres may have"
+        1.5, description="Distance, per axis, from the middle that centres may have"
     )
-    modes: Count = Field(description="Leading modes of the residuals")
-    diagonal: Fraction = Field(description="Part of their variance that no mode knows")
-    threads: Count = Field(description="Threads of the linear algebra")
+    modes: Count = Field(40, description="Leading modes of the residuals")
+    diagonal: Fraction = Field(0.2, description="Part of their variance that no mode knows")
+    threads: Count = Field(1, description="Threads of the linear algebra")
 
 
 class Node(NamedTuple):
@@ -307,10 +313,14 @@ class FieldMixture(Method):
     def restored(
         cls, arrays: Mapping[str, np.ndarray], config: Mapping[str, Any], reference: str
     ) -> Self:
-        """As of all methods; noise and settings are those of the configuration."""
+        """As of all methods; noise and settings are those of the configuration.
+
+        Settings that this release does not know change no number of a fit that is done.
+        """
         noise = NoiseModel(config["noise"]["kappa"], config["noise"]["background_photons"])
         same = {"modes": arrays["modes"].astype(np.float32)}
-        settings = FieldSettings.model_validate(config["field"])
+        known = {k: v for k, v in config["field"].items() if k in FieldSettings.model_fields}
+        settings = FieldSettings.model_validate(known)
         return cls(**{**arrays, **same}, noise=noise, settings=settings)
 
     def pack(self, stamp_px: int, noise: float) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -368,6 +378,13 @@ class FieldMixture(Method):
         images = self.model.images(terms, phase + self._list_offset, self.side, oversampling)
         whole = self.model.images(terms, 0.0 * phase + self._list_offset, self.side)
         return images / whole.sum(axis=(1, 2), keepdims=True)
+
+    def facts(self) -> dict[str, str]:
+        """The polynomial of the field."""
+        order = self.model.order
+        changes = f"changes over the image by a polynomial of order {order}"
+        same = "is the same everywhere (order 0: more is not supported by stars left out)"
+        return {"Field": f"the PSF {changes if order else same}"}
 
     def _terms(self, position: np.ndarray | None, count: int = 0) -> tuple[np.ndarray, np.ndarray]:
         """Terms of the field of each star, the usual ones where no position is known, and where."""
@@ -731,8 +748,8 @@ class FieldMixture(Method):
         """
         count, pixels = stars.images.shape
         first, second = np.zeros((count, 4)), np.zeros((count, 4, 4))
-        star, square, with_flux, inside, with_slope = np.zeros((5, count, pixels))
-        total, total2, unsure = np.zeros((3, count, 1))
+        star, square, inside = np.zeros((3, count, pixels))
+        total = np.zeros((count, 1))
         strange = np.zeros(count)
         for k, kind, rows in self._asked(stars, number, weight > 0):
             factor, w = self._factor(k, kind), weight[rows, k, None]
@@ -754,12 +771,8 @@ class FieldMixture(Method):
             doubt = w * fit.variance[:, None]
             star[rows] += w * one
             square[rows] += w * one**2
-            with_flux[rows] += w * flux * one
             inside[rows] += w * factor.variance + doubt * change**2
-            with_slope[rows] += doubt * change
             total[rows] += w * flux
-            total2[rows] += w * flux**2
-            unsure[rows] += doubt
             place = self.places[k] if stars.centre is None else stars.centre[rows]
             told = np.hstack([flux, sky, place + factor.scale[1:] * latent[:, 1:]])
             with_a = np.hstack([np.ones_like(flux), -factor.scale * pull])
@@ -769,9 +782,8 @@ class FieldMixture(Method):
             second[rows] += w[..., None] * (alone + told[:, :, None] * told[:, None, :])
             second[rows] += doubt[..., None] * with_a[:, :, None] * with_a[:, None, :]
         psf = star / total
-        variance = square + inside - 2 * psf * (with_flux + with_slope)
-        variance += psf**2 * (total2 + unsure)
-        sigma = np.sqrt(np.maximum(variance, 0.0)) / np.abs(total)
+        # Of the star as it is: the doubt about its flux is in its pixels.
+        sigma = np.sqrt(np.maximum(square + inside - star**2, 0.0)) / np.abs(total)
         return first, second - first[:, :, None] * first[:, None, :], strange, psf, sigma
 
 

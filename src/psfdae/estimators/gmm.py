@@ -31,9 +31,9 @@ Y_k, LOOSE μ_y,k.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, Self
 
 import numpy as np
@@ -77,8 +77,15 @@ FINE = 0.2
 FLAT = 0.005
 """Variance of a coordinate, as a part of s, below which all clusters share one normal law."""
 
+PAYS = 0.02
+"""Part of the error by which more clusters must lower it."""
+
+CAREFUL = 512
+"""Clusters that k-means++ begins. Of more, it takes ten times as long as a random beginning,
+and errs as much."""
+
 WORSE = 1.05
-"""Times the least error so far, with which a search ends, of more clusters or without places."""
+"""Times the least error, below which a search without positions may find a smaller one."""
 
 AT_ONCE = 4096
 """Images that are restored together."""
@@ -89,11 +96,12 @@ class Gmm(Group):
 
     stars: Count | None = Field(description="Training stars that are learnt from; null: all")
     components: Annotated[list[Count], Field(min_length=1)] = Field(
-        description="Clusters K that are tried, in this order; more than stars are not"
+        description="Clusters K among which a search goes, from the first one, as long as it "
+        "pays; more than stars are not"
     )
     shrinkage: Annotated[list[Positive], Field(min_length=1)] = Field(
-        description="Stars ν that the covariance of all clusters counts for in each; "
-        "the first one is used to choose K"
+        description="Stars ν that the covariance of all clusters counts for in each; searched "
+        "from the first one, too"
     )
     principal: Count = Field(description="Principal components in which stars are clustered")
     place: Positive = Field(
@@ -283,38 +291,46 @@ class GaussianMixture(Method):
         noisy = [data.noise.draw(data.images[judge], level, rng) for level in data.levels]
         truth, where = data.references[judge], cls._told(data, judge)
 
-        def error(tried: Self) -> float:
+        @cache
+        def clustered(k: int, told: bool) -> Self:
+            return cls._clustered(data, learn, k, gmm, told)
+
+        @cache
+        def error(k: int, nu: float, told: bool) -> float:
             """Geometric mean over the noise levels."""
+            tried = replace(clustered(k, told), shrinkage=np.array([nu]))
             pairs = zip(noisy, data.levels, strict=True)
             errors = [np.square(tried.predict(z, s, where) - truth).mean() for z, s in pairs]
-            tried._nodes.clear()
-            tried.__dict__.pop("_clusters", None)  # another ν has others
             return float(np.exp(np.mean(np.log(errors))))
 
-        def search(told: bool) -> tuple[float, int, bool, float]:
-            """K at the first ν, until more clusters are worse; then ν at the best K."""
-            tried: dict[int, float] = {}
-            for k in sizes:
-                one = cls._clustered(data, learn, k, gmm, told)
-                tried[k] = error(one)
-                if tried[k] == min(tried.values()):
-                    best = one
-                del one  # before the next takes as much memory
-                if tried[k] > WORSE * min(tried.values()):
-                    break
-            k = min(tried, key=tried.__getitem__)
-            found = [(tried[k], k, told, gmm.shrinkage[0])]
-            for nu in gmm.shrinkage[1:] if k > 1 else ():  # in one cluster it has no effect
-                found.append((error(replace(best, shrinkage=np.array([nu]))), k, told, nu))
-            return min(found)
+        def search(k: int, nu: float, told: bool) -> tuple[float, int, bool, float]:
+            """Climb to the best ν, to the best K there, and on to the best ν of fewer clusters.
 
-        best = search(cls.told_position)
+            More of them take longer, and want the same ν.
+            """
+            first = k
+            nu = climbed(gmm.shrinkage, nu, lambda tried: error(k, tried, told))
+            k = climbed(sizes, k, lambda tried: error(tried, nu, told), PAYS)
+            if k < first:
+                nu = climbed(gmm.shrinkage, nu, lambda tried: error(k, tried, told))
+            return error(k, nu, told), k, told, nu
+
+        best = search(sizes[0], gmm.shrinkage[0], cls.told_position)
         if cls.told_position:
             # What is told may be left aside, where stars in other places are worse for it.
             least, k, _, nu = best
-            without = cls._clustered(data, learn, k, gmm, False)
-            if error(replace(without, shrinkage=np.array([nu]))) < WORSE * least:
-                best = min(best, search(False))
+            if error(k, nu, False) < WORSE * least:
+                best = min(best, search(k, nu, False))
+        _, k, told, nu = best
+        tried = [("K", k, [max(sizes)] if k > 1 else [], sizes)]
+        tried += [("ν", nu, [min(gmm.shrinkage), max(gmm.shrinkage)], gmm.shrinkage)]
+        last = [f"{n} = {v:g}" for n, v, ends, all_ in tried if v in ends and len(all_) > 1]
+        print(
+            f"{cls.label}: K = {k} clusters, ν = {nu:g}"
+            + (", without positions" if cls.told_position > told else "")
+            + (f"; {', '.join(last)}: last that were tried" if last else ""),
+            flush=True,
+        )
         return best[1:]
 
     @classmethod
@@ -649,7 +665,7 @@ class GaussianMixture(Method):
         """C_k + s factorised: D + b XᵀX with the diagonal D, and M = 1/b + X D⁻¹Xᵀ = L Lᵀ."""
         node = self._nodes.setdefault(s, {})  # whole, whatever another thread drops
         if k not in node:
-            from scipy.linalg import solve_triangular
+            from scipy.linalg.lapack import dtrtrs
 
             cluster = self._clusters[k]
             leading = min(self._leading(s), cluster.own.shape[1])
@@ -660,7 +676,7 @@ class GaussianMixture(Method):
             low = np.linalg.cholesky(np.eye(len(x)) / cluster.scale + (x / d[:leading]) @ x.T)
             y = cluster.own_reference
             both = np.hstack([x / d[:leading], y]) if len(y) else x / d[:leading]
-            both = solve_triangular(low, both, lower=True)
+            both, _ = dtrtrs(low, both, lower=True)
             half_det = np.log(low.diagonal()).sum() + 0.5 * len(x) * np.log(cluster.scale)
             node[k] = Factor(
                 inverse=(1.0 / d).astype(np.float32),
@@ -678,7 +694,12 @@ class GaussianMixture(Method):
 
     def _leading(self, s: float) -> int:
         """Coordinates in which clusters differ at a noise variance s."""
-        return int(np.count_nonzero(np.maximum.accumulate(self._total[::-1]) > FLAT * s))
+        return int(np.count_nonzero(self._reaching > FLAT * s))
+
+    @cached_property
+    def _reaching(self) -> np.ndarray:
+        """Largest variance of all stars along an axis or one after it, the last axis first."""
+        return np.maximum.accumulate(self._total[::-1])
 
     @cached_property
     def _total(self) -> np.ndarray:
@@ -729,6 +750,26 @@ def _whitening(p: np.ndarray) -> np.ndarray:
     return np.asarray(axes * np.where(real, 1.0 / np.sqrt(np.where(real, variance, 1.0)), 0.0))
 
 
+def climbed(
+    values: Sequence[float], start: float, error: Callable[[float], float], pays: float = 0.0
+) -> Any:
+    """Where steps from one of some values, up or else down, no longer lower the error.
+
+    A step up must lower it by more than the part `pays`.
+    """
+    ascending = sorted(values)
+    place = ascending.index(start)
+    for way, least in ((ascending[place:], pays), (ascending[place::-1], 0.0)):
+        best = start
+        for value in way[1:]:
+            if error(value) >= (1.0 - least) * error(best):
+                break
+            best = value
+        if best != start:
+            break
+    return best
+
+
 def _k_means(
     x: np.ndarray, place: np.ndarray, clusters: int, principal: int, seed: int
 ) -> np.ndarray:
@@ -745,4 +786,6 @@ def _k_means(
     scale = np.sqrt(np.square(found).sum() / len(x) / max(place.shape[1], 1))
     draw = int(stream(seed, "gmm", "clusters").integers(2**31))
     features = np.hstack([found, scale * place]).astype(np.float32)
-    return np.asarray(KMeans(clusters, n_init=1, random_state=draw).fit(features).labels_)
+    init = "k-means++" if clusters <= CAREFUL else "random"
+    means = KMeans(clusters, init=init, n_init=1, random_state=draw)
+    return np.asarray(means.fit(features).labels_)

@@ -33,10 +33,11 @@ def saturation_advice(found: Candidates) -> str:
     level = piled_up(found.brightest, found.sky, found.snr * found.noise)
     if not np.isfinite(level):
         return f"saturation: none is seen up to {found.brightest.max():.6g} counts"
-    piled = int((found.brightest >= level).sum())
+    piled, flagged = (int((pixel >= level).sum()) for pixel in (found.brightest, found.highest))
     return (
-        f"saturation: the brightest pixels of {piled} stars agree at {level:.6g} counts, as if cut "
-        f"off; they are not learnt from, --saturate {round(0.98 * level):d} flags them, too"
+        f"saturation: the brightest pixels of {piled} stars agree from {level:.6g} counts on, as "
+        f"if cut off; {flagged} stamps have such pixels and are not learnt from, --saturate "
+        f"{level:.6g} flags these, too"
     )
 
 

@@ -36,9 +36,10 @@ from psfdae.files import ProductError, atomic_path
 from psfdae.own_stars.errors import one_line
 from psfdae.own_stars.photometry import FluxModel
 
-FORMAT_VERSION = 2  # raised when an older psfdae could no longer read what a newer one writes
-# Fields that one format has alone: the first knows no method but the network.
-ONLY = {1: ("dae", "image_scale"), 2: ("method", "reference")}
+FORMAT_VERSION = 3  # raised when an older psfdae could no longer read what a newer one writes
+# A network says its shape, other methods what they are; the first format knows only networks, the
+# second only others.
+NETWORK, OTHERS = ("dae", "image_scale"), ("method", "reference")
 SUFFIX = ".psf.safetensors"
 SHIPPED = "wfsat"  # name of the bundle that comes with the package
 FRAMING = "brightest pixel at (d/2, d/2)"  # 0-based (row, column) in stamps of side d, unjittered
@@ -46,11 +47,14 @@ KIND = "psfdae bundle"
 
 COMPLETED_PX = 32**2  # pixels of the largest stamps whose covariance gets a whole basis
 LARGEST = 2**28  # bytes; a bundle of stamps of 256 × 256 pixels has some 20 MB
+BRIGHT = 20 / 256  # part of the pixels that counts as bright
 TOLERANCE = 1e-3  # by which the mean PSF may miss the sum 1, and eigenvectors orthonormality
 VARIANCE = 1e6  # largest variance of images of sum 1 that is no nonsense
+# Arrays of S nodes that a bundle may lack, and the shape of their rows.
+SCALES = {"scale68": (4, 2), "scale95": (4, 2), "flux_error_scale": ()}
+FREE = {"ratio95": (), "strange_limit": (), "widening": (7,), **SCALES}
 # Arrays of float64; the others are float32.
-DOUBLE = {"flux/variance", "flux/rest", "noise_nodes", "distance_limit"}
-DOUBLE |= {"ratio95", "strange_limit", "widening"}
+DOUBLE = {"flux/variance", "flux/rest", "noise_nodes", "distance_limit", *FREE}
 
 Positive = Annotated[float, Field(gt=0)]
 Count = Annotated[int, Field(ge=1)]
@@ -98,8 +102,8 @@ class BundleInfo(_Described):
 
     Noise is the RMS of the sky noise in a pixel divided by the flux of the star
     inside its stamp, κλ in the words of the simulation. The signal to noise ratio is
-    that of a matched filter on the mean PSF, 1 / (noise · √A), with the
-    noise-equivalent area A (King 1983, PASP 95, 163).
+    that of a filter matched to the star, 1 / (noise · √A), with the noise-equivalent
+    area A (King 1983, PASP 95, 163) of the typical star of the training.
     """
 
     format_version: Count = FORMAT_VERSION
@@ -121,7 +125,7 @@ class BundleInfo(_Described):
     noise_max: Positive
     snr_min: Positive
     snr_max: Positive
-    noise_equivalent_px: Positive = Field(description="A = 1 / Σ(mean PSF)²")
+    noise_equivalent_px: Positive = Field(description="A = 1 / ΣPSF² of the typical star")
     components: Annotated[int, Field(ge=1, le=1024)] = Field(
         description="leading eigenvectors: stored, and in the distance"
     )
@@ -139,22 +143,13 @@ class BundleInfo(_Described):
     config: dict[str, Any] = Field(description="resolved configuration of all stages")
     metrics: list[dict[str, float]] = Field(description="errors of the test stars by noise level")
 
-    @model_validator(mode="before")
-    @classmethod
-    def _format(cls, given: Any) -> Any:
-        """A new one is of the first format that can say what it is."""
-        if isinstance(given, Mapping) and "format_version" not in given:
-            return {**given, "format_version": 1 if "dae" in given else 2}
-        return given
-
     @model_validator(mode="after")
     def _of_its_format(self) -> BundleInfo:
-        first, (network, named) = self.format_version == 1, ONLY.values()
-        given = [key for key in (*network, *named) if key in self.model_fields_set]
-        wanted = network if first else named
+        wanted = {1: NETWORK, 2: OTHERS}.get(self.format_version, NETWORK if self.dae else OTHERS)
+        given = [key for key in (*NETWORK, *OTHERS) if key in self.model_fields_set]
         if sorted(given) != sorted(wanted) or any(getattr(self, key) is None for key in wanted):
             raise ValueError(f"format {self.format_version} has {' and '.join(wanted)}")
-        if not (first or (self.kappa > 0 and isfinite(self.kappa))):
+        if not (self.dae or (self.kappa > 0 and isfinite(self.kappa))):
             raise ValueError("config.train.noise.kappa: must be above 0, methods are told λ by it")
         return self
 
@@ -164,7 +159,7 @@ class BundleInfo(_Described):
         try:
             return float(self.config["train"]["noise"]["kappa"])
         except (LookupError, TypeError, ValueError):
-            return 1.0 if self.format_version == 1 else 0.0  # the network is told no λ
+            return 1.0 if self.dae else 0.0  # the network is told no λ
 
     @property
     def scale_assumed(self) -> bool:
@@ -176,7 +171,7 @@ class BundleInfo(_Described):
 
     def described(self) -> dict[str, Any]:
         """What a file of its format says."""
-        other = {*ONLY[2 if self.format_version == 1 else 1], *(() if self.misfit else ("misfit",))}
+        other = {*(OTHERS if self.dae else NETWORK), *(() if self.misfit else ("misfit",))}
         return self.model_dump(mode="json", exclude=other)
 
 
@@ -192,17 +187,31 @@ class Bundle:
     error68: np.ndarray  # (S, d, d), half-width of 68.27 %
     rms: np.ndarray  # (S, d, d), root mean square
     distance_limit: float  # 99.9 % quantile of the distance of test stars (`mahalanobis`)
-    ratio95: np.ndarray | None = None  # (S,), error68 times this holds 95 %; not in format 1
+    ratio95: np.ndarray | None = None  # (S,), error68 times this holds 95 %
     # (S,), 99.9 % quantile of `Method.strangeness`, if the method knows it
     strange_limit: np.ndarray | None = None
-    # (S, 7), by how much 68 % and 95 % of the errors are wider than that where the noise is
-    # estimated, the flux, too, and the sky; then the scatter of the flux over its error
+    # (S, 4, 2), by how much 68 % and 95 % of the errors are wider than that where everything is
+    # known, the noise is estimated, the flux, too, and the sky; of faint and of bright pixels
+    # (`brightest`)
+    scale68: np.ndarray | None = None
+    scale95: np.ndarray | None = None
+    flux_error_scale: np.ndarray | None = None  # (S,), scatter of the flux over its error
+    # (S, 7), what format 2 had in their place: 68 % and 95 % from the second case on, of all
+    # pixels; then the flux
     widening: np.ndarray | None = None
 
     @property
     def sha256(self) -> str:
         """Checksum of everything but the date."""
         return _digest(self.info.described(), _tensors(self))
+
+    def scales(self) -> list[np.ndarray] | None:
+        """`scale68`, `scale95` and `flux_error_scale`, of any format that has them."""
+        old = self.widening
+        if old is None:
+            return None if self.scale68 is None else [getattr(self, name) for name in SCALES]
+        both = (np.insert(old[:, column:6:2], 0, 1.0, axis=1) for column in (0, 1))
+        return [*(np.stack([scale, scale], axis=2) for scale in both), old[:, 6]]
 
 
 def estimator(bundle: Bundle) -> Method:
@@ -215,7 +224,7 @@ def estimator(bundle: Bundle) -> Method:
     """
     info = bundle.info
     found = method(info.method)
-    if info.format_version == 1:
+    if info.dae:
         return found.unpack(bundle.weights, info)
     # Their shapes are the method's own affair: it must be able to work with them.
     blank = np.zeros((1, info.stamp_px, info.stamp_px), np.float32)
@@ -257,6 +266,13 @@ def at_noise(noise: np.ndarray, nodes: np.ndarray, maps: np.ndarray) -> np.ndarr
     upper = np.minimum(lower + 1, len(nodes) - 1)
     share = (place - lower).astype(maps.dtype)[:, None, None]
     return maps[lower] * (1 - share) + maps[upper] * share
+
+
+def brightest(psf: np.ndarray) -> np.ndarray:
+    """The brightest pixels of stars (n, d, d), `BRIGHT` of them each, as a mask."""
+    flat = psf.reshape(len(psf), -1)
+    dimmer = flat.shape[1] - max(1, round(BRIGHT * flat.shape[1]))
+    return psf >= np.partition(flat, dimmer, axis=1)[:, dimmer, None, None]
 
 
 def mahalanobis(
@@ -350,7 +366,7 @@ def _tensors(bundle: Bundle) -> dict[str, np.ndarray]:
         "error68": bundle.error68,
         "rms": bundle.rms,
     }
-    free = {name: getattr(bundle, name) for name in ("ratio95", "strange_limit", "widening")}
+    free = {name: getattr(bundle, name) for name in FREE}
     arrays |= {name: values for name, values in free.items() if values is not None}
     ours = {name: np.asarray(value, _dtype(name), order="C") for name, value in arrays.items()}
     # The method's own are as they are.
@@ -389,9 +405,7 @@ def read_bundle(path: Path | None = None) -> Bundle:
         flux_model=_completed(tensors),
         **{name: tensors[name] for name in ("noise_nodes", "error68", "rms")},
         distance_limit=float(tensors["distance_limit"]),
-        ratio95=tensors.get("ratio95"),
-        strange_limit=tensors.get("strange_limit"),
-        widening=tensors.get("widening"),
+        **{name: tensors.get(name) for name in FREE},
     )
 
 
@@ -464,9 +478,11 @@ def _check(info: BundleInfo, tensors: Mapping[str, np.ndarray], path: Path) -> N
         "distance_limit": (),
     }
     if info.format_version > 1:
-        free = {"strange_limit": (nodes,), "widening": (nodes, 7)}
-        expected |= {name: shape for name, shape in free.items() if name in tensors}
-        expected["ratio95"] = (nodes,)
+        wanted = {"ratio95", *(SCALES if set(SCALES) & set(tensors) else ())}
+        wanted |= set(FREE) & set(tensors) - set(
+            SCALES if info.format_version < 3 else ("widening",)
+        )
+        expected |= {name: (nodes, *FREE[name]) for name in wanted}
     expected |= _of_method(info, tensors, path)
     if set(tensors) != set(expected):
         name = min(set(tensors) ^ set(expected))
@@ -474,7 +490,7 @@ def _check(info: BundleInfo, tensors: Mapping[str, np.ndarray], path: Path) -> N
         raise BundleError(f"{path}: array {name!r} is {state}")
     for name, shape in expected.items():
         array, dtype = tensors[name], _dtype(name)
-        free = info.format_version > 1 and name.startswith(f"{info.method}/")
+        free = not info.dae and name.startswith(f"{info.method}/")
         if array.dtype != dtype and not (
             free and array.dtype in (np.float16, np.float64, np.int64)
         ):

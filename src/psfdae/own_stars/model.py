@@ -18,6 +18,7 @@ from psfdae.own_stars.bundle import (
     Bundle,
     BundleInfo,
     at_noise,
+    brightest,
     estimator,
     mahalanobis,
     read_bundle,
@@ -29,6 +30,7 @@ from psfdae.own_stars.stamps import (
     Stamps,
     StarFlag,
     border_median,
+    border_scatter,
     cut,
     displacement,
     raise_flag,
@@ -37,6 +39,7 @@ from psfdae.threads import side_by_side
 
 SCALE_TOLERANCE = 0.02  # relative difference of the pixel scale from that of the training
 SNR_TOLERANCE = 1.25  # beyond the trained S/N without a flag: a faint star's is no better known
+SKY_SIGMA = 5.0  # scatter of the border by which its median may differ from a sky that is given
 FLUX_FACTOR = (0.5, 2.0)  # by which a method may correct the flux of a star
 BLOCK = 256  # stars that a network computes together, always so many: other numbers round otherwise
 MOST_OVERSAMPLED = 32  # values per pixel and axis
@@ -317,6 +320,8 @@ class Engine:
         exact = fixed & np.isfinite(stars.listed).all(axis=1)
         stamps, bad, shift, flags = self._centred(stars, exact)
         start = border_median(stamps, bad)
+        unlike_sky = np.abs(start - stars.background) > SKY_SIGMA * border_scatter(stamps)
+        raise_flag(flags, StarFlag.SKY_OFF, unlike_sky)
         found = self._photometer.measure(stamps, bad, start, stars)
         told: dict[str, np.ndarray] = {}
         if self.estimator.measures:
@@ -330,7 +335,8 @@ class Engine:
             psf, sigma, found = self._estimate(found, free, lost)
         noise = found.noise / np.where(lost, np.nan, found.flux)
         shapes = measure_shapes(psf)
-        snr = 1.0 / (noise * info.noise_equivalent_px**0.5)
+        snr = np.sqrt(np.square(psf, dtype=np.float64).sum(axis=(1, 2))) / noise
+        doubt = None if sigma is None else sigma * found.flux[:, None, None]
         distance = mahalanobis(found.images, noise, bundle.flux_model, info.components)
         flux = found.flux.astype(np.float32)[:, None, None]
         uncertainty = at_noise(noise, bundle.noise_nodes, bundle.error68)
@@ -339,10 +345,12 @@ class Engine:
         ratio95 = np.full(len(noise), np.nan)
         if bundle.ratio95 is not None:
             ratio95 = np.interp(noise, bundle.noise_nodes, bundle.ratio95)
-        if bundle.widening is not None:
-            wider, widest, of_flux = self._widening(noise, stars)
-            uncertainty *= wider.astype(np.float32)[:, None, None]
-            ratio95 *= widest / wider
+        ratios = np.stack([ratio95, ratio95], axis=1)
+        if (tables := bundle.scales()) is not None:
+            wider, widest, of_flux = self._scales(tables, noise, stars)
+            faint, bright = wider.T.astype(np.float32)[:, :, None, None]
+            uncertainty *= np.where(brightest(psf), bright, faint)
+            ratios *= widest / wider
             found = replace(found, flux_error=found.flux_error * of_flux)
         psf *= flux
         uncertainty *= flux
@@ -350,7 +358,9 @@ class Engine:
         residual[~found.used] = np.nan
         flags |= found.flags
         raise_flag(flags, StarFlag.SNR_LOW, snr < info.snr_min / SNR_TOLERANCE)
-        raise_flag(flags, StarFlag.SNR_HIGH, snr > info.snr_max * SNR_TOLERANCE)
+        # What measures stars knows their noise, and comes ever nearer to the star itself.
+        limited = not self.estimator.measures
+        raise_flag(flags, StarFlag.SNR_HIGH, limited & (snr > info.snr_max * SNR_TOLERANCE))
         unlike, strangeness = distance > bundle.distance_limit, np.full(len(noise), np.nan)
         if bundle.strange_limit is not None and not lost.all():
             level = noise[~lost] / info.kappa
@@ -366,13 +376,14 @@ class Engine:
             psf=psf,
             residual=residual,
             uncertainty=uncertainty,
-            ratio95=ratio95,
+            ratio95=ratios[:, 0],
+            ratio95_bright=ratios[:, 1],
             flux=found.flux,
             flux_error=np.sqrt(found.flux_error**2 + photons),
             background=found.background,
             noise=found.noise,
             snr=snr,
-            chi2=_chi2(residual, psf, found.noise, stars.gain),
+            chi2=_chi2(residual, psf, doubt, found.noise, stars.gain),
             distance=distance,
             strangeness=strangeness,
             fwhm_px=shapes.fwhm_px,
@@ -384,21 +395,30 @@ class Engine:
             **(told or unmeasured(len(stars))),
         )
 
-    def _widening(self, noise: np.ndarray, stars: Stamps) -> tuple[np.ndarray, ...]:
-        """Factors of the half-widths of 68 % and 95 % and of the error of the flux, each (n,).
+    def _scales(
+        self, tables: list[np.ndarray], noise: np.ndarray, stars: Stamps
+    ) -> tuple[np.ndarray, ...]:
+        """Factors of the half-widths of 68 % and 95 %, (n, 2), and of the error of the flux, (n,).
 
         They are those of what was estimated: the noise, the flux, the sky.
         """
-        nodes, table = self.bundle.noise_nodes, self.bundle.widening
-        assert table is not None
-        *widths, of_flux = (np.interp(noise, nodes, factor) for factor in table.T)
+        nodes = self.bundle.noise_nodes
         noise_too, flux_too, sky_too = (
             np.isnan(known) for known in (stars.noise, stars.flux, stars.background)
         )
-        case = np.where(sky_too, 2, np.where(flux_too, 1, 0))
+        case, star = np.where(sky_too, 3, np.where(flux_too, 2, 1)), np.arange(len(noise))
+
+        def at(table: np.ndarray) -> np.ndarray:
+            """A table (S, …) at the noise of each star."""
+            columns = table.reshape(len(nodes), -1).T
+            found = np.stack([np.interp(noise, nodes, column) for column in columns], axis=1)
+            return found.reshape(-1, *table.shape[1:])
+
+        *widths, of_flux = map(at, tables)
+        # What the estimated noise has for its part is between the first two cases.
         wider, widest = (
-            np.choose(case, of) / np.where(noise_too, 1.0, of[0])
-            for of in (widths[::2], widths[1::2])
+            np.where(noise_too[:, None], t[star, case], t[star, case] * t[:, 0] / t[:, 1])
+            for t in widths
         )
         return wider, widest, np.where(flux_too & sky_too, of_flux, 1.0)
 
@@ -523,19 +543,34 @@ class Engine:
         return stamps, bad | saturated, shift, flags
 
 
-def _chi2(residual: np.ndarray, psf: np.ndarray, noise: np.ndarray, gain: np.ndarray) -> np.ndarray:
-    """Mean of the squared residuals in units of their σ over the pixels that are not NaN."""
-    variance = (noise**2).astype(np.float32)[:, None, None]
+def _chi2(
+    residual: np.ndarray,
+    psf: np.ndarray,
+    doubt: np.ndarray | None,
+    noise: np.ndarray,
+    gain: np.ndarray,
+) -> np.ndarray:
+    """Σ residual²/v over what is expected of it, of the pixels that are not NaN; v is noise.
+
+    A restored star follows its own noise where it is bright. If the method has a `doubt` u (n, d,
+    d) of its pixels in a noise of the mean variance s, it leaves the part k = 1 − u²/s of what
+    noise does to each, and Σ (s k + k² (v − s))/v is expected; else the number of pixels is.
+    """
+    variance = np.broadcast_to((noise**2)[:, None, None], residual.shape)
     if np.isfinite(gain).any():
-        per_electron = np.where(gain > 0, 1.0 / gain, 0.0).astype(np.float32)[:, None, None]
+        per_electron = np.where(gain > 0, 1.0 / gain, 0.0)[:, None, None]
         variance = variance + np.maximum(psf, 0.0) * per_electron
-    squares = (residual**2 / variance).reshape(len(residual), -1)
-    used = np.isfinite(squares)
-    if not used.all():
-        squares = np.where(used, squares, 0.0)
-    count = used.sum(axis=1)
-    total = squares.sum(axis=1, dtype=np.float64)
-    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+    used = np.isfinite(residual) & np.isfinite(variance)
+    expected = np.ones(residual.shape)
+    if doubt is not None:
+        even = variance.mean(axis=(1, 2), keepdims=True)
+        left = np.clip(1.0 - doubt.astype(np.float64) ** 2 / even, 0.0, 1.0)
+        expected = left * (even + left * (variance - even)) / variance
+    found, wanted = (
+        np.where(used, values, 0.0).sum(axis=(1, 2), dtype=np.float64)
+        for values in (residual**2 / variance, expected)
+    )
+    return np.where(used.any(axis=(1, 2)), found / np.where(wanted > 0, wanted, np.inf), np.nan)
 
 
 def _filled(stars: Stamps, bundle: Bundle, size: int) -> Stamps:

@@ -33,12 +33,17 @@ from psfdae.own_stars.images import (
     find_image,
     open_pixels,
 )
-from psfdae.own_stars.stamps import Stamps, StarFlag, cut, raise_flag
+from psfdae.own_stars.stamps import Stamps, StarFlag, cut, raise_flag, sky_around
 
 FAR = 2**30  # positions are clipped to ± this many pixels, far off any image
 NEAR = 1.0  # stars farther off by this many image sizes are not corrected for distortion
 ASSUMED_SCALE = 1.0  # arcseconds per pixel where nothing says it
+FARTHEST_OFF = 1.0  # px, per axis, of the stars of a list from its positions, in the median
+FEWEST_OFF = 5  # stars of which that is said
 SEEN = 2.0  # σ above the sky from which a position of a list is on a source
+COLOURS = (3, 4)  # planes of a colour image, the fourth for luminance or transparency
+LARGEST_STAMP_PX = 256  # of a model; a margin of stamps is small beside it
+RING_PX = 8  # around a stamp, at least: there the noise of the sky is that of no star
 SAME_PX = 0.1  # nearer to each other than this, two rows of a list are one star
 
 
@@ -62,6 +67,7 @@ class Source:
     saturate: float | None = None  # counts
     flux_column: str | None = None  # of the catalogue: fluxes that are not to be estimated
     background_column: str | None = None  # the same for sky levels per pixel
+    accept_offset: bool = False  # of the catalogue's positions from the stars
 
     def files(self) -> tuple[Any, ...]:
         """All that is read."""
@@ -131,6 +137,7 @@ class Source:
 
     def _is_cube(self, image: ImageFile, stamp_px: int) -> bool:
         shape = image.shape
+        _refuse_colours(image, self.detect is not None)
         if len(shape) == 2 and (self.catalogue is not None or self.detect is not None):
             return False
         square = shape[-2] == shape[-1] >= stamp_px
@@ -251,6 +258,23 @@ class Source:
         return table.numbers(name)
 
 
+def _refuse_colours(image: ImageFile, searched: bool) -> None:
+    """Refuse an image with a plane for each colour; a few large planes are no stamps of stars."""
+    shape = image.shape
+    if len(shape) != 3:
+        return
+    first, last = shape[0] in COLOURS, shape[-1] in COLOURS
+    stamps = shape[-2] == shape[-1] <= LARGEST_STAMP_PX and not searched
+    if last or (first and not stamps):
+        plane, size = ("[0]", shape[1:]) if first else ("[..., 0]", shape[:-1])
+        raise ObservationError(
+            image.path,
+            f"{shape[0] if first else shape[-1]} planes of {size[0]}×{size[1]} pixels, as of a "
+            "colour image; a PSF belongs to one colour: write one plane to a file of its own, "
+            f"such as astropy.io.fits.getdata(…){plane}, or their sum",
+        )
+
+
 def _check_overlap(image: ImageFile, table: Catalogue, positions: np.ndarray) -> None:
     rows, columns = image.shape
     found = np.count_nonzero(_inside(positions, image.shape))
@@ -273,6 +297,29 @@ def _check_overlap(image: ImageFile, table: Catalogue, positions: np.ndarray) ->
         f"none of the {len(table)} stars is on the image {image.path} of {columns} columns "
         f"and {rows} rows; they are {ranges}",
     )
+
+
+def list_offset(path: Path | None, off: np.ndarray, accept: bool) -> str | None:
+    """What is said of a list of which the stars are `off` (n, 2), x and y, its positions.
+
+    Rows that are not known are left out; None if there are few, or no list. ObservationError says
+    that they are farther off than `FARTHEST_OFF`, unless that is to be accepted.
+    """
+    known = off[~np.isnan(off).any(axis=1)]
+    if path is None or len(known) < FEWEST_OFF:
+        return None
+    (x, y), distance = np.median(known, axis=0), np.median(np.abs(known), axis=0)
+    said = (
+        f"stars are off its positions by x {x:+.2f}, y {y:+.2f} px in the median, half of them "
+        f"by more than {distance[0]:.2f}, {distance[1]:.2f} px either way ({len(known)} stars)"
+    )
+    if (distance > FARTHEST_OFF).any() and not accept:
+        raise ObservationError(
+            path,
+            f"{said}: a list of another image or origin, or x and y exchanged? --accept-offset "
+            "takes it as it is",
+        )
+    return f"{path}: {said}"
 
 
 def _inside(positions: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
@@ -474,17 +521,23 @@ class Observation:
         self, part: slice, pixels: Pixels, mask: Pixels | None, noise: Pixels | None
     ) -> tuple[np.ndarray, ...]:
         x, y = self.positions[part].T
-        where = (self.shape, x, y, self.stamp_px, self.margin)
+        wide = max(self.margin, RING_PX)
+        where = (self.shape, x, y, self.stamp_px, wide)
         data, inside, truncated = cut_image(pixels, *where)
-        masked, level = ~inside, np.full(len(data), np.nan)
+        masked = ~inside
         if mask is not None:
             masked |= self._layers.bad(cut_image(mask, *where)[0])
+        own = slice(wide - self.margin, wide + self.stamp_px + self.margin)
         if noise is not None:
             sigma = self._layers.sigma(cut_image(noise, *where)[0])
             masked |= np.isnan(sigma)
-            each = np.ma.array(sigma, mask=masked)
+            each = np.ma.array(sigma, mask=masked)[:, own, own]
             level = np.ma.median(each, axis=(1, 2)).filled(np.nan).astype(float)
-        return data, masked, truncated, level
+        else:
+            # In the stamp of a bright star, light that no PSF explains would pass for noise.
+            _, level = sky_around(data, masked | ~np.isfinite(data), self.stamp_px)
+            level = np.where(level > 0, np.maximum(level, self.least_noise), np.nan)
+        return data[:, own, own], masked[:, own, own], truncated, level
 
     def _stamps(
         self,

@@ -7,8 +7,9 @@ bundle carries both, and by how much the interval that holds 95 % is wider. Wher
 method says how sure it is of every pixel, all of them are in units of that: they
 correct its σ, which knows the star, by what came true.
 
-All this is for known flux and sky. Where these are estimates, errors are larger and of another
-distribution: two factors per node, of the same stars, make up for it.
+All this is for known flux and sky, and for all pixels alike. Where these are estimates, errors are
+larger, and where a star is bright they are of another distribution: factors per node, for the
+brightest pixels and for the others, make up for it (`with_scales`).
 """
 
 from __future__ import annotations
@@ -23,9 +24,16 @@ from typing import Any
 import numpy as np
 
 from psfdae.estimators import Estimate, Method
-from psfdae.own_stars.bundle import Bundle, BundleError, at_noise, mahalanobis
+from psfdae.own_stars.bundle import (
+    SCALES,
+    Bundle,
+    BundleError,
+    at_noise,
+    brightest,
+    mahalanobis,
+)
 from psfdae.own_stars.model import SNR_TOLERANCE, PsfModel
-from psfdae.own_stars.photometry import FluxModel, noise_equivalent_px, signal_to_noise
+from psfdae.own_stars.photometry import FluxModel, signal_to_noise
 from psfdae.stars.noise import NoiseModel
 
 NODES = 8  # noise levels at which errors are measured, equidistant in the logarithm
@@ -33,11 +41,12 @@ COMPONENTS = 48  # leading eigenvectors that a bundle stores
 COVERAGE = 0.6827  # part of the errors within ± `error68`; of a normal variable within ± 1 σ
 WIDE = 0.95  # part of them within ± `error68` times `ratio95`
 LEAST_SIGMA = 1e-12  # of the flux; equal stars leave a method no doubt
+CASES = 4  # nothing is estimated; the noise is, and the flux, and the sky
 NORMAL_WIDE = 1.96  # σ within which a normal variable has as much
 LIMIT = 0.999  # part of the test stars within the limit of the Mahalanobis distance
 STEPS = 64  # of the noise up to that of the flux in every pixel, of a model that is to be small
 LEAST_STARS = 2000  # noisy images per node; few test stars are seen several times with new noise
-FEW_STARS = 500  # of them, for a choice
+FEW_STARS = 500  # of them, for a choice, and where all pixels of a brightness are one number
 
 Restore = Callable[[np.ndarray, float], Estimate]
 """The method: normalised noisy images (n, d, d) of a noise level λ to PSFs."""
@@ -142,9 +151,8 @@ def leading(model: FluxModel, components: int) -> FluxModel:
     return replace(model, variance=variance)
 
 
-def reach(band: np.ndarray, mean: np.ndarray) -> dict[str, float]:
-    """Range of noise and S/N of a training, from its noise levels σ and its mean PSF."""
-    area = noise_equivalent_px(mean)
+def reach(band: np.ndarray, area: float) -> dict[str, float]:
+    """Range of noise and S/N of a training, from its noise levels σ and its stars' area A in px."""
     least, most = float(band.min()), float(band.max())
     return {
         "noise_min": least,
@@ -163,7 +171,7 @@ def measure_errors(
     rng: np.random.Generator,
 ) -> Errors:
     """Errors and distances of noisy test stars at every node (S,), pixel RMS over the flux."""
-    star = np.tile(np.arange(len(stars.images)), -(-LEAST_STARS // len(stars.images)))
+    star = _repeated(len(stars.images), LEAST_STARS)
     error = np.empty((len(nodes), star.size, *stars.images.shape[1:]), np.float32)
     distance = np.empty((len(nodes), star.size))
     strangeness, free = [], fitted.free_flux()
@@ -187,38 +195,63 @@ def errors_of(estimate: Estimate, references: np.ndarray) -> np.ndarray:
     return error if estimate.sigma is None else error / np.maximum(estimate.sigma, LEAST_SIGMA)
 
 
-def with_photometry(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -> Bundle:
-    """The bundle with the `misfit` and the `widening` of a method that does not measure stars.
-
-    No training must have seen them: where noise is far below the errors that a method makes on
-    other stars, those on its own tell neither.
-    """
-    bundle = replace(
-        bundle, info=bundle.info.model_copy(update={"misfit": misfit(bundle, stars, rng)})
+def calibrated(
+    bundle: Bundle, fitted: Method, stars: HeldOutStars, rng: np.random.Generator
+) -> tuple[Bundle, Errors]:
+    """The bundle of a method with all that these stars say of its errors, and these errors."""
+    errors = measure_errors(stars, fitted, bundle.flux_model, bundle.noise_nodes, rng)
+    found = replace(
+        bundle,
+        error68=errors.half_width(),
+        rms=errors.rms(),
+        distance_limit=errors.distance_limit(),
+        ratio95=errors.ratio95(),
+        strange_limit=errors.strange_limit(),
+        **dict.fromkeys((*SCALES, "widening")),
     )
+    return with_scales(found, stars, rng), errors
+
+
+def with_scales(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -> Bundle:
+    """The bundle with its `misfit`, and with what flux, sky and brightness do to its errors.
+
+    No training must have seen the stars: where noise is far below the errors that a method makes
+    on other stars, those on its own tell neither.
+    """
+    info = bundle.info.model_copy(update={"misfit": misfit(bundle, stars, rng)})
+    bundle = replace(bundle, info=info)
     model, nodes = PsfModel(bundle), bundle.noise_nodes
-    cases = ({"flux": 1.0, "background": 0.0}, {"background": 0.0}, {})
-    found = np.ones((len(cases), len(nodes), 4))  # noise, half-widths, and scatter of the flux
+    noise = np.tile(nodes, (CASES, 1))
+    width, of_flux = np.ones((2, CASES, 2, len(nodes))), np.ones(len(nodes))
     for place, node in enumerate(nodes):
-        noisy, star = _noisy(stars, node, LEAST_STARS, rng)
-        for row, known in enumerate(cases):
-            told = model.predict(noisy, **known)
+        noisy, star = _noisy(stars, node, rng)
+        known = [("noise", node), ("flux", 1.0), ("background", 0.0)]
+        for case in range(CASES):
+            told = model.predict(noisy, position=stars.position[star], **dict(known[case:]))
             usable = np.isfinite(told.psf).all(axis=(1, 2))
             if not usable.any():
-                found[row, place, 0] = node
                 continue
+            noise[case, place] = np.median((told.noise / told.flux)[usable])
             error = np.abs(told.psf - stars.references[star])[usable]
             error /= np.maximum(told.uncertainty[usable], LEAST_SIGMA)
-            noise = np.median((told.noise / told.flux)[usable])
-            scatter = np.abs(told.flux - 1.0)[usable] / told.flux_error[usable]
             wide = error / told.ratio95[usable, None, None]
-            widths = np.quantile(error, COVERAGE), np.quantile(wide, WIDE)
-            found[row, place] = noise, *widths, np.quantile(scatter, WIDE) / NORMAL_WIDE
+            bright = brightest(told.psf[usable])
+            for pixels, kind in ((~bright, 0), (bright, 1)):
+                width[0, case, kind, place] = np.quantile(error[pixels], COVERAGE)
+                width[1, case, kind, place] = np.quantile(wide[pixels], WIDE)
+            # A method that measures stars knows how sure it is of their flux.
+            if case == CASES - 1 and not model.engine.estimator.measures:
+                scatter = np.abs(told.flux - 1.0)[usable] / told.flux_error[usable]
+                of_flux[place] = np.quantile(scatter, WIDE) / NORMAL_WIDE
     # Where a star has light that the photometry does not know, its noise is found too large.
-    noise = np.maximum.accumulate(found[..., 0], axis=1)
-    wanted = [(row, column) for row in range(len(cases)) for column in (1, 2)] + [(2, 3)]
-    columns = [np.interp(nodes, noise[row], found[row, :, column]) for row, column in wanted]
-    return replace(bundle, widening=np.stack(columns, axis=1))
+    noise = np.maximum.accumulate(noise, axis=1)
+    for case, kind, part in np.ndindex(CASES, 2, 2):
+        width[part, case, kind] = np.interp(nodes, noise[case], width[part, case, kind])
+    return replace(
+        bundle,
+        **dict(zip(("scale68", "scale95"), width.transpose(0, 3, 1, 2), strict=True)),
+        flux_error_scale=np.interp(nodes, noise[-1], of_flux),
+    )
 
 
 def misfit(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -> float:
@@ -230,11 +263,11 @@ def misfit(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -> flo
     nodes, errors = bundle.noise_nodes, []
     some = {name: getattr(stars, name)[:FEW_STARS] for name in ("images", "references", "position")}
     few = replace(stars, **some)
-    noisy = [_noisy(few, node, FEW_STARS, rng) for node in nodes[: len(nodes) // 2]]
+    noisy = [_noisy(few, node, rng) for node in nodes[: len(nodes) // 2]]
     tried = (0.0, *nodes)
     for value in tried:
         model = PsfModel(replace(bundle, info=bundle.info.model_copy(update={"misfit": value})))
-        if model.engine.free_flux is model.engine.estimator:
+        if model.engine.free_flux is model.engine.estimator or model.engine.estimator.measures:
             break
         told = [(model.predict(images), stars.references[star]) for images, star in noisy]
         logs = [
@@ -248,11 +281,16 @@ def misfit(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -> flo
 
 
 def _noisy(
-    stars: HeldOutStars, noise: float, least: int, rng: np.random.Generator
+    stars: HeldOutStars, noise: float, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """At least so many noisy images (n, d, d) of flux 1, and which stars they show, (n,)."""
-    star = np.tile(np.arange(len(stars.images)), -(-least // len(stars.images)))
+    """At least `FEW_STARS` noisy images (n, d, d) of flux 1, and which stars they show, (n,)."""
+    star = _repeated(len(stars.images), FEW_STARS)
     return stars.noise.draw(stars.images[star], noise / stars.noise.kappa, rng), star
+
+
+def _repeated(count: int, least: int) -> np.ndarray:
+    """Numbers of so many stars, over and over if they are few."""
+    return np.resize(np.arange(count), max(count, least))
 
 
 def measure_levels(

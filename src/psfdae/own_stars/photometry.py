@@ -123,9 +123,14 @@ class FluxModel:
         return replace(self, basis=basis, variance=np.maximum(variance, 0.0))
 
 
-def noise_equivalent_px(mean: np.ndarray) -> float:
-    """Noise-equivalent area A = 1/Σm² of a PSF m of sum 1 (King 1983, PASP 95, 163)."""
-    return 1.0 / float(np.square(mean, dtype=np.float64).sum())
+def noise_equivalent_px(psf: np.ndarray) -> float:
+    """Noise-equivalent area A = 1/Σp² in pixels of a PSF p of sum 1 (King 1983, PASP 95, 163).
+
+    Of several, shape (n, d, d), that of their mean Σp². The mean of their images would be wider
+    than each of them, because they lie at different places in their stamps.
+    """
+    count = len(psf) if psf.ndim == 3 else 1
+    return count / float(np.square(psf, dtype=np.float64).sum())
 
 
 def signal_to_noise(noise: float, area: float) -> float:

@@ -45,20 +45,23 @@ class Prediction:
     residual : ndarray, shape (n, d, d), float32
         Stamp − sky − `psf`; NaN in pixels that were not used.
     uncertainty : ndarray, shape (n, d, d), float32
-        Half-width that holds 68.27 % of the errors of `psf` at this S/N, as found on
-        the test stars of the model; in units of the star's own σ where the model knows it.
-    ratio95 : ndarray, shape (n,), float64
-        `uncertainty` times this holds 95 % of the errors; NaN where the model does not say.
+        Half-width that holds 68.27 % of the errors of `psf` at this S/N, of the brightest
+        pixels (`psfdae.own_stars.bundle.brightest`) and of the others, as found on test stars.
+    ratio95, ratio95_bright : ndarray, shape (n,), float64
+        `uncertainty` times this holds 95 % of the errors, in the brightest pixels the second
+        one; NaN where the model does not say.
     flux, flux_error : ndarray, shape (n,), float64
         Flux inside the stamp, in the unit of the stamps; the error is NaN where the
         flux was given.
     background, noise : ndarray, shape (n,), float64
         Sky level and RMS of the sky noise in a pixel.
     snr : ndarray, shape (n,), float64
-        flux / (noise √A), with the model's noise-equivalent area A.
+        Of a filter matched to the star as restored, √Σ psf² / noise: flux / (noise √A), with
+        its own noise-equivalent area A.
     chi2 : ndarray, shape (n,), float64
-        Mean of (residual / σ)² over the used pixels; σ² is noise² and, if the gain is
-        known, the star's own photon noise.
+        Mean of (residual / σ)² over the used pixels, divided by what is expected of it, which is
+        below 1 where the restored star follows its own noise; σ² is noise² and, if the gain is
+        known, the star's own photon noise. Stars that a model has learnt from have less than 1.
     distance : ndarray, shape (n,), float64
         Mahalanobis distance from the training set (`psfdae.own_stars.bundle.mahalanobis`).
     strangeness : ndarray, shape (n,), float64
@@ -82,6 +85,7 @@ class Prediction:
     residual: np.ndarray
     uncertainty: np.ndarray
     ratio95: np.ndarray
+    ratio95_bright: np.ndarray
     flux: np.ndarray
     flux_error: np.ndarray
     background: np.ndarray
@@ -161,9 +165,10 @@ COLUMNS: dict[str, tuple[str, str | None, str]] = {
     "flux_error": ("D", UNIT, "standard error; NaN if the flux was given"),
     "background": ("D", UNIT, "sky per pixel"),
     "noise": ("D", UNIT, "RMS of the sky noise in a pixel"),
-    "snr": ("D", None, "flux / (noise sqrt(A))"),
+    "snr": ("D", None, "of a matched filter, sqrt(sum of PSF^2) / noise"),
     "ratio95": ("D", None, "UNCERT times this holds 95 % of the errors"),
-    "chi2": ("D", None, "mean squared residual over its variance"),
+    "ratio95_bright": ("D", None, "the same in the brightest 8 % of the pixels"),
+    "chi2": ("D", None, "squared residuals over their expectation"),
     "distance": ("D", None, "Mahalanobis distance from the training set"),
     "strangeness": ("D", None, "its square by the model's own law of stars"),
     "fwhm_px": ("D", "pix", "of the PSF, adaptive moments"),
@@ -263,7 +268,7 @@ def _primary_header(bundle: Bundle, cards: Sequence[Card], history: str) -> Any:
         ("PSFSHA", bundle.sha256, ""),
         ("PSFFORM", info.format_version, "format of the bundle"),
         ("STAMPPX", info.stamp_px, "[pix] side of the stamps"),
-        ("NOISEAPX", info.noise_equivalent_px, "[pix] noise-equivalent area A of the S/N"),
+        ("NOISEAPX", info.noise_equivalent_px, "[pix] noise-equivalent area of a typical star"),
         ("SNRMIN", info.snr_min, "least S/N of the training"),
         ("SNRMAX", info.snr_max, "largest S/N of the training"),
         ("DISTMAX", bundle.distance_limit, "largest distance that raises no flag"),

@@ -35,6 +35,8 @@ SHOWN_STARS = 8
 SIZE_BIAS = 0.02  # of the FWHM, beyond two standard errors
 COVERED = (0.60, 0.76)  # of the errors, where 68 % are stated
 USUAL_CHI2 = (0.8, 1.3)
+CHI2_SNR = (10.0, 100.0, 1000.0)  # between them, below and above, if there are some stars
+SOME_STARS = 5
 FEW_STARS = 20  # held out
 
 
@@ -140,6 +142,8 @@ class Quality:
         PNG of faint held-out stars and what the methods make of them.
     field : Figure, optional
         Map of the PSF, if the stars have positions.
+    facts : sequence of str
+        What the model says of itself (`Method.facts`).
     """
 
     name: str
@@ -155,6 +159,7 @@ class Quality:
     bright: np.ndarray
     strip: bytes
     field: Figure | None
+    facts: Sequence[str] = ()
 
     def has(self, flag: StarFlag) -> np.ndarray:
         """Which stars carry one of these flags."""
@@ -163,6 +168,18 @@ class Quality:
     def usable(self) -> np.ndarray:
         """Stars whose shape means something."""
         return ~self.has(SPOILT) & np.isfinite(self.stars["fwhm_px"])
+
+    def chi2(self) -> dict[str, np.ndarray]:
+        """χ² of stars without a flag that were not learnt from, by words for their S/N."""
+        stars = self.stars
+        fair = (stars["flags"] == 0) & (stars["part"] != "training") & np.isfinite(stars["chi2"])
+        place, found = np.searchsorted(CHI2_SNR, stars["snr"]), {}
+        words = [f"below {CHI2_SNR[0]:g}", *(f"from {edge:g}" for edge in CHI2_SNR)]
+        for index, name in enumerate(words):
+            some = stars["chi2"][fair & (place == index)]
+            if some.size >= SOME_STARS:
+                found[name] = some
+        return found
 
     def sizes(self, snr: float, kind: str) -> np.ndarray:
         """FWHM of the faint held-out stars over that of their bright images, minus 1, (n,)."""
@@ -181,6 +198,7 @@ def quality_page(q: Quality) -> str:
         _picture(errors_figure(q)),
         _png(q.strip),
         "<h2>The PSF over the field</h2>",
+        *(f"<p>{escape(fact)}.</p>" for fact in q.facts),
         _picture(q.field) if q.field else "<p>The stars have no positions.</p>",
         "<h2>Residuals of held-out stars</h2>",
         "<p>Above: restored minus bright image at the S/N given, over all held-out stars. "
@@ -239,8 +257,7 @@ def checks(q: Quality) -> list[tuple[str, str, bool]]:
     images = q.errors.images.iloc[0]
     held = int(q.errors.stars.iloc[0])
     bias, error = float(np.median(size)), 1.25 * float(size.std()) / np.sqrt(min(held, images))
-    chi2 = q.stars["chi2"][q.stars["flags"] == 0]
-    usual = float(np.median(chi2)) if chi2.size else np.nan
+    chi2 = {name: (float(np.median(some)), some.size) for name, some in q.chi2().items()}
     unlike = float(q.has(StarFlag.UNLIKE_TRAINING).mean())
     found = [
         ("Better than one mean PSF?", _by_snr(mean), max(mean.values()) < 1),
@@ -256,9 +273,9 @@ def checks(q: Quality) -> list[tuple[str, str, bool]]:
             all(COVERED[0] < v < COVERED[1] for v in q.coverage.values()),
         ),
         (
-            "χ² of stars without a flag",
-            f"median {usual:.2f} of {chi2.size} stars",
-            USUAL_CHI2[0] < usual < USUAL_CHI2[1],
+            "χ² of stars without a flag that were not learnt from",
+            ", ".join(f"median {v:.2f} at S/N {s} ({n} stars)" for s, (v, n) in chi2.items()),
+            all(USUAL_CHI2[0] < v < USUAL_CHI2[1] for v, _ in chi2.values()),
         ),
         ("Stars unlike the training", f"{100 * unlike:.0f} % of the list", unlike < 0.1),
         ("Stars held out", f"{held}", held >= FEW_STARS),
@@ -378,14 +395,16 @@ def shapes_figure(q: Quality) -> Figure:
 
 @styled
 def chi2_figure(q: Quality) -> Figure:
-    """χ² of all stars against S/N; those with a flag in grey."""
+    """χ² of all stars against S/N; those with a flag in grey, and those that were learnt from."""
     stars, flagged = q.stars, q.stars["flags"] != 0
+    learnt = stars["part"] == "training"
     shown = (stars["chi2"] > 0) & (stars["snr"] > 0)
     figure = new_figure(2.8, layout="constrained")
     axes = figure.add_subplot(xscale="log", yscale="log", xlabel="S/N", ylabel="χ² per pixel")
     for which, color, label in (
         (flagged, "#aaaaaa", "flagged"),
-        (~flagged, SERIES_COLORS[0], "no flag"),
+        (~flagged & learnt, SERIES_COLORS[5], "no flag, learnt from"),
+        (~flagged & ~learnt, SERIES_COLORS[0], "no flag"),
     ):
         axes.plot(stars["snr"][shown & which], stars["chi2"][shown & which], ".", ms=3, color=color,
                   label=label)  # fmt: skip

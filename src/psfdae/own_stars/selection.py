@@ -6,7 +6,6 @@ star of a stamp lies near index (s//2, s//2).
 
 from __future__ import annotations
 
-import warnings
 from collections import Counter
 from dataclasses import dataclass, fields
 from enum import StrEnum
@@ -17,7 +16,7 @@ import numpy as np
 
 from psfdae.own_stars.errors import no_formula
 from psfdae.own_stars.observation import Observation
-from psfdae.own_stars.stamps import Stamps, StarFlag, cut, peaks
+from psfdae.own_stars.stamps import Stamps, StarFlag, cut, peaks, sky_around
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -25,7 +24,6 @@ if TYPE_CHECKING:
     from psfdae.configuration.schema import CalibrationStars, Framing
 
 ROWS = 2048  # stars that are measured at a time
-SKY_CLIP = 3.0  # pixels of the sky this many σ off their median belong to other stars
 REGISTRATION_ROUNDS = 10  # of the windowed centroid; each leaves less than a fifth of the distance
 COMPANIONS = 12  # nearest stars with which a star is compared
 DEFECT = 6.0  # pixels this many σ below the sky are defects; they are raised to that
@@ -79,6 +77,10 @@ class BrightStars:
         """Some of the stars, by a mask or by indices."""
         return BrightStars(*(getattr(self, field.name)[chosen] for field in fields(self)))
 
+    def area(self) -> np.ndarray:
+        """Noise-equivalent area A = (F / (σ S/N))² of each star in pixels, shape (n,)."""
+        return (self.flux / (self.noise * self.snr)) ** 2
+
     def aligned(self) -> np.ndarray:
         """The stars of flux 1, moved to a common centre, index (s//2, s//2); shape (n, s, s)."""
         return moved(self.wide, -self.centre) / self.flux[:, None, None]
@@ -103,7 +105,8 @@ class Candidates:
     snr: np.ndarray
     noise: np.ndarray  # RMS of the sky in counts per pixel
     sky: np.ndarray  # its level, likewise
-    brightest: np.ndarray  # pixel in counts, sky included; -inf off centre
+    brightest: np.ndarray  # pixel of the star in counts, sky included; -inf off centre
+    highest: np.ndarray  # pixel of the stamp, likewise; -inf if none can be used
     verdict: np.ndarray  # a `Verdict` for every star
     bright: BrightStars  # the good ones
 
@@ -145,7 +148,7 @@ def collect(observation: Observation, settings: CalibrationStars, framing: Frami
     side, verdict, noise, snr = framing.stamp_px, found["verdict"], found["noise"], found["snr"]
     row = np.flatnonzero(verdict == Verdict.GOOD)
     if observation.saturate is None:
-        flat = found["brightest"] >= piled_up(found["brightest"], found["sky"], snr * noise)
+        flat = found["highest"] >= piled_up(found["brightest"], found["sky"], snr * noise)
         verdict[flat & (verdict == Verdict.GOOD)] = Verdict.SATURATED
     close = crowded(found["position"], snr * noise, settings.isolation_px, settings.neighbour_ratio)
     verdict[close & (verdict == Verdict.GOOD)] = Verdict.CROWDED
@@ -204,6 +207,7 @@ def _measure(
         "noise": noise,
         "sky": level,
         "brightest": level + np.where(centred, _at(wide, peak), -np.inf),
+        "highest": cut(np.where(chunk.bad, -np.inf, chunk.data), side).max(axis=(1, 2)),
         "verdict": verdict,
     }
     good = verdict == Verdict.GOOD
@@ -217,7 +221,7 @@ def _at(wide: np.ndarray, peak: np.ndarray) -> np.ndarray:
 
 
 def piled_up(brightest: np.ndarray, sky: np.ndarray, brightness: np.ndarray) -> float:
-    """Counts at which the brightest pixels of stars pile up; infinite if they do not.
+    """Counts, of six digits, from which brightest pixels of stars pile up; infinite if none do.
 
     Stars of the same brightness have the same brightest pixels, too. Of those that are cut
     off, the brightest pixel is less of the star than in others.
@@ -238,47 +242,13 @@ def piled_up(brightest: np.ndarray, sky: np.ndarray, brightness: np.ndarray) -> 
     sharpness = height / np.where(brightness > 0, brightness, 1.0)
     if np.median(sharpness[piled]) > PILE_SHARPNESS * np.median(sharpness[others]):
         return np.inf
-    return float(brightest[piled].min())
+    return _rounded_down(float(brightest[piled].min()))
 
 
-def sky_around(wide: np.ndarray, bad: np.ndarray, stamp_px: int) -> tuple[np.ndarray, np.ndarray]:
-    """Median and scatter of the pixels outside the stamps, other stars clipped.
-
-    Without a margin (s < d + 4) the pixels are the outer two rows and columns of
-    the stamp itself; light of the star in them counts as sky then.
-
-    Parameters
-    ----------
-    wide : ndarray, shape (n, s, s)
-    bad : ndarray of bool, shape (n, s, s)
-        Pixels that do not count.
-    stamp_px : int
-        Side d.
-
-    Returns
-    -------
-    level, noise : ndarray, shape (n,)
-        In counts per pixel.
-    """
-    from astropy.stats import sigma_clipped_stats
-
-    side = wide.shape[-1]
-    inner = stamp_px if side >= stamp_px + 4 else side - 4
-    start = side // 2 - inner // 2
-    ring = np.ones((side, side), dtype=bool)
-    ring[start : start + inner, start : start + inner] = False
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # stars off the image have no pixels
-        _, level, noise = sigma_clipped_stats(
-            wide[:, ring],
-            mask=bad[:, ring],
-            sigma=SKY_CLIP,
-            cenfunc="median",
-            stdfunc="mad_std",
-            axis=1,
-        )
-    level, noise = (np.nan_to_num(np.ma.filled(a, np.nan)).astype(float) for a in (level, noise))
-    return level, noise
+def _rounded_down(value: float) -> float:
+    """Six digits, so that a level that is printed is the one that is meant."""
+    unit = 10.0 ** (np.floor(np.log10(value)) - 5) if value > 0 else 1.0
+    return float(f"{np.floor(value / unit * (1 + 1e-12)) * unit:.6g}")
 
 
 def signal_to_noise(stamps: np.ndarray, noise: np.ndarray) -> np.ndarray:

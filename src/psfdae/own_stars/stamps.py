@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, fields
 from enum import IntFlag
 from functools import cache
@@ -51,6 +52,7 @@ class StarFlag(IntFlag):
     OFF_CENTRE = 256
     UNLIKE_TRAINING = 512
     BLENDED = 1024
+    SKY_OFF = 2048
 
 
 MEANING: dict[StarFlag, str] = {
@@ -61,10 +63,11 @@ MEANING: dict[StarFlag, str] = {
     StarFlag.SATURATED: "saturated pixels, replaced; or the star list says so",
     StarFlag.TRUNCATED: "part of the stamp is off the image; or the star list says so",
     StarFlag.SNR_LOW: "S/N less than 1/1.25 of the least that the training had",
-    StarFlag.SNR_HIGH: "S/N more than 1.25 times the largest that the training had",
+    StarFlag.SNR_HIGH: "S/N over 1.25 times the largest of the training; not of field models",
     StarFlag.OFF_CENTRE: "brightest pixel farther from the centre than the stamp could be moved",
     StarFlag.UNLIKE_TRAINING: "farther from the training set than 99.9 % of its test stars",
     StarFlag.BLENDED: "the star list says that it was parted from a neighbour",
+    StarFlag.SKY_OFF: "the sky that was given is over 5 sigma off the border of the stamp",
 }
 """One line for every flag."""
 
@@ -74,7 +77,9 @@ def raise_flag(flags: np.ndarray, flag: StarFlag, where: np.ndarray) -> None:
     flags[where] |= np.uint16(flag)
 
 
-# The border: where there is most sky and least star.
+# The border and what is around it: where there is most sky and least star.
+
+SKY_CLIP = 3.0  # pixels of the sky this many σ off their median belong to other stars
 
 
 @cache
@@ -111,6 +116,46 @@ def border_scatter(stamps: np.ndarray) -> np.ndarray:
     ring = stamps.reshape(len(stamps), side**2)[:, border_pixels(side)]
     deviation = np.abs(ring - np.median(ring, axis=1, keepdims=True))
     return 1.4826 * np.median(deviation, axis=1).astype(np.float64)
+
+
+def sky_around(wide: np.ndarray, bad: np.ndarray, stamp_px: int) -> tuple[np.ndarray, np.ndarray]:
+    """Median and scatter of the pixels outside the stamps, other stars clipped.
+
+    Without a margin (s < d + 4) the pixels are the outer two rows and columns of
+    the stamp itself; light of the star in them counts as sky then.
+
+    Parameters
+    ----------
+    wide : ndarray, shape (n, s, s)
+    bad : ndarray of bool, shape (n, s, s)
+        Pixels that do not count.
+    stamp_px : int
+        Side d.
+
+    Returns
+    -------
+    level, noise : ndarray, shape (n,)
+        In counts per pixel.
+    """
+    from astropy.stats import sigma_clipped_stats
+
+    side = wide.shape[-1]
+    inner = stamp_px if side >= stamp_px + 4 else side - 4
+    start = side // 2 - inner // 2
+    ring = np.ones((side, side), dtype=bool)
+    ring[start : start + inner, start : start + inner] = False
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # stars off the image have no pixels
+        _, level, noise = sigma_clipped_stats(
+            wide[:, ring],
+            mask=bad[:, ring],
+            sigma=SKY_CLIP,
+            cenfunc="median",
+            stdfunc="mad_std",
+            axis=1,
+        )
+    level, noise = (np.nan_to_num(np.ma.filled(a, np.nan)).astype(float) for a in (level, noise))
+    return level, noise
 
 
 # Centring, to the convention of the training: brightest pixel near (d/2, d/2).

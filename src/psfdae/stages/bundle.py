@@ -39,6 +39,7 @@ from psfdae.stages.common import (
     noisy_test_images,
     read_stars,
     split_stars,
+    star_area,
 )
 from psfdae.stages.evaluate import Models
 from psfdae.stages.fit import fit_apart, training_set
@@ -122,7 +123,7 @@ def bundle(
         float(band.min()),
         1e6 * (largest_mb or np.inf),
     )
-    reach = packing.reach(band, model.mean)
+    reach = packing.reach(band, star_area(product, parts.train))
     info = BundleInfo(
         psfdae_version=psfdae.__version__,
         name=name or out.name.removesuffix(SUFFIX),
@@ -132,7 +133,7 @@ def bundle(
         **reach,
         components=packing.COMPONENTS,
         training_sha256=packing.checksum(images[parts.train], references[parts.train]),
-        training_stars=parts.train.size,
+        training_stars=_trained_on(product, parts.train),
         **(said or {"method": kind.name, "reference": restored}),
         config={
             "stars": product.config,
@@ -143,7 +144,9 @@ def bundle(
     )
     fitted = kind.unpack(arrays, info)  # what it errs as packed
     nodes, rng = packing.noise_nodes(band), stream(config.seed, "noise", "bundle")
-    errors = packing.measure_errors(held_out, fitted, model, nodes, rng)
+    nothing = np.zeros((nodes.size, *images.shape[1:]), np.float32)
+    made = Bundle(info, arrays, model, nodes, nothing, nothing, 0.0)
+    made, errors = packing.calibrated(made, fitted, held_out, rng)
     metrics = packing.measure_levels(
         config.noise.levels,
         held_out,
@@ -153,14 +156,8 @@ def bundle(
         reach["noise_equivalent_px"],
         config.evaluation.data_range,
     )
-    info = info.model_copy(update={"metrics": metrics})
-    maps = (errors.nodes, errors.half_width(), errors.rms(), errors.distance_limit())
-    ratio95 = errors.ratio95() if info.format_version > 1 else None
-    made = Bundle(info, arrays, model, *maps, ratio95, errors.strange_limit())
-    # A method that measures stars knows how sure it is of flux and sky.
-    if info.format_version > 1 and not kind.measures:
-        made = packing.with_photometry(made, held_out, rng)
-    write_bundle(made, out)
+    info = made.info.model_copy(update={"metrics": metrics})
+    write_bundle(replace(made, info=info), out)
 
 
 def _trained(kind: type[Method], place: Path, config: Config, split: str | None) -> dict[str, Any]:
@@ -189,6 +186,12 @@ def _refuse_mismatch(trained: dict[str, Any], asked: dict[str, Any], path: Path)
             f"{path}: the network was trained with {differing[0]}, "
             f"but the bundle is asked for with {other}"
         )
+
+
+def _trained_on(product: Product, train: np.ndarray) -> int:
+    """Stars of the training; those of an image are in several of its images each."""
+    own = product.config.get("source") == "stars"
+    return len(np.unique(product["field_index"][train])) if own else len(train)
 
 
 def _kind_of_stamps(product: Product) -> dict[str, Any]:
@@ -308,6 +311,7 @@ def _facts(packed: Bundle) -> dict[str, str]:
         network = {"Network": f"{shape}; {count} weights"}
     else:
         network = {"Method": f"{method(info.method).label}; {count} numbers"}
+    own = {} if info.dae else estimator(packed).facts()
     return {
         "Name": info.name,
         "Format": f"{info.format_version}, written {info.created} by psfdae {info.psfdae_version}",
@@ -319,6 +323,7 @@ def _facts(packed: Bundle) -> dict[str, str]:
         "S/N": f"{info.snr_min:.3g} to {info.snr_max:.3g}",
         "Noise-equivalent area": f"{info.noise_equivalent_px:.3g} px",
         **network,
+        **own,
         "Trained on": f"{info.training_stars} {_KINDS[info.source]}, "
         f"SHA-256 {info.training_sha256[:16]}…",
         "Distance limit": f"{packed.distance_limit:.3g} in {info.components} components",

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from psfdae.files import Column, Product, ProductError, read_product
+from psfdae.own_stars.photometry import noise_equivalent_px
 from psfdae.rng import stream
 from psfdae.stars.fields import Split, held_out_split, random_split
 from psfdae.stars.noise import NoiseModel
@@ -77,6 +78,17 @@ def field_positions(stars: Product) -> np.ndarray:
     if stars.config.get("source") == "stars":
         return read_product(stars.path, "stars", ("position",))["position"][stars["field_index"]]
     return stars["grid"][stars["field_index"]]
+
+
+def star_area(stars: Product, train: np.ndarray) -> float:
+    """Noise-equivalent area in pixels of the typical star, of which `train` are training images.
+
+    Bright stars of an image have their own, A = (F / (σ S/N))², free of their noise.
+    """
+    if stars.config.get("source") == "stars":
+        known = read_product(stars.path, "stars", ("noise", "snr"))
+        return float(np.median((known["noise"] * known["snr"]) ** -2.0))
+    return noise_equivalent_px(stars["realisation"][train])
 
 
 def split_stars(stars: Product, kind: str, config: Any) -> Split:

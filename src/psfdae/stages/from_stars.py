@@ -27,10 +27,10 @@ from psfdae.files import (
 )
 from psfdae.own_stars.advice import advice
 from psfdae.own_stars.bundle import SUFFIX
-from psfdae.own_stars.observation import Observation, Source
-from psfdae.own_stars.photometry import noise_equivalent_px, signal_to_noise
+from psfdae.own_stars.observation import Observation, Source, list_offset
+from psfdae.own_stars.photometry import signal_to_noise
 from psfdae.own_stars.report import MEAN_PSF, fitted_mean, standing
-from psfdae.own_stars.selection import collect
+from psfdae.own_stars.selection import BrightStars, collect
 from psfdae.own_stars.training_images import single_psf, star_grid, training_columns
 from psfdae.reading import read_table
 from psfdae.rng import stream
@@ -249,7 +249,9 @@ def _make(
     framing, wanted = config.framing, config.calibration_stars
     observation = exposure.open(framing.stamp_px, wanted.margin_px).assuming()
     found = collect(observation, wanted, framing)
-    notes = [observation.said(), *advice(found, observation, framing.stamp_px)]
+    off = (found.bright.centre - found.bright.listed)[:, ::-1]
+    notes = [observation.said(), list_offset(exposure.catalogue, off, exposure.accept_offset)]
+    notes = [*filter(None, notes), *advice(found, observation, framing.stamp_px)]
     print(*notes, sep="\n")
     grid = star_grid(found.bright.position)
     held_out = held_out_fields(grid)
@@ -263,9 +265,8 @@ def _make(
         found.bright, grid, held_out, wanted.bins, framing, config.parts, rng
     )
     write_product(files.stars, "stars", columns, _described(config, observation))
-    images = columns["realisation"].values[~held_out[columns["field_index"].values]]
     sky = found.bright.sky_photons(observation.gain, config.noise.background_photons)
-    settings = {**config.model_dump(), "noise": _noise(config, images, sky)}
+    settings = {**config.model_dump(), "noise": _noise(config, found.bright, sky)}
     write_text(files.path / "overrides.txt", _overrides(settings))
     for kind in files.kinds:
         print(f"fitting {kind.label}")
@@ -285,8 +286,10 @@ def _make(
     # Its name is the last one to be there: it says that all is done.
     with atomic_path(files.bundle) as model:
         bundle(own, files.stars, models, SPLIT, REFERENCE, files.name, licence, out=model)
+        fitted = taken.load(files.fit(taken), REFERENCE, checked.evaluation)
+        print("".join(f"{taken.label}: {fact}\n" for fact in fitted.facts().values()), end="")
         mean = single_psf(found.bright, held_out)
-        restored = tested(checked, files, taken, mean, framing.jitter_px)
+        restored = tested(checked, files, fitted, mean, framing.jitter_px)
         errors = report(checked, files, restored)
         if page is not None:
             print(f"writing {page}")
@@ -332,6 +335,7 @@ def _described(config: Any, observation: Observation) -> dict[str, Any]:
         **kept,
         "source": "stars",
         "image": observation.path.name,
+        **({"image_px": [*reversed(observation.shape)]} if observation.shape else {}),
         "telescope": {
             "pixel_scale_arcsec": observation.pixel_scale_arcsec,
             **({"assumed": True} if observation.scale_assumed else {}),
@@ -339,10 +343,10 @@ def _described(config: Any, observation: Observation) -> dict[str, Any]:
     }
 
 
-def _noise(config: Any, images: np.ndarray, background: float) -> dict[str, Any]:
+def _noise(config: Any, bright: BrightStars, background: float) -> dict[str, Any]:
     """Config group `noise` with the levels of the S/N asked for, of noise-free stars."""
-    area, kappa = noise_equivalent_px(images.mean(axis=0, dtype=np.float64)), config.noise.kappa
-    levels = [1.0 / (snr * np.sqrt(area) * kappa) for snr in config.calibration_stars.snr_levels]
+    area, kappa = float(np.median(bright.area())), config.noise.kappa
+    levels = [1.0 / (snr * np.sqrt(area) * kappa) for snr in config.calibration_stars.degraded()]
     noise = Noise(
         name=config.noise.name,
         levels=[float(f"{level:.9g}") for level in reversed(levels)],
@@ -358,7 +362,7 @@ def _overrides(settings: dict[str, Any]) -> str:
 
 
 def tested(
-    config: Any, files: Made, kind: type[Method], mean: np.ndarray, jitter_px: int
+    config: Any, files: Made, fitted: Method, mean: np.ndarray, jitter_px: int
 ) -> dict[float, dict[str, np.ndarray]]:
     """By noise level λ: stars held out, and what the model and one mean PSF make of them faint."""
     from psfdae.stages.common import (
@@ -371,7 +375,6 @@ def tested(
     product = read_stars(files.stars, REFERENCE)
     test = split_stars(product, SPLIT, config).test
     place = field_positions(product)[test]
-    fitted = kind.load(files.fit(kind), REFERENCE, config.evaluation)
     restored = {}
     for level in config.noise.levels:
         noisy = noisy_test_images(config, product, test, level)
@@ -388,12 +391,11 @@ def report(config: Any, files: Made, restored: dict[float, dict[str, np.ndarray]
     import pandas as pd
 
     from psfdae.evaluation.metrics import all_metrics, clustered_mean
-    from psfdae.stages.common import read_stars, split_stars
+    from psfdae.stages.common import read_stars, split_stars, star_area
 
     product = read_stars(files.stars, REFERENCE)
     parts = split_stars(product, SPLIT, config)
-    images = product["realisation"]
-    area = noise_equivalent_px(images[parts.train].mean(axis=0, dtype=np.float64))
+    area = star_area(product, parts.train)
     rows = [read_table(files.path / "evaluation.csv")]
     star = product["field_index"][parts.test]
     for level, found in restored.items():

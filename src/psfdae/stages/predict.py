@@ -24,7 +24,7 @@ from psfdae.own_stars.model import (
     load_model,
     one_thread_each,
 )
-from psfdae.own_stars.observation import Observation, Source
+from psfdae.own_stars.observation import Observation, Source, list_offset
 from psfdae.own_stars.prediction import Prediction, prediction_file
 from psfdae.own_stars.stamps import Stamps, StarFlag
 from psfdae.stages.common import check_outputs
@@ -73,6 +73,7 @@ class Stated:
     saturate: Annotated[float | None, "Counts of a saturated pixel.  [default: the header's]"] = (
         None
     )
+    accept_offset: Annotated[bool, "Take a star list that is off by more than a pixel."] = False
 
     def words(self) -> list[str]:
         """The options that state it, as they are typed."""
@@ -200,7 +201,7 @@ def restored(
             # Its name is the last one to be there: it says that all is done.
             with atomic_path(out) as unfinished:
                 done = (loaded, source, observation, unfinished, threads, bar.update)
-                counts, clean = write_prediction(*done, fixed_positions)
+                counts, clean, off = write_prediction(*done, fixed_positions)
                 if found is not None:
                     write_list(observation, found)
                 if plot is not None:
@@ -214,7 +215,7 @@ def restored(
     flagged = zip(StarFlag, counts, strict=True)
     flags = "".join(f"\n  {flag.name}: {count}" for flag, count in flagged if count)
     clean_of = f"{out}: {observation.count} stars, {clean} without a flag{flags}"
-    return f"{observation.said()}\n{clean_of}"
+    return "\n".join([observation.said(), *([off] if off else []), clean_of])
 
 
 def _check_targets(out: Path, plot: Path | None, found: Path | None, overwrite: bool) -> None:
@@ -238,13 +239,16 @@ def write_prediction(
     threads: int | None,
     tick: Callable[[int], object] = lambda done: None,
     fixed: bool = False,
-) -> tuple[np.ndarray, int]:
-    """Write the file; number of stars with each flag, and of those without any."""
+) -> tuple[np.ndarray, int, str | None]:
+    """Write the file; number of stars with each flag, of those without any, and how good a list is.
+
+    Nothing is left of it if the list's positions are far off (`list_offset`).
+    """
     size = model.engine.size
     chunks = observation.chunks(max(size, min(ROWS, 4 * size)))
     first = next(chunks)
     counts = np.zeros(len(StarFlag), dtype=int)
-    done = clean = 0
+    done, clean, off = 0, 0, []
 
     def predicted(stamps: Stamps) -> Prediction:
         blocks = model.engine.blocks(stamps)
@@ -259,9 +263,25 @@ def write_prediction(
             file.write(done, stamps, result)
             counts += [(result.flags & int(flag) > 0).sum() for flag in StarFlag]
             clean += int((result.flags == 0).sum())
+            off.append(_off(stamps, result))
             done += len(result)
             tick(len(result))
-    return counts, clean
+        said = list_offset(source.catalogue, np.concatenate(off), source.accept_offset)
+    return counts, clean, said if observation.shape else None
+
+
+def _off(stamps: Stamps, found: Prediction) -> np.ndarray:
+    """How far stars are from their positions (n, 2), x and y in px; NaN where that is not clear.
+
+    A model that measures no centres knows how far their stamps were moved, or should have been.
+    """
+    centre = np.stack([found.x_fit - stamps.x, found.y_fit - stamps.y], axis=1)
+    lost = (found.flags & int(StarFlag.OFF_CENTRE)) > 0
+    shift = np.stack([found.shift_x, found.shift_y], axis=1)
+    moved = np.where(lost[:, None], MARGIN_PX + 1.0, shift)
+    unclear = (found.flags & int(StarFlag.FAINT | StarFlag.NO_FLUX)) > 0
+    unclear |= ~np.isfinite(stamps.listed).all(axis=1)
+    return np.where(unclear[:, None], np.nan, np.where(np.isfinite(centre), centre, moved))
 
 
 def _cards(source: Source, observation: Observation) -> list[Card]:

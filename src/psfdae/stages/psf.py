@@ -47,6 +47,8 @@ def psf(
         raise PredictionError("--at X,Y or --grid COLUMNSxROWS says where")
     loaded = load_model(model)
     places = np.array([_place(text) for text in at]) if at else _grid(str(grid), loaded)
+    for note in _notes(loaded, places):
+        print(f"{model}: {note}")
     write(out, loaded, places, oversampling)
 
 
@@ -58,6 +60,33 @@ def _place(text: str) -> tuple[float, float]:
         return float(found[1]), float(found[2])
     except ValueError:
         raise PredictionError(f"--at {text!r}: expected X,Y, such as 100,250.5") from None
+
+
+def _notes(model: PsfModel, places: np.ndarray) -> list[str]:
+    """What is to be said of places (n, 2); PredictionError if one is off the image."""
+    model.psf_at(0.0, 0.0, 1)  # or it has no field
+    low, high = np.array(model.bundle.weights["low"]), np.array(model.bundle.weights["high"])
+    size = model.info.config.get("stars", {}).get("image_px")
+    if size is not None:
+        off = ((places < -0.5) | (places >= np.array(size) - 0.5)).any(axis=1)
+        for x, y in places[off][:1]:
+            raise PredictionError(
+                f"{x:g},{y:g} is off the image of {size[0]} columns and {size[1]} rows that the "
+                f"model {model.info.name!r} was trained on"
+            )
+    field, notes = model.engine.estimator, []
+    beyond = int(((places < low) | (places > high)).any(axis=1).sum())
+    if beyond and (high > low).all():
+        x, y = (
+            f"{a} {least:.6g} … {most:.6g}" for a, least, most in zip("xy", low, high, strict=True)
+        )
+        notes.append(
+            f"{beyond} of {len(places)} places are beyond the training stars, {x}, {y}; the PSF "
+            "there is that of their edge"
+        )
+    if len(places) > 1 and field.model.order == 0:
+        notes.append(f"{field.facts()['Field']}: all {len(places)} PSFs are equal")
+    return notes
 
 
 def _grid(text: str, model: PsfModel) -> np.ndarray:

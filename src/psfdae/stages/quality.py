@@ -42,6 +42,7 @@ def told(
         exposure = replace(exposure, detect=None, catalogue=files.list)
     model = load_model(bundle)
     info = model.info
+    exposure = replace(exposure, accept_offset=True)  # as far as the training did
     observation = exposure.open(info.stamp_px, MARGIN_PX).assuming()
     held = np.flatnonzero(selection.part == "held out")
     place = selection[["x", "y"]].to_numpy()[held]
@@ -73,5 +74,6 @@ def told(
             bright=psf + residual,
             strip=(files.path / "report.png").read_bytes(),
             field=field,
+            facts=[*model.engine.estimator.facts().values()],
         )
     )
