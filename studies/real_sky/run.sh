@@ -1,6 +1,6 @@
 #!/bin/sh
-# All that the table needs, in the current folder, which run.sh, interrupted, completes.
-# usage: run.sh IMAGE LIST.csv, with `python` that has psfdae and `$PEERS` that has the packages.
+# usage: run.sh IMAGE LIST.csv
+# All that compare.py needs, in the current folder; what is there stays.
 set -eu
 
 here=$(dirname "$(realpath "$0")")
@@ -11,10 +11,10 @@ for split in 0 1 2 3 4; do
         calibration_stars.misfit=1e6 calibration_stars.neighbour_ratio=1e6 "methods=[field]"
     "$PEERS" "$here/faint.py" "$1" $ours/selection.csv faint$split.npz
     for setting in "epsf 0.5 0" "epsf 1 0" "psfex 0.5 1" "psfex 0.5 2" "psfex 0.5 3" \
-        "psfex 1 1" "psfex 1 2" "psfex 1 3" "piff 1 1" "piff 1 2" "piff 1 3" "piff 0.5 1"; do
+        "psfex 1 1" "psfex 1 2" "psfex 1 3" "piff 0.5 1" "piff 0.5 2" "piff 0.5 3" "piff 1 1" "piff 1 2" "piff 1 3"; do
         file=$(echo $setting | tr ' ' -)-$split.npz
         # shellcheck disable=SC2086
-        [ -f "$file" ] ||
-            "$PEERS" "$here/peers.py" $setting "$1" $ours/selection.csv faint$split.npz "$file"
+        [ -f "$file" ] || "$PEERS" "$here/peers.py" $setting "$1" \
+            $ours/selection.csv faint$split.npz "$file"
     done
 done
