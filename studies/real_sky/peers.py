@@ -217,7 +217,8 @@ def main(package, sampling, order, image, selection, faint, out):
                 fitted, mean, flux = restored(centres, stamp, float(known[f"sigma{snr}"]))
                 found[f"fitted{snr}"][copy], found[f"averaged{snr}"][copy] = fitted, mean
                 found[f"flux{snr}"][copy] = flux
-    np.savez_compressed(out, **found)
+    np.savez_compressed(f"{out}.part.npz", **found)
+    os.replace(f"{out}.part.npz", out)
     for snr in SNR:
         errors = [
             np.square(found[f"{n}{snr}"] - known["truth"]).mean() for n in ("fitted", "averaged")
