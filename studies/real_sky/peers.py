@@ -218,7 +218,7 @@ def main(package, sampling, order, image, selection, faint, out):
                 found[f"fitted{snr}"][copy], found[f"averaged{snr}"][copy] = fitted, mean
                 found[f"flux{snr}"][copy] = flux
     np.savez_compressed(f"{out}.part.npz", **found)
-    os.replace(f"{out}.part.npz", out)
+    Path(f"{out}.part.npz").replace(out)
     for snr in SNR:
         errors = [
             np.square(found[f"{n}{snr}"] - known["truth"]).mean() for n in ("fitted", "averaged")
