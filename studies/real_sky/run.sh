@@ -1,10 +1,11 @@
 #!/bin/sh
-# usage: run.sh IMAGE LIST.csv
-# All that compare.py needs, in the current folder; what is there stays.
+# usage: run.sh IMAGE LIST.csv [SPLITS]
+# All that compare.py needs, in the current folder; what is there stays. SPLITS, "0 1" for instance,
+# leaves the others to another process.
 set -eu
 
 here=$(dirname "$(realpath "$0")")
-for split in 0 1 2 3 4; do
+for split in ${3:-0 1 2 3 4}; do
     ours=ours$split
     [ -f $ours/report.csv ] || python "$here/ours.py" $split "$1" --catalogue "$2" \
         --pixel-scale 5.21 --saturate 4000 --method field --out $ours framing.stamp_px=10 \
