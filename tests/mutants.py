@@ -33,13 +33,20 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 LIST = Path(__file__).with_suffix(".csv")
-SEED, DRAWN = 13, 40
+SEED, DRAWN = 14, 60
 SCIENCE = [
     *("alignment", "bounds", "estimators", "optics", "stars"),
     *(f"evaluation/{name}.py" for name in ("calibration", "comparison", "metrics")),
-    *(f"own_stars/{name}.py" for name in ("packing", "photometry", "shapes", "stamps")),
+    *(f"own_stars/{name}.py" for name in ("detection", "model", "packing", "photometry")),
+    *(f"own_stars/{name}.py" for name in ("prediction", "selection", "shapes", "stamps")),
+    "own_stars/training_images.py",
 ]
-"""Where the random mutants were drawn from; no matter once they are drawn."""
+LATEST = [
+    *("bounds/sampling.py", "bounds/tight.py", "estimators/field.py", "estimators/gmm.py"),
+    *("own_stars/detection.py", "own_stars/packing.py", "stars/field_model.py"),
+]
+"""Where the random mutants were drawn from, half of them from the latest, file by file; no
+matter once they are drawn."""
 
 CHOICE = ["-m", "not slow and not written and not workflow", "--ignore=tests/test_mutants.py"]
 """The fast tests but for those of the list, which notice every mutant."""
@@ -187,34 +194,41 @@ def write_list(mutants: list[Mutant]) -> None:
 
 
 def draw(known: list[Mutant]) -> list[Mutant]:
-    """Random mutants of the science, as many more as are known to be equivalent."""
+    """Random mutants of the science, and for each that is known to be equivalent another one."""
     package = ROOT / "src" / "psfdae"
     units = units_of(package)
-    science = [package / name for name in SCIENCE]
-    able = [
-        (name, path, node, around)
-        for name in sorted(units)
-        for path, parts in units[name].items()
-        if any(path.is_relative_to(folder) for folder in science)
-        for part in parts
-        for node, around in places(part)
-        if changes(node, random.Random(0))
-    ]
     reasons = {replace(mutant, equivalent=""): mutant.equivalent for mutant in known}
-    rng = random.Random(SEED)
+    files = [[*changeable(units, [package / name])] for name in LATEST]
+    every = [*changeable(units, [package / name for name in SCIENCE])]
+    drawn: dict[Mutant, str] = {}
+    for number in range(DRAWN):
+        rng = random.Random(f"{SEED} {number}")
+        able = files[number % len(files)] if number < DRAWN // 2 else every
+        while sum(not equivalent for equivalent in drawn.values()) <= number:
+            mutant = mutant_at(units, *rng.choice(able), rng)
+            drawn[mutant] = reasons.get(mutant, "")
+    return [replace(mutant, equivalent=reason) for mutant, reason in drawn.items()]
 
-    def mutant_at(name: str, path: Path, node: ast.AST, around: ast.AST) -> Mutant:
-        original = ast.unparse(around)
-        occurrence = matches(units[name][path], original).index(around)
-        new = Swap([*ast.walk(around)].index(node), changes(node, rng)).of(around)
-        mutant = Mutant(name, original, ast.unparse(new), occurrence, "drawn", "")
-        find(units, mutant)
-        return replace(mutant, equivalent=reasons.get(mutant, ""))
 
-    drawn = [mutant_at(*place) for place in rng.sample(able, DRAWN)]
-    while sum(not mutant.equivalent for mutant in drawn) < DRAWN:
-        drawn.append(mutant_at(*rng.choice(able)))
-    return drawn
+def changeable(units: Units, folders: list[Path]) -> Iterator[tuple[str, Path, ast.AST, ast.AST]]:
+    """Name, file and `places` of all code in some folders that a mutant can change."""
+    for name in sorted(units):
+        for path, parts in units[name].items():
+            if any(path.is_relative_to(folder) for folder in folders):
+                for node, around in (place for part in parts for place in places(part)):
+                    if changes(node, random.Random(0)):
+                        yield name, path, node, around
+
+
+def mutant_at(
+    units: Units, name: str, path: Path, node: ast.AST, around: ast.AST, rng: random.Random
+) -> Mutant:
+    original = ast.unparse(around)
+    occurrence = matches(units[name][path], original).index(around)
+    new = Swap([*ast.walk(around)].index(node), changes(node, rng)).of(around)
+    mutant = Mutant(name, original, ast.unparse(new), occurrence, "drawn", "")
+    find(units, mutant)
+    return mutant
 
 
 class Swap(ast.NodeTransformer):

@@ -6,6 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import f as f_law
+from scipy.stats import multivariate_t
 
 from psfdae.bounds import sampling
 from psfdae.bounds.posterior import Likelihood, jitters, merge
@@ -158,6 +160,55 @@ def test_twins_give_the_same_image(model, noise):
     assert found.z[there][0] == pytest.approx(far[0], abs=0.02)
     # A pixel aside is a tilt, which distortion can make up for where it is large.
     assert len(found.star) > 1
+
+
+def test_the_twin_of_a_mode_at_its_own_place_weighs_as_the_mode(model, noise):
+    """Of two modes with nearly the same evidence, the one with more goes first."""
+    field = np.array([[0.4, 0.2], [0.8, 0.4], [-0.4, 0.6]])
+    wide = replace(model, mean=np.zeros(5), sd=np.ones(5), field=field)
+    z = np.array([[0.0, 0.3, 0.2, 0.3, 0.0], [0.5, 2.0, 1.0, 2.0, 0.5]])
+    number, middle = np.arange(2), np.array([[1, 2], [0, 0]])
+    images = wide.stamps(z, 2 * number, middle)
+    likelihood = Likelihood.of(noise, 1e-4, images)
+    start = Modes.at(number, 2 * number, middle, 0 * number, z)
+    found = climb(start, likelihood.counts(images), likelihood, wide)
+    for first in range(2):
+        evidence = np.where(number == first, 100.0, 99.0)
+        both = replace(found, star=0 * number, evidence=evidence)
+        other = twins(both, likelihood, wide)
+        at = [
+            np.flatnonzero((other.field == f) & (other.offset == o).all(axis=1))[0]
+            for f, o in zip(2 * number, middle, strict=True)
+        ]
+        assert at[first] < at[1 - first]
+        assert other.z[at] == pytest.approx(found.z, abs=0.1)
+
+
+def test_draws_have_the_density_of_students_t():
+    rng = np.random.default_rng(5)
+    factor = np.tril(rng.normal(0, 0.3, (2, 5, 5))) + np.eye(5)
+    number, none = np.arange(2), np.zeros(2, int)
+    start = Modes.at(none, number, np.array([[0, 1], [2, 3]]), none, rng.normal(size=(2, 5)))
+    modes = replace(start, factor=factor)
+    z, field = rng.normal(0, 3, (30, 5)), np.arange(30) % 2
+    offset = np.where(np.arange(30) < 20, modes.offset[field].T, 7).T
+    found = modes.log_density(z, field, offset)
+    for mode in number:
+        scale = factor[mode] @ factor[mode].T
+        law = multivariate_t(modes.z[mode], scale, sampling.FREEDOM)
+        there = (field == mode) & (np.arange(30) < 20)
+        assert found[mode, there] == pytest.approx(law.logpdf(z[there]), abs=1e-9)
+        assert (found[mode, ~there] == -np.inf).all()
+    draws, count = modes.draws(20_000, 0, rng)
+    for mode in number:
+        mine = draws.z[draws.field == mode]
+        assert len(mine) == count[mode] > 5000
+        whitened = np.linalg.solve(factor[mode], (mine - modes.z[mode]).T)
+        # The median of the squared distance of t is that of F, times the dimension.
+        expected = 5 * f_law(5, sampling.FREEDOM).median()
+        assert np.median((whitened**2).sum(axis=0)) == pytest.approx(expected, rel=0.05)
+        inside = np.cov(whitened[:, (whitened**2).sum(axis=0) < 2 * expected])
+        assert inside == pytest.approx(inside[0, 0] * np.eye(5), abs=0.06 * inside[0, 0])
 
 
 def aside(stars, model, noise, level, shift):

@@ -58,14 +58,15 @@ def test_every_part_of_the_evidence_is_needed(but):
     assert not replace(SURE, **but).tight
 
 
-@pytest.mark.parametrize(("few", "missing", "tight"), [(4, 0, True), (5, 0, False), (2, 3, False)])
-def test_one_in_a_hundred_may_have_few_samples_or_none(few, missing, tight):
+@pytest.mark.parametrize(("few", "missing", "low"), [(4, 0, 300), (5, 0, 3), (2, 3, 3), (0, 5, 0)])
+def test_one_in_a_hundred_may_have_few_samples_or_none(few, missing, low):
     mse, variance = gaussian()
     ess = np.full(STARS, 300.0)
     ess[:few] = 3.0
     mse[10 : 10 + missing] = np.nan
     found = Evidence.of(mse, variance, ess, FIELD, last_change=0.0, undetected=0.0)
-    assert found.tight == tight
+    assert found.ess_low == low
+    assert found.tight == (low >= 10)
 
 
 def measured(mse, ess=300.0):

@@ -226,13 +226,15 @@ def test_a_method_that_knows_how_sure_it_is_covers_68_and_95_per_cent(folder, ti
     np.testing.assert_allclose(one.psf[0], found.psf[7], atol=1e-6)
 
 
-def test_bright_pixels_are_covered_as_the_others_are(tiny):
-    """Of unseen stars whose flux and sky are found."""
+@pytest.mark.parametrize("told", [(), ("noise",), ("background", "noise")])
+def test_bright_pixels_are_covered_as_the_others_are(tiny, told):
+    """Of unseen stars, whatever is known of them beside their flux."""
     images, rng = gaussians(1500, 99), np.random.default_rng(5)
     model = PsfModel(tiny)
     for noise in (6e-3, 1.5e-2):
         noisy = images + noise * rng.normal(size=images.shape) + 3.0
-        found = model.predict(noisy)
+        known = {"background": 3.0, "noise": noise}
+        found = model.predict(noisy, **{name: known[name] for name in told})
         kept = np.isfinite(found.psf).all(axis=(1, 2))
         error, width = np.abs(found.psf - images)[kept], found.uncertainty[kept]
         bright = brightest(found.psf[kept])

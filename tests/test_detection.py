@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from scipy.spatial import cKDTree
 from command_line import psfdae, refused
 from psfdae.configuration.compose import load_stage
 from psfdae.own_stars.bundle import read_bundle
+from psfdae.own_stars.detection import Sky
 from psfdae.own_stars.images import find_image
 from psfdae.own_stars.observation import SEEN, Source
 from psfdae.own_stars.selection import collect
@@ -70,6 +72,25 @@ def test_stars_are_found_where_they_are(field):
     assert (spurious > 8).sum() <= 1
     level = found.found.numbers("BACKGROUND")
     assert level == pytest.approx(300 / 1.6, rel=0.08)
+
+
+def test_a_star_without_noise_is_found_exactly_and_nothing_is_named_twice():
+    """Smoothing moves no star, and in white noise it leaves `SMOOTHED_NOISE` of it."""
+    place = np.array([[40.3, 51.8], [90.0, 30.4], [70.7, 100.1]])
+    y, x = np.indices((140, 130))
+    light = [np.exp(-0.5 * ((x - a) ** 2 + (y - b) ** 2) / 1.5**2) for a, b in place]
+    shape, rng = x.shape, np.random.default_rng(1)
+    nothing = np.zeros(shape, bool)
+    sky = Sky(1e3 * np.sum(light, axis=0), np.full(shape, 7.0), np.ones(shape), nothing, np.nan)
+    found = sky.stars(5.0)
+    seen = np.stack([found["X_IMAGE"], found["Y_IMAGE"]], axis=1) - 1
+    distance, star = cKDTree(seen).query(place)
+    assert len(seen) == 3 and sorted(star) == [0, 1, 2] and (distance < 0.02).all()
+    assert sorted(found["id"]) == [1, 2, 3]
+    assert (found["BACKGROUND"] == 7.0).all()
+    assert found["FLUX_ISO"] == pytest.approx(np.full(3, 1e3 * 2 * np.pi * 1.5**2), rel=0.02)
+    smooth, limit = replace(sky, flat=rng.normal(size=shape))._above(2.0)
+    assert smooth.std() == pytest.approx(limit[0, 0] / 2.0, rel=0.05)
 
 
 def test_commands_need_no_list_and_no_card(field, tmp_path):

@@ -76,6 +76,10 @@ def sandbox(tmp_path, monkeypatch):
     for run in ("results", "results/paper", "results/smoke"):
         for network in ("random-realisation", "held_out-realisation"):
             write_network(tmp_path / run, f"dataset3/{network}")
+    for run in ("results", "results/reference"):
+        table = tmp_path / run / "tables" / "psf_metrics.csv"
+        table.parent.mkdir(parents=True)
+        shutil.copy(ROOT / "results/reference/tables/psf_metrics.csv", table)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PSFDAE_CONFIG", str(tmp_path / "config"))
     forget()

@@ -29,6 +29,7 @@ from psfdae.own_stars.example import add_stamps, write_field
 from psfdae.own_stars.model import PredictionError
 from psfdae.own_stars.shapes import measure_shapes
 from psfdae.stages import psf
+from psfdae.stars.field_model import Frames, fit_field
 from psfdae.stars.noise import NoiseModel
 
 SIDE, WIDE, FIELD = 10, 26, 1000.0
@@ -76,10 +77,10 @@ def bright(count=150, seed=1, spread=0.02, varied=True):
     return BrightStamps(images, peak, listed, position, noise, np.arange(count))
 
 
-def fitted(stars, orders=(2,), **changed):
+def fitted(stars, orders=(2,), background=1e6, **changed):
     images = stars.wide[:, 8:18, 8:18].astype(np.float32)
     some = np.arange(len(images))
-    noise = NoiseModel(1.0, 1e6)
+    noise = NoiseModel(1.0, background)
     data = TrainingSet(images, images, some, some[:0], np.array([0.01]), noise, bright=stars)
     config = load_stage(("field",), [])
     settings = config.field.model_copy(update={"orders": list(orders), **changed})
@@ -137,6 +138,18 @@ def test_terms_of_high_orders_are_solved_for(stars, monkeypatch):
     assert ended and all(ended)
 
 
+def test_photon_noise_of_bright_stars_is_no_difference_between_stars():
+    """Of equal stars the fit leaves noise, of which most is their own photons'."""
+    some = bright(spread=0.0, varied=False)
+    photons = np.sqrt(100.0) / some.noise
+    light = np.maximum(some.wide, 0.0) / photons[:, None, None]
+    wide = some.wide + np.sqrt(light) * np.random.default_rng(3).standard_normal(light.shape)
+    found = fitted(some._replace(wide=wide), orders=(0,), background=100.0)
+    variance = np.square(found.modes, dtype=float).sum(axis=1) + found.diagonal
+    own = 0.5 * (1 / photons).mean()  # half of it is left by the splines that move them
+    assert variance.sum(axis=1).max() < 0.5 * own
+
+
 @pytest.mark.parametrize("snr", SNR)
 def test_flux_sky_centre_and_size_are_unbiased_and_as_sure_as_said(field, snr):
     some = Faint(1000, snr)
@@ -183,6 +196,23 @@ def test_positions_help_and_are_not_needed(field):
     some = Faint(400, 20.0)
     without = field.measure(some.stamps, some.sigma, np.full((400, 2), np.nan))
     assert some.mse(some.measured(field)) < some.mse(without) < 5e-5
+
+
+def test_a_star_without_a_position_is_that_of_the_mean_field(field):
+    """Noise hides it: what is left is the mean over the field, not the PSF of some corner."""
+    some, all_over = Faint(10, 5.0), np.random.default_rng(4).uniform(0, FIELD, (500, 2))
+    position = some.position.copy()
+    position[::2] = np.nan
+    given = {"centre": some.centre + 0.1, "fixed": True, "flux": np.full(10, 1e3)}
+    found = field.measure(some.stamps, np.full(10, 1e5), position, **given)
+    for star, centre in enumerate(some.centre):
+        where = all_over if star % 2 == 0 else some.position[star : star + 1]
+        terms = field.model.terms(where)
+        mean = unit(field.model.images(terms, np.tile(centre, (len(where), 1)), SIDE)).mean(axis=0)
+        assert found.psf[star] == pytest.approx(mean, abs=0.02 * mean.max())
+    nothing_said = field.measure(some.stamps, np.full(10, 1e5), None, **given)
+    assert nothing_said.psf[::2] == pytest.approx(found.psf[::2], abs=1e-7)
+    assert (nothing_said.sigma[1::2] > found.sigma[1::2]).mean() > 0.8
 
 
 def test_without_noise_the_data_come_back_and_without_data_the_field(field):
@@ -261,6 +291,42 @@ def test_bad_stamps_are_refused(field):
         field.measure(stamps, np.ones(2))
     with pytest.raises(ValueError, match="expected 100"):
         field.measure(np.zeros((2, 8, 8)), np.ones(2))
+
+
+def test_centres_are_as_likely_as_nodes_have_room_in_the_box(field):
+    """Every node stands for the places that are nearest to it; beyond 1.5 px there are none."""
+    rng = np.random.default_rng(2)
+    places = rng.uniform(-1.5, 1.5, (200_000, 2))
+    nearest = np.rint(places / 0.25).astype(int)
+    edges = np.arange(-7.5, 8)
+    counted = np.histogram2d(*nearest.T, bins=(edges, edges))[0]
+    found = np.exp(field._prior(np.full((1, 2), np.nan)))[0].reshape(15, 15)
+    assert field.settings.centring_px == 1.5 and field.settings.step_px == 0.25
+    for part in (slice(1, 2), slice(2, -2)):
+        share = counted[part, 2:-2].sum() / len(places)
+        assert found[part, 2:-2].sum() == pytest.approx(share, rel=0.02)
+    assert (found[counted == 0] == 0).all()
+
+
+def test_the_unit_of_a_star_does_not_matter_to_the_field():
+    """Stars of any flux, in units of which their noise is, too, have the same PSF."""
+    some, rng = bright(60, spread=0.0), np.random.default_rng(3)
+    inner = some.wide[:, 6:20, 6:20]
+
+    def fit(unit):
+        frames = Frames(
+            unit[:, None, None] * inner,
+            np.ones(inner.shape, bool),
+            unit * np.where(np.arange(60) < 30, 1e-2, 1e-3),
+            np.full(60, 1e6),
+            some.position,
+        )
+        return fit_field(frames, [1], SIDE, 0.5, 100.0)
+
+    one, other = fit(np.ones(60)), fit(unit := rng.uniform(0.2, 5.0, 60))
+    assert other.model.coefficients == pytest.approx(one.model.coefficients, abs=1e-4)
+    assert other.flux / unit == pytest.approx(one.flux, rel=1e-4)
+    assert other.centre == pytest.approx(one.centre, abs=1e-3)
 
 
 def test_order_is_what_the_field_has(stars):
@@ -373,6 +439,8 @@ def test_predict_measures_flux_and_centre_with_their_errors(image):
     known = image[2]
     assert np.isfinite(stars["strangeness"]).all()
     assert image[1].stat().st_size < 5e6
+    # Who measures stars knows how sure it is of their flux.
+    assert (read_bundle(image[1]).flux_error_scale == 1).all()
     assert (stars["flags"] == 0).mean() > 0.95
     assert abs(np.mean(stars["flux"] / known["inside"]) - 1) < 0.005
     for column, true in (
@@ -419,6 +487,17 @@ def test_python_takes_positions_and_centres(image):
         model.predict(some.stamps, position=some.position[:3])
     blind = model.predict(np.full((1, SIDE, SIDE), 7.0))
     assert blind.flags[0] & 8 and np.isnan(blind.psf).all() and np.isnan(blind.x_fit).all()
+
+
+def test_a_flux_below_its_error_is_none_and_below_three_times_it_is_faint(image):
+    some = Faint(300, 2.0)
+    stamps = some.stamps - np.linspace(0, 1500, 300)[:, None, None] * some.psf
+    found = load_model(image[1]).predict(stamps, position=some.position)
+    ratio = found.flux / found.flux_error
+    assert (ratio < 1).sum() > 20 and ((ratio > 1) & (ratio < 3)).sum() > 20
+    assert np.array_equal((found.flags & 8) > 0, ~(ratio > 1))
+    assert np.array_equal((found.flags & 4) > 0, (ratio > 1) & (ratio < 3))
+    assert np.isnan(found.psf[ratio < 1]).all() and np.isfinite(found.psf[ratio > 1]).all()
 
 
 def test_bad_pixels_are_left_out(image):

@@ -157,6 +157,18 @@ def test_a_flux_that_is_an_estimate_is_found(same, monkeypatch):
     assert free.free_flux().loose == free.loose and mixture.estimate(noisy, LEVEL / 5).flux is None
 
 
+def test_total_variance_is_that_of_the_stars_and_with_a_free_flux_of_no_less():
+    """By it coordinates are left out in which noise hides all differences of the clusters."""
+    mixture, (images, _) = fitted(components=[4]), stars(400)
+    flux = np.random.default_rng(5).normal(1.0, module.LOOSE, (400, 1))
+    flat = images.reshape(400, -1)
+    loose = flux * flat + (1 - flux) / flat.shape[1]
+    plain, moved = ((a @ mixture.axes).astype(float).var(axis=0) for a in (flat, loose))
+    assert mixture._total == pytest.approx(plain, rel=1e-3, abs=1e-3 * plain.max())
+    assert (mixture.free_flux()._total > 0.9 * moved - 1e-3 * plain.max()).all()
+    assert moved.sum() > 1.1 * plain.sum()
+
+
 def test_one_cluster_is_linear_mmse():
     data = training(same=False)
     mixture = GaussianMixture.fit(data, Gmm(**ONE))

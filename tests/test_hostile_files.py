@@ -500,7 +500,7 @@ def test_formulas_are_text_in_tables_for_spreadsheets():
     names = np.array(["=cmd|' /C calc'!A0", "+1+1", "-2+3", "@SUM(A1)", "-5", "+1e3", "star"])
     bright = type("Bright", (), {"row": np.array([0])})()
     numbers, good = np.zeros(7), np.full(7, "good")
-    found = Candidates(names, np.zeros((7, 2)), *[numbers] * 4, good, bright)
+    found = Candidates(names, np.zeros((7, 2)), *[numbers] * 5, good, bright)
     written = found.table(np.array([False]))["id"].tolist()
     assert written == ["'=cmd|' /C calc'!A0", "'+1+1", "'-2+3", "'@SUM(A1)", "-5", "+1e3", "star"]
     assert no_formula("\t=1") == "'\t=1"

@@ -31,7 +31,7 @@ def test_every_mutant_changes_code_that_is_there(units):
         assert ast.dump(ast.parse(apply(path, node, mutant.mutated))) != before, mutant
 
 
-def test_list_has_forty_drawn_mutants_besides_the_equivalent():
+def test_list_has_sixty_drawn_mutants_besides_the_equivalent():
     drawn = [mutant for mutant in read_list() if mutant.source == "drawn"]
     assert sum(not mutant.equivalent for mutant in drawn) == DRAWN
     assert len(set(read_list())) == len(read_list())

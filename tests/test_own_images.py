@@ -18,6 +18,7 @@ from psfdae import StarFlag, load_model
 from psfdae.cli import main
 from psfdae.configuration.compose import load_stage
 from psfdae.estimators.field import FieldSettings
+from psfdae.own_stars import packing
 from psfdae.own_stars.advice import saturation_advice
 from psfdae.own_stars.bundle import read_bundle, write_bundle
 from psfdae.own_stars.observation import Source
@@ -84,7 +85,11 @@ def sky(tmp_path_factory):
     made = Made(tmp_path_factory.mktemp("sky"))
     out, page = made.folder / "model", made.folder / "page.html"
     words = ("--catalogue", made.list, "--method", "field", "--out", out, "--report", page)
-    done = run("from-stars", made.image, *words, "methods=[noisy,field]", *TINY)
+    with pytest.MonkeyPatch.context() as patched:
+        # Of what a bundle says of its errors little is asked here, and it takes longest.
+        for name, fewer in {"NODES": 4, "LEAST_STARS": 400, "FEW_STARS": 100}.items():
+            patched.setattr(packing, name, fewer)
+        done = run("from-stars", made.image, *words, "methods=[noisy,field]", *TINY)
     assert done.exit_code == 0, done.output
     made.said, made.page, made.model = done.output, page, out / "sky.psf.safetensors"
     made.selection = pd.read_csv(out / "selection.csv")
@@ -104,8 +109,8 @@ def test_signal_to_noise_is_that_of_each_star(sky):
     assert area == pytest.approx(np.median(sky.area), rel=0.05)
     five = (sky.snr > 4.8) & (sky.snr < 6.0)
     assert five.sum() > 10
-    # What is measured scatters by more than 1, and 4 is the limit.
-    assert ((sky.stars["flags"][five] & StarFlag.SNR_LOW) > 0).mean() < 0.4
+    # What is measured scatters by about 1, and 4 is the limit.
+    assert ((sky.stars["flags"][five] & StarFlag.SNR_LOW) > 0).mean() < 0.15
 
 
 def test_bright_stars_are_good_stars(sky):
@@ -122,7 +127,7 @@ def test_chi2_of_bright_stars_is_about_one(sky):
     for low, high in ((5, 10), (10, 100), (100, 3500)):
         some = unseen & (sky.snr > low) & (sky.snr < high)
         assert some.sum() >= 5
-        assert 0.65 < np.median(sky.stars["chi2"][some]) < 1.3, low
+        assert 0.8 < np.median(sky.stars["chi2"][some]) < 1.3, low
     page = sky.page.read_text(encoding="utf-8")
     assert re.search(r"median \d\.\d\d at S/N from 100 \(\d+ stars\)", page)
 

@@ -239,6 +239,40 @@ def test_sky_that_is_given_is_believed_in_stamps_with_bad_pixels(gaussian_stars,
     assert found.background == pytest.approx(sky, abs=1e-12)
 
 
+def test_stars_as_bright_as_their_error_are_fitted_and_flagged_as_with_care(
+    gaussian_stars, whole_model
+):
+    """Flux below its error is none, below three times it is faint, whichever solver is asked."""
+    flux = np.linspace(-1.0, 4.0, 300)[:, None, None]
+    stamps = 10.0 * flux * gaussian_stars + np.random.default_rng(8).normal(0, 1, (300, 16, 16))
+    found = measure(whole_model, stamps, 0.0)
+    ratio = found.flux / found.flux_error
+    assert (ratio < 1).sum() > 50 and ((ratio > 1) & (ratio < 2)).sum() > 20
+    assert np.array_equal((found.flags & NO_FLUX) > 0, ~(ratio > 1))
+    assert np.array_equal((found.flags & FAINT) > 0, (ratio > 1) & (ratio < 3))
+    assert (found.images[ratio < 1] == 0).all()
+    alone = robust_flux(stamps, whole_model.with_free_sky())
+    careful = ratio < 2
+    assert found.flux[careful] == pytest.approx(alone.flux[careful], rel=1e-6)
+    assert found.flux_error[careful] == pytest.approx(alone.error[careful], rel=1e-6)
+
+
+def test_another_flux_of_the_same_light_is_another_sky(gaussian_stars, whole_model):
+    rng = np.random.default_rng(9)
+    stamps = 1e3 * gaussian_stars[:20] + 70.0 + rng.normal(0, 3.0, (20, 16, 16))
+    found = measure(whole_model, stamps, 72.0)
+    factor = rng.uniform(0.5, 2.0, 20)
+    other = found.with_flux(factor)
+
+    def light(measured):
+        sky = measured.background[:, None, None]
+        return measured.flux[:, None, None] * measured.images + sky
+
+    assert other.flux == pytest.approx(factor * found.flux)
+    assert other.images.sum(axis=(1, 2)) == pytest.approx(found.images.sum(axis=(1, 2)), abs=1e-4)
+    assert light(other) == pytest.approx(light(found), abs=1e-3)
+
+
 @pytest.mark.parametrize("sky_known", [True, False])
 def test_residuals_of_the_border_are_those_of_dense_matrices(
     gaussian_stars, whole_model, sky_known

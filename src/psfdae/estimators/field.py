@@ -294,7 +294,7 @@ class FieldMixture(Method):
         fit = fit_field(stars, field.orders, side, field.spacing_px, field.smoothness)
         used = stars.of(fit.good)
         terms = fit.model.terms(used.position)
-        offset, modes, diagonal = _residuals(fit, used.noise / fit.flux[fit.good], field)
+        offset, modes, diagonal = _residuals(fit, used, terms.mean(axis=0), field)
         return cls(
             coefficients=fit.model.coefficients.astype(np.float32),
             low=fit.model.low,
@@ -824,23 +824,27 @@ def _window(side: int, whole: np.ndarray) -> np.ndarray:
 
 
 def _residuals(
-    fit: FieldFit, noise: np.ndarray, settings: FieldSettings
+    fit: FieldFit, stars: Frames, usual: np.ndarray, settings: FieldSettings
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Mean, modes and remaining variance of the residuals in every phase of a pixel.
 
-    Splines move them there. A star counts by how much of its residual is no `noise` (n,),
-    which is the RMS of a pixel of flux 1, and what noise adds to their scatter is taken off.
+    They are those of the fit's good `stars`, which splines move there; `usual` (K,) are the mean
+    terms of the field. A star counts by how much of its residual is no noise. What noise of sky
+    and star adds to the scatter is taken off. In units of this noise, of P pixels and n stars, a
+    mode of the variance ℓ is found with about ℓ + P/n (Paul 2007, Stat. Sinica 17, 1617).
     """
     from scipy import ndimage
 
-    residual, centre = fit.residual[fit.good], fit.centre[fit.good]
+    residual, centre, flux = fit.residual[fit.good], fit.centre[fit.good], fit.flux[fit.good]
     side = residual.shape[-1]
     inner = residual[:, 1:-1, 1:-1]
-    own = noise**2 * inner[0].size
+    sky, light = np.square(stars.noise / flux), 1.0 / (stars.photons * flux)
+    own = sky * inner[0].size + light
     signal = np.median(np.maximum(np.square(inner).sum(axis=(1, 2)) - own, 0.0))
     weight = (signal + 1e-12) / (signal + 1e-12 + own)
     weight /= weight.sum()
-    left = OWN_NOISE * float(weight @ noise**2)
+    noise_only = 1.0 + residual[0].size * float(np.square(weight).sum())
+    sky, light = (OWN_NOISE * float(weight @ part) for part in (sky, light))
     phases, impulses = _phases(settings.step_px), np.eye(side)
 
     def along(axis: int) -> np.ndarray:
@@ -852,14 +856,16 @@ def _residuals(
 
     rows, columns = along(0), along(1).transpose(0, 1, 3, 2)
     found = []
-    for row in rows:
+    for row, down in zip(rows, phases, strict=True):
         half = row @ residual
-        for column in columns:
+        for column, right in zip(columns, phases, strict=True):
             moved = (half @ column).reshape(len(residual), -1)
             mean = weight @ moved
-            scatter = np.sqrt(weight)[:, None] * (moved - mean)
+            star = fit.model.images(usual[None], np.array([[down, right]]), side).ravel()
+            noise = np.sqrt(sky + light * np.maximum(star, 0.0))
+            scatter = np.sqrt(weight)[:, None] * (moved - mean) / noise
             _, size, axes = np.linalg.svd(scatter, full_matrices=False)
-            modes = np.sqrt(np.maximum(size**2 - left, 0.0))[:, None] * axes
+            modes = np.sqrt(np.maximum(size**2 - noise_only, 0.0))[:, None] * axes * noise
             variance = np.square(modes).sum(axis=0)
             modes = np.sqrt(1.0 - settings.diagonal) * modes[: settings.modes]
             diagonal = variance - np.square(modes).sum(axis=0)

@@ -51,7 +51,7 @@ BRIGHT = 20 / 256  # part of the pixels that counts as bright
 TOLERANCE = 1e-3  # by which the mean PSF may miss the sum 1, and eigenvectors orthonormality
 VARIANCE = 1e6  # largest variance of images of sum 1 that is no nonsense
 # Arrays of S nodes that a bundle may lack, and the shape of their rows.
-SCALES = {"scale68": (4, 2), "scale95": (4, 2), "flux_error_scale": ()}
+SCALES = {"scale68": (2, 3, 2), "scale95": (2, 3, 2), "flux_error_scale": ()}
 FREE = {"ratio95": (), "strange_limit": (), "widening": (7,), **SCALES}
 # Arrays of float64; the others are float32.
 DOUBLE = {"flux/variance", "flux/rest", "noise_nodes", "distance_limit", *FREE}
@@ -190,14 +190,14 @@ class Bundle:
     ratio95: np.ndarray | None = None  # (S,), error68 times this holds 95 %
     # (S,), 99.9 % quantile of `Method.strangeness`, if the method knows it
     strange_limit: np.ndarray | None = None
-    # (S, 4, 2), by how much 68 % and 95 % of the errors are wider than that where everything is
-    # known, the noise is estimated, the flux, too, and the sky; of faint and of bright pixels
-    # (`brightest`)
+    # (S, 2, 3, 2), by how much 68 % and 95 % of the errors are wider than that: where the noise is
+    # known or estimated; where flux and sky are known, the sky is, or neither; and in faint or in
+    # bright pixels (`brightest`)
     scale68: np.ndarray | None = None
     scale95: np.ndarray | None = None
     flux_error_scale: np.ndarray | None = None  # (S,), scatter of the flux over its error
-    # (S, 7), what format 2 had in their place: 68 % and 95 % from the second case on, of all
-    # pixels; then the flux
+    # (S, 7), what format 2 had in their place: 68 % and 95 % for each of the three cases of flux
+    # and sky, with estimated noise and of all pixels; then the flux
     widening: np.ndarray | None = None
 
     @property
@@ -205,13 +205,26 @@ class Bundle:
         """Checksum of everything but the date."""
         return _digest(self.info.described(), _tensors(self))
 
-    def scales(self) -> list[np.ndarray] | None:
-        """`scale68`, `scale95` and `flux_error_scale`, of any format that has them."""
-        old = self.widening
-        if old is None:
-            return None if self.scale68 is None else [getattr(self, name) for name in SCALES]
-        both = (np.insert(old[:, column:6:2], 0, 1.0, axis=1) for column in (0, 1))
-        return [*(np.stack([scale, scale], axis=2) for scale in both), old[:, 6]]
+    def scales(self, noise: np.ndarray) -> list[np.ndarray] | None:
+        """`scale68`, `scale95` and `flux_error_scale`, of any format, at the noise of stars (n,).
+
+        They are interpolated linearly: (n, 2, 3, 2) twice, and (n,); None if there are none.
+        """
+
+        def at(table: np.ndarray) -> np.ndarray:
+            columns = table.reshape(len(table), -1).T
+            found = [np.interp(noise, self.noise_nodes, column) for column in columns]
+            return np.stack(found, axis=1).reshape(-1, *table.shape[1:])
+
+        if self.widening is None:
+            return None if self.scale68 is None else [at(getattr(self, name)) for name in SCALES]
+        old = at(self.widening)
+        found = []
+        for wider in (old[:, 0:6:2], old[:, 1:6:2]):
+            # That format took the estimate of the noise for a factor by itself.
+            both = np.stack([wider / wider[:, :1], wider], axis=1)
+            found.append(np.stack([both, both], axis=-1))
+        return [*found, old[:, 6]]
 
 
 def estimator(bundle: Bundle) -> Method:

@@ -339,21 +339,9 @@ class Engine:
         doubt = None if sigma is None else sigma * found.flux[:, None, None]
         distance = mahalanobis(found.images, noise, bundle.flux_model, info.components)
         flux = found.flux.astype(np.float32)[:, None, None]
-        uncertainty = at_noise(noise, bundle.noise_nodes, bundle.error68)
-        if sigma is not None:
-            uncertainty *= sigma
-        ratio95 = np.full(len(noise), np.nan)
-        if bundle.ratio95 is not None:
-            ratio95 = np.interp(noise, bundle.noise_nodes, bundle.ratio95)
-        ratios = np.stack([ratio95, ratio95], axis=1)
-        if (tables := bundle.scales()) is not None:
-            wider, widest, of_flux = self._scales(tables, noise, stars)
-            faint, bright = wider.T.astype(np.float32)[:, :, None, None]
-            uncertainty *= np.where(brightest(psf), bright, faint)
-            ratios *= widest / wider
-            found = replace(found, flux_error=found.flux_error * of_flux)
+        width, ratios, of_flux = self._doubts(psf, sigma, noise, stars)
+        uncertainty = flux * width
         psf *= flux
-        uncertainty *= flux
         residual = (stamps - found.background[:, None, None]).astype(np.float32) - psf
         residual[~found.used] = np.nan
         flags |= found.flags
@@ -379,7 +367,7 @@ class Engine:
             ratio95=ratios[:, 0],
             ratio95_bright=ratios[:, 1],
             flux=found.flux,
-            flux_error=np.sqrt(found.flux_error**2 + photons),
+            flux_error=np.sqrt((of_flux * found.flux_error) ** 2 + photons),
             background=found.background,
             noise=found.noise,
             snr=snr,
@@ -395,32 +383,33 @@ class Engine:
             **(told or unmeasured(len(stars))),
         )
 
-    def _scales(
-        self, tables: list[np.ndarray], noise: np.ndarray, stars: Stamps
-    ) -> tuple[np.ndarray, ...]:
-        """Factors of the half-widths of 68 % and 95 %, (n, 2), and of the error of the flux, (n,).
+    def _doubts(
+        self, psf: np.ndarray, sigma: np.ndarray | None, noise: np.ndarray, stars: Stamps
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Half-widths of 68 % of PSFs of flux 1 (n, d, d), and what widens them to 95 % (n, 2).
 
-        They are those of what was estimated: the noise, the flux, the sky.
+        The latter are of faint and of bright pixels. The last array (n,) has factors of the
+        error of the flux. All depend on which of noise, flux and sky were estimated.
         """
-        nodes = self.bundle.noise_nodes
+        bundle, count = self.bundle, len(noise)
+        width = at_noise(noise, bundle.noise_nodes, bundle.error68)
+        if sigma is not None:
+            width = width * sigma
+        ratios, of_flux = np.full((count, 2), np.nan), np.ones(count)
+        if bundle.ratio95 is not None:
+            ratios[:] = np.interp(noise, bundle.noise_nodes, bundle.ratio95)[:, None]
+        if (scales := bundle.scales(noise)) is None:
+            return width, ratios, of_flux
         noise_too, flux_too, sky_too = (
             np.isnan(known) for known in (stars.noise, stars.flux, stars.background)
         )
-        case, star = np.where(sky_too, 3, np.where(flux_too, 2, 1)), np.arange(len(noise))
-
-        def at(table: np.ndarray) -> np.ndarray:
-            """A table (S, …) at the noise of each star."""
-            columns = table.reshape(len(nodes), -1).T
-            found = np.stack([np.interp(noise, nodes, column) for column in columns], axis=1)
-            return found.reshape(-1, *table.shape[1:])
-
-        *widths, of_flux = map(at, tables)
-        # What the estimated noise has for its part is between the first two cases.
+        case = np.where(sky_too, 2, flux_too.astype(int))
         wider, widest = (
-            np.where(noise_too[:, None], t[star, case], t[star, case] * t[:, 0] / t[:, 1])
-            for t in widths
+            table[np.arange(count), noise_too.astype(int), case] for table in scales[:2]
         )
-        return wider, widest, np.where(flux_too & sky_too, of_flux, 1.0)
+        faint, bright = wider.T.astype(np.float32)[:, :, None, None]
+        width = width * np.where(brightest(psf), bright, faint)
+        return width, ratios * widest / wider, np.where(flux_too & sky_too, scales[2], of_flux)
 
     def _measured(
         self,

@@ -137,7 +137,7 @@ class Source:
 
     def _is_cube(self, image: ImageFile, stamp_px: int) -> bool:
         shape = image.shape
-        _refuse_colours(image, self.detect is not None)
+        _refuse_colours(image)
         if len(shape) == 2 and (self.catalogue is not None or self.detect is not None):
             return False
         square = shape[-2] == shape[-1] >= stamp_px
@@ -258,13 +258,13 @@ class Source:
         return table.numbers(name)
 
 
-def _refuse_colours(image: ImageFile, searched: bool) -> None:
+def _refuse_colours(image: ImageFile) -> None:
     """Refuse an image with a plane for each colour; a few large planes are no stamps of stars."""
     shape = image.shape
     if len(shape) != 3:
         return
     first, last = shape[0] in COLOURS, shape[-1] in COLOURS
-    stamps = shape[-2] == shape[-1] <= LARGEST_STAMP_PX and not searched
+    stamps = max(shape[-2:]) <= LARGEST_STAMP_PX
     if last or (first and not stamps):
         plane, size = ("[0]", shape[1:]) if first else ("[..., 0]", shape[:-1])
         raise ObservationError(

@@ -41,7 +41,8 @@ COMPONENTS = 48  # leading eigenvectors that a bundle stores
 COVERAGE = 0.6827  # part of the errors within ± `error68`; of a normal variable within ± 1 σ
 WIDE = 0.95  # part of them within ± `error68` times `ratio95`
 LEAST_SIGMA = 1e-12  # of the flux; equal stars leave a method no doubt
-CASES = 4  # nothing is estimated; the noise is, and the flux, and the sky
+# What is told of stars: their flux and sky, their sky, or neither.
+CASES = ({"flux": 1.0, "background": 0.0}, {"background": 0.0}, {})
 NORMAL_WIDE = 1.96  # σ within which a normal variable has as much
 LIMIT = 0.999  # part of the test stars within the limit of the Mahalanobis distance
 STEPS = 64  # of the noise up to that of the flux in every pixel, of a model that is to be small
@@ -221,36 +222,38 @@ def with_scales(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -
     info = bundle.info.model_copy(update={"misfit": misfit(bundle, stars, rng)})
     bundle = replace(bundle, info=info)
     model, nodes = PsfModel(bundle), bundle.noise_nodes
-    noise = np.tile(nodes, (CASES, 1))
-    width, of_flux = np.ones((2, CASES, 2, len(nodes))), np.ones(len(nodes))
+    shape = 2, len(CASES)  # the noise is told, or it is not
+    noise = np.tile(nodes, (*shape, 1))
+    width, of_flux = np.ones((2, *shape, 2, len(nodes))), np.ones(len(nodes))
     for place, node in enumerate(nodes):
         noisy, star = _noisy(stars, node, rng)
-        known = [("noise", node), ("flux", 1.0), ("background", 0.0)]
-        for case in range(CASES):
-            told = model.predict(noisy, position=stars.position[star], **dict(known[case:]))
+        for estimated, case in np.ndindex(shape):
+            known = CASES[case] if estimated else {"noise": node, **CASES[case]}
+            told = model.predict(noisy, position=stars.position[star], **known)
             usable = np.isfinite(told.psf).all(axis=(1, 2))
             if not usable.any():
                 continue
-            noise[case, place] = np.median((told.noise / told.flux)[usable])
+            noise[estimated, case, place] = np.median((told.noise / told.flux)[usable])
             error = np.abs(told.psf - stars.references[star])[usable]
             error /= np.maximum(told.uncertainty[usable], LEAST_SIGMA)
             wide = error / told.ratio95[usable, None, None]
             bright = brightest(told.psf[usable])
             for pixels, kind in ((~bright, 0), (bright, 1)):
-                width[0, case, kind, place] = np.quantile(error[pixels], COVERAGE)
-                width[1, case, kind, place] = np.quantile(wide[pixels], WIDE)
+                width[0, estimated, case, kind, place] = np.quantile(error[pixels], COVERAGE)
+                width[1, estimated, case, kind, place] = np.quantile(wide[pixels], WIDE)
             # A method that measures stars knows how sure it is of their flux.
-            if case == CASES - 1 and not model.engine.estimator.measures:
+            if estimated and not known and not model.engine.estimator.measures:
                 scatter = np.abs(told.flux - 1.0)[usable] / told.flux_error[usable]
                 of_flux[place] = np.quantile(scatter, WIDE) / NORMAL_WIDE
     # Where a star has light that the photometry does not know, its noise is found too large.
-    noise = np.maximum.accumulate(noise, axis=1)
-    for case, kind, part in np.ndindex(CASES, 2, 2):
-        width[part, case, kind] = np.interp(nodes, noise[case], width[part, case, kind])
+    noise = np.maximum.accumulate(noise, axis=-1)
+    for index in np.ndindex(width.shape[:-1]):
+        _, *case, _ = index
+        width[index] = np.interp(nodes, noise[tuple(case)], width[index])
     return replace(
         bundle,
-        **dict(zip(("scale68", "scale95"), width.transpose(0, 3, 1, 2), strict=True)),
-        flux_error_scale=np.interp(nodes, noise[-1], of_flux),
+        **dict(zip(("scale68", "scale95"), np.moveaxis(width, -1, 1), strict=True)),
+        flux_error_scale=np.interp(nodes, noise[1, -1], of_flux),
     )
 
 

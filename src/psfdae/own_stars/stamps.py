@@ -154,7 +154,9 @@ def sky_around(wide: np.ndarray, bad: np.ndarray, stamp_px: int) -> tuple[np.nda
             stdfunc="mad_std",
             axis=1,
         )
-    level, noise = (np.nan_to_num(np.ma.filled(a, np.nan)).astype(float) for a in (level, noise))
+    # Where no pixel counts in any stamp, both are one masked value.
+    found = np.nan_to_num(np.stack([np.ma.filled(a, np.nan) for a in (level, noise)])).astype(float)
+    level, noise = np.broadcast_to(found.T, (len(wide), 2)).T.copy()
     return level, noise
 
 
