@@ -1,14 +1,15 @@
 """Numbers of README and docs, from the run of record and the configuration.
 
 A page keeps numbers between two comments, `<!-- SOURCE where … by …: TEXT -->…<!-- end -->`. SOURCE
-is a table of `results/reference`, or a function below with words for arguments; `where` picks rows
-and `by` sorts them. TEXT is an f-string over the columns. A comment at the end of its line makes a
-line of each row, below the head of the table that the page has; within a line (never at its start)
-the columns of several rows are arrays. Without TEXT, the source itself is put in.
+is a table of `results/reference` or of `studies`, or a function below with words for arguments;
+`where` picks rows and `by` sorts them. TEXT is an f-string over the columns. A comment at the end
+of its line makes a line of each row, below the head of the table that the page has; within a line
+(never at its start) the columns of several rows are arrays. Without TEXT, the source itself is put
+in.
 
-What stays from an earlier record (`kept` in its provenance) gets its date and commit beside it:
-a line below a table; words behind the first number of a section that has no such table. Files of
-two commits are not joined.
+What stays from an earlier record (`kept` in its provenance) or is of a study (its columns `date`
+and `commit`) gets its date and commit beside it: a line below a table; words behind the first
+number of a section that has no such table. Files of two commits are not joined.
 
 `python docs/tables.py` fills in all pages; `--check` names what has drifted.
 """
@@ -55,6 +56,13 @@ PROPAGATORS = {
 }
 STATES = ["decenter_x", "decenter_y", "tilt_x", "tilt_y"]
 CELL = ["dataset", "reference", "noise_level"]
+REAL_SKY = "studies/real_sky/table.csv"
+SKY_PACKAGES = {
+    "psfdae": "psfdae",
+    "piff": "Piff",
+    "psfex": "PSFEx",
+    "epsf": "EPSFBuilder of photutils",
+}
 
 
 READ: set[str] = set()
@@ -95,6 +103,8 @@ def _section(page, text, drifted):
 def _since(*names, where):
     """Date and commit of files of an earlier record; nothing of those of the record itself."""
     kept = json.loads(file("provenance.json")).get("kept", {})
+    studies = [name for name in names if name.startswith("studies/")]
+    kept |= {name: _table(name).iloc[0][["commit", "date"]].to_dict() for name in studies}
     found = {json.dumps(kept.get(name)): kept.get(name) for name in names}
     if len(found) > 1:
         sys.exit(f"{where}: {', '.join(names)} are of two commits, and joined")
@@ -122,14 +132,14 @@ def _written(text, row):
 
 
 def csv(name):
-    """A table of the run of record; names of columns become names in Python."""
+    """A table of the run of record or of a study; names of columns become names in Python."""
     READ.add(name)
     return _table(name)
 
 
 @cache
 def _table(name):
-    table = pd.read_csv(REFERENCE / name)
+    table = pd.read_csv((ROOT if name.startswith("studies/") else REFERENCE) / name)
     return table.rename(columns=lambda column: re.sub(r"\W", "_", column))
 
 
@@ -238,18 +248,60 @@ def sweep(name):
 
 
 def real_sky():
-    """Errors on a real image by S/N: ours, the better setting of each package, and the fluxes."""
-    table = csv("tables/real_sky.csv")
-    table["family"] = table.package.str.rstrip("0123456789")
+    """Errors on a real image in 1e-5 by S/N: ours, and each package's at its best setting.
+
+    Those of the packages are with the centre fitted and averaged, as are the ratios of psfdae's to
+    the least of them and the settings that won. Fluxes are those of the fitted centre.
+    """
     rows = []
-    for snr, cell in table.groupby("snr"):
-        better = cell.loc[cell.groupby("family").mse.idxmin()].set_index("family")
-        errors = (f"{m:.2e} ± {s:.0e}" for m, s in zip(better.mse, better.stderr, strict=True))
-        row = {"snr": snr} | dict(zip(better.index, errors, strict=True))
-        ours, others = better.loc["psfdae"], cell[cell.family != "psfdae"]
-        row |= dict(ours[["ratio", "ratio_stderr", "flux_bias", "bias_stderr", "flux_scatter"]])
-        rows.append(row | {"least_scatter": others.flux_scatter.min()})
+    for _, cell in csv(REAL_SKY).groupby("snr"):
+        (ours,) = cell.query("package == 'psfdae'").to_dict("records")
+        others = cell.query("package != 'psfdae'")
+        row = ours | {"psfdae": _in_1e5(ours), "least_scatter": others.flux_scatter.min()}
+        for centre, group in others.groupby("centre"):
+            for peer in group.loc[group.groupby("package").mse.idxmin()].to_dict("records"):
+                row[f"{peer['package']}_{centre}"] = _in_1e5(peer)
+                row[f"{peer['package']}_{centre}_setting"] = _setting(peer)
+            least = group.loc[group.mse.idxmin()]
+            row[f"over_{centre}"] = f"{least.ratio:.2f} ± {least.ratio_stderr:.2f}"
+        rows.append(row)
     return pd.DataFrame(rows)
+
+
+def real_sky_settings():
+    """Errors on a real image in 1e-5 of every package and setting, a column for every S/N."""
+    table = csv(REAL_SKY).sort_values(["package", "sampling_px", "order", "centre"])
+    table["cell"] = [_in_1e5(row) for row in table.to_dict("records")]
+    keys = ["package", "version", "sampling_px", "order", "centre", "fit_cpu_s"]
+    wide = table.pivot(index=keys, columns="snr", values="cell").add_prefix("snr").reset_index()
+    about = [_setting(row) for row in wide.to_dict("records")]
+    return wide.assign(label=wide.package.map(SKY_PACKAGES), setting=about)
+
+
+def real_sky_packages():
+    """Each package on the real image, its release and all its settings, as words."""
+    rows = []
+    for (package, version), group in csv(REAL_SKY).groupby(["package", "version"]):
+        orders = group.groupby("sampling_px").order.unique().items()
+        settings = [
+            f"samples of {px:g} px" + (f", orders {listed(o, '.0f')}" if all(o > 0) else "")
+            for px, o in orders
+        ]
+        said = f"{SKY_PACKAGES[package]} {version}"
+        rows.append(said + f" ({'; '.join(settings)})" * bool(settings))
+    return pd.DataFrame({"said": rows})
+
+
+def _in_1e5(row):
+    return f"{1e5 * row['mse']:.2f} ± {1e5 * row['stderr']:.2f}"
+
+
+def _setting(row):
+    """Sampling and order, of a package that has them."""
+    if np.isnan(row["sampling_px"]):
+        return ""
+    order = "" if np.isnan(row["order"]) else f", order {row['order']:.0f}"
+    return f"{row['sampling_px']:g} px{order}"
 
 
 def seeds():

@@ -23,7 +23,6 @@ from psfdae.reading import read_table
 from psfdae.rng import stream
 from psfdae.source import git_commit
 from psfdae.stars.field_model import slopes
-from real_sky import standard_error
 
 SIDE = 48  # px of a simulated star
 PITCH = 64  # px of the lattice of the stars
@@ -187,6 +186,11 @@ def _psfex(path, position):
     degree = header["POLDEG1"]
     powers = [x**i * y**j for j in range(degree + 1) for i in range(degree + 1 - j)]
     return np.tensordot(np.stack(powers, axis=1), terms.astype(float), 1), header["PSF_SAMP"]
+
+
+def standard_error(values):
+    """Of a mean."""
+    return values.std(ddof=1) / np.sqrt(len(values))
 
 
 def _lanczos(t):
