@@ -128,7 +128,7 @@ test: lint ## Lint, unit tests and the smoke workflow
 	  --numprocesses logical --maxprocesses 4 --dist worksteal --junitxml results/tests.xml
 
 test-all: test ## The tests, then the slow ones
-	pytest -m slow
+	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 pytest -m slow --numprocesses 2 --dist loadfile
 
 test-docs: env ## Every command of README and docs as it is written
 	pytest -m written

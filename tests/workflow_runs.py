@@ -17,6 +17,8 @@ PATH = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
 VARYING = ("history.csv", "_times.csv", "alignment_time.csv", "runtime.csv", "mlflow.db")
 """Ends of the names of files with run times, which no two runs share."""
 QUIET = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+NO_CLUSTER = {"SLURM_CONF": os.devnull}
+"""Snakemake asks SLURM's programs, where there are any, and waits 10 s for a cluster in vain."""
 
 
 def environment(**more):
@@ -55,7 +57,7 @@ def shell(folder, line, home=None, **options):
 
     `home` is the user's, by default the folder itself; options are those of `Popen`.
     """
-    own = {"HOME": str(home or folder), "PATH": PATH, "LANG": "C.UTF-8"}
+    own = {"HOME": str(home or folder), "PATH": PATH, "LANG": "C.UTF-8", **NO_CLUSTER}
     # An environment of the copy's own would be linked to the copy's source.
     own["PYTHONPATH"] = str(folder / "src")
     return subprocess.Popen(["bash", "-c", line], cwd=folder, env=own, **options)
@@ -74,7 +76,8 @@ def command(folder, *arguments, overrides="", preset="smoke", root=ROOT):
 def snakemake(folder, *arguments, check=True, **options):
     """Output of a run; fails the test if the run fails, unless told otherwise."""
     source = str(options.get("root", ROOT) / "src")
-    result = captured(command(folder, *arguments, **options), env=environment(PYTHONPATH=source))
+    own = environment(PYTHONPATH=source, **NO_CLUSTER)
+    result = captured(command(folder, *arguments, **options), env=own)
     if check:
         assert result.returncode == 0, result.stdout + result.stderr
     return result.stdout + result.stderr
