@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import socket
 import subprocess
 import time
 from collections.abc import Iterator
@@ -86,9 +87,9 @@ def cluster(folder: Path) -> Iterator[None]:
         stack.callback(CONF.unlink, missing_ok=True)
         text = TEMPLATE.format(mark=MARK, pid=os.getpid(), folder=folder)
         CONF.write_text(text, encoding="utf-8")
-        if not MUNGE_SOCKET.exists():
+        if not _munge_answers():
             stack.enter_context(_daemon(_munged(), folder / "munged.log"))
-            wait_for(MUNGE_SOCKET.exists, 10, "munged")
+            wait_for(_munge_answers, 10, "munged")
         stack.enter_context(_daemon(["slurmctld", "-D"], folder / "slurmctld.log"))
         for node in NODES:
             stack.enter_context(_daemon(["slurmd", "-D", "-N", node], folder / f"{node}.log"))
@@ -96,6 +97,12 @@ def cluster(folder: Path) -> Iterator[None]:
         stack.callback(_cancel_everything)
         wait_for(lambda: states() == dict.fromkeys(NODES, "idle"), 30, "the nodes")
         yield
+
+
+def _munge_answers() -> bool:
+    """Whether somebody listens at the socket; it outlives a daemon that was killed."""
+    with socket.socket(socket.AF_UNIX) as client:
+        return client.connect_ex(str(MUNGE_SOCKET)) == 0
 
 
 def _munged() -> list[str]:
