@@ -130,7 +130,10 @@ def mean_errors(**scale):
     """A table of mean errors of dataset d with three methods; keywords multiply their MSE."""
     key = {"dataset": "d", "split": "random", "reference": "realisation"}
     rows = [
-        key | {"method": name, "noise_level": level, "metric": metric, "value": value}
+        key
+        | {"method": name, "noise_level": level, "metric": metric, "value": value}
+        # Half a per cent of what is lost.
+        | {"stderr": 0.005 * (value if metric == "mse" else 1 - value)}
         for name, mse in (("noisy", 4.0), ("pca_som", 2.0), ("dae", 1.0))
         for level in (1e-3, 2e-3)
         for metric, value in (
@@ -171,6 +174,8 @@ def test_tables_of_a_run_and_of_the_record_are_compared(recorded):
     unknown = "  - d, random, realisation: noisy at λ = 0.001, 0.002 (mse, ssim)"
     assert f"- 4 differ by more\n{beyond}\n- 4 differ, but their scatter" in said
     assert unknown in said
+    said = recorded(noisy=1.0004).output
+    assert "- 8 are equal" in said and "- 4 differ by less than 0.1 of the standard error" in said
 
 
 def test_an_exchange_of_the_papers_methods_is_named(recorded):

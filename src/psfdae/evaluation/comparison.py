@@ -18,6 +18,10 @@ if TYPE_CHECKING:
 SIGNIFICANT = 3.0
 """A difference of so many standard errors is called one; 1 of 370 is chance."""
 
+NEGLIGIBLE = 0.1
+"""Of the standard error of the test stars: another kind of processor, which rounds differently and
+with it draws a photon more or less in a few stars, changes the errors by less than that."""
+
 Scatter = Mapping[tuple[str, str, str], float]
 """Relative scatter of a method's MSE between seeds by dataset, reference and method."""
 
@@ -201,9 +205,10 @@ def compare_tables(
     Returns
     -------
     rows : DataFrame
-        The keys, value_first, value_second, and verdict: "equal"; "within" `SIGNIFICANT`
-        standard deviations of the difference of two fits with different seeds; "beyond" that;
-        "not measured" of rows that differ, but whose scatter is not known.
+        The keys, value_first, value_second, and verdict: "equal"; "rounding" of differences
+        that are `NEGLIGIBLE`; "within" `SIGNIFICANT` standard deviations of the difference of
+        two fits with different seeds; "beyond" that; "not measured" of rows that differ, but
+        whose scatter is not known.
     order : DataFrame
         By column of the tables: whether errors ascend as in `PAPER_ORDER` in the `first` and in
         the `second`, and whether two methods are `exchanged`, by more than the scatter in both.
@@ -212,13 +217,17 @@ def compare_tables(
 
     both = [with_seed_stderr(table, scatter) for table in (first, second)]
     keys = [*CELL, "method", "metric"]
-    kept = [table[[*keys, "value", "seed_stderr"]] for table in both]
+    kept = [table[[*keys, "value", "stderr", "seed_stderr"]] for table in both]
     rows = kept[0].merge(kept[1], on=keys, suffixes=("_first", "_second"))
     gap = (rows.value_second - rows.value_first).abs()
-    allowed = SIGNIFICANT * np.hypot(rows.pop("seed_stderr_first"), rows.pop("seed_stderr_second"))
+    rounding = NEGLIGIBLE * rows[["stderr_first", "stderr_second"]].min(axis=1)
+    allowed = SIGNIFICANT * np.hypot(rows.seed_stderr_first, rows.seed_stderr_second)
     rows["verdict"] = np.select(
-        [gap == 0, allowed.isna(), gap <= allowed], ["equal", "not measured", "within"], "beyond"
+        [gap == 0, gap <= rounding, allowed.isna(), gap <= allowed],
+        ["equal", "rounding", "not measured", "within"],
+        "beyond",
     )
+    rows = rows[[*keys, "value_first", "value_second", "verdict"]]
     signs = [_signs(table) for table in both]
     signs = [s.reindex(signs[0].index.intersection(signs[1].index)) for s in signs]
     order = {name: (s < 0).all(axis=1) for name, s in zip(("first", "second"), signs, strict=True)}

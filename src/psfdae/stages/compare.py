@@ -171,7 +171,7 @@ def read_errors(folder: Path) -> pd.DataFrame:
 
     from psfdae.evaluation.comparison import CELL
 
-    wanted = [*CELL, "method", "metric", "value"]
+    wanted = [*CELL, "method", "metric", "value", "stderr"]
     parts = {path: read_table(path) for path in _tables(folder)}
     for path, part in parts.items():
         if lacking := [name for name in wanted if name not in part]:
@@ -182,6 +182,7 @@ def read_errors(folder: Path) -> pd.DataFrame:
 def describe_tables(first: Path, second: Path) -> str:
     """Markdown: which mean errors of two runs are equal, and which differ by more than seeds do."""
     from psfdae.evaluation.comparison import (
+        NEGLIGIBLE,
         PAPER_ORDER,
         SIGNIFICANT,
         compare_tables,
@@ -193,6 +194,8 @@ def describe_tables(first: Path, second: Path) -> str:
     names = " < ".join(method(name).paper[1] for name in PAPER_ORDER)  # type: ignore[index]
     said = {
         "equal": "are equal to the last digit",
+        "rounding": f"differ by less than {NEGLIGIBLE:g} of the standard error of the test stars, "
+        "as by the rounding of another kind of processor",
         "within": f"differ within the scatter between seeds ({SIGNIFICANT:g} standard deviations "
         "of the difference of two fits)",
         "beyond": "differ by more",
