@@ -57,8 +57,7 @@ MAY_STAY = re.compile(
     "|".join(
         (
             *(r"(sweeps|paper)/.+", r"tables/psf_metrics_on_request\.csv"),
-            r"tables/(benchmark_\w+|scaling_stages|baseline_readings|seeds_dataset3)\.csv",
-            r"tables/predict_(poppy\w*|throughput)\.csv",
+            r"tables/(benchmark_\w+|scaling_stages|baseline_readings|predict_poppy\w*)\.csv",
             *(r"figures/benchmark/.+", *BY_HAND),
         )
     )
