@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 from faint import FLUX, SNR
+from scipy.stats import sem
 
 from psfdae import __version__, load_model
 from psfdae.source import git_commit
@@ -60,20 +61,15 @@ def of_stars(folder, split):
             yield table.assign(**dict(zip(SETTING, setting, strict=True)), snr=snr, **about)
 
 
-def standard_error(values):
-    """Of a mean."""
-    return values.std(ddof=1) / np.sqrt(len(values))
-
-
 def row(cell, reference):
     """A row of the table, of the stars of a setting and those of psfdae."""
     ratio = reference.mse.mean() / cell.mse.mean()
     found = {"version": cell.version.iloc[0], "fit_cpu_s": cell.fit_cpu_s.mean()}
     found |= {"stars": len(cell), "copies": cell.copies.sum()}
-    found |= {"mse": cell.mse.mean(), "stderr": standard_error(cell.mse), "ratio": ratio}
-    found["ratio_stderr"] = standard_error(reference.mse - ratio * cell.mse) / cell.mse.mean()
+    found |= {"mse": cell.mse.mean(), "stderr": sem(cell.mse), "ratio": ratio}
+    found["ratio_stderr"] = sem(reference.mse - ratio * cell.mse) / cell.mse.mean()
     bias = cell.off.mean()
-    found |= {"flux_bias": bias, "bias_stderr": standard_error(cell.off)}
+    found |= {"flux_bias": bias, "bias_stderr": sem(cell.off)}
     found |= {"flux_scatter": np.sqrt(cell.off2.mean() - bias**2)}
     return found | {"own_mse": cell.own_mse.mean()}
 

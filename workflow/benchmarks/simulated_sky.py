@@ -11,6 +11,7 @@ from typing import Annotated
 
 import click
 import numpy as np
+from scipy.stats import sem
 
 from measure import write
 from psfdae.cli import File, command, program
@@ -146,8 +147,8 @@ def places(
         over = errors["psfdae"].mean() / error.mean()
         paired = (errors["psfdae"] - over * error) / error.mean()
         row = {"package": package, "stars": len(held), "learnt": sum(table["part"] == "training")}
-        row |= {"mse": error.mean(), "stderr": standard_error(error)}
-        row |= {"over": over, "over_stderr": standard_error(paired)}
+        row |= {"mse": error.mean(), "stderr": sem(error)}
+        row |= {"over": over, "over_stderr": sem(paired)}
         rows.append(row | {"date": date.today().isoformat(), "commit": git_commit()})
     write(out, rows)
 
@@ -186,11 +187,6 @@ def _psfex(path, position):
     degree = header["POLDEG1"]
     powers = [x**i * y**j for j in range(degree + 1) for i in range(degree + 1 - j)]
     return np.tensordot(np.stack(powers, axis=1), terms.astype(float), 1), header["PSF_SAMP"]
-
-
-def standard_error(values):
-    """Of a mean."""
-    return values.std(ddof=1) / np.sqrt(len(values))
 
 
 def _lanczos(t):

@@ -19,8 +19,8 @@ SIGNIFICANT = 3.0
 """A difference of so many standard errors is called one; 1 of 370 is chance."""
 
 NEGLIGIBLE = 0.1
-"""Of the standard error of the test stars: another kind of processor, which rounds differently and
-with it draws a photon more or less in a few stars, changes the errors by less than that."""
+"""Part of the standard error of the test stars below which a difference says nothing. Most of those
+are smaller that come from another kind of processor, which rounds differently."""
 
 Scatter = Mapping[tuple[str, str, str], float]
 """Relative scatter of a method's MSE between seeds by dataset, reference and method."""
