@@ -17,8 +17,8 @@ from psfdae.evaluation.curves import (
     errors_above_bounds,
 )
 from psfdae.files import ProductError, read_product
+from psfdae.own_stars.star_sets import noisy_test_images, split_stars
 from psfdae.stages import bounds, figures, stars
-from psfdae.stages.common import noisy_test_images, split_stars
 
 LEVELS = (0.001, 0.003, 0.01, 0.1)
 SIZES = ("preset=smoke", "grid.points=3", "stars.count=60", "parts.train_stars=20")

@@ -31,9 +31,9 @@ from psfdae.own_stars.bundle import (
 )
 from psfdae.own_stars.model import PsfModel
 from psfdae.own_stars.photometry import FluxModel, noise_equivalent_px, signal_to_noise
+from psfdae.own_stars.star_sets import noise_model, noisy_test_images, read_stars
 from psfdae.rng import stream
 from psfdae.stages import bundle as stage
-from psfdae.stages.common import noise_model, noisy_test_images, read_stars
 from psfdae.stages.evaluate import Models
 from psfdae.stages.fit import fit, train
 

@@ -21,8 +21,8 @@ from psfdae.evaluation.figures import (
 )
 from psfdae.evaluation.paper import published
 from psfdae.files import Column, ProductError, write_product
+from psfdae.own_stars.star_sets import noisy_test_images, read_stars
 from psfdae.stages import figures as stage
-from psfdae.stages.common import noisy_test_images, read_stars
 from psfdae.stages.evaluate import READS, Models
 from psfdae.stars.fields import random_split, square_grid
 

@@ -41,11 +41,11 @@ from psfdae.own_stars.selection import (
     star_centres,
 )
 from psfdae.own_stars.stamps import cut
+from psfdae.own_stars.star_sets import noise_model, split_stars
 from psfdae.own_stars.training_images import OwnNoise, make_images, star_grid, training_columns
 from psfdae.rng import stream
 from psfdae.stages import from_stars as stage
 from psfdae.stages import simulate
-from psfdae.stages.common import noise_model, split_stars
 from psfdae.stages.evaluate import READS
 from psfdae.stages.from_stars import Source, _alone, from_stars
 from psfdae.stars.fields import held_out_fields

@@ -10,8 +10,9 @@ import pytest
 from psfdae.configuration.compose import load
 from psfdae.files import Product
 from psfdae.optics.wavefronts import seidel_wavefronts, zernike_wavefronts
+from psfdae.own_stars.star_sets import noisy_test_images
 from psfdae.rng import stream
-from psfdae.stages.common import noisy_test_images, template_wavefronts
+from psfdae.stages.common import template_wavefronts
 from psfdae.stars.fields import (
     assign_fields,
     draw_jitter,

@@ -21,6 +21,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 import click
 
 import psfdae
+from psfdae.errors import Error
 
 File = Annotated[Path, click.Path(path_type=Path, dir_okay=False)]
 Folder = Annotated[Path, click.Path(path_type=Path, file_okay=False)]
@@ -58,28 +59,27 @@ class Stage:
     name: str
     reads: tuple[str, ...] | Callable[..., tuple[str, ...]]
     root: Literal["config", "alignment"]
-    start: tuple[str, ...] = ()
+    words: Callable[[Sequence[str]], Any] | None = None
 
 
 def command(
     name: str,
     reads: tuple[str, ...] | Callable[..., tuple[str, ...]] = (),
     root: Literal["config", "alignment"] = "config",
-    start: tuple[str, ...] = (),
+    words: Callable[[Sequence[str]], Any] | None = None,
 ) -> Callable[..., Any]:
     """Make a function the command `psfdae NAME`.
 
     A parameter `config` receives the groups of the configuration in `reads`, checked, from
-    trailing overrides, those of `start` before them, or a file of settings; which groups may
-    depend on the options. Other
-    parameters are options: required without a default, repeatable as `tuple[X, ...]`, a
-    flag as bool, all fields of a dataclass. `Annotated` adds help (a text), a click type,
-    or a dict of what click's option takes, where "flag" names it and "argument" makes it
-    positional. Help is the docstring.
+    trailing overrides or a file of settings; which groups may depend on the options. `words`
+    reads the overrides where Hydra is not to. Other parameters are options: required without a
+    default, repeatable as `tuple[X, ...]`, a flag as bool, all fields of a dataclass. `Annotated`
+    adds help (a text), a click type, or a dict of what click's option takes, where "flag" names
+    it and "argument" makes it positional. Help is the docstring.
     """
 
     def mark(function: Callable[..., Any]) -> Callable[..., Any]:
-        function.stage = Stage(name, reads, root, start)  # type: ignore[attr-defined]
+        function.stage = Stage(name, reads, root, words)  # type: ignore[attr-defined]
         return function
 
     return mark
@@ -109,7 +109,7 @@ def refusal(error: Exception) -> str | None:
         return f"not enough memory ({error or 'no more is known'})"
     if isinstance(error, OSError):
         return None if error.errno is None else str(error)
-    if type(error).__module__.startswith("psfdae"):
+    if isinstance(error, Error):
         return str(error)
     # HDF5 reports a full disk as a RuntimeError without a number of its own.
     # So does torch a lack of memory, as its own RuntimeError.
@@ -235,7 +235,7 @@ def _settings(
 
     reads = spec.reads(**given) if callable(spec.reads) else spec.reads
     if file is None:
-        return load_stage(reads, (*spec.start, *overrides), spec.root)
+        return spec.words(overrides) if spec.words else load_stage(reads, overrides, spec.root)
     if overrides:
         raise click.UsageError("--config and overrides exclude each other")
     return load_settings(file, reads, spec.root)

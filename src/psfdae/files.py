@@ -20,9 +20,10 @@ from typing import IO, Any
 import numpy as np
 
 import psfdae
+from psfdae.errors import Error
 
 
-class ProductError(RuntimeError):
+class ProductError(Error, RuntimeError):
     """A data product is missing, damaged, or not what the stage expects."""
 
 
@@ -195,6 +196,12 @@ def write_text(path: str | Path, text: str) -> None:
     """Write a UTF-8 text file atomically."""
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+def write_bytes(path: str | Path, content: bytes) -> None:
+    """Write a file atomically."""
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(content)
 
 
 def write_csv(path: str | Path, table: Any, digits: int = 8) -> None:
@@ -400,13 +407,20 @@ def _describe(file: Any, kind: str, config: Mapping[str, Any]) -> None:
 
 @dataclass(frozen=True)
 class Product:
-    """Arrays and config read from a data product."""
+    """A data product: its configuration, and its arrays, each read when it is first asked for.
+
+    `kind` is that of `read_product`; "" for a product that is in memory as a whole, of which
+    `path` is only a name.
+    """
 
     path: Path
     config: dict[str, Any]
     arrays: dict[str, np.ndarray]
+    kind: str = ""
 
     def __getitem__(self, name: str) -> np.ndarray:
+        if name not in self.arrays and self.kind:
+            self.arrays.update(read_product(self.path, self.kind, (name,)).arrays)
         return self.arrays[name]
 
 
@@ -432,7 +446,7 @@ def read_product(path: str | Path, kind: str, names: tuple[str, ...] | None = No
             if missing:
                 raise ProductError(f"{path}: array {missing[0]!r} is missing")
             arrays = {name: file[name][()] for name in wanted}
-            return Product(path, json.loads(file.attrs["config"]), arrays)
+            return Product(path, json.loads(file.attrs["config"]), arrays, kind)
     except FileNotFoundError:
         raise ProductError(f"{path}: no such file") from None
     except (OSError, KeyError, ValueError) as error:

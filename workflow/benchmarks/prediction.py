@@ -21,8 +21,8 @@ from psfdae.configuration.compose import ConfigError, part
 from psfdae.configuration.consistency import SIMULATION
 from psfdae.configuration.schema import Config
 from psfdae.files import read_product
+from psfdae.own_stars import star_sets
 from psfdae.rng import stream
-from psfdae.stages import common
 from psfdae.stars.fields import assign_fields, draw_jitter, perturb, relative_field
 from psfdae.stars.framing import brightest_pixel, crop_jittered, normalise_flux
 from psfdae.stars.noise import NoiseModel, mixed_levels
@@ -232,7 +232,7 @@ def coverage(
     """
     from psfdae.own_stars.bundle import read_bundle
 
-    products = [common.read_stars(path, "template") for path in stars]
+    products = [star_sets.read_stars(path, "template") for path in stars]
     rows = []
     for path in bundles:
         bundle = read_bundle(path)
@@ -255,12 +255,15 @@ def covered(bundle, product, rng):
 
     trained, fitted = bundle.info.config["train"], estimator(bundle)
     said = part(("seed", "noise", "parts"), trained)
-    noise, reference = common.noise_model(said), bundle.info.reference or trained.get("reference")
-    test = common.split_stars(product, trained["split"], said).test
+    noise, reference = (
+        star_sets.noise_model(said),
+        bundle.info.reference or trained.get("reference"),
+    )
+    test = star_sets.split_stars(product, trained["split"], said).test
     # Images of one star of an image are of one half.
     star = product["field_index"][test] if trained["split"] == "held_out" else test
     odd = np.unique(star, return_inverse=True)[1] % 2 == 1
-    columns = product["realisation"], product[reference], common.field_positions(product)
+    columns = product["realisation"], product[reference], star_sets.field_positions(product)
     halves = [
         packing.HeldOutStars(*(c[test[half]] for c in columns[:2]), noise, columns[2][test[half]])
         for half in (odd, ~odd)
@@ -304,14 +307,14 @@ def strange(
     """
     from psfdae.own_stars.model import load_model
 
-    product = common.read_stars(stars, "realisation")
+    product = star_sets.read_stars(stars, "realisation")
     require(stars, product.config, STARS, config)
     require_bundle(bundle, config)
     model, noise = (
         load_model(bundle),
         NoiseModel(config.noise.kappa, config.noise.background_photons),
     )
-    images = product["realisation"][common.split_stars(product, "random", config).test]
+    images = product["realisation"][star_sets.split_stars(product, "random", config).test]
     images = np.tile(images, (NOISY_EACH, 1, 1))
     rows = []
     for level in config.noise.levels:

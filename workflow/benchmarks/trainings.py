@@ -18,9 +18,9 @@ from psfdae.configuration.consistency import SIMULATION
 from psfdae.configuration.schema import Config
 from psfdae.estimators import all_groups, groups_of, method
 from psfdae.files import read_product, write_csv
+from psfdae.own_stars import star_sets
 from psfdae.reading import read_table, read_yaml
 from psfdae.stages import common
-from psfdae.stages.fit import training_set
 
 PATIENCE = 5  # validations without a better one after which a training no longer improves
 WORTHWHILE = 0.9  # fraction to which each doubling of the time must bring the error
@@ -72,12 +72,12 @@ def knee_table(
 
     common.limit_threads(config.evaluation.threads)
     folders = {name: Path(folder) for name, _, folder in (p.partition("=") for p in points)}
-    product = common.read_stars(stars)
+    product = star_sets.read_stars(stars)
     for folder in folders.values():
         Dae.require(folder, product, config, "random", "realisation")
-    test = common.split_stars(product, "random", config).test
+    test = star_sets.split_stars(product, "random", config).test
     images, levels = product["realisation"][test], config.noise.levels
-    noisy = {level: common.noisy_test_images(config, product, test, level) for level in levels}
+    noisy = {level: star_sets.noisy_test_images(config, product, test, level) for level in levels}
     configured = decisive(config.model_dump(include={"dae", "train"}))
     rows, idle = [], []
     for name, folder in folders.items():
@@ -186,14 +186,14 @@ def time_points(tree, stars):
     config = part(READS, tree)
     settings, levels = config.baseline, config.noise.levels
     common.limit_threads(settings.threads)
-    product = common.read_stars(stars, "template")
-    parts = common.split_stars(product, "random", config)
+    product = star_sets.read_stars(stars, "template")
+    parts = star_sets.split_stars(product, "random", config)
     # As the stage `baseline` does it: the point in use is the very model of the tables.
-    data = training_set(config, PcaSom, product, "random", "realisation")
+    data = star_sets.training_set(config, PcaSom, product, "random", "realisation")
     truths = {name: product[name][parts.test] for name in ("realisation", "template")}
     clean = truths["realisation"]
     tests = {
-        level: common.noisy_test_images(config, product, parts.test, level) for level in levels
+        level: star_sets.noisy_test_images(config, product, parts.test, level) for level in levels
     }
     used = tuple(getattr(settings, size) for size in SIZES)
     rows = []
@@ -232,19 +232,19 @@ def readings(
     from psfdae.evaluation.paper import published
 
     common.limit_threads(config.baseline.threads)
-    product = common.read_stars(stars, "template")
+    product = star_sets.read_stars(stars, "template")
     require(stars, product.config, STARS, config)
-    test = common.split_stars(product, "random", config).test
+    test = star_sets.split_stars(product, "random", config).test
     field, dataset = product["field_index"][test], config.dataset.name
     paper = published("psf").query("dataset == @dataset and metric == 'mse' and method == 'pca'")
     paper = paper.set_index("noise_level").value
-    data = training_set(config, PcaSom, product, "random", "realisation")
+    data = star_sets.training_set(config, PcaSom, product, "random", "realisation")
     rows = []
     for reading, per_level in READINGS:
         changed = {"reading": reading, "per_level": per_level}
         fitted = PcaSom.fit(data, config.baseline.model_copy(update=changed))
         for level in config.noise.levels:
-            noisy = common.noisy_test_images(config, product, test, level)
+            noisy = star_sets.noisy_test_images(config, product, test, level)
             found = fitted.predict(noisy, level)
             for name in config.dataset.references:
                 mean, stderr = clustered_mean(mse(found, product[name][test]), field)
@@ -286,20 +286,20 @@ def time_methods(tree, stars):
 
     config = part(METHODS, tree)
     common.limit_threads(1)
-    product = common.read_stars(stars, "template")
-    test = common.split_stars(product, "random", config).test
+    product = star_sets.read_stars(stars, "template")
+    test = star_sets.split_stars(product, "random", config).test
     clean, field = product["realisation"][test], product["field_index"][test]
-    position = common.field_positions(product)[test]
+    position = star_sets.field_positions(product)[test]
     rows = []
     for kind in (kind for kind in map(method, config.methods) if kind.restores):
         with TemporaryDirectory() as folder:
             given = config, kind, product, "random", "realisation"
-            data = training_set(*given, checkpoint=Path(folder, "checkpoint"))
+            data = star_sets.training_set(*given, checkpoint=Path(folder, "checkpoint"))
             start = process_time()
             fitted = kind.fit(data, **kind.settings(config))
             fit_s = process_time() - start
         for level in config.noise.levels:
-            noisy = common.noisy_test_images(config, product, test, level)
+            noisy = star_sets.noisy_test_images(config, product, test, level)
             # What is made once for a level, such as factorisations, is not of the stars.
             fitted.restore(noisy[:1], level, position[:1])
             start = process_time()
@@ -324,11 +324,11 @@ def seeds(
     """Repeat the fits of METHOD with other seeds, and test all of them on the same noisy stars."""
     from psfdae.evaluation.metrics import mse
 
-    kind, product = method(name), common.read_stars(stars, "template")
+    kind, product = method(name), star_sets.read_stars(stars, "template")
     common.limit_threads(kind.threads(config))
-    test = common.split_stars(product, "random", config).test
-    position = common.field_positions(product)[test]
-    noisy = {x: common.noisy_test_images(config, product, test, x) for x in config.noise.levels}
+    test = star_sets.split_stars(product, "random", config).test
+    position = star_sets.field_positions(product)[test]
+    noisy = {x: star_sets.noisy_test_images(config, product, test, x) for x in config.noise.levels}
     own = own_fits(config, kind, dataset, reference, product, results)
     rows = []
     for seed in range(config.seed, config.seed + SEEDS):
@@ -351,7 +351,7 @@ def own_fits(config, kind, dataset, references, product, results):
             kind.require(place, product, config, "random", reference)
             fits[reference] = kind.load(place, reference, config.evaluation)
         else:
-            data = training_set(config, kind, product, "random", reference)
+            data = star_sets.training_set(config, kind, product, "random", reference)
             fits[reference] = kind.fit(data, **kind.settings(config))
     return fits
 
@@ -364,7 +364,7 @@ def other_fits(config, kind, own, product, seed):
             fits[reference] = next(iter(fits.values()))  # one serves all
             continue
         with TemporaryDirectory() as folder:
-            data = training_set(
+            data = star_sets.training_set(
                 *(config, kind, product, "random", reference),
                 checkpoint=Path(folder, "checkpoint"),
                 start=fits.get("realisation") if kind.continues(config) else None,

@@ -15,6 +15,7 @@ import numpy as np
 
 from psfdae.configuration.alignment import Alignment, AlignmentOptics
 from psfdae.configuration.telescope import Telescope
+from psfdae.errors import Error
 from psfdae.optics.derivatives import ModalStamps, PeriodSampling, normalise_with_derivatives
 from psfdae.optics.propagation import in_batches
 from psfdae.optics.pupil import annular_pupil, choose_samples, required_samples
@@ -30,7 +31,7 @@ from psfdae.optics.wavefronts import (
 from psfdae.stars.framing import normalise_flux
 
 
-class EnergyError(ValueError):
+class EnergyError(Error, ValueError):
     """A stamp holds too little of the light."""
 
 

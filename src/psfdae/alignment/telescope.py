@@ -25,6 +25,7 @@ import numpy as np
 from psfdae.configuration.alignment import Alignment
 from psfdae.configuration.telescope import Telescope
 from psfdae.configuration.wavefront import Prescription
+from psfdae.errors import Error
 from psfdae.optics.raytracing import ZernikeTracer, build_optic
 from psfdae.stars.symmetry import SYMMETRIES, Symmetry
 
@@ -34,7 +35,7 @@ PAIRS = tuple(combinations_with_replacement(range(4), 2))
 TERMS = 1 + 4 + len(PAIRS)
 
 
-class ModelError(RuntimeError):
+class ModelError(Error, RuntimeError):
     """The quadratic model does not reproduce ray tracing."""
 
 

@@ -9,6 +9,8 @@ from typing import Annotated
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
+from psfdae.errors import Error
+
 SEARCH = 48.0
 """λ/D around the chief ray within which brightest pixels are searched by default.
 
@@ -47,7 +49,7 @@ class Group(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class ConfigError(ValueError):
+class ConfigError(Error, ValueError):
     """The configuration is not usable; every line names a key, its value and the range."""
 
 

@@ -109,7 +109,8 @@ def _kept(overrides: tuple[str, ...], root: Root, outline: str = "") -> dict[str
 def _made_of(overrides: tuple[str, ...], root: Root, outline: str) -> str:
     """Hash of all that a composition is made of, "" if a resolver may add more."""
     folder = config_dir()
-    words = (overrides, root, outline, all_groups(), version("hydra-core"), version("omegaconf"))
+    words = (overrides, root, outline, all_groups(), _class_defaults())
+    words += (version("hydra-core"), version("omegaconf"))
     parts = [repr(words).encode(), Path(__file__).read_bytes()]
     for path in sorted(folder.rglob("*.yaml")):
         parts += [str(path.relative_to(folder)).encode(), path.read_bytes()]
@@ -139,7 +140,11 @@ def _by_hydra(overrides: tuple[str, ...], root: Root, outline: str = "") -> dict
 
 
 def _primary(root: Root, folder: Path) -> str:
-    """Name of a root that has the settings of all methods, whether it lists them or not."""
+    """Name of a root that begins with the defaults of the classes of its settings.
+
+    Files of the groups hold what differs from these. The settings of every method are there,
+    whether the root's list of defaults has them or not.
+    """
     from hydra.core.config_store import ConfigStore
 
     if root != "config":
@@ -147,13 +152,32 @@ def _primary(root: Root, folder: Path) -> str:
     tree = parse_yaml(folder / "config.yaml")
     defaults = tree.get("defaults", [])
     chosen = {group for entry in defaults if isinstance(entry, dict) for group in entry}
-    groups = set(all_groups())
-    if not groups - chosen:
-        return root
     # Before all others, so that datasets and presets may change them.
-    more = [{group: "default"} for group in sorted(groups - chosen)]
-    ConfigStore.instance().store("config_of_methods", {**tree, "defaults": [*more, *defaults]})
-    return "config_of_methods"
+    more = [{f"optional {group}": "default"} for group in sorted({*all_groups()} - chosen)]
+    store = ConfigStore.instance()
+    store.store(CLASS_DEFAULTS, _class_defaults(), package="_global_")
+    whole = {**tree, "defaults": [CLASS_DEFAULTS, *more, *defaults]}
+    store.store(WHOLE_ROOT, whole)
+    return WHOLE_ROOT
+
+
+CLASS_DEFAULTS, WHOLE_ROOT = "class_defaults", "config_with_class_defaults"
+
+
+def _class_defaults() -> dict[str, Any]:
+    """Groups of the configuration with the values that their classes give, where they give some."""
+    fields = whole_config().model_fields.items()
+    kinds = {name: field.annotation for name, field in fields}
+    groups = {
+        name: {
+            key: field.get_default(call_default_factory=True)
+            for key, field in kind.model_fields.items()
+            if not (field.is_required() or field.exclude)
+        }
+        for name, kind in kinds.items()
+        if isinstance(kind, type) and issubclass(kind, Group)
+    }
+    return {name: values for name, values in groups.items() if values}
 
 
 def _reason(error: Exception, folder: Path) -> str:

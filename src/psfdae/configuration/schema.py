@@ -66,12 +66,24 @@ class Stars(Group):
     )
 
 
-class Framing(Group):
-    """Stamp size and centring."""
+class Stamp(Group):
+    """Size and centring of stamps."""
 
     stamp_px: Annotated[int, Field(ge=8, le=256, multiple_of=2)] = Field(
-        description="Side d of a stamp"
+        16, description="Side d of a stamp"
     )
+    jitter_px: Annotated[int, Field(ge=0, le=8)] = Field(
+        1, description="Centring error, uniform in ± this many whole pixels per axis"
+    )
+    subpixel: bool = Field(
+        True,
+        description="Pixel grid of every realisation anywhere within ± ½ pixel, as for real stars",
+    )
+
+
+class Framing(Stamp):
+    """Stamps of simulated stars."""
+
     search_px: Annotated[int, Field(ge=4, le=512)] = Field(
         description="A template's brightest pixel is searched within ± this of the chief ray; "
         "null: search_lambda_d"
@@ -79,14 +91,8 @@ class Framing(Group):
     search_lambda_d: SearchDistance = Field(
         default=SEARCH, description="The same in λ/D of whatever telescope, if search_px is null"
     )
-    jitter_px: Annotated[int, Field(ge=0, le=8)] = Field(
-        description="Centring error, uniform in ± this many whole pixels per axis"
-    )
     tie: Annotated[float, Field(ge=0, lt=0.1)] = Field(
         description="Pixels within this fraction of the maximum count as equally bright"
-    )
-    subpixel: bool = Field(
-        description="Pixel grid of every realisation anywhere within ± ½ pixel, as for real stars"
     )
 
 
@@ -118,10 +124,10 @@ class Noise(Group):
 class Parts(Group):
     """Sizes of the training, validation and test parts."""
 
-    train_stars: Count = Field(description="Training stars, validation included")
-    test_stars: Count = Field(description="Test stars of the random split")
+    train_stars: Count = Field(3000, description="Training stars, validation included")
+    test_stars: Count = Field(300, description="Test stars of the random split")
     validation_fraction: Annotated[float, Field(gt=0, le=0.5)] = Field(
-        description="Part of the training stars that selects the best state"
+        0.1, description="Part of the training stars that selects the best state"
     )
 
 
@@ -143,9 +149,9 @@ class Dataset(Group):
 class Evaluation(Group):
     """Image metrics."""
 
-    data_range: Positive = Field(description="SSIM dynamic range fitted to the paper's rows")
-    batch: Count = Field(description="Stars per forward pass")
-    threads: Count = Field(description="Threads of the linear algebra")
+    data_range: Positive = Field(0.66, description="SSIM dynamic range fitted to the paper's rows")
+    batch: Count = Field(256, description="Stars per forward pass")
+    threads: Count = Field(1, description="Threads of the linear algebra")
 
 
 class Calibration(Group):
@@ -195,27 +201,31 @@ class Bounds(Group):
 class CalibrationStars(Group):
     """Which stars of an image become training data, and the noise that they get."""
 
-    snr_min: Positive = Field(description="Least S/N of a star that is learnt from")
-    isolation_px: Positive = Field(description="Distance within which a neighbour is too close")
+    snr_min: Positive = Field(100.0, description="Least S/N of a star that is learnt from")
+    isolation_px: Positive = Field(
+        12.0, description="Distance within which a neighbour is too close"
+    )
     neighbour_ratio: Positive = Field(
-        description="Brightness of such a neighbour, in that of the star, from which it disturbs"
+        0.02,
+        description="Brightness of such a neighbour, in that of the star, from which it disturbs",
     )
     misfit: Annotated[float, Field(gt=1, allow_inf_nan=False)] = Field(
-        description="Difference of a misfit from the nearest stars, in that of the median star"
+        2.5, description="Difference of a misfit from the nearest stars, in that of the median star"
     )
     search_px: Annotated[int, Field(ge=1, le=16)] = Field(
-        description="The brightest pixel is searched within ± this of the catalogue's position"
+        3, description="The brightest pixel is searched within ± this of the catalogue's position"
     )
     margin_px: Annotated[int, Field(ge=0, le=64)] = Field(
-        description="Pixels around a stamp, in which the sky is measured"
+        8, description="Pixels around a stamp, in which the sky is measured"
     )
-    stars_min: Annotated[int, Field(ge=10)] = Field(description="Fewest stars to learn from")
+    stars_min: Annotated[int, Field(ge=10)] = Field(20, description="Fewest stars to learn from")
     bins: Annotated[int, Field(ge=1, le=64)] = Field(
-        description="Parts of the field along a side; stars of a part are stacked"
+        4, description="Parts of the field along a side; stars of a part are stacked"
     )
     snr_levels: Annotated[list[Positive], Field(min_length=1)] = Field(
+        [5.0, 10.0, 20.0, 50.0],
         description="S/N to which bright stars are degraded, ascending; those above snr_min / 2, "
-        "where the stars' own noise would count, are that"
+        "where the stars' own noise would count, are that",
     )
 
     @model_validator(mode="after")
@@ -237,6 +247,8 @@ def _listed(name: str) -> str:
 
 
 MethodName = Annotated[str, AfterValidator(_listed)]
+MethodNames = Annotated[list[MethodName], Field(min_length=1)]
+Seed = Annotated[int, Field(ge=0, lt=2**63)]
 
 
 class Workflow(Group):
@@ -257,9 +269,9 @@ class Config(Consistent):
 
         def __getattr__(self, name: str) -> Any: ...
 
-    seed: Annotated[int, Field(ge=0, lt=2**63)] = Field(description="Of every random draw")
+    seed: Seed = Field(description="Of every random draw")
     workflow: Workflow
-    methods: Annotated[list[MethodName], Field(min_length=1)] = Field(
+    methods: MethodNames = Field(
         description="Methods that are fitted, measured and drawn, in the order of tables"
     )
     scene: Scene

@@ -23,6 +23,7 @@ import numpy as np
 
 from psfdae.belonging import TRAINED_ON, require_training, write_origin
 from psfdae.configuration.base import ConfigError, Group, config_dir
+from psfdae.errors import Error
 from psfdae.files import (
     Column,
     Product,
@@ -43,7 +44,7 @@ CONFIG, HISTORY = "config.yaml", "history.csv"
 """Resolved configuration and course of a training, in the folder of a network."""
 
 
-class FitError(RuntimeError):
+class FitError(Error, RuntimeError):
     """A method cannot be fitted; the message says why and what to change."""
 
 

@@ -29,14 +29,16 @@ class DaeSettings(Group):
     """The denoising autoencoder."""
 
     kernels: Annotated[list[Annotated[int, Field(ge=1, le=31)]], Field(min_length=2)] = Field(
-        description="Kernel sizes of the convolutions, encoder then decoder; odd"
+        [9, 7, 5, 3, 1, 1, 3, 5, 7, 9],
+        description="Kernel sizes of the convolutions, encoder then decoder; odd",
     )
     widths: Annotated[list[Count], Field(min_length=1)] = Field(
-        description="Channels between the convolutions, one fewer than kernels"
+        [16, 16, 16, 16, 16, 16, 16, 16, 16],
+        description="Channels between the convolutions, one fewer than kernels",
     )
-    init: Literal["he", "default"] = Field(description="He (2015) or PyTorch's default")
+    init: Literal["he", "default"] = Field("he", description="He (2015) or PyTorch's default")
     scale: Literal["mean", "none"] = Field(
-        description="'mean' multiplies images by d² (mean pixel 1), 'none' leaves sum 1"
+        "mean", description="'mean' multiplies images by d² (mean pixel 1), 'none' leaves sum 1"
     )
 
     @model_validator(mode="after")
@@ -54,47 +56,51 @@ class DaeSettings(Group):
 class Train(Group):
     """Optimisation of the denoising autoencoder."""
 
-    epochs: Count = Field(description="Passes over the training stars")
-    batch: Count = Field(description="Stars per step")
+    epochs: Count = Field(24, description="Passes over the training stars")
+    batch: Count = Field(32, description="Stars per step")
     lr: Annotated[float, Field(gt=0, le=1)] = Field(
-        description="Adam's learning rate (its maximum if one-cycle)"
+        6.0e-3, description="Adam's learning rate (its maximum if one-cycle)"
     )
     optimiser: Literal["adam", "muon"] = Field(
-        description="Of the inner layers' weights; all else is Adam's"
+        "muon", description="Of the inner layers' weights; all else is Adam's"
     )
     level_weight: Annotated[float, Field(ge=0, le=2)] = Field(
-        description="Power p by which the squared error of a star counts 1/λ^p; 0: all alike"
+        1.0, description="Power p by which the squared error of a star counts 1/λ^p; 0: all alike"
     )
-    schedule: Literal["onecycle", "constant"] = Field(description="Course of the learning rate")
+    schedule: Literal["onecycle", "constant"] = Field(
+        "onecycle", description="Course of the learning rate"
+    )
     grad_clip: Annotated[float, Field(ge=0)] = Field(
-        description="Maximum norm of the gradient; 0 switches clipping off"
+        1.0, description="Maximum norm of the gradient; 0 switches clipping off"
     )
-    threads: Count = Field(description="Threads of one training")
+    threads: Count = Field(1, description="Threads of one training")
     precision: Literal["float32", "bfloat16"] = Field(
-        description="Of the convolutions' products while training; weights stay float32"
+        "float32", description="Of the convolutions' products while training; weights stay float32"
     )
-    validate_every: Count = Field(description="Epochs between validations")
-    validation_draws: Count = Field(description="Noise draws per validation star")
-    dead_check_steps: Count = Field(description="Steps between looks for a dead network")
+    validate_every: Count = Field(2, description="Epochs between validations")
+    validation_draws: Count = Field(1, description="Noise draws per validation star")
+    dead_check_steps: Count = Field(50, description="Steps between looks for a dead network")
     restarts: Annotated[int, Field(ge=0)] = Field(
-        description="New starts from another seed if the network dies"
+        3, description="New starts from another seed if the network dies"
     )
     checkpoint_seconds: CheckpointSeconds = Field(
-        description="Least time between checkpoints; repeats nothing"
+        20.0, description="Least time between checkpoints; repeats nothing"
     )
     noise: Literal["fresh", "fixed"] = Field(
-        description="Noise drawn anew every epoch, or once for all epochs"
+        "fresh", description="Noise drawn anew every epoch, or once for all epochs"
     )
     crop_epochs: Annotated[float, Field(ge=0, lt=1)] = Field(
+        0.0,
         description="First part of the epochs, which sees the middle of stamps alone where "
-        "realisations are learnt; 0: none"
+        "realisations are learnt; 0: none",
     )
     continued_epochs: Annotated[float, Field(ge=0, le=1)] = Field(
+        0.0,
         description="Part of the epochs in which a network of templates goes on from that of the "
-        "realisations; 0: all of them, from a start of its own"
+        "realisations; 0: all of them, from a start of its own",
     )
     patience: Annotated[int, Field(ge=0)] = Field(
-        description="Stop after this many validations without a better one; 0 never stops"
+        0, description="Stop after this many validations without a better one; 0 never stops"
     )
 
 

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from psfdae.errors import Error
 from psfdae.estimators import TrainingSet
 from psfdae.estimators.training import DeadNetworkError, Muon, Row, Training, TrainingError, train
 from psfdae.files import atomic_path
@@ -280,7 +281,7 @@ ONNX_TOLERANCE = 1e-5
 CHECKED_BATCHES = (1, 7)
 
 
-class ExportError(RuntimeError):
+class ExportError(Error, RuntimeError):
     """The network cannot be exported, or the exported one computes something else."""
 
 

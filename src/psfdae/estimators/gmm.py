@@ -94,21 +94,24 @@ AT_ONCE = 4096
 class Gmm(Group):
     """Mixture of Gaussians; of several values the validation stars choose."""
 
-    stars: Count | None = Field(description="Training stars that are learnt from; null: all")
+    stars: Count | None = Field(None, description="Training stars that are learnt from; null: all")
     components: Annotated[list[Count], Field(min_length=1)] = Field(
+        [16, 1, 4, 64, 128],
         description="Clusters K among which a search goes, from the first one, as long as it "
-        "pays; more than stars are not"
+        "pays; more than stars are not",
     )
     shrinkage: Annotated[list[Positive], Field(min_length=1)] = Field(
+        [10.0, 3.0, 30.0, 100.0],
         description="Stars ν that the covariance of all clusters counts for in each; searched "
-        "from the first one, too"
+        "from the first one, too",
     )
-    principal: Count = Field(description="Principal components in which stars are clustered")
+    principal: Count = Field(40, description="Principal components in which stars are clustered")
     place: Positive = Field(
+        1.0,
         description="RMS of the field position beside that of the principal components, "
-        "for methods that are told it"
+        "for methods that are told it",
     )
-    threads: Count = Field(description="Threads of the linear algebra")
+    threads: Count = Field(1, description="Threads of the linear algebra")
 
 
 class Cluster(NamedTuple):

@@ -15,7 +15,7 @@ from psfdae.estimators.gmm import GaussianMixture, Gmm
 class Simulated(Gmm):
     """Methods that learn from fresh stars, and the mixture's settings there."""
 
-    stars: Count = Field(description="Fresh stars, of random streams of their own")  # type: ignore[assignment]
+    stars: Count = Field(60000, description="Fresh stars, of random streams of their own")  # type: ignore[assignment]
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,20 +31,22 @@ class Baseline(Group):
     """PCA features clustered by a self-organising map."""
 
     reading: Literal["map", "projection"] = Field(
-        description="PSF of a star: mean image of its cluster, or its projection on the components"
+        "map",
+        description="PSF of a star: mean image of its cluster, or its projection on the components",
     )
     per_level: bool = Field(
-        description="A fit for each noise level λ, on stars of its noise; otherwise one for mixed λ"
+        True,
+        description="A fit for each noise level λ, on stars of its noise; else one for mixed λ",
     )
-    components: Count = Field(description="Principal components K")
-    rows: Count = Field(description="Rows of the map")
-    columns: Count = Field(description="Columns of the map")
-    epochs: Count = Field(description="Passes over the training stars, t_max")
-    sigma: Positive = Field(description="Initial neighbourhood radius in map nodes")
+    components: Count = Field(20, description="Principal components K")
+    rows: Count = Field(11, description="Rows of the map")
+    columns: Count = Field(11, description="Columns of the map")
+    epochs: Count = Field(10, description="Passes over the training stars, t_max")
+    sigma: Positive = Field(1.0, description="Initial neighbourhood radius in map nodes")
     learning_rate: Annotated[float, Field(gt=0, le=1)] = Field(
-        description="Initial learning rate of the map"
+        0.5, description="Initial learning rate of the map"
     )
-    threads: Count = Field(description="Threads of the linear algebra")
+    threads: Count = Field(1, description="Threads of the linear algebra")
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ import torch
 from torch import nn
 from torch.optim.lr_scheduler import LambdaLR, LRScheduler, OneCycleLR
 
+from psfdae.errors import Error
 from psfdae.estimators import FitError
 from psfdae.estimators.weights import load_checkpoint, save_checkpoint
 
@@ -43,7 +44,7 @@ class TrainingError(FitError):
     """A training cannot go on; the message says why and what to change."""
 
 
-class DeadNetworkError(RuntimeError):
+class DeadNetworkError(Error, RuntimeError):
     """All outputs of the network are zero, or most: no gradient will ever revive it."""
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import wraps
+from io import BytesIO
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,6 +14,9 @@ if TYPE_CHECKING:
 
 WIDTH_IN = 8.0
 """Width of every figure in inches."""
+
+DPI = 150
+"""Dots per inch of every PNG."""
 
 SERIES_COLORS = ("#0072b2", "#e69f00", "#cc79a7", "#009e73", "#56b4e9", "#d55e00")
 """Colours of lines that are not methods."""
@@ -24,7 +28,7 @@ REFERENCES = {
 """What each reference is, for titles."""
 
 RC: dict[str, Any] = {
-    "figure.dpi": 150,
+    "figure.dpi": DPI,
     "font.size": 9,
     "axes.titlesize": 10,
     "axes.labelsize": 9,
@@ -61,6 +65,14 @@ def new_figure(height_in: float, **kwargs: Any) -> Figure:
     figure = Figure(figsize=(WIDTH_IN, height_in), **kwargs)
     FigureCanvasAgg(figure)
     return figure
+
+
+def as_png(figure: Figure) -> bytes:
+    """The figure as PNG; the same figure gives the same bytes."""
+    content = BytesIO()
+    # The default metadata name matplotlib's version.
+    figure.savefig(content, format="png", dpi=DPI, metadata={"Software": None})
+    return content.getvalue()
 
 
 def in_field_unit(field: np.ndarray) -> tuple[np.ndarray, str]:

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
+
+if TYPE_CHECKING:
+    from psfdae.estimators import Estimate
 
 SSIM_WINDOW = 7
 """Side of the uniform SSIM window in pixels, scikit-image's default."""
@@ -94,6 +99,32 @@ def all_metrics(
     similar = ssim(estimates, references, data_range, 1.0, peak_range(references))
     names = ("ssim", "ssim_unit", "ssim_peak")
     return {"mse": mse(estimates, references), **dict(zip(names, similar, strict=True))}
+
+
+def quality(estimate: Estimate, truth: np.ndarray, data_range: float) -> dict[str, np.ndarray]:
+    """Metrics of every star (n,); of a method that says how sure it is, whether that is true.
+
+    Beside those of `all_metrics`: `coverage68`, the part of the pixels within ± σ, and `evidence`.
+    """
+    metrics = all_metrics(estimate.psf, truth, data_range)
+    if estimate.sigma is not None:
+        inside = np.abs(estimate.psf - truth) <= estimate.sigma
+        metrics["coverage68"] = inside.mean(axis=(1, 2))
+    if estimate.evidence is not None:
+        metrics["evidence"] = estimate.evidence
+    return metrics
+
+
+def summarised(
+    row: dict[str, Any], metrics: dict[str, np.ndarray], field: np.ndarray
+) -> list[dict[str, Any]]:
+    """Mean of each metric with its standard error by field, each added to a copy of `row`."""
+    rows = []
+    for metric, values in metrics.items():
+        mean, stderr = clustered_mean(values, field)
+        found = {"metric": metric, "value": mean, "stderr": stderr}
+        rows.append({**row, **found, "n": values.size})
+    return rows
 
 
 def clustered_mean(values: np.ndarray, cluster: np.ndarray) -> tuple[float, float]:

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from psfdae.errors import Error
+
 
 @dataclass(frozen=True)
 class Pupil:
@@ -131,7 +133,7 @@ ARCSEC = np.pi / 180.0 / 3600.0
 """One arc second in radians."""
 
 
-class SamplingError(ValueError):
+class SamplingError(Error, ValueError):
     """The pupil grid is too coarse for a wavefront or for the stamp's position."""
 
 

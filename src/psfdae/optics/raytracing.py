@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from psfdae.errors import Error
 from psfdae.optics.wavefronts import noll_to_nm, zernike_basis
 
 if TYPE_CHECKING:
@@ -41,7 +42,7 @@ RANGE_ROUNDING = 1e-9
 """A state may exceed the range by this much of it: the ends of a grid are rounded."""
 
 
-class RayTracingError(ValueError):
+class RayTracingError(Error, ValueError):
     """A state of misalignment or a field that the telescope cannot serve."""
 
 

@@ -30,6 +30,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 import psfdae
+from psfdae.errors import Error
 from psfdae.estimators import Method, method
 from psfdae.estimators.weights import digest_of
 from psfdae.files import ProductError, atomic_path
@@ -62,7 +63,7 @@ Kernel = Annotated[int, Field(ge=1, le=31)]
 Width = Annotated[int, Field(ge=1, le=1024)]
 
 
-class BundleError(ValueError):
+class BundleError(Error, ValueError):
     """A model bundle is missing, damaged, of a newer format, or no bundle at all; one line."""
 
     def __init__(self, problem: str) -> None:

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from psfdae.errors import Error
 from psfdae.own_stars.errors import ObservationError, reading, shorten
 from psfdae.own_stars.images import UNPACK, PlainFile, open_hdus, plain_file
 from psfdae.own_stars.stamps import StarFlag, raise_flag
@@ -84,7 +85,7 @@ ID_COLUMNS = ("id", "source_id", "number", "star_id", "objid", "obj_id", "object
 ID_COLUMNS += ("label", "name")
 
 
-class ColumnError(ValueError):
+class ColumnError(Error, ValueError):
     """The position columns of a catalogue are missing or not the only ones."""
 
 
@@ -351,6 +352,32 @@ def read_catalogue(path: Path) -> Catalogue:
         fits = start.startswith((b"SIMPLE  =", *UNPACK))
         lines = [] if fits else _lines(path, start + file.read(LARGEST_TEXT))
     table = _fits_table(path) if fits else _text_table(path, lines)
+    if len(table) == 0:
+        raise ObservationError(path, "the catalogue has no stars")
+    return Catalogue(path, table)
+
+
+def as_catalogue(given: Any) -> Catalogue:
+    """A star list from a file, a table, or positions.
+
+    Parameters
+    ----------
+    given : path-like, table, or array of shape (n, 2)
+        A table is one of astropy or pandas, or a mapping of columns, with names as in files
+        (`CONVENTIONS`); positions are (x, y), 0-based.
+    """
+    from astropy.table import Table
+
+    if isinstance(given, str | Path):
+        return read_catalogue(Path(given))
+    path = Path("catalogue")
+    with reading(path):
+        if isinstance(given, np.ndarray) and given.dtype.names is None:
+            if given.ndim != 2 or given.shape[1] != 2:
+                raise ObservationError(path, f"positions of shape {given.shape}, expected (n, 2)")
+            given = {"x_fit": given[:, 0], "y_fit": given[:, 1]}
+        frame = hasattr(given, "to_records")
+        table = Table(given.to_records(index=False) if frame else given)
     if len(table) == 0:
         raise ObservationError(path, "the catalogue has no stars")
     return Catalogue(path, table)

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
+from psfdae.errors import Error
+
 LONGEST = 160
 """Characters of a library's message that are passed on."""
 
@@ -45,7 +47,7 @@ def shorten(names: list[str], most: int = 20) -> str:
     return ", ".join(name[:40] for name in names[:most]) + more if names else "none"
 
 
-class ObservationError(ValueError):
+class ObservationError(Error, ValueError):
     """An input file cannot be used; one line that names the file."""
 
     def __init__(self, path: str | Path, problem: str) -> None:

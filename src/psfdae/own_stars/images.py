@@ -221,7 +221,8 @@ class ImageFile:
     `shape` is without leading axes of length 1, of which `leading` were removed. Values
     are `bscale`·stored + `bzero`, and NaN where `blank` is stored. `headers` are its own
     and the primary one: what is missing, not a number or out of range in both counts as
-    not given. `wcs` is the celestial WCS or None.
+    not given. `wcs` is the celestial WCS or None. `values` are the pixels of an image that
+    is an array and in no file; `array_image` makes one.
     """
 
     file: PlainFile
@@ -233,6 +234,7 @@ class ImageFile:
     blank: int | None
     headers: tuple[Any, ...]
     wcs: Any
+    values: np.ndarray | None = None
 
     @property
     def path(self) -> Path:
@@ -307,14 +309,34 @@ def card_value(header: Any, key: str) -> Any:
         return None
 
 
-def find_image(path: Path | PlainFile, extension: str | int | None = None) -> ImageFile:
+def array_image(values: np.ndarray, name: str = "array") -> ImageFile:
+    """An image that is an array (h, w) or a cube of stamps (n, s, s), without a header."""
+    values, path = np.asarray(values), Path(name)
+    if values.dtype.kind not in "fiu" or values.ndim not in (2, 3) or not values.size:
+        shape = "×".join(map(str, values.shape))
+        raise ObservationError(
+            path, f"{values.dtype} of shape {shape}, expected numbers of 2 or 3 dimensions"
+        )
+    file = PlainFile(path, path)
+    return ImageFile(file, 0, values.shape, 0, 1.0, 0.0, None, (), None, values)
+
+
+def find_image(path: Any, extension: str | int | None = None) -> ImageFile:
     """Find an image in a FITS file and check that its data are all there.
+
+    Parameters
+    ----------
+    path : Path, PlainFile, or ndarray
+        An array is an image itself.
+    extension : str or int, optional
 
     The file may be tile-compressed (.fz) or compressed as a whole (.gz, .bz2, .xz, .zip with
     one file). The extension is a name (case does not matter), "NAME,version" or a number (0
     is the primary one); without it the only image is taken that is not a mask, an error or
     the like (`NOT_SCIENCE`).
     """
+    if isinstance(path, np.ndarray):
+        return array_image(path)
     file = path if isinstance(path, PlainFile) else plain_file(path)
     path = file.name
     with reading(path), open_hdus(file, memmap=True, **_AS_STORED) as hdus:
@@ -535,6 +557,9 @@ def open_pixels(image: ImageFile, *, whole: bool, dtype: Any = np.float32) -> It
     """
     from astropy.io import fits
 
+    if image.values is not None:
+        yield Pixels(image.values, image, dtype)
+        return
     with ExitStack() as files:
         with reading(image.path):
             hdus = files.enter_context(open_hdus(image.file, memmap=whole, **_AS_STORED))

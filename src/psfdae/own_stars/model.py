@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import fields, replace
@@ -13,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from psfdae.errors import Error
 from psfdae.estimators import Estimate, FitError
 from psfdae.own_stars.bundle import (
     Bundle,
@@ -22,7 +22,9 @@ from psfdae.own_stars.bundle import (
     estimator,
     mahalanobis,
     read_bundle,
+    write_bundle,
 )
+from psfdae.own_stars.observation import Observation
 from psfdae.own_stars.photometry import FAINT_SNR, KEPT, NOISE_FLOOR, Photometer, Photometry
 from psfdae.own_stars.prediction import Prediction, measured_of, unmeasured
 from psfdae.own_stars.shapes import measure_shapes
@@ -35,7 +37,7 @@ from psfdae.own_stars.stamps import (
     displacement,
     raise_flag,
 )
-from psfdae.threads import side_by_side
+from psfdae.threads import available_cores, in_order, side_by_side
 
 SCALE_TOLERANCE = 0.02  # relative difference of the pixel scale from that of the training
 SNR_TOLERANCE = 1.25  # beyond the trained S/N without a flag: a faint star's is no better known
@@ -43,10 +45,12 @@ SKY_SIGMA = 5.0  # scatter of the border by which its median may differ from a s
 FLUX_FACTOR = (0.5, 2.0)  # by which a method may correct the flux of a star
 BLOCK = 256  # stars that a network computes together, always so many: other numbers round otherwise
 MOST_OVERSAMPLED = 32  # values per pixel and axis
+ROWS = 4 * BLOCK  # stars that are read at a time, fewer if their stamps are large
+MARGIN_PX = 2  # by which a star of an image may be moved to centre it
 WHOLE_PX = 32  # larger stamps come in smaller blocks
 
 
-class PredictionError(ValueError):
+class PredictionError(Error, ValueError):
     """Stars that a model cannot be applied to; one line with what it takes instead."""
 
 
@@ -90,6 +94,10 @@ class PsfModel:
     def info(self) -> BundleInfo:
         """Stamp size, pixel scale, range of S/N and all else that the bundle says."""
         return self.bundle.info
+
+    def save(self, path: str | Path) -> None:
+        """Write the model to a file, by custom NAME.psf.safetensors, for `load_model`."""
+        write_bundle(self.bundle, Path(path))
 
     def predict(
         self,
@@ -177,6 +185,24 @@ class PsfModel:
             work = (lambda block: self.engine.block(block, fixed), blocks or [stars], threads)
             parts = side_by_side(*work)
         return Prediction.joined(parts)
+
+    def stream(
+        self, observation: Observation, threads: int | None = None, fixed: bool = False
+    ) -> Iterator[tuple[Stamps, Prediction]]:
+        """The stars of an observation in their order, some at a time, with their predictions.
+
+        Few of them are in memory. Listed centres are exact if `fixed`; by default all cores are
+        taken.
+        """
+        size = self.engine.size
+
+        def predicted(stamps: Stamps) -> Prediction:
+            blocks = self.engine.blocks(stamps)
+            return Prediction.joined([self.engine.block(block, fixed) for block in blocks])
+
+        chunks = observation.chunks(max(size, min(ROWS, 4 * size)))
+        with one_thread_each():
+            yield from in_order(predicted, chunks, threads or available_cores())
 
     def psf_at(self, x: ArrayLike, y: ArrayLike, oversampling: int = 4) -> np.ndarray:
         """PSFs at places of the image of the training, where no star need be.
@@ -577,13 +603,6 @@ def _filled(stars: Stamps, bundle: Bundle, size: int) -> Stamps:
     filled["data"][count:] = 0.0
     filled["data"][count:, inner, inner] = bundle.flux_model.mean.reshape(side, side)
     return Stamps(**filled)
-
-
-def available_cores() -> int:
-    """Cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 @contextmanager

@@ -11,6 +11,7 @@ Whatever is wrong with a file ends in one `ObservationError` of one line that na
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -20,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from psfdae.own_stars.catalogue import Catalogue, Positions, read_catalogue
+from psfdae.own_stars.catalogue import Catalogue, Positions, as_catalogue
 from psfdae.own_stars.detection import Sky, sky_of
 from psfdae.own_stars.errors import ObservationError, reading, shorten
 from psfdae.own_stars.images import (
@@ -30,6 +31,7 @@ from psfdae.own_stars.images import (
     ImageFile,
     Pixels,
     Said,
+    array_image,
     find_image,
     open_pixels,
 )
@@ -44,6 +46,7 @@ SEEN = 2.0  # σ above the sky from which a position of a list is on a source
 COLOURS = (3, 4)  # planes of a colour image, the fourth for luminance or transparency
 LARGEST_STAMP_PX = 256  # of a model; a margin of stamps is small beside it
 RING_PX = 8  # around a stamp, at least: there the noise of the sky is that of no star
+HASHED_ROWS = 256  # of an image, or stamps of a cube, that are read at a time for its checksum
 SAME_PX = 0.1  # nearer to each other than this, two rows of a list are one star
 
 
@@ -51,16 +54,17 @@ SAME_PX = 0.1  # nearer to each other than this, two rows of a list are one star
 class Source:
     """A FITS file with stars, and what is stated about it."""
 
-    path: Path  # FITS cube of stamps, or FITS image
-    catalogue: Path | None = None  # of an image; positions and identifiers of a cube
+    image: Path | np.ndarray  # cube of stamps, or image
+    catalogue: Any = None  # of an image, as `as_catalogue` takes it; of a cube, row by row
     detect: float | None = None  # in its place: σ above the sky from which stars are searched
     extension: str | int | None = None  # with the stars
     on_image: bool = False  # stars of the catalogue that are off the image are left out
     origin: int | None = None  # of the catalogue's pixels; by default that of its program
-    mask: str | int | Path | None = None  # as large as the image; or (d, d) for all of a cube
+    # Extension, file or array as large as the image; or a mask (d, d) for all of a cube.
+    mask: str | int | Path | np.ndarray | None = None
     bad_bits: int | None = None  # of the mask; any by default
-    weight: str | int | Path | None = None  # 1/σ² of every pixel of an image, but for a factor
-    variance: str | int | Path | None = None  # σ² in its place
+    weight: str | int | Path | np.ndarray | None = None  # 1/σ² of every pixel, but for a factor
+    variance: str | int | Path | np.ndarray | None = None  # σ² in its place
     pixel_scale_arcsec: float | None = None  # what is given goes before the header
     gain: float | None = None  # electrons per count
     read_noise: float | None = None  # electrons
@@ -69,9 +73,14 @@ class Source:
     background_column: str | None = None  # the same for sky levels per pixel
     accept_offset: bool = False  # of the catalogue's positions from the stars
 
+    @property
+    def path(self) -> Path:
+        """The image's file, or what an array is called in messages."""
+        return self.image if isinstance(self.image, Path) else Path("array")
+
     def files(self) -> tuple[Any, ...]:
         """All that is read."""
-        return (self.path, self.catalogue, self.mask, self.weight, self.variance)
+        return (self.image, self.catalogue, self.mask, self.weight, self.variance)
 
     def open(self, stamp_px: int, margin: int = 0) -> Observation:
         """Check all that can be checked without reading pixels.
@@ -80,16 +89,18 @@ class Source:
         of so many pixels, those of a cube as many of these as they have.
         """
         self._check(stamp_px, margin)
-        image = find_image(self.path, self.extension)
+        image = find_image(self.image, self.extension)
         shape = image.shape
         is_cube = self._is_cube(image, stamp_px)
-        if self.detect is not None and (is_cube or self.catalogue or self.origin is not None):
+        given = self.catalogue is not None or self.origin is not None
+        if self.detect is not None and (is_cube or given):
             raise ObservationError(
                 self.path, "--detect takes an image, no cube; no list, and no origin of one"
             )
         camera = self._camera(image)
         layers = self._layers(image, is_cube, camera)
-        table = None if self.catalogue is None else read_catalogue(self.catalogue)
+        table = None if self.catalogue is None else as_catalogue(self.catalogue)
+        listed = None if table is None else table.path
         if self.detect is not None or layers.noise is not None:
             sky = layers.sky()
             if layers.noise is not None:
@@ -116,7 +127,7 @@ class Source:
             camera=camera,
             positions=positions,
             header_cards=image.provenance(),
-            catalogue=self.catalogue,
+            catalogue=listed,
             found=table if self.detect is not None else None,
             _columns=columns,
             _layers=layers,
@@ -328,10 +339,16 @@ def _inside(positions: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     return ((place >= 0) & (place < shape)).all(axis=1)
 
 
-def _find_beside(image: ImageFile, place: str | int | Path, what: str) -> ImageFile:
+def _find_beside(image: ImageFile, place: Any, what: str) -> ImageFile:
     """An extension, or another file, with a pixel for every one of the image."""
+    array = isinstance(place, np.ndarray)
     outside = isinstance(place, Path) or (isinstance(place, str) and Path(place).is_file())
-    found = find_image(Path(place)) if outside else find_image(image.file, place)
+    if image.values is not None and not (array or outside):
+        raise ObservationError(image.path, f"{what} of an array is an array, too, or a file")
+    if array:
+        found = array_image(np.asarray(place, dtype=np.float64), what)
+    else:
+        found = find_image(Path(place)) if outside else find_image(image.file, place)
     wanted = image.shape
     if found.shape != wanted and not (len(wanted) == 3 and found.shape == wanted[1:]):
         sizes = ["×".join(str(n) for n in shape) for shape in (found.shape, wanted)]
@@ -490,6 +507,18 @@ class Observation:
                 f"{seen} of {placed.size} positions are on a source of {self.path}, at least half "
                 "are expected: a list of another image, or with stars too faint for this one?",
             )
+
+    def sha256(self) -> str:
+        """SHA-256 of all pixels of the image or cube, as float32."""
+        digest = hashlib.sha256()
+        with open_pixels(self._layers.image, whole=False) as pixels:
+            for start in range(0, pixels.image.shape[0], HASHED_ROWS):
+                digest.update(pixels[slice(start, start + HASHED_ROWS)].tobytes())
+        return digest.hexdigest()
+
+    def with_margin(self, margin: int) -> Observation:
+        """The same with stamps of so wide a margin, those of a cube as far as they have it."""
+        return replace(self, margin=margin if self.shape else min(margin, self.margin))
 
     def chunks(self, rows: int) -> Iterator[Stamps]:
         """Stream the stars in their order, at most `rows` at a time.

@@ -16,24 +16,37 @@ from __future__ import annotations
 
 import hashlib
 from bisect import bisect_left
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
 import numpy as np
 
+import psfdae
 from psfdae.estimators import Estimate, Method
+from psfdae.files import Product, ProductError
 from psfdae.own_stars.bundle import (
     SCALES,
     Bundle,
     BundleError,
+    BundleInfo,
     at_noise,
     brightest,
+    creation_date,
     mahalanobis,
 )
 from psfdae.own_stars.model import SNR_TOLERANCE, PsfModel
 from psfdae.own_stars.photometry import FluxModel, signal_to_noise
+from psfdae.own_stars.star_sets import (
+    field_positions,
+    noise_model,
+    noisy_test_images,
+    of_image,
+    split_stars,
+    star_area,
+)
+from psfdae.rng import stream
 from psfdae.stars.noise import NoiseModel
 
 NODES = 8  # noise levels at which errors are measured, equidistant in the logarithm
@@ -106,6 +119,109 @@ class Errors:
     def distance_limit(self) -> float:
         """Distance that 0.1 % of the stars of all nodes exceed."""
         return float(np.quantile(self.distance, LIMIT))
+
+
+def bundle_of(
+    fitted: Method,
+    stars: Product,
+    reference: str,
+    config: Any,
+    trained: Mapping[str, Any],
+    name: str,
+    licence: str,
+    largest_mb: float | None = None,
+) -> Bundle:
+    """A fit with its errors on test stars and all that it takes to apply it.
+
+    Parameters
+    ----------
+    fitted : Method
+    stars : product "stars", of which the fit is
+    reference : "realisation" or "template", which is restored
+    config : settings (seed, noise, parts, evaluation)
+    trained : mapping
+        Settings of the fit, and its "split".
+    name, licence : str
+    largest_mb : float, optional
+        Size of the arrays, for which a mixture leaves out fine axes.
+
+    Raises
+    ------
+    BundleError
+        If it cannot be that small.
+    """
+    stamps, parts = _kind_of_stamps(stars), split_stars(stars, trained["split"], config)
+    images, references = stars["realisation"], stars[reference]
+    held_out = HeldOutStars(
+        images[parts.test],
+        references[parts.test],
+        noise_model(config),
+        field_positions(stars)[parts.test],
+    )
+    model = leading(FluxModel.fit(images[parts.train]), COMPONENTS)
+    band = config.noise.kappa * np.asarray(config.noise.levels)
+    largest = 1e6 * (largest_mb or np.inf)
+    arrays, said = packed(fitted, stamps["stamp_px"], float(band.min()), largest)
+    range_of = reach(band, star_area(stars, parts.train))
+    info = BundleInfo(
+        psfdae_version=psfdae.__version__,
+        name=name,
+        licence=licence,
+        created=creation_date(),
+        **stamps,
+        **range_of,
+        components=COMPONENTS,
+        training_sha256=checksum(images[parts.train], references[parts.train]),
+        training_stars=_trained_on(stars, parts.train),
+        **(said or {"method": fitted.name, "reference": reference}),
+        config={
+            "stars": stars.config,
+            "train": dict(trained),
+            "evaluation": config.evaluation.model_dump(),
+        },
+        metrics=[],
+    )
+    unpacked = type(fitted).unpack(arrays, info)  # what it errs as packed
+    nodes, rng = noise_nodes(band), stream(config.seed, "noise", "bundle")
+    nothing = np.zeros((nodes.size, *images.shape[1:]), np.float32)
+    made = Bundle(info, arrays, model, nodes, nothing, nothing, 0.0)
+    made, errors = calibrated(made, unpacked, held_out, rng)
+    metrics = measure_levels(
+        config.noise.levels,
+        held_out,
+        lambda level: noisy_test_images(config, stars, parts.test, level),
+        lambda noisy, level: unpacked.estimate(noisy, level, held_out.position),
+        errors,
+        range_of["noise_equivalent_px"],
+        config.evaluation.data_range,
+    )
+    return replace(made, info=made.info.model_copy(update={"metrics": metrics}))
+
+
+def _trained_on(product: Product, train: np.ndarray) -> int:
+    """Stars of the training; those of an image are in several of its images each."""
+    return len(np.unique(product["field_index"][train])) if of_image(product) else len(train)
+
+
+def _kind_of_stamps(product: Product) -> dict[str, Any]:
+    """What the configuration of the stars says of their stamps."""
+    config = product.config
+    try:
+        telescope, framing = config["telescope"], config["framing"]
+        pixel = None
+        if "diameter_m" in telescope:
+            diffraction = telescope["wavelength_m"] / telescope["diameter_m"]
+            pixel = float(np.deg2rad(telescope["pixel_scale_arcsec"] / 3600.0)) / diffraction
+        return {
+            "stamp_px": product["realisation"].shape[-1],
+            "pixel_scale_arcsec": telescope["pixel_scale_arcsec"],
+            "pixel_lambda_d": pixel,
+            "jitter_px": framing["jitter_px"],
+            "subpixel": framing.get("subpixel", False),
+            "source": config.get("source", "simulated"),
+        }
+    except KeyError as error:
+        raise ProductError(f"{product.path}: its configuration lacks {error}") from None
 
 
 def packed(

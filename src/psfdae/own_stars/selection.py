@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from psfdae.errors import Error
 from psfdae.own_stars.errors import no_formula
 from psfdae.own_stars.observation import Observation
 from psfdae.own_stars.stamps import Stamps, StarFlag, cut, peaks, sky_around
@@ -38,7 +39,7 @@ PILE, PILE_WIDTH, PILE_SHARPNESS, PILE_FROM = 3, 0.03, 0.9, 0.1
 SHIFT_ORDER = 3  # splines; on a star with a FWHM of 3 px they err by an MSE of 1e-8
 
 
-class CalibrationStarsError(ValueError):
+class CalibrationStarsError(Error, ValueError):
     """An image has too few stars to learn from, or its settings contradict each other."""
 
 

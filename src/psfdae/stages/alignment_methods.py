@@ -44,10 +44,11 @@ from psfdae.files import (
     write_product,
     write_text,
 )
+from psfdae.own_stars.star_sets import noise_model
 from psfdae.reading import from_tree, read_yaml
 from psfdae.rng import stream
 from psfdae.stages.alignment import ModelFile, StatesFile, TestSet, read_model
-from psfdae.stages.common import limit_threads, noise_model
+from psfdae.stages.common import limit_threads
 from psfdae.stars.noise import mixed_levels
 
 if TYPE_CHECKING:

@@ -25,10 +25,11 @@ from psfdae.belonging import STATE_STAMPS, require, require_origin
 from psfdae.cli import File, Folder, command
 from psfdae.configuration.alignment import AlignmentConfig
 from psfdae.files import Product, ProductError, read_product, write_csv, write_text
+from psfdae.own_stars.star_sets import noise_model
 from psfdae.reading import read_table
 from psfdae.stages.alignment import StatesFile
 from psfdae.stages.alignment_methods import DaeFolder, denoise, noisy_test_states
-from psfdae.stages.common import limit_threads, noise_model
+from psfdae.stages.common import limit_threads
 from psfdae.stages.figures import write_png
 
 Estimates = Annotated[tuple[File, ...], "Product of `alignment estimate`."]

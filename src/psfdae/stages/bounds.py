@@ -48,16 +48,10 @@ from psfdae.files import (
     write_parquet,
     write_product,
 )
+from psfdae.own_stars.star_sets import noise_model, noisy_test_images, split_stars
 from psfdae.reading import read_table
 from psfdae.rng import stream
-from psfdae.stages.common import (
-    drawn_columns,
-    limit_threads,
-    noise_model,
-    noisy_test_images,
-    split_stars,
-    star_wavefronts,
-)
+from psfdae.stages.common import drawn_columns, limit_threads, star_wavefronts
 from psfdae.stars.fields import assign_fields, relative_field
 from psfdae.stars.framing import Propagation
 from psfdae.stars.symmetry import orbit

@@ -8,13 +8,12 @@ from typing import Annotated, Any
 
 import numpy as np
 
-import psfdae
 from psfdae.belonging import SAME_IMAGE, SAME_STARS, STARS, require_origin
 from psfdae.cli import AboveZero, File, Folder, Reference, Split, command
 from psfdae.configuration.compose import as_overrides
 from psfdae.configuration.schema import Config
 from psfdae.estimators import CONFIG, Method, all_groups, method
-from psfdae.files import Product, ProductError
+from psfdae.files import Product
 from psfdae.own_stars import packing
 from psfdae.own_stars.bundle import (
     SHIPPED,
@@ -22,27 +21,21 @@ from psfdae.own_stars.bundle import (
     Bundle,
     BundleError,
     BundleInfo,
-    creation_date,
     estimator,
     read_bundle,
     write_bundle,
 )
 from psfdae.own_stars.errors import one_line
 from psfdae.own_stars.model import PsfModel
-from psfdae.own_stars.photometry import FluxModel
-from psfdae.rng import stream
-from psfdae.stages.common import (
-    check_outputs,
-    field_positions,
-    limit_threads,
+from psfdae.own_stars.star_sets import (
+    fit_apart,
     noise_model,
-    noisy_test_images,
     read_stars,
-    split_stars,
-    star_area,
+    training_set,
 )
+from psfdae.rng import stream
+from psfdae.stages.common import check_outputs, limit_threads
 from psfdae.stages.evaluate import Models
-from psfdae.stages.fit import fit_apart, training_set
 
 SEEN_BY_TRAINING = ("seed", "noise", "parts")
 """Groups in which the configuration must be that of the training."""
@@ -105,59 +98,12 @@ def bundle(
     trained = _trained(kind, place, config, split)
     restored = trained.get("reference") or reference or "realisation"
     product = read_stars(stars, restored)
-    stamps = _kind_of_stamps(product)
     require_origin(place, (*STARS, *SAME_STARS, *SAME_IMAGE), product)
-    parts = split_stars(product, trained["split"], config)
-    images, references = product["realisation"], product[restored]
-    held_out = packing.HeldOutStars(
-        images[parts.test],
-        references[parts.test],
-        noise_model(config),
-        field_positions(product)[parts.test],
+    fitted = kind.load(place, restored, config.evaluation)
+    said = name or out.name.removesuffix(SUFFIX), licence
+    write_bundle(
+        packing.bundle_of(fitted, product, restored, config, trained, *said, largest_mb), out
     )
-    model = packing.leading(FluxModel.fit(images[parts.train]), packing.COMPONENTS)
-    band = config.noise.kappa * np.asarray(config.noise.levels)
-    arrays, said = packing.packed(
-        kind.load(place, restored, config.evaluation),
-        stamps["stamp_px"],
-        float(band.min()),
-        1e6 * (largest_mb or np.inf),
-    )
-    reach = packing.reach(band, star_area(product, parts.train))
-    info = BundleInfo(
-        psfdae_version=psfdae.__version__,
-        name=name or out.name.removesuffix(SUFFIX),
-        licence=licence,
-        created=creation_date(),
-        **stamps,
-        **reach,
-        components=packing.COMPONENTS,
-        training_sha256=packing.checksum(images[parts.train], references[parts.train]),
-        training_stars=_trained_on(product, parts.train),
-        **(said or {"method": kind.name, "reference": restored}),
-        config={
-            "stars": product.config,
-            "train": trained,
-            "evaluation": config.evaluation.model_dump(),
-        },
-        metrics=[],
-    )
-    fitted = kind.unpack(arrays, info)  # what it errs as packed
-    nodes, rng = packing.noise_nodes(band), stream(config.seed, "noise", "bundle")
-    nothing = np.zeros((nodes.size, *images.shape[1:]), np.float32)
-    made = Bundle(info, arrays, model, nodes, nothing, nothing, 0.0)
-    made, errors = packing.calibrated(made, fitted, held_out, rng)
-    metrics = packing.measure_levels(
-        config.noise.levels,
-        held_out,
-        lambda level: noisy_test_images(config, product, parts.test, level),
-        lambda noisy, level: fitted.estimate(noisy, level, held_out.position),
-        errors,
-        reach["noise_equivalent_px"],
-        config.evaluation.data_range,
-    )
-    info = made.info.model_copy(update={"metrics": metrics})
-    write_bundle(replace(made, info=info), out)
 
 
 def _trained(kind: type[Method], place: Path, config: Config, split: str | None) -> dict[str, Any]:
@@ -186,33 +132,6 @@ def _refuse_mismatch(trained: dict[str, Any], asked: dict[str, Any], path: Path)
             f"{path}: the network was trained with {differing[0]}, "
             f"but the bundle is asked for with {other}"
         )
-
-
-def _trained_on(product: Product, train: np.ndarray) -> int:
-    """Stars of the training; those of an image are in several of its images each."""
-    own = product.config.get("source") == "stars"
-    return len(np.unique(product["field_index"][train])) if own else len(train)
-
-
-def _kind_of_stamps(product: Product) -> dict[str, Any]:
-    """What the configuration of the stars says of their stamps."""
-    config = product.config
-    try:
-        telescope, framing = config["telescope"], config["framing"]
-        pixel = None
-        if "diameter_m" in telescope:
-            diffraction = telescope["wavelength_m"] / telescope["diameter_m"]
-            pixel = float(np.deg2rad(telescope["pixel_scale_arcsec"] / 3600.0)) / diffraction
-        return {
-            "stamp_px": product["realisation"].shape[-1],
-            "pixel_scale_arcsec": telescope["pixel_scale_arcsec"],
-            "pixel_lambda_d": pixel,
-            "jitter_px": framing["jitter_px"],
-            "subpixel": framing.get("subpixel", False),
-            "source": config.get("source", "simulated"),
-        }
-    except KeyError as error:
-        raise ProductError(f"{product.path}: its configuration lacks {error}") from None
 
 
 @command("export")

@@ -8,14 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from psfdae.files import Column, Product, ProductError, read_product
-from psfdae.own_stars.photometry import noise_equivalent_px
-from psfdae.rng import stream
-from psfdae.stars.fields import Split, held_out_split, random_split
-from psfdae.stars.noise import NoiseModel
+from psfdae.errors import Error
+from psfdae.files import Column
 
 
-class OutputError(ValueError):
+class OutputError(Error, ValueError):
     """A result would take the place of what it is made of."""
 
 
@@ -62,70 +59,3 @@ def limit_threads(threads: int) -> None:
     from threadpoolctl import threadpool_limits
 
     threadpool_limits(threads)
-
-
-def read_stars(path: Path, *references: str) -> Product:
-    """Stars with their noise-free images, fields and the references asked for."""
-    names = ("realisation", *(r for r in references if r != "realisation"), "field_index", "grid")
-    return read_product(path, "stars", names)
-
-
-def field_positions(stars: Product) -> np.ndarray:
-    """Where each star stands, shape (n, 2): in steps of the field's grid, or pixels of an image.
-
-    NaN where an image's list does not say it.
-    """
-    if stars.config.get("source") == "stars":
-        return read_product(stars.path, "stars", ("position",))["position"][stars["field_index"]]
-    return stars["grid"][stars["field_index"]]
-
-
-def star_area(stars: Product, train: np.ndarray) -> float:
-    """Noise-equivalent area in pixels of the typical star, of which `train` are training images.
-
-    Bright stars of an image have their own, A = (F / (σ S/N))², free of their noise.
-    """
-    if stars.config.get("source") == "stars":
-        known = read_product(stars.path, "stars", ("noise", "snr"))
-        return float(np.median((known["noise"] * known["snr"]) ** -2.0))
-    return noise_equivalent_px(stars["realisation"][train])
-
-
-def split_stars(stars: Product, kind: str, config: Any) -> Split:
-    """Training, validation and test stars of a split.
-
-    Raises
-    ------
-    ProductError
-        If the file holds fewer stars than the config's parts need.
-    """
-    parts, count = config.parts, len(stars["field_index"])
-    if kind == "held_out":
-        return held_out_split(
-            stars["field_index"], stars["grid"], parts.validation_fraction, config.seed
-        )
-    if parts.train_stars + parts.test_stars > count:
-        raise ProductError(
-            f"{stars.path}: holds {count} stars, but parts.train_stars + parts.test_stars = "
-            f"{parts.train_stars + parts.test_stars}"
-        )
-    return random_split(
-        count, parts.train_stars, parts.test_stars, parts.validation_fraction, config.seed
-    )
-
-
-def noise_model(config: Any) -> NoiseModel:
-    """The noise of a stage's config."""
-    return NoiseModel(config.noise.kappa, config.noise.background_photons)
-
-
-def noisy_test_images(config: Any, stars: Product, test: np.ndarray, level: float) -> np.ndarray:
-    """Noisy images of test stars, numbers `test` of a product "stars", at one λ.
-
-    The noise of a star depends on seed, set of stars, λ and star only. Datasets differ in
-    set or λ, so that their columns are independent; methods, references, bounds and splits
-    share it, so that what they make of a star is compared on one image.
-    """
-    of = stars.config.get("stars", {}).get("name", "own")
-    rng = stream(config.seed, "noise", "test", of, f"{level:.6g}")
-    return noise_model(config).draw(stars["realisation"], level, rng)[test]

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from psfdae.cli import File, Folder, command
+from psfdae.errors import Error
 from psfdae.estimators import CONFIG, HISTORY, method, registered
 from psfdae.files import ProductError, write_text
 from psfdae.reading import read_csv, read_table, read_yaml
@@ -21,7 +22,7 @@ TABLE = "tables/psf_metrics.csv"
 """Mean errors of all methods, in a folder of results and in the run of record."""
 
 
-class ComparisonError(ValueError):
+class ComparisonError(Error, ValueError):
     """What was named cannot be compared."""
 
 

@@ -7,22 +7,20 @@ from dataclasses import make_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import numpy as np
-
 from psfdae.cli import File, Folder, Reference, Split, command
 from psfdae.configuration.schema import Config
-from psfdae.estimators import ConfigError, Estimate, Method, method, registered
-from psfdae.evaluation.metrics import all_metrics, clustered_mean
+from psfdae.estimators import ConfigError, Method, method, registered
+from psfdae.evaluation.metrics import quality, summarised
 from psfdae.files import Product, ProductError, write_csv, write_parquet, write_text
-from psfdae.reading import read_table
-from psfdae.stages.common import (
+from psfdae.own_stars.star_sets import (
     field_positions,
-    limit_threads,
     noisy_test_images,
     read_stars,
     split_stars,
+    training_set,
 )
-from psfdae.stages.fit import training_set
+from psfdae.reading import read_table
+from psfdae.stages.common import limit_threads
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -71,35 +69,14 @@ def evaluate(
     for level in config.noise.levels:
         noisy = noisy_test_images(config, product, test, level)
         for name, estimator in methods.items():
-            metrics = measured(estimator.estimate(noisy, level, position), truth, config)
+            metrics = quality(
+                estimator.estimate(noisy, level, position), truth, config.evaluation.data_range
+            )
             row = {**key, "method": name, "noise_level": level}
             summary += summarised(row, metrics, field)
             stars_table.append(pd.DataFrame({**row, "star": test, "field": field, **metrics}))
     write_csv(out, pd.DataFrame(summary))
     write_parquet(per_star, pd.concat(stars_table, ignore_index=True))
-
-
-def measured(estimate: Estimate, truth: np.ndarray, config: Config) -> dict[str, np.ndarray]:
-    """Metrics of every star; of a method that says how sure it is, whether that is true."""
-    metrics = all_metrics(estimate.psf, truth, config.evaluation.data_range)
-    if estimate.sigma is not None:
-        inside = np.abs(estimate.psf - truth) <= estimate.sigma
-        metrics["coverage68"] = inside.mean(axis=(1, 2))
-    if estimate.evidence is not None:
-        metrics["evidence"] = estimate.evidence
-    return metrics
-
-
-def summarised(
-    row: dict[str, Any], metrics: dict[str, np.ndarray], field: np.ndarray
-) -> list[dict[str, Any]]:
-    """Mean of each metric with its standard error by field."""
-    rows = []
-    for metric, values in metrics.items():
-        mean, stderr = clustered_mean(values, field)
-        found = {"metric": metric, "value": mean, "stderr": stderr}
-        rows.append({**row, **found, "n": values.size})
-    return rows
 
 
 def estimators(

@@ -11,15 +11,11 @@ import numpy as np
 from psfdae.cli import AboveZero, File, Reference, command
 from psfdae.configuration.schema import Config
 from psfdae.estimators import Method
+from psfdae.evaluation.figure_style import as_png
 from psfdae.files import Product, ProductError, atomic_path, read_product
+from psfdae.own_stars.star_sets import field_positions, noisy_test_images, read_stars, split_stars
 from psfdae.reading import read_table
-from psfdae.stages.common import (
-    field_positions,
-    limit_threads,
-    noisy_test_images,
-    read_stars,
-    split_stars,
-)
+from psfdae.stages.common import limit_threads
 from psfdae.stages.evaluate import READS, Evaluations, Metric, Models, estimators, read_evaluations
 
 if TYPE_CHECKING:
@@ -28,8 +24,6 @@ if TYPE_CHECKING:
 
     from psfdae.evaluation.figures import StripRow
 
-
-DPI = 150
 STRIP_STARS, HEADLINE_STARS = 8, 5
 """Columns of a restoration strip, and of the headline."""
 
@@ -180,8 +174,7 @@ def figure_errors(
 def write_png(figure: Figure, out: Path) -> None:
     """Write a figure atomically; the same figure gives the same bytes."""
     with atomic_path(out) as temporary:
-        # The temporary name ends in .tmp; the default metadata names matplotlib's version.
-        figure.savefig(temporary, format="png", dpi=DPI, metadata={"Software": None})
+        temporary.write_bytes(as_png(figure))
 
 
 def without_margin(templates: Product) -> np.ndarray:

@@ -4,62 +4,37 @@ from __future__ import annotations
 
 import os
 import shlex
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
-
-import numpy as np
+from typing import Annotated, Any
 
 from psfdae.cli import File, Folder, command
 from psfdae.configuration.base import ConfigError
-from psfdae.configuration.compose import as_overrides, part
-from psfdae.configuration.schema import Config, Noise
-from psfdae.estimators import Method, all_groups, groups_of, method
-from psfdae.files import (
-    Product,
-    atomic_path,
-    interrupted,
-    write_csv,
-    write_product,
-    write_text,
-)
-from psfdae.own_stars.advice import advice
+from psfdae.configuration.compose import as_overrides
+from psfdae.configuration.own_stars import CHOSEN, from_words, of_config
+from psfdae.configuration.schema import Config
+from psfdae.errors import Error
+from psfdae.estimators import Method, all_groups, method
+from psfdae.evaluation.figure_style import as_png
+from psfdae.files import atomic_path, interrupted, write_bytes, write_csv, write_product, write_text
 from psfdae.own_stars.bundle import SUFFIX
-from psfdae.own_stars.observation import Observation, Source, list_offset
-from psfdae.own_stars.photometry import signal_to_noise
-from psfdae.own_stars.report import MEAN_PSF, fitted_mean, standing
-from psfdae.own_stars.selection import BrightStars, collect
-from psfdae.own_stars.training_images import single_psf, star_grid, training_columns
-from psfdae.reading import read_table
-from psfdae.rng import stream
-from psfdae.stages.bundle import bundle
+from psfdae.own_stars.fitting import best, described, fitted_to, makes_models, packed
+from psfdae.own_stars.observation import Source
+from psfdae.own_stars.stars import Stars
+from psfdae.own_stars.validation import validate
 from psfdae.stages.common import check_outputs
-from psfdae.stages.evaluate import READS, Models, estimators, evaluate
-from psfdae.stages.fit import fit, fit_apart, training_set
 from psfdae.stages.mosaic import each, images_of, with_name
 from psfdae.stages.predict import Stated, write_list
-from psfdae.stages.quality import told
-from psfdae.stars.fields import held_out_fields
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 LOCK = ".from_stars.lock"
-
-SPLIT, REFERENCE = "held_out", "realisation"
-
-SHOWN_SNR = 10.0
-"""The figure shows stars at the S/N nearest to this."""
-
-SHOWN_STARS = 6
 
 LONGEST_NAME = 255
 """Bytes of a file's name."""
 
 
-class FolderError(RuntimeError):
+class FolderError(Error, RuntimeError):
     """The folder holds a model already, or another process is making one there."""
 
 
@@ -86,13 +61,9 @@ class Made:
     def bundle(self) -> Path:
         return self.path / f"{self.name}{SUFFIX}"
 
-    def models(self) -> Any:
-        """What the stage `evaluate` takes."""
-        return Models(**{kind.name: self.fit(kind) for kind in self.kinds})
-
     def written(self) -> list[Path]:
         """Files of the folder itself."""
-        names = ("selection.csv", "overrides.txt", "evaluation.csv", "per_star.parquet")
+        names = ("selection.csv", "overrides.txt", "evaluation.csv", "per_star.csv")
         own = [self.path / name for name in (*names, "report.csv", "report.png")]
         for kind in self.kinds:
             own += kind.outputs(self.fit(kind))
@@ -101,7 +72,7 @@ class Made:
 
 @command(
     "from-stars",
-    start=("dataset=from_stars",),
+    words=from_words,
     reads=(
         *("seed", "calibration_stars", "framing", "noise", "parts"),
         *(*all_groups(), "evaluation", "methods"),
@@ -165,29 +136,34 @@ def trained(
 
     `config` is what `from_stars` receives, or its tree.
     """
-    config = part(from_stars.stage.reads, config)  # type: ignore[attr-defined]
-    exposure = stated.source(image)
-    # Those that are told a place on the grid of a simulation know none of an image.
-    methods = [n for n in config.methods if method(n).bundled or not method(n).told_position]
-    if taken is not None and taken not in methods:
-        methods.append(method(taken).name)
-    config = config.model_copy(update={"methods": methods})
-    kinds = tuple(kind for kind in map(method, methods) if kind.stored)
+    source = stated.source(image)
+    settings, kinds, tried = _methods(of_config(config), taken)
     files = Made(out, _stem(image, name), kinds)
-    allowed = {kind.name: kind for kind in kinds if kind.bundled}
-    if not allowed or taken not in {None, *allowed}:
-        known = ", ".join(allowed) or "none, for no method of the list makes a model"
-        raise ConfigError(f"methods = {config.methods}: --method takes one of these: {known}")
-    made = [*files.written(), *([files.list] if exposure.detect is not None else []), page]
-    check_outputs(made, exposure.files())
+    made = [*files.written(), *([files.list] if source.detect is not None else []), page]
+    check_outputs(made, source.files())
     if page is not None and page.exists() and not (overwrite or interrupted(files.bundle)):
         raise FolderError(f"{page}: exists already; --overwrite replaces it")
     with _alone(out):
         finished = sorted(out.glob(f"*{SUFFIX}"))
         if finished and not overwrite:
             raise FolderError(f"{finished[0]}: a model is there already; --overwrite replaces it")
-        tried = [allowed[taken]] if taken else [*allowed.values()]
-        return _make(config, exposure, files, licence, tried, page)
+        return _make(settings, source, files, licence, tried, page)
+
+
+def _methods(
+    settings: Any, taken: str | None
+) -> tuple[Any, tuple[type[Method], ...], list[type[Method]]]:
+    """Settings whose methods are those that are measured; the fits, and who may be the model."""
+    # Those that are given a place on the grid of a simulation know none of an image.
+    names = [n for n in settings.methods if method(n).bundled or not method(n).told_position]
+    if taken is not None:
+        names = [n for n in names if not method(n).stored and n != taken] + [method(taken).name]
+    kinds = tuple(kind for kind in map(method, names) if kind.stored)
+    tried = [kind for kind in kinds if makes_models(kind.name)]
+    if not tried:
+        known = ", ".join(n for n in settings.methods if makes_models(n)) or "none of the list"
+        raise ConfigError(f"methods = {settings.methods}: --method takes one of these: {known}")
+    return settings.model_copy(update={"methods": names}), kinds, tried
 
 
 def _stem(image: Path, name: str | None) -> str:
@@ -237,241 +213,58 @@ def _alone(folder: Path) -> Iterator[None]:
 
 
 def _make(
-    config: Config,
-    exposure: Source,
+    settings: Any,
+    source: Source,
     files: Made,
     licence: str,
-    allowed: list[type[Method]],
+    tried: list[type[Method]],
     page: Path | None,
 ) -> str:
     """Make all files; how good the model is, in a sentence."""
-    # The noise levels follow from the stars.
-    framing, wanted = config.framing, config.calibration_stars
-    observation = exposure.open(framing.stamp_px, wanted.margin_px).assuming()
-    found = collect(observation, wanted, framing)
-    off = (found.bright.centre - found.bright.listed)[:, ::-1]
-    notes = [observation.said(), list_offset(exposure.catalogue, off, exposure.accept_offset)]
-    notes = [*filter(None, notes), *advice(found, observation, framing.stamp_px)]
-    print(*notes, sep="\n")
-    grid = star_grid(found.bright.position)
-    held_out = held_out_fields(grid)
-    print(f"{len(found.verdict)} stars: {found.count()}")
-    print(f"{int((~held_out).sum())} to learn from, {int(held_out.sum())} held out")
-    if exposure.detect is not None:
-        write_list(observation, files.list)
-    write_csv(files.path / "selection.csv", found.table(held_out), digits=6)
-    rng = stream(config.seed, "own stars")
-    columns = training_columns(
-        found.bright, grid, held_out, wanted.bins, framing, config.parts, rng
-    )
-    write_product(files.stars, "stars", columns, _described(config, observation))
-    sky = found.bright.sky_photons(observation.gain, config.noise.background_photons)
-    settings = {**config.model_dump(), "noise": _noise(config, found.bright, sky)}
-    write_text(files.path / "overrides.txt", _overrides(settings))
+    stars = Stars.of(source, settings)
+    print(*stars.notes, stars.summary(), sep="\n")
+    if source.detect is not None:
+        write_list(stars.observation, files.list)
+    write_csv(files.path / "selection.csv", stars.table, digits=6)
+    write_product(files.stars, "stars", stars.columns, stars.described())
+    write_text(files.path / "overrides.txt", _overrides(stars.settings))
+    fitted = {}
     for kind in files.kinds:
         print(f"fitting {kind.label}")
-        own = part(groups_of(kind.name), settings)
-        fit(own, kind.name, files.stars, SPLIT, REFERENCE, out=files.fit(kind))
-    print("testing on the stars held out")
-    checked = part(READS, settings)
-    evaluate(
-        *(checked, files.name, files.stars, files.models(), SPLIT, REFERENCE),
-        per_star=files.path / "per_star.parquet",
-        out=files.path / "evaluation.csv",
-    )
-    taken = allowed[0] if len(allowed) == 1 else best(settings, files, allowed)
+        place = files.fit(kind)
+        checkpoint = kind.beside(place, "checkpoint.pt")
+        fitted[kind.name] = fitted_to(stars, kind, checkpoint)
+        fitted[kind.name].store(place, described(stars, kind), stars.product)
+        checkpoint.unlink(missing_ok=True)
+    taken = tried[0]
+    if len(tried) > 1:
+        name, errors = best(stars, {kind.name: fitted[kind.name] for kind in tried})
+        taken = method(name)
+        for other, error in errors.items():
+            print(f"{method(other).label}: MSE {error:.3g} on validation stars")
     print(f"packing {taken.label}")
-    own = part(bundle.stage.reads, settings)  # type: ignore[attr-defined]
-    models = Models(**{taken.name: files.fit(taken)})
+    model = packed(stars, fitted[taken.name], files.name, licence)
+    print(
+        "".join(f"{taken.label}: {fact}\n" for fact in fitted[taken.name].facts().values()), end=""
+    )
     # Its name is the last one to be there: it says that all is done.
-    with atomic_path(files.bundle) as model:
-        bundle(own, files.stars, models, SPLIT, REFERENCE, files.name, licence, out=model)
-        fitted = taken.load(files.fit(taken), REFERENCE, checked.evaluation)
-        print("".join(f"{taken.label}: {fact}\n" for fact in fitted.facts().values()), end="")
-        mean = single_psf(found.bright, held_out)
-        restored = tested(checked, files, fitted, mean, framing.jitter_px)
-        errors = report(checked, files, restored)
+    with atomic_path(files.bundle) as unfinished:
+        model.save(unfinished)
+        print("testing on the stars held out")
+        report = validate(model, stars, fitted)
+        write_csv(files.path / "evaluation.csv", report.evaluation)
+        write_csv(files.path / "per_star.csv", report.per_star)
+        write_csv(files.path / "report.csv", report.table, digits=6)
+        write_bytes(files.path / "report.png", as_png(report.strip()))
         if page is not None:
             print(f"writing {page}")
-            tables = (errors, restored, found.table(held_out))
-            write_text(page, told(exposure, files, model, taken, tables, notes))
-    return standing(errors, taken.name, taken.label)
+            report.save(page)
+    return str(report)
 
 
-def best(settings: Any, files: Made, kinds: Iterable[type[Method]]) -> type[Method]:
-    """The method that errs least on validation stars, which no fit that is asked has seen.
-
-    Every S/N counts alike: the geometric mean of the errors decides.
-    """
-    from psfdae.stages.common import noise_model, read_stars, split_stars
-
-    errors = {}
-    for kind in kinds:
-        config = part((*groups_of(kind.name), "evaluation"), settings)
-        product = read_stars(files.stars, "template")
-        data = training_set(config, kind, product, SPLIT, REFERENCE)
-        star, judges = product["field_index"], split_stars(product, SPLIT, config).validation
-        fitted = kind.load(files.fit(kind), REFERENCE, config.evaluation)
-        if not kind.validates:
-            fitted = fit_apart(kind, data, star, config)
-        truth, rng = product["realisation"][judges], stream(config.seed, "noise", "own stars")
-        noisy = [noise_model(config).draw(truth, level, rng) for level in data.levels]
-        where = data.positions[judges]
-        free = fitted.free_flux()  # as of the stars that the model is for
-        logs = []
-        for images, level in zip(noisy, data.levels, strict=True):
-            psf = free.restore(images, level, where)
-            psf = psf / psf.sum(axis=(1, 2), keepdims=True)
-            logs.append(np.log(np.square(psf - truth).mean()))
-        errors[kind] = float(np.mean(logs))
-        print(f"{kind.label}: MSE {np.exp(errors[kind]):.3g} on validation stars")
-    return min(errors, key=errors.__getitem__)
-
-
-def _described(config: Any, observation: Observation) -> dict[str, Any]:
-    """Configuration of the product: what `stages.bundle` wants to know of its stars."""
-    kept = config.model_dump(include={"seed", "calibration_stars", "framing", "parts"})
-    return {
-        **kept,
-        "source": "stars",
-        "image": observation.path.name,
-        **({"image_px": [*reversed(observation.shape)]} if observation.shape else {}),
-        "telescope": {
-            "pixel_scale_arcsec": observation.pixel_scale_arcsec,
-            **({"assumed": True} if observation.scale_assumed else {}),
-        },
-    }
-
-
-def _noise(config: Any, bright: BrightStars, background: float) -> dict[str, Any]:
-    """Config group `noise` with the levels of the S/N asked for, of noise-free stars."""
-    area, kappa = float(np.median(bright.area())), config.noise.kappa
-    levels = [1.0 / (snr * np.sqrt(area) * kappa) for snr in config.calibration_stars.degraded()]
-    noise = Noise(
-        name=config.noise.name,
-        levels=[float(f"{level:.9g}") for level in reversed(levels)],
-        kappa=kappa,
-        background_photons=background,
+def _overrides(settings: Any) -> str:
+    """The settings as words of a command line that chooses files of the configuration, too."""
+    return (
+        "\n".join([CHOSEN, *as_overrides(settings.model_dump(exclude={"calibration_stars"}))])
+        + "\n"
     )
-    return noise.model_dump()
-
-
-def _overrides(settings: dict[str, Any]) -> str:
-    tree = {key: value for key, value in settings.items() if key != "calibration_stars"}
-    return "\n".join(["dataset=from_stars", *as_overrides(tree)]) + "\n"
-
-
-def tested(
-    config: Any, files: Made, fitted: Method, mean: np.ndarray, jitter_px: int
-) -> dict[float, dict[str, np.ndarray]]:
-    """By noise level λ: stars held out, and what the model and one mean PSF make of them faint."""
-    from psfdae.stages.common import (
-        field_positions,
-        noisy_test_images,
-        read_stars,
-        split_stars,
-    )
-
-    product = read_stars(files.stars, REFERENCE)
-    test = split_stars(product, SPLIT, config).test
-    place = field_positions(product)[test]
-    restored = {}
-    for level in config.noise.levels:
-        noisy = noisy_test_images(config, product, test, level)
-        restored[level] = {
-            "truth": product["realisation"][test],
-            "model": fitted.estimate(noisy, level, place).psf,
-            MEAN_PSF: fitted_mean(noisy, mean, jitter_px + 1.0),
-        }
-    return restored
-
-
-def report(config: Any, files: Made, restored: dict[float, dict[str, np.ndarray]]) -> pd.DataFrame:
-    """Table and figure of the errors on the stars held out; the table."""
-    import pandas as pd
-
-    from psfdae.evaluation.metrics import all_metrics, clustered_mean
-    from psfdae.stages.common import read_stars, split_stars, star_area
-
-    product = read_stars(files.stars, REFERENCE)
-    parts = split_stars(product, SPLIT, config)
-    area = star_area(product, parts.train)
-    rows = [read_table(files.path / "evaluation.csv")]
-    star = product["field_index"][parts.test]
-    for level, found in restored.items():
-        metrics = all_metrics(found[MEAN_PSF], found["truth"], config.evaluation.data_range)
-        means = {name: clustered_mean(values, star) for name, values in metrics.items()}
-        mean = pd.DataFrame(means.values(), columns=["value", "stderr"])
-        rows.append(mean.assign(noise_level=level, method=MEAN_PSF, metric=[*means]))
-    rows = pd.concat(rows)
-    # A table keeps eight digits of a level.
-    rows["noise_level"] = [float(f"{level:.8g}") for level in rows["noise_level"]]
-    wide = rows.pivot(index=["noise_level", "method"], columns="metric", values=["value", "stderr"])
-    table = pd.DataFrame(
-        {
-            "mse": wide["value", "mse"],
-            "mse_stderr": wide["stderr", "mse"],
-            "ssim": wide["value", "ssim_peak"],
-        }
-    ).reset_index()
-    noise = config.noise.kappa * table.pop("noise_level")
-    table.insert(0, "noise", noise)
-    table.insert(0, "snr", [signal_to_noise(level, area) for level in noise])
-    table["images"] = parts.test.size
-    table["stars"] = np.unique(star).size
-    table["truth_mse"] = _noise_of_truth(files.stars, parts.test, config.noise.background_photons)
-    order = {name: place for place, name in enumerate([*config.methods, MEAN_PSF])}
-    table = table.sort_values(["snr", "method"], key=lambda c: c.map(order).fillna(c))
-    write_csv(files.path / "report.csv", table, digits=6)
-    _draw(config, files, product, parts.test, area)
-    return table
-
-
-def _noise_of_truth(stars: Path, test: np.ndarray, sky: float) -> float:
-    """Mean variance of the pixels of the stars held out: their own noise, in every MSE.
-
-    Sky noise σ and the star's photons F, F = √B / σ: σ² + p/F with the mean p = 1/P.
-    """
-    from psfdae.files import read_product
-
-    product = read_product(stars, "stars", ("realisation", "field_index", "noise"))
-    noise = product["noise"][product["field_index"][test]]
-    pixels = product["realisation"][0].size
-    return float((noise**2 + noise / np.sqrt(sky) / pixels).mean())
-
-
-def _draw(config: Any, files: Made, stars: Product, test: np.ndarray, area: float) -> None:
-    """Strip of stars held out, made faint, and what the methods make of them."""
-    from psfdae.evaluation.figures import StripRow, restoration_strip
-    from psfdae.evaluation.metrics import mse
-    from psfdae.files import read_product
-    from psfdae.stages.common import field_positions, noisy_test_images
-    from psfdae.stages.figures import write_png
-
-    levels = np.asarray(config.noise.levels)
-    snr = 1.0 / (config.noise.kappa * levels * np.sqrt(area))
-    level = float(levels[np.abs(np.log(snr / SHOWN_SNR)).argmin()])
-    images, star = stars["realisation"][test], stars["field_index"][test]
-    noisy = noisy_test_images(config, stars, test, level)
-    product = read_product(files.stars, "stars", ("position", "snr"))
-    shown = _shown(star, product["position"])
-    truth = images[shown]
-    rows = [StripRow("bright\nstar", truth)]
-    methods = estimators(config, stars, vars(files.models()), SPLIT, REFERENCE, only_drawn=True)
-    for kind in methods.values():
-        stamps = kind.restore(noisy, level, field_positions(stars)[test])[shown]
-        rows.append(StripRow(kind.label, stamps, mse(stamps, truth), own_scale=not kind.restores))
-    found = signal_to_noise(config.noise.kappa * level, area)
-    columns = [f"S/N {value:.0f}" for value in product["snr"][star[shown]]]
-    title = f"Bright stars that no training saw, made faint: S/N {found:.3g}"
-    write_png(restoration_strip(rows, columns, title), files.path / "report.png")
-
-
-def _shown(star: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """An image each of stars that lie evenly over the field."""
-    from psfdae.evaluation.figures import spread_stars
-
-    stars, first = np.unique(star, return_index=True)
-    if not np.isfinite(position[stars]).all():
-        return first[:SHOWN_STARS]
-    return first[spread_stars(position[stars], SHOWN_STARS)]

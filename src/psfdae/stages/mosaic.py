@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from psfdae.cli import refusal
+from psfdae.errors import Error
 from psfdae.own_stars.catalogue import read_catalogue
 from psfdae.own_stars.errors import ObservationError
 from psfdae.own_stars.images import science_images
@@ -22,7 +23,7 @@ ALONE = ("extension", "origin", "mask", "weight", "variance")
 """What is stated of one image, and cannot be of several."""
 
 
-class MosaicError(RuntimeError):
+class MosaicError(Error, RuntimeError):
     """Some images of a file could not be used."""
 
 

@@ -17,25 +17,16 @@ from psfdae.files import atomic_path, interrupted
 from psfdae.own_stars.bundle import SUFFIX
 from psfdae.own_stars.images import Card
 from psfdae.own_stars.model import (
-    BLOCK,
+    MARGIN_PX,
     PredictionError,
     PsfModel,
-    available_cores,
     load_model,
-    one_thread_each,
 )
 from psfdae.own_stars.observation import Observation, Source, list_offset
 from psfdae.own_stars.prediction import Prediction, prediction_file
 from psfdae.own_stars.stamps import Stamps, StarFlag
 from psfdae.stages.common import check_outputs
 from psfdae.stages.mosaic import each, images_of, with_name
-from psfdae.threads import in_order
-
-ROWS = 4 * BLOCK
-"""Stars that are read and written at a time, fewer if their stamps are large."""
-
-MARGIN_PX = 2
-"""Pixels by which a star of an image may be moved to centre it."""
 
 
 @dataclass(frozen=True)
@@ -244,29 +235,21 @@ def write_prediction(
 
     Nothing is left of it if the list's positions are far off (`list_offset`).
     """
-    size = model.engine.size
-    chunks = observation.chunks(max(size, min(ROWS, 4 * size)))
-    first = next(chunks)
+    pairs = model.stream(observation, threads, fixed)
+    first = next(pairs)
     counts = np.zeros(len(StarFlag), dtype=int)
     done, clean, off = 0, 0, []
-
-    def predicted(stamps: Stamps) -> Prediction:
-        blocks = model.engine.blocks(stamps)
-        return Prediction.joined([model.engine.block(block, fixed) for block in blocks])
-
     history = " ".join(["psfdae", *sys.argv[1:]])  # without the folder of the program
-    header = (model.bundle, first, observation.count, _cards(source, observation), history)
-    with one_thread_each(), prediction_file(out, *header) as file:
-        for stamps, result in in_order(
-            predicted, itertools.chain([first], chunks), threads or available_cores()
-        ):
+    header = (first[0], observation.count, _cards(source, observation), history)
+    with prediction_file(out, model.bundle, *header) as file:
+        for stamps, result in itertools.chain([first], pairs):
             file.write(done, stamps, result)
             counts += [(result.flags & int(flag) > 0).sum() for flag in StarFlag]
             clean += int((result.flags == 0).sum())
             off.append(_off(stamps, result))
             done += len(result)
             tick(len(result))
-        said = list_offset(source.catalogue, np.concatenate(off), source.accept_offset)
+        said = list_offset(observation.catalogue, np.concatenate(off), source.accept_offset)
     return counts, clean, said if observation.shape else None
 
 

@@ -13,6 +13,7 @@ import psfdae
 from psfdae.cli import File, Folder, command
 from psfdae.configuration.consistency import STATIC
 from psfdae.configuration.schema import Config
+from psfdae.errors import Error
 from psfdae.evaluation.figures import FieldOfPsfs, field_of_psfs
 from psfdae.files import Product, atomic_path, read_product, write_csv, write_fits
 from psfdae.own_stars.example import ExampleField, FieldRecipe, add_stamps, write_field
@@ -44,7 +45,7 @@ MARGIN_PX = 8
 """Sky between stamps."""
 
 
-class FitError(ValueError):
+class FitError(Error, ValueError):
     """The PSFs of a telescope do not fit into their stamps."""
 
 

@@ -19,6 +19,7 @@ from typing import Annotated, Any
 import psfdae
 from psfdae import mlflow_view
 from psfdae.cli import File, Folder, command
+from psfdae.errors import Error
 from psfdae.files import atomic_path, write_text
 from psfdae.source import git_commit
 from psfdae.tracking import Run, flatten, runs_of_alignment, runs_of_datasets, runs_of_sweep
@@ -36,7 +37,7 @@ COLUMNS = ("run_id", "action", "experiment", *SLOT, "config_hash")
 NOT_SENT = "not sent"
 
 
-class TrackingError(RuntimeError):
+class TrackingError(Error, RuntimeError):
     """The MLflow database cannot be used."""
 
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from psfdae.configuration.schema import Framing, Optics
 from psfdae.configuration.telescope import Telescope
+from psfdae.errors import Error
 from psfdae.optics.propagation import EXTRA_POINTS, Precision, StampPropagator, in_batches
 from psfdae.optics.pupil import (
     Pupil,
@@ -26,7 +27,7 @@ from psfdae.optics.wavefronts import WavefrontSource
 Propagator = StampPropagator | BlurredPropagator
 
 
-class FramingError(ValueError):
+class FramingError(Error, ValueError):
     """The brightest pixel of a star cannot be trusted to be in the search window."""
 
 

@@ -117,15 +117,16 @@ def image_rows(
         Noisy images of noise-free ones at a noise level.
     model : Method
     """
-    from psfdae.stages.common import field_positions
-    from psfdae.stages.evaluate import measured, summarised
+    from psfdae.evaluation.metrics import quality, summarised
+    from psfdae.own_stars.star_sets import field_positions
 
     images, truth = (product[kind][stars] for kind in ("realisation", task.reference))
     field, position = product["field_index"][stars], field_positions(product)[stars]
     key = {"dataset": task.dataset, "split": task.split, "reference": task.reference}
     rows = []
     for level in task.levels:
-        found = measured(model.estimate(noisy(images, level), level, position), truth, config)
+        estimate = model.estimate(noisy(images, level), level, position)
+        found = quality(estimate, truth, config.evaluation.data_range)
         rows += summarised({**key, "method": method, "noise_level": level}, found, field)
     return rows
 
@@ -164,8 +165,8 @@ def measure_images(
     import pandas as pd
 
     from psfdae.files import write_csv
+    from psfdae.own_stars.star_sets import noise_model, noisy_test_images, read_stars, split_stars
     from psfdae.rng import stream
-    from psfdae.stages.common import noise_model, noisy_test_images, read_stars, split_stars
 
     product = read_stars(task.data["stars"], task.reference)
     parts = split_stars(product, task.split, config)

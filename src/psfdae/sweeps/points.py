@@ -22,6 +22,7 @@ from psfdae.configuration.compose import (
 )
 from psfdae.configuration.consistency import SIMULATION
 from psfdae.configuration.sweep import Sweep, load_sweep
+from psfdae.errors import Error
 from psfdae.rng import stream
 from psfdae.tracking import hash_of
 
@@ -29,7 +30,7 @@ DIGITS = 4
 """Significant digits of a drawn number: enough for a search, and short to paste."""
 
 
-class SweepError(ValueError):
+class SweepError(Error, ValueError):
     """A sweep cannot be used; the message names the file or key and says what to do."""
 
 

@@ -1,0 +1,317 @@
+"""How good a model is on stars that no training saw: `validate`, and its `Report`."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from psfdae.estimators import Method
+from psfdae.estimators import method as method_of
+from psfdae.evaluation.figure_style import as_png
+from psfdae.evaluation.figures import StripRow, restoration_strip, spread_stars
+from psfdae.evaluation.metrics import all_metrics, mse, quality, summarised
+from psfdae.files import write_text
+from psfdae.own_stars.model import MARGIN_PX, PredictionError, PsfModel
+from psfdae.own_stars.packing import checksum
+from psfdae.own_stars.photometry import signal_to_noise
+from psfdae.own_stars.plot import FieldStars, psf_map
+from psfdae.own_stars.prediction import Prediction
+from psfdae.own_stars.report import (
+    MEAN_PSF,
+    SHOWN_STARS,
+    Quality,
+    fitted_mean,
+    quality_page,
+    standing,
+)
+from psfdae.own_stars.stamps import Stamps
+from psfdae.own_stars.star_sets import (
+    field_positions,
+    noisy_test_images,
+    split_stars,
+    star_area,
+    training_set,
+)
+from psfdae.own_stars.stars import REFERENCE, SPLIT, Stars
+from psfdae.threads import fixed_threads
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+BESIDE = ("noisy", "lmmse")
+"""Methods that every model is compared with, beside one mean PSF."""
+
+STRIP_SNR = 10.0
+"""The figure of restored stars has the S/N nearest to this."""
+
+STRIP_STARS = 6
+
+
+def validate(model: PsfModel, stars: Stars, others: Mapping[str, Method] | None = None) -> Report:
+    """Errors of a model on the stars held out, degraded to the noise levels of their settings.
+
+    Beside it stand the noisy images, one mean PSF whose centre is fitted, and linear MMSE.
+
+    Parameters
+    ----------
+    model : PsfModel
+        It was fitted to these stars, or to another image of the same camera.
+    stars : Stars
+    others : mapping of str to Method, optional
+        Further fits to these stars for the table, by name.
+
+    Raises
+    ------
+    Error
+        If the model may have seen the stars that are held out, or their pixels differ.
+    """
+    _require_unseen(model, stars)
+    settings, own = stars.settings, model.info.method
+    known = {**(others or {}), own: model.engine.estimator}
+    names = [n for n in settings.methods if n in known or n in BESIDE]
+    names += [n for n in (own, *BESIDE) if n not in names]
+    with fixed_threads(settings.evaluation.threads):
+        methods = {name: known.get(name) or _fitted_here(name, stars) for name in names}
+        return _measured(model, stars, methods)
+
+
+def _require_unseen(model: PsfModel, stars: Stars) -> None:
+    """Refuse a model of other stars of the same image, and one of another camera."""
+    info, product, said = model.info, stars.product, stars.observation.path
+    model.check_scale(stars.observation.pixel_scale_arcsec, str(said))
+    if info.stamp_px != stars.settings.framing.stamp_px:
+        raise PredictionError(
+            f"{said}: stamps of {stars.settings.framing.stamp_px} px, but the model {info.name!r} "
+            f"takes {info.stamp_px} px"
+        )
+    train = split_stars(product, SPLIT, stars.settings).train
+    images = product["realisation"][train]
+    trained_on = info.config["stars"].get("image_sha256")
+    if trained_on != product.config["image_sha256"]:
+        return
+    if info.training_sha256 != checksum(images, product[REFERENCE][train]):
+        raise PredictionError(
+            f"{said}: the model {info.name!r} was trained on other stars of this image, among "
+            "which may be those held out here; fit a model to these stars"
+        )
+
+
+def _fitted_here(name: str, stars: Stars) -> Method:
+    kind = method_of(name)
+    data = training_set(stars.settings, kind, stars.product, SPLIT, REFERENCE)
+    fitted: Method = kind.fit(data, **kind.settings(stars.settings))
+    return fitted
+
+
+def _measured(model: PsfModel, stars: Stars, methods: Mapping[str, Method]) -> Report:
+    import pandas as pd
+
+    settings, product = stars.settings, stars.product
+    parts = split_stars(product, SPLIT, settings)
+    truth, field = product[REFERENCE][parts.test], product["field_index"][parts.test]
+    position = field_positions(product)[parts.test]
+    data_range = settings.evaluation.data_range
+    key = {"dataset": stars.name, "split": SPLIT, "reference": REFERENCE}
+    summary, per_star, restored = [], [], {}
+    for level in settings.noise.levels:
+        noisy = noisy_test_images(settings, product, parts.test, level)
+        reach = settings.framing.jitter_px + 1.0
+        mean = fitted_mean(noisy, stars.mean_psf, reach)
+        row = {**key, "method": MEAN_PSF, "noise_level": level}
+        beside = summarised(row, all_metrics(mean, truth, data_range), field)
+        for name, method in methods.items():
+            own = name == model.info.method
+            scale = settings.noise.kappa / model.info.kappa if own else 1.0
+            estimate = method.estimate(noisy, scale * level, position)
+            metrics = quality(estimate, truth, data_range)
+            row = {**key, "method": name, "noise_level": level}
+            summary += summarised(row, metrics, field)
+            per_star.append(pd.DataFrame({**row, "star": parts.test, "field": field, **metrics}))
+            if own:
+                restored[level] = {"truth": truth, "model": estimate.psf, MEAN_PSF: mean}
+        summary += beside
+    every = pd.DataFrame(summary)
+    return Report(
+        model,
+        stars,
+        methods,
+        _table(every, stars, methods),
+        every[every.method != MEAN_PSF],
+        pd.concat(per_star, ignore_index=True),
+        restored,
+    )
+
+
+def _table(rows: pd.DataFrame, stars: Stars, methods: Mapping[str, Method]) -> pd.DataFrame:
+    """MSE and SSIM by S/N and method."""
+    import pandas as pd
+
+    settings, product = stars.settings, stars.product
+    parts = split_stars(product, SPLIT, settings)
+    area = star_area(product, parts.train)
+    wide = rows.pivot(index=["noise_level", "method"], columns="metric", values=["value", "stderr"])
+    table = pd.DataFrame(
+        {
+            "mse": wide["value", "mse"],
+            "mse_stderr": wide["stderr", "mse"],
+            "ssim": wide["value", "ssim_peak"],
+        }
+    ).reset_index()
+    noise = settings.noise.kappa * table.pop("noise_level")
+    table.insert(0, "noise", noise)
+    table.insert(0, "snr", [signal_to_noise(level, area) for level in noise])
+    table["images"] = parts.test.size
+    table["stars"] = int(stars.held_out.sum())
+    table["truth_mse"] = _noise_of_truth(stars, parts.test)
+    order = {name: place for place, name in enumerate([*methods, MEAN_PSF])}
+    return table.sort_values(["snr", "method"], key=lambda c: c.map(order).fillna(c))
+
+
+def _noise_of_truth(stars: Stars, test: np.ndarray) -> float:
+    """Mean variance of the pixels of the stars held out: their own noise, in every MSE.
+
+    Sky noise σ and the star's photons F, F = √B / σ: σ² + p/F with the mean p = 1/P.
+    """
+    product, sky = stars.product, stars.settings.noise.background_photons
+    noise = product["noise"][product["field_index"][test]]
+    pixels = product["realisation"][0].size
+    return float((noise**2 + noise / np.sqrt(sky) / pixels).mean())
+
+
+@dataclass(frozen=True, eq=False)
+class Report:
+    """Whether to trust a model: its errors on stars that no training saw.
+
+    Attributes
+    ----------
+    model : PsfModel
+    stars : Stars
+    methods : dict of str to Method
+        All that were measured, the model's own included.
+    table : DataFrame
+        MSE with its standard error and SSIM by S/N and method.
+    evaluation : DataFrame
+        Every metric of every method at every noise level.
+    per_star : DataFrame
+        The same of every image.
+    restored : dict
+        By noise level λ the held-out images (n, d, d): `truth`, `model`, and `mean_psf`.
+    """
+
+    model: PsfModel
+    stars: Stars
+    methods: Mapping[str, Method]
+    table: pd.DataFrame
+    evaluation: pd.DataFrame
+    per_star: pd.DataFrame
+    restored: dict[float, dict[str, np.ndarray]]
+
+    def __str__(self) -> str:
+        kind = type(self.model.engine.estimator)
+        return standing(self.table, kind.name, kind.label)
+
+    def save(self, path: str | Path) -> None:
+        """Write the page, one HTML file that needs no other."""
+        write_text(path, self.page())
+
+    def strip(self) -> Figure:
+        """Held-out stars degraded to S/N 10, and what the methods make of them."""
+        settings, product = self.stars.settings, self.stars.product
+        parts = split_stars(product, SPLIT, settings)
+        area = star_area(product, parts.train)
+        levels = np.asarray(settings.noise.levels)
+        snr = 1.0 / (settings.noise.kappa * levels * np.sqrt(area))
+        level = float(levels[np.abs(np.log(snr / STRIP_SNR)).argmin()])
+        star, place = product["field_index"][parts.test], field_positions(product)[parts.test]
+        noisy = noisy_test_images(settings, product, parts.test, level)
+        shown = _one_of_each(star, product["position"])
+        truth = product[REFERENCE][parts.test][shown]
+        rows = [StripRow("bright\nstar", truth)]
+        for method in self.methods.values():
+            if method.drawn:
+                stamps = method.restore(noisy, level, place)[shown]
+                error = mse(stamps, truth)
+                rows.append(StripRow(method.label, stamps, error, own_scale=not method.restores))
+        columns = [f"S/N {value:.0f}" for value in product["snr"][star[shown]]]
+        found = signal_to_noise(settings.noise.kappa * level, area)
+        title = f"Bright stars that no training saw, degraded to S/N {found:.3g}"
+        return restoration_strip(rows, columns, title)
+
+    def page(self) -> str:
+        """The HTML of the page; the PSFs of all stars of the image are predicted for it."""
+        model, stars = self.model, self.stars
+        info, selection = model.info, stars.table
+        held = np.flatnonzero(selection.part == "held out")
+        where = selection[["x", "y"]].to_numpy()[held]
+        shown = held[spread_stars(where, SHOWN_STARS)] if np.isfinite(where).all() else held
+        found, psf, residual = _all_stars(model, stars, shown[:SHOWN_STARS])
+        columns = {name: selection[name].to_numpy() for name in ("verdict", "part")}
+        area, shown = info.noise_equivalent_px, shown[:SHOWN_STARS]
+        kind = type(model.engine.estimator)
+        levels = self.restored.items()
+        return quality_page(
+            Quality(
+                name=info.name,
+                image=stars.observation.path.name,
+                method=kind.name,
+                label=kind.label,
+                notes=stars.notes,
+                errors=self.table,
+                coverage={r["snr"]: r["coverage68"] for r in info.metrics if "coverage68" in r},
+                faint={signal_to_noise(info.kappa * level, area): of for level, of in levels},
+                stars=found | columns,
+                residual=residual / found["noise"][shown, None, None],
+                bright=psf[shown] + residual,
+                strip=as_png(self.strip()),
+                field=None if stars.observation.positions is None else _map(found, psf, stars),
+                facts=[*model.engine.estimator.facts().values()],
+            )
+        )
+
+
+def _one_of_each(star: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """An image each of stars that lie evenly over the field."""
+    stars, first = np.unique(star, return_index=True)
+    if not np.isfinite(position[stars]).all():
+        return first[:STRIP_STARS]
+    return first[spread_stars(position[stars], STRIP_STARS)]
+
+
+def _all_stars(
+    model: PsfModel, stars: Stars, kept: np.ndarray
+) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
+    """Columns and PSFs of all stars of an image, and the residuals of those that are kept."""
+    columns: dict[str, list[np.ndarray]] = {}
+    psf, residual, done = [], [], 0
+    for stamps, found in model.stream(stars.observation.with_margin(MARGIN_PX), threads=1):
+        for name, value in itertools.chain(_per_star(stamps, ("x", "y")), _per_star(found)):
+            columns.setdefault(name, []).append(value)
+        psf.append(found.psf)
+        inside = kept[(kept >= done) & (kept < done + len(found))] - done
+        residual.append((inside + done, found.residual[inside]))
+        done += len(found)
+    order = np.argsort(np.argsort(kept))
+    rows = np.concatenate([images for _, images in residual])[order]
+    joined = {name: np.concatenate(values) for name, values in columns.items()}
+    joined["flags"] = joined["flags"].astype(int)
+    return joined, np.concatenate(psf), rows
+
+
+def _per_star(of: Stamps | Prediction, names: Any = None) -> Iterator[tuple[str, np.ndarray]]:
+    for name in names or of.__dataclass_fields__:
+        value = np.asarray(getattr(of, name))
+        if value.ndim == 1:
+            yield name, value
+
+
+def _map(found: Mapping[str, np.ndarray], psf: np.ndarray, stars: Stars) -> Figure:
+    field = FieldStars(**{name: found[name] for name in FieldStars.__dataclass_fields__})
+    drawn, count = len(field.drawable()), len(field.x)
+    title = f"{stars.observation.path.name}: {drawn} of {count} stars"
+    return psf_map(psf[field.chosen()], field, title)
