@@ -109,7 +109,7 @@ def _kept(overrides: tuple[str, ...], root: Root, outline: str = "") -> dict[str
 def _made_of(overrides: tuple[str, ...], root: Root, outline: str) -> str:
     """Hash of all that a composition is made of, "" if a resolver may add more."""
     folder = config_dir()
-    words = (overrides, root, outline, all_groups(), _class_defaults())
+    words = (overrides, root, outline, all_groups(), _class_defaults(root))
     words += (version("hydra-core"), version("omegaconf"))
     parts = [repr(words).encode(), Path(__file__).read_bytes()]
     for path in sorted(folder.rglob("*.yaml")):
@@ -147,26 +147,21 @@ def _primary(root: Root, folder: Path) -> str:
     """
     from hydra.core.config_store import ConfigStore
 
-    if root != "config":
-        return root
-    tree = parse_yaml(folder / "config.yaml")
+    tree = parse_yaml(folder / f"{root}.yaml")
     defaults = tree.get("defaults", [])
     chosen = {group for entry in defaults if isinstance(entry, dict) for group in entry}
+    groups = {*all_groups()} - chosen if root == "config" else set()
     # Before all others, so that datasets and presets may change them.
-    more = [{f"optional {group}": "default"} for group in sorted({*all_groups()} - chosen)]
-    store = ConfigStore.instance()
-    store.store(CLASS_DEFAULTS, _class_defaults(), package="_global_")
-    whole = {**tree, "defaults": [CLASS_DEFAULTS, *more, *defaults]}
-    store.store(WHOLE_ROOT, whole)
-    return WHOLE_ROOT
+    more = [{f"optional {group}": "default"} for group in sorted(groups)]
+    store, classes, whole = ConfigStore.instance(), f"{root}_defaults", f"{root}_with_defaults"
+    store.store(classes, _class_defaults(root), package="_global_")
+    store.store(whole, {**tree, "defaults": [classes, *more, *defaults]})
+    return whole
 
 
-CLASS_DEFAULTS, WHOLE_ROOT = "class_defaults", "config_with_class_defaults"
-
-
-def _class_defaults() -> dict[str, Any]:
-    """Groups of the configuration with the values that their classes give, where they give some."""
-    fields = whole_config().model_fields.items()
+def _class_defaults(root: Root) -> dict[str, Any]:
+    """Groups of a configuration with the values that their classes give, where they give some."""
+    fields = model_of(root).model_fields.items()
     kinds = {name: field.annotation for name, field in fields}
     groups = {
         name: {
