@@ -31,6 +31,7 @@ from psfdae.own_stars.example import (
     example_field,
     star_images,
 )
+from psfdae.own_stars.model import load_model
 from psfdae.own_stars.photometry import noise_equivalent_px
 from psfdae.own_stars.report import MEAN_PSF
 from psfdae.own_stars.selection import (
@@ -43,6 +44,7 @@ from psfdae.own_stars.selection import (
 from psfdae.own_stars.stamps import cut
 from psfdae.own_stars.star_sets import noise_model, split_stars
 from psfdae.own_stars.training_images import OwnNoise, make_images, star_grid, training_columns
+from psfdae.own_stars.validation import Report
 from psfdae.rng import stream
 from psfdae.stages import from_stars as stage
 from psfdae.stages import simulate
@@ -328,7 +330,7 @@ def test_a_model_is_replaced_on_request_only(field, model, tmp_path):
     assert all(after[path] > before[path] for path in before if path.is_file())
 
 
-@pytest.mark.parametrize("last", ["report", "write_text"])
+@pytest.mark.parametrize("last", ["picture", "page"])
 def test_a_killed_command_ends_well_if_typed_again(field, model, tmp_path, monkeypatch, last):
     """The bundle comes last, and says that all is there."""
     image, catalogue, _ = field
@@ -336,29 +338,23 @@ def test_a_killed_command_ends_well_if_typed_again(field, model, tmp_path, monke
     shutil.copytree(model[0], out)
     made = out / "image.psf.safetensors"
     kept = made.rename(tmp_path / made.name)
-    for name in ("fit", "evaluate"):  # what they leave is there
-        monkeypatch.setattr(stage, name, lambda *args, **more: None)
-
-    def packed(*args, out, **more):
-        shutil.copy(kept, out)
-
-    packed.stage = stage.bundle.stage
-    monkeypatch.setattr(stage, "bundle", packed)
+    monkeypatch.setattr(stage, "fitted_to", lambda stars, kind, _: kind.load(out / "gmm.h5"))
+    monkeypatch.setattr(stage, "packed", lambda *args: load_model(kept))
     words = [image, "--catalogue", catalogue, "--out", out, "--report", page, "--method", "gmm"]
     child = os.fork()
     if child == 0:
-        after = getattr(stage, last)
+        owner, name = {"picture": (stage, "write_bytes"), "page": (Report, "save")}[last]
+        after = getattr(owner, name)
 
         def killed(*args):
             after(*args)
-            if last == "report" or args[0] == page:
-                os.kill(os.getpid(), signal.SIGKILL)
+            os.kill(os.getpid(), signal.SIGKILL)
 
-        monkeypatch.setattr(stage, last, killed)
+        monkeypatch.setattr(owner, name, killed)
         run(*words, *TINY)
         os._exit(1)
     assert os.waitpid(child, 0)[1] == signal.SIGKILL
-    assert not made.exists() and page.exists() == (last == "write_text")
+    assert not made.exists() and page.exists() == (last == "page")
     done = run(*words, *TINY)
     assert done.exit_code == 0, done.output
     assert made.read_bytes() == kept.read_bytes() and page.exists()
