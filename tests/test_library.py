@@ -13,6 +13,7 @@ import psfdae
 from psfdae.cli import main
 from psfdae.configuration.compose import load_stage
 from psfdae.configuration.own_stars import CHOSEN, from_words, of_config, settings_model
+from psfdae.own_stars import packing
 from psfdae.stages import simulate
 
 SIDE = {"side_px": 700, "bright": 60, "faint": 80, "blended": 6, "saturated": 3}
@@ -20,6 +21,15 @@ SIZES = {"train_stars": 120, "test_stars": 40}
 WORDS = [f"parts.{name}={value}" for name, value in SIZES.items()]
 QUICK = {"orders": [0, 1], "modes": 8}
 QUICK_WORDS = ["field.orders=[0,1]", "field.modes=8"]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_draws():
+    """Errors of models are measured on few noisy images."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in (("NODES", 3), ("LEAST_STARS", 60), ("FEW_STARS", 40)):
+            patch.setattr(packing, name, value)
+        yield
 
 
 @pytest.fixture(scope="module")
