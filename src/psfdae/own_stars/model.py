@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import fields, replace
@@ -589,13 +590,21 @@ def available_cores() -> int:
 @contextmanager
 def one_thread_each() -> Iterator[None]:
     """Linear algebra and network on one thread per calling thread, and as before afterwards."""
-    import torch
+    with _libraries().limit(limits=1, user_api="blas"), _networks_on_one_thread():
+        yield
 
+
+@contextmanager
+def _networks_on_one_thread() -> Iterator[None]:
+    """Limit torch to one thread meanwhile, if a network has loaded it already."""
+    torch = sys.modules.get("torch")
+    if torch is None:
+        yield
+        return
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        with _libraries().limit(limits=1, user_api="blas"):
-            yield
+        yield
     finally:
         torch.set_num_threads(before)
 

@@ -11,7 +11,7 @@ import numpy as np
 from psfdae.cli import AboveZero, File, Reference, command
 from psfdae.configuration.schema import Config
 from psfdae.estimators import Method
-from psfdae.files import Product, ProductError, atomic_path, read_product
+from psfdae.files import Product, ProductError, read_product, write_png
 from psfdae.reading import read_table
 from psfdae.stages.common import (
     field_positions,
@@ -24,12 +24,10 @@ from psfdae.stages.evaluate import READS, Evaluations, Metric, Models, estimator
 
 if TYPE_CHECKING:
     import pandas as pd
-    from matplotlib.figure import Figure
 
     from psfdae.evaluation.figures import StripRow
 
 
-DPI = 150
 STRIP_STARS, HEADLINE_STARS = 8, 5
 """Columns of a restoration strip, and of the headline."""
 
@@ -175,13 +173,6 @@ def figure_errors(
             names = ", ".join(str(path) for path in evaluations)
             raise ProductError(f"{names}: no rows of {dataset}, {metric}")
         write_png(error_against_noise(metrics, published("psf"), dataset, metric), path)
-
-
-def write_png(figure: Figure, out: Path) -> None:
-    """Write a figure atomically; the same figure gives the same bytes."""
-    with atomic_path(out) as temporary:
-        # The temporary name ends in .tmp; the default metadata names matplotlib's version.
-        figure.savefig(temporary, format="png", dpi=DPI, metadata={"Software": None})
 
 
 def without_margin(templates: Product) -> np.ndarray:

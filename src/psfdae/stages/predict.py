@@ -13,7 +13,7 @@ import click
 import numpy as np
 
 from psfdae.cli import File, NameOrNumber, command
-from psfdae.files import atomic_path, interrupted
+from psfdae.files import atomic_path, interrupted, write_png
 from psfdae.own_stars.bundle import SUFFIX
 from psfdae.own_stars.images import Card
 from psfdae.own_stars.model import (
@@ -176,8 +176,6 @@ def restored(
     out: Path,
 ) -> str:
     """Predict the stars of one image; what there is to say of it."""
-    from tqdm import tqdm
-
     source = stated.source(stars, flux_column=flux_column, background_column=background_column)
     found = out.with_name(f"{out.stem}_stars.csv") if stated.detect else None
     check_outputs((out, plot, found), (*source.files(), model))
@@ -195,8 +193,10 @@ def restored(
         )
     if plot is not None and observation.positions is None:
         raise PredictionError(f"{source.path}: a map needs a catalogue with pixel positions")
-    with tqdm(unit="star", unit_scale=True, desc="predict", disable=quiet or None) as bar:
-        bar.reset(observation.count)
+    hidden = quiet or not sys.stderr.isatty()
+    with click.progressbar(
+        length=observation.count, label="predict", show_pos=True, hidden=hidden, file=sys.stderr
+    ) as bar:
         try:
             # Its name is the last one to be there: it says that all is done.
             with atomic_path(out) as unfinished:
@@ -206,7 +206,6 @@ def restored(
                     write_list(observation, found)
                 if plot is not None:
                     from psfdae.own_stars.plot import map_of_file
-                    from psfdae.stages.figures import write_png
 
                     write_png(map_of_file(unfinished), plot)
         except OSError as error:
