@@ -63,6 +63,8 @@ def load_model(path: str | Path | None = None) -> PsfModel:
     ------
     BundleError
         If the file is missing, damaged, of a newer format, or no model bundle.
+    MissingExtraError
+        If the model is a network and torch is not installed.
     """
     return PsfModel(read_bundle(None if path is None else Path(path)))
 
