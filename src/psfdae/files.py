@@ -233,17 +233,6 @@ def write_fits(path: str | Path, hdus: Any) -> None:
         temporary.write_bytes(content.getbuffer())
 
 
-DPI = 150
-"""Pixels per inch of a figure."""
-
-
-def write_png(figure: Any, out: Path) -> None:
-    """Write a matplotlib figure atomically; the same figure gives the same bytes."""
-    with atomic_path(out) as temporary:
-        # The temporary name ends in .tmp; the default metadata names matplotlib's version.
-        figure.savefig(temporary, format="png", dpi=DPI, metadata={"Software": None})
-
-
 @dataclass(frozen=True)
 class Column:
     """One array of a product with its unit and a line of explanation."""

@@ -8,11 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from psfdae.files import Column, Product, ProductError, read_product
+from psfdae.files import Column, Product, ProductError, atomic_path, read_product
 from psfdae.own_stars.photometry import noise_equivalent_px
 from psfdae.rng import stream
 from psfdae.stars.fields import Split, held_out_split, random_split
 from psfdae.stars.noise import NoiseModel
+
+DPI = 150
+"""Pixels per inch of a figure."""
 
 
 class OutputError(ValueError):
@@ -30,6 +33,13 @@ def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Any]) -> None
     for out in outputs:
         if out is not None and out.resolve() in given:
             raise OutputError(f"{out}: is an input, too; choose another name")
+
+
+def write_png(figure: Any, out: Path) -> None:
+    """Write a matplotlib figure atomically; the same figure gives the same bytes."""
+    with atomic_path(out) as temporary:
+        # The temporary name ends in .tmp; the default metadata names matplotlib's version.
+        figure.savefig(temporary, format="png", dpi=DPI, metadata={"Software": None})
 
 
 def scene_of(config: Any) -> Any:

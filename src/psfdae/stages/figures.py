@@ -11,7 +11,7 @@ import numpy as np
 from psfdae.cli import AboveZero, File, Reference, command
 from psfdae.configuration.schema import Config
 from psfdae.estimators import Method
-from psfdae.files import Product, ProductError, read_product, write_png
+from psfdae.files import Product, ProductError, read_product
 from psfdae.reading import read_table
 from psfdae.stages.common import (
     field_positions,
@@ -19,6 +19,7 @@ from psfdae.stages.common import (
     noisy_test_images,
     read_stars,
     split_stars,
+    write_png,
 )
 from psfdae.stages.evaluate import READS, Evaluations, Metric, Models, estimators, read_evaluations
 
