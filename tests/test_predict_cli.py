@@ -22,7 +22,6 @@ from psfdae.own_stars import plot
 from psfdae.own_stars import prediction as writer
 from psfdae.own_stars.bundle import shipped_path
 from psfdae.own_stars.model import SCALE_TOLERANCE
-from psfdae.stages import figures
 from psfdae.stages import predict as stage
 from workflow_runs import ROOT
 
@@ -249,7 +248,7 @@ def test_a_killed_command_ends_well_if_typed_again(folder, tmp_path, monkeypatch
 
     child = os.fork()
     if child == 0:
-        place = (stage, "write_list") if last == "list" else (figures, "write_png")
+        place = (stage, "write_list" if last == "list" else "write_png")
         monkeypatch.setattr(*place, killed(getattr(*place)))
         run(*words)
         os._exit(1)

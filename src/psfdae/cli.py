@@ -22,6 +22,7 @@ import click
 
 import psfdae
 from psfdae.errors import Error
+from psfdae.extras import missing
 
 File = Annotated[Path, click.Path(path_type=Path, dir_okay=False)]
 Folder = Annotated[Path, click.Path(path_type=Path, file_okay=False)]
@@ -85,17 +86,22 @@ def command(
     return mark
 
 
+REFUSABLE = (OSError, MemoryError, RuntimeError, ValueError, ImportError)
+"""Errors of which some are no bugs; `refusal` tells which."""
+
+
 class Careful(click.Group):
     """Commands whose mistakes are one message and exit code 2."""
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command; a refusal of ours is a message, a bug stays a traceback.
 
-        So is a file that the system does not let us read or write, and a lack of memory.
+        So is a file that the system does not let us read or write, a lack of memory, and a
+        package that an extra brings.
         """
         try:
             return super().invoke(ctx)
-        except (OSError, MemoryError, RuntimeError, ValueError) as error:
+        except REFUSABLE as error:
             said = refusal(error)
             if said is None:
                 raise
@@ -109,6 +115,8 @@ def refusal(error: Exception) -> str | None:
         return f"not enough memory ({error or 'no more is known'})"
     if isinstance(error, OSError):
         return None if error.errno is None else str(error)
+    if isinstance(error, ModuleNotFoundError):
+        return missing(error, "this command")
     if isinstance(error, Error):
         return str(error)
     # HDF5 reports a full disk as a RuntimeError without a number of its own.

@@ -9,7 +9,7 @@ from psfdae.estimators import method
 from psfdae.evaluation.figure_style import SERIES_COLORS, new_figure, styled
 from psfdae.files import ProductError
 from psfdae.reading import read_table
-from psfdae.stages.figures import write_png
+from psfdae.stages.common import write_png
 
 WAYS = {
     "kernel numpy": ("our kernel, numpy", "#0072b2", "o"),

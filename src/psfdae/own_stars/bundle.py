@@ -33,6 +33,7 @@ import psfdae
 from psfdae.errors import Error
 from psfdae.estimators import Method, method
 from psfdae.estimators.weights import digest_of
+from psfdae.extras import needed_by
 from psfdae.files import ProductError, atomic_path
 from psfdae.own_stars.errors import one_line
 from psfdae.own_stars.photometry import FluxModel
@@ -235,11 +236,14 @@ def estimator(bundle: Bundle) -> Method:
     ------
     BundleError
         If its arrays do not fit together.
+    MissingExtraError
+        If it is a network and torch is not installed.
     """
     info = bundle.info
     found = method(info.method)
     if info.dae:
-        return found.unpack(bundle.weights, info)
+        with needed_by(f"the model {info.name!r}"):
+            return found.unpack(bundle.weights, info)
     # Their shapes are the method's own affair: it must be able to work with them.
     blank = np.zeros((1, info.stamp_px, info.stamp_px), np.float32)
     try:

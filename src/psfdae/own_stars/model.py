@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import fields, replace
@@ -66,6 +67,8 @@ def load_model(path: str | Path | None = None) -> PsfModel:
     ------
     BundleError
         If the file is missing, damaged, of a newer format, or no model bundle.
+    MissingExtraError
+        If the model is a network and torch is not installed.
     """
     return PsfModel(read_bundle(None if path is None else Path(path)))
 
@@ -608,13 +611,21 @@ def _filled(stars: Stamps, bundle: Bundle, size: int) -> Stamps:
 @contextmanager
 def one_thread_each() -> Iterator[None]:
     """Linear algebra and network on one thread per calling thread, and as before afterwards."""
-    import torch
+    with _libraries().limit(limits=1, user_api="blas"), _networks_on_one_thread():
+        yield
 
+
+@contextmanager
+def _networks_on_one_thread() -> Iterator[None]:
+    """Limit torch to one thread meanwhile, if a network has loaded it already."""
+    torch = sys.modules.get("torch")
+    if torch is None:
+        yield
+        return
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        with _libraries().limit(limits=1, user_api="blas"):
-            yield
+        yield
     finally:
         torch.set_num_threads(before)
 

@@ -29,8 +29,7 @@ from psfdae.own_stars.star_sets import noise_model
 from psfdae.reading import read_table
 from psfdae.stages.alignment import StatesFile
 from psfdae.stages.alignment_methods import DaeFolder, denoise, noisy_test_states
-from psfdae.stages.common import limit_threads
-from psfdae.stages.figures import write_png
+from psfdae.stages.common import limit_threads, write_png
 
 Estimates = Annotated[tuple[File, ...], "Product of `alignment estimate`."]
 Fits = Annotated[tuple[File, ...], "Product of `alignment fit`.", {"flag": "--fit"}]

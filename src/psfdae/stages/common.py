@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from psfdae.errors import Error
-from psfdae.files import Column
+from psfdae.evaluation.figure_style import as_png
+from psfdae.files import Column, write_bytes
 
 
 class OutputError(Error, ValueError):
@@ -27,6 +28,11 @@ def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Any]) -> None
     for out in outputs:
         if out is not None and out.resolve() in given:
             raise OutputError(f"{out}: is an input, too; choose another name")
+
+
+def write_png(figure: Any, out: Path) -> None:
+    """Write a matplotlib figure atomically; the same figure gives the same bytes."""
+    write_bytes(out, as_png(figure))
 
 
 def scene_of(config: Any) -> Any:

@@ -11,16 +11,14 @@ import numpy as np
 from psfdae.cli import AboveZero, File, Reference, command
 from psfdae.configuration.schema import Config
 from psfdae.estimators import Method
-from psfdae.evaluation.figure_style import as_png
-from psfdae.files import Product, ProductError, atomic_path, read_product
+from psfdae.files import Product, ProductError, read_product
 from psfdae.own_stars.star_sets import field_positions, noisy_test_images, read_stars, split_stars
 from psfdae.reading import read_table
-from psfdae.stages.common import limit_threads
+from psfdae.stages.common import limit_threads, write_png
 from psfdae.stages.evaluate import READS, Evaluations, Metric, Models, estimators, read_evaluations
 
 if TYPE_CHECKING:
     import pandas as pd
-    from matplotlib.figure import Figure
 
     from psfdae.evaluation.figures import StripRow
 
@@ -169,12 +167,6 @@ def figure_errors(
             names = ", ".join(str(path) for path in evaluations)
             raise ProductError(f"{names}: no rows of {dataset}, {metric}")
         write_png(error_against_noise(metrics, published("psf"), dataset, metric), path)
-
-
-def write_png(figure: Figure, out: Path) -> None:
-    """Write a figure atomically; the same figure gives the same bytes."""
-    with atomic_path(out) as temporary:
-        temporary.write_bytes(as_png(figure))
 
 
 def without_margin(templates: Product) -> np.ndarray:

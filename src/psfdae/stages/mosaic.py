@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from psfdae.cli import refusal
+from psfdae.cli import REFUSABLE, refusal
 from psfdae.errors import Error
 from psfdae.own_stars.catalogue import read_catalogue
 from psfdae.own_stars.errors import ObservationError
@@ -95,7 +95,7 @@ def _quietly(work: Callable[..., str], job: Mapping[str, Any]) -> tuple[bool, st
     with Path(os.devnull).open("w") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere):
         try:
             return True, work(**job)
-        except (OSError, MemoryError, RuntimeError, ValueError) as error:
+        except REFUSABLE as error:
             said = refusal(error)
             if said is None:
                 raise

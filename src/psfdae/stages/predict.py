@@ -25,7 +25,7 @@ from psfdae.own_stars.model import (
 from psfdae.own_stars.observation import Observation, Source, list_offset
 from psfdae.own_stars.prediction import Prediction, prediction_file
 from psfdae.own_stars.stamps import Stamps, StarFlag
-from psfdae.stages.common import check_outputs
+from psfdae.stages.common import check_outputs, write_png
 from psfdae.stages.mosaic import each, images_of, with_name
 
 
@@ -167,8 +167,6 @@ def restored(
     out: Path,
 ) -> str:
     """Predict the stars of one image; what there is to say of it."""
-    from tqdm import tqdm
-
     source = stated.source(stars, flux_column=flux_column, background_column=background_column)
     found = out.with_name(f"{out.stem}_stars.csv") if stated.detect else None
     check_outputs((out, plot, found), (*source.files(), model))
@@ -186,8 +184,10 @@ def restored(
         )
     if plot is not None and observation.positions is None:
         raise PredictionError(f"{source.path}: a map needs a catalogue with pixel positions")
-    with tqdm(unit="star", unit_scale=True, desc="predict", disable=quiet or None) as bar:
-        bar.reset(observation.count)
+    hidden = quiet or not sys.stderr.isatty()
+    with click.progressbar(
+        length=observation.count, label="predict", show_pos=True, hidden=hidden, file=sys.stderr
+    ) as bar:
         try:
             # Its name is the last one to be there: it says that all is done.
             with atomic_path(out) as unfinished:
@@ -197,7 +197,6 @@ def restored(
                     write_list(observation, found)
                 if plot is not None:
                     from psfdae.own_stars.plot import map_of_file
-                    from psfdae.stages.figures import write_png
 
                     write_png(map_of_file(unfinished), plot)
         except OSError as error:

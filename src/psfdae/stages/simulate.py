@@ -21,8 +21,8 @@ from psfdae.own_stars.example import example_field as simulated
 from psfdae.own_stars.photometry import noise_equivalent_px
 from psfdae.own_stars.shapes import measure_shapes
 from psfdae.rng import stream
-from psfdae.stages.common import check_outputs, template_wavefronts
-from psfdae.stages.figures import without_margin, write_png
+from psfdae.stages.common import check_outputs, template_wavefronts, write_png
+from psfdae.stages.figures import without_margin
 from psfdae.stages.stars import templates
 from psfdae.stars.framing import normalise_flux
 

@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 from psfdae.cli import File, Folder, command
 from psfdae.files import ProductError, as_yaml, write_csv, write_text
 from psfdae.reading import read_table, read_yaml
+from psfdae.stages.common import write_png
 from psfdae.stages.sweep import RESULT, read_cost, read_result
 from psfdae.sweeps.points import SweepError
 
@@ -176,7 +177,6 @@ def sweep_figure(
     from psfdae.configuration.compose import validate
     from psfdae.configuration.sweep import Axis
     from psfdae.evaluation import sweep_figures
-    from psfdae.stages.figures import write_png
 
     described = read_yaml(definition)
     logarithmic = [n for n, axis in described["space"].items() if validate(Axis, axis).log]
