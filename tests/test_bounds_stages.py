@@ -242,10 +242,10 @@ def test_the_posterior_mean_respects_the_floor(scene_1):
 
 
 @pytest.mark.parametrize(("factor", "verdict"), [(1.0, "ok"), (1e-3, "beaten")])
-def test_a_method_told_the_field_is_judged_by_the_mean_told_it(
+def test_a_method_given_the_field_is_judged_by_the_mean_given_it(
     scene_1, monkeypatch, factor, verdict
 ):
-    monkeypatch.setattr(method("lmmse"), "told_position", True)
+    monkeypatch.setattr(method("lmmse"), "needs_position", True)
     table = compared(scene_1, "dataset6", factor, "bayes_position")
     rows = table[table.method == "lmmse"]
     assert set(rows.bound) == {"bayes_position", "floor"}

@@ -47,7 +47,7 @@ def stars(count, seed=1):
 
 
 class Placed(GaussianMixture):
-    told_position = True
+    needs_position = True
 
 
 def where(count, seed=1):

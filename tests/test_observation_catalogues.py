@@ -142,10 +142,10 @@ def test_a_row_without_a_position_is_kept_flagged_and_named(tmp_path, image, con
     path = tmp_path / "stars.csv"
     path.write_text(content)
     found = open_observation(image, D, catalogue=path)
-    assert found.unplaced().tolist() == [False, True, True, True, False]
+    assert found.without_position().tolist() == [False, True, True, True, False]
     assert f"{path}: no position in row 2, 3, 4: flagged" in found.said()
     stamps = next(found.chunks(5))
-    assert ((stamps.flags & StarFlag.TRUNCATED) > 0).tolist() == found.unplaced().tolist()
+    assert ((stamps.flags & StarFlag.TRUNCATED) > 0).tolist() == found.without_position().tolist()
     assert stamps.bad[1:4].all()
 
 

@@ -4,7 +4,7 @@ Photon counts are Poisson, n ~ Poisson(F p + B). Their Fisher information about
 the state t, per pixel F² ∂p ∂pᵀ / (F p + B), is that of a Gaussian with the
 variance (κλ)² + p/F, summed over pixels and fields (Kay 1993, chapter 3).
 
-Nobody is told the flux and the centroid of a star. With an operator of movable
+Flux and centroid of a star are unknown. With an operator of movable
 stamps they are parameters, too: (n, 4) states become (n, 4 + 3F) parameters, after
 the state the three of each stamp in turn, what is missing to its flux relative to
 1, and its star's place (x, y) in pixels.

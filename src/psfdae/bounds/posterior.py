@@ -380,7 +380,7 @@ def posterior_sums(
     noisy: np.ndarray,
     likelihood: Likelihood,
     chunk: int = CHUNK,
-    told: np.ndarray | None = None,
+    own_field: np.ndarray | None = None,
 ) -> PosteriorSums:
     """Weigh all stars of a bank, at all jitters and symmetries, by noisy images.
 
@@ -393,15 +393,15 @@ def posterior_sums(
         Of that noise level.
     chunk : int
         Stars of the bank per matrix product; does not change the result.
-    told : ndarray of int, shape (n,), optional
+    own_field : ndarray of int, shape (n,), optional
         Field of every noisy image: only stars that a symmetry takes there count. Each star
         of the bank must have one that does.
     """
     shifts = len(jitters(bank.jitter_px))
     sums = PosteriorSums.empty(len(noisy), noisy[0].size, bank.points**2, shifts)
     for part in scored(bank, noisy, likelihood, chunk):
-        if told is not None:
-            part.scores[told[:, None] != part.field] = -np.inf
+        if own_field is not None:
+            part.scores[own_field[:, None] != part.field] = -np.inf
         symmetry = SYMMETRIES[part.symmetry]
         sums.add(part.scores, part.images, symmetry, part.field, part.jitter)
     return sums
@@ -411,7 +411,7 @@ def exact_posterior(
     noisy: np.ndarray,
     templates: np.ndarray,
     likelihood: Likelihood,
-    told: np.ndarray | None = None,
+    own_field: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Posterior mean, variance and probability of the templates, centring errors summed out.
 
@@ -424,7 +424,7 @@ def exact_posterior(
         Every template at every centring error.
     likelihood : Likelihood
         Of the images' noise level.
-    told : ndarray of int, shape (n,), optional
+    own_field : ndarray of int, shape (n,), optional
         Field of every noisy image: only its template counts.
 
     Returns
@@ -438,8 +438,8 @@ def exact_posterior(
     images = templates.reshape(fields * shifts, -1).astype(np.float64)
     ratio, offset = likelihood.factors(images)
     scores = likelihood.residuals(noisy) @ ratio.T + offset
-    if told is not None:
-        scores[told[:, None] != np.repeat(np.arange(fields), shifts)] = -np.inf
+    if own_field is not None:
+        scores[own_field[:, None] != np.repeat(np.arange(fields), shifts)] = -np.inf
     weight = np.exp(scores - scores.max(axis=1, keepdims=True))
     weight /= weight.sum(axis=1, keepdims=True)
     mean, variance = mixture(weight, images)

@@ -97,7 +97,7 @@ PRIOR_DRAWS = 10.0
 """Effective draws of a mode that change its scale half way to theirs."""
 
 OWN_SHARE = 0.25
-"""Least part of the draws in the star's own field: all that one has who is told it."""
+"""Least part of the draws in the star's own field: all that counts where the field is given."""
 
 PARTS = 4
 """Equal parts of the draws, whose errors tell whether they are enough."""
@@ -299,13 +299,13 @@ class Modes:
         """About `count` draws around one star's modes and their number from each mode, (M,)."""
         share = np.exp(self.evidence - self.evidence.max())
         share = 0.9 * share / share.sum() + 0.1 / share.size
-        told = self.field == own
-        # Whoever is told the field can use these alone.
-        missing = OWN_SHARE - share[told].sum()
-        if missing > 0 and told.any():
-            inside = np.exp(self.evidence[told] - self.evidence[told].max()) + 0.1
+        own_field = self.field == own
+        # Where the field is given, these alone count.
+        missing = OWN_SHARE - share[own_field].sum()
+        if missing > 0 and own_field.any():
+            inside = np.exp(self.evidence[own_field] - self.evidence[own_field].max()) + 0.1
             share *= 1.0 - missing
-            share[told] += missing * inside / inside.sum()
+            share[own_field] += missing * inside / inside.sum()
         number = np.ceil(share * count).astype(int)
         mode = np.repeat(np.arange(share.size), number)
         normal = rng.standard_normal((mode.size, TERMS))
@@ -622,19 +622,19 @@ class Sampled:
 
     Attributes
     ----------
-    free, told : list of PosteriorSums
+    free, in_field : list of PosteriorSums
         In `PARTS` equal parts: over the fields that were found, and over the own one for who
         is given the field.
-    free_helped, told_helped : PosteriorSums
+    free_helped, in_field_helped : PosteriorSums
         The same in one part with all modes found with more given, those climbed from the truth
         among them. The truth is one draw from the posterior, so what the search does not detect
         of the posterior shows in the difference.
     """
 
     free: list[PosteriorSums]
-    told: list[PosteriorSums]
+    in_field: list[PosteriorSums]
     free_helped: PosteriorSums
-    told_helped: PosteriorSums
+    in_field_helped: PosteriorSums
 
 
 def sampled_sums(
@@ -684,8 +684,8 @@ def sampled_sums(
         again = dict(zip(lost, sampled(lost, modes), strict=True))
         for star, sampler in zip(stars, samplers, strict=True):
             kinds.append((*sampler.parts(model), *again.get(star, sampler).whole(model)))
-    *halves, free, told = (PosteriorSums.stack(kind) for kind in zip(*kinds, strict=True))
-    return Sampled(halves[:PARTS], halves[PARTS:], free, told)
+    *halves, free, in_field = (PosteriorSums.stack(kind) for kind in zip(*kinds, strict=True))
+    return Sampled(halves[:PARTS], halves[PARTS:], free, in_field)
 
 
 def _draw(samplers: list[_Sampler], count: int, likelihood: Likelihood, model: StampModel) -> None:

@@ -189,10 +189,10 @@ class Bounds(Group):
 
     bank_stars: Count = Field(description="Fresh draws of the simulator in the bank")
     position_stars: Count = Field(
-        description="Further draws, which only the bound uses that is told the field"
+        description="Further draws, which only the bound uses that is given the field"
     )
     star_draws: Annotated[int, Field(ge=20)] = Field(
-        description="Draws around the best matches of each star, where the bank is too thin"
+        description="Draws around the best matches of a star that few of the bank resemble"
     )
     test_stars: Count = Field(description="Test stars that are bounded, the first of the part")
     threads: Count = Field(description="Threads of the linear algebra")

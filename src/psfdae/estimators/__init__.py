@@ -230,9 +230,9 @@ class Method:
         Shown among restored stars.
     restores : bool
         False for the noisy image itself, which is drawn on its own scale.
-    told_level : bool
+    needs_level : bool
         `predict` gets the noise level λ, too: of all images, or of each, shape (n,).
-    told_position : bool
+    needs_position : bool
         `predict` gets the positions in the field as well, shape (n, 2).
     measures : bool
         It measures flux, sky and centre of a star with its PSF: `measure` does, of stamps, and
@@ -274,8 +274,8 @@ class Method:
     paper: ClassVar[tuple[str, str] | None] = None
     drawn: ClassVar[bool] = True
     restores: ClassVar[bool] = True
-    told_level: ClassVar[bool] = False
-    told_position: ClassVar[bool] = False
+    needs_level: ClassVar[bool] = False
+    needs_position: ClassVar[bool] = False
     measures: ClassVar[bool] = False
     groups: ClassVar[Mapping[str, type[Group]]] = {}
     stored: ClassVar[bool] = True
@@ -317,7 +317,7 @@ class Method:
     @classmethod
     def given(cls) -> str:
         """What it is given beside the image, as the end of a label: " (given λ, position)"."""
-        names = ["λ"] * cls.told_level + ["position"] * cls.told_position
+        names = ["λ"] * cls.needs_level + ["position"] * cls.needs_position
         return f" (given {', '.join(names)})" if names else ""
 
     @classmethod
@@ -358,8 +358,8 @@ class Method:
         self, noisy: np.ndarray, level: float | np.ndarray, position: np.ndarray | None = None
     ) -> np.ndarray:
         """`predict`, given what the method wants to know beside the image."""
-        told = (level,) * self.told_level + (position,) * self.told_position
-        return self.predict(noisy, *told)
+        given = (level,) * self.needs_level + (position,) * self.needs_position
+        return self.predict(noisy, *given)
 
     def strangeness(self, noisy: np.ndarray, level: np.ndarray) -> np.ndarray | None:
         """How unlike all training stars images (n, d, d) are, if the method has a law of them.
@@ -576,4 +576,4 @@ def all_groups() -> tuple[str, ...]:
 def oracles_last(names: Any) -> list[type[Method]]:
     """Methods among some names in the order of legends: those that are given λ at the end."""
     kinds = [kind for kind in registered() if kind.name in set(names)]
-    return sorted(kinds, key=lambda kind: kind.told_level)
+    return sorted(kinds, key=lambda kind: kind.needs_level)

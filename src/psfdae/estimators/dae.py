@@ -217,7 +217,7 @@ class Dae(Method):
     def load(
         cls, place: Path, reference: str = "realisation", evaluation: Evaluation | None = None
     ) -> Dae:
-        """As of all methods; the two files must be of the same training."""
+        """As `Method.require`; the two files must be of the same training."""
         import torch
 
         from psfdae.configuration.compose import validate

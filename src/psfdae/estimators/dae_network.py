@@ -165,7 +165,7 @@ class DaeTraining(Training):
             model.load_state_dict(data.start.network.state_dict())
         super().__init__(model, settings, -(-data.fit.size // settings.batch), attempt)
         self.grad_clip = settings.grad_clip or self.grad_clip
-        # A template is told from all of a stamp.
+        # A template follows from all of a stamp.
         own = data.reference == "realisation"
         self.cropped = round(settings.crop_epochs * settings.epochs) if own else 0
         self.fixed: tuple[np.ndarray, ...] | None = None

@@ -78,7 +78,7 @@ AT_ONCE = 1024
 """Stars that are restored together."""
 
 TELLING, LEAST_SEEN = 12, 1e-9
-"""Leading modes that tell strange stars, as the others tell the training stars from all others;
+"""Leading modes that tell outliers, as the others tell the training stars from all others;
 and the least variance of one over that of the noise in it."""
 
 KEPT = 200e6
@@ -184,7 +184,7 @@ class Kind(NamedTuple):
     """What a factorisation of a node is for."""
 
     number: int  # of the noise variance
-    placed: bool  # the position is known
+    positioned: bool  # the position is known
     sky: bool  # likewise
     centred: bool  # the centre is exactly known
 
@@ -207,7 +207,7 @@ class Stars(NamedTuple):
     images: np.ndarray  # (n, P), sky roughly off
     noise: np.ndarray  # (n,)
     terms: np.ndarray  # (n, K)
-    placed: np.ndarray  # (n,), the position is known
+    positioned: np.ndarray  # (n,), the position is known
     prior: np.ndarray  # (n, nodes), ln; −inf where no centre is
     centre: np.ndarray | None  # (n, 2), if it is known
     flux: np.ndarray  # (n,), NaN where to be found
@@ -244,7 +244,7 @@ class FieldMixture(Method):
     """
 
     label, color, marker = "field", "#117733", "D"
-    told_level = told_position = True
+    needs_level = needs_position = True
     measures = True
     together, padded = 1024, False
     per_reference = True
@@ -324,7 +324,7 @@ class FieldMixture(Method):
         return cls(**{**arrays, **same}, noise=noise, settings=settings)
 
     def pack(self, stamp_px: int, noise: float) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """As of all methods; fewer modes of large stamps, the others join the diagonal."""
+        """As `Method.pack`, with fewer modes of large stamps, the others join the diagonal."""
         arrays, said = super().pack(stamp_px, noise)
         phases, most, pixels = self.modes.shape
         kept = min(most, max(1, int(PACKED // (2 * phases * pixels))))
@@ -349,7 +349,7 @@ class FieldMixture(Method):
         yield "listed", "an error above 0, if any", self.listed[1:] > 0
 
     def free_flux(self) -> Self:
-        """As of all methods: flux and sky are found."""
+        """As `Method.estimate`; flux and sky are found."""
         return replace(self, free=True)
 
     # The field.
@@ -389,9 +389,9 @@ class FieldMixture(Method):
     def _terms(self, position: np.ndarray | None, count: int = 0) -> tuple[np.ndarray, np.ndarray]:
         """Terms of the field of each star, the usual ones where no position is known, and where."""
         position = np.full((count, 2), np.nan) if position is None else position
-        placed = np.isfinite(position).all(axis=1) | (len(self.usual) == 1)
+        positioned = np.isfinite(position).all(axis=1) | (len(self.usual) == 1)
         terms = self.model.terms(np.nan_to_num(position))
-        return np.where(placed[:, None], terms, self.usual), placed
+        return np.where(positioned[:, None], terms, self.usual), positioned
 
     # The nodes.
 
@@ -477,7 +477,7 @@ class FieldMixture(Method):
         width = np.array([0.0 if kind.sky else 1.0, *[0.0 if kind.centred else self._part] * 2])
         latent = width[:, None] * np.vstack([np.ones(pixels), node.slope])
         # Leading modes are the last ones: their law is the last block of the factor.
-        spread = [] if kind.placed else [node.spread]
+        spread = [] if kind.positioned else [node.spread]
         rows = np.vstack([latent, *spread, node.rows[::-1]])
         d = node.diagonal + s
         weighted = rows / d
@@ -579,10 +579,10 @@ class FieldMixture(Method):
         listed = np.full((count, 2), np.nan) if centre is None else centre
         if len(self.listed) and np.isfinite(self.listed).all():
             listed = listed + self.listed[0]
-        terms, placed = self._terms(position, count)
+        terms, positioned = self._terms(position, count)
         level = np.nan_to_num(sky)
         stars = Stars(
-            *(images - level[:, None], np.broadcast_to(noise, count), terms, placed),
+            *(images - level[:, None], np.broadcast_to(noise, count), terms, positioned),
             *(self._prior(listed), None, flux, np.isfinite(sky)),
         )
         known = np.isfinite(listed).all(axis=1) & fixed
@@ -693,20 +693,20 @@ class FieldMixture(Method):
             weight /= weight.sum(axis=1, keepdims=True)
             near = weight > 0
             guess = flux * (weight * factor).sum(axis=1)
-        values, covariance, strange, psf, sigma = self._summed(scaled, number, weight, precision)
+        values, covariance, outlying, psf, sigma = self._summed(scaled, number, weight, precision)
         evidence = peak + np.log(total) - scaled.images.shape[1] * np.log(np.sqrt(2 * np.pi) * flux)
         unit = np.stack([flux, flux, *np.ones((2, len(flux)))], axis=1)
-        found = np.hstack([evidence[:, None], values * unit, strange[:, None], psf, sigma])
+        found = np.hstack([evidence[:, None], values * unit, outlying[:, None], psf, sigma])
         return found, covariance * unit[:, :, None] * unit[:, None, :]
 
     def _asked(
         self, stars: Stars, number: np.ndarray, near: np.ndarray
     ) -> Iterator[tuple[int, Kind, np.ndarray]]:
         """Nodes, kinds of factorisations and the stars that need them."""
-        told = np.stack([number, stars.placed, stars.sky], axis=1)
-        kinds, which = np.unique(told, axis=0, return_inverse=True)
-        for index, (s, placed, sky) in enumerate(kinds.tolist()):
-            kind = Kind(s, bool(placed), bool(sky), stars.centre is not None)
+        known = np.stack([number, stars.positioned, stars.sky], axis=1)
+        kinds, which = np.unique(known, axis=0, return_inverse=True)
+        for index, (s, positioned, sky) in enumerate(kinds.tolist()):
+            kind = Kind(s, bool(positioned), bool(sky), stars.centre is not None)
             (rows,) = (which.ravel() == index).nonzero()
             for k in near[rows].any(axis=0).nonzero()[0].tolist():
                 yield k, kind, rows[near[rows, k]]
@@ -750,7 +750,7 @@ class FieldMixture(Method):
         first, second = np.zeros((count, 4)), np.zeros((count, 4, 4))
         star, square, inside = np.zeros((3, count, pixels))
         total = np.zeros((count, 1))
-        strange = np.zeros(count)
+        outlying = np.zeros(count)
         for k, kind, rows in self._asked(stars, number, weight > 0):
             factor, w = self._factor(k, kind), weight[rows, k, None]
             fit = self._against(k, kind, stars, rows, precision)
@@ -767,24 +767,24 @@ class FieldMixture(Method):
                 change += (1.0 - change.sum(axis=1, keepdims=True)) / pixels
             leading = fit.low - (fit.factor - 1.0)[:, None] * fit.low_mean
             white = np.linalg.solve(factor.whitening, leading[:, -TELLING:].T)
-            strange[rows] += w[:, 0] * np.square(white).sum(axis=0)
+            outlying[rows] += w[:, 0] * np.square(white).sum(axis=0)
             doubt = w * fit.variance[:, None]
             star[rows] += w * one
             square[rows] += w * one**2
             inside[rows] += w * factor.variance + doubt * change**2
             total[rows] += w * flux
             place = self.places[k] if stars.centre is None else stars.centre[rows]
-            told = np.hstack([flux, sky, place + factor.scale[1:] * latent[:, 1:]])
+            measured = np.hstack([flux, sky, place + factor.scale[1:] * latent[:, 1:]])
             with_a = np.hstack([np.ones_like(flux), -factor.scale * pull])
             alone = np.zeros((4, 4))
             alone[1:, 1:] = factor.scale[:, None] * factor.scale * factor.latent_left
-            first[rows] += w * told
-            second[rows] += w[..., None] * (alone + told[:, :, None] * told[:, None, :])
+            first[rows] += w * measured
+            second[rows] += w[..., None] * (alone + measured[:, :, None] * measured[:, None, :])
             second[rows] += doubt[..., None] * with_a[:, :, None] * with_a[:, None, :]
         psf = star / total
         # Of the star as it is: the doubt about its flux is in its pixels.
         sigma = np.sqrt(np.maximum(square + inside - star**2, 0.0)) / np.abs(total)
-        return first, second - first[:, :, None] * first[:, None, :], strange, psf, sigma
+        return first, second - first[:, :, None] * first[:, None, :], outlying, psf, sigma
 
 
 def _parts(rows: np.ndarray) -> list[np.ndarray]:

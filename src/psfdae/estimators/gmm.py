@@ -18,7 +18,7 @@ C_k = (X_kᵀX_k + ν S) / (n_k + ν), X_k the deviations of its stars from thei
 eigenvectors of S this is a diagonal and a matrix of rank n_k; by Woodbury's identity its
 inverse takes matrices of n_k × n_k alone, and no C_k is ever made.
 
-A method that is told where the star stands has two more numbers p in the observed vector,
+A method that is given where the star stands has two more numbers p in the observed vector,
 without noise. Given p, everything above holds again: π_k becomes π_k N(p; p_k, P_k), μ_k
 follows p linearly, and X_k are the deviations that p leaves, with two rows more for what
 the slope of the cluster differs from that of all.
@@ -68,8 +68,8 @@ ROWS = 4096
 """Stars that are turned into other axes at once; all would take as much memory again."""
 
 TELLING, LEADING_ARRAYS = 40, ("axes", "variance", "mean", "deviation", "slope")
-"""Coordinates that tell strange stars, and arrays whose last axis they are. More of them find
-more strange stars that are bright, and fewer that are faint."""
+"""Coordinates that tell outliers, and arrays whose last axis they are. More of them find
+more outliers that are bright, and fewer that are faint."""
 
 FINE = 0.2
 """`STEP` where the density of images counts: an error of s weighs more in it than in their mean."""
@@ -109,7 +109,7 @@ class Gmm(Group):
     place: Positive = Field(
         1.0,
         description="RMS of the field position beside that of the principal components, "
-        "for methods that are told it",
+        "for methods that are given it",
     )
     threads: Count = Field(1, description="Threads of the linear algebra")
 
@@ -193,7 +193,7 @@ class GaussianMixture(Method):
     variance_reference : ndarray, shape (P,), or (0,)
         Variance of the references within clusters.
     whitening : ndarray, shape (q, q)
-        To positions of unit variance within clusters; q = 2 where they are told, else 0.
+        To positions of unit variance within clusters; q = 2 where they are given, else 0.
     center, deviation_center : ndarray, shape (K, q) and (n, q)
         Mean whitened position of each cluster, and each star's deviation from it.
     slope, slope_reference : ndarray, shape (q, P)
@@ -208,7 +208,7 @@ class GaussianMixture(Method):
     """
 
     label, color, marker = "GMM", "#cc79a7", "P"
-    told_level = True
+    needs_level = True
     together, padded = 4096, False
     per_reference = True
     groups: ClassVar = {"gmm": Gmm}
@@ -273,16 +273,16 @@ class GaussianMixture(Method):
                 f"must be at most {learn.size}, the number of training stars"
                 f"{' without those that choose' if searched else ''}"
             )
-        clusters, told, shrinkage = sizes[0], cls.told_position, gmm.shrinkage[0]
+        clusters, positions, shrinkage = sizes[0], cls.needs_position, gmm.shrinkage[0]
         if searched:
-            clusters, told, shrinkage = cls._chosen(data, learn, judge, sizes, gmm)
-        final = cls._clustered(data, data.train[: gmm.stars], clusters, gmm, told)
+            clusters, positions, shrinkage = cls._chosen(data, learn, judge, sizes, gmm)
+        final = cls._clustered(data, data.train[: gmm.stars], clusters, gmm, positions)
         return replace(final, shrinkage=np.array([shrinkage]))
 
     def again(self, data: TrainingSet, gmm: Gmm) -> Self:
         """Fit to other stars, with the K, the ν and the use of the position of this one."""
-        told = bool(self.whitening.any())
-        one = self._clustered(data, data.train[: gmm.stars], len(self.count), gmm, told)
+        positions = bool(self.whitening.any())
+        one = self._clustered(data, data.train[: gmm.stars], len(self.count), gmm, positions)
         return replace(one, shrinkage=self.shrinkage)
 
     @classmethod
@@ -292,45 +292,45 @@ class GaussianMixture(Method):
         """K, whether the position is used, and ν, by the error on the stars that judge."""
         rng = stream(data.seed, "noise", "gmm validation")
         noisy = [data.noise.draw(data.images[judge], level, rng) for level in data.levels]
-        truth, where = data.references[judge], cls._told(data, judge)
+        truth, where = data.references[judge], cls._positions_of(data, judge)
 
         @cache
-        def clustered(k: int, told: bool) -> Self:
-            return cls._clustered(data, learn, k, gmm, told)
+        def clustered(k: int, positions: bool) -> Self:
+            return cls._clustered(data, learn, k, gmm, positions)
 
         @cache
-        def error(k: int, nu: float, told: bool) -> float:
+        def error(k: int, nu: float, positions: bool) -> float:
             """Geometric mean over the noise levels."""
-            tried = replace(clustered(k, told), shrinkage=np.array([nu]))
+            tried = replace(clustered(k, positions), shrinkage=np.array([nu]))
             pairs = zip(noisy, data.levels, strict=True)
             errors = [np.square(tried.predict(z, s, where) - truth).mean() for z, s in pairs]
             return float(np.exp(np.mean(np.log(errors))))
 
-        def search(k: int, nu: float, told: bool) -> tuple[float, int, bool, float]:
+        def search(k: int, nu: float, positions: bool) -> tuple[float, int, bool, float]:
             """Climb to the best ν, to the best K there, and on to the best ν of fewer clusters.
 
             More of them take longer, and want the same ν.
             """
             first = k
-            nu = climbed(gmm.shrinkage, nu, lambda tried: error(k, tried, told))
-            k = climbed(sizes, k, lambda tried: error(tried, nu, told), PAYS)
+            nu = climbed(gmm.shrinkage, nu, lambda tried: error(k, tried, positions))
+            k = climbed(sizes, k, lambda tried: error(tried, nu, positions), PAYS)
             if k < first:
-                nu = climbed(gmm.shrinkage, nu, lambda tried: error(k, tried, told))
-            return error(k, nu, told), k, told, nu
+                nu = climbed(gmm.shrinkage, nu, lambda tried: error(k, tried, positions))
+            return error(k, nu, positions), k, positions, nu
 
-        best = search(sizes[0], gmm.shrinkage[0], cls.told_position)
-        if cls.told_position:
-            # What is told may be left aside, where stars in other places are worse for it.
+        best = search(sizes[0], gmm.shrinkage[0], cls.needs_position)
+        if cls.needs_position:
+            # Positions may be left aside, where stars in other places are worse for it.
             least, k, _, nu = best
             if error(k, nu, False) < WORSE * least:
                 best = min(best, search(k, nu, False))
-        _, k, told, nu = best
+        _, k, positions, nu = best
         tried = [("K", k, [max(sizes)] if k > 1 else [], sizes)]
         tried += [("ν", nu, [min(gmm.shrinkage), max(gmm.shrinkage)], gmm.shrinkage)]
         last = [f"{n} = {v:g}" for n, v, ends, all_ in tried if v in ends and len(all_) > 1]
         print(
             f"{cls.label}: K = {k} clusters, ν = {nu:g}"
-            + (", without positions" if cls.told_position > told else "")
+            + (", without positions" if cls.needs_position > positions else "")
             + (f"; {', '.join(last)}: last that were tried" if last else ""),
             flush=True,
         )
@@ -338,11 +338,11 @@ class GaussianMixture(Method):
 
     @classmethod
     def _clustered(
-        cls, data: TrainingSet, stars: np.ndarray, clusters: int, gmm: Gmm, told: bool
+        cls, data: TrainingSet, stars: np.ndarray, clusters: int, gmm: Gmm, positions: bool
     ) -> Self:
-        """Moments of the clusters of some stars, and how they follow the position if it is told."""
+        """Moments of the clusters of some stars, and how they follow the position if used."""
         same = np.array_equal(data.images[stars], data.references[stars])
-        p = cls._told(data, stars).astype(np.float64) * told
+        p = cls._positions_of(data, stars).astype(np.float64) * positions
         x = data.images[stars].reshape(stars.size, -1).astype(np.float64)
         cluster = _k_means(x, gmm.place * _standard(p), clusters, gmm.principal, data.seed)
         del x  # before it is there in another order
@@ -398,21 +398,21 @@ class GaussianMixture(Method):
         )
 
     @classmethod
-    def _told(cls, data: TrainingSet, stars: np.ndarray) -> np.ndarray:
+    def _positions_of(cls, data: TrainingSet, stars: np.ndarray) -> np.ndarray:
         """Positions of some stars, (n, q)."""
-        return data.positions[stars] if cls.told_position else np.empty((len(stars), 0))
+        return data.positions[stars] if cls.needs_position else np.empty((len(stars), 0))
 
     @classmethod
     def restored(
         cls, arrays: Mapping[str, np.ndarray], config: Mapping[str, Any], reference: str
     ) -> Self:
-        """As of all methods; the noise is that of the configuration."""
+        """As `Method.estimate`; the noise is that of the configuration."""
         noise = NoiseModel(config["noise"]["kappa"], config["noise"]["background_photons"])
         rows = arrays["deviation"].astype(np.float32)
         return cls(**{**arrays, "deviation": rows}, noise=noise)
 
     def pack(self, stamp_px: int, noise: float) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """As of all methods; where the references are the images, clusters by their main axes.
+        """As `Method.pack`; where the references are the images, clusters by their main axes.
 
         Axes with a variance below FLAT of that of the noise are left out.
         """
@@ -449,7 +449,7 @@ class GaussianMixture(Method):
         yield "shrinkage", "a number above 0", self.shrinkage.shape == (1,) and self.shrinkage > 0
 
     def strangeness(self, noisy: np.ndarray, level: np.ndarray) -> np.ndarray:
-        """As of all methods, from the evidence of the leading `TELLING` coordinates.
+        """As `Method.strangeness`, from the evidence of the leading `TELLING` coordinates.
 
         The others hold noise, which is an estimate: their χ² would say that it is wrong.
         """
@@ -470,11 +470,11 @@ class GaussianMixture(Method):
         )
 
     def free_flux(self) -> Self:
-        """As of all methods."""
+        """As that of `Method`."""
         return replace(self, loose=LOOSE)
 
     def flux(self, noisy: np.ndarray, level: np.ndarray) -> np.ndarray:
-        """As of all methods."""
+        """As that of `Method`."""
         flux = self._estimate(noisy, level, None, sure=False).flux
         return super().flux(noisy, level) if flux is None else flux
 

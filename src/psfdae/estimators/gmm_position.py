@@ -1,4 +1,4 @@
-"""The Gaussian mixture that is told where in the field a star stands, as an observer knows."""
+"""The Gaussian mixture that is given where in the field a star stands, as an observer knows."""
 
 from __future__ import annotations
 
@@ -13,5 +13,5 @@ class PlacedMixture(GaussianMixture):
 
     label, color, marker = "GMM", "#882255", "X"
     drawn = False
-    told_position = True
+    needs_position = True
     bundled = False

@@ -1,4 +1,4 @@
-"""The Gaussian mixture of many fresh stars that is told where a star stands."""
+"""The Gaussian mixture of many fresh stars that is given where a star stands."""
 
 from __future__ import annotations
 
@@ -12,5 +12,5 @@ class PlacedSimulatedMixture(SimulatedMixture):
     """A mixture of fresh images, references and positions."""
 
     label, color, marker = "GMM of fresh stars", "#661100", "*"
-    told_position = True
+    needs_position = True
     bundled = False

@@ -2,7 +2,7 @@
 
 ŷ = ȳ + C_yx (C_xx + N)⁻¹ (x − x̄) with the mean and the (cross-)covariance of the
 noise-free training stars and their references, and the noise variance of the
-star's own λ on the diagonal of N, which it is told.
+star's own λ on the diagonal of N, which it is given.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class LinearMmse(Method):
 
     label, color, marker = "linear MMSE", "#009e73", "^"
     drawn = False
-    told_level = True
+    needs_level = True
     stored = False
 
     mean_x: np.ndarray

@@ -113,7 +113,7 @@ class PcaSom(Method):
 
     label, color, marker = "PCA+SOM", "#d55e00", "s"
     paper = ("pca", "PCA")
-    told_level = True
+    needs_level = True
     groups: ClassVar = {"baseline": Baseline}
     rule = kind = "baseline"
     about = "Product of the stage baseline."
@@ -203,7 +203,7 @@ class PcaSom(Method):
 
     @classmethod
     def require(cls, place: Path, stars: Product, config: Any, split: str, reference: str) -> None:
-        """As of all methods; its images must have the stars' size, too."""
+        """As `Method.require`; images must have the stars' size, too."""
         pixels = read_product(place, cls.name, ("mean",))["mean"].shape[-1]
         sides = (isqrt(pixels), stars["realisation"].shape[-1])
         here, there = ({"framing": {"stamp_px": side}} for side in sides)

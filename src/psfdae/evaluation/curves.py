@@ -33,14 +33,14 @@ METRIC_LABELS = {
 
 
 BAYES = {"color": "black", "marker": "o", "label": "posterior mean (Bayes)"}
-"""Look of the posterior mean; its marker is open where the bank is too thin."""
+"""Look of the posterior mean; its marker is open where the bank has too few similar stars."""
 
 MEANS = {
     "bayes": BAYES,
     "bayes_position": {
         "color": "#8c510a",
         "marker": "v",
-        "label": "posterior mean, told the field",
+        "label": "posterior mean, given the field",
     },
 }
 """Looks of both posterior means."""

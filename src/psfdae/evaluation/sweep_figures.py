@@ -24,7 +24,7 @@ LOGARITHMIC_FROM = 5.0
 """Numbers whose largest is this many times the smallest go on a logarithmic scale."""
 
 MOST_LINES = 6
-"""Lines of one panel that can still be told apart."""
+"""Lines of one panel that can still be distinguished."""
 
 FAILED_AT = -0.09
 """Where failed points end on the axis of the metric, below its scale."""

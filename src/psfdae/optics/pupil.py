@@ -180,7 +180,7 @@ def pixel_width(scale_arcsec: float, diameter_m: float, wavelength_m: float) -> 
 
 
 def choose_samples(needed: np.ndarray, ladder: tuple[int, ...]) -> np.ndarray:
-    """Smallest rung of a ladder of grid sizes that serves each wavefront.
+    """Smallest of some grid sizes that serves each wavefront.
 
     Parameters
     ----------
@@ -196,7 +196,7 @@ def choose_samples(needed: np.ndarray, ladder: tuple[int, ...]) -> np.ndarray:
     Raises
     ------
     SamplingError
-        If a wavefront needs more than the last rung; names the N that would do.
+        If a wavefront needs more than the largest; names the N that would do.
     """
     worst = int(needed.max())
     if worst > ladder[-1]:
@@ -206,5 +206,5 @@ def choose_samples(needed: np.ndarray, ladder: tuple[int, ...]) -> np.ndarray:
             f"samples (half a wave per sample, replicas clear of the stamp); "
             f"{int((needed > ladder[-1]).sum())} of {needed.size} wavefronts exceed the last value"
         )
-    rungs = np.asarray(ladder)
-    return rungs[np.searchsorted(rungs, needed)]
+    sizes = np.asarray(ladder)
+    return sizes[np.searchsorted(sizes, needed)]

@@ -75,8 +75,8 @@ def overlapping(position: np.ndarray, side: int) -> float:
     """Part of the stars (n, 2) in whose stamps another one stands."""
     from scipy.spatial import cKDTree
 
-    placed = position[np.isfinite(position).all(axis=1)]
-    if len(placed) < 2:
+    known = position[np.isfinite(position).all(axis=1)]
+    if len(known) < 2:
         return 0.0
-    distance, _ = cKDTree(placed).query(placed, k=2, p=np.inf)
+    distance, _ = cKDTree(known).query(known, k=2, p=np.inf)
     return float((distance[:, 1] < 0.5 * side).mean())

@@ -152,7 +152,7 @@ class BundleInfo(_Described):
         if sorted(given) != sorted(wanted) or any(getattr(self, key) is None for key in wanted):
             raise ValueError(f"format {self.format_version} has {' and '.join(wanted)}")
         if not (self.dae or (self.kappa > 0 and isfinite(self.kappa))):
-            raise ValueError("config.train.noise.kappa: must be above 0, methods are told λ by it")
+            raise ValueError("config.train.noise.kappa: must be above 0, methods are given λ by it")
         return self
 
     @property
@@ -161,7 +161,7 @@ class BundleInfo(_Described):
         try:
             return float(self.config["train"]["noise"]["kappa"])
         except (LookupError, TypeError, ValueError):
-            return 1.0 if self.dae else 0.0  # the network is told no λ
+            return 1.0 if self.dae else 0.0  # the network is given no λ
 
     @property
     def scale_assumed(self) -> bool:

@@ -342,7 +342,7 @@ def _as_identifiers(column: Any) -> np.ndarray:
 def read_catalogue(path: Path) -> Catalogue:
     """Read a star catalogue.
 
-    The format is told from the content: a FITS file, of which the LDAC_OBJECTS or
+    The format follows from the content: a FITS file, of which the LDAC_OBJECTS or
     the only table is taken; ECSV; the ASCII_HEAD format of SExtractor; or a text
     table with a line of column names, separated by commas, semicolons, tabs or
     blanks. Lines that begin with # are comments.

@@ -54,8 +54,8 @@ class Sky:
         x, y, flux = (
             np.atleast_1d(v) for v in (found.x_centroid, found.y_centroid, found.segment_flux)
         )
-        placed = np.isfinite(x) & np.isfinite(y)
-        x, y, flux = x[placed], y[placed], flux[placed]
+        finite = np.isfinite(x) & np.isfinite(y)
+        x, y, flux = x[finite], y[finite], flux[finite]
         height, width = self.level.shape
         row, column = (
             np.clip(np.rint(v), 0, n - 1).astype(int) for v, n in ((y, height), (x, width))

@@ -7,7 +7,7 @@ header is checked before astropy sees it.
 
 The decoders of tile-compressed images (.fz) are compiled code of CFITSIO and trust parts
 of the file. Those of RICE and GZIP check the length of what they read and write; that of
-HCOMPRESS is told the size of its buffer in bytes where it counts pixels (astropy 8.0,
+HCOMPRESS is given the size of its buffer in bytes where it counts pixels (astropy 8.0,
 `decompress_hcompress_1_c`) and that of PLIO takes the length of its input from the input,
 so that one wrong byte writes or reads outside the memory of the tile. Files with these
 two are refused; funpack of CFITSIO makes plain ones of them.
@@ -171,7 +171,7 @@ def _unpacked(path: Path, content: IO[bytes]) -> PlainFile:
 def open_hdus(file: PlainFile, **options: Any) -> Iterator[Any]:
     """The file's `astropy.io.fits.HDUList` with all headers read; `options` are those of `open`.
 
-    Belongs inside `reading`: only headers that are too long or too many are told here.
+    Belongs inside `reading`: only headers that are too long or too many are refused here.
     """
     from astropy.io import fits
 

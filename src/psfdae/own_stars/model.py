@@ -353,9 +353,11 @@ class Engine:
             unlike_sky = np.abs(start - stars.background) > SKY_SIGMA * border_scatter(stamps)
             raise_flag(flags, StarFlag.SKY_OFF, unlike_sky)
         found = self._photometer.measure(stamps, bad, start, stars)
-        told: dict[str, np.ndarray] = {}
+        of_star: dict[str, np.ndarray] = {}
         if self.estimator.measures:
-            estimate, found, told = self._measured(stars, stamps, bad, shift, start, exact, found)
+            estimate, found, of_star = self._measured(
+                stars, stamps, bad, shift, start, exact, found
+            )
             psf, sigma = estimate.psf, estimate.sigma
             lost = (found.flags & StarFlag.NO_FLUX) > 0
         else:
@@ -410,7 +412,7 @@ class Engine:
             shift_x=shift[:, 1],
             shift_y=shift[:, 0],
             flags=flags,
-            **(told or unmeasured(len(stars))),
+            **(of_star or unmeasured(len(stars))),
         )
 
     def _doubts(
@@ -478,17 +480,17 @@ class Engine:
             flux=stars.flux,
             sky=stars.background - start,
         )
-        told = estimate.measured
-        assert told is not None and estimate.sigma is not None
-        error = np.sqrt(told.covariance[:, 0, 0])
-        flux = np.where(given, stars.flux, told.flux)
+        own = estimate.measured
+        assert own is not None and estimate.sigma is not None
+        error = np.sqrt(own.covariance[:, 0, 0])
+        flux = np.where(given, stars.flux, own.flux)
         lost = nothing | np.where(given, unseen, ~(flux > error))
         flags = found.flags & np.uint16(StarFlag.MASKED | StarFlag.OUTLIER)
         raise_flag(flags, StarFlag.NO_FLUX, lost)
         raise_flag(flags, StarFlag.FAINT, ~given & ~lost & (flux < FAINT_SNR * error))
-        sky = start + told.background
+        sky = start + own.background
         unit = np.where(lost, 1.0, flux)[:, None, None]
-        images = (data - told.background[:, None, None]) / unit
+        images = (data - own.background[:, None, None]) / unit
         better = replace(
             found,
             flux=np.where(nothing, np.nan, flux),
@@ -500,7 +502,7 @@ class Engine:
         # The pixel at the middle of the stamp as it was given, in the image if that is known.
         middle = np.stack([stars.y, stars.x], axis=1) - stars.listed
         middle = np.where(np.isfinite(middle), middle, stars.data.shape[-1] // 2)
-        measured = measured_of(middle + shift + told.centre, told.covariance)
+        measured = measured_of(middle + shift + own.centre, own.covariance)
         estimate.psf[lost] = estimate.sigma[lost] = np.nan
         return estimate, better, {k: np.where(lost, np.nan, v) for k, v in measured.items()}
 
@@ -517,7 +519,7 @@ class Engine:
             return np.full_like(found.images, np.nan), None, found
         mean = self.bundle.flux_model.mean.reshape(found.images.shape[1:])
 
-        def told() -> tuple[np.ndarray, np.ndarray]:
+        def current() -> tuple[np.ndarray, np.ndarray]:
             images = found.images
             if lost.any():
                 images = np.where(lost[:, None, None], mean, images).astype(images.dtype)
@@ -526,11 +528,11 @@ class Engine:
 
         free = free & ~lost
         if free.any() and self.free_flux is not self.estimator:
-            images, noise = told()
+            images, noise = current()
             flux = self.free_flux.flux(images, np.hypot(noise, info.misfit) / info.kappa)
             free &= np.isfinite(flux)  # a damaged model may find none
             found = found.with_flux(np.where(free, np.clip(flux, *FLUX_FACTOR), 1.0))
-        images, noise = told()
+        images, noise = current()
         estimate = self.estimator.estimate(images, noise / info.kappa)
         for array in (estimate.psf, estimate.sigma):
             if array is not None:

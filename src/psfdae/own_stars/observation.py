@@ -298,10 +298,10 @@ def _check_overlap(image: ImageFile, table: Catalogue, positions: np.ndarray) ->
     if found:
         return
     with np.errstate(all="ignore"):
-        placed = positions[np.isfinite(positions).all(axis=1)]
+        known = positions[np.isfinite(positions).all(axis=1)]
         ranges = "nowhere in its projection"
-        if len(placed):
-            (x0, y0), (x1, y1) = placed.min(axis=0), placed.max(axis=0)
+        if len(known):
+            (x0, y0), (x1, y1) = known.min(axis=0), known.max(axis=0)
             ranges = f"at x {x0:.6g} … {x1:.6g}, y {y0:.6g} … {y1:.6g}"
     raise ObservationError(
         table.path,
@@ -469,13 +469,13 @@ class Observation:
         said = f"{self.path}: {', '.join(words)}"
         if empty := self._layers.empty:
             said += f"\n{self._layers.noise.path}: weight 0, bad pixels: {empty}"  # type: ignore
-        lost = self.unplaced()
+        lost = self.without_position()
         if lost.any():
             rows = shorten([str(row + 1) for row in np.flatnonzero(lost)])
             said += f"\n{self.catalogue}: no position in row {rows}: flagged, and not learnt from"
         return said
 
-    def unplaced(self) -> np.ndarray:
+    def without_position(self) -> np.ndarray:
         """Which stars have no position though the list has others, bool, shape (n,)."""
         if self.positions is None or self.found is not None:
             return np.zeros(self.count, dtype=bool)
@@ -490,10 +490,10 @@ class Observation:
 
         if self.shape is None or self.catalogue is None:
             return
-        placed = np.flatnonzero(np.isfinite(self.positions).all(axis=1))
-        pairs = cKDTree(self.positions[placed]).query_pairs(SAME_PX, output_type="ndarray")
+        known = np.flatnonzero(np.isfinite(self.positions).all(axis=1))
+        pairs = cKDTree(self.positions[known]).query_pairs(SAME_PX, output_type="ndarray")
         if len(pairs):
-            one, other = placed[pairs[np.lexsort(pairs.T[::-1])[0]]] + 1
+            one, other = known[pairs[np.lexsort(pairs.T[::-1])[0]]] + 1
             raise ObservationError(
                 self.catalogue,
                 f"rows {one} and {other} are the same star; {len(pairs)} such pairs in all",
@@ -501,10 +501,10 @@ class Observation:
         sky = self._layers.sky()
         with reading(self.path):
             seen = int(sky.covered(*central_pixel(self.positions.T), SEEN).sum())
-        if seen < 0.5 * placed.size:
+        if seen < 0.5 * known.size:
             raise ObservationError(
                 self.catalogue,
-                f"{seen} of {placed.size} positions are on a source of {self.path}, at least half "
+                f"{seen} of {known.size} positions are on a source of {self.path}, at least half "
                 "are expected: a list of another image, or with stars too faint for this one?",
             )
 

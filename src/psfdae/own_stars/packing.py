@@ -54,7 +54,7 @@ COMPONENTS = 48  # leading eigenvectors that a bundle stores
 COVERAGE = 0.6827  # part of the errors within ± `error68`; of a normal variable within ± 1 σ
 WIDE = 0.95  # part of them within ± `error68` times `ratio95`
 LEAST_SIGMA = 1e-12  # of the flux; equal stars leave a method no doubt
-# What is told of stars: their flux and sky, their sky, or neither.
+# What is known of stars: their flux and sky, their sky, or neither.
 CASES = ({"flux": 1.0, "background": 0.0}, {"background": 0.0}, {})
 NORMAL_WIDE = 1.96  # σ within which a normal variable has as much
 LIMIT = 0.999  # part of the test stars within the limit of the Mahalanobis distance
@@ -338,28 +338,28 @@ def with_scales(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -
     info = bundle.info.model_copy(update={"misfit": misfit(bundle, stars, rng)})
     bundle = replace(bundle, info=info)
     model, nodes = PsfModel(bundle), bundle.noise_nodes
-    shape = 2, len(CASES)  # the noise is told, or it is not
+    shape = 2, len(CASES)  # the noise is known, or estimated
     noise = np.tile(nodes, (*shape, 1))
     width, of_flux = np.ones((2, *shape, 2, len(nodes))), np.ones(len(nodes))
     for place, node in enumerate(nodes):
         noisy, star = _noisy(stars, node, rng)
         for estimated, case in np.ndindex(shape):
             known = CASES[case] if estimated else {"noise": node, **CASES[case]}
-            told = model.predict(noisy, position=stars.position[star], **known)
-            usable = np.isfinite(told.psf).all(axis=(1, 2))
+            found = model.predict(noisy, position=stars.position[star], **known)
+            usable = np.isfinite(found.psf).all(axis=(1, 2))
             if not usable.any():
                 continue
-            noise[estimated, case, place] = np.median((told.noise / told.flux)[usable])
-            error = np.abs(told.psf - stars.references[star])[usable]
-            error /= np.maximum(told.uncertainty[usable], LEAST_SIGMA)
-            wide = error / told.ratio95[usable, None, None]
-            bright = brightest(told.psf[usable])
+            noise[estimated, case, place] = np.median((found.noise / found.flux)[usable])
+            error = np.abs(found.psf - stars.references[star])[usable]
+            error /= np.maximum(found.uncertainty[usable], LEAST_SIGMA)
+            wide = error / found.ratio95[usable, None, None]
+            bright = brightest(found.psf[usable])
             for pixels, kind in ((~bright, 0), (bright, 1)):
                 width[0, estimated, case, kind, place] = np.quantile(error[pixels], COVERAGE)
                 width[1, estimated, case, kind, place] = np.quantile(wide[pixels], WIDE)
             # A method that measures stars knows how sure it is of their flux.
             if estimated and not known and not model.engine.estimator.measures:
-                scatter = np.abs(told.flux - 1.0)[usable] / told.flux_error[usable]
+                scatter = np.abs(found.flux - 1.0)[usable] / found.flux_error[usable]
                 of_flux[place] = np.quantile(scatter, WIDE) / NORMAL_WIDE
     # Where a star has light that the photometry does not know, its noise is found too large.
     noise = np.maximum.accumulate(noise, axis=-1)
@@ -388,10 +388,10 @@ def misfit(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -> flo
         model = PsfModel(replace(bundle, info=bundle.info.model_copy(update={"misfit": value})))
         if model.engine.free_flux is model.engine.estimator or model.engine.estimator.measures:
             break
-        told = [(model.predict(images), stars.references[star]) for images, star in noisy]
+        found = [(model.predict(images), stars.references[star]) for images, star in noisy]
         logs = [
             np.log(np.nanmean(np.square(t.psf / t.flux[:, None, None] - truth)))
-            for t, truth in told
+            for t, truth in found
         ]
         errors.append(float(np.mean(logs)))
         if errors[-1] > min(errors):

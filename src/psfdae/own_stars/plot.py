@@ -119,7 +119,7 @@ def _whiskers(axes: Axes, stars: FieldStars, drawn: np.ndarray, cell: float) -> 
     from matplotlib.collections import LineCollection
 
     if not drawn.size:
-        axes.text(0.5, 0.5, "no star without complaint", ha="center", transform=axes.transAxes)
+        axes.text(0.5, 0.5, "no unflagged star", ha="center", transform=axes.transAxes)
         return None
     per_ellipticity = 2.0 * cell
     angle = np.deg2rad(stars.position_angle_deg[drawn])

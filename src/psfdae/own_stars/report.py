@@ -130,7 +130,7 @@ class Quality:
     coverage : dict
         Part of the errors within ± the stated 68 % by S/N.
     faint : dict
-        By S/N the held-out stars made faint, (n, d, d) each: `truth`, `model` and `MEAN_PSF`.
+        By S/N the held-out stars degraded, (n, d, d) each: `truth`, `model` and `MEAN_PSF`.
     stars : dict
         Columns of the prediction of all N stars, (N,) each, and `verdict` and `part` of
         `selection.csv`.
@@ -193,7 +193,7 @@ def quality_page(q: Quality) -> str:
     parts = [
         f"<h1>{escape(q.name)}</h1><p class=lead>{escape(lead)}.</p>",
         _checks(q),
-        "<h2>Errors on stars that no training saw, made faint</h2>",
+        "<h2>Errors on stars that no training saw, degraded to low S/N</h2>",
         _errors_table(q),
         _picture(errors_figure(q)),
         _png(q.strip),
@@ -419,7 +419,7 @@ def _left_out(q: Quality) -> str:
     rows = [(escape(v), str(n)) for v in Verdict if (n := int((verdicts == v).sum()))]
     marked = [(f.name or "", str(n)) for f in StarFlag if (n := int(((flags & int(f)) > 0).sum()))]
     return (
-        _table(("good to learn from, or why not", "stars"), rows)
+        _table(("used for training, or why not", "stars"), rows)
         + "<p>Flags of the model on all stars of the list:</p>"
         + _table(("flag", "stars"), [*marked, ("none", str(int((flags == 0).sum())))])
     )

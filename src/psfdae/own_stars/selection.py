@@ -47,7 +47,7 @@ class Verdict(StrEnum):
     """Why a star is not used; the first reason that applies."""
 
     GOOD = "good"
-    UNPLACED = "no position"
+    NO_POSITION = "no position"
     INCOMPLETE = "incomplete"  # pixels off the image, masked or not finite
     SATURATED = "saturated"
     BLENDED = "blended"  # by the star list
@@ -153,7 +153,7 @@ def collect(observation: Observation, settings: CalibrationStars, framing: Frami
         verdict[flat & (verdict == Verdict.GOOD)] = Verdict.SATURATED
     close = crowded(found["position"], snr * noise, settings.isolation_px, settings.neighbour_ratio)
     verdict[close & (verdict == Verdict.GOOD)] = Verdict.CROWDED
-    verdict[observation.unplaced()] = Verdict.UNPLACED
+    verdict[observation.without_position()] = Verdict.NO_POSITION
     wide, peak, listed = (np.concatenate([k[i] for k in kept]) for i in range(3))
     wide = np.maximum(wide, -DEFECT * noise[row, None, None])
     flux = cut(wide, side, peak).sum(axis=(1, 2))
@@ -285,9 +285,9 @@ def crowded(
     """
     from scipy.spatial import cKDTree
 
-    placed = np.flatnonzero(np.isfinite(position).all(axis=1))
+    known = np.flatnonzero(np.isfinite(position).all(axis=1))
     out = np.zeros(len(position), dtype=bool)
-    pairs = placed[cKDTree(position[placed]).query_pairs(distance_px, output_type="ndarray")]
+    pairs = known[cKDTree(position[known]).query_pairs(distance_px, output_type="ndarray")]
     for one, other in ((pairs[:, 0], pairs[:, 1]), (pairs[:, 1], pairs[:, 0])):
         out[one[brightness[other] >= ratio * brightness[one]]] = True
     return out

@@ -166,8 +166,8 @@ def make_images(
         who, wide = star[rows], stars.wide[star[rows]]
         wide[subpixel[rows]] = moved(wide[subpixel[rows]], phase[rows][subpixel[rows]])
         offset = brightest_pixels(wide, reach)[0] - jitter[rows]
-        placed = moved(template[who], stars.centre[who] + phase[rows])
-        for source, target in ((wide, realisations), (placed, templates)):
+        shifted = moved(template[who], stars.centre[who] + phase[rows])
+        for source, target in ((wide, realisations), (shifted, templates)):
             stamp = cut(source, side, offset)
             target[rows] = stamp / stamp.sum(axis=(1, 2), keepdims=True)
     return realisations, templates, jitter, phase

@@ -350,24 +350,24 @@ def _over_bank(
     """Posterior means over a bank, how they change with its size, and better ones.
 
     In a single field the larger bank is needed, and in a moment weighed. Stars for which a bank
-    is too thin get importance samples around their own matches.
+    has too few similar stars get importance samples around their own matches.
     """
     stars = tables.stars
     for level in config.noise.levels:
         start = time.monotonic()
         likelihood = Likelihood.of(noise_model(config), level, bank.stamps((bank.margin,) * 2))
-        over_banks, thin = {}, np.zeros(stars.star.size, bool)
+        over_banks, sparse = {}, np.zeros(stars.star.size, bool)
         for method, given in POSTERIOR_MEANS.items():
             draws = larger if given else bank
             sizes = _weighed(draws, given, static, stars, level, likelihood)
             _grown(tables, method, level, sizes)
             over_banks[method] = max(sizes), Estimates.over_bank(sizes)
-            thin |= over_banks[method][1].ess < ENOUGH_ESS
-        few, sampled = np.flatnonzero(thin), {}
+            sparse |= over_banks[method][1].ess < ENOUGH_ESS
+        few, sampled = np.flatnonzero(sparse), {}
         if few.size:
             some = stars.take(few)
             found = _samples(config, bank, drawn["seidel"], product, some, level, likelihood)
-            sums = ((found.free, found.free_helped), (found.told, found.told_helped))
+            sums = ((found.free, found.free_helped), (found.in_field, found.in_field_helped))
             for method, (parts, helped) in zip(POSTERIOR_MEANS, sums, strict=True):
                 sampled[method] = Estimates.over_samples(parts, helped, static, some)
         for method, (draws, over_bank) in over_banks.items():
@@ -526,8 +526,8 @@ def _weighed(
     """`_measures` of the posterior mean over a bank, with the field given or not, by its size.
 
     Every part of the bank has as many draws of every group, and those that are counted are
-    the draws in all fields. A bank that is hopelessly thin for its noise level is left after a
-    quarter.
+    the draws in all fields. A bank in which far too few stars are similar at its noise level is
+    left after a quarter.
     """
     groups = _in_the_field(stars, bank) if given else _anywhere(stars, bank)
     pieces = segments(min(draws.size for _, draws in groups))
@@ -539,7 +539,7 @@ def _weighed(
             [
                 posterior_sums(
                     *(bank.take(cut), few.noisy[level], like),
-                    told=few.field if given else None,
+                    own_field=few.field if given else None,
                 )
                 for cut in cuts[first:end]
             ]
@@ -573,8 +573,8 @@ def _exact(config: Config, static: np.ndarray, tables: Tables) -> None:
     stars = tables.stars
     for level in config.noise.levels:
         likelihood = Likelihood.of(noise_model(config), level, static[:, static.shape[1] // 2])
-        for method, told in POSTERIOR_MEANS.items():
-            known = stars.field if told else None
+        for method, given_field in POSTERIOR_MEANS.items():
+            known = stars.field if given_field else None
             mean, variance, probability = exact_posterior(
                 stars.noisy[level], static, likelihood, known
             )
@@ -582,7 +582,7 @@ def _exact(config: Config, static: np.ndarray, tables: Tables) -> None:
             if error.mean() < NEGLIGIBLE_MSE:
                 error, variance = np.zeros_like(error), np.zeros_like(error)
             values = {"mse": error, "variance": variance}
-            if not told:
+            if not given_field:
                 values["p_right"] = probability[np.arange(stars.field.size), stars.field]
             score = calibration(error, variance, stars.field)
             tables.add("realisation", method, level, values, True, "sum", calibration=score)
@@ -600,7 +600,7 @@ def efficiency(
     """Compare methods with the bounds; PARTS are the evaluations' Parquet files.
 
     They are paired by star; the methods' errors are those of the bounded stars alone.
-    Methods that are told the star's field have a posterior mean of their own; all are
+    Methods that are given the star's field have a posterior mean of their own; all are
     compared with the floor, and so are the posterior means. An efficiency is given for the
     floor and where the posterior mean is tight; the verdict is `beaten` if a method's error
     is below such a bound by more than two standard errors of the difference and 5 % of the
@@ -642,7 +642,7 @@ def _column(
         for method, errors in methods.groupby("method", sort=False):
             if bound != "floor" and (
                 method in POSTERIOR_MEANS
-                or POSTERIOR_MEANS[bound] != method_named(method).told_position
+                or POSTERIOR_MEANS[bound] != method_named(method).needs_position
             ):
                 continue
             paired = limits.merge(errors, on="star", suffixes=("_bound", ""), validate="1:1")

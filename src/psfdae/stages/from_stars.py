@@ -99,7 +99,7 @@ def from_stars(
     """Train a model on the bright stars of IMAGE.
 
     IMAGE is a FITS image with --catalogue or --detect, or a FITS cube of stamps. Some stars choose
-    the method of the model; others are held out and made faint to test it.
+    the method of the model; others are held out and degraded to low S/N to test it.
     """
     job = dict(locals())
     stem = _stem(image, name)
@@ -155,7 +155,7 @@ def _methods(
 ) -> tuple[Any, tuple[type[Method], ...], list[type[Method]]]:
     """Settings whose methods are those that are measured; the fits, and who may be the model."""
     # Those that are given a place on the grid of a simulation know none of an image.
-    names = [n for n in settings.methods if method(n).bundled or not method(n).told_position]
+    names = [n for n in settings.methods if method(n).bundled or not method(n).needs_position]
     if taken is not None:
         names = [n for n in names if not method(n).stored and n != taken] + [method(taken).name]
     kinds = tuple(kind for kind in map(method, names) if kind.stored)
