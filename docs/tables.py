@@ -128,7 +128,7 @@ def _new(name, words, where, by, text, line, old):
 
 def _written(text, row):
     """An f-string over the columns of a row; what is not there stays empty."""
-    return re.sub(r"\bnan( %)?", "", eval(f'f"""{text}"""', globals() | row))
+    return re.sub(r"\+?\bnan( ± nan| %)?", "", eval(f'f"""{text}"""', globals() | row))
 
 
 def csv(name):
@@ -322,24 +322,12 @@ def costs():
 
 
 def errors(name="tables/psf_metrics.csv"):
-    """MSE of every method with its scatter between seeds (`…_sd`), and the best of a row."""
+    """MSE of every method, with its scatter between seeds (`…_sd`)."""
     keys = ["dataset", "split", "reference", "noise_level"]
     rows = with_seed_stderr(csv(name).query("metric == 'mse'"), seed_scatter())
     mse, sd = (rows.pivot(index=keys, columns="method", values=v) for v in ("value", "seed_stderr"))
-    best = [_best(mse.loc[key], sd.loc[key]) for key in mse.index]
-    table = mse.assign(best=best).join(sd.add_suffix("_sd")).reset_index()
+    table = mse.join(sd.add_suffix("_sd")).reset_index()
     return table.sort_values(keys, ascending=[True, False, True, True])
-
-
-def _best(mse, sd):
-    """The method that errs least, or all that do so within the scatter between seeds."""
-    least = mse.idxmin()
-    allowed = SIGNIFICANT * np.hypot(sd, sd[least]).drop(least)
-    equal = [least, *mse.drop(least).index[mse.drop(least) - mse[least] <= allowed]]
-    names = ", ".join(method(name).label for name in equal)
-    if len(equal) > 1:
-        return f"equal within the scatter: {names}"
-    return names + ", scatter not measured" * bool(allowed.isna().any())
 
 
 def readings():
@@ -361,19 +349,20 @@ def fit():
     return {row.quantity: row for row in csv("calibration/fit.csv").itertuples()}
 
 
-def bounds(method="bayes"):
-    """Least possible errors of one posterior mean, what it rests on, and the floor."""
-    rows = csv("tables/psf_bounds.csv").query("metric == 'mse'").sort_values(CELL)
+def posterior_means():
+    """Both posterior means of every noise level, and what they rest on."""
+    rows = csv("tables/psf_bounds.csv").query("metric == 'mse' and method != 'floor'")
     # A record made before these columns leaves them empty.
     since = ["variance", "calibration", "ess_low", "undetected", "missing", "missing_stars"]
-    rows = rows.reindex(columns=[*dict.fromkeys([*rows, *since])])
-    floor = rows.query("method == 'floor'")[[*CELL, "value"]]
-    return rows.query("method == @method").merge(floor, "left", CELL, suffixes=("", "_floor"))
+    return rows.reindex(columns=[*dict.fromkeys([*rows, *since])]).sort_values(CELL)
 
 
-def unbounded():
-    """Posterior means that some stars do not have."""
-    return pd.concat([bounds(), bounds("bayes_position")]).query("missing > 0")
+def bounds():
+    """The posterior mean, the one that is given the field (`…_given`), and the floor."""
+    means = dict(list(posterior_means().groupby("method")))
+    table = means["bayes"].merge(means["bayes_position"], "left", CELL, suffixes=("", "_given"))
+    floor = csv("tables/psf_bounds.csv").query("metric == 'mse' and method == 'floor'")
+    return table.merge(floor[[*CELL, "value"]], "left", CELL, suffixes=("", "_floor"))
 
 
 def efficiency():
@@ -383,8 +372,8 @@ def efficiency():
         f"({row.efficiency:.1g})" if row.bound == "floor" else f"{row.efficiency:.2g}"
         for row in rows.itertuples()
     ]
-    table = rows.assign(cell=cells).groupby([*CELL, "method"]).cell.agg(" ".join).unstack()
-    return bounds()[CELL].merge(table.reset_index(), "left", CELL)
+    table = rows.assign(cell=cells).groupby([*CELL, "method"]).cell.agg(" ".join)
+    return table.unstack(fill_value="").reset_index()
 
 
 def uniform():
