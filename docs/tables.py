@@ -32,7 +32,6 @@ from psfdae.alignment import methods as scene3
 from psfdae.configuration.compose import compose
 from psfdae.estimators import method
 from psfdae.evaluation.comparison import FITTED, SIGNIFICANT, seed_scatter, with_seed_stderr
-from psfdae.own_stars.bundle import SHIPPED
 
 ROOT = Path(__file__).resolve().parents[1]
 REFERENCE = ROOT / "results/reference"
@@ -204,15 +203,14 @@ def poppy(name):
     """Errors on POPPY's stars, with the labels of the methods, which end the bundles' names."""
     table = csv(name)
     ends = table.bundle.str.extract(r"-realisation-(\w+)$", expand=False).fillna(table.method)
-    before = table.bundle.eq(SHIPPED).map({True: ", in the package before", False: ""})
-    return table.assign(label=[method(m).label for m in ends] + before)
+    return table.assign(label=[method(m).label for m in ends])
 
 
 def coverage():
     """Part of the pixels within the uncertainty, by model, S/N and brightness of the pixel."""
-    if not (REFERENCE / "tables/predict_coverage.csv").is_file():
-        return pd.DataFrame()  # a record of before
     keys = ["bundle", "method", "noise_level", "snr", "stars"]
+    if not (REFERENCE / "tables/predict_coverage.csv").is_file():
+        return pd.DataFrame(columns=keys)  # a record made before this table
     wide = poppy("tables/predict_coverage.csv").pivot(
         index=[*keys, "label"], columns="pixels", values=["coverage68", "coverage95"]
     )
@@ -220,24 +218,11 @@ def coverage():
     return wide.reset_index().sort_values(["bundle", "noise_level"])
 
 
-def strange():
-    """Stars found by either measure, by kind and noise level."""
+def outliers():
+    """Outliers found by either measure, by kind and noise level."""
     table = csv("tables/predict_strange.csv").query("kind != 'usual'")
     wide = table.pivot_table("found", ["kind", "noise_level"], "measure", sort=False)
     return wide.reset_index()
-
-
-def rules():
-    """What the jobs of each rule took together; scene 3 job by job."""
-    table = csv("runtime.csv")
-    small = table.rule.eq("alignment") & table.wildcards.str.contains("figure|table|time|telesc")
-    own = table.rule.eq("alignment") & ~small
-    rule = table.rule.where(~own, "scene 3: " + table.wildcards.str.replace("_", " "))
-    grouped = table.assign(jobs=1).groupby(rule.where(~small, "scene 3: tables, figures"))
-    table = grouped.agg({"jobs": "sum", "wall_s": "sum", "cpu_s": "sum", "peak_mb": "max"})
-    table.loc["together"] = table.sum()
-    table.loc["together", "peak_mb"] = table.peak_mb[:-1].max()
-    return table.rename_axis("rule").reset_index().sort_values("cpu_s", ascending=False)
 
 
 def sweep(name):
