@@ -236,7 +236,7 @@ def real_sky():
     """Errors on a real image in 1e-5 by S/N: ours, and each package's at its best setting.
 
     Those of the packages are with the centre fitted and averaged, as are the ratios of psfdae's to
-    the least of them and the settings that won. Fluxes are those of the fitted centre.
+    the least of them. Fluxes are those of the fitted centre.
     """
     rows = []
     for _, cell in csv(REAL_SKY).groupby("snr"):
@@ -246,21 +246,10 @@ def real_sky():
         for centre, group in others.groupby("centre"):
             for peer in group.loc[group.groupby("package").mse.idxmin()].to_dict("records"):
                 row[f"{peer['package']}_{centre}"] = _in_1e5(peer)
-                row[f"{peer['package']}_{centre}_setting"] = _setting(peer)
             least = group.loc[group.mse.idxmin()]
             row[f"over_{centre}"] = f"{least.ratio:.2f} ± {least.ratio_stderr:.2f}"
         rows.append(row)
     return pd.DataFrame(rows)
-
-
-def real_sky_settings():
-    """Errors on a real image in 1e-5 of every package and setting, a column for every S/N."""
-    table = csv(REAL_SKY).sort_values(["package", "sampling_px", "order", "centre"])
-    table["cell"] = [_in_1e5(row) for row in table.to_dict("records")]
-    keys = ["package", "version", "sampling_px", "order", "centre", "fit_cpu_s"]
-    wide = table.pivot(index=keys, columns="snr", values="cell").add_prefix("snr").reset_index()
-    about = [_setting(row) for row in wide.to_dict("records")]
-    return wide.assign(label=wide.package.map(SKY_PACKAGES), setting=about)
 
 
 def real_sky_packages():
@@ -279,14 +268,6 @@ def real_sky_packages():
 
 def _in_1e5(row):
     return f"{1e5 * row['mse']:.2f} ± {1e5 * row['stderr']:.2f}"
-
-
-def _setting(row):
-    """Sampling and order, of a package that has them."""
-    if np.isnan(row["sampling_px"]):
-        return ""
-    order = "" if np.isnan(row["order"]) else f", order {row['order']:.0f}"
-    return f"{row['sampling_px']:g} px{order}"
 
 
 def seeds():
