@@ -420,10 +420,23 @@ def flux():
 
 
 def own_stars():
-    """MSE of bright stars made faint, by S/N and method."""
+    """MSE of bright stars degraded to low S/N, by S/N and method."""
     rows = csv("tables/from_stars.csv")
     cells = [f"{row.mse:.2e} ± {row.mse_stderr:.0e}" for row in rows.itertuples()]
     return rows.assign(cell=cells).pivot(index="snr", columns="method", values="cell").reset_index()
+
+
+def over_mean_psf():
+    """MSE of bright stars degraded to low S/N over that of one mean PSF, by S/N and method."""
+    table = csv("tables/from_stars.csv").pivot(index="snr", columns="method", values="mse")
+    return table.div(table.mean_psf, axis=0).reset_index()
+
+
+def over_lmmse():
+    """MSE over that of linear MMSE, split random, reference realisation."""
+    table = errors().query("split == 'random' and reference == 'realisation'")
+    methods = ["pca_som", "dae", "gmm", "gmm_position"]
+    return table[["dataset", "noise_level"]].join(table[methods].div(table.lmmse, axis=0))
 
 
 def main():
