@@ -19,7 +19,6 @@ from __future__ import annotations
 import ast
 import json
 import re
-import subprocess
 import sys
 from functools import cache
 from pathlib import Path
@@ -44,7 +43,7 @@ MARK = re.compile(
 HEAD = re.compile(r"\|.*\n\|[-|]+\n")
 
 ALIGNERS = {m.name: m.label for m in scene3.METHODS.values() if m.name != "cramer_rao_pooled"}
-SCENES = {"seidel": "scene 1", "turbulence": "scene 2", "all": "any"}
+SCENES = {"seidel": "scene 1", "turbulence": "scene 2"}
 PROPAGATORS = {
     "kernel": "our kernel",
     "fft": "zero-padded FFT",
@@ -184,16 +183,6 @@ def packages():
     return pd.DataFrame(found.items(), columns=["name", "about"])
 
 
-def rulegraph(target):
-    """Rules that a target needs, as Snakemake draws them, by name and without its colours."""
-    line = [sys.executable, "-m", "snakemake", "--nolock", "--rulegraph", "mermaid-js", target]
-    drawn = subprocess.run(line, cwd=ROOT, check=True, capture_output=True, text=True).stdout
-    rule = dict(re.findall(r"^\t(id\d+)\[(\w+)\]$", drawn, re.M))
-    edges = re.findall(r"^\t(id\d+) --> (id\d+)$", drawn, re.M)
-    arrows = sorted(f"    {rule[start]} --> {rule[end]}" for start, end in edges)
-    return "\n".join(["```mermaid", "flowchart LR", *arrows, "```"])
-
-
 def run():
     """How and where the run of record was made."""
     return _names(json.loads(file("provenance.json")))
@@ -279,7 +268,7 @@ def seeds():
 def costs():
     """CPU time of each method's fit, and stars per second at its slowest noise level."""
     name = "tables/benchmark_methods.csv"
-    # A record of before has several seeds in a table of its own.
+    # An older record has several seeds in a table of its own.
     name = name if (REFERENCE / name).is_file() else "tables/seeds_dataset3.csv"
     cells = csv(name).groupby(["method", "noise_level"], sort=False)
     cells = cells[["fit_cpu_s", "stars_per_s"]].mean().groupby("method", sort=False)
@@ -297,7 +286,7 @@ def errors(name="tables/psf_metrics.csv"):
 
 
 def readings():
-    """PCA+SOM as the paper can be read: rise with λ², errors over the paper's and the usual."""
+    """Interpretations of PCA+SOM: rise with λ², errors over the paper's and the usual."""
     table = csv("tables/baseline_readings.csv")
     usual = table.query("reading == 'map' and per_level == 'yes'")
     usual = usual.set_index(CELL).mse.rename("usual")
@@ -398,8 +387,7 @@ def peers():
     """Factors by which other propagators are slower at equal error."""
     table = csv("tables/benchmark_peers.csv")
     rows = table.groupby(["processes", "scene", "aberration", "method"])
-    table = rows.speedup.agg(["size", "min", "median", "max"]).join(rows.required.first())
-    return table.assign(met=rows.met.agg(lambda met: (met == "yes").sum())).reset_index()
+    return rows.speedup.agg(["size", "min", "median", "max"]).reset_index()
 
 
 def inference():
