@@ -5,10 +5,10 @@ is a table of `results/reference` or of `studies`, or a function below with word
 `where` picks rows and `by` sorts them. TEXT is an f-string over the columns. A comment at the end
 of its line makes a line of each row, below the head of the table that the page has; within a line
 (never at its start) the columns of several rows are arrays. Without TEXT, the source itself is put
-in.
+in. TEXT is evaluated as Python: fill in only pages that you trust.
 
-What stays from an earlier record (`kept` in its provenance) or is of a study (its columns `date`
-and `commit`) gets its date and commit beside it: a line below a table; words behind the first
+Numbers of an earlier record (`kept` in its provenance) or of a study (its columns `date` and
+`commit`) get their date and commit beside them: a line below a table; words behind the first
 number of a section that has no such table. Files of two commits are not joined.
 
 `python docs/tables.py` fills in all pages; `--check` names what has drifted.
