@@ -30,7 +30,8 @@ import pandas as pd
 from psfdae.alignment import methods as scene3
 from psfdae.configuration.compose import compose
 from psfdae.estimators import method
-from psfdae.evaluation.comparison import FITTED, SIGNIFICANT, seed_scatter, with_seed_stderr
+from psfdae.evaluation.comparison import FITTED, seed_scatter, with_seed_stderr
+from psfdae.evaluation.comparison import SIGNIFICANT as SIGNIFICANT  # pages use it
 
 ROOT = Path(__file__).resolve().parents[1]
 REFERENCE = ROOT / "results/reference"
