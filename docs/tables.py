@@ -30,8 +30,7 @@ import pandas as pd
 from psfdae.alignment import methods as scene3
 from psfdae.configuration.compose import compose
 from psfdae.estimators import method
-from psfdae.evaluation.comparison import FITTED, seed_scatter, with_seed_stderr
-from psfdae.evaluation.comparison import SIGNIFICANT as SIGNIFICANT  # pages use it
+from psfdae.evaluation.comparison import FITTED, SIGNIFICANT, seed_scatter, with_seed_stderr
 
 ROOT = Path(__file__).resolve().parents[1]
 REFERENCE = ROOT / "results/reference"
@@ -284,6 +283,14 @@ def errors(name="tables/psf_metrics.csv"):
     mse, sd = (rows.pivot(index=keys, columns="method", values=v) for v in ("value", "seed_stderr"))
     table = mse.join(sd.add_suffix("_sd")).reset_index()
     return table.sort_values(keys, ascending=[True, False, True, True])
+
+
+def better(first, second):
+    """Rows of errors in which one method is better, beyond the scatter of seeds where measured."""
+    table = errors()
+    gain = table[second] - table[first]
+    allowed = SIGNIFICANT * np.hypot(table[f"{first}_sd"], table[f"{second}_sd"])
+    return table[(gain > 0) & ~(gain <= allowed)]
 
 
 def readings():
