@@ -13,7 +13,7 @@ from mkdocs.structure.files import File, Files
 ROOT = Path(__file__).resolve().parents[1]
 PUBLISHED = (
     *("*.md", "LICENSE", "CITATION.cff", "docs/*.md", "docs/*.css", "docs/figures/*.png"),
-    *("results/reference/figures/**/*.png", "results/reference/tables/psf_metrics.csv"),
+    *("results/reference/**/*.png", "results/reference/**/*.csv", "studies/*/*.csv"),
     "src/psfdae/configuration/schema.py",
 )
 """What pages are and link to; links are relative and the same on GitHub."""
