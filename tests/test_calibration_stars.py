@@ -100,6 +100,8 @@ def test_only_a_bright_neighbour_crowds():
     brightness = np.array([100.0, 1.0, 100.0, 50.0, 1e6])
     found = crowded(position, brightness, 10.0, 0.02)
     assert found.tolist() == [False, True, True, True, False]
+    turned = crowded(position[::-1], brightness[::-1], 10.0, 0.02)
+    assert turned[::-1].tolist() == found.tolist()
     assert not crowded(np.full((2, 2), np.nan), brightness[:2], 10.0, 0.02).any()
 
 
