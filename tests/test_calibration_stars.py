@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -93,6 +94,14 @@ def test_signal_to_noise_is_that_of_king_s_area():
     assert measured.mean() == pytest.approx(expected, rel=3e-4)
     assert measured.std() == pytest.approx(1.0, abs=0.15)  # its error is one unit
     assert (signal_to_noise(noisy, np.zeros(400)) == 0).all()
+
+
+def test_area_of_a_star_follows_from_its_signal_to_noise():
+    """A = (F / (σ S/N))² is King's 1/Σp², whatever the noise."""
+    stars, noise = bright_stars([[0.2, 0.4], [0.0, -0.3]]), np.array([3.0, 7.0])
+    told = replace(stars, noise=noise, snr=signal_to_noise(stars.wide, noise))
+    area = [noise_equivalent_px(image / image.sum()) for image in stars.wide]
+    assert told.area() == pytest.approx(area, rel=0.01)
 
 
 def test_only_a_bright_neighbour_crowds():
