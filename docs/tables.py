@@ -267,10 +267,7 @@ def seeds():
 
 def costs():
     """CPU time of each method's fit, and stars per second at its slowest noise level."""
-    name = "tables/benchmark_methods.csv"
-    # An older record has several seeds in a table of its own.
-    name = name if (REFERENCE / name).is_file() else "tables/seeds_dataset3.csv"
-    cells = csv(name).groupby(["method", "noise_level"], sort=False)
+    cells = csv("tables/benchmark_methods.csv").groupby(["method", "noise_level"], sort=False)
     cells = cells[["fit_cpu_s", "stars_per_s"]].mean().groupby("method", sort=False)
     table = cells.agg({"fit_cpu_s": "first", "stars_per_s": "min"}).reset_index()
     return table.assign(label=[method(m).label for m in table.method])

@@ -15,6 +15,7 @@ takes long; words select mutants whose row holds one of them.
 from __future__ import annotations
 
 import ast
+import contextlib
 import copy
 import csv
 import os
@@ -205,8 +206,10 @@ def draw(known: list[Mutant]) -> list[Mutant]:
         rng = random.Random(f"{SEED} {number}")
         able = files[number % len(files)] if number < DRAWN // 2 else every
         while sum(not equivalent for equivalent in drawn.values()) <= number:
-            mutant = mutant_at(units, *rng.choice(able), rng)
-            drawn[mutant] = reasons.get(mutant, "")
+            # A fragment of two files, or one that is assigned to, does not say where it is.
+            with contextlib.suppress(LostError, ValueError):
+                mutant = mutant_at(units, *rng.choice(able), rng)
+                drawn[mutant] = reasons.get(mutant, "")
     return [replace(mutant, equivalent=reason) for mutant, reason in drawn.items()]
 
 

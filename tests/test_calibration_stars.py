@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -95,11 +96,21 @@ def test_signal_to_noise_is_that_of_king_s_area():
     assert (signal_to_noise(noisy, np.zeros(400)) == 0).all()
 
 
+def test_area_of_a_star_follows_from_its_signal_to_noise():
+    """A = (F / (σ S/N))² is King's 1/Σp², whatever the noise."""
+    stars, noise = bright_stars([[0.2, 0.4], [0.0, -0.3]]), np.array([3.0, 7.0])
+    told = replace(stars, noise=noise, snr=signal_to_noise(stars.wide, noise))
+    area = [noise_equivalent_px(image / image.sum()) for image in stars.wide]
+    assert told.area() == pytest.approx(area, rel=0.01)
+
+
 def test_only_a_bright_neighbour_crowds():
     position = np.array([[0.0, 0.0], [5.0, 0.0], [100.0, 0.0], [106.0, 0.0], [np.nan, 0.0]])
     brightness = np.array([100.0, 1.0, 100.0, 50.0, 1e6])
     found = crowded(position, brightness, 10.0, 0.02)
     assert found.tolist() == [False, True, True, True, False]
+    turned = crowded(position[::-1], brightness[::-1], 10.0, 0.02)
+    assert turned[::-1].tolist() == found.tolist()
     assert not crowded(np.full((2, 2), np.nan), brightness[:2], 10.0, 0.02).any()
 
 

@@ -210,6 +210,11 @@ def test_it_beats_one_cluster_and_its_input_on_stars_of_several_kinds():
     assert errors[1] < 0.9 * errors[0] < 0.9 * np.square(noisy - truth).mean()
 
 
+def test_positions_have_unit_variance_within_clusters():
+    p = fitted(kind=Placed, components=[4]).deviation_center
+    assert p.T @ p / len(p) == pytest.approx(np.eye(2), abs=1e-5)
+
+
 def test_validation_stars_choose():
     wanted = fitted(components=[1, 12], shrinkage=[5.0, 1e6])
     assert len(wanted.count) == 12 and wanted.shrinkage == [5.0]

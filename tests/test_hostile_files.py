@@ -341,6 +341,19 @@ def test_numbers_that_no_training_leaves_are_refused(tmp_path, name, change, mes
     refused("predict", tmp_path / "c.fits", "--model", path, "--out", tmp_path / "o.fits")
 
 
+@pytest.mark.parametrize("name", ["scale68", "scale95", "flux_error_scale"])
+def test_factors_of_errors_below_0_are_refused(tmp_path, name):
+    """With them, `predict` wrote negative standard errors."""
+    bundle, path = read_bundle(), tmp_path / "x.psf.safetensors"
+    tensors = module._tensors(bundle)
+    path.write_bytes(module.packed(bundle.info.described(), tensors | {name: -tensors[name]}))
+    message = f"array '{name}' must have numbers of at least 0"
+    assert message in refused("describe", path)
+    write_cube(tmp_path / "c.fits", np.ones((2, 16, 16)), PIXSCALE=0.1)
+    words = ["predict", tmp_path / "c.fits", "--model", path, "--out", tmp_path / "o.fits"]
+    assert message in refused(*words)
+
+
 @pytest.mark.parametrize(
     ("name", "change", "message"),
     [

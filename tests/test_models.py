@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from psfdae.estimators import TrainingSet, dae_network
+from psfdae.estimators import TrainingSet, dae_network, pca_som
 from psfdae.estimators.dae import Dae as Fitted
 from psfdae.estimators.dae import DaeSettings, Train
 from psfdae.estimators.dae_network import (
@@ -166,6 +166,19 @@ def test_baseline_refuses_stars_that_are_not_finite(gaussian_stars):
         fitted.predict(broken)
 
 
+def test_map_begins_otherwise_with_another_seed_of_the_configuration(data, monkeypatch):
+    seeds, settings = [], Baseline(**BASELINE, reading="map", per_level=False)
+
+    def begun(images, *, seed, **others):
+        seeds.append(seed)
+        return fit_pca_som(images, seed=seed, **others)
+
+    monkeypatch.setattr(pca_som, "fit_pca_som", begun)
+    for seed in (1, 2, 1):
+        PcaSom.fit(replace(data, seed=seed), settings)
+    assert seeds[0] == seeds[2] != seeds[1]
+
+
 @pytest.mark.parametrize("reading", ["map", "projection"])
 def test_baseline_of_each_level_has_that_level_s_noise(data, tmp_path, reading):
     """Cluster means and projections carry noise of the fit's own stars."""
@@ -288,6 +301,18 @@ def test_dead_network_restarts_and_then_gives_up(data, tmp_path, monkeypatch, ca
     with pytest.raises(TrainingError, match="died in all 2 attempts"):
         train(data, tmp_path)
     assert "starting from another seed" in capsys.readouterr().out
+
+
+def test_every_check_notices_a_dead_network_and_no_other_step_looks(data):
+    training = DaeTraining(data, DAE, TRAIN, 3, 0)
+    with torch.no_grad():
+        training.model.layers[-1].bias.fill_(-1e6)
+    batch = next(training.batches(0))
+    for step in range(1, 7):
+        dead = step % TRAIN.dead_check_steps == 0
+        told = pytest.raises(DeadNetworkError, match=f"at step {step}$") if dead else nullcontext()
+        with told:
+            assert training.loss(batch, step) > 0
 
 
 def test_restart_uses_other_weights(data, tmp_path, monkeypatch):

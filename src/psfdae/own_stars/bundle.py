@@ -55,6 +55,7 @@ VARIANCE = 1e6  # largest variance of images of sum 1 that is no nonsense
 # Arrays of S nodes that a bundle may lack, and the shape of their rows.
 SCALES = {"scale68": (2, 3, 2), "scale95": (2, 3, 2), "flux_error_scale": ()}
 FREE = {"ratio95": (), "strange_limit": (), "widening": (7,), **SCALES}
+NEVER_NEGATIVE = {"error68", "rms", "ratio95", "widening", *SCALES}
 # Arrays of float64; the others are float32.
 DOUBLE = {"flux/variance", "flux/rest", "noise_nodes", "distance_limit", *FREE}
 
@@ -517,7 +518,7 @@ def _check(info: BundleInfo, tensors: Mapping[str, np.ndarray], path: Path) -> N
             raise BundleError(f"{path}: array {name!r} has shape {array.shape}, not {shape}")
         if not np.isfinite(array).all():
             raise BundleError(f"{path}: array {name!r} is not finite")
-        if name in ("error68", "rms", "ratio95", "widening") and (array < 0).any():
+        if name in NEVER_NEGATIVE and (array < 0).any():
             raise BundleError(f"{path}: array {name!r} must have numbers of at least 0")
     _check_flux_model(info, tensors, path)
     if nodes < 1 or tensors["noise_nodes"][0] <= 0 or (np.diff(tensors["noise_nodes"]) <= 0).any():
