@@ -209,6 +209,21 @@ def write_csv(path: str | Path, table: Any, digits: int = 8) -> None:
     write_text(path, table.to_csv(index=False, float_format=f"%.{digits}g"))
 
 
+def write_columns(path: str | Path, columns: Mapping[str, Any], digits: int = 8) -> None:
+    """Write columns of equal length as CSV, numbers with so many digits, NaN as nothing."""
+
+    def cell(value: Any) -> Any:
+        if not isinstance(value, float | np.floating):
+            return value
+        return "" if np.isnan(value) else f"{value:.{digits}g}"
+
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(map(cell, row) for row in zip(*columns.values(), strict=True))
+    write_text(path, text.getvalue())
+
+
 def write_parquet(path: str | Path, table: Any) -> None:
     """Write a DataFrame as Parquet with checksums, atomically."""
     with atomic_path(path) as temporary:

@@ -13,6 +13,7 @@ from psfdae.configuration.compose import part
 from psfdae.configuration.own_stars import with_keywords
 from psfdae.estimators import Method, groups_of
 from psfdae.estimators import method as method_of
+from psfdae.extras import needed_by
 from psfdae.own_stars.model import PsfModel
 from psfdae.own_stars.packing import bundle_of
 from psfdae.own_stars.star_sets import (
@@ -41,8 +42,8 @@ def fit(
     ----------
     stars : Stars
     method : str, optional
-        "lmmse", "gmm", "field" or "dae"; by default the one of the first three that errs least
-        on validation stars.
+        "gmm", "field" or "dae"; by default the one of the first two that errs least on validation
+        stars.
     name : str, optional
         Of the model; by default the image's.
     licence : str
@@ -96,7 +97,7 @@ def fitted_to(stars: Stars, kind: type[Method], checkpoint: Path | None = None) 
     data = training_set(
         stars.settings, kind, stars.product, SPLIT, REFERENCE, checkpoint=checkpoint
     )
-    with fixed_threads(kind.threads(stars.settings)):
+    with fixed_threads(kind.threads(stars.settings)), needed_by(f"the method {kind.name}"):
         fitted: Method = kind.fit(data, **kind.settings(stars.settings))
     return fitted
 

@@ -22,7 +22,7 @@ from psfdae.own_stars.shapes import measure_shapes
 from psfdae.own_stars.stamps import StarFlag, cut
 
 if TYPE_CHECKING:
-    import pandas as pd
+    from astropy.table import Table
     from matplotlib.figure import Figure
 
 MEAN_PSF, MEAN_LABEL = "mean_psf", "one mean PSF, its centre fitted"
@@ -82,15 +82,15 @@ def fitted_mean(noisy: np.ndarray, mean: np.ndarray, reach_px: float) -> np.ndar
     return at(places)
 
 
-def ratios(errors: pd.DataFrame, method: str, other: str) -> dict[float, float]:
+def ratios(errors: Table, method: str, other: str) -> dict[float, float]:
     """MSE of a method over that of another one by S/N, ascending; empty if one is missing.
 
     `errors` has the columns snr, method and mse.
     """
-    wide = errors.pivot(index="snr", columns="method", values="mse").sort_index()
-    if not {method, other} <= set(wide.columns):
-        return {}
-    return dict((wide[method] / wide[other]).items())  # type: ignore[arg-type]
+    mse = {(row["method"], row["snr"]): row["mse"] for row in errors}
+    levels = sorted({snr for name, snr in mse if name == method})
+    pairs = {snr: (mse[method, snr], mse.get((other, snr))) for snr in levels}
+    return {float(snr): float(own / its) for snr, (own, its) in pairs.items() if its is not None}
 
 
 def nearest(values: Iterable[float], wanted: float = SHOWN_SNR) -> float:
@@ -98,7 +98,7 @@ def nearest(values: Iterable[float], wanted: float = SHOWN_SNR) -> float:
     return min(values, key=lambda value: abs(np.log(value / wanted)))
 
 
-def standing(errors: pd.DataFrame, method: str, label: str) -> str:
+def standing(errors: Table, method: str, label: str) -> str:
     """How good a method is beside one mean PSF and linear MMSE, in a sentence."""
     mean, linear = (ratios(errors, method, other) for other in (MEAN_PSF, LINEAR))
     snr = nearest(mean)
@@ -107,7 +107,7 @@ def standing(errors: pd.DataFrame, method: str, label: str) -> str:
         said += f", {linear[snr]:.2f} times that of linear MMSE"
     worse = [f"{level:.3g}" for level, ratio in mean.items() if ratio >= 1]
     where = f"no better than the mean PSF at S/N {', '.join(worse)}" if worse else "better at each"
-    return f"{said}; {where} ({errors.stars.iloc[0]} stars held out)"
+    return f"{said}; {where} ({errors['stars'][0]} stars held out)"
 
 
 # The page.
@@ -125,7 +125,7 @@ class Quality:
         That of the model.
     notes : sequence of str
         What is known of the camera, and advice.
-    errors : DataFrame
+    errors : Table
         Columns of `report.csv`.
     coverage : dict
         Part of the errors within ± the stated 68 % by S/N.
@@ -151,7 +151,7 @@ class Quality:
     method: str
     label: str
     notes: Sequence[str]
-    errors: pd.DataFrame
+    errors: Table
     coverage: dict[float, float]
     faint: dict[float, dict[str, np.ndarray]]
     stars: dict[str, np.ndarray]
@@ -254,8 +254,8 @@ def checks(q: Quality) -> list[tuple[str, str, bool]]:
     mean, linear = (ratios(q.errors, q.method, other) for other in (MEAN_PSF, LINEAR))
     snr = nearest(q.faint)
     size = q.sizes(snr, "model")
-    images = q.errors.images.iloc[0]
-    held = int(q.errors.stars.iloc[0])
+    images = q.errors["images"][0]
+    held = int(q.errors["stars"][0])
     bias, error = float(np.median(size)), 1.25 * float(size.std()) / np.sqrt(min(held, images))
     chi2 = {name: (float(np.median(some)), some.size) for name, some in q.chi2().items()}
     unlike = float(q.has(StarFlag.UNLIKE_TRAINING).mean())
@@ -296,14 +296,14 @@ def _checks(q: Quality) -> str:
 
 def _errors_table(q: Quality) -> str:
     labels = _labels(q)
-    levels = sorted(q.errors.snr.unique())
-    cell = {(r.method, r.snr): f"{r.mse:.2e} ± {r.mse_stderr:.0e}" for r in q.errors.itertuples()}
+    levels = np.unique(q.errors["snr"])
+    cell = {(r["method"], r["snr"]): f"{r['mse']:.2e} ± {r['mse_stderr']:.0e}" for r in q.errors}
     rows = [
         [escape(f"{label} (the model)" if name == q.method else label)]
         + [cell.get((name, snr), "") for snr in levels]
         for name, label in labels.items()
     ]
-    truth = q.errors.truth_mse.iloc[0]
+    truth = q.errors["truth_mse"][0]
     return _table(["MSE", *(f"S/N {snr:.3g}" for snr in levels)], rows) + (
         f"<p>Stars have flux 1. Noise of the bright images is {truth:.1e} of every MSE.</p>"
     )
@@ -312,7 +312,7 @@ def _errors_table(q: Quality) -> str:
 def _labels(q: Quality) -> dict[str, str]:
     from psfdae.estimators import method
 
-    names = q.errors.method.unique()
+    names = dict.fromkeys(q.errors["method"])
     return {n: MEAN_LABEL if n == MEAN_PSF else method(n).label for n in names}
 
 
@@ -322,12 +322,13 @@ def errors_figure(q: Quality) -> Figure:
     figure = new_figure(3.4, layout="constrained")
     axes = figure.add_subplot(xscale="log", yscale="log", xlabel="S/N", ylabel="MSE")
     for place, (name, label) in enumerate(_labels(q).items()):
-        rows = q.errors[q.errors.method == name].sort_values("snr")
+        rows = q.errors[q.errors["method"] == name]
+        rows.sort("snr")
         axes.errorbar(
-            rows.snr, rows.mse, rows.mse_stderr, label=label, marker="o", ms=3,
+            rows["snr"], rows["mse"], rows["mse_stderr"], label=label, marker="o", ms=3,
             color=SERIES_COLORS[place % len(SERIES_COLORS)], lw=2.2 if name == q.method else 1,
         )  # fmt: skip
-    axes.axhline(q.errors.truth_mse.iloc[0], color="grey", ls=":", label="noise of the truth")
+    axes.axhline(q.errors["truth_mse"][0], color="grey", ls=":", label="noise of the truth")
     axes.grid(True, which="both")
     figure.legend(loc="outside right upper")
     return figure

@@ -20,7 +20,7 @@ from psfdae.own_stars.observation import Observation
 from psfdae.own_stars.stamps import Stamps, StarFlag, cut, peaks, sky_around
 
 if TYPE_CHECKING:
-    import pandas as pd
+    from astropy.table import Table
 
     from psfdae.configuration.schema import CalibrationStars, Framing
 
@@ -116,13 +116,13 @@ class Candidates:
         found = Counter(self.verdict.tolist())
         return ", ".join(f"{found[v]} {v}" for v in map(str, Verdict) if found[v])
 
-    def table(self, held_out: np.ndarray) -> pd.DataFrame:
+    def table(self, held_out: np.ndarray) -> Table:
         """Every star of the catalogue, and which of the good ones are held out."""
-        import pandas as pd
+        from astropy.table import Table
 
         part = np.full(len(self.verdict), "", dtype="<U8")
         part[self.bright.row] = np.where(held_out, "held out", "training")
-        return pd.DataFrame(
+        return Table(
             {
                 "id": self.id if self.id.dtype.kind == "i" else [no_formula(n) for n in self.id],
                 "x": self.position[:, 0],

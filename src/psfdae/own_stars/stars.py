@@ -22,7 +22,7 @@ from psfdae.rng import stream
 from psfdae.stars.fields import held_out_fields
 
 if TYPE_CHECKING:
-    import pandas as pd
+    from astropy.table import Table
 
 SPLIT, REFERENCE = "held_out", "realisation"
 """Whole stars are held out, and a star itself is what is to be restored."""
@@ -177,7 +177,7 @@ class Stars:
         )
 
     @property
-    def table(self) -> pd.DataFrame:
+    def table(self) -> Table:
         """Every star of the image: place, S/N, why it is not used, and its part."""
         return self.candidates.table(self.held_out)
 

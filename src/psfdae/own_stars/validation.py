@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -41,7 +41,7 @@ from psfdae.own_stars.stars import REFERENCE, SPLIT, Stars
 from psfdae.threads import fixed_threads
 
 if TYPE_CHECKING:
-    import pandas as pd
+    from astropy.table import Table
     from matplotlib.figure import Figure
 
 BESIDE = ("noisy", "lmmse")
@@ -110,19 +110,16 @@ def _fitted_here(name: str, stars: Stars) -> Method:
 
 
 def _measured(model: PsfModel, stars: Stars, methods: Mapping[str, Method]) -> Report:
-    import pandas as pd
-
     settings, product = stars.settings, stars.product
     parts = split_stars(product, SPLIT, settings)
     truth, field = product[REFERENCE][parts.test], product["field_index"][parts.test]
     position = field_positions(product)[parts.test]
     data_range = settings.evaluation.data_range
     key = {"dataset": stars.name, "split": SPLIT, "reference": REFERENCE}
-    summary, per_star, restored = [], [], {}
+    rows, per_star, restored = [], [], {}
     for level in settings.noise.levels:
         noisy = noisy_test_images(settings, product, parts.test, level)
-        reach = settings.framing.jitter_px + 1.0
-        mean = fitted_mean(noisy, stars.mean_psf, reach)
+        mean = fitted_mean(noisy, stars.mean_psf, settings.framing.jitter_px + 1.0)
         row = {**key, "method": MEAN_PSF, "noise_level": level}
         beside = summarised(row, all_metrics(mean, truth, data_range), field)
         for name, method in methods.items():
@@ -131,46 +128,62 @@ def _measured(model: PsfModel, stars: Stars, methods: Mapping[str, Method]) -> R
             estimate = method.estimate(noisy, scale * level, position)
             metrics = quality(estimate, truth, data_range)
             row = {**key, "method": name, "noise_level": level}
-            summary += summarised(row, metrics, field)
-            per_star.append(pd.DataFrame({**row, "star": parts.test, "field": field, **metrics}))
+            rows += summarised(row, metrics, field)
+            per_star.append({**row, "star": parts.test, "field": field, **metrics})
             if own:
                 restored[level] = {"truth": truth, "model": estimate.psf, MEAN_PSF: mean}
-        summary += beside
-    every = pd.DataFrame(summary)
-    return Report(
-        model,
-        stars,
-        methods,
-        _table(every, stars, methods),
-        every[every.method != MEAN_PSF],
-        pd.concat(per_star, ignore_index=True),
-        restored,
-    )
+        rows += beside
+    measured = [row for row in rows if row["method"] != MEAN_PSF]
+    table = _table(rows, stars, methods)
+    return Report(model, stars, methods, table, _stacked(measured), _joined(per_star), restored)
 
 
-def _table(rows: pd.DataFrame, stars: Stars, methods: Mapping[str, Method]) -> pd.DataFrame:
+def _stacked(rows: Sequence[Mapping[str, Any]]) -> Table:
+    from astropy.table import Table
+
+    return Table({name: [row[name] for row in rows] for name in rows[0]})
+
+
+def _joined(parts: Sequence[Mapping[str, Any]]) -> Table:
+    """Rows of parts, NaN in columns that a part does not have."""
+    from astropy.table import Table
+
+    names = dict.fromkeys(name for part in parts for name in part)
+    columns = {
+        name: [np.broadcast_to(part.get(name, np.nan), part["star"].shape) for part in parts]
+        for name in names
+    }
+    return Table({name: np.concatenate(values) for name, values in columns.items()})
+
+
+def _table(rows: Sequence[Mapping[str, Any]], stars: Stars, methods: Mapping[str, Method]) -> Table:
     """MSE and SSIM by S/N and method."""
-    import pandas as pd
-
     settings, product = stars.settings, stars.product
     parts = split_stars(product, SPLIT, settings)
     area = star_area(product, parts.train)
-    wide = rows.pivot(index=["noise_level", "method"], columns="metric", values=["value", "stderr"])
-    table = pd.DataFrame(
-        {
-            "mse": wide["value", "mse"],
-            "mse_stderr": wide["stderr", "mse"],
-            "ssim": wide["value", "ssim_peak"],
-        }
-    ).reset_index()
-    noise = settings.noise.kappa * table.pop("noise_level")
-    table.insert(0, "noise", noise)
-    table.insert(0, "snr", [signal_to_noise(level, area) for level in noise])
-    table["images"] = parts.test.size
-    table["stars"] = int(stars.held_out.sum())
-    table["truth_mse"] = _noise_of_truth(stars, parts.test)
-    order = {name: place for place, name in enumerate([*methods, MEAN_PSF])}
-    return table.sort_values(["snr", "method"], key=lambda c: c.map(order).fillna(c))
+    of = {(row["noise_level"], row["method"], row["metric"]): row for row in rows}
+    shared = {
+        "images": parts.test.size,
+        "stars": int(stars.held_out.sum()),
+        "truth_mse": _noise_of_truth(stars, parts.test),
+    }
+    found = []
+    for level in sorted(settings.noise.levels, reverse=True):  # S/N ascending
+        noise = settings.noise.kappa * level
+        for name in (*methods, MEAN_PSF):
+            mse_of, ssim_of = (of[level, name, metric] for metric in ("mse", "ssim_peak"))
+            found.append(
+                {
+                    "snr": signal_to_noise(noise, area),
+                    "noise": noise,
+                    "method": name,
+                    "mse": mse_of["value"],
+                    "mse_stderr": mse_of["stderr"],
+                    "ssim": ssim_of["value"],
+                    **shared,
+                }
+            )
+    return _stacked(found)
 
 
 def _noise_of_truth(stars: Stars, test: np.ndarray) -> float:
@@ -194,11 +207,11 @@ class Report:
     stars : Stars
     methods : dict of str to Method
         All that were measured, the model's own included.
-    table : DataFrame
+    table : Table
         MSE with its standard error and SSIM by S/N and method.
-    evaluation : DataFrame
+    evaluation : Table
         Every metric of every method at every noise level.
-    per_star : DataFrame
+    per_star : Table
         The same of every image.
     restored : dict
         By noise level λ the held-out images (n, d, d): `truth`, `model`, and `mean_psf`.
@@ -207,9 +220,9 @@ class Report:
     model: PsfModel
     stars: Stars
     methods: Mapping[str, Method]
-    table: pd.DataFrame
-    evaluation: pd.DataFrame
-    per_star: pd.DataFrame
+    table: Table
+    evaluation: Table
+    per_star: Table
     restored: dict[float, dict[str, np.ndarray]]
 
     def __str__(self) -> str:
@@ -247,11 +260,11 @@ class Report:
         """The HTML of the page; the PSFs of all stars of the image are predicted for it."""
         model, stars = self.model, self.stars
         info, selection = model.info, stars.table
-        held = np.flatnonzero(selection.part == "held out")
-        where = selection[["x", "y"]].to_numpy()[held]
+        held = np.flatnonzero(selection["part"] == "held out")
+        where = np.stack([selection["x"][held], selection["y"][held]], axis=1)
         shown = held[spread_stars(where, SHOWN_STARS)] if np.isfinite(where).all() else held
         found, psf, residual = _all_stars(model, stars, shown[:SHOWN_STARS])
-        columns = {name: selection[name].to_numpy() for name in ("verdict", "part")}
+        columns = {name: np.asarray(selection[name]) for name in ("verdict", "part")}
         area, shown = info.noise_equivalent_px, shown[:SHOWN_STARS]
         kind = type(model.engine.estimator)
         levels = self.restored.items()

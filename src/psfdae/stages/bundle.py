@@ -263,13 +263,13 @@ def _gain(row: dict[str, float]) -> dict[str, float]:
 
 
 def _table(info: BundleInfo) -> str:
-    from tabulate import tabulate
+    from astropy.table import Table
 
     metrics = [row | _gain(row) for row in info.metrics]
     shown = [key for key in METRICS if any(key in row for row in metrics)]
-    rows = [
-        [format(row[key], METRICS[key][1]) if key in row else "" for key in shown]
-        for row in metrics
-    ]
-    headings = [METRICS[key][0] for key in shown]
-    return str(tabulate(rows, headings, tablefmt="plain", disable_numparse=True, stralign="right"))
+    table = Table()
+    for key in shown:
+        heading, form = METRICS[key]
+        table[heading] = [format(row[key], form) if key in row else "" for row in metrics]
+    head, _, *rows = table.pformat(max_lines=-1, max_width=-1, align=">") if shown else ("", "")
+    return "\n".join(line.rstrip() for line in (head, *rows))

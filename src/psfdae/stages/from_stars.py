@@ -18,7 +18,14 @@ from psfdae.configuration.schema import Config
 from psfdae.errors import Error
 from psfdae.estimators import Method, all_groups, method
 from psfdae.evaluation.figure_style import as_png
-from psfdae.files import atomic_path, interrupted, write_bytes, write_csv, write_product, write_text
+from psfdae.files import (
+    atomic_path,
+    interrupted,
+    write_bytes,
+    write_columns,
+    write_product,
+    write_text,
+)
 from psfdae.own_stars.bundle import SUFFIX
 from psfdae.own_stars.fitting import best, described, fitted_to, makes_models, packed
 from psfdae.own_stars.observation import Source
@@ -225,7 +232,7 @@ def _make(
     print(*stars.notes, stars.summary(), sep="\n")
     if source.detect is not None:
         write_list(stars.observation, files.list)
-    write_csv(files.path / "selection.csv", stars.table, digits=6)
+    write_columns(files.path / "selection.csv", stars.table.columns, digits=6)
     write_product(files.stars, "stars", stars.columns, stars.described())
     write_text(files.path / "overrides.txt", _overrides(stars.settings))
     fitted = {}
@@ -252,9 +259,9 @@ def _make(
         model.save(unfinished)
         print("testing on the stars held out")
         report = validate(model, stars, fitted)
-        write_csv(files.path / "evaluation.csv", report.evaluation)
-        write_csv(files.path / "per_star.csv", report.per_star)
-        write_csv(files.path / "report.csv", report.table, digits=6)
+        write_columns(files.path / "evaluation.csv", report.evaluation.columns)
+        write_columns(files.path / "per_star.csv", report.per_star.columns)
+        write_columns(files.path / "report.csv", report.table.columns, digits=6)
         write_bytes(files.path / "report.png", as_png(report.strip()))
         if page is not None:
             print(f"writing {page}")
