@@ -242,6 +242,8 @@ def test_the_other_test_reads_the_page(page, test):
 def test_python_blocks_run(sandbox):
     side = read_bundle(None).info.stamp_px
     found = [body for page in own_pages() for body in blocks(read(page), "python")]
+    # Those that train on an image run in test_library.py.
+    found = [body for body in found if "from_image" not in body]
     assert found
     for body in found:
         names = {"stamps": 5e3 * star_stamps(4, side) + 100.0}

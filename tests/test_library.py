@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import ast
+import shutil
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -10,6 +13,7 @@ from astropy.table import Table
 from click.testing import CliRunner
 
 import psfdae
+from docs_pages import blocks, read
 from psfdae.cli import main
 from psfdae.configuration.compose import load_stage
 from psfdae.configuration.own_stars import CHOSEN, from_words, of_config, settings_model
@@ -103,6 +107,19 @@ def test_a_model_is_saved_and_knows_the_psf_of_any_place(model, tmp_path):
     psf = model.psf_at(300.0, 400.0, oversampling=1)
     assert psf.sum() == pytest.approx(1.0, abs=0.02)
     assert (again.psf_at(300.0, 400.0, oversampling=1) == psf).all()
+
+
+def test_the_lines_of_the_pages_run(sky, tmp_path, monkeypatch):
+    """As they stand in README; those of docs/python.md are the same."""
+    body, same = (blocks(read(page), "python")[0] for page in ("README.md", "docs/python.md"))
+    statements = [[ast.unparse(line) for line in ast.parse(text).body] for text in (body, same)]
+    assert statements[0] == statements[1]
+    for path in sky:
+        shutil.copy(path, tmp_path)
+    monkeypatch.chdir(tmp_path)
+    exec(compile(body, "README.md", "exec"), {})
+    assert psfdae.load_model("image.psf.safetensors").info.method == "field"
+    assert "<img" in (tmp_path / "page.html").read_text(encoding="utf-8")
 
 
 def test_held_out_stars_are_not_learnt_from(stars, model):
