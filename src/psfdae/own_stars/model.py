@@ -39,6 +39,7 @@ from psfdae.threads import side_by_side
 
 SCALE_TOLERANCE = 0.02  # relative difference of the pixel scale from that of the training
 SNR_TOLERANCE = 1.25  # beyond the trained S/N without a flag: a faint star's is no better known
+MOST_CHI2 = 10.0  # of a star without a flag
 SKY_SIGMA = 5.0  # scatter of the border by which its median may differ from a sky that is given
 FLUX_FACTOR = (0.5, 2.0)  # by which a method may correct the flux of a star
 BLOCK = 256  # stars that a network computes together, always so many: other numbers round otherwise
@@ -360,6 +361,9 @@ class Engine:
             )
             unlike |= strangeness > np.interp(noise, bundle.noise_nodes, bundle.strange_limit)
         raise_flag(flags, StarFlag.UNLIKE_TRAINING, unlike)
+        chi2 = _chi2(residual, psf, doubt, found.noise, stars.gain)
+        # Without the gain, bright stars have photon noise that nothing accounts for.
+        raise_flag(flags, StarFlag.POOR_FIT, (chi2 > MOST_CHI2) & (stars.gain > 0))
         photons = np.nan_to_num(np.maximum(found.flux, 0.0) / stars.gain)
         return Prediction(
             psf=psf,
@@ -372,7 +376,7 @@ class Engine:
             background=found.background,
             noise=found.noise,
             snr=snr,
-            chi2=_chi2(residual, psf, doubt, found.noise, stars.gain),
+            chi2=chi2,
             distance=distance,
             strangeness=strangeness,
             fwhm_px=shapes.fwhm_px,
