@@ -144,6 +144,14 @@ def test_a_residual_far_above_the_noise_is_flagged_where_the_gain_is_known(
     assert (without.flags & int(StarFlag.POOR_FIT) == 0).all()
 
 
+def test_chi2_of_a_star_that_is_followed_everywhere_is_a_number():
+    """Where the doubt about a PSF exceeds the noise, hardly anything is expected to be left."""
+    residual = np.full((1, 8, 8), 0.1)
+    psf, doubt = np.ones((1, 8, 8)), np.full((1, 8, 8), 3.0)
+    chi2 = model._chi2(residual, psf, doubt, np.ones(1), np.full(1, np.nan))
+    assert chi2 == pytest.approx(0.1**2 / model.LEAST_LEFT)
+
+
 def test_photons_of_the_star_belong_to_chi2_if_the_gain_is_known(shipped, field_psfs):
     stars = observe(field_psfs, 1e-4)
     without = shipped.predict(stars.stamps, noise=SKY**0.5)

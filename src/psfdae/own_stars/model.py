@@ -39,6 +39,7 @@ from psfdae.threads import side_by_side
 
 SCALE_TOLERANCE = 0.02  # relative difference of the pixel scale from that of the training
 SNR_TOLERANCE = 1.25  # beyond the trained S/N without a flag: a faint star's is no better known
+LEAST_LEFT = 0.01  # of the noise in a pixel, by a PSF that follows the star there
 MOST_CHI2 = 10.0  # of a star without a flag
 SKY_SIGMA = 5.0  # scatter of the border by which its median may differ from a sky that is given
 FLUX_FACTOR = (0.5, 2.0)  # by which a method may correct the flux of a star
@@ -547,8 +548,8 @@ def _chi2(
     """Σ residual²/v over what is expected of it, of the pixels that are not NaN; v is noise.
 
     A restored star follows its own noise where it is bright. If the method has a `doubt` u (n, d,
-    d) of its pixels in a noise of the mean variance s, it leaves the part k = 1 − u²/s of what
-    noise does to each, and Σ (s k + k² (v − s))/v is expected; else the number of pixels is.
+    d) of its pixels in a noise of the mean variance s, it leaves the part k = 1 − u²/s, at
+    least `LEAST_LEFT`, of what noise does to each, and Σ (s k + k² (v − s))/v is expected; else the number of pixels is.
     """
     variance = np.broadcast_to((noise**2)[:, None, None], residual.shape)
     if np.isfinite(gain).any():
@@ -558,7 +559,7 @@ def _chi2(
     expected = np.ones(residual.shape)
     if doubt is not None:
         even = variance.mean(axis=(1, 2), keepdims=True)
-        left = np.clip(1.0 - doubt.astype(np.float64) ** 2 / even, 0.0, 1.0)
+        left = np.clip(1.0 - doubt.astype(np.float64) ** 2 / even, LEAST_LEFT, 1.0)
         expected = left * (even + left * (variance - even)) / variance
     found, wanted = (
         np.where(used, values, 0.0).sum(axis=(1, 2), dtype=np.float64)
