@@ -129,9 +129,7 @@ def test_residual_is_what_is_left_of_the_stamp(medium, clean):
     assert np.median(clean.chi2) == pytest.approx(1.0, abs=0.15)
 
 
-def test_a_residual_far_above_the_noise_is_flagged_where_the_gain_is_known(
-    shipped, field_psfs, monkeypatch
-):
+def test_a_residual_far_above_the_noise_is_flagged(shipped, field_psfs, monkeypatch):
     """Stars with a companion, and a limit among their χ²."""
     double = field_psfs[:60] + 0.3 * np.roll(field_psfs[:60], (3, 4), (1, 2))
     flux = np.geomspace(1e4, 1e6, 60)[:, None, None]
@@ -140,8 +138,8 @@ def test_a_residual_far_above_the_noise_is_flagged_where_the_gain_is_known(
     found = shipped.predict(stamps, gain=1.0, noise=10.0)
     poor = (found.flags & int(StarFlag.POOR_FIT)) > 0
     assert (poor == (found.chi2 > 2.0)).all() and 5 < poor.sum() < 55
-    without = shipped.predict(stamps, noise=10.0)
-    assert (without.flags & int(StarFlag.POOR_FIT) == 0).all()
+    without = shipped.predict(stamps, noise=10.0)  # the gain: fewer photons are expected
+    assert ((without.flags & int(StarFlag.POOR_FIT)) > 0).sum() >= poor.sum()
 
 
 def test_chi2_of_a_star_that_is_followed_everywhere_is_a_number():

@@ -363,8 +363,7 @@ class Engine:
             unlike |= strangeness > np.interp(noise, bundle.noise_nodes, bundle.strange_limit)
         raise_flag(flags, StarFlag.UNLIKE_TRAINING, unlike)
         chi2 = _chi2(residual, psf, doubt, found.noise, stars.gain)
-        # Without the gain, bright stars have photon noise that nothing accounts for.
-        raise_flag(flags, StarFlag.POOR_FIT, (chi2 > MOST_CHI2) & (stars.gain > 0))
+        raise_flag(flags, StarFlag.POOR_FIT, chi2 > MOST_CHI2)
         photons = np.nan_to_num(np.maximum(found.flux, 0.0) / stars.gain)
         return Prediction(
             psf=psf,
@@ -549,7 +548,8 @@ def _chi2(
 
     A restored star follows its own noise where it is bright. If the method has a `doubt` u (n, d,
     d) of its pixels in a noise of the mean variance s, it leaves the part k = 1 − u²/s, at
-    least `LEAST_LEFT`, of what noise does to each, and Σ (s k + k² (v − s))/v is expected; else the number of pixels is.
+    least `LEAST_LEFT`, of what noise does to each, and Σ (s k + k² (v − s))/v is expected; else
+    the number of pixels is.
     """
     variance = np.broadcast_to((noise**2)[:, None, None], residual.shape)
     if np.isfinite(gain).any():
