@@ -208,12 +208,20 @@ class PsfModel:
         if not 1 <= oversampling <= MOST_OVERSAMPLED:
             raise PredictionError(f"oversampling {oversampling}: 1 to {MOST_OVERSAMPLED}")
         try:
-            found = self.engine.estimator.psf_at(position.reshape(-1, 2), oversampling)
+            with np.errstate(all="ignore"):
+                found = self.engine.estimator.psf_at(position.reshape(-1, 2), oversampling)
         except FitError as error:
             raise PredictionError(
                 f"the model {self.info.name!r}: {error}; psfdae from-stars --method field makes "
                 "one that does"
             ) from None
+        flux = found.sum(axis=(1, 2))
+        if not (np.isfinite(flux) & (flux > 0)).all():
+            place = position.reshape(-1, 2)[np.argmin(np.isfinite(flux) & (flux > 0))]
+            raise PredictionError(
+                f"the model {self.info.name!r}: damaged, or far outside its image: no PSF of a "
+                f"finite flux above 0 at x {place[0]:.6g}, y {place[1]:.6g}"
+            )
         return found if position.ndim == 2 else found[0]
 
     def field_range(self) -> tuple[np.ndarray, np.ndarray]:
