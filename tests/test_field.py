@@ -612,6 +612,16 @@ def test_wrong_places_are_one_line(image, tmp_path, words, message):
     assert len(done.output.strip().splitlines()) == 1
 
 
+@pytest.mark.parametrize("psf", [np.nan, 0.0, -1.0])
+def test_a_place_without_a_psf_is_named(shipped, monkeypatch, psf):
+    """Such as in a damaged model; nothing is drawn there."""
+    fixed = np.full((2, 4, 4), 1.0)
+    fixed[1] = psf
+    monkeypatch.setattr(type(shipped.engine.estimator), "psf_at", lambda *_: fixed)
+    with pytest.raises(PredictionError, match=r"flux above 0 at x 7, y 8"):
+        shipped.psf_at([5.0, 7.0], [6.0, 8.0])
+
+
 def test_models_without_a_field_say_so(image, tmp_path):
     shipped = load_model()
     with pytest.raises(PredictionError, match="from-stars --method field"):

@@ -10,7 +10,7 @@ import pytest
 
 from prediction_stars import KAPPA, SKY, observe
 from psfdae import Prediction, PredictionError, StarFlag
-from psfdae.own_stars import photometry
+from psfdae.own_stars import model, photometry
 from psfdae.own_stars.model import BLOCK, PsfModel
 from psfdae.own_stars.stamps import MEANING, cut
 from psfdae.threads import in_order
@@ -127,6 +127,27 @@ def test_residual_is_what_is_left_of_the_stamp(medium, clean):
     left = medium.stamps - clean.background[:, None, None] - clean.psf
     assert clean.residual == pytest.approx(left, abs=1e-2)
     assert np.median(clean.chi2) == pytest.approx(1.0, abs=0.15)
+
+
+def test_a_residual_far_above_the_noise_is_flagged(shipped, field_psfs, monkeypatch):
+    """Stars with a companion, and a limit among their χ²."""
+    double = field_psfs[:60] + 0.3 * np.roll(field_psfs[:60], (3, 4), (1, 2))
+    flux = np.geomspace(1e4, 1e6, 60)[:, None, None]
+    stamps = np.random.default_rng(4).poisson(flux * double + 100.0).astype(np.float32)
+    monkeypatch.setattr(model, "MOST_CHI2", 2.0)
+    found = shipped.predict(stamps, gain=1.0, noise=10.0)
+    poor = (found.flags & int(StarFlag.POOR_FIT)) > 0
+    assert (poor == (found.chi2 > 2.0)).all() and 5 < poor.sum() < 55
+    without = shipped.predict(stamps, noise=10.0)  # the gain: fewer photons are expected
+    assert ((without.flags & int(StarFlag.POOR_FIT)) > 0).sum() >= poor.sum()
+
+
+def test_chi2_of_a_star_that_is_followed_everywhere_is_a_number():
+    """Where the doubt about a PSF exceeds the noise, hardly anything is expected to be left."""
+    residual = np.full((1, 8, 8), 0.1)
+    psf, doubt = np.ones((1, 8, 8)), np.full((1, 8, 8), 3.0)
+    chi2 = model._chi2(residual, psf, doubt, np.ones(1), np.full(1, np.nan))
+    assert chi2 == pytest.approx(0.1**2 / model.LEAST_LEFT)
 
 
 def test_photons_of_the_star_belong_to_chi2_if_the_gain_is_known(shipped, field_psfs):

@@ -42,6 +42,8 @@ from psfdae.threads import available_cores, in_order, side_by_side
 
 SCALE_TOLERANCE = 0.02  # relative difference of the pixel scale from that of the training
 SNR_TOLERANCE = 1.25  # beyond the trained S/N without a flag: a faint star's is no better known
+LEAST_LEFT = 0.01  # of the noise in a pixel, by a PSF that follows the star there
+MOST_CHI2 = 10.0  # of a star without a flag
 SKY_SIGMA = 5.0  # scatter of the border by which its median may differ from a sky that is given
 FLUX_FACTOR = (0.5, 2.0)  # by which a method may correct the flux of a star
 BLOCK = 256  # stars that a network computes together, always so many: other numbers round otherwise
@@ -235,12 +237,20 @@ class PsfModel:
         if not 1 <= oversampling <= MOST_OVERSAMPLED:
             raise PredictionError(f"oversampling {oversampling}: 1 to {MOST_OVERSAMPLED}")
         try:
-            found = self.engine.estimator.psf_at(position.reshape(-1, 2), oversampling)
+            with np.errstate(all="ignore"):
+                found = self.engine.estimator.psf_at(position.reshape(-1, 2), oversampling)
         except FitError as error:
             raise PredictionError(
                 f"the model {self.info.name!r}: {error}; psfdae from-stars --method field makes "
                 "one that does"
             ) from None
+        flux = found.sum(axis=(1, 2))
+        if not (np.isfinite(flux) & (flux > 0)).all():
+            place = position.reshape(-1, 2)[np.argmin(np.isfinite(flux) & (flux > 0))]
+            raise PredictionError(
+                f"the model {self.info.name!r}: damaged, or far outside its image: no PSF of a "
+                f"finite flux above 0 at x {place[0]:.6g}, y {place[1]:.6g}"
+            )
         return found if position.ndim == 2 else found[0]
 
     def field_range(self) -> tuple[np.ndarray, np.ndarray]:
@@ -391,6 +401,8 @@ class Engine:
             )
             unlike |= strangeness > np.interp(noise, bundle.noise_nodes, bundle.strange_limit)
         raise_flag(flags, StarFlag.UNLIKE_TRAINING, unlike)
+        chi2 = _chi2(residual, psf, doubt, found.noise, stars.gain)
+        raise_flag(flags, StarFlag.POOR_FIT, chi2 > MOST_CHI2)
         photons = np.nan_to_num(np.maximum(found.flux, 0.0) / stars.gain)
         return Prediction(
             psf=psf,
@@ -403,7 +415,7 @@ class Engine:
             background=found.background,
             noise=found.noise,
             snr=snr,
-            chi2=_chi2(residual, psf, doubt, found.noise, stars.gain),
+            chi2=chi2,
             distance=distance,
             strangeness=strangeness,
             fwhm_px=shapes.fwhm_px,
@@ -574,8 +586,9 @@ def _chi2(
     """Σ residual²/v over what is expected of it, of the pixels that are not NaN; v is noise.
 
     A restored star follows its own noise where it is bright. If the method has a `doubt` u (n, d,
-    d) of its pixels in a noise of the mean variance s, it leaves the part k = 1 − u²/s of what
-    noise does to each, and Σ (s k + k² (v − s))/v is expected; else the number of pixels is.
+    d) of its pixels in a noise of the mean variance s, it leaves the part k = 1 − u²/s, at
+    least `LEAST_LEFT`, of what noise does to each, and Σ (s k + k² (v − s))/v is expected; else
+    the number of pixels is.
     """
     variance = np.broadcast_to((noise**2)[:, None, None], residual.shape)
     if np.isfinite(gain).any():
@@ -585,7 +598,7 @@ def _chi2(
     expected = np.ones(residual.shape)
     if doubt is not None:
         even = variance.mean(axis=(1, 2), keepdims=True)
-        left = np.clip(1.0 - doubt.astype(np.float64) ** 2 / even, 0.0, 1.0)
+        left = np.clip(1.0 - doubt.astype(np.float64) ** 2 / even, LEAST_LEFT, 1.0)
         expected = left * (even + left * (variance - even)) / variance
     found, wanted = (
         np.where(used, values, 0.0).sum(axis=(1, 2), dtype=np.float64)

@@ -53,6 +53,7 @@ class StarFlag(IntFlag):
     UNLIKE_TRAINING = 512
     BLENDED = 1024
     SKY_OFF = 2048
+    POOR_FIT = 4096
 
 
 MEANING: dict[StarFlag, str] = {
@@ -68,6 +69,7 @@ MEANING: dict[StarFlag, str] = {
     StarFlag.UNLIKE_TRAINING: "farther from the training set than 99.9 % of its test stars",
     StarFlag.BLENDED: "the star list says that it was parted from a neighbour",
     StarFlag.SKY_OFF: "the sky that was given is over 5 sigma off the border of the stamp",
+    StarFlag.POOR_FIT: "chi2 above 10: the residual is far above the noise",
 }
 """One line for every flag."""
 
