@@ -333,7 +333,7 @@ def test_network_of_another_training_is_refused(folder, tmp_path, override, mess
 
 
 def test_stars_that_say_too_little_are_refused(folder, tmp_path):
-    stars = write_stars(tmp_path / "s.h5", {"telescope": {}, "framing": {"jitter_px": 0}})
+    stars = write_stars(tmp_path / "s.h5", {"telescope": {}, "framing": {"jitter_px": 1}})
     with pytest.raises(ProductError, match=r"s\.h5: its configuration lacks 'pixel_scale_arcsec'"):
         pack(folder, tmp_path / "x", stars=stars)
 
