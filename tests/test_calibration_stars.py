@@ -97,11 +97,11 @@ def test_signal_to_noise_is_that_of_king_s_area():
 
 
 def test_area_of_a_star_follows_from_its_signal_to_noise():
-    """A = (F / (σ S/N))² is King's 1/Σp², whatever the noise."""
+    """A = (F / (σ S/N))² is King's 1/Σp², where noise is low."""
     stars, noise = bright_stars([[0.2, 0.4], [0.0, -0.3]]), np.array([0.3, 0.7])
-    told = replace(stars, noise=noise, snr=signal_to_noise(stars.wide, noise))
+    measured = replace(stars, noise=noise, snr=signal_to_noise(stars.wide, noise))
     area = [noise_equivalent_px(image / image.sum()) for image in stars.wide]
-    assert told.area() == pytest.approx(area, rel=1e-3)
+    assert measured.area() == pytest.approx(area, rel=1e-3)
 
 
 def test_only_a_bright_neighbour_crowds():

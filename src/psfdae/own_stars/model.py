@@ -229,7 +229,8 @@ class PsfModel:
         Raises
         ------
         PredictionError
-            If the model's method knows no PSF between the stars, or a number is not usable.
+            If the model's method knows no PSF between the stars, a number is not usable, or the
+            model has no PSF of a finite flux above 0 at a place.
         """
         position = np.stack(np.broadcast_arrays(_numbers("x", x), _numbers("y", y)), axis=-1)
         if position.ndim > 2 or not np.isfinite(position).all():
@@ -245,8 +246,9 @@ class PsfModel:
                 "one that does"
             ) from None
         flux = found.sum(axis=(1, 2))
-        if not (np.isfinite(flux) & (flux > 0)).all():
-            place = position.reshape(-1, 2)[np.argmin(np.isfinite(flux) & (flux > 0))]
+        usable = np.isfinite(flux) & (flux > 0)
+        if not usable.all():
+            place = position.reshape(-1, 2)[np.argmin(usable)]
             raise PredictionError(
                 f"the model {self.info.name!r}: damaged, or far outside its image: no PSF of a "
                 f"finite flux above 0 at x {place[0]:.6g}, y {place[1]:.6g}"
