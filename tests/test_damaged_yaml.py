@@ -135,7 +135,7 @@ def test_deep_nesting_is_one_line(folder):
 
 def test_a_list_is_no_group(folder):
     (folder / "gmm/default.yaml").write_text("- stars\n")
-    assert refused(["config"]).startswith("psfdae: gmm = ['stars']: ")
+    assert refused(["config"]).startswith("psfdae: config: In 'gmm/default': ")
 
 
 @pytest.mark.parametrize(

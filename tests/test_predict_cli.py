@@ -121,7 +121,7 @@ def test_names_given_fluxes_and_columns_of_a_table(folder):
 def test_chunks_and_threads_do_not_show(folder, monkeypatch):
     files = []
     for rows, threads in ((engine.BLOCK, 1), (4 * engine.BLOCK, 2), (engine.BLOCK, 3)):
-        monkeypatch.setattr(stage, "ROWS", rows)
+        monkeypatch.setattr(engine, "ROWS", rows)
         out = folder / f"rows{rows}_{threads}.fits"
         stage.predict(folder / "cube.fits", stage.Stated(), threads=threads, out=out)
         files.append(out.read_bytes())

@@ -38,7 +38,7 @@ STEP = 0.5  # px, at most
 LANCZOS = 4  # of the interpolation of sampled PSFs
 
 
-@command("field", reads=SIMULATION, start=("dataset=field",))
+@command("field", reads=SIMULATION)
 def field(
     config: Config,
     image: Annotated[File, "FITS image."],
