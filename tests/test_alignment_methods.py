@@ -30,8 +30,9 @@ from psfdae.alignment.networks import (
 from psfdae.alignment.stamps import AlignmentStamps
 from psfdae.alignment.telescope import mirror_symmetries, uniform_states
 from psfdae.configuration.alignment import Cnn, Perceptron
-from psfdae.configuration.compose import ConfigError, load
+from psfdae.configuration.compose import load
 from psfdae.estimators.training import TrainingError, train
+from psfdae.settings import ConfigError
 
 FIT = load((), "alignment").fit
 EXACT = FIT.model_copy(update={"iterations": 25, "tolerance": 1e-7})

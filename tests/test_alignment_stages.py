@@ -9,9 +9,10 @@ from click.testing import CliRunner
 
 from psfdae.alignment.methods import ESTIMATORS, FITTED, LEARNED, METHODS, TRAINED, of_set
 from psfdae.cli import main
-from psfdae.configuration.compose import ConfigError, config_dir, load, load_stage, overrides_for
+from psfdae.configuration.compose import config_dir, load, load_stage, overrides_for
 from psfdae.evaluation import alignment_tables
 from psfdae.files import read_product
+from psfdae.settings import ConfigError
 from psfdae.stages.alignment import states
 from psfdae.stages.alignment_results import read_bounds
 

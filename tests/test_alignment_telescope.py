@@ -20,7 +20,7 @@ from psfdae.alignment.telescope import (
     verify,
     zernike_tracer,
 )
-from psfdae.configuration.compose import ConfigError, load
+from psfdae.configuration.compose import load
 from psfdae.optics.raytracing import (
     DEGREES_OF_FREEDOM,
     RayTracingError,
@@ -29,6 +29,7 @@ from psfdae.optics.raytracing import (
     misaligned,
 )
 from psfdae.optics.wavefronts import zernike_basis
+from psfdae.settings import ConfigError
 
 ARCSEC = np.pi / 180 / 3600
 

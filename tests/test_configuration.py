@@ -5,9 +5,10 @@ from __future__ import annotations
 import pytest
 
 from psfdae.configuration import compose
-from psfdae.configuration.compose import ConfigError, as_overrides, config_dir, load, load_stage
+from psfdae.configuration.compose import config_dir, load, load_stage
 from psfdae.configuration.consistency import SIMULATION
 from psfdae.estimators import groups_of
+from psfdae.settings import ConfigError, as_overrides
 from psfdae.stages.alignment_methods import train_dae, train_network
 from psfdae.stages.evaluate import READS
 

@@ -21,7 +21,7 @@ from click.testing import CliRunner
 from docs_pages import blocks, commands, read
 from fits_inputs import write_cube
 from psfdae.cli import main
-from psfdae.configuration.compose import ConfigError, load_stage
+from psfdae.configuration.compose import load_stage
 from psfdae.estimators import groups_of, method
 from psfdae.files import read_product, write_product
 from psfdae.own_stars.bundle import estimator, read_bundle
@@ -46,6 +46,7 @@ from psfdae.own_stars.star_sets import noise_model, split_stars
 from psfdae.own_stars.training_images import OwnNoise, make_images, star_grid, training_columns
 from psfdae.own_stars.validation import Report
 from psfdae.rng import stream
+from psfdae.settings import ConfigError
 from psfdae.stages import from_stars as stage
 from psfdae.stages import simulate
 from psfdae.stages.evaluate import READS

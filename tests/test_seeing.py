@@ -9,12 +9,13 @@ from scipy.signal import fftconvolve
 from scipy.special import j0
 
 from psfdae.belonging import STARS, STATIC, require
-from psfdae.configuration.compose import ConfigError, load
+from psfdae.configuration.compose import load
 from psfdae.files import ProductError
 from psfdae.optics.propagation import StampPropagator
 from psfdae.optics.pupil import SamplingError, annular_pupil
 from psfdae.optics.seeing import FAINT, BlurredPropagator, Profile
 from psfdae.optics.wavefronts import zernike_images
+from psfdae.settings import ConfigError
 from psfdae.stages.common import template_wavefronts
 from psfdae.stars import framing
 from psfdae.stars.framing import Propagation

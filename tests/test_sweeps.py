@@ -11,8 +11,9 @@ import pytest
 import yaml
 
 from psfdae.configuration import compose
-from psfdae.configuration.compose import ConfigError, config_dir, load
+from psfdae.configuration.compose import config_dir, load
 from psfdae.configuration.sweep import Axis, load_sweep, sweep_names
+from psfdae.settings import ConfigError
 from psfdae.sweeps import adaptive
 from psfdae.sweeps.points import SweepError, draws, grid, plan_sweep, tidy, with_values
 

@@ -11,14 +11,7 @@ from command_line import psfdae, refused
 from fits_inputs import open_observation
 from psfdae.alignment.stamps import AlignmentStamps, mean_slope
 from psfdae.alignment.telescope import zernike_tracer
-from psfdae.configuration.compose import (
-    ConfigError,
-    as_overrides,
-    compose,
-    load,
-    load_stage,
-    stage_tree,
-)
+from psfdae.configuration.compose import compose, load, load_stage, stage_tree
 from psfdae.configuration.consistency import SIMULATION, STATIC
 from psfdae.files import read_product
 from psfdae.optics.pupil import annular_pupil
@@ -29,6 +22,7 @@ from psfdae.optics.wavefronts import (
     zernike_images,
     zernike_wavefronts,
 )
+from psfdae.settings import ConfigError, as_overrides
 from psfdae.stages import stars
 from psfdae.stages.common import star_wavefronts, template_wavefronts
 from psfdae.stars.fields import relative_field

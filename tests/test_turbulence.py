@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.special import jv
 
-from psfdae.configuration.compose import ConfigError, load
+from psfdae.configuration.compose import load
 from psfdae.optics.pupil import SamplingError, annular_pupil, pupil_axis
 from psfdae.optics.turbulence import (
     SPECTRUM,
@@ -21,6 +21,7 @@ from psfdae.optics.turbulence import (
 )
 from psfdae.optics.wavefronts import zernike_basis
 from psfdae.rng import stream
+from psfdae.settings import ConfigError
 from psfdae.stars.fields import square_grid
 from psfdae.stars.scenes import TurbulenceScene
 

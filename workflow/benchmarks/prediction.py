@@ -17,12 +17,13 @@ import numpy as np
 from measure import alone, cost_of_command, write, yes
 from psfdae.belonging import STARS, require
 from psfdae.cli import File, command, program
-from psfdae.configuration.compose import ConfigError, part
+from psfdae.configuration.compose import part
 from psfdae.configuration.consistency import SIMULATION
 from psfdae.configuration.schema import Config
 from psfdae.files import read_product
 from psfdae.own_stars import star_sets
 from psfdae.rng import stream
+from psfdae.settings import ConfigError
 from psfdae.stars.fields import assign_fields, draw_jitter, perturb, relative_field
 from psfdae.stars.framing import brightest_pixel, crop_jittered, normalise_flux
 from psfdae.stars.noise import NoiseModel, mixed_levels

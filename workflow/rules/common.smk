@@ -8,7 +8,8 @@ from importlib import import_module
 from snakemake.utils import validate
 
 from psfdae.cli import stage
-from psfdae.configuration.compose import ConfigError, as_overrides, config_dir
+from psfdae.settings import ConfigError, as_overrides
+from psfdae.configuration.compose import config_dir
 from psfdae.configuration.compose import compose, dataset_names, decisive, load
 from psfdae.configuration.compose import keep_in, load_groups, neutral, overrides_for
 from psfdae.configuration.compose import write_settings

@@ -11,17 +11,11 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
-from psfdae.configuration.base import CheckpointSeconds, PupilSamples
-from psfdae.configuration.schema import (
-    Count,
-    Evaluation,
-    Group,
-    Noise,
-    Positive,
-)
+from psfdae.configuration.base import PupilSamples
 from psfdae.configuration.telescope import Telescope
 from psfdae.configuration.wavefront import Prescription
 from psfdae.estimators.dae import DaeSettings, Train
+from psfdae.settings import CheckpointSeconds, Count, Evaluation, Group, Noise, Positive
 
 
 class AlignmentOptics(Group):

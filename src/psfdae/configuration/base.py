@@ -1,4 +1,4 @@
-"""What every configuration model is made of."""
+"""Folder of the configuration, and types that its models share."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from functools import cache
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, Field
 
-from psfdae.errors import Error
+from psfdae.settings import ConfigError
 
 SEARCH = 48.0
 """λ/D around the chief ray within which brightest pixels are searched by default.
@@ -18,13 +18,8 @@ Four times the distance of the farthest template of scene 1; a peak that lies
 farther out is searched at twice the distance, then refused.
 """
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Fraction = Annotated[float, Field(ge=0, lt=1)]
-Count = Annotated[int, Field(ge=1)]
 # Left out of products: they state the distance in pixels that follows.
 SearchDistance = Annotated[float, Field(gt=0, allow_inf_nan=False, exclude=True)]
-Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_]+$")]
 
 
 def _ascending(ladder: list[int]) -> list[int]:
@@ -36,21 +31,6 @@ def _ascending(ladder: list[int]) -> list[int]:
 PupilSamples = Annotated[
     list[Annotated[int, Field(ge=16, le=8192)]], Field(min_length=1), AfterValidator(_ascending)
 ]
-
-NEUTRAL = "cannot change a result"
-"""Marks a setting of which no byte of a result depends: another value repeats no job."""
-
-CheckpointSeconds = Annotated[float, Field(ge=0), NEUTRAL]
-
-
-class Group(BaseModel):
-    """A config group: immutable, and no key beyond those declared."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class ConfigError(Error, ValueError):
-    """The configuration is not usable; every line names a key, its value and the range."""
 
 
 def config_dir() -> Path:

@@ -12,16 +12,17 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from pydantic import ValidationError, create_model
+from pydantic import create_model
 
 from psfdae.configuration.alignment import AlignmentConfig
-from psfdae.configuration.base import NEUTRAL, ConfigError, config_dir
+from psfdae.configuration.base import config_dir
 from psfdae.configuration.consistency import Consistent, stage_model, with_derived
 from psfdae.configuration.outline import filled, outline_of
-from psfdae.configuration.schema import Group, whole_config
+from psfdae.configuration.schema import whole_config
 from psfdae.estimators import all_groups, methods_in
 from psfdae.files import ProductError, write_text
 from psfdae.reading import parse_yaml
+from psfdae.settings import NEUTRAL, ConfigError, Group, validate
 
 Root = Literal["config", "alignment"]
 """Root files of the configuration: the datasets', and that of scene 3."""
@@ -32,10 +33,6 @@ ROOTS: tuple[Root, ...] = get_args(Root)
 def model_of(root: Root) -> type[Group]:
     """The checked model of a root."""
     return whole_config() if root == "config" else AlignmentConfig
-
-
-LONGEST = 200
-"""Characters of a wrong value that a message repeats."""
 
 
 def compose(overrides: Sequence[str] = (), root: Root = "config") -> dict[str, Any]:
@@ -250,20 +247,6 @@ def _named(path: Path, check: Callable[[], Any]) -> Any:
     except ConfigError as error:
         lines = "\n".join(f"{path}: {line}" for line in str(error).splitlines())
         raise ConfigError(lines) from None
-
-
-def validate(model: type[Any], tree: Mapping[str, Any]) -> Any:
-    """Check a configuration tree against a pydantic model.
-
-    Raises
-    ------
-    ConfigError
-        One line per finding: key = value: what is allowed.
-    """
-    try:
-        return model.model_validate(tree)
-    except ValidationError as error:
-        raise ConfigError("\n".join(_finding(e) for e in error.errors())) from None
 
 
 def load_stage(reads: tuple[str, ...], overrides: Sequence[str] = (), root: Root = "config") -> Any:
@@ -493,46 +476,6 @@ def _part(tree: Mapping[str, Any], wanted: Callable[[tuple[str, str]], bool]) ->
         elif wanted((group, "")):
             part[group] = value
     return part
-
-
-def as_overrides(tree: Mapping[str, Any]) -> list[str]:
-    """Hydra overrides that pin every leaf of a tree, in a fixed order.
-
-    The list is at once a command line, the trigger of a rerun (the same
-    configuration gives the same text, comments and number formats do not count)
-    and something that a person can paste.
-    """
-    return [f"++{key}={_literal(value)}" for key, value in sorted(_leaves(tree))]
-
-
-def _leaves(tree: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
-    leaves: list[tuple[str, Any]] = []
-    for key, value in tree.items():
-        if isinstance(value, Mapping):
-            leaves += _leaves(value, f"{prefix}{key}.")
-        else:
-            leaves.append((prefix + key, value))
-    return leaves
-
-
-def _literal(value: Any) -> str:
-    if isinstance(value, list):
-        return "[" + ",".join(_literal(item) for item in value) + "]"
-    return value if isinstance(value, str) else json.dumps(value)
-
-
-def _finding(error: Mapping[str, Any]) -> str:
-    key = ".".join(str(part) for part in error["loc"])
-    message = error["msg"].removeprefix("Value error, ")
-    if error["type"] == "extra_forbidden":
-        return f"{key}: unknown key"
-    if error["type"] == "missing":
-        return f"{key}: missing"
-    if error["type"] == "value_error":
-        return f"{key}: {message}" if key else message
-    given = repr(error["input"])
-    given = given if len(given) <= LONGEST else f"{given[:LONGEST]}…"
-    return f"{key} = {given}: {message[0].lower()}{message[1:]}"
 
 
 def _first_lines(error: Exception) -> str:

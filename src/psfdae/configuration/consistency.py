@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError, create_model, model_validator
 
-from psfdae.configuration.base import SEARCH, Group
+from psfdae.configuration.base import SEARCH
 from psfdae.configuration.telescope import Telescope, has_own_aberrations
+from psfdae.settings import Group
 
 SIMULATION = ("seed", "scene", "telescope", "grid", "wavefront", "stars", "framing", "optics")
 """Groups that decide the noise-free stars."""

@@ -12,18 +12,20 @@ from typing import Any
 
 from pydantic import Field, create_model
 
-from psfdae.configuration.base import ConfigError, Group
-from psfdae.configuration.compose import load_stage, validate
-from psfdae.configuration.schema import (
+from psfdae.configuration.compose import load_stage
+from psfdae.configuration.schema import MethodNames
+from psfdae.estimators import registered
+from psfdae.settings import (
     CalibrationStars,
+    ConfigError,
     Evaluation,
-    MethodNames,
+    Group,
     Noise,
     Parts,
     Seed,
     Stamp,
+    validate,
 )
-from psfdae.estimators import registered
 
 CHOSEN = "dataset=from_stars"
 """The choice of the configuration's files with the same values."""

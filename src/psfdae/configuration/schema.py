@@ -11,22 +11,25 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, create_model, model_validator
 
-from psfdae.configuration.base import (
-    SEARCH,
-    Count,
-    Group,
-    Name,
-    Positive,
-    PupilSamples,
-    SearchDistance,
-)
+from psfdae.configuration.base import SEARCH, PupilSamples, SearchDistance
 from psfdae.configuration.consistency import Consistent
 from psfdae.configuration.telescope import AnyTelescope
 from psfdae.configuration.wavefront import OfTelescope, Seidel, VonKarman
 from psfdae.estimators import Method, registered
-
-Reference = Literal["realisation", "template"]
-SplitKind = Literal["random", "held_out"]
+from psfdae.settings import (
+    CalibrationStars,
+    Count,
+    Evaluation,
+    Group,
+    Name,
+    Noise,
+    Parts,
+    Positive,
+    Reference,
+    Seed,
+    SplitKind,
+    Stamp,
+)
 
 
 class Grid(Group):
@@ -66,21 +69,6 @@ class Stars(Group):
     )
 
 
-class Stamp(Group):
-    """Size and centring of stamps."""
-
-    stamp_px: Annotated[int, Field(ge=8, le=256, multiple_of=2)] = Field(
-        16, description="Side d of a stamp"
-    )
-    jitter_px: Annotated[int, Field(ge=0, le=8)] = Field(
-        1, description="Centring error, uniform in ± this many whole pixels per axis"
-    )
-    subpixel: bool = Field(
-        True,
-        description="Pixel grid of every realisation anywhere within ± ½ pixel, as for real stars",
-    )
-
-
 class Framing(Stamp):
     """Stamps of simulated stars."""
 
@@ -108,29 +96,6 @@ class Optics(Group):
     threads: Count = Field(description="Threads of the linear algebra")
 
 
-class Noise(Group):
-    """A noise band: the levels λ that one dataset mixes."""
-
-    name: Name = Field(description="For titles and messages")
-    levels: Annotated[list[Positive], Field(min_length=1)] = Field(
-        description="Noise levels λ of the paper"
-    )
-    kappa: Positive = Field(description="Pixel RMS of the normalised image per unit of λ")
-    background_photons: Annotated[float, Field(gt=0, le=1e12)] = Field(
-        description="Sky photons per pixel"
-    )
-
-
-class Parts(Group):
-    """Sizes of the training, validation and test parts."""
-
-    train_stars: Count = Field(3000, description="Training stars, validation included")
-    test_stars: Count = Field(300, description="Test stars of the random split")
-    validation_fraction: Annotated[float, Field(gt=0, le=0.5)] = Field(
-        0.1, description="Part of the training stars that selects the best state"
-    )
-
-
 class Dataset(Group):
     """A dataset of the paper: stars, a noise band, splits and references."""
 
@@ -144,14 +109,6 @@ class Dataset(Group):
     shown_levels: Annotated[list[Positive], Field(min_length=1)] = Field(
         description="Noise levels λ of the figure of restored stars; extremes if none is in band"
     )
-
-
-class Evaluation(Group):
-    """Image metrics."""
-
-    data_range: Positive = Field(0.66, description="SSIM dynamic range fitted to the paper's rows")
-    batch: Count = Field(256, description="Stars per forward pass")
-    threads: Count = Field(1, description="Threads of the linear algebra")
 
 
 class Calibration(Group):
@@ -198,47 +155,6 @@ class Bounds(Group):
     threads: Count = Field(description="Threads of the linear algebra")
 
 
-class CalibrationStars(Group):
-    """Which stars of an image become training data, and the noise that they get."""
-
-    snr_min: Positive = Field(100.0, description="Least S/N of a star that is learnt from")
-    isolation_px: Positive = Field(
-        12.0, description="Distance within which a neighbour is too close"
-    )
-    neighbour_ratio: Positive = Field(
-        0.02,
-        description="Brightness of such a neighbour, in that of the star, from which it disturbs",
-    )
-    misfit: Annotated[float, Field(gt=1, allow_inf_nan=False)] = Field(
-        2.5, description="Difference of a misfit from the nearest stars, in that of the median star"
-    )
-    search_px: Annotated[int, Field(ge=1, le=16)] = Field(
-        3, description="The brightest pixel is searched within ± this of the catalogue's position"
-    )
-    margin_px: Annotated[int, Field(ge=0, le=64)] = Field(
-        8, description="Pixels around a stamp, in which the sky is measured"
-    )
-    stars_min: Annotated[int, Field(ge=10)] = Field(20, description="Fewest stars to learn from")
-    bins: Annotated[int, Field(ge=1, le=64)] = Field(
-        4, description="Parts of the field along a side; stars of a part are stacked"
-    )
-    snr_levels: Annotated[list[Positive], Field(min_length=1)] = Field(
-        [5.0, 10.0, 20.0, 50.0],
-        description="S/N to which bright stars are degraded, ascending; those above snr_min / 2, "
-        "where the stars' own noise would count, are that",
-    )
-
-    @model_validator(mode="after")
-    def _levels(self) -> CalibrationStars:
-        if sorted(set(self.snr_levels)) != self.snr_levels:
-            raise ValueError(f"snr_levels = {self.snr_levels}: must be ascending")
-        return self
-
-    def degraded(self) -> list[float]:
-        """S/N to which bright stars are degraded, ascending, none above snr_min / 2."""
-        return sorted({min(level, 0.5 * self.snr_min) for level in self.snr_levels})
-
-
 def _listed(name: str) -> str:
     names = [method.name for method in registered()]
     if name not in names:
@@ -248,7 +164,6 @@ def _listed(name: str) -> str:
 
 MethodName = Annotated[str, AfterValidator(_listed)]
 MethodNames = Annotated[list[MethodName], Field(min_length=1)]
-Seed = Annotated[int, Field(ge=0, lt=2**63)]
 
 
 class Workflow(Group):

@@ -8,10 +8,9 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from psfdae.configuration.alignment import NETWORKS
-from psfdae.configuration.base import Count, Finite, Group, Name
-from psfdae.configuration.compose import ConfigError, Root, config_dir, load_file
-from psfdae.configuration.schema import Reference, SplitKind
+from psfdae.configuration.compose import Root, config_dir, load_file
 from psfdae.estimators import groups_of, method, registered
+from psfdae.settings import ConfigError, Count, Finite, Group, Name, Reference, SplitKind
 
 Scalar = bool | int | float | str
 Value = Scalar | list[Scalar]

@@ -13,10 +13,10 @@ from pydantic import (
     model_validator,
 )
 
-from psfdae.configuration.base import Fraction, Group, Name, Positive
 from psfdae.configuration.wavefront import Raytraced, Seidel, Zernike
 from psfdae.optics.pupil import pixel_width
 from psfdae.optics.seeing import Profile
+from psfdae.settings import Fraction, Group, Name, Positive
 
 ABERRATIONS: dict[str, type[Group]] = {
     "seidel": Seidel,

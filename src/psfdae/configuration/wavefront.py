@@ -9,8 +9,8 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
-from psfdae.configuration.base import Finite, Group, Name, Positive
 from psfdae.optics.wavefronts import SEIDEL_TERMS
+from psfdae.settings import Finite, Group, Name, Positive
 
 
 def _not_zero(value: float) -> float:

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 import numpy as np
 
 from psfdae.belonging import TRAINED_ON, require_training, write_origin
-from psfdae.configuration.base import ConfigError, Group, config_dir
+from psfdae.configuration.base import config_dir
 from psfdae.errors import Error
 from psfdae.files import (
     Column,
@@ -34,11 +34,12 @@ from psfdae.files import (
     write_text,
 )
 from psfdae.reading import parse_yaml
+from psfdae.settings import ConfigError, Group
 from psfdae.stars.noise import NoiseModel, mixed_levels
 
 if TYPE_CHECKING:
-    from psfdae.configuration.schema import Evaluation
     from psfdae.own_stars.bundle import BundleInfo
+    from psfdae.settings import Evaluation
 
 CONFIG, HISTORY = "config.yaml", "history.csv"
 """Resolved configuration and course of a training, in the folder of a network."""

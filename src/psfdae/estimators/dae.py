@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from psfdae.configuration.base import CheckpointSeconds, Count, Group
 from psfdae.estimators import CONFIG, HISTORY, FitError, Method, TrainingSet
 from psfdae.files import as_yaml, write_text
 from psfdae.reading import from_tree, read_yaml
+from psfdae.settings import CheckpointSeconds, Count, Group, deciding
 
 if TYPE_CHECKING:
-    from psfdae.configuration.schema import Evaluation
     from psfdae.estimators.dae_network import Dae as Network
     from psfdae.own_stars.bundle import BundleInfo
+    from psfdae.settings import Evaluation
 
 WEIGHTS = "dae.safetensors"
 
@@ -170,7 +170,7 @@ class Dae(Method):
         from psfdae.estimators.dae_network import train_dae
         from psfdae.estimators.training import fingerprint, progress
 
-        described = {"dae": dae.model_dump(), "train": train.model_dump(), "seed": data.seed}
+        described = {"dae": deciding(dae), "train": deciding(train), "seed": data.seed}
         described["noise"] = [data.levels.tolist(), data.noise.kappa, data.noise.background]
         sees = [data.images, data.references, data.fit, data.validation]
         if isinstance(data.start, Dae):
@@ -220,9 +220,9 @@ class Dae(Method):
         """As `Method.require`; the two files must be of the same training."""
         import torch
 
-        from psfdae.configuration.compose import validate
         from psfdae.estimators.dae_network import Dae as Network
         from psfdae.estimators.weights import with_weights
+        from psfdae.settings import validate
 
         described, batch = cls.described(place), 256
         settings = from_tree(

@@ -32,8 +32,8 @@ from typing import Annotated, Any, ClassVar, NamedTuple, Self
 import numpy as np
 from pydantic import Field
 
-from psfdae.configuration.base import Count, Fraction, Group, Positive
 from psfdae.estimators import BrightStamps, Estimate, FitError, Measured, Method, TrainingSet
+from psfdae.settings import Count, Fraction, Group, Positive
 from psfdae.stars.field_model import FieldFit, FieldModel, Frames, fit_field, slopes
 from psfdae.stars.noise import NoiseModel
 

@@ -39,9 +39,9 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, Self
 import numpy as np
 from pydantic import Field
 
-from psfdae.configuration.base import Count, Group, Positive
 from psfdae.estimators import Estimate, FitError, Method, TrainingSet
 from psfdae.rng import stream
+from psfdae.settings import Count, Group, Positive
 from psfdae.stars.noise import NoiseModel
 
 if TYPE_CHECKING:

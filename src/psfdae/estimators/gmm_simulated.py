@@ -7,9 +7,9 @@ from typing import Any, ClassVar, Self
 
 from pydantic import Field
 
-from psfdae.configuration.base import Count
 from psfdae.estimators import TrainingSet
 from psfdae.estimators.gmm import GaussianMixture, Gmm
+from psfdae.settings import Count
 
 
 class Simulated(Gmm):

@@ -21,10 +21,10 @@ import numpy as np
 from pydantic import Field
 
 from psfdae.belonging import require
-from psfdae.configuration.base import Count, Group, Positive
 from psfdae.estimators import FitError, Method, TrainingSet
 from psfdae.files import Column, Product, read_product, write_product
 from psfdae.rng import stream
+from psfdae.settings import Count, Group, Positive
 
 
 class Baseline(Group):

@@ -262,11 +262,9 @@ def train(
     )
 
 
-def fingerprint(described: Mapping[str, Any], *arrays: np.ndarray) -> str:
-    """Hash of what a training sees, and of what of its configuration counts."""
-    from psfdae.configuration.compose import decisive
-
-    digest = hashlib.sha256(json.dumps(decisive(described), sort_keys=True).encode())
+def fingerprint(deciding: Mapping[str, Any], *arrays: np.ndarray) -> str:
+    """Hash of what a training sees, and of the settings that decide its result."""
+    digest = hashlib.sha256(json.dumps(deciding, sort_keys=True).encode())
     for array in arrays:
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from psfdae.configuration.base import ConfigError
 from psfdae.configuration.compose import part
 from psfdae.configuration.own_stars import with_keywords
 from psfdae.estimators import Method, groups_of
@@ -25,6 +24,7 @@ from psfdae.own_stars.star_sets import (
 )
 from psfdae.own_stars.stars import REFERENCE, SPLIT, Stars
 from psfdae.rng import stream
+from psfdae.settings import ConfigError
 from psfdae.threads import fixed_threads
 
 

@@ -22,7 +22,8 @@ from psfdae.own_stars.stamps import Stamps, StarFlag, cut, peaks, sky_around
 if TYPE_CHECKING:
     from astropy.table import Table
 
-    from psfdae.configuration.schema import CalibrationStars, Framing
+    from psfdae.configuration.schema import Framing
+    from psfdae.settings import CalibrationStars
 
 ROWS = 2048  # stars that are measured at a time
 REGISTRATION_ROUNDS = 10  # of the windowed centroid; each leaves less than a fifth of the distance

@@ -21,7 +21,8 @@ from psfdae.own_stars.stamps import cut
 from psfdae.stars.fields import draw_jitter, draw_phase
 
 if TYPE_CHECKING:
-    from psfdae.configuration.schema import Framing, Parts
+    from psfdae.configuration.schema import Framing
+    from psfdae.settings import Parts
 
 IMAGES_AT_A_TIME = 512  # made before they are framed; bounds the memory
 TINY = 1e-300

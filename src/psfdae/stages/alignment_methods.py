@@ -32,6 +32,7 @@ from psfdae.alignment.stamps import AlignmentStamps
 from psfdae.belonging import STATE_STAMPS, require, require_origin, write_origin
 from psfdae.cli import AboveZero, File, Folder, command
 from psfdae.configuration.alignment import NETWORKS, AlignmentConfig, NetworkTrain
+from psfdae.configuration.compose import decisive
 from psfdae.estimators import CONFIG, HISTORY, TrainingSet
 from psfdae.estimators.dae import Dae
 from psfdae.files import (
@@ -155,7 +156,7 @@ def train_network(
         return NetworkTraining(data, getattr(config, settings.network), settings, config.seed, kind)
 
     with progress(settings.epochs) as report:
-        done = train(begin, checkpoint, fingerprint(described, data.stamps), report)
+        done = train(begin, checkpoint, fingerprint(decisive(described), data.stamps), report)
     save_weights(out / NETWORK_WEIGHTS, done.result, described)
     write_origin(out, product)
     write_text(out / HISTORY, as_csv(done.history))
@@ -202,7 +203,7 @@ def network_predictor(folder: Path, config: Any) -> Callable[[np.ndarray], np.nd
 
     from psfdae.alignment.networks import load_network, predict_states
     from psfdae.alignment.telescope import mirror_symmetries
-    from psfdae.configuration.compose import validate
+    from psfdae.settings import validate
 
     torch.set_num_threads(config.evaluation.threads)
     path = folder / CONFIG

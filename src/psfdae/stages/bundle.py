@@ -10,7 +10,6 @@ import numpy as np
 
 from psfdae.belonging import SAME_IMAGE, SAME_STARS, STARS, require_origin
 from psfdae.cli import AboveZero, File, Folder, Reference, Split, command
-from psfdae.configuration.compose import as_overrides
 from psfdae.configuration.schema import Config
 from psfdae.estimators import CONFIG, Method, all_groups, method
 from psfdae.files import Product
@@ -34,6 +33,7 @@ from psfdae.own_stars.star_sets import (
     training_set,
 )
 from psfdae.rng import stream
+from psfdae.settings import as_overrides
 from psfdae.stages.common import check_outputs, limit_threads
 from psfdae.stages.evaluate import Models
 

@@ -11,8 +11,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from psfdae.cli import File, Folder, command
-from psfdae.configuration.base import ConfigError
-from psfdae.configuration.compose import as_overrides
 from psfdae.configuration.own_stars import CHOSEN, from_words, of_config
 from psfdae.configuration.schema import Config
 from psfdae.errors import Error
@@ -31,6 +29,7 @@ from psfdae.own_stars.fitting import best, described, fitted_to, makes_models, p
 from psfdae.own_stars.observation import Source
 from psfdae.own_stars.stars import Stars
 from psfdae.own_stars.validation import validate
+from psfdae.settings import ConfigError, as_overrides
 from psfdae.stages.common import check_outputs
 from psfdae.stages.mosaic import each, images_of, with_name
 from psfdae.stages.predict import Stated, write_list

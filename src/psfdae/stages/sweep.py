@@ -269,8 +269,8 @@ def _write_cost(folder: Path, seconds: float, cpu_seconds: float) -> None:
 
 def _open(trial: Trial) -> tuple[Any, dict[str, Any]]:
     """Module that asks, and axes of the space."""
-    from psfdae.configuration.compose import validate
     from psfdae.configuration.sweep import Axis
+    from psfdae.settings import validate
 
     space = {name: validate(Axis, axis) for name, axis in trial.search["space"].items()}
     return import_module(ADAPTIVE_MODULE), space
@@ -289,7 +289,7 @@ def _asked(
 
 def _with(config: Any, keys: Mapping[str, Any]) -> Any:
     """The stage's configuration with other values, checked again."""
-    from psfdae.configuration.compose import validate
+    from psfdae.settings import validate
 
     return validate(type(config), with_values(config.model_dump(), keys))
 

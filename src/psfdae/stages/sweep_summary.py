@@ -95,8 +95,8 @@ def _complete_journal(
     journal: Path, definition: Mapping[str, Any], results: Sequence[Mapping[str, Any]]
 ) -> None:
     """Note all trials, also those that a new journal did not learn from the ones after them."""
-    from psfdae.configuration.compose import validate
     from psfdae.configuration.sweep import Axis
+    from psfdae.settings import validate
     from psfdae.sweeps import adaptive
 
     space = {name: validate(Axis, axis) for name, axis in sorted(definition["space"].items())}
@@ -149,7 +149,7 @@ def _best_yaml(
     name: str, definition: Mapping[str, Any], given: Sequence[str], best: Mapping[str, Any]
 ) -> str:
     """The best point as overrides, those of the workflow before its own."""
-    from psfdae.configuration.compose import as_overrides
+    from psfdae.settings import as_overrides
 
     own = [override.removeprefix("++") for override in as_overrides(best["keys"])]
     tree = {
@@ -174,9 +174,9 @@ def sweep_figure(
     out: Annotated[File, "PNG."],
 ) -> None:
     """Draw all points at once, or the metric against each axis."""
-    from psfdae.configuration.compose import validate
     from psfdae.configuration.sweep import Axis
     from psfdae.evaluation import sweep_figures
+    from psfdae.settings import validate
 
     described = read_yaml(definition)
     logarithmic = [n for n, axis in described["space"].items() if validate(Axis, axis).log]

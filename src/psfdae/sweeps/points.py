@@ -11,19 +11,18 @@ from typing import Any
 import numpy as np
 
 from psfdae.configuration.compose import (
-    ConfigError,
     compose,
     config_dir,
     decisive,
     model_of,
     overrides_for,
     stage_tree,
-    validate,
 )
 from psfdae.configuration.consistency import SIMULATION
 from psfdae.configuration.sweep import Sweep, load_sweep
 from psfdae.errors import Error
 from psfdae.rng import stream
+from psfdae.settings import ConfigError, validate
 from psfdae.tracking import hash_of
 
 DIGITS = 4
