@@ -29,7 +29,7 @@ import pandas as pd
 
 from psfdae.alignment import methods as scene3
 from psfdae.configuration.compose import compose
-from psfdae.estimators import method
+from psfdae.estimators.registry import method
 from psfdae.evaluation.comparison import FITTED, SIGNIFICANT, seed_scatter, with_seed_stderr
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -11,9 +11,9 @@ from prediction_stars import fresh_psfs, with_network
 from psfdae import load_model
 from psfdae.alignment.telescope import design_states, fit_quadratic, grid_states, zernike_tracer
 from psfdae.configuration.compose import load
+from psfdae.noise import NoiseModel
 from psfdae.optics.pupil import annular_pupil
 from psfdae.own_stars.model import PsfModel
-from psfdae.stars.noise import NoiseModel
 from workflow_runs import snakemake
 
 FINISHED = ".built"

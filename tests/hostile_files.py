@@ -85,7 +85,7 @@ def write_good(folder):
 
     from fits_inputs import write_cube, write_field
     from prediction_stars import with_network
-    from psfdae.estimators.weights import save_weights
+    from psfdae.networks.weights import save_weights
     from psfdae.own_stars.bundle import read_bundle, shipped_path, write_bundle
 
     rng = np.random.default_rng(1)
@@ -339,7 +339,7 @@ def sign_bundle(text, arrays):
 
 
 def sign_weights(text, arrays):
-    from psfdae.estimators.weights import digest_of
+    from psfdae.networks.weights import digest_of
 
     return text | {"sha256": digest_of(arrays)}
 
@@ -560,7 +560,7 @@ def run(words):
     if words[0] == "load":
         import click
 
-        from psfdae.estimators.weights import load_weights
+        from psfdae.networks.weights import load_weights
 
         path = Path(words.pop())
         load = click.Command("load", callback=lambda: load_weights(path))

@@ -9,8 +9,8 @@ import torch
 
 from psfdae.configuration.compose import load_stage
 from psfdae.configuration.consistency import SIMULATION, STATIC
-from psfdae.estimators.dae_network import build_dae
 from psfdae.files import read_product
+from psfdae.networks.dae import build_dae
 from psfdae.own_stars.bundle import FREE, Architecture, BundleInfo
 from psfdae.stages import stars
 

@@ -31,7 +31,7 @@ from psfdae.alignment.stamps import AlignmentStamps
 from psfdae.alignment.telescope import mirror_symmetries, uniform_states
 from psfdae.configuration.alignment import Cnn, Perceptron
 from psfdae.configuration.compose import load
-from psfdae.estimators.training import TrainingError, train
+from psfdae.networks.training import TrainingError, train
 from psfdae.settings import ConfigError
 
 FIT = load((), "alignment").fit

@@ -10,7 +10,7 @@ from matplotlib.collections import PolyCollection
 
 from psfdae.configuration.compose import load_stage
 from psfdae.configuration.consistency import SIMULATION, STATIC
-from psfdae.estimators import method
+from psfdae.estimators.registry import method
 from psfdae.evaluation.curves import (
     MEANS,
     efficiency_against_noise,

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from safetensors.numpy import save_file
 
 from psfdae.cli import main
-from psfdae.estimators.dae_network import build_dae, predict
+from psfdae.networks.dae import build_dae, predict
 from psfdae.own_stars import packing
 from psfdae.own_stars.bundle import (
     Architecture,

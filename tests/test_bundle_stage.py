@@ -15,8 +15,9 @@ from psfdae.belonging import write_origin
 from psfdae.cli import main
 from psfdae.configuration.compose import load_stage
 from psfdae.configuration.consistency import SIMULATION, STATIC
-from psfdae.estimators import dae_network, groups_of
+from psfdae.estimators.registry import groups_of
 from psfdae.files import Column, ProductError, read_product, write_product
+from psfdae.networks import dae as dae_network
 from psfdae.own_stars import packing
 from psfdae.own_stars.bundle import (
     SCALES,
@@ -140,7 +141,7 @@ def test_unknown_optics_have_no_diffraction_limit(folder, tmp_path):
 def test_metrics_are_those_of_the_stage_evaluate(folder, tiny):
     config = load_stage(stage.bundle.stage.reads, TINY)
     images = gaussians(1400, 1)
-    from psfdae.stars.fields import random_split
+    from psfdae.splits import random_split
 
     test = random_split(1400, 1000, 400, config.parts.validation_fraction, config.seed).test
     stars = read_stars(folder / "stars.h5")

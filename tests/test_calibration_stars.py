@@ -29,7 +29,7 @@ from psfdae.own_stars.training_images import (
     star_of_images,
 )
 from psfdae.rng import stream
-from psfdae.stars.fields import held_out_fields
+from psfdae.splits import held_out_fields
 
 FRAMING = SimpleNamespace(stamp_px=16, jitter_px=1)
 

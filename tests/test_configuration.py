@@ -7,7 +7,7 @@ import pytest
 from psfdae.configuration import compose
 from psfdae.configuration.compose import config_dir, load, load_stage
 from psfdae.configuration.consistency import SIMULATION
-from psfdae.estimators import groups_of
+from psfdae.estimators.registry import groups_of
 from psfdae.settings import ConfigError, as_overrides
 from psfdae.stages.alignment_methods import train_dae, train_network
 from psfdae.stages.evaluate import READS
@@ -137,10 +137,11 @@ def test_a_file_of_settings_that_is_damaged_is_named(tmp_path):
 def test_a_checkpoint_does_not_depend_on_how_often_it_is_written():
     import numpy as np
 
-    from psfdae.estimators.training import fingerprint
+    from psfdae.networks.training import fingerprint
+    from psfdae.settings import deciding
 
     def of(*overrides):
-        return fingerprint(load(overrides).model_dump(), np.zeros(3))
+        return fingerprint(deciding(load(overrides).train), np.zeros(3))
 
     assert of("train.checkpoint_seconds=3") == of() != of("train.lr=0.003")
 

@@ -8,7 +8,7 @@ import pytest
 from scipy.stats import pearsonr
 from skimage.metrics import mean_squared_error, structural_similarity
 
-from psfdae.estimators import registered
+from psfdae.configuration.methods import registered
 from psfdae.evaluation.metrics import (
     all_metrics,
     clustered_mean,

@@ -24,13 +24,13 @@ from psfdae.cli import main
 from psfdae.configuration.compose import load_stage
 from psfdae.estimators import BrightStamps, FitError, TrainingSet
 from psfdae.estimators.field import TELLING, FieldMixture
+from psfdae.field_psf import Frames, fit_field
+from psfdae.noise import NoiseModel
 from psfdae.own_stars.bundle import read_bundle, write_bundle
-from psfdae.own_stars.example import add_stamps, write_field
 from psfdae.own_stars.model import PredictionError
 from psfdae.own_stars.shapes import measure_shapes
 from psfdae.stages import psf
-from psfdae.stars.field_model import Frames, fit_field
-from psfdae.stars.noise import NoiseModel
+from psfdae.stars.example import add_stamps, write_field
 
 SIDE, WIDE, FIELD = 10, 26, 1000.0
 SNR = (5.0, 10.0, 20.0, 50.0)

@@ -11,20 +11,15 @@ from psfdae.estimators.dae import Dae
 from psfdae.estimators.pca_som import PcaSom
 from psfdae.evaluation.curves import error_against_noise, training_curves
 from psfdae.evaluation.figure_style import in_field_unit
-from psfdae.evaluation.figures import (
-    StripRow,
-    mosaic,
-    restoration_strip,
-    spread_stars,
-    stamp_energy_map,
-    template_map,
-)
+from psfdae.evaluation.figures import mosaic, stamp_energy_map, template_map
 from psfdae.evaluation.paper import published
+from psfdae.evaluation.strip import StripRow, restoration_strip, spread_stars
 from psfdae.files import Column, ProductError, write_product
 from psfdae.own_stars.star_sets import noisy_test_images, read_stars
+from psfdae.splits import random_split
 from psfdae.stages import figures as stage
 from psfdae.stages.evaluate import READS, Models
-from psfdae.stars.fields import random_split, square_grid
+from psfdae.stars.fields import square_grid
 
 METHODS = ("noisy", "pca_som", "dae", "lmmse")
 LEVELS = (0.001, 0.002, 0.003, 0.005)

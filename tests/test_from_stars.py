@@ -22,15 +22,10 @@ from docs_pages import blocks, commands, read
 from fits_inputs import write_cube
 from psfdae.cli import main
 from psfdae.configuration.compose import load_stage
-from psfdae.estimators import groups_of, method
+from psfdae.estimators.registry import groups_of, method
 from psfdae.files import read_product, write_product
+from psfdae.noise import NoiseModel
 from psfdae.own_stars.bundle import estimator, read_bundle
-from psfdae.own_stars.example import (
-    RENDER_PX,
-    FieldRecipe,
-    example_field,
-    star_images,
-)
 from psfdae.own_stars.model import load_model
 from psfdae.own_stars.photometry import noise_equivalent_px
 from psfdae.own_stars.report import MEAN_PSF
@@ -47,12 +42,12 @@ from psfdae.own_stars.training_images import OwnNoise, make_images, star_grid, t
 from psfdae.own_stars.validation import Report
 from psfdae.rng import stream
 from psfdae.settings import ConfigError
+from psfdae.splits import held_out_fields
 from psfdae.stages import from_stars as stage
 from psfdae.stages import simulate
 from psfdae.stages.evaluate import READS
 from psfdae.stages.from_stars import Source, _alone, from_stars
-from psfdae.stars.fields import held_out_fields
-from psfdae.stars.noise import NoiseModel
+from psfdae.stars.example import RENDER_PX, FieldRecipe, example_field, star_images
 
 SIDE = {"side_px": 700, "bright": 60, "faint": 80, "blended": 6, "saturated": 3}
 TINY = ["preset=smoke", "parts.train_stars=120", "parts.test_stars=30", "train.epochs=1"]

@@ -14,9 +14,9 @@ from psfdae.estimators import gmm as module
 from psfdae.estimators.gmm import GaussianMixture, Gmm
 from psfdae.estimators.gmm_simulated import Simulated, SimulatedMixture
 from psfdae.files import Product
+from psfdae.noise import NoiseModel
 from psfdae.own_stars.bundle import BundleError
 from psfdae.own_stars.packing import packed
-from psfdae.stars.noise import NoiseModel
 
 NOISE = NoiseModel(kappa=5.0, background=1e4)
 D = 6

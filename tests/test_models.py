@@ -9,10 +9,15 @@ import numpy as np
 import pytest
 import torch
 
-from psfdae.estimators import TrainingSet, dae_network, pca_som
+from psfdae.estimators import TrainingSet, pca_som
 from psfdae.estimators.dae import Dae as Fitted
 from psfdae.estimators.dae import DaeSettings, Train
-from psfdae.estimators.dae_network import (
+from psfdae.estimators.lmmse import LinearMmse
+from psfdae.estimators.pca_som import Baseline, PcaFit, PcaSom, fit_pca_som
+from psfdae.evaluation.metrics import mse
+from psfdae.files import ProductError
+from psfdae.networks import dae as dae_network
+from psfdae.networks.dae import (
     DaeTraining,
     SingleChannelConv,
     build_dae,
@@ -20,12 +25,8 @@ from psfdae.estimators.dae_network import (
     predict,
     train_dae,
 )
-from psfdae.estimators.lmmse import LinearMmse
-from psfdae.estimators.pca_som import Baseline, PcaFit, PcaSom, fit_pca_som
-from psfdae.estimators.training import DeadNetworkError, TrainingError, orthogonal, progress
-from psfdae.estimators.weights import load_weights, save_checkpoint, save_weights
-from psfdae.evaluation.metrics import mse
-from psfdae.files import ProductError
+from psfdae.networks.training import DeadNetworkError, TrainingError, orthogonal, progress
+from psfdae.networks.weights import load_weights, save_checkpoint, save_weights
 from psfdae.rng import stream
 
 SOM = {"rows": 4, "columns": 4, "epochs": 3, "sigma": 1.0, "learning_rate": 0.5, "seed": 1}
@@ -289,7 +290,7 @@ def test_exploding_loss_stops_with_advice(data, tmp_path):
 
 
 def test_dead_network_restarts_and_then_gives_up(data, tmp_path, monkeypatch, capsys):
-    import psfdae.estimators.dae_network as module
+    import psfdae.networks.dae as module
 
     def dead(*args):
         model = build_dae(*args)
@@ -316,7 +317,7 @@ def test_every_check_notices_a_dead_network_and_no_other_step_looks(data):
 
 
 def test_restart_uses_other_weights(data, tmp_path, monkeypatch):
-    import psfdae.estimators.dae_network as module
+    import psfdae.networks.dae as module
 
     attempts = []
 

@@ -10,7 +10,7 @@ from textwrap import dedent
 
 import pytest
 
-from psfdae.estimators import registered
+from psfdae.configuration.methods import registered
 from psfdae.source import ROOT, Code, Reader, source_hash
 
 REPOSITORY = ROOT.parents[1]

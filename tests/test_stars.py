@@ -9,21 +9,13 @@ import pytest
 
 from psfdae.configuration.compose import load
 from psfdae.files import Product
+from psfdae.noise import mixed_levels
 from psfdae.optics.wavefronts import seidel_wavefronts, zernike_wavefronts
 from psfdae.own_stars.star_sets import noisy_test_images
 from psfdae.rng import stream
+from psfdae.splits import draw_jitter, draw_phase, held_out_fields, held_out_split, random_split
 from psfdae.stages.common import template_wavefronts
-from psfdae.stars.fields import (
-    assign_fields,
-    draw_jitter,
-    draw_phase,
-    held_out_fields,
-    held_out_split,
-    perturb,
-    random_split,
-    relative_field,
-    square_grid,
-)
+from psfdae.stars.fields import assign_fields, perturb, relative_field, square_grid
 from psfdae.stars.framing import (
     FramingError,
     Propagation,
@@ -31,7 +23,6 @@ from psfdae.stars.framing import (
     crop_jittered,
     normalise_flux,
 )
-from psfdae.stars.noise import mixed_levels
 
 
 @pytest.fixture(scope="module")

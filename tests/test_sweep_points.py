@@ -13,15 +13,15 @@ import yaml
 
 from psfdae.configuration.compose import compose, load, load_stage, stage_tree
 from psfdae.configuration.sweep import point_groups
-from psfdae.estimators import groups_of
 from psfdae.estimators.pca_som import PcaSom
+from psfdae.estimators.registry import groups_of
 from psfdae.files import Column, ProductError, write_product
 from psfdae.own_stars.star_sets import noise_model
+from psfdae.splits import random_split
 from psfdae.stages import sweep as stage
 from psfdae.stages import sweep_summary, track
 from psfdae.stages.alignment_methods import train_network
 from psfdae.stages.fit import baseline, train
-from psfdae.stars.fields import random_split
 from psfdae.sweeps.measured import Task
 from psfdae.sweeps.points import SweepError
 from psfdae.tracking import runs_of_sweep

@@ -16,8 +16,8 @@ from click.testing import CliRunner
 
 from psfdae import files
 from psfdae.cli import main
-from psfdae.estimators.weights import load_checkpoint, save_checkpoint, save_weights
 from psfdae.files import Column, Empty, atomic_path, stream_product, write_product, write_text
+from psfdae.networks.weights import load_checkpoint, save_checkpoint, save_weights
 from psfdae.stages import record
 
 

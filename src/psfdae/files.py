@@ -10,7 +10,7 @@ import json
 import os
 import re
 import secrets
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
@@ -466,3 +466,20 @@ def read_product(path: str | Path, kind: str, names: tuple[str, ...] | None = No
         raise ProductError(f"{path}: no such file") from None
     except (OSError, KeyError, ValueError) as error:
         raise ProductError(f"{path}: damaged ({error}); delete it and run again") from error
+
+
+class OutputError(Error, ValueError):
+    """A result would take the place of what it is made of."""
+
+
+def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Any]) -> None:
+    """Refuse outputs that are inputs, too; what is no path of a file is passed over.
+
+    Raises
+    ------
+    OutputError
+    """
+    given = {Path(name).resolve() for name in inputs if isinstance(name, str | Path)}
+    for out in outputs:
+        if out is not None and out.resolve() in given:
+            raise OutputError(f"{out}: is an input, too; choose another name")

@@ -83,3 +83,13 @@ def fixed_threads(threads: int) -> Iterator[None]:
         finally:
             if torch := sys.modules.get("torch"):
                 torch.set_num_threads(before)
+
+
+def limit_threads(threads: int) -> None:
+    """Use this many threads for linear algebra, whatever the environment says.
+
+    Results depend on it in the last digits, so it comes from the config.
+    """
+    from threadpoolctl import threadpool_limits
+
+    threadpool_limits(threads)

@@ -12,7 +12,9 @@ from typing import Any, NamedTuple
 
 from psfdae.alignment.methods import TRAINED
 from psfdae.belonging import STARS, require_origin
-from psfdae.estimators import HISTORY, Method, method, registered
+from psfdae.configuration.methods import registered
+from psfdae.estimators import HISTORY, Method
+from psfdae.estimators.registry import method
 from psfdae.files import ProductError, read_product
 from psfdae.reading import number, read_csv, read_yaml
 

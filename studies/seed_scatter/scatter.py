@@ -22,8 +22,8 @@ from torch.optim.lr_scheduler import OneCycleLR
 
 from psfdae.configuration.compose import load
 from psfdae.estimators.dae import Dae
-from psfdae.estimators.dae_network import DaeTraining, predict
 from psfdae.files import read_product
+from psfdae.networks.dae import DaeTraining, predict
 from psfdae.source import git_commit
 from psfdae.stages.common import noisy_test_images, split_stars
 from psfdae.stages.fit import training_set

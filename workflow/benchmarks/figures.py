@@ -5,11 +5,10 @@ from typing import Annotated, Literal
 import numpy as np
 
 from psfdae.cli import File, command, program
-from psfdae.estimators import method
-from psfdae.evaluation.figure_style import SERIES_COLORS, new_figure, styled
+from psfdae.estimators.registry import method
+from psfdae.evaluation.figure_style import SERIES_COLORS, new_figure, styled, write_png
 from psfdae.files import ProductError
 from psfdae.reading import read_table
-from psfdae.stages.common import write_png
 
 WAYS = {
     "kernel numpy": ("our kernel, numpy", "#0072b2", "o"),

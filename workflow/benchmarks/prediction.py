@@ -21,12 +21,13 @@ from psfdae.configuration.compose import part
 from psfdae.configuration.consistency import SIMULATION
 from psfdae.configuration.schema import Config
 from psfdae.files import read_product
+from psfdae.noise import NoiseModel, mixed_levels
 from psfdae.own_stars import star_sets
 from psfdae.rng import stream
 from psfdae.settings import ConfigError
-from psfdae.stars.fields import assign_fields, draw_jitter, perturb, relative_field
+from psfdae.splits import draw_jitter
+from psfdae.stars.fields import assign_fields, perturb, relative_field
 from psfdae.stars.framing import brightest_pixel, crop_jittered, normalise_flux
-from psfdae.stars.noise import NoiseModel, mixed_levels
 
 REQUIRED_SHARE = 0.6  # of the bare network's throughput, which a prediction must reach
 ALLOWED_MB = 1000.0  # memory that it may take
@@ -75,7 +76,7 @@ def throughput(
 
 def make_cube(tree, stars, count, out):
     """Write a FITS cube of the noise-free stars of a product in turn, sky and noise added."""
-    from psfdae.own_stars.example import write_cube
+    from psfdae.stars.example import write_cube
 
     images = read_product(stars, "stars", ("realisation",))["realisation"]
     rng = stream(tree["seed"], "prediction", "cube")
@@ -122,7 +123,7 @@ def bare_rate(model, stamps, threads, way):
     """Stamps per second of the network alone, on images that are in memory."""
     import torch
 
-    from psfdae.estimators.dae_network import predict
+    from psfdae.networks.dae import predict
     from psfdae.own_stars.model import BLOCK, one_thread_each
     from psfdae.threads import side_by_side
 

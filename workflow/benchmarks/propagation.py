@@ -20,7 +20,7 @@ from propagators import (
 from psfdae.cli import Folder, command, program
 from psfdae.configuration.schema import Config
 from psfdae.reading import read_table
-from psfdae.stages.common import limit_threads
+from psfdae.threads import limit_threads
 from savings import PACKAGES, finer_than_needed, imports, timed_savings
 from scenes import READS, Scene, build_cases
 

@@ -17,13 +17,13 @@ from measure import write
 from psfdae.cli import File, command, program
 from psfdae.configuration.consistency import SIMULATION
 from psfdae.configuration.schema import Config
+from psfdae.field_psf import slopes
 from psfdae.files import atomic_path
-from psfdae.own_stars.example import add_stamps, write_field
 from psfdae.own_stars.observation import central_pixel
 from psfdae.reading import read_table
 from psfdae.rng import stream
 from psfdae.source import git_commit
-from psfdae.stars.field_model import slopes
+from psfdae.stars.example import add_stamps, write_field
 
 SIDE = 48  # px of a simulated star
 PITCH = 64  # px of the lattice of the stars

@@ -16,8 +16,9 @@ from measure import alone, cost_of_command, write
 from prediction import make_cube
 from psfdae.cli import File, command, program
 from psfdae.configuration.consistency import SIMULATION
+from psfdae.configuration.methods import all_groups
 from psfdae.configuration.schema import Config
-from psfdae.estimators import all_groups, method
+from psfdae.estimators.registry import method
 from psfdae.rng import stream
 
 BATCHES = (1, 16, 64, 256, 1024)
@@ -56,7 +57,7 @@ def random_network(dae, width, side):
     """A network of one width with random weights, and the factor of its images."""
     import torch
 
-    from psfdae.estimators.dae_network import build_dae, image_scale
+    from psfdae.networks.dae import build_dae, image_scale
 
     widths, seed = [width] * len(dae["widths"]), torch.Generator().manual_seed(width)
     return build_dae(dae["kernels"], widths, "he", seed), image_scale(dae["scale"], side)
@@ -69,7 +70,7 @@ def onnx_path(folder, width, side):
 
 def export_networks(dae, sizes, folder):
     """Export random networks of each width and side of the stamps."""
-    from psfdae.estimators.dae_network import export_onnx
+    from psfdae.networks.dae import export_onnx
 
     for size in sizes:
         export_onnx(*random_network(dae, *size), size[1], onnx_path(folder, *size))
@@ -78,13 +79,13 @@ def export_networks(dae, sizes, folder):
 def network(engine, dae, folder, size, threads):
     """An exported network, or in torch `predict` as every stage calls it."""
     if engine == "onnxruntime":
-        from psfdae.estimators.dae_network import session
+        from psfdae.networks.dae import session
 
         run = session(onnx_path(folder, *size), threads).run
         return lambda images: run(None, {"images": images})[0]
     import torch
 
-    from psfdae.estimators.dae_network import predict
+    from psfdae.networks.dae import predict
 
     torch.set_num_threads(threads)
     model, factor = random_network(dae, *size)

@@ -14,8 +14,9 @@ from psfdae.belonging import STARS, require
 from psfdae.cli import File, Folder, Reference, command, program
 from psfdae.configuration.compose import config_dir, decisive, load_file, part
 from psfdae.configuration.consistency import SIMULATION
+from psfdae.configuration.methods import all_groups
 from psfdae.configuration.schema import Config
-from psfdae.estimators import all_groups, groups_of, method
+from psfdae.estimators.registry import groups_of, method
 from psfdae.files import read_product, write_csv
 from psfdae.own_stars import star_sets
 from psfdae.reading import read_table, read_yaml

@@ -13,7 +13,9 @@ from psfdae.configuration.compose import config_dir
 from psfdae.configuration.compose import compose, dataset_names, decisive, load
 from psfdae.configuration.compose import keep_in, load_groups, neutral, overrides_for
 from psfdae.configuration.compose import write_settings
-from psfdae.estimators import HISTORY, method, registered
+from psfdae.estimators import HISTORY
+from psfdae.estimators.registry import method
+from psfdae.configuration.methods import registered
 from psfdae.files import DIGESTS, ProductError
 from psfdae.source import source_hash
 from psfdae.sweeps.points import SweepError

@@ -18,7 +18,7 @@ import numpy as np
 
 from psfdae.alignment.stamps import AlignmentStamps
 from psfdae.alignment.telescope import QuadraticModel
-from psfdae.stars.noise import NoiseModel
+from psfdae.noise import NoiseModel
 
 Stamps = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 """Of parameters (n, K) stamps and derivatives, as `stamps_and_slopes` gives them."""

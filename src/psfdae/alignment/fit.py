@@ -17,7 +17,7 @@ import numpy as np
 
 from psfdae.alignment.fisher import Stamps, score_and_information
 from psfdae.configuration.alignment import Fit
-from psfdae.stars.noise import NoiseModel
+from psfdae.noise import NoiseModel
 
 ROUNDING = 1e-6
 """Relative rise of the deviance that stamps in single precision may cause."""

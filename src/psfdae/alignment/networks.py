@@ -24,10 +24,10 @@ from torch import nn
 
 from psfdae.alignment.telescope import Mirror, mirror_symmetries
 from psfdae.configuration.alignment import Cnn, NetworkTrain, Perceptron
-from psfdae.estimators.training import Row, Training
-from psfdae.estimators.weights import with_weights
+from psfdae.networks.training import Row, Training
+from psfdae.networks.weights import with_weights
+from psfdae.noise import NoiseModel, mixed_levels
 from psfdae.rng import stream
-from psfdae.stars.noise import NoiseModel, mixed_levels
 
 PARAMETERS = 4
 """Numbers of a state: decentre x, y and tilt x, y in units of the range."""

@@ -8,8 +8,8 @@ from itertools import product
 
 import numpy as np
 
+from psfdae.noise import NoiseModel
 from psfdae.stars.framing import crop_jittered, normalise_flux
-from psfdae.stars.noise import NoiseModel
 from psfdae.stars.symmetry import SYMMETRIES, Symmetry
 
 MIRROR_MARGIN = 1

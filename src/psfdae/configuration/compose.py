@@ -17,9 +17,9 @@ from pydantic import create_model
 from psfdae.configuration.alignment import AlignmentConfig
 from psfdae.configuration.base import config_dir
 from psfdae.configuration.consistency import Consistent, stage_model, with_derived
+from psfdae.configuration.methods import all_groups, methods_in
 from psfdae.configuration.outline import filled, outline_of
 from psfdae.configuration.schema import whole_config
-from psfdae.estimators import all_groups, methods_in
 from psfdae.files import ProductError, write_text
 from psfdae.reading import parse_yaml
 from psfdae.settings import NEUTRAL, ConfigError, Group, validate

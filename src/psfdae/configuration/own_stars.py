@@ -14,7 +14,7 @@ from pydantic import Field, create_model
 
 from psfdae.configuration.compose import load_stage
 from psfdae.configuration.schema import MethodNames
-from psfdae.estimators import registered
+from psfdae.estimators.registry import known
 from psfdae.settings import (
     CalibrationStars,
     ConfigError,
@@ -51,7 +51,7 @@ def settings_model() -> type[Any]:
     """The model of all settings, those of the methods of `config.yaml` included."""
     groups: dict[str, Any] = {
         name: (group, Field(default_factory=group))
-        for kind in registered()
+        for kind in known()
         for name, group in kind.groups.items()
     }
     return create_model("Settings", __base__=_Settings, **groups)

@@ -13,9 +13,10 @@ from pydantic import AfterValidator, Field, create_model, model_validator
 
 from psfdae.configuration.base import SEARCH, PupilSamples, SearchDistance
 from psfdae.configuration.consistency import Consistent
+from psfdae.configuration.methods import registered
 from psfdae.configuration.telescope import AnyTelescope
 from psfdae.configuration.wavefront import OfTelescope, Seidel, VonKarman
-from psfdae.estimators import Method, registered
+from psfdae.estimators import Method
 from psfdae.settings import (
     CalibrationStars,
     Count,

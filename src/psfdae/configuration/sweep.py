@@ -9,7 +9,8 @@ from pydantic import AfterValidator, Field, model_validator
 
 from psfdae.configuration.alignment import NETWORKS
 from psfdae.configuration.compose import Root, config_dir, load_file
-from psfdae.estimators import groups_of, method, registered
+from psfdae.configuration.methods import registered
+from psfdae.estimators.registry import groups_of, method
 from psfdae.settings import ConfigError, Count, Finite, Group, Name, Reference, SplitKind
 
 Scalar = bool | int | float | str

@@ -13,29 +13,23 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cache
-from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 
 from psfdae.belonging import TRAINED_ON, require_training, write_origin
-from psfdae.configuration.base import config_dir
 from psfdae.errors import Error
 from psfdae.files import (
     Column,
     Product,
-    ProductError,
     as_csv,
     read_product,
     write_product,
     write_text,
 )
-from psfdae.reading import parse_yaml
-from psfdae.settings import ConfigError, Group
-from psfdae.stars.noise import NoiseModel, mixed_levels
+from psfdae.noise import NoiseModel, mixed_levels
+from psfdae.settings import Group
 
 if TYPE_CHECKING:
     from psfdae.own_stars.bundle import BundleInfo
@@ -504,77 +498,3 @@ class Method:
         """
         options = {"split": split} | ({"reference": reference} if cls.per_reference else {})
         require_training(place, cls.described(place), stars, config, **options)
-
-
-def groups_of(name: str, **options: Any) -> tuple[str, ...]:
-    """Groups of the configuration that decide a fit of a method."""
-    return ("seed", "noise", "parts", *method(name).groups)
-
-
-def method(name: str) -> type[Method]:
-    """The method of a name.
-
-    Raises
-    ------
-    ProductError
-        If there is none.
-    """
-    try:
-        module = import_module(f"psfdae.estimators.{name}")
-    except ModuleNotFoundError as error:
-        if not (error.name or "").startswith("psfdae.estimators."):
-            raise
-        raise ProductError(f"no method {name!r}; there are {', '.join(_known())}") from None
-    for kind in vars(module).values():
-        if isinstance(kind, type) and issubclass(kind, Method) and kind.name == name:
-            return kind
-    raise ProductError(f"no method {name!r}: psfdae.estimators.{name} has no class Method")
-
-
-def _known() -> list[str]:
-    """Names that the configuration lists and that have a module, without loading one."""
-    try:
-        tree = parse_yaml(config_dir() / "config.yaml")
-        names = [*tree["methods"], *tree["workflow"].get("on_request", ())]
-        return [n for n in map(str, names) if find_spec(f"psfdae.estimators.{n}")]
-    except (ConfigError, LookupError, TypeError, ValueError):
-        return []
-
-
-def registered() -> tuple[type[Method], ...]:
-    """The methods that the configuration lists, in the order of tables; those on request last.
-
-    Raises
-    ------
-    ConfigError
-        If the list is missing, or names something else.
-    """
-    return methods_in(config_dir() / "config.yaml")
-
-
-@cache
-def methods_in(path: Path) -> tuple[type[Method], ...]:
-    """The methods of a file `config.yaml`."""
-    try:
-        tree = parse_yaml(path)
-        names = tree.get("methods") if isinstance(tree, dict) else None
-        if not isinstance(names, list):
-            raise ProductError("methods: must be a list of different names")
-        names = [*map(str, names), *(tree.get("workflow") or {}).get("on_request", ())]
-        if len({*names}) < len(names):
-            raise ProductError("methods, workflow.on_request: must be different names")
-        return tuple(map(method, names))
-    except ProductError as error:
-        text = str(error)
-        raise ConfigError(text if text.startswith(str(path)) else f"{path}: {text}") from None
-
-
-def all_groups() -> tuple[str, ...]:
-    """Groups of the configuration that are settings of methods."""
-    return tuple(dict.fromkeys(group for kind in registered() for group in kind.groups))
-
-
-def oracles_last(names: Any) -> list[type[Method]]:
-    """Methods among some names in the order of legends: those that are given λ at the end."""
-    kinds = [kind for kind in registered() if kind.name in set(names)]
-    return sorted(kinds, key=lambda kind: kind.needs_level)

@@ -15,7 +15,7 @@ from psfdae.reading import from_tree, read_yaml
 from psfdae.settings import CheckpointSeconds, Count, Group, deciding
 
 if TYPE_CHECKING:
-    from psfdae.estimators.dae_network import Dae as Network
+    from psfdae.networks.dae import Dae as Network
     from psfdae.own_stars.bundle import BundleInfo
     from psfdae.settings import Evaluation
 
@@ -166,9 +166,9 @@ class Dae(Method):
         """
         import torch
 
-        from psfdae.estimators.dae_network import Dae as Network
-        from psfdae.estimators.dae_network import train_dae
-        from psfdae.estimators.training import fingerprint, progress
+        from psfdae.networks.dae import Dae as Network
+        from psfdae.networks.dae import train_dae
+        from psfdae.networks.training import fingerprint, progress
 
         described = {"dae": deciding(dae), "train": deciding(train), "seed": data.seed}
         described["noise"] = [data.levels.tolist(), data.noise.kappa, data.noise.background]
@@ -196,19 +196,19 @@ class Dae(Method):
 
     def predict(self, noisy: np.ndarray) -> np.ndarray:
         """PSFs, neither clipped nor renormalised, float32."""
-        from psfdae.estimators.dae_network import predict
+        from psfdae.networks.dae import predict
 
         return predict(self.network, noisy, self.factor(noisy.shape[-1]), self.batch)
 
     def factor(self, stamp_px: int) -> float:
         """From images of sum 1 to those that the network sees."""
-        from psfdae.estimators.dae_network import image_scale
+        from psfdae.networks.dae import image_scale
 
         return self.scale if isinstance(self.scale, float) else image_scale(self.scale, stamp_px)
 
     def save(self, place: Path, described: Mapping[str, Any]) -> None:
         """Write weights, and the resolved configuration with the number of the start."""
-        from psfdae.estimators.weights import save_weights
+        from psfdae.networks.weights import save_weights
 
         save_weights(place / WEIGHTS, self.network.state_dict(), described)
         write_text(place / CONFIG, as_yaml({**described, "attempt": self.attempt}))
@@ -220,8 +220,8 @@ class Dae(Method):
         """As `Method.require`; the two files must be of the same training."""
         import torch
 
-        from psfdae.estimators.dae_network import Dae as Network
-        from psfdae.estimators.weights import with_weights
+        from psfdae.networks.dae import Dae as Network
+        from psfdae.networks.weights import with_weights
         from psfdae.settings import validate
 
         described, batch = cls.described(place), 256
@@ -251,7 +251,7 @@ class Dae(Method):
         """The network of a bundle, which takes as many images at once as memory should hold."""
         import torch
 
-        from psfdae.estimators.dae_network import Dae as Network
+        from psfdae.networks.dae import Dae as Network
 
         assert info.dae is not None and info.image_scale is not None
         network = Network(info.dae.kernels, info.dae.widths)
@@ -262,7 +262,7 @@ class Dae(Method):
 
     def export(self, stamp_px: int, path: Path) -> None:
         """Write the network as ONNX and check it against torch; raises ExportError."""
-        from psfdae.estimators.dae_network import export_onnx
+        from psfdae.networks.dae import export_onnx
 
         export_onnx(self.network, self.factor(stamp_px), stamp_px, path)
 

@@ -33,9 +33,9 @@ import numpy as np
 from pydantic import Field
 
 from psfdae.estimators import BrightStamps, Estimate, FitError, Measured, Method, TrainingSet
+from psfdae.field_psf import FieldFit, FieldModel, Frames, fit_field, slopes
+from psfdae.noise import NoiseModel
 from psfdae.settings import Count, Fraction, Group, Positive
-from psfdae.stars.field_model import FieldFit, FieldModel, Frames, fit_field, slopes
-from psfdae.stars.noise import NoiseModel
 
 STEP = 0.4
 """Of ln s between noise variances of single stars, which share a factorisation; s is then

@@ -40,9 +40,9 @@ import numpy as np
 from pydantic import Field
 
 from psfdae.estimators import Estimate, FitError, Method, TrainingSet
+from psfdae.noise import NoiseModel
 from psfdae.rng import stream
 from psfdae.settings import Count, Group, Positive
-from psfdae.stars.noise import NoiseModel
 
 if TYPE_CHECKING:
     from psfdae.own_stars.bundle import BundleInfo

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from psfdae.estimators import Method, TrainingSet
-from psfdae.stars.noise import NoiseModel
+from psfdae.noise import NoiseModel
 
 
 @dataclass(frozen=True)

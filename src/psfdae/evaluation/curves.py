@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from psfdae.estimators import Method, method, oracles_last, registered
+from psfdae.configuration.methods import oracles_last, registered
+from psfdae.estimators import Method
+from psfdae.estimators.registry import method
 from psfdae.evaluation.figure_style import REFERENCES, SERIES_COLORS, new_figure, styled
-from psfdae.evaluation.figures import StripRow, draw_cell
+from psfdae.evaluation.strip import StripRow, draw_cell
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import wraps
 from io import BytesIO
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from psfdae.files import write_bytes
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -93,3 +96,8 @@ def in_field_unit(field: np.ndarray) -> tuple[np.ndarray, str]:
     if np.abs(degrees).max() >= 1.0:
         return degrees, "deg"
     return 60.0 * degrees, "arcmin"
+
+
+def write_png(figure: Any, out: Path) -> None:
+    """Write a matplotlib figure atomically; the same figure gives the same bytes."""
+    write_bytes(out, as_png(figure))

@@ -31,10 +31,11 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 import psfdae
 from psfdae.errors import Error
-from psfdae.estimators import Method, method
-from psfdae.estimators.weights import digest_of
+from psfdae.estimators import Method
+from psfdae.estimators.registry import method
 from psfdae.extras import needed_by
 from psfdae.files import ProductError, atomic_path
+from psfdae.networks.weights import digest_of
 from psfdae.own_stars.errors import one_line
 from psfdae.own_stars.photometry import FluxModel
 

@@ -10,8 +10,9 @@ import numpy as np
 
 from psfdae.configuration.compose import part
 from psfdae.configuration.own_stars import with_keywords
-from psfdae.estimators import Method, groups_of
-from psfdae.estimators import method as method_of
+from psfdae.estimators import Method
+from psfdae.estimators.registry import groups_of
+from psfdae.estimators.registry import method as method_of
 from psfdae.extras import needed_by
 from psfdae.own_stars.model import PsfModel
 from psfdae.own_stars.packing import bundle_of

@@ -26,6 +26,7 @@ import numpy as np
 import psfdae
 from psfdae.estimators import Estimate, Method
 from psfdae.files import Product, ProductError
+from psfdae.noise import NoiseModel
 from psfdae.own_stars.bundle import (
     SCALES,
     Bundle,
@@ -47,7 +48,6 @@ from psfdae.own_stars.star_sets import (
     star_area,
 )
 from psfdae.rng import stream
-from psfdae.stars.noise import NoiseModel
 
 NODES = 8  # noise levels at which errors are measured, equidistant in the logarithm
 COMPONENTS = 48  # leading eigenvectors that a bundle stores

@@ -11,11 +11,11 @@ import numpy as np
 
 from psfdae.estimators import BrightStamps, Method, TrainingSet
 from psfdae.files import Product, ProductError, read_product
+from psfdae.noise import NoiseModel
 from psfdae.own_stars.photometry import noise_equivalent_px
 from psfdae.own_stars.training_images import OwnNoise
 from psfdae.rng import stream
-from psfdae.stars.fields import Split, held_out_split, random_split
-from psfdae.stars.noise import NoiseModel
+from psfdae.splits import Split, held_out_split, random_split
 
 INNER = 10
 """One of so many stars chooses the settings of a fit that has not seen the validation stars."""

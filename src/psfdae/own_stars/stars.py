@@ -19,7 +19,7 @@ from psfdae.own_stars.selection import BrightStars, Candidates, collect
 from psfdae.own_stars.training_images import single_psf, star_grid, training_columns
 from psfdae.rng import stream
 from psfdae.settings import Noise
-from psfdae.stars.fields import held_out_fields
+from psfdae.splits import held_out_fields
 
 if TYPE_CHECKING:
     from astropy.table import Table

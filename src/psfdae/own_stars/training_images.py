@@ -18,7 +18,7 @@ import numpy as np
 from psfdae.files import Column
 from psfdae.own_stars.selection import SHIFT_ORDER, BrightStars, brightest_pixels, moved
 from psfdae.own_stars.stamps import cut
-from psfdae.stars.fields import draw_jitter, draw_phase
+from psfdae.splits import draw_jitter, draw_phase
 
 if TYPE_CHECKING:
     from psfdae.configuration.schema import Framing

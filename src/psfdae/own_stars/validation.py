@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from psfdae.estimators import Method
-from psfdae.estimators import method as method_of
+from psfdae.estimators.registry import method as method_of
 from psfdae.evaluation.figure_style import as_png
-from psfdae.evaluation.figures import StripRow, restoration_strip, spread_stars
 from psfdae.evaluation.metrics import all_metrics, mse, quality, summarised
+from psfdae.evaluation.strip import StripRow, restoration_strip, spread_stars
 from psfdae.files import write_text
 from psfdae.own_stars.model import MARGIN_PX, PredictionError, PsfModel
 from psfdae.own_stars.packing import checksum

@@ -29,7 +29,7 @@ from psfdae.configuration.alignment import AlignmentConfig
 from psfdae.files import Column, read_product, write_csv, write_product
 from psfdae.optics.raytracing import FIRST_NOLL, ZernikeTracer
 from psfdae.rng import stream
-from psfdae.stages.common import limit_threads
+from psfdae.threads import limit_threads
 
 ModelFile = Annotated[File, "Product of `alignment model`."]
 StatesFile = Annotated[File, "Product of `alignment states`."]

@@ -45,12 +45,12 @@ from psfdae.files import (
     write_product,
     write_text,
 )
+from psfdae.noise import mixed_levels
 from psfdae.own_stars.star_sets import noise_model
 from psfdae.reading import from_tree, read_yaml
 from psfdae.rng import stream
 from psfdae.stages.alignment import ModelFile, StatesFile, TestSet, read_model
-from psfdae.stages.common import limit_threads
-from psfdae.stars.noise import mixed_levels
+from psfdae.threads import limit_threads
 
 if TYPE_CHECKING:
     from psfdae.alignment.networks import TrainingStates
@@ -132,8 +132,8 @@ def train_network(
 ) -> None:
     """Train a network that estimates states of misalignment."""
     from psfdae.alignment.networks import MixedNoise, NetworkTraining, TrainingStates
-    from psfdae.estimators.training import fingerprint, progress, train
-    from psfdae.estimators.weights import save_weights
+    from psfdae.networks.training import fingerprint, progress, train
+    from psfdae.networks.weights import save_weights
 
     if METHODS[kind].denoised != (dae is not None):
         raise click.UsageError(f"--dae goes with --kind {DENOISED}, and only with it")

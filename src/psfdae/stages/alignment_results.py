@@ -24,12 +24,13 @@ from psfdae.alignment.telescope import design_states, fit_quadratic, zernike_tra
 from psfdae.belonging import STATE_STAMPS, require, require_origin
 from psfdae.cli import File, Folder, command
 from psfdae.configuration.alignment import AlignmentConfig
+from psfdae.evaluation.figure_style import write_png
 from psfdae.files import Product, ProductError, read_product, write_csv, write_text
 from psfdae.own_stars.star_sets import noise_model
 from psfdae.reading import read_table
 from psfdae.stages.alignment import StatesFile
 from psfdae.stages.alignment_methods import DaeFolder, denoise, noisy_test_states
-from psfdae.stages.common import limit_threads, write_png
+from psfdae.threads import limit_threads
 
 Estimates = Annotated[tuple[File, ...], "Product of `alignment estimate`."]
 Fits = Annotated[tuple[File, ...], "Product of `alignment fit`.", {"flag": "--fit"}]

@@ -37,7 +37,7 @@ from psfdae.bounds.tight import FEW, Evidence, calibration
 from psfdae.cli import File, command
 from psfdae.configuration.consistency import SIMULATION
 from psfdae.configuration.schema import Config
-from psfdae.estimators import method as method_named
+from psfdae.estimators.registry import method as method_named
 from psfdae.evaluation.metrics import clustered_mean, mse
 from psfdae.files import (
     Column,
@@ -51,10 +51,11 @@ from psfdae.files import (
 from psfdae.own_stars.star_sets import noise_model, noisy_test_images, split_stars
 from psfdae.reading import read_table
 from psfdae.rng import stream
-from psfdae.stages.common import drawn_columns, limit_threads, star_wavefronts
+from psfdae.stages.common import drawn_columns, star_wavefronts
 from psfdae.stars.fields import assign_fields, relative_field
 from psfdae.stars.framing import Propagation
 from psfdae.stars.symmetry import orbit
+from psfdae.threads import limit_threads
 
 if TYPE_CHECKING:
     import pandas as pd

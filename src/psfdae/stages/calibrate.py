@@ -20,14 +20,15 @@ from psfdae.evaluation.calibration import (
 )
 from psfdae.evaluation.metrics import mse, ssim
 from psfdae.files import Product, read_product, write_csv
+from psfdae.noise import NoiseModel
 from psfdae.optics.pupil import Pupil
 from psfdae.optics.wavefronts import WavefrontSource
 from psfdae.reading import read_table
 from psfdae.rng import stream
-from psfdae.stages.common import limit_threads, star_wavefronts, template_wavefronts
+from psfdae.stages.common import star_wavefronts, template_wavefronts
 from psfdae.stars.fields import assign_fields
 from psfdae.stars.framing import Propagation, normalise_flux
-from psfdae.stars.noise import NoiseModel
+from psfdae.threads import limit_threads
 
 
 @command("scan", reads=(*SIMULATION, "noise", "calibration"))

@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from psfdae.cli import File, Folder, command
+from psfdae.configuration.methods import registered
 from psfdae.errors import Error
-from psfdae.estimators import CONFIG, HISTORY, method, registered
+from psfdae.estimators import CONFIG, HISTORY
+from psfdae.estimators.registry import method
 from psfdae.files import ProductError, write_text
 from psfdae.reading import read_csv, read_table, read_yaml
 from psfdae.tracking import flatten

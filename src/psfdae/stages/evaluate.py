@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from psfdae.cli import File, Folder, Reference, Split, command
+from psfdae.configuration.methods import registered
 from psfdae.configuration.schema import Config
-from psfdae.estimators import ConfigError, Method, method, registered
+from psfdae.estimators import Method
+from psfdae.estimators.registry import method
 from psfdae.evaluation.metrics import quality, summarised
 from psfdae.files import Product, ProductError, write_csv, write_parquet, write_text
 from psfdae.own_stars.star_sets import (
@@ -20,7 +22,8 @@ from psfdae.own_stars.star_sets import (
     training_set,
 )
 from psfdae.reading import read_table
-from psfdae.stages.common import limit_threads
+from psfdae.settings import ConfigError
+from psfdae.threads import limit_threads
 
 if TYPE_CHECKING:
     import pandas as pd

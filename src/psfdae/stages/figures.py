@@ -11,16 +11,17 @@ import numpy as np
 from psfdae.cli import AboveZero, File, Reference, command
 from psfdae.configuration.schema import Config
 from psfdae.estimators import Method
+from psfdae.evaluation.figure_style import write_png
 from psfdae.files import Product, ProductError, read_product
 from psfdae.own_stars.star_sets import field_positions, noisy_test_images, read_stars, split_stars
 from psfdae.reading import read_table
-from psfdae.stages.common import limit_threads, write_png
 from psfdae.stages.evaluate import READS, Evaluations, Metric, Models, estimators, read_evaluations
+from psfdae.threads import limit_threads
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from psfdae.evaluation.figures import StripRow
+    from psfdae.evaluation.strip import StripRow
 
 STRIP_STARS, HEADLINE_STARS = 8, 5
 """Columns of a restoration strip, and of the headline."""
@@ -76,7 +77,7 @@ def figure_strip(
 ) -> None:
     """Draw test stars of the split random before and after restoration."""
     from psfdae.evaluation.figure_style import REFERENCES, in_field_unit
-    from psfdae.evaluation.figures import restoration_strip, spread_stars
+    from psfdae.evaluation.strip import restoration_strip, spread_stars
 
     limit_threads(config.evaluation.threads)
     product = read_stars(stars, reference)
@@ -109,7 +110,7 @@ def figure_headline(
     from dataclasses import replace
 
     from psfdae.evaluation.curves import headline
-    from psfdae.evaluation.figures import spread_stars
+    from psfdae.evaluation.strip import spread_stars
 
     limit_threads(config.evaluation.threads)
     product = read_stars(stars, HEADLINE_REFERENCE)
@@ -197,8 +198,8 @@ def strip_rows(
 
     `config` is that of the stage `evaluate`; `test` are the test stars, `picks` those shown.
     """
-    from psfdae.evaluation.figures import StripRow
     from psfdae.evaluation.metrics import mse
+    from psfdae.evaluation.strip import StripRow
 
     truth, position = product[reference][test][picks], field_positions(product)[test][picks]
     rows = [StripRow("reference", truth)]

@@ -10,9 +10,9 @@ import click
 
 from psfdae.cli import File, Folder, Reference, Split, command
 from psfdae.configuration.schema import Config
-from psfdae.estimators import groups_of, method
+from psfdae.estimators.registry import groups_of, method
 from psfdae.own_stars.star_sets import read_stars, training_set
-from psfdae.stages.common import limit_threads
+from psfdae.threads import limit_threads
 
 INNER = 10
 """One of so many stars chooses the settings of a fit that has not seen the validation stars."""

@@ -11,13 +11,16 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from psfdae.cli import File, Folder, command
+from psfdae.configuration.methods import all_groups
 from psfdae.configuration.own_stars import CHOSEN, from_words, of_config
 from psfdae.configuration.schema import Config
 from psfdae.errors import Error
-from psfdae.estimators import Method, all_groups, method
+from psfdae.estimators import Method
+from psfdae.estimators.registry import method
 from psfdae.evaluation.figure_style import as_png
 from psfdae.files import (
     atomic_path,
+    check_outputs,
     interrupted,
     write_bytes,
     write_columns,
@@ -30,7 +33,6 @@ from psfdae.own_stars.observation import Source
 from psfdae.own_stars.stars import Stars
 from psfdae.own_stars.validation import validate
 from psfdae.settings import ConfigError, as_overrides
-from psfdae.stages.common import check_outputs
 from psfdae.stages.mosaic import each, images_of, with_name
 from psfdae.stages.predict import Stated, write_list
 

@@ -13,7 +13,8 @@ import click
 import numpy as np
 
 from psfdae.cli import File, NameOrNumber, command
-from psfdae.files import atomic_path, interrupted
+from psfdae.evaluation.figure_style import write_png
+from psfdae.files import atomic_path, check_outputs, interrupted
 from psfdae.own_stars.bundle import SUFFIX
 from psfdae.own_stars.images import Card
 from psfdae.own_stars.model import (
@@ -25,7 +26,6 @@ from psfdae.own_stars.model import (
 from psfdae.own_stars.observation import Observation, Source, list_offset
 from psfdae.own_stars.prediction import Prediction, prediction_file
 from psfdae.own_stars.stamps import Stamps, StarFlag
-from psfdae.stages.common import check_outputs, write_png
 from psfdae.stages.mosaic import each, images_of, with_name
 
 

@@ -11,11 +11,10 @@ import numpy as np
 
 import psfdae
 from psfdae.cli import File, command
-from psfdae.files import atomic_path
+from psfdae.files import atomic_path, check_outputs
 from psfdae.own_stars.errors import ascii_line
 from psfdae.own_stars.images import BLOCK_BYTES
 from psfdae.own_stars.model import PredictionError, PsfModel, load_model
-from psfdae.stages.common import check_outputs
 
 PLACE = re.compile(r"([-+0-9.eE]+),([-+0-9.eE]+)")
 GRID = re.compile(r"([0-9]{1,3})x([0-9]{1,3})")

@@ -14,16 +14,17 @@ from psfdae.cli import File, Folder, command
 from psfdae.configuration.consistency import STATIC
 from psfdae.configuration.schema import Config
 from psfdae.errors import Error
+from psfdae.evaluation.figure_style import write_png
 from psfdae.evaluation.figures import FieldOfPsfs, field_of_psfs
-from psfdae.files import Product, atomic_path, read_product, write_csv, write_fits
-from psfdae.own_stars.example import ExampleField, FieldRecipe, add_stamps, write_field
-from psfdae.own_stars.example import example_field as simulated
+from psfdae.files import Product, atomic_path, check_outputs, read_product, write_csv, write_fits
 from psfdae.own_stars.photometry import noise_equivalent_px
 from psfdae.own_stars.shapes import measure_shapes
 from psfdae.rng import stream
-from psfdae.stages.common import check_outputs, template_wavefronts, write_png
+from psfdae.stages.common import template_wavefronts
 from psfdae.stages.figures import without_margin
 from psfdae.stages.stars import templates
+from psfdae.stars.example import ExampleField, FieldRecipe, add_stamps, write_field
+from psfdae.stars.example import example_field as simulated
 from psfdae.stars.framing import normalise_flux
 
 OWN_DATASET = "_telescope"

@@ -12,9 +12,11 @@ from psfdae.configuration.consistency import SIMULATION, STATIC
 from psfdae.configuration.schema import Config
 from psfdae.files import Column, Empty, read_product, stream_product, write_product
 from psfdae.rng import stream
-from psfdae.stages.common import drawn_columns, limit_threads, star_wavefronts, template_wavefronts
-from psfdae.stars.fields import assign_fields, draw_jitter, draw_phase, square_grid
+from psfdae.splits import draw_jitter, draw_phase
+from psfdae.stages.common import drawn_columns, star_wavefronts, template_wavefronts
+from psfdae.stars.fields import assign_fields, square_grid
 from psfdae.stars.framing import Propagation, crop_jittered, normalise_flux
+from psfdae.threads import limit_threads
 
 ABOUT_PEAK = "brightest pixel (row, column) from the chief ray"
 

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from psfdae.cli import File, Folder, command
+from psfdae.evaluation.figure_style import write_png
 from psfdae.files import ProductError, as_yaml, write_csv, write_text
 from psfdae.reading import read_table, read_yaml
-from psfdae.stages.common import write_png
 from psfdae.stages.sweep import RESULT, read_cost, read_result
 from psfdae.sweeps.points import SweepError
 

@@ -13,7 +13,6 @@ import click
 
 from psfdae import mlflow_view
 from psfdae.cli import File, Folder, command
-from psfdae.estimators.weights import load_weights
 from psfdae.files import (
     DIGESTS,
     UNDIGESTED,
@@ -23,6 +22,7 @@ from psfdae.files import (
     digest_path,
     sweep_stale,
 )
+from psfdae.networks.weights import load_weights
 
 ASIDE = ".damaged"
 """Suffix that a damaged file gets; it is overwritten by the next one of its name."""

@@ -7,13 +7,14 @@ from pathlib import Path
 from typing import Any
 
 from psfdae.configuration.compose import part
-from psfdae.estimators import HISTORY, Method, groups_of, method
+from psfdae.estimators import HISTORY, Method
+from psfdae.estimators.registry import groups_of, method
 from psfdae.files import read_product
 from psfdae.own_stars.star_sets import read_stars, training_set
 from psfdae.reading import read_table
-from psfdae.stages.common import limit_threads
 from psfdae.stages.fit import fit
 from psfdae.sweeps.measured import Measured, Task, measure_images
+from psfdae.threads import limit_threads
 
 
 def place_of(kind: type[Method], folder: Path) -> Path:

@@ -18,7 +18,6 @@ from psfdae.stages.alignment_methods import (
     noisy_test_states,
     train_network,
 )
-from psfdae.stages.common import limit_threads
 from psfdae.sweeps.measured import (
     EVALUATION,
     VALIDATION,
@@ -26,6 +25,7 @@ from psfdae.sweeps.measured import (
     Task,
     geometric_mean,
 )
+from psfdae.threads import limit_threads
 
 TEST_SET = "uniform"
 """Test set of scene 3, whose noise is drawn as in the main workflow."""

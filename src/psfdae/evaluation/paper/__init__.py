@@ -6,7 +6,7 @@ from importlib import resources
 
 import pandas as pd
 
-from psfdae.estimators import registered
+from psfdae.configuration.methods import registered
 
 
 def paper_rows() -> dict[str, str]:

@@ -18,8 +18,8 @@ from torch import nn
 
 from psfdae.errors import Error
 from psfdae.estimators import TrainingSet
-from psfdae.estimators.training import DeadNetworkError, Muon, Row, Training, TrainingError, train
 from psfdae.files import atomic_path
+from psfdae.networks.training import DeadNetworkError, Muon, Row, Training, TrainingError, train
 from psfdae.rng import stream
 
 if TYPE_CHECKING:

@@ -23,7 +23,7 @@ from torch.optim.lr_scheduler import LambdaLR, LRScheduler, OneCycleLR
 
 from psfdae.errors import Error
 from psfdae.estimators import FitError
-from psfdae.estimators.weights import load_checkpoint, save_checkpoint
+from psfdae.networks.weights import load_checkpoint, save_checkpoint
 
 if TYPE_CHECKING:
     from psfdae.configuration.alignment import NetworkTrain
