@@ -145,7 +145,7 @@ def test_sets_of_states(products):
 
 
 def _states_config(*overrides):
-    return load_stage(states.stage.reads, (*PRESET, *overrides), "alignment")
+    return load_stage(states.stage.settings.reads, (*PRESET, *overrides), "alignment")
 
 
 def test_model_and_rays_give_the_same_training_stamps(products, tmp_path):

@@ -335,7 +335,7 @@ def test_a_missing_aberration_is_none_and_what_is_not_stated_is_unknown(tmp_path
 
 
 def settings_of(name, *overrides):
-    reads = stage(f"alignment {name}").stage.reads
+    reads = stage(f"alignment {name}").stage.settings.reads
     return load_stage(reads, ("alignment_preset=smoke", *overrides), "alignment")
 
 

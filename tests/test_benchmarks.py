@@ -54,7 +54,7 @@ def test_a_process_of_its_own_has_its_own_threads(monkeypatch):
 
 def test_what_is_timed_is_the_command_that_users_run(tmp_path):
     """Its product is left behind and its size is that of the files; a refusal is an error."""
-    tree, out = load_stage(speed.growth.stage.reads, SMALL).model_dump(), tmp_path / "t.h5"
+    tree, out = load_stage(speed.growth.stage.settings.reads, SMALL).model_dump(), tmp_path / "t.h5"
     cost = measure.cost_of_command(["templates"], out, tree)
     assert cost["disk_b"] == out.stat().st_size
     assert 0 < cost["resting_b"] <= cost["peak_b"]
@@ -68,7 +68,7 @@ def test_what_is_timed_is_the_command_that_users_run(tmp_path):
 @pytest.mark.slow
 def test_engines_run_apart_and_fill_the_table(tmp_path):
     small = ("benchmark.repeats=1", "benchmark.stamp_sizes=[8,10]", "benchmark.stamps=1")
-    config = load_stage(speed.inference.stage.reads, [*small, "benchmark.threads=1"])
+    config = load_stage(speed.inference.stage.settings.reads, [*small, "benchmark.threads=1"])
     config.dae.widths[:] = [2] * len(config.dae.widths)
     speed.inference(config, tmp_path / "t.csv")
     table = pd.read_csv(tmp_path / "t.csv")
@@ -104,7 +104,7 @@ def test_readings_of_the_baseline_stand_beside_the_paper_s(tmp_path, gaussian_st
     }
     given = ("dataset=dataset3", "preset=smoke", "baseline.components=4")
     given += ("parts.train_stars=200", "parts.test_stars=100")
-    config = load_stage(trainings.readings.stage.reads, given)
+    config = load_stage(trainings.readings.stage.settings.reads, given)
     write_product(tmp_path / "s.h5", "stars", columns, config.model_dump())
     trainings.readings(config, tmp_path / "s.h5", tmp_path / "t.csv")
     table = pd.read_csv(tmp_path / "t.csv")

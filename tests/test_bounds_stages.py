@@ -28,7 +28,7 @@ SIZES += (f"noise.levels={list(LEVELS)}", "bounds.threads=1", "optics.threads=1"
 
 
 def settings(stage, dataset, *more):
-    reads = stage if isinstance(stage, tuple) else stage.stage.reads
+    reads = stage if isinstance(stage, tuple) else stage.stage.settings.reads
     return load_stage(reads, (f"dataset={dataset}", *SIZES, *more))
 
 

@@ -92,7 +92,7 @@ def folder(tmp_path_factory):
 def pack(folder, out, overrides=(), **options):
     chosen = {"stars": folder / "stars.h5", "split": None, "name": "tiny", "licence": "MIT"}
     chosen["models"] = Models(dae=options.pop("dae", folder / "dae"))
-    config = load_stage(stage.bundle.stage.reads, [*TINY, *overrides])
+    config = load_stage(stage.bundle.stage.settings.reads, [*TINY, *overrides])
     stage.bundle(config, out=out, **(chosen | options))
 
 
@@ -139,7 +139,7 @@ def test_unknown_optics_have_no_diffraction_limit(folder, tmp_path):
 
 
 def test_metrics_are_those_of_the_stage_evaluate(folder, tiny):
-    config = load_stage(stage.bundle.stage.reads, TINY)
+    config = load_stage(stage.bundle.stage.settings.reads, TINY)
     images = gaussians(1400, 1)
     from psfdae.splits import random_split
 
@@ -153,7 +153,7 @@ def test_metrics_are_those_of_the_stage_evaluate(folder, tiny):
 
 
 def test_half_width_covers_fresh_stars_and_the_rms_too_many(tiny):
-    config = load_stage(stage.bundle.stage.reads, TINY)
+    config = load_stage(stage.bundle.stage.settings.reads, TINY)
     images = gaussians(1500, 99)
     rng = np.random.default_rng(5)
     noise = np.exp(rng.uniform(np.log(4.98e-3), np.log(4.98e-2), size=1500))
@@ -408,7 +408,7 @@ def test_shipped_bundle_covers_stars_that_nobody_has_seen(tmp_path):
     bundle, rng = read_bundle(), stream(11, "coverage")
     band = np.log([bundle.info.noise_min, bundle.info.noise_max])
     noise = np.exp(rng.uniform(*band, size=len(images)))
-    config = load_stage(stage.bundle.stage.reads, chosen)
+    config = load_stage(stage.bundle.stage.settings.reads, chosen)
     noisy = noise_model(config).draw(images, noise / config.noise.kappa, rng)
     level = noise / config.noise.kappa
     error = packing.errors_of(estimator(bundle).estimate(noisy, level), images)
@@ -419,7 +419,7 @@ def test_shipped_bundle_covers_stars_that_nobody_has_seen(tmp_path):
 
 def test_ship_names_checks_and_writes(folder, tiny, tmp_path, capsys):
     """The bundle that errs least on the validation stars, of a fit that has not seen them."""
-    config = load_stage(stage.ship.stage.reads, TINY)
+    config = load_stage(stage.ship.stage.settings.reads, TINY)
     given = {"stars": folder / "stars.h5", "out": tmp_path / "bundles"}
     weights = {name: 0 * array for name, array in tiny.weights.items()}
     write_bundle(replace(tiny, weights=weights), tmp_path / "none.psf.safetensors")

@@ -97,8 +97,8 @@ def test_search_distances_follow_from_the_telescope():
     ("groups", "root"),
     [
         (("seed", "noise", "parts", "dae", "train"), "config"),
-        (train_dae.stage.reads, "alignment"),
-        (train_network.stage.reads("original"), "alignment"),
+        (train_dae.stage.settings.reads, "alignment"),
+        (train_network.stage.settings.reads("original"), "alignment"),
     ],
 )
 def test_settings_that_cannot_change_a_result_are_set_apart(groups, root):

@@ -110,7 +110,7 @@ def done(step, *unwanted):
 def settings(*stages):
     # Composing a configuration is what the command line does; the stages themselves must not.
     from psfdae.configuration.compose import load_stage
-    config = [load_stage(stage.stage.reads, TINY) for stage in stages]
+    config = [load_stage(stage.stage.settings.reads, TINY) for stage in stages]
     for name in list(sys.modules):
         if name.partition(".")[0] in PACKAGES:
             del sys.modules[name]

@@ -36,6 +36,7 @@ from psfdae.own_stars.selection import (
     moved,
     star_centres,
 )
+from psfdae.own_stars.settings import from_words
 from psfdae.own_stars.stamps import cut
 from psfdae.own_stars.star_sets import noise_model, split_stars
 from psfdae.own_stars.training_images import OwnNoise, make_images, star_grid, training_columns
@@ -46,7 +47,7 @@ from psfdae.splits import held_out_fields
 from psfdae.stages import from_stars as stage
 from psfdae.stages import simulate
 from psfdae.stages.evaluate import READS
-from psfdae.stages.from_stars import Source, _alone, from_stars
+from psfdae.stages.from_stars import Source, _alone
 from psfdae.stars.example import RENDER_PX, FieldRecipe, example_field, star_images
 
 SIDE = {"side_px": 700, "bright": 60, "faint": 80, "blended": 6, "saturated": 3}
@@ -56,7 +57,7 @@ TINY += ["methods=[noisy,pca_som,lmmse,dae,gmm,field]"]
 
 @pytest.fixture(scope="module")
 def config():
-    return load_stage(from_stars.stage.reads, ["dataset=from_stars", *TINY])
+    return from_words(["dataset=from_stars", *TINY])
 
 
 @pytest.fixture(scope="module")
@@ -427,7 +428,7 @@ def test_what_cannot_be_used_ends_in_one_line(field, tmp_path):
 )
 def test_wrong_settings_are_named(override, message):
     with pytest.raises(ConfigError, match=message):
-        load_stage(from_stars.stage.reads, ["dataset=from_stars", override])
+        from_words(["dataset=from_stars", override])
 
 
 @pytest.mark.slow

@@ -16,8 +16,8 @@ import psfdae
 from docs_pages import blocks, read
 from psfdae.cli import main
 from psfdae.configuration.compose import load_stage
-from psfdae.configuration.own_stars import CHOSEN, from_words, of_config, settings_model
 from psfdae.own_stars import packing
+from psfdae.own_stars.settings import CHOSEN, from_words, of_config, settings_model
 from psfdae.stages import simulate
 
 SIDE = {"side_px": 700, "bright": 60, "faint": 80, "blended": 6, "saturated": 3}

@@ -23,8 +23,8 @@ from psfdae.own_stars.advice import saturation_advice
 from psfdae.own_stars.bundle import read_bundle, write_bundle
 from psfdae.own_stars.observation import Source
 from psfdae.own_stars.selection import collect
+from psfdae.own_stars.settings import from_words
 from psfdae.own_stars.stamps import cut
-from psfdae.stages.from_stars import from_stars
 
 SIDE, SKY, NOISE = 10, 187.0, 10.0
 COLUMNS, ROWS = 440, 350
@@ -137,7 +137,7 @@ def test_chi2_of_bright_stars_is_about_one(sky):
 
 def test_levels_of_noise_follow_the_least_signal_to_noise():
     words = ("dataset=from_stars", "calibration_stars.snr_min=60")
-    config = load_stage(from_stars.stage.reads, words)
+    config = from_words(words)
     assert config.calibration_stars.degraded() == [5, 10, 20, 30]
     lower = config.calibration_stars.model_copy(update={"snr_min": 8.0})
     assert lower.degraded() == [4]
@@ -260,7 +260,7 @@ def test_the_advised_saturation_flags_as_many_stars_as_it_says(sky, tmp_path):
     plate[y, x + 7] = plate.max()  # a neighbour that is saturated
     path = tmp_path / "plate.fits"
     fits.PrimaryHDU(plate.astype(np.float32)).writeto(path)
-    config = load_stage(from_stars.stage.reads, ["dataset=from_stars", "framing.stamp_px=22"])
+    config = from_words(["dataset=from_stars", "framing.stamp_px=22"])
     stars = config.calibration_stars.model_copy(update={"stars_min": 10})
     found = collect(Source(path, sky.list).open(22, 8), stars, config.framing)
     said = re.search(r"(\d+) stamps have .*--saturate (\S+) ", saturation_advice(found))

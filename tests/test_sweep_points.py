@@ -213,7 +213,7 @@ def test_cnn_is_the_main_workflow_s_and_measured_on_other_states(tmp_path):
     )
     settings = load_stage(point_groups("noise_trained"), given, "alignment")
     stage.point(settings, "noise_trained", {}, {}, task)
-    config = load_stage(train_network.stage.reads("noise_trained"), given, "alignment")
+    config = load_stage(train_network.stage.settings.reads("noise_trained"), given, "alignment")
     main = tmp_path / "main"
     train_network(config, "noise_trained", data["states"], tmp_path / "main.pt", main)
     for name in ("network.safetensors", "config.yaml"):

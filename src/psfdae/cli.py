@@ -10,13 +10,15 @@ from __future__ import annotations
 import ast
 import re
 import types
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, is_dataclass
 from functools import cache
 from importlib import import_module
+from importlib.metadata import entry_points
+from importlib.util import find_spec
 from inspect import Parameter, cleandoc, signature
 from pathlib import Path
-from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, Protocol, Union, get_args, get_origin, get_type_hints
 
 import click
 
@@ -39,48 +41,37 @@ class NameOrNumber(click.ParamType):
         return int(value) if re.fullmatch("[0-9]{1,6}", str(value)) else value
 
 
-Split = Literal["random", "held_out"]
-Reference = Literal["realisation", "template"]
+OWN = "psfdae.stages"
+"""The package's own commands; those of others join it by entry points "psfdae.commands"."""
 
-GROUPS = {
-    "alignment": "Scene 3: alignment of a secondary mirror (config/alignment.yaml).",
-    "alignment figure": "Draw a figure of scene 3 as PNG.",
-    "figure": "Draw a figure as PNG from finished products.",
-    "sweep": "Train many variants of a model and compare them (config/sweep).",
-}
-"""Commands of two and three words, and what is said of their first words."""
 
-STAGES = Path(psfdae.__file__).with_name("stages")
+class Reader(Protocol):
+    """Makes what a command's parameter `config` receives."""
+
+    def __call__(self, options: Mapping[str, Any], file: Path | None, words: Sequence[str]) -> Any:
+        """From the other options, a file of settings or words of the command line."""
 
 
 @dataclass(frozen=True)
 class Stage:
-    """What `command` knows of a function: its command's words and the config groups it reads."""
+    """What `command` knows of a function: its command's words, and what reads its settings."""
 
     name: str
-    reads: tuple[str, ...] | Callable[..., tuple[str, ...]]
-    root: Literal["config", "alignment"]
-    words: Callable[[Sequence[str]], Any] | None = None
+    settings: Any = None
 
 
-def command(
-    name: str,
-    reads: tuple[str, ...] | Callable[..., tuple[str, ...]] = (),
-    root: Literal["config", "alignment"] = "config",
-    words: Callable[[Sequence[str]], Any] | None = None,
-) -> Callable[..., Any]:
+def command(name: str, settings: Reader | None = None) -> Callable[..., Any]:
     """Make a function the command `psfdae NAME`.
 
-    A parameter `config` receives the groups of the configuration in `reads`, checked, from
-    trailing overrides or a file of settings; which groups may depend on the options. `words`
-    reads the overrides where Hydra is not to. Other parameters are options: required without a
-    default, repeatable as `tuple[X, ...]`, a flag as bool, all fields of a dataclass. `Annotated`
-    adds help (a text), a click type, or a dict of what click's option takes, where "flag" names
-    it and "argument" makes it positional. Help is the docstring.
+    A parameter `config` receives what `settings` reads from trailing words or a file. Other
+    parameters are options: required without a default, repeatable as `tuple[X, ...]`, a flag as
+    bool, all fields of a dataclass. `Annotated` adds help (a text), a click type, or a dict of
+    what click's option takes, where "flag" names it and "argument" makes it positional. Help is
+    the docstring.
     """
 
     def mark(function: Callable[..., Any]) -> Callable[..., Any]:
-        function.stage = Stage(name, reads, root, words)  # type: ignore[attr-defined]
+        function.stage = Stage(name, settings)  # type: ignore[attr-defined]
         return function
 
     return mark
@@ -142,8 +133,8 @@ class Commands(Careful):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """A group, or the command of a stage, whose module is imported now."""
         name = f"{self.prefix} {cmd_name}".strip()
-        if name in GROUPS:
-            return Commands(name, name=cmd_name, help=GROUPS[name])
+        if name in groups():
+            return Commands(name, name=cmd_name, help=groups()[name])
         return as_click(stage(name)) if name in found() else None
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
@@ -159,22 +150,40 @@ class Commands(Careful):
 def main() -> None:
     """PSF modelling with a denoising autoencoder, one command per stage.
 
-    OVERRIDES are Hydra overrides, such as dataset=dataset5 train.lr=1e-3; the
-    groups and keys are those of the config folder.
+    OVERRIDES are words group.key=value, such as train.lr=1e-3; with the extra "paper" also
+    choices of files of the config folder, such as dataset=dataset5.
     """
 
 
 @cache
-def found() -> dict[str, Path]:
-    """Modules by command."""
+def found() -> dict[str, tuple[str, Path]]:
+    """Module and its file by command."""
     pattern = re.compile(r'^@command\(\s*"([^"]+)"', re.MULTILINE)
-    texts = {path: path.read_text(encoding="utf-8") for path in STAGES.glob("*.py")}
-    return {name: path for path, text in texts.items() for name in pattern.findall(text)}
+    commands = {}
+    for package in _packages():
+        for folder in find_spec(package).submodule_search_locations:  # type: ignore[union-attr]
+            for path in sorted(Path(folder).glob("*.py")):
+                for name in pattern.findall(path.read_text(encoding="utf-8")):
+                    commands[name] = f"{package}.{path.stem}", path
+    return commands
+
+
+def _packages() -> list[str]:
+    return [OWN, *(point.value for point in entry_points(group="psfdae.commands"))]
+
+
+@cache
+def groups() -> dict[str, str]:
+    """Help of the first words of commands of two and three words, from the packages' `GROUPS`."""
+    known: dict[str, str] = {}
+    for package in _packages():
+        known |= getattr(import_module(package), "GROUPS", {})
+    return known
 
 
 def stage(name: str) -> Callable[..., Any]:
     """The function of a command; its module is imported."""
-    module = import_module(f"psfdae.stages.{found()[name].stem}")
+    module = import_module(found()[name][0])
     functions = [f for f in vars(module).values() if isinstance(getattr(f, "stage", None), Stage)]
     return next(f for f in functions if f.stage.name == name)
 
@@ -189,9 +198,9 @@ def _shortened(text: str, width: int) -> str:
 
 def _about(name: str) -> str:
     """First paragraph of a command's help, nothing being imported."""
-    if name in GROUPS:
-        return GROUPS[name]
-    for node in ast.parse(found()[name].read_text(encoding="utf-8")).body:
+    if name in groups():
+        return groups()[name]
+    for node in ast.parse(found()[name][1].read_text(encoding="utf-8")).body:
         for call in getattr(node, "decorator_list", []):
             if isinstance(call, ast.Call) and ast.unparse(call).startswith(f"command('{name}'"):
                 return (ast.get_docstring(node) or "").split("\n\n")[0]  # type: ignore[arg-type]
@@ -201,13 +210,13 @@ def _about(name: str) -> str:
 def as_click(function: Callable[..., Any]) -> click.Command:
     """The command of a stage."""
     spec: Stage = function.stage  # type: ignore[attr-defined]
-    groups: dict[str, Any] = {}
+    fields: dict[str, Any] = {}
     parameters: list[click.Parameter] = []
     for name, hint, default in _parameters(function):
         if name == "config":
             continue
         if is_dataclass(hint):
-            groups[name] = hint
+            fields[name] = hint
             parameters += [_option(*field) for field in _parameters(hint)]
         else:
             parameters.append(_option(name, hint, default))
@@ -222,8 +231,10 @@ def as_click(function: Callable[..., Any]) -> click.Command:
         config = {}
         if configured:
             file, overrides = given.pop("settings"), given.pop("overrides")
-            config["config"] = _settings(spec, given, file, overrides)
-        for name, kind in groups.items():
+            if file is not None and overrides:
+                raise click.UsageError("--config and overrides exclude each other")
+            config["config"] = spec.settings(given, file, overrides)
+        for name, kind in fields.items():
             given[name] = kind(**{key: given.pop(key) for key, *_ in _parameters(kind)})
         function(**config, **given)
 
@@ -234,19 +245,6 @@ def as_click(function: Callable[..., Any]) -> click.Command:
 def program(*functions: Callable[..., Any]) -> None:
     """Run commands of a program outside the package, as those of `workflow/benchmarks` are."""
     Careful(commands=[as_click(function) for function in functions])()
-
-
-def _settings(
-    spec: Stage, given: dict[str, Any], file: Path | None, overrides: Sequence[str]
-) -> Any:
-    from psfdae.configuration.compose import load_settings, load_stage
-
-    reads = spec.reads(**given) if callable(spec.reads) else spec.reads
-    if file is None:
-        return spec.words(overrides) if spec.words else load_stage(reads, overrides, spec.root)
-    if overrides:
-        raise click.UsageError("--config and overrides exclude each other")
-    return load_settings(file, reads, spec.root)
 
 
 def _parameters(function: Any) -> list[tuple[str, Any, Any]]:

@@ -4,7 +4,8 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from psfdae.cli import File, command, program
+from psfdae.cli import File, program
+from psfdae.configuration.command import command
 from psfdae.estimators.registry import method
 from psfdae.evaluation.figure_style import SERIES_COLORS, new_figure, styled, write_png
 from psfdae.files import ProductError

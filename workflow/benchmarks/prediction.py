@@ -16,7 +16,8 @@ import numpy as np
 
 from measure import alone, cost_of_command, write, yes
 from psfdae.belonging import STARS, require
-from psfdae.cli import File, command, program
+from psfdae.cli import File, program
+from psfdae.configuration.command import command
 from psfdae.configuration.compose import part
 from psfdae.configuration.consistency import SIMULATION
 from psfdae.configuration.schema import Config

@@ -17,7 +17,8 @@ from propagators import (
     peers_of,
     time_settings,
 )
-from psfdae.cli import Folder, command, program
+from psfdae.cli import Folder, program
+from psfdae.configuration.command import command
 from psfdae.configuration.schema import Config
 from psfdae.reading import read_table
 from psfdae.threads import limit_threads

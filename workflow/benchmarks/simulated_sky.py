@@ -14,7 +14,8 @@ import numpy as np
 from scipy.stats import sem
 
 from measure import write
-from psfdae.cli import File, command, program
+from psfdae.cli import File, program
+from psfdae.configuration.command import command
 from psfdae.configuration.consistency import SIMULATION
 from psfdae.configuration.schema import Config
 from psfdae.field_psf import slopes

@@ -14,7 +14,8 @@ import numpy as np
 
 from measure import alone, cost_of_command, write
 from prediction import make_cube
-from psfdae.cli import File, command, program
+from psfdae.cli import File, program
+from psfdae.configuration.command import command
 from psfdae.configuration.consistency import SIMULATION
 from psfdae.configuration.methods import all_groups
 from psfdae.configuration.schema import Config

@@ -11,7 +11,8 @@ from pydantic import Field
 
 from measure import alone, pareto, write, yes
 from psfdae.belonging import STARS, require
-from psfdae.cli import File, Folder, Reference, command, program
+from psfdae.cli import File, Folder, program
+from psfdae.configuration.command import command
 from psfdae.configuration.compose import config_dir, decisive, load_file, part
 from psfdae.configuration.consistency import SIMULATION
 from psfdae.configuration.methods import all_groups
@@ -20,7 +21,7 @@ from psfdae.estimators.registry import groups_of, method
 from psfdae.files import read_product, write_csv
 from psfdae.own_stars import star_sets
 from psfdae.reading import read_table, read_yaml
-from psfdae.settings import Group
+from psfdae.settings import Group, Reference
 from psfdae.stages import common
 
 PATIENCE = 5  # validations without a better one after which a training no longer improves

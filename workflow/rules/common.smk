@@ -110,8 +110,9 @@ def settings(name, /, *choice, more=(), **options):
     Options are those of the command on which it depends what is read.
     """
     program, _, function = name.rpartition(".")
-    spec = (getattr(import_module(program), function) if program else stage(name)).stage
-    reads = spec.reads(**options) if callable(spec.reads) else spec.reads
+    stage_of = getattr(import_module(program), function) if program else stage(name)
+    spec = stage_of.stage.settings
+    reads = spec.of(options)
     if spec.root == "config":
         tree = composed(*choice, more=more)
     else:

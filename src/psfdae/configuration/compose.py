@@ -10,12 +10,13 @@ from contextlib import suppress
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 from pydantic import create_model
 
 from psfdae.configuration.alignment import AlignmentConfig
 from psfdae.configuration.base import config_dir
+from psfdae.configuration.command import Root
 from psfdae.configuration.consistency import Consistent, stage_model, with_derived
 from psfdae.configuration.methods import all_groups, methods_in
 from psfdae.configuration.outline import filled, outline_of
@@ -23,9 +24,6 @@ from psfdae.configuration.schema import whole_config
 from psfdae.files import ProductError, write_text
 from psfdae.reading import parse_yaml
 from psfdae.settings import NEUTRAL, ConfigError, Group, validate
-
-Root = Literal["config", "alignment"]
-"""Root files of the configuration: the datasets', and that of scene 3."""
 
 ROOTS: tuple[Root, ...] = get_args(Root)
 

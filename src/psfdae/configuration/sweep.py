@@ -8,7 +8,8 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from psfdae.configuration.alignment import NETWORKS
-from psfdae.configuration.compose import Root, config_dir, load_file
+from psfdae.configuration.command import Root
+from psfdae.configuration.compose import config_dir, load_file
 from psfdae.configuration.methods import registered
 from psfdae.estimators.registry import groups_of, method
 from psfdae.settings import ConfigError, Count, Finite, Group, Name, Reference, SplitKind

@@ -8,14 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from psfdae.configuration.compose import part
-from psfdae.configuration.own_stars import with_keywords
 from psfdae.estimators import Method
 from psfdae.estimators.registry import groups_of
 from psfdae.estimators.registry import method as method_of
 from psfdae.extras import needed_by
 from psfdae.own_stars.model import PsfModel
 from psfdae.own_stars.packing import bundle_of
+from psfdae.own_stars.settings import with_keywords
 from psfdae.own_stars.star_sets import (
     field_positions,
     fit_apart,
@@ -105,7 +104,7 @@ def fitted_to(stars: Stars, kind: type[Method], checkpoint: Path | None = None) 
 
 def described(stars: Stars, kind: type[Method]) -> dict[str, Any]:
     """Settings that decide a fit, as its product and its model say them."""
-    own: dict[str, Any] = part(groups_of(kind.name), stars.settings).model_dump()
+    own = stars.settings.model_dump(include={*groups_of(kind.name)})
     return own | {"split": SPLIT} | ({"reference": REFERENCE} if kind.per_reference else {})
 
 

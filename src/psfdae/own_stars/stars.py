@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from psfdae.configuration.own_stars import IMAGE_GROUPS, settings_model, with_keywords
 from psfdae.files import Column, Product
 from psfdae.own_stars.advice import advice
 from psfdae.own_stars.observation import Observation, Source, list_offset
 from psfdae.own_stars.selection import BrightStars, Candidates, collect
+from psfdae.own_stars.settings import IMAGE_GROUPS, settings_model, with_keywords
 from psfdae.own_stars.training_images import single_psf, star_grid, training_columns
 from psfdae.rng import stream
 from psfdae.settings import Noise

@@ -24,8 +24,9 @@ from psfdae.alignment.telescope import (
     zernike_tracer,
 )
 from psfdae.belonging import OURS, STATE_STAMPS, STATES, require
-from psfdae.cli import File, command
+from psfdae.cli import File
 from psfdae.configuration.alignment import AlignmentConfig
+from psfdae.configuration.command import command
 from psfdae.files import Column, read_product, write_csv, write_product
 from psfdae.optics.raytracing import FIRST_NOLL, ZernikeTracer
 from psfdae.rng import stream

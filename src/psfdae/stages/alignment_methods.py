@@ -30,8 +30,9 @@ from psfdae.alignment.methods import (
 )
 from psfdae.alignment.stamps import AlignmentStamps
 from psfdae.belonging import STATE_STAMPS, require, require_origin, write_origin
-from psfdae.cli import AboveZero, File, Folder, command
+from psfdae.cli import AboveZero, File, Folder
 from psfdae.configuration.alignment import NETWORKS, AlignmentConfig, NetworkTrain
+from psfdae.configuration.command import command
 from psfdae.configuration.compose import decisive
 from psfdae.estimators import CONFIG, HISTORY, TrainingSet
 from psfdae.estimators.dae import Dae

@@ -22,8 +22,9 @@ from psfdae.alignment.methods import (
 from psfdae.alignment.stamps import AlignmentStamps
 from psfdae.alignment.telescope import design_states, fit_quadratic, zernike_tracer
 from psfdae.belonging import STATE_STAMPS, require, require_origin
-from psfdae.cli import File, Folder, command
+from psfdae.cli import File, Folder
 from psfdae.configuration.alignment import AlignmentConfig
+from psfdae.configuration.command import command
 from psfdae.evaluation.figure_style import write_png
 from psfdae.files import Product, ProductError, read_product, write_csv, write_text
 from psfdae.own_stars.star_sets import noise_model

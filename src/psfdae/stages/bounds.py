@@ -34,7 +34,8 @@ from psfdae.bounds.posterior import (
 )
 from psfdae.bounds.sampling import TRUTH, Modes, Sampled, StampModel, sample
 from psfdae.bounds.tight import FEW, Evidence, calibration
-from psfdae.cli import File, command
+from psfdae.cli import File
+from psfdae.configuration.command import command
 from psfdae.configuration.consistency import SIMULATION
 from psfdae.configuration.schema import Config
 from psfdae.estimators.registry import method as method_named

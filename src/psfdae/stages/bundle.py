@@ -9,7 +9,8 @@ from typing import Annotated, Any
 import numpy as np
 
 from psfdae.belonging import SAME_IMAGE, SAME_STARS, STARS, require_origin
-from psfdae.cli import AboveZero, File, Folder, Reference, Split, command
+from psfdae.cli import AboveZero, File, Folder
+from psfdae.configuration.command import command
 from psfdae.configuration.methods import all_groups
 from psfdae.configuration.schema import Config
 from psfdae.estimators import CONFIG, Method
@@ -32,7 +33,7 @@ from psfdae.own_stars.star_sets import (
     training_set,
 )
 from psfdae.rng import stream
-from psfdae.settings import as_overrides
+from psfdae.settings import Reference, SplitKind, as_overrides
 from psfdae.stages.evaluate import Models
 from psfdae.threads import limit_threads
 
@@ -55,7 +56,7 @@ def bundle(
     stars: Annotated[File, "Product of the stage stars that the network was trained on."],
     models: Models,
     split: Annotated[
-        Split | None, "Refuse a network of another split.  [default: that of the training]"
+        SplitKind | None, "Refuse a network of another split.  [default: that of the training]"
     ] = None,
     reference: Annotated[
         Reference | None, "Of a method that serves both.  [default: realisation]"

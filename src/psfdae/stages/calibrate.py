@@ -9,7 +9,8 @@ from typing import Annotated, Any
 import numpy as np
 
 from psfdae.belonging import STATIC, require
-from psfdae.cli import File, Folder, command
+from psfdae.cli import File, Folder
+from psfdae.configuration.command import command
 from psfdae.configuration.consistency import SIMULATION
 from psfdae.configuration.schema import Config
 from psfdae.evaluation.calibration import (

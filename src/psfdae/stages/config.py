@@ -6,7 +6,8 @@ from typing import Annotated, Literal
 
 import click
 
-from psfdae.cli import command, found, stage
+from psfdae.cli import found, stage
+from psfdae.configuration.command import command
 
 Overrides = Annotated[tuple[str, ...], {"argument": True}]
 Only = Annotated[str | None, "Only the groups that this stage reads.", {"flag": "--stage"}]
@@ -32,11 +33,11 @@ def _print(
     from psfdae.configuration.compose import load, load_stage
 
     stages = {_key(name): name for name in found()}
+    reader = stage(stages[_key(only)]).stage.settings if only and _key(only) in stages else None
     if only is None:
         checked = load(overrides, root)
-    elif _key(only) in stages and (spec := stage(stages[_key(only)]).stage).root == root:
-        reads = spec.reads() if callable(spec.reads) else spec.reads
-        checked = load_stage(reads, overrides, root)
+    elif reader is not None and reader.root == root:
+        checked = load_stage(reader.of({}), overrides, root)
     else:
         names = [name for name in found() if name.startswith("alignment ") == (root != "config")]
         raise click.BadParameter(f"{only!r} is not one of {', '.join(sorted(names))}")

@@ -7,7 +7,8 @@ from dataclasses import make_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from psfdae.cli import File, Folder, Reference, Split, command
+from psfdae.cli import File, Folder
+from psfdae.configuration.command import command
 from psfdae.configuration.methods import registered
 from psfdae.configuration.schema import Config
 from psfdae.estimators import Method
@@ -22,7 +23,7 @@ from psfdae.own_stars.star_sets import (
     training_set,
 )
 from psfdae.reading import read_table
-from psfdae.settings import ConfigError
+from psfdae.settings import ConfigError, Reference, SplitKind
 from psfdae.threads import limit_threads
 
 if TYPE_CHECKING:
@@ -52,7 +53,7 @@ def evaluate(
     dataset: Annotated[str, "Name that goes into the table."],
     stars: Annotated[File, "Product of the stage stars."],
     models: Models,
-    split: Split = "random",
+    split: SplitKind = "random",
     reference: Reference = "realisation",
     *,
     per_star: Annotated[File, "Parquet with every star."],

@@ -8,13 +8,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
-from psfdae.cli import AboveZero, File, Reference, command
+from psfdae.cli import AboveZero, File
+from psfdae.configuration.command import command
 from psfdae.configuration.schema import Config
 from psfdae.estimators import Method
 from psfdae.evaluation.figure_style import write_png
 from psfdae.files import Product, ProductError, read_product
 from psfdae.own_stars.star_sets import field_positions, noisy_test_images, read_stars, split_stars
 from psfdae.reading import read_table
+from psfdae.settings import Reference
 from psfdae.stages.evaluate import READS, Evaluations, Metric, Models, estimators, read_evaluations
 from psfdae.threads import limit_threads
 

@@ -8,10 +8,12 @@ from typing import Annotated
 
 import click
 
-from psfdae.cli import File, Folder, Reference, Split, command
+from psfdae.cli import File, Folder
+from psfdae.configuration.command import command
 from psfdae.configuration.schema import Config
 from psfdae.estimators.registry import groups_of, method
 from psfdae.own_stars.star_sets import read_stars, training_set
+from psfdae.settings import Reference, SplitKind
 from psfdae.threads import limit_threads
 
 INNER = 10
@@ -25,7 +27,7 @@ def fit(
     config: Config,
     name: Annotated[str, {"argument": True, "metavar": "METHOD"}],
     stars: Stars,
-    split: Split = "random",
+    split: SplitKind = "random",
     reference: Reference = "realisation",
     fresh: Annotated[File | None, "Product of the stage stars with other draws."] = None,
     start: Annotated[
@@ -57,7 +59,7 @@ def fit(
 def baseline(
     config: Config,
     stars: Stars,
-    split: Split = "random",
+    split: SplitKind = "random",
     *,
     out: Annotated[File, "HDF5 product with the fitted PCA+SOM."],
 ) -> None:
@@ -69,7 +71,7 @@ def baseline(
 def train(
     config: Config,
     stars: Stars,
-    split: Split = "random",
+    split: SplitKind = "random",
     reference: Reference = "realisation",
     checkpoint: Annotated[
         File | None, "State of an interrupted training.  [default: OUT/checkpoint.pt]"

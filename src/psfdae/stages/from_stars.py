@@ -11,9 +11,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from psfdae.cli import File, Folder, command
-from psfdae.configuration.methods import all_groups
-from psfdae.configuration.own_stars import CHOSEN, from_words, of_config
-from psfdae.configuration.schema import Config
 from psfdae.errors import Error
 from psfdae.estimators import Method
 from psfdae.estimators.registry import method
@@ -30,6 +27,7 @@ from psfdae.files import (
 from psfdae.own_stars.bundle import SUFFIX
 from psfdae.own_stars.fitting import best, described, fitted_to, makes_models, packed
 from psfdae.own_stars.observation import Source
+from psfdae.own_stars.settings import CHOSEN, Words, of_config
 from psfdae.own_stars.stars import Stars
 from psfdae.own_stars.validation import validate
 from psfdae.settings import ConfigError, as_overrides
@@ -78,16 +76,9 @@ class Made:
         return [self.stars, self.bundle, *own]
 
 
-@command(
-    "from-stars",
-    words=from_words,
-    reads=(
-        *("seed", "calibration_stars", "framing", "noise", "parts"),
-        *(*all_groups(), "evaluation", "methods"),
-    ),
-)
+@command("from-stars", Words())
 def from_stars(
-    config: Config,
+    config: Any,
     image: Annotated[File, {"argument": True}],
     stated: Stated,
     name: Annotated[str | None, "Name of the model.  [default: the image's]"] = None,

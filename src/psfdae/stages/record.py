@@ -21,7 +21,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from psfdae.cli import File, Folder, command
+from psfdae.cli import File, Folder
+from psfdae.configuration.command import command
 from psfdae.files import ProductError, write_csv, write_text
 from psfdae.reading import read_table
 from psfdae.source import git

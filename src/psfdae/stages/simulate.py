@@ -10,7 +10,8 @@ import click
 import numpy as np
 
 import psfdae
-from psfdae.cli import File, Folder, command
+from psfdae.cli import File, Folder
+from psfdae.configuration.command import command
 from psfdae.configuration.consistency import STATIC
 from psfdae.configuration.schema import Config
 from psfdae.errors import Error

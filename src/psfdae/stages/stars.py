@@ -7,7 +7,8 @@ from typing import Annotated
 import numpy as np
 
 from psfdae import belonging
-from psfdae.cli import File, command
+from psfdae.cli import File
+from psfdae.configuration.command import command
 from psfdae.configuration.consistency import SIMULATION, STATIC
 from psfdae.configuration.schema import Config
 from psfdae.files import Column, Empty, read_product, stream_product, write_product

@@ -13,12 +13,14 @@ from typing import Annotated, Any, Literal
 
 import click
 
-from psfdae.cli import File, Folder, Reference, Split, command
-from psfdae.configuration.compose import Root, decisive, load_stage
+from psfdae.cli import File, Folder
+from psfdae.configuration.command import Root, command
+from psfdae.configuration.compose import decisive, load_stage
 from psfdae.configuration.sweep import TRAINED, models, point_groups
 from psfdae.estimators import FitError
 from psfdae.files import ProductError, write_text
 from psfdae.reading import from_tree, read_json
+from psfdae.settings import Reference, SplitKind
 from psfdae.sweeps.measured import EVALUATION, VALIDATION, Task
 from psfdae.sweeps.points import changes, with_values
 
@@ -102,7 +104,7 @@ def sweep_list(name: Annotated[str, {"argument": True}], overrides: Overrides = 
 def sweep_point(
     model: Annotated[str, click.Choice(models()), "What is trained."],
     dataset: Annotated[str, "Name that goes into the tables."],
-    split: Split = "random",
+    split: SplitKind = "random",
     reference: Reference = "realisation",
     *,
     data: Annotated[

@@ -7,7 +7,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from psfdae.cli import File, Folder, command
+from psfdae.cli import File, Folder
+from psfdae.configuration.command import command
 from psfdae.evaluation.figure_style import write_png
 from psfdae.files import ProductError, as_yaml, write_csv, write_text
 from psfdae.reading import read_table, read_yaml

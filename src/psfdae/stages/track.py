@@ -18,7 +18,8 @@ from typing import Annotated, Any
 
 import psfdae
 from psfdae import mlflow_view
-from psfdae.cli import File, Folder, command
+from psfdae.cli import File, Folder
+from psfdae.configuration.command import command
 from psfdae.errors import Error
 from psfdae.files import atomic_path, write_text
 from psfdae.source import git_commit

@@ -12,7 +12,8 @@ from typing import Annotated
 import click
 
 from psfdae import mlflow_view
-from psfdae.cli import File, Folder, command
+from psfdae.cli import File, Folder
+from psfdae.configuration.command import command
 from psfdae.files import (
     DIGESTS,
     UNDIGESTED,

@@ -231,7 +231,7 @@ class Plan:
             return stage_tree(SIMULATION, self._base)
         from psfdae.stages.alignment import states
 
-        reads = states.stage.reads  # type: ignore[attr-defined]
+        reads = states.stage.settings.reads  # type: ignore[attr-defined]
         return stage_tree(reads, self._base, "alignment")
 
     @cached_property

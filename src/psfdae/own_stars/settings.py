@@ -1,20 +1,23 @@
 """Settings of a model of one's own stars: defaults in classes, words of a command line, keywords.
 
-Neither Hydra nor a file of the configuration is needed, unless a word chooses one, such as
-`train=onecycle` or `preset=smoke`.
+A word that chooses a file of a configuration, such as `train=onecycle` or `preset=smoke`, is for
+what the extra "paper" adds by an entry point of the group "psfdae.settings".
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
+from importlib.metadata import entry_points
+from pathlib import Path
 from typing import Any
 
 from pydantic import Field, create_model
 
-from psfdae.configuration.compose import load_stage
 from psfdae.configuration.schema import MethodNames
 from psfdae.estimators.registry import known
+from psfdae.reading import read_yaml
 from psfdae.settings import (
     CalibrationStars,
     ConfigError,
@@ -72,11 +75,32 @@ def from_words(words: Sequence[str] = ()) -> Any:
         group, _, name = key.partition(".")
         plain = group in ("seed", "methods") and not name
         if not equals or (group in fields and not (name or plain)) or group not in fields:
-            # A file is chosen, or something is wrong, and Hydra says what.
-            return of_config(load_stage(tuple(fields), (CHOSEN, *words)))
+            return of_config(_composed(tuple(fields), word, words))
         value = _value(text, word)
         tree |= {group: value} if plain else {group: {**tree.get(group, {}), name: value}}
     return validate(settings_model(), tree)
+
+
+def _composed(groups: tuple[str, ...], word: str, words: Sequence[str]) -> Any:
+    """Groups of settings where a word chooses a file, or is wrong, of which Hydra says more."""
+    for point in entry_points(group="psfdae.settings"):
+        return point.load()(groups, (CHOSEN, *words))
+    raise ConfigError(f"{word}: expected group.key=value, the group one of {', '.join(groups)}")
+
+
+@dataclass(frozen=True)
+class Words:
+    """Reads the settings of a command; see `psfdae.cli.Reader`."""
+
+    root: str = "config"
+
+    def of(self, options: Mapping[str, Any]) -> tuple[str, ...]:
+        """Names of the groups of settings."""
+        return tuple(settings_model().model_fields)
+
+    def __call__(self, options: Mapping[str, Any], file: Path | None, words: Sequence[str]) -> Any:
+        """The settings of words, or of a YAML file."""
+        return of_config(read_yaml(file)) if file is not None else from_words(words)
 
 
 def of_config(config: Any) -> Any:
