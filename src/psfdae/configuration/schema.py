@@ -9,7 +9,7 @@ from __future__ import annotations
 from functools import cache
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, create_model, model_validator
+from pydantic import Field, create_model, model_validator
 
 from psfdae.configuration.base import SEARCH, PupilSamples, SearchDistance
 from psfdae.configuration.consistency import Consistent
@@ -17,6 +17,7 @@ from psfdae.configuration.methods import registered
 from psfdae.configuration.telescope import AnyTelescope
 from psfdae.configuration.wavefront import OfTelescope, Seidel, VonKarman
 from psfdae.estimators import Method
+from psfdae.estimators.registry import MethodName, MethodNames
 from psfdae.settings import (
     CalibrationStars,
     Count,
@@ -154,17 +155,6 @@ class Bounds(Group):
     )
     test_stars: Count = Field(description="Test stars that are bounded, the first of the part")
     threads: Count = Field(description="Threads of the linear algebra")
-
-
-def _listed(name: str) -> str:
-    names = [method.name for method in registered()]
-    if name not in names:
-        raise ValueError(f"{name!r} is not in the list of config.yaml ({', '.join(names)})")
-    return name
-
-
-MethodName = Annotated[str, AfterValidator(_listed)]
-MethodNames = Annotated[list[MethodName], Field(min_length=1)]
 
 
 class Workflow(Group):

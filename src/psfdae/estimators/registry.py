@@ -11,6 +11,9 @@ from importlib import import_module
 from importlib.metadata import entry_points
 from importlib.util import find_spec
 from pkgutil import iter_modules
+from typing import Annotated
+
+from pydantic import AfterValidator, Field
 
 from psfdae.estimators import Method
 from psfdae.files import ProductError
@@ -62,3 +65,14 @@ def _of_module(module: str) -> type[Method] | None:
 def groups_of(name: str, **options: object) -> tuple[str, ...]:
     """Groups of settings that decide a fit of a method."""
     return ("seed", "noise", "parts", *method(name).groups)
+
+
+def _is_known(name: str) -> str:
+    names = [kind.name for kind in known()]
+    if name not in names:
+        raise ValueError(f"no method {name!r}; there are {', '.join(names)}")
+    return name
+
+
+MethodName = Annotated[str, AfterValidator(_is_known)]
+MethodNames = Annotated[list[MethodName], Field(min_length=1)]

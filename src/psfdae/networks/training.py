@@ -14,7 +14,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -24,10 +24,6 @@ from torch.optim.lr_scheduler import LambdaLR, LRScheduler, OneCycleLR
 from psfdae.errors import Error
 from psfdae.estimators import FitError
 from psfdae.networks.weights import load_checkpoint, save_checkpoint
-
-if TYPE_CHECKING:
-    from psfdae.configuration.alignment import NetworkTrain
-    from psfdae.estimators.dae import Train
 
 Row = dict[str, float]
 """An epoch in the history of a training."""
@@ -96,6 +92,16 @@ def orthogonal(matrices: Sequence[torch.Tensor]) -> list[torch.Tensor]:
     return [p if p.shape == m.shape else p.T for p, m in zip(parts, matrices, strict=True)]
 
 
+class Course(Protocol):
+    """Settings of every training: learning rate and its schedule, passes, threads."""
+
+    lr: float
+    schedule: str
+    epochs: int
+    threads: int
+    checkpoint_seconds: float
+
+
 class Training(ABC):
     """One training; a kind of network says what its batches, its loss and its history are.
 
@@ -113,7 +119,7 @@ class Training(ABC):
     def __init__(
         self,
         model: nn.Module,
-        settings: Train | NetworkTrain,
+        settings: Course,
         steps: int,
         attempt: int = 0,
         key: str = "train",

@@ -22,8 +22,7 @@ from psfdae.own_stars.stamps import Stamps, StarFlag, cut, peaks, sky_around
 if TYPE_CHECKING:
     from astropy.table import Table
 
-    from psfdae.configuration.schema import Framing
-    from psfdae.settings import CalibrationStars
+    from psfdae.settings import CalibrationStars, Stamp
 
 ROWS = 2048  # stars that are measured at a time
 REGISTRATION_ROUNDS = 10  # of the windowed centroid; each leaves less than a fifth of the distance
@@ -135,7 +134,7 @@ class Candidates:
         )
 
 
-def collect(observation: Observation, settings: CalibrationStars, framing: Framing) -> Candidates:
+def collect(observation: Observation, settings: CalibrationStars, framing: Stamp) -> Candidates:
     """Measure all stars and choose those that are good enough to learn from.
 
     The observation has stamps with a margin (a cube: its own, larger ones), of which only
@@ -178,7 +177,7 @@ def collect(observation: Observation, settings: CalibrationStars, framing: Frami
 
 
 def _measure(
-    chunk: Stamps, settings: CalibrationStars, framing: Framing, least_noise: float
+    chunk: Stamps, settings: CalibrationStars, framing: Stamp, least_noise: float
 ) -> tuple[dict[str, np.ndarray], tuple[np.ndarray, ...]]:
     """Columns for all stars of a chunk; stamps, peaks and listed centres of the bright ones."""
     side = framing.stamp_px

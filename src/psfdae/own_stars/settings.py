@@ -15,8 +15,7 @@ from typing import Any
 
 from pydantic import Field, create_model
 
-from psfdae.configuration.schema import MethodNames
-from psfdae.estimators.registry import known
+from psfdae.estimators.registry import MethodNames, known
 from psfdae.reading import read_yaml
 from psfdae.settings import (
     CalibrationStars,

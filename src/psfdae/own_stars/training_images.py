@@ -21,8 +21,7 @@ from psfdae.own_stars.stamps import cut
 from psfdae.splits import draw_jitter, draw_phase
 
 if TYPE_CHECKING:
-    from psfdae.configuration.schema import Framing
-    from psfdae.settings import Parts
+    from psfdae.settings import Parts, Stamp
 
 IMAGES_AT_A_TIME = 512  # made before they are framed; bounds the memory
 TINY = 1e-300
@@ -127,7 +126,7 @@ def make_images(
     stars: BrightStars,
     template: np.ndarray,
     star: np.ndarray,
-    framing: Framing,
+    framing: Stamp,
     subpixel: np.ndarray,
     rng: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -143,7 +142,7 @@ def make_images(
         Centre at index (s//2, s//2).
     star : ndarray of int, shape (n,)
         Star of every image.
-    framing : Framing
+    framing : Stamp
         Its `stamp_px` and `jitter_px` count.
     subpixel : ndarray of bool, shape (n,)
         Images of stars that are moved by up to ± ½ pixel; the others are not interpolated.
@@ -235,7 +234,7 @@ def training_columns(
     grid: np.ndarray,
     held_out: np.ndarray,
     bins: int,
-    framing: Framing,
+    framing: Stamp,
     parts: Parts,
     rng: np.random.Generator,
 ) -> dict[str, Column]:
