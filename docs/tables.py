@@ -27,10 +27,10 @@ from types import SimpleNamespace
 import numpy as np
 import pandas as pd
 
-from psfdae.alignment import methods as scene3
-from psfdae.configuration.compose import compose
-from psfdae.estimators.registry import method
-from psfdae.evaluation.comparison import FITTED, SIGNIFICANT, seed_scatter, with_seed_stderr
+from psfdae.methods.registry import method
+from psfdae_paper.alignment import methods as scene3
+from psfdae_paper.configuration.compose import compose
+from psfdae_paper.evaluation.comparison import FITTED, SIGNIFICANT, seed_scatter, with_seed_stderr
 
 ROOT = Path(__file__).resolve().parents[1]
 REFERENCE = ROOT / "results/reference"

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from astropy.io import fits
 
-from psfdae.own_stars.observation import Source
-from psfdae.stars import example
+from psfdae.image.observation import Source
+from psfdae_paper.stars import example
 
 
 def open_observation(path, stamp_px, margin=0, **stated):

@@ -85,8 +85,8 @@ def write_good(folder):
 
     from fits_inputs import write_cube, write_field
     from prediction_stars import with_network
+    from psfdae.model.bundle import read_bundle, shipped_path, write_bundle
     from psfdae.networks.weights import save_weights
-    from psfdae.own_stars.bundle import read_bundle, shipped_path, write_bundle
 
     rng = np.random.default_rng(1)
     grid = np.arange(16) - 8
@@ -333,7 +333,7 @@ def another(array, rng):
 
 
 def sign_bundle(text, arrays):
-    from psfdae.own_stars.bundle import _digest
+    from psfdae.model.bundle import _digest
 
     return text | {"sha256": _digest(text["info"], arrays)}
 
@@ -395,7 +395,7 @@ OWN += ["methods=[noisy,field]", "--method", "field"]
 OWN += ["field.orders=[1]", "field.step_px=0.5", "field.modes=10"]  # a fourth of the work each
 
 FEW = {"LEAST_STARS": 60, "FEW_STARS": 40, "NODES": 4}
-"""Of `psfdae.own_stars.packing`: a model that is trained in a second says little of its errors."""
+"""Of `psfdae.model.packing`: a model that is trained in a second says little of its errors."""
 
 
 def write_own(folder):
@@ -407,8 +407,9 @@ def write_own(folder):
     from astropy.table import Table
 
     from command_line import psfdae
-    from psfdae.own_stars import packing
-    from psfdae.stages import mosaic, simulate
+    from psfdae.commands import mosaic
+    from psfdae.model import packing
+    from psfdae_paper.stages import simulate
 
     for name, value in FEW.items():
         setattr(packing, name, value)

@@ -13,11 +13,11 @@ import prediction
 import trainings
 from psfdae.belonging import STARS, STATIC, require
 from psfdae.cli import Careful, as_click, main, stage
-from psfdae.configuration.compose import load, load_stage
 from psfdae.files import Column, ProductError, write_product
-from psfdae.own_stars.bundle import read_bundle, shipped_path
-from psfdae.stages.alignment import read_model
-from psfdae.stages.alignment_results import require_one_test
+from psfdae.model.bundle import read_bundle, shipped_path
+from psfdae_paper.configuration.compose import load, load_stage
+from psfdae_paper.stages.alignment import read_model
+from psfdae_paper.stages.alignment_results import require_one_test
 
 SIZES = ("preset=smoke", "grid.points=3", "stars.count=60", "parts.train_stars=40")
 SIZES += ("parts.test_stars=20", "optics.threads=1", "train.epochs=1", "bounds.threads=1")

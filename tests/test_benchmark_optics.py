@@ -16,12 +16,12 @@ import propagators
 import savings
 import scenes
 from measure import alone, time_in_rounds
-from psfdae.configuration.compose import load_stage
 from psfdae.files import ProductError
-from psfdae.optics.propagation import StampPropagator
-from psfdae.optics.pupil import annular_pupil
-from psfdae.optics.wavefronts import monomial_coefficients, monomial_images, seidel_wavefronts
-from psfdae.stars.framing import normalise_flux
+from psfdae_paper.configuration.compose import load_stage
+from psfdae_paper.optics.propagation import StampPropagator
+from psfdae_paper.optics.pupil import annular_pupil
+from psfdae_paper.optics.wavefronts import monomial_coefficients, monomial_images, seidel_wavefronts
+from psfdae_paper.stars.framing import normalise_flux
 from workflow_runs import ROOT
 
 RECORD = ROOT / "results/reference/tables"

@@ -14,14 +14,14 @@ import measure
 import prediction
 import speed
 import trainings
-from psfdae.configuration.compose import load, load_stage
-from psfdae.estimators import TrainingSet
-from psfdae.estimators.pca_som import Baseline
 from psfdae.files import Column, write_product
-from psfdae.optics.wavefronts import seidel_wavefronts
-from psfdae.own_stars.bundle import read_bundle, shipped_path
-from psfdae.stars.fields import square_grid
-from psfdae.stars.framing import Propagation, normalise_flux
+from psfdae.methods import TrainingSet
+from psfdae.model.bundle import read_bundle, shipped_path
+from psfdae_paper.configuration.compose import load, load_stage
+from psfdae_paper.methods.pca_som import Baseline
+from psfdae_paper.optics.wavefronts import seidel_wavefronts
+from psfdae_paper.stars.fields import square_grid
+from psfdae_paper.stars.framing import Propagation, normalise_flux
 from workflow_runs import ROOT, planned, snakemake
 
 RECORD = ROOT / "results/reference/tables"
@@ -303,7 +303,7 @@ def test_targets_on_request(smoke, tmp_path):
     known = tables["psf_metrics"].query("metric == 'mse' and split == 'random'")
     both = errors.merge(known, on=["dataset", "reference", "method", "noise_level"])
     assert both.mse.to_numpy() == pytest.approx(both.value.to_numpy(), rel=1e-5)
-    renewed = pd.read_csv(folder / "src/psfdae/evaluation/seed_scatter.csv")
+    renewed = pd.read_csv(folder / "src/psfdae_paper/evaluation/seed_scatter.csv")
     assert renewed.equals(tables["seed_scatter"])
     readings = tables["baseline_readings"]
     assert set(readings.groupby(["dataset", "noise_level"]).size()) == {3, 6}

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import poisson
 
-from psfdae.bounds.floor import compare, local_error, sensitivities
-from psfdae.bounds.posterior import (
+from psfdae_paper.bounds.floor import compare, local_error, sensitivities
+from psfdae_paper.bounds.posterior import (
     Bank,
     Likelihood,
     exact_posterior,
@@ -22,12 +22,12 @@ from psfdae.bounds.posterior import (
     weights,
     windows,
 )
-from psfdae.optics.propagation import StampPropagator
-from psfdae.optics.pupil import annular_pupil
-from psfdae.optics.wavefronts import monomial_coefficients, monomial_images, seidel_wavefronts
-from psfdae.stars.fields import perturb, relative_field
-from psfdae.stars.framing import Propagation, brightest_pixel, normalise_flux
-from psfdae.stars.symmetry import SYMMETRIES, orbit
+from psfdae_paper.optics.propagation import StampPropagator
+from psfdae_paper.optics.pupil import annular_pupil
+from psfdae_paper.optics.wavefronts import monomial_coefficients, monomial_images, seidel_wavefronts
+from psfdae_paper.stars.fields import perturb, relative_field
+from psfdae_paper.stars.framing import Propagation, brightest_pixel, normalise_flux
+from psfdae_paper.stars.symmetry import SYMMETRIES, orbit
 
 POINTS, SIDE = 3, 8
 

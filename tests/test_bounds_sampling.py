@@ -9,9 +9,10 @@ import pytest
 from scipy.stats import f as f_law
 from scipy.stats import multivariate_t
 
-from psfdae.bounds import sampling
-from psfdae.bounds.posterior import Likelihood, jitters, merge
-from psfdae.bounds.sampling import (
+from psfdae.rng import stream
+from psfdae_paper.bounds import sampling
+from psfdae_paper.bounds.posterior import Likelihood, jitters, merge
+from psfdae_paper.bounds.sampling import (
     FIELD,
     TRUTH,
     Modes,
@@ -22,9 +23,8 @@ from psfdae.bounds.sampling import (
     twins,
     unexplained,
 )
-from psfdae.optics.wavefronts import seidel_wavefronts
-from psfdae.rng import stream
-from psfdae.stars.framing import Propagation, crop_jittered, normalise_flux
+from psfdae_paper.optics.wavefronts import seidel_wavefronts
+from psfdae_paper.stars.framing import Propagation, crop_jittered, normalise_flux
 
 LEVEL = 3e-3
 FIELDS = np.array([[0.4, 0.2], [0.416, 0.208], [-0.4, 0.6]])

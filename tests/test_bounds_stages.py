@@ -8,17 +8,13 @@ import pandas as pd
 import pytest
 from matplotlib.collections import PolyCollection
 
-from psfdae.configuration.compose import load_stage
-from psfdae.configuration.consistency import SIMULATION, STATIC
-from psfdae.estimators.registry import method
-from psfdae.evaluation.curves import (
-    MEANS,
-    efficiency_against_noise,
-    errors_above_bounds,
-)
 from psfdae.files import ProductError, read_product
-from psfdae.own_stars.star_sets import noisy_test_images, split_stars
-from psfdae.stages import bounds, figures, stars
+from psfdae.methods.registry import method
+from psfdae.model.star_sets import noisy_test_images, split_stars
+from psfdae_paper.configuration.compose import load_stage
+from psfdae_paper.configuration.consistency import SIMULATION, STATIC
+from psfdae_paper.evaluation.curves import MEANS, efficiency_against_noise, errors_above_bounds
+from psfdae_paper.stages import bounds, figures, stars
 
 LEVELS = (0.001, 0.003, 0.01, 0.1)
 SIZES = ("preset=smoke", "grid.points=3", "stars.count=60", "parts.train_stars=20")

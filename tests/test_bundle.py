@@ -18,9 +18,8 @@ from hypothesis import strategies as st
 from safetensors.numpy import save_file
 
 from psfdae.cli import main
-from psfdae.networks.dae import build_dae, predict
-from psfdae.own_stars import packing
-from psfdae.own_stars.bundle import (
+from psfdae.model import packing
+from psfdae.model.bundle import (
     Architecture,
     Bundle,
     BundleError,
@@ -30,8 +29,9 @@ from psfdae.own_stars.bundle import (
     read_bundle,
     write_bundle,
 )
-from psfdae.own_stars.model import PsfModel
-from psfdae.own_stars.photometry import FluxModel, robust_flux
+from psfdae.model.photometry import FluxModel, robust_flux
+from psfdae.model.psf_model import PsfModel
+from psfdae.networks.dae import build_dae, predict
 
 SHAPE = Architecture(kernels=(5, 3, 5), widths=(4, 4))
 INFO = {

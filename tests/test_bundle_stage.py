@@ -13,13 +13,10 @@ from click.testing import CliRunner
 from psfdae import StarFlag
 from psfdae.belonging import write_origin
 from psfdae.cli import main
-from psfdae.configuration.compose import load_stage
-from psfdae.configuration.consistency import SIMULATION, STATIC
-from psfdae.estimators.registry import groups_of
 from psfdae.files import Column, ProductError, read_product, write_product
-from psfdae.networks import dae as dae_network
-from psfdae.own_stars import packing
-from psfdae.own_stars.bundle import (
+from psfdae.methods.registry import groups_of
+from psfdae.model import packing
+from psfdae.model.bundle import (
     SCALES,
     BundleError,
     at_noise,
@@ -30,13 +27,17 @@ from psfdae.own_stars.bundle import (
     shipped_path,
     write_bundle,
 )
-from psfdae.own_stars.model import PsfModel
-from psfdae.own_stars.photometry import FluxModel, noise_equivalent_px, signal_to_noise
-from psfdae.own_stars.star_sets import noise_model, noisy_test_images, read_stars
+from psfdae.model.photometry import FluxModel, signal_to_noise
+from psfdae.model.psf_model import PsfModel
+from psfdae.model.star_sets import noise_model, noisy_test_images, read_stars
+from psfdae.networks import dae as dae_network
+from psfdae.noise import noise_equivalent_px
 from psfdae.rng import stream
-from psfdae.stages import bundle as stage
-from psfdae.stages.evaluate import Models
-from psfdae.stages.fit import fit, train
+from psfdae_paper.configuration.compose import load_stage
+from psfdae_paper.configuration.consistency import SIMULATION, STATIC
+from psfdae_paper.stages import bundle as stage
+from psfdae_paper.stages.evaluate import Models
+from psfdae_paper.stages.fit import fit, train
 
 TINY = [
     "noise.levels=[1e-3,3e-3,1e-2]",
@@ -398,7 +399,7 @@ def test_shipped_bundle_is_small_and_wide():
 def test_shipped_bundle_covers_stars_that_nobody_has_seen(tmp_path):
     """New stars of the same telescope, from another seed."""
     from psfdae.files import read_product
-    from psfdae.stages import stars
+    from psfdae_paper.stages import stars
 
     sizes = ["seed=11", "grid.points=5", "grid.spacing_deg=2.75", "stars.count=500"]
     chosen = ["dataset=field", *sizes, "parts.train_stars=400", "parts.test_stars=100"]

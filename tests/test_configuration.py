@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from psfdae.configuration import compose
-from psfdae.configuration.compose import config_dir, load, load_stage
-from psfdae.configuration.consistency import SIMULATION
-from psfdae.estimators.registry import groups_of
+from psfdae.methods.registry import groups_of
 from psfdae.settings import ConfigError, as_overrides
-from psfdae.stages.alignment_methods import train_dae, train_network
-from psfdae.stages.evaluate import READS
+from psfdae_paper.configuration import compose
+from psfdae_paper.configuration.compose import config_dir, load, load_stage
+from psfdae_paper.configuration.consistency import SIMULATION
+from psfdae_paper.stages.alignment_methods import train_dae, train_network
+from psfdae_paper.stages.evaluate import READS
 
 DATASETS = sorted(p.stem for p in config_dir().glob("dataset/[!_]*.yaml"))
 PRESETS = sorted(p.stem for p in config_dir().glob("preset/*.yaml"))

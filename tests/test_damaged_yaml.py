@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from command_line import psfdae
-from psfdae.configuration import compose
-from psfdae.configuration.compose import config_dir, forget, load
 from psfdae.files import ProductError
 from psfdae.reading import read_csv, read_json, read_table, read_yaml
 from psfdae.settings import ConfigError
-from psfdae.sweeps.points import SweepError, plan_sweep
+from psfdae_paper.configuration import compose
+from psfdae_paper.configuration.compose import config_dir, forget, load
+from psfdae_paper.sweeps.points import SweepError, plan_sweep
 from trainings import load_knee
 
 DATASET = ["config"]

@@ -15,13 +15,13 @@ from astropy.table import Table
 from scipy.spatial import cKDTree
 
 from command_line import psfdae, refused
-from psfdae.own_stars.bundle import read_bundle
-from psfdae.own_stars.detection import Sky
-from psfdae.own_stars.images import find_image
-from psfdae.own_stars.observation import SEEN, Source
-from psfdae.own_stars.selection import collect
-from psfdae.own_stars.settings import from_words
-from psfdae.stages import simulate
+from psfdae.image.detection import Sky
+from psfdae.image.fits_file import find_image
+from psfdae.image.observation import SEEN, Source
+from psfdae.image.selection import collect
+from psfdae.model.bundle import read_bundle
+from psfdae.model.settings import from_words
+from psfdae_paper.stages import simulate
 
 REAL = Path(os.environ.get("PSFDAE_REAL_IMAGE", "hatp32.fits"))
 """A real image that is not ours to distribute; the list of its stars lies beside it."""

@@ -18,9 +18,9 @@ from click.testing import CliRunner
 from docs_pages import ROOT, Command, blocks, commands, pages, read
 from fits_inputs import write_field
 from psfdae.cli import main
-from psfdae.configuration.compose import forget
 from psfdae.files import write_text
-from psfdae.own_stars.bundle import read_bundle
+from psfdae.model.bundle import read_bundle
+from psfdae_paper.configuration.compose import forget
 from test_compare import errors
 from workflow_runs import QUIET, clone, environment, shell, wait_until
 

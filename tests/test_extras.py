@@ -13,7 +13,7 @@ from command_line import refused
 from psfdae import extras, load_model
 from psfdae.cli import refusal
 from psfdae.extras import MissingExtraError
-from psfdae.own_stars.bundle import write_bundle
+from psfdae.model.bundle import write_bundle
 from workflow_runs import ROOT
 
 

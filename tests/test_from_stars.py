@@ -21,34 +21,27 @@ from click.testing import CliRunner
 from docs_pages import blocks, commands, read
 from fits_inputs import write_cube
 from psfdae.cli import main
-from psfdae.configuration.compose import load_stage
-from psfdae.estimators.registry import groups_of, method
+from psfdae.commands import from_stars as stage
+from psfdae.commands.from_stars import Source, _alone
 from psfdae.files import read_product, write_product
-from psfdae.noise import NoiseModel
-from psfdae.own_stars.bundle import estimator, read_bundle
-from psfdae.own_stars.model import load_model
-from psfdae.own_stars.photometry import noise_equivalent_px
-from psfdae.own_stars.report import MEAN_PSF
-from psfdae.own_stars.selection import (
-    BrightStars,
-    brightest_pixels,
-    collect,
-    moved,
-    star_centres,
-)
-from psfdae.own_stars.settings import from_words
-from psfdae.own_stars.stamps import cut
-from psfdae.own_stars.star_sets import noise_model, split_stars
-from psfdae.own_stars.training_images import OwnNoise, make_images, star_grid, training_columns
-from psfdae.own_stars.validation import Report
+from psfdae.image.selection import BrightStars, brightest_pixels, collect, moved, star_centres
+from psfdae.image.stamps import cut
+from psfdae.image.training_images import make_images, star_grid, training_columns
+from psfdae.methods.registry import groups_of, method
+from psfdae.model.bundle import estimator, read_bundle
+from psfdae.model.psf_model import load_model
+from psfdae.model.report import MEAN_PSF
+from psfdae.model.settings import from_words
+from psfdae.model.star_sets import noise_model, split_stars
+from psfdae.model.validation import Report
+from psfdae.noise import NoiseModel, OwnNoise, noise_equivalent_px
 from psfdae.rng import stream
 from psfdae.settings import ConfigError
 from psfdae.splits import held_out_fields
-from psfdae.stages import from_stars as stage
-from psfdae.stages import simulate
-from psfdae.stages.evaluate import READS
-from psfdae.stages.from_stars import Source, _alone
-from psfdae.stars.example import RENDER_PX, FieldRecipe, example_field, star_images
+from psfdae_paper.configuration.compose import load_stage
+from psfdae_paper.stages import simulate
+from psfdae_paper.stages.evaluate import READS
+from psfdae_paper.stars.example import RENDER_PX, FieldRecipe, example_field, star_images
 
 SIDE = {"side_px": 700, "bright": 60, "faint": 80, "blended": 6, "saturated": 3}
 TINY = ["preset=smoke", "parts.train_stars=120", "parts.test_stars=30", "train.epochs=1"]
@@ -371,7 +364,7 @@ def test_the_sky_of_any_gain_can_be_drawn(gain):
 def test_one_process_at_a_time_works_in_a_folder(field, tmp_path):
     """Whoever holds the folder is alone, until its process ends in whatever way."""
     holder = (
-        "import sys, time; from pathlib import Path; from psfdae.stages.from_stars import _alone\n"
+        "import sys, time; from pathlib import Path; from psfdae.commands.from_stars import _alone\n"
         "with _alone(Path(sys.argv[1])): print('mine', flush=True); time.sleep(600)"
     )
     out = tmp_path / "model"

@@ -22,10 +22,10 @@ from matplotlib.figure import Figure
 
 from fits_inputs import write_cube
 from psfdae import files
-from psfdae.evaluation.figure_style import write_png
+from psfdae.figure_style import write_png
 from psfdae.files import Column, Empty, as_yaml
 from psfdae.networks.weights import load_checkpoint, load_weights, save_checkpoint, save_weights
-from psfdae.stages.verify import _check_table
+from psfdae_paper.stages.verify import _check_table
 
 pytestmark = pytest.mark.slow
 

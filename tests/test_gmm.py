@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from psfdae.estimators import FitError, TrainingSet
-from psfdae.estimators import gmm as module
-from psfdae.estimators.gmm import GaussianMixture, Gmm
-from psfdae.estimators.gmm_simulated import Simulated, SimulatedMixture
 from psfdae.files import Product
+from psfdae.methods import FitError, TrainingSet
+from psfdae.methods import gmm as module
+from psfdae.methods.gmm import GaussianMixture, Gmm
+from psfdae.model.bundle import BundleError
+from psfdae.model.packing import packed
 from psfdae.noise import NoiseModel
-from psfdae.own_stars.bundle import BundleError
-from psfdae.own_stars.packing import packed
+from psfdae_paper.methods.gmm_simulated import Simulated, SimulatedMixture
 
 NOISE = NoiseModel(kappa=5.0, background=1e4)
 D = 6

@@ -22,13 +22,14 @@ from fits_inputs import open_observation, write_cube, write_field
 from hostile_files import PACK
 from prediction_stars import with_network
 from psfdae import load_model
-from psfdae.own_stars import bundle as module
-from psfdae.own_stars import catalogue, images
-from psfdae.own_stars.bundle import BundleError, read_bundle, shipped_path, write_bundle
-from psfdae.own_stars.catalogue import read_catalogue
-from psfdae.own_stars.errors import ObservationError, no_formula, one_line
-from psfdae.own_stars.model import BLOCK
-from psfdae.own_stars.selection import Candidates
+from psfdae.image import catalogue
+from psfdae.image import fits_file as images
+from psfdae.image.catalogue import read_catalogue
+from psfdae.image.errors import ObservationError, no_formula, one_line
+from psfdae.image.selection import Candidates
+from psfdae.model import bundle as module
+from psfdae.model.bundle import BundleError, read_bundle, shipped_path, write_bundle
+from psfdae.model.psf_model import BLOCK
 from workflow_runs import captured
 
 D = 8
@@ -484,7 +485,7 @@ def test_digits_that_are_no_number_name_an_extension(tmp_path, option, value):
 
 
 def test_lack_of_memory_is_one_line(tmp_path, monkeypatch):
-    monkeypatch.setattr("psfdae.own_stars.model.Engine.block", lambda *_: np.empty(2**50))
+    monkeypatch.setattr("psfdae.model.psf_model.Engine.block", lambda *_: np.empty(2**50))
     write_cube(tmp_path / "c.fits", np.ones((2, 16, 16)), PIXSCALE=0.1)
     words = ["predict", tmp_path / "c.fits", "--out", tmp_path / "o.fits", "--quiet"]
     assert "not enough memory" in refused(*words)

@@ -15,10 +15,10 @@ from click.testing import CliRunner
 import psfdae
 from docs_pages import blocks, read
 from psfdae.cli import main
-from psfdae.configuration.compose import load_stage
-from psfdae.own_stars import packing
-from psfdae.own_stars.settings import CHOSEN, from_words, of_config, settings_model
-from psfdae.stages import simulate
+from psfdae.model import packing
+from psfdae.model.settings import CHOSEN, from_words, of_config, settings_model
+from psfdae_paper.configuration.compose import load_stage
+from psfdae_paper.stages import simulate
 
 SIDE = {"side_px": 700, "bright": 60, "faint": 80, "blended": 6, "saturated": 3}
 SIZES = {"train_stars": 120, "test_stars": 40}

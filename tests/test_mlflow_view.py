@@ -10,11 +10,11 @@ from contextlib import closing
 import pytest
 from click.testing import CliRunner
 
-from psfdae import mlflow_view
 from psfdae.cli import main
 from psfdae.files import atomic_path
-from psfdae.mlflow_view import damage
-from psfdae.stages import track
+from psfdae_paper import mlflow_view
+from psfdae_paper.mlflow_view import damage
+from psfdae_paper.stages import track
 from test_track import write_tree
 
 RECEIPT = "mlflow/dataset3.csv"

@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 import torch
 
-from psfdae.estimators import TrainingSet, pca_som
-from psfdae.estimators.dae import Dae as Fitted
-from psfdae.estimators.dae import DaeSettings, Train
-from psfdae.estimators.lmmse import LinearMmse
-from psfdae.estimators.pca_som import Baseline, PcaFit, PcaSom, fit_pca_som
-from psfdae.evaluation.metrics import mse
 from psfdae.files import ProductError
+from psfdae.methods import TrainingSet
+from psfdae.methods.dae import Dae as Fitted
+from psfdae.methods.dae import DaeSettings, Train
+from psfdae.methods.lmmse import LinearMmse
+from psfdae.metrics import mse
 from psfdae.networks import dae as dae_network
 from psfdae.networks.dae import (
     DaeTraining,
@@ -28,6 +27,8 @@ from psfdae.networks.dae import (
 from psfdae.networks.training import DeadNetworkError, TrainingError, orthogonal, progress
 from psfdae.networks.weights import load_weights, save_checkpoint, save_weights
 from psfdae.rng import stream
+from psfdae_paper.methods import pca_som
+from psfdae_paper.methods.pca_som import Baseline, PcaFit, PcaSom, fit_pca_som
 
 SOM = {"rows": 4, "columns": 4, "epochs": 3, "sigma": 1.0, "learning_rate": 0.5, "seed": 1}
 BASELINE = {key: value for key, value in SOM.items() if key != "seed"}

@@ -24,8 +24,8 @@ from typing import Annotated, ClassVar
 import numpy as np
 from pydantic import Field
 
-from psfdae.configuration.base import Group
-from psfdae.estimators import Method
+from psfdae_paper.configuration.base import Group
+from psfdae.methods import Method
 
 
 class Settings(Group):
@@ -63,7 +63,7 @@ LEGENDS = """
 import sys
 from matplotlib.legend import Legend
 from psfdae.cli import main
-from psfdae.stages import figures
+from psfdae_paper.stages import figures
 figures.write_png = lambda figure, out: print(
     *(text.get_text() for legend in figure.findobj(Legend) for text in legend.get_texts()),
 )

@@ -8,9 +8,9 @@ from astropy.io import fits
 from astropy.table import Table
 
 from fits_inputs import open_observation, write_field
-from psfdae.own_stars.catalogue import CONVENTIONS, read_catalogue
-from psfdae.own_stars.errors import ObservationError
-from psfdae.own_stars.stamps import StarFlag
+from psfdae.image.catalogue import CONVENTIONS, read_catalogue
+from psfdae.image.errors import ObservationError
+from psfdae.image.stamps import StarFlag
 
 D = 8
 X, Y = [12.0, 20.25, 33.5], [9.0, 15.0, 21.75]

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from fits_inputs import open_observation, write_cube
 from hostile_files import GOOD, write_good
-from psfdae.own_stars.errors import ObservationError, reading
+from psfdae.image.errors import ObservationError, reading
 
 D = 16
 HEADERS = 8640  # bytes at the start of the files here that hold their headers and some data

@@ -16,15 +16,15 @@ from click.testing import CliRunner
 import psfdae
 from psfdae import StarFlag, load_model
 from psfdae.cli import main
-from psfdae.configuration.compose import load_stage
-from psfdae.estimators.field import FieldSettings
-from psfdae.own_stars import packing
-from psfdae.own_stars.advice import saturation_advice
-from psfdae.own_stars.bundle import read_bundle, write_bundle
-from psfdae.own_stars.observation import Source
-from psfdae.own_stars.selection import collect
-from psfdae.own_stars.settings import from_words
-from psfdae.own_stars.stamps import cut
+from psfdae.image.advice import saturation_advice
+from psfdae.image.observation import Source
+from psfdae.image.selection import collect
+from psfdae.image.stamps import cut
+from psfdae.methods.field import FieldSettings
+from psfdae.model import packing
+from psfdae.model.bundle import read_bundle, write_bundle
+from psfdae.model.settings import from_words
+from psfdae_paper.configuration.compose import load_stage
 
 SIDE, SKY, NOISE = 10, 187.0, 10.0
 COLUMNS, ROWS = 440, 350

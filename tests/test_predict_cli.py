@@ -17,12 +17,12 @@ from command_line import psfdae
 from fits_inputs import write_cube, write_field
 from prediction_stars import SKY, observe
 from psfdae import StarFlag
-from psfdae.own_stars import model as engine
-from psfdae.own_stars import plot
-from psfdae.own_stars import prediction as writer
-from psfdae.own_stars.bundle import shipped_path
-from psfdae.own_stars.model import SCALE_TOLERANCE
-from psfdae.stages import predict as stage
+from psfdae.commands import predict as stage
+from psfdae.model import plot
+from psfdae.model import prediction as writer
+from psfdae.model import psf_model as engine
+from psfdae.model.bundle import shipped_path
+from psfdae.model.psf_model import SCALE_TOLERANCE
 from workflow_runs import ROOT
 
 SIDE = 320

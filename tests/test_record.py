@@ -11,10 +11,10 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from psfdae import source
-from psfdae.configuration.compose import load
 from psfdae.files import ProductError
-from psfdae.stages import record
+from psfdae_paper import source
+from psfdae_paper.configuration.compose import load
+from psfdae_paper.stages import record
 from workflow_runs import PATH, captured, environment
 
 ROOT = Path(__file__).resolve().parents[1]

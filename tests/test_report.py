@@ -10,9 +10,12 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
-from psfdae.own_stars import advice
-from psfdae.own_stars.observation import Source
-from psfdae.own_stars.report import (
+from psfdae.commands.predict import Stated
+from psfdae.image import advice
+from psfdae.image.observation import Source
+from psfdae.image.selection import Verdict, misfit, piled_up
+from psfdae.image.stamps import StarFlag, cut
+from psfdae.model.report import (
     MEAN_PSF,
     Quality,
     checks,
@@ -22,9 +25,6 @@ from psfdae.own_stars.report import (
     ratios,
     standing,
 )
-from psfdae.own_stars.selection import Verdict, misfit, piled_up
-from psfdae.own_stars.stamps import StarFlag, cut
-from psfdae.stages.predict import Stated
 
 SIDE = 16
 

@@ -43,7 +43,7 @@ def test_a_copy_and_comments_repeat_nothing(jobs, tree):
     assert jobs() == {}
     append(tree / "config/train/onecycle.yaml", "# A thought.\n")
     append(tree / "config/dataset/dataset3.yaml", "# Another.\n")
-    append(tree / "src/psfdae/optics/propagation.py", "# And a third.\n")
+    append(tree / "src/psfdae_paper/optics/propagation.py", "# And a third.\n")
     assert jobs() == {}
 
 
@@ -71,7 +71,7 @@ def edit(path: Path, name: str) -> None:
 
 def test_plotting_function(jobs, tree):
     """Its figures, and their import into MLflow; nothing that computes."""
-    edit(tree / "src/psfdae/evaluation/figures.py", "restoration_strip")
+    edit(tree / "src/psfdae_paper/evaluation/figures.py", "restoration_strip")
     assert set(jobs(*TARGETS, "tables")) == {"figure_strip", "track"}
 
 

@@ -8,9 +8,9 @@ import pytest
 from astropy.io import fits
 
 import simulated_sky
-from psfdae.configuration.compose import load_stage
-from psfdae.configuration.consistency import SIMULATION
-from psfdae.own_stars.bundle import shipped_path
+from psfdae.model.bundle import shipped_path
+from psfdae_paper.configuration.compose import load_stage
+from psfdae_paper.configuration.consistency import SIMULATION
 
 COUNT, SIDE, WIDTH = 9, 16, 1.6
 
@@ -101,7 +101,7 @@ def test_stars_are_compared_with_their_own_images(made, monkeypatch):
         info=SimpleNamespace(stamp_px=SIDE),
         engine=SimpleNamespace(estimator=SimpleNamespace(model=Field())),
     )
-    monkeypatch.setattr("psfdae.own_stars.model.load_model", lambda path: model)
+    monkeypatch.setattr("psfdae.model.psf_model.load_model", lambda path: model)
     monkeypatch.setattr(simulated_sky, "_fitted", fitted)
     monkeypatch.setattr(simulated_sky, "_sampled", lambda *args: lambda _: 0.01 * np.eye(SIDE))
     files = [made / name for name in ("sky.fits", "truth.npz", "selection.csv")]

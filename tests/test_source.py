@@ -10,8 +10,8 @@ from textwrap import dedent
 
 import pytest
 
-from psfdae.configuration.methods import registered
-from psfdae.source import ROOT, Code, Reader, source_hash
+from psfdae_paper.configuration.methods import registered
+from psfdae_paper.source import ROOT, Code, Reader, source_hash
 
 REPOSITORY = ROOT.parents[1]
 OPTIONS = {
@@ -370,7 +370,7 @@ def test_settings_that_a_command_reads(small):
         "configuration/schema": schema,
         "cli": "def command(*a, **k):\n    ...",
     }
-    modules["main"] = main.replace("psfdae.schema", "psfdae.configuration.schema")
+    modules["main"] = main.replace("psfdae.schema", "psfdae_paper.configuration.schema")
 
     def after(module, old, new):
         assert old in modules[module]
@@ -441,6 +441,6 @@ def test_no_module_is_chosen_unseen():
 def test_the_same_question_is_answered_once(monkeypatch):
     asked = []
     monkeypatch.setattr(Code, "hash", lambda self, *words: asked.append(words) or "hash")
-    words = {"chosen": ["psfdae.estimators.gmm", "nobody_else"]}
+    words = {"chosen": ["psfdae.methods.gmm", "nobody_else"]}
     assert {source_hash("evaluate", **words) for _ in range(20)} == {"hash"}
     assert len(asked) == 1

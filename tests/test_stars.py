@@ -7,16 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from psfdae.configuration.compose import load
 from psfdae.files import Product
+from psfdae.model.star_sets import noisy_test_images
 from psfdae.noise import mixed_levels
-from psfdae.optics.wavefronts import seidel_wavefronts, zernike_wavefronts
-from psfdae.own_stars.star_sets import noisy_test_images
 from psfdae.rng import stream
 from psfdae.splits import draw_jitter, draw_phase, held_out_fields, held_out_split, random_split
-from psfdae.stages.common import template_wavefronts
-from psfdae.stars.fields import assign_fields, perturb, relative_field, square_grid
-from psfdae.stars.framing import (
+from psfdae_paper.configuration.compose import load
+from psfdae_paper.optics.wavefronts import seidel_wavefronts, zernike_wavefronts
+from psfdae_paper.stages.common import template_wavefronts
+from psfdae_paper.stars.fields import assign_fields, perturb, relative_field, square_grid
+from psfdae_paper.stars.framing import (
     FramingError,
     Propagation,
     brightest_pixel,

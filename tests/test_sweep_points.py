@@ -11,20 +11,20 @@ import pandas as pd
 import pytest
 import yaml
 
-from psfdae.configuration.compose import compose, load, load_stage, stage_tree
-from psfdae.configuration.sweep import point_groups
-from psfdae.estimators.pca_som import PcaSom
-from psfdae.estimators.registry import groups_of
 from psfdae.files import Column, ProductError, write_product
-from psfdae.own_stars.star_sets import noise_model
+from psfdae.methods.registry import groups_of
+from psfdae.model.star_sets import noise_model
 from psfdae.splits import random_split
-from psfdae.stages import sweep as stage
-from psfdae.stages import sweep_summary, track
-from psfdae.stages.alignment_methods import train_network
-from psfdae.stages.fit import baseline, train
-from psfdae.sweeps.measured import Task
-from psfdae.sweeps.points import SweepError
-from psfdae.tracking import runs_of_sweep
+from psfdae_paper.configuration.compose import compose, load, load_stage, stage_tree
+from psfdae_paper.configuration.sweep import point_groups
+from psfdae_paper.methods.pca_som import PcaSom
+from psfdae_paper.stages import sweep as stage
+from psfdae_paper.stages import sweep_summary, track
+from psfdae_paper.stages.alignment_methods import train_network
+from psfdae_paper.stages.fit import baseline, train
+from psfdae_paper.sweeps.measured import Task
+from psfdae_paper.sweeps.points import SweepError
+from psfdae_paper.tracking import runs_of_sweep
 
 SIZES = ("parts.train_stars=160", "parts.test_stars=60", "noise.levels=[0.001,0.005]")
 TINY = ("dataset=dataset3", "preset=smoke", *SIZES, "train.epochs=3")

@@ -11,8 +11,8 @@ import pandas as pd
 import pytest
 import yaml
 
-from psfdae.configuration.compose import config_dir
-from psfdae.stages.sweep_summary import best_overrides
+from psfdae_paper.configuration.compose import config_dir
+from psfdae_paper.stages.sweep_summary import best_overrides
 from workflow_runs import (
     QUIET,
     command,

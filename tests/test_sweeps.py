@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 import yaml
 
-from psfdae.configuration import compose
-from psfdae.configuration.compose import config_dir, load
-from psfdae.configuration.sweep import Axis, load_sweep, sweep_names
 from psfdae.settings import ConfigError
-from psfdae.sweeps import adaptive
-from psfdae.sweeps.points import SweepError, draws, grid, plan_sweep, tidy, with_values
+from psfdae_paper.configuration import compose
+from psfdae_paper.configuration.compose import config_dir, load
+from psfdae_paper.configuration.sweep import Axis, load_sweep, sweep_names
+from psfdae_paper.sweeps import adaptive
+from psfdae_paper.sweeps.points import SweepError, draws, grid, plan_sweep, tidy, with_values
 
 PRESETS = sorted(p.stem for p in config_dir().glob("preset/*.yaml"))
 GRID = {

@@ -10,9 +10,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from psfdae.evaluation.comparison import seed_scatter
 from psfdae.files import read_product
-from psfdae.stages.bounds import COLUMNS as BOUND_COLUMNS
+from psfdae_paper.evaluation.comparison import seed_scatter
+from psfdae_paper.stages.bounds import COLUMNS as BOUND_COLUMNS
 from workflow_runs import PATH, ROOT, captured, command, planned, snakemake
 
 pytestmark = pytest.mark.workflow

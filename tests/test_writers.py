@@ -18,7 +18,7 @@ from psfdae import files
 from psfdae.cli import main
 from psfdae.files import Column, Empty, atomic_path, stream_product, write_product, write_text
 from psfdae.networks.weights import load_checkpoint, save_checkpoint, save_weights
-from psfdae.stages import record
+from psfdae_paper.stages import record
 
 
 @pytest.fixture

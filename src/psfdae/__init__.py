@@ -19,26 +19,26 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from psfdae.errors import Error
-    from psfdae.own_stars.fitting import fit
-    from psfdae.own_stars.model import PredictionError, PsfModel, load_model
-    from psfdae.own_stars.prediction import Prediction
-    from psfdae.own_stars.stamps import StarFlag
-    from psfdae.own_stars.stars import Stars
-    from psfdae.own_stars.validation import Report, validate
+    from psfdae.image.stamps import StarFlag
+    from psfdae.model.fitting import fit
+    from psfdae.model.prediction import Prediction
+    from psfdae.model.psf_model import PredictionError, PsfModel, load_model
+    from psfdae.model.stars import Stars
+    from psfdae.model.validation import Report, validate
 
 __version__ = "0.1.0"
 
 _MODULES = {
     "Error": "errors",
-    "Prediction": "own_stars.prediction",
-    "PredictionError": "own_stars.model",
-    "PsfModel": "own_stars.model",
-    "Report": "own_stars.validation",
-    "StarFlag": "own_stars.stamps",
-    "Stars": "own_stars.stars",
-    "fit": "own_stars.fitting",
-    "load_model": "own_stars.model",
-    "validate": "own_stars.validation",
+    "Prediction": "model.prediction",
+    "PredictionError": "model.psf_model",
+    "PsfModel": "model.psf_model",
+    "Report": "model.validation",
+    "StarFlag": "image.stamps",
+    "Stars": "model.stars",
+    "fit": "model.fitting",
+    "load_model": "model.psf_model",
+    "validate": "model.validation",
 }
 
 __all__ = [

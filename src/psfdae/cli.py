@@ -1,6 +1,6 @@
 """The command line: a stage is a function, and its signature is its command.
 
-`@command("name")` on a function of `psfdae.stages` makes it one: parameters become options,
+`@command("name")` on a function of `psfdae_paper.stages` makes it one: parameters become options,
 the docstring the help. Which module has which command is read from the text of the modules,
 so that `psfdae --help` imports none of them.
 """
@@ -41,7 +41,7 @@ class NameOrNumber(click.ParamType):
         return int(value) if re.fullmatch("[0-9]{1,6}", str(value)) else value
 
 
-OWN = "psfdae.stages"
+OWN = "psfdae_paper.stages"
 """The package's own commands; those of others join it by entry points "psfdae.commands"."""
 
 

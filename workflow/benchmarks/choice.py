@@ -8,8 +8,8 @@ import numpy as np
 
 from measure import yes
 from propagators import POINTS, PRECISIONS, candidate_samples
-from psfdae.optics.propagation import EXTRA_POINTS
-from psfdae.optics.pupil import SamplingError, choose_samples
+from psfdae_paper.optics.propagation import EXTRA_POINTS
+from psfdae_paper.optics.pupil import SamplingError, choose_samples
 from scenes import Selection, spread_evenly, stamp_mse, stamps_at
 
 REFERENCE = (768, 12)  # samples and points of exact stamps; `build_cases` shows: they suffice

@@ -5,11 +5,11 @@ from typing import Annotated, Literal
 import numpy as np
 
 from psfdae.cli import File, program
-from psfdae.configuration.command import command
-from psfdae.estimators.registry import method
-from psfdae.evaluation.figure_style import SERIES_COLORS, new_figure, styled, write_png
+from psfdae.figure_style import SERIES_COLORS, new_figure, styled, write_png
 from psfdae.files import ProductError
+from psfdae.methods.registry import method
 from psfdae.reading import read_table
+from psfdae_paper.configuration.command import command
 
 WAYS = {
     "kernel numpy": ("our kernel, numpy", "#0072b2", "o"),

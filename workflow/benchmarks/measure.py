@@ -16,9 +16,9 @@ from unittest.mock import patch
 import numpy as np
 
 from psfdae.cli import main, stage
-from psfdae.configuration.compose import write_settings
 from psfdae.files import write_text
-from psfdae.stages.record import cpu_model
+from psfdae_paper.configuration.compose import write_settings
+from psfdae_paper.stages.record import cpu_model
 
 VERSIONED = ("psfdae", "numpy", "scipy", "torch", "numexpr", "poppy", "hcipy")
 """Packages whose versions can change a time; recorded where they are installed."""

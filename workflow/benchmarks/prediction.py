@@ -17,18 +17,18 @@ import numpy as np
 from measure import alone, cost_of_command, write, yes
 from psfdae.belonging import STARS, require
 from psfdae.cli import File, program
-from psfdae.configuration.command import command
-from psfdae.configuration.compose import part
-from psfdae.configuration.consistency import SIMULATION
-from psfdae.configuration.schema import Config
 from psfdae.files import read_product
+from psfdae.model import star_sets
 from psfdae.noise import NoiseModel, mixed_levels
-from psfdae.own_stars import star_sets
 from psfdae.rng import stream
 from psfdae.settings import ConfigError
 from psfdae.splits import draw_jitter
-from psfdae.stars.fields import assign_fields, perturb, relative_field
-from psfdae.stars.framing import brightest_pixel, crop_jittered, normalise_flux
+from psfdae_paper.configuration.command import command
+from psfdae_paper.configuration.compose import part
+from psfdae_paper.configuration.consistency import SIMULATION
+from psfdae_paper.configuration.schema import Config
+from psfdae_paper.stars.fields import assign_fields, perturb, relative_field
+from psfdae_paper.stars.framing import brightest_pixel, crop_jittered, normalise_flux
 
 REQUIRED_SHARE = 0.6  # of the bare network's throughput, which a prediction must reach
 ALLOWED_MB = 1000.0  # memory that it may take
@@ -77,7 +77,7 @@ def throughput(
 
 def make_cube(tree, stars, count, out):
     """Write a FITS cube of the noise-free stars of a product in turn, sky and noise added."""
-    from psfdae.stars.example import write_cube
+    from psfdae_paper.stars.example import write_cube
 
     images = read_product(stars, "stars", ("realisation",))["realisation"]
     rng = stream(tree["seed"], "prediction", "cube")
@@ -100,7 +100,7 @@ def time_prediction(cube, bundle, mixture, stamps, threads, repeats):
     many passes as threads beside each other. Then the memory of the prediction in MB,
     interpreter and libraries included.
     """
-    from psfdae.own_stars.model import BLOCK, load_model
+    from psfdae.model.psf_model import BLOCK, load_model
 
     model, peak = load_model(bundle), 0.0
     side = model.info.stamp_px
@@ -124,8 +124,8 @@ def bare_rate(model, stamps, threads, way):
     """Stamps per second of the network alone, on images that are in memory."""
     import torch
 
+    from psfdae.model.psf_model import BLOCK, one_thread_each
     from psfdae.networks.dae import predict
-    from psfdae.own_stars.model import BLOCK, one_thread_each
     from psfdae.threads import side_by_side
 
     side, factor, network = (
@@ -172,7 +172,7 @@ def poppy(
 
 def bundle_errors(bundle, truth, config):
     """Errors of a bundle on noise-free stars of flux 1, a row for each noise level."""
-    from psfdae.own_stars.model import load_model
+    from psfdae.model.psf_model import load_model
 
     model, noise = (
         load_model(bundle),
@@ -196,7 +196,7 @@ def bundle_errors(bundle, truth, config):
 
 def require_bundle(bundle, config):
     """Refuse a bundle whose training stars are not of the configured scene."""
-    from psfdae.own_stars.bundle import read_bundle
+    from psfdae.model.bundle import read_bundle
 
     trained_on = read_bundle(bundle).info.config.get("stars")
     if isinstance(trained_on, dict):
@@ -208,7 +208,7 @@ def quality(found, truth, flux, expected, which):
 
     `coverage95` is of `UNCERT` times `ratio95`, which networks of older bundles do not say.
     """
-    from psfdae.own_stars.bundle import brightest
+    from psfdae.model.bundle import brightest
 
     kept = np.isfinite(found.psf).all(axis=(1, 2))
     psf, width = found.psf[kept], found.uncertainty[kept]
@@ -233,7 +233,7 @@ def coverage(
 
     Either half of the stars, with flux and sky found, by what the other half says of the errors.
     """
-    from psfdae.own_stars.bundle import read_bundle
+    from psfdae.model.bundle import read_bundle
 
     products = [star_sets.read_stars(path, "template") for path in stars]
     rows = []
@@ -252,9 +252,9 @@ def refuse(bundle, stars):
 
 def covered(bundle, product, rng):
     """Rows of a bundle: noise level, S/N, brightness, and part of the pixels that is covered."""
-    from psfdae.own_stars import packing
-    from psfdae.own_stars.bundle import brightest, estimator
-    from psfdae.own_stars.model import PsfModel
+    from psfdae.model import packing
+    from psfdae.model.bundle import brightest, estimator
+    from psfdae.model.psf_model import PsfModel
 
     trained, fitted = bundle.info.config["train"], estimator(bundle)
     said = part(("seed", "noise", "parts"), trained)
@@ -308,7 +308,7 @@ def strange(
     companion, or is hit by a cosmic ray, or is turned by 90 degrees, or gives way to a Gaussian as
     wide as the mean star.
     """
-    from psfdae.own_stars.model import load_model
+    from psfdae.model.psf_model import load_model
 
     product = star_sets.read_stars(stars, "realisation")
     require(stars, product.config, STARS, config)

@@ -18,10 +18,10 @@ from propagators import (
     time_settings,
 )
 from psfdae.cli import Folder, program
-from psfdae.configuration.command import command
-from psfdae.configuration.schema import Config
 from psfdae.reading import read_table
 from psfdae.threads import limit_threads
+from psfdae_paper.configuration.command import command
+from psfdae_paper.configuration.schema import Config
 from savings import PACKAGES, finer_than_needed, imports, timed_savings
 from scenes import READS, Scene, build_cases
 

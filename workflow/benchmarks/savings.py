@@ -11,13 +11,18 @@ from scipy.special import j0
 
 from measure import time_calls, use_threads
 from propagators import Setting, build, configured_setting, fresnel_grid, kernel
-from psfdae.configuration.compose import part
-from psfdae.optics.propagation import EXTRA_POINTS
-from psfdae.optics.pupil import choose_samples
-from psfdae.optics.turbulence import structure_function
-from psfdae.optics.wavefronts import MONOMIALS, ModalWavefronts, monomial_images, zernike_images
-from psfdae.stages.common import template_wavefronts
-from psfdae.stars.framing import crop_jittered
+from psfdae_paper.configuration.compose import part
+from psfdae_paper.optics.propagation import EXTRA_POINTS
+from psfdae_paper.optics.pupil import choose_samples
+from psfdae_paper.optics.turbulence import structure_function
+from psfdae_paper.optics.wavefronts import (
+    MONOMIALS,
+    ModalWavefronts,
+    monomial_images,
+    zernike_images,
+)
+from psfdae_paper.stages.common import template_wavefronts
+from psfdae_paper.stars.framing import crop_jittered
 from scenes import READS, Selection, pupil_of, relative_to_peak, spread_evenly, stamp_mse
 
 OF_PEAK = "largest difference / peak"
@@ -246,7 +251,11 @@ def imports(repeats, packages):
     """Start of an interpreter with and without packages that are installed and not imported."""
 
     def start(*more):
-        command = [sys.executable, "-c", f"import {', '.join(('psfdae.stages.stars', *more))}"]
+        command = [
+            sys.executable,
+            "-c",
+            f"import {', '.join(('psfdae_paper.stages.stars', *more))}",
+        ]
         return time_calls(lambda: subprocess.run(command, check=True), repeats)
 
     lean_s = start()

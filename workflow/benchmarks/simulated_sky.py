@@ -15,16 +15,16 @@ from scipy.stats import sem
 
 from measure import write
 from psfdae.cli import File, program
-from psfdae.configuration.command import command
-from psfdae.configuration.consistency import SIMULATION
-from psfdae.configuration.schema import Config
 from psfdae.field_psf import slopes
 from psfdae.files import atomic_path
-from psfdae.own_stars.observation import central_pixel
+from psfdae.image.observation import central_pixel
 from psfdae.reading import read_table
 from psfdae.rng import stream
-from psfdae.source import git_commit
-from psfdae.stars.example import add_stamps, write_field
+from psfdae_paper.configuration.command import command
+from psfdae_paper.configuration.consistency import SIMULATION
+from psfdae_paper.configuration.schema import Config
+from psfdae_paper.source import git_commit
+from psfdae_paper.stars.example import add_stamps, write_field
 
 SIDE = 48  # px of a simulated star
 PITCH = 64  # px of the lattice of the stars
@@ -53,9 +53,9 @@ def field(
     star to star. The list has centroids inside an isophote. `psf` (stars, s, s) are parts of all
     light of a star; their pixel (s/2, s/2) is `pixel` (stars, 2), x and y in the image.
     """
-    from psfdae.optics.propagation import StampPropagator
-    from psfdae.optics.pupil import annular_pupil, pixel_width
-    from psfdae.optics.wavefronts import seidel_wavefronts
+    from psfdae_paper.optics.propagation import StampPropagator
+    from psfdae_paper.optics.pupil import annular_pupil, pixel_width
+    from psfdae_paper.optics.wavefronts import seidel_wavefronts
 
     telescope, optics = config.telescope, config.optics
     scale = telescope.pixel_scale_arcsec
@@ -118,7 +118,7 @@ def places(
     """
     from astropy.io import fits
 
-    from psfdae.own_stars.model import load_model
+    from psfdae.model.psf_model import load_model
 
     model, table, known = load_model(bundle), read_table(selection), np.load(truth)
     held, side = np.flatnonzero(table["part"] == "held out"), model.info.stamp_px

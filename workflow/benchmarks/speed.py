@@ -15,12 +15,12 @@ import numpy as np
 from measure import alone, cost_of_command, write
 from prediction import make_cube
 from psfdae.cli import File, program
-from psfdae.configuration.command import command
-from psfdae.configuration.consistency import SIMULATION
-from psfdae.configuration.methods import all_groups
-from psfdae.configuration.schema import Config
-from psfdae.estimators.registry import method
+from psfdae.methods.registry import method
 from psfdae.rng import stream
+from psfdae_paper.configuration.command import command
+from psfdae_paper.configuration.consistency import SIMULATION
+from psfdae_paper.configuration.methods import all_groups
+from psfdae_paper.configuration.schema import Config
 
 BATCHES = (1, 16, 64, 256, 1024)
 LARGEST_BATCH_PER_STAMP = 16  # larger ones than this times `benchmark.stamps` are left out
@@ -163,9 +163,10 @@ def last_cost(runs):
 def untrained_bundle(tree, stars, out):
     """The shipped model with a random network and these stars' size of stamps."""
     from psfdae.files import read_product
-    from psfdae.own_stars.bundle import FREE, Architecture, BundleInfo, read_bundle, write_bundle
-    from psfdae.own_stars.packing import leading
-    from psfdae.own_stars.photometry import FluxModel, noise_equivalent_px
+    from psfdae.model.bundle import FREE, Architecture, BundleInfo, read_bundle, write_bundle
+    from psfdae.model.packing import leading
+    from psfdae.model.photometry import FluxModel
+    from psfdae.noise import noise_equivalent_px
 
     images, dae, shipped = read_product(stars, "stars")["realisation"], tree["dae"], read_bundle()
     side, model = images.shape[-1], FluxModel.fit(images[:1000])

@@ -12,17 +12,17 @@ from pydantic import Field
 from measure import alone, pareto, write, yes
 from psfdae.belonging import STARS, require
 from psfdae.cli import File, Folder, program
-from psfdae.configuration.command import command
-from psfdae.configuration.compose import config_dir, decisive, load_file, part
-from psfdae.configuration.consistency import SIMULATION
-from psfdae.configuration.methods import all_groups
-from psfdae.configuration.schema import Config
-from psfdae.estimators.registry import groups_of, method
 from psfdae.files import read_product, write_csv
-from psfdae.own_stars import star_sets
+from psfdae.methods.registry import groups_of, method
+from psfdae.model import star_sets
 from psfdae.reading import read_table, read_yaml
 from psfdae.settings import Group, Reference
-from psfdae.stages import common
+from psfdae_paper.configuration.command import command
+from psfdae_paper.configuration.compose import config_dir, decisive, load_file, part
+from psfdae_paper.configuration.consistency import SIMULATION
+from psfdae_paper.configuration.methods import all_groups
+from psfdae_paper.configuration.schema import Config
+from psfdae_paper.stages import common
 
 PATIENCE = 5  # validations without a better one after which a training no longer improves
 WORTHWHILE = 0.9  # fraction to which each doubling of the time must bring the error
@@ -68,9 +68,9 @@ def knee_table(
     """
     import pandas as pd
 
-    from psfdae.estimators import HISTORY
-    from psfdae.estimators.dae import Dae
-    from psfdae.evaluation.metrics import mse
+    from psfdae.methods import HISTORY
+    from psfdae.methods.dae import Dae
+    from psfdae.metrics import mse
 
     common.limit_threads(config.evaluation.threads)
     folders = {name: Path(folder) for name, _, folder in (p.partition("=") for p in points)}
@@ -106,7 +106,7 @@ def knee_table(
 
 def settings_of(folder, configured):
     """What a training was, and whether it is the one that the configuration uses."""
-    from psfdae.estimators import CONFIG
+    from psfdae.methods import CONFIG
 
     tree = decisive(read_yaml(folder / CONFIG))
     same = tree["parts"]["test_stars"] > 1
@@ -183,7 +183,7 @@ def time_points(tree, stars):
     import minisom  # noqa: F401
     import sklearn.decomposition  # noqa: F401
 
-    from psfdae.estimators.pca_som import PcaSom
+    from psfdae_paper.methods.pca_som import PcaSom
 
     config = part(READS, tree)
     settings, levels = config.baseline, config.noise.levels
@@ -209,7 +209,7 @@ def time_points(tree, stars):
 
 def time_point(data, settings, tests, truths, repeats):
     """Fit a training set and restore the test images of each λ: median times and mean errors."""
-    from psfdae.estimators.pca_som import PcaSom
+    from psfdae_paper.methods.pca_som import PcaSom
 
     model, fit_s, done = median_time(lambda: PcaSom.fit(data, settings), repeats)
     estimates, predict_s, _ = median_time(
@@ -229,9 +229,9 @@ def readings(
     out: Annotated[File, "CSV: errors of PCA+SOM as the paper can be read, beside its own."],
 ) -> None:
     """Fit PCA+SOM in every reading of the paper and measure it on the random test stars."""
-    from psfdae.estimators.pca_som import PcaSom
-    from psfdae.evaluation.metrics import clustered_mean, mse
-    from psfdae.evaluation.paper import published
+    from psfdae.metrics import clustered_mean, mse
+    from psfdae_paper.evaluation.paper import published
+    from psfdae_paper.methods.pca_som import PcaSom
 
     common.limit_threads(config.baseline.threads)
     product = star_sets.read_stars(stars, "template")
@@ -284,7 +284,7 @@ def methods(
 
 def time_methods(tree, stars):
     """CPU time of each method's fit, stars per second and errors, λ by λ."""
-    from psfdae.evaluation.metrics import clustered_mean, mse
+    from psfdae.metrics import clustered_mean, mse
 
     config = part(METHODS, tree)
     common.limit_threads(1)
@@ -324,7 +324,7 @@ def seeds(
     out: Annotated[File, "CSV with the mean error of every seed."],
 ) -> None:
     """Repeat the fits of METHOD with other seeds, and test all of them on the same noisy stars."""
-    from psfdae.evaluation.metrics import mse
+    from psfdae.metrics import mse
 
     kind, product = method(name), star_sets.read_stars(stars, "template")
     common.limit_threads(kind.threads(config))
@@ -388,7 +388,7 @@ def scatter(
 
 def pooled(errors):
     """Root mean square over λ of the standard deviation over the seeds divided by their mean."""
-    from psfdae.evaluation.comparison import FITTED
+    from psfdae_paper.evaluation.comparison import FITTED
 
     cells = errors.groupby([*FITTED, "noise_level"], sort=False)
     relative = (cells.mse.std() / cells.mse.mean()).groupby(FITTED, sort=False)

@@ -18,10 +18,7 @@ rule propagation:
         config=lambda w: settings(
             "propagation.measure", f"dataset={strictest_dataset(w.scene)}"
         ),
-        source=lambda w: source_hash(
-            "workflow/benchmarks/propagation.py:measure",
-            chosen=[f"psfdae.stars.scenes:{w.scene.title()}Scene"],
-        ),
+        source=lambda w: source_hash("workflow/benchmarks/propagation.py"),
         program=program("propagation.measure"),
         folder=subpath(output[0], parent=True),
         datasets=lambda w: sharing_stars(strictest_dataset(w.scene)),
@@ -49,7 +46,7 @@ rule propagation_tables:
         mem_mb=1000,
     params:
         config=lambda w: settings("propagation.tables", f"dataset={TIMED_DATASET}"),
-        source=source_hash("workflow/benchmarks/propagation.py:tables"),
+        source=source_hash("workflow/benchmarks/propagation.py"),
         program=program("propagation.tables"),
         folder=subpath(output[0], parent=True),
         scenes=lambda w, input: [f"--scene={Path(path).parent}" for path in input],
@@ -64,7 +61,7 @@ BUNDLE = f"{RESULTS}/bundles/{TIMED_DATASET}-random-realisation.psf.safetensors"
 STARS = {"stars": lambda w: stars_of(TIMED_DATASET)}
 OWN_MODEL = f"{RESULTS}/own_stars/example/model"
 MIXED = BUNDLE.replace("realisation", f"realisation{method('gmm').suffix}")
-FITTED = [f"psfdae.estimators.{name}" for name in names_of(TIMED_DATASET)]
+FITTED = [method(name).__module__ for name in names_of(TIMED_DATASET)]
 # By table: target, command, inputs, MB, minutes, stages that it runs or modules that it chooses.
 TIMED = {
     "benchmark_baseline": ("benchmark", "trainings.baseline", STARS, 1500, 20, []),
@@ -248,7 +245,7 @@ use rule stars as fresh_stars with:
             # Another name is another random stream.
             more=("stars.name=fresh", f"stars.count={KNEE.fresh_stars}"),
         ),
-        source=source_hash("stars", chosen=["psfdae.stars.scenes:SeidelScene"]),
+        source=source_hash("stars"),
     message:
         "Simulating other stars for the knee of the training"
 
@@ -277,7 +274,7 @@ rule knee_train:
         config=lambda w: settings(
             "train", f"dataset={KNEE_DATASET}", more=knee_overrides(w.point)
         ),
-        source=source_hash("train", chosen=["psfdae.estimators.dae"]),
+        source=source_hash("train", chosen=["psfdae.methods.dae"]),
         folder=subpath(output.weights, parent=True),
         checkpoint=lambda w: f"{RESULTS}/checkpoints/knee-{w.point}.pt",
     message:
@@ -303,7 +300,7 @@ rule knee_table:
         mem_mb=1500,
     params:
         config=lambda w: settings("trainings.knee_table", f"dataset={KNEE_DATASET}"),
-        source=source_hash("workflow/benchmarks/trainings.py:knee_table"),
+        source=source_hash("workflow/benchmarks/trainings.py"),
         program=program("trainings.knee"),
         points=[f"--point={p}={KNEE_FOLDER.format(point=p)}" for p in KNEE.points],
     message:
@@ -353,9 +350,7 @@ for _method in registered():
             config=lambda w, m=_method: settings(
                 "trainings.seeds", f"dataset={w.dataset}", name=m.name
             ),
-            source=lambda w, m=_method: program_code(
-                "trainings.seeds", [f"psfdae.estimators.{m.name}"]
-            ),
+            source=lambda w, m=_method: program_code("trainings.seeds", [m.__module__]),
             program=program("trainings.seeds"),
             method=_method.name,
             results=lambda w: RESULTS,
@@ -404,7 +399,7 @@ rule seeds:
         f"{RESULTS}/logs/seeds/all.log",
     localrule: True
     params:
-        table="src/psfdae/evaluation/seed_scatter.csv",
+        table="src/psfdae_paper/evaluation/seed_scatter.csv",
     message:
         "Renewing the scatter between seeds that comes with the package"
     shell:
@@ -429,7 +424,7 @@ rule readings_of:
         runtime=20,
     params:
         config=lambda w: settings("trainings.readings", f"dataset={w.dataset}"),
-        source=program_code("trainings.readings", ["psfdae.estimators.pca_som"]),
+        source=program_code("trainings.readings", ["psfdae_paper.methods.pca_som"]),
         program=program("trainings.readings"),
     message:
         "Fitting PCA+SOM of {wildcards.dataset} in every reading of the paper"

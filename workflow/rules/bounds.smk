@@ -16,7 +16,7 @@ rule bank:
         runtime=30,
     params:
         config=lambda w: settings("bank", f"stars={w.stars}"),
-        source=source_hash("bank", chosen=["psfdae.stars.scenes:SeidelScene"]),
+        source=source_hash("bank"),
     message:
         "Simulating the bank of {wildcards.stars}"
     shell:

@@ -9,16 +9,21 @@ from snakemake.utils import validate
 
 from psfdae.cli import stage
 from psfdae.settings import ConfigError, as_overrides
-from psfdae.configuration.compose import config_dir
-from psfdae.configuration.compose import compose, dataset_names, decisive, load
-from psfdae.configuration.compose import keep_in, load_groups, neutral, overrides_for
-from psfdae.configuration.compose import write_settings
-from psfdae.estimators import HISTORY
-from psfdae.estimators.registry import method
-from psfdae.configuration.methods import registered
+from psfdae_paper.configuration.compose import config_dir
+from psfdae_paper.configuration.compose import compose, dataset_names, decisive, load
+from psfdae_paper.configuration.compose import (
+    keep_in,
+    load_groups,
+    neutral,
+    overrides_for,
+)
+from psfdae_paper.configuration.compose import write_settings
+from psfdae.methods import HISTORY
+from psfdae.methods.registry import method
+from psfdae_paper.configuration.methods import registered
 from psfdae.files import DIGESTS, ProductError
-from psfdae.source import source_hash
-from psfdae.sweeps.points import SweepError
+from psfdae_paper.source import source_hash
+from psfdae_paper.sweeps.points import SweepError
 
 keep_in(Path(".snakemake/compositions"))
 validate(config, "../schemas/command_line.schema.yaml")
@@ -63,8 +68,9 @@ def program(name):
 
 def program_code(name, stages):
     """Hash of a command of a program, and of the stages that it runs."""
-    function = f"workflow/benchmarks/{name.replace('.', '.py:')}"
-    return source_hash(function, chosen=stages)
+    return source_hash(
+        f"workflow/benchmarks/{name.partition('.')[0]}.py", chosen=stages
+    )
 
 
 # Stars of an image are not simulated: own_stars.smk.
@@ -275,7 +281,7 @@ def bundles_of(dataset, networks, on_request=False):
 def estimators_source(command, dataset, on_request=False):
     """Hash of a command that applies the methods of a dataset."""
     names = names_of(dataset, on_request)
-    return source_hash(command, chosen=[f"psfdae.estimators.{name}" for name in names])
+    return source_hash(command, chosen=[method(name).__module__ for name in names])
 
 
 def fit_threads(dataset):

@@ -1,5 +1,5 @@
-from psfdae.alignment.methods import TRAINED, METHODS
-from psfdae.own_stars.bundle import SUFFIX
+from psfdae_paper.alignment.methods import TRAINED, METHODS
+from psfdae.model.bundle import SUFFIX
 
 with one_line():
     KNEE = import_module("trainings").load_knee()

@@ -14,9 +14,7 @@ use rule stars as more_stars with:
             f"stars={w.stars}",
             more=(f"stars.name={w.stars}_fresh", f"stars.count={w.fresh}"),
         ),
-        source=lambda w: source_hash(
-            "stars", chosen=[f"psfdae.stars.scenes:{w.scene.title()}Scene"]
-        ),
+        source=source_hash("stars"),
     message:
         "Simulating {wildcards.fresh} other stars {wildcards.stars}"
 
@@ -51,7 +49,7 @@ for _method in (m for m in registered() if m.stored):
             config=lambda w, m=_method: settings(
                 "fit", f"dataset={w.dataset}", name=m.name
             ),
-            source=source_hash("fit", chosen=[f"psfdae.estimators.{_method.name}"]),
+            source=source_hash("fit", chosen=[_method.__module__]),
             method=_method.name,
             more=lambda w, input, m=_method: [
                 *(f"--reference={w.reference}" for _ in w.get("reference", "")[:1]),

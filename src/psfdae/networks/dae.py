@@ -17,13 +17,13 @@ import torch
 from torch import nn
 
 from psfdae.errors import Error
-from psfdae.estimators import TrainingSet
 from psfdae.files import atomic_path
+from psfdae.methods import TrainingSet
 from psfdae.networks.training import DeadNetworkError, Muon, Row, Training, TrainingError, train
 from psfdae.rng import stream
 
 if TYPE_CHECKING:
-    from psfdae.estimators.dae import DaeSettings, Train
+    from psfdae.methods.dae import DaeSettings, Train
 
 
 MOST_ZERO = 0.5
