@@ -27,7 +27,7 @@ from types import SimpleNamespace
 import numpy as np
 import pandas as pd
 
-from psfdae.methods.registry import method
+from psfdae.methods import method
 from psfdae_paper.alignment import methods as scene3
 from psfdae_paper.configuration.compose import compose
 from psfdae_paper.evaluation.comparison import FITTED, SIGNIFICANT, seed_scatter, with_seed_stderr

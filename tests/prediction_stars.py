@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from psfdae.bundle_info import Architecture, BundleInfo
 from psfdae.files import read_product
-from psfdae.model.bundle import FREE, Architecture, BundleInfo
+from psfdae.model.bundle import FREE
 from psfdae.networks.dae import build_dae
 from psfdae_paper.configuration.compose import load_stage
 from psfdae_paper.configuration.consistency import SIMULATION, STATIC

@@ -13,8 +13,8 @@ from psfdae_paper.configuration.compose import load
 from psfdae_paper.optics.derivatives import ModalStamps, PeriodSampling, PointSampling
 from psfdae_paper.optics.propagation import StampPropagator
 from psfdae_paper.optics.pupil import SamplingError, annular_pupil
-from psfdae_paper.optics.raytracing import annulus_points, misaligned
 from psfdae_paper.optics.wavefronts import monomial_coefficients, monomial_images
+from psfdae_paper.raytracing import annulus_points, misaligned
 
 OBSCURATION = 0.42
 SHOWN = [((0, 0, 0, 0), 0), ((0.6, -0.3, 0.2, 0.8), 2), ((1, 1, 1, 1), 7)]

@@ -22,14 +22,14 @@ from psfdae_paper.alignment.telescope import (
     zernike_tracer,
 )
 from psfdae_paper.configuration.compose import load
-from psfdae_paper.optics.raytracing import (
+from psfdae_paper.optics.wavefronts import zernike_basis
+from psfdae_paper.raytracing import (
     DEGREES_OF_FREEDOM,
     RayTracingError,
     annulus_points,
     build_optic,
     misaligned,
 )
-from psfdae_paper.optics.wavefronts import zernike_basis
 
 ARCSEC = np.pi / 180 / 3600
 

@@ -15,7 +15,7 @@ import prediction
 import speed
 import trainings
 from psfdae.files import Column, write_product
-from psfdae.methods import TrainingSet
+from psfdae.method import TrainingSet
 from psfdae.model.bundle import read_bundle, shipped_path
 from psfdae_paper.configuration.compose import load, load_stage
 from psfdae_paper.methods.pca_som import Baseline

@@ -9,7 +9,7 @@ import pytest
 from matplotlib.collections import PolyCollection
 
 from psfdae.files import ProductError, read_product
-from psfdae.methods.registry import method
+from psfdae.methods import method
 from psfdae.model.star_sets import noisy_test_images, split_stars
 from psfdae_paper.configuration.compose import load_stage
 from psfdae_paper.configuration.consistency import SIMULATION, STATIC

@@ -17,13 +17,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.numpy import save_file
 
+from psfdae.bundle_info import Architecture, BundleInfo
 from psfdae.cli import main
 from psfdae.model import packing
 from psfdae.model.bundle import (
-    Architecture,
     Bundle,
     BundleError,
-    BundleInfo,
     creation_date,
     estimator,
     read_bundle,

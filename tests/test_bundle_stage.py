@@ -14,7 +14,7 @@ from psfdae import StarFlag
 from psfdae.belonging import write_origin
 from psfdae.cli import main
 from psfdae.files import Column, ProductError, read_product, write_product
-from psfdae.methods.registry import groups_of
+from psfdae.methods import groups_of
 from psfdae.model import packing
 from psfdae.model.bundle import (
     SCALES,

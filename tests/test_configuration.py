@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from psfdae.methods.registry import groups_of
+from psfdae.methods import groups_of
 from psfdae.settings import ConfigError, as_overrides
 from psfdae_paper.configuration import compose
 from psfdae_paper.configuration.compose import config_dir, load, load_stage

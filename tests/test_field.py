@@ -23,7 +23,7 @@ from psfdae import load_model
 from psfdae.cli import main
 from psfdae.commands import psf
 from psfdae.field_psf import Frames, fit_field
-from psfdae.methods import BrightStamps, FitError, TrainingSet
+from psfdae.method import BrightStamps, FitError, TrainingSet
 from psfdae.methods.field import TELLING, FieldMixture
 from psfdae.model.bundle import read_bundle, write_bundle
 from psfdae.model.psf_model import PredictionError

@@ -27,7 +27,7 @@ from psfdae.files import read_product, write_product
 from psfdae.image.selection import BrightStars, brightest_pixels, collect, moved, star_centres
 from psfdae.image.stamps import cut
 from psfdae.image.training_images import make_images, star_grid, training_columns
-from psfdae.methods.registry import groups_of, method
+from psfdae.methods import groups_of, method
 from psfdae.model.bundle import estimator, read_bundle
 from psfdae.model.psf_model import load_model
 from psfdae.model.report import MEAN_PSF
@@ -364,7 +364,8 @@ def test_the_sky_of_any_gain_can_be_drawn(gain):
 def test_one_process_at_a_time_works_in_a_folder(field, tmp_path):
     """Whoever holds the folder is alone, until its process ends in whatever way."""
     holder = (
-        "import sys, time; from pathlib import Path; from psfdae.commands.from_stars import _alone\n"
+        "import sys, time; from pathlib import Path\n"
+        "from psfdae.commands.from_stars import _alone\n"
         "with _alone(Path(sys.argv[1])): print('mine', flush=True); time.sleep(600)"
     )
     out = tmp_path / "model"

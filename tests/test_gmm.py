@@ -10,7 +10,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from psfdae.files import Product
-from psfdae.methods import FitError, TrainingSet
+from psfdae.method import FitError, TrainingSet
 from psfdae.methods import gmm as module
 from psfdae.methods.gmm import GaussianMixture, Gmm
 from psfdae.model.bundle import BundleError

@@ -13,7 +13,7 @@ import pytest
 from psfdae.settings import ConfigError
 from psfdae_paper.configuration.compose import load
 from psfdae_paper.configuration.wavefront import Prescription
-from psfdae_paper.optics.raytracing import ZernikeTracer, build_optic
+from psfdae_paper.raytracing import ZernikeTracer, build_optic
 
 OWN = "dataset=_telescope"
 FIELD = np.deg2rad([0.0, 0.1, 0.2])

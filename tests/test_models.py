@@ -10,9 +10,8 @@ import pytest
 import torch
 
 from psfdae.files import ProductError
-from psfdae.methods import TrainingSet
+from psfdae.method import TrainingSet
 from psfdae.methods.dae import Dae as Fitted
-from psfdae.methods.dae import DaeSettings, Train
 from psfdae.methods.lmmse import LinearMmse
 from psfdae.metrics import mse
 from psfdae.networks import dae as dae_network
@@ -24,6 +23,7 @@ from psfdae.networks.dae import (
     predict,
     train_dae,
 )
+from psfdae.networks.settings import DaeSettings, Train
 from psfdae.networks.training import DeadNetworkError, TrainingError, orthogonal, progress
 from psfdae.networks.weights import load_weights, save_checkpoint, save_weights
 from psfdae.rng import stream

@@ -24,8 +24,8 @@ from typing import Annotated, ClassVar
 import numpy as np
 from pydantic import Field
 
-from psfdae_paper.configuration.base import Group
-from psfdae.methods import Method
+from psfdae.method import Method
+from psfdae.settings import Group
 
 
 class Settings(Group):
@@ -79,7 +79,7 @@ def tree(tmp_path_factory):
         ignored = shutil.ignore_patterns("__pycache__")
         shutil.copytree(ROOT / name, root / name, ignore=ignored)
     shutil.copy(ROOT / "Snakefile", root)
-    (root / "src/psfdae/estimators/shrunk.py").write_text(CLASS)
+    (root / "src/psfdae_paper/methods/shrunk.py").write_text(CLASS)
     (root / "config/shrunk").mkdir()
     (root / "config/shrunk/default.yaml").write_text("weight: 0.5\n")
     path = root / "config/config.yaml"

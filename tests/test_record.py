@@ -56,7 +56,7 @@ def plan(results, **status):
 @pytest.fixture
 def history(tmp_path, monkeypatch):
     """Git in the folder of the test, as if the package lay there; commits what is in it."""
-    monkeypatch.setattr(source, "ROOT", tmp_path / "src/psfdae")
+    monkeypatch.setattr(source, "SOURCES", tmp_path / "src")
     written(tmp_path / "src/psfdae/a.py", "")
     for name in ("name", "email"):
         for who in ("AUTHOR", "COMMITTER"):

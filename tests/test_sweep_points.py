@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 from psfdae.files import Column, ProductError, write_product
-from psfdae.methods.registry import groups_of
+from psfdae.methods import groups_of
 from psfdae.model.star_sets import noise_model
 from psfdae.splits import random_split
 from psfdae_paper.configuration.compose import compose, load, load_stage, stage_tree

@@ -16,13 +16,13 @@ from psfdae_paper.alignment.telescope import zernike_tracer
 from psfdae_paper.configuration.compose import compose, load, load_stage, stage_tree
 from psfdae_paper.configuration.consistency import SIMULATION, STATIC
 from psfdae_paper.optics.pupil import annular_pupil
-from psfdae_paper.optics.raytracing import RayTracingError
 from psfdae_paper.optics.wavefronts import (
     field_coefficients,
     seidel_wavefronts,
     zernike_images,
     zernike_wavefronts,
 )
+from psfdae_paper.raytracing import RayTracingError
 from psfdae_paper.stages import stars
 from psfdae_paper.stages.common import star_wavefronts, template_wavefronts
 from psfdae_paper.stars.fields import relative_field

@@ -17,6 +17,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from psfdae.version import __version__
+
 if TYPE_CHECKING:
     from psfdae.errors import Error
     from psfdae.image.stamps import StarFlag
@@ -25,8 +27,6 @@ if TYPE_CHECKING:
     from psfdae.model.psf_model import PredictionError, PsfModel, load_model
     from psfdae.model.stars import Stars
     from psfdae.model.validation import Report, validate
-
-__version__ = "0.1.0"
 
 _MODULES = {
     "Error": "errors",

@@ -22,9 +22,9 @@ from typing import Annotated, Any, Literal, Protocol, Union, get_args, get_origi
 
 import click
 
-import psfdae
 from psfdae.errors import Error
 from psfdae.extras import missing
+from psfdae.version import __version__
 
 File = Annotated[Path, click.Path(path_type=Path, dir_okay=False)]
 Folder = Annotated[Path, click.Path(path_type=Path, file_okay=False)]
@@ -146,7 +146,7 @@ class Commands(Careful):
 
 
 @click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"]})
-@click.version_option(psfdae.__version__)
+@click.version_option(__version__)
 def main() -> None:
     """PSF modelling with a denoising autoencoder, one command per stage.
 

@@ -19,8 +19,8 @@ from typing import IO, Any
 
 import numpy as np
 
-import psfdae
 from psfdae.errors import Error
+from psfdae.version import __version__
 
 
 class ProductError(Error, RuntimeError):
@@ -416,7 +416,7 @@ def _storage(column: Column | Empty) -> dict[str, Any]:
 
 def _describe(file: Any, kind: str, config: Mapping[str, Any]) -> None:
     file.attrs["kind"] = kind
-    file.attrs["psfdae_version"] = psfdae.__version__
+    file.attrs["psfdae_version"] = __version__
     file.attrs["config"] = json.dumps(config, sort_keys=True)
 
 

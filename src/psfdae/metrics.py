@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from psfdae.methods import Estimate
+    from psfdae.method import Estimate
 
 SSIM_WINDOW = 7
 """Side of the uniform SSIM window in pixels, scikit-image's default."""

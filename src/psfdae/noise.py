@@ -12,6 +12,7 @@ with variance (κλ)² + p/F: the star's own photons are included.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 

@@ -12,11 +12,12 @@ from typing import Any, NamedTuple
 
 from psfdae.belonging import STARS, require_origin
 from psfdae.files import ProductError, read_product
-from psfdae.methods import HISTORY, Method
-from psfdae.methods.registry import method
+from psfdae.method import HISTORY, Method
+from psfdae.methods import method
 from psfdae.reading import number, read_csv, read_yaml
 from psfdae_paper.alignment.methods import TRAINED
 from psfdae_paper.configuration.methods import registered
+from psfdae_paper.sweeps.points import hash_of
 
 NETWORKS = {"dae": "dae.safetensors", **dict.fromkeys(TRAINED, "network.safetensors")}
 """Networks of scene 3 and the files of their weights."""
@@ -264,8 +265,7 @@ def runs_of_sweep(results: Path, name: str) -> list[Run]:
         If the sweep has no summary, or a point no result.
     """
     from psfdae_paper.configuration.sweep import TRAINED
-    from psfdae_paper.stages.sweep import read_cost, read_result
-    from psfdae_paper.sweeps.method_point import place_of
+    from psfdae_paper.sweeps.measured import place_of, read_cost, read_result
 
     def model_files(model: str, place: Path) -> dict[str, Path]:
         if model in TRAINED:
@@ -348,12 +348,6 @@ def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
         else:
             leaves[f"{prefix}{key}"] = value if isinstance(value, str) else json.dumps(value)
     return leaves
-
-
-def hash_of(tree: Any) -> str:
-    """Hash of a tree in its canonical JSON."""
-    canonical = json.dumps(tree, sort_keys=True, separators=(",", ":"))
-    return hashlib.sha256(canonical.encode()).hexdigest()
 
 
 def _contents(files: Mapping[str, Path]) -> dict[str, str]:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from psfdae.methods import FitError, TrainingSet
+from psfdae.method import FitError, TrainingSet
 from psfdae.methods.gmm import GaussianMixture, Gmm
 from stress.bench import Bench
 

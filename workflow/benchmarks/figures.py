@@ -7,7 +7,7 @@ import numpy as np
 from psfdae.cli import File, program
 from psfdae.figure_style import SERIES_COLORS, new_figure, styled, write_png
 from psfdae.files import ProductError
-from psfdae.methods.registry import method
+from psfdae.methods import method
 from psfdae.reading import read_table
 from psfdae_paper.configuration.command import command
 

@@ -15,7 +15,7 @@ import numpy as np
 from measure import alone, cost_of_command, write
 from prediction import make_cube
 from psfdae.cli import File, program
-from psfdae.methods.registry import method
+from psfdae.methods import method
 from psfdae.rng import stream
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.consistency import SIMULATION
@@ -162,8 +162,9 @@ def last_cost(runs):
 
 def untrained_bundle(tree, stars, out):
     """The shipped model with a random network and these stars' size of stamps."""
+    from psfdae.bundle_info import Architecture, BundleInfo
     from psfdae.files import read_product
-    from psfdae.model.bundle import FREE, Architecture, BundleInfo, read_bundle, write_bundle
+    from psfdae.model.bundle import FREE, read_bundle, write_bundle
     from psfdae.model.packing import leading
     from psfdae.model.photometry import FluxModel
     from psfdae.noise import noise_equivalent_px

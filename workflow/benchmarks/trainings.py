@@ -13,7 +13,7 @@ from measure import alone, pareto, write, yes
 from psfdae.belonging import STARS, require
 from psfdae.cli import File, Folder, program
 from psfdae.files import read_product, write_csv
-from psfdae.methods.registry import groups_of, method
+from psfdae.methods import groups_of, method
 from psfdae.model import star_sets
 from psfdae.reading import read_table, read_yaml
 from psfdae.settings import Group, Reference
@@ -68,7 +68,7 @@ def knee_table(
     """
     import pandas as pd
 
-    from psfdae.methods import HISTORY
+    from psfdae.method import HISTORY
     from psfdae.methods.dae import Dae
     from psfdae.metrics import mse
 
@@ -106,7 +106,7 @@ def knee_table(
 
 def settings_of(folder, configured):
     """What a training was, and whether it is the one that the configuration uses."""
-    from psfdae.methods import CONFIG
+    from psfdae.method import CONFIG
 
     tree = decisive(read_yaml(folder / CONFIG))
     same = tree["parts"]["test_stars"] > 1

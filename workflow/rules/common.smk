@@ -18,8 +18,8 @@ from psfdae_paper.configuration.compose import (
     overrides_for,
 )
 from psfdae_paper.configuration.compose import write_settings
-from psfdae.methods import HISTORY
-from psfdae.methods.registry import method
+from psfdae.method import HISTORY
+from psfdae.methods import method
 from psfdae_paper.configuration.methods import registered
 from psfdae.files import DIGESTS, ProductError
 from psfdae_paper.source import source_hash

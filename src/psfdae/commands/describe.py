@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from typing import Annotated
 
+from psfdae.bundle_info import BundleInfo
 from psfdae.cli import File, command
 from psfdae.files import check_outputs
 from psfdae.image.errors import one_line
-from psfdae.methods.registry import method
-from psfdae.model.bundle import Bundle, BundleInfo, estimator, read_bundle
+from psfdae.methods import method
+from psfdae.model.bundle import Bundle, estimator, read_bundle
 
 Packed = Annotated[File | None, {"argument": True}]
 

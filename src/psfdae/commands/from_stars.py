@@ -25,8 +25,8 @@ from psfdae.files import (
     write_text,
 )
 from psfdae.image.observation import Source
-from psfdae.methods import Method
-from psfdae.methods.registry import method
+from psfdae.method import Method
+from psfdae.methods import method
 from psfdae.model.bundle import SUFFIX
 from psfdae.model.fitting import best, described, fitted_to, makes_models, packed
 from psfdae.model.settings import CHOSEN, Words, of_config

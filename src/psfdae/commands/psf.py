@@ -9,12 +9,12 @@ from typing import Annotated
 import click
 import numpy as np
 
-import psfdae
 from psfdae.cli import File, command
 from psfdae.files import atomic_path, check_outputs
 from psfdae.image.errors import ascii_line
 from psfdae.image.fits_file import BLOCK_BYTES
 from psfdae.model.psf_model import PredictionError, PsfModel, load_model
+from psfdae.version import __version__
 
 PLACE = re.compile(r"([-+0-9.eE]+),([-+0-9.eE]+)")
 GRID = re.compile(r"([0-9]{1,3})x([0-9]{1,3})")
@@ -110,7 +110,7 @@ def write(path: Path, model: PsfModel, places: np.ndarray, oversampling: int) ->
     header["NAXIS3"] = len(places)
     cards = [
         *header.cards,
-        ("CREATOR", f"psfdae {psfdae.__version__}", "program that made this file"),
+        ("CREATOR", f"psfdae {__version__}", "program that made this file"),
         ("PSFMODEL", ascii_line(model.info.name), "model bundle"),
         ("PSFSHA", model.bundle.sha256, ""),
         ("OVERSAMP", oversampling, "values per pixel and axis"),

@@ -18,6 +18,7 @@ from psfdae.errors import Error
 from psfdae.image.errors import no_formula
 from psfdae.image.observation import Observation
 from psfdae.image.stamps import Stamps, StarFlag, cut, peaks, sky_around
+from psfdae.noise import SHIFT_ORDER
 
 if TYPE_CHECKING:
     from astropy.table import Table

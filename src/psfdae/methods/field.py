@@ -33,7 +33,7 @@ import numpy as np
 from pydantic import Field
 
 from psfdae.field_psf import FieldFit, FieldModel, Frames, fit_field, slopes
-from psfdae.methods import BrightStamps, Estimate, FitError, Measured, Method, TrainingSet
+from psfdae.method import BrightStamps, Estimate, FitError, Measured, Method, TrainingSet
 from psfdae.noise import NoiseModel
 from psfdae.settings import Count, Fraction, Group, Positive
 

@@ -39,13 +39,13 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, Self
 import numpy as np
 from pydantic import Field
 
-from psfdae.methods import Estimate, FitError, Method, TrainingSet
+from psfdae.method import Estimate, FitError, Method, TrainingSet
 from psfdae.noise import NoiseModel
 from psfdae.rng import stream
 from psfdae.settings import Count, Group, Positive
 
 if TYPE_CHECKING:
-    from psfdae.model.bundle import BundleInfo
+    from psfdae.bundle_info import BundleInfo
 
 STEP = 0.4
 """Of ln s between noise variances of single stars, which share a factorisation; s is then

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from psfdae.methods import Method, TrainingSet
+from psfdae.method import Method, TrainingSet
 from psfdae.noise import NoiseModel
 
 

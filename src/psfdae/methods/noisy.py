@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from psfdae.methods import Method, TrainingSet
+from psfdae.method import Method, TrainingSet
 
 
 class Noisy(Method):

@@ -1,1 +1,1 @@
-"""Models of the PSF: their fit to the stars of an image, their files, what they predict, their test."""
+"""Models of the PSF of an image: their fit, their files, what they predict, their test."""

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from psfdae.extras import needed_by
-from psfdae.methods import Method
-from psfdae.methods.registry import groups_of
-from psfdae.methods.registry import method as method_of
+from psfdae.method import Method
+from psfdae.methods import groups_of
+from psfdae.methods import method as method_of
 from psfdae.model.packing import bundle_of
 from psfdae.model.psf_model import PsfModel
 from psfdae.model.settings import with_keywords

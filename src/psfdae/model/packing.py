@@ -23,14 +23,13 @@ from typing import Any
 
 import numpy as np
 
-import psfdae
+from psfdae.bundle_info import BundleInfo
 from psfdae.files import Product, ProductError
-from psfdae.methods import Estimate, Method
+from psfdae.method import Estimate, Method
 from psfdae.model.bundle import (
     SCALES,
     Bundle,
     BundleError,
-    BundleInfo,
     at_noise,
     brightest,
     creation_date,
@@ -48,6 +47,7 @@ from psfdae.model.star_sets import (
 )
 from psfdae.noise import NoiseModel
 from psfdae.rng import stream
+from psfdae.version import __version__
 
 NODES = 8  # noise levels at which errors are measured, equidistant in the logarithm
 COMPONENTS = 48  # leading eigenvectors that a bundle stores
@@ -164,7 +164,7 @@ def bundle_of(
     arrays, said = packed(fitted, stamps["stamp_px"], float(band.min()), largest)
     range_of = reach(band, star_area(stars, parts.train))
     info = BundleInfo(
-        psfdae_version=psfdae.__version__,
+        psfdae_version=__version__,
         name=name,
         licence=licence,
         created=creation_date(),

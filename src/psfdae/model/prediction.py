@@ -23,11 +23,11 @@ from typing import IO, TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-import psfdae
 from psfdae.files import atomic_path
 from psfdae.image.errors import ascii_line
 from psfdae.image.fits_file import BLOCK_BYTES, Card
 from psfdae.image.stamps import MEANING, Stamps
+from psfdae.version import __version__
 
 if TYPE_CHECKING:
     from psfdae.model.bundle import Bundle
@@ -263,7 +263,7 @@ def _primary_header(bundle: Bundle, cards: Sequence[Card], history: str) -> Any:
     info, header = bundle.info, fits.PrimaryHDU().header
     header["EXTEND"] = True
     own: list[Card] = [
-        ("CREATOR", f"psfdae {psfdae.__version__}", "program that made this file"),
+        ("CREATOR", f"psfdae {__version__}", "program that made this file"),
         ("PSFMODEL", info.name, "model bundle"),
         ("PSFSHA", bundle.sha256, ""),
         ("PSFFORM", info.format_version, "format of the bundle"),

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from psfdae.bundle_info import BundleInfo
 from psfdae.errors import Error
 from psfdae.image.observation import Observation
 from psfdae.image.stamps import (
@@ -24,10 +25,9 @@ from psfdae.image.stamps import (
     displacement,
     raise_flag,
 )
-from psfdae.methods import Estimate, FitError
+from psfdae.method import Estimate, FitError
 from psfdae.model.bundle import (
     Bundle,
-    BundleInfo,
     at_noise,
     brightest,
     estimator,

@@ -310,7 +310,7 @@ def _errors_table(q: Quality) -> str:
 
 
 def _labels(q: Quality) -> dict[str, str]:
-    from psfdae.methods.registry import method
+    from psfdae.methods import method
 
     names = dict.fromkeys(q.errors["method"])
     return {n: MEAN_LABEL if n == MEAN_PSF else method(n).label for n in names}

@@ -15,7 +15,7 @@ from typing import Any
 
 from pydantic import Field, create_model
 
-from psfdae.methods.registry import MethodNames, known
+from psfdae.methods import MethodNames, known
 from psfdae.reading import read_yaml
 from psfdae.settings import (
     CalibrationStars,

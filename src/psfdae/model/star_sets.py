@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from psfdae.files import Product, ProductError, read_product
-from psfdae.methods import BrightStamps, Method, TrainingSet
+from psfdae.method import BrightStamps, Method, TrainingSet
 from psfdae.noise import NoiseModel, OwnNoise, noise_equivalent_px
 from psfdae.rng import stream
 from psfdae.splits import Split, held_out_split, random_split

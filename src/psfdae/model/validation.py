@@ -13,8 +13,8 @@ import numpy as np
 from psfdae.figure_style import as_png
 from psfdae.files import write_text
 from psfdae.image.stamps import Stamps
-from psfdae.methods import Method
-from psfdae.methods.registry import method as method_of
+from psfdae.method import Method
+from psfdae.methods import method as method_of
 from psfdae.metrics import all_metrics, mse, quality, summarised
 from psfdae.model.packing import checksum
 from psfdae.model.photometry import signal_to_noise

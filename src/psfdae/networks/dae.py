@@ -18,12 +18,12 @@ from torch import nn
 
 from psfdae.errors import Error
 from psfdae.files import atomic_path
-from psfdae.methods import TrainingSet
+from psfdae.method import TrainingSet
 from psfdae.networks.training import DeadNetworkError, Muon, Row, Training, TrainingError, train
 from psfdae.rng import stream
 
 if TYPE_CHECKING:
-    from psfdae.methods.dae import DaeSettings, Train
+    from psfdae.networks.settings import DaeSettings, Train
 
 
 MOST_ZERO = 0.5

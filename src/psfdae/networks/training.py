@@ -22,7 +22,7 @@ from torch import nn
 from torch.optim.lr_scheduler import LambdaLR, LRScheduler, OneCycleLR
 
 from psfdae.errors import Error
-from psfdae.methods import FitError
+from psfdae.method import FitError
 from psfdae.networks.weights import load_checkpoint, save_checkpoint
 
 Row = dict[str, float]

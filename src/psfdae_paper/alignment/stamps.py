@@ -19,7 +19,6 @@ from psfdae_paper.configuration.telescope import Telescope
 from psfdae_paper.optics.derivatives import ModalStamps, PeriodSampling, normalise_with_derivatives
 from psfdae_paper.optics.propagation import in_batches
 from psfdae_paper.optics.pupil import annular_pupil, choose_samples, required_samples
-from psfdae_paper.optics.raytracing import FIRST_NOLL
 from psfdae_paper.optics.wavefronts import (
     Modes,
     mode_slopes,
@@ -28,6 +27,7 @@ from psfdae_paper.optics.wavefronts import (
     slope_ranges,
     zernike,
 )
+from psfdae_paper.raytracing import FIRST_NOLL
 from psfdae_paper.stars.framing import normalise_flux
 
 
@@ -157,8 +157,8 @@ class AlignmentStamps:
         zernikes : ndarray, shape (..., J)
             In waves.
         directions : ndarray, shape (..., K, J)
-            Changes of the coefficients per unit parameter, such as
-            `psfdae_paper.alignment.telescope.QuadraticModel.jacobian`; of none, stamps alone are made.
+            Changes of the coefficients per unit parameter, such as those of
+            `QuadraticModel.jacobian`; of none, stamps alone are made.
 
         Returns
         -------

@@ -26,7 +26,7 @@ from psfdae.errors import Error
 from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.telescope import Telescope
 from psfdae_paper.configuration.wavefront import Prescription
-from psfdae_paper.optics.raytracing import ZernikeTracer, build_optic
+from psfdae_paper.raytracing import ZernikeTracer, build_optic
 from psfdae_paper.stars.symmetry import SYMMETRIES, Symmetry
 
 PAIRS = tuple(combinations_with_replacement(range(4), 2))

@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
-from psfdae.methods.dae import DaeSettings, Train
+from psfdae.networks.settings import DaeSettings, Train
 from psfdae.settings import CheckpointSeconds, Count, Evaluation, Group, Noise, Positive
 from psfdae_paper.configuration.base import PupilSamples
 from psfdae_paper.configuration.telescope import Telescope
@@ -181,3 +181,7 @@ class AlignmentConfig(Group):
     train_dae_retrained: NetworkTrain
     evaluation: Evaluation
     fit: Fit
+
+
+OF_STATES = ("seed", "telescope", "prescription", "alignment", "optics")
+"""Groups that decide the stamps of states."""

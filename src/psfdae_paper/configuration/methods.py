@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from psfdae.files import ProductError
-from psfdae.methods import Method
-from psfdae.methods.registry import known, method
+from psfdae.method import Method
+from psfdae.methods import known, method
 from psfdae.reading import parse_yaml
 from psfdae.settings import ConfigError
 from psfdae_paper.configuration.base import config_dir

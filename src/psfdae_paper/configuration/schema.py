@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field, create_model, model_validator
 
-from psfdae.methods import Method
-from psfdae.methods.registry import MethodName, MethodNames
+from psfdae.method import Method
+from psfdae.methods import MethodName, MethodNames
 from psfdae.settings import (
     CalibrationStars,
     Count,

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
-from psfdae.methods.registry import groups_of, method
+from psfdae.methods import groups_of, method
 from psfdae.settings import ConfigError, Count, Finite, Group, Name, Reference, SplitKind
 from psfdae_paper.configuration.alignment import NETWORKS
 from psfdae_paper.configuration.command import Root

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from psfdae.figure_style import REFERENCES, SERIES_COLORS, new_figure, styled
-from psfdae.methods import Method
-from psfdae.methods.registry import method
+from psfdae.method import Method
+from psfdae.methods import method
 from psfdae.strip import StripRow, draw_cell
 from psfdae_paper.configuration.methods import oracles_last, registered
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from psfdae.methods import Method
+    from psfdae.method import Method
 
 
 SPLIT_LINES = {"random": "-", "held_out": "--"}

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
-from psfdae.methods import TrainingSet
-from psfdae.methods.dae import Dae, DaeSettings, Train
+from psfdae.method import TrainingSet
+from psfdae.methods.dae import Dae
+from psfdae.networks.settings import DaeSettings, Train
 from psfdae_paper.methods.gmm_simulated import Simulated
 
 

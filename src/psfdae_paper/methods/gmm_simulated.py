@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Self
 
 from pydantic import Field
 
-from psfdae.methods import TrainingSet
+from psfdae.method import TrainingSet
 from psfdae.methods.gmm import GaussianMixture, Gmm
 from psfdae.settings import Count
 

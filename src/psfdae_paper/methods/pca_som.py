@@ -22,7 +22,7 @@ from pydantic import Field
 
 from psfdae.belonging import require
 from psfdae.files import Column, Product, read_product, write_product
-from psfdae.methods import FitError, Method, TrainingSet
+from psfdae.method import FitError, Method, TrainingSet
 from psfdae.rng import stream
 from psfdae.settings import Count, Group, Positive
 

@@ -28,9 +28,9 @@ from psfdae_paper.alignment.telescope import (
     verify,
     zernike_tracer,
 )
-from psfdae_paper.configuration.alignment import AlignmentConfig
+from psfdae_paper.configuration.alignment import OF_STATES, AlignmentConfig
 from psfdae_paper.configuration.command import command
-from psfdae_paper.optics.raytracing import FIRST_NOLL, ZernikeTracer
+from psfdae_paper.raytracing import FIRST_NOLL, ZernikeTracer
 
 ModelFile = Annotated[File, "Product of `alignment model`."]
 StatesFile = Annotated[File, "Product of `alignment states`."]
@@ -70,7 +70,7 @@ def read_model(path: Path, wanted: Any, whose: object = OURS) -> QuadraticModel:
 
 @command(
     "alignment states",
-    reads=("seed", "telescope", "prescription", "alignment", "optics"),
+    reads=OF_STATES,
     root="alignment",
 )
 def states(

@@ -31,7 +31,7 @@ from psfdae.files import (
     write_product,
     write_text,
 )
-from psfdae.methods import CONFIG, HISTORY, TrainingSet
+from psfdae.method import CONFIG, HISTORY, TrainingSet
 from psfdae.methods.dae import Dae
 from psfdae.model.star_sets import noise_model
 from psfdae.noise import mixed_levels

@@ -21,7 +21,7 @@ from psfdae.files import (
     write_parquet,
     write_product,
 )
-from psfdae.methods.registry import method as method_named
+from psfdae.methods import method as method_named
 from psfdae.metrics import clustered_mean, mse
 from psfdae.model.star_sets import noise_model, noisy_test_images, split_stars
 from psfdae.reading import read_table

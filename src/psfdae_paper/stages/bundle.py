@@ -11,8 +11,8 @@ import numpy as np
 from psfdae.belonging import SAME_IMAGE, SAME_STARS, STARS, require_origin
 from psfdae.cli import AboveZero, File, Folder
 from psfdae.files import Product
-from psfdae.methods import CONFIG, Method
-from psfdae.methods.registry import method
+from psfdae.method import CONFIG, Method
+from psfdae.methods import method
 from psfdae.model import packing
 from psfdae.model.bundle import SHIPPED, SUFFIX, Bundle, BundleError, read_bundle, write_bundle
 from psfdae.model.psf_model import PsfModel

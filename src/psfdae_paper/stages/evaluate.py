@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from psfdae.cli import File, Folder
 from psfdae.files import Product, ProductError, write_csv, write_parquet, write_text
-from psfdae.methods import Method
-from psfdae.methods.registry import method
+from psfdae.method import Method
+from psfdae.methods import method
 from psfdae.metrics import quality, summarised
 from psfdae.model.star_sets import (
     field_positions,

@@ -11,7 +11,7 @@ import numpy as np
 from psfdae.cli import AboveZero, File
 from psfdae.figure_style import write_png
 from psfdae.files import Product, ProductError, read_product
-from psfdae.methods import Method
+from psfdae.method import Method
 from psfdae.model.star_sets import field_positions, noisy_test_images, read_stars, split_stars
 from psfdae.reading import read_table
 from psfdae.settings import Reference

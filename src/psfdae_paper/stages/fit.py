@@ -9,7 +9,7 @@ from typing import Annotated
 import click
 
 from psfdae.cli import File, Folder
-from psfdae.methods.registry import groups_of, method
+from psfdae.methods import groups_of, method
 from psfdae.model.star_sets import read_stars, training_set
 from psfdae.settings import Reference, SplitKind
 from psfdae.threads import limit_threads

@@ -9,7 +9,6 @@ from typing import Annotated, Any
 import click
 import numpy as np
 
-import psfdae
 from psfdae.cli import File, Folder
 from psfdae.errors import Error
 from psfdae.figure_style import write_png
@@ -17,6 +16,7 @@ from psfdae.files import Product, atomic_path, check_outputs, read_product, writ
 from psfdae.model.shapes import measure_shapes
 from psfdae.noise import noise_equivalent_px
 from psfdae.rng import stream
+from psfdae.version import __version__
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.consistency import STATIC
 from psfdae_paper.configuration.schema import Config
@@ -218,7 +218,7 @@ def write_psfs(config: Any, fields: FieldOfPsfs, path: Path) -> None:
         ("WAVELEN", telescope.wavelength_m, "[m] wavelength"),
         ("APERTURE", telescope.diameter_m, "[m] diameter"),
         ("BUNIT", "1", "fraction of the light of the star"),
-        ("CREATOR", f"psfdae {psfdae.__version__}", ""),
+        ("CREATOR", f"psfdae {__version__}", ""),
     ):
         cube.header.append(card)
     x, y = np.rad2deg(fields.field).T

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import time
 from collections.abc import Mapping, Sequence
@@ -15,24 +14,23 @@ import click
 
 from psfdae.cli import File, Folder
 from psfdae.files import ProductError, write_text
-from psfdae.methods import FitError
-from psfdae.reading import from_tree, read_json
+from psfdae.method import FitError
 from psfdae.settings import Reference, SplitKind
 from psfdae_paper.configuration.command import Root, command
 from psfdae_paper.configuration.compose import decisive, load_stage
 from psfdae_paper.configuration.sweep import TRAINED, models, point_groups
-from psfdae_paper.sweeps.measured import EVALUATION, VALIDATION, Task
+from psfdae_paper.sweeps.measured import (
+    CHECKSUM,
+    COST,
+    EVALUATION,
+    FINISHED,
+    RESULT,
+    VALIDATION,
+    Task,
+    checksum,
+    read_result,
+)
 from psfdae_paper.sweeps.points import changes, with_values
-
-RESULT, COST, FINISHED = "result.json", "cost.json", "finished.json"
-"""Result and cost of a point, and a copy of its result that a workflow does not know.
-
-A workflow that was killed takes what its last jobs still brought to an end for
-incomplete and deletes their results; the copy keeps these trainings from being repeated.
-"""
-
-CHECKSUM = "sha256"
-"""Key of the checksum of all other keys in a result."""
 
 ADAPTIVE_MODULE = "psfdae_paper.sweeps.adaptive"
 
@@ -42,7 +40,7 @@ ROLES = {"config": {"stars"}, "alignment": {"states", "validation", "test"}}
 
 def module_of(model: str) -> str:
     """Module that trains and measures a model."""
-    return f"psfdae_paper.sweeps.{'network' if model in TRAINED else 'method'}_point"
+    return f"psfdae_paper.stages.{'network' if model in TRAINED else 'method'}_point"
 
 
 @dataclass(frozen=True)
@@ -187,7 +185,7 @@ def point(
         dict(keys),
         task.described(),
     ]
-    fingerprint = _digest(content)
+    fingerprint = checksum(content)
     result = _finished(task.folder, fingerprint, files)
     if result is None:
         for stale in (*files, EVALUATION, VALIDATION, COST, RESULT, FINISHED):
@@ -227,11 +225,7 @@ def _finished(folder: Path, fingerprint: str, files: Sequence[str]) -> dict[str,
 
 def as_json(result: Mapping[str, Any]) -> str:
     """A result as text with its checksum."""
-    return json.dumps({**result, CHECKSUM: _digest(result)}, indent=1) + "\n"
-
-
-def _digest(tree: Any) -> str:
-    return hashlib.sha256(json.dumps(tree, sort_keys=True).encode()).hexdigest()
+    return json.dumps({**result, CHECKSUM: checksum(result)}, indent=1) + "\n"
 
 
 def _outcome(module: Any, config: Any, task: Task, model: str) -> dict[str, Any]:
@@ -294,24 +288,3 @@ def _with(config: Any, keys: Mapping[str, Any]) -> Any:
     from psfdae.settings import validate
 
     return validate(type(config), with_values(config.model_dump(), keys))
-
-
-def read_result(path: Path) -> dict[str, Any]:
-    """A point's `result.json` without its checksum.
-
-    Raises
-    ------
-    ProductError
-        If the file is missing, or not what was written.
-    """
-    tree = read_json(path)
-    if tree.pop(CHECKSUM, None) != _digest(tree):
-        raise ProductError(f"{path}: damaged (wrong checksum); delete it and run again")
-    return tree
-
-
-def read_cost(folder: Path) -> dict[str, float]:
-    """Seconds and CPU seconds of a point's training; raises ProductError."""
-    path = folder / COST
-    tree = read_json(path)
-    return {key: from_tree(path, tree, key, make=float) for key in ("seconds", "cpu_seconds")}

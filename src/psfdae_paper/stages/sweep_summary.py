@@ -12,7 +12,7 @@ from psfdae.figure_style import write_png
 from psfdae.files import ProductError, as_yaml, write_csv, write_text
 from psfdae.reading import read_table, read_yaml
 from psfdae_paper.configuration.command import command
-from psfdae_paper.stages.sweep import RESULT, read_cost, read_result
+from psfdae_paper.sweeps.measured import RESULT, read_cost, read_result
 from psfdae_paper.sweeps.points import SweepError
 
 SUMMARY, COSTS, BEST, DEFINITION = "summary.csv", "cost.csv", "best.yaml", "sweep.yaml"

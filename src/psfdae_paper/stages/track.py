@@ -16,10 +16,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
-import psfdae
 from psfdae.cli import File, Folder
 from psfdae.errors import Error
 from psfdae.files import atomic_path, write_text
+from psfdae.version import __version__
 from psfdae_paper import mlflow_view
 from psfdae_paper.configuration.command import command
 from psfdae_paper.source import git_commit
@@ -77,7 +77,7 @@ def import_runs(runs: Sequence[Run], preset: str, database: Path, receipt: Path)
     os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", "20")
     os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "1")
     uri = os.environ.get("MLFLOW_TRACKING_URI", "")
-    tags = {"preset": preset, "commit": git_commit(), "psfdae_version": psfdae.__version__}
+    tags = {"preset": preset, "commit": git_commit(), "psfdae_version": __version__}
     done: list[tuple[str, str]] = []
     with _alone(database):
         try:

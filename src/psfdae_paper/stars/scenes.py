@@ -225,7 +225,7 @@ def static_terms(grid: Grid, telescope: OwnTelescope) -> tuple[tuple[int, ...], 
     aberrations = telescope.aberrations
     if aberrations.kind == "zernike":
         return aberrations.noll, field_coefficients(aberrations.polynomials, relative_field(grid))
-    from psfdae_paper.optics.raytracing import FIRST_NOLL, ZernikeTracer, build_optic
+    from psfdae_paper.raytracing import FIRST_NOLL, ZernikeTracer, build_optic
 
     _, angle_deg = square_grid(grid.points, grid.spacing_deg)
     tracer = ZernikeTracer(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from psfdae.methods import Method
+from psfdae.files import ProductError
+from psfdae.method import Method
+from psfdae.reading import from_tree, read_json
 
 if TYPE_CHECKING:
     from psfdae.files import Product
@@ -188,3 +191,46 @@ def measure_images(
         metrics |= image_metrics(part, rows)
         write_csv(task.folder / name, pd.DataFrame(rows))
     return metrics
+
+
+RESULT, COST, FINISHED = "result.json", "cost.json", "finished.json"
+"""Result and cost of a point, and a copy of its result that a workflow does not know.
+
+A workflow that was killed takes what its last jobs still brought to an end for
+incomplete and deletes their results; the copy keeps these trainings from being repeated.
+"""
+
+
+CHECKSUM = "sha256"
+"""Key of the checksum of all other keys in a result."""
+
+
+def read_result(path: Path) -> dict[str, Any]:
+    """A point's `result.json` without its checksum.
+
+    Raises
+    ------
+    ProductError
+        If the file is missing, or not what was written.
+    """
+    tree = read_json(path)
+    if tree.pop(CHECKSUM, None) != checksum(tree):
+        raise ProductError(f"{path}: damaged (wrong checksum); delete it and run again")
+    return tree
+
+
+def read_cost(folder: Path) -> dict[str, float]:
+    """Seconds and CPU seconds of a point's training; raises ProductError."""
+    path = folder / COST
+    tree = read_json(path)
+    return {key: from_tree(path, tree, key, make=float) for key in ("seconds", "cpu_seconds")}
+
+
+def place_of(kind: type[Method], folder: Path) -> Path:
+    """Where the fit of a point is: the folder itself, or a file in it."""
+    return folder if kind.files else folder / f"{kind.name}.h5"
+
+
+def checksum(tree: Any) -> str:
+    """SHA-256 of a tree as JSON."""
+    return hashlib.sha256(json.dumps(tree, sort_keys=True).encode()).hexdigest()

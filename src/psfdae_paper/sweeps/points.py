@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,6 +15,7 @@ import numpy as np
 from psfdae.errors import Error
 from psfdae.rng import stream
 from psfdae.settings import ConfigError, validate
+from psfdae_paper.configuration.alignment import OF_STATES
 from psfdae_paper.configuration.compose import (
     compose,
     config_dir,
@@ -23,7 +26,6 @@ from psfdae_paper.configuration.compose import (
 )
 from psfdae_paper.configuration.consistency import SIMULATION
 from psfdae_paper.configuration.sweep import Sweep, load_sweep
-from psfdae_paper.tracking import hash_of
 
 DIGITS = 4
 """Significant digits of a drawn number: enough for a search, and short to paste."""
@@ -229,10 +231,7 @@ class Plan:
         """Configuration of the images that all points share."""
         if self.sweep.root == "config":
             return stage_tree(SIMULATION, self._base)
-        from psfdae_paper.stages.alignment import states
-
-        reads = states.stage.settings.reads  # type: ignore[attr-defined]
-        return stage_tree(reads, self._base, "alignment")
+        return stage_tree(OF_STATES, self._base, "alignment")
 
     @cached_property
     def _base(self) -> dict[str, Any]:
@@ -275,3 +274,9 @@ def plan_sweep(name: str, given: Sequence[str] = ()) -> Plan:
     choice = (f"dataset={sweep.dataset}",) if sweep.root == "config" else ()
     chosen = (*choice, *overrides_for(sweep.root, given, choice))
     return Plan(name, sweep, tuple(given), compose(chosen, sweep.root))
+
+
+def hash_of(tree: Any) -> str:
+    """Hash of a tree in its canonical JSON."""
+    canonical = json.dumps(tree, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(canonical.encode()).hexdigest()

@@ -8,7 +8,7 @@ import numpy as np
 
 from psfdae.belonging import STATE_STAMPS, require
 from psfdae.files import read_product, write_csv
-from psfdae.methods import CONFIG, HISTORY
+from psfdae.method import CONFIG, HISTORY
 from psfdae.reading import read_table, read_yaml
 from psfdae.threads import limit_threads
 from psfdae_paper.configuration.compose import part

@@ -7,19 +7,14 @@ from pathlib import Path
 from typing import Any
 
 from psfdae.files import read_product
-from psfdae.methods import HISTORY, Method
-from psfdae.methods.registry import groups_of, method
+from psfdae.method import HISTORY
+from psfdae.methods import groups_of, method
 from psfdae.model.star_sets import read_stars, training_set
 from psfdae.reading import read_table
 from psfdae.threads import limit_threads
 from psfdae_paper.configuration.compose import part
 from psfdae_paper.stages.fit import fit
-from psfdae_paper.sweeps.measured import Measured, Task, measure_images
-
-
-def place_of(kind: type[Method], folder: Path) -> Path:
-    """Where the fit of a point is: the folder itself, or a file in it."""
-    return folder if kind.files else folder / f"{kind.name}.h5"
+from psfdae_paper.sweeps.measured import Measured, Task, measure_images, place_of
 
 
 def files_of(name: str) -> tuple[str, ...]:
