@@ -1,6 +1,6 @@
 """The command line: a stage is a function, and its signature is its command.
 
-`@command("name")` on a function of `psfdae_paper.stages` makes it one: parameters become options,
+`@command("name")` on a function makes it one: parameters become options,
 the docstring the help. Which module has which command is read from the text of the modules,
 so that `psfdae --help` imports none of them.
 """
@@ -26,22 +26,7 @@ from psfdae.errors import Error
 from psfdae.extras import missing
 from psfdae.version import __version__
 
-File = Annotated[Path, click.Path(path_type=Path, dir_okay=False)]
-Folder = Annotated[Path, click.Path(path_type=Path, file_okay=False)]
-AboveZero = click.FloatRange(min=0, min_open=True)
-
-
-class NameOrNumber(click.ParamType):
-    """An extension of a FITS file: its number, in plain digits, or its name."""
-
-    name = "text"
-
-    def convert(self, value: Any, param: Any, ctx: Any) -> str | int:
-        """A number from digits; any other text as it is."""
-        return int(value) if re.fullmatch("[0-9]{1,6}", str(value)) else value
-
-
-OWN = "psfdae_paper.stages"
+OWN = "psfdae.commands"
 """The package's own commands; those of others join it by entry points "psfdae.commands"."""
 
 

@@ -73,9 +73,15 @@ def _finding(error: Mapping[str, Any]) -> str:
 
 
 def deciding(group: Group) -> dict[str, Any]:
-    """The settings of a group but for those that cannot change a result."""
-    fields = type(group).model_fields.items()
-    return group.model_dump(exclude={name for name, field in fields if NEUTRAL in field.metadata})
+    """The settings of a group, and of groups in it, but for those that cannot change a result."""
+    tree = group.model_dump()
+    for name, field in type(group).model_fields.items():
+        value = getattr(group, name)
+        if NEUTRAL in field.metadata:
+            del tree[name]
+        elif isinstance(value, Group):
+            tree[name] = deciding(value)
+    return tree
 
 
 def as_overrides(tree: Mapping[str, Any]) -> list[str]:

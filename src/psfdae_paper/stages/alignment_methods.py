@@ -20,7 +20,6 @@ import click
 import numpy as np
 
 from psfdae.belonging import STATE_STAMPS, require, require_origin, write_origin
-from psfdae.cli import AboveZero, File, Folder
 from psfdae.files import (
     Column,
     Product,
@@ -35,14 +34,15 @@ from psfdae.method import CONFIG, HISTORY, TrainingSet
 from psfdae.methods.dae import Dae
 from psfdae.model.star_sets import noise_model
 from psfdae.noise import mixed_levels
+from psfdae.options import AboveZero, File, Folder
 from psfdae.reading import from_tree, read_yaml
 from psfdae.rng import stream
+from psfdae.settings import deciding
 from psfdae.threads import limit_threads
 from psfdae_paper.alignment.methods import BOUNDS, FITTED, LEARNED, METHODS, TRAINED, Method, of_set
 from psfdae_paper.alignment.stamps import AlignmentStamps
 from psfdae_paper.configuration.alignment import NETWORKS, AlignmentConfig, NetworkTrain
 from psfdae_paper.configuration.command import command
-from psfdae_paper.configuration.compose import decisive
 from psfdae_paper.stages.alignment import ModelFile, StatesFile, TestSet, read_model
 
 if TYPE_CHECKING:
@@ -149,7 +149,9 @@ def train_network(
         return NetworkTraining(data, getattr(config, settings.network), settings, config.seed, kind)
 
     with progress(settings.epochs) as report:
-        done = train(begin, checkpoint, fingerprint(decisive(described), data.stamps), report)
+        done = train(
+            begin, checkpoint, fingerprint(described | deciding(config), data.stamps), report
+        )
     save_weights(out / NETWORK_WEIGHTS, done.result, described)
     write_origin(out, product)
     write_text(out / HISTORY, as_csv(done.history))

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 
 from psfdae.belonging import STARS, STATIC, require
-from psfdae.cli import File
 from psfdae.files import (
     Column,
     Product,
@@ -24,6 +23,7 @@ from psfdae.files import (
 from psfdae.methods import method as method_named
 from psfdae.metrics import clustered_mean, mse
 from psfdae.model.star_sets import noise_model, noisy_test_images, split_stars
+from psfdae.options import File
 from psfdae.reading import read_table
 from psfdae.rng import stream
 from psfdae.threads import limit_threads

@@ -11,7 +11,6 @@ from typing import Annotated
 
 import click
 
-from psfdae.cli import File, Folder
 from psfdae.files import (
     DIGESTS,
     UNDIGESTED,
@@ -22,6 +21,7 @@ from psfdae.files import (
     sweep_stale,
 )
 from psfdae.networks.weights import load_weights
+from psfdae.options import File, Folder
 from psfdae_paper import mlflow_view
 from psfdae_paper.configuration.command import command
 
