@@ -172,10 +172,20 @@ def datasets():
     return pd.DataFrame([config(f"dataset={d}") for d in config()["workflow"].datasets])
 
 
-def packages():
-    """First sentence of every sub-package and of every module at the top."""
+def library():
+    """Modules of the library, as `_modules`."""
+    return _modules("psfdae")
+
+
+def reproduction():
+    """Modules of the reproduction, as `_modules`."""
+    return _modules("psfdae_paper")
+
+
+def _modules(name):
+    """First sentence of every sub-package and of every module at the top of a package."""
     found = {}
-    for path in sorted((ROOT / "src/psfdae").glob("[!_]*")):
+    for path in sorted((ROOT / "src" / name).glob("[!_]*")):
         source = path / "__init__.py" if path.is_dir() else path
         if source.is_file() and source.suffix == ".py":
             about = ast.get_docstring(ast.parse(source.read_text(encoding="utf-8"))) or ""
