@@ -1,1 +1,1 @@
-"""Star images: field points, random aberrations, framing, noise and splits."""
+"""Simulated stars: field points, random aberrations, framing."""
