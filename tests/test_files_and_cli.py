@@ -137,6 +137,7 @@ templates(of_templates, folder / "t")
 stars(of_stars, folder / "t", folder / "s")
 done("simulation", "torch", "pandas", "skimage", "sklearn", *PACKAGES)
 
+import psfdae_paper.stages
 for module in pkgutil.iter_modules(psfdae_paper.stages.__path__):
     importlib.import_module(f"psfdae_paper.stages.{module.name}")
 done("import of the stages", "torch", "matplotlib", *PACKAGES)

@@ -63,7 +63,7 @@ def atomic_path(path: str | Path, digest: bool = True) -> Iterator[Path]:
         if digest and (record := digest_path(path)):
             # First, so that no product stands without its digest.
             with atomic_path(record, digest=False) as noted:
-                noted.write_text(digest_line(temporary, path.name), encoding="utf-8")
+                noted.write_text(digest_line(temporary, record), encoding="utf-8")
         temporary.replace(path)
         _to_disk(path.parent)
     except OSError as error:
@@ -114,10 +114,12 @@ def digest_path(path: Path) -> Path | None:
     return None
 
 
-def digest_line(path: Path, name: str) -> str:
-    """What `sha256sum` would print for a file of that name."""
+def digest_line(path: Path, record: Path) -> str:
+    """What `sha256sum` would print of a file, in the folder of results, for its digest `record`."""
+    parts = record.parts
+    place = Path(*parts[len(parts) - parts[::-1].index(DIGESTS) :]).with_suffix("")
     with path.open("rb") as file:
-        return f"{hashlib.file_digest(file, 'sha256').hexdigest()}  {name}\n"
+        return f"{hashlib.file_digest(file, 'sha256').hexdigest()}  {place}\n"
 
 
 @cache

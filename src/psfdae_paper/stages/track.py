@@ -20,7 +20,6 @@ from psfdae.errors import Error
 from psfdae.files import atomic_path, write_text
 from psfdae.options import File, Folder
 from psfdae.version import __version__
-from psfdae_paper import mlflow_view
 from psfdae_paper.configuration.command import command
 from psfdae_paper.source import git_commit
 from psfdae_paper.tracking import Run, flatten, runs_of_alignment, runs_of_datasets, runs_of_sweep
@@ -98,7 +97,6 @@ def import_runs(runs: Sequence[Run], preset: str, database: Path, receipt: Path)
             )
     done += [("", NOT_SENT)] * (len(runs) - len(done))
     write_text(receipt, _as_csv(runs, preset, done))
-    mlflow_view.note(receipt, {} if uri else _written(runs, tags, done))
     counts = Counter(action for _, action in done)
     print(f"{len(done)} runs:", ", ".join(f"{n} {action}" for action, n in sorted(counts.items())))
 
@@ -226,17 +224,6 @@ def _create(client: Any, experiment: str, record: Run, tags: dict[str, str]) -> 
     client.set_terminated(run_id, record.status, record.end_ms)
     client.set_tag(run_id, "content_hash", record.content_hash)
     return run_id
-
-
-def _written(
-    runs: Sequence[Run], tags: dict[str, str], done: Sequence[tuple[str, str]]
-) -> dict[str, tuple[list[str], list[str]]]:
-    """Names of the tags and files of each run, by its id."""
-    written = {}
-    for record, (run_id, _) in zip(runs, done, strict=True):
-        own = {*tags, *_tags(record), "content_hash", *([PARENT] if record.parent else [])}
-        written[run_id] = (sorted(own), sorted([*record.files, "config.yaml"]))
-    return written
 
 
 def _tags(record: Run) -> dict[str, str]:
