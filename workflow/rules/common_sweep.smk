@@ -61,9 +61,8 @@ def sweep_options(w):
     for name, tree in (("values", point.values), ("keys", point.keys)):
         options.append(f"--{name}={json.dumps(tree, sort_keys=True)}")
     if point.slot is not None:
-        search = json.dumps({**plan.search, "study": plan.study}, sort_keys=True)
+        search = json.dumps(plan.search, sort_keys=True)
         options += [f"--slot={point.slot}", f"--search={search}"]
-        options += [f"--journal={SWEEPS}/{w.sweep}/study.journal"]
         options += [f"--known={other.name}" for other in plan.known(point)]
     return options
 

@@ -52,18 +52,14 @@ class Trial:
     slot : int
         Its number.
     search : dict
-        space, seed, startup, metric and direction of the sweep, and study, the name under
-        which the journal has its trials.
+        space, seed, startup, metric and direction of the sweep.
     known : sequence of str
         Names of the points that it learns from.
-    journal : Path
-        File of Optuna's journal storage.
     """
 
     slot: int
     search: Mapping[str, Any]
     known: Sequence[str]
-    journal: Path
 
 
 class JsonType(click.ParamType):
@@ -115,7 +111,6 @@ def sweep_point(
     checkpoint: Annotated[File, "State of an interrupted training."],
     slot: Annotated[int | None, "Number of a trial of an adaptive sweep."] = None,
     search: Annotated[Json | None, "Space and settings of an adaptive sweep, as JSON."] = None,
-    journal: Annotated[File | None, "Optuna's journal of an adaptive sweep."] = None,
     source: Annotated[
         str, "Hash of the code, with which a result is kept.", {"show_default": False}
     ] = "",
@@ -124,15 +119,14 @@ def sweep_point(
     overrides: Overrides = (),
 ) -> None:
     """Train one point of a sweep and measure it."""
-    given = (slot is not None, search is not None, journal is not None)
-    if any(given) and not all(given):
-        raise click.UsageError("--slot, --search and --journal go together")
+    if (slot is None) != (search is None):
+        raise click.UsageError("--slot and --search go together")
     root: Root = "alignment" if model in TRAINED else "config"
     if {role for role, _ in data} != ROLES[root]:
         raise click.UsageError(f"--data: {model} needs {', '.join(sorted(ROLES[root]))}")
     trial = None
-    if slot is not None and search is not None and journal is not None:
-        trial = Trial(slot, search, known, journal)
+    if slot is not None and search is not None:
+        trial = Trial(slot, search, known)
     task = Task(dataset, split, reference, dict(data), levels, out, checkpoint)
     config = load_stage(point_groups(model), overrides, root)
     point(config, model, values or {}, keys or {}, task, trial, source)
@@ -173,8 +167,7 @@ def point(
     module = import_module(module_of(model))
     files = module.files_of(model)
     if trial is not None:
-        adaptive, space = _open(trial)
-        values = _asked(adaptive, space, trial, task.folder)
+        space, values = _asked(trial, task.folder)
         asked = changes(space, values)
         config, keys = _with(config, asked), {**keys, **asked}
     content = [
@@ -204,8 +197,6 @@ def point(
         }
         write_text(task.folder / FINISHED, as_json(result))
     write_text(task.folder / RESULT, as_json(result))
-    if trial is not None:
-        adaptive.finish(trial.journal, space, trial.search, [result])
 
 
 def _finished(folder: Path, fingerprint: str, files: Sequence[str]) -> dict[str, Any] | None:
@@ -263,24 +254,15 @@ def _write_cost(folder: Path, seconds: float, cpu_seconds: float) -> None:
     write_text(folder / COST, json.dumps(cost) + "\n")
 
 
-def _open(trial: Trial) -> tuple[Any, dict[str, Any]]:
-    """Module that asks, and axes of the space."""
+def _asked(trial: Trial, folder: Path) -> tuple[dict[str, Any], Mapping[str, Any]]:
+    """Axes of the space, and the values that the search proposes for a trial."""
     from psfdae.settings import validate
     from psfdae_paper.configuration.sweep import Axis
 
     space = {name: validate(Axis, axis) for name, axis in trial.search["space"].items()}
-    return import_module(ADAPTIVE_MODULE), space
-
-
-def _asked(
-    adaptive: Any, space: Mapping[str, Any], trial: Trial, folder: Path
-) -> Mapping[str, Any]:
-    """Values that the search proposes for a trial, which the journal then has as begun."""
     known = [read_result(folder.parent / other / RESULT) for other in trial.known]
-    values: Mapping[str, Any] = adaptive.ask(space, trial.search, trial.slot, known)
-    about = {"slot": trial.slot, "point": folder.name}
-    adaptive.begin(trial.journal, space, trial.search, about, values, known)
-    return values
+    adaptive = import_module(ADAPTIVE_MODULE)
+    return space, adaptive.ask(space, trial.search, trial.slot, known)
 
 
 def _with(config: Any, keys: Mapping[str, Any]) -> Any:

@@ -16,7 +16,6 @@ from psfdae_paper.sweeps.measured import RESULT, read_cost, read_result
 from psfdae_paper.sweeps.points import SweepError
 
 SUMMARY, COSTS, BEST, DEFINITION = "summary.csv", "cost.csv", "best.yaml", "sweep.yaml"
-JOURNAL = "study.journal"
 
 
 @command("sweep summary")
@@ -88,21 +87,6 @@ def summary(
     # Unsorted: the order of the axes is that of the figures.
     write_text(out / DEFINITION, yaml.safe_dump(described, sort_keys=False))
     write_text(out / BEST, _best_yaml(name, definition, given, chosen))
-    if definition["kind"] == "adaptive":
-        _complete_journal(out / JOURNAL, definition, results)
-
-
-def _complete_journal(
-    journal: Path, definition: Mapping[str, Any], results: Sequence[Mapping[str, Any]]
-) -> None:
-    """Note all trials, also those that a new journal did not learn from the ones after them."""
-    from psfdae.settings import validate
-    from psfdae_paper.configuration.sweep import Axis
-    from psfdae_paper.sweeps import adaptive
-
-    space = {name: validate(Axis, axis) for name, axis in sorted(definition["space"].items())}
-    # The study is called like its first point.
-    adaptive.finish(journal, space, {**definition, "study": results[0]["point"]}, results)
 
 
 def choose(

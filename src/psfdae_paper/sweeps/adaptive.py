@@ -1,15 +1,13 @@
 """Adaptive search: Optuna's ask and tell, one process per trial.
 
 What a trial asks for follows from the results of earlier trials alone, which are files
-of the workflow. The journal, Optuna's own record of the study, is a view of them that
-its tools can open (`optuna-dashboard`); a lost or damaged journal is written again.
+of the workflow: each process tells a new study what they were.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from psfdae.rng import stream
@@ -34,8 +32,7 @@ def ask(
     ----------
     space : mapping of name to config group `Axis`
     search : mapping
-        seed, startup, metric and direction of the sweep; for the journal, also study,
-        the name of the study in it.
+        seed, startup, metric and direction of the sweep.
     slot : int
         Number of the trial.
     known : sequence of mappings
@@ -55,140 +52,21 @@ def ask(
         sampler=optuna.samplers.TPESampler(seed=seed, n_startup_trials=search["startup"]),
     )
     for result in sorted(known, key=lambda result: result["slot"]):
-        study.add_trial(_trial(space, result["values"], *_outcome(result, search), result))
+        study.add_trial(_trial(space, result, search))
     asked = study.ask(_distributions(space)).params
     return {name: _read(axis, asked[name]) for name, axis in space.items()}
 
 
-def begin(
-    journal: Path,
-    space: Mapping[str, Any],
-    search: Mapping[str, Any],
-    about: Mapping[str, Any],
-    values: Mapping[str, Any],
-    known: Sequence[Mapping[str, Any]],
-) -> None:
-    """Note a trial as running, and the results of earlier ones that the journal lacks.
+def _trial(space: Mapping[str, Any], result: Mapping[str, Any], search: Mapping[str, Any]) -> Any:
+    from optuna.trial import TrialState, create_trial
 
-    A trial that was interrupted goes on under its number if it asks for the same.
-
-    Parameters
-    ----------
-    journal : Path
-        File of Optuna's journal storage; created if missing, set aside if damaged.
-    space, search, known : as for `ask`
-    about : mapping
-        slot and point of the trial.
-    values : mapping
-        Result of `ask`.
-    """
-    from optuna.trial import TrialState
-
-    study = _study(journal, search)
-    for result in sorted(known, key=lambda result: result["slot"]):
-        _tell(study, space, search, result)
-    if _running(study, space, about["slot"], values) is None:
-        study.add_trial(_trial(space, values, TrialState.RUNNING, None, about))
-
-
-def finish(
-    journal: Path,
-    space: Mapping[str, Any],
-    search: Mapping[str, Any],
-    results: Sequence[Mapping[str, Any]],
-) -> None:
-    """Note results of trials, those that are there already excepted.
-
-    Parameters
-    ----------
-    journal, space, search : as for `begin`
-    results : sequence of mappings
-        slot, point, values, status and metrics of each.
-    """
-    study = _study(journal, search)
-    for result in results:
-        _tell(study, space, search, result)
-
-
-def _tell(
-    study: Any, space: Mapping[str, Any], search: Mapping[str, Any], result: Mapping[str, Any]
-) -> None:
-    state, value = _outcome(result, search)
-    for trial in study.get_trials(deepcopy=False):
-        same = trial.user_attrs.get("point") == result["point"]
-        if same and (trial.state, trial.value) == (state, value):
-            return
-    running = _running(study, space, result["slot"], result["values"])
-    if running is None:
-        study.add_trial(_trial(space, result["values"], state, value, result))
-    else:
-        study.tell(running.number, value, state)
-
-
-def _running(
-    study: Any, space: Mapping[str, Any], slot: int, values: Mapping[str, Any]
-) -> Any | None:
-    """The unfinished trial of a slot; others that it has left behind have failed."""
-    from optuna.trial import TrialState
-
-    asked = {name: _written(space[name], value) for name, value in values.items()}
-    found = None
-    for trial in study.get_trials(states=(TrialState.RUNNING,)):
-        if trial.user_attrs.get("slot") == slot:
-            if found is None and trial.params == asked:
-                found = trial
-            else:
-                study.tell(trial.number, state=TrialState.FAIL)
-    return found
-
-
-def _study(journal: Path, search: Mapping[str, Any]) -> Any:
-    import optuna
-    from optuna.storages import JournalStorage
-    from optuna.storages.journal import JournalFileBackend
-
-    _silence()
-    journal.parent.mkdir(parents=True, exist_ok=True)
-    for attempt in range(2):
-        try:
-            return optuna.create_study(
-                storage=JournalStorage(JournalFileBackend(str(journal))),
-                study_name=search["study"],
-                direction=search["direction"],
-                load_if_exists=True,
-            )
-        except (ValueError, KeyError) as error:  # a process was killed within a line
-            if attempt:
-                raise
-            print(f"{journal}: damaged ({error}); set aside and written again", flush=True)
-            journal.replace(journal.with_name(f"{journal.name}.damaged"))
-    raise AssertionError
-
-
-def _trial(
-    space: Mapping[str, Any],
-    values: Mapping[str, Any],
-    state: Any,
-    value: float | None,
-    about: Mapping[str, Any],
-) -> Any:
-    from optuna.trial import create_trial
-
+    done = result["status"] in FINISHED
     return create_trial(
-        state=state,
-        value=value,
-        params={name: _written(axis, values[name]) for name, axis in space.items()},
+        state=TrialState.COMPLETE if done else TrialState.FAIL,
+        value=float(result["metrics"][search["metric"]]) if done else None,
+        params={name: _written(axis, result["values"][name]) for name, axis in space.items()},
         distributions=_distributions(space),
-        user_attrs={key: about[key] for key in ("slot", "point") if key in about},
     )
-
-
-def _outcome(result: Mapping[str, Any], search: Mapping[str, Any]) -> tuple[Any, float | None]:
-    from optuna.trial import TrialState
-
-    if result["status"] not in FINISHED:
-        return TrialState.FAIL, None
-    return TrialState.COMPLETE, float(result["metrics"][search["metric"]])
 
 
 def _distributions(space: Mapping[str, Any]) -> dict[str, Any]:

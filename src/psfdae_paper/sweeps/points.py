@@ -186,11 +186,6 @@ class Plan:
         keys = ("space", "seed", "metric", "direction", "startup", "parallel", "overrides")
         return self.sweep.model_dump(include=set(keys), exclude_none=True)
 
-    @property
-    def study(self) -> str:
-        """Name of an adaptive sweep's study: that of its first point, however many follow."""
-        return next(iter(self.points))
-
     def known(self, point: Point) -> list[Point]:
         """Trials that a trial of an adaptive sweep learns from.
 
