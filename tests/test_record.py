@@ -191,19 +191,6 @@ def test_what_is_kept_is_of_a_commit_in_the_history(results, history, tmp_path):
             record.reference(results, out, [plan(results)])
 
 
-def test_table_that_no_rule_makes_says_its_commit(results, history, tmp_path):
-    out, name = tmp_path / "reference", "tables/simulated_sky.csv"
-    first = history()
-    head = history()
-    table = written(results / name, f"mse,commit,date\n1,{first},2026-01-02\n")
-    record.reference(results, out, [plan(results)])
-    assert recorded(out)["kept"] == {name: {"commit": first, "date": "2026-01-02"}}
-    for text in ("mse\n1\n", f"mse,commit,date\n1,{head}-dirty,2026-01-02\n"):
-        table.write_text(text)
-        with pytest.raises(ProductError, match="simulated_sky"):
-            record.reference(results, out, [plan(results)])
-
-
 def test_a_plan_of_something_else_is_no_record(results, history, tmp_path):
     history()
     other = written(tmp_path / "other.tsv", "output_file\tplan\n")

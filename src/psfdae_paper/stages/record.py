@@ -23,7 +23,6 @@ import numpy as np
 
 from psfdae.files import ProductError, write_csv, write_text
 from psfdae.options import File, Folder
-from psfdae.reading import read_table
 from psfdae_paper.configuration.command import command
 from psfdae_paper.source import git
 
@@ -51,13 +50,10 @@ RECORDED = re.compile(
 )
 """Products that the record holds."""
 
-BY_HAND = ("tables/simulated_sky.csv", "tables/simulated_sky_scatter.csv")
-"""Tables that no rule makes: they need packages that are not ours to distribute."""
-
 MAY_STAY = re.compile(
     r"(sweeps|paper|figures/benchmark)/.+"
     r"|tables/(benchmark_\w+|scaling_stages|baseline_readings|predict_poppy\w*)\.csv"
-    r"|tables/psf_metrics_on_request\.csv|" + "|".join(BY_HAND)
+    r"|tables/psf_metrics_on_request\.csv"
 )
 """What takes too long, or a machine without other work, to be made for every record."""
 
@@ -133,24 +129,21 @@ def reference(
     are as committed and Snakemake finds every file up to date with them, wherever it was made.
     What takes long (`MAY_STAY`) stays from the record before if it is not; provenance names it
     with the commit it was recorded at, which has to be in the history, and the commit's date.
-    Tables that no rule makes (`BY_HAND`) say in their columns what they are of.
     """
     from psfdae_paper.configuration.compose import load
 
     commit = _commit_in_use()
     renewed = _up_to_date(results, plans)
-    by_hand = [path for path in BY_HAND if (results / path).is_file()]
     last = out / "provenance.json"
     before = json.loads(last.read_text()) if last.is_file() else {}
     stays = (path for path in sorted(out.rglob("*")) if path.is_file() and path != last)
     kept = {
         name: _since(name, before)
         for name in (path.relative_to(out).as_posix() for path in stays)
-        if name not in (*renewed, *by_hand) and MAY_STAY.fullmatch(name)
+        if name not in renewed and MAY_STAY.fullmatch(name)
     }
-    sources = {name: results / name for name in (*renewed, *by_hand)}
+    sources = {name: results / name for name in renewed}
     sources |= {name: out / name for name in kept}
-    kept |= {name: _said(results / name) for name in by_hand}
     for name, found in kept.items():
         _require_history(name, found)
     staging = out.with_name(f".{out.name}.new")
@@ -207,13 +200,6 @@ def _since(name: str, before: Mapping[str, Any]) -> dict[str, str]:
     """Commit and date at which a file of the record before was recorded."""
     earlier = before.get("kept", {}).get(name)
     return earlier or {key: before.get(key, "unknown") for key in ("commit", "date")}
-
-
-def _said(path: Path) -> dict[str, str]:
-    """Commit and date in the columns of a table; ProductError without."""
-    columns = {"commit": str, "date": str}
-    row = read_table(path, usecols=list(columns), dtype=columns).iloc[0]
-    return {key: str(row[key]) for key in columns}
 
 
 def _require_history(name: str, found: Mapping[str, str]) -> None:

@@ -11,9 +11,9 @@ from typing import Annotated
 
 import click
 import numpy as np
+import pandas as pd
 from scipy.stats import sem
 
-from measure import write
 from psfdae.cli import program
 from psfdae.field_psf import slopes
 from psfdae.files import atomic_path
@@ -152,7 +152,7 @@ def places(
         row |= {"mse": error.mean(), "stderr": sem(error)}
         row |= {"over": over, "over_stderr": sem(paired)}
         rows.append(row | {"date": date.today().isoformat(), "commit": git_commit()})
-    write(out, rows)
+    pd.DataFrame(rows).to_csv(out, index=False, float_format="%.6g")
 
 
 def _cut(image, pixel, side):
