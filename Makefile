@@ -46,7 +46,7 @@ SNAKEMAKE := snakemake --cores "$$CORES" --config preset="$$PRESET" set="$$SET"
 LOCKED := set -f; sh workflow/locked.sh $(SNAKEMAKE)
 # Targets on request are in the report where they have been built.
 REPORTED = all \
-  $(if $(wildcard $(PSFDAE_RESULTS)/figures/benchmark/skipping.png),benchmark) \
+  $(if $(wildcard $(PSFDAE_RESULTS)/figures/benchmark/inference.png),benchmark) \
   $(if $(wildcard $(PSFDAE_RESULTS)/.stability_passed),stability) \
   $(if $(wildcard $(PSFDAE_RESULTS)/tables/psf_efficiency.csv),bounds) \
   $(if $(wildcard $(PSFDAE_RESULTS)/figures/benchmark/training.png),training_knee) \

@@ -313,7 +313,7 @@ def better(first, second):
 
 def readings():
     """Interpretations of PCA+SOM: rise with λ², errors over the paper's and the usual."""
-    table = csv("tables/baseline_readings.csv")
+    table = csv("studies/baseline_readings/table.csv")
     usual = table.query("reading == 'map' and per_level == 'yes'")
     usual = usual.set_index(CELL).mse.rename("usual")
     keys, rows = ["dataset", "reference", "reading", "per_level"], []

@@ -311,17 +311,6 @@ def test_every_stress_test_passes():
     assert (table.verdict == "pass").all()
 
 
-MORE_RUNGS = pytest.mark.xfail(
-    strict=True, reason="a ladder with more rungs is cheaper; it needs new stars and a new record"
-)
-
-
-@pytest.mark.parametrize("scene", [pytest.param("seidel", marks=MORE_RUNGS), "turbulence"])
-def test_settings_are_those_that_the_benchmark_chose(scene):
-    choice = pd.read_csv(REFERENCE / "tables/benchmark_choice.csv")
-    assert (choice.config_is_cheapest[choice.scene == scene] == "yes").all()
-
-
 def test_training_in_use_is_the_knee():
     training = pd.read_csv(REFERENCE / "tables/benchmark_training.csv")
     assert (training[training.used == "yes"].knee == "yes").all()

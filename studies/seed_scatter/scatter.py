@@ -22,11 +22,10 @@ from torch.optim.lr_scheduler import OneCycleLR
 
 from psfdae.files import read_product
 from psfdae.methods.dae import Dae
+from psfdae.model.star_sets import noisy_test_images, split_stars, training_set
 from psfdae.networks.dae import DaeTraining, predict
 from psfdae_paper.configuration.compose import load
 from psfdae_paper.source import git_commit
-from psfdae_paper.stages.common import noisy_test_images, split_stars
-from psfdae_paper.stages.fit import training_set
 
 AVERAGES = (0.98, 0.99, 0.995)
 """Decays of the moving averages of the weights, a step of the optimiser each."""

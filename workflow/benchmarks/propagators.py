@@ -356,17 +356,6 @@ def finish(rows, used):
     return table.assign(used=np.where(in_use, "yes", "no"))
 
 
-def kernel_times(table, optics, benchmark):
-    """Time of a stamp in ms by (samples, points, precision), mean over the cases.
-
-    Backend and batch are the configured ones, threads the benchmark's.
-    """
-    used = asdict(configured_setting(optics, benchmark, 0)) | {"threads": benchmark.threads}
-    wanted = ["method", "backend", "threads", "batch", "processes"]
-    rows = table[(table[wanted] == [used[name] for name in wanted]).all(axis=1)]
-    return dict(rows.groupby(["samples", "points", "precision"])["time_ms"].mean())
-
-
 def compare(table):
     """Every setting of a peer beside our cheapest setting that errs no more.
 

@@ -32,7 +32,6 @@ SIZES = ("components", "rows", "columns", "epochs")
 COMPONENTS, MAPS, EPOCHS = (5, 10, 20, 40), (7, 11, 15), (2, 10, 50)
 CHEAP_S = 3.0  # within which a fit of PCA+SOM is repeated
 
-READINGS = (("map", True), ("map", False), ("projection", True))
 
 SEEDS = 5  # of each method: that of the configuration and the next ones
 
@@ -223,45 +222,6 @@ def time_point(data, settings, tests, truths, repeats):
     return row
 
 
-@command("readings", reads=(*SIMULATION, "dataset", "noise", "parts", "baseline"))
-def readings(
-    config: Config,
-    stars: Annotated[File, "Product of the stage stars."],
-    out: Annotated[File, "CSV: errors of PCA+SOM as the paper can be read, beside its own."],
-) -> None:
-    """Fit PCA+SOM in every reading of the paper and measure it on the random test stars."""
-    from psfdae.metrics import clustered_mean, mse
-    from psfdae_paper.evaluation.paper import published
-    from psfdae_paper.methods.pca_som import PcaSom
-
-    common.limit_threads(config.baseline.threads)
-    product = star_sets.read_stars(stars, "template")
-    require(stars, product.config, STARS, config)
-    test = star_sets.split_stars(product, "random", config).test
-    field, dataset = product["field_index"][test], config.dataset.name
-    paper = published("psf").query("dataset == @dataset and metric == 'mse' and method == 'pca'")
-    paper = paper.set_index("noise_level").value
-    data = star_sets.training_set(config, PcaSom, product, "random", "realisation")
-    rows = []
-    for reading, per_level in READINGS:
-        changed = {"reading": reading, "per_level": per_level}
-        fitted = PcaSom.fit(data, config.baseline.model_copy(update=changed))
-        for level in config.noise.levels:
-            noisy = star_sets.noisy_test_images(config, product, test, level)
-            found = fitted.predict(noisy, level)
-            for name in config.dataset.references:
-                mean, stderr = clustered_mean(mse(found, product[name][test]), field)
-                row = {"dataset": dataset, "reference": name, "reading": reading}
-                row |= {"per_level": yes(per_level), "noise_level": level}
-                row |= {"mse": mean, "stderr": stderr, "n": test.size}
-                row |= {
-                    "mse_paper": paper.get(level),
-                    "over_paper": mean / paper.get(level, np.nan),
-                }
-                rows.append(row)
-    write(out, rows)
-
-
 def median_time(call, repeats):
     """Result, median seconds and number of repeats; fewer if they take long."""
     times: list[float] = []
@@ -398,4 +358,4 @@ def pooled(errors):
 
 
 if __name__ == "__main__":
-    program(knee_table, baseline, readings, methods, seeds, scatter)
+    program(knee_table, baseline, methods, seeds, scatter)

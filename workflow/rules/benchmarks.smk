@@ -1,6 +1,6 @@
 PROPAGATION = f"{RESULTS}/benchmark/propagation/{{scene}}/"
 SCENES = options("scene")
-OPTICS = ["propagation", "convergence", "choice", "guard", "skipping", "machine"]
+OPTICS = ["propagation", "convergence", "machine"]
 
 
 rule propagation:
@@ -21,12 +21,11 @@ rule propagation:
         source=lambda w: source_hash("workflow/benchmarks/propagation.py"),
         program=program("propagation.measure"),
         folder=subpath(output[0], parent=True),
-        datasets=lambda w: sharing_stars(strictest_dataset(w.scene)),
     message:
         "Timing the optics of scene {wildcards.scene} against its error"
     shell:
         "python {params.program} --config {params.config}"
-        " --datasets {params.datasets} --out {params.folder} > {log} 2>&1"
+        " --out {params.folder} > {log} 2>&1"
 
 
 rule propagation_tables:
@@ -45,16 +44,14 @@ rule propagation_tables:
     resources:
         mem_mb=1000,
     params:
-        config=lambda w: settings("propagation.tables", f"dataset={TIMED_DATASET}"),
         source=source_hash("workflow/benchmarks/propagation.py"),
         program=program("propagation.tables"),
         folder=subpath(output[0], parent=True),
         scenes=lambda w, input: [f"--scene={Path(path).parent}" for path in input],
     message:
-        "Joining the tables of the optics benchmark and timing imports"
+        "Joining the tables of the optics benchmark"
     shell:
-        "python {params.program} --config {params.config}"
-        " {params.scenes:q} --out {params.folder} > {log} 2>&1"
+        "python {params.program} {params.scenes:q} --out {params.folder} > {log} 2>&1"
 
 
 BUNDLE = f"{RESULTS}/bundles/{TIMED_DATASET}-random-realisation.psf.safetensors"
@@ -164,7 +161,6 @@ for _table, (_target, _run, _inputs, _mb, _minutes, _stages) in TIMED.items():
 
 DRAWN = {
     **{f"propagation_{scene}": f"error against time, {scene}" for scene in SCENES},
-    "skipping": "what is not computed",
     "baseline": "baseline: error against time",
     "inference": "speed of the network",
     "methods": "all methods: error against time",
@@ -404,49 +400,3 @@ rule seeds:
         "Renewing the scatter between seeds that comes with the package"
     shell:
         "install -D -m 644 {input} {params.table} 2> {log}"
-
-
-# What the paper leaves open about its PCA, by its own rows.
-READINGS = f"{RESULTS}/readings/{{dataset}}.csv"
-
-
-rule readings_of:
-    input:
-        stars=lambda w: stars_of(w.dataset),
-    output:
-        READINGS,
-    log:
-        f"{RESULTS}/logs/benchmark/readings_{{dataset}}.log",
-    benchmark:
-        f"{RESULTS}/benchmarks_on_request/readings/{{dataset}}.tsv"
-    resources:
-        mem_mb=1500,
-        runtime=20,
-    params:
-        config=lambda w: settings("trainings.readings", f"dataset={w.dataset}"),
-        source=program_code("trainings.readings", ["psfdae_paper.methods.pca_som"]),
-        program=program("trainings.readings"),
-    message:
-        "Fitting PCA+SOM of {wildcards.dataset} in every reading of the paper"
-    shell:
-        "python {params.program} --config {params.config} --stars {input.stars}"
-        " --out {output} > {log} 2>&1"
-
-
-use rule psf_bounds as baseline_readings with:
-    input:
-        expand(READINGS, dataset=TABULATED),
-    output:
-        f"{RESULTS}/tables/baseline_readings.csv",
-    log:
-        f"{RESULTS}/logs/benchmark/baseline_readings.log",
-    benchmark:
-        f"{RESULTS}/benchmarks_on_request/readings/all.tsv"
-    message:
-        "Collecting the readings of PCA+SOM"
-
-
-rule readings:
-    input:
-        rules.baseline_readings.output,
-    localrule: True

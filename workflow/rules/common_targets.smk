@@ -70,12 +70,6 @@ def strictest_dataset(scene):
     )
 
 
-def sharing_stars(dataset):
-    """Number of datasets that are made of the same stars."""
-    stars = dataset_config(dataset).stars.name
-    return sum(dataset_config(d).stars.name == stars for d in ALL_DATASETS)
-
-
 def timed_threads(w):
     """A timing takes as many cores as it may use, so that no other job disturbs it."""
     return dataset_config(ALL_DATASETS[0]).benchmark.threads

@@ -210,9 +210,7 @@ class DaeTraining(Training):
     def loss(self, batch: tuple[torch.Tensor, ...], step: int) -> torch.Tensor:
         """Mean squared error, weighted by star."""
         noisy, target, weight = batch
-        half = self.settings.precision == "bfloat16"
-        with torch.autocast("cpu", torch.bfloat16, enabled=half):
-            output = self.model(noisy)
+        output = self.model(noisy)
         if step % self.settings.dead_check_steps == 0 and not output.detach().any():
             raise DeadNetworkError(f"all outputs are zero at step {step}")
         return (weight * (output - target) ** 2).mean()

@@ -58,9 +58,6 @@ class Train(Group):
         1.0, description="Maximum norm of the gradient; 0 switches clipping off"
     )
     threads: Count = Field(1, description="Threads of one training")
-    precision: Literal["float32", "bfloat16"] = Field(
-        "float32", description="Of the convolutions' products while training; weights stay float32"
-    )
     validate_every: Count = Field(2, description="Epochs between validations")
     validation_draws: Count = Field(1, description="Noise draws per validation star")
     dead_check_steps: Count = Field(50, description="Steps between looks for a dead network")

@@ -5,8 +5,7 @@ Star images are mean-subtracted and projected on their first K eigenvectors
 6–8), and the mean star image of a cluster is the PSF of all its stars. The
 decomposition is scikit-learn's, the map is MiniSom's.
 
-The paper says neither which noise its training stars have nor whether images follow from
-features in another way: `baseline.per_level` and `baseline.reading`.
+The paper does not say which noise its training stars have: `baseline.per_level`.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from math import isqrt
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from pydantic import Field
@@ -30,10 +29,6 @@ from psfdae.settings import Count, Group, Positive
 class Baseline(Group):
     """PCA features clustered by a self-organising map."""
 
-    reading: Literal["map", "projection"] = Field(
-        "map",
-        description="PSF of a star: mean image of its cluster, or its projection on the components",
-    )
     per_level: bool = Field(
         True,
         description="A fit for each noise level λ, on stars of its noise; else one for mixed λ",
@@ -60,8 +55,7 @@ class PcaFit:
     components : ndarray, shape (K, P)
         Eigenvectors, rows.
     nodes : ndarray, shape (M, K)
-        Map nodes in feature space; only nodes that won a training star. Where there are none,
-        images are projected on the components.
+        Map nodes in feature space; only nodes that won a training star.
     psf : ndarray, shape (M, P)
         Mean star image of each node's cluster.
     """
@@ -95,9 +89,7 @@ class PcaFit:
 
     def predict(self, images: np.ndarray) -> np.ndarray:
         """PSF of every image, shape (n, d, d); raises as `features`."""
-        if len(self.nodes):
-            return self.psf[self.assign(images)].reshape(images.shape)
-        return (self.mean + self.features(images) @ self.components).reshape(images.shape)
+        return self.psf[self.assign(images)].reshape(images.shape)
 
 
 @dataclass(frozen=True)
@@ -242,7 +234,6 @@ def fit_pca_som(
     sigma: float,
     learning_rate: float,
     seed: int,
-    reading: str = "map",
 ) -> PcaFit:
     """Fit the baseline on noisy star images of one level, or of mixed ones.
 
@@ -262,8 +253,6 @@ def fit_pca_som(
         Initial values; the neighbourhood radius `sigma` is in nodes.
     seed : int
         Seed of the map's initial weights and of the order of stars.
-    reading : str
-        "map", or "projection": no map is fitted.
 
     Raises
     ------
@@ -280,9 +269,6 @@ def fit_pca_som(
             f"(stars and pixels: {flat.shape})"
         )
     pca = PCA(components, svd_solver="full").fit(flat)
-    if reading == "projection":
-        none = np.empty((0, components)), np.empty((0, flat.shape[1]))
-        return PcaFit(pca.mean_, pca.components_, *none)
     # The sign of an eigenvector is free; scikit-learn fixes it, so runs agree.
     features = pca.transform(flat)
     som = MiniSom(

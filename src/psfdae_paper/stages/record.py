@@ -37,7 +37,7 @@ ON_REQUEST = "benchmarks_on_request"
 
 TARGETS = (
     *("benchmark", "bounds", "own_stars", "prediction"),
-    *("readings", "scaling", "stability", "training_knee"),
+    *("scaling", "stability", "training_knee"),
 )
 """Those targets that a record is made of."""
 
@@ -52,7 +52,7 @@ RECORDED = re.compile(
 
 MAY_STAY = re.compile(
     r"(sweeps|paper|figures/benchmark)/.+"
-    r"|tables/(benchmark_\w+|scaling_stages|baseline_readings|predict_poppy\w*)\.csv"
+    r"|tables/(benchmark_\w+|scaling_stages|predict_poppy\w*)\.csv"
     r"|tables/psf_metrics_on_request\.csv"
 )
 """What takes too long, or a machine without other work, to be made for every record."""
