@@ -27,7 +27,7 @@ from types import SimpleNamespace
 import numpy as np
 import pandas as pd
 
-from psfdae.methods import method
+from psfdae.methods import known, method
 from psfdae_paper.alignment import methods as scene3
 from psfdae_paper.configuration.compose import compose
 from psfdae_paper.evaluation.comparison import FITTED, SIGNIFICANT, seed_scatter, with_seed_stderr
@@ -202,7 +202,7 @@ def poppy(name):
     """Errors on POPPY's stars, with the labels of the methods, which end the bundles' names."""
     table = csv(name)
     ends = table.bundle.str.extract(r"-realisation-(\w+)$", expand=False).fillna(table.method)
-    return table.assign(label=[method(m).label for m in ends])
+    return table.assign(label=ends.map({kind.name: kind.label for kind in known()}))
 
 
 def coverage():

@@ -246,14 +246,13 @@ def test_all_methods_are_timed_and_drawn(smoke, tmp_path):
 def test_targets_on_request(smoke, tmp_path):
     # Other tests want the folder as the default target leaves it.
     folder = shutil.copytree(smoke, tmp_path / "run", symlinks=True)
-    snakemake(folder, "prediction", "scaling", "on_request", "seeds")
+    snakemake(folder, "prediction", "scaling", "seeds")
     tables = {p.stem: pd.read_csv(p) for p in (folder / "results/tables").glob("*.csv")}
     for name in ("predict_throughput", "scaling_stages"):
         assert list(tables[name].columns) == columns(name)
     poppy = tables["predict_poppy"]
-    # A DAE that was trained on fresh stars is a DAE; the bundle's name tells them apart.
-    assert set(poppy.method) == {"dae", "gmm", "gmm_simulated"}
-    assert poppy.bundle.nunique() == 4
+    assert set(poppy.method) == {"dae", "gmm"}
+    assert poppy.bundle.nunique() == 2
     assert poppy.coverage95_given.notna().all()
     cover = tables["predict_coverage"]
     assert set(cover.bundle) == {*poppy.bundle, "example"}
@@ -279,7 +278,4 @@ def test_targets_on_request(smoke, tmp_path):
     assert both.mse.to_numpy() == pytest.approx(both.value.to_numpy(), rel=1e-5)
     renewed = pd.read_csv(folder / "src/psfdae_paper/evaluation/seed_scatter.csv")
     assert renewed.equals(tables["seed_scatter"])
-    asked = {"gmm_simulated", "gmm_simulated_position", "dae_simulated"}
-    for name in ("psf_metrics_on_request", "psf_efficiency_on_request"):
-        assert asked <= set(tables[name].method)
-    assert planned(folder, "prediction", "scaling", "on_request", "seeds") == {}
+    assert planned(folder, "prediction", "scaling", "seeds") == {}

@@ -141,7 +141,7 @@ def test_reference_keeps_the_layout_and_says_where_it_comes_from(results, histor
     assert provenance["versions"]["torch"].startswith("2.")
 
 
-SLOW = "tables/psf_metrics_on_request.csv"
+SLOW = "tables/benchmark_training.csv"
 
 
 @pytest.mark.parametrize("pending", [{SLOW: "update pending"}, {}])
@@ -187,7 +187,7 @@ def test_what_is_kept_is_of_a_commit_in_the_history(results, history, tmp_path):
     written(out / "provenance.json", json.dumps({"kept": kept}))
     for commit in (kept[SLOW]["commit"], "f" * 40):
         kept[SLOW]["commit"] = commit
-        with pytest.raises(ProductError, match=r"on_request\.csv: .* not in the history"):
+        with pytest.raises(ProductError, match=r"benchmark_training\.csv: .* not in the history"):
             record.reference(results, out, [plan(results)])
 
 
@@ -200,8 +200,8 @@ def test_a_plan_of_something_else_is_no_record(results, history, tmp_path):
 
 TOY = """rule reference:
     input: "results/runtime.csv", "results/tables/a.csv"
-rule psf_metrics_on_request:
-    output: "results/tables/psf_metrics_on_request.csv"
+rule training_knee:
+    output: "results/tables/benchmark_training.csv"
     params: source=HASH
     shell: "echo {params.source} > {output}"
 rule:
@@ -229,7 +229,7 @@ def test_make_reference_refuses_a_run_of_two_commits(history, tmp_path):
             assert done.returncode == 0, done.stderr
         return commit, captured(line, **options)
 
-    first, done = renewed("1", "reference", "psf_metrics_on_request")
+    first, done = renewed("1", "reference", "training_knee")
     assert done.returncode == 0, done.stderr
     assert recorded(tmp_path / "results/reference")["commit"] == first
     _, done = renewed("2", "results/runtime.csv")

@@ -96,9 +96,6 @@ class TrainingSet:
         "realisation" or "template".
     positions : ndarray, shape (n, 2)
         Where the stars stand in the field, any unit; empty where nobody knows.
-    fresh : Product or None
-        Other draws of the simulator, with the arrays of a product "stars", if
-        `Method.fresh` asks for them.
     own_noise : callable or None
         Of images that are not noise-free: from star indices (m,) and their mean image (P,)
         to what noise adds to their scatter (P, P) about it.
@@ -120,7 +117,6 @@ class TrainingSet:
     seed: int = 0
     reference: str = "realisation"
     positions: np.ndarray = field(default_factory=lambda: np.empty((0, 2)))
-    fresh: Product | None = None
     own_noise: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
     bright: BrightStamps | None = None
     start: Method | None = None
@@ -139,29 +135,6 @@ class TrainingSet:
     def without_validation(self) -> TrainingSet:
         """The same stars but for those that validate."""
         return replace(self, validation=self.validation[:0])
-
-    def on_fresh_stars(self) -> TrainingSet:
-        """The fresh stars as those that are fitted, in fields of the training part only.
-
-        Raises
-        ------
-        FitError
-            If there are none.
-        """
-        if self.fresh is None:
-            raise FitError("it learns from fresh stars: give a product of the stage stars")
-        grid, field = self.fresh["grid"], self.fresh["field_index"]
-        known = (grid[:, None] == np.unique(self.positions[self.train], axis=0)).all(-1).any(1)
-        drawn, kept = known[field].nonzero()[0], self.validation
-        return replace(
-            self,
-            images=np.concatenate([self.fresh["realisation"][drawn], self.images[kept]]),
-            references=np.concatenate([self.fresh[self.reference][drawn], self.references[kept]]),
-            positions=np.concatenate([grid[field[drawn]], self.positions[kept]]),
-            fit=np.arange(drawn.size),
-            validation=drawn.size + np.arange(kept.size),
-            fresh=None,
-        )
 
 
 @dataclass(frozen=True)
@@ -329,11 +302,6 @@ class Method:
         """Threads of a fit: the setting of that name, if there is one."""
         groups = cls.settings(config).values()
         return next((g.threads for g in groups if hasattr(g, "threads")), 1)
-
-    @classmethod
-    def fresh(cls, config: Any) -> int:
-        """Stars beyond those of the training part, which a simulation may draw; 0: none."""
-        return 0
 
     @classmethod
     def continues(cls, config: Any) -> bool:

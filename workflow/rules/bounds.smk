@@ -112,23 +112,6 @@ rule psf_efficiency:
         " {input.methods} > {log} 2>&1"
 
 
-use rule psf_efficiency as psf_efficiency_on_request with:
-    input:
-        bounds=lambda w: expand(
-            rules.dataset_bounds.output.summary, dataset=asked_datasets()
-        ),
-        best=lambda w: expand(
-            rules.dataset_bounds.output.per_star, dataset=asked_datasets()
-        ),
-        methods=lambda w: on_request_of("parquet"),
-    output:
-        f"{RESULTS}/tables/psf_efficiency_on_request.csv",
-    log:
-        f"{RESULTS}/logs/bounds/psf_efficiency_on_request.log",
-    benchmark:
-        f"{RESULTS}/benchmarks_on_request/bounds/psf_efficiency_on_request.tsv"
-
-
 rule paper_rows:
     input:
         bounds=rules.psf_bounds.output,

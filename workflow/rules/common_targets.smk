@@ -28,20 +28,6 @@ def per_star_of(dataset, splits=None):
     ]
 
 
-def asked_datasets():
-    """Datasets that methods on request are fitted to."""
-    return [d for d in default_datasets() if names_of(d, on_request=True)]
-
-
-def on_request_of(suffix):
-    """Evaluations of the methods on request, all fields seen in training."""
-    return [
-        csv.removesuffix("csv") + suffix
-        for dataset in asked_datasets()
-        for csv in evaluations_of(dataset, ["random"], "on_request")
-    ]
-
-
 def bound_figures_of(dataset):
     kinds = ["errors", "efficiency"] + (["growth"] if has_bank(dataset) else [])
     return [f"{RESULTS}/figures/bounds/{dataset}_{kind}.png" for kind in kinds]
@@ -76,9 +62,8 @@ def timed_threads(w):
 
 
 def every_bundle_of_timed(w):
-    """Bundles of the methods of the timed dataset, those on request, too."""
-    some = [bundles_of(TIMED_DATASET, PACKED, asked) for asked in (False, True)]
-    return sum(some, [])
+    """Bundles of the methods of the timed dataset."""
+    return bundles_of(TIMED_DATASET, PACKED)
 
 
 def rivals_of_shipped(w):

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import Field, create_model, model_validator
 
 from psfdae.method import Method
-from psfdae.methods import MethodName, MethodNames
+from psfdae.methods import MethodNames
 from psfdae.settings import (
     CalibrationStars,
     Count,
@@ -162,9 +162,6 @@ class Workflow(Group):
 
     datasets: Annotated[list[Name], Field(min_length=1)] = Field(
         description="Options of the group dataset"
-    )
-    on_request: dict[MethodName, list[Name]] = Field(
-        description="Methods of the target on_request, and the datasets that they are fitted to"
     )
 
 

@@ -29,7 +29,6 @@ def fit(
     stars: Stars,
     split: SplitKind = "random",
     reference: Reference = "realisation",
-    fresh: Annotated[File | None, "Product of the stage stars with other draws."] = None,
     start: Annotated[
         Folder | None, "Fit to the realisations, from which one to templates goes on."
     ] = None,
@@ -41,9 +40,8 @@ def fit(
     kind = method(name)
     limit_threads(kind.threads(config))
     product = read_stars(stars, reference if kind.per_reference else "template")
-    more = None if fresh is None else read_stars(fresh, "template")
     kept = checkpoint or kind.beside(out, "checkpoint.pt")
-    data = training_set(config, kind, product, split, reference, fresh=more, checkpoint=kept)
+    data = training_set(config, kind, product, split, reference, checkpoint=kept)
     if start is not None:
         if reference != "template" or not kind.continues(config):
             raise click.UsageError("--start: nothing that goes on from a fit is fitted")

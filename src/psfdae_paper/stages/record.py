@@ -53,7 +53,6 @@ RECORDED = re.compile(
 MAY_STAY = re.compile(
     r"(sweeps|paper|figures/benchmark)/.+"
     r"|tables/(benchmark_\w+|scaling_stages|predict_poppy\w*)\.csv"
-    r"|tables/psf_metrics_on_request\.csv"
 )
 """What takes too long, or a machine without other work, to be made for every record."""
 
