@@ -13,8 +13,7 @@ from astropy.io import fits
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from fits_inputs import open_observation, write_cube
-from hostile_files import GOOD, write_good
+from fits_inputs import GOOD, open_observation, write_cube, write_good
 from psfdae.image.errors import ObservationError, reading
 
 D = 16
@@ -40,7 +39,6 @@ def folder(tmp_path_factory):
 
 
 FILES = [(kind, name) for kind in ("cube", "image", "catalogue") for name in GOOD[kind]]
-FILES += [("catalogue", "sky.csv")]
 
 
 def attempt(path, **options):
