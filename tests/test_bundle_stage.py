@@ -13,6 +13,7 @@ from click.testing import CliRunner
 from psfdae import StarFlag
 from psfdae.belonging import write_origin
 from psfdae.cli import main
+from psfdae.commands import describe
 from psfdae.files import Column, ProductError, read_product, write_product
 from psfdae.methods import groups_of
 from psfdae.model import packing
@@ -378,7 +379,7 @@ def test_export_of_a_wrong_network_fails_and_leaves_no_file(folder, tmp_path, mo
 
     monkeypatch.setattr(dae_network, "_plain", wrong)
     with pytest.raises(dae_network.ExportError, match="differs from torch"):
-        stage.export(folder / "tiny.psf.safetensors", out=tmp_path / "x.onnx")
+        describe.export(folder / "tiny.psf.safetensors", out=tmp_path / "x.onnx")
     assert list(tmp_path.iterdir()) == []
 
 

@@ -304,4 +304,4 @@ def test_an_installed_wheel_finds_its_configuration(installed, tmp_path, argumen
     ]
     assert shown[0] == shown[1]
     assert "checkpoint_seconds: 20.0" in shown[0]
-    assert (installed / "psfdae/config/config.yaml").is_file()
+    assert (installed / "psfdae_paper/config/config.yaml").is_file()

@@ -242,7 +242,7 @@ def test_strip_shows_the_noise_that_evaluate_measures(tmp_path, gaussian_stars, 
         monkeypatch.setattr(kind, "require", lambda *stars: None)
         monkeypatch.setattr(kind, "load", classmethod(unchanged))
     monkeypatch.setattr(
-        "psfdae_paper.evaluation.figures.restoration_strip",
+        "psfdae.strip.restoration_strip",
         lambda rows, columns, title: shown.update(rows=rows, columns=columns, title=title),
     )
     monkeypatch.setattr(stage, "write_png", lambda figure, out: None)

@@ -215,7 +215,7 @@ rule:
 @pytest.mark.workflow
 def test_make_reference_refuses_a_run_of_two_commits(history, tmp_path):
     """With Snakemake's own word for it, in a workflow of three files."""
-    for folder in ("config", "src/psfdae"):
+    for folder in ("config", "src"):
         shutil.copytree(ROOT / folder, tmp_path / folder, dirs_exist_ok=True)
     line = ["sh", str(ROOT / "workflow/reference.sh")]
     options = {"cwd": tmp_path, "env": environment(PYTHONPATH=str(tmp_path / "src"))}

@@ -14,6 +14,7 @@ from astropy.io import fits
 
 from fits_inputs import write_cube
 from prediction_stars import observe
+from psfdae_paper.stages.simulate import write_example
 from workflow_runs import ROOT, captured
 
 pytestmark = pytest.mark.slow
@@ -122,3 +123,27 @@ def test_a_command_of_the_reproduction_names_its_extra(installed, words, package
     done = installed.psfdae(*words)
     line = f'psfdae: this command needs {package}: pip install "psfdae[paper]"\n'
     assert (done.returncode, done.stderr) == (2, line)
+
+
+FOUR_LINES = """
+import psfdae
+stars = psfdae.Stars.from_image("image.fits", catalogue="stars.csv")
+model = psfdae.fit(stars, method="field")
+report = psfdae.validate(model, stars)
+model.save("image.psf.safetensors"); report.save("page.html")
+print(model.bundle.sha256)
+"""
+
+
+def test_four_lines_of_python_train_and_judge_a_model(installed):
+    """The command leaves the same model."""
+    image, stars = installed.folder / "image.fits", installed.folder / "stars.csv"
+    sizes = {"side_px": 400, "bright": 60, "faint": 20, "blended": 1, "saturated": 1}
+    write_example(image, stars, seed=3, **sizes)
+    said = installed.python(FOUR_LINES)
+    assert (installed.folder / "page.html").stat().st_size > 10_000
+    words = ("from-stars", image, "--catalogue", stars, "--method", "field", "--out", "trained")
+    done = installed.psfdae(*words)
+    assert done.returncode == 0, done.stderr
+    described = installed.psfdae("describe", "trained/image.psf.safetensors")
+    assert said.split()[-1] in described.stdout

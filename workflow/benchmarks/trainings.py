@@ -18,12 +18,12 @@ from psfdae.model import star_sets
 from psfdae.options import File, Folder
 from psfdae.reading import read_table, read_yaml
 from psfdae.settings import Group, Reference
+from psfdae.threads import limit_threads
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.compose import config_dir, decisive, load_file, part
 from psfdae_paper.configuration.consistency import SIMULATION
 from psfdae_paper.configuration.methods import all_groups
 from psfdae_paper.configuration.schema import Config
-from psfdae_paper.stages import common
 
 PATIENCE = 5  # validations without a better one after which a training no longer improves
 WORTHWHILE = 0.9  # fraction to which each doubling of the time must bring the error
@@ -72,7 +72,7 @@ def knee_table(
     from psfdae.methods.dae import Dae
     from psfdae.metrics import mse
 
-    common.limit_threads(config.evaluation.threads)
+    limit_threads(config.evaluation.threads)
     folders = {name: Path(folder) for name, _, folder in (p.partition("=") for p in points)}
     product = star_sets.read_stars(stars)
     for folder in folders.values():
@@ -187,7 +187,7 @@ def time_points(tree, stars):
 
     config = part(READS, tree)
     settings, levels = config.baseline, config.noise.levels
-    common.limit_threads(settings.threads)
+    limit_threads(settings.threads)
     product = star_sets.read_stars(stars, "template")
     parts = star_sets.split_stars(product, "random", config)
     # As the stage `baseline` does it: the point in use is the very model of the tables.
@@ -248,7 +248,7 @@ def time_methods(tree, stars):
     from psfdae.metrics import clustered_mean, mse
 
     config = part(METHODS, tree)
-    common.limit_threads(1)
+    limit_threads(1)
     product = star_sets.read_stars(stars, "template")
     test = star_sets.split_stars(product, "random", config).test
     clean, field = product["realisation"][test], product["field_index"][test]
@@ -288,7 +288,7 @@ def seeds(
     from psfdae.metrics import mse
 
     kind, product = method(name), star_sets.read_stars(stars, "template")
-    common.limit_threads(kind.threads(config))
+    limit_threads(kind.threads(config))
     test = star_sets.split_stars(product, "random", config).test
     position = star_sets.field_positions(product)[test]
     noisy = {x: star_sets.noisy_test_images(config, product, test, x) for x in config.noise.levels}
