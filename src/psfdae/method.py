@@ -1,9 +1,9 @@
-"""Methods: each restores the PSF of a star from its noisy image, and is one class.
+"""What a method is: a class that restores the PSF of a star from its noisy image.
 
-To add one takes three places: a module here with a subclass of `Method`, its settings in
-`config/<group>/default.yaml`, and the module's name in the list `methods` of
-`config/config.yaml`. Rules, tables, figures, sweeps, runs of MLflow, bundles and
-`from-stars` ask the classes for all that they must know.
+Each is in a module of its own in `psfdae.methods` or `psfdae_paper.methods`, with its settings;
+where files give others, these are in `config/<group>/default.yaml`. The list `methods` of
+`config/config.yaml` names those that the reproduction runs. Rules, tables, figures, sweeps, runs
+of MLflow, bundles and `from-stars` ask the classes for all that they must know.
 
 Modules of methods load neither torch nor scipy when they are imported: options of
 commands follow from them.
