@@ -19,7 +19,7 @@ VENV := .venv
 PIP := $(VENV)/bin/python -m pip --disable-pip-version-check --no-input
 # Hashed files only; what has no wheel is built with the pinned tools of build.lock.
 HASHED := $(PIP) install --quiet --require-hashes --no-build-isolation
-TORCH = $(shell sed -nE 's/^ *"torch==([^"]+)",/\1/p' pyproject.toml)
+TORCH = $(shell sed -nE 's/^torch==//p' requirements/torch.in)
 FROM = $(if $(TORCH_INDEX),--index-url "$$TORCH_INDEX")
 COMPILE := uv pip compile --quiet --upgrade --universal --python-version 3.11 --generate-hashes \
   --no-header --no-annotate
@@ -46,7 +46,7 @@ SNAKEMAKE := snakemake --cores "$$CORES" --config preset="$$PRESET" set="$$SET"
 LOCKED := set -f; sh workflow/locked.sh $(SNAKEMAKE)
 # Targets on request are in the report where they have been built.
 REPORTED = all \
-  $(if $(wildcard $(PSFDAE_RESULTS)/figures/benchmark/skipping.png),benchmark) \
+  $(if $(wildcard $(PSFDAE_RESULTS)/figures/benchmark/inference.png),benchmark) \
   $(if $(wildcard $(PSFDAE_RESULTS)/.stability_passed),stability) \
   $(if $(wildcard $(PSFDAE_RESULTS)/tables/psf_efficiency.csv),bounds) \
   $(if $(wildcard $(PSFDAE_RESULTS)/figures/benchmark/training.png),training_knee) \
@@ -133,15 +133,15 @@ test-all: test ## The tests, then the slow ones
 test-docs: env ## Every command of README and docs as it is written
 	pytest -m written
 
-lock: env ## Renew the lock files from pyproject.toml; torch's CPU builds from TORCH_INDEX
-	$(if $(TORCH_INDEX),echo torch==$(TORCH) | $(COMPILE) --no-deps --default-index "$$TORCH_INDEX" \
-	  - --output-file requirements/torch-cpu.lock)
-	$(COMPILE) --extra dev --overrides requirements/no-torch.txt \
+lock: env ## Renew the lock files from pyproject.toml and requirements; torch's CPU builds from TORCH_INDEX
+	$(if $(TORCH_INDEX),$(COMPILE) --no-deps --default-index "$$TORCH_INDEX" \
+	  requirements/torch.in --output-file requirements/torch-cpu.lock)
+	$(COMPILE) --extra paper --extra dev --overrides requirements/no-torch.txt \
 	  pyproject.toml requirements/torch-runtime.in --output-file requirements.lock
 	$(COMPILE) --constraints requirements.lock \
 	  requirements/build.in --output-file requirements/build.lock
-	echo torch==$(TORCH) | $(COMPILE) --constraints requirements.lock \
-	  - --output-file requirements/torch.lock
+	$(COMPILE) --constraints requirements.lock \
+	  requirements/torch.in --output-file requirements/torch.lock
 
 clean: ## Remove results (but not results/reference) and Snakemake's memory of them
 	find results -mindepth 1 -maxdepth 1 ! -name reference -exec rm -rf {} + 2>/dev/null || true

@@ -13,8 +13,8 @@ from mkdocs.structure.files import File, Files
 ROOT = Path(__file__).resolve().parents[1]
 PUBLISHED = (
     *("*.md", "LICENSE", "CITATION.cff", "docs/*.md", "docs/*.css", "docs/figures/*.png"),
-    *("results/reference/figures/**/*.png", "results/reference/tables/psf_metrics.csv"),
-    "src/psfdae/configuration/schema.py",
+    *("results/reference/**/*.png", "results/reference/**/*.csv", "studies/*/*.csv"),
+    "src/psfdae_paper/configuration/schema.py",
 )
 """What pages are and link to; links are relative and the same on GitHub."""
 
@@ -55,8 +55,8 @@ def on_page_content(html: str, **_: Any) -> str:
 
 def key_reference(root: str) -> Iterator[str]:
     """Markdown of all groups of a root: their keys and, below, their options."""
-    from psfdae.configuration.base import config_dir
-    from psfdae.configuration.compose import compose, model_of
+    from psfdae_paper.configuration.base import config_dir
+    from psfdae_paper.configuration.compose import compose, model_of
 
     schema = model_of(root).model_json_schema()
     tree = compose((), root)

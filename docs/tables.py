@@ -5,10 +5,10 @@ is a table of `results/reference` or of `studies`, or a function below with word
 `where` picks rows and `by` sorts them. TEXT is an f-string over the columns. A comment at the end
 of its line makes a line of each row, below the head of the table that the page has; within a line
 (never at its start) the columns of several rows are arrays. Without TEXT, the source itself is put
-in.
+in. TEXT is evaluated as Python: fill in only pages that you trust.
 
-What stays from an earlier record (`kept` in its provenance) or is of a study (its columns `date`
-and `commit`) gets its date and commit beside it: a line below a table; words behind the first
+Numbers of an earlier record (`kept` in its provenance) or of a study (its columns `date` and
+`commit`) get their date and commit beside them: a line below a table; words behind the first
 number of a section that has no such table. Files of two commits are not joined.
 
 `python docs/tables.py` fills in all pages; `--check` names what has drifted.
@@ -19,7 +19,6 @@ from __future__ import annotations
 import ast
 import json
 import re
-import subprocess
 import sys
 from functools import cache
 from pathlib import Path
@@ -28,11 +27,10 @@ from types import SimpleNamespace
 import numpy as np
 import pandas as pd
 
-from psfdae.alignment import methods as scene3
-from psfdae.configuration.compose import compose
-from psfdae.estimators import method
-from psfdae.evaluation.comparison import FITTED, SIGNIFICANT, seed_scatter, with_seed_stderr
-from psfdae.own_stars.bundle import SHIPPED
+from psfdae.methods import known, method
+from psfdae_paper.alignment import methods as scene3
+from psfdae_paper.configuration.compose import compose
+from psfdae_paper.evaluation.comparison import FITTED, SIGNIFICANT, seed_scatter, with_seed_stderr
 
 ROOT = Path(__file__).resolve().parents[1]
 REFERENCE = ROOT / "results/reference"
@@ -45,7 +43,7 @@ MARK = re.compile(
 HEAD = re.compile(r"\|.*\n\|[-|]+\n")
 
 ALIGNERS = {m.name: m.label for m in scene3.METHODS.values() if m.name != "cramer_rao_pooled"}
-SCENES = {"seidel": "scene 1", "turbulence": "scene 2", "all": "any"}
+SCENES = {"seidel": "scene 1", "turbulence": "scene 2"}
 PROPAGATORS = {
     "kernel": "our kernel",
     "fft": "zero-padded FFT",
@@ -128,7 +126,7 @@ def _new(name, words, where, by, text, line, old):
 
 def _written(text, row):
     """An f-string over the columns of a row; what is not there stays empty."""
-    return re.sub(r"\bnan( %)?", "", eval(f'f"""{text}"""', globals() | row))
+    return re.sub(r"\+?\bnan( ± nan| %)?", "", eval(f'f"""{text}"""', globals() | row))
 
 
 def csv(name):
@@ -174,25 +172,25 @@ def datasets():
     return pd.DataFrame([config(f"dataset={d}") for d in config()["workflow"].datasets])
 
 
-def packages():
-    """First sentence of every sub-package and of every module at the top."""
+def library():
+    """Modules of the library, as `_modules`."""
+    return _modules("psfdae")
+
+
+def reproduction():
+    """Modules of the reproduction, as `_modules`."""
+    return _modules("psfdae_paper")
+
+
+def _modules(name):
+    """First sentence of every sub-package and of every module at the top of a package."""
     found = {}
-    for path in sorted((ROOT / "src/psfdae").glob("[!_]*")):
+    for path in sorted((ROOT / "src" / name).glob("[!_]*")):
         source = path / "__init__.py" if path.is_dir() else path
         if source.is_file() and source.suffix == ".py":
             about = ast.get_docstring(ast.parse(source.read_text(encoding="utf-8"))) or ""
             found[path.stem] = " ".join(about.split("\n\n", maxsplit=1)[0].split())
     return pd.DataFrame(found.items(), columns=["name", "about"])
-
-
-def rulegraph(target):
-    """Rules that a target needs, as Snakemake draws them, by name and without its colours."""
-    line = [sys.executable, "-m", "snakemake", "--nolock", "--rulegraph", "mermaid-js", target]
-    drawn = subprocess.run(line, cwd=ROOT, check=True, capture_output=True, text=True).stdout
-    rule = dict(re.findall(r"^\t(id\d+)\[(\w+)\]$", drawn, re.M))
-    edges = re.findall(r"^\t(id\d+) --> (id\d+)$", drawn, re.M)
-    arrows = sorted(f"    {rule[start]} --> {rule[end]}" for start, end in edges)
-    return "\n".join(["```mermaid", "flowchart LR", *arrows, "```"])
 
 
 def run():
@@ -204,13 +202,14 @@ def poppy(name):
     """Errors on POPPY's stars, with the labels of the methods, which end the bundles' names."""
     table = csv(name)
     ends = table.bundle.str.extract(r"-realisation-(\w+)$", expand=False).fillna(table.method)
-    before = table.bundle.eq(SHIPPED).map({True: ", in the package before", False: ""})
-    return table.assign(label=[method(m).label for m in ends] + before)
+    return table.assign(label=ends.map({kind.name: kind.label for kind in known()}))
 
 
 def coverage():
     """Part of the pixels within the uncertainty, by model, S/N and brightness of the pixel."""
     keys = ["bundle", "method", "noise_level", "snr", "stars"]
+    if not (REFERENCE / "tables/predict_coverage.csv").is_file():
+        return pd.DataFrame(columns=keys)  # a record made before this table
     wide = poppy("tables/predict_coverage.csv").pivot(
         index=[*keys, "label"], columns="pixels", values=["coverage68", "coverage95"]
     )
@@ -218,24 +217,11 @@ def coverage():
     return wide.reset_index().sort_values(["bundle", "noise_level"])
 
 
-def strange():
-    """Stars found by either measure, by kind and noise level."""
+def outliers():
+    """Outliers found by either measure, by kind and noise level."""
     table = csv("tables/predict_strange.csv").query("kind != 'usual'")
     wide = table.pivot_table("found", ["kind", "noise_level"], "measure", sort=False)
     return wide.reset_index()
-
-
-def rules():
-    """What the jobs of each rule took together; scene 3 job by job."""
-    table = csv("runtime.csv")
-    small = table.rule.eq("alignment") & table.wildcards.str.contains("figure|table|time|telesc")
-    own = table.rule.eq("alignment") & ~small
-    rule = table.rule.where(~own, "scene 3: " + table.wildcards.str.replace("_", " "))
-    grouped = table.assign(jobs=1).groupby(rule.where(~small, "scene 3: tables, figures"))
-    table = grouped.agg({"jobs": "sum", "wall_s": "sum", "cpu_s": "sum", "peak_mb": "max"})
-    table.loc["together"] = table.sum()
-    table.loc["together", "peak_mb"] = table.peak_mb[:-1].max()
-    return table.rename_axis("rule").reset_index().sort_values("cpu_s", ascending=False)
 
 
 def sweep(name):
@@ -249,7 +235,7 @@ def real_sky():
     """Errors on a real image in 1e-5 by S/N: ours, and each package's at its best setting.
 
     Those of the packages are with the centre fitted and averaged, as are the ratios of psfdae's to
-    the least of them and the settings that won. Fluxes are those of the fitted centre.
+    the least of them. Fluxes are those of the fitted centre.
     """
     rows = []
     for _, cell in csv(REAL_SKY).groupby("snr"):
@@ -259,21 +245,10 @@ def real_sky():
         for centre, group in others.groupby("centre"):
             for peer in group.loc[group.groupby("package").mse.idxmin()].to_dict("records"):
                 row[f"{peer['package']}_{centre}"] = _in_1e5(peer)
-                row[f"{peer['package']}_{centre}_setting"] = _setting(peer)
             least = group.loc[group.mse.idxmin()]
             row[f"over_{centre}"] = f"{least.ratio:.2f} ± {least.ratio_stderr:.2f}"
         rows.append(row)
     return pd.DataFrame(rows)
-
-
-def real_sky_settings():
-    """Errors on a real image in 1e-5 of every package and setting, a column for every S/N."""
-    table = csv(REAL_SKY).sort_values(["package", "sampling_px", "order", "centre"])
-    table["cell"] = [_in_1e5(row) for row in table.to_dict("records")]
-    keys = ["package", "version", "sampling_px", "order", "centre", "fit_cpu_s"]
-    wide = table.pivot(index=keys, columns="snr", values="cell").add_prefix("snr").reset_index()
-    about = [_setting(row) for row in wide.to_dict("records")]
-    return wide.assign(label=wide.package.map(SKY_PACKAGES), setting=about)
 
 
 def real_sky_packages():
@@ -290,16 +265,19 @@ def real_sky_packages():
     return pd.DataFrame({"said": rows})
 
 
+def simulated_sky():
+    """Stars of the study of a simulated field, and our error over the least of each package."""
+    table = csv("studies/simulated_sky/table.csv")
+    least = {
+        name.lower(): table[table.package.str.startswith(name)].mse.min()
+        for name in ("psfdae", "Piff", "PSFEx")
+    }
+    over = {f"over_{name}": least["psfdae"] / mse for name, mse in least.items()}
+    return pd.DataFrame([{"stars": table.stars[0], "learnt": table.learnt[0], **over}])
+
+
 def _in_1e5(row):
     return f"{1e5 * row['mse']:.2f} ± {1e5 * row['stderr']:.2f}"
-
-
-def _setting(row):
-    """Sampling and order, of a package that has them."""
-    if np.isnan(row["sampling_px"]):
-        return ""
-    order = "" if np.isnan(row["order"]) else f", order {row['order']:.0f}"
-    return f"{row['sampling_px']:g} px{order}"
 
 
 def seeds():
@@ -317,29 +295,25 @@ def costs():
 
 
 def errors(name="tables/psf_metrics.csv"):
-    """MSE of every method with its scatter between seeds (`…_sd`), and the best of a row."""
+    """MSE of every method, with its scatter between seeds (`…_sd`)."""
     keys = ["dataset", "split", "reference", "noise_level"]
     rows = with_seed_stderr(csv(name).query("metric == 'mse'"), seed_scatter())
     mse, sd = (rows.pivot(index=keys, columns="method", values=v) for v in ("value", "seed_stderr"))
-    best = [_best(mse.loc[key], sd.loc[key]) for key in mse.index]
-    table = mse.assign(best=best).join(sd.add_suffix("_sd")).reset_index()
+    table = mse.join(sd.add_suffix("_sd")).reset_index()
     return table.sort_values(keys, ascending=[True, False, True, True])
 
 
-def _best(mse, sd):
-    """The method that errs least, or all that do so within the scatter between seeds."""
-    least = mse.idxmin()
-    allowed = SIGNIFICANT * np.hypot(sd, sd[least]).drop(least)
-    equal = [least, *mse.drop(least).index[mse.drop(least) - mse[least] <= allowed]]
-    names = ", ".join(method(name).label for name in equal)
-    if len(equal) > 1:
-        return f"equal within the scatter: {names}"
-    return names + ", scatter not measured" * bool(allowed.isna().any())
+def better(first, second):
+    """Rows of errors in which one method is better, beyond the scatter of seeds where measured."""
+    table = errors()
+    gain = table[second] - table[first]
+    allowed = SIGNIFICANT * np.hypot(table[f"{first}_sd"], table[f"{second}_sd"])
+    return table[(gain > 0) & ~(gain <= allowed)]
 
 
 def readings():
-    """PCA+SOM as the paper can be read: rise with λ², errors over the paper's and the usual."""
-    table = csv("tables/baseline_readings.csv")
+    """Interpretations of PCA+SOM: rise with λ², errors over the paper's and the usual."""
+    table = csv("studies/baseline_readings/table.csv")
     usual = table.query("reading == 'map' and per_level == 'yes'")
     usual = usual.set_index(CELL).mse.rename("usual")
     keys, rows = ["dataset", "reference", "reading", "per_level"], []
@@ -356,19 +330,20 @@ def fit():
     return {row.quantity: row for row in csv("calibration/fit.csv").itertuples()}
 
 
-def bounds(method="bayes"):
-    """Least possible errors of one posterior mean, what it rests on, and the floor."""
-    rows = csv("tables/psf_bounds.csv").query("metric == 'mse'").sort_values(CELL)
+def posterior_means():
+    """Both posterior means of every noise level, and what they rest on."""
+    rows = csv("tables/psf_bounds.csv").query("metric == 'mse' and method != 'floor'")
     # A record made before these columns leaves them empty.
     since = ["variance", "calibration", "ess_low", "undetected", "missing", "missing_stars"]
-    rows = rows.reindex(columns=[*dict.fromkeys([*rows, *since])])
-    floor = rows.query("method == 'floor'")[[*CELL, "value"]]
-    return rows.query("method == @method").merge(floor, "left", CELL, suffixes=("", "_floor"))
+    return rows.reindex(columns=[*dict.fromkeys([*rows, *since])]).sort_values(CELL)
 
 
-def unbounded():
-    """Posterior means that some stars do not have."""
-    return pd.concat([bounds(), bounds("bayes_position")]).query("missing > 0")
+def bounds():
+    """The posterior mean, the one that is given the field (`…_given`), and the floor."""
+    means = dict(list(posterior_means().groupby("method")))
+    table = means["bayes"].merge(means["bayes_position"], "left", CELL, suffixes=("", "_given"))
+    floor = csv("tables/psf_bounds.csv").query("metric == 'mse' and method == 'floor'")
+    return table.merge(floor[[*CELL, "value"]], "left", CELL, suffixes=("", "_floor"))
 
 
 def efficiency():
@@ -378,8 +353,8 @@ def efficiency():
         f"({row.efficiency:.1g})" if row.bound == "floor" else f"{row.efficiency:.2g}"
         for row in rows.itertuples()
     ]
-    table = rows.assign(cell=cells).groupby([*CELL, "method"]).cell.agg(" ".join).unstack()
-    return bounds()[CELL].merge(table.reset_index(), "left", CELL)
+    table = rows.assign(cell=cells).groupby([*CELL, "method"]).cell.agg(" ".join)
+    return table.unstack(fill_value="").reset_index()
 
 
 def uniform():
@@ -438,8 +413,7 @@ def peers():
     """Factors by which other propagators are slower at equal error."""
     table = csv("tables/benchmark_peers.csv")
     rows = table.groupby(["processes", "scene", "aberration", "method"])
-    table = rows.speedup.agg(["size", "min", "median", "max"]).join(rows.required.first())
-    return table.assign(met=rows.met.agg(lambda met: (met == "yes").sum())).reset_index()
+    return rows.speedup.agg(["size", "min", "median", "max"]).reset_index()
 
 
 def inference():
@@ -460,10 +434,23 @@ def flux():
 
 
 def own_stars():
-    """MSE of bright stars made faint, by S/N and method."""
+    """MSE of bright stars degraded to low S/N, by S/N and method."""
     rows = csv("tables/from_stars.csv")
     cells = [f"{row.mse:.2e} ± {row.mse_stderr:.0e}" for row in rows.itertuples()]
     return rows.assign(cell=cells).pivot(index="snr", columns="method", values="cell").reset_index()
+
+
+def over_mean_psf():
+    """MSE of bright stars degraded to low S/N over that of one mean PSF, by S/N and method."""
+    table = csv("tables/from_stars.csv").pivot(index="snr", columns="method", values="mse")
+    return table.div(table.mean_psf, axis=0).reset_index()
+
+
+def over_lmmse():
+    """MSE over that of linear MMSE, split random, reference realisation."""
+    table = errors().query("split == 'random' and reference == 'realisation'")
+    methods = ["pca_som", "dae", "gmm", "gmm_position"]
+    return table[["dataset", "noise_level"]].join(table[methods].div(table.lmmse, axis=0))
 
 
 def main():

@@ -9,11 +9,16 @@ import pytest
 
 from prediction_stars import fresh_psfs, with_network
 from psfdae import load_model
-from psfdae.alignment.telescope import design_states, fit_quadratic, grid_states, zernike_tracer
-from psfdae.configuration.compose import load
-from psfdae.optics.pupil import annular_pupil
-from psfdae.own_stars.model import PsfModel
-from psfdae.stars.noise import NoiseModel
+from psfdae.model.psf_model import PsfModel
+from psfdae.noise import NoiseModel
+from psfdae_paper.alignment.telescope import (
+    design_states,
+    fit_quadratic,
+    grid_states,
+    zernike_tracer,
+)
+from psfdae_paper.configuration.compose import load
+from psfdae_paper.optics.pupil import annular_pupil
 from workflow_runs import snakemake
 
 FINISHED = ".built"
@@ -110,7 +115,7 @@ def field_psfs(tmp_path_factory):
 @pytest.fixture(scope="session")
 def empty_database(tmp_path_factory):
     """A migrated database without runs; the migrations take seconds."""
-    from psfdae.stages import track
+    from psfdae_paper.stages import track
 
     path = tmp_path_factory.mktemp("mlflow") / "mlflow.db"
     patch = pytest.MonkeyPatch()

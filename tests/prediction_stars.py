@@ -7,12 +7,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from psfdae.configuration.compose import load_stage
-from psfdae.configuration.consistency import SIMULATION, STATIC
-from psfdae.estimators.dae_network import build_dae
+from psfdae.bundle_info import Architecture, BundleInfo
 from psfdae.files import read_product
-from psfdae.own_stars.bundle import FREE, Architecture, BundleInfo
-from psfdae.stages import stars
+from psfdae.model.bundle import FREE
+from psfdae.networks.dae import build_dae
+from psfdae_paper.configuration.compose import load_stage
+from psfdae_paper.configuration.consistency import SIMULATION, STATIC
+from psfdae_paper.stages import stars
 
 KAPPA, SKY = 4.98, 1e4
 

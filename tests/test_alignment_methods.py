@@ -9,8 +9,10 @@ import pytest
 import torch
 from torch import nn
 
-from psfdae.alignment.emulator import StampEmulator
-from psfdae.alignment.fisher import (
+from psfdae.networks.training import TrainingError, train
+from psfdae.settings import ConfigError
+from psfdae_paper.alignment.emulator import StampEmulator
+from psfdae_paper.alignment.fisher import (
     bound_covariances,
     coma_free_decentre,
     expected_abs_error,
@@ -19,19 +21,18 @@ from psfdae.alignment.fisher import (
     stamps_and_slopes,
     twin_states,
 )
-from psfdae.alignment.fit import Likelihood, fit_states, refit_twins
-from psfdae.alignment.networks import (
+from psfdae_paper.alignment.fit import Likelihood, fit_states, refit_twins
+from psfdae_paper.alignment.networks import (
     AlignmentCnn,
     NetworkTraining,
     TrainingStates,
     build_network,
     predict_states,
 )
-from psfdae.alignment.stamps import AlignmentStamps
-from psfdae.alignment.telescope import mirror_symmetries, uniform_states
-from psfdae.configuration.alignment import Cnn, Perceptron
-from psfdae.configuration.compose import ConfigError, load
-from psfdae.estimators.training import TrainingError, train
+from psfdae_paper.alignment.stamps import AlignmentStamps
+from psfdae_paper.alignment.telescope import mirror_symmetries, uniform_states
+from psfdae_paper.configuration.alignment import Cnn, Perceptron
+from psfdae_paper.configuration.compose import load
 
 FIT = load((), "alignment").fit
 EXACT = FIT.model_copy(update={"iterations": 25, "tolerance": 1e-7})

@@ -8,8 +8,8 @@ import pytest
 import yaml
 
 from psfdae.files import ProductError
-from psfdae.stages import track
-from psfdae.tracking import NETWORKS, runs_of_alignment
+from psfdae_paper.stages import track
+from psfdae_paper.tracking import NETWORKS, runs_of_alignment
 
 COLUMNS = ("test_set", "noise_level", "method", "parameter", "mean_abs_error", "bias", "variance")
 

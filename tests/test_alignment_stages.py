@@ -7,13 +7,14 @@ import pandas as pd
 import pytest
 from click.testing import CliRunner
 
-from psfdae.alignment.methods import ESTIMATORS, FITTED, LEARNED, METHODS, TRAINED, of_set
 from psfdae.cli import main
-from psfdae.configuration.compose import ConfigError, config_dir, load, load_stage, overrides_for
-from psfdae.evaluation import alignment_tables
 from psfdae.files import read_product
-from psfdae.stages.alignment import states
-from psfdae.stages.alignment_results import read_bounds
+from psfdae.settings import ConfigError
+from psfdae_paper.alignment.methods import ESTIMATORS, FITTED, LEARNED, METHODS, TRAINED, of_set
+from psfdae_paper.configuration.compose import config_dir, load, load_stage, overrides_for
+from psfdae_paper.evaluation import alignment_tables
+from psfdae_paper.stages.alignment import states
+from psfdae_paper.stages.alignment_results import read_bounds
 
 PRESET = ("alignment_preset=smoke", "alignment.grid_levels=2")
 
@@ -144,7 +145,7 @@ def test_sets_of_states(products):
 
 
 def _states_config(*overrides):
-    return load_stage(states.stage.reads, (*PRESET, *overrides), "alignment")
+    return load_stage(states.stage.settings.reads, (*PRESET, *overrides), "alignment")
 
 
 def test_model_and_rays_give_the_same_training_stamps(products, tmp_path):

@@ -7,14 +7,14 @@ from functools import partial
 import numpy as np
 import pytest
 
-from psfdae.alignment.stamps import AlignmentStamps, EnergyError, centred_modes, mean_slope
-from psfdae.alignment.telescope import uniform_states
-from psfdae.configuration.compose import load
-from psfdae.optics.derivatives import ModalStamps, PeriodSampling, PointSampling
-from psfdae.optics.propagation import StampPropagator
-from psfdae.optics.pupil import SamplingError, annular_pupil
-from psfdae.optics.raytracing import annulus_points, misaligned
-from psfdae.optics.wavefronts import monomial_coefficients, monomial_images
+from psfdae_paper.alignment.stamps import AlignmentStamps, EnergyError, centred_modes, mean_slope
+from psfdae_paper.alignment.telescope import uniform_states
+from psfdae_paper.configuration.compose import load
+from psfdae_paper.optics.derivatives import ModalStamps, PeriodSampling, PointSampling
+from psfdae_paper.optics.propagation import StampPropagator
+from psfdae_paper.optics.pupil import SamplingError, annular_pupil
+from psfdae_paper.optics.wavefronts import monomial_coefficients, monomial_images
+from psfdae_paper.raytracing import annulus_points, misaligned
 
 OBSCURATION = 0.42
 SHOWN = [((0, 0, 0, 0), 0), ((0.6, -0.3, 0.2, 0.8), 2), ((1, 1, 1, 1), 7)]

@@ -13,11 +13,11 @@ import prediction
 import trainings
 from psfdae.belonging import STARS, STATIC, require
 from psfdae.cli import Careful, as_click, main, stage
-from psfdae.configuration.compose import load, load_stage
 from psfdae.files import Column, ProductError, write_product
-from psfdae.own_stars.bundle import read_bundle, shipped_path
-from psfdae.stages.alignment import read_model
-from psfdae.stages.alignment_results import require_one_test
+from psfdae.model.bundle import read_bundle, shipped_path
+from psfdae_paper.configuration.compose import load, load_stage
+from psfdae_paper.stages.alignment import read_model
+from psfdae_paper.stages.alignment_results import require_one_test
 
 SIZES = ("preset=smoke", "grid.points=3", "stars.count=60", "parts.train_stars=40")
 SIZES += ("parts.test_stars=20", "optics.threads=1", "train.epochs=1", "bounds.threads=1")
@@ -335,7 +335,7 @@ def test_a_missing_aberration_is_none_and_what_is_not_stated_is_unknown(tmp_path
 
 
 def settings_of(name, *overrides):
-    reads = stage(f"alignment {name}").stage.reads
+    reads = stage(f"alignment {name}").stage.settings.reads
     return load_stage(reads, ("alignment_preset=smoke", *overrides), "alignment")
 
 

@@ -9,19 +9,17 @@ import numpy as np
 import pandas as pd
 import pytest
 
-import choice
 import figures
 import propagation
 import propagators
-import savings
 import scenes
 from measure import alone, time_in_rounds
-from psfdae.configuration.compose import load_stage
 from psfdae.files import ProductError
-from psfdae.optics.propagation import StampPropagator
-from psfdae.optics.pupil import annular_pupil
-from psfdae.optics.wavefronts import monomial_coefficients, monomial_images, seidel_wavefronts
-from psfdae.stars.framing import normalise_flux
+from psfdae_paper.configuration.compose import load_stage
+from psfdae_paper.optics.propagation import StampPropagator
+from psfdae_paper.optics.pupil import annular_pupil
+from psfdae_paper.optics.wavefronts import seidel_wavefronts
+from psfdae_paper.stars.framing import normalise_flux
 from workflow_runs import ROOT
 
 RECORD = ROOT / "results/reference/tables"
@@ -95,40 +93,8 @@ def test_configured_settings_stay_within_the_budget(both, name):
     some = scenes.Selection(scene.stars, stars)
     way = scene.propagation(some, scene.search_px)
     stamps, offset = way.framed(scene.framing.stamp_px)
-    exact = scenes.stamps_at(scene, some, offset, *choice.REFERENCE)
+    exact = scenes.stamps_at(scene, some, offset, *scenes.REFERENCES[-1])
     assert scenes.stamp_mse(normalise_flux(stamps)[0], exact).max() <= scene.budget
-
-
-@pytest.mark.parametrize(
-    ("time", "error", "cheapest"),
-    [
-        ([1.0, 1.01, 0.1], [0.5, 0.9, 9.0], [1]),  # the configured one of equal times
-        ([1.0, 1.05, 0.1], [0.5, 0.9, 9.0], [0]),  # the cheapest is not good enough
-        ([3.0, 2.0, 1.0], [0.1, 0.5, 1.0], [2]),  # on the budget is within it
-        ([np.nan, np.nan, 3.0], [0.1, 0.1, 0.1], [2]),  # what was not timed cannot be chosen
-        ([2.0, 5.0, 2.0], [0.5, 0.1, 0.1], [0]),
-        ([1.0, 1.0, 1.0], [2.0, 2.0, 2.0], []),
-    ],
-)
-def test_cheapest_within_budget(time, error, cheapest):
-    rows = {"time_ms": time, "mse": error, "configured": ["no", "yes", "no"]}
-    blank = {name: 0 for name in "abcdefgh"}
-    table = choice.mark_cheapest(pd.DataFrame({**rows, **blank}), 1.0)
-    assert table.index[table.cheapest == "yes"].tolist() == cheapest
-    assert set(table.config_is_cheapest) == {"yes" if cheapest == [1] else "no"}
-
-
-def test_first_lasting_value_ignores_lucky_coarse_grids():
-    fine = np.array([[1, 0, 1, 1], [1, 1, 1, 1], [1, 1, 1, 0]], bool)
-    found = choice.first_lasting(fine, np.array([94.0, 126.0, 158.0, 222.0]))
-    assert found[:2].tolist() == [158.0, 94.0]
-    assert np.isnan(found[2])
-
-
-def test_spread_takes_the_extremes_of_every_rung():
-    needed = np.array([100, 90, 210, 130, 120, 190, 110])
-    picks = choice.spread(needed, (126, 222), per_rung=2)
-    assert sorted(needed[picks]) == [90, 120, 130, 210]
 
 
 def rows_of(values):
@@ -163,19 +129,6 @@ def test_pareto_front_and_setting_in_use_are_marked():
     table = propagators.finish(rows_of(TABLE).to_dict("records"), used)
     assert table.index[table.used == "yes"].tolist() == [1, 4]
     assert table.index[table.pareto == "yes"].tolist() == [3, 4, 6]
-
-
-def test_zernike_fit_is_exact_and_piston_does_not_matter(case):
-    monomials = monomial_coefficients(COMATIC, FIELD)
-    x, y = np.meshgrid(*[np.linspace(-0.7, 0.7, 9)] * 2)
-    fitted = np.tensordot(savings.zernike_fit(monomials), savings.ZERNIKES(x, y), axes=1)
-    assert fitted == pytest.approx(np.tensordot(monomials, monomial_images(x, y), axes=1), abs=1e-9)
-    pupil = annular_pupil(96, 0.3)
-    propagate = StampPropagator(pupil, 10, 0.88)
-    lean = savings.equal_stars(monomial_images, monomials, 2)
-    full = savings.equal_stars(savings.with_piston, np.append(monomials, 0.37), 2)
-    stamps, others = (propagate(opd_of(pupil, np.dtype(float))) for opd_of in (lean, full))
-    assert scenes.relative_to_peak(stamps, others) < 1e-12
 
 
 def test_times_are_those_of_one_stamp_of_all_that_ran(case, monkeypatch):
@@ -243,11 +196,9 @@ def tiny(tmp_path_factory):
     config = load_stage(scenes.READS, ["dataset=dataset7", *small])
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(propagation, "alone", lambda threads, f, *arguments: f(*arguments))
-        patch.setattr(propagation, "PACKAGES", ("colorsys", "no_such_package"))
         patch.setattr(scenes, "REFERENCES", ((126, 3), (158, 4), (190, 5)))
-        patch.setattr(choice, "REFERENCE", (190, 5))
-        propagation.measure(config, folder / "turbulence", 2)
-        propagation.tables(config, folder / "tables", (folder / "turbulence",))
+        propagation.measure(config, folder / "turbulence")
+        propagation.tables(folder / "tables", (folder / "turbulence",))
     return folder / "tables"
 
 
@@ -263,29 +214,11 @@ def test_every_table_is_that_of_the_record(tiny):
     used = times[times.used == "yes"]
     assert used.aberration.tolist() == ["mild", "strong"]
     assert (used.within_budget == "yes").all()
-    chosen = tables["benchmark_choice.csv"]
-    assert (chosen.cheapest == "yes").sum() == (chosen.configured == "yes").sum() == 1
-    assert chosen.time_ms.notna().all()
-
-
-def test_savings_change_nothing_that_matters(tiny):
-    table = pd.read_csv(tiny / "benchmark_skipping.csv", keep_default_na=False)
-    rows = table.set_index("item")
-    assert rows.saving["Stamps anew for each λ"] == pytest.approx(8)  # two datasets, four λ
-    assert rows.change["Stamps anew for each λ"] == 0
-    for item in ("Pixels outside the stamp", "Templates anew for each star"):
-        assert rows.change[item] < 1e-5
-    assert rows.change["Tilt of the turbulence"] > 0.01
-    assert rows.scene["Import of colorsys"] == "all"
-    assert "Import of no_such_package" not in rows.index
-    budget = pd.read_csv(tiny / "benchmark_choice.csv").budget[0]
-    assert (rows.change[rows.unit == savings.AS_MSE] < budget).all()
 
 
 def test_figures_are_drawn(tiny, tmp_path):
     times, out = tiny / "benchmark_propagation.csv", tmp_path / "drawn.png"
-    for kind, scene in (("propagation", "turbulence"), ("skipping", None)):
-        figures.draw(kind, tiny / f"benchmark_{kind}.csv", out, scene)
-        assert out.stat().st_size > 10_000
+    figures.draw("propagation", times, out, "turbulence")
+    assert out.stat().st_size > 10_000
     with pytest.raises(ProductError, match="no rows of scene seidel"):
         figures.draw("propagation", times, out, "seidel")

@@ -14,14 +14,12 @@ import measure
 import prediction
 import speed
 import trainings
-from psfdae.configuration.compose import load, load_stage
-from psfdae.estimators import TrainingSet
-from psfdae.estimators.pca_som import Baseline
-from psfdae.files import Column, write_product
-from psfdae.optics.wavefronts import seidel_wavefronts
-from psfdae.own_stars.bundle import read_bundle, shipped_path
-from psfdae.stars.fields import square_grid
-from psfdae.stars.framing import Propagation, normalise_flux
+from psfdae.method import TrainingSet
+from psfdae.model.bundle import read_bundle, shipped_path
+from psfdae_paper.configuration.compose import load, load_stage
+from psfdae_paper.methods.pca_som import Baseline
+from psfdae_paper.optics.wavefronts import seidel_wavefronts
+from psfdae_paper.stars.framing import Propagation, normalise_flux
 from workflow_runs import ROOT, planned, snakemake
 
 RECORD = ROOT / "results/reference/tables"
@@ -54,7 +52,7 @@ def test_a_process_of_its_own_has_its_own_threads(monkeypatch):
 
 def test_what_is_timed_is_the_command_that_users_run(tmp_path):
     """Its product is left behind and its size is that of the files; a refusal is an error."""
-    tree, out = load_stage(speed.growth.stage.reads, SMALL).model_dump(), tmp_path / "t.h5"
+    tree, out = load_stage(speed.growth.stage.settings.reads, SMALL).model_dump(), tmp_path / "t.h5"
     cost = measure.cost_of_command(["templates"], out, tree)
     assert cost["disk_b"] == out.stat().st_size
     assert 0 < cost["resting_b"] <= cost["peak_b"]
@@ -68,7 +66,7 @@ def test_what_is_timed_is_the_command_that_users_run(tmp_path):
 @pytest.mark.slow
 def test_engines_run_apart_and_fill_the_table(tmp_path):
     small = ("benchmark.repeats=1", "benchmark.stamp_sizes=[8,10]", "benchmark.stamps=1")
-    config = load_stage(speed.inference.stage.reads, [*small, "benchmark.threads=1"])
+    config = load_stage(speed.inference.stage.settings.reads, [*small, "benchmark.threads=1"])
     config.dae.widths[:] = [2] * len(config.dae.widths)
     speed.inference(config, tmp_path / "t.csv")
     table = pd.read_csv(tmp_path / "t.csv")
@@ -87,36 +85,12 @@ def test_grid_has_the_point_in_use_first_and_respects_the_limit():
 
 def test_baseline_point_reports_the_error_of_its_predictions(gaussian_stars, noise):
     settings = {"components": 4, "rows": 3, "columns": 3, "epochs": 2, "threads": 1}
-    settings |= {"sigma": 1.0, "learning_rate": 0.5, "reading": "map", "per_level": True}
+    settings |= {"sigma": 1.0, "learning_rate": 0.5, "per_level": True}
     truths = {"realisation": gaussian_stars, "template": 0 * gaussian_stars}
     stars = np.arange(len(gaussian_stars))
     data = TrainingSet(gaussian_stars, gaussian_stars, stars, stars[:0], np.array([1e-5]), noise)
     point = trainings.time_point(data, Baseline(**settings), {1e-5: gaussian_stars}, truths, 2)
     assert 0 < point["mse_realisation"] < (gaussian_stars**2).mean() < 2 * point["mse_template"]
-
-
-def test_readings_of_the_baseline_stand_beside_the_paper_s(tmp_path, gaussian_stars):
-    columns = {
-        "realisation": Column(gaussian_stars, "1", "stars"),
-        "template": Column(gaussian_stars, "1", "templates"),
-        "field_index": Column(np.arange(300) % 25, "1", "field"),
-        "grid": Column(square_grid(5, 1.0)[0], "1", "grid"),
-    }
-    given = ("dataset=dataset3", "preset=smoke", "baseline.components=4")
-    given += ("parts.train_stars=200", "parts.test_stars=100")
-    config = load_stage(trainings.readings.stage.reads, given)
-    write_product(tmp_path / "s.h5", "stars", columns, config.model_dump())
-    trainings.readings(config, tmp_path / "s.h5", tmp_path / "t.csv")
-    table = pd.read_csv(tmp_path / "t.csv")
-    assert len(table) == 2 * 3 * 4
-    errors = table.set_index(["reference", "reading", "per_level", "noise_level"])
-    assert errors.over_paper.to_numpy() == pytest.approx(errors.mse / errors.mse_paper, rel=1e-5)
-    assert errors.mse_paper["realisation", "map", "yes", 0.005] == 5.2028e-5
-    # A fit of quiet stars beats one of mixed stars there.
-    assert (
-        errors.mse["realisation", "map", "yes", 0.001]
-        < errors.mse["realisation", "map", "no", 0.001]
-    )
 
 
 # Growth
@@ -272,14 +246,13 @@ def test_all_methods_are_timed_and_drawn(smoke, tmp_path):
 def test_targets_on_request(smoke, tmp_path):
     # Other tests want the folder as the default target leaves it.
     folder = shutil.copytree(smoke, tmp_path / "run", symlinks=True)
-    snakemake(folder, "prediction", "scaling", "on_request", "seeds", "readings")
+    snakemake(folder, "prediction", "scaling", "seeds")
     tables = {p.stem: pd.read_csv(p) for p in (folder / "results/tables").glob("*.csv")}
     for name in ("predict_throughput", "scaling_stages"):
         assert list(tables[name].columns) == columns(name)
     poppy = tables["predict_poppy"]
-    # A DAE that was trained on fresh stars is a DAE; the bundle's name tells them apart.
-    assert set(poppy.method) == {"dae", "gmm", "gmm_simulated"}
-    assert poppy.bundle.nunique() == 4
+    assert set(poppy.method) == {"dae", "gmm"}
+    assert poppy.bundle.nunique() == 2
     assert poppy.coverage95_given.notna().all()
     cover = tables["predict_coverage"]
     assert set(cover.bundle) == {*poppy.bundle, "example"}
@@ -303,11 +276,6 @@ def test_targets_on_request(smoke, tmp_path):
     known = tables["psf_metrics"].query("metric == 'mse' and split == 'random'")
     both = errors.merge(known, on=["dataset", "reference", "method", "noise_level"])
     assert both.mse.to_numpy() == pytest.approx(both.value.to_numpy(), rel=1e-5)
-    renewed = pd.read_csv(folder / "src/psfdae/evaluation/seed_scatter.csv")
+    renewed = pd.read_csv(folder / "src/psfdae_paper/evaluation/seed_scatter.csv")
     assert renewed.equals(tables["seed_scatter"])
-    readings = tables["baseline_readings"]
-    assert set(readings.groupby(["dataset", "noise_level"]).size()) == {3, 6}
-    asked = {"gmm_simulated", "gmm_simulated_position", "dae_simulated"}
-    for name in ("psf_metrics_on_request", "psf_efficiency_on_request"):
-        assert asked <= set(tables[name].method)
-    assert planned(folder, "prediction", "scaling", "on_request", "seeds", "readings") == {}
+    assert planned(folder, "prediction", "scaling", "seeds") == {}

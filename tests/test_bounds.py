@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import poisson
 
-from psfdae.bounds.floor import compare, local_error, sensitivities
-from psfdae.bounds.posterior import (
+from psfdae_paper.bounds.floor import compare, local_error, sensitivities
+from psfdae_paper.bounds.posterior import (
     Bank,
     Likelihood,
     exact_posterior,
@@ -22,12 +22,12 @@ from psfdae.bounds.posterior import (
     weights,
     windows,
 )
-from psfdae.optics.propagation import StampPropagator
-from psfdae.optics.pupil import annular_pupil
-from psfdae.optics.wavefronts import monomial_coefficients, monomial_images, seidel_wavefronts
-from psfdae.stars.fields import perturb, relative_field
-from psfdae.stars.framing import Propagation, brightest_pixel, normalise_flux
-from psfdae.stars.symmetry import SYMMETRIES, orbit
+from psfdae_paper.optics.propagation import StampPropagator
+from psfdae_paper.optics.pupil import annular_pupil
+from psfdae_paper.optics.wavefronts import monomial_coefficients, monomial_images, seidel_wavefronts
+from psfdae_paper.stars.fields import perturb, relative_field
+from psfdae_paper.stars.framing import Propagation, brightest_pixel, normalise_flux
+from psfdae_paper.stars.symmetry import SYMMETRIES, orbit
 
 POINTS, SIDE = 3, 8
 
@@ -223,7 +223,7 @@ def test_posterior_mean_is_that_of_the_poisson_distribution(level, bank, members
 
 
 @pytest.mark.parametrize("level", [1e-3, 2e-2])
-def test_told_the_field_only_its_images_count(level, bank, members, noise):
+def test_given_the_field_only_its_images_count(level, bank, members, noise):
     """The centre is its own orbit; corners are mirror images of each other."""
     images, field, _, weight = members
     for corners in (np.array([4]), np.array([0, 2, 6, 8])):
@@ -231,7 +231,7 @@ def test_told_the_field_only_its_images_count(level, bank, members, noise):
         for told in corners:
             noisy = noise.draw(images[field == told][[3, 50]], level, np.random.default_rng(2))
             likelihood = Likelihood.of(noise, level, bank.stamps((2, 2)))
-            sums = posterior_sums(few, noisy, likelihood, chunk=7, told=np.array([told, told]))
+            sums = posterior_sums(few, noisy, likelihood, chunk=7, own_field=np.array([told, told]))
             own = (images, field, None, weight * (field == told))
             w = brute_force(own, noisy, likelihood.flux, noise.background)
             expected = np.einsum("nk,khw->nhw", w, images).reshape(2, -1)
@@ -252,7 +252,7 @@ def test_off_the_mirror_axes_only_the_identity_stays_in_the_field(field, symmetr
     # So noisy that all images are alike.
     dark = Likelihood.of(noise, 1e3, own.stamps((2, 2)))
     noisy = noise.draw(own.stamps((2, 2))[:2], 1e3, rng)
-    sums = posterior_sums(own, noisy, dark, told=np.full(2, field))
+    sums = posterior_sums(own, noisy, dark, own_field=np.full(2, field))
     assert sums.effective_size == pytest.approx([6 * 9] * 2, rel=1e-3)
     if symmetries == 1:
         cuts = [own.stamps(SYMMETRIES[0].window(jitter, own.margin)) for jitter in jitters(1)]
@@ -261,7 +261,7 @@ def test_off_the_mirror_axes_only_the_identity_stays_in_the_field(field, symmetr
 
 
 @pytest.mark.parametrize("level", [1e-3, 3e-3, 1e-2, 1e-1])
-def test_told_the_field_is_never_worse(level, bank, members, noise):
+def test_given_the_field_is_never_worse(level, bank, members, noise):
     """Stars are drawn from the prior itself, so both means are the best possible."""
     images, field, _, weight = members
     rng = np.random.default_rng(11)
@@ -273,7 +273,7 @@ def test_told_the_field_is_never_worse(level, bank, members, noise):
     for home in np.unique(orbit(field, POINTS)):
         star = np.flatnonzero(orbit(field[drawn], POINTS) == home)
         few = bank.take(np.flatnonzero(orbit(bank.field, POINTS) == home))
-        sums = posterior_sums(few, noisy[star], likelihood, told=field[drawn[star]])
+        sums = posterior_sums(few, noisy[star], likelihood, own_field=field[drawn[star]])
         told[star] = sums.mean_image
     truth = images[drawn].reshape(len(drawn), -1)
     gain = ((free - truth) ** 2 - (told - truth) ** 2).mean(axis=1)

@@ -9,9 +9,10 @@ import pytest
 from scipy.stats import f as f_law
 from scipy.stats import multivariate_t
 
-from psfdae.bounds import sampling
-from psfdae.bounds.posterior import Likelihood, jitters, merge
-from psfdae.bounds.sampling import (
+from psfdae.rng import stream
+from psfdae_paper.bounds import sampling
+from psfdae_paper.bounds.posterior import Likelihood, jitters, merge
+from psfdae_paper.bounds.sampling import (
     FIELD,
     TRUTH,
     Modes,
@@ -22,9 +23,8 @@ from psfdae.bounds.sampling import (
     twins,
     unexplained,
 )
-from psfdae.optics.wavefronts import seidel_wavefronts
-from psfdae.rng import stream
-from psfdae.stars.framing import Propagation, crop_jittered, normalise_flux
+from psfdae_paper.optics.wavefronts import seidel_wavefronts
+from psfdae_paper.stars.framing import Propagation, crop_jittered, normalise_flux
 
 LEVEL = 3e-3
 FIELDS = np.array([[0.4, 0.2], [0.416, 0.208], [-0.4, 0.6]])
@@ -109,11 +109,11 @@ def test_draws_have_the_posterior_mean_of_the_grid(model, modes, stars, noise, e
     free = merge(found.free)
     error = ((mean - stars[1].reshape(4, -1)) ** 2).mean()
     assert ((free.mean_image - mean) ** 2).mean() < 0.01 * error
-    assert ((merge(found.told).mean_image - told) ** 2).mean() < 0.01 * error
+    assert ((merge(found.in_field).mean_image - told) ** 2).mean() < 0.01 * error
     assert free.share / free.total[:, None, None] == pytest.approx(share, abs=0.03)
     # Fields in one direction can give nearly the same image.
     assert (share[:, 1].sum(axis=1) > 0.01).any()
-    assert (merge(found.told).share[:, 1:] == 0).all()
+    assert (merge(found.in_field).share[:, 1:] == 0).all()
     assert found.free_helped.mean_image == pytest.approx(free.mean_image, abs=1e-12)
 
 
@@ -243,12 +243,14 @@ def test_a_mode_undetected_with_the_field_given_shows(stars, model, noise):
     rngs = [stream(1, "test", 0)]
     arguments = (noisy, np.zeros(1, int), *problem[1:], [50, 50], rngs)
     lost = sampled_sums(wrong + right, *arguments)
-    assert np.isnan(merge(lost.told).mean_image).all()
-    error = ((lost.told_helped.mean_image - stars[1][:1].reshape(1, -1)) ** 2).mean()
+    assert np.isnan(merge(lost.in_field).mean_image).all()
+    error = ((lost.in_field_helped.mean_image - stars[1][:1].reshape(1, -1)) ** 2).mean()
     assert error < 1e-7
-    assert 0 < lost.told_helped.variance_image[0] < 1e-7
+    assert 0 < lost.in_field_helped.variance_image[0] < 1e-7
     found = sampled_sums(replace(right, given=np.full(1, FIELD)), *arguments)
-    assert found.told_helped.mean_image == pytest.approx(merge(found.told).mean_image, abs=1e-9)
+    assert found.in_field_helped.mean_image == pytest.approx(
+        merge(found.in_field).mean_image, abs=1e-9
+    )
 
 
 def test_what_is_found_without_the_truth_does_not_depend_on_it(stars, model, noise):
@@ -258,6 +260,6 @@ def test_what_is_found_without_the_truth_does_not_depend_on_it(stars, model, noi
         sampled_sums(modes, noisy, np.zeros(1, int), *problem[1:], [50, 50], [stream(1, "test", 0)])
         for modes in (wrong, both)
     )
-    for part, other in zip(one.told, two.told, strict=True):
+    for part, other in zip(one.in_field, two.in_field, strict=True):
         assert part.image.tobytes() == other.image.tobytes()
-    assert two.told_helped.image.tobytes() != one.told_helped.image.tobytes()
+    assert two.in_field_helped.image.tobytes() != one.in_field_helped.image.tobytes()

@@ -8,17 +8,13 @@ import pandas as pd
 import pytest
 from matplotlib.collections import PolyCollection
 
-from psfdae.configuration.compose import load_stage
-from psfdae.configuration.consistency import SIMULATION, STATIC
-from psfdae.estimators import method
-from psfdae.evaluation.curves import (
-    MEANS,
-    efficiency_against_noise,
-    errors_above_bounds,
-)
 from psfdae.files import ProductError, read_product
-from psfdae.stages import bounds, figures, stars
-from psfdae.stages.common import noisy_test_images, split_stars
+from psfdae.methods import method
+from psfdae.model.star_sets import noisy_test_images, split_stars
+from psfdae_paper.configuration.compose import load_stage
+from psfdae_paper.configuration.consistency import SIMULATION, STATIC
+from psfdae_paper.evaluation.curves import MEANS, efficiency_against_noise, errors_above_bounds
+from psfdae_paper.stages import bounds, figures, stars
 
 LEVELS = (0.001, 0.003, 0.01, 0.1)
 SIZES = ("preset=smoke", "grid.points=3", "stars.count=60", "parts.train_stars=20")
@@ -28,7 +24,7 @@ SIZES += (f"noise.levels={list(LEVELS)}", "bounds.threads=1", "optics.threads=1"
 
 
 def settings(stage, dataset, *more):
-    reads = stage if isinstance(stage, tuple) else stage.stage.reads
+    reads = stage if isinstance(stage, tuple) else stage.stage.settings.reads
     return load_stage(reads, (f"dataset={dataset}", *SIZES, *more))
 
 
@@ -242,10 +238,10 @@ def test_the_posterior_mean_respects_the_floor(scene_1):
 
 
 @pytest.mark.parametrize(("factor", "verdict"), [(1.0, "ok"), (1e-3, "beaten")])
-def test_a_method_told_the_field_is_judged_by_the_mean_told_it(
+def test_a_method_given_the_field_is_judged_by_the_mean_given_it(
     scene_1, monkeypatch, factor, verdict
 ):
-    monkeypatch.setattr(method("lmmse"), "told_position", True)
+    monkeypatch.setattr(method("lmmse"), "needs_position", True)
     table = compared(scene_1, "dataset6", factor, "bayes_position")
     rows = table[table.method == "lmmse"]
     assert set(rows.bound) == {"bayes_position", "floor"}

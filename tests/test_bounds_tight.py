@@ -8,8 +8,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from psfdae.bounds.tight import Evidence, calibration
-from psfdae.stages import bounds
+from psfdae_paper.bounds.tight import Evidence, calibration
+from psfdae_paper.stages import bounds
 
 STARS, PIXELS = 400, 16
 FIELD = np.arange(STARS) % 40

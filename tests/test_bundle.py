@@ -17,21 +17,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.numpy import save_file
 
+from psfdae.bundle_info import Architecture, BundleInfo
 from psfdae.cli import main
-from psfdae.estimators.dae_network import build_dae, predict
-from psfdae.own_stars import packing
-from psfdae.own_stars.bundle import (
-    Architecture,
+from psfdae.model import packing
+from psfdae.model.bundle import (
     Bundle,
     BundleError,
-    BundleInfo,
     creation_date,
     estimator,
     read_bundle,
     write_bundle,
 )
-from psfdae.own_stars.model import PsfModel
-from psfdae.own_stars.photometry import FluxModel, robust_flux
+from psfdae.model.photometry import FluxModel, robust_flux
+from psfdae.model.psf_model import PsfModel
+from psfdae.networks.dae import build_dae, predict
 
 SHAPE = Architecture(kernels=(5, 3, 5), widths=(4, 4))
 INFO = {

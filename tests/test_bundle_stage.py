@@ -13,12 +13,11 @@ from click.testing import CliRunner
 from psfdae import StarFlag
 from psfdae.belonging import write_origin
 from psfdae.cli import main
-from psfdae.configuration.compose import load_stage
-from psfdae.configuration.consistency import SIMULATION, STATIC
-from psfdae.estimators import dae_network, groups_of
+from psfdae.commands import describe
 from psfdae.files import Column, ProductError, read_product, write_product
-from psfdae.own_stars import packing
-from psfdae.own_stars.bundle import (
+from psfdae.methods import groups_of
+from psfdae.model import packing
+from psfdae.model.bundle import (
     SCALES,
     BundleError,
     at_noise,
@@ -29,13 +28,17 @@ from psfdae.own_stars.bundle import (
     shipped_path,
     write_bundle,
 )
-from psfdae.own_stars.model import PsfModel
-from psfdae.own_stars.photometry import FluxModel, noise_equivalent_px, signal_to_noise
+from psfdae.model.photometry import FluxModel, signal_to_noise
+from psfdae.model.psf_model import PsfModel
+from psfdae.model.star_sets import noise_model, noisy_test_images, read_stars
+from psfdae.networks import dae as dae_network
+from psfdae.noise import noise_equivalent_px
 from psfdae.rng import stream
-from psfdae.stages import bundle as stage
-from psfdae.stages.common import noise_model, noisy_test_images, read_stars
-from psfdae.stages.evaluate import Models
-from psfdae.stages.fit import fit, train
+from psfdae_paper.configuration.compose import load_stage
+from psfdae_paper.configuration.consistency import SIMULATION, STATIC
+from psfdae_paper.stages import bundle as stage
+from psfdae_paper.stages.evaluate import Models
+from psfdae_paper.stages.fit import fit, train
 
 TINY = [
     "noise.levels=[1e-3,3e-3,1e-2]",
@@ -91,7 +94,7 @@ def folder(tmp_path_factory):
 def pack(folder, out, overrides=(), **options):
     chosen = {"stars": folder / "stars.h5", "split": None, "name": "tiny", "licence": "MIT"}
     chosen["models"] = Models(dae=options.pop("dae", folder / "dae"))
-    config = load_stage(stage.bundle.stage.reads, [*TINY, *overrides])
+    config = load_stage(stage.bundle.stage.settings.reads, [*TINY, *overrides])
     stage.bundle(config, out=out, **(chosen | options))
 
 
@@ -138,9 +141,9 @@ def test_unknown_optics_have_no_diffraction_limit(folder, tmp_path):
 
 
 def test_metrics_are_those_of_the_stage_evaluate(folder, tiny):
-    config = load_stage(stage.bundle.stage.reads, TINY)
+    config = load_stage(stage.bundle.stage.settings.reads, TINY)
     images = gaussians(1400, 1)
-    from psfdae.stars.fields import random_split
+    from psfdae.splits import random_split
 
     test = random_split(1400, 1000, 400, config.parts.validation_fraction, config.seed).test
     stars = read_stars(folder / "stars.h5")
@@ -152,7 +155,7 @@ def test_metrics_are_those_of_the_stage_evaluate(folder, tiny):
 
 
 def test_half_width_covers_fresh_stars_and_the_rms_too_many(tiny):
-    config = load_stage(stage.bundle.stage.reads, TINY)
+    config = load_stage(stage.bundle.stage.settings.reads, TINY)
     images = gaussians(1500, 99)
     rng = np.random.default_rng(5)
     noise = np.exp(rng.uniform(np.log(4.98e-3), np.log(4.98e-2), size=1500))
@@ -333,7 +336,7 @@ def test_network_of_another_training_is_refused(folder, tmp_path, override, mess
 
 
 def test_stars_that_say_too_little_are_refused(folder, tmp_path):
-    stars = write_stars(tmp_path / "s.h5", {"telescope": {}, "framing": {"jitter_px": 0}})
+    stars = write_stars(tmp_path / "s.h5", {"telescope": {}, "framing": {"jitter_px": 1}})
     with pytest.raises(ProductError, match=r"s\.h5: its configuration lacks 'pixel_scale_arcsec'"):
         pack(folder, tmp_path / "x", stars=stars)
 
@@ -376,7 +379,7 @@ def test_export_of_a_wrong_network_fails_and_leaves_no_file(folder, tmp_path, mo
 
     monkeypatch.setattr(dae_network, "_plain", wrong)
     with pytest.raises(dae_network.ExportError, match="differs from torch"):
-        stage.export(folder / "tiny.psf.safetensors", out=tmp_path / "x.onnx")
+        describe.export(folder / "tiny.psf.safetensors", out=tmp_path / "x.onnx")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -397,7 +400,7 @@ def test_shipped_bundle_is_small_and_wide():
 def test_shipped_bundle_covers_stars_that_nobody_has_seen(tmp_path):
     """New stars of the same telescope, from another seed."""
     from psfdae.files import read_product
-    from psfdae.stages import stars
+    from psfdae_paper.stages import stars
 
     sizes = ["seed=11", "grid.points=5", "grid.spacing_deg=2.75", "stars.count=500"]
     chosen = ["dataset=field", *sizes, "parts.train_stars=400", "parts.test_stars=100"]
@@ -407,7 +410,7 @@ def test_shipped_bundle_covers_stars_that_nobody_has_seen(tmp_path):
     bundle, rng = read_bundle(), stream(11, "coverage")
     band = np.log([bundle.info.noise_min, bundle.info.noise_max])
     noise = np.exp(rng.uniform(*band, size=len(images)))
-    config = load_stage(stage.bundle.stage.reads, chosen)
+    config = load_stage(stage.bundle.stage.settings.reads, chosen)
     noisy = noise_model(config).draw(images, noise / config.noise.kappa, rng)
     level = noise / config.noise.kappa
     error = packing.errors_of(estimator(bundle).estimate(noisy, level), images)
@@ -418,7 +421,7 @@ def test_shipped_bundle_covers_stars_that_nobody_has_seen(tmp_path):
 
 def test_ship_names_checks_and_writes(folder, tiny, tmp_path, capsys):
     """The bundle that errs least on the validation stars, of a fit that has not seen them."""
-    config = load_stage(stage.ship.stage.reads, TINY)
+    config = load_stage(stage.ship.stage.settings.reads, TINY)
     given = {"stars": folder / "stars.h5", "out": tmp_path / "bundles"}
     weights = {name: 0 * array for name, array in tiny.weights.items()}
     write_bundle(replace(tiny, weights=weights), tmp_path / "none.psf.safetensors")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from psfdae.own_stars.bundle import read_bundle
+from psfdae.model.bundle import read_bundle
 from workflow_runs import planned, snakemake
 
 pytestmark = [pytest.mark.workflow, pytest.mark.slow]

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from psfdae.evaluation.calibration import (
+from psfdae_paper.evaluation.calibration import (
     fit_scales,
     kappa_of_mse,
     original_noise_rows,
@@ -22,7 +22,7 @@ def model(level, scale, data_range):
 @pytest.fixture
 def rows(monkeypatch):
     """The paper's columns with SSIM values that range 0.7 and scales 0.11, 0.16 explain."""
-    import psfdae.evaluation.calibration as module
+    import psfdae_paper.evaluation.calibration as module
 
     table = original_noise_rows()
     scale = np.where(table.dataset == "dataset8", 0.16, 0.11)

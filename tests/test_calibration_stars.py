@@ -8,8 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from psfdae.own_stars.photometry import noise_equivalent_px
-from psfdae.own_stars.selection import (
+from psfdae.image.selection import (
     BrightStars,
     brightest_pixels,
     crowded,
@@ -20,16 +19,11 @@ from psfdae.own_stars.selection import (
     star_centres,
     window_of,
 )
-from psfdae.own_stars.stamps import cut
-from psfdae.own_stars.training_images import (
-    bins_of,
-    make_images,
-    stacks,
-    star_grid,
-    star_of_images,
-)
+from psfdae.image.stamps import cut
+from psfdae.image.training_images import bins_of, make_images, stacks, star_grid, star_of_images
+from psfdae.noise import noise_equivalent_px
 from psfdae.rng import stream
-from psfdae.stars.fields import held_out_fields
+from psfdae.splits import held_out_fields
 
 FRAMING = SimpleNamespace(stamp_px=16, jitter_px=1)
 

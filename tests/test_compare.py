@@ -11,15 +11,15 @@ import pytest
 
 import trainings
 from command_line import psfdae, refused
-from psfdae.evaluation import comparison
-from psfdae.evaluation.comparison import (
+from psfdae.files import write_text
+from psfdae_paper.evaluation import comparison
+from psfdae_paper.evaluation.comparison import (
     compare_errors,
     config_differences,
     held_out_ratios,
     seed_scatter,
     training_summary,
 )
-from psfdae.files import write_text
 
 FIELDS, STARS = 20, 400
 ROOT = Path(__file__).resolve().parents[1]
@@ -123,7 +123,9 @@ def test_the_package_has_the_table_of_the_record():
     table = RECORD / "tables/seed_scatter.csv"
     if not table.is_file():
         pytest.skip("the record was made before this table")
-    assert table.read_bytes() == (ROOT / "src/psfdae/evaluation/seed_scatter.csv").read_bytes()
+    assert (
+        table.read_bytes() == (ROOT / "src/psfdae_paper/evaluation/seed_scatter.csv").read_bytes()
+    )
 
 
 def mean_errors(**scale):

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from psfdae.configuration import compose
-from psfdae.configuration.compose import ConfigError, as_overrides, config_dir, load, load_stage
-from psfdae.configuration.consistency import SIMULATION
-from psfdae.estimators import groups_of
-from psfdae.stages.alignment_methods import train_dae, train_network
-from psfdae.stages.evaluate import READS
+from psfdae.methods import groups_of
+from psfdae.settings import ConfigError, as_overrides
+from psfdae_paper.configuration import compose
+from psfdae_paper.configuration.compose import config_dir, load, load_stage
+from psfdae_paper.configuration.consistency import SIMULATION
+from psfdae_paper.stages.alignment_methods import train_dae, train_network
+from psfdae_paper.stages.evaluate import READS
 
 DATASETS = sorted(p.stem for p in config_dir().glob("dataset/[!_]*.yaml"))
 PRESETS = sorted(p.stem for p in config_dir().glob("preset/*.yaml"))
@@ -96,8 +97,8 @@ def test_search_distances_follow_from_the_telescope():
     ("groups", "root"),
     [
         (("seed", "noise", "parts", "dae", "train"), "config"),
-        (train_dae.stage.reads, "alignment"),
-        (train_network.stage.reads("original"), "alignment"),
+        (train_dae.stage.settings.reads, "alignment"),
+        (train_network.stage.settings.reads("original"), "alignment"),
     ],
 )
 def test_settings_that_cannot_change_a_result_are_set_apart(groups, root):
@@ -136,10 +137,11 @@ def test_a_file_of_settings_that_is_damaged_is_named(tmp_path):
 def test_a_checkpoint_does_not_depend_on_how_often_it_is_written():
     import numpy as np
 
-    from psfdae.estimators.training import fingerprint
+    from psfdae.networks.training import fingerprint
+    from psfdae.settings import deciding
 
     def of(*overrides):
-        return fingerprint(load(overrides).model_dump(), np.zeros(3))
+        return fingerprint(deciding(load(overrides).train), np.zeros(3))
 
     assert of("train.checkpoint_seconds=3") == of() != of("train.lr=0.003")
 
@@ -302,4 +304,4 @@ def test_an_installed_wheel_finds_its_configuration(installed, tmp_path, argumen
     ]
     assert shown[0] == shown[1]
     assert "checkpoint_seconds: 20.0" in shown[0]
-    assert (installed / "psfdae/config/config.yaml").is_file()
+    assert (installed / "psfdae_paper/config/config.yaml").is_file()

@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 
 from command_line import psfdae
-from psfdae.configuration import compose
-from psfdae.configuration.compose import ConfigError, config_dir, forget, load
 from psfdae.files import ProductError
 from psfdae.reading import read_csv, read_json, read_table, read_yaml
-from psfdae.sweeps.points import SweepError, plan_sweep
+from psfdae.settings import ConfigError
+from psfdae_paper.configuration import compose
+from psfdae_paper.configuration.compose import config_dir, forget, load
+from psfdae_paper.sweeps.points import SweepError, plan_sweep
 from trainings import load_knee
 
 DATASET = ["config"]
@@ -135,7 +136,7 @@ def test_deep_nesting_is_one_line(folder):
 
 def test_a_list_is_no_group(folder):
     (folder / "gmm/default.yaml").write_text("- stars\n")
-    assert refused(["config"]).startswith("psfdae: gmm = ['stars']: ")
+    assert refused(["config"]).startswith("psfdae: config: In 'gmm/default': ")
 
 
 @pytest.mark.parametrize(

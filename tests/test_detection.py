@@ -15,14 +15,13 @@ from astropy.table import Table
 from scipy.spatial import cKDTree
 
 from command_line import psfdae, refused
-from psfdae.configuration.compose import load_stage
-from psfdae.own_stars.bundle import read_bundle
-from psfdae.own_stars.detection import Sky
-from psfdae.own_stars.images import find_image
-from psfdae.own_stars.observation import SEEN, Source
-from psfdae.own_stars.selection import collect
-from psfdae.stages import simulate
-from psfdae.stages.from_stars import from_stars
+from psfdae.image.detection import Sky
+from psfdae.image.fits_file import find_image
+from psfdae.image.observation import SEEN, Source
+from psfdae.image.selection import collect
+from psfdae.model.bundle import read_bundle
+from psfdae.model.settings import from_words
+from psfdae_paper.stages import simulate
 
 REAL = Path(os.environ.get("PSFDAE_REAL_IMAGE", "hatp32.fits"))
 """A real image that is not ours to distribute; the list of its stars lies beside it."""
@@ -181,7 +180,7 @@ def test_what_is_given_goes_before_the_header(field, tmp_path):
 
 def test_whole_counts_without_scatter_have_the_read_noise(field, tmp_path):
     """Half of the sky's pixels are one number: its median deviation is 0."""
-    config = load_stage(from_stars.stage.reads, ["dataset=from_stars", *TINY])
+    config = from_words(["dataset=from_stars", *TINY])
     coarse = np.round(pixels(field) / 60.0) * 60.0
     image = write(tmp_path / "image.fits", coarse, GAIN=1.0, RDNOISE=20.0)
     found = collect(opened(image, detect=5.0), config.calibration_stars, config.framing)

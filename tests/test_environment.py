@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 import yaml
 from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -24,8 +25,9 @@ CONDA_NAMES = {
     "matplotlib-base": "matplotlib",
 }
 CONDA_ONLY = {"pip", "python"}
-TRANSITIVE = {"omegaconf": "of hydra-core", "sqlalchemy": "of mlflow", "numexpr": "of poppy"}
+TRANSITIVE = {"sqlalchemy": "of mlflow", "numexpr": "of poppy"}
 NOT_IMPORTED = {
+    "pyarrow": "writes the Parquet files of pandas",
     "snakemake": "runs the workflow",
     "snakemake-executor-plugin-slurm": "runs it on a cluster",
 }
@@ -41,11 +43,27 @@ esac
 """
 
 
+def required(*extras):
+    """Requirements of pyproject.toml by package: of the plain package, and of extras."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    lines = sum(
+        (project["optional-dependencies"][name] for name in extras), project["dependencies"]
+    )
+    found = {canonicalize_name(r.name): r for r in map(Requirement, lines)}
+    more = found.pop("psfdae", None)
+    return found | (required(*more.extras) if more else {})
+
+
 @pytest.fixture(scope="module")
 def declared():
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    lines = project["dependencies"] + project["optional-dependencies"]["dev"]
-    return {canonicalize_name(r.name): r for r in map(Requirement, lines)}
+    """What the environment of make and conda holds."""
+    return required("paper", "dev")
+
+
+@pytest.fixture(scope="module")
+def torch_pin():
+    """The version of torch in that environment."""
+    return re.search(r"^torch==(.+)$", (ROOT / "requirements/torch.in").read_text(), re.M)[1]
 
 
 @pytest.fixture(scope="module")
@@ -69,15 +87,23 @@ def locked(path):
     return versions, hashes
 
 
-def test_conda_requires_what_pyproject_requires(declared, conda, pip_part):
+def test_conda_requires_what_pyproject_requires(declared, conda, pip_part, torch_pin):
     lines = [line for line in conda["dependencies"] if isinstance(line, str)]
     lines += [line for line in pip_part if line != "--editable ."]
     ours = {CONDA_NAMES.get(r.name, r.name): r.specifier for r in map(Requirement, lines)}
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert str(ours["python"]) == project["requires-python"]
-    assert {canonicalize_name(n): s for n, s in ours.items() if n not in CONDA_ONLY} == {
-        n: r.specifier for n, r in declared.items()
-    }
+    wanted = {n: r.specifier for n, r in declared.items()}
+    wanted["torch"] = SpecifierSet(f"=={torch_pin}")
+    assert {canonicalize_name(n): s for n, s in ours.items() if n not in CONDA_ONLY} == wanted
+
+
+def test_the_plain_package_is_light():
+    plain = required()
+    assert len(plain) <= 12
+    heavy = {"torch", "hydra-core", "mlflow", "pyarrow", "snakemake"}
+    assert heavy <= required("paper").keys() - plain.keys()
+    assert required("dae").keys() - plain.keys() == {"torch", "tqdm"}
 
 
 def test_snakefile_asks_for_the_snakemake_of_pyproject(declared):
@@ -109,13 +135,11 @@ def test_imports_are_declared_and_what_is_declared_is_imported(declared):
     packages = packages_distributions()
     imported = {
         name: {canonicalize_name(package) for package in packages.get(name, [name])}
-        for name in names - sys.stdlib_module_names - {"psfdae"}
+        for name in names - sys.stdlib_module_names - {"psfdae", "psfdae_paper"}
     }
     known = declared.keys() | TRANSITIVE.keys()
     assert [name for name, found in imported.items() if not found & known] == []
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    required = {canonicalize_name(Requirement(line).name) for line in project["dependencies"]}
-    assert required - set().union(*imported.values()) == NOT_IMPORTED.keys()
+    assert required("paper").keys() - set().union(*imported.values()) == NOT_IMPORTED.keys()
 
 
 @pytest.mark.slow
@@ -147,13 +171,12 @@ def test_locked_and_installed_versions_satisfy_pyproject(declared):
         assert requirement.specifier.contains(version(name), prereleases=True), name
 
 
-def test_torch_and_cuda_are_locked_apart(declared):
-    pin = str(declared["torch"].specifier)
-    assert re.fullmatch(r"==[0-9.]+", pin)
+def test_torch_and_cuda_are_locked_apart(declared, torch_pin):
+    assert declared["torch"].specifier.contains(torch_pin)
     apart = locked("requirements/torch.lock")[0]
     cpu = locked("requirements/torch-cpu.lock")[0]
-    assert apart["torch"] == {pin[2:]}
-    assert cpu["torch"] - apart["torch"] == {f"{pin[2:]}+cpu"}
+    assert apart["torch"] == {torch_pin}
+    assert cpu["torch"] - apart["torch"] == {f"{torch_pin}+cpu"}
     assert any(name.startswith("nvidia") for name in apart)
     everyone = locked("requirements.lock")[0]
     assert not [name for name in everyone if name == "torch" or name.startswith("nvidia")]
@@ -182,19 +205,18 @@ def test_every_locked_requirement_has_a_hash(path):
         ("https://example.org/cpu", "{pin}+cpu", "torch-cpu"),
     ],
 )
-def test_make_env_installs_nothing_without_a_hash(index, offered, lock, declared, tmp_path):
-    pin = str(declared["torch"].specifier)[2:]
+def test_make_env_installs_nothing_without_a_hash(index, offered, lock, torch_pin, tmp_path):
     python = tmp_path / "python"
     python.write_text(RECORDER)
     python.chmod(0o755)
     line = ["make", "env", f"PYTHON={python}", f"VENV={tmp_path / 'venv'}", f"TORCH_INDEX={index}"]
-    env = {"OFFERED": offered.format(pin=pin), "LOG": str(tmp_path / "log"), "MAKEFLAGS": ""}
+    env = {"OFFERED": offered.format(pin=torch_pin), "LOG": str(tmp_path / "log"), "MAKEFLAGS": ""}
     subprocess.run(line, cwd=ROOT, env=os.environ | env, check=True, capture_output=True)
     installs = [step for step in Path(env["LOG"]).read_text().splitlines() if " install " in step]
     assert len(installs) > 3
     assert all("--require-hashes" in step or "--no-index" in step for step in installs), installs
     assert all("--no-build-isolation" in step for step in installs), installs
     torch = next(step for step in installs if "torch==" in step)
-    assert torch.endswith(f" --constraint requirements/{lock}.lock torch=={pin}")
+    assert torch.endswith(f" --constraint requirements/{lock}.lock torch=={torch_pin}")
     assert [step for step in installs if "--index-url" in step] == ([torch] if index else [])
     assert not index or f"--index-url {index} " in torch

@@ -8,8 +8,7 @@ import pytest
 from scipy.stats import pearsonr
 from skimage.metrics import mean_squared_error, structural_similarity
 
-from psfdae.estimators import registered
-from psfdae.evaluation.metrics import (
+from psfdae.metrics import (
     all_metrics,
     clustered_mean,
     clustered_ratio,
@@ -17,7 +16,8 @@ from psfdae.evaluation.metrics import (
     mse,
     ssim,
 )
-from psfdae.evaluation.paper import as_markdown, paper_table
+from psfdae_paper.configuration.methods import registered
+from psfdae_paper.evaluation.paper import as_markdown, paper_table
 
 
 @pytest.fixture(scope="module")

@@ -21,16 +21,16 @@ from photutils.psf import GriddedPSFModel, PSFPhotometry
 from photutils_grid import drawn, gridded
 from psfdae import load_model
 from psfdae.cli import main
-from psfdae.configuration.compose import load_stage
-from psfdae.estimators import BrightStamps, FitError, TrainingSet
-from psfdae.estimators.field import TELLING, FieldMixture
-from psfdae.own_stars.bundle import read_bundle, write_bundle
-from psfdae.own_stars.example import add_stamps, write_field
-from psfdae.own_stars.model import PredictionError
-from psfdae.own_stars.shapes import measure_shapes
-from psfdae.stages import psf
-from psfdae.stars.field_model import Frames, fit_field
-from psfdae.stars.noise import NoiseModel
+from psfdae.commands import psf
+from psfdae.field_psf import Frames, fit_field
+from psfdae.method import BrightStamps, FitError, TrainingSet
+from psfdae.methods.field import TELLING, FieldMixture
+from psfdae.model.bundle import read_bundle, write_bundle
+from psfdae.model.psf_model import PredictionError
+from psfdae.model.shapes import measure_shapes
+from psfdae.noise import NoiseModel
+from psfdae_paper.configuration.compose import load_stage
+from psfdae_paper.stars.example import add_stamps, write_field
 
 SIDE, WIDE, FIELD = 10, 26, 1000.0
 SNR = (5.0, 10.0, 20.0, 50.0)
@@ -266,7 +266,7 @@ def test_stars_are_restored_in_groups_that_do_not_matter(field, monkeypatch):
     each = [Faint(40, snr) for snr in (5.0, 50.0, 500.0, 5000.0)]
     told = [np.concatenate([getattr(some, n) for some in each]) for n in ("stamps", "sigma")]
     whole = field.measure(*told)
-    monkeypatch.setattr("psfdae.estimators.field.KEPT", 1.0)
+    monkeypatch.setattr("psfdae.methods.field.KEPT", 1.0)
     few = fitted(bright()).measure(*told)
     assert few.psf == pytest.approx(whole.psf, abs=1e-7)
     assert few.measured.flux == pytest.approx(whole.measured.flux, rel=1e-9)

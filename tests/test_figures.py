@@ -6,25 +6,20 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from psfdae.configuration.compose import load_stage
-from psfdae.estimators.dae import Dae
-from psfdae.estimators.pca_som import PcaSom
-from psfdae.evaluation.curves import error_against_noise, training_curves
-from psfdae.evaluation.figure_style import in_field_unit
-from psfdae.evaluation.figures import (
-    StripRow,
-    mosaic,
-    restoration_strip,
-    spread_stars,
-    stamp_energy_map,
-    template_map,
-)
-from psfdae.evaluation.paper import published
+from psfdae.figure_style import in_field_unit
 from psfdae.files import Column, ProductError, write_product
-from psfdae.stages import figures as stage
-from psfdae.stages.common import noisy_test_images, read_stars
-from psfdae.stages.evaluate import READS, Models
-from psfdae.stars.fields import random_split, square_grid
+from psfdae.methods.dae import Dae
+from psfdae.model.star_sets import noisy_test_images, read_stars
+from psfdae.splits import random_split
+from psfdae.strip import StripRow, restoration_strip, spread_stars
+from psfdae_paper.configuration.compose import load_stage
+from psfdae_paper.evaluation.curves import error_against_noise, training_curves
+from psfdae_paper.evaluation.figures import mosaic, stamp_energy_map, template_map
+from psfdae_paper.evaluation.paper import published
+from psfdae_paper.methods.pca_som import PcaSom
+from psfdae_paper.stages import figures as stage
+from psfdae_paper.stages.evaluate import READS, Models
+from psfdae_paper.stars.fields import square_grid
 
 METHODS = ("noisy", "pca_som", "dae", "lmmse")
 LEVELS = (0.001, 0.002, 0.003, 0.005)
@@ -247,7 +242,7 @@ def test_strip_shows_the_noise_that_evaluate_measures(tmp_path, gaussian_stars, 
         monkeypatch.setattr(kind, "require", lambda *stars: None)
         monkeypatch.setattr(kind, "load", classmethod(unchanged))
     monkeypatch.setattr(
-        "psfdae.evaluation.figures.restoration_strip",
+        "psfdae.strip.restoration_strip",
         lambda rows, columns, title: shown.update(rows=rows, columns=columns, title=title),
     )
     monkeypatch.setattr(stage, "write_png", lambda figure, out: None)

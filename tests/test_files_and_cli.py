@@ -22,7 +22,7 @@ from psfdae.files import (
     write_product,
     write_text,
 )
-from psfdae.stages import verify
+from psfdae_paper.stages import verify
 
 
 def write(path, values=None):
@@ -109,8 +109,8 @@ def done(step, *unwanted):
 
 def settings(*stages):
     # Composing a configuration is what the command line does; the stages themselves must not.
-    from psfdae.configuration.compose import load_stage
-    config = [load_stage(stage.stage.reads, TINY) for stage in stages]
+    from psfdae_paper.configuration.compose import load_stage
+    config = [load_stage(stage.stage.settings.reads, TINY) for stage in stages]
     for name in list(sys.modules):
         if name.partition(".")[0] in PACKAGES:
             del sys.modules[name]
@@ -122,7 +122,7 @@ assert CliRunner().invoke(main, ["--help"]).exit_code == 0
 done("--help", "torch", "mlflow", "hydra", "snakemake", "numpy", "pandas")
 
 from psfdae.files import write_text
-from psfdae.stages import verify
+from psfdae_paper.stages import verify
 (folder / ".digests").mkdir()
 write_text(folder / "data.csv", "1\\n")
 assert verify.set_aside(folder) == []
@@ -130,19 +130,20 @@ done("verify", "torch", "mlflow", "h5py", "pandas", "pyarrow")
 
 import psfdae
 assert psfdae.__version__ and callable(psfdae.load_model)
-from psfdae.stages.stars import stars, templates
+from psfdae_paper.stages.stars import stars, templates
 done("import of the simulation", *PACKAGES)
 of_templates, of_stars = settings(templates, stars)
 templates(of_templates, folder / "t")
 stars(of_stars, folder / "t", folder / "s")
 done("simulation", "torch", "pandas", "skimage", "sklearn", *PACKAGES)
 
-for module in pkgutil.iter_modules(psfdae.stages.__path__):
-    importlib.import_module(f"psfdae.stages.{module.name}")
+import psfdae_paper.stages
+for module in pkgutil.iter_modules(psfdae_paper.stages.__path__):
+    importlib.import_module(f"psfdae_paper.stages.{module.name}")
 done("import of the stages", "torch", "matplotlib", *PACKAGES)
 
-from psfdae.stages.evaluate import Models, evaluate
-from psfdae.stages.fit import baseline, train
+from psfdae_paper.stages.evaluate import Models, evaluate
+from psfdae_paper.stages.fit import baseline, train
 of_baseline, of_train, of_evaluate = settings(baseline, train, evaluate)
 pca_som, dae = folder / "pca_som", folder / "dae"
 baseline(of_baseline, folder / "s", out=pca_som)

@@ -21,35 +21,27 @@ from click.testing import CliRunner
 from docs_pages import blocks, commands, read
 from fits_inputs import write_cube
 from psfdae.cli import main
-from psfdae.configuration.compose import ConfigError, load_stage
-from psfdae.estimators import groups_of, method
+from psfdae.commands import from_stars as stage
+from psfdae.commands.from_stars import Source, _alone
 from psfdae.files import read_product, write_product
-from psfdae.own_stars.bundle import estimator, read_bundle
-from psfdae.own_stars.example import (
-    RENDER_PX,
-    FieldRecipe,
-    example_field,
-    star_images,
-)
-from psfdae.own_stars.photometry import noise_equivalent_px
-from psfdae.own_stars.report import MEAN_PSF
-from psfdae.own_stars.selection import (
-    BrightStars,
-    brightest_pixels,
-    collect,
-    moved,
-    star_centres,
-)
-from psfdae.own_stars.stamps import cut
-from psfdae.own_stars.training_images import OwnNoise, make_images, star_grid, training_columns
+from psfdae.image.selection import BrightStars, brightest_pixels, collect, moved, star_centres
+from psfdae.image.stamps import cut
+from psfdae.image.training_images import make_images, star_grid, training_columns
+from psfdae.methods import groups_of, method
+from psfdae.model.bundle import estimator, read_bundle
+from psfdae.model.psf_model import load_model
+from psfdae.model.report import MEAN_PSF
+from psfdae.model.settings import from_words
+from psfdae.model.star_sets import noise_model, split_stars
+from psfdae.model.validation import Report
+from psfdae.noise import NoiseModel, OwnNoise, noise_equivalent_px
 from psfdae.rng import stream
-from psfdae.stages import from_stars as stage
-from psfdae.stages import simulate
-from psfdae.stages.common import noise_model, split_stars
-from psfdae.stages.evaluate import READS
-from psfdae.stages.from_stars import Source, _alone, from_stars
-from psfdae.stars.fields import held_out_fields
-from psfdae.stars.noise import NoiseModel
+from psfdae.settings import ConfigError
+from psfdae.splits import held_out_fields
+from psfdae_paper.configuration.compose import load_stage
+from psfdae_paper.stages import simulate
+from psfdae_paper.stages.evaluate import READS
+from psfdae_paper.stars.example import RENDER_PX, FieldRecipe, example_field, star_images
 
 SIDE = {"side_px": 700, "bright": 60, "faint": 80, "blended": 6, "saturated": 3}
 TINY = ["preset=smoke", "parts.train_stars=120", "parts.test_stars=30", "train.epochs=1"]
@@ -58,7 +50,7 @@ TINY += ["methods=[noisy,pca_som,lmmse,dae,gmm,field]"]
 
 @pytest.fixture(scope="module")
 def config():
-    return load_stage(from_stars.stage.reads, ["dataset=from_stars", *TINY])
+    return from_words(["dataset=from_stars", *TINY])
 
 
 @pytest.fixture(scope="module")
@@ -328,7 +320,7 @@ def test_a_model_is_replaced_on_request_only(field, model, tmp_path):
     assert all(after[path] > before[path] for path in before if path.is_file())
 
 
-@pytest.mark.parametrize("last", ["report", "write_text"])
+@pytest.mark.parametrize("last", ["picture", "page"])
 def test_a_killed_command_ends_well_if_typed_again(field, model, tmp_path, monkeypatch, last):
     """The bundle comes last, and says that all is there."""
     image, catalogue, _ = field
@@ -336,29 +328,23 @@ def test_a_killed_command_ends_well_if_typed_again(field, model, tmp_path, monke
     shutil.copytree(model[0], out)
     made = out / "image.psf.safetensors"
     kept = made.rename(tmp_path / made.name)
-    for name in ("fit", "evaluate"):  # what they leave is there
-        monkeypatch.setattr(stage, name, lambda *args, **more: None)
-
-    def packed(*args, out, **more):
-        shutil.copy(kept, out)
-
-    packed.stage = stage.bundle.stage
-    monkeypatch.setattr(stage, "bundle", packed)
+    monkeypatch.setattr(stage, "fitted_to", lambda stars, kind, _: kind.load(out / "gmm.h5"))
+    monkeypatch.setattr(stage, "packed", lambda *args: load_model(kept))
     words = [image, "--catalogue", catalogue, "--out", out, "--report", page, "--method", "gmm"]
     child = os.fork()
     if child == 0:
-        after = getattr(stage, last)
+        owner, name = {"picture": (stage, "write_bytes"), "page": (Report, "save")}[last]
+        after = getattr(owner, name)
 
         def killed(*args):
             after(*args)
-            if last == "report" or args[0] == page:
-                os.kill(os.getpid(), signal.SIGKILL)
+            os.kill(os.getpid(), signal.SIGKILL)
 
-        monkeypatch.setattr(stage, last, killed)
+        monkeypatch.setattr(owner, name, killed)
         run(*words, *TINY)
         os._exit(1)
     assert os.waitpid(child, 0)[1] == signal.SIGKILL
-    assert not made.exists() and page.exists() == (last == "write_text")
+    assert not made.exists() and page.exists() == (last == "page")
     done = run(*words, *TINY)
     assert done.exit_code == 0, done.output
     assert made.read_bytes() == kept.read_bytes() and page.exists()
@@ -378,7 +364,8 @@ def test_the_sky_of_any_gain_can_be_drawn(gain):
 def test_one_process_at_a_time_works_in_a_folder(field, tmp_path):
     """Whoever holds the folder is alone, until its process ends in whatever way."""
     holder = (
-        "import sys, time; from pathlib import Path; from psfdae.stages.from_stars import _alone\n"
+        "import sys, time; from pathlib import Path\n"
+        "from psfdae.commands.from_stars import _alone\n"
         "with _alone(Path(sys.argv[1])): print('mine', flush=True); time.sleep(600)"
     )
     out = tmp_path / "model"
@@ -435,7 +422,7 @@ def test_what_cannot_be_used_ends_in_one_line(field, tmp_path):
 )
 def test_wrong_settings_are_named(override, message):
     with pytest.raises(ConfigError, match=message):
-        load_stage(from_stars.stage.reads, ["dataset=from_stars", override])
+        from_words(["dataset=from_stars", override])
 
 
 @pytest.mark.slow

@@ -22,10 +22,9 @@ from matplotlib.figure import Figure
 
 from fits_inputs import write_cube
 from psfdae import files
-from psfdae.estimators.weights import load_checkpoint, load_weights, save_checkpoint, save_weights
+from psfdae.figure_style import write_png
 from psfdae.files import Column, Empty, as_yaml
-from psfdae.stages.figures import write_png
-from psfdae.stages.verify import _check_table
+from psfdae.networks.weights import load_checkpoint, load_weights, save_checkpoint, save_weights
 
 pytestmark = pytest.mark.slow
 
@@ -84,7 +83,7 @@ def _cube(path):
 WRITERS = {
     "product.h5": (_product, _read_product),
     "stream.h5": (_stream, _read_product),
-    "table.parquet": (_parquet, _check_table),
+    "table.parquet": (_parquet, pd.read_parquet),
     "w.safetensors": (lambda path: save_weights(path, STATE, {"lr": 1}), load_weights),
     "checkpoint.pt": (
         lambda path: save_checkpoint(path, "f", {**STATE, "history": []}),

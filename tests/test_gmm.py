@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from psfdae.estimators import FitError, TrainingSet
-from psfdae.estimators import gmm as module
-from psfdae.estimators.gmm import GaussianMixture, Gmm
-from psfdae.estimators.gmm_simulated import Simulated, SimulatedMixture
-from psfdae.files import Product
-from psfdae.own_stars.bundle import BundleError
-from psfdae.own_stars.packing import packed
-from psfdae.stars.noise import NoiseModel
+from psfdae.method import TrainingSet
+from psfdae.methods import gmm as module
+from psfdae.methods.gmm import GaussianMixture, Gmm
+from psfdae.model.bundle import BundleError
+from psfdae.model.packing import packed
+from psfdae.noise import NoiseModel
 
 NOISE = NoiseModel(kappa=5.0, background=1e4)
 D = 6
@@ -47,7 +44,7 @@ def stars(count, seed=1):
 
 
 class Placed(GaussianMixture):
-    told_position = True
+    needs_position = True
 
 
 def where(count, seed=1):
@@ -381,30 +378,6 @@ def test_the_position_is_used_where_it_tells_something():
     np.testing.assert_allclose(
         kept.predict(noisy, LEVEL, place), kept.predict(noisy, LEVEL, -place), atol=1e-7
     )
-
-
-@pytest.mark.parametrize("reference", ["realisation", "template"])
-def test_fresh_stars_are_of_fields_that_the_training_part_has(reference):
-    grid, field = np.array([[0, 0], [0, 1], [1, 0]]), np.arange(60) % 3
-    x, y = stars(60, seed=5)
-    arrays = {"realisation": x, "template": y, "grid": grid, "field_index": field}
-    data = replace(
-        training(same=False),
-        positions=grid[np.arange(400) % 2],
-        reference=reference,
-        fresh=Product(Path("fresh.h5"), {}, arrays),
-    )
-    found = data.on_fresh_stars()
-    known = field < 2
-    np.testing.assert_array_equal(found.images[found.fit], x[known])
-    wanted = (x if reference == "realisation" else y)[known]
-    np.testing.assert_array_equal(found.references[found.fit], wanted)
-    np.testing.assert_array_equal(found.positions[found.fit], grid[field[known]])
-    np.testing.assert_array_equal(found.images[found.validation], data.images[data.validation])
-    mixture = SimulatedMixture.fit(data, Simulated(**{**ONE, "stars": 90}))
-    assert mixture.count.sum() == known.sum() + data.validation.size
-    with pytest.raises(FitError, match="learns from fresh stars"):
-        training().on_fresh_stars()
 
 
 def test_no_stars_have_no_psfs():

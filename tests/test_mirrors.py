@@ -10,9 +10,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from psfdae.configuration.compose import ConfigError, load
-from psfdae.configuration.wavefront import Prescription
-from psfdae.optics.raytracing import ZernikeTracer, build_optic
+from psfdae.settings import ConfigError
+from psfdae_paper.configuration.compose import load
+from psfdae_paper.configuration.wavefront import Prescription
+from psfdae_paper.raytracing import ZernikeTracer, build_optic
 
 OWN = "dataset=_telescope"
 FIELD = np.deg2rad([0.0, 0.1, 0.2])

@@ -9,10 +9,13 @@ import numpy as np
 import pytest
 import torch
 
-from psfdae.estimators import TrainingSet, dae_network, pca_som
-from psfdae.estimators.dae import Dae as Fitted
-from psfdae.estimators.dae import DaeSettings, Train
-from psfdae.estimators.dae_network import (
+from psfdae.files import ProductError
+from psfdae.method import TrainingSet
+from psfdae.methods.dae import Dae as Fitted
+from psfdae.methods.lmmse import LinearMmse
+from psfdae.metrics import mse
+from psfdae.networks import dae as dae_network
+from psfdae.networks.dae import (
     DaeTraining,
     SingleChannelConv,
     build_dae,
@@ -20,13 +23,12 @@ from psfdae.estimators.dae_network import (
     predict,
     train_dae,
 )
-from psfdae.estimators.lmmse import LinearMmse
-from psfdae.estimators.pca_som import Baseline, PcaFit, PcaSom, fit_pca_som
-from psfdae.estimators.training import DeadNetworkError, TrainingError, orthogonal, progress
-from psfdae.estimators.weights import load_weights, save_checkpoint, save_weights
-from psfdae.evaluation.metrics import mse
-from psfdae.files import ProductError
+from psfdae.networks.settings import DaeSettings, Train
+from psfdae.networks.training import DeadNetworkError, TrainingError, orthogonal, progress
+from psfdae.networks.weights import load_weights, save_checkpoint, save_weights
 from psfdae.rng import stream
+from psfdae_paper.methods import pca_som
+from psfdae_paper.methods.pca_som import Baseline, PcaFit, PcaSom, fit_pca_som
 
 SOM = {"rows": 4, "columns": 4, "epochs": 3, "sigma": 1.0, "learning_rate": 0.5, "seed": 1}
 BASELINE = {key: value for key, value in SOM.items() if key != "seed"}
@@ -38,7 +40,6 @@ TRAIN = Train(
     lr=3e-3,
     schedule="onecycle",
     optimiser="adam",
-    precision="float32",
     level_weight=0.0,
     grad_clip=1.0,
     threads=1,
@@ -167,7 +168,7 @@ def test_baseline_refuses_stars_that_are_not_finite(gaussian_stars):
 
 
 def test_map_begins_otherwise_with_another_seed_of_the_configuration(data, monkeypatch):
-    seeds, settings = [], Baseline(**BASELINE, reading="map", per_level=False)
+    seeds, settings = [], Baseline(**BASELINE, per_level=False)
 
     def begun(images, *, seed, **others):
         seeds.append(seed)
@@ -179,10 +180,9 @@ def test_map_begins_otherwise_with_another_seed_of_the_configuration(data, monke
     assert seeds[0] == seeds[2] != seeds[1]
 
 
-@pytest.mark.parametrize("reading", ["map", "projection"])
-def test_baseline_of_each_level_has_that_level_s_noise(data, tmp_path, reading):
-    """Cluster means and projections carry noise of the fit's own stars."""
-    settings = Baseline(**BASELINE, reading=reading, per_level=True)
+def test_baseline_of_each_level_has_that_level_s_noise(data, tmp_path):
+    """Cluster means carry noise of the fit's own stars."""
+    settings = Baseline(**BASELINE, per_level=True)
     fitted = PcaSom.fit(data, settings)
     assert fitted.level.tolist() == [1e-3, 5e-3]
     low, high = (fit.predict(data.images) for fit in fitted.fits)
@@ -194,22 +194,11 @@ def test_baseline_of_each_level_has_that_level_s_noise(data, tmp_path, reading):
     fitted.save(tmp_path / "fit.h5", {})
     assert (PcaSom.load(tmp_path / "fit.h5").predict(data.images, near) == found).all()
     assert fitted.fits[0].components.shape == (4, 256)
-    assert len(fitted.fits[0].nodes) == 0 or reading == "map"
 
 
 def test_baseline_of_mixed_levels_ignores_the_level(data):
-    mixed = PcaSom.fit(data, Baseline(**BASELINE, reading="map", per_level=False))
+    mixed = PcaSom.fit(data, Baseline(**BASELINE, per_level=False))
     assert (mixed.predict(data.images, 1e-5) == mixed.predict(data.images, 1.0)).all()
-
-
-def test_a_projection_on_k_of_p_components_keeps_k_of_p_of_the_noise(noise):
-    images = np.full((2000, 16, 16), 1 / 256)
-    stars = np.arange(2000)
-    data = TrainingSet(images, images, stars, stars[:0], np.array([5e-3]), noise)
-    fitted = PcaSom.fit(data, Baseline(**BASELINE, reading="projection", per_level=True))
-    noisy = noise.draw(images, 5e-3, np.random.default_rng(0))
-    left = mse(fitted.predict(noisy, 5e-3), images).mean()
-    assert left == pytest.approx(4 / 256 * mse(noisy, images).mean(), rel=0.1)
 
 
 def test_dae_keeps_the_size_and_is_never_negative(gaussian_stars):
@@ -289,7 +278,7 @@ def test_exploding_loss_stops_with_advice(data, tmp_path):
 
 
 def test_dead_network_restarts_and_then_gives_up(data, tmp_path, monkeypatch, capsys):
-    import psfdae.estimators.dae_network as module
+    import psfdae.networks.dae as module
 
     def dead(*args):
         model = build_dae(*args)
@@ -316,7 +305,7 @@ def test_every_check_notices_a_dead_network_and_no_other_step_looks(data):
 
 
 def test_restart_uses_other_weights(data, tmp_path, monkeypatch):
-    import psfdae.estimators.dae_network as module
+    import psfdae.networks.dae as module
 
     attempts = []
 
@@ -436,18 +425,6 @@ def test_interrupted_muon_continues_as_if_nothing_had_happened(data, tmp_path):
     whole = train(data, tmp_path, settings)
     interrupted(data, tmp_path, 2, train_config=settings)
     assert same(whole.result, train(data, tmp_path, settings).result)
-
-
-def test_training_in_bfloat16_repeats_and_stays_near_float32(data, tmp_path):
-    """The products have 8 bits; weights, their steps and the trained network have all."""
-    trained = {}
-    for place, precision in ((1, "float32"), (2, "bfloat16"), (3, "bfloat16")):
-        settings = TRAIN.model_copy(update={"precision": precision, "optimiser": "muon"})
-        trained[place] = train(data, tmp_path / str(place), settings)
-    assert same(trained[2].result, trained[3].result)
-    assert {weight.dtype for weight in trained[2].result.values()} == {torch.float32}
-    ratio = trained[2].best_mse / trained[1].best_mse
-    assert ratio == pytest.approx(1.0, abs=0.1) and ratio != 1.0
 
 
 def test_patience_stops_a_training_that_no_longer_improves(data, tmp_path):

@@ -11,13 +11,14 @@ from astropy.io import fits
 from astropy.table import Table
 
 from command_line import psfdae, refused
-from psfdae.own_stars import example
-from psfdae.own_stars.bundle import read_bundle
-from psfdae.own_stars.errors import ObservationError
-from psfdae.own_stars.images import science_images
-from psfdae.own_stars.observation import Source
-from psfdae.stages import mosaic, simulate
-from psfdae.stages.predict import Stated
+from psfdae.commands import mosaic
+from psfdae.commands.predict import Stated
+from psfdae.image.errors import ObservationError
+from psfdae.image.fits_file import science_images
+from psfdae.image.observation import Source
+from psfdae.model.bundle import read_bundle
+from psfdae_paper.stages import simulate
+from psfdae_paper.stars import example
 
 TINY = ["preset=smoke", "parts.train_stars=120", "parts.test_stars=30", "train.epochs=1"]
 SIDE = {"side_px": 700, "bright": 60, "faint": 80, "blended": 6, "saturated": 3}

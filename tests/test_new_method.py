@@ -24,8 +24,8 @@ from typing import Annotated, ClassVar
 import numpy as np
 from pydantic import Field
 
-from psfdae.configuration.base import Group
-from psfdae.estimators import Method
+from psfdae.method import Method
+from psfdae.settings import Group
 
 
 class Settings(Group):
@@ -63,7 +63,7 @@ LEGENDS = """
 import sys
 from matplotlib.legend import Legend
 from psfdae.cli import main
-from psfdae.stages import figures
+from psfdae_paper.stages import figures
 figures.write_png = lambda figure, out: print(
     *(text.get_text() for legend in figure.findobj(Legend) for text in legend.get_texts()),
 )
@@ -79,7 +79,7 @@ def tree(tmp_path_factory):
         ignored = shutil.ignore_patterns("__pycache__")
         shutil.copytree(ROOT / name, root / name, ignore=ignored)
     shutil.copy(ROOT / "Snakefile", root)
-    (root / "src/psfdae/estimators/shrunk.py").write_text(CLASS)
+    (root / "src/psfdae_paper/methods/shrunk.py").write_text(CLASS)
     (root / "config/shrunk").mkdir()
     (root / "config/shrunk/default.yaml").write_text("weight: 0.5\n")
     path = root / "config/config.yaml"

@@ -8,9 +8,9 @@ from astropy.io import fits
 from astropy.table import Table
 
 from fits_inputs import open_observation, write_field
-from psfdae.own_stars.catalogue import CONVENTIONS, read_catalogue
-from psfdae.own_stars.errors import ObservationError
-from psfdae.own_stars.stamps import StarFlag
+from psfdae.image.catalogue import CONVENTIONS, read_catalogue
+from psfdae.image.errors import ObservationError
+from psfdae.image.stamps import StarFlag
 
 D = 8
 X, Y = [12.0, 20.25, 33.5], [9.0, 15.0, 21.75]
@@ -142,10 +142,10 @@ def test_a_row_without_a_position_is_kept_flagged_and_named(tmp_path, image, con
     path = tmp_path / "stars.csv"
     path.write_text(content)
     found = open_observation(image, D, catalogue=path)
-    assert found.unplaced().tolist() == [False, True, True, True, False]
+    assert found.without_position().tolist() == [False, True, True, True, False]
     assert f"{path}: no position in row 2, 3, 4: flagged" in found.said()
     stamps = next(found.chunks(5))
-    assert ((stamps.flags & StarFlag.TRUNCATED) > 0).tolist() == found.unplaced().tolist()
+    assert ((stamps.flags & StarFlag.TRUNCATED) > 0).tolist() == found.without_position().tolist()
     assert stamps.bad[1:4].all()
 
 

@@ -13,9 +13,8 @@ from astropy.io import fits
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from fits_inputs import open_observation, write_cube
-from hostile_files import GOOD, write_good
-from psfdae.own_stars.errors import ObservationError, reading
+from fits_inputs import GOOD, open_observation, write_cube, write_good
+from psfdae.image.errors import ObservationError, reading
 
 D = 16
 HEADERS = 8640  # bytes at the start of the files here that hold their headers and some data
@@ -40,7 +39,6 @@ def folder(tmp_path_factory):
 
 
 FILES = [(kind, name) for kind in ("cube", "image", "catalogue") for name in GOOD[kind]]
-FILES += [("catalogue", "sky.csv")]
 
 
 def attempt(path, **options):

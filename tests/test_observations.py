@@ -11,9 +11,9 @@ from astropy.table import Table
 from astropy.wcs import WCS
 
 from fits_inputs import open_observation, pack, write_cube, write_field
-from psfdae.own_stars import example
-from psfdae.own_stars.errors import ObservationError
-from psfdae.own_stars.stamps import StarFlag
+from psfdae.image.errors import ObservationError
+from psfdae.image.stamps import StarFlag
+from psfdae_paper.stars import example
 
 D = 8
 

@@ -16,15 +16,15 @@ from click.testing import CliRunner
 import psfdae
 from psfdae import StarFlag, load_model
 from psfdae.cli import main
-from psfdae.configuration.compose import load_stage
-from psfdae.estimators.field import FieldSettings
-from psfdae.own_stars import packing
-from psfdae.own_stars.advice import saturation_advice
-from psfdae.own_stars.bundle import read_bundle, write_bundle
-from psfdae.own_stars.observation import Source
-from psfdae.own_stars.selection import collect
-from psfdae.own_stars.stamps import cut
-from psfdae.stages.from_stars import from_stars
+from psfdae.image.advice import saturation_advice
+from psfdae.image.observation import Source
+from psfdae.image.selection import collect
+from psfdae.image.stamps import cut
+from psfdae.methods.field import FieldSettings
+from psfdae.model import packing
+from psfdae.model.bundle import read_bundle, write_bundle
+from psfdae.model.settings import from_words
+from psfdae_paper.configuration.compose import load_stage
 
 SIDE, SKY, NOISE = 10, 187.0, 10.0
 COLUMNS, ROWS = 440, 350
@@ -137,7 +137,7 @@ def test_chi2_of_bright_stars_is_about_one(sky):
 
 def test_levels_of_noise_follow_the_least_signal_to_noise():
     words = ("dataset=from_stars", "calibration_stars.snr_min=60")
-    config = load_stage(from_stars.stage.reads, words)
+    config = from_words(words)
     assert config.calibration_stars.degraded() == [5, 10, 20, 30]
     lower = config.calibration_stars.model_copy(update={"snr_min": 8.0})
     assert lower.degraded() == [4]
@@ -209,7 +209,7 @@ def test_a_wrong_method_is_answered_with_the_right_ones(sky, tmp_path):
     words = ("--catalogue", sky.list, "--method", "psfex", "--out", tmp_path / "model")
     done = run("from-stars", sky.image, *words)
     assert done.exit_code == 2
-    assert re.search("no method 'psfex'; there are .*gmm.*field", done.output)
+    assert re.search("no method 'psfex'; there are .*field.*gmm", done.output)
 
 
 @pytest.mark.parametrize("axis", [0, -1])
@@ -260,7 +260,7 @@ def test_the_advised_saturation_flags_as_many_stars_as_it_says(sky, tmp_path):
     plate[y, x + 7] = plate.max()  # a neighbour that is saturated
     path = tmp_path / "plate.fits"
     fits.PrimaryHDU(plate.astype(np.float32)).writeto(path)
-    config = load_stage(from_stars.stage.reads, ["dataset=from_stars", "framing.stamp_px=22"])
+    config = from_words(["dataset=from_stars", "framing.stamp_px=22"])
     stars = config.calibration_stars.model_copy(update={"stars_min": 10})
     found = collect(Source(path, sky.list).open(22, 8), stars, config.framing)
     said = re.search(r"(\d+) stamps have .*--saturate (\S+) ", saturation_advice(found))

@@ -10,7 +10,7 @@ from click.testing import CliRunner
 
 from docs_pages import commands, read
 from psfdae.cli import main
-from psfdae.configuration.compose import config_dir, forget
+from psfdae_paper.configuration.compose import config_dir, forget
 from workflow_runs import planned
 
 STARS = ["grid.points=3", "stars.count=200"]

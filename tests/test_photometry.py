@@ -9,17 +9,10 @@ import pytest
 from scipy import ndimage
 
 from prediction_stars import observe
-from psfdae.own_stars import photometry as module
-from psfdae.own_stars.photometry import FluxModel, Photometer, robust_flux
-from psfdae.own_stars.shapes import measure_shapes
-from psfdae.own_stars.stamps import (
-    SMOOTHED_NOISE,
-    StarFlag,
-    border_pixels,
-    cut,
-    displacement,
-    smoothed,
-)
+from psfdae.image.stamps import SMOOTHED_NOISE, StarFlag, border_pixels, cut, displacement, smoothed
+from psfdae.model import photometry as module
+from psfdae.model.photometry import FluxModel, Photometer, robust_flux
+from psfdae.model.shapes import measure_shapes
 
 MASKED, OUTLIER, FAINT, NO_FLUX = StarFlag(1), StarFlag(2), StarFlag(4), StarFlag(8)
 

@@ -17,13 +17,12 @@ from command_line import psfdae
 from fits_inputs import write_cube, write_field
 from prediction_stars import SKY, observe
 from psfdae import StarFlag
-from psfdae.own_stars import model as engine
-from psfdae.own_stars import plot
-from psfdae.own_stars import prediction as writer
-from psfdae.own_stars.bundle import shipped_path
-from psfdae.own_stars.model import SCALE_TOLERANCE
-from psfdae.stages import figures
-from psfdae.stages import predict as stage
+from psfdae.commands import predict as stage
+from psfdae.model import plot
+from psfdae.model import prediction as writer
+from psfdae.model import psf_model as engine
+from psfdae.model.bundle import shipped_path
+from psfdae.model.psf_model import SCALE_TOLERANCE
 from workflow_runs import ROOT
 
 SIDE = 320
@@ -122,7 +121,7 @@ def test_names_given_fluxes_and_columns_of_a_table(folder):
 def test_chunks_and_threads_do_not_show(folder, monkeypatch):
     files = []
     for rows, threads in ((engine.BLOCK, 1), (4 * engine.BLOCK, 2), (engine.BLOCK, 3)):
-        monkeypatch.setattr(stage, "ROWS", rows)
+        monkeypatch.setattr(engine, "ROWS", rows)
         out = folder / f"rows{rows}_{threads}.fits"
         stage.predict(folder / "cube.fits", stage.Stated(), threads=threads, out=out)
         files.append(out.read_bytes())
@@ -249,7 +248,7 @@ def test_a_killed_command_ends_well_if_typed_again(folder, tmp_path, monkeypatch
 
     child = os.fork()
     if child == 0:
-        place = (stage, "write_list") if last == "list" else (figures, "write_png")
+        place = (stage, "write_list" if last == "list" else "write_png")
         monkeypatch.setattr(*place, killed(getattr(*place)))
         run(*words)
         os._exit(1)

@@ -10,9 +10,10 @@ import pytest
 
 from prediction_stars import KAPPA, SKY, observe
 from psfdae import Prediction, PredictionError, StarFlag
-from psfdae.own_stars import model, photometry
-from psfdae.own_stars.model import BLOCK, PsfModel
-from psfdae.own_stars.stamps import MEANING, cut
+from psfdae.image.stamps import MEANING, cut
+from psfdae.model import photometry
+from psfdae.model import psf_model as model
+from psfdae.model.psf_model import BLOCK, PsfModel
 from psfdae.threads import in_order
 
 LEVELS = (1e-4, 1e-3, 3e-3)

@@ -7,12 +7,15 @@ from html.parser import HTMLParser
 from types import SimpleNamespace
 
 import numpy as np
-import pandas as pd
 import pytest
+from astropy.table import Table
 
-from psfdae.own_stars import advice
-from psfdae.own_stars.observation import Source
-from psfdae.own_stars.report import (
+from psfdae.commands.predict import Stated
+from psfdae.image import advice
+from psfdae.image.observation import Source
+from psfdae.image.selection import Verdict, misfit, piled_up
+from psfdae.image.stamps import StarFlag, cut
+from psfdae.model.report import (
     MEAN_PSF,
     Quality,
     checks,
@@ -22,9 +25,6 @@ from psfdae.own_stars.report import (
     ratios,
     standing,
 )
-from psfdae.own_stars.selection import Verdict, misfit, piled_up
-from psfdae.own_stars.stamps import StarFlag, cut
-from psfdae.stages.predict import Stated
 
 SIDE = 16
 
@@ -57,7 +57,7 @@ def test_one_psf_is_all_that_is_needed_where_all_are_alike():
 # The sentence
 
 
-def errors(model, mean=(4e-6, 4e-6), linear=(5e-6, 2e-6)):
+def errors(model, mean=(4e-6, 4e-6), linear=(5e-6, 2e-6), stars=40):
     """A table as report.csv, at S/N 10 and 50."""
     rows = {"gmm": model, MEAN_PSF: mean, "lmmse": linear}
     table = [
@@ -65,7 +65,7 @@ def errors(model, mean=(4e-6, 4e-6), linear=(5e-6, 2e-6)):
         for name, values in rows.items()
         for snr, mse in zip((10.0, 50.0), values, strict=True)
     ]
-    return pd.DataFrame(table).assign(images=300, stars=40, truth_mse=1e-7)
+    return Table([row | {"images": 300, "stars": stars, "truth_mse": 1e-7} for row in table])
 
 
 def test_standing_says_where_a_model_is_worse():
@@ -76,7 +76,7 @@ def test_standing_says_where_a_model_is_worse():
     assert "0.40 times that of linear MMSE" in said
     assert said.endswith("better at each (40 stars held out)")
     assert "no better than the mean PSF at S/N 50 (" in standing(poor, "gmm", "mixture")
-    alone = standing(good[good.method != "lmmse"], "gmm", "mixture")
+    alone = standing(good[good["method"] != "lmmse"], "gmm", "mixture")
     assert "linear" not in alone
 
 
@@ -151,7 +151,7 @@ def test_page_is_one_file_in_the_order_in_which_it_is_read():
         ({"errors": errors((2e-6, 5e-6), linear=(5e-6, 6e-6))}, "Better than one mean PSF?"),
         ({"errors": errors((2e-6, 3e-6))}, "Better than linear MMSE?"),
         ({"coverage": {10.0: 0.4}}, "Does ± UNCERT hold 68 % of the errors?"),
-        ({"errors": errors((2e-6, 1e-6)).assign(stars=5)}, "Stars held out"),
+        ({"errors": errors((2e-6, 1e-6), stars=5)}, "Stars held out"),
     ],
 )
 def test_what_is_wrong_is_marked(wrong, check):

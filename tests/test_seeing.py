@@ -9,15 +9,16 @@ from scipy.signal import fftconvolve
 from scipy.special import j0
 
 from psfdae.belonging import STARS, STATIC, require
-from psfdae.configuration.compose import ConfigError, load
 from psfdae.files import ProductError
-from psfdae.optics.propagation import StampPropagator
-from psfdae.optics.pupil import SamplingError, annular_pupil
-from psfdae.optics.seeing import FAINT, BlurredPropagator, Profile
-from psfdae.optics.wavefronts import zernike_images
-from psfdae.stages.common import template_wavefronts
-from psfdae.stars import framing
-from psfdae.stars.framing import Propagation
+from psfdae.settings import ConfigError
+from psfdae_paper.configuration.compose import load
+from psfdae_paper.optics.propagation import StampPropagator
+from psfdae_paper.optics.pupil import SamplingError, annular_pupil
+from psfdae_paper.optics.seeing import FAINT, BlurredPropagator, Profile
+from psfdae_paper.optics.wavefronts import zernike_images
+from psfdae_paper.stages.common import template_wavefronts
+from psfdae_paper.stars import framing
+from psfdae_paper.stars.framing import Propagation
 
 OWN = "dataset=_telescope"
 PROFILES = [Profile(4.0), Profile(4.0, 2.5), Profile(4.0, 4.765)]

@@ -7,30 +7,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from psfdae.configuration.compose import load
 from psfdae.files import Product
-from psfdae.optics.wavefronts import seidel_wavefronts, zernike_wavefronts
+from psfdae.model.star_sets import noisy_test_images
+from psfdae.noise import mixed_levels
 from psfdae.rng import stream
-from psfdae.stages.common import noisy_test_images, template_wavefronts
-from psfdae.stars.fields import (
-    assign_fields,
-    draw_jitter,
-    draw_phase,
-    held_out_fields,
-    held_out_split,
-    perturb,
-    random_split,
-    relative_field,
-    square_grid,
-)
-from psfdae.stars.framing import (
+from psfdae.splits import draw_jitter, draw_phase, held_out_fields, held_out_split, random_split
+from psfdae_paper.configuration.compose import load
+from psfdae_paper.optics.wavefronts import seidel_wavefronts, zernike_wavefronts
+from psfdae_paper.stages.common import template_wavefronts
+from psfdae_paper.stars.fields import assign_fields, perturb, relative_field, square_grid
+from psfdae_paper.stars.framing import (
     FramingError,
     Propagation,
     brightest_pixel,
     crop_jittered,
     normalise_flux,
 )
-from psfdae.stars.noise import mixed_levels
 
 
 @pytest.fixture(scope="module")

@@ -9,13 +9,13 @@ import pytest
 import speed
 from measure import alone, cost_of_command
 from prediction import make_cube
-from psfdae.configuration.compose import compose, load_stage
-from psfdae.configuration.consistency import SIMULATION, STATIC
 from psfdae.files import Column, Empty, ProductError, read_product, stream_product, write_product
-from psfdae.optics.wavefronts import ModalWavefronts, monomial_images
-from psfdae.stages import stars
-from psfdae.stages.common import template_wavefronts
-from psfdae.stars.framing import Propagation, brightest_pixel
+from psfdae_paper.configuration.compose import compose, load_stage
+from psfdae_paper.configuration.consistency import SIMULATION, STATIC
+from psfdae_paper.optics.wavefronts import ModalWavefronts, monomial_images
+from psfdae_paper.stages import stars
+from psfdae_paper.stages.common import template_wavefronts
+from psfdae_paper.stars.framing import Propagation, brightest_pixel
 
 CHEAP = (
     *("grid.points=3", "optics.pupil_samples=[40,80]", "optics.threads=1"),

@@ -11,20 +11,20 @@ import pandas as pd
 import pytest
 import yaml
 
-from psfdae.configuration.compose import compose, load, load_stage, stage_tree
-from psfdae.configuration.sweep import point_groups
-from psfdae.estimators import groups_of
-from psfdae.estimators.pca_som import PcaSom
 from psfdae.files import Column, ProductError, write_product
-from psfdae.stages import sweep as stage
-from psfdae.stages import sweep_summary, track
-from psfdae.stages.alignment_methods import train_network
-from psfdae.stages.common import noise_model
-from psfdae.stages.fit import baseline, train
-from psfdae.stars.fields import random_split
-from psfdae.sweeps.measured import Task
-from psfdae.sweeps.points import SweepError
-from psfdae.tracking import runs_of_sweep
+from psfdae.methods import groups_of
+from psfdae.model.star_sets import noise_model
+from psfdae.splits import random_split
+from psfdae_paper.configuration.compose import compose, load, load_stage, stage_tree
+from psfdae_paper.configuration.sweep import point_groups
+from psfdae_paper.methods.pca_som import PcaSom
+from psfdae_paper.stages import sweep as stage
+from psfdae_paper.stages import sweep_summary, track
+from psfdae_paper.stages.alignment_methods import train_network
+from psfdae_paper.stages.fit import baseline, train
+from psfdae_paper.sweeps.measured import Task
+from psfdae_paper.sweeps.points import SweepError
+from psfdae_paper.tracking import runs_of_sweep
 
 SIZES = ("parts.train_stars=160", "parts.test_stars=60", "noise.levels=[0.001,0.005]")
 TINY = ("dataset=dataset3", "preset=smoke", *SIZES, "train.epochs=3")
@@ -213,7 +213,7 @@ def test_cnn_is_the_main_workflow_s_and_measured_on_other_states(tmp_path):
     )
     settings = load_stage(point_groups("noise_trained"), given, "alignment")
     stage.point(settings, "noise_trained", {}, {}, task)
-    config = load_stage(train_network.stage.reads("noise_trained"), given, "alignment")
+    config = load_stage(train_network.stage.settings.reads("noise_trained"), given, "alignment")
     main = tmp_path / "main"
     train_network(config, "noise_trained", data["states"], tmp_path / "main.pt", main)
     for name in ("network.safetensors", "config.yaml"):
@@ -229,15 +229,13 @@ def test_cnn_is_the_main_workflow_s_and_measured_on_other_states(tmp_path):
 def test_trial_asks_and_trains_what_it_asked_for(point):
     space = {"train.lr": {"low": 1e-3, "high": 1e-2, "log": True}}
     search = {"space": space, "seed": 1, "startup": 2, "metric": "validation_mse"}
-    search |= {"direction": "minimize", "study": "s"}
-    journal = point.folder.parents[1] / "study.journal"
-    result = point.run(trial=stage.Trial(0, search, (), journal))
+    search |= {"direction": "minimize"}
+    result = point.run(trial=stage.Trial(0, search, ()))
     asked = result["values"]["train.lr"]
     assert 1e-3 <= asked <= 1e-2
     assert result["keys"] == {"train.lr": asked}
     described = yaml.safe_load((point.folder / "config.yaml").read_text())
     assert described["train"]["lr"] == asked
-    assert journal.stat().st_size > 0
 
 
 def write_points(root, outcomes):

@@ -11,8 +11,8 @@ import pandas as pd
 import pytest
 import yaml
 
-from psfdae.configuration.compose import config_dir
-from psfdae.stages.sweep_summary import best_overrides
+from psfdae_paper.configuration.compose import config_dir
+from psfdae_paper.stages.sweep_summary import best_overrides
 from workflow_runs import (
     QUIET,
     command,
@@ -133,27 +133,12 @@ def test_adaptive_sweep_goes_on_where_it_was(killed, configuration, tmp_path):
         assert len(before) == 3
         configuration({**tree, "trials": 4})
         assert planned(tmp_path, SUMMARY) == {"sweep_point": 1, "sweep_summary": 1}
-        # A lost journal loses no trial.
-        (tmp_path / "results/sweeps/tried/study.journal").unlink()
         snakemake(tmp_path, SUMMARY)
     finally:
         configuration(GRID)
     after = finished(tmp_path)
     assert len(after) == 4
     assert {name: after[name] for name in before} == before
-    assert states(tmp_path / "results/sweeps/tried/study.journal") == ["COMPLETE"] * 4
-
-
-def states(journal):
-    import optuna
-    from optuna.storages import JournalStorage
-    from optuna.storages.journal import JournalFileBackend
-
-    storage = JournalStorage(JournalFileBackend(str(journal)))
-    (study,) = optuna.get_all_study_summaries(storage)
-    trials = optuna.load_study(study_name=study.study_name, storage=storage).trials
-    assert {trial.user_attrs["slot"] for trial in trials} == {0, 1, 2, 3}
-    return [trial.state.name for trial in trials]
 
 
 @pytest.mark.slow

@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 import yaml
 
-from psfdae.configuration import compose
-from psfdae.configuration.compose import ConfigError, config_dir, load
-from psfdae.configuration.sweep import Axis, load_sweep, sweep_names
-from psfdae.sweeps import adaptive
-from psfdae.sweeps.points import SweepError, draws, grid, plan_sweep, tidy, with_values
+from psfdae.settings import ConfigError
+from psfdae_paper.configuration import compose
+from psfdae_paper.configuration.compose import config_dir, load
+from psfdae_paper.configuration.sweep import Axis, load_sweep, sweep_names
+from psfdae_paper.sweeps import adaptive
+from psfdae_paper.sweeps.points import SweepError, draws, grid, plan_sweep, tidy, with_values
 
 PRESETS = sorted(p.stem for p in config_dir().glob("preset/*.yaml"))
 GRID = {
@@ -229,17 +230,12 @@ def outcome(slot, values, status="finished"):
     return {"slot": slot, "point": name, "values": values, "status": status, "metrics": metrics}
 
 
-def run_trials(count, known_at=lambda slot: slot, journal=None):
+def run_trials(count, known_at=lambda slot: slot):
     results = []
     for slot in range(count):
         known = results[: known_at(slot)]
         values = adaptive.ask(SPACE, SEARCH, slot, known)
         results.append(outcome(slot, values, "failed" if slot == 2 else "finished"))
-        if journal is not None:
-            search = {**SEARCH, "study": "s"}
-            about = {"slot": slot, "point": results[-1]["point"]}
-            adaptive.begin(journal, SPACE, search, about, values, known)
-            adaptive.finish(journal, SPACE, search, results[-1:])
     return results
 
 
@@ -272,59 +268,7 @@ def test_more_trials_keep_the_old_ones_and_another_search_has_others(sweep):
     tree = {**GRID, "kind": "adaptive", "trials": 3}
     old = list(sweep(tree).points)
     assert list(sweep({**tree, "trials": 5}).points)[:3] == old
-    assert sweep({**tree, "trials": 5}).study == old[0]
     for change in ({"seed": 1}, {"direction": "maximize"}, {"startup": 2}):
         assert not set(sweep({**tree, **change}).points) & set(old)
     narrower = {**GRID["space"], "train.lr": [0.001]}
     assert not set(sweep({**tree, "space": narrower}).points) & set(old)
-
-
-def trials(journal):
-    import optuna
-    from optuna.storages import JournalStorage
-    from optuna.storages.journal import JournalFileBackend
-
-    storage = JournalStorage(JournalFileBackend(str(journal)))
-    study = optuna.load_study(study_name="s", storage=storage)
-    return [(t.user_attrs["slot"], t.state.name, t.value) for t in study.trials]
-
-
-def test_journal_holds_every_trial_once(tmp_path):
-    journal = tmp_path / "sweep/study.journal"
-    results = run_trials(5, journal=journal)
-    expected = [
-        (r["slot"], "COMPLETE" if r["metrics"] else "FAIL", r["metrics"].get("validation_mse"))
-        for r in results
-    ]
-    assert trials(journal) == expected
-    adaptive.finish(journal, SPACE, {**SEARCH, "study": "s"}, results[3:])
-    assert trials(journal) == expected
-
-
-def test_interrupted_trial_goes_on_under_its_number(tmp_path):
-    journal, search = tmp_path / "study.journal", {**SEARCH, "study": "s"}
-    values = adaptive.ask(SPACE, SEARCH, 0, [])
-    about = {"slot": 0, "point": f"{0:012x}"}
-    for _ in range(2):
-        adaptive.begin(journal, SPACE, search, about, values, [])
-    assert trials(journal) == [(0, "RUNNING", None)]
-    result = outcome(0, values)
-    adaptive.finish(journal, SPACE, search, [result])
-    assert trials(journal) == [(0, "COMPLETE", result["metrics"]["validation_mse"])]
-
-
-def test_lost_or_damaged_journal_is_written_again(tmp_path, capsys):
-    journal, search = tmp_path / "study.journal", {**SEARCH, "study": "s"}
-    results = run_trials(3, journal=journal)
-    before = trials(journal)
-    values = adaptive.ask(SPACE, SEARCH, 3, results)
-    about = {"slot": 3, "point": f"{3:012x}"}
-    with journal.open("a") as file:
-        file.write('{"op_code":4,"worker')
-        file.write("\n")
-    adaptive.begin(journal, SPACE, search, about, values, results)
-    assert "set aside" in capsys.readouterr().out
-    assert trials(journal) == [*before, (3, "RUNNING", None)]
-    journal.unlink()
-    adaptive.begin(journal, SPACE, search, about, values, results)
-    assert trials(journal) == [*before, (3, "RUNNING", None)]

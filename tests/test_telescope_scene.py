@@ -9,31 +9,25 @@ import pytest
 
 from command_line import psfdae, refused
 from fits_inputs import open_observation
-from psfdae.alignment.stamps import AlignmentStamps, mean_slope
-from psfdae.alignment.telescope import zernike_tracer
-from psfdae.configuration.compose import (
-    ConfigError,
-    as_overrides,
-    compose,
-    load,
-    load_stage,
-    stage_tree,
-)
-from psfdae.configuration.consistency import SIMULATION, STATIC
 from psfdae.files import read_product
-from psfdae.optics.pupil import annular_pupil
-from psfdae.optics.raytracing import RayTracingError
-from psfdae.optics.wavefronts import (
+from psfdae.settings import ConfigError, as_overrides
+from psfdae_paper.alignment.stamps import AlignmentStamps, mean_slope
+from psfdae_paper.alignment.telescope import zernike_tracer
+from psfdae_paper.configuration.compose import compose, load, load_stage, stage_tree
+from psfdae_paper.configuration.consistency import SIMULATION, STATIC
+from psfdae_paper.optics.pupil import annular_pupil
+from psfdae_paper.optics.wavefronts import (
     field_coefficients,
     seidel_wavefronts,
     zernike_images,
     zernike_wavefronts,
 )
-from psfdae.stages import stars
-from psfdae.stages.common import star_wavefronts, template_wavefronts
-from psfdae.stars.fields import relative_field
-from psfdae.stars.framing import Propagation, normalise_flux
-from psfdae.stars.scenes import static_terms
+from psfdae_paper.raytracing import RayTracingError
+from psfdae_paper.stages import stars
+from psfdae_paper.stages.common import star_wavefronts, template_wavefronts
+from psfdae_paper.stars.fields import relative_field
+from psfdae_paper.stars.framing import Propagation, normalise_flux
+from psfdae_paper.stars.scenes import static_terms
 
 OWN = "dataset=_telescope"
 Z4, Z5, Z8, Z11 = 2 * np.sqrt(3), np.sqrt(6), 3 * np.sqrt(8), 6 * np.sqrt(5)

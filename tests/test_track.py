@@ -16,8 +16,8 @@ import pytest
 import yaml
 
 from psfdae.files import Column, ProductError, write_product
-from psfdae.stages import track
-from psfdae.tracking import flatten, runs_of_datasets
+from psfdae_paper.stages import track
+from psfdae_paper.tracking import flatten, runs_of_datasets
 
 PNG = b"\x89PNG\r\n\x1a\n"
 HISTORY = ((1, 3e-5, "nan", 1.5), (2, 2e-5, 1e-5, 3.0), (3, 1e-5, 2e-5, 4.5))
@@ -284,7 +284,7 @@ def test_flatten():
 
 
 def test_mlflow_is_imported_by_the_import_only():
-    code = "import sys, psfdae.tracking, psfdae.stages.track; print('mlflow' in sys.modules)"
+    code = "import sys, psfdae_paper.stages.track; print('mlflow' in sys.modules)"
     result = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     )

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from scipy.special import jv
 
-from psfdae.configuration.compose import ConfigError, load
-from psfdae.optics.pupil import SamplingError, annular_pupil, pupil_axis
-from psfdae.optics.turbulence import (
+from psfdae.rng import stream
+from psfdae.settings import ConfigError
+from psfdae_paper.configuration.compose import load
+from psfdae_paper.optics.pupil import SamplingError, annular_pupil, pupil_axis
+from psfdae_paper.optics.turbulence import (
     SPECTRUM,
     STRENGTH,
     Footprints,
@@ -19,10 +21,9 @@ from psfdae.optics.turbulence import (
     layer_r0,
     structure_function,
 )
-from psfdae.optics.wavefronts import zernike_basis
-from psfdae.rng import stream
-from psfdae.stars.fields import square_grid
-from psfdae.stars.scenes import TurbulenceScene
+from psfdae_paper.optics.wavefronts import zernike_basis
+from psfdae_paper.stars.fields import square_grid
+from psfdae_paper.stars.scenes import TurbulenceScene
 
 R0, L0, HEIGHTS, STRENGTHS = 0.2, 25.0, (0.0, 4000.0, 10000.0), (0.6, 0.25, 0.15)
 FLOAT64 = np.dtype(np.float64)

@@ -13,7 +13,7 @@ plan() {
     snakemake --summary "$@" >"$plans/$name"
 }
 
-plan main -- reference psf_metrics_on_request
+plan main -- reference
 for sweep in dae_crop network_epochs; do
     [ ! -d "results/sweeps/$sweep" ] || plan "$sweep" --config "sweep=$sweep" -- sweep
 done

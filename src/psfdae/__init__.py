@@ -1,41 +1,68 @@
 """psfdae: point spread function modelling with a denoising autoencoder.
 
-The package follows the science: `optics` turns wavefronts into pixels, `stars`
-turns pixels into noisy star images, `models` learns the point spread function
-from them, `evaluation` measures how well. `stages` binds one step of each to
-files; the command line and the Snakemake workflow call stages only.
+For stars of your own::
 
-For stars of your own, `load_model` gives a trained model and its method `predict`
-their PSFs.
+    stars = psfdae.Stars.from_image("image.fits", catalogue="stars.csv")
+    model = psfdae.fit(stars, method="field")
+    report = psfdae.validate(model, stars)
+    model.save("image.psf.safetensors")
+
+`load_model` gives a trained model; its methods `predict` and `psf_at` give PSFs. No call writes a
+file unless it is named for that, prints, or changes threads or random generators of the process.
+Refusals are of the class `Error`.
 """
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from psfdae.version import __version__
+
 if TYPE_CHECKING:
-    from psfdae.own_stars.model import (
-        Prediction,
-        PredictionError,
-        PsfModel,
-        StarFlag,
-        load_model,
-    )
+    from psfdae.errors import Error
+    from psfdae.image.stamps import StarFlag
+    from psfdae.model.fitting import fit
+    from psfdae.model.prediction import Prediction
+    from psfdae.model.psf_model import PredictionError, PsfModel, load_model
+    from psfdae.model.stars import Stars
+    from psfdae.model.validation import Report, validate
 
-__version__ = "0.1.0"
+_MODULES = {
+    "Error": "errors",
+    "Prediction": "model.prediction",
+    "PredictionError": "model.psf_model",
+    "PsfModel": "model.psf_model",
+    "Report": "model.validation",
+    "StarFlag": "image.stamps",
+    "Stars": "model.stars",
+    "fit": "model.fitting",
+    "load_model": "model.psf_model",
+    "validate": "model.validation",
+}
 
-__all__ = ["Prediction", "PredictionError", "PsfModel", "StarFlag", "__version__", "load_model"]
+__all__ = [
+    "Error",
+    "Prediction",
+    "PredictionError",
+    "PsfModel",
+    "Report",
+    "StarFlag",
+    "Stars",
+    "__version__",
+    "fit",
+    "load_model",
+    "validate",
+]
 
 
 def __getattr__(name: str) -> Any:
-    """Import the model on first use (PEP 562): the command line must not wait for torch."""
-    if name in __all__:
-        from psfdae.own_stars import model
-
-        return getattr(model, name)
+    """Import a public name on first use (PEP 562): nobody waits for what is not used."""
+    if name in _MODULES:
+        return getattr(import_module(f"psfdae.{_MODULES[name]}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
     """What there is, loaded or not."""
-    return sorted({*globals(), *__all__})
+    return sorted({*globals(), *_MODULES})

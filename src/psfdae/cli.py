@@ -1,6 +1,6 @@
 """The command line: a stage is a function, and its signature is its command.
 
-`@command("name")` on a function of `psfdae.stages` makes it one: parameters become options,
+`@command("name")` on a function makes it one: parameters become options,
 the docstring the help. Which module has which command is read from the text of the modules,
 so that `psfdae --help` imports none of them.
 """
@@ -10,79 +10,60 @@ from __future__ import annotations
 import ast
 import re
 import types
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, is_dataclass
 from functools import cache
 from importlib import import_module
+from importlib.metadata import entry_points
+from importlib.util import find_spec
 from inspect import Parameter, cleandoc, signature
 from pathlib import Path
-from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, Protocol, Union, get_args, get_origin, get_type_hints
 
 import click
 
-import psfdae
+from psfdae.errors import Error
+from psfdae.extras import missing
+from psfdae.version import __version__
 
-File = Annotated[Path, click.Path(path_type=Path, dir_okay=False)]
-Folder = Annotated[Path, click.Path(path_type=Path, file_okay=False)]
-AboveZero = click.FloatRange(min=0, min_open=True)
-
-
-class NameOrNumber(click.ParamType):
-    """An extension of a FITS file: its number, in plain digits, or its name."""
-
-    name = "text"
-
-    def convert(self, value: Any, param: Any, ctx: Any) -> str | int:
-        """A number from digits; any other text as it is."""
-        return int(value) if re.fullmatch("[0-9]{1,6}", str(value)) else value
+OWN = "psfdae.commands"
+"""The package's own commands; those of others join it by entry points "psfdae.commands"."""
 
 
-Split = Literal["random", "held_out"]
-Reference = Literal["realisation", "template"]
+class Reader(Protocol):
+    """Makes what a command's parameter `config` receives."""
 
-GROUPS = {
-    "alignment": "Scene 3: alignment of a secondary mirror (config/alignment.yaml).",
-    "alignment figure": "Draw a figure of scene 3 as PNG.",
-    "figure": "Draw a figure as PNG from finished products.",
-    "sweep": "Train many variants of a model and compare them (config/sweep).",
-}
-"""Commands of two and three words, and what is said of their first words."""
-
-STAGES = Path(psfdae.__file__).with_name("stages")
+    def __call__(self, options: Mapping[str, Any], file: Path | None, words: Sequence[str]) -> Any:
+        """From the other options, a file of settings or words of the command line."""
 
 
 @dataclass(frozen=True)
 class Stage:
-    """What `command` knows of a function: its command's words and the config groups it reads."""
+    """What `command` knows of a function: its command's words, and what reads its settings."""
 
     name: str
-    reads: tuple[str, ...] | Callable[..., tuple[str, ...]]
-    root: Literal["config", "alignment"]
-    start: tuple[str, ...] = ()
+    settings: Any = None
 
 
-def command(
-    name: str,
-    reads: tuple[str, ...] | Callable[..., tuple[str, ...]] = (),
-    root: Literal["config", "alignment"] = "config",
-    start: tuple[str, ...] = (),
-) -> Callable[..., Any]:
+def command(name: str, settings: Reader | None = None) -> Callable[..., Any]:
     """Make a function the command `psfdae NAME`.
 
-    A parameter `config` receives the groups of the configuration in `reads`, checked, from
-    trailing overrides, those of `start` before them, or a file of settings; which groups may
-    depend on the options. Other
-    parameters are options: required without a default, repeatable as `tuple[X, ...]`, a
-    flag as bool, all fields of a dataclass. `Annotated` adds help (a text), a click type,
-    or a dict of what click's option takes, where "flag" names it and "argument" makes it
-    positional. Help is the docstring.
+    A parameter `config` receives what `settings` reads from trailing words or a file. Other
+    parameters are options: required without a default, repeatable as `tuple[X, ...]`, a flag as
+    bool, all fields of a dataclass. `Annotated` adds help (a text), a click type, or a dict of
+    what click's option takes, where "flag" names it and "argument" makes it positional. Help is
+    the docstring.
     """
 
     def mark(function: Callable[..., Any]) -> Callable[..., Any]:
-        function.stage = Stage(name, reads, root, start)  # type: ignore[attr-defined]
+        function.stage = Stage(name, settings)  # type: ignore[attr-defined]
         return function
 
     return mark
+
+
+REFUSABLE = (OSError, MemoryError, RuntimeError, ValueError, ImportError)
+"""Errors of which some are no bugs; `refusal` tells which."""
 
 
 class Careful(click.Group):
@@ -91,11 +72,12 @@ class Careful(click.Group):
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command; a refusal of ours is a message, a bug stays a traceback.
 
-        So is a file that the system does not let us read or write, and a lack of memory.
+        So is a file that the system does not let us read or write, a lack of memory, and a
+        package that an extra brings.
         """
         try:
             return super().invoke(ctx)
-        except (OSError, MemoryError, RuntimeError, ValueError) as error:
+        except REFUSABLE as error:
             said = refusal(error)
             if said is None:
                 raise
@@ -109,7 +91,9 @@ def refusal(error: Exception) -> str | None:
         return f"not enough memory ({error or 'no more is known'})"
     if isinstance(error, OSError):
         return None if error.errno is None else str(error)
-    if type(error).__module__.startswith("psfdae"):
+    if isinstance(error, ModuleNotFoundError):
+        return missing(error, "this command")
+    if isinstance(error, Error):
         return str(error)
     # HDF5 reports a full disk as a RuntimeError without a number of its own.
     # So does torch a lack of memory, as its own RuntimeError.
@@ -134,8 +118,8 @@ class Commands(Careful):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """A group, or the command of a stage, whose module is imported now."""
         name = f"{self.prefix} {cmd_name}".strip()
-        if name in GROUPS:
-            return Commands(name, name=cmd_name, help=GROUPS[name])
+        if name in groups():
+            return Commands(name, name=cmd_name, help=groups()[name])
         return as_click(stage(name)) if name in found() else None
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
@@ -147,26 +131,44 @@ class Commands(Careful):
 
 
 @click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"]})
-@click.version_option(psfdae.__version__)
+@click.version_option(__version__)
 def main() -> None:
     """PSF modelling with a denoising autoencoder, one command per stage.
 
-    OVERRIDES are Hydra overrides, such as dataset=dataset5 train.lr=1e-3; the
-    groups and keys are those of the config folder.
+    OVERRIDES are words group.key=value, such as train.lr=1e-3; with the extra "paper" also
+    choices of files of the config folder, such as dataset=dataset5.
     """
 
 
 @cache
-def found() -> dict[str, Path]:
-    """Modules by command."""
+def found() -> dict[str, tuple[str, Path]]:
+    """Module and its file by command."""
     pattern = re.compile(r'^@command\(\s*"([^"]+)"', re.MULTILINE)
-    texts = {path: path.read_text(encoding="utf-8") for path in STAGES.glob("*.py")}
-    return {name: path for path, text in texts.items() for name in pattern.findall(text)}
+    commands = {}
+    for package in _packages():
+        for folder in find_spec(package).submodule_search_locations:  # type: ignore[union-attr]
+            for path in sorted(Path(folder).glob("*.py")):
+                for name in pattern.findall(path.read_text(encoding="utf-8")):
+                    commands[name] = f"{package}.{path.stem}", path
+    return commands
+
+
+def _packages() -> list[str]:
+    return [OWN, *(point.value for point in entry_points(group="psfdae.commands"))]
+
+
+@cache
+def groups() -> dict[str, str]:
+    """Help of the first words of commands of two and three words, from the packages' `GROUPS`."""
+    known: dict[str, str] = {}
+    for package in _packages():
+        known |= getattr(import_module(package), "GROUPS", {})
+    return known
 
 
 def stage(name: str) -> Callable[..., Any]:
     """The function of a command; its module is imported."""
-    module = import_module(f"psfdae.stages.{found()[name].stem}")
+    module = import_module(found()[name][0])
     functions = [f for f in vars(module).values() if isinstance(getattr(f, "stage", None), Stage)]
     return next(f for f in functions if f.stage.name == name)
 
@@ -181,9 +183,9 @@ def _shortened(text: str, width: int) -> str:
 
 def _about(name: str) -> str:
     """First paragraph of a command's help, nothing being imported."""
-    if name in GROUPS:
-        return GROUPS[name]
-    for node in ast.parse(found()[name].read_text(encoding="utf-8")).body:
+    if name in groups():
+        return groups()[name]
+    for node in ast.parse(found()[name][1].read_text(encoding="utf-8")).body:
         for call in getattr(node, "decorator_list", []):
             if isinstance(call, ast.Call) and ast.unparse(call).startswith(f"command('{name}'"):
                 return (ast.get_docstring(node) or "").split("\n\n")[0]  # type: ignore[arg-type]
@@ -193,13 +195,13 @@ def _about(name: str) -> str:
 def as_click(function: Callable[..., Any]) -> click.Command:
     """The command of a stage."""
     spec: Stage = function.stage  # type: ignore[attr-defined]
-    groups: dict[str, Any] = {}
+    fields: dict[str, Any] = {}
     parameters: list[click.Parameter] = []
     for name, hint, default in _parameters(function):
         if name == "config":
             continue
         if is_dataclass(hint):
-            groups[name] = hint
+            fields[name] = hint
             parameters += [_option(*field) for field in _parameters(hint)]
         else:
             parameters.append(_option(name, hint, default))
@@ -214,8 +216,10 @@ def as_click(function: Callable[..., Any]) -> click.Command:
         config = {}
         if configured:
             file, overrides = given.pop("settings"), given.pop("overrides")
-            config["config"] = _settings(spec, given, file, overrides)
-        for name, kind in groups.items():
+            if file is not None and overrides:
+                raise click.UsageError("--config and overrides exclude each other")
+            config["config"] = spec.settings(given, file, overrides)
+        for name, kind in fields.items():
             given[name] = kind(**{key: given.pop(key) for key, *_ in _parameters(kind)})
         function(**config, **given)
 
@@ -226,19 +230,6 @@ def as_click(function: Callable[..., Any]) -> click.Command:
 def program(*functions: Callable[..., Any]) -> None:
     """Run commands of a program outside the package, as those of `workflow/benchmarks` are."""
     Careful(commands=[as_click(function) for function in functions])()
-
-
-def _settings(
-    spec: Stage, given: dict[str, Any], file: Path | None, overrides: Sequence[str]
-) -> Any:
-    from psfdae.configuration.compose import load_settings, load_stage
-
-    reads = spec.reads(**given) if callable(spec.reads) else spec.reads
-    if file is None:
-        return load_stage(reads, (*spec.start, *overrides), spec.root)
-    if overrides:
-        raise click.UsageError("--config and overrides exclude each other")
-    return load_settings(file, reads, spec.root)
 
 
 def _parameters(function: Any) -> list[tuple[str, Any, Any]]:

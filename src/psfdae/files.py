@@ -10,7 +10,7 @@ import json
 import os
 import re
 import secrets
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
@@ -19,10 +19,11 @@ from typing import IO, Any
 
 import numpy as np
 
-import psfdae
+from psfdae.errors import Error
+from psfdae.version import __version__
 
 
-class ProductError(RuntimeError):
+class ProductError(Error, RuntimeError):
     """A data product is missing, damaged, or not what the stage expects."""
 
 
@@ -62,7 +63,7 @@ def atomic_path(path: str | Path, digest: bool = True) -> Iterator[Path]:
         if digest and (record := digest_path(path)):
             # First, so that no product stands without its digest.
             with atomic_path(record, digest=False) as noted:
-                noted.write_text(digest_line(temporary, path.name), encoding="utf-8")
+                noted.write_text(digest_line(temporary, record), encoding="utf-8")
         temporary.replace(path)
         _to_disk(path.parent)
     except OSError as error:
@@ -113,10 +114,12 @@ def digest_path(path: Path) -> Path | None:
     return None
 
 
-def digest_line(path: Path, name: str) -> str:
-    """What `sha256sum` would print for a file of that name."""
+def digest_line(path: Path, record: Path) -> str:
+    """What `sha256sum` would print of a file, in the folder of results, for its digest `record`."""
+    parts = record.parts
+    place = Path(*parts[len(parts) - parts[::-1].index(DIGESTS) :]).with_suffix("")
     with path.open("rb") as file:
-        return f"{hashlib.file_digest(file, 'sha256').hexdigest()}  {name}\n"
+        return f"{hashlib.file_digest(file, 'sha256').hexdigest()}  {place}\n"
 
 
 @cache
@@ -197,9 +200,30 @@ def write_text(path: str | Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
+def write_bytes(path: str | Path, content: bytes) -> None:
+    """Write a file atomically."""
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(content)
+
+
 def write_csv(path: str | Path, table: Any, digits: int = 8) -> None:
     """Write a DataFrame as CSV, numbers with so many digits, atomically."""
     write_text(path, table.to_csv(index=False, float_format=f"%.{digits}g"))
+
+
+def write_columns(path: str | Path, columns: Mapping[str, Any], digits: int = 8) -> None:
+    """Write columns of equal length as CSV, numbers with so many digits, NaN as nothing."""
+
+    def cell(value: Any) -> Any:
+        if not isinstance(value, float | np.floating):
+            return value
+        return "" if np.isnan(value) else f"{value:.{digits}g}"
+
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(map(cell, row) for row in zip(*columns.values(), strict=True))
+    write_text(path, text.getvalue())
 
 
 def write_parquet(path: str | Path, table: Any) -> None:
@@ -394,19 +418,26 @@ def _storage(column: Column | Empty) -> dict[str, Any]:
 
 def _describe(file: Any, kind: str, config: Mapping[str, Any]) -> None:
     file.attrs["kind"] = kind
-    file.attrs["psfdae_version"] = psfdae.__version__
+    file.attrs["psfdae_version"] = __version__
     file.attrs["config"] = json.dumps(config, sort_keys=True)
 
 
 @dataclass(frozen=True)
 class Product:
-    """Arrays and config read from a data product."""
+    """A data product: its configuration, and its arrays, each read when it is first asked for.
+
+    `kind` is that of `read_product`; "" for a product that is in memory as a whole, of which
+    `path` is only a name.
+    """
 
     path: Path
     config: dict[str, Any]
     arrays: dict[str, np.ndarray]
+    kind: str = ""
 
     def __getitem__(self, name: str) -> np.ndarray:
+        if name not in self.arrays and self.kind:
+            self.arrays.update(read_product(self.path, self.kind, (name,)).arrays)
         return self.arrays[name]
 
 
@@ -432,8 +463,25 @@ def read_product(path: str | Path, kind: str, names: tuple[str, ...] | None = No
             if missing:
                 raise ProductError(f"{path}: array {missing[0]!r} is missing")
             arrays = {name: file[name][()] for name in wanted}
-            return Product(path, json.loads(file.attrs["config"]), arrays)
+            return Product(path, json.loads(file.attrs["config"]), arrays, kind)
     except FileNotFoundError:
         raise ProductError(f"{path}: no such file") from None
     except (OSError, KeyError, ValueError) as error:
         raise ProductError(f"{path}: damaged ({error}); delete it and run again") from error
+
+
+class OutputError(Error, ValueError):
+    """A result would take the place of what it is made of."""
+
+
+def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Any]) -> None:
+    """Refuse outputs that are inputs, too; what is no path of a file is passed over.
+
+    Raises
+    ------
+    OutputError
+    """
+    given = {Path(name).resolve() for name in inputs if isinstance(name, str | Path)}
+    for out in outputs:
+        if out is not None and out.resolve() in given:
+            raise OutputError(f"{out}: is an input, too; choose another name")

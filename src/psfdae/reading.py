@@ -1,4 +1,4 @@
-"""Text files that people write and disks damage: YAML, JSON and CSV, with one line of complaint."""
+"""Text files that people write or disks damage: YAML, JSON and CSV; one line says what is wrong."""
 
 from __future__ import annotations
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from typing import TypeVar
 
 Batch = TypeVar("Batch")
@@ -55,3 +58,38 @@ def in_order(
         finally:
             for _, future in waiting:
                 future.cancel()
+
+
+def available_cores() -> int:
+    """Cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+@contextmanager
+def fixed_threads(threads: int) -> Iterator[None]:
+    """Linear algebra on so many threads, and as before afterwards, whatever a fit has set.
+
+    Results depend on their number in the last digits.
+    """
+    from threadpoolctl import threadpool_limits
+
+    torch = sys.modules.get("torch")
+    before = torch.get_num_threads() if torch else available_cores()
+    with threadpool_limits(threads):
+        try:
+            yield
+        finally:
+            if torch := sys.modules.get("torch"):
+                torch.set_num_threads(before)
+
+
+def limit_threads(threads: int) -> None:
+    """Use this many threads for linear algebra, whatever the environment says.
+
+    Results depend on it in the last digits, so it comes from the config.
+    """
+    from threadpoolctl import threadpool_limits
+
+    threadpool_limits(threads)

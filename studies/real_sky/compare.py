@@ -18,7 +18,7 @@ from faint import FLUX, SNR
 from scipy.stats import sem
 
 from psfdae import __version__, load_model
-from psfdae.source import git_commit
+from psfdae_paper.source import git_commit
 
 SETTING = ["package", "sampling_px", "order", "centre"]
 SPLITS = 5

@@ -8,7 +8,7 @@ import sys
 import numpy as np
 
 from psfdae.cli import main
-from psfdae.stages import from_stars
+from psfdae.commands import from_stars
 
 split, *words = sys.argv[1:]
 lattice = from_stars.star_grid

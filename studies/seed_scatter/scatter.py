@@ -20,13 +20,12 @@ import numpy as np
 import torch
 from torch.optim.lr_scheduler import OneCycleLR
 
-from psfdae.configuration.compose import load
-from psfdae.estimators.dae import Dae
-from psfdae.estimators.dae_network import DaeTraining, predict
 from psfdae.files import read_product
-from psfdae.source import git_commit
-from psfdae.stages.common import noisy_test_images, split_stars
-from psfdae.stages.fit import training_set
+from psfdae.methods.dae import Dae
+from psfdae.model.star_sets import noisy_test_images, split_stars, training_set
+from psfdae.networks.dae import DaeTraining, predict
+from psfdae_paper.configuration.compose import load
+from psfdae_paper.source import git_commit
 
 AVERAGES = (0.98, 0.99, 0.995)
 """Decays of the moving averages of the weights, a step of the optimiser each."""

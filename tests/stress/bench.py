@@ -7,15 +7,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from psfdae.estimators.dae_network import DaeTraining, TrainingSet, image_scale
-from psfdae.own_stars.packing import COMPONENTS, leading
-from psfdae.own_stars.photometry import FluxModel, Photometer
+from psfdae.model.packing import COMPONENTS, leading
+from psfdae.model.photometry import FluxModel, Photometer
+from psfdae.networks.dae import DaeTraining, TrainingSet, image_scale
+from psfdae.noise import NoiseModel
 from psfdae.rng import stream
-from psfdae.stages import stars as stars_stage
-from psfdae.stages.common import star_wavefronts
-from psfdae.stars.fields import assign_fields, draw_jitter
-from psfdae.stars.framing import Propagation, normalise_flux
-from psfdae.stars.noise import NoiseModel
+from psfdae.splits import draw_jitter
+from psfdae_paper.stages import stars as stars_stage
+from psfdae_paper.stages.common import star_wavefronts
+from psfdae_paper.stars.fields import assign_fields
+from psfdae_paper.stars.framing import Propagation, normalise_flux
 
 THREADS = 2  # of the linear algebra, and trainings side by side
 # Noise levels λ of the paper's three bands.

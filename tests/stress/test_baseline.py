@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from psfdae.estimators.pca_som import fit_pca_som
+from psfdae_paper.methods.pca_som import fit_pca_som
 from stress.bench import subspace_angle
 
 EPS = float(np.finfo(np.float64).eps)

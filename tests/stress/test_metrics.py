@@ -4,7 +4,7 @@ import warnings
 
 import numpy as np
 
-from psfdae.evaluation.metrics import all_metrics, error_correlation, mse, peak_range, ssim
+from psfdae.metrics import all_metrics, error_correlation, mse, peak_range, ssim
 
 EPS = float(np.finfo(np.float64).eps)
 C1 = 0.01**2  # of SSIM's luminance term (Wang et al. 2004, IEEE Trans. Image Process. 13, 600)

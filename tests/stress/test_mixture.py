@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from psfdae.estimators import FitError, TrainingSet
-from psfdae.estimators.gmm import GaussianMixture, Gmm
+from psfdae.method import FitError, TrainingSet
+from psfdae.methods.gmm import GaussianMixture, Gmm
 from stress.bench import Bench
 
 EPS = float(np.finfo(np.float32).eps)

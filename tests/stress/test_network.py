@@ -11,9 +11,9 @@ import pytest
 import torch
 from scipy.stats import binom
 
-from psfdae.estimators.dae_network import Dae, DaeTraining, predict, train_dae
-from psfdae.estimators.training import DeadNetworkError, TrainingError
-from psfdae.estimators.weights import save_checkpoint
+from psfdae.networks.dae import Dae, DaeTraining, predict, train_dae
+from psfdae.networks.training import DeadNetworkError, TrainingError
+from psfdae.networks.weights import save_checkpoint
 from stress.bench import THREADS, rounding_of
 from stress.test_photometry import measured
 

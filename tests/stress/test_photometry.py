@@ -5,9 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from psfdae.own_stars.photometry import CLIP, MARGIN, SLACK, FluxModel, robust_flux
-from psfdae.own_stars.stamps import StarFlag, border_median
-from psfdae.stars.framing import normalise_flux
+from psfdae.image.stamps import StarFlag, border_median
+from psfdae.model.photometry import CLIP, MARGIN, SLACK, FluxModel, robust_flux
+from psfdae_paper.stars.framing import normalise_flux
 from stress.bench import LEVELS
 
 pytestmark = pytest.mark.slow

@@ -7,11 +7,11 @@ import pytest
 import torch
 from sklearn.decomposition import PCA
 
-from psfdae.evaluation.metrics import mse, ssim
-from psfdae.optics.wavefronts import seidel_wavefronts
-from psfdae.stages.common import template_wavefronts
-from psfdae.stars.fields import relative_field
-from psfdae.stars.framing import normalise_flux
+from psfdae.metrics import mse, ssim
+from psfdae_paper.optics.wavefronts import seidel_wavefronts
+from psfdae_paper.stages.common import template_wavefronts
+from psfdae_paper.stars.fields import relative_field
+from psfdae_paper.stars.framing import normalise_flux
 from stress.bench import changed, propagation, rounding_of, stamp_mse, subspace_angle
 
 EPS = float(np.finfo(np.float32).eps)  # relative spacing of single precision

@@ -5,9 +5,9 @@ from itertools import combinations, product
 import numpy as np
 import pytest
 
-from psfdae.optics.wavefronts import ModalWavefronts
 from psfdae.rng import stream
-from psfdae.stages.common import star_wavefronts
+from psfdae_paper.optics.wavefronts import ModalWavefronts
+from psfdae_paper.stages.common import star_wavefronts
 from stress.bench import LEVELS, changed, propagation, simulated
 
 STARS = 24  # that are simulated again and again

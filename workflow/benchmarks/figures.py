@@ -4,12 +4,13 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from psfdae.cli import File, command, program
-from psfdae.estimators import method
-from psfdae.evaluation.figure_style import SERIES_COLORS, new_figure, styled
+from psfdae.cli import program
+from psfdae.figure_style import SERIES_COLORS, new_figure, styled, write_png
 from psfdae.files import ProductError
+from psfdae.methods import method
+from psfdae.options import File
 from psfdae.reading import read_table
-from psfdae.stages.figures import write_png
+from psfdae_paper.configuration.command import command
 
 WAYS = {
     "kernel numpy": ("our kernel, numpy", "#0072b2", "o"),
@@ -56,15 +57,14 @@ SERIES = (
 @command("draw")
 def draw(
     kind: Literal[
-        *("propagation", "skipping", "training", "baseline", "methods", "inference"),
-        *("scaling", "graded"),
+        *("propagation", "training", "baseline", "methods", "inference", "scaling", "graded")
     ],
     table: Annotated[File, "Table of that benchmark."],
     out: Annotated[File, "PNG."],
     scene: Annotated[str | None, "Scene whose rows are drawn."] = None,
 ) -> None:
     """Draw what a benchmark has measured."""
-    rows = read_table(table, keep_default_na=kind != "skipping")
+    rows = read_table(table)
     if scene is not None:
         rows = rows[rows["scene"] == scene]
         if rows.empty:
@@ -113,27 +113,6 @@ def propagation(table):
     name = table["scene"].iloc[0]
     title = f"{SCENES.get(name, name)}: error of a stamp against its time"
     figure.suptitle(f"{title}, threads or processes: {threads}".capitalize())
-    return figure
-
-
-def skipping(table):
-    """Time with and without superfluous work, one pair of bars per item, by saving."""
-    rows = table.sort_values("saving", ignore_index=True)
-    where = rows["scene"].map(SCENES).add(", ").fillna("") + "per " + rows["per"]
-    figure = new_figure(1.4 + 0.32 * len(rows), layout="constrained")
-    axes = figure.add_subplot()
-    bars = rows[["without_s", "with_s"]].set_axis(rows["item"] + " (" + where + ")")
-    bars.columns = ["without it", "with it"]
-    bars.plot.barh(ax=axes, logx=True, width=0.76, color=["#0072b2", "#d55e00"])
-    for i, row in rows.iterrows():
-        text = f"{row['saving']:.{0 if row['saving'] >= 10 else 2}f}×"
-        kept = "" if row["skipped"] == "yes" else ", kept"
-        labelled(axes, bars.iloc[i].max(), i, text + kept, va="center")
-    axes.set(xlabel="time (s) per star, set or process")
-    axes.set_title("What is not computed: time with and without it")
-    axes.margins(x=0.12)
-    axes.grid(True, axis="x")
-    axes.set_axisbelow(True)
     return figure
 
 

@@ -16,9 +16,9 @@ from unittest.mock import patch
 import numpy as np
 
 from psfdae.cli import main, stage
-from psfdae.configuration.compose import write_settings
 from psfdae.files import write_text
-from psfdae.stages.record import cpu_model
+from psfdae_paper.configuration.compose import write_settings
+from psfdae_paper.stages.record import cpu_model
 
 VERSIONED = ("psfdae", "numpy", "scipy", "torch", "numexpr", "poppy", "hcipy")
 """Packages whose versions can change a time; recorded where they are installed."""
@@ -85,8 +85,7 @@ def cost_of_command(words, out, tree=None):
     (name, *given), before = [*map(str, words), "--out", str(out)], _files(out.parent)
     with TemporaryDirectory() as folder:
         if tree is not None:
-            reads = stage(name).stage.reads
-            reads = reads(given[0]) if callable(reads) else reads  # of the method that it names
+            reads = stage(name).stage.settings.of({"name": given[0]})  # of the method that it names
             settings = write_settings(Path(folder), name, reads, tree)
             given += ["--config", str(settings)]
         resting, start, start_cpu = _memory("VmRSS", forget=True), perf_counter(), process_time()

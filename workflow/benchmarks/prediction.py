@@ -16,16 +16,20 @@ import numpy as np
 
 from measure import alone, cost_of_command, write, yes
 from psfdae.belonging import STARS, require
-from psfdae.cli import File, command, program
-from psfdae.configuration.compose import ConfigError, part
-from psfdae.configuration.consistency import SIMULATION
-from psfdae.configuration.schema import Config
+from psfdae.cli import program
 from psfdae.files import read_product
+from psfdae.model import star_sets
+from psfdae.noise import NoiseModel, mixed_levels
+from psfdae.options import File
 from psfdae.rng import stream
-from psfdae.stages import common
-from psfdae.stars.fields import assign_fields, draw_jitter, perturb, relative_field
-from psfdae.stars.framing import brightest_pixel, crop_jittered, normalise_flux
-from psfdae.stars.noise import NoiseModel, mixed_levels
+from psfdae.settings import ConfigError
+from psfdae.splits import draw_jitter
+from psfdae_paper.configuration.command import command
+from psfdae_paper.configuration.compose import part
+from psfdae_paper.configuration.consistency import SIMULATION
+from psfdae_paper.configuration.schema import Config
+from psfdae_paper.stars.fields import assign_fields, perturb, relative_field
+from psfdae_paper.stars.framing import brightest_pixel, crop_jittered, normalise_flux
 
 REQUIRED_SHARE = 0.6  # of the bare network's throughput, which a prediction must reach
 ALLOWED_MB = 1000.0  # memory that it may take
@@ -74,7 +78,7 @@ def throughput(
 
 def make_cube(tree, stars, count, out):
     """Write a FITS cube of the noise-free stars of a product in turn, sky and noise added."""
-    from psfdae.own_stars.example import write_cube
+    from psfdae_paper.stars.example import write_cube
 
     images = read_product(stars, "stars", ("realisation",))["realisation"]
     rng = stream(tree["seed"], "prediction", "cube")
@@ -97,7 +101,7 @@ def time_prediction(cube, bundle, mixture, stamps, threads, repeats):
     many passes as threads beside each other. Then the memory of the prediction in MB,
     interpreter and libraries included.
     """
-    from psfdae.own_stars.model import BLOCK, load_model
+    from psfdae.model.psf_model import BLOCK, load_model
 
     model, peak = load_model(bundle), 0.0
     side = model.info.stamp_px
@@ -121,8 +125,8 @@ def bare_rate(model, stamps, threads, way):
     """Stamps per second of the network alone, on images that are in memory."""
     import torch
 
-    from psfdae.estimators.dae_network import predict
-    from psfdae.own_stars.model import BLOCK, one_thread_each
+    from psfdae.model.psf_model import BLOCK, one_thread_each
+    from psfdae.networks.dae import predict
     from psfdae.threads import side_by_side
 
     side, factor, network = (
@@ -169,7 +173,7 @@ def poppy(
 
 def bundle_errors(bundle, truth, config):
     """Errors of a bundle on noise-free stars of flux 1, a row for each noise level."""
-    from psfdae.own_stars.model import load_model
+    from psfdae.model.psf_model import load_model
 
     model, noise = (
         load_model(bundle),
@@ -193,7 +197,7 @@ def bundle_errors(bundle, truth, config):
 
 def require_bundle(bundle, config):
     """Refuse a bundle whose training stars are not of the configured scene."""
-    from psfdae.own_stars.bundle import read_bundle
+    from psfdae.model.bundle import read_bundle
 
     trained_on = read_bundle(bundle).info.config.get("stars")
     if isinstance(trained_on, dict):
@@ -205,7 +209,7 @@ def quality(found, truth, flux, expected, which):
 
     `coverage95` is of `UNCERT` times `ratio95`, which networks of older bundles do not say.
     """
-    from psfdae.own_stars.bundle import brightest
+    from psfdae.model.bundle import brightest
 
     kept = np.isfinite(found.psf).all(axis=(1, 2))
     psf, width = found.psf[kept], found.uncertainty[kept]
@@ -230,9 +234,9 @@ def coverage(
 
     Either half of the stars, with flux and sky found, by what the other half says of the errors.
     """
-    from psfdae.own_stars.bundle import read_bundle
+    from psfdae.model.bundle import read_bundle
 
-    products = [common.read_stars(path, "template") for path in stars]
+    products = [star_sets.read_stars(path, "template") for path in stars]
     rows = []
     for path in bundles:
         bundle = read_bundle(path)
@@ -249,18 +253,21 @@ def refuse(bundle, stars):
 
 def covered(bundle, product, rng):
     """Rows of a bundle: noise level, S/N, brightness, and part of the pixels that is covered."""
-    from psfdae.own_stars import packing
-    from psfdae.own_stars.bundle import brightest, estimator
-    from psfdae.own_stars.model import PsfModel
+    from psfdae.model import packing
+    from psfdae.model.bundle import brightest, estimator
+    from psfdae.model.psf_model import PsfModel
 
     trained, fitted = bundle.info.config["train"], estimator(bundle)
     said = part(("seed", "noise", "parts"), trained)
-    noise, reference = common.noise_model(said), bundle.info.reference or trained.get("reference")
-    test = common.split_stars(product, trained["split"], said).test
+    noise, reference = (
+        star_sets.noise_model(said),
+        bundle.info.reference or trained.get("reference"),
+    )
+    test = star_sets.split_stars(product, trained["split"], said).test
     # Images of one star of an image are of one half.
     star = product["field_index"][test] if trained["split"] == "held_out" else test
     odd = np.unique(star, return_inverse=True)[1] % 2 == 1
-    columns = product["realisation"], product[reference], common.field_positions(product)
+    columns = product["realisation"], product[reference], star_sets.field_positions(product)
     halves = [
         packing.HeldOutStars(*(c[test[half]] for c in columns[:2]), noise, columns[2][test[half]])
         for half in (odd, ~odd)
@@ -302,16 +309,16 @@ def strange(
     companion, or is hit by a cosmic ray, or is turned by 90 degrees, or gives way to a Gaussian as
     wide as the mean star.
     """
-    from psfdae.own_stars.model import load_model
+    from psfdae.model.psf_model import load_model
 
-    product = common.read_stars(stars, "realisation")
+    product = star_sets.read_stars(stars, "realisation")
     require(stars, product.config, STARS, config)
     require_bundle(bundle, config)
     model, noise = (
         load_model(bundle),
         NoiseModel(config.noise.kappa, config.noise.background_photons),
     )
-    images = product["realisation"][common.split_stars(product, "random", config).test]
+    images = product["realisation"][star_sets.split_stars(product, "random", config).test]
     images = np.tile(images, (NOISY_EACH, 1, 1))
     rows = []
     for level in config.noise.levels:

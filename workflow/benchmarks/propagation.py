@@ -1,11 +1,8 @@
-"""Time against error of the optics: kernel, peers, cheapest setting, and what is left out."""
+"""Time against error of the optics: our kernel and other packages."""
 
 from dataclasses import replace
 from typing import Annotated, Any
 
-import click
-
-from choice import choose, guard_or_budget, take_sample
 from measure import alone, machine, write
 from propagators import (
     compare,
@@ -13,21 +10,21 @@ from propagators import (
     finish,
     in_processes,
     kernel_settings,
-    kernel_times,
     peers_of,
     time_settings,
 )
-from psfdae.cli import Folder, command, program
-from psfdae.configuration.schema import Config
+from psfdae.cli import program
+from psfdae.options import Folder
 from psfdae.reading import read_table
-from psfdae.stages.common import limit_threads
-from savings import PACKAGES, finer_than_needed, imports, timed_savings
+from psfdae.threads import limit_threads
+from psfdae_paper.configuration.command import command
+from psfdae_paper.configuration.schema import Config
 from scenes import READS, Scene, build_cases
 
-TABLES = ("propagation", "convergence", "choice", "guard", "skipping", "machine")
+TABLES = ("propagation", "convergence", "machine")
 """Tables of one scene, `<name>.csv` in its folder; joined as `benchmark_<name>.csv`."""
 
-AS_TEXT: dict[str, Any] = {"machine": str, "choice": {"ladder": str}}
+AS_TEXT: dict[str, Any] = {"machine": str}
 """Columns that must not turn into numbers, by table."""
 
 DIGITS = 5
@@ -37,7 +34,6 @@ DIGITS = 5
 def measure(
     config: Config,
     out: Annotated[Folder, "Folder for the tables of the scene."],
-    datasets: Annotated[int, click.IntRange(min=1), "Datasets that share the stars."] = 1,
 ) -> None:
     """Time the optics of a scene against its error; needs a quiet machine."""
     described, benchmark = machine(), config.benchmark
@@ -45,28 +41,16 @@ def measure(
     scene = Scene.of(config)
     cases, convergence = build_cases(scene)
     table = time_everything(config, cases)
-    work = (timed_savings, config.model_dump(), scene, cases, datasets)
-    savings = alone(benchmark.threads, *work)
-    times = kernel_times(table, config.optics, benchmark)
-    sample = take_sample(scene, max(2, benchmark.stamps // 2), benchmark.peers)
     described |= {"threads": str(benchmark.threads)}
     rows = {
         "propagation": table,
         "convergence": convergence,
-        "choice": choose(scene, sample, times),
-        "guard": guard_or_budget(scene, sample),
-        "skipping": in_scene(scene.name, [*savings, *finer_than_needed(scene, sample, times)]),
         "machine": [
             {"scene": scene.name, "item": item, "value": value} for item, value in described.items()
         ],
     }
     for name in TABLES:
         write(out / f"{name}.csv", rows[name], DIGITS)
-
-
-def in_scene(name, rows):
-    """Rows of savings, whose second column is the scene."""
-    return [{"item": row["item"], "scene": name, **row} for row in rows]
 
 
 def time_everything(config, cases):
@@ -97,23 +81,16 @@ def time_everything(config, cases):
     return finish(rows, used)
 
 
-@command("tables", reads=("benchmark",))
+@command("tables")
 def tables(
-    config: Config,
     out: Annotated[Folder, "Folder for the joined tables."],
     scenes: Annotated[tuple[Folder, ...], {"flag": "--scene"}, "Folder of a scene's tables."],
 ) -> None:
-    """Join the tables of the scenes, compare with other packages, and time imports."""
+    """Join the tables of the scenes, and compare with other packages."""
     import pandas as pd
 
     for name in TABLES:
-        kept: dict[str, Any] = {"dtype": AS_TEXT.get(name), "keep_default_na": name != "skipping"}
-        parts = [read_table(folder / f"{name}.csv", **kept) for folder in scenes]
-        if name == "skipping":
-            # The others take seconds each to import.
-            packages = PACKAGES if config.benchmark.peers else PACKAGES[:1]
-            rows = imports(config.benchmark.repeats, packages)
-            parts.append(pd.DataFrame(in_scene("all", rows)))
+        parts = [read_table(folder / f"{name}.csv", dtype=AS_TEXT.get(name)) for folder in scenes]
         joined = pd.concat(parts, ignore_index=True)
         write(out / f"benchmark_{name}.csv", joined, DIGITS)
         if name == "propagation":

@@ -16,10 +16,10 @@ from itertools import product
 import numpy as np
 
 from measure import alone, pareto, time_in_rounds, use_threads, yes
-from psfdae.optics.propagation import EXTRA_POINTS, StampPropagator
-from psfdae.optics.pupil import ARCSEC, SamplingError
-from psfdae.stars.framing import normalise_flux
 from psfdae.threads import side_by_side
+from psfdae_paper.optics.propagation import EXTRA_POINTS, StampPropagator
+from psfdae_paper.optics.pupil import ARCSEC, SamplingError
+from psfdae_paper.stars.framing import normalise_flux
 from scenes import pupil_of
 
 GRIDS = (62, 94, 126, 158, 190, 286)  # pupil samples tried beside the ladder; even with guard cells
@@ -354,17 +354,6 @@ def finish(rows, used):
         table.loc[group.index[front], "pareto"] = "yes"
     in_use = [asdict(used[row["aberration"]]).items() <= row.items() for row in rows]
     return table.assign(used=np.where(in_use, "yes", "no"))
-
-
-def kernel_times(table, optics, benchmark):
-    """Time of a stamp in ms by (samples, points, precision), mean over the cases.
-
-    Backend and batch are the configured ones, threads the benchmark's.
-    """
-    used = asdict(configured_setting(optics, benchmark, 0)) | {"threads": benchmark.threads}
-    wanted = ["method", "backend", "threads", "batch", "processes"]
-    rows = table[(table[wanted] == [used[name] for name in wanted]).all(axis=1)]
-    return dict(rows.groupby(["samples", "points", "precision"])["time_ms"].mean())
 
 
 def compare(table):

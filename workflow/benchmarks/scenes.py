@@ -6,16 +6,16 @@ from functools import lru_cache
 
 import numpy as np
 
-from psfdae.configuration.consistency import SIMULATION
-from psfdae.configuration.schema import Framing, Optics
-from psfdae.configuration.telescope import Telescope
-from psfdae.optics.propagation import StampPropagator
-from psfdae.optics.pupil import annular_pupil
-from psfdae.optics.wavefronts import WavefrontSource
 from psfdae.rng import stream
-from psfdae.stages.common import star_wavefronts, template_wavefronts
-from psfdae.stars.fields import assign_fields
-from psfdae.stars.framing import Propagation, normalise_flux
+from psfdae_paper.configuration.consistency import SIMULATION
+from psfdae_paper.configuration.schema import Framing, Optics
+from psfdae_paper.configuration.telescope import Telescope
+from psfdae_paper.optics.propagation import StampPropagator
+from psfdae_paper.optics.pupil import annular_pupil
+from psfdae_paper.optics.wavefronts import WavefrontSource
+from psfdae_paper.stages.common import star_wavefronts, template_wavefronts
+from psfdae_paper.stars.fields import assign_fields
+from psfdae_paper.stars.framing import Propagation, normalise_flux
 
 READS = (*SIMULATION, "noise", "benchmark")
 BUDGET = 0.01  # numerical MSE of a stamp in units of the smallest noise variance it carries

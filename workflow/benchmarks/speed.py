@@ -14,11 +14,14 @@ import numpy as np
 
 from measure import alone, cost_of_command, write
 from prediction import make_cube
-from psfdae.cli import File, command, program
-from psfdae.configuration.consistency import SIMULATION
-from psfdae.configuration.schema import Config
-from psfdae.estimators import all_groups, method
+from psfdae.cli import program
+from psfdae.methods import method
+from psfdae.options import File
 from psfdae.rng import stream
+from psfdae_paper.configuration.command import command
+from psfdae_paper.configuration.consistency import SIMULATION
+from psfdae_paper.configuration.methods import all_groups
+from psfdae_paper.configuration.schema import Config
 
 BATCHES = (1, 16, 64, 256, 1024)
 LARGEST_BATCH_PER_STAMP = 16  # larger ones than this times `benchmark.stamps` are left out
@@ -56,7 +59,7 @@ def random_network(dae, width, side):
     """A network of one width with random weights, and the factor of its images."""
     import torch
 
-    from psfdae.estimators.dae_network import build_dae, image_scale
+    from psfdae.networks.dae import build_dae, image_scale
 
     widths, seed = [width] * len(dae["widths"]), torch.Generator().manual_seed(width)
     return build_dae(dae["kernels"], widths, "he", seed), image_scale(dae["scale"], side)
@@ -69,7 +72,7 @@ def onnx_path(folder, width, side):
 
 def export_networks(dae, sizes, folder):
     """Export random networks of each width and side of the stamps."""
-    from psfdae.estimators.dae_network import export_onnx
+    from psfdae.networks.dae import export_onnx
 
     for size in sizes:
         export_onnx(*random_network(dae, *size), size[1], onnx_path(folder, *size))
@@ -78,13 +81,13 @@ def export_networks(dae, sizes, folder):
 def network(engine, dae, folder, size, threads):
     """An exported network, or in torch `predict` as every stage calls it."""
     if engine == "onnxruntime":
-        from psfdae.estimators.dae_network import session
+        from psfdae.networks.dae import session
 
         run = session(onnx_path(folder, *size), threads).run
         return lambda images: run(None, {"images": images})[0]
     import torch
 
-    from psfdae.estimators.dae_network import predict
+    from psfdae.networks.dae import predict
 
     torch.set_num_threads(threads)
     model, factor = random_network(dae, *size)
@@ -160,10 +163,12 @@ def last_cost(runs):
 
 def untrained_bundle(tree, stars, out):
     """The shipped model with a random network and these stars' size of stamps."""
+    from psfdae.bundle_info import Architecture, BundleInfo
     from psfdae.files import read_product
-    from psfdae.own_stars.bundle import FREE, Architecture, BundleInfo, read_bundle, write_bundle
-    from psfdae.own_stars.packing import leading
-    from psfdae.own_stars.photometry import FluxModel, noise_equivalent_px
+    from psfdae.model.bundle import FREE, read_bundle, write_bundle
+    from psfdae.model.packing import leading
+    from psfdae.model.photometry import FluxModel
+    from psfdae.noise import noise_equivalent_px
 
     images, dae, shipped = read_product(stars, "stars")["realisation"], tree["dae"], read_bundle()
     side, model = images.shape[-1], FluxModel.fit(images[:1000])

@@ -11,16 +11,19 @@ from pydantic import Field
 
 from measure import alone, pareto, write, yes
 from psfdae.belonging import STARS, require
-from psfdae.cli import File, Folder, Reference, command, program
-from psfdae.configuration.base import Group
-from psfdae.configuration.compose import config_dir, decisive, load_file, part
-from psfdae.configuration.consistency import SIMULATION
-from psfdae.configuration.schema import Config
-from psfdae.estimators import all_groups, groups_of, method
+from psfdae.cli import program
 from psfdae.files import read_product, write_csv
+from psfdae.methods import groups_of, method
+from psfdae.model import star_sets
+from psfdae.options import File, Folder
 from psfdae.reading import read_table, read_yaml
-from psfdae.stages import common
-from psfdae.stages.fit import training_set
+from psfdae.settings import Group, Reference
+from psfdae.threads import limit_threads
+from psfdae_paper.configuration.command import command
+from psfdae_paper.configuration.compose import config_dir, decisive, load_file, part
+from psfdae_paper.configuration.consistency import SIMULATION
+from psfdae_paper.configuration.methods import all_groups
+from psfdae_paper.configuration.schema import Config
 
 PATIENCE = 5  # validations without a better one after which a training no longer improves
 WORTHWHILE = 0.9  # fraction to which each doubling of the time must bring the error
@@ -29,7 +32,6 @@ SIZES = ("components", "rows", "columns", "epochs")
 COMPONENTS, MAPS, EPOCHS = (5, 10, 20, 40), (7, 11, 15), (2, 10, 50)
 CHEAP_S = 3.0  # within which a fit of PCA+SOM is repeated
 
-READINGS = (("map", True), ("map", False), ("projection", True))
 
 SEEDS = 5  # of each method: that of the configuration and the next ones
 
@@ -66,18 +68,18 @@ def knee_table(
     """
     import pandas as pd
 
-    from psfdae.estimators import HISTORY
-    from psfdae.estimators.dae import Dae
-    from psfdae.evaluation.metrics import mse
+    from psfdae.method import HISTORY
+    from psfdae.methods.dae import Dae
+    from psfdae.metrics import mse
 
-    common.limit_threads(config.evaluation.threads)
+    limit_threads(config.evaluation.threads)
     folders = {name: Path(folder) for name, _, folder in (p.partition("=") for p in points)}
-    product = common.read_stars(stars)
+    product = star_sets.read_stars(stars)
     for folder in folders.values():
         Dae.require(folder, product, config, "random", "realisation")
-    test = common.split_stars(product, "random", config).test
+    test = star_sets.split_stars(product, "random", config).test
     images, levels = product["realisation"][test], config.noise.levels
-    noisy = {level: common.noisy_test_images(config, product, test, level) for level in levels}
+    noisy = {level: star_sets.noisy_test_images(config, product, test, level) for level in levels}
     configured = decisive(config.model_dump(include={"dae", "train"}))
     rows, idle = [], []
     for name, folder in folders.items():
@@ -104,7 +106,7 @@ def knee_table(
 
 def settings_of(folder, configured):
     """What a training was, and whether it is the one that the configuration uses."""
-    from psfdae.estimators import CONFIG
+    from psfdae.method import CONFIG
 
     tree = decisive(read_yaml(folder / CONFIG))
     same = tree["parts"]["test_stars"] > 1
@@ -181,19 +183,19 @@ def time_points(tree, stars):
     import minisom  # noqa: F401
     import sklearn.decomposition  # noqa: F401
 
-    from psfdae.estimators.pca_som import PcaSom
+    from psfdae_paper.methods.pca_som import PcaSom
 
     config = part(READS, tree)
     settings, levels = config.baseline, config.noise.levels
-    common.limit_threads(settings.threads)
-    product = common.read_stars(stars, "template")
-    parts = common.split_stars(product, "random", config)
+    limit_threads(settings.threads)
+    product = star_sets.read_stars(stars, "template")
+    parts = star_sets.split_stars(product, "random", config)
     # As the stage `baseline` does it: the point in use is the very model of the tables.
-    data = training_set(config, PcaSom, product, "random", "realisation")
+    data = star_sets.training_set(config, PcaSom, product, "random", "realisation")
     truths = {name: product[name][parts.test] for name in ("realisation", "template")}
     clean = truths["realisation"]
     tests = {
-        level: common.noisy_test_images(config, product, parts.test, level) for level in levels
+        level: star_sets.noisy_test_images(config, product, parts.test, level) for level in levels
     }
     used = tuple(getattr(settings, size) for size in SIZES)
     rows = []
@@ -207,7 +209,7 @@ def time_points(tree, stars):
 
 def time_point(data, settings, tests, truths, repeats):
     """Fit a training set and restore the test images of each λ: median times and mean errors."""
-    from psfdae.estimators.pca_som import PcaSom
+    from psfdae_paper.methods.pca_som import PcaSom
 
     model, fit_s, done = median_time(lambda: PcaSom.fit(data, settings), repeats)
     estimates, predict_s, _ = median_time(
@@ -218,45 +220,6 @@ def time_point(data, settings, tests, truths, repeats):
     for name, truth in truths.items():
         row[f"mse_{name}"] = np.mean([((found - truth) ** 2).mean() for found in estimates])
     return row
-
-
-@command("readings", reads=(*SIMULATION, "dataset", "noise", "parts", "baseline"))
-def readings(
-    config: Config,
-    stars: Annotated[File, "Product of the stage stars."],
-    out: Annotated[File, "CSV: errors of PCA+SOM as the paper can be read, beside its own."],
-) -> None:
-    """Fit PCA+SOM in every reading of the paper and measure it on the random test stars."""
-    from psfdae.estimators.pca_som import PcaSom
-    from psfdae.evaluation.metrics import clustered_mean, mse
-    from psfdae.evaluation.paper import published
-
-    common.limit_threads(config.baseline.threads)
-    product = common.read_stars(stars, "template")
-    require(stars, product.config, STARS, config)
-    test = common.split_stars(product, "random", config).test
-    field, dataset = product["field_index"][test], config.dataset.name
-    paper = published("psf").query("dataset == @dataset and metric == 'mse' and method == 'pca'")
-    paper = paper.set_index("noise_level").value
-    data = training_set(config, PcaSom, product, "random", "realisation")
-    rows = []
-    for reading, per_level in READINGS:
-        changed = {"reading": reading, "per_level": per_level}
-        fitted = PcaSom.fit(data, config.baseline.model_copy(update=changed))
-        for level in config.noise.levels:
-            noisy = common.noisy_test_images(config, product, test, level)
-            found = fitted.predict(noisy, level)
-            for name in config.dataset.references:
-                mean, stderr = clustered_mean(mse(found, product[name][test]), field)
-                row = {"dataset": dataset, "reference": name, "reading": reading}
-                row |= {"per_level": yes(per_level), "noise_level": level}
-                row |= {"mse": mean, "stderr": stderr, "n": test.size}
-                row |= {
-                    "mse_paper": paper.get(level),
-                    "over_paper": mean / paper.get(level, np.nan),
-                }
-                rows.append(row)
-    write(out, rows)
 
 
 def median_time(call, repeats):
@@ -282,24 +245,24 @@ def methods(
 
 def time_methods(tree, stars):
     """CPU time of each method's fit, stars per second and errors, λ by λ."""
-    from psfdae.evaluation.metrics import clustered_mean, mse
+    from psfdae.metrics import clustered_mean, mse
 
     config = part(METHODS, tree)
-    common.limit_threads(1)
-    product = common.read_stars(stars, "template")
-    test = common.split_stars(product, "random", config).test
+    limit_threads(1)
+    product = star_sets.read_stars(stars, "template")
+    test = star_sets.split_stars(product, "random", config).test
     clean, field = product["realisation"][test], product["field_index"][test]
-    position = common.field_positions(product)[test]
+    position = star_sets.field_positions(product)[test]
     rows = []
     for kind in (kind for kind in map(method, config.methods) if kind.restores):
         with TemporaryDirectory() as folder:
             given = config, kind, product, "random", "realisation"
-            data = training_set(*given, checkpoint=Path(folder, "checkpoint"))
+            data = star_sets.training_set(*given, checkpoint=Path(folder, "checkpoint"))
             start = process_time()
             fitted = kind.fit(data, **kind.settings(config))
             fit_s = process_time() - start
         for level in config.noise.levels:
-            noisy = common.noisy_test_images(config, product, test, level)
+            noisy = star_sets.noisy_test_images(config, product, test, level)
             # What is made once for a level, such as factorisations, is not of the stars.
             fitted.restore(noisy[:1], level, position[:1])
             start = process_time()
@@ -322,13 +285,13 @@ def seeds(
     out: Annotated[File, "CSV with the mean error of every seed."],
 ) -> None:
     """Repeat the fits of METHOD with other seeds, and test all of them on the same noisy stars."""
-    from psfdae.evaluation.metrics import mse
+    from psfdae.metrics import mse
 
-    kind, product = method(name), common.read_stars(stars, "template")
-    common.limit_threads(kind.threads(config))
-    test = common.split_stars(product, "random", config).test
-    position = common.field_positions(product)[test]
-    noisy = {x: common.noisy_test_images(config, product, test, x) for x in config.noise.levels}
+    kind, product = method(name), star_sets.read_stars(stars, "template")
+    limit_threads(kind.threads(config))
+    test = star_sets.split_stars(product, "random", config).test
+    position = star_sets.field_positions(product)[test]
+    noisy = {x: star_sets.noisy_test_images(config, product, test, x) for x in config.noise.levels}
     own = own_fits(config, kind, dataset, reference, product, results)
     rows = []
     for seed in range(config.seed, config.seed + SEEDS):
@@ -351,7 +314,7 @@ def own_fits(config, kind, dataset, references, product, results):
             kind.require(place, product, config, "random", reference)
             fits[reference] = kind.load(place, reference, config.evaluation)
         else:
-            data = training_set(config, kind, product, "random", reference)
+            data = star_sets.training_set(config, kind, product, "random", reference)
             fits[reference] = kind.fit(data, **kind.settings(config))
     return fits
 
@@ -364,7 +327,7 @@ def other_fits(config, kind, own, product, seed):
             fits[reference] = next(iter(fits.values()))  # one serves all
             continue
         with TemporaryDirectory() as folder:
-            data = training_set(
+            data = star_sets.training_set(
                 *(config, kind, product, "random", reference),
                 checkpoint=Path(folder, "checkpoint"),
                 start=fits.get("realisation") if kind.continues(config) else None,
@@ -386,7 +349,7 @@ def scatter(
 
 def pooled(errors):
     """Root mean square over λ of the standard deviation over the seeds divided by their mean."""
-    from psfdae.evaluation.comparison import FITTED
+    from psfdae_paper.evaluation.comparison import FITTED
 
     cells = errors.groupby([*FITTED, "noise_level"], sort=False)
     relative = (cells.mse.std() / cells.mse.mean()).groupby(FITTED, sort=False)
@@ -395,4 +358,4 @@ def pooled(errors):
 
 
 if __name__ == "__main__":
-    program(knee_table, baseline, readings, methods, seeds, scatter)
+    program(knee_table, baseline, methods, seeds, scatter)

@@ -1,6 +1,6 @@
 PROPAGATION = f"{RESULTS}/benchmark/propagation/{{scene}}/"
 SCENES = options("scene")
-OPTICS = ["propagation", "convergence", "choice", "guard", "skipping", "machine"]
+OPTICS = ["propagation", "convergence", "machine"]
 
 
 rule propagation:
@@ -18,18 +18,14 @@ rule propagation:
         config=lambda w: settings(
             "propagation.measure", f"dataset={strictest_dataset(w.scene)}"
         ),
-        source=lambda w: source_hash(
-            "workflow/benchmarks/propagation.py:measure",
-            chosen=[f"psfdae.stars.scenes:{w.scene.title()}Scene"],
-        ),
+        source=lambda w: source_hash("workflow/benchmarks/propagation.py"),
         program=program("propagation.measure"),
         folder=subpath(output[0], parent=True),
-        datasets=lambda w: sharing_stars(strictest_dataset(w.scene)),
     message:
         "Timing the optics of scene {wildcards.scene} against its error"
     shell:
         "python {params.program} --config {params.config}"
-        " --datasets {params.datasets} --out {params.folder} > {log} 2>&1"
+        " --out {params.folder} > {log} 2>&1"
 
 
 rule propagation_tables:
@@ -48,23 +44,21 @@ rule propagation_tables:
     resources:
         mem_mb=1000,
     params:
-        config=lambda w: settings("propagation.tables", f"dataset={TIMED_DATASET}"),
-        source=source_hash("workflow/benchmarks/propagation.py:tables"),
+        source=source_hash("workflow/benchmarks/propagation.py"),
         program=program("propagation.tables"),
         folder=subpath(output[0], parent=True),
         scenes=lambda w, input: [f"--scene={Path(path).parent}" for path in input],
     message:
-        "Joining the tables of the optics benchmark and timing imports"
+        "Joining the tables of the optics benchmark"
     shell:
-        "python {params.program} --config {params.config}"
-        " {params.scenes:q} --out {params.folder} > {log} 2>&1"
+        "python {params.program} {params.scenes:q} --out {params.folder} > {log} 2>&1"
 
 
 BUNDLE = f"{RESULTS}/bundles/{TIMED_DATASET}-random-realisation.psf.safetensors"
 STARS = {"stars": lambda w: stars_of(TIMED_DATASET)}
 OWN_MODEL = f"{RESULTS}/own_stars/example/model"
 MIXED = BUNDLE.replace("realisation", f"realisation{method('gmm').suffix}")
-FITTED = [f"psfdae.estimators.{name}" for name in names_of(TIMED_DATASET)]
+FITTED = [method(name).__module__ for name in names_of(TIMED_DATASET)]
 # By table: target, command, inputs, MB, minutes, stages that it runs or modules that it chooses.
 TIMED = {
     "benchmark_baseline": ("benchmark", "trainings.baseline", STARS, 1500, 20, []),
@@ -167,7 +161,6 @@ for _table, (_target, _run, _inputs, _mb, _minutes, _stages) in TIMED.items():
 
 DRAWN = {
     **{f"propagation_{scene}": f"error against time, {scene}" for scene in SCENES},
-    "skipping": "what is not computed",
     "baseline": "baseline: error against time",
     "inference": "speed of the network",
     "methods": "all methods: error against time",
@@ -248,7 +241,7 @@ use rule stars as fresh_stars with:
             # Another name is another random stream.
             more=("stars.name=fresh", f"stars.count={KNEE.fresh_stars}"),
         ),
-        source=source_hash("stars", chosen=["psfdae.stars.scenes:SeidelScene"]),
+        source=source_hash("stars"),
     message:
         "Simulating other stars for the knee of the training"
 
@@ -277,7 +270,7 @@ rule knee_train:
         config=lambda w: settings(
             "train", f"dataset={KNEE_DATASET}", more=knee_overrides(w.point)
         ),
-        source=source_hash("train", chosen=["psfdae.estimators.dae"]),
+        source=source_hash("train", chosen=["psfdae.methods.dae"]),
         folder=subpath(output.weights, parent=True),
         checkpoint=lambda w: f"{RESULTS}/checkpoints/knee-{w.point}.pt",
     message:
@@ -303,7 +296,7 @@ rule knee_table:
         mem_mb=1500,
     params:
         config=lambda w: settings("trainings.knee_table", f"dataset={KNEE_DATASET}"),
-        source=source_hash("workflow/benchmarks/trainings.py:knee_table"),
+        source=source_hash("workflow/benchmarks/trainings.py"),
         program=program("trainings.knee"),
         points=[f"--point={p}={KNEE_FOLDER.format(point=p)}" for p in KNEE.points],
     message:
@@ -353,9 +346,7 @@ for _method in registered():
             config=lambda w, m=_method: settings(
                 "trainings.seeds", f"dataset={w.dataset}", name=m.name
             ),
-            source=lambda w, m=_method: program_code(
-                "trainings.seeds", [f"psfdae.estimators.{m.name}"]
-            ),
+            source=lambda w, m=_method: program_code("trainings.seeds", [m.__module__]),
             program=program("trainings.seeds"),
             method=_method.name,
             results=lambda w: RESULTS,
@@ -404,54 +395,8 @@ rule seeds:
         f"{RESULTS}/logs/seeds/all.log",
     localrule: True
     params:
-        table="src/psfdae/evaluation/seed_scatter.csv",
+        table="src/psfdae_paper/evaluation/seed_scatter.csv",
     message:
         "Renewing the scatter between seeds that comes with the package"
     shell:
         "install -D -m 644 {input} {params.table} 2> {log}"
-
-
-# What the paper leaves open about its PCA, by its own rows.
-READINGS = f"{RESULTS}/readings/{{dataset}}.csv"
-
-
-rule readings_of:
-    input:
-        stars=lambda w: stars_of(w.dataset),
-    output:
-        READINGS,
-    log:
-        f"{RESULTS}/logs/benchmark/readings_{{dataset}}.log",
-    benchmark:
-        f"{RESULTS}/benchmarks_on_request/readings/{{dataset}}.tsv"
-    resources:
-        mem_mb=1500,
-        runtime=20,
-    params:
-        config=lambda w: settings("trainings.readings", f"dataset={w.dataset}"),
-        source=program_code("trainings.readings", ["psfdae.estimators.pca_som"]),
-        program=program("trainings.readings"),
-    message:
-        "Fitting PCA+SOM of {wildcards.dataset} in every reading of the paper"
-    shell:
-        "python {params.program} --config {params.config} --stars {input.stars}"
-        " --out {output} > {log} 2>&1"
-
-
-use rule psf_bounds as baseline_readings with:
-    input:
-        expand(READINGS, dataset=TABULATED),
-    output:
-        f"{RESULTS}/tables/baseline_readings.csv",
-    log:
-        f"{RESULTS}/logs/benchmark/baseline_readings.log",
-    benchmark:
-        f"{RESULTS}/benchmarks_on_request/readings/all.tsv"
-    message:
-        "Collecting the readings of PCA+SOM"
-
-
-rule readings:
-    input:
-        rules.baseline_readings.output,
-    localrule: True

@@ -16,7 +16,7 @@ rule bank:
         runtime=30,
     params:
         config=lambda w: settings("bank", f"stars={w.stars}"),
-        source=source_hash("bank", chosen=["psfdae.stars.scenes:SeidelScene"]),
+        source=source_hash("bank"),
     message:
         "Simulating the bank of {wildcards.stars}"
     shell:
@@ -110,23 +110,6 @@ rule psf_efficiency:
     shell:
         "psfdae efficiency {params.bounds:q} {params.best:q} --out {output}"
         " {input.methods} > {log} 2>&1"
-
-
-use rule psf_efficiency as psf_efficiency_on_request with:
-    input:
-        bounds=lambda w: expand(
-            rules.dataset_bounds.output.summary, dataset=asked_datasets()
-        ),
-        best=lambda w: expand(
-            rules.dataset_bounds.output.per_star, dataset=asked_datasets()
-        ),
-        methods=lambda w: on_request_of("parquet"),
-    output:
-        f"{RESULTS}/tables/psf_efficiency_on_request.csv",
-    log:
-        f"{RESULTS}/logs/bounds/psf_efficiency_on_request.log",
-    benchmark:
-        f"{RESULTS}/benchmarks_on_request/bounds/psf_efficiency_on_request.tsv"
 
 
 rule paper_rows:

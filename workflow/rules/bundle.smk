@@ -18,7 +18,7 @@ for _method in (m for m in registered() if m.stored and m.bundled):
             mem_mb=max(1500, _method.memory_mb),
         params:
             config=lambda w: settings("bundle", f"dataset={w.dataset}"),
-            source=source_hash("bundle", chosen=[f"psfdae.estimators.{_method.name}"]),
+            source=source_hash("bundle", chosen=[_method.__module__]),
             model=lambda w, m=_method: option_of(m, w.dataset, w.split, w.reference),
             # A model that comes with a package is small.
             size=lambda w: ["--largest-mb=4.8"] * (w.dataset == SHIPPED_DATASET),
@@ -52,7 +52,7 @@ rule shipped:
     localrule: True
     params:
         config=lambda w: settings("ship", f"dataset={SHIPPED_DATASET}"),
-        source=lambda w: source_hash("ship"),
+        source=source_hash("ship"),
         folder="src/psfdae/bundles",
         bundles=lambda w, input: [f"--bundle={file}" for file in input.bundles],
     message:

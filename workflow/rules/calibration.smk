@@ -11,12 +11,7 @@ rule scan:
         runtime=30,
     params:
         config=lambda w: settings("scan", f"dataset={w.dataset}"),
-        source=lambda w: source_hash(
-            "scan",
-            chosen=[
-                f"psfdae.stars.scenes:{dataset_config(w.dataset).scene.name.title()}Scene"
-            ],
-        ),
+        source=source_hash("scan"),
     message:
         "Scanning pixel scales and dynamic ranges for {wildcards.dataset}"
     shell:

@@ -8,14 +8,22 @@ from importlib import import_module
 from snakemake.utils import validate
 
 from psfdae.cli import stage
-from psfdae.configuration.compose import ConfigError, as_overrides, config_dir
-from psfdae.configuration.compose import compose, dataset_names, decisive, load
-from psfdae.configuration.compose import keep_in, load_groups, neutral, overrides_for
-from psfdae.configuration.compose import write_settings
-from psfdae.estimators import HISTORY, method, registered
+from psfdae.settings import ConfigError, as_overrides
+from psfdae_paper.configuration.compose import config_dir
+from psfdae_paper.configuration.compose import compose, dataset_names, decisive, load
+from psfdae_paper.configuration.compose import (
+    keep_in,
+    load_groups,
+    neutral,
+    overrides_for,
+)
+from psfdae_paper.configuration.compose import write_settings
+from psfdae.method import HISTORY
+from psfdae.methods import method
+from psfdae_paper.configuration.methods import registered
 from psfdae.files import DIGESTS, ProductError
-from psfdae.source import source_hash
-from psfdae.sweeps.points import SweepError
+from psfdae_paper.source import source_hash
+from psfdae_paper.sweeps.points import SweepError
 
 keep_in(Path(".snakemake/compositions"))
 validate(config, "../schemas/command_line.schema.yaml")
@@ -60,8 +68,9 @@ def program(name):
 
 def program_code(name, stages):
     """Hash of a command of a program, and of the stages that it runs."""
-    function = f"workflow/benchmarks/{name.replace('.', '.py:')}"
-    return source_hash(function, chosen=stages)
+    return source_hash(
+        f"workflow/benchmarks/{name.partition('.')[0]}.py", chosen=stages
+    )
 
 
 # Stars of an image are not simulated: own_stars.smk.
@@ -107,8 +116,9 @@ def settings(name, /, *choice, more=(), **options):
     Options are those of the command on which it depends what is read.
     """
     program, _, function = name.rpartition(".")
-    spec = (getattr(import_module(program), function) if program else stage(name)).stage
-    reads = spec.reads(**options) if callable(spec.reads) else spec.reads
+    stage_of = getattr(import_module(program), function) if program else stage(name)
+    spec = stage_of.stage.settings
+    reads = spec.of(options)
     if spec.root == "config":
         tree = composed(*choice, more=more)
     else:
@@ -223,16 +233,14 @@ def model_of(method, dataset, split, reference):
     return f"{RESULTS}/{method.place(dataset, split, reference)}"
 
 
-def names_of(dataset, on_request=False):
-    """Names of a dataset's methods, or of those on request."""
-    config = dataset_config(dataset)
-    asked = config.workflow.on_request
-    return [m for m in asked if dataset in asked[m]] if on_request else config.methods
+def names_of(dataset):
+    """Names of a dataset's methods."""
+    return dataset_config(dataset).methods
 
 
-def methods_of(dataset, on_request=False):
+def methods_of(dataset):
     """Methods of a dataset that leave a model."""
-    return [m for m in map(method, names_of(dataset, on_request)) if m.stored]
+    return [m for m in map(method, names_of(dataset)) if m.stored]
 
 
 def files_of(method, dataset, split, reference):
@@ -246,32 +254,32 @@ def option_of(method, dataset, split, reference):
     return f"--{method.name.replace('_', '-')}={place}"
 
 
-def fitted(dataset, split, reference, drawn=False, on_request=False):
+def fitted(dataset, split, reference, drawn=False):
     """Files of all models that restore stars of a split, or of those that figures show."""
-    wanted = [m for m in methods_of(dataset, on_request) if m.drawn or not drawn]
+    wanted = [m for m in methods_of(dataset) if m.drawn or not drawn]
     return [path for m in wanted for path in files_of(m, dataset, split, reference)]
 
 
-def model_options(dataset, split, reference, drawn=False, on_request=False):
+def model_options(dataset, split, reference, drawn=False):
     """Options of a command that takes these models."""
-    wanted = [m for m in methods_of(dataset, on_request) if m.drawn or not drawn]
+    wanted = [m for m in methods_of(dataset) if m.drawn or not drawn]
     return [option_of(m, dataset, split, reference) for m in wanted]
 
 
-def bundles_of(dataset, networks, on_request=False):
+def bundles_of(dataset, networks):
     """Bundles of a dataset's methods, of some splits and references."""
     return [
         f"{RESULTS}/bundles/{dataset}-{split}-{reference}{m.suffix}.psf.safetensors"
-        for m in methods_of(dataset, on_request)
+        for m in methods_of(dataset)
         if m.bundled
         for split, reference in networks
     ]
 
 
-def estimators_source(command, dataset, on_request=False):
+def estimators_source(command, dataset):
     """Hash of a command that applies the methods of a dataset."""
-    names = names_of(dataset, on_request)
-    return source_hash(command, chosen=[f"psfdae.estimators.{name}" for name in names])
+    names = names_of(dataset)
+    return source_hash(command, chosen=[method(name).__module__ for name in names])
 
 
 def fit_threads(dataset):
@@ -290,14 +298,6 @@ def histories_of(dataset):
         for m in trained
         for split, reference in networks_of(dataset)
     }
-
-
-def fresh_stars(method, dataset):
-    """Product with other draws of a dataset's stars, if a method learns from some."""
-    config = dataset_config(dataset)
-    count = method.fresh(config)
-    stars = f"{RESULTS}/data/{config.scene.name}/fresh/{config.stars.name}-{count}.h5"
-    return {"fresh": stars} if count else {}
 
 
 def start_of(method, w):

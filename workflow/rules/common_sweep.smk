@@ -2,10 +2,10 @@ import json
 
 from snakemake.exceptions import WorkflowError
 
-from psfdae.configuration.sweep import TRAINED as SWEPT_NETWORKS
-from psfdae.configuration.sweep import sweep_names
-from psfdae.stages.sweep import ADAPTIVE_MODULE, module_of
-from psfdae.sweeps.points import plan_sweep
+from psfdae_paper.configuration.sweep import TRAINED as SWEPT_NETWORKS
+from psfdae_paper.configuration.sweep import sweep_names
+from psfdae_paper.stages.sweep import ADAPTIVE_MODULE, module_of
+from psfdae_paper.sweeps.points import plan_sweep
 
 SWEEPS = f"{RESULTS}/sweeps"
 SWEEP_FIGURES = ["parallel", "response"]
@@ -61,9 +61,8 @@ def sweep_options(w):
     for name, tree in (("values", point.values), ("keys", point.keys)):
         options.append(f"--{name}={json.dumps(tree, sort_keys=True)}")
     if point.slot is not None:
-        search = json.dumps({**plan.search, "study": plan.study}, sort_keys=True)
+        search = json.dumps(plan.search, sort_keys=True)
         options += [f"--slot={point.slot}", f"--search={search}"]
-        options += [f"--journal={SWEEPS}/{w.sweep}/study.journal"]
         options += [f"--known={other.name}" for other in plan.known(point)]
     return options
 
@@ -73,7 +72,7 @@ def sweep_source(name):
     """Code that a point consists of: its model's, and the search's if there is one."""
     sweep = sweep_plan(name).sweep
     search = [ADAPTIVE_MODULE] if sweep.kind == "adaptive" else []
-    own = [] if sweep.model in SWEPT_NETWORKS else [f"psfdae.estimators.{sweep.model}"]
+    own = [] if sweep.model in SWEPT_NETWORKS else [method(sweep.model).__module__]
     return source_hash("sweep point", chosen=[module_of(sweep.model), *own, *search])
 
 

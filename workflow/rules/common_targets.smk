@@ -1,5 +1,5 @@
-from psfdae.alignment.methods import TRAINED, METHODS
-from psfdae.own_stars.bundle import SUFFIX
+from psfdae_paper.alignment.methods import TRAINED, METHODS
+from psfdae.model.bundle import SUFFIX
 
 with one_line():
     KNEE = import_module("trainings").load_knee()
@@ -25,20 +25,6 @@ def per_star_of(dataset, splits=None):
     """Errors of the methods on single test stars, of all splits unless some are named."""
     return [
         csv.removesuffix(".csv") + ".parquet" for csv in evaluations_of(dataset, splits)
-    ]
-
-
-def asked_datasets():
-    """Datasets that methods on request are fitted to."""
-    return [d for d in default_datasets() if names_of(d, on_request=True)]
-
-
-def on_request_of(suffix):
-    """Evaluations of the methods on request, all fields seen in training."""
-    return [
-        csv.removesuffix("csv") + suffix
-        for dataset in asked_datasets()
-        for csv in evaluations_of(dataset, ["random"], "on_request")
     ]
 
 
@@ -70,21 +56,14 @@ def strictest_dataset(scene):
     )
 
 
-def sharing_stars(dataset):
-    """Number of datasets that are made of the same stars."""
-    stars = dataset_config(dataset).stars.name
-    return sum(dataset_config(d).stars.name == stars for d in ALL_DATASETS)
-
-
 def timed_threads(w):
     """A timing takes as many cores as it may use, so that no other job disturbs it."""
     return dataset_config(ALL_DATASETS[0]).benchmark.threads
 
 
 def every_bundle_of_timed(w):
-    """Bundles of the methods of the timed dataset, those on request, too."""
-    some = [bundles_of(TIMED_DATASET, PACKED, asked) for asked in (False, True)]
-    return sum(some, [])
+    """Bundles of the methods of the timed dataset."""
+    return bundles_of(TIMED_DATASET, PACKED)
 
 
 def rivals_of_shipped(w):

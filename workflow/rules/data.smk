@@ -8,9 +8,7 @@ rule templates:
     threads: lambda w: composed(f"scene={w.scene}")["optics"]["threads"]
     params:
         config=lambda w: settings("templates", f"scene={w.scene}"),
-        source=lambda w: source_hash(
-            "templates", chosen=[f"psfdae.stars.scenes:{w.scene.title()}Scene"]
-        ),
+        source=source_hash("templates"),
     message:
         "Propagating the static PSFs of scene {wildcards.scene}"
     shell:
@@ -32,9 +30,7 @@ rule stars:
         runtime=30,
     params:
         config=lambda w: settings("stars", f"stars={w.stars}"),
-        source=lambda w: source_hash(
-            "stars", chosen=[f"psfdae.stars.scenes:{w.scene.title()}Scene"]
-        ),
+        source=source_hash("stars"),
     message:
         "Simulating the noise-free stars {wildcards.stars}"
     shell:

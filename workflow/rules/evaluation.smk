@@ -25,29 +25,6 @@ rule evaluate:
         " --out {output.summary} > {log} 2>&1"
 
 
-use rule evaluate as evaluate_on_request with:
-    input:
-        stars=lambda w: stars_of(w.dataset),
-        models=lambda w: fitted(w.dataset, w.split, w.reference, on_request=True),
-    output:
-        summary=f"{RESULTS}/on_request/{{dataset}}/{{split}}-{{reference}}.csv",
-        per_star=f"{RESULTS}/on_request/{{dataset}}/{{split}}-{{reference}}.parquet",
-    log:
-        f"{RESULTS}/logs/on_request/{{dataset}}/{{split}}-{{reference}}.log",
-    benchmark:
-        f"{RESULTS}/benchmarks_on_request/evaluate/{{dataset}}/{{split}}-{{reference}}.tsv"
-    params:
-        config=lambda w: settings(
-            "evaluate",
-            f"dataset={w.dataset}",
-            more=(f"methods={names_of(w.dataset, on_request=True)}",),
-        ),
-        source=lambda w: estimators_source("evaluate", w.dataset, on_request=True),
-        models=lambda w: model_options(w.dataset, w.split, w.reference, on_request=True),
-    message:
-        "Evaluating methods on request: {wildcards.dataset}, {wildcards.reference}"
-
-
 rule paper_tables:
     input:
         lambda w: evaluations_of(w.dataset, ["random"]),
@@ -119,16 +96,3 @@ rule psf_metrics:
         "Collecting the metrics of all datasets"
     shell:
         "psfdae collect --out {output} {input} > {log} 2>&1"
-
-
-use rule psf_metrics as psf_metrics_on_request with:
-    input:
-        lambda w: on_request_of("csv"),
-    output:
-        f"{RESULTS}/tables/psf_metrics_on_request.csv",
-    log:
-        f"{RESULTS}/logs/tables/psf_metrics_on_request.log",
-    benchmark:
-        f"{RESULTS}/benchmarks_on_request/psf_metrics/all.tsv"
-    message:
-        "Collecting the metrics of methods on request"

@@ -12,7 +12,7 @@ use rule templates as telescope_templates with:
         mem_mb=1000,
     params:
         config=lambda w: settings("templates", f"dataset={w.stars}"),
-        source=source_hash("templates", chosen=["psfdae.stars.scenes:TelescopeScene"]),
+        source=source_hash("templates"),
     message:
         "Propagating the static PSFs of the telescope of {wildcards.stars}"
 
@@ -34,7 +34,7 @@ use rule stars as telescope_stars with:
         runtime=60,
     params:
         config=lambda w: settings("stars", f"dataset={w.stars}"),
-        source=source_hash("stars", chosen=["psfdae.stars.scenes:TelescopeScene"]),
+        source=source_hash("stars"),
 
 
 rule figure_telescope:

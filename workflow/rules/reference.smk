@@ -11,7 +11,6 @@ rule reference:
         rules.benchmark.input,
         rules.training_knee.input,
         rules.scaling.input,
-        rules.readings.input,
         rules.stability.input,
         rules.bounds.input,
         rules.prediction.input,

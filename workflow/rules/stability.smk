@@ -57,9 +57,7 @@ rule figure_stability:
     benchmark:
         f"{RESULTS}/benchmarks_on_request/stability/figure.tsv"
     params:
-        source=source_hash(
-            *(f"workflow/benchmarks/figures.py:{name}" for name in ("draw", "graded"))
-        ),
+        source=source_hash("workflow/benchmarks/figures.py"),
         program=program("figures.draw"),
     message:
         "Drawing error against stress"

@@ -36,13 +36,6 @@ for _dataset in ALL_DATASETS:
         localrule: True
 
 
-rule on_request:
-    input:
-        rules.psf_metrics_on_request.output,
-        rules.psf_efficiency_on_request.output,
-    localrule: True
-
-
 rule scene3:
     input:
         ALIGNMENT_PRODUCTS,

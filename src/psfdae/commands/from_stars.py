@@ -1,0 +1,270 @@
+"""Stage `from-stars`: from an image and its star list to a model of its own, in one go."""
+
+from __future__ import annotations
+
+import os
+import shlex
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from psfdae.cli import command
+from psfdae.commands.mosaic import each, images_of, with_name
+from psfdae.commands.predict import Stated, write_list
+from psfdae.errors import Error
+from psfdae.figure_style import as_png
+from psfdae.files import (
+    atomic_path,
+    check_outputs,
+    interrupted,
+    write_bytes,
+    write_columns,
+    write_product,
+    write_text,
+)
+from psfdae.image.observation import Source
+from psfdae.method import Method
+from psfdae.methods import method
+from psfdae.model.bundle import SUFFIX
+from psfdae.model.fitting import best, described, fitted_to, makes_models, packed
+from psfdae.model.settings import CHOSEN, Words, of_config
+from psfdae.model.stars import Stars
+from psfdae.model.validation import validate
+from psfdae.options import File, Folder
+from psfdae.settings import ConfigError, as_overrides
+
+LOCK = ".from_stars.lock"
+
+LONGEST_NAME = 255
+"""Bytes of a file's name."""
+
+
+class FolderError(Error, RuntimeError):
+    """The folder holds a model already, or another process is making one there."""
+
+
+@dataclass(frozen=True)
+class Made:
+    """Files that the stage leaves in a folder."""
+
+    path: Path
+    name: str
+    kinds: tuple[type[Method], ...]
+
+    @property
+    def stars(self) -> Path:
+        return self.path / "stars.h5"
+
+    @property
+    def list(self) -> Path:
+        return self.path / "stars.csv"
+
+    def fit(self, kind: type[Method]) -> Path:
+        return self.path / (kind.name if kind.files else f"{kind.name}.h5")
+
+    @property
+    def bundle(self) -> Path:
+        return self.path / f"{self.name}{SUFFIX}"
+
+    def written(self) -> list[Path]:
+        """Files of the folder itself."""
+        names = ("selection.csv", "overrides.txt", "evaluation.csv", "per_star.csv")
+        own = [self.path / name for name in (*names, "report.csv", "report.png")]
+        for kind in self.kinds:
+            own += kind.outputs(self.fit(kind))
+        return [self.stars, self.bundle, *own]
+
+
+@command("from-stars", Words())
+def from_stars(
+    config: Any,
+    image: Annotated[File, {"argument": True}],
+    stated: Stated,
+    name: Annotated[str | None, "Name of the model.  [default: the image's]"] = None,
+    licence: Annotated[str, "Of the model."] = "not stated",
+    taken: Annotated[
+        str | None,
+        {"flag": "--method"},
+        "Method of the model.  [default: that which errs least on validation stars]",
+    ] = None,
+    *,
+    out: Annotated[Folder, "Folder for the model, its report and what they are made of."],
+    page: Annotated[
+        File | None, {"flag": "--report"}, "HTML page that shows whether to trust the model."
+    ] = None,
+    overwrite: Annotated[bool, "Replace a model that the folder holds."] = False,
+) -> None:
+    """Train a model on the bright stars of IMAGE.
+
+    IMAGE is a FITS image with --catalogue or --detect, or a FITS cube of stamps. Some stars choose
+    the method of the model; others are held out and degraded to low S/N to test it.
+    """
+    job = dict(locals())
+    stem = _stem(image, name)
+    if not stated.all_extensions:
+        print(trained(**job))
+    else:
+        jobs = {
+            extension: {
+                **job,
+                "config": config.model_dump(),
+                "stated": of_image,
+                "name": f"{stem}_{extension}",
+                "out": out / extension,
+                "page": with_name(page, extension),
+            }
+            for extension, of_image in images_of(image, stated).items()
+        }
+        each(trained, jobs, image)
+    print(f"next: {shlex.join(_next(image, stated, out, name))}")
+
+
+def trained(
+    config: Any,
+    image: Path,
+    stated: Stated,
+    name: str | None,
+    licence: str,
+    taken: str | None,
+    out: Path,
+    page: Path | None,
+    overwrite: bool,
+) -> str:
+    """Train a model on the stars of one image; how good it is, in a sentence.
+
+    `config` is what `from_stars` receives, or its tree.
+    """
+    source = stated.source(image)
+    settings, kinds, tried = _methods(of_config(config), taken)
+    files = Made(out, _stem(image, name), kinds)
+    made = [*files.written(), *([files.list] if source.detect is not None else []), page]
+    check_outputs(made, source.files())
+    if page is not None and page.exists() and not (overwrite or interrupted(files.bundle)):
+        raise FolderError(f"{page}: exists already; --overwrite replaces it")
+    with _alone(out):
+        finished = sorted(out.glob(f"*{SUFFIX}"))
+        if finished and not overwrite:
+            raise FolderError(f"{finished[0]}: a model is there already; --overwrite replaces it")
+        return _make(settings, source, files, licence, tried, page)
+
+
+def _methods(
+    settings: Any, taken: str | None
+) -> tuple[Any, tuple[type[Method], ...], list[type[Method]]]:
+    """Settings whose methods are those that are measured; the fits, and who may be the model."""
+    # Those that are given a place on the grid of a simulation know none of an image.
+    names = [n for n in settings.methods if method(n).bundled or not method(n).needs_position]
+    if taken is not None:
+        names = [n for n in names if not method(n).stored and n != taken] + [method(taken).name]
+    kinds = tuple(kind for kind in map(method, names) if kind.stored)
+    tried = [kind for kind in kinds if makes_models(kind.name)]
+    if not tried:
+        known = ", ".join(n for n in settings.methods if makes_models(n)) or "none of the list"
+        raise ConfigError(f"methods = {settings.methods}: --method takes one of these: {known}")
+    return settings.model_copy(update={"methods": names}), kinds, tried
+
+
+def _stem(image: Path, name: str | None) -> str:
+    """The name of a model, with which names of its files start; FolderError if they cannot."""
+    name = name or image.name.split(".")[0] or "model"
+    if "/" in name or len(f"{name}{SUFFIX}".encode()) > LONGEST_NAME:
+        said = f"at most {LONGEST_NAME - len(SUFFIX)} bytes, and no folder"
+        raise FolderError(f"--name {name}: expected the start of a file's name, {said}")
+    return name
+
+
+def _next(image: Path, stated: Stated, out: Path, name: str | None) -> list[str]:
+    """The command that applies the models to all stars of their image."""
+    name = _stem(image, name)
+    model = out if stated.all_extensions else Made(out, name, ()).bundle
+    where = ["--model", str(model), "--out", str(out / f"{name}_psf.fits")]
+    return ["psfdae", "predict", str(image), *stated.words(), *where]
+
+
+@contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """Refuse a folder in which another process works; its lock ends with the process.
+
+    A folder that is left empty is removed again.
+    """
+    import fcntl
+
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / LOCK
+    try:
+        with path.open("a") as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                # That of a process which has just ended may be removed, and made anew by a third.
+                mine = os.path.samestat(os.fstat(lock.fileno()), path.stat())
+            except (BlockingIOError, FileNotFoundError):
+                mine = False
+            if not mine:
+                raise FolderError(f"{folder}: another psfdae from-stars works there")
+            try:
+                yield
+            finally:
+                path.unlink(missing_ok=True)
+    finally:
+        with suppress(OSError):
+            folder.rmdir()
+
+
+def _make(
+    settings: Any,
+    source: Source,
+    files: Made,
+    licence: str,
+    tried: list[type[Method]],
+    page: Path | None,
+) -> str:
+    """Make all files; how good the model is, in a sentence."""
+    stars = Stars.of(source, settings)
+    print(*stars.notes, stars.summary(), sep="\n")
+    if source.detect is not None:
+        write_list(stars.observation, files.list)
+    write_columns(files.path / "selection.csv", stars.table.columns, digits=6)
+    write_product(files.stars, "stars", stars.columns, stars.described())
+    write_text(files.path / "overrides.txt", _overrides(stars.settings))
+    fitted = {}
+    for kind in files.kinds:
+        print(f"fitting {kind.label}")
+        place = files.fit(kind)
+        checkpoint = kind.beside(place, "checkpoint.pt")
+        fitted[kind.name] = fitted_to(stars, kind, checkpoint)
+        fitted[kind.name].store(place, described(stars, kind), stars.product)
+        checkpoint.unlink(missing_ok=True)
+    taken = tried[0]
+    if len(tried) > 1:
+        name, errors = best(stars, {kind.name: fitted[kind.name] for kind in tried})
+        taken = method(name)
+        for other, error in errors.items():
+            print(f"{method(other).label}: MSE {error:.3g} on validation stars")
+    print(f"packing {taken.label}")
+    model = packed(stars, fitted[taken.name], files.name, licence)
+    print(
+        "".join(f"{taken.label}: {fact}\n" for fact in fitted[taken.name].facts().values()), end=""
+    )
+    # Its name is the last one to be there: it says that all is done.
+    with atomic_path(files.bundle) as unfinished:
+        model.save(unfinished)
+        print("testing on the stars held out")
+        report = validate(model, stars, fitted)
+        write_columns(files.path / "evaluation.csv", report.evaluation.columns)
+        write_columns(files.path / "per_star.csv", report.per_star.columns)
+        write_columns(files.path / "report.csv", report.table.columns, digits=6)
+        write_bytes(files.path / "report.png", as_png(report.strip()))
+        if page is not None:
+            print(f"writing {page}")
+            report.save(page)
+    return str(report)
+
+
+def _overrides(settings: Any) -> str:
+    """The settings as words of a command line that chooses files of the configuration, too."""
+    return (
+        "\n".join([CHOSEN, *as_overrides(settings.model_dump(exclude={"calibration_stars"}))])
+        + "\n"
+    )

@@ -1,0 +1,505 @@
+"""Star catalogues: FITS tables (also FITS_LDAC), CSV and other text tables, ECSV, SExtractor.
+
+Names of columns (`CONVENTIONS`) are found whatever their case. The origin, the index of
+the centre of the first pixel, is 1 for SExtractor and 0 for photutils; plain x, y are
+written with either (IRAF and DS9 count from 1, numpy and sep from 0): a wrong guess would
+shift every star by a pixel, so there is none. Pixel columns go before sky columns.
+Columns of different programs in one catalogue are not guessed between, either.
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from psfdae.errors import Error
+from psfdae.image.errors import ObservationError, reading, shorten
+from psfdae.image.fits_file import UNPACK, PlainFile, open_hdus, plain_file
+from psfdae.image.stamps import StarFlag, raise_flag
+
+SEXTRACTOR_HEADER = re.compile(r"#\s*(\d+)\s+[A-Za-z_]\w*")
+SEXAGESIMAL = re.compile(r"[:hd\s]", re.IGNORECASE)
+
+MOST_STARS = 5_000_000  # rows of a catalogue
+MOST_COLUMNS = 2000
+LARGEST_TEXT = 2**26  # bytes of a text table; reading takes some ten times as much memory
+LARGEST_ECSV_HEADER = 2**18  # characters; it is YAML and slow to read
+# Characters of all rows of a text table, each as wide as its columns' widest cells: numpy keeps
+# text in columns as wide as their longest cell, and one long cell makes every row as long.
+WIDEST = 2**27
+LONGEST_IDENTIFIER = 200  # characters; each row of the prediction is as long as the longest
+ROWS = 10_000  # rows of a text table that are measured at a time
+
+
+@dataclass(frozen=True)
+class Convention:
+    """Position columns of one program, pairs `x,y` from best to worst."""
+
+    names: str
+    sky: bool = False
+    origin: int | None = None
+    flags: str | None = None  # its column with the bits `FLAGGED`
+
+    @property
+    def pairs(self) -> list[list[str]]:
+        """Both names of every pair."""
+        return [pair.split(",") for pair in self.names.split()]
+
+
+def _each(names: str, sky: bool = False) -> list[Convention]:
+    """A convention for every pair."""
+    return [Convention(pair, sky) for pair in names.split()]
+
+
+CONVENTIONS = [
+    Convention(
+        "XWIN_IMAGE,YWIN_IMAGE XPSF_IMAGE,YPSF_IMAGE XMODEL_IMAGE,YMODEL_IMAGE "
+        "X_IMAGE,Y_IMAGE XPEAK_IMAGE,YPEAK_IMAGE",
+        origin=1,
+        flags="FLAGS",
+    ),
+    Convention("x_fit,y_fit x_centroid,y_centroid xcentroid,ycentroid xcenter,ycenter", origin=0),
+    *_each("x,y xpos,ypos x_pos,y_pos xpix,ypix x_pix,y_pix x_pixel,y_pixel"),
+    Convention(
+        "ALPHAWIN_J2000,DELTAWIN_J2000 ALPHAPSF_J2000,DELTAPSF_J2000 ALPHA_J2000,DELTA_J2000 "
+        "ALPHAWIN_SKY,DELTAWIN_SKY ALPHA_SKY,DELTA_SKY",
+        sky=True,
+        flags="FLAGS",
+    ),
+    *_each(
+        "ra,dec RAJ2000,DEJ2000 RAJ2000,DECJ2000 _RAJ2000,_DEJ2000 RA_ICRS,DE_ICRS "
+        "RA_ICRS,DEC_ICRS ra_deg,dec_deg raMean,decMean radeg,decdeg radeg,dedeg",
+        sky=True,
+    ),
+]
+# SExtractor's bits that say something against a star; 1, a neighbour nearby, is no reason.
+FLAGGED = {2: StarFlag.BLENDED, 4: StarFlag.SATURATED, 8: StarFlag.TRUNCATED}
+# Columns that identify a star; the first of these that a catalogue has is used.
+ID_COLUMNS = ("id", "source_id", "number", "star_id", "objid", "obj_id", "object_id")
+ID_COLUMNS += ("label", "name")
+
+
+class ColumnError(Error, ValueError):
+    """The position columns of a catalogue are missing or not the only ones."""
+
+
+@dataclass(frozen=True)
+class Positions:
+    """Which two columns hold the positions and how to read them."""
+
+    first: str
+    second: str
+    sky: bool
+    origin: int | None
+    flags: str | None
+
+
+def choose_positions(names: Sequence[str]) -> Positions:
+    """Find the position columns among the names of a catalogue, or raise ColumnError."""
+    found = []
+    for convention in CONVENTIONS:
+        for pair in convention.pairs:
+            first, second = (_in_any_case(names, name) for name in pair)
+            if first is not None and second is not None:
+                how = (convention.sky, convention.origin, convention.flags)
+                found.append(Positions(first, second, *how))
+                break
+    found = [where for where in found if not where.sky] or found
+    if not found:
+        raise ColumnError("no position columns")
+    if len(found) > 1:
+        pairs = " or ".join(f"{where.first},{where.second}" for where in found)
+        raise ColumnError(f"ambiguous position columns {pairs}; keep one pair")
+    return found[0]
+
+
+def _in_any_case(names: Sequence[str], wanted: str) -> str | None:
+    same = [name for name in names if name.strip().lower() == wanted.lower()]
+    if len(same) > 1:
+        raise ColumnError(f"columns {' and '.join(same)} differ in their case only; keep one")
+    return same[0] if same else None
+
+
+@dataclass(frozen=True)
+class _FitsTable:
+    """Columns of a FITS table, each read when it is asked for: the others may be large."""
+
+    file: PlainFile
+    index: int
+    colnames: list[str]
+    rows: int
+
+    def __len__(self) -> int:
+        return self.rows
+
+    def __getitem__(self, name: str) -> Any:
+        from astropy.table import Column, MaskedColumn
+        from astropy.units import Unit
+
+        with reading(self.file.name), open_hdus(self.file, memmap=True) as hdus:
+            hdu, place = hdus[self.index], self.colnames.index(name)
+            column = hdu.columns[place]
+            # Arrays of variable length may all be the same bytes of the file: 3 MB unfold to 1 TB.
+            if re.match(r"\d*[PQ]", str(column.format)):
+                raise ObservationError(self.file.name, f"column {name!r} holds arrays, not numbers")
+            values = hdu.data.field(place)
+            unit = column.unit and Unit(column.unit, format="fits", parse_strict="silent")
+            if column.null is None:
+                return Column(values, name, unit=unit, copy=True)
+            return MaskedColumn(values, name, mask=values == column.null, unit=unit, copy=True)
+
+
+@dataclass(frozen=True)
+class Catalogue:
+    """A table of stars; rows keep their order, none is left out."""
+
+    path: Path
+    table: Any
+
+    def __len__(self) -> int:
+        return len(self.table)
+
+    def numbers(self, name: str, strict: bool = True) -> np.ndarray:
+        """A column as float64, shape (n,); NaN where the catalogue has no value.
+
+        A text that is no number is refused, or NaN unless `strict`.
+        """
+        column = self._column(name)
+        if column.ndim != 1:
+            raise ObservationError(self.path, f"column {name!r} holds arrays, not numbers")
+        missing = np.ma.getmaskarray(column) if np.ma.isMaskedArray(column) else None
+        values = np.asarray(np.ma.getdata(column))
+        if values.dtype.kind in "iuf":
+            numbers = values.astype(np.float64)
+        elif values.dtype.kind in "SUO":
+            numbers = self._parsed(name, values, missing, strict)
+        else:
+            raise ObservationError(self.path, f"column {name!r} does not hold numbers")
+        if missing is not None:
+            numbers[missing] = np.nan
+        return numbers
+
+    def coordinates(self, name: str) -> np.ndarray:
+        """As `numbers`, NaN where they are not finite; an error if none is."""
+        numbers = self.numbers(name, strict=False)
+        finite = np.isfinite(numbers)
+        if not finite.any():
+            raise ObservationError(self.path, f"column {name!r} has no finite number in any row")
+        return np.where(finite, numbers, np.nan)
+
+    def flags(self, where: Positions) -> np.ndarray:
+        """What the list's own program says against its stars, as `StarFlag`s, (n,), uint16."""
+        flags = np.zeros(len(self), dtype=np.uint16)
+        if where.flags is not None and where.flags in self.table.colnames:
+            said = np.nan_to_num(self.numbers(where.flags), posinf=0, neginf=0).astype(np.int64)
+            for bit, flag in FLAGGED.items():
+                raise_flag(flags, flag, (said & bit) > 0)
+        return flags
+
+    def positions(self) -> Positions:
+        """The columns with the positions, or an error that lists what would be accepted."""
+        try:
+            return choose_positions(self.table.colnames)
+        except ColumnError as error:
+            accepted = " ".join(f"{a},{b}" for c in CONVENTIONS for a, b in c.pairs)
+            raise ObservationError(
+                self.path, f"{error}; found {shorten(self.table.colnames)}; accepted {accepted}"
+            ) from None
+
+    def sky(self, where: Positions) -> tuple[np.ndarray, np.ndarray]:
+        """Right ascension and declination in degrees, each shape (n,).
+
+        Columns without unit are in degrees; text with colons, blanks or letters is
+        sexagesimal, then right ascensions are in hours. Declinations off the sphere are NaN,
+        and an error if all are.
+        """
+        ra = self._angles(where.first, "hourangle")
+        dec = self._angles(where.second, "deg")
+        on = np.abs(dec) <= 90
+        if not on.any():
+            row = np.flatnonzero(np.isfinite(dec))[0]
+            raise ObservationError(
+                self.path,
+                f"column {where.second!r} is {dec[row]:g}° in row {row + 1}, expected -90 … 90",
+            )
+        return ra, np.where(on, dec, np.nan)
+
+    def identifiers(self) -> np.ndarray:
+        """One identifier per star, int64 or str, shape (n,); row numbers from 0 without any."""
+        for alias in ID_COLUMNS:
+            try:
+                name = self._resolve(alias)
+            except ColumnError:
+                continue
+            column = None if name is None else self._column(name)
+            if column is not None and column.ndim == 1:
+                found = _as_identifiers(column)
+                break
+        else:
+            return np.arange(len(self), dtype=np.int64)
+        if found.dtype.kind == "U" and found.dtype.itemsize > 4 * LONGEST_IDENTIFIER:
+            lengths = np.char.str_len(found)
+            row = lengths.argmax()
+            raise ObservationError(
+                self.path,
+                f"column {name!r} has {lengths[row]} characters in row {row + 1}, "
+                f"an identifier may have {LONGEST_IDENTIFIER}",
+            )
+        return found
+
+    def _resolve(self, wanted: str) -> str | None:
+        """The one column of that name, case aside if it is not written exactly so."""
+        names = self.table.colnames
+        return wanted if wanted in names else _in_any_case(names, wanted)
+
+    def _column(self, name: str) -> Any:
+        try:
+            found = self._resolve(name)
+        except ColumnError as error:
+            raise ObservationError(self.path, str(error)) from None
+        if found is None:
+            raise ObservationError(
+                self.path, f"no column {name!r}; found {shorten(self.table.colnames)}"
+            )
+        column = self.table[found]
+        if not isinstance(column, np.ndarray):
+            raise ObservationError(self.path, f"column {name!r} does not hold plain numbers")
+        return column
+
+    def _parsed(
+        self, name: str, values: np.ndarray, missing: np.ndarray | None, strict: bool
+    ) -> np.ndarray:
+        numbers = np.full(len(values), np.nan)
+        for row, value in enumerate(values):
+            if missing is not None and missing[row]:
+                continue
+            try:
+                numbers[row] = float(_text(value))
+            except ValueError:
+                if not strict:
+                    continue
+                raise ObservationError(
+                    self.path,
+                    f"column {name!r} holds {_text(value)[:40]!r} in row {row + 1}, "
+                    "expected a number",
+                ) from None
+        return numbers
+
+    def _angles(self, name: str, sexagesimal_unit: str) -> np.ndarray:
+        from astropy import units
+        from astropy.coordinates import Angle
+
+        column = self._column(name)
+        values = np.asarray(np.ma.getdata(column))
+        is_text = values.dtype.kind in "SUO"
+        if is_text and column.ndim == 1:
+            there = ~np.ma.getmaskarray(column)
+            texts = [_text(value).strip() for value in values[there]]
+            if any(SEXAGESIMAL.search(text) for text in texts):
+                angles = np.full(len(values), np.nan)
+                with reading(self.path):
+                    angles[there] = Angle(texts, unit=sexagesimal_unit).deg
+                return angles
+        numbers = self.coordinates(name)
+        unit = getattr(column, "unit", None)
+        if unit is None or is_text:
+            return numbers
+        try:
+            return numbers * float(units.Unit(unit).to("deg"))
+        except (units.UnitConversionError, TypeError, ValueError):
+            raise ObservationError(
+                self.path, f"column {name!r} has the unit {str(unit)!r}, expected an angle"
+            ) from None
+
+
+def _text(value: Any) -> str:
+    return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
+
+
+def _as_identifiers(column: Any) -> np.ndarray:
+    values, missing = np.ma.getdata(column), np.ma.getmaskarray(column)
+    if values.dtype.kind in "iuf" and not missing.any():
+        with np.errstate(all="ignore"):
+            whole = values.astype(np.int64)
+        # Unsigned ones beyond the largest signed one come back negative.
+        if (whole.astype(values.dtype) == values).all() and ((whole < 0) == (values < 0)).all():
+            return whole
+    texts = [
+        "" if gone else _text(v).strip() for v, gone in zip(values.tolist(), missing, strict=True)
+    ]
+    return np.array(texts, dtype=str)
+
+
+# Reading.
+
+
+def read_catalogue(path: Path) -> Catalogue:
+    """Read a star catalogue.
+
+    The format follows from the content: a FITS file, of which the LDAC_OBJECTS or
+    the only table is taken; ECSV; the ASCII_HEAD format of SExtractor; or a text
+    table with a line of column names, separated by commas, semicolons, tabs or
+    blanks. Lines that begin with # are comments.
+    """
+    with reading(path), path.open("rb") as file:
+        start = file.read(16)
+        fits = start.startswith((b"SIMPLE  =", *UNPACK))
+        lines = [] if fits else _lines(path, start + file.read(LARGEST_TEXT))
+    table = _fits_table(path) if fits else _text_table(path, lines)
+    if len(table) == 0:
+        raise ObservationError(path, "the catalogue has no stars")
+    return Catalogue(path, table)
+
+
+def as_catalogue(given: Any) -> Catalogue:
+    """A star list from a file, a table, or positions.
+
+    Parameters
+    ----------
+    given : path-like, table, or array of shape (n, 2)
+        A table is one of astropy or pandas, or a mapping of columns, with names as in files
+        (`CONVENTIONS`); positions are (x, y), 0-based.
+    """
+    from astropy.table import Table
+
+    if isinstance(given, str | Path):
+        return read_catalogue(Path(given))
+    path = Path("catalogue")
+    with reading(path):
+        if isinstance(given, np.ndarray) and given.dtype.names is None:
+            if given.ndim != 2 or given.shape[1] != 2:
+                raise ObservationError(path, f"positions of shape {given.shape}, expected (n, 2)")
+            given = {"x_fit": given[:, 0], "y_fit": given[:, 1]}
+        frame = hasattr(given, "to_records")
+        table = Table(given.to_records(index=False) if frame else given)
+    if len(table) == 0:
+        raise ObservationError(path, "the catalogue has no stars")
+    return Catalogue(path, table)
+
+
+def _fits_table(path: Path) -> _FitsTable:
+    from astropy.io import fits
+
+    file = plain_file(path)
+    with reading(path), open_hdus(file, memmap=True) as hdus:
+        tables = [
+            hdu
+            for hdu in hdus
+            if isinstance(hdu, fits.BinTableHDU | fits.TableHDU) and hdu.name != "LDAC_IMHEAD"
+        ]
+        objects = [hdu for hdu in tables if hdu.name == "LDAC_OBJECTS"] or tables
+        if len(objects) != 1:
+            names = shorten([hdu.name or "(no name)" for hdu in objects])
+            raise ObservationError(path, f"expected one table of stars, found {names}")
+        rows = int(objects[0].header["NAXIS2"])
+        size = objects[0].header["NAXIS1"] * rows
+        if objects[0].fileinfo()["datLoc"] + size > file.path.stat().st_size:
+            raise ObservationError(path, "damaged: the table is larger than the file")
+        # A damaged table has columns without a name, or of the same one.
+        names = [str(name or f"col{k}") for k, name in enumerate(objects[0].columns.names, 1)]
+        _check_size(path, rows, len(names))
+        return _FitsTable(file, hdus.index(objects[0]), names, rows)
+
+
+def _check_size(path: Path, rows: int, columns: int) -> None:
+    for what, found, most in (("stars", rows, MOST_STARS), ("columns", columns, MOST_COLUMNS)):
+        if found > most:
+            raise ObservationError(path, f"{found} {what} in a catalogue, at most {most}")
+
+
+def _lines(path: Path, content: bytes) -> list[str]:
+    """Lines of a text file that are not blank."""
+    if not content.strip():
+        raise ObservationError(path, "the catalogue is empty")
+    if len(content) > LARGEST_TEXT:
+        raise ObservationError(
+            path, f"a text table of more than {LARGEST_TEXT} bytes; a FITS table may be larger"
+        )
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise ObservationError(path, "neither a FITS table nor text in UTF-8") from None
+    if "\x00" in text:
+        raise ObservationError(path, "neither a FITS table nor text")
+    return [line for line in text.splitlines() if line.strip()]
+
+
+def _text_table(path: Path, lines: list[str]) -> Any:
+    """Table of the lines, which are gone then: they take twice the memory of the file."""
+    from astropy.io import ascii as text_tables
+
+    rows = _without_comments(lines)
+    if lines[0].startswith("# %ECSV"):
+        kind: dict[str, Any] = {"format": "ecsv"}
+        if sum(map(len, lines)) - sum(map(len, rows)) > LARGEST_ECSV_HEADER:
+            raise ObservationError(
+                path, f"an ECSV header of more than {LARGEST_ECSV_HEADER} characters"
+            )
+    elif SEXTRACTOR_HEADER.match(lines[0]):
+        kind = {"format": "sextractor"}
+        numbered = filter(None, map(SEXTRACTOR_HEADER.match, lines))
+        _check_size(path, 0, max(int(found[1][:9]) for found in numbered))
+    else:
+        lines[:] = rows
+        kind = {"format": "basic", "delimiter": _delimiter(rows)}
+    if not rows:
+        raise ObservationError(path, "the catalogue has no stars")
+    # astropy looks for the end of the quotation through the whole file, many times.
+    if rows[0].count('"') % 2:
+        raise ObservationError(path, "not a text table (a quote without an end in its header)")
+    _check_widths(path, rows)
+    # The line break at the end is what tells a table from the name of a file.
+    text = "\n".join(lines) + "\n"
+    lines.clear()
+    rows.clear()
+    with reading(path):
+        return text_tables.read(text, guess=False, **kind)
+
+
+def _delimiter(rows: list[str]) -> str:
+    return next((c for c in ",;\t" if c in rows[0]), " ") if rows else ","
+
+
+def _check_widths(path: Path, rows: list[str]) -> None:
+    """Refuse a table of which numpy would make far more than it is; see `WIDEST`."""
+    delimiter = _delimiter(rows)
+    columns = len(rows[0].split(None if delimiter == " " else delimiter))
+    _check_size(path, len(rows), columns)
+    widest = [0] * columns
+    for start in range(0, len(rows), ROWS):
+        part = rows[start : start + ROWS]
+        split = map(str.split, part) if delimiter == " " else csv.reader(part, delimiter=delimiter)
+        try:
+            cells = list(split)
+        except csv.Error as error:
+            raise ObservationError(path, f"not a text table ({error})") from None
+        if all(len(row) == columns for row in cells):
+            found = [max(map(len, column)) for column in zip(*cells, strict=True)]
+        else:
+            # Quoted otherwise than we think, or no table at all.
+            found = [max(map(len, part))] * columns
+        widest = list(map(max, widest, found))
+    if len(rows) * sum(widest) > WIDEST:
+        column = max(range(columns), key=widest.__getitem__)
+        raise ObservationError(
+            path,
+            f"column {column + 1} is {widest[column]} characters wide; {len(rows)} rows may have "
+            f"{WIDEST // len(rows)} characters in all columns",
+        )
+
+
+def _without_comments(lines: list[str]) -> list[str]:
+    """Lines of the table; a comment right before numbers without a header is the header."""
+    table = [line for line in lines if not line.lstrip().startswith("#")]
+    if not table:
+        return []
+    before = lines[: lines.index(table[0])]
+    if before and not any(c.isalpha() for c in table[0].replace("e", "").replace("E", "")):
+        return [before[-1].lstrip("# \t"), *table]
+    return table

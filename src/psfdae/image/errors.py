@@ -1,0 +1,90 @@
+"""The one error of files that observers bring, and their texts made fit to be shown."""
+
+from __future__ import annotations
+
+import threading
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from psfdae.errors import Error
+
+LONGEST = 160
+"""Characters of a library's message that are passed on."""
+
+FORMULA = ("=", "+", "-", "@", "\t", "\r")
+"""First characters of what a spreadsheet takes for a formula and executes."""
+
+
+def one_line(text: object) -> str:
+    """The text without line breaks and characters that do not print."""
+    words = " ".join(str(text).split())
+    return "".join(c if c.isprintable() else "?" for c in words)
+
+
+def ascii_line(text: object) -> str:
+    """The same in the characters that FITS headers hold, others as question marks."""
+    return one_line(text).encode("ascii", "replace").decode()
+
+
+def no_formula(text: str) -> str:
+    """The text, with an apostrophe before it if a spreadsheet would execute it; numbers stay."""
+    if not text.startswith(FORMULA):
+        return text
+    try:
+        float(text)
+    except ValueError:
+        return "'" + text
+    return text
+
+
+def shorten(names: list[str], most: int = 20) -> str:
+    """A list of names for a message, cut after `most`."""
+    more = f", … ({len(names)} in all)" if len(names) > most else ""
+    return ", ".join(name[:40] for name in names[:most]) + more if names else "none"
+
+
+class ObservationError(Error, ValueError):
+    """An input file cannot be used; one line that names the file."""
+
+    def __init__(self, path: str | Path, problem: str) -> None:
+        super().__init__(one_line(f"{path}: {problem}"))
+
+
+_ONE_AT_A_TIME = threading.RLock()
+"""Filters of warnings belong to the process; threads would restore each other's."""
+
+
+@contextmanager
+def reading(path: str | Path) -> Iterator[None]:
+    """Around calls of astropy on a file of unknown content: silent, and one kind of error.
+
+    Only such calls belong inside. On damaged files astropy raises a dozen kinds of
+    errors (struct, index, key, assertion, zlib, …) that no list would complete.
+    """
+    from astropy import log
+
+    with _ONE_AT_A_TIME, warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore")
+        level = log.level
+        log.setLevel("CRITICAL")
+        try:
+            yield
+        except ObservationError:
+            raise
+        except FileNotFoundError:
+            raise ObservationError(path, "no such file") from None
+        except IsADirectoryError:
+            raise ObservationError(path, "a folder, not a file") from None
+        except PermissionError:
+            raise ObservationError(path, "no permission to read it") from None
+        except MemoryError:
+            raise ObservationError(path, "does not fit into memory") from None
+        except Exception as error:
+            what = one_line(error)[:LONGEST] or type(error).__name__
+            raise ObservationError(path, f"damaged or of a wrong format ({what})") from error
+        finally:
+            log.setLevel(level)

@@ -1,0 +1,683 @@
+"""An observation: the stars of one FITS file, described and ready to be streamed as stamps.
+
+| input | stamps | positions |
+|---|---|---|
+| cube (n, s, s), or one stamp (s, s) | their middle | from the catalogue, row by row, or NaN |
+| image (h, w) and a catalogue | cut at the rounded position | of the catalogue |
+| image (h, w) to be searched | the same | of the stars found (`detection`) |
+
+Whatever is wrong with a file ends in one `ObservationError` of one line that names it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from psfdae.image.catalogue import Catalogue, Positions, as_catalogue
+from psfdae.image.detection import Sky, sky_of
+from psfdae.image.errors import ObservationError, reading, shorten
+from psfdae.image.fits_file import (
+    READ_NOISE_KEYS,
+    SATURATION_KEYS,
+    Card,
+    ImageFile,
+    Pixels,
+    Said,
+    array_image,
+    find_image,
+    open_pixels,
+)
+from psfdae.image.stamps import Stamps, StarFlag, cut, raise_flag, sky_around
+
+FAR = 2**30  # positions are clipped to ± this many pixels, far off any image
+NEAR = 1.0  # stars farther off by this many image sizes are not corrected for distortion
+ASSUMED_SCALE = 1.0  # arcseconds per pixel where nothing says it
+FARTHEST_OFF = 1.0  # px, per axis, of the stars of a list from its positions, in the median
+FEWEST_OFF = 5  # stars of which that is said
+SEEN = 2.0  # σ above the sky from which a position of a list is on a source
+COLOURS = (3, 4)  # planes of a colour image, the fourth for luminance or transparency
+LARGEST_STAMP_PX = 256  # of a model; a margin of stamps is small beside it
+RING_PX = 8  # around a stamp, at least: there the noise of the sky is that of no star
+HASHED_ROWS = 256  # of an image, or stamps of a cube, that are read at a time for its checksum
+SAME_PX = 0.1  # nearer to each other than this, two rows of a list are one star
+
+
+@dataclass(frozen=True)
+class Source:
+    """A FITS file with stars, and what is stated about it."""
+
+    image: Path | np.ndarray  # cube of stamps, or image
+    catalogue: Any = None  # of an image, as `as_catalogue` takes it; of a cube, row by row
+    detect: float | None = None  # in its place: σ above the sky from which stars are searched
+    extension: str | int | None = None  # with the stars
+    on_image: bool = False  # stars of the catalogue that are off the image are left out
+    origin: int | None = None  # of the catalogue's pixels; by default that of its program
+    # Extension, file or array as large as the image; or a mask (d, d) for all of a cube.
+    mask: str | int | Path | np.ndarray | None = None
+    bad_bits: int | None = None  # of the mask; any by default
+    weight: str | int | Path | np.ndarray | None = None  # 1/σ² of every pixel, but for a factor
+    variance: str | int | Path | np.ndarray | None = None  # σ² in its place
+    pixel_scale_arcsec: float | None = None  # what is given goes before the header
+    gain: float | None = None  # electrons per count
+    read_noise: float | None = None  # electrons
+    saturate: float | None = None  # counts
+    flux_column: str | None = None  # of the catalogue: fluxes that are not to be estimated
+    background_column: str | None = None  # the same for sky levels per pixel
+    accept_offset: bool = False  # of the catalogue's positions from the stars
+
+    @property
+    def path(self) -> Path:
+        """The image's file, or what an array is called in messages."""
+        return self.image if isinstance(self.image, Path) else Path("array")
+
+    def files(self) -> tuple[Any, ...]:
+        """All that is read."""
+        return (self.image, self.catalogue, self.mask, self.weight, self.variance)
+
+    def open(self, stamp_px: int, margin: int = 0) -> Observation:
+        """Check all that can be checked without reading pixels.
+
+        Pixels are read to find stars, and where there is a map of noise. Stamps get a margin
+        of so many pixels, those of a cube as many of these as they have.
+        """
+        self._check(stamp_px, margin)
+        image = find_image(self.image, self.extension)
+        shape = image.shape
+        is_cube = self._is_cube(image, stamp_px)
+        given = self.catalogue is not None or self.origin is not None
+        if self.detect is not None and (is_cube or given):
+            raise ObservationError(
+                self.path, "--detect takes an image, no cube; no list, and no origin of one"
+            )
+        camera = self._camera(image)
+        layers = self._layers(image, is_cube, camera)
+        table = None if self.catalogue is None else as_catalogue(self.catalogue)
+        listed = None if table is None else table.path
+        if self.detect is not None or layers.noise is not None:
+            sky = layers.sky()
+            if layers.noise is not None:
+                layers = replace(layers, noise_scale=sky.noise_scale)
+            table = table if self.detect is None else self._detected(sky)
+        count = len(table) if table is not None else shape[0] if len(shape) == 3 else 1
+        identifiers = np.arange(count, dtype=np.int64)
+        positions, flags = None, np.zeros(count, dtype=np.uint16)
+        if table is not None:
+            where = table.positions()
+            positions = self._positions(image, table, where, is_cube)
+            identifiers, flags = table.identifiers(), table.flags(where)
+        known = (self._column(table, c, count) for c in (self.flux_column, self.background_column))
+        columns = [identifiers, *known, flags]
+        if self.on_image and positions is not None and not is_cube:
+            kept = _inside(positions, shape)
+            columns, positions = [column[kept] for column in columns], positions[kept]
+        return Observation(
+            self.path,
+            len(columns[0]),
+            stamp_px,
+            margin=min(margin, (shape[-1] - stamp_px) // 2) if is_cube else margin,
+            shape=None if is_cube else shape,
+            camera=camera,
+            positions=positions,
+            header_cards=image.provenance(),
+            catalogue=listed,
+            found=table if self.detect is not None else None,
+            _columns=columns,
+            _layers=layers,
+        )
+
+    def _check(self, stamp_px: int, margin: int) -> None:
+        if stamp_px < 1:
+            raise ObservationError(self.path, f"stamp size {stamp_px}, expected at least 1 pixel")
+        if margin < 0:
+            raise ObservationError(self.path, f"margin {margin}, expected at least 0 pixels")
+        if self.origin not in (None, 0, 1):
+            raise ObservationError(
+                self.path, f"origin {self.origin!r} of pixel coordinates, expected 0 or 1"
+            )
+        for name, value in (*self._given().items(), ("threshold", self.detect)):
+            if value is not None and not (math.isfinite(value) and value > 0):
+                raise ObservationError(self.path, f"{name} {value!r}, expected a number above 0")
+
+    def _is_cube(self, image: ImageFile, stamp_px: int) -> bool:
+        shape = image.shape
+        _refuse_colours(image)
+        if len(shape) == 2 and (self.catalogue is not None or self.detect is not None):
+            return False
+        square = shape[-2] == shape[-1] >= stamp_px
+        if square and (len(shape) == 3 or shape[-1] == stamp_px):
+            return True
+        size = f"{shape[-2]}×{shape[-1]}"
+        if len(shape) == 2:
+            raise ObservationError(
+                image.path, f"an image of {size} pixels needs a star catalogue, or --detect"
+            )
+        raise ObservationError(
+            image.path, f"stamps of {size} pixels, expected {stamp_px}×{stamp_px} pixels or larger"
+        )
+
+    def _positions(
+        self, image: ImageFile, table: Catalogue, where: Positions, is_cube: bool
+    ) -> np.ndarray | None:
+        """Positions (n, 2) of the catalogue's stars; None for a cube if they are on the sky.
+
+        NaN in rows without one.
+        """
+        if is_cube and len(table) != image.shape[0]:
+            raise ObservationError(
+                table.path, f"{len(table)} stars for the {image.shape[0]} stamps of {image.path}"
+            )
+        if where.sky and is_cube:
+            return None
+        if where.sky:
+            ra, dec = table.sky(where)
+            if image.wcs is None:
+                raise ObservationError(
+                    image.path,
+                    f"no usable celestial WCS, which the sky coordinates {where.first},"
+                    f"{where.second} of {table.path} need",
+                )
+            with reading(image.path):
+                positions = np.stack(sky_to_pixel(image.wcs, ra, dec, image.shape), axis=1)
+        else:
+            origin = where.origin if self.origin is None else self.origin
+            if origin is None:
+                raise ObservationError(
+                    table.path,
+                    f"the origin of columns {where.first},{where.second} must be stated: "
+                    "is the centre of the first pixel 0 or 1?",
+                )
+            columns = [table.coordinates(name) for name in (where.first, where.second)]
+            positions = np.stack(columns, axis=1) - origin
+        # What is beyond any image is no position: its squares would not even be numbers.
+        positions = np.where(np.abs(positions) < FAR, positions, np.nan)
+        if not is_cube:
+            _check_overlap(image, table, positions)
+        return positions
+
+    def _given(self) -> dict[str, float | None]:
+        return {
+            "pixel scale": self.pixel_scale_arcsec,
+            "gain": self.gain,
+            "read noise": self.read_noise,
+            "saturation": self.saturate,
+        }
+
+    def _camera(self, image: ImageFile) -> dict[str, Said]:
+        """What is given, else what the WCS and the headers say, and who says it."""
+        scale = image.scale()
+        if image.wcs is not None:
+            with reading(image.path):
+                found = pixel_scale(image.wcs)
+            scale = (found, "WCS") if math.isfinite(found) and found > 0 else scale
+        saturation, noise = map(image.positive, (SATURATION_KEYS, READ_NOISE_KEYS))
+        headers = dict(zip(self._given(), (scale, image.gain(), noise, saturation), strict=True))
+        given = {name: (v, "given") for name, v in self._given().items() if v is not None}
+        return headers | given
+
+    def _layers(self, image: ImageFile, is_cube: bool, camera: dict[str, Said]) -> Layers:
+        mask = None if self.mask is None else _find_beside(image, self.mask, "a mask")
+        if self.bad_bits is not None and mask is None:
+            raise ObservationError(self.path, "bits are given, but no mask that has them")
+        gain, read_noise = (camera[name][0] for name in ("gain", "read noise"))
+        least = read_noise / gain if read_noise and gain else 0.0
+        maps = {"a weight map": self.weight, "a variance map": self.variance}
+        given = [(what, place) for what, place in maps.items() if place is not None]
+        if not given:
+            return Layers(image, mask, self.bad_bits, least_noise=least)
+        if len(given) > 1 or is_cube:
+            raise ObservationError(
+                self.path, "an image takes one map of weight or variance, a cube of stamps none"
+            )
+        what, place = given[0]
+        noise = _find_beside(image, place, what)
+        inverse = self.weight is not None
+        with open_pixels(noise, whole=True) as pixels:
+            values = pixels[:]
+        wrong, empty = np.count_nonzero(values < 0), np.count_nonzero(values == 0)
+        if wrong or (empty and not inverse):
+            raise ObservationError(
+                noise.path,
+                f"{what} of which {wrong + (not inverse) * empty} of {values.size} pixels are not "
+                f"{'at least' if inverse else 'above'} 0; NaN is for bad pixels, or a mask",
+            )
+        return Layers(image, mask, self.bad_bits, noise, inverse, empty, least_noise=least)
+
+    def _detected(self, sky: Sky) -> Catalogue:
+        """The stars of an image."""
+        from astropy.table import Table
+
+        with reading(self.path):
+            table = Table(sky.stars(self.detect))
+        if len(table) == 0:
+            raise ObservationError(self.path, f"no star {self.detect:g} σ above the sky")
+        return Catalogue(self.path, table)
+
+    def _column(self, table: Catalogue | None, name: str | None, count: int) -> np.ndarray:
+        """A numeric column of the catalogue, NaN where it has no value or is not asked for."""
+        if name is None:
+            return np.full(count, np.nan)
+        if table is None:
+            raise ObservationError(self.path, f"no catalogue is given to take {name!r} from")
+        return table.numbers(name)
+
+
+def _refuse_colours(image: ImageFile) -> None:
+    """Refuse an image with a plane for each colour; a few large planes are no stamps of stars."""
+    shape = image.shape
+    if len(shape) != 3:
+        return
+    first, last = shape[0] in COLOURS, shape[-1] in COLOURS
+    stamps = max(shape[-2:]) <= LARGEST_STAMP_PX
+    if last or (first and not stamps):
+        plane, size = ("[0]", shape[1:]) if first else ("[..., 0]", shape[:-1])
+        raise ObservationError(
+            image.path,
+            f"{shape[0] if first else shape[-1]} planes of {size[0]}×{size[1]} pixels, as of a "
+            "colour image; a PSF belongs to one colour: write one plane to a file of its own, "
+            f"such as astropy.io.fits.getdata(…){plane}, or their sum",
+        )
+
+
+def _check_overlap(image: ImageFile, table: Catalogue, positions: np.ndarray) -> None:
+    rows, columns = image.shape
+    found = np.count_nonzero(_inside(positions, image.shape))
+    if found > rows * columns:
+        raise ObservationError(
+            table.path,
+            f"{found} stars are on the image {image.path} of {columns} columns and {rows} rows, "
+            "more than it has pixels",
+        )
+    if found:
+        return
+    with np.errstate(all="ignore"):
+        known = positions[np.isfinite(positions).all(axis=1)]
+        ranges = "nowhere in its projection"
+        if len(known):
+            (x0, y0), (x1, y1) = known.min(axis=0), known.max(axis=0)
+            ranges = f"at x {x0:.6g} … {x1:.6g}, y {y0:.6g} … {y1:.6g}"
+    raise ObservationError(
+        table.path,
+        f"none of the {len(table)} stars is on the image {image.path} of {columns} columns "
+        f"and {rows} rows; they are {ranges}",
+    )
+
+
+def list_offset(path: Path | None, off: np.ndarray, accept: bool) -> str | None:
+    """What is said of a list of which the stars are `off` (n, 2), x and y, its positions.
+
+    Rows that are not known are left out; None if there are few, or no list. ObservationError says
+    that they are farther off than `FARTHEST_OFF`, unless that is to be accepted.
+    """
+    known = off[~np.isnan(off).any(axis=1)]
+    if path is None or len(known) < FEWEST_OFF:
+        return None
+    (x, y), distance = np.median(known, axis=0), np.median(np.abs(known), axis=0)
+    said = (
+        f"stars are off its positions by x {x:+.2f}, y {y:+.2f} px in the median, half of them "
+        f"by more than {distance[0]:.2f}, {distance[1]:.2f} px either way ({len(known)} stars)"
+    )
+    if (distance > FARTHEST_OFF).any() and not accept:
+        raise ObservationError(
+            path,
+            f"{said}: a list of another image or origin, or x and y exchanged? --accept-offset "
+            "takes it as it is",
+        )
+    return f"{path}: {said}"
+
+
+def _inside(positions: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Which positions (n, 2), x and y, are on an image (rows, columns)."""
+    place = central_pixel(positions[:, ::-1])
+    return ((place >= 0) & (place < shape)).all(axis=1)
+
+
+def _find_beside(image: ImageFile, place: Any, what: str) -> ImageFile:
+    """An extension, or another file, with a pixel for every one of the image."""
+    array = isinstance(place, np.ndarray)
+    outside = isinstance(place, Path) or (isinstance(place, str) and Path(place).is_file())
+    if image.values is not None and not (array or outside):
+        raise ObservationError(image.path, f"{what} of an array is an array, too, or a file")
+    if array:
+        found = array_image(np.asarray(place, dtype=np.float64), what)
+    else:
+        found = find_image(Path(place)) if outside else find_image(image.file, place)
+    wanted = image.shape
+    if found.shape != wanted and not (len(wanted) == 3 and found.shape == wanted[1:]):
+        sizes = ["×".join(str(n) for n in shape) for shape in (found.shape, wanted)]
+        raise ObservationError(found.path, f"{what} of {sizes[0]} pixels, expected {sizes[1]}")
+    return found
+
+
+@dataclass(frozen=True)
+class Layers:
+    """An image, what lies beside it, and how that is read."""
+
+    image: ImageFile
+    mask: ImageFile | None = None
+    bad_bits: int | None = None
+    noise: ImageFile | None = None  # weight or variance
+    inverse: bool = False  # weight
+    empty: int = 0  # pixels of the weight 0, which are bad
+    noise_scale: float = 1.0  # of σ by this map
+    least_noise: float = 0.0  # counts; the read noise
+
+    @contextmanager
+    def open(self, whole: bool) -> Iterator[tuple[Any, Any, Any]]:
+        """Pixels of the image, the mask and the map of noise, None for what there is not."""
+        with ExitStack() as files:
+            # Bits of whole numbers do not fit into the mantissa of a float32.
+            kinds = ((self.image, np.float32), (self.mask, np.float64), (self.noise, np.float32))
+            yield tuple(
+                image and files.enter_context(open_pixels(image, whole=whole, dtype=dtype))
+                for image, dtype in kinds
+            )  # type: ignore[misc]
+
+    def bad(self, values: np.ndarray) -> np.ndarray:
+        """Which pixels the mask calls bad; those without a value are."""
+        if self.bad_bits is None:
+            return values != 0
+        with np.errstate(invalid="ignore"):  # what is beyond any number has no bits
+            return (np.nan_to_num(values, nan=-1).astype(np.int64) & self.bad_bits) != 0
+
+    def sigma(self, values: np.ndarray) -> np.ndarray:
+        """σ of pixels by the map, NaN where it has none."""
+        with np.errstate(all="ignore"):
+            variance = 1.0 / values if self.inverse else values
+            known = np.isfinite(variance) & (variance > 0)
+        return self.noise_scale * np.sqrt(np.where(known, variance, np.nan))
+
+    def sky(self) -> Sky:
+        """The image as a whole with its sky."""
+        everything = (slice(None), slice(None))
+        with self.open(whole=True) as (pixels, mask, noise):
+            image = pixels[everything]
+            bad = ~np.isfinite(image)
+            sigma = None
+            if mask is not None:
+                bad |= self.bad(mask[everything])
+            if noise is not None:
+                sigma = self.sigma(noise[everything])
+                bad |= np.isnan(sigma)
+        with reading(self.image.path):
+            try:
+                return sky_of(image, bad, sigma, self.least_noise)
+            except ValueError:  # nothing to measure the sky on
+                problem = "too few pixels of the image have a value that is not masked"
+                raise ObservationError(self.image.path, problem) from None
+
+
+@dataclass(frozen=True)
+class Observation:
+    """Stars of one FITS file. `Source.open` makes it."""
+
+    path: Path
+    count: int  # of stars, none is ever left out
+    stamp_px: int
+    margin: int  # pixels around each stamp
+    shape: tuple[int, ...] | None  # (rows, columns) of the image, None for a cube
+    camera: dict[str, Said]  # given, of the WCS, or of the header, in this order, and which
+    positions: np.ndarray | None  # (n, 2), 0-based x, y; NaN where neither list nor WCS has one
+    header_cards: list[Card]  # provenance to copy into what is made of the stars
+    catalogue: Path | None  # the star list
+    found: Catalogue | None  # that made in its place
+    _columns: list[np.ndarray] = field(repr=False)  # identifiers, flux, sky and flags of the list
+    _layers: Layers = field(repr=False)
+
+    @property
+    def pixel_scale_arcsec(self) -> float | None:
+        return self.camera["pixel scale"][0]
+
+    @property
+    def gain(self) -> float | None:
+        """Electrons per count."""
+        return self.camera["gain"][0]
+
+    @property
+    def saturate(self) -> float | None:
+        """Counts from which a pixel is saturated."""
+        return self.camera["saturation"][0]
+
+    @property
+    def least_noise(self) -> float:
+        """Read noise in counts; 0 where it or the gain is not known."""
+        return self._layers.least_noise
+
+    @property
+    def scale_assumed(self) -> bool:
+        return self.camera["pixel scale"][1] == "assumed"
+
+    def assuming(self) -> Observation:
+        """The same with `ASSUMED_SCALE` if nothing says the scale."""
+        if self.pixel_scale_arcsec is not None:
+            return self
+        return replace(self, camera=self.camera | {"pixel scale": (ASSUMED_SCALE, "assumed")})
+
+    def said(self) -> str:
+        """What is known of the camera and who says it, in words."""
+        units = ("arcsec", "electrons per count", "electrons", "counts")
+        words = []
+        for (name, (value, origin)), unit in zip(self.camera.items(), units, strict=True):
+            words.append(f"{name} {origin if value is None else f'{value:.6g} {unit} ({origin})'}")
+        said = f"{self.path}: {', '.join(words)}"
+        if empty := self._layers.empty:
+            said += f"\n{self._layers.noise.path}: weight 0, bad pixels: {empty}"  # type: ignore
+        lost = self.without_position()
+        if lost.any():
+            rows = shorten([str(row + 1) for row in np.flatnonzero(lost)])
+            said += f"\n{self.catalogue}: no position in row {rows}: flagged, and not learnt from"
+        return said
+
+    def without_position(self) -> np.ndarray:
+        """Which stars have no position though the list has others, bool, shape (n,)."""
+        if self.positions is None or self.found is not None:
+            return np.zeros(self.count, dtype=bool)
+        return ~np.isfinite(self.positions).all(axis=1)
+
+    def check_list(self) -> None:
+        """Refuse a star list of another image, and one with a star twice.
+
+        At least half of its positions must be on a source.
+        """
+        from scipy.spatial import cKDTree
+
+        if self.shape is None or self.catalogue is None:
+            return
+        known = np.flatnonzero(np.isfinite(self.positions).all(axis=1))
+        pairs = cKDTree(self.positions[known]).query_pairs(SAME_PX, output_type="ndarray")
+        if len(pairs):
+            one, other = known[pairs[np.lexsort(pairs.T[::-1])[0]]] + 1
+            raise ObservationError(
+                self.catalogue,
+                f"rows {one} and {other} are the same star; {len(pairs)} such pairs in all",
+            )
+        sky = self._layers.sky()
+        with reading(self.path):
+            seen = int(sky.covered(*central_pixel(self.positions.T), SEEN).sum())
+        if seen < 0.5 * known.size:
+            raise ObservationError(
+                self.catalogue,
+                f"{seen} of {known.size} positions are on a source of {self.path}, at least half "
+                "are expected: a list of another image, or with stars too faint for this one?",
+            )
+
+    def sha256(self) -> str:
+        """SHA-256 of all pixels of the image or cube, as float32."""
+        digest = hashlib.sha256()
+        with open_pixels(self._layers.image, whole=False) as pixels:
+            for start in range(0, pixels.image.shape[0], HASHED_ROWS):
+                digest.update(pixels[slice(start, start + HASHED_ROWS)].tobytes())
+        return digest.hexdigest()
+
+    def with_margin(self, margin: int) -> Observation:
+        """The same with stamps of so wide a margin, those of a cube as far as they have it."""
+        return replace(self, margin=margin if self.shape else min(margin, self.margin))
+
+    def chunks(self, rows: int) -> Iterator[Stamps]:
+        """Stream the stars in their order, at most `rows` at a time.
+
+        Only the pixels of a chunk are read. Tile-compressed cubes are decompressed
+        chunk by chunk, tile-compressed images once per call, to a temporary file.
+        """
+        if rows < 1:
+            raise ValueError(f"rows is {rows}, expected at least 1")
+        stamps_of = self._of_cube if self.shape is None else self._of_image
+        with self._layers.open(whole=self.shape is not None) as opened:
+            for start in range(0, self.count, rows):
+                part = slice(start, min(start + rows, self.count))
+                yield self._stamps(part, *stamps_of(part, *opened))
+
+    def _of_cube(
+        self, part: slice, pixels: Pixels, mask: Pixels | None, _: None
+    ) -> tuple[np.ndarray, ...]:
+        """Pixels, which of them are masked, which stars are truncated, and their noise."""
+        side, count = self.stamp_px + 2 * self.margin, part.stop - part.start
+        data = cut(_rows(pixels, part), side)
+        masked = np.zeros(data.shape, dtype=bool)
+        if mask is not None:
+            each = part if len(mask.image.shape) == 3 else slice(0, 1)
+            masked |= self._layers.bad(cut(_rows(mask, each), side))
+        return data, masked, np.zeros(count, dtype=bool), np.full(count, np.nan)
+
+    def _of_image(
+        self, part: slice, pixels: Pixels, mask: Pixels | None, noise: Pixels | None
+    ) -> tuple[np.ndarray, ...]:
+        x, y = self.positions[part].T
+        wide = max(self.margin, RING_PX)
+        where = (self.shape, x, y, self.stamp_px, wide)
+        data, inside, truncated = cut_image(pixels, *where)
+        masked = ~inside
+        if mask is not None:
+            masked |= self._layers.bad(cut_image(mask, *where)[0])
+        own = slice(wide - self.margin, wide + self.stamp_px + self.margin)
+        if noise is not None:
+            sigma = self._layers.sigma(cut_image(noise, *where)[0])
+            masked |= np.isnan(sigma)
+            each = np.ma.array(sigma, mask=masked)[:, own, own]
+            level = np.ma.median(each, axis=(1, 2)).filled(np.nan).astype(float)
+        else:
+            # In the stamp of a bright star, light that no PSF explains would pass for noise.
+            _, level = sky_around(data, masked | ~np.isfinite(data), self.stamp_px)
+            level = np.where(level > 0, np.maximum(level, self.least_noise), np.nan)
+        return data[:, own, own], masked[:, own, own], truncated, level
+
+    def _stamps(
+        self,
+        part: slice,
+        data: np.ndarray,
+        masked: np.ndarray,
+        truncated: np.ndarray,
+        noise: np.ndarray,
+    ) -> Stamps:
+        if self.saturate is None:
+            saturated = np.zeros(data.shape, dtype=bool)
+        else:
+            saturated = data >= self.saturate  # +inf is, NaN is not
+        finite = np.isfinite(data)
+        if not finite.all():
+            data[~finite] = 0.0
+            masked |= ~finite
+        unknown = np.full(len(data), np.nan)
+        x, y = (unknown, unknown) if self.positions is None else self.positions[part].T
+        gain = unknown if self.gain is None else np.full(len(data), self.gain)
+        listed = np.full((len(data), 2), np.nan)
+        if self.shape is not None:
+            listed = np.stack([y - central_pixel(y), x - central_pixel(x)], axis=1)
+        ids, flux, background, flags = (column[part].copy() for column in self._columns)
+        raise_flag(flags, StarFlag.TRUNCATED, truncated)
+        known = (flux, background, noise, gain, listed)
+        return Stamps(data, masked, saturated, flags, ids, x, y, *known)
+
+
+def _rows(pixels: Pixels, part: slice) -> np.ndarray:
+    """Stamps of a cube; a 2-d image counts as a cube of one."""
+    return pixels[part] if len(pixels.image.shape) == 3 else pixels[slice(None)][None]
+
+
+def central_pixel(position: np.ndarray) -> np.ndarray:
+    """The pixel in which a 0-based position lies, int64; −`FAR` where it is NaN.
+
+    Pixel k covers k − ½ ≤ position < k + ½.
+    """
+    rounded = np.floor(np.nan_to_num(position, nan=-FAR, posinf=FAR, neginf=-FAR) + 0.5)
+    return np.clip(rounded, -FAR, FAR).astype(np.int64)
+
+
+def cut_image(
+    pixels: Any, shape: tuple[int, int], x: np.ndarray, y: np.ndarray, stamp_px: int, margin: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Cut a stamp around each star, with the star's pixel at index d//2 + margin.
+
+    Parameters
+    ----------
+    pixels : array-like of that shape, indexed once with arrays of rows and columns
+    x, y : ndarray, shape (n,)
+        0-based positions; NaN is off the image.
+    stamp_px, margin : int
+        d, and pixels added on every side.
+
+    Returns
+    -------
+    stamps : ndarray, shape (n, d + 2·margin, d + 2·margin), 0 off the image
+    inside : ndarray of bool, the same shape: the pixel is on the image
+    truncated : ndarray of bool, shape (n,): a pixel of the stamp, margin aside, is not
+    """
+    side = np.arange(stamp_px + 2 * margin) - stamp_px // 2 - margin
+    rows = central_pixel(y)[:, None] + side
+    columns = central_pixel(x)[:, None] + side
+    row_inside = (rows >= 0) & (rows < shape[0])
+    column_inside = (columns >= 0) & (columns < shape[1])
+    stamps = pixels[
+        np.clip(rows, 0, shape[0] - 1)[:, :, None], np.clip(columns, 0, shape[1] - 1)[:, None, :]
+    ]
+    inside = row_inside[:, :, None] & column_inside[:, None, :]
+    stamp = slice(margin, margin + stamp_px)
+    truncated = ~(row_inside[:, stamp].all(axis=1) & column_inside[:, stamp].all(axis=1))
+    if not inside.all():
+        stamps = np.where(inside, stamps, 0)
+    return stamps, inside, truncated
+
+
+def pixel_scale(wcs: Any) -> float:
+    """Side in arcseconds of a square as large as a pixel at the reference point."""
+    from astropy.wcs.utils import proj_plane_pixel_area
+
+    return float(np.sqrt(proj_plane_pixel_area(wcs))) * 3600.0
+
+
+def sky_to_pixel(
+    wcs: Any, ra: np.ndarray, dec: np.ndarray, shape: tuple[int, ...]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Positions of stars in an image (rows, columns) from their ICRS coordinates in degrees.
+
+    0-based x and y, shape (n,); NaN for stars that the projection cannot show. Distortions
+    are inverted by iteration, and only for stars near the image: far from it their
+    polynomials fold back, and a star degrees away would seem to be in the image (Shupe et
+    al. 2005, ASP Conf. 347, 491 define them for the image).
+    """
+    from astropy.coordinates import SkyCoord
+    from astropy.wcs import NoConvergence
+    from astropy.wcs.utils import skycoord_to_pixel
+
+    stars = SkyCoord(ra, dec, unit="deg")
+    x, y = (np.array(v, dtype=np.float64) for v in skycoord_to_pixel(stars, wcs, mode="wcs"))
+    rows, columns = shape
+    near = (np.abs(x - columns / 2) < (0.5 + NEAR) * columns) & (
+        np.abs(y - rows / 2) < (0.5 + NEAR) * rows
+    )
+    if wcs.has_distortion and near.any():
+        try:
+            x[near], y[near] = skycoord_to_pixel(stars[near], wcs, mode="all")
+        except NoConvergence as error:
+            solution = np.array(error.best_solution, dtype=np.float64)
+            if error.divergent is not None:
+                solution[error.divergent] = np.nan
+            x[near], y[near] = solution.T
+    return x, y

@@ -1,0 +1,414 @@
+"""Which stars of an image are good enough to learn the PSF from.
+
+Everything works on stamps (n, s, s) somewhat wider than those of the network. The
+star of a stamp lies near index (s//2, s//2).
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, fields
+from enum import StrEnum
+from itertools import repeat
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from psfdae.errors import Error
+from psfdae.image.errors import no_formula
+from psfdae.image.observation import Observation
+from psfdae.image.stamps import Stamps, StarFlag, cut, peaks, sky_around
+from psfdae.noise import SHIFT_ORDER
+
+if TYPE_CHECKING:
+    from astropy.table import Table
+
+    from psfdae.settings import CalibrationStars, Stamp
+
+ROWS = 2048  # stars that are measured at a time
+REGISTRATION_ROUNDS = 10  # of the windowed centroid; each leaves less than a fifth of the distance
+COMPANIONS = 12  # nearest stars with which a star is compared
+DEFECT = 6.0  # pixels this many σ below the sky are defects; they are raised to that
+# Photons per pixel of the new noise, at least: no rate of photons is negative, and the deepest
+# pixel of a star that is made fainter has B − DEFECT √B at most.
+LEAST_SKY, MOST_SKY = 2.0 * DEFECT**2, 1e12
+CORE_PX = 8  # or half of the stamp, if that is more: no place for a faint neighbour
+LOCAL = 1.2  # the worst pixels of good stars scatter more than their stamps as a whole
+# Stars are saturated if at least so many have brightest pixels that agree to this part, which is
+# less of their light, by this factor, than in stars at least so bright.
+PILE, PILE_WIDTH, PILE_SHARPNESS, PILE_FROM = 3, 0.03, 0.9, 0.1
+
+
+class CalibrationStarsError(Error, ValueError):
+    """An image has too few stars to learn from, or its settings contradict each other."""
+
+
+class Verdict(StrEnum):
+    """Why a star is not used; the first reason that applies."""
+
+    GOOD = "good"
+    NO_POSITION = "no position"
+    INCOMPLETE = "incomplete"  # pixels off the image, masked or not finite
+    SATURATED = "saturated"
+    BLENDED = "blended"  # by the star list
+    FAINT = "faint"
+    OFF_CENTRE = "off centre"
+    CROWDED = "crowded"
+    MISFIT = "misfit"  # unlike its neighbours: a blend, a galaxy, a cosmic ray
+
+
+@dataclass(frozen=True)
+class BrightStars:
+    """Stars that are good enough to learn from."""
+
+    wide: np.ndarray  # (n, s, s), sky-subtracted stamps with a margin, counts
+    peak: np.ndarray  # (n, 2), brightest pixel (row, column) from index (s//2, s//2)
+    centre: np.ndarray  # (n, 2), centroid from the same index
+    position: np.ndarray  # (n, 2), x, y in the image, NaN where unknown
+    flux: np.ndarray  # (n,), counts inside the stamp
+    noise: np.ndarray  # (n,), RMS of the sky per pixel in counts
+    snr: np.ndarray  # (n,)
+    row: np.ndarray  # (n,), of the catalogue
+    listed: np.ndarray  # (n, 2), centre by the catalogue from index (s//2, s//2), NaN if unknown
+
+    def __len__(self) -> int:
+        return len(self.wide)
+
+    def of(self, chosen: np.ndarray) -> BrightStars:
+        """Some of the stars, by a mask or by indices."""
+        return BrightStars(*(getattr(self, field.name)[chosen] for field in fields(self)))
+
+    def area(self) -> np.ndarray:
+        """Noise-equivalent area A = (F / (σ S/N))² of each star in pixels, shape (n,)."""
+        return (self.flux / (self.noise * self.snr)) ** 2
+
+    def aligned(self) -> np.ndarray:
+        """The stars of flux 1, moved to a common centre, index (s//2, s//2); shape (n, s, s)."""
+        return moved(self.wide, -self.centre) / self.flux[:, None, None]
+
+    def sky_photons(self, gain: float | None, otherwise: float) -> float:
+        """Photons per pixel whose Poisson noise is the sky's, read noise included.
+
+        From the electrons per count; `otherwise` where they are unknown. At most `MOST_SKY`, beside
+        which no star has photons that count.
+        """
+        if gain is None:
+            return otherwise
+        return float(np.clip(np.median(self.noise) * gain, LEAST_SKY**0.5, MOST_SKY**0.5) ** 2)
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """What is known of all n stars of an observation, and the bright ones among them."""
+
+    id: np.ndarray
+    position: np.ndarray  # (n, 2), x, y, NaN where unknown
+    snr: np.ndarray
+    noise: np.ndarray  # RMS of the sky in counts per pixel
+    sky: np.ndarray  # its level, likewise
+    brightest: np.ndarray  # pixel of the star in counts, sky included; -inf off centre
+    highest: np.ndarray  # pixel of the stamp, likewise; -inf if none can be used
+    verdict: np.ndarray  # a `Verdict` for every star
+    bright: BrightStars  # the good ones
+
+    def count(self) -> str:
+        """How many stars there are of every verdict, in words."""
+        found = Counter(self.verdict.tolist())
+        return ", ".join(f"{found[v]} {v}" for v in map(str, Verdict) if found[v])
+
+    def table(self, held_out: np.ndarray) -> Table:
+        """Every star of the catalogue, and which of the good ones are held out."""
+        from astropy.table import Table
+
+        part = np.full(len(self.verdict), "", dtype="<U8")
+        part[self.bright.row] = np.where(held_out, "held out", "training")
+        return Table(
+            {
+                "id": self.id if self.id.dtype.kind == "i" else [no_formula(n) for n in self.id],
+                "x": self.position[:, 0],
+                "y": self.position[:, 1],
+                "snr": self.snr,
+                "verdict": self.verdict,
+                "part": part,
+            }
+        )
+
+
+def collect(observation: Observation, settings: CalibrationStars, framing: Stamp) -> Candidates:
+    """Measure all stars and choose those that are good enough to learn from.
+
+    The observation has stamps with a margin (a cube: its own, larger ones), of which only
+    those of bright stars are kept in memory. CalibrationStarsError says that there are
+    fewer good ones than `calibration_stars.stars_min`.
+    """
+    observation.check_list()
+    least = observation.least_noise
+    measured = [_measure(chunk, settings, framing, least) for chunk in observation.chunks(ROWS)]
+    columns, kept = zip(*measured, strict=True)
+    found = {key: np.concatenate([c[key] for c in columns]) for key in columns[0]}
+    side, verdict, noise, snr = framing.stamp_px, found["verdict"], found["noise"], found["snr"]
+    row = np.flatnonzero(verdict == Verdict.GOOD)
+    if observation.saturate is None:
+        flat = found["highest"] >= piled_up(found["brightest"], found["sky"], snr * noise)
+        verdict[flat & (verdict == Verdict.GOOD)] = Verdict.SATURATED
+    close = crowded(found["position"], snr * noise, settings.isolation_px, settings.neighbour_ratio)
+    verdict[close & (verdict == Verdict.GOOD)] = Verdict.CROWDED
+    verdict[observation.without_position()] = Verdict.NO_POSITION
+    wide, peak, listed = (np.concatenate([k[i] for k in kept]) for i in range(3))
+    wide = np.maximum(wide, -DEFECT * noise[row, None, None])
+    flux = cut(wide, side, peak).sum(axis=(1, 2))
+    verdict[row[flux <= 0]] = Verdict.MISFIT
+    good = verdict[row] == Verdict.GOOD
+    wide, peak, listed, flux, row = (a[good] for a in (wide, peak, listed, flux, row))
+    centre = star_centres(wide, peak, window_of(snr[row], flux, noise[row]))
+    bright = BrightStars(
+        wide, peak, centre, found["position"][row], flux, noise[row], snr[row], row, listed
+    )
+    score = misfit(cut(bright.aligned(), side), bright.position, bright.noise / bright.flux)
+    verdict[row[score > settings.misfit]] = Verdict.MISFIT
+    result = Candidates(**found, bright=bright.of(score <= settings.misfit))
+    if len(result.bright) < settings.stars_min:
+        raise CalibrationStarsError(
+            f"{observation.path}: {len(result.bright)} stars are good enough to learn from, "
+            f"calibration_stars.stars_min = {settings.stars_min} are needed "
+            f"(of {len(verdict)}: {result.count()})"
+        )
+    return result
+
+
+def _measure(
+    chunk: Stamps, settings: CalibrationStars, framing: Stamp, least_noise: float
+) -> tuple[dict[str, np.ndarray], tuple[np.ndarray, ...]]:
+    """Columns for all stars of a chunk; stamps, peaks and listed centres of the bright ones."""
+    side = framing.stamp_px
+    level, noise = sky_around(chunk.data, chunk.bad, side)
+    noise = np.where(np.isfinite(chunk.noise), chunk.noise, np.maximum(noise, least_noise))
+    wide = np.where(chunk.bad, 0.0, chunk.data - level[:, None, None])
+    reach = min(settings.search_px, (wide.shape[-1] - 5) // 2)
+    peak, centred = brightest_pixels(wide, reach)
+    needed = side + 2 * min(reach + framing.jitter_px + 1, (wide.shape[-1] - side) // 2)
+    snr = signal_to_noise(cut(wide, side), noise)
+    verdict = np.full(len(chunk), Verdict.GOOD, dtype="<U16")
+
+    def said(flag: StarFlag) -> np.ndarray:
+        return (chunk.flags & np.uint16(flag)) > 0
+
+    for reason, stars in (
+        (Verdict.OFF_CENTRE, ~centred),
+        (Verdict.FAINT, snr < settings.snr_min),
+        (Verdict.BLENDED, said(StarFlag.BLENDED)),
+        (Verdict.SATURATED, cut(chunk.saturated, side).any(axis=(1, 2)) | said(StarFlag.SATURATED)),
+        (Verdict.INCOMPLETE, cut(chunk.bad, needed).any(axis=(1, 2)) | said(StarFlag.TRUNCATED)),
+    ):
+        verdict[stars] = reason
+    columns = {
+        "id": chunk.id,
+        "position": np.stack([chunk.x, chunk.y], axis=1),
+        "snr": snr,
+        "noise": noise,
+        "sky": level,
+        "brightest": level + np.where(centred, _at(wide, peak), -np.inf),
+        "highest": cut(np.where(chunk.bad, -np.inf, chunk.data), side).max(axis=(1, 2)),
+        "verdict": verdict,
+    }
+    good = verdict == Verdict.GOOD
+    return columns, (wide[good], peak[good], chunk.listed[good])
+
+
+def _at(wide: np.ndarray, peak: np.ndarray) -> np.ndarray:
+    """Pixels of stamps (n, s, s) at (row, column) from index (s//2, s//2), shape (n,)."""
+    row, column = (peak + wide.shape[-1] // 2).T
+    return wide[np.arange(len(wide)), row, column]
+
+
+def piled_up(brightest: np.ndarray, sky: np.ndarray, brightness: np.ndarray) -> float:
+    """Counts, of six digits, from which brightest pixels of stars pile up; infinite if none do.
+
+    Stars of the same brightness have the same brightest pixels, too. Of those that are cut
+    off, the brightest pixel is less of the star than in others.
+
+    Parameters
+    ----------
+    brightest : ndarray, shape (n,)
+        Pixel of every star, counts, sky included.
+    sky, brightness : ndarray, shape (n,)
+        Level in counts, and light of the star in any unit.
+    """
+    height = brightest - sky
+    top = height.max(initial=0.0)
+    piled = height >= (1.0 - PILE_WIDTH) * top
+    others = (height >= PILE_FROM * top) & ~piled
+    if top <= 0 or piled.sum() < PILE or not others.any():
+        return np.inf
+    sharpness = height / np.where(brightness > 0, brightness, 1.0)
+    if np.median(sharpness[piled]) > PILE_SHARPNESS * np.median(sharpness[others]):
+        return np.inf
+    return _rounded_down(float(brightest[piled].min()))
+
+
+def _rounded_down(value: float) -> float:
+    """Six digits, so that a level that is printed is the one that is meant."""
+    unit = 10.0 ** (np.floor(np.log10(value)) - 5) if value > 0 else 1.0
+    return float(f"{np.floor(value / unit * (1 + 1e-12)) * unit:.6g}")
+
+
+def signal_to_noise(stamps: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """S/N of a filter matched to the star itself, √(Σx²/σ² − P), shape (n,).
+
+    For an image x = F p the expectation of Σx² is F²Σp² + Pσ², and F/(σ √A) with
+    the noise-equivalent area A = 1/Σp² is what stays (King 1983, PASP 95, 163). No
+    PSF has to be known. 0 where the noise is 0.
+
+    Parameters
+    ----------
+    stamps : ndarray, shape (n, d, d)
+        Sky-subtracted.
+    noise : ndarray, shape (n,)
+        RMS σ of a pixel.
+    """
+    power = np.square(stamps, dtype=np.float64).sum(axis=(1, 2))
+    safe = np.where(noise > 0, noise, np.inf)
+    return np.sqrt(np.maximum(power / safe**2 - stamps[0].size, 0.0))
+
+
+def crowded(
+    position: np.ndarray, brightness: np.ndarray, distance_px: float, ratio: float
+) -> np.ndarray:
+    """Stars with a neighbour of at least `ratio` of their brightness nearby, bool, shape (n,).
+
+    Parameters
+    ----------
+    position : ndarray, shape (n, 2)
+        In pixels; a star at NaN has no neighbours.
+    brightness : ndarray, shape (n,)
+    distance_px, ratio : float
+    """
+    from scipy.spatial import cKDTree
+
+    known = np.flatnonzero(np.isfinite(position).all(axis=1))
+    out = np.zeros(len(position), dtype=bool)
+    pairs = known[cKDTree(position[known]).query_pairs(distance_px, output_type="ndarray")]
+    for one, other in ((pairs[:, 0], pairs[:, 1]), (pairs[:, 1], pairs[:, 0])):
+        out[one[brightness[other] >= ratio * brightness[one]]] = True
+    return out
+
+
+def brightest_pixels(wide: np.ndarray, search_px: int) -> tuple[np.ndarray, np.ndarray]:
+    """Brightest pixel near the middle of every stamp.
+
+    Parameters
+    ----------
+    wide : ndarray, shape (n, s, s)
+    search_px : int
+        Searched within ± this of the middle.
+
+    Returns
+    -------
+    peak : ndarray of int, shape (n, 2)
+        (row, column) from index (s//2, s//2).
+    inside : ndarray of bool, shape (n,)
+        Whether no pixel just outside the search window is brighter.
+    """
+    middle, reach = wide.shape[-1] // 2, search_px + 1
+    near = slice(middle - reach, middle + reach + 1)
+    peak = peaks(wide[:, near, near]) - reach
+    return peak, np.abs(peak).max(axis=1, initial=0) <= search_px
+
+
+def star_centres(wide: np.ndarray, peak: np.ndarray, window_px: np.ndarray) -> np.ndarray:
+    """Centroids under a Gaussian window that follows the star (Bertin's XWIN), shape (n, 2).
+
+    Parameters
+    ----------
+    wide : ndarray, shape (n, s, s)
+        Sky-subtracted.
+    peak : ndarray, shape (n, 2)
+        Where to start, (row, column) from index (s//2, s//2).
+    window_px : ndarray, shape (n,)
+        σ of the window, about that of the star.
+
+    Returns
+    -------
+    ndarray, shape (n, 2)
+        (row, column) from index (s//2, s//2), at most 1.5 px per axis from `peak`.
+    """
+    axis = np.arange(wide.shape[-1]) - wide.shape[-1] // 2
+    centre = peak.astype(np.float64)
+    width = window_px[:, None] ** 2
+    for _ in range(REGISTRATION_ROUNDS):
+        rows, columns = (axis - centre[:, i : i + 1] for i in (0, 1))
+        weight = np.exp(-0.5 * rows**2 / width)[:, :, None]
+        light = weight * np.exp(-0.5 * columns**2 / width)[:, None, :] * wide
+        total = light.sum(axis=(1, 2))
+        moments = [np.einsum("nij,ni->n", light, rows), np.einsum("nij,nj->n", light, columns)]
+        # A window as wide as the star halves the distance of the centroid, hence the 2.
+        step = 2.0 * np.stack(moments, axis=1) / np.where(total > 0, total, np.inf)[:, None]
+        centre = np.clip(centre + step, peak - 1.5, peak + 1.5)
+    return centre
+
+
+def window_of(snr: np.ndarray, flux: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """σ in pixels of the Gaussian with the noise-equivalent area of a star, shape (n,).
+
+    A = (F / (σ_noise · S/N))² = 4π σ²; at least 0.7 px.
+    """
+    area = (flux / (noise * snr)) ** 2
+    return np.maximum(np.sqrt(area / (4.0 * np.pi)), 0.7)
+
+
+def moved(wide: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    """Stamps (n, s, s) moved by (row, column) pixels, splines of `SHIFT_ORDER`."""
+    from scipy import ndimage
+
+    out = np.empty(wide.shape)
+    for image, step, target in zip(wide, shift, out, strict=True):
+        ndimage.shift(image, step, target, order=SHIFT_ORDER, mode="nearest")
+    return out
+
+
+def misfit(aligned: np.ndarray, position: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """How unlike its neighbours each star is, in what is usual in this image, shape (n,).
+
+    A star is compared with the nearest `COMPANIONS` stars, pixel by pixel: its
+    difference from their median in units of their robust scatter, root mean square
+    over the stamp, or over the worst 3 × 3 pixels of its core: a close companion and a core that is
+    flat or hollow are no more than that. Where the PSF varies, so do the neighbours; a
+    companion or a cosmic ray lies where they agree. The median star has 1, in its worst
+    pixels 1/`LOCAL`.
+
+    Parameters
+    ----------
+    aligned : ndarray, shape (n, d, d)
+        Of flux 1, moved to a common centre.
+    position : ndarray, shape (n, 2)
+        In the image; all stars are neighbours where a position is not finite.
+    noise : ndarray, shape (n,)
+        RMS of a pixel over the flux.
+    """
+    from scipy import ndimage
+    from scipy.spatial import cKDTree
+
+    count = len(aligned)
+    if count < 4:
+        return np.ones(count)
+    if np.isfinite(position).all() and count > COMPANIONS:
+        near = cKDTree(position).query(position, k=COMPANIONS + 1)[1]
+        usual = (_usual(aligned[found[found != star]]) for star, found in enumerate(near))
+    else:
+        usual = repeat(_usual(aligned), count)
+    score, side = np.empty((count, 2)), aligned.shape[-1]
+    core = min(side, max(side // 2, CORE_PX))
+    for star, (median, variance) in enumerate(usual):
+        square = (aligned[star] - median) ** 2 / (variance + noise[star] ** 2)
+        patches = ndimage.uniform_filter(square, 3)[None]
+        score[star] = square.mean(), cut(patches, core).max()
+    score = np.sqrt(score)
+    return (score / np.median(score, axis=0) / (1.0, LOCAL)).max(axis=1)
+
+
+def _usual(stars: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Median and robust variance of every pixel of some stars."""
+    median = np.median(stars, axis=0)
+    scatter = 1.4826 * np.median(np.abs(stars - median), axis=0)
+    # A dozen stars may agree in a pixel by chance.
+    return median, scatter**2 + np.median(scatter) ** 2

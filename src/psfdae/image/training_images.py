@@ -1,0 +1,205 @@
+"""Stars of an image as training data: bright ones are what the faint ones look like.
+
+A bright star is its own template. Moved by fractions of a pixel it is seen at every
+phase of the pixel grid, moved by whole pixels it learns of centring errors, and new
+noise makes it a faint star as often as one likes. Every star is a field point of its
+own, so the split `held_out` keeps whole stars from the training, all their images
+included; those stars are used as they are.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from psfdae.files import Column
+from psfdae.image.selection import BrightStars, brightest_pixels, moved
+from psfdae.image.stamps import cut
+from psfdae.splits import draw_jitter, draw_phase
+
+if TYPE_CHECKING:
+    from psfdae.settings import Parts, Stamp
+
+IMAGES_AT_A_TIME = 512  # made before they are framed; bounds the memory
+
+
+def star_grid(position: np.ndarray) -> np.ndarray:
+    """Stars on a square lattice that keeps their order in the image.
+
+    Columns of equally many stars follow each other in x, the stars of a column in y.
+    The pattern of `psfdae_paper.stars.fields.held_out_fields` then takes every fifth star,
+    evenly over the field.
+
+    Parameters
+    ----------
+    position : ndarray, shape (n, 2)
+        (x, y); the order of the stars counts where a position is not finite.
+
+    Returns
+    -------
+    ndarray of int, shape (n, 2)
+        (ix, iy) of every star.
+    """
+    count = len(position)
+    rows = max(1, round(np.sqrt(count)))
+    known = np.isfinite(position).all()
+    by_x = np.argsort(position[:, 0], kind="stable") if known else np.arange(count)
+    grid = np.empty((count, 2), dtype=np.int64)
+    for column, start in enumerate(range(0, count, rows)):
+        members = by_x[start : start + rows]
+        if known:
+            members = members[np.argsort(position[members, 1], kind="stable")]
+        grid[members] = np.stack([np.full(members.size, column), np.arange(members.size)], axis=1)
+    return grid
+
+
+def star_of_images(held_out: np.ndarray, train: int, test: int) -> np.ndarray:
+    """Star of every image, shape (images,): the training stars, then those held out.
+
+    So many images are wanted to train and to test, but at least one of each star; each
+    star of a part comes as often as the others, or once more.
+    """
+    parts = ((np.flatnonzero(~held_out), train), (np.flatnonzero(held_out), test))
+    return np.concatenate([np.resize(stars, max(wanted, stars.size)) for stars, wanted in parts])
+
+
+def bins_of(position: np.ndarray, bins: int) -> np.ndarray:
+    """Which of bins × bins parts of the field every star is in, ix + bins·iy, shape (n,).
+
+    Where a position (n, 2) is not finite, all stars are in the first part.
+    """
+    if not np.isfinite(position).all():
+        return np.zeros(len(position), dtype=np.int64)
+    low, high = position.min(axis=0), position.max(axis=0)
+    share = (position - low) / np.where(high > low, high - low, 1.0)
+    place = np.minimum((share * bins).astype(np.int64), bins - 1)
+    return place[:, 0] + bins * place[:, 1]
+
+
+def stacks(aligned: np.ndarray, snr: np.ndarray, part: np.ndarray, parts: int) -> np.ndarray:
+    """Mean star of every part of the field, weighted by signal to noise, (parts, s, s).
+
+    The weight is S/N and not its square, so that one very bright star is not all of
+    its part. A part without stars gets the stack of all.
+
+    Parameters
+    ----------
+    aligned : ndarray, shape (n, s, s)
+    snr : ndarray, shape (n,)
+    part : ndarray of int, shape (n,)
+    parts : int
+    """
+    everyone = np.average(aligned, axis=0, weights=snr)
+    out = np.broadcast_to(everyone, (parts, *everyone.shape)).copy()
+    for index in np.unique(part):
+        mine = part == index
+        out[index] = np.average(aligned[mine], axis=0, weights=snr[mine])
+    return out
+
+
+def templates_of(stars: BrightStars, held_out: np.ndarray, bins: int) -> np.ndarray:
+    """Template of every star: the stack of the training stars of its part of the field.
+
+    Returns
+    -------
+    ndarray, shape (n, s, s)
+        Centre at index (s//2, s//2), flux 1 inside the stamp.
+    """
+    part = bins_of(stars.position, bins)
+    training = stars.of(~held_out)
+    return stacks(training.aligned(), training.snr, part[~held_out], bins**2)[part]
+
+
+def single_psf(stars: BrightStars, held_out: np.ndarray) -> np.ndarray:
+    """The stack of all training stars, (s, s), centre at index (s//2, s//2)."""
+    training = stars.of(~held_out)
+    everyone = np.zeros(len(training), dtype=int)
+    return stacks(training.aligned(), training.snr, everyone, 1)[0]
+
+
+def make_images(
+    stars: BrightStars,
+    template: np.ndarray,
+    star: np.ndarray,
+    framing: Stamp,
+    subpixel: np.ndarray,
+    rng: np.random.Generator,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Frame stars as the network will see them, at new sub-pixel phases where asked for.
+
+    Every star has its brightest pixel at (d/2, d/2), moved by a random jitter, and
+    the sum 1. A template lies at its star's phase, in the same pixels.
+
+    Parameters
+    ----------
+    stars : BrightStars
+    template : ndarray, shape (n_stars, s, s)
+        Centre at index (s//2, s//2).
+    star : ndarray of int, shape (n,)
+        Star of every image.
+    framing : Stamp
+        Its `stamp_px` and `jitter_px` count.
+    subpixel : ndarray of bool, shape (n,)
+        Images of stars that are moved by up to ± ½ pixel; the others are not interpolated.
+    rng : Generator
+
+    Returns
+    -------
+    realisation, template : ndarray, shape (n, d, d), float32
+    jitter : ndarray of int, shape (n, 2)
+        Centring error (row, column) in pixels.
+    phase : ndarray, shape (n, 2)
+        Part of a pixel (row, column) by which the star was moved.
+    """
+    side = framing.stamp_px
+    phase = np.where(subpixel[:, None], draw_phase(star.size, rng), 0.0)
+    jitter = draw_jitter(star.size, framing.jitter_px, rng)
+    realisations, templates = np.empty((2, star.size, side, side), np.float32)
+    reach = int(np.abs(stars.peak).max()) + 1
+    for start in range(0, star.size, IMAGES_AT_A_TIME):
+        rows = slice(start, start + IMAGES_AT_A_TIME)
+        who, wide = star[rows], stars.wide[star[rows]]
+        wide[subpixel[rows]] = moved(wide[subpixel[rows]], phase[rows][subpixel[rows]])
+        offset = brightest_pixels(wide, reach)[0] - jitter[rows]
+        shifted = moved(template[who], stars.centre[who] + phase[rows])
+        for source, target in ((wide, realisations), (shifted, templates)):
+            stamp = cut(source, side, offset)
+            target[rows] = stamp / stamp.sum(axis=(1, 2), keepdims=True)
+    return realisations, templates, jitter, phase
+
+
+def training_columns(
+    bright: BrightStars,
+    grid: np.ndarray,
+    held_out: np.ndarray,
+    bins: int,
+    framing: Stamp,
+    parts: Parts,
+    rng: np.random.Generator,
+) -> dict[str, Column]:
+    """Columns of the product "stars": images of bright stars, and what is known of these.
+
+    `grid` (n, 2) is their place (`star_grid`); stars of each of `bins`² parts of the field
+    are stacked.
+    """
+    star = star_of_images(held_out, parts.train_stars, parts.test_stars)
+    template = templates_of(bright, held_out, bins)
+    subpixel = ~held_out[star] & framing.subpixel
+    images, templates, jitter, phase = make_images(bright, template, star, framing, subpixel, rng)
+    wide = (bright.wide / bright.flux[:, None, None]).astype(np.float32)
+    return {
+        "template": Column(templates, "1", "stack of the star's part of the field, sum 1"),
+        "realisation": Column(images, "1", "the star itself, sum 1"),
+        "field_index": Column(star, "1", "star that the image shows"),
+        "grid": Column(grid, "1", "place (ix, iy) of every star in the order of x and y"),
+        "jitter": Column(jitter, "pixel", "centring error (row, column)"),
+        "phase": Column(phase, "pixel", "(row, column) that splines moved the star"),
+        "position": Column(bright.position, "pixel", "(x, y) of every star, 0-based"),
+        "snr": Column(bright.snr, "1", "signal to noise of every star"),
+        "noise": Column(bright.noise / bright.flux, "1", "pixel RMS over flux of every star"),
+        "row": Column(bright.row, "1", "row of every star in the catalogue"),
+        "wide": Column(wide, "1", "the bright stars with a margin, of flux 1"),
+        "peak": Column(bright.peak, "pixel", "brightest pixel (row, column) from the middle's"),
+        "listed": Column(bright.listed, "pixel", "centre by the catalogue, likewise"),
+    }

@@ -1,0 +1,78 @@
+"""The methods that there are: modules of `psfdae.methods`, and of packages that join it.
+
+Another distribution adds methods by an entry point of the group `psfdae.methods`, whose value is
+the name of a package of such modules.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from importlib import import_module
+from importlib.metadata import entry_points
+from importlib.util import find_spec
+from pkgutil import iter_modules
+from typing import Annotated
+
+from pydantic import AfterValidator, Field
+
+from psfdae.files import ProductError
+from psfdae.method import Method
+
+OWN = "psfdae.methods"
+
+
+def method(name: str) -> type[Method]:
+    """The method of a name.
+
+    Raises
+    ------
+    ProductError
+        If there is none.
+    """
+    found = _of_module(f"{OWN}.{name}") or _joined().get(name)
+    if found is None:
+        raise ProductError(f"no method {name!r}; there are {', '.join(k.name for k in known())}")
+    return found
+
+
+@cache
+def known() -> tuple[type[Method], ...]:
+    """All methods, the package's own first."""
+    own = [_of_module(f"{OWN}.{name}") for name in _modules(OWN)]
+    return (*filter(None, own), *_joined().values())
+
+
+@cache
+def _joined() -> dict[str, type[Method]]:
+    packages = [point.value for point in entry_points(group="psfdae.methods")]
+    found = [_of_module(f"{package}.{name}") for package in packages for name in _modules(package)]
+    return {kind.name: kind for kind in found if kind}
+
+
+def _modules(package: str) -> list[str]:
+    return sorted(module.name for module in iter_modules(import_module(package).__path__))
+
+
+def _of_module(module: str) -> type[Method] | None:
+    """The method whose class a module defines; None if it defines none, or is absent."""
+    if not (module.rpartition(".")[2].isidentifier() and find_spec(module)):
+        return None
+    kinds = [k for k in vars(import_module(module)).values() if isinstance(k, type)]
+    own = [k for k in kinds if issubclass(k, Method) and k.__module__ == module]
+    return own[0] if own else None
+
+
+def groups_of(name: str, **options: object) -> tuple[str, ...]:
+    """Groups of settings that decide a fit of a method."""
+    return ("seed", "noise", "parts", *method(name).groups)
+
+
+def _is_known(name: str) -> str:
+    names = [kind.name for kind in known()]
+    if name not in names:
+        raise ValueError(f"no method {name!r}; there are {', '.join(names)}")
+    return name
+
+
+MethodName = Annotated[str, AfterValidator(_is_known)]
+MethodNames = Annotated[list[MethodName], Field(min_length=1)]

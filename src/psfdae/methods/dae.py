@@ -1,0 +1,193 @@
+"""The denoising autoencoder as a method: its settings, its training, its files."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+import numpy as np
+
+from psfdae.files import as_yaml, write_text
+from psfdae.method import CONFIG, HISTORY, FitError, Method, TrainingSet
+from psfdae.networks.settings import DaeSettings, Train
+from psfdae.reading import from_tree, read_yaml
+from psfdae.settings import deciding
+
+if TYPE_CHECKING:
+    from psfdae.bundle_info import BundleInfo
+    from psfdae.networks.dae import Dae as Network
+    from psfdae.settings import Evaluation
+
+WEIGHTS = "dae.safetensors"
+
+BLOCK_VALUES = 64 * 256 * 32**2
+"""Numbers between two layers of a bundle's network at most: 64 channels of 256 stamps."""
+
+
+class Dae(Method):
+    """A network, the factor of its images, and how it was trained.
+
+    Parameters
+    ----------
+    network : Network
+    scale : "mean", "none" or float
+        Of images for the network: as the setting, or the factor itself.
+    batch : int
+        Images per forward pass.
+    attempt : int
+        Starts of the training before the one that succeeded.
+    history : list of dict
+        Course of the training.
+    """
+
+    label, color, marker = "DAE", "#0072b2", "D"
+    paper = ("dae", "DAE")
+    groups: ClassVar = {"dae": DaeSettings, "train": Train}
+    per_reference = True
+    validates = True
+    files = (WEIGHTS, CONFIG)
+    diagnostics = (HISTORY,)
+    rule = "train"
+    suffix = ""
+    about = "Folder of a trained network."
+    memory_mb, minutes = 1500, 60
+
+    def __init__(
+        self,
+        network: Network,
+        scale: Literal["mean", "none"] | float,
+        batch: int = 256,
+        attempt: int = 0,
+        history: list[dict[str, Any]] | None = None,
+    ) -> None:
+        self.network, self.scale, self.batch, self.attempt = network, scale, batch, attempt
+        self.diagnosed = {HISTORY: history or []}
+
+    @classmethod
+    def threads(cls, config: Any) -> int:
+        """Those of the training."""
+        return int(config.train.threads)
+
+    @classmethod
+    def continues(cls, config: Any) -> bool:
+        """As set."""
+        return bool(config.train.continued_epochs)
+
+    @classmethod
+    def fit(cls, data: TrainingSet, dae: DaeSettings, train: Train) -> Dae:
+        """Train, and keep the state with the least validation error; resumes if interrupted.
+
+        Raises
+        ------
+        TrainingError
+            As `train_dae`.
+        FitError
+            If it is to go on from a network of another shape or scale of images.
+        """
+        import torch
+
+        from psfdae.networks.dae import Dae as Network
+        from psfdae.networks.dae import train_dae
+        from psfdae.networks.training import fingerprint, progress
+
+        described = {"dae": deciding(dae), "train": deciding(train), "seed": data.seed}
+        described["noise"] = [data.levels.tolist(), data.noise.kappa, data.noise.background]
+        sees = [data.images, data.references, data.fit, data.validation]
+        if isinstance(data.start, Dae):
+            known = data.start.network
+            found = (known.kernels, known.widths, data.start.scale)
+            wanted = (tuple(dae.kernels), tuple(dae.widths), dae.scale)
+            if found != wanted:
+                raise FitError(
+                    f"dae.kernels, dae.widths, dae.scale = {wanted}: the network to go on from "
+                    f"has {found}"
+                )
+            epochs = max(1, round(train.continued_epochs * train.epochs))
+            train = train.model_copy(update={"epochs": epochs})
+            sees += [value.numpy() for value in known.state_dict().values()]
+        seen = fingerprint(described, *sees)
+        with progress(train.epochs) as report:
+            assert data.checkpoint is not None
+            done = train_dae(data, dae, train, data.seed, data.checkpoint, seen, report)
+        network = Network(dae.kernels, dae.widths)
+        network.load_state_dict(done.result)
+        network = network.to(memory_format=torch.channels_last).eval()
+        return cls(network, dae.scale, attempt=done.attempt, history=done.history)
+
+    def predict(self, noisy: np.ndarray) -> np.ndarray:
+        """PSFs, neither clipped nor renormalised, float32."""
+        from psfdae.networks.dae import predict
+
+        return predict(self.network, noisy, self.factor(noisy.shape[-1]), self.batch)
+
+    def factor(self, stamp_px: int) -> float:
+        """From images of sum 1 to those that the network sees."""
+        from psfdae.networks.dae import image_scale
+
+        return self.scale if isinstance(self.scale, float) else image_scale(self.scale, stamp_px)
+
+    def save(self, place: Path, described: Mapping[str, Any]) -> None:
+        """Write weights, and the resolved configuration with the number of the start."""
+        from psfdae.networks.weights import save_weights
+
+        save_weights(place / WEIGHTS, self.network.state_dict(), described)
+        write_text(place / CONFIG, as_yaml({**described, "attempt": self.attempt}))
+
+    @classmethod
+    def load(
+        cls, place: Path, reference: str = "realisation", evaluation: Evaluation | None = None
+    ) -> Dae:
+        """As `Method.require`; the two files must be of the same training."""
+        import torch
+
+        from psfdae.networks.dae import Dae as Network
+        from psfdae.networks.weights import with_weights
+        from psfdae.settings import validate
+
+        described, batch = cls.described(place), 256
+        settings = from_tree(
+            place / CONFIG, described, "dae", make=lambda tree: validate(DaeSettings, tree)
+        )
+        if evaluation is not None:
+            torch.set_num_threads(evaluation.threads)
+            batch = evaluation.batch
+        network = with_weights(lambda: Network(settings.kernels, settings.widths), place / WEIGHTS)
+        return cls(network, settings.scale, batch)
+
+    def pack(self, stamp_px: int, noise: float) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Weights, and the network's shape."""
+        state = self.network.state_dict()
+        shape = {"kernels": self.network.kernels, "widths": self.network.widths}
+        arrays = {name: value.contiguous().numpy() for name, value in state.items()}
+        return arrays, {"dae": shape, "image_scale": self.factor(stamp_px)}
+
+    @classmethod
+    def shapes(cls, info: BundleInfo) -> Mapping[str, tuple[int, ...] | None]:
+        """Those of the weights."""
+        return info.dae.shapes() if info.dae else {}
+
+    @classmethod
+    def unpack(cls, arrays: Mapping[str, np.ndarray], info: BundleInfo) -> Dae:
+        """The network of a bundle, which takes as many images at once as memory should hold."""
+        import torch
+
+        from psfdae.networks.dae import Dae as Network
+
+        assert info.dae is not None and info.image_scale is not None
+        network = Network(info.dae.kernels, info.dae.widths)
+        network.load_state_dict({k: torch.from_numpy(v.copy()) for k, v in arrays.items()})
+        network = network.to(memory_format=torch.channels_last).eval()
+        batch = max(1, BLOCK_VALUES // (max(info.dae.widths) * info.stamp_px**2))
+        return cls(network, float(info.image_scale), batch)
+
+    def export(self, stamp_px: int, path: Path) -> None:
+        """Write the network as ONNX and check it against torch; raises ExportError."""
+        from psfdae.networks.dae import export_onnx
+
+        export_onnx(self.network, self.factor(stamp_px), stamp_px, path)
+
+    @classmethod
+    def described(cls, place: Path) -> dict[str, Any]:
+        """The resolved configuration of the training."""
+        return read_yaml(place / CONFIG)

@@ -1,0 +1,17 @@
+"""The Gaussian mixture that is given where in the field a star stands, as an observer knows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from psfdae.methods.gmm import GaussianMixture
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedMixture(GaussianMixture):
+    """A mixture of images, references and positions."""
+
+    label, color, marker = "GMM", "#882255", "X"
+    drawn = False
+    needs_position = True
+    bundled = False

@@ -1,0 +1,65 @@
+"""Linear minimum-mean-square-error estimator with known noise level: an oracle.
+
+ŷ = ȳ + C_yx (C_xx + N)⁻¹ (x − x̄) with the mean and the (cross-)covariance of the
+noise-free training stars and their references, and the noise variance of the
+star's own λ on the diagonal of N, which it is given.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from psfdae.method import Method, TrainingSet
+from psfdae.noise import NoiseModel
+
+
+@dataclass(frozen=True)
+class LinearMmse(Method):
+    """Second moments of a training set.
+
+    Attributes
+    ----------
+    mean_x, mean_y : ndarray, shape (P,)
+        Mean noise-free image and mean reference, P = d² pixels.
+    cov_xx : ndarray, shape (P, P)
+        Covariance of the noise-free images.
+    cov_yx : ndarray, shape (P, P)
+        Cross-covariance of references and images.
+    noise : NoiseModel
+    """
+
+    label, color, marker = "linear MMSE", "#009e73", "^"
+    drawn = False
+    needs_level = True
+    stored = False
+
+    mean_x: np.ndarray
+    mean_y: np.ndarray
+    cov_xx: np.ndarray
+    cov_yx: np.ndarray
+    noise: NoiseModel
+
+    @classmethod
+    def fit(cls, data: TrainingSet) -> LinearMmse:
+        """Moments of the training stars."""
+        return cls.of(data.images[data.train], data.references[data.train], data.noise)
+
+    @classmethod
+    def of(cls, images: np.ndarray, references: np.ndarray, noise: NoiseModel) -> LinearMmse:
+        """Moments of noise-free training images and references, both of shape (n, d, d)."""
+        x = images.reshape(len(images), -1).astype(np.float64)
+        y = references.reshape(len(references), -1).astype(np.float64)
+        mean_x, mean_y = x.mean(axis=0), y.mean(axis=0)
+        x -= mean_x
+        y -= mean_y
+        return cls(mean_x, mean_y, x.T @ x / len(x), y.T @ x / len(x), noise)
+
+    def predict(self, noisy: np.ndarray, level: float) -> np.ndarray:
+        """Estimates for noisy images of one noise level λ, shape (n, d, d)."""
+        variance = self.noise.variance(self.mean_x, level)
+        system = self.cov_xx + np.diag(variance)
+        gain = np.linalg.solve(system, self.cov_yx.T).T
+        residual = noisy.reshape(len(noisy), -1) - self.mean_x
+        return (self.mean_y + residual @ gain.T).reshape(noisy.shape)

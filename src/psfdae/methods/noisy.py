@@ -1,0 +1,25 @@
+"""No method at all: the noisy image itself, which all others have to beat."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from psfdae.method import Method, TrainingSet
+
+
+class Noisy(Method):
+    """The image as it is."""
+
+    label, color, marker = "noisy", "#4d4d4d", "o"
+    paper = ("original_noise", "original-noise")
+    restores = False
+    stored = False
+
+    @classmethod
+    def fit(cls, data: TrainingSet) -> Noisy:
+        """There is nothing to learn."""
+        return cls()
+
+    def predict(self, noisy: np.ndarray) -> np.ndarray:
+        """The images."""
+        return noisy

@@ -1,0 +1,143 @@
+"""From the bright stars of an image to a model: `fit`, and its steps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from psfdae.extras import needed_by
+from psfdae.method import Method
+from psfdae.methods import groups_of
+from psfdae.methods import method as method_of
+from psfdae.model.packing import bundle_of
+from psfdae.model.psf_model import PsfModel
+from psfdae.model.settings import with_keywords
+from psfdae.model.star_sets import (
+    field_positions,
+    fit_apart,
+    noise_model,
+    split_stars,
+    training_set,
+)
+from psfdae.model.stars import REFERENCE, SPLIT, Stars
+from psfdae.rng import stream
+from psfdae.settings import ConfigError
+from psfdae.threads import fixed_threads
+
+
+def fit(
+    stars: Stars,
+    method: str | None = None,
+    *,
+    name: str | None = None,
+    licence: str = "not stated",
+    **settings: Any,
+) -> PsfModel:
+    """Train a model on the bright stars of an image, without those that are held out.
+
+    Parameters
+    ----------
+    stars : Stars
+    method : str, optional
+        "gmm", "field" or "dae"; by default the one of the first two that errs least on validation
+        stars.
+    name : str, optional
+        Of the model; by default the image's.
+    licence : str
+        Of the model.
+    **settings
+        Keys of the method's settings, such as `orders=[0, 1, 2]` for "field".
+
+    Returns
+    -------
+    PsfModel
+        `save` writes it to a file.
+
+    Raises
+    ------
+    Error
+        If the method makes no model of an image, or a setting is wrong.
+    """
+    names = [method] if method else [n for n in stars.settings.methods if makes_models(n)]
+    kinds = [model_method(one) for one in names]
+    groups = [group for kind in kinds for group in kind.groups]
+    stars = stars.with_settings(with_keywords(stars.settings, groups, settings))
+    fitted = {kind.name: fitted_to(stars, kind) for kind in kinds}
+    chosen = next(iter(fitted)) if len(fitted) == 1 else best(stars, fitted)[0]
+    return packed(stars, fitted[chosen], name or stars.name, licence)
+
+
+def makes_models(name: str) -> bool:
+    """Whether a method makes a model that can be saved, and knows all that it needs of an image."""
+    kind = method_of(name)
+    return kind.stored and kind.bundled
+
+
+def model_method(name: str) -> type[Method]:
+    """The method of a name, if it makes a model of an image.
+
+    Raises
+    ------
+    ConfigError
+        If it does not.
+    """
+    if not makes_models(name):
+        raise ConfigError(f"method {name!r}: makes no model of an image")
+    return method_of(name)
+
+
+def fitted_to(stars: Stars, kind: type[Method], checkpoint: Path | None = None) -> Method:
+    """A fit of a method to the stars that are not held out.
+
+    A long one keeps its state in the file `checkpoint`, if one is given.
+    """
+    data = training_set(
+        stars.settings, kind, stars.product, SPLIT, REFERENCE, checkpoint=checkpoint
+    )
+    with fixed_threads(kind.threads(stars.settings)), needed_by(f"the method {kind.name}"):
+        fitted: Method = kind.fit(data, **kind.settings(stars.settings))
+    return fitted
+
+
+def described(stars: Stars, kind: type[Method]) -> dict[str, Any]:
+    """Settings that decide a fit, as its product and its model say them."""
+    own = stars.settings.model_dump(include={*groups_of(kind.name)})
+    return own | {"split": SPLIT} | ({"reference": REFERENCE} if kind.per_reference else {})
+
+
+def best(stars: Stars, fitted: Mapping[str, Method]) -> tuple[str, dict[str, float]]:
+    """The method that errs least on validation stars, and the MSE of each of PSFs of flux 1.
+
+    No fit that is asked has seen these stars. Every S/N counts alike: the geometric mean of the
+    errors decides.
+    """
+    settings, product = stars.settings, stars.product
+    judges = split_stars(product, SPLIT, settings).validation
+    truth, where = product["realisation"][judges], field_positions(product)[judges]
+    errors = {}
+    for name, fit_of_all in fitted.items():
+        found, kind = fit_of_all, type(fit_of_all)
+        data = training_set(settings, kind, product, SPLIT, REFERENCE)
+        with fixed_threads(kind.threads(settings)):
+            if not kind.validates:
+                found = fit_apart(kind, data, product["field_index"], settings)
+            rng = stream(settings.seed, "noise", "own stars")
+            noisy = [noise_model(settings).draw(truth, level, rng) for level in data.levels]
+            free = found.free_flux()  # as of the stars that the model is for
+            logs = []
+            for images, level in zip(noisy, data.levels, strict=True):
+                psf = free.restore(images, level, where)
+                psf = psf / psf.sum(axis=(1, 2), keepdims=True)
+                logs.append(np.log(np.square(psf - truth).mean()))
+        errors[name] = float(np.exp(np.mean(logs)))
+    return min(errors, key=errors.__getitem__), errors
+
+
+def packed(stars: Stars, fitted: Method, name: str, licence: str) -> PsfModel:
+    """The model of a fit, with its errors on the stars that are held out."""
+    of = stars.product, REFERENCE, stars.settings, described(stars, type(fitted)), name, licence
+    with fixed_threads(stars.settings.evaluation.threads):
+        return PsfModel(bundle_of(fitted, *of))

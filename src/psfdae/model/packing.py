@@ -1,0 +1,483 @@
+"""What a bundle has to know of its network: the errors that it makes on test stars.
+
+Errors are per pixel and per noise level. They are not normally distributed: the core
+of a PSF, its wings and the rare star that is unlike all others share a pixel, and the
+root mean square is then wider than the interval that holds 68 % of the errors. A
+bundle carries both, and by how much the interval that holds 95 % is wider. Where a
+method says how sure it is of every pixel, all of them are in units of that: they
+correct its σ, which knows the star, by what came true.
+
+All this is for known flux and sky, and for all pixels alike. Where these are estimates, errors are
+larger, and where a star is bright they are of another distribution: factors per node, for the
+brightest pixels and for the others, make up for it (`with_scales`).
+"""
+
+from __future__ import annotations
+
+import hashlib
+from bisect import bisect_left
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from psfdae.bundle_info import BundleInfo
+from psfdae.files import Product, ProductError
+from psfdae.method import Estimate, Method
+from psfdae.model.bundle import (
+    SCALES,
+    Bundle,
+    BundleError,
+    at_noise,
+    brightest,
+    creation_date,
+    mahalanobis,
+)
+from psfdae.model.photometry import FluxModel, signal_to_noise
+from psfdae.model.psf_model import SNR_TOLERANCE, PsfModel
+from psfdae.model.star_sets import (
+    field_positions,
+    noise_model,
+    noisy_test_images,
+    of_image,
+    split_stars,
+    star_area,
+)
+from psfdae.noise import NoiseModel
+from psfdae.rng import stream
+from psfdae.version import __version__
+
+NODES = 8  # noise levels at which errors are measured, equidistant in the logarithm
+COMPONENTS = 48  # leading eigenvectors that a bundle stores
+COVERAGE = 0.6827  # part of the errors within ± `error68`; of a normal variable within ± 1 σ
+WIDE = 0.95  # part of them within ± `error68` times `ratio95`
+LEAST_SIGMA = 1e-12  # of the flux; equal stars leave a method no doubt
+# What is known of stars: their flux and sky, their sky, or neither.
+CASES = ({"flux": 1.0, "background": 0.0}, {"background": 0.0}, {})
+NORMAL_WIDE = 1.96  # σ within which a normal variable has as much
+LIMIT = 0.999  # part of the test stars within the limit of the Mahalanobis distance
+STEPS = 64  # of the noise up to that of the flux in every pixel, of a model that is to be small
+LEAST_STARS = 2000  # noisy images per node; few test stars are seen several times with new noise
+FEW_STARS = 500  # of them, for a choice, and where all pixels of a brightness are one number
+
+Restore = Callable[[np.ndarray, float], Estimate]
+"""The method: normalised noisy images (n, d, d) of a noise level λ to PSFs."""
+
+
+@dataclass(frozen=True)
+class HeldOutStars:
+    """Noise-free stars of flux 1 that no training has seen, (n, d, d), noise, and places (n, 2)."""
+
+    images: np.ndarray
+    references: np.ndarray
+    noise: NoiseModel
+    position: np.ndarray
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Errors of the PSFs of test stars at S nodes of noise, as `errors_of` gives them."""
+
+    nodes: np.ndarray  # (S,), pixel RMS over the flux
+    error: np.ndarray  # (S, N, d, d), float32
+    star: np.ndarray  # (N,), of every error
+    distance: np.ndarray  # (S, N), Mahalanobis', of the noisy images
+    strangeness: np.ndarray | None = None  # (S, N), if the method knows it
+
+    def of(self, chosen: np.ndarray) -> Errors:
+        """Those of some stars, from a mask over stars."""
+        kept = chosen[self.star]
+        return Errors(self.nodes, self.error[:, kept], self.star[kept], self.distance[:, kept])
+
+    def half_width(self) -> np.ndarray:
+        """Half-width of the interval around 0 that holds 68.27 %, shape (S, d, d)."""
+        return np.stack([np.quantile(np.abs(node), COVERAGE, axis=0) for node in self.error])
+
+    def ratio95(self) -> np.ndarray:
+        """By how much the interval that holds 95 % of all pixels is wider, shape (S,)."""
+        scaled = np.abs(self.error) / np.maximum(self.half_width(), LEAST_SIGMA)[:, None]
+        return np.array([np.quantile(node, WIDE) for node in scaled], np.float64)
+
+    def rms(self) -> np.ndarray:
+        """Root mean square per pixel, shape (S, d, d)."""
+        return np.sqrt(np.stack([np.square(node).mean(axis=0) for node in self.error]))
+
+    def strange_limit(self) -> np.ndarray | None:
+        """What 0.1 % of the stars exceed at every node, shape (S,).
+
+        The excess over a node's median is taken to be as usual at all of them.
+        """
+        if self.strangeness is None:
+            return None
+        usual = np.median(self.strangeness, axis=1)
+        spread = np.median(np.abs(self.strangeness - usual[:, None]), axis=1)
+        excess = (self.strangeness - usual[:, None]) / np.maximum(spread, 1e-12)[:, None]
+        return np.asarray(usual + spread * np.quantile(excess, LIMIT))
+
+    def distance_limit(self) -> float:
+        """Distance that 0.1 % of the stars of all nodes exceed."""
+        return float(np.quantile(self.distance, LIMIT))
+
+
+def bundle_of(
+    fitted: Method,
+    stars: Product,
+    reference: str,
+    config: Any,
+    trained: Mapping[str, Any],
+    name: str,
+    licence: str,
+    largest_mb: float | None = None,
+) -> Bundle:
+    """A fit with its errors on test stars and all that it takes to apply it.
+
+    Parameters
+    ----------
+    fitted : Method
+    stars : product "stars", of which the fit is
+    reference : "realisation" or "template", which is restored
+    config : settings (seed, noise, parts, evaluation)
+    trained : mapping
+        Settings of the fit, and its "split".
+    name, licence : str
+    largest_mb : float, optional
+        Size of the arrays, for which a mixture leaves out fine axes.
+
+    Raises
+    ------
+    BundleError
+        If it cannot be that small.
+    """
+    stamps, parts = _kind_of_stamps(stars), split_stars(stars, trained["split"], config)
+    images, references = stars["realisation"], stars[reference]
+    held_out = HeldOutStars(
+        images[parts.test],
+        references[parts.test],
+        noise_model(config),
+        field_positions(stars)[parts.test],
+    )
+    model = leading(FluxModel.fit(images[parts.train]), COMPONENTS)
+    band = config.noise.kappa * np.asarray(config.noise.levels)
+    largest = 1e6 * (largest_mb or np.inf)
+    arrays, said = packed(fitted, stamps["stamp_px"], float(band.min()), largest)
+    range_of = reach(band, star_area(stars, parts.train))
+    info = BundleInfo(
+        psfdae_version=__version__,
+        name=name,
+        licence=licence,
+        created=creation_date(),
+        **stamps,
+        **range_of,
+        components=COMPONENTS,
+        training_sha256=checksum(images[parts.train], references[parts.train]),
+        training_stars=_trained_on(stars, parts.train),
+        **(said or {"method": fitted.name, "reference": reference}),
+        config={
+            "stars": stars.config,
+            "train": dict(trained),
+            "evaluation": config.evaluation.model_dump(),
+        },
+        metrics=[],
+    )
+    unpacked = type(fitted).unpack(arrays, info)  # what it errs as packed
+    nodes, rng = noise_nodes(band), stream(config.seed, "noise", "bundle")
+    nothing = np.zeros((nodes.size, *images.shape[1:]), np.float32)
+    made = Bundle(info, arrays, model, nodes, nothing, nothing, 0.0)
+    made, errors = calibrated(made, unpacked, held_out, rng)
+    metrics = measure_levels(
+        config.noise.levels,
+        held_out,
+        lambda level: noisy_test_images(config, stars, parts.test, level),
+        lambda noisy, level: unpacked.estimate(noisy, level, held_out.position),
+        errors,
+        range_of["noise_equivalent_px"],
+        config.evaluation.data_range,
+    )
+    return replace(made, info=made.info.model_copy(update={"metrics": metrics}))
+
+
+def _trained_on(product: Product, train: np.ndarray) -> int:
+    """Stars of the training; those of an image are in several of its images each."""
+    return len(np.unique(product["field_index"][train])) if of_image(product) else len(train)
+
+
+def _kind_of_stamps(product: Product) -> dict[str, Any]:
+    """What the configuration of the stars says of their stamps."""
+    config = product.config
+    try:
+        telescope, framing = config["telescope"], config["framing"]
+        pixel = None
+        if "diameter_m" in telescope:
+            diffraction = telescope["wavelength_m"] / telescope["diameter_m"]
+            pixel = float(np.deg2rad(telescope["pixel_scale_arcsec"] / 3600.0)) / diffraction
+        return {
+            "stamp_px": product["realisation"].shape[-1],
+            "pixel_scale_arcsec": telescope["pixel_scale_arcsec"],
+            "pixel_lambda_d": pixel,
+            "jitter_px": framing["jitter_px"],
+            "subpixel": framing.get("subpixel", False),
+            "source": config.get("source", "simulated"),
+        }
+    except KeyError as error:
+        raise ProductError(f"{product.path}: its configuration lacks {error}") from None
+
+
+def packed(
+    fitted: Method, stamp_px: int, noise: float, largest: float
+) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """What a fit packs for this noise, or for the least above it for which it takes few bytes.
+
+    Raises
+    ------
+    BundleError
+        If it takes more than the largest number of bytes in any case.
+    """
+    tried = np.geomspace(noise, max(1.0, noise), STEPS)
+
+    @cache
+    def made(step: int) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        return fitted.pack(stamp_px, float(tried[step]))
+
+    def small(step: int) -> bool:
+        return sum(array.nbytes for array in made(step)[0].values()) <= largest
+
+    # Mostly the first one will do, and each takes a while.
+    least = 0 if small(0) else bisect_left(range(STEPS), True, key=small)
+    if least == STEPS:
+        raise BundleError(f"{fitted.label}: takes more than {largest / 1e6:.2g} MB")
+    return made(least)
+
+
+def noise_nodes(band: np.ndarray) -> np.ndarray:
+    """Noise at which errors are measured, ascending.
+
+    They reach as far as stars go without a flag: fluxes are estimates, and half of the faintest
+    stars look fainter than they are.
+    """
+    return np.geomspace(band.min() / SNR_TOLERANCE, band.max() * SNR_TOLERANCE, NODES)
+
+
+def leading(model: FluxModel, components: int) -> FluxModel:
+    """The model with the variance beyond its leading eigenvectors spread evenly."""
+    variance = model.variance.copy()
+    rest = variance[: variance.size - components]
+    if rest.size:
+        rest[:] = rest.sum() / rest.size
+    return replace(model, variance=variance)
+
+
+def reach(band: np.ndarray, area: float) -> dict[str, float]:
+    """Range of noise and S/N of a training, from its noise levels σ and its stars' area A in px."""
+    least, most = float(band.min()), float(band.max())
+    return {
+        "noise_min": least,
+        "noise_max": most,
+        "snr_min": signal_to_noise(most, area),
+        "snr_max": signal_to_noise(least, area),
+        "noise_equivalent_px": area,
+    }
+
+
+def measure_errors(
+    stars: HeldOutStars,
+    fitted: Method,
+    model: FluxModel,
+    nodes: np.ndarray,
+    rng: np.random.Generator,
+) -> Errors:
+    """Errors and distances of noisy test stars at every node (S,), pixel RMS over the flux."""
+    star = _repeated(len(stars.images), LEAST_STARS)
+    error = np.empty((len(nodes), star.size, *stars.images.shape[1:]), np.float32)
+    distance = np.empty((len(nodes), star.size))
+    strangeness, free = [], fitted.free_flux()
+    for place, noise in enumerate(nodes):
+        level = noise / stars.noise.kappa
+        noisy = stars.noise.draw(stars.images[star], level, rng)
+        estimate = fitted.estimate(noisy, level, stars.position[star])
+        error[place] = errors_of(estimate, stars.references[star])
+        found = estimate.strangeness
+        if found is None:
+            found = free.strangeness(noisy, np.full(star.size, level))
+        strangeness.append(found)
+        distance[place] = mahalanobis(noisy, np.full(star.size, noise), model, COMPONENTS)
+    known = [node for node in strangeness if node is not None]
+    return Errors(nodes, error, star, distance, np.stack(known) if known else None)
+
+
+def errors_of(estimate: Estimate, references: np.ndarray) -> np.ndarray:
+    """PSFs minus references (n, d, d), in units of σ if the method says it, else of the flux."""
+    error = estimate.psf - references
+    return error if estimate.sigma is None else error / np.maximum(estimate.sigma, LEAST_SIGMA)
+
+
+def calibrated(
+    bundle: Bundle, fitted: Method, stars: HeldOutStars, rng: np.random.Generator
+) -> tuple[Bundle, Errors]:
+    """The bundle of a method with all that these stars say of its errors, and these errors."""
+    errors = measure_errors(stars, fitted, bundle.flux_model, bundle.noise_nodes, rng)
+    found = replace(
+        bundle,
+        error68=errors.half_width(),
+        rms=errors.rms(),
+        distance_limit=errors.distance_limit(),
+        ratio95=errors.ratio95(),
+        strange_limit=errors.strange_limit(),
+        **dict.fromkeys((*SCALES, "widening")),
+    )
+    return with_scales(found, stars, rng), errors
+
+
+def with_scales(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -> Bundle:
+    """The bundle with its `misfit`, and with what flux, sky and brightness do to its errors.
+
+    No training must have seen the stars: where noise is far below the errors that a method makes
+    on other stars, those on its own tell neither.
+    """
+    info = bundle.info.model_copy(update={"misfit": misfit(bundle, stars, rng)})
+    bundle = replace(bundle, info=info)
+    model, nodes = PsfModel(bundle), bundle.noise_nodes
+    shape = 2, len(CASES)  # the noise is known, or estimated
+    noise = np.tile(nodes, (*shape, 1))
+    width, of_flux = np.ones((2, *shape, 2, len(nodes))), np.ones(len(nodes))
+    for place, node in enumerate(nodes):
+        noisy, star = _noisy(stars, node, rng)
+        for estimated, case in np.ndindex(shape):
+            known = CASES[case] if estimated else {"noise": node, **CASES[case]}
+            found = model.predict(noisy, position=stars.position[star], **known)
+            usable = np.isfinite(found.psf).all(axis=(1, 2))
+            if not usable.any():
+                continue
+            noise[estimated, case, place] = np.median((found.noise / found.flux)[usable])
+            error = np.abs(found.psf - stars.references[star])[usable]
+            error /= np.maximum(found.uncertainty[usable], LEAST_SIGMA)
+            wide = error / found.ratio95[usable, None, None]
+            bright = brightest(found.psf[usable])
+            for pixels, kind in ((~bright, 0), (bright, 1)):
+                width[0, estimated, case, kind, place] = np.quantile(error[pixels], COVERAGE)
+                width[1, estimated, case, kind, place] = np.quantile(wide[pixels], WIDE)
+            # A method that measures stars knows how sure it is of their flux.
+            if estimated and not known and not model.engine.estimator.measures:
+                scatter = np.abs(found.flux - 1.0)[usable] / found.flux_error[usable]
+                of_flux[place] = np.quantile(scatter, WIDE) / NORMAL_WIDE
+    # Where a star has light that the photometry does not know, its noise is found too large.
+    noise = np.maximum.accumulate(noise, axis=-1)
+    for index in np.ndindex(width.shape[:-1]):
+        _, *case, _ = index
+        width[index] = np.interp(nodes, noise[tuple(case)], width[index])
+    return replace(
+        bundle,
+        **dict(zip(("scale68", "scale95"), np.moveaxis(width, -1, 1), strict=True)),
+        flux_error_scale=np.interp(nodes, noise[1, -1], of_flux),
+    )
+
+
+def misfit(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -> float:
+    """Noise over the flux with which the method finds the flux of bright stars best.
+
+    What the method does not know of a star's shape would pass for flux, if there is little noise
+    beside it. Tried are none and the nodes of the noise.
+    """
+    nodes, errors = bundle.noise_nodes, []
+    some = {name: getattr(stars, name)[:FEW_STARS] for name in ("images", "references", "position")}
+    few = replace(stars, **some)
+    noisy = [_noisy(few, node, rng) for node in nodes[: len(nodes) // 2]]
+    tried = (0.0, *nodes)
+    for value in tried:
+        model = PsfModel(replace(bundle, info=bundle.info.model_copy(update={"misfit": value})))
+        if model.engine.free_flux is model.engine.estimator or model.engine.estimator.measures:
+            break
+        found = [(model.predict(images), stars.references[star]) for images, star in noisy]
+        logs = [
+            np.log(np.nanmean(np.square(t.psf / t.flux[:, None, None] - truth)))
+            for t, truth in found
+        ]
+        errors.append(float(np.mean(logs)))
+        if errors[-1] > min(errors):
+            break
+    return float(tried[int(np.argmin(errors))]) if errors else 0.0
+
+
+def _noisy(
+    stars: HeldOutStars, noise: float, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """At least `FEW_STARS` noisy images (n, d, d) of flux 1, and which stars they show, (n,)."""
+    star = _repeated(len(stars.images), FEW_STARS)
+    return stars.noise.draw(stars.images[star], noise / stars.noise.kappa, rng), star
+
+
+def _repeated(count: int, least: int) -> np.ndarray:
+    """Numbers of so many stars, over and over if they are few."""
+    return np.resize(np.arange(count), max(count, least))
+
+
+def measure_levels(
+    levels: Sequence[float],
+    stars: HeldOutStars,
+    draw: Callable[[float], np.ndarray],
+    restore: Restore,
+    errors: Errors,
+    area: float,
+    data_range: float,
+) -> list[dict[str, float]]:
+    """Mean errors of the test stars at noise levels λ, and what `errors` at the nodes cover.
+
+    `draw` gives noisy images of all test stars at a λ; `area` is the noise-equivalent one
+    in pixels, `data_range` that of `psfdae.metrics.all_metrics`.
+    """
+    from psfdae.metrics import all_metrics
+
+    rows = []
+    for level in levels:
+        noisy, noise = draw(level), stars.noise.kappa * level
+        estimate = restore(noisy, level)
+        quality = all_metrics(estimate.psf, stars.references, data_range)
+        rows.append(
+            {
+                "noise_level": level,
+                "noise": noise,
+                "snr": signal_to_noise(noise, area),
+                "mse_noisy": float(np.square(noisy - stars.references).mean()),
+                **{name: float(values.mean()) for name, values in quality.items()},
+                **crossed_coverage(errors, errors_of(estimate, stars.references), noise),
+                "stars": len(noisy),
+            }
+        )
+    return rows
+
+
+def coverage(error: np.ndarray, noise: np.ndarray, nodes: np.ndarray, maps: np.ndarray) -> float:
+    """Part of the errors (n, d, d) within ± the map at the noise of each star (n,)."""
+    return float((np.abs(error) <= at_noise(noise, nodes, maps)).mean())
+
+
+def crossed_coverage(errors: Errors, error: np.ndarray, noise: float) -> dict[str, float]:
+    """Coverage at another noise, of either half of the stars by the errors of the other.
+
+    `error` (n, d, d) holds every star once, at `noise`. Told are `coverage68` of the
+    half-width, `coverage95` of the wider one and `coverage_rms` of the root mean square.
+    """
+    even = np.arange(len(error)) % 2 == 0
+    found: dict[str, list[float]] = {}
+    for half in (even, ~even):
+        if not half.any() or half.all():
+            continue
+        other = errors.of(~half)
+        level = np.full(int(half.sum()), noise)
+        half_width = other.half_width()
+        wide = (half_width * other.ratio95()[:, None, None]).astype(half_width.dtype)
+        of = {"coverage68": half_width, "coverage95": wide, "coverage_rms": other.rms()}
+        for name, maps in of.items():
+            covered = coverage(error[half], level, errors.nodes, maps)
+            found.setdefault(name, []).append(covered)
+    return {name: float(np.mean(values)) for name, values in found.items()}
+
+
+def checksum(images: np.ndarray, references: np.ndarray) -> str:
+    """SHA-256 of training stars and of what was to be learnt from them."""
+    digest = hashlib.sha256()
+    for array in (images, references):
+        digest.update(f"{array.dtype.str} {array.shape}".encode())
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()

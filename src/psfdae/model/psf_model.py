@@ -1,0 +1,655 @@
+"""`PsfModel`: a model bundle applied to stamps: centring, photometry, network, uncertainty."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import fields, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from psfdae.bundle_info import BundleInfo
+from psfdae.errors import Error
+from psfdae.image.observation import Observation
+from psfdae.image.stamps import (
+    Stamps,
+    StarFlag,
+    border_median,
+    border_scatter,
+    cut,
+    displacement,
+    raise_flag,
+)
+from psfdae.method import Estimate, FitError
+from psfdae.model.bundle import (
+    Bundle,
+    at_noise,
+    brightest,
+    estimator,
+    mahalanobis,
+    read_bundle,
+    write_bundle,
+)
+from psfdae.model.photometry import FAINT_SNR, KEPT, NOISE_FLOOR, Photometer, Photometry
+from psfdae.model.prediction import Prediction, measured_of, unmeasured
+from psfdae.model.shapes import measure_shapes
+from psfdae.threads import available_cores, in_order, side_by_side
+
+SCALE_TOLERANCE = 0.02  # relative difference of the pixel scale from that of the training
+SNR_TOLERANCE = 1.25  # beyond the trained S/N without a flag: a faint star's is no better known
+LEAST_LEFT = 0.01  # of the noise in a pixel, by a PSF that follows the star there
+MOST_CHI2 = 10.0  # of a star without a flag
+SKY_SIGMA = 5.0  # scatter of the border by which its median may differ from a sky that is given
+FLUX_FACTOR = (0.5, 2.0)  # by which a method may correct the flux of a star
+BLOCK = 256  # stars that a network computes together, always so many: other numbers round otherwise
+MOST_OVERSAMPLED = 32  # values per pixel and axis
+ROWS = 4 * BLOCK  # stars that are read at a time, fewer if their stamps are large
+MARGIN_PX = 2  # by which a star of an image may be moved to centre it
+WHOLE_PX = 32  # larger stamps come in smaller blocks
+
+
+class PredictionError(Error, ValueError):
+    """Stars that a model cannot be applied to; one line with what it takes instead."""
+
+
+def load_model(path: str | Path | None = None) -> PsfModel:
+    """A trained model, ready to predict the PSFs of stars.
+
+    Parameters
+    ----------
+    path : path-like, optional
+        Model bundle (`.psf.safetensors`); by default the one that comes with the package.
+
+    Raises
+    ------
+    BundleError
+        If the file is missing, damaged, of a newer format, or no model bundle.
+    MissingExtraError
+        If the model is a network and torch is not installed.
+    """
+    return PsfModel(read_bundle(None if path is None else Path(path)))
+
+
+class PsfModel:
+    """A trained network with all that it takes to apply it to stars.
+
+    Parameters
+    ----------
+    bundle : Bundle
+        `load_model` reads one from a file.
+    """
+
+    def __init__(self, bundle: Bundle) -> None:
+        self.bundle = bundle
+        self.engine = Engine(bundle)
+
+    def __repr__(self) -> str:
+        info = self.info
+        return (
+            f"PsfModel({info.name!r}, {info.stamp_px}×{info.stamp_px} px of "
+            f'{info.pixel_scale_arcsec:g}", S/N {info.snr_min:.3g} … {info.snr_max:.3g})'
+        )
+
+    @property
+    def info(self) -> BundleInfo:
+        """Stamp size, pixel scale, range of S/N and all else that the bundle says."""
+        return self.bundle.info
+
+    def save(self, path: str | Path) -> None:
+        """Write the model to a file, by custom NAME.psf.safetensors, for `load_model`."""
+        write_bundle(self.bundle, Path(path))
+
+    def predict(
+        self,
+        stamps: ArrayLike,
+        *,
+        flux: ArrayLike | None = None,
+        background: ArrayLike | None = None,
+        noise: ArrayLike | None = None,
+        bad: ArrayLike | None = None,
+        saturated: ArrayLike | None = None,
+        gain: ArrayLike | None = None,
+        position: ArrayLike | None = None,
+        centre: ArrayLike | None = None,
+        fixed: bool = False,
+        margin: int = 0,
+        threads: int | None = 1,
+    ) -> Prediction:
+        """PSFs of stars, with uncertainties, photometry, shapes and flags.
+
+        Stars do not influence each other; the result does not depend on the number
+        of threads, and on how many stars are passed at once in its rounding at most.
+
+        Parameters
+        ----------
+        stamps : array, shape (n, s, s) or (s, s)
+            s = `info.stamp_px` + 2 `margin`; in any unit, sky included, the star's
+            brightest pixel about [s/2, s/2] (0-based), pixels of the scale
+            `info.pixel_scale_arcsec`.
+        flux, background, noise : float or array, shape (n,), optional
+            Flux inside the stamp, sky level and RMS of the sky noise in a pixel, in
+            the unit of the stamps. What is not given, or is NaN, is estimated.
+        bad, saturated : array of bool, shape of the stamps, optional
+            Pixels that must not be used; those that are not finite never are.
+        gain : float or array, shape (n,), optional
+            Electrons per unit of the stamps: adds the star's photon noise to `chi2`
+            and `flux_error`.
+        position : array, shape (n, 2), optional
+            (x, y) of the stars in the image of the training, 0-based; NaN where unknown.
+        centre : array, shape (n, 2), optional
+            (x, y) of the stars' centres that a list says, from index s//2; NaN where unknown.
+            Like the position, for models that measure centres (`psfdae.methods.field`).
+        fixed : bool
+            These centres are exact.
+        margin : int
+            Pixels around each stamp, by which a star may be moved to centre it.
+        threads : int, optional
+            None takes all cores.
+
+        Returns
+        -------
+        Prediction
+            One row per star, also of those that are flagged.
+
+        Raises
+        ------
+        PredictionError
+            If shapes or types do not fit.
+        """
+        data = _numbers("stamps", stamps)
+        single = data.ndim == 2
+        data = data[None] if single else data
+        side = self.info.stamp_px + 2 * margin
+        if margin < 0 or data.ndim != 3 or data.shape[1:] != (side, side):
+            size = "×".join(str(n) for n in data.shape)
+            raise PredictionError(
+                f"stamps of shape {size}, but the model {self.info.name!r} takes n×{side}×{side}"
+            )
+        finite = np.isfinite(data)
+        x, y = _pairs("position", position, len(data)).T
+        given = {"flux": flux, "background": background, "noise": noise, "gain": gain}
+        stars = Stamps(
+            data=data if finite.all() else np.where(finite, data, 0),
+            bad=_mask("bad", bad, data, single) | ~finite,
+            saturated=_mask("saturated", saturated, data, single),
+            flags=np.zeros(len(data), dtype=np.uint16),
+            id=np.arange(len(data)),
+            x=x,
+            y=y,
+            listed=_pairs("centre", centre, len(data))[:, ::-1],
+            **{name: _per_star(name, value, len(data)) for name, value in given.items()},
+        )
+        blocks = self.engine.blocks(stars)
+        with one_thread_each():
+            threads = min(threads or available_cores(), max(len(blocks), 1))
+            work = (lambda block: self.engine.block(block, fixed), blocks or [stars], threads)
+            parts = side_by_side(*work)
+        return Prediction.joined(parts)
+
+    def stream(
+        self, observation: Observation, threads: int | None = None, fixed: bool = False
+    ) -> Iterator[tuple[Stamps, Prediction]]:
+        """The stars of an observation in their order, some at a time, with their predictions.
+
+        Few of them are in memory. Listed centres are exact if `fixed`; by default all cores are
+        taken.
+        """
+        size = self.engine.size
+
+        def predicted(stamps: Stamps) -> Prediction:
+            blocks = self.engine.blocks(stamps)
+            return Prediction.joined([self.engine.block(block, fixed) for block in blocks])
+
+        chunks = observation.chunks(max(size, min(ROWS, 4 * size)))
+        with one_thread_each():
+            yield from in_order(predicted, chunks, threads or available_cores())
+
+    def psf_at(self, x: ArrayLike, y: ArrayLike, oversampling: int = 4) -> np.ndarray:
+        """PSFs at places of the image of the training, where no star need be.
+
+        Parameters
+        ----------
+        x, y : float or array, shape (n,)
+            0-based pixel coordinates. The PSF lies at their sub-pixel phase.
+        oversampling : int
+            Values per pixel and axis; each is what a whole pixel there would get.
+
+        Returns
+        -------
+        ndarray, shape (m, m) or (n, m, m), float64
+            m is the stamp's side d for an oversampling o of 1, else o d + 1. Index m//2 is the
+            middle of the pixel of the position. The flux is that for which a star in the middle
+            of its pixel has the sum 1 in the d × d pixels of its stamp.
+
+        Raises
+        ------
+        PredictionError
+            If the model's method knows no PSF between the stars, a number is not usable, or the
+            model has no PSF of a finite flux above 0 at a place.
+        """
+        position = np.stack(np.broadcast_arrays(_numbers("x", x), _numbers("y", y)), axis=-1)
+        if position.ndim > 2 or not np.isfinite(position).all():
+            raise PredictionError("positions must be finite, one x and y or arrays of as many")
+        if not 1 <= oversampling <= MOST_OVERSAMPLED:
+            raise PredictionError(f"oversampling {oversampling}: 1 to {MOST_OVERSAMPLED}")
+        try:
+            with np.errstate(all="ignore"):
+                found = self.engine.estimator.psf_at(position.reshape(-1, 2), oversampling)
+        except FitError as error:
+            raise PredictionError(
+                f"the model {self.info.name!r}: {error}; psfdae from-stars --method field makes "
+                "one that does"
+            ) from None
+        flux = found.sum(axis=(1, 2))
+        usable = np.isfinite(flux) & (flux > 0)
+        if not usable.all():
+            place = position.reshape(-1, 2)[np.argmin(usable)]
+            raise PredictionError(
+                f"the model {self.info.name!r}: damaged, or far outside its image: no PSF of a "
+                f"finite flux above 0 at x {place[0]:.6g}, y {place[1]:.6g}"
+            )
+        return found if position.ndim == 2 else found[0]
+
+    def field_range(self) -> tuple[np.ndarray, np.ndarray]:
+        """Least and greatest position (x, y) of the training stars; raises as `psf_at`."""
+        self.psf_at(0.0, 0.0, 1)
+        low, high = (np.asarray(self.bundle.weights[name]) for name in ("low", "high"))
+        if not (high > low).all():
+            raise PredictionError(f"the model {self.info.name!r} knows no places of its stars")
+        return low, high
+
+    def check_scale(self, pixel_scale_arcsec: float | None, what: str) -> None:
+        """Refuse stars whose pixels are not those of the training.
+
+        Parameters
+        ----------
+        pixel_scale_arcsec : float or None
+            None if nobody knows it.
+        what : str
+            Name of the file, for the message.
+
+        Raises
+        ------
+        PredictionError
+            If the scale is unknown, or off by more than `SCALE_TOLERANCE`.
+        """
+        trained = self.info.pixel_scale_arcsec
+        other = "; psfdae from-stars trains one on an image of yours"
+        if pixel_scale_arcsec is None:
+            raise PredictionError(
+                f"{what}: neither a WCS nor the header gives the pixel scale; "
+                f"state it with --pixel-scale (the model's is {trained:.6g} arcsec){other}"
+            )
+        if not abs(pixel_scale_arcsec / trained - 1.0) <= SCALE_TOLERANCE:
+            assumed = ", assumed" if self.info.scale_assumed else ""
+            raise PredictionError(
+                f"{what}: pixels of {pixel_scale_arcsec:.6g} arcsec, but the model "
+                f"{self.info.name!r} was trained on {trained:.6g} arcsec{assumed} "
+                f"(tolerance {100 * SCALE_TOLERANCE:g} %){other}"
+            )
+
+
+def _numbers(name: str, values: ArrayLike) -> np.ndarray:
+    """An array of float32 or float64 in the machine's byte order."""
+    array = np.asarray(values)
+    if array.dtype.kind not in "fiub":
+        raise PredictionError(f"{name} of type {array.dtype}, expected real numbers")
+    narrow = array.dtype.kind == "f" and array.dtype.itemsize <= 4
+    return array.astype(np.float32 if narrow else np.float64, copy=False)
+
+
+def _mask(name: str, mask: ArrayLike | None, data: np.ndarray, single: bool) -> np.ndarray:
+    if mask is None:
+        return np.zeros(data.shape, dtype=bool)
+    array = np.asarray(mask, dtype=bool)
+    array = array[None] if single else array
+    if array.shape != data.shape:
+        raise PredictionError(f"{name} of shape {array.shape}, but stamps of shape {data.shape}")
+    return array
+
+
+def _pairs(name: str, values: ArrayLike | None, count: int) -> np.ndarray:
+    """Two numbers per star, NaN where they are not known."""
+    numbers = _numbers(name, np.full((count, 2), np.nan) if values is None else values)
+    if numbers.shape != (count, 2):
+        raise PredictionError(f"{name} of shape {numbers.shape}, expected ({count}, 2)")
+    return numbers.astype(np.float64)
+
+
+def _per_star(name: str, value: ArrayLike | None, count: int) -> np.ndarray:
+    """One number per star, NaN where it is not known."""
+    numbers = _numbers(name, np.nan if value is None else value).astype(np.float64)
+    if numbers.ndim > 1 or (numbers.ndim == 1 and len(numbers) != count):
+        raise PredictionError(f"{name} of shape {numbers.shape}, expected one for {count} stamps")
+    return np.broadcast_to(numbers, (count,))
+
+
+class Engine:
+    """What a bundle needs to be ready: the method and the photometry's matrices.
+
+    Safe to use from several threads.
+    """
+
+    def __init__(self, bundle: Bundle) -> None:
+        self.bundle = bundle
+        self.estimator = estimator(bundle)
+        self.free_flux = self.estimator.free_flux()
+        together = self.estimator.together
+        self.size = min(together, max(1, together * WHOLE_PX**2 // bundle.info.stamp_px**2))
+        self._photometer = Photometer(bundle.flux_model, bundle.info.components)
+
+    def blocks(self, stars: Stamps) -> list[Stamps]:
+        """Stars in parts of `size`."""
+        return [stars.part(slice(a, a + self.size)) for a in range(0, len(stars), self.size)]
+
+    def block(self, stars: Stamps, fixed: bool = False) -> Prediction:
+        """PSFs of at most `size` stars, whose listed centres are exact if `fixed`."""
+        count = len(stars)
+        size = self.size if self.estimator.padded else 1
+        if count < size:
+            stars = _filled(stars, self.bundle, size)
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            return self._compute(stars, fixed).first(count)
+
+    def _compute(self, stars: Stamps, fixed: bool) -> Prediction:
+        bundle, info = self.bundle, self.bundle.info
+        exact = fixed & np.isfinite(stars.listed).all(axis=1)
+        stamps, bad, shift, flags = self._centred(stars, exact)
+        start = border_median(stamps, bad)
+        if np.isfinite(stars.background).any():
+            unlike_sky = np.abs(start - stars.background) > SKY_SIGMA * border_scatter(stamps)
+            raise_flag(flags, StarFlag.SKY_OFF, unlike_sky)
+        found = self._photometer.measure(stamps, bad, start, stars)
+        of_star: dict[str, np.ndarray] = {}
+        if self.estimator.measures:
+            estimate, found, of_star = self._measured(
+                stars, stamps, bad, shift, start, exact, found
+            )
+            psf, sigma = estimate.psf, estimate.sigma
+            lost = (found.flags & StarFlag.NO_FLUX) > 0
+        else:
+            estimate = None
+            lost = (found.flags & StarFlag.NO_FLUX) > 0
+            free = np.isnan(stars.flux) & np.isnan(stars.background)
+            psf, sigma, found = self._estimate(found, free, lost)
+        noise = found.noise / np.where(lost, np.nan, found.flux)
+        shapes = measure_shapes(psf)
+        snr = np.sqrt(np.square(psf, dtype=np.float64).sum(axis=(1, 2))) / noise
+        doubt = None if sigma is None else sigma * found.flux[:, None, None]
+        distance = mahalanobis(found.images, noise, bundle.flux_model, info.components)
+        flux = found.flux.astype(np.float32)[:, None, None]
+        width, ratios, of_flux = self._doubts(psf, sigma, noise, stars)
+        uncertainty = flux * width
+        psf *= flux
+        residual = (stamps - found.background[:, None, None]).astype(np.float32) - psf
+        residual[~found.used] = np.nan
+        flags |= found.flags
+        raise_flag(flags, StarFlag.SNR_LOW, snr < info.snr_min / SNR_TOLERANCE)
+        # What measures stars knows their noise, and comes ever nearer to the star itself.
+        limited = not self.estimator.measures
+        raise_flag(flags, StarFlag.SNR_HIGH, limited & (snr > info.snr_max * SNR_TOLERANCE))
+        unlike, strangeness = distance > bundle.distance_limit, np.full(len(noise), np.nan)
+        if bundle.strange_limit is not None and not lost.all():
+            level = noise[~lost] / info.kappa
+            strangeness[~lost] = (
+                self.free_flux.strangeness(found.images[~lost], level)
+                if estimate is None
+                else estimate.strangeness[~lost]
+            )
+            unlike |= strangeness > np.interp(noise, bundle.noise_nodes, bundle.strange_limit)
+        raise_flag(flags, StarFlag.UNLIKE_TRAINING, unlike)
+        chi2 = _chi2(residual, psf, doubt, found.noise, stars.gain)
+        raise_flag(flags, StarFlag.POOR_FIT, chi2 > MOST_CHI2)
+        photons = np.nan_to_num(np.maximum(found.flux, 0.0) / stars.gain)
+        return Prediction(
+            psf=psf,
+            residual=residual,
+            uncertainty=uncertainty,
+            ratio95=ratios[:, 0],
+            ratio95_bright=ratios[:, 1],
+            flux=found.flux,
+            flux_error=np.sqrt((of_flux * found.flux_error) ** 2 + photons),
+            background=found.background,
+            noise=found.noise,
+            snr=snr,
+            chi2=chi2,
+            distance=distance,
+            strangeness=strangeness,
+            fwhm_px=shapes.fwhm_px,
+            ellipticity=shapes.ellipticity,
+            position_angle_deg=shapes.position_angle_deg,
+            shift_x=shift[:, 1],
+            shift_y=shift[:, 0],
+            flags=flags,
+            **(of_star or unmeasured(len(stars))),
+        )
+
+    def _doubts(
+        self, psf: np.ndarray, sigma: np.ndarray | None, noise: np.ndarray, stars: Stamps
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Half-widths of 68 % of PSFs of flux 1 (n, d, d), and what widens them to 95 % (n, 2).
+
+        The latter are of faint and of bright pixels. The last array (n,) has factors of the
+        error of the flux. All depend on which of noise, flux and sky were estimated.
+        """
+        bundle, count = self.bundle, len(noise)
+        width = at_noise(noise, bundle.noise_nodes, bundle.error68)
+        if sigma is not None:
+            width = width * sigma
+        ratios, of_flux = np.full((count, 2), np.nan), np.ones(count)
+        if bundle.ratio95 is not None:
+            ratios[:] = np.interp(noise, bundle.noise_nodes, bundle.ratio95)[:, None]
+        if (scales := bundle.scales(noise)) is None:
+            return width, ratios, of_flux
+        noise_too, flux_too, sky_too = (
+            np.isnan(known) for known in (stars.noise, stars.flux, stars.background)
+        )
+        case = np.where(sky_too, 2, flux_too.astype(int))
+        wider, widest = (
+            table[np.arange(count), noise_too.astype(int), case] for table in scales[:2]
+        )
+        faint, bright = wider.T.astype(np.float32)[:, :, None, None]
+        width = width * np.where(brightest(psf), bright, faint)
+        return width, ratios * widest / wider, np.where(flux_too & sky_too, scales[2], of_flux)
+
+    def _measured(
+        self,
+        stars: Stamps,
+        stamps: np.ndarray,
+        bad: np.ndarray,
+        shift: np.ndarray,
+        start: np.ndarray,
+        exact: np.ndarray,
+        found: Photometry,
+    ) -> tuple[Estimate, Photometry, dict[str, np.ndarray]]:
+        """PSFs of flux 1, their σ and what the method measures in place of the photometry.
+
+        `found` repairs bad pixels and tells the noise, `start` (n,) is a rough sky; listed
+        centres are `exact` or not.
+        """
+        pixels = stamps[0].size
+        given, unseen = np.isfinite(stars.flux), (found.flags & StarFlag.NO_FLUX) > 0
+        level = start[:, None, None]
+        repaired = found.images * found.flux[:, None, None] + found.background[:, None, None]
+        repaired = np.where(unseen[:, None, None], np.where(bad, level, stamps), repaired)
+        data = np.where(found.used & ~bad, stamps, repaired).astype(np.float64) - level
+        size = np.abs(data).max(axis=(1, 2))
+        nothing = ~((bad.mean(axis=(1, 2)) <= 1 - KEPT) & (size > 0) & np.isfinite(size))
+        nothing |= (np.ptp(data, axis=(1, 2)) <= 0) | ~np.isfinite(found.noise)
+        data = np.where(nothing[:, None, None], 0.0, data)
+        noise = np.where(found.noise > NOISE_FLOOR * size, found.noise, NOISE_FLOOR * size)
+        photons = np.nan_to_num(np.maximum(found.flux, 0.0) / stars.gain / pixels)
+        noise = np.where(nothing, 1.0, np.sqrt(noise**2 + photons))
+        estimate = self.estimator.measure(
+            data,
+            noise,
+            np.stack([stars.x, stars.y], axis=1),
+            stars.listed - shift,
+            exact,
+            flux=stars.flux,
+            sky=stars.background - start,
+        )
+        own = estimate.measured
+        assert own is not None and estimate.sigma is not None
+        error = np.sqrt(own.covariance[:, 0, 0])
+        flux = np.where(given, stars.flux, own.flux)
+        lost = nothing | np.where(given, unseen, ~(flux > error))
+        flags = found.flags & np.uint16(StarFlag.MASKED | StarFlag.OUTLIER)
+        raise_flag(flags, StarFlag.NO_FLUX, lost)
+        raise_flag(flags, StarFlag.FAINT, ~given & ~lost & (flux < FAINT_SNR * error))
+        sky = start + own.background
+        unit = np.where(lost, 1.0, flux)[:, None, None]
+        images = (data - own.background[:, None, None]) / unit
+        better = replace(
+            found,
+            flux=np.where(nothing, np.nan, flux),
+            flux_error=np.where(given | nothing, np.nan, error),
+            background=np.where(nothing, found.background, sky),
+            images=np.where(lost[:, None, None], 0.0, images).astype(np.float32),
+            flags=flags,
+        )
+        # The pixel at the middle of the stamp as it was given, in the image if that is known.
+        middle = np.stack([stars.y, stars.x], axis=1) - stars.listed
+        middle = np.where(np.isfinite(middle), middle, stars.data.shape[-1] // 2)
+        measured = measured_of(middle + shift + own.centre, own.covariance)
+        estimate.psf[lost] = estimate.sigma[lost] = np.nan
+        return estimate, better, {k: np.where(lost, np.nan, v) for k, v in measured.items()}
+
+    def _estimate(
+        self, found: Photometry, free: np.ndarray, lost: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray | None, Photometry]:
+        """PSFs of flux 1 and, if the method knows it, their σ; NaN where there is no flux.
+
+        Where flux and sky are `free`, the method may find better ones first. It takes the noise
+        for larger then: what it does not know of a bright star would pass for flux.
+        """
+        info = self.bundle.info
+        if lost.all():  # such as the stars of a catalogue that reaches far beyond the image
+            return np.full_like(found.images, np.nan), None, found
+        mean = self.bundle.flux_model.mean.reshape(found.images.shape[1:])
+
+        def current() -> tuple[np.ndarray, np.ndarray]:
+            images = found.images
+            if lost.any():
+                images = np.where(lost[:, None, None], mean, images).astype(images.dtype)
+            noise = found.noise / np.where(lost, np.nan, found.flux)
+            return images, np.where(lost, info.noise_max, noise)
+
+        free = free & ~lost
+        if free.any() and self.free_flux is not self.estimator:
+            images, noise = current()
+            flux = self.free_flux.flux(images, np.hypot(noise, info.misfit) / info.kappa)
+            free &= np.isfinite(flux)  # a damaged model may find none
+            found = found.with_flux(np.where(free, np.clip(flux, *FLUX_FACTOR), 1.0))
+        images, noise = current()
+        estimate = self.estimator.estimate(images, noise / info.kappa)
+        for array in (estimate.psf, estimate.sigma):
+            if array is not None:
+                array[lost] = np.nan
+        return estimate.psf.astype(np.float32, copy=False), estimate.sigma, found
+
+    def _centred(self, stars: Stamps, exact: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Stamps (n, d, d), their bad pixels, their shift (row, column), and flags so far.
+
+        Stars (n,) whose place is `exact` are not moved.
+        """
+        side = self.bundle.info.stamp_px
+        margin = (stars.data.shape[-1] - side) // 2
+        # Saturated pixels show where the star is; the others would mislead.
+        data, hidden = stars.data, stars.bad & ~stars.saturated
+        if hidden.any():
+            data = np.where(hidden, border_median(data, hidden)[:, None, None], data)
+        shift = displacement(data, self.bundle.info.jitter_px)
+        shift[exact] = 0
+        too_far = np.abs(shift).max(axis=1) > margin
+        shift[too_far] = 0
+        stamps, bad, saturated = (
+            cut(wide, side, shift) for wide in (data, stars.bad, stars.saturated)
+        )
+        flags = stars.flags.copy()
+        raise_flag(flags, StarFlag.MASKED, bad.any(axis=(1, 2)))
+        raise_flag(flags, StarFlag.SATURATED, saturated.any(axis=(1, 2)))
+        raise_flag(flags, StarFlag.OFF_CENTRE, too_far)
+        return stamps, bad | saturated, shift, flags
+
+
+def _chi2(
+    residual: np.ndarray,
+    psf: np.ndarray,
+    doubt: np.ndarray | None,
+    noise: np.ndarray,
+    gain: np.ndarray,
+) -> np.ndarray:
+    """Σ residual²/v over what is expected of it, of the pixels that are not NaN; v is noise.
+
+    A restored star follows its own noise where it is bright. If the method has a `doubt` u (n, d,
+    d) of its pixels in a noise of the mean variance s, it leaves the part k = 1 − u²/s, at
+    least `LEAST_LEFT`, of what noise does to each, and Σ (s k + k² (v − s))/v is expected; else
+    the number of pixels is.
+    """
+    variance = np.broadcast_to((noise**2)[:, None, None], residual.shape)
+    if np.isfinite(gain).any():
+        per_electron = np.where(gain > 0, 1.0 / gain, 0.0)[:, None, None]
+        variance = variance + np.maximum(psf, 0.0) * per_electron
+    used = np.isfinite(residual) & np.isfinite(variance)
+    expected = np.ones(residual.shape)
+    if doubt is not None:
+        even = variance.mean(axis=(1, 2), keepdims=True)
+        left = np.clip(1.0 - doubt.astype(np.float64) ** 2 / even, LEAST_LEFT, 1.0)
+        expected = left * (even + left * (variance - even)) / variance
+    found, wanted = (
+        np.where(used, values, 0.0).sum(axis=(1, 2), dtype=np.float64)
+        for values in (residual**2 / variance, expected)
+    )
+    return np.where(used.any(axis=(1, 2)), found / np.where(wanted > 0, wanted, np.inf), np.nan)
+
+
+def _filled(stars: Stamps, bundle: Bundle, size: int) -> Stamps:
+    """Stars up to `size`, the last ones being mean PSFs of which nothing is known."""
+    count, side = len(stars), bundle.info.stamp_px
+    filled = {}
+    for field in fields(stars):
+        values = getattr(stars, field.name)
+        blank = np.nan if values.dtype.kind == "f" else 0
+        more = np.full((size - count, *values.shape[1:]), blank, values.dtype)
+        filled[field.name] = np.concatenate([values, more])
+    margin = (stars.data.shape[-1] - side) // 2
+    inner = slice(margin, margin + side)
+    filled["data"][count:] = 0.0
+    filled["data"][count:, inner, inner] = bundle.flux_model.mean.reshape(side, side)
+    return Stamps(**filled)
+
+
+@contextmanager
+def one_thread_each() -> Iterator[None]:
+    """Linear algebra and network on one thread per calling thread, and as before afterwards."""
+    with _libraries().limit(limits=1, user_api="blas"), _networks_on_one_thread():
+        yield
+
+
+@contextmanager
+def _networks_on_one_thread() -> Iterator[None]:
+    """Limit torch to one thread meanwhile, if a network has loaded it already."""
+    torch = sys.modules.get("torch")
+    if torch is None:
+        yield
+        return
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@cache
+def _libraries() -> Any:
+    """Looking for the loaded libraries takes milliseconds, hence once."""
+    from threadpoolctl import ThreadpoolController
+
+    return ThreadpoolController()

@@ -1,0 +1,137 @@
+"""Sets of stars, products of the kind "stars": their parts, their noise, what methods learn."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from psfdae.files import Product, ProductError, read_product
+from psfdae.method import BrightStamps, Method, TrainingSet
+from psfdae.noise import NoiseModel, OwnNoise, noise_equivalent_px
+from psfdae.rng import stream
+from psfdae.splits import Split, held_out_split, random_split
+
+INNER = 10
+"""One of so many stars chooses the settings of a fit that has not seen the validation stars."""
+
+
+def read_stars(path: Path, *references: str) -> Product:
+    """Stars with their noise-free images, fields and the references asked for."""
+    names = ("realisation", *(r for r in references if r != "realisation"), "field_index", "grid")
+    return read_product(path, "stars", names)
+
+
+def of_image(stars: Product) -> bool:
+    """Whether the stars are those of an image, not of a simulation."""
+    return stars.config.get("source") == "stars"
+
+
+def field_positions(stars: Product) -> np.ndarray:
+    """Where each star stands, shape (n, 2): in steps of the field's grid, or pixels of an image.
+
+    NaN where an image's list does not say it.
+    """
+    return stars["position" if of_image(stars) else "grid"][stars["field_index"]]
+
+
+def star_area(stars: Product, train: np.ndarray) -> float:
+    """Noise-equivalent area in pixels of the typical star, of which `train` are training images.
+
+    Bright stars of an image have their own, A = (F / (σ S/N))², free of their noise.
+    """
+    if of_image(stars):
+        return float(np.median((stars["noise"] * stars["snr"]) ** -2.0))
+    return noise_equivalent_px(stars["realisation"][train])
+
+
+def split_stars(stars: Product, kind: str, config: Any) -> Split:
+    """Training, validation and test stars of a split.
+
+    Raises
+    ------
+    ProductError
+        If the file holds fewer stars than the config's parts need.
+    """
+    parts, count = config.parts, len(stars["field_index"])
+    if kind == "held_out":
+        return held_out_split(
+            stars["field_index"], stars["grid"], parts.validation_fraction, config.seed
+        )
+    if parts.train_stars + parts.test_stars > count:
+        raise ProductError(
+            f"{stars.path}: holds {count} stars, but parts.train_stars + parts.test_stars = "
+            f"{parts.train_stars + parts.test_stars}"
+        )
+    return random_split(
+        count, parts.train_stars, parts.test_stars, parts.validation_fraction, config.seed
+    )
+
+
+def noise_model(config: Any) -> NoiseModel:
+    """The noise of a stage's config."""
+    return NoiseModel(config.noise.kappa, config.noise.background_photons)
+
+
+def noisy_test_images(config: Any, stars: Product, test: np.ndarray, level: float) -> np.ndarray:
+    """Noisy images of test stars, numbers `test` of a product "stars", at one λ.
+
+    The noise of a star depends on seed, set of stars, λ and star only. Datasets differ in
+    set or λ, so that their columns are independent; methods, references, bounds and splits
+    share it, so that what they make of a star is compared on one image.
+    """
+    of = stars.config.get("stars", {}).get("name", "own")
+    rng = stream(config.seed, "noise", "test", of, f"{level:.6g}")
+    return noise_model(config).draw(stars["realisation"], level, rng)[test]
+
+
+def training_set(
+    config: Any,
+    kind: type[Method],
+    stars: Product,
+    split: str,
+    reference: str,
+    **more: Any,
+) -> TrainingSet:
+    """What a method learns from: the training part of a split, with a configuration's noise."""
+    parts = split_stars(stars, split, config)
+    if of_image(stars):
+        more["own_noise"] = _own_noise(stars, config.noise.background_photons)
+        if kind.measures:
+            *names, _ = BrightStamps._fields
+            more["bright"] = BrightStamps(*map(stars.__getitem__, names), stars["field_index"])
+    return TrainingSet(
+        images=stars["realisation"],
+        references=stars["template" if kind.stored and not kind.per_reference else reference],
+        fit=parts.fit,
+        validation=parts.validation,
+        levels=np.asarray(config.noise.levels),
+        noise=noise_model(config),
+        seed=config.seed,
+        reference=reference,
+        positions=field_positions(stars),
+        **more,
+    )
+
+
+def fit_apart(kind: type[Method], data: TrainingSet, star: np.ndarray, config: Any) -> Method:
+    """A fit that has learnt nothing from the validation stars, for methods that else do.
+
+    Some stars of `fit` choose its settings instead; `star` says which images are of the same.
+    """
+    inner = np.isin(star[data.fit], np.unique(star[data.fit])[::INNER])
+    some = replace(data, fit=data.fit[~inner], validation=data.fit[inner])
+    return kind.fit(some, **kind.settings(config))
+
+
+def _own_noise(stars: Product, background: float) -> Callable[..., np.ndarray]:
+    """Noise of the bright stars of an image; its arrays are read if a method asks for it."""
+
+    def own_noise(images: np.ndarray, mean: np.ndarray) -> np.ndarray:
+        star = stars["field_index"]
+        return OwnNoise(stars["noise"][star], background, stars["phase"], star)(images, mean)
+
+    return own_noise

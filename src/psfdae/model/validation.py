@@ -1,0 +1,323 @@
+"""How good a model is on stars that no training saw: `validate`, and its `Report`."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from psfdae.figure_style import as_png
+from psfdae.files import write_text
+from psfdae.image.stamps import Stamps
+from psfdae.method import Method
+from psfdae.methods import method as method_of
+from psfdae.metrics import all_metrics, mse, quality, summarised
+from psfdae.model.packing import checksum
+from psfdae.model.photometry import signal_to_noise
+from psfdae.model.plot import FieldStars, psf_map
+from psfdae.model.prediction import Prediction
+from psfdae.model.psf_model import MARGIN_PX, PredictionError, PsfModel
+from psfdae.model.report import MEAN_PSF, SHOWN_STARS, Quality, fitted_mean, quality_page, standing
+from psfdae.model.star_sets import (
+    field_positions,
+    noisy_test_images,
+    split_stars,
+    star_area,
+    training_set,
+)
+from psfdae.model.stars import REFERENCE, SPLIT, Stars
+from psfdae.strip import StripRow, restoration_strip, spread_stars
+from psfdae.threads import fixed_threads
+
+if TYPE_CHECKING:
+    from astropy.table import Table
+    from matplotlib.figure import Figure
+
+BESIDE = ("noisy", "lmmse")
+"""Methods that every model is compared with, beside one mean PSF."""
+
+STRIP_SNR = 10.0
+"""The figure of restored stars has the S/N nearest to this."""
+
+STRIP_STARS = 6
+
+
+def validate(model: PsfModel, stars: Stars, others: Mapping[str, Method] | None = None) -> Report:
+    """Errors of a model on the stars held out, degraded to the noise levels of their settings.
+
+    Beside it stand the noisy images, one mean PSF whose centre is fitted, and linear MMSE.
+
+    Parameters
+    ----------
+    model : PsfModel
+        It was fitted to these stars, or to another image of the same camera.
+    stars : Stars
+    others : mapping of str to Method, optional
+        Further fits to these stars for the table, by name.
+
+    Raises
+    ------
+    Error
+        If the model may have seen the stars that are held out, or their pixels differ.
+    """
+    _require_unseen(model, stars)
+    settings, own = stars.settings, model.info.method
+    known = {**(others or {}), own: model.engine.estimator}
+    names = [n for n in settings.methods if n in known or n in BESIDE]
+    names += [n for n in (own, *BESIDE) if n not in names]
+    with fixed_threads(settings.evaluation.threads):
+        methods = {name: known.get(name) or _fitted_here(name, stars) for name in names}
+        return _measured(model, stars, methods)
+
+
+def _require_unseen(model: PsfModel, stars: Stars) -> None:
+    """Refuse a model of other stars of the same image, and one of another camera."""
+    info, product, said = model.info, stars.product, stars.observation.path
+    model.check_scale(stars.observation.pixel_scale_arcsec, str(said))
+    if info.stamp_px != stars.settings.framing.stamp_px:
+        raise PredictionError(
+            f"{said}: stamps of {stars.settings.framing.stamp_px} px, but the model {info.name!r} "
+            f"takes {info.stamp_px} px"
+        )
+    train = split_stars(product, SPLIT, stars.settings).train
+    images = product["realisation"][train]
+    trained_on = info.config["stars"].get("image_sha256")
+    if trained_on != product.config["image_sha256"]:
+        return
+    if info.training_sha256 != checksum(images, product[REFERENCE][train]):
+        raise PredictionError(
+            f"{said}: the model {info.name!r} was trained on other stars of this image, among "
+            "which may be those held out here; fit a model to these stars"
+        )
+
+
+def _fitted_here(name: str, stars: Stars) -> Method:
+    kind = method_of(name)
+    data = training_set(stars.settings, kind, stars.product, SPLIT, REFERENCE)
+    fitted: Method = kind.fit(data, **kind.settings(stars.settings))
+    return fitted
+
+
+def _measured(model: PsfModel, stars: Stars, methods: Mapping[str, Method]) -> Report:
+    settings, product = stars.settings, stars.product
+    parts = split_stars(product, SPLIT, settings)
+    truth, field = product[REFERENCE][parts.test], product["field_index"][parts.test]
+    position = field_positions(product)[parts.test]
+    data_range = settings.evaluation.data_range
+    key = {"dataset": stars.name, "split": SPLIT, "reference": REFERENCE}
+    rows, per_star, restored = [], [], {}
+    for level in settings.noise.levels:
+        noisy = noisy_test_images(settings, product, parts.test, level)
+        mean = fitted_mean(noisy, stars.mean_psf, settings.framing.jitter_px + 1.0)
+        row = {**key, "method": MEAN_PSF, "noise_level": level}
+        beside = summarised(row, all_metrics(mean, truth, data_range), field)
+        for name, method in methods.items():
+            own = name == model.info.method
+            scale = settings.noise.kappa / model.info.kappa if own else 1.0
+            estimate = method.estimate(noisy, scale * level, position)
+            metrics = quality(estimate, truth, data_range)
+            row = {**key, "method": name, "noise_level": level}
+            rows += summarised(row, metrics, field)
+            per_star.append({**row, "star": parts.test, "field": field, **metrics})
+            if own:
+                restored[level] = {"truth": truth, "model": estimate.psf, MEAN_PSF: mean}
+        rows += beside
+    measured = [row for row in rows if row["method"] != MEAN_PSF]
+    table = _table(rows, stars, methods)
+    return Report(model, stars, methods, table, _stacked(measured), _joined(per_star), restored)
+
+
+def _stacked(rows: Sequence[Mapping[str, Any]]) -> Table:
+    from astropy.table import Table
+
+    return Table({name: [row[name] for row in rows] for name in rows[0]})
+
+
+def _joined(parts: Sequence[Mapping[str, Any]]) -> Table:
+    """Rows of parts, NaN in columns that a part does not have."""
+    from astropy.table import Table
+
+    names = dict.fromkeys(name for part in parts for name in part)
+    columns = {
+        name: [np.broadcast_to(part.get(name, np.nan), part["star"].shape) for part in parts]
+        for name in names
+    }
+    return Table({name: np.concatenate(values) for name, values in columns.items()})
+
+
+def _table(rows: Sequence[Mapping[str, Any]], stars: Stars, methods: Mapping[str, Method]) -> Table:
+    """MSE and SSIM by S/N and method."""
+    settings, product = stars.settings, stars.product
+    parts = split_stars(product, SPLIT, settings)
+    area = star_area(product, parts.train)
+    of = {(row["noise_level"], row["method"], row["metric"]): row for row in rows}
+    shared = {
+        "images": parts.test.size,
+        "stars": int(stars.held_out.sum()),
+        "truth_mse": _noise_of_truth(stars, parts.test),
+    }
+    found = []
+    for level in sorted(settings.noise.levels, reverse=True):  # S/N ascending
+        noise = settings.noise.kappa * level
+        for name in (*methods, MEAN_PSF):
+            mse_of, ssim_of = (of[level, name, metric] for metric in ("mse", "ssim_peak"))
+            found.append(
+                {
+                    "snr": signal_to_noise(noise, area),
+                    "noise": noise,
+                    "method": name,
+                    "mse": mse_of["value"],
+                    "mse_stderr": mse_of["stderr"],
+                    "ssim": ssim_of["value"],
+                    **shared,
+                }
+            )
+    return _stacked(found)
+
+
+def _noise_of_truth(stars: Stars, test: np.ndarray) -> float:
+    """Mean variance of the pixels of the stars held out: their own noise, in every MSE.
+
+    Sky noise σ and the star's photons F, F = √B / σ: σ² + p/F with the mean p = 1/P.
+    """
+    product, sky = stars.product, stars.settings.noise.background_photons
+    noise = product["noise"][product["field_index"][test]]
+    pixels = product["realisation"][0].size
+    return float((noise**2 + noise / np.sqrt(sky) / pixels).mean())
+
+
+@dataclass(frozen=True, eq=False)
+class Report:
+    """Whether to trust a model: its errors on stars that no training saw.
+
+    Attributes
+    ----------
+    model : PsfModel
+    stars : Stars
+    methods : dict of str to Method
+        All that were measured, the model's own included.
+    table : Table
+        MSE with its standard error and SSIM by S/N and method.
+    evaluation : Table
+        Every metric of every method at every noise level.
+    per_star : Table
+        The same of every image.
+    restored : dict
+        By noise level λ the held-out images (n, d, d): `truth`, `model`, and `mean_psf`.
+    """
+
+    model: PsfModel
+    stars: Stars
+    methods: Mapping[str, Method]
+    table: Table
+    evaluation: Table
+    per_star: Table
+    restored: dict[float, dict[str, np.ndarray]]
+
+    def __str__(self) -> str:
+        kind = type(self.model.engine.estimator)
+        return standing(self.table, kind.name, kind.label)
+
+    def save(self, path: str | Path) -> None:
+        """Write the page, one HTML file that needs no other."""
+        write_text(path, self.page())
+
+    def strip(self) -> Figure:
+        """Held-out stars degraded to S/N 10, and what the methods make of them."""
+        settings, product = self.stars.settings, self.stars.product
+        parts = split_stars(product, SPLIT, settings)
+        area = star_area(product, parts.train)
+        levels = np.asarray(settings.noise.levels)
+        snr = 1.0 / (settings.noise.kappa * levels * np.sqrt(area))
+        level = float(levels[np.abs(np.log(snr / STRIP_SNR)).argmin()])
+        star, place = product["field_index"][parts.test], field_positions(product)[parts.test]
+        noisy = noisy_test_images(settings, product, parts.test, level)
+        shown = _one_of_each(star, product["position"])
+        truth = product[REFERENCE][parts.test][shown]
+        rows = [StripRow("bright\nstar", truth)]
+        for method in self.methods.values():
+            if method.drawn:
+                stamps = method.restore(noisy, level, place)[shown]
+                error = mse(stamps, truth)
+                rows.append(StripRow(method.label, stamps, error, own_scale=not method.restores))
+        columns = [f"S/N {value:.0f}" for value in product["snr"][star[shown]]]
+        found = signal_to_noise(settings.noise.kappa * level, area)
+        title = f"Bright stars that no training saw, degraded to S/N {found:.3g}"
+        return restoration_strip(rows, columns, title)
+
+    def page(self) -> str:
+        """The HTML of the page; the PSFs of all stars of the image are predicted for it."""
+        model, stars = self.model, self.stars
+        info, selection = model.info, stars.table
+        held = np.flatnonzero(selection["part"] == "held out")
+        where = np.stack([selection["x"][held], selection["y"][held]], axis=1)
+        shown = held[spread_stars(where, SHOWN_STARS)] if np.isfinite(where).all() else held
+        found, psf, residual = _all_stars(model, stars, shown[:SHOWN_STARS])
+        columns = {name: np.asarray(selection[name]) for name in ("verdict", "part")}
+        area, shown = info.noise_equivalent_px, shown[:SHOWN_STARS]
+        kind = type(model.engine.estimator)
+        levels = self.restored.items()
+        return quality_page(
+            Quality(
+                name=info.name,
+                image=stars.observation.path.name,
+                method=kind.name,
+                label=kind.label,
+                notes=stars.notes,
+                errors=self.table,
+                coverage={r["snr"]: r["coverage68"] for r in info.metrics if "coverage68" in r},
+                faint={signal_to_noise(info.kappa * level, area): of for level, of in levels},
+                stars=found | columns,
+                residual=residual / found["noise"][shown, None, None],
+                bright=psf[shown] + residual,
+                strip=as_png(self.strip()),
+                field=None if stars.observation.positions is None else _map(found, psf, stars),
+                facts=[*model.engine.estimator.facts().values()],
+            )
+        )
+
+
+def _one_of_each(star: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """An image each of stars that lie evenly over the field."""
+    stars, first = np.unique(star, return_index=True)
+    if not np.isfinite(position[stars]).all():
+        return first[:STRIP_STARS]
+    return first[spread_stars(position[stars], STRIP_STARS)]
+
+
+def _all_stars(
+    model: PsfModel, stars: Stars, kept: np.ndarray
+) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
+    """Columns and PSFs of all stars of an image, and the residuals of those that are kept."""
+    columns: dict[str, list[np.ndarray]] = {}
+    psf, residual, done = [], [], 0
+    for stamps, found in model.stream(stars.observation.with_margin(MARGIN_PX), threads=1):
+        for name, value in itertools.chain(_per_star(stamps, ("x", "y")), _per_star(found)):
+            columns.setdefault(name, []).append(value)
+        psf.append(found.psf)
+        inside = kept[(kept >= done) & (kept < done + len(found))] - done
+        residual.append((inside + done, found.residual[inside]))
+        done += len(found)
+    order = np.argsort(np.argsort(kept))
+    rows = np.concatenate([images for _, images in residual])[order]
+    joined = {name: np.concatenate(values) for name, values in columns.items()}
+    joined["flags"] = joined["flags"].astype(int)
+    return joined, np.concatenate(psf), rows
+
+
+def _per_star(of: Stamps | Prediction, names: Any = None) -> Iterator[tuple[str, np.ndarray]]:
+    for name in names or of.__dataclass_fields__:
+        value = np.asarray(getattr(of, name))
+        if value.ndim == 1:
+            yield name, value
+
+
+def _map(found: Mapping[str, np.ndarray], psf: np.ndarray, stars: Stars) -> Figure:
+    field = FieldStars(**{name: found[name] for name in FieldStars.__dataclass_fields__})
+    drawn, count = len(field.drawable()), len(field.x)
+    title = f"{stars.observation.path.name}: {drawn} of {count} stars"
+    return psf_map(psf[field.chosen()], field, title)

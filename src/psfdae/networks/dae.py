@@ -1,0 +1,389 @@
+"""The network of the paper's section 2.2, a denoising autoencoder, and its training.
+
+Ten convolutions with "same" padding and ReLU after each, kernels 9, 7, 5, 3, 1
+as the encoder and 1, 3, 5, 7, 9 as the decoder, no pooling; the output has the
+size of the input. As ONNX file it serves programs that have no torch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+import torch
+from torch import nn
+
+from psfdae.errors import Error
+from psfdae.files import atomic_path
+from psfdae.method import TrainingSet
+from psfdae.networks.training import DeadNetworkError, Muon, Row, Training, TrainingError, train
+from psfdae.rng import stream
+
+if TYPE_CHECKING:
+    from psfdae.networks.settings import DaeSettings, Train
+
+
+MOST_ZERO = 0.5
+"""Part of the validation stars without any output above which a network is dead."""
+
+
+class SingleChannelConv(nn.Conv2d):
+    """Convolution to one channel, computed as a transposed convolution.
+
+    The two are the same sum: correlating with a kernel is scattering with the
+    flipped one. oneDNN vectorises over output channels and is slow for one; the
+    matrix-product path of the transposed convolution takes half the time (a
+    tenth of a training step at width 16).
+    """
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Map (B, C, h, w) to (B, 1, h, w)."""
+        if x.device.type != "cpu":
+            return super().forward(x)
+        x = x.to(self.weight.dtype)  # autocast hands on its own
+        flipped = self.weight.flip(2, 3).transpose(0, 1)
+        return torch.ops.aten.slow_conv_transpose2d(
+            x, flipped, self.kernel_size, self.bias, [1, 1], self.padding, [0, 0], [1, 1]
+        )
+
+
+class Dae(nn.Module):
+    """Denoising autoencoder on single-channel images.
+
+    Parameters
+    ----------
+    kernels : sequence of int
+        Odd kernel sizes of the L convolutions.
+    widths : sequence of int
+        Channels between them, L − 1 values.
+    """
+
+    def __init__(self, kernels: Sequence[int], widths: Sequence[int]) -> None:
+        super().__init__()
+        self.kernels, self.widths = tuple(kernels), tuple(widths)
+        channels = [1, *widths, 1]
+        self.layers = nn.ModuleList(
+            (nn.Conv2d if outer > 1 else SingleChannelConv)(
+                inner, outer, kernel, padding=kernel // 2
+            )
+            for (inner, outer), kernel in zip(pairwise(channels), kernels, strict=True)
+        )
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Map scaled star images (B, 1, d, d) to scaled PSFs of the same shape."""
+        for layer in self.layers:
+            x = torch.relu(layer(x))
+        return x
+
+
+def build_dae(
+    kernels: Sequence[int],
+    widths: Sequence[int],
+    init: Literal["he", "default"],
+    generator: torch.Generator,
+) -> Dae:
+    """A fresh network whose weights come from `generator` alone.
+
+    `he` draws N(0, 2/fan_in) with zero biases (He et al. 2015); `default` is
+    PyTorch's uniform ±1/√fan_in for weights and biases.
+    """
+    model = Dae(kernels, widths).to(memory_format=torch.channels_last)
+    with torch.no_grad():
+        for layer in model.layers:
+            if init == "he":
+                nn.init.kaiming_normal_(layer.weight, nonlinearity="relu", generator=generator)
+                layer.bias.zero_()
+            else:
+                bound = float(layer.weight[0].numel()) ** -0.5
+                layer.weight.uniform_(-bound, bound, generator=generator)
+                layer.bias.uniform_(-bound, bound, generator=generator)
+    return model
+
+
+def image_scale(scale: Literal["mean", "none"], stamp_px: int) -> float:
+    """Factor between flux-normalised images (sum 1) and what the network sees."""
+    return float(stamp_px**2) if scale == "mean" else 1.0
+
+
+def crop_px(stamp_px: int) -> int:
+    """Side of the middle of stamps in which a training begins, as even or odd as theirs.
+
+    Most of a star's light is there, and all that a convolution has to learn but the border.
+    """
+    return stamp_px - 2 * round(0.2 * stamp_px)
+
+
+@torch.inference_mode()
+def predict(model: Dae, noisy: np.ndarray, factor: float, batch: int = 256) -> np.ndarray:
+    """PSFs of noisy star images.
+
+    Parameters
+    ----------
+    model : Dae
+    noisy : ndarray, shape (n, d, d)
+        Flux-normalised images.
+    factor : float
+        Result of `image_scale`.
+    batch : int
+        Images per forward pass.
+
+    Returns
+    -------
+    ndarray, shape (n, d, d), float32
+        Neither clipped nor renormalised.
+    """
+    model.eval()
+    out = np.empty(noisy.shape, dtype=np.float32)
+    for start in range(0, len(noisy), batch):
+        images = torch.from_numpy(np.ascontiguousarray(noisy[start : start + batch], np.float32))
+        scaled = (images[:, None] * factor).to(memory_format=torch.channels_last)
+        out[start : start + batch] = (model(scaled)[:, 0] / factor).numpy()
+    return out
+
+
+class DaeTraining(Training):
+    """Training on noisy images, with noise that is drawn anew in every epoch, or once.
+
+    It may begin with the middle of the stamps, where an epoch takes half of the time. The history
+    has MSEs of flux-normalised images. Another attempt draws other weights and other noise.
+    """
+
+    settings: Train
+
+    def __init__(
+        self, data: TrainingSet, dae: DaeSettings, settings: Train, seed: int, attempt: int = 0
+    ) -> None:
+        self.data, self.seed = data, seed
+        self.factor = image_scale(dae.scale, data.images.shape[-1])
+        generator = torch.Generator()
+        generator.manual_seed(int(stream(seed, "dae", "init", attempt).integers(2**62)))
+        model = build_dae(dae.kernels, dae.widths, dae.init, generator)
+        if data.start is not None:
+            model.load_state_dict(data.start.network.state_dict())
+        super().__init__(model, settings, -(-data.fit.size // settings.batch), attempt)
+        self.grad_clip = settings.grad_clip or self.grad_clip
+        # A template follows from all of a stamp.
+        own = data.reference == "realisation"
+        self.cropped = round(settings.crop_epochs * settings.epochs) if own else 0
+        self.fixed: tuple[np.ndarray, ...] | None = None
+        if settings.noise == "fixed":
+            stars = np.arange(len(data.images))
+            self.fixed = data.draw(stars, stream(seed, "dae", "fixed noise"))
+
+    def begin(self, lr: float) -> torch.optim.Optimizer:
+        """Muon for the weights of the inner layers, Adam for the others; or Adam for all."""
+        if self.settings.optimiser == "adam":
+            return super().begin(lr)
+        inner = [layer.weight for layer in self.model.layers[1:-1]]
+        others = [p for p in self.model.parameters() if all(p is not w for w in inner)]
+        return Muon([{"params": others}, {"params": inner, "orthogonal": True}], lr=lr)
+
+    def batches(self, epoch: int) -> Iterator[tuple[torch.Tensor, ...]]:
+        """Noisy images and what is to come of them, (B, 1, d, d) as the network sees them.
+
+        The third is the weight of each star's error, (B, 1, 1, 1), of mean 1 over the levels.
+        """
+        rng = stream(self.seed, "dae", "epoch", self.attempt, epoch)
+        side = self.data.images.shape[-1]
+        edge = (side - crop_px(side)) // 2 if epoch < self.cropped else 0
+        order = rng.permutation(self.data.fit)
+        for start in range(0, order.size, self.settings.batch):
+            stars = order[start : start + self.settings.batch]
+            if self.fixed is None:
+                noisy, level = self.data.draw(stars, rng)
+            else:
+                noisy, level = (fixed[stars] for fixed in self.fixed)
+            power = -self.settings.level_weight
+            weight = level**power / np.mean(self.data.levels**power)
+            weighted = torch.from_numpy(weight.astype(np.float32))[:, None, None, None]
+            references = self.data.references[stars]
+            yield self._tensor(noisy, edge), self._tensor(references, edge), weighted
+
+    def _tensor(self, images: np.ndarray, edge: int) -> torch.Tensor:
+        inner = slice(edge, images.shape[-1] - edge)
+        scaled = torch.from_numpy(images[:, inner, inner])[:, None] * self.factor
+        return scaled.to(memory_format=torch.channels_last)
+
+    def loss(self, batch: tuple[torch.Tensor, ...], step: int) -> torch.Tensor:
+        """Mean squared error, weighted by star."""
+        noisy, target, weight = batch
+        output = self.model(noisy)
+        if step % self.settings.dead_check_steps == 0 and not output.detach().any():
+            raise DeadNetworkError(f"all outputs are zero at step {step}")
+        return (weight * (output - target) ** 2).mean()
+
+    def validate(self, epoch: int) -> float:
+        """Mean squared error of the validation stars every few epochs and after the last."""
+        if epoch % self.settings.validate_every and epoch != self.settings.epochs:
+            return float("nan")
+        stars = np.tile(self.data.validation, self.settings.validation_draws)
+        noisy, _ = self.data.draw(stars, stream(self.seed, "dae", "validation"))
+        estimate = predict(self.model, noisy, self.factor)
+        zero = 1.0 - estimate.any(axis=(1, 2)).mean()
+        if zero > MOST_ZERO:
+            raise DeadNetworkError(f"{zero:.0%} of the outputs are zero after epoch {epoch}")
+        error = float(((estimate - self.data.references[stars]) ** 2).mean(dtype=np.float64))
+        if not np.isfinite(error):
+            raise TrainingError(
+                f"the validation error is {error} after epoch {epoch}: "
+                f"look for validation stars that are not finite"
+            )
+        return error
+
+    def row(self, epoch: int, rate: float, loss: float, error: float) -> Row:
+        """Row of the history; the learning rate is that at the epoch's end."""
+        return {
+            "epoch": epoch,
+            "step": epoch * self.steps,
+            "lr": self.rate,
+            "train_mse": loss / self.factor**2,
+            "validation_mse": error,
+            "seconds": round(self.seconds, 3),
+            "cpu_seconds": round(self.cpu_seconds, 3),
+        }
+
+    def finished(self) -> bool:
+        """All epochs are done, or `patience` validations brought nothing better."""
+        scores = [row["validation_mse"] for row in self.history]
+        scores = [score for score in scores if np.isfinite(score)]
+        stale = len(scores) - 1 - int(np.argmin(scores)) if scores else 0
+        return super().finished() or 0 < self.settings.patience <= stale
+
+
+def train_dae(
+    data: TrainingSet,
+    dae: DaeSettings,
+    settings: Train,
+    seed: int,
+    checkpoint: Path,
+    fingerprint: str,
+    report: Callable[[Row], None] = lambda row: None,
+) -> Training:
+    """A trained denoising autoencoder: `result`, `history`, `attempt` of the training.
+
+    Parameters and errors are those of `train`.
+    """
+
+    def begin(attempt: int) -> Training:
+        return DaeTraining(data, dae, settings, seed, attempt)
+
+    return train(begin, checkpoint, fingerprint, report, settings.restarts)
+
+
+ONNX_TOLERANCE = 1e-5
+"""Largest difference between the exported and the original network, of the peak."""
+
+CHECKED_BATCHES = (1, 7)
+
+
+class ExportError(Error, RuntimeError):
+    """The network cannot be exported, or the exported one computes something else."""
+
+
+class _Exported(nn.Module):
+    """Star images in, PSFs out, with standard convolutions that share the weights."""
+
+    def __init__(self, model: Dae, factor: float) -> None:
+        super().__init__()
+        self.factor = factor
+        self.layers = nn.ModuleList(_plain(layer) for layer in model.layers)
+
+    def forward(self, images: torch.Tensor) -> torch.Tensor:
+        x = images[:, None] * self.factor
+        for layer in self.layers:
+            x = torch.relu(layer(x))
+        return x[:, 0] / self.factor
+
+
+def _plain(layer: nn.Conv2d) -> nn.Conv2d:
+    """The convolution without its fast path, which has no ONNX operator."""
+    plain = nn.Conv2d(
+        layer.in_channels, layer.out_channels, layer.kernel_size, padding=layer.padding
+    )
+    plain.weight, plain.bias = layer.weight, layer.bias
+    return plain
+
+
+def export_onnx(model: Dae, factor: float, stamp_px: int, path: Path) -> None:
+    """Write a network as ONNX and check it against torch.
+
+    The file takes `images`, float32 of shape (stars, d, d), flux-normalised, and
+    gives `psf` of the same shape and unit; the scale factor is part of it and the
+    number of stars is free.
+
+    Parameters
+    ----------
+    model : Dae
+    factor : float
+        Result of `image_scale`.
+    stamp_px : int
+        Side d of the stamps.
+    path : path of the ONNX file
+
+    Raises
+    ------
+    ExportError
+        If onnx, onnxscript or onnxruntime is missing, or if the file's PSFs of
+        random stars differ from torch's by more than `ONNX_TOLERANCE` of the peak. No
+        file is left then.
+    """
+    try:
+        import onnxruntime  # noqa: F401
+        import onnxscript  # noqa: F401
+    except ImportError as error:
+        raise ExportError(f"{error}: the extra 'dev' holds what the export needs") from error
+    model.eval()
+    # Two stars: a batch of one would be taken for a constant.
+    example = torch.zeros(2, stamp_px, stamp_px)
+    with atomic_path(path) as temporary:
+        torch.onnx.export(
+            _Exported(model, factor).eval(),
+            (example,),
+            temporary,
+            input_names=["images"],
+            output_names=["psf"],
+            dynamo=True,
+            dynamic_shapes={"images": {0: torch.export.Dim("stars", min=1)}},
+            external_data=False,
+            verbose=False,
+        )
+        _check(model, factor, stamp_px, temporary)
+
+
+def _check(model: Dae, factor: float, stamp_px: int, path: Path) -> None:
+    for batch in CHECKED_BATCHES:
+        images = random_stars(batch, stamp_px)
+        expected = predict(model, images, factor)
+        found = session(path, threads=1).run(None, {"images": images})[0]
+        worst = float(np.abs(found - expected).max(initial=0.0))
+        peak = float(np.abs(expected).max(initial=0.0))
+        if found.shape != expected.shape or not worst <= ONNX_TOLERANCE * peak:
+            raise ExportError(
+                f"{path.name}: a batch of {batch} differs from torch by {worst:.3g} "
+                f"(peak {peak:.3g}, at most {ONNX_TOLERANCE} of it)"
+            )
+
+
+def session(path: Path, threads: int):  # type: ignore[no-untyped-def]
+    """An onnxruntime session on the CPU whose operators use this many threads."""
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.inter_op_num_threads = 1
+    return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+
+
+def random_stars(count: int, stamp_px: int) -> np.ndarray:
+    """Noisy Gaussian stars that sum to about 1, shape (count, d, d), float32."""
+    rng = stream(0, "random_stars", count, stamp_px)
+    grid = np.arange(stamp_px) - 0.5 * stamp_px
+    centre = rng.uniform(-1.0, 1.0, (2, count, 1, 1))
+    width = rng.uniform(0.8, 2.5, (count, 1, 1))
+    r2 = (grid[:, None] - centre[0]) ** 2 + (grid - centre[1]) ** 2
+    images = np.exp(-0.5 * r2 / width**2)
+    images /= images.sum(axis=(1, 2), keepdims=True)
+    return (images + rng.normal(0.0, 0.005, images.shape)).astype(np.float32)

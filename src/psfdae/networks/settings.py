@@ -1,0 +1,85 @@
+"""Settings of the denoising autoencoder and of its training."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from psfdae.settings import CheckpointSeconds, Count, Group
+
+
+class DaeSettings(Group):
+    """The denoising autoencoder."""
+
+    kernels: Annotated[list[Annotated[int, Field(ge=1, le=31)]], Field(min_length=2)] = Field(
+        [9, 7, 5, 3, 1, 1, 3, 5, 7, 9],
+        description="Kernel sizes of the convolutions, encoder then decoder; odd",
+    )
+    widths: Annotated[list[Count], Field(min_length=1)] = Field(
+        [16, 16, 16, 16, 16, 16, 16, 16, 16],
+        description="Channels between the convolutions, one fewer than kernels",
+    )
+    init: Literal["he", "default"] = Field("he", description="He (2015) or PyTorch's default")
+    scale: Literal["mean", "none"] = Field(
+        "mean", description="'mean' multiplies images by d² (mean pixel 1), 'none' leaves sum 1"
+    )
+
+    @model_validator(mode="after")
+    def _shape(self) -> DaeSettings:
+        if any(k % 2 == 0 for k in self.kernels):
+            raise ValueError(f"kernels = {self.kernels}: must be odd")
+        if len(self.widths) != len(self.kernels) - 1:
+            raise ValueError(
+                f"widths = {self.widths}: {len(self.kernels)} kernels need "
+                f"{len(self.kernels) - 1} widths, not {len(self.widths)}"
+            )
+        return self
+
+
+class Train(Group):
+    """Optimisation of the denoising autoencoder."""
+
+    epochs: Count = Field(24, description="Passes over the training stars")
+    batch: Count = Field(32, description="Stars per step")
+    lr: Annotated[float, Field(gt=0, le=1)] = Field(
+        6.0e-3, description="Adam's learning rate (its maximum if one-cycle)"
+    )
+    optimiser: Literal["adam", "muon"] = Field(
+        "muon", description="Of the inner layers' weights; all else is Adam's"
+    )
+    level_weight: Annotated[float, Field(ge=0, le=2)] = Field(
+        1.0, description="Power p by which the squared error of a star counts 1/λ^p; 0: all alike"
+    )
+    schedule: Literal["onecycle", "constant"] = Field(
+        "onecycle", description="Course of the learning rate"
+    )
+    grad_clip: Annotated[float, Field(ge=0)] = Field(
+        1.0, description="Maximum norm of the gradient; 0 switches clipping off"
+    )
+    threads: Count = Field(1, description="Threads of one training")
+    validate_every: Count = Field(2, description="Epochs between validations")
+    validation_draws: Count = Field(1, description="Noise draws per validation star")
+    dead_check_steps: Count = Field(50, description="Steps between looks for a dead network")
+    restarts: Annotated[int, Field(ge=0)] = Field(
+        3, description="New starts from another seed if the network dies"
+    )
+    checkpoint_seconds: CheckpointSeconds = Field(
+        20.0, description="Least time between checkpoints; repeats nothing"
+    )
+    noise: Literal["fresh", "fixed"] = Field(
+        "fresh", description="Noise drawn anew every epoch, or once for all epochs"
+    )
+    crop_epochs: Annotated[float, Field(ge=0, lt=1)] = Field(
+        0.0,
+        description="First part of the epochs, which sees the middle of stamps alone where "
+        "realisations are learnt; 0: none",
+    )
+    continued_epochs: Annotated[float, Field(ge=0, le=1)] = Field(
+        0.0,
+        description="Part of the epochs in which a network of templates goes on from that of the "
+        "realisations; 0: all of them, from a start of its own",
+    )
+    patience: Annotated[int, Field(ge=0)] = Field(
+        0, description="Stop after this many validations without a better one; 0 never stops"
+    )

@@ -1,0 +1,200 @@
+"""Settings with their types, units, ranges, meanings and defaults, and how they are checked.
+
+A group of settings is a class. Its keys are read from keywords, from words `group.key=value` of
+a command line or from YAML; each wrong one is named with its value and the allowed range.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from psfdae.errors import Error
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Fraction = Annotated[float, Field(ge=0, lt=1)]
+Count = Annotated[int, Field(ge=1)]
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_]+$")]
+
+Reference = Literal["realisation", "template"]
+SplitKind = Literal["random", "held_out"]
+
+
+NEUTRAL = "cannot change a result"
+"""Marks a setting of which no byte of a result depends: another value repeats no job."""
+
+CheckpointSeconds = Annotated[float, Field(ge=0), NEUTRAL]
+
+
+class Group(BaseModel):
+    """A config group: immutable, and no key beyond those declared."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class ConfigError(Error, ValueError):
+    """The configuration is not usable; every line names a key, its value and the range."""
+
+
+LONGEST = 200
+"""Characters of a wrong value that a message repeats."""
+
+
+def validate(model: type[Any], tree: Mapping[str, Any]) -> Any:
+    """Check a configuration tree against a pydantic model.
+
+    Raises
+    ------
+    ConfigError
+        One line per finding: key = value: what is allowed.
+    """
+    try:
+        return model.model_validate(tree)
+    except ValidationError as error:
+        raise ConfigError("\n".join(_finding(e) for e in error.errors())) from None
+
+
+def _finding(error: Mapping[str, Any]) -> str:
+    key = ".".join(str(part) for part in error["loc"])
+    message = error["msg"].removeprefix("Value error, ")
+    if error["type"] == "extra_forbidden":
+        return f"{key}: unknown key"
+    if error["type"] == "missing":
+        return f"{key}: missing"
+    if error["type"] == "value_error":
+        return f"{key}: {message}" if key else message
+    given = repr(error["input"])
+    given = given if len(given) <= LONGEST else f"{given[:LONGEST]}…"
+    return f"{key} = {given}: {message[0].lower()}{message[1:]}"
+
+
+def deciding(group: Group) -> dict[str, Any]:
+    """The settings of a group, and of groups in it, but for those that cannot change a result."""
+    tree = group.model_dump()
+    for name, field in type(group).model_fields.items():
+        value = getattr(group, name)
+        if NEUTRAL in field.metadata:
+            del tree[name]
+        elif isinstance(value, Group):
+            tree[name] = deciding(value)
+    return tree
+
+
+def as_overrides(tree: Mapping[str, Any]) -> list[str]:
+    """Hydra overrides that pin every leaf of a tree, in a fixed order.
+
+    The list is at once a command line, the trigger of a rerun (the same
+    configuration gives the same text, comments and number formats do not count)
+    and something that a person can paste.
+    """
+    return [f"++{key}={_literal(value)}" for key, value in sorted(_leaves(tree))]
+
+
+def _leaves(tree: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
+    leaves: list[tuple[str, Any]] = []
+    for key, value in tree.items():
+        if isinstance(value, Mapping):
+            leaves += _leaves(value, f"{prefix}{key}.")
+        else:
+            leaves.append((prefix + key, value))
+    return leaves
+
+
+def _literal(value: Any) -> str:
+    if isinstance(value, list):
+        return "[" + ",".join(_literal(item) for item in value) + "]"
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+Seed = Annotated[int, Field(ge=0, lt=2**63)]
+
+
+class Stamp(Group):
+    """Size and centring of stamps."""
+
+    stamp_px: Annotated[int, Field(ge=8, le=256, multiple_of=2)] = Field(
+        16, description="Side d of a stamp"
+    )
+    jitter_px: Annotated[int, Field(ge=0, le=8)] = Field(
+        1, description="Centring error, uniform in ± this many whole pixels per axis"
+    )
+    subpixel: bool = Field(
+        True,
+        description="Pixel grid of every realisation anywhere within ± ½ pixel, as for real stars",
+    )
+
+
+class Noise(Group):
+    """A noise band: the levels λ that one dataset mixes."""
+
+    name: Name = Field(description="For titles and messages")
+    levels: Annotated[list[Positive], Field(min_length=1)] = Field(
+        description="Noise levels λ of the paper"
+    )
+    kappa: Positive = Field(description="Pixel RMS of the normalised image per unit of λ")
+    background_photons: Annotated[float, Field(gt=0, le=1e12)] = Field(
+        description="Sky photons per pixel"
+    )
+
+
+class Parts(Group):
+    """Sizes of the training, validation and test parts."""
+
+    train_stars: Count = Field(3000, description="Training stars, validation included")
+    test_stars: Count = Field(300, description="Test stars of the random split")
+    validation_fraction: Annotated[float, Field(gt=0, le=0.5)] = Field(
+        0.1, description="Part of the training stars that selects the best state"
+    )
+
+
+class Evaluation(Group):
+    """Image metrics."""
+
+    data_range: Positive = Field(0.66, description="SSIM dynamic range fitted to the paper's rows")
+    batch: Count = Field(256, description="Stars per forward pass")
+    threads: Count = Field(1, description="Threads of the linear algebra")
+
+
+class CalibrationStars(Group):
+    """Which stars of an image become training data, and the noise that they get."""
+
+    snr_min: Positive = Field(100.0, description="Least S/N of a star that is learnt from")
+    isolation_px: Positive = Field(
+        12.0, description="Distance within which a neighbour is too close"
+    )
+    neighbour_ratio: Positive = Field(
+        0.02,
+        description="Brightness of such a neighbour, in that of the star, from which it disturbs",
+    )
+    misfit: Annotated[float, Field(gt=1, allow_inf_nan=False)] = Field(
+        2.5, description="Difference of a misfit from the nearest stars, in that of the median star"
+    )
+    search_px: Annotated[int, Field(ge=1, le=16)] = Field(
+        3, description="The brightest pixel is searched within ± this of the catalogue's position"
+    )
+    margin_px: Annotated[int, Field(ge=0, le=64)] = Field(
+        8, description="Pixels around a stamp, in which the sky is measured"
+    )
+    stars_min: Annotated[int, Field(ge=10)] = Field(20, description="Fewest stars to learn from")
+    bins: Annotated[int, Field(ge=1, le=64)] = Field(
+        4, description="Parts of the field along a side; stars of a part are stacked"
+    )
+    snr_levels: Annotated[list[Positive], Field(min_length=1)] = Field(
+        [5.0, 10.0, 20.0, 50.0],
+        description="S/N to which bright stars are degraded, ascending; those above snr_min / 2, "
+        "where the stars' own noise would count, are that",
+    )
+
+    @model_validator(mode="after")
+    def _levels(self) -> CalibrationStars:
+        if sorted(set(self.snr_levels)) != self.snr_levels:
+            raise ValueError(f"snr_levels = {self.snr_levels}: must be ascending")
+        return self
+
+    def degraded(self) -> list[float]:
+        """S/N to which bright stars are degraded, ascending, none above snr_min / 2."""
+        return sorted({min(level, 0.5 * self.snr_min) for level in self.snr_levels})

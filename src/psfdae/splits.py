@@ -1,0 +1,79 @@
+"""Parts of a set of stars for training, validation and test, and random centring errors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from psfdae.rng import stream
+
+
+def draw_jitter(count: int, jitter_px: int, rng: np.random.Generator) -> np.ndarray:
+    """Centring error of every star in whole pixels (row, column), uniform in ±`jitter_px`."""
+    return rng.integers(-jitter_px, jitter_px + 1, size=(count, 2))
+
+
+def draw_phase(count: int, rng: np.random.Generator) -> np.ndarray:
+    """Place of the pixel grid of every star (row, column), uniform in ± ½ pixel."""
+    return rng.uniform(-0.5, 0.5, size=(count, 2))
+
+
+@dataclass(frozen=True)
+class Split:
+    """Star indices of the three parts; `fit` and `validation` make up the training part."""
+
+    fit: np.ndarray
+    validation: np.ndarray
+    test: np.ndarray
+
+    @property
+    def train(self) -> np.ndarray:
+        """All training stars, validation included, ascending."""
+        return np.sort(np.concatenate([self.fit, self.validation]))
+
+
+def random_split(count: int, train: int, test: int, validation_fraction: float, seed: int) -> Split:
+    """Stars at random, as in the paper: every test star's field was seen in training."""
+    order = stream(seed, "split", "random").permutation(count)
+    held = round(validation_fraction * train)
+    return Split(
+        fit=np.sort(order[held:train]),
+        validation=np.sort(order[:held]),
+        test=np.sort(order[train : train + test]),
+    )
+
+
+def held_out_fields(grid: np.ndarray) -> np.ndarray:
+    """Fields never seen in training: (ix + 2·iy) mod 5 = 1, a knight's-move pattern, (F,).
+
+    `grid`, shape (F, 2), holds (ix, iy) of every field.
+    """
+    return (grid[:, 0] + 2 * grid[:, 1]) % 5 == 1
+
+
+def held_out_split(
+    star_field: np.ndarray, grid: np.ndarray, validation_fraction: float, seed: int
+) -> Split:
+    """Whole fields held out: the test part is all stars of `held_out_fields`.
+
+    Validation takes whole fields of the rest, too, so that it asks the same
+    question as the test.
+
+    Parameters
+    ----------
+    star_field : ndarray of int, shape (n,)
+        Field of every star.
+    grid : ndarray of int, shape (F, 2)
+        (ix, iy) of every field.
+    """
+    test_field = held_out_fields(grid)
+    seen = stream(seed, "split", "held_out").permutation(np.flatnonzero(~test_field))
+    validation_field = seen[: max(1, round(validation_fraction * seen.size))]
+    is_test = test_field[star_field]
+    is_validation = np.isin(star_field, validation_field)
+    return Split(
+        fit=np.flatnonzero(~is_test & ~is_validation),
+        validation=np.flatnonzero(is_validation),
+        test=np.flatnonzero(is_test),
+    )

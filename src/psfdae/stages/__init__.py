@@ -1,1 +1,0 @@
-"""Stages: one step of the science each, from input files to output files."""

@@ -1,1 +1,0 @@
-"""Star images: field points, random aberrations, framing, noise and splits."""

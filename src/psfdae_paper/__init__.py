@@ -1,0 +1,1 @@
+"""The reproduction of the paper: simulated telescopes, its methods, tables and figures."""

@@ -1,0 +1,284 @@
+"""Networks from the stamps of all fields to a state: the paper's, and one of ours.
+
+The paper's (section 3.3) has five convolutions with batch normalisation and leaky ReLU
+after each, and one linear layer. The fields are the channels of the input. Widths, kernels
+and strides are not in the paper's text; the configuration names them.
+
+Ours is a perceptron behind the leading principal components of all stamps together: states
+have four numbers, so that a hundred components hold what the stamps say of them, and stamps
+that always stand at the same place need no convolution. It learns in a seventh of the time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import chain, pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.linalg import eigh
+from torch import nn
+
+from psfdae.networks.training import Row, Training
+from psfdae.networks.weights import with_weights
+from psfdae.noise import NoiseModel, mixed_levels
+from psfdae.rng import stream
+from psfdae_paper.alignment.telescope import Mirror, mirror_symmetries
+from psfdae_paper.configuration.alignment import Cnn, NetworkTrain, Perceptron
+
+PARAMETERS = 4
+"""Numbers of a state: decentre x, y and tilt x, y in units of the range."""
+
+EXAMPLES = 1500
+"""States whose stamps, with their mirror images, tell the principal components."""
+
+
+class AlignmentCnn(nn.Module):
+    """Regression of a state of misalignment from the stamps of all fields.
+
+    Parameters
+    ----------
+    config : config group `cnn`
+        Widths, kernels and strides of the convolutions.
+    fields : int
+        Stamps per state, the channels of the input.
+    stamp_px : int
+        Side d of a stamp.
+    """
+
+    def __init__(self, config: Cnn, fields: int, stamp_px: int) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        channels, side = fields, stamp_px
+        for width, kernel, step in zip(config.widths, config.kernels, config.strides, strict=True):
+            layers += [
+                # Batch normalisation subtracts the mean: a bias would be lost in it.
+                nn.Conv2d(channels, width, kernel, step, kernel // 2, bias=False),
+                nn.BatchNorm2d(width),
+                nn.LeakyReLU(config.leak),
+            ]
+            channels, side = width, -(-side // step)
+        self.features = nn.Sequential(*layers)
+        self.linear = nn.Linear(channels * side**2, PARAMETERS)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Map scaled stamps (B, fields, d, d) to states (B, 4)."""
+        return self.linear(self.features(x).flatten(1))
+
+
+class AlignmentPerceptron(nn.Module):
+    """The same behind principal components; parameters as for `AlignmentCnn`."""
+
+    def __init__(self, config: Perceptron, fields: int, stamp_px: int) -> None:
+        super().__init__()
+        pixels = fields * stamp_px**2
+        self.register_buffer("mean", torch.zeros(pixels))
+        self.register_buffer("axes", torch.zeros(pixels, config.components))
+        sizes = [config.components, *config.widths]
+        layers = [(nn.Linear(*pair), nn.SiLU()) for pair in pairwise(sizes)]
+        self.features = nn.Sequential(*chain.from_iterable(layers))
+        self.linear = nn.Linear(sizes[-1], PARAMETERS)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Map scaled stamps (B, fields, d, d) to states (B, 4)."""
+        return self.linear(self.features((x.flatten(1) - self.mean) @ self.axes))
+
+    def look_at(self, clean: torch.Tensor, seen: torch.Tensor) -> None:
+        """Take the components of noise-free stamps, scaled to variance 1 of those that are seen.
+
+        Both are scaled, shape (n, fields, d, d).
+        """
+        flat = clean.flatten(1)
+        self.mean.copy_(flat.mean(dim=0))
+        flat = flat - self.mean
+        count = self.axes.shape[1]
+        # In double precision: pixels that a DAE leaves empty make the matrix singular.
+        products, last = (flat.T @ flat).double().numpy(), flat.shape[1] - 1
+        leading = eigh(products, subset_by_index=[last + 1 - count, last], overwrite_a=True)[1]
+        axes = torch.from_numpy(leading[:, ::-1].astype(np.float32))
+        del flat, products  # seen takes as much memory
+        spread = ((seen.flatten(1) - self.mean) @ axes).std(dim=0)
+        self.axes.copy_(axes / spread.clamp_min(torch.finfo(spread.dtype).tiny))
+
+
+def empty_network(config: Cnn | Perceptron, fields: int, stamp_px: int) -> nn.Module:
+    """The network of a configuration, its weights still to come."""
+    kind: Any = AlignmentCnn if isinstance(config, Cnn) else AlignmentPerceptron
+    return kind(config, fields, stamp_px)  # type: ignore[no-any-return]
+
+
+def build_network(
+    config: Cnn | Perceptron, fields: int, stamp_px: int, generator: torch.Generator
+) -> nn.Module:
+    """A fresh network whose weights come from `generator` alone.
+
+    Inner layers draw N(0, 2/fan_in) (He et al. 2015), the last one PyTorch's uniform
+    ±1/√fan_in; its bias is 0, the middle of the range.
+    """
+    model = empty_network(config, fields, stamp_px).to(memory_format=torch.channels_last)
+    leak = getattr(config, "leak", 0.0)
+    with torch.no_grad():
+        for layer in model.features:
+            if isinstance(layer, nn.Conv2d | nn.Linear):
+                nn.init.kaiming_normal_(
+                    layer.weight, a=leak, nonlinearity="leaky_relu", generator=generator
+                )
+            if isinstance(layer, nn.Linear):
+                layer.bias.zero_()
+        bound = float(model.linear.in_features) ** -0.5
+        model.linear.weight.uniform_(-bound, bound, generator=generator)
+        model.linear.bias.zero_()
+    return model
+
+
+def load_network(config: Cnn | Perceptron, fields: int, stamp_px: int, weights: Path) -> nn.Module:
+    """Network of a configuration with weights from a file; raises ProductError."""
+    return with_weights(lambda: empty_network(config, fields, stamp_px), weights)
+
+
+def _scaled(stamps: np.ndarray) -> torch.Tensor:
+    """Flux-normalised stamps as the network sees them, with a mean of 1."""
+    images = torch.from_numpy(np.ascontiguousarray(stamps, np.float32))
+    own = images.to(memory_format=torch.channels_last, copy=True)
+    return own.mul_(float(stamps.shape[-1] ** 2))
+
+
+@torch.inference_mode()
+def predict_states(
+    model: nn.Module, stamps: np.ndarray, batch: int = 256, mirrors: Sequence[Mirror] = ()
+) -> np.ndarray:
+    """States of flux-normalised stamps (n, fields, d, d), shape (n, 4), float64.
+
+    With mirrors the mean of the estimates from all mirror images of the stamps.
+    """
+    model.eval()
+    if mirrors:
+        # The inverse of an orthogonal matrix is its transpose.
+        each = [predict_states(model, m.stamps(stamps), batch) @ m.state for m in mirrors]
+        return np.mean(each, axis=0)
+    parts = [
+        model(_scaled(stamps[start : start + batch])).numpy()
+        for start in range(0, len(stamps), batch)
+    ]
+    return np.concatenate(parts).astype(np.float64)
+
+
+@dataclass(frozen=True)
+class MixedNoise:
+    """Noise of random levels λ of a band, by the faster law."""
+
+    noise: NoiseModel
+    levels: np.ndarray
+
+    def __call__(self, stamps: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Noisy stamps of states, of one level each."""
+        return self.noise.draw_gaussian(stamps, mixed_levels(self.levels, len(stamps), rng), rng)
+
+
+@dataclass(frozen=True)
+class TrainingStates:
+    """States that a network is trained on.
+
+    Attributes
+    ----------
+    states : ndarray, shape (n, 4)
+    stamps : ndarray, shape (n, F, d, d) or (D, n, F, d, d)
+        Of D draws of a noise, every field shows one at random.
+    noise : MixedNoise, optional
+        Is drawn anew for every batch.
+    """
+
+    states: np.ndarray
+    stamps: np.ndarray
+    noise: MixedNoise | None = None
+
+
+class NetworkTraining(Training):
+    """Training of a network; order, noise and mirror images are drawn anew in every epoch.
+
+    The history has the mean squared error in units of the range.
+
+    Parameters
+    ----------
+    data : TrainingStates
+    network, settings : config groups
+    seed : int
+    name : str
+        Of the network; part of the address of its random streams.
+    """
+
+    settings: NetworkTrain
+
+    def __init__(
+        self,
+        data: TrainingStates,
+        network: Cnn | Perceptron,
+        settings: NetworkTrain,
+        seed: int,
+        name: str,
+    ) -> None:
+        self.data, self.seed, self.name = data, seed, name
+        fields, side = data.stamps.shape[-3], data.stamps.shape[-1]
+        self.mirrors = mirror_symmetries(fields - 1) if settings.mirrors else []
+        generator = torch.Generator()
+        generator.manual_seed(int(stream(seed, "cnn", "init", name).integers(2**62)))
+        model = build_network(network, fields, side, generator)
+        if isinstance(model, AlignmentPerceptron):
+            model.look_at(*self._examples())
+        # A remainder of one state, of which batch normalisation could make nothing, is left out.
+        whole, rest = divmod(len(data.states), settings.batch)
+        super().__init__(
+            model,
+            settings,
+            whole + (rest > 1),
+            key=f"train_{name}",
+            rate=lambda epoch: settings.decay ** (epoch // settings.decay_epochs),
+        )
+
+    def batches(self, epoch: int) -> Iterator[tuple[torch.Tensor, ...]]:
+        """Stamps (B, fields, d, d) and states (B, 4)."""
+        data = self.data
+        rng = stream(self.seed, "cnn", "epoch", self.name, epoch)
+        order = rng.permutation(len(data.states))
+        for start in range(0, order.size, self.settings.batch)[: self.steps]:
+            chosen = order[start : start + self.settings.batch]
+            images, truth = self._shown(chosen, rng), data.states[chosen]
+            if data.noise is not None:
+                images = data.noise(images, rng)
+            if self.mirrors:
+                mirror = self.mirrors[rng.integers(len(self.mirrors))]
+                images, truth = mirror.stamps(images), mirror.states(truth)
+            yield _scaled(images), torch.from_numpy(truth.astype(np.float32))
+
+    def _shown(self, chosen: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Stamps of chosen states, in one of the draws if there are several."""
+        stamps = self.data.stamps
+        if stamps.ndim == 4:
+            return stamps[chosen]
+        fields = np.arange(stamps.shape[2])
+        return stamps[
+            rng.integers(len(stamps), size=(chosen.size, fields.size)), chosen[:, None], fields
+        ]
+
+    def _examples(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Stamps in all mirror images, as they are and as the network sees them."""
+        rng = stream(self.seed, "cnn", "examples", self.name)
+        clean = self._shown(rng.permutation(len(self.data.states))[:EXAMPLES], rng)
+        if self.mirrors:
+            clean = np.concatenate([mirror.stamps(clean) for mirror in self.mirrors])
+        scaled = _scaled(clean)
+        if self.data.noise is None:
+            return scaled, scaled
+        return scaled, _scaled(self.data.noise(clean, rng))
+
+    def loss(self, batch: tuple[torch.Tensor, ...], step: int) -> torch.Tensor:
+        """Mean squared error."""
+        stamps, states = batch
+        return nn.functional.mse_loss(self.model(stamps), states)
+
+    def row(self, epoch: int, rate: float, loss: float, error: float) -> Row:
+        """Row of the history; the learning rate is that at the epoch's start."""
+        return {"epoch": epoch, "lr": rate, "loss": loss, "seconds": round(self.seconds, 3)}

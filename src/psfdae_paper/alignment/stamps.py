@@ -1,0 +1,235 @@
+"""Centroid-centred stamps of wavefronts given by Zernike coefficients.
+
+The centroid of an image lies at the mean slope of the wavefront over the lit
+pupil. Every Zernike polynomial therefore takes its own tilt along that cancels
+its mean slope, once; the centring stays linear in the coefficients and a
+derivative of a stamp is that of the centred stamp.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+
+from psfdae.errors import Error
+from psfdae_paper.configuration.alignment import Alignment, AlignmentOptics
+from psfdae_paper.configuration.telescope import Telescope
+from psfdae_paper.optics.derivatives import ModalStamps, PeriodSampling, normalise_with_derivatives
+from psfdae_paper.optics.propagation import in_batches
+from psfdae_paper.optics.pupil import annular_pupil, choose_samples, required_samples
+from psfdae_paper.optics.wavefronts import (
+    Modes,
+    mode_slopes,
+    noll_to_nm,
+    radial_polynomial,
+    slope_ranges,
+    zernike,
+)
+from psfdae_paper.raytracing import FIRST_NOLL
+from psfdae_paper.stars.framing import normalise_flux
+
+
+class EnergyError(Error, ValueError):
+    """A stamp holds too little of the light."""
+
+
+def mean_slope(j: int, obscuration: float) -> tuple[float, float]:
+    """Mean gradient (x, y) of Noll polynomial j over an annulus, per pupil radius.
+
+    By the divergence theorem it is an integral along the two rims; only terms
+    with one cycle per turn have one.
+    """
+    n, m = noll_to_nm(j)
+    if abs(m) != 1:
+        return 0.0, 0.0
+    inner = obscuration * float(radial_polynomial(n, m, np.float64(obscuration)))
+    slope = float(np.sqrt(2.0 * (n + 1.0)) * (1.0 - inner) / (1.0 - obscuration**2))
+    return (slope, 0.0) if m > 0 else (0.0, slope)
+
+
+def centred_modes(highest: int, obscuration: float, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """OPD in waves of unit Zernike coefficients with their centring tilts, (highest − 3, ...).
+
+    The sign turns the lead of a wavefront, which coefficients count, into an
+    OPD. Stamps are then seen as the detector shows them: columns run along +x
+    and rows along +y, the directions of the field angles.
+
+    Parameters
+    ----------
+    highest : int
+        Highest Noll index; the first is `FIRST_NOLL`.
+    obscuration : float
+        Linear central obscuration of the pupil that is centred.
+    x, y : ndarray, shape (...)
+        Pupil coordinates in pupil radii.
+    """
+    modes = []
+    for j in range(FIRST_NOLL, highest + 1):
+        slope_x, slope_y = mean_slope(j, obscuration)
+        modes.append(slope_x * x + slope_y * y - zernike(j, x, y))
+    return np.stack(modes)
+
+
+def movable_modes(
+    modes: Modes, pixel: float, x: np.ndarray | float, y: np.ndarray | float
+) -> np.ndarray:
+    """Modes, (J, ...), and two tilts that move the image by a pixel along x and y, (J + 2, ...)."""
+    tilts = 0.5 * pixel * np.stack(np.broadcast_arrays(x, y))
+    return np.concatenate([modes(x, y), tilts])
+
+
+class AlignmentStamps:
+    """Operator from Zernike coefficients to centred stamps and their derivatives.
+
+    Each wavefront uses the smallest grid of the ladder that its slopes allow.
+    Batches run in `optics.threads` threads; results do not depend on their number.
+
+    Parameters
+    ----------
+    telescope, optics, alignment : config groups
+    movable : bool
+        Two more coefficients, the last, move the stamp's star along x and y, in pixels.
+    """
+
+    def __init__(
+        self,
+        telescope: Telescope,
+        optics: AlignmentOptics,
+        alignment: Alignment,
+        movable: bool = False,
+    ) -> None:
+        self.telescope = telescope
+        self.optics = optics
+        self.alignment = alignment
+        self.noll = np.arange(FIRST_NOLL, alignment.highest_zernike + 1)
+        """Noll indices of the J coefficients."""
+        self.movable = movable
+        self._modes: Modes = partial(
+            centred_modes, alignment.highest_zernike, telescope.obscuration
+        )
+        if movable:
+            self._modes = partial(movable_modes, self._modes, telescope.pixel)
+        self._slopes = mode_slopes(self._modes)
+        self._operators: dict[int, ModalStamps] = {}
+
+    def __call__(self, zernikes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Flux-normalised stamps.
+
+        Parameters
+        ----------
+        zernikes : ndarray, shape (..., J)
+            Noll 4 … 3 + J in waves.
+
+        Returns
+        -------
+        stamps : ndarray, shape (..., d, d)
+            Each sums to 1; in the configured precision.
+        energy : ndarray, shape (...)
+            Fraction of the light inside the stamp.
+
+        Raises
+        ------
+        SamplingError
+            If the ladder ends below what a wavefront needs.
+        EnergyError
+            If a stamp holds less than `alignment.least_energy`.
+        """
+        shape, zernikes = zernikes.shape[:-1], zernikes.reshape(-1, zernikes.shape[-1])
+        raw = self._empty(len(zernikes))
+
+        def propagate(operator: ModalStamps, part: np.ndarray) -> None:
+            raw[part] = operator.stamps(zernikes[part])
+
+        self._run(zernikes, self.optics.batch, propagate)
+        stamps, energy = normalise_flux(raw)
+        self._check_energy(energy)
+        return stamps.reshape(*shape, *stamps.shape[1:]), energy.reshape(shape)
+
+    def derivatives(
+        self, zernikes: np.ndarray, directions: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Flux-normalised stamps and their derivatives.
+
+        Parameters
+        ----------
+        zernikes : ndarray, shape (..., J)
+            In waves.
+        directions : ndarray, shape (..., K, J)
+            Changes of the coefficients per unit parameter, such as those of
+            `QuadraticModel.jacobian`; of none, stamps alone are made.
+
+        Returns
+        -------
+        stamps : ndarray, shape (..., d, d)
+            Each sums to 1.
+        derivatives : ndarray, shape (..., K, d, d)
+            Per unit parameter; each sums to 0.
+
+        Raises
+        ------
+        SamplingError, EnergyError
+            As for stamps.
+        """
+        shape, count = zernikes.shape[:-1], directions.shape[-2]
+        if not count:
+            return self(zernikes)[0], self._empty(*shape, 0)
+        zernikes, directions = (
+            a.reshape(-1, *a.shape[len(shape) :]) for a in (zernikes, directions)
+        )
+        stamps, energy = self._empty(len(zernikes)), np.empty(len(zernikes))
+        slopes = self._empty(len(zernikes), count)
+
+        def propagate(operator: ModalStamps, part: np.ndarray) -> None:
+            raw = operator.derivatives(zernikes[part], directions[part])
+            stamps[part], slopes[part], energy[part] = normalise_with_derivatives(*raw)
+
+        self._run(zernikes, max(1, self.optics.batch // count), propagate)
+        self._check_energy(energy)
+        return stamps.reshape(*shape, *stamps.shape[1:]), slopes.reshape(*shape, *slopes.shape[1:])
+
+    def samples(self, zernikes: np.ndarray) -> np.ndarray:
+        """Pupil samples N of each wavefront, (B, J) to (B,).
+
+        Raises
+        ------
+        SamplingError
+            If the ladder ends below what a wavefront needs: half a wave per
+            sample, and no replica of the image on the stamp.
+        """
+        half = 0.5 * self.alignment.stamp_px * self.telescope.pixel
+        reach = np.broadcast_to([-half, half], (2, 2))
+        needed = required_samples(slope_ranges(self._slopes, zernikes), reach)
+        return choose_samples(needed, tuple(self.optics.pupil_samples))
+
+    def operator(self, samples: int) -> ModalStamps:
+        """The operator on a pupil grid with N samples across; made once, then kept."""
+        if samples not in self._operators:
+            pupil, pixel = annular_pupil(samples, self.telescope.obscuration), self.telescope.pixel
+            sampling = PeriodSampling(pupil, self.alignment.stamp_px, pixel, self.optics.precision)
+            self._operators[samples] = ModalStamps(pupil, self._modes, sampling, pixel)
+        return self._operators[samples]
+
+    def _empty(self, *count: int) -> np.ndarray:
+        side = self.alignment.stamp_px
+        return np.empty((*count, side, side), np.empty(0, self.optics.precision).real.dtype)
+
+    def _run(
+        self, zernikes: np.ndarray, size: int, work: Callable[[ModalStamps, np.ndarray], None]
+    ) -> None:
+        def prepare(samples: int) -> Callable[[np.ndarray], None]:
+            return partial(work, self.operator(samples))
+
+        in_batches(self.samples(zernikes), size, self.optics.threads, prepare)
+
+    def _check_energy(self, energy: np.ndarray) -> None:
+        least = self.alignment.least_energy
+        if not energy.min() >= least:
+            worst = int(energy.argmin())
+            raise EnergyError(
+                f"stamp {worst} holds {energy[worst]:.4g} of the light "
+                f"(alignment.least_energy = {least:g}); {int((energy < least).sum())} of "
+                f"{energy.size} stamps hold too little: alignment.stamp_px = "
+                f"{self.alignment.stamp_px} is too small for these states"
+            )

@@ -1,0 +1,196 @@
+"""Scene 3: a telescope with a misaligned secondary mirror, its states and its wavefronts.
+
+A state is four numbers in units of the range, in the order of
+`psfdae_paper.optics.raytracing.DEGREES_OF_FREEDOM`. Its data are the stamps at a few fields.
+Wavefronts leave out piston and tilts: all fields move together with the secondary, and
+a stamp is centred on its own centroid.
+
+Rays are needed for 25 states only. Zernike coefficients are quadratic functions of a
+state, and the 15 terms of a fit give the wavefront of any state within the range at
+once, and its exact derivatives.
+
+An aligned telescope and its ring of field points look the same in a mirror through
+the axis. Its image is the telescope with the mirrored misalignment: a decentre is a
+vector; a tilt is the axial vector of a rotation, whose component along the normal of
+the mirror stays while the other turns.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations_with_replacement, product
+
+import numpy as np
+
+from psfdae.errors import Error
+from psfdae_paper.configuration.alignment import Alignment
+from psfdae_paper.configuration.telescope import Telescope
+from psfdae_paper.configuration.wavefront import Prescription
+from psfdae_paper.raytracing import ZernikeTracer, build_optic
+from psfdae_paper.stars.symmetry import SYMMETRIES, Symmetry
+
+PAIRS = tuple(combinations_with_replacement(range(4), 2))
+"""Degrees of freedom of the ten products, in their order."""
+
+TERMS = 1 + 4 + len(PAIRS)
+
+
+class ModelError(Error, RuntimeError):
+    """The quadratic model does not reproduce ray tracing."""
+
+
+def field_points(radius_deg: float, points: int) -> np.ndarray:
+    """The centre of the field and points on a circle, the first on the x axis.
+
+    Field angles (x, y) in radians, shape (1 + points, 2).
+    """
+    angle = 2.0 * np.pi * np.arange(points) / points
+    circle = np.deg2rad(radius_deg) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return np.concatenate([np.zeros((1, 2)), circle])
+
+
+def grid_states(levels: int) -> np.ndarray:
+    """All combinations of equidistant levels from −1 to 1, shape (levels⁴, 4)."""
+    return np.array(list(product(np.linspace(-1.0, 1.0, levels), repeat=4)))
+
+
+def uniform_states(count: int, rng: np.random.Generator) -> np.ndarray:
+    """Random states, uniform within the range, shape (count, 4)."""
+    return rng.uniform(-1.0, 1.0, size=(count, 4))
+
+
+def design_states() -> np.ndarray:
+    """States for the fit, a central composite design: corners, axes, centre; shape (25, 4)."""
+    return np.concatenate([np.zeros((1, 4)), np.eye(4), -np.eye(4), grid_states(2)])
+
+
+def zernike_tracer(
+    telescope: Telescope, prescription: Prescription, alignment: Alignment
+) -> ZernikeTracer:
+    """Ray tracer from states to Zernike coefficients (n, F, J) at the field points."""
+    return ZernikeTracer(
+        build_optic(prescription, telescope, alignment.defocus_m),
+        telescope.wavelength_m,
+        field_points(alignment.field_radius_deg, alignment.field_points),
+        alignment.unit,
+        alignment.highest_zernike,
+    )
+
+
+@dataclass(frozen=True)
+class Mirror:
+    """A symmetry of the telescope, as it acts on states, fields and stamps.
+
+    Attributes
+    ----------
+    symmetry : Symmetry
+        Of a stamp, whose rows run along y.
+    state : ndarray, shape (4, 4)
+        Signed permutation of the four numbers of a state.
+    fields : ndarray of int, shape (F,)
+        The mirrored telescope's stamp at field k is that of field `fields[k]`.
+    """
+
+    symmetry: Symmetry
+    state: np.ndarray
+    fields: np.ndarray
+
+    def states(self, states: np.ndarray) -> np.ndarray:
+        """Mirrored states, shape (n, 4)."""
+        return states @ self.state.T
+
+    def stamps(self, stamps: np.ndarray) -> np.ndarray:
+        """Stamps of the mirrored states, shape (n, F, d, d)."""
+        return self.symmetry.image(stamps[:, self.fields])
+
+
+def mirror_symmetries(points: int) -> list[Mirror]:
+    """The identity and the other symmetries that map `field_points` on themselves.
+
+    Eight, fewer if the number of points on the circle is not a multiple of 4.
+    """
+    fields, mirrors = field_points(45.0, points), []
+    for symmetry in SYMMETRIES:
+        matrix = symmetry.matrix
+        # The mirrored telescope shows at p what the telescope shows at matrix⁻¹ p.
+        distance = np.linalg.norm((fields @ matrix)[:, None] - fields, axis=2)
+        if distance.min(axis=1).max() < 1e-9:  # no field point maps between two
+            state = np.zeros((4, 4))
+            state[:2, :2], state[2:, 2:] = matrix, np.round(np.linalg.det(matrix)) * matrix
+            mirrors.append(Mirror(symmetry, state, distance.argmin(axis=1)))
+    return mirrors
+
+
+def quadratic_terms(states: np.ndarray) -> np.ndarray:
+    """1, the four numbers of states (n, 4) and their ten products, shape (n, 15)."""
+    products = [states[:, a] * states[:, b] for a, b in PAIRS]
+    return np.column_stack([np.ones(len(states)), states, *products])
+
+
+def term_slopes(states: np.ndarray) -> np.ndarray:
+    """Derivatives of `quadratic_terms` by the four numbers, shape (n, 4, 15)."""
+    slopes = np.zeros((len(states), 4, TERMS))
+    for axis in range(4):
+        slopes[:, axis, 1 + axis] = 1.0
+    for term, (a, b) in enumerate(PAIRS, start=5):
+        slopes[:, a, term] += states[:, b]
+        slopes[:, b, term] += states[:, a]
+    return slopes
+
+
+@dataclass(frozen=True)
+class QuadraticModel:
+    """Zernike coefficients at a set of fields.
+
+    Attributes
+    ----------
+    coefficients : ndarray, shape (F, 15, J)
+        In waves, for states in units of the range.
+    """
+
+    coefficients: np.ndarray
+
+    def __call__(self, states: np.ndarray) -> np.ndarray:
+        """Zernike coefficients of states, (n, 4) to (n, F, J), in waves."""
+        return np.einsum("nt,ftj->nfj", quadratic_terms(states), self.coefficients)
+
+    def jacobian(self, states: np.ndarray) -> np.ndarray:
+        """Derivatives by the four numbers of a state, shape (n, F, 4, J), in waves per range."""
+        return np.einsum("nkt,ftj->nfkj", term_slopes(states), self.coefficients)
+
+
+def fit_quadratic(states: np.ndarray, zernikes: np.ndarray) -> QuadraticModel:
+    """Least-squares fit of the model to states (n, 4) with coefficients (n, F, J) in waves.
+
+    Raises
+    ------
+    ModelError
+        If the states do not determine all 15 terms.
+    """
+    count, fields, modes = zernikes.shape
+    terms = quadratic_terms(states)
+    fit, _, rank, _ = np.linalg.lstsq(terms, zernikes.reshape(count, -1), rcond=None)
+    if rank < TERMS:
+        raise ModelError(f"{count} states determine {rank} of the {TERMS} quadratic terms")
+    return QuadraticModel(np.moveaxis(fit.reshape(TERMS, fields, modes), 0, 1))
+
+
+def verify(
+    model: QuadraticModel, states: np.ndarray, zernikes: np.ndarray, tolerance: float
+) -> np.ndarray:
+    """RMS difference of a model from coefficients (n, F, J), shape (n, F), in waves.
+
+    Raises
+    ------
+    ModelError
+        If it exceeds `tolerance` anywhere; names the state, the field and the RMS.
+    """
+    residual = np.sqrt(((model(states) - zernikes) ** 2).sum(axis=-1))
+    if not residual.max() <= tolerance:
+        state, field = np.unravel_index(residual.argmax(), residual.shape)
+        raise ModelError(
+            f"quadratic model: {residual.max():.3g} waves RMS from ray tracing in state "
+            f"{states[state].tolist()}, field {field} (at most {tolerance:.3g}); "
+            "a smaller range of misalignment would do"
+        )
+    return residual

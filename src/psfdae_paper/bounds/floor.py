@@ -1,0 +1,167 @@
+"""Local error floor of a star image whose field, centring and frame are known.
+
+Then only the Seidel coefficients c are open. Near the true ones the image is
+linear in c, p(c + δ) ≈ p + Jδ, and the posterior covariance of c is that of a
+linear Gaussian problem, (JᵀΣ⁻¹J + P⁻¹)⁻¹ with noise covariance Σ and prior
+covariance P (e.g. Kay 1993, Fundamentals of Statistical Signal Processing:
+Estimation Theory, chapter 11). It is a local approximation and no lower limit: where the
+image bends within the width of the posterior, the posterior mean can lie below it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from psfdae.metrics import clustered_mean
+from psfdae_paper.configuration.schema import Optics
+from psfdae_paper.configuration.telescope import Telescope
+from psfdae_paper.optics.derivatives import ModalStamps, PointSampling, normalise_with_derivatives
+from psfdae_paper.optics.propagation import in_batches
+from psfdae_paper.optics.pupil import annular_pupil
+from psfdae_paper.optics.wavefronts import SEIDEL_TERMS, monomial_coefficients, monomial_images
+
+BATCH = 16
+"""Stars at a time, to bound the memory."""
+
+
+def sensitivities(
+    seidel: np.ndarray,
+    field: np.ndarray,
+    offset_px: np.ndarray,
+    samples: np.ndarray,
+    telescope: Telescope,
+    optics: Optics,
+    stamp_px: int,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Stamps of many stars and their derivatives by the Seidel coefficients.
+
+    Parameters
+    ----------
+    seidel : ndarray, shape (n, 5)
+        Coefficients in waves.
+    field : ndarray, shape (n, 2)
+        Relative field vectors.
+    offset_px : ndarray, shape (n, 2)
+        Centre (row, column) of each stamp from the chief ray, in pixels.
+    samples : ndarray of int, shape (n,)
+        Pupil samples N of each star.
+    telescope, optics : config groups
+    stamp_px : int
+        Side d of the stamps.
+
+    Returns
+    -------
+    stamps : ndarray, shape (n, d, d)
+        Sum 1.
+    derivatives : ndarray, shape (n, 5, d, d)
+        Per wave; each sums to 0.
+    """
+    terms = monomial_coefficients(np.eye(len(SEIDEL_TERMS)), field[:, None])
+    coefficients = monomial_coefficients(seidel, field)
+    stamps = np.empty((len(seidel), stamp_px, stamp_px))
+    derivatives = np.empty((len(seidel), len(SEIDEL_TERMS), stamp_px, stamp_px))
+
+    def prepare(count: int) -> Callable[[np.ndarray], None]:
+        pupil, pixel = annular_pupil(count, telescope.obscuration), telescope.pixel
+        sampling = PointSampling(pupil, stamp_px, pixel, "complex128")
+        operator = ModalStamps(pupil, monomial_images, sampling, pixel)
+
+        def differentiate(star: np.ndarray) -> None:
+            raw = operator.derivatives(coefficients[star], terms[star], offset_px[star])
+            stamps[star], derivatives[star], _ = normalise_with_derivatives(*raw)
+
+        return differentiate
+
+    in_batches(samples, BATCH, 1, prepare)
+    return stamps, derivatives
+
+
+def local_error(derivatives: np.ndarray, prior_sd: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    """tr[J (JᵀΣ⁻¹J + P⁻¹)⁻¹ Jᵀ] / N_pix of every star.
+
+    Coefficients are counted in their prior standard deviations, P = 1, so that a
+    term that cannot vary drops out instead of dividing by zero.
+
+    Parameters
+    ----------
+    derivatives : ndarray, shape (n, K, d, d)
+        Image per unit of each coefficient.
+    prior_sd : ndarray, shape (K,)
+        Prior standard deviations, ≥ 0.
+    variance : ndarray, shape (n, d, d)
+        Noise variance of every pixel.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        Mean squared error per pixel.
+    """
+    count, terms = derivatives.shape[:2]
+    jacobian = (derivatives * prior_sd[:, None, None]).reshape(count, terms, -1)
+    weighted = jacobian / variance.reshape(count, 1, -1)
+    information = weighted @ jacobian.swapaxes(1, 2) + np.eye(terms)
+    spread = jacobian @ jacobian.swapaxes(1, 2)
+    trace = np.trace(np.linalg.solve(information, spread), axis1=1, axis2=2)
+    return trace / jacobian.shape[-1]
+
+
+TOLERANCE = 0.05
+"""Part of a bound by which an estimator may lie below it: its approximation and its noise."""
+
+FLOOR_TOLERANCE = 0.2
+"""The same part of a local floor, which the posterior mean itself may undercut by 15 %."""
+
+STANDARD_ERRORS = 2.0
+"""Standard errors of the paired difference by which it may lie below it besides."""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """An estimator's errors beside a bound, over the same stars.
+
+    Attributes
+    ----------
+    mse, bound : float
+        Mean squared error of the estimator, and the bound.
+    difference, stderr : float
+        Mean of their paired difference and its standard error, clustered by field.
+    tolerance : float
+        Part of the bound by which the estimator may lie below it.
+    """
+
+    mse: float
+    bound: float
+    difference: float
+    stderr: float
+    tolerance: float = TOLERANCE
+
+    @property
+    def efficiency(self) -> float:
+        """Bound divided by MSE; NaN where the bound is 0."""
+        return self.bound / self.mse if self.bound > 0 and self.mse > 0 else float("nan")
+
+    @property
+    def beaten(self) -> bool:
+        """Whether the estimator is below the bound by more than the tolerance."""
+        return self.difference < -(STANDARD_ERRORS * self.stderr + self.tolerance * self.bound)
+
+
+def compare(
+    errors: np.ndarray, bounds: np.ndarray, field: np.ndarray, tolerance: float = TOLERANCE
+) -> Comparison:
+    """Compare an estimator with a bound.
+
+    Parameters
+    ----------
+    errors, bounds : ndarray, shape (n,)
+        Squared error and bound of every star.
+    field : ndarray of int, shape (n,)
+        Field of every star.
+    tolerance : float
+        As in `Comparison`.
+    """
+    difference, stderr = clustered_mean(errors - bounds, field)
+    return Comparison(float(errors.mean()), float(bounds.mean()), difference, stderr, tolerance)

@@ -1,0 +1,51 @@
+"""The methods of the configuration: those of the list in `config.yaml`, in the order of tables."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from psfdae.files import ProductError
+from psfdae.method import Method
+from psfdae.methods import known, method
+from psfdae.reading import parse_yaml
+from psfdae.settings import ConfigError
+from psfdae_paper.configuration.base import config_dir
+
+
+def registered() -> tuple[type[Method], ...]:
+    """The methods that the configuration lists, in the order of tables; then all others.
+
+    Raises
+    ------
+    ConfigError
+        If the list is missing, or names something else.
+    """
+    return methods_in(config_dir() / "config.yaml")
+
+
+@cache
+def methods_in(path: Path) -> tuple[type[Method], ...]:
+    """The methods of a file `config.yaml`, then all others."""
+    try:
+        tree = parse_yaml(path)
+        names = tree.get("methods") if isinstance(tree, dict) else None
+        if not isinstance(names, list) or len({*map(str, names)}) < len(names):
+            raise ProductError("methods: must be a list of different names")
+        listed = tuple(method(str(name)) for name in names)
+    except ProductError as error:
+        text = str(error)
+        raise ConfigError(text if text.startswith(str(path)) else f"{path}: {text}") from None
+    return (*listed, *(kind for kind in known() if kind not in listed))
+
+
+def all_groups() -> tuple[str, ...]:
+    """Groups of the configuration that are settings of methods."""
+    return tuple(dict.fromkeys(group for kind in registered() for group in kind.groups))
+
+
+def oracles_last(names: Any) -> list[type[Method]]:
+    """Methods among some names in the order of legends: those that are given λ at the end."""
+    kinds = [kind for kind in registered() if kind.name in set(names)]
+    return sorted(kinds, key=lambda kind: kind.needs_level)

@@ -1,0 +1,229 @@
+"""Every configuration key with its type, unit, range and meaning.
+
+Lengths are in metres and angles in the unit that their name carries; the
+science code receives SI units (`Telescope.pixel_scale` is in radians).
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from pydantic import Field, create_model, model_validator
+
+from psfdae.method import Method
+from psfdae.methods import MethodNames
+from psfdae.settings import (
+    CalibrationStars,
+    Count,
+    Evaluation,
+    Group,
+    Name,
+    Noise,
+    Parts,
+    Positive,
+    Reference,
+    Seed,
+    SplitKind,
+    Stamp,
+)
+from psfdae_paper.configuration.base import SEARCH, PupilSamples, SearchDistance
+from psfdae_paper.configuration.consistency import Consistent
+from psfdae_paper.configuration.methods import registered
+from psfdae_paper.configuration.telescope import AnyTelescope
+from psfdae_paper.configuration.wavefront import OfTelescope, Seidel, VonKarman
+
+
+class Grid(Group):
+    """A square grid of field points."""
+
+    points: Count = Field(description="Field points along a side")
+    spacing_deg: Positive = Field(
+        description="Distance of neighbouring field points; null: the outermost lie at edge_deg"
+    )
+    edge_deg: Positive = Field(
+        description="Field angle at which the relative field H is 1; null: that of the telescope"
+    )
+
+
+class Scene(Group):
+    """A family of static PSFs."""
+
+    name: Literal["seidel", "turbulence", "telescope"] = Field(
+        description="Module that makes its wavefronts"
+    )
+    experiment: Name = Field(description="The paper's scene, and the MLflow experiment")
+
+
+class Stars(Group):
+    """A set of noise-free stars, shared by all datasets that only differ in noise."""
+
+    name: Name = Field(description="Names the file of the stars")
+    count: Count = Field(description="Number of stars")
+    aberration_fraction: Annotated[float, Field(ge=0, le=10)] = Field(
+        description="Relative standard deviation of every aberration term"
+    )
+    search_px: Annotated[int, Field(ge=4, le=512)] = Field(
+        description="Search distance for the brightest pixel of a star; null: search_lambda_d"
+    )
+    search_lambda_d: SearchDistance = Field(
+        default=SEARCH, description="The same in λ/D of whatever telescope, if search_px is null"
+    )
+
+
+class Framing(Stamp):
+    """Stamps of simulated stars."""
+
+    search_px: Annotated[int, Field(ge=4, le=512)] = Field(
+        description="A template's brightest pixel is searched within ± this of the chief ray; "
+        "null: search_lambda_d"
+    )
+    search_lambda_d: SearchDistance = Field(
+        default=SEARCH, description="The same in λ/D of whatever telescope, if search_px is null"
+    )
+    tie: Annotated[float, Field(ge=0, lt=0.1)] = Field(
+        description="Pixels within this fraction of the maximum count as equally bright"
+    )
+
+
+class Optics(Group):
+    """Numerical settings of the propagation."""
+
+    pupil_samples: PupilSamples = Field(
+        description="Ladder of grid sizes N; each wavefront takes the first that suffices"
+    )
+    precision: Literal["complex64", "complex128"] = Field(description="Of the propagation")
+    backend: Literal["numpy", "torch"] = Field(description="Library of the matrix products")
+    batch: Count = Field(description="Wavefronts per batch")
+    threads: Count = Field(description="Threads of the linear algebra")
+
+
+class Dataset(Group):
+    """A dataset of the paper: stars, a noise band, splits and references."""
+
+    name: Name = Field(description="Names folders, tables and figures")
+    splits: Annotated[list[SplitKind], Field(min_length=1)] = Field(
+        description="Test stars of all fields, or of fields never seen in training"
+    )
+    references: Annotated[list[Reference], Field(min_length=1)] = Field(
+        description="The truth: the star's own noise-free image, or the PSF of its field"
+    )
+    shown_levels: Annotated[list[Positive], Field(min_length=1)] = Field(
+        description="Noise levels λ of the figure of restored stars; extremes if none is in band"
+    )
+
+
+class Calibration(Group):
+    """Scan of what the paper leaves open."""
+
+    stars: Count = Field(description="Stars simulated per point of the scan")
+    pixel_scales_arcsec: Annotated[list[Positive], Field(min_length=2)] = Field(
+        description="Pixel scales scanned, ascending"
+    )
+    r0_m: Annotated[list[Positive], Field(min_length=1)] = Field(
+        description="Fried parameters scanned (scene 2; scene 1 has none)"
+    )
+    data_ranges: Annotated[list[Positive], Field(min_length=2)] = Field(
+        description="SSIM dynamic ranges scanned, ascending"
+    )
+
+
+class Benchmark(Group):
+    """Run time against error; needs a quiet machine."""
+
+    repeats: Count = Field(description="Timings of every point; the median is reported")
+    stamps: Count = Field(description="Stamps per timing of a kernel")
+    peers: bool = Field(description="Time POPPY beside our kernels")
+    star_counts: Annotated[list[Count], Field(min_length=2)] = Field(
+        description="Numbers of stars at which time, memory and disk are measured, ascending"
+    )
+    stamp_sizes: Annotated[
+        list[Annotated[int, Field(ge=8, le=256, multiple_of=2)]], Field(min_length=2)
+    ] = Field(description="Stamp sides at which cost is measured, ascending")
+    threads: Count = Field(description="Largest number of threads timed")
+
+
+class Bounds(Group):
+    """Best possible estimates."""
+
+    bank_stars: Count = Field(description="Fresh draws of the simulator in the bank")
+    position_stars: Count = Field(
+        description="Further draws, which only the bound uses that is given the field"
+    )
+    star_draws: Annotated[int, Field(ge=20)] = Field(
+        description="Draws around the best matches of a star that few of the bank resemble"
+    )
+    test_stars: Count = Field(description="Test stars that are bounded, the first of the part")
+    threads: Count = Field(description="Threads of the linear algebra")
+
+
+class Workflow(Group):
+    """What the default target of the workflow builds."""
+
+    datasets: Annotated[list[Name], Field(min_length=1)] = Field(
+        description="Options of the group dataset"
+    )
+
+
+class Config(Consistent):
+    """The whole configuration of one dataset, but for the settings of methods."""
+
+    if TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any: ...
+
+    seed: Seed = Field(description="Of every random draw")
+    workflow: Workflow
+    methods: MethodNames = Field(
+        description="Methods that are fitted, measured and drawn, in the order of tables"
+    )
+    scene: Scene
+    telescope: AnyTelescope
+    grid: Grid
+    wavefront: Annotated[Seidel | VonKarman | OfTelescope, Field(discriminator="kind")]
+    stars: Stars
+    framing: Framing
+    optics: Optics
+    noise: Noise
+    parts: Parts
+    dataset: Dataset
+    evaluation: Evaluation
+    calibration: Calibration
+    benchmark: Benchmark
+    bounds: Bounds
+    calibration_stars: CalibrationStars
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Config:
+        used = self.parts.train_stars + self.parts.test_stars
+        if used > self.stars.count:
+            raise ValueError(
+                f"parts.train_stars + parts.test_stars = {used}: "
+                f"must be at most stars.count = {self.stars.count}"
+            )
+        if self.framing.subpixel and "template" in self.dataset.references:
+            raise ValueError(
+                "framing.subpixel = true: templates have no sub-pixel phase, "
+                "dataset.references must be [realisation]"
+            )
+        if self.framing.subpixel and self.stars.aberration_fraction == 0:
+            raise ValueError(
+                "framing.subpixel = true: stars.aberration_fraction must be above 0, "
+                "stars without random aberrations are their templates"
+            )
+        for method in registered():
+            method.check(self)
+        return self
+
+
+def whole_config() -> type[Config]:
+    """`Config` with the settings of all methods."""
+    return _with_settings(registered())
+
+
+@cache
+def _with_settings(methods: tuple[type[Method], ...]) -> type[Config]:
+    groups: dict[str, Any] = {
+        name: (group, ...) for method in methods for name, group in method.groups.items()
+    }
+    return create_model("Config", __base__=Config, **groups)

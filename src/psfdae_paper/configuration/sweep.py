@@ -1,0 +1,216 @@
+"""Configuration of a sweep (`config/sweep/*.yaml`): what is varied, and how the best is chosen."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, Field, model_validator
+
+from psfdae.methods import groups_of, method
+from psfdae.settings import ConfigError, Count, Finite, Group, Name, Reference, SplitKind
+from psfdae_paper.configuration.alignment import NETWORKS
+from psfdae_paper.configuration.command import Root
+from psfdae_paper.configuration.compose import config_dir, load_file
+from psfdae_paper.configuration.methods import registered
+
+Scalar = bool | int | float | str
+Value = Scalar | list[Scalar]
+
+AxisName = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_.]*$")]
+Metric = Literal["validation_mse", "validation_ssim", "validation_mae"]
+
+TRAINED = {
+    "original": ("cnn", "train_original"),
+    "noise_trained": ("cnn", "perceptron", "train_noise_trained", "noise.levels"),
+}
+"""Networks of scene 3 that a sweep may train, and what it may change of them."""
+
+
+def models() -> tuple[str, ...]:
+    """What a sweep may train: methods that are fitted to a file, and networks of scene 3."""
+    return (*(kind.name for kind in registered() if kind.stored), *TRAINED)
+
+
+def _trainable(name: str) -> str:
+    if name not in models():
+        raise ValueError(f"{name!r} is not one of {', '.join(models())}")
+    return name
+
+
+Model = Annotated[str, AfterValidator(_trainable)]
+
+METRICS: dict[Root, tuple[Metric, ...]] = {
+    "config": ("validation_mse", "validation_ssim"),
+    "alignment": ("validation_mae",),
+}
+"""What points can be compared by: errors of images, or of states of misalignment."""
+
+RESERVED = ("point", "status", "reason", "epochs", "attempt", "best")
+"""Columns of the summary that no axis may be called."""
+
+
+class Axis(Group):
+    """One thing that is varied: listed values, named sets of values, or a range."""
+
+    values: Annotated[list[Value], Field(min_length=1)] | None = Field(
+        default=None, description="Listed values; a bare list means the same"
+    )
+    choices: Annotated[dict[str, dict[str, Value]], Field(min_length=1)] | None = Field(
+        default=None, description="Name of each choice, and the keys with values that it stands for"
+    )
+    low: Finite | None = Field(default=None, description="Lower end of a range")
+    high: Finite | None = Field(default=None, description="Upper end of a range")
+    log: bool = Field(default=False, description="A range that is even in the logarithm")
+    integer: bool = Field(default=False, description="A range of whole numbers")
+    keys: Annotated[list[str], Field(min_length=1)] | None = Field(
+        default=None, description="Configuration keys that get the value; default: the axis' name"
+    )
+    repeat: Count | None = Field(
+        default=None, description="The key gets a list with the value this many times"
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _short_forms(cls, given: Any) -> Any:
+        """A bare list are values; names of choices may look like numbers."""
+        if isinstance(given, list):
+            return {"values": given}
+        if isinstance(given, Mapping) and isinstance(given.get("choices"), Mapping):
+            return {**given, "choices": {str(k): v for k, v in given["choices"].items()}}
+        return given
+
+    @model_validator(mode="after")
+    def _one_form(self) -> Axis:
+        ends = (self.low is not None) + (self.high is not None)
+        forms = (self.values is not None) + (self.choices is not None) + (ends > 0)
+        if forms != 1 or ends == 1:
+            raise ValueError("needs either values, or choices, or low and high")
+        if self.choices is not None and (self.keys or self.repeat):
+            raise ValueError("choices name their keys themselves: no keys, no repeat")
+        if self.low is not None and self.high is not None:
+            if not self.low < self.high:
+                raise ValueError(f"low = {self.low:g}: must be below high = {self.high:g}")
+            if self.log and self.low <= 0:
+                raise ValueError(f"low = {self.low:g}: must be above 0 on a logarithmic range")
+            if self.integer and not (self.low.is_integer() and self.high.is_integer()):
+                raise ValueError(f"low = {self.low:g}, high = {self.high:g}: must be whole numbers")
+        elif self.log or self.integer:
+            raise ValueError("log and integer belong to a range, low and high")
+        return self
+
+    @property
+    def options(self) -> list[Value]:
+        """Listed values, or the names of the choices; empty for a range."""
+        return list(self.values or self.choices or ())
+
+    def changes(self, name: str, value: Value) -> dict[str, Value]:
+        """Configuration keys and their values at a value of this axis."""
+        if self.choices is not None:
+            return dict(self.choices[str(value)])
+        if self.repeat is not None:
+            assert not isinstance(value, list)
+            return dict.fromkeys(self.keys or [name], [value] * self.repeat)
+        return dict.fromkeys(self.keys or [name], value)
+
+
+class Sweep(Group):
+    """Points of one model that are trained alike and compared by one metric."""
+
+    kind: Literal["grid", "random", "adaptive"] = Field(
+        description="Every combination, random draws, or draws that learn from earlier ones"
+    )
+    model: Model = Field(description="Method, or one of scene 3's networks")
+    dataset: Name | None = Field(default=None, description="Dataset; none for scene 3's networks")
+    split: SplitKind = Field(default="random", description="Split of the stars")
+    reference: Reference = Field(default="realisation", description="What the DAE is to restore")
+    metric: Metric = Field(description="Chooses the best point: over all noise levels")
+    direction: Literal["minimize", "maximize"] = Field(description="Which metric is better")
+    overrides: dict[AxisName, Value] = Field(
+        default={}, description="Configuration keys that all points share"
+    )
+    space: Annotated[dict[AxisName, Axis], Field(min_length=1)] = Field(
+        description="What is varied, by name"
+    )
+    trials: Count | None = Field(default=None, description="Number of draws; a grid has none")
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = Field(default=0, description="Of the draws")
+    startup: Count = Field(default=4, description="Adaptive: random trials before it learns")
+    parallel: Count = Field(default=2, description="Adaptive: trials that may run at once")
+
+    @property
+    def root(self) -> Root:
+        """Root of the configuration that the model is part of."""
+        return "alignment" if self.model in TRAINED else "config"
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        """Groups of the configuration that decide a point."""
+        return point_groups(self.model)
+
+    @property
+    def varied(self) -> tuple[str, ...]:
+        """Keys and groups that may differ; all points share their stars and their parts."""
+        return TRAINED.get(self.model) or (*method(self.model).groups, "noise.levels")
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> Sweep:
+        if (self.kind == "grid") != (self.trials is None):
+            raise ValueError("trials: random and adaptive sweeps need it, a grid has none")
+        if (self.root == "config") != (self.dataset is not None):
+            raise ValueError("dataset: methods need one, scene 3's networks have none")
+        if self.metric not in METRICS[self.root]:
+            allowed = " or ".join(METRICS[self.root])
+            raise ValueError(f"metric = {self.metric}: model {self.model} has {allowed}")
+        return self
+
+    @model_validator(mode="after")
+    def _axes_fit(self) -> Sweep:
+        for name, axis in self.space.items():
+            if name in RESERVED or name.startswith(("validation_", "test_")):
+                raise ValueError(f"space.{name}: is a column of the summary; choose another name")
+            if self.kind == "grid" and not axis.options:
+                raise ValueError(f"space.{name}: a grid needs values or choices, not a range")
+            if axis.repeat and any(isinstance(value, list) for value in axis.options):
+                raise ValueError(f"space.{name}: repeat needs single values, not lists")
+        return self
+
+    @model_validator(mode="after")
+    def _keys_fit(self) -> Sweep:
+        allowed = self.varied
+        keys = list(self.overrides)
+        for name, axis in self.space.items():
+            # A range has the same keys at every value.
+            options = axis.options or [0]
+            keys += {key for option in options for key in axis.changes(name, option)}
+        for key in keys:
+            if not any(key == k or key.startswith(f"{k}.") for k in allowed):
+                raise ValueError(f"{key}: a sweep of {self.model} may change {', '.join(allowed)}")
+            if keys.count(key) > 1:
+                raise ValueError(f"{key}: set more than once")
+        return self
+
+
+def point_groups(model: str) -> tuple[str, ...]:
+    """Groups of the configuration that a point of a model reads."""
+    if model in TRAINED:
+        return ("seed", "noise", *NETWORKS, f"train_{model}", "evaluation")
+    return (*groups_of(model), "evaluation")
+
+
+def sweep_names() -> list[str]:
+    """Sweeps that the configuration folder has."""
+    return sorted(path.stem for path in config_dir().glob("sweep/[!_]*.yaml"))
+
+
+def load_sweep(name: str) -> Sweep:
+    """Read and check a file of `config/sweep`.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such sweep, or with one line per wrong key: file, key, what is allowed.
+    """
+    if name not in sweep_names():
+        raise ConfigError(f"sweep = {name!r}: must be one of {', '.join(sweep_names())}")
+    checked: Sweep = load_file(Sweep, config_dir() / "sweep" / f"{name}.yaml")
+    return checked

@@ -1,0 +1,1 @@
+"""Methods of the paper and of its studies, beside those of the library."""

@@ -1,0 +1,286 @@
+"""The baseline: principal components clustered by a self-organising map.
+
+Star images are mean-subtracted and projected on their first K eigenvectors
+(eqs. 2–5 of the paper), a self-organising map clusters the K features (eqs.
+6–8), and the mean star image of a cluster is the PSF of all its stars. The
+decomposition is scikit-learn's, the map is MiniSom's.
+
+The paper does not say which noise its training stars have: `baseline.per_level`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from math import isqrt
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Self
+
+import numpy as np
+from pydantic import Field
+
+from psfdae.belonging import require
+from psfdae.files import Column, Product, read_product, write_product
+from psfdae.method import FitError, Method, TrainingSet
+from psfdae.rng import stream
+from psfdae.settings import Count, Group, Positive
+
+
+class Baseline(Group):
+    """PCA features clustered by a self-organising map."""
+
+    per_level: bool = Field(
+        True,
+        description="A fit for each noise level λ, on stars of its noise; else one for mixed λ",
+    )
+    components: Count = Field(20, description="Principal components K")
+    rows: Count = Field(11, description="Rows of the map")
+    columns: Count = Field(11, description="Columns of the map")
+    epochs: Count = Field(10, description="Passes over the training stars, t_max")
+    sigma: Positive = Field(1.0, description="Initial neighbourhood radius in map nodes")
+    learning_rate: Annotated[float, Field(gt=0, le=1)] = Field(
+        0.5, description="Initial learning rate of the map"
+    )
+    threads: Count = Field(1, description="Threads of the linear algebra")
+
+
+@dataclass(frozen=True)
+class PcaFit:
+    """One fit: arrays that can be stored and applied without a library.
+
+    Attributes
+    ----------
+    mean : ndarray, shape (P,)
+        Mean training image.
+    components : ndarray, shape (K, P)
+        Eigenvectors, rows.
+    nodes : ndarray, shape (M, K)
+        Map nodes in feature space; only nodes that won a training star.
+    psf : ndarray, shape (M, P)
+        Mean star image of each node's cluster.
+    """
+
+    mean: np.ndarray
+    components: np.ndarray
+    nodes: np.ndarray
+    psf: np.ndarray
+
+    def features(self, images: np.ndarray) -> np.ndarray:
+        """Features of images (n, d, d), shape (n, K).
+
+        Raises
+        ------
+        ValueError
+            If an image has a pixel that is not finite: it is nearest to no node.
+        """
+        features = (images.reshape(len(images), -1) - self.mean) @ self.components.T
+        if not (finite := np.isfinite(features).all(axis=1)).all():
+            raise ValueError(
+                f"images: {np.count_nonzero(~finite)} of {len(images)} have pixels that are not "
+                f"finite, the first is number {int(np.argmin(finite))}"
+            )
+        return features
+
+    def assign(self, images: np.ndarray) -> np.ndarray:
+        """Winning node (eq. 7) of every image, shape (n,); raises as `features`."""
+        # |y − m|² without the term that is the same for all nodes.
+        score = (self.nodes**2).sum(axis=1) - 2.0 * self.features(images) @ self.nodes.T
+        return score.argmin(axis=1)
+
+    def predict(self, images: np.ndarray) -> np.ndarray:
+        """PSF of every image, shape (n, d, d); raises as `features`."""
+        return self.psf[self.assign(images)].reshape(images.shape)
+
+
+@dataclass(frozen=True)
+class PcaSom(Method):
+    """The baseline of one noise band.
+
+    Attributes
+    ----------
+    level : ndarray, shape (L,)
+        Noise level λ of each fit, ascending; 0 of a single one for all levels.
+    fits : tuple of PcaFit
+    """
+
+    label, color, marker = "PCA+SOM", "#d55e00", "s"
+    paper = ("pca", "PCA")
+    needs_level = True
+    groups: ClassVar = {"baseline": Baseline}
+    rule = kind = "baseline"
+    about = "Product of the stage baseline."
+    arrays: ClassVar = {
+        "level": ("1", "noise level λ of each fit; 0: one for all"),
+        "mean": ("1", "mean training image of each fit"),
+        "components": ("1", "eigenvectors of each fit, rows"),
+        "nodes": ("1", "map nodes of all fits in feature space"),
+        "psf": ("1", "mean star image of each node's cluster"),
+        "owner": ("1", "number of each node's fit"),
+    }
+    bundled = False
+    minutes = 20
+
+    level: np.ndarray
+    fits: tuple[PcaFit, ...]
+
+    @classmethod
+    def check(cls, config: Any) -> None:
+        """Components must be fewer than pixels and stars."""
+        components, side = config.baseline.components, config.framing.stamp_px
+        if components > side**2:
+            raise ValueError(
+                f"baseline.components = {components}: must be at most framing.stamp_px² = {side**2}"
+            )
+        if components > config.parts.train_stars:
+            raise ValueError(
+                f"baseline.components = {components}: must be at most "
+                f"parts.train_stars = {config.parts.train_stars}"
+            )
+
+    @classmethod
+    def fit(cls, data: TrainingSet, baseline: Baseline) -> PcaSom:
+        """Fit noisy images of the training stars, level by level or at mixed λ.
+
+        Raises
+        ------
+        FitError
+            If there are fewer stars than components.
+        """
+        without = "" if data.validation.size else " validation"
+        if baseline.components > data.train.size:
+            raise FitError(
+                f"baseline.components = {baseline.components}: must be at most "
+                f"{data.train.size}, the number of training stars"
+                f"{' without those that validate' if without else ''}"
+            )
+        settings = baseline.model_dump(exclude={"threads", "per_level"})
+        seed = int(stream(data.seed, "baseline", "map").integers(2**31))
+        level = np.sort(data.levels) if baseline.per_level else np.zeros(1)
+        return cls(
+            level,
+            tuple(
+                fit_pca_som(noisy, **settings, seed=seed)
+                for noisy in _noisy(data, level, f"baseline{without}")
+            ),
+        )
+
+    def save(self, place: Path, described: Mapping[str, Any]) -> None:
+        """Write the arrays of all fits with their resolved configuration."""
+        values = {
+            name: joined([getattr(fit, name) for fit in self.fits])
+            for names, joined in (
+                (("mean", "components"), np.stack),
+                (("nodes", "psf"), np.concatenate),
+            )
+            for name in names
+        }
+        values["level"] = self.level
+        values["owner"] = np.repeat(
+            np.arange(len(self.fits)), [len(fit.nodes) for fit in self.fits]
+        )
+        columns = {name: Column(values[name], *said) for name, said in self.arrays.items()}
+        write_product(place, self.name, columns, described)
+
+    @classmethod
+    def restored(
+        cls, arrays: Mapping[str, np.ndarray], config: Mapping[str, Any], reference: str
+    ) -> Self:
+        """The fits from their arrays."""
+        own = [arrays["owner"] == i for i in range(len(arrays["level"]))]
+        each = zip(arrays["mean"], arrays["components"], own, strict=True)
+        return cls(
+            arrays["level"],
+            tuple(PcaFit(m, c, arrays["nodes"][o], arrays["psf"][o]) for m, c, o in each),
+        )
+
+    @classmethod
+    def require(cls, place: Path, stars: Product, config: Any, split: str, reference: str) -> None:
+        """As `Method.require`; images must have the stars' size, too."""
+        pixels = read_product(place, cls.name, ("mean",))["mean"].shape[-1]
+        sides = (isqrt(pixels), stars["realisation"].shape[-1])
+        here, there = ({"framing": {"stamp_px": side}} for side in sides)
+        require(place, here, ("framing.stamp_px",), there, stars.path)
+        super().require(place, stars, config, split, reference)
+
+    def predict(self, images: np.ndarray, level: float | np.ndarray) -> np.ndarray:
+        """PSF of every image, shape (n, d, d), by the fit of the nearest λ on a logarithmic scale.
+
+        Raises as `PcaFit.features`.
+        """
+        between = np.sqrt(self.level[1:] * self.level[:-1])
+        nearest = np.broadcast_to(np.searchsorted(between, level), len(images))
+        found = np.empty(images.shape)
+        for i in np.unique(nearest):
+            found[nearest == i] = self.fits[i].predict(images[nearest == i])
+        return found
+
+
+def _noisy(data: TrainingSet, levels: np.ndarray, name: str) -> Iterator[np.ndarray]:
+    """Images of the training stars for each fit; level 0 mixes all."""
+    for level in levels:
+        if level:
+            rng = stream(data.seed, "noise", name, f"{level:.6g}")
+            yield data.noise.draw(data.images[data.train], level, rng)
+        else:
+            yield data.draw(data.train, stream(data.seed, "noise", name))[0]
+
+
+def fit_pca_som(
+    images: np.ndarray,
+    components: int,
+    rows: int,
+    columns: int,
+    epochs: int,
+    sigma: float,
+    learning_rate: float,
+    seed: int,
+) -> PcaFit:
+    """Fit the baseline on noisy star images of one level, or of mixed ones.
+
+    Nodes that win no training star have no mean image; they are left out of the
+    fitted map, so a test star falls to the nearest node that has one.
+
+    Parameters
+    ----------
+    images : ndarray, shape (n, d, d)
+    components : int
+        K, at most min(n, d²).
+    rows, columns : int
+        Size of the map.
+    epochs : int
+        Passes over the stars (t_max).
+    sigma, learning_rate : float
+        Initial values; the neighbourhood radius `sigma` is in nodes.
+    seed : int
+        Seed of the map's initial weights and of the order of stars.
+
+    Raises
+    ------
+    ValueError
+        If there are fewer images than components.
+    """
+    from minisom import MiniSom
+    from sklearn.decomposition import PCA
+
+    flat = images.reshape(len(images), -1).astype(np.float64)
+    if components > min(flat.shape):
+        raise ValueError(
+            f"baseline.components = {components}: must be at most {min(flat.shape)} "
+            f"(stars and pixels: {flat.shape})"
+        )
+    pca = PCA(components, svd_solver="full").fit(flat)
+    # The sign of an eigenvector is free; scikit-learn fixes it, so runs agree.
+    features = pca.transform(flat)
+    som = MiniSom(
+        rows, columns, components, sigma=sigma, learning_rate=learning_rate, random_seed=seed
+    )
+    som.random_weights_init(features)
+    som.train(features, epochs, random_order=True, use_epochs=True)
+    nodes = som.get_weights().reshape(-1, components)
+    full = PcaFit(pca.mean_, pca.components_, nodes, np.empty((len(nodes), flat.shape[1])))
+    winner = full.assign(images)
+    count = np.bincount(winner, minlength=len(nodes))
+    total = np.zeros((len(nodes), flat.shape[1]))
+    np.add.at(total, winner, flat)
+    won = count > 0
+    return PcaFit(pca.mean_, pca.components_, nodes[won], total[won] / count[won, None])

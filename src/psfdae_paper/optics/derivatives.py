@@ -1,0 +1,206 @@
+"""A stamp and its derivatives with respect to coefficients of pupil modes.
+
+The OPD is a sum of modes, W = Σ c_j M_j. The field in the image is that of
+`psfdae_paper.optics.propagation`, E = Σ A exp(2πiW) exp(−πiu·x). A direction v in the
+space of coefficients changes it by dE = Σ 2πi (Σ v_j M_j) A exp(2πiW) exp(−πiu·x),
+another such sum, and the intensity by d|E|² = 2 Re(E* dE): derivatives are exact
+and each costs about as much as a stamp.
+
+Two ways lead from the pupil to the pixels. Both sample the image on a separable
+set of points and turn the intensities there into pixels with one matrix:
+
+- `PointSampling`: the points of `StampPropagator` and a matrix DFT, for stamps
+  narrower than the image's period;
+- `PeriodSampling`: the whole period of the image by a Fourier transform. The
+  intensity is a trigonometric polynomial, which its samples determine, so pixels
+  are integrated exactly. It is the faster one for stamps nearly as wide as it.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from scipy import fft
+
+from psfdae_paper.optics.propagation import Precision, image_points
+from psfdae_paper.optics.pupil import Pupil
+from psfdae_paper.optics.wavefronts import Modes
+
+
+class Sampling(Protocol):
+    """Points of the image plane, and what they contribute to the pixels of a stamp."""
+
+    pixels: np.ndarray
+    """Shape (d, m): pixels = P I Pᵀ for intensities I, shape (m, m)."""
+
+    def fields(self, pupil_fields: np.ndarray) -> np.ndarray:
+        """Fields at the points, (..., M, M) to (..., m, m), up to a common phase per point."""
+
+
+class PointSampling:
+    """The points of `image_points` on both sides of the chief ray; its parameters."""
+
+    def __init__(self, pupil: Pupil, stamp_px: int, pixel: float, precision: Precision) -> None:
+        half, even, odd = image_points(pupil, stamp_px, pixel)
+        points = np.concatenate([-half[::-1], half])
+        self._dft = np.exp(-1j * np.pi * np.outer(pupil.axis, points)).astype(precision)
+        above = 0.5 * np.hstack([(even - odd)[::-1].T, (even + odd).T])
+        # The middle pixel of an odd stamp is its own mirror image.
+        below = above[::-1, ::-1][: stamp_px // 2]
+        self.pixels = np.vstack([below, above]).astype(self._dft.real.dtype)
+
+    def fields(self, pupil_fields: np.ndarray) -> np.ndarray:
+        """See `Sampling`, m = all points."""
+        return self._dft.T @ (pupil_fields @ self._dft)
+
+
+class PeriodSampling:
+    """Equidistant points over the period of the image, 2/spacing λ/D.
+
+    With lags l of the pupil's samples, |E(u)|² = Σ_l c_l exp(−πi l·spacing·u); the
+    integral over a pixel multiplies c_l by the pixel's width and a sinc. Twice as
+    many points as samples determine all c_l. Pixels beyond the period repeat those
+    inside.
+    """
+
+    def __init__(self, pupil: Pupil, stamp_px: int, pixel: float, precision: Precision) -> None:
+        samples = pupil.axis.size
+        self.points = fft.next_fast_len(2 * samples)
+        lags = np.arange(1 - samples, samples)
+        frequency = 0.5 * pupil.spacing * lags
+        centres = _centres(stamp_px, pixel)
+        to_pixels = (
+            pixel * np.sinc(frequency * pixel) * np.exp(-2j * np.pi * np.outer(centres, frequency))
+        )
+        from_points = np.exp(2j * np.pi * np.outer(lags, np.arange(self.points)) / self.points)
+        self.pixels = (to_pixels @ from_points).real / self.points
+        self.pixels = self.pixels.astype(np.empty(0, precision).real.dtype)
+
+    def fields(self, pupil_fields: np.ndarray) -> np.ndarray:
+        """See `Sampling`, m = points."""
+        rows = fft.fft(pupil_fields, self.points, axis=-1)
+        return fft.fft(rows, self.points, axis=-2)
+
+
+def _centres(stamp_px: int, pixel: float) -> np.ndarray:
+    return (np.arange(stamp_px) - 0.5 * (stamp_px - 1)) * pixel
+
+
+class ModalStamps:
+    """Stamps of wavefronts that are sums of pupil modes, and their derivatives.
+
+    Parameters
+    ----------
+    pupil : Pupil
+        Transmission on an M × M grid.
+    modes : Modes
+    sampling : Sampling
+        Made for the same pupil.
+    pixel : float
+        Pixel width in λ/D; the unit of offsets.
+    """
+
+    def __init__(self, pupil: Pupil, modes: Modes, sampling: Sampling, pixel: float) -> None:
+        dtype = sampling.pixels.dtype
+        self.shape = pupil.amplitude.shape
+        self._sampling = sampling
+        self._pixel = pixel
+        self._axis = pupil.axis.astype(dtype)
+        images = modes(pupil.axis[None, :], pupil.axis[:, None])
+        self._modes = np.ascontiguousarray(images.reshape(len(images), -1), dtype)
+        self._amplitude = (pupil.amplitude / np.sqrt(pupil.light)).astype(dtype)
+
+    def stamps(self, coefficients: np.ndarray, offset_px: np.ndarray | None = None) -> np.ndarray:
+        """Stamps of a batch.
+
+        Parameters
+        ----------
+        coefficients : ndarray, shape (B, J)
+        offset_px : ndarray, shape (B, 2), optional
+            Position (row, column) of the stamp's centre from the chief ray, in pixels.
+
+        Returns
+        -------
+        ndarray, shape (B, d, d)
+            Fraction of the light through the pupil on each pixel.
+        """
+        field = self._sampling.fields(self._pupil_fields(coefficients, offset_px))
+        return self._to_pixels(field.real**2 + field.imag**2)
+
+    def derivatives(
+        self,
+        coefficients: np.ndarray,
+        directions: np.ndarray | None = None,
+        offset_px: np.ndarray | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Stamps of a batch and their derivatives along directions of the coefficients.
+
+        Parameters
+        ----------
+        coefficients : ndarray, shape (B, J)
+        directions : ndarray, shape (B, K, J) or (K, J), optional
+            Changes of the coefficients per unit parameter, the Jacobian's
+            transpose; by default the coefficients themselves, K = J.
+        offset_px : ndarray, shape (B, 2), optional
+            As in `stamps`; kept fixed.
+
+        Returns
+        -------
+        stamps : ndarray, shape (B, d, d)
+        derivatives : ndarray, shape (B, K, d, d)
+            Per unit parameter.
+        """
+        if directions is None:
+            directions = np.eye(len(self._modes))
+        changes = directions.astype(self._modes.dtype) @ self._modes
+        changes = changes.reshape(*directions.shape[:-1], *self.shape)
+        pupil_fields = self._pupil_fields(coefficients, offset_px)[:, None]
+        turned = 2j * np.pi * changes * pupil_fields
+        image = self._sampling.fields(pupil_fields)
+        change = self._sampling.fields(turned)
+        intensity = (image.real**2 + image.imag**2)[:, 0]
+        slope = 2.0 * (image.real * change.real + image.imag * change.imag)
+        return self._to_pixels(intensity), self._to_pixels(slope)
+
+    def opd(self, coefficients: np.ndarray) -> np.ndarray:
+        """OPD maps in waves, shape (B, M, M)."""
+        opd = np.asarray(coefficients, self._modes.dtype) @ self._modes
+        return opd.reshape(-1, *self.shape)
+
+    def _pupil_fields(self, coefficients: np.ndarray, offset_px: np.ndarray | None) -> np.ndarray:
+        phase = self.opd(coefficients) * (2.0 * np.pi)
+        if offset_px is not None:
+            # Looking at a stamp moved by +u is the tilt that moves the image by −u.
+            tilt = (np.pi * self._pixel * np.asarray(offset_px, float)).astype(phase.dtype)
+            phase -= tilt[:, 0, None, None] * self._axis[:, None]
+            phase -= tilt[:, 1, None, None] * self._axis
+        fields = np.empty(phase.shape, np.result_type(phase.dtype, np.complex64))
+        np.cos(phase, out=fields.real)
+        np.sin(phase, out=fields.imag)
+        fields *= self._amplitude
+        return fields
+
+    def _to_pixels(self, values: np.ndarray) -> np.ndarray:
+        pixels = self._sampling.pixels
+        return pixels @ (values @ pixels.T)
+
+
+def normalise_with_derivatives(
+    stamps: np.ndarray, derivatives: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Divide stamps (..., d, d) by their own flux, and differentiate the quotient.
+
+    Returns
+    -------
+    normalised : ndarray, shape (..., d, d)
+        Sum 1.
+    derivatives : ndarray, shape (..., K, d, d)
+        Of `normalised`; each sums to 0.
+    flux : ndarray, shape (...)
+    """
+    flux = stamps.sum(axis=(-2, -1))
+    normalised = stamps / flux[..., None, None]
+    change = derivatives.sum(axis=(-2, -1))[..., None, None]
+    slope = (derivatives - normalised[..., None, :, :] * change) / flux[..., None, None, None]
+    return normalised, slope, flux

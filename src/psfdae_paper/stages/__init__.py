@@ -1,0 +1,9 @@
+"""Stages of the reproduction: each reads files, calls the science and writes files."""
+
+GROUPS = {
+    "alignment": "Scene 3: alignment of a secondary mirror (config/alignment.yaml).",
+    "alignment figure": "Draw a figure of scene 3 as PNG.",
+    "figure": "Draw a figure as PNG from finished products.",
+    "sweep": "Train many variants of a model and compare them (config/sweep).",
+}
+"""Help of the first words of commands of two and three words."""

@@ -1,0 +1,169 @@
+"""Stages of scene 3: the quadratic model, sets of states with their stamps, key figures.
+
+Noise is drawn where it is used, as in the other scenes. The clean stamps of the
+grid are what the networks are trained on; with other noise they are a test set,
+too, beside the set of uniform states.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+
+from psfdae.belonging import OURS, STATE_STAMPS, STATES, require
+from psfdae.files import Column, read_product, write_csv, write_product
+from psfdae.options import File
+from psfdae.rng import stream
+from psfdae.threads import limit_threads
+from psfdae_paper.alignment.stamps import AlignmentStamps
+from psfdae_paper.alignment.telescope import (
+    QuadraticModel,
+    design_states,
+    field_points,
+    fit_quadratic,
+    grid_states,
+    uniform_states,
+    verify,
+    zernike_tracer,
+)
+from psfdae_paper.configuration.alignment import OF_STATES, AlignmentConfig
+from psfdae_paper.configuration.command import command
+from psfdae_paper.raytracing import FIRST_NOLL, ZernikeTracer
+
+ModelFile = Annotated[File, "Product of `alignment model`."]
+StatesFile = Annotated[File, "Product of `alignment states`."]
+TestSet = Annotated[Literal["grid", "uniform"], {"flag": "--set"}]
+
+
+@command("alignment model", reads=("telescope", "prescription", "alignment"), root="alignment")
+def model(
+    config: AlignmentConfig,
+    out: Annotated[File, "HDF5 product with the quadratic model of the wavefront."],
+) -> None:
+    """Fit the quadratic model to few ray-traced states, verify it on the grid."""
+    limit_threads(1)
+    tracer, design = _tracer(config), design_states()
+    fitted = fit_quadratic(design, tracer(design))
+    grid = grid_states(config.alignment.grid_levels)
+    tolerance = config.alignment.model_tolerance_waves
+    residual = verify(fitted, grid, tracer(grid), tolerance)
+    columns = {
+        "coefficients": Column(
+            fitted.coefficients,
+            "wave",
+            "[field, term, Zernike]; terms 1, 4 numbers of the state, 10 products",
+        ),
+        "residual": Column(residual, "wave", "[state, field] RMS from ray tracing, on the grid"),
+        **_geometry(config),
+    }
+    write_product(out, "alignment_model", columns, config.model_dump())
+
+
+def read_model(path: Path, wanted: Any, whose: object = OURS) -> QuadraticModel:
+    """The quadratic model of a product; `wanted` and `whose` as in `psfdae.belonging.require`."""
+    product = read_product(path, "alignment_model", ("coefficients",))
+    require(path, product.config, STATES, wanted, whose)
+    return QuadraticModel(product["coefficients"])
+
+
+@command(
+    "alignment states",
+    reads=OF_STATES,
+    root="alignment",
+)
+def states(
+    config: AlignmentConfig,
+    kind: Annotated[Literal["grid", "uniform", "train"], {"flag": "--set"}],
+    out: Annotated[File, "HDF5 product with states and their noise-free stamps."],
+    model: Annotated[
+        File | None,
+        "Product of `alignment model`: take wavefronts from it instead of tracing rays.",
+    ] = None,
+) -> None:
+    """Simulate the noise-free stamps of a set of states."""
+    limit_threads(1)  # batches run side by side, optics.threads of them
+    alignment = config.alignment
+    fitted = None if model is None else read_model(model, config)
+    if kind == "grid":
+        chosen = grid_states(alignment.grid_levels)
+    else:
+        count = alignment.test_states if kind == "uniform" else alignment.train_states
+        chosen = uniform_states(count, stream(config.seed, "alignment", "states", kind))
+    zernikes = fitted(chosen) if fitted else _tracer(config)(chosen)
+    stamps, energy = AlignmentStamps(config.telescope, config.optics, alignment)(zernikes)
+    columns = {
+        "states": Column(chosen, "range", "decentre x, y and tilt x, y of the secondary"),
+        "stamps": Column(
+            stamps.astype(np.float32, copy=False),
+            "1",
+            "[state, field, row, column] noise-free, sum 1; rows along +y, columns along +x",
+        ),
+        "zernikes": Column(zernikes, "wave", "[state, field, Zernike] lead of the wavefront"),
+        "energy": Column(energy, "1", "[state, field] light inside the stamp"),
+        **_geometry(config),
+    }
+    write_product(out, "alignment_states", columns, config.model_dump())
+
+
+def _tracer(config: AlignmentConfig) -> ZernikeTracer:
+    return zernike_tracer(config.telescope, config.prescription, config.alignment)
+
+
+def _geometry(config: AlignmentConfig) -> dict[str, Column]:
+    alignment = config.alignment
+    fields = field_points(alignment.field_radius_deg, alignment.field_points)
+    noll = np.arange(FIRST_NOLL, alignment.highest_zernike + 1)
+    return {
+        "fields": Column(fields, "rad", "field angle (x, y)"),
+        "noll": Column(noll, "1", "Noll index of every Zernike coefficient"),
+        "unit": Column(alignment.unit, "m, m, rad, rad", "range of the state's four numbers"),
+    }
+
+
+@command("alignment telescope", reads=("telescope", "alignment"), root="alignment")
+def telescope(
+    config: AlignmentConfig,
+    model: ModelFile,
+    grid: Annotated[File, "Product of `alignment states --set grid`."],
+    uniform: Annotated[File, "Product of `alignment states --set uniform`."],
+    out: Annotated[File, "CSV with key figures."],
+) -> None:
+    """Tabulate key figures of telescope, model and stamps."""
+    import pandas as pd
+
+    fitted = read_product(model, "alignment_model")
+    sets = {
+        name: read_product(path, "alignment_states", ("energy", "stamps"))
+        for name, path in (("grid", grid), ("uniform", uniform))
+    }
+    require(model, fitted.config, STATES, config)
+    for product in sets.values():
+        require(product.path, product.config, STATE_STAMPS, config)
+    coefficients, residual, noll = (fitted[k] for k in ("coefficients", "residual", "noll"))
+    # How well the states are separated, and the aligned telescope's defocus.
+    sensitivity = np.moveaxis(coefficients[:, 1:5], 1, -1).reshape(-1, 4)
+    defocus = coefficients[:, 0, noll == 4][:, 0]
+    pixel = config.telescope.pixel
+    rows = [
+        ("pixel", pixel, "lambda/D"),
+        ("lambda_over_d", config.telescope.pixel_scale_arcsec / pixel, "arcsec"),
+        ("model_rms", np.sqrt((residual**2).mean()), "wave"),
+        ("model_rms_greatest", residual.max(), "wave"),
+        ("model_states", len(design_states()), "1"),
+        ("defocus_centre", defocus[0], "wave"),
+        ("defocus_edge", defocus[1:].mean(), "wave"),
+        ("sensitivity_condition", np.linalg.cond(sensitivity), "1"),
+    ]
+    for name, product in sets.items():
+        energy, peak = product["energy"], product["stamps"].max(axis=(2, 3))
+        rows += [
+            (f"energy_least_{name}", energy.min(), "1"),
+            (f"energy_mean_{name}", energy.mean(), "1"),
+            (f"peak_least_{name}", peak.min(), "1"),
+            (f"peak_greatest_{name}", peak.max(), "1"),
+            (f"stamps_{name}", energy.size, "1"),
+        ]
+    table = pd.DataFrame(rows, columns=["quantity", "value", "unit"])
+    write_csv(out, table, digits=6)

@@ -1,0 +1,392 @@
+"""Stages of scene 3 that train its networks, estimate the states of test sets, bound the errors.
+
+The networks differ in what they are trained on: the paper's CNN on clean stamps of the grid
+(used as "original" and as "dae"), ours on noisy stamps of many states, and on the DAE's
+output for noisy stamps of many states. The noise of a test set depends on seed, set
+and λ only, so all methods see the same stamps and their differences are paired.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from dataclasses import asdict, make_dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import click
+import numpy as np
+
+from psfdae.belonging import STATE_STAMPS, require, require_origin, write_origin
+from psfdae.files import (
+    Column,
+    Product,
+    as_csv,
+    as_yaml,
+    read_product,
+    write_csv,
+    write_product,
+    write_text,
+)
+from psfdae.method import CONFIG, HISTORY, TrainingSet
+from psfdae.methods.dae import Dae
+from psfdae.model.star_sets import noise_model
+from psfdae.noise import mixed_levels
+from psfdae.options import AboveZero, File, Folder
+from psfdae.reading import from_tree, read_yaml
+from psfdae.rng import stream
+from psfdae.settings import deciding
+from psfdae.threads import limit_threads
+from psfdae_paper.alignment.methods import BOUNDS, FITTED, LEARNED, METHODS, TRAINED, Method, of_set
+from psfdae_paper.alignment.stamps import AlignmentStamps
+from psfdae_paper.configuration.alignment import NETWORKS, AlignmentConfig, NetworkTrain
+from psfdae_paper.configuration.command import command
+from psfdae_paper.stages.alignment import ModelFile, StatesFile, TestSet, read_model
+
+if TYPE_CHECKING:
+    from psfdae_paper.alignment.networks import TrainingStates
+
+NETWORK_WEIGHTS = "network.safetensors"
+
+VALIDATION_STATES = 100
+"""States of the large set that choose the DAE's best epoch; it is not trained on them."""
+
+Checkpoint = Annotated[File, "File that lets an interrupted training resume."]
+Trained = Annotated[Folder, "Folder for weights, config and history."]
+
+DENOISED = ", ".join(name for name in TRAINED if METHODS[name].denoised)
+"""Networks that are trained on the DAE's output."""
+
+PART = 1000
+"""States whose photons are counted at a time."""
+
+CLEAN = 0.0
+"""Noise level of the rows without noise."""
+
+OF_DAE = "Folder of `alignment train-dae`."
+DaeFolder = Annotated[Folder, OF_DAE]
+NetworkFolders = make_dataclass(
+    "NetworkFolders",
+    [(name, Annotated[Folder, "Folder of the network of that name."]) for name in TRAINED],
+)
+
+
+@command("alignment train-dae", reads=("seed", "noise", "dae", "dae_train"), root="alignment")
+def train_dae(
+    config: AlignmentConfig,
+    grid: Annotated[File, "Product of `alignment states --set grid`."],
+    train: Annotated[File, "Product of `alignment states --set train`: its first states validate."],
+    checkpoint: Checkpoint,
+    out: Trained,
+) -> None:
+    """Train the DAE on the stamps of the grid."""
+    on, validating = (
+        read_product(path, "alignment_states", ("states", "stamps")) for path in (grid, train)
+    )
+    require(train, validating.config, STATE_STAMPS, on.config, grid)
+    fit, validation = _flat(on["stamps"]), _flat(validating["stamps"][:VALIDATION_STATES])
+    images = np.concatenate([fit, validation])
+    data = TrainingSet(
+        images=images,
+        references=images,
+        fit=np.arange(len(fit)),
+        validation=np.arange(len(fit), len(images)),
+        levels=np.asarray(config.noise.levels),
+        noise=noise_model(config),
+        seed=config.seed,
+        checkpoint=checkpoint,
+    )
+    Dae.fit(data, config.dae, config.dae_train).store(out, config.model_dump(), on)
+    checkpoint.unlink(missing_ok=True)
+
+
+def _groups(kind: str = "", **_: Any) -> tuple[str, ...]:
+    """Config groups of the training of one network, or of all."""
+    kinds = [kind] if kind else TRAINED
+    noise = ["noise"] if any(METHODS[name].noisy for name in kinds) else []
+    dae = ["evaluation"] if any(METHODS[name].denoised for name in kinds) else []
+    return ("seed", *noise, *NETWORKS, *(f"train_{name}" for name in kinds), *dae)
+
+
+@command("alignment train-network", reads=_groups, root="alignment")
+def train_network(
+    config: AlignmentConfig,
+    kind: Annotated[
+        str,
+        click.Choice(TRAINED),
+        "Clean stamps, noisy stamps, or the DAE's output for noisy stamps.",
+    ],
+    states: Annotated[File, "Product of `alignment states`: the grid or the large set."],
+    checkpoint: Checkpoint,
+    out: Trained,
+    dae: Annotated[DaeFolder | None, f"{OF_DAE} For {DENOISED} only."] = None,
+) -> None:
+    """Train a network that estimates states of misalignment."""
+    from psfdae.networks.training import fingerprint, progress, train
+    from psfdae.networks.weights import save_weights
+    from psfdae_paper.alignment.networks import MixedNoise, NetworkTraining, TrainingStates
+
+    if METHODS[kind].denoised != (dae is not None):
+        raise click.UsageError(f"--dae goes with --kind {DENOISED}, and only with it")
+    settings: NetworkTrain = getattr(config, f"train_{kind}")
+    product = read_product(states, "alignment_states", ("states", "stamps"))
+    if dae:
+        require_origin(dae, STATE_STAMPS, product)
+    data = TrainingStates(product["states"], product["stamps"])
+    if METHODS[kind].noisy:
+        data = replace(data, noise=MixedNoise(noise_model(config), np.asarray(config.noise.levels)))
+    if dae and data.noise:
+        data = denoised_draws(data, Dae.load(dae, evaluation=config.evaluation), config, kind)
+        product.arrays.clear()  # only what it says of itself is still needed
+    limit_threads(settings.threads)
+    fields, side = data.stamps.shape[-3], data.stamps.shape[-1]
+    described = {**config.model_dump(), "fields": fields, "stamp_px": side, "name": kind}
+    described |= {"network": settings.network, "mirrors": settings.mirrors}
+
+    def begin(attempt: int) -> NetworkTraining:
+        return NetworkTraining(data, getattr(config, settings.network), settings, config.seed, kind)
+
+    with progress(settings.epochs) as report:
+        done = train(
+            begin, checkpoint, fingerprint(described | deciding(config), data.stamps), report
+        )
+    save_weights(out / NETWORK_WEIGHTS, done.result, described)
+    write_origin(out, product)
+    write_text(out / HISTORY, as_csv(done.history))
+    write_text(out / CONFIG, as_yaml(described))
+    checkpoint.unlink(missing_ok=True)
+
+
+def denoised_draws(data: TrainingStates, dae: Dae, config: Any, kind: str) -> TrainingStates:
+    """States with the DAE's output for a few draws of their noise, each state at one level."""
+    assert data.noise is not None
+    rng = stream(config.seed, "cnn", "noise", kind)
+    count = getattr(config, f"train_{kind}").noise_draws
+    level = mixed_levels(data.noise.levels, len(data.states), rng)
+    many = np.empty((count, *data.stamps.shape), np.float32)
+    for draw in many:
+        for start in range(0, len(level), PART):
+            part = slice(start, start + PART)
+            noisy = data.noise.noise.draw(data.stamps[part], level[part], rng)
+            draw[part] = dae.predict(_flat(noisy)).reshape(noisy.shape)
+    return replace(data, stamps=many, noise=None)
+
+
+def denoise(dae: Path, config: Any, stamps: np.ndarray) -> np.ndarray:
+    """Output of a trained DAE for stamps (n, F, d, d), neither clipped nor renormalised."""
+    network = Dae.load(dae, evaluation=config.evaluation)
+    return network.predict(_flat(stamps)).reshape(stamps.shape)
+
+
+def _flat(stamps: np.ndarray) -> np.ndarray:
+    return stamps.reshape(-1, *stamps.shape[-2:])
+
+
+def noisy_test_states(config: Any, stamps: np.ndarray, test_set: str, level: float) -> np.ndarray:
+    """Stamps of a test set at one λ, shape (n, F, d, d), float32; unchanged for λ = 0."""
+    if level == CLEAN:
+        return stamps
+    rng = stream(config.seed, "alignment", "noise", test_set, f"{level:.6g}")
+    return noise_model(config).draw(stamps, level, rng)
+
+
+def network_predictor(folder: Path, config: Any) -> Callable[[np.ndarray], np.ndarray]:
+    """The trained network of a folder, from stamps (n, F, d, d) to states (n, 4)."""
+    import torch
+
+    from psfdae.settings import validate
+    from psfdae_paper.alignment.networks import load_network, predict_states
+    from psfdae_paper.alignment.telescope import mirror_symmetries
+
+    torch.set_num_threads(config.evaluation.threads)
+    path = folder / CONFIG
+    described = read_yaml(path)
+    fields, side = (from_tree(path, described, key, make=_size) for key in ("fields", "stamp_px"))
+    kind = from_tree(path, described, "network", make=_kind)
+    settings = from_tree(path, described, kind, make=lambda tree: validate(NETWORKS[kind], tree))
+    model = load_network(settings, fields, side, folder / NETWORK_WEIGHTS)
+    mirrors = mirror_symmetries(fields - 1) if from_tree(path, described, "mirrors") else []
+    return partial(predict_states, model, batch=config.evaluation.batch, mirrors=mirrors)
+
+
+def _kind(value: Any) -> str:
+    if value not in NETWORKS:
+        raise ValueError(f"{value!r} must be one of {', '.join(NETWORKS)}")
+    return str(value)
+
+
+def _size(value: Any) -> int:
+    if not isinstance(value, int) or not 1 <= value <= 4096:
+        raise ValueError(f"{value!r} must be a whole number from 1 to 4096")
+    return value
+
+
+def require_network(folder: Path, states: Product, name: str | None = None) -> None:
+    """Refuse a network that does not belong to states with stamps, or is not the one of a name."""
+    _, fields, _, side = states["stamps"].shape
+    said, keys = read_yaml(folder / CONFIG), ("fields", "stamp_px")
+    require(folder / CONFIG, said, keys, {"fields": fields, "stamp_px": side}, states.path)
+    require_origin(folder, STATE_STAMPS, states)
+    if name:
+        require(folder / CONFIG, said, ("name",), {"name": name}, "the command")
+
+
+@command("alignment estimate", reads=("seed", "noise", "evaluation"), root="alignment")
+def estimate(
+    config: AlignmentConfig,
+    test_set: TestSet,
+    states: StatesFile,
+    dae: DaeFolder,
+    networks: NetworkFolders,
+    out: Annotated[File, "HDF5 product with the estimates of all learned methods."],
+    times: Annotated[File, "CSV that receives the run times."],
+) -> None:
+    """Estimate the states of a test set with every learned method."""
+    limit_threads(config.evaluation.threads)
+    product = read_product(states, "alignment_states", ("states", "stamps"))
+    require_origin(dae, STATE_STAMPS, product)
+    folders: dict[str, Path] = asdict(networks)
+    for name, folder in folders.items():
+        require_network(folder, product, name)
+    predict = {name: network_predictor(folder, config) for name, folder in folders.items()}
+    levels = [CLEAN, *config.noise.levels]
+    found = np.empty((len(levels), len(LEARNED), *product["states"].shape))
+    rows = []
+    for row, level in enumerate(levels):
+        noisy = noisy_test_states(config, product["stamps"], test_set, level)
+        for column, method in enumerate(LEARNED):
+            started = time.perf_counter()
+            stamps = denoise(dae, config, noisy) if method.denoised else noisy
+            found[row, column] = predict[method.network](stamps)
+            seconds = time.perf_counter() - started
+            rows.append((test_set, level, method.name, seconds, len(stamps)))
+    columns = {
+        "states": Column(product["states"], "range", "true states"),
+        "levels": Column(np.array(levels), "1", "noise levels λ"),
+        "estimates": Column(found, "range", f"[λ, method, state, number]; {_names(LEARNED)}"),
+    }
+    described = {**config.model_dump(), "test_set": test_set}
+    write_product(out, "alignment_estimates", columns, described)
+    _write_times(times, rows)
+
+
+def _names(methods: list[Method]) -> str:
+    return ", ".join(method.name for method in methods)
+
+
+def _write_times(path: Path, rows: list[tuple[str, float, str, float, int]]) -> None:
+    import pandas as pd
+
+    columns = ["test_set", "noise_level", "method", "seconds", "states"]
+    table = pd.DataFrame(rows, columns=columns)
+    write_csv(path, table, digits=6)
+
+
+@command(
+    "alignment fit",
+    reads=("seed", "telescope", "alignment", "optics", "noise", "fit", "evaluation"),
+    root="alignment",
+)
+def fit(
+    config: AlignmentConfig,
+    test_set: TestSet,
+    level: Annotated[float, AboveZero, "Noise level λ."],
+    states: StatesFile,
+    train: Annotated[File, "Product of `alignment states --set train`: most steps go by it."],
+    model: ModelFile,
+    network: Annotated[Folder, "Folder of the network that starts the fit."],
+    out: Annotated[File, "HDF5 product with the fits."],
+    times: Annotated[File, "CSV that receives the run time."],
+) -> None:
+    """Fit the states of a test set by maximum likelihood."""
+    from psfdae_paper.alignment.emulator import StampEmulator
+    from psfdae_paper.alignment.fisher import parameters_of, stamps_and_slopes, twin_states
+    from psfdae_paper.alignment.fit import Likelihood, fit_states, refit_twins
+
+    limit_threads(1)
+    product, many = (
+        read_product(path, "alignment_states", ("states", "stamps", "noll"))
+        for path in (states, train)
+    )
+    for given in (product, many):
+        require(given.path, given.config, STATE_STAMPS, config)
+    wavefronts = read_model(model, product.config, states)
+    require_network(network, product)
+    predict = network_predictor(network, config)
+    stamps = noisy_test_states(config, product["stamps"], test_set, level)
+    fits: dict[str, list[np.ndarray]] = defaultdict(list)
+    rows, methods = [], of_set(FITTED, test_set)
+    operator = partial(AlignmentStamps, config.telescope, config.optics, config.alignment)
+    columns = {"states": Column(product["states"], "range", "true states")}
+    started = time.perf_counter()
+    emulator = StampEmulator(wavefronts, operator(), many["states"], many["stamps"], config.fit)
+    start = predict(stamps)
+    columns["start"] = Column(start, "range", "estimate of the network")
+    for method in methods:
+        own = operator(movable=method.free)
+        optics = partial(stamps_and_slopes, wavefronts, own, emulator=emulator)
+        exact = Likelihood(optics, noise_model(config), level)
+        # The emulator knows stars in their place only.
+        near = exact if method.free else replace(exact, stamps=emulator)
+        first = fit_states(near, stamps, parameters_of(wavefronts, own, start), config.fit)
+        # In focus, a state and its twin have nearly the same stamps.
+        others = twin_states(wavefronts, first.states, product["noll"])
+        best, twins = refit_twins(near, stamps, first, others, config.fit)
+        found = best if near is exact else fit_states(exact, stamps, best.states, config.fit)
+        last = found.evaluations * (near is not exact)
+        rows.append((test_set, level, method.name, time.perf_counter() - started, len(stamps)))
+        start = found.states[:, :4]  # where the next one starts: it has more to find
+        fits["estimates"].append(found.states[:, :4])
+        fits["deviance"].append(found.deviance)
+        fits["evaluations"].append([best.evaluations, last])
+        fits["converged"].append(found.converged)
+        fits["twin_tried"].append(twins)
+        fits["twin_won"].append(best.states[:, 0] != first.states[:, 0])
+    about = {
+        "estimates": f"[method, state, number] maximum of the likelihood; {_names(methods)}",
+        "deviance": "twice the log-likelihood missing to a perfect fit",
+        "evaluations": "[method, (before, last step), state] stamps and derivatives computed",
+        "converged": "ended by the tolerance",
+        "twin_tried": "the twin was a starting point, too",
+        "twin_won": "and the better one",
+    }
+    for name, text in about.items():
+        unit = "range" if name == "estimates" else "1"
+        columns[name] = Column(np.array(fits[name]), unit, text)
+    described = {**config.model_dump(), "test_set": test_set, "level": level}
+    write_product(out, "alignment_fit", columns, described)
+    _write_times(times, rows)
+
+
+@command("alignment bound", reads=("telescope", "alignment", "optics", "noise"), root="alignment")
+def bound(
+    config: AlignmentConfig,
+    test_set: TestSet,
+    states: StatesFile,
+    model: ModelFile,
+    out: Annotated[File, "HDF5 product with Cramér-Rao bounds."],
+) -> None:
+    """Bound the errors of any unbiased estimate."""
+    from psfdae_paper.alignment.fisher import bound_covariances
+
+    limit_threads(1)
+    product = read_product(states, "alignment_states", ("states",))
+    require(states, product.config, STATE_STAMPS, config)
+    wavefronts = read_model(model, product.config, states)
+    noise, levels, truth = noise_model(config), config.noise.levels, product["states"]
+    covariances, methods = [], of_set(BOUNDS, test_set)
+    for method in methods:
+        operator = AlignmentStamps(
+            config.telescope, config.optics, config.alignment, movable=method.free
+        )
+        covariances.append(bound_covariances(wavefronts, operator, noise, levels, truth))
+    about = f"[method, λ, state, number, number] of the bound; {_names(methods)}"
+    columns = {
+        "states": Column(truth, "range", "true states"),
+        "levels": Column(np.array(levels), "1", "noise levels λ"),
+        "covariances": Column(np.array(covariances), "range^2", about),
+    }
+    described = {**config.model_dump(), "test_set": test_set}
+    write_product(out, "alignment_bound", columns, described)

@@ -1,0 +1,190 @@
+"""Stages `evaluate`, `collect`, `held-out` and `paper-tables`: all methods on test stars."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import make_dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from psfdae.files import Product, ProductError, write_csv, write_parquet, write_text
+from psfdae.method import Method
+from psfdae.methods import method
+from psfdae.metrics import quality, summarised
+from psfdae.model.star_sets import (
+    field_positions,
+    noisy_test_images,
+    read_stars,
+    split_stars,
+    training_set,
+)
+from psfdae.options import File, Folder
+from psfdae.reading import read_table
+from psfdae.settings import ConfigError, Reference, SplitKind
+from psfdae.threads import limit_threads
+from psfdae_paper.configuration.command import command
+from psfdae_paper.configuration.methods import registered
+from psfdae_paper.configuration.schema import Config
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+READS = (
+    *("seed", "noise", "parts", "evaluation", "methods"),
+    *(group for kind in registered() if not kind.stored for group in kind.groups),
+)
+"""Groups of the configuration on which the measurements depend, models being given."""
+
+Models: Any = make_dataclass(
+    "Models",
+    [
+        (kind.name, Annotated[(Folder if kind.files else File) | None, kind.about], None)
+        for kind in registered()
+        if kind.stored
+    ],
+)
+"""Options with the model of each method that leaves one."""
+
+
+@command("evaluate", reads=READS)
+def evaluate(
+    config: Config,
+    dataset: Annotated[str, "Name that goes into the table."],
+    stars: Annotated[File, "Product of the stage stars."],
+    models: Models,
+    split: SplitKind = "random",
+    reference: Reference = "realisation",
+    *,
+    per_star: Annotated[File, "Parquet with every star."],
+    out: Annotated[File, "CSV with means and standard errors."],
+) -> None:
+    """Measure every method on the test stars at each noise level."""
+    import pandas as pd
+
+    limit_threads(config.evaluation.threads)
+    product = read_stars(stars, reference)
+    methods = estimators(config, product, vars(models), split, reference)
+    test = split_stars(product, split, config).test
+    truth, field = product[reference][test], product["field_index"][test]
+    position = field_positions(product)[test]
+    key = {"dataset": dataset, "split": split, "reference": reference}
+    summary, stars_table = [], []
+    for level in config.noise.levels:
+        noisy = noisy_test_images(config, product, test, level)
+        for name, estimator in methods.items():
+            metrics = quality(
+                estimator.estimate(noisy, level, position), truth, config.evaluation.data_range
+            )
+            row = {**key, "method": name, "noise_level": level}
+            summary += summarised(row, metrics, field)
+            stars_table.append(pd.DataFrame({**row, "star": test, "field": field, **metrics}))
+    write_csv(out, pd.DataFrame(summary))
+    write_parquet(per_star, pd.concat(stars_table, ignore_index=True))
+
+
+def estimators(
+    config: Config,
+    stars: Product,
+    models: Mapping[str, Path | None],
+    split: str,
+    reference: str,
+    only_drawn: bool = False,
+) -> dict[str, Method]:
+    """The methods of a configuration by name, ready for the test stars of a split.
+
+    Parameters
+    ----------
+    config : stage config (seed, noise, parts, evaluation, methods)
+    stars : product "stars"
+    models : file or folder of each method that leaves one
+    split, reference : of the test stars
+    only_drawn : whether only those are wanted that figures of stars show
+
+    Raises
+    ------
+    ConfigError
+        If a model is not given.
+    ProductError
+        If one is damaged, or does not belong to the stars.
+    """
+    kinds = [kind for kind in map(method, config.methods) if kind.drawn or not only_drawn]
+    places: dict[str, Path] = {}
+    for kind in kinds:
+        if kind.stored:
+            place = models.get(kind.name)
+            if place is None:
+                raise ConfigError(f"--{kind.name.replace('_', '-')} is missing: it is in methods")
+            kind.require(place, stars, config, split, reference)
+            places[kind.name] = place
+    return {
+        kind.name: kind.load(places[kind.name], reference, config.evaluation)
+        if kind.stored
+        else kind.fit(training_set(config, kind, stars, split, reference), **kind.settings(config))
+        for kind in kinds
+    }
+
+
+COLUMNS = ["dataset", "split", "reference", "method", "noise_level", "metric"]
+COLUMNS += ["value", "stderr", "n"]
+
+Evaluations = Annotated[tuple[File, ...], {"argument": True}]
+Metric = Literal["mse", "ssim"]
+
+
+@command("collect")
+def collect(evaluations: Evaluations, out: Annotated[File, "Tidy CSV."]) -> None:
+    """Join evaluations into one tidy table, with the scatter of each method between seeds."""
+    from psfdae_paper.evaluation.comparison import seed_scatter, with_seed_stderr
+
+    table = with_seed_stderr(read_evaluations(evaluations), seed_scatter())
+    write_csv(out, table[[*COLUMNS[:-1], "seed_stderr", "n"]])
+
+
+@command("held-out")
+def held_out(
+    per_star: Annotated[tuple[File, ...], {"argument": True}],
+    out: Annotated[File, "CSV: held-out over seen fields, on the stars that both splits test."],
+) -> None:
+    """Compare fields that a training has not seen with those that it has, star by star.
+
+    PER_STAR are the evaluations' Parquet files of both splits.
+    """
+    import pandas as pd
+
+    from psfdae_paper.evaluation.comparison import HELD_OUT_COLUMNS, held_out_ratios
+
+    wanted = [*HELD_OUT_COLUMNS[:4], "split", "star", "field", "mse"]
+    parts = [pd.read_parquet(path, columns=wanted) for path in per_star]
+    write_csv(out, held_out_ratios(pd.concat(parts)))
+
+
+@command("paper-tables")
+def paper_tables(
+    dataset: str,
+    evaluations: Evaluations,
+    out: Annotated[
+        tuple[tuple[Metric, File], ...], "Metric and its CSV, the Markdown beside; repeat for more."
+    ],
+) -> None:
+    """Write the paper's tables, ours beside the paper's."""
+    from psfdae_paper.evaluation.paper import as_markdown, paper_table
+
+    measured = read_evaluations(evaluations)
+    for metric, path in out:
+        table = paper_table(measured, dataset, metric)
+        write_csv(path, table, 6)
+        write_text(path.with_suffix(".md"), as_markdown(table, dataset, metric))
+
+
+def read_evaluations(evaluations: Sequence[Path]) -> pd.DataFrame:
+    """Join CSV files of the stage `evaluate`; raises ProductError if one has other columns."""
+    import pandas as pd
+
+    parts = []
+    for path in evaluations:
+        part = read_table(path)
+        if list(part.columns) != COLUMNS:
+            raise ProductError(f"{path}: columns {list(part.columns)}, expected {COLUMNS}")
+        parts.append(part)
+    return pd.concat(parts, ignore_index=True)

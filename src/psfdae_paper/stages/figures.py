@@ -1,0 +1,273 @@
+"""Stages `figure ...`: from data products and tables to one PNG each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+
+from psfdae.figure_style import write_png
+from psfdae.files import Product, ProductError, read_product
+from psfdae.method import Method
+from psfdae.model.star_sets import field_positions, noisy_test_images, read_stars, split_stars
+from psfdae.options import AboveZero, File
+from psfdae.reading import read_table
+from psfdae.settings import Reference
+from psfdae.threads import limit_threads
+from psfdae_paper.configuration.command import command
+from psfdae_paper.configuration.schema import Config
+from psfdae_paper.stages.evaluate import (
+    READS,
+    Evaluations,
+    Metric,
+    Models,
+    estimators,
+    read_evaluations,
+)
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from psfdae.strip import StripRow
+
+STRIP_STARS, HEADLINE_STARS = 8, 5
+"""Columns of a restoration strip, and of the headline."""
+
+HEADLINE_REFERENCE = "realisation"
+
+Stars = Annotated[File, "Product of the stage stars."]
+Templates = Annotated[File, "Product of the stage templates."]
+Png = Annotated[File, "PNG."]
+DatasetName = Annotated[str, "Name in the tables."]
+Bounds = Annotated[File, "CSV of the stage bounds."]
+Efficiency = Annotated[File, "CSV of the stage efficiency."]
+
+
+@command("figure templates")
+def figure_templates(templates: Templates, out: Png) -> None:
+    """Draw the static PSFs at their field positions."""
+    from psfdae_paper.evaluation.figures import template_map
+
+    product = read_product(templates, "templates", ("psf", "grid", "field"))
+    psf = without_margin(product)
+    title = (
+        f"Static PSFs of scene {product.config['scene']['name']}: {len(psf)} field points, "
+        f"stamps of {psf.shape[-1]} × {psf.shape[-1]} px"
+    )
+    write_png(template_map(psf, product["grid"], product["field"], title), out)
+
+
+@command("figure energy")
+def figure_energy(templates: Templates, out: Png) -> None:
+    """Draw the light inside the stamp over the field."""
+    from psfdae_paper.evaluation.figures import stamp_energy_map
+
+    product = read_product(templates, "templates", ("energy", "grid", "field"))
+    stamp_px = product.config["framing"]["stamp_px"]
+    write_png(stamp_energy_map(product["energy"], product["grid"], product["field"], stamp_px), out)
+
+
+@command("figure strip", reads=READS)
+def figure_strip(
+    config: Config,
+    dataset: Annotated[str, "Name that goes into the title."],
+    stars: Stars,
+    models: Models,
+    reference: Reference = "realisation",
+    *,
+    levels: Annotated[
+        tuple[Annotated[float, AboveZero], ...],
+        {"flag": "--level"},
+        "Noise level λ; repeat for more rows.",
+    ],
+    out: Png,
+) -> None:
+    """Draw test stars of the split random before and after restoration."""
+    from psfdae.figure_style import REFERENCES, in_field_unit
+    from psfdae.strip import restoration_strip, spread_stars
+
+    limit_threads(config.evaluation.threads)
+    product = read_stars(stars, reference)
+    methods = estimators(config, product, vars(models), "random", reference, only_drawn=True)
+    test = split_stars(product, "random", config).test
+    field = field_of(product)[product["field_index"][test]]
+    picks = spread_stars(field, STRIP_STARS)
+    rows = strip_rows(config, product, test, picks, reference, methods, levels)
+    angle, unit = in_field_unit(field)
+    columns = [f"({x:+.1f}, {y:+.1f})".replace("-", "−") for x, y in angle[picks]]
+    title = (
+        f"{dataset}: test stars at field angle (x, y) in {unit},\n"
+        f"restored and measured {REFERENCES[reference]}"
+    )
+    write_png(restoration_strip(rows, columns, title), out)
+
+
+@command("figure headline", reads=READS)
+def figure_headline(
+    config: Config,
+    dataset: str,
+    stars: Stars,
+    models: Models,
+    level: Annotated[float, AboveZero, "Noise level λ."],
+    bounds: Bounds,
+    efficiency: Efficiency,
+    out: Png,
+) -> None:
+    """Draw restored stars beside the errors and their bounds."""
+    from dataclasses import replace
+
+    from psfdae.strip import spread_stars
+    from psfdae_paper.evaluation.curves import headline
+
+    limit_threads(config.evaluation.threads)
+    product = read_stars(stars, HEADLINE_REFERENCE)
+    given = (vars(models), "random", HEADLINE_REFERENCE)
+    methods = estimators(config, product, *given, only_drawn=True)
+    test = split_stars(product, "random", config).test
+    picks = spread_stars(field_of(product)[product["field_index"][test]], HEADLINE_STARS)
+    truth, *restored = strip_rows(
+        config, product, test, picks, HEADLINE_REFERENCE, methods, [level]
+    )
+    rows = [
+        replace(row, label=kind.label if kind.restores else f"{kind.label} star")
+        for row, kind in zip(restored, methods.values(), strict=True)
+    ]
+    rows.append(replace(truth, label="truth"))
+    errors, limits = (rows_of(p, dataset, HEADLINE_REFERENCE) for p in (efficiency, bounds))
+    limits = limits[limits.metric == "mse"]
+    titles = (f"Test stars of {dataset}, λ = {level:g}", "Error against noise")
+    write_png(headline(rows, list(methods.values()), errors, limits, titles), out)
+
+
+@command("figure curves")
+def figure_curves(
+    labels: Annotated[tuple[str, ...], {"flag": "--label"}, "One per history, in order."],
+    histories: Annotated[tuple[File, ...], {"argument": True}],
+    out: Png,
+) -> None:
+    """Draw training and validation error of networks."""
+    from psfdae_paper.evaluation.curves import training_curves
+
+    if len(histories) != len(labels):
+        raise ProductError(f"{len(histories)} histories, but {len(labels)} labels")
+    tables = {}
+    for path, label in zip(histories, labels, strict=True):
+        tables[label] = read_table(path)
+        missing = {"step", "train_mse", "validation_mse"} - set(tables[label].columns)
+        if missing:
+            raise ProductError(f"{path}: no column {min(missing)!r}")
+    write_png(training_curves(tables, "Training of the denoising autoencoders"), out)
+
+
+@command("figure errors")
+def figure_errors(
+    dataset: str,
+    evaluations: Evaluations,
+    out: Annotated[tuple[tuple[Metric, File], ...], "Metric and its PNG; repeat for more."],
+) -> None:
+    """Draw metrics against the noise level, with the paper's points."""
+    from psfdae_paper.evaluation.curves import error_against_noise
+    from psfdae_paper.evaluation.paper import published
+
+    metrics = read_evaluations(evaluations)
+    for metric, path in out:
+        if not ((metrics.dataset == dataset) & (metrics.metric == metric)).any():
+            names = ", ".join(str(path) for path in evaluations)
+            raise ProductError(f"{names}: no rows of {dataset}, {metric}")
+        write_png(error_against_noise(metrics, published("psf"), dataset, metric), path)
+
+
+def without_margin(templates: Product) -> np.ndarray:
+    """Static PSFs as they look in the middle of a stamp, shape (F, d, d)."""
+    margin = templates.config["framing"]["jitter_px"]
+    side = templates["psf"].shape[-1] - margin
+    return templates["psf"][:, margin:side, margin:side]
+
+
+def field_of(stars: Product) -> np.ndarray:
+    """Field angle (x, y) of every field point in radians, shape (F, 2)."""
+    from psfdae_paper.stars.fields import square_grid
+
+    grid = stars.config["grid"]
+    return np.deg2rad(square_grid(grid["points"], grid["spacing_deg"])[1])
+
+
+def strip_rows(
+    config: Any,
+    product: Product,
+    test: np.ndarray,
+    picks: np.ndarray,
+    reference: str,
+    methods: Mapping[str, Method],
+    levels: Sequence[float],
+) -> list[StripRow]:
+    """Rows of a restoration strip: the reference, then the methods by noise level.
+
+    `config` is that of the stage `evaluate`; `test` are the test stars, `picks` those shown.
+    """
+    from psfdae.metrics import mse
+    from psfdae.strip import StripRow
+
+    truth, position = product[reference][test][picks], field_positions(product)[test][picks]
+    rows = [StripRow("reference", truth)]
+    if reference == "template":
+        noise_free = product["realisation"][test][picks]
+        rows.append(StripRow("star without\nnoise", noise_free, mse(noise_free, truth)))
+    for level in levels:
+        noisy = noisy_test_images(config, product, test[picks], level)
+        for kind in methods.values():
+            images = kind.restore(noisy, level, position)
+            label = f"{kind.label}\nλ = {level:g}"
+            rows.append(StripRow(label, images, mse(images, truth), not kind.restores))
+    return rows
+
+
+@command("figure bounds")
+def figure_bounds(
+    dataset: DatasetName,
+    bounds: Bounds,
+    efficiency: Efficiency,
+    out: Png,
+) -> None:
+    """Draw the methods' errors above the bounds."""
+    from psfdae_paper.evaluation.curves import errors_above_bounds
+
+    tables = (rows_of(efficiency, dataset), rows_of(bounds, dataset))
+    write_png(errors_above_bounds(*tables, dataset), out)
+
+
+@command("figure efficiency")
+def figure_efficiency(
+    dataset: DatasetName,
+    efficiency: Efficiency,
+    out: Png,
+) -> None:
+    """Draw the methods' efficiency against the noise level."""
+    from psfdae_paper.evaluation.curves import efficiency_against_noise
+
+    write_png(efficiency_against_noise(rows_of(efficiency, dataset), dataset), out)
+
+
+@command("figure bank-growth")
+def figure_bank_growth(
+    dataset: DatasetName,
+    growth: Annotated[File, "CSV of the stage bounds: error by size of the bank."],
+    out: Png,
+) -> None:
+    """Draw the posterior mean's error against the size of the bank."""
+    from psfdae_paper.evaluation.curves import bank_growth
+
+    write_png(bank_growth(rows_of(growth, dataset), dataset), out)
+
+
+def rows_of(path: Path, dataset: str, reference: str | None = None) -> pd.DataFrame:
+    """Rows of a dataset, and of a reference if one is given; raises ProductError without any."""
+    table = read_table(path)
+    rows = table[table.dataset == dataset]
+    if reference is not None:
+        rows = rows[rows.reference == reference]
+    if rows.empty:
+        raise ProductError(f"{path}: no rows of {', '.join(filter(None, (dataset, reference)))}")
+    return rows

@@ -1,0 +1,81 @@
+"""Stage `fit`: a method for one dataset and split, and for a reference if it has one each."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import click
+
+from psfdae.methods import groups_of, method
+from psfdae.model.star_sets import read_stars, training_set
+from psfdae.options import File, Folder
+from psfdae.settings import Reference, SplitKind
+from psfdae.threads import limit_threads
+from psfdae_paper.configuration.command import command
+from psfdae_paper.configuration.schema import Config
+
+INNER = 10
+"""One of so many stars chooses the settings of a fit that has not seen the validation stars."""
+
+Stars = Annotated[File, "Product of the stage stars."]
+
+
+@command("fit", reads=groups_of)
+def fit(
+    config: Config,
+    name: Annotated[str, {"argument": True, "metavar": "METHOD"}],
+    stars: Stars,
+    split: SplitKind = "random",
+    reference: Reference = "realisation",
+    start: Annotated[
+        Folder | None, "Fit to the realisations, from which one to templates goes on."
+    ] = None,
+    checkpoint: Annotated[File | None, "State of an interrupted fit, if it keeps one."] = None,
+    *,
+    out: Annotated[Path, click.Path(path_type=Path), "Folder or HDF5 product."],
+) -> None:
+    """Fit METHOD, a name of the list `methods` in config.yaml."""
+    kind = method(name)
+    limit_threads(kind.threads(config))
+    product = read_stars(stars, reference if kind.per_reference else "template")
+    kept = checkpoint or kind.beside(out, "checkpoint.pt")
+    data = training_set(config, kind, product, split, reference, checkpoint=kept)
+    if start is not None:
+        if reference != "template" or not kind.continues(config):
+            raise click.UsageError("--start: nothing that goes on from a fit is fitted")
+        kind.require(start, product, config, split, "realisation")
+        data = replace(data, start=kind.load(start))
+    described = {**config.model_dump(), "split": split}
+    described |= {"reference": reference} if kind.per_reference else {}
+    kind.fit(data, **kind.settings(config)).store(out, described, product)
+    kept.unlink(missing_ok=True)
+
+
+@command("baseline", reads=groups_of("pca_som"))
+def baseline(
+    config: Config,
+    stars: Stars,
+    split: SplitKind = "random",
+    *,
+    out: Annotated[File, "HDF5 product with the fitted PCA+SOM."],
+) -> None:
+    """Fit the PCA+SOM baseline."""
+    fit(config, "pca_som", stars, split, out=out)
+
+
+@command("train", reads=groups_of("dae"))
+def train(
+    config: Config,
+    stars: Stars,
+    split: SplitKind = "random",
+    reference: Reference = "realisation",
+    checkpoint: Annotated[
+        File | None, "State of an interrupted training.  [default: OUT/checkpoint.pt]"
+    ] = None,
+    *,
+    out: Annotated[Folder, "Folder for weights, resolved config and history."],
+) -> None:
+    """Train a denoising autoencoder; resumes from its checkpoint."""
+    fit(config, "dae", stars, split, reference, checkpoint=checkpoint, out=out)

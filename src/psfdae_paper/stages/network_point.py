@@ -1,0 +1,91 @@
+"""A point of a sweep over the networks of scene 3."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from psfdae.belonging import STATE_STAMPS, require
+from psfdae.files import read_product, write_csv
+from psfdae.method import CONFIG, HISTORY
+from psfdae.reading import read_table, read_yaml
+from psfdae.threads import limit_threads
+from psfdae_paper.configuration.compose import part
+from psfdae_paper.evaluation.alignment_tables import error_rows
+from psfdae_paper.stages.alignment_methods import (
+    NETWORK_WEIGHTS,
+    network_predictor,
+    noisy_test_states,
+    train_network,
+)
+from psfdae_paper.sweeps.measured import EVALUATION, VALIDATION, Measured, Task, geometric_mean
+
+TEST_SET = "uniform"
+"""Test set of scene 3, whose noise is drawn as in the main workflow."""
+
+
+def files_of(name: str) -> tuple[str, ...]:
+    """Names of the files of a point's training."""
+    return (NETWORK_WEIGHTS, CONFIG, HISTORY)
+
+
+def run(config: Any, task: Task, name: str) -> Measured:
+    """Train as the stage of the same network does, and measure.
+
+    Parameters
+    ----------
+    config : stage config (seed, noise, cnn, perceptron, train_<name>, evaluation)
+    task : Task
+    name : of the network, original or noise_trained
+
+    Raises TrainingError if the training cannot go on, and ProductError if the products
+    are of different telescopes or stamps.
+    """
+    import pandas as pd
+
+    trained_on = read_product(task.data["states"], "alignment_states", ())
+    for role in ("validation", "test"):
+        product = read_product(task.data[role], "alignment_states", ())
+        require(product.path, product.config, STATE_STAMPS, trained_on.config, trained_on.path)
+    settings = part(train_network.stage.settings.reads(name), config, "alignment")  # type: ignore[attr-defined]
+    train_network(settings, name, task.data["states"], task.checkpoint, task.folder)
+    limit_threads(config.evaluation.threads)
+    metrics: dict[str, float] = {}
+    for role, file in (("validation", VALIDATION), ("test", EVALUATION)):
+        rows = _rows(config, task, role)
+        metrics |= _metrics(role, rows)
+        write_csv(task.folder / file, pd.DataFrame(rows))
+    described = read_yaml(task.folder / CONFIG)
+    history = read_table(task.folder / HISTORY)
+    return Measured(
+        metrics=metrics,
+        described={**trained_on.config, **described},
+        seconds=float(history["seconds"].iloc[-1]),
+        cpu_seconds=float("nan"),
+        epochs=int(history["epoch"].iloc[-1]),
+    )
+
+
+def _rows(config: Any, task: Task, role: str) -> list[dict[str, Any]]:
+    """Rows of the table of errors as the main workflow makes them, of one network."""
+    product = read_product(task.data[role], "alignment_states", ("states", "stamps", "unit"))
+    predict = network_predictor(task.folder, config)
+    test_set = TEST_SET if role == "test" else role
+    rows = []
+    for level in task.levels:
+        stamps = noisy_test_states(config, product["stamps"], test_set, level)
+        key = {"test_set": test_set, "noise_level": level, "method": task.dataset}
+        rows += error_rows(key, predict(stamps) - product["states"], product["unit"])
+    return rows
+
+
+def _metrics(role: str, rows: list[dict[str, Any]]) -> dict[str, float]:
+    """Mean absolute error in units of the range: of all parameters, and at each noise level."""
+    levels: dict[float, list[float]] = {}
+    for row in rows:
+        if row["unit"] == "range":
+            levels.setdefault(row["noise_level"], []).append(row["mean_abs_error"])
+    each = {level: float(np.mean(errors)) for level, errors in levels.items()}
+    metrics = {f"{role}_mae": geometric_mean(list(each.values()))}
+    return metrics | {f"{role}_mae_{level:g}": value for level, value in each.items()}

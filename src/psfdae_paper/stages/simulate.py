@@ -1,0 +1,315 @@
+"""Stages `simulate`, `figure telescope`: what a telescope does to a star, all over its field."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import click
+import numpy as np
+
+from psfdae.errors import Error
+from psfdae.figure_style import write_png
+from psfdae.files import Product, atomic_path, check_outputs, read_product, write_csv, write_fits
+from psfdae.model.shapes import measure_shapes
+from psfdae.noise import noise_equivalent_px
+from psfdae.options import File, Folder
+from psfdae.rng import stream
+from psfdae.version import __version__
+from psfdae_paper.configuration.command import command
+from psfdae_paper.configuration.consistency import STATIC
+from psfdae_paper.configuration.schema import Config
+from psfdae_paper.evaluation.figures import FieldOfPsfs, field_of_psfs
+from psfdae_paper.stages.common import template_wavefronts
+from psfdae_paper.stages.figures import without_margin
+from psfdae_paper.stages.stars import templates
+from psfdae_paper.stars.example import ExampleField, FieldRecipe, add_stamps, write_field
+from psfdae_paper.stars.example import example_field as simulated
+from psfdae_paper.stars.framing import normalise_flux
+
+OWN_DATASET = "_telescope"
+"""The dataset that a telescope of one's own is put into."""
+
+ENOUGH_LIGHT = 0.8
+"""Fraction of the light below which a stamp is called too small."""
+
+LARGEST = 4
+"""Stamps up to this many times as wide are tried to find one that is wide enough."""
+
+LEAST_FWHM_PX = 1.5
+"""A narrower PSF looks different in every place of a pixel."""
+
+SKY = 1000.0
+"""Photons per pixel of the sky."""
+
+MARGIN_PX = 8
+"""Sky between stamps."""
+
+
+class FitError(Error, ValueError):
+    """The PSFs of a telescope do not fit into their stamps."""
+
+
+@command("simulate")
+def simulate(
+    out: Annotated[Folder | None, "Folder.  [default: name of the telescope]"] = None,
+    fits: Annotated[bool, "Also write the PSFs as FITS cube, psfs.fits."] = False,
+    image_snr: Annotated[
+        float | None,
+        click.FloatRange(min=0, min_open=True, max=1e6),
+        "Also write an image with a noisy star per field, image.fits, and stars.csv.",
+    ] = None,
+    seed: Annotated[int, click.IntRange(min=0), "Of the image's noise."] = 0,
+    least_energy: Annotated[
+        float, click.FloatRange(0, 1), "Refuse stamps that hold less of the light."
+    ] = 0.1,
+    overrides: Annotated[tuple[str, ...], {"argument": True}] = (),
+) -> None:
+    """Draw the PSFs of a telescope over its field: psfdae simulate telescope=NAME.
+
+    Writes templates.h5, psfs.png and fields.csv.
+    """
+    from psfdae_paper.configuration.compose import load_stage
+
+    if not any(word.startswith(("dataset=", "scene=", "stars=")) for word in overrides):
+        overrides = (f"dataset={OWN_DATASET}", *overrides)
+    config = load_stage(STATIC, overrides)
+    folder = out or Path(config.telescope.name)
+    # No file is written if the PSFs do not fit.
+    with atomic_path(folder / "templates.h5") as temporary:
+        templates(config, temporary)
+        fields = measure_fields(read_product(temporary, "templates"))
+        warnings = [*_light(config, fields, least_energy), *_sampling(config, fields)]
+    figure_telescope(folder / "templates.h5", folder / "fields.csv", folder / "psfs.png")
+    written = ["templates.h5", "psfs.png", "fields.csv"]
+    if fits:
+        write_psfs(config, fields, folder / "psfs.fits")
+        written.append("psfs.fits")
+    if image_snr:
+        image, catalogue = folder / "image.fits", folder / "stars.csv"
+        write_image(config, fields, image_snr, seed, image, catalogue)
+        written += ["image.fits", "stars.csv"]
+    for line in warnings:
+        print(f"psfdae: {line}", file=sys.stderr)
+    telescope = config.telescope
+    print(
+        f"{telescope.name}: {len(fields.psf)} fields, pixels of {telescope.pixel:.3g} λ/D, "
+        f"light inside the stamp {fields.energy.min():.3f} … {fields.energy.max():.3f}, "
+        f"FWHM {fields.fwhm_arcsec.min():.3g} … {fields.fwhm_arcsec.max():.3g} arcsec"
+    )
+    print(f"{folder}: {', '.join(written)}")
+
+
+@command("figure telescope")
+def figure_telescope(
+    templates: Annotated[File, "Product of the stage templates."],
+    table: Annotated[File, "CSV, a row per field point."],
+    out: Annotated[File, "PNG."],
+) -> None:
+    """Draw the static PSFs of a telescope with their light and their width."""
+    import pandas as pd
+
+    product = read_product(templates, "templates")
+    fields, telescope = measure_fields(product), product.config["telescope"]
+    x, y = np.rad2deg(fields.field).T
+    columns = {
+        "x_deg": x,
+        "y_deg": y,
+        "energy": fields.energy,
+        "fwhm_arcsec": fields.fwhm_arcsec,
+        "ellipticity": fields.ellipticity,
+        "position_angle_deg": fields.position_angle_deg,
+        "pupil_samples": product["pupil_samples"],
+    }
+    write_csv(table, pd.DataFrame(columns), 6)
+    write_png(field_of_psfs(fields, telescope["name"], telescope["pixel_scale_arcsec"]), out)
+
+
+def measure_fields(product: Product) -> FieldOfPsfs:
+    """Stamps of the product "templates" without their margin, and their shapes."""
+    psf = without_margin(product)
+    shapes = measure_shapes(psf)
+    return FieldOfPsfs(
+        psf,
+        product["grid"],
+        product["field"],
+        product["energy"],
+        shapes.fwhm_px * product.config["telescope"]["pixel_scale_arcsec"],
+        shapes.ellipticity,
+        shapes.position_angle_deg,
+    )
+
+
+def _light(config: Config, fields: FieldOfPsfs, least_energy: float) -> list[str]:
+    energy, side = fields.energy, config.framing.stamp_px
+    if not energy.min() < ENOUGH_LIGHT:
+        return []
+    worst = int(energy.argmin())
+    x, y = np.rad2deg(fields.field[worst])
+    wide = _wide_enough(config, worst)
+    advice = (
+        f"framing.stamp_px={wide} would hold {ENOUGH_LIGHT:.0%} of it everywhere"
+        if wide
+        else f"no stamp up to {LARGEST * side} px holds {ENOUGH_LIGHT:.0%} of it everywhere"
+    )
+    found = (
+        f"{int((energy < ENOUGH_LIGHT).sum())} of {energy.size} fields have less than "
+        f"{ENOUGH_LIGHT:.0%} of their light inside {side} × {side} px, the least "
+        f"{energy[worst]:.1%} at ({x:.3g}, {y:.3g})°; {advice}"
+    )
+    if energy.min() < least_energy:
+        raise FitError(f"telescope = {config.telescope.name}: {found} (--least-energy)")
+    return [found]
+
+
+def _wide_enough(config: Config, worst: int) -> int | None:
+    """Least even stamp that holds enough light of the field that needs the widest one."""
+    from psfdae_paper.optics.pupil import SamplingError
+    from psfdae_paper.stars.framing import FramingError, Propagation
+
+    side = LARGEST * config.framing.stamp_px
+    framing = config.framing.model_copy(update={"stamp_px": side})
+    source = template_wavefronts(config)
+    try:
+        propagation = Propagation(
+            source, config.telescope, config.optics, framing, framing.search_px
+        )
+        field = np.array([worst])
+        stamp = propagation.framed(side, stars=field)[0][0]
+    except (SamplingError, FramingError):
+        return None
+    for size in range(config.framing.stamp_px + 2, side + 1, 2):
+        cut = slice((side - size) // 2, (side + size) // 2)
+        if stamp[cut, cut].sum() >= ENOUGH_LIGHT:
+            return size
+    return None
+
+
+def _sampling(config: Config, fields: FieldOfPsfs) -> list[str]:
+    width = np.median(fields.fwhm_arcsec) / config.telescope.pixel_scale_arcsec
+    if width >= LEAST_FWHM_PX:
+        return []
+    return [
+        f"the PSFs are {width:.2f} px wide (median FWHM, the pixel included): undersampled, what "
+        "a star looks like depends on its place in the pixel more than on the optics"
+    ]
+
+
+def write_psfs(config: Any, fields: FieldOfPsfs, path: Path) -> None:
+    """Write the static PSFs as a cube, with a table of where they are.
+
+    The primary HDU holds the fraction of the light on each pixel, (F, d, d), the
+    table FIELDS one row per PSF. Both carry no date: the same PSFs, the same bytes.
+
+    Parameters
+    ----------
+    config : stage config of `templates`
+    fields : FieldOfPsfs
+    path : path of the FITS file
+    """
+    from astropy.io import fits
+
+    telescope = config.telescope
+    cube = fits.PrimaryHDU(fields.psf.astype(np.float32))
+    for card in (
+        ("TELESCOP", telescope.name, "telescope of the configuration"),
+        ("PIXSCALE", telescope.pixel_scale_arcsec, "[arcsec] width of a pixel"),
+        ("WAVELEN", telescope.wavelength_m, "[m] wavelength"),
+        ("APERTURE", telescope.diameter_m, "[m] diameter"),
+        ("BUNIT", "1", "fraction of the light of the star"),
+        ("CREATOR", f"psfdae {__version__}", ""),
+    ):
+        cube.header.append(card)
+    x, y = np.rad2deg(fields.field).T
+    columns = (
+        ("id", "K", None, np.arange(len(fields.psf))),
+        ("x_deg", "D", "deg", x),
+        ("y_deg", "D", "deg", y),
+        ("energy", "D", None, fields.energy),
+        ("fwhm", "D", "arcsec", fields.fwhm_arcsec),
+        ("ellipticity", "D", None, fields.ellipticity),
+        ("position_angle", "D", "deg", fields.position_angle_deg),
+    )
+    table = fits.BinTableHDU.from_columns(
+        [fits.Column(name=n, format=f, unit=u, array=a) for n, f, u, a in columns], name="FIELDS"
+    )
+    write_fits(path, fits.HDUList([cube, table]))
+
+
+def write_image(
+    config: Any, fields: FieldOfPsfs, snr: float, seed: int, path: Path, catalogue: Path
+) -> None:
+    """Write an image with one noisy star per field, and its catalogue.
+
+    The stars are moved together, so that little sky lies between them; their order
+    on the detector is that of the field. Their flux is F = snr √(B A), with the sky B
+    and the noise-equivalent area A of the mean PSF (King 1983, PASP 95, 163): the
+    S/N of a matched filter that is limited by the sky.
+
+    Parameters
+    ----------
+    config : stage config of `templates`
+    fields : FieldOfPsfs
+    snr : float
+        > 0.
+    seed : int
+    path, catalogue : FITS image and CSV
+    """
+    stamps, _ = normalise_flux(fields.psf.astype(np.float64))
+    side = stamps.shape[-1]
+    flux = snr * np.sqrt(SKY * noise_equivalent_px(stamps.mean(axis=0)))
+    pitch = side + MARGIN_PX
+    columns, rows = fields.grid.max(axis=0) + 1
+    x, y = (fields.grid * pitch + pitch // 2).T.astype(np.float64)
+    expected = np.full((int(rows) * pitch, int(columns) * pitch), SKY)
+    add_stamps(expected, flux * stamps, x, y)
+    rng = stream(seed, "simulated image", config.telescope.name)
+    write_field(
+        path,
+        catalogue,
+        rng.poisson(expected).astype(np.float32),
+        x,
+        y,
+        pixel_scale_arcsec=config.telescope.pixel_scale_arcsec,
+        GAIN=1.0,
+        TELESCOP=config.telescope.name,
+    )
+
+
+@command("example-field")
+def example_field(
+    catalogue: Annotated[File, "CSV file for the star list."],
+    seed: Annotated[int, click.IntRange(min=0)] = 1,
+    side: Annotated[
+        int | None, click.IntRange(min=100), "Pixels along a side.  [default: 1500]"
+    ] = None,
+    bright: Annotated[int | None, click.IntRange(min=1), "Bright stars.  [default: 300]"] = None,
+    faint: Annotated[int | None, click.IntRange(min=0), "Faint stars.  [default: 700]"] = None,
+    *,
+    out: Annotated[File, "FITS image."],
+) -> None:
+    """Simulate an image of a star field with its star list, to try things on."""
+    check_outputs((out,), (catalogue,))
+    asked = {"side_px": side, "bright": bright, "faint": faint}
+    write_example(out, catalogue, seed, **{k: v for k, v in asked.items() if v is not None})
+
+
+def write_example(out: Path, catalogue: Path, seed: int, **recipe: int) -> ExampleField:
+    """Write an image and its star list; `recipe` are attributes of `FieldRecipe`.
+
+    The image has a WCS and the cards GAIN and SATURATE; the list has pixel (1-based)
+    and sky coordinates of all stars but the companions of blended ones.
+    """
+    made = FieldRecipe(**recipe)
+    field = simulated(made, seed)
+    write_field(
+        out,
+        catalogue,
+        field.image.astype(np.float32),
+        *field.centroid.T,
+        pixel_scale_arcsec=made.pixel_scale_arcsec,
+        GAIN=made.gain,
+        SATURATE=float(made.saturation),
+    )
+    return field

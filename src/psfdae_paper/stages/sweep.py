@@ -1,0 +1,272 @@
+"""Stage `sweep point`: one training of a sweep, measured on validation and test part."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import click
+
+from psfdae.files import ProductError, write_text
+from psfdae.method import FitError
+from psfdae.options import File, Folder
+from psfdae.settings import Reference, SplitKind
+from psfdae_paper.configuration.command import Root, command
+from psfdae_paper.configuration.compose import decisive, load_stage
+from psfdae_paper.configuration.sweep import TRAINED, models, point_groups
+from psfdae_paper.sweeps.measured import (
+    CHECKSUM,
+    COST,
+    EVALUATION,
+    FINISHED,
+    RESULT,
+    VALIDATION,
+    Task,
+    checksum,
+    read_result,
+)
+from psfdae_paper.sweeps.points import changes, with_values
+
+ADAPTIVE_MODULE = "psfdae_paper.sweeps.adaptive"
+
+ROLES = {"config": {"stars"}, "alignment": {"states", "validation", "test"}}
+"""Products that the points of a root need."""
+
+
+def module_of(model: str) -> str:
+    """Module that trains and measures a model."""
+    return f"psfdae_paper.stages.{'network' if model in TRAINED else 'method'}_point"
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A trial of an adaptive sweep.
+
+    Attributes
+    ----------
+    slot : int
+        Its number.
+    search : dict
+        space, seed, startup, metric and direction of the sweep.
+    known : sequence of str
+        Names of the points that it learns from.
+    """
+
+    slot: int
+    search: Mapping[str, Any]
+    known: Sequence[str]
+
+
+class JsonType(click.ParamType):
+    """A JSON object as one argument."""
+
+    name = "json"
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> Any:
+        """Parse; a wrong text is a usage error."""
+        if isinstance(value, dict):
+            return value
+        try:
+            tree = json.loads(value)
+        except json.JSONDecodeError as error:
+            self.fail(f"{value!r} is no JSON: {error}", param, ctx)
+        if not isinstance(tree, dict):
+            self.fail(f"{value!r} is no JSON object", param, ctx)
+        return tree
+
+
+Json = Annotated[dict[str, Any], JsonType()]
+Overrides = Annotated[tuple[str, ...], {"argument": True}]
+
+
+@command("sweep list")
+def sweep_list(name: Annotated[str, {"argument": True}], overrides: Overrides = ()) -> None:
+    """List the points of a sweep as tab-separated text, without running it."""
+    from psfdae_paper.sweeps.points import plan_sweep
+
+    for each in plan_sweep(name, overrides).points.values():
+        values = each.values or {"trial": each.slot}
+        print("\t".join([each.name, *(f"{k}={json.dumps(v)}" for k, v in values.items())]))
+
+
+@command("sweep point")
+def sweep_point(
+    model: Annotated[str, click.Choice(models()), "What is trained."],
+    dataset: Annotated[str, "Name that goes into the tables."],
+    split: SplitKind = "random",
+    reference: Reference = "realisation",
+    *,
+    data: Annotated[
+        tuple[tuple[Literal["stars", "states", "validation", "test"], File], ...],
+        "Role and product: stars; for scene 3 states, validation and test.",
+    ],
+    levels: Annotated[tuple[float, ...], {"flag": "--level"}, "Noise level λ."],
+    values: Annotated[Json | None, "Value of every axis, as JSON."] = None,
+    keys: Annotated[Json | None, "Keys that were changed, as JSON."] = None,
+    checkpoint: Annotated[File, "State of an interrupted training."],
+    slot: Annotated[int | None, "Number of a trial of an adaptive sweep."] = None,
+    search: Annotated[Json | None, "Space and settings of an adaptive sweep, as JSON."] = None,
+    source: Annotated[
+        str, "Hash of the code, with which a result is kept.", {"show_default": False}
+    ] = "",
+    known: Annotated[tuple[str, ...], "Point of an earlier trial, beside OUT."] = (),
+    out: Annotated[Folder, "Folder that receives the point's files; its name is the point's."],
+    overrides: Overrides = (),
+) -> None:
+    """Train one point of a sweep and measure it."""
+    if (slot is None) != (search is None):
+        raise click.UsageError("--slot and --search go together")
+    root: Root = "alignment" if model in TRAINED else "config"
+    if {role for role, _ in data} != ROLES[root]:
+        raise click.UsageError(f"--data: {model} needs {', '.join(sorted(ROLES[root]))}")
+    trial = None
+    if slot is not None and search is not None:
+        trial = Trial(slot, search, known)
+    task = Task(dataset, split, reference, dict(data), levels, out, checkpoint)
+    config = load_stage(point_groups(model), overrides, root)
+    point(config, model, values or {}, keys or {}, task, trial, source)
+
+
+def point(
+    config: Any,
+    model: str,
+    values: Mapping[str, Any],
+    keys: Mapping[str, Any],
+    task: Task,
+    trial: Trial | None = None,
+    source: str = "",
+) -> None:
+    """Train and measure one point; leave `result.json`, `cost.json` and the model's files.
+
+    A training that cannot go on (not finite, or dead in all its starts) is a result, too: status
+    failed, with the reason. `result.json` is written last; nothing in it differs between two
+    runs. A point finished with the same code, configuration and data is not trained again.
+
+    Parameters
+    ----------
+    config : groups that a point of the model reads
+    model : method, or network of scene 3
+    values : value of every axis; those of a trial are asked for here
+    keys : configuration keys that differ from the dataset's
+    task : Task
+    trial : Trial, of an adaptive sweep
+    source : hash of the code that the point consists of
+
+    Raises
+    ------
+    ProductError
+        If an input is missing or damaged.
+    ConfigError
+        If a trial asks for values that the configuration does not allow.
+    """
+    module = import_module(module_of(model))
+    files = module.files_of(model)
+    if trial is not None:
+        space, values = _asked(trial, task.folder)
+        asked = changes(space, values)
+        config, keys = _with(config, asked), {**keys, **asked}
+    content = [
+        source,
+        model,
+        decisive(config.model_dump()),
+        dict(values),
+        dict(keys),
+        task.described(),
+    ]
+    fingerprint = checksum(content)
+    result = _finished(task.folder, fingerprint, files)
+    if result is None:
+        for stale in (*files, EVALUATION, VALIDATION, COST, RESULT, FINISHED):
+            (task.folder / stale).unlink(missing_ok=True)
+        result = {
+            "point": task.folder.name,
+            "slot": trial.slot if trial else None,
+            "model": model,
+            "dataset": task.dataset,
+            "split": task.split,
+            "reference": task.reference,
+            "values": dict(values),
+            "keys": dict(keys),
+            **_outcome(module, config, task, model),
+            "fingerprint": fingerprint,
+        }
+        write_text(task.folder / FINISHED, as_json(result))
+    write_text(task.folder / RESULT, as_json(result))
+
+
+def _finished(folder: Path, fingerprint: str, files: Sequence[str]) -> dict[str, Any] | None:
+    """The result of an earlier run of the same point, if it is whole."""
+    try:
+        result = read_result(folder / FINISHED)
+    except ProductError:
+        return None
+    needed = [COST] if result["status"] == "failed" else [COST, *files]
+    if result.get("fingerprint") != fingerprint:
+        return None
+    if not all((folder / name).is_file() for name in needed):
+        return None
+    print("finished before with the same code, configuration and data; kept", flush=True)
+    return result
+
+
+def as_json(result: Mapping[str, Any]) -> str:
+    """A result as text with its checksum."""
+    return json.dumps({**result, CHECKSUM: checksum(result)}, indent=1) + "\n"
+
+
+def _outcome(module: Any, config: Any, task: Task, model: str) -> dict[str, Any]:
+    """Status, metrics and configuration of a point; its cost goes to a file of its own."""
+    started, started_cpu = time.monotonic(), time.process_time()
+    try:
+        done = module.run(config, task, model)
+    except FitError as error:
+        reason = str(error).splitlines()[0]
+        print(f"failed: {reason}", flush=True)
+        task.checkpoint.unlink(missing_ok=True)
+        cost = (time.monotonic() - started, time.process_time() - started_cpu)
+        _write_cost(task.folder, *cost)
+        return {
+            "status": "failed",
+            "reason": reason,
+            "epochs": None,
+            "attempt": None,
+            "metrics": {},
+            "config": config.model_dump(),
+        }
+    _write_cost(task.folder, done.seconds, done.cpu_seconds)
+    return {
+        "status": "stopped" if done.stopped else "finished",
+        "reason": "",
+        "epochs": done.epochs,
+        "attempt": done.attempt,
+        "metrics": done.metrics,
+        "config": done.described,
+    }
+
+
+def _write_cost(folder: Path, seconds: float, cpu_seconds: float) -> None:
+    cost = {"seconds": round(seconds, 3), "cpu_seconds": round(cpu_seconds, 3)}
+    write_text(folder / COST, json.dumps(cost) + "\n")
+
+
+def _asked(trial: Trial, folder: Path) -> tuple[dict[str, Any], Mapping[str, Any]]:
+    """Axes of the space, and the values that the search proposes for a trial."""
+    from psfdae.settings import validate
+    from psfdae_paper.configuration.sweep import Axis
+
+    space = {name: validate(Axis, axis) for name, axis in trial.search["space"].items()}
+    known = [read_result(folder.parent / other / RESULT) for other in trial.known]
+    adaptive = import_module(ADAPTIVE_MODULE)
+    return space, adaptive.ask(space, trial.search, trial.slot, known)
+
+
+def _with(config: Any, keys: Mapping[str, Any]) -> Any:
+    """The stage's configuration with other values, checked again."""
+    from psfdae.settings import validate
+
+    return validate(type(config), with_values(config.model_dump(), keys))

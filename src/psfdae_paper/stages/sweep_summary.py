@@ -1,0 +1,175 @@
+"""Stages `sweep summary`, `sweep figure` and `best`: what the points of a sweep have found."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from psfdae.figure_style import write_png
+from psfdae.files import ProductError, as_yaml, write_csv, write_text
+from psfdae.options import File, Folder
+from psfdae.reading import read_table, read_yaml
+from psfdae_paper.configuration.command import command
+from psfdae_paper.sweeps.measured import RESULT, read_cost, read_result
+from psfdae_paper.sweeps.points import SweepError
+
+SUMMARY, COSTS, BEST, DEFINITION = "summary.csv", "cost.csv", "best.yaml", "sweep.yaml"
+
+
+@command("sweep summary")
+def sweep_summary(
+    name: Annotated[str, {"argument": True}],
+    points: Annotated[Folder, "Folder with a folder for each point."],
+    out: Annotated[Folder, "Folder for summary.csv, cost.csv, best.yaml and sweep.yaml."],
+    overrides: Annotated[tuple[str, ...], {"argument": True}] = (),
+) -> None:
+    """Tabulate the points of a sweep and choose the best."""
+    from psfdae_paper.sweeps.points import plan_sweep
+
+    plan = plan_sweep(name, overrides)
+    files = [points / point / RESULT for point in plan.points]
+    summary(name, plan.sweep.model_dump(exclude_none=True), overrides, files, out)
+
+
+@command("best")
+def best(
+    name: Annotated[str, {"argument": True}],
+    results: Annotated[Folder, "Folder that the workflow writes to."] = Path("results"),
+) -> None:
+    """Print the best point of a sweep as overrides: make reproduce SET="$(psfdae best NAME)"."""
+    print(" ".join(best_overrides(results, name)))
+
+
+def summary(
+    name: str,
+    definition: Mapping[str, Any],
+    given: Sequence[str],
+    points: Sequence[Path],
+    out: Path,
+) -> None:
+    """Tabulate the points of a sweep and choose the best by its metric.
+
+    Parameters
+    ----------
+    name : of the sweep
+    definition : config group `Sweep`
+    given : the workflow's overrides that all points share, its preset first
+    points : `result.json` of every point, in the order of the table
+    out : folder that receives `summary.csv` (point, a column per axis, status, reason,
+        epochs, attempt, best, metrics), `cost.csv` (seconds of each training), `best.yaml`
+        and `sweep.yaml`
+
+    Raises
+    ------
+    ProductError
+        If a result is missing or damaged.
+    SweepError
+        If no point has a metric.
+    """
+    import pandas as pd
+    import yaml
+
+    results = [read_result(path) for path in points]
+    chosen = choose(results, definition["metric"], definition["direction"])
+    if chosen is None:
+        failed = f"{results[0]['point']}: {results[0]['reason']}"
+        raise SweepError(f"all {len(results)} points of sweep {name} failed; the first, {failed}")
+    rows = [_row(result, definition["space"], result is chosen) for result in results]
+    write_csv(out / SUMMARY, pd.DataFrame(rows))
+    costs = [
+        {"point": result["point"], **read_cost(path.parent)}
+        for result, path in zip(results, points, strict=True)
+    ]
+    write_text(out / COSTS, pd.DataFrame(costs).to_csv(index=False))
+    described = {"sweep": name, "given": list(given), **definition}
+    # Unsorted: the order of the axes is that of the figures.
+    write_text(out / DEFINITION, yaml.safe_dump(described, sort_keys=False))
+    write_text(out / BEST, _best_yaml(name, definition, given, chosen))
+
+
+def choose(
+    results: Sequence[Mapping[str, Any]], metric: str, direction: str
+) -> Mapping[str, Any] | None:
+    """The result with the best validation metric, the first of equals; None if all failed."""
+    sign = 1.0 if direction == "minimize" else -1.0
+    with_metric = [result for result in results if metric in result["metrics"]]
+    return min(with_metric, key=lambda result: sign * result["metrics"][metric], default=None)
+
+
+def best_overrides(results: Path, name: str) -> list[str]:
+    """Hydra overrides of the best point of a sweep.
+
+    Parameters
+    ----------
+    results : folder that the workflow writes to
+    name : of the sweep
+
+    Raises
+    ------
+    ProductError
+        If the sweep has not been run.
+    """
+    from psfdae.reading import read_yaml
+
+    path = results / "sweeps" / name / BEST
+    if not path.is_file():
+        raise ProductError(f"{path}: missing; run `snakemake sweep --config sweep={name}` first")
+    overrides = read_yaml(path).get("overrides")
+    if not isinstance(overrides, list):
+        raise ProductError(f"{path}: damaged (no overrides); delete it and run again")
+    return [str(override) for override in overrides]
+
+
+def _row(result: Mapping[str, Any], axes: Iterable[str], best: bool) -> dict[str, Any]:
+    values = {name: result["values"][name] for name in axes}
+    values = {k: json.dumps(v) if isinstance(v, list) else v for k, v in values.items()}
+    outcome = {key: result[key] for key in ("status", "reason", "epochs", "attempt")}
+    chosen = {"best": "yes" if best else "no"}
+    return {"point": result["point"], **values, **outcome, **chosen, **result["metrics"]}
+
+
+def _best_yaml(
+    name: str, definition: Mapping[str, Any], given: Sequence[str], best: Mapping[str, Any]
+) -> str:
+    """The best point as overrides, those of the workflow before its own."""
+    from psfdae.settings import as_overrides
+
+    own = [override.removeprefix("++") for override in as_overrides(best["keys"])]
+    tree = {
+        "sweep": name,
+        "point": best["point"],
+        "preset": next((g.partition("=")[2] for g in given if g.startswith("preset=")), ""),
+        "overrides": [*(g for g in given if not g.startswith("preset=")), *own],
+        "dataset": definition.get("dataset") or definition["model"],
+        "split": best["split"],
+        "reference": best["reference"],
+        "metric": definition["metric"],
+        "metrics": {key: float(f"{value:.8g}") for key, value in best["metrics"].items()},
+    }
+    return as_yaml(tree)
+
+
+@command("sweep figure")
+def sweep_figure(
+    kind: Annotated[Literal["parallel", "response"], {"argument": True}],
+    definition: Annotated[File, "sweep.yaml of the command `sweep summary`."],
+    table: Annotated[File, "summary.csv of the same."],
+    out: Annotated[File, "PNG."],
+) -> None:
+    """Draw all points at once, or the metric against each axis."""
+    from psfdae.settings import validate
+    from psfdae_paper.configuration.sweep import Axis
+    from psfdae_paper.evaluation import sweep_figures
+
+    described = read_yaml(definition)
+    logarithmic = [n for n, axis in described["space"].items() if validate(Axis, axis).log]
+    draw = {
+        "parallel": sweep_figures.parallel_coordinates,
+        "response": sweep_figures.response_curves,
+    }[kind]
+    axes = list(described["space"])
+    text = dict.fromkeys(axes, str)
+    drawn = draw(read_table(table, dtype=text), described, axes, logarithmic)
+    write_png(drawn, out)

@@ -1,0 +1,258 @@
+"""Stage `track`: finished runs become MLflow runs, and again without duplicates.
+
+The results folder is the truth and the database a view of it: no training talks
+to MLflow, and a lost database is rebuilt by running the stage again.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+import tempfile
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+from psfdae.errors import Error
+from psfdae.files import atomic_path, write_text
+from psfdae.options import File, Folder
+from psfdae.version import __version__
+from psfdae_paper.configuration.command import command
+from psfdae_paper.source import git_commit
+from psfdae_paper.tracking import Run, flatten, runs_of_alignment, runs_of_datasets, runs_of_sweep
+
+SLOT = ("kind", "dataset", "split", "reference", "preset", "source")
+"""Tags that name a place in the results folder; with `config_hash` they name a run."""
+
+PARENT = "mlflow.parentRunId"
+"""Tag by which MLflow shows a run as a part of another."""
+
+BATCH, PARAM_LENGTH = 100, 6000
+"""MLflow takes 100 params, or 1000 metrics, at once, and 6000 characters of a param."""
+
+COLUMNS = ("run_id", "action", "experiment", *SLOT, "config_hash")
+NOT_SENT = "not sent"
+
+
+class TrackingError(Error, RuntimeError):
+    """The MLflow database cannot be used."""
+
+
+@command("track")
+def track(
+    results: Annotated[Folder, "Folder that the workflow writes to."],
+    preset: Annotated[str, "Goes into the tags."],
+    database: Annotated[File, "SQLite file; mlartifacts/ lies beside it."],
+    out: Annotated[File, "CSV with the MLflow id of every run and what was done."],
+    stars: Annotated[
+        tuple[tuple[str, File], ...], "Dataset and its product of the stage stars."
+    ] = (),
+    alignment: Annotated[bool, "The networks of scene 3."] = False,
+    sweeps: Annotated[tuple[str, ...], "The points of a sweep.", {"flag": "--sweep"}] = (),
+) -> None:
+    """Import finished runs into MLflow; MLFLOW_TRACKING_URI names a server instead.
+
+    A run is known by its place in the results and its config. If it is there
+    with the same files nothing is done; with other files it is replaced (MLflow
+    can only append to metrics); with another config it stays for comparison,
+    with the tag superseded = true, beside the new one.
+
+    If a server fails there is a message and no error: it must not stop a workflow.
+    """
+    runs = runs_of_datasets(results, dict(stars))
+    runs += runs_of_alignment(results) if alignment else []
+    runs += [run for sweep in sweeps for run in runs_of_sweep(results, sweep)]
+    import_runs(runs, preset, database, out)
+
+
+def import_runs(runs: Sequence[Run], preset: str, database: Path, receipt: Path) -> None:
+    """Import runs; see `track`. Raises TrackingError if the database cannot be used."""
+    artifacts = database.parent / "mlartifacts"
+    os.environ["MLFLOW_DISABLE_TELEMETRY"] = "true"
+    # MLflow's own waits add up to minutes for a server that is away.
+    os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", "20")
+    os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "1")
+    uri = os.environ.get("MLFLOW_TRACKING_URI", "")
+    tags = {"preset": preset, "commit": git_commit(), "psfdae_version": __version__}
+    done: list[tuple[str, str]] = []
+    with _alone(database):
+        try:
+            for outcome in _import(runs, tags, uri, database, artifacts):
+                done.append(outcome)
+        except Exception as error:
+            if not _ours_to_explain(error):
+                raise
+            if not uri:
+                raise TrackingError(
+                    f"{database}: {_first_line(error)} (if it is damaged, delete it: the next "
+                    "import rebuilds it)"
+                ) from error
+            print(
+                f"MLflow at {uri} cannot be used: {_first_line(error)}\n"
+                f"Not sent: {', '.join(r.name for r in runs[len(done) :])}\n"
+                "To send later, repeat the import (snakemake --forcerun track)."
+            )
+    done += [("", NOT_SENT)] * (len(runs) - len(done))
+    write_text(receipt, _as_csv(runs, preset, done))
+    counts = Counter(action for _, action in done)
+    print(f"{len(done)} runs:", ", ".join(f"{n} {action}" for action, n in sorted(counts.items())))
+
+
+@contextmanager
+def _alone(database: Path) -> Iterator[None]:
+    """Wait for other importers: two that meet on a new database would ruin it."""
+    import fcntl
+
+    database.parent.mkdir(parents=True, exist_ok=True)
+    with database.with_name(f".{database.name}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+
+
+def _import(
+    runs: Sequence[Run], tags: dict[str, str], uri: str, database: Path, artifacts: Path
+) -> Iterator[tuple[str, str]]:
+    """Id and action of one record after the other."""
+    client = _client(uri, database)
+    experiments: dict[str, str] = {}
+    known: dict[tuple[str, ...], list[Any]] = {}
+    imported: dict[str, str] = {}
+    for record in runs:
+        name = record.experiment
+        if name not in experiments:
+            # A server decides itself where artifacts go.
+            served = uri.startswith(("http", "databricks"))
+            location = None if served else (artifacts.resolve() / name).as_uri()
+            experiments[name] = _experiment(client, name, location, check=not uri)
+            for old in _runs(client, experiments[name]):
+                known.setdefault((name, *_slot(old.data.tags)), []).append(old)
+        own = {**tags, **_tags(record)}
+        if record.parent:
+            own[PARENT] = imported[record.parent]
+        outcome = _import_one(
+            client, experiments[name], record, own, known.get((name, *_slot(own)), ())
+        )
+        imported[record.source] = outcome[0]
+        yield outcome
+
+
+def _client(uri: str, database: Path) -> Any:
+    from mlflow import MlflowClient
+
+    if not uri:
+        if not database.exists():
+            # The migrations take seconds; killed within them, MLflow could not go on.
+            with atomic_path(database, digest=False) as temporary:
+                MlflowClient(f"sqlite:///{temporary.resolve()}").search_experiments(max_results=1)
+        uri = f"sqlite:///{database.resolve()}"
+    return MlflowClient(uri)
+
+
+def _experiment(client: Any, name: str, location: str | None, check: bool) -> str:
+    found = client.get_experiment_by_name(name)
+    if found is None:
+        return client.create_experiment(name, artifact_location=location)
+    if check and found.artifact_location != location:
+        # A copied results folder would otherwise write into the original's files.
+        raise TrackingError(
+            f"the database keeps its files in {found.artifact_location}, not in {location}; "
+            "was the results folder moved? Delete mlflow.db and import again"
+        )
+    if found.lifecycle_stage == "deleted":
+        client.restore_experiment(found.experiment_id)
+    return found.experiment_id
+
+
+def _runs(client: Any, experiment: str) -> Iterator[Any]:
+    """Active runs of an experiment that this stage has made."""
+    token = None
+    while True:
+        page = client.search_runs([experiment], max_results=1000, page_token=token)
+        yield from (run for run in page if "config_hash" in run.data.tags)
+        token = page.token
+        if not token:
+            return
+
+
+def _import_one(
+    client: Any, experiment: str, record: Run, tags: dict[str, str], known: Sequence[Any]
+) -> tuple[str, str]:
+    """Leave exactly one active run of the record; `known` are those of its slot."""
+    same = [run for run in known if run.data.tags["config_hash"] == record.config_hash]
+    # An import that was killed leaves a run without content_hash.
+    valid = [r for r in same if r.data.tags.get("content_hash") == record.content_hash]
+    if valid:
+        run_id, action = valid[0].info.run_id, "unchanged"
+        for key in ("superseded", PARENT):
+            # A parent that has new files is another run.
+            if key in tags and valid[0].data.tags.get(key) != tags[key]:
+                client.set_tag(run_id, key, tags[key])
+    else:
+        run_id, action = _create(client, experiment, record, tags), "created"
+        if same:
+            action = "updated"
+    for old in known:
+        if old in same and old.info.run_id != run_id:
+            client.delete_run(old.info.run_id)
+        elif old not in same and old.data.tags.get("superseded") != "true":
+            client.set_tag(old.info.run_id, "superseded", "true")
+    return run_id, action
+
+
+def _create(client: Any, experiment: str, record: Run, tags: dict[str, str]) -> str:
+    import yaml
+    from mlflow.entities import Metric, Param
+
+    created = client.create_run(experiment, record.start_ms, tags, record.name)
+    run_id = created.info.run_id
+    metrics = [Metric(p.name, p.value, p.time_ms, p.epoch) for p in record.points]
+    params = [Param(k, v[:PARAM_LENGTH]) for k, v in flatten(record.config).items()]
+    for i in range(0, len(params), BATCH):
+        client.log_batch(run_id, params=params[i : i + BATCH], synchronous=True)
+    for i in range(0, len(metrics), 10 * BATCH):
+        client.log_batch(run_id, metrics=metrics[i : i + 10 * BATCH], synchronous=True)
+    with tempfile.TemporaryDirectory() as folder:
+        for name, path in record.files.items():
+            link = Path(folder, name)
+            link.parent.mkdir(parents=True, exist_ok=True)
+            link.symlink_to(path.resolve())
+        Path(folder, "config.yaml").write_text(yaml.safe_dump(record.config), encoding="utf-8")
+        client.log_artifacts(run_id, folder)
+    client.set_terminated(run_id, record.status, record.end_ms)
+    client.set_tag(run_id, "content_hash", record.content_hash)
+    return run_id
+
+
+def _tags(record: Run) -> dict[str, str]:
+    own = {key: getattr(record, key) for key in SLOT if key != "preset"}
+    own |= record.tags
+    return {**own, "config_hash": record.config_hash, "superseded": "false"}
+
+
+def _slot(tags: dict[str, str]) -> tuple[str, ...]:
+    return tuple(tags.get(key, "") for key in SLOT)
+
+
+def _ours_to_explain(error: Exception) -> bool:
+    """Whether an error comes from the database, the server or the disk, not from a bug."""
+    from mlflow.exceptions import MlflowException
+    from sqlalchemy.exc import SQLAlchemyError
+
+    return isinstance(error, MlflowException | SQLAlchemyError | OSError)
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).strip().split("\n", 1)[0]
+
+
+def _as_csv(runs: Sequence[Run], preset: str, done: Sequence[tuple[str, str]]) -> str:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, COLUMNS, extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    for record, (run_id, action) in zip(runs, done, strict=True):
+        row = {"run_id": run_id, "action": action, "experiment": record.experiment}
+        writer.writerow({**row, "preset": preset, **_tags(record)})
+    return text.getvalue()

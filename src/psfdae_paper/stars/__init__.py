@@ -1,0 +1,1 @@
+"""Simulated stars: field points, random aberrations, framing."""

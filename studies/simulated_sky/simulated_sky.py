@@ -1,0 +1,227 @@
+"""The PSF where a star stands, by psfdae and by other packages, on simulated images of scene 1.
+
+`field` simulates an image whose PSFs are known. Any package that has learnt from the training
+stars of psfdae's list says its PSF at the places of the stars that were held out; `places` fits
+centre, flux and sky of these stars in one way for all, and measures the errors.
+"""
+
+from datetime import date
+from pathlib import Path
+from typing import Annotated
+
+import click
+import numpy as np
+import pandas as pd
+from scipy.stats import sem
+
+from psfdae.cli import program
+from psfdae.field_psf import slopes
+from psfdae.files import atomic_path
+from psfdae.image.observation import central_pixel
+from psfdae.options import File
+from psfdae.reading import read_table
+from psfdae.rng import stream
+from psfdae_paper.configuration.command import command
+from psfdae_paper.configuration.consistency import SIMULATION
+from psfdae_paper.configuration.schema import Config
+from psfdae_paper.source import git_commit
+from psfdae_paper.stars.example import add_stamps, write_field
+
+SIDE = 48  # px of a simulated star
+PITCH = 64  # px of the lattice of the stars
+ASIDE_PX = 8  # of stars from it, at most, per axis
+SKY = 1000.0  # electrons per pixel
+SNR = (150.0, 1500.0)  # of the stars, by a matched filter
+SMOOTHING_PX, ISOPHOTE = 1.0, 0.1  # of the listed centroids: σ, and part of the peak
+NEAR_PX = 6  # of the brightest pixel from the list
+FARTHEST = 3  # px of a star's centre from the frame's middle, at the start
+ROUNDS = 30  # of Gauss-Newton steps
+STEP = 0.5  # px, at most
+LANCZOS = 4  # of the interpolation of sampled PSFs
+
+
+@command("field", reads=SIMULATION)
+def field(
+    config: Config,
+    image: Annotated[File, "FITS image."],
+    catalogue: Annotated[File, "CSV file for the star list."],
+    truth: Annotated[File, "NPZ with the stars' images, in the order of the list."],
+    stars: Annotated[int, click.IntRange(min=1), "Anywhere over the 11 × 11 fields."] = 2000,
+) -> None:
+    """Simulate an image of scene 1, all fields side by side.
+
+    The aberrations are those of one telescope; `stars.aberration_fraction` scatters them from
+    star to star. The list has centroids inside an isophote. `psf` (stars, s, s) are parts of all
+    light of a star; their pixel (s/2, s/2) is `pixel` (stars, 2), x and y in the image.
+    """
+    from psfdae_paper.optics.propagation import StampPropagator
+    from psfdae_paper.optics.pupil import annular_pupil, pixel_width
+    from psfdae_paper.optics.wavefronts import seidel_wavefronts
+
+    telescope, optics = config.telescope, config.optics
+    scale = telescope.pixel_scale_arcsec
+    rng = stream(config.seed, "simulated sky")
+    count = int(np.ceil(np.sqrt(stars)))
+    lattice = np.stack(np.divmod(rng.permutation(count**2)[:stars], count), axis=1)
+    position = (lattice + 0.5) * PITCH + rng.uniform(-ASIDE_PX, ASIDE_PX, lattice.shape)
+    pixel, side = central_pixel(position), count * PITCH
+    scatter = 1.0 + config.stars.aberration_fraction * rng.standard_normal((stars, 5))
+    seidel = scatter * config.wavefront.coefficients
+    source = seidel_wavefronts(seidel, 2.0 * position / side - 1.0)
+    pupil = annular_pupil(max(optics.pupil_samples), telescope.obscuration)
+    width = pixel_width(scale, telescope.diameter_m, telescope.wavelength_m)
+    propagate = StampPropagator(pupil, SIDE, width, precision=optics.precision)
+    # The middle of an even stamp is the corner of four pixels.
+    off = (pixel - 0.5 - position)[:, ::-1]
+    parts = np.array_split(np.arange(stars), -(-stars // optics.batch))
+    psf = [propagate(source.opd(part, pupil, propagate.real_dtype), off[part]) for part in parts]
+    psf = np.concatenate(psf).astype(np.float32)
+    snr = SNR[0] * (SNR[1] / SNR[0]) ** rng.uniform(size=stars)
+    flux = snr * np.sqrt(SKY / np.square(psf).sum(axis=(1, 2)))
+    expected = np.full((side, side), SKY)
+    add_stamps(expected, flux[:, None, None] * psf, *pixel.T)
+    listed = pixel - SIDE // 2 + np.array([_centroid(star) for star in psf])
+    counts = rng.poisson(expected).astype(np.float32)
+    write_field(image, catalogue, counts, *listed.T, pixel_scale_arcsec=scale, GAIN=1.0)
+    with atomic_path(truth) as temporary, temporary.open("wb") as file:
+        np.savez(file, psf=psf, pixel=pixel)
+
+
+def _centroid(star):
+    """Centroid (x, y) of what is brighter than an isophote around the brightest pixel."""
+    from scipy import ndimage
+
+    smooth = ndimage.gaussian_filter(star, SMOOTHING_PX)
+    parts, _ = ndimage.label(smooth > ISOPHOTE * smooth.max())
+    row, column = ndimage.center_of_mass(smooth, parts, parts.flat[smooth.argmax()])
+    return column, row
+
+
+@command("places")
+def places(
+    image: Annotated[File, {"argument": True}, "FITS image of `field`."],
+    truth: Annotated[File, "NPZ of `field`."],
+    selection: Annotated[File, "selection.csv of from-stars on image and list."],
+    bundle: Annotated[File, "Its model, of the method field."],
+    others: Annotated[
+        tuple[str, ...],
+        {"flag": "--other"},
+        "NAME=FILE of a package that learnt from the same stars: a .psf of PSFEx, or NPZ with psf "
+        "(held-out stars, m, m), PSFs at the listed places about the pixel m//2, and oversampling.",
+    ],
+    out: Annotated[File, "CSV with the errors of each package."],
+) -> None:
+    """Errors of PSFs of sum 1 at the places of the stars that were held out.
+
+    Their pixels give centre, flux and sky by least squares, in the same way for all packages.
+    `over` is the error of psfdae over that of a package. Standard errors are those over the
+    stars, that of `over` the paired one.
+    """
+    from astropy.io import fits
+
+    from psfdae.model.psf_model import load_model
+
+    model, table, known = load_model(bundle), read_table(selection), np.load(truth)
+    held, side = np.flatnonzero(table["part"] == "held out"), model.info.stamp_px
+    position = table[["x", "y"]].to_numpy()[held]
+    data = np.pad(np.asarray(fits.getdata(image), float), SIDE, mode="reflect")
+    frame = central_pixel(position) + SIDE
+    near = _cut(data, frame, 2 * NEAR_PX).reshape(len(held), -1)
+    frame += np.stack(np.divmod(near.argmax(axis=1), 2 * NEAR_PX)[::-1], axis=1) - NEAR_PX
+    stamps = _cut(data, frame, side)
+    right = np.pad(known["psf"][held].astype(float), ((0, 0), (SIDE, SIDE), (SIDE, SIDE)))
+    at = frame - known["pixel"][held] + SIDE // 2
+    right = np.concatenate(
+        [_cut(star, one[None], side) for star, one in zip(right, at, strict=True)]
+    )
+    right /= right.sum(axis=(1, 2), keepdims=True)
+    ours = model.engine.estimator.model
+    terms = ours.terms(position)
+    draws = {"psfdae": lambda centre: ours.images(terms, centre, side)}
+    for package, file in (other.split("=", 1) for other in others):
+        draws[package] = _sampled(Path(file), position, side)
+    errors = {
+        package: np.square(_fitted(draw, stamps) - right).mean(axis=(1, 2))
+        for package, draw in draws.items()
+    }
+    rows = []
+    for package, error in errors.items():
+        over = errors["psfdae"].mean() / error.mean()
+        paired = (errors["psfdae"] - over * error) / error.mean()
+        row = {"package": package, "stars": len(held), "learnt": sum(table["part"] == "training")}
+        row |= {"mse": error.mean(), "stderr": sem(error)}
+        row |= {"over": over, "over_stderr": sem(paired)}
+        rows.append(row | {"date": date.today().isoformat(), "commit": git_commit()})
+    pd.DataFrame(rows).to_csv(out, index=False, float_format="%.6g")
+
+
+def _cut(image, pixel, side):
+    """Stamps (n, d, d) whose pixel (d/2, d/2) is a pixel (n, 2), x and y, of an image."""
+    x, y = (pixel.T[..., None] - side // 2) + np.arange(side)
+    return image[y[:, :, None], x[:, None, :]]
+
+
+def _sampled(path, position, side):
+    """What draws a package's PSFs (n, d, d) at their centres (n, 2) (row, column)."""
+    if path.suffix == ".psf":
+        psf, step = _psfex(path, position + 1.0)
+    else:
+        found = np.load(path)
+        psf, step = found["psf"], 1.0 / found["oversampling"]
+    grid = step * (np.arange(psf.shape[-1]) - psf.shape[-1] // 2)
+
+    def draw(centre):
+        rows, columns = ((np.arange(side) - side // 2 - c[:, None])[..., None] for c in centre.T)
+        rows, columns = (_lanczos((a - grid) / step) for a in (rows, columns))
+        return rows @ psf @ columns.transpose(0, 2, 1)
+
+    return draw
+
+
+def _psfex(path, position):
+    """PSFs (n, m, m) of a file of PSFEx at 1-based positions (n, 2), and their step in pixels."""
+    from astropy.io import fits
+
+    with fits.open(path) as file:
+        header, terms = file["PSF_DATA"].header, file["PSF_DATA"].data["PSF_MASK"][0]
+    zero, scale = (np.array([header[f"POL{key}{i}"] for i in (1, 2)]) for key in ("ZERO", "SCAL"))
+    x, y = ((position - zero) / scale).T
+    degree = header["POLDEG1"]
+    powers = [x**i * y**j for j in range(degree + 1) for i in range(degree + 1 - j)]
+    return np.tensordot(np.stack(powers, axis=1), terms.astype(float), 1), header["PSF_SAMP"]
+
+
+def _lanczos(t):
+    """Weights (…, m) of samples at distances, their sum 1."""
+    weight = np.where(np.abs(t) < LANCZOS, np.sinc(t) * np.sinc(t / LANCZOS), 0.0)
+    return weight / weight.sum(axis=-1, keepdims=True)
+
+
+def _fitted(draw, stamps):
+    """PSFs of sum 1 in the frames of stamps (n, d, d), by least squares."""
+
+    def solved(centre, *more):
+        parts = np.stack([draw(centre), np.ones_like(stamps), *more], axis=-1)
+        parts = parts.reshape(len(stamps), -1, parts.shape[-1])
+        found = np.linalg.pinv(parts) @ flat
+        return found[..., 0], np.square(flat - parts @ found).sum(axis=(1, 2))
+
+    flat = stamps.reshape(len(stamps), -1, 1)
+    axis = np.arange(-FARTHEST, FARTHEST + 1.0)
+    starts = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    first = [solved(np.tile(start, (len(stamps), 1)))[1] for start in starts]
+    centre, least, part = starts[np.argmin(first, axis=0)], np.min(first, axis=0), 1.0
+    for _ in range(ROUNDS):
+        found, _ = solved(centre, *slopes(draw, centre))
+        move = np.clip(found[:, 2:] / found[:, :1], -STEP, STEP) * part
+        chi2 = solved(centre + move)[1]
+        better = chi2 < least
+        centre = np.where(better[:, None], centre + move, centre)
+        least = np.minimum(chi2, least)
+        part = np.where(better, 1.0, np.asarray(part).ravel() / 2)[:, None]
+    psf = draw(centre)
+    return psf / psf.sum(axis=(1, 2), keepdims=True)
+
+
+if __name__ == "__main__":
+    program(field, places)

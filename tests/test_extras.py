@@ -1,0 +1,87 @@
+"""Without the packages of an extra: what needs none works, the rest says which extra to install."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import sys
+import tomllib
+
+import numpy as np
+import pytest
+
+from command_line import refused
+from psfdae import extras, load_model
+from psfdae.cli import refusal
+from psfdae.extras import MissingExtraError
+from psfdae.model.bundle import write_bundle
+from workflow_runs import ROOT
+
+
+@pytest.fixture(autouse=True)
+def metadata(monkeypatch):
+    """The requirements of pyproject.toml as those of the installed package."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    lines = project["dependencies"] + [
+        f"{line}; extra == '{extra}'"
+        for extra, names in project["optional-dependencies"].items()
+        for line in names
+    ]
+    monkeypatch.setattr(extras, "requires", lambda name: lines)
+
+
+@pytest.fixture
+def without(monkeypatch):
+    """Make imports of modules fail, as where they are not installed."""
+    return lambda *names: [monkeypatch.setitem(sys.modules, name, None) for name in names]
+
+
+@pytest.fixture
+def bundle(network, tmp_path):
+    """The file of a model that is a network."""
+    path = tmp_path / "network.psf.safetensors"
+    write_bundle(network.bundle, path)
+    return path
+
+
+def test_a_command_names_the_package_and_its_extra(without):
+    without("hydra")
+    said = refused("train", "--stars", "stars.h5", "--out", "model", "seed=20811")
+    assert said == 'psfdae: this command needs hydra-core: pip install "psfdae[paper]"\n'
+
+
+def test_a_network_without_torch_names_the_extra(bundle, without):
+    without("torch")
+    line = "the model 'wfsat' needs torch: pip install \"psfdae[dae]\""
+    with pytest.raises(MissingExtraError) as caught:
+        load_model(bundle)
+    assert (str(caught.value), caught.value.name) == (line, "torch")
+    assert isinstance(caught.value, ImportError)
+    said = refused(
+        "predict", "stars.fits", "--model", bundle, "--out", bundle.with_name("psf.fits")
+    )
+    assert said == f"psfdae: {line}\n"
+
+
+def test_a_mixture_predicts_without_torch(shipped, without):
+    side = shipped.info.stamp_px
+    stamps = np.random.default_rng(3).poisson(100.0, (2, side, side)).astype(np.float32)
+    stamps[:, side // 2, side // 2] += 5000.0
+    expected = shipped.predict(stamps)
+    without("torch")
+    np.testing.assert_array_equal(load_model().predict(stamps).psf, expected.psf)
+
+
+@pytest.mark.parametrize("module", ["no_such_module", "hydra.no_such_module", "psfdae.nothing"])
+def test_what_no_extra_brings_stays_a_traceback(module):
+    assert refusal(ModuleNotFoundError("…", name=module)) is None
+
+
+def test_without_metadata_the_error_stays_what_it_is(monkeypatch):
+    def unknown(name):
+        raise importlib.metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(extras, "requires", unknown)
+    error = ModuleNotFoundError("…", name="torch")
+    with pytest.raises(ModuleNotFoundError) as caught, extras.needed_by("it"):
+        raise error
+    assert caught.value is error
