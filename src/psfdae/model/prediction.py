@@ -129,7 +129,7 @@ class Prediction:
 
 
 def measured_of(centre: np.ndarray, covariance: np.ndarray) -> dict[str, np.ndarray]:
-    """Columns from centres (row, column) and the covariance of `estimators.Measured`.
+    """Columns from centres (row, column) and the covariance of `psfdae.method.Measured`.
 
     A number that is known has the error 0, and correlates with nothing.
     """
