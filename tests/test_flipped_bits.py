@@ -58,6 +58,9 @@ def flipped(smoke, tmp_path_factory):
     """The folder of a run that was damaged and repeated, what was flipped, and what was said."""
     folder = tmp_path_factory.mktemp("flipped")
     shutil.copytree(smoke, folder, dirs_exist_ok=True, symlinks=True)
+    # The database says where its files are: that of a copy is deleted, and filled again.
+    (folder / "results/mlflow.db").unlink()
+    shutil.rmtree(folder / "results/mlartifacts")
     # A user's own, which no job can build again.
     write_text(folder / "results" / OWN, "1\n")
     chosen = one_of_each(folder / "results") | {("own",): folder / "results" / OWN}
