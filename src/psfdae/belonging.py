@@ -1,37 +1,25 @@
-"""Whether products belong together: what files say of themselves, key by key.
+"""Whether products belong together, by what their files say of their upstream settings.
 
-A product carries the configuration that made it. A network or a fitted baseline says
-in a file beside it of which stars it was trained, because its own configuration does
-not know them. Compared are the keys that decide what an input is; what only one side
-states, and what changes no result (names, threads, batches), is not.
+A product carries the configuration that made it. A network or a fitted baseline has the
+configuration of its training stars in a file beside it. Settings that only one side states are
+not compared, nor are those that change no result (names, threads, batches).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from psfdae.files import Product, ProductError, write_text
 from psfdae.reading import read_yaml
 
-STATIC = (
-    "scene.name",
-    "telescope",
-    "framing.stamp_px",
-    "framing.jitter_px",
-    "framing.tie",
-    "grid",
-    "wavefront",
-)
+FRAMING = ("framing.stamp_px", "framing.jitter_px", "framing.tie")
+STATIC = ("scene.name", "telescope", *FRAMING, "grid", "wavefront")
 """What decides the static PSFs of a scene."""
 
-STARS = (
-    *STATIC,
-    "framing.subpixel",
-    "telescope.aberrations.jitter_waves",
-    "stars.aberration_fraction",
-)
+DRAWN = ("framing.subpixel", "telescope.aberrations.jitter_waves", "stars.aberration_fraction")
+STARS = (*STATIC, *DRAWN)
 """What decides of which kind stars are; others of the same kind have another seed or name."""
 
 SAME_STARS = ("seed", "stars.name", "stars.count")
@@ -40,41 +28,11 @@ SAME_STARS = ("seed", "stars.name", "stars.count")
 SAME_IMAGE = ("image", "calibration_stars", "parts")
 """What tells sets of stars of images apart, which are not simulated."""
 
-TRAINING_PART = ("seed", "parts.train_stars")
-"""What decides which stars of a set a training has seen."""
-
-STATES = (
-    "telescope.diameter_m",
-    "telescope.obscuration",
-    "telescope.wavelength_m",
-    "prescription",
-    "alignment.decenter_range_m",
-    "alignment.tilt_range_deg",
-    "alignment.defocus_m",
-    "alignment.field_radius_deg",
-    "alignment.field_points",
-    "alignment.highest_zernike",
-)
-"""What decides the wavefront of a state of scene 3."""
-
-STATE_STAMPS = (*STATES, "telescope.pixel_scale_arcsec", "alignment.stamp_px")
-"""What decides the stamps of a state of scene 3."""
-
-ONLY_IF_NAMED = ("name", "jitter_waves")
-"""Last part of keys that a group does not bring along: titles, and what static PSFs lack."""
-
-WHOLE = {
-    "wavefront": "wavefront",
-    "telescope.aberrations": "telescope.aberrations",
-    "telescope.seeing": "telescope.aberrations",
-    "prescription": "prescription",
-}
-"""Groups whose missing terms are not there, if the configuration has the other group at all."""
+NO_PART = {"name", "jitter_waves"}
+"""Keys that a group does not bring along: titles, and what static PSFs lack."""
 
 TRAINED_ON = "trained_on.yaml"
 """Configuration of the stars or states that a network was trained on, in its folder."""
-
-OURS = "the configuration"
 
 
 def require(
@@ -82,9 +40,9 @@ def require(
     said: Mapping[str, Any],
     keys: Sequence[str],
     wanted: Any,
-    whose: object = OURS,
+    whose: object = "the configuration",
 ) -> None:
-    """Refuse an input that is not what a stage takes it for.
+    """Refuse an input of other settings than those of a stage, or of another input.
 
     Parameters
     ----------
@@ -93,7 +51,7 @@ def require(
     said : mapping
         The configuration that it carries.
     keys : sequence of str
-        Dotted keys and groups that must agree.
+        Dotted keys, and groups of them, that must agree where both sides state them.
     wanted : mapping or pydantic model
         Configuration of the stage, or of another input.
     whose : object
@@ -105,30 +63,39 @@ def require(
         For the first key that differs, with both values.
     """
     tree = wanted if isinstance(wanted, Mapping) else wanted.model_dump()
-    ours, theirs = dict(_leaves(said)), dict(_leaves(tree))
-    for key in _selected(keys, {*ours, *theirs}):
-        here, there = _value(ours, key), _value(theirs, key)
-        if here is not None and there is not None and here != there:
-            raise ProductError(f"{path}: {key} = {here}, but {whose} has {there}")
+    for key in keys:
+        here, there = _at(said, key), _at(tree, key)
+        names = [key]
+        if isinstance(here, Mapping) and isinstance(there, Mapping):
+            names = [f"{key}.{name}" for name in sorted({*here} & {*there} - NO_PART)]
+        for name in names:
+            one, other = _at(said, name), _at(tree, name)
+            found = None if one is None or other is None else _difference(name, one, other)
+            if found is not None:
+                raise ProductError(f"{path}: {found[0]} = {found[1]}, but {whose} has {found[2]}")
 
 
-def agree(keys: Sequence[str], said: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
-    """Whether two configurations state all of some keys, and the same values."""
-    ours, theirs = dict(_leaves(said)), dict(_leaves(other))
-    return all(key in ours and ours[key] == theirs.get(key) for key in keys)
+def _at(tree: Any, key: str) -> Any:
+    """The value of a dotted key; None if it is not there."""
+    for name in key.split("."):
+        tree = tree.get(name) if isinstance(tree, Mapping) else None
+    return tree
 
 
-def write_origin(model: Path, product: Product) -> None:
-    """Note beside a model, which is written already, of which product it was trained.
+def _difference(name: str, one: Any, other: Any) -> tuple[str, Any, Any] | None:
+    """The first key in which two values differ, and what each has there."""
+    if not (isinstance(one, Mapping) and isinstance(other, Mapping)):
+        return None if one == other else (name, one, other)
+    inner = ((key, *(s.get(key, "nothing") for s in (one, other))) for key in {**one, **other})
+    parts = (_difference(f"{name}.{key}", *both) for key, *both in inner if key not in NO_PART)
+    return next(filter(None, parts), None)
 
-    Parameters
-    ----------
-    model : folder of a network, or path of a fitted baseline
-    product : Product
-    """
+
+def write_origin(model: Path, stars: Product) -> None:
+    """Note beside a model, a folder or a file, of which product it was trained."""
     import yaml
 
-    write_text(origin_path(model), yaml.safe_dump(product.config, sort_keys=True))
+    write_text(origin_path(model), yaml.safe_dump(stars.config, sort_keys=True))
 
 
 def origin_path(model: Path) -> Path:
@@ -139,25 +106,11 @@ def origin_path(model: Path) -> Path:
 def require_origin(model: Path, keys: Sequence[str], product: Product) -> dict[str, Any]:
     """Refuse a model that was trained on other stars or states than those of a product.
 
-    Parameters
-    ----------
-    model : folder of a network, or path of a fitted baseline
-    keys, product : as in `require`
-
-    Returns
-    -------
-    dict
-        What the model was trained on; empty if nobody has noted it.
-
-    Raises
-    ------
-    ProductError
-        As `require`, or if the note is damaged.
+    Returns what it was trained on, empty if no file says it; raises as `require`, and if that
+    file is damaged.
     """
     path = origin_path(model)
-    if not path.is_file():
-        return {}
-    found = read_yaml(path)
+    found = read_yaml(path) if path.is_file() else {}
     require(path, found, keys, product.config, product.path)
     return found
 
@@ -165,51 +118,14 @@ def require_origin(model: Path, keys: Sequence[str], product: Product) -> dict[s
 def require_training(
     model: Path, said: Mapping[str, Any], stars: Product, config: Any, **options: str
 ) -> None:
-    """Refuse a network or baseline that was not trained for a test on some stars.
+    """Refuse a fit, whose configuration is `said`, that is no test on a product of stars.
 
-    It must be of stars of the same kind and, where they are the very same stars, must
-    not have been trained on those that are tested.
-
-    Parameters
-    ----------
-    model : folder of a network, or path of a fitted baseline
-    said : mapping
-        The configuration of the training.
-    stars : product "stars" that it is tested on
-    config : stage config (seed, parts)
-    options : split, and reference of a network
+    It must be of stars of the same kind and have the same `options`, split and reference. Where
+    they are the very same stars, those of the random split's test must not have trained it.
     """
     origin = require_origin(model, STARS, stars)
     path = model if model.is_file() else model / "config.yaml"
     require(path, said, tuple(options), options, "the command")
-    if agree(SAME_STARS, origin, stars.config) and options["split"] == "random":
-        require(path, said, TRAINING_PART, config)
-
-
-def _selected(keys: Sequence[str], known: set[str]) -> Iterator[str]:
-    """The leaves that keys and groups stand for, in the order of `keys`."""
-    for key in keys:
-        if key in known:
-            yield key
-        inside = [leaf for leaf in known if leaf.startswith(f"{key}.")]
-        inside = [leaf for leaf in inside if leaf.rsplit(".", 1)[1] not in ONLY_IF_NAMED]
-        # The kind of a group explains why all else in it differs.
-        yield from sorted(inside, key=lambda leaf: (not leaf.endswith(".kind"), leaf))
-
-
-def _leaves(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for key, value in tree.items():
-        if isinstance(value, Mapping):
-            yield from _leaves(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
-
-
-def _value(leaves: Mapping[str, Any], key: str) -> Any:
-    """Value of a key; None if nothing is stated."""
-    if key in leaves:
-        return leaves[key]
-    group = next((WHOLE[group] for group in WHOLE if key.startswith(f"{group}.")), None)
-    if group is None or not any(leaf.startswith(f"{group}.") for leaf in leaves):
-        return None
-    return 0.0 if ".terms." in key else "nothing"
+    known = [(_at(origin, key), _at(stars.config, key)) for key in SAME_STARS]
+    if options["split"] == "random" and all(one == two and one is not None for one, two in known):
+        require(path, said, ("seed", "parts.train_stars"), config)

@@ -185,3 +185,14 @@ class AlignmentConfig(Group):
 
 OF_STATES = ("seed", "telescope", "prescription", "alignment", "optics")
 """Groups that decide the stamps of states."""
+
+DETECTOR = ("telescope.pixel_scale_arcsec", "alignment.stamp_px")
+STATES = (
+    *("telescope.diameter_m", "telescope.obscuration", "telescope.wavelength_m", "prescription"),
+    *("alignment.decenter_range_m", "alignment.tilt_range_deg", "alignment.defocus_m"),
+    *("alignment.field_radius_deg", "alignment.field_points", "alignment.highest_zernike"),
+)
+"""What decides the wavefront of a state of scene 3."""
+
+STATE_STAMPS = (*STATES, *DETECTOR)
+"""What decides the stamps of a state of scene 3."""

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from psfdae.belonging import OURS, STATE_STAMPS, STATES, require
+from psfdae.belonging import require
 from psfdae.files import Column, read_product, write_csv, write_product
 from psfdae.options import File
 from psfdae.rng import stream
@@ -28,7 +28,7 @@ from psfdae_paper.alignment.telescope import (
     verify,
     zernike_tracer,
 )
-from psfdae_paper.configuration.alignment import OF_STATES, AlignmentConfig
+from psfdae_paper.configuration.alignment import OF_STATES, STATE_STAMPS, STATES, AlignmentConfig
 from psfdae_paper.configuration.command import command
 from psfdae_paper.raytracing import FIRST_NOLL, ZernikeTracer
 
@@ -61,7 +61,7 @@ def model(
     write_product(out, "alignment_model", columns, config.model_dump())
 
 
-def read_model(path: Path, wanted: Any, whose: object = OURS) -> QuadraticModel:
+def read_model(path: Path, wanted: Any, whose: object = "the configuration") -> QuadraticModel:
     """The quadratic model of a product; `wanted` and `whose` as in `psfdae.belonging.require`."""
     product = read_product(path, "alignment_model", ("coefficients",))
     require(path, product.config, STATES, wanted, whose)

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import click
 import numpy as np
 
-from psfdae.belonging import STATE_STAMPS, require, require_origin, write_origin
+from psfdae.belonging import require, require_origin, write_origin
 from psfdae.files import (
     Column,
     Product,
@@ -41,7 +41,12 @@ from psfdae.settings import deciding
 from psfdae.threads import limit_threads
 from psfdae_paper.alignment.methods import BOUNDS, FITTED, LEARNED, METHODS, TRAINED, Method, of_set
 from psfdae_paper.alignment.stamps import AlignmentStamps
-from psfdae_paper.configuration.alignment import NETWORKS, AlignmentConfig, NetworkTrain
+from psfdae_paper.configuration.alignment import (
+    NETWORKS,
+    STATE_STAMPS,
+    AlignmentConfig,
+    NetworkTrain,
+)
 from psfdae_paper.configuration.command import command
 from psfdae_paper.stages.alignment import ModelFile, StatesFile, TestSet, read_model
 

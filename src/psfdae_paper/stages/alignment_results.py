@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from psfdae.belonging import STATE_STAMPS, require, require_origin
+from psfdae.belonging import require, require_origin
 from psfdae.figure_style import write_png
 from psfdae.files import Product, ProductError, read_product, write_csv, write_text
 from psfdae.model.star_sets import noise_model
@@ -28,7 +28,7 @@ from psfdae_paper.alignment.methods import (
 )
 from psfdae_paper.alignment.stamps import AlignmentStamps
 from psfdae_paper.alignment.telescope import design_states, fit_quadratic, zernike_tracer
-from psfdae_paper.configuration.alignment import AlignmentConfig
+from psfdae_paper.configuration.alignment import STATE_STAMPS, AlignmentConfig
 from psfdae_paper.configuration.command import command
 from psfdae_paper.stages.alignment import StatesFile
 from psfdae_paper.stages.alignment_methods import DaeFolder, denoise, noisy_test_states

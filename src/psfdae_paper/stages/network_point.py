@@ -6,11 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from psfdae.belonging import STATE_STAMPS, require
+from psfdae.belonging import require
 from psfdae.files import read_product, write_csv
 from psfdae.method import CONFIG, HISTORY
 from psfdae.reading import read_table, read_yaml
 from psfdae.threads import limit_threads
+from psfdae_paper.configuration.alignment import STATE_STAMPS
 from psfdae_paper.configuration.compose import part
 from psfdae_paper.evaluation.alignment_tables import error_rows
 from psfdae_paper.stages.alignment_methods import (
