@@ -208,8 +208,6 @@ def poppy(name):
 def coverage():
     """Part of the pixels within the uncertainty, by model, S/N and brightness of the pixel."""
     keys = ["bundle", "method", "noise_level", "snr", "stars"]
-    if not (REFERENCE / "tables/predict_coverage.csv").is_file():
-        return pd.DataFrame(columns=keys)  # a record made before this table
     wide = poppy("tables/predict_coverage.csv").pivot(
         index=[*keys, "label"], columns="pixels", values=["coverage68", "coverage95"]
     )

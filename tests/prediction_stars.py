@@ -9,7 +9,7 @@ import torch
 
 from psfdae.bundle_info import Architecture, BundleInfo
 from psfdae.files import read_product
-from psfdae.model.bundle import FREE
+from psfdae.model.bundle import OPTIONAL
 from psfdae.networks.dae import build_dae
 from psfdae_paper.configuration.compose import load_stage
 from psfdae_paper.configuration.consistency import SIMULATION, STATIC
@@ -53,10 +53,10 @@ def with_network(bundle):
     shape = Architecture(kernels=(5, 3, 5), widths=(4, 4))
     network = build_dae(shape.kernels, shape.widths, "he", torch.Generator().manual_seed(1))
     told = bundle.info.model_dump(exclude={"method", "reference", "misfit"})
-    told |= {"format_version": 1, "dae": shape, "image_scale": 256.0}
+    told |= {"dae": shape, "image_scale": 256.0}
     return replace(
         bundle,
         info=BundleInfo(**told),
         weights={name: value.contiguous().numpy() for name, value in network.state_dict().items()},
-        **dict.fromkeys(FREE),
+        **dict.fromkeys(OPTIONAL),
     )

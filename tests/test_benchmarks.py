@@ -257,7 +257,6 @@ def test_targets_on_request(smoke, tmp_path):
     cover = tables["predict_coverage"]
     assert set(cover.bundle) == {*poppy.bundle, "example"}
     assert (cover.groupby(["bundle", "noise_level"]).pixels.nunique() == 2).all()
-    assert set(tables["predict_poppy_field"].method) == {"dae", "gmm"}
     usual = tables["predict_strange"].query("kind == 'usual'")
     assert (usual.found - usual.false_alarms).abs().max() < 0.02
     (row,) = tables["predict_throughput"].to_dict("records")

@@ -183,7 +183,8 @@ def test_newer_format_is_refused_with_both_versions(file, tmp_path):
         lambda text: text.update(info=None),
         lambda text: text.update(kind="another"),
         lambda text: text.update(format_version=0),
-        lambda text: text.update(format_version="1"),
+        lambda text: text.update(format_version=1),
+        lambda text: text.update(format_version="3"),
         lambda text: text["info"].update(created="soon"),
     ],
 )

@@ -437,7 +437,7 @@ def test_descriptions_of_an_enemy_are_refused(tmp_path, change, message):
 def test_a_description_that_json_cannot_read_is_refused(tmp_path):
     from safetensors.numpy import save
 
-    deep = '{"kind": "psfdae bundle", "format_version": 1, "info": {"config": ' + "[" * 100_000
+    deep = '{"kind": "psfdae bundle", "format_version": 3, "info": {"config": ' + "[" * 100_000
     (tmp_path / "x.psf.safetensors").write_bytes(save({"a": np.zeros(1)}, {"bundle": deep}))
     assert "nested too deeply" in refused("describe", tmp_path / "x.psf.safetensors")
 

@@ -9,12 +9,10 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 FORMAT_VERSION = 3  # raised when an older psfdae could no longer read what a newer one writes
+OLDEST_FORMAT = 2
 
-
-# A network says its shape, other methods what they are; the first format knows only networks, the
-# second only others.
+# A network says its shape, other methods what they are.
 NETWORK, OTHERS = ("dae", "image_scale"), ("method", "reference")
-
 
 FRAMING = "brightest pixel at (d/2, d/2)"  # 0-based (row, column) in stamps of side d, unjittered
 
@@ -107,10 +105,10 @@ class BundleInfo(_Described):
 
     @model_validator(mode="after")
     def _of_its_format(self) -> BundleInfo:
-        wanted = {1: NETWORK, 2: OTHERS}.get(self.format_version, NETWORK if self.dae else OTHERS)
+        wanted = NETWORK if self.dae or self.method == "dae" else OTHERS
         given = [key for key in (*NETWORK, *OTHERS) if key in self.model_fields_set]
         if sorted(given) != sorted(wanted) or any(getattr(self, key) is None for key in wanted):
-            raise ValueError(f"format {self.format_version} has {' and '.join(wanted)}")
+            raise ValueError(f"a model of {self.method} has {' and '.join(wanted)}")
         if not (self.dae or (self.kappa > 0 and isfinite(self.kappa))):
             raise ValueError("config.train.noise.kappa: must be above 0, methods are given λ by it")
         return self

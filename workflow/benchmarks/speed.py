@@ -165,7 +165,7 @@ def untrained_bundle(tree, stars, out):
     """The shipped model with a random network and these stars' size of stamps."""
     from psfdae.bundle_info import Architecture, BundleInfo
     from psfdae.files import read_product
-    from psfdae.model.bundle import FREE, read_bundle, write_bundle
+    from psfdae.model.bundle import OPTIONAL, read_bundle, write_bundle
     from psfdae.model.packing import leading
     from psfdae.model.photometry import FluxModel
     from psfdae.noise import noise_equivalent_px
@@ -176,7 +176,6 @@ def untrained_bundle(tree, stars, out):
     errors = np.ones((len(shipped.noise_nodes), side, side), np.float32)
     about = {
         **shipped.info.model_dump(exclude={"method", "reference", "misfit"}),
-        "format_version": 1,
         "stamp_px": side,
         "pixel_scale_arcsec": tree["telescope"]["pixel_scale_arcsec"],
         "image_scale": factor,
@@ -190,7 +189,7 @@ def untrained_bundle(tree, stars, out):
         flux_model=leading(model, shipped.info.components),
         error68=errors,
         rms=errors,
-        **dict.fromkeys(FREE),
+        **dict.fromkeys(OPTIONAL),
     )
     write_bundle(bundle, out)
 

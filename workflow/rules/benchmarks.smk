@@ -86,16 +86,6 @@ TIMED = {
             [],
         ),
     ),
-    "predict_poppy_field": (
-        *(
-            "prediction",
-            "prediction.poppy",
-            {"bundle": rivals_of_shipped},
-            1500,
-            20,
-            [],
-        ),
-    ),
     "predict_coverage": (
         *(
             "prediction",
@@ -142,10 +132,7 @@ for _table, (_target, _run, _inputs, _mb, _minutes, _stages) in TIMED.items():
             runtime=_minutes,
             disk_mb=2000,
         params:
-            config=lambda w, run=_run, table=_table: settings(
-                run,
-                f"dataset={SHIPPED_DATASET if table.endswith('_field') else TIMED_DATASET}",
-            ),
+            config=lambda w, run=_run: settings(run, f"dataset={TIMED_DATASET}"),
             source=program_code(_run, _stages),
             program=program(_run),
             inputs=as_options,

@@ -66,14 +66,6 @@ def every_bundle_of_timed(w):
     return bundles_of(TIMED_DATASET, PACKED)
 
 
-def rivals_of_shipped(w):
-    """The models that may come with the package, and the network that came with it before."""
-    before = (
-        ["workflow/benchmarks/wfsat_before.psf.safetensors"] if PRESET == "fast" else []
-    )
-    return bundles_of(SHIPPED_DATASET, PACKED) + before
-
-
 def poppy_stars(w):
     """A small preset has small test parts; POPPY takes its time for each star."""
     return min(POPPY_STARS, dataset_config(TIMED_DATASET).parts.test_stars)

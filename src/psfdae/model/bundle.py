@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from psfdae.bundle_info import FORMAT_VERSION, BundleInfo
+from psfdae.bundle_info import FORMAT_VERSION, OLDEST_FORMAT, BundleInfo
 from psfdae.errors import Error
 from psfdae.extras import needed_by
 from psfdae.files import ProductError, atomic_path
@@ -49,10 +49,10 @@ TOLERANCE = 1e-3  # by which the mean PSF may miss the sum 1, and eigenvectors o
 VARIANCE = 1e6  # largest variance of images of sum 1 that is no nonsense
 # Arrays of S nodes that a bundle may lack, and the shape of their rows.
 SCALES = {"scale68": (2, 3, 2), "scale95": (2, 3, 2), "flux_error_scale": ()}
-FREE = {"ratio95": (), "strange_limit": (), "widening": (7,), **SCALES}
+OPTIONAL = {"strange_limit": (), "widening": (7,), **SCALES}
 NEVER_NEGATIVE = {"error68", "rms", "ratio95", "widening", *SCALES}
 # Arrays of float64; the others are float32.
-DOUBLE = {"flux/variance", "flux/rest", "noise_nodes", "distance_limit", *FREE}
+DOUBLE = {"flux/variance", "flux/rest", "noise_nodes", "distance_limit", "ratio95", *OPTIONAL}
 
 
 class BundleError(Error, ValueError):
@@ -73,8 +73,8 @@ class Bundle:
     # Of errors in units of the flux, or of σ if the method says it (`Estimate.sigma`):
     error68: np.ndarray  # (S, d, d), half-width of 68.27 %
     rms: np.ndarray  # (S, d, d), root mean square
+    ratio95: np.ndarray  # (S,), error68 times this holds 95 %
     distance_limit: float  # 99.9 % quantile of the distance of test stars (`mahalanobis`)
-    ratio95: np.ndarray | None = None  # (S,), error68 times this holds 95 %
     # (S,), 99.9 % quantile of `Method.strangeness`, if the method knows it
     strange_limit: np.ndarray | None = None
     # (S, 2, 3, 2), by how much 68 % and 95 % of the errors are wider than that: where the noise is
@@ -268,9 +268,10 @@ def _tensors(bundle: Bundle) -> dict[str, np.ndarray]:
         "flux/basis": model.basis[:, -kept:],
         "error68": bundle.error68,
         "rms": bundle.rms,
+        "ratio95": bundle.ratio95,
     }
-    free = {name: getattr(bundle, name) for name in FREE}
-    arrays |= {name: values for name, values in free.items() if values is not None}
+    optional = {name: getattr(bundle, name) for name in OPTIONAL}
+    arrays |= {name: values for name, values in optional.items() if values is not None}
     ours = {name: np.asarray(value, _dtype(name), order="C") for name, value in arrays.items()}
     # The method's own are as they are.
     own = {name: np.asarray(value, order="C") for name, value in bundle.weights.items()}
@@ -306,9 +307,9 @@ def read_bundle(path: Path | None = None) -> Bundle:
             if name.startswith(f"{info.method}/")
         },
         flux_model=_completed(tensors),
-        **{name: tensors[name] for name in ("noise_nodes", "error68", "rms")},
+        **{name: tensors[name] for name in ("noise_nodes", "error68", "rms", "ratio95")},
         distance_limit=float(tensors["distance_limit"]),
-        **{name: tensors.get(name) for name in FREE},
+        **{name: tensors.get(name) for name in OPTIONAL},
     )
 
 
@@ -324,7 +325,7 @@ def _load(path: Path) -> tuple[Any, dict[str, np.ndarray]]:
             if text is None:
                 raise BundleError(f"{path}: a safetensors file, but not a psfdae model bundle")
             parsed = json.loads(text)
-            _refuse_newer(parsed, path)
+            _check_format(parsed, path)
             names = list(file.keys())
             return parsed, {name: file.get_tensor(name) for name in names}
     except FileNotFoundError:
@@ -337,8 +338,8 @@ def _load(path: Path) -> tuple[Any, dict[str, np.ndarray]]:
         raise BundleError(f"{path}: damaged, or not a model bundle ({error})") from None
 
 
-def _refuse_newer(text: Any, path: Path) -> None:
-    """Before anything else is looked at: a newer format may differ in all of it."""
+def _check_format(text: Any, path: Path) -> None:
+    """Before anything else is looked at: another format may differ in all of it."""
     if not isinstance(text, dict) or text.get("kind") != KIND:
         raise BundleError(f"{path}: a safetensors file, but not a psfdae model bundle")
     version = text.get("format_version")
@@ -348,6 +349,11 @@ def _refuse_newer(text: Any, path: Path) -> None:
         raise BundleError(
             f"{path}: format {version}, but psfdae {__version__} reads up to "
             f"format {FORMAT_VERSION}; a newer psfdae would do"
+        )
+    if version < OLDEST_FORMAT:
+        raise BundleError(
+            f"{path}: format {version}, but psfdae {__version__} reads formats from "
+            f"{OLDEST_FORMAT} on; train the model again"
         )
 
 
@@ -378,14 +384,13 @@ def _check(info: BundleInfo, tensors: Mapping[str, np.ndarray], path: Path) -> N
         "flux/basis": (pixels, info.components),
         "noise_nodes": (nodes,),
         **dict.fromkeys(("error68", "rms"), (nodes, info.stamp_px, info.stamp_px)),
+        "ratio95": (nodes,),
         "distance_limit": (),
     }
-    if info.format_version > 1:
-        wanted = {"ratio95", *(SCALES if set(SCALES) & set(tensors) else ())}
-        wanted |= set(FREE) & set(tensors) - set(
-            SCALES if info.format_version < 3 else ("widening",)
-        )
-        expected |= {name: (nodes, *FREE[name]) for name in wanted}
+    old = info.format_version == OLDEST_FORMAT
+    known = {"strange_limit", *(("widening",) if old else SCALES)} & set(tensors)
+    known |= set(SCALES if set(SCALES) & known else ())  # all of them or none
+    expected |= {name: (nodes, *OPTIONAL[name]) for name in known}
     expected |= _of_method(info, tensors, path)
     if set(tensors) != set(expected):
         name = min(set(tensors) ^ set(expected))

@@ -184,7 +184,7 @@ def bundle_of(
     unpacked = type(fitted).unpack(arrays, info)  # what it errs as packed
     nodes, rng = noise_nodes(band), stream(config.seed, "noise", "bundle")
     nothing = np.zeros((nodes.size, *images.shape[1:]), np.float32)
-    made = Bundle(info, arrays, model, nodes, nothing, nothing, 0.0)
+    made = Bundle(info, arrays, model, nodes, nothing, nothing, np.ones(nodes.size), 0.0)
     made, errors = calibrated(made, unpacked, held_out, rng)
     metrics = measure_levels(
         config.noise.levels,

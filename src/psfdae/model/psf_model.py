@@ -441,9 +441,8 @@ class Engine:
         width = at_noise(noise, bundle.noise_nodes, bundle.error68)
         if sigma is not None:
             width = width * sigma
-        ratios, of_flux = np.full((count, 2), np.nan), np.ones(count)
-        if bundle.ratio95 is not None:
-            ratios[:] = np.interp(noise, bundle.noise_nodes, bundle.ratio95)[:, None]
+        ratio = np.interp(noise, bundle.noise_nodes, bundle.ratio95)
+        ratios, of_flux = np.stack([ratio, ratio], axis=1), np.ones(count)
         if (scales := bundle.scales(noise)) is None:
             return width, ratios, of_flux
         noise_too, flux_too, sky_too = (
