@@ -202,7 +202,7 @@ def poppy(name):
     """Errors on POPPY's stars, with the labels of the methods, which end the bundles' names."""
     table = csv(name)
     ends = table.bundle.str.extract(r"-realisation-(\w+)$", expand=False).fillna(table.method)
-    return table.assign(label=ends.map({kind.name: kind.label for kind in known()}))
+    return table.assign(label=ends.map({kind.name: kind.look.label for kind in known()}))
 
 
 def coverage():
@@ -289,7 +289,7 @@ def costs():
     cells = csv("tables/benchmark_methods.csv").groupby(["method", "noise_level"], sort=False)
     cells = cells[["fit_cpu_s", "stars_per_s"]].mean().groupby("method", sort=False)
     table = cells.agg({"fit_cpu_s": "first", "stars_per_s": "min"}).reset_index()
-    return table.assign(label=[method(m).label for m in table.method])
+    return table.assign(label=[method(m).look.label for m in table.method])
 
 
 def errors(name="tables/psf_metrics.csv"):

@@ -9,6 +9,7 @@ import pytest
 from matplotlib.collections import PolyCollection
 
 from psfdae.files import ProductError, read_product
+from psfdae.method import Needs
 from psfdae.methods import method
 from psfdae.model.star_sets import noisy_test_images, split_stars
 from psfdae_paper.configuration.compose import load_stage
@@ -241,7 +242,7 @@ def test_the_posterior_mean_respects_the_floor(scene_1):
 def test_a_method_given_the_field_is_judged_by_the_mean_given_it(
     scene_1, monkeypatch, factor, verdict
 ):
-    monkeypatch.setattr(method("lmmse"), "needs_position", True)
+    monkeypatch.setattr(method("lmmse"), "needs", Needs(level=True, position=True))
     table = compared(scene_1, "dataset6", factor, "bayes_position")
     rows = table[table.method == "lmmse"]
     assert set(rows.bound) == {"bayes_position", "floor"}

@@ -224,7 +224,7 @@ def test_a_method_that_knows_how_sure_it_is_covers_68_and_95_per_cent(folder, ti
     )
     both = [(found.flags & StarFlag.UNLIKE_TRAINING > 0).mean() for found in (strange, far)]
     assert both[0] > 0.1 > both[1]
-    assert np.isfinite(strange.strangeness).mean() > 0.9 and np.isnan(far.strangeness).all()
+    assert np.isfinite(strange.outlier_score).mean() > 0.9 and np.isnan(far.outlier_score).all()
     one = PsfModel(bundle).predict(noisy[7], flux=1.0, background=0.0, noise=noise[7])
     np.testing.assert_allclose(one.psf[0], found.psf[7], atol=1e-6)
 

@@ -8,6 +8,7 @@ import subprocess
 import warnings
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import photutils
@@ -20,14 +21,16 @@ from photutils.psf import GriddedPSFModel, PSFPhotometry
 
 from photutils_grid import drawn, gridded
 from psfdae import load_model
+from psfdae.bright_stars import BrightStars
 from psfdae.cli import main
 from psfdae.commands import psf
-from psfdae.field_psf import Frames, fit_field
-from psfdae.method import BrightStamps, FitError, TrainingSet
-from psfdae.methods.field import TELLING, FieldMixture
+from psfdae.field_law import OUTLIER_MODES
+from psfdae.field_psf import fit_field
+from psfdae.method import FitError, TrainingSet
+from psfdae.methods.field import FieldMixture
 from psfdae.model.bundle import read_bundle, write_bundle
 from psfdae.model.psf_model import PredictionError
-from psfdae.model.shapes import measure_shapes
+from psfdae.moments import measure_shapes
 from psfdae.noise import NoiseModel
 from psfdae_paper.configuration.compose import load_stage
 from psfdae_paper.stars.example import add_stamps, write_field
@@ -74,14 +77,17 @@ def bright(count=150, seed=1, spread=0.02, varied=True):
     images, noise = images / inner[:, None, None], noise / inner
     peak = np.zeros((count, 2), int)
     listed = centre + 0.1 + 0.05 * rng.standard_normal((count, 2))
-    return BrightStamps(images, peak, listed, position, noise, np.arange(count))
+    known = {"peak": peak, "listed": listed, "position": position, "noise": noise}
+    nothing = {"centre": listed, "snr": 1 / noise, "row": np.arange(count)}
+    return BrightStars(wide=images, flux=np.ones(count), **known, **nothing)
 
 
 def fitted(stars, orders=(2,), **changed):
     images = stars.wide[:, 8:18, 8:18].astype(np.float32)
     some = np.arange(len(images))
     noise = NoiseModel(1.0, 1e6)
-    data = TrainingSet(images, images, some, some[:0], np.array([0.01]), noise, bright=stars)
+    own = {"bright": stars, "star": some}
+    data = TrainingSet(images, images, some, some[:0], np.array([0.01]), noise, **own)
     config = load_stage(("field",), [])
     settings = config.field.model_copy(update={"orders": list(orders), **changed})
     return FieldMixture.fit(data, field=settings)
@@ -230,16 +236,16 @@ def test_bright_stars_are_as_sure_as_said(field):
 
 
 @pytest.mark.parametrize("snr", SNR)
-def test_strangeness_has_the_law_of_chi2_and_tells_blends(field, snr):
+def test_outlier_score_has_the_law_of_chi2_and_tells_blends(field, snr):
     some = Faint(400, snr)
     here, nowhere = some.measured(field), field.measure(some.stamps, some.sigma)
     for found in (here, nowhere):
-        assert np.median(found.strangeness) == pytest.approx(TELLING, rel=0.25)
-        assert (found.strangeness < TELLING + 8 * np.sqrt(2 * TELLING)).mean() > 0.98
+        assert np.median(found.outlier_score) == pytest.approx(OUTLIER_MODES, rel=0.25)
+        assert (found.outlier_score < OUTLIER_MODES + 8 * np.sqrt(2 * OUTLIER_MODES)).mean() > 0.98
     blend = 0.8 * some.psf + 0.2 * np.roll(some.psf, 3, axis=2)
     strange = field.measure(1000 * (blend + some.noise / 1000), some.sigma, some.position)
     if snr == 50:
-        assert np.median(strange.strangeness) > np.quantile(here.strangeness, 0.99)
+        assert np.median(strange.outlier_score) > np.quantile(here.outlier_score, 0.99)
 
 
 def test_flux_and_sky_that_are_known_are_taken(field):
@@ -266,7 +272,7 @@ def test_stars_are_restored_in_groups_that_do_not_matter(field, monkeypatch):
     each = [Faint(40, snr) for snr in (5.0, 50.0, 500.0, 5000.0)]
     told = [np.concatenate([getattr(some, n) for some in each]) for n in ("stamps", "sigma")]
     whole = field.measure(*told)
-    monkeypatch.setattr("psfdae.methods.field.KEPT", 1.0)
+    monkeypatch.setattr("psfdae.field_law.CACHE_BYTES", 1.0)
     few = fitted(bright()).measure(*told)
     assert few.psf == pytest.approx(whole.psf, abs=1e-7)
     assert few.measured.flux == pytest.approx(whole.measured.flux, rel=1e-9)
@@ -299,17 +305,12 @@ def test_centres_are_as_likely_as_nodes_have_room_in_the_box(field):
 def test_the_unit_of_a_star_does_not_matter_to_the_field():
     """Stars of any flux, in units of which their noise is, too, have the same PSF."""
     some, rng = bright(60, spread=0.0), np.random.default_rng(3)
-    inner = some.wide[:, 6:20, 6:20]
+    noise = np.where(np.arange(60) < 30, 1e-2, 1e-3)
 
     def fit(unit):
-        frames = Frames(
-            unit[:, None, None] * inner,
-            np.ones(inner.shape, bool),
-            unit * np.where(np.arange(60) < 30, 1e-2, 1e-3),
-            np.full(60, 1e6),
-            some.position,
-        )
-        return fit_field(frames, [1], SIDE, 0.5, 100.0)
+        wide = unit[:, None, None] * some.wide
+        stars = replace(some, wide=wide, flux=unit, noise=unit * noise)
+        return fit_field(stars, 1e6, 14, SIDE, [1], 0.5, 100.0)
 
     one, other = fit(np.ones(60)), fit(unit := rng.uniform(0.2, 5.0, 60))
     assert other.model.coefficients == pytest.approx(one.model.coefficients, abs=1e-4)
@@ -320,7 +321,7 @@ def test_the_unit_of_a_star_does_not_matter_to_the_field():
 def test_order_is_what_the_field_has(stars):
     assert fitted(bright(varied=False), (0, 1, 2)).model.order == 0
     assert fitted(stars, (0, 1, 2, 3)).model.order >= 1
-    nowhere = stars._replace(position=np.full((len(stars.peak), 2), np.nan))
+    nowhere = replace(stars, position=np.full((len(stars.peak), 2), np.nan))
     alone = fitted(nowhere, (0, 1, 2))
     assert alone.model.order == 0
     some = Faint(50, 20.0)
@@ -329,7 +330,7 @@ def test_order_is_what_the_field_has(stars):
 
 def test_same_stars_give_the_same_fit(stars, field):
     again = fitted(stars)
-    for name in FieldMixture.arrays:
+    for name in FieldMixture.stored():
         assert getattr(again, name).tobytes() == getattr(field, name).tobytes(), name
 
 
@@ -425,7 +426,7 @@ def test_predict_measures_flux_and_centre_with_their_errors(image):
     """The bundle is small, and the list of the training says how good this one is."""
     stars, uncertainty = predicted(image)
     known = image[2]
-    assert np.isfinite(stars["strangeness"]).all()
+    assert np.isfinite(stars["outlier_score"]).all()
     assert image[1].stat().st_size < 5e6
     assert (stars["flags"] == 0).mean() > 0.95
     assert abs(np.mean(stars["flux"] / known["inside"]) - 1) < 0.005
@@ -617,7 +618,8 @@ def test_a_place_without_a_psf_is_named(shipped, monkeypatch, psf):
     """Such as in a damaged model; nothing is drawn there."""
     fixed = np.full((2, 4, 4), 1.0)
     fixed[1] = psf
-    monkeypatch.setattr(type(shipped.engine.estimator), "psf_at", lambda *_: fixed)
+    field = SimpleNamespace(psf_at=lambda *_: fixed, facts=dict)
+    monkeypatch.setattr(shipped.engine, "estimator", field)
     with pytest.raises(PredictionError, match=r"flux above 0 at x 7, y 8"):
         shipped.psf_at([5.0, 7.0], [6.0, 8.0])
 

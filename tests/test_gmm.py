@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from psfdae.method import TrainingSet
-from psfdae.methods import gmm as module
+from psfdae import lowrank
+from psfdae import mixture_law as module
+from psfdae.method import Needs, TrainingSet
+from psfdae.methods import gmm
 from psfdae.methods.gmm import GaussianMixture, Gmm
 from psfdae.model.bundle import BundleError
 from psfdae.model.packing import packed
@@ -44,7 +46,7 @@ def stars(count, seed=1):
 
 
 class Placed(GaussianMixture):
-    needs_position = True
+    needs = Needs(level=True, position=True)
 
 
 def where(count, seed=1):
@@ -122,8 +124,8 @@ def dense(mixture, noisy, level, position):
 @pytest.mark.parametrize("level", [1e-4, LEVEL, 0.05])
 @pytest.mark.parametrize("clusters", [1, 12])
 def test_sums_are_those_of_dense_matrices(same, kind, level, clusters, monkeypatch):
-    monkeypatch.setattr(module, "FLAT", 0.0)
-    monkeypatch.setattr(module, "LEAST", 0.0)
+    monkeypatch.setattr(module, "FLAT_VARIANCE", 0.0)
+    monkeypatch.setattr(lowrank, "LEAST_WEIGHT", 0.0)
     mixture = fitted(same=same, kind=kind, components=[clusters])
     noisy = NOISE.draw(stars(50, seed=2)[0], level, np.random.default_rng(3))
     mean, sigma, evidence = dense(mixture, noisy, level, where(50, seed=2))
@@ -135,8 +137,8 @@ def test_sums_are_those_of_dense_matrices(same, kind, level, clusters, monkeypat
 
 @pytest.mark.parametrize("same", [True, False])
 def test_a_flux_that_is_an_estimate_is_found(same, monkeypatch):
-    monkeypatch.setattr(module, "FLAT", 0.0)
-    monkeypatch.setattr(module, "LEAST", 0.0)
+    monkeypatch.setattr(module, "FLAT_VARIANCE", 0.0)
+    monkeypatch.setattr(lowrank, "LEAST_WEIGHT", 0.0)
     mixture, rng, pixels = fitted(same=same, components=[12]), np.random.default_rng(3), D * D
     images, wider = stars(300, seed=2)
     flux = rng.normal(1.0, 0.1, (300, 1, 1))
@@ -157,7 +159,7 @@ def test_a_flux_that_is_an_estimate_is_found(same, monkeypatch):
 def test_total_variance_is_that_of_the_stars_and_with_a_free_flux_of_no_less():
     """By it coordinates are left out in which noise hides all differences of the clusters."""
     mixture, (images, _) = fitted(components=[4]), stars(400)
-    flux = np.random.default_rng(5).normal(1.0, module.LOOSE, (400, 1))
+    flux = np.random.default_rng(5).normal(1.0, lowrank.FLUX_SIGMA, (400, 1))
     flat = images.reshape(400, -1)
     loose = flux * flat + (1 - flux) / flat.shape[1]
     plain, moved = ((a @ mixture.axes).astype(float).var(axis=0) for a in (flat, loose))
@@ -230,7 +232,7 @@ def test_another_seed_keeps_what_the_search_has_chosen(kind):
     settings = Gmm(**{**ONE, "components": [1, 3], "shrinkage": [20.0, 5.0]})
     found = kind.fit(data, settings)
     same, other = (found.again(replace(data, seed=seed), settings) for seed in (data.seed, 5))
-    for name in kind.arrays:
+    for name in kind.stored():
         np.testing.assert_array_equal(getattr(same, name), getattr(found, name))
     assert len(other.count) == len(found.count) == 3
     assert other.shrinkage == found.shrinkage
@@ -243,7 +245,7 @@ def test_a_search_goes_both_ways_and_more_clusters_must_pay():
 
     def climbed(errors, start, pays=0.0):
         asked.clear()
-        return module.climbed([*errors], start, lambda k: asked.append(k) or errors[k], pays)
+        return gmm.climbed([*errors], start, lambda k: asked.append(k) or errors[k], pays)
 
     falling = {1: 9.0, 4: 5.0, 16: 4.0, 64: 3.98, 256: 1.0}
     assert climbed(falling, 4, pays=0.02) == 16 and 256 not in asked and 1 not in asked
@@ -262,20 +264,21 @@ def test_a_search_that_ends_at_the_last_value_says_so(capsys):
 
 
 @pytest.mark.parametrize("free", [False, True])
-def test_strangeness_of_one_cluster_is_the_square_of_mahalanobis_distance(free, monkeypatch):
-    monkeypatch.setattr(module, "FLAT", 0.0)
-    monkeypatch.setattr(module, "TELLING", 10)
+def test_outlier_score_of_one_cluster_is_the_square_of_mahalanobis_distance(free, monkeypatch):
+    monkeypatch.setattr(module, "FLAT_VARIANCE", 0.0)
+    monkeypatch.setattr(module, "OUTLIER_COORDINATES", 10)
     mixture = fitted(same=False)
     mixture = mixture.free_flux() if free else mixture
     noisy = NOISE.draw(stars(20, seed=2)[0], LEVEL, np.random.default_rng(3))
-    s = np.exp(np.rint(np.log(NOISE.variance(1.0 / D**2, LEVEL)) / module.FINE) * module.FINE)
+    s = np.rint(np.log(NOISE.variance(1.0 / D**2, LEVEL)) / module.FINE_NOISE_STEP)
+    s = np.exp(s * module.FINE_NOISE_STEP)
     residual = (noisy.reshape(20, -1) @ mixture.axes - mixture.mean[0])[:, :10].astype(float)
     row = mixture.loose * mixture._contrast[0, :10].astype(float)
     usual = np.diag(mixture._total[:10] + s)
     covariance = np.diag(mixture.variance[:10] + s) + np.outer(row, row)
     wanted = np.einsum("ni,ij,nj->n", residual, np.linalg.inv(covariance), residual)
     wanted += np.linalg.slogdet(covariance)[1] - np.linalg.slogdet(usual)[1]
-    found = mixture.strangeness(noisy, np.full(20, LEVEL))
+    found = mixture.outlier_score(noisy, np.full(20, LEVEL))
     np.testing.assert_allclose(found, wanted, rtol=2e-3, atol=0.05)
 
 
@@ -307,7 +310,7 @@ def test_it_is_stored_and_the_same_again(tmp_path):
     np.testing.assert_array_equal(again.predict(noisy, LEVEL), mixture.predict(noisy, LEVEL))
     twice = fitted(same=False, components=[12])
     assert all(
-        np.array_equal(getattr(twice, n), getattr(mixture, n)) for n in GaussianMixture.arrays
+        np.array_equal(getattr(twice, n), getattr(mixture, n)) for n in GaussianMixture.stored()
     )
     assert replace(mixture, shrinkage=np.array([1.0])).shrinkage == [1.0]
 
@@ -356,7 +359,7 @@ def test_arrays_that_no_fit_leaves_are_known(name, change):
     config = {"noise": {"kappa": NOISE.kappa, "background_photons": NOISE.background}}
 
     def wrong(arrays):
-        laws = GaussianMixture.restored(arrays, config, "realisation").lawful()
+        laws = GaussianMixture.restored(arrays, config, "realisation").conditions()
         return [law for law, _, right in laws if not np.all(right)]
 
     assert wrong(arrays) == []
@@ -384,4 +387,4 @@ def test_no_stars_have_no_psfs():
     none, mixture = np.empty((0, D, D), np.float32), fitted(components=[4])
     found = mixture.estimate(none, np.empty(0))
     assert found.psf.shape == found.sigma.shape == none.shape
-    assert mixture.strangeness(none, np.empty(0)).shape == (0,)
+    assert mixture.outlier_score(none, np.empty(0)).shape == (0,)

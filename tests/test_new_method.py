@@ -24,7 +24,7 @@ from typing import Annotated, ClassVar
 import numpy as np
 from pydantic import Field
 
-from psfdae.method import Method
+from psfdae.method import Look, Method, Storage
 from psfdae.settings import Group
 
 
@@ -38,9 +38,9 @@ class Settings(Group):
 class Shrunk(Method):
     """Toy."""
 
-    label, color, marker = "toy", "#aa3377", "v"
+    look = Look("toy", "#aa3377", "v")
     groups: ClassVar = {"shrunk": Settings}
-    arrays: ClassVar = {"mean": ("flux", "mean reference"), "weight": ("", "of the image")}
+    storage = Storage({"mean": ("flux", "mean reference"), "weight": ("", "of the image")})
 
     mean: np.ndarray
     weight: np.ndarray

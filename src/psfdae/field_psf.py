@@ -17,47 +17,21 @@ from typing import NamedTuple
 
 import numpy as np
 
-ROUNDS = 3  # of splines, centres and fluxes; with more, centres follow what splines cannot
-CENTRES = 2  # Gauss-Newton steps of a round
-WINDOW = 1.2  # px, σ of the window of the first centroids
-FARTHEST = 1.5  # px of a centre from the brightest pixel
-STEP = 0.3  # px of a Gauss-Newton step, at most
-SLOPE = 0.02  # px, for differences
+from psfdae.bright_stars import BrightStars
+from psfdae.moments import windowed_centres
+
+FIT_ROUNDS = 3  # of splines, centres and fluxes; with more, centres follow what splines cannot
+CENTRE_STEPS, LEFT_OUT_STEPS = 2, 5  # of Gauss-Newton in a round, and for a star that was left out
+WINDOW_PX, WINDOW_ROUNDS, WINDOW_REACH_PX = 1.2, 4, 1.0  # of the first centroids
+FARTHEST_PX = 1.5  # of a centre from the brightest pixel
+LARGEST_STEP_PX = 0.3  # of Gauss-Newton
+SLOPE_PX = 0.02  # for differences
 MODEL_ERROR = 0.02  # of a pixel's light, which no polynomial follows
-LEAST = 1e-4  # of the flux: error of any pixel
-HIGHER = 10.0  # as much smoother are the terms beyond the constant
-RIDGE = 10.0  # 1/flux²
-UNLIKE = 8.0  # times the median χ², from which a star does not count
-FOLDS, ENOUGH = 5, 300  # of stars; left out, of which one fold after the other is predicted
+LEAST_ERROR = 1e-4  # of the flux, in any pixel
+HIGHER_SMOOTHNESS, RIDGE = 10.0, 10.0  # of terms beyond the constant, times its; 1/flux²
+UNLIKE_CHI2 = 8.0  # times the median, from which a star does not count
+FOLDS, ENOUGH_STARS = 5, 300  # left out, of which one fold after the other is predicted
 TOLERANCE, ITERATIONS = 1e-4, 150  # of the conjugate gradients
-JUDGED = 5  # Gauss-Newton steps for a star that was left out
-
-
-class Frames(NamedTuple):
-    """Bright stars, each with its brightest pixel at index (s//2, s//2).
-
-    Attributes
-    ----------
-    images : ndarray, shape (n, s, s)
-        Sky-subtracted, of flux about 1; 0 where not seen.
-    seen : ndarray of bool, shape (n, s, s)
-    noise : ndarray, shape (n,)
-        RMS of the sky in a pixel over the flux.
-    photons : ndarray, shape (n,)
-        Flux in photons.
-    position : ndarray, shape (n, 2)
-        Any unit; NaN where unknown.
-    """
-
-    images: np.ndarray
-    seen: np.ndarray
-    noise: np.ndarray
-    photons: np.ndarray
-    position: np.ndarray
-
-    def of(self, chosen: np.ndarray) -> Frames:
-        """Some of them."""
-        return Frames(*(array[chosen] for array in self))
 
 
 @dataclass(frozen=True)
@@ -114,9 +88,11 @@ class FieldFit(NamedTuple):
 
 
 def fit_field(
-    stars: Frames,
-    orders: Sequence[int],
+    stars: BrightStars,
+    background: float,
+    frame_px: int,
     stamp_px: int,
+    orders: Sequence[int],
     spacing: float,
     smoothness: float,
 ) -> FieldFit:
@@ -124,18 +100,20 @@ def fit_field(
 
     Parameters
     ----------
-    stars : Frames
+    stars : BrightStars
         Only order 0 is fitted if a position is not known.
+    background : float
+        Photons of the sky in a pixel.
+    frame_px, stamp_px : int
+        Side of what is fitted, and of the stamps in which stars have flux 1 and are predicted.
     orders : sequence of int
-    stamp_px : int
-        Side of the stamps in which stars have flux 1, and in which they are predicted.
     spacing : float
         Of the knots, in pixels.
     smoothness : float
         Weight of the squared second differences of the coefficients, 1/flux².
     """
     known = np.isfinite(stars.position).all()
-    alternating = _Alternating(stars, stamp_px, spacing, smoothness)
+    alternating = _Alternating(stars, background, frame_px, stamp_px, spacing, smoothness)
     best, least = None, np.inf
     for order in sorted(orders) if known else [0]:
         fit = alternating.fit(order)
@@ -152,13 +130,22 @@ def fit_field(
 class _Alternating:
     """Rounds of a fit to stars."""
 
-    def __init__(self, stars: Frames, stamp_px: int, spacing: float, smoothness: float) -> None:
-        self.stars, self.stamp_px = stars, stamp_px
-        self.spacing, self.smoothness = spacing, smoothness
-        side = stars.images.shape[-1]
+    def __init__(
+        self,
+        stars: BrightStars,
+        background: float,
+        side: int,
+        stamp_px: int,
+        spacing: float,
+        smoothness: float,
+    ) -> None:
+        self.images, self.seen = stars.framed(side)
+        self.noise, self.position = stars.noise, stars.position
+        self.photons = np.sqrt(background) * stars.flux / stars.noise
+        self.stamp_px, self.spacing, self.smoothness = stamp_px, spacing, smoothness
         self.axis = np.arange(side) - side // 2.0
         self.knots = int((side + 1) / spacing) - 1
-        known = stars.position[np.isfinite(stars.position).all(axis=1)]
+        known = self.position[np.isfinite(self.position).all(axis=1)]
         known = known if len(known) else np.zeros((1, 2))
         self.low, self.high = known.min(axis=0), known.max(axis=0)
         bend = np.diff(np.eye(self.knots), 2, axis=0)
@@ -166,18 +153,18 @@ class _Alternating:
 
     def fit(self, order: int) -> FieldFit:
         """All stars."""
-        stars = self.stars
-        terms = _terms(stars.position, self.low, self.high, order)
-        good, flux = np.ones(len(terms), bool), stars.images.sum(axis=(1, 2))
-        centre = _centroids(stars.images, self.axis)
+        terms = _terms(self.position, self.low, self.high, order)
+        good, flux = np.ones(len(terms), bool), self.images.sum(axis=(1, 2))
+        start, window = np.zeros((len(flux), 2)), np.full(len(flux), WINDOW_PX)
+        centre = windowed_centres(self.images, start, window, WINDOW_ROUNDS, WINDOW_REACH_PX)
         found = None
-        for turn in range(ROUNDS):
-            data = stars.images / flux[:, None, None]
+        for turn in range(FIT_ROUNDS):
+            data = self.images / flux[:, None, None]
             weight = self._weight(flux)
             found = self._splines(terms, data, weight * good[:, None, None], centre, found)
             splines = np.tensordot(terms, found, 1)
             factor, centre, _ = _adjusted(
-                splines, data, weight, centre, self.axis, self.spacing, CENTRES
+                splines, data, weight, centre, self.axis, self.spacing, CENTRE_STEPS
             )
             middle = found[:1] if order == 0 else np.tensordot(terms.mean(axis=0)[None], found, 1)
             sides = np.arange(self.stamp_px) - self.stamp_px // 2.0
@@ -185,10 +172,10 @@ class _Alternating:
             found, flux = found / total, flux * factor * total
             model = np.tensordot(terms, found, 1)
             drawn = _drawn(model, self.axis, centre, self.spacing)
-            residual = np.where(stars.seen, stars.images / flux[:, None, None] - drawn, 0.0)
+            residual = np.where(self.seen, self.images / flux[:, None, None] - drawn, 0.0)
             chi2 = (residual**2 * weight).mean(axis=(1, 2))
             if turn:
-                good = chi2 < UNLIKE * np.median(chi2)
+                good = chi2 < UNLIKE_CHI2 * np.median(chi2)
         model = FieldModel(found, self.low, self.high, self.spacing)
         return FieldFit(model, flux, centre, good, residual)
 
@@ -197,8 +184,8 @@ class _Alternating:
 
         Flux, sky and centre of these are fitted to them. Of many stars, some folds are enough.
         """
-        stars, terms = self.stars, fit.model.terms(self.stars.position)
-        data = stars.images / fit.flux[:, None, None]
+        terms = fit.model.terms(self.position)
+        data = self.images / fit.flux[:, None, None]
         weight = self._weight(fit.flux)
         fold, errors = np.arange(len(terms)) % FOLDS, []
         inner = np.abs(self.axis + 0.5) < self.stamp_px / 2
@@ -207,25 +194,27 @@ class _Alternating:
             used = weight * ((fold != left_out) & fit.good)[:, None, None]
             found = self._splines(terms, data, used, fit.centre, None)
             judged = np.flatnonzero((fold == left_out) & fit.good)
-            images, even = data[box][judged], stars.seen[box][judged].astype(float)
+            images, even = data[box][judged], self.seen[box][judged].astype(float)
             splines = np.tensordot(terms[judged], found, 1)
             _, _, left = _adjusted(
                 *(splines, images, even, fit.centre[judged]),
-                *(self.axis[inner], self.spacing, JUDGED),
+                *(self.axis[inner], self.spacing, LEFT_OUT_STEPS),
                 sky=True,
             )
             errors.append(np.log((left**2 * even).sum(axis=(1, 2)) / even.sum(axis=(1, 2))))
-            if sum(map(len, errors)) >= ENOUGH:
+            if sum(map(len, errors)) >= ENOUGH_STARS:
                 break
         return float(np.exp(np.concatenate(errors).mean()))
 
     def _weight(self, flux: np.ndarray) -> np.ndarray:
         """1/variance of the pixels of flux 1; 0 where not seen."""
-        stars, factor = self.stars, 1.0 / flux[:, None, None]
-        light = np.maximum(stars.images * factor, 0.0)
-        noise, photons = (a[:, None, None] for a in (stars.noise, stars.photons))
+        factor = 1.0 / flux[:, None, None]
+        light = np.maximum(self.images * factor, 0.0)
+        noise, photons = (a[:, None, None] for a in (self.noise, self.photons))
         variance = (noise * factor) ** 2 + light * factor / photons
-        return np.where(stars.seen, 1.0 / (variance + (MODEL_ERROR * light) ** 2 + LEAST**2), 0.0)
+        return np.where(
+            self.seen, 1.0 / (variance + (MODEL_ERROR * light) ** 2 + LEAST_ERROR**2), 0.0
+        )
 
     def _splines(
         self,
@@ -246,7 +235,7 @@ class _Alternating:
             for i in (0, 1)
         )
         rows_t, columns_t = rows.transpose(0, 2, 1), columns.transpose(0, 2, 1)
-        penalty = np.full(shape[0], HIGHER * self.smoothness)
+        penalty = np.full(shape[0], HIGHER_SMOOTHNESS * self.smoothness)
         penalty[0] = self.smoothness
         penalty = penalty[:, None, None]
 
@@ -306,8 +295,8 @@ def _drawn(splines: np.ndarray, axis: np.ndarray, centre: np.ndarray, spacing: f
 
 def slopes(draw: Callable[[np.ndarray], np.ndarray], centre: np.ndarray) -> list[np.ndarray]:
     """Change of drawn images with the row and the column of their centre (n, 2), per pixel."""
-    steps = SLOPE * np.eye(2)
-    return [(draw(centre + e) - draw(centre - e)) / (2 * SLOPE) for e in steps]
+    steps = SLOPE_PX * np.eye(2)
+    return [(draw(centre + e) - draw(centre - e)) / (2 * SLOPE_PX) for e in steps]
 
 
 def _adjusted(
@@ -333,20 +322,7 @@ def _adjusted(
         left = (design * weight.reshape(count, -1, 1)).transpose(0, 2, 1)
         found = np.linalg.solve(left @ design, left @ flat)[..., 0]
         flux = found[:, 0]
-        move = np.clip(found[:, 1:3] / flux[:, None], -STEP, STEP)
-        centre = np.clip(centre + move, -FARTHEST, FARTHEST)
+        move = np.clip(found[:, 1:3] / flux[:, None], -LARGEST_STEP_PX, LARGEST_STEP_PX)
+        centre = np.clip(centre + move, -FARTHEST_PX, FARTHEST_PX)
     level = found[:, 3, None, None] if sky else 0.0
     return flux, centre, (data - level) / flux[:, None, None] - draw(centre)
-
-
-def _centroids(images: np.ndarray, axis: np.ndarray) -> np.ndarray:
-    """Centroids under a Gaussian window that follows the star, shape (n, 2)."""
-    centre = np.zeros((len(images), 2))
-    for _ in range(4):
-        rows, columns = (axis[None] - centre[:, i, None] for i in (0, 1))
-        window = [np.exp(-0.5 * (a / WINDOW) ** 2) for a in (rows, columns)]
-        light = window[0][:, :, None] * window[1][:, None, :] * images
-        total = light.sum(axis=(1, 2))
-        moments = [np.einsum("nij,ni->n", light, rows), np.einsum("nij,nj->n", light, columns)]
-        centre = np.clip(centre + 2 * np.stack(moments, axis=1) / total[:, None], -1.0, 1.0)
-    return centre

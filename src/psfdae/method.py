@@ -3,7 +3,9 @@
 Each is in a module of its own in `psfdae.methods` or `psfdae_paper.methods`, with its settings;
 where files give others, these are in `config/<group>/default.yaml`. The list `methods` of
 `config/config.yaml` names those that the reproduction runs. Rules, tables, figures, sweeps, runs
-of MLflow, bundles and `from-stars` ask the classes for all that they must know.
+of MLflow, bundles and `from-stars` ask the classes for all that they must know: how a method
+looks, what it needs, how a fit is stored, how it is packed. What only some methods can do is a
+protocol.
 
 Modules of methods load neither torch nor scipy when they are imported: options of
 commands follow from them.
@@ -14,24 +16,17 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self, runtime_checkable
 
 import numpy as np
 
-from psfdae.belonging import TRAINED_ON, require_training, write_origin
 from psfdae.errors import Error
-from psfdae.files import (
-    Column,
-    Product,
-    as_csv,
-    read_product,
-    write_product,
-    write_text,
-)
+from psfdae.files import Column, read_product, write_product
 from psfdae.noise import NoiseModel, mixed_levels
 from psfdae.settings import Group
 
 if TYPE_CHECKING:
+    from psfdae.bright_stars import BrightStars
     from psfdae.bundle_info import BundleInfo
     from psfdae.settings import Evaluation
 
@@ -41,37 +36,6 @@ CONFIG, HISTORY = "config.yaml", "history.csv"
 
 class FitError(Error, RuntimeError):
     """A method cannot be fitted; the message says why and what to change."""
-
-
-class BrightStamps(NamedTuple):
-    """The bright stars of an image as they are in it.
-
-    Attributes
-    ----------
-    wide : ndarray, shape (n, s, s)
-        Sky-subtracted, of flux 1 in the stamp, with a margin.
-    peak : ndarray of int, shape (n, 2)
-        Brightest pixel (row, column) from index (s//2, s//2).
-    listed : ndarray, shape (n, 2)
-        Centre that the star list says, likewise; NaN where none does.
-    position : ndarray, shape (n, 2)
-        (x, y) in the image; NaN where unknown.
-    noise : ndarray, shape (n,)
-        RMS of the sky in a pixel over the flux.
-    star : ndarray of int
-        Star of every image of the training set.
-    """
-
-    wide: np.ndarray
-    peak: np.ndarray
-    listed: np.ndarray
-    position: np.ndarray
-    noise: np.ndarray
-    star: np.ndarray
-
-    def of(self, chosen: np.ndarray) -> BrightStamps:
-        """Some of the stars."""
-        return BrightStamps(*(array[chosen] for array in self[:-1]), self.star)
 
 
 @dataclass(frozen=True)
@@ -99,8 +63,10 @@ class TrainingSet:
     own_noise : callable or None
         Of images that are not noise-free: from star indices (m,) and their mean image (P,)
         to what noise adds to their scatter (P, P) about it.
-    bright : BrightStamps or None
-        The stars of which the images were made, if these are an image's.
+    bright : BrightStars or None
+        The stars of which the images were made, if these are an image's; of flux 1.
+    star : ndarray of int, shape (n,)
+        Bright star of every image; empty if there are none.
     start : Method or None
         Fit of the method to the realisations of the same stars, from which that to their
         templates goes on.
@@ -118,7 +84,8 @@ class TrainingSet:
     reference: str = "realisation"
     positions: np.ndarray = field(default_factory=lambda: np.empty((0, 2)))
     own_noise: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
-    bright: BrightStamps | None = None
+    bright: BrightStars | None = None
+    star: np.ndarray = field(default_factory=lambda: np.empty(0, int))
     start: Method | None = None
     checkpoint: Path | None = None
 
@@ -173,8 +140,8 @@ class Estimate:
         the PSF has this sum.
     measured : Measured or None
         Of a method that measures stars itself; its PSFs have the sum 1.
-    strangeness : ndarray, shape (n,), or None
-        As `Method.strangeness`, of a method that finds it on the way.
+    outlier_score : ndarray, shape (n,), or None
+        As `ScoresOutliers.outlier_score`, of a method that finds it on the way.
     """
 
     psf: np.ndarray
@@ -182,7 +149,200 @@ class Estimate:
     evidence: np.ndarray | None = None
     flux: np.ndarray | None = None
     measured: Measured | None = None
-    strangeness: np.ndarray | None = None
+    outlier_score: np.ndarray | None = None
+
+
+# The parts of a method's class.
+
+
+@dataclass(frozen=True)
+class Look:
+    """How a method is called and drawn.
+
+    Attributes
+    ----------
+    label, color, marker : str
+        In tables and figures. What the method is given beside the image is added to its label.
+    paper : (str, str) or None
+        Its row in the paper's tables as data, and as printed.
+    drawn : bool
+        Shown among restored stars.
+    restores : bool
+        False for the noisy image itself, which is drawn on its own scale.
+    """
+
+    label: str
+    color: str
+    marker: str = "o"
+    paper: tuple[str, str] | None = None
+    drawn: bool = True
+    restores: bool = True
+
+
+@dataclass(frozen=True)
+class Needs:
+    """What a method is given, and what a fit takes.
+
+    Attributes
+    ----------
+    level : bool
+        `predict` gets the noise level λ, too: of all images, or of each, shape (n,).
+    position : bool
+        `predict` gets the positions in the field as well, shape (n, 2).
+    validation : bool
+        The fit leaves out the validation stars, or only chooses by them.
+    memory_mb, minutes : int
+        What a fit takes at most.
+    """
+
+    level: bool = False
+    position: bool = False
+    validation: bool = False
+    memory_mb: int = 1000
+    minutes: int = 30
+
+    def __str__(self) -> str:
+        """What is given, as the end of a label: " (given λ, position)"."""
+        names = ["λ"] * self.level + ["position"] * self.position
+        return f" (given {', '.join(names)})" if names else ""
+
+
+@dataclass(frozen=True)
+class Storage:
+    """What a fit leaves on the disk, and the names of all that make it; see `psfdae.fits`.
+
+    Attributes
+    ----------
+    arrays : mapping
+        Attributes that are the HDF5 product, and of each its unit and what it is.
+    files : tuple of str
+        Files of the folder that a fit leaves in place of a product.
+    diagnostics : tuple of str
+        Tables (CSV) beside them, of which a fitted method has the rows in `diagnosed`.
+    per_reference : bool
+        Fitted for each reference, or once for both.
+    rule, run, about : str
+        Name of its rule, name of its runs in MLflow, and help of the options that take a fit;
+        by default they follow from the method's name.
+    """
+
+    arrays: Mapping[str, tuple[str, str]] = field(default_factory=dict)
+    files: tuple[str, ...] = ()
+    diagnostics: tuple[str, ...] = ()
+    per_reference: bool = False
+    rule: str = ""
+    run: str = ""
+    about: str = ""
+
+
+@dataclass(frozen=True)
+class Packing:
+    """How a fit is part of a model bundle.
+
+    Attributes
+    ----------
+    suffix : str or None
+        Ends the names of its bundles; by default "-" and the method's name.
+    together : int
+        Small images that `psfdae predict` has restored at once.
+    padded : bool
+        Fewer are made up to as many: other numbers of them round otherwise.
+    """
+
+    suffix: str | None = None
+    together: int = 256
+    padded: bool = True
+
+
+# What some methods can do.
+
+
+@runtime_checkable
+class MeasuresStars(Protocol):
+    """Measures flux, sky and centre of a star with its PSF: no other photometry is needed."""
+
+    def measure(
+        self,
+        stamps: np.ndarray,
+        noise: np.ndarray,
+        position: np.ndarray | None = None,
+        centre: np.ndarray | None = None,
+        fixed: bool | np.ndarray = False,
+        flux: np.ndarray | None = None,
+        sky: np.ndarray | None = None,
+    ) -> Estimate:
+        """From stamps in any unit; see `psfdae.methods.field.FieldMixture.measure`."""
+
+
+@runtime_checkable
+class KnowsField(Protocol):
+    """Knows the PSF between the stars."""
+
+    def psf_at(self, position: np.ndarray, oversampling: int = 1) -> np.ndarray:
+        """PSFs at positions (n, 2)."""
+
+    def facts(self) -> Mapping[str, str]:
+        """What a fit knows of the field that its user should: a title and words for each."""
+
+
+@runtime_checkable
+class FreesFlux(Protocol):
+    """Has a form for images whose flux and sky are estimates, and their sum therefore 1."""
+
+    def free_flux(self) -> Self:
+        """That form."""
+
+
+@runtime_checkable
+class FindsFlux(FreesFlux, Protocol):
+    """Finds, in that form, the flux of a star in that by which its image was divided."""
+
+    def flux(self, noisy: np.ndarray, level: np.ndarray) -> np.ndarray:
+        """That flux of images (n, d, d), shape (n,)."""
+
+
+@runtime_checkable
+class ScoresOutliers(Protocol):
+    """Has a law of the training stars."""
+
+    def outlier_score(self, noisy: np.ndarray, level: np.ndarray) -> np.ndarray:
+        """How unlike all training stars images (n, d, d) are, shape (n,).
+
+        −2 ln of the probability density; for a normal law the square of Mahalanobis' distance.
+        """
+
+
+@runtime_checkable
+class HasConditions(Protocol):
+    """Knows conditions that the arrays of any fit fulfil."""
+
+    def conditions(self) -> Iterator[tuple[str, str, Any]]:
+        """Name of an array, what it must have in words, and whether it has it, bool."""
+
+
+@runtime_checkable
+class FitsAgain(Protocol):
+    """Has searched for some of its settings."""
+
+    def again(self, data: TrainingSet, **settings: Any) -> Self:
+        """A fit to `data` with its seed and the settings that were found."""
+
+
+@runtime_checkable
+class GoesOn(Protocol):
+    """A fit to templates may go on from one to the realisations."""
+
+    @classmethod
+    def continues(cls, config: Any) -> bool:
+        """Whether it does, by its settings."""
+
+
+@runtime_checkable
+class Exports(Protocol):
+    """Is a network."""
+
+    def export(self, stamp_px: int, path: Path) -> None:
+        """Write it as ONNX."""
 
 
 class Method:
@@ -190,77 +350,22 @@ class Method:
 
     Attributes
     ----------
-    label, color, marker : str
-        In figures. What the method is given beside the image is added to its label.
-    paper : (str, str) or None
-        Its row in the paper's tables as data, and as printed.
-    drawn : bool
-        Shown among restored stars.
-    restores : bool
-        False for the noisy image itself, which is drawn on its own scale.
-    needs_level : bool
-        `predict` gets the noise level λ, too: of all images, or of each, shape (n,).
-    needs_position : bool
-        `predict` gets the positions in the field as well, shape (n, 2).
-    measures : bool
-        It measures flux, sky and centre of a star with its PSF: `measure` does, of stamps, and
-        a model of it takes no photometry from elsewhere.
+    look : Look
+    needs : Needs
+    storage : Storage or None
+        None if it is fitted where it is applied, in a moment, and leaves no file.
+    packing : Packing or None
+        None if no bundle holds it.
     groups : mapping
         Groups of the configuration that are its settings; `fit` gets them by name.
-    stored : bool
-        False if it is fitted where it is applied, in a moment, and leaves no file.
-    per_reference : bool
-        Of a stored one: fitted for each reference, or once for both.
-    validates : bool
-        The fit leaves out the validation stars, or only chooses by them.
-    files : tuple of str
-        Files of the folder that a fit leaves; empty if it leaves one HDF5 product.
-    diagnostics : tuple of str
-        Tables (CSV) beside them, of which a fitted method has the rows in `diagnosed`.
-    arrays : mapping
-        Attributes that are the HDF5 product, and of each its unit and what it is.
-    rule, kind : str
-        Name of its rule, and of its runs in MLflow.
-    about : str
-        What a fit leaves, for the help of commands.
-    bundled : bool
-        Packed as a model that `psfdae predict` takes.
-    suffix : str
-        Ends the names of its bundles.
-    together : int
-        Small images that `psfdae predict` has restored at once.
-    padded : bool
-        Fewer are made up to as many: other numbers of them round otherwise.
-    memory_mb, minutes : int
-        What a fit takes at most.
     """
 
     name: ClassVar[str] = ""
-    label: ClassVar[str]
-    color: ClassVar[str]
-    marker: ClassVar[str] = "o"
-    paper: ClassVar[tuple[str, str] | None] = None
-    drawn: ClassVar[bool] = True
-    restores: ClassVar[bool] = True
-    needs_level: ClassVar[bool] = False
-    needs_position: ClassVar[bool] = False
-    measures: ClassVar[bool] = False
+    look: ClassVar[Look]
+    needs: ClassVar[Needs] = Needs()
+    storage: ClassVar[Storage | None] = Storage()
+    packing: ClassVar[Packing | None] = Packing()
     groups: ClassVar[Mapping[str, type[Group]]] = {}
-    stored: ClassVar[bool] = True
-    per_reference: ClassVar[bool] = False
-    validates: ClassVar[bool] = False
-    files: ClassVar[tuple[str, ...]] = ()
-    diagnostics: ClassVar[tuple[str, ...]] = ()
-    arrays: ClassVar[Mapping[str, tuple[str, str]]] = {}
-    rule: ClassVar[str]
-    kind: ClassVar[str]
-    about: ClassVar[str]
-    bundled: ClassVar[bool] = True
-    suffix: ClassVar[str]
-    together: ClassVar[int] = 256
-    padded: ClassVar[bool] = True
-    memory_mb: ClassVar[int] = 1000
-    minutes: ClassVar[int] = 30
 
     diagnosed: Mapping[str, list[dict[str, Any]]]
 
@@ -269,24 +374,11 @@ class Method:
         """Class method: from a `TrainingSet` and the groups of settings to a fitted method."""
         predict: Callable[..., np.ndarray]
         """PSFs of flux-normalised noisy images, both of shape (n, d, d)."""
-        measure: Callable[..., Estimate]
-        """PSFs of stamps; see `psfdae.methods.field`, if `measures`."""
 
     def __init_subclass__(cls) -> None:
         cls.name = cls.__module__.rpartition(".")[2]
-        own = vars(cls)
-        if "label" in own:
-            cls.label += cls.given()
-        cls.rule = own.get("rule", f"fit_{cls.name}")
-        cls.kind = own.get("kind", cls.name)
-        cls.about = own.get("about", f"What `psfdae fit {cls.name}` leaves.")
-        cls.suffix = own.get("suffix", f"-{cls.name}")
-
-    @classmethod
-    def given(cls) -> str:
-        """What it is given beside the image, as the end of a label: " (given λ, position)"."""
-        names = ["λ"] * cls.needs_level + ["position"] * cls.needs_position
-        return f" (given {', '.join(names)})" if names else ""
+        if "look" in vars(cls):
+            cls.look = replace(cls.look, label=f"{cls.look.label}{cls.needs}")
 
     @classmethod
     def settings(cls, config: Any) -> dict[str, Any]:
@@ -303,11 +395,6 @@ class Method:
         groups = cls.settings(config).values()
         return next((g.threads for g in groups if hasattr(g, "threads")), 1)
 
-    @classmethod
-    def continues(cls, config: Any) -> bool:
-        """Whether a fit to templates goes on from that to the realisations."""
-        return False
-
     def estimate(
         self, noisy: np.ndarray, level: float | np.ndarray, position: np.ndarray | None = None
     ) -> Estimate:
@@ -320,73 +407,16 @@ class Method:
     def restore(
         self, noisy: np.ndarray, level: float | np.ndarray, position: np.ndarray | None = None
     ) -> np.ndarray:
-        """`predict`, given what the method wants to know beside the image."""
-        given = (level,) * self.needs_level + (position,) * self.needs_position
+        """`predict`, given what the method needs beside the image."""
+        given = (level,) * self.needs.level + (position,) * self.needs.position
         return self.predict(noisy, *given)
 
-    def strangeness(self, noisy: np.ndarray, level: np.ndarray) -> np.ndarray | None:
-        """How unlike all training stars images (n, d, d) are, if the method has a law of them.
-
-        For a normal law it is the square of Mahalanobis' distance.
-        """
-        return None
-
-    def free_flux(self) -> Self:
-        """The same for images whose flux and sky are estimates, and their sum therefore 1.
-
-        A method that can finds the `flux` of these.
-        """
-        return self
-
-    def flux(self, noisy: np.ndarray, level: np.ndarray) -> np.ndarray:
-        """Flux of each star in that by which its image was divided, shape (n,), if it is free."""
-        return np.ones(len(noisy))
-
-    def psf_at(self, position: np.ndarray, oversampling: int = 1) -> np.ndarray:
-        """PSFs at positions (n, 2), of a method that knows them between the stars."""
-        raise FitError(f"{self.label}: knows the PSF of a star alone, not that of a place")
-
-    def facts(self) -> Mapping[str, str]:
-        """What a fit knows of itself that its user should: a title and words for each."""
-        return {}
-
-    @classmethod
-    def stem(cls, dataset: str, split: str, reference: str) -> str:
-        """What tells its fits apart, as part of a path."""
-        return f"{dataset}/{split}" + (f"-{reference}" if cls.per_reference else "")
-
-    @classmethod
-    def place(cls, dataset: str, split: str, reference: str) -> str:
-        """Folder or file of a fit, below the folder of results."""
-        return f"{cls.name}/{cls.stem(dataset, split, reference)}" + ("" if cls.files else ".h5")
-
-    @classmethod
-    def beside(cls, place: str | Path, name: str) -> Path:
-        """A further file of a fit: in its folder, or beside its product."""
-        place = Path(place)
-        return place / name if cls.files else place.with_name(f"{place.stem}.{name}")
-
-    @classmethod
-    def outputs(cls, place: str | Path) -> list[Path]:
-        """All files of a fit."""
-        own = [Path(place, name) for name in cls.files] or [Path(place)]
-        return own + [cls.beside(place, name) for name in (TRAINED_ON, *cls.diagnostics)]
-
-    def again(self, data: TrainingSet, **settings: Any) -> Self:
-        """A fit to `data` with its seed; settings that this fit has searched for are kept."""
-        return type(self).fit(data, **settings)  # type: ignore[no-any-return]
+    # A fit as files, and as part of a bundle.
 
     def save(self, place: Path, described: Mapping[str, Any]) -> None:
         """Write the fit with its resolved configuration."""
-        columns = {name: Column(getattr(self, name), *said) for name, said in self.arrays.items()}
+        columns = {n: Column(getattr(self, n), *said) for n, said in self.stored().items()}
         write_product(place, self.name, columns, described)
-
-    def store(self, place: Path, described: Mapping[str, Any], stars: Product) -> None:
-        """Write all files of the fit, which is one to stars."""
-        self.save(place, described)
-        write_origin(place, stars)
-        for name in self.diagnostics:
-            write_text(self.beside(place, name), as_csv(self.diagnosed[name]))
 
     @classmethod
     def load(
@@ -407,8 +437,18 @@ class Method:
         ProductError
             If a file is missing or damaged.
         """
-        product = read_product(place, cls.name, tuple(cls.arrays))
+        product = read_product(place, cls.name, tuple(cls.stored()))
         return cls.restored(product.arrays, product.config, reference)
+
+    @classmethod
+    def stored(cls) -> Mapping[str, tuple[str, str]]:
+        """Arrays of a fit, with unit and meaning; none of a method that leaves no file."""
+        return cls.storage.arrays if cls.storage else {}
+
+    @classmethod
+    def described(cls, place: Path) -> dict[str, Any]:
+        """The resolved configuration of a fit."""
+        return read_product(place, cls.name, ()).config
 
     @classmethod
     def restored(
@@ -422,47 +462,19 @@ class Method:
 
         `noise` is the least RMS per pixel, over the flux, that they are for.
         """
-        return {name: np.asarray(getattr(self, name)) for name in self.arrays}, {}
+        return {name: np.asarray(getattr(self, name)) for name in self.stored()}, {}
 
     @classmethod
     def shapes(cls, info: BundleInfo) -> Mapping[str, tuple[int, ...] | None]:
         """Arrays that a bundle must have, with their shapes; None: any."""
-        return dict.fromkeys(cls.arrays)
+        return dict.fromkeys(cls.stored())
 
     @classmethod
     def unpack(cls, arrays: Mapping[str, np.ndarray], info: BundleInfo) -> Self:
         """A fit from a bundle."""
         return cls.restored(arrays, info.config["train"], info.reference or "realisation")
 
-    def lawful(self) -> Iterator[tuple[str, str, Any]]:
-        """What arrays of a bundle must have: name, words, and whether they have it, bool."""
-        return iter(())
 
-    def export(self, stamp_px: int, path: Path) -> None:
-        """Write it as ONNX, if it is a network."""
-        raise FitError(f"{self.label}: is no network, ONNX has no form for it")
-
-    @classmethod
-    def described(cls, place: Path) -> dict[str, Any]:
-        """The resolved configuration of a fit."""
-        return read_product(place, cls.name, ()).config
-
-    @classmethod
-    def require(cls, place: Path, stars: Product, config: Any, split: str, reference: str) -> None:
-        """Refuse a fit that does not belong to test stars.
-
-        Parameters
-        ----------
-        place : Path
-        stars : product "stars" with its realisations
-        config : stage config (seed, parts)
-        split : "random" or "held_out"
-        reference : "realisation" or "template"
-
-        Raises
-        ------
-        ProductError
-            With both values of what differs.
-        """
-        options = {"split": split} | ({"reference": reference} if cls.per_reference else {})
-        require_training(place, cls.described(place), stars, config, **options)
+def facts_of(fitted: Method) -> list[str]:
+    """What a fit knows of the field, in sentences without a stop."""
+    return [*fitted.facts().values()] if isinstance(fitted, KnowsField) else []

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from psfdae import fits
 from psfdae.belonging import STARS, require_origin
 from psfdae.files import ProductError, read_product
 from psfdae.method import HISTORY, Method
@@ -118,7 +119,7 @@ def runs_of_datasets(results: Path, datasets: Mapping[str, Path]) -> list[Run]:
             figures = _figures(results / "figures" / dataset, split, reference)
             measured = {row["method"] for row in read_csv(path, "method")}
             for kind in registered():
-                if kind.stored and kind.name in measured:
+                if kind.storage and kind.name in measured:
                     runs.append(_of_stars(results, kind, key, stars, path, figures))
     return runs
 
@@ -136,23 +137,23 @@ def _of_stars(
     Its config is that of the model together with that of its stars: a network trained on
     the stars of another telescope is another run.
     """
-    source = kind.place(**key)
+    source = fits.place_of(kind, **key)
     model = results / source
     files = _model_files(kind, model) | {"evaluation.csv": evaluation} | figures
     contents = _contents(files)
     product = read_product(stars, "stars", ())
     require_origin(model, STARS, product)
-    own = kind.described(model)
+    own, run_kind = kind.described(model), fits.storage_of(kind).run or kind.name
     # Which start succeeded is an outcome, not a setting.
     own.pop("attempt", None)
     epochs = []
-    if HISTORY in kind.diagnostics:
-        epochs = _epochs(kind.beside(model, HISTORY), "train_mse", "validation_mse")
+    if HISTORY in fits.storage_of(kind).diagnostics:
+        epochs = _epochs(fits.beside(kind, model, HISTORY), "train_mse", "validation_mse")
     try:
         experiment = str(product.config["scene"]["experiment"])
     except (KeyError, TypeError):
         raise ProductError(f"{stars}: its config has no scene.experiment") from None
-    start_ms, end_ms = _span_ms(kind.outputs(model)[0], epochs)
+    start_ms, end_ms = _span_ms(fits.outputs(kind, model)[0], epochs)
     points = _epoch_points(epochs, start_ms)
     for row in read_csv(evaluation, "method", "noise_level", "metric", "value", "stderr"):
         if row["method"] == kind.name:
@@ -166,9 +167,9 @@ def _of_stars(
         {**product.config, **own},
         points,
         **key,
-        kind=kind.kind,
+        kind=run_kind,
         source=source,
-        name=" ".join([*key.values(), kind.kind]),
+        name=" ".join([*key.values(), run_kind]),
         experiment=experiment,
         start_ms=start_ms,
         end_ms=end_ms,
@@ -177,10 +178,9 @@ def _of_stars(
 
 def _model_files(kind: type[Method], place: Path) -> dict[str, Path]:
     """Files of a fit by their names within the run; `model/` is what the method loads."""
-    own = [place / name for name in kind.files] or [place]
-    return {f"model/{path.name}": path for path in own} | {
-        name: kind.beside(place, name) for name in kind.diagnostics
-    }
+    model = {f"model/{path.name}": path for path in fits.own_files(kind, place)}
+    more = fits.storage_of(kind).diagnostics
+    return model | {name: fits.beside(kind, place, name) for name in more}
 
 
 def _figures(folder: Path, split: str, reference: str) -> dict[str, Path]:

@@ -180,8 +180,8 @@ def methods(table):
     for name, rows in table.groupby("method", sort=False):
         kind, mean = method(name), rows.mean(numeric_only=True)
         for axes, column in zip(panels, ("fit_cpu_s", "star_ms"), strict=True):
-            style = {"marker": kind.marker, "color": kind.color, "ls": "", "ms": 9}
-            axes.plot(mean[column], np.exp(mean["mse"]), label=kind.label, **style)
+            style = {"marker": kind.look.marker, "color": kind.look.color, "ls": "", "ms": 9}
+            axes.plot(mean[column], np.exp(mean["mse"]), label=kind.look.label, **style)
     panels[0].set(**LOGS, xlabel="CPU time of the fit, its choices included (s)")
     panels[1].set(**LOGS, xlabel="CPU time of a star (ms)")
     panels[0].set_ylabel("test MSE, geometric mean over λ")

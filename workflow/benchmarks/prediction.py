@@ -300,10 +300,10 @@ def covered(bundle, product, rng):
 def strange(
     config: Config,
     stars: Annotated[File, "Product of the stage stars."],
-    bundle: Annotated[File, "Model bundle of a method that knows how strange a star is."],
+    bundle: Annotated[File, "Model bundle of a method with a law of stars."],
     out: Annotated[File, "CSV with the stars found, by kind and noise level."],
 ) -> None:
-    """Find stars unlike the training by `distance` and by `strangeness`, at equal false alarms.
+    """Find stars unlike the training by `distance` and by the outlier score, at equal false alarms.
 
     Of the test stars a part of `FALSE_ALARMS` is above either limit. Then each of them gets a
     companion, or is hit by a cosmic ray, or is turned by 90 degrees, or gives way to a Gaussian as

@@ -15,6 +15,7 @@ import numpy as np
 from measure import alone, cost_of_command, write
 from prediction import make_cube
 from psfdae.cli import program
+from psfdae.fits import rule_of
 from psfdae.methods import method
 from psfdae.options import File
 from psfdae.rng import stream
@@ -246,7 +247,7 @@ def measured(config, folder):
     tree["train"]["epochs"] = TRAINED_EPOCHS
     names = ("templates.h5", "simulated.h5", "stars.h5", "stars.fits")
     templates, simulated, stars, cube = (folder / name for name in names)
-    fits = {kind: folder / kind.name for kind in map(method, config.methods) if kind.stored}
+    places = {kind: folder / kind.name for kind in map(method, config.methods) if kind.storage}
     bundle = folder / "model.psf.safetensors"
     alone(threads, cost_of_command, ["templates"], templates, tree)
 
@@ -265,9 +266,9 @@ def measured(config, folder):
         tree["parts"] |= {"train_stars": 4 * count // 5, "test_stars": count - 4 * count // 5}
         alone(1, repeat_stars, simulated, count, stars)
         models = ["--dataset", "measured"]
-        for kind, place in fits.items():
+        for kind, place in places.items():
             own = ["--checkpoint", folder / "fit.pt"]
-            cost(kind.rule, ["fit", kind.name, *given, *own], place)
+            cost(rule_of(kind), ["fit", kind.name, *given, *own], place)
             models += [f"--{kind.name.replace('_', '-')}", place]
         per_star = ["--per-star", folder / "per_star.parquet"]
         cost("evaluate", ["evaluate", *given, *models, *per_star], folder / "summary.csv")

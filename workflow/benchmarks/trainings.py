@@ -10,9 +10,11 @@ import numpy as np
 from pydantic import Field
 
 from measure import alone, pareto, write, yes
+from psfdae import fits
 from psfdae.belonging import STARS, require
 from psfdae.cli import program
 from psfdae.files import read_product, write_csv
+from psfdae.method import FitsAgain, GoesOn
 from psfdae.methods import groups_of, method
 from psfdae.model import star_sets
 from psfdae.options import File, Folder
@@ -76,7 +78,7 @@ def knee_table(
     folders = {name: Path(folder) for name, _, folder in (p.partition("=") for p in points)}
     product = star_sets.read_stars(stars)
     for folder in folders.values():
-        Dae.require(folder, product, config, "random", "realisation")
+        fits.require(Dae, folder, product, config, "random", "realisation")
     test = star_sets.split_stars(product, "random", config).test
     images, levels = product["realisation"][test], config.noise.levels
     noisy = {level: star_sets.noisy_test_images(config, product, test, level) for level in levels}
@@ -254,7 +256,7 @@ def time_methods(tree, stars):
     clean, field = product["realisation"][test], product["field_index"][test]
     position = star_sets.field_positions(product)[test]
     rows = []
-    for kind in (kind for kind in map(method, config.methods) if kind.restores):
+    for kind in (kind for kind in map(method, config.methods) if kind.look.restores):
         with TemporaryDirectory() as folder:
             given = config, kind, product, "random", "realisation"
             data = star_sets.training_set(*given, checkpoint=Path(folder, "checkpoint"))
@@ -307,33 +309,36 @@ def seeds(
 
 def own_fits(config, kind, dataset, references, product, results):
     """The fits of the workflow by reference; where they leave no file, the same again."""
-    fits = {}
+    found = {}
     for reference in references:
-        if kind.stored:
-            place = results / kind.place(dataset, "random", reference)
-            kind.require(place, product, config, "random", reference)
-            fits[reference] = kind.load(place, reference, config.evaluation)
+        if kind.storage:
+            place = results / fits.place_of(kind, dataset, "random", reference)
+            fits.require(kind, place, product, config, "random", reference)
+            found[reference] = kind.load(place, reference, config.evaluation)
         else:
             data = star_sets.training_set(config, kind, product, "random", reference)
-            fits[reference] = kind.fit(data, **kind.settings(config))
-    return fits
+            found[reference] = kind.fit(data, **kind.settings(config))
+    return found
 
 
 def other_fits(config, kind, own, product, seed):
     """Fits that differ from the given ones by nothing but their seed."""
-    fits = {}
+    found = {}
+    goes_on = issubclass(kind, GoesOn) and kind.continues(config)
     for reference, fitted in own.items():
-        if fits and kind.stored and not kind.per_reference:
-            fits[reference] = next(iter(fits.values()))  # one serves all
+        if found and kind.storage and not kind.storage.per_reference:
+            found[reference] = next(iter(found.values()))  # one serves all
             continue
         with TemporaryDirectory() as folder:
             data = star_sets.training_set(
                 *(config, kind, product, "random", reference),
                 checkpoint=Path(folder, "checkpoint"),
-                start=fits.get("realisation") if kind.continues(config) else None,
+                start=found.get("realisation") if goes_on else None,
             )
-            fits[reference] = fitted.again(replace(data, seed=seed), **kind.settings(config))
-    return fits
+            data = replace(data, seed=seed)
+            again = fitted.again if isinstance(fitted, FitsAgain) else kind.fit
+            found[reference] = again(data, **kind.settings(config))
+    return found
 
 
 @command("scatter")

@@ -57,7 +57,7 @@ rule propagation_tables:
 BUNDLE = f"{RESULTS}/bundles/{TIMED_DATASET}-random-realisation.psf.safetensors"
 STARS = {"stars": lambda w: stars_of(TIMED_DATASET)}
 OWN_MODEL = f"{RESULTS}/own_stars/example/model"
-MIXED = BUNDLE.replace("realisation", f"realisation{method('gmm').suffix}")
+MIXED = BUNDLE.replace("realisation", f"realisation{suffix_of(method('gmm'))}")
 FITTED = [method(name).__module__ for name in names_of(TIMED_DATASET)]
 # By table: target, command, inputs, MB, minutes, stages that it runs or modules that it chooses.
 TIMED = {
@@ -314,7 +314,7 @@ for _method in registered():
                 path
                 for reference in dataset_config(w.dataset).dataset.references
                 for path in files_of(m, w.dataset, "random", reference)
-                if m.stored
+                if m.storage
             ],
             stars=lambda w: stars_of(w.dataset),
         output:
@@ -324,11 +324,11 @@ for _method in registered():
         benchmark:
             f"{RESULTS}/benchmarks_on_request/seeds/{{dataset}}-{_method.name}.tsv"
         # What takes longest is started first.
-        priority: _method.minutes
+        priority: _method.needs.minutes
         threads: lambda w, m=_method: m.threads(dataset_config(w.dataset))
         resources:
-            mem_mb=_method.memory_mb,
-            runtime=5 * _method.minutes,
+            mem_mb=_method.needs.memory_mb,
+            runtime=5 * _method.needs.minutes,
         params:
             config=lambda w, m=_method: settings(
                 "trainings.seeds", f"dataset={w.dataset}", name=m.name
@@ -342,7 +342,7 @@ for _method in registered():
                 for r in dataset_config(w.dataset).dataset.references
             ],
         message:
-            f"Fitting {_method.label} to {{wildcards.dataset}} with other seeds"
+            f"Fitting {_method.look.label} to {{wildcards.dataset}} with other seeds"
         shell:
             "python {params.program} {params.method} --config {params.config}"
             " --dataset {wildcards.dataset} {params.references} --stars {input.stars}"

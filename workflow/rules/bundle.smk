@@ -1,9 +1,10 @@
-for _method in (m for m in registered() if m.stored and m.bundled):
-    _stem = f"{{dataset}}-{{split}}-{{reference}}{_method.suffix}"
+for _method in (m for m in registered() if m.storage and m.packing):
+    _suffix = suffix_of(_method)
+    _stem = f"{{dataset}}-{{split}}-{{reference}}{_suffix}"
 
     rule:
         name:
-            f"bundle{_method.suffix}".replace("-", "_")
+            f"bundle{_suffix}".replace("-", "_")
         input:
             stars=lambda w: stars_of(w.dataset),
             model=lambda w, m=_method: files_of(m, w.dataset, w.split, w.reference),
@@ -15,7 +16,7 @@ for _method in (m for m in registered() if m.stored and m.bundled):
             f"{RESULTS}/benchmarks_on_request/bundles/{_stem}.tsv"
         threads: lambda w: dataset_config(w.dataset).evaluation.threads
         resources:
-            mem_mb=max(1500, _method.memory_mb),
+            mem_mb=max(1500, _method.needs.memory_mb),
         params:
             config=lambda w: settings("bundle", f"dataset={w.dataset}"),
             source=source_hash("bundle", chosen=[_method.__module__]),
@@ -23,7 +24,7 @@ for _method in (m for m in registered() if m.stored and m.bundled):
             # A model that comes with a package is small.
             size=lambda w: ["--largest-mb=4.8"] * (w.dataset == SHIPPED_DATASET),
         message:
-            f"Packing {_method.label} of {{wildcards.dataset}}, {{wildcards.split}}, {{wildcards.reference}}"
+            f"Packing {_method.look.label} of {{wildcards.dataset}}, {{wildcards.split}}, {{wildcards.reference}}"
         shell:
             "psfdae bundle --config {params.config} --stars {input.stars} {params.model}"
             " --split {wildcards.split} --reference {wildcards.reference} --licence MIT"

@@ -7,7 +7,10 @@ from importlib import import_module
 
 from snakemake.utils import validate
 
+from psfdae import fits
 from psfdae.cli import stage
+from psfdae.fits import suffix_of
+from psfdae.method import GoesOn
 from psfdae.settings import ConfigError, as_overrides
 from psfdae_paper.configuration.compose import config_dir
 from psfdae_paper.configuration.compose import compose, dataset_names, decisive, load
@@ -230,7 +233,7 @@ def products_of(dataset):
 
 def model_of(method, dataset, split, reference):
     """Folder or file of a fit."""
-    return f"{RESULTS}/{method.place(dataset, split, reference)}"
+    return f"{RESULTS}/{fits.place_of(method, dataset, split, reference)}"
 
 
 def names_of(dataset):
@@ -240,12 +243,15 @@ def names_of(dataset):
 
 def methods_of(dataset):
     """Methods of a dataset that leave a model."""
-    return [m for m in map(method, names_of(dataset)) if m.stored]
+    return [m for m in map(method, names_of(dataset)) if m.storage]
 
 
 def files_of(method, dataset, split, reference):
     """All files of a fit."""
-    return [str(p) for p in method.outputs(model_of(method, dataset, split, reference))]
+    return [
+        str(p)
+        for p in fits.outputs(method, model_of(method, dataset, split, reference))
+    ]
 
 
 def option_of(method, dataset, split, reference):
@@ -256,22 +262,22 @@ def option_of(method, dataset, split, reference):
 
 def fitted(dataset, split, reference, drawn=False):
     """Files of all models that restore stars of a split, or of those that figures show."""
-    wanted = [m for m in methods_of(dataset) if m.drawn or not drawn]
+    wanted = [m for m in methods_of(dataset) if m.look.drawn or not drawn]
     return [path for m in wanted for path in files_of(m, dataset, split, reference)]
 
 
 def model_options(dataset, split, reference, drawn=False):
     """Options of a command that takes these models."""
-    wanted = [m for m in methods_of(dataset) if m.drawn or not drawn]
+    wanted = [m for m in methods_of(dataset) if m.look.drawn or not drawn]
     return [option_of(m, dataset, split, reference) for m in wanted]
 
 
 def bundles_of(dataset, networks):
     """Bundles of a dataset's methods, of some splits and references."""
     return [
-        f"{RESULTS}/bundles/{dataset}-{split}-{reference}{m.suffix}.psf.safetensors"
+        f"{RESULTS}/bundles/{dataset}-{split}-{reference}{suffix_of(m)}.psf.safetensors"
         for m in methods_of(dataset)
-        if m.bundled
+        if m.packing
         for split, reference in networks
     ]
 
@@ -290,10 +296,10 @@ def fit_threads(dataset):
 
 def histories_of(dataset):
     """Courses of the trainings of a dataset, and a label of each."""
-    trained = [m for m in methods_of(dataset) if HISTORY in m.diagnostics]
+    trained = [m for m in methods_of(dataset) if HISTORY in m.storage.diagnostics]
     return {
-        str(m.beside(model_of(m, dataset, split, reference), HISTORY)): ", ".join(
-            [dataset, split, reference] + [m.label] * (len(trained) > 1)
+        str(fits.beside(m, model_of(m, dataset, split, reference), HISTORY)): ", ".join(
+            [dataset, split, reference] + [m.look.label] * (len(trained) > 1)
         )
         for m in trained
         for split, reference in networks_of(dataset)
@@ -302,7 +308,7 @@ def histories_of(dataset):
 
 def start_of(method, w):
     """Fit to the realisations from which that to the templates goes on, if one does."""
-    goes_on = method.continues(dataset_config(w.dataset))
+    goes_on = issubclass(method, GoesOn) and method.continues(dataset_config(w.dataset))
     if not goes_on or w.get("reference") != "template":
         return {}
     return {"start": files_of(method, w.dataset, w.split, "realisation")}

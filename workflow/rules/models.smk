@@ -1,24 +1,25 @@
-for _method in (m for m in registered() if m.stored):
-    _stem = _method.stem("{dataset}", "{split}", "{reference}")
+for _method in (m for m in registered() if m.storage):
+    _rule = fits.rule_of(_method)
+    _stem = fits.stem(_method, "{dataset}", "{split}", "{reference}")
     _names = (f"{{wildcards.{key}}}" for key in ("dataset", "split", "reference"))
     _place = model_of(_method, "{dataset}", "{split}", "{reference}")
 
     rule:
         name:
-            _method.rule
+            _rule
         input:
             unpack(lambda w, m=_method: start_of(m, w)),
             stars=lambda w: stars_of(w.dataset),
         output:
-            [str(path) for path in _method.outputs(_place)],
+            [str(path) for path in fits.outputs(_method, _place)],
         log:
-            f"{RESULTS}/logs/{_method.rule}/{_stem}.log",
+            f"{RESULTS}/logs/{_rule}/{_stem}.log",
         benchmark:
-            f"{RESULTS}/benchmarks/{_method.rule}/{_stem}.tsv"
+            f"{RESULTS}/benchmarks/{_rule}/{_stem}.tsv"
         threads: lambda w, m=_method: m.threads(dataset_config(w.dataset))
         resources:
-            mem_mb=_method.memory_mb,
-            runtime=_method.minutes,
+            mem_mb=_method.needs.memory_mb,
+            runtime=_method.needs.minutes,
         params:
             config=lambda w, m=_method: settings(
                 "fit", f"dataset={w.dataset}", name=m.name
@@ -36,7 +37,7 @@ for _method in (m for m in registered() if m.stored):
             # Not an output: Snakemake would delete it with a failed job's outputs.
             checkpoint=f"{RESULTS}/checkpoints/{_method.name}/{_stem}.pt",
         message:
-            f"Fitting {_method.label} to {_method.stem(*_names)}"
+            f"Fitting {_method.look.label} to {fits.stem(_method, *_names)}"
         shell:
             "psfdae fit {params.method} --config {params.config} --stars {input.stars}"
             " --split {wildcards.split} {params.more} --checkpoint {params.checkpoint}"

@@ -8,6 +8,7 @@ from psfdae.bundle_info import BundleInfo
 from psfdae.cli import command
 from psfdae.files import check_outputs
 from psfdae.image.errors import one_line
+from psfdae.method import Exports, FitError, KnowsField
 from psfdae.methods import method
 from psfdae.model.bundle import Bundle, estimator, read_bundle
 from psfdae.options import File
@@ -43,7 +44,11 @@ def export(
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)
-        estimator(packed).export(packed.info.stamp_px, out)
+        fitted = estimator(packed)
+        if not isinstance(fitted, Exports):
+            label = fitted.look.label
+            raise FitError(f"{label}: is no network, ONNX has no form for it")
+        fitted.export(packed.info.stamp_px, out)
 
 
 @command("describe")
@@ -73,8 +78,9 @@ def _facts(packed: Bundle) -> dict[str, str]:
         shape = f"kernels {_list(info.dae.kernels)}; widths {_list(info.dae.widths)}"
         network = {"Network": f"{shape}; {count} weights"}
     else:
-        network = {"Method": f"{method(info.method).label}; {count} numbers"}
-    own = {} if info.dae else estimator(packed).facts()
+        network = {"Method": f"{method(info.method).look.label}; {count} numbers"}
+    fitted = None if info.dae else estimator(packed)
+    own = fitted.facts() if isinstance(fitted, KnowsField) else {}
     return {
         "Name": info.name,
         "Format": f"{info.format_version}, written {info.created} by psfdae {info.psfdae_version}",

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
+from psfdae import fits
 from psfdae.cli import command
 from psfdae.commands.mosaic import each, images_of, with_name
 from psfdae.commands.predict import Stated, write_list
@@ -25,7 +26,7 @@ from psfdae.files import (
     write_text,
 )
 from psfdae.image.observation import Source
-from psfdae.method import Method
+from psfdae.method import Method, facts_of
 from psfdae.methods import method
 from psfdae.model.bundle import SUFFIX
 from psfdae.model.fitting import best, described, fitted_to, makes_models, packed
@@ -62,7 +63,7 @@ class Made:
         return self.path / "stars.csv"
 
     def fit(self, kind: type[Method]) -> Path:
-        return self.path / (kind.name if kind.files else f"{kind.name}.h5")
+        return self.path / fits.named(kind, kind.name)
 
     @property
     def bundle(self) -> Path:
@@ -73,7 +74,7 @@ class Made:
         names = ("selection.csv", "overrides.txt", "evaluation.csv", "per_star.csv")
         own = [self.path / name for name in (*names, "report.csv", "report.png")]
         for kind in self.kinds:
-            own += kind.outputs(self.fit(kind))
+            own += fits.outputs(kind, self.fit(kind))
         return [self.stars, self.bundle, *own]
 
 
@@ -155,10 +156,11 @@ def _methods(
 ) -> tuple[Any, tuple[type[Method], ...], list[type[Method]]]:
     """Settings whose methods are those that are measured; the fits, and who may be the model."""
     # Those that are given a place on the grid of a simulation know none of an image.
-    names = [n for n in settings.methods if method(n).bundled or not method(n).needs_position]
+    names = [n for n in settings.methods if method(n).packing or not method(n).needs.position]
     if taken is not None:
-        names = [n for n in names if not method(n).stored and n != taken] + [method(taken).name]
-    kinds = tuple(kind for kind in map(method, names) if kind.stored)
+        names = [n for n in names if method(n).storage is None and n != taken]
+        names.append(method(taken).name)
+    kinds = tuple(kind for kind in map(method, names) if kind.storage is not None)
     tried = [kind for kind in kinds if makes_models(kind.name)]
     if not tried:
         known = ", ".join(n for n in settings.methods if makes_models(n)) or "none of the list"
@@ -230,23 +232,22 @@ def _make(
     write_text(files.path / "overrides.txt", _overrides(stars.settings))
     fitted = {}
     for kind in files.kinds:
-        print(f"fitting {kind.label}")
+        print(f"fitting {kind.look.label}")
         place = files.fit(kind)
-        checkpoint = kind.beside(place, "checkpoint.pt")
+        checkpoint = fits.beside(kind, place, "checkpoint.pt")
         fitted[kind.name] = fitted_to(stars, kind, checkpoint)
-        fitted[kind.name].store(place, described(stars, kind), stars.product)
+        fits.store(fitted[kind.name], place, described(stars, kind), stars.product)
         checkpoint.unlink(missing_ok=True)
     taken = tried[0]
     if len(tried) > 1:
         name, errors = best(stars, {kind.name: fitted[kind.name] for kind in tried})
         taken = method(name)
         for other, error in errors.items():
-            print(f"{method(other).label}: MSE {error:.3g} on validation stars")
-    print(f"packing {taken.label}")
+            print(f"{method(other).look.label}: MSE {error:.3g} on validation stars")
+    print(f"packing {taken.look.label}")
     model = packed(stars, fitted[taken.name], files.name, licence)
-    print(
-        "".join(f"{taken.label}: {fact}\n" for fact in fitted[taken.name].facts().values()), end=""
-    )
+    for fact in facts_of(fitted[taken.name]):
+        print(f"{taken.look.label}: {fact}")
     # Its name is the last one to be there: it says that all is done.
     with atomic_path(files.bundle) as unfinished:
         model.save(unfinished)

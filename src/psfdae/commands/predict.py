@@ -19,6 +19,7 @@ from psfdae.files import atomic_path, check_outputs, interrupted
 from psfdae.image.fits_file import Card
 from psfdae.image.observation import Observation, Source, list_offset
 from psfdae.image.stamps import Stamps, StarFlag
+from psfdae.method import MeasuresStars
 from psfdae.model.bundle import SUFFIX
 from psfdae.model.prediction import Prediction, prediction_file
 from psfdae.model.psf_model import MARGIN_PX, PredictionError, PsfModel, load_model
@@ -173,7 +174,8 @@ def restored(
         observation = observation.assuming()
     assumed = " (scale assumed, --pixel-scale states it)" if observation.scale_assumed else ""
     loaded.check_scale(observation.pixel_scale_arcsec, f"{source.path}{assumed}")
-    if fixed_positions and not (loaded.engine.estimator.measures and observation.shape):
+    measures = isinstance(loaded.engine.estimator, MeasuresStars)
+    if fixed_positions and not (measures and observation.shape):
         raise PredictionError(
             f"{source.path}: --fixed-positions takes an image with a star list, and a model of "
             "psfdae from-stars --method field"

@@ -7,18 +7,19 @@ star of a stamp lies near index (s//2, s//2).
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from enum import StrEnum
 from itertools import repeat
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from psfdae.bright_stars import DEFECT, BrightStars
 from psfdae.errors import Error
 from psfdae.image.errors import no_formula
 from psfdae.image.observation import Observation
 from psfdae.image.stamps import Stamps, StarFlag, cut, peaks, sky_around
-from psfdae.noise import SHIFT_ORDER
+from psfdae.moments import robust_scatter, windowed_centres
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -26,12 +27,8 @@ if TYPE_CHECKING:
     from psfdae.settings import CalibrationStars, Stamp
 
 ROWS = 2048  # stars that are measured at a time
-REGISTRATION_ROUNDS = 10  # of the windowed centroid; each leaves less than a fifth of the distance
+REGISTRATION_ROUNDS, FARTHEST_PX = 10, 1.5  # of the centroid; from the brightest pixel, per axis
 COMPANIONS = 12  # nearest stars with which a star is compared
-DEFECT = 6.0  # pixels this many σ below the sky are defects; they are raised to that
-# Photons per pixel of the new noise, at least: no rate of photons is negative, and the deepest
-# pixel of a star that is made fainter has B − DEFECT √B at most.
-LEAST_SKY, MOST_SKY = 2.0 * DEFECT**2, 1e12
 CORE_PX = 8  # or half of the stamp, if that is more: no place for a faint neighbour
 LOCAL = 1.2  # the worst pixels of good stars scatter more than their stamps as a whole
 # Stars are saturated if at least so many have brightest pixels that agree to this part, which is
@@ -55,46 +52,6 @@ class Verdict(StrEnum):
     OFF_CENTRE = "off centre"
     CROWDED = "crowded"
     MISFIT = "misfit"  # unlike its neighbours: a blend, a galaxy, a cosmic ray
-
-
-@dataclass(frozen=True)
-class BrightStars:
-    """Stars that are good enough to learn from."""
-
-    wide: np.ndarray  # (n, s, s), sky-subtracted stamps with a margin, counts
-    peak: np.ndarray  # (n, 2), brightest pixel (row, column) from index (s//2, s//2)
-    centre: np.ndarray  # (n, 2), centroid from the same index
-    position: np.ndarray  # (n, 2), x, y in the image, NaN where unknown
-    flux: np.ndarray  # (n,), counts inside the stamp
-    noise: np.ndarray  # (n,), RMS of the sky per pixel in counts
-    snr: np.ndarray  # (n,)
-    row: np.ndarray  # (n,), of the catalogue
-    listed: np.ndarray  # (n, 2), centre by the catalogue from index (s//2, s//2), NaN if unknown
-
-    def __len__(self) -> int:
-        return len(self.wide)
-
-    def of(self, chosen: np.ndarray) -> BrightStars:
-        """Some of the stars, by a mask or by indices."""
-        return BrightStars(*(getattr(self, field.name)[chosen] for field in fields(self)))
-
-    def area(self) -> np.ndarray:
-        """Noise-equivalent area A = (F / (σ S/N))² of each star in pixels, shape (n,)."""
-        return (self.flux / (self.noise * self.snr)) ** 2
-
-    def aligned(self) -> np.ndarray:
-        """The stars of flux 1, moved to a common centre, index (s//2, s//2); shape (n, s, s)."""
-        return moved(self.wide, -self.centre) / self.flux[:, None, None]
-
-    def sky_photons(self, gain: float | None, otherwise: float) -> float:
-        """Photons per pixel whose Poisson noise is the sky's, read noise included.
-
-        From the electrons per count; `otherwise` where they are unknown. At most `MOST_SKY`, beside
-        which no star has photons that count.
-        """
-        if gain is None:
-            return otherwise
-        return float(np.clip(np.median(self.noise) * gain, LEAST_SKY**0.5, MOST_SKY**0.5) ** 2)
 
 
 @dataclass(frozen=True)
@@ -160,7 +117,8 @@ def collect(observation: Observation, settings: CalibrationStars, framing: Stamp
     verdict[row[flux <= 0]] = Verdict.MISFIT
     good = verdict[row] == Verdict.GOOD
     wide, peak, listed, flux, row = (a[good] for a in (wide, peak, listed, flux, row))
-    centre = star_centres(wide, peak, window_of(snr[row], flux, noise[row]))
+    window = window_of(snr[row], flux, noise[row])
+    centre = windowed_centres(wide, peak, window, REGISTRATION_ROUNDS, FARTHEST_PX)
     bright = BrightStars(
         wide, peak, centre, found["position"][row], flux, noise[row], snr[row], row, listed
     )
@@ -315,38 +273,6 @@ def brightest_pixels(wide: np.ndarray, search_px: int) -> tuple[np.ndarray, np.n
     return peak, np.abs(peak).max(axis=1, initial=0) <= search_px
 
 
-def star_centres(wide: np.ndarray, peak: np.ndarray, window_px: np.ndarray) -> np.ndarray:
-    """Centroids under a Gaussian window that follows the star (Bertin's XWIN), shape (n, 2).
-
-    Parameters
-    ----------
-    wide : ndarray, shape (n, s, s)
-        Sky-subtracted.
-    peak : ndarray, shape (n, 2)
-        Where to start, (row, column) from index (s//2, s//2).
-    window_px : ndarray, shape (n,)
-        σ of the window, about that of the star.
-
-    Returns
-    -------
-    ndarray, shape (n, 2)
-        (row, column) from index (s//2, s//2), at most 1.5 px per axis from `peak`.
-    """
-    axis = np.arange(wide.shape[-1]) - wide.shape[-1] // 2
-    centre = peak.astype(np.float64)
-    width = window_px[:, None] ** 2
-    for _ in range(REGISTRATION_ROUNDS):
-        rows, columns = (axis - centre[:, i : i + 1] for i in (0, 1))
-        weight = np.exp(-0.5 * rows**2 / width)[:, :, None]
-        light = weight * np.exp(-0.5 * columns**2 / width)[:, None, :] * wide
-        total = light.sum(axis=(1, 2))
-        moments = [np.einsum("nij,ni->n", light, rows), np.einsum("nij,nj->n", light, columns)]
-        # A window as wide as the star halves the distance of the centroid, hence the 2.
-        step = 2.0 * np.stack(moments, axis=1) / np.where(total > 0, total, np.inf)[:, None]
-        centre = np.clip(centre + step, peak - 1.5, peak + 1.5)
-    return centre
-
-
 def window_of(snr: np.ndarray, flux: np.ndarray, noise: np.ndarray) -> np.ndarray:
     """σ in pixels of the Gaussian with the noise-equivalent area of a star, shape (n,).
 
@@ -354,16 +280,6 @@ def window_of(snr: np.ndarray, flux: np.ndarray, noise: np.ndarray) -> np.ndarra
     """
     area = (flux / (noise * snr)) ** 2
     return np.maximum(np.sqrt(area / (4.0 * np.pi)), 0.7)
-
-
-def moved(wide: np.ndarray, shift: np.ndarray) -> np.ndarray:
-    """Stamps (n, s, s) moved by (row, column) pixels, splines of `SHIFT_ORDER`."""
-    from scipy import ndimage
-
-    out = np.empty(wide.shape)
-    for image, step, target in zip(wide, shift, out, strict=True):
-        ndimage.shift(image, step, target, order=SHIFT_ORDER, mode="nearest")
-    return out
 
 
 def misfit(aligned: np.ndarray, position: np.ndarray, noise: np.ndarray) -> np.ndarray:
@@ -408,7 +324,6 @@ def misfit(aligned: np.ndarray, position: np.ndarray, noise: np.ndarray) -> np.n
 
 def _usual(stars: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Median and robust variance of every pixel of some stars."""
-    median = np.median(stars, axis=0)
-    scatter = 1.4826 * np.median(np.abs(stars - median), axis=0)
+    scatter = robust_scatter(stars)
     # A dozen stars may agree in a pixel by chance.
-    return median, scatter**2 + np.median(scatter) ** 2
+    return np.median(stars, axis=0), scatter**2 + np.median(scatter) ** 2

@@ -13,9 +13,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from psfdae.bright_stars import BrightStars
 from psfdae.files import Column
-from psfdae.image.selection import BrightStars, brightest_pixels, moved
+from psfdae.image.selection import brightest_pixels
 from psfdae.image.stamps import cut
+from psfdae.moments import moved
 from psfdae.splits import draw_jitter, draw_phase
 
 if TYPE_CHECKING:

@@ -9,7 +9,17 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 import numpy as np
 
 from psfdae.files import as_yaml, write_text
-from psfdae.method import CONFIG, HISTORY, FitError, Method, TrainingSet
+from psfdae.method import (
+    CONFIG,
+    HISTORY,
+    FitError,
+    Look,
+    Method,
+    Needs,
+    Packing,
+    Storage,
+    TrainingSet,
+)
 from psfdae.networks.settings import DaeSettings, Train
 from psfdae.reading import from_tree, read_yaml
 from psfdae.settings import deciding
@@ -41,17 +51,17 @@ class Dae(Method):
         Course of the training.
     """
 
-    label, color, marker = "DAE", "#0072b2", "D"
-    paper = ("dae", "DAE")
+    look = Look("DAE", "#0072b2", "D", paper=("dae", "DAE"))
+    needs = Needs(validation=True, memory_mb=1500, minutes=60)
+    storage = Storage(
+        files=(WEIGHTS, CONFIG),
+        diagnostics=(HISTORY,),
+        per_reference=True,
+        rule="train",
+        about="Folder of a trained network.",
+    )
+    packing = Packing(suffix="")
     groups: ClassVar = {"dae": DaeSettings, "train": Train}
-    per_reference = True
-    validates = True
-    files = (WEIGHTS, CONFIG)
-    diagnostics = (HISTORY,)
-    rule = "train"
-    suffix = ""
-    about = "Folder of a trained network."
-    memory_mb, minutes = 1500, 60
 
     def __init__(
         self,
@@ -65,13 +75,8 @@ class Dae(Method):
         self.diagnosed = {HISTORY: history or []}
 
     @classmethod
-    def threads(cls, config: Any) -> int:
-        """Those of the training."""
-        return int(config.train.threads)
-
-    @classmethod
     def continues(cls, config: Any) -> bool:
-        """As set."""
+        """Whether a training on templates goes on from one on the realisations."""
         return bool(config.train.continued_epochs)
 
     @classmethod
@@ -138,7 +143,7 @@ class Dae(Method):
     def load(
         cls, place: Path, reference: str = "realisation", evaluation: Evaluation | None = None
     ) -> Dae:
-        """As `Method.require`; the two files must be of the same training."""
+        """Read a network; the two files must be of the same training."""
         import torch
 
         from psfdae.networks.dae import Dae as Network

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from psfdae.method import Look, Needs
 from psfdae.methods.gmm import GaussianMixture
 
 
@@ -11,7 +12,6 @@ from psfdae.methods.gmm import GaussianMixture
 class PlacedMixture(GaussianMixture):
     """A mixture of images, references and positions."""
 
-    label, color, marker = "GMM", "#882255", "X"
-    drawn = False
-    needs_position = True
-    bundled = False
+    look = Look("GMM", "#882255", "X", drawn=False)
+    needs = Needs(level=True, position=True)
+    packing = None

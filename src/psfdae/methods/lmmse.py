@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from psfdae.method import Method, TrainingSet
+from psfdae.method import Look, Method, Needs, TrainingSet
 from psfdae.noise import NoiseModel
 
 
@@ -30,10 +30,9 @@ class LinearMmse(Method):
     noise : NoiseModel
     """
 
-    label, color, marker = "linear MMSE", "#009e73", "^"
-    drawn = False
-    needs_level = True
-    stored = False
+    look = Look("linear MMSE", "#009e73", "^", drawn=False)
+    needs = Needs(level=True)
+    storage = None
 
     mean_x: np.ndarray
     mean_y: np.ndarray

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from psfdae.method import Method, TrainingSet
+from psfdae.method import Look, Method, TrainingSet
 
 
 class Noisy(Method):
     """The image as it is."""
 
-    label, color, marker = "noisy", "#4d4d4d", "o"
-    paper = ("original_noise", "original-noise")
-    restores = False
-    stored = False
+    look = Look("noisy", "#4d4d4d", paper=("original_noise", "original-noise"), restores=False)
+    storage = None
 
     @classmethod
     def fit(cls, data: TrainingSet) -> Noisy:

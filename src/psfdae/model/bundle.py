@@ -32,7 +32,7 @@ from psfdae.errors import Error
 from psfdae.extras import needed_by
 from psfdae.files import ProductError, atomic_path
 from psfdae.image.errors import one_line
-from psfdae.method import Method
+from psfdae.method import HasConditions, Method
 from psfdae.methods import method
 from psfdae.model.photometry import FluxModel
 from psfdae.networks.weights import digest_of
@@ -75,7 +75,7 @@ class Bundle:
     rms: np.ndarray  # (S, d, d), root mean square
     ratio95: np.ndarray  # (S,), error68 times this holds 95 %
     distance_limit: float  # 99.9 % quantile of the distance of test stars (`mahalanobis`)
-    # (S,), 99.9 % quantile of `Method.strangeness`, if the method knows it
+    # (S,), 99.9 % quantile of the outlier score, if the method has one
     strange_limit: np.ndarray | None = None
     # (S, 2, 3, 2), by how much 68 % and 95 % of the errors are wider than that: where the noise is
     # known or estimated; where flux and sky are known, the sky is, or neither; and in faint or in
@@ -133,7 +133,8 @@ def estimator(bundle: Bundle) -> Method:
     blank = np.zeros((1, info.stamp_px, info.stamp_px), np.float32)
     try:
         fitted = found.unpack(bundle.weights, info)
-        for name, wanted, right in fitted.lawful():
+        conditions = fitted.conditions() if isinstance(fitted, HasConditions) else ()
+        for name, wanted, right in conditions:
             if not np.all(right):
                 raise ValueError(f"array {name!r} must have {wanted}")
         if fitted.estimate(blank, np.array([info.noise_max])).psf.shape != blank.shape:

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from psfdae.extras import needed_by
-from psfdae.method import Method
+from psfdae.fits import described_by
+from psfdae.method import FreesFlux, Method
 from psfdae.methods import groups_of
 from psfdae.methods import method as method_of
 from psfdae.model.packing import bundle_of
@@ -73,7 +74,7 @@ def fit(
 def makes_models(name: str) -> bool:
     """Whether a method makes a model that can be saved, and knows all that it needs of an image."""
     kind = method_of(name)
-    return kind.stored and kind.bundled
+    return kind.storage is not None and kind.packing is not None
 
 
 def model_method(name: str) -> type[Method]:
@@ -105,7 +106,8 @@ def fitted_to(stars: Stars, kind: type[Method], checkpoint: Path | None = None) 
 def described(stars: Stars, kind: type[Method]) -> dict[str, Any]:
     """Settings that decide a fit, as its product and its model say them."""
     own = stars.settings.model_dump(include={*groups_of(kind.name)})
-    return own | {"split": SPLIT} | ({"reference": REFERENCE} if kind.per_reference else {})
+    tree: dict[str, Any] = described_by(kind, own, SPLIT, REFERENCE)
+    return tree
 
 
 def best(stars: Stars, fitted: Mapping[str, Method]) -> tuple[str, dict[str, float]]:
@@ -122,11 +124,12 @@ def best(stars: Stars, fitted: Mapping[str, Method]) -> tuple[str, dict[str, flo
         found, kind = fit_of_all, type(fit_of_all)
         data = training_set(settings, kind, product, SPLIT, REFERENCE)
         with fixed_threads(kind.threads(settings)):
-            if not kind.validates:
+            if not kind.needs.validation:
                 found = fit_apart(kind, data, product["field_index"], settings)
             rng = stream(settings.seed, "noise", "own stars")
             noisy = [noise_model(settings).draw(truth, level, rng) for level in data.levels]
-            free = found.free_flux()  # as of the stars that the model is for
+            # As of the stars that the model is for.
+            free = found.free_flux() if isinstance(found, FreesFlux) else found
             logs = []
             for images, level in zip(noisy, data.levels, strict=True):
                 psf = free.restore(images, level, where)

@@ -25,7 +25,7 @@ import numpy as np
 
 from psfdae.bundle_info import BundleInfo
 from psfdae.files import Product, ProductError
-from psfdae.method import Estimate, Method
+from psfdae.method import Estimate, FindsFlux, FreesFlux, MeasuresStars, Method, ScoresOutliers
 from psfdae.model.bundle import (
     SCALES,
     Bundle,
@@ -84,7 +84,7 @@ class Errors:
     error: np.ndarray  # (S, N, d, d), float32
     star: np.ndarray  # (N,), of every error
     distance: np.ndarray  # (S, N), Mahalanobis', of the noisy images
-    strangeness: np.ndarray | None = None  # (S, N), if the method knows it
+    outlier_score: np.ndarray | None = None  # (S, N), if the method has one
 
     def of(self, chosen: np.ndarray) -> Errors:
         """Those of some stars, from a mask over stars."""
@@ -109,11 +109,11 @@ class Errors:
 
         The excess over a node's median is taken to be as usual at all of them.
         """
-        if self.strangeness is None:
+        if self.outlier_score is None:
             return None
-        usual = np.median(self.strangeness, axis=1)
-        spread = np.median(np.abs(self.strangeness - usual[:, None]), axis=1)
-        excess = (self.strangeness - usual[:, None]) / np.maximum(spread, 1e-12)[:, None]
+        usual = np.median(self.outlier_score, axis=1)
+        spread = np.median(np.abs(self.outlier_score - usual[:, None]), axis=1)
+        excess = (self.outlier_score - usual[:, None]) / np.maximum(spread, 1e-12)[:, None]
         return np.asarray(usual + spread * np.quantile(excess, LIMIT))
 
     def distance_limit(self) -> float:
@@ -246,7 +246,7 @@ def packed(
     # Mostly the first one will do, and each takes a while.
     least = 0 if small(0) else bisect_left(range(STEPS), True, key=small)
     if least == STEPS:
-        raise BundleError(f"{fitted.label}: takes more than {largest / 1e6:.2g} MB")
+        raise BundleError(f"{fitted.look.label}: takes more than {largest / 1e6:.2g} MB")
     return made(least)
 
 
@@ -291,18 +291,19 @@ def measure_errors(
     star = _repeated(len(stars.images), LEAST_STARS)
     error = np.empty((len(nodes), star.size, *stars.images.shape[1:]), np.float32)
     distance = np.empty((len(nodes), star.size))
-    strangeness, free = [], fitted.free_flux()
+    scores = []
+    free = fitted.free_flux() if isinstance(fitted, FreesFlux) else fitted
     for place, noise in enumerate(nodes):
         level = noise / stars.noise.kappa
         noisy = stars.noise.draw(stars.images[star], level, rng)
         estimate = fitted.estimate(noisy, level, stars.position[star])
         error[place] = errors_of(estimate, stars.references[star])
-        found = estimate.strangeness
-        if found is None:
-            found = free.strangeness(noisy, np.full(star.size, level))
-        strangeness.append(found)
+        found = estimate.outlier_score
+        if found is None and isinstance(free, ScoresOutliers):
+            found = free.outlier_score(noisy, np.full(star.size, level))
+        scores.append(found)
         distance[place] = mahalanobis(noisy, np.full(star.size, noise), model, COMPONENTS)
-    known = [node for node in strangeness if node is not None]
+    known = [node for node in scores if node is not None]
     return Errors(nodes, error, star, distance, np.stack(known) if known else None)
 
 
@@ -358,7 +359,7 @@ def with_scales(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -
                 width[0, estimated, case, kind, place] = np.quantile(error[pixels], COVERAGE)
                 width[1, estimated, case, kind, place] = np.quantile(wide[pixels], WIDE)
             # A method that measures stars knows how sure it is of their flux.
-            if estimated and not known and not model.engine.estimator.measures:
+            if estimated and not known and not isinstance(model.engine.estimator, MeasuresStars):
                 scatter = np.abs(found.flux - 1.0)[usable] / found.flux_error[usable]
                 of_flux[place] = np.quantile(scatter, WIDE) / NORMAL_WIDE
     # Where a star has light that the photometry does not know, its noise is found too large.
@@ -386,7 +387,7 @@ def misfit(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -> flo
     tried = (0.0, *nodes)
     for value in tried:
         model = PsfModel(replace(bundle, info=bundle.info.model_copy(update={"misfit": value})))
-        if model.engine.free_flux is model.engine.estimator or model.engine.estimator.measures:
+        if not isinstance(model.engine.estimator, FindsFlux):
             break
         found = [(model.predict(images), stars.references[star]) for images, star in noisy]
         logs = [

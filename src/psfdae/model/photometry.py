@@ -31,6 +31,7 @@ from typing import NamedTuple
 import numpy as np
 
 from psfdae.image.stamps import Stamps, StarFlag, border_pixels, raise_flag
+from psfdae.moments import SIGMA_OF_MAD
 
 FAINT_SNR = 3.0  # flux in units of its error below which a star is faint
 CLIP = 5.0  # σ of the noise by which pixels may leave the range of the training set
@@ -236,7 +237,7 @@ def _least_absolute(x: np.ndarray, finite: np.ndarray, mean: np.ndarray) -> np.n
 
 def _scatter(modulus: np.ndarray, used: np.ndarray) -> np.ndarray:
     """Standard deviation of a normal variable from the median of its modulus."""
-    return 1.4826 * np.nanmedian(np.where(used, modulus, np.nan), axis=1)
+    return SIGMA_OF_MAD * np.nanmedian(np.where(used, modulus, np.nan), axis=1)
 
 
 def _generalised_least_squares(
@@ -561,7 +562,7 @@ def _clipped_rms(score: np.ndarray) -> np.ndarray:
         median = np.take_along_axis(ascending, middle, axis=1)
     else:
         median = np.median(modulus, axis=1, keepdims=True)
-    kept = ~unused & (modulus <= SCATTER_CLIP * 1.4826 * median)
+    kept = ~unused & (modulus <= SCATTER_CLIP * SIGMA_OF_MAD * median)
     squares = np.where(kept, modulus, 0.0)
     count = kept.sum(axis=1)
     total = np.einsum("ij,ij->i", squares, squares)

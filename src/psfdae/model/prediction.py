@@ -64,10 +64,11 @@ class Prediction:
         known, the star's own photon noise. Stars that a model has learnt from have less than 1.
     distance : ndarray, shape (n,), float64
         Mahalanobis distance from the training set (`psfdae.model.bundle.mahalanobis`).
-    strangeness : ndarray, shape (n,), float64
-        The same, squared, by the model's own law of stars; NaN where it has none.
+    outlier_score : ndarray, shape (n,), float64
+        −2 ln of the probability density of the star by the model's own law of stars, in its leading
+        components: the square of a Mahalanobis distance. NaN where it has no law.
     fwhm_px, ellipticity, position_angle_deg : ndarray, shape (n,), float64
-        Of the PSF (`psfdae.model.shapes`).
+        Of the PSF (`psfdae.moments`).
     x_fit, y_fit : ndarray, shape (n,), float64
         Centre of the star, 0-based: in the image where the star was cut from one, else in
         its stamp. NaN if the model's method measures none, and so all that follows.
@@ -93,7 +94,7 @@ class Prediction:
     snr: np.ndarray
     chi2: np.ndarray
     distance: np.ndarray
-    strangeness: np.ndarray
+    outlier_score: np.ndarray
     fwhm_px: np.ndarray
     ellipticity: np.ndarray
     position_angle_deg: np.ndarray
@@ -114,6 +115,11 @@ class Prediction:
 
     def __len__(self) -> int:
         return len(self.psf)
+
+    @property
+    def strangeness(self) -> np.ndarray:
+        """Former name of `outlier_score`."""
+        return self.outlier_score
 
     def first(self, count: int) -> Self:
         """The same of the first stars."""
@@ -170,7 +176,7 @@ COLUMNS: dict[str, tuple[str, str | None, str]] = {
     "ratio95_bright": ("D", None, "the same in the brightest 8 % of the pixels"),
     "chi2": ("D", None, "squared residuals over their expectation"),
     "distance": ("D", None, "Mahalanobis distance from the training set"),
-    "strangeness": ("D", None, "its square by the model's own law of stars"),
+    "outlier_score": ("D", None, "its square by the model's own law of stars"),
     "fwhm_px": ("D", "pix", "of the PSF, adaptive moments"),
     "ellipticity": ("D", None, "1 - b/a of the PSF"),
     "position_angle_deg": ("D", "deg", "of the major axis, from +x to +y"),

@@ -25,7 +25,7 @@ from psfdae.image.stamps import (
     displacement,
     raise_flag,
 )
-from psfdae.method import Estimate, FitError
+from psfdae.method import Estimate, FindsFlux, FreesFlux, KnowsField, MeasuresStars, Packing
 from psfdae.model.bundle import (
     Bundle,
     at_noise,
@@ -37,7 +37,7 @@ from psfdae.model.bundle import (
 )
 from psfdae.model.photometry import FAINT_SNR, KEPT, NOISE_FLOOR, Photometer, Photometry
 from psfdae.model.prediction import Prediction, measured_of, unmeasured
-from psfdae.model.shapes import measure_shapes
+from psfdae.moments import measure_shapes
 from psfdae.threads import available_cores, in_order, side_by_side
 
 SCALE_TOLERANCE = 0.02  # relative difference of the pixel scale from that of the training
@@ -237,14 +237,14 @@ class PsfModel:
             raise PredictionError("positions must be finite, one x and y or arrays of as many")
         if not 1 <= oversampling <= MOST_OVERSAMPLED:
             raise PredictionError(f"oversampling {oversampling}: 1 to {MOST_OVERSAMPLED}")
-        try:
-            with np.errstate(all="ignore"):
-                found = self.engine.estimator.psf_at(position.reshape(-1, 2), oversampling)
-        except FitError as error:
+        field = self.engine.estimator
+        if not isinstance(field, KnowsField):
             raise PredictionError(
-                f"the model {self.info.name!r}: {error}; psfdae from-stars --method field makes "
-                "one that does"
-            ) from None
+                f"the model {self.info.name!r}: {field.look.label}: knows the PSF of a star alone, "
+                "not that of a place; psfdae from-stars --method field makes one that does"
+            )
+        with np.errstate(all="ignore"):
+            found = field.psf_at(position.reshape(-1, 2), oversampling)
         flux = found.sum(axis=(1, 2))
         usable = np.isfinite(flux) & (flux > 0)
         if not usable.all():
@@ -338,8 +338,11 @@ class Engine:
     def __init__(self, bundle: Bundle) -> None:
         self.bundle = bundle
         self.estimator = estimator(bundle)
-        self.free_flux = self.estimator.free_flux()
-        together = self.estimator.together
+        self.free_flux = (
+            self.estimator.free_flux() if isinstance(self.estimator, FreesFlux) else self.estimator
+        )
+        packing = self.estimator.packing or Packing()
+        together, self._padded = packing.together, packing.padded
         self.size = min(together, max(1, together * WHOLE_PX**2 // bundle.info.stamp_px**2))
         self._photometer = Photometer(bundle.flux_model, bundle.info.components)
 
@@ -350,7 +353,7 @@ class Engine:
     def block(self, stars: Stamps, fixed: bool = False) -> Prediction:
         """PSFs of at most `size` stars, whose listed centres are exact if `fixed`."""
         count = len(stars)
-        size = self.size if self.estimator.padded else 1
+        size = self.size if self._padded else 1
         if count < size:
             stars = _filled(stars, self.bundle, size)
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
@@ -366,7 +369,7 @@ class Engine:
             raise_flag(flags, StarFlag.SKY_OFF, unlike_sky)
         found = self._photometer.measure(stamps, bad, start, stars)
         of_star: dict[str, np.ndarray] = {}
-        if self.estimator.measures:
+        if isinstance(self.estimator, MeasuresStars):
             estimate, found, of_star = self._measured(
                 stars, stamps, bad, shift, start, exact, found
             )
@@ -391,17 +394,17 @@ class Engine:
         flags |= found.flags
         raise_flag(flags, StarFlag.SNR_LOW, snr < info.snr_min / SNR_TOLERANCE)
         # What measures stars knows their noise, and comes ever nearer to the star itself.
-        limited = not self.estimator.measures
+        limited = estimate is None
         raise_flag(flags, StarFlag.SNR_HIGH, limited & (snr > info.snr_max * SNR_TOLERANCE))
-        unlike, strangeness = distance > bundle.distance_limit, np.full(len(noise), np.nan)
+        unlike, score = distance > bundle.distance_limit, np.full(len(noise), np.nan)
         if bundle.strange_limit is not None and not lost.all():
             level = noise[~lost] / info.kappa
-            strangeness[~lost] = (
-                self.free_flux.strangeness(found.images[~lost], level)
+            score[~lost] = (
+                self.free_flux.outlier_score(found.images[~lost], level)
                 if estimate is None
-                else estimate.strangeness[~lost]
+                else estimate.outlier_score[~lost]
             )
-            unlike |= strangeness > np.interp(noise, bundle.noise_nodes, bundle.strange_limit)
+            unlike |= score > np.interp(noise, bundle.noise_nodes, bundle.strange_limit)
         raise_flag(flags, StarFlag.UNLIKE_TRAINING, unlike)
         chi2 = _chi2(residual, psf, doubt, found.noise, stars.gain)
         raise_flag(flags, StarFlag.POOR_FIT, chi2 > MOST_CHI2)
@@ -419,7 +422,7 @@ class Engine:
             snr=snr,
             chi2=chi2,
             distance=distance,
-            strangeness=strangeness,
+            outlier_score=score,
             fwhm_px=shapes.fwhm_px,
             ellipticity=shapes.ellipticity,
             position_angle_deg=shapes.position_angle_deg,
@@ -540,7 +543,7 @@ class Engine:
             return images, np.where(lost, info.noise_max, noise)
 
         free = free & ~lost
-        if free.any() and self.free_flux is not self.estimator:
+        if free.any() and isinstance(self.free_flux, FindsFlux):
             images, noise = current()
             flux = self.free_flux.flux(images, np.hypot(noise, info.misfit) / info.kappa)
             free &= np.isfinite(flux)  # a damaged model may find none

@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from psfdae.figure_style import SERIES_COLORS, new_figure, styled
-from psfdae.image.selection import Verdict, moved
+from psfdae.image.selection import Verdict
 from psfdae.image.stamps import StarFlag, cut
 from psfdae.model.plot import SPOILT
-from psfdae.model.shapes import measure_shapes
+from psfdae.moments import measure_shapes, moved
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -313,7 +313,7 @@ def _labels(q: Quality) -> dict[str, str]:
     from psfdae.methods import method
 
     names = dict.fromkeys(q.errors["method"])
-    return {n: MEAN_LABEL if n == MEAN_PSF else method(n).label for n in names}
+    return {n: MEAN_LABEL if n == MEAN_PSF else method(n).look.label for n in names}
 
 
 @styled

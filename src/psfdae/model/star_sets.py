@@ -9,8 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from psfdae.bright_stars import BrightStars
 from psfdae.files import Product, ProductError, read_product
-from psfdae.method import BrightStamps, Method, TrainingSet
+from psfdae.fits import learnt
+from psfdae.method import MeasuresStars, Method, TrainingSet
 from psfdae.noise import NoiseModel, OwnNoise, noise_equivalent_px
 from psfdae.rng import stream
 from psfdae.splits import Split, held_out_split, random_split
@@ -100,12 +102,11 @@ def training_set(
     parts = split_stars(stars, split, config)
     if of_image(stars):
         more["own_noise"] = _own_noise(stars, config.noise.background_photons)
-        if kind.measures:
-            *names, _ = BrightStamps._fields
-            more["bright"] = BrightStamps(*map(stars.__getitem__, names), stars["field_index"])
+        if issubclass(kind, MeasuresStars):
+            more |= {"bright": BrightStars.of_product(stars), "star": stars["field_index"]}
     return TrainingSet(
         images=stars["realisation"],
-        references=stars["template" if kind.stored and not kind.per_reference else reference],
+        references=stars[learnt(kind, reference)],
         fit=parts.fit,
         validation=parts.validation,
         levels=np.asarray(config.noise.levels),

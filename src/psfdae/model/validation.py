@@ -13,7 +13,7 @@ import numpy as np
 from psfdae.figure_style import as_png
 from psfdae.files import write_text
 from psfdae.image.stamps import Stamps
-from psfdae.method import Method
+from psfdae.method import Method, facts_of
 from psfdae.methods import method as method_of
 from psfdae.metrics import all_metrics, mse, quality, summarised
 from psfdae.model.packing import checksum
@@ -220,7 +220,7 @@ class Report:
 
     def __str__(self) -> str:
         kind = type(self.model.engine.estimator)
-        return standing(self.table, kind.name, kind.label)
+        return standing(self.table, kind.name, kind.look.label)
 
     def save(self, path: str | Path) -> None:
         """Write the page, one HTML file that needs no other."""
@@ -240,10 +240,11 @@ class Report:
         truth = product[REFERENCE][parts.test][shown]
         rows = [StripRow("bright\nstar", truth)]
         for method in self.methods.values():
-            if method.drawn:
+            look = method.look
+            if look.drawn:
                 stamps = method.restore(noisy, level, place)[shown]
                 error = mse(stamps, truth)
-                rows.append(StripRow(method.label, stamps, error, own_scale=not method.restores))
+                rows.append(StripRow(look.label, stamps, error, own_scale=not look.restores))
         columns = [f"S/N {value:.0f}" for value in product["snr"][star[shown]]]
         found = signal_to_noise(settings.noise.kappa * level, area)
         title = f"Bright stars that no training saw, degraded to S/N {found:.3g}"
@@ -266,7 +267,7 @@ class Report:
                 name=info.name,
                 image=stars.observation.path.name,
                 method=kind.name,
-                label=kind.label,
+                label=kind.look.label,
                 notes=stars.notes,
                 errors=self.table,
                 coverage={r["snr"]: r["coverage68"] for r in info.metrics if "coverage68" in r},
@@ -276,7 +277,7 @@ class Report:
                 bright=psf[shown] + residual,
                 strip=as_png(self.strip()),
                 field=None if stars.observation.positions is None else _map(found, psf, stars),
-                facts=[*model.engine.estimator.facts().values()],
+                facts=facts_of(model.engine.estimator),
             )
         )
 

@@ -48,4 +48,4 @@ def all_groups() -> tuple[str, ...]:
 def oracles_last(names: Any) -> list[type[Method]]:
     """Methods among some names in the order of legends: those that are given λ at the end."""
     kinds = [kind for kind in registered() if kind.name in set(names)]
-    return sorted(kinds, key=lambda kind: kind.needs_level)
+    return sorted(kinds, key=lambda kind: kind.needs.level)

@@ -29,7 +29,7 @@ TRAINED = {
 
 def models() -> tuple[str, ...]:
     """What a sweep may train: methods that are fitted to a file, and networks of scene 3."""
-    return (*(kind.name for kind in registered() if kind.stored), *TRAINED)
+    return (*(kind.name for kind in registered() if kind.storage), *TRAINED)
 
 
 def _trainable(name: str) -> str:

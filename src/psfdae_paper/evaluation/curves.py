@@ -146,9 +146,9 @@ def _method_handles(methods: set[str], published: Set[str] = frozenset()) -> lis
     handles = []
     for kind in oracles_last(methods | published):
         if kind.name in methods:
-            handles.append(Line2D([], [], **_line(kind), label=kind.label))
+            handles.append(Line2D([], [], **_line(kind), label=kind.look.label))
         if kind.name in published:
-            handles.append(Line2D([], [], **_paper_marker(kind), label=f"{kind.label}, paper"))
+            handles.append(Line2D([], [], **_paper_marker(kind), label=f"{kind.look.label}, paper"))
     return handles
 
 
@@ -313,7 +313,7 @@ def _of_methods(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def _line(kind: type[Method]) -> dict[str, Any]:
-    return {"color": kind.color, "marker": kind.marker, "lw": 1.4, "ms": 4.5}
+    return {"color": kind.look.color, "marker": kind.look.marker, "lw": 1.4, "ms": 4.5}
 
 
 def _finish_panel(axes: Axes, reference: str, levels: np.ndarray) -> None:
@@ -398,8 +398,8 @@ def _errors(
         # The lowest line is near the one above, and has room below where noise is least.
         last = kind is methods[-1]
         named = line[:1] if last else line
-        name = kind.label.partition(" (")[0]  # what it is given stands beside its stars
-        _name(axes, named["noise_level"], named["mse"], name, kind.color, below=last)
+        name = kind.look.label.partition(" (")[0]  # what it is given stands beside its stars
+        _name(axes, named["noise_level"], named["mse"], name, kind.look.color, below=last)
     best = bounds[bounds.method == "bayes"].sort_values("noise_level")
     tight = best[best.tight == "yes"]
     axes.plot(best["noise_level"], best["value"], color=BAYES["color"], ls="--", lw=1.2)

@@ -46,7 +46,7 @@ class FieldOfPsfs:
     energy : ndarray, shape (F,)
         Fraction of the light inside the stamp.
     fwhm_arcsec, ellipticity, position_angle_deg : ndarray, shape (F,)
-        As `psfdae.model.shapes.Shapes`.
+        As `psfdae.moments.Shapes`.
     """
 
     psf: np.ndarray

@@ -12,16 +12,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from math import isqrt
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from pydantic import Field
 
-from psfdae.belonging import require
-from psfdae.files import Column, Product, read_product, write_product
-from psfdae.method import FitError, Method, TrainingSet
+from psfdae.files import Column, write_product
+from psfdae.method import FitError, Look, Method, Needs, Storage, TrainingSet
 from psfdae.rng import stream
 from psfdae.settings import Count, Group, Positive
 
@@ -103,22 +101,23 @@ class PcaSom(Method):
     fits : tuple of PcaFit
     """
 
-    label, color, marker = "PCA+SOM", "#d55e00", "s"
-    paper = ("pca", "PCA")
-    needs_level = True
+    look = Look("PCA+SOM", "#d55e00", "s", paper=("pca", "PCA"))
+    needs = Needs(level=True, minutes=20)
+    storage = Storage(
+        arrays={
+            "level": ("1", "noise level λ of each fit; 0: one for all"),
+            "mean": ("1", "mean training image of each fit"),
+            "components": ("1", "eigenvectors of each fit, rows"),
+            "nodes": ("1", "map nodes of all fits in feature space"),
+            "psf": ("1", "mean star image of each node's cluster"),
+            "owner": ("1", "number of each node's fit"),
+        },
+        rule="baseline",
+        run="baseline",
+        about="Product of the stage baseline.",
+    )
+    packing = None
     groups: ClassVar = {"baseline": Baseline}
-    rule = kind = "baseline"
-    about = "Product of the stage baseline."
-    arrays: ClassVar = {
-        "level": ("1", "noise level λ of each fit; 0: one for all"),
-        "mean": ("1", "mean training image of each fit"),
-        "components": ("1", "eigenvectors of each fit, rows"),
-        "nodes": ("1", "map nodes of all fits in feature space"),
-        "psf": ("1", "mean star image of each node's cluster"),
-        "owner": ("1", "number of each node's fit"),
-    }
-    bundled = False
-    minutes = 20
 
     level: np.ndarray
     fits: tuple[PcaFit, ...]
@@ -178,7 +177,7 @@ class PcaSom(Method):
         values["owner"] = np.repeat(
             np.arange(len(self.fits)), [len(fit.nodes) for fit in self.fits]
         )
-        columns = {name: Column(values[name], *said) for name, said in self.arrays.items()}
+        columns = {name: Column(values[name], *said) for name, said in self.stored().items()}
         write_product(place, self.name, columns, described)
 
     @classmethod
@@ -192,15 +191,6 @@ class PcaSom(Method):
             arrays["level"],
             tuple(PcaFit(m, c, arrays["nodes"][o], arrays["psf"][o]) for m, c, o in each),
         )
-
-    @classmethod
-    def require(cls, place: Path, stars: Product, config: Any, split: str, reference: str) -> None:
-        """As `Method.require`; images must have the stars' size, too."""
-        pixels = read_product(place, cls.name, ("mean",))["mean"].shape[-1]
-        sides = (isqrt(pixels), stars["realisation"].shape[-1])
-        here, there = ({"framing": {"stamp_px": side}} for side in sides)
-        require(place, here, ("framing.stamp_px",), there, stars.path)
-        super().require(place, stars, config, split, reference)
 
     def predict(self, images: np.ndarray, level: float | np.ndarray) -> np.ndarray:
         """PSF of every image, shape (n, d, d), by the fit of the nearest λ on a logarithmic scale.

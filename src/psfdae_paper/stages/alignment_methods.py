@@ -30,6 +30,7 @@ from psfdae.files import (
     write_product,
     write_text,
 )
+from psfdae.fits import store
 from psfdae.method import CONFIG, HISTORY, TrainingSet
 from psfdae.methods.dae import Dae
 from psfdae.model.star_sets import noise_model
@@ -103,7 +104,7 @@ def train_dae(
         seed=config.seed,
         checkpoint=checkpoint,
     )
-    Dae.fit(data, config.dae, config.dae_train).store(out, config.model_dump(), on)
+    store(Dae.fit(data, config.dae, config.dae_train), out, config.model_dump(), on)
     checkpoint.unlink(missing_ok=True)
 
 

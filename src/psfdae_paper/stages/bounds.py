@@ -644,7 +644,7 @@ def _column(
         for method, errors in methods.groupby("method", sort=False):
             if bound != "floor" and (
                 method in POSTERIOR_MEANS
-                or POSTERIOR_MEANS[bound] != method_named(method).needs_position
+                or POSTERIOR_MEANS[bound] != method_named(method).needs.position
             ):
                 continue
             paired = limits.merge(errors, on="star", suffixes=("_bound", ""), validate="1:1")

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
+from psfdae import fits
 from psfdae.belonging import SAME_IMAGE, SAME_STARS, STARS, require_origin
 from psfdae.files import Product
 from psfdae.method import CONFIG, Method
@@ -79,13 +80,13 @@ def bundle(
 
 def _trained(kind: type[Method], place: Path, config: Config, split: str | None) -> dict[str, Any]:
     """Configuration of a fit, if it is that of the stage."""
-    for path in [place / name for name in kind.files] or [place]:
+    for path in fits.own_files(kind, place):
         if not path.is_file():
-            command = kind.rule.replace("_", " ", 1)
+            command = fits.rule_of(kind).replace("_", " ", 1)
             raise BundleError(f"{path}: no such file; psfdae {command} writes it")
-    path, trained = place / CONFIG if kind.files else place, kind.described(place)
+    path, trained = place / CONFIG if place.is_dir() else place, kind.described(place)
     lacking = {*SEEN_BY_TRAINING, *kind.groups, "split"} - set(trained)
-    lacking |= {"reference"} - set(trained) if kind.per_reference else set()
+    lacking |= {"reference"} - set(trained) if fits.storage_of(kind).per_reference else set()
     if lacking:
         raise BundleError(f"{path}: key {min(lacking)!r} is missing")
     asked = config.model_dump(include={*SEEN_BY_TRAINING}) | {"split": split or trained["split"]}
@@ -141,7 +142,7 @@ def _validation_error(bundle: Bundle, stars: Product, config: Config) -> float:
     """Geometric mean over the noise levels of the MSE of PSFs of flux 1."""
     kind = method(bundle.info.method)
     data = training_set(config, kind, stars, "random", "realisation")
-    if not kind.validates:
+    if not kind.needs.validation:
         apart = fit_apart(kind, data, np.arange(len(data.images)), config)
         size = sum(array.nbytes for array in bundle.weights.values())
         weights, _ = packing.packed(apart, bundle.info.stamp_px, bundle.info.noise_min, size)

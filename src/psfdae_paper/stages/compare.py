@@ -68,7 +68,7 @@ def compare(
 
 def _networks(folder: Path) -> set[Path]:
     """Folders of trained networks below a folder of results."""
-    kinds = (kind.name for kind in registered() if CONFIG in kind.files)
+    kinds = (kind.name for kind in registered() if kind.storage and CONFIG in kind.storage.files)
     paths = (path for name in kinds for path in folder.glob(f"{name}/*/*/{CONFIG}"))
     return {path.parent.relative_to(folder) for path in paths}
 
@@ -195,7 +195,7 @@ def describe_tables(first: Path, second: Path) -> str:
 
     both = [read_errors(folder) for folder in (first, second)]
     rows, order = compare_tables(*both, seed_scatter())
-    names = " < ".join(method(name).paper[1] for name in PAPER_ORDER)  # type: ignore[index]
+    names = " < ".join(method(name).look.paper[1] for name in PAPER_ORDER)  # type: ignore[index]
     said = {
         "equal": "are equal to the last digit",
         "rounding": f"differ by less than {NEGLIGIBLE:g} of the standard error of the test stars, "

@@ -7,6 +7,7 @@ from dataclasses import make_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+from psfdae import fits
 from psfdae.files import Product, ProductError, write_csv, write_parquet, write_text
 from psfdae.method import Method
 from psfdae.methods import method
@@ -32,16 +33,23 @@ if TYPE_CHECKING:
 
 READS = (
     *("seed", "noise", "parts", "evaluation", "methods"),
-    *(group for kind in registered() if not kind.stored for group in kind.groups),
+    *(group for kind in registered() if kind.storage is None for group in kind.groups),
 )
 """Groups of the configuration on which the measurements depend, models being given."""
 
 Models: Any = make_dataclass(
     "Models",
     [
-        (kind.name, Annotated[(Folder if kind.files else File) | None, kind.about], None)
+        (
+            kind.name,
+            Annotated[
+                (Folder if kind.storage.files else File) | None,
+                kind.storage.about or f"What `psfdae fit {kind.name}` leaves.",
+            ],
+            None,
+        )
         for kind in registered()
-        if kind.stored
+        if kind.storage
     ],
 )
 """Options with the model of each method that leaves one."""
@@ -108,18 +116,18 @@ def estimators(
     ProductError
         If one is damaged, or does not belong to the stars.
     """
-    kinds = [kind for kind in map(method, config.methods) if kind.drawn or not only_drawn]
+    kinds = [kind for kind in map(method, config.methods) if kind.look.drawn or not only_drawn]
     places: dict[str, Path] = {}
     for kind in kinds:
-        if kind.stored:
+        if kind.storage:
             place = models.get(kind.name)
             if place is None:
                 raise ConfigError(f"--{kind.name.replace('_', '-')} is missing: it is in methods")
-            kind.require(place, stars, config, split, reference)
+            fits.require(kind, place, stars, config, split, reference)
             places[kind.name] = place
     return {
         kind.name: kind.load(places[kind.name], reference, config.evaluation)
-        if kind.stored
+        if kind.storage
         else kind.fit(training_set(config, kind, stars, split, reference), **kind.settings(config))
         for kind in kinds
     }

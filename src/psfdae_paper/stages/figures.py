@@ -131,7 +131,7 @@ def figure_headline(
         config, product, test, picks, HEADLINE_REFERENCE, methods, [level]
     )
     rows = [
-        replace(row, label=kind.label if kind.restores else f"{kind.label} star")
+        replace(row, label=kind.look.label if kind.look.restores else f"{kind.look.label} star")
         for row, kind in zip(restored, methods.values(), strict=True)
     ]
     rows.append(replace(truth, label="truth"))
@@ -219,8 +219,8 @@ def strip_rows(
         noisy = noisy_test_images(config, product, test[picks], level)
         for kind in methods.values():
             images = kind.restore(noisy, level, position)
-            label = f"{kind.label}\nλ = {level:g}"
-            rows.append(StripRow(label, images, mse(images, truth), not kind.restores))
+            label = f"{kind.look.label}\nλ = {level:g}"
+            rows.append(StripRow(label, images, mse(images, truth), not kind.look.restores))
     return rows
 
 

@@ -8,6 +8,8 @@ from typing import Annotated
 
 import click
 
+from psfdae import fits
+from psfdae.method import GoesOn
 from psfdae.methods import groups_of, method
 from psfdae.model.star_sets import read_stars, training_set
 from psfdae.options import File, Folder
@@ -15,9 +17,6 @@ from psfdae.settings import Reference, SplitKind
 from psfdae.threads import limit_threads
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.schema import Config
-
-INNER = 10
-"""One of so many stars chooses the settings of a fit that has not seen the validation stars."""
 
 Stars = Annotated[File, "Product of the stage stars."]
 
@@ -39,17 +38,16 @@ def fit(
     """Fit METHOD, a name of the list `methods` in config.yaml."""
     kind = method(name)
     limit_threads(kind.threads(config))
-    product = read_stars(stars, reference if kind.per_reference else "template")
-    kept = checkpoint or kind.beside(out, "checkpoint.pt")
+    product = read_stars(stars, fits.learnt(kind, reference))
+    kept = checkpoint or fits.beside(kind, out, "checkpoint.pt")
     data = training_set(config, kind, product, split, reference, checkpoint=kept)
     if start is not None:
-        if reference != "template" or not kind.continues(config):
+        if reference != "template" or not (issubclass(kind, GoesOn) and kind.continues(config)):
             raise click.UsageError("--start: nothing that goes on from a fit is fitted")
-        kind.require(start, product, config, split, "realisation")
+        fits.require(kind, start, product, config, split, "realisation")
         data = replace(data, start=kind.load(start))
-    described = {**config.model_dump(), "split": split}
-    described |= {"reference": reference} if kind.per_reference else {}
-    kind.fit(data, **kind.settings(config)).store(out, described, product)
+    described = fits.described_by(kind, config.model_dump(), split, reference)
+    fits.store(kind.fit(data, **kind.settings(config)), out, described, product)
     kept.unlink(missing_ok=True)
 
 

@@ -6,6 +6,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+from psfdae import fits
 from psfdae.files import read_product
 from psfdae.method import HISTORY
 from psfdae.methods import groups_of, method
@@ -19,7 +20,7 @@ from psfdae_paper.sweeps.measured import Measured, Task, measure_images, place_o
 
 def files_of(name: str) -> tuple[str, ...]:
     """Names of the files of a point's fit."""
-    return tuple(path.name for path in method(name).outputs(place_of(method(name), Path())))
+    return tuple(path.name for path in fits.outputs(method(name), place_of(method(name), Path())))
 
 
 def run(config: Any, task: Task, name: str) -> Measured:
@@ -45,8 +46,8 @@ def run(config: Any, task: Task, name: str) -> Measured:
     stars, place = task.data["stars"], place_of(kind, task.folder)
     limit_threads(kind.threads(own))
     validated = None
-    if not kind.validates:
-        product = read_stars(stars, task.reference if kind.per_reference else "template")
+    if not kind.needs.validation:
+        product = read_stars(stars, fits.learnt(kind, task.reference))
         data = training_set(own, kind, product, task.split, task.reference)
         validated = kind.fit(data.without_validation(), **kind.settings(own))
     started, started_cpu = time.monotonic(), time.process_time()
@@ -58,8 +59,8 @@ def run(config: Any, task: Task, name: str) -> Measured:
     described = kind.described(place)
     attempt = described.pop("attempt", 0)
     course: dict[str, Any] = {}
-    if HISTORY in kind.diagnostics:
-        last = read_table(kind.beside(place, HISTORY)).iloc[-1]
+    if HISTORY in fits.storage_of(kind).diagnostics:
+        last = read_table(fits.beside(kind, place, HISTORY)).iloc[-1]
         # Of the training alone, and of all its parts if it was interrupted.
         seconds, cpu_seconds = float(last["seconds"]), float(last["cpu_seconds"])
         most = max(getattr(group, "epochs", 0) for group in kind.settings(own).values())

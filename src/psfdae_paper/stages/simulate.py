@@ -12,7 +12,7 @@ import numpy as np
 from psfdae.errors import Error
 from psfdae.figure_style import write_png
 from psfdae.files import Product, atomic_path, check_outputs, read_product, write_csv, write_fits
-from psfdae.model.shapes import measure_shapes
+from psfdae.moments import measure_shapes
 from psfdae.noise import noise_equivalent_px
 from psfdae.options import File, Folder
 from psfdae.rng import stream

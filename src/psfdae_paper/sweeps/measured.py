@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from psfdae.files import ProductError
+from psfdae.fits import storage_of
 from psfdae.method import Method
 from psfdae.reading import from_tree, read_json
 
@@ -228,7 +229,7 @@ def read_cost(folder: Path) -> dict[str, float]:
 
 def place_of(kind: type[Method], folder: Path) -> Path:
     """Where the fit of a point is: the folder itself, or a file in it."""
-    return folder if kind.files else folder / f"{kind.name}.h5"
+    return folder if storage_of(kind).files else folder / f"{kind.name}.h5"
 
 
 def checksum(tree: Any) -> str:

@@ -1,0 +1,94 @@
+"""`BrightStars`: the stars of an image that are bright enough to learn from, as they are in it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from psfdae.files import Product
+from psfdae.moments import moved
+
+DEFECT = 6.0
+"""σ of the sky: pixels this far below it are defects; they are raised to that."""
+
+LEAST_SKY, MOST_SKY = 2.0 * DEFECT**2, 1e12
+"""Photons per pixel of the new noise, at least: no rate of photons is negative, and the deepest
+pixel of a star that is made fainter has B − DEFECT √B at most."""
+
+
+@dataclass(frozen=True)
+class BrightStars:
+    """Bright stars with the pixels around them.
+
+    Attributes
+    ----------
+    wide : ndarray, shape (n, s, s)
+        Sky-subtracted stamps with a margin, in the unit of `flux`.
+    peak : ndarray of int, shape (n, 2)
+        Brightest pixel (row, column) from index (s//2, s//2).
+    centre, listed : ndarray, shape (n, 2)
+        Centroid, and centre by the star list, from the same index; NaN where unknown.
+    position : ndarray, shape (n, 2)
+        (x, y) in the image, NaN where unknown.
+    flux, noise : ndarray, shape (n,)
+        Flux inside the stamp, and RMS of the sky in a pixel, both in counts or over the flux.
+    snr : ndarray, shape (n,)
+    row : ndarray of int, shape (n,)
+        Of the star list.
+    """
+
+    wide: np.ndarray
+    peak: np.ndarray
+    centre: np.ndarray
+    position: np.ndarray
+    flux: np.ndarray
+    noise: np.ndarray
+    snr: np.ndarray
+    row: np.ndarray
+    listed: np.ndarray
+
+    @classmethod
+    def of_product(cls, stars: Product) -> BrightStars:
+        """Those of a product "stars" of an image, of flux 1; their centroids are not stored."""
+        names = ("wide", "peak", "position", "noise", "snr", "row", "listed")
+        arrays = {name: stars[name] for name in names}
+        centre = np.full(arrays["position"].shape, np.nan)
+        return cls(**arrays, centre=centre, flux=np.ones(len(centre)))
+
+    def __len__(self) -> int:
+        return len(self.wide)
+
+    def of(self, chosen: np.ndarray) -> BrightStars:
+        """Some of the stars, by a mask or by indices."""
+        return BrightStars(*(getattr(self, field.name)[chosen] for field in fields(self)))
+
+    def area(self) -> np.ndarray:
+        """Noise-equivalent area A = (F / (σ S/N))² of each star in pixels, shape (n,)."""
+        return (self.flux / (self.noise * self.snr)) ** 2
+
+    def aligned(self) -> np.ndarray:
+        """The stars of flux 1, moved to a common centre, index (s//2, s//2); shape (n, s, s)."""
+        return moved(self.wide, -self.centre) / self.flux[:, None, None]
+
+    def sky_photons(self, gain: float | None, otherwise: float) -> float:
+        """Photons per pixel whose Poisson noise is the sky's, read noise included.
+
+        From the electrons per count; `otherwise` where they are unknown. At most `MOST_SKY`, beside
+        which no star has photons that count.
+        """
+        if gain is None:
+            return otherwise
+        return float(np.clip(np.median(self.noise) * gain, LEAST_SKY**0.5, MOST_SKY**0.5) ** 2)
+
+    def framed(self, side: int) -> tuple[np.ndarray, np.ndarray]:
+        """Frames (n, side, side) with the brightest pixel at index (side//2, side//2).
+
+        The second array says which pixels `wide` shows; the others are 0.
+        """
+        wide = np.pad(self.wide, ((0, 0), (side, side), (side, side)), constant_values=np.nan)
+        start = side + self.wide.shape[-1] // 2 - side // 2
+        rows, columns = (self.peak[:, i, None] + start + np.arange(side) for i in (0, 1))
+        images = wide[np.arange(len(wide))[:, None, None], rows[:, :, None], columns[:, None, :]]
+        seen = np.isfinite(images)
+        return np.where(seen, images, 0.0).astype(np.float64), seen

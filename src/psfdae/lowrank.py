@@ -1,0 +1,101 @@
+"""Covariances that are a diagonal plus few rows, and mixtures of normal laws with them.
+
+By Woodbury's identity (D + b XᵀX)⁻¹ = D⁻¹ − AᵀA with A = L⁻¹ X D⁻¹ and L Lᵀ = 1/b + X D⁻¹Xᵀ, of
+which no matrix is larger than the number of rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable
+from typing import Generic, NamedTuple, TypeVar
+
+import numpy as np
+
+NOISE_STEP = 0.4
+"""Of ln s between noise variances s of single stars, which share a factorisation; s is then
+wrong by half of it at most, and the error grows by the square."""
+
+LEAST_WEIGHT = 1e-3
+"""Of a law of a mixture that is summed over."""
+
+FLUX_SIGMA = 0.2
+"""Standard deviation of a star's flux over what it was found to be before."""
+
+
+class Factorised(NamedTuple):
+    """Inverse of a diagonal D plus rows X: D⁻¹ − AᵀA, and its determinant.
+
+    Attributes
+    ----------
+    low : ndarray, shape (r, m + q)
+        A in the leading m coordinates, where X is not 0; then L⁻¹ of q further columns.
+    cholesky : ndarray, shape (r, r)
+        L.
+    half_det : float
+        ½ ln of the determinant over that of D.
+    """
+
+    low: np.ndarray
+    cholesky: np.ndarray
+    half_det: float
+
+
+def factorised(
+    diagonal: np.ndarray, rows: np.ndarray, weight: float = 1.0, beside: np.ndarray | None = None
+) -> Factorised:
+    """Factorise D + b XᵀX.
+
+    Parameters
+    ----------
+    diagonal : ndarray, shape (m,)
+        D in the coordinates of the rows.
+    rows : ndarray, shape (r, m)
+        X.
+    weight : float
+        b.
+    beside : ndarray, shape (r, q), optional
+        Further columns of which L⁻¹ is wanted.
+    """
+    from scipy.linalg.blas import dtrsm
+
+    weighted = rows / diagonal
+    cholesky = np.linalg.cholesky(np.eye(len(rows)) / weight + weighted @ rows.T)
+    columns = weighted if beside is None else np.hstack([weighted, beside])
+    low = dtrsm(1.0, cholesky.T, columns.T, side=1).T  # a third of solve_triangular's time
+    half_det = np.log(cholesky.diagonal()).sum() + 0.5 * len(rows) * np.log(weight)
+    return Factorised(low, cholesky, float(half_det))
+
+
+def mixing_weights(log: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Weights (n, K) of K laws from ln of their probabilities, and ln of these' sum, (n,).
+
+    Those below `LEAST_WEIGHT` are 0.
+    """
+    peak = log.max(axis=1)
+    weight = np.exp(log - peak[:, None])
+    total = weight.sum(axis=1)
+    weight[weight < LEAST_WEIGHT * total[:, None]] = 0.0
+    return weight / weight.sum(axis=1, keepdims=True), peak + np.log(total)
+
+
+Key = TypeVar("Key", bound=Hashable)
+Value = TypeVar("Value")
+
+
+class Kept(Generic[Key, Value]):
+    """What was computed for some keys and laws; of more keys than fit, the first are dropped."""
+
+    def __init__(self) -> None:
+        self._of: dict[Key, dict[int, Value]] = {}
+
+    def __call__(self, key: Key, law: int, make: Callable[[], Value]) -> Value:
+        """What there is for a key and the number of a law, or is made now."""
+        known = self._of.setdefault(key, {})  # whole, whatever another thread drops
+        if law not in known:
+            known[law] = make()
+        return known[law]
+
+    def trim(self, most: int) -> None:
+        """Drop all but the `most` last keys."""
+        for old in list(self._of)[:-most]:
+            self._of.pop(old, None)
