@@ -129,7 +129,7 @@ def test_effective_size_is_that_of_the_weights(model, modes, stars, noise):
 def test_same_streams_give_the_same_bytes_in_any_blocks(model, modes, stars, noise, monkeypatch):
     one, two = (sampled(model, modes, stars, noise, 80).free_helped for _ in range(2))
     assert one.image.tobytes() == two.image.tobytes()
-    monkeypatch.setattr(sampling, "BLOCK", 1)
+    monkeypatch.setattr(sampling, "STARS_AT_ONCE", 1)
     single = sampled(model, modes, stars, noise, 80).free_helped
     assert single.mean_image == pytest.approx(one.mean_image, abs=1e-6)
 
@@ -195,7 +195,7 @@ def test_draws_have_the_density_of_students_t():
     found = modes.log_density(z, field, offset)
     for mode in number:
         scale = factor[mode] @ factor[mode].T
-        law = multivariate_t(modes.z[mode], scale, sampling.FREEDOM)
+        law = multivariate_t(modes.z[mode], scale, sampling.PROPOSALS.freedom)
         there = (field == mode) & (np.arange(30) < 20)
         assert found[mode, there] == pytest.approx(law.logpdf(z[there]), abs=1e-9)
         assert (found[mode, ~there] == -np.inf).all()
@@ -205,7 +205,7 @@ def test_draws_have_the_density_of_students_t():
         assert len(mine) == count[mode] > 5000
         whitened = np.linalg.solve(factor[mode], (mine - modes.z[mode]).T)
         # The median of the squared distance of t is that of F, times the dimension.
-        expected = 5 * f_law(5, sampling.FREEDOM).median()
+        expected = 5 * f_law(5, sampling.PROPOSALS.freedom).median()
         assert np.median((whitened**2).sum(axis=0)) == pytest.approx(expected, rel=0.05)
         inside = np.cov(whitened[:, (whitened**2).sum(axis=0) < 2 * expected])
         assert inside == pytest.approx(inside[0, 0] * np.eye(5), abs=0.06 * inside[0, 0])

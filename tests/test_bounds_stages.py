@@ -12,6 +12,8 @@ from psfdae.files import ProductError, read_product
 from psfdae.method import Needs
 from psfdae.methods import method
 from psfdae.model.star_sets import noisy_test_images, split_stars
+from psfdae_paper.bounds.estimates import bounded_stars
+from psfdae_paper.bounds.tables import POSTERIOR_MEANS
 from psfdae_paper.configuration.compose import load_stage
 from psfdae_paper.configuration.consistency import SIMULATION, STATIC
 from psfdae_paper.evaluation.curves import MEANS, efficiency_against_noise, errors_above_bounds
@@ -166,7 +168,7 @@ def test_bounded_stars_are_the_first_test_stars_with_their_noise(scene_1):
     for _, column in rows.groupby(["reference", "method", "noise_level"]):
         assert column.star.tolist() == test[:24].tolist()
         assert column.field.tolist() == product["field_index"][test[:24]].tolist()
-    used = bounds._test_stars(config, product).noisy
+    used = bounded_stars(config, product).noisy
     assert list(used) == list(LEVELS)
     for level in LEVELS:
         everyone = noisy_test_images(config, product, test, level)
@@ -230,7 +232,7 @@ def test_efficiency_of_a_known_method(scene_1, factor, verdict):
 
 def test_the_posterior_mean_respects_the_floor(scene_1):
     table = compared(scene_1, "dataset6", 1.5)
-    rows = table[table.method.isin(bounds.POSTERIOR_MEANS)]
+    rows = table[table.method.isin(POSTERIOR_MEANS)]
     assert len(rows) == 2 * len(LEVELS)
     assert set(rows.bound) == {"floor"}
     assert set(rows.verdict) == {"ok"}

@@ -8,6 +8,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from psfdae_paper.bounds.estimates import BoundedStars, Estimates
+from psfdae_paper.bounds.tables import COLUMNS, Tables
 from psfdae_paper.bounds.tight import Evidence, calibration
 from psfdae_paper.stages import bounds
 
@@ -75,7 +77,7 @@ def measured(mse, ess=300.0):
 
 
 def estimates(mse, helped):
-    return bounds.Estimates(measured(mse), measured(mse), measured(helped))
+    return Estimates(measured(mse), measured(mse), measured(helped))
 
 
 def test_a_mode_undetected_with_the_field_given_is_not_tight():
@@ -91,15 +93,15 @@ def test_a_mode_undetected_with_the_field_given_is_not_tight():
 
 def table_of(estimated):
     truth = {name: np.zeros((STARS, 4, 4)) for name in ("realisation", "template")}
-    stars = bounds.BoundedStars(np.arange(1000, 1000 + STARS), FIELD, truth, {})
-    tables = bounds.Tables("dataset1", stars)
+    stars = BoundedStars(np.arange(1000, 1000 + STARS), FIELD, truth, {})
+    tables = Tables("dataset1", stars)
     tables.add_mean("bayes", 1e-3, estimated, "samples", draws=400, sampled=STARS)
     return tables
 
 
 def compared(tables, folder, errors):
     """Table of the efficiency of a made-up method with these errors."""
-    pd.DataFrame(tables.summary, columns=bounds.COLUMNS).to_csv(folder / "b.csv")
+    pd.DataFrame(tables.summary, columns=COLUMNS).to_csv(folder / "b.csv")
     per_star = pd.concat(tables.per_star, ignore_index=True)
     per_star.to_parquet(folder / "b.parquet")
     per_star.assign(method="dae", mse=np.tile(errors, 2)).to_parquet(folder / "e.parquet")
@@ -144,13 +146,13 @@ def test_no_efficiency_where_over_one_in_a_hundred_is_missing(tmp_path):
 
 def test_a_star_comes_from_the_bank_or_from_its_own_samples():
     """Wherever the bank has too few, and never fewer than it has."""
-    bank = bounds.Estimates(*(measured(np.full(STARS, 1.0), ess=20.0) for _ in range(3)))
+    bank = Estimates(*(measured(np.full(STARS, 1.0), ess=20.0) for _ in range(3)))
     assert bank.improved(np.zeros(0, int), None) == (bank, 0)
     few = np.array([3, 9, 11])
     rows = np.full((5, 3), 2.0)
     rows[-1] = [300.0, 5.0, 60.0]
     bank.full[-1, 11] = 55.0
-    best, chosen = bank.improved(few, bounds.Estimates(rows, rows, rows))
+    best, chosen = bank.improved(few, Estimates(rows, rows, rows))
     assert chosen == 1
     assert np.flatnonzero(best.full[0] == 2.0).tolist() == [3]
     assert best.full[-1, [3, 9, 11]].tolist() == [300.0, 20.0, 55.0]

@@ -12,7 +12,7 @@ import pytest
 from command_line import refused
 from psfdae import extras, load_model
 from psfdae.cli import refusal
-from psfdae.extras import MissingExtraError
+from psfdae.errors import MissingExtraError
 from psfdae.model.bundle import write_bundle
 from workflow_runs import ROOT
 

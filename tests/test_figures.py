@@ -6,12 +6,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from psfdae.figure_style import in_field_unit
+from psfdae.figures import StripRow, in_field_unit, restoration_strip, spread_stars
 from psfdae.files import Column, ProductError, write_product
 from psfdae.methods.dae import Dae
 from psfdae.model.star_sets import noisy_test_images, read_stars
 from psfdae.splits import random_split
-from psfdae.strip import StripRow, restoration_strip, spread_stars
 from psfdae_paper.configuration.compose import load_stage
 from psfdae_paper.evaluation.curves import error_against_noise, training_curves
 from psfdae_paper.evaluation.figures import mosaic, stamp_energy_map, template_map
@@ -242,7 +241,7 @@ def test_strip_shows_the_noise_that_evaluate_measures(tmp_path, gaussian_stars, 
         monkeypatch.setattr(kind, "require", lambda *stars: None)
         monkeypatch.setattr(kind, "load", classmethod(unchanged))
     monkeypatch.setattr(
-        "psfdae.strip.restoration_strip",
+        "psfdae.figures.restoration_strip",
         lambda rows, columns, title: shown.update(rows=rows, columns=columns, title=title),
     )
     monkeypatch.setattr(stage, "write_png", lambda figure, out: None)

@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 
 from fits_inputs import write_cube
 from psfdae import files
-from psfdae.figure_style import write_png
+from psfdae.figures import write_png
 from psfdae.files import Column, Empty, as_yaml
 from psfdae.networks.weights import load_checkpoint, load_weights, save_checkpoint, save_weights
 

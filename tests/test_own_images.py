@@ -16,9 +16,8 @@ from click.testing import CliRunner
 import psfdae
 from psfdae import StarFlag, load_model
 from psfdae.cli import main
-from psfdae.image.advice import saturation_advice
 from psfdae.image.observation import Source
-from psfdae.image.selection import collect
+from psfdae.image.selection import collect, saturation_advice
 from psfdae.image.stamps import cut
 from psfdae.methods.field import FieldSettings
 from psfdae.model import packing

@@ -16,9 +16,9 @@ from psfdae_paper.optics.propagation import StampPropagator
 from psfdae_paper.optics.pupil import SamplingError, annular_pupil
 from psfdae_paper.optics.seeing import FAINT, BlurredPropagator, Profile
 from psfdae_paper.optics.wavefronts import zernike_images
-from psfdae_paper.stages.common import template_wavefronts
 from psfdae_paper.stars import framing
 from psfdae_paper.stars.framing import Propagation
+from psfdae_paper.stars.scenes import template_wavefronts
 
 OWN = "dataset=_telescope"
 PROFILES = [Profile(4.0), Profile(4.0, 2.5), Profile(4.0, 4.765)]

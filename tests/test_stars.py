@@ -14,7 +14,6 @@ from psfdae.rng import stream
 from psfdae.splits import draw_jitter, draw_phase, held_out_fields, held_out_split, random_split
 from psfdae_paper.configuration.compose import load
 from psfdae_paper.optics.wavefronts import seidel_wavefronts, zernike_wavefronts
-from psfdae_paper.stages.common import template_wavefronts
 from psfdae_paper.stars.fields import assign_fields, perturb, relative_field, square_grid
 from psfdae_paper.stars.framing import (
     FramingError,
@@ -23,6 +22,7 @@ from psfdae_paper.stars.framing import (
     crop_jittered,
     normalise_flux,
 )
+from psfdae_paper.stars.scenes import template_wavefronts
 
 
 @pytest.fixture(scope="module")

@@ -14,8 +14,8 @@ from psfdae_paper.configuration.compose import compose, load_stage
 from psfdae_paper.configuration.consistency import SIMULATION, STATIC
 from psfdae_paper.optics.wavefronts import ModalWavefronts, monomial_images
 from psfdae_paper.stages import stars
-from psfdae_paper.stages.common import template_wavefronts
 from psfdae_paper.stars.framing import Propagation, brightest_pixel
+from psfdae_paper.stars.scenes import template_wavefronts
 
 CHEAP = (
     *("grid.points=3", "optics.pupil_samples=[40,80]", "optics.threads=1"),

@@ -24,10 +24,9 @@ from psfdae_paper.optics.wavefronts import (
 )
 from psfdae_paper.raytracing import RayTracingError
 from psfdae_paper.stages import stars
-from psfdae_paper.stages.common import star_wavefronts, template_wavefronts
 from psfdae_paper.stars.fields import relative_field
 from psfdae_paper.stars.framing import Propagation, normalise_flux
-from psfdae_paper.stars.scenes import static_terms
+from psfdae_paper.stars.scenes import star_wavefronts, static_terms, template_wavefronts
 
 OWN = "dataset=_telescope"
 Z4, Z5, Z8, Z11 = 2 * np.sqrt(3), np.sqrt(6), 3 * np.sqrt(8), 6 * np.sqrt(5)

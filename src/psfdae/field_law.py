@@ -315,8 +315,7 @@ class FieldLaw:
             total = images.sum(axis=1)
             mean = self.usual @ images / (self.usual @ total)
 
-            def lit(rows: np.ndarray, mean: np.ndarray = mean) -> np.ndarray:
-                """Rows without the flux in them."""
+            def lit(rows: np.ndarray, mean: np.ndarray = mean) -> np.ndarray:  # no flux in them
                 return rows - rows.sum(axis=-1, keepdims=True) * mean
 
             def draw(at: np.ndarray) -> np.ndarray:
@@ -360,8 +359,7 @@ class FieldLaw:
 
     def _factor(self, k: int, kind: Kind) -> Factor:
         """S of a node."""
-        make = lambda: factor_of(self._nodes[k], kind, self._part)  # noqa: E731
-        return self._factors(kind, k, make)
+        return self._factors(kind, k, lambda: factor_of(self._nodes[k], kind, self._part))
 
     @property
     def _part(self) -> float:
@@ -465,8 +463,7 @@ class FieldLaw:
     @cached_property
     def _most(self) -> int:
         """Kinds whose factorisations are kept."""
-        low = sum(8 * node.rows.size for node in self._nodes)
-        return max(1, int(CACHE_BYTES // low))
+        return max(1, int(CACHE_BYTES // sum(8 * node.rows.size for node in self._nodes)))
 
     def _against(
         self, k: int, kind: Kind, stars: Asked, rows: np.ndarray, precision: np.ndarray

@@ -369,13 +369,11 @@ class MixtureLaw:
         )
 
     def _leading(self, s: float) -> int:
-        """Coordinates in which clusters differ at a noise variance s."""
-        return int(np.count_nonzero(self._reaching > FLAT_VARIANCE * s))
+        """Coordinates in which clusters differ at a noise variance s.
 
-    @cached_property
-    def _reaching(self) -> np.ndarray:
-        """Largest variance of all stars along an axis or one after it, the last axis first."""
-        return np.maximum.accumulate(self._total[::-1])
+        That is by the largest variance of all stars along an axis or one after it.
+        """
+        return int(np.count_nonzero(np.maximum.accumulate(self._total[::-1]) > FLAT_VARIANCE * s))
 
     @cached_property
     def _total(self) -> np.ndarray:

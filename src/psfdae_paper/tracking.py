@@ -264,51 +264,14 @@ def runs_of_sweep(results: Path, name: str) -> list[Run]:
     ProductError
         If the sweep has no summary, or a point no result.
     """
-    from psfdae_paper.configuration.sweep import TRAINED
-    from psfdae_paper.sweeps.measured import place_of, read_cost, read_result
-
-    def model_files(model: str, place: Path) -> dict[str, Path]:
-        if model in TRAINED:
-            return _network_files(place, NETWORKS[model])
-        return _model_files(method(model), place_of(method(model), place))
-
     folder = results / "sweeps" / name
     summary = folder / "summary.csv"
     if not summary.is_file():
         raise ProductError(f"{summary}: missing; run `snakemake sweep --config sweep={name}` first")
     # Every sweep is an experiment of its own, apart from the paper's scenes.
     shared = {"experiment": f"sweep_{name}"}
-    points = []
-    for row in read_csv(summary, "point", "status"):
-        place = folder / "points" / row["point"]
-        result = read_result(place / "result.json")
-        files = {file: place / file for file in POINT_FILES} | model_files(result["model"], place)
-        files = {file: path for file, path in files.items() if path.is_file()}
-        contents = _contents(files)
-        end_ms = int((place / "result.json").stat().st_mtime * 1000)
-        start_ms = end_ms - int(1000 * read_cost(place)["seconds"])
-        history = place / "history.csv"
-        epochs = _epochs(history) if history.is_file() else []
-        metrics = [Point(key, value, 0, end_ms) for key, value in result["metrics"].items()]
-        values = ", ".join(f"{key}={json.dumps(v)}" for key, v in result["values"].items())
-        points.append(
-            _run(
-                files,
-                contents,
-                {**result["config"], "axes": result["values"]},
-                metrics + _epoch_points(epochs, start_ms),
-                **{key: result[key] for key in ("dataset", "split", "reference")},
-                **shared,
-                kind=result["model"],
-                source=f"sweeps/{name}/points/{row['point']}",
-                name=values or row["point"],
-                start_ms=start_ms,
-                end_ms=end_ms,
-                status="FAILED" if result["status"] == "failed" else "FINISHED",
-                parent=f"sweeps/{name}",
-                tags={key: result[key] for key in ("point", "status", "reason")},
-            )
-        )
+    names = [row["point"] for row in read_csv(summary, "point", "status")]
+    points = [_point_of_sweep(folder / "points" / point, name, point) for point in names]
     figures = sorted((folder / "figures").glob("*.png"))
     paths = [*(folder / file for file in SUMMARY_FILES), *figures]
     files = {path.relative_to(folder).as_posix(): path for path in paths}
@@ -337,6 +300,43 @@ def runs_of_sweep(results: Path, name: str) -> list[Run]:
         tags={"best_point": str(best.get("point", ""))},
     )
     return [parent, *points]
+
+
+def _point_of_sweep(place: Path, name: str, point: str) -> Run:
+    from psfdae_paper.configuration.sweep import TRAINED
+    from psfdae_paper.sweeps.measured import place_of, read_cost, read_result
+
+    result = read_result(place / "result.json")
+    model = result["model"]
+    if model in TRAINED:
+        of_model = _network_files(place, NETWORKS[model])
+    else:
+        of_model = _model_files(method(model), place_of(method(model), place))
+    files = {file: place / file for file in POINT_FILES} | of_model
+    files = {file: path for file, path in files.items() if path.is_file()}
+    contents = _contents(files)
+    end_ms = int((place / "result.json").stat().st_mtime * 1000)
+    start_ms = end_ms - int(1000 * read_cost(place)["seconds"])
+    history = place / "history.csv"
+    epochs = _epochs(history) if history.is_file() else []
+    metrics = [Point(key, value, 0, end_ms) for key, value in result["metrics"].items()]
+    values = ", ".join(f"{key}={json.dumps(v)}" for key, v in result["values"].items())
+    return _run(
+        files,
+        contents,
+        {**result["config"], "axes": result["values"]},
+        metrics + _epoch_points(epochs, start_ms),
+        **{key: result[key] for key in ("dataset", "split", "reference")},
+        experiment=f"sweep_{name}",
+        kind=model,
+        source=f"sweeps/{name}/points/{point}",
+        name=values or point,
+        start_ms=start_ms,
+        end_ms=end_ms,
+        status="FAILED" if result["status"] == "failed" else "FINISHED",
+        parent=f"sweeps/{name}",
+        tags={key: result[key] for key in ("point", "status", "reason")},
+    )
 
 
 def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, str]:

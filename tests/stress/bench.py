@@ -14,9 +14,9 @@ from psfdae.noise import NoiseModel
 from psfdae.rng import stream
 from psfdae.splits import draw_jitter
 from psfdae_paper.stages import stars as stars_stage
-from psfdae_paper.stages.common import star_wavefronts
 from psfdae_paper.stars.fields import assign_fields
 from psfdae_paper.stars.framing import Propagation, normalise_flux
+from psfdae_paper.stars.scenes import star_wavefronts
 
 THREADS = 2  # of the linear algebra, and trainings side by side
 # Noise levels λ of the paper's three bands.

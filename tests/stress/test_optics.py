@@ -7,9 +7,13 @@ from psfdae_paper.optics.propagation import StampPropagator
 from psfdae_paper.optics.pupil import SamplingError, annular_pupil
 from psfdae_paper.optics.turbulence import SPECTRUM
 from psfdae_paper.optics.wavefronts import seidel_wavefronts
-from psfdae_paper.stages.common import template_wavefronts
 from psfdae_paper.stars.framing import FramingError
-from psfdae_paper.stars.scenes import CYCLES_PER_DIAMETER, SLOPE_SAMPLES, TurbulentWavefronts
+from psfdae_paper.stars.scenes import (
+    CYCLES_PER_DIAMETER,
+    SLOPE_SAMPLES,
+    TurbulentWavefronts,
+    template_wavefronts,
+)
 from stress.bench import changed, propagation, stamp_mse
 
 FINER = (254, 318, 398, 512, 640, 800, 1024, 1280, 1600, 2048)  # N beyond the config's

@@ -9,9 +9,9 @@ from sklearn.decomposition import PCA
 
 from psfdae.metrics import mse, ssim
 from psfdae_paper.optics.wavefronts import seidel_wavefronts
-from psfdae_paper.stages.common import template_wavefronts
 from psfdae_paper.stars.fields import relative_field
 from psfdae_paper.stars.framing import normalise_flux
+from psfdae_paper.stars.scenes import template_wavefronts
 from stress.bench import changed, propagation, rounding_of, stamp_mse, subspace_angle
 
 EPS = float(np.finfo(np.float32).eps)  # relative spacing of single precision

@@ -7,7 +7,7 @@ import pytest
 
 from psfdae.rng import stream
 from psfdae_paper.optics.wavefronts import ModalWavefronts
-from psfdae_paper.stages.common import star_wavefronts
+from psfdae_paper.stars.scenes import star_wavefronts
 from stress.bench import LEVELS, changed, propagation, simulated
 
 STARS = 24  # that are simulated again and again

@@ -13,9 +13,9 @@ from psfdae_paper.configuration.telescope import Telescope
 from psfdae_paper.optics.propagation import StampPropagator
 from psfdae_paper.optics.pupil import annular_pupil
 from psfdae_paper.optics.wavefronts import WavefrontSource
-from psfdae_paper.stages.common import star_wavefronts, template_wavefronts
 from psfdae_paper.stars.fields import assign_fields
 from psfdae_paper.stars.framing import Propagation, normalise_flux
+from psfdae_paper.stars.scenes import star_wavefronts, template_wavefronts
 
 READS = (*SIMULATION, "noise", "benchmark")
 BUDGET = 0.01  # numerical MSE of a stamp in units of the smallest noise variance it carries

@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from psfdae import fits
-from psfdae.cli import command
+from psfdae.cli import File, Folder, command
 from psfdae.commands.mosaic import each, images_of, with_name
 from psfdae.commands.predict import Stated, write_list
 from psfdae.errors import Error
-from psfdae.figure_style import as_png
+from psfdae.figures import as_png
 from psfdae.files import (
     atomic_path,
     check_outputs,
@@ -33,7 +33,6 @@ from psfdae.model.fitting import best, described, fitted_to, makes_models, packe
 from psfdae.model.settings import CHOSEN, Words, of_config
 from psfdae.model.stars import Stars
 from psfdae.model.validation import validate
-from psfdae.options import File, Folder
 from psfdae.settings import ConfigError, as_overrides
 
 LOCK = ".from_stars.lock"

@@ -12,9 +12,9 @@ from typing import Annotated
 import click
 import numpy as np
 
-from psfdae.cli import command
+from psfdae.cli import File, NameOrNumber, command
 from psfdae.commands.mosaic import each, images_of, with_name
-from psfdae.figure_style import write_png
+from psfdae.figures import write_png
 from psfdae.files import atomic_path, check_outputs, interrupted
 from psfdae.image.fits_file import Card
 from psfdae.image.observation import Observation, Source, list_offset
@@ -23,7 +23,6 @@ from psfdae.method import MeasuresStars
 from psfdae.model.bundle import SUFFIX
 from psfdae.model.prediction import Prediction, prediction_file
 from psfdae.model.psf_model import MARGIN_PX, PredictionError, PsfModel, load_model
-from psfdae.options import File, NameOrNumber
 
 
 @dataclass(frozen=True)

@@ -28,8 +28,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from psfdae.bundle_info import FORMAT_VERSION, OLDEST_FORMAT, BundleInfo
-from psfdae.errors import Error
-from psfdae.extras import needed_by
+from psfdae.errors import Error, needed_by
 from psfdae.files import ProductError, atomic_path
 from psfdae.image.errors import one_line
 from psfdae.method import HasConditions, Method

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from psfdae.extras import needed_by
+from psfdae.errors import needed_by
 from psfdae.fits import described_by
 from psfdae.method import FreesFlux, Method
 from psfdae.methods import groups_of

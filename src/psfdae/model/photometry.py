@@ -41,11 +41,13 @@ NOISE_FLOOR = 1e-6  # least σ in units of a star's median pixel; images may hav
 
 # Of `robust_flux`.
 KEPT = 0.5  # part of the pixels that must be left for a fit
-ROUNDS = 5  # fits per star; flux, noise and outliers settle in three or four
 LARGEST = 1e15  # pixels are cut at this many times the median pixel, so that no square overflows
 
+# Fits of a star by `robust_flux`, where flux, noise and outliers settle in three or four, and
+# updates of flux and noise by `Photometer`, where they settle in three.
+ROBUST_ROUNDS, UPDATES = 5, 4
+
 # Of `Photometer`.
-UPDATES = 4  # of flux and noise; they settle in three
 CLEAR = 2.0  # stars of less flux than this times its error are fitted carefully
 GROUP = 16  # stars per careful fit, always filled: other sizes would round otherwise
 FREE_SKY = 1e4  # variance of an unknown sky in units of the flux squared: as good as infinite
@@ -206,7 +208,7 @@ def _robust_fit(
     first = _scatter(np.abs(x - flux[:, None] * model.mean), finite)
     sigma = np.maximum(first, NOISE_FLOOR)
     limit = SLACK * model.high.max()
-    for _ in range(ROUNDS):
+    for _ in range(ROBUST_ROUNDS):
         positive = np.maximum(flux, 0.0)[:, None]
         noise = CLIP * sigma[:, None]
         kept = finite & (x <= positive * (MARGIN * model.high + limit) + noise)

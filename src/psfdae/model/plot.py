@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from psfdae.figure_style import WIDTH_IN, new_figure, styled
+from psfdae.figures import WIDTH_IN, new_figure, styled
 from psfdae.image.stamps import StarFlag
 
 if TYPE_CHECKING:

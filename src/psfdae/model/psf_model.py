@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields, replace
 from functools import cache
@@ -161,6 +161,26 @@ class PsfModel:
         PredictionError
             If shapes or types do not fit.
         """
+        given = {"flux": flux, "background": background, "noise": noise, "gain": gain}
+        masks = {"bad": bad, "saturated": saturated}
+        stars = self._stamps(stamps, margin, given, masks, position, centre)
+        blocks = self.engine.blocks(stars)
+        with one_thread_each():
+            threads = min(threads or available_cores(), max(len(blocks), 1))
+            work = (lambda block: self.engine.block(block, fixed), blocks or [stars], threads)
+            parts = side_by_side(*work)
+        return Prediction.joined(parts)
+
+    def _stamps(
+        self,
+        stamps: ArrayLike,
+        margin: int,
+        given: Mapping[str, ArrayLike | None],
+        masks: Mapping[str, ArrayLike | None],
+        position: ArrayLike | None,
+        centre: ArrayLike | None,
+    ) -> Stamps:
+        """What `predict` is given, checked."""
         data = _numbers("stamps", stamps)
         single = data.ndim == 2
         data = data[None] if single else data
@@ -172,11 +192,10 @@ class PsfModel:
             )
         finite = np.isfinite(data)
         x, y = _pairs("position", position, len(data)).T
-        given = {"flux": flux, "background": background, "noise": noise, "gain": gain}
-        stars = Stamps(
+        return Stamps(
             data=data if finite.all() else np.where(finite, data, 0),
-            bad=_mask("bad", bad, data, single) | ~finite,
-            saturated=_mask("saturated", saturated, data, single),
+            bad=_mask("bad", masks["bad"], data, single) | ~finite,
+            saturated=_mask("saturated", masks["saturated"], data, single),
             flags=np.zeros(len(data), dtype=np.uint16),
             id=np.arange(len(data)),
             x=x,
@@ -184,12 +203,6 @@ class PsfModel:
             listed=_pairs("centre", centre, len(data))[:, ::-1],
             **{name: _per_star(name, value, len(data)) for name, value in given.items()},
         )
-        blocks = self.engine.blocks(stars)
-        with one_thread_each():
-            threads = min(threads or available_cores(), max(len(blocks), 1))
-            work = (lambda block: self.engine.block(block, fixed), blocks or [stars], threads)
-            parts = side_by_side(*work)
-        return Prediction.joined(parts)
 
     def stream(
         self, observation: Observation, threads: int | None = None, fixed: bool = False

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from psfdae.figure_style import SERIES_COLORS, new_figure, styled
+from psfdae.figures import SERIES_COLORS, new_figure, styled
 from psfdae.image.selection import Verdict
 from psfdae.image.stamps import StarFlag, cut
 from psfdae.model.plot import SPOILT

@@ -13,9 +13,8 @@ import numpy as np
 
 from psfdae.bright_stars import BrightStars
 from psfdae.files import Column, Product
-from psfdae.image.advice import advice
 from psfdae.image.observation import Observation, Source, list_offset
-from psfdae.image.selection import Candidates, collect
+from psfdae.image.selection import Candidates, advice, collect
 from psfdae.image.training_images import single_psf, star_grid, training_columns
 from psfdae.model.settings import IMAGE_GROUPS, settings_model, with_keywords
 from psfdae.rng import stream

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from psfdae.figure_style import as_png
+from psfdae.figures import StripRow, as_png, restoration_strip, spread_stars
 from psfdae.files import write_text
 from psfdae.image.stamps import Stamps
 from psfdae.method import Method, facts_of
@@ -30,7 +30,6 @@ from psfdae.model.star_sets import (
     training_set,
 )
 from psfdae.model.stars import REFERENCE, SPLIT, Stars
-from psfdae.strip import StripRow, restoration_strip, spread_stars
 from psfdae.threads import fixed_threads
 
 if TYPE_CHECKING:

@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from math import lgamma
+from typing import NamedTuple
 
 import numpy as np
 
@@ -37,72 +38,77 @@ from psfdae_paper.stars.symmetry import SYMMETRIES
 
 TERMS = len(SEIDEL_TERMS)
 
-RUNGS = (126, 158, 190, 222, 254, 318, 398, 478, 574, 690, 830, 1000)
+PUPIL_SAMPLES = (126, 158, 190, 222, 254, 318, 398, 478, 574, 690, 830, 1000)
 """Pupil samples of draws; the sampling guard decides, as it does for stars.
 
 Stamps differ from those of N = 222 by an MSE of 4e-11 on average and 7e-10 at most.
 """
 
-FARTHEST = 6.0
+FARTHEST_Z = 6.0
 """Standardised coefficients beyond ± this have no weight, as they have none in the prior (2e-9);
 the tails of the proposals reach beyond what can be sampled."""
 
-MATCHES = 16
+BANK_MATCHES = 16
 """Best matches of the bank from which modes are sought: in as many fields, and in the own one at
 as many offsets."""
 
-ROUNDS = (0.2, 0.3, 0.5)
-"""Parts of the draws before the mixture is adapted once, twice, and after."""
 
-FREEDOM = 5.0
-"""Degrees of freedom of the proposals; their tails are heavier than any normal posterior's."""
+class Climb(NamedTuple):
+    """Gauss–Newton steps from a match to a mode."""
 
-STEPS = 12
-"""Most Gauss–Newton steps from a match."""
+    most_steps: int = 12
+    least_gain: float = 0.02
+    """In log-posterior, that another step must promise."""
+    most_damping: float = 1e6
+    """At which a climb is given up."""
 
-CONVERGED = 0.02
-"""Gain in log-posterior that another step must promise."""
 
-SOURCES = 3
-"""Best modes of a star whose twins in other fields are sought."""
+class TwinSearch(NamedTuple):
+    """Modes that look like those found, in other fields and at other offsets."""
 
-POOR_FIT = 2.0
-"""Standard deviations of χ² by which a star's best mode must fit worse than the truth would,
-for more modes to be sought beside it. Chance alone makes 3 % of the stars."""
+    sources: int = 3
+    """Best modes of a star whose twins are sought."""
+    poor_fit: float = 2.0
+    """Standard deviations of χ² by which a star's best mode must fit worse than the truth would,
+    for more modes to be sought beside it. Chance alone makes 3 % of the stars."""
+    neighbourhood_px: int = 3
+    """By which the offsets of these modes differ at most. At low noise an offset that the bank
+    does not have in a star's field is a mode that no match leads to."""
+    offsets: int = 1
+    """That are tried in a field around every source."""
+    most: int = 40
+    """Twins that are tried in all."""
 
-NEIGHBOURHOOD = 3
-"""Pixels by which the offsets of these modes differ at most. At low noise an offset that the bank
-does not have in a star's field is a mode that no match leads to."""
 
-OFFSETS = 1
-"""Offsets that are tried in a field around every source."""
+class Proposals(NamedTuple):
+    """Draws around modes."""
 
-MOST_TWINS = 40
-"""Twins that are tried in all."""
+    rounds: tuple[float, ...] = (0.2, 0.3, 0.5)
+    """Parts of the draws before the mixture is adapted once, twice, and after."""
+    freedom: float = 5.0
+    """Degrees of freedom of Student's t; its tails are heavier than any normal posterior's."""
+    prior_draws: float = 10.0
+    """Effective draws of a mode that change its scale half way to theirs."""
+    own_share: float = 0.25
+    """Least part of the draws in the star's own field: all that counts where the field is given."""
+
+
+CLIMB, TWINS, PROPOSALS = Climb(), TwinSearch(), Proposals()
 
 CONJUGATE = np.array([1 - 2 * (name in ("r4", "xx", "xy", "yy")) for name in MONOMIALS])
 """Signs that negate the even part of a wavefront: its image stays the same."""
 
-STUCK = 1e6
-"""Damping at which a climb is given up."""
-
-FAR = 50.0
+FARTHEST_EVIDENCE = 50.0
 """Modes whose evidence is this far (in its logarithm) below a star's best are left out.
 
 The evidence is that of a Gaussian, which errs by much along a bent ridge of the posterior: a nearer
 limit leaves out modes that the draws then find to hold the mass.
 """
 
-PRIOR_DRAWS = 10.0
-"""Effective draws of a mode that change its scale half way to theirs."""
-
-OWN_SHARE = 0.25
-"""Least part of the draws in the star's own field: all that counts where the field is given."""
-
-PARTS = 4
+EQUAL_PARTS = 4
 """Equal parts of the draws, whose errors tell whether they are enough."""
 
-BLOCK = 60
+STARS_AT_ONCE = 60
 """Stars whose draws are propagated together, to bound the memory."""
 
 
@@ -195,7 +201,7 @@ class StampModel:
         half = np.array([-0.5, 0.5]) * self.framing.stamp_px
         edges = (offset[:, ::-1, None] + half) * self.telescope.pixel  # (x, y) from (row, column)
         needed = required_samples(slope_ranges(mode_slopes(monomial_images), coefficients), edges)
-        ladder = sorted({*RUNGS, *self.optics.pupil_samples})
+        ladder = sorted({*PUPIL_SAMPLES, *self.optics.pupil_samples})
         return choose_samples(needed, tuple(ladder))
 
 
@@ -283,8 +289,8 @@ class Modes:
         share = np.where(np.isfinite(share), share, 0.0) * weight
         mass = share.sum(axis=1)
         known = mass**2 / np.maximum((share**2).sum(axis=1), np.finfo(float).tiny)
-        pull = (known / (known + PRIOR_DRAWS))[:, None]
-        share *= (FREEDOM + TERMS) / (FREEDOM + distance)
+        pull = (known / (known + PROPOSALS.prior_draws))[:, None]
+        share *= (PROPOSALS.freedom + TERMS) / (PROPOSALS.freedom + distance)
         share /= np.maximum(share.sum(axis=1, keepdims=True), np.finfo(float).tiny)
         z = self.z + pull * (share @ draws.z - self.z * share.sum(axis=1, keepdims=True))
         apart = draws.z - z[:, None]
@@ -301,7 +307,7 @@ class Modes:
         share = 0.9 * share / share.sum() + 0.1 / share.size
         own_field = self.field == own
         # Where the field is given, these alone count.
-        missing = OWN_SHARE - share[own_field].sum()
+        missing = PROPOSALS.own_share - share[own_field].sum()
         if missing > 0 and own_field.any():
             inside = np.exp(self.evidence[own_field] - self.evidence[own_field].max()) + 0.1
             share *= 1.0 - missing
@@ -309,7 +315,7 @@ class Modes:
         number = np.ceil(share * count).astype(int)
         mode = np.repeat(np.arange(share.size), number)
         normal = rng.standard_normal((mode.size, TERMS))
-        tail = np.sqrt(FREEDOM / rng.chisquare(FREEDOM, mode.size))
+        tail = np.sqrt(PROPOSALS.freedom / rng.chisquare(PROPOSALS.freedom, mode.size))
         moved = (self.factor[mode] @ (normal * tail[:, None])[:, :, None])[:, :, 0]
         return Draws(self.field[mode], self.offset[mode], self.z[mode] + moved), number
 
@@ -339,23 +345,27 @@ def sample(
     draws : int
     """
     problem = (likelihood.counts(noisy), likelihood, model)
-    matches = best_matches(bank, seidel, noisy, likelihood, model, MATCHES, truth.field)
+    matches = best_matches(bank, seidel, noisy, likelihood, model, BANK_MATCHES, truth.field)
     modes = climb(matches, *problem)
     poor = unexplained(modes, *problem)
     beside = neighbours(modes, poor) + neighbours(matches, poor)
     modes = climb(modes + beside, *problem)
     modes = climb(modes + twins(modes, likelihood, model), *problem)
     modes = _separate(modes + climb(truth, *problem))
-    rounds = [round(share * draws) for share in ROUNDS]
+    rounds = [round(share * draws) for share in PROPOSALS.rounds]
     return sampled_sums(modes, noisy, truth.field, likelihood, model, rounds, rngs)
 
 
 def _log_student(distance: np.ndarray, factor: np.ndarray) -> np.ndarray:
     """Log-density of Student's t at squared distances (M, n) for Cholesky factors (M, 5, 5)."""
     width = np.log(np.diagonal(factor, axis1=1, axis2=2)).sum(axis=1)
-    constant = lgamma(0.5 * (FREEDOM + TERMS)) - lgamma(0.5 * FREEDOM)
-    constant -= 0.5 * TERMS * np.log(FREEDOM * np.pi)
-    return constant - width[:, None] - 0.5 * (FREEDOM + TERMS) * np.log1p(distance / FREEDOM)
+    constant = lgamma(0.5 * (PROPOSALS.freedom + TERMS)) - lgamma(0.5 * PROPOSALS.freedom)
+    constant -= 0.5 * TERMS * np.log(PROPOSALS.freedom * np.pi)
+    return (
+        constant
+        - width[:, None]
+        - 0.5 * (PROPOSALS.freedom + TERMS) * np.log1p(distance / PROPOSALS.freedom)
+    )
 
 
 @dataclass(frozen=True)
@@ -448,11 +458,11 @@ def climb(modes: Modes, counts: np.ndarray, likelihood: Likelihood, model: Stamp
     model : StampModel
     """
     total = len(modes.star)
-    z, score = np.clip(modes.z, -FARTHEST, FARTHEST), np.full(total, -np.inf)
+    z, score = np.clip(modes.z, -FARTHEST_Z, FARTHEST_Z), np.full(total, -np.inf)
     information, slope = np.tile(np.eye(TERMS), (total, 1, 1)), np.zeros((total, TERMS))
     gain, damping = np.full(total, np.inf), np.full(total, 1e-2)
     trial, active = z.copy(), np.arange(total)
-    for _ in range(STEPS):
+    for _ in range(CLIMB.most_steps):
         a = active
         field = modes.field[a]
         coefficients, directions = model.coefficients(trial[a], field), model.directions(field)
@@ -470,13 +480,15 @@ def climb(modes: Modes, counts: np.ndarray, likelihood: Likelihood, model: Stamp
         damping[a] *= np.where(better, 0.1, 10.0)
         step = np.linalg.solve(information[a], slope[a][:, :, None])[:, :, 0]
         gain[a] = 0.5 * (step * slope[a]).sum(axis=1)
-        hopeful = score + 2.0 * gain > _best(modes, score) - FAR
-        active = np.flatnonzero(hopeful & (gain > CONVERGED) & (damping < STUCK))
+        hopeful = score + 2.0 * gain > _best(modes, score) - FARTHEST_EVIDENCE
+        active = np.flatnonzero(
+            hopeful & (gain > CLIMB.least_gain) & (damping < CLIMB.most_damping)
+        )
         if not active.size:
             break
         ridge = damping[active, None, None] * information[active] * np.eye(TERMS)
         step = np.linalg.solve(information[active] + ridge, slope[active][:, :, None])
-        trial[active] = np.clip(z[active] + step[:, :, 0], -FARTHEST, FARTHEST)
+        trial[active] = np.clip(z[active] + step[:, :, 0], -FARTHEST_Z, FARTHEST_Z)
     factor = np.linalg.cholesky(np.linalg.inv(information))
     evidence = score + np.log(np.diagonal(factor, axis1=1, axis2=2)).sum(axis=1)
     return _separate(replace(modes, z=z, factor=factor, evidence=evidence))
@@ -488,7 +500,7 @@ def unexplained(
     """Stars with an image that their best mode does not explain, without or with the field given.
 
     χ² of the right mode has the mean P and the variance 2P for P pixels; they are those where it
-    is larger by `POOR_FIT` standard deviations.
+    is larger by `TWINS.poor_fit` standard deviations.
 
     Parameters
     ----------
@@ -499,7 +511,7 @@ def unexplained(
     expected = likelihood.flux * stamps.astype(np.float64) + likelihood.background
     misfit = ((counts[best.star] - expected) ** 2 / expected).sum(axis=1)
     pixels = counts.shape[1]
-    return np.unique(best.star[misfit > pixels + POOR_FIT * np.sqrt(2.0 * pixels)])
+    return np.unique(best.star[misfit > pixels + TWINS.poor_fit * np.sqrt(2.0 * pixels)])
 
 
 def neighbours(modes: Modes, stars: np.ndarray) -> Modes:
@@ -509,7 +521,7 @@ def neighbours(modes: Modes, stars: np.ndarray) -> Modes:
     and lead to a wrong one at its own.
     """
     best = modes.take(_first(2 * modes.star + modes.given, modes.evidence, 1))
-    shifts = np.array(jitters(NEIGHBOURHOOD))
+    shifts = np.array(jitters(TWINS.neighbourhood_px))
     some = np.flatnonzero(np.isin(best.star, stars))
     source = best.take(np.repeat(some, len(shifts)))
     offset = source.offset + np.tile(shifts, (some.size, 1))
@@ -534,7 +546,7 @@ def twins(modes: Modes, likelihood: Likelihood, model: StampModel) -> Modes:
     model : StampModel
     """
     blind = modes.take(np.flatnonzero(modes.given == NOTHING))
-    source = blind.take(_first(blind.star, blind.evidence, SOURCES))
+    source = blind.take(_first(blind.star, blind.evidence, TWINS.sources))
     middle = model.coefficients(source.z, source.field)
     each = np.tile(np.eye(len(MONOMIALS)), (len(middle), 1, 1))
     stamps, jacobian = model.derivatives(middle, each, source.offset)
@@ -554,7 +566,7 @@ def twins(modes: Modes, likelihood: Likelihood, model: StampModel) -> Modes:
             gap = sign * middle[m] + tilt - static[:, None]
             value, z = _projected(sign[:, None] * metric[m] * sign, directions, gap)
             value += height[m]
-            for f, k in zip(*np.nonzero(value > value.max() - FAR), strict=True):
+            for f, k in zip(*np.nonzero(value > value.max() - FARTHEST_EVIDENCE), strict=True):
                 key = (star, f, *(source.offset[m] + shifts[k]))
                 if key not in places or value[f, k] > places[key][0]:
                     places[key] = (value[f, k], z[f, k])
@@ -562,8 +574,8 @@ def twins(modes: Modes, likelihood: Likelihood, model: StampModel) -> Modes:
     value, z = (np.array(column) for column in zip(*places.values(), strict=True))
     # A few offsets of every field, then the best of them: no field crowds out another.
     fields_of = keys[:, 0] * len(model.field) + keys[:, 1]
-    kept = _first(fields_of, value, OFFSETS)
-    kept = kept[_first(keys[kept, 0], value[kept], MOST_TWINS)]
+    kept = _first(fields_of, value, TWINS.offsets)
+    kept = kept[_first(keys[kept, 0], value[kept], TWINS.most)]
     keys = keys[kept]
     given = np.full(len(keys), NOTHING)
     return Modes.at(keys[:, 0], keys[:, 1], keys[:, 2:], given, z[kept])
@@ -601,7 +613,7 @@ def _best(modes: Modes, score: np.ndarray) -> np.ndarray:
 
 def _separate(modes: Modes) -> Modes:
     """Modes with any mass, each once."""
-    near = np.flatnonzero(modes.evidence > _best(modes, modes.evidence) - FAR)
+    near = np.flatnonzero(modes.evidence > _best(modes, modes.evidence) - FARTHEST_EVIDENCE)
     kept: dict[tuple[int, ...], list[int]] = {}
     given = modes.given.copy()
     for m in near[np.argsort(-modes.evidence[near], kind="stable")]:
@@ -623,7 +635,7 @@ class Sampled:
     Attributes
     ----------
     free, in_field : list of PosteriorSums
-        In `PARTS` equal parts: over the fields that were found, and over the own one for who
+        In `EQUAL_PARTS` equal parts: over the fields that were found, and over the own one for who
         is given the field.
     free_helped, in_field_helped : PosteriorSums
         The same in one part with all modes found with more given, those climbed from the truth
@@ -678,14 +690,14 @@ def sampled_sums(
     found = modes.take(np.flatnonzero(modes.given != TRUTH))
     undetected = np.unique(modes.star[modes.given == TRUTH])
     kinds: list[tuple[PosteriorSums, ...]] = []
-    for stars in np.array_split(np.arange(len(noisy)), -(-len(noisy) // BLOCK)):
+    for stars in np.array_split(np.arange(len(noisy)), -(-len(noisy) // STARS_AT_ONCE)):
         samplers = sampled(stars, found)
         lost = stars[np.isin(stars, undetected)]
         again = dict(zip(lost, sampled(lost, modes), strict=True))
         for star, sampler in zip(stars, samplers, strict=True):
             kinds.append((*sampler.parts(model), *again.get(star, sampler).whole(model)))
     *halves, free, in_field = (PosteriorSums.stack(kind) for kind in zip(*kinds, strict=True))
-    return Sampled(halves[:PARTS], halves[PARTS:], free, in_field)
+    return Sampled(halves[:EQUAL_PARTS], halves[EQUAL_PARTS:], free, in_field)
 
 
 def _draw(samplers: list[_Sampler], count: int, likelihood: Likelihood, model: StampModel) -> None:
@@ -695,7 +707,7 @@ def _draw(samplers: list[_Sampler], count: int, likelihood: Likelihood, model: S
         np.concatenate([getattr(d, key) for d in fresh]) for key in ("z", "field", "offset")
     )
     z, *places = together
-    stamps = model.stamps(np.clip(z, -FARTHEST, FARTHEST), *places)
+    stamps = model.stamps(np.clip(z, -FARTHEST_Z, FARTHEST_Z), *places)
     stamps = stamps.reshape(len(stamps), -1)
     ends = np.cumsum([draws.field.size for draws in fresh])[:-1]
     for sampler, draws, images in zip(samplers, fresh, np.split(stamps, ends), strict=True):
@@ -729,7 +741,7 @@ class _Sampler:
         pixel = np.stack(np.divmod((images >= least).argmax(axis=1), framing.stamp_px), axis=1)
         jitter = pixel - framing.stamp_px // 2
         possible = (np.abs(jitter) <= framing.jitter_px).all(axis=1)
-        possible &= (np.abs(draws.z) <= FARTHEST).all(axis=1)
+        possible &= (np.abs(draws.z) <= FARTHEST_Z).all(axis=1)
         height = log_posterior(images, draws.z, self.counts, likelihood)
         place = (jitter + framing.jitter_px) @ [2 * framing.jitter_px + 1, 1]
         self.draws = Draws(
@@ -751,9 +763,9 @@ class _Sampler:
 
     def parts(self, model: StampModel) -> list[PosteriorSums]:
         """Sums of every part without the field, then of every part with the field given."""
-        own, part = self.draws.field == self.own, np.arange(self.height.size) % PARTS
+        own, part = self.draws.field == self.own, np.arange(self.height.size) % EQUAL_PARTS
         blind = ~own | self.found_own
-        kinds = [kind & (part == k) for kind in (blind, own) for k in range(PARTS)]
+        kinds = [kind & (part == k) for kind in (blind, own) for k in range(EQUAL_PARTS)]
         return self._sums(kinds, model)
 
     def whole(self, model: StampModel) -> list[PosteriorSums]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from psfdae.figure_style import SERIES_COLORS, new_figure, styled
+from psfdae.figures import SERIES_COLORS, new_figure, styled
 from psfdae_paper.alignment.methods import METHODS
 from psfdae_paper.evaluation.alignment_tables import PARAMETERS
 from psfdae_paper.evaluation.curves import readable_log_axis

@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from psfdae.figure_style import REFERENCES, SERIES_COLORS, new_figure, styled
+from psfdae.figures import REFERENCES, SERIES_COLORS, StripRow, draw_cell, new_figure, styled
 from psfdae.method import Method
 from psfdae.methods import method
-from psfdae.strip import StripRow, draw_cell
 from psfdae_paper.configuration.methods import oracles_last, registered
 
 if TYPE_CHECKING:

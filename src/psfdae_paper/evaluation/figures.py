@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from psfdae.figure_style import in_field_unit, new_figure, styled
-from psfdae.strip import STAMP_MAP
+from psfdae.figures import STAMP_MAP, in_field_unit, new_figure, styled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from psfdae.figure_style import SERIES_COLORS, new_figure, styled
+from psfdae.figures import SERIES_COLORS, new_figure, styled
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -9,10 +9,10 @@ from typing import Annotated, Any
 import numpy as np
 
 from psfdae.belonging import STATIC, require
+from psfdae.cli import File, Folder
 from psfdae.files import Product, read_product, write_csv
 from psfdae.metrics import mse, ssim
 from psfdae.noise import NoiseModel
-from psfdae.options import File, Folder
 from psfdae.reading import read_table
 from psfdae.rng import stream
 from psfdae.threads import limit_threads
@@ -27,9 +27,9 @@ from psfdae_paper.evaluation.calibration import (
 )
 from psfdae_paper.optics.pupil import Pupil
 from psfdae_paper.optics.wavefronts import WavefrontSource
-from psfdae_paper.stages.common import star_wavefronts, template_wavefronts
 from psfdae_paper.stars.fields import assign_fields
 from psfdae_paper.stars.framing import Propagation, normalise_flux
+from psfdae_paper.stars.scenes import star_wavefronts, template_wavefronts
 
 
 @command("scan", reads=(*SIMULATION, "noise", "calibration"))

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
-from psfdae.figure_style import write_png
+from psfdae.cli import AboveZero, File
+from psfdae.figures import write_png
 from psfdae.files import Product, ProductError, read_product
 from psfdae.method import Method
 from psfdae.model.star_sets import field_positions, noisy_test_images, read_stars, split_stars
-from psfdae.options import AboveZero, File
 from psfdae.reading import read_table
 from psfdae.settings import Reference
 from psfdae.threads import limit_threads
@@ -30,7 +30,7 @@ from psfdae_paper.stages.evaluate import (
 if TYPE_CHECKING:
     import pandas as pd
 
-    from psfdae.strip import StripRow
+    from psfdae.figures import StripRow
 
 STRIP_STARS, HEADLINE_STARS = 8, 5
 """Columns of a restoration strip, and of the headline."""
@@ -85,8 +85,7 @@ def figure_strip(
     out: Png,
 ) -> None:
     """Draw test stars of the split random before and after restoration."""
-    from psfdae.figure_style import REFERENCES, in_field_unit
-    from psfdae.strip import restoration_strip, spread_stars
+    from psfdae.figures import REFERENCES, in_field_unit, restoration_strip, spread_stars
 
     limit_threads(config.evaluation.threads)
     product = read_stars(stars, reference)
@@ -118,7 +117,7 @@ def figure_headline(
     """Draw restored stars beside the errors and their bounds."""
     from dataclasses import replace
 
-    from psfdae.strip import spread_stars
+    from psfdae.figures import spread_stars
     from psfdae_paper.evaluation.curves import headline
 
     limit_threads(config.evaluation.threads)
@@ -207,8 +206,8 @@ def strip_rows(
 
     `config` is that of the stage `evaluate`; `test` are the test stars, `picks` those shown.
     """
+    from psfdae.figures import StripRow
     from psfdae.metrics import mse
-    from psfdae.strip import StripRow
 
     truth, position = product[reference][test][picks], field_positions(product)[test][picks]
     rows = [StripRow("reference", truth)]

@@ -9,24 +9,24 @@ from typing import Annotated, Any
 import click
 import numpy as np
 
+from psfdae.cli import File, Folder
 from psfdae.errors import Error
-from psfdae.figure_style import write_png
+from psfdae.figures import write_png
 from psfdae.files import Product, atomic_path, check_outputs, read_product, write_csv, write_fits
 from psfdae.moments import measure_shapes
 from psfdae.noise import noise_equivalent_px
-from psfdae.options import File, Folder
 from psfdae.rng import stream
 from psfdae.version import __version__
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.consistency import STATIC
 from psfdae_paper.configuration.schema import Config
 from psfdae_paper.evaluation.figures import FieldOfPsfs, field_of_psfs
-from psfdae_paper.stages.common import template_wavefronts
 from psfdae_paper.stages.figures import without_margin
 from psfdae_paper.stages.stars import templates
 from psfdae_paper.stars.example import ExampleField, FieldRecipe, add_stamps, write_field
 from psfdae_paper.stars.example import example_field as simulated
 from psfdae_paper.stars.framing import normalise_flux
+from psfdae_paper.stars.scenes import template_wavefronts
 
 OWN_DATASET = "_telescope"
 """The dataset that a telescope of one's own is put into."""

@@ -7,17 +7,17 @@ from typing import Annotated
 import numpy as np
 
 from psfdae import belonging
+from psfdae.cli import File
 from psfdae.files import Column, Empty, read_product, stream_product, write_product
-from psfdae.options import File
 from psfdae.rng import stream
 from psfdae.splits import draw_jitter, draw_phase
 from psfdae.threads import limit_threads
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.consistency import SIMULATION, STATIC
 from psfdae_paper.configuration.schema import Config
-from psfdae_paper.stages.common import drawn_columns, star_wavefronts, template_wavefronts
 from psfdae_paper.stars.fields import assign_fields, square_grid
 from psfdae_paper.stars.framing import Propagation, crop_jittered, normalise_flux
+from psfdae_paper.stars.scenes import drawn_columns, star_wavefronts, template_wavefronts
 
 ABOUT_PEAK = "brightest pixel (row, column) from the chief ray"
 

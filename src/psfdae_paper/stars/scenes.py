@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from psfdae.files import Column
 from psfdae.rng import stream
 from psfdae_paper.configuration.schema import Grid, Stars
 from psfdae_paper.configuration.telescope import OwnTelescope, Telescope
@@ -242,3 +243,23 @@ def static_terms(grid: Grid, telescope: OwnTelescope) -> tuple[tuple[int, ...], 
 
 SCENES = {"seidel": SeidelScene, "turbulence": TurbulenceScene, "telescope": TelescopeScene}
 """By name."""
+
+
+def scene_of(config: Any) -> Any:
+    """The scene of a stage's config."""
+    return SCENES[config.scene.name](config.grid, config.telescope, config.wavefront)
+
+
+def template_wavefronts(config: Any) -> Any:
+    """Static wavefronts of all fields of a stage's scene."""
+    return scene_of(config).templates()
+
+
+def star_wavefronts(config: Any, star_field: np.ndarray) -> Any:
+    """Wavefronts of stars with random aberrations, `star_field` the field of each."""
+    return scene_of(config).stars(config.stars, star_field, config.seed)
+
+
+def drawn_columns(source: Any) -> dict[str, Column]:
+    """What the stars' random aberrations were, as products keep it."""
+    return {name: Column(values, "wave", about) for name, (values, about) in source.drawn.items()}

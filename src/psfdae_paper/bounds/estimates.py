@@ -1,0 +1,239 @@
+"""Posterior means of test stars: over a bank, over importance samples, and the better of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from psfdae.files import Product
+from psfdae.metrics import mse
+from psfdae.model.star_sets import noisy_test_images, split_stars
+from psfdae.rng import stream
+from psfdae_paper.bounds.posterior import (
+    Bank,
+    Likelihood,
+    PosteriorSums,
+    nested_means,
+    posterior_sums,
+    segments,
+)
+from psfdae_paper.bounds.sampling import TRUTH, Modes, Sampled, StampModel, sample
+from psfdae_paper.bounds.tight import Evidence
+from psfdae_paper.configuration.schema import Config
+from psfdae_paper.stars.fields import relative_field
+from psfdae_paper.stars.symmetry import orbit
+
+SPLIT = "random"
+"""The split that is bounded: its test stars lie in all fields."""
+
+HOPELESS_ESS = 2.0
+"""A quarter of the bank with a smaller median effective sample size is not extended."""
+
+ENOUGH_ESS = 50.0
+"""Effective sample size below which a star gets importance samples of its own.
+
+The error of a mean over so many is 2 % above that of the exact mean.
+"""
+
+
+@dataclass(frozen=True)
+class BoundedStars:
+    """The test stars that are bounded.
+
+    Attributes
+    ----------
+    star, field : ndarray of int, shape (n,)
+        Number of the star in the product and its field.
+    truth : dict of ndarray, shape (n, d, d)
+        Noise-free image by reference.
+    noisy : dict of ndarray, shape (n, d, d)
+        Noisy image by noise level λ: the very images of the stage `evaluate`.
+    """
+
+    star: np.ndarray
+    field: np.ndarray
+    truth: dict[str, np.ndarray]
+    noisy: dict[float, np.ndarray]
+
+    def take(self, stars: np.ndarray) -> BoundedStars:
+        """Some of the stars, in the order given."""
+        truth, noisy = (
+            {key: images[stars] for key, images in kind.items()}
+            for kind in (self.truth, self.noisy)
+        )
+        return BoundedStars(self.star[stars], self.field[stars], truth, noisy)
+
+
+def bounded_stars(config: Config, product: Product) -> BoundedStars:
+    """The first test stars of a product "stars", with the noise of their datasets."""
+    test = split_stars(product, SPLIT, config).test
+    kept = test[: config.bounds.test_stars]
+    return BoundedStars(
+        star=kept,
+        field=product["field_index"][kept],
+        truth={name: product[name][kept] for name in ("realisation", "template")},
+        noisy={lvl: noisy_test_images(config, product, kept, lvl) for lvl in config.noise.levels},
+    )
+
+
+@dataclass(frozen=True)
+class Estimates:
+    """`measures_of`, shape (5, n), of one posterior mean.
+
+    Attributes
+    ----------
+    full, quarter : ndarray, shape (5, n)
+        Of all samples, and of a quarter of them.
+    helped : ndarray, shape (5, n)
+        Of all samples and those around modes that only the truth leads to.
+    """
+
+    full: np.ndarray
+    quarter: np.ndarray
+    helped: np.ndarray
+
+    @classmethod
+    def over_bank(cls, sizes: dict[int, np.ndarray]) -> Estimates:
+        """From `measures_of` by number of draws, each twice that before."""
+        nested = list(sizes.values())
+        quarter = nested[-3] if len(nested) > 2 else np.full_like(nested[-1], np.nan)
+        return cls(nested[-1], quarter, nested[-1])
+
+    @classmethod
+    def oversampled(
+        cls,
+        parts: list[PosteriorSums],
+        helped: PosteriorSums,
+        static: np.ndarray,
+        stars: BoundedStars,
+    ) -> Estimates:
+        """From sums over importance samples in four parts, and those with the truth's modes."""
+        measure = partial(measures_of, static=static, stars=stars)
+        quarter, _, full = nested_means(parts, measure).values()
+        return cls(full, quarter, measure(helped))
+
+    @property
+    def ess(self) -> np.ndarray:
+        """Effective sample size of every star."""
+        return self.full[-1]
+
+    def improved(self, few: np.ndarray, other: Estimates | None) -> tuple[Estimates, int]:
+        """With another one of the stars `few` where it has more samples, and for how many."""
+        if other is None:
+            return self, 0
+        better = (self.ess[few] < ENOUGH_ESS) & (other.ess > self.ess[few])
+        changed = {name: values.copy() for name, values in vars(self).items()}
+        for name, values in changed.items():
+            values[:, few[better]] = getattr(other, name)[:, better]
+        return Estimates(**changed), int(better.sum())
+
+    def values(self, number: int) -> dict[str, np.ndarray]:
+        """Error and variance of every star by one reference, and the effective sample size."""
+        return {"mse": self.full[number], "variance": self.full[2 + number], "ess": self.ess}
+
+    def evidence(self, number: int, field: np.ndarray) -> Evidence:
+        """Whether the mean of one reference is near the exact one."""
+        return Evidence.of(
+            **self.values(number),
+            field=field,
+            last_change=abs(_change(self.quarter[number], self.full[number])),
+            undetected=-_change(self.helped[number], self.full[number]),
+        )
+
+
+def _change(errors: np.ndarray, full: np.ndarray) -> float:
+    """Relative difference of mean errors, over the stars that have both."""
+    known = np.isfinite(errors) & np.isfinite(full)
+    return float(errors[known].mean() / full[known].mean() - 1.0) if known.any() else np.nan
+
+
+def sampled(
+    config: Config,
+    bank: Bank,
+    seidel: np.ndarray,
+    product: Product,
+    stars: BoundedStars,
+    level: float,
+    likelihood: Likelihood,
+) -> Sampled:
+    """Importance samples around the best matches of every star, from a stream of its own."""
+    mean = np.array(config.wavefront.coefficients)
+    spread = config.stars.aberration_fraction * np.abs(mean)
+    field = relative_field(config.grid)
+    model = StampModel(mean, spread, field, config.telescope, config.optics, config.framing)
+    names = ("bounds", config.stars.name, f"{level:.6g}")
+    rngs = [stream(config.seed, *names, int(star)) for star in stars.star]
+    noisy, draws = stars.noisy[level], config.bounds.star_draws
+    count = stars.star.size
+    truth = Modes.at(
+        np.arange(count),
+        stars.field,
+        product["peak"][stars.star] - product["jitter"][stars.star],
+        np.full(count, TRUTH),
+        model.standardised(product["seidel"][stars.star]),
+    )
+    return sample(bank, seidel, noisy, truth, likelihood, model, draws, rngs)
+
+
+def _anywhere(stars: BoundedStars, bank: Bank) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Test stars and the draws that they are weighed with: all with all."""
+    return [(np.arange(stars.field.size), np.arange(len(bank)))]
+
+
+def _in_the_field(stars: BoundedStars, bank: Bank) -> list[tuple[np.ndarray, np.ndarray]]:
+    """The same for draws that the symmetries take to each star's own field.
+
+    Fields that are mirror images of each other share theirs.
+    """
+    ours, theirs = orbit(stars.field, bank.points), orbit(bank.field, bank.points)
+    return [(np.flatnonzero(ours == o), np.flatnonzero(theirs == o)) for o in np.unique(ours)]
+
+
+def weighed(
+    bank: Bank, given: bool, static: np.ndarray, stars: BoundedStars, level: float, like: Likelihood
+) -> dict[int, np.ndarray]:
+    """`measures_of` of the posterior mean over a bank, with the field given or not, by its size.
+
+    Every part of the bank has as many draws of every group, and those that are counted are
+    the draws in all fields. A bank in which far too few stars are similar at its noise level is
+    left after a quarter.
+    """
+    groups = _in_the_field(stars, bank) if given else _anywhere(stars, bank)
+    pieces = segments(min(draws.size for _, draws in groups))
+    quarter = max(1, pieces // 4)
+    several = [(stars.take(group), np.array_split(draws, pieces)) for group, draws in groups]
+
+    def weigh(first: int, end: int) -> list[list[PosteriorSums]]:
+        return [
+            [
+                posterior_sums(
+                    *(bank.take(cut), few.noisy[level], like),
+                    own_field=few.field if given else None,
+                )
+                for cut in cuts[first:end]
+            ]
+            for few, cuts in several
+        ]
+
+    parts = weigh(0, quarter)
+    sizes = [nested_means(part, lambda sums: sums.effective_size)[quarter] for part in parts]
+    if np.median(np.concatenate(sizes)) >= HOPELESS_ESS:
+        parts = [old + new for old, new in zip(parts, weigh(quarter, pieces), strict=True)]
+    means: dict[int, np.ndarray] = {}
+    for (group, _), (few, _), part in zip(groups, several, parts, strict=True):
+        measure = partial(measures_of, static=static, stars=few)
+        for size, values in nested_means(part, measure).items():
+            total = means.setdefault(size, np.empty((len(values), stars.field.size)))
+            total[:, group] = values
+    return {round(len(bank) / pieces * size): values for size, values in means.items()}
+
+
+def measures_of(sums: PosteriorSums, static: np.ndarray, stars: BoundedStars) -> np.ndarray:
+    """MSE against realisation and template, variances of both, effective sample size, (5, n)."""
+    shape = stars.truth["realisation"].shape
+    template, spread = sums.template(static)
+    means = {"realisation": sums.mean_image, "template": template}
+    errors = [mse(means[name].reshape(shape), truth) for name, truth in stars.truth.items()]
+    return np.stack([*errors, sums.variance_image, spread, sums.effective_size])
