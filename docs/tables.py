@@ -222,24 +222,17 @@ def outliers():
     return wide.reset_index()
 
 
-def sweep(name):
-    """Points of a sweep with what they took, the shortest first."""
-    folder = f"sweeps/{name}"
-    table = csv(f"{folder}/summary.csv").merge(csv(f"{folder}/cost.csv"), on="point")
-    return table.sort_values("seconds")
-
-
 def real_sky():
     """Errors on a real image in 1e-5 by S/N: ours, and each package's at its best setting.
 
     Those of the packages are with the centre fitted and averaged, as are the ratios of psfdae's to
-    the least of them. Fluxes are those of the fitted centre.
+    the least of them.
     """
     rows = []
     for _, cell in csv(REAL_SKY).groupby("snr"):
         (ours,) = cell.query("package == 'psfdae'").to_dict("records")
         others = cell.query("package != 'psfdae'")
-        row = ours | {"psfdae": _in_1e5(ours), "least_scatter": others.flux_scatter.min()}
+        row = ours | {"psfdae": _in_1e5(ours)}
         for centre, group in others.groupby("centre"):
             for peer in group.loc[group.groupby("package").mse.idxmin()].to_dict("records"):
                 row[f"{peer['package']}_{centre}"] = _in_1e5(peer)
@@ -307,20 +300,6 @@ def better(first, second):
     gain = table[second] - table[first]
     allowed = SIGNIFICANT * np.hypot(table[f"{first}_sd"], table[f"{second}_sd"])
     return table[(gain > 0) & ~(gain <= allowed)]
-
-
-def readings():
-    """Interpretations of PCA+SOM: rise with λ², errors over the paper's and the usual."""
-    table = csv("studies/baseline_readings/table.csv")
-    usual = table.query("reading == 'map' and per_level == 'yes'")
-    usual = usual.set_index(CELL).mse.rename("usual")
-    keys, rows = ["dataset", "reference", "reading", "per_level"], []
-    for key, column in table.join(usual, CELL).groupby(keys, sort=False):
-        row = dict(zip(keys, key, strict=True)) | {"over_paper": column.over_paper.tolist()}
-        for name in ("mse", "mse_paper"):
-            row[name] = np.polyfit(column.noise_level**2, column[name], 1)[0]
-        rows.append(row | {"over_usual": (column.mse / column.usual).iloc[0]})
-    return pd.DataFrame(rows)
 
 
 def fit():

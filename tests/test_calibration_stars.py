@@ -8,19 +8,18 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from psfdae.bright_stars import BrightStars
 from psfdae.image.selection import (
-    BrightStars,
     brightest_pixels,
     crowded,
     misfit,
-    moved,
     signal_to_noise,
     sky_around,
-    star_centres,
     window_of,
 )
 from psfdae.image.stamps import cut
 from psfdae.image.training_images import bins_of, make_images, stacks, star_grid, star_of_images
+from psfdae.moments import moved, windowed_centres
 from psfdae.noise import noise_equivalent_px
 from psfdae.rng import stream
 from psfdae.splits import held_out_fields
@@ -114,7 +113,7 @@ def test_centres_are_found_to_a_hundredth_of_a_pixel():
     peak, inside = brightest_pixels(wide, 3)
     assert inside.all()
     assert (np.abs(peak - centre) <= 0.5 + 1e-9).all()
-    found = star_centres(wide, peak, np.full(40, 1.5))
+    found = windowed_centres(wide, peak, np.full(40, 1.5), 10, 1.5)
     assert np.abs(found - centre).max() < 0.01
 
 
@@ -205,9 +204,9 @@ def test_images_are_framed_normalised_and_moved_only_where_asked():
         piece = cut(stars.wide[who : who + 1], 16, offset[None])[0]
         assert realisation[image] == pytest.approx(piece / piece.sum(), abs=1e-7)
     # The others lie anywhere in their pixel, and so do their templates.
-    place = star_centres(realisation.astype(float), jitter, np.full(400, 1.5))
+    place = windowed_centres(realisation.astype(float), jitter, np.full(400, 1.5), 10, 1.5)
     phase = (place - jitter)[subpixel]
     assert np.abs(phase.mean(axis=0)).max() < 4 * np.sqrt(1 / 12 / 200)
     assert phase.std(axis=0) == pytest.approx(np.sqrt(1 / 12), rel=0.1)
-    again = star_centres(made.astype(float), jitter, np.full(400, 1.5))
+    again = windowed_centres(made.astype(float), jitter, np.full(400, 1.5), 10, 1.5)
     assert np.abs(again - place).max() < 0.03

@@ -26,6 +26,7 @@ from psfdae_paper.stages import simulate
 REAL = Path(os.environ.get("PSFDAE_REAL_IMAGE", "hatp32.fits"))
 """A real image that is not ours to distribute; the list of its stars lies beside it."""
 TINY = ["preset=smoke", "parts.train_stars=120", "parts.test_stars=30", "train.epochs=1"]
+TINY += ["methods=[noisy,lmmse,gmm]"]
 
 
 @pytest.fixture(scope="module")

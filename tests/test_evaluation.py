@@ -112,7 +112,7 @@ def test_paper_table_puts_ours_beside_the_paper_s():
 
 
 def test_labels_say_what_a_method_is_given_beside_the_image():
-    ends = {kind.name: kind.label.partition(" (")[2] for kind in registered()}
+    ends = {kind.name: kind.look.label.partition(" (")[2] for kind in registered()}
     assert ends["dae"] == ends["noisy"] == ""
     assert ends["lmmse"] == ends["pca_som"] == ends["gmm"] == "given λ)"
     assert ends["gmm_position"] == ends["field"] == "given λ, position)"

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from command_line import refused
-from psfdae import extras, load_model
+from psfdae import errors, load_model
 from psfdae.cli import refusal
 from psfdae.errors import MissingExtraError
 from psfdae.model.bundle import write_bundle
@@ -26,7 +26,7 @@ def metadata(monkeypatch):
         for extra, names in project["optional-dependencies"].items()
         for line in names
     ]
-    monkeypatch.setattr(extras, "requires", lambda name: lines)
+    monkeypatch.setattr(errors, "requires", lambda name: lines)
 
 
 @pytest.fixture
@@ -80,8 +80,8 @@ def test_without_metadata_the_error_stays_what_it_is(monkeypatch):
     def unknown(name):
         raise importlib.metadata.PackageNotFoundError(name)
 
-    monkeypatch.setattr(extras, "requires", unknown)
+    monkeypatch.setattr(errors, "requires", unknown)
     error = ModuleNotFoundError("…", name="torch")
-    with pytest.raises(ModuleNotFoundError) as caught, extras.needed_by("it"):
+    with pytest.raises(ModuleNotFoundError) as caught, errors.needed_by("it"):
         raise error
     assert caught.value is error

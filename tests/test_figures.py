@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from psfdae import fits
 from psfdae.figures import StripRow, in_field_unit, restoration_strip, spread_stars
 from psfdae.files import Column, ProductError, write_product
 from psfdae.methods.dae import Dae
@@ -237,8 +238,8 @@ def test_strip_shows_the_noise_that_evaluate_measures(tmp_path, gaussian_stars, 
         ),
     )
     shown = {}
+    monkeypatch.setattr(fits, "require", lambda *stars: None)
     for kind in (PcaSom, Dae):
-        monkeypatch.setattr(kind, "require", lambda *stars: None)
         monkeypatch.setattr(kind, "load", classmethod(unchanged))
     monkeypatch.setattr(
         "psfdae.figures.restoration_strip",

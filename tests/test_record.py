@@ -208,6 +208,7 @@ rule:
 """
 
 
+@pytest.mark.slow
 @pytest.mark.workflow
 def test_make_reference_refuses_a_run_of_two_commits(history, tmp_path):
     """With Snakemake's own word for it, in a workflow of three files."""

@@ -11,7 +11,7 @@ import pytest
 from astropy.table import Table
 
 from psfdae.commands.predict import Stated
-from psfdae.image import advice
+from psfdae.image import selection as advice
 from psfdae.image.observation import Source
 from psfdae.image.selection import Verdict, misfit, piled_up
 from psfdae.image.stamps import StarFlag, cut

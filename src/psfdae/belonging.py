@@ -65,12 +65,17 @@ def require(
     tree = wanted if isinstance(wanted, Mapping) else wanted.model_dump()
     for key in keys:
         here, there = _at(said, key), _at(tree, key)
-        names = [key]
+        names, parts = [key], set()
         if isinstance(here, Mapping) and isinstance(there, Mapping):
-            names = [f"{key}.{name}" for name in sorted({*here} & {*there} - NO_PART)]
+            one, other = ({k for k in s if isinstance(s[k], Mapping)} for s in (here, there))
+            # Who states one part of a group by itself, such as aberrations, states all of them.
+            parts = one | other if one & other else set()
+            names = [f"{key}.{name}" for name in sorted(({*here} & {*there} | parts) - NO_PART)]
         for name in names:
             one, other = _at(said, name), _at(tree, name)
-            found = None if one is None or other is None else _difference(name, one, other)
+            if (one is None or other is None) and name.rpartition(".")[2] not in parts:
+                continue
+            found = _difference(name, one, other)
             if found is not None:
                 raise ProductError(f"{path}: {found[0]} = {found[1]}, but {whose} has {found[2]}")
 
@@ -84,6 +89,10 @@ def _at(tree: Any, key: str) -> Any:
 
 def _difference(name: str, one: Any, other: Any) -> tuple[str, Any, Any] | None:
     """The first key in which two values differ, and what each has there."""
+    one, other = (
+        {} if side is None and isinstance(beside, Mapping) else side
+        for side, beside in ((one, other), (other, one))
+    )
     if not (isinstance(one, Mapping) and isinstance(other, Mapping)):
         return None if one == other else (name, one, other)
     inner = ((key, *(s.get(key, "nothing") for s in (one, other))) for key in {**one, **other})

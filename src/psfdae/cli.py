@@ -276,22 +276,3 @@ def _unfolded(hint: Any) -> tuple[Any, dict[str, Any]]:
             return kind, {**attributes, "multiple": True}
         return tuple(_unfolded(part)[0] for part in inner), {}
     return hint, {}
-
-
-# Types of options.
-
-File = Annotated[Path, click.Path(path_type=Path, dir_okay=False)]
-
-Folder = Annotated[Path, click.Path(path_type=Path, file_okay=False)]
-
-AboveZero = click.FloatRange(min=0, min_open=True)
-
-
-class NameOrNumber(click.ParamType):
-    """An extension of a FITS file: its number, in plain digits, or its name."""
-
-    name = "text"
-
-    def convert(self, value: Any, param: Any, ctx: Any) -> str | int:
-        """A number from digits; any other text as it is."""
-        return int(value) if re.fullmatch("[0-9]{1,6}", str(value)) else value

@@ -14,10 +14,11 @@ import numpy as np
 import pandas as pd
 from scipy.stats import sem
 
-from psfdae.cli import File, program
+from psfdae.cli import program
 from psfdae.field_psf import slopes
 from psfdae.files import atomic_path
 from psfdae.image.observation import central_pixel
+from psfdae.options import File
 from psfdae.reading import read_table
 from psfdae.rng import stream
 from psfdae_paper.configuration.command import command

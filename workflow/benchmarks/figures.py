@@ -4,10 +4,11 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from psfdae.cli import File, program
+from psfdae.cli import program
 from psfdae.figures import SERIES_COLORS, new_figure, styled, write_png
 from psfdae.files import ProductError
 from psfdae.methods import method
+from psfdae.options import File
 from psfdae.reading import read_table
 from psfdae_paper.configuration.command import command
 

@@ -16,10 +16,11 @@ import numpy as np
 
 from measure import alone, cost_of_command, write, yes
 from psfdae.belonging import STARS, require
-from psfdae.cli import File, program
+from psfdae.cli import program
 from psfdae.files import read_product
 from psfdae.model import star_sets
 from psfdae.noise import NoiseModel, mixed_levels
+from psfdae.options import File
 from psfdae.rng import stream
 from psfdae.settings import ConfigError
 from psfdae.splits import draw_jitter

@@ -13,7 +13,8 @@ from propagators import (
     peers_of,
     time_settings,
 )
-from psfdae.cli import Folder, program
+from psfdae.cli import program
+from psfdae.options import Folder
 from psfdae.reading import read_table
 from psfdae.threads import limit_threads
 from psfdae_paper.configuration.command import command

@@ -14,9 +14,10 @@ import numpy as np
 
 from measure import alone, cost_of_command, write
 from prediction import make_cube
-from psfdae.cli import File, program
+from psfdae.cli import program
 from psfdae.fits import rule_of
 from psfdae.methods import method
+from psfdae.options import File
 from psfdae.rng import stream
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.consistency import SIMULATION

@@ -12,11 +12,12 @@ from pydantic import Field
 from measure import alone, pareto, write, yes
 from psfdae import fits
 from psfdae.belonging import STARS, require
-from psfdae.cli import File, Folder, program
+from psfdae.cli import program
 from psfdae.files import read_product, write_csv
 from psfdae.method import FitsAgain, GoesOn
 from psfdae.methods import groups_of, method
 from psfdae.model import star_sets
+from psfdae.options import File, Folder
 from psfdae.reading import read_table, read_yaml
 from psfdae.settings import Group, Reference
 from psfdae.threads import limit_threads

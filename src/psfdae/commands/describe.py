@@ -5,12 +5,13 @@ from __future__ import annotations
 from typing import Annotated
 
 from psfdae.bundle_info import BundleInfo
-from psfdae.cli import File, command
+from psfdae.cli import command
 from psfdae.files import check_outputs
 from psfdae.image.errors import one_line
 from psfdae.method import Exports, FitError, KnowsField
 from psfdae.methods import method
 from psfdae.model.bundle import Bundle, estimator, read_bundle
+from psfdae.options import File
 
 Packed = Annotated[File | None, {"argument": True}]
 

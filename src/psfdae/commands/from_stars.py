@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from psfdae import fits
-from psfdae.cli import File, Folder, command
+from psfdae.cli import command
 from psfdae.commands.mosaic import each, images_of, with_name
 from psfdae.commands.predict import Stated, write_list
 from psfdae.errors import Error
@@ -33,6 +33,7 @@ from psfdae.model.fitting import best, described, fitted_to, makes_models, packe
 from psfdae.model.settings import CHOSEN, Words, of_config
 from psfdae.model.stars import Stars
 from psfdae.model.validation import validate
+from psfdae.options import File, Folder
 from psfdae.settings import ConfigError, as_overrides
 
 LOCK = ".from_stars.lock"

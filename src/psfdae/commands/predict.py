@@ -12,7 +12,7 @@ from typing import Annotated
 import click
 import numpy as np
 
-from psfdae.cli import File, NameOrNumber, command
+from psfdae.cli import command
 from psfdae.commands.mosaic import each, images_of, with_name
 from psfdae.figures import write_png
 from psfdae.files import atomic_path, check_outputs, interrupted
@@ -23,6 +23,7 @@ from psfdae.method import MeasuresStars
 from psfdae.model.bundle import SUFFIX
 from psfdae.model.prediction import Prediction, prediction_file
 from psfdae.model.psf_model import MARGIN_PX, PredictionError, PsfModel, load_model
+from psfdae.options import File, NameOrNumber
 
 
 @dataclass(frozen=True)

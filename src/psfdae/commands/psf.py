@@ -9,11 +9,12 @@ from typing import Annotated
 import click
 import numpy as np
 
-from psfdae.cli import File, command
+from psfdae.cli import command
 from psfdae.files import atomic_path, check_outputs
 from psfdae.image.errors import ascii_line
 from psfdae.image.fits_file import BLOCK_BYTES
 from psfdae.model.psf_model import PredictionError, PsfModel, load_model
+from psfdae.options import File
 from psfdae.version import __version__
 
 PLACE = re.compile(r"([-+0-9.eE]+),([-+0-9.eE]+)")

@@ -13,8 +13,8 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from psfdae.belonging import require
-from psfdae.cli import File
 from psfdae.files import Column, read_product, write_csv, write_product
+from psfdae.options import File
 from psfdae.rng import stream
 from psfdae.threads import limit_threads
 from psfdae_paper.alignment.stamps import AlignmentStamps

@@ -20,7 +20,6 @@ import click
 import numpy as np
 
 from psfdae.belonging import require, require_origin, write_origin
-from psfdae.cli import AboveZero, File, Folder
 from psfdae.files import (
     Column,
     Product,
@@ -36,6 +35,7 @@ from psfdae.method import CONFIG, HISTORY, TrainingSet
 from psfdae.methods.dae import Dae
 from psfdae.model.star_sets import noise_model
 from psfdae.noise import mixed_levels
+from psfdae.options import AboveZero, File, Folder
 from psfdae.reading import from_tree, read_yaml
 from psfdae.rng import stream
 from psfdae.settings import deciding

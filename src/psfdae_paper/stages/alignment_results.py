@@ -10,10 +10,10 @@ from typing import Annotated, Any
 import numpy as np
 
 from psfdae.belonging import require, require_origin
-from psfdae.cli import File, Folder
 from psfdae.figures import write_png
 from psfdae.files import Product, ProductError, read_product, write_csv, write_text
 from psfdae.model.star_sets import noise_model
+from psfdae.options import File, Folder
 from psfdae.reading import read_table
 from psfdae.threads import limit_threads
 from psfdae_paper.alignment.fisher import coma_free_decentre, expected_abs_error

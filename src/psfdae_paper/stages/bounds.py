@@ -8,7 +8,6 @@ from typing import Annotated, Any
 import numpy as np
 
 from psfdae.belonging import STARS, STATIC, require
-from psfdae.cli import File
 from psfdae.files import (
     Column,
     ProductError,
@@ -17,6 +16,7 @@ from psfdae.files import (
     write_parquet,
     write_product,
 )
+from psfdae.options import File
 from psfdae.reading import read_table
 from psfdae.rng import stream
 from psfdae.threads import limit_threads

@@ -10,7 +10,6 @@ import numpy as np
 
 from psfdae import fits
 from psfdae.belonging import SAME_IMAGE, SAME_STARS, STARS, require_origin
-from psfdae.cli import AboveZero, File, Folder
 from psfdae.files import Product
 from psfdae.method import CONFIG, Method
 from psfdae.methods import method
@@ -18,6 +17,7 @@ from psfdae.model import packing
 from psfdae.model.bundle import SHIPPED, SUFFIX, Bundle, BundleError, read_bundle, write_bundle
 from psfdae.model.psf_model import PsfModel
 from psfdae.model.star_sets import fit_apart, noise_model, read_stars, training_set
+from psfdae.options import AboveZero, File, Folder
 from psfdae.rng import stream
 from psfdae.settings import Reference, SplitKind, as_overrides
 from psfdae.threads import limit_threads

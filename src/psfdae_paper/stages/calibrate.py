@@ -9,10 +9,10 @@ from typing import Annotated, Any
 import numpy as np
 
 from psfdae.belonging import STATIC, require
-from psfdae.cli import File, Folder
 from psfdae.files import Product, read_product, write_csv
 from psfdae.metrics import mse, ssim
 from psfdae.noise import NoiseModel
+from psfdae.options import File, Folder
 from psfdae.reading import read_table
 from psfdae.rng import stream
 from psfdae.threads import limit_threads

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from psfdae.cli import File, Folder
 from psfdae.errors import Error
 from psfdae.files import ProductError, write_text
 from psfdae.method import CONFIG, HISTORY
 from psfdae.methods import method
+from psfdae.options import File, Folder
 from psfdae.reading import read_csv, read_table, read_yaml
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.methods import registered

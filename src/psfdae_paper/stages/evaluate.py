@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from psfdae import fits
-from psfdae.cli import File, Folder
 from psfdae.files import Product, ProductError, write_csv, write_parquet, write_text
 from psfdae.method import Method
 from psfdae.methods import method
@@ -20,6 +19,7 @@ from psfdae.model.star_sets import (
     split_stars,
     training_set,
 )
+from psfdae.options import File, Folder
 from psfdae.reading import read_table
 from psfdae.settings import ConfigError, Reference, SplitKind
 from psfdae.threads import limit_threads

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
-from psfdae.cli import AboveZero, File
 from psfdae.figures import write_png
 from psfdae.files import Product, ProductError, read_product
 from psfdae.method import Method
 from psfdae.model.star_sets import field_positions, noisy_test_images, read_stars, split_stars
+from psfdae.options import AboveZero, File
 from psfdae.reading import read_table
 from psfdae.settings import Reference
 from psfdae.threads import limit_threads

@@ -9,10 +9,10 @@ from typing import Annotated
 import click
 
 from psfdae import fits
-from psfdae.cli import File, Folder
 from psfdae.method import GoesOn
 from psfdae.methods import groups_of, method
 from psfdae.model.star_sets import read_stars, training_set
+from psfdae.options import File, Folder
 from psfdae.settings import Reference, SplitKind
 from psfdae.threads import limit_threads
 from psfdae_paper.configuration.command import command

@@ -21,8 +21,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from psfdae.cli import File, Folder
 from psfdae.files import ProductError, write_csv, write_text
+from psfdae.options import File, Folder
 from psfdae_paper.configuration.command import command
 from psfdae_paper.source import git
 

@@ -9,12 +9,12 @@ from typing import Annotated, Any
 import click
 import numpy as np
 
-from psfdae.cli import File, Folder
 from psfdae.errors import Error
 from psfdae.figures import write_png
 from psfdae.files import Product, atomic_path, check_outputs, read_product, write_csv, write_fits
 from psfdae.moments import measure_shapes
 from psfdae.noise import noise_equivalent_px
+from psfdae.options import File, Folder
 from psfdae.rng import stream
 from psfdae.version import __version__
 from psfdae_paper.configuration.command import command

@@ -7,8 +7,8 @@ from typing import Annotated
 import numpy as np
 
 from psfdae import belonging
-from psfdae.cli import File
 from psfdae.files import Column, Empty, read_product, stream_product, write_product
+from psfdae.options import File
 from psfdae.rng import stream
 from psfdae.splits import draw_jitter, draw_phase
 from psfdae.threads import limit_threads

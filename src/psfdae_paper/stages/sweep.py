@@ -12,9 +12,9 @@ from typing import Annotated, Any, Literal
 
 import click
 
-from psfdae.cli import File, Folder
 from psfdae.files import ProductError, write_text
 from psfdae.method import FitError
+from psfdae.options import File, Folder
 from psfdae.settings import Reference, SplitKind
 from psfdae_paper.configuration.command import Root, command
 from psfdae_paper.configuration.compose import decisive, load_stage

@@ -7,9 +7,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from psfdae.cli import File, Folder
 from psfdae.figures import write_png
 from psfdae.files import ProductError, as_yaml, write_csv, write_text
+from psfdae.options import File, Folder
 from psfdae.reading import read_table, read_yaml
 from psfdae_paper.configuration.command import command
 from psfdae_paper.sweeps.measured import RESULT, read_cost, read_result

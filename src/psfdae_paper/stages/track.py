@@ -16,9 +16,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
-from psfdae.cli import File, Folder
 from psfdae.errors import Error
 from psfdae.files import atomic_path, write_text
+from psfdae.options import File, Folder
 from psfdae.version import __version__
 from psfdae_paper.configuration.command import command
 from psfdae_paper.source import git_commit

@@ -11,8 +11,8 @@ from typing import Annotated
 
 import click
 
-from psfdae.cli import File, Folder
 from psfdae.files import DIGESTS, atomic_path, digest_line, sweep_stale
+from psfdae.options import File, Folder
 from psfdae_paper.configuration.command import command
 
 ASIDE = ".damaged"

@@ -1,0 +1,27 @@
+"""Types of the options of commands."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Annotated, Any
+
+import click
+
+File = Annotated[Path, click.Path(path_type=Path, dir_okay=False)]
+
+
+Folder = Annotated[Path, click.Path(path_type=Path, file_okay=False)]
+
+
+AboveZero = click.FloatRange(min=0, min_open=True)
+
+
+class NameOrNumber(click.ParamType):
+    """An extension of a FITS file: its number, in plain digits, or its name."""
+
+    name = "text"
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> str | int:
+        """A number from digits; any other text as it is."""
+        return int(value) if re.fullmatch("[0-9]{1,6}", str(value)) else value
