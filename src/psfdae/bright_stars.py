@@ -50,7 +50,7 @@ class BrightStars:
 
     @classmethod
     def of_product(cls, stars: Product) -> BrightStars:
-        """Those of a product "stars" of an image, of flux 1; their centroids are not stored."""
+        """Read the bright stars of a product "stars" of an image; flux 1, no centroids."""
         names = ("wide", "peak", "position", "noise", "snr", "row", "listed")
         arrays = {name: stars[name] for name in names}
         centre = np.full(arrays["position"].shape, np.nan)
@@ -60,7 +60,7 @@ class BrightStars:
         return len(self.wide)
 
     def of(self, chosen: np.ndarray) -> BrightStars:
-        """Some of the stars, by a mask or by indices."""
+        """A part of the stars, by a mask or by indices."""
         return BrightStars(*(getattr(self, field.name)[chosen] for field in fields(self)))
 
     def area(self) -> np.ndarray:

@@ -122,7 +122,7 @@ class Commands(Careful):
         return as_click(stage(name)) if name in found() else None
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """As click does, with help from the modules' text."""
+        """List the commands with the first sentence of their help, from the modules' text."""
         names = [f"{self.prefix} {word}".strip() for word in self.list_commands(ctx)]
         width = formatter.width - 6 - max(map(len, names))
         with formatter.section("Commands"):

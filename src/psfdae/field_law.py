@@ -38,32 +38,32 @@ from psfdae.noise import NoiseModel
 from psfdae.settings import Count, Fraction, Group, Positive
 
 MARGIN_PX = 2
-"""Around a stamp, in which the field and the residuals are known, too."""
+"""Pixels around a stamp in which the field and the residuals are known, too."""
 
 KNOWN_FLUX_SIGMA = 1e-6
 """Standard deviation of a flux that is given, over itself."""
 
 FLUX_ROUNDS = 2
-"""Of flux, and noise over flux."""
+"""Times that the flux, and with it the noise over the flux, is estimated anew."""
 
 LEAST_SNR = 1.5
-"""That a star is taken to have."""
+"""Least S/N that a star is taken to have."""
 
 NEAREST_NODES = 48
-"""That are looked at, found by a matched filter."""
+"""Nodes of which the likelihood is computed; a matched filter finds them."""
 
 WRONG_LIST = 0.05
 """Probability that the list, or its place, is not what it was for the training stars."""
 
 STARS_AT_ONCE = 1024
-"""That are restored together."""
+"""Stars that are restored together."""
 
 OUTLIER_MODES, LEAST_SEEN = 12, 1e-9
 """Leading modes that tell outliers, as the others tell the training stars from all others;
 and the least variance of one over that of the noise in it."""
 
 CACHE_BYTES = 200e6
-"""Of factorisations that are kept for further stars."""
+"""Size of the factorisations that are kept for further stars."""
 
 
 class FieldSettings(Group):
@@ -226,7 +226,7 @@ class Asked(NamedTuple):
     sky: np.ndarray  # (n,) of bool: the sky is off
 
     def of(self, chosen: Any) -> Asked:
-        """Some of them."""
+        """A part of these stars, by indices or a mask."""
         return Asked(*(None if a is None else a[chosen] for a in self))
 
 
@@ -279,7 +279,7 @@ class FieldLaw:
 
     @property
     def side(self) -> int:
-        """Of stamps."""
+        """Side of a stamp in pixels."""
         return round(self.offset.shape[-1] ** 0.5) - 2 * MARGIN_PX
 
     def _terms(self, position: np.ndarray | None, count: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -370,7 +370,7 @@ class FieldLaw:
 
     @cached_property
     def _list_offset(self) -> np.ndarray:
-        """Of the field's centres from those of the training stars' list, shape (2,)."""
+        """Offset of the field's centres from those of the training stars' list, shape (2,)."""
         known = len(self.listed) and np.isfinite(self.listed).all()
         return np.asarray(self.listed[0] if known else np.zeros(2))
 

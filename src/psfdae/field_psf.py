@@ -55,7 +55,7 @@ class FieldModel:
 
     @property
     def order(self) -> int:
-        """Of the polynomial, which has (order + 1)(order + 2)/2 terms."""
+        """Order of the polynomial, which has (order + 1)(order + 2)/2 terms."""
         return round((8 * len(self.coefficients) + 1) ** 0.5 - 3) // 2
 
     def terms(self, position: np.ndarray) -> np.ndarray:

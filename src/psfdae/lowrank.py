@@ -12,11 +12,11 @@ from typing import Generic, NamedTuple, TypeVar
 import numpy as np
 
 NOISE_STEP = 0.4
-"""Of ln s between noise variances s of single stars, which share a factorisation; s is then
+"""Step in ln s between noise variances s of single stars that share a factorisation; s is then
 wrong by half of it at most, and the error grows by the square."""
 
 LEAST_WEIGHT = 1e-3
-"""Of a law of a mixture that is summed over."""
+"""Least weight of a law that counts in the sum over a mixture."""
 
 FLUX_SIGMA = 0.2
 """Standard deviation of a star's flux over what it was found to be before."""

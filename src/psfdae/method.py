@@ -100,7 +100,7 @@ class TrainingSet:
         return self.noise.draw(self.images[stars], level, rng), level
 
     def without_validation(self) -> TrainingSet:
-        """The same stars but for those that validate."""
+        """This set without its validation stars."""
         return replace(self, validation=self.validation[:0])
 
 

@@ -46,7 +46,7 @@ FINE_NOISE_STEP = 0.2
 mean."""
 
 CACHE_BYTES = 400e6
-"""Of factorisations that are kept for further stars."""
+"""Size of the factorisations that are kept for further stars."""
 
 NEAREST, LEADING = 32, 64
 """Clusters that are looked at, and coordinates in which they are found; the others of 512
@@ -57,10 +57,10 @@ OUTLIER_COORDINATES, LEADING_ARRAYS = 40, ("axes", "variance", "mean", "deviatio
 more outliers that are bright, and fewer that are faint."""
 
 FLAT_VARIANCE = 0.005
-"""Of a coordinate, as a part of s, below which all clusters share one normal law."""
+"""Variance of a coordinate over s below which all clusters share one normal law."""
 
 IMAGES_AT_ONCE = 4096
-"""That are restored together."""
+"""Images that are restored together."""
 
 
 class Cluster(NamedTuple):

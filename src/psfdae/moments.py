@@ -18,7 +18,7 @@ SIGMA_OF_MAD = 1.4826
 """Standard deviation of a normal variable over the median of its modulus."""
 
 SPLINE_ORDER = 3
-"""Of the splines that move images; on a star with a FWHM of 3 px they err by an MSE of 1e-8."""
+"""Order of the splines that move images; a star with a FWHM of 3 px gets an MSE of 1e-8."""
 
 FWHM_OF_SIGMA = 2.0 * np.sqrt(2.0 * np.log(2.0))
 
@@ -193,7 +193,7 @@ def _moved(
 
 
 def _bounded(xx: np.ndarray, xy: np.ndarray, yy: np.ndarray, side: int) -> Matrix:
-    """The same moments, kept where they make sense for a stamp."""
+    """Moments, limited to what makes sense for a stamp."""
     xx, yy = (np.clip(variance, LEAST_VARIANCE_PX2, (0.5 * side) ** 2) for variance in (xx, yy))
     most = 0.99 * np.sqrt(xx * yy)
     return xx, np.clip(xy, -most, most), yy

@@ -65,7 +65,7 @@ class NoiseModel:
     def draw_gaussian(
         self, psf: np.ndarray, level: np.ndarray | float, rng: np.random.Generator
     ) -> np.ndarray:
-        """As `draw` with Gaussian noise of the same variance, for training only.
+        """Draw images with Gaussian noise of the same variance as `draw`, for training only.
 
         With 1e4 photons of sky in a pixel the two laws differ by 1 % in skewness,
         and the draw takes a tenth of the time.

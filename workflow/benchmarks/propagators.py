@@ -22,7 +22,14 @@ from psfdae_paper.optics.pupil import ARCSEC, SamplingError
 from psfdae_paper.stars.framing import normalise_flux
 from scenes import pupil_of
 
-GRIDS = (62, 94, 126, 158, 190, 286)  # pupil samples tried beside the ladder; even with guard cells
+GRIDS = (
+    62,
+    94,
+    126,
+    158,
+    190,
+    286,
+)  # pupil samples tried beside the configured ones; even with guard cells
 POINTS = (0, 2, 4, EXTRA_POINTS, EXTRA_POINTS + 2)  # extra points of the kernel
 BATCHES = (1, 4, 16, 64)  # stamps per call
 PRECISIONS = ("complex64", "complex128")
@@ -54,7 +61,7 @@ class Setting:
 
 
 def candidate_samples(optics, thorough):
-    """Grid sizes N to try: the configured ladder, coarser ones and those between, ascending."""
+    """Grid sizes N to try: the configured grid_sizes, coarser ones and those between, ascending."""
     least, *_, most = optics.pupil_samples
     others = GRIDS if thorough else [n for n in GRIDS if n < least][-1:]
     return sorted({*(n for n in others if n < most), *optics.pupil_samples})

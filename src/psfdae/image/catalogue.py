@@ -186,7 +186,7 @@ class Catalogue:
         return numbers
 
     def coordinates(self, name: str) -> np.ndarray:
-        """As `numbers`, NaN where they are not finite; an error if none is."""
+        """A column of finite numbers, NaN elsewhere; an error if no number is finite."""
         numbers = self.numbers(name, strict=False)
         finite = np.isfinite(numbers)
         if not finite.any():

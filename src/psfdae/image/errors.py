@@ -26,7 +26,7 @@ def one_line(text: object) -> str:
 
 
 def ascii_line(text: object) -> str:
-    """The same in the characters that FITS headers hold, others as question marks."""
+    """A text in the characters that FITS headers hold, others as question marks."""
     return one_line(text).encode("ascii", "replace").decode()
 
 

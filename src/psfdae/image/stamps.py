@@ -34,7 +34,7 @@ class Stamps:
         return len(self.data)
 
     def part(self, rows: slice) -> Stamps:
-        """Some of the stars."""
+        """A part of the stars."""
         return Stamps(*(getattr(self, field.name)[rows] for field in fields(self)))
 
 

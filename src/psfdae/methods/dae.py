@@ -169,7 +169,7 @@ class Dae(Method):
 
     @classmethod
     def shapes(cls, info: BundleInfo) -> Mapping[str, tuple[int, ...] | None]:
-        """Those of the weights."""
+        """Shapes of the weights, by the architecture that the bundle states."""
         return info.dae.shapes() if info.dae else {}
 
     @classmethod

@@ -32,16 +32,16 @@ OWN_NOISE = 0.5
 """Part of the variance of bright stars' own noise that is left when splines have moved them."""
 
 LEAST_LIST_ERROR_PX = 0.05
-"""RMS of listed centres."""
+"""Least RMS that listed centres are taken to have."""
 
 LEAST_DIAGONAL, LEAST_ERROR = 0.01, 1e-6
-"""Of the mean diagonal of C; of the flux, in any pixel."""
+"""Least diagonal of C over its mean, and least error of any pixel over the flux."""
 
 LEAST_LISTED = 5
-"""Stars with listed centres that tell how good the list is."""
+"""Stars with listed centres that are needed to measure the error of a list."""
 
 PACKED_BYTES = 3e6
-"""Of a bundle's residuals, at most."""
+"""Largest size of the residuals in a bundle."""
 
 
 @dataclass(frozen=True, eq=False)

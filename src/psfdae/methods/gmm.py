@@ -35,10 +35,10 @@ if TYPE_CHECKING:
     from psfdae.bundle_info import BundleInfo
 
 STARS_AT_ONCE = 4096
-"""That are turned into other axes; all would take as much memory again."""
+"""Stars that are turned into other axes together; all would take as much memory again."""
 
 LEAST_GAIN = 0.02
-"""Part of the error by which more clusters must lower it."""
+"""Part of the error by which more clusters must lower it to be taken."""
 
 MOST_CAREFUL = 512
 """Clusters that k-means++ begins. Of more, it takes ten times as long as a random beginning,

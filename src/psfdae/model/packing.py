@@ -87,7 +87,7 @@ class Errors:
     outlier_score: np.ndarray | None = None  # (S, N), if the method has one
 
     def of(self, chosen: np.ndarray) -> Errors:
-        """Those of some stars, from a mask over stars."""
+        """Errors of a part of the stars, by a mask over stars."""
         kept = chosen[self.star]
         return Errors(self.nodes, self.error[:, kept], self.star[kept], self.distance[:, kept])
 

@@ -122,7 +122,7 @@ class Prediction:
         return self.outlier_score
 
     def first(self, count: int) -> Self:
-        """The same of the first stars."""
+        """The rows of the first stars."""
         return type(self)(*(getattr(self, f.name)[:count] for f in fields(self)))
 
     @classmethod
@@ -151,7 +151,7 @@ def measured_of(centre: np.ndarray, covariance: np.ndarray) -> dict[str, np.ndar
 
 
 def unmeasured(count: int) -> dict[str, np.ndarray]:
-    """The same columns of a method that measures nothing."""
+    """Columns of `measured_of`, all NaN, for a method that measures nothing."""
     return dict.fromkeys(measured_of(np.zeros((0, 2)), np.zeros((0, 4, 4))), np.full(count, np.nan))
 
 
@@ -177,6 +177,7 @@ COLUMNS: dict[str, tuple[str, str | None, str]] = {
     "chi2": ("D", None, "squared residuals over their expectation"),
     "distance": ("D", None, "Mahalanobis distance from the training set"),
     "outlier_score": ("D", None, "its square by the model's own law of stars"),
+    "strangeness": ("D", None, "former name of outlier_score"),
     "fwhm_px": ("D", "pix", "of the PSF, adaptive moments"),
     "ellipticity": ("D", None, "1 - b/a of the PSF"),
     "position_angle_deg": ("D", "deg", "of the major axis, from +x to +y"),

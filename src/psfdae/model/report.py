@@ -224,7 +224,7 @@ PAGE = """<!doctype html>
 body {{ font: 15px/1.45 sans-serif; max-width: 60em; margin: 2em auto; padding: 0 1em }}
 table {{ border-collapse: collapse; margin: 1em 0 }}
 td, th {{ padding: .25em .8em; border-bottom: 1px solid #ddd; text-align: left }}
-.lead {{ font-size: 1.15em }} .good {{ color: #007a5a }} .look {{ color: #b04000 }}
+.lead {{ font-size: 1.15em }} .pass {{ color: #007a5a }} .inspect {{ color: #b04000 }}
 img {{ max-width: 100%; display: block; margin: 1em 0 }}
 </style></head><body>
 <p>PSF model of {image}</p>
@@ -250,7 +250,7 @@ def _png(content: bytes) -> str:
 
 
 def checks(q: Quality) -> list[tuple[str, str, bool]]:
-    """What to look at before the model is trusted: question, answer, and whether it is good."""
+    """Checks before the model is trusted: question, answer, and whether it is passed."""
     mean, linear = (ratios(q.errors, q.method, other) for other in (MEAN_PSF, LINEAR))
     snr = nearest(q.faint)
     size = q.sizes(snr, "model")
@@ -289,7 +289,7 @@ def _by_snr(values: dict[float, float]) -> str:
 
 
 def _checks(q: Quality) -> str:
-    words = {True: "<b class=good>good</b>", False: "<b class=look>look</b>"}
+    words = {True: "<b class=pass>pass</b>", False: "<b class=inspect>inspect</b>"}
     rows = ((escape(a), escape(b), words[bool(good)]) for a, b, good in checks(q))
     return _table(("check", "found", ""), rows)
 

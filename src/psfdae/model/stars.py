@@ -162,7 +162,7 @@ class Stars:
         return self.observation.path.name.split(".")[0] or "model"
 
     def with_settings(self, settings: Any) -> Stars:
-        """The same stars for fits with other settings of methods."""
+        """These stars with other settings of methods."""
         return replace(self, settings=settings)
 
     def __len__(self) -> int:

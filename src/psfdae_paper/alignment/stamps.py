@@ -83,7 +83,7 @@ def movable_modes(
 class AlignmentStamps:
     """Operator from Zernike coefficients to centred stamps and their derivatives.
 
-    Each wavefront uses the smallest grid of the ladder that its slopes allow.
+    Each wavefront uses the smallest grid size that its slopes allow.
     Batches run in `optics.threads` threads; results do not depend on their number.
 
     Parameters
@@ -132,7 +132,7 @@ class AlignmentStamps:
         Raises
         ------
         SamplingError
-            If the ladder ends below what a wavefront needs.
+            If the largest grid size is below what a wavefront needs.
         EnergyError
             If a stamp holds less than `alignment.least_energy`.
         """
@@ -195,7 +195,7 @@ class AlignmentStamps:
         Raises
         ------
         SamplingError
-            If the ladder ends below what a wavefront needs: half a wave per
+            If the largest grid size is below what a wavefront needs: half a wave per
             sample, and no replica of the image on the stamp.
         """
         half = 0.5 * self.alignment.stamp_px * self.telescope.pixel

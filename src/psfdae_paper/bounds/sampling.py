@@ -201,8 +201,8 @@ class StampModel:
         half = np.array([-0.5, 0.5]) * self.framing.stamp_px
         edges = (offset[:, ::-1, None] + half) * self.telescope.pixel  # (x, y) from (row, column)
         needed = required_samples(slope_ranges(mode_slopes(monomial_images), coefficients), edges)
-        ladder = sorted({*PUPIL_SAMPLES, *self.optics.pupil_samples})
-        return choose_samples(needed, tuple(ladder))
+        grid_sizes = sorted({*PUPIL_SAMPLES, *self.optics.pupil_samples})
+        return choose_samples(needed, tuple(grid_sizes))
 
 
 NOTHING, FIELD, TRUTH = range(3)

@@ -22,7 +22,7 @@ class AlignmentOptics(Group):
     """Numerical settings of the propagation by the whole period of the image."""
 
     pupil_samples: PupilSamples = Field(
-        description="Ladder of grid sizes N; each wavefront takes the first that suffices"
+        description="Grid sizes N, ascending; each wavefront takes the first that suffices"
     )
     precision: Literal["complex64", "complex128"] = Field(description="Of the propagation")
     batch: Count = Field(description="Wavefronts per batch")

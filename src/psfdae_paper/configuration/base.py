@@ -22,10 +22,10 @@ farther out is searched at twice the distance, then refused.
 SearchDistance = Annotated[float, Field(gt=0, allow_inf_nan=False, exclude=True)]
 
 
-def _ascending(ladder: list[int]) -> list[int]:
-    if sorted(set(ladder)) != ladder:
-        raise ValueError(f"{ladder} must be ascending")
-    return ladder
+def _ascending(grid_sizes: list[int]) -> list[int]:
+    if sorted(set(grid_sizes)) != grid_sizes:
+        raise ValueError(f"{grid_sizes} must be ascending")
+    return grid_sizes
 
 
 PupilSamples = Annotated[

@@ -90,7 +90,7 @@ class Optics(Group):
     """Numerical settings of the propagation."""
 
     pupil_samples: PupilSamples = Field(
-        description="Ladder of grid sizes N; each wavefront takes the first that suffices"
+        description="Grid sizes N, ascending; each wavefront takes the first that suffices"
     )
     precision: Literal["complex64", "complex128"] = Field(description="Of the propagation")
     backend: Literal["numpy", "torch"] = Field(description="Library of the matrix products")

@@ -170,7 +170,7 @@ def required_samples(slopes: np.ndarray, reach: np.ndarray) -> np.ndarray:
     if not np.isfinite(needed).all():
         wavefront = int(np.flatnonzero(~np.isfinite(needed))[0])
         raise SamplingError(f"wavefront {wavefront} is not finite: no grid can sample it")
-    # Larger numbers would wrap around as integers; no ladder ends that high.
+    # Larger numbers would wrap around as integers; no grid is that large.
     return np.ceil(np.minimum(needed, 2.0**53)).astype(np.int64)
 
 
@@ -179,14 +179,14 @@ def pixel_width(scale_arcsec: float, diameter_m: float, wavelength_m: float) -> 
     return scale_arcsec * ARCSEC * diameter_m / wavelength_m
 
 
-def choose_samples(needed: np.ndarray, ladder: tuple[int, ...]) -> np.ndarray:
+def choose_samples(needed: np.ndarray, sizes: tuple[int, ...]) -> np.ndarray:
     """Smallest of some grid sizes that serves each wavefront.
 
     Parameters
     ----------
     needed : ndarray of int, shape (B,)
         Result of `required_samples`.
-    ladder : tuple of int
+    sizes : tuple of int
         Available grid sizes N, ascending.
 
     Returns
@@ -199,12 +199,12 @@ def choose_samples(needed: np.ndarray, ladder: tuple[int, ...]) -> np.ndarray:
         If a wavefront needs more than the largest; names the N that would do.
     """
     worst = int(needed.max())
-    if worst > ladder[-1]:
+    if worst > sizes[-1]:
         star = int(needed.argmax())
         raise SamplingError(
-            f"optics.pupil_samples = {list(ladder)}: wavefront {star} needs N ≥ {worst} pupil "
+            f"optics.pupil_samples = {list(sizes)}: wavefront {star} needs N ≥ {worst} pupil "
             f"samples (half a wave per sample, replicas clear of the stamp); "
-            f"{int((needed > ladder[-1]).sum())} of {needed.size} wavefronts exceed the last value"
+            f"{int((needed > sizes[-1]).sum())} of {needed.size} wavefronts exceed the last value"
         )
-    sizes = np.asarray(ladder)
+    sizes = np.asarray(sizes)
     return sizes[np.searchsorted(sizes, needed)]

@@ -83,9 +83,9 @@ def _fresh_stars(config: Config, suffix: str, count: int) -> dict[str, Column]:
     rng = stream(drawn.seed, "field", drawn.stars.name)
     star_field = assign_fields(count, drawn.grid.points**2, rng)
     source = star_wavefronts(drawn, star_field)
-    ladder = sorted({*FINE_SAMPLES, *drawn.optics.pupil_samples})
+    grid_sizes = sorted({*FINE_SAMPLES, *drawn.optics.pupil_samples})
     optics = drawn.optics.model_copy(
-        update={"pupil_samples": ladder, "threads": config.bounds.threads}
+        update={"pupil_samples": grid_sizes, "threads": config.bounds.threads}
     )
     framing = drawn.framing
     propagation = Propagation(source, drawn.telescope, optics, framing, drawn.stars.search_px)

@@ -98,7 +98,7 @@ others are computed exactly.
 class Propagation:
     """Stamps and brightest pixels of the wavefronts of one source.
 
-    Each wavefront uses the smallest grid of the ladder that its slopes allow. Batches
+    Each wavefront uses the smallest grid size that its slopes allow. Batches
     run in `optics.threads` threads; results do not depend on their number, and on the
     batch by rounding only. The caller limits the linear algebra to one thread.
 
@@ -112,7 +112,7 @@ class Propagation:
     Raises
     ------
     SamplingError
-        If the ladder ends below what a wavefront needs.
+        If the largest grid size is below what a wavefront needs.
     """
 
     def __init__(
