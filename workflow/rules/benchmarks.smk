@@ -313,8 +313,8 @@ for _method in registered():
             lambda w, m=_method: [
                 path
                 for reference in dataset_config(w.dataset).dataset.references
-                for path in files_of(m, w.dataset, "random", reference)
                 if m.storage
+                for path in files_of(m, w.dataset, "random", reference)
             ],
             stars=lambda w: stars_of(w.dataset),
         output:
