@@ -40,8 +40,10 @@ def reproduce(folder):
 
 
 def with_stars(smoke, folder):
-    """A house with the stars, but without network and evaluation."""
-    shutil.copytree(smoke / "results/data", clone(folder) / "results/smoke/data")
+    """A house with the stars and their digests, but without network and evaluation."""
+    clone(folder)
+    for name in ("data", ".digests/data"):
+        shutil.copytree(smoke / "results" / name, folder / "results/smoke" / name)
     return folder
 
 
