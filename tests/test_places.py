@@ -77,6 +77,11 @@ use rule figure_templates as figure_dots with:
 KEY = """
     extra: Count = Field(1, description="Something new")
 """
+USED = """
+
+def extra(settings):
+    return settings.{}extra
+"""
 DATASET = """# @package _global_
 defaults:
   - dataset3
@@ -145,17 +150,23 @@ def test_a_setting_is_two_and_an_option_of_the_field_model_is_one_file(tree):
     own = 'description="Stars simulated per point of the scan")\n'
     places = [
         added(tree, "src/psfdae_paper/configuration/schema.py", KEY[1:], own),
-        added(tree, "src/psfdae_paper/stages/calibrate.py", "\n# config.calibration.extra\n"),
+        added(
+            tree,
+            "src/psfdae_paper/stages/calibrate.py",
+            USED.format("calibration."),
+        ),
     ]
     program = "from psfdae_paper.configuration.compose import load; c = load(['WORD'])"
-    shown = program.replace("WORD", "calibration.extra=7") + "; print(c.calibration.extra)"
+    shown = program.replace("WORD", "calibration.extra=7")
+    shown += "; from psfdae_paper.stages.calibrate import extra; print(extra(c))"
     assert python(tree, shown) == "7"
     modes = 'description="Leading modes of the residuals")\n'
     option = {
         added(tree, "src/psfdae/field_law.py", KEY[1:], modes),
-        added(tree, "src/psfdae/field_law.py", "\n# self.settings.extra\n"),
+        added(tree, "src/psfdae/field_law.py", USED.format("")),
     }
-    program = "from psfdae.model.settings import from_words as f; print(f(['WORD']).field.extra)"
+    program = "from psfdae.model.settings import from_words as f"
+    program += "; from psfdae.field_law import extra; print(extra(f(['WORD']).field))"
     assert python(tree, program.replace("WORD", "field.extra=3")) == "3"
     assert len(places) == 2 and len(option) == 1
 

@@ -71,7 +71,9 @@ def store(fitted: Method, place: Path, described: Mapping[str, Any], stars: Prod
         write_text(beside(type(fitted), place, name), as_csv(fitted.diagnosed[name]))
 
 
-def described_by(kind: type[Method], tree: Mapping[str, Any], split: str, reference: str) -> Any:
+def described_by(
+    kind: type[Method], tree: Mapping[str, Any], split: str, reference: str
+) -> dict[str, Any]:
     """The configuration that is written with a fit: its settings, and what it was fitted to."""
     own = {"reference": reference} if storage_of(kind).per_reference else {}
     return {**tree, "split": split, **own}

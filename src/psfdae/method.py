@@ -261,16 +261,7 @@ class Packing:
 class MeasuresStars(Protocol):
     """Measures flux, sky and centre of a star with its PSF: no other photometry is needed."""
 
-    def measure(
-        self,
-        stamps: np.ndarray,
-        noise: np.ndarray,
-        position: np.ndarray | None = None,
-        centre: np.ndarray | None = None,
-        fixed: bool | np.ndarray = False,
-        flux: np.ndarray | None = None,
-        sky: np.ndarray | None = None,
-    ) -> Estimate:
+    def measure(self, *stars: Any, **known: Any) -> Estimate:
         """From stamps in any unit; see `psfdae.methods.field.FieldMixture.measure`."""
 
 
@@ -473,6 +464,11 @@ class Method:
     def unpack(cls, arrays: Mapping[str, np.ndarray], info: BundleInfo) -> Self:
         """A fit from a bundle."""
         return cls.restored(arrays, info.config["train"], info.reference or "realisation")
+
+
+def with_free_flux(fitted: Method) -> Method:
+    """The form of a fit for images whose flux and sky are estimates, or the fit if it has none."""
+    return fitted.free_flux() if isinstance(fitted, FreesFlux) else fitted
 
 
 def facts_of(fitted: Method) -> list[str]:

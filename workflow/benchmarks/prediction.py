@@ -207,7 +207,7 @@ def require_bundle(bundle, config):
 def quality(found, truth, flux, expected, which):
     """Mean errors of PSFs of flux 1, and how many pixels are within the uncertainty.
 
-    `coverage95` is of `UNCERT` times `ratio95`, which networks of older bundles do not say.
+    `coverage95` is of `UNCERT` times `ratio95`.
     """
     from psfdae.model.bundle import brightest
 
@@ -219,7 +219,7 @@ def quality(found, truth, flux, expected, which):
     error, mse = np.abs(psf - flux * truth[kept]), squares.mean()
     row = {"mse": mse, "stderr": squares.std(ddof=1) / squares.size**0.5, "ratio": mse / expected}
     row |= {"coverage": (error <= width).mean()}
-    row |= {"coverage95": np.nan if np.isnan(wide).all() else (error <= wide).mean()}
+    row |= {"coverage95": (error <= wide).mean()}
     return {f"{name}_{which}": value for name, value in row.items()}
 
 

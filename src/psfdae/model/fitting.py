@@ -10,7 +10,7 @@ import numpy as np
 
 from psfdae.errors import needed_by
 from psfdae.fits import described_by
-from psfdae.method import FreesFlux, Method
+from psfdae.method import Method, with_free_flux
 from psfdae.methods import groups_of
 from psfdae.methods import method as method_of
 from psfdae.model.packing import bundle_of
@@ -106,8 +106,7 @@ def fitted_to(stars: Stars, kind: type[Method], checkpoint: Path | None = None) 
 def described(stars: Stars, kind: type[Method]) -> dict[str, Any]:
     """Settings that decide a fit, as its product and its model say them."""
     own = stars.settings.model_dump(include={*groups_of(kind.name)})
-    tree: dict[str, Any] = described_by(kind, own, SPLIT, REFERENCE)
-    return tree
+    return described_by(kind, own, SPLIT, REFERENCE)
 
 
 def best(stars: Stars, fitted: Mapping[str, Method]) -> tuple[str, dict[str, float]]:
@@ -129,7 +128,7 @@ def best(stars: Stars, fitted: Mapping[str, Method]) -> tuple[str, dict[str, flo
             rng = stream(settings.seed, "noise", "own stars")
             noisy = [noise_model(settings).draw(truth, level, rng) for level in data.levels]
             # As of the stars that the model is for.
-            free = found.free_flux() if isinstance(found, FreesFlux) else found
+            free = with_free_flux(found)
             logs = []
             for images, level in zip(noisy, data.levels, strict=True):
                 psf = free.restore(images, level, where)

@@ -25,7 +25,7 @@ import numpy as np
 
 from psfdae.bundle_info import BundleInfo
 from psfdae.files import Product, ProductError
-from psfdae.method import Estimate, FindsFlux, FreesFlux, MeasuresStars, Method, ScoresOutliers
+from psfdae.method import Estimate, FindsFlux, MeasuresStars, Method, ScoresOutliers, with_free_flux
 from psfdae.model.bundle import (
     SCALES,
     Bundle,
@@ -292,7 +292,7 @@ def measure_errors(
     error = np.empty((len(nodes), star.size, *stars.images.shape[1:]), np.float32)
     distance = np.empty((len(nodes), star.size))
     scores = []
-    free = fitted.free_flux() if isinstance(fitted, FreesFlux) else fitted
+    free = with_free_flux(fitted)
     for place, noise in enumerate(nodes):
         level = noise / stars.noise.kappa
         noisy = stars.noise.draw(stars.images[star], level, rng)

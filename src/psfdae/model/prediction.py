@@ -48,8 +48,7 @@ class Prediction:
         Half-width that holds 68.27 % of the errors of `psf` at this S/N, of the brightest
         pixels (`psfdae.model.bundle.brightest`) and of the others, as found on test stars.
     ratio95, ratio95_bright : ndarray, shape (n,), float64
-        `uncertainty` times this holds 95 % of the errors, in the brightest pixels the second
-        one; NaN where the model does not say.
+        `uncertainty` times this holds 95 % of the errors, in the brightest pixels the second one.
     flux, flux_error : ndarray, shape (n,), float64
         Flux inside the stamp, in the unit of the stamps; the error is NaN where the
         flux was given.

@@ -25,7 +25,7 @@ from psfdae.image.stamps import (
     displacement,
     raise_flag,
 )
-from psfdae.method import Estimate, FindsFlux, FreesFlux, KnowsField, MeasuresStars, Packing
+from psfdae.method import Estimate, FindsFlux, KnowsField, MeasuresStars, Packing, with_free_flux
 from psfdae.model.bundle import (
     Bundle,
     at_noise,
@@ -351,9 +351,7 @@ class Engine:
     def __init__(self, bundle: Bundle) -> None:
         self.bundle = bundle
         self.estimator = estimator(bundle)
-        self.free_flux = (
-            self.estimator.free_flux() if isinstance(self.estimator, FreesFlux) else self.estimator
-        )
+        self.free_flux = with_free_flux(self.estimator)
         packing = self.estimator.packing or Packing()
         together, self._padded = packing.together, packing.padded
         self.size = min(together, max(1, together * WHOLE_PX**2 // bundle.info.stamp_px**2))
