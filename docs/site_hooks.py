@@ -18,12 +18,12 @@ PUBLISHED = (
 )
 """What pages are and link to; links are relative and the same on GitHub."""
 
-KEYS = re.compile(r"<!-- keys: (\w+) -->")
+KEYS = "<!-- keys -->"
 CELL = re.compile(r"<td[^>]*>[^<]*")
 NUMBER = re.compile(r"[-+−]?\d[\d.]*e[-+]\d+")
 LIMITS = {"minimum": "≥", "exclusiveMinimum": ">", "maximum": "≤", "exclusiveMaximum": "<"}
 HEAD = ("| key | type | allowed | default | meaning |", "|---|---|---|---|---|")
-PRESETS = {"config": ["preset"], "alignment": ["network_train", "alignment_preset"]}
+PRESETS = ("network_train", "preset")
 """Groups of options that set keys of several groups."""
 
 Schema = Mapping[str, Any]
@@ -40,8 +40,8 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """List the keys of a root of the configuration at `<!-- keys: ROOT -->`."""
-    return KEYS.sub(lambda mark: "\n".join(key_reference(mark[1])), markdown)
+    """List the keys of the configuration at `<!-- keys -->`."""
+    return markdown.replace(KEYS, "\n".join(key_reference())) if KEYS in markdown else markdown
 
 
 def on_page_content(html: str, **_: Any) -> str:
@@ -53,16 +53,16 @@ def on_page_content(html: str, **_: Any) -> str:
     return CELL.sub(kept, html)
 
 
-def key_reference(root: str) -> Iterator[str]:
-    """Markdown of all groups of a root: their keys and, below, their options."""
+def key_reference() -> Iterator[str]:
+    """Markdown of all groups: their keys and, below, their options."""
     from psfdae_paper.configuration.base import config_dir
-    from psfdae_paper.configuration.compose import compose, model_of
+    from psfdae_paper.configuration.compose import compose
+    from psfdae_paper.configuration.schema import whole_config
 
-    schema = model_of(root).model_json_schema()
-    tree = compose((), root)
-    for group in (*schema["properties"], *PRESETS[root]):
+    schema, tree = whole_config().model_json_schema(), compose()
+    for group in (*schema["properties"], *PRESETS):
         yield f"\n### `{group}`\n"
-        if group not in PRESETS[root]:
+        if group not in PRESETS:
             yield from (*HEAD, *_rows(group, schema["properties"][group], schema, tree.get(group)))
         yield ""
         for option in sorted((config_dir() / group).glob("[!_]*.yaml")):

@@ -29,6 +29,7 @@ import pandas as pd
 
 from psfdae.methods import known, method
 from psfdae_paper.alignment import methods as scene3
+from psfdae_paper.configuration.alignment import CHOICE
 from psfdae_paper.configuration.compose import compose
 from psfdae_paper.evaluation.comparison import FITTED, SIGNIFICANT, seed_scatter, with_seed_stderr
 
@@ -164,7 +165,7 @@ def config(*overrides):
 
 def scene3():
     """Groups of the configuration of scene 3."""
-    return _names(compose((), "alignment"))
+    return _names(compose(CHOICE))
 
 
 def datasets():

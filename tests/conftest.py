@@ -17,6 +17,7 @@ from psfdae_paper.alignment.telescope import (
     grid_states,
     zernike_tracer,
 )
+from psfdae_paper.configuration.alignment import CHOICE
 from psfdae_paper.configuration.compose import load
 from psfdae_paper.optics.pupil import annular_pupil
 from workflow_runs import snakemake
@@ -58,7 +59,7 @@ def noise():
 @pytest.fixture(scope="session")
 def tracer():
     """Ray tracer of scene 3."""
-    config = load((), "alignment")
+    config = load(CHOICE)
     return zernike_tracer(config.telescope, config.prescription, config.alignment)
 
 

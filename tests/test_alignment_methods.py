@@ -31,10 +31,10 @@ from psfdae_paper.alignment.networks import (
 )
 from psfdae_paper.alignment.stamps import AlignmentStamps
 from psfdae_paper.alignment.telescope import mirror_symmetries, uniform_states
-from psfdae_paper.configuration.alignment import Cnn, Perceptron
+from psfdae_paper.configuration.alignment import CHOICE, Cnn, Perceptron
 from psfdae_paper.configuration.compose import load
 
-FIT = load((), "alignment").fit
+FIT = load(CHOICE).fit
 EXACT = FIT.model_copy(update={"iterations": 25, "tolerance": 1e-7})
 
 
@@ -44,7 +44,7 @@ def _likelihood(model, operator, noise, level, emulator=None, kind=Likelihood):
 
 @pytest.fixture(scope="module")
 def config():
-    return load((), "alignment")
+    return load(CHOICE)
 
 
 @pytest.fixture(scope="module")
@@ -185,9 +185,9 @@ def test_perceptron_sees_uncorrelated_numbers_of_variance_1(config, stamps, stat
 
 def test_configuration_names_what_is_wrong():
     with pytest.raises(ConfigError, match=r"cnn: strides = \[1, 2\]: 5 widths need as many"):
-        load(["cnn.strides=[1,2]"], "alignment")
+        load([*CHOICE, "cnn.strides=[1,2]"])
     with pytest.raises(ConfigError, match=r"cnn: kernels = .* must be odd"):
-        load(["cnn.kernels=[3,3,4,3,3]"], "alignment")
+        load([*CHOICE, "cnn.kernels=[3,3,4,3,3]"])
 
 
 def test_weights_come_from_the_generator_alone(config):

@@ -11,12 +11,13 @@ from psfdae.cli import main
 from psfdae.files import read_product
 from psfdae.settings import ConfigError
 from psfdae_paper.alignment.methods import ESTIMATORS, FITTED, LEARNED, METHODS, TRAINED, of_set
+from psfdae_paper.configuration.alignment import CHOICE
 from psfdae_paper.configuration.compose import config_dir, load, load_stage, overrides_for
 from psfdae_paper.evaluation import alignment_tables
 from psfdae_paper.stages.alignment import states
 from psfdae_paper.stages.alignment_results import read_bounds
 
-PRESET = ("alignment_preset=smoke", "alignment.grid_levels=2")
+PRESET = ("preset=smoke", "alignment.grid_levels=2")
 
 
 def test_rows_of_the_tables():
@@ -145,7 +146,7 @@ def test_sets_of_states(products):
 
 
 def _states_config(*overrides):
-    return load_stage(states.stage.settings.reads, (*PRESET, *overrides), "alignment")
+    return load_stage(states.stage.settings.reads, (*CHOICE, *PRESET, *overrides))
 
 
 def test_model_and_rays_give_the_same_training_stamps(products, tmp_path):
@@ -185,23 +186,22 @@ def test_same_configuration_gives_the_same_bytes(products, tmp_path):
 
 
 @pytest.mark.parametrize("preset", [p.stem for p in config_dir().glob("preset/*.yaml")])
-def test_every_preset_of_the_datasets_has_one_here(preset):
-    chosen = overrides_for("alignment", [f"preset={preset}"])
-    assert load(chosen, "alignment").alignment.field_points == 8
+def test_every_preset_suits_scene_3(preset):
+    assert load((*CHOICE, f"preset={preset}")).alignment.field_points == 8
 
 
-def test_overrides_reach_the_roots_that_know_them():
-    given = ["preset=smoke", "noise.kappa=5", "train.lr=1e-3", "alignment.test_states=9"]
-    given += ["telescope=wfsat_literal", "trian.lr=1"]
-    assert overrides_for("alignment", given) == (
-        *("alignment_preset=smoke", "noise.kappa=5", "alignment.test_states=9", "trian.lr=1"),
-    )
-    assert overrides_for("config", given) == (
-        *("preset=smoke", "noise.kappa=5", "train.lr=1e-3", "telescope=wfsat_literal"),
-        "trian.lr=1",
-    )
+def test_scene_3_keeps_its_telescope_where_a_whole_run_gets_another():
+    given = ["preset=smoke", "noise.kappa=5", "train.lr=1e-3", "stars.count=9"]
+    given += ["telescope=wfsat_literal", "network_train@train_original=denoised", "trian.lr=1"]
+    kept = [word for word in given if word.split("=")[0] not in ("telescope", "wavefront.coma")]
+    assert overrides_for([*given, "wavefront.coma=3"], CHOICE) == tuple(kept)
+    assert overrides_for(given) == tuple(given)
     with pytest.raises(ConfigError, match=r"trian\.lr"):
-        load(["trian.lr=1"], "alignment")
+        load([*CHOICE, "trian.lr=1"])
+    with pytest.raises(ConfigError, match="colour: unknown key"):
+        load([*CHOICE, "+colour=blue"])
+    with pytest.raises(ConfigError, match=r"example_zernike: brings its own aberrations"):
+        load([*CHOICE, "telescope=example_zernike"])
 
 
 def test_command_line_names_what_is_wrong(tmp_path):

@@ -9,6 +9,7 @@ import pytest
 
 from psfdae_paper.alignment.stamps import AlignmentStamps, EnergyError, centred_modes, mean_slope
 from psfdae_paper.alignment.telescope import uniform_states
+from psfdae_paper.configuration.alignment import CHOICE
 from psfdae_paper.configuration.compose import load
 from psfdae_paper.optics.derivatives import ModalStamps, PeriodSampling, PointSampling
 from psfdae_paper.optics.propagation import StampPropagator
@@ -23,7 +24,7 @@ SHOWN = [((0, 0, 0, 0), 0), ((0.6, -0.3, 0.2, 0.8), 2), ((1, 1, 1, 1), 7)]
 
 @pytest.fixture(scope="module")
 def config():
-    return load((), "alignment")
+    return load(CHOICE)
 
 
 @pytest.fixture(scope="module")

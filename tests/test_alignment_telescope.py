@@ -21,6 +21,7 @@ from psfdae_paper.alignment.telescope import (
     verify,
     zernike_tracer,
 )
+from psfdae_paper.configuration.alignment import CHOICE
 from psfdae_paper.configuration.compose import load
 from psfdae_paper.optics.wavefronts import zernike_basis
 from psfdae_paper.raytracing import (
@@ -36,7 +37,7 @@ ARCSEC = np.pi / 180 / 3600
 
 @pytest.fixture(scope="module")
 def config():
-    return load((), "alignment")
+    return load(CHOICE)
 
 
 @pytest.fixture(scope="module")
@@ -199,7 +200,7 @@ def test_ends_of_the_range_are_inside(tracer):
 
 
 def test_vignetted_field_is_refused():
-    config = load(["alignment.field_radius_deg=0.7"], "alignment")
+    config = load([*CHOICE, "alignment.field_radius_deg=0.7"])
     message = r"state 0, field \(0\.7, 0\)°: \d+ of 132 rays are vignetted; 8 of 9 fields are"
     with pytest.raises(RayTracingError, match=message):
         zernike_tracer(config.telescope, config.prescription, config.alignment)(np.zeros((1, 4)))
@@ -235,7 +236,7 @@ def test_no_state_of_the_grid_is_vignetted(tracer):
 )
 def test_wrong_configuration_is_named(override, message):
     with pytest.raises(ConfigError, match=message):
-        load([override], "alignment")
+        load([*CHOICE, override])
 
 
 def test_nine_fields_are_the_centre_and_a_circle():

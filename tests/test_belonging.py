@@ -12,6 +12,7 @@ from click.testing import CliRunner
 from psfdae.belonging import STARS, STATIC, require
 from psfdae.cli import main, stage
 from psfdae.files import Column, ProductError, write_product
+from psfdae_paper.configuration.alignment import CHOICE
 from psfdae_paper.configuration.compose import load, load_stage
 from psfdae_paper.stages.alignment_results import require_one_test
 
@@ -182,7 +183,7 @@ def test_a_missing_aberration_is_none_and_what_is_not_stated_is_unknown(tmp_path
 
 def tree_of(name, *overrides):
     reads = stage(f"alignment {name}").stage.settings.reads
-    return load_stage(reads, ("alignment_preset=smoke", *overrides), "alignment").model_dump()
+    return load_stage(reads, (*CHOICE, "preset=smoke", *overrides)).model_dump()
 
 
 def write(path, kind, config, **arrays):
@@ -201,7 +202,7 @@ def test_products_of_scene_3_are_of_one_telescope(tmp_path):
     words = ("alignment", "train-network", "--kind=dae_retrained", "--states", states)
     words += ("--dae", tmp_path / "dae", "--checkpoint", tmp_path / "c.pt")
     found = {"key": "telescope.pixel_scale_arcsec", "values": (0.4, 0.6)}
-    out = ("--out", tmp_path / "out", "alignment_preset=smoke")
+    out = ("--out", tmp_path / "out", "preset=smoke")
     refused(tmp_path, *words, *out, file=tmp_path / "dae/trained_on.yaml", **found)
 
 

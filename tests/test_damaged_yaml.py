@@ -19,7 +19,7 @@ from psfdae_paper.sweeps.points import SweepError, plan_sweep
 from trainings import load_knee
 
 DATASET = ["config"]
-SCENE3 = ["alignment", "config", "alignment_preset=smoke"]
+SCENE3 = ["alignment", "config", "preset=smoke"]
 SHOWN = {
     "config.yaml": DATASET,
     "dataset/dataset3.yaml": DATASET,
@@ -34,7 +34,7 @@ SHOWN = {
     "train/onecycle.yaml": [*DATASET, "--stage", "train"],
     "preset/smoke.yaml": [*DATASET, "preset=smoke"],
     "telescope/example_zernike.yaml": [*DATASET, "dataset=_telescope"],
-    "alignment.yaml": SCENE3,
+    "dataset/alignment.yaml": SCENE3,
     "prescription/rc15.yaml": SCENE3,
     "network_train/denoised.yaml": SCENE3,
 }

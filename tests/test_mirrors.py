@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from psfdae.settings import ConfigError
+from psfdae_paper.configuration.alignment import CHOICE
 from psfdae_paper.configuration.compose import load
 from psfdae_paper.configuration.wavefront import Prescription
 from psfdae_paper.raytracing import ZernikeTracer, build_optic
@@ -152,4 +153,4 @@ def test_mirrors_that_cannot_be_are_named(name, override, message):
 
 def test_nothing_of_a_newtonian_can_be_misaligned():
     with pytest.raises(ConfigError, match=r"^prescription: secondary: missing"):
-        load(["prescription=newtonian"], "alignment")
+        load([*CHOICE, "prescription=newtonian"])

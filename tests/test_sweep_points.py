@@ -15,6 +15,7 @@ from psfdae.files import Column, ProductError, write_product
 from psfdae.methods import groups_of
 from psfdae.model.star_sets import noise_model
 from psfdae.splits import random_split
+from psfdae_paper.configuration.alignment import CHOICE
 from psfdae_paper.configuration.compose import compose, load, load_stage, stage_tree
 from psfdae_paper.configuration.sweep import point_groups
 from psfdae_paper.methods.pca_som import PcaSom
@@ -200,7 +201,7 @@ def test_cnn_is_the_main_workflow_s_and_measured_on_other_states(tmp_path):
     data = {role: write_states(tmp_path / f"{role}.h5", rng, n) for role, n in roles.items()}
     folder = tmp_path / "points/0123456789ab"
     given = (
-        "alignment_preset=smoke",
+        "preset=smoke",
         "train_noise_trained.mirrors=false",
         "perceptron.widths=[8,8]",
     )
@@ -211,9 +212,9 @@ def test_cnn_is_the_main_workflow_s_and_measured_on_other_states(tmp_path):
         folder=folder,
         checkpoint=tmp_path / "sweep.pt",
     )
-    settings = load_stage(point_groups("noise_trained"), given, "alignment")
+    settings = load_stage(point_groups("noise_trained"), (*CHOICE, *given))
     stage.point(settings, "noise_trained", {}, {}, task)
-    config = load_stage(train_network.stage.settings.reads("noise_trained"), given, "alignment")
+    config = load_stage(train_network.stage.settings.reads("noise_trained"), (*CHOICE, *given))
     main = tmp_path / "main"
     train_network(config, "noise_trained", data["states"], tmp_path / "main.pt", main)
     for name in ("network.safetensors", "config.yaml"):

@@ -13,6 +13,7 @@ from psfdae.files import read_product
 from psfdae.settings import ConfigError, as_overrides
 from psfdae_paper.alignment.stamps import AlignmentStamps, mean_slope
 from psfdae_paper.alignment.telescope import zernike_tracer
+from psfdae_paper.configuration.alignment import CHOICE as SCENE3
 from psfdae_paper.configuration.compose import compose, load, load_stage, stage_tree
 from psfdae_paper.configuration.consistency import SIMULATION, STATIC
 from psfdae_paper.optics.pupil import annular_pupil
@@ -132,7 +133,7 @@ def traced():
 
 
 def test_ray_trace_is_that_of_scene_3(traced):
-    alignment = load((), "alignment")
+    alignment = load(SCENE3)
     tracer = zernike_tracer(alignment.telescope, alignment.prescription, alignment.alignment)
     noll, ours = static_terms(traced.grid, traced.telescope)
     theirs = -tracer(np.zeros((1, 4)))[0]
@@ -146,7 +147,7 @@ def test_ray_trace_is_that_of_scene_3(traced):
 
 def test_ray_traced_stamps_are_those_of_scene_3(traced):
     """In pixels, to which the sign of every term and both axes count."""
-    alignment = load((), "alignment")
+    alignment = load(SCENE3)
     source = template_wavefronts(traced)
     leaning = source.coefficients[[0, 4, 8]]
     leaning[:, 3:5] += [0.2, -0.1]  # the aligned telescope has too little coma to tell its sign

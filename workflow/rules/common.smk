@@ -12,6 +12,7 @@ from psfdae.cli import stage
 from psfdae.fits import suffix_of
 from psfdae.method import GoesOn
 from psfdae.settings import ConfigError, as_overrides
+from psfdae_paper.configuration.alignment import NAME as SCENE3
 from psfdae_paper.configuration.compose import config_dir
 from psfdae_paper.configuration.compose import compose, dataset_names, decisive, load
 from psfdae_paper.configuration.compose import (
@@ -51,7 +52,7 @@ def one_line():
 @one_line()
 def composed(*choice, more=()):
     """Configuration of a choice, with those of the given overrides that concern it."""
-    return compose((*choice, *overrides_for("config", GIVEN, choice), *more))
+    return compose((*choice, *overrides_for(GIVEN, choice), *more))
 
 
 def options(group):
@@ -78,7 +79,7 @@ def program_code(name, stages):
 
 # Stars of an image are not simulated: own_stars.smk.
 OWN_STARS = "from_stars"
-ALL_DATASETS = [name for name in dataset_names() if name != OWN_STARS]
+ALL_DATASETS = [name for name in dataset_names() if name not in (OWN_STARS, SCENE3)]
 # Data of telescopes that bring their own aberrations; they bear the dataset's name.
 OWN_TELESCOPES = f"{RESULTS}/data/telescope"
 SCENE_HEADINGS = {
@@ -104,7 +105,7 @@ def dataset_config(dataset):
     """Checked configuration of a dataset that is built; a wrong key stops before any job."""
     choice = f"dataset={dataset}"
     try:
-        return load((choice, *overrides_for("config", GIVEN, (choice,))))
+        return load((choice, *overrides_for(GIVEN, (choice,))))
     except ConfigError as error:
         sys.exit(f"psfdae: {choice}: {error}")
 
@@ -122,15 +123,10 @@ def settings(name, /, *choice, more=(), **options):
     stage_of = getattr(import_module(program), function) if program else stage(name)
     spec = stage_of.stage.settings
     reads = spec.of(options)
-    if spec.root == "config":
-        tree = composed(*choice, more=more)
-    else:
-        tree = compose((*ALIGNMENT_OVERRIDES, *more), spec.root)
+    tree = composed(*spec.choice, *choice, more=more)
     folder = Path(RESULTS, ".settings")
     # As text: Snakemake does not remember params that are paths.
-    return str(
-        write_settings(folder, name, reads, tree, spec.root, dry=workflow.dryrun)
-    )
+    return str(write_settings(folder, name, reads, tree, dry=workflow.dryrun))
 
 
 @cache
@@ -140,7 +136,7 @@ def default_datasets():
 
     Sizes that fit together in one dataset may not in another: that counts where one is built.
     """
-    return load_groups(overrides_for("config", GIVEN)).workflow.datasets
+    return load_groups(overrides_for(GIVEN)).workflow.datasets
 
 
 def templates_of(stars):

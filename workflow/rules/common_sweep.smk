@@ -30,7 +30,7 @@ def sweep_point_of(w):
 def sweep_data(w):
     """Products that the points of a sweep share, by role."""
     sweep = sweep_plan(w.sweep).sweep
-    if sweep.root == "config":
+    if sweep.dataset:
         return {"stars": stars_of(sweep.dataset)}
     return {
         "states": f"{ALIGNMENT_DATA}/{'grid' if sweep.model == 'original' else 'train'}.h5",

@@ -71,18 +71,14 @@ def poppy_stars(w):
     return min(POPPY_STARS, dataset_config(TIMED_DATASET).parts.test_stars)
 
 
-with one_line():
-    ALIGNMENT_OVERRIDES = overrides_for("alignment", GIVEN)
 ALIGNMENT_DATA = f"{RESULTS}/data/alignment"
 ALIGNMENT = f"{RESULTS}/alignment"
 ALIGNMENT_SETS = ["uniform", "grid"]
 
 
-@cache
-@one_line()
 def alignment_config():
     """Checked configuration of scene 3; a wrong key stops before any job."""
-    return load(ALIGNMENT_OVERRIDES, "alignment")
+    return dataset_config(SCENE3)
 
 
 def as_options(wildcards, input):

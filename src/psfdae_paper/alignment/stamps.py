@@ -14,7 +14,8 @@ from functools import partial
 import numpy as np
 
 from psfdae.errors import Error
-from psfdae_paper.configuration.alignment import Alignment, AlignmentOptics
+from psfdae_paper.configuration.alignment import Alignment
+from psfdae_paper.configuration.schema import Optics
 from psfdae_paper.configuration.telescope import Telescope
 from psfdae_paper.optics.derivatives import ModalStamps, PeriodSampling, normalise_with_derivatives
 from psfdae_paper.optics.propagation import in_batches
@@ -96,7 +97,7 @@ class AlignmentStamps:
     def __init__(
         self,
         telescope: Telescope,
-        optics: AlignmentOptics,
+        optics: Optics,
         alignment: Alignment,
         movable: bool = False,
     ) -> None:

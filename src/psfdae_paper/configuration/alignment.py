@@ -1,69 +1,58 @@
-"""Configuration of scene 3, the alignment of a secondary mirror (`config/alignment.yaml`).
-
-It is a root of its own: nothing of it exists in a dataset's configuration, and
-groups of the same name mean the same in both.
-"""
+"""Configuration of scene 3, the alignment of a secondary mirror (`dataset=alignment`)."""
 
 from __future__ import annotations
 
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field, model_validator
 
-from psfdae.networks.settings import DaeSettings, Train
-from psfdae.settings import CheckpointSeconds, Count, Evaluation, Group, Noise, Positive
-from psfdae_paper.configuration.base import PupilSamples
-from psfdae_paper.configuration.telescope import Telescope
+from psfdae.settings import CheckpointSeconds, Count, Group, Positive
 from psfdae_paper.configuration.wavefront import Prescription
-
-
-class AlignmentOptics(Group):
-    """Numerical settings of the propagation by the whole period of the image."""
-
-    pupil_samples: PupilSamples = Field(
-        description="Grid sizes N, ascending; each wavefront takes the first that suffices"
-    )
-    precision: Literal["complex64", "complex128"] = Field(description="Of the propagation")
-    batch: Count = Field(description="Wavefronts per batch")
-    threads: Count = Field(description="Batches at once")
 
 
 class Alignment(Group):
     """States of misalignment, fields, stamps and sets of states."""
 
+    # The paper's ranges (section 3.3).
     decenter_range_m: Annotated[float, Field(gt=0, le=0.01)] = Field(
-        description="Decentre of the secondary in x and y: ± this"
+        1e-3, description="Decentre of the secondary in x and y: ± this"
     )
     tilt_range_deg: Annotated[float, Field(gt=0, le=1)] = Field(
-        description="Tilt of the secondary about x and y: ± this"
+        0.1, description="Tilt of the secondary about x and y: ± this"
     )
+    # In focus an astigmatic image is nearly the same for opposite signs of the astigmatism, so a
+    # tilt and its opposite, each with a matching decentre, give nearly the same nine stamps; a
+    # known defocus (0.3 waves RMS) tells them apart. The paper only says that the CCD stays in a
+    # fixed position.
     defocus_m: Annotated[float, Field(ge=-0.01, le=0.01)] = Field(
-        description="Fixed distance of the CCD beyond best focus"
+        2e-4, description="Fixed distance of the CCD beyond best focus"
     )
     field_radius_deg: Annotated[float, Field(gt=0, le=5)] = Field(
-        description="Radius of the circle of field points; one more is in the centre"
+        0.5, description="Radius of the circle of field points; one more is in the centre"
     )
     field_points: Annotated[int, Field(ge=1, le=64)] = Field(
-        description="Field points on the circle"
+        8, description="Field points on the circle"
     )
     highest_zernike: Annotated[int, Field(ge=11, le=28)] = Field(
-        description="Highest Noll index of the wavefront"
+        22, description="Highest Noll index of the wavefront"
     )
     model_tolerance_waves: Positive = Field(
-        description="Largest RMS by which the quadratic model may differ from ray tracing"
+        5e-4, description="Largest RMS by which the quadratic model may differ from ray tracing"
     )
+    # Centred on the centroid, no jitter: no shift is left to be estimated.
     stamp_px: Annotated[int, Field(ge=8, le=64, multiple_of=2)] = Field(
-        description="Side d of a stamp, centred on the image's centroid"
+        16, description="Side d of a stamp, centred on the image's centroid"
     )
     least_energy: Annotated[float, Field(gt=0, lt=1)] = Field(
-        description="A stamp that holds less of the light is refused"
+        0.9, description="A stamp that holds less of the light is refused"
     )
+    # 5 levels in each of 4 degrees of freedom: the paper's 625 states.
     grid_levels: Annotated[int, Field(ge=2, le=9)] = Field(
-        description="Levels per degree of freedom of the grid of states"
+        5, description="Levels per degree of freedom of the grid of states"
     )
-    test_states: Count = Field(description="Uniform states of the independent test set")
-    train_states: Count = Field(description="Uniform states of the large training set")
+    test_states: Count = Field(625, description="Uniform states of the independent test set")
+    train_states: Count = Field(12000, description="Uniform states of the large training set")
 
     @property
     def unit(self) -> np.ndarray:
@@ -73,18 +62,21 @@ class Alignment(Group):
 
 
 class Cnn(Group):
-    """Convolutions and a linear layer, the paper's network."""
+    """Convolutions and a linear layer, the paper's network (section 3.3)."""
 
+    # They are not in the text; with these the paper's training takes less than a minute.
     widths: Annotated[list[Count], Field(min_length=1)] = Field(
-        description="Channels after every convolution"
+        [64, 64, 128, 128, 128], description="Channels after every convolution"
     )
     kernels: Annotated[list[Annotated[int, Field(ge=1, le=15)]], Field(min_length=1)] = Field(
-        description="Kernel sizes of the convolutions; odd"
+        [5, 3, 3, 3, 3], description="Kernel sizes of the convolutions; odd"
     )
     strides: Annotated[list[Annotated[int, Field(ge=1, le=4)]], Field(min_length=1)] = Field(
-        description="Strides of the convolutions"
+        [2, 1, 2, 1, 2], description="Strides of the convolutions"
     )
-    leak: Annotated[float, Field(ge=0, lt=1)] = Field(description="Slope of the leaky ReLU below 0")
+    leak: Annotated[float, Field(ge=0, lt=1)] = Field(
+        0.01, description="Slope of the leaky ReLU below 0"
+    )
 
     @model_validator(mode="after")
     def _shape(self) -> Cnn:
@@ -101,11 +93,13 @@ class Cnn(Group):
 
 
 class Perceptron(Group):
-    """Fully connected layers behind the stamps' leading principal components."""
+    """Fully connected layers behind the stamps' leading principal components, our own."""
 
-    components: Count = Field(description="Principal components of all stamps of a state together")
+    components: Count = Field(
+        128, description="Principal components of all stamps of a state together"
+    )
     widths: Annotated[list[Count], Field(min_length=1)] = Field(
-        description="Neurons of every inner layer"
+        [512, 256], description="Neurons of every inner layer"
     )
 
 
@@ -114,74 +108,87 @@ NETWORKS = {"cnn": Cnn, "perceptron": Perceptron}
 
 
 class NetworkTrain(Group):
-    """Optimisation of one network."""
+    """Optimisation of one network; as in the paper, lr = 1e-3 × 0.1^⌊epoch/30⌋."""
 
-    network: Literal["cnn", "perceptron"] = Field(description="Which one is trained")
-    epochs: Count = Field(description="Passes over the training states")
-    batch: Annotated[int, Field(ge=2)] = Field(description="States per step")
+    network: Literal["cnn", "perceptron"] = Field("cnn", description="Which one is trained")
+    epochs: Count = Field(100, description="Passes over the training states")
+    batch: Annotated[int, Field(ge=2)] = Field(10, description="States per step")
     lr: Annotated[float, Field(gt=0, le=1)] = Field(
-        description="Adam's learning rate (its maximum if one-cycle)"
+        1e-3, description="Adam's learning rate (its maximum if one-cycle)"
     )
-    schedule: Literal["steps", "onecycle"] = Field(description="Course of the learning rate")
+    schedule: Literal["steps", "onecycle"] = Field(
+        "steps", description="Course of the learning rate"
+    )
     decay: Annotated[float, Field(gt=0, le=1)] = Field(
-        description="Factor of the learning rate at each step of the schedule"
+        0.1, description="Factor of the learning rate at each step of the schedule"
     )
-    decay_epochs: Count = Field(description="Epochs between steps of the schedule")
+    decay_epochs: Count = Field(30, description="Epochs between steps of the schedule")
     mirrors: bool = Field(
-        description="Train on the telescope's mirror images and average estimates over them"
+        False, description="Train on the telescope's mirror images and average estimates over them"
     )
     noise_draws: Count = Field(
+        1,
         description="Draws of each field's noise where the DAE's output is learnt, whose "
-        "computation takes long; noisy stamps get new noise in every epoch"
+        "computation takes long; noisy stamps get new noise in every epoch",
     )
-    threads: Count = Field(description="Threads of the training")
+    threads: Count = Field(1, description="Threads of the training")
     checkpoint_seconds: CheckpointSeconds = Field(
-        description="Least time between checkpoints; repeats nothing"
+        20.0, description="Least time between checkpoints; repeats nothing"
     )
 
 
 class Fit(Group):
     """Maximum-likelihood fit of a state."""
 
+    # More are slower and nearer to the optics.
     neighbours: Annotated[int, Field(ge=5, le=1000)] = Field(
-        description="Computed states that a stamp is interpolated from, in all but the last step"
+        125,
+        description="Computed states that a stamp is interpolated from, in all but the last step",
     )
-    outer_states: Count = Field(description="States beyond the range that are computed for it")
-    iterations: Count = Field(description="Most steps of a fit")
+    # Without them estimates at the edge of the range would be worse.
+    outer_states: Count = Field(
+        1000, description="States beyond the range that are computed for it"
+    )
+    iterations: Count = Field(12, description="Most steps of a fit")
+    # A step of 0.3 standard errors leaves a few hundredths to the maximum.
     tolerance: Positive = Field(
-        description="A step of this many standard errors or fewer is the last"
+        0.3, description="A step of this many standard errors or fewer is the last"
     )
-    damping: Positive = Field(description="Levenberg damping of the first step")
+    damping: Positive = Field(1e-3, description="Levenberg damping of the first step")
     limit: Annotated[float, Field(ge=1, le=2)] = Field(
-        description="States are kept within ± this, in units of the range"
+        1.25, description="States are kept within ± this, in units of the range"
     )
 
 
-def _misaligned(prescription: Prescription) -> Prescription:
+def misaligned(prescription: Prescription) -> Prescription:
+    """The prescription, if it has a secondary mirror.
+
+    Raises
+    ------
+    ValueError
+        If it has none.
+    """
     if prescription.secondary is None:
         raise ValueError("secondary: missing, nothing else can be misaligned")
     return prescription
 
 
-class AlignmentConfig(Group):
-    """The whole configuration of scene 3."""
+NAME = "alignment"
+"""Of scene 3 among the datasets."""
 
-    seed: Annotated[int, Field(ge=0, lt=2**63)] = Field(description="Of every random draw")
-    telescope: Telescope
-    prescription: Annotated[Prescription, AfterValidator(_misaligned)]
-    alignment: Alignment
-    optics: AlignmentOptics
-    noise: Noise
-    dae: DaeSettings
-    dae_train: Train
-    cnn: Cnn
-    perceptron: Perceptron
-    train_original: NetworkTrain
-    train_noise_trained: NetworkTrain
-    train_dae_retrained: NetworkTrain
-    evaluation: Evaluation
-    fit: Fit
+CHOICE = (f"dataset={NAME}",)
+"""Override that chooses scene 3."""
 
+OWN_OPTIONS = ("preset", "prescription", "dae_train", "network_train")
+"""Groups of which options chosen for all datasets apply to scene 3, too. Of others, such as the
+telescope, it keeps those in dataset/alignment.yaml."""
+
+GROUPS = (
+    *("seed", "telescope", "prescription", "alignment", "optics", "noise", "dae", "dae_train"),
+    *("cnn", "perceptron", "train_original", "train_noise_trained", "train_dae_retrained"),
+    *("evaluation", "fit"),
+)
+"""Groups of the configuration that scene 3 reads."""
 
 OF_STATES = ("seed", "telescope", "prescription", "alignment", "optics")
 """Groups that decide the stamps of states."""

@@ -5,20 +5,20 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from psfdae import cli
-
-Root = Literal["config", "alignment"]
-"""Root files of the configuration: the datasets', and that of scene 3."""
 
 
 @dataclass(frozen=True)
 class Groups:
-    """Reads groups of a root of the configuration; which may depend on a command's options."""
+    """Reads groups of the configuration; which may depend on a command's options.
+
+    `choice` are words before those of the command line, such as the dataset that it is about.
+    """
 
     reads: tuple[str, ...] | Callable[..., tuple[str, ...]]
-    root: Root = "config"
+    choice: tuple[str, ...] = ()
 
     def of(self, options: Mapping[str, Any]) -> tuple[str, ...]:
         """Names of the groups that a command with these options reads."""
@@ -30,14 +30,14 @@ class Groups:
 
         reads = self.of(options)
         if file is not None:
-            return load_settings(file, reads, self.root)
-        return load_stage(reads, words, self.root)
+            return load_settings(file, reads)
+        return load_stage(reads, (*self.choice, *words))
 
 
 def command(
     name: str,
     reads: tuple[str, ...] | Callable[..., tuple[str, ...]] = (),
-    root: Root = "config",
+    choice: tuple[str, ...] = (),
 ) -> Callable[..., Any]:
     """`psfdae.cli.command`, whose `config` has groups of the configuration as attributes."""
-    return cli.command(name, Groups(reads, root))
+    return cli.command(name, Groups(reads, choice))

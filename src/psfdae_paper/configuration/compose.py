@@ -10,38 +10,34 @@ from contextlib import suppress
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 from pydantic import create_model
 
 from psfdae.files import ProductError, write_text
 from psfdae.reading import parse_yaml
 from psfdae.settings import NEUTRAL, ConfigError, Group, validate
-from psfdae_paper.configuration.alignment import AlignmentConfig
+from psfdae_paper.configuration import alignment
 from psfdae_paper.configuration.base import config_dir
-from psfdae_paper.configuration.command import Root
-from psfdae_paper.configuration.consistency import Consistent, stage_model, with_derived
+from psfdae_paper.configuration.consistency import stage_model, with_derived
 from psfdae_paper.configuration.methods import all_groups, methods_in
 from psfdae_paper.configuration.outline import filled, outline_of
 from psfdae_paper.configuration.schema import whole_config
 
-ROOTS: tuple[Root, ...] = get_args(Root)
+ROOT = "config.yaml"
 
 
-def model_of(root: Root) -> type[Group]:
-    """The checked model of a root."""
-    return whole_config() if root == "config" else AlignmentConfig
+def compose(overrides: Sequence[str] = ()) -> dict[str, Any]:
+    """Resolved configuration tree of a list of Hydra overrides, not yet checked.
 
-
-def compose(overrides: Sequence[str] = (), root: Root = "config") -> dict[str, Any]:
-    """Resolved configuration tree of a root and a list of Hydra overrides, not yet checked.
+    `alignment_preset` is a former name of `preset`.
 
     Raises
     ------
     ConfigError
         If Hydra refuses an override (unknown key or group option, bad syntax).
     """
-    return _composed(tuple(overrides), root)
+    return _composed(tuple(re.sub("^alignment_preset=", "preset=", word) for word in overrides))
 
 
 def forget() -> None:
@@ -65,15 +61,15 @@ KEPT: list[Path] = []
 
 
 @cache
-def _composed(overrides: tuple[str, ...], root: Root) -> dict[str, Any]:
+def _composed(overrides: tuple[str, ...]) -> dict[str, Any]:
     chosen = [word for word in overrides if re.fullmatch(r"dataset=\w+", word)]
-    if root == "config" and len(chosen) == 1:
+    if len(chosen) == 1:
         found = outline_of(config_dir() / f"dataset/{chosen[0].removeprefix('dataset=')}.yaml")
         if found:
             words = tuple(f"dataset={OUTLINE}" if word in chosen else word for word in overrides)
             with suppress(ConfigError, KeyError):  # composed as it is, it says what is wrong
-                return dict(filled(_kept(words, root, json.dumps(found[0])), found[1]))
-    return _kept(overrides, root)
+                return dict(filled(_kept(words, json.dumps(found[0])), found[1]))
+    return _kept(overrides)
 
 
 OUTLINE = "_outline"
@@ -81,30 +77,30 @@ OUTLINE = "_outline"
 
 
 @cache
-def _kept(overrides: tuple[str, ...], root: Root, outline: str = "") -> dict[str, Any]:
+def _kept(overrides: tuple[str, ...], outline: str = "") -> dict[str, Any]:
     """A composition from the folder where they are kept, or by Hydra, then kept there."""
-    name = _made_of(overrides, root, outline) if KEPT or outline else ""
+    name = _made_of(overrides, outline) if KEPT or outline else ""
     if outline and not name:
         raise ConfigError("a resolver may look at values that an outline does not have")
     if not (name and KEPT):
-        return _by_hydra(overrides, root, outline)
+        return _by_hydra(overrides, outline)
     path = Path(KEPT[-1], name)
     digest, _, text = path.read_bytes().partition(b"\n") if path.is_file() else (b"", b"", b"")
     if digest.decode("latin1") == hashlib.sha256(text).hexdigest():
         kept: dict[str, Any] = json.loads(text)
         return kept
-    tree = _by_hydra(overrides, root, outline)
+    tree = _by_hydra(overrides, outline)
     written = json.dumps(tree)
     # Somebody may have edited the configuration meanwhile.
-    if json.loads(written) == tree and _made_of(overrides, root, outline) == name:
+    if json.loads(written) == tree and _made_of(overrides, outline) == name:
         write_text(path, f"{hashlib.sha256(written.encode()).hexdigest()}\n{written}")
     return tree
 
 
-def _made_of(overrides: tuple[str, ...], root: Root, outline: str) -> str:
+def _made_of(overrides: tuple[str, ...], outline: str) -> str:
     """Hash of all that a composition is made of, "" if a resolver may add more."""
     folder = config_dir()
-    words = (overrides, root, outline, all_groups(), _class_defaults(root))
+    words = (overrides, outline, all_groups(), _class_defaults())
     words += (version("hydra-core"), version("omegaconf"))
     parts = [repr(words).encode(), Path(__file__).read_bytes()]
     for path in sorted(folder.rglob("*.yaml")):
@@ -113,7 +109,7 @@ def _made_of(overrides: tuple[str, ...], root: Root, outline: str) -> str:
     return "" if resolves else hashlib.sha256(b"\0".join(parts)).hexdigest()
 
 
-def _by_hydra(overrides: tuple[str, ...], root: Root, outline: str = "") -> dict[str, Any]:
+def _by_hydra(overrides: tuple[str, ...], outline: str = "") -> dict[str, Any]:
     import hydra
     from hydra.core.config_store import ConfigStore
     from hydra.core.global_hydra import GlobalHydra
@@ -125,38 +121,37 @@ def _by_hydra(overrides: tuple[str, ...], root: Root, outline: str = "") -> dict
         ConfigStore.instance().store(OUTLINE, json.loads(outline), "dataset", "_global_")
     try:
         with hydra.initialize_config_dir(str(folder), version_base="1.3"):
-            tree = hydra.compose(_primary(root, folder), overrides=list(overrides))
+            tree = hydra.compose(_primary(folder), overrides=list(overrides))
         resolved = OmegaConf.to_container(tree, resolve=True, throw_on_missing=True)
     except Exception as error:  # what a broken file leads to inside Hydra is beyond listing
         raise ConfigError(_reason(error, folder)) from error
     if not isinstance(resolved, dict):
-        raise ConfigError(f"{folder / root}.yaml: must be a mapping")
+        raise ConfigError(f"{folder / ROOT}: must be a mapping")
     return resolved
 
 
-def _primary(root: Root, folder: Path) -> str:
-    """Name of a root that begins with the defaults of the classes of its settings.
+def _primary(folder: Path) -> str:
+    """Name of a root file that begins with the defaults of the classes of its settings.
 
     Files of the groups hold what differs from these. The settings of every method are there,
     whether the root's list of defaults has them or not.
     """
     from hydra.core.config_store import ConfigStore
 
-    tree = parse_yaml(folder / f"{root}.yaml")
+    tree = parse_yaml(folder / ROOT)
     defaults = tree.get("defaults", [])
-    chosen = {group for entry in defaults if isinstance(entry, dict) for group in entry}
-    groups = {*all_groups()} - chosen if root == "config" else set()
+    groups = {*all_groups()} - {g for entry in defaults if isinstance(entry, dict) for g in entry}
     # Before all others, so that datasets and presets may change them.
     more = [{f"optional {group}": "default"} for group in sorted(groups)]
-    store, classes, whole = ConfigStore.instance(), f"{root}_defaults", f"{root}_with_defaults"
-    store.store(classes, _class_defaults(root), package="_global_")
-    store.store(whole, {**tree, "defaults": [classes, *more, *defaults]})
-    return whole
+    store = ConfigStore.instance()
+    store.store("class_defaults", _class_defaults(), package="_global_")
+    store.store("with_class_defaults", {**tree, "defaults": ["class_defaults", *more, *defaults]})
+    return "with_class_defaults"
 
 
-def _class_defaults(root: Root) -> dict[str, Any]:
+def _class_defaults() -> dict[str, Any]:
     """Groups of a configuration with the values that their classes give, where they give some."""
-    fields = model_of(root).model_fields.items()
+    fields = whole_config().model_fields.items()
     kinds = {name: field.annotation for name, field in fields}
     groups = {
         name: {
@@ -186,15 +181,29 @@ def _reason(error: Exception, folder: Path) -> str:
     return f"config: {_first_lines(error)}"
 
 
-def load(overrides: Sequence[str] = (), root: Root = "config") -> Any:
-    """Compose and check the whole configuration of one dataset, or of another root.
+def load(overrides: Sequence[str] = ()) -> Any:
+    """Compose and check the whole configuration of a dataset, or all that scene 3 reads of it.
 
     Raises
     ------
     ConfigError
         Names each wrong key with its value and the allowed range.
     """
-    return validate(model_of(root), compose(overrides, root))
+    return checked(compose(overrides))
+
+
+def checked(tree: Mapping[str, Any]) -> Any:
+    """As `load`, of a tree that is composed."""
+    if "scene" in tree or tree.get("dataset", {}).get("name") != alignment.NAME:
+        return validate(whole_config(), tree)
+    _require_known(tree)
+    return part(alignment.GROUPS, tree)
+
+
+def _require_known(tree: Mapping[str, Any]) -> None:
+    unknown = sorted(set(tree) - set(whole_config().model_fields))
+    if unknown:
+        raise ConfigError(f"{unknown[0]}: unknown key")
 
 
 def load_groups(overrides: Sequence[str] = ()) -> Any:
@@ -247,7 +256,7 @@ def _named(path: Path, check: Callable[[], Any]) -> Any:
         raise ConfigError(lines) from None
 
 
-def load_stage(reads: tuple[str, ...], overrides: Sequence[str] = (), root: Root = "config") -> Any:
+def load_stage(reads: tuple[str, ...], overrides: Sequence[str] = ()) -> Any:
     """Compose the configuration and check the groups that a stage reads.
 
     Returns
@@ -259,14 +268,12 @@ def load_stage(reads: tuple[str, ...], overrides: Sequence[str] = (), root: Root
     ConfigError
         As `load`; an unknown group at the top is refused, too.
     """
-    tree = compose(overrides, root)
-    unknown = sorted(set(tree) - set(model_of(root).model_fields))
-    if unknown:
-        raise ConfigError(f"{unknown[0]}: unknown key")
-    return part(reads, stage_tree(reads, tree, root), root)
+    tree = compose(overrides)
+    _require_known(tree)
+    return part(reads, stage_tree(reads, tree))
 
 
-def load_settings(path: Path, reads: tuple[str, ...], root: Root = "config") -> Any:
+def load_settings(path: Path, reads: tuple[str, ...]) -> Any:
     """The groups that a stage reads from a file that `write_settings` has written.
 
     Raises
@@ -275,7 +282,7 @@ def load_settings(path: Path, reads: tuple[str, ...], root: Root = "config") -> 
         If the file is no YAML or holds something else; names file, key and range.
     """
     tree = parse_yaml(path)
-    model = stage_model(reads, model_of(root))
+    model = stage_model(reads, whole_config())
     return _named(path, lambda: validate(model, tree if isinstance(tree, dict) else {}))
 
 
@@ -284,7 +291,6 @@ def write_settings(
     stage: str,
     reads: tuple[str, ...],
     tree: Mapping[str, Any],
-    root: Root = "config",
     dry: bool = False,
 ) -> Path:
     """Write the checked groups that a stage reads; the same settings have the same name.
@@ -298,7 +304,7 @@ def write_settings(
     """
     import yaml
 
-    checked = part(reads, stage_tree(reads, tree, root), root).model_dump()
+    checked = part(reads, stage_tree(reads, tree)).model_dump()
     digest = hashlib.sha256(json.dumps(decisive(checked), sort_keys=True).encode()).hexdigest()
     path = folder / f"{stage.replace(' ', '-')}-{digest[:16]}.yaml"
     if not dry:
@@ -309,7 +315,7 @@ def write_settings(
     return path
 
 
-def part(reads: tuple[str, ...], tree: Any, root: Root = "config") -> Any:
+def part(reads: tuple[str, ...], tree: Any) -> Any:
     """Some groups of a configuration, a tree or a model, checked.
 
     Raises
@@ -319,12 +325,10 @@ def part(reads: tuple[str, ...], tree: Any, root: Root = "config") -> Any:
     """
     tree = tree if isinstance(tree, Mapping) else tree.model_dump()
     found = {key: tree[key] for key in reads if key in tree}
-    return validate(stage_model(reads, model_of(root)), found)
+    return validate(stage_model(reads, whole_config()), found)
 
 
-def stage_tree(
-    reads: tuple[str, ...], tree: Mapping[str, Any], root: Root = "config"
-) -> dict[str, Any]:
+def stage_tree(reads: tuple[str, ...], tree: Mapping[str, Any]) -> dict[str, Any]:
     """The part of a configuration tree that a stage reads.
 
     What follows from groups that it does not read is filled in.
@@ -334,7 +338,7 @@ def stage_tree(
     ConfigError
         If nothing can follow from them.
     """
-    tree = _derived(tree) if issubclass(model_of(root), Consistent) else tree
+    tree = _derived(tree)
     missing = [key for key in reads if key not in tree]
     if missing:
         raise ConfigError(f"{missing[0]}: missing")
@@ -348,71 +352,45 @@ def _derived(tree: Mapping[str, Any]) -> dict[str, Any]:
         raise ConfigError(str(error)) from None
 
 
-def overrides_for(
-    root: Root, overrides: Sequence[str], choice: Sequence[str] = ()
-) -> tuple[str, ...]:
-    """Those of the workflow's overrides that concern a configuration.
+def overrides_for(overrides: Sequence[str], choice: Sequence[str] = ()) -> tuple[str, ...]:
+    """Those of the workflow's overrides that concern a dataset.
 
-    The workflow takes one list for everything. A key that only other roots or other
-    datasets have is left out; one that none has stays and is refused by name. A shared
-    value, such as noise.kappa=5, reaches every root, but the choice of an option
-    of a shared group, such as telescope=wfsat_literal, is the datasets'. The
-    preset is every root's own option of that name.
+    The workflow takes one list for everything. A key that only other datasets have is left
+    out; one that none has stays and is refused by name. The options of a group that all
+    datasets take, scene 3 takes only of `alignment.OWN_OPTIONS`.
 
     Parameters
     ----------
-    root : Root
     overrides : sequence of str
     choice : sequence of str
-        What chooses the configuration in its root, such as dataset=dataset7.
+        What chooses the dataset, such as dataset=dataset7.
 
     Raises
     ------
     ConfigError
         If an option does not exist.
     """
-    kept = []
-    for override in overrides:
-        if _owner(_key(override)):
-            kept += _options(root, [override])
-        elif _concerns(root, override, overrides, choice):
-            kept.append(override)
-    return tuple(kept)
+    options = [word for word in overrides if (config_dir() / _key(word)).is_dir()]
+    chosen = [
+        word
+        for word in options
+        if choice != alignment.CHOICE or _key(word) in alignment.OWN_OPTIONS
+    ]
 
+    def has(key: str, choice: Sequence[str]) -> bool:
+        return _knows(compose((*choice, *chosen)), key)
 
-def _owner(key: str) -> str | None:
-    """The root whose groups a key chooses an option of, "every" for the preset."""
-    if key == "preset":
-        return "every"
-    return next((root for root in ROOTS if isinstance(compose((), root).get(key), Mapping)), None)
+    def concerns(override: str) -> bool:
+        for key in _places(override):
+            if has(key, choice):
+                return True
+            if any(has(key, [f"dataset={name}"]) for name in dataset_names()):
+                return False
+        return True
 
-
-def _options(root: Root, overrides: Sequence[str]) -> tuple[str, ...]:
-    """Overrides that choose an option of a group of a root."""
-    found = []
-    for override in overrides:
-        owner = _owner(_key(override))
-        if owner == "every" and root != "config":
-            found.append(f"{root}_{override}")
-        elif owner in (root, "every"):
-            found.append(override)
-    return tuple(found)
-
-
-def _concerns(root: Root, override: str, overrides: Sequence[str], choice: Sequence[str]) -> bool:
-    """Whether a configuration has the key of an override, or no other one has it, either."""
-
-    def has(key: str, root: Root, choice: Sequence[str] = ()) -> bool:
-        return _knows(compose((*choice, *_options(root, overrides)), root), key)
-
-    for key in _places(override):
-        if has(key, root, choice):
-            return True
-        if any(has(key, other) for other in ROOTS if other != root):
-            return False
-        if any(has(key, "config", [f"dataset={name}"]) for name in dataset_names()):
-            return False
-    return True
+    return tuple(
+        word for word in overrides if word in chosen or (word not in options and concerns(word))
+    )
 
 
 def dataset_names() -> list[str]:
@@ -445,11 +423,10 @@ def _knows(tree: Mapping[str, Any], key: str) -> bool:
 
 @cache
 def _neutral_keys() -> frozenset[tuple[str, str]]:
-    """Group and name of the settings that cannot change a result, over all roots."""
+    """Group and name of the settings that cannot change a result."""
     return frozenset(
         (group, name)
-        for root in ROOTS
-        for group, field in model_of(root).model_fields.items()
+        for group, field in whole_config().model_fields.items()
         if isinstance(field.annotation, type) and issubclass(field.annotation, Group)
         for name, inner in field.annotation.model_fields.items()
         if NEUTRAL in inner.metadata

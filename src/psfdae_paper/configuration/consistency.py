@@ -67,6 +67,8 @@ def with_derived(tree: Mapping[str, Any]) -> dict[str, Any]:
 
 def _check_scene(tree: Mapping[str, Any]) -> None:
     scene, telescope = tree.get("scene"), tree.get("telescope")
+    if scene is None and "alignment" in tree:
+        scene = {"name": "alignment"}
     if not isinstance(scene, Mapping) or not isinstance(telescope, Mapping):
         return
     name, own = telescope.get("name"), has_own_aberrations(telescope)
@@ -130,8 +132,7 @@ def _space(grid: dict[str, Any]) -> None:
 
 
 @cache
-def stage_model(keys: tuple[str, ...], root: type[Group]) -> type[Group]:
-    """Some config groups of a root as a model of their own."""
-    fields = {key: (root.model_fields[key].rebuild_annotation(), ...) for key in keys}
-    base = Consistent if issubclass(root, Consistent) else Group
-    return create_model("Settings", __base__=base, **fields)  # type: ignore[call-overload]
+def stage_model(keys: tuple[str, ...], whole: type[Group]) -> type[Group]:
+    """Some groups of a whole configuration as a model of their own."""
+    fields = {key: (whole.model_fields[key].rebuild_annotation(), ...) for key in keys}
+    return create_model("Settings", __base__=Consistent, **fields)  # type: ignore[call-overload]

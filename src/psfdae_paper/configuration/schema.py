@@ -9,10 +9,11 @@ from __future__ import annotations
 from functools import cache
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import Field, create_model, model_validator
+from pydantic import AfterValidator, Field, create_model, model_validator
 
 from psfdae.method import Method
 from psfdae.methods import MethodNames
+from psfdae.networks.settings import DaeSettings, Train
 from psfdae.settings import (
     CalibrationStars,
     Count,
@@ -27,11 +28,19 @@ from psfdae.settings import (
     SplitKind,
     Stamp,
 )
+from psfdae_paper.configuration.alignment import (
+    Alignment,
+    Cnn,
+    Fit,
+    NetworkTrain,
+    Perceptron,
+    misaligned,
+)
 from psfdae_paper.configuration.base import SEARCH, PupilSamples, SearchDistance
 from psfdae_paper.configuration.consistency import Consistent
 from psfdae_paper.configuration.methods import registered
 from psfdae_paper.configuration.telescope import AnyTelescope
-from psfdae_paper.configuration.wavefront import OfTelescope, Seidel, VonKarman
+from psfdae_paper.configuration.wavefront import OfTelescope, Prescription, Seidel, VonKarman
 
 
 class Grid(Group):
@@ -93,7 +102,9 @@ class Optics(Group):
         description="Grid sizes N, ascending; each wavefront takes the first that suffices"
     )
     precision: Literal["complex64", "complex128"] = Field(description="Of the propagation")
-    backend: Literal["numpy", "torch"] = Field(description="Library of the matrix products")
+    backend: Literal["numpy", "torch"] = Field(
+        "numpy", description="Library of the matrix products; scene 3 has none"
+    )
     batch: Count = Field(description="Wavefronts per batch")
     threads: Count = Field(description="Threads of the linear algebra")
 
@@ -166,7 +177,10 @@ class Workflow(Group):
 
 
 class Config(Consistent):
-    """The whole configuration of one dataset, but for the settings of methods."""
+    """The whole configuration of one dataset, but for the settings of methods.
+
+    Scene 3 reads `alignment.GROUPS` of them.
+    """
 
     if TYPE_CHECKING:
 
@@ -192,6 +206,16 @@ class Config(Consistent):
     benchmark: Benchmark
     bounds: Bounds
     calibration_stars: CalibrationStars
+    prescription: Annotated[Prescription, AfterValidator(misaligned)]
+    alignment: Alignment
+    dae: DaeSettings
+    dae_train: Train
+    cnn: Cnn
+    perceptron: Perceptron
+    train_original: NetworkTrain
+    train_noise_trained: NetworkTrain
+    train_dae_retrained: NetworkTrain
+    fit: Fit
 
     @model_validator(mode="after")
     def _consistent(self) -> Config:

@@ -9,8 +9,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from psfdae.methods import groups_of, method
 from psfdae.settings import ConfigError, Count, Finite, Group, Name, Reference, SplitKind
-from psfdae_paper.configuration.alignment import NETWORKS
-from psfdae_paper.configuration.command import Root
+from psfdae_paper.configuration.alignment import CHOICE, NETWORKS
 from psfdae_paper.configuration.compose import config_dir, load_file
 from psfdae_paper.configuration.methods import registered
 
@@ -40,10 +39,8 @@ def _trainable(name: str) -> str:
 
 Model = Annotated[str, AfterValidator(_trainable)]
 
-METRICS: dict[Root, tuple[Metric, ...]] = {
-    "config": ("validation_mse", "validation_ssim"),
-    "alignment": ("validation_mae",),
-}
+METRICS = ("validation_mse", "validation_ssim")
+NETWORK_METRICS = ("validation_mae",)
 """What points can be compared by: errors of images, or of states of misalignment."""
 
 RESERVED = ("point", "status", "reason", "epochs", "attempt", "best")
@@ -138,9 +135,9 @@ class Sweep(Group):
     parallel: Count = Field(default=2, description="Adaptive: trials that may run at once")
 
     @property
-    def root(self) -> Root:
-        """Root of the configuration that the model is part of."""
-        return "alignment" if self.model in TRAINED else "config"
+    def choice(self) -> tuple[str, ...]:
+        """Override that chooses the dataset, or scene 3."""
+        return CHOICE if self.dataset is None else (f"dataset={self.dataset}",)
 
     @property
     def reads(self) -> tuple[str, ...]:
@@ -156,10 +153,11 @@ class Sweep(Group):
     def _fits_together(self) -> Sweep:
         if (self.kind == "grid") != (self.trials is None):
             raise ValueError("trials: random and adaptive sweeps need it, a grid has none")
-        if (self.root == "config") != (self.dataset is not None):
+        if (self.model in TRAINED) != (self.dataset is None):
             raise ValueError("dataset: methods need one, scene 3's networks have none")
-        if self.metric not in METRICS[self.root]:
-            allowed = " or ".join(METRICS[self.root])
+        metrics = NETWORK_METRICS if self.dataset is None else METRICS
+        if self.metric not in metrics:
+            allowed = " or ".join(metrics)
             raise ValueError(f"metric = {self.metric}: model {self.model} has {allowed}")
         return self
 

@@ -1,7 +1,7 @@
 """Stages of the reproduction: each reads files, calls the science and writes files."""
 
 GROUPS = {
-    "alignment": "Scene 3: alignment of a secondary mirror (config/alignment.yaml).",
+    "alignment": "Scene 3: alignment of a secondary mirror (config/dataset/alignment.yaml).",
     "alignment figure": "Draw a figure of scene 3 as PNG.",
     "figure": "Draw a figure as PNG from finished products.",
     "sweep": "Train many variants of a model and compare them (config/sweep).",

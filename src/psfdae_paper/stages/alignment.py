@@ -28,8 +28,9 @@ from psfdae_paper.alignment.telescope import (
     verify,
     zernike_tracer,
 )
-from psfdae_paper.configuration.alignment import OF_STATES, STATE_STAMPS, STATES, AlignmentConfig
+from psfdae_paper.configuration.alignment import CHOICE, OF_STATES, STATE_STAMPS, STATES
 from psfdae_paper.configuration.command import command
+from psfdae_paper.configuration.schema import Config
 from psfdae_paper.raytracing import FIRST_NOLL, ZernikeTracer
 
 ModelFile = Annotated[File, "Product of `alignment model`."]
@@ -37,9 +38,9 @@ StatesFile = Annotated[File, "Product of `alignment states`."]
 TestSet = Annotated[Literal["grid", "uniform"], {"flag": "--set"}]
 
 
-@command("alignment model", reads=("telescope", "prescription", "alignment"), root="alignment")
+@command("alignment model", reads=("telescope", "prescription", "alignment"), choice=CHOICE)
 def model(
-    config: AlignmentConfig,
+    config: Config,
     out: Annotated[File, "HDF5 product with the quadratic model of the wavefront."],
 ) -> None:
     """Fit the quadratic model to few ray-traced states, verify it on the grid."""
@@ -71,10 +72,10 @@ def read_model(path: Path, wanted: Any, whose: object = "the configuration") -> 
 @command(
     "alignment states",
     reads=OF_STATES,
-    root="alignment",
+    choice=CHOICE,
 )
 def states(
-    config: AlignmentConfig,
+    config: Config,
     kind: Annotated[Literal["grid", "uniform", "train"], {"flag": "--set"}],
     out: Annotated[File, "HDF5 product with states and their noise-free stamps."],
     model: Annotated[
@@ -107,11 +108,11 @@ def states(
     write_product(out, "alignment_states", columns, config.model_dump())
 
 
-def _tracer(config: AlignmentConfig) -> ZernikeTracer:
+def _tracer(config: Config) -> ZernikeTracer:
     return zernike_tracer(config.telescope, config.prescription, config.alignment)
 
 
-def _geometry(config: AlignmentConfig) -> dict[str, Column]:
+def _geometry(config: Config) -> dict[str, Column]:
     alignment = config.alignment
     fields = field_points(alignment.field_radius_deg, alignment.field_points)
     noll = np.arange(FIRST_NOLL, alignment.highest_zernike + 1)
@@ -122,9 +123,9 @@ def _geometry(config: AlignmentConfig) -> dict[str, Column]:
     }
 
 
-@command("alignment telescope", reads=("telescope", "alignment"), root="alignment")
+@command("alignment telescope", reads=("telescope", "alignment"), choice=CHOICE)
 def telescope(
-    config: AlignmentConfig,
+    config: Config,
     model: ModelFile,
     grid: Annotated[File, "Product of `alignment states --set grid`."],
     uniform: Annotated[File, "Product of `alignment states --set uniform`."],

@@ -43,12 +43,13 @@ from psfdae.threads import limit_threads
 from psfdae_paper.alignment.methods import BOUNDS, FITTED, LEARNED, METHODS, TRAINED, Method, of_set
 from psfdae_paper.alignment.stamps import AlignmentStamps
 from psfdae_paper.configuration.alignment import (
+    CHOICE,
     NETWORKS,
     STATE_STAMPS,
-    AlignmentConfig,
     NetworkTrain,
 )
 from psfdae_paper.configuration.command import command
+from psfdae_paper.configuration.schema import Config
 from psfdae_paper.stages.alignment import ModelFile, StatesFile, TestSet, read_model
 
 if TYPE_CHECKING:
@@ -79,9 +80,9 @@ NetworkFolders = make_dataclass(
 )
 
 
-@command("alignment train-dae", reads=("seed", "noise", "dae", "dae_train"), root="alignment")
+@command("alignment train-dae", reads=("seed", "noise", "dae", "dae_train"), choice=CHOICE)
 def train_dae(
-    config: AlignmentConfig,
+    config: Config,
     grid: Annotated[File, "Product of `alignment states --set grid`."],
     train: Annotated[File, "Product of `alignment states --set train`: its first states validate."],
     checkpoint: Checkpoint,
@@ -116,9 +117,9 @@ def _groups(kind: str = "", **_: Any) -> tuple[str, ...]:
     return ("seed", *noise, *NETWORKS, *(f"train_{name}" for name in kinds), *dae)
 
 
-@command("alignment train-network", reads=_groups, root="alignment")
+@command("alignment train-network", reads=_groups, choice=CHOICE)
 def train_network(
-    config: AlignmentConfig,
+    config: Config,
     kind: Annotated[
         str,
         click.Choice(TRAINED),
@@ -239,9 +240,9 @@ def require_network(folder: Path, states: Product, name: str | None = None) -> N
         require(folder / CONFIG, said, ("name",), {"name": name}, "the command")
 
 
-@command("alignment estimate", reads=("seed", "noise", "evaluation"), root="alignment")
+@command("alignment estimate", reads=("seed", "noise", "evaluation"), choice=CHOICE)
 def estimate(
-    config: AlignmentConfig,
+    config: Config,
     test_set: TestSet,
     states: StatesFile,
     dae: DaeFolder,
@@ -293,10 +294,10 @@ def _write_times(path: Path, rows: list[tuple[str, float, str, float, int]]) -> 
 @command(
     "alignment fit",
     reads=("seed", "telescope", "alignment", "optics", "noise", "fit", "evaluation"),
-    root="alignment",
+    choice=CHOICE,
 )
 def fit(
-    config: AlignmentConfig,
+    config: Config,
     test_set: TestSet,
     level: Annotated[float, AboveZero, "Noise level λ."],
     states: StatesFile,
@@ -366,9 +367,9 @@ def fit(
     _write_times(times, rows)
 
 
-@command("alignment bound", reads=("telescope", "alignment", "optics", "noise"), root="alignment")
+@command("alignment bound", reads=("telescope", "alignment", "optics", "noise"), choice=CHOICE)
 def bound(
-    config: AlignmentConfig,
+    config: Config,
     test_set: TestSet,
     states: StatesFile,
     model: ModelFile,

@@ -28,8 +28,9 @@ from psfdae_paper.alignment.methods import (
 )
 from psfdae_paper.alignment.stamps import AlignmentStamps
 from psfdae_paper.alignment.telescope import design_states, fit_quadratic, zernike_tracer
-from psfdae_paper.configuration.alignment import STATE_STAMPS, AlignmentConfig
+from psfdae_paper.configuration.alignment import CHOICE, STATE_STAMPS
 from psfdae_paper.configuration.command import command
+from psfdae_paper.configuration.schema import Config
 from psfdae_paper.stages.alignment import StatesFile
 from psfdae_paper.stages.alignment_methods import DaeFolder, denoise, noisy_test_states
 
@@ -202,8 +203,8 @@ def time_table(
     write_csv(out, pd.DataFrame(rows, columns=columns), digits=4)
 
 
-@command("alignment figure stamps", reads=("seed", "noise", "evaluation"), root="alignment")
-def stamps(config: AlignmentConfig, states: StatesFile, dae: DaeFolder, out: Png) -> None:
+@command("alignment figure stamps", reads=("seed", "noise", "evaluation"), choice=CHOICE)
+def stamps(config: Config, states: StatesFile, dae: DaeFolder, out: Png) -> None:
     """Draw the nine stamps of a few states before and after the DAE."""
     from psfdae_paper.evaluation.alignment_figures import stamp_rows
 
@@ -263,11 +264,9 @@ def errors(estimates: Estimates, fits: Fits, bounds: Bounds, out: Png) -> None:
 @command(
     "alignment figure twin",
     reads=("telescope", "prescription", "alignment", "optics", "noise"),
-    root="alignment",
+    choice=CHOICE,
 )
-def twin(
-    config: AlignmentConfig, table: Annotated[File, "CSV that receives the curves."], out: Png
-) -> None:
+def twin(config: Config, table: Annotated[File, "CSV that receives the curves."], out: Png) -> None:
     """Draw a state and its twin, in focus and with the CCD's defocus."""
     # The line leads through the state, the aligned telescope and the twin: tilts with the
     # decentres that cancel their field-constant coma.
@@ -295,7 +294,7 @@ def twin(
     write_png(twin_ambiguity(curves, shown, state), out)
 
 
-def _stamps_along(config: AlignmentConfig, defocus_m: float) -> tuple[np.ndarray, np.ndarray]:
+def _stamps_along(config: Config, defocus_m: float) -> tuple[np.ndarray, np.ndarray]:
     """A state and the ray-traced stamps of its multiples, with the CCD at a defocus."""
     moved = config.alignment.model_copy(update={"defocus_m": defocus_m})
     tracer = zernike_tracer(config.telescope, config.prescription, moved)

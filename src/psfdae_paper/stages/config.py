@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated
 
 import click
 
 from psfdae.cli import found, stage
-from psfdae_paper.configuration.command import command
+from psfdae_paper.configuration.alignment import CHOICE
+from psfdae_paper.configuration.command import Groups, command
 
 Overrides = Annotated[tuple[str, ...], {"argument": True}]
 Only = Annotated[str | None, "Only the groups that this stage reads.", {"flag": "--stage"}]
@@ -16,32 +17,25 @@ Only = Annotated[str | None, "Only the groups that this stage reads.", {"flag": 
 @command("config")
 def config(overrides: Overrides = (), only: Only = None) -> None:
     """Check the configuration and print it, resolved, as YAML."""
-    _print("config", overrides, only)
-
-
-@command("alignment config")
-def alignment_config(only: Only = None, overrides: Overrides = ()) -> None:
-    """Check the configuration of scene 3 and print it, resolved, as YAML."""
-    _print("alignment", overrides, only)
-
-
-def _print(
-    root: Literal["config", "alignment"], overrides: tuple[str, ...], only: str | None
-) -> None:
     import yaml
 
     from psfdae_paper.configuration.compose import load, load_stage
 
-    stages = {_key(name): name for name in found()}
-    reader = stage(stages[_key(only)]).stage.settings if only and _key(only) in stages else None
     if only is None:
-        checked = load(overrides, root)
-    elif reader is not None and reader.root == root:
-        checked = load_stage(reader.of({}), overrides, root)
+        checked = load(overrides)
     else:
-        names = [name for name in found() if name.startswith("alignment ") == (root != "config")]
-        raise click.BadParameter(f"{only!r} is not one of {', '.join(sorted(names))}")
+        names = {_key(name): name for name in found()}
+        reader = stage(names[_key(only)]).stage.settings if _key(only) in names else None
+        if not isinstance(reader, Groups):
+            raise click.BadParameter(f"{only!r} is not one of {', '.join(sorted(found()))}")
+        checked = load_stage(reader.of({}), (*reader.choice, *overrides))
     click.echo(yaml.safe_dump(checked.model_dump(), sort_keys=False), nl=False)
+
+
+@command("alignment config")
+def alignment_config(only: Only = None, overrides: Overrides = ()) -> None:
+    """Check the configuration of scene 3 and print it, resolved: `config dataset=alignment`."""
+    config(overrides if only else (*CHOICE, *overrides), only)
 
 
 def _key(name: str) -> str:

@@ -49,7 +49,7 @@ def run(config: Any, task: Task, name: str) -> Measured:
     for role in ("validation", "test"):
         product = read_product(task.data[role], "alignment_states", ())
         require(product.path, product.config, STATE_STAMPS, trained_on.config, trained_on.path)
-    settings = part(train_network.stage.settings.reads(name), config, "alignment")  # type: ignore[attr-defined]
+    settings = part(train_network.stage.settings.reads(name), config)  # type: ignore[attr-defined]
     train_network(settings, name, task.data["states"], task.checkpoint, task.folder)
     limit_threads(config.evaluation.threads)
     metrics: dict[str, float] = {}

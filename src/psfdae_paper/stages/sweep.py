@@ -16,7 +16,8 @@ from psfdae.files import ProductError, write_text
 from psfdae.method import FitError
 from psfdae.options import File, Folder
 from psfdae.settings import Reference, SplitKind
-from psfdae_paper.configuration.command import Root, command
+from psfdae_paper.configuration.alignment import CHOICE
+from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.compose import decisive, load_stage
 from psfdae_paper.configuration.sweep import TRAINED, models, point_groups
 from psfdae_paper.sweeps.measured import (
@@ -34,8 +35,9 @@ from psfdae_paper.sweeps.points import changes, with_values
 
 ADAPTIVE_MODULE = "psfdae_paper.sweeps.adaptive"
 
-ROLES = {"config": {"stars"}, "alignment": {"states", "validation", "test"}}
-"""Products that the points of a root need."""
+ROLES = {"stars"}
+NETWORK_ROLES = {"states", "validation", "test"}
+"""Products that points of a method need, and those of a network of scene 3."""
 
 
 def module_of(model: str) -> str:
@@ -121,14 +123,15 @@ def sweep_point(
     """Train one point of a sweep and measure it."""
     if (slot is None) != (search is None):
         raise click.UsageError("--slot and --search go together")
-    root: Root = "alignment" if model in TRAINED else "config"
-    if {role for role, _ in data} != ROLES[root]:
-        raise click.UsageError(f"--data: {model} needs {', '.join(sorted(ROLES[root]))}")
+    network = model in TRAINED
+    roles = NETWORK_ROLES if network else ROLES
+    if {role for role, _ in data} != roles:
+        raise click.UsageError(f"--data: {model} needs {', '.join(sorted(roles))}")
     trial = None
     if slot is not None and search is not None:
         trial = Trial(slot, search, known)
     task = Task(dataset, split, reference, dict(data), levels, out, checkpoint)
-    config = load_stage(point_groups(model), overrides, root)
+    config = load_stage(point_groups(model), (*(CHOICE if network else ()), *overrides))
     point(config, model, values or {}, keys or {}, task, trial, source)
 
 

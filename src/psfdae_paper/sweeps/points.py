@@ -14,13 +14,13 @@ import numpy as np
 
 from psfdae.errors import Error
 from psfdae.rng import stream
-from psfdae.settings import ConfigError, validate
+from psfdae.settings import ConfigError
 from psfdae_paper.configuration.alignment import OF_STATES
 from psfdae_paper.configuration.compose import (
+    checked,
     compose,
     config_dir,
     decisive,
-    model_of,
     overrides_for,
     stage_tree,
 )
@@ -215,23 +215,21 @@ class Plan:
         where = config_dir() / "sweep" / f"{self.name}.yaml"
         try:
             tree = with_values(self.tree, keys)
-            checked = validate(model_of(self.sweep.root), tree).model_dump()
+            whole = checked(tree).model_dump()
         except (SweepError, ConfigError) as error:
             at = f" (point {', '.join(f'{k}={v}' for k, v in values.items())})" if values else ""
             raise SweepError(f"{where}: {str(error).splitlines()[0]}{at}") from None
-        return stage_tree(self.sweep.reads, checked, self.sweep.root)
+        return stage_tree(self.sweep.reads, whole)
 
     @cached_property
     def _data(self) -> dict[str, Any]:
         """Configuration of the images that all points share."""
-        if self.sweep.root == "config":
-            return stage_tree(SIMULATION, self._base)
-        return stage_tree(OF_STATES, self._base, "alignment")
+        return stage_tree(SIMULATION if self.sweep.dataset else OF_STATES, self._base)
 
     @cached_property
     def _base(self) -> dict[str, Any]:
-        checked: dict[str, Any] = validate(model_of(self.sweep.root), self.tree).model_dump()
-        return checked
+        base: dict[str, Any] = checked(self.tree).model_dump()
+        return base
 
     def _check_range(self) -> None:
         """Refuse a space with a corner that the configuration does not allow."""
@@ -266,9 +264,8 @@ def plan_sweep(name: str, given: Sequence[str] = ()) -> Plan:
         Name file and key.
     """
     sweep = load_sweep(name)
-    choice = (f"dataset={sweep.dataset}",) if sweep.root == "config" else ()
-    chosen = (*choice, *overrides_for(sweep.root, given, choice))
-    return Plan(name, sweep, tuple(given), compose(chosen, sweep.root))
+    chosen = (*sweep.choice, *overrides_for(given, sweep.choice))
+    return Plan(name, sweep, tuple(given), compose(chosen))
 
 
 def hash_of(tree: Any) -> str:
