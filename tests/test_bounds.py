@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import poisson
 
-from psfdae_paper.bounds.floor import compare, local_error, sensitivities
+from psfdae_paper.bounds.estimates import stamp_model
+from psfdae_paper.bounds.floor import compare, local_error
 from psfdae_paper.bounds.posterior import (
     Bank,
     Likelihood,
@@ -356,11 +357,19 @@ def test_exact_posterior_is_the_poisson_one(noise, members):
 def derivatives(scene1):
     """Stamp and derivatives at N = 160 of one star away from every mirror axis."""
     pupil = annular_pupil(160, scene1.telescope.obscuration)
-    star = (np.array([0.55, 3.7, 4.3, 1.7, -0.12]), np.array([0.2, -0.6]), np.array([-3, 2]))
-    stamps, jacobians = sensitivities(
-        *(part[None] for part in star), np.array([160]), scene1.telescope, scene1.optics, 16
+    seidel, field, offset = star = (
+        np.array([0.55, 3.7, 4.3, 1.7, -0.12]),
+        np.array([0.2, -0.6]),
+        np.array([-3, 2]),
     )
-    return pupil, stamps[0], jacobians[0], star
+    stamps, jacobians = stamp_model(scene1).derivatives(
+        monomial_coefficients(seidel, field)[None],
+        monomial_coefficients(np.eye(5), field[None])[None],
+        offset[None],
+        np.array([160]),
+        "complex128",
+    )
+    return pupil, stamps.reshape(16, 16), jacobians.reshape(5, 16, 16), star
 
 
 def stamp(pupil, seidel, field, offset, pixel):
@@ -388,11 +397,11 @@ def test_derivatives_are_those_of_the_propagated_stamp(derivatives, scene1):
 def test_floor_of_a_linear_gaussian_problem():
     """The error of the optimal linear estimator, in closed form and by simulation."""
     rng = np.random.default_rng(6)
-    jacobian = rng.standard_normal((1, 3, 4, 4))
+    jacobian = rng.standard_normal((1, 3, 16))
     sd = np.array([0.5, 2.0, 0.0])
-    variance = rng.uniform(0.5, 2.0, (1, 4, 4))
+    variance = rng.uniform(0.5, 2.0, (1, 16))
     error = local_error(jacobian, sd, variance)[0]
-    h, prior, noise_cov = jacobian[0].reshape(3, 16).T, np.diag(sd**2), np.diag(variance.ravel())
+    h, prior, noise_cov = jacobian[0].T, np.diag(sd**2), np.diag(variance[0])
     gain = prior @ h.T @ np.linalg.inv(h @ prior @ h.T + noise_cov)
     posterior = prior - gain @ h @ prior
     assert error == pytest.approx(np.trace(h @ posterior @ h.T) / 16, rel=1e-10)
@@ -403,9 +412,9 @@ def test_floor_of_a_linear_gaussian_problem():
 
 def test_floor_lies_between_no_and_all_prior_knowledge():
     rng = np.random.default_rng(7)
-    jacobian, sd = rng.standard_normal((2, 2, 4, 4)), np.array([0.3, 0.4])
-    prior_only = ((jacobian * sd[:, None, None]) ** 2).sum(axis=1).mean(axis=(1, 2))
-    errors = [local_error(jacobian, sd, np.full((2, 4, 4), v)) for v in (1e-6, 1e-2, 1.0, 1e6)]
+    jacobian, sd = rng.standard_normal((2, 2, 16)), np.array([0.3, 0.4])
+    prior_only = ((jacobian * sd[:, None]) ** 2).sum(axis=1).mean(axis=1)
+    errors = [local_error(jacobian, sd, np.full((2, 16), v)) for v in (1e-6, 1e-2, 1.0, 1e6)]
     assert (np.diff(errors, axis=0) > 0).all()
     assert errors[-1] == pytest.approx(prior_only, rel=1e-4)
     # K coefficients and a weak prior: K of the N pixels' noise is left.

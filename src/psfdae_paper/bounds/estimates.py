@@ -149,6 +149,14 @@ def _change(errors: np.ndarray, full: np.ndarray) -> float:
     return float(errors[known].mean() / full[known].mean() - 1.0) if known.any() else np.nan
 
 
+def stamp_model(config: Config) -> StampModel:
+    """Stamps of a dataset's stars as functions of their coefficients."""
+    mean = np.array(config.wavefront.coefficients)
+    spread = config.stars.aberration_fraction * np.abs(mean)
+    field = relative_field(config.grid)
+    return StampModel(mean, spread, field, config.telescope, config.optics, config.framing)
+
+
 def sampled(
     config: Config,
     bank: Bank,
@@ -159,10 +167,7 @@ def sampled(
     likelihood: Likelihood,
 ) -> Sampled:
     """Importance samples around the best matches of every star, from a stream of its own."""
-    mean = np.array(config.wavefront.coefficients)
-    spread = config.stars.aberration_fraction * np.abs(mean)
-    field = relative_field(config.grid)
-    model = StampModel(mean, spread, field, config.telescope, config.optics, config.framing)
+    model = stamp_model(config)
     names = ("bounds", config.stars.name, f"{level:.6g}")
     rngs = [stream(config.seed, *names, int(star)) for star in stars.star]
     noisy, draws = stars.noisy[level], config.bounds.star_draws

@@ -10,73 +10,11 @@ image bends within the width of the posterior, the posterior mean can lie below 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from psfdae.metrics import clustered_mean
-from psfdae_paper.configuration.schema import Optics
-from psfdae_paper.configuration.telescope import Telescope
-from psfdae_paper.optics.derivatives import ModalStamps, PointSampling, normalise_with_derivatives
-from psfdae_paper.optics.propagation import in_batches
-from psfdae_paper.optics.pupil import annular_pupil
-from psfdae_paper.optics.wavefronts import SEIDEL_TERMS, monomial_coefficients, monomial_images
-
-BATCH = 16
-"""Stars at a time, to bound the memory."""
-
-
-def sensitivities(
-    seidel: np.ndarray,
-    field: np.ndarray,
-    offset_px: np.ndarray,
-    samples: np.ndarray,
-    telescope: Telescope,
-    optics: Optics,
-    stamp_px: int,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Stamps of many stars and their derivatives by the Seidel coefficients.
-
-    Parameters
-    ----------
-    seidel : ndarray, shape (n, 5)
-        Coefficients in waves.
-    field : ndarray, shape (n, 2)
-        Relative field vectors.
-    offset_px : ndarray, shape (n, 2)
-        Centre (row, column) of each stamp from the chief ray, in pixels.
-    samples : ndarray of int, shape (n,)
-        Pupil samples N of each star.
-    telescope, optics : config groups
-    stamp_px : int
-        Side d of the stamps.
-
-    Returns
-    -------
-    stamps : ndarray, shape (n, d, d)
-        Sum 1.
-    derivatives : ndarray, shape (n, 5, d, d)
-        Per wave; each sums to 0.
-    """
-    terms = monomial_coefficients(np.eye(len(SEIDEL_TERMS)), field[:, None])
-    coefficients = monomial_coefficients(seidel, field)
-    stamps = np.empty((len(seidel), stamp_px, stamp_px))
-    derivatives = np.empty((len(seidel), len(SEIDEL_TERMS), stamp_px, stamp_px))
-
-    def prepare(count: int) -> Callable[[np.ndarray], None]:
-        pupil, pixel = annular_pupil(count, telescope.obscuration), telescope.pixel
-        sampling = PointSampling(pupil, stamp_px, pixel, "complex128")
-        operator = ModalStamps(pupil, monomial_images, sampling, pixel)
-
-        def differentiate(star: np.ndarray) -> None:
-            raw = operator.derivatives(coefficients[star], terms[star], offset_px[star])
-            stamps[star], derivatives[star], _ = normalise_with_derivatives(*raw)
-
-        return differentiate
-
-    in_batches(samples, BATCH, 1, prepare)
-    return stamps, derivatives
 
 
 def local_error(derivatives: np.ndarray, prior_sd: np.ndarray, variance: np.ndarray) -> np.ndarray:
@@ -87,11 +25,11 @@ def local_error(derivatives: np.ndarray, prior_sd: np.ndarray, variance: np.ndar
 
     Parameters
     ----------
-    derivatives : ndarray, shape (n, K, d, d)
-        Image per unit of each coefficient.
+    derivatives : ndarray, shape (n, K, P)
+        Pixels per unit of each coefficient.
     prior_sd : ndarray, shape (K,)
         Prior standard deviations, ≥ 0.
-    variance : ndarray, shape (n, d, d)
+    variance : ndarray, shape (n, P)
         Noise variance of every pixel.
 
     Returns
@@ -99,9 +37,9 @@ def local_error(derivatives: np.ndarray, prior_sd: np.ndarray, variance: np.ndar
     ndarray, shape (n,)
         Mean squared error per pixel.
     """
-    count, terms = derivatives.shape[:2]
-    jacobian = (derivatives * prior_sd[:, None, None]).reshape(count, terms, -1)
-    weighted = jacobian / variance.reshape(count, 1, -1)
+    terms = derivatives.shape[1]
+    jacobian = derivatives * prior_sd[:, None]
+    weighted = jacobian / variance[:, None]
     information = weighted @ jacobian.swapaxes(1, 2) + np.eye(terms)
     spread = jacobian @ jacobian.swapaxes(1, 2)
     trace = np.trace(np.linalg.solve(information, spread), axis1=1, axis2=2)

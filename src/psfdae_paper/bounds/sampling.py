@@ -23,7 +23,7 @@ from psfdae_paper.bounds.posterior import Bank, Likelihood, PosteriorSums, jitte
 from psfdae_paper.configuration.schema import Framing, Optics
 from psfdae_paper.configuration.telescope import Telescope
 from psfdae_paper.optics.derivatives import ModalStamps, PointSampling, normalise_with_derivatives
-from psfdae_paper.optics.propagation import StampPropagator, in_batches
+from psfdae_paper.optics.propagation import Precision, StampPropagator, in_batches
 from psfdae_paper.optics.pupil import annular_pupil, choose_samples, required_samples
 from psfdae_paper.optics.wavefronts import (
     MONOMIALS,
@@ -167,16 +167,24 @@ class StampModel:
         return monomial_coefficients(np.diag(self.sd), self.field[field][:, None])
 
     def derivatives(
-        self, coefficients: np.ndarray, directions: np.ndarray, offset: np.ndarray
+        self,
+        coefficients: np.ndarray,
+        directions: np.ndarray,
+        offset: np.ndarray,
+        samples: np.ndarray | None = None,
+        precision: Precision = "complex64",
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Stamps in float64, (n, P), and derivatives (n, K, P) along `directions`, (n, K, 8)."""
+        """Stamps in float64, (n, P), and derivatives (n, K, P) along `directions`, (n, K, 8).
+
+        `samples` (n,) are pupil samples; by default as many as the stamps need.
+        """
         side, pixel = self.framing.stamp_px, self.telescope.pixel
         stamps = np.empty((len(offset), side, side))
         slopes = np.empty((*directions.shape[:2], side, side))
 
         def prepare(samples: int) -> Callable[[np.ndarray], None]:
             pupil = annular_pupil(samples, self.telescope.obscuration)
-            sampling = PointSampling(pupil, side, pixel, "complex64")
+            sampling = PointSampling(pupil, side, pixel, precision)
             operator = ModalStamps(pupil, monomial_images, sampling, pixel)
 
             def differentiate(draw: np.ndarray) -> None:
@@ -185,7 +193,9 @@ class StampModel:
 
             return differentiate
 
-        in_batches(self._samples(coefficients, offset), self.optics.batch, 1, prepare)
+        if samples is None:
+            samples = self._samples(coefficients, offset)
+        in_batches(samples, self.optics.batch, 1, prepare)
         return stamps.reshape(len(offset), -1), slopes.reshape(*directions.shape[:2], -1)
 
     def information(

@@ -18,6 +18,7 @@ from psfdae_paper.bounds.estimates import (
     BoundedStars,
     Estimates,
     sampled,
+    stamp_model,
     weighed,
 )
 from psfdae_paper.bounds.floor import (
@@ -26,7 +27,6 @@ from psfdae_paper.bounds.floor import (
     Comparison,
     compare,
     local_error,
-    sensitivities,
 )
 from psfdae_paper.bounds.posterior import (
     Bank,
@@ -37,7 +37,7 @@ from psfdae_paper.bounds.posterior import (
 )
 from psfdae_paper.bounds.tight import FEW, calibration
 from psfdae_paper.configuration.schema import Config
-from psfdae_paper.stars.fields import relative_field
+from psfdae_paper.optics.wavefronts import monomial_coefficients
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -133,21 +133,18 @@ class Tables:
 
 def add_floor(config: Config, product: Product, tables: Tables) -> None:
     """The local lower limit of the error of every star, from the slopes of its stamp."""
-    stars = tables.stars
-    field = relative_field(config.grid)
-    stamps, derivatives = sensitivities(
-        product["seidel"][stars.star],
-        field[stars.field],
+    stars, model = tables.stars, stamp_model(config)
+    field = model.field[stars.field]
+    stamps, derivatives = model.derivatives(
+        monomial_coefficients(product["seidel"][stars.star], field),
+        monomial_coefficients(np.eye(len(model.sd)), field[:, None]),
         product["peak"][stars.star] - product["jitter"][stars.star],
         product["pupil_samples"][stars.star],
-        config.telescope,
-        config.optics,
-        config.framing.stamp_px,
+        "complex128",
     )
-    spread = config.stars.aberration_fraction * np.abs(config.wavefront.coefficients)
     for level in config.noise.levels:
         variance = noise_model(config).variance(stamps, level)
-        error = local_error(derivatives, spread, variance)
+        error = local_error(derivatives, model.sd, variance)
         tables.add("realisation", "floor", level, {"mse": error}, tight=False, found="derivatives")
 
 
