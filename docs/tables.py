@@ -28,7 +28,7 @@ import numpy as np
 import pandas as pd
 
 from psfdae.methods import known, method
-from psfdae_paper.alignment import methods as scene3
+from psfdae_paper.configuration import aligners
 from psfdae_paper.configuration.alignment import CHOICE
 from psfdae_paper.configuration.compose import compose
 from psfdae_paper.evaluation.comparison import FITTED, SIGNIFICANT, seed_scatter, with_seed_stderr
@@ -43,7 +43,11 @@ MARK = re.compile(
 )
 HEAD = re.compile(r"\|.*\n\|[-|]+\n")
 
-ALIGNERS = {m.name: m.label for m in scene3.METHODS.values() if m.name != "cramer_rao_pooled"}
+ALIGNERS = {
+    name: aligner.look.label
+    for name, aligner in aligners.ALIGNERS.items()
+    if name != "cramer_rao_pooled"
+}
 SCENES = {"seidel": "scene 1", "turbulence": "scene 2"}
 PROPAGATORS = {
     "kernel": "our kernel",

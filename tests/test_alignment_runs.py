@@ -9,7 +9,7 @@ import yaml
 
 from psfdae.files import ProductError
 from psfdae_paper.stages import track
-from psfdae_paper.tracking import NETWORKS, runs_of_alignment
+from psfdae_paper.tracking import WEIGHTS, runs_of_alignment
 
 COLUMNS = ("test_set", "noise_level", "method", "parameter", "mean_abs_error", "bias", "variance")
 
@@ -17,7 +17,7 @@ COLUMNS = ("test_set", "noise_level", "method", "parameter", "mean_abs_error", "
 @pytest.fixture
 def results(tmp_path):
     """A results folder as scene 3 leaves it, without any training."""
-    for kind, weights in NETWORKS.items():
+    for kind, weights in WEIGHTS.items():
         folder = tmp_path / "alignment" / kind
         folder.mkdir(parents=True)
         (folder / weights).write_bytes(kind.encode())
@@ -30,7 +30,7 @@ def results(tmp_path):
     with table.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow([*COLUMNS, "unit"])
-        for method in NETWORKS:
+        for method in WEIGHTS:
             writer.writerow(["uniform", 0.002, method, "tilt_x", 0.05, 0.01, 0.004, "range"])
             writer.writerow(["uniform", 0.002, method, "tilt_x", 5e-5, 1e-5, 4e-9, "rad"])
     return tmp_path
@@ -38,7 +38,7 @@ def results(tmp_path):
 
 def test_every_network_has_its_curve_and_its_errors(results):
     records = {run.kind: run for run in runs_of_alignment(results)}
-    assert set(records) == set(NETWORKS)
+    assert set(records) == set(WEIGHTS)
     for kind, record in records.items():
         values = {(p.name, p.epoch): p.value for p in record.points}
         assert values["loss", 2] == 0.25
@@ -47,7 +47,7 @@ def test_every_network_has_its_curve_and_its_errors(results):
         assert record.end_ms - record.start_ms == 4000
         assert "attempt" not in record.config
         assert record.name == f"alignment {kind}"
-    assert len({record.content_hash for record in records.values()}) == len(NETWORKS)
+    assert len({record.content_hash for record in records.values()}) == len(WEIGHTS)
 
 
 def test_importing_twice_changes_nothing(results, tmp_path):
@@ -55,7 +55,7 @@ def test_importing_twice_changes_nothing(results, tmp_path):
     for action in ("created", "unchanged"):
         track.track(results, "fast", results / "mlflow.db", receipt, alignment=True)
         rows = list(csv.DictReader(receipt.open()))
-        assert [row["action"] for row in rows] == [action] * len(NETWORKS)
+        assert [row["action"] for row in rows] == [action] * len(WEIGHTS)
         assert {row["experiment"] for row in rows} == {"scene3"}
 
 

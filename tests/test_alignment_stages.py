@@ -10,7 +10,14 @@ from click.testing import CliRunner
 from psfdae.cli import main
 from psfdae.files import read_product
 from psfdae.settings import ConfigError
-from psfdae_paper.alignment.methods import ESTIMATORS, FITTED, LEARNED, METHODS, TRAINED, of_set
+from psfdae_paper.configuration.aligners import (
+    ALIGNERS,
+    ESTIMATORS,
+    FITTED,
+    LEARNED,
+    TRAINED,
+    of_set,
+)
 from psfdae_paper.configuration.alignment import CHOICE
 from psfdae_paper.configuration.compose import config_dir, load, load_stage, overrides_for
 from psfdae_paper.evaluation import alignment_tables
@@ -94,8 +101,8 @@ def tables(products):
     data = ("--grid", at / "grid.h5", "--train", at / "train.h5", "--checkpoint", at / "c")
     _run("train-dae", *data, "--out", at / "dae", *PRESET)
     for name in TRAINED:
-        given = ("--kind", name, "--states", at / f"{METHODS[name].states}.h5")
-        given += ("--dae", at / "dae") if METHODS[name].denoised else ()
+        given = ("--kind", name, "--states", at / f"{ALIGNERS[name].states}.h5")
+        given += ("--dae", at / "dae") if ALIGNERS[name].denoised else ()
         _run("train-network", *given, "--checkpoint", at / "c", "--out", at / name, *PRESET)
     networks = [w for n in ("dae", *TRAINED) for w in (f"--{n.replace('_', '-')}", at / n)]
     test = ("--set", "uniform", "--states", at / "uniform.h5")
@@ -217,7 +224,7 @@ def test_tables_hold_every_method(tables):
     noisy = errors[errors.noise_level > 0]
     cells = noisy.groupby(["noise_level", "method"]).size()
     assert (cells == 8).all()
-    assert set(noisy.method) == set(METHODS) - {"cramer_rao_pooled"}
+    assert set(noisy.method) == set(ALIGNERS) - {"cramer_rao_pooled"}
     assert set(noisy.noise_level) == {0.002, 0.005}
     clean = set(errors[errors.noise_level == 0].method)
     assert clean == {"constant", *(method.name for method in LEARNED)}
@@ -235,7 +242,7 @@ def test_flux_and_place_are_free_for_uniform_states_only(products, tmp_path):
         "cramer_rao"
     ]
     assert of_set(FITTED, "uniform") == FITTED
-    assert of_set(FITTED, "grid") == [METHODS["max_likelihood"]]
+    assert of_set(FITTED, "grid") == [ALIGNERS["max_likelihood"]]
 
 
 def test_paper_s_rows_stand_beside_ours(tables):

@@ -13,15 +13,17 @@ from typing import Any, NamedTuple
 from psfdae import fits
 from psfdae.belonging import STARS, require_origin
 from psfdae.files import ProductError, read_product
-from psfdae.method import HISTORY, Method
+from psfdae.method import CONFIG, HISTORY, Method
 from psfdae.methods import method
+from psfdae.methods.dae import WEIGHTS as DAE_WEIGHTS
 from psfdae.reading import number, read_csv, read_yaml
-from psfdae_paper.alignment.methods import TRAINED
+from psfdae_paper.configuration.aligners import SWEPT, TRAINED
+from psfdae_paper.configuration.aligners import WEIGHTS as NETWORK_WEIGHTS
 from psfdae_paper.configuration.methods import registered
 from psfdae_paper.sweeps.points import hash_of
 
-NETWORKS = {"dae": "dae.safetensors", **dict.fromkeys(TRAINED, "network.safetensors")}
-"""Networks of scene 3 and the files of their weights."""
+WEIGHTS = {"dae": DAE_WEIGHTS, **dict.fromkeys(TRAINED, NETWORK_WEIGHTS)}
+"""Files of the networks of scene 3, in their folders."""
 
 STATISTICS = ("mean_abs_error", "bias", "variance")
 
@@ -46,9 +48,33 @@ class Point(NamedTuple):
 class Run:
     """A finished run.
 
-    `source` is the model's place below the results folder, which tells runs apart that
-    agree in everything else; `files` are by their names within the run; `status` is
-    MLflow's; `parent` the source of the run that this one is a part of, which comes first.
+    Attributes
+    ----------
+    kind, dataset, split, reference : str
+    source : str
+        The model's place below the results folder, which tells runs apart that agree in
+        everything else.
+    name, experiment : str
+    files : mapping
+        By their names within the run.
+    config : mapping
+    end_ms : int
+        In ms since 1970.
+    metrics : mapping
+        Of the finished run.
+    epochs : sequence
+        Rows of the course of the training.
+    seconds : float or None
+        That the run took; None: those of the last epoch.
+    status : str
+        MLflow's.
+    parent : str
+        Source of the run that this one is a part of, which comes first.
+
+    Raises
+    ------
+    ProductError
+        If a file is missing.
     """
 
     kind: str
@@ -60,32 +86,36 @@ class Run:
     experiment: str
     files: Mapping[str, Path]
     config: Mapping[str, Any]
-    points: Sequence[Point]
-    start_ms: int
     end_ms: int
-    config_hash: str
-    content_hash: str
+    metrics: Mapping[str, float]
+    epochs: Sequence[Mapping[str, float]] = ()
+    seconds: float | None = None
     status: str = "FINISHED"
     parent: str = ""
     tags: Mapping[str, str] = field(default_factory=dict)
+    content_hash: str = field(init=False)
 
+    def __post_init__(self) -> None:
+        contents = {name: _digest(path) for name, path in self.files.items()}
+        object.__setattr__(self, "content_hash", hash_of([CONTENT, self.config_hash, contents]))
 
-def _run(
-    files: Mapping[str, Path],
-    contents: Mapping[str, str],
-    config: Mapping[str, Any],
-    points: Sequence[Point],
-    **more: Any,
-) -> Run:
-    config_hash = hash_of(config)
-    return Run(
-        files=files,
-        config=config,
-        points=[point for point in points if math.isfinite(point.value)],
-        config_hash=config_hash,
-        content_hash=hash_of([CONTENT, config_hash, contents]),
-        **more,
-    )
+    @property
+    def config_hash(self) -> str:
+        """Tells settings apart; `content_hash` settings and files."""
+        return hash_of(self.config)
+
+    @property
+    def start_ms(self) -> int:
+        """The end less the seconds that the run took."""
+        took = max((row["seconds"] for row in self.epochs), default=0.0)
+        return self.end_ms - int(1000 * (took if self.seconds is None else self.seconds))
+
+    @property
+    def points(self) -> list[Point]:
+        """All metrics that are finite."""
+        points = _epoch_points(self.epochs, self.start_ms)
+        points += [Point(name, value, 0, self.end_ms) for name, value in self.metrics.items()]
+        return [point for point in points if math.isfinite(point.value)]
 
 
 def runs_of_datasets(results: Path, datasets: Mapping[str, Path]) -> list[Run]:
@@ -140,39 +170,33 @@ def _of_stars(
     source = fits.place_of(kind, **key)
     model = results / source
     files = _model_files(kind, model) | {"evaluation.csv": evaluation} | figures
-    contents = _contents(files)
     product = read_product(stars, "stars", ())
     require_origin(model, STARS, product)
     own, run_kind = kind.described(model), fits.storage_of(kind).run or kind.name
     # Which start succeeded is an outcome, not a setting.
     own.pop("attempt", None)
-    epochs = []
-    if HISTORY in fits.storage_of(kind).diagnostics:
-        epochs = _epochs(fits.beside(kind, model, HISTORY), "train_mse", "validation_mse")
     try:
         experiment = str(product.config["scene"]["experiment"])
     except (KeyError, TypeError):
         raise ProductError(f"{stars}: its config has no scene.experiment") from None
-    start_ms, end_ms = _span_ms(fits.outputs(kind, model)[0], epochs)
-    points = _epoch_points(epochs, start_ms)
+    metrics = {}
     for row in read_csv(evaluation, "method", "noise_level", "metric", "value", "stderr"):
         if row["method"] == kind.name:
             metric, level = row["metric"], f"{number(evaluation, row['noise_level']):g}"
             for name, column in ((metric, "value"), (f"{metric}_stderr", "stderr")):
-                value = number(evaluation, row[column])
-                points.append(Point(f"test_{name}_{level}", value, 0, end_ms))
-    return _run(
-        files,
-        contents,
-        {**product.config, **own},
-        points,
+                metrics[f"test_{name}_{level}"] = number(evaluation, row[column])
+    trained = HISTORY in fits.storage_of(kind).diagnostics
+    return Run(
         **key,
         kind=run_kind,
         source=source,
         name=" ".join([*key.values(), run_kind]),
         experiment=experiment,
-        start_ms=start_ms,
-        end_ms=end_ms,
+        files=files,
+        config={**product.config, **own},
+        end_ms=_time_ms(fits.outputs(kind, model)[0]),
+        metrics=metrics,
+        epochs=_epochs(fits.beside(kind, model, HISTORY)) if trained else (),
     )
 
 
@@ -208,42 +232,32 @@ def runs_of_alignment(results: Path) -> list[Run]:
     errors = results / "tables/alignment_errors.csv"
     if not errors.is_file():
         raise ProductError(f"{errors}: missing; run `snakemake scene3` first")
-    figures = {
-        f"figures/{path.name}": path
-        for path in sorted((results / "figures/alignment").glob("*.png"))
-    }
-    return [_of_states(results / "alignment" / kind, errors, figures) for kind in NETWORKS]
+    figures = sorted((results / "figures/alignment").glob("*.png"))
+    more = {"evaluation.csv": errors, **{f"figures/{path.name}": path for path in figures}}
+    return [_of_states(results / "alignment" / kind, errors, more) for kind in WEIGHTS]
 
 
 def _network_files(folder: Path, weights: str) -> dict[str, Path]:
-    model = {f"model/{name}": folder / name for name in (weights, "config.yaml")}
-    return {**model, "history.csv": folder / "history.csv"}
+    return {f"model/{name}": folder / name for name in (weights, CONFIG)} | {
+        HISTORY: folder / HISTORY
+    }
 
 
-def _of_states(folder: Path, errors: Path, figures: Mapping[str, Path]) -> Run:
-    kind = folder.name
-    weights = NETWORKS[kind]
-    files = {**_network_files(folder, weights), "evaluation.csv": errors, **figures}
-    contents = _contents(files)
-    config = read_yaml(folder / "config.yaml")
+def _of_states(folder: Path, errors: Path, more: Mapping[str, Path]) -> Run:
+    kind, weights = folder.name, WEIGHTS[folder.name]
+    files = {**_network_files(folder, weights), **more}
+    config = read_yaml(folder / CONFIG)
     config.pop("attempt", None)
-    epochs = _epochs(folder / "history.csv")
-    start_ms, end_ms = _span_ms(folder / weights, epochs)
-    points = _epoch_points(epochs, start_ms)
-    tested = len(points)
+    metrics = {}
     for row in read_csv(errors, "test_set", "noise_level", "method", "parameter", "unit"):
         if (row["method"], row["unit"]) == (kind, "range"):
             level = f"{number(errors, row['noise_level']):g}"
             for statistic in STATISTICS:
                 name = f"{row['test_set']}_{row['parameter']}_{statistic}_{level}"
-                points.append(Point(name, number(errors, row[statistic]), 0, end_ms))
-    if len(points) == tested:
+                metrics[name] = number(errors, row[statistic])
+    if not metrics:
         raise ProductError(f"{errors}: no rows of method {kind!r}")
-    return _run(
-        files,
-        contents,
-        config,
-        points,
+    return Run(
         kind=kind,
         dataset="alignment",
         split="uniform and grid",
@@ -251,8 +265,11 @@ def _of_states(folder: Path, errors: Path, figures: Mapping[str, Path]) -> Run:
         source=f"alignment/{kind}",
         name=f"alignment {kind}",
         experiment="scene3",
-        start_ms=start_ms,
-        end_ms=end_ms,
+        files=files,
+        config=config,
+        end_ms=_time_ms(folder / weights),
+        metrics=metrics,
+        epochs=_epochs(folder / HISTORY),
     )
 
 
@@ -268,71 +285,54 @@ def runs_of_sweep(results: Path, name: str) -> list[Run]:
     summary = folder / "summary.csv"
     if not summary.is_file():
         raise ProductError(f"{summary}: missing; run `snakemake sweep --config sweep={name}` first")
-    # Every sweep is an experiment of its own, apart from the paper's scenes.
-    shared = {"experiment": f"sweep_{name}"}
-    names = [row["point"] for row in read_csv(summary, "point", "status")]
-    points = [_point_of_sweep(folder / "points" / point, name, point) for point in names]
+    rows = list(read_csv(summary, "point", "status"))
+    points = [_point_of_sweep(folder / "points" / row["point"], name, row["point"]) for row in rows]
     figures = sorted((folder / "figures").glob("*.png"))
     paths = [*(folder / file for file in SUMMARY_FILES), *figures]
-    files = {path.relative_to(folder).as_posix(): path for path in paths}
-    contents = _contents(files)
-    config, best = read_yaml(folder / "sweep.yaml"), read_yaml(folder / "best.yaml")
-    end_ms = int(summary.stat().st_mtime * 1000)
-    metrics = [Point(f"best_{key}", v, 0, end_ms) for key, v in best.get("metrics", {}).items()]
-    states = [row["status"] for row in read_csv(summary, "point", "status")]
+    best, states = read_yaml(folder / "best.yaml"), [row["status"] for row in rows]
+    metrics = {f"best_{key}": value for key, value in best.get("metrics", {}).items()}
     for status in ("finished", "stopped", "failed"):
-        metrics.append(Point(f"points_{status}", float(states.count(status)), 0, end_ms))
-    first = points[0]
-    parent = _run(
-        files,
-        contents,
-        config,
-        metrics,
-        **shared,
+        metrics[f"points_{status}"] = float(states.count(status))
+    parent = Run(
         kind="sweep",
-        dataset=first.dataset,
-        split=first.split,
-        reference=first.reference,
+        **{key: getattr(points[0], key) for key in ("dataset", "split", "reference")},
         source=f"sweeps/{name}",
         name=f"sweep {name}",
-        start_ms=end_ms,
-        end_ms=end_ms,
+        # Every sweep is an experiment of its own, apart from the paper's scenes.
+        experiment=f"sweep_{name}",
+        files={path.relative_to(folder).as_posix(): path for path in paths},
+        config=read_yaml(folder / "sweep.yaml"),
+        end_ms=_time_ms(summary),
+        metrics=metrics,
         tags={"best_point": str(best.get("point", ""))},
     )
     return [parent, *points]
 
 
 def _point_of_sweep(place: Path, name: str, point: str) -> Run:
-    from psfdae_paper.configuration.sweep import TRAINED
-    from psfdae_paper.sweeps.measured import place_of, read_cost, read_result
+    from psfdae_paper.sweeps.measured import fit_in, read_cost, read_result
 
     result = read_result(place / "result.json")
     model = result["model"]
-    if model in TRAINED:
-        of_model = _network_files(place, NETWORKS[model])
+    if model in SWEPT:
+        of_model = _network_files(place, NETWORK_WEIGHTS)
     else:
-        of_model = _model_files(method(model), place_of(method(model), place))
+        of_model = _model_files(method(model), fit_in(method(model), place))
     files = {file: place / file for file in POINT_FILES} | of_model
-    files = {file: path for file, path in files.items() if path.is_file()}
-    contents = _contents(files)
-    end_ms = int((place / "result.json").stat().st_mtime * 1000)
-    start_ms = end_ms - int(1000 * read_cost(place)["seconds"])
-    history = place / "history.csv"
-    epochs = _epochs(history) if history.is_file() else []
-    metrics = [Point(key, value, 0, end_ms) for key, value in result["metrics"].items()]
+    history = place / HISTORY
     values = ", ".join(f"{key}={json.dumps(v)}" for key, v in result["values"].items())
-    return _run(
-        files,
-        contents,
-        {**result["config"], "axes": result["values"]},
-        metrics + _epoch_points(epochs, start_ms),
-        **{key: result[key] for key in ("dataset", "split", "reference")},
-        experiment=f"sweep_{name}",
+    return Run(
         kind=model,
+        **{key: result[key] for key in ("dataset", "split", "reference")},
         source=f"sweeps/{name}/points/{point}",
         name=values or point,
-        start_ms=start_ms,
-        end_ms=end_ms,
+        experiment=f"sweep_{name}",
+        files={file: path for file, path in files.items() if path.is_file()},
+        config={**result["config"], "axes": result["values"]},
+        end_ms=_time_ms(place / "result.json"),
+        metrics=result["metrics"],
+        epochs=_epochs(history) if history.is_file() else (),
+        seconds=read_cost(place)["seconds"],
         status="FAILED" if result["status"] == "failed" else "FINISHED",
         parent=f"sweeps/{name}",
         tags={key: result[key] for key in ("point", "status", "reason")},
@@ -350,30 +350,28 @@ def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
     return leaves
 
 
-def _contents(files: Mapping[str, Path]) -> dict[str, str]:
-    """Hash of every file; raises ProductError if one is missing."""
-    found = {}
-    for name, path in files.items():
-        try:
-            with path.open("rb") as file:
-                found[name] = hashlib.file_digest(file, "sha256").hexdigest()
-        except FileNotFoundError:
-            raise ProductError(f"{path}: no such file") from None
-    return found
+def _digest(path: Path) -> str:
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except FileNotFoundError:
+        raise ProductError(f"{path}: no such file") from None
 
 
-def _span_ms(model: Path, epochs: list[dict[str, float]]) -> tuple[int, int]:
-    """Start and end of a training in ms since 1970: the model's file, and the history's seconds."""
-    end_ms = int(model.stat().st_mtime * 1000)
-    return end_ms - int(1000 * max((row["seconds"] for row in epochs), default=0.0)), end_ms
+def _time_ms(path: Path) -> int:
+    """When a file was written, in ms since 1970."""
+    try:
+        return int(path.stat().st_mtime * 1000)
+    except FileNotFoundError:
+        raise ProductError(f"{path}: no such file") from None
 
 
-def _epochs(history: Path, *columns: str) -> list[dict[str, float]]:
-    rows = read_csv(history, "epoch", "seconds", *columns)
+def _epochs(history: Path) -> list[dict[str, float]]:
+    rows = read_csv(history, "epoch", "seconds")
     return [{name: number(history, text) for name, text in row.items()} for row in rows]
 
 
-def _epoch_points(epochs: list[dict[str, float]], start_ms: int) -> list[Point]:
+def _epoch_points(epochs: Sequence[Mapping[str, float]], start_ms: int) -> list[Point]:
     """Metrics of every epoch of a history, and the best validation error."""
     points = [
         Point(name, value, int(row["epoch"]), start_ms + int(1000 * row["seconds"]))

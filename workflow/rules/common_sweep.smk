@@ -2,7 +2,7 @@ import json
 
 from snakemake.exceptions import WorkflowError
 
-from psfdae_paper.configuration.sweep import TRAINED as SWEPT_NETWORKS
+from psfdae_paper.configuration.aligners import SWEPT
 from psfdae_paper.configuration.sweep import sweep_names
 from psfdae_paper.stages.sweep import ADAPTIVE_MODULE, module_of
 from psfdae_paper.sweeps.points import plan_sweep
@@ -72,7 +72,7 @@ def sweep_source(name):
     """Code that a point consists of: its model's, and the search's if there is one."""
     sweep = sweep_plan(name).sweep
     search = [ADAPTIVE_MODULE] if sweep.kind == "adaptive" else []
-    own = [] if sweep.model in SWEPT_NETWORKS else [method(sweep.model).__module__]
+    own = [] if sweep.model in SWEPT else [method(sweep.model).__module__]
     return source_hash("sweep point", chosen=[module_of(sweep.model), *own, *search])
 
 

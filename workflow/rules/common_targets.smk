@@ -1,4 +1,4 @@
-from psfdae_paper.alignment.methods import TRAINED, METHODS
+from psfdae_paper.configuration.aligners import TRAINED, ALIGNERS
 from psfdae.model.bundle import SUFFIX
 
 with one_line():

@@ -8,6 +8,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from psfdae.settings import CheckpointSeconds, Count, Group, Positive
+from psfdae_paper.configuration.aligners import TRAINED
 from psfdae_paper.configuration.wavefront import Prescription
 
 
@@ -185,8 +186,7 @@ telescope, it keeps those in dataset/alignment.yaml."""
 
 GROUPS = (
     *("seed", "telescope", "prescription", "alignment", "optics", "noise", "dae", "dae_train"),
-    *("cnn", "perceptron", "train_original", "train_noise_trained", "train_dae_retrained"),
-    *("evaluation", "fit"),
+    *("cnn", "perceptron", *(f"train_{name}" for name in TRAINED), "evaluation", "fit"),
 )
 """Groups of the configuration that scene 3 reads."""
 

@@ -28,6 +28,7 @@ from psfdae.settings import (
     SplitKind,
     Stamp,
 )
+from psfdae_paper.configuration.aligners import TRAINED
 from psfdae_paper.configuration.alignment import (
     Alignment,
     Cnn,
@@ -212,9 +213,6 @@ class Config(Consistent):
     dae_train: Train
     cnn: Cnn
     perceptron: Perceptron
-    train_original: NetworkTrain
-    train_noise_trained: NetworkTrain
-    train_dae_retrained: NetworkTrain
     fit: Fit
 
     @model_validator(mode="after")
@@ -241,7 +239,7 @@ class Config(Consistent):
 
 
 def whole_config() -> type[Config]:
-    """`Config` with the settings of all methods."""
+    """`Config` with the settings of all methods, and of the trainings of scene 3."""
     return _with_settings(registered())
 
 
@@ -250,4 +248,5 @@ def _with_settings(methods: tuple[type[Method], ...]) -> type[Config]:
     groups: dict[str, Any] = {
         name: (group, ...) for method in methods for name, group in method.groups.items()
     }
+    groups |= {f"train_{name}": (NetworkTrain, ...) for name in TRAINED}
     return create_model("Config", __base__=Config, **groups)

@@ -9,6 +9,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from psfdae.methods import groups_of, method
 from psfdae.settings import ConfigError, Count, Finite, Group, Name, Reference, SplitKind
+from psfdae_paper.configuration.aligners import ALIGNERS, SWEPT
 from psfdae_paper.configuration.alignment import CHOICE, NETWORKS
 from psfdae_paper.configuration.compose import config_dir, load_file
 from psfdae_paper.configuration.methods import registered
@@ -19,16 +20,10 @@ Value = Scalar | list[Scalar]
 AxisName = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_.]*$")]
 Metric = Literal["validation_mse", "validation_ssim", "validation_mae"]
 
-TRAINED = {
-    "original": ("cnn", "train_original"),
-    "noise_trained": ("cnn", "perceptron", "train_noise_trained", "noise.levels"),
-}
-"""Networks of scene 3 that a sweep may train, and what it may change of them."""
-
 
 def models() -> tuple[str, ...]:
     """What a sweep may train: methods that are fitted to a file, and networks of scene 3."""
-    return (*(kind.name for kind in registered() if kind.storage), *TRAINED)
+    return (*(kind.name for kind in registered() if kind.storage), *SWEPT)
 
 
 def _trainable(name: str) -> str:
@@ -147,13 +142,17 @@ class Sweep(Group):
     @property
     def varied(self) -> tuple[str, ...]:
         """Keys and groups that may differ; all points share their stars and their parts."""
-        return TRAINED.get(self.model) or (*method(self.model).groups, "noise.levels")
+        return (
+            ALIGNERS[self.model].swept
+            if self.model in SWEPT
+            else (*method(self.model).groups, "noise.levels")
+        )
 
     @model_validator(mode="after")
     def _fits_together(self) -> Sweep:
         if (self.kind == "grid") != (self.trials is None):
             raise ValueError("trials: random and adaptive sweeps need it, a grid has none")
-        if (self.model in TRAINED) != (self.dataset is None):
+        if (self.model in SWEPT) != (self.dataset is None):
             raise ValueError("dataset: methods need one, scene 3's networks have none")
         metrics = NETWORK_METRICS if self.dataset is None else METRICS
         if self.metric not in metrics:
@@ -190,7 +189,7 @@ class Sweep(Group):
 
 def point_groups(model: str) -> tuple[str, ...]:
     """Groups of the configuration that a point of a model reads."""
-    if model in TRAINED:
+    if model in SWEPT:
         return ("seed", "noise", *NETWORKS, f"train_{model}", "evaluation")
     return (*groups_of(model), "evaluation")
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from psfdae.figures import SERIES_COLORS, new_figure, styled
-from psfdae_paper.alignment.methods import METHODS
+from psfdae_paper.configuration.aligners import ALIGNERS
 from psfdae_paper.evaluation.alignment_tables import PARAMETERS
 from psfdae_paper.evaluation.curves import readable_log_axis
 
@@ -91,7 +91,9 @@ def predicted_against_true(
             cell.set_xlim(-1.1, 1.1)
             cell.set_ylim(-1.6, 1.6)
             cell.grid(True)
-        line[0].set_ylabel(METHODS[method].label.replace(" on ", "\non ").replace(", ", ",\n"))
+        line[0].set_ylabel(
+            ALIGNERS[method].look.label.replace(" on ", "\non ").replace(", ", ",\n")
+        )
     for parameter, top, bottom in zip(PARAMETERS, axes[0], axes[-1], strict=True):
         top.set_title(NAMES[parameter])
         bottom.set_xlabel("true / range")
@@ -123,7 +125,11 @@ def errors_against_size(
     for axes, (level, methods) in zip(panels, curves.items(), strict=True):
         for method, (size, error) in methods.items():
             x, y, half = binned(size, error)
-            style = {"color": METHODS[method].color, "label": METHODS[method].label, "lw": 1.4}
+            style = {
+                "color": ALIGNERS[method].look.color,
+                "label": ALIGNERS[method].look.label,
+                "lw": 1.4,
+            }
             if method == "cramer_rao":
                 axes.plot(x, y, ls="--", **style)
             else:

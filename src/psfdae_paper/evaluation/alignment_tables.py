@@ -10,7 +10,7 @@ import pandas as pd
 
 from psfdae.metrics import error_correlation
 from psfdae_paper.alignment.fisher import expected_abs_error
-from psfdae_paper.alignment.methods import METHODS
+from psfdae_paper.configuration.aligners import ALIGNERS
 from psfdae_paper.evaluation.paper import published
 
 PARAMETERS = ("decenter_x", "decenter_y", "tilt_x", "tilt_y")
@@ -183,7 +183,7 @@ def paper_correlations(correlations: pd.DataFrame) -> pd.DataFrame:
 
 def _wide(table: pd.DataFrame, across: str, order: list[str], index: list[str]) -> pd.DataFrame:
     """One row per index, columns in a given order, methods in the order of the tables."""
-    methods = list(METHODS)
+    methods = list(ALIGNERS)
     wide = table.pivot(index=index, columns=across, values="value")[order].reset_index()
     wide.columns.name = None
     keys = [wide["method"].map(methods.index) if name == "method" else wide[name] for name in index]
@@ -210,7 +210,7 @@ def as_markdown(table: pd.DataFrame, title: str, digits: dict[str, str]) -> str:
             for value, kind in zip(table[column], kinds, strict=True)
         ]
     shown["method"] = [
-        METHODS[m].paper if source == "paper" else METHODS[m].label
+        ALIGNERS[m].look.paper[1] if source == "paper" else ALIGNERS[m].look.label
         for m, source in zip(table["method"], table["source"], strict=True)
     ]
     return f"{title}\n\n{shown.to_markdown(index=False, disable_numparse=True)}\n"

@@ -40,8 +40,17 @@ from psfdae.reading import from_tree, read_yaml
 from psfdae.rng import stream
 from psfdae.settings import deciding
 from psfdae.threads import limit_threads
-from psfdae_paper.alignment.methods import BOUNDS, FITTED, LEARNED, METHODS, TRAINED, Method, of_set
 from psfdae_paper.alignment.stamps import AlignmentStamps
+from psfdae_paper.configuration.aligners import (
+    ALIGNERS,
+    BOUNDS,
+    FITTED,
+    LEARNED,
+    TRAINED,
+    WEIGHTS,
+    Aligner,
+    of_set,
+)
 from psfdae_paper.configuration.alignment import (
     CHOICE,
     NETWORKS,
@@ -55,15 +64,13 @@ from psfdae_paper.stages.alignment import ModelFile, StatesFile, TestSet, read_m
 if TYPE_CHECKING:
     from psfdae_paper.alignment.networks import TrainingStates
 
-NETWORK_WEIGHTS = "network.safetensors"
-
 VALIDATION_STATES = 100
 """States of the large set that choose the DAE's best epoch; it is not trained on them."""
 
 Checkpoint = Annotated[File, "File that lets an interrupted training resume."]
 Trained = Annotated[Folder, "Folder for weights, config and history."]
 
-DENOISED = ", ".join(name for name in TRAINED if METHODS[name].denoised)
+DENOISED = ", ".join(name for name in TRAINED if ALIGNERS[name].denoised)
 """Networks that are trained on the DAE's output."""
 
 PART = 1000
@@ -112,8 +119,8 @@ def train_dae(
 def _groups(kind: str = "", **_: Any) -> tuple[str, ...]:
     """Config groups of the training of one network, or of all."""
     kinds = [kind] if kind else TRAINED
-    noise = ["noise"] if any(METHODS[name].noisy for name in kinds) else []
-    dae = ["evaluation"] if any(METHODS[name].denoised for name in kinds) else []
+    noise = ["noise"] if any(ALIGNERS[name].noisy for name in kinds) else []
+    dae = ["evaluation"] if any(ALIGNERS[name].denoised for name in kinds) else []
     return ("seed", *noise, *NETWORKS, *(f"train_{name}" for name in kinds), *dae)
 
 
@@ -135,14 +142,14 @@ def train_network(
     from psfdae.networks.weights import save_weights
     from psfdae_paper.alignment.networks import MixedNoise, NetworkTraining, TrainingStates
 
-    if METHODS[kind].denoised != (dae is not None):
+    if ALIGNERS[kind].denoised != (dae is not None):
         raise click.UsageError(f"--dae goes with --kind {DENOISED}, and only with it")
     settings: NetworkTrain = getattr(config, f"train_{kind}")
     product = read_product(states, "alignment_states", ("states", "stamps"))
     if dae:
         require_origin(dae, STATE_STAMPS, product)
     data = TrainingStates(product["states"], product["stamps"])
-    if METHODS[kind].noisy:
+    if ALIGNERS[kind].noisy:
         data = replace(data, noise=MixedNoise(noise_model(config), np.asarray(config.noise.levels)))
     if dae and data.noise:
         data = denoised_draws(data, Dae.load(dae, evaluation=config.evaluation), config, kind)
@@ -159,7 +166,7 @@ def train_network(
         done = train(
             begin, checkpoint, fingerprint(described | deciding(config), data.stamps), report
         )
-    save_weights(out / NETWORK_WEIGHTS, done.result, described)
+    save_weights(out / WEIGHTS, done.result, described)
     write_origin(out, product)
     write_text(out / HISTORY, as_csv(done.history))
     write_text(out / CONFIG, as_yaml(described))
@@ -213,7 +220,7 @@ def network_predictor(folder: Path, config: Any) -> Callable[[np.ndarray], np.nd
     fields, side = (from_tree(path, described, key, make=_size) for key in ("fields", "stamp_px"))
     kind = from_tree(path, described, "network", make=_kind)
     settings = from_tree(path, described, kind, make=lambda tree: validate(NETWORKS[kind], tree))
-    model = load_network(settings, fields, side, folder / NETWORK_WEIGHTS)
+    model = load_network(settings, fields, side, folder / WEIGHTS)
     mirrors = mirror_symmetries(fields - 1) if from_tree(path, described, "mirrors") else []
     return partial(predict_states, model, batch=config.evaluation.batch, mirrors=mirrors)
 
@@ -279,7 +286,7 @@ def estimate(
     _write_times(times, rows)
 
 
-def _names(methods: list[Method]) -> str:
+def _names(methods: list[Aligner]) -> str:
     return ", ".join(method.name for method in methods)
 
 

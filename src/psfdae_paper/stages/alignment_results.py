@@ -17,17 +17,17 @@ from psfdae.options import File, Folder
 from psfdae.reading import read_table
 from psfdae.threads import limit_threads
 from psfdae_paper.alignment.fisher import coma_free_decentre, expected_abs_error
-from psfdae_paper.alignment.methods import (
+from psfdae_paper.alignment.stamps import AlignmentStamps
+from psfdae_paper.alignment.telescope import design_states, fit_quadratic, zernike_tracer
+from psfdae_paper.configuration.aligners import (
+    ALIGNERS,
     BOUNDS,
     ESTIMATORS,
     FITTED,
     LEARNED,
-    METHODS,
-    Method,
+    Aligner,
     of_set,
 )
-from psfdae_paper.alignment.stamps import AlignmentStamps
-from psfdae_paper.alignment.telescope import design_states, fit_quadratic, zernike_tracer
 from psfdae_paper.configuration.alignment import CHOICE, STATE_STAMPS
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.schema import Config
@@ -141,7 +141,7 @@ def tables(
         found[errors] += rows.bound_rows(key, covariances, unit)
         if key["method"] == "cramer_rao":
             found[correlation] += rows.predicted_correlations(key, covariances)
-    order = list(METHODS)
+    order = list(ALIGNERS)
     for path, table in found.items():
         frame = pd.DataFrame(table).sort_values(
             ["test_set", "noise_level", "method"],
@@ -312,7 +312,7 @@ def correlation(correlation: ErrorTable, out: Png) -> None:
     from psfdae_paper.evaluation.alignment_tables import PARAMETERS
     from psfdae_paper.evaluation.paper import published
 
-    def titled(method: Method, rows: Any, whose: str = "") -> tuple[str, np.ndarray]:
+    def titled(method: Aligner, rows: Any, whose: str = "") -> tuple[str, np.ndarray]:
         matrix = np.full((4, 4), np.nan)
         for row in rows[rows.method == method.name].itertuples():
             a, b = (PARAMETERS.index(name) for name in row.pair.split("-"))
@@ -322,8 +322,8 @@ def correlation(correlation: ErrorTable, out: Png) -> None:
     ours, paper = read_table(correlation), published("correlation")
     ours = ours[(ours.test_set == "uniform") & (ours.noise_level > 0)]
     ours = ours.assign(pair=ours.parameter_a + "-" + ours.parameter_b)
-    shown = [method for method in METHODS.values() if method.short]
-    published_too, more = [m for m in shown if m.paper], [m for m in shown if not m.paper]
+    shown = [method for method in ALIGNERS.values() if method.short]
+    published_too, more = [m for m in shown if m.look.paper], [m for m in shown if not m.look.paper]
     panels = []
     for level, rows in ours.groupby("noise_level"):
         known = paper[np.isclose(paper.noise_level, level)]

@@ -15,12 +15,12 @@ from psfdae.reading import read_table
 from psfdae.threads import limit_threads
 from psfdae_paper.configuration.compose import part
 from psfdae_paper.stages.fit import fit
-from psfdae_paper.sweeps.measured import Measured, Task, measure_images, place_of
+from psfdae_paper.sweeps.measured import Measured, Task, fit_in, measure_images
 
 
 def files_of(name: str) -> tuple[str, ...]:
     """Names of the files of a point's fit."""
-    return tuple(path.name for path in fits.outputs(method(name), place_of(method(name), Path())))
+    return tuple(path.name for path in fits.outputs(method(name), fit_in(method(name), Path())))
 
 
 def run(config: Any, task: Task, name: str) -> Measured:
@@ -43,7 +43,7 @@ def run(config: Any, task: Task, name: str) -> Measured:
     """
     kind = method(name)
     own = part(groups_of(name), config)
-    stars, place = task.data["stars"], place_of(kind, task.folder)
+    stars, place = task.data["stars"], fit_in(kind, task.folder)
     limit_threads(kind.threads(own))
     validated = None
     if not kind.needs.validation:

@@ -11,11 +11,11 @@ from psfdae.files import read_product, write_csv
 from psfdae.method import CONFIG, HISTORY
 from psfdae.reading import read_table, read_yaml
 from psfdae.threads import limit_threads
+from psfdae_paper.configuration.aligners import WEIGHTS
 from psfdae_paper.configuration.alignment import STATE_STAMPS
 from psfdae_paper.configuration.compose import part
 from psfdae_paper.evaluation.alignment_tables import error_rows
 from psfdae_paper.stages.alignment_methods import (
-    NETWORK_WEIGHTS,
     network_predictor,
     noisy_test_states,
     train_network,
@@ -28,7 +28,7 @@ TEST_SET = "uniform"
 
 def files_of(name: str) -> tuple[str, ...]:
     """Names of the files of a point's training."""
-    return (NETWORK_WEIGHTS, CONFIG, HISTORY)
+    return (WEIGHTS, CONFIG, HISTORY)
 
 
 def run(config: Any, task: Task, name: str) -> Measured:

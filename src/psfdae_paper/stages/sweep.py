@@ -16,10 +16,11 @@ from psfdae.files import ProductError, write_text
 from psfdae.method import FitError
 from psfdae.options import File, Folder
 from psfdae.settings import Reference, SplitKind
+from psfdae_paper.configuration.aligners import SWEPT
 from psfdae_paper.configuration.alignment import CHOICE
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.compose import decisive, load_stage
-from psfdae_paper.configuration.sweep import TRAINED, models, point_groups
+from psfdae_paper.configuration.sweep import models, point_groups
 from psfdae_paper.sweeps.measured import (
     CHECKSUM,
     COST,
@@ -42,7 +43,7 @@ NETWORK_ROLES = {"states", "validation", "test"}
 
 def module_of(model: str) -> str:
     """Module that trains and measures a model."""
-    return f"psfdae_paper.stages.{'network' if model in TRAINED else 'method'}_point"
+    return f"psfdae_paper.stages.{'network' if model in SWEPT else 'method'}_point"
 
 
 @dataclass(frozen=True)
@@ -123,7 +124,7 @@ def sweep_point(
     """Train one point of a sweep and measure it."""
     if (slot is None) != (search is None):
         raise click.UsageError("--slot and --search go together")
-    network = model in TRAINED
+    network = model in SWEPT
     roles = NETWORK_ROLES if network else ROLES
     if {role for role, _ in data} != roles:
         raise click.UsageError(f"--data: {model} needs {', '.join(sorted(roles))}")

@@ -227,7 +227,7 @@ def read_cost(folder: Path) -> dict[str, float]:
     return {key: from_tree(path, tree, key, make=float) for key in ("seconds", "cpu_seconds")}
 
 
-def place_of(kind: type[Method], folder: Path) -> Path:
+def fit_in(kind: type[Method], folder: Path) -> Path:
     """Where the fit of a point is: the folder itself, or a file in it."""
     return folder if storage_of(kind).files else folder / f"{kind.name}.h5"
 
