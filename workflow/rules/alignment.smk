@@ -100,8 +100,9 @@ rule alignment_dae:
 
 use rule alignment_dae as alignment_network with:
     input:
-        states=lambda w: f"{ALIGNMENT_DATA}/{METHODS[w.network].states}.h5",
-        dae=lambda w: [f"{ALIGNMENT}/dae/dae.safetensors"] * METHODS[w.network].denoised,
+        states=lambda w: f"{ALIGNMENT_DATA}/{ALIGNERS[w.network].states}.h5",
+        dae=lambda w: [f"{ALIGNMENT}/dae/dae.safetensors"]
+        * ALIGNERS[w.network].denoised,
     output:
         **network_files("{network}", "network.safetensors"),
     log:
@@ -173,7 +174,7 @@ use rule alignment_bound as alignment_fit with:
         states=f"{ALIGNMENT_DATA}/{{test_set}}.h5",
         train=f"{ALIGNMENT_DATA}/train.h5",
         model=rules.alignment_model.output,
-        network=f"{ALIGNMENT}/{METHODS['max_likelihood'].network}/network.safetensors",
+        network=f"{ALIGNMENT}/{ALIGNERS['max_likelihood'].network}/network.safetensors",
     output:
         out=f"{ALIGNMENT}/fits/{{test_set}}_{{level}}.h5",
         times=f"{ALIGNMENT}/fits/{{test_set}}_{{level}}_times.csv",
