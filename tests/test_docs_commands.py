@@ -30,6 +30,7 @@ TINY = {
     "train": ["preset=smoke", "parts.train_stars=150", "parts.test_stars=50"],
     "config": [],
     "simulate": ["grid.points=3"],
+    "from-stars": [],
     "predict": [],
     "describe": [],
     "compare": [],
@@ -98,14 +99,14 @@ def write_network(results, place):
 
 @pytest.fixture(scope="module")
 def observation(tmp_path_factory):
-    """An image with nine stars and its catalogue, for the model that comes with the package."""
+    """An image with 64 stars and its catalogue, for the model that comes with the package."""
     folder = tmp_path_factory.mktemp("observation")
     info = read_bundle(None).info
-    x, y = (axis.ravel() for axis in np.meshgrid([30.0, 60, 90], [30.0, 60, 90]))
+    x, y = (axis.ravel() for axis in np.meshgrid(*2 * [np.arange(30.0, 270, 30)]))
     paths = folder / "image.fits", folder / "stars.csv"
-    sky = np.random.default_rng(1).normal(100, 3, (120, 120))
+    sky = np.random.default_rng(1).normal(100, 3, (270, 270))
     scale = info.pixel_scale_arcsec
-    stamps = 5e3 * star_stamps(9, info.stamp_px)
+    stamps = 5e3 * star_stamps(64, info.stamp_px)
     write_field(*paths, stamps, x, y, shape=sky.shape, background=sky, pixel_scale_arcsec=scale)
     return paths
 

@@ -91,7 +91,7 @@ def _composed(groups: tuple[str, ...], word: str, words: Sequence[str]) -> Any:
 class Words:
     """Reads the settings of a command; see `psfdae.cli.Reader`."""
 
-    root: str = "config"
+    choice: tuple[str, ...] = ()
 
     def of(self, options: Mapping[str, Any]) -> tuple[str, ...]:
         """Names of the groups of settings."""
