@@ -9,8 +9,11 @@ import shutil
 import numpy as np
 import pandas as pd
 import pytest
+from skimage.metrics import mean_squared_error, structural_similarity
 
 from psfdae.files import read_product
+from psfdae.model.star_sets import noisy_test_images, read_stars, split_stars
+from psfdae_paper.configuration.compose import load
 from psfdae_paper.evaluation.comparison import seed_scatter
 from psfdae_paper.stages.bounds import COLUMNS as BOUND_COLUMNS
 from workflow_runs import PATH, ROOT, captured, command, planned, snakemake
@@ -45,6 +48,29 @@ def test_original_noise_rows_are_the_noise_that_was_added(smoke):
     ]
     expected = (4.98 * rows.noise_level) ** 2 + 4.98 * rows.noise_level / 100 / 256
     assert (rows.value / expected).to_numpy() == pytest.approx(1, abs=0.05)
+
+
+def test_errors_of_single_stars_are_scikit_image_s(smoke):
+    """Every test star of one column of the tables, its noise drawn again."""
+    config = load(["dataset=dataset3", "preset=smoke"])
+    stars = read_stars(smoke / "results/data/seidel/seidel_10pct.h5", "realisation")
+    test = split_stars(stars, "random", config).test
+    truth = stars["realisation"][test].astype(float)
+    noisy = noisy_test_images(config, stars, test, 0.003).astype(float)
+    table = pd.read_parquet(smoke / "results/evaluation/dataset3/random-realisation.parquet")
+    table = table[(table.method == "noisy") & (table.noise_level == 0.003)]
+    assert table.star.to_list() == test.tolist()
+    for number, row in enumerate(table.itertuples()):
+        pair = noisy[number], truth[number]
+        assert row.mse == pytest.approx(mean_squared_error(*pair), rel=1e-6)
+        peak = np.ptp(pair[1])
+        for found, data_range in (
+            (row.ssim, config.evaluation.data_range),
+            (row.ssim_unit, 1.0),
+            (row.ssim_peak, peak),
+        ):
+            expected = structural_similarity(*pair, data_range=data_range)
+            assert found == pytest.approx(expected, abs=1e-6)
 
 
 @pytest.mark.parametrize(
