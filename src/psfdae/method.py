@@ -67,6 +67,8 @@ class TrainingSet:
         The stars of which the images were made, if these are an image's; of flux 1.
     star : ndarray of int, shape (n,)
         Bright star of every image; empty if there are none.
+    simulation : mapping
+        Configuration of the simulation that made the stars; empty for those of an image.
     start : Method or None
         Fit of the method to the realisations of the same stars, from which that to their
         templates goes on.
@@ -86,6 +88,7 @@ class TrainingSet:
     own_noise: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
     bright: BrightStars | None = None
     star: np.ndarray = field(default_factory=lambda: np.empty(0, int))
+    simulation: Mapping[str, Any] = field(default_factory=dict)
     start: Method | None = None
     checkpoint: Path | None = None
 

@@ -104,6 +104,8 @@ def training_set(
         more["own_noise"] = _own_noise(stars, config.noise.background_photons)
         if issubclass(kind, MeasuresStars):
             more |= {"bright": BrightStars.of_product(stars), "star": stars["field_index"]}
+    else:
+        more["simulation"] = stars.config
     return TrainingSet(
         images=stars["realisation"],
         references=stars[learnt(kind, reference)],

@@ -80,6 +80,19 @@ class TwinSearch(NamedTuple):
     """Twins that are tried in all."""
 
 
+class Search(NamedTuple):
+    """Modes without the truth: few starts, and more for stars that they do not explain."""
+
+    first_stars: int = 4000
+    """Of the bank, that are matched first."""
+    starts: int = 4
+    """Best matches that modes are sought from: in as many fields, or at as many offsets."""
+    more_starts: int = 16
+    """The same of the whole bank, for stars that no mode explains."""
+    stars_at_once: int = 256
+    """Whose matches are in memory together."""
+
+
 class Proposals(NamedTuple):
     """Draws around modes."""
 
@@ -93,7 +106,7 @@ class Proposals(NamedTuple):
     """Least part of the draws in the star's own field: all that counts where the field is given."""
 
 
-CLIMB, TWINS, PROPOSALS = Climb(), TwinSearch(), Proposals()
+CLIMB, TWINS, SEARCH, PROPOSALS = Climb(), TwinSearch(), Search(), Proposals()
 
 CONJUGATE = np.array([1 - 2 * (name in ("r4", "xx", "xy", "yy")) for name in MONOMIALS])
 """Signs that negate the even part of a wavefront: its image stays the same."""
@@ -366,6 +379,56 @@ def sample(
     return sampled_sums(modes, noisy, truth.field, likelihood, model, rounds, rngs)
 
 
+def search(
+    bank: Bank,
+    seidel: np.ndarray,
+    noisy: np.ndarray,
+    likelihood: Likelihood,
+    model: StampModel,
+    own: np.ndarray | None = None,
+) -> tuple[Modes, np.ndarray]:
+    """Modes of stars of which nothing is known, or their fields.
+
+    Parameters
+    ----------
+    bank : Bank
+    seidel : ndarray, shape (M, 5)
+        Coefficients of the bank's stars in waves.
+    noisy : ndarray, shape (n, d, d)
+    likelihood : Likelihood
+    model : StampModel
+    own : ndarray of int, shape (n,), optional
+        Fields of the stars.
+
+    Returns
+    -------
+    modes : Modes
+        At least one for every star.
+    missed : ndarray of int
+        Stars that none of them explains (`unexplained`).
+    """
+    problem = (likelihood.counts(noisy), likelihood, model)
+
+    def matched(stars: np.ndarray, size: int, starts: int) -> Modes:
+        some, given = bank.take(np.arange(size)), None if own is None else own[stars]
+        found = best_matches(
+            some, seidel[:size], noisy[stars], likelihood, model, starts, given, own is None
+        )
+        return replace(found, star=stars[found.star])
+
+    everything = np.arange(len(noisy))
+    modes = climb(matched(everything, SEARCH.first_stars, SEARCH.starts), *problem)
+    missed = unexplained(modes, *problem)
+    if missed.size:
+        modes = climb(modes + matched(missed, len(bank), SEARCH.more_starts), *problem)
+        missed = unexplained(modes, *problem)
+    if missed.size:
+        modes = climb(modes + neighbours(modes, missed), *problem)
+    if own is None:
+        modes = climb(modes + twins(modes, likelihood, model), *problem)
+    return modes, unexplained(modes, *problem)
+
+
 def _log_student(distance: np.ndarray, factor: np.ndarray) -> np.ndarray:
     """Log-density of Student's t at squared distances (M, n) for Cholesky factors (M, 5, 5)."""
     width = np.log(np.diagonal(factor, axis1=1, axis2=2)).sum(axis=1)
@@ -394,9 +457,10 @@ def best_matches(
     likelihood: Likelihood,
     model: StampModel,
     count: int,
-    own: np.ndarray,
+    own: np.ndarray | None,
+    anywhere: bool = True,
 ) -> Modes:
-    """The best star of the bank in each of the `count` best fields of every image.
+    """The best star of the bank in each of the `count` best fields of every image, if `anywhere`.
 
     With the field given, the best at each of as many offsets in the stars' `own` fields, (n,),
     are added. Mirrored stars keep their coefficients. `evidence` is the log-likelihood up to a
@@ -427,8 +491,11 @@ def best_matches(
     offsets = (peaks[:, :, None] - shifts).reshape(len(bank), -1, 2)
     rows = []
     for star, scores in enumerate(best):
-        top = np.argsort(-scores.max(axis=1), kind="stable")[:count]
-        rows += [(star, field, scores[field].argmax(), NOTHING) for field in top]
+        if anywhere:
+            top = np.argsort(-scores.max(axis=1), kind="stable")[:count]
+            rows += [(star, field, scores[field].argmax(), NOTHING) for field in top]
+        if own is None:
+            continue
         mine, seen = own[star], set()
         for column in np.argsort(-scores[mine], kind="stable"):
             offset = tuple(offsets[which[star, mine, column], column])

@@ -9,7 +9,6 @@ import numpy as np
 
 from psfdae.belonging import STARS, STATIC, require
 from psfdae.files import (
-    Column,
     ProductError,
     read_product,
     write_csv,
@@ -18,11 +17,10 @@ from psfdae.files import (
 )
 from psfdae.options import File
 from psfdae.reading import read_table
-from psfdae.rng import stream
 from psfdae.threads import limit_threads
-from psfdae_paper.bounds.estimates import bounded_stars
+from psfdae_paper.bounds.estimates import bounded_stars, fresh_stars
 from psfdae_paper.bounds.floor import Comparison
-from psfdae_paper.bounds.posterior import MIRROR_MARGIN, Bank, jittered_templates
+from psfdae_paper.bounds.posterior import Bank, jittered_templates
 from psfdae_paper.bounds.tables import (
     COLUMNS,
     EFFICIENCY_COLUMNS,
@@ -39,20 +37,9 @@ from psfdae_paper.bounds.tables import (
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.consistency import SIMULATION
 from psfdae_paper.configuration.schema import Config
-from psfdae_paper.stars.fields import assign_fields
-from psfdae_paper.stars.framing import Propagation
-from psfdae_paper.stars.scenes import drawn_columns, star_wavefronts
 
 COLUMN_OF_TABLE = ["dataset", "split", "reference", "noise_level"]
 """What one column of the paper's tables is: methods are compared inside it."""
-
-FINE_SAMPLES = (158, 190)
-"""Pupil samples that a bank may use besides `optics.pupil_samples`.
-
-The sampling guard decides as it does for stars. Such stamps of scene 1 differ from
-those of N = 222 by an MSE of 4e-11 at most, below any noise of the datasets, and
-take half the time.
-"""
 
 
 @command("bank", reads=(*SIMULATION, "bounds"))
@@ -63,7 +50,7 @@ def bank(
     """Simulate the bank of fresh stars behind the posterior mean."""
     limit_threads(1)  # batches run side by side
     parts = [
-        _fresh_stars(config, name, count)
+        fresh_stars(config, name, count, config.bounds.threads)
         for name, count in (
             ("bank", config.bounds.bank_stars),
             ("bank_position", config.bounds.position_stars),
@@ -74,31 +61,6 @@ def bank(
         for name, column in parts[0].items()
     }
     write_product(out, "bank", columns, config.model_dump())
-
-
-def _fresh_stars(config: Config, suffix: str, count: int) -> dict[str, Column]:
-    # Another name gives other random streams: no training or test star is in the bank.
-    named = {"name": f"{config.stars.name}_{suffix}", "count": count}
-    drawn = config.model_copy(update={"stars": config.stars.model_copy(update=named)})
-    rng = stream(drawn.seed, "field", drawn.stars.name)
-    star_field = assign_fields(count, drawn.grid.points**2, rng)
-    source = star_wavefronts(drawn, star_field)
-    grid_sizes = sorted({*FINE_SAMPLES, *drawn.optics.pupil_samples})
-    optics = drawn.optics.model_copy(
-        update={"pupil_samples": grid_sizes, "threads": config.bounds.threads}
-    )
-    framing = drawn.framing
-    propagation = Propagation(source, drawn.telescope, optics, framing, drawn.stars.search_px)
-    framed, peak = propagation.framed(framing.stamp_px + 2 * (framing.jitter_px + MIRROR_MARGIN))
-    return {
-        "framed": Column(
-            framed.astype(np.float32), "1", "pixel flux as a fraction of the light, with margin"
-        ),
-        "field_index": Column(star_field, "1", "field of the star"),
-        "peak": Column(peak, "pixel", "brightest pixel (row, column) from the chief ray"),
-        **drawn_columns(source),
-        "pupil_samples": Column(propagation.samples, "1", "pupil samples N"),
-    }
 
 
 @command("bounds", reads=(*SIMULATION, "noise", "parts", "bounds"))

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 READS = (
     *("seed", "noise", "parts", "evaluation", "methods"),
-    *(group for kind in registered() if kind.storage is None for group in kind.groups),
+    *dict.fromkeys(g for kind in registered() if kind.storage is None for g in kind.groups),
 )
 """Groups of the configuration on which the measurements depend, models being given."""
 

@@ -1,0 +1,19 @@
+"""The telescope's optics as an estimator that is given where in the field a star stands."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from psfdae.method import Look, Needs
+from psfdae.methods.gmm_position import PlacedMixture
+from psfdae_paper.methods.wavefront import Wavefront
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedWavefront(Wavefront):
+    """As `Wavefront`, in a field that is given."""
+
+    look = Look("optics of the telescope", "#666666", "p", drawn=False)
+    needs = Needs(level=True, position=True)
+    fallback: ClassVar = PlacedMixture

@@ -1,0 +1,106 @@
+"""The telescope's optics as an estimator: it reaches the local floor of a star's error."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from psfdae.method import FitError, TrainingSet
+from psfdae.methods import method
+from psfdae.methods.gmm import Gmm
+from psfdae.metrics import mse
+from psfdae.model.star_sets import noise_model
+from psfdae_paper.bounds import sampling
+from psfdae_paper.bounds.estimates import fresh_stars, stamp_model
+from psfdae_paper.bounds.floor import local_error
+from psfdae_paper.configuration.compose import load
+from psfdae_paper.configuration.consistency import SIMULATION
+from psfdae_paper.methods import wavefront
+from psfdae_paper.optics.wavefronts import monomial_coefficients
+from psfdae_paper.stars.framing import crop_jittered, normalise_flux
+
+LEVEL = 1e-3
+NAMES = ("wavefront", "wavefront_position")
+TEST = 24
+
+
+@pytest.fixture(scope="module")
+def stars():
+    """Simulated stars, the last ones for tests: configuration, columns, images."""
+    config = load(["dataset=dataset3", "preset=smoke"])
+    drawn = {name: c.values for name, c in fresh_stars(config, "trial", 120 + TEST).items()}
+    margin = (drawn["framed"].shape[-1] - config.framing.stamp_px) // 2
+    cuts = crop_jittered(drawn["framed"].astype(float), np.array([0, 0]), margin)
+    return config, drawn, normalise_flux(cuts)[0].astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def data(stars):
+    config, drawn, images = stars
+    iy, ix = np.divmod(drawn["field_index"], config.grid.points)
+    number = np.arange(120)
+    return TrainingSet(
+        *(images, images, number[:100], number[100:], np.array([LEVEL]), noise_model(config)),
+        positions=np.stack([ix, iy], axis=1),
+        simulation={name: config.model_dump()[name] for name in SIMULATION},
+    )
+
+
+@pytest.fixture(scope="module")
+def fitted(data):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(wavefront, "BANK_STARS", 1500)
+        patch.setattr(sampling, "SEARCH", sampling.Search(first_stars=700))
+        gmm = Gmm(components=[4], shrinkage=[10.0])
+        yield {name: method(name).fit(data, gmm) for name in NAMES}
+
+
+@pytest.fixture(scope="module")
+def noisy(stars):
+    config, _, images = stars
+    return noise_model(config).draw(images[-TEST:], LEVEL, np.random.default_rng(5))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_errors_are_at_the_local_floor(stars, data, fitted, noisy, name):
+    config, drawn, images = stars
+    model, field = stamp_model(config), drawn["field_index"][-TEST:]
+    _, slopes = model.derivatives(
+        model.coefficients(model.standardised(drawn["seidel"][-TEST:]), field),
+        monomial_coefficients(np.eye(5), model.field[field][:, None]),
+        drawn["peak"][-TEST:],
+    )
+    variance = noise_model(config).variance(images[-TEST:].reshape(TEST, -1), LEVEL)
+    floor = local_error(slopes, model.sd, variance)
+    psf = fitted[name].estimate(noisy, LEVEL, data.positions[-TEST:]).psf
+    error = mse(psf, images[-TEST:])
+    # Half of the stars err less than their mean.
+    assert 0.3 < np.median(error / floor) < 1.3
+    mixture = fitted[name].mixture.restore(noisy, LEVEL, data.positions[-TEST:])
+    assert np.median(error) < 0.3 * np.median(mse(mixture, images[-TEST:]))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_same_images_have_the_same_bytes(data, fitted, noisy, name):
+    once, twice = (
+        fitted[name].estimate(noisy[:4], LEVEL, data.positions[-TEST:][:4]).psf for _ in range(2)
+    )
+    assert (once == twice).all()
+
+
+def test_a_star_that_no_wavefront_explains_has_the_mixture_s_psf(data, fitted, noisy):
+    moved = noisy[:3].copy()
+    moved[1] = np.roll(moved[1], 5, axis=0)
+    for kind in fitted.values():
+        position = data.positions[-TEST:][:3]
+        psf, mixture = (f(moved, LEVEL, position) for f in (kind.estimate, kind.mixture.restore))
+        assert (psf.psf[1] == mixture[1]).all()
+        assert (psf.psf[0] != mixture[0]).any()
+
+
+def test_stars_of_other_scenes_are_refused(data):
+    turbulent = replace(data, simulation={"scene": {"name": "turbulence"}})
+    with pytest.raises(FitError, match="wavefront: needs stars with random Seidel aberrations"):
+        method("wavefront").fit(turbulent, Gmm())
