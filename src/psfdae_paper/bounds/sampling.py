@@ -91,6 +91,9 @@ class Search(NamedTuple):
     """The same of the whole bank, for stars that no mode explains."""
     stars_at_once: int = 256
     """Whose matches are in memory together."""
+    missed: float = 4.0
+    """As `TwinSearch.poor_fit`, for a star to count as not explained. Chance alone makes one in
+    a thousand."""
 
 
 class Proposals(NamedTuple):
@@ -426,7 +429,7 @@ def search(
         modes = climb(modes + neighbours(modes, missed), *problem)
     if own is None:
         modes = climb(modes + twins(modes, likelihood, model), *problem)
-    return modes, unexplained(modes, *problem)
+    return modes, unexplained(modes, *problem, SEARCH.missed)
 
 
 def _log_student(distance: np.ndarray, factor: np.ndarray) -> np.ndarray:
@@ -572,12 +575,16 @@ def climb(modes: Modes, counts: np.ndarray, likelihood: Likelihood, model: Stamp
 
 
 def unexplained(
-    modes: Modes, counts: np.ndarray, likelihood: Likelihood, model: StampModel
+    modes: Modes,
+    counts: np.ndarray,
+    likelihood: Likelihood,
+    model: StampModel,
+    deviations: float = TWINS.poor_fit,
 ) -> np.ndarray:
     """Stars with an image that their best mode does not explain, without or with the field given.
 
     χ² of the right mode has the mean P and the variance 2P for P pixels; they are those where it
-    is larger by `TWINS.poor_fit` standard deviations.
+    is larger by so many standard `deviations`.
 
     Parameters
     ----------
@@ -588,7 +595,7 @@ def unexplained(
     expected = likelihood.flux * stamps.astype(np.float64) + likelihood.background
     misfit = ((counts[best.star] - expected) ** 2 / expected).sum(axis=1)
     pixels = counts.shape[1]
-    return np.unique(best.star[misfit > pixels + TWINS.poor_fit * np.sqrt(2.0 * pixels)])
+    return np.unique(best.star[misfit > pixels + deviations * np.sqrt(2.0 * pixels)])
 
 
 def neighbours(modes: Modes, stars: np.ndarray) -> Modes:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 BANK_STARS = 32000
 """Of the bank, of which most stars need a part only."""
 
-DRAWS = 60
+DRAWS = 100
 """Importance samples of a star."""
 
 
