@@ -299,6 +299,12 @@ def errors(name="tables/psf_metrics.csv"):
     return table.sort_values(keys, ascending=[True, False, True, True])
 
 
+def optics():
+    """MSE of the study of the telescope's optics against the realisation, a column a method."""
+    rows = csv("studies/optics/table.csv").query("reference == 'realisation'")
+    return rows.pivot(index=["dataset", "noise_level"], columns="method", values="mse").reset_index()
+
+
 def better(first, second):
     """Rows of errors in which one method is better, beyond the scatter of seeds where measured."""
     table = errors()

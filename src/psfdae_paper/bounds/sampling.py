@@ -83,12 +83,14 @@ class TwinSearch(NamedTuple):
 class Search(NamedTuple):
     """Modes without the truth: few starts, and more for stars that they do not explain."""
 
-    first_stars: int = 4000
+    first_stars: int = 8000
     """Of the bank, that are matched first."""
-    starts: int = 4
-    """Best matches that modes are sought from: in as many fields, or at as many offsets."""
-    more_starts: int = 16
-    """The same of the whole bank, for stars that no mode explains."""
+    fields: int = 8
+    """From the best matches in which modes are sought."""
+    offsets: int = 4
+    """The same in the star's own field, if it is given."""
+    more: int = 16
+    """Fields or offsets, with the whole bank, for stars that no mode explains."""
     stars_at_once: int = 256
     """Whose matches are in memory together."""
     missed: float = 4.0
@@ -419,11 +421,12 @@ def search(
         )
         return replace(found, star=stars[found.star])
 
+    few = SEARCH.fields if own is None else SEARCH.offsets
     everything = np.arange(len(noisy))
-    modes = climb(matched(everything, SEARCH.first_stars, SEARCH.starts), *problem)
+    modes = climb(matched(everything, SEARCH.first_stars, few), *problem)
     missed = unexplained(modes, *problem)
     if missed.size:
-        modes = climb(modes + matched(missed, len(bank), SEARCH.more_starts), *problem)
+        modes = climb(modes + matched(missed, len(bank), SEARCH.more), *problem)
         missed = unexplained(modes, *problem)
     if missed.size:
         modes = climb(modes + neighbours(modes, missed), *problem)

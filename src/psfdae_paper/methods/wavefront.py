@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 BANK_STARS = 32000
 """Of the bank, of which most stars need a part only."""
 
-DRAWS = 100
+DRAWS = 150
 """Importance samples of a star."""
 
 
