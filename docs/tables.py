@@ -302,7 +302,9 @@ def errors(name="tables/psf_metrics.csv"):
 def optics():
     """MSE of the study of the telescope's optics against the realisation, a column a method."""
     rows = csv("studies/optics/table.csv").query("reference == 'realisation'")
-    return rows.pivot(index=["dataset", "noise_level"], columns="method", values="mse").reset_index()
+    return rows.pivot(
+        index=["dataset", "noise_level"], columns="method", values="mse"
+    ).reset_index()
 
 
 def better(first, second):

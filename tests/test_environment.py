@@ -27,6 +27,7 @@ CONDA_NAMES = {
 CONDA_ONLY = {"pip", "python"}
 TRANSITIVE = {"sqlalchemy": "of mlflow", "numexpr": "of poppy"}
 NOT_IMPORTED = {
+    "pywavelets": "scikit-image's wavelets need it",
     "pyarrow": "writes the Parquet files of pandas",
     "snakemake": "runs the workflow",
     "snakemake-executor-plugin-slurm": "runs it on a cluster",
