@@ -19,7 +19,7 @@ from psfdae_paper.configuration.aligners import (
     of_set,
 )
 from psfdae_paper.configuration.alignment import CHOICE
-from psfdae_paper.configuration.compose import config_dir, load, load_stage, overrides_for
+from psfdae_paper.configuration.compose import load, load_stage, overrides_for
 from psfdae_paper.evaluation import alignment_tables
 from psfdae_paper.stages.alignment import states
 from psfdae_paper.stages.alignment_results import read_bounds
@@ -192,9 +192,14 @@ def test_same_configuration_gives_the_same_bytes(products, tmp_path):
     assert not np.isin(other["states"], one["states"]).any()
 
 
-@pytest.mark.parametrize("preset", [p.stem for p in config_dir().glob("preset/*.yaml")])
-def test_every_preset_suits_scene_3(preset):
-    assert load((*CHOICE, f"preset={preset}")).alignment.field_points == 8
+@pytest.mark.parametrize(
+    ("preset", "states", "schedule"),
+    [("fast", 625, "onecycle"), ("paper", 625, "constant"), ("smoke", 12, "onecycle")],
+)
+def test_presets_reach_scene_3(preset, states, schedule):
+    config = load((*CHOICE, f"preset={preset}"))
+    assert (config.alignment.test_states, config.dae_train.schedule) == (states, schedule)
+    assert "backend" not in config.model_dump()["optics"]
 
 
 def test_scene_3_keeps_its_telescope_where_a_whole_run_gets_another():
@@ -203,12 +208,41 @@ def test_scene_3_keeps_its_telescope_where_a_whole_run_gets_another():
     kept = [word for word in given if word.split("=")[0] not in ("telescope", "wavefront.coma")]
     assert overrides_for([*given, "wavefront.coma=3"], CHOICE) == tuple(kept)
     assert overrides_for(given) == tuple(given)
+    assert overrides_for(["optics.backend=torch"], list(CHOICE)) == ()
     with pytest.raises(ConfigError, match=r"trian\.lr"):
         load([*CHOICE, "trian.lr=1"])
     with pytest.raises(ConfigError, match="colour: unknown key"):
         load([*CHOICE, "+colour=blue"])
     with pytest.raises(ConfigError, match=r"example_zernike: brings its own aberrations"):
         load([*CHOICE, "telescope=example_zernike"])
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["alignment", "config", "dataset=dataset3"], "this command is about dataset=alignment"),
+        (["alignment", "bound", "dataset=dataset3"], "this command is about dataset=alignment"),
+        (["config", "--stage", "templates", "dataset=alignment"], "has no simulated stars"),
+        (["config", "--stage", "no-such"], "'no-such' is not one of"),
+    ],
+)
+def test_datasets_and_scene_3_are_not_taken_for_each_other(words, message):
+    if words[1] == "bound":
+        words += ["--set=grid", "--states=x", "--model=x", "--out=x"]
+    result = CliRunner().invoke(main, words)
+    assert result.exit_code == 2 and message in result.output
+
+
+@pytest.mark.parametrize("stage", ["from-stars", "train", "alignment_estimate"])
+def test_groups_of_any_command_are_shown(stage):
+    result = CliRunner().invoke(main, ["config", "--stage", stage], catch_exceptions=False)
+    assert result.exit_code == 0 and "noise:" in result.output
+
+
+def test_prescriptions_without_a_secondary_stop_scene_3_alone():
+    load(["prescription=newtonian"])
+    with pytest.raises(ConfigError, match="secondary: missing"):
+        load([*CHOICE, "prescription=newtonian"])
 
 
 def test_command_line_names_what_is_wrong(tmp_path):

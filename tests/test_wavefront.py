@@ -9,7 +9,6 @@ import pytest
 
 from psfdae.method import FitError, TrainingSet
 from psfdae.methods import method
-from psfdae.methods.gmm import Gmm
 from psfdae.metrics import mse
 from psfdae.model.star_sets import noise_model
 from psfdae_paper.bounds import sampling
@@ -53,8 +52,7 @@ def fitted(data):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(wavefront, "BANK_STARS", 1500)
         patch.setattr(sampling, "SEARCH", sampling.Search(first_stars=700))
-        gmm = Gmm(components=[4], shrinkage=[10.0])
-        yield {name: method(name).fit(data, gmm) for name in NAMES}
+        yield {name: method(name).fit(data) for name in NAMES}
 
 
 @pytest.fixture(scope="module")
@@ -102,4 +100,4 @@ def test_a_star_that_no_wavefront_explains_has_the_mixture_s_psf(data, fitted, n
 def test_stars_of_other_scenes_are_refused(data):
     turbulent = replace(data, simulation={"scene": {"name": "turbulence"}})
     with pytest.raises(FitError, match="wavefront: needs stars with random Seidel aberrations"):
-        method("wavefront").fit(turbulent, Gmm())
+        method("wavefront").fit(turbulent)

@@ -1,7 +1,7 @@
-"""Classical denoisers of scikit-image, which know the noise but no other star.
+"""Classical denoisers of scikit-image, which know the noise.
 
-Each has one strength, in units of the noise of a sky pixel; it is that with the least error on
-validation stars at each noise level.
+All that they learn from other stars is one strength, in units of the noise of a sky pixel: that
+with the least error on validation stars at each noise level.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class Denoiser(Method):
     def denoised(cls, noisy: np.ndarray, sigma: float, strength: float) -> np.ndarray:
         """Images (n, d, d) at a strength; `sigma` is the noise of a sky pixel."""
         # The functions have absolute tolerances, made for images between 0 and 1.
-        peak = float(noisy.max())
+        peak = float(np.abs(noisy).max()) or 1.0
         scaled = noisy.astype(np.float64) / peak
         found = [cls.denoise(image, sigma / peak, strength * sigma / peak) for image in scaled]
         return (peak * np.array(found)).astype(np.float32)

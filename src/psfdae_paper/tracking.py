@@ -70,6 +70,10 @@ class Run:
         MLflow's.
     parent : str
         Source of the run that this one is a part of, which comes first.
+    tags : mapping
+        Beside those that all runs have.
+    content_hash : str
+        Of files and settings.
 
     Raises
     ------
@@ -196,7 +200,9 @@ def _of_stars(
         config={**product.config, **own},
         end_ms=_time_ms(fits.outputs(kind, model)[0]),
         metrics=metrics,
-        epochs=_epochs(fits.beside(kind, model, HISTORY)) if trained else (),
+        epochs=_epochs(fits.beside(kind, model, HISTORY), "train_mse", "validation_mse")
+        if trained
+        else (),
     )
 
 
@@ -366,8 +372,8 @@ def _time_ms(path: Path) -> int:
         raise ProductError(f"{path}: no such file") from None
 
 
-def _epochs(history: Path) -> list[dict[str, float]]:
-    rows = read_csv(history, "epoch", "seconds")
+def _epochs(history: Path, *columns: str) -> list[dict[str, float]]:
+    rows = read_csv(history, "epoch", "seconds", *columns)
     return [{name: number(history, text) for name, text in row.items()} for row in rows]
 
 

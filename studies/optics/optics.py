@@ -18,6 +18,7 @@ import numpy as np
 import pandas as pd
 
 from psfdae.methods import method
+from psfdae.methods.gmm import Gmm
 from psfdae.metrics import clustered_mean, mse
 from psfdae.model.star_sets import field_positions, noise_model, read_stars, training_set
 from psfdae.rng import stream
@@ -85,11 +86,11 @@ def optics(config, product, stars, add) -> None:
         kind = method(name)
         fits = {
             reference: kind.fallback.fit(
-                training_set(config, kind.fallback, product, "random", reference), config.gmm
+                training_set(config, kind.fallback, product, "random", reference), Gmm()
             )
             for reference in stars.truth
         }
-        fitted = kind.fit(training_set(config, kind, product, "random", "realisation"), config.gmm)
+        fitted = kind.fit(training_set(config, kind, product, "random", "realisation"))
         own = stars.field if kind.needs.position else None
         middle = fitted.bank.stamps((fitted.bank.margin,) * 2)
         for level, noisy in stars.noisy.items():

@@ -136,7 +136,10 @@ def default_datasets():
 
     Sizes that fit together in one dataset may not in another: that counts where one is built.
     """
-    return load_groups(overrides_for(GIVEN)).workflow.datasets
+    names = load_groups(overrides_for(GIVEN)).workflow.datasets
+    if SCENE3 in names:
+        raise ConfigError(f"workflow.datasets: {SCENE3} is built by the target scene3")
+    return names
 
 
 def templates_of(stars):

@@ -15,7 +15,7 @@ import numpy as np
 
 from psfdae.errors import Error
 from psfdae_paper.configuration.alignment import Alignment
-from psfdae_paper.configuration.schema import Optics
+from psfdae_paper.configuration.schema import WholePeriodOptics
 from psfdae_paper.configuration.telescope import Telescope
 from psfdae_paper.optics.derivatives import ModalStamps, PeriodSampling, normalise_with_derivatives
 from psfdae_paper.optics.propagation import in_batches
@@ -97,7 +97,7 @@ class AlignmentStamps:
     def __init__(
         self,
         telescope: Telescope,
-        optics: Optics,
+        optics: WholePeriodOptics,
         alignment: Alignment,
         movable: bool = False,
     ) -> None:

@@ -94,8 +94,8 @@ class Search(NamedTuple):
     stars_at_once: int = 256
     """Whose matches are in memory together."""
     missed: float = 4.0
-    """As `TwinSearch.poor_fit`, for a star to count as not explained. Chance alone makes one in
-    a thousand."""
+    """As `TwinSearch.poor_fit`, for a star to count as not explained. Chance alone makes a
+    few in ten thousand."""
 
 
 class Proposals(NamedTuple):

@@ -9,7 +9,6 @@ from pydantic import Field, model_validator
 
 from psfdae.settings import CheckpointSeconds, Count, Group, Positive
 from psfdae_paper.configuration.aligners import TRAINED
-from psfdae_paper.configuration.wavefront import Prescription
 
 
 class Alignment(Group):
@@ -109,7 +108,7 @@ NETWORKS = {"cnn": Cnn, "perceptron": Perceptron}
 
 
 class NetworkTrain(Group):
-    """Optimisation of one network; as in the paper, lr = 1e-3 × 0.1^⌊epoch/30⌋."""
+    """Optimisation of one network; the defaults are the paper's, lr = 1e-3 × 0.1^⌊epoch/30⌋."""
 
     network: Literal["cnn", "perceptron"] = Field("cnn", description="Which one is trained")
     epochs: Count = Field(100, description="Passes over the training states")
@@ -161,19 +160,6 @@ class Fit(Group):
     )
 
 
-def misaligned(prescription: Prescription) -> Prescription:
-    """The prescription, if it has a secondary mirror.
-
-    Raises
-    ------
-    ValueError
-        If it has none.
-    """
-    if prescription.secondary is None:
-        raise ValueError("secondary: missing, nothing else can be misaligned")
-    return prescription
-
-
 NAME = "alignment"
 """Of scene 3 among the datasets."""
 
@@ -181,8 +167,7 @@ CHOICE = (f"dataset={NAME}",)
 """Override that chooses scene 3."""
 
 OWN_OPTIONS = ("preset", "prescription", "dae_train", "network_train")
-"""Groups of which options chosen for all datasets apply to scene 3, too. Of others, such as the
-telescope, it keeps those in dataset/alignment.yaml."""
+"""Groups of which an option that is chosen for a whole run applies to scene 3, too."""
 
 GROUPS = (
     *("seed", "telescope", "prescription", "alignment", "optics", "noise", "dae", "dae_train"),

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from psfdae import cli
+from psfdae.settings import ConfigError
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,14 @@ class Groups:
         reads = self.of(options)
         if file is not None:
             return load_settings(file, reads)
-        return load_stage(reads, (*self.choice, *words))
+        return load_stage(reads, self.chosen(words))
+
+    def chosen(self, words: Sequence[str]) -> tuple[str, ...]:
+        """Words of a command line behind its choice, which none of them may change."""
+        for word in words if self.choice else ():
+            if word.startswith("dataset="):
+                raise ConfigError(f"{word}: this command is about {', '.join(self.choice)}")
+        return (*self.choice, *words)
 
 
 def command(

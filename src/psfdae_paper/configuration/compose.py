@@ -30,14 +30,12 @@ ROOT = "config.yaml"
 def compose(overrides: Sequence[str] = ()) -> dict[str, Any]:
     """Resolved configuration tree of a list of Hydra overrides, not yet checked.
 
-    `alignment_preset` is a former name of `preset`.
-
     Raises
     ------
     ConfigError
         If Hydra refuses an override (unknown key or group option, bad syntax).
     """
-    return _composed(tuple(re.sub("^alignment_preset=", "preset=", word) for word in overrides))
+    return _composed(tuple(overrides))
 
 
 def forget() -> None:
@@ -194,10 +192,17 @@ def load(overrides: Sequence[str] = ()) -> Any:
 
 def checked(tree: Mapping[str, Any]) -> Any:
     """As `load`, of a tree that is composed."""
-    if "scene" in tree or tree.get("dataset", {}).get("name") != alignment.NAME:
+    if not _aligns(tree):
         return validate(whole_config(), tree)
     _require_known(tree)
     return part(alignment.GROUPS, tree)
+
+
+def _aligns(tree: Mapping[str, Any]) -> bool:
+    """Whether a tree is that of scene 3."""
+    dataset = tree.get("dataset")
+    name = dataset.get("name") if isinstance(dataset, Mapping) else None
+    return "scene" not in tree and name == alignment.NAME
 
 
 def _require_known(tree: Mapping[str, Any]) -> None:
@@ -340,6 +345,11 @@ def stage_tree(reads: tuple[str, ...], tree: Mapping[str, Any]) -> dict[str, Any
     """
     tree = _derived(tree)
     missing = [key for key in reads if key not in tree]
+    if missing and _aligns(tree):
+        raise ConfigError(
+            f"dataset = {alignment.NAME}: scene 3 has no simulated stars, which are needed here; "
+            "its commands are `psfdae alignment …`, its target is scene3"
+        )
     if missing:
         raise ConfigError(f"{missing[0]}: missing")
     return {key: tree[key] for key in reads}
@@ -374,7 +384,7 @@ def overrides_for(overrides: Sequence[str], choice: Sequence[str] = ()) -> tuple
     chosen = [
         word
         for word in options
-        if choice != alignment.CHOICE or _key(word) in alignment.OWN_OPTIONS
+        if tuple(choice) != alignment.CHOICE or _key(word) in alignment.OWN_OPTIONS
     ]
 
     def has(key: str, choice: Sequence[str]) -> bool:

@@ -56,6 +56,16 @@ class Consistent(Group):
             )
         return self
 
+    @model_validator(mode="after")
+    def _suits_the_scene(self) -> Consistent:
+        prescription, optics = (getattr(self, name, None) for name in ("prescription", "optics"))
+        if getattr(self, "scene", None) is None:  # scene 3, or part of a dataset without both
+            if prescription is not None and prescription.secondary is None:
+                raise ValueError("prescription: secondary: missing, nothing else can be misaligned")
+        elif optics is not None and not hasattr(optics, "backend"):
+            raise ValueError("optics.backend: missing")
+        return self
+
 
 def with_derived(tree: Mapping[str, Any]) -> dict[str, Any]:
     """A whole configuration with values in place of those nulls that follow from other groups."""

@@ -6,10 +6,11 @@ science code receives SI units (`Telescope.pixel_scale` is in radians).
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import cache
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, create_model, model_validator
+from pydantic import BeforeValidator, Field, create_model, model_validator
 
 from psfdae.method import Method
 from psfdae.methods import MethodNames
@@ -35,7 +36,6 @@ from psfdae_paper.configuration.alignment import (
     Fit,
     NetworkTrain,
     Perceptron,
-    misaligned,
 )
 from psfdae_paper.configuration.base import SEARCH, PupilSamples, SearchDistance
 from psfdae_paper.configuration.consistency import Consistent
@@ -96,18 +96,30 @@ class Framing(Stamp):
     )
 
 
-class Optics(Group):
-    """Numerical settings of the propagation."""
+class WholePeriodOptics(Group):
+    """Numerical settings of the propagation by the whole period of the image, of scene 3."""
 
     pupil_samples: PupilSamples = Field(
         description="Grid sizes N, ascending; each wavefront takes the first that suffices"
     )
     precision: Literal["complex64", "complex128"] = Field(description="Of the propagation")
-    backend: Literal["numpy", "torch"] = Field(
-        "numpy", description="Library of the matrix products; scene 3 has none"
-    )
     batch: Count = Field(description="Wavefronts per batch")
-    threads: Count = Field(description="Threads of the linear algebra")
+    threads: Count = Field(description="Batches at once, each with one thread of linear algebra")
+
+
+class Optics(WholePeriodOptics):
+    """Numerical settings of the propagation by matrix products."""
+
+    backend: Literal["numpy", "torch"] = Field(description="Library of the matrix products")
+
+
+def _optics(tree: Any) -> Any:
+    if not isinstance(tree, Mapping):
+        return tree
+    return (Optics if "backend" in tree else WholePeriodOptics).model_validate(tree)
+
+
+AnyOptics = Annotated[WholePeriodOptics | Optics, BeforeValidator(_optics)]
 
 
 class Dataset(Group):
@@ -198,7 +210,7 @@ class Config(Consistent):
     wavefront: Annotated[Seidel | VonKarman | OfTelescope, Field(discriminator="kind")]
     stars: Stars
     framing: Framing
-    optics: Optics
+    optics: AnyOptics
     noise: Noise
     parts: Parts
     dataset: Dataset
@@ -207,7 +219,7 @@ class Config(Consistent):
     benchmark: Benchmark
     bounds: Bounds
     calibration_stars: CalibrationStars
-    prescription: Annotated[Prescription, AfterValidator(misaligned)]
+    prescription: Prescription
     alignment: Alignment
     dae: DaeSettings
     dae_train: Train

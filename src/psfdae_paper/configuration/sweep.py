@@ -10,7 +10,7 @@ from pydantic import AfterValidator, Field, model_validator
 from psfdae.methods import groups_of, method
 from psfdae.settings import ConfigError, Count, Finite, Group, Name, Reference, SplitKind
 from psfdae_paper.configuration.aligners import ALIGNERS, SWEPT
-from psfdae_paper.configuration.alignment import CHOICE, NETWORKS
+from psfdae_paper.configuration.alignment import CHOICE, NAME, NETWORKS
 from psfdae_paper.configuration.compose import config_dir, load_file
 from psfdae_paper.configuration.methods import registered
 
@@ -154,6 +154,8 @@ class Sweep(Group):
             raise ValueError("trials: random and adaptive sweeps need it, a grid has none")
         if (self.model in SWEPT) != (self.dataset is None):
             raise ValueError("dataset: methods need one, scene 3's networks have none")
+        if self.dataset == NAME:
+            raise ValueError(f"dataset = {NAME}: scene 3 has no stars that methods restore")
         metrics = NETWORK_METRICS if self.dataset is None else METRICS
         if self.metric not in metrics:
             allowed = " or ".join(metrics)

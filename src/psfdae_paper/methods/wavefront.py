@@ -51,7 +51,6 @@ class Wavefront(Method):
     needs = Needs(level=True)
     storage = None
     packing = None
-    groups: ClassVar = {"gmm": Gmm}
     fallback: ClassVar = GaussianMixture
 
     bank: Bank
@@ -62,7 +61,7 @@ class Wavefront(Method):
     seed: int
 
     @classmethod
-    def fit(cls, data: TrainingSet, gmm: Gmm) -> Self:
+    def fit(cls, data: TrainingSet) -> Self:
         """Simulate the bank, and fit the mixture.
 
         Raises
@@ -86,7 +85,7 @@ class Wavefront(Method):
             drawn["seidel"],
             stamp_model(config),
             _static(config) if data.reference == "template" else None,
-            cls.fallback.fit(data, gmm),
+            cls.fallback.fit(data, Gmm()),
             data.seed,
         )
 

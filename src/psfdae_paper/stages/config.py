@@ -26,16 +26,17 @@ def config(overrides: Overrides = (), only: Only = None) -> None:
     else:
         names = {_key(name): name for name in found()}
         reader = stage(names[_key(only)]).stage.settings if _key(only) in names else None
-        if not isinstance(reader, Groups):
+        if reader is None:
             raise click.BadParameter(f"{only!r} is not one of {', '.join(sorted(found()))}")
-        checked = load_stage(reader.of({}), (*reader.choice, *overrides))
+        words = overrides if overrides[:1] == reader.choice else (*reader.choice, *overrides)
+        checked = load_stage(reader.of({}), words)
     click.echo(yaml.safe_dump(checked.model_dump(), sort_keys=False), nl=False)
 
 
 @command("alignment config")
 def alignment_config(only: Only = None, overrides: Overrides = ()) -> None:
     """Check the configuration of scene 3 and print it, resolved: `config dataset=alignment`."""
-    config(overrides if only else (*CHOICE, *overrides), only)
+    config(Groups((), CHOICE).chosen(overrides), only)
 
 
 def _key(name: str) -> str:
