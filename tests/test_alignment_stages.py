@@ -222,6 +222,10 @@ def test_scene_3_keeps_its_telescope_where_a_whole_run_gets_another():
     [
         (["alignment", "config", "dataset=dataset3"], "this command is about dataset=alignment"),
         (["alignment", "bound", "dataset=dataset3"], "this command is about dataset=alignment"),
+        (
+            ["config", "--stage", "alignment_bound", "dataset=dataset3"],
+            "is about dataset=alignment",
+        ),
         (["config", "--stage", "templates", "dataset=alignment"], "has no simulated stars"),
         (["config", "--stage", "no-such"], "'no-such' is not one of"),
     ],

@@ -23,10 +23,9 @@ from psfdae.metrics import clustered_mean, mse
 from psfdae.model.star_sets import field_positions, noise_model, read_stars, training_set
 from psfdae.rng import stream
 from psfdae.threads import limit_threads
-from psfdae_paper.bounds.estimates import bounded_stars
+from psfdae_paper.bounds.estimates import bounded_stars, static_psfs
 from psfdae_paper.bounds.posterior import Likelihood
 from psfdae_paper.configuration.compose import load
-from psfdae_paper.methods.wavefront import _static
 
 DENOISERS = ("wavelet", "nl_means", "tv")
 OPTICS = ("wavefront", "wavefront_position")
@@ -81,7 +80,7 @@ def main(results: Path, dataset: str, out: Path) -> None:
 def optics(config, product, stars, add) -> None:
     """Both references from the same samples; missed stars have the mixture's PSF."""
     position = field_positions(product)[stars.star]
-    static = _static(config)
+    static = static_psfs(config)
     for name in OPTICS:
         kind = method(name)
         fits = {

@@ -16,6 +16,7 @@ from psfdae_paper.bounds.posterior import (
     Bank,
     Likelihood,
     PosteriorSums,
+    jittered_templates,
     nested_means,
     posterior_sums,
     segments,
@@ -25,7 +26,7 @@ from psfdae_paper.bounds.tight import Evidence
 from psfdae_paper.configuration.schema import Config
 from psfdae_paper.stars.fields import assign_fields, relative_field
 from psfdae_paper.stars.framing import Propagation
-from psfdae_paper.stars.scenes import drawn_columns, star_wavefronts
+from psfdae_paper.stars.scenes import drawn_columns, star_wavefronts, template_wavefronts
 from psfdae_paper.stars.symmetry import orbit
 
 SPLIT = "random"
@@ -192,6 +193,16 @@ def fresh_stars(config: Config, suffix: str, count: int, threads: int = 1) -> di
         **drawn_columns(source),
         "pupil_samples": Column(propagation.samples, "1", "pupil samples N"),
     }
+
+
+def static_psfs(config: Config) -> np.ndarray:
+    """Static PSFs of all fields at all centring errors, shape (F, J, d, d), as in "templates"."""
+    framing = config.framing
+    propagation = Propagation(
+        template_wavefronts(config), config.telescope, config.optics, framing, framing.search_px
+    )
+    framed, _ = propagation.framed(framing.stamp_px + 2 * framing.jitter_px)
+    return jittered_templates(framed.astype(np.float32), framing.jitter_px)
 
 
 def stamp_model(config: Config) -> StampModel:

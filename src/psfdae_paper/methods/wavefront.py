@@ -69,7 +69,7 @@ class Wavefront(Method):
         FitError
             If the stars are not simulated with random Seidel aberrations.
         """
-        from psfdae_paper.bounds.estimates import fresh_stars, stamp_model
+        from psfdae_paper.bounds.estimates import fresh_stars, stamp_model, static_psfs
         from psfdae_paper.bounds.posterior import Bank
         from psfdae_paper.configuration.compose import part
         from psfdae_paper.configuration.consistency import SIMULATION
@@ -84,7 +84,7 @@ class Wavefront(Method):
             Bank(drawn["framed"], drawn["field_index"], drawn["peak"], *sizes),
             drawn["seidel"],
             stamp_model(config),
-            _static(config) if data.reference == "template" else None,
+            static_psfs(config) if data.reference == "template" else None,
             cls.fallback.fit(data, Gmm()),
             data.seed,
         )
@@ -137,17 +137,3 @@ class Wavefront(Method):
         known = sums.total > 0
         known[missed] = False
         return sums, known
-
-
-def _static(config: Any) -> np.ndarray:
-    """Static PSFs of all fields at all centring errors, shape (F, J, d, d)."""
-    from psfdae_paper.bounds.posterior import jittered_templates
-    from psfdae_paper.stars.framing import Propagation
-    from psfdae_paper.stars.scenes import template_wavefronts
-
-    framing = config.framing
-    propagation = Propagation(
-        template_wavefronts(config), config.telescope, config.optics, framing, framing.search_px
-    )
-    framed, _ = propagation.framed(framing.stamp_px + 2 * framing.jitter_px)
-    return jittered_templates(framed.astype(np.float32), framing.jitter_px)

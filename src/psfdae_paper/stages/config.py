@@ -28,15 +28,15 @@ def config(overrides: Overrides = (), only: Only = None) -> None:
         reader = stage(names[_key(only)]).stage.settings if _key(only) in names else None
         if reader is None:
             raise click.BadParameter(f"{only!r} is not one of {', '.join(sorted(found()))}")
-        words = overrides if overrides[:1] == reader.choice else (*reader.choice, *overrides)
-        checked = load_stage(reader.of({}), words)
+        groups = Groups(reader.of({}), reader.choice)
+        checked = load_stage(groups.of({}), groups.chosen(overrides))
     click.echo(yaml.safe_dump(checked.model_dump(), sort_keys=False), nl=False)
 
 
 @command("alignment config")
 def alignment_config(only: Only = None, overrides: Overrides = ()) -> None:
     """Check the configuration of scene 3 and print it, resolved: `config dataset=alignment`."""
-    config(Groups((), CHOICE).chosen(overrides), only)
+    config(overrides if only else Groups((), CHOICE).chosen(overrides), only)
 
 
 def _key(name: str) -> str:
