@@ -11,6 +11,7 @@ from prediction_stars import fresh_psfs, with_network
 from psfdae import load_model
 from psfdae.model.psf_model import PsfModel
 from psfdae.noise import NoiseModel
+from psfdae.optics.pupil import annular_pupil
 from psfdae_paper.alignment.telescope import (
     design_states,
     fit_quadratic,
@@ -19,7 +20,6 @@ from psfdae_paper.alignment.telescope import (
 )
 from psfdae_paper.configuration.alignment import CHOICE
 from psfdae_paper.configuration.compose import load
-from psfdae_paper.optics.pupil import annular_pupil
 from workflow_runs import snakemake
 
 FINISHED = ".built"

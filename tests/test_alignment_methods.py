@@ -15,9 +15,9 @@ from psfdae_paper.alignment.emulator import StampEmulator
 from psfdae_paper.alignment.fisher import (
     bound_covariances,
     coma_free_decentre,
+    deviance_and_information,
     expected_abs_error,
     parameters_of,
-    score_and_information,
     stamps_and_slopes,
     twin_states,
 )
@@ -262,7 +262,7 @@ def test_gaussian_noise_has_poisson_s_variance(noise, stamps):
 def test_fisher_matrix_against_finite_differences(model, exact_operator, noise):
     state = np.array([[0.3, -0.5, 0.4, 0.2]])
     stamps, slopes = stamps_and_slopes(model, exact_operator, state)
-    _, fisher = score_and_information(0 * stamps, slopes, noise.variance(stamps, 0.002))
+    _, _, fisher = deviance_and_information(noise, 0.002, stamps, stamps, slopes)
     step = 1e-4
     plus, minus = (exact_operator(model(state + sign * step * np.eye(4)))[0] for sign in (1, -1))
     slopes = ((plus - minus) / (2 * step)).reshape(4, -1)
@@ -299,8 +299,8 @@ def test_gauss_newton_recovers_a_noise_free_state(model, exact_operator, noise):
     likelihood = _likelihood(model, exact_operator, noise, 0.002)
     found = fit_states(likelihood, images, truth + 0.08, EXACT)
     assert found.converged.all()
-    assert found.states == pytest.approx(truth, abs=1e-6)
-    assert found.deviance == pytest.approx(0, abs=1e-6)
+    assert found.parameters == pytest.approx(truth, abs=1e-6)
+    assert (-2 * found.height) == pytest.approx(0, abs=1e-6)
 
 
 def test_score_is_the_slope_of_the_likelihood(model, exact_operator, noise, states):
@@ -326,12 +326,14 @@ def test_scatter_of_the_fit_is_the_bound(model, config, noise, states, stamps, m
     likelihood = _likelihood(model, operator, noise, level)
     found = fit_states(likelihood, images, parameters_of(model, operator, states + 0.01), FIT)
     covariances = bound_covariances(model, operator, noise, [level], states)[0]
-    error = found.states[:, :4] - states
+    error = found.parameters[:, :4] - states
     chi2 = np.einsum("nk,nkl,nl->", error, np.linalg.inv(covariances), error)
     assert 75 < chi2 < 177
     # Pixels minus parameters, with the spread √(2 N) of χ².
     pixels, free = 9 * 16 * 16, 4 + 27 * movable
-    assert found.deviance.mean() == pytest.approx(pixels - free, abs=5 * np.sqrt(2 * pixels / 30))
+    assert (-2 * found.height).mean() == pytest.approx(
+        pixels - free, abs=5 * np.sqrt(2 * pixels / 30)
+    )
 
 
 class Uphill(Likelihood):
@@ -350,7 +352,7 @@ def test_a_step_that_damping_made_small_is_no_convergence(model, operator, noise
     )
     assert found.converged.tolist() == [False, True]
     # A short step is taken without another look.
-    assert found.states == pytest.approx(np.array([start[0], 2 * start[1]]))
+    assert found.parameters == pytest.approx(np.array([start[0], 2 * start[1]]))
     assert found.evaluations.tolist() == [13, 1]
 
 
@@ -367,7 +369,7 @@ def test_free_flux_and_place_are_recovered(model, exact_operator, config, noise)
     start = parameters_of(model, movable, truth + 0.08)
     found = fit_states(_likelihood(model, movable, noise, 0.002), images, start, EXACT)
     assert found.converged.all()
-    assert found.states == pytest.approx(given, abs=1e-6)
+    assert found.parameters == pytest.approx(given, abs=1e-6)
 
 
 def _movable(config, precision="complex64"):
@@ -406,7 +408,7 @@ def test_fit_stays_near_the_range(model, operator, noise):
     images = noise.draw(stamps, 0.02, np.random.default_rng(3))
     settings = FIT.model_copy(update={"limit": 1.0})
     found = fit_states(_likelihood(model, operator, noise, 0.02), images, truth, settings)
-    assert np.abs(found.states).max() <= 1.0
+    assert np.abs(found.parameters).max() <= 1.0
 
 
 @pytest.fixture(scope="module")
@@ -427,15 +429,14 @@ def test_emulator_errs_by_a_part_of_a_standard_error(
     states = scale * uniform_states(150, np.random.default_rng(6))
     stamps, slopes = stamps_and_slopes(model, operator, states)
     about, theirs = emulator(states)
-    variance = noise.variance(stamps.astype(np.float64), 0.002)
-    score, fisher = score_and_information(about - stamps, slopes, variance)
+    _, score, fisher = deviance_and_information(noise, 0.002, about, stamps, slopes)
     covariance = np.linalg.inv(fisher)
     sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     shift = np.einsum("nkl,nl->nk", covariance, score) / sigma
     assert least < np.sqrt(np.mean(shift**2)) < most
     assert np.median(np.abs(shift)) < 0.05
     assert np.abs(shift).max() < 1.0
-    spread = score_and_information(about - stamps, theirs - slopes, variance)[1]
+    spread = deviance_and_information(noise, 0.002, about, stamps, theirs - slopes)[2]
     wander = np.sqrt(np.einsum("nkl,nlk->n", spread, covariance))
     assert 0.05 < np.median(wander) < noisy
 
@@ -448,16 +449,18 @@ def test_last_step_reaches_the_maximum_of_the_exact_optics(
     images = noise.draw(stamps, level, np.random.default_rng(8))
     last, exact = (_likelihood(model, operator, noise, level, e) for e in (emulator, None))
     first = fit_states(Likelihood(emulator, noise, level), images, states + 0.02, FIT)
-    found = fit_states(last, images, first.states, FIT)
-    best = fit_states(exact, images, found.states, FIT.model_copy(update={"tolerance": 0.01}))
+    found = fit_states(last, images, first.parameters, FIT)
+    best = fit_states(exact, images, found.parameters, FIT.model_copy(update={"tolerance": 0.01}))
     assert found.converged.all()
     assert found.evaluations.mean() < 1.2
-    sigma = np.sqrt(np.diagonal(np.linalg.inv(best.fisher), axis1=1, axis2=2))
-    off = [np.sqrt(np.mean(((f.states - best.states) / sigma) ** 2)) for f in (first, found)]
+    sigma = np.sqrt(np.diagonal(np.linalg.inv(best.information), axis1=1, axis2=2))
+    off = [
+        np.sqrt(np.mean(((f.parameters - best.parameters) / sigma) ** 2)) for f in (first, found)
+    ]
     assert 0.01 < off[1] < 0.08
     assert off[1] < off[0] < 0.12
     # The gain of a step that is not looked at.
-    assert found.deviance == pytest.approx(best.deviance, abs=0.3)
+    assert (-2 * found.height) == pytest.approx((-2 * best.height), abs=0.3)
 
 
 def test_emulator_of_few_states(model, operator, states, stamps):
@@ -479,8 +482,8 @@ def test_start_far_beyond_the_range_is_safe(model, operator, noise, stamps):
     likelihood = _likelihood(model, operator, noise, 0.005)
     found = fit_states(likelihood, images, start, FIT)
     before = likelihood.evaluate(images, np.clip(start, -FIT.limit, FIT.limit))[0]
-    assert np.abs(found.states).max() <= FIT.limit
-    assert (found.deviance < before).all()
+    assert np.abs(found.parameters).max() <= FIT.limit
+    assert ((-2 * found.height) < before).all()
 
 
 def test_twin_keeps_the_coma_and_turns_the_tilt(model, config):
@@ -510,8 +513,8 @@ def test_wrong_twin_is_left_for_the_more_likely_state(model, config, noise, mova
     twin = parameters_of(model, operator, twin_states(model, truth, noll))
     once = settings.model_copy(update={"iterations": 1})
     stuck = fit_states(likelihood, images, twin, once)
-    others = twin_states(model, stuck.states, noll)
+    others = twin_states(model, stuck.parameters, noll)
     found, tried = refit_twins(likelihood, images, stuck, others, settings)
     assert tried.all()
-    assert found.states[:, :4] == pytest.approx(truth, abs=2e-3)
-    assert found.deviance[0] < stuck.deviance[0]
+    assert found.parameters[:, :4] == pytest.approx(truth, abs=2e-3)
+    assert (-2 * found.height)[0] < (-2 * stuck.height)[0]

@@ -7,15 +7,15 @@ from functools import partial
 import numpy as np
 import pytest
 
+from psfdae.optics.derivatives import ModalStamps, PeriodSampling, PointSampling
+from psfdae.optics.propagation import StampPropagator
+from psfdae.optics.pupil import SamplingError, annular_pupil
+from psfdae.optics.wavefronts import monomial_coefficients, monomial_images
+from psfdae.telescope.raytracing import annulus_points, misaligned
 from psfdae_paper.alignment.stamps import AlignmentStamps, EnergyError, centred_modes, mean_slope
 from psfdae_paper.alignment.telescope import uniform_states
 from psfdae_paper.configuration.alignment import CHOICE
 from psfdae_paper.configuration.compose import load
-from psfdae_paper.optics.derivatives import ModalStamps, PeriodSampling, PointSampling
-from psfdae_paper.optics.propagation import StampPropagator
-from psfdae_paper.optics.pupil import SamplingError, annular_pupil
-from psfdae_paper.optics.wavefronts import monomial_coefficients, monomial_images
-from psfdae_paper.raytracing import annulus_points, misaligned
 
 OBSCURATION = 0.42
 SHOWN = [((0, 0, 0, 0), 0), ((0.6, -0.3, 0.2, 0.8), 2), ((1, 1, 1, 1), 7)]
@@ -88,7 +88,7 @@ def test_point_sampling_is_the_stamp_propagator():
 def test_period_sampling_integrates_pixels_exactly(tracer, exact, config):
     """The stamp propagator approaches it spectrally as its points increase."""
     zernikes = shown_zernikes(tracer)
-    modal = exact.operator(254)
+    modal = exact.propagation.operator(254)
     pupil = annular_pupil(254, OBSCURATION)
     stamps = modal.stamps(zernikes)
     errors = []
@@ -173,9 +173,9 @@ def test_chosen_grids_have_two_samples_per_wave_of_the_maps(operator, grid):
     """The slopes that choose N are those of the OPD maps that are propagated."""
     states, zernikes = grid
     steep = zernikes[(np.abs(states) == 1).all(axis=1)].reshape(-1, 19)
-    samples = operator.samples(steep)
+    samples = operator.propagation.samples(steep)
     for n in np.unique(samples):
-        opd = operator.operator(int(n)).opd(steep[samples == n])
+        opd = operator.propagation.operator(int(n)).opd(steep[samples == n])
         lit = annular_pupil(int(n), OBSCURATION).amplitude > 0
         for axis, pairs in ((-1, lit[:, 1:] & lit[:, :-1]), (-2, lit[1:] & lit[:-1])):
             assert np.abs(np.diff(opd, axis=axis))[..., pairs].max() <= 0.5

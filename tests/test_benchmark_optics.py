@@ -15,10 +15,10 @@ import propagators
 import scenes
 from measure import alone, time_in_rounds
 from psfdae.files import ProductError
+from psfdae.optics.propagation import StampPropagator
+from psfdae.optics.pupil import annular_pupil
+from psfdae.optics.wavefronts import seidel_wavefronts
 from psfdae_paper.configuration.compose import load_stage
-from psfdae_paper.optics.propagation import StampPropagator
-from psfdae_paper.optics.pupil import annular_pupil
-from psfdae_paper.optics.wavefronts import seidel_wavefronts
 from psfdae_paper.stars.framing import normalise_flux
 from workflow_runs import ROOT
 

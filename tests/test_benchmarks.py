@@ -16,9 +16,9 @@ import speed
 import trainings
 from psfdae.method import TrainingSet
 from psfdae.model.bundle import shipped_path
+from psfdae.optics.wavefronts import seidel_wavefronts
 from psfdae_paper.configuration.compose import load, load_stage
 from psfdae_paper.methods.pca_som import Baseline
-from psfdae_paper.optics.wavefronts import seidel_wavefronts
 from psfdae_paper.stars.framing import Propagation, normalise_flux
 from workflow_runs import ROOT, planned, snakemake
 

@@ -6,6 +6,9 @@ import numpy as np
 import pytest
 from scipy.stats import poisson
 
+from psfdae.optics.propagation import StampPropagator
+from psfdae.optics.pupil import annular_pupil
+from psfdae.optics.wavefronts import monomial_coefficients, monomial_images, seidel_wavefronts
 from psfdae_paper.bounds.estimates import stamp_model
 from psfdae_paper.bounds.floor import compare, local_error
 from psfdae_paper.bounds.posterior import (
@@ -23,9 +26,6 @@ from psfdae_paper.bounds.posterior import (
     weights,
     windows,
 )
-from psfdae_paper.optics.propagation import StampPropagator
-from psfdae_paper.optics.pupil import annular_pupil
-from psfdae_paper.optics.wavefronts import monomial_coefficients, monomial_images, seidel_wavefronts
 from psfdae_paper.stars.fields import perturb, relative_field
 from psfdae_paper.stars.framing import Propagation, brightest_pixel, normalise_flux
 from psfdae_paper.stars.symmetry import SYMMETRIES, orbit

@@ -9,6 +9,7 @@ import pytest
 from scipy.stats import f as f_law
 from scipy.stats import multivariate_t
 
+from psfdae.optics.wavefronts import seidel_wavefronts
 from psfdae.rng import stream
 from psfdae_paper.bounds import sampling
 from psfdae_paper.bounds.posterior import Likelihood, jitters, merge
@@ -23,7 +24,6 @@ from psfdae_paper.bounds.sampling import (
     twins,
     unexplained,
 )
-from psfdae_paper.optics.wavefronts import seidel_wavefronts
 from psfdae_paper.stars.framing import Propagation, crop_jittered, normalise_flux
 
 LEVEL = 3e-3

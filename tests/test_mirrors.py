@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from psfdae.settings import ConfigError
+from psfdae.telescope.aberrations import Prescription
+from psfdae.telescope.raytracing import ZernikeTracer, build_optic
 from psfdae_paper.configuration.alignment import CHOICE
 from psfdae_paper.configuration.compose import load
-from psfdae_paper.configuration.wavefront import Prescription
-from psfdae_paper.raytracing import ZernikeTracer, build_optic
 
 OWN = "dataset=_telescope"
 FIELD = np.deg2rad([0.0, 0.1, 0.2])

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.special import j0, j1
 
-from psfdae_paper.optics.derivatives import ModalStamps, PeriodSampling, PointSampling
-from psfdae_paper.optics.propagation import StampPropagator, image_points
-from psfdae_paper.optics.pupil import Pupil, annular_pupil, pupil_axis
-from psfdae_paper.optics.wavefronts import monomial_coefficients, monomial_images
+from psfdae.optics.derivatives import ModalStamps, PeriodSampling, PointSampling
+from psfdae.optics.propagation import StampPropagator, image_points
+from psfdae.optics.pupil import Pupil, annular_pupil, pupil_axis
+from psfdae.optics.wavefronts import monomial_coefficients, monomial_images
 
 ARCSEC = np.pi / 180 / 3600
 COMATIC = monomial_coefficients(np.array([0.5, 4.0, 4.196, 1.813, -0.113]), np.array([0.6, 0.4]))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from psfdae_paper.optics.pupil import (
+from psfdae.optics.pupil import (
     SamplingError,
     annular_pupil,
     choose_samples,
@@ -13,7 +13,7 @@ from psfdae_paper.optics.pupil import (
     pupil_axis,
     required_samples,
 )
-from psfdae_paper.optics.wavefronts import (
+from psfdae.optics.wavefronts import (
     monomial_coefficients,
     monomial_images,
     noll_to_nm,

@@ -42,7 +42,7 @@ def test_a_copy_and_comments_repeat_nothing(jobs, tree):
     assert jobs() == {}
     append(tree / "config/train/onecycle.yaml", "# A thought.\n")
     append(tree / "config/dataset/dataset3.yaml", "# Another.\n")
-    append(tree / "src/psfdae_paper/optics/propagation.py", "# And a third.\n")
+    append(tree / "src/psfdae/optics/propagation.py", "# And a third.\n")
     assert jobs() == {}
 
 
@@ -80,7 +80,7 @@ LEARNED = {"train": 6, "evaluate": 6}
 @pytest.mark.parametrize(
     ("module", "repeated", "left"),
     [
-        ("psfdae_paper/optics/propagation", SIMULATED | {"baseline": 4} | LEARNED, ()),
+        ("psfdae/optics/propagation", SIMULATED | {"baseline": 4} | LEARNED, ()),
         ("psfdae/networks/dae", LEARNED, SIMULATED),
         ("psfdae/metrics", {"evaluate": 6}, (*SIMULATED, "baseline", "train")),
     ],

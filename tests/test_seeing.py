@@ -10,12 +10,12 @@ from scipy.special import j0
 
 from psfdae.belonging import STARS, STATIC, require
 from psfdae.files import ProductError
+from psfdae.optics.propagation import StampPropagator
+from psfdae.optics.pupil import SamplingError, annular_pupil
+from psfdae.optics.seeing import FAINT, BlurredPropagator, Profile
+from psfdae.optics.wavefronts import zernike_images
 from psfdae.settings import ConfigError
 from psfdae_paper.configuration.compose import load
-from psfdae_paper.optics.propagation import StampPropagator
-from psfdae_paper.optics.pupil import SamplingError, annular_pupil
-from psfdae_paper.optics.seeing import FAINT, BlurredPropagator, Profile
-from psfdae_paper.optics.wavefronts import zernike_images
 from psfdae_paper.stars import framing
 from psfdae_paper.stars.framing import Propagation
 from psfdae_paper.stars.scenes import template_wavefronts

@@ -60,7 +60,7 @@ def test_what_looks_reads_images_or_is_new_trains_nothing(changed, path):
 
 
 def test_comments_docstrings_and_formatting_train_nothing(changed):
-    for path in ("psfdae/method.py", "psfdae_paper/optics/propagation.py", "psfdae/settings.py"):
+    for path in ("psfdae/method.py", "psfdae/optics/propagation.py", "psfdae/settings.py"):
         assert changed(path, '\n# A thought.\n"""A constant\'s docstring."""\n') == set()
 
 
@@ -84,7 +84,7 @@ def test_noise_repeats_all_fits_but_no_stars(changed):
 
 
 def test_optics_repeat_all_simulations(changed):
-    found = changed("psfdae_paper/optics/propagation.py")
+    found = changed("psfdae/optics/propagation.py")
     assert {"stars", "alignment states"} <= found and not {*METHODS} & found
 
 

@@ -10,10 +10,10 @@ import pytest
 from psfdae.files import Product
 from psfdae.model.star_sets import noisy_test_images
 from psfdae.noise import mixed_levels
+from psfdae.optics.wavefronts import seidel_wavefronts, zernike_wavefronts
 from psfdae.rng import stream
 from psfdae.splits import draw_jitter, draw_phase, held_out_fields, held_out_split, random_split
 from psfdae_paper.configuration.compose import load
-from psfdae_paper.optics.wavefronts import seidel_wavefronts, zernike_wavefronts
 from psfdae_paper.stars.fields import assign_fields, perturb, relative_field, square_grid
 from psfdae_paper.stars.framing import (
     FramingError,

@@ -10,9 +10,9 @@ import speed
 from measure import alone, cost_of_command
 from prediction import make_cube
 from psfdae.files import Column, Empty, ProductError, read_product, stream_product, write_product
+from psfdae.optics.wavefronts import ModalWavefronts, monomial_images
 from psfdae_paper.configuration.compose import compose, load_stage
 from psfdae_paper.configuration.consistency import SIMULATION, STATIC
-from psfdae_paper.optics.wavefronts import ModalWavefronts, monomial_images
 from psfdae_paper.stages import stars
 from psfdae_paper.stars.framing import Propagation, brightest_pixel
 from psfdae_paper.stars.scenes import template_wavefronts

@@ -10,20 +10,20 @@ import pytest
 from command_line import psfdae, refused
 from fits_inputs import open_observation
 from psfdae.files import read_product
-from psfdae.settings import ConfigError, as_overrides
-from psfdae_paper.alignment.stamps import AlignmentStamps, mean_slope
-from psfdae_paper.alignment.telescope import zernike_tracer
-from psfdae_paper.configuration.alignment import CHOICE as SCENE3
-from psfdae_paper.configuration.compose import compose, load, load_stage, stage_tree
-from psfdae_paper.configuration.consistency import SIMULATION, STATIC
-from psfdae_paper.optics.pupil import annular_pupil
-from psfdae_paper.optics.wavefronts import (
+from psfdae.optics.pupil import annular_pupil
+from psfdae.optics.wavefronts import (
     field_coefficients,
     seidel_wavefronts,
     zernike_images,
     zernike_wavefronts,
 )
-from psfdae_paper.raytracing import RayTracingError
+from psfdae.settings import ConfigError, as_overrides
+from psfdae.telescope.raytracing import RayTracingError
+from psfdae_paper.alignment.stamps import AlignmentStamps, mean_slope
+from psfdae_paper.alignment.telescope import zernike_tracer
+from psfdae_paper.configuration.alignment import CHOICE as SCENE3
+from psfdae_paper.configuration.compose import compose, load, load_stage, stage_tree
+from psfdae_paper.configuration.consistency import SIMULATION, STATIC
 from psfdae_paper.stages import stars
 from psfdae_paper.stars.fields import relative_field
 from psfdae_paper.stars.framing import Propagation, normalise_flux

@@ -8,11 +8,14 @@ import numpy as np
 import pytest
 from scipy.special import jv
 
+from psfdae.optics.pupil import SamplingError, annular_pupil, pupil_axis
+from psfdae.optics.wavefronts import zernike_basis
 from psfdae.rng import stream
 from psfdae.settings import ConfigError
 from psfdae_paper.configuration.compose import load
-from psfdae_paper.optics.pupil import SamplingError, annular_pupil, pupil_axis
-from psfdae_paper.optics.turbulence import (
+from psfdae_paper.stars.fields import square_grid
+from psfdae_paper.stars.scenes import TurbulenceScene
+from psfdae_paper.stars.turbulence import (
     SPECTRUM,
     STRENGTH,
     Footprints,
@@ -21,9 +24,6 @@ from psfdae_paper.optics.turbulence import (
     layer_r0,
     structure_function,
 )
-from psfdae_paper.optics.wavefronts import zernike_basis
-from psfdae_paper.stars.fields import square_grid
-from psfdae_paper.stars.scenes import TurbulenceScene
 
 R0, L0, HEIGHTS, STRENGTHS = 0.2, 25.0, (0.0, 4000.0, 10000.0), (0.6, 0.25, 0.15)
 FLOAT64 = np.dtype(np.float64)

@@ -11,13 +11,13 @@ from psfdae.method import FitError, TrainingSet
 from psfdae.methods import method
 from psfdae.metrics import mse
 from psfdae.model.star_sets import noise_model
+from psfdae.optics.wavefronts import monomial_coefficients
 from psfdae_paper.bounds import sampling
 from psfdae_paper.bounds.estimates import fresh_stars, stamp_model
 from psfdae_paper.bounds.floor import local_error
 from psfdae_paper.configuration.compose import load
 from psfdae_paper.configuration.consistency import SIMULATION
 from psfdae_paper.methods import wavefront
-from psfdae_paper.optics.wavefronts import monomial_coefficients
 from psfdae_paper.stars.framing import crop_jittered, normalise_flux
 
 LEVEL = 1e-3

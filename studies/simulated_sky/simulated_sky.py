@@ -54,9 +54,9 @@ def field(
     star to star. The list has centroids inside an isophote. `psf` (stars, s, s) are parts of all
     light of a star; their pixel (s/2, s/2) is `pixel` (stars, 2), x and y in the image.
     """
-    from psfdae_paper.optics.propagation import StampPropagator
-    from psfdae_paper.optics.pupil import annular_pupil, pixel_width
-    from psfdae_paper.optics.wavefronts import seidel_wavefronts
+    from psfdae.optics.propagation import StampPropagator
+    from psfdae.optics.pupil import annular_pupil, pixel_width
+    from psfdae.optics.wavefronts import seidel_wavefronts
 
     telescope, optics = config.telescope, config.optics
     scale = telescope.pixel_scale_arcsec

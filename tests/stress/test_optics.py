@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from psfdae_paper.optics.propagation import StampPropagator
-from psfdae_paper.optics.pupil import SamplingError, annular_pupil
-from psfdae_paper.optics.turbulence import SPECTRUM
-from psfdae_paper.optics.wavefronts import seidel_wavefronts
+from psfdae.optics.propagation import StampPropagator
+from psfdae.optics.pupil import SamplingError, annular_pupil
+from psfdae.optics.wavefronts import seidel_wavefronts
 from psfdae_paper.stars.framing import FramingError
 from psfdae_paper.stars.scenes import (
     CYCLES_PER_DIAMETER,
@@ -14,6 +13,7 @@ from psfdae_paper.stars.scenes import (
     TurbulentWavefronts,
     template_wavefronts,
 )
+from psfdae_paper.stars.turbulence import SPECTRUM
 from stress.bench import changed, propagation, stamp_mse
 
 FINER = (254, 318, 398, 512, 640, 800, 1024, 1280, 1600, 2048)  # N beyond the config's

@@ -8,7 +8,7 @@ import torch
 from sklearn.decomposition import PCA
 
 from psfdae.metrics import mse, ssim
-from psfdae_paper.optics.wavefronts import seidel_wavefronts
+from psfdae.optics.wavefronts import seidel_wavefronts
 from psfdae_paper.stars.fields import relative_field
 from psfdae_paper.stars.framing import normalise_flux
 from psfdae_paper.stars.scenes import template_wavefronts

@@ -5,8 +5,8 @@ from itertools import combinations, product
 import numpy as np
 import pytest
 
+from psfdae.optics.wavefronts import ModalWavefronts
 from psfdae.rng import stream
-from psfdae_paper.optics.wavefronts import ModalWavefronts
 from psfdae_paper.stars.scenes import star_wavefronts
 from stress.bench import LEVELS, changed, propagation, simulated
 

@@ -6,13 +6,13 @@ from functools import lru_cache
 
 import numpy as np
 
+from psfdae.optics.propagation import StampPropagator
+from psfdae.optics.pupil import annular_pupil
+from psfdae.optics.wavefronts import WavefrontSource
 from psfdae.rng import stream
+from psfdae.telescope.settings import Telescope
 from psfdae_paper.configuration.consistency import SIMULATION
 from psfdae_paper.configuration.schema import Framing, Optics
-from psfdae_paper.configuration.telescope import Telescope
-from psfdae_paper.optics.propagation import StampPropagator
-from psfdae_paper.optics.pupil import annular_pupil
-from psfdae_paper.optics.wavefronts import WavefrontSource
 from psfdae_paper.stars.fields import assign_fields
 from psfdae_paper.stars.framing import Propagation, normalise_flux
 from psfdae_paper.stars.scenes import star_wavefronts, template_wavefronts

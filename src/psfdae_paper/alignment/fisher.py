@@ -17,6 +17,7 @@ from collections.abc import Callable
 import numpy as np
 
 from psfdae.noise import NoiseModel
+from psfdae.sensing.climbing import poisson
 from psfdae_paper.alignment.stamps import AlignmentStamps
 from psfdae_paper.alignment.telescope import QuadraticModel
 
@@ -69,30 +70,38 @@ def stamps_and_slopes(
     return flux * shapes, slopes
 
 
-def score_and_information(
-    residuals: np.ndarray, slopes: np.ndarray, variance: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Slope of the log-likelihood, (n, K), and Fisher matrix, (n, K, K), by all K parameters.
+def deviance_and_information(
+    noise: NoiseModel, level: float, images: np.ndarray, stamps: np.ndarray, slopes: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Deviance (n,), its score (n, K) and Fisher matrix (n, K, K), by all K parameters.
 
     Parameters
     ----------
-    residuals, variance : ndarray, shape (n, F, d, d)
-        What is observed less what is expected, and the variance that is expected.
+    noise : NoiseModel
+    level : float
+        Noise level λ.
+    images, stamps : ndarray, shape (n, F, d, d)
+        What is observed and what is expected, normalised by the true flux.
     slopes : ndarray, shape (n, F, k, d, d)
         By the parameters of each stamp: the first four are shared by all.
     """
     count, fields, k = slopes.shape[:3]
-    slopes = slopes.reshape(count, fields, k, -1).astype(np.float64)
-    weighted = slopes / variance.reshape(count, fields, 1, -1)
-    score = (weighted @ residuals.reshape(count, fields, -1, 1))[..., 0]
-    information = weighted @ slopes.swapaxes(2, 3)
+    flux, sky = noise.flux(level), noise.background
+    observed, expected = (
+        flux * each.reshape(count * fields, -1).astype(np.float64) + sky
+        for each in (images, stamps)
+    )
+    slopes = flux * slopes.reshape(count * fields, k, -1).astype(np.float64)
+    deviance, score, information = poisson(observed, expected, slopes)
+    score = score.reshape(count, fields, k)
+    information = information.reshape(count, fields, k, k)
     size = 4 + fields * (k - 4)
     all_scores, joint = np.zeros((count, size)), np.zeros((count, size, size))
     for field in range(fields):
         place = np.r_[0:4, 4 + field * (k - 4) : 4 + (field + 1) * (k - 4)]
         all_scores[:, place] += score[:, field]
         joint[:, place[:, None], place] += information[:, field]
-    return all_scores, joint
+    return deviance.reshape(count, fields).sum(axis=1), all_scores, joint
 
 
 def bound_covariances(
@@ -117,8 +126,7 @@ def bound_covariances(
         free = parameters_of(model, operator, states[part])
         images, slopes = stamps_and_slopes(model, operator, free)
         for index, level in enumerate(levels):
-            variance = noise.variance(images.astype(np.float64), level)
-            fisher = score_and_information(np.zeros_like(images), slopes, variance)[1]
+            fisher = deviance_and_information(noise, level, images, images, slopes)[2]
             out[index, part] = np.linalg.inv(fisher)[:, :4, :4]
     return out
 

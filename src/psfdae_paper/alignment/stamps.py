@@ -8,27 +8,17 @@ derivative of a stamp is that of the centred stamp.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 
 import numpy as np
 
 from psfdae.errors import Error
+from psfdae.optics.derivatives import PeriodSampling, SampledStamps, normalise_with_derivatives
+from psfdae.optics.wavefronts import Modes, noll_to_nm, radial_polynomial, zernike
+from psfdae.telescope.raytracing import FIRST_NOLL
+from psfdae.telescope.settings import Telescope
 from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.schema import WholePeriodOptics
-from psfdae_paper.configuration.telescope import Telescope
-from psfdae_paper.optics.derivatives import ModalStamps, PeriodSampling, normalise_with_derivatives
-from psfdae_paper.optics.propagation import in_batches
-from psfdae_paper.optics.pupil import annular_pupil, choose_samples, required_samples
-from psfdae_paper.optics.wavefronts import (
-    Modes,
-    mode_slopes,
-    noll_to_nm,
-    radial_polynomial,
-    slope_ranges,
-    zernike,
-)
-from psfdae_paper.raytracing import FIRST_NOLL
 from psfdae_paper.stars.framing import normalise_flux
 
 
@@ -112,8 +102,17 @@ class AlignmentStamps:
         )
         if movable:
             self._modes = partial(movable_modes, self._modes, telescope.pixel)
-        self._slopes = mode_slopes(self._modes)
-        self._operators: dict[int, ModalStamps] = {}
+        side, pixel = alignment.stamp_px, telescope.pixel
+        self.propagation = SampledStamps(
+            telescope.obscuration,
+            self._modes,
+            partial(PeriodSampling, stamp_px=side, pixel=pixel, precision=optics.precision),
+            side,
+            pixel,
+            optics.pupil_samples,
+            batch=optics.batch,
+            threads=optics.threads,
+        )
 
     def __call__(self, zernikes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Flux-normalised stamps.
@@ -137,13 +136,8 @@ class AlignmentStamps:
         EnergyError
             If a stamp holds less than `alignment.least_energy`.
         """
-        shape, zernikes = zernikes.shape[:-1], zernikes.reshape(-1, zernikes.shape[-1])
-        raw = self._empty(len(zernikes))
-
-        def propagate(operator: ModalStamps, part: np.ndarray) -> None:
-            raw[part] = operator.stamps(zernikes[part])
-
-        self._run(zernikes, self.optics.batch, propagate)
+        shape = zernikes.shape[:-1]
+        raw = self.propagation.stamps(zernikes.reshape(-1, zernikes.shape[-1]))
         stamps, energy = normalise_flux(raw)
         self._check_energy(energy)
         return stamps.reshape(*shape, *stamps.shape[1:]), energy.reshape(shape)
@@ -175,54 +169,14 @@ class AlignmentStamps:
         """
         shape, count = zernikes.shape[:-1], directions.shape[-2]
         if not count:
-            return self(zernikes)[0], self._empty(*shape, 0)
+            return self(zernikes)[0], np.empty((*shape, 0, *[self.alignment.stamp_px] * 2))
         zernikes, directions = (
             a.reshape(-1, *a.shape[len(shape) :]) for a in (zernikes, directions)
         )
-        stamps, energy = self._empty(len(zernikes)), np.empty(len(zernikes))
-        slopes = self._empty(len(zernikes), count)
-
-        def propagate(operator: ModalStamps, part: np.ndarray) -> None:
-            raw = operator.derivatives(zernikes[part], directions[part])
-            stamps[part], slopes[part], energy[part] = normalise_with_derivatives(*raw)
-
-        self._run(zernikes, max(1, self.optics.batch // count), propagate)
+        raw = self.propagation.derivatives(zernikes, directions)
+        stamps, slopes, energy = normalise_with_derivatives(*raw)
         self._check_energy(energy)
         return stamps.reshape(*shape, *stamps.shape[1:]), slopes.reshape(*shape, *slopes.shape[1:])
-
-    def samples(self, zernikes: np.ndarray) -> np.ndarray:
-        """Pupil samples N of each wavefront, (B, J) to (B,).
-
-        Raises
-        ------
-        SamplingError
-            If the largest grid size is below what a wavefront needs: half a wave per
-            sample, and no replica of the image on the stamp.
-        """
-        half = 0.5 * self.alignment.stamp_px * self.telescope.pixel
-        reach = np.broadcast_to([-half, half], (2, 2))
-        needed = required_samples(slope_ranges(self._slopes, zernikes), reach)
-        return choose_samples(needed, tuple(self.optics.pupil_samples))
-
-    def operator(self, samples: int) -> ModalStamps:
-        """The operator on a pupil grid with N samples across; made once, then kept."""
-        if samples not in self._operators:
-            pupil, pixel = annular_pupil(samples, self.telescope.obscuration), self.telescope.pixel
-            sampling = PeriodSampling(pupil, self.alignment.stamp_px, pixel, self.optics.precision)
-            self._operators[samples] = ModalStamps(pupil, self._modes, sampling, pixel)
-        return self._operators[samples]
-
-    def _empty(self, *count: int) -> np.ndarray:
-        side = self.alignment.stamp_px
-        return np.empty((*count, side, side), np.empty(0, self.optics.precision).real.dtype)
-
-    def _run(
-        self, zernikes: np.ndarray, size: int, work: Callable[[ModalStamps, np.ndarray], None]
-    ) -> None:
-        def prepare(samples: int) -> Callable[[np.ndarray], None]:
-            return partial(work, self.operator(samples))
-
-        in_batches(self.samples(zernikes), size, self.optics.threads, prepare)
 
     def _check_energy(self, energy: np.ndarray) -> None:
         least = self.alignment.least_energy

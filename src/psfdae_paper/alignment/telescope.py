@@ -1,7 +1,7 @@
 """Scene 3: a telescope with a misaligned secondary mirror, its states and its wavefronts.
 
 A state is four numbers in units of the range, in the order of
-`psfdae_paper.optics.raytracing.DEGREES_OF_FREEDOM`. Its data are the stamps at a few fields.
+`psfdae.optics.raytracing.DEGREES_OF_FREEDOM`. Its data are the stamps at a few fields.
 Wavefronts leave out piston and tilts: all fields move together with the secondary, and
 a stamp is centred on its own centroid.
 
@@ -23,10 +23,10 @@ from itertools import combinations_with_replacement, product
 import numpy as np
 
 from psfdae.errors import Error
+from psfdae.telescope.aberrations import Prescription
+from psfdae.telescope.raytracing import ZernikeTracer, build_optic
+from psfdae.telescope.settings import Telescope
 from psfdae_paper.configuration.alignment import Alignment
-from psfdae_paper.configuration.telescope import Telescope
-from psfdae_paper.configuration.wavefront import Prescription
-from psfdae_paper.raytracing import ZernikeTracer, build_optic
 from psfdae_paper.stars.symmetry import SYMMETRIES, Symmetry
 
 PAIRS = tuple(combinations_with_replacement(range(4), 2))

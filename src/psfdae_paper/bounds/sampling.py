@@ -14,25 +14,30 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from math import lgamma
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
 import numpy as np
 
-from psfdae_paper.bounds.posterior import Bank, Likelihood, PosteriorSums, jitters, scored
-from psfdae_paper.configuration.schema import Framing, Optics
-from psfdae_paper.configuration.telescope import Telescope
-from psfdae_paper.optics.derivatives import ModalStamps, PointSampling, normalise_with_derivatives
-from psfdae_paper.optics.propagation import Precision, StampPropagator, in_batches
-from psfdae_paper.optics.pupil import annular_pupil, choose_samples, required_samples
-from psfdae_paper.optics.wavefronts import (
+from psfdae.optics.derivatives import (
+    PointSampling,
+    SampledStamps,
+    normalise_with_derivatives,
+)
+from psfdae.optics.propagation import Precision, StampPropagator, in_batches
+from psfdae.optics.pupil import annular_pupil
+from psfdae.optics.wavefronts import (
     MONOMIALS,
     SEIDEL_TERMS,
-    mode_slopes,
     monomial_coefficients,
     monomial_images,
-    slope_ranges,
 )
+from psfdae.sensing.climbing import Steps, poisson
+from psfdae.sensing.climbing import climb as climbed
+from psfdae.telescope.settings import Telescope
+from psfdae_paper.bounds.posterior import Bank, Likelihood, PosteriorSums, jitters, scored
+from psfdae_paper.configuration.schema import Framing, Optics
 from psfdae_paper.stars.framing import normalise_flux
 from psfdae_paper.stars.symmetry import SYMMETRIES
 
@@ -51,16 +56,6 @@ the tails of the proposals reach beyond what can be sampled."""
 BANK_MATCHES = 16
 """Best matches of the bank from which modes are sought: in as many fields, and in the own one at
 as many offsets."""
-
-
-class Climb(NamedTuple):
-    """Gauss–Newton steps from a match to a mode."""
-
-    most_steps: int = 12
-    least_gain: float = 0.02
-    """In log-posterior, that another step must promise."""
-    most_damping: float = 1e6
-    """At which a climb is given up."""
 
 
 class TwinSearch(NamedTuple):
@@ -111,7 +106,7 @@ class Proposals(NamedTuple):
     """Least part of the draws in the star's own field: all that counts where the field is given."""
 
 
-CLIMB, TWINS, SEARCH, PROPOSALS = Climb(), TwinSearch(), Search(), Proposals()
+TWINS, SEARCH, PROPOSALS = TwinSearch(), Search(), Proposals()
 
 CONJUGATE = np.array([1 - 2 * (name in ("r4", "xx", "xy", "yy")) for name in MONOMIALS])
 """Signs that negate the even part of a wavefront: its image stays the same."""
@@ -125,6 +120,8 @@ limit leaves out modes that the draws then find to hold the mass.
 
 EQUAL_PARTS = 4
 """Equal parts of the draws, whose errors tell whether they are enough."""
+
+CLIMB = Steps(depth=FARTHEST_EVIDENCE)
 
 STARS_AT_ONCE = 60
 """Stars whose draws are propagated together, to bound the memory."""
@@ -177,7 +174,8 @@ class StampModel:
 
             return propagate
 
-        in_batches(self._samples(coefficients, offset), self.optics.batch, 1, prepare)
+        samples = self._operators["complex64"].samples(coefficients, offset)
+        in_batches(samples, self.optics.batch, 1, prepare)
         return out
 
     def directions(self, field: np.ndarray) -> np.ndarray:
@@ -196,25 +194,14 @@ class StampModel:
 
         `samples` (n,) are pupil samples; by default as many as the stamps need.
         """
-        side, pixel = self.framing.stamp_px, self.telescope.pixel
-        stamps = np.empty((len(offset), side, side))
-        slopes = np.empty((*directions.shape[:2], side, side))
-
-        def prepare(samples: int) -> Callable[[np.ndarray], None]:
-            pupil = annular_pupil(samples, self.telescope.obscuration)
-            sampling = PointSampling(pupil, side, pixel, precision)
-            operator = ModalStamps(pupil, monomial_images, sampling, pixel)
-
-            def differentiate(draw: np.ndarray) -> None:
-                raw = operator.derivatives(coefficients[draw], directions[draw], offset[draw])
-                stamps[draw], slopes[draw], _ = normalise_with_derivatives(*raw)
-
-            return differentiate
-
-        if samples is None:
-            samples = self._samples(coefficients, offset)
-        in_batches(samples, self.optics.batch, 1, prepare)
-        return stamps.reshape(len(offset), -1), slopes.reshape(*directions.shape[:2], -1)
+        stamps, slopes, _ = normalise_with_derivatives(
+            *self._operators[precision].derivatives(coefficients, directions, offset, samples)
+        )
+        count = len(offset)
+        return (
+            stamps.reshape(count, -1).astype(np.float64),
+            slopes.reshape(*directions.shape[:2], -1).astype(np.float64),
+        )
 
     def information(
         self, stamps: np.ndarray, derivatives: np.ndarray, likelihood: Likelihood
@@ -224,13 +211,21 @@ class StampModel:
         mean = likelihood.flux * stamps + likelihood.background
         return (light / mean[:, None]) @ light.swapaxes(1, 2)
 
-    def _samples(self, coefficients: np.ndarray, offset: np.ndarray) -> np.ndarray:
-        # Only the stamp must be clear of replicas: nothing is searched around it.
-        half = np.array([-0.5, 0.5]) * self.framing.stamp_px
-        edges = (offset[:, ::-1, None] + half) * self.telescope.pixel  # (x, y) from (row, column)
-        needed = required_samples(slope_ranges(mode_slopes(monomial_images), coefficients), edges)
-        grid_sizes = sorted({*PUPIL_SAMPLES, *self.optics.pupil_samples})
-        return choose_samples(needed, tuple(grid_sizes))
+    @cached_property
+    def _operators(self) -> dict[Precision, SampledStamps]:
+        side, pixel = self.framing.stamp_px, self.telescope.pixel
+        return {
+            precision: SampledStamps(
+                self.telescope.obscuration,
+                monomial_images,
+                partial(PointSampling, stamp_px=side, pixel=pixel, precision=precision),
+                side,
+                pixel,
+                sorted({*PUPIL_SAMPLES, *self.optics.pupil_samples}),
+                batch=TERMS * self.optics.batch,
+            )
+            for precision in get_args(Precision)
+        }
 
 
 NOTHING, FIELD, TRUTH = range(3)
@@ -540,41 +535,23 @@ def climb(modes: Modes, counts: np.ndarray, likelihood: Likelihood, model: Stamp
     likelihood : Likelihood
     model : StampModel
     """
-    total = len(modes.star)
-    z, score = np.clip(modes.z, -FARTHEST_Z, FARTHEST_Z), np.full(total, -np.inf)
-    information, slope = np.tile(np.eye(TERMS), (total, 1, 1)), np.zeros((total, TERMS))
-    gain, damping = np.full(total, np.inf), np.full(total, 1e-2)
-    trial, active = z.copy(), np.arange(total)
-    for _ in range(CLIMB.most_steps):
-        a = active
-        field = modes.field[a]
-        coefficients, directions = model.coefficients(trial[a], field), model.directions(field)
-        stamps, jacobian = model.derivatives(coefficients, directions, modes.offset[a])
-        seen = counts[modes.star[a]]
-        value = log_posterior(stamps, trial[a], seen, likelihood)
-        better = value > score[a]
-        up = a[better]
-        information[up] = model.information(stamps[better], jacobian[better], likelihood)
-        information[up] += np.eye(TERMS)
-        excess = seen / (likelihood.flux * stamps + likelihood.background) - 1.0
-        light = likelihood.flux * jacobian @ excess[:, :, None]
-        slope[up] = light[better, :, 0] - trial[up]
-        z[up], score[up] = trial[up], value[better]
-        damping[a] *= np.where(better, 0.1, 10.0)
-        step = np.linalg.solve(information[a], slope[a][:, :, None])[:, :, 0]
-        gain[a] = 0.5 * (step * slope[a]).sum(axis=1)
-        hopeful = score + 2.0 * gain > _best(modes, score) - FARTHEST_EVIDENCE
-        active = np.flatnonzero(
-            hopeful & (gain > CLIMB.least_gain) & (damping < CLIMB.most_damping)
+
+    def evaluate(some: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, ...]:
+        field = modes.field[some]
+        coefficients, directions = model.coefficients(z, field), model.directions(field)
+        stamps, slopes = model.derivatives(coefficients, directions, modes.offset[some])
+        mean = likelihood.flux * stamps + likelihood.background
+        deviance, score, information = poisson(
+            counts[modes.star[some]], mean, likelihood.flux * slopes
         )
-        if not active.size:
-            break
-        ridge = damping[active, None, None] * information[active] * np.eye(TERMS)
-        step = np.linalg.solve(information[active] + ridge, slope[active][:, :, None])
-        trial[active] = np.clip(z[active] + step[:, :, 0], -FARTHEST_Z, FARTHEST_Z)
-    factor = np.linalg.cholesky(np.linalg.inv(information))
-    evidence = score + np.log(np.diagonal(factor, axis1=1, axis2=2)).sum(axis=1)
-    return _separate(replace(modes, z=z, factor=factor, evidence=evidence))
+        height = -0.5 * (deviance + (z**2).sum(axis=1))
+        return height, score - z, information + np.eye(TERMS)
+
+    group = (TRUTH + 1) * modes.star + modes.given
+    peaks = climbed(evaluate, modes.z, FARTHEST_Z, CLIMB, group)
+    factor = np.linalg.cholesky(np.linalg.inv(peaks.information))
+    evidence = peaks.height + np.log(np.diagonal(factor, axis1=1, axis2=2)).sum(axis=1)
+    return _separate(replace(modes, z=peaks.parameters, factor=factor, evidence=evidence))
 
 
 def unexplained(

@@ -12,6 +12,7 @@ from psfdae.files import Product, ProductError
 from psfdae.methods import method as method_named
 from psfdae.metrics import clustered_mean, mse
 from psfdae.model.star_sets import noise_model
+from psfdae.optics.wavefronts import monomial_coefficients
 from psfdae_paper.bounds.estimates import (
     ENOUGH_ESS,
     SPLIT,
@@ -37,7 +38,6 @@ from psfdae_paper.bounds.posterior import (
 )
 from psfdae_paper.bounds.tight import FEW, calibration
 from psfdae_paper.configuration.schema import Config
-from psfdae_paper.optics.wavefronts import monomial_coefficients
 
 if TYPE_CHECKING:
     import pandas as pd

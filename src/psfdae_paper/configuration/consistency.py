@@ -10,8 +10,8 @@ import numpy as np
 from pydantic import ValidationError, create_model, model_validator
 
 from psfdae.settings import Group
+from psfdae.telescope.settings import Telescope, has_own_aberrations
 from psfdae_paper.configuration.base import SEARCH
-from psfdae_paper.configuration.telescope import Telescope, has_own_aberrations
 
 SIMULATION = ("seed", "scene", "telescope", "grid", "wavefront", "stars", "framing", "optics")
 """Groups that decide the noise-free stars."""

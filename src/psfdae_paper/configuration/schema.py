@@ -29,6 +29,8 @@ from psfdae.settings import (
     SplitKind,
     Stamp,
 )
+from psfdae.telescope.aberrations import Prescription, Seidel
+from psfdae.telescope.settings import AnyTelescope
 from psfdae_paper.configuration.aligners import TRAINED
 from psfdae_paper.configuration.alignment import (
     Alignment,
@@ -40,8 +42,7 @@ from psfdae_paper.configuration.alignment import (
 from psfdae_paper.configuration.base import SEARCH, PupilSamples, SearchDistance
 from psfdae_paper.configuration.consistency import Consistent
 from psfdae_paper.configuration.methods import registered
-from psfdae_paper.configuration.telescope import AnyTelescope
-from psfdae_paper.configuration.wavefront import OfTelescope, Prescription, Seidel, VonKarman
+from psfdae_paper.configuration.wavefront import OfTelescope, VonKarman
 
 
 class Grid(Group):

@@ -16,6 +16,7 @@ from psfdae.belonging import require
 from psfdae.files import Column, read_product, write_csv, write_product
 from psfdae.options import File
 from psfdae.rng import stream
+from psfdae.telescope.raytracing import FIRST_NOLL, ZernikeTracer
 from psfdae.threads import limit_threads
 from psfdae_paper.alignment.stamps import AlignmentStamps
 from psfdae_paper.alignment.telescope import (
@@ -31,7 +32,6 @@ from psfdae_paper.alignment.telescope import (
 from psfdae_paper.configuration.alignment import CHOICE, OF_STATES, STATE_STAMPS, STATES
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.schema import Config
-from psfdae_paper.raytracing import FIRST_NOLL, ZernikeTracer
 
 ModelFile = Annotated[File, "Product of `alignment model`."]
 StatesFile = Annotated[File, "Product of `alignment states`."]

@@ -346,18 +346,18 @@ def fit(
         near = exact if method.free else replace(exact, stamps=emulator)
         first = fit_states(near, stamps, parameters_of(wavefronts, own, start), config.fit)
         # In focus, a state and its twin have nearly the same stamps.
-        others = twin_states(wavefronts, first.states, product["noll"])
+        others = twin_states(wavefronts, first.parameters, product["noll"])
         best, twins = refit_twins(near, stamps, first, others, config.fit)
-        found = best if near is exact else fit_states(exact, stamps, best.states, config.fit)
+        found = best if near is exact else fit_states(exact, stamps, best.parameters, config.fit)
         last = found.evaluations * (near is not exact)
         rows.append((test_set, level, method.name, time.perf_counter() - started, len(stamps)))
-        start = found.states[:, :4]  # where the next one starts: it has more to find
-        fits["estimates"].append(found.states[:, :4])
-        fits["deviance"].append(found.deviance)
+        start = found.parameters[:, :4]  # where the next one starts: it has more to find
+        fits["estimates"].append(found.parameters[:, :4])
+        fits["deviance"].append(-2.0 * found.height)
         fits["evaluations"].append([best.evaluations, last])
         fits["converged"].append(found.converged)
         fits["twin_tried"].append(twins)
-        fits["twin_won"].append(best.states[:, 0] != first.states[:, 0])
+        fits["twin_won"].append(best.parameters[:, 0] != first.parameters[:, 0])
     about = {
         "estimates": f"[method, state, number] maximum of the likelihood; {_names(methods)}",
         "deviance": "twice the log-likelihood missing to a perfect fit",

@@ -12,6 +12,8 @@ from psfdae.belonging import STATIC, require
 from psfdae.files import Product, read_product, write_csv
 from psfdae.metrics import mse, ssim
 from psfdae.noise import NoiseModel
+from psfdae.optics.pupil import Pupil
+from psfdae.optics.wavefronts import WavefrontSource
 from psfdae.options import File, Folder
 from psfdae.reading import read_table
 from psfdae.rng import stream
@@ -25,8 +27,6 @@ from psfdae_paper.evaluation.calibration import (
     original_noise_rows,
     residuals_by_scale,
 )
-from psfdae_paper.optics.pupil import Pupil
-from psfdae_paper.optics.wavefronts import WavefrontSource
 from psfdae_paper.stars.fields import assign_fields
 from psfdae_paper.stars.framing import Propagation, normalise_flux
 from psfdae_paper.stars.scenes import star_wavefronts, template_wavefronts

@@ -165,7 +165,7 @@ def _light(config: Config, fields: FieldOfPsfs, least_energy: float) -> list[str
 
 def _wide_enough(config: Config, worst: int) -> int | None:
     """Least even stamp that holds enough light of the field that needs the widest one."""
-    from psfdae_paper.optics.pupil import SamplingError
+    from psfdae.optics.pupil import SamplingError
     from psfdae_paper.stars.framing import FramingError, Propagation
 
     side = LARGEST * config.framing.stamp_px

@@ -19,10 +19,10 @@ import numpy as np
 from psfdae.files import atomic_path, write_fits
 from psfdae.image.observation import central_pixel
 from psfdae.noise import noise_equivalent_px
+from psfdae.optics.propagation import StampPropagator
+from psfdae.optics.pupil import annular_pupil
+from psfdae.optics.wavefronts import seidel_wavefronts
 from psfdae.rng import stream
-from psfdae_paper.optics.propagation import StampPropagator
-from psfdae_paper.optics.pupil import annular_pupil
-from psfdae_paper.optics.wavefronts import seidel_wavefronts
 
 OVERSAMPLING = 3  # sub-pixels per axis; seeing leaves nothing beyond their Nyquist frequency
 RENDER_PX = 32  # side of the square into which a star is drawn

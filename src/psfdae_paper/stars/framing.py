@@ -11,18 +11,18 @@ from collections.abc import Callable
 import numpy as np
 
 from psfdae.errors import Error
-from psfdae_paper.configuration.schema import Framing, Optics
-from psfdae_paper.configuration.telescope import Telescope
-from psfdae_paper.optics.propagation import EXTRA_POINTS, Precision, StampPropagator, in_batches
-from psfdae_paper.optics.pupil import (
+from psfdae.optics.propagation import EXTRA_POINTS, Precision, StampPropagator, in_batches
+from psfdae.optics.pupil import (
     Pupil,
     SamplingError,
     annular_pupil,
     choose_samples,
     required_samples,
 )
-from psfdae_paper.optics.seeing import BlurredPropagator
-from psfdae_paper.optics.wavefronts import WavefrontSource
+from psfdae.optics.seeing import BlurredPropagator
+from psfdae.optics.wavefronts import WavefrontSource
+from psfdae.telescope.settings import Telescope
+from psfdae_paper.configuration.schema import Framing, Optics
 
 Propagator = StampPropagator | BlurredPropagator
 

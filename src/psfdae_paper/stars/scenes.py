@@ -12,18 +12,18 @@ from typing import Any
 import numpy as np
 
 from psfdae.files import Column
-from psfdae.rng import stream
-from psfdae_paper.configuration.schema import Grid, Stars
-from psfdae_paper.configuration.telescope import OwnTelescope, Telescope
-from psfdae_paper.optics.pupil import Pupil, SamplingError, annular_pupil
-from psfdae_paper.optics.turbulence import SPECTRUM, Footprints, draw_waves, layer_r0
-from psfdae_paper.optics.wavefronts import (
+from psfdae.optics.pupil import Pupil, SamplingError, annular_pupil
+from psfdae.optics.wavefronts import (
     ModalWavefronts,
     field_coefficients,
     seidel_wavefronts,
     zernike_wavefronts,
 )
+from psfdae.rng import stream
+from psfdae.telescope.settings import OwnTelescope, Telescope
+from psfdae_paper.configuration.schema import Grid, Stars
 from psfdae_paper.stars.fields import perturb, relative_field, square_grid
+from psfdae_paper.stars.turbulence import SPECTRUM, Footprints, draw_waves, layer_r0
 
 CYCLES_PER_DIAMETER = 60
 """Highest spatial frequency of the turbulence, cycles across the pupil.
@@ -226,7 +226,7 @@ def static_terms(grid: Grid, telescope: OwnTelescope) -> tuple[tuple[int, ...], 
     aberrations = telescope.aberrations
     if aberrations.kind == "zernike":
         return aberrations.noll, field_coefficients(aberrations.polynomials, relative_field(grid))
-    from psfdae_paper.raytracing import FIRST_NOLL, ZernikeTracer, build_optic
+    from psfdae.telescope.raytracing import FIRST_NOLL, ZernikeTracer, build_optic
 
     _, angle_deg = square_grid(grid.points, grid.spacing_deg)
     tracer = ZernikeTracer(

@@ -24,7 +24,7 @@ from typing import Protocol
 
 import numpy as np
 
-from psfdae_paper.optics.pupil import Pupil
+from psfdae.optics.pupil import Pupil
 
 SEIDEL_TERMS = ("spherical", "coma", "astigmatism", "field_curvature", "distortion")
 """Order of the coefficients W040, W131, W222, W220, W311 in every array."""

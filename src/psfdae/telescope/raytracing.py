@@ -21,11 +21,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from psfdae.errors import Error
-from psfdae_paper.optics.wavefronts import noll_to_nm, zernike_basis
+from psfdae.optics.wavefronts import noll_to_nm, zernike_basis
 
 if TYPE_CHECKING:
-    from psfdae_paper.configuration.telescope import Telescope
-    from psfdae_paper.configuration.wavefront import Lens, Mirror, Prescription
+    from psfdae.telescope.aberrations import Lens, Mirror, Prescription
+    from psfdae.telescope.settings import Telescope
 
 DEGREES_OF_FREEDOM = ("decenter_x", "decenter_y", "tilt_x", "tilt_y")
 """Order of the four numbers of a state of misalignment."""

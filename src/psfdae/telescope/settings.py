@@ -13,10 +13,10 @@ from pydantic import (
     model_validator,
 )
 
+from psfdae.optics.pupil import pixel_width
+from psfdae.optics.seeing import Profile
 from psfdae.settings import Fraction, Group, Name, Positive
-from psfdae_paper.configuration.wavefront import Raytraced, Seidel, Zernike
-from psfdae_paper.optics.pupil import pixel_width
-from psfdae_paper.optics.seeing import Profile
+from psfdae.telescope.aberrations import Raytraced, Seidel, Zernike
 
 ABERRATIONS: dict[str, type[Group]] = {
     "seidel": Seidel,

@@ -28,8 +28,8 @@ from typing import Any, Literal
 
 import numpy as np
 
+from psfdae.optics.pupil import Pupil
 from psfdae.threads import side_by_side
-from psfdae_paper.optics.pupil import Pupil
 
 Backend = Literal["numpy", "torch"]
 Precision = Literal["complex64", "complex128"]

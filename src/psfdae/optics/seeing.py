@@ -5,7 +5,7 @@ the transfer function, and so does the pixel: on the lags l of the pupil's sampl
 
     |E(u)|² = Σ_l c_l exp(−πi l·spacing·u)
 
-(`psfdae_paper.optics.derivatives.PeriodSampling`), and stamps are the sums of c_l times the
+(`psfdae.optics.derivatives.PeriodSampling`), and stamps are the sums of c_l times the
 transfer functions of profile and pixel. Nothing is cut off or interpolated, but the image
 repeats with the pupil grid's period, and so do the wings of the profile (`Profile.reach`).
 """
@@ -16,8 +16,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from psfdae_paper.optics.propagation import Precision
-from psfdae_paper.optics.pupil import Pupil
+from psfdae.optics.propagation import Precision
+from psfdae.optics.pupil import Pupil
 
 FAINT = 1e-4
 """Fraction of the maximum below which wings of the next period do not matter.
@@ -70,6 +70,57 @@ class Profile:
         return self.scale * np.sqrt(FAINT ** (-1.0 / self.beta) - 1.0)
 
 
+class BlurredSampling:
+    """The whole period of the image, blurred; a `psfdae.optics.derivatives.Sampling`.
+
+    Parameters
+    ----------
+    pupil : Pupil
+    stamp_px : int
+        Pixels d along a side.
+    pixel : float
+        Pixel width in λ/D.
+    profile : Profile
+    precision : "complex64" or "complex128"
+    """
+
+    def __init__(
+        self, pupil: Pupil, stamp_px: int, pixel: float, profile: Profile, precision: Precision
+    ) -> None:
+        from scipy import fft  # here, because every configuration knows the profiles
+
+        self.dtype = np.dtype(np.float32 if precision == "complex64" else np.float64)
+        self.complex = np.dtype(precision)
+        self.points = n = fft.next_fast_len(2 * pupil.axis.size)
+        # Cycles per pixel of the lags; those of one sign stand for both, the image is real.
+        step = 0.5 * pupil.spacing * pixel * n
+        self.rows, self.columns = step * fft.fftfreq(n), step * fft.rfftfreq(n)
+        rows, columns = self.rows[:, None], self.columns
+        both = np.where(columns == 0.0, 1.0, 2.0)
+        blur = profile.transfer(np.hypot(rows, columns) / pixel)
+        weights = both * (pixel / n) ** 2 * np.sinc(rows) * np.sinc(columns)
+        self._transfer = (weights * blur).astype(self.dtype)
+        self._centres = np.arange(stamp_px) - 0.5 * (stamp_px - 1)
+
+    def fields(self, pupil_fields: np.ndarray) -> np.ndarray:
+        """Fields over the period, (..., M, M) to (..., n, n), up to a common phase per point."""
+        from scipy import fft
+
+        # Only the pupil's rows hold anything.
+        return fft.fft(fft.fft(pupil_fields, self.points), self.points, axis=-2)
+
+    def to_pixels(self, values: np.ndarray, offset_px: tuple[float, float] = (0, 0)) -> np.ndarray:
+        """Pixels (..., d, d) of intensities (..., n, n) around a place (row, column) in pixels."""
+        from scipy import fft
+
+        spectrum = fft.rfft2(values) * self._transfer
+        to_rows, to_columns = (
+            np.exp(2j * np.pi * np.outer(self._centres + offset, frequency)).astype(self.complex)
+            for offset, frequency in zip(offset_px, (self.rows, self.columns), strict=True)
+        )
+        return ((to_rows @ spectrum) @ to_columns.T).real
+
+
 class BlurredPropagator:
     """From OPD maps to blurred stamps, as `StampPropagator` without a blur; its parameters.
 
@@ -84,21 +135,9 @@ class BlurredPropagator:
         profile: Profile,
         precision: Precision = "complex128",
     ) -> None:
-        from scipy import fft  # here, because every configuration knows the profiles
-
-        self.real_dtype = np.dtype(np.float32 if precision == "complex64" else np.float64)
-        self._complex = np.dtype(precision)
-        self._points = n = fft.next_fast_len(2 * pupil.axis.size)
+        self._sampling = BlurredSampling(pupil, stamp_px, pixel, profile, precision)
+        self.real_dtype = self._sampling.dtype
         self._amplitude = (pupil.amplitude / np.sqrt(pupil.light)).astype(self.real_dtype)
-        # Cycles per pixel of the lags; those of one sign stand for both, the image is real.
-        step = 0.5 * pupil.spacing * pixel * n
-        self._rows, self._columns = step * fft.fftfreq(n), step * fft.rfftfreq(n)
-        rows, columns = self._rows[:, None], self._columns
-        both = np.where(columns == 0.0, 1.0, 2.0)
-        blur = profile.transfer(np.hypot(rows, columns) / pixel)
-        weights = both * (pixel / n) ** 2 * np.sinc(rows) * np.sinc(columns)
-        self._transfer = (weights * blur).astype(self.real_dtype)
-        self._centres = np.arange(stamp_px) - 0.5 * (stamp_px - 1)
 
     def __call__(self, opd: np.ndarray, offset_px: np.ndarray | None = None) -> np.ndarray:
         """As `StampPropagator`: (B, M, M) in waves and (B, 2) in pixels to (B, d, d)."""
@@ -106,17 +145,9 @@ class BlurredPropagator:
         return np.stack([self._stamp(*star) for star in zip(opd, offset_px, strict=True)])
 
     def _stamp(self, opd: np.ndarray, offset_px: np.ndarray) -> np.ndarray:
-        from scipy import fft
-
         phase = (2.0 * np.pi) * opd.astype(self.real_dtype)
-        pupil_field = np.empty(phase.shape, self._complex)
+        pupil_field = np.empty(phase.shape, self._sampling.complex)
         pupil_field.real, pupil_field.imag = np.cos(phase), np.sin(phase)
         pupil_field *= self._amplitude
-        # Only the pupil's rows hold anything.
-        image = fft.fft(fft.fft(pupil_field, self._points), self._points, axis=0)
-        spectrum = fft.rfft2(image.real**2 + image.imag**2) * self._transfer
-        to_rows, to_columns = (
-            np.exp(2j * np.pi * np.outer(self._centres + offset, frequency)).astype(self._complex)
-            for offset, frequency in zip(offset_px, (self._rows, self._columns), strict=True)
-        )
-        return ((to_rows @ spectrum) @ to_columns.T).real
+        image = self._sampling.fields(pupil_field)
+        return self._sampling.to_pixels(image.real**2 + image.imag**2, offset_px)

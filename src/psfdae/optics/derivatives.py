@@ -1,44 +1,63 @@
 """A stamp and its derivatives with respect to coefficients of pupil modes.
 
 The OPD is a sum of modes, W = Σ c_j M_j. The field in the image is that of
-`psfdae_paper.optics.propagation`, E = Σ A exp(2πiW) exp(−πiu·x). A direction v in the
+`psfdae.optics.propagation`, E = Σ A exp(2πiW) exp(−πiu·x). A direction v in the
 space of coefficients changes it by dE = Σ 2πi (Σ v_j M_j) A exp(2πiW) exp(−πiu·x),
 another such sum, and the intensity by d|E|² = 2 Re(E* dE): derivatives are exact
 and each costs about as much as a stamp.
 
-Two ways lead from the pupil to the pixels. Both sample the image on a separable
-set of points and turn the intensities there into pixels with one matrix:
+Three ways lead from the pupil to the pixels, a `Sampling` each:
 
 - `PointSampling`: the points of `StampPropagator` and a matrix DFT, for stamps
   narrower than the image's period;
 - `PeriodSampling`: the whole period of the image by a Fourier transform. The
   intensity is a trigonometric polynomial, which its samples determine, so pixels
-  are integrated exactly. It is the faster one for stamps nearly as wide as it.
+  are integrated exactly. It is the faster one for stamps nearly as wide as it;
+- `psfdae.optics.seeing.BlurredSampling`: the same period, blurred by the atmosphere.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 import numpy as np
 from scipy import fft
 
-from psfdae_paper.optics.propagation import Precision, image_points
-from psfdae_paper.optics.pupil import Pupil
-from psfdae_paper.optics.wavefronts import Modes
+from psfdae.optics.propagation import Precision, image_points, in_batches
+from psfdae.optics.pupil import Pupil, annular_pupil, choose_samples, required_samples
+from psfdae.optics.wavefronts import Modes, mode_slopes, slope_ranges
 
 
 class Sampling(Protocol):
     """Points of the image plane, and what they contribute to the pixels of a stamp."""
 
-    pixels: np.ndarray
-    """Shape (d, m): pixels = P I Pᵀ for intensities I, shape (m, m)."""
+    dtype: np.dtype
+    """float32 or float64, of the pixels."""
 
     def fields(self, pupil_fields: np.ndarray) -> np.ndarray:
         """Fields at the points, (..., M, M) to (..., m, m), up to a common phase per point."""
 
+    def to_pixels(self, values: np.ndarray) -> np.ndarray:
+        """Pixels (..., d, d) of intensities, or of their slopes, at the points (..., m, m)."""
 
-class PointSampling:
+
+class Separable:
+    """Points of which one matrix P (d, m) makes pixels, P I Pᵀ."""
+
+    pixels: np.ndarray
+
+    @property
+    def dtype(self) -> np.dtype:
+        """See `Sampling`."""
+        return self.pixels.dtype
+
+    def to_pixels(self, values: np.ndarray) -> np.ndarray:
+        """See `Sampling`."""
+        return self.pixels @ (values @ self.pixels.T)
+
+
+class PointSampling(Separable):
     """The points of `image_points` on both sides of the chief ray; its parameters."""
 
     def __init__(self, pupil: Pupil, stamp_px: int, pixel: float, precision: Precision) -> None:
@@ -55,7 +74,7 @@ class PointSampling:
         return self._dft.T @ (pupil_fields @ self._dft)
 
 
-class PeriodSampling:
+class PeriodSampling(Separable):
     """Equidistant points over the period of the image, 2/spacing λ/D.
 
     With lags l of the pupil's samples, |E(u)|² = Σ_l c_l exp(−πi l·spacing·u); the
@@ -102,7 +121,7 @@ class ModalStamps:
     """
 
     def __init__(self, pupil: Pupil, modes: Modes, sampling: Sampling, pixel: float) -> None:
-        dtype = sampling.pixels.dtype
+        self.dtype = dtype = sampling.dtype
         self.shape = pupil.amplitude.shape
         self._sampling = sampling
         self._pixel = pixel
@@ -126,7 +145,7 @@ class ModalStamps:
             Fraction of the light through the pupil on each pixel.
         """
         field = self._sampling.fields(self._pupil_fields(coefficients, offset_px))
-        return self._to_pixels(field.real**2 + field.imag**2)
+        return self._sampling.to_pixels(field.real**2 + field.imag**2)
 
     def derivatives(
         self,
@@ -161,7 +180,7 @@ class ModalStamps:
         change = self._sampling.fields(turned)
         intensity = (image.real**2 + image.imag**2)[:, 0]
         slope = 2.0 * (image.real * change.real + image.imag * change.imag)
-        return self._to_pixels(intensity), self._to_pixels(slope)
+        return self._sampling.to_pixels(intensity), self._sampling.to_pixels(slope)
 
     def opd(self, coefficients: np.ndarray) -> np.ndarray:
         """OPD maps in waves, shape (B, M, M)."""
@@ -181,9 +200,124 @@ class ModalStamps:
         fields *= self._amplitude
         return fields
 
-    def _to_pixels(self, values: np.ndarray) -> np.ndarray:
-        pixels = self._sampling.pixels
-        return pixels @ (values @ pixels.T)
+
+class SampledStamps:
+    """Stamps of sums of modes, each on the smallest pupil grid that its slopes allow.
+
+    Batches run side by side in threads; results do not depend on their number.
+
+    Parameters
+    ----------
+    obscuration : float
+        Linear central obscuration of the pupil.
+    modes : Modes
+    sampling : callable
+        From a pupil to its `Sampling`.
+    stamp_px : int
+        Pixels d along a side.
+    pixel : float
+        Pixel width in λ/D.
+    sizes : sequence of int
+        Pupil samples N to choose from, ascending.
+    reach : float
+        Distance in λ/D around a stamp from which light is spread into it.
+    batch, threads : int
+        Stamps or derivatives that are propagated together, and batches at once.
+    """
+
+    def __init__(
+        self,
+        obscuration: float,
+        modes: Modes,
+        sampling: Callable[[Pupil], Sampling],
+        stamp_px: int,
+        pixel: float,
+        sizes: Sequence[int],
+        reach: float = 0.0,
+        batch: int = 16,
+        threads: int = 1,
+    ) -> None:
+        self.stamp_px, self.pixel, self.sizes, self.reach = stamp_px, pixel, tuple(sizes), reach
+        self._obscuration, self._modes, self._sampling = obscuration, modes, sampling
+        self._batch, self._threads = batch, threads
+        self._slopes = mode_slopes(modes)
+        self._operators: dict[int, ModalStamps] = {}
+
+    def operator(self, samples: int) -> ModalStamps:
+        """The operator on a pupil grid with N samples across; made once, then kept."""
+        if samples not in self._operators:
+            pupil = annular_pupil(samples, self._obscuration)
+            self._operators[samples] = ModalStamps(
+                pupil, self._modes, self._sampling(pupil), self.pixel
+            )
+        return self._operators[samples]
+
+    def samples(self, coefficients: np.ndarray, offset_px: np.ndarray | None = None) -> np.ndarray:
+        """Pupil samples N of each wavefront, (B, J) to (B,); offsets as in `ModalStamps.stamps`.
+
+        Raises
+        ------
+        SamplingError
+            If the largest grid size is below what a wavefront needs.
+        """
+        offset_px = np.zeros((len(coefficients), 2)) if offset_px is None else offset_px
+        half = np.array([-0.5, 0.5]) * self.stamp_px
+        edges = (offset_px[:, ::-1, None] + half) * self.pixel  # (x, y) from (row, column)
+        edges = edges + np.array([-self.reach, self.reach])
+        return choose_samples(
+            required_samples(slope_ranges(self._slopes, coefficients), edges), self.sizes
+        )
+
+    def stamps(self, coefficients: np.ndarray, offset_px: np.ndarray | None = None) -> np.ndarray:
+        """As `ModalStamps.stamps`; raises as `samples`."""
+        out = np.empty((len(coefficients), self.stamp_px, self.stamp_px), self._dtype)
+
+        def prepare(samples: int) -> Callable[[np.ndarray], None]:
+            operator = self.operator(samples)
+
+            def propagate(part: np.ndarray) -> None:
+                offset = None if offset_px is None else offset_px[part]
+                out[part] = operator.stamps(coefficients[part], offset)
+
+            return propagate
+
+        in_batches(self.samples(coefficients, offset_px), self._batch, self._threads, prepare)
+        return out
+
+    def derivatives(
+        self,
+        coefficients: np.ndarray,
+        directions: np.ndarray,
+        offset_px: np.ndarray | None = None,
+        samples: np.ndarray | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """As `ModalStamps.derivatives`, directions (B, K, J); raises as `samples`.
+
+        `samples` (B,) are pupil samples, by default as many as the stamps need.
+        """
+        count, side = directions.shape[1], self.stamp_px
+        stamps = np.empty((len(coefficients), side, side), self._dtype)
+        slopes = np.empty((len(coefficients), count, side, side), self._dtype)
+
+        def prepare(samples: int) -> Callable[[np.ndarray], None]:
+            operator = self.operator(samples)
+
+            def differentiate(part: np.ndarray) -> None:
+                offset = None if offset_px is None else offset_px[part]
+                stamps[part], slopes[part] = operator.derivatives(
+                    coefficients[part], directions[part], offset
+                )
+
+            return differentiate
+
+        if samples is None:
+            samples = self.samples(coefficients, offset_px)
+        in_batches(samples, max(1, self._batch // count), self._threads, prepare)
+        return stamps, slopes
+
+    @property
+    def _dtype(self) -> np.dtype:
+        return self.operator(self.sizes[0]).dtype
 
 
 def normalise_with_derivatives(

@@ -1,0 +1,1 @@
+"""Wavefront sensing: the aberrations of a telescope from the images of its stars."""

@@ -1,0 +1,1 @@
+"""A telescope as settings: aperture, detector, field, aberrations and seeing."""

@@ -1,0 +1,222 @@
+"""Static aberrations of a telescope: Seidel terms, Zernike terms over the field, a ray trace."""
+
+from __future__ import annotations
+
+import re
+from itertools import pairwise
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+
+from psfdae.optics.wavefronts import SEIDEL_TERMS
+from psfdae.settings import Finite, Group, Name, Positive
+
+
+def _not_zero(value: float) -> float:
+    if value == 0:
+        raise ValueError("must not be 0")
+    return value
+
+
+Radius = Annotated[Finite, AfterValidator(_not_zero)]
+
+
+class Mirror(Group):
+    """A conic mirror."""
+
+    radius_m: Radius = Field(description="Radius of curvature, > 0: centre above the vertex")
+    conic: Finite = Field(description="Conic constant")
+    vertex_m: Finite = Field(description="z of the vertex")
+
+
+class Secondary(Mirror):
+    """The mirror that is misaligned."""
+
+    clear_radius_m: Positive = Field(description="Rays beyond this radius are vignetted")
+
+
+class Lens(Group):
+    """A lens with two spherical surfaces; light meets the front first."""
+
+    front_radius_m: Radius = Field(description="Radius of curvature, > 0: centre above vertex")
+    back_radius_m: Radius = Field(description="As front_radius_m")
+    front_vertex_m: Finite = Field(description="z of the front vertex")
+    back_vertex_m: Finite = Field(description="z of the back vertex, below the front")
+    clear_radius_m: Positive = Field(description="Rays beyond this radius are vignetted")
+
+    @model_validator(mode="after")
+    def _thick(self) -> Lens:
+        thickness = self.front_vertex_m - self.back_vertex_m
+        if not thickness > 0:
+            raise ValueError(
+                f"thickness = {thickness:.6g} m (front_vertex_m − back_vertex_m): "
+                "must be greater than 0"
+            )
+        return self
+
+
+class Glass(Group):
+    """Sellmeier's equation, n² − 1 = Σ b λ² / (λ² − c)."""
+
+    sellmeier_b: Annotated[list[Finite], Field(min_length=3, max_length=3)] = Field(
+        description="Strengths of the three resonances"
+    )
+    sellmeier_c_um2: Annotated[list[Finite], Field(min_length=3, max_length=3)] = Field(
+        description="In square micrometres"
+    )
+
+
+class Prescription(Group):
+    """One or two mirrors, and lenses behind the second; z up, light along −z.
+
+    Without a secondary the light is focused above the primary. A flat mirror that folds it,
+    as in a Newtonian, is left out: it is nothing but the telescope's obscuration.
+    """
+
+    name: Name = Field(description="For titles and messages")
+    entrance_pupil_m: Finite = Field(description="z of the plane that holds the pupil")
+    launch_distance_m: Positive = Field(description="Start of the rays above that plane")
+    reference_sphere_m: Positive = Field(description="Radius of the wavefront's reference")
+    primary: Mirror
+    secondary: Secondary | None = Field(default=None, description="Null: none, or a flat one")
+    lenses: dict[Name, Lens] = Field(
+        default_factory=dict, description="Lenses of the corrector, by name"
+    )
+    glass: Glass | None = Field(default=None, description="Of all lenses")
+    best_focus_m: Finite = Field(description="z of the detector in focus")
+
+    @property
+    def ordered_lenses(self) -> list[tuple[str, Lens]]:
+        """Name and lens in the order in which light meets them."""
+        return sorted(self.lenses.items(), key=lambda item: -item[1].front_vertex_m)
+
+    @model_validator(mode="after")
+    def _complete(self) -> Prescription:
+        if self.lenses and self.secondary is None:
+            raise ValueError(f"lenses = {list(self.lenses)}: must lie behind a secondary")
+        if bool(self.lenses) != (self.glass is not None):
+            raise ValueError("glass: must be given for lenses, and for nothing else")
+        return self
+
+    @model_validator(mode="after")
+    def _in_order(self) -> Prescription:
+        primary = ("primary", self.primary.vertex_m)
+        focus = ("best focus", self.best_focus_m)
+        upwards, downwards = [primary, focus], []
+        if self.secondary is not None:
+            secondary = ("secondary", self.secondary.vertex_m)
+            upwards, downwards = [primary, secondary], [secondary]
+            for name, lens in self.ordered_lenses:
+                downwards += [(f"front of {name}", lens.front_vertex_m)]
+                downwards += [(f"back of {name}", lens.back_vertex_m)]
+            downwards += [focus]
+        for sign, path in ((1, upwards), (-1, downwards)):
+            for (start, z_start), (end, z_end) in pairwise(path):
+                distance = sign * (z_end - z_start)
+                if not distance > 0:
+                    raise ValueError(
+                        f"distance from {start} to {end} = {distance:.6g} m: must be greater than 0"
+                    )
+        return self
+
+
+HIGHEST_NOLL = 45
+HIGHEST_POWER = 6
+
+
+class Seidel(Group):
+    """Static third-order aberrations in waves at H = 1."""
+
+    kind: Literal["seidel"] = Field(description="Tells which keys follow")
+    spherical: Finite = Field(description="W040, waves")
+    coma: Finite = Field(description="W131, waves")
+    astigmatism: Finite = Field(description="W222, waves")
+    field_curvature: Finite = Field(description="W220, waves")
+    distortion: Finite = Field(description="W311, waves")
+
+    @property
+    def coefficients(self) -> np.ndarray:
+        """In waves, in the order of `SEIDEL_TERMS`, shape (5,)."""
+        return np.array([getattr(self, term) for term in SEIDEL_TERMS])
+
+
+def _constant(term: Any) -> Any:
+    """A bare number is a term that is the same over the whole field."""
+    return {"constant": term} if isinstance(term, int | float) else term
+
+
+def _powers_of_the_field(term: dict[str, float]) -> dict[str, float]:
+    for name in term:
+        if name != "constant" and not re.fullmatch(r"(?=.)x*y*", name):
+            raise ValueError(f"{name!r}: must be constant or a product such as x, yy or xxy")
+        if name != "constant" and len(name) > HIGHEST_POWER:
+            raise ValueError(f"{name!r}: must be of degree {HIGHEST_POWER} or less")
+    return term
+
+
+FieldPolynomial = Annotated[
+    dict[str, Finite],
+    Field(min_length=1),
+    BeforeValidator(_constant),
+    AfterValidator(_powers_of_the_field),
+]
+
+
+def _noll_terms(terms: dict[str, dict[str, float]]) -> dict[str, dict[str, float]]:
+    for name in terms:
+        number = re.fullmatch(r"z([1-9]\d?)", name)
+        if number is None or not 2 <= int(number[1]) <= HIGHEST_NOLL:
+            raise ValueError(f"{name!r}: must be between z2 and z{HIGHEST_NOLL} (Noll's order)")
+    return terms
+
+
+class Zernike(Group):
+    """Static Zernike terms whose coefficients are polynomials of the field.
+
+    Noll's order and normalisation: a coefficient is the RMS of its term over the unit
+    disc. The field vector (x, y) has length 1 at `field_edge_deg`.
+    """
+
+    kind: Literal["zernike"] = Field(description="Tells which keys follow")
+    terms: Annotated[
+        dict[str, FieldPolynomial], Field(min_length=1), AfterValidator(_noll_terms)
+    ] = Field(
+        description="Waves RMS by Noll index and power of the field: "
+        "z8: {constant: 0.1, x: 0.3, xyy: 0.02}"
+    )
+    jitter_waves: Annotated[float, Field(ge=0, le=100)] = Field(
+        default=0.0, description="Standard deviation added to every term of every star"
+    )
+
+    @property
+    def noll(self) -> tuple[int, ...]:
+        """Noll indices of the terms, ascending."""
+        return tuple(sorted(int(name[1:]) for name in self.terms))
+
+    @property
+    def polynomials(self) -> list[dict[tuple[int, int], float]]:
+        """Coefficient in waves by powers (of x, of y) of the field, in the order of `noll`."""
+        return [
+            {
+                (0, 0) if name == "constant" else (name.count("x"), name.count("y")): waves
+                for name, waves in self.terms[f"z{noll}"].items()
+            }
+            for noll in self.noll
+        ]
+
+
+class Raytraced(Group):
+    """Aberrations of an aligned telescope by ray tracing (batoid)."""
+
+    kind: Literal["raytraced"] = Field(description="Tells which keys follow")
+    prescription: Prescription
+    defocus_m: Annotated[float, Field(ge=-0.01, le=0.01)] = Field(
+        default=0.0, description="Distance of the detector beyond best focus"
+    )
+    highest_zernike: Annotated[int, Field(ge=11, le=HIGHEST_NOLL)] = Field(
+        default=22, description="Highest Noll index of the wavefront"
+    )
+    jitter_waves: Annotated[float, Field(ge=0, le=100)] = Field(
+        default=0.0, description="Standard deviation added to every Zernike term of every star"
+    )
