@@ -7,6 +7,10 @@ For stars of your own::
     report = psfdae.validate(model, stars)
     model.save("image.psf.safetensors")
 
+Of a telescope that is known::
+
+    found = psfdae.wavefront(stamps, "telescope.yaml", field_deg=field, joint=True)
+
 `load_model` gives a trained model; its methods `predict` and `psf_at` give PSFs. No call writes a
 file unless it is named for that, prints, or changes threads or random generators of the process.
 Refusals are of the class `Error`.
@@ -27,6 +31,8 @@ if TYPE_CHECKING:
     from psfdae.model.psf_model import PredictionError, PsfModel, load_model
     from psfdae.model.stars import Stars
     from psfdae.model.validation import Report, validate
+    from psfdae.sensing.results import Wavefronts, wavefront
+    from psfdae.telescope.settings import read_telescope
 
 _MODULES = {
     "Error": "errors",
@@ -36,9 +42,12 @@ _MODULES = {
     "Report": "model.validation",
     "StarFlag": "image.stamps",
     "Stars": "model.stars",
+    "Wavefronts": "sensing.results",
     "fit": "model.fitting",
     "load_model": "model.psf_model",
+    "read_telescope": "telescope.settings",
     "validate": "model.validation",
+    "wavefront": "sensing.results",
 }
 
 __all__ = [
@@ -49,10 +58,13 @@ __all__ = [
     "Report",
     "StarFlag",
     "Stars",
+    "Wavefronts",
     "__version__",
     "fit",
     "load_model",
+    "read_telescope",
     "validate",
+    "wavefront",
 ]
 
 

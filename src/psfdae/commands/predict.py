@@ -167,7 +167,7 @@ def restored(
     source = stated.source(stars, flux_column=flux_column, background_column=background_column)
     found = out.with_name(f"{out.stem}_stars.csv") if stated.detect else None
     check_outputs((out, plot, found), (*source.files(), model))
-    _check_targets(out, plot, found, overwrite)
+    check_targets(out, plot, found, overwrite)
     loaded = load_model(model)
     observation = source.open(loaded.info.stamp_px, MARGIN_PX)
     if loaded.info.source == "stars":  # which may have been trained without knowing it, too
@@ -206,7 +206,8 @@ def restored(
     return "\n".join([observation.said(), *([off] if off else []), clean_of])
 
 
-def _check_targets(out: Path, plot: Path | None, found: Path | None, overwrite: bool) -> None:
+def check_targets(out: Path, plot: Path | None, found: Path | None, overwrite: bool) -> None:
+    """Refuse files that are there already, unless a killed run left them or `overwrite` says so."""
     ours = overwrite or (not out.exists() and interrupted(out))
     for target in (out, plot, found):
         if target is None:

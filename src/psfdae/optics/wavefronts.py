@@ -175,6 +175,15 @@ def field_coefficients(
 Modes = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Modes at pupil points (x, y) in pupil radii, shapes (...) to (J, ...)."""
 
+
+def movable_modes(
+    modes: Modes, pixel: float, x: np.ndarray | float, y: np.ndarray | float
+) -> np.ndarray:
+    """Modes, (J, ...), and two tilts that move the image by a pixel along x and y, (J + 2, ...)."""
+    tilts = 0.5 * pixel * np.stack(np.broadcast_arrays(x, y))
+    return np.concatenate([modes(x, y), tilts])
+
+
 SLOPE_POINTS = 65
 """Points per axis at which slopes are measured."""
 

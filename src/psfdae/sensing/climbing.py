@@ -93,6 +93,31 @@ def poisson(
     return deviance, score, weighted @ slopes.swapaxes(1, 2)
 
 
+def together(
+    score: np.ndarray, information: np.ndarray, shared: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Score (n, K) and information (n, K, K) of images that share their first parameters.
+
+    Parameters
+    ----------
+    score, information : ndarray, shapes (n, F, k) and (n, F, k, k)
+        Of F images, by the k parameters of each.
+    shared : int
+        Number s of the first that are common; K = s + F (k − s): after them, the others of each
+        image in turn.
+    """
+    count, images, k = score.shape
+    own = k - shared
+    size = shared + images * own
+    all_scores, joint = np.zeros((count, size)), np.zeros((count, size, size))
+    for image in range(images):
+        first = shared + image * own
+        place = np.r_[0:shared, first : first + own]
+        all_scores[:, place] += score[:, image]
+        joint[:, place[:, None], place] += information[:, image]
+    return all_scores, joint
+
+
 def climb(
     evaluate: Evaluate,
     start: np.ndarray,

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import (
@@ -15,7 +17,8 @@ from pydantic import (
 
 from psfdae.optics.pupil import pixel_width
 from psfdae.optics.seeing import Profile
-from psfdae.settings import Fraction, Group, Name, Positive
+from psfdae.reading import read_yaml
+from psfdae.settings import ConfigError, Fraction, Group, Name, Positive, validate
 from psfdae.telescope.aberrations import Raytraced, Seidel, Zernike
 
 ABERRATIONS: dict[str, type[Group]] = {
@@ -62,6 +65,24 @@ class Seeing(Group):
         return self
 
 
+class Prior(Group):
+    """How far a telescope may be from what its file says, as `psfdae wavefront` assumes."""
+
+    fraction: Annotated[float, Field(ge=0, le=10)] = Field(
+        default=0.1, description="Relative standard deviation of every term"
+    )
+    waves: Annotated[float, Field(ge=0, le=100)] | None = Field(
+        default=None, description="Standard deviation in waves besides; null: jitter_waves"
+    )
+    defocus_m: Positive = Field(
+        default=1e-4, description="Of a ray trace: standard deviation of the detector's place"
+    )
+    decentre_m: Positive = Field(
+        default=1e-3, description="Likewise of the secondary's decentre along x and y"
+    )
+    tilt_deg: Positive = Field(default=0.1, description="Likewise of its tilt about x and y")
+
+
 def _aberrations(tree: Any) -> Any:
     if not isinstance(tree, Mapping):
         return tree
@@ -82,6 +103,7 @@ class OwnTelescope(Telescope):
         description="Static aberrations over the field"
     )
     seeing: Seeing | None = Field(default=None, description="Null: a telescope above the air")
+    prior: Prior | None = Field(default=None, description="Null: that of `Prior()`")
 
     @property
     def blur(self) -> Profile | None:
@@ -93,13 +115,14 @@ class OwnTelescope(Telescope):
 
     @model_serializer(mode="wrap")
     def _as_before(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        # Products of telescopes without seeing keep the bytes that they had before it.
-        return {k: v for k, v in dump(self).items() if k != "seeing" or v is not None}
+        # Products of telescopes without these keep the bytes that they had before them.
+        later = ("seeing", "prior")
+        return {k: v for k, v in dump(self).items() if k not in later or v is not None}
 
 
 def has_own_aberrations(tree: Any) -> bool:
     """Whether a telescope, checked or not yet, brings aberrations of its own."""
-    own = {"aberrations", "field_edge_deg", "seeing"}
+    own = {"aberrations", "field_edge_deg", "seeing", "prior"}
     return isinstance(tree, OwnTelescope) or (isinstance(tree, Mapping) and bool(own & set(tree)))
 
 
@@ -110,3 +133,56 @@ def _telescope(tree: Any) -> Any:
 
 
 AnyTelescope = Annotated[Telescope | OwnTelescope, BeforeValidator(_telescope)]
+
+
+DEFAULT = re.compile(r"(?:/(?P<group>\w+)(?:@(?P<place>[\w.]+))?: )?(?P<name>\w+)")
+"""An entry of the list `defaults`: a file of the same folder, or of another one."""
+
+
+def read_telescope(path: Path) -> OwnTelescope:
+    """A telescope of one's own from its YAML file.
+
+    Its list `defaults` may name other files, as those in `config/telescope` do: NAME is one of the
+    same folder, `/GROUP@KEY: NAME` one of the folder GROUP beside it, whose content becomes KEY.
+
+    Raises
+    ------
+    ConfigError
+        Names the file and each wrong key with its value and the allowed range.
+    """
+    try:
+        return validate(OwnTelescope, _composed(path))
+    except ConfigError as error:
+        lines = [line.removeprefix(f"{path}: ") for line in str(error).splitlines()]
+        raise ConfigError("\n".join(f"{path}: {line}" for line in lines)) from None
+
+
+def _composed(path: Path) -> dict[str, Any]:
+    """The tree of a file with those that it names."""
+    tree = read_yaml(path)
+    entries, whole = tree.pop("defaults", []), {}
+    if not isinstance(entries, list):
+        raise ConfigError(f"{path}: defaults = {entries!r}: must be a list")
+    for entry in [*entries, *([] if "_self_" in entries else ["_self_"])]:
+        text = "".join(f"{k}: {v}" for k, v in entry.items()) if isinstance(entry, dict) else entry
+        found = DEFAULT.fullmatch(str(text))
+        if found is None:
+            raise ConfigError(f"{path}: defaults: {entry!r}: must be NAME or /GROUP@KEY: NAME")
+        if text == "_self_":
+            whole = _merged(whole, tree)
+            continue
+        folder = path.parent.parent / found["group"] if found["group"] else path.parent
+        part = _composed(folder / f"{found['name']}.yaml")
+        for key in reversed(found["place"].split(".") if found["place"] else []):
+            part = {key: part}
+        whole = _merged(whole, part)
+    return whole
+
+
+def _merged(first: dict[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
+    """Two trees, of which the second one decides."""
+    merged = dict(first)
+    for key, value in second.items():
+        both = isinstance(value, Mapping) and isinstance(merged.get(key), Mapping)
+        merged[key] = _merged(merged[key], value) if both else value
+    return merged

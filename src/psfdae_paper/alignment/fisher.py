@@ -17,7 +17,7 @@ from collections.abc import Callable
 import numpy as np
 
 from psfdae.noise import NoiseModel
-from psfdae.sensing.climbing import poisson
+from psfdae.sensing.climbing import poisson, together
 from psfdae_paper.alignment.stamps import AlignmentStamps
 from psfdae_paper.alignment.telescope import QuadraticModel
 
@@ -93,15 +93,9 @@ def deviance_and_information(
     )
     slopes = flux * slopes.reshape(count * fields, k, -1).astype(np.float64)
     deviance, score, information = poisson(observed, expected, slopes)
-    score = score.reshape(count, fields, k)
     information = information.reshape(count, fields, k, k)
-    size = 4 + fields * (k - 4)
-    all_scores, joint = np.zeros((count, size)), np.zeros((count, size, size))
-    for field in range(fields):
-        place = np.r_[0:4, 4 + field * (k - 4) : 4 + (field + 1) * (k - 4)]
-        all_scores[:, place] += score[:, field]
-        joint[:, place[:, None], place] += information[:, field]
-    return deviance.reshape(count, fields).sum(axis=1), all_scores, joint
+    score, joint = together(score.reshape(count, fields, k), information, 4)
+    return deviance.reshape(count, fields).sum(axis=1), score, joint
 
 
 def bound_covariances(

@@ -14,7 +14,13 @@ import numpy as np
 
 from psfdae.errors import Error
 from psfdae.optics.derivatives import PeriodSampling, SampledStamps, normalise_with_derivatives
-from psfdae.optics.wavefronts import Modes, noll_to_nm, radial_polynomial, zernike
+from psfdae.optics.wavefronts import (
+    Modes,
+    movable_modes,
+    noll_to_nm,
+    radial_polynomial,
+    zernike,
+)
 from psfdae.telescope.raytracing import FIRST_NOLL
 from psfdae.telescope.settings import Telescope
 from psfdae_paper.configuration.alignment import Alignment
@@ -61,14 +67,6 @@ def centred_modes(highest: int, obscuration: float, x: np.ndarray, y: np.ndarray
         slope_x, slope_y = mean_slope(j, obscuration)
         modes.append(slope_x * x + slope_y * y - zernike(j, x, y))
     return np.stack(modes)
-
-
-def movable_modes(
-    modes: Modes, pixel: float, x: np.ndarray | float, y: np.ndarray | float
-) -> np.ndarray:
-    """Modes, (J, ...), and two tilts that move the image by a pixel along x and y, (J + 2, ...)."""
-    tilts = 0.5 * pixel * np.stack(np.broadcast_arrays(x, y))
-    return np.concatenate([modes(x, y), tilts])
 
 
 class AlignmentStamps:

@@ -4,7 +4,7 @@ What is unknown of a star are its field f, the pixels o from the chief ray to th
 its stamp, and the Seidel coefficients c. For one (f, o) the image is smooth in c, so a
 mode of the posterior is sought by Gauss–Newton steps from the bank's best matches, and
 coefficients are drawn around all modes found, from a mixture of Student's t. The mixture
-is adapted to its own draws (Cappé et al. 2008, Statistics and Computing 18, 447), and the
+is adapted to its own draws (`psfdae.sensing.sampling`), and the
 draws of all rounds are weighed by prior × likelihood over the density of all rounds
 together (Cornuet et al. 2012, Scandinavian Journal of Statistics 39, 798). Draws whose
 brightest pixel the simulator would not frame at o have no weight.
@@ -15,7 +15,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from math import lgamma
 from typing import NamedTuple, get_args
 
 import numpy as np
@@ -35,6 +34,7 @@ from psfdae.optics.wavefronts import (
 )
 from psfdae.sensing.climbing import Steps, poisson
 from psfdae.sensing.climbing import climb as climbed
+from psfdae.sensing.sampling import Mixture
 from psfdae.telescope.settings import Telescope
 from psfdae_paper.bounds.posterior import Bank, Likelihood, PosteriorSums, jitters, scored
 from psfdae_paper.configuration.schema import Framing, Optics
@@ -98,10 +98,6 @@ class Proposals(NamedTuple):
 
     rounds: tuple[float, ...] = (0.2, 0.3, 0.5)
     """Parts of the draws before the mixture is adapted once, twice, and after."""
-    freedom: float = 5.0
-    """Degrees of freedom of Student's t; its tails are heavier than any normal posterior's."""
-    prior_draws: float = 10.0
-    """Effective draws of a mode that change its scale half way to theirs."""
     own_share: float = 0.25
     """Least part of the draws in the star's own field: all that counts where the field is given."""
 
@@ -281,14 +277,15 @@ class Modes:
         pairs = zip(vars(self).values(), vars(other).values(), strict=True)
         return Modes(*(np.concatenate(pair) for pair in pairs))
 
+    @property
+    def mixture(self) -> Mixture:
+        """Student's t around the modes."""
+        return Mixture(self.z, self.factor, self.evidence)
+
     def log_density(self, z: np.ndarray, field: np.ndarray, offset: np.ndarray) -> np.ndarray:
         """Log-density of Student's t around every mode, shape (M, n), of draws (n, 5)."""
-        return _log_student(self._distance(z), self.factor) + self._elsewhere(field, offset)
-
-    def _distance(self, z: np.ndarray) -> np.ndarray:
-        """Squared distance in scale matrices, shape (M, n)."""
-        apart = np.linalg.solve(self.factor, (z - self.z[:, None]).swapaxes(1, 2))
-        return (apart**2).sum(axis=1)
+        mixture = self.mixture
+        return mixture.log_density(mixture.distance(z)) + self._elsewhere(field, offset)
 
     def _elsewhere(self, field: np.ndarray, offset: np.ndarray) -> np.ndarray:
         """−∞ for draws of another field or offset, otherwise 0, shape (M, n)."""
@@ -297,32 +294,10 @@ class Modes:
         return np.where(same, 0.0, -np.inf)
 
     def adapted(self, draws: Draws, log_weight: np.ndarray) -> Modes:
-        """Places, scales and masses of the modes by what all draws of the star weigh.
-
-        They stay as they are as long as no draw was possible.
-        """
-        if not np.isfinite(log_weight).any():
-            return self
-        distance = self._distance(draws.z)
-        log_part = _log_student(distance, self.factor) + self._elsewhere(draws.field, draws.offset)
-        log_part += self.evidence[:, None]
-        weight = np.exp(log_weight - log_weight.max())
-        with np.errstate(invalid="ignore"):
-            share = np.exp(log_part - np.logaddexp.reduce(log_part, axis=0))
-        share = np.where(np.isfinite(share), share, 0.0) * weight
-        mass = share.sum(axis=1)
-        known = mass**2 / np.maximum((share**2).sum(axis=1), np.finfo(float).tiny)
-        pull = (known / (known + PROPOSALS.prior_draws))[:, None]
-        share *= (PROPOSALS.freedom + TERMS) / (PROPOSALS.freedom + distance)
-        share /= np.maximum(share.sum(axis=1, keepdims=True), np.finfo(float).tiny)
-        z = self.z + pull * (share @ draws.z - self.z * share.sum(axis=1, keepdims=True))
-        apart = draws.z - z[:, None]
-        scale = (share[:, :, None] * apart).swapaxes(1, 2) @ apart
-        scale = pull[..., None] * scale + (1.0 - pull[..., None]) * (
-            self.factor @ self.factor.swapaxes(1, 2)
-        )
-        evidence = np.log(np.maximum(mass, np.finfo(float).tiny))
-        return replace(self, z=z, factor=np.linalg.cholesky(scale), evidence=evidence)
+        """Places, scales and masses of the modes by what all draws of the star weigh."""
+        elsewhere = self._elsewhere(draws.field, draws.offset)
+        found = self.mixture.adapted(draws.z, log_weight, elsewhere)
+        return replace(self, z=found.mean, factor=found.factor, evidence=found.evidence)
 
     def draws(self, count: int, own: int, rng: np.random.Generator) -> tuple[Draws, np.ndarray]:
         """About `count` draws around one star's modes and their number from each mode, (M,)."""
@@ -337,10 +312,7 @@ class Modes:
             share[own_field] += missing * inside / inside.sum()
         number = np.ceil(share * count).astype(int)
         mode = np.repeat(np.arange(share.size), number)
-        normal = rng.standard_normal((mode.size, TERMS))
-        tail = np.sqrt(PROPOSALS.freedom / rng.chisquare(PROPOSALS.freedom, mode.size))
-        moved = (self.factor[mode] @ (normal * tail[:, None])[:, :, None])[:, :, 0]
-        return Draws(self.field[mode], self.offset[mode], self.z[mode] + moved), number
+        return Draws(self.field[mode], self.offset[mode], self.mixture.draws(mode, rng)), number
 
 
 def sample(
@@ -428,18 +400,6 @@ def search(
     if own is None:
         modes = climb(modes + twins(modes, likelihood, model), *problem)
     return modes, unexplained(modes, *problem, SEARCH.missed)
-
-
-def _log_student(distance: np.ndarray, factor: np.ndarray) -> np.ndarray:
-    """Log-density of Student's t at squared distances (M, n) for Cholesky factors (M, 5, 5)."""
-    width = np.log(np.diagonal(factor, axis1=1, axis2=2)).sum(axis=1)
-    constant = lgamma(0.5 * (PROPOSALS.freedom + TERMS)) - lgamma(0.5 * PROPOSALS.freedom)
-    constant -= 0.5 * TERMS * np.log(PROPOSALS.freedom * np.pi)
-    return (
-        constant
-        - width[:, None]
-        - 0.5 * (PROPOSALS.freedom + TERMS) * np.log1p(distance / PROPOSALS.freedom)
-    )
 
 
 @dataclass(frozen=True)

@@ -243,9 +243,9 @@ def write_image(
     """Write an image with one noisy star per field, and its catalogue.
 
     The stars are moved together, so that little sky lies between them; their order
-    on the detector is that of the field. Their flux is F = snr √(B A), with the sky B
-    and the noise-equivalent area A of the mean PSF (King 1983, PASP 95, 163): the
-    S/N of a matched filter that is limited by the sky.
+    on the detector is that of the field, and the catalogue has their field angles. Their
+    flux is F = snr √(B A), with the sky B and the noise-equivalent area A of the mean PSF (King
+    1983, PASP 95, 163): the S/N of a matched filter that is limited by the sky.
 
     Parameters
     ----------
@@ -272,6 +272,7 @@ def write_image(
         x,
         y,
         pixel_scale_arcsec=config.telescope.pixel_scale_arcsec,
+        columns=dict(zip(("x_deg", "y_deg"), np.rad2deg(fields.field).T, strict=True)),
         GAIN=1.0,
         TELESCOP=config.telescope.name,
     )

@@ -183,13 +183,14 @@ def write_field(
     x: np.ndarray,
     y: np.ndarray,
     pixel_scale_arcsec: float = 1.0,
+    columns: Mapping[str, np.ndarray] | None = None,
     **cards: Any,
 ) -> None:
     """Write an image with header cards, float64 as float32, and a CSV catalogue of its stars.
 
     The image has a tangential WCS with north up; the catalogue has the columns id,
-    X_IMAGE, Y_IMAGE (1-based, as in SExtractor) and ra, dec (degrees). `x`, `y` are
-    0-based.
+    X_IMAGE, Y_IMAGE (1-based, as in SExtractor) and ra, dec (degrees), and `columns` besides.
+    `x`, `y` are 0-based.
     """
     from astropy.table import Table
     from astropy.wcs import WCS
@@ -202,6 +203,7 @@ def write_field(
     _write_image(path, image, {**wcs.to_header(), **cards})
     ra, dec = wcs.all_pix2world(x, y, 0)
     rows = {"id": np.arange(len(x)), "X_IMAGE": x + 1, "Y_IMAGE": y + 1, "ra": ra, "dec": dec}
+    rows |= columns or {}
     with atomic_path(catalogue) as temporary:
         formats = {"X_IMAGE": "%.4f", "Y_IMAGE": "%.4f", "ra": "%.8f", "dec": "%.8f"}
         Table(rows).write(temporary, format="ascii.csv", formats=formats, overwrite=True)

@@ -15,11 +15,11 @@ from psfdae.files import Column
 from psfdae.optics.pupil import Pupil, SamplingError, annular_pupil
 from psfdae.optics.wavefronts import (
     ModalWavefronts,
-    field_coefficients,
     seidel_wavefronts,
     zernike_wavefronts,
 )
 from psfdae.rng import stream
+from psfdae.telescope.field import static_zernikes
 from psfdae.telescope.settings import OwnTelescope, Telescope
 from psfdae_paper.configuration.schema import Grid, Stars
 from psfdae_paper.stars.fields import perturb, relative_field, square_grid
@@ -214,31 +214,14 @@ class TelescopeScene(Scene):
 
 
 def static_terms(grid: Grid, telescope: OwnTelescope) -> tuple[tuple[int, ...], np.ndarray]:
-    """Noll indices (J of them) and static coefficients of all fields, shape (F, J).
-
-    The coefficients are an OPD in waves.
+    """Noll indices (J of them) and static coefficients of all fields, shape (F, J), in waves.
 
     Raises
     ------
     RayTracingError
         If the ray trace of a field is vignetted.
     """
-    aberrations = telescope.aberrations
-    if aberrations.kind == "zernike":
-        return aberrations.noll, field_coefficients(aberrations.polynomials, relative_field(grid))
-    from psfdae.telescope.raytracing import FIRST_NOLL, ZernikeTracer, build_optic
-
-    _, angle_deg = square_grid(grid.points, grid.spacing_deg)
-    tracer = ZernikeTracer(
-        build_optic(aberrations.prescription, telescope, aberrations.defocus_m),
-        telescope.wavelength_m,
-        np.deg2rad(angle_deg),
-        np.zeros(4),
-        aberrations.highest_zernike,
-    )
-    # The trace counts the lead of the wavefront, an OPD its delay.
-    traced = -tracer(np.zeros((1, 4)))[0]
-    return tuple(range(FIRST_NOLL, aberrations.highest_zernike + 1)), traced
+    return static_zernikes(telescope, square_grid(grid.points, grid.spacing_deg)[1])
 
 
 SCENES = {"seidel": SeidelScene, "turbulence": TurbulenceScene, "telescope": TelescopeScene}
