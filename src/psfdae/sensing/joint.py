@@ -24,7 +24,7 @@ from psfdae.telescope.field import FieldModel
 MOST_STARS = 500
 """Of the highest S/N, that take part; equations grow with their number."""
 
-CLIMB = Steps(most=30, least_gain=0.005)
+CLIMB = Steps(most=30, least_gain=0.005, rounding=1e-7)
 
 ROUNDS = 4
 """In which stars choose the mode nearest to the field, and the field follows them."""

@@ -40,7 +40,8 @@ def wavefront_map(found: Wavefronts, title: str) -> Figure:
     cell = 0.92 * reach / CELLS
     figure = new_figure(0.5 * WIDTH_IN, layout="constrained")
     axes = figure.subplots(1, 3, sharex=True, sharey=True)
-    peak = float(np.nanmax(np.abs([measured, model]))) if len(chosen) else 1.0
+    # The rim alone would take the whole scale.
+    peak = float(np.nanpercentile(np.abs([measured, model]), 98)) if len(chosen) else 1.0
     names = ("measured", "fitted telescope" if joint else "prior's mean", "residuals of the stars")
     for panel, images, limit, colours, name in zip(
         axes,
@@ -81,7 +82,7 @@ def _apart(found: Wavefronts) -> np.ndarray:
     """Bright stars that are explained, far enough from each other to be drawn at their places."""
     left = np.intersect1d(found.star, np.flatnonzero(found.explained))
     left = left[np.argsort(-found.snr[left], kind="stable")]
-    cell = np.ptp(found.field_deg, axis=0).max() / CELLS
+    cell = (1.0 - 1e-6) * np.ptp(found.field_deg, axis=0).max() / CELLS
     chosen = []
     while left.size:
         chosen.append(left[0])

@@ -93,10 +93,10 @@ class Chains(NamedTuple):
     """Markov chains of every posterior."""
 
     number: int = 4
-    steps: int = 600
-    burn_in: int = 100
+    steps: int = 1200
+    burn_in: int = 120
     """Steps in which the strides are adapted, and that do not count."""
-    kept: int = 200
+    kept: int = 300
     """Draws of a posterior that are returned, evenly spaced."""
     wanted: float = 0.35
     """Part of the strides that should be taken."""

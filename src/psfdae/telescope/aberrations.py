@@ -7,7 +7,14 @@ from itertools import pairwise
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Field,
+    SerializerFunctionWrapHandler,
+    model_serializer,
+    model_validator,
+)
 
 from psfdae.optics.wavefronts import SEIDEL_TERMS
 from psfdae.settings import Finite, Group, Name, Positive
@@ -206,13 +213,20 @@ class Zernike(Group):
         ]
 
 
+Pair = tuple[Finite, Finite]
+
+
 class Raytraced(Group):
-    """Aberrations of an aligned telescope by ray tracing (batoid)."""
+    """Aberrations of a telescope by ray tracing (batoid)."""
 
     kind: Literal["raytraced"] = Field(description="Tells which keys follow")
     prescription: Prescription
     defocus_m: Annotated[float, Field(ge=-0.01, le=0.01)] = Field(
         default=0.0, description="Distance of the detector beyond best focus"
+    )
+    decentre_m: Pair = Field(default=(0.0, 0.0), description="Of the secondary, along x and y")
+    tilt_deg: Pair = Field(
+        default=(0.0, 0.0), description="Of the secondary about its vertex, about x and y"
     )
     highest_zernike: Annotated[int, Field(ge=11, le=HIGHEST_NOLL)] = Field(
         default=22, description="Highest Noll index of the wavefront"
@@ -220,3 +234,26 @@ class Raytraced(Group):
     jitter_waves: Annotated[float, Field(ge=0, le=100)] = Field(
         default=0.0, description="Standard deviation added to every Zernike term of every star"
     )
+
+    @property
+    def misalignment(self) -> np.ndarray:
+        """Decentre x, y in metres and tilt about x, y in radians of the secondary, (4,)."""
+        return np.array([*self.decentre_m, *np.deg2rad(self.tilt_deg)])
+
+    @model_validator(mode="after")
+    def _secondary(self) -> Raytraced:
+        if self.prescription.secondary is None and self.misalignment.any():
+            raise ValueError(
+                f"decentre_m = {list(self.decentre_m)}, tilt_deg = {list(self.tilt_deg)}: "
+                "of a secondary, which the prescription has not"
+            )
+        return self
+
+    @model_serializer(mode="wrap")
+    def _aligned(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        # Products of aligned telescopes keep the bytes that they had before misalignments.
+        return {
+            key: value
+            for key, value in dump(self).items()
+            if key not in ("decentre_m", "tilt_deg") or any(value)
+        }

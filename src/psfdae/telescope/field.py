@@ -94,30 +94,26 @@ def static_zernikes(
 def traced(
     telescope: OwnTelescope,
     angle_deg: np.ndarray,
-    defocus_m: float = 0.0,
+    defocus_m: float | None = None,
     misalignment: np.ndarray | None = None,
 ) -> np.ndarray:
     """Zernike coefficients (n, J) of a ray trace, an OPD in waves.
 
-    `defocus_m` is added to that of the file; `misalignment` (4,) is a decentre x, y in metres and
-    a tilt about x, y in radians of the secondary.
+    `defocus_m` and `misalignment` (4,), a decentre x, y in metres and a tilt about x, y in
+    radians of the secondary, are the file's by default.
     """
-    from psfdae.telescope.raytracing import ZernikeTracer, build_optic
+    from psfdae.telescope.raytracing import ZernikeTracer, build_optic, misaligned
 
-    aberrations = telescope.aberrations
+    own = telescope.aberrations
+    defocus_m = own.defocus_m if defocus_m is None else defocus_m
     with needed_by(f"{telescope.name}: a ray trace"):
-        optic = build_optic(aberrations.prescription, telescope, aberrations.defocus_m + defocus_m)
-    unit = np.zeros(4) if misalignment is None else np.asarray(misalignment, float)
+        optic = build_optic(own.prescription, telescope, defocus_m)
+    optic = misaligned(optic, own.misalignment if misalignment is None else misalignment)
     tracer = ZernikeTracer(
-        optic,
-        telescope.wavelength_m,
-        np.deg2rad(angle_deg),
-        unit,
-        aberrations.highest_zernike,
+        optic, telescope.wavelength_m, np.deg2rad(angle_deg), np.zeros(4), own.highest_zernike
     )
-    state = np.zeros((1, 4)) if misalignment is None else np.ones((1, 4))
     # The trace counts the lead of the wavefront, an OPD its delay.
-    return -tracer(state)[0]
+    return -tracer(np.zeros((1, 4)))[0]
 
 
 def terms_of(telescope: OwnTelescope, angle_deg: np.ndarray) -> Terms:
@@ -229,19 +225,20 @@ def _polynomials(telescope: OwnTelescope, angle_deg: np.ndarray, prior: Prior) -
 
 
 def _ray_trace(telescope: OwnTelescope, angle_deg: np.ndarray, prior: Prior) -> FieldModel:
-    if telescope.aberrations.prescription.secondary is not None:
-        tilt = np.deg2rad(prior.tilt_deg)
+    own: Any = telescope.aberrations
+    if own.prescription.secondary is not None:
+        to_radians = np.array([1.0, 1.0, np.deg2rad(1.0), np.deg2rad(1.0)])
         return FieldModel(
             ("defocus", "decentre_x", "decentre_y", "tilt_x", "tilt_y"),
-            ("m", "m", "m", "rad", "rad"),
-            np.zeros(5),
-            np.array([prior.defocus_m, *[prior.decentre_m] * 2, tilt, tilt]),
-            lambda numbers: traced(telescope, angle_deg, numbers[0], numbers[1:]),
+            ("m", "m", "m", "deg", "deg"),
+            np.array([own.defocus_m, *own.decentre_m, *own.tilt_deg]),
+            np.array([prior.defocus_m, *[prior.decentre_m] * 2, *[prior.tilt_deg] * 2]),
+            lambda numbers: traced(telescope, angle_deg, numbers[0], to_radians * numbers[1:]),
         )
     return FieldModel(
         ("defocus", "axis_x", "axis_y"),
         ("m", "deg", "deg"),
-        np.zeros(3),
+        np.array([own.defocus_m, 0.0, 0.0]),
         np.array([prior.defocus_m, prior.tilt_deg, prior.tilt_deg]),
         lambda numbers: traced(telescope, angle_deg - numbers[1:], numbers[0]),
     )

@@ -1,0 +1,422 @@
+"""Wavefronts of known telescopes: the climb, the draws, single stars, the state of a telescope."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from click.testing import CliRunner
+
+import psfdae
+from psfdae.cli import main
+from psfdae.optics.derivatives import ModalStamps
+from psfdae.optics.pupil import annular_pupil
+from psfdae.optics.seeing import BlurredPropagator, BlurredSampling, Profile
+from psfdae.optics.wavefronts import zernike_images
+from psfdae.sensing import stars as engine
+from psfdae.sensing.climbing import Steps, climb, poisson, together
+from psfdae.sensing.plot import wavefront_map
+from psfdae.sensing.sampling import Mixture, sample_around
+from psfdae.sensing.stars import SensingError, StarOptics
+from psfdae.settings import ConfigError
+from psfdae.telescope.field import field_model, terms_of
+from psfdae.telescope.settings import Prior, read_telescope
+from psfdae_paper.configuration.base import config_dir
+from psfdae_paper.configuration.compose import load
+
+SKY = 1000.0
+EXAMPLES = ("zernike", "seidel", "newtonian", "raytraced", "ritchey_chretien")
+
+
+def example(kind):
+    return read_telescope(config_dir() / "telescope" / f"example_{kind}.yaml")
+
+
+def field_of(telescope, count, rng):
+    return rng.uniform(-1.0, 1.0, (count, 2)) * telescope.field_edge_deg
+
+
+def imaged(telescope, angle, coefficients, place, snr, rng=None):
+    """Stamps in counts of gain 1, noise-free without a generator, and fluxes."""
+    terms = terms_of(telescope, angle)
+    waves = np.einsum("mk,mkj->mj", coefficients, terms.to_modes)
+    operator = StarOptics(telescope, terms, 16).operator
+    images = operator.stamps(np.concatenate([waves, place], axis=1)).astype(float)
+    flux = snr * np.sqrt(SKY / (images**2).sum(axis=(1, 2)))
+    mean = flux[:, None, None] * images + SKY
+    return (mean if rng is None else rng.poisson(mean).astype(float)), flux
+
+
+@pytest.mark.parametrize("kind", EXAMPLES)
+def test_library_reads_telescopes_as_hydra_composes_them(kind):
+    composed = load(["dataset=_telescope", f"telescope=example_{kind}"]).telescope
+    assert example(kind) == composed
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("name: a\ndefaults: 3\n", "defaults = 3: must be a list"),
+        ("defaults: ['../../secret']\n", "must be NAME or /GROUP@KEY: NAME"),
+        ("defaults: [nobody]\n", "nobody.yaml"),
+        ("name: a\ndiameter_m: -1\n", "diameter_m = -1"),
+    ],
+)
+def test_telescope_file_that_cannot_be_used_is_named(tmp_path, text, message):
+    path = tmp_path / "telescope.yaml"
+    path.write_text(text)
+    with pytest.raises(psfdae.Error, match=message):
+        read_telescope(path)
+
+
+def test_misalignment_needs_a_secondary(tmp_path):
+    path = tmp_path / "telescope"
+    path.mkdir()
+    text = (config_dir() / "telescope" / "example_newtonian.yaml").read_text()
+    (tmp_path / "prescription").symlink_to(config_dir() / "prescription")
+    moved = text.replace("kind: raytraced", "kind: raytraced\n  tilt_deg: [0.1, 0.0]")
+    (path / "mine.yaml").write_text(moved)
+    with pytest.raises(ConfigError, match="of a secondary, which the prescription has not"):
+        read_telescope(path / "mine.yaml")
+
+
+# --- The climb
+
+
+def test_score_and_information_of_poisson_counts():
+    rng = np.random.default_rng(1)
+    slopes, base = rng.normal(size=(1, 3, 40)), rng.uniform(50, 90, (1, 40))
+    counts = rng.poisson(base).astype(float)
+    counts[0, 3] = np.nan
+
+    def deviance(t):
+        return poisson(counts, base + t @ slopes[0], slopes)[0][0]
+
+    _, score, information = poisson(counts, base, slopes)
+    for axis, unit in enumerate(1e-3 * np.eye(3)):
+        slope = -(deviance(unit) - deviance(-unit)) / 4e-3
+        assert score[0, axis] == pytest.approx(slope, rel=1e-4, abs=1e-4)
+    used = np.isfinite(counts[0])
+    expected = (slopes[0][:, used] / base[0, used]) @ slopes[0][:, used].T
+    assert information[0] == pytest.approx(expected)
+
+
+def test_deviance_is_the_log_likelihood_that_is_missing():
+    counts, mean = np.array([[3.0, 100.0, 7.0]]), np.array([[5.0, 90.0, 7.0]])
+    found = poisson(counts, mean, np.empty((1, 0, 3)))[0]
+    expected = 2 * (counts * np.log(counts / mean) - counts + mean).sum()
+    assert found == pytest.approx(expected)
+
+
+def test_shared_parameters_add_up_and_own_ones_stand_alone():
+    rng = np.random.default_rng(2)
+    score, root = rng.normal(size=(1, 3, 4)), rng.normal(size=(1, 3, 4, 4))
+    whole, matrix = together(score, root @ root.swapaxes(2, 3), 2)
+    assert whole[0, :2] == pytest.approx(score[0, :, :2].sum(axis=0))
+    assert whole[0, 2:] == pytest.approx(score[0, :, 2:].ravel())
+    assert matrix.shape == (1, 8, 8)
+    assert not matrix[0, 2:4, 4:].any()
+
+
+def quadratic(centre, curvature):
+    def evaluate(some, at):
+        gap = centre[some] - at
+        slope = gap @ curvature
+        count = (len(some), 1, 1)
+        return -0.5 * (gap * slope).sum(axis=1), slope, np.tile(curvature, count)
+
+    return evaluate
+
+
+def test_climb_reaches_maxima_and_stays_within_its_limit():
+    centre = np.array([[0.3, -2.0], [5.0, 1.0]])
+    evaluate = quadratic(centre, np.array([[2.0, 0.3], [0.3, 1.0]]))
+    peaks = climb(evaluate, np.zeros((2, 2)))
+    assert peaks.parameters == pytest.approx(centre, abs=1e-2)
+    assert peaks.height == pytest.approx(0.0, abs=1e-2)
+    assert peaks.converged.all()
+    held = climb(evaluate, np.zeros((2, 2)), 3.0, Steps(least_gain=1e-9))
+    assert held.parameters[0] == pytest.approx(centre[0], abs=1e-4)
+    # At the limit the other parameter is at its own maximum: 1 + 0.3 (5 − 3).
+    assert held.parameters[1] == pytest.approx([3.0, 1.6], abs=1e-4)
+
+
+def test_a_climb_far_below_the_best_of_its_group_is_given_up():
+    def evaluate(some, at):
+        height = np.where(some == 0, 0.0, -100.0) - 0.5 * (at**2).sum(axis=1)
+        return height, -at, np.tile(np.eye(1), (len(some), 1, 1))
+
+    start, steps = np.array([[0.0], [3.0], [3.0]]), Steps(depth=20.0, first_damping=10.0)
+    peaks = climb(evaluate, start, np.inf, steps, np.array([0, 0, 1]))
+    assert peaks.converged.tolist() == [True, False, True]
+
+
+# --- Draws
+
+
+def test_chains_draw_from_a_normal_whose_mode_is_known_badly():
+    covariance = np.array([[1.0, 0.6], [0.6, 2.0]])
+    precision = np.linalg.inv(covariance)
+
+    def height(owner, at):
+        return -0.5 * np.einsum("ni,ij,nj->n", at - 3.0, precision, at - 3.0)
+
+    def twin(owner, at):
+        return at, np.full(len(at), -np.inf)
+
+    modes = Mixture(np.array([[2.5, 3.2]] * 20), np.array([0.8 * np.eye(2)] * 20), np.zeros(20))
+    rngs = [np.random.default_rng(i) for i in range(20)]
+    draws = sample_around(height, twin, np.arange(20), modes, rngs).reshape(-1, 2)
+    assert draws.mean(axis=0) == pytest.approx([3.0, 3.0], abs=0.1)
+    assert np.cov(draws.T) == pytest.approx(covariance, abs=0.2)
+
+
+def test_twins_are_drawn_by_their_probability():
+    """A likelihood of |x| and a prior that prefers one sign by e to 1."""
+
+    def height(owner, at):
+        return -50.0 * (np.abs(at[:, 0]) - 1.0) ** 2 + 0.5 * at[:, 0]
+
+    def twin(owner, at):
+        return -at, -at[:, 0]
+
+    modes = Mixture(np.ones((8, 1)), np.full((8, 1, 1), 0.1), np.zeros(8))
+    rngs = [np.random.default_rng(i) for i in range(8)]
+    draws = sample_around(height, twin, np.arange(8), modes, rngs)
+    assert np.mean(draws > 0) == pytest.approx(np.e / (1 + np.e), abs=0.03)
+
+
+# --- Optics
+
+
+def test_blurred_modal_stamps_are_blurred_stamps_and_their_slopes_are_differences():
+    pupil, profile = annular_pupil(64, 0.3), Profile(3.0, 3.0)
+    modes = partial(zernike_images, (2, 3, 4, 7))
+    sampling = BlurredSampling(pupil, 12, 1.5, profile, "complex128")
+    operator = ModalStamps(pupil, modes, sampling, 1.5)
+    waves = np.array([[0.3, -0.2, 0.4, 0.25]])
+    stamp, slopes = operator.derivatives(waves)
+    opd = operator.opd(waves)
+    assert stamp == pytest.approx(BlurredPropagator(pupil, 12, 1.5, profile)(opd), abs=1e-12)
+    for j, unit in enumerate(1e-5 * np.eye(4)):
+        ahead, behind = (operator.stamps(waves + sign * unit) for sign in (1, -1))
+        assert slopes[0, j] == pytest.approx((ahead - behind)[0] / 2e-5, abs=1e-8)
+
+
+@pytest.mark.parametrize("kind", ["zernike", "seidel", "newtonian"])
+def test_even_part_has_no_sign(kind):
+    telescope = example(kind)
+    telescope = telescope.model_copy(update={"prior": Prior(waves=0.2)})
+    rng = np.random.default_rng(3)
+    optics = StarOptics(telescope, terms_of(telescope, field_of(telescope, 5, rng)), 16)
+    star, z = np.arange(5), rng.standard_normal((5, optics.count))
+    place = np.zeros((5, 2))
+    images, twins = (
+        optics.operator.stamps(optics.modes(star, each, place))
+        for each in (z, optics.twins(star, z))
+    )
+    assert twins == pytest.approx(images, abs=float(2e-6 * images.max()))
+    assert optics.twins(star, optics.twins(star, z)) == pytest.approx(z)
+    assert np.abs(optics.twins(star, z) - z).max() > 0.5
+
+
+# --- Single stars
+
+
+def test_noise_free_stars_come_back():
+    telescope, rng = example("zernike"), np.random.default_rng(4)
+    angle = field_of(telescope, 6, rng)
+    terms = terms_of(telescope, angle)
+    truth = terms.mean + 0.7 * terms.sd * rng.standard_normal(terms.mean.shape)
+    place = rng.uniform(-0.5, 0.5, (6, 2))
+    counts, flux = imaged(telescope, angle, truth, place, 2000.0)
+    found = psfdae.wavefront(counts, telescope, field_deg=angle, noise=SKY**0.5, gain=1.0)
+    best = found.summary["mean"][found.summary["probability"] > 0.5]
+    error = np.sqrt(np.einsum("mkk->mk", found.summary["covariance"]))
+    assert np.abs(best - truth).max() < 6 * error.max()
+    assert error.max() < 0.2 * terms.sd.min()
+    own = found.measured()
+    assert own["x"] == pytest.approx(7.5 + place[:, 0], abs=0.02)
+    assert own["y"] == pytest.approx(7.5 + place[:, 1], abs=0.02)
+    assert own["flux"] == pytest.approx(flux, rel=5e-3)
+    assert own["sky"] == pytest.approx(SKY, abs=5 * own["sky_error"].max())
+    assert found.explained.all()
+    assert found.psf().sum(axis=(1, 2)) == pytest.approx(1.0, abs=0.3)
+    fine = found.psf(3)
+    binned = fine.reshape(6, 16, 3, 16, 3).mean(axis=(2, 4))
+    assert binned[:, 2:-2, 2:-2] == pytest.approx(found.psf()[:, 2:-2, 2:-2], abs=0.05)
+
+
+def test_intervals_hold_as_many_stars_as_they_say():
+    telescope, rng = example("zernike"), np.random.default_rng(5)
+    angle = field_of(telescope, 30, rng)
+    terms = terms_of(telescope, angle)
+    truth = terms.mean + terms.sd * rng.standard_normal(terms.mean.shape)
+    place = rng.uniform(-0.5, 0.5, (30, 2))
+    counts, _ = imaged(telescope, angle, truth, place, 60.0, rng)
+    found = psfdae.wavefront(counts, telescope, field_deg=angle, noise=SKY**0.5, gain=1.0)
+    for probability, least, most in ((0.6827, 0.56, 0.80), (0.9545, 0.87, 0.995)):
+        low, high = np.moveaxis(found.interval(probability), -1, 0)
+        assert least < np.mean((truth >= low) & (truth <= high)) < most
+    again = psfdae.wavefront(counts[:2], telescope, field_deg=angle[:2], noise=SKY**0.5, gain=1.0)
+    assert again.draws == pytest.approx(found.draws[:2], abs=1e-3)
+    assert found.chi2.mean() == pytest.approx(0.97, abs=0.05)
+    assert len(found.table) >= 30
+    picture = wavefront_map(found, "stars")
+    assert len(picture.axes) == 6
+
+
+def test_both_signs_of_focus_have_a_probability():
+    """A round image out of focus, with a prior that does not know the side."""
+    telescope = example("zernike").model_copy(update={"prior": Prior(fraction=0.0, waves=0.3)})
+    rng, angle = np.random.default_rng(6), np.zeros((3, 2))
+    terms = terms_of(telescope, angle)
+    terms.mean[:] = 0.0
+    truth = np.where(np.array(terms.names) == "z4", 0.3, 0.0) + terms.mean
+    counts, _ = imaged(telescope, angle, truth, np.zeros((3, 2)), 100.0, rng)
+    found = psfdae.wavefront(counts, telescope, field_deg=angle, noise=SKY**0.5, gain=1.0)
+    focus = found.coefficients[..., terms.names.index("z4")]
+    for star in focus:
+        assert 0.1 < np.mean(star > 0) < 0.9
+    # The prior's mean is −0.15, but its width is twice that.
+    assert (found.summary["probability"] < 0.9).all()
+
+
+def test_a_wrong_telescope_explains_few_stars():
+    telescope, rng = example("zernike"), np.random.default_rng(7)
+    angle = field_of(telescope, 2, rng)
+    narrow = rng.poisson(SKY, (2, 16, 16)).astype(float)
+    narrow[:, 7:9, 7:9] += 50_000.0
+    narrow[:, 3, 12] += 40_000.0
+    found = psfdae.wavefront(narrow, telescope, field_deg=angle, noise=SKY**0.5, gain=1.0)
+    assert not found.explained.any()
+    assert found.chi2.min() > 3.0
+
+
+def test_stars_without_pixels_are_kept_as_rows():
+    telescope, rng = example("zernike"), np.random.default_rng(8)
+    angle = field_of(telescope, 3, rng)
+    counts, _ = imaged(
+        telescope, angle, terms_of(telescope, angle).mean, np.zeros((3, 2)), 50.0, rng
+    )
+    counts[1] = np.nan
+    counts[2, :3] = np.nan
+    found = psfdae.wavefront(counts, telescope, field_deg=angle, gain=1.0)
+    assert found.star.tolist() == [0, 2]
+    assert np.isnan(found.psf()[1]).all()
+    assert found.explained.tolist() == [True, False, True]
+    table = found.table
+    assert np.isnan(table["z4"][table["id"] == 1]).all()
+    with pytest.raises(SensingError, match="no star has enough"):
+        psfdae.wavefront(counts[1:2], telescope, field_deg=angle[1:2])
+
+
+@pytest.mark.parametrize(
+    ("stars", "options", "message"),
+    [
+        (np.ones((2, 16, 15)), {}, "expected \\(n, d, d\\)"),
+        (np.ones((2, 16, 16)), {"field_deg": np.zeros((3, 2))}, "field_deg of shape"),
+        (np.ones((2, 16, 16)), {"noise": -1.0}, "noise: expected numbers above 0"),
+        (np.ones((2, 16, 16)), {"gain": np.ones(5)}, "gain of shape"),
+    ],
+)
+def test_wrong_input_is_named(stars, options, message):
+    with pytest.raises(SensingError, match=message):
+        psfdae.wavefront(stars, example("zernike"), **{"field_deg": np.zeros((2, 2)), **options})
+
+
+def test_aberrations_beyond_every_grid_are_refused():
+    telescope = example("zernike").model_copy(update={"prior": Prior(waves=90.0)})
+    with pytest.raises(SensingError, match=f"more than {engine.SIZES[-1]} samples"):
+        psfdae.wavefront(np.random.default_rng(1).normal(size=(1, 16, 16)), telescope,
+                         field_deg=np.zeros((1, 2)))  # fmt: skip
+
+
+# --- The state of a telescope
+
+
+@pytest.mark.parametrize(
+    ("kind", "count"),
+    [("zernike", 16), ("seidel", 10), pytest.param("ritchey_chretien", 20, marks=pytest.mark.slow)],
+)
+def test_state_of_the_telescope_is_found_with_its_errors(kind, count):
+    telescope, rng = example(kind), np.random.default_rng(9)
+    angle = field_of(telescope, count, rng)
+    model = field_model(telescope, angle)
+    truth = model.mean + model.sd * rng.standard_normal(model.sd.size)
+    place = rng.uniform(-0.5, 0.5, (count, 2))
+    counts, _ = imaged(telescope, angle, model.coefficients(truth), place, 60.0, rng)
+    counts[0] = np.roll(counts[0], 5, axis=1) + counts[1] - SKY  # two stars in one stamp
+    found = psfdae.wavefront(
+        counts, telescope, field_deg=angle, noise=SKY**0.5, gain=1.0, joint=True
+    )
+    state = found.joint
+    pull = (state.value - truth) / state.error
+    assert np.sqrt(np.mean(pull**2)) < 2.0
+    assert np.abs(pull).max() > 0.05
+    assert (state.error < 0.5 * model.sd).all()
+    assert 0 not in state.star or state.disagrees[state.star == 0].all()
+    assert np.mean(state.disagrees) < 0.1
+    assert state.correlation == pytest.approx(state.correlation.T)
+
+
+def test_slopes_of_the_field_s_numbers_are_differences():
+    telescope, angle = example("ritchey_chretien"), np.array([[0.1, -0.2], [0.0, 0.15]])
+    model = field_model(telescope, angle)
+    slopes = model.jacobian(model.mean)
+    step = np.where(np.array(model.names) == "decentre_x", 1e-4, 0.0)
+    change = model.coefficients(model.mean + step) - model.coefficients(model.mean)
+    row = model.names.index("decentre_x")
+    assert change == pytest.approx(1e-4 * slopes[row], abs=1e-2 * np.abs(change).max())
+
+
+# --- The command
+
+
+@pytest.fixture(scope="module")
+def night(tmp_path_factory):
+    """An image of the example whose coma is not that of its file, with its star list."""
+    folder = tmp_path_factory.mktemp("night")
+    words = ["telescope=example_zernike", "++telescope.aberrations.terms.z8.constant=0.1"]
+    options = ["--image-snr", "80", "--out", str(folder), "grid.points=4"]
+    result = CliRunner().invoke(main, ["simulate", *words, *options])
+    assert result.exit_code == 0, result.output
+    return folder
+
+
+def sense(night, *options):
+    telescope = config_dir() / "telescope" / "example_zernike.yaml"
+    words = [str(night / "image.fits"), "--catalogue", str(night / "stars.csv")]
+    words += ["--telescope", str(telescope), "--out", str(night / "wavefront.fits")]
+    return CliRunner().invoke(main, ["wavefront", *words, *options])
+
+
+def test_command_finds_the_changed_coma(night):
+    result = sense(night, "--joint", "--plot", str(night / "map.png"), "--overwrite")
+    assert result.exit_code == 0, (result.output, result.exception)
+    with fits.open(night / "wavefront.fits") as file:
+        assert {hdu.name for hdu in file} >= {"WAVEFRONT", "PSF", "MODEL", "RESIDUAL", "JOINT"}
+        state = file["JOINT"].data
+        coma = state[state["name"] == "z8.constant"]
+        assert coma["value"][0] == pytest.approx(0.1, abs=5 * coma["error"][0])
+        assert coma["error"][0] < 0.005
+        assert len(file["COVAR"].data) == len(file["WAVEFRONT"].data)
+        assert file["PSF"].data.shape == (16, 16, 16)
+    assert "z8.constant" in result.output
+    assert "16 stars, 0 not explained" in result.output
+    assert (night / "map.png").stat().st_size > 5000
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--pixel-scale", "0.9"], "pixels of 0.9 arcsec, but those of the telescope"),
+        (["--stamp-px", "7"], "stamp"),
+    ],
+)
+def test_command_refuses_in_one_line(night, options, message):
+    result = sense(night, *options, "--overwrite")
+    assert result.exit_code == 2
+    assert message in result.output
