@@ -11,6 +11,7 @@ from scipy.stats import multivariate_t
 
 from psfdae.optics.wavefronts import seidel_wavefronts
 from psfdae.rng import stream
+from psfdae.sensing.sampling import FREEDOM
 from psfdae_paper.bounds import sampling
 from psfdae_paper.bounds.posterior import Likelihood, jitters, merge
 from psfdae_paper.bounds.sampling import (
@@ -195,7 +196,7 @@ def test_draws_have_the_density_of_students_t():
     found = modes.log_density(z, field, offset)
     for mode in number:
         scale = factor[mode] @ factor[mode].T
-        law = multivariate_t(modes.z[mode], scale, sampling.PROPOSALS.freedom)
+        law = multivariate_t(modes.z[mode], scale, FREEDOM)
         there = (field == mode) & (np.arange(30) < 20)
         assert found[mode, there] == pytest.approx(law.logpdf(z[there]), abs=1e-9)
         assert (found[mode, ~there] == -np.inf).all()
@@ -205,7 +206,7 @@ def test_draws_have_the_density_of_students_t():
         assert len(mine) == count[mode] > 5000
         whitened = np.linalg.solve(factor[mode], (mine - modes.z[mode]).T)
         # The median of the squared distance of t is that of F, times the dimension.
-        expected = 5 * f_law(5, sampling.PROPOSALS.freedom).median()
+        expected = 5 * f_law(5, FREEDOM).median()
         assert np.median((whitened**2).sum(axis=0)) == pytest.approx(expected, rel=0.05)
         inside = np.cov(whitened[:, (whitened**2).sum(axis=0) < 2 * expected])
         assert inside == pytest.approx(inside[0, 0] * np.eye(5), abs=0.06 * inside[0, 0])

@@ -10,6 +10,7 @@ from astropy.io import fits
 from click.testing import CliRunner
 
 import psfdae
+from docs_pages import blocks, read
 from psfdae.cli import main
 from psfdae.optics.derivatives import ModalStamps
 from psfdae.optics.pupil import annular_pupil
@@ -420,3 +421,14 @@ def test_command_refuses_in_one_line(night, options, message):
     result = sense(night, *options, "--overwrite")
     assert result.exit_code == 2
     assert message in result.output
+
+
+def test_python_lines_of_the_page_run(monkeypatch, capsys):
+    telescope, rng = example("zernike"), np.random.default_rng(10)
+    angle = field_of(telescope, 6, rng)
+    mean = terms_of(telescope, angle).mean
+    counts, _ = imaged(telescope, angle, mean, np.zeros((6, 2)), 80.0, rng)
+    (lines,) = blocks(read("docs/wavefront.md"), "python")
+    monkeypatch.chdir(config_dir().parent)
+    exec(compile(lines, "page", "exec"), {"stamps": counts, "field_deg": angle})
+    assert "z8.constant" in capsys.readouterr().out

@@ -97,6 +97,19 @@ def test_a_star_that_no_wavefront_explains_has_the_mixture_s_psf(data, fitted, n
         assert (psf.psf[0] != mixture[0]).any()
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_coefficients_come_with_their_covariance(stars, data, fitted, noisy, name):
+    _, drawn, _ = stars
+    modes, missed = fitted[name].modes(noisy, LEVEL, data.positions[-TEST:])
+    assert missed.size == 0
+    truth = fitted[name].model.standardised(drawn["seidel"][-TEST:])
+    own = modes.take(np.flatnonzero(modes.field == drawn["field_index"][-TEST:][modes.star]))
+    first = own.take(sampling._first(own.star, own.evidence, 1))
+    assert len(first.star) > 0.8 * TEST
+    pull = np.linalg.solve(first.factor, (first.z - truth[first.star])[:, :, None])
+    assert 0.5 < np.median((pull**2).mean(axis=1)) < 2.0
+
+
 def test_stars_of_other_scenes_are_refused(data):
     turbulent = replace(data, simulation={"scene": {"name": "turbulence"}})
     with pytest.raises(FitError, match="wavefront: needs stars with random Seidel aberrations"):

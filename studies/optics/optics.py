@@ -20,11 +20,9 @@ import pandas as pd
 from psfdae.methods import method
 from psfdae.methods.gmm import Gmm
 from psfdae.metrics import clustered_mean, mse
-from psfdae.model.star_sets import field_positions, noise_model, read_stars, training_set
-from psfdae.rng import stream
+from psfdae.model.star_sets import field_positions, read_stars, training_set
 from psfdae.threads import limit_threads
 from psfdae_paper.bounds.estimates import bounded_stars, static_psfs
-from psfdae_paper.bounds.posterior import Likelihood
 from psfdae_paper.configuration.compose import load
 
 DENOISERS = ("wavelet", "nl_means", "tv")
@@ -90,18 +88,12 @@ def optics(config, product, stars, add) -> None:
             for reference in stars.truth
         }
         fitted = kind.fit(training_set(config, kind, product, "random", "realisation"))
-        own = stars.field if kind.needs.position else None
-        middle = fitted.bank.stamps((fitted.bank.margin,) * 2)
         for level, noisy in stars.noisy.items():
-            likelihood = Likelihood.of(noise_model(config), level, middle)
             psf = {r: np.array(fit.restore(noisy, level, position)) for r, fit in fits.items()}
             started, missed = time.process_time(), 0
             for start in range(0, len(noisy), AT_ONCE):
                 block = np.arange(start, min(start + AT_ONCE, len(noisy)))
-                rngs = [stream(config.seed, name, f"{level:.6g}", star) for star in block]
-                sums, known = fitted.posterior(
-                    noisy[block], None if own is None else own[block], likelihood, rngs
-                )
+                sums, known = fitted.posterior(noisy[block], level, position[block], start)
                 missed += int((~known).sum())
                 means = {"realisation": sums.mean_image, "template": sums.template(static)[0]}
                 for reference, mean in means.items():

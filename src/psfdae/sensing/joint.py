@@ -22,7 +22,7 @@ from psfdae.sensing.stars import (
 from psfdae.telescope.field import FieldModel
 
 MOST_STARS = 500
-"""Of the highest S/N, that take part; equations grow with their number."""
+"""Of the most light, that take part; equations grow with their number."""
 
 CLIMB = Steps(most=30, least_gain=0.005, rounding=1e-7)
 
@@ -117,7 +117,7 @@ class _Field:
         return height, score, information
 
 
-def joint_fit(search: Search, modes: Modes, model: FieldModel, snr: np.ndarray) -> Joint:
+def joint_fit(search: Search, modes: Modes, model: FieldModel) -> Joint:
     """Fit the numbers of a field to the stamps of all its stars.
 
     Parameters
@@ -127,7 +127,6 @@ def joint_fit(search: Search, modes: Modes, model: FieldModel, snr: np.ndarray) 
         Of the single stars; those that no mode explains take no part.
     model : FieldModel
         Of all stars of the search.
-    snr : ndarray, shape (n,)
 
     Raises
     ------
@@ -135,8 +134,11 @@ def joint_fit(search: Search, modes: Modes, model: FieldModel, snr: np.ndarray) 
         If there are fewer stars than numbers.
     """
     first = modes.take(modes.first)
-    stars = first.star[search.explained(first)]
-    stars = np.sort(stars[np.argsort(-snr[stars], kind="stable")[:MOST_STARS]])
+    explained = search.explained(first)
+    stars = first.star[explained]
+    # In units of the sky's noise.
+    light = search.flux[stars] * first.numbers[explained, -2] / np.sqrt(search.photons.sky[stars])
+    stars = np.sort(stars[np.argsort(-light, kind="stable")[:MOST_STARS]])
     if stars.size * 2 < model.sd.size or not stars.size:
         raise SensingError(
             f"{stars.size} stars that a wavefront explains are too few for "

@@ -82,10 +82,8 @@ def wavefront(
         terms = terms_of(telescope, angle)
         search = Search(StarOptics(telescope, terms, stamps.data.shape[-1]), photons, seed)
         modes = search.modes(np.arange(len(stamps)))
-        found = Wavefronts(search, stamps, angle, modes, *search.sampled(modes))
-        if joint:
-            state = joint_fit(search, modes, field_model(telescope, angle), found.snr)
-            found = Wavefronts(search, stamps, angle, modes, found.star, found.draws, state)
+        state = joint_fit(search, modes, field_model(telescope, angle)) if joint else None
+        found = Wavefronts(search, stamps, angle, modes, state)
     except SamplingError as error:
         largest = search.optics.operator.sizes[-1]
         raise SensingError(
@@ -136,10 +134,6 @@ class Wavefronts:
     field_deg : ndarray, shape (n, 2)
     modes : Modes
         Of the posteriors.
-    star : ndarray of int, shape (m,)
-        Stars with usable pixels.
-    draws : ndarray, shape (m, s, K + 4)
-        From their posteriors: standardised coefficients, place, flux and sky (`Modes.numbers`).
     joint : Joint or None
         State of the telescope.
     """
@@ -148,8 +142,6 @@ class Wavefronts:
     stamps: Stamps
     field_deg: np.ndarray
     modes: Modes
-    star: np.ndarray
-    draws: np.ndarray
     joint: Joint | None = None
 
     def __repr__(self) -> str:
@@ -164,6 +156,16 @@ class Wavefronts:
     def terms(self) -> Terms:
         """Names, modes and prior of the coefficients."""
         return self.search.optics.terms
+
+    @property
+    def star(self) -> np.ndarray:
+        """Stars with usable pixels, (m,)."""
+        return self.modes.star[self.modes.first]
+
+    @cached_property
+    def draws(self) -> np.ndarray:
+        """Draws from their posteriors, (m, s, K + 4), as `Modes.numbers`; made on first use."""
+        return self.search.sampled(self.modes)
 
     @cached_property
     def coefficients(self) -> np.ndarray:

@@ -349,8 +349,8 @@ class Search:
         deviance = -2.0 * peaks.height - (z**2).sum(axis=1)
         return Modes(star, peaks.parameters, covariance, evidence, deviance)
 
-    def sampled(self, modes: Modes) -> tuple[np.ndarray, np.ndarray]:
-        """Stars with modes (m,), and draws (m, `CHAINS.kept`, K + 4) from their posteriors."""
+    def sampled(self, modes: Modes) -> np.ndarray:
+        """Draws (m, `CHAINS.kept`, K + 4) from the posteriors of the stars that have modes."""
         stars = modes.star[modes.first]
         k = self.optics.count
 
@@ -361,14 +361,13 @@ class Search:
             gain = np.where((np.abs(there) <= FARTHEST_Z).all(axis=1), gain, -np.inf)
             return np.concatenate([there, numbers[:, k:]], axis=1), gain
 
-        draws = sample_around(
+        return sample_around(
             lambda member, numbers: self._height(stars[member], numbers),
             twin,
             np.searchsorted(stars, modes.star),
             Mixture(modes.numbers, np.linalg.cholesky(modes.covariance), modes.evidence),
             [stream(self.seed, "wavefront draws", int(star)) for star in stars],
         )
-        return stars, draws
 
     def _height(self, star: np.ndarray, numbers: np.ndarray) -> np.ndarray:
         """Logarithm of the posterior at numbers (m, K + 4) of stars (m,)."""

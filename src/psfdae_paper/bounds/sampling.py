@@ -53,10 +53,6 @@ FARTHEST_Z = 6.0
 """Standardised coefficients beyond ± this have no weight, as they have none in the prior (2e-9);
 the tails of the proposals reach beyond what can be sampled."""
 
-BANK_MATCHES = 16
-"""Best matches of the bank from which modes are sought: in as many fields, and in the own one at
-as many offsets."""
-
 
 class TwinSearch(NamedTuple):
     """Modes that look like those found, in other fields and at other offsets."""
@@ -76,7 +72,7 @@ class TwinSearch(NamedTuple):
 
 
 class Search(NamedTuple):
-    """Modes without the truth: few starts, and more for stars that they do not explain."""
+    """How many modes are sought: few, and more for stars that they do not explain."""
 
     first_stars: int = 8000
     """Of the bank, that are matched first."""
@@ -103,6 +99,9 @@ class Proposals(NamedTuple):
 
 
 TWINS, SEARCH, PROPOSALS = TwinSearch(), Search(), Proposals()
+
+THOROUGH = Search(first_stars=2**62, fields=16, offsets=16)
+"""Of the error bounds: the whole bank at once."""
 
 CONJUGATE = np.array([1 - 2 * (name in ("r4", "xx", "xy", "yy")) for name in MONOMIALS])
 """Signs that negate the even part of a wavefront: its image stays the same."""
@@ -339,14 +338,9 @@ def sample(
     noisy, likelihood, model, rngs : as for `sampled_sums`
     draws : int
     """
-    problem = (likelihood.counts(noisy), likelihood, model)
-    matches = best_matches(bank, seidel, noisy, likelihood, model, BANK_MATCHES, truth.field)
-    modes = climb(matches, *problem)
-    poor = unexplained(modes, *problem)
-    beside = neighbours(modes, poor) + neighbours(matches, poor)
-    modes = climb(modes + beside, *problem)
-    modes = climb(modes + twins(modes, likelihood, model), *problem)
-    modes = _separate(modes + climb(truth, *problem))
+    found, _ = search(bank, seidel, noisy, likelihood, model, truth.field, effort=THOROUGH)
+    counts = likelihood.counts(noisy)
+    modes = _separate(found + climb(truth, counts, likelihood, model))
     rounds = [round(share * draws) for share in PROPOSALS.rounds]
     return sampled_sums(modes, noisy, truth.field, likelihood, model, rounds, rngs)
 
@@ -358,8 +352,13 @@ def search(
     likelihood: Likelihood,
     model: StampModel,
     own: np.ndarray | None = None,
+    anywhere: bool = True,
+    effort: Search | None = None,
 ) -> tuple[Modes, np.ndarray]:
     """Modes of stars of which nothing is known, or their fields.
+
+    Stars that no mode explains get more starts: of the whole bank, and all offsets around their
+    best modes and matches.
 
     Parameters
     ----------
@@ -370,7 +369,11 @@ def search(
     likelihood : Likelihood
     model : StampModel
     own : ndarray of int, shape (n,), optional
-        Fields of the stars.
+        Fields of the stars, in which modes are sought, too.
+    anywhere : bool
+        Whether modes are sought in all fields.
+    effort : Search, optional
+        By default `SEARCH`.
 
     Returns
     -------
@@ -379,27 +382,29 @@ def search(
     missed : ndarray of int
         Stars that none of them explains (`unexplained`).
     """
+    effort = effort or SEARCH
     problem = (likelihood.counts(noisy), likelihood, model)
 
-    def matched(stars: np.ndarray, size: int, starts: int) -> Modes:
+    def matched(stars: np.ndarray, size: int, fields: int, offsets: int) -> Modes:
         some, given = bank.take(np.arange(size)), None if own is None else own[stars]
-        found = best_matches(
-            some, seidel[:size], noisy[stars], likelihood, model, starts, given, own is None
-        )
+        problem = (some, seidel[:size], noisy[stars], likelihood, model)
+        found = best_matches(*problem, fields if anywhere else 0, offsets, given)
         return replace(found, star=stars[found.star])
 
-    few = SEARCH.fields if own is None else SEARCH.offsets
-    everything = np.arange(len(noisy))
-    modes = climb(matched(everything, SEARCH.first_stars, few), *problem)
+    first = min(effort.first_stars, len(bank))
+    matches = matched(np.arange(len(noisy)), first, effort.fields, effort.offsets)
+    modes = climb(matches, *problem)
     missed = unexplained(modes, *problem)
-    if missed.size:
-        modes = climb(modes + matched(missed, len(bank), SEARCH.more), *problem)
+    if missed.size and first < len(bank):
+        matches = matched(missed, len(bank), effort.more, effort.more)
+        modes = climb(modes + matches, *problem)
         missed = unexplained(modes, *problem)
     if missed.size:
-        modes = climb(modes + neighbours(modes, missed), *problem)
-    if own is None:
+        beside = neighbours(modes, missed) + neighbours(matches, missed)
+        modes = climb(modes + beside, *problem)
+    if anywhere:
         modes = climb(modes + twins(modes, likelihood, model), *problem)
-    return modes, unexplained(modes, *problem, SEARCH.missed)
+    return modes, unexplained(modes, *problem, effort.missed)
 
 
 @dataclass(frozen=True)
@@ -417,13 +422,13 @@ def best_matches(
     noisy: np.ndarray,
     likelihood: Likelihood,
     model: StampModel,
-    count: int,
+    fields: int,
+    offsets: int,
     own: np.ndarray | None,
-    anywhere: bool = True,
 ) -> Modes:
-    """The best star of the bank in each of the `count` best fields of every image, if `anywhere`.
+    """The best star of the bank in each of the best `fields` of every image.
 
-    With the field given, the best at each of as many offsets in the stars' `own` fields, (n,),
+    With the field given, the best at each of so many `offsets` in the stars' `own` fields, (n,),
     are added. Mirrored stars keep their coefficients. `evidence` is the log-likelihood up to a
     constant.
 
@@ -449,25 +454,22 @@ def best_matches(
             best[place] = np.where(better, value, best[place])
             which[place] = np.where(better, part.star[top], which[place])
     peaks = np.stack([s.pixel(bank.peak) for s in SYMMETRIES], axis=1)
-    offsets = (peaks[:, :, None] - shifts).reshape(len(bank), -1, 2)
+    middle = (peaks[:, :, None] - shifts).reshape(len(bank), -1, 2)
     rows = []
     for star, scores in enumerate(best):
-        if anywhere:
-            top = np.argsort(-scores.max(axis=1), kind="stable")[:count]
-            rows += [(star, field, scores[field].argmax(), NOTHING) for field in top]
+        top = np.argsort(-scores.max(axis=1), kind="stable")[:fields]
+        rows += [(star, field, scores[field].argmax(), NOTHING) for field in top]
         if own is None:
             continue
         mine, seen = own[star], set()
         for column in np.argsort(-scores[mine], kind="stable"):
-            offset = tuple(offsets[which[star, mine, column], column])
-            if np.isfinite(scores[mine, column]) and offset not in seen and len(seen) < count:
+            offset = tuple(middle[which[star, mine, column], column])
+            if np.isfinite(scores[mine, column]) and offset not in seen and len(seen) < offsets:
                 seen.add(offset)
                 rows.append((star, mine, column, FIELD))
     star, field, place, given = np.array(rows).T
     chosen = which[star, field, place]
-    starts = Modes.at(
-        star, field, offsets[chosen, place], given, model.standardised(seidel[chosen])
-    )
+    starts = Modes.at(star, field, middle[chosen, place], given, model.standardised(seidel[chosen]))
     return replace(starts, evidence=best[star, field, place])
 
 

@@ -21,7 +21,7 @@ from psfdae.rng import stream
 
 if TYPE_CHECKING:
     from psfdae_paper.bounds.posterior import Bank, Likelihood, PosteriorSums
-    from psfdae_paper.bounds.sampling import StampModel
+    from psfdae_paper.bounds.sampling import Modes, StampModel
 
 BANK_STARS = 32000
 """Of the bank, of which most stars need a part only."""
@@ -93,47 +93,57 @@ class Wavefront(Method):
         self, noisy: np.ndarray, level: float | np.ndarray, position: np.ndarray | None = None
     ) -> Estimate:
         """PSFs of images of one noise level λ, shape (n, d, d), in the field of `position`."""
-        from psfdae_paper.bounds.posterior import Likelihood
         from psfdae_paper.bounds.sampling import SEARCH
 
-        assert np.ndim(level) == 0, "images of one noise level"
-        middle = self.bank.stamps((self.bank.margin,) * 2)
-        likelihood = Likelihood.of(self.mixture.noise, float(level), middle)
-        own = None
-        if self.needs.position and position is not None:
-            own = np.rint(position @ [1, self.bank.points]).astype(int)
         found = np.array(self.mixture.restore(noisy, level, position))
         for start in range(0, len(noisy), SEARCH.stars_at_once):
             block = slice(start, start + SEARCH.stars_at_once)
-            rngs = [
-                stream(self.seed, self.name, f"{level:.6g}", star)
-                for star in range(start, min(block.stop, len(noisy)))
-            ]
-            fields = None if own is None else own[block]
-            sums, known = self.posterior(noisy[block], fields, likelihood, rngs)
+            where = None if position is None else position[block]
+            sums, known = self.posterior(noisy[block], float(np.asarray(level)), where, start)
             mean = sums.mean_image if self.static is None else sums.template(self.static)[0]
             found[block][known] = mean[known].reshape(-1, *noisy.shape[1:])
         return Estimate(found)
 
+    def modes(
+        self, noisy: np.ndarray, level: float, position: np.ndarray | None = None
+    ) -> tuple[Modes, np.ndarray]:
+        """Wavefronts that explain images, and numbers of the stars that none explains.
+
+        Of every mode: field, place of the stamp, standardised coefficients
+        (`StampModel.coefficients`) with the Cholesky factor of their covariance, and evidence.
+        """
+        from psfdae_paper.bounds.sampling import search
+
+        own = None
+        if self.needs.position and position is not None:
+            own = np.rint(position @ [1, self.bank.points]).astype(int)
+        problem = (self.bank, self.seidel, noisy, self.likelihood(level), self.model)
+        return search(*problem, own, anywhere=own is None)
+
+    def likelihood(self, level: float) -> Likelihood:
+        """Of photons at a noise level λ."""
+        from psfdae_paper.bounds.posterior import Likelihood
+
+        middle = self.bank.stamps((self.bank.margin,) * 2)
+        return Likelihood.of(self.mixture.noise, level, middle)
+
     def posterior(
-        self,
-        noisy: np.ndarray,
-        own: np.ndarray | None,
-        likelihood: Likelihood,
-        rngs: list[np.random.Generator],
+        self, noisy: np.ndarray, level: float, position: np.ndarray | None = None, first: int = 0
     ) -> tuple[PosteriorSums, np.ndarray]:
         """Sums over importance samples of stars, and whether a mode explains each, (n,).
 
-        `own` are the stars' fields (n,) if they are given, `rngs` a generator of each.
+        `first` is the number of the first star, of which the draws depend.
         """
-        from psfdae_paper.bounds.sampling import PROPOSALS, sampled_sums, search
+        from psfdae_paper.bounds.sampling import PROPOSALS, sampled_sums
 
-        modes, missed = search(self.bank, self.seidel, noisy, likelihood, self.model, own)
+        modes, missed = self.modes(noisy, level, position)
         rounds = [round(share * DRAWS) for share in PROPOSALS.rounds]
+        rngs = [
+            stream(self.seed, self.name, f"{level:.6g}", first + star) for star in range(len(noisy))
+        ]
         anywhere = np.full(len(noisy), -1)
-        sums = sampled_sums(
-            modes, noisy, anywhere, likelihood, self.model, rounds, rngs
-        ).free_helped
+        problem = (modes, noisy, anywhere, self.likelihood(level), self.model)
+        sums = sampled_sums(*problem, rounds, rngs).free_helped
         known = sums.total > 0
         known[missed] = False
         return sums, known
