@@ -28,6 +28,8 @@ class Steps(NamedTuple):
     most: int = 12
     least_gain: float = 0.02
     """In the logarithm of the posterior: a step that promises less is the last one."""
+    decisive: int | None = None
+    """First so many parameters, of which alone that gain is counted, whatever the others are."""
     first_damping: float = 1e-2
     most_damping: float = 1e6
     """At which a climb is given up."""
@@ -152,7 +154,12 @@ def climb(
         whole = _step(now, active, np.zeros(active.size), limit)
         gain[active] = np.einsum("nk,nk->n", whole, now.slope[active])
         gain[active] -= 0.5 * np.einsum("nk,nkl,nl->n", whole, now.information[active], whole)
-        last = gain[active] <= steps.least_gain
+        promise = gain[active]
+        if steps.decisive is not None:
+            own = slice(steps.decisive)
+            marginal = np.linalg.inv(np.linalg.inv(now.information[active])[:, own, own])
+            promise = 0.5 * np.einsum("nk,nkl,nl->n", whole[:, own], marginal, whole[:, own])
+        last = promise <= steps.least_gain
         done = active[last]
         now.parameters[done] += whole[last]
         now.height[done] += gain[done]

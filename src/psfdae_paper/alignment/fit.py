@@ -14,6 +14,7 @@ import numpy as np
 
 from psfdae.noise import NoiseModel
 from psfdae.sensing.climbing import Peaks, Steps, climb
+from psfdae.telescope.raytracing import DEGREES_OF_FREEDOM
 from psfdae_paper.alignment.fisher import Stamps, deviance_and_information
 from psfdae_paper.configuration.alignment import Fit
 
@@ -46,9 +47,9 @@ def fit_states(
 ) -> Peaks:
     """Fit states to noisy stamps, each from one starting point.
 
-    A step of at most `settings.tolerance` standard errors is the last. The height of the peaks is
-    minus half of the deviance, which is twice the log-likelihood that is missing to a perfect fit:
-    about the number of pixels if the model is true.
+    A step of at most `settings.tolerance` standard errors of the state is the last. The height of
+    the peaks is minus half of the deviance, which is twice the log-likelihood that is missing to
+    a perfect fit: about the number of pixels if the model is true.
 
     Parameters
     ----------
@@ -67,6 +68,7 @@ def fit_states(
     steps = Steps(
         most=settings.iterations,
         least_gain=0.5 * settings.tolerance**2,
+        decisive=len(DEGREES_OF_FREEDOM),
         first_damping=settings.damping,
         most_damping=np.inf,
         rounding=ROUNDING,
