@@ -81,7 +81,7 @@ def wavefront(
     try:
         terms = terms_of(telescope, angle)
         search = Search(StarOptics(telescope, terms, stamps.data.shape[-1]), photons, seed)
-        modes = search.modes(np.arange(len(stamps)))
+        modes = search.modes()
         state = joint_fit(search, modes, field_model(telescope, angle)) if joint else None
         found = Wavefronts(search, stamps, angle, modes, state)
     except SamplingError as error:

@@ -54,7 +54,14 @@ SHIFT_PX = 4
 LEAST_PIXELS = 0.5
 """Part of the pixels that a star must have."""
 
-STARS_AT_ONCE = 64
+LEAST_LEFT = 0.01
+"""Of the sky's counts, that a pixel is expected to have at least."""
+
+WEAK = 1e-9
+"""Information on place, flux and sky besides that of the star, so that no matrix is singular."""
+
+STARS_AT_ONCE = 128
+"""That are worked on together, to bound the memory."""
 
 
 class Round(NamedTuple):
@@ -67,11 +74,10 @@ class Round(NamedTuple):
 ROUNDS = (Round(48, 4), Round(100, 6), Round(400, 12), Round(1000, 12))
 """The later ones for stars that no mode explains, or of which the one before found another."""
 
-CLIMB = Steps(most=25, depth=40.0, rounding=1e-5)
-
-
 LIKELY = 0.01
 """Probability of a mode beside which there may be others."""
+
+CLIMB = Steps(most=25, depth=40.0, rounding=1e-5)
 
 
 class SensingError(Error, ValueError):
@@ -145,11 +151,11 @@ class StarOptics:
         )
 
     def twins(self, star: np.ndarray, z: np.ndarray) -> np.ndarray:
-        """Standardised coefficients (m, K) with the even terms negated."""
+        """Standardised coefficients (m, K) with the even terms negated; ∞ where one is fixed."""
         mean, sd = self.terms.mean[star], self.terms.sd[star]
-        even = self.terms.even & (sd > 0)
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.where(even, -z - 2.0 * mean / sd, z)
+            negated = np.where(sd > 0, -z - 2.0 * mean / sd, np.where(mean == 0, z, np.inf))
+        return np.where(self.terms.even, negated, z)
 
 
 @dataclass(frozen=True)
@@ -201,7 +207,7 @@ class Modes:
     star : ndarray of int, shape (M,)
     numbers : ndarray, shape (M, K + 4)
         Standardised coefficients, place (x, y) from the middle of the stamp in pixels, flux and
-        sky in the units of `Fit.flux` and of the noise.
+        sky in the units of `Search.flux` and of the noise.
     covariance : ndarray, shape (M, K + 4, K + 4)
     evidence : ndarray, shape (M,)
         Logarithm of the mode's mass.
@@ -260,11 +266,23 @@ class Search:
         wide = optics.stamp_px + 2 * SHIFT_PX
         self._wide = optics.propagation(wide)
 
-    def modes(self, stars: np.ndarray) -> Modes:
-        """Modes of some stars, those without usable pixels left out."""
+    def modes(self) -> Modes:
+        """Modes of all stars, those without usable pixels left out.
+
+        Raises
+        ------
+        SensingError
+            If no star has enough usable pixels.
+        """
+        usable = np.flatnonzero(self.photons.usable)
+        if not usable.size:
+            raise SensingError("no star has enough usable pixels")
+        return joined([self._modes(part) for part in _blocks(usable)])
+
+    def _modes(self, missing: np.ndarray) -> Modes:
+        """Modes of some stars."""
         found: Modes | None = None
         k, known = self.optics.count, np.ones(len(self.flux), int)
-        missing = stars[self.photons.usable[stars]]
         for number, each in enumerate(ROUNDS):
             if not missing.size:
                 break
@@ -282,8 +300,7 @@ class Search:
             likely = np.bincount(found.star, found.probability > LIKELY, known.size)
             more = (likely[first.star] > known[first.star]) | ~self.explained(first)
             missing, known = np.intersect1d(missing, first.star[more]), likely
-        if found is None:
-            raise SensingError("no star has enough usable pixels")
+        assert found is not None, "some stars"
         return found
 
     def explained(self, modes: Modes) -> np.ndarray:
@@ -352,7 +369,11 @@ class Search:
     def sampled(self, modes: Modes) -> np.ndarray:
         """Draws (m, `CHAINS.kept`, K + 4) from the posteriors of the stars that have modes."""
         stars = modes.star[modes.first]
-        k = self.optics.count
+        parts = [modes.take(np.flatnonzero(np.isin(modes.star, part))) for part in _blocks(stars)]
+        return np.concatenate([self._sampled(part) for part in parts])
+
+    def _sampled(self, modes: Modes) -> np.ndarray:
+        stars, k = modes.star[modes.first], self.optics.count
 
         def twin(member: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             z = numbers[:, :k]
@@ -401,11 +422,8 @@ class Search:
         return np.maximum(mean, LEAST_LEFT * sky), slopes
 
 
-LEAST_LEFT = 0.01
-"""Of the sky's counts, that a pixel is expected to have at least."""
-
-WEAK = 1e-9
-"""Information on place, flux and sky besides that of the star, so that no matrix is singular."""
+def _blocks(stars: np.ndarray) -> list[np.ndarray]:
+    return np.split(stars, range(STARS_AT_ONCE, stars.size, STARS_AT_ONCE))
 
 
 def joined(parts: list[Modes]) -> Modes:
