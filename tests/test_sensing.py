@@ -7,6 +7,7 @@ from functools import partial
 import numpy as np
 import pytest
 from astropy.io import fits
+from astropy.table import Table
 from click.testing import CliRunner
 
 import psfdae
@@ -415,6 +416,12 @@ def test_command_finds_the_changed_coma(night):
         assert coma["value"][0] == pytest.approx(0.1, abs=5 * coma["error"][0])
         assert coma["error"][0] < 0.005
         assert len(file["COVAR"].data) == len(file["WAVEFRONT"].data)
+        rows = file["WAVEFRONT"].data
+        listed = Table.read(night / "stars.csv")[rows["id"]]
+        off = np.hypot(rows["x"] + 1 - listed["X_IMAGE"], rows["y"] + 1 - listed["Y_IMAGE"])
+        # Near the axis the brightest pixel touches the chief ray with a corner; coma moves it off.
+        assert off.min() == pytest.approx(0.5**0.5, abs=0.1)
+        assert off.max() < 4.5
         assert file["PSF"].data.shape == (16, 16, 16)
     assert "z8.constant" in result.output
     assert "16 stars, 0 not explained" in result.output

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from psfdae.image.observation import central_pixel
 from psfdae.image.stamps import Stamps
 from psfdae.optics.pupil import SamplingError, annular_pupil
 from psfdae.sensing.joint import Joint, joint_fit
@@ -288,14 +289,23 @@ class Wavefronts:
         return found
 
     def measured(self) -> dict[str, np.ndarray]:
-        """Place (index in the stamp), flux and sky of every star with errors, (n,) each."""
+        """Place, flux and sky of every star with errors, (n,) each.
+
+        The place of the chief ray is a 0-based pixel of the image, where stamps were cut from one,
+        else of the stamp; flux is the whole light.
+        """
         photons, k = self.search.photons, len(self.terms.names)
-        middle = 0.5 * (self.stamps.data.shape[-1] - 1)
+        side = self.stamps.data.shape[-1]
+        corners = [
+            np.where(np.isfinite(at), central_pixel(at) - side // 2, 0)[self.star]
+            for at in (self.stamps.x, self.stamps.y)
+        ]
         own = self.draws[..., k:]
         gain, star = photons.gain, self.star
         scale = [np.ones(len(star))] * 2
         scale += [self.search.flux[star] / gain[star], np.sqrt(photons.sky[star]) / gain[star]]
-        zero = [np.full(len(star), middle)] * 2 + [np.zeros(len(star)), photons.level[star]]
+        zero = [corner + 0.5 * (side - 1) for corner in corners]
+        zero += [np.zeros(len(star)), photons.level[star]]
         columns: dict[str, np.ndarray] = {}
         for i, name in enumerate(("x", "y", "flux", "sky")):
             columns[name] = self._spread(zero[i] + scale[i] * own[..., i].mean(axis=1))
