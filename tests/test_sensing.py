@@ -63,6 +63,8 @@ def test_library_reads_telescopes_as_hydra_composes_them(kind):
         ("name: a\ndefaults: 3\n", "defaults = 3: must be a list"),
         ("defaults: ['../../secret']\n", "must be NAME or /GROUP@KEY: NAME"),
         ("defaults: [nobody]\n", "nobody.yaml"),
+        ("defaults: [telescope]\n", "it names itself"),
+        ("aberrations: {kind: [zernike]}\n", "kind = "),
         ("name: a\ndiameter_m: -1\n", "diameter_m = -1"),
     ],
 )
@@ -347,6 +349,20 @@ def test_aberrations_beyond_every_grid_are_refused():
                          field_deg=np.zeros((1, 2)))  # fmt: skip
 
 
+def test_one_bad_star_stops_nobody():
+    telescope, rng = example("zernike"), np.random.default_rng(11)
+    angle = field_of(telescope, 4, rng)
+    mean = terms_of(telescope, angle).mean
+    counts, _ = imaged(telescope, angle, mean, np.zeros((4, 2)), 60.0, rng)
+    counts[1] = SKY  # nothing at all
+    counts[2] = rng.poisson(SKY, (16, 16))
+    counts[2, :, 15] += 3000.0  # light of a star beside the stamp
+    found = psfdae.wavefront(counts, telescope, field_deg=angle, noise=SKY**0.5, gain=1.0)
+    assert found.explained[[0, 3]].all()
+    assert np.isfinite(found.draws).all()
+    assert np.abs(found.measured()["x"] - 7.5).max() < 13
+
+
 # --- The state of a telescope
 
 
@@ -383,6 +399,16 @@ def test_slopes_of_the_field_s_numbers_are_differences():
     change = model.coefficients(model.mean + step) - model.coefficients(model.mean)
     row = model.names.index("decentre_x")
     assert change == pytest.approx(1e-4 * slopes[row], abs=1e-2 * np.abs(change).max())
+
+
+def test_nothing_free_and_no_term_are_named():
+    telescope, counts = example("zernike"), np.random.default_rng(1).poisson(SKY, (3, 16, 16))
+    known = telescope.model_copy(update={"prior": Prior(fraction=0.0, waves=0.0)})
+    with pytest.raises(SensingError, match="nothing of the telescope free"):
+        psfdae.wavefront(counts, known, field_deg=np.zeros((3, 2)), joint=True)
+    tilted = telescope.aberrations.model_copy(update={"terms": {"z2": {"constant": 0.1}}})
+    with pytest.raises(ConfigError, match="z2 and z3 only move a star"):
+        terms_of(telescope.model_copy(update={"aberrations": tilted}), np.zeros((1, 2)))
 
 
 # --- The command

@@ -14,7 +14,8 @@ from psfdae.figures import write_png
 from psfdae.files import check_outputs, write_fits
 from psfdae.image.catalogue import as_catalogue
 from psfdae.image.errors import ascii_line
-from psfdae.image.observation import Observation
+from psfdae.image.observation import Observation, central_pixel, list_offset
+from psfdae.model.prediction import as_ascii
 from psfdae.model.psf_model import SCALE_TOLERANCE
 from psfdae.options import File
 from psfdae.sensing.joint import Joint
@@ -55,6 +56,8 @@ def wavefront(
     field angle of a star is in the columns x_deg, y_deg of the list, or follows from its position.
     Two modes of a star are two wavefronts that its image does not tell apart.
     """
+    if stated.all_extensions:
+        raise SensingError("psfdae wavefront takes one image: name it with --extension")
     source = stated.source(stars)
     found_list = out.with_name(f"{out.stem}_stars.csv") if stated.detect else None
     check_outputs((out, plot, found_list), (*source.files(), telescope))
@@ -65,14 +68,30 @@ def wavefront(
     angle = field_angles(observation, source.catalogue, known, axis)
     stamps = next(observation.chunks(observation.count))
     found = sensed(stamps, known, field_deg=angle, joint=joint, seed=seed)
-    write_fits(out, as_fits(found, source.path.name))
+    said = [observation.said(), *off_list(found, observation), *report(found)]
     if found_list is not None:
         write_list(observation, found_list)
     if plot is not None:
         from psfdae.sensing.plot import wavefront_map
 
         write_png(wavefront_map(found, f"{source.path.name}: {known.name}"), plot)
-    print("\n".join([observation.said(), *report(found), unexplained(found, out)]))
+    # Its name is the last one to be there: it says that all is done.
+    write_fits(out, as_fits(found, source.path.name))
+    print("\n".join([*said, unexplained(found, out)]))
+
+
+def off_list(found: Wavefronts, observation: Observation) -> list[str]:
+    """How far stars are from their list, which is no mistake: aberrations move them."""
+    if observation.shape is None or observation.positions is None:
+        return []
+    # The centre of the light: that of the chief ray is moved by coma.
+    rows, columns = np.indices(found.model.shape[1:])
+    total = found.model.sum(axis=(1, 2))
+    centre = np.stack([(found.model * axis).sum(axis=(1, 2)) / total for axis in (columns, rows)])
+    corner = central_pixel(observation.positions.T) - found.model.shape[-1] // 2
+    off = np.where(found.explained, centre + corner - observation.positions.T, np.nan).T
+    said = list_offset(observation.catalogue, off, accept=True)
+    return [] if said is None else [said]
 
 
 def check_scale(observation: Observation, telescope: OwnTelescope) -> None:
@@ -107,8 +126,14 @@ def field_angles(
     if catalogue is not None and axis is None:
         table = as_catalogue(catalogue)
         names = set(table.table.colnames)
-        if names.issuperset(FIELD_COLUMNS) and len(table) == observation.count:
-            return np.stack([table.numbers(name) for name in FIELD_COLUMNS], axis=1)
+        if names.issuperset(FIELD_COLUMNS):
+            angle = np.stack([table.numbers(name) for name in FIELD_COLUMNS], axis=1)
+            if len(table) != observation.count:
+                raise SensingError(f"{table.path}: --on-image takes no list with x_deg, y_deg")
+            lost = ~np.isfinite(angle).all(axis=1)
+            if lost.any():
+                raise SensingError(f"{table.path}: no x_deg, y_deg in row {lost.argmax() + 1}")
+            return angle
     positions, shape = observation.positions, observation.shape
     if positions is None or (shape is None and axis is None):
         raise SensingError(
@@ -139,15 +164,22 @@ def as_fits(found: Wavefronts, image: str) -> Any:
     ):
         primary.header.append(card)
     summary = found.summary
-    table = fits.table_to_hdu(found.table)
+    rows = found.table
+    if rows["id"].dtype.kind == "U":
+        rows["id"] = as_ascii(np.asarray(rows["id"]))
+    table = fits.table_to_hdu(rows)
     table.name = "WAVEFRONT"
     table.header["COMMENT"] = "Coefficients and their errors are in waves; a row per star and mode."
     cubes = {
         "PSF": (found.psf(), "whole light 1, chief ray in the middle"),
         "MODEL": (found.model, "star without sky, unit of the input"),
         "RESIDUAL": (
-            found.stamps.data - found.measured()["sky"][:, None, None] - found.model,
-            "stamp minus sky minus model",
+            np.where(
+                found.stamps.bad | found.stamps.saturated,
+                np.nan,
+                found.stamps.data - found.measured()["sky"][:, None, None] - found.model,
+            ),
+            "stamp minus sky minus model, NaN where unused",
         ),
         "COVAR": (summary["covariance"], "of the coefficients, squared waves; row by row"),
     }

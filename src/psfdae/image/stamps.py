@@ -109,16 +109,23 @@ def border_median(stamps: np.ndarray, bad: np.ndarray) -> np.ndarray:
     return median
 
 
-def border_scatter(stamps: np.ndarray) -> np.ndarray:
+def border_scatter(stamps: np.ndarray, bad: np.ndarray | None = None) -> np.ndarray:
     """σ of the pixels in the border of every stamp from their median deviation, (n,).
 
-    Light of the star in the border is in it.
+    Light of the star in the border is in it. Pixels that are `bad` (n, s, s) are left out, unless
+    all are.
     """
     from astropy.stats import mad_std
 
-    side = stamps.shape[-1]
-    ring = stamps.reshape(len(stamps), side**2)[:, border_pixels(side)]
-    return mad_std(ring, axis=1).astype(np.float64)
+    size = (len(stamps), stamps.shape[-1] ** 2)
+    border = border_pixels(stamps.shape[-1])
+    ring = stamps.reshape(size)[:, border]
+    if bad is None:
+        return mad_std(ring, axis=1).astype(np.float64)
+    hidden = bad.reshape(size)[:, border]
+    hidden &= ~hidden.all(axis=1, keepdims=True)
+    ring = np.where(hidden, np.nan, ring)
+    return np.asarray(mad_std(ring, axis=1, ignore_nan=True), np.float64)
 
 
 def sky_around(wide: np.ndarray, bad: np.ndarray, stamp_px: int) -> tuple[np.ndarray, np.ndarray]:

@@ -236,7 +236,7 @@ class PredictionFile:
         rows = np.zeros(len(prediction), dtype=self._row)
         for name in self._row.names or ():
             value = getattr(stamps if name in OF_STAMPS else prediction, name)
-            rows[name] = _as_ascii(value) if value.dtype.kind == "U" else value
+            rows[name] = as_ascii(value) if value.dtype.kind == "U" else value
         self._put("stars", start * self._row.itemsize, rows)
 
     def _put(self, name: str, place: int, values: np.ndarray) -> None:
@@ -258,7 +258,7 @@ def prediction_file(
         yield PredictionFile(file, primary, example, count, bundle.info.stamp_px)
 
 
-def _as_ascii(text: np.ndarray) -> np.ndarray:
+def as_ascii(text: np.ndarray) -> np.ndarray:
     """FITS tables hold ASCII; other characters become question marks."""
     return np.array([name.encode("ascii", "replace") for name in text.tolist()], dtype=bytes)
 

@@ -6,20 +6,24 @@ has its own place, flux and sky besides.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
 
+from psfdae.optics.pupil import SamplingError
 from psfdae.sensing.climbing import Peaks, Steps, climb, poisson, together
 from psfdae.sensing.stars import (
     BESIDE,
     FARTHEST_Z,
+    WEAK,
     Modes,
     Search,
     SensingError,
     expected_deviance,
 )
 from psfdae.telescope.field import FieldModel
+from psfdae.telescope.raytracing import RayTracingError
 
 MOST_STARS = 500
 """Of the most light, that take part; equations grow with their number."""
@@ -84,7 +88,7 @@ class _Field:
         return np.moveaxis(whole * self.model.sd[:, None, None], 0, 1)[self.stars]
 
     def evaluate(self, _: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, ...]:
-        """See `psfdae.sensing.climbing.Evaluate`."""
+        """See `psfdae.sensing.climbing.Evaluate`; states without an image are impossible."""
         parts = [self._one(each) for each in numbers]
         height, score, information = (np.stack(part) for part in zip(*parts, strict=True))
         return height, score, information
@@ -108,11 +112,15 @@ class _Field:
 
     def _one(self, numbers: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
         q = self.shared
-        deviance, score, information = self._images(numbers)
+        try:
+            deviance, score, information = self._images(numbers)
+        except (RayTracingError, SamplingError):
+            return -np.inf, np.zeros(numbers.size), np.eye(numbers.size)
         both = together(score[None], information[None], q)
         score, information = both[0][0], both[1][0]
         score[:q] -= numbers[:q]
         information[range(q), range(q)] += 1.0
+        information[range(q, len(score)), range(q, len(score))] += WEAK
         height = -0.5 * (deviance.sum() + (numbers[:q] ** 2).sum())
         return height, score, information
 
@@ -131,8 +139,10 @@ def joint_fit(search: Search, modes: Modes, model: FieldModel) -> Joint:
     Raises
     ------
     SensingError
-        If there are fewer stars than numbers.
+        If there are fewer stars than half the numbers, or no number is free.
     """
+    if not model.sd.size:
+        raise SensingError("the prior leaves nothing of the telescope free: its widths are 0")
     first = modes.take(modes.first)
     explained = search.explained(first)
     stars = first.star[explained]
@@ -148,11 +158,11 @@ def joint_fit(search: Search, modes: Modes, model: FieldModel) -> Joint:
     field = _Field(search, model, stars)
     ahead = _start(field, kept, np.zeros(field.shared))
     starts = [ahead]
-    back = _twin(field, ahead[: field.shared])
-    if (np.abs(back) < FARTHEST_Z).all():
-        starts.append(_start(field, kept, back))
+    with suppress(RayTracingError):  # where there is no such telescope
+        starts.append(_start(field, kept, _twin(field, ahead[: field.shared])))
     limit = np.full(ahead.size, np.inf)
     limit[: field.shared] = FARTHEST_Z
+    limit[field.shared :].reshape(-1, BESIDE)[:, :2] = search.optics.reach_px
     peaks = climb(field.evaluate, np.stack(starts), limit, CLIMB)
     return _joint(field, peaks)
 
@@ -213,4 +223,5 @@ def _twin(field: _Field, t: np.ndarray) -> np.ndarray:
         slopes = field.slopes(back).transpose(1, 0, 2).reshape(t.size, -1)
         gap = (wanted - field.coefficients(back)).ravel()
         back = back + np.linalg.lstsq(slopes.T, gap, rcond=1e-9)[0]
+        back = np.clip(back, -FARTHEST_Z, FARTHEST_Z)
     return back

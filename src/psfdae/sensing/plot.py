@@ -33,6 +33,7 @@ def wavefront_map(found: Wavefronts, title: str) -> Figure:
     model = _pupils(found, chosen, expected[chosen])
     rows = found.search.photons
     residual = found.stamps.data - rows.level[:, None, None] - found.model
+    residual[found.stamps.bad | found.stamps.saturated] = np.nan
     residual -= np.nanmedian(residual, axis=(1, 2), keepdims=True)
     residual = (residual / rows.noise[:, None, None])[chosen]
     field = found.field_deg[chosen]

@@ -57,11 +57,17 @@ LEAST_PIXELS = 0.5
 LEAST_LEFT = 0.01
 """Of the sky's counts, that a pixel is expected to have at least."""
 
+OUTSIDE = 1e100
+"""That the logarithm of the posterior falls by where a star is not near its stamp."""
+
 WEAK = 1e-9
-"""Information on place, flux and sky besides that of the star, so that no matrix is singular."""
+"""Information on flux and sky besides that of the star, so that no matrix is singular."""
 
 STARS_AT_ONCE = 128
-"""That are worked on together, to bound the memory."""
+"""Of 16 × 16 px that are worked on together, to bound the memory."""
+
+CANDIDATES_AT_ONCE = 100
+"""Likewise of a star."""
 
 
 class Round(NamedTuple):
@@ -104,6 +110,11 @@ class StarOptics:
     def count(self) -> int:
         """Coefficients K of a star."""
         return len(self.terms.names)
+
+    @property
+    def reach_px(self) -> float:
+        """Distance along x and y from the middle of a stamp within which its star is."""
+        return 0.5 * self.stamp_px + SHIFT_PX
 
     @cached_property
     def operator(self) -> SampledStamps:
@@ -184,7 +195,8 @@ class Photons:
         data = stamps.data.astype(np.float64)
         level = border_median(data, stamps.bad)
         level = np.where(np.isfinite(stamps.background), stamps.background, level)
-        noise = np.where(np.isfinite(stamps.noise), stamps.noise, border_scatter(data))
+        scatter = border_scatter(data, stamps.bad)
+        noise = np.where(np.isfinite(stamps.noise), stamps.noise, scatter)
         noise = np.where(noise > 0, noise, np.nan)
         gain = np.where(np.isfinite(stamps.gain), stamps.gain, MOST_SKY**0.5 / noise)
         sky = np.clip((gain * noise) ** 2, LEAST_SKY, MOST_SKY)
@@ -277,7 +289,7 @@ class Search:
         usable = np.flatnonzero(self.photons.usable)
         if not usable.size:
             raise SensingError("no star has enough usable pixels")
-        return joined([self._modes(part) for part in _blocks(usable)])
+        return joined([self._modes(part) for part in self._blocks(usable)])
 
     def _modes(self, missing: np.ndarray) -> Modes:
         """Modes of some stars."""
@@ -310,42 +322,55 @@ class Search:
 
     def matched(self, star: int, number: int, size: Round) -> np.ndarray:
         """Starts of a star, (at most `starts`, K + 4): its best candidates, each at its place."""
-        optics, side, count = self.optics, self.optics.stamp_px, size.candidates
+        optics, count = self.optics, size.candidates
         rng = stream(self.seed, "wavefront", int(star), number)
         z = np.clip(rng.standard_normal((count, optics.count)), -FARTHEST_Z, FARTHEST_Z)
         if number == 0:
             z[0] = 0.0
-        many = np.full(count, star)
-        wide = self._wide.stamps(optics.modes(many, z, np.zeros((count, 2)))).astype(np.float64)
-        windows = np.lib.stride_tricks.sliding_window_view(wide, (side, side), axis=(1, 2))
-        shifts = windows.shape[1]
-        images = windows.reshape(count * shifts**2, side**2)
         seen = self.photons.counts[star] - self.photons.sky[star]
         used = np.isfinite(seen)
-        images, seen = images[:, used], seen[used]
-        light = images - images.mean(axis=1, keepdims=True)
-        variance = (light**2).sum(axis=1)
-        product = light @ (seen - seen.mean())
-        flux = product / np.maximum(variance, np.finfo(float).tiny)
-        gain = np.where(flux > 0, flux * product, 0.0) / (2.0 * self.photons.sky[star])
-        value = gain.reshape(count, -1) - 0.5 * (z**2).sum(axis=1, keepdims=True)
+        parts = [
+            self._gains(star, part, seen[used] - seen[used].mean(), used)
+            for part in np.split(z, range(CANDIDATES_AT_ONCE, count, CANDIDATES_AT_ONCE))
+        ]
+        flux, gain = (np.concatenate(values) for values in zip(*parts, strict=True))
+        shifts = 2 * SHIFT_PX + 1
+        value = gain - 0.5 * (z**2).sum(axis=1, keepdims=True)
         place = value.argmax(axis=1)
         best = np.argsort(-value.max(axis=1), kind="stable")[: size.starts]
         if number == 0:
-            top = flux.reshape(count, -1)[best[0], place[best[0]]]
+            top = flux[best[0], place[best[0]]]
             self.flux[star] = max(top, np.sqrt(self.photons.sky[star]))
         row, column = np.divmod(place[best], shifts)
         # A window that starts later shows the star earlier.
         numbers = [z[best], SHIFT_PX - np.stack([column, row], axis=1)]
-        part = flux.reshape(count, -1)[best, place[best]] / self.flux[star]
+        part = flux[best, place[best]] / self.flux[star]
         numbers.append(np.stack([np.maximum(part, 0.01), np.zeros(best.size)], axis=1))
         return np.concatenate(numbers, axis=1)
+
+    def _gains(
+        self, star: int, z: np.ndarray, seen: np.ndarray, used: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Flux of candidates z (c, K) at all shifts, and what it gains in log-likelihood, (c, S).
+
+        `seen` are the counts of the pixels (P,) that are `used`, their mean taken out.
+        """
+        side, nowhere = self.optics.stamp_px, np.zeros((len(z), 2))
+        modes = self.optics.modes(np.full(len(z), star), z, nowhere)
+        wide = self._wide.stamps(modes).astype(np.float64)
+        windows = np.lib.stride_tricks.sliding_window_view(wide, (side, side), axis=(1, 2))
+        light = windows.reshape(-1, side**2)[:, used]
+        light -= light.mean(axis=1, keepdims=True)
+        product = light @ seen
+        flux = product / np.maximum((light**2).sum(axis=1), np.finfo(float).tiny)
+        gain = np.where(flux > 0, flux * product, 0.0) / (2.0 * self.photons.sky[star])
+        return flux.reshape(len(z), -1), gain.reshape(len(z), -1)
 
     def climbed(self, star: np.ndarray, start: np.ndarray) -> Modes:
         """Modes that starts (M, K + 4) of stars (M,) lead to."""
         optics, photons = self.optics, self.photons
         k = optics.count
-        limit = np.array([FARTHEST_Z] * k + [np.inf] * BESIDE)
+        limit = np.array([FARTHEST_Z] * k + [optics.reach_px] * 2 + [np.inf] * 2)
 
         def evaluate(some: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, ...]:
             members = star[some]
@@ -355,22 +380,27 @@ class Search:
             z = numbers[:, :k]
             score[:, :k] -= z
             information[:, range(k), range(k)] += 1.0
-            information[:, range(k, k + BESIDE), range(k, k + BESIDE)] += WEAK
-            return -0.5 * (deviance + (z**2).sum(axis=1)), score, information
+            score[:, k : k + 2] -= numbers[:, k : k + 2] / optics.stamp_px**2
+            information[:, range(k, k + 2), range(k, k + 2)] += 1.0 / optics.stamp_px**2
+            information[:, range(k + 2, k + BESIDE), range(k + 2, k + BESIDE)] += WEAK
+            return -0.5 * (deviance + self.penalty(numbers)), score, information
 
         peaks = climb(evaluate, start, limit, CLIMB, star)
         covariance = np.linalg.inv(peaks.information)
         sign, width = np.linalg.slogdet(covariance)
         evidence = np.where(sign > 0, peaks.height + 0.5 * width, -np.inf)
-        z = peaks.parameters[:, :k]
-        deviance = -2.0 * peaks.height - (z**2).sum(axis=1)
+        deviance = -2.0 * peaks.height - self.penalty(peaks.parameters)
         return Modes(star, peaks.parameters, covariance, evidence, deviance)
 
     def sampled(self, modes: Modes) -> np.ndarray:
         """Draws (m, `CHAINS.kept`, K + 4) from the posteriors of the stars that have modes."""
-        stars = modes.star[modes.first]
-        parts = [modes.take(np.flatnonzero(np.isin(modes.star, part))) for part in _blocks(stars)]
+        blocks = self._blocks(modes.star[modes.first])
+        parts = [modes.take(np.flatnonzero(np.isin(modes.star, part))) for part in blocks]
         return np.concatenate([self._sampled(part) for part in parts])
+
+    def _blocks(self, stars: np.ndarray) -> list[np.ndarray]:
+        size = max(1, int(STARS_AT_ONCE * (16 / self.optics.stamp_px) ** 2))
+        return np.split(stars, range(size, stars.size, size))
 
     def _sampled(self, modes: Modes) -> np.ndarray:
         stars, k = modes.star[modes.first], self.optics.count
@@ -394,12 +424,22 @@ class Search:
         """Logarithm of the posterior at numbers (m, K + 4) of stars (m,)."""
         optics, k = self.optics, self.optics.count
         z = np.clip(numbers[:, :k], -FARTHEST_Z, FARTHEST_Z)
-        modes = optics.modes(star, z, numbers[:, k : k + 2])
+        place = np.clip(numbers[:, k : k + 2], -optics.reach_px, optics.reach_px)
+        modes = optics.modes(star, z, place)
         stamps = optics.operator.stamps(modes).reshape(len(star), -1).astype(np.float64)
         none = np.empty((len(star), 0, stamps.shape[1]))
         mean, none = self.expected(star, stamps, none, numbers[:, k:])
         deviance = poisson(self.photons.counts[star], mean, none)[0]
-        return np.asarray(-0.5 * (deviance + (numbers[:, :k] ** 2).sum(axis=1)))
+        height = -0.5 * (deviance + self.penalty(numbers))
+        within = (np.abs(numbers[:, k : k + 2]) <= optics.reach_px).all(axis=1)
+        return np.where(within, height, -OUTSIDE)
+
+    def penalty(self, numbers: np.ndarray) -> np.ndarray:
+        """−2 ln of the prior of numbers (m, K + 4): of coefficients, and a wide one of places."""
+        k = self.optics.count
+        own = (numbers[:, :k] ** 2).sum(axis=1)
+        place = numbers[:, k : k + 2] / self.optics.stamp_px
+        return np.asarray(own + (place**2).sum(axis=1))
 
     def expected(
         self, star: np.ndarray, stamps: np.ndarray, slopes: np.ndarray, own: np.ndarray
@@ -420,10 +460,6 @@ class Search:
         slopes = slopes * (flux * own[:, 2:3])[:, None]
         slopes = np.concatenate([slopes, (flux * stamps)[:, None], of_sky[:, None]], axis=1)
         return np.maximum(mean, LEAST_LEFT * sky), slopes
-
-
-def _blocks(stars: np.ndarray) -> list[np.ndarray]:
-    return np.split(stars, range(STARS_AT_ONCE, stars.size, STARS_AT_ONCE))
 
 
 def joined(parts: list[Modes]) -> Modes:

@@ -23,6 +23,7 @@ from psfdae.optics.wavefronts import (
     noll_to_nm,
     zernike_images,
 )
+from psfdae.settings import ConfigError
 from psfdae.telescope.aberrations import Seidel, Zernike
 from psfdae.telescope.settings import OwnTelescope, Prior
 
@@ -51,8 +52,6 @@ class Terms:
     even : ndarray of bool, shape (K,)
         Terms that are the same at opposite points of the pupil. A wavefront whose even part
         has the other sign has the same image.
-    rms : ndarray, shape (K,)
-        RMS of a term over the unit disc for a coefficient of 1.
     """
 
     names: tuple[str, ...]
@@ -61,7 +60,6 @@ class Terms:
     mean: np.ndarray
     sd: np.ndarray
     even: np.ndarray
-    rms: np.ndarray
 
 
 def relative(telescope: OwnTelescope, angle_deg: np.ndarray) -> np.ndarray:
@@ -132,19 +130,19 @@ def terms_of(telescope: OwnTelescope, angle_deg: np.ndarray) -> Terms:
         to_modes = monomial_coefficients(each, field[:, None])
         modes, even = monomial_images, np.array([name not in ODD_SEIDEL for name in names])
         mean = np.tile(aberrations.coefficients[: len(names)], (len(field), 1))
-        rms = np.full(len(names), np.nan)
     else:
         noll, mean = static_zernikes(telescope, angle_deg)
         seen = [k for k, j in enumerate(noll) if j >= FIRST_NOLL]
+        if not seen:
+            raise ConfigError(f"{telescope.name}: aberrations.terms: z2 and z3 only move a star")
         noll, mean = tuple(noll[k] for k in seen), mean[:, seen]
         names = tuple(f"z{j}" for j in noll)
         to_modes = np.broadcast_to(np.eye(len(noll)), (len(mean), len(noll), len(noll)))
         modes = partial(zernike_images, noll)
         even = np.array([noll_to_nm(j)[1] % 2 == 0 for j in noll])
-        rms = np.ones(len(noll))
     jitter = getattr(aberrations, "jitter_waves", 0.0) if prior.waves is None else prior.waves
     sd = np.hypot(prior.fraction * np.abs(mean), jitter)
-    return Terms(names, modes, to_modes, mean, sd, even, rms)
+    return Terms(names, modes, to_modes, mean, sd, even)
 
 
 @dataclass(frozen=True)

@@ -87,7 +87,7 @@ def _aberrations(tree: Any) -> Any:
     if not isinstance(tree, Mapping):
         return tree
     kind = tree.get("kind")
-    if kind not in ABERRATIONS:
+    if not isinstance(kind, str) or kind not in ABERRATIONS:
         raise ValueError(f"kind = {kind!r}: must be {', '.join(ABERRATIONS)}")
     return ABERRATIONS[kind].model_validate(tree)
 
@@ -151,14 +151,16 @@ def read_telescope(path: Path) -> OwnTelescope:
         Names the file and each wrong key with its value and the allowed range.
     """
     try:
-        return validate(OwnTelescope, _composed(path))
+        return validate(OwnTelescope, _composed(path.absolute()))
     except ConfigError as error:
-        lines = [line.removeprefix(f"{path}: ") for line in str(error).splitlines()]
+        lines = [line.removeprefix(f"{path.absolute()}: ") for line in str(error).splitlines()]
         raise ConfigError("\n".join(f"{path}: {line}" for line in lines)) from None
 
 
-def _composed(path: Path) -> dict[str, Any]:
-    """The tree of a file with those that it names."""
+def _composed(path: Path, within: tuple[Path, ...] = ()) -> dict[str, Any]:
+    """The tree of a file with those that it names; `within` are those that name it."""
+    if path in within:
+        raise ConfigError(f"{path}: defaults: it names itself")
     tree = read_yaml(path)
     entries, whole = tree.pop("defaults", []), {}
     if not isinstance(entries, list):
@@ -172,7 +174,7 @@ def _composed(path: Path) -> dict[str, Any]:
             whole = _merged(whole, tree)
             continue
         folder = path.parent.parent / found["group"] if found["group"] else path.parent
-        part = _composed(folder / f"{found['name']}.yaml")
+        part = _composed(folder / f"{found['name']}.yaml", (*within, path))
         for key in reversed(found["place"].split(".") if found["place"] else []):
             part = {key: part}
         whole = _merged(whole, part)
