@@ -13,6 +13,7 @@ from click.testing import CliRunner
 import psfdae
 from docs_pages import blocks, read
 from psfdae.cli import main
+from psfdae.commands.wavefront import as_fits
 from psfdae.optics.derivatives import ModalStamps
 from psfdae.optics.pupil import annular_pupil
 from psfdae.optics.seeing import BlurredPropagator, BlurredSampling, Profile
@@ -324,6 +325,9 @@ def test_stars_without_pixels_are_kept_as_rows():
     assert found.explained.tolist() == [True, False, True]
     table = found.table
     assert np.isnan(table["z4"][table["id"] == 1]).all()
+    file = as_fits(found, "stars")
+    sd = np.sqrt(np.einsum("mkk->mk", file["COVAR"].data))[:, 0]
+    assert sd == pytest.approx(np.asarray(table["z4_error"]), rel=1e-5, nan_ok=True)
     with pytest.raises(SensingError, match="no star has enough"):
         psfdae.wavefront(counts[1:2], telescope, field_deg=angle[1:2])
 

@@ -163,7 +163,6 @@ def as_fits(found: Wavefronts, image: str) -> Any:
         ("NPOOR", int((~found.explained).sum()), "stars that no wavefront explains"),
     ):
         primary.header.append(card)
-    summary = found.summary
     rows = found.table
     if rows["id"].dtype.kind == "U":
         rows["id"] = as_ascii(np.asarray(rows["id"]))
@@ -181,7 +180,7 @@ def as_fits(found: Wavefronts, image: str) -> Any:
             ),
             "stamp minus sky minus model, NaN where unused",
         ),
-        "COVAR": (summary["covariance"], "of the coefficients, squared waves; row by row"),
+        "COVAR": (_by_row(found, rows), "of the coefficients, squared waves; row by row"),
     }
     hdus = [primary, table]
     for name, (values, about) in cubes.items():
@@ -205,6 +204,14 @@ def as_fits(found: Wavefronts, image: str) -> Any:
     return fits.HDUList(hdus)
 
 
+def _by_row(found: Wavefronts, rows: Any) -> np.ndarray:
+    """Covariances of the rows of the table; NaN for stars without usable pixels."""
+    covariance = found.summary["covariance"]
+    whole = np.full((len(rows), *covariance.shape[1:]), np.nan)
+    whole[np.isfinite(rows["probability"])] = covariance
+    return whole
+
+
 def report(found: Wavefronts) -> list[str]:
     """What is said of the stars and of the telescope, in lines."""
     terms, summary = found.terms, found.summary
@@ -216,7 +223,7 @@ def report(found: Wavefronts) -> list[str]:
     lines = [
         f"prior of {found.telescope.name}: every coefficient about the telescope's own, with the "
         "standard deviation of the column prior",
-        f"{'term':12}{'prior':>10}{'error':>10}{'error':>10}   median over {len(first)} stars",
+        f"{'term':12}{'prior':>10}{'error':>10}{'error':>10}   of one star, median of {len(first)}",
         f"{'':12}{'(waves)':>10}{'(waves)':>10}{'(nm)':>10}",
     ]
     for k, name in enumerate(terms.names):
