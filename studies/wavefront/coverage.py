@@ -23,7 +23,7 @@ import pandas as pd
 
 import psfdae
 from psfdae.sensing import stars as engine
-from psfdae.sensing.joint import _Field
+from psfdae.sensing.joint import FieldPosterior
 from psfdae.telescope.field import field_model, terms_of
 from psfdae.threads import limit_threads
 
@@ -144,7 +144,7 @@ def joint(out, fits=50, count=100, snr=50.0):
             counts, telescope, field_deg=angle, gain=1.0, noise=SKY**0.5, joint=True
         )
         took, state = time.process_time() - started, found.joint
-        field = _Field(found.search, model, state.star)
+        field = FieldPosterior(found.search, model, state.star)
         flux = snr * np.sqrt(SKY / (images**2).sum(axis=(1, 2)))[state.star]
         own = np.column_stack([place[state.star], flux / found.search.flux[state.star]])
         own = np.column_stack([own, np.zeros(len(own))])

@@ -22,7 +22,7 @@ from psfdae.sensing.joint import Joint
 from psfdae.sensing.results import NANOMETRE, Wavefronts
 from psfdae.sensing.results import wavefront as sensed
 from psfdae.sensing.stars import SensingError
-from psfdae.telescope.settings import OwnTelescope, Prior, read_telescope
+from psfdae.telescope.settings import OwnTelescope, read_telescope
 from psfdae.version import __version__
 
 FIELD_COLUMNS = ("x_deg", "y_deg")
@@ -152,7 +152,7 @@ def as_fits(found: Wavefronts, image: str) -> Any:
     from astropy.io import fits
 
     primary = fits.PrimaryHDU()
-    prior = found.telescope.prior or Prior()
+    prior = found.telescope.prior
     for card in (
         ("CREATOR", f"psfdae {__version__}", ""),
         ("INFILE", ascii_line(image), "stars"),

@@ -29,6 +29,9 @@ from psfdae.optics.pupil import Pupil
 SEIDEL_TERMS = ("spherical", "coma", "astigmatism", "field_curvature", "distortion")
 """Order of the coefficients W040, W131, W222, W220, W311 in every array."""
 
+FIRST_NOLL = 4
+"""Of terms that are no piston and no tilt: those only move the image."""
+
 MONOMIALS = ("r4", "r2x", "r2y", "xx", "xy", "yy", "x", "y")
 """Order of the pupil monomials of a Seidel wavefront (r² = x² + y²)."""
 

@@ -166,7 +166,7 @@ def climb(
         now.converged[done] = True
         going = ~now.converged & (damping < steps.most_damping)
         if group is not None:
-            going &= now.height + 2.0 * gain > _best(now.height, group) - steps.depth
+            going &= now.height + 2.0 * gain > best_of_group(now.height, group) - steps.depth
         active = np.flatnonzero(going)
         if not active.size:
             break
@@ -194,7 +194,7 @@ def _step(
     return np.clip(parameters + step, -limit, limit) - parameters
 
 
-def _best(height: np.ndarray, group: np.ndarray) -> np.ndarray:
+def best_of_group(height: np.ndarray, group: np.ndarray) -> np.ndarray:
     """Greatest height in each one's group, shape (M,)."""
     best = np.full(group.max() + 1, -np.inf)
     np.maximum.at(best, group, height)

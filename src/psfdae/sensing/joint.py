@@ -16,6 +16,7 @@ from psfdae.sensing.climbing import Peaks, Steps, climb, poisson, together
 from psfdae.sensing.stars import (
     BESIDE,
     FARTHEST_Z,
+    POOR_FIT,
     WEAK,
     Modes,
     Search,
@@ -68,10 +69,10 @@ class Joint:
     @property
     def disagrees(self) -> np.ndarray:
         """Which of these stars the state does not explain, (m,)."""
-        return self.deviance > self.expected + 4.0 * self.scatter
+        return self.deviance > self.expected + POOR_FIT * self.scatter
 
 
-class _Field:
+class FieldPosterior:
     """The posterior of the numbers of a field, and of the places, fluxes and skies of its stars."""
 
     def __init__(self, search: Search, model: FieldModel, stars: np.ndarray) -> None:
@@ -155,7 +156,7 @@ def joint_fit(search: Search, modes: Modes, model: FieldModel) -> Joint:
             f"{model.sd.size} numbers of the telescope"
         )
     kept = modes.take(np.flatnonzero(np.isin(modes.star, stars)))
-    field = _Field(search, model, stars)
+    field = FieldPosterior(search, model, stars)
     ahead = _start(field, kept, np.zeros(field.shared))
     starts = [ahead]
     with suppress(RayTracingError):  # where there is no such telescope
@@ -167,7 +168,7 @@ def joint_fit(search: Search, modes: Modes, model: FieldModel) -> Joint:
     return _joint(field, peaks)
 
 
-def _joint(field: _Field, peaks: Peaks) -> Joint:
+def _joint(field: FieldPosterior, peaks: Peaks) -> Joint:
     q, model = field.shared, field.model
     covariance = np.linalg.inv(peaks.information)
     evidence = peaks.height + 0.5 * np.linalg.slogdet(covariance)[1]
@@ -193,7 +194,7 @@ def _joint(field: _Field, peaks: Peaks) -> Joint:
     )
 
 
-def _start(field: _Field, modes: Modes, t: np.ndarray) -> np.ndarray:
+def _start(field: FieldPosterior, modes: Modes, t: np.ndarray) -> np.ndarray:
     """Numbers of the field and the stars from the stars' own modes, near standardised t (Q,)."""
     terms, k = field.search.optics.terms, field.search.optics.count
     mean, sd = terms.mean[modes.star], terms.sd[modes.star]
@@ -214,7 +215,7 @@ def _start(field: _Field, modes: Modes, t: np.ndarray) -> np.ndarray:
     return np.concatenate([t, modes.numbers[chosen, k:].ravel()])
 
 
-def _twin(field: _Field, t: np.ndarray) -> np.ndarray:
+def _twin(field: FieldPosterior, t: np.ndarray) -> np.ndarray:
     """Standardised numbers whose stars have the even coefficients of t (Q,) negated, nearly."""
     even = field.search.optics.terms.even
     wanted = np.where(even, -1.0, 1.0) * field.coefficients(t)

@@ -15,6 +15,7 @@ import numpy as np
 
 from psfdae.errors import needed_by
 from psfdae.optics.wavefronts import (
+    FIRST_NOLL,
     SEIDEL_TERMS,
     Modes,
     field_coefficients,
@@ -26,9 +27,6 @@ from psfdae.optics.wavefronts import (
 from psfdae.settings import ConfigError
 from psfdae.telescope.aberrations import Seidel, Zernike
 from psfdae.telescope.settings import OwnTelescope, Prior
-
-FIRST_NOLL = 4
-"""Piston and tilts come before."""
 
 SEEN_SEIDEL = SEIDEL_TERMS[:-1]
 """Distortion is a tilt."""
@@ -122,7 +120,7 @@ def terms_of(telescope: OwnTelescope, angle_deg: np.ndarray) -> Terms:
     RayTracingError, MissingExtraError
         As `static_zernikes`.
     """
-    prior, aberrations = telescope.prior or Prior(), telescope.aberrations
+    prior, aberrations = telescope.prior, telescope.aberrations
     if isinstance(aberrations, Seidel):
         names = SEEN_SEIDEL
         field = relative(telescope, angle_deg)
@@ -181,7 +179,7 @@ def field_model(telescope: OwnTelescope, angle_deg: np.ndarray) -> FieldModel:
     polynomials of the field. A ray trace: the detector's defocus, and decentre and tilt of the
     secondary, or without one the place of the optical axis.
     """
-    prior, aberrations = telescope.prior or Prior(), telescope.aberrations
+    prior, aberrations = telescope.prior, telescope.aberrations
     if isinstance(aberrations, Seidel):
         mean = aberrations.coefficients[: len(SEEN_SEIDEL)]
         sd = np.hypot(prior.fraction * np.abs(mean), prior.waves or 0.0)

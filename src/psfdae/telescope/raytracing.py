@@ -21,7 +21,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from psfdae.errors import Error
-from psfdae.optics.wavefronts import noll_to_nm, zernike_basis
+from psfdae.optics.wavefronts import FIRST_NOLL, noll_to_nm, zernike_basis
 
 if TYPE_CHECKING:
     from psfdae.telescope.aberrations import Lens, Mirror, Prescription
@@ -29,9 +29,6 @@ if TYPE_CHECKING:
 
 DEGREES_OF_FREEDOM = ("decenter_x", "decenter_y", "tilt_x", "tilt_y")
 """Order of the four numbers of a state of misalignment."""
-
-FIRST_NOLL = 4
-"""Piston and tilts are left out: wavefronts refer to the image's centroid."""
 
 RIM = 0.998
 """Relative radius of the rays that look for vignetting at the pupil's rim."""

@@ -103,7 +103,7 @@ class OwnTelescope(Telescope):
         description="Static aberrations over the field"
     )
     seeing: Seeing | None = Field(default=None, description="Null: a telescope above the air")
-    prior: Prior | None = Field(default=None, description="Null: that of `Prior()`")
+    prior: Prior = Field(default=Prior(), description="Of the state of the telescope")
 
     @property
     def blur(self) -> Profile | None:
@@ -116,8 +116,10 @@ class OwnTelescope(Telescope):
     @model_serializer(mode="wrap")
     def _as_before(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
         # Products of telescopes without these keep the bytes that they had before them.
-        later = ("seeing", "prior")
-        return {k: v for k, v in dump(self).items() if k not in later or v is not None}
+        later = {"seeing": None, "prior": Prior()}
+        return {
+            k: v for k, v in dump(self).items() if k not in later or getattr(self, k) != later[k]
+        }
 
 
 def has_own_aberrations(tree: Any) -> bool:

@@ -15,13 +15,13 @@ import numpy as np
 from psfdae.errors import Error
 from psfdae.optics.derivatives import PeriodSampling, SampledStamps, normalise_with_derivatives
 from psfdae.optics.wavefronts import (
+    FIRST_NOLL,
     Modes,
     movable_modes,
     noll_to_nm,
     radial_polynomial,
     zernike,
 )
-from psfdae.telescope.raytracing import FIRST_NOLL
 from psfdae.telescope.settings import Telescope
 from psfdae_paper.configuration.alignment import Alignment
 from psfdae_paper.configuration.schema import WholePeriodOptics

@@ -32,7 +32,7 @@ from psfdae.optics.wavefronts import (
     monomial_coefficients,
     monomial_images,
 )
-from psfdae.sensing.climbing import Steps, poisson
+from psfdae.sensing.climbing import Steps, best_of_group, poisson
 from psfdae.sensing.climbing import climb as climbed
 from psfdae.sensing.sampling import Mixture
 from psfdae.telescope.settings import Telescope
@@ -277,6 +277,11 @@ class Modes:
         return Modes(*(np.concatenate(pair) for pair in pairs))
 
     @property
+    def group(self) -> np.ndarray:
+        """The same number for modes of a star that were found with as much given, (M,)."""
+        return (TRUTH + 1) * self.star + self.given
+
+    @property
     def mixture(self) -> Mixture:
         """Student's t around the modes."""
         return Mixture(self.z, self.factor, self.evidence)
@@ -509,8 +514,7 @@ def climb(modes: Modes, counts: np.ndarray, likelihood: Likelihood, model: Stamp
         height = -0.5 * (deviance + (z**2).sum(axis=1))
         return height, score - z, information + np.eye(TERMS)
 
-    group = (TRUTH + 1) * modes.star + modes.given
-    peaks = climbed(evaluate, modes.z, FARTHEST_Z, CLIMB, group)
+    peaks = climbed(evaluate, modes.z, FARTHEST_Z, CLIMB, modes.group)
     factor = np.linalg.cholesky(np.linalg.inv(peaks.information))
     evidence = peaks.height + np.log(np.diagonal(factor, axis1=1, axis2=2)).sum(axis=1)
     return _separate(replace(modes, z=peaks.parameters, factor=factor, evidence=evidence))
@@ -629,17 +633,10 @@ def _projected(
     return -0.5 * (loss + np.linalg.slogdet(curvature)[1][:, None]), z
 
 
-def _best(modes: Modes, score: np.ndarray) -> np.ndarray:
-    """Best score of each mode's star among modes found with as much given, shape (M,)."""
-    group = (TRUTH + 1) * modes.star + modes.given
-    best = np.full(group.max() + 1, -np.inf)
-    np.maximum.at(best, group, score)
-    return best[group]
-
-
 def _separate(modes: Modes) -> Modes:
     """Modes with any mass, each once."""
-    near = np.flatnonzero(modes.evidence > _best(modes, modes.evidence) - FARTHEST_EVIDENCE)
+    best = best_of_group(modes.evidence, modes.group)
+    near = np.flatnonzero(modes.evidence > best - FARTHEST_EVIDENCE)
     kept: dict[tuple[int, ...], list[int]] = {}
     given = modes.given.copy()
     for m in near[np.argsort(-modes.evidence[near], kind="stable")]:

@@ -14,9 +14,10 @@ import numpy as np
 
 from psfdae.belonging import require
 from psfdae.files import Column, read_product, write_csv, write_product
+from psfdae.optics.wavefronts import FIRST_NOLL
 from psfdae.options import File
 from psfdae.rng import stream
-from psfdae.telescope.raytracing import FIRST_NOLL, ZernikeTracer
+from psfdae.telescope.raytracing import ZernikeTracer
 from psfdae.threads import limit_threads
 from psfdae_paper.alignment.stamps import AlignmentStamps
 from psfdae_paper.alignment.telescope import (

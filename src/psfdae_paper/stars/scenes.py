@@ -20,7 +20,7 @@ from psfdae.optics.wavefronts import (
 )
 from psfdae.rng import stream
 from psfdae.telescope.field import static_zernikes
-from psfdae.telescope.settings import OwnTelescope, Telescope
+from psfdae.telescope.settings import Telescope
 from psfdae_paper.configuration.schema import Grid, Stars
 from psfdae_paper.stars.fields import perturb, relative_field, square_grid
 from psfdae_paper.stars.turbulence import SPECTRUM, Footprints, draw_waves, layer_r0
@@ -192,14 +192,14 @@ class TelescopeScene(Scene):
         """
         if self.telescope.aberrations.kind == "seidel":
             return self._seidel().templates()
-        return zernike_wavefronts(*static_terms(self.grid, self.telescope))
+        return zernike_wavefronts(*self._zernikes())
 
     def stars(self, stars: Stars, star_field: np.ndarray, seed: int) -> ModalWavefronts:
         """Wavefronts of stars with random aberrations, `star_field` the field of each, (n,)."""
         aberrations = self.telescope.aberrations
         if aberrations.kind == "seidel":
             return self._seidel().stars(stars, star_field, seed)
-        noll, static = static_terms(self.grid, self.telescope)
+        noll, static = self._zernikes()
         perturbed = perturb(
             static[star_field],
             stars.aberration_fraction,
@@ -209,19 +209,13 @@ class TelescopeScene(Scene):
         )
         return zernike_wavefronts(noll, perturbed)
 
+    def _zernikes(self) -> tuple[tuple[int, ...], np.ndarray]:
+        """See `static_zernikes`."""
+        _, angle_deg = square_grid(self.grid.points, self.grid.spacing_deg)
+        return static_zernikes(self.telescope, angle_deg)
+
     def _seidel(self) -> SeidelScene:
         return SeidelScene(self.grid, self.telescope, self.telescope.aberrations)
-
-
-def static_terms(grid: Grid, telescope: OwnTelescope) -> tuple[tuple[int, ...], np.ndarray]:
-    """Noll indices (J of them) and static coefficients of all fields, shape (F, J), in waves.
-
-    Raises
-    ------
-    RayTracingError
-        If the ray trace of a field is vignetted.
-    """
-    return static_zernikes(telescope, square_grid(grid.points, grid.spacing_deg)[1])
 
 
 SCENES = {"seidel": SeidelScene, "turbulence": TurbulenceScene, "telescope": TelescopeScene}
