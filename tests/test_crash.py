@@ -17,7 +17,7 @@ import time
 import psutil
 import pytest
 
-from workflow_runs import NO_CLUSTER, PATH, QUIET, captured, clone, job_counts, wait_until
+from workflow_runs import KERNELS, NO_CLUSTER, PATH, QUIET, captured, clone, job_counts, wait_until
 
 pytestmark = [pytest.mark.workflow, pytest.mark.slow]
 
@@ -34,7 +34,8 @@ TOO_LARGE = 150_000
 
 def reproduce(folder):
     """What a user types, with the environment active and nothing else set, for `subprocess`."""
-    own = {"HOME": str(folder), "PATH": PATH, "PYTHONPATH": str(folder / "src"), **NO_CLUSTER}
+    own = {"HOME": str(folder), "PATH": PATH, "PYTHONPATH": str(folder / "src")}
+    own |= NO_CLUSTER | KERNELS
     line = ["make", "reproduce", "PRESET=smoke", f"TARGETS={TARGET}", f"SET={SLOW}"]
     return {"args": line, "cwd": folder, "env": own}
 

@@ -19,6 +19,12 @@ VARYING = ("history.csv", "_times.csv", "alignment_time.csv", "runtime.csv", "ml
 QUIET = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
 NO_CLUSTER = {"SLURM_CONF": os.devnull}
 """Snakemake asks SLURM's programs, where there are any, and waits 10 s for a cluster in vain."""
+KERNELS = {
+    name: value
+    for name, value in os.environ.items()
+    if name.startswith("OPENBLAS_") and "THREADS" not in name
+}
+"""What chooses the kernels of linear algebra; like another processor it changes last digits."""
 
 
 def environment(**more):
@@ -57,7 +63,7 @@ def shell(folder, line, home=None, **options):
 
     `home` is the user's, by default the folder itself; options are those of `Popen`.
     """
-    own = {"HOME": str(home or folder), "PATH": PATH, "LANG": "C.UTF-8", **NO_CLUSTER}
+    own = {"HOME": str(home or folder), "PATH": PATH, "LANG": "C.UTF-8", **NO_CLUSTER, **KERNELS}
     # An environment of the copy's own would be linked to the copy's source.
     own["PYTHONPATH"] = str(folder / "src")
     return subprocess.Popen(["bash", "-c", line], cwd=folder, env=own, **options)
