@@ -145,6 +145,8 @@ class Estimate:
         Of a method that measures stars itself; its PSFs have the sum 1.
     outlier_score : ndarray, shape (n,), or None
         As `ScoresOutliers.outlier_score`, of a method that finds it on the way.
+    explained : ndarray of bool, shape (n,), or None
+        Whether the method's own model explains each star; else its PSF is another method's.
     """
 
     psf: np.ndarray
@@ -153,6 +155,7 @@ class Estimate:
     flux: np.ndarray | None = None
     measured: Measured | None = None
     outlier_score: np.ndarray | None = None
+    explained: np.ndarray | None = None
 
 
 # The parts of a method's class.

@@ -104,7 +104,8 @@ def all_metrics(
 def quality(estimate: Estimate, truth: np.ndarray, data_range: float) -> dict[str, np.ndarray]:
     """Metrics of every star (n,); of a method that says how sure it is, whether that is true.
 
-    Beside those of `all_metrics`: `coverage68`, the part of the pixels within ± σ, and `evidence`.
+    Beside those of `all_metrics`: `coverage68`, the part of the pixels within ± σ, `evidence`, and
+    whether the star is `explained`, 1 or 0.
     """
     metrics = all_metrics(estimate.psf, truth, data_range)
     if estimate.sigma is not None:
@@ -112,6 +113,8 @@ def quality(estimate: Estimate, truth: np.ndarray, data_range: float) -> dict[st
         metrics["coverage68"] = inside.mean(axis=(1, 2))
     if estimate.evidence is not None:
         metrics["evidence"] = estimate.evidence
+    if estimate.explained is not None:
+        metrics["explained"] = estimate.explained.astype(float)
     return metrics
 
 

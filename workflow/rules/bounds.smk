@@ -53,6 +53,31 @@ rule dataset_bounds:
         " > {log} 2>&1"
 
 
+rule dataset_optics:
+    input:
+        stars=lambda w: stars_of(w.dataset),
+        bank=lambda w: bank_of(w.dataset),
+    output:
+        summary=f"{RESULTS}/wavefront/{{dataset}}.csv",
+        per_star=f"{RESULTS}/wavefront/{{dataset}}.parquet",
+    log:
+        f"{RESULTS}/logs/wavefront/{{dataset}}.log",
+    benchmark:
+        f"{RESULTS}/benchmarks_on_request/bounds/optics-{{dataset}}.tsv"
+    resources:
+        mem_mb=1500,
+        runtime=30,
+    params:
+        config=lambda w: settings("optics", f"dataset={w.dataset}"),
+        source=source_hash("optics"),
+    message:
+        "Restoring {wildcards.dataset} by the optics of the telescope"
+    shell:
+        "psfdae optics --config {params.config} --dataset {wildcards.dataset}"
+        " --stars {input.stars} --bank {input.bank}"
+        " --per-star {output.per_star} --out {output.summary} > {log} 2>&1"
+
+
 rule psf_bounds:
     input:
         expand(rules.dataset_bounds.output.summary, dataset=default_datasets()),
@@ -84,6 +109,23 @@ use rule psf_bounds as psf_bounds_growth with:
         "Collecting how the posterior means depend on their banks"
 
 
+use rule psf_bounds as wavefront with:
+    input:
+        lambda w: [
+            f"{RESULTS}/wavefront/{dataset}.csv"
+            for dataset in default_datasets()
+            if has_bank(dataset)
+        ],
+    output:
+        f"{RESULTS}/tables/psf_optics.csv",
+    log:
+        f"{RESULTS}/logs/wavefront/psf_optics.log",
+    benchmark:
+        f"{RESULTS}/benchmarks_on_request/bounds/psf_optics.tsv"
+    message:
+        "Collecting what the optics of the telescope restore"
+
+
 rule psf_efficiency:
     input:
         bounds=expand(rules.dataset_bounds.output.summary, dataset=default_datasets()),
@@ -91,7 +133,7 @@ rule psf_efficiency:
         methods=lambda w: [
             path
             for dataset in default_datasets()
-            for path in per_star_of(dataset, ["random"])
+            for path in per_star_of(dataset, ["random"]) + optics_of(dataset)
         ],
     output:
         f"{RESULTS}/tables/psf_efficiency.csv",
@@ -218,6 +260,7 @@ rule bounds:
         rules.figure_headline.output if HEADLINE_DATASET in default_datasets() else [],
         rules.psf_bounds.output,
         rules.psf_bounds_growth.output,
+        rules.wavefront.output,
         rules.psf_efficiency.output,
         rules.paper_rows.output,
         lambda w: [

@@ -28,6 +28,11 @@ def per_star_of(dataset, splits=None):
     ]
 
 
+def optics_of(dataset):
+    """Errors on single test stars of the methods that know the telescope's optics."""
+    return [f"{RESULTS}/wavefront/{dataset}.parquet"] if has_bank(dataset) else []
+
+
 def bound_figures_of(dataset):
     kinds = ["errors", "efficiency"] + (["growth"] if has_bank(dataset) else [])
     return [f"{RESULTS}/figures/bounds/{dataset}_{kind}.png" for kind in kinds]

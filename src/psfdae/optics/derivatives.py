@@ -3,8 +3,10 @@
 The OPD is a sum of modes, W = Σ c_j M_j. The field in the image is that of
 `psfdae.optics.propagation`, E = Σ A exp(2πiW) exp(−πiu·x). A direction v in the
 space of coefficients changes it by dE = Σ 2πi (Σ v_j M_j) A exp(2πiW) exp(−πiu·x),
-another such sum, and the intensity by d|E|² = 2 Re(E* dE): derivatives are exact
-and each costs about as much as a stamp.
+another such sum, and the intensity by d|E|² = 2 Re(E* dE): derivatives are exact.
+Modes are polynomials of the pupil's coordinates, sums of products P_a(x) P_b(y) of Legendre
+polynomials. The field of such a product is two matrix products with weighted matrices, and those
+along x serve all b: all directions together cost a few stamps.
 
 Three ways lead from the pupil to the pixels, a `Sampling` each:
 
@@ -26,7 +28,7 @@ from scipy import fft
 
 from psfdae.optics.propagation import Precision, image_points, in_batches
 from psfdae.optics.pupil import Pupil, annular_pupil, choose_samples, required_samples
-from psfdae.optics.wavefronts import Modes, mode_slopes, slope_ranges
+from psfdae.optics.wavefronts import Modes, legendre, legendre_expansion, mode_slopes, slope_ranges
 
 
 class Sampling(Protocol):
@@ -35,8 +37,25 @@ class Sampling(Protocol):
     dtype: np.dtype
     """float32 or float64, of the pixels."""
 
-    def fields(self, pupil_fields: np.ndarray) -> np.ndarray:
-        """Fields at the points, (..., M, M) to (..., m, m), up to a common phase per point."""
+    def along_x(self, pupil_fields: np.ndarray, degrees: Sequence[int] = (0,)) -> np.ndarray:
+        """Rows of the pupil to points, times P_a(x) for all degrees a.
+
+        Parameters
+        ----------
+        pupil_fields : ndarray, shape (B, M, M)
+        degrees : sequence of A int
+            Of Legendre polynomials.
+
+        Returns
+        -------
+        ndarray, shape (A, B, M, m)
+        """
+
+    def along_y(self, rows: np.ndarray, degrees: Sequence[int] = (0,)) -> np.ndarray:
+        """Columns of those, (B, M, m), to points, times P_b(y) for all degrees b, (A, B, m, m).
+
+        Together they give fields at the points, up to a common phase of each.
+        """
 
     def to_pixels(self, values: np.ndarray) -> np.ndarray:
         """Pixels (..., d, d) of intensities, or of their slopes, at the points (..., m, m)."""
@@ -60,18 +79,64 @@ class Separable:
 class PointSampling(Separable):
     """The points of `image_points` on both sides of the chief ray; its parameters."""
 
+    # Pupil and points are symmetric about the chief ray. Even and odd parts of the pupil fields
+    # meet cosines or sines, so that products are real and a quarter as large.
+
     def __init__(self, pupil: Pupil, stamp_px: int, pixel: float, precision: Precision) -> None:
         half, even, odd = image_points(pupil, stamp_px, pixel)
-        points = np.concatenate([-half[::-1], half])
-        self._dft = np.exp(-1j * np.pi * np.outer(pupil.axis, points)).astype(precision)
+        self._samples = (pupil.axis.size + 1) // 2
+        self._axis = pupil.axis[-self._samples :]
+        # Of an odd grid the middle sample is its own mirror image.
+        alone = np.where(self._axis == 0.0, 0.5, 1.0)[:, None]
+        angle = np.pi * np.outer(self._axis, half)
+        self._waves = np.stack([np.cos(angle), np.sin(angle)]) * alone
         above = 0.5 * np.hstack([(even - odd)[::-1].T, (even + odd).T])
         # The middle pixel of an odd stamp is its own mirror image.
         below = above[::-1, ::-1][: stamp_px // 2]
-        self.pixels = np.vstack([below, above]).astype(self._dft.real.dtype)
+        self.pixels = np.vstack([below, above]).astype(np.empty(0, precision).real.dtype)
+        self._weighted: dict[int, np.ndarray] = {}
 
-    def fields(self, pupil_fields: np.ndarray) -> np.ndarray:
+    def along_x(self, pupil_fields: np.ndarray, degrees: Sequence[int] = (0,)) -> np.ndarray:
         """See `Sampling`, m = all points."""
-        return self._dft.T @ (pupil_fields @ self._dft)
+        first, last = (
+            pupil_fields[..., self._samples - 1 :: -1],
+            pupil_fields[..., -self._samples :],
+        )
+        parts = _real_parts(last + first), _real_parts(last - first)
+        shape = (2, *pupil_fields.shape[:-1], -1)
+        found = []
+        for a in degrees:
+            waves = [parts[(a + k) % 2] @ self._matrix(a)[k] for k in (0, 1)]
+            found.append(_joined(*(wave.reshape(shape) for wave in waves)))
+        return np.stack(found)
+
+    def along_y(self, rows: np.ndarray, degrees: Sequence[int] = (0,)) -> np.ndarray:
+        """See `Sampling`."""
+        # Transposed, so that both ways are the same products.
+        return self.along_x(rows.swapaxes(-1, -2), degrees).swapaxes(-1, -2)
+
+    def _matrix(self, degree: int) -> np.ndarray:
+        """Cosines and sines times P_a(x) over half of the pupil, shape (2, M/2, m/2)."""
+        if degree not in self._weighted:
+            weighted = legendre([degree], self._axis)[0][:, None] * self._waves
+            self._weighted[degree] = weighted.astype(self.dtype)
+        return self._weighted[degree]
+
+
+def _real_parts(array: np.ndarray) -> np.ndarray:
+    """Rows (n, M) of the real, then of the imaginary part: one matrix for one product."""
+    return np.stack([array.real, array.imag]).reshape(-1, array.shape[-1])
+
+
+def _joined(cosines: np.ndarray, sines: np.ndarray) -> np.ndarray:
+    """C − iS at the points above the chief ray, C + iS below, of real and imaginary parts."""
+    (cos_re, cos_im), (sin_re, sin_im) = cosines, sines
+    half = cos_re.shape[-1]
+    out = np.empty((*cos_re.shape[:-1], 2 * half), np.result_type(cos_re, np.complex64))
+    above, below = out[..., half:], out[..., half - 1 :: -1]
+    above.real, above.imag = cos_re + sin_im, cos_im - sin_re
+    below.real, below.imag = cos_re - sin_im, cos_im + sin_re
+    return out
 
 
 class PeriodSampling(Separable):
@@ -85,6 +150,7 @@ class PeriodSampling(Separable):
 
     def __init__(self, pupil: Pupil, stamp_px: int, pixel: float, precision: Precision) -> None:
         samples = pupil.axis.size
+        self._axis = pupil.axis
         self.points = fft.next_fast_len(2 * samples)
         lags = np.arange(1 - samples, samples)
         frequency = 0.5 * pupil.spacing * lags
@@ -96,10 +162,15 @@ class PeriodSampling(Separable):
         self.pixels = (to_pixels @ from_points).real / self.points
         self.pixels = self.pixels.astype(np.empty(0, precision).real.dtype)
 
-    def fields(self, pupil_fields: np.ndarray) -> np.ndarray:
+    def along_x(self, pupil_fields: np.ndarray, degrees: Sequence[int] = (0,)) -> np.ndarray:
         """See `Sampling`, m = points."""
-        rows = fft.fft(pupil_fields, self.points, axis=-1)
-        return fft.fft(rows, self.points, axis=-2)
+        weights = legendre(degrees, self._axis).astype(self.dtype)
+        return fft.fft(pupil_fields * weights[:, None, None], self.points)
+
+    def along_y(self, rows: np.ndarray, degrees: Sequence[int] = (0,)) -> np.ndarray:
+        """See `Sampling`."""
+        weights = legendre(degrees, self._axis).astype(self.dtype)
+        return fft.fft(rows * weights[:, None, :, None], self.points, axis=-2)
 
 
 def _centres(stamp_px: int, pixel: float) -> np.ndarray:
@@ -129,6 +200,14 @@ class ModalStamps:
         images = modes(pupil.axis[None, :], pupil.axis[:, None])
         self._modes = np.ascontiguousarray(images.reshape(len(images), -1), dtype)
         self._amplitude = (pupil.amplitude / np.sqrt(pupil.light)).astype(dtype)
+        degrees, coefficients = legendre_expansion(modes)
+        self._coefficients = coefficients.astype(dtype)
+        self._products = [*map(tuple, degrees)]
+        # What is needed along y with each degree along x; the constant first, it is the field.
+        self._degrees = [
+            [0] * (a == 0) + [b for c, b in self._products if c == a]
+            for a in range(degrees[:, 0].max() + 1)
+        ]
 
     def stamps(self, coefficients: np.ndarray, offset_px: np.ndarray | None = None) -> np.ndarray:
         """Stamps of a batch.
@@ -144,8 +223,10 @@ class ModalStamps:
         ndarray, shape (B, d, d)
             Fraction of the light through the pupil on each pixel.
         """
-        field = self._sampling.fields(self._pupil_fields(coefficients, offset_px))
-        return self._sampling.to_pixels(field.real**2 + field.imag**2)
+        sampling = self._sampling
+        (rows,) = sampling.along_x(self._pupil_fields(coefficients, offset_px))
+        (field,) = sampling.along_y(rows)
+        return sampling.to_pixels(field.real**2 + field.imag**2)
 
     def derivatives(
         self,
@@ -172,15 +253,24 @@ class ModalStamps:
         """
         if directions is None:
             directions = np.eye(len(self._modes))
-        changes = directions.astype(self._modes.dtype) @ self._modes
-        changes = changes.reshape(*directions.shape[:-1], *self.shape)
-        pupil_fields = self._pupil_fields(coefficients, offset_px)[:, None]
-        turned = 2j * np.pi * changes * pupil_fields
-        image = self._sampling.fields(pupil_fields)
-        change = self._sampling.fields(turned)
-        intensity = (image.real**2 + image.imag**2)[:, 0]
-        slope = 2.0 * (image.real * change.real + image.imag * change.imag)
-        return self._sampling.to_pixels(intensity), self._sampling.to_pixels(slope)
+        weights = directions.astype(self.dtype) @ self._coefficients
+        if weights.ndim == 2:
+            weights = weights[None]
+        sampling, pupil_fields = self._sampling, self._pupil_fields(coefficients, offset_px)
+        slopes: dict[tuple[int, int], np.ndarray] = {}
+        for a, rows in enumerate(sampling.along_x(pupil_fields, range(len(self._degrees)))):
+            degrees = self._degrees[a]
+            changes = sampling.along_y(rows, degrees)
+            if a == 0:
+                image = changes[0]
+            for b, change in zip(degrees, changes, strict=True):
+                # Half of 2 Re(E* i G)
+                slope = image.imag * change.real - image.real * change.imag
+                slopes[a, b] = sampling.to_pixels(slope)
+        each = (4.0 * np.pi) * np.stack([slopes[place] for place in self._products], axis=1)
+        stamps = sampling.to_pixels(image.real**2 + image.imag**2)
+        shape = (len(stamps), weights.shape[1], *stamps.shape[1:])
+        return stamps, (weights @ each.reshape(*each.shape[:2], -1)).reshape(shape)
 
     def opd(self, coefficients: np.ndarray) -> np.ndarray:
         """OPD maps in waves, shape (B, M, M)."""

@@ -12,12 +12,14 @@ repeats with the pupil grid's period, and so do the wings of the profile (`Profi
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from psfdae.optics.propagation import Precision
 from psfdae.optics.pupil import Pupil
+from psfdae.optics.wavefronts import legendre
 
 FAINT = 1e-4
 """Fraction of the maximum below which wings of the next period do not matter.
@@ -91,6 +93,7 @@ class BlurredSampling:
 
         self.dtype = np.dtype(np.float32 if precision == "complex64" else np.float64)
         self.complex = np.dtype(precision)
+        self._axis = pupil.axis
         self.points = n = fft.next_fast_len(2 * pupil.axis.size)
         # Cycles per pixel of the lags; those of one sign stand for both, the image is real.
         step = 0.5 * pupil.spacing * pixel * n
@@ -102,12 +105,19 @@ class BlurredSampling:
         self._transfer = (weights * blur).astype(self.dtype)
         self._centres = np.arange(stamp_px) - 0.5 * (stamp_px - 1)
 
-    def fields(self, pupil_fields: np.ndarray) -> np.ndarray:
-        """Fields over the period, (..., M, M) to (..., n, n), up to a common phase per point."""
+    def along_x(self, pupil_fields: np.ndarray, degrees: Sequence[int] = (0,)) -> np.ndarray:
+        """See `Sampling`, m = n points of the period."""
         from scipy import fft
 
-        # Only the pupil's rows hold anything.
-        return fft.fft(fft.fft(pupil_fields, self.points), self.points, axis=-2)
+        weights = legendre(degrees, self._axis).astype(self.dtype)
+        return fft.fft(pupil_fields * weights[:, None, None], self.points)
+
+    def along_y(self, rows: np.ndarray, degrees: Sequence[int] = (0,)) -> np.ndarray:
+        """See `Sampling`."""
+        from scipy import fft
+
+        weights = legendre(degrees, self._axis).astype(self.dtype)
+        return fft.fft(rows * weights[:, None, :, None], self.points, axis=-2)
 
     def to_pixels(self, values: np.ndarray, offset_px: tuple[float, float] = (0, 0)) -> np.ndarray:
         """Pixels (..., d, d) of intensities (..., n, n) around a place (row, column) in pixels."""
@@ -149,5 +159,6 @@ class BlurredPropagator:
         pupil_field = np.empty(phase.shape, self._sampling.complex)
         pupil_field.real, pupil_field.imag = np.cos(phase), np.sin(phase)
         pupil_field *= self._amplitude
-        image = self._sampling.fields(pupil_field)
+        (rows,) = self._sampling.along_x(pupil_field[None])
+        image = self._sampling.along_y(rows)[0, 0]
         return self._sampling.to_pixels(image.real**2 + image.imag**2, offset_px)

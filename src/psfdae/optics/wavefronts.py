@@ -187,6 +187,42 @@ def movable_modes(
     return np.concatenate([modes(x, y), tilts])
 
 
+HIGHEST_DEGREE = 16
+"""Of modes, in either coordinate of the pupil."""
+
+
+def legendre(degrees: Sequence[int], x: np.ndarray) -> np.ndarray:
+    """Legendre polynomials at x (n,), shape (A, n)."""
+    return np.polynomial.legendre.legvander(x, max(degrees)).T[list(degrees)]
+
+
+def legendre_expansion(modes: Modes) -> tuple[np.ndarray, np.ndarray]:
+    """Modes as sums of products P_a(x) P_b(y) of Legendre polynomials.
+
+    Returns
+    -------
+    degrees : ndarray of int, shape (T, 2)
+        (a, b) of every product that occurs, but for the constant.
+    coefficients : ndarray, shape (J, T)
+
+    Raises
+    ------
+    ValueError
+        If modes are no polynomials of a degree below `HIGHEST_DEGREE`.
+    """
+    nodes, weights = np.polynomial.legendre.leggauss(HIGHEST_DEGREE + 1)
+    values = modes(nodes[None, :], nodes[:, None])
+    norm = np.arange(HIGHEST_DEGREE + 1) + 0.5
+    onto = legendre(range(HIGHEST_DEGREE + 1), nodes) * weights * norm[:, None]
+    found = (onto @ values @ onto.T).swapaxes(1, 2)  # [mode, a, b]
+    size = np.abs(found).max(axis=(1, 2), keepdims=True)
+    occurs = (np.abs(found) > 1e-11 * size).any(axis=0)
+    if occurs[-1].any() or occurs[:, -1].any():
+        raise ValueError(f"modes: no polynomials of a degree below {HIGHEST_DEGREE}")
+    occurs[0, 0] = False
+    return np.argwhere(occurs), found[:, occurs]
+
+
 SLOPE_POINTS = 65
 """Points per axis at which slopes are measured."""
 

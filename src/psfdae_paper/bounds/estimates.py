@@ -16,6 +16,7 @@ from psfdae_paper.bounds.posterior import (
     Bank,
     Likelihood,
     PosteriorSums,
+    companions,
     jittered_templates,
     nested_means,
     posterior_sums,
@@ -27,7 +28,6 @@ from psfdae_paper.configuration.schema import Config
 from psfdae_paper.stars.fields import assign_fields, relative_field
 from psfdae_paper.stars.framing import Propagation
 from psfdae_paper.stars.scenes import drawn_columns, star_wavefronts, template_wavefronts
-from psfdae_paper.stars.symmetry import orbit
 
 SPLIT = "random"
 """The split that is bounded: its test stars lie in all fields."""
@@ -238,20 +238,6 @@ def sampled(
     return sample(bank, seidel, noisy, truth, likelihood, model, draws, rngs)
 
 
-def _anywhere(stars: BoundedStars, bank: Bank) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Test stars and the draws that they are weighed with: all with all."""
-    return [(np.arange(stars.field.size), np.arange(len(bank)))]
-
-
-def _in_the_field(stars: BoundedStars, bank: Bank) -> list[tuple[np.ndarray, np.ndarray]]:
-    """The same for draws that the symmetries take to each star's own field.
-
-    Fields that are mirror images of each other share theirs.
-    """
-    ours, theirs = orbit(stars.field, bank.points), orbit(bank.field, bank.points)
-    return [(np.flatnonzero(ours == o), np.flatnonzero(theirs == o)) for o in np.unique(ours)]
-
-
 def weighed(
     bank: Bank, given: bool, static: np.ndarray, stars: BoundedStars, level: float, like: Likelihood
 ) -> dict[int, np.ndarray]:
@@ -261,7 +247,7 @@ def weighed(
     the draws in all fields. A bank in which far too few stars are similar at its noise level is
     left after a quarter.
     """
-    groups = _in_the_field(stars, bank) if given else _anywhere(stars, bank)
+    groups = companions(stars.field.size, stars.field if given else None, bank)
     pieces = segments(min(draws.size for _, draws in groups))
     quarter = max(1, pieces // 4)
     several = [(stars.take(group), np.array_split(draws, pieces)) for group, draws in groups]
@@ -297,4 +283,5 @@ def measures_of(sums: PosteriorSums, static: np.ndarray, stars: BoundedStars) ->
     template, spread = sums.template(static)
     means = {"realisation": sums.mean_image, "template": template}
     errors = [mse(means[name].reshape(shape), truth) for name, truth in stars.truth.items()]
-    return np.stack([*errors, sums.variance_image, spread, sums.effective_size])
+    spreads = [sums.variance.mean(axis=1), spread.mean(axis=1)]
+    return np.stack([*errors, *spreads, sums.effective_size])

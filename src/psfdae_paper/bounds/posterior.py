@@ -10,7 +10,7 @@ import numpy as np
 
 from psfdae.noise import NoiseModel
 from psfdae_paper.stars.framing import crop_jittered, normalise_flux
-from psfdae_paper.stars.symmetry import SYMMETRIES, Symmetry
+from psfdae_paper.stars.symmetry import SYMMETRIES, Symmetry, orbit
 
 MIRROR_MARGIN = 1
 """Pixels beyond the jitter that a flipped stamp needs (`Symmetry.window`)."""
@@ -199,10 +199,8 @@ class PosteriorSums:
         Largest log-likelihood of every test star.
     total, square : ndarray, shape (n,)
         Σw and Σw².
-    power : ndarray, shape (n,)
-        Σw |p|², p the bank's images.
-    image : ndarray, shape (n, P)
-        Σw p.
+    image, power : ndarray, shape (n, P)
+        Σw p and Σw p², p the bank's images.
     share : ndarray, shape (n, F, J)
         Σw by field and jitter.
     """
@@ -210,20 +208,30 @@ class PosteriorSums:
     peak: np.ndarray
     total: np.ndarray
     square: np.ndarray
-    power: np.ndarray
     image: np.ndarray
+    power: np.ndarray
     share: np.ndarray
 
     @classmethod
     def empty(cls, stars: int, pixels: int, fields: int, shifts: int) -> PosteriorSums:
         """Sums over nothing."""
-        zeros = (np.zeros((stars, *shape)) for shape in ((), (), (), (pixels,), (fields, shifts)))
+        shapes = ((), (), (pixels,), (pixels,), (fields, shifts))
+        zeros = (np.zeros((stars, *shape)) for shape in shapes)
         return cls(np.full(stars, -np.inf), *zeros)
 
     @classmethod
     def stack(cls, parts: Sequence[PosteriorSums]) -> PosteriorSums:
         """Sums of several groups of test stars, one after the other."""
         return cls(*(np.concatenate([getattr(p, key) for p in parts]) for key in vars(parts[0])))
+
+    def take(self, stars: np.ndarray) -> PosteriorSums:
+        """Those of some stars, in the order given."""
+        return PosteriorSums(*(values[stars] for values in vars(self).values()))
+
+    def put(self, stars: np.ndarray, others: PosteriorSums) -> None:
+        """Put others in place of those of some stars."""
+        for name, values in vars(others).items():
+            getattr(self, name)[stars] = values
 
     @property
     def mean_image(self) -> np.ndarray:
@@ -237,13 +245,14 @@ class PosteriorSums:
         return self.total**2 / np.maximum(self.square, np.finfo(float).tiny)
 
     @property
-    def variance_image(self) -> np.ndarray:
-        """Posterior variance of the noise-free image, mean of its pixels, (n,); NaN as above."""
+    def variance(self) -> np.ndarray:
+        """Posterior variance of every pixel of the noise-free image, (n, P); NaN as above."""
         with np.errstate(invalid="ignore"):
-            return _variance(self.power / self.total, self.mean_image)
+            # Rounding makes none of it negative.
+            return np.maximum(self.power / self.total[:, None] - self.mean_image**2, 0.0)
 
     def template(self, templates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Posterior mean (n, P) and variance (n,) of the static PSF; NaN as `mean_image`.
+        """Posterior mean and variance of the static PSF, (n, P) both; NaN as `mean_image`.
 
         Parameters
         ----------
@@ -281,8 +290,8 @@ class PosteriorSums:
         scale = np.exp(self.peak[changed] - peak[changed])
         self.total[changed] *= scale
         self.square[changed] *= scale**2
-        self.power[changed] *= scale
         self.image[changed] *= scale[:, None]
+        self.power[changed] *= scale[:, None]
         self.share[changed] *= scale[:, None, None]
         self.peak = peak
         # A star of which no image is possible so far keeps weights of zero.
@@ -290,24 +299,18 @@ class PosteriorSums:
         weight = np.exp(above.astype(np.float32))
         self.total += weight.sum(axis=1, dtype=np.float64)
         self.square += np.einsum("nk,nk->n", weight, weight, dtype=np.float64)
-        power = np.einsum("kp,kp->k", images[used], images[used], dtype=np.float64)
-        self.power += weight.astype(np.float64) @ power
         side = int(np.sqrt(images.shape[1]))
-        added = symmetry.image((weight @ images[used]).reshape(-1, side, side))
-        self.image += added.reshape(self.image.shape)
+        for whole, values in ((self.image, images[used]), (self.power, images[used] ** 2)):
+            part = symmetry.image((weight @ values).reshape(-1, side, side))
+            np.add(whole, part.reshape(whole.shape), out=whole)
         start = np.flatnonzero(np.diff(field[used], prepend=-1))
         self.share[:, field[used][start], jitter] += np.add.reduceat(weight, start, axis=1)
 
 
 def mixture(weight: np.ndarray, images: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean (n, P) and variance (n,), the mean over pixels, of images (K, P) by weights (n, K)."""
+    """Mean and variance, (n, P) both, of images (K, P) by weights (n, K)."""
     mean = weight @ images
-    return mean, _variance(weight @ (images**2).sum(axis=1), mean)
-
-
-def _variance(power: np.ndarray, mean: np.ndarray) -> np.ndarray:
-    """(⟨|p|²⟩ − |⟨p⟩|²)/P; rounding makes none of it negative."""
-    return np.maximum(power - (mean**2).sum(axis=1), 0.0) / mean.shape[1]
+    return mean, np.maximum(weight @ images**2 - mean**2, 0.0)
 
 
 def merge(parts: Sequence[PosteriorSums]) -> PosteriorSums:
@@ -320,8 +323,8 @@ def merge(parts: Sequence[PosteriorSums]) -> PosteriorSums:
         scale = np.exp(part.peak - np.maximum(whole.peak, np.finfo(float).min))
         whole.total += scale * part.total
         whole.square += scale**2 * part.square
-        whole.power += scale * part.power
         whole.image += scale[:, None] * part.image
+        whole.power += scale[:, None] * part.power
         whole.share += scale[:, None, None] * part.share
     return whole
 
@@ -373,6 +376,20 @@ def scored(
                 scores = mirrored[s] @ ratio_t + (offset + log_weights[:, s])
                 field = SYMMETRIES[s].field(part.field, bank.points)
                 yield Scored(stars, field, s, jitter, images, scores)
+
+
+def companions(
+    count: int, own: np.ndarray | None, bank: Bank
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Groups of noisy images, by their numbers, and the stars of a bank that may explain each.
+
+    All with all; if the images' fields are given, `own` (n,), with stars that symmetries take
+    there. Fields that are mirror images of each other share theirs.
+    """
+    if own is None:
+        return [(np.arange(count), np.arange(len(bank)))]
+    ours, theirs = orbit(own, bank.points), orbit(bank.field, bank.points)
+    return [(np.flatnonzero(ours == o), np.flatnonzero(theirs == o)) for o in np.unique(ours)]
 
 
 def posterior_sums(
@@ -444,7 +461,7 @@ def exact_posterior(
     weight /= weight.sum(axis=1, keepdims=True)
     mean, variance = mixture(weight, images)
     share = weight.reshape(-1, fields, shifts).sum(axis=2)
-    return mean.reshape(noisy.shape), variance, share
+    return mean.reshape(noisy.shape), variance.mean(axis=1), share
 
 
 FITTED_POINTS = 4

@@ -14,7 +14,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property, partial, reduce
+from itertools import product
 from typing import NamedTuple, get_args
 
 import numpy as np
@@ -32,11 +33,18 @@ from psfdae.optics.wavefronts import (
     monomial_coefficients,
     monomial_images,
 )
-from psfdae.sensing.climbing import Steps, best_of_group, poisson
+from psfdae.sensing.climbing import Peaks, Steps, best_of_group, poisson
 from psfdae.sensing.climbing import climb as climbed
 from psfdae.sensing.sampling import Mixture
 from psfdae.telescope.settings import Telescope
-from psfdae_paper.bounds.posterior import Bank, Likelihood, PosteriorSums, jitters, scored
+from psfdae_paper.bounds.posterior import (
+    Bank,
+    Likelihood,
+    PosteriorSums,
+    companions,
+    jitters,
+    scored,
+)
 from psfdae_paper.configuration.schema import Framing, Optics
 from psfdae_paper.stars.framing import normalise_flux
 from psfdae_paper.stars.symmetry import SYMMETRIES
@@ -59,12 +67,6 @@ class TwinSearch(NamedTuple):
 
     sources: int = 3
     """Best modes of a star whose twins are sought."""
-    poor_fit: float = 2.0
-    """Standard deviations of χ² by which a star's best mode must fit worse than the truth would,
-    for more modes to be sought beside it. Chance alone makes 3 % of the stars."""
-    neighbourhood_px: int = 3
-    """By which the offsets of these modes differ at most. At low noise an offset that the bank
-    does not have in a star's field is a mode that no match leads to."""
     offsets: int = 1
     """That are tried in a field around every source."""
     most: int = 40
@@ -74,19 +76,23 @@ class TwinSearch(NamedTuple):
 class Search(NamedTuple):
     """How many modes are sought: few, and more for stars that they do not explain."""
 
-    first_stars: int = 8000
-    """Of the bank, that are matched first."""
-    fields: int = 8
+    fields: int = 4
     """From the best matches in which modes are sought."""
-    offsets: int = 4
+    offsets: int = 3
     """The same in the star's own field, if it is given."""
+    poor_fit: float = 3.0
+    """Standard deviations of χ² by which a star's best mode must fit worse than the truth would,
+    for more modes to be sought. Chance alone makes a few in a thousand, with 2 one in forty."""
     more: int = 16
-    """Fields or offsets, with the whole bank, for stars that no mode explains."""
+    """Fields or offsets for those stars."""
+    hops: int = 2
+    """Rounds in which those that are still not explained are sought all around their best modes."""
+    corner: float = 0.5
+    """Half the side of the cube, in standardised coefficients, at whose corners a hop begins."""
     stars_at_once: int = 256
     """Whose matches are in memory together."""
     missed: float = 4.0
-    """As `TwinSearch.poor_fit`, for a star to count as not explained. Chance alone makes a
-    few in ten thousand."""
+    """As `poor_fit`, for a star to count as not explained in the end."""
 
 
 class Proposals(NamedTuple):
@@ -100,8 +106,8 @@ class Proposals(NamedTuple):
 
 TWINS, SEARCH, PROPOSALS = TwinSearch(), Search(), Proposals()
 
-THOROUGH = Search(first_stars=2**62, fields=16, offsets=16)
-"""Of the error bounds: the whole bank at once."""
+THOROUGH = Search(fields=16, offsets=16, poor_fit=2.0)
+"""Of the error bounds."""
 
 CONJUGATE = np.array([1 - 2 * (name in ("r4", "xx", "xy", "yy")) for name in MONOMIALS])
 """Signs that negate the even part of a wavefront: its image stays the same."""
@@ -117,6 +123,9 @@ EQUAL_PARTS = 4
 """Equal parts of the draws, whose errors tell whether they are enough."""
 
 CLIMB = Steps(depth=FARTHEST_EVIDENCE)
+
+CLIMB_PX = 1.5
+"""Standard deviation in pixels of where a stamp may lie while matches are recentred."""
 
 STARS_AT_ONCE = 60
 """Stars whose draws are propagated together, to bound the memory."""
@@ -362,8 +371,8 @@ def search(
 ) -> tuple[Modes, np.ndarray]:
     """Modes of stars of which nothing is known, or their fields.
 
-    Stars that no mode explains get more starts: of the whole bank, and all offsets around their
-    best modes and matches.
+    Climbs begin at the bank's best matches, as they are and recentred. Stars that no mode explains
+    get more of them, and then starts all around their best modes.
 
     Parameters
     ----------
@@ -390,23 +399,30 @@ def search(
     effort = effort or SEARCH
     problem = (likelihood.counts(noisy), likelihood, model)
 
-    def matched(stars: np.ndarray, size: int, fields: int, offsets: int) -> Modes:
-        some, given = bank.take(np.arange(size)), None if own is None else own[stars]
-        problem = (some, seidel[:size], noisy[stars], likelihood, model)
-        found = best_matches(*problem, fields if anywhere else 0, offsets, given)
-        return replace(found, star=stars[found.star])
+    def matched(stars: np.ndarray, fields: int, offsets: int) -> Modes:
+        given = None if own is None else own[stars]
+        groups = companions(stars.size, None if anywhere else given, bank)
+        found = []
+        for group, drawn in groups:
+            some = stars[group]
+            sample = (bank.take(drawn), seidel[drawn], noisy[some], likelihood, model)
+            theirs = None if given is None else given[group]
+            best = best_matches(*sample, fields if anywhere else 0, offsets, theirs)
+            found.append(replace(best, star=some[best.star]))
+        return reduce(Modes.__add__, found)
 
-    first = min(effort.first_stars, len(bank))
-    matches = matched(np.arange(len(noisy)), first, effort.fields, effort.offsets)
-    modes = climb(matches, *problem)
-    missed = unexplained(modes, *problem)
-    if missed.size and first < len(bank):
-        matches = matched(missed, len(bank), effort.more, effort.more)
-        modes = climb(modes + matches, *problem)
-        missed = unexplained(modes, *problem)
+    matches = matched(np.arange(len(noisy)), effort.fields, effort.offsets)
+    modes = climb(matches + recentred(matches, *problem), *problem)
+    missed = unexplained(modes, *problem, effort.poor_fit)
     if missed.size:
-        beside = neighbours(modes, missed) + neighbours(matches, missed)
-        modes = climb(modes + beside, *problem)
+        matches = matched(missed, effort.more, effort.more)
+        modes = climb(modes + matches + recentred(matches, *problem), *problem)
+        missed = unexplained(modes, *problem, effort.poor_fit)
+    for _ in range(effort.hops):
+        if not missed.size:
+            break
+        modes = climb(modes + recentred(corners(modes, missed), *problem), *problem)
+        missed = unexplained(modes, *problem, effort.poor_fit)
     if anywhere:
         modes = climb(modes + twins(modes, likelihood, model), *problem)
     return modes, unexplained(modes, *problem, effort.missed)
@@ -503,21 +519,60 @@ def climb(modes: Modes, counts: np.ndarray, likelihood: Likelihood, model: Stamp
     model : StampModel
     """
 
+    peaks = _climbed(modes, counts, likelihood, model, np.empty((0, len(MONOMIALS))))
+    factor = np.linalg.cholesky(np.linalg.inv(peaks.information))
+    evidence = peaks.height + np.log(np.diagonal(factor, axis1=1, axis2=2)).sum(axis=1)
+    return _separate(replace(modes, z=peaks.parameters, factor=factor, evidence=evidence))
+
+
+def recentred(modes: Modes, counts: np.ndarray, likelihood: Likelihood, model: StampModel) -> Modes:
+    """Where matches climb to if the stamp may lie anywhere, at the pixel that is nearest.
+
+    In whole pixels, a stamp that is one beside its place leads to another mode, mostly a wrong one.
+    Parameters are those of `climb`.
+    """
+    shift = CLIMB_PX * _tilt(model, np.eye(2))
+    peaks = _climbed(modes, counts, likelihood, model, shift)
+    moved = np.rint(CLIMB_PX * peaks.parameters[:, TERMS:]).astype(int)
+    z = peaks.parameters[:, :TERMS]
+    return Modes.at(modes.star, modes.field, modes.offset - moved, modes.given, z)
+
+
+def _tilt(model: StampModel, shift_px: np.ndarray) -> np.ndarray:
+    """Monomials' coefficients (n, 8) that move a stamp by pixels (row, column), (n, 2).
+
+    A pixel is a tilt by half its width in λ/D (`StampPropagator`).
+    """
+    tilt = np.zeros((len(shift_px), len(MONOMIALS)))
+    tilt[:, -2:] = 0.5 * model.telescope.pixel * shift_px[:, ::-1]
+    return tilt
+
+
+def _climbed(
+    modes: Modes,
+    counts: np.ndarray,
+    likelihood: Likelihood,
+    model: StampModel,
+    more: np.ndarray,
+) -> Peaks:
+    """Maxima over z and coefficients of further directions `more` (K, 8), normal like z."""
+
     def evaluate(some: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, ...]:
         field = modes.field[some]
-        coefficients, directions = model.coefficients(z, field), model.directions(field)
+        coefficients = model.coefficients(z[:, :TERMS], field) + z[:, TERMS:] @ more
+        directions = np.concatenate(
+            [model.directions(field), np.tile(more, (some.size, 1, 1))], axis=1
+        )
         stamps, slopes = model.derivatives(coefficients, directions, modes.offset[some])
         mean = likelihood.flux * stamps + likelihood.background
         deviance, score, information = poisson(
             counts[modes.star[some]], mean, likelihood.flux * slopes
         )
         height = -0.5 * (deviance + (z**2).sum(axis=1))
-        return height, score - z, information + np.eye(TERMS)
+        return height, score - z, information + np.eye(z.shape[1])
 
-    peaks = climbed(evaluate, modes.z, FARTHEST_Z, CLIMB, modes.group)
-    factor = np.linalg.cholesky(np.linalg.inv(peaks.information))
-    evidence = peaks.height + np.log(np.diagonal(factor, axis1=1, axis2=2)).sum(axis=1)
-    return _separate(replace(modes, z=peaks.parameters, factor=factor, evidence=evidence))
+    start = np.hstack([modes.z, np.zeros((len(modes.z), len(more)))])
+    return climbed(evaluate, start, FARTHEST_Z, CLIMB, modes.group)
 
 
 def unexplained(
@@ -525,7 +580,7 @@ def unexplained(
     counts: np.ndarray,
     likelihood: Likelihood,
     model: StampModel,
-    deviations: float = TWINS.poor_fit,
+    deviations: float,
 ) -> np.ndarray:
     """Stars with an image that their best mode does not explain, without or with the field given.
 
@@ -544,18 +599,18 @@ def unexplained(
     return np.unique(best.star[misfit > pixels + deviations * np.sqrt(2.0 * pixels)])
 
 
-def neighbours(modes: Modes, stars: np.ndarray) -> Modes:
-    """The best modes of some stars, without and with the field given, at all offsets around.
+def corners(modes: Modes, stars: np.ndarray) -> Modes:
+    """Places all around the best modes of some stars, without and with the field given.
 
-    So for matches, from which modes are sought: the best may be near a mode of another offset
-    and lead to a wrong one at its own.
+    So for stars whose climbs have ended in local maxima: a climb from beside one mostly ends
+    elsewhere.
     """
     best = modes.take(_first(2 * modes.star + modes.given, modes.evidence, 1))
-    shifts = np.array(jitters(TWINS.neighbourhood_px))
     some = np.flatnonzero(np.isin(best.star, stars))
-    source = best.take(np.repeat(some, len(shifts)))
-    offset = source.offset + np.tile(shifts, (some.size, 1))
-    return Modes.at(source.star, source.field, offset, source.given, source.z)
+    signs = np.array(list(product((-1.0, 1.0), repeat=TERMS)))
+    source = best.take(np.repeat(some, len(signs)))
+    z = source.z + SEARCH.corner * np.tile(signs, (some.size, 1))
+    return Modes.at(source.star, source.field, source.offset, source.given, z)
 
 
 def twins(modes: Modes, likelihood: Likelihood, model: StampModel) -> Modes:
@@ -587,9 +642,7 @@ def twins(modes: Modes, likelihood: Likelihood, model: StampModel) -> Modes:
     static = model.coefficients(np.zeros((fields.size, TERMS)), fields)
     directions = model.directions(fields)
     shifts = np.array(jitters(1))
-    # Moving the stamp by a pixel is a tilt by half its width in λ/D (`StampPropagator`).
-    tilt = np.zeros((len(shifts), len(MONOMIALS)))
-    tilt[:, -2:] = 0.5 * model.telescope.pixel * shifts[:, ::-1]
+    tilt = _tilt(model, shifts)
     places: dict[tuple[int, ...], tuple[float, np.ndarray]] = {}
     for m, star in enumerate(source.star):
         for sign in (np.ones(len(MONOMIALS)), CONJUGATE):
@@ -814,7 +867,7 @@ class _Sampler:
             sums.total[:] = weight.sum()
             sums.square[:] = (weight**2).sum()
             images = self.images[draws].astype(np.float64)
-            sums.power[:] = weight @ (images**2).sum(axis=1)
             sums.image[:] = weight @ images
+            sums.power[:] = weight @ images**2
             np.add.at(sums.share[0], (self.draws.field[draws], self.jitter[draws]), weight)
         return sums

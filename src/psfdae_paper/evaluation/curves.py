@@ -399,6 +399,13 @@ def _errors(
         named = line[:1] if last else line
         name = kind.look.label.partition(" (")[0]  # what it is given stands beside its stars
         _name(axes, named["noise_level"], named["mse"], name, kind.look.color, below=last)
+    optics = method("wavefront")
+    known = efficiency[efficiency.method == optics.name].drop_duplicates("noise_level")
+    if len(known):
+        known = known.sort_values("noise_level")
+        axes.plot(known["noise_level"], known["mse"], **{**_line(optics), "lw": 1.6, "ms": 8})
+        name = "telescope known"
+        _name(axes, known["noise_level"][:1], known["mse"][:1], name, optics.look.color)
     best = bounds[bounds.method == "bayes"].sort_values("noise_level")
     tight = best[best.tight == "yes"]
     axes.plot(best["noise_level"], best["value"], color=BAYES["color"], ls="--", lw=1.2)

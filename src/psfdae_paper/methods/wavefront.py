@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
@@ -24,10 +25,12 @@ if TYPE_CHECKING:
     from psfdae_paper.bounds.sampling import Modes, StampModel
 
 BANK_STARS = 32000
-"""Of the bank, of which most stars need a part only."""
 
-DRAWS = 150
+DRAWS = 100
 """Importance samples of a star."""
+
+PARTS = 8
+"""Of the bank, the first of which tells whether all of it would be enough."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,14 +43,13 @@ class Wavefront(Method):
     seidel : ndarray, shape (M, 5)
         Coefficients of the bank's stars in waves.
     model : StampModel
-    static : ndarray, shape (F, J, d, d), or None
-        Static PSFs at all centring errors, if these are to be found.
-    mixture : GaussianMixture
-        For stars that no mode explains.
-    seed : int
+    static : ndarray, shape (F, J, d, d)
+        Static PSFs at all centring errors.
+    data : TrainingSet
+        From which stars that no mode explains get the Gaussian mixture.
     """
 
-    look = Look("optics of the telescope", "#000000", "*", drawn=False)
+    look = Look("optics of the telescope", "#e69f00", "*", drawn=False)
     needs = Needs(level=True)
     storage = None
     packing = None
@@ -56,21 +58,19 @@ class Wavefront(Method):
     bank: Bank
     seidel: np.ndarray
     model: StampModel
-    static: np.ndarray | None
-    mixture: GaussianMixture
-    seed: int
+    static: np.ndarray
+    data: TrainingSet
 
     @classmethod
     def fit(cls, data: TrainingSet) -> Self:
-        """Simulate the bank, and fit the mixture.
+        """Simulate the bank.
 
         Raises
         ------
         FitError
             If the stars are not simulated with random Seidel aberrations.
         """
-        from psfdae_paper.bounds.estimates import fresh_stars, stamp_model, static_psfs
-        from psfdae_paper.bounds.posterior import Bank
+        from psfdae_paper.bounds.estimates import fresh_stars
         from psfdae_paper.configuration.compose import part
         from psfdae_paper.configuration.consistency import SIMULATION
 
@@ -78,31 +78,51 @@ class Wavefront(Method):
         if simulated.get("scene", {}).get("name") != "seidel":
             raise FitError(f"{cls.name}: needs stars with random Seidel aberrations (scene 1)")
         config = part(SIMULATION, simulated)
-        drawn = {name: c.values for name, c in fresh_stars(config, "optics", BANK_STARS).items()}
+        drawn = fresh_stars(config, "optics", BANK_STARS)
+        return cls.with_bank({name: c.values for name, c in drawn.items()}, config, data)
+
+    @classmethod
+    def with_bank(cls, drawn: Mapping[str, np.ndarray], config: Any, data: TrainingSet) -> Self:
+        """The method with the columns of a bank of stars, as `fresh_stars` draws them."""
+        from psfdae_paper.bounds.estimates import stamp_model, static_psfs
+        from psfdae_paper.bounds.posterior import Bank
+
         sizes = config.grid.points, config.framing.jitter_px
-        return cls(
-            Bank(drawn["framed"], drawn["field_index"], drawn["peak"], *sizes),
-            drawn["seidel"],
-            stamp_model(config),
-            static_psfs(config) if data.reference == "template" else None,
-            cls.fallback.fit(data, Gmm()),
-            data.seed,
-        )
+        bank = Bank(drawn["framed"], drawn["field_index"], drawn["peak"], *sizes)
+        return cls(bank, drawn["seidel"], stamp_model(config), static_psfs(config), data)
+
+    @cached_property
+    def mixture(self) -> GaussianMixture:
+        """For stars that no mode explains."""
+        fitted: GaussianMixture = self.fallback.fit(self.data, Gmm())
+        return fitted
 
     def estimate(
         self, noisy: np.ndarray, level: float | np.ndarray, position: np.ndarray | None = None
     ) -> Estimate:
         """PSFs of images of one noise level λ, shape (n, d, d), in the field of `position`."""
-        from psfdae_paper.bounds.sampling import SEARCH
+        level = float(np.asarray(level))
+        return self.estimated(*self.posterior(noisy, level, position), noisy, level, position)
 
-        found = np.array(self.mixture.restore(noisy, level, position))
-        for start in range(0, len(noisy), SEARCH.stars_at_once):
-            block = slice(start, start + SEARCH.stars_at_once)
-            where = None if position is None else position[block]
-            sums, known = self.posterior(noisy[block], float(np.asarray(level)), where, start)
-            mean = sums.mean_image if self.static is None else sums.template(self.static)[0]
-            found[block][known] = mean[known].reshape(-1, *noisy.shape[1:])
-        return Estimate(found)
+    def estimated(
+        self,
+        sums: PosteriorSums,
+        explained: np.ndarray,
+        noisy: np.ndarray,
+        level: float,
+        position: np.ndarray | None = None,
+    ) -> Estimate:
+        """What a `posterior` says of the reference: the same one serves both."""
+        mean, variance = sums.mean_image, sums.variance
+        if self.data.reference == "template":
+            mean, variance = sums.template(self.static)
+        psf, sigma = mean.reshape(noisy.shape), np.sqrt(variance).reshape(noisy.shape)
+        lost = ~explained
+        if lost.any():
+            where = None if position is None else position[lost]
+            other = self.mixture.estimate(noisy[lost], level, where)
+            psf[lost], sigma[lost] = other.psf, other.sigma
+        return Estimate(psf, sigma, explained=explained)
 
     def modes(
         self, noisy: np.ndarray, level: float, position: np.ndarray | None = None
@@ -114,9 +134,7 @@ class Wavefront(Method):
         """
         from psfdae_paper.bounds.sampling import search
 
-        own = None
-        if self.needs.position and position is not None:
-            own = np.rint(position @ [1, self.bank.points]).astype(int)
+        own = self._fields(position)
         problem = (self.bank, self.seidel, noisy, self.likelihood(level), self.model)
         return search(*problem, own, anywhere=own is None)
 
@@ -125,25 +143,65 @@ class Wavefront(Method):
         from psfdae_paper.bounds.posterior import Likelihood
 
         middle = self.bank.stamps((self.bank.margin,) * 2)
-        return Likelihood.of(self.mixture.noise, level, middle)
+        return Likelihood.of(self.data.noise, level, middle)
 
     def posterior(
-        self, noisy: np.ndarray, level: float, position: np.ndarray | None = None, first: int = 0
+        self, noisy: np.ndarray, level: float, position: np.ndarray | None = None
     ) -> tuple[PosteriorSums, np.ndarray]:
-        """Sums over importance samples of stars, and whether a mode explains each, (n,).
+        """Weighed samples of images (n, d, d) of one noise level λ, and whether they explain each.
 
-        `first` is the number of the first star, of which the draws depend.
+        Where noise is high, enough stars of the bank are similar to an image. The others get
+        importance samples around their modes.
         """
-        from psfdae_paper.bounds.sampling import PROPOSALS, sampled_sums
+        from psfdae_paper.bounds.estimates import ENOUGH_ESS
+        from psfdae_paper.bounds.sampling import PROPOSALS, SEARCH, sampled_sums
 
-        modes, missed = self.modes(noisy, level, position)
+        sums = self._over_bank(noisy, level, self._fields(position))
+        explained = np.ones(len(noisy), bool)
+        few = np.flatnonzero(sums.effective_size < ENOUGH_ESS)
         rounds = [round(share * DRAWS) for share in PROPOSALS.rounds]
-        rngs = [
-            stream(self.seed, self.name, f"{level:.6g}", first + star) for star in range(len(noisy))
-        ]
-        anywhere = np.full(len(noisy), -1)
-        problem = (modes, noisy, anywhere, self.likelihood(level), self.model)
-        sums = sampled_sums(*problem, rounds, rngs).free_helped
-        known = sums.total > 0
-        known[missed] = False
-        return sums, known
+        for start in range(0, len(few), SEARCH.stars_at_once):
+            block = few[start : start + SEARCH.stars_at_once]
+            where = None if position is None else position[block]
+            modes, missed = self.modes(noisy[block], level, where)
+            names = (self.data.seed, self.name, f"{level:.6g}")
+            rngs = [stream(*names, int(star)) for star in block]
+            problem = (modes, noisy[block], np.full(len(block), -1), self.likelihood(level))
+            found = sampled_sums(*problem, self.model, rounds, rngs).free_helped
+            sums.put(block, found)
+            explained[block[missed]] = False
+        return sums, explained & (sums.total > 0)
+
+    def _fields(self, position: np.ndarray | None) -> np.ndarray | None:
+        """Numbers of the fields of stars, (n,), if the method is given them."""
+        if not self.needs.position or position is None:
+            return None
+        return np.rint(position @ [1, self.bank.points]).astype(int)
+
+    def _over_bank(self, noisy: np.ndarray, level: float, own: np.ndarray | None) -> PosteriorSums:
+        """Sums over a part of the bank; over all of it where that promises to be enough."""
+        from psfdae_paper.bounds.estimates import ENOUGH_ESS
+        from psfdae_paper.bounds.posterior import (
+            PosteriorSums,
+            companions,
+            merge,
+            posterior_sums,
+        )
+
+        likelihood, fields, shifts = self.likelihood(level), *self.static.shape[:2]
+        whole = PosteriorSums.empty(len(noisy), noisy[0].size, fields, shifts)
+
+        def weighed(stars: np.ndarray, drawn: np.ndarray) -> PosteriorSums:
+            given = None if own is None else own[stars]
+            return posterior_sums(self.bank.take(drawn), noisy[stars], likelihood, own_field=given)
+
+        for group, drawn in companions(len(noisy), own, self.bank):
+            size = len(drawn) // PARTS
+            part = weighed(group, drawn[:size])
+            whole.put(group, part)
+            size_now = part.effective_size
+            rich = (size_now < ENOUGH_ESS) & (PARTS * size_now >= ENOUGH_ESS)
+            if rich.any():
+                rest = weighed(group[rich], drawn[size:])
+                whole.put(group[rich], merge([part.take(rich), rest]))
+        return whole

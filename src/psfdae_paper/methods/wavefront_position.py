@@ -14,6 +14,6 @@ from psfdae_paper.methods.wavefront import Wavefront
 class PlacedWavefront(Wavefront):
     """As `Wavefront`, in a field that is given."""
 
-    look = Look("optics of the telescope", "#666666", "p", drawn=False)
+    look = Look("optics of the telescope", "#b8860b", "p", drawn=False)
     needs = Needs(level=True, position=True)
     fallback: ClassVar = PlacedMixture

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from typing import Annotated, Any
 
@@ -15,10 +16,13 @@ from psfdae.files import (
     write_parquet,
     write_product,
 )
+from psfdae.methods import method
+from psfdae.metrics import quality, summarised
+from psfdae.model.star_sets import field_positions, training_set
 from psfdae.options import File
 from psfdae.reading import read_table
 from psfdae.threads import limit_threads
-from psfdae_paper.bounds.estimates import bounded_stars, fresh_stars
+from psfdae_paper.bounds.estimates import SPLIT, bounded_stars, fresh_stars
 from psfdae_paper.bounds.floor import Comparison
 from psfdae_paper.bounds.posterior import Bank, jittered_templates
 from psfdae_paper.bounds.tables import (
@@ -37,6 +41,8 @@ from psfdae_paper.bounds.tables import (
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.consistency import SIMULATION
 from psfdae_paper.configuration.schema import Config
+
+KNOWING_THE_OPTICS = ("wavefront", "wavefront_position")
 
 COLUMN_OF_TABLE = ["dataset", "split", "reference", "noise_level"]
 """What one column of the paper's tables is: methods are compared inside it."""
@@ -108,6 +114,50 @@ def bounds(
     write_csv(out, pd.DataFrame(tables.summary, columns=COLUMNS))
     write_csv(growth, pd.DataFrame(tables.growth, columns=GROWTH_COLUMNS))
     write_parquet(per_star, pd.concat(tables.per_star, ignore_index=True))
+
+
+@command("optics", reads=(*SIMULATION, "noise", "parts", "bounds", "evaluation"))
+def optics(
+    config: Config,
+    dataset: Annotated[str, "Name in the tables."],
+    stars: Annotated[File, "Product of the stage stars."],
+    bank: Annotated[File, "Product of the stage bank."],
+    per_star: Annotated[File, "Parquet with every star."],
+    out: Annotated[File, "CSV with means and standard errors."],
+) -> None:
+    """Measure the methods that know the telescope, on the test stars that are bounded."""
+    import pandas as pd
+
+    limit_threads(1)
+    product = read_product(stars, "stars")
+    require(stars, product.config, STARS, config)
+    drawn = read_product(bank, "bank", ("framed", "field_index", "peak", "seidel"))
+    require(bank, drawn.config, STARS, product.config, stars)
+    bounded = bounded_stars(config, product)
+    position = field_positions(product)[bounded.star]
+    summary, stars_table = [], []
+    for kind in (method(name) for name in KNOWING_THE_OPTICS):
+        fitted = {
+            reference: kind.with_bank(
+                drawn.arrays, config, training_set(config, kind, product, SPLIT, reference)
+            )
+            for reference in bounded.truth
+        }
+        for level, noisy in bounded.noisy.items():
+            start = time.monotonic()
+            posterior = next(iter(fitted.values())).posterior(noisy, level, position)
+            for reference, estimator in fitted.items():
+                found = estimator.estimated(*posterior, noisy, level, position)
+                truth = bounded.truth[reference]
+                metrics = quality(found, truth, config.evaluation.data_range)
+                row = {"dataset": dataset, "split": SPLIT, "reference": reference}
+                row |= {"method": kind.name, "noise_level": level}
+                summary += summarised(row, metrics, bounded.field)
+                each = {"star": bounded.star, "field": bounded.field}
+                stars_table.append(pd.DataFrame({**row, **each, **metrics}))
+            print(f"{kind.name}, λ = {level:g}: {time.monotonic() - start:.1f} s", flush=True)
+    write_csv(out, pd.DataFrame(summary))
+    write_parquet(per_star, pd.concat(stars_table, ignore_index=True))
 
 
 @command("collect-bounds")
