@@ -16,7 +16,7 @@ from psfdae.cli import main
 from psfdae.commands.wavefront import as_fits
 from psfdae.optics.derivatives import ModalStamps
 from psfdae.optics.pupil import annular_pupil
-from psfdae.optics.seeing import BlurredPropagator, BlurredSampling, Profile
+from psfdae.optics.seeing import BlurredPropagator, BlurredSampling, Broadening, Profile
 from psfdae.optics.wavefronts import zernike_images
 from psfdae.sensing import stars as engine
 from psfdae.sensing.climbing import Steps, climb, poisson, together
@@ -25,7 +25,7 @@ from psfdae.sensing.sampling import Mixture, sample_around
 from psfdae.sensing.stars import SensingError, StarOptics
 from psfdae.settings import ConfigError
 from psfdae.telescope.field import field_model, terms_of
-from psfdae.telescope.settings import Prior, read_telescope
+from psfdae.telescope.settings import Prior, Seeing, read_telescope
 from psfdae_paper.configuration.base import config_dir
 from psfdae_paper.configuration.compose import load
 
@@ -208,6 +208,20 @@ def test_blurred_modal_stamps_are_blurred_stamps_and_their_slopes_are_difference
     for j, unit in enumerate(1e-5 * np.eye(4)):
         ahead, behind = (operator.stamps(waves + sign * unit) for sign in (1, -1))
         assert slopes[0, j] == pytest.approx((ahead - behind)[0] / 2e-5, abs=1e-8)
+
+
+@pytest.mark.parametrize("beta", [None, 2.5])
+def test_broadened_stamps_are_derivatives_by_the_width(beta):
+    pupil = annular_pupil(64, 0.3)
+    opd = np.tile(0.2 * pupil.axis, (1, pupil.axis.size, 1))
+
+    def stamp(profile):
+        return BlurredPropagator(pupil, 12, 1.5, profile)(opd)[0]
+
+    change = stamp(Profile(3.0 * 1.01, beta)) - stamp(Profile(3.0 / 1.01, beta))
+    slope = stamp(Broadening(Profile(3.0, beta)))
+    assert slope == pytest.approx(change / (2 * np.log(1.01)), abs=1e-3 * np.abs(slope).max())
+    assert slope.min() < -0.1 * stamp(Profile(3.0, beta)).max()
 
 
 @pytest.mark.parametrize("kind", ["zernike", "seidel", "newtonian"])
@@ -411,6 +425,37 @@ def test_state_of_the_telescope_is_found_with_its_errors(kind, count):
     assert 0 not in state.star or state.disagrees[state.star == 0].all()
     assert np.mean(state.disagrees) < 0.1
     assert state.correlation == pytest.approx(state.correlation.T)
+
+
+def test_seeing_is_found_with_the_telescope():
+    """Worse by 20 % than the file says; its error goes with that of the aberrations."""
+    telescope, rng = example("zernike"), np.random.default_rng(4)
+    angle = field_of(telescope, 12, rng)
+
+    def seen(fwhm, prior):
+        seeing = Seeing(kind="gaussian", fwhm_arcsec=fwhm)
+        return telescope.model_copy(update={"seeing": seeing, "prior": Prior(seeing=prior)})
+
+    stated, there = seen(1.5, 0.15), seen(1.8, 0.0)
+    model = field_model(there, angle)
+    truth = model.mean + model.sd * rng.standard_normal(model.sd.size)
+    place = rng.uniform(-0.5, 0.5, (12, 2))
+    counts, _ = imaged(there, angle, model.coefficients(truth), place, 100.0, rng)
+    state = psfdae.wavefront(
+        counts, stated, field_deg=angle, noise=SKY**0.5, gain=1.0, joint=True
+    ).joint
+    assert state.model.names[-1] == "seeing"
+    assert state.model.units[-1] == "arcsec"
+    assert abs(state.value[-1] - 1.8) < 3 * state.error[-1]
+    assert 0.002 < state.error[-1] < 0.1
+    pull = (state.value[:-1] - truth) / state.error[:-1]
+    assert np.sqrt(np.mean(pull**2)) < 2.0
+    assert np.abs(state.correlation[-1, :-1]).max() > 0.2
+    fixed = psfdae.wavefront(
+        counts, seen(1.5, 0.0), field_deg=angle, noise=SKY**0.5, gain=1.0, joint=True
+    ).joint
+    assert "seeing" not in fixed.model.names
+    assert fixed.deviance.sum() > state.deviance.sum() + 20
 
 
 def test_slopes_of_the_field_s_numbers_are_differences():

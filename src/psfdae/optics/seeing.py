@@ -13,7 +13,7 @@ repeats with the pupil grid's period, and so do the wings of the profile (`Profi
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -72,6 +72,29 @@ class Profile:
         return self.scale * np.sqrt(FAINT ** (-1.0 / self.beta) - 1.0)
 
 
+STEP = 1e-3
+"""Relative step of the central difference over the width of a profile."""
+
+
+@dataclass(frozen=True)
+class Broadening:
+    """Derivative of a profile by the logarithm of its width, in the place of the profile.
+
+    A stamp is linear in the profile's transfer function: what is blurred by this is the stamp's
+    derivative.
+    """
+
+    profile: Profile
+
+    def transfer(self, frequency: np.ndarray) -> np.ndarray:
+        """As `Profile.transfer`, 0 at 0."""
+        wide, narrow = (
+            replace(self.profile, fwhm=self.profile.fwhm * np.exp(step)).transfer(frequency)
+            for step in (STEP, -STEP)
+        )
+        return np.asarray((wide - narrow) / (2.0 * STEP))
+
+
 class BlurredSampling:
     """The whole period of the image, blurred; a `psfdae.optics.derivatives.Sampling`.
 
@@ -82,12 +105,17 @@ class BlurredSampling:
         Pixels d along a side.
     pixel : float
         Pixel width in λ/D.
-    profile : Profile
+    profile : Profile or Broadening
     precision : "complex64" or "complex128"
     """
 
     def __init__(
-        self, pupil: Pupil, stamp_px: int, pixel: float, profile: Profile, precision: Precision
+        self,
+        pupil: Pupil,
+        stamp_px: int,
+        pixel: float,
+        profile: Profile | Broadening,
+        precision: Precision,
     ) -> None:
         from scipy import fft  # here, because every configuration knows the profiles
 

@@ -7,7 +7,7 @@ has its own place, flux and sky besides.
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from psfdae.sensing.stars import (
     Modes,
     Search,
     SensingError,
+    StarOptics,
     expected_deviance,
 )
 from psfdae.telescope.field import FieldModel
@@ -32,7 +33,11 @@ MOST_STARS = 500
 CLIMB = Steps(most=30, least_gain=0.005, rounding=1e-7)
 
 ROUNDS = 4
-"""In which stars choose the mode nearest to the field, and the field follows them."""
+"""In which stars choose the mode nearest to the field, and the field follows them; and in which
+stamps are computed anew for a seeing that was found."""
+
+LEAST_SEEING, SEEING_ERROR = 0.5, 2e-3
+"""Relative change of the seeing's FWHM: the least of one round, and one that needs no other."""
 
 
 @dataclass(frozen=True)
@@ -73,11 +78,36 @@ class Joint:
 
 
 class FieldPosterior:
-    """The posterior of the numbers of a field, and of the places, fluxes and skies of its stars."""
+    """The posterior of the numbers of a field, and of the places, fluxes and skies of its stars.
 
-    def __init__(self, search: Search, model: FieldModel, stars: np.ndarray) -> None:
-        self.search, self.model, self.stars = search, model, stars
+    Stamps are those of `optics`; where the FWHM of the seeing is among the numbers, they depend on
+    it by a straight line about that of `optics`.
+    """
+
+    def __init__(
+        self, search: Search, model: FieldModel, stars: np.ndarray, optics: StarOptics
+    ) -> None:
+        self.search, self.model, self.stars, self.optics = search, model, stars, optics
         self.shared = model.sd.size
+
+    def seeing(self, t: np.ndarray) -> float:
+        """FWHM of the seeing at standardised numbers t (Q,), in that of `optics`."""
+        return float((self.model.mean[-1] + self.model.sd[-1] * t[-1]) / self._fwhm)
+
+    @property
+    def _fwhm(self) -> float:
+        assert self.optics.telescope.seeing is not None, "the model has one"
+        return self.optics.telescope.seeing.fwhm_arcsec
+
+    def refocused(self, t: np.ndarray) -> FieldPosterior:
+        """The same with optics of the seeing at standardised numbers t (Q,)."""
+        telescope = self.optics.telescope
+        assert telescope.seeing is not None, "the model has one"
+        fwhm = max(self.seeing(t), LEAST_SEEING) * self._fwhm
+        seeing = telescope.seeing.model_copy(update={"fwhm_arcsec": fwhm})
+        changed = telescope.model_copy(update={"seeing": seeing})
+        optics = replace(self.optics, telescope=changed)
+        return FieldPosterior(self.search, self.model, self.stars, optics)
 
     def coefficients(self, t: np.ndarray) -> np.ndarray:
         """Coefficients of the stars (m, K) in waves, of standardised numbers t (Q,)."""
@@ -99,7 +129,7 @@ class FieldPosterior:
         return self._images(numbers)[0]
 
     def _images(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        q, optics, photons = self.shared, self.search.optics, self.search.photons
+        q, optics, photons = self.shared, self.optics, self.search.photons
         own, stars = numbers[q:].reshape(len(self.stars), BESIDE), self.stars
         to_modes = optics.terms.to_modes[stars]
         coefficients = np.einsum("mk,mkj->mj", self.coefficients(numbers[:q]), to_modes)
@@ -109,6 +139,11 @@ class FieldPosterior:
         stamps, slopes = optics.operator.derivatives(modes, directions)
         stamps = stamps.reshape(len(stars), -1).astype(np.float64)
         slopes = slopes.reshape(len(stars), q + 2, -1).astype(np.float64)
+        if self.model.seeing:
+            wider = optics.broadening.stamps(modes).reshape(len(stars), -1).astype(np.float64)
+            here = self.seeing(numbers[:q])
+            stamps = stamps + (here - 1.0) * wider
+            slopes[:, q - 1] = self.model.sd[-1] / self._fwhm * wider
         return poisson(photons.counts[stars], *self.search.expected(stars, stamps, slopes, own))
 
     def _one(self, numbers: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
@@ -156,15 +191,23 @@ def joint_fit(search: Search, modes: Modes, model: FieldModel) -> Joint:
             f"{model.sd.size} numbers of the telescope"
         )
     kept = modes.take(np.flatnonzero(np.isin(modes.star, stars)))
-    field = FieldPosterior(search, model, stars)
+    field = FieldPosterior(search, model, stars, search.optics)
     ahead = _start(field, kept, np.zeros(field.shared))
     starts = [ahead]
     with suppress(RayTracingError):  # where there is no such telescope
         starts.append(_start(field, kept, _twin(field, ahead[: field.shared])))
     limit = np.full(ahead.size, np.inf)
     limit[: field.shared] = FARTHEST_Z
+    if model.seeing:
+        limit[field.shared - 1] = 0.5 / model.sd[-1] * model.mean[-1]
     limit[field.shared :].reshape(-1, BESIDE)[:, :2] = search.optics.reach_px
     peaks = climb(field.evaluate, np.stack(starts), limit, CLIMB)
+    for _ in range(ROUNDS if model.seeing else 0):
+        best = peaks.parameters[peaks.height.argmax(), : field.shared]
+        if abs(field.seeing(best) - 1.0) < SEEING_ERROR:
+            break
+        field = field.refocused(best)
+        peaks = climb(field.evaluate, peaks.parameters, limit, CLIMB)
     return _joint(field, peaks)
 
 

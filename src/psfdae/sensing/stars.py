@@ -10,6 +10,7 @@ mode is a start, too, and both are given with their probabilities.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import NamedTuple
@@ -19,8 +20,8 @@ import numpy as np
 from psfdae.bright_stars import LEAST_SKY, MOST_SKY
 from psfdae.errors import Error
 from psfdae.image.stamps import Stamps, border_median, border_scatter
-from psfdae.optics.derivatives import PointSampling, SampledStamps
-from psfdae.optics.seeing import BlurredSampling
+from psfdae.optics.derivatives import PointSampling, SampledStamps, Sampling
+from psfdae.optics.seeing import BlurredSampling, Broadening
 from psfdae.optics.wavefronts import movable_modes
 from psfdae.rng import stream
 from psfdae.sensing.climbing import Steps, best_of_group, climb, poisson
@@ -121,12 +122,22 @@ class StarOptics:
         """Propagation to stamps."""
         return self.propagation(self.stamp_px)
 
-    def propagation(self, stamp_px: int, oversampling: int = 1) -> SampledStamps:
+    @cached_property
+    def broadening(self) -> SampledStamps:
+        """Propagation to the stamps' derivatives by the logarithm of the seeing's FWHM."""
+        return self.propagation(self.stamp_px, broadening=True)
+
+    def propagation(
+        self, stamp_px: int, oversampling: int = 1, *, broadening: bool = False
+    ) -> SampledStamps:
         """Propagation to stamps of another size, with several values per pixel and axis."""
         telescope = self.telescope
         pixel = telescope.pixel
         blur = telescope.blur
-        sampling = PointSampling if blur is None else partial(BlurredSampling, profile=blur)
+        sampling: Callable[..., Sampling] = PointSampling
+        if blur is not None:
+            profile = Broadening(blur) if broadening else blur
+            sampling = partial(BlurredSampling, profile=profile)
         return SampledStamps(
             telescope.obscuration,
             partial(movable_modes, self.terms.modes, pixel),

@@ -154,6 +154,8 @@ class FieldModel:
         Prior of the numbers.
     coefficients : callable
         From the numbers (Q,) to coefficients of all stars (n, K), in waves.
+    seeing : bool
+        Whether the last number is the FWHM of the seeing in arcsec, which moves no coefficient.
     """
 
     names: tuple[str, ...]
@@ -161,6 +163,18 @@ class FieldModel:
     mean: np.ndarray
     sd: np.ndarray
     coefficients: Callable[[np.ndarray], np.ndarray]
+    seeing: bool = False
+
+    def with_seeing(self, fwhm_arcsec: float, fraction: float) -> FieldModel:
+        """This model, and the FWHM of the seeing with a prior of that relative width."""
+        return FieldModel(
+            (*self.names, "seeing"),
+            (*self.units, "arcsec"),
+            np.append(self.mean, fwhm_arcsec),
+            np.append(self.sd, fraction * fwhm_arcsec),
+            lambda numbers: self.coefficients(numbers[:-1]),
+            seeing=True,
+        )
 
     def jacobian(self, numbers: np.ndarray) -> np.ndarray:
         """Derivatives of the coefficients, (Q, n, K), by differences of a hundredth of σ."""
@@ -177,8 +191,16 @@ def field_model(telescope: OwnTelescope, angle_deg: np.ndarray) -> FieldModel:
 
     Seidel terms: the four coefficients that are no tilt. Zernike terms: the coefficients of their
     polynomials of the field. A ray trace: the detector's defocus, and decentre and tilt of the
-    secondary, or without one the place of the optical axis.
+    secondary, or without one the place of the optical axis. The FWHM of the seeing is among them
+    if the prior leaves it free.
     """
+    optics, seeing = _of_the_optics(telescope, angle_deg), telescope.seeing
+    if seeing is None or not telescope.prior.seeing:
+        return optics
+    return optics.with_seeing(seeing.fwhm_arcsec, telescope.prior.seeing)
+
+
+def _of_the_optics(telescope: OwnTelescope, angle_deg: np.ndarray) -> FieldModel:
     prior, aberrations = telescope.prior, telescope.aberrations
     if isinstance(aberrations, Seidel):
         mean = aberrations.coefficients[: len(SEEN_SEIDEL)]

@@ -81,6 +81,11 @@ class Prior(Group):
         default=1e-3, description="Likewise of the secondary's decentre along x and y"
     )
     tilt_deg: Positive = Field(default=0.1, description="Likewise of its tilt about x and y")
+    seeing: Annotated[float, Field(ge=0, le=0.3)] = Field(
+        default=0.0,
+        description="Relative standard deviation of the seeing's FWHM, found with all stars "
+        "together; 0: as given",
+    )
 
 
 def _aberrations(tree: Any) -> Any:

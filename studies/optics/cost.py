@@ -1,0 +1,129 @@
+"""CPU time per star against error, of the optics at several efforts and of the other methods.
+
+    python studies/optics/cost.py RESULTS OUT.csv OUT.png
+
+RESULTS is the folder of a run with `results/evaluation/dataset3/random-realisation.csv` and the
+target `wavefront`. Dataset 3, λ = 0.001, reference realisation, test stars of the error bounds, one
+thread, on a machine that does nothing else.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from datetime import date
+from pathlib import Path
+
+import pandas as pd
+
+from psfdae import fits
+from psfdae.files import read_product
+from psfdae.methods import method
+from psfdae.metrics import clustered_mean, mse
+from psfdae.model.star_sets import field_positions, read_stars, training_set
+from psfdae.threads import limit_threads
+from psfdae_paper.bounds import sampling
+from psfdae_paper.bounds.estimates import bounded_stars
+from psfdae_paper.configuration.compose import load
+from psfdae_paper.methods import wavefront
+from psfdae_paper.stages.evaluate import estimators
+
+DATASET, LEVEL, REFERENCE = "dataset3", 1e-3, "realisation"
+REPEATS = 3
+DEFAULT = {"starts": None, "draws": wavefront.DRAWS}
+EFFORTS = (
+    {"starts": 1, "draws": 12},
+    {"starts": 1, "draws": 25},
+    {"starts": 2, "draws": 50},
+    DEFAULT,
+    {"starts": 8, "draws": 200},
+    {"starts": 16, "draws": 800},
+)
+"""Fields (without the field) or offsets (in it) from whose best matches modes are sought."""
+
+
+def main(results: Path, out: Path, picture: Path) -> None:
+    """Measure, and draw."""
+    limit_threads(1)
+    config = load([f"dataset={DATASET}"])
+    name = config.stars.name
+    product = read_stars(results / "data" / config.scene.name / f"{name}.h5", REFERENCE)
+    stars = bounded_stars(config, product)
+    position = field_positions(product)[stars.star]
+    noisy, truth = stars.noisy[LEVEL], stars.truth[REFERENCE]
+    rows = []
+
+    def add(kind, estimator, effort, repeats=REPEATS):
+        seconds = []
+        for _ in range(repeats):
+            started = time.process_time()
+            psf = estimator.estimate(noisy, LEVEL, position).psf
+            seconds.append(time.process_time() - started)
+        error, stderr = clustered_mean(mse(psf, truth), stars.field)
+        ms = 1000 * min(seconds) / len(noisy)
+        rows.append({"method": kind.name, **effort, "mse": error, "stderr": stderr})
+        rows[-1] |= {"ms_per_star": ms, "n": len(noisy)}
+        print(rows[-1], flush=True)
+
+    models = {
+        n: results / fits.place_of(method(n), DATASET, "random", REFERENCE)
+        for n in config.methods
+        if method(n).storage
+    }
+    for estimator in estimators(config, product, models, "random", REFERENCE).values():
+        if type(estimator).look.restores:
+            add(type(estimator), estimator, {"starts": None, "draws": None})
+    drawn = read_product(results / "bounds/bank" / f"{name}.h5", "bank").arrays
+    usual = sampling.SEARCH
+    for optics in ("wavefront", "wavefront_position"):
+        kind = method(optics)
+        data = training_set(config, kind, product, "random", REFERENCE)
+        fitted = kind.with_bank(drawn, config, data)
+        _ = fitted.mixture  # fitted here, where no clock runs
+        for effort in EFFORTS:
+            starts = effort["starts"]
+            few = {"fields": starts, "offsets": starts} if starts else {}
+            sampling.SEARCH = usual._replace(**few)
+            wavefront.DRAWS = effort["draws"]
+            chosen = usual.offsets if kind.needs.position else usual.fields
+            add(kind, fitted, effort | {"starts": starts or chosen}, repeats=1)
+    commit = subprocess.run(
+        ["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=True
+    ).stdout.strip()
+    table = pd.DataFrame(rows).assign(date=date.today().isoformat(), commit=commit)
+    table.to_csv(out, index=False, float_format="%.5g")
+    draw(table, picture)
+
+
+def draw(table: pd.DataFrame, picture: Path) -> None:
+    """Every method a point, the optics a line of efforts."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(7.0, 4.4), layout="constrained")
+    for name, rows in table.groupby("method", sort=False):
+        look = method(name).look
+        axes.errorbar(
+            rows.ms_per_star,
+            rows.mse,
+            yerr=rows.stderr,
+            color=look.color,
+            marker=look.marker,
+            ms=8,
+            lw=1.4,
+            capsize=2,
+            label=look.label,
+        )
+    axes.set(xscale="log", yscale="log", xlabel="CPU time per star in ms, one thread")
+    axes.set_ylabel("MSE per pixel (stamp sum = 1)")
+    axes.set_title(f"{DATASET}, λ = {LEVEL:g}: cost against error")
+    axes.grid(True, which="major", alpha=0.4)
+    axes.legend(fontsize=8)
+    figure.savefig(picture, dpi=130)
+
+
+if __name__ == "__main__":
+    main(*map(Path, sys.argv[1:4]))

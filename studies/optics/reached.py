@@ -1,0 +1,105 @@
+"""How near the optics of the telescope come to the least possible error, and what they miss.
+
+    python studies/optics/reached.py RESULTS DATASET OUT.csv
+
+RESULTS is the folder of a run with the targets `wavefront` and `bounds`. Both are paired star by
+star. A mode is missed if the climb from the truth ends e¹⁰ times as likely as every mode found;
+modes are sought for all stars here, also for those of which the bank alone says enough.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from datetime import date
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from psfdae.files import read_product
+from psfdae.methods import method
+from psfdae.metrics import clustered_mean
+from psfdae.model.star_sets import field_positions, training_set
+from psfdae.threads import limit_threads
+from psfdae_paper.bounds import sampling
+from psfdae_paper.bounds.estimates import bounded_stars
+from psfdae_paper.configuration.compose import load
+
+BOUND_OF = {"wavefront": "bayes", "wavefront_position": "bayes_position"}
+MISSED = 10.0
+KEY = ["reference", "noise_level", "star", "field"]
+
+
+def main(results: Path, dataset: str, out: Path) -> None:
+    """Compare, and seek modes once more."""
+    limit_threads(1)
+    config = load([f"dataset={dataset}"])
+    name = config.stars.name
+    product = read_product(results / "data" / config.scene.name / f"{name}.h5", "stars")
+    drawn = read_product(results / "bounds/bank" / f"{name}.h5", "bank").arrays
+    found = pd.read_parquet(results / "wavefront" / f"{dataset}.parquet")
+    bounds = pd.read_parquet(results / "bounds" / f"{dataset}.parquet")
+    summary = pd.read_csv(results / "bounds" / f"{dataset}.csv").query("metric == 'mse'")
+    floors = bounds[bounds.method == "floor"].rename(columns={"mse": "mse_floor"})
+    rows = []
+    for optics, bound in BOUND_OF.items():
+        missed = misses(config, product, drawn, optics)
+        limits = bounds[bounds.method == bound]
+        both = found[found.method == optics].merge(limits, on=KEY, suffixes=("", "_bound"))
+        for (reference, level), pairs in both.groupby(["reference", "noise_level"]):
+            pair = pairs[np.isfinite(pairs.mse_bound)]
+            mse, stderr = clustered_mean(pair.mse.to_numpy(), pair.field.to_numpy())
+            apart = (pair.mse - pair.mse_bound).to_numpy()
+            least = pair.mse_bound.mean()
+            tight = summary.query("method == @bound and reference == @reference")
+            tight = tight[np.isclose(tight.noise_level, level)].tight.iloc[0]
+            row = {"dataset": dataset, "method": optics, "reference": reference}
+            row |= {"noise_level": level, "mse": mse, "stderr": stderr, "bound": least}
+            row |= {"tight": tight, "ratio": mse / least}
+            row |= {"ratio_stderr": clustered_mean(apart, pair.field.to_numpy())[1] / least}
+            row["flagged"] = int((pairs.explained == 0).sum())
+            if reference == "realisation":
+                floor = floors[np.isclose(floors.noise_level, level)]
+                own = pairs.merge(floor[["star", "mse_floor"]], on="star")
+                row["median_over_floor"] = (own.mse / own.mse_floor).median()
+                lost, doubtful = missed[level]
+                row |= {"missed": len(lost), "missed_flagged": len(set(lost) & set(doubtful))}
+                row["others_flagged"] = len(set(doubtful) - set(lost))
+            rows.append(row | {"n": len(pairs)})
+            print(rows[-1], flush=True)
+    commit = subprocess.run(
+        ["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=True
+    ).stdout.strip()
+    table = pd.DataFrame(rows).assign(date=date.today().isoformat(), commit=commit)
+    table.to_csv(out, index=False, float_format="%.5g")
+
+
+def misses(config, product, drawn, optics) -> dict:
+    """By noise level: stars of which a better mode is missed, and those that are flagged."""
+    kind = method(optics)
+    data = training_set(config, kind, product, "random", "realisation")
+    fitted = kind.with_bank(drawn, config, data)
+    stars = bounded_stars(config, product)
+    position, count = field_positions(product)[stars.star], len(stars.star)
+    truth = sampling.Modes.at(
+        np.arange(count),
+        stars.field,
+        product["peak"][stars.star] - product["jitter"][stars.star],
+        np.full(count, sampling.TRUTH),
+        fitted.model.standardised(product["seidel"][stars.star]),
+    )
+    found = {}
+    for level, noisy in stars.noisy.items():
+        modes, doubtful = fitted.modes(noisy, level, position)
+        likelihood = fitted.likelihood(level)
+        right = sampling.climb(truth, likelihood.counts(noisy), likelihood, fitted.model)
+        best = np.full(count, -np.inf)
+        np.maximum.at(best, modes.star, modes.evidence)
+        lost = right.star[right.evidence > best[right.star] + MISSED]
+        found[level] = lost.tolist(), doubtful.tolist()
+    return found
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), sys.argv[2], Path(sys.argv[3]))
