@@ -300,8 +300,15 @@ def errors(name="tables/psf_metrics.csv"):
 
 
 def optics():
-    """MSE of the study of the telescope's optics against the realisation, a column a method."""
-    rows = csv("studies/optics/table.csv").query("reference == 'realisation'")
+    """The telescope's optics beside the least possible error, realisation; `…_given`: the field."""
+    rows = csv("studies/optics/reached.csv").query("reference == 'realisation'")
+    given = rows.method == "wavefront_position"
+    return rows[~given].merge(rows[given], on=["dataset", "noise_level"], suffixes=("", "_given"))
+
+
+def denoisers():
+    """MSE of denoisers that know no star, against the realisation, a column a method."""
+    rows = csv("studies/optics/denoisers.csv").query("reference == 'realisation'")
     return rows.pivot(
         index=["dataset", "noise_level"], columns="method", values="mse"
     ).reset_index()

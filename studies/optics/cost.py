@@ -33,7 +33,6 @@ DATASET, LEVEL, REFERENCE = "dataset3", 1e-3, "realisation"
 REPEATS = 3
 DEFAULT = {"starts": None, "draws": wavefront.DRAWS}
 EFFORTS = (
-    {"starts": 1, "draws": 12},
     {"starts": 1, "draws": 25},
     {"starts": 2, "draws": 50},
     DEFAULT,

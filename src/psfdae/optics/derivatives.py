@@ -28,6 +28,7 @@ from scipy import fft
 
 from psfdae.optics.propagation import Precision, image_points, in_batches
 from psfdae.optics.pupil import Pupil, annular_pupil, choose_samples, required_samples
+from psfdae.optics.seeing import WholePeriod
 from psfdae.optics.wavefronts import Modes, legendre, legendre_expansion, mode_slopes, slope_ranges
 
 
@@ -139,7 +140,7 @@ def _joined(cosines: np.ndarray, sines: np.ndarray) -> np.ndarray:
     return out
 
 
-class PeriodSampling(Separable):
+class PeriodSampling(Separable, WholePeriod):
     """Equidistant points over the period of the image, 2/spacing λ/D.
 
     With lags l of the pupil's samples, |E(u)|² = Σ_l c_l exp(−πi l·spacing·u); the
@@ -161,16 +162,6 @@ class PeriodSampling(Separable):
         from_points = np.exp(2j * np.pi * np.outer(lags, np.arange(self.points)) / self.points)
         self.pixels = (to_pixels @ from_points).real / self.points
         self.pixels = self.pixels.astype(np.empty(0, precision).real.dtype)
-
-    def along_x(self, pupil_fields: np.ndarray, degrees: Sequence[int] = (0,)) -> np.ndarray:
-        """See `Sampling`, m = points."""
-        weights = legendre(degrees, self._axis).astype(self.dtype)
-        return fft.fft(pupil_fields * weights[:, None, None], self.points)
-
-    def along_y(self, rows: np.ndarray, degrees: Sequence[int] = (0,)) -> np.ndarray:
-        """See `Sampling`."""
-        weights = legendre(degrees, self._axis).astype(self.dtype)
-        return fft.fft(rows * weights[:, None, :, None], self.points, axis=-2)
 
 
 def _centres(stamp_px: int, pixel: float) -> np.ndarray:

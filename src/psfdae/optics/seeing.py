@@ -95,7 +95,32 @@ class Broadening:
         return np.asarray((wide - narrow) / (2.0 * STEP))
 
 
-class BlurredSampling:
+class WholePeriod:
+    """Fields over the whole period of the image, by Fourier transforms.
+
+    Part of a `psfdae.optics.derivatives.Sampling`.
+    """
+
+    points: int
+    dtype: np.dtype
+    _axis: np.ndarray
+
+    def along_x(self, pupil_fields: np.ndarray, degrees: Sequence[int] = (0,)) -> np.ndarray:
+        """See `Sampling`, m = points."""
+        from scipy import fft
+
+        weights = legendre(degrees, self._axis).astype(self.dtype)
+        return fft.fft(pupil_fields * weights[:, None, None], self.points)
+
+    def along_y(self, rows: np.ndarray, degrees: Sequence[int] = (0,)) -> np.ndarray:
+        """See `Sampling`."""
+        from scipy import fft
+
+        weights = legendre(degrees, self._axis).astype(self.dtype)
+        return fft.fft(rows * weights[:, None, :, None], self.points, axis=-2)
+
+
+class BlurredSampling(WholePeriod):
     """The whole period of the image, blurred; a `psfdae.optics.derivatives.Sampling`.
 
     Parameters
@@ -132,20 +157,6 @@ class BlurredSampling:
         weights = both * (pixel / n) ** 2 * np.sinc(rows) * np.sinc(columns)
         self._transfer = (weights * blur).astype(self.dtype)
         self._centres = np.arange(stamp_px) - 0.5 * (stamp_px - 1)
-
-    def along_x(self, pupil_fields: np.ndarray, degrees: Sequence[int] = (0,)) -> np.ndarray:
-        """See `Sampling`, m = n points of the period."""
-        from scipy import fft
-
-        weights = legendre(degrees, self._axis).astype(self.dtype)
-        return fft.fft(pupil_fields * weights[:, None, None], self.points)
-
-    def along_y(self, rows: np.ndarray, degrees: Sequence[int] = (0,)) -> np.ndarray:
-        """See `Sampling`."""
-        from scipy import fft
-
-        weights = legendre(degrees, self._axis).astype(self.dtype)
-        return fft.fft(rows * weights[:, None, :, None], self.points, axis=-2)
 
     def to_pixels(self, values: np.ndarray, offset_px: tuple[float, float] = (0, 0)) -> np.ndarray:
         """Pixels (..., d, d) of intensities (..., n, n) around a place (row, column) in pixels."""
