@@ -191,6 +191,35 @@ def test_a_bank_of_other_stars_is_refused(scene_1, tmp_path):
     assert not outputs[0].exists()
 
 
+def test_optics_restore_the_bounded_stars(scene_1, tmp_path):
+    """Both methods, both references; beside the bounds they stand star by star."""
+    config = settings(bounds.optics, "dataset6")
+    products, out = (scene_1 / "stars.h5", scene_1 / "bank.h5"), tmp_path / "optics.csv"
+    bounds.optics(config, "dataset6", *products, tmp_path / "optics.parquet", out)
+    table = pd.read_csv(out)
+    assert set(table.n) == {24}
+    assert set(table.method) == {"wavefront", "wavefront_position"}
+    assert {"mse", "ssim", "coverage68", "explained"} <= set(table.metric)
+    assert len(table.drop_duplicates(["method", "reference", "noise_level"])) == 16
+    keys = ["method", "reference", "noise_level"]
+    cells = table[table.metric == "mse"].set_index(keys).value
+    for name in bounds.KNOWING_THE_OPTICS:
+        assert cells[name, "realisation", 0.003] < 0.2 * (4.98 * 0.003) ** 2
+    per_star = [tmp_path / "optics.parquet"]
+    bounds.efficiency(
+        [scene_1 / "bounds.csv"], [scene_1 / "bounds.parquet"], tmp_path / "e.csv", per_star
+    )
+    rows = pd.read_csv(tmp_path / "e.csv").query("bound != 'floor'")
+    pairs = {(row.method, row.bound) for row in rows.itertuples()}
+    assert pairs == {("wavefront", "bayes"), ("wavefront_position", "bayes_position")}
+    other = settings(bounds.bounds, "dataset3", "bounds.bank_stars=9")
+    bounds.bank(other, tmp_path / "bank.h5")
+    inputs = (config, "dataset6", scene_1 / "stars.h5", tmp_path / "bank.h5")
+    with pytest.raises(ProductError, match=r"bank\.h5: stars\.aberration_fraction = 0\.1"):
+        bounds.optics(*inputs, tmp_path / "x.parquet", tmp_path / "x.csv")
+    assert not (tmp_path / "x.csv").exists()
+
+
 def test_scene_2_is_exact(scene_2):
     table = pd.read_csv(scene_2 / "bounds.csv")
     assert set(table.method) == {"bayes", "bayes_position"}

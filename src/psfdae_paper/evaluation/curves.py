@@ -404,8 +404,7 @@ def _errors(
     if len(known):
         known = known.sort_values("noise_level")
         axes.plot(known["noise_level"], known["mse"], **{**_line(optics), "lw": 1.6, "ms": 8})
-        name = "telescope known"
-        _name(axes, known["noise_level"][:1], known["mse"][:1], name, optics.look.color)
+        _name(axes, known["noise_level"], known["mse"], "telescope known", optics.look.color)
     best = bounds[bounds.method == "bayes"].sort_values("noise_level")
     tight = best[best.tight == "yes"]
     axes.plot(best["noise_level"], best["value"], color=BAYES["color"], ls="--", lw=1.2)
