@@ -214,9 +214,11 @@ def test_posterior_mean_is_that_of_the_poisson_distribution(level, bank, members
     assert mean == pytest.approx(static, rel=1e-2)
     flat = templates[field, jitter].reshape(len(images), -1)
     expected = w @ (flat**2) - (w @ flat) ** 2
+    assert variance.mean(axis=1) == pytest.approx(expected.mean(axis=1), rel=2e-2, abs=1e-6)
     assert variance == pytest.approx(expected, rel=2e-2, abs=1e-6)
     flat = images.reshape(len(images), -1)
     expected = w @ (flat**2) - (w @ flat) ** 2
+    assert sums.variance.mean(axis=1) == pytest.approx(expected.mean(axis=1), rel=2e-2, abs=1e-9)
     assert sums.variance == pytest.approx(expected, rel=2e-2, abs=1e-8)
     # At the highest noise the data say little, at the lowest everything.
     assert (sums.effective_size > 50).all() if level > 1e-2 else True

@@ -141,9 +141,7 @@ def traced():
 def test_ray_trace_is_that_of_scene_3(traced):
     alignment = load(SCENE3)
     tracer = zernike_tracer(alignment.telescope, alignment.prescription, alignment.alignment)
-    noll, ours = static_zernikes(
-        traced.telescope, square_grid(traced.grid.points, traced.grid.spacing_deg)[1]
-    )
+    noll, ours = static_zernikes(traced.telescope, angles_of(traced.grid))
     theirs = -tracer(np.zeros((1, 4)))[0]
     assert noll == tuple(range(4, 23))
     assert traced.telescope.aberrations.defocus_m == alignment.alignment.defocus_m
@@ -199,9 +197,7 @@ def test_random_aberrations_have_both_spreads():
     config = load([OWN, "stars.aberration_fraction=0.2", "grid.points=3"])
     field = np.full(20000, 8)
     drawn = star_wavefronts(config, field)
-    _, static = static_zernikes(
-        config.telescope, square_grid(config.grid.points, config.grid.spacing_deg)[1]
-    )
+    _, static = static_zernikes(config.telescope, angles_of(config.grid))
     assert drawn.coefficients.mean(axis=0) == pytest.approx(static[8], abs=0.005)
     jitter = config.telescope.aberrations.jitter_waves
     assert drawn.coefficients.std(axis=0) == pytest.approx(

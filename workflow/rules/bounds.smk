@@ -112,9 +112,9 @@ use rule psf_bounds as psf_bounds_growth with:
 use rule psf_bounds as wavefront with:
     input:
         lambda w: [
-            f"{RESULTS}/wavefront/{dataset}.csv"
+            path
             for dataset in default_datasets()
-            if has_bank(dataset)
+            for path in optics_of(dataset, "csv")
         ],
     output:
         f"{RESULTS}/tables/psf_optics.csv",
@@ -133,7 +133,8 @@ rule psf_efficiency:
         methods=lambda w: [
             path
             for dataset in default_datasets()
-            for path in per_star_of(dataset, ["random"]) + optics_of(dataset)
+            for path in per_star_of(dataset, ["random"])
+            + optics_of(dataset, "parquet")
         ],
     output:
         f"{RESULTS}/tables/psf_efficiency.csv",

@@ -28,9 +28,9 @@ def per_star_of(dataset, splits=None):
     ]
 
 
-def optics_of(dataset):
-    """Errors on single test stars of the methods that know the telescope's optics."""
-    return [f"{RESULTS}/wavefront/{dataset}.parquet"] if has_bank(dataset) else []
+def optics_of(dataset, ending):
+    """Errors of the methods that know the telescope: csv, or parquet of single stars."""
+    return [f"{RESULTS}/wavefront/{dataset}.{ending}"] if has_bank(dataset) else []
 
 
 def bound_figures_of(dataset):

@@ -26,6 +26,7 @@ from psfdae.sensing.stars import (
 )
 from psfdae.telescope.field import FieldModel
 from psfdae.telescope.raytracing import RayTracingError
+from psfdae.telescope.settings import Seeing
 
 MOST_STARS = 500
 """Of the most light, that take part; equations grow with their number."""
@@ -36,8 +37,9 @@ ROUNDS = 4
 """In which stars choose the mode nearest to the field, and the field follows them; and in which
 stamps are computed anew for a seeing that was found."""
 
-LEAST_SEEING, SEEING_ERROR = 0.5, 2e-3
-"""Relative change of the seeing's FWHM: the least of one round, and one that needs no other."""
+MOST_CHANGE, SEEING_ERROR = 0.5, 2e-3
+"""Relative changes of the seeing's FWHM: the most that is allowed, from what is stated and
+downwards in a round, and one that needs no other round."""
 
 
 @dataclass(frozen=True)
@@ -92,20 +94,19 @@ class FieldPosterior:
 
     def seeing(self, t: np.ndarray) -> float:
         """FWHM of the seeing at standardised numbers t (Q,), in that of `optics`."""
-        return float((self.model.mean[-1] + self.model.sd[-1] * t[-1]) / self._fwhm)
+        fwhm = self.model.mean[-1] + self.model.sd[-1] * t[-1]
+        return float(fwhm / self._stated.fwhm_arcsec)
 
     @property
-    def _fwhm(self) -> float:
+    def _stated(self) -> Seeing:
         assert self.optics.telescope.seeing is not None, "the model has one"
-        return self.optics.telescope.seeing.fwhm_arcsec
+        return self.optics.telescope.seeing
 
     def refocused(self, t: np.ndarray) -> FieldPosterior:
         """The same with optics of the seeing at standardised numbers t (Q,)."""
-        telescope = self.optics.telescope
-        assert telescope.seeing is not None, "the model has one"
-        fwhm = max(self.seeing(t), LEAST_SEEING) * self._fwhm
-        seeing = telescope.seeing.model_copy(update={"fwhm_arcsec": fwhm})
-        changed = telescope.model_copy(update={"seeing": seeing})
+        fwhm = max(self.seeing(t), 1.0 - MOST_CHANGE) * self._stated.fwhm_arcsec
+        seeing = self._stated.model_copy(update={"fwhm_arcsec": fwhm})
+        changed = self.optics.telescope.model_copy(update={"seeing": seeing})
         optics = replace(self.optics, telescope=changed)
         return FieldPosterior(self.search, self.model, self.stars, optics)
 
@@ -143,7 +144,7 @@ class FieldPosterior:
             wider = optics.broadening.stamps(modes).reshape(len(stars), -1).astype(np.float64)
             here = self.seeing(numbers[:q])
             stamps = stamps + (here - 1.0) * wider
-            slopes[:, q - 1] = self.model.sd[-1] / self._fwhm * wider
+            slopes[:, q - 1] = self.model.sd[-1] / self._stated.fwhm_arcsec * wider
         return poisson(photons.counts[stars], *self.search.expected(stars, stamps, slopes, own))
 
     def _one(self, numbers: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
@@ -199,7 +200,7 @@ def joint_fit(search: Search, modes: Modes, model: FieldModel) -> Joint:
     limit = np.full(ahead.size, np.inf)
     limit[: field.shared] = FARTHEST_Z
     if model.seeing:
-        limit[field.shared - 1] = 0.5 / model.sd[-1] * model.mean[-1]
+        limit[field.shared - 1] = MOST_CHANGE * model.mean[-1] / model.sd[-1]
     limit[field.shared :].reshape(-1, BESIDE)[:, :2] = search.optics.reach_px
     peaks = climb(field.evaluate, np.stack(starts), limit, CLIMB)
     for _ in range(ROUNDS if model.seeing else 0):

@@ -3,8 +3,9 @@
 It is given what the simulation knows: the telescope, the law of its random aberrations, and flux,
 sky and noise level of the star. Modes of the posterior of the star's Seidel coefficients, of its
 field and of where its stamp lies are found as for the error bounds
-(`psfdae_paper.bounds.sampling`), from a bank of stars of its own; importance samples around them
-give the mean. A star that no mode explains gets the PSF of the Gaussian mixture.
+(`psfdae_paper.bounds.sampling`), and importance samples around them give the mean, unless enough
+stars of a simulated bank are similar. A star that no mode explains gets the PSF of the Gaussian
+mixture.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from psfdae_paper.bounds.sampling import Modes, StampModel
 
 BANK_STARS = 32000
+"""Of a fit; the target `wavefront` has the bank of the error bounds."""
 
 DRAWS = 100
 """Importance samples of a star."""
@@ -142,8 +144,12 @@ class Wavefront(Method):
         """Of photons at a noise level λ."""
         from psfdae_paper.bounds.posterior import Likelihood
 
-        middle = self.bank.stamps((self.bank.margin,) * 2)
-        return Likelihood.of(self.data.noise, level, middle)
+        return Likelihood.of(self.data.noise, level, self._middle)
+
+    @cached_property
+    def _middle(self) -> np.ndarray:
+        """Mean of the bank's stamps, (1, d, d): the same for all noise levels."""
+        return self.bank.stamps((self.bank.margin,) * 2).mean(axis=0, keepdims=True)
 
     def posterior(
         self, noisy: np.ndarray, level: float, position: np.ndarray | None = None
@@ -199,8 +205,8 @@ class Wavefront(Method):
             size = len(drawn) // PARTS
             part = weighed(group, drawn[:size])
             whole.put(group, part)
-            size_now = part.effective_size
-            rich = (size_now < ENOUGH_ESS) & (PARTS * size_now >= ENOUGH_ESS)
+            samples = part.effective_size
+            rich = (samples < ENOUGH_ESS) & (PARTS * samples >= ENOUGH_ESS)
             if rich.any():
                 rest = weighed(group[rich], drawn[size:])
                 whole.put(group[rich], merge([part.take(rich), rest]))

@@ -137,15 +137,12 @@ def optics(
     position = field_positions(product)[bounded.star]
     summary, stars_table = [], []
     for kind in (method(name) for name in KNOWING_THE_OPTICS):
-        fitted = {
-            reference: kind.with_bank(
-                drawn.arrays, config, training_set(config, kind, product, SPLIT, reference)
-            )
-            for reference in bounded.truth
-        }
+        data = {r: training_set(config, kind, product, SPLIT, r) for r in bounded.truth}
+        first = kind.with_bank(drawn.arrays, config, next(iter(data.values())))
+        fitted = {reference: replace(first, data=own) for reference, own in data.items()}
         for level, noisy in bounded.noisy.items():
             start = time.monotonic()
-            posterior = next(iter(fitted.values())).posterior(noisy, level, position)
+            posterior = first.posterior(noisy, level, position)
             for reference, estimator in fitted.items():
                 found = estimator.estimated(*posterior, noisy, level, position)
                 truth = bounded.truth[reference]
