@@ -230,6 +230,49 @@ def test_he_initialisation_keeps_the_variance(gaussian_stars):
     assert not model.layers[0].bias.any()
 
 
+@pytest.mark.parametrize("widths", [[16] * 4, [7, 3, 5, 9], [1] * 4])
+def test_linear_start_has_the_least_squares_of_what_its_last_layer_sees(data, widths):
+    """A linear function of the layer before has no smaller error: the two are uncorrelated."""
+    dae = DAE.model_copy(update={"init": "linear", "widths": widths})
+    training = DaeTraining(data, dae, TRAIN, 3)
+    noisy, _ = data.draw(data.fit, np.random.default_rng(5))
+    x = torch.from_numpy(noisy)[:, None] * training.factor
+    with torch.no_grad():
+        for layer in training.model.layers[:-1]:
+            x = torch.relu(layer(x))
+        missing = training.model.layers[-1](x)[:, 0].numpy()
+    missing -= training.factor * data.images[data.fit]
+    power = np.sqrt(np.mean(missing**2))
+    assert abs(missing.mean()) < 0.05 * power
+    for channel in x.numpy().transpose(1, 0, 2, 3):
+        strength = np.sqrt(np.mean(channel**2))
+        assert abs(np.mean(channel * missing)) < 0.1 * strength * power
+
+
+def test_linear_start_is_near_the_best_linear_estimator(data):
+    """Given λ and with all pixels that is the linear MMSE; kernels of 9 pixels come close."""
+    one = replace(data, levels=np.array([5e-3]))
+    kernels = [9, 7, 5, 3, 1, 1, 3, 5, 7, 9]
+    errors = {}
+    noisy = one.noise.draw(one.images, 5e-3, np.random.default_rng(7))[one.validation]
+    for init in ("linear", "he"):
+        dae = DaeSettings(kernels=kernels, widths=[16] * 9, init=init)
+        training = DaeTraining(one, dae, TRAIN, 3)
+        estimate = predict(training.model, noisy, training.factor)
+        errors[init] = mse(estimate, one.images[one.validation]).mean()
+    best = mse(LinearMmse.fit(one).predict(noisy, 5e-3), one.images[one.validation]).mean()
+    assert 0.8 * best < errors["linear"] < 2.0 * best
+    assert errors["linear"] < 0.1 * errors["he"]
+
+
+def test_linear_start_refuses_stars_that_are_not_finite(data):
+    references = data.references.copy()
+    references[data.fit[0]] = np.nan
+    linear = DAE.model_copy(update={"init": "linear"})
+    with pytest.raises(TrainingError, match="training stars that are not finite"):
+        DaeTraining(replace(data, references=references), linear, TRAIN, 3)
+
+
 def test_training_learns_and_repeats(data, tmp_path):
     longer = TRAIN.model_copy(update={"epochs": 12})
     first = train(data, tmp_path, longer)

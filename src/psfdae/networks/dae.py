@@ -26,6 +26,21 @@ if TYPE_CHECKING:
     from psfdae.networks.settings import DaeSettings, Train
 
 
+LINEAR_STARS = 1500
+"""Training stars from which a network that begins as a linear estimator takes its weights."""
+
+LINEAR_PX = 48_000
+"""Pixels of them all, at random, that its last layer is fitted to."""
+
+LINEAR_BLOCK = 100
+"""Stars of which the sums of that fit are taken at once."""
+
+DRAWN = 0.1
+"""Part of the random draw in the inner layers of such a network."""
+
+RIDGE = 1e-6
+"""Of the mean of the fit's normal matrix's diagonal, added to it: a channel may be empty."""
+
 MOST_ZERO = 0.5
 """Part of the validation stars without any output above which a network is dead."""
 
@@ -82,25 +97,91 @@ class Dae(nn.Module):
 def build_dae(
     kernels: Sequence[int],
     widths: Sequence[int],
-    init: Literal["he", "default"],
+    init: Literal["linear", "he", "default"],
     generator: torch.Generator,
 ) -> Dae:
     """A fresh network whose weights come from `generator` alone.
 
-    `he` draws N(0, 2/fan_in) with zero biases (He et al. 2015); `default` is
-    PyTorch's uniform ±1/√fan_in for weights and biases.
+    `he` and `linear` draw N(0, 2/fan_in) with zero biases (He et al. 2015), `linear` for
+    `begin_linear` to go on; `default` is PyTorch's uniform ±1/√fan_in for weights and biases.
     """
     model = Dae(kernels, widths).to(memory_format=torch.channels_last)
     with torch.no_grad():
         for layer in model.layers:
-            if init == "he":
-                nn.init.kaiming_normal_(layer.weight, nonlinearity="relu", generator=generator)
-                layer.bias.zero_()
-            else:
+            if init == "default":
                 bound = float(layer.weight[0].numel()) ** -0.5
                 layer.weight.uniform_(-bound, bound, generator=generator)
                 layer.bias.uniform_(-bound, bound, generator=generator)
+            else:
+                nn.init.kaiming_normal_(layer.weight, nonlinearity="relu", generator=generator)
+                layer.bias.zero_()
     return model
+
+
+@torch.no_grad()
+def begin_linear(
+    model: Dae, noisy: np.ndarray, references: np.ndarray, weight: np.ndarray, pixels: np.ndarray
+) -> None:
+    """Turn a freshly drawn network into a linear estimator, about the best of its kernels.
+
+    The first layer looks at the pixel itself and at the leading eigenpatches of the stars, each
+    with both signs, so that nothing is lost in the ReLU. Inner layers hand each channel on, with
+    a little of what they drew. The last layer is least squares from there to the references.
+
+    Parameters
+    ----------
+    model : Dae
+        As `build_dae` gives it.
+    noisy, references : ndarray, shape (n, d, d)
+        Images as the network sees them, and what is to come of them.
+    weight : ndarray, shape (n,)
+        Of each star in the sum of squares.
+    pixels : ndarray of int, shape (n, m)
+        Pixels of each star, counted along its rows, that the sum of squares takes.
+
+    Raises
+    ------
+    TrainingError
+        If an image or reference is not finite.
+    """
+    if not (np.isfinite(noisy).all() and np.isfinite(references).all()):
+        raise TrainingError("training stars that are not finite")
+    first, *inner, last = model.layers
+    images = torch.from_numpy(noisy[:, None])
+    patches = nn.functional.unfold(images, first.kernel_size, padding=first.padding)
+    flat = patches.transpose(1, 2).flatten(0, 1)
+    axes = torch.linalg.eigh(flat.T @ flat).eigenvectors.flip(1)
+    own = torch.zeros_like(axes[:, :1])
+    own[len(own) // 2] = 1.0
+    pairs = torch.cat([own, axes], dim=1).T[: len(first.weight) // 2]
+    seen = torch.stack([pairs, -pairs], dim=1).flatten(0, 1)
+    first.weight[: len(seen)] = seen.view(-1, 1, *first.kernel_size)
+    for layer in inner:
+        layer.weight *= DRAWN
+        middle = layer.kernel_size[0] // 2
+        for channel in range(min(layer.in_channels, layer.out_channels)):
+            layer.weight[channel, channel, middle, middle] += 1.0
+    size = last.weight.numel() + 1
+    normal, right = torch.zeros(size, size, dtype=torch.float64), torch.zeros(size).double()
+    flat_references = references.reshape(len(references), -1)
+    root = torch.from_numpy(np.sqrt(weight / weight.mean()).astype(np.float32))[:, None]
+    for start in range(0, len(noisy), LINEAR_BLOCK):
+        block = slice(start, start + LINEAR_BLOCK)
+        x = images[block].to(memory_format=torch.channels_last)
+        for layer in (first, *inner):
+            x = torch.relu(layer(x))
+        x = nn.functional.unfold(x, last.kernel_size, padding=last.padding).transpose(1, 2)
+        x = torch.stack([star[some] for star, some in zip(x, pixels[block], strict=True)])
+        x = torch.cat([x, torch.ones_like(x[:, :, :1])], dim=2) * root[block, :, None]
+        x = x.flatten(0, 1)
+        y = torch.from_numpy(np.take_along_axis(flat_references[block], pixels[block], axis=1))
+        y = y * root[block]
+        normal += (x.T @ x).double()
+        right += (x.T @ y.flatten()).double()
+    normal += RIDGE * normal.diagonal().mean() * torch.eye(size, dtype=torch.float64)
+    solved = torch.linalg.solve(normal, right).float()
+    last.weight.copy_(solved[:-1].view_as(last.weight))
+    last.bias.copy_(solved[-1:])
 
 
 def image_scale(scale: Literal["mean", "none"], stamp_px: int) -> float:
@@ -163,6 +244,18 @@ class DaeTraining(Training):
         model = build_dae(dae.kernels, dae.widths, dae.init, generator)
         if data.start is not None:
             model.load_state_dict(data.start.network.state_dict())
+        elif dae.init == "linear":
+            rng = stream(seed, "dae", "linear", attempt)
+            stars = rng.permutation(data.fit)[:LINEAR_STARS]
+            noisy, level = data.draw(stars, rng)
+            everywhere = np.tile(np.arange(noisy[0].size), (stars.size, 1))
+            begin_linear(
+                model,
+                noisy * np.float32(self.factor),
+                data.references[stars] * np.float32(self.factor),
+                level**-settings.level_weight,
+                rng.permuted(everywhere, axis=1)[:, : -(-LINEAR_PX // stars.size)],
+            )
         super().__init__(model, settings, -(-data.fit.size // settings.batch), attempt)
         self.grad_clip = settings.grad_clip or self.grad_clip
         # A template follows from all of a stamp.

@@ -20,7 +20,10 @@ class DaeSettings(Group):
         [16, 16, 16, 16, 16, 16, 16, 16, 16],
         description="Channels between the convolutions, one fewer than kernels",
     )
-    init: Literal["he", "default"] = Field("he", description="He (2015) or PyTorch's default")
+    init: Literal["linear", "he", "default"] = Field(
+        "linear",
+        description="A linear estimator fitted to the stars, He (2015) or PyTorch's default",
+    )
     scale: Literal["mean", "none"] = Field(
         "mean", description="'mean' multiplies images by d² (mean pixel 1), 'none' leaves sum 1"
     )
@@ -75,10 +78,10 @@ class Train(Group):
         description="First part of the epochs, which sees the middle of stamps alone where "
         "realisations are learnt; 0: none",
     )
-    continued_epochs: Annotated[float, Field(ge=0, le=1)] = Field(
+    continued_epochs: Annotated[float, Field(ge=0, le=2)] = Field(
         0.0,
-        description="Part of the epochs in which a network of templates goes on from that of the "
-        "realisations; 0: all of them, from a start of its own",
+        description="Epochs, of those of the realisations, in which a network of templates goes on "
+        "from theirs; 0: as many, from a start of its own",
     )
     patience: Annotated[int, Field(ge=0)] = Field(
         0, description="Stop after this many validations without a better one; 0 never stops"

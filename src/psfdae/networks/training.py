@@ -131,7 +131,9 @@ class Training(ABC):
         self.scheduler: LRScheduler
         if settings.schedule == "onecycle":
             total = max(settings.epochs * steps, 2)
-            self.scheduler = OneCycleLR(self.optimiser, settings.lr, total_steps=total)
+            self.scheduler = OneCycleLR(
+                self.optimiser, settings.lr, total_steps=total, anneal_strategy="linear"
+            )
         else:
             self.scheduler = LambdaLR(self.optimiser, lambda step: rate(step // steps))
         self.seconds = self.cpu_seconds = 0.0

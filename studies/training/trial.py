@@ -1,0 +1,76 @@
+"""Trainings of the DAE under other settings: seconds and errors of the test stars.
+
+    python studies/training/trial.py DATASET TRIAL SEEDS STARS OUT [KEY=VALUE ...]
+
+appends a row per seed, reference and noise level to the CSV OUT. KEY=VALUE are overrides of the
+configuration, as for the workflow.
+"""
+
+from __future__ import annotations
+
+import csv
+import sys
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from psfdae.files import read_product
+from psfdae.method import HISTORY
+from psfdae.methods.dae import Dae
+from psfdae.model.star_sets import noisy_test_images, split_stars, training_set
+from psfdae_paper.configuration.compose import load
+from psfdae_paper.source import git_commit
+
+COLUMNS = ["commit", "dataset", "trial", "settings", "seed", "split", "reference"]
+COLUMNS += ["noise_level", "mse", "validation_mse", "attempt", "cpu_s"]
+
+
+def main(dataset: str, name: str, seeds: str, stars: str, out: str, *given: str) -> None:
+    """Train with every seed, measure, append."""
+    config = load([f"dataset={dataset}", *given])
+    references = config.dataset.references
+    product = read_product(Path(stars), "stars", ("field_index", "grid", *references))
+    for seed in map(int, seeds.split(",")):
+        start = None
+        for reference in references:
+            data = training_set(config, Dae, product, "random", reference)
+            if reference == "template" and config.train.continued_epochs:
+                data = replace(data, start=start)
+            with tempfile.TemporaryDirectory() as folder:
+                data = replace(data, seed=seed, checkpoint=Path(folder) / "checkpoint")
+                start = fitted = Dae.fit(data, config.dae, config.train)
+            history = fitted.diagnosed[HISTORY]
+            best = np.nanmin([row["validation_mse"] for row in history])
+            test = split_stars(product, "random", config).test
+            rows = []
+            for level in config.noise.levels:
+                noisy = noisy_test_images(config, product, test, level)
+                error = fitted.predict(noisy) - product[reference][test]
+                rows.append(
+                    [
+                        git_commit()[:7],
+                        dataset,
+                        name,
+                        " ".join(given),
+                        seed,
+                        "random",
+                        reference,
+                        level,
+                        f"{np.square(error).mean(dtype=np.float64):.5g}",
+                        f"{best:.5g}",
+                        fitted.attempt,
+                        history[-1]["cpu_seconds"],
+                    ]
+                )
+            new = not Path(out).exists()
+            with Path(out).open("a", newline="") as file:
+                writer = csv.writer(file)
+                if new:
+                    writer.writerow(COLUMNS)
+                writer.writerows(rows)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
