@@ -68,12 +68,14 @@ class Site:
         self.stars = write_tree(self.results)
         self.database = self.results / "mlflow.db"
         self.dae = self.results / "dae/dataset3/random-template"
+        self.optics = False
         shutil.copy(empty_database, self.database)
 
     def track(self):
         """Import everything; actions by kind of run, as the receipt tells."""
         receipt = self.results / "runs.csv"
-        track.track(self.results, "smoke", self.database, receipt, tuple(self.stars.items()))
+        stars = tuple(self.stars.items())
+        track.track(self.results, "smoke", self.database, receipt, stars, self.optics)
         with receipt.open(newline="") as file:
             return {row["kind"]: row["action"] for row in csv.DictReader(file)}
 
@@ -134,6 +136,26 @@ def test_run_holds_what_the_files_say(site):
     assert [(p.step, p.value) for p in points] == [(1, 3e-5), (2, 2e-5), (3, 1e-5)]
     assert [p.timestamp - dae.info.start_time for p in points] == [1500, 3000, 4500]
     assert [p.step for p in site.history(dae, "validation_mse")] == [2, 3]
+
+
+def test_what_knows_the_optics_is_a_run_without_a_model(site):
+    rows = ["dataset,split,reference,method,noise_level,metric,value,stderr,n"]
+    for method, value in (("wavefront", 3e-7), ("wavefront_position", 2.5e-7)):
+        rows.append(f"dataset3,random,template,{method},0.001,mse,{value},2e-8,420")
+    folder = site.results / "wavefront"
+    folder.mkdir()
+    (folder / "dataset3.csv").write_text("\n".join([*rows, ""]))
+    (folder / "dataset3.parquet").write_bytes(b"stars")
+    site.optics = True
+    assert site.track() == {"wavefront": "created", "wavefront_position": "created"}
+    (run,) = site.runs("wavefront_position")
+    assert run.data.metrics["bounded_mse_0.001"] == 2.5e-7
+    assert run.data.metrics["bounded_mse_stderr_0.001"] == 2e-8
+    assert run.data.params["telescope.diameter_m"] == "1.0"
+    assert set(site.track().values()) == {"unchanged"}
+    (folder / "dataset3.csv").unlink()
+    with pytest.raises(ProductError, match=r"dataset3\.csv: missing; run `snakemake wavefront`"):
+        site.track()
 
 
 def test_artifacts_lie_beside_the_database(site):

@@ -32,7 +32,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -176,6 +176,7 @@ class MixtureLaw:
     loose: float = 0.0
     step: float = NOISE_STEP
     _factors: Kept[float, Factor] = field(default_factory=Kept, init=False, repr=False)
+    _insides: Kept[float, np.ndarray] = field(default_factory=Kept, init=False, repr=False)
 
     def _estimate(
         self,
@@ -200,7 +201,8 @@ class MixtureLaw:
             for part in np.array_split(stars, -(-stars.size // IMAGES_AT_ONCE)):
                 found = self._posterior(flat[part], where[part], float(variance), sure)
                 psf[part], sigma[part], evidence[part], flux[part] = found
-            self._factors.trim(self._most)
+            for kept in (self._factors, self._insides):
+                kept.trim(self._most)
         shaped = psf.reshape(noisy.shape), sigma.reshape(noisy.shape) if sure else None
         return Estimate(*shaped, evidence, flux if self.loose else None)
 
@@ -248,7 +250,8 @@ class MixtureLaw:
             gain[stars] += w * g
             if sure:
                 one = self._restored(flat[stars], g, mean, s).astype(np.float64)
-                second[stars] += w * (self._uncertain(k, s) + one**2)
+                inside = self._insides(s, k, partial(self._uncertain, k, s))
+                second[stars] += w * (inside + one**2)
         psf = self._restored(flat, gain, own, s)
         sigma = np.sqrt(np.maximum(second - psf.astype(np.float64) ** 2, 0.0)) if sure else np.nan
         if not len(self.cross):  # the sky of the image is no part of the star
@@ -345,7 +348,7 @@ class MixtureLaw:
 
     def _factor(self, k: int, s: float) -> Factor:
         """C_k + s factorised."""
-        return self._factors(s, k, lambda: self._factored(k, s))
+        return self._factors(s, k, partial(self._factored, k, s))
 
     def _factored(self, k: int, s: float) -> Factor:
         cluster = self._clusters[k]

@@ -206,6 +206,45 @@ def _of_stars(
     )
 
 
+def runs_of_optics(results: Path, datasets: Mapping[str, Path]) -> list[Run]:
+    """What the methods that know the telescope made of the stars that are bounded.
+
+    Parameters and errors are those of `runs_of_datasets`. They keep no model: a run has its
+    errors, named `bounded_…` because they are those of some of the test stars.
+    """
+    runs = []
+    for dataset, stars in datasets.items():
+        path = results / "wavefront" / f"{dataset}.csv"
+        if not path.is_file():
+            raise ProductError(f"{path}: missing; run `snakemake wavefront` first")
+        config = read_product(stars, "stars", ()).config
+        rows = list(read_csv(path, "method", "split", "reference", "noise_level", "metric"))
+        of_run: dict[tuple[str, str, str], dict[str, float]] = {}
+        for row in rows:
+            metrics = of_run.setdefault((row["method"], row["split"], row["reference"]), {})
+            name = f"bounded_{row['metric']}"
+            level = f"{number(path, row['noise_level']):g}"
+            metrics[f"{name}_{level}"] = number(path, row["value"])
+            metrics[f"{name}_stderr_{level}"] = number(path, row["stderr"])
+        runs += [
+            Run(
+                kind=kind,
+                dataset=dataset,
+                split=split,
+                reference=reference,
+                source=f"wavefront/{dataset}/{kind}",
+                name=f"{dataset} {split} {reference} {kind}",
+                experiment=str(config["scene"]["experiment"]),
+                files={"evaluation.csv": path, "stars.parquet": path.with_suffix(".parquet")},
+                config=config,
+                end_ms=_time_ms(path),
+                metrics=metrics,
+            )
+            for (kind, split, reference), metrics in of_run.items()
+        ]
+    return runs
+
+
 def _model_files(kind: type[Method], place: Path) -> dict[str, Path]:
     """Files of a fit by their names within the run; `model/` is what the method loads."""
     model = {f"model/{path.name}": path for path in fits.own_files(kind, place)}

@@ -109,7 +109,7 @@ use rule psf_bounds as psf_bounds_growth with:
         "Collecting how the posterior means depend on their banks"
 
 
-use rule psf_bounds as wavefront with:
+use rule psf_bounds as psf_optics with:
     input:
         lambda w: [
             path
@@ -124,6 +124,13 @@ use rule psf_bounds as wavefront with:
         f"{RESULTS}/benchmarks_on_request/bounds/psf_optics.tsv"
     message:
         "Collecting what the optics of the telescope restore"
+
+
+rule wavefront:
+    input:
+        rules.psf_optics.output,
+        rules.track_wavefront.output,
+    localrule: True
 
 
 rule psf_efficiency:
@@ -261,7 +268,7 @@ rule bounds:
         rules.figure_headline.output if HEADLINE_DATASET in default_datasets() else [],
         rules.psf_bounds.output,
         rules.psf_bounds_growth.output,
-        rules.wavefront.output,
+        rules.wavefront.input,
         rules.psf_efficiency.output,
         rules.paper_rows.output,
         lambda w: [

@@ -22,7 +22,14 @@ from psfdae.options import File, Folder
 from psfdae.version import __version__
 from psfdae_paper.configuration.command import command
 from psfdae_paper.source import git_commit
-from psfdae_paper.tracking import Run, flatten, runs_of_alignment, runs_of_datasets, runs_of_sweep
+from psfdae_paper.tracking import (
+    Run,
+    flatten,
+    runs_of_alignment,
+    runs_of_datasets,
+    runs_of_optics,
+    runs_of_sweep,
+)
 
 SLOT = ("kind", "dataset", "split", "reference", "preset", "source")
 """Tags that name a place in the results folder; with `config_hash` they name a run."""
@@ -50,6 +57,7 @@ def track(
     stars: Annotated[
         tuple[tuple[str, File], ...], "Dataset and its product of the stage stars."
     ] = (),
+    optics: Annotated[bool, "Of these datasets, the methods that know the telescope."] = False,
     alignment: Annotated[bool, "The networks of scene 3."] = False,
     sweeps: Annotated[tuple[str, ...], "The points of a sweep.", {"flag": "--sweep"}] = (),
 ) -> None:
@@ -62,7 +70,8 @@ def track(
 
     If a server fails there is a message and no error: it must not stop a workflow.
     """
-    runs = runs_of_datasets(results, dict(stars))
+    of_datasets = runs_of_optics if optics else runs_of_datasets
+    runs = of_datasets(results, dict(stars))
     runs += runs_of_alignment(results) if alignment else []
     runs += [run for sweep in sweeps for run in runs_of_sweep(results, sweep)]
     import_runs(runs, preset, database, out)
