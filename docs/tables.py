@@ -301,9 +301,15 @@ def errors(name="tables/psf_metrics.csv"):
 
 def optics():
     """The telescope's optics beside the least possible error, realisation; `…_given`: the field."""
-    rows = csv("studies/optics/reached.csv").query("reference == 'realisation'")
-    given = rows.method == "wavefront_position"
-    return rows[~given].merge(rows[given], on=["dataset", "noise_level"], suffixes=("", "_given"))
+    rows = csv("tables/psf_efficiency.csv").query("reference == 'realisation'")
+    rows = rows.assign(ratio=rows.mse / rows.mse_bound)
+    one = csv("tables/psf_optics.csv").query("reference == 'realisation' and metric == 'explained'")
+    one = one.assign(flagged=(one.n * (1.0 - one.value)).round().astype(int))
+    key = ["dataset", "noise_level"]
+    rows = rows.merge(one[[*key, "method", "flagged"]], on=[*key, "method"])
+    free = rows.query("method == 'wavefront' and bound == 'bayes'")
+    given = rows.query("method == 'wavefront_position' and bound == 'bayes_position'")
+    return free.merge(given, on=key, suffixes=("", "_given")).sort_values(key)
 
 
 def denoisers():

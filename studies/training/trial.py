@@ -3,7 +3,8 @@
     python studies/training/trial.py DATASET TRIAL SEEDS STARS OUT [KEY=VALUE ...]
 
 appends a row per seed, reference and noise level to the CSV OUT. KEY=VALUE are overrides of the
-configuration, as for the workflow.
+configuration, as for the workflow, or of the schedule of the learning rate: course=cos (how it
+rises and falls; linear in use) and peak=0.15 (part of the steps before the peak; 0.3 in use).
 """
 
 from __future__ import annotations
@@ -15,11 +16,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from torch.optim.lr_scheduler import OneCycleLR
 
 from psfdae.files import read_product
 from psfdae.method import HISTORY
 from psfdae.methods.dae import Dae
 from psfdae.model.star_sets import noisy_test_images, split_stars, training_set
+from psfdae.networks import training
 from psfdae_paper.configuration.compose import load
 from psfdae_paper.source import git_commit
 
@@ -27,9 +30,18 @@ COLUMNS = ["commit", "dataset", "trial", "settings", "seed", "split", "reference
 COLUMNS += ["noise_level", "mse", "validation_mse", "attempt", "cpu_s"]
 
 
+def with_schedule(**own):
+    """Let trainings take another one-cycle schedule."""
+    training.OneCycleLR = lambda *given, **usual: OneCycleLR(*given, **{**usual, **own})
+
+
 def main(dataset: str, name: str, seeds: str, stars: str, out: str, *given: str) -> None:
     """Train with every seed, measure, append."""
-    config = load([f"dataset={dataset}", *given])
+    words = dict(word.split("=", 1) for word in given)
+    own = {"course": ("anneal_strategy", str), "peak": ("pct_start", float)}
+    with_schedule(**{own[k][0]: own[k][1](v) for k, v in words.items() if k in own})
+    overrides = [f"{k}={v}" for k, v in words.items() if k not in own]
+    config = load([f"dataset={dataset}", *overrides])
     references = config.dataset.references
     product = read_product(Path(stars), "stars", ("field_index", "grid", *references))
     for seed in map(int, seeds.split(",")):
