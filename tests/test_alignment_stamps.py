@@ -100,14 +100,17 @@ def test_period_sampling_integrates_pixels_exactly(tracer, exact, config):
     assert errors[2] < 1e-7
 
 
+@pytest.mark.parametrize("product_cost", [0.0, np.inf])
 @pytest.mark.parametrize("kind", ["points", "period"])
-def test_derivatives_by_coefficients_are_differences(kind):
+def test_derivatives_by_coefficients_are_differences(kind, product_cost):
+    """By products of polynomials, and each direction by itself."""
     pupil = annular_pupil(48, 0.3)
     sampling = (
         PointSampling(pupil, 8, 2.0, "complex128")
         if kind == "points"
         else PeriodSampling(pupil, 8, 2.0, "complex128")
     )
+    sampling.product_cost = product_cost
     modal = ModalStamps(pupil, partial(centred_modes, 11, 0.3), sampling, 2.0)
     rng = np.random.default_rng(0)
     coefficients = 0.2 * rng.standard_normal((2, 8))

@@ -6,7 +6,8 @@ space of coefficients changes it by dE = Σ 2πi (Σ v_j M_j) A exp(2πiW) exp(�
 another such sum, and the intensity by d|E|² = 2 Re(E* dE): derivatives are exact.
 Modes are polynomials of the pupil's coordinates, sums of products P_a(x) P_b(y) of Legendre
 polynomials. The field of such a product is two matrix products with weighted matrices, and those
-along x serve all b: all directions together cost a few stamps.
+along x serve all b: all directions together cost a few stamps. Where directions are few and modes
+many, a field for each direction costs less.
 
 Three ways lead from the pupil to the pixels, a `Sampling` each:
 
@@ -37,6 +38,9 @@ class Sampling(Protocol):
 
     dtype: np.dtype
     """float32 or float64, of the pixels."""
+
+    product_cost: float
+    """Time of a product of polynomials over that of a direction by itself, as measured."""
 
     def along_x(self, pupil_fields: np.ndarray, degrees: Sequence[int] = (0,)) -> np.ndarray:
         """Rows of the pupil to points, times P_a(x) for all degrees a.
@@ -79,6 +83,8 @@ class Separable:
 
 class PointSampling(Separable):
     """The points of `image_points` on both sides of the chief ray; its parameters."""
+
+    product_cost = 0.1
 
     # Pupil and points are symmetric about the chief ray. Even and odd parts of the pupil fields
     # meet cosines or sines, so that products are real and a quarter as large.
@@ -244,10 +250,35 @@ class ModalStamps:
         """
         if directions is None:
             directions = np.eye(len(self._modes))
-        weights = directions.astype(self.dtype) @ self._coefficients
-        if weights.ndim == 2:
-            weights = weights[None]
-        sampling, pupil_fields = self._sampling, self._pupil_fields(coefficients, offset_px)
+        directions = directions.astype(self.dtype)
+        if directions.ndim == 2:
+            directions = directions[None]
+        pupil_fields = self._pupil_fields(coefficients, offset_px)
+        few = directions.shape[1] < self._sampling.product_cost * len(self._products)
+        derivatives = self._by_direction if few else self._by_product
+        return derivatives(pupil_fields, directions)
+
+    def _by_direction(
+        self, pupil_fields: np.ndarray, directions: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Stamps and derivatives, each direction a field of its own."""
+        sampling, (count, *shape) = self._sampling, pupil_fields.shape
+        changed = np.empty((count, 1 + directions.shape[1], *shape), pupil_fields.dtype)
+        changed[:, 0] = pupil_fields
+        opd = (directions @ self._modes).reshape(*directions.shape[:2], *shape)
+        np.multiply(pupil_fields[:, None], opd, out=changed[:, 1:])
+        (rows,) = sampling.along_x(changed.reshape(-1, *shape))
+        (fields,) = sampling.along_y(rows)
+        image, *changes = np.moveaxis(fields.reshape(*changed.shape[:2], *fields.shape[1:]), 1, 0)
+        slopes = [image.imag * c.real - image.real * c.imag for c in changes]
+        stamps = sampling.to_pixels(image.real**2 + image.imag**2)
+        return stamps, (4.0 * np.pi) * sampling.to_pixels(np.stack(slopes, axis=1))
+
+    def _by_product(
+        self, pupil_fields: np.ndarray, directions: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Stamps and derivatives from those of all products of Legendre polynomials."""
+        sampling, weights = self._sampling, directions @ self._coefficients
         slopes: dict[tuple[int, int], np.ndarray] = {}
         for a, rows in enumerate(sampling.along_x(pupil_fields, range(len(self._degrees)))):
             degrees = self._degrees[a]

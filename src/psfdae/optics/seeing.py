@@ -101,6 +101,7 @@ class WholePeriod:
     Part of a `psfdae.optics.derivatives.Sampling`.
     """
 
+    product_cost = 0.6
     points: int
     dtype: np.dtype
     _axis: np.ndarray
