@@ -146,11 +146,9 @@ def begin_linear(
     """
     if not (np.isfinite(noisy).all() and np.isfinite(references).all()):
         raise TrainingError("training stars that are not finite")
-    first, *inner, last = model.layers
+    first, *inner, _ = model.layers
     images = torch.from_numpy(noisy[:, None])
-    patches = nn.functional.unfold(images, first.kernel_size, padding=first.padding)
-    flat = patches.transpose(1, 2).flatten(0, 1)
-    axes = torch.linalg.eigh(flat.T @ flat).eigenvectors.flip(1)
+    axes = _eigenpatches(images, first)
     own = torch.zeros_like(axes[:, :1])
     own[len(own) // 2] = 1.0
     pairs = torch.cat([own, axes], dim=1).T[: len(first.weight) // 2]
@@ -161,20 +159,31 @@ def begin_linear(
         middle = layer.kernel_size[0] // 2
         for channel in range(min(layer.in_channels, layer.out_channels)):
             layer.weight[channel, channel, middle, middle] += 1.0
+    _fit_last_layer(model, images, references.reshape(len(references), -1), weight, pixels)
+
+
+def _fit_last_layer(
+    model: Dae,
+    images: torch.Tensor,
+    references: np.ndarray,
+    weight: np.ndarray,
+    pixels: np.ndarray,
+) -> None:
+    """Least squares from what the last layer sees of images (n, 1, d, d) to references (n, d²)."""
+    *others, last = model.layers
     size = last.weight.numel() + 1
     normal, right = torch.zeros(size, size, dtype=torch.float64), torch.zeros(size).double()
-    flat_references = references.reshape(len(references), -1)
     root = torch.from_numpy(np.sqrt(weight / weight.mean()).astype(np.float32))[:, None]
-    for start in range(0, len(noisy), LINEAR_BLOCK):
+    for start in range(0, len(images), LINEAR_BLOCK):
         block = slice(start, start + LINEAR_BLOCK)
         x = images[block].to(memory_format=torch.channels_last)
-        for layer in (first, *inner):
+        for layer in others:
             x = torch.relu(layer(x))
         x = nn.functional.unfold(x, last.kernel_size, padding=last.padding).transpose(1, 2)
         x = torch.stack([star[some] for star, some in zip(x, pixels[block], strict=True)])
         x = torch.cat([x, torch.ones_like(x[:, :, :1])], dim=2) * root[block, :, None]
         x = x.flatten(0, 1)
-        y = torch.from_numpy(np.take_along_axis(flat_references[block], pixels[block], axis=1))
+        y = torch.from_numpy(np.take_along_axis(references[block], pixels[block], axis=1))
         y = y * root[block]
         normal += (x.T @ x).double()
         right += (x.T @ y.flatten()).double()
@@ -182,6 +191,17 @@ def begin_linear(
     solved = torch.linalg.solve(normal, right).float()
     last.weight.copy_(solved[:-1].view_as(last.weight))
     last.bias.copy_(solved[-1:])
+
+
+def _eigenpatches(images: torch.Tensor, layer: nn.Conv2d) -> torch.Tensor:
+    """Eigenvectors, columns, of the products of what a layer sees, the leading one first."""
+    # Without names, so that only one copy of the patches is there at the end.
+    flat = (
+        nn.functional.unfold(images, layer.kernel_size, padding=layer.padding)
+        .transpose(1, 2)
+        .flatten(0, 1)
+    )
+    return torch.linalg.eigh(flat.T @ flat).eigenvectors.flip(1)
 
 
 def image_scale(scale: Literal["mean", "none"], stamp_px: int) -> float:
