@@ -79,7 +79,7 @@ class Train(Group):
         "realisations are learnt; 0: none",
     )
     continued_epochs: Annotated[float, Field(ge=0, le=2)] = Field(
-        0.0,
+        1.0,
         description="Epochs, of those of the realisations, in which a network of templates goes on "
         "from theirs; 0: as many, from a start of its own",
     )
