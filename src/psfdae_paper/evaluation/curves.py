@@ -404,7 +404,9 @@ def _errors(
     if len(known):
         known = known.sort_values("noise_level")
         axes.plot(known["noise_level"], known["mse"], **{**_line(optics), "lw": 1.6, "ms": 8})
-        _name(axes, known["noise_level"], known["mse"], "telescope known", optics.look.color)
+        # It hides under the least possible, whose name it stands below.
+        low = 0.6 * known["mse"]
+        _name(axes, known["noise_level"], low, "telescope known", optics.look.color, below=True)
     best = bounds[bounds.method == "bayes"].sort_values("noise_level")
     tight = best[best.tight == "yes"]
     axes.plot(best["noise_level"], best["value"], color=BAYES["color"], ls="--", lw=1.2)
