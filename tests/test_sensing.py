@@ -307,6 +307,11 @@ def test_intervals_hold_as_many_stars_as_they_say(monkeypatch):
     for probability, least, most in ((0.6827, 0.56, 0.80), (0.9545, 0.87, 0.995)):
         low, high = np.moveaxis(found.interval(probability), -1, 0)
         assert least < np.mean((truth >= low) & (truth <= high)) < most
+    centred, flux = imaged(telescope, angle, truth, np.zeros((30, 2)), 60.0)
+    psf, error = found.psf_and_error()
+    off = np.abs(psf - (centred - SKY) / flux[:, None, None])
+    assert 0.56 < np.mean(off <= error) < 0.80
+    assert np.mean(off <= 3 * error) > 0.95
     monkeypatch.setattr(engine, "STARS_AT_ONCE", 1)
     again = psfdae.wavefront(counts[:2], telescope, field_deg=angle[:2], noise=SKY**0.5, gain=1.0)
     assert again.draws == pytest.approx(found.draws[:2], abs=1e-3)
@@ -504,6 +509,7 @@ def test_command_finds_the_changed_coma(night):
     assert result.exit_code == 0, (result.output, result.exception)
     with fits.open(night / "wavefront.fits") as file:
         assert {hdu.name for hdu in file} >= {"WAVEFRONT", "PSF", "MODEL", "RESIDUAL", "JOINT"}
+        assert (file["UNCERT"].data > 0).all()
         state = file["JOINT"].data
         coma = state[state["name"] == "z8.constant"]
         assert coma["value"][0] == pytest.approx(0.1, abs=5 * coma["error"][0])

@@ -148,7 +148,7 @@ def field_angles(
 
 
 def as_fits(found: Wavefronts, image: str) -> Any:
-    """The FITS file: primary header, WAVEFRONT, PSF, MODEL, RESIDUAL and JOINT."""
+    """The FITS file: primary header, WAVEFRONT, PSF, UNCERT, MODEL, RESIDUAL, COVAR and JOINT."""
     from astropy.io import fits
 
     primary = fits.PrimaryHDU()
@@ -169,8 +169,10 @@ def as_fits(found: Wavefronts, image: str) -> Any:
     table = fits.table_to_hdu(rows)
     table.name = "WAVEFRONT"
     table.header["COMMENT"] = "Coefficients and their errors are in waves; a row per star and mode."
+    psf, error = found.psf_and_error()
     cubes = {
-        "PSF": (found.psf(), "whole light 1, chief ray in the middle"),
+        "PSF": (psf, "whole light 1, chief ray in the middle"),
+        "UNCERT": (error, "standard deviation of PSF"),
         "MODEL": (found.model, "star without sky, unit of the input"),
         "RESIDUAL": (
             np.where(

@@ -244,15 +244,22 @@ class Wavefronts:
         The whole light is 1 per oversampling²; `side` in pixels is that of the stamps by default.
         NaN for stars without usable pixels.
         """
+        return self.psf_and_error(oversampling, side)[0]
+
+    def psf_and_error(
+        self, oversampling: int = 1, side: int | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """As `psf`, and the standard deviation of every pixel over all wavefronts of the star."""
         optics = self.search.optics
         side = (side or optics.stamp_px) * oversampling
         operator = optics.propagation(side, oversampling)
         k, count = len(self.terms.names), self.draws.shape[1]
-        found = np.full((len(self.stamps), side, side), np.nan)
+        mean, error = np.full((2, len(self.stamps), side, side), np.nan)
         for row, star in enumerate(self.star):
             modes = optics.modes(np.full(count, star), self.draws[row, :, :k], np.zeros((count, 2)))
-            found[star] = operator.stamps(modes).mean(axis=0) * oversampling**2
-        return found
+            each = operator.stamps(modes) * oversampling**2
+            mean[star], error[star] = each.mean(axis=0), each.std(axis=0)
+        return mean, error
 
     @cached_property
     def model(self) -> np.ndarray:
