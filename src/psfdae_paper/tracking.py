@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from psfdae import fits
 from psfdae.belonging import STARS, require_origin
-from psfdae.files import ProductError, read_product
+from psfdae.files import Product, ProductError, read_product
 from psfdae.method import CONFIG, HISTORY, Method
 from psfdae.methods import method
 from psfdae.methods.dae import WEIGHTS as DAE_WEIGHTS
@@ -24,6 +24,9 @@ from psfdae_paper.sweeps.points import hash_of
 
 WEIGHTS = {"dae": DAE_WEIGHTS, **dict.fromkeys(TRAINED, NETWORK_WEIGHTS)}
 """Files of the networks of scene 3, in their folders."""
+
+MEASURED = ("method", "noise_level", "metric", "value", "stderr")
+"""Columns of tables of errors."""
 
 STATISTICS = ("mean_abs_error", "bias", "variance")
 
@@ -179,23 +182,17 @@ def _of_stars(
     own, run_kind = kind.described(model), fits.storage_of(kind).run or kind.name
     # Which start succeeded is an outcome, not a setting.
     own.pop("attempt", None)
-    try:
-        experiment = str(product.config["scene"]["experiment"])
-    except (KeyError, TypeError):
-        raise ProductError(f"{stars}: its config has no scene.experiment") from None
-    metrics = {}
-    for row in read_csv(evaluation, "method", "noise_level", "metric", "value", "stderr"):
+    metrics: dict[str, float] = {}
+    for row in read_csv(evaluation, *MEASURED):
         if row["method"] == kind.name:
-            metric, level = row["metric"], f"{number(evaluation, row['noise_level']):g}"
-            for name, column in ((metric, "value"), (f"{metric}_stderr", "stderr")):
-                metrics[f"test_{name}_{level}"] = number(evaluation, row[column])
+            metrics |= _measured(evaluation, row, "test")
     trained = HISTORY in fits.storage_of(kind).diagnostics
     return Run(
         **key,
         kind=run_kind,
         source=source,
         name=" ".join([*key.values(), run_kind]),
-        experiment=experiment,
+        experiment=_experiment(product),
         files=files,
         config={**product.config, **own},
         end_ms=_time_ms(fits.outputs(kind, model)[0]),
@@ -217,15 +214,11 @@ def runs_of_optics(results: Path, datasets: Mapping[str, Path]) -> list[Run]:
         path = results / "wavefront" / f"{dataset}.csv"
         if not path.is_file():
             raise ProductError(f"{path}: missing; run `snakemake wavefront` first")
-        config = read_product(stars, "stars", ()).config
-        rows = list(read_csv(path, "method", "split", "reference", "noise_level", "metric"))
+        product = read_product(stars, "stars", ())
         of_run: dict[tuple[str, str, str], dict[str, float]] = {}
-        for row in rows:
+        for row in read_csv(path, "split", "reference", *MEASURED):
             metrics = of_run.setdefault((row["method"], row["split"], row["reference"]), {})
-            name = f"bounded_{row['metric']}"
-            level = f"{number(path, row['noise_level']):g}"
-            metrics[f"{name}_{level}"] = number(path, row["value"])
-            metrics[f"{name}_stderr_{level}"] = number(path, row["stderr"])
+            metrics |= _measured(path, row, "bounded")
         runs += [
             Run(
                 kind=kind,
@@ -234,15 +227,30 @@ def runs_of_optics(results: Path, datasets: Mapping[str, Path]) -> list[Run]:
                 reference=reference,
                 source=f"wavefront/{dataset}/{kind}",
                 name=f"{dataset} {split} {reference} {kind}",
-                experiment=str(config["scene"]["experiment"]),
+                experiment=_experiment(product),
                 files={"evaluation.csv": path, "stars.parquet": path.with_suffix(".parquet")},
-                config=config,
+                config=product.config,
                 end_ms=_time_ms(path),
                 metrics=metrics,
             )
             for (kind, split, reference), metrics in of_run.items()
         ]
     return runs
+
+
+def _experiment(stars: Product) -> str:
+    """Name of the experiment of stars, their scene; raises ProductError without one."""
+    try:
+        return str(stars.config["scene"]["experiment"])
+    except (KeyError, TypeError):
+        raise ProductError(f"{stars.path}: its config has no scene.experiment") from None
+
+
+def _measured(path: Path, row: Mapping[str, str], what: str) -> dict[str, float]:
+    """Value and standard error of a row of a table of errors, by their names in MLflow."""
+    metric, level = row["metric"], f"{number(path, row['noise_level']):g}"
+    named = ((metric, "value"), (f"{metric}_stderr", "stderr"))
+    return {f"{what}_{name}_{level}": number(path, row[column]) for name, column in named}
 
 
 def _model_files(kind: type[Method], place: Path) -> dict[str, Path]:

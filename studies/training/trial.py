@@ -9,13 +9,14 @@ rises and falls; linear in use) and peak=0.15 (part of the steps before the peak
 
 from __future__ import annotations
 
-import csv
 import sys
 import tempfile
 from dataclasses import replace
+from datetime import date
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 from torch.optim.lr_scheduler import OneCycleLR
 
 from psfdae.files import read_product
@@ -25,9 +26,6 @@ from psfdae.model.star_sets import noisy_test_images, split_stars, training_set
 from psfdae.networks import training
 from psfdae_paper.configuration.compose import load
 from psfdae_paper.source import git_commit
-
-COLUMNS = ["commit", "dataset", "trial", "settings", "seed", "split", "reference"]
-COLUMNS += ["noise_level", "mse", "validation_mse", "attempt", "cpu_s"]
 
 
 def with_schedule(**own):
@@ -60,28 +58,13 @@ def main(dataset: str, name: str, seeds: str, stars: str, out: str, *given: str)
             for level in config.noise.levels:
                 noisy = noisy_test_images(config, product, test, level)
                 error = fitted.predict(noisy) - product[reference][test]
-                rows.append(
-                    [
-                        git_commit()[:7],
-                        dataset,
-                        name,
-                        " ".join(given),
-                        seed,
-                        "random",
-                        reference,
-                        level,
-                        f"{np.square(error).mean(dtype=np.float64):.5g}",
-                        f"{best:.5g}",
-                        fitted.attempt,
-                        history[-1]["cpu_seconds"],
-                    ]
-                )
-            new = not Path(out).exists()
-            with Path(out).open("a", newline="") as file:
-                writer = csv.writer(file)
-                if new:
-                    writer.writerow(COLUMNS)
-                writer.writerows(rows)
+                row = dict(dataset=dataset, trial=name, settings=" ".join(given), seed=seed)
+                row |= dict(split="random", reference=reference, noise_level=level)
+                row |= dict(mse=np.square(error).mean(dtype=np.float64), validation_mse=best)
+                row |= dict(attempt=fitted.attempt, cpu_s=history[-1]["cpu_seconds"])
+                rows.append(row | dict(date=date.today().isoformat(), commit=git_commit()))
+            table, new = pd.DataFrame(rows), not Path(out).exists()
+            table.to_csv(out, mode="a", header=new, index=False, float_format="%.5g")
 
 
 if __name__ == "__main__":
