@@ -253,11 +253,14 @@ class Packing:
         Small images that `psfdae predict` has restored at once.
     padded : bool
         Fewer are made up to as many: other numbers of them round otherwise.
+    parallel : bool
+        Threads restore some at a time. Without large products, they would wait for each other.
     """
 
     suffix: str | None = None
     together: int = 256
     padded: bool = True
+    parallel: bool = True
 
 
 # What some methods can do.
@@ -294,8 +297,11 @@ class FreesFlux(Protocol):
 class FindsFlux(FreesFlux, Protocol):
     """Finds, in that form, the flux of a star in that by which its image was divided."""
 
-    def flux(self, noisy: np.ndarray, level: np.ndarray) -> np.ndarray:
-        """That flux of images (n, d, d), shape (n,)."""
+    def flux(self, noisy: np.ndarray, level: np.ndarray) -> tuple[np.ndarray, Any]:
+        """That flux of images (n, d, d), shape (n,), and which parts of its law are near them.
+
+        `estimate` and `outlier_score` take the latter as `near` and look at no other part.
+        """
 
 
 @runtime_checkable

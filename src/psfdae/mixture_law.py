@@ -48,7 +48,7 @@ mean."""
 CACHE_BYTES = 400e6
 """Size of the factorisations that are kept for further stars."""
 
-NEAREST, LEADING = 32, 64
+NEAREST, LEADING = 16, 64
 """Clusters that are looked at, and coordinates in which they are found; the others of 512
 hold less than 1 % of the weight."""
 
@@ -184,7 +184,12 @@ class MixtureLaw:
         level: float | np.ndarray,
         position: np.ndarray | None,
         sure: bool,
-    ) -> Estimate:
+        near: np.ndarray | None = None,
+    ) -> tuple[Estimate, np.ndarray]:
+        """Estimates, and the weight of each cluster for each image, (n, K).
+
+        Those that are not `near`, (n, K) of bool, have none.
+        """
         flat = noisy.reshape(len(noisy), math.prod(noisy.shape[1:]))
         if not np.isfinite(flat).all():
             raise ValueError("noisy images must be finite")
@@ -196,34 +201,45 @@ class MixtureLaw:
         s, node = np.unique(s, return_inverse=True)
         psf, sigma = (np.empty(flat.shape, np.float32) for _ in range(2))
         evidence, flux = np.empty((2, len(flat)))
+        weight = np.empty((len(flat), len(self.count)), np.float32)
         for place, variance in enumerate(s):
             (stars,) = (node == place).nonzero()
             for part in np.array_split(stars, -(-stars.size // IMAGES_AT_ONCE)):
-                found = self._posterior(flat[part], where[part], float(variance), sure)
-                psf[part], sigma[part], evidence[part], flux[part] = found
+                own = None if near is None else near[part]
+                found = self._posterior(flat[part], where[part], float(variance), sure, own)
+                psf[part], sigma[part], evidence[part], flux[part], weight[part] = found
             for kept in (self._factors, self._insides):
                 kept.trim(self._most)
         shaped = psf.reshape(noisy.shape), sigma.reshape(noisy.shape) if sure else None
-        return Estimate(*shaped, evidence, flux if self.loose else None)
+        return Estimate(*shaped, evidence, flux if self.loose else None), weight
 
     def _posterior(
-        self, flat: np.ndarray, where: np.ndarray, s: float, sure: bool
-    ) -> tuple[np.ndarray, np.ndarray | float, np.ndarray, np.ndarray]:
-        """Posterior mean, its σ, evidence and flux of images (n, P) of variance s."""
+        self,
+        flat: np.ndarray,
+        where: np.ndarray,
+        s: float,
+        sure: bool,
+        near: np.ndarray | None = None,
+    ) -> tuple[np.ndarray, np.ndarray | float, np.ndarray, np.ndarray, np.ndarray]:
+        """Posterior mean, its σ, evidence, flux and weights of images (n, P) of variance s."""
         z = (flat @ self.axes).astype(np.float32)
+        near = self._near(z, where, s) if near is None else near
         log = np.full((len(z), len(self.count)), -np.inf)
-        near = self._near(z, where, s)
+        leading = self._leading(s)
         for k in range(len(self.count)):
             (stars,) = near[:, k].nonzero()
             if stars.size:
-                _, residual, half = self._against(k, z[stars], where[stars], s)
                 factor = self._factor(k, s)
+                _, residual, half = self._against(k, z[stars, :leading], where[stars], s)
                 off = (where[stars] - self.center[k]) @ self._clusters[k].spread.T
                 log[stars, k] = factor.constant - 0.5 * (
-                    np.einsum("ij,ij,j->i", residual, residual, factor.inverse, dtype=np.float64)
-                    - np.einsum("ij,ij->i", half, half, dtype=np.float64)
-                    + np.einsum("ij,ij->i", off, off)
+                    np.square(residual) @ factor.inverse[:leading]
+                    - np.square(half).sum(axis=1)
+                    + np.square(off).sum(axis=1)
                 )
+        # In the other coordinates all clusters have nearly one law.
+        rest = np.square(z[:, leading:] - self._middle[leading:])
+        log -= 0.5 * (rest @ (1.0 / (self.variance[leading:] + s)))[:, None]
         weights, evidence = mixing_weights(log)
         evidence -= 0.5 * z.shape[1] * np.log(2 * np.pi)
         weight = weights.astype(np.float32)
@@ -256,7 +272,7 @@ class MixtureLaw:
         sigma = np.sqrt(np.maximum(second - psf.astype(np.float64) ** 2, 0.0)) if sure else np.nan
         if not len(self.cross):  # the sky of the image is no part of the star
             psf += ((flux - 1.0) / z.shape[1]).astype(np.float32)[:, None]
-        return psf, sigma, evidence, flux
+        return psf, sigma, evidence, flux, weight
 
     @cached_property
     def _contrast(self) -> np.ndarray:
@@ -279,12 +295,16 @@ class MixtureLaw:
     def _against(
         self, k: int, z: np.ndarray, where: np.ndarray, s: float
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Position from the cluster's, image less its mean there, and A times that."""
+        """Position from the cluster's, image less its mean there, and A times that.
+
+        The image z has all coordinates or the leading ones.
+        """
         low = self._factor(k, s).low
         at = (where - self.center[k]).astype(np.float32)
-        residual = z - self.mean[k]
+        width = z.shape[1]
+        residual = z - self.mean[k, :width]
         if at.size:
-            residual -= at @ self._clusters[k].slope
+            residual -= at @ self._clusters[k].slope[:, :width]
         return at, residual, residual[:, : low.shape[1]] @ low.T
 
     def _near(self, z: np.ndarray, where: np.ndarray, s: float) -> np.ndarray:
@@ -379,10 +399,14 @@ class MixtureLaw:
         return int(np.count_nonzero(np.maximum.accumulate(self._total[::-1]) > FLAT_VARIANCE * s))
 
     @cached_property
+    def _middle(self) -> np.ndarray:
+        """Mean of all stars in the axes, (P,)."""
+        return np.asarray(np.average(self.mean, axis=0, weights=self.count))
+
+    @cached_property
     def _total(self) -> np.ndarray:
         """Variance of all stars along the axes."""
-        mean = np.average(self.mean, axis=0, weights=self.count)
-        between = np.average(np.square(self.mean - mean), axis=0, weights=self.count)
+        between = np.average(np.square(self.mean - self._middle), axis=0, weights=self.count)
         loose = np.square(self.loose * self._contrast).max(axis=0)
         return self.variance + between + np.square(self.slope).sum(axis=0) + loose
 

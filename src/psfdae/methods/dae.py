@@ -52,7 +52,7 @@ class Dae(Method):
     """
 
     look = Look("DAE", "#0072b2", "D", paper=("dae", "DAE"))
-    needs = Needs(validation=True, memory_mb=1500, minutes=60)
+    needs = Needs(validation=True, memory_mb=1800, minutes=60)
     storage = Storage(
         files=(WEIGHTS, CONFIG),
         diagnostics=(HISTORY,),

@@ -98,7 +98,7 @@ class GaussianMixture(MixtureLaw, Method):
         },
         per_reference=True,
     )
-    packing = Packing(together=4096, padded=False)
+    packing = Packing(together=8192, padded=False, parallel=False)
     groups: ClassVar = {"gmm": Gmm}
 
     @classmethod
@@ -297,15 +297,17 @@ class GaussianMixture(MixtureLaw, Method):
         yield "deviation", "images of the sum 1", power <= 4.0 * self.count.sum()
         yield "shrinkage", "a number above 0", self.shrinkage.shape == (1,) and self.shrinkage > 0
 
-    def outlier_score(self, noisy: np.ndarray, level: np.ndarray) -> np.ndarray:
-        """From the evidence of the leading `OUTLIER_COORDINATES`.
+    def outlier_score(
+        self, noisy: np.ndarray, level: np.ndarray, near: np.ndarray | None = None
+    ) -> np.ndarray:
+        """From the evidence of the leading `OUTLIER_COORDINATES`; `near` as for `estimate`.
 
         The others hold noise, which is an estimate: their χ² would say that it is wrong.
         """
         some = self._telling
         s = self.noise.variance(np.full(len(noisy), 1.0 / self.axes.shape[0]), np.asarray(level))
         usual = np.log(2 * np.pi * (some._total + s[:, None])).sum(axis=1)
-        evidence = some._estimate(noisy, level, None, sure=False).evidence
+        evidence = some._estimate(noisy, level, None, sure=False, near=near)[0].evidence
         assert evidence is not None
         return -2.0 * evidence - usual
 
@@ -313,28 +315,38 @@ class GaussianMixture(MixtureLaw, Method):
         """The law of images whose flux and sky are estimates."""
         return replace(self, loose=FLUX_SIGMA)
 
-    def flux(self, noisy: np.ndarray, level: np.ndarray) -> np.ndarray:
-        """Flux of the star in that by which its image was divided; 1 where fluxes are known."""
-        flux = self._estimate(noisy, level, None, sure=False).flux
-        return np.ones(len(noisy)) if flux is None else flux
+    def flux(self, noisy: np.ndarray, level: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Flux of the star in that by which its image was divided, and clusters that are near.
+
+        The flux is 1 where fluxes are known.
+        """
+        found, weight = self._estimate(noisy, level, None, sure=False)
+        return np.ones(len(noisy)) if found.flux is None else found.flux, weight > 0
 
     def predict(
         self, noisy: np.ndarray, level: float | np.ndarray, position: np.ndarray | None = None
     ) -> np.ndarray:
         """PSFs, float32; raises as `estimate`."""
-        return self._estimate(noisy, level, position, sure=False).psf
+        return self._estimate(noisy, level, position, sure=False)[0].psf
 
     def estimate(
-        self, noisy: np.ndarray, level: float | np.ndarray, position: np.ndarray | None = None
+        self,
+        noisy: np.ndarray,
+        level: float | np.ndarray,
+        position: np.ndarray | None = None,
+        near: np.ndarray | None = None,
     ) -> Estimate:
         """PSFs, float32, their standard deviation, and the evidence of every image.
+
+        Only clusters count that are `near` an image, shape (n, K) of bool, by default those that
+        the common covariance finds.
 
         Raises
         ------
         ValueError
             If a pixel is not finite.
         """
-        return self._estimate(noisy, level, position, sure=True)
+        return self._estimate(noisy, level, position, sure=True, near=near)[0]
 
 
 def _less(x: np.ndarray, noise: np.ndarray) -> np.ndarray:

@@ -25,7 +25,8 @@ that are known should be NaN. No star influences another one.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -318,6 +319,18 @@ class Photometry:
     images: np.ndarray  # (n, d, d), float32: sky-subtracted, repaired, of flux 1; zero without flux
     used: np.ndarray  # (n, d, d): pixels that were measured; the others are repaired
     flags: np.ndarray  # uint16
+
+    def part(self, rows: slice) -> Photometry:
+        """Of a part of the stamps."""
+        return Photometry(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+    @classmethod
+    def joined(cls, parts: Sequence[Photometry]) -> Photometry:
+        """Of the stamps of several."""
+        if len(parts) == 1:
+            return parts[0]
+        columns = ([getattr(p, field.name) for p in parts] for field in fields(cls))
+        return cls(*map(np.concatenate, columns))
 
     def with_flux(self, factor: np.ndarray) -> Photometry:
         """The same light with fluxes times a factor (n,), the rest of it being sky."""

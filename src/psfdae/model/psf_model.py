@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields, replace
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,7 +26,7 @@ from psfdae.image.stamps import (
     displacement,
     raise_flag,
 )
-from psfdae.method import Estimate, FindsFlux, KnowsField, MeasuresStars, Packing, with_free_flux
+from psfdae.method import FindsFlux, KnowsField, MeasuresStars, Packing, with_free_flux
 from psfdae.model.bundle import (
     Bundle,
     at_noise,
@@ -48,6 +49,7 @@ SKY_SIGMA = 5.0  # scatter of the border by which its median may differ from a s
 FLUX_FACTOR = (0.5, 2.0)  # by which a method may correct the flux of a star
 BLOCK = 256  # stars that a network computes together, always so many: other numbers round otherwise
 MOST_OVERSAMPLED = 32  # values per pixel and axis
+SEEN = 2048  # stars that are measured and described together
 ROWS = 4 * BLOCK  # stars that are read at a time, fewer if their stamps are large
 MARGIN_PX = 2  # by which a star of an image may be moved to centre it
 WHOLE_PX = 32  # larger stamps come in smaller blocks
@@ -166,7 +168,7 @@ class PsfModel:
         stars = self._stamps(stamps, margin, given, masks, position, centre)
         blocks = self.engine.blocks(stars)
         with one_thread_each():
-            threads = min(threads or available_cores(), max(len(blocks), 1))
+            threads = min(self.engine.threads(threads), max(len(blocks), 1))
             work = (lambda block: self.engine.block(block, fixed), blocks or [stars], threads)
             parts = side_by_side(*work)
         return Prediction.joined(parts)
@@ -220,7 +222,7 @@ class PsfModel:
 
         chunks = observation.chunks(max(size, min(ROWS, 4 * size)))
         with one_thread_each():
-            yield from in_order(predicted, chunks, threads or available_cores())
+            yield from in_order(predicted, chunks, self.engine.threads(threads))
 
     def psf_at(self, x: ArrayLike, y: ArrayLike, oversampling: int = 4) -> np.ndarray:
         """PSFs at places of the image of the training, where no star need be.
@@ -342,6 +344,60 @@ def _per_star(name: str, value: ArrayLike | None, count: int) -> np.ndarray:
     return np.broadcast_to(numbers, (count,))
 
 
+class Seen(NamedTuple):
+    """Stars as they are before they are restored.
+
+    Attributes
+    ----------
+    stars : Stamps
+    exact : ndarray of bool, shape (n,)
+        Whether their listed centres are.
+    stamps, bad : ndarray, shape (n, d, d)
+        Centred, with pixels that are not used.
+    shift : ndarray of int, shape (n, 2)
+        By which they were moved, (row, column).
+    flags : ndarray of uint16, shape (n,)
+    start : ndarray, shape (n,)
+        A rough sky.
+    found : Photometry
+    """
+
+    stars: Stamps
+    exact: np.ndarray
+    stamps: np.ndarray
+    bad: np.ndarray
+    shift: np.ndarray
+    flags: np.ndarray
+    start: np.ndarray
+    found: Photometry
+
+
+class Restored(NamedTuple):
+    """PSFs of stars.
+
+    Attributes
+    ----------
+    psf : ndarray, shape (n, d, d)
+        Of flux 1; NaN where there is no flux.
+    sigma : ndarray, shape (n, d, d), or None
+        Its standard deviation.
+    found : Photometry
+    lost : ndarray of bool, shape (n,)
+        Stars without flux.
+    score : ndarray, shape (n,)
+        How unlike all training stars; NaN where nothing says so.
+    of_star : dict of ndarray
+        What a method measured that measures stars.
+    """
+
+    psf: np.ndarray
+    sigma: np.ndarray | None
+    found: Photometry
+    lost: np.ndarray
+    score: np.ndarray
+    of_star: dict[str, np.ndarray]
+
+
 class Engine:
     """What a bundle needs to be ready: the method and the photometry's matrices.
 
@@ -353,9 +409,17 @@ class Engine:
         self.estimator = estimator(bundle)
         self.free_flux = with_free_flux(self.estimator)
         packing = self.estimator.packing or Packing()
-        together, self._padded = packing.together, packing.padded
+        together, self._padded, self._parallel = (
+            packing.together,
+            packing.padded,
+            packing.parallel,
+        )
         self.size = min(together, max(1, together * WHOLE_PX**2 // bundle.info.stamp_px**2))
         self._photometer = Photometer(bundle.flux_model, bundle.info.components)
+
+    def threads(self, most: int | None) -> int:
+        """Threads that gain time, of at most so many, or of all cores."""
+        return (most or available_cores()) if self._parallel else 1
 
     def blocks(self, stars: Stamps) -> list[Stamps]:
         """Stars in parts of `size`."""
@@ -371,7 +435,16 @@ class Engine:
             return self._compute(stars, fixed).first(count)
 
     def _compute(self, stars: Stamps, fixed: bool) -> Prediction:
-        bundle, info = self.bundle, self.bundle.info
+        parts = [stars.part(slice(a, a + SEEN)) for a in range(0, len(stars), SEEN)]
+        seen = [self._seen(part, fixed) for part in parts]
+        if isinstance(self.estimator, MeasuresStars):
+            restored = [self._measured(one) for one in seen]
+        else:
+            restored = self._estimated(seen)
+        told = (self._predicted(one, own) for one, own in zip(seen, restored, strict=True))
+        return Prediction.joined([*told])
+
+    def _seen(self, stars: Stamps, fixed: bool) -> Seen:
         exact = fixed & np.isfinite(stars.listed).all(axis=1)
         stamps, bad, shift, flags = self._centred(stars, exact)
         start = border_median(stamps, bad)
@@ -379,18 +452,12 @@ class Engine:
             unlike_sky = np.abs(start - stars.background) > SKY_SIGMA * border_scatter(stamps)
             raise_flag(flags, StarFlag.SKY_OFF, unlike_sky)
         found = self._photometer.measure(stamps, bad, start, stars)
-        of_star: dict[str, np.ndarray] = {}
-        if isinstance(self.estimator, MeasuresStars):
-            estimate, found, of_star = self._measured(
-                stars, stamps, bad, shift, start, exact, found
-            )
-            psf, sigma = estimate.psf, estimate.sigma
-            lost = (found.flags & StarFlag.NO_FLUX) > 0
-        else:
-            estimate = None
-            lost = (found.flags & StarFlag.NO_FLUX) > 0
-            free = np.isnan(stars.flux) & np.isnan(stars.background)
-            psf, sigma, found = self._estimate(found, free, lost)
+        return Seen(stars, exact, stamps, bad, shift, flags, start, found)
+
+    def _predicted(self, seen: Seen, restored: Restored) -> Prediction:
+        bundle, info = self.bundle, self.bundle.info
+        stars, stamps, flags = seen.stars, seen.stamps, seen.flags
+        psf, sigma, found, lost = restored.psf, restored.sigma, restored.found, restored.lost
         noise = found.noise / np.where(lost, np.nan, found.flux)
         shapes = measure_shapes(psf)
         snr = np.sqrt(np.square(psf, dtype=np.float64).sum(axis=(1, 2))) / noise
@@ -405,17 +472,11 @@ class Engine:
         flags |= found.flags
         raise_flag(flags, StarFlag.SNR_LOW, snr < info.snr_min / SNR_TOLERANCE)
         # What measures stars knows their noise, and comes ever nearer to the star itself.
-        limited = estimate is None
+        limited = not restored.of_star
         raise_flag(flags, StarFlag.SNR_HIGH, limited & (snr > info.snr_max * SNR_TOLERANCE))
-        unlike, score = distance > bundle.distance_limit, np.full(len(noise), np.nan)
-        if bundle.strange_limit is not None and not lost.all():
-            level = noise[~lost] / info.kappa
-            score[~lost] = (
-                self.free_flux.outlier_score(found.images[~lost], level)
-                if estimate is None
-                else estimate.outlier_score[~lost]
-            )
-            unlike |= score > np.interp(noise, bundle.noise_nodes, bundle.strange_limit)
+        unlike = distance > bundle.distance_limit
+        if bundle.strange_limit is not None:
+            unlike |= restored.score > np.interp(noise, bundle.noise_nodes, bundle.strange_limit)
         raise_flag(flags, StarFlag.UNLIKE_TRAINING, unlike)
         chi2 = _chi2(residual, psf, doubt, found.noise, stars.gain)
         raise_flag(flags, StarFlag.POOR_FIT, chi2 > MOST_CHI2)
@@ -433,14 +494,14 @@ class Engine:
             snr=snr,
             chi2=chi2,
             distance=distance,
-            outlier_score=score,
+            outlier_score=restored.score,
             fwhm_px=shapes.fwhm_px,
             ellipticity=shapes.ellipticity,
             position_angle_deg=shapes.position_angle_deg,
-            shift_x=shift[:, 1],
-            shift_y=shift[:, 0],
+            shift_x=seen.shift[:, 1],
+            shift_y=seen.shift[:, 0],
             flags=flags,
-            **(of_star or unmeasured(len(stars))),
+            **(restored.of_star or unmeasured(len(stars))),
         )
 
     def _doubts(
@@ -470,21 +531,13 @@ class Engine:
         width = width * np.where(brightest(psf), bright, faint)
         return width, ratios * widest / wider, np.where(flux_too & sky_too, scales[2], of_flux)
 
-    def _measured(
-        self,
-        stars: Stamps,
-        stamps: np.ndarray,
-        bad: np.ndarray,
-        shift: np.ndarray,
-        start: np.ndarray,
-        exact: np.ndarray,
-        found: Photometry,
-    ) -> tuple[Estimate, Photometry, dict[str, np.ndarray]]:
-        """PSFs of flux 1, their σ and what the method measures in place of the photometry.
+    def _measured(self, seen: Seen) -> Restored:
+        """With what the method measures in place of the photometry.
 
-        `found` repairs bad pixels and tells the noise, `start` (n,) is a rough sky; listed
-        centres are `exact` or not.
+        That repairs bad pixels and tells the noise.
         """
+        stars, stamps, bad, shift = seen.stars, seen.stamps, seen.bad, seen.shift
+        start, exact, found = seen.start, seen.exact, seen.found
         pixels = stamps[0].size
         given, unseen = np.isfinite(stars.flux), (found.flags & StarFlag.NO_FLUX) > 0
         level = start[:, None, None]
@@ -531,19 +584,24 @@ class Engine:
         middle = np.where(np.isfinite(middle), middle, stars.data.shape[-1] // 2)
         measured = measured_of(middle + shift + own.centre, own.covariance)
         estimate.psf[lost] = estimate.sigma[lost] = np.nan
-        return estimate, better, {k: np.where(lost, np.nan, v) for k, v in measured.items()}
+        score = np.full(len(lost), np.nan)
+        if self.bundle.strange_limit is not None and estimate.outlier_score is not None:
+            score[~lost] = estimate.outlier_score[~lost]
+        of_star = {k: np.where(lost, np.nan, v) for k, v in measured.items()}
+        return Restored(estimate.psf, estimate.sigma, better, lost, score, of_star)
 
-    def _estimate(
-        self, found: Photometry, free: np.ndarray, lost: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray | None, Photometry]:
-        """PSFs of flux 1 and, if the method knows it, their σ; NaN where there is no flux.
+    def _estimated(self, seen: Sequence[Seen]) -> list[Restored]:
+        """With fluxes and sky that the method found first, if it can where both are unknown.
 
-        Where flux and sky are `free`, the method may find better ones first. It takes the noise
-        for larger then: what it does not know of a bright star would pass for flux.
+        It takes the noise for larger then: what it does not know of a bright star would pass for
+        flux. Parts are restored together, in which some stars have about the same noise.
         """
-        info = self.bundle.info
-        if lost.all():  # such as the stars of a catalogue that reaches far beyond the image
-            return np.full_like(found.images, np.nan), None, found
+        info, near = self.bundle.info, {}
+        found = Photometry.joined([one.found for one in seen])
+        parts = np.cumsum([0, *(len(one.stars) for one in seen)])
+        lost = (found.flags & StarFlag.NO_FLUX) > 0
+        psf, sigma = np.full_like(found.images, np.nan), None
+        score = np.full(len(lost), np.nan)
         mean = self.bundle.flux_model.mean.reshape(found.images.shape[1:])
 
         def current() -> tuple[np.ndarray, np.ndarray]:
@@ -553,18 +611,37 @@ class Engine:
             noise = found.noise / np.where(lost, np.nan, found.flux)
             return images, np.where(lost, info.noise_max, noise)
 
-        free = free & ~lost
+        free = [np.isnan(one.stars.flux) & np.isnan(one.stars.background) for one in seen]
+        free = np.concatenate(free) & ~lost
         if free.any() and isinstance(self.free_flux, FindsFlux):
             images, noise = current()
-            flux = self.free_flux.flux(images, np.hypot(noise, info.misfit) / info.kappa)
+            wider = np.hypot(noise, info.misfit) / info.kappa
+            flux, near["near"] = self.free_flux.flux(images, wider)
             free &= np.isfinite(flux)  # a damaged model may find none
             found = found.with_flux(np.where(free, np.clip(flux, *FLUX_FACTOR), 1.0))
-        images, noise = current()
-        estimate = self.estimator.estimate(images, noise / info.kappa)
-        for array in (estimate.psf, estimate.sigma):
-            if array is not None:
-                array[lost] = np.nan
-        return estimate.psf.astype(np.float32, copy=False), estimate.sigma, found
+        if not lost.all():  # such as the stars of a catalogue that reaches far beyond the image
+            images, noise = current()
+            estimate = self.estimator.estimate(images, noise / info.kappa, **near)
+            psf, sigma = estimate.psf.astype(np.float32, copy=False), estimate.sigma
+            for array in (psf, sigma):
+                if array is not None:
+                    array[lost] = np.nan
+            if self.bundle.strange_limit is not None:
+                some = {name: values[~lost] for name, values in near.items()}
+                level = noise[~lost] / info.kappa
+                score[~lost] = self.free_flux.outlier_score(images[~lost], level, **some)
+        rows = [slice(*ends) for ends in pairwise(parts)]
+        return [
+            Restored(
+                psf[part],
+                None if sigma is None else sigma[part],
+                found.part(part),
+                lost[part],
+                score[part],
+                {},
+            )
+            for part in rows
+        ]
 
     def _centred(self, stars: Stamps, exact: np.ndarray) -> tuple[np.ndarray, ...]:
         """Stamps (n, d, d), their bad pixels, their shift (row, column), and flags so far.

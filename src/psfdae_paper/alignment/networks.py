@@ -35,6 +35,12 @@ PARAMETERS = 4
 EXAMPLES = 1500
 """States whose stamps, with their mirror images, tell the principal components."""
 
+VIEWS = 4
+"""Times that draws of a noise are mixed anew, each field of a state from one of them."""
+
+STATES_AT_ONCE = 1000
+"""States whose components are computed together."""
+
 
 class AlignmentCnn(nn.Module):
     """Regression of a state of misalignment from the stamps of all fields.
@@ -84,7 +90,15 @@ class AlignmentPerceptron(nn.Module):
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Map scaled stamps (B, fields, d, d) to states (B, 4)."""
-        return self.linear(self.features((x.flatten(1) - self.mean) @ self.axes))
+        return self.state_of(self.components(x))
+
+    def components(self, x: torch.Tensor) -> torch.Tensor:
+        """Principal components (B, K) of scaled stamps."""
+        return (x.flatten(1) - self.mean) @ self.axes
+
+    def state_of(self, components: torch.Tensor) -> torch.Tensor:
+        """States (B, 4) of principal components."""
+        return self.linear(self.features(components))
 
     def look_at(self, clean: torch.Tensor, seen: torch.Tensor) -> None:
         """Take the components of noise-free stamps, scaled to variance 1 of those that are seen.
@@ -282,3 +296,80 @@ class NetworkTraining(Training):
     def row(self, epoch: int, rate: float, loss: float, error: float) -> Row:
         """Row of the history; the learning rate is that at the epoch's start."""
         return {"epoch": epoch, "lr": rate, "loss": loss, "seconds": round(self.seconds, 3)}
+
+
+class PerceptronTraining(NetworkTraining):
+    """Training behind principal components, which are computed once, and so is their noise.
+
+    The span of the components of all mirror images is mirrored onto itself, so that mirror images
+    are matrix products of components. Noise is normal, with the covariance that it has in the mean
+    stamps of all states: a batch draws a number for each component in place of each pixel.
+    """
+
+    model: AlignmentPerceptron
+
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self.views = [self._view(number) for number in range(VIEWS if self._several else 1)]
+        fields, side = self.data.stamps.shape[-3], self.data.stamps.shape[-1]
+        axes = self.model.axes.numpy()
+        stamps = axes.T.reshape(-1, fields, side, side)
+        # (P x)·a = x·(Pᵀ a): of A T = Pᵀ A the same as P A T = A.
+        self.mirrored = [
+            np.linalg.lstsq(mirror.stamps(stamps).reshape(len(stamps), -1).T, axes)[0]
+            for mirror in self.mirrors
+        ]
+        self.roots = self._roots()
+
+    @property
+    def _several(self) -> bool:
+        """Whether there are several draws of the stamps' noise."""
+        return self.data.stamps.ndim > 4
+
+    @torch.inference_mode()
+    def _view(self, number: int) -> np.ndarray:
+        """Components of all states, of draws that are mixed anew, float32, shape (n, K)."""
+        rng = stream(self.seed, "cnn", "view", self.name, number)
+        every = np.arange(len(self.data.states))
+        parts = np.array_split(every, -(-every.size // STATES_AT_ONCE))
+        shown = [self.model.components(_scaled(self._shown(part, rng))).numpy() for part in parts]
+        return np.concatenate(shown)
+
+    def _roots(self) -> list[np.ndarray]:
+        """R of each λ, shape (K, K), for which RᵀR is the covariance of noise in components."""
+        if self.data.noise is None:
+            return []
+        law, to_mean = self.data.noise.noise, self.data.stamps.shape[-1] ** 2
+        mean, axes = (a.double().numpy() for a in (self.model.mean, self.model.axes))
+        psf = np.maximum(mean / to_mean, 0.0)
+        sigma = [to_mean * np.sqrt(law.variance(psf, level)) for level in self.data.noise.levels]
+        return [np.linalg.qr(s[:, None] * axes, mode="r").astype(np.float32) for s in sigma]
+
+    def batches(self, epoch: int) -> Iterator[tuple[torch.Tensor, ...]]:
+        """Components (B, K) and states (B, 4)."""
+        rng = stream(self.seed, "cnn", "epoch", self.name, epoch)
+        order = rng.permutation(len(self.data.states))
+        for start in range(0, order.size, self.settings.batch)[: self.steps]:
+            chosen = order[start : start + self.settings.batch]
+            seen = self.views[rng.integers(len(self.views))][chosen]
+            truth = self.data.states[chosen]
+            if self.mirrors:
+                mirror = rng.integers(len(self.mirrors))
+                seen, truth = seen @ self.mirrored[mirror], self.mirrors[mirror].states(truth)
+            if self.roots:
+                white = rng.standard_normal(seen.shape, dtype=np.float32)
+                level = rng.integers(len(self.roots), size=chosen.size)
+                for own, root in enumerate(self.roots):
+                    seen[level == own] += white[level == own] @ root
+            yield torch.from_numpy(seen), torch.from_numpy(truth.astype(np.float32))
+
+    def loss(self, batch: tuple[torch.Tensor, ...], step: int) -> torch.Tensor:
+        """Mean squared error."""
+        components, states = batch
+        return nn.functional.mse_loss(self.model.state_of(components), states)
+
+
+def training_of(network: Cnn | Perceptron, data: TrainingStates, *rest: Any) -> NetworkTraining:
+    """The training of a kind of network; arguments as those of `NetworkTraining`."""
+    kind = NetworkTraining if isinstance(network, Cnn) else PerceptronTraining
+    return kind(data, network, *rest)

@@ -140,7 +140,12 @@ def train_network(
     """Train a network that estimates states of misalignment."""
     from psfdae.networks.training import fingerprint, progress, train
     from psfdae.networks.weights import save_weights
-    from psfdae_paper.alignment.networks import MixedNoise, NetworkTraining, TrainingStates
+    from psfdae_paper.alignment.networks import (
+        MixedNoise,
+        NetworkTraining,
+        TrainingStates,
+        training_of,
+    )
 
     if ALIGNERS[kind].denoised != (dae is not None):
         raise click.UsageError(f"--dae goes with --kind {DENOISED}, and only with it")
@@ -160,7 +165,8 @@ def train_network(
     described |= {"network": settings.network, "mirrors": settings.mirrors}
 
     def begin(attempt: int) -> NetworkTraining:
-        return NetworkTraining(data, getattr(config, settings.network), settings, config.seed, kind)
+        network = getattr(config, settings.network)
+        return training_of(network, data, settings, config.seed, kind)
 
     with progress(settings.epochs) as report:
         done = train(
