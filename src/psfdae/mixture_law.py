@@ -48,7 +48,7 @@ mean."""
 CACHE_BYTES = 400e6
 """Size of the factorisations that are kept for further stars."""
 
-NEAREST, LEADING = 16, 64
+NEAREST, LEADING = 32, 64
 """Clusters that are looked at, and coordinates in which they are found; the others of 512
 hold less than 1 % of the weight."""
 
@@ -413,17 +413,23 @@ class MixtureLaw:
     def _uncertain(self, k: int, s: float) -> np.ndarray:
         """Variance of each pixel inside a cluster once the image is known, shape (P,)."""
         factor, cluster = self._factor(k, s), self._clusters[k]
-        leading = factor.low.shape[1]
+        m = factor.low.shape[1]
         if not len(self.cross):
-            known = np.square(self.axes) @ factor.inverse
-            known -= np.square(factor.low @ self.axes[:, :leading].T).sum(axis=0)
+            known = self._squares @ factor.inverse
+            known -= np.square(factor.low @ self.axes[:, :m].T).sum(axis=0)
             return np.maximum(s - s**2 * known, 0.0)
-        own, cross = cluster.own_reference, self.cross * factor.shared
-        cross[:, :leading] += cluster.scale * own.T @ cluster.own[:, :leading]
+        own, cross = cluster.own_reference, self.cross[:, :m] * factor.shared[:m]
+        cross += cluster.scale * own.T @ cluster.own[:, :m]
         prior = cluster.common * self.variance_reference + cluster.scale * cluster.square
-        known = np.square(cross) @ factor.inverse
-        known -= np.square(cross[:, :leading] @ factor.low.T).sum(axis=1)
+        known = np.square(cross) @ factor.inverse[:m]
+        known += self._squares[:, m:] @ (np.square(factor.shared[m:]) * factor.inverse[m:])
+        known -= np.square(cross @ factor.low.T).sum(axis=1)
         return np.maximum(prior - known, 0.0)
+
+    @cached_property
+    def _squares(self) -> np.ndarray:
+        """Squares of the axes in pixels, or of the covariances with references, (P, P)."""
+        return np.square(self.cross if len(self.cross) else self.axes)
 
     @cached_property
     def _telling(self) -> Self:
