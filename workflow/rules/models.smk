@@ -16,6 +16,8 @@ for _method in (m for m in registered() if m.storage):
             f"{RESULTS}/logs/{_rule}/{_stem}.log",
         benchmark:
             f"{RESULTS}/benchmarks/{_rule}/{_stem}.tsv"
+        # What takes longest is started first.
+        priority: _method.needs.minutes
         threads: lambda w, m=_method: m.threads(dataset_config(w.dataset))
         resources:
             mem_mb=_method.needs.memory_mb,

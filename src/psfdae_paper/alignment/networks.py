@@ -35,12 +35,6 @@ PARAMETERS = 4
 EXAMPLES = 1500
 """States whose stamps, with their mirror images, tell the principal components."""
 
-VIEWS = 4
-"""Times that draws of a noise are mixed anew, each field of a state from one of them."""
-
-STATES_AT_ONCE = 1000
-"""States whose components are computed together."""
-
 
 class AlignmentCnn(nn.Module):
     """Regression of a state of misalignment from the stamps of all fields.
@@ -310,7 +304,7 @@ class PerceptronTraining(NetworkTraining):
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
-        self.views = [self._view(number) for number in range(VIEWS if self._several else 1)]
+        self.parts = self._parts()
         fields, side = self.data.stamps.shape[-3], self.data.stamps.shape[-1]
         axes = self.model.axes.numpy()
         stamps = axes.T.reshape(-1, fields, side, side)
@@ -321,19 +315,20 @@ class PerceptronTraining(NetworkTraining):
         ]
         self.roots = self._roots()
 
-    @property
-    def _several(self) -> bool:
-        """Whether there are several draws of the stamps' noise."""
-        return self.data.stamps.ndim > 4
-
-    @torch.inference_mode()
-    def _view(self, number: int) -> np.ndarray:
-        """Components of all states, of draws that are mixed anew, float32, shape (n, K)."""
-        rng = stream(self.seed, "cnn", "view", self.name, number)
-        every = np.arange(len(self.data.states))
-        parts = np.array_split(every, -(-every.size // STATES_AT_ONCE))
-        shown = [self.model.components(_scaled(self._shown(part, rng))).numpy() for part in parts]
-        return np.concatenate(shown)
+    def _parts(self) -> np.ndarray:
+        """What each field adds to the components in each draw of its noise, (D, n, F, K)."""
+        stamps = self.data.stamps[(None,) * (5 - self.data.stamps.ndim)]
+        draws, count, fields, side, _ = stamps.shape
+        mean, axes = (
+            a.numpy().reshape(fields, side**2, *a.shape[1:])
+            for a in (self.model.mean, self.model.axes)
+        )
+        parts = np.empty((draws, count, fields, axes.shape[-1]), np.float32)
+        for draw, field in np.ndindex(draws, fields):
+            seen = stamps[draw, :, field].reshape(count, -1) * np.float32(side**2)
+            parts[draw, :, field] = (seen - mean[field]) @ axes[field]
+        # Of one draw, all fields are always seen together.
+        return parts if draws > 1 else parts.sum(axis=2, keepdims=True)
 
     def _roots(self) -> list[np.ndarray]:
         """R of each λ, shape (K, K), for which RᵀR is the covariance of noise in components."""
@@ -347,11 +342,13 @@ class PerceptronTraining(NetworkTraining):
 
     def batches(self, epoch: int) -> Iterator[tuple[torch.Tensor, ...]]:
         """Components (B, K) and states (B, 4)."""
+        draws, _, fields, _ = self.parts.shape
         rng = stream(self.seed, "cnn", "epoch", self.name, epoch)
         order = rng.permutation(len(self.data.states))
         for start in range(0, order.size, self.settings.batch)[: self.steps]:
             chosen = order[start : start + self.settings.batch]
-            seen = self.views[rng.integers(len(self.views))][chosen]
+            draw = rng.integers(draws, size=(chosen.size, fields))
+            seen = self.parts[draw, chosen[:, None], np.arange(fields)].sum(axis=1)
             truth = self.data.states[chosen]
             if self.mirrors:
                 mirror = rng.integers(len(self.mirrors))

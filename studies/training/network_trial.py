@@ -1,0 +1,56 @@
+"""Trainings of scene 3's networks under other settings: seconds and errors on uniform states.
+
+    python studies/training/network_trial.py KIND TRIAL RESULTS OUT [KEY=VALUE ...]
+
+RESULTS is the folder of a run that has the states of scene 3 and its DAE
+(data/alignment/train.h5 and uniform.h5, alignment/dae). A row per noise level is appended to the
+CSV OUT. KEY=VALUE are overrides of the configuration.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+import time
+from datetime import date
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from psfdae.cli import main as psfdae
+from psfdae.files import read_product
+from psfdae_paper.configuration.aligners import ALIGNERS
+from psfdae_paper.configuration.alignment import CHOICE
+from psfdae_paper.configuration.compose import load
+from psfdae_paper.source import git_commit
+from psfdae_paper.stages.alignment_methods import denoise, network_predictor, noisy_test_states
+
+
+def main(kind: str, trial: str, results: str, out: str, *overrides: str) -> None:
+    """Train, measure, append."""
+    root = Path(results)
+    states, dae = root / "data/alignment", root / "alignment/dae"
+    given = [f"--dae={dae}"] * ALIGNERS[kind].denoised
+    config = load([*CHOICE, *overrides])
+    test = read_product(states / "uniform.h5", "alignment_states", ("states", "stamps"))
+    with tempfile.TemporaryDirectory() as folder:
+        words = ["alignment", "train-network", "--kind", kind, "--out", folder, *given]
+        words += ["--states", f"{states}/train.h5", "--checkpoint", f"{folder}/checkpoint.pt"]
+        started = time.process_time()
+        psfdae([*words, *overrides], standalone_mode=False)
+        seconds = time.process_time() - started
+        predict, rows = network_predictor(Path(folder), config), []
+        for level in config.noise.levels:
+            noisy = noisy_test_states(config, test["stamps"], "uniform", level)
+            seen = denoise(dae, config, noisy) if ALIGNERS[kind].denoised else noisy
+            error = np.abs(predict(seen) - test["states"]).mean()
+            row = dict(network=kind, trial=trial, settings=" ".join(overrides))
+            row |= dict(noise_level=level, mean_abs_error=error, cpu_s=seconds)
+            rows.append(row | dict(date=date.today().isoformat(), commit=git_commit()))
+    table, new = pd.DataFrame(rows), not Path(out).exists()
+    table.to_csv(out, mode="a", header=new, index=False, float_format="%.5g")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
