@@ -5,8 +5,12 @@ included (Anderson & King 2000, PASP 112, 1360). Here f is a sum of cubic B-spli
 of knots finer than a pixel, whose coefficients are polynomials in the position (x, y).
 Stars lie at all phases of the pixel grid, hence f is known between the pixels. Weighted
 least squares by conjugate gradients alternate with the flux and the centre of every star
-(Gauss-Newton); stars that are unlike the others do not count. How far the polynomial goes
-is what stars that were left out are predicted best with.
+(Gauss-Newton). Light is the same at all phases: without that condition, splines and fluxes could
+change with the phase against each other. Changes over the field are as small a part of the wings
+as of the core, unless the stars say otherwise. Stars that are unlike the others do not count, and
+pixels that are brighter or fainter than the model count less: they may show a neighbour. How far
+the polynomial goes, and how smooth the splines are, is what stars that were left out are
+predicted best with.
 """
 
 from __future__ import annotations
@@ -29,7 +33,13 @@ SLOPE_PX = 0.02  # for differences
 MODEL_ERROR = 0.02  # of a pixel's light, which no polynomial follows
 LEAST_ERROR = 1e-4  # of the flux, in any pixel
 HIGHER_SMOOTHNESS, RIDGE = 10.0, 10.0  # of terms beyond the constant, times its; 1/flux²
+CHANGE, LEAST_CHANGE = 0.5, 1e-5  # of a coefficient over the field, by its mean, and at least
+UNLIKE_SIGMA = 3.0  # of a pixel, from which it counts less: it may show a neighbour
 UNLIKE_CHI2 = 8.0  # times the median, from which a star does not count
+CURVED = (
+    2  # order up to which all are tried: what is alike on both sides of the middle has no slope
+)
+SMOOTHER, SMOOTHER_BY = 3, 10.0  # steps of the smoothness, each by this factor, that are tried
 FOLDS, ENOUGH_STARS = 5, 300  # left out, of which one fold after the other is predicted
 TOLERANCE, ITERATIONS = 1e-4, 150  # of the conjugate gradients
 
@@ -96,7 +106,9 @@ def fit_field(
     spacing: float,
     smoothness: float,
 ) -> FieldFit:
-    """Fit orders of the polynomial, ascending, until the next is no better, and take the best.
+    """Fit orders of the polynomial, ascending, and then stronger smoothing, as long as it pays.
+
+    It pays if stars that are left out are predicted better.
 
     Parameters
     ----------
@@ -107,10 +119,11 @@ def fit_field(
     frame_px, stamp_px : int
         Side of what is fitted, and of the stamps in which stars have flux 1 and are predicted.
     orders : sequence of int
+        Of one alone nothing is tried.
     spacing : float
         Of the knots, in pixels.
     smoothness : float
-        Weight of the squared second differences of the coefficients, 1/flux².
+        Least weight of the squared second differences of the coefficients, 1/flux².
     """
     known = np.isfinite(stars.position).all()
     alternating = _Alternating(stars, background, frame_px, stamp_px, spacing, smoothness)
@@ -120,10 +133,18 @@ def fit_field(
         if len(orders) == 1:
             return fit
         error = alternating.crossed_error(fit)
+        if error < least:
+            best, least = fit, error
+        elif order >= CURVED:
+            break
+    assert best is not None
+    for _ in range(SMOOTHER):
+        alternating.smoothness *= SMOOTHER_BY
+        fit = alternating.fit(best.model.order)
+        error = alternating.crossed_error(fit)
         if error >= least:
             break
         best, least = fit, error
-    assert best is not None
     return best
 
 
@@ -157,10 +178,10 @@ class _Alternating:
         good, flux = np.ones(len(terms), bool), self.images.sum(axis=(1, 2))
         start, window = np.zeros((len(flux), 2)), np.full(len(flux), WINDOW_PX)
         centre = windowed_centres(self.images, start, window, WINDOW_ROUNDS, WINDOW_REACH_PX)
-        found = None
+        found, alike = None, np.ones(self.images.shape)
         for turn in range(FIT_ROUNDS):
             data = self.images / flux[:, None, None]
-            weight = self._weight(flux)
+            weight = self._weight(flux) * alike
             found = self._splines(terms, data, weight * good[:, None, None], centre, found)
             splines = np.tensordot(terms, found, 1)
             factor, centre, _ = _adjusted(
@@ -172,8 +193,14 @@ class _Alternating:
             found, flux = found / total, flux * factor * total
             model = np.tensordot(terms, found, 1)
             drawn = _drawn(model, self.axis, centre, self.spacing)
+            # Where a star lies on the pixel grid changes no light: without this, fluxes and splines
+            # could change with that place against each other.
+            inner = np.abs(self.axis + 0.5) < self.stamp_px / 2
+            light = drawn[:, inner][:, :, inner].sum(axis=(1, 2))
+            flux, drawn = flux * light, drawn / light[:, None, None]
             residual = np.where(self.seen, self.images / flux[:, None, None] - drawn, 0.0)
             chi2 = (residual**2 * weight).mean(axis=(1, 2))
+            alike = 1.0 / (1.0 + residual**2 * self._weight(flux) / UNLIKE_SIGMA**2)
             if turn:
                 good = chi2 < UNLIKE_CHI2 * np.median(chi2)
         model = FieldModel(found, self.low, self.high, self.spacing)
@@ -192,7 +219,7 @@ class _Alternating:
         box = np.ix_(range(len(terms)), inner, inner)
         for left_out in range(FOLDS):
             used = weight * ((fold != left_out) & fit.good)[:, None, None]
-            found = self._splines(terms, data, used, fit.centre, None)
+            found = self._splines(terms, data, used, fit.centre, fit.model.coefficients)
             judged = np.flatnonzero((fold == left_out) & fit.good)
             images, even = data[box][judged], self.seen[box][judged].astype(float)
             splines = np.tensordot(terms[judged], found, 1)
@@ -238,12 +265,15 @@ class _Alternating:
         penalty = np.full(shape[0], HIGHER_SMOOTHNESS * self.smoothness)
         penalty[0] = self.smoothness
         penalty = penalty[:, None, None]
+        ridge = np.full(shape, RIDGE)
+        if start is not None:
+            ridge[1:] = 1.0 / (CHANGE * np.abs(start[0]) + LEAST_CHANGE) ** 2
 
         def normal(flat: np.ndarray) -> np.ndarray:
             c = flat.reshape(shape)
             image = rows @ (terms @ c.reshape(shape[0], -1)).reshape(-1, *shape[1:]) @ columns_t
             back = (rows_t @ (weight * image) @ columns).reshape(len(terms), -1)
-            smooth = penalty * (self.bend @ c + c @ self.bend) + RIDGE * c
+            smooth = penalty * (self.bend @ c + c @ self.bend) + ridge * c
             return ((terms.T @ back).reshape(shape) + smooth).ravel()
 
         wanted = (rows_t @ (weight * data) @ columns).reshape(len(terms), -1)
@@ -251,7 +281,9 @@ class _Alternating:
         seen = (rows_t**2 @ weight @ columns**2).reshape(len(terms), -1)
         pairs = (terms[:, :, None] * terms[:, None]).reshape(len(terms), -1)
         blocks = (seen.T @ pairs).reshape(-1, shape[0], shape[0])
-        blocks += np.diag(6 * penalty.ravel() + RIDGE)
+        blocks += (
+            np.eye(shape[0]) * (6 * penalty.ravel() + ridge.reshape(shape[0], -1).T)[:, None, :]
+        )
         inverse, size = np.linalg.inv(blocks), (int(np.prod(shape)),) * 2
 
         def nearly(flat: np.ndarray) -> np.ndarray:
