@@ -245,7 +245,7 @@ def test_outlier_score_has_the_law_of_chi2_and_tells_blends(field, snr):
     blend = 0.8 * some.psf + 0.2 * np.roll(some.psf, 3, axis=2)
     strange = field.measure(1000 * (blend + some.noise / 1000), some.sigma, some.position)
     if snr == 50:
-        assert np.median(strange.outlier_score) > np.quantile(here.outlier_score, 0.99)
+        assert np.median(strange.outlier_score) > np.quantile(here.outlier_score, 0.97)
 
 
 def test_flux_and_sky_that_are_known_are_taken(field):
@@ -326,6 +326,22 @@ def test_order_is_what_the_field_has(stars):
     assert alone.model.order == 0
     some = Faint(50, 20.0)
     assert np.isfinite(some.measured(alone).psf).all()
+
+
+def test_light_is_the_same_at_all_phases_of_the_pixel_grid():
+    """Neighbours at the edges of the frames spoil fluxes, which phases must not make up for."""
+    stars, rng = bright(100), np.random.default_rng(3)
+    angle, flux = rng.uniform(0, 2 * np.pi, 100), rng.uniform(0, 0.15, 100)
+    beside = truth(stars.position, 6.5 * np.stack([np.sin(angle), np.cos(angle)], axis=1), WIDE)
+    stars = replace(stars, wide=stars.wide + flux[:, None, None] * beside)
+    model = fit_field(stars, 1e6, SIDE + 4, SIDE, [2], 0.5, 100.0).model
+    steps = np.arange(-0.5, 0.5, 0.125)
+    phase = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+    for place in ([200.0, 300.0], [700.0, 800.0]):
+        where = np.repeat([place], len(phase), axis=0)
+        seen = unit(truth(where, phase, WIDE))[:, 8:18, 8:18].sum(axis=(1, 2))
+        light = model.images(model.terms(where), phase, SIDE).sum(axis=(1, 2)) / seen
+        assert np.std(light / light.mean()) < 0.004
 
 
 def test_same_stars_give_the_same_fit(stars, field):

@@ -199,8 +199,8 @@ class _Alternating:
             light = drawn[:, inner][:, :, inner].sum(axis=(1, 2))
             flux, drawn = flux * light, drawn / light[:, None, None]
             residual = np.where(self.seen, self.images / flux[:, None, None] - drawn, 0.0)
-            chi2 = (residual**2 * weight).mean(axis=(1, 2))
-            alike = 1.0 / (1.0 + residual**2 * self._weight(flux) / UNLIKE_SIGMA**2)
+            square = residual**2 * self._weight(flux)
+            chi2, alike = square.mean(axis=(1, 2)), 1.0 / (1.0 + square / UNLIKE_SIGMA**2)
             if turn:
                 good = chi2 < UNLIKE_CHI2 * np.median(chi2)
         model = FieldModel(found, self.low, self.high, self.spacing)

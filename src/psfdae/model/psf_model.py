@@ -71,9 +71,16 @@ def load_model(path: str | Path | None = None) -> PsfModel:
     ------
     BundleError
         If the file is missing, damaged, of a newer format, or no model bundle.
+    PredictionError
+        If it describes a telescope.
     MissingExtraError
         If the model is a network and torch is not installed.
     """
+    if path is not None and Path(path).suffix in (".yaml", ".yml"):
+        raise PredictionError(
+            f"{path}: describes a telescope, and is no model; psfdae wavefront INPUT --telescope "
+            f"{path} measures the wavefronts of its stars and writes their PSFs"
+        )
     return PsfModel(read_bundle(None if path is None else Path(path)))
 
 

@@ -1,0 +1,143 @@
+"""Photometry of a crowded field with PSFs of several packages, and with the true one.
+
+    python crowded_sky.py image SEED OUT                   # OUT.fits and OUT.csv
+    python crowded_sky.py photometry OUT TABLE NAME=GRID …
+
+A GRID is a cube of `psfdae psf --grid`, a .psf of PSFEx, or the word true. The stars are Moffat
+profiles (β = 3, FWHM 3.2 px) whose width and ellipticity change over the field.
+"""
+
+from __future__ import annotations
+
+import sys
+from datetime import date
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from astropy.io import fits
+from astropy.nddata import NDData
+from astropy.table import Table
+from photutils.psf import GriddedPSFModel, PSFPhotometry, SourceGrouper
+
+from psfdae_paper.source import git_commit
+
+SIZE_PX, STARS, BRIGHT = 1000, 2000, 600
+SKY, READ_NOISE, BETA, FWHM_PX = 400.0, 3.0, 3.0, 3.2
+SAMPLES, HALF_PX = 5, (20, 40)  # in a pixel and axis; of the frames of faint and of bright stars
+BRIGHT_FROM = 3e4  # electrons, from which a star has the larger frame
+MARGIN_PX, NODES, OVERSAMPLING, INTEGRATED = 15, 7, 4, 9  # of the grid of true PSFs
+
+
+def moffat(dx, dy, x, y):
+    """Moffat profile of flux 1 that a star at x, y of the field has at distances dx, dy in px."""
+    u, v = 2 * x / SIZE_PX - 1, 2 * y / SIZE_PX - 1
+    e1, e2 = 0.02 + 0.06 * u + 0.03 * v**2, -0.03 + 0.05 * v + 0.03 * u * v
+    fwhm = FWHM_PX * (1 + 0.06 * (u**2 + v**2) + 0.03 * u)
+    scale = fwhm / (2 * np.sqrt(2 ** (1 / BETA) - 1))
+    square = (1 - e1) * dx**2 - 2 * e2 * dx * dy + (1 + e1) * dy**2
+    square = square / np.sqrt(1 - e1**2 - e2**2) / scale**2
+    return (1 + square) ** -BETA * (BETA - 1) / (np.pi * scale**2)
+
+
+def image(seed: str, out: str) -> None:
+    """Simulate a field of stars with Poisson and read noise, and write the list of its stars."""
+    rng = np.random.default_rng(int(seed))
+    x, y = rng.uniform(MARGIN_PX, SIZE_PX - MARGIN_PX, (2, STARS))
+    flux = 1500 * 10 ** (0.4 * 6 * (1 - rng.power(2.2, STARS)))
+    edge = HALF_PX[1] + 1
+    light = np.zeros((SIZE_PX + 2 * edge,) * 2)
+    for px, py, f in zip(x, y, flux, strict=True):
+        half, row, column = HALF_PX[f > BRIGHT_FROM], int(np.rint(py)), int(np.rint(px))
+        axis = (np.arange((2 * half + 1) * SAMPLES) + 0.5) / SAMPLES - 0.5 - half
+        dx, dy = np.meshgrid(axis + column - px, axis + row - py)
+        shape = (2 * half + 1, SAMPLES) * 2
+        stamp = moffat(dx, dy, px, py).reshape(shape).mean(axis=(1, 3))
+        rows, columns = (slice(a - half + edge, a + half + 1 + edge) for a in (row, column))
+        light[rows, columns] += f * stamp
+    seen = light[edge:-edge, edge:-edge] + SKY
+    seen = rng.poisson(seen) + rng.normal(0, READ_NOISE, seen.shape)
+    hdu = fits.PrimaryHDU(seen.astype(np.float32))
+    hdu.header.update({"GAIN": 1.0, "PIXSCALE": 0.5, "RDNOISE": READ_NOISE})
+    hdu.writeto(f"{out}.fits", overwrite=True)
+    columns = {"id": np.arange(STARS), "x": x, "y": y, "flux": flux}
+    Table(columns).write(f"{out}.csv", overwrite=True)
+
+
+def gridded(cubes, places, oversampling):
+    """Photutils' model of PSFs (n, m, m) at places (x, y)."""
+    meta = {"grid_xypos": places, "oversampling": oversampling}
+    return GriddedPSFModel(NDData(np.array(cubes), meta=meta))
+
+
+def nodes():
+    """Places of a grid over the field."""
+    axis = np.linspace(MARGIN_PX, SIZE_PX - MARGIN_PX, NODES)
+    return [(x, y) for y in axis for x in axis]
+
+
+def true_psf():
+    """What whole pixels get of the true profile."""
+    side = 2 * HALF_PX[0] * OVERSAMPLING + 1
+    axis = (np.arange(side) - side // 2) / OVERSAMPLING
+    inside = (np.arange(INTEGRATED) - INTEGRATED // 2) / INTEGRATED
+    cubes = []
+    for x, y in nodes():
+        parts = [moffat(*np.meshgrid(axis + a, axis + b), x, y) for a in inside for b in inside]
+        cubes.append(np.mean(parts, axis=0))
+    return gridded(cubes, nodes(), OVERSAMPLING)
+
+
+def of_psfex(path):
+    """The same of a file of PSFEx, of the sum 1."""
+    hdu = fits.open(path)[1]
+    basis, header = np.squeeze(hdu.data["PSF_MASK"][0]), hdu.header
+    degree, step = header["POLDEG1"], round(1 / header["PSF_SAMP"])
+    cubes = []
+    for x, y in nodes():
+        u = (x + 1 - header["POLZERO1"]) / header["POLSCAL1"]
+        v = (y + 1 - header["POLZERO2"]) / header["POLSCAL2"]
+        terms = [u**i * v**j for j in range(degree + 1) for i in range(degree + 1 - j)]
+        psf = np.tensordot(terms, basis, 1)
+        cubes.append(psf * step**2 / psf.sum())
+    return gridded(cubes, nodes(), step)
+
+
+def of_psfdae(path):
+    """The same of `psfdae psf --grid`."""
+    cube, header = fits.getdata(path, header=True)
+    yx = [header[f"DET_YX{k}"].strip("()").split(",") for k in range(len(cube))]
+    return gridded(cube, [(float(x), float(y)) for y, x in yx], header["OVERSAMP"])
+
+
+def photometry(stem: str, table: str, *named: str) -> None:
+    """Fit all stars with each PSF, from their true places and fluxes on; a row for each."""
+    stars = Table.read(f"{stem}.csv")
+    counts = fits.getdata(f"{stem}.fits").astype(float) - SKY
+    error = np.sqrt(np.maximum(counts, 0) + SKY + READ_NOISE**2)
+    order = np.argsort(-np.array(stars["flux"]))[:BRIGHT]
+    rows = []
+    for word in named:
+        name, path = word.split("=", 1)
+        model = true_psf() if path == "true" else None
+        model = model or (of_psfex(path) if path.endswith(".psf") else of_psfdae(path))
+        fit = PSFPhotometry(
+            model, (7, 7), grouper=SourceGrouper(4.5), aperture_radius=3, progress_bar=False
+        )
+        found = fit(counts, error=error, init_params=Table(stars["x", "y", "flux"]))
+        found.sort("id")
+        ratio = (np.array(found["flux_fit"]) / stars["flux"])[order]
+
+        def scatter(part):
+            return 148.26 * np.median(np.abs(part - np.median(part)))
+
+        row = {"image": Path(stem).name, "psf": name, "bias_percent": 100 * (np.median(ratio) - 1)}
+        row |= {"scatter_percent": scatter(ratio), "brighter_half": scatter(ratio[: BRIGHT // 2])}
+        row |= {"fainter_half": scatter(ratio[BRIGHT // 2 :]), "date": date.today().isoformat()}
+        rows.append(row | {"commit": git_commit()})
+    frame, new = pd.DataFrame(rows), not Path(table).exists()
+    frame.to_csv(table, mode="a", header=new, index=False, float_format="%.4g")
+
+
+if __name__ == "__main__":
+    {"image": image, "photometry": photometry}[sys.argv[1]](*sys.argv[2:])
