@@ -3,6 +3,7 @@
 #   PRESET=name      smoke, fast (default) or paper
 #   SET="a.b=1 …"    Hydra overrides for every dataset
 #   TARGETS="…"      Snakemake targets, for example dataset3 (default: all)
+#   AGAINST=commit   that `make benchmark TARGETS=run` compares this one with
 #   PORT=n           port of the MLflow page (default: 5000)
 #   TORCH_INDEX=url  package index with PyTorch's CPU builds (default: pip's own index)
 #   PYTHON=python3   interpreter that makes the environment (3.11 or newer)
@@ -12,6 +13,7 @@ CORES ?= all
 PRESET ?= fast
 SET ?=
 TARGETS ?=
+AGAINST ?=
 TORCH_INDEX ?=
 PORT ?= 5000
 
@@ -37,10 +39,11 @@ override CORES := $(value CORES)
 override PRESET := $(value PRESET)
 override SET := $(value SET)
 override TARGETS := $(value TARGETS)
+override AGAINST := $(value AGAINST)
 override PORT := $(value PORT)
 override TORCH_INDEX := $(value TORCH_INDEX)
 PSFDAE_RESULTS := results$(if $(filter-out fast,$(PRESET)),/$(PRESET))
-export CORES PRESET SET TARGETS PORT TORCH_INDEX PSFDAE_RESULTS
+export CORES PRESET SET TARGETS AGAINST PORT TORCH_INDEX PSFDAE_RESULTS
 SNAKEMAKE := snakemake --cores "$$CORES" --config preset="$$PRESET" set="$$SET"
 # -f: a target is no pattern of file names.
 LOCKED := set -f; sh workflow/locked.sh $(SNAKEMAKE)
@@ -79,13 +82,15 @@ reproduce: env ## Build everything of the preset: datasets, models, tables, repo
 	@[ "$$PSFDAE_RESULTS" != results ] || [ ! -d results/evaluation ] || \
 	  psfdae compare results results/reference || true
 
-benchmark: env ## Run time against error, on a quiet machine
+benchmark: env ## Run time against error, on a quiet machine; TARGETS=run AGAINST=commit: that of a whole run
 stability: env ## Stress tests of the whole chain
 bounds: env ## How far each method is from the best possible one
 training_knee: env ## Test error against training time
 bundles: env ## Pack each dataset's network as a model that psfdae predict takes
 benchmark stability bounds training_knee bundles:
-	@$(LOCKED) -- $@
+	@case "$@ $$TARGETS" in "benchmark run") python workflow/benchmarks/commits.py compare \
+	  --against "$$AGAINST" --preset "$$PRESET" --out "$$PSFDAE_RESULTS/tables/benchmark_run.csv";; \
+	*) $(LOCKED) -- $@;; esac
 
 shipped: env ## Train the model that comes with the package and renew it
 	@$(LOCKED) --forcerun shipped -- shipped

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+import commits
 import figures
 import measure
 import prediction
@@ -41,6 +42,19 @@ def test_rounds_take_turns():
 
     assert measure.time_in_rounds([builder("a"), builder("b")], repeats=2).shape == (2, 2)
     assert events == ["build a", "a", "build b", "b"] * 2
+
+
+def test_two_commits_are_compared_target_by_target():
+    """The order of the rows does not count, and a ratio has the scatter of the targets."""
+    costs = {"wall_s": [4.0, 2.0, 3.0, 2.0], "cpu_s": [4.0, 2.0, 8.0, 4.0], "job_s": 1.0}
+    names = {"commit": ["a", "b", "b", "a"], "target": ["x", "x", "y", "y"]}
+    table = pd.DataFrame({**names, **costs, "peak_mb": [1.0, 2.0, 3.0, 4.0]})
+    table.loc[2:, "cpu_s"] = [4.0, 8.0]
+    said = commits.said(table, "a", "b")
+    assert "b over a, 2 targets" in said
+    assert "CPU time 12 -> 6 s: 0.500 ± 0.000" in said
+    assert "wall time 6 -> 5 s: 0.833 ± 0.4" in said
+    assert "largest job 4 -> 3 MB" in said
 
 
 def test_a_process_of_its_own_has_its_own_threads(monkeypatch):

@@ -48,7 +48,7 @@ def image(seed: str, out: str) -> None:
     edge = HALF_PX[1] + 1
     light = np.zeros((SIZE_PX + 2 * edge,) * 2)
     for px, py, f in zip(x, y, flux, strict=True):
-        half, row, column = HALF_PX[f > BRIGHT_FROM], int(np.rint(py)), int(np.rint(px))
+        half, row, column = HALF_PX[int(f > BRIGHT_FROM)], int(np.rint(py)), int(np.rint(px))
         axis = (np.arange((2 * half + 1) * SAMPLES) + 0.5) / SAMPLES - 0.5 - half
         dx, dy = np.meshgrid(axis + column - px, axis + row - py)
         shape = (2 * half + 1, SAMPLES) * 2
@@ -110,6 +110,13 @@ def of_psfdae(path):
     return gridded(cube, [(float(x), float(y)) for y, x in yx], header["OVERSAMP"])
 
 
+def of_file(path):
+    """The same of a file, or the true one."""
+    if path == "true":
+        return true_psf()
+    return of_psfex(path) if path.endswith(".psf") else of_psfdae(path)
+
+
 def photometry(stem: str, table: str, *named: str) -> None:
     """Fit all stars with each PSF, from their true places and fluxes on; a row for each."""
     stars = Table.read(f"{stem}.csv")
@@ -117,10 +124,10 @@ def photometry(stem: str, table: str, *named: str) -> None:
     error = np.sqrt(np.maximum(counts, 0) + SKY + READ_NOISE**2)
     order = np.argsort(-np.array(stars["flux"]))[:BRIGHT]
     rows = []
-    for word in named:
-        name, path = word.split("=", 1)
-        model = true_psf() if path == "true" else None
-        model = model or (of_psfex(path) if path.endswith(".psf") else of_psfdae(path))
+    # All at once: photutils 3.0 may take the interpolators of a model that is gone for those of
+    # another one that has its place in the memory.
+    models = {name: of_file(path) for name, path in (word.split("=", 1) for word in named)}
+    for name, model in models.items():
         fit = PSFPhotometry(
             model, (7, 7), grouper=SourceGrouper(4.5), aperture_radius=3, progress_bar=False
         )
