@@ -1,7 +1,7 @@
 """Photometry of a crowded field with PSFs of several packages, and with the true one.
 
     python crowded_sky.py image SEED OUT                   # OUT.fits and OUT.csv
-    python crowded_sky.py photometry OUT TABLE NAME=GRID …
+    python crowded_sky.py photometry OUT TABLE NAME=GRID   # appends a row
 
 A GRID is a cube of `psfdae psf --grid`, a .psf of PSFEx, or the word true. The stars are Moffat
 profiles (β = 3, FWHM 3.2 px) whose width and ellipticity change over the field.
@@ -117,32 +117,29 @@ def of_file(path):
     return of_psfex(path) if path.endswith(".psf") else of_psfdae(path)
 
 
-def photometry(stem: str, table: str, *named: str) -> None:
-    """Fit all stars with each PSF, from their true places and fluxes on; a row for each."""
+def photometry(stem: str, table: str, named: str) -> None:
+    """Fit all stars with a PSF, from their true places and fluxes on, and append a row.
+
+    One in a process: in photutils 3.0.0, fits with one model change those with the next.
+    """
     stars = Table.read(f"{stem}.csv")
     counts = fits.getdata(f"{stem}.fits").astype(float) - SKY
     error = np.sqrt(np.maximum(counts, 0) + SKY + READ_NOISE**2)
     order = np.argsort(-np.array(stars["flux"]))[:BRIGHT]
-    rows = []
-    # All at once: photutils 3.0 may take the interpolators of a model that is gone for those of
-    # another one that has its place in the memory.
-    models = {name: of_file(path) for name, path in (word.split("=", 1) for word in named)}
-    for name, model in models.items():
-        fit = PSFPhotometry(
-            model, (7, 7), grouper=SourceGrouper(4.5), aperture_radius=3, progress_bar=False
-        )
-        found = fit(counts, error=error, init_params=Table(stars["x", "y", "flux"]))
-        found.sort("id")
-        ratio = (np.array(found["flux_fit"]) / stars["flux"])[order]
+    name, path = named.split("=", 1)
+    grouper = SourceGrouper(4.5)
+    fit = PSFPhotometry(of_file(path), (7, 7), grouper=grouper, aperture_radius=3)
+    found = fit(counts, error=error, init_params=Table(stars["x", "y", "flux"]))
+    found.sort("id")
+    ratio = (np.array(found["flux_fit"]) / np.array(stars["flux"]))[order]
 
-        def scatter(part):
-            return 148.26 * np.median(np.abs(part - np.median(part)))
+    def scatter(part):
+        return 148.26 * np.median(np.abs(part - np.median(part)))
 
-        row = {"image": Path(stem).name, "psf": name, "bias_percent": 100 * (np.median(ratio) - 1)}
-        row |= {"scatter_percent": scatter(ratio), "brighter_half": scatter(ratio[: BRIGHT // 2])}
-        row |= {"fainter_half": scatter(ratio[BRIGHT // 2 :]), "date": date.today().isoformat()}
-        rows.append(row | {"commit": git_commit()})
-    frame, new = pd.DataFrame(rows), not Path(table).exists()
+    row = {"image": Path(stem).name, "psf": name, "bias_percent": 100 * (np.median(ratio) - 1)}
+    row |= {"scatter_percent": scatter(ratio), "brighter_half": scatter(ratio[: BRIGHT // 2])}
+    row |= {"fainter_half": scatter(ratio[BRIGHT // 2 :]), "date": date.today().isoformat()}
+    frame, new = pd.DataFrame([row | {"commit": git_commit()}]), not Path(table).exists()
     frame.to_csv(table, mode="a", header=new, index=False, float_format="%.4g")
 
 

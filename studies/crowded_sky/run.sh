@@ -27,4 +27,4 @@ if command -v psfex >/dev/null; then
     done
 fi
 shift 3
-sky photometry "$stem" table.csv "$@"
+for psf in "$@"; do sky photometry "$stem" table.csv "$psf"; done
