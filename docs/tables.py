@@ -272,6 +272,16 @@ def simulated_sky():
     return pd.DataFrame([{"stars": table.stars[0], "learnt": table.learnt[0], **over}])
 
 
+def crowded_sky():
+    """Scatter of the photometry in crowded fields with each package's PSF, over the images."""
+    table = csv("studies/crowded_sky/table.csv")
+    names = {"true": "true", "psfdae": "psfdae", "PSFEx, degree 2": "psfex"}
+    table = table[table.psf.isin(names)].assign(psf=table.psf.map(names))
+    cells = table.pivot(index="image", columns="psf", values="scatter_percent")
+    said = {name: " and ".join(f"{v:.2f}" for v in cells[name]) for name in cells}
+    return pd.DataFrame([said])
+
+
 def _in_1e5(row):
     return f"{1e5 * row['mse']:.2f} ± {1e5 * row['stderr']:.2f}"
 
