@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import ast
 import csv
+import os
 import re
 import shutil
 import subprocess
@@ -23,7 +24,6 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 LIST = Path(__file__).with_suffix(".csv")
-COPIED = ("config", "docs", "src", "tests", "workflow", "Snakefile", "pyproject.toml")
 FAST = ["-m", "not slow and not written and not workflow", "--ignore=tests/test_mutants.py"]
 FUNCTION = (ast.FunctionDef, ast.AsyncFunctionDef)
 
@@ -98,19 +98,25 @@ def mutated(path: Path, node: ast.AST, text: str) -> str:
 def main(words: list[str]) -> None:
     chosen = [m for m in read_list() if not m.equivalent]
     chosen = [m for m in chosen if not words or any(word in str(m) for word in words)]
+    line = ["git", "ls-files"]
+    tracked = subprocess.run(line, cwd=ROOT, capture_output=True, text=True, check=True)
+    tracked = tracked.stdout.splitlines()
     for mutant in chosen:
         with tempfile.TemporaryDirectory() as folder:
-            for name in COPIED:
-                copy = shutil.copytree if (ROOT / name).is_dir() else shutil.copy
-                copy(ROOT / name, Path(folder, name))
+            for name in tracked:
+                Path(folder, name).parent.mkdir(parents=True, exist_ok=True)
+                shutil.copy(ROOT / name, Path(folder, name))
             path, node = find(Path(folder, "src"), mutant)
             path.write_text(mutated(path, node, mutant.mutated), encoding="utf-8")
             named = re.compile(rf"\b{path.stem}\b")
             tests = sorted(Path(folder).glob("tests/test_*.py"))
             tests.sort(key=lambda test: not named.search(test.read_text(encoding="utf-8")))
             line = [sys.executable, "-m", "pytest", "-qx", *FAST, *map(str, tests)]
-            done = subprocess.run(line, cwd=folder, env={"PYTHONPATH": "src"}, check=False)
-        fate = "killed" if done.returncode else "alive"
+            done = subprocess.run(
+                line, cwd=folder, env={**os.environ, "PYTHONPATH": "src"}, check=False
+            )
+        # Other codes of pytest say that no test was tried.
+        fate = {0: "alive", 1: "killed"}[done.returncode]
         print(f"{fate}  {mutant.function}: {mutant.original} -> {mutant.mutated}", flush=True)
 
 

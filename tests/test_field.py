@@ -330,8 +330,8 @@ def test_order_is_what_the_field_has(stars):
 
 def test_light_is_the_same_at_all_phases_of_the_pixel_grid():
     """Neighbours at the edges of the frames spoil fluxes, which phases must not make up for."""
-    stars, rng = bright(100), np.random.default_rng(3)
-    angle, flux = rng.uniform(0, 2 * np.pi, 100), rng.uniform(0, 0.15, 100)
+    stars, rng = bright(60), np.random.default_rng(3)
+    angle, flux = rng.uniform(0, 2 * np.pi, 60), rng.uniform(0, 0.3, 60)
     beside = truth(stars.position, 6.5 * np.stack([np.sin(angle), np.cos(angle)], axis=1), WIDE)
     stars = replace(stars, wide=stars.wide + flux[:, None, None] * beside)
     model = fit_field(stars, 1e6, SIDE + 4, SIDE, [2], 0.5, 100.0).model
@@ -341,7 +341,7 @@ def test_light_is_the_same_at_all_phases_of_the_pixel_grid():
         where = np.repeat([place], len(phase), axis=0)
         seen = unit(truth(where, phase, WIDE))[:, 8:18, 8:18].sum(axis=(1, 2))
         light = model.images(model.terms(where), phase, SIDE).sum(axis=(1, 2)) / seen
-        assert np.std(light / light.mean()) < 0.004
+        assert np.std(light / light.mean()) < 0.006
 
 
 def test_same_stars_give_the_same_fit(stars, field):
