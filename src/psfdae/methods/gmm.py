@@ -76,7 +76,7 @@ class GaussianMixture(MixtureLaw, Method):
     """A fitted mixture."""
 
     look = Look("GMM", "#cc79a7", "P")
-    needs = Needs(level=True)
+    needs = Needs(level=True, memory_mb=1200)
     storage = Storage(
         arrays={
             "axes": ("1", "eigenvectors of the covariance within clusters, columns"),

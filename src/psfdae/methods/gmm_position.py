@@ -13,5 +13,5 @@ class PlacedMixture(GaussianMixture):
     """A mixture of images, references and positions."""
 
     look = Look("GMM", "#882255", "X", drawn=False)
-    needs = Needs(level=True, position=True)
+    needs = Needs(level=True, position=True, memory_mb=1200)
     packing = None
