@@ -24,10 +24,13 @@ from psfdae_paper.alignment.fisher import (
 from psfdae_paper.alignment.fit import Likelihood, fit_states, refit_twins
 from psfdae_paper.alignment.networks import (
     AlignmentCnn,
+    MixedNoise,
     NetworkTraining,
     TrainingStates,
+    _scaled,
     build_network,
     predict_states,
+    training_of,
 )
 from psfdae_paper.alignment.stamps import AlignmentStamps
 from psfdae_paper.alignment.telescope import mirror_symmetries, uniform_states
@@ -241,6 +244,27 @@ def test_every_field_shows_a_draw_of_its_own(config, states, stamps):
     signs = np.concatenate(signs)
     assert set(signs.ravel()) == {1, -1, 3}
     assert any(len(set(fields)) > 1 for fields in signs)
+
+
+def test_components_are_those_of_mirrored_noisy_stamps(config, noise, stamps, states):
+    """A perceptron learns from components that its network would find in the stamps."""
+    network = config.perceptron.model_copy(update={"components": 20})
+    settings = config.train_noise_trained.model_copy(update={"epochs": 1, "batch": 5})
+    law, level = MixedNoise(noise, np.array([0.005])), 0.005
+    draws = np.stack([stamps, 2 * stamps]).astype(np.float32)
+    for data in (TrainingStates(states, stamps, law), TrainingStates(states, draws)):
+        training = training_of(network, data, settings, 1, "x")
+        scaled = _scaled(np.asarray(stamps, np.float32))
+        every = np.arange(training.parts.shape[2])
+        parts = training.parts[0][:, every].sum(axis=1)
+        assert parts == pytest.approx(training.model.components(scaled).numpy(), abs=1e-3)
+    data = TrainingStates(states, stamps, law)
+    training = training_of(network, data, settings, 1, "x")
+    many = np.repeat(np.mean(stamps, axis=0, keepdims=True), 3000, axis=0)
+    seen = noise.draw(many, level, np.random.default_rng(2)) - many
+    spread = training.model.components(_scaled(seen)).numpy().std(axis=0)
+    expected = np.sqrt(np.square(training.roots[0]).sum(axis=0))
+    assert spread == pytest.approx(expected, rel=0.1)
 
 
 def test_gaussian_noise_has_poisson_s_variance(noise, stamps):

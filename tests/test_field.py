@@ -103,6 +103,12 @@ def field(stars):
     return fitted(stars)
 
 
+@pytest.fixture(scope="module")
+def chosen(stars):
+    """With order and smoothness by stars left out, as those of a user's image."""
+    return fitted(stars, (0, 1, 2))
+
+
 class Faint:
     """Stars of flux 1000 on a sky of 3, their frames moved by up to a pixel."""
 
@@ -236,7 +242,8 @@ def test_bright_stars_are_as_sure_as_said(field):
 
 
 @pytest.mark.parametrize("snr", SNR)
-def test_outlier_score_has_the_law_of_chi2_and_tells_blends(field, snr):
+def test_outlier_score_has_the_law_of_chi2_and_tells_blends(chosen, snr):
+    field = chosen
     some = Faint(400, snr)
     here, nowhere = some.measured(field), field.measure(some.stamps, some.sigma)
     for found in (here, nowhere):
@@ -245,7 +252,7 @@ def test_outlier_score_has_the_law_of_chi2_and_tells_blends(field, snr):
     blend = 0.8 * some.psf + 0.2 * np.roll(some.psf, 3, axis=2)
     strange = field.measure(1000 * (blend + some.noise / 1000), some.sigma, some.position)
     if snr == 50:
-        assert np.median(strange.outlier_score) > np.quantile(here.outlier_score, 0.97)
+        assert np.median(strange.outlier_score) > np.quantile(here.outlier_score, 0.99)
 
 
 def test_flux_and_sky_that_are_known_are_taken(field):

@@ -171,3 +171,8 @@ def test_words_and_files_of_the_configuration_mean_the_same():
     word = "calibration_stars.snr_levels=[5,10]"
     assert from_words([word]).calibration_stars.snr_levels == [5.0, 10.0]
     assert from_words([word, "train=onecycle"]).calibration_stars.snr_levels == [5.0, 10.0]
+
+
+def test_a_telescope_in_the_place_of_a_model_gets_a_hint():
+    with pytest.raises(psfdae.Error, match="psfdae wavefront INPUT --telescope"):
+        psfdae.load_model("mine.yaml")

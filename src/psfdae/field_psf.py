@@ -36,9 +36,7 @@ HIGHER_SMOOTHNESS, RIDGE = 10.0, 10.0  # of terms beyond the constant, times its
 CHANGE, LEAST_CHANGE = 0.5, 1e-5  # of a coefficient over the field, by its mean, and at least
 UNLIKE_SIGMA = 3.0  # of a pixel, from which it counts less: it may show a neighbour
 UNLIKE_CHI2 = 8.0  # times the median, from which a star does not count
-CURVED = (
-    2  # order up to which all are tried: what is alike on both sides of the middle has no slope
-)
+CURVED = 2  # order up to which all are tried: a symmetric field has no slope
 SMOOTHER, SMOOTHER_BY = 3, 10.0  # steps of the smoothness, each by this factor, that are tried
 FOLDS, ENOUGH_STARS = 5, 300  # left out, of which one fold after the other is predicted
 TOLERANCE, ITERATIONS = 1e-4, 150  # of the conjugate gradients
@@ -165,6 +163,7 @@ class _Alternating:
         self.photons = np.sqrt(background) * stars.flux / stars.noise
         self.stamp_px, self.spacing, self.smoothness = stamp_px, spacing, smoothness
         self.axis = np.arange(side) - side // 2.0
+        self.inner = np.abs(self.axis + 0.5) < stamp_px / 2
         self.knots = int((side + 1) / spacing) - 1
         known = self.position[np.isfinite(self.position).all(axis=1)]
         known = known if len(known) else np.zeros((1, 2))
@@ -178,10 +177,10 @@ class _Alternating:
         good, flux = np.ones(len(terms), bool), self.images.sum(axis=(1, 2))
         start, window = np.zeros((len(flux), 2)), np.full(len(flux), WINDOW_PX)
         centre = windowed_centres(self.images, start, window, WINDOW_ROUNDS, WINDOW_REACH_PX)
-        found, alike = None, np.ones(self.images.shape)
+        found, alike, noise = None, np.ones(self.images.shape), self._weight(flux)
         for turn in range(FIT_ROUNDS):
             data = self.images / flux[:, None, None]
-            weight = self._weight(flux) * alike
+            weight = noise * alike
             found = self._splines(terms, data, weight * good[:, None, None], centre, found)
             splines = np.tensordot(terms, found, 1)
             factor, centre, _ = _adjusted(
@@ -195,11 +194,11 @@ class _Alternating:
             drawn = _drawn(model, self.axis, centre, self.spacing)
             # Where a star lies on the pixel grid changes no light: without this, fluxes and splines
             # could change with that place against each other.
-            inner = np.abs(self.axis + 0.5) < self.stamp_px / 2
-            light = drawn[:, inner][:, :, inner].sum(axis=(1, 2))
+            light = drawn[:, self.inner][:, :, self.inner].sum(axis=(1, 2))
             flux, drawn = flux * light, drawn / light[:, None, None]
             residual = np.where(self.seen, self.images / flux[:, None, None] - drawn, 0.0)
-            square = residual**2 * self._weight(flux)
+            noise = self._weight(flux)
+            square = residual**2 * noise
             chi2, alike = square.mean(axis=(1, 2)), 1.0 / (1.0 + square / UNLIKE_SIGMA**2)
             if turn:
                 good = chi2 < UNLIKE_CHI2 * np.median(chi2)
@@ -215,7 +214,7 @@ class _Alternating:
         data = self.images / fit.flux[:, None, None]
         weight = self._weight(fit.flux)
         fold, errors = np.arange(len(terms)) % FOLDS, []
-        inner = np.abs(self.axis + 0.5) < self.stamp_px / 2
+        inner = self.inner
         box = np.ix_(range(len(terms)), inner, inner)
         for left_out in range(FOLDS):
             used = weight * ((fold != left_out) & fit.good)[:, None, None]

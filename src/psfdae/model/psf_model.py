@@ -448,8 +448,7 @@ class Engine:
             restored = [self._measured(one) for one in seen]
         else:
             restored = self._estimated(seen)
-        told = (self._predicted(one, own) for one, own in zip(seen, restored, strict=True))
-        return Prediction.joined([*told])
+        return Prediction.joined([*map(self._predicted, seen, restored)])
 
     def _seen(self, stars: Stamps, fixed: bool) -> Seen:
         exact = fixed & np.isfinite(stars.listed).all(axis=1)
