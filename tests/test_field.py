@@ -24,7 +24,7 @@ from psfdae import load_model
 from psfdae.bright_stars import BrightStars
 from psfdae.cli import main
 from psfdae.commands import psf
-from psfdae.field_law import OUTLIER_MODES
+from psfdae.field_law import MOST_NODES, OUTLIER_MODES
 from psfdae.field_psf import fit_field
 from psfdae.method import FitError, TrainingSet
 from psfdae.methods.field import FieldMixture
@@ -283,6 +283,17 @@ def test_stars_are_restored_in_groups_that_do_not_matter(field, monkeypatch):
     few = fitted(bright()).measure(*told)
     assert few.psf == pytest.approx(whole.psf, abs=1e-7)
     assert few.measured.flux == pytest.approx(whole.measured.flux, rel=1e-9)
+
+
+@pytest.mark.parametrize("snr", [5.0, 20.0, 100.0])
+def test_nodes_that_the_matched_filter_leaves_out_do_not_matter(field, snr, monkeypatch):
+    some = Faint(40, snr)
+    found = some.measured(field)
+    monkeypatch.setattr("psfdae.field_law.LEAST_NODES", MOST_NODES)
+    every = some.measured(field)
+    assert np.abs(found.psf - every.psf).max() < 0.01 * every.sigma.max()
+    assert found.measured.flux == pytest.approx(every.measured.flux, rel=1e-5)
+    assert found.evidence == pytest.approx(every.evidence, abs=1e-3)
 
 
 def test_bad_stamps_are_refused(field):

@@ -49,13 +49,17 @@ FLUX_ROUNDS = 2
 LEAST_SNR = 1.5
 """Least S/N that a star is taken to have."""
 
-NEAREST_NODES = 48
+LEAST_NODES, MOST_NODES = 9, 48
 """Nodes of which the likelihood is computed; a matched filter finds them."""
+
+FAR, MATCHED_SNR = 12.0, 30.0
+"""ln of the filter's likelihood below the best, from which a node is one of the fewest only; and
+the S/N up to which that is asked: of brighter stars, the filter does not know the shape."""
 
 WRONG_LIST = 0.05
 """Probability that the list, or its place, is not what it was for the training stars."""
 
-STARS_AT_ONCE = 1024
+STARS_AT_ONCE = 4096
 """Stars that are restored together."""
 
 OUTLIER_MODES, LEAST_SEEN = 12, 1e-9
@@ -128,7 +132,10 @@ class Factor(NamedTuple):
     ----------
     s : float
     inverse : ndarray, shape (P,)
-    low : ndarray, shape (R, P)
+    seen : ndarray, shape (R + K + 1, P)
+        `low` and `solved`.
+    means : ndarray, shape (K + 1, K + 1)
+        Products of the node's `mean` with `solved`.
     half_det : float
         ½ ln det S.
     latent : ndarray, shape (3, P)
@@ -145,7 +152,8 @@ class Factor(NamedTuple):
 
     s: float
     inverse: np.ndarray
-    low: np.ndarray
+    seen: np.ndarray
+    means: np.ndarray
     half_det: float
     latent: np.ndarray
     scale: np.ndarray
@@ -153,8 +161,18 @@ class Factor(NamedTuple):
     variance: np.ndarray
     whitening: np.ndarray
 
-    def solve(self, rows: np.ndarray, low: np.ndarray) -> np.ndarray:
-        """S⁻¹ of rows (n, P) of which `low` times them (n, R) is known."""
+    @property
+    def low(self) -> np.ndarray:
+        return self.seen[: -len(self.means)]
+
+    @property
+    def solved(self) -> np.ndarray:
+        """S⁻¹ of the node's `mean`, shape (K + 1, P)."""
+        return self.seen[-len(self.means) :]
+
+    def solve(self, rows: np.ndarray, low: np.ndarray | None = None) -> np.ndarray:
+        """S⁻¹ of rows (n, P), of which `low` times them (n, R) may be known."""
+        low = rows @ self.low.T if low is None else low
         return rows * self.inverse - low @ self.low
 
 
@@ -181,10 +199,12 @@ def factor_of(node: Node, kind: Kind, part_px: float) -> Factor:
     d = node.diagonal + s
     low, cholesky, half_det = factorised(d, rows)
     last = cholesky[-OUTLIER_MODES:, -OUTLIER_MODES:]
+    solved = node.mean / d - (node.mean @ low.T) @ low
     factor = Factor(
         s=s,
         inverse=1.0 / d,
-        low=low,
+        seen=np.vstack([low, solved]),
+        means=solved @ node.mean.T,
         half_det=half_det + float(0.5 * np.log(d).sum()),
         latent=latent,
         scale=width,
@@ -192,25 +212,21 @@ def factor_of(node: Node, kind: Kind, part_px: float) -> Factor:
         variance=d,
         whitening=np.linalg.cholesky(last.T @ last - (1.0 - LEAST_SEEN) * np.eye(len(last))),
     )
-    solved = factor.solve(latent, latent @ low.T)
     # The same as I − latent S⁻¹ latentᵀ, which loses all digits for bright stars.
     root = dtrsm(1.0, cholesky, np.eye(len(rows), 3), lower=1)
     left = root.T @ root
     inverse = factor.inverse - np.einsum("ij,ij->j", low, low)  # diagonal of S⁻¹
-    variance = s - s**2 * inverse + width[0] ** 2 * left[0, 0] - 2 * s * width[0] * solved[0]
+    sky = width[0] ** 2 * left[0, 0] - 2 * s * width[0] * factor.solve(latent[:1])[0]
+    variance = s - s**2 * inverse + sky
     return factor._replace(latent_left=left, variance=np.maximum(variance, 0.0))
 
 
 class Fit(NamedTuple):
-    """Stars x over a guess of their flux, in one node with its mean m."""
+    """Stars x over a guess of their flux, in nodes with their means m."""
 
-    log: np.ndarray  # (n,), ln of the likelihood, without (2π)^(P/2)
-    factor: np.ndarray  # (n,), a
-    variance: np.ndarray  # (n,), of a
-    mean: np.ndarray  # (n, P), m
-    low_mean: np.ndarray  # (n, R)
-    left: np.ndarray  # (n, P), x − m
-    low: np.ndarray  # (n, R)
+    log: np.ndarray  # ln of the likelihood, without (2π)^(P/2)
+    factor: np.ndarray  # a
+    variance: np.ndarray  # of a
 
 
 class Asked(NamedTuple):
@@ -346,16 +362,23 @@ class FieldLaw:
         )
         return means, means @ means.transpose(0, 2, 1), np.stack([n.total for n in self._nodes])
 
-    def _mean(self, k: int, stars: Asked, rows: np.ndarray) -> np.ndarray:
-        """PSFs (n, P) of sum 1 that the field has for some stars in a node."""
-        node, terms = self._nodes[k], stars.terms[rows]
+    def _parts(self, k: int, stars: Asked, rows: np.ndarray) -> np.ndarray:
+        """Coefficients (n, K + 1) of PSFs of sum 1 that the field has in a node, in its `mean`."""
+        terms = stars.terms[rows]
+        return np.hstack([terms / (terms @ self._nodes[k].total)[:, None], np.ones((len(rows), 1))])
+
+    def _mean(
+        self, k: int, factor: Factor, stars: Asked, rows: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """PSFs m (n, P) of sum 1 that the field has for some stars in a node, and S⁻¹ m."""
+        node = self._nodes[k]
         if stars.centre is None:
-            images, total = terms @ node.mean[:-1], terms @ node.total
-        else:
-            images = self.model.images(terms, stars.centre[rows], self.side)
-            images = images.reshape(len(rows), -1)
-            total = images.sum(axis=1)
-        return np.asarray(images / total[:, None] + node.mean[-1])
+            parts = self._parts(k, stars, rows)
+            return parts @ node.mean, parts @ factor.solved
+        images = self.model.images(stars.terms[rows], stars.centre[rows], self.side)
+        images = images.reshape(len(rows), -1)
+        mean = images / images.sum(axis=1, keepdims=True) + node.mean[-1]
+        return mean, factor.solve(mean)
 
     def _factor(self, k: int, kind: Kind) -> Factor:
         """S of a node."""
@@ -406,11 +429,15 @@ class FieldLaw:
         known = np.isfinite(stars.flux)[:, None]
         flux = np.where(known, stars.flux[:, None], np.maximum(along / square, 0.0))
         gain = flux * along - 0.5 * flux**2 * square
-        score = gain / stars.noise[:, None] ** 2 + stars.prior
+        variance = stars.noise[:, None] ** 2
+        score = gain / variance + stars.prior
         rows, best = np.arange(len(flux)), score.argmax(axis=1)
-        last = min(NEAREST_NODES, score.shape[1]) - 1
-        least = -np.partition(-score, last, axis=1)[:, last]
-        near = np.isfinite(score) & (score >= least[:, None])
+        unclear = gain / (variance + flux**2 * square / MATCHED_SNR**2) + stars.prior
+        few, most = (min(count, score.shape[1]) - 1 for count in (LEAST_NODES, MOST_NODES))
+        nearest = -np.partition(-unclear, [few, most], axis=1)
+        least = np.clip(unclear.max(axis=1) - FAR, nearest[:, most], nearest[:, few])
+        near = np.isfinite(score) & (unclear >= least[:, None])
+        near[rows, best] = True
         return flux[rows, best], near, 1.0 / np.sqrt(square[rows, best])
 
     def _alike(self, stars: Asked, guess: np.ndarray) -> list[np.ndarray]:
@@ -434,14 +461,16 @@ class FieldLaw:
             flux = np.where(known, stars.flux, np.maximum(guess, least))
             scaled = stars._replace(images=stars.images / flux[:, None])
             number = np.rint(np.log((stars.noise / flux) ** 2) / NOISE_STEP).astype(int)
-            log, factor = np.full(near.shape, -np.inf), np.ones(near.shape)
+            fit = Fit(np.full(near.shape, -np.inf), np.ones(near.shape), np.ones(near.shape))
             for k, kind, rows in self._asked(stars, number, near):
-                fit = self._against(k, kind, scaled, rows, precision)
-                log[rows, k], factor[rows, k] = fit.log + stars.prior[rows, k], fit.factor
-            weight, evidence = mixing_weights(log)
+                for all_nodes, found in zip(
+                    fit, self._against(k, kind, scaled, rows, precision), strict=True
+                ):
+                    all_nodes[rows, k] = found
+            weight, evidence = mixing_weights(fit.log + stars.prior)
             near = weight > 0
-            guess = flux * (weight * factor).sum(axis=1)
-        values, covariance, outlying, psf, sigma = self._summed(scaled, number, weight, precision)
+            guess = flux * (weight * fit.factor).sum(axis=1)
+        values, covariance, outlying, psf, sigma = self._summed(scaled, number, weight, fit)
         evidence -= scaled.images.shape[1] * np.log(np.sqrt(2 * np.pi) * flux)
         unit = np.stack([flux, flux, *np.ones((2, len(flux)))], axis=1)
         found = np.hstack([evidence[:, None], values * unit, outlying[:, None], psf, sigma])
@@ -469,23 +498,24 @@ class FieldLaw:
         self, k: int, kind: Kind, stars: Asked, rows: np.ndarray, precision: np.ndarray
     ) -> Fit:
         """Some stars over their guessed flux in a node: likelihood, and a with its prior."""
-        factor, mean, certain = self._factor(k, kind), self._mean(k, stars, rows), precision[rows]
-        # From y − m, so that a flux that is all but known loses no digits.
-        left = stars.images[rows] - mean
-        low, low_mean = left @ factor.low.T, mean @ factor.low.T
-        weighted = mean * factor.inverse
-        seen = np.einsum("ij,ij->i", mean, weighted) - np.einsum("ij,ij->i", low_mean, low_mean)
-        along = np.einsum("ij,ij->i", left, weighted) - np.einsum("ij,ij->i", low, low_mean)
-        chi2 = np.square(left) @ factor.inverse - np.einsum("ij,ij->i", low, low)
-        information = seen + certain
-        chi2 -= along**2 / information
+        factor, certain, images = self._factor(k, kind), precision[rows], stars.images[rows]
+        low, along = np.split(images @ factor.seen.T, [-len(factor.means)], axis=1)
+        if stars.centre is None:
+            parts = self._parts(k, stars, rows)
+            along, means = (np.einsum("ij,ij->i", a, parts) for a in (along, parts @ factor.means))
+        else:
+            mean, solved = self._mean(k, factor, stars, rows)
+            along, means = (np.einsum("ij,ij->i", a, solved) for a in (images, mean))
+        chi2 = np.square(images) @ factor.inverse - np.einsum("ij,ij->i", low, low)
+        information, left = means + certain, along - means
+        chi2 -= along + left + left**2 / information
         log = -0.5 * (chi2 + np.log(information / certain)) - factor.half_det
         # What was found before says nothing new: it is no part of the error.
-        variance = 1.0 / np.where(certain > FLUX_SIGMA**-2.0, information, seen)
-        return Fit(log, 1.0 + along / information, variance, mean, low_mean, left, low)
+        variance = 1.0 / np.where(certain > FLUX_SIGMA**-2.0, information, means)
+        return Fit(log, 1.0 + left / information, variance)
 
     def _summed(
-        self, stars: Asked, number: np.ndarray, weight: np.ndarray, precision: np.ndarray
+        self, stars: Asked, number: np.ndarray, weight: np.ndarray, fit: Fit
     ) -> tuple[np.ndarray, ...]:
         """Mean (n, 4) and covariance of flux, sky, row, column; outlier score; PSF (n, P) and σ.
 
@@ -499,22 +529,23 @@ class FieldLaw:
         outlying = np.zeros(count)
         for k, kind, rows in self._asked(stars, number, weight > 0):
             factor, w = self._factor(k, kind), weight[rows, k, None]
-            fit = self._against(k, kind, stars, rows, precision)
-            solved = factor.solve(fit.mean, fit.low_mean)
-            gain = factor.solve(fit.left, fit.low) - (fit.factor - 1.0)[:, None] * solved
+            a, variance = fit.factor[rows, k, None], fit.variance[rows, k, None]
+            mean, solved = self._mean(k, factor, stars, rows)
+            left = stars.images[rows] - a * mean
+            low = left @ factor.low.T
+            gain = factor.solve(left, low)
             latent, pull = gain @ factor.latent.T, solved @ factor.latent.T
             sky = factor.scale[0] * latent[:, :1]
             one = stars.images[rows] - factor.s * gain - sky
             change = factor.s * solved + factor.scale[0] * pull[:, :1]  # with a
             flux = one.sum(axis=1, keepdims=True)
             if not kind.sky:  # what is even in the star is sky
-                more = (fit.factor[:, None] - flux) / pixels
-                one, sky, flux = one + more, sky - more, fit.factor[:, None]
+                more = (a - flux) / pixels
+                one, sky, flux = one + more, sky - more, a
                 change += (1.0 - change.sum(axis=1, keepdims=True)) / pixels
-            leading = fit.low - (fit.factor - 1.0)[:, None] * fit.low_mean
-            white = np.linalg.solve(factor.whitening, leading[:, -OUTLIER_MODES:].T)
+            white = np.linalg.solve(factor.whitening, low[:, -OUTLIER_MODES:].T)
             outlying[rows] += w[:, 0] * np.square(white).sum(axis=0)
-            doubt = w * fit.variance[:, None]
+            doubt = w * variance
             star[rows] += w * one
             square[rows] += w * one**2
             inside[rows] += w * factor.variance + doubt * change**2

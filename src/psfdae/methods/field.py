@@ -64,7 +64,7 @@ class FieldMixture(FieldLaw, Method):
         },
         per_reference=True,
     )
-    packing = Packing(together=1024, padded=False)
+    packing = Packing(together=4096, padded=False)
     groups: ClassVar = {"field": FieldSettings}
 
     @classmethod
