@@ -2,9 +2,13 @@
 
     python crowded_sky.py image SEED OUT                   # OUT.fits and OUT.csv
     python crowded_sky.py photometry OUT TABLE NAME=GRID   # appends a row
+    python crowded_sky.py found OUT TABLE NAME=CATALOGUE   # likewise, stars that a program found
+    python crowded_sky.py pipeline OUT CATALOGUE GRID      # photutils' own search for the latter
+    python crowded_sky.py apertures OUT TABLE BUNDLE       # aperture corrections over the field
 
-A GRID is a cube of `psfdae psf --grid`, a .psf of PSFEx, or the word true. The stars are Moffat
-profiles (β = 3, FWHM 3.2 px) whose width and ellipticity change over the field.
+A GRID is a cube of `psfdae psf --grid`, a .psf of PSFEx, or the word true; a CATALOGUE is of
+`psfdae photometry`. The stars are Moffat profiles (β = 3, FWHM 3.2 px) whose width and ellipticity
+change over the field.
 """
 
 from __future__ import annotations
@@ -18,14 +22,26 @@ import pandas as pd
 from astropy.io import fits
 from astropy.nddata import NDData
 from astropy.table import Table
-from photutils.psf import GriddedPSFModel, PSFPhotometry, SourceGrouper
+from photutils.background import Background2D
+from photutils.detection import DAOStarFinder
+from photutils.psf import (
+    GriddedPSFModel,
+    IterativePSFPhotometry,
+    PSFPhotometry,
+    SourceGrouper,
+)
+from scipy.spatial import cKDTree
 
+from psfdae import load_model
+from psfdae.image.observation import Source
+from psfdae.model import crowded
 from psfdae_paper.source import git_commit
 
 SIZE_PX, STARS, BRIGHT = 1000, 2000, 600
 SKY, READ_NOISE, BETA, FWHM_PX = 400.0, 3.0, 3.0, 3.2
 SAMPLES, HALF_PX = 5, (20, 40)  # in a pixel and axis; of the frames of faint and of bright stars
 BRIGHT_FROM = 3e4  # electrons, from which a star has the larger frame
+FALSE_PX = 1.5  # from the nearest star, from which a star is false
 MARGIN_PX, NODES, OVERSAMPLING, INTEGRATED = 15, 7, 4, 9  # of the grid of true PSFs
 
 
@@ -120,7 +136,7 @@ def of_file(path):
 def photometry(stem: str, table: str, named: str) -> None:
     """Fit all stars with a PSF, from their true places and fluxes on, and append a row.
 
-    One in a process: in photutils 3.0.0, fits with one model change those with the next.
+    One in a process: photutils 3.0.0 fits groups with the first model of a class.
     """
     stars = Table.read(f"{stem}.csv")
     counts = fits.getdata(f"{stem}.fits").astype(float) - SKY
@@ -133,15 +149,80 @@ def photometry(stem: str, table: str, named: str) -> None:
     found.sort("id")
     ratio = (np.array(found["flux_fit"]) / np.array(stars["flux"]))[order]
 
-    def scatter(part):
-        return 148.26 * np.median(np.abs(part - np.median(part)))
+    append(table, {"image": Path(stem).name, "psf": name} | compared(ratio))
 
-    row = {"image": Path(stem).name, "psf": name, "bias_percent": 100 * (np.median(ratio) - 1)}
-    row |= {"scatter_percent": scatter(ratio), "brighter_half": scatter(ratio[: BRIGHT // 2])}
-    row |= {"fainter_half": scatter(ratio[BRIGHT // 2 :]), "date": date.today().isoformat()}
-    frame, new = pd.DataFrame([row | {"commit": git_commit()}]), not Path(table).exists()
-    frame.to_csv(table, mode="a", header=new, index=False, float_format="%.4g")
+
+def scatter(part):
+    """Robust standard deviation in per cent."""
+    return 148.26 * np.median(np.abs(part - np.median(part)))
+
+
+def compared(ratio):
+    """What is said of fluxes over the true ones, of bright stars, the brightest first."""
+    half = len(ratio) // 2
+    row = {"bias_percent": 100 * (np.median(ratio) - 1), "scatter_percent": scatter(ratio)}
+    return row | {"brighter_half": scatter(ratio[:half]), "fainter_half": scatter(ratio[half:])}
+
+
+def append(table, row):
+    """A row more in a table, with its date and commit."""
+    row = row | {"date": date.today().isoformat(), "commit": git_commit()}
+    new = not Path(table).exists()
+    pd.DataFrame([row]).to_csv(table, mode="a", header=new, index=False, float_format="%.4g")
+
+
+def found(stem: str, table: str, named: str) -> None:
+    """Compare a catalogue with the true stars: those within a pixel of one are found."""
+    name, path = named.split("=", 1)
+    stars, rows = Table.read(f"{stem}.csv"), Table.read(path)
+    rows = rows[np.isfinite(rows["flux"])]
+    true, place = (np.stack([t["x"], t["y"]], axis=1) for t in (stars, rows))
+    off, nearest = cKDTree(place).query(true)
+    bright = np.argsort(-np.array(stars["flux"]))[:BRIGHT]
+    seen = bright[off[bright] < 1]
+    flux, error = (np.array(rows[c])[nearest] for c in ("flux", "flux_error"))
+    pull = ((flux - stars["flux"]) / error)[off < 1]
+    row = {"image": Path(stem).name, "catalogue": name, "stars": len(rows)}
+    row |= {"completeness": np.mean(off < 1), "bright_completeness": len(seen) / BRIGHT}
+    row |= {"false": int((cKDTree(true).query(place)[0] > FALSE_PX).sum())}
+    row |= compared(flux[seen] / stars["flux"][seen])
+    append(table, row | {"coverage68": np.mean(np.abs(pull) < 1)})
+
+
+def pipeline(stem: str, catalogue: str, psf: str) -> None:
+    """Photutils' own search: DAOStarFinder, and iterative fits of the whole list."""
+    counts = fits.getdata(f"{stem}.fits").astype(float)
+    sky = Background2D(counts, 64)
+    counts, noise = counts - sky.background, float(np.median(sky.background_rms))
+    error = np.sqrt(np.maximum(counts, 0) + sky.background_rms**2)
+    finder = DAOStarFinder(5 * noise, FWHM_PX)
+    fit = IterativePSFPhotometry(
+        of_file(psf), (9, 9), finder, grouper=SourceGrouper(9), aperture_radius=3, mode="all"
+    )
+    rows = fit(counts, error=error)
+    names = {"x_fit": "x", "y_fit": "y", "flux_fit": "flux", "flux_err": "flux_error"}
+    Table({new: rows[old] for old, new in names.items()}).write(catalogue, overwrite=True)
+
+
+def apertures(stem: str, table: str, bundle: str) -> None:
+    """Compare aperture corrections with the true ones, at places over the field."""
+    model = load_model(bundle)
+    source = Source(Path(f"{stem}.fits"), detect=5.0)
+    measured = crowded.photometry(model, source.open(model.info.stamp_px), 5.0)
+    fine = (np.arange(-20, 20, 0.05) + 0.025, np.arange(-20, 20, 0.05) + 0.025)
+    dx, dy = np.meshgrid(*fine)
+    for radius in (3.0, 5.0, 8.0, 16.0):
+        off = []
+        for x in np.linspace(100, 900, 5):
+            for y in np.linspace(100, 900, 5):
+                inside = moffat(dx, dy, x, y)[np.hypot(dx, dy) < radius].sum() * 0.05**2
+                off.append(measured.aperture_correction(x, y, radius) * inside - 1)
+        off = 100 * np.array(off)
+        row = {"image": Path(stem).name, "radius_px": radius, "places": len(off)}
+        row |= {"mean_percent": off.mean(), "rms_percent": np.sqrt(np.mean(off**2))}
+        append(table, row | {"worst_percent": np.abs(off).max()})
 
 
 if __name__ == "__main__":
-    {"image": image, "photometry": photometry}[sys.argv[1]](*sys.argv[2:])
+    commands = (image, photometry, found, pipeline, apertures)
+    {one.__name__: one for one in commands}[sys.argv[1]](*sys.argv[2:])

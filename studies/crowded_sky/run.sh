@@ -28,3 +28,7 @@ if command -v psfex >/dev/null; then
 fi
 shift 3
 for psf in "$@"; do sky photometry "$stem" table.csv "$psf"; done
+psfdae photometry "$stem.fits" --detect --model "$stem-psfdae/$stem.psf.safetensors" --out "$stem-psfdae.ecsv" --overwrite
+sky pipeline "$stem" "$stem-photutils.ecsv" true
+for name in psfdae photutils; do sky found "$stem" found.csv "$name=$stem-$name.ecsv"; done
+sky apertures "$stem" apertures.csv "$stem-psfdae/$stem.psf.safetensors"

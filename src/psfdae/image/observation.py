@@ -460,6 +460,20 @@ class Observation:
             return self
         return replace(self, camera=self.camera | {"pixel scale": (ASSUMED_SCALE, "assumed")})
 
+    def sky(self) -> Sky:
+        """The whole image, and its sky; ObservationError if none can be measured."""
+        return self._layers.sky()
+
+    def on_sky(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        """ICRS coordinates in degrees of 0-based pixels (n,); None without a celestial WCS."""
+        from astropy.wcs.utils import pixel_to_skycoord
+
+        if (wcs := self._layers.image.wcs) is None:
+            return None
+        with reading(self.path):
+            place = pixel_to_skycoord(x, y, wcs).icrs
+        return place.ra.deg, place.dec.deg
+
     def said(self) -> str:
         """What is known of the camera and who says it, in words."""
         units = ("arcsec", "electrons per count", "electrons", "counts")

@@ -9,7 +9,7 @@ from dataclasses import fields, replace
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -40,6 +40,9 @@ from psfdae.model.photometry import FAINT_SNR, KEPT, NOISE_FLOOR, Photometer, Ph
 from psfdae.model.prediction import Prediction, measured_of, unmeasured
 from psfdae.moments import measure_shapes
 from psfdae.threads import available_cores, in_order, side_by_side
+
+if TYPE_CHECKING:
+    from photutils.psf import GriddedPSFModel
 
 SCALE_TOLERANCE = 0.02  # relative difference of the pixel scale from that of the training
 SNR_TOLERANCE = 1.25  # beyond the trained S/N without a flag: a faint star's is no better known
@@ -276,6 +279,38 @@ class PsfModel:
                 f"finite flux above 0 at x {place[0]:.6g}, y {place[1]:.6g}"
             )
         return found if position.ndim == 2 else found[0]
+
+    def fwhm_px(self) -> float:
+        """FWHM of the PSF in the middle of the field; raises as `psf_at`."""
+        middle = np.rint(np.mean(self.field_range(), axis=0))
+        return float(measure_shapes(self.psf_at(*middle[:, None], 1)).fwhm_px[0])
+
+    def to_photutils(self, nodes: int = 9, oversampling: int = 4) -> GriddedPSFModel:
+        """The field as photutils' `GriddedPSFModel`, such as `PSFPhotometry` takes.
+
+        Parameters
+        ----------
+        nodes : int
+            Places along either axis, over the field of the training stars.
+        oversampling : int
+            Values per pixel and axis.
+
+        Raises
+        ------
+        PredictionError
+            As `psf_at`.
+        """
+        from astropy.nddata import NDData
+        from photutils.psf import GriddedPSFModel
+
+        axes = np.rint(np.linspace(*self.field_range(), nodes)).T
+        x, y = (a.ravel() for a in np.meshgrid(*axes))
+        meta = {"grid_xypos": list(zip(x, y, strict=True)), "oversampling": oversampling}
+        # Of a class of its own: photutils 3.0 fits groups with the first model of a class.
+        name = f"FieldPSF_{self.bundle.sha256[:12]}_{nodes}_{oversampling}"
+        return type(name, (GriddedPSFModel,), {})(
+            NDData(self.psf_at(x, y, oversampling), meta=meta)
+        )
 
     def field_range(self) -> tuple[np.ndarray, np.ndarray]:
         """Least and greatest position (x, y) of the training stars; raises as `psf_at`."""

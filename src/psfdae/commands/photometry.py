@@ -1,0 +1,159 @@
+"""Stage `photometry`: fluxes of all stars of an image with the PSF of its field."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+
+from psfdae.cli import command
+from psfdae.commands.predict import Stated
+from psfdae.errors import Error
+from psfdae.files import atomic_path, check_outputs, write_fits
+from psfdae.image.catalogue import as_catalogue
+from psfdae.image.errors import ascii_line
+from psfdae.model.psf_model import load_model
+from psfdae.options import File
+
+if TYPE_CHECKING:
+    from psfdae.model.crowded import CrowdedPhotometry
+
+FORMATS = {".fits": "fits", ".ecsv": "ascii.ecsv", ".csv": "ascii.csv"}
+MATCHED_FWHM, FEWEST = 0.5, 3  # distance of a reference star; those that a zero point takes
+MAGNITUDE = 2.5 / math.log(10.0)  # of a relative error
+
+
+class PhotometryError(Error, ValueError):
+    """Nothing to measure, or no zero point."""
+
+
+@command("photometry")
+def photometry(
+    image: Annotated[File, {"argument": True}],
+    stated: Stated,
+    zero_point: Annotated[float | None, "Magnitude of a flux of 1."] = None,
+    reference: Annotated[File | None, "Star list with magnitudes, which give it."] = None,
+    magnitude_column: Annotated[str, "Of --reference."] = "mag",
+    residual: Annotated[File | None, "FITS image without its sky and stars."] = None,
+    overwrite: Annotated[bool, "Replace files that exist."] = False,
+    *,
+    model: Annotated[File, "Bundle of from-stars --method field, of this image."],
+    out: Annotated[File, "Table of the stars: .fits, .ecsv or .csv."],
+) -> None:
+    """Measure the fluxes of all stars of IMAGE, overlapping ones together.
+
+    --detect finds the stars, and in a second round those that brighter ones hide; those of
+    --catalogue are measured where it says, and no others. Fluxes have the light beyond the
+    stamps of MODEL, which the bright stars show.
+    """
+    form = FORMATS.get(out.suffix.lower())
+    if form is None:
+        raise PhotometryError(f"{out}: expected a name that ends in {', '.join(FORMATS)}")
+    if zero_point is not None and (reference is not None or not math.isfinite(zero_point)):
+        raise PhotometryError("--zero-point takes a number, or --reference gives it")
+    # Of stars that are found, the origin is known; then it is that of the reference.
+    found_here = reference is not None and stated.detect
+    source = (replace(stated, origin=None) if found_here else stated).source(image)
+    check_outputs((out, residual), (*source.files(), reference, model))
+    for path in (out, residual):
+        if path is not None and path.exists() and not overwrite:
+            raise PhotometryError(f"{path}: exists already; --overwrite replaces it")
+    loaded = load_model(model)
+    loaded.field_range()  # or it knows no place
+    observation = source.open(loaded.info.stamp_px).assuming()
+    if stated.all_extensions or observation.shape is None:
+        raise PhotometryError(f"{image}: photometry takes one image, no cube of stamps")
+    loaded.check_scale(observation.pixel_scale_arcsec, str(image))
+    magnitudes = None
+    if reference is not None:
+        listed = replace(stated, catalogue=reference, detect=False, on_image=False)
+        places = listed.source(image).open(loaded.info.stamp_px).positions
+        magnitudes = places, as_catalogue(reference).numbers(magnitude_column)
+
+    from psfdae.model.crowded import photometry as measured
+
+    found = measured(loaded, observation, stated.threshold)
+    if magnitudes is not None:
+        zero_point, said = _zero_point(found, *magnitudes, reference)
+        print(said)
+    _complete(found, observation, zero_point)
+    found.stars.meta |= _said(found, image, zero_point)
+    with atomic_path(out) as temporary:
+        found.stars.write(temporary, format=form, overwrite=True)
+    if residual is not None:
+        from astropy.io import fits
+
+        write_fits(residual, fits.PrimaryHDU(found.residual.astype(np.float32)))
+    print(observation.said(), _summary(found, out), sep="\n")
+
+
+def _zero_point(
+    found: CrowdedPhotometry, places: Any, magnitude: np.ndarray, reference: Path | None
+) -> tuple[float, str]:
+    """Median of what stars of the reference say, in magnitudes, and how sure it is."""
+    from scipy.spatial import cKDTree
+
+    from psfdae.moments import robust_scatter
+
+    stars = found.stars
+    flux = np.array(stars["flux"], dtype=np.float64)
+    used = np.flatnonzero(np.isfinite(flux) & (flux > 0))
+    place = np.stack([stars["x"], stars["y"]], axis=1)[used]
+    known = np.isfinite(places).all(axis=1) & np.isfinite(magnitude)
+    off, star = cKDTree(place).query(places[known])
+    near = off < MATCHED_FWHM * found.model.fwhm_px()
+    zero = magnitude[known][near] + 2.5 * np.log10(flux[used[star[near]]])
+    if len(zero) < FEWEST:
+        raise PhotometryError(
+            f"{reference}: {len(zero)} of its stars with a magnitude are stars of the image, "
+            f"{FEWEST} are needed for a zero point"
+        )
+    error = float(robust_scatter(zero[:, None])[0]) / math.sqrt(len(zero))
+    value = float(np.median(zero))
+    return value, f"zero point {value:.4f} ± {error:.4f} mag ({len(zero)} stars of {reference})"
+
+
+def _complete(found: CrowdedPhotometry, observation: Any, zero_point: float | None) -> None:
+    """Columns that take a zero point, or a WCS."""
+    stars = found.stars
+    with np.errstate(all="ignore"):
+        if zero_point is not None:
+            flux = np.where(np.array(stars["flux"]) > 0, stars["flux"], np.nan)
+            stars["mag"] = zero_point - 2.5 * np.log10(flux)
+            stars["mag_error"] = MAGNITUDE * np.array(stars["flux_error"]) / flux
+        sky = observation.on_sky(np.array(stars["x"]), np.array(stars["y"]))
+    if sky is not None:
+        stars["ra"], stars["dec"] = sky
+
+
+def _said(found: CrowdedPhotometry, image: Path, zero_point: float | None) -> dict[str, Any]:
+    """What the table says of itself."""
+    info = found.model.info
+    return {
+        "INFILE": ascii_line(image.name),
+        "PSFMODEL": ascii_line(info.name),
+        "PSFSHA": found.model.bundle.sha256,
+        "FLUXRAD": found.radius_px,
+        "INMODEL": _part_of_model(found),
+        **({} if zero_point is None else {"ZEROPT": zero_point}),
+    }
+
+
+def _part_of_model(found: CrowdedPhotometry) -> float:
+    """Part of a usual star's flux that the model knows."""
+    return 1.0 if found.wings is None else 1.0 / (1.0 + found.wings.light()[0])
+
+
+def _summary(found: CrowdedPhotometry, out: Path) -> str:
+    count, measured = len(found.stars), int(np.isfinite(found.stars["flux"]).sum())
+    beyond = "no star is bright enough to show light beyond the model's stamp"
+    if found.wings is not None:
+        light, error = found.wings.light()
+        beyond = (
+            f"fluxes are the light within {found.radius_px:.3g} px; the model of the PSF has "
+            f"{100 * _part_of_model(found):.2f} ± {100 * error / (1 + light) ** 2:.2f} % of it"
+        )
+    return f"{out}: {count} stars, {measured} measured\n{beyond}"

@@ -1,0 +1,267 @@
+"""Photometry of all stars of an image: overlapping stars, hidden ones, and light in wings."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.table import Table
+from click.testing import CliRunner
+from photutils.aperture import CircularAperture
+from scipy.ndimage import uniform_filter
+from scipy.spatial import cKDTree
+
+from psfdae import load_model
+from psfdae.cli import main
+from psfdae.image.observation import Source
+from psfdae.model import crowded
+from psfdae.model.psf_model import PredictionError
+from psfdae_paper.stars.example import add_stamps, write_field
+
+SIZE, SKY, STAMP, WIDE = 500, 200.0, 10, 81
+CORE, CORE_PX, WING_PX = 0.94, 1.4, 3.0  # flux of the Gaussian, its σ, and the radius of the wings
+
+
+def profile(dx, dy):
+    """A Gaussian, and wings as those of a Moffat profile of β = 2.5, of flux 1 together."""
+    square = dx**2 + dy**2
+    core = np.exp(-square / (2 * CORE_PX**2)) / (2 * np.pi * CORE_PX**2)
+    wings = 1.5 / (np.pi * WING_PX**2) * (1 + square / WING_PX**2) ** -2.5
+    return CORE * core + (1 - CORE) * wings
+
+
+def stamps(x, y):
+    """Stars (n, WIDE, WIDE) at the sub-pixel phases of places; a pixel is 5 × 5 points."""
+    axis = (np.arange(WIDE * 5) + 0.5) / 5 - 0.5 - WIDE // 2
+    phase = np.stack([y - np.floor(y + 0.5), x - np.floor(x + 0.5)], axis=1)
+    found = [profile(*np.meshgrid(axis - px, axis - py)) for py, px in phase]
+    return np.array(found).reshape(-1, WIDE, 5, WIDE, 5).mean(axis=(2, 4))
+
+
+def run(*words):
+    return CliRunner().invoke(main, [str(word) for word in words])
+
+
+@pytest.fixture(scope="module")
+def sky(tmp_path_factory):
+    """An image with single stars and pairs, its model of the field, and the true stars."""
+    folder, rng = tmp_path_factory.mktemp("crowded"), np.random.default_rng(5)
+    axis = np.arange(30.0, SIZE - 20, 32)
+    single = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    single += rng.uniform(-3, 3, single.shape)
+    flux = 10 ** rng.uniform(3.7, 5.3, len(single))
+    paired = np.arange(len(single)) % 5 == 0
+    angle = rng.uniform(0, 2 * np.pi, paired.sum())
+    beside = single[paired] + 5.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    place = np.concatenate([single, beside])
+    light = np.concatenate([flux, 0.5 * flux[paired]])
+    pixels = np.full((SIZE, SIZE), SKY)
+    add_stamps(pixels, light[:, None, None] * stamps(*place.T), *place.T)
+    pixels = rng.poisson(pixels) + rng.normal(0, 3, pixels.shape)
+    write_field(folder / "i.fits", folder / "i.csv", pixels, *place.T, GAIN=1.0, RDNOISE=3.0)
+    words = ("--catalogue", folder / "i.csv", "--method", "field", "--out", folder / "model")
+    few = ("framing.stamp_px=10", "parts.train_stars=100", "parts.test_stars=20")
+    done = run("from-stars", folder / "i.fits", *words, "methods=[noisy,field]", *few)
+    assert done.exit_code == 0, done.output
+    true = Table({"x": place[:, 0], "y": place[:, 1], "flux": light})
+    true["pair"] = np.concatenate([paired, np.ones(len(beside), bool)])
+    return folder, folder / "model/i.psf.safetensors", true
+
+
+@pytest.fixture(scope="module")
+def found(sky):
+    """Its photometry, with stars that are looked for."""
+    folder, path, _ = sky
+    observation = Source(folder / "i.fits", detect=5.0).open(STAMP)
+    return crowded.photometry(load_model(path), observation, 5.0)
+
+
+def matched(rows, true):
+    """Row of every true star; there is one within a pixel of each."""
+    place, where = (np.stack([t["x"], t["y"]], axis=1) for t in (rows, true))
+    off, row = cKDTree(place).query(where)
+    assert (off < 1.0).mean() > 0.98
+    return np.where(off < 1.0, row, -1)
+
+
+def test_fluxes_are_those_of_the_stars_with_their_wings(sky, found):
+    true = sky[2]
+    row = matched(found.stars, true)
+    for kind in (~true["pair"], true["pair"]):
+        chosen = kind & (row >= 0) & (true["flux"] > 1e4)
+        ratio = found.stars["flux"][row[chosen]] / true["flux"][chosen]
+        error = found.stars["flux_error"][row[chosen]] / true["flux"][chosen]
+        assert np.median(ratio) == pytest.approx(1.0, abs=0.004)
+        pull = (ratio - np.median(ratio)) / error
+        assert 0.5 < (np.abs(pull) < 1).mean() < 0.85
+    # The model's own flux has not what lies beyond its stamp, nor what it takes for sky.
+    short = np.median(found.stars["flux_model"][row] / true["flux"])
+    assert 0.975 < short < 0.993
+
+
+def test_there_are_as_many_stars_as_are_true(sky, found):
+    true = sky[2]
+    assert len(found.stars) == pytest.approx(len(true), abs=0.02 * len(true))
+    assert found.residual.std() == pytest.approx(np.sqrt(SKY + 9), rel=0.15)
+    assert abs(np.median(found.residual)) < 0.5
+
+
+def test_a_star_behind_a_brighter_one_is_found_in_the_second_round(monkeypatch):
+    level, noise = np.zeros((60, 60)), np.ones((60, 60))
+    rows, columns = np.mgrid[:60, :60]
+    left = 40 * np.exp(-((rows - 20) ** 2 + (columns - 33) ** 2) / 4.0)
+    left += 40 * np.exp(-((rows - 40) ** 2 + (columns - 10) ** 2) / 4.0)
+    sky = crowded.Sky(left, level, noise, level > 0, np.nan)
+    known = np.array([[10.2, 40.1], [30.0, 20.0]])
+    place, flux = crowded._with_hidden(sky, noise, known, np.array([1e4, 1e4]), 5.0, 3.0)
+    assert place[:2].tolist() == known.tolist() and len(place) == len(flux) == 3
+    assert place[2] == pytest.approx([33, 20], abs=0.1)
+    # Beside a bright star, as much light may be a PSF that is a little off.
+    doubt = np.where(left > 1, 40.0, 1.0)
+    assert len(crowded._with_hidden(sky, doubt, known, flux[:2], 5.0, 3.0)[0]) == 2
+
+
+def test_aperture_corrections(found):
+    for x, y in ((100.0, 100.3), (400.4, 250.0), (250.5, 60.2)):
+        image = stamps(np.array([x]), np.array([y]))[0]
+        middle = np.array([x, y]) - np.floor(np.array([x, y]) + 0.5) + WIDE // 2
+
+        def light(radius, image=image, middle=middle):
+            return CircularAperture(middle, radius).do_photometry(image)[0][0]
+
+        for radius in (3.0, 4.0, 8.0, 15.0):
+            true = light(found.radius_px) / light(radius)
+            assert found.aperture_correction(x, y, radius) == pytest.approx(true, rel=0.005)
+    assert found.aperture_correction(250, 250, found.radius_px) == pytest.approx(1.0, abs=2e-3)
+    with pytest.raises(ValueError, match="expected above 0 up to 25"):
+        found.aperture_correction(250, 250, 26)
+
+
+@pytest.mark.parametrize("level", [0.0, 3.0])
+def test_wings_are_found_beside_a_wrong_sky(level):
+    """Of a known profile, as tents are; an even light beside them does not count."""
+    rng = np.random.default_rng(1)
+    place, flux = rng.uniform(0, 300, (30, 2)), 10 ** rng.uniform(4, 5.5, 30)
+    blank = np.ones(30)
+    radius = np.geomspace(5, 25, crowded.TENTS + 1)
+    true = crowded.Wings(radius, np.geomspace(3e-4, 1e-4, crowded.TENTS), np.eye(6), 1.0)
+    ((_, tented),) = crowded._tented((300, 300), place, flux, blank, true)
+    image = level + np.tensordot(true.profile, tented, 1) + rng.normal(0, 5, (300, 300))
+    nothing = np.zeros(image.shape, bool)
+    known = (np.full(image.shape, 5.0), nothing, place)
+    wings = crowded.wings_of(image, *known, flux, blank, 10)
+    assert wings.light()[0] == pytest.approx(true.light()[0], abs=4 * wings.light()[1])
+    assert wings.light()[1] < 0.05 * true.light()[0]
+    assert crowded.wings_of(rng.normal(0, 5, image.shape), *known, flux, blank, 10) is None
+    assert crowded.wings_of(image, *known, np.full(30, np.nan), blank, 10) is None
+
+
+def test_the_light_of_tents_is_the_sum_over_pixels():
+    radius = np.geomspace(5, 25, crowded.TENTS + 1)
+    wings = crowded.Wings(radius, np.linspace(2e-4, 1e-4, 6), np.eye(6), 1.0)
+    drawn = crowded._tented((81, 81), np.array([[40.0, 40.0]]), np.ones(1), np.ones(1), wings)
+    total = sum(np.tensordot(wings.profile, tented, 1).sum() for _, tented in drawn)
+    assert wings.light()[0] == pytest.approx(total, rel=5e-3)
+    assert wings.light(10.0)[0] < wings.light(20.0)[0] < wings.light()[0]
+
+
+def test_groups_are_chains_and_never_large():
+    line = np.stack([np.arange(120.0) * 2, np.zeros(120)], axis=1)
+    line[60:, 0] += 0.3 * np.arange(60)  # these are farther apart
+    far = np.array([[500.0, 500.0], [503.0, 500.0], [np.nan, 1.0]])
+    group = crowded.groups_of(np.concatenate([line, far]), 4.0)
+    assert np.unique(group, return_counts=True)[1].max() <= crowded.LARGEST_GROUP
+    assert group[120] == group[121] and group[122] not in group[:122]
+    assert crowded.groups_of(line[:40], 4.0).tolist() == [1] * 40
+
+
+def test_models_of_photutils_do_not_mix(sky):
+    """Groups are fitted with the model that is asked for, not with that of another field."""
+    from dataclasses import replace
+
+    from photutils.psf import PSFPhotometry
+
+    first = load_model(sky[1])
+    weights = first.bundle.weights
+    smooth = uniform_filter(weights["coefficients"], (1, 5, 5))
+    wider = weights | {"coefficients": smooth}
+    other = type(first)(replace(first.bundle, weights=wider))
+    one, two = (model.to_photutils(3, 2) for model in (first, other))
+    x, y = one.grid_xypos[4]
+    assert one.data[4] == pytest.approx(first.psf_at(x, y, 2), abs=1e-12)
+    assert np.abs(one.data[4] - two.data[4]).max() > 1e-5
+    rows, columns = np.mgrid[:40, :40]
+    drawn = sum(two.evaluate(columns, rows, 1e3, a, 20.0) for a in (16.0, 21.0))
+    start = Table({"x": [16.2, 20.9], "y": [20.1, 19.9], "group_id": [1, 1]})
+    for model in (one, two):
+        fit = PSFPhotometry(model, 9, aperture_radius=3)(drawn, init_params=start)
+    # With the other one they are off by a tenth.
+    assert fit["flux_fit"] == pytest.approx([1e3, 1e3], rel=0.005)
+
+
+def test_the_command_and_its_table(sky, tmp_path):
+    folder, model, true = sky
+    true["mag"] = 24.5 - 2.5 * np.log10(true["flux"])
+    true[:60].write(tmp_path / "magnitudes.csv")
+    words = ("photometry", folder / "i.fits", "--model", model, "--detect")
+    out, left = tmp_path / "stars.fits", tmp_path / "left.fits"
+    more = ("--reference", tmp_path / "magnitudes.csv", "--origin", 0, "--residual", left)
+    done = run(*words, "--out", out, *more)
+    assert done.exit_code == 0, done.output
+    assert re.search(r"zero point 24\.(49|50)\d+ ± 0\.00", done.output), done.output
+    assert "% of it" in done.output
+    rows, header = Table.read(out), fits.getheader(out, 1)
+    assert header["ZEROPT"] == pytest.approx(24.5, abs=0.01) and header["FLUXRAD"] == 25.0
+    assert 0.975 < header["INMODEL"] < 0.995
+    row = matched(rows, true)
+    assert np.median(rows["mag"][row] - true["mag"]) == pytest.approx(0.0, abs=0.01)
+    x, y = load_wcs(folder / "i.fits").world_to_pixel_values(rows["ra"], rows["dec"])
+    assert x == pytest.approx(np.array(rows["x"]), abs=1e-6)
+    assert y == pytest.approx(np.array(rows["y"]), abs=1e-6)
+    assert fits.getdata(left).shape == (SIZE, SIZE)
+    assert "exists already" in run(*words, "--out", out).output
+
+
+def load_wcs(path):
+    from astropy.wcs import WCS
+
+    return WCS(fits.getheader(path))
+
+
+def test_stars_of_a_list_are_measured_and_no_others(sky, tmp_path):
+    folder, model, true = sky
+    rows = Table.read(folder / "i.csv")[:25]
+    rows.write(tmp_path / "some.csv")
+    out = tmp_path / "some.ecsv"
+    words = ("photometry", folder / "i.fits", "--model", model, "--zero-point", 25)
+    done = run(*words, "--catalogue", tmp_path / "some.csv", "--out", out)
+    assert done.exit_code == 0, done.output
+    found = Table.read(out)
+    assert len(found) == 25 and found.meta["ZEROPT"] == 25.0
+    alone = ~np.array(true["pair"][:25])
+    assert np.median((found["flux"] / true["flux"][:25])[alone]) == pytest.approx(1.0, abs=0.01)
+
+
+def test_what_cannot_be_measured_is_refused_in_one_line(sky, tmp_path):
+    folder, model, _ = sky
+    out = tmp_path / "out.csv"
+    far = Table({"x": [1.0, 2.0, 3.0], "y": [1.0, 2.0, 3.0], "mag": [10.0, 11.0, 12.0]})
+    far.write(tmp_path / "far.csv")
+    words = ("photometry", folder / "i.fits", "--model", model, "--detect", "--out")
+    wrong = {
+        ("x.txt",): "expected a name that ends in .fits, .ecsv, .csv",
+        (out, "--zero-point", "nan"): "--zero-point takes a number",
+        (out, "--zero-point", 1, "--reference", tmp_path / "far.csv"): "or --reference gives it",
+        (out, "--reference", tmp_path / "far.csv", "--origin", 0): "0 of its stars",
+        (out, "--all-extensions"): "one image",
+        (model,): "expected a name",
+    }
+    for more, said in wrong.items():
+        done = run(*words, *more)
+        assert done.exit_code == 2 and said in done.output, done.output
+        assert len(done.output.strip().splitlines()) == 1
+        assert not out.exists()
+    with pytest.raises(PredictionError, match="knows the PSF of a star alone"):
+        load_model().to_photutils()
