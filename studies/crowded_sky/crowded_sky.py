@@ -3,7 +3,8 @@
     python crowded_sky.py image SEED OUT                   # OUT.fits and OUT.csv
     python crowded_sky.py photometry OUT TABLE NAME=GRID   # appends a row
     python crowded_sky.py found OUT TABLE NAME=CATALOGUE   # likewise, stars that a program found
-    python crowded_sky.py pipeline OUT CATALOGUE GRID      # photutils' own search for the latter
+    python crowded_sky.py with_truth OUT CATALOGUE         # psfdae's search with the true PSF
+    python crowded_sky.py pipeline OUT CATALOGUE GRID      # photutils' own search, for the same
     python crowded_sky.py apertures OUT TABLE BUNDLE       # aperture corrections over the field
 
 A GRID is a cube of `psfdae psf --grid`, a .psf of PSFEx, or the word true; a CATALOGUE is of
@@ -16,12 +17,14 @@ from __future__ import annotations
 import sys
 from datetime import date
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
 from astropy.io import fits
 from astropy.nddata import NDData
 from astropy.table import Table
+from photutils.aperture import CircularAperture
 from photutils.background import Background2D
 from photutils.detection import DAOStarFinder
 from photutils.psf import (
@@ -189,6 +192,28 @@ def found(stem: str, table: str, named: str) -> None:
     append(table, row | {"coverage68": np.mean(np.abs(pull) < 1)})
 
 
+class TrueField:
+    """What `psfdae photometry` asks of a model, of the true profile."""
+
+    info = SimpleNamespace(stamp_px=2 * HALF_PX[0])
+
+    def to_photutils(self):
+        return true_psf()
+
+    def fwhm_px(self):
+        return FWHM_PX
+
+    def psf_at(self, x, y, oversampling):
+        axis = np.arange(self.info.stamp_px) - self.info.stamp_px // 2
+        return np.stack([moffat(*np.meshgrid(axis, axis), *at) for at in np.stack([x, y], axis=1)])
+
+
+def with_truth(stem: str, catalogue: str) -> None:
+    """The catalogue of `psfdae photometry --detect` with the true PSF."""
+    observation = Source(Path(f"{stem}.fits"), detect=5.0).open(TrueField.info.stamp_px)
+    crowded.photometry(TrueField(), observation, 5.0).stars.write(catalogue, overwrite=True)
+
+
 def pipeline(stem: str, catalogue: str, psf: str) -> None:
     """Photutils' own search: DAOStarFinder, and iterative fits of the whole list."""
     counts = fits.getdata(f"{stem}.fits").astype(float)
@@ -209,13 +234,15 @@ def apertures(stem: str, table: str, bundle: str) -> None:
     model = load_model(bundle)
     source = Source(Path(f"{stem}.fits"), detect=5.0)
     measured = crowded.photometry(model, source.open(model.info.stamp_px), 5.0)
-    fine = (np.arange(-20, 20, 0.05) + 0.025, np.arange(-20, 20, 0.05) + 0.025)
-    dx, dy = np.meshgrid(*fine)
+    side = 2 * HALF_PX[1] + 1
+    axis = (np.arange(side * INTEGRATED) + 0.5) / INTEGRATED - 0.5 - side // 2
+    shape = (side, INTEGRATED) * 2
     for radius in (3.0, 5.0, 8.0, 16.0):
-        off = []
+        off, aperture = [], CircularAperture((side // 2,) * 2, radius)
         for x in np.linspace(100, 900, 5):
             for y in np.linspace(100, 900, 5):
-                inside = moffat(dx, dy, x, y)[np.hypot(dx, dy) < radius].sum() * 0.05**2
+                star = moffat(*np.meshgrid(axis, axis), x, y).reshape(shape).mean(axis=(1, 3))
+                inside = aperture.do_photometry(star)[0][0]
                 off.append(measured.aperture_correction(x, y, radius) * inside - 1)
         off = 100 * np.array(off)
         row = {"image": Path(stem).name, "radius_px": radius, "places": len(off)}
@@ -224,5 +251,5 @@ def apertures(stem: str, table: str, bundle: str) -> None:
 
 
 if __name__ == "__main__":
-    commands = (image, photometry, found, pipeline, apertures)
+    commands = (image, photometry, found, with_truth, pipeline, apertures)
     {one.__name__: one for one in commands}[sys.argv[1]](*sys.argv[2:])

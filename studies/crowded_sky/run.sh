@@ -29,6 +29,7 @@ fi
 shift 3
 for psf in "$@"; do sky photometry "$stem" table.csv "$psf"; done
 psfdae photometry "$stem.fits" --detect --model "$stem-psfdae/$stem.psf.safetensors" --out "$stem-psfdae.ecsv" --overwrite
+sky with_truth "$stem" "$stem-truth.ecsv"
 sky pipeline "$stem" "$stem-photutils.ecsv" true
-for name in psfdae photutils; do sky found "$stem" found.csv "$name=$stem-$name.ecsv"; done
+for name in psfdae truth photutils; do sky found "$stem" found.csv "$name=$stem-$name.ecsv"; done
 sky apertures "$stem" apertures.csv "$stem-psfdae/$stem.psf.safetensors"
