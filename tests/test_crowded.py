@@ -171,10 +171,14 @@ def test_groups_are_chains_and_never_large():
     line = np.stack([np.arange(120.0) * 2, np.zeros(120)], axis=1)
     line[60:, 0] += 0.3 * np.arange(60)  # these are farther apart
     far = np.array([[500.0, 500.0], [503.0, 500.0], [np.nan, 1.0]])
-    group = crowded.groups_of(np.concatenate([line, far]), 4.0)
+    group, parted = crowded.groups_of(np.concatenate([line, far]), 4.0)
+    assert parted[:120].all() and not parted[120:].any()
     assert np.unique(group, return_counts=True)[1].max() <= crowded.LARGEST_GROUP
     assert group[120] == group[121] and group[122] not in group[:122]
-    assert crowded.groups_of(line[:40], 4.0).tolist() == [1] * 40
+    group, parted = crowded.groups_of(line[:40], 4.0)
+    assert group.tolist() == [1] * 40 and not parted.any()
+    group, parted = crowded.groups_of(np.zeros((120, 2)), 4.0)  # a list with one star 120 times
+    assert sorted(np.unique(group, return_counts=True)[1]) == [20, 50, 50] and parted.all()
 
 
 def test_models_of_photutils_do_not_mix(sky):
@@ -233,15 +237,20 @@ def load_wcs(path):
 def test_stars_of_a_list_are_measured_and_no_others(sky, tmp_path):
     folder, model, true = sky
     rows = Table.read(folder / "i.csv")[:25]
+    rows.add_row(rows[0])
+    rows["X_IMAGE"][25] = 5000.0  # off the image
     rows.write(tmp_path / "some.csv")
     out = tmp_path / "some.ecsv"
     words = ("photometry", folder / "i.fits", "--model", model, "--zero-point", 25)
     done = run(*words, "--catalogue", tmp_path / "some.csv", "--out", out)
     assert done.exit_code == 0, done.output
     found = Table.read(out)
-    assert len(found) == 25 and found.meta["ZEROPT"] == 25.0
+    assert len(found) == 26 and found.meta["ZEROPT"] == 25.0
+    assert not np.isfinite(found["flux"][25]) and found["flags"][25] > 0
     alone = ~np.array(true["pair"][:25])
-    assert np.median((found["flux"] / true["flux"][:25])[alone]) == pytest.approx(1.0, abs=0.01)
+    assert np.median((found["flux"][:25] / true["flux"][:25])[alone]) == pytest.approx(
+        1.0, abs=0.01
+    )
 
 
 def test_what_cannot_be_measured_is_refused_in_one_line(sky, tmp_path):

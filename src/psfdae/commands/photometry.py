@@ -148,6 +148,8 @@ def _part_of_model(found: CrowdedPhotometry) -> float:
 
 
 def _summary(found: CrowdedPhotometry, out: Path) -> str:
+    from psfdae.model.crowded import LARGEST_GROUP
+
     count, measured = len(found.stars), int(np.isfinite(found.stars["flux"]).sum())
     beyond = "no star is bright enough to show light beyond the model's stamp"
     if found.wings is not None:
@@ -156,4 +158,7 @@ def _summary(found: CrowdedPhotometry, out: Path) -> str:
             f"fluxes are the light within {found.radius_px:.3g} px; the model of the PSF has "
             f"{100 * _part_of_model(found):.2f} ± {100 * error / (1 + light) ** 2:.2f} % of it"
         )
-    return f"{out}: {count} stars, {measured} measured\n{beyond}"
+    said = f"{out}: {count} stars, {measured} measured"
+    if parted := int(np.sum(found.stars["parted"])):
+        said += f", {parted} of them in groups of over {LARGEST_GROUP}, which were parted"
+    return f"{said}\n{beyond}"

@@ -1,11 +1,11 @@
 """Photometry of all stars of an image, those that overlap together, with a model of its field.
 
 photutils finds, groups and fits the stars (`PSFPhotometry`). What brighter stars hid is then found
-where their models are subtracted, and all are fitted again, on a sky without the light of stars;
-of stars that were hidden, those whose flux is no 3 σ are dropped, and the others fitted a last
-time. The model knows the light of a star
-in its stamp, above what is there in a ring around it. The rest is one profile for all stars: a star
-of flux F at distance r from its centre has
+where their models are subtracted, and all are fitted again, on a sky without the light of stars.
+Stars that were hidden and have no flux of 3 σ are dropped, and the others fitted a last time.
+
+The model knows the light of a star in its stamp, above what is there in a ring around it. The rest
+is one profile for all stars: a star of flux F at distance r from its centre has
 
     F s Σ_k p_k h_k(r)
 
@@ -41,6 +41,7 @@ REACH, TENTS, STEEPNESS = 2.5, 6, 3.0  # radius of the wings in stamps; tents; p
 WINGED, BAND_PX = 1000, 512  # brightest stars, whose wings are drawn; rows at a time
 CLIPS, CLIPPED_SIGMA = 3, 4.0  # least squares, of which pixels farther off are left out
 LEAST_SEEN = 3.0  # σ, from which wings and hidden stars are real
+NEAREST_PX = 0.1  # of stars in a group that is to be parted
 PSFS_AT_ONCE = 2048
 
 
@@ -82,7 +83,8 @@ class CrowdedPhotometry:
     stars : Table
         A row for each: `id`, `x`, `y` (0-based pixels), `x_error`, `y_error`, `flux` (counts,
         wings included), `flux_error`, `flux_model` (without the wings), `group`, `group_size`,
-        `chi2` (reduced, of the pixels of the fit), `flags` of photutils.
+        `parted` (the group was too large, and is a part of it), `chi2` (reduced, of the pixels of
+        the fit), `flags` of photutils.
     residual : ndarray, shape (h, w)
         Image without sky and stars, counts.
     wings : Wings or None
@@ -202,7 +204,7 @@ def _fitted(
 
     side = 2 * int(np.ceil(FIT_FWHM * fwhm / 2)) + 1
     start = Table({"id": np.arange(1, len(place) + 1), "x": place[:, 0], "y": place[:, 1]})
-    start["group_id"] = groups_of(place, GROUP_FWHM * fwhm)
+    start["group_id"], parted = groups_of(place, GROUP_FWHM * fwhm)
     if flux is not None:
         start["flux"] = np.where(np.isfinite(flux), flux, 0.0)
     bounds = MOST_MOVED_FWHM * fwhm
@@ -214,31 +216,36 @@ def _fitted(
         found = fit(flat, mask=bad, error=error, init_params=start)
         drawn = fit.make_model_image(flat.shape)
     found.sort("id")
+    found["parted"] = parted
     return found, drawn
 
 
-def groups_of(place: np.ndarray, distance_px: float) -> np.ndarray:
-    """Numbers from 1 of groups of stars at places (n, 2), of not more than `LARGEST_GROUP`.
+def groups_of(place: np.ndarray, distance_px: float) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers from 1 of groups of stars at places (n, 2), and who was in a larger one, (n,).
 
-    Chains of stars that are nearer to each other than a distance are a group; of a large one,
-    those that are nearer still.
+    Chains of stars that are nearer to each other than a distance are a group; of more than
+    `LARGEST_GROUP`, those that are nearer still.
     """
     from photutils.psf import SourceGrouper
 
     known = np.flatnonzero(np.isfinite(place).all(axis=1))
     group, todo = np.arange(1, len(place) + 1), [(known, distance_px)]
+    parted = np.zeros(len(place), dtype=bool)
     while todo:
         stars, distance = todo.pop()
         if len(stars) < 2:
             continue
         label = np.asarray(SourceGrouper(distance)(*place[stars].T))
+        if distance < NEAREST_PX:  # as good as one place
+            label = np.arange(len(stars)) // LARGEST_GROUP
         for one in np.unique(label):
             members = stars[label == one]
             if len(members) > LARGEST_GROUP:
+                parted[members] = True
                 todo.append((members, CLOSER * distance))
             else:
                 group[members] = members[0] + 1
-    return group
+    return group, parted
 
 
 def _with_hidden(
@@ -360,5 +367,6 @@ def _described(
     stars["flux"], stars["flux_error"] = (table[c] * total for c in ("flux_fit", "flux_err"))
     stars["flux_model"] = table["flux_fit"]
     stars["group"], stars["group_size"] = table["group_id"], table["group_size"]
+    stars["parted"] = table["parted"]
     stars["chi2"], stars["flags"] = table["reduced_chi2"], table["flags"]
     return found
