@@ -282,6 +282,28 @@ def crowded_sky():
     return pd.DataFrame([said])
 
 
+def crowded_found():
+    """What `psfdae photometry` finds in crowded fields, over the images."""
+    table = csv("studies/crowded_sky/found.csv")
+    own, truth = (table[table.catalogue == name] for name in ("psfdae", "truth"))
+
+    def each(values, form):
+        return " and ".join(format(v, form) for v in values)
+
+    said = {"completeness": each(100 * own.completeness, ".1f"), "false": each(own.false, "d")}
+    said |= {"scatter": each(own.scatter_percent, ".2f"), "bias": each(own.bias_percent, ".2f")}
+    said |= {"scatter_of_truth": each(truth.scatter_percent, ".2f")}
+    return pd.DataFrame([said | {"coverage": each(100 * own.coverage68, ".0f")}])
+
+
+def crowded_apertures():
+    """RMS error of aperture corrections over places and images, in words."""
+    table = csv("studies/crowded_sky/apertures.csv")
+    rms = table.groupby("radius_px").rms_percent.apply(lambda v: np.sqrt(np.mean(v**2)))
+    said = ", ".join(f"{error:.2f} % at a radius of {radius:g} px" for radius, error in rms.items())
+    return pd.DataFrame([{"said": said}])
+
+
 def _in_1e5(row):
     return f"{1e5 * row['mse']:.2f} ± {1e5 * row['stderr']:.2f}"
 
