@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 
 from psfdae.cli import command
-from psfdae.commands.predict import Stated
+from psfdae.commands.predict import Stated, check_targets
 from psfdae.errors import Error
 from psfdae.files import atomic_path, check_outputs, write_fits
 from psfdae.image.catalogue import as_catalogue
@@ -58,14 +58,14 @@ def photometry(
     found_here = reference is not None and stated.detect
     source = (replace(stated, origin=None) if found_here else stated).source(image)
     check_outputs((out, residual), (*source.files(), reference, model))
-    for path in (out, residual):
-        if path is not None and path.exists() and not overwrite:
-            raise PhotometryError(f"{path}: exists already; --overwrite replaces it")
+    check_targets(out, residual, None, overwrite)
+    if stated.all_extensions:
+        raise PhotometryError(f"{image}: photometry takes one image, not --all-extensions")
     loaded = load_model(model)
     loaded.field_range()  # or it knows no place
     observation = source.open(loaded.info.stamp_px).assuming()
-    if stated.all_extensions or observation.shape is None:
-        raise PhotometryError(f"{image}: photometry takes one image, no cube of stamps")
+    if observation.shape is None:
+        raise PhotometryError(f"{image}: photometry takes an image, no cube of stamps")
     loaded.check_scale(observation.pixel_scale_arcsec, str(image))
     magnitudes = None
     if reference is not None:
@@ -137,14 +137,9 @@ def _said(found: CrowdedPhotometry, image: Path, zero_point: float | None) -> di
         "PSFMODEL": ascii_line(info.name),
         "PSFSHA": found.model.bundle.sha256,
         "FLUXRAD": found.radius_px,
-        "INMODEL": _part_of_model(found),
+        "INMODEL": found.part_of_model()[0],
         **({} if zero_point is None else {"ZEROPT": zero_point}),
     }
-
-
-def _part_of_model(found: CrowdedPhotometry) -> float:
-    """Part of a usual star's flux that the model knows."""
-    return 1.0 if found.wings is None else 1.0 / (1.0 + found.wings.light()[0])
 
 
 def _summary(found: CrowdedPhotometry, out: Path) -> str:
@@ -153,10 +148,10 @@ def _summary(found: CrowdedPhotometry, out: Path) -> str:
     count, measured = len(found.stars), int(np.isfinite(found.stars["flux"]).sum())
     beyond = "no star is bright enough to show light beyond the model's stamp"
     if found.wings is not None:
-        light, error = found.wings.light()
+        part, error = found.part_of_model()
         beyond = (
             f"fluxes are the light within {found.radius_px:.3g} px; the model of the PSF has "
-            f"{100 * _part_of_model(found):.2f} ± {100 * error / (1 + light) ** 2:.2f} % of it"
+            f"{100 * part:.2f} ± {100 * error:.2f} % of it"
         )
     said = f"{out}: {count} stars, {measured} measured"
     if parted := int(np.sum(found.stars["parted"])):

@@ -39,7 +39,7 @@ FOLLOWED = 0.03  # part of a star's light in a pixel by which its PSF may be off
 OUTER, OUTER_RANGE = 0.7, (0.3, 3.0)  # radius of a stamp's outer part over half its side; s
 REACH, TENTS, STEEPNESS = 2.5, 6, 3.0  # radius of the wings in stamps; tents; power of 1/r in them
 WINGED, BAND_PX = 1000, 512  # brightest stars, whose wings are drawn; rows at a time
-CLIPS, CLIPPED_SIGMA = 3, 4.0  # least squares, of which pixels farther off are left out
+CLIPPED_SIGMA = 4.0  # of a pixel from the wings known so far, from which it is left out
 LEAST_SEEN = 3.0  # σ, from which wings and hidden stars are real
 NEAREST_PX = 0.1  # of stars in a group that is to be parted
 PSFS_AT_ONCE = 2048
@@ -71,6 +71,12 @@ class Wings:
         r = np.linspace(0.0, min(radius_px, self.radius_px[-1]), 4001)
         share = np.trapezoid(2 * np.pi * r * tents(r, self.radius_px), r, axis=1)
         return float(self.profile @ share), float(np.sqrt(share @ self.covariance @ share))
+
+    @property
+    def seen(self) -> bool:
+        """The light is no chance."""
+        light, error = self.light()
+        return light > LEAST_SEEN * error
 
 
 @dataclass(frozen=True)
@@ -108,6 +114,11 @@ class CrowdedPhotometry:
             return np.ones(len(x))
         scale = outer_light(self.model, np.stack([x, y], axis=1)) / self.wings.outer
         return 1.0 + np.clip(scale, *OUTER_RANGE) * self.wings.light()[0]
+
+    def part_of_model(self) -> tuple[float, float]:
+        """Part of a usual star's flux that the model knows, and its standard error."""
+        light, error = (0.0, 0.0) if self.wings is None else self.wings.light()
+        return 1.0 / (1.0 + light), error / (1.0 + light) ** 2
 
     def aperture_correction(self, x: float, y: float, radius_px: float) -> float:
         """Flux of a star at a place over what an aperture of a radius about it gets.
@@ -159,7 +170,7 @@ def photometry(model: PsfModel, observation: Observation, threshold: float) -> C
     if observation.saturate is not None:
         bad = bad | (image >= observation.saturate)
     place, flux = np.array(observation.positions, dtype=np.float64), None
-    light, far = np.maximum(sky.flat, 0.0), np.zeros(image.shape)
+    light, far, wings = np.maximum(sky.flat, 0.0), np.zeros(image.shape), None
     for turn in range(ROUNDS):
         flat = image - sky.level - far
         error = np.sqrt(sky.noise**2 + (light / observation.gain if observation.gain else 0.0))
@@ -170,9 +181,9 @@ def photometry(model: PsfModel, observation: Observation, threshold: float) -> C
         outer = outer_light(model, np.nan_to_num(place))
         for _ in range(SKIES):
             left, doubt = image - sky.level - drawn, np.hypot(error, FOLLOWED * drawn)
-            wings = wings_of(left, doubt, bad, place, flux, outer, side)
+            wings = wings_of(left, doubt, bad, place, flux, outer, side, wings)
             far = np.zeros(image.shape)
-            if wings is not None:
+            if wings is not None and wings.seen:
                 for band, tented in _tented(image.shape, place, flux, outer, wings):
                     far[band] = np.tensordot(wings.profile, tented, 1)
             sky = sky_of(image - drawn - far, bad, sky.noise if mapped else None)
@@ -186,7 +197,7 @@ def photometry(model: PsfModel, observation: Observation, threshold: float) -> C
             if real.all():
                 break
             place, flux = place[real], flux[real]
-    return _described(model, table, sky.flat, wings)
+    return _described(model, table, sky.flat, wings if wings is not None and wings.seen else None)
 
 
 def _fitted(
@@ -313,10 +324,12 @@ def wings_of(
     flux: np.ndarray,
     outer: np.ndarray,
     stamp_px: int,
+    before: Wings | None = None,
 ) -> Wings | None:
-    """Wings of stars in what is left of an image (h, w) without sky and models; None if unseen.
+    """Wings of stars in what is left of an image (h, w) without sky and models; None without light.
 
-    An even light that was left beside them, such as a wrong sky, does not count.
+    An even light that was left beside them, such as a wrong sky, does not count. Nor do pixels that
+    are far from the wings as they were known `before`.
     """
     from scipy.optimize import lsq_linear
 
@@ -325,33 +338,27 @@ def wings_of(
     if not lit.any() or not (mean := float(np.average(outer[lit], weights=flux[lit]))) > 0:
         return None
     blank = Wings(radius, np.zeros(TENTS), np.zeros((TENTS, TENTS)), mean)
-    found = None
-    for _ in range(CLIPS):
-        normal, right = np.zeros((TENTS + 1,) * 2), np.zeros(TENTS + 1)
-        square, count = 0.0, 0
-        for band, tented in _tented(left.shape, place, flux, outer, blank):
-            weight = np.where(bad[band], 0.0, 1.0 / error[band])
-            design = np.concatenate([tented, np.ones((1, *weight.shape))]) * weight
-            seen = left[band] * weight
-            if found is not None:
-                off = seen - np.tensordot(found, design, 1)
-                kept = (np.abs(off) < CLIPPED_SIGMA) & (weight > 0)
-                design, seen = design * kept, seen * kept
-                square, count = square + float((off[kept] ** 2).sum()), count + int(kept.sum())
-            flat = design.reshape(TENTS + 1, -1)
-            normal += flat @ flat.T
-            right += flat @ seen.ravel()
-        unit = np.sqrt(normal.diagonal())
-        if not (unit > 0).all():
-            return None
-        scaled = normal / unit / unit[:, None]
-        root = np.linalg.cholesky(scaled + 1e-12 * np.eye(TENTS + 1))
-        bounds = np.array([0.0] * TENTS + [-np.inf]), np.inf
-        found = lsq_linear(root.T, np.linalg.solve(root, right / unit), bounds).x / unit
-    inverse = np.linalg.inv(root @ root.T) / unit / unit[:, None] * max(square / max(count, 1), 1.0)
-    wings = Wings(radius, found[:-1], inverse[:-1, :-1], mean)
-    light, doubt = wings.light()
-    return wings if light > LEAST_SEEN * doubt else None
+    normal, right, square, count = np.zeros((TENTS + 1,) * 2), np.zeros(TENTS + 1), 0.0, 0
+    for band, tented in _tented(left.shape, place, flux, outer, blank):
+        weight = np.where(bad[band], 0.0, 1.0 / error[band])
+        if before is not None:
+            off = (left[band] - np.tensordot(before.profile, tented, 1)) * weight
+            weight = np.where(np.abs(off) < CLIPPED_SIGMA, weight, 0.0)
+        design = np.concatenate([tented, np.ones((1, *weight.shape))]) * weight
+        flat, seen = design.reshape(TENTS + 1, -1), (left[band] * weight).ravel()
+        normal, right = normal + flat @ flat.T, right + flat @ seen
+        square, count = square + float(seen @ seen), count + np.count_nonzero(weight)
+    unit = np.sqrt(normal.diagonal())
+    if not (unit > 0).all():
+        return None
+    root = np.linalg.cholesky(normal / unit / unit[:, None] + 1e-12 * np.eye(TENTS + 1))
+    wanted, bounds = np.linalg.solve(root, right / unit), np.array([0.0] * TENTS + [-np.inf])
+    fit = lsq_linear(root.T, wanted, (bounds, np.inf))
+    found = fit.x / unit
+    # In Σ (seen − design found)², the part that no profile explains is what remains of Σ seen².
+    chi2 = (square - wanted @ wanted + 2.0 * fit.cost) / max(count, 1)
+    inverse = np.linalg.inv(root @ root.T) / unit / unit[:, None] * max(chi2, 1.0)
+    return Wings(radius, found[:-1], inverse[:-1, :-1], mean)
 
 
 def _described(
