@@ -23,11 +23,11 @@ from photutils_grid import drawn, gridded
 from psfdae import load_model
 from psfdae.bright_stars import BrightStars
 from psfdae.cli import main
-from psfdae.commands import psf
 from psfdae.field_law import MOST_NODES, OUTLIER_MODES
 from psfdae.field_psf import fit_field
 from psfdae.method import FitError, TrainingSet
 from psfdae.methods.field import FieldMixture
+from psfdae.model import exchange
 from psfdae.model.bundle import read_bundle, write_bundle
 from psfdae.model.psf_model import PredictionError
 from psfdae.moments import measure_shapes
@@ -612,7 +612,7 @@ def test_thousands_of_places_take_a_line_each_in_the_header_and_no_warning(oblon
     places = np.random.default_rng(1).uniform(100, 900, (3000, 2))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        psf.write(tmp_path / "many.fits", model, places, 4)
+        exchange.write_grid(tmp_path / "many.fits", model, places, 4)
     header = fits.getheader(tmp_path / "many.fits")
     y, x = (float(v) for v in header["DET_YX2999"].strip("()").split(","))
     assert (x, y) == pytest.approx(places[-1], rel=1e-6)
@@ -652,7 +652,8 @@ def test_a_place_without_a_psf_is_named(shipped, monkeypatch, psf):
     """Such as in a damaged model; nothing is drawn there."""
     fixed = np.full((2, 4, 4), 1.0)
     fixed[1] = psf
-    field = SimpleNamespace(psf_at=lambda *_: fixed, facts=dict)
+    model = SimpleNamespace(order=0)
+    field = SimpleNamespace(psf_at=lambda *_: fixed, facts=dict, model=model)
     monkeypatch.setattr(shipped.engine, "estimator", field)
     with pytest.raises(PredictionError, match=r"flux above 0 at x 7, y 8"):
         shipped.psf_at([5.0, 7.0], [6.0, 8.0])

@@ -17,7 +17,6 @@ from __future__ import annotations
 import sys
 from datetime import date
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -195,7 +194,7 @@ def found(stem: str, table: str, named: str) -> None:
 class TrueField:
     """What `psfdae photometry` asks of a model, of the true profile."""
 
-    info = SimpleNamespace(stamp_px=2 * HALF_PX[0])
+    stamp_px = 2 * HALF_PX[0]
 
     def to_photutils(self):
         return true_psf()
@@ -204,13 +203,13 @@ class TrueField:
         return FWHM_PX
 
     def psf_at(self, x, y, oversampling):
-        axis = np.arange(self.info.stamp_px) - self.info.stamp_px // 2
+        axis = np.arange(self.stamp_px) - self.stamp_px // 2
         return np.stack([moffat(*np.meshgrid(axis, axis), *at) for at in np.stack([x, y], axis=1)])
 
 
 def with_truth(stem: str, catalogue: str) -> None:
     """The catalogue of `psfdae photometry --detect` with the true PSF."""
-    observation = Source(Path(f"{stem}.fits"), detect=5.0).open(TrueField.info.stamp_px)
+    observation = Source(Path(f"{stem}.fits"), detect=5.0).open(TrueField.stamp_px)
     crowded.photometry(TrueField(), observation, 5.0).stars.write(catalogue, overwrite=True)
 
 

@@ -15,7 +15,7 @@ from psfdae.errors import Error
 from psfdae.files import atomic_path, check_outputs, write_fits
 from psfdae.image.catalogue import as_catalogue
 from psfdae.image.errors import ascii_line
-from psfdae.model.psf_model import load_model
+from psfdae.model.exchange import load_field
 from psfdae.options import File
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ def photometry(
     residual: Annotated[File | None, "FITS image without its sky and stars."] = None,
     overwrite: Annotated[bool, "Replace files that exist."] = False,
     *,
-    model: Annotated[File, "Bundle of from-stars --method field, of this image."],
+    model: Annotated[File, "Bundle of from-stars --method field, or .psf of PSFEx, of this image."],
     out: Annotated[File, "Table of the stars: .fits, .ecsv or .csv."],
 ) -> None:
     """Measure the fluxes of all stars of IMAGE, overlapping ones together.
@@ -61,16 +61,16 @@ def photometry(
     check_targets(out, residual, None, overwrite)
     if stated.all_extensions:
         raise PhotometryError(f"{image}: photometry takes one image, not --all-extensions")
-    loaded = load_model(model)
+    loaded = load_field(model)
     loaded.field_range()  # or it knows no place
-    observation = source.open(loaded.info.stamp_px).assuming()
+    observation = source.open(loaded.stamp_px).assuming()
     if observation.shape is None:
         raise PhotometryError(f"{image}: photometry takes an image, no cube of stamps")
     loaded.check_scale(observation.pixel_scale_arcsec, str(image))
     magnitudes = None
     if reference is not None:
         listed = replace(stated, catalogue=reference, detect=False, on_image=False)
-        places = listed.source(image).open(loaded.info.stamp_px).positions
+        places = listed.source(image).open(loaded.stamp_px).positions
         magnitudes = places, as_catalogue(reference).numbers(magnitude_column)
 
     from psfdae.model.crowded import photometry as measured
@@ -131,11 +131,10 @@ def _complete(found: CrowdedPhotometry, observation: Any, zero_point: float | No
 
 def _said(found: CrowdedPhotometry, image: Path, zero_point: float | None) -> dict[str, Any]:
     """What the table says of itself."""
-    info = found.model.info
     return {
         "INFILE": ascii_line(image.name),
-        "PSFMODEL": ascii_line(info.name),
-        "PSFSHA": found.model.bundle.sha256,
+        "PSFMODEL": ascii_line(found.model.name),
+        "PSFSHA": found.model.sha256,
         "FLUXRAD": found.radius_px,
         "INMODEL": found.part_of_model()[0],
         **({} if zero_point is None else {"ZEROPT": zero_point}),

@@ -29,7 +29,7 @@ from psfdae.image.observation import Observation
 if TYPE_CHECKING:
     from astropy.table import Table
 
-    from psfdae.model.psf_model import PsfModel
+    from psfdae.model.field_psfs import FieldPsfs
 
 ROUNDS, SKIES = 3, 3  # of fits, at most; of wings and sky in each
 FIT_FWHM, GROUP_FWHM = 1.6, 2.4  # side of the pixels that are fitted; nearest of two groups
@@ -85,7 +85,7 @@ class CrowdedPhotometry:
 
     Attributes
     ----------
-    model : PsfModel
+    model : FieldPsfs
     stars : Table
         A row for each: `id`, `x`, `y` (0-based pixels), `x_error`, `y_error`, `flux` (counts,
         wings included), `flux_error`, `flux_model` (without the wings), `group`, `group_size`,
@@ -97,7 +97,7 @@ class CrowdedPhotometry:
         None if no star is bright enough to show any.
     """
 
-    model: PsfModel
+    model: FieldPsfs
     stars: Table
     residual: np.ndarray
     wings: Wings | None
@@ -105,7 +105,7 @@ class CrowdedPhotometry:
     @property
     def radius_px(self) -> float:
         """Inside of which a flux is the light of its star; that of a stamp without wings."""
-        half = self.model.info.stamp_px / 2
+        half = self.model.stamp_px / 2
         return half if self.wings is None else float(self.wings.radius_px[-1])
 
     def total(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -144,12 +144,12 @@ class CrowdedPhotometry:
         return total / inside
 
 
-def photometry(model: PsfModel, observation: Observation, threshold: float) -> CrowdedPhotometry:
+def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> CrowdedPhotometry:
     """Positions and fluxes of all stars of an image.
 
     Parameters
     ----------
-    model : PsfModel
+    model : FieldPsfs
         That knows the PSF at every place of this image.
     observation : Observation
         The image with its stars. No others are looked for if they are those of a list.
@@ -163,7 +163,7 @@ def photometry(model: PsfModel, observation: Observation, threshold: float) -> C
     ObservationError
         If there is no sky to measure.
     """
-    psf, fwhm, side = model.to_photutils(), model.fwhm_px(), model.info.stamp_px
+    psf, fwhm, side = model.to_photutils(), model.fwhm_px(), model.stamp_px
     sky = observation.sky()
     mapped = np.isfinite(sky.noise_scale)
     image, bad = sky.flat + sky.level, sky.bad
@@ -276,9 +276,9 @@ def _with_hidden(
     return np.concatenate([place, new[alone]]), np.append(flux, left["FLUX_ISO"][alone])
 
 
-def outer_light(model: PsfModel, place: np.ndarray) -> np.ndarray:
+def outer_light(model: FieldPsfs, place: np.ndarray) -> np.ndarray:
     """Light of the PSFs at places (n, 2) in the outer part of their stamps, shape (n,)."""
-    side = model.info.stamp_px
+    side = model.stamp_px
     axis = np.arange(side) - side // 2
     ring = np.hypot(axis[:, None], axis)
     ring = (ring >= OUTER * side / 2) & (ring < side / 2)
@@ -362,7 +362,7 @@ def wings_of(
 
 
 def _described(
-    model: PsfModel, table: Table, left: np.ndarray, wings: Wings | None
+    model: FieldPsfs, table: Table, left: np.ndarray, wings: Wings | None
 ) -> CrowdedPhotometry:
     """The stars with the fluxes that they have with their wings."""
     from astropy.table import Table

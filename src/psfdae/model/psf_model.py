@@ -9,13 +9,12 @@ from dataclasses import fields, replace
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from psfdae.bundle_info import BundleInfo
-from psfdae.errors import Error
 from psfdae.image.observation import Observation
 from psfdae.image.stamps import (
     Stamps,
@@ -36,13 +35,11 @@ from psfdae.model.bundle import (
     read_bundle,
     write_bundle,
 )
+from psfdae.model.field_psfs import FieldPsfs, PredictionError
 from psfdae.model.photometry import FAINT_SNR, KEPT, NOISE_FLOOR, Photometer, Photometry
 from psfdae.model.prediction import Prediction, measured_of, unmeasured
 from psfdae.moments import measure_shapes
 from psfdae.threads import available_cores, in_order, side_by_side
-
-if TYPE_CHECKING:
-    from photutils.psf import GriddedPSFModel
 
 SCALE_TOLERANCE = 0.02  # relative difference of the pixel scale from that of the training
 SNR_TOLERANCE = 1.25  # beyond the trained S/N without a flag: a faint star's is no better known
@@ -51,15 +48,10 @@ MOST_CHI2 = 10.0  # of a star without a flag
 SKY_SIGMA = 5.0  # scatter of the border by which its median may differ from a sky that is given
 FLUX_FACTOR = (0.5, 2.0)  # by which a method may correct the flux of a star
 BLOCK = 256  # stars that a network computes together, always so many: other numbers round otherwise
-MOST_OVERSAMPLED = 32  # values per pixel and axis
 SEEN = 2048  # stars that are measured and described together
 ROWS = 4 * BLOCK  # stars that are read at a time, fewer if their stamps are large
 MARGIN_PX = 2  # by which a star of an image may be moved to centre it
 WHOLE_PX = 32  # larger stamps come in smaller blocks
-
-
-class PredictionError(Error, ValueError):
-    """Stars that a model cannot be applied to; one line with what it takes instead."""
 
 
 def load_model(path: str | Path | None = None) -> PsfModel:
@@ -87,7 +79,7 @@ def load_model(path: str | Path | None = None) -> PsfModel:
     return PsfModel(read_bundle(None if path is None else Path(path)))
 
 
-class PsfModel:
+class PsfModel(FieldPsfs):
     """A trained network with all that it takes to apply it to stars.
 
     Parameters
@@ -234,91 +226,51 @@ class PsfModel:
         with one_thread_each():
             yield from in_order(predicted, chunks, self.engine.threads(threads))
 
-    def psf_at(self, x: ArrayLike, y: ArrayLike, oversampling: int = 4) -> np.ndarray:
-        """PSFs at places of the image of the training, where no star need be.
+    @property
+    def name(self) -> str:
+        """What the bundle calls it."""
+        return self.info.name
 
-        Parameters
-        ----------
-        x, y : float or array, shape (n,)
-            0-based pixel coordinates. The PSF lies at their sub-pixel phase.
-        oversampling : int
-            Values per pixel and axis; each is what a whole pixel there would get.
+    @property
+    def sha256(self) -> str:
+        """Checksum of the bundle."""
+        return self.bundle.sha256
 
-        Returns
-        -------
-        ndarray, shape (m, m) or (n, m, m), float64
-            m is the stamp's side d for an oversampling o of 1, else o d + 1. Index m//2 is the
-            middle of the pixel of the position. The flux is that for which a star in the middle
-            of its pixel has the sum 1 in the d × d pixels of its stamp.
+    @property
+    def stamp_px(self) -> int:
+        """Side of the stamps in pixels."""
+        return self.info.stamp_px
 
-        Raises
-        ------
-        PredictionError
-            If the model's method knows no PSF between the stars, a number is not usable, or the
-            model has no PSF of a finite flux above 0 at a place.
-        """
-        position = np.stack(np.broadcast_arrays(_numbers("x", x), _numbers("y", y)), axis=-1)
-        if position.ndim > 2 or not np.isfinite(position).all():
-            raise PredictionError("positions must be finite, one x and y or arrays of as many")
-        if not 1 <= oversampling <= MOST_OVERSAMPLED:
-            raise PredictionError(f"oversampling {oversampling}: 1 to {MOST_OVERSAMPLED}")
-        field = self.engine.estimator
-        if not isinstance(field, KnowsField):
-            raise PredictionError(
-                f"the model {self.info.name!r}: {field.look.label}: knows the PSF of a star alone, "
-                "not that of a place; psfdae from-stars --method field makes one that does"
-            )
-        with np.errstate(all="ignore"):
-            found = field.psf_at(position.reshape(-1, 2), oversampling)
-        flux = found.sum(axis=(1, 2))
-        usable = np.isfinite(flux) & (flux > 0)
-        if not usable.all():
-            place = position.reshape(-1, 2)[np.argmin(usable)]
-            raise PredictionError(
-                f"the model {self.info.name!r}: damaged, or far outside its image: no PSF of a "
-                f"finite flux above 0 at x {place[0]:.6g}, y {place[1]:.6g}"
-            )
-        return found if position.ndim == 2 else found[0]
+    @property
+    def order(self) -> int:
+        """Order of the field's polynomial; raises as `psf_at`."""
+        return self._field().model.order
 
-    def fwhm_px(self) -> float:
-        """FWHM of the PSF in the middle of the field; raises as `psf_at`."""
-        middle = np.rint(np.mean(self.field_range(), axis=0))
-        return float(measure_shapes(self.psf_at(*middle[:, None], 1)).fwhm_px[0])
-
-    def to_photutils(self, nodes: int = 9, oversampling: int = 4) -> GriddedPSFModel:
-        """The field as photutils' `GriddedPSFModel`, such as `PSFPhotometry` takes.
-
-        Parameters
-        ----------
-        nodes : int
-            Places along either axis, over the field of the training stars.
-        oversampling : int
-            Values per pixel and axis.
-
-        Raises
-        ------
-        PredictionError
-            As `psf_at`.
-        """
-        from astropy.nddata import NDData
-        from photutils.psf import GriddedPSFModel
-
-        axes = np.rint(np.linspace(*self.field_range(), nodes)).T
-        x, y = (a.ravel() for a in np.meshgrid(*axes))
-        meta = {"grid_xypos": list(zip(x, y, strict=True)), "oversampling": oversampling}
-        # Of a class of its own: photutils 3.0 fits groups with the first model of a class.
-        name = f"FieldPSF_{self.bundle.sha256[:12]}_{nodes}_{oversampling}"
-        return type(name, (GriddedPSFModel,), {})(
-            NDData(self.psf_at(x, y, oversampling), meta=meta)
-        )
+    @property
+    def image_px(self) -> tuple[int, int] | None:
+        """Columns and rows of the image of the training stars, if the bundle says it."""
+        size = self.info.config.get("stars", {}).get("image_px")
+        return None if size is None else (size[0], size[1])
 
     def field_range(self) -> tuple[np.ndarray, np.ndarray]:
         """Least and greatest position (x, y) of the training stars; raises as `psf_at`."""
-        self.psf_at(0.0, 0.0, 1)
+        self._field()
         low, high = (np.asarray(self.bundle.weights[name]) for name in ("low", "high"))
         if not (high > low).all():
-            raise PredictionError(f"the model {self.info.name!r} knows no places of its stars")
+            raise PredictionError(f"the model {self.name!r} knows no places of its stars")
         return low, high
+
+    def _field(self) -> Any:
+        field = self.engine.estimator
+        if not isinstance(field, KnowsField):
+            raise PredictionError(
+                f"the model {self.name!r}: {field.look.label}: knows the PSF of a star alone, "
+                "not that of a place; psfdae from-stars --method field makes one that does"
+            )
+        return field
+
+    def _drawn(self, place: np.ndarray, oversampling: int) -> np.ndarray:
+        return np.asarray(self._field().psf_at(place, oversampling))
 
     def check_scale(self, pixel_scale_arcsec: float | None, what: str) -> None:
         """Refuse stars whose pixels are not those of the training.

@@ -1,0 +1,146 @@
+"""`FieldPsfs`: the PSF at every place of an image, of a model of ours or of another program."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from psfdae.errors import Error
+from psfdae.moments import measure_shapes
+
+if TYPE_CHECKING:
+    from photutils.psf import GriddedPSFModel
+
+MOST_OVERSAMPLED = 32  # values per pixel and axis
+
+
+class PredictionError(Error, ValueError):
+    """Stars or places that a model cannot be applied to; one line with what it takes instead."""
+
+
+class FieldPsfs(ABC):
+    """A PSF for every place of an image, and what follows from it alone."""
+
+    @property
+    @abstractmethod
+    def name(self) -> str:
+        """What the model is called."""
+
+    @property
+    @abstractmethod
+    def sha256(self) -> str:
+        """Checksum of the model."""
+
+    @property
+    @abstractmethod
+    def stamp_px(self) -> int:
+        """Side d of the stamps in which PSFs have the sum 1, in pixels."""
+
+    @property
+    @abstractmethod
+    def order(self) -> int:
+        """Order of the polynomial by which the PSF changes over the field; raises as `psf_at`."""
+
+    @property
+    @abstractmethod
+    def image_px(self) -> tuple[int, int] | None:
+        """Columns and rows of the image that the model is of, if known."""
+
+    @abstractmethod
+    def field_range(self) -> tuple[np.ndarray, np.ndarray]:
+        """Least and greatest position (x, y) of the training stars; raises as `psf_at`."""
+
+    @abstractmethod
+    def check_scale(self, pixel_scale_arcsec: float | None, what: str) -> None:
+        """Refuse, by PredictionError, an image `what` whose pixels are not those of the model."""
+
+    @abstractmethod
+    def _drawn(self, place: np.ndarray, oversampling: int) -> np.ndarray:
+        """PSFs (n, m, m) as `psf_at`, at checked places (n, 2)."""
+
+    def psf_at(self, x: ArrayLike, y: ArrayLike, oversampling: int = 4) -> np.ndarray:
+        """PSFs at places of the image of the training, where no star need be.
+
+        Parameters
+        ----------
+        x, y : float or array, shape (n,)
+            0-based pixel coordinates. The PSF lies at their sub-pixel phase.
+        oversampling : int
+            Values per pixel and axis; each is what a whole pixel there would get.
+
+        Returns
+        -------
+        ndarray, shape (m, m) or (n, m, m), float64
+            m is the stamp's side d for an oversampling o of 1, else o d + 1. Index m//2 is the
+            middle of the pixel of the position. The flux is that for which a star in the middle
+            of its pixel has the sum 1 in the d × d pixels of its stamp.
+
+        Raises
+        ------
+        PredictionError
+            If the model's method knows no PSF between the stars, a number is not usable, or the
+            model has no PSF of a finite flux above 0 at a place.
+        """
+        position = np.stack(np.broadcast_arrays(_numbers(x), _numbers(y)), axis=-1)
+        if position.ndim > 2 or not np.isfinite(position).all():
+            raise PredictionError("positions must be finite, one x and y or arrays of as many")
+        if not 1 <= oversampling <= MOST_OVERSAMPLED:
+            raise PredictionError(f"oversampling {oversampling}: 1 to {MOST_OVERSAMPLED}")
+        with np.errstate(all="ignore"):
+            found = self._drawn(position.reshape(-1, 2), oversampling)
+        flux = found.sum(axis=(1, 2))
+        usable = np.isfinite(flux) & (flux > 0)
+        if not usable.all():
+            place = position.reshape(-1, 2)[np.argmin(usable)]
+            raise PredictionError(
+                f"the model {self.name!r}: damaged, or far outside its image: no PSF of a "
+                f"finite flux above 0 at x {place[0]:.6g}, y {place[1]:.6g}"
+            )
+        return found if position.ndim == 2 else found[0]
+
+    def grid(self, columns: int, rows: int) -> np.ndarray:
+        """Places (n, 2), x and y, that are spread over the field; raises as `field_range`."""
+        low, high = self.field_range()
+        x, y = (np.linspace(low[i], high[i], count) for i, count in ((0, columns), (1, rows)))
+        return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+
+    def fwhm_px(self) -> float:
+        """FWHM of the PSF in the middle of the field; raises as `psf_at`."""
+        middle = np.rint(np.mean(self.field_range(), axis=0))
+        return float(measure_shapes(self.psf_at(*middle[:, None], 1)).fwhm_px[0])
+
+    def to_photutils(self, nodes: int = 9, oversampling: int = 4) -> GriddedPSFModel:
+        """The field as photutils' `GriddedPSFModel`, such as `PSFPhotometry` takes.
+
+        Parameters
+        ----------
+        nodes : int
+            Places along either axis, over the field of the training stars.
+        oversampling : int
+            Values per pixel and axis.
+
+        Raises
+        ------
+        PredictionError
+            As `psf_at`.
+        """
+        from astropy.nddata import NDData
+        from photutils.psf import GriddedPSFModel
+
+        x, y = np.rint(self.grid(nodes, nodes)).T
+        meta = {"grid_xypos": list(zip(x, y, strict=True)), "oversampling": oversampling}
+        # Of a class of its own: photutils 3.0 fits groups with the first model of a class.
+        name = f"FieldPSF_{self.sha256[:12]}_{nodes}_{oversampling}"
+        return type(name, (GriddedPSFModel,), {})(
+            NDData(self.psf_at(x, y, oversampling), meta=meta)
+        )
+
+
+def _numbers(values: ArrayLike) -> np.ndarray:
+    array = np.asarray(values)
+    if array.dtype.kind not in "fiub":
+        raise PredictionError(f"positions of type {array.dtype}, expected real numbers")
+    return array.astype(np.float64)

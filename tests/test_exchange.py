@@ -1,0 +1,175 @@
+"""PSFs of a field in files of other programs: what they read is what the model says, and back."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from click.testing import CliRunner
+from photutils.psf import GriddedPSFModel
+
+from psfdae.cli import main
+from psfdae.model import exchange
+from psfdae.model.exchange import PsfexField, load_field
+from psfdae.model.field_psfs import FieldPsfs, PredictionError
+
+galsim = pytest.importorskip("galsim")
+des = pytest.importorskip("galsim.des")
+
+LOW, HIGH = np.array([20.0, 40.0]), np.array([980.0, 640.0])
+PLACES = np.random.default_rng(3).uniform(LOW, HIGH, (10, 2))
+
+
+class Moving(FieldPsfs):
+    """Two Gaussians of the sum 1, of 3 and 4 px FWHM and round and not, mixed over the field."""
+
+    name, sha256, stamp_px, order, image_px = "moving", "0" * 64, 24, 2, (1000, 660)
+
+    def field_range(self):
+        return LOW, HIGH
+
+    def check_scale(self, pixel_scale_arcsec, what):
+        pass
+
+    def _drawn(self, place, oversampling):
+        u, v = (2 * (place - LOW) / (HIGH - LOW) - 1).T
+        axis = np.arange(oversampling * self.stamp_px + (oversampling > 1)) / oversampling
+        axis = axis - self.stamp_px // 2
+        phase = place - np.floor(place + 0.5)
+        part = 0.4 + 0.3 * u - 0.2 * v + 0.1 * u * v
+        x, y = ((axis - p[:, None]) ** 2 / 2 for p in phase.T)
+        found = 0.0
+        for weight, first, second in ((part, 1.3, 1.3), (1 - part, 1.8, 1.5)):
+            rows, columns = np.exp(-y / second**2), np.exp(-x / first**2)
+            unit = weight / (2 * np.pi * first * second)
+            found = found + unit[:, None, None] * rows[:, :, None] * columns[:, None]
+        return found
+
+
+def test_galsim_reads_what_is_written_for_psfex(tmp_path):
+    """At ten places, to 1e-3 of the brightest value: positions, axes, phases, sampling, flux.
+
+    Its Lanczos kernel is of order 3; with 8 samples in a pixel it errs by 1.3e-3.
+    """
+    model, path = Moving(), tmp_path / "m.psf"
+    assert exchange.write_psfex(path, model, 16) < 1e-6
+    read = des.DES_PSFEx(str(path))
+    for x, y in PLACES:
+        wanted = model.psf_at(x, y, 1)
+        psf = read.getPSF(galsim.PositionD(x + 1, y + 1))
+        # Its middle of an even image is half a pixel before index n//2.
+        offset = (x - np.floor(x + 0.5) + 0.5, y - np.floor(y + 0.5) + 0.5)
+        seen = psf.drawImage(nx=24, ny=24, scale=1.0, method="no_pixel", offset=offset).array
+        assert np.abs(seen - wanted).max() < 1e-3 * wanted.max()
+
+
+def test_psfex_comes_back(tmp_path):
+    """What was written is read as the same PSFs, at any sampling, and described alike."""
+    model, path = Moving(), tmp_path / "m.psf"
+    exchange.write_psfex(path, model, 8)
+    back = load_field(path)
+    assert (back.order, back.stamp_px, back.name) == (2, 24, "m")
+    assert np.array(back.field_range()) == pytest.approx(np.array([LOW, HIGH]))
+    for samples in (1, 3, 4):
+        wanted, found = (m.psf_at(*PLACES.T, samples) for m in (model, back))
+        assert found.shape == wanted.shape
+        assert np.abs(found - wanted).max() < 1e-3 * wanted.max()
+    edge, beyond = back.psf_at([980.0, 1500.0], [300.0, 300.0], 1)
+    assert beyond == pytest.approx(edge)
+
+
+def test_photutils_reads_stdpsf(tmp_path):
+    model, path = Moving(), tmp_path / "m.stdpsf.fits"
+    exchange.write_stdpsf(path, model, 7, 5)
+    grid = GriddedPSFModel.read(path)
+    assert list(grid.oversampling) == [4, 4]
+    assert grid.grid_xypos == pytest.approx(np.rint(model.grid(7, 5)))
+    for x, y in PLACES:
+        columns, rows = np.meshgrid(np.rint(x) + np.arange(-8, 9), np.rint(y) + np.arange(-8, 9))
+        wanted = model.psf_at(x, y, 1)[4:21, 4:21]
+        seen = grid.evaluate(columns, rows, 1.0, x, y)
+        assert np.abs(seen - wanted).max() < 1e-3 * wanted.max()
+
+
+def test_the_same_everywhere_is_a_polynomial_of_order_0(tmp_path, monkeypatch):
+    monkeypatch.setattr(Moving, "order", 0)
+    monkeypatch.setattr(Moving, "field_range", lambda self: (LOW, LOW))
+    exchange.write_psfex(tmp_path / "m.psf", Moving(), 2)
+    back = load_field(tmp_path / "m.psf")
+    assert back.order == 0
+    assert back.psf_at(500.0, 500.0, 2) == pytest.approx(Moving().psf_at(*LOW, 2), abs=1e-5)
+    with pytest.raises(PredictionError, match="knows no places"):
+        back.field_range()
+
+
+def altered(path, **cards):
+    """A copy of a .psf file with other cards; None removes one."""
+    out = path.with_name("altered.psf")
+    with fits.open(path) as hdus:
+        for key, value in cards.items():
+            if value is None:
+                del hdus[1].header[key]
+            else:
+                hdus[1].header[key] = value
+        hdus.writeto(out, overwrite=True)
+    return out
+
+
+@pytest.mark.parametrize(
+    ("cards", "message"),
+    [
+        ({"EXTNAME": "OTHER"}, "0 tables PSF_DATA"),
+        ({"POLNAME1": "MAG_AUTO"}, "changes with MAG_AUTO, Y_IMAGE"),
+        ({"POLSCAL1": 0.0}, "out of range"),
+        ({"PSF_SAMP": -1.0}, "out of range"),
+        ({"PSF_SAMP": "half"}, "no model of PSFEx"),
+        ({"POLDEG1": 3}, "out of range"),
+        ({"POLDEG1": 10**6}, "out of range"),
+        ({"POLZERO2": None}, "no model of PSFEx"),
+    ],
+)
+def test_other_tables_are_refused(tmp_path, cards, message):
+    path = tmp_path / "m.psf"
+    exchange.write_psfex(path, Moving(), 2)
+    with pytest.raises(PredictionError, match=message) as error:
+        PsfexField(altered(path, **cards))
+    assert "altered.psf" in str(error.value) and "\n" not in str(error.value)
+
+
+def run(*words):
+    return CliRunner().invoke(main, [str(word) for word in words])
+
+
+@pytest.fixture
+def psfex(tmp_path):
+    exchange.write_psfex(tmp_path / "m.psf", Moving(), 8)
+    return tmp_path / "m.psf"
+
+
+def test_psf_converts_a_model_of_psfex(psfex, tmp_path):
+    done = run("psf", psfex, "--grid", "3x3", "--out", tmp_path / "g.fits")
+    assert done.exit_code == 0, done.output
+    wanted = Moving().psf_at(*np.rint(Moving().grid(3, 3)).T)
+    assert np.abs(fits.getdata(tmp_path / "g.fits") - wanted).max() < 1e-3 * wanted.max()
+    for name, words in (("a.psf", ()), ("a.stdpsf.fits", ("--grid", "3x3"))):
+        done = run("psf", psfex, *words, "--out", tmp_path / name)
+        assert done.exit_code == 0 and (tmp_path / name).is_file(), done.output
+
+
+@pytest.mark.parametrize(
+    ("name", "words", "message"),
+    [
+        ("a.psf", ("--grid", "3x3"), "has the whole field"),
+        ("a.stdpsf.fits", ("--at", "5,5"), "STDPSF has a --grid"),
+        ("a.stdpsf.fits", ("--grid", "3x3", "--oversampling", 2), "4 values per pixel"),
+        ("a.stdpsf.fits", ("--grid", "100x2"), "at most 99 places"),
+        ("x_y_z.stdpsf.fits", ("--grid", "3x3"), "underscores"),
+        ("a.fits", (), "says where"),
+    ],
+)
+def test_files_that_others_cannot_read_are_refused(psfex, tmp_path, name, words, message):
+    done = run("psf", psfex, *words, "--out", tmp_path / name)
+    assert done.exit_code == 2 and message in done.output, done.output
+    assert sorted(Path(tmp_path).iterdir()) == [psfex]
