@@ -14,11 +14,12 @@ from photutils.aperture import CircularAperture
 from scipy.ndimage import uniform_filter
 from scipy.spatial import cKDTree
 
-from psfdae import load_model
+from psfdae import Stars, load_model
 from psfdae.cli import main
-from psfdae.image.observation import Source
+from psfdae.image.observation import Source, cut_image
 from psfdae.model import crowded
-from psfdae.model.psf_model import PredictionError
+from psfdae.model.field_psfs import PredictionError
+from psfdae.model.neighbours import light_of_others
 from psfdae_paper.stars.example import add_stamps, write_field
 
 SIZE, SKY, STAMP, WIDE = 500, 200.0, 10, 81
@@ -284,3 +285,69 @@ def test_what_cannot_be_measured_is_refused_in_one_line(sky, tmp_path):
         assert not out.exists()
     with pytest.raises(PredictionError, match="knows the PSF of a star alone"):
         load_model().to_photutils()
+
+
+def test_light_of_others_leaves_each_star_alone(sky, found):
+    """Stars of pairs, without what their neighbours add: within the noise and 3 % of their peak."""
+    folder, _, true = sky
+    place = np.stack([true["x"], true["y"]], axis=1)
+    pairs = np.flatnonzero(true["pair"])
+    pixels = fits.getdata(folder / "i.fits").astype(float) - SKY
+    cut = (pixels, pixels.shape, *place.T, STAMP, 2)
+    seen = cut_image(*cut)[0]
+    light = light_of_others(found, place)(slice(None), STAMP, 2)
+    middle = slice(WIDE // 2 - STAMP // 2 - 2, WIDE // 2 + STAMP // 2 + 2)
+    own = np.array(true["flux"])[:, None, None] * stamps(*place.T)[:, middle, middle]
+    doubt = np.sqrt(SKY + np.abs(seen)) * 4 + 0.03 * own.max(axis=(1, 2), keepdims=True)
+    off, before = (np.abs(a - own)[pairs] > doubt[pairs] for a in (seen - light, seen))
+    assert off.mean() < 0.01 and before.mean() > 0.05
+
+
+def words_of(stars):
+    return " ".join(stars.notes)
+
+
+def chosen(sky, **settings):
+    few = {"stamp_px": STAMP, "train_stars": 100, "test_stars": 20} | settings
+    return Stars.from_image(sky[0] / "i.fits", sky[0] / "i.csv", **few)
+
+
+def test_stars_are_kept_whose_neighbours_can_be_subtracted(sky, monkeypatch):
+    """Where many are crowded: the stars of pairs are good then, and as alike as single ones."""
+    before = chosen(sky)
+    assert "neighbours" not in words_of(before)
+    monkeypatch.setattr("psfdae.model.stars.MANY_CROWDED", 0.1)
+    after = chosen(sky)
+    assert "neighbours: the light of" in words_of(after)
+    paired = np.array(sky[2]["pair"])
+    assert paired[before.candidates.bright.row].mean() < 0.02
+    assert paired[after.candidates.bright.row].mean() > 0.2 and len(after) > 1.2 * len(before)
+    bright = after.candidates.bright
+    single, images = ~paired[bright.row], bright.aligned()
+    ratio = bright.flux / np.array(sky[2]["flux"])[bright.row]
+    for part in (single, ~single):
+        assert np.median(ratio[part]) == pytest.approx(0.987, abs=0.003)
+        assert ratio[part].std() == pytest.approx(0.011, abs=0.003)
+    means = [images[part].mean(axis=0) for part in (single, ~single)]
+    assert np.abs(means[0] - means[1]).max() < 0.01 * means[0].max()
+    assert after.observation.others is None
+
+
+def test_saturated_stars_are_still_seen_without_their_neighbours(sky, monkeypatch):
+    level = float(np.quantile(fits.getdata(sky[0] / "i.fits"), 0.9995))
+    plain = chosen(sky, saturate=level).candidates.verdict == "saturated"
+    monkeypatch.setattr("psfdae.model.stars.MANY_CROWDED", 0.1)
+    again = chosen(sky, saturate=level)
+    assert "neighbours: the light of" in words_of(again) and plain.sum() > 3
+    assert (again.candidates.verdict[plain] == "saturated").all()
+
+
+def test_images_that_cannot_be_fitted_keep_their_stars(sky, monkeypatch):
+    def fails(*_):
+        raise PredictionError("no model")
+
+    monkeypatch.setattr("psfdae.model.stars.MANY_CROWDED", 0.1)
+    monkeypatch.setattr(crowded, "photometry", fails)
+    stars = chosen(sky)
+    assert "neighbours: their light was not subtracted (no model)" in words_of(stars)
+    assert len(stars) >= 100

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -430,6 +430,8 @@ class Observation:
     found: Catalogue | None  # that made in its place
     _columns: list[np.ndarray] = field(repr=False)  # identifiers, flux, sky and flags of the list
     _layers: Layers = field(repr=False)
+    # Light of other stars in the stamps of a part of the list, of a side and with a margin in px.
+    others: Callable[[slice, int, int], np.ndarray] | None = field(default=None, repr=False)
 
     @property
     def pixel_scale_arcsec(self) -> float | None:
@@ -567,6 +569,10 @@ class Observation:
         wide = max(self.margin, RING_PX)
         where = (self.shape, x, y, self.stamp_px, wide)
         data, inside, truncated = cut_image(pixels, *where)
+        if self.others is not None:
+            full = np.inf if self.saturate is None else self.saturate
+            left = data - self.others(part, self.stamp_px, wide)
+            data = np.where(data >= full, data, left)  # or saturated pixels would not be seen
         masked = ~inside
         if mask is not None:
             masked |= self._layers.bad(cut_image(mask, *where)[0])

@@ -91,8 +91,15 @@ class Candidates:
         )
 
 
-def collect(observation: Observation, settings: CalibrationStars, framing: Stamp) -> Candidates:
+def collect(
+    observation: Observation,
+    settings: CalibrationStars,
+    framing: Stamp,
+    isolation_px: float | None = None,
+) -> Candidates:
     """Measure all stars and choose those that are good enough to learn from.
+
+    No neighbour is nearer than `isolation_px`, by default that of the settings.
 
     The observation has stamps with a margin (a cube: its own, larger ones), of which only
     those of bright stars are kept in memory. CalibrationStarsError says that there are
@@ -108,7 +115,8 @@ def collect(observation: Observation, settings: CalibrationStars, framing: Stamp
     if observation.saturate is None:
         flat = found["highest"] >= piled_up(found["brightest"], found["sky"], snr * noise)
         verdict[flat & (verdict == Verdict.GOOD)] = Verdict.SATURATED
-    close = crowded(found["position"], snr * noise, settings.isolation_px, settings.neighbour_ratio)
+    near = settings.isolation_px if isolation_px is None else isolation_px
+    close = crowded(found["position"], snr * noise, near, settings.neighbour_ratio)
     verdict[close & (verdict == Verdict.GOOD)] = Verdict.CROWDED
     verdict[observation.without_position()] = Verdict.NO_POSITION
     wide, peak, listed = (np.concatenate([k[i] for k in kept]) for i in range(3))

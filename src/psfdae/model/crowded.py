@@ -91,8 +91,8 @@ class CrowdedPhotometry:
         wings included), `flux_error`, `flux_model` (without the wings), `group`, `group_size`,
         `parted` (the group was too large, and is a part of it), `chi2` (reduced, of the pixels of
         the fit), `flags` of photutils.
-    residual : ndarray, shape (h, w)
-        Image without sky and stars, counts.
+    residual, light : ndarray, shape (h, w)
+        Image without sky and stars, and that of all stars, counts.
     wings : Wings or None
         None if no star is bright enough to show any.
     """
@@ -100,6 +100,7 @@ class CrowdedPhotometry:
     model: FieldPsfs
     stars: Table
     residual: np.ndarray
+    light: np.ndarray
     wings: Wings | None
 
     @property
@@ -197,7 +198,9 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
             if real.all():
                 break
             place, flux = place[real], flux[real]
-    return _described(model, table, sky.flat, wings if wings is not None and wings.seen else None)
+    return _described(
+        model, table, sky.flat, drawn + far, wings if wings is not None and wings.seen else None
+    )
 
 
 def _fitted(
@@ -362,14 +365,14 @@ def wings_of(
 
 
 def _described(
-    model: FieldPsfs, table: Table, left: np.ndarray, wings: Wings | None
+    model: FieldPsfs, table: Table, left: np.ndarray, light: np.ndarray, wings: Wings | None
 ) -> CrowdedPhotometry:
     """The stars with the fluxes that they have with their wings."""
     from astropy.table import Table
 
     names = {"id": "id", "x_fit": "x", "y_fit": "y", "x_err": "x_error", "y_err": "y_error"}
     stars = Table({new: np.array(table[old]) for old, new in names.items()})
-    found = CrowdedPhotometry(model, stars, left, wings)
+    found = CrowdedPhotometry(model, stars, left, light, wings)
     total = found.total(*(np.nan_to_num(np.array(stars[axis])) for axis in "xy"))
     stars["flux"], stars["flux_error"] = (table[c] * total for c in ("flux_fit", "flux_err"))
     stars["flux_model"] = table["flux_fit"]

@@ -14,7 +14,7 @@ import numpy as np
 from psfdae.bright_stars import BrightStars
 from psfdae.files import Column, Product
 from psfdae.image.observation import Observation, Source, list_offset
-from psfdae.image.selection import Candidates, advice, collect
+from psfdae.image.selection import Candidates, Verdict, advice, collect
 from psfdae.image.training_images import single_psf, star_grid, training_columns
 from psfdae.model.settings import IMAGE_GROUPS, settings_model, with_keywords
 from psfdae.rng import stream
@@ -26,6 +26,9 @@ if TYPE_CHECKING:
 
 SPLIT, REFERENCE = "held_out", "realisation"
 """Whole stars are held out, and a star itself is what is to be restored."""
+
+MANY_CROWDED = 1.0
+"""Bright stars with neighbours over those without, from which the neighbours are subtracted."""
 
 DETECTED_SIGMA = 5.0
 """σ above the sky from which stars are searched by default."""
@@ -134,9 +137,29 @@ class Stars:
     @classmethod
     def of(cls, source: Source, settings: Any) -> Stars:
         """As `from_image`, of an image with what is stated about it, and settings."""
+        margin = settings.calibration_stars.margin_px
+        observation = source.open(settings.framing.stamp_px, margin).assuming()
+        stars = cls.chosen(source, observation, settings)
+        if not stars.many_crowded:
+            return stars
+        from psfdae.model.neighbours import without_neighbours
+
+        return without_neighbours(stars)
+
+    @classmethod
+    def chosen(
+        cls,
+        source: Source,
+        observation: Observation,
+        settings: Any,
+        isolation_px: float | None = None,
+    ) -> Stars:
+        """The bright stars of an observation; no neighbour is nearer than `isolation_px`.
+
+        By default, the settings say how near one may be.
+        """
         framing, wanted = settings.framing, settings.calibration_stars
-        observation = source.open(framing.stamp_px, wanted.margin_px).assuming()
-        found = collect(observation, wanted, framing)
+        found = collect(observation, wanted, framing, isolation_px)
         bright = found.bright
         off = list_offset(
             observation.catalogue, (bright.centre - bright.listed)[:, ::-1], source.accept_offset
@@ -152,6 +175,14 @@ class Stars:
         sky = bright.sky_photons(observation.gain, settings.noise.background_photons)
         settings = settings.model_copy(update={"noise": _noise(settings, bright, sky)})
         return cls(source, observation, found, held_out, columns, settings, tuple(notes))
+
+    @property
+    def many_crowded(self) -> bool:
+        """So many bright stars of an image have neighbours that it pays to subtract these."""
+        if self.observation.shape is None or not np.isfinite(self.candidates.bright.position).all():
+            return False
+        crowded = np.count_nonzero(self.candidates.verdict == Verdict.CROWDED)
+        return bool(crowded >= MANY_CROWDED * len(self))
 
     def __repr__(self) -> str:
         return f"Stars({str(self.observation.path)!r}, {self.summary()})"

@@ -1,0 +1,119 @@
+"""Bright stars of a crowded image without the light of their neighbours.
+
+Where many bright stars have a neighbour, a model of the field is made of those that have none. All
+stars are then fitted with it, and in the stamp of each star the light of all others is subtracted,
+so that stars can be learnt from whose neighbours are further away than `NEAREST_FWHM`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from psfdae.errors import Error
+from psfdae.image.observation import cut_image
+from psfdae.method import Method
+from psfdae.methods import method
+from psfdae.model import crowded
+from psfdae.model.field_psfs import FieldPsfs
+from psfdae.model.fitting import fitted_to
+from psfdae.model.stars import DETECTED_SIGMA, Stars
+
+NEAREST_FWHM = 1.25  # of a neighbour whose light can be told from that of its star
+SAME_PX = 1.5  # from a star of the list to the same star as it was fitted
+
+
+class _Field(FieldPsfs):
+    """The field that a fit knows, without the calibration that a model in a bundle has."""
+
+    name, image_px = "of stars without neighbours", None
+
+    def __init__(self, fitted: Method, stamp_px: int) -> None:
+        self.fitted, self._side = fitted, stamp_px
+
+    @property
+    def stamp_px(self) -> int:
+        return self._side
+
+    @property
+    def order(self) -> int:
+        return int(self.fitted.model.order)
+
+    @property
+    def sha256(self) -> str:
+        return hashlib.sha256(self.fitted.coefficients.tobytes()).hexdigest()
+
+    def field_range(self) -> tuple[np.ndarray, np.ndarray]:
+        return self.fitted.low, self.fitted.high
+
+    def check_scale(self, pixel_scale_arcsec: float | None, what: str) -> None:
+        """It is of the image that it is applied to."""
+
+    def _drawn(self, place: np.ndarray, oversampling: int) -> np.ndarray:
+        return np.asarray(self.fitted.psf_at(place, oversampling))
+
+
+def without_neighbours(stars: Stars) -> Stars:
+    """The stars of the same image, each without the light of all others.
+
+    What they were is what comes back if their image cannot be fitted, with a note that says why.
+    """
+    kind = method("field")
+    field = _Field(fitted_to(stars, kind), stars.settings.framing.stamp_px)
+    observation = stars.observation
+    try:
+        found = crowded.photometry(field, observation, DETECTED_SIGMA)
+        fwhm = field.fwhm_px()
+        alone = replace(observation, others=light_of_others(found, observation.positions))
+        again = Stars.chosen(stars.source, alone, stars.settings, NEAREST_FWHM * fwhm)
+    except Error as error:
+        note = f"neighbours: their light was not subtracted ({error})"
+        return replace(stars, notes=(*stars.notes, note))
+    said = (
+        f"neighbours: the light of {len(found.stars)} stars was subtracted in the others' stamps; "
+        f"{len(stars)} stars are good with no neighbour within "
+        f"{stars.settings.calibration_stars.isolation_px:g} px, {len(again)} with none within "
+        f"{NEAREST_FWHM * fwhm:.2g} px"
+    )
+    return replace(again, observation=observation, notes=(*again.notes, said))
+
+
+def light_of_others(
+    found: crowded.CrowdedPhotometry, place: np.ndarray
+) -> Callable[[slice, int, int], np.ndarray]:
+    """Light of all stars of an image but the one in the middle, for stamps of stars of a list.
+
+    Parameters
+    ----------
+    found : CrowdedPhotometry
+    place : ndarray, shape (n, 2)
+        Positions of the list, x and y.
+
+    Returns
+    -------
+    callable
+        Of a part of the list, the side of the stamps and the margin around them, as
+        `psfdae.image.observation.cut_image` cuts them; (m, s, s), s with both margins.
+    """
+    from scipy.spatial import cKDTree
+
+    stars = found.stars
+    fitted = np.stack([stars["x"], stars["y"]], axis=1)
+    known = np.flatnonzero(np.isfinite(fitted).all(axis=1) & np.isfinite(stars["flux_model"]))
+    off, nearest = cKDTree(fitted[known]).query(np.nan_to_num(place, nan=-np.inf))
+    psf = found.model.to_photutils()
+
+    def light(part: slice, stamp_px: int, margin: int) -> np.ndarray:
+        x, y = place[part].T
+        stamps = cut_image(found.light, found.light.shape, x, y, stamp_px, margin)[0]
+        axis = np.arange(stamps.shape[-1]) - stamp_px // 2 - margin
+        for row in np.flatnonzero(off[part] <= SAME_PX):
+            star = known[nearest[part][row]]
+            columns, rows = np.meshgrid(np.rint(x[row]) + axis, np.rint(y[row]) + axis)
+            stamps[row] -= psf.evaluate(columns, rows, stars["flux_model"][star], *fitted[star])
+        return stamps
+
+    return light
