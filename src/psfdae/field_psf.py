@@ -38,6 +38,9 @@ UNLIKE_SIGMA = 3.0  # of a pixel, from which it counts less: it may show a neigh
 UNLIKE_CHI2 = 8.0  # times the median, from which a star does not count
 CURVED = 2  # order up to which all are tried: a symmetric field has no slope
 SMOOTHER, SMOOTHER_BY = 3, 10.0  # steps of the smoothness, each by this factor, that are tried
+EXPOSURE_CHANGES = (0.005, 0.02, 0.1)  # of a coefficient by that of another exposure, tried
+LARGEST_DEFORMATION = 0.3  # usual stretch of a PSF in another exposure; px² of its blur
+HIGHER_CHANGE = 0.3  # times this, of terms beyond the constant
 FOLDS, ENOUGH_STARS = 5, 300  # left out, of which one fold after the other is predicted
 TOLERANCE, ITERATIONS = 1e-4, 150  # of the conjugate gradients
 
@@ -146,8 +149,31 @@ def fit_field(
     return best
 
 
+def refit_field(
+    prior: FieldModel,
+    stars: BrightStars,
+    background: float,
+    frame_px: int,
+    stamp_px: int,
+    smoothness: float,
+) -> FieldFit:
+    """Fit another exposure of a field, of which its stars show how it differs from `prior`.
+
+    Stars that are left out say how much it may. Other parameters are those of `fit_field`, to
+    which the stars of the prior came in the same frames.
+    """
+    sizes = (background, frame_px, stamp_px, prior.spacing, smoothness)
+    alternating, fits = _Alternating(stars, *sizes, prior), []
+    for alternating.change in EXPOSURE_CHANGES:
+        fit = alternating.fit(prior.order)
+        fits.append((alternating.crossed_error(fit), fit))
+    return min(fits, key=lambda found: found[0])[1]
+
+
 class _Alternating:
-    """Rounds of a fit to stars."""
+    """Rounds of a fit to stars, and to what is known of the field from other exposures."""
+
+    change = 0.0
 
     def __init__(
         self,
@@ -157,7 +183,9 @@ class _Alternating:
         stamp_px: int,
         spacing: float,
         smoothness: float,
+        prior: FieldModel | None = None,
     ) -> None:
+        self.prior = prior
         self.images, self.seen = stars.framed(side)
         self.noise, self.position = stars.noise, stars.position
         self.photons = np.sqrt(background) * stars.flux / stars.noise
@@ -168,6 +196,8 @@ class _Alternating:
         known = self.position[np.isfinite(self.position).all(axis=1)]
         known = known if len(known) else np.zeros((1, 2))
         self.low, self.high = known.min(axis=0), known.max(axis=0)
+        if prior is not None:
+            self.low, self.high = prior.low, prior.high
         bend = np.diff(np.eye(self.knots), 2, axis=0)
         self.bend = bend.T @ bend
 
@@ -220,6 +250,8 @@ class _Alternating:
             used = weight * ((fold != left_out) & fit.good)[:, None, None]
             found = self._splines(terms, data, used, fit.centre, fit.model.coefficients)
             judged = np.flatnonzero((fold == left_out) & fit.good)
+            if not len(judged):
+                continue
             images, even = data[box][judged], self.seen[box][judged].astype(float)
             splines = np.tensordot(terms[judged], found, 1)
             _, _, left = _adjusted(
@@ -241,6 +273,36 @@ class _Alternating:
         return np.where(
             self.seen, 1.0 / (variance + (MODEL_ERROR * light) ** 2 + LEAST_ERROR**2), 0.0
         )
+
+    def _deformed(
+        self,
+        prior: FieldModel,
+        terms: np.ndarray,
+        data: np.ndarray,
+        weight: np.ndarray,
+        rows: np.ndarray,
+        columns: np.ndarray,
+    ) -> np.ndarray:
+        """Splines of another exposure, stretched and blurred as its stars (n, s, s) show it.
+
+        Their fluxes may be wrong: what is proportional to a star says nothing of its shape.
+        """
+
+        def seen(splines: np.ndarray) -> np.ndarray:
+            image = rows @ np.tensordot(terms, splines, 1) @ columns
+            return (image * np.sqrt(weight)).reshape(len(terms), -1)
+
+        changes = _deformations(prior.coefficients, prior.spacing)
+        star = seen(prior.coefficients)
+        star /= np.linalg.norm(star, axis=1, keepdims=True)
+        left = (np.sqrt(weight) * data).reshape(len(terms), -1)
+        shapes = np.stack([*map(seen, changes), left])
+        shapes -= (shapes * star).sum(axis=2, keepdims=True) * star
+        shapes = shapes.reshape(len(shapes), -1)
+        products = shapes @ shapes.T
+        normal = products[:-1, :-1] + np.eye(len(changes)) / LARGEST_DEFORMATION**2
+        amounts = np.linalg.solve(normal, products[:-1, -1])
+        return np.asarray(prior.coefficients + np.tensordot(amounts, changes, 1))
 
     def _splines(
         self,
@@ -264,8 +326,13 @@ class _Alternating:
         penalty = np.full(shape[0], HIGHER_SMOOTHNESS * self.smoothness)
         penalty[0] = self.smoothness
         penalty = penalty[:, None, None]
-        ridge = np.full(shape, RIDGE)
-        if start is not None:
+        ridge, known = np.full(shape, RIDGE), np.zeros(shape)
+        if self.prior is not None:
+            known = self._deformed(self.prior, terms, data, weight, rows, columns_t)
+            ridge[:] = 1.0 / (self.change * np.abs(known[0]) + LEAST_CHANGE) ** 2
+            ridge[1:] /= HIGHER_CHANGE**2
+            data = data - rows @ np.tensordot(terms, known, 1) @ columns_t
+        elif start is not None:
             ridge[1:] = 1.0 / (CHANGE * np.abs(start[0]) + LEAST_CHANGE) ** 2
 
         def normal(flat: np.ndarray) -> np.ndarray:
@@ -291,12 +358,26 @@ class _Alternating:
         found, _ = cg(
             LinearOperator(size, matvec=normal, dtype=float),
             (terms.T @ wanted).ravel(),
-            None if start is None else start.ravel(),
+            None if start is None else (start - known).ravel(),
             rtol=TOLERANCE,
             maxiter=ITERATIONS,
             M=LinearOperator(size, matvec=nearly, dtype=float),
         )
-        return np.asarray(found).reshape(shape)
+        return np.asarray(found).reshape(shape) + known
+
+
+def _deformations(coefficients: np.ndarray, spacing: float) -> np.ndarray:
+    """Changes of splines (K, N, N) by stretching and by blurring them, along three axes each.
+
+    Shape (6, K, N, N): a change of one is that of r → r (1 − a), or of a² added to the variance.
+    """
+    place = (np.arange(coefficients.shape[-1]) - (coefficients.shape[-1] - 1) / 2) * spacing
+    along_y, along_x = (np.gradient(coefficients, spacing, axis=axis) for axis in (1, 2))
+    yy, xy = (np.gradient(along_y, spacing, axis=axis) for axis in (1, 2))
+    xx = np.gradient(along_x, spacing, axis=2)
+    x, y = place, place[:, None]
+    stretched = (x * along_x, y * along_y, x * along_y + y * along_x)
+    return np.stack([*stretched, xx, yy, xy])
 
 
 def _terms(position: np.ndarray, low: np.ndarray, high: np.ndarray, order: int) -> np.ndarray:

@@ -12,8 +12,9 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
+from psfdae.bright_stars import BrightStars
 from psfdae.field_law import MARGIN_PX, Asked, FieldLaw, FieldSettings, parts_of, phases_of
-from psfdae.field_psf import FieldFit, fit_field
+from psfdae.field_psf import FieldFit, fit_field, refit_field
 from psfdae.method import (
     Estimate,
     FitError,
@@ -97,6 +98,27 @@ class FieldMixture(FieldLaw, Method):
             listed=_list_error((fit.centre + bright.peak - bright.listed)[fit.good]),
             noise=data.noise,
             settings=field,
+        )
+
+    def of_exposure(self, bright: BrightStars, background: float) -> Self:
+        """This model for another exposure of the same field, by its few bright stars.
+
+        The residuals of stars about the field stay those of the training, and so does the error of
+        the star list if too few stars show that of the new one.
+
+        Parameters
+        ----------
+        bright : BrightStars
+        background : float
+            Photons of the sky in a pixel.
+        """
+        sizes = (self.side + 2 * MARGIN_PX, self.side, self.settings.smoothness)
+        fit = refit_field(self.model, bright, background, *sizes)
+        listed = _list_error((fit.centre + bright.peak - bright.listed)[fit.good])
+        return replace(
+            self,
+            coefficients=fit.model.coefficients.astype(np.float32),
+            listed=listed if np.isfinite(listed).all() else self.listed,
         )
 
     @classmethod

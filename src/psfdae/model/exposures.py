@@ -1,0 +1,93 @@
+"""A field model of one exposure for another one, which may have few bright stars of its own."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from psfdae.image.observation import Source
+from psfdae.image.selection import collect
+from psfdae.methods.field import FieldMixture
+from psfdae.model.bundle import creation_date
+from psfdae.model.field_psfs import PredictionError
+from psfdae.model.psf_model import PsfModel
+from psfdae.model.settings import of_config
+from psfdae.version import __version__
+
+FEWEST_STARS = 5
+"""Bright stars of an exposure, of which one can be left out to judge the others."""
+
+
+def exposure(model: PsfModel, source: Source, name: str) -> tuple[PsfModel, str]:
+    """A model for another exposure of the same camera, by its own bright stars.
+
+    The PSF at a place changes from that of `model` by as much as the stars that are left out
+    support. The scatter of stars about the field, and the calibration of errors, stay those of the
+    training of `model`.
+
+    Parameters
+    ----------
+    model : PsfModel
+        Of the method field, of an exposure with many stars.
+    source : Source
+        The other exposure, and what is stated about it.
+    name : str
+        Of the new model.
+
+    Returns
+    -------
+    model : PsfModel
+    said : str
+        How many stars it rests on.
+
+    Raises
+    ------
+    PredictionError
+        If `model` knows no places, was adapted itself, or is of pixels of another size.
+    Error
+        If the image cannot be used, or has too few bright stars.
+    """
+    model.field_range()
+    info, field = model.info, model.engine.estimator
+    if not isinstance(field, FieldMixture):
+        raise PredictionError(f"the model {model.name!r}: of {field.look.label}, expected a field")
+    trained = info.config["stars"]
+    if "adapted" in trained:
+        raise PredictionError(
+            f"the model {model.name!r} was itself adapted to {trained['image']}; expected that of "
+            "the exposure it was trained on"
+        )
+    settings = of_config({key: trained[key] for key in ("calibration_stars", "framing")})
+    wanted = settings.calibration_stars.model_copy(update={"stars_min": FEWEST_STARS})
+    observation = source.open(info.stamp_px, wanted.margin_px).assuming()
+    if observation.shape is None:
+        raise PredictionError(f"{observation.path}: a cube of stamps; expected an image")
+    model.check_scale(observation.pixel_scale_arcsec, str(observation.path))
+    bright = collect(observation, wanted, settings.framing).bright
+    if not np.isfinite(bright.position).all():
+        raise PredictionError(f"{observation.path}: positions of bright stars are not known")
+    sky = bright.sky_photons(observation.gain, field.noise.background)
+    arrays, _ = field.of_exposure(bright, sky).pack(info.stamp_px, info.noise_min)
+    changed = {key: arrays[key].astype(model.bundle.weights[key].dtype) for key in CHANGED}
+    image = {
+        "image": observation.path.name,
+        "image_sha256": observation.sha256(),
+        "image_px": [*reversed(observation.shape)],
+        "adapted": {"from": model.sha256, "stars": len(bright)},
+    }
+    described = info.model_copy(
+        update={
+            "name": name,
+            "created": creation_date(),
+            "psfdae_version": __version__,
+            "config": info.config | {"stars": trained | image},
+        }
+    )
+    bundle = replace(model.bundle, info=described, weights={**model.bundle.weights, **changed})
+    said = f"{len(bright)} stars of {observation.path.name} change the field of {model.name}"
+    return PsfModel(bundle), said
+
+
+CHANGED = ("coefficients", "listed")
+"""Arrays of a bundle that an exposure has of its own."""
