@@ -90,7 +90,7 @@ class CrowdedPhotometry:
         A row for each: `id`, `x`, `y` (0-based pixels), `x_error`, `y_error`, `flux` (counts,
         wings included), `flux_error`, `flux_model` (without the wings), `group`, `group_size`,
         `parted` (the group was too large, and is a part of it), `chi2` (reduced, of the pixels of
-        the fit), `flags` of photutils.
+        the fit), `flags` of photutils. Errors are √χ² times those of the noise where χ² > 1.
     residual, light : ndarray, shape (h, w)
         Image without sky and stars, and that of all stars, counts.
     wings : Wings or None
@@ -375,6 +375,11 @@ def _described(
     found = CrowdedPhotometry(model, stars, left, light, wings)
     total = found.total(*(np.nan_to_num(np.array(stars[axis])) for axis in "xy"))
     stars["flux"], stars["flux_error"] = (table[c] * total for c in ("flux_fit", "flux_err"))
+    # Light that no model explains, of the PSF's own errors or of stars that nobody sees, is as much
+    # in the fluxes as in the residuals.
+    chi2 = np.array(table["reduced_chi2"], dtype=np.float64)
+    for name in ("x_error", "y_error", "flux_error"):
+        stars[name] *= np.sqrt(np.fmax(chi2, 1.0))
     stars["flux_model"] = table["flux_fit"]
     stars["group"], stars["group_size"] = table["group_id"], table["group_size"]
     stars["parted"] = table["parted"]
