@@ -296,6 +296,17 @@ def crowded_found():
     return pd.DataFrame([said | {"coverage": each(100 * own.coverage68, ".0f")}])
 
 
+def exposures():
+    """Error of a field of 10 stars and another exposure over that of 100 stars, over the draws."""
+    table = csv("studies/exposures/draws.csv")
+    table = table[table.commit == table.commit.iloc[-1]]
+    over = table[["10_and_first", "10_and_second"]].div(table.own_100, axis=0)
+    alone = table.own_10 / table.own_100
+    said = {"median": " and ".join(f"{v:.2f}" for v in over.median()), "draws": len(table)}
+    said |= {"above": int((over > 1.15).sum().sum()), "fits": over.size}
+    return pd.DataFrame([said | {"most": over.max().max(), "alone": alone.median()}])
+
+
 def crowded_apertures():
     """RMS error of aperture corrections over places and images, in words."""
     table = csv("studies/crowded_sky/apertures.csv")

@@ -40,6 +40,7 @@ CURVED = 2  # order up to which all are tried: a symmetric field has no slope
 SMOOTHER, SMOOTHER_BY = 3, 10.0  # steps of the smoothness, each by this factor, that are tried
 EXPOSURE_CHANGES = (0.005, 0.02, 0.1)  # of a coefficient by that of another exposure, tried
 LARGEST_DEFORMATION = 0.3  # usual stretch of a PSF in another exposure; px² of its blur
+DEFORMATION_STEPS = 3  # of Gauss-Newton
 HIGHER_CHANGE = 0.3  # times this, of terms beyond the constant
 FOLDS, ENOUGH_STARS = 5, 300  # left out, of which one fold after the other is predicted
 TOLERANCE, ITERATIONS = 1e-4, 150  # of the conjugate gradients
@@ -292,17 +293,18 @@ class _Alternating:
             image = rows @ np.tensordot(terms, splines, 1) @ columns
             return (image * np.sqrt(weight)).reshape(len(terms), -1)
 
-        changes = _deformations(prior.coefficients, prior.spacing)
-        star = seen(prior.coefficients)
-        star /= np.linalg.norm(star, axis=1, keepdims=True)
         left = (np.sqrt(weight) * data).reshape(len(terms), -1)
-        shapes = np.stack([*map(seen, changes), left])
-        shapes -= (shapes * star).sum(axis=2, keepdims=True) * star
-        shapes = shapes.reshape(len(shapes), -1)
-        products = shapes @ shapes.T
-        normal = products[:-1, :-1] + np.eye(len(changes)) / LARGEST_DEFORMATION**2
-        amounts = np.linalg.solve(normal, products[:-1, -1])
-        return np.asarray(prior.coefficients + np.tensordot(amounts, changes, 1))
+        found = prior.coefficients
+        for _ in range(DEFORMATION_STEPS):
+            changes, star = _deformations(found, prior.spacing), seen(found)
+            star /= np.linalg.norm(star, axis=1, keepdims=True)
+            shapes = np.stack([*map(seen, changes), left])
+            shapes -= (shapes * star).sum(axis=2, keepdims=True) * star
+            shapes = shapes.reshape(len(shapes), -1)
+            products = shapes @ shapes.T
+            normal = products[:-1, :-1] + np.eye(len(changes)) / LARGEST_DEFORMATION**2
+            found = found + np.tensordot(np.linalg.solve(normal, products[:-1, -1]), changes, 1)
+        return np.asarray(found)
 
     def _splines(
         self,
@@ -372,9 +374,14 @@ def _deformations(coefficients: np.ndarray, spacing: float) -> np.ndarray:
     Shape (6, K, N, N): a change of one is that of r → r (1 − a), or of a² added to the variance.
     """
     place = (np.arange(coefficients.shape[-1]) - (coefficients.shape[-1] - 1) / 2) * spacing
-    along_y, along_x = (np.gradient(coefficients, spacing, axis=axis) for axis in (1, 2))
-    yy, xy = (np.gradient(along_y, spacing, axis=axis) for axis in (1, 2))
-    xx = np.gradient(along_x, spacing, axis=2)
+
+    def slope(values: np.ndarray, axis: int) -> np.ndarray:
+        """Of a polynomial through five knots."""
+        near, far = (np.roll(values, -k, axis) - np.roll(values, k, axis) for k in (1, 2))
+        return (8.0 * near - far) / (12.0 * spacing)
+
+    along_y, along_x = (slope(coefficients, axis) for axis in (1, 2))
+    yy, xy, xx = slope(along_y, 1), slope(along_y, 2), slope(along_x, 2)
     x, y = place, place[:, None]
     stretched = (x * along_x, y * along_y, x * along_y + y * along_x)
     return np.stack([*stretched, xx, yy, xy])
