@@ -111,6 +111,8 @@ def test_the_command_writes_a_model_that_predict_takes(sky):
     done = run("exposure", *of, "--model", model, "--out", out)
     assert done.exit_code == 0 and "10 stars of sparse.fits" in done.output, done.output
     assert run("exposure", *of, "--model", model, "--out", out).exit_code == 2
+    assert "sparse.fits, by 10 of its stars" in run("describe", out).output
+    assert "Adapted" not in run("describe", model).output
     assert run("predict", *of, "--model", out, "--out", folder / "p.fits").exit_code == 0
     assert error(load_model(out), 1.04) < 0.2 * error(load_model(model), 1.04)
     done = run("exposure", *of, "--model", out, "--out", folder / "second.psf.safetensors")

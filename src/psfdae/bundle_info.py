@@ -122,6 +122,15 @@ class BundleInfo(_Described):
             return 1.0 if self.dae else 0.0  # the network is given no λ
 
     @property
+    def adapted(self) -> str | None:
+        """To which exposure the model was adapted after its training, and by how many stars."""
+        try:
+            stars = self.config["stars"]
+            return f"{stars['image']}, by {int(stars['adapted']['stars'])} of its stars"
+        except (KeyError, TypeError, ValueError):
+            return None
+
+    @property
     def scale_assumed(self) -> bool:
         """Whether nothing said the pixel scale of the image that it was trained on."""
         try:

@@ -95,6 +95,7 @@ def _facts(packed: Bundle) -> dict[str, str]:
         **own,
         "Trained on": f"{info.training_stars} {_KINDS[info.source]}, "
         f"SHA-256 {info.training_sha256[:16]}…",
+        **({"Adapted to": f"{info.adapted}, after its training"} if info.adapted else {}),
         "Distance limit": f"{packed.distance_limit:.3g} in {info.components} components",
     }
 
