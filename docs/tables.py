@@ -299,7 +299,6 @@ def crowded_found():
 def exposures():
     """Error of a field of 10 stars and another exposure over that of 100 stars, over the draws."""
     table = csv("studies/exposures/draws.csv")
-    table = table[table.commit == table.commit.iloc[-1]]
     over = table[["10_and_first", "10_and_second"]].div(table.own_100, axis=0)
     alone = table.own_10 / table.own_100
     said = {"median": " and ".join(f"{v:.2f}" for v in over.median()), "draws": len(table)}
