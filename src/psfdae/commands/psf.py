@@ -95,14 +95,10 @@ def _notes(model: FieldPsfs, places: np.ndarray) -> list[str]:
                 f"{x:g},{y:g} is off the image of {size[0]} columns and {size[1]} rows that the "
                 f"model {model.name!r} was trained on"
             )
-    if order == 0:
-        if len(places) > 1:
-            notes.append(
-                "the PSF is the same everywhere (order 0: more is not supported by stars left "
-                f"out): all {len(places)} PSFs are equal"
-            )
-        return notes
-    low, high = model.field_range()
+    try:
+        low, high = model.field_range()
+    except PredictionError:  # of stars without positions, which have one PSF
+        low, high = np.full((2, 2), (-np.inf, np.inf)).T
     if beyond := int(((places < low) | (places > high)).any(axis=1).sum()):
         x, y = (
             f"{a} {least:.6g} … {most:.6g}" for a, least, most in zip("xy", low, high, strict=True)
@@ -110,5 +106,10 @@ def _notes(model: FieldPsfs, places: np.ndarray) -> list[str]:
         notes.append(
             f"{beyond} of {len(places)} places are beyond the training stars, {x}, {y}; the PSF "
             "there is that of their edge"
+        )
+    if order == 0 and len(places) > 1:
+        notes.append(
+            "the PSF is the same everywhere (order 0: more is not supported by stars left "
+            f"out): all {len(places)} PSFs are equal"
         )
     return notes
