@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from psfdae import PredictionError, load_model
+from psfdae import PredictionError, PsfModel, load_model
 from psfdae.cli import main
 from psfdae.field_psf import fit_field
 from psfdae.image.observation import Source
@@ -125,6 +125,9 @@ def test_what_cannot_be_adapted_is_said(sky, tmp_path):
         exposure(model, replace(sparse, pixel_scale_arcsec=0.5), "x")
     with pytest.raises(PredictionError, match="knows the PSF of a star alone"):
         exposure(load_model(), sparse, "x")
+    silent = model.info.model_copy(update={"config": {"train": model.info.config["train"]}})
+    with pytest.raises(PredictionError, match="does not say how its stars were chosen"):
+        exposure(PsfModel(replace(model.bundle, info=silent)), sparse, "x")
     few = simulated(tmp_path, "few", 4, 4, 1.0)
     done = run(
         *("exposure", few.image, "--catalogue", tmp_path / "few.csv"),

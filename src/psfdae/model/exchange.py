@@ -28,7 +28,7 @@ PSFEX, STDPSF = ".psf", ".stdpsf.fits"
 LANCZOS = 4  # order of the kernel, as of PSFEx
 STDPSF_SAMPLES, PSFEX_SAMPLES = 4, 8  # values per pixel and axis
 STDPSF_PLACES = 99  # along an axis, at most
-LARGEST_PSF = 1025  # samples along an axis of a file of PSFEx
+LARGEST_PSF = 1025  # samples, and pixels, along an axis of a file of PSFEx
 HIGHEST_ORDER = 12
 NO_WIDTH = 1.0  # of a field in pixels, whose places nobody knows
 AT_ONCE = 2**20  # values of PSFs that are made before they are written
@@ -106,6 +106,7 @@ class PsfexField(FieldPsfs):
             and len(self.terms) == len(mask)
             and 1 < side <= max(mask.shape[-2:]) <= LARGEST_PSF
             and 0.01 < self.step <= 10
+            and side * self.step <= LARGEST_PSF
             and np.isfinite([zero, width]).all()
             and (width > 0).all()
             and np.isfinite(mask).all()

@@ -52,13 +52,18 @@ def exposure(model: PsfModel, source: Source, name: str) -> tuple[PsfModel, str]
     info, field = model.info, model.engine.estimator
     if not isinstance(field, FieldMixture):
         raise PredictionError(f"the model {model.name!r}: of {field.look.label}, expected a field")
-    trained = info.config["stars"]
-    if "adapted" in trained:
+    if info.adapted:
         raise PredictionError(
-            f"the model {model.name!r} was itself adapted to {trained['image']}; expected that of "
-            "the exposure it was trained on"
+            f"the model {model.name!r} was itself adapted to {info.adapted}; expected that of the "
+            "exposure it was trained on"
         )
-    settings = of_config({key: trained[key] for key in ("calibration_stars", "framing")})
+    try:
+        trained = info.config["stars"]
+        settings = of_config({key: trained[key] for key in ("calibration_stars", "framing")})
+    except (KeyError, TypeError):
+        raise PredictionError(
+            f"the model {model.name!r} does not say how its stars were chosen"
+        ) from None
     wanted = settings.calibration_stars.model_copy(update={"stars_min": FEWEST_STARS})
     observation = source.open(info.stamp_px, wanted.margin_px).assuming()
     if observation.shape is None:
