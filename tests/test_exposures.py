@@ -10,7 +10,7 @@ from click.testing import CliRunner
 
 from psfdae import PredictionError, PsfModel, load_model
 from psfdae.cli import main
-from psfdae.field_psf import fit_field
+from psfdae.field_psf import _deformations, fit_field
 from psfdae.image.observation import Source
 from psfdae.model.exposures import exposure
 from psfdae.model.stars import Stars
@@ -148,3 +148,18 @@ def test_without_other_stars_the_field_stays(sky):
     same = field.of_exposure(observed.of(np.arange(8)), SKY)
     off = np.abs(same.coefficients - field.coefficients).max() / np.abs(field.coefficients).max()
     assert off < 0.02
+
+
+def test_deformations_are_the_slopes_of_the_splines():
+    """Of a Gaussian: x ∂/∂x, y ∂/∂y and both, ∂²/∂x², ∂²/∂y² and ∂²/∂x∂y; of the largest, 0.5 and 2 %."""
+    spacing, sigma = 0.5, 1.4
+    axis = (np.arange(41) - 20) * spacing
+    x, y = axis, axis[:, None]
+    light = np.exp(-(x**2 + y**2) / (2 * sigma**2))
+    slopes = [-(x**2), -(y**2), -2 * x * y]
+    curves = [x**2 / sigma**2 - 1, y**2 / sigma**2 - 1, x * y / sigma**2]
+    wanted = np.stack([a * light / sigma**2 for a in (*slopes, *curves)])
+    found = _deformations(light[None], spacing)[:, 0]
+    largest = np.abs(wanted).max(axis=(1, 2), keepdims=True)
+    off = (np.abs(found - wanted) / largest).max(axis=(1, 2))
+    assert (off < [0.005] * 3 + [0.02] * 3).all()
