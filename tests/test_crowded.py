@@ -351,3 +351,13 @@ def test_images_that_cannot_be_fitted_keep_their_stars(sky, monkeypatch):
     stars = chosen(sky)
     assert "neighbours: their light was not subtracted (no model)" in words_of(stars)
     assert len(stars) >= 100
+
+
+def test_errors_grow_with_residuals_above_the_noise():
+    table = Table({name: [1.0, 1.0, 1.0] for name in ("x_err", "y_err", "flux_err")})
+    table["reduced_chi2"] = [0.5, 4.0, np.nan]
+    for name in ("id", "x_fit", "y_fit", "flux_fit", "group_id", "group_size", "parted", "flags"):
+        table[name] = [1.0, 2.0, 3.0]
+    stars = crowded._described(None, table, np.zeros((2, 2)), np.zeros((2, 2)), None).stars
+    for name in ("x_error", "y_error", "flux_error"):
+        assert list(stars[name]) == [1.0, 2.0, 1.0]

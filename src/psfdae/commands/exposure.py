@@ -6,7 +6,7 @@ from typing import Annotated
 
 from psfdae.cli import command
 from psfdae.commands.predict import Stated, check_targets
-from psfdae.files import atomic_path, check_outputs
+from psfdae.files import check_outputs
 from psfdae.model.bundle import SUFFIX
 from psfdae.model.field_psfs import PredictionError
 from psfdae.model.psf_model import load_model
@@ -36,6 +36,5 @@ def exposure(
     from psfdae.model.exposures import exposure as adapted
 
     made, said = adapted(loaded, source, out.name.removesuffix(SUFFIX))
-    with atomic_path(out) as unfinished:
-        made.save(unfinished)
+    made.save(out)
     print(f"{out}: {said}")

@@ -47,10 +47,10 @@ def psf(
     if not whole and bool(at) == (grid is not None):
         raise PredictionError("--at X,Y or --grid COLUMNSxROWS says where")
     # Readers of PSFEx's files interpolate with Lanczos' kernel, which errs less the finer they are.
-    oversampling = oversampling or (exchange.PSFEX_SAMPLES if whole else exchange.STDPSF_SAMPLES)
-    if standard and (at or oversampling != exchange.STDPSF_SAMPLES):
+    oversampling = oversampling or (exchange.PSFEX_SAMPLES if whole else exchange.GRID_SAMPLES)
+    if standard and (at or oversampling != exchange.GRID_SAMPLES):
         raise PredictionError(
-            f"{out}: STDPSF has a --grid, and {exchange.STDPSF_SAMPLES} values per pixel and axis"
+            f"{out}: STDPSF has a --grid, and {exchange.GRID_SAMPLES} values per pixel and axis"
         )
     loaded = load_field(model)
     if whole:

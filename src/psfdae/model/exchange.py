@@ -20,13 +20,14 @@ from psfdae.image.errors import ascii_line, reading
 from psfdae.image.fits_file import BLOCK_BYTES, open_hdus, plain_file
 from psfdae.model.field_psfs import FieldPsfs, PredictionError
 from psfdae.model.psf_model import load_model
+from psfdae.moments import measure_shapes
 from psfdae.version import __version__
 
 PSFEX, STDPSF = ".psf", ".stdpsf.fits"
 """Ends of names: what a file is written as, or read as."""
 
 LANCZOS = 4  # order of the kernel, as of PSFEx
-STDPSF_SAMPLES, PSFEX_SAMPLES = 4, 8  # values per pixel and axis
+GRID_SAMPLES, PSFEX_SAMPLES = 4, 8  # values per pixel and axis
 STDPSF_PLACES = 99  # along an axis, at most
 LARGEST_PSF = 1025  # samples, and pixels, along an axis of a file of PSFEx
 HIGHEST_ORDER = 12
@@ -61,10 +62,10 @@ class PsfexField(FieldPsfs):
         If it is not such a model.
     """
 
-    order, stamp_px, image_px = 0, 0, None
+    image_px = None
 
     def __init__(self, path: Path) -> None:
-        self.path = path
+        self.path, self.name = path, path.stem
         file = plain_file(path)
         with reading(path), open_hdus(file) as hdus:
             tables = [hdu for hdu in hdus if hdu.name == "PSF_DATA"]
@@ -115,10 +116,6 @@ class PsfexField(FieldPsfs):
             self._refuse("its polynomial, sampling, scales or pixels are out of range")
         self.basis, self.stamp_px = mask, 2 * max(1, int(side * self.step / 2))
         self.zero, self.width = zero - 1.0, width
-
-    @property
-    def name(self) -> str:
-        return self.path.stem
 
     @cached_property
     def sha256(self) -> str:
@@ -191,13 +188,12 @@ def write_psfex(path: Path, model: FieldPsfs, oversampling: int) -> float:
         )
     try:
         low, high = model.field_range()
+        places = np.rint(model.grid(2 * order + 3, 2 * order + 3))
     except PredictionError:
         if order:
             raise
-        low = high = np.zeros(2)
+        low, high, places = np.zeros(2), np.zeros(2), np.zeros((1, 2))
     zero, width = (low + high) / 2, np.maximum(high - low, NO_WIDTH)
-    axes = (np.linspace(*ends, 2 * order + 3) for ends in zip(low, high, strict=True))
-    places = np.rint(np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2))
     powers = psfex_powers(order)
     u, v = ((places - zero) / width).T
     terms = np.stack([u**i * v**j for i, j in powers], axis=1)
@@ -224,19 +220,14 @@ def write_psfex(path: Path, model: FieldPsfs, oversampling: int) -> float:
         said[f"POLZERO{i + 1}"] = float(zero[i] + 1.0)
         said[f"POLSCAL{i + 1}"] = float(width[i])
     middle = psfs[len(psfs) // 2]
-    said |= {"POLNGRP": 1, "POLDEG1": order, "PSF_FWHM": _fwhm_px(middle, oversampling)}
+    fwhm = float(measure_shapes(middle[None]).fwhm_px[0]) / oversampling
+    said |= {"POLNGRP": 1, "POLDEG1": order, "PSF_FWHM": fwhm}
     said |= {"PSF_SAMP": 1.0 / oversampling, "PSFNAXIS": 3}
     said |= {"PSFAXIS1": size, "PSFAXIS2": size, "PSFAXIS3": len(basis)}
     said |= {"CREATOR": f"psfdae {__version__}", "PSFMODEL": ascii_line(model.name)}
     table.header.update(said)
     write_fits(path, fits.HDUList([fits.PrimaryHDU(), table]))
     return off
-
-
-def _fwhm_px(psf: np.ndarray, oversampling: int) -> float:
-    from psfdae.moments import measure_shapes
-
-    return float(measure_shapes(psf[None]).fwhm_px[0]) / oversampling
 
 
 def write_stdpsf(path: Path, model: FieldPsfs, columns: int, rows: int) -> None:
@@ -259,7 +250,7 @@ def write_stdpsf(path: Path, model: FieldPsfs, columns: int, rows: int) -> None:
     along = places.reshape(rows, columns, 2)
     cards += [(f"IPSFX{i + 1:02d}", int(x) + 1, "x, 1-based") for i, x in enumerate(along[0, :, 0])]
     cards += [(f"JPSFY{j + 1:02d}", int(y) + 1, "y, 1-based") for j, y in enumerate(along[:, 0, 1])]
-    _write_cube(path, model, places, STDPSF_SAMPLES, cards)
+    _write_cube(path, model, places, GRID_SAMPLES, cards)
 
 
 def write_grid(path: Path, model: FieldPsfs, places: np.ndarray, oversampling: int) -> None:

@@ -22,32 +22,25 @@ class PredictionError(Error, ValueError):
 
 
 class FieldPsfs(ABC):
-    """A PSF for every place of an image, and what follows from it alone."""
+    """A PSF for every place of an image, and what follows from it alone.
 
-    @property
-    @abstractmethod
-    def name(self) -> str:
-        """What the model is called."""
+    Attributes
+    ----------
+    name, sha256 : str
+        What the model is called, and its checksum.
+    stamp_px : int
+        Side d of the stamps in which PSFs have the sum 1, even.
+    order : int
+        Of the polynomial by which the PSF changes over the field; raises as `psf_at`.
+    image_px : (int, int) or None
+        Columns and rows of the image that the model is of, if known.
+    """
 
-    @property
-    @abstractmethod
-    def sha256(self) -> str:
-        """Checksum of the model."""
-
-    @property
-    @abstractmethod
-    def stamp_px(self) -> int:
-        """Side d of the stamps in which PSFs have the sum 1, in pixels."""
-
-    @property
-    @abstractmethod
-    def order(self) -> int:
-        """Order of the polynomial by which the PSF changes over the field; raises as `psf_at`."""
-
-    @property
-    @abstractmethod
-    def image_px(self) -> tuple[int, int] | None:
-        """Columns and rows of the image that the model is of, if known."""
+    name: str
+    sha256: str
+    stamp_px: int
+    order: int
+    image_px: tuple[int, int] | None
 
     @abstractmethod
     def field_range(self) -> tuple[np.ndarray, np.ndarray]:
@@ -84,7 +77,9 @@ class FieldPsfs(ABC):
             If the model's method knows no PSF between the stars, a number is not usable, or the
             model has no PSF of a finite flux above 0 at a place.
         """
-        position = np.stack(np.broadcast_arrays(_numbers(x), _numbers(y)), axis=-1)
+        position = np.stack(
+            np.broadcast_arrays(real_numbers("x", x), real_numbers("y", y)), axis=-1
+        )
         if position.ndim > 2 or not np.isfinite(position).all():
             raise PredictionError("positions must be finite, one x and y or arrays of as many")
         if not 1 <= oversampling <= MOST_OVERSAMPLED:
@@ -139,8 +134,10 @@ class FieldPsfs(ABC):
         )
 
 
-def _numbers(values: ArrayLike) -> np.ndarray:
+def real_numbers(name: str, values: ArrayLike) -> np.ndarray:
+    """An array of float32 or float64 in the machine's byte order; PredictionError otherwise."""
     array = np.asarray(values)
     if array.dtype.kind not in "fiub":
-        raise PredictionError(f"positions of type {array.dtype}, expected real numbers")
-    return array.astype(np.float64)
+        raise PredictionError(f"{name} of type {array.dtype}, expected real numbers")
+    narrow = array.dtype.kind == "f" and array.dtype.itemsize <= 4
+    return array.astype(np.float32 if narrow else np.float64, copy=False)

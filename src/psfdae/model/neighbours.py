@@ -32,19 +32,9 @@ class _Field(FieldPsfs):
     name, image_px = "of stars without neighbours", None
 
     def __init__(self, fitted: Method, stamp_px: int) -> None:
-        self.fitted, self._side = fitted, stamp_px
-
-    @property
-    def stamp_px(self) -> int:
-        return self._side
-
-    @property
-    def order(self) -> int:
-        return int(self.fitted.model.order)
-
-    @property
-    def sha256(self) -> str:
-        return hashlib.sha256(self.fitted.coefficients.tobytes()).hexdigest()
+        self.fitted, self.stamp_px = fitted, stamp_px
+        self.order = fitted.model.order
+        self.sha256 = hashlib.sha256(fitted.coefficients.tobytes()).hexdigest()
 
     def field_range(self) -> tuple[np.ndarray, np.ndarray]:
         return self.fitted.low, self.fitted.high

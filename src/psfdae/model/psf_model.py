@@ -35,7 +35,7 @@ from psfdae.model.bundle import (
     read_bundle,
     write_bundle,
 )
-from psfdae.model.field_psfs import FieldPsfs, PredictionError
+from psfdae.model.field_psfs import FieldPsfs, PredictionError, real_numbers
 from psfdae.model.photometry import FAINT_SNR, KEPT, NOISE_FLOOR, Photometer, Photometry
 from psfdae.model.prediction import Prediction, measured_of, unmeasured
 from psfdae.moments import measure_shapes
@@ -185,7 +185,7 @@ class PsfModel(FieldPsfs):
         centre: ArrayLike | None,
     ) -> Stamps:
         """What `predict` is given, checked."""
-        data = _numbers("stamps", stamps)
+        data = real_numbers("stamps", stamps)
         single = data.ndim == 2
         data = data[None] if single else data
         side = self.info.stamp_px + 2 * margin
@@ -303,15 +303,6 @@ class PsfModel(FieldPsfs):
             )
 
 
-def _numbers(name: str, values: ArrayLike) -> np.ndarray:
-    """An array of float32 or float64 in the machine's byte order."""
-    array = np.asarray(values)
-    if array.dtype.kind not in "fiub":
-        raise PredictionError(f"{name} of type {array.dtype}, expected real numbers")
-    narrow = array.dtype.kind == "f" and array.dtype.itemsize <= 4
-    return array.astype(np.float32 if narrow else np.float64, copy=False)
-
-
 def _mask(name: str, mask: ArrayLike | None, data: np.ndarray, single: bool) -> np.ndarray:
     if mask is None:
         return np.zeros(data.shape, dtype=bool)
@@ -324,7 +315,7 @@ def _mask(name: str, mask: ArrayLike | None, data: np.ndarray, single: bool) -> 
 
 def _pairs(name: str, values: ArrayLike | None, count: int) -> np.ndarray:
     """Two numbers per star, NaN where they are not known."""
-    numbers = _numbers(name, np.full((count, 2), np.nan) if values is None else values)
+    numbers = real_numbers(name, np.full((count, 2), np.nan) if values is None else values)
     if numbers.shape != (count, 2):
         raise PredictionError(f"{name} of shape {numbers.shape}, expected ({count}, 2)")
     return numbers.astype(np.float64)
@@ -332,7 +323,7 @@ def _pairs(name: str, values: ArrayLike | None, count: int) -> np.ndarray:
 
 def _per_star(name: str, value: ArrayLike | None, count: int) -> np.ndarray:
     """One number per star, NaN where it is not known."""
-    numbers = _numbers(name, np.nan if value is None else value).astype(np.float64)
+    numbers = real_numbers(name, np.nan if value is None else value).astype(np.float64)
     if numbers.ndim > 1 or (numbers.ndim == 1 and len(numbers) != count):
         raise PredictionError(f"{name} of shape {numbers.shape}, expected one for {count} stamps")
     return np.broadcast_to(numbers, (count,))
