@@ -129,6 +129,18 @@ def test_held_out_stars_are_not_learnt_from(stars, model):
     assert model.info.training_stars == (~stars.held_out).sum()
 
 
+def test_errors_of_what_is_found_are_as_large_as_said(stars, model):
+    found = psfdae.validate(model, stars).found
+    assert list(found["snr"]) == sorted(found["snr"])
+    assert not found["lost"].any()
+    for row in found:
+        assert abs(row["flux_bias"]) < 3 * row["flux_bias_stderr"] + 0.01
+        assert 0.6 < row["flux_pull"] < 1.7  # of ten stars
+        for name in ("flux", "centre", "psf"):
+            off = abs(row[f"{name}_within"] - packing.COVERAGE)
+            assert off < 3 * row[f"{name}_within_stderr"] + 0.04, name
+
+
 def test_a_model_that_may_have_seen_the_stars_is_refused(sky, model):
     others = psfdae.Stars.from_image(sky[0], catalogue=sky[1], snr_min=150.0, **SIZES)
     with pytest.raises(psfdae.Error, match="trained on other stars of this image"):

@@ -83,6 +83,15 @@ def test_standing_says_where_a_model_is_worse():
 # The page
 
 
+def found(flux=(0.68, 0.68), centre=(0.68, 0.68)):
+    """A table as found.csv, at S/N 10 and 50."""
+    columns = {"snr": [10.0, 50.0], "lost": [0.0, 0.0], "flux_bias": [0.01, 0.0]}
+    columns |= {"flux_bias_stderr": [0.01] * 2, "flux_pull": [1.0] * 2, "centre_rms_px": [0.1] * 2}
+    for name, part in (("flux", flux), ("centre", centre), ("psf", (0.68, 0.68))):
+        columns |= {f"{name}_within": part, f"{name}_within_stderr": [0.02, 0.02]}
+    return Table(columns)
+
+
 def quality(count=60, name="a <b> & c", field=None, **more):
     rng = np.random.default_rng(2)
     truth = cut(gaussians(*rng.uniform(-0.5, 0.5, (2, 40))), SIDE)
@@ -103,7 +112,9 @@ def quality(count=60, name="a <b> & c", field=None, **more):
     given = {
         "name": name, "image": "image.fits", "method": "gmm", "label": "mixture",
         "notes": ["image.fits: gain 2\nstars.csv: no position in row 7"],
-        "errors": errors((2e-6, 1e-6)), "coverage": {10.0: 0.68}, "faint": faint, "stars": stars,
+        "errors": errors((2e-6, 1e-6)), "found": found(),
+        "degraded": {key: rng.uniform(1, 700, 40) for key in ("x", "y", "flux")},
+        "coverage": {10.0: 0.68}, "faint": faint, "stars": stars,
         "residual": rng.normal(size=(4, SIDE, SIDE)), "bright": truth[:4], "strip": b"png",
     }  # fmt: skip
     return Quality(**{**given, "field": field, **more})
@@ -151,12 +162,20 @@ def test_page_is_one_file_in_the_order_in_which_it_is_read():
         ({"errors": errors((2e-6, 5e-6), linear=(5e-6, 6e-6))}, "Better than one mean PSF?"),
         ({"errors": errors((2e-6, 3e-6))}, "Better than linear MMSE?"),
         ({"coverage": {10.0: 0.4}}, "Does ± UNCERT hold 68 % of the errors?"),
+        ({"found": found(flux=(0.68, 0.5))}, "Do errors of the flux hold 68 %?"),
+        ({"found": found(centre=(0.9, 0.68))}, "Do errors of the centre hold 68 %?"),
         ({"errors": errors((2e-6, 1e-6), stars=5)}, "Stars held out"),
     ],
 )
 def test_what_is_wrong_is_marked(wrong, check):
     assert all(good for *_, good in checks(quality()))
     assert [question for question, _, good in checks(quality(**wrong)) if not good] == [check]
+
+
+def test_no_check_of_centres_that_a_method_does_not_measure():
+    questions = [question for question, *_ in checks(quality(found=found(centre=(np.nan,) * 2)))]
+    assert len(questions) == len(checks(quality())) - 1
+    assert not any("centre" in question for question in questions)
 
 
 def test_faint_stars_that_come_out_too_wide_are_marked():

@@ -8,10 +8,10 @@ import sys
 import numpy as np
 
 from psfdae.cli import main
-from psfdae.commands import from_stars
+from psfdae.model import stars
 
 split, *words = sys.argv[1:]
-lattice = from_stars.star_grid
+lattice = stars.star_grid
 # Each fifth is a residue of the lattice, so that moving it holds out the next one.
-from_stars.star_grid = lambda position: lattice(position) + np.array([int(split), 0])
+stars.star_grid = lambda position: lattice(position) + np.array([int(split), 0])
 main(["from-stars", *words])

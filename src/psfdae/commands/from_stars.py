@@ -72,7 +72,7 @@ class Made:
     def written(self) -> list[Path]:
         """Files of the folder itself."""
         names = ("selection.csv", "overrides.txt", "evaluation.csv", "per_star.csv")
-        own = [self.path / name for name in (*names, "report.csv", "report.png")]
+        own = [self.path / name for name in (*names, "report.csv", "found.csv", "report.png")]
         for kind in self.kinds:
             own += fits.outputs(kind, self.fit(kind))
         return [self.stars, self.bundle, *own]
@@ -256,6 +256,7 @@ def _make(
         write_columns(files.path / "evaluation.csv", report.evaluation.columns)
         write_columns(files.path / "per_star.csv", report.per_star.columns)
         write_columns(files.path / "report.csv", report.table.columns, digits=6)
+        write_columns(files.path / "found.csv", report.found.columns, digits=6)
         write_bytes(files.path / "report.png", as_png(report.strip()))
         if page is not None:
             print(f"writing {page}")

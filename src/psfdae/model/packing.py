@@ -42,6 +42,7 @@ from psfdae.model.star_sets import (
     noise_model,
     noisy_test_images,
     of_image,
+    own_flux_error,
     split_stars,
     star_area,
 )
@@ -68,12 +69,17 @@ Restore = Callable[[np.ndarray, float], Estimate]
 
 @dataclass(frozen=True)
 class HeldOutStars:
-    """Noise-free stars of flux 1 that no training has seen, (n, d, d), noise, and places (n, 2)."""
+    """Noise-free stars of flux 1 that no training has seen, (n, d, d), noise, and places (n, 2).
+
+    Those of an image are not free of noise: it makes their flux, which is taken to be 1, uncertain
+    by `flux_error` (n,).
+    """
 
     images: np.ndarray
     references: np.ndarray
     noise: NoiseModel
     position: np.ndarray
+    flux_error: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -157,6 +163,7 @@ def bundle_of(
         references[parts.test],
         noise_model(config),
         field_positions(stars)[parts.test],
+        own_flux_error(stars, parts.train)[parts.test],
     )
     model = leading(FluxModel.fit(images[parts.train]), COMPONENTS)
     band = config.noise.kappa * np.asarray(config.noise.levels)
@@ -344,7 +351,8 @@ def with_scales(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -
     width, of_flux = np.ones((2, *shape, 2, len(nodes))), np.ones(len(nodes))
     for place, node in enumerate(nodes):
         noisy, star = _noisy(stars, node, rng)
-        for estimated, case in np.ndindex(shape):
+        # Case by case: what a method computes for a known sky serves the next one, too.
+        for case, estimated in np.ndindex(shape[::-1]):
             known = CASES[case] if estimated else {"noise": node, **CASES[case]}
             found = model.predict(noisy, position=stars.position[star], **known)
             usable = np.isfinite(found.psf).all(axis=(1, 2))
@@ -358,10 +366,14 @@ def with_scales(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -
             for pixels, kind in ((~bright, 0), (bright, 1)):
                 width[0, estimated, case, kind, place] = np.quantile(error[pixels], COVERAGE)
                 width[1, estimated, case, kind, place] = np.quantile(wide[pixels], WIDE)
-            # A method that measures stars knows how sure it is of their flux.
-            if estimated and not known and not isinstance(model.engine.estimator, MeasuresStars):
-                scatter = np.abs(found.flux - 1.0)[usable] / found.flux_error[usable]
-                of_flux[place] = np.quantile(scatter, WIDE) / NORMAL_WIDE
+            if estimated and not known:
+                doubt = np.hypot(found.flux_error, stars.flux_error[star])[usable]
+                off = np.abs(found.flux - 1.0)[usable] / doubt
+                of_flux[place] = (
+                    np.quantile(off, COVERAGE)
+                    if isinstance(model.engine.estimator, MeasuresStars)
+                    else np.quantile(off, WIDE) / NORMAL_WIDE
+                )
     # Where a star has light that the photometry does not know, its noise is found too large.
     noise = np.maximum.accumulate(noise, axis=-1)
     for index in np.ndindex(width.shape[:-1]):

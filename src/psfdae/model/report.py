@@ -127,10 +127,14 @@ class Quality:
         What is known of the camera, and advice.
     errors : Table
         Columns of `report.csv`.
+    found : Table
+        Columns of `found.csv`.
     coverage : dict
         Part of the errors within ± the stated 68 % by S/N.
     faint : dict
         By S/N the held-out stars degraded, (n, d, d) each: `truth`, `model` and `MEAN_PSF`.
+    degraded : dict
+        Columns of `stars` of these held-out stars, (n,).
     stars : dict
         Columns of the prediction of all N stars, (N,) each, and `verdict` and `part` of
         `selection.csv`.
@@ -152,8 +156,10 @@ class Quality:
     label: str
     notes: Sequence[str]
     errors: Table
+    found: Table
     coverage: dict[float, float]
     faint: dict[float, dict[str, np.ndarray]]
+    degraded: dict[str, np.ndarray]
     stars: dict[str, np.ndarray]
     residual: np.ndarray
     bright: np.ndarray
@@ -181,10 +187,13 @@ class Quality:
                 found[name] = some
         return found
 
-    def sizes(self, snr: float, kind: str) -> np.ndarray:
-        """FWHM of the faint held-out stars over that of their bright images, minus 1, (n,)."""
-        found, truth = (measure_shapes(self.faint[snr][k]) for k in (kind, "truth"))
-        return found.fwhm_px / truth.fwhm_px - 1.0
+    def sizes(self, snr: float) -> tuple[np.ndarray, np.ndarray]:
+        """FWHM of the faint held-out stars over that of their bright images, minus 1, (n,).
+
+        The second one is by how much their ellipticity is larger.
+        """
+        found, truth = (measure_shapes(self.faint[snr][kind]) for kind in ("model", "truth"))
+        return found.fwhm_px / truth.fwhm_px - 1.0, found.ellipticity - truth.ellipticity
 
 
 def quality_page(q: Quality) -> str:
@@ -197,6 +206,8 @@ def quality_page(q: Quality) -> str:
         _errors_table(q),
         _picture(errors_figure(q)),
         _png(q.strip),
+        "<h2>Flux, centre and their errors</h2>",
+        _found_table(q),
         "<h2>The PSF over the field</h2>",
         *(f"<p>{escape(fact)}.</p>" for fact in q.facts),
         _picture(q.field) if q.field else "<p>The stars have no positions.</p>",
@@ -253,7 +264,7 @@ def checks(q: Quality) -> list[tuple[str, str, bool]]:
     """Checks before the model is trusted: question, answer, and whether it is passed."""
     mean, linear = (ratios(q.errors, q.method, other) for other in (MEAN_PSF, LINEAR))
     snr = nearest(q.faint)
-    size = q.sizes(snr, "model")
+    size = q.sizes(snr)[0]
     images = q.errors["images"][0]
     held = int(q.errors["stars"][0])
     bias, error = float(np.median(size)), 1.25 * float(size.std()) / np.sqrt(min(held, images))
@@ -272,6 +283,8 @@ def checks(q: Quality) -> list[tuple[str, str, bool]]:
             ", ".join(f"{100 * v:.0f} % at S/N {s:.3g}" for s, v in sorted(q.coverage.items())),
             all(COVERED[0] < v < COVERED[1] for v in q.coverage.values()),
         ),
+        ("Do errors of the flux hold 68 %?", *_held(q.found, "flux")),
+        ("Do errors of the centre hold 68 %?", *_held(q.found, "centre")),
         (
             "χ² of stars without a flag that were not learnt from",
             ", ".join(f"median {v:.2f} at S/N {s} ({n} stars)" for s, (v, n) in chi2.items()),
@@ -281,6 +294,14 @@ def checks(q: Quality) -> list[tuple[str, str, bool]]:
         ("Stars held out", f"{held}", held >= FEW_STARS),
     ]
     return [row for row in found if row[1]]
+
+
+def _held(found: Table, name: str) -> tuple[str, bool]:
+    """Parts of the errors within the stated ones by S/N, and whether 68 % may be true of each."""
+    rows = [(r["snr"], r[f"{name}_within"], r[f"{name}_within_stderr"]) for r in found]
+    rows = [row for row in rows if np.isfinite(row[1])]
+    said = ", ".join(f"{100 * v:.0f} ± {100 * e:.0f} % at S/N {snr:.3g}" for snr, v, e in rows)
+    return said, all(COVERED[0] < v + 2 * e and v - 2 * e < COVERED[1] for _, v, e in rows)
 
 
 def _by_snr(values: dict[float, float]) -> str:
@@ -306,6 +327,25 @@ def _errors_table(q: Quality) -> str:
     truth = q.errors["truth_mse"][0]
     return _table(["MSE", *(f"S/N {snr:.3g}" for snr in levels)], rows) + (
         f"<p>Stars have flux 1. Noise of the bright images is {truth:.1e} of every MSE.</p>"
+    )
+
+
+def _found_table(q: Quality) -> str:
+    """What `predict` measures of held-out stars of which nothing is given."""
+    rows = [
+        [
+            f"{row['snr']:.3g}",
+            f"{100 * row['flux_bias']:+.1f} ± {100 * row['flux_bias_stderr']:.1f} %",
+            f"{row['flux_pull']:.2f}",
+            f"{row['centre_rms_px']:.3f}" if np.isfinite(row["centre_rms_px"]) else "",
+        ]
+        for row in q.found
+    ]
+    head = ("S/N", "flux, mean error", "pull of the flux", "centre, RMS error (px)")
+    return (
+        "<p>Held-out stars degraded to low S/N, of which neither flux, sky, noise nor centre is "
+        "given. The pull is what 68 % of the errors are below, over the stated error; it is 1 "
+        "where errors hold.</p>" + _table(head, rows)
     )
 
 
@@ -375,23 +415,47 @@ def residual_strip(q: Quality) -> Figure:
 
 @styled
 def shapes_figure(q: Quality) -> Figure:
-    """FWHM and ellipticity against magnitude, x and y; held-out stars stand out."""
-    stars, usable = q.stars, q.usable()
-    magnitude = -2.5 * np.log10(np.where(stars["flux"] > 0, stars["flux"], np.nan))
+    """FWHM and ellipticity against magnitude, x and y, and how far faint stars come out off them.
+
+    Above are all stars, and those held out stand out; below the latter, degraded.
+    """
+    stars, usable, snr = q.stars, q.usable(), nearest(q.faint)
     held = usable & (stars["part"] == "held out")
-    figure = new_figure(4.4, layout="constrained")
-    grid: Any = figure.subplots(2, 3, sharey="row")
-    across = (("−2.5 log₁₀ flux", magnitude), ("x (px)", stars["x"]), ("y (px)", stars["y"]))
-    for column, (name, where) in enumerate(across):
-        for row, (what, of) in enumerate((("FWHM (px)", "fwhm_px"), ("ellipticity",) * 2)):
-            axes = grid[row, column]
-            axes.plot(where[usable], stars[of][usable], ".", ms=2, color="#888888", label="all")
-            axes.plot(where[held], stars[of][held], ".", color=SERIES_COLORS[5], label="held out")
-            axes.set_xlabel(name)
+    size, shape = q.sizes(snr)
+    figure = new_figure(7.6, layout="constrained")
+    grid: Any = figure.subplots(4, 3, sharey="row", sharex="col")
+    rows = (
+        ("FWHM (px)", "fwhm_px", 100 * size, f"FWHM at S/N {snr:.3g} (%)"),
+        ("ellipticity", "ellipticity", shape, f"ellipticity at S/N {snr:.3g}"),
+    )
+    for column, (name, across) in enumerate(ACROSS.items()):
+        everywhere, where = across(stars), across(q.degraded)
+        for row, (what, of, residual, off) in enumerate(rows):
+            axes, below = grid[2 * row : 2 * row + 2, column]
+            axes.plot(everywhere[usable], stars[of][usable], ".", ms=2, color="#888888",
+                      label="all")  # fmt: skip
+            axes.plot(everywhere[held], stars[of][held], ".", color=SERIES_COLORS[5],
+                      label="held out")  # fmt: skip
+            below.axhline(0.0, color="black", lw=0.8)
+            below.plot(where, residual, ".", ms=2, color=SERIES_COLORS[5])
             if column == 0:
                 axes.set_ylabel(what)
+                below.set_ylabel(f"error of\n{off}")
+        grid[-1, column].set_xlabel(name)
     grid[0, 0].legend()
     return figure
+
+
+def _magnitude(stars: dict[str, np.ndarray]) -> np.ndarray:
+    return np.asarray(-2.5 * np.log10(np.where(stars["flux"] > 0, stars["flux"], np.nan)))
+
+
+ACROSS = {
+    "−2.5 log₁₀ flux": _magnitude,
+    "x (px)": lambda stars: stars["x"],
+    "y (px)": lambda stars: stars["y"],
+}
+"""What sizes and shapes are drawn against."""
 
 
 @styled

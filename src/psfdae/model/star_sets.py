@@ -90,6 +90,17 @@ def noisy_test_images(config: Any, stars: Product, test: np.ndarray, level: floa
     return noise_model(config).draw(stars["realisation"], level, rng)[test]
 
 
+def own_flux_error(stars: Product, train: np.ndarray) -> np.ndarray:
+    """Error of the flux of stars of a product "stars", over it, by their own noise, (n,).
+
+    That of a filter matched to a typical training star; simulated stars have none.
+    """
+    star = stars["field_index"]
+    if not of_image(stars):
+        return np.zeros(len(star))
+    return np.asarray(stars["noise"][star] * np.sqrt(star_area(stars, train)))
+
+
 def training_set(
     config: Any,
     kind: type[Method],

@@ -15,8 +15,8 @@ from psfdae.files import write_text
 from psfdae.image.stamps import Stamps
 from psfdae.method import Method, facts_of
 from psfdae.methods import method as method_of
-from psfdae.metrics import all_metrics, mse, quality, summarised
-from psfdae.model.packing import checksum
+from psfdae.metrics import all_metrics, clustered_mean, mse, quality, summarised
+from psfdae.model.packing import COVERAGE, checksum
 from psfdae.model.photometry import signal_to_noise
 from psfdae.model.plot import FieldStars, psf_map
 from psfdae.model.prediction import Prediction
@@ -25,6 +25,7 @@ from psfdae.model.report import MEAN_PSF, SHOWN_STARS, Quality, fitted_mean, qua
 from psfdae.model.star_sets import (
     field_positions,
     noisy_test_images,
+    own_flux_error,
     split_stars,
     star_area,
     training_set,
@@ -108,7 +109,7 @@ def _measured(model: PsfModel, stars: Stars, methods: Mapping[str, Method]) -> R
     position = field_positions(product)[parts.test]
     data_range = settings.evaluation.data_range
     key = {"dataset": stars.name, "split": SPLIT, "reference": REFERENCE}
-    rows, per_star, restored = [], [], {}
+    rows, per_star, restored, measured_rows = [], [], {}, []
     for level in settings.noise.levels:
         noisy = noisy_test_images(settings, product, parts.test, level)
         mean = fitted_mean(noisy, stars.mean_psf, settings.framing.jitter_px + 1.0)
@@ -125,9 +126,56 @@ def _measured(model: PsfModel, stars: Stars, methods: Mapping[str, Method]) -> R
             if own:
                 restored[level] = {"truth": truth, "model": estimate.psf, MEAN_PSF: mean}
         rows += beside
+        measured_rows.append(_found_alone(model, stars, level, noisy))
     measured = [row for row in rows if row["method"] != MEAN_PSF]
     table = _table(rows, stars, methods)
-    return Report(model, stars, methods, table, _stacked(measured), _joined(per_star), restored)
+    found = _stacked(measured_rows[::-1])  # S/N ascending
+    return Report(
+        model, stars, methods, table, _stacked(measured), _joined(per_star), found, restored
+    )
+
+
+def _found_alone(model: PsfModel, stars: Stars, level: float, noisy: np.ndarray) -> dict[str, Any]:
+    """What `predict` makes of held-out stars of flux 1 at λ, of which it is told no more.
+
+    The bright star that is the truth has noise of its own: it counts in errors of flux and centre,
+    and is in UNCERT, which was measured on such stars.
+    """
+    settings, product = stars.settings, stars.product
+    parts = split_stars(product, SPLIT, settings)
+    train, test = parts.train, parts.test
+    star, truth = product["field_index"][test], product[REFERENCE][test]
+    position, own = field_positions(product)[test], product["noise"][star]
+    noise, sky = settings.noise.kappa * level, np.sqrt(settings.noise.background_photons)
+    found = model.predict(noisy, position=position, gain=sky / noise)
+    bright = model.predict(truth, position=position, flux=1.0, background=0.0, noise=own)
+    off = np.stack([getattr(found, c) - getattr(bright, c) for c in ("x_fit", "y_fit")])
+    doubt = np.stack(
+        [np.hypot(getattr(found, c), getattr(bright, c)) for c in ("x_error", "y_error")]
+    )
+    usable = np.isfinite(found.psf).all(axis=(1, 2)) & (found.flux_error > 0)
+    pull = (found.flux - 1.0) / np.hypot(found.flux_error, own_flux_error(product, train)[test])
+    held = {
+        "flux": np.abs(pull) < 1.0,
+        "centre": (np.abs(off) < doubt).mean(axis=0),
+        "psf": (np.abs(found.psf - truth) < found.uncertainty).mean((1, 2)),
+    }
+    bias, bias_error = clustered_mean(found.flux[usable] - 1.0, star[usable])
+    row = {
+        "snr": signal_to_noise(noise, star_area(product, train)),
+        "lost": float(1.0 - usable.mean()),
+        "flux_bias": bias,
+        "flux_bias_stderr": bias_error,
+        "flux_pull": float(np.quantile(np.abs(pull[usable]), COVERAGE)),
+        "centre_rms_px": float(np.sqrt(np.square(off[:, usable]).sum(axis=0).mean())),
+    }
+    for name, of in held.items():
+        part, error = clustered_mean(of[usable].astype(float), star[usable])
+        known = name != "centre" or np.isfinite(off[:, usable]).all()
+        row[f"{name}_within"], row[f"{name}_within_stderr"] = (
+            (part, error) if known else (np.nan, np.nan)
+        )
+    return row
 
 
 def _stacked(rows: Sequence[Mapping[str, Any]]) -> Table:
@@ -205,6 +253,11 @@ class Report:
         Every metric of every method at every noise level.
     per_star : Table
         The same of every image.
+    found : Table
+        What `predict` makes of the held-out images where no flux, sky, noise and centre is given,
+        by S/N: bias of the flux over the flux, its pull (what 68.27 % of |error| over `flux_error`
+        are below: 1 if errors hold), RMS of the centre, and the parts of fluxes, centres and
+        pixels that are within their stated errors, with standard errors clustered by star.
     restored : dict
         By noise level λ the held-out images (n, d, d): `truth`, `model`, and `mean_psf`.
     """
@@ -215,6 +268,7 @@ class Report:
     table: Table
     evaluation: Table
     per_star: Table
+    found: Table
     restored: dict[float, dict[str, np.ndarray]]
 
     def __str__(self) -> str:
@@ -260,7 +314,9 @@ class Report:
         columns = {name: np.asarray(selection[name]) for name in ("verdict", "part")}
         area, shown = info.noise_equivalent_px, shown[:SHOWN_STARS]
         kind = type(model.engine.estimator)
-        levels = self.restored.items()
+        levels, product = self.restored.items(), stars.product
+        test = split_stars(product, SPLIT, stars.settings).test
+        row = product["row"][product["field_index"][test]]
         return quality_page(
             Quality(
                 name=info.name,
@@ -269,8 +325,10 @@ class Report:
                 label=kind.look.label,
                 notes=stars.notes,
                 errors=self.table,
+                found=self.found,
                 coverage={r["snr"]: r["coverage68"] for r in info.metrics if "coverage68" in r},
                 faint={signal_to_noise(info.kappa * level, area): of for level, of in levels},
+                degraded={name: found[name][row] for name in ("x", "y", "flux")},
                 stars=found | columns,
                 residual=residual / found["noise"][shown, None, None],
                 bright=psf[shown] + residual,
