@@ -105,7 +105,8 @@ def predicted_against_true(
 
 def size_of(states: np.ndarray) -> np.ndarray:
     """Size of a misalignment: RMS of its four numbers, in units of the range, shape (n,)."""
-    return np.sqrt((states**2).mean(axis=1))
+    size: np.ndarray = np.sqrt((states**2).mean(axis=1))
+    return size
 
 
 @styled

@@ -38,7 +38,10 @@ def kappa_of_mse(mse: np.ndarray, level: np.ndarray, pixels: int, background: fl
     of P pixels.
     """
     photon = 1.0 / (pixels * np.sqrt(background))
-    return (-photon + np.sqrt(photon**2 + 4.0 * np.asarray(mse))) / 2.0 / np.asarray(level)
+    kappa: np.ndarray = (
+        (-photon + np.sqrt(photon**2 + 4.0 * np.asarray(mse))) / 2.0 / np.asarray(level)
+    )
+    return kappa
 
 
 @dataclass(frozen=True)

@@ -71,7 +71,7 @@ class PcaFit:
         ValueError
             If an image has a pixel that is not finite: it is nearest to no node.
         """
-        features = (images.reshape(len(images), -1) - self.mean) @ self.components.T
+        features: np.ndarray = (images.reshape(len(images), -1) - self.mean) @ self.components.T
         if not (finite := np.isfinite(features).all(axis=1)).all():
             raise ValueError(
                 f"images: {np.count_nonzero(~finite)} of {len(images)} have pixels that are not "
@@ -83,11 +83,13 @@ class PcaFit:
         """Winning node (eq. 7) of every image, shape (n,); raises as `features`."""
         # |y − m|² without the term that is the same for all nodes.
         score = (self.nodes**2).sum(axis=1) - 2.0 * self.features(images) @ self.nodes.T
-        return score.argmin(axis=1)
+        winner: np.ndarray = score.argmin(axis=1)
+        return winner
 
     def predict(self, images: np.ndarray) -> np.ndarray:
         """PSF of every image, shape (n, d, d); raises as `features`."""
-        return self.psf[self.assign(images)].reshape(images.shape)
+        psf: np.ndarray = self.psf[self.assign(images)].reshape(images.shape)
+        return psf
 
 
 @dataclass(frozen=True)

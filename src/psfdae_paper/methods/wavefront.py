@@ -149,7 +149,8 @@ class Wavefront(Method):
     @cached_property
     def _middle(self) -> np.ndarray:
         """Mean of the bank's stamps, (1, d, d): the same for all noise levels."""
-        return self.bank.stamps((self.bank.margin,) * 2).mean(axis=0, keepdims=True)
+        mean: np.ndarray = self.bank.stamps((self.bank.margin,) * 2).mean(axis=0, keepdims=True)
+        return mean
 
     def posterior(
         self, noisy: np.ndarray, level: float, position: np.ndarray | None = None
@@ -182,7 +183,8 @@ class Wavefront(Method):
         """Numbers of the fields of stars, (n,), if the method is given them."""
         if not self.needs.position or position is None:
             return None
-        return np.rint(position @ [1, self.bank.points]).astype(int)
+        fields: np.ndarray = np.rint(position @ [1, self.bank.points]).astype(int)
+        return fields
 
     def _over_bank(self, noisy: np.ndarray, level: float, own: np.ndarray | None) -> PosteriorSums:
         """Sums over a part of the bank; over all of it where that promises to be enough."""

@@ -190,7 +190,8 @@ def field_of(stars: Product) -> np.ndarray:
     from psfdae_paper.stars.fields import square_grid
 
     grid = stars.config["grid"]
-    return np.deg2rad(square_grid(grid["points"], grid["spacing_deg"])[1])
+    angle: np.ndarray = np.deg2rad(square_grid(grid["points"], grid["spacing_deg"])[1])
+    return angle
 
 
 def strip_rows(

@@ -139,7 +139,8 @@ def _shift_transfer(shift: np.ndarray, side: int) -> np.ndarray:
     """Factors that move images by (x, y) pixels, shape (n, side, side//2 + 1)."""
     rows = np.exp(-2j * np.pi * np.fft.fftfreq(side) * shift[:, 1, None])
     columns = np.exp(-2j * np.pi * np.fft.rfftfreq(side) * shift[:, 0, None])
-    return rows[:, :, None] * columns[:, None, :]
+    factors: np.ndarray = rows[:, :, None] * columns[:, None, :]
+    return factors
 
 
 def _fluxes(recipe: FieldRecipe, kind: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -152,7 +153,8 @@ def _fluxes(recipe: FieldRecipe, kind: np.ndarray, rng: np.random.Generator) -> 
     flux = noise * low * (high / low) ** draw
     # Twice to four times what fills the brightest pixel.
     full = recipe.saturation * recipe.gain / axis_psf.max()
-    return np.where(kind == "saturated", full * (2.0 + 2.0 * draw), flux)
+    fluxes: np.ndarray = np.where(kind == "saturated", full * (2.0 + 2.0 * draw), flux)
+    return fluxes
 
 
 def add_stamps(image: np.ndarray, stamps: np.ndarray, x: np.ndarray, y: np.ndarray) -> None:
