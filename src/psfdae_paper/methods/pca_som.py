@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
 
 import numpy as np
 from pydantic import Field
@@ -22,6 +22,9 @@ from psfdae.files import Column, write_product
 from psfdae.method import FitError, Look, Method, Needs, Storage, TrainingSet
 from psfdae.rng import stream
 from psfdae.settings import Count, Group, Positive
+
+if TYPE_CHECKING:
+    from psfdae_paper.configuration.schema import Config
 
 
 class Baseline(Group):
@@ -125,7 +128,7 @@ class PcaSom(Method):
     fits: tuple[PcaFit, ...]
 
     @classmethod
-    def check(cls, config: Any) -> None:
+    def check(cls, config: Config) -> None:
         """Components must be fewer than pixels and stars."""
         components, side = config.baseline.components, config.framing.stamp_px
         if components > side**2:

@@ -18,5 +18,5 @@ class TotalVariation(Denoiser):
         """See `Denoiser`."""
         from skimage.restoration import denoise_tv_chambolle
 
-        denoised: np.ndarray = denoise_tv_chambolle(image, strength)
+        denoised: np.ndarray = denoise_tv_chambolle(image, strength)  # type: ignore[no-untyped-call]
         return denoised

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from psfdae.rng import stream
 if TYPE_CHECKING:
     from psfdae_paper.bounds.posterior import Bank, Likelihood, PosteriorSums
     from psfdae_paper.bounds.sampling import Modes, StampModel
+    from psfdae_paper.configuration.schema import Config
 
 BANK_STARS = 32000
 """Of a fit; the target `wavefront` has the bank of the error bounds."""
@@ -76,7 +77,7 @@ class Wavefront(Method):
         from psfdae_paper.configuration.compose import part
         from psfdae_paper.configuration.consistency import SIMULATION
 
-        simulated: Mapping[str, Any] = data.simulation
+        simulated = data.simulation
         if simulated.get("scene", {}).get("name") != "seidel":
             raise FitError(f"{cls.name}: needs stars with random Seidel aberrations (scene 1)")
         config = part(SIMULATION, simulated)
@@ -84,7 +85,7 @@ class Wavefront(Method):
         return cls.with_bank({name: c.values for name, c in drawn.items()}, config, data)
 
     @classmethod
-    def with_bank(cls, drawn: Mapping[str, np.ndarray], config: Any, data: TrainingSet) -> Self:
+    def with_bank(cls, drawn: Mapping[str, np.ndarray], config: Config, data: TrainingSet) -> Self:
         """The method with the columns of a bank of stars, as `fresh_stars` draws them."""
         from psfdae_paper.bounds.estimates import stamp_model, static_psfs
         from psfdae_paper.bounds.posterior import Bank

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, cast
 
 import numpy as np
 
@@ -41,6 +41,9 @@ from psfdae_paper.bounds.tables import (
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.consistency import SIMULATION
 from psfdae_paper.configuration.schema import Config
+
+if TYPE_CHECKING:
+    from psfdae_paper.methods.wavefront import Wavefront
 
 KNOWING_THE_OPTICS = ("wavefront", "wavefront_position")
 
@@ -136,7 +139,7 @@ def optics(
     bounded = bounded_stars(config, product)
     position = field_positions(product)[bounded.star]
     summary, stars_table = [], []
-    for kind in (method(name) for name in KNOWING_THE_OPTICS):
+    for kind in (cast("type[Wavefront]", method(name)) for name in KNOWING_THE_OPTICS):
         data = {r: training_set(config, kind, product, SPLIT, r) for r in bounded.truth}
         first = kind.with_bank(drawn.arrays, config, next(iter(data.values())))
         fitted = {reference: replace(first, data=own) for reference, own in data.items()}
@@ -147,8 +150,8 @@ def optics(
                 found = estimator.estimated(*posterior, noisy, level, position)
                 truth = bounded.truth[reference]
                 metrics = quality(found, truth, config.evaluation.data_range)
-                row = {"dataset": dataset, "split": SPLIT, "reference": reference}
-                row |= {"method": kind.name, "noise_level": level}
+                row: dict[str, object] = {"dataset": dataset, "split": SPLIT}
+                row |= {"reference": reference, "method": kind.name, "noise_level": level}
                 summary += summarised(row, metrics, bounded.field)
                 each = {"star": bounded.star, "field": bounded.field}
                 stars_table.append(pd.DataFrame({**row, **each, **metrics}))

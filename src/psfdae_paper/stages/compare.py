@@ -180,7 +180,8 @@ def read_errors(folder: Path) -> pd.DataFrame:
     for path, part in parts.items():
         if lacking := [name for name in wanted if name not in part]:
             raise ProductError(f"{path}: column {lacking[0]!r} is missing")
-    return pd.concat([part[wanted] for part in parts.values()], ignore_index=True)
+    table: pd.DataFrame = pd.concat([part[wanted] for part in parts.values()], ignore_index=True)
+    return table
 
 
 def describe_tables(first: Path, second: Path) -> str:
@@ -193,9 +194,10 @@ def describe_tables(first: Path, second: Path) -> str:
         seed_scatter,
     )
 
-    both = [read_errors(folder) for folder in (first, second)]
+    both = read_errors(first), read_errors(second)
     rows, order = compare_tables(*both, seed_scatter())
-    names = " < ".join(method(name).look.paper[1] for name in PAPER_ORDER)  # type: ignore[index]
+    looks = [method(name).look for name in PAPER_ORDER]
+    names = " < ".join(look.paper[1] for look in looks if look.paper)
     said = {
         "equal": "are equal to the last digit",
         "rounding": f"differ by less than {NEGLIGIBLE:g} of the standard error of the test stars, "
@@ -227,7 +229,7 @@ def _named(rows: pd.DataFrame) -> list[str]:
         metrics: dict[str, list[str]] = {}
         for (name, metric), part in cell.groupby(["method", "metric"], sort=False):
             levels = ", ".join(f"{level:g}" for level in part.noise_level)
-            metrics.setdefault(f"{name} at λ = {levels}", []).append(metric)
+            metrics.setdefault(f"{name} at λ = {levels}", []).append(str(metric))
         found = (f"{name} ({', '.join(of)})" for name, of in metrics.items())
         lines.append(f"{_cell(key)}: {'; '.join(found)}")
     return lines

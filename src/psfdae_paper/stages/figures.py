@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
@@ -195,7 +195,7 @@ def field_of(stars: Product) -> np.ndarray:
 
 
 def strip_rows(
-    config: Any,
+    config: Config,
     product: Product,
     test: np.ndarray,
     picks: np.ndarray,
@@ -264,7 +264,7 @@ def figure_bank_growth(
 
 def rows_of(path: Path, dataset: str, reference: str | None = None) -> pd.DataFrame:
     """Rows of a dataset, and of a reference if one is given; raises ProductError without any."""
-    table = read_table(path)
+    table: pd.DataFrame = read_table(path)
     rows = table[table.dataset == dataset]
     if reference is not None:
         rows = rows[rows.reference == reference]

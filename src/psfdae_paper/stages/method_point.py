@@ -14,6 +14,7 @@ from psfdae.model.star_sets import read_stars, training_set
 from psfdae.reading import read_table
 from psfdae.threads import limit_threads
 from psfdae_paper.configuration.compose import part
+from psfdae_paper.configuration.schema import Config
 from psfdae_paper.stages.fit import fit
 from psfdae_paper.sweeps.measured import Measured, Task, fit_in, measure_images
 
@@ -23,7 +24,7 @@ def files_of(name: str) -> tuple[str, ...]:
     return tuple(path.name for path in fits.outputs(method(name), fit_in(method(name), Path())))
 
 
-def run(config: Any, task: Task, name: str) -> Measured:
+def run(config: Config, task: Task, name: str) -> Measured:
     """Fit as the stage `fit` does, and measure.
 
     If that fit takes the validation stars, too, the model that is validated is fitted
