@@ -26,9 +26,10 @@ from psfdae.version import __version__
 if TYPE_CHECKING:
     from psfdae.errors import Error
     from psfdae.image.stamps import StarFlag
+    from psfdae.model.field_psfs import PredictionError
     from psfdae.model.fitting import fit
     from psfdae.model.prediction import Prediction
-    from psfdae.model.psf_model import PredictionError, PsfModel, load_model
+    from psfdae.model.psf_model import PsfModel, load_model
     from psfdae.model.stars import Stars
     from psfdae.model.validation import Report, validate
     from psfdae.sensing.results import Wavefronts, wavefront
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
 _MODULES = {
     "Error": "errors",
     "Prediction": "model.prediction",
-    "PredictionError": "model.psf_model",
+    "PredictionError": "model.field_psfs",
     "PsfModel": "model.psf_model",
     "Report": "model.validation",
     "StarFlag": "image.stamps",

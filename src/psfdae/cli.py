@@ -168,8 +168,9 @@ def groups() -> dict[str, str]:
 def stage(name: str) -> Callable[..., Any]:
     """The function of a command; its module is imported."""
     module = import_module(found()[name][0])
-    functions = [f for f in vars(module).values() if isinstance(getattr(f, "stage", None), Stage)]
-    return next(f for f in functions if f.stage.name == name)
+    marked = (f for f in vars(module).values() if isinstance(getattr(f, "stage", None), Stage))
+    function: Callable[..., Any] = next(f for f in marked if f.stage.name == name)
+    return function
 
 
 def _shortened(text: str, width: int) -> str:

@@ -206,7 +206,11 @@ def restoration_strip(rows: Sequence[StripRow], columns: Sequence[str], title: s
 
 
 def draw_cell(
-    figure: Figure, box: tuple[float, ...], row: StripRow, column: int, peak: np.ndarray
+    figure: Figure,
+    box: tuple[float, float, float, float],
+    row: StripRow,
+    column: int,
+    peak: np.ndarray,
 ) -> Axes:
     """A stamp of a row on a square-root scale up to `peak`, (n,); the first one has the label."""
     image = row.images[column]

@@ -399,7 +399,7 @@ def _most_bytes(column: Column | Empty) -> int:
     """Upper limit of what HDF5 stores of a column, with the table of its chunks."""
     if isinstance(column, Column):
         # Chunks at the border are whole; h5py gives them at least half of an axis' length.
-        return int(column.values.nbytes) * 2**column.values.ndim + 2**17
+        return (int(column.values.nbytes) << column.values.ndim) + 2**17
     rows = _storage(column)["chunks"][0]
     count = -(-column.shape[0] // rows)
     row_bytes = int(np.prod(column.shape[1:], dtype=int)) * np.dtype(column.dtype).itemsize

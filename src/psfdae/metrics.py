@@ -19,7 +19,7 @@ BLOCK = 256
 def mse(estimates: np.ndarray, references: np.ndarray) -> np.ndarray:
     """Mean squared error of every stamp, shape (n,)."""
     difference = estimates.astype(np.float64) - references
-    return (difference**2).mean(axis=(1, 2))
+    return np.asarray((difference**2).mean(axis=(1, 2)))
 
 
 def ssim(
@@ -58,7 +58,7 @@ def ssim(
     inner = slice(SSIM_WINDOW // 2, side - SSIM_WINDOW // 2)
 
     def mean(images: np.ndarray) -> np.ndarray:
-        return uniform_filter(images, (1, SSIM_WINDOW, SSIM_WINDOW))[:, inner, inner]
+        return np.asarray(uniform_filter(images, (1, SSIM_WINDOW, SSIM_WINDOW))[:, inner, inner])
 
     out = np.empty(ranges.shape)
     for first in range(0, count, BLOCK):
@@ -82,7 +82,7 @@ def ssim(
 
 def peak_range(references: np.ndarray) -> np.ndarray:
     """Maximum minus minimum of every reference, shape (n,)."""
-    return references.max(axis=(1, 2)) - references.min(axis=(1, 2))
+    return np.asarray(references.max(axis=(1, 2)) - references.min(axis=(1, 2)))
 
 
 def all_metrics(

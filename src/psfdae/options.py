@@ -17,7 +17,7 @@ Folder = Annotated[Path, click.Path(path_type=Path, file_okay=False)]
 AboveZero = click.FloatRange(min=0, min_open=True)
 
 
-class NameOrNumber(click.ParamType):
+class NameOrNumber(click.ParamType):  # type: ignore[type-arg]  # click below 8.5 takes none
     """An extension of a FITS file: its number, in plain digits, or its name."""
 
     name = "text"

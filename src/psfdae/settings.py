@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -40,11 +40,13 @@ class ConfigError(Error, ValueError):
     """The configuration is not usable; every line names a key, its value and the range."""
 
 
+Model = TypeVar("Model", bound=BaseModel)
+
 LONGEST = 200
 """Characters of a wrong value that a message repeats."""
 
 
-def validate(model: type[Any], tree: Mapping[str, Any]) -> Any:
+def validate(model: type[Model], tree: Mapping[str, Any]) -> Model:
     """Check a configuration tree against a pydantic model.
 
     Raises

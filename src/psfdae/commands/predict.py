@@ -21,8 +21,9 @@ from psfdae.image.observation import Observation, Source, list_offset
 from psfdae.image.stamps import Stamps, StarFlag
 from psfdae.method import MeasuresStars
 from psfdae.model.bundle import SUFFIX
+from psfdae.model.field_psfs import PredictionError
 from psfdae.model.prediction import Prediction, prediction_file
-from psfdae.model.psf_model import MARGIN_PX, PredictionError, PsfModel, load_model
+from psfdae.model.psf_model import MARGIN_PX, PsfModel, load_model
 from psfdae.options import File, NameOrNumber
 
 

@@ -81,8 +81,8 @@ CONVENTIONS = [
 # SExtractor's bits that say something against a star; 1, a neighbour nearby, is no reason.
 FLAGGED = {2: StarFlag.BLENDED, 4: StarFlag.SATURATED, 8: StarFlag.TRUNCATED}
 # Columns that identify a star; the first of these that a catalogue has is used.
-ID_COLUMNS = ("id", "source_id", "number", "star_id", "objid", "obj_id", "object_id")
-ID_COLUMNS += ("label", "name")
+ID_COLUMNS: tuple[str, ...] = ("id", "source_id", "number", "star_id", "objid", "obj_id")
+ID_COLUMNS += ("object_id", "label", "name")
 
 
 class ColumnError(Error, ValueError):
@@ -395,8 +395,8 @@ def _fits_table(path: Path) -> _FitsTable:
         ]
         objects = [hdu for hdu in tables if hdu.name == "LDAC_OBJECTS"] or tables
         if len(objects) != 1:
-            names = shorten([hdu.name or "(no name)" for hdu in objects])
-            raise ObservationError(path, f"expected one table of stars, found {names}")
+            found = shorten([hdu.name or "(no name)" for hdu in objects])
+            raise ObservationError(path, f"expected one table of stars, found {found}")
         rows = int(objects[0].header["NAXIS2"])
         size = objects[0].header["NAXIS1"] * rows
         if objects[0].fileinfo()["datLoc"] + size > file.path.stat().st_size:

@@ -61,14 +61,14 @@ NOT_SCIENCE = MASKS | ERRORS | EXTRAS  # extensions that go with an image
 
 # Electrons per count; cameras that write the first two put a setting without unit into GAIN.
 GAIN_KEYS = ("EGAIN", "GAIN", "ESO DET OUT1 CONAD", "ATODGAIN", "CCDGAIN", "GAIN1", "GAINA")
-READ_NOISE_KEYS = ("RDNOISE", "READNOIS", "READNOISE", "RON", "ENOISE", "ESO DET OUT1 RON")
-READ_NOISE_KEYS += ("CCDNOISE", "RDNOISE1", "RDNOISEA")  # electrons
+READ_NOISE_KEYS: tuple[str, ...] = ("RDNOISE", "READNOIS", "READNOISE", "RON", "ENOISE")
+READ_NOISE_KEYS += ("ESO DET OUT1 RON", "CCDNOISE", "RDNOISE1", "RDNOISEA")  # electrons
 SATURATION_KEYS = ("SATURATE", "SATLEVEL", "SATURATA", "MAXLIN")  # counts
 # Arcseconds; the second is POPPY's.
 SCALE_KEYS = ("PIXSCALE", "PIXELSCL", "SECPIX", "SECPIX1", "PIXSCAL1", "IM_SCALE", "SCALE")
 LENS_KEYS = ("XPIXSZ", "FOCALLEN")  # micrometres and millimetres, of amateurs' cameras
 # Where stamps come from, copied to whatever is made of them.
-PROVENANCE_KEYS = ("OBJECT", "TELESCOP", "INSTRUME", "OBSERVER", "FILTER")
+PROVENANCE_KEYS: tuple[str, ...] = ("OBJECT", "TELESCOP", "INSTRUME", "OBSERVER", "FILTER")
 PROVENANCE_KEYS += ("DATE-OBS", "MJD-OBS", "EXPTIME", "AIRMASS")
 
 Card = tuple[str, Any, str]  # key, value and comment
@@ -524,7 +524,11 @@ def decompress(path: Path, hdu: Any, copy: IO[bytes]) -> np.ndarray:
         wide *= max(1, BLOCK_PX // (high * wide))
     for row in range(0, rows, high):
         for column in range(0, columns, wide):
-            block = (*first, slice(row, row + high), slice(column, column + wide))
+            block: tuple[int | slice, ...] = (
+                *first,
+                slice(row, row + high),
+                slice(column, column + wide),
+            )
             values[block] = hdu.section[block]
     return values
 

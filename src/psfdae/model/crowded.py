@@ -294,7 +294,7 @@ def tents(r: np.ndarray, radius_px: np.ndarray) -> np.ndarray:
     tops = np.log(radius_px)
     inside = np.maximum(r, radius_px[0])
     off = np.abs(np.log(inside) - tops[:-1].reshape(-1, *[1] * r.ndim)) / (tops[1] - tops[0])
-    return np.maximum(1.0 - off, 0.0) * (inside / radius_px[0]) ** -STEEPNESS
+    return np.asarray(np.maximum(1.0 - off, 0.0) * (inside / radius_px[0]) ** -STEEPNESS)
 
 
 def _tented(

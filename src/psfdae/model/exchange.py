@@ -137,7 +137,7 @@ class PsfexField(FieldPsfs):
         axis = (np.arange(count) - oversampling * (self.stamp_px // 2)) / oversampling
         whole = np.arange(self.stamp_px) - self.stamp_px // 2  # of a star in the middle
         inside = self._interpolated(sampled, whole, np.zeros_like(phase)).sum(axis=(1, 2))
-        return self._interpolated(sampled, axis, phase) / inside[:, None, None]
+        return np.asarray(self._interpolated(sampled, axis, phase) / inside[:, None, None])
 
     def _interpolated(self, sampled: np.ndarray, axis: np.ndarray, phase: np.ndarray) -> np.ndarray:
         """Images (n, m, m) on an axis (m,) of samples (n, h, w), moved by phases (n, 2), x, y."""

@@ -102,7 +102,7 @@ class Errors:
 
     def rms(self) -> np.ndarray:
         """Root mean square per pixel, shape (S, d, d)."""
-        return np.sqrt(np.stack([np.square(node).mean(axis=0) for node in self.error]))
+        return np.asarray(np.sqrt(np.stack([np.square(node).mean(axis=0) for node in self.error])))
 
     def strange_limit(self) -> np.ndarray | None:
         """What 0.1 % of the stars exceed at every node, shape (S,).
@@ -310,7 +310,9 @@ def measure_errors(
 def errors_of(estimate: Estimate, references: np.ndarray) -> np.ndarray:
     """PSFs minus references (n, d, d), in units of σ if the method says it, else of the flux."""
     error = estimate.psf - references
-    return error if estimate.sigma is None else error / np.maximum(estimate.sigma, LEAST_SIGMA)
+    return np.asarray(
+        error if estimate.sigma is None else error / np.maximum(estimate.sigma, LEAST_SIGMA)
+    )
 
 
 def calibrated(

@@ -485,7 +485,7 @@ class Photometer:
         residual = ring / sigma2[:, None] + pull @ self._ring_basis
         lost = np.where(sky_known, 0.0, 1.0 / self.pixels)
         precision = beyond @ self._ring_basis**2 + ((1.0 - lost) / sigma2)[:, None]
-        return residual / np.sqrt(precision)
+        return np.asarray(residual / np.sqrt(precision))
 
     def _normalise(self, x: np.ndarray, fit: _Fit) -> tuple[np.ndarray, np.ndarray]:
         """Images of flux 1, and which of them stay in the range of the training set."""

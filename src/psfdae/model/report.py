@@ -60,7 +60,7 @@ def fitted_mean(noisy: np.ndarray, mean: np.ndarray, reach_px: float) -> np.ndar
 
     def at(places: np.ndarray) -> np.ndarray:
         psf = cut(moved(np.broadcast_to(mean, (len(places), *mean.shape)), places), side)
-        return psf / psf.sum(axis=(1, 2), keepdims=True)
+        return np.asarray(psf / psf.sum(axis=(1, 2), keepdims=True))
 
     count, side = noisy.shape[:2]
     axis = np.arange(-reach_px, reach_px + STEP_PX / 2, STEP_PX)
@@ -167,7 +167,7 @@ class Quality:
 
     def usable(self) -> np.ndarray:
         """Stars whose shape means something."""
-        return ~self.has(SPOILT) & np.isfinite(self.stars["fwhm_px"])
+        return np.asarray(~self.has(SPOILT) & np.isfinite(self.stars["fwhm_px"]))
 
     def chi2(self) -> dict[str, np.ndarray]:
         """χ² of stars without a flag that were not learnt from, by words for their S/N."""
@@ -184,7 +184,7 @@ class Quality:
     def sizes(self, snr: float, kind: str) -> np.ndarray:
         """FWHM of the faint held-out stars over that of their bright images, minus 1, (n,)."""
         found, truth = (measure_shapes(self.faint[snr][k]) for k in (kind, "truth"))
-        return found.fwhm_px / truth.fwhm_px - 1.0
+        return np.asarray(found.fwhm_px / truth.fwhm_px - 1.0)
 
 
 def quality_page(q: Quality) -> str:

@@ -37,7 +37,7 @@ def field_positions(stars: Product) -> np.ndarray:
 
     NaN where an image's list does not say it.
     """
-    return stars["position" if of_image(stars) else "grid"][stars["field_index"]]
+    return np.asarray(stars["position" if of_image(stars) else "grid"][stars["field_index"]])
 
 
 def star_area(stars: Product, train: np.ndarray) -> float:
@@ -87,7 +87,7 @@ def noisy_test_images(config: Any, stars: Product, test: np.ndarray, level: floa
     """
     of = stars.config.get("stars", {}).get("name", "own")
     rng = stream(config.seed, "noise", "test", of, f"{level:.6g}")
-    return noise_model(config).draw(stars["realisation"], level, rng)[test]
+    return np.asarray(noise_model(config).draw(stars["realisation"], level, rng)[test])
 
 
 def training_set(

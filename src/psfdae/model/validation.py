@@ -16,11 +16,12 @@ from psfdae.image.stamps import Stamps
 from psfdae.method import Method, facts_of
 from psfdae.methods import method as method_of
 from psfdae.metrics import all_metrics, mse, quality, summarised
+from psfdae.model.field_psfs import PredictionError
 from psfdae.model.packing import checksum
 from psfdae.model.photometry import signal_to_noise
 from psfdae.model.plot import FieldStars, psf_map
 from psfdae.model.prediction import Prediction
-from psfdae.model.psf_model import MARGIN_PX, PredictionError, PsfModel
+from psfdae.model.psf_model import MARGIN_PX, PsfModel
 from psfdae.model.report import MEAN_PSF, SHOWN_STARS, Quality, fitted_mean, quality_page, standing
 from psfdae.model.star_sets import (
     field_positions,
@@ -286,7 +287,7 @@ def _one_of_each(star: np.ndarray, position: np.ndarray) -> np.ndarray:
     stars, first = np.unique(star, return_index=True)
     if not np.isfinite(position[stars]).all():
         return first[:STRIP_STARS]
-    return first[spread_stars(position[stars], STRIP_STARS)]
+    return np.asarray(first[spread_stars(position[stars], STRIP_STARS)])
 
 
 def _all_stars(

@@ -86,9 +86,18 @@ def with_weights(build: Callable[[], Network], path: Path) -> Network:
             raise ProductError(
                 f"{path}: shape of {name} is {has}, but {needs} in the network of its config.yaml"
             )
-    model = build().to(memory_format=torch.channels_last)
+    model = channels_last(build())
     model.load_state_dict(state)
     return model.eval()
+
+
+def channels_last(network: Network) -> Network:
+    """The network with its weights in the order in memory in which convolutions are fastest."""
+    import torch
+
+    # torch's own types know this argument of tensors only.
+    moved: Network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    return moved
 
 
 def load_weights(path: Path) -> dict[str, np.ndarray]:

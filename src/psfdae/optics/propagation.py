@@ -232,10 +232,10 @@ class StampPropagator:
 
     def _buffer(self, name: str, *shape: int) -> Any:
         """Scratch space kept between calls: fresh pages would cost more than the arithmetic."""
-        kept = self._work.__dict__
-        if (name, shape) not in kept:
-            kept[name, shape] = self._array(np.empty(shape, self.real_dtype))
-        return kept[name, shape]
+        kept: dict[tuple[int, ...], Any] = vars(self._work).setdefault(name, {})
+        if shape not in kept:
+            kept[shape] = self._array(np.empty(shape, self.real_dtype))
+        return kept[shape]
 
 
 def in_batches(

@@ -161,7 +161,7 @@ class ZernikeTracer:
         pupil = slice(0, self._weights.size)
         landing, velocity = (a.reshape(*lost.shape, 3)[:, pupil] for a in (rays.r, rays.v))
         lead = self._lead(landing, velocity, rays.t.reshape(lost.shape)[:, pupil])
-        return (lead @ self._fit.T)[:, FIRST_NOLL - 1 :]
+        return np.asarray((lead @ self._fit.T)[:, FIRST_NOLL - 1 :])
 
     def _lead(self, landing: np.ndarray, velocity: np.ndarray, path: np.ndarray) -> np.ndarray:
         """Lead of every ray on the mean of its field at the reference sphere, in waves."""
@@ -172,7 +172,7 @@ class ZernikeTracer:
         # Back along the ray to the sphere, |offset + s·direction| = radius with s < 0.
         beyond = (offset**2).sum(-1) - self.optic.sphereRadius**2
         path = path - along - np.sqrt(along**2 - beyond)
-        return (path @ self._weights[:, None] - path) / self.wavelength
+        return np.asarray((path @ self._weights[:, None] - path) / self.wavelength)
 
 
 def annulus_points(highest: int, obscuration: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
