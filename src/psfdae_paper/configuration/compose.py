@@ -193,8 +193,7 @@ def load(overrides: Sequence[str] = ()) -> Config:
 def checked(tree: Mapping[str, Any]) -> Config:
     """As `load`, of a tree that is composed."""
     if not _aligns(tree):
-        whole: Config = validate(whole_config(), tree)
-        return whole
+        return validate(whole_config(), tree)
     _require_known(tree)
     return part(alignment.GROUPS, tree)
 
@@ -258,8 +257,7 @@ def load_file(model: type[Model], path: Path) -> Model:
         raise ConfigError(str(error)) from None
     except Exception as error:
         raise ConfigError(f"{path}: {_first_lines(error)}") from None
-    checked: Model = _named(path, lambda: validate(model, tree if isinstance(tree, dict) else {}))
-    return checked
+    return _named(path, lambda: validate(model, tree if isinstance(tree, dict) else {}))
 
 
 def _named(path: Path, check: Callable[[], T]) -> T:

@@ -36,7 +36,7 @@ class Consistent(Group):
 
     @model_validator(mode="before")
     @classmethod
-    def _derive(cls, tree: Any) -> Any:
+    def _derive(cls, tree: object) -> object:
         if not isinstance(tree, Mapping):
             return tree
         _check_scene(tree)
@@ -116,7 +116,7 @@ def _derived_values(name: str, tree: Mapping[str, Any]) -> dict[str, Any]:
     return {}
 
 
-def _search(group: Any, pixel: float | None) -> int:
+def _search(group: object, pixel: float | None) -> int:
     """Search distance in pixels; any number for a group that will be refused in a moment."""
     reach = group.get("search_lambda_d", SEARCH) if isinstance(group, Mapping) else SEARCH
     if isinstance(reach, bool) or not isinstance(reach, int | float) or not reach > 0:

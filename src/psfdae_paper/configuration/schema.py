@@ -114,7 +114,7 @@ class Optics(WholePeriodOptics):
     backend: Literal["numpy", "torch"] = Field(description="Library of the matrix products")
 
 
-def _optics(tree: Any) -> Any:
+def _optics(tree: object) -> object:
     if not isinstance(tree, Mapping):
         return tree
     return (Optics if "backend" in tree else WholePeriodOptics).model_validate(tree)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
@@ -65,7 +65,7 @@ class Axis(Group):
 
     @model_validator(mode="before")
     @classmethod
-    def _short_forms(cls, given: Any) -> Any:
+    def _short_forms(cls, given: object) -> object:
         """A bare list are values; names of choices may look like numbers."""
         if isinstance(given, list):
             return {"values": given}

@@ -240,7 +240,7 @@ def _cell(key: Sequence[Any]) -> str:
     return ", ".join([*key[:3], *(f"λ = {level:g}" for level in key[3:])])
 
 
-def _table(rows: Sequence[Sequence[Any]], headers: Sequence[str]) -> str:
+def _table(rows: Sequence[Sequence[object]], headers: Sequence[str]) -> str:
     from tabulate import tabulate
 
     if not rows:

@@ -211,7 +211,7 @@ def _require_history(name: str, found: Mapping[str, str]) -> None:
         ) from None
 
 
-def provenance(results: Path, config: Config) -> dict[str, Any]:
+def provenance(results: Path, config: Config) -> dict[str, object]:
     """Where a run comes from and what it took."""
     costs = _costs(results)
     canonical = json.dumps(config.model_dump(), sort_keys=True)

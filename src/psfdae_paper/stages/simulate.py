@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -303,7 +302,7 @@ def write_example(out: Path, catalogue: Path, seed: int, **recipe: int) -> Examp
     The image has a WCS and the cards GAIN and SATURATE; the list has pixel (1-based)
     and sky coordinates of all stars but the companions of blended ones.
     """
-    made = replace(FieldRecipe(), **recipe)
+    made = FieldRecipe(**recipe)  # type: ignore[arg-type]  # no pair of numbers among them
     field = simulated(made, seed)
     x, y = field.centroid.T
     write_field(

@@ -274,5 +274,4 @@ def _asked(trial: Trial, folder: Path) -> tuple[dict[str, Axis], dict[str, Value
 
 def _with(config: Config, keys: Mapping[str, Value]) -> Config:
     """The stage's configuration with other values, checked again."""
-    changed: Config = validate(type(config), with_values(config.model_dump(), keys))
-    return changed
+    return validate(type(config), with_values(config.model_dump(), keys))

@@ -137,7 +137,7 @@ def image_rows(
     return rows
 
 
-def image_metrics(part: str, rows: list[dict[str, Any]]) -> dict[str, float]:
+def image_metrics(part: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
     """MSE and SSIM of a part, over all noise levels and at each."""
     metrics: dict[str, float] = {}
     for metric, mean in (("mse", geometric_mean), ("ssim", lambda v: float(np.mean(v)))):
