@@ -22,7 +22,7 @@ from scipy.linalg import eigh
 from torch import nn
 
 from psfdae.networks.training import Row, Training
-from psfdae.networks.weights import with_weights
+from psfdae.networks.weights import channels_last, with_weights
 from psfdae.noise import NoiseModel, mixed_levels
 from psfdae.rng import stream
 from psfdae_paper.alignment.telescope import Mirror, mirror_symmetries
@@ -134,8 +134,7 @@ def build_network(
     Inner layers draw N(0, 2/fan_in) (He et al. 2015), the last one PyTorch's uniform
     ±1/√fan_in; its bias is 0, the middle of the range.
     """
-    model = empty_network(config, fields, stamp_px)
-    model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch's stubs
+    model = channels_last(empty_network(config, fields, stamp_px))
     leak = getattr(config, "leak", 0.0)
     with torch.no_grad():
         for layer in model.features:
