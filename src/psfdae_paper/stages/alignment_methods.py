@@ -11,7 +11,7 @@ from __future__ import annotations
 import time
 from collections import defaultdict
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, make_dataclass, replace
+from dataclasses import make_dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -83,7 +83,6 @@ OF_DAE = "Folder of `alignment train-dae`."
 DaeFolder = Annotated[Folder, OF_DAE]
 if TYPE_CHECKING:
 
-    @dataclass
     class NetworkFolders:
         """A folder of each network, by its name."""
 else:
@@ -275,7 +274,7 @@ def estimate(
     limit_threads(config.evaluation.threads)
     product = read_product(states, "alignment_states", ("states", "stamps"))
     require_origin(dae, STATE_STAMPS, product)
-    folders: dict[str, Path] = asdict(networks)
+    folders: dict[str, Path] = vars(networks)
     for name, folder in folders.items():
         require_network(folder, product, name)
     predict = {name: network_predictor(folder, config) for name, folder in folders.items()}
