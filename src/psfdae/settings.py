@@ -36,6 +36,11 @@ class Group(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
+Config = Any
+"""A configuration: a model of which the groups are attributes. Which there are follows from the
+methods, and the class is made of them when it is needed."""
+
+
 class ConfigError(Error, ValueError):
     """The configuration is not usable; every line names a key, its value and the range."""
 

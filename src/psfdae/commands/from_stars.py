@@ -59,7 +59,7 @@ class Made:
         return self.path / "stars.h5"
 
     @property
-    def list(self) -> Path:
+    def star_list(self) -> Path:
         return self.path / "stars.csv"
 
     def fit(self, kind: type[Method]) -> Path:
@@ -140,7 +140,7 @@ def trained(
     source = stated.source(image)
     settings, kinds, tried = _methods(of_config(config), taken)
     files = Made(out, _stem(image, name), kinds)
-    made = [*files.written(), *([files.list] if source.detect is not None else []), page]
+    made = [*files.written(), *([files.star_list] if source.detect is not None else []), page]
     check_outputs(made, source.files())
     if page is not None and page.exists() and not (overwrite or interrupted(files.bundle)):
         raise FolderError(f"{page}: exists already; --overwrite replaces it")
@@ -226,7 +226,7 @@ def _make(
     stars = Stars.of(source, settings)
     print(*stars.notes, stars.summary(), sep="\n")
     if source.detect is not None:
-        write_list(stars.observation, files.list)
+        write_list(stars.observation, files.star_list)
     write_columns(files.path / "selection.csv", stars.table.columns, digits=6)
     write_product(files.stars, "stars", stars.columns, stars.described())
     write_text(files.path / "overrides.txt", _overrides(stars.settings))

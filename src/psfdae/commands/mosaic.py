@@ -17,7 +17,7 @@ from psfdae.errors import Error
 from psfdae.image.catalogue import read_catalogue
 from psfdae.image.errors import ObservationError
 from psfdae.image.fits_file import science_images
-from psfdae.model.psf_model import available_cores
+from psfdae.threads import available_cores
 
 ALONE = ("extension", "origin", "mask", "weight", "variance")
 """What is stated of one image, and cannot be of several."""

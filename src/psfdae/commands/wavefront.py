@@ -135,13 +135,14 @@ def field_angles(
                 raise SensingError(f"{table.path}: no x_deg, y_deg in row {lost.argmax() + 1}")
             return angle
     positions, shape = observation.positions, observation.shape
-    if positions is None or (shape is None and axis is None):
+    if axis is None and shape is not None:
+        axis = (0.5 * (shape[1] - 1), 0.5 * (shape[0] - 1))
+    if positions is None or axis is None:
         raise SensingError(
             f"{observation.path}: the stars' field angles are not known: a star list with columns "
             "x_deg, y_deg, an image, or --axis with positions says them"
         )
-    middle = axis if axis is not None else (0.5 * (shape[1] - 1), 0.5 * (shape[0] - 1))
-    angle = (positions - np.asarray(middle)) * telescope.pixel_scale_arcsec / 3600.0
+    angle = (positions - np.asarray(axis)) * telescope.pixel_scale_arcsec / 3600.0
     if not np.isfinite(angle).all():
         raise SensingError(f"{observation.path}: stars without a position (--on-image leaves out)")
     return np.asarray(angle)

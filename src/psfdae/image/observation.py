@@ -486,8 +486,8 @@ class Observation:
         for (name, (value, origin)), unit in zip(self.camera.items(), units, strict=True):
             words.append(f"{name} {origin if value is None else f'{value:.6g} {unit} ({origin})'}")
         said = f"{self.path}: {', '.join(words)}"
-        if empty := self._layers.empty:
-            said += f"\n{self._layers.noise.path}: weight 0, bad pixels: {empty}"  # type: ignore
+        if (empty := self._layers.empty) and (noise := self._layers.noise) is not None:
+            said += f"\n{noise.path}: weight 0, bad pixels: {empty}"
         lost = self.without_position()
         if lost.any():
             rows = shorten([str(row + 1) for row in np.flatnonzero(lost)])

@@ -91,7 +91,7 @@ class PsfexField(FieldPsfs):
         )
         if names and not (at_place and int(header["POLNGRP"]) == 1):
             self._refuse(f"changes with {', '.join(names)}; expected X_IMAGE and Y_IMAGE")
-        self.order = int(header["POLDEG1"]) if names else 0
+        self._order = order = int(header["POLDEG1"]) if names else 0
         self.step = float(header["PSF_SAMP"])
         zero, width = np.full(2, 0.0), np.full(2, NO_WIDTH)
         if names:
@@ -100,10 +100,11 @@ class PsfexField(FieldPsfs):
                 for key in ("POLZERO", "POLSCAL")
             )
         mask = mask.reshape(-1, *mask.shape[-2:])
-        self.terms = np.array(psfex_powers(self.order)) if self.order <= HIGHEST_ORDER else []
+        powers = psfex_powers(order) if order <= HIGHEST_ORDER else []
+        self.terms: np.ndarray = np.array(powers)
         side = min(mask.shape[-2:])
         usable = (
-            0 <= self.order <= HIGHEST_ORDER
+            0 <= order <= HIGHEST_ORDER
             and len(self.terms) == len(mask)
             and 1 < side <= max(mask.shape[-2:]) <= LARGEST_PSF
             and 0.01 < self.step <= 10
@@ -116,6 +117,10 @@ class PsfexField(FieldPsfs):
             self._refuse("its polynomial, sampling, scales or pixels are out of range")
         self.basis, self.stamp_px = mask, 2 * max(1, int(side * self.step / 2))
         self.zero, self.width = zero - 1.0, width
+
+    @property
+    def order(self) -> int:
+        return self._order
 
     @cached_property
     def sha256(self) -> str:
@@ -197,7 +202,8 @@ def write_psfex(path: Path, model: FieldPsfs, oversampling: int) -> float:
     powers = psfex_powers(order)
     u, v = ((places - zero) / width).T
     terms = np.stack([u**i * v**j for i, j in powers], axis=1)
-    psfs = model.psf_at(*places.T, oversampling)
+    x, y = places.T
+    psfs = model.psf_at(x, y, oversampling)
     basis = np.tensordot(np.linalg.pinv(terms), psfs, 1)
     off = float(np.abs(np.tensordot(terms, basis, 1) - psfs).max() / psfs.max())
     size = basis.shape[-1]
