@@ -283,8 +283,8 @@ def _cards(source: Source, observation: Observation) -> list[Card]:
             f"[arcsec] width of a pixel{', assumed' if observation.scale_assumed else ''}",
         ),
     ]
-    if source.catalogue is not None:
-        cards.append(("CATALOG", source.catalogue.name, "star list"))
+    if observation.catalogue is not None:
+        cards.append(("CATALOG", observation.catalogue.name, "star list"))
     if observation.gain is not None:
         cards.append(("GAIN", observation.gain, "electrons per count"))
     if observation.saturate is not None:

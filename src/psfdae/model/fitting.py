@@ -37,7 +37,7 @@ def fit(
     *,
     name: str | None = None,
     licence: str = "not stated",
-    **settings: Any,
+    **settings: object,
 ) -> PsfModel:
     """Train a model on the bright stars of an image, without those that are held out.
 

@@ -46,6 +46,7 @@ from psfdae.model.star_sets import (
 )
 from psfdae.noise import NoiseModel
 from psfdae.rng import stream
+from psfdae.settings import OfTest
 from psfdae.version import __version__
 
 NODES = 8  # noise levels at which errors are measured, equidistant in the logarithm
@@ -124,7 +125,7 @@ def bundle_of(
     fitted: Method,
     stars: Product,
     reference: str,
-    config: Any,
+    config: OfTest,
     trained: Mapping[str, Any],
     name: str,
     licence: str,
