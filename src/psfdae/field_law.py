@@ -295,6 +295,11 @@ class FieldLaw:
         return FieldModel(coefficients, self.low, self.high, self.settings.spacing_px)
 
     @property
+    def order(self) -> int:
+        """Order of its polynomial."""
+        return self.model.order
+
+    @property
     def side(self) -> int:
         """Side of a stamp in pixels."""
         return isqrt(self.offset.shape[-1]) - 2 * MARGIN_PX

@@ -100,7 +100,7 @@ def in_field_unit(field: np.ndarray) -> tuple[np.ndarray, str]:
     return 60.0 * degrees, "arcmin"
 
 
-def write_png(figure: Any, out: Path) -> None:
+def write_png(figure: Figure, out: Path) -> None:
     """Write a matplotlib figure atomically; the same figure gives the same bytes."""
     write_bytes(out, as_png(figure))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -119,7 +120,7 @@ def quality(estimate: Estimate, truth: np.ndarray, data_range: float) -> dict[st
 
 
 def summarised(
-    row: dict[str, Any], metrics: dict[str, np.ndarray], field: np.ndarray
+    row: Mapping[str, object], metrics: Mapping[str, np.ndarray], field: np.ndarray
 ) -> list[dict[str, Any]]:
     """Mean of each metric with its standard error by field, each added to a copy of `row`."""
     rows = []

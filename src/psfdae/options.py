@@ -22,6 +22,8 @@ class NameOrNumber(click.ParamType):  # type: ignore[type-arg]  # click below 8.
 
     name = "text"
 
-    def convert(self, value: Any, param: Any, ctx: Any) -> str | int:
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> str | int:
         """A number from digits; any other text as it is."""
         return int(value) if re.fullmatch("[0-9]{1,6}", str(value)) else value

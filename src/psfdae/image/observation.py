@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -37,6 +37,11 @@ from psfdae.image.fits_file import (
 )
 from psfdae.image.stamps import Stamps, StarFlag, cut, raise_flag, sky_around
 
+if TYPE_CHECKING:
+    from astropy.wcs import WCS
+
+    from psfdae.image.catalogue import StarList
+
 FAR = 2**30  # positions are clipped to ± this many pixels, far off any image
 NEAR = 1.0  # stars farther off by this many image sizes are not corrected for distortion
 ASSUMED_SCALE = 1.0  # arcseconds per pixel where nothing says it
@@ -55,7 +60,9 @@ class Source:
     """A FITS file with stars, and what is stated about it."""
 
     image: Path | np.ndarray  # cube of stamps, or image
-    catalogue: Any = None  # of an image, as `as_catalogue` takes it; of a cube, row by row
+    catalogue: StarList | None = (
+        None  # of an image, as `as_catalogue` takes it; of a cube, row by row
+    )
     detect: float | None = None  # in its place: σ above the sky from which stars are searched
     extension: str | int | None = None  # with the stars
     on_image: bool = False  # stars of the catalogue that are off the image are left out
@@ -78,7 +85,7 @@ class Source:
         """The image's file, or what an array is called in messages."""
         return self.image if isinstance(self.image, Path) else Path("array")
 
-    def files(self) -> tuple[Any, ...]:
+    def files(self) -> tuple[object, ...]:
         """All that is read."""
         return (self.image, self.catalogue, self.mask, self.weight, self.variance)
 
@@ -486,8 +493,8 @@ class Observation:
         for (name, (value, origin)), unit in zip(self.camera.items(), units, strict=True):
             words.append(f"{name} {origin if value is None else f'{value:.6g} {unit} ({origin})'}")
         said = f"{self.path}: {', '.join(words)}"
-        if empty := self._layers.empty:
-            said += f"\n{self._layers.noise.path}: weight 0, bad pixels: {empty}"  # type: ignore
+        if (empty := self._layers.empty) and (noise := self._layers.noise) is not None:
+            said += f"\n{noise.path}: weight 0, bad pixels: {empty}"
         lost = self.without_position()
         if lost.any():
             rows = shorten([str(row + 1) for row in np.flatnonzero(lost)])
@@ -675,7 +682,7 @@ def cut_image(
     return stamps, inside, np.asarray(~whole)
 
 
-def pixel_scale(wcs: Any) -> float:
+def pixel_scale(wcs: WCS) -> float:
     """Side in arcseconds of a square as large as a pixel at the reference point."""
     from astropy.wcs.utils import proj_plane_pixel_area
 
@@ -683,7 +690,7 @@ def pixel_scale(wcs: Any) -> float:
 
 
 def sky_to_pixel(
-    wcs: Any, ra: np.ndarray, dec: np.ndarray, shape: tuple[int, ...]
+    wcs: WCS, ra: np.ndarray, dec: np.ndarray, shape: tuple[int, ...]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Positions of stars in an image (rows, columns) from their ICRS coordinates in degrees.
 

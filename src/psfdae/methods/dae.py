@@ -22,7 +22,7 @@ from psfdae.method import (
 )
 from psfdae.networks.settings import DaeSettings, Train
 from psfdae.reading import from_tree, read_yaml
-from psfdae.settings import deciding
+from psfdae.settings import Config, deciding
 
 if TYPE_CHECKING:
     from psfdae.bundle_info import BundleInfo
@@ -75,7 +75,7 @@ class Dae(Method):
         self.diagnosed = {HISTORY: history or []}
 
     @classmethod
-    def continues(cls, config: Any) -> bool:
+    def continues(cls, config: Config) -> bool:
         """Whether a training on templates goes on from one on the realisations."""
         return bool(config.train.continued_epochs)
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from psfdae.bright_stars import BrightStars
 from psfdae.field_law import MARGIN_PX, Asked, FieldLaw, FieldSettings, parts_of, phases_of
@@ -145,7 +146,7 @@ class FieldMixture(FieldLaw, Method):
         arrays["listed"] = self.listed if np.isfinite(self.listed).all() else np.empty((0, 2))
         return arrays, said
 
-    def conditions(self) -> Iterator[tuple[str, str, Any]]:
+    def conditions(self) -> Iterator[tuple[str, str, ArrayLike]]:
         """Conditions that any fit fulfils: a mean star of the sum 1, residuals smaller than it."""
         terms, spread = len(self.coefficients), self.spread
         usual = self.model.images(self.usual[None], np.zeros((1, 2)), self.side)
@@ -179,7 +180,7 @@ class FieldMixture(FieldLaw, Method):
 
     def facts(self) -> dict[str, str]:
         """The polynomial of the field."""
-        order = self.model.order
+        order = self.order
         changes = f"changes over the image by a polynomial of order {order}"
         same = "is the same everywhere (order 0: more is not supported by stars left out)"
         return {"Field": f"the PSF {changes if order else same}"}

@@ -32,6 +32,8 @@ from psfdae.rng import stream
 from psfdae.settings import Count, Group, Positive
 
 if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
     from psfdae.bundle_info import BundleInfo
 
 STARS_AT_ONCE = 4096
@@ -287,7 +289,7 @@ class GaussianMixture(MixtureLaw, Method):
         pixels = info.stamp_px**2
         return dict.fromkeys(cls.stored()) | {"axes": (pixels, pixels), "variance": (pixels,)}
 
-    def conditions(self) -> Iterator[tuple[str, str, Any]]:
+    def conditions(self) -> Iterator[tuple[str, str, ArrayLike]]:
         """Conditions that any fit fulfils: images of the sum 1, without large negative pixels."""
         total, power = self.axes.sum(axis=0), np.square(self.deviation, dtype=np.float64).sum()
         some = stream(0, "gmm", "axes").standard_normal((len(self.axes), 4))

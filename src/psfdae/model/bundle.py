@@ -299,6 +299,7 @@ def read_bundle(path: Path | None = None) -> Bundle:
     except RecursionError:
         raise BundleError(f"{path}: damaged (its description is nested too deeply)") from None
     _check(info, tensors, path)
+    optional: dict[str, Any] = {name: tensors.get(name) for name in OPTIONAL}
     return Bundle(
         info=info,
         weights={
@@ -309,7 +310,7 @@ def read_bundle(path: Path | None = None) -> Bundle:
         flux_model=_completed(tensors),
         **{name: tensors[name] for name in ("noise_nodes", "error68", "rms", "ratio95")},
         distance_limit=float(tensors["distance_limit"]),
-        **{name: tensors.get(name) for name in OPTIONAL},
+        **optional,
     )
 
 

@@ -88,7 +88,7 @@ class FluxModel:
     @property
     def whole(self) -> bool:
         """The basis leaves no direction out."""
-        return self.basis.shape[1] >= self.mean.size
+        return bool(self.basis.shape[1] >= self.mean.size)
 
     @classmethod
     def fit(cls, images: np.ndarray) -> FluxModel:
@@ -196,9 +196,9 @@ def robust_flux(images: np.ndarray, model: FluxModel) -> FluxEstimate:
     raise_flag(flags, StarFlag.OUTLIER, possible & (kept < usable_pixel).any(axis=1))
     raise_flag(flags, StarFlag.FAINT, usable & (flux < FAINT_SNR * error))
     raise_flag(flags, StarFlag.NO_FLUX, ~usable)
-    found = (np.where(fitted, values * unit, np.nan) for values in (flux, error, sigma))
+    flux, error, sigma = (np.where(fitted, v * unit, np.nan) for v in (flux, error, sigma))
     repaired = np.where(fitted[:, None], repaired * unit[:, None], 0.0)
-    return FluxEstimate(*found, flags, repaired.reshape(images.shape))
+    return FluxEstimate(flux, error, sigma, flags, repaired.reshape(images.shape))
 
 
 def _robust_fit(

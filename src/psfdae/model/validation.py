@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -131,7 +131,7 @@ def _measured(model: PsfModel, stars: Stars, methods: Mapping[str, Method]) -> R
     return Report(model, stars, methods, table, _stacked(measured), _joined(per_star), restored)
 
 
-def _stacked(rows: Sequence[Mapping[str, Any]]) -> Table:
+def _stacked(rows: Sequence[Mapping[str, object]]) -> Table:
     from astropy.table import Table
 
     return Table({name: [row[name] for row in rows] for name in rows[0]})
@@ -310,7 +310,9 @@ def _all_stars(
     return joined, np.concatenate(psf), rows
 
 
-def _per_star(of: Stamps | Prediction, names: Any = None) -> Iterator[tuple[str, np.ndarray]]:
+def _per_star(
+    of: Stamps | Prediction, names: Iterable[str] = ()
+) -> Iterator[tuple[str, np.ndarray]]:
     for name in names or of.__dataclass_fields__:
         value = np.asarray(getattr(of, name))
         if value.ndim == 1:

@@ -14,6 +14,7 @@ import numpy as np
 from psfdae.files import ProductError, atomic_path
 
 if TYPE_CHECKING:
+    from torch import Tensor
     from torch.nn import Module
 
 Network = TypeVar("Network", bound="Module")
@@ -35,7 +36,7 @@ def digest_of(arrays: Mapping[str, np.ndarray]) -> str:
     return digest.hexdigest()
 
 
-def save_weights(path: Path, state: Mapping[str, Any], config: Mapping[str, Any]) -> None:
+def save_weights(path: Path, state: Mapping[str, Tensor], config: Mapping[str, Any]) -> None:
     """Write a network's tensors, its resolved config and the checksum of the tensors.
 
     Parameters

@@ -127,7 +127,7 @@ class OwnTelescope(Telescope):
         }
 
 
-def has_own_aberrations(tree: Any) -> bool:
+def has_own_aberrations(tree: object) -> bool:
     """Whether a telescope, checked or not yet, brings aberrations of its own."""
     own = {"aberrations", "field_edge_deg", "seeing", "prior"}
     return isinstance(tree, OwnTelescope) or (isinstance(tree, Mapping) and bool(own & set(tree)))
