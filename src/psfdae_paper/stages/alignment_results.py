@@ -207,7 +207,7 @@ def time_table(
     total = table.groupby("method")[["seconds", "states"]].sum()
     rows = []
     for method in ESTIMATORS:
-        seconds, states = total.loc[method.name]
+        seconds, states = total.loc[method.name].to_numpy()
         # With the trainings of all networks that the method needs.
         trained = sum(training[name] for name in (method.network, "dae" * method.denoised) if name)
         rows.append((method.name, seconds / states, int(states), trained))
@@ -338,7 +338,8 @@ def correlation(correlation: ErrorTable, out: Png) -> None:
     shown = [method for method in ALIGNERS.values() if method.short]
     published_too, more = [m for m in shown if m.look.paper], [m for m in shown if not m.look.paper]
     panels = []
-    for level, rows in ours.groupby("noise_level"):
+    for level in np.unique(ours.noise_level):
+        rows = ours[ours.noise_level == level]
         known = paper[np.isclose(paper.noise_level, level)]
         first = [titled(method, known, "paper, ") for method in published_too]
         first += [titled(method, rows) for method in published_too]

@@ -180,8 +180,7 @@ def read_errors(folder: Path) -> pd.DataFrame:
     for path, part in parts.items():
         if lacking := [name for name in wanted if name not in part]:
             raise ProductError(f"{path}: column {lacking[0]!r} is missing")
-    table: pd.DataFrame = pd.concat([part[wanted] for part in parts.values()], ignore_index=True)
-    return table
+    return pd.concat([part[wanted] for part in parts.values()], ignore_index=True)
 
 
 def describe_tables(first: Path, second: Path) -> str:

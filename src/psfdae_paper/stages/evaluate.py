@@ -199,5 +199,4 @@ def read_evaluations(evaluations: Sequence[Path]) -> pd.DataFrame:
         if list(part.columns) != COLUMNS:
             raise ProductError(f"{path}: columns {list(part.columns)}, expected {COLUMNS}")
         parts.append(part)
-    table: pd.DataFrame = pd.concat(parts, ignore_index=True)
-    return table
+    return pd.concat(parts, ignore_index=True)

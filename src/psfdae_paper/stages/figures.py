@@ -264,7 +264,7 @@ def figure_bank_growth(
 
 def rows_of(path: Path, dataset: str, reference: str | None = None) -> pd.DataFrame:
     """Rows of a dataset, and of a reference if one is given; raises ProductError without any."""
-    table: pd.DataFrame = read_table(path)
+    table = read_table(path)
     rows = table[table.dataset == dataset]
     if reference is not None:
         rows = rows[rows.reference == reference]
