@@ -19,7 +19,7 @@ Refusals are of the class `Error`.
 from __future__ import annotations
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from psfdae.version import __version__
 
@@ -69,11 +69,13 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str) -> Any:
-    """Import a public name on first use (PEP 562): nobody waits for what is not used."""
-    if name in _MODULES:
-        return getattr(import_module(f"psfdae.{_MODULES[name]}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+if not TYPE_CHECKING:  # for a type checker, a module with this function has every name
+
+    def __getattr__(name: str) -> object:
+        """Import a public name on first use (PEP 562): nobody waits for what is not used."""
+        if name in _MODULES:
+            return getattr(import_module(f"psfdae.{_MODULES[name]}"), name)
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,6 +16,14 @@ if TYPE_CHECKING:
     from photutils.psf import GriddedPSFModel
 
 MOST_OVERSAMPLED = 32  # values per pixel and axis
+
+
+class _Array(Protocol):
+    def __array__(self) -> np.ndarray: ...
+
+
+Numbers: TypeAlias = float | Sequence[float] | _Array
+"""One number or several; `ArrayLike` would be texts, too."""
 
 
 class PredictionError(Error, ValueError):
@@ -62,7 +71,7 @@ class FieldPsfs(ABC):
     def _drawn(self, place: np.ndarray, oversampling: int) -> np.ndarray:
         """PSFs (n, m, m) as `psf_at`, at checked places (n, 2)."""
 
-    def psf_at(self, x: ArrayLike, y: ArrayLike, oversampling: int = 4) -> np.ndarray:
+    def psf_at(self, x: Numbers, y: Numbers, oversampling: int = 4) -> np.ndarray:
         """PSFs at places of the image of the training, where no star need be.
 
         Parameters
