@@ -24,11 +24,13 @@ def rows(monkeypatch):
     """The paper's columns with SSIM values that range 0.7 and scales 0.11, 0.16 explain."""
     import psfdae_paper.evaluation.calibration as module
 
-    table = original_noise_rows()
-    scale = np.where(table.dataset == "dataset8", 0.16, 0.11)
-    table["ssim"] = model(table.noise_level, scale, 0.7)
-    monkeypatch.setattr(module, "original_noise_rows", lambda: table)
-    return table
+    scale = {"dataset8": 0.16}
+    columns = [
+        row._replace(ssim=model(row.noise_level, scale.get(row.dataset, 0.11), 0.7))
+        for row in original_noise_rows()
+    ]
+    monkeypatch.setattr(module, "original_noise_rows", lambda: columns)
+    return columns
 
 
 @pytest.fixture
@@ -43,7 +45,7 @@ def scan(rows):
             "data_range": data_range,
             "ssim": model(row.noise_level, scale, data_range),
         }
-        for row in rows.itertuples()
+        for row in rows
         for scale in (0.06, 0.08, 0.1, 0.12, 0.15, 0.2)
         for data_range in (0.5, 0.6, 0.7, 0.85, 1.0)
     ]

@@ -652,8 +652,7 @@ def test_a_place_without_a_psf_is_named(shipped, monkeypatch, psf):
     """Such as in a damaged model; nothing is drawn there."""
     fixed = np.full((2, 4, 4), 1.0)
     fixed[1] = psf
-    model = SimpleNamespace(order=0)
-    field = SimpleNamespace(psf_at=lambda *_: fixed, facts=dict, model=model)
+    field = SimpleNamespace(psf_at=lambda *_: fixed, facts=dict, order=0)
     monkeypatch.setattr(shipped.engine, "estimator", field)
     with pytest.raises(PredictionError, match=r"flux above 0 at x 7, y 8"):
         shipped.psf_at([5.0, 7.0], [6.0, 8.0])

@@ -19,16 +19,17 @@ Refusals are of the class `Error`.
 from __future__ import annotations
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from psfdae.version import __version__
 
 if TYPE_CHECKING:
     from psfdae.errors import Error
     from psfdae.image.stamps import StarFlag
+    from psfdae.model.field_psfs import PredictionError
     from psfdae.model.fitting import fit
     from psfdae.model.prediction import Prediction
-    from psfdae.model.psf_model import PredictionError, PsfModel, load_model
+    from psfdae.model.psf_model import PsfModel, load_model
     from psfdae.model.stars import Stars
     from psfdae.model.validation import Report, validate
     from psfdae.sensing.results import Wavefronts, wavefront
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
 _MODULES = {
     "Error": "errors",
     "Prediction": "model.prediction",
-    "PredictionError": "model.psf_model",
+    "PredictionError": "model.field_psfs",
     "PsfModel": "model.psf_model",
     "Report": "model.validation",
     "StarFlag": "image.stamps",
@@ -68,11 +69,13 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str) -> Any:
-    """Import a public name on first use (PEP 562): nobody waits for what is not used."""
-    if name in _MODULES:
-        return getattr(import_module(f"psfdae.{_MODULES[name]}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+if not TYPE_CHECKING:  # for a type checker, a module with this function has every name
+
+    def __getattr__(name: str) -> object:
+        """Import a public name on first use (PEP 562): nobody waits for what is not used."""
+        if name in _MODULES:
+            return getattr(import_module(f"psfdae.{_MODULES[name]}"), name)
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:

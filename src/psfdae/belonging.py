@@ -9,10 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from psfdae.files import Product, ProductError, write_text
 from psfdae.reading import read_yaml
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
 
 FRAMING = ("framing.stamp_px", "framing.jitter_px", "framing.tie")
 STATIC = ("scene.name", "telescope", *FRAMING, "grid", "wavefront")
@@ -39,7 +42,7 @@ def require(
     path: Path,
     said: Mapping[str, Any],
     keys: Sequence[str],
-    wanted: Any,
+    wanted: Mapping[str, Any] | BaseModel,
     whose: object = "the configuration",
 ) -> None:
     """Refuse an input of other settings than those of a stage, or of another input.
@@ -125,7 +128,11 @@ def require_origin(model: Path, keys: Sequence[str], product: Product) -> dict[s
 
 
 def require_training(
-    model: Path, said: Mapping[str, Any], stars: Product, config: Any, **options: str
+    model: Path,
+    said: Mapping[str, Any],
+    stars: Product,
+    config: Mapping[str, Any] | BaseModel,
+    **options: str,
 ) -> None:
     """Refuse a fit, whose configuration is `said`, that is no test on a product of stars.
 

@@ -65,11 +65,11 @@ class BrightStars:
 
     def area(self) -> np.ndarray:
         """Noise-equivalent area A = (F / (σ S/N))² of each star in pixels, shape (n,)."""
-        return (self.flux / (self.noise * self.snr)) ** 2
+        return np.asarray((self.flux / (self.noise * self.snr)) ** 2)
 
     def aligned(self) -> np.ndarray:
         """The stars of flux 1, moved to a common centre, index (s//2, s//2); shape (n, s, s)."""
-        return moved(self.wide, -self.centre) / self.flux[:, None, None]
+        return np.asarray(moved(self.wide, -self.centre) / self.flux[:, None, None])
 
     def sky_photons(self, gain: float | None, otherwise: float) -> float:
         """Photons per pixel whose Poisson noise is the sky's, read noise included.

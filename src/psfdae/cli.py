@@ -18,7 +18,17 @@ from importlib.metadata import entry_points
 from importlib.util import find_spec
 from inspect import Parameter, cleandoc, signature
 from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol, Union, get_args, get_origin, get_type_hints
+from typing import (
+    Annotated,
+    Any,
+    Literal,
+    Protocol,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import click
 
@@ -27,6 +37,9 @@ from psfdae.version import __version__
 
 OWN = "psfdae.commands"
 """The package's own commands; those of others join it by entry points "psfdae.commands"."""
+
+
+Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 class Reader(Protocol):
@@ -41,10 +54,10 @@ class Stage:
     """What `command` knows of a function: its command's words, and what reads its settings."""
 
     name: str
-    settings: Any = None
+    settings: Reader | None = None
 
 
-def command(name: str, settings: Reader | None = None) -> Callable[..., Any]:
+def command(name: str, settings: Reader | None = None) -> Callable[[Function], Function]:
     """Make a function the command `psfdae NAME`.
 
     A parameter `config` receives what `settings` reads from trailing words or a file. Other
@@ -54,7 +67,7 @@ def command(name: str, settings: Reader | None = None) -> Callable[..., Any]:
     the docstring.
     """
 
-    def mark(function: Callable[..., Any]) -> Callable[..., Any]:
+    def mark(function: Function) -> Function:
         function.stage = Stage(name, settings)  # type: ignore[attr-defined]
         return function
 
@@ -168,8 +181,9 @@ def groups() -> dict[str, str]:
 def stage(name: str) -> Callable[..., Any]:
     """The function of a command; its module is imported."""
     module = import_module(found()[name][0])
-    functions = [f for f in vars(module).values() if isinstance(getattr(f, "stage", None), Stage)]
-    return next(f for f in functions if f.stage.name == name)
+    marked = (f for f in vars(module).values() if isinstance(getattr(f, "stage", None), Stage))
+    function: Callable[..., Any] = next(f for f in marked if f.stage.name == name)
+    return function
 
 
 def _shortened(text: str, width: int) -> str:
@@ -204,8 +218,8 @@ def as_click(function: Callable[..., Any]) -> click.Command:
             parameters += [_option(*field) for field in _parameters(hint)]
         else:
             parameters.append(_option(name, hint, default))
-    configured = "config" in signature(function).parameters
-    if configured:
+    read = spec.settings if "config" in signature(function).parameters else None
+    if read is not None:
         path = click.Path(path_type=Path, dir_okay=False)
         about = "Settings as the workflow writes them, instead of overrides."
         parameters.append(click.Option(["--config", "settings"], type=path, help=about))
@@ -213,11 +227,11 @@ def as_click(function: Callable[..., Any]) -> click.Command:
 
     def run(**given: Any) -> None:
         config = {}
-        if configured:
+        if read is not None:
             file, overrides = given.pop("settings"), given.pop("overrides")
             if file is not None and overrides:
                 raise click.UsageError("--config and overrides exclude each other")
-            config["config"] = spec.settings(given, file, overrides)
+            config["config"] = read(given, file, overrides)
         for name, kind in fields.items():
             given[name] = kind(**{key: given.pop(key) for key, *_ in _parameters(kind)})
         function(**config, **given)

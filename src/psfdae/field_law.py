@@ -27,7 +27,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Annotated, Any, NamedTuple
+from math import isqrt
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -173,7 +174,7 @@ class Factor(NamedTuple):
     def solve(self, rows: np.ndarray, low: np.ndarray | None = None) -> np.ndarray:
         """S⁻¹ of rows (n, P), of which `low` times them (n, R) may be known."""
         low = rows @ self.low.T if low is None else low
-        return rows * self.inverse - low @ self.low
+        return np.asarray(rows * self.inverse - low @ self.low)
 
 
 class Kind(NamedTuple):
@@ -241,9 +242,9 @@ class Asked(NamedTuple):
     flux: np.ndarray  # (n,), NaN where to be found
     sky: np.ndarray  # (n,) of bool: the sky is off
 
-    def of(self, chosen: Any) -> Asked:
+    def of(self, chosen: np.ndarray | slice) -> Asked:
         """A part of these stars, by indices or a mask."""
-        return Asked(*(None if a is None else a[chosen] for a in self))
+        return Asked._make(None if a is None else a[chosen] for a in self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -294,9 +295,14 @@ class FieldLaw:
         return FieldModel(coefficients, self.low, self.high, self.settings.spacing_px)
 
     @property
+    def order(self) -> int:
+        """Order of its polynomial."""
+        return self.model.order
+
+    @property
     def side(self) -> int:
         """Side of a stamp in pixels."""
-        return round(self.offset.shape[-1] ** 0.5) - 2 * MARGIN_PX
+        return isqrt(self.offset.shape[-1]) - 2 * MARGIN_PX
 
     def _terms(self, position: np.ndarray | None, count: int = 0) -> tuple[np.ndarray, np.ndarray]:
         """Terms of the field of each star, the usual ones where no position is known, and where."""
@@ -332,7 +338,7 @@ class FieldLaw:
             mean = self.usual @ images / (self.usual @ total)
 
             def lit(rows: np.ndarray, mean: np.ndarray = mean) -> np.ndarray:  # no flux in them
-                return rows - rows.sum(axis=-1, keepdims=True) * mean
+                return np.asarray(rows - rows.sum(axis=-1, keepdims=True) * mean)
 
             def draw(at: np.ndarray) -> np.ndarray:
                 return self.model.images(self.usual[None], at, side)
@@ -411,7 +417,7 @@ class FieldLaw:
             there /= np.where(total > 0, total, 1.0)
             prior[near] = WRONG_LIST * prior[near] + (1.0 - WRONG_LIST) * there
         with np.errstate(divide="ignore"):
-            return np.log(prior / prior.sum(axis=1, keepdims=True))
+            return np.asarray(np.log(prior / prior.sum(axis=1, keepdims=True)))
 
     def _start(self, stars: Asked) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Fluxes by the node that fits best, the nodes (n, nodes) to look at, and √A there."""
@@ -585,7 +591,7 @@ def _split(place: np.ndarray, phases: np.ndarray) -> tuple[np.ndarray, int]:
 def _window(side: int, whole: np.ndarray) -> np.ndarray:
     """Pixels of a frame that are a stamp of a star so many pixels off its middle."""
     rows, columns = (np.arange(side) + MARGIN_PX - w for w in whole)
-    return (rows[:, None] * (side + 2 * MARGIN_PX) + columns).ravel()
+    return np.asarray((rows[:, None] * (side + 2 * MARGIN_PX) + columns).ravel())
 
 
 def _root(covariance: np.ndarray) -> np.ndarray:

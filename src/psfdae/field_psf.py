@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from math import isqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -68,7 +69,7 @@ class FieldModel:
     @property
     def order(self) -> int:
         """Order of the polynomial, which has (order + 1)(order + 2)/2 terms."""
-        return round((8 * len(self.coefficients) + 1) ** 0.5 - 3) // 2
+        return (isqrt(8 * len(self.coefficients) + 1) - 3) // 2
 
     def terms(self, position: np.ndarray) -> np.ndarray:
         """Terms of the polynomial at positions (n, 2), shape (n, K); NaN where unknown."""
@@ -208,7 +209,8 @@ class _Alternating:
         good, flux = np.ones(len(terms), bool), self.images.sum(axis=(1, 2))
         start, window = np.zeros((len(flux), 2)), np.full(len(flux), WINDOW_PX)
         centre = windowed_centres(self.images, start, window, WINDOW_ROUNDS, WINDOW_REACH_PX)
-        found, alike, noise = None, np.ones(self.images.shape), self._weight(flux)
+        alike, noise = np.ones(self.images.shape), self._weight(flux)
+        found: np.ndarray | None = None
         for turn in range(FIT_ROUNDS):
             data = self.images / flux[:, None, None]
             weight = noise * alike
@@ -221,8 +223,8 @@ class _Alternating:
             sides = np.arange(self.stamp_px) - self.stamp_px // 2.0
             total = float(_drawn(middle, sides, np.zeros((1, 2)), self.spacing).sum())
             found, flux = found / total, flux * factor * total
-            model = np.tensordot(terms, found, 1)
-            drawn = _drawn(model, self.axis, centre, self.spacing)
+            splines = np.tensordot(terms, found, 1)
+            drawn = _drawn(splines, self.axis, centre, self.spacing)
             # Where a star lies on the pixel grid changes no light: without this, fluxes and splines
             # could change with that place against each other.
             light = drawn[:, self.inner][:, :, self.inner].sum(axis=(1, 2))
@@ -233,6 +235,7 @@ class _Alternating:
             chi2, alike = square.mean(axis=(1, 2)), 1.0 / (1.0 + square / UNLIKE_SIGMA**2)
             if turn:
                 good = chi2 < UNLIKE_CHI2 * np.median(chi2)
+        assert found is not None
         model = FieldModel(found, self.low, self.high, self.spacing)
         return FieldFit(model, flux, centre, good, residual)
 
@@ -291,7 +294,7 @@ class _Alternating:
 
         def seen(splines: np.ndarray) -> np.ndarray:
             image = rows @ np.tensordot(terms, splines, 1) @ columns
-            return (image * np.sqrt(weight)).reshape(len(terms), -1)
+            return np.asarray((image * np.sqrt(weight)).reshape(len(terms), -1))
 
         left = (np.sqrt(weight) * data).reshape(len(terms), -1)
         found = prior.coefficients
@@ -342,7 +345,7 @@ class _Alternating:
             image = rows @ (terms @ c.reshape(shape[0], -1)).reshape(-1, *shape[1:]) @ columns_t
             back = (rows_t @ (weight * image) @ columns).reshape(len(terms), -1)
             smooth = penalty * (self.bend @ c + c @ self.bend) + ridge * c
-            return ((terms.T @ back).reshape(shape) + smooth).ravel()
+            return np.asarray(((terms.T @ back).reshape(shape) + smooth).ravel())
 
         wanted = (rows_t @ (weight * data) @ columns).reshape(len(terms), -1)
         # Terms of a knot are solved for together: they are far from orthogonal.
@@ -355,7 +358,7 @@ class _Alternating:
         inverse, size = np.linalg.inv(blocks), (int(np.prod(shape)),) * 2
 
         def nearly(flat: np.ndarray) -> np.ndarray:
-            return (inverse @ flat.reshape(shape[0], -1).T[..., None])[..., 0].T.ravel()
+            return np.asarray((inverse @ flat.reshape(shape[0], -1).T[..., None])[..., 0].T.ravel())
 
         found, _ = cg(
             LinearOperator(size, matvec=normal, dtype=float),
@@ -378,7 +381,7 @@ def _deformations(coefficients: np.ndarray, spacing: float) -> np.ndarray:
     def slope(values: np.ndarray, axis: int) -> np.ndarray:
         """Of a polynomial through five knots."""
         near, far = (np.roll(values, -k, axis) - np.roll(values, k, axis) for k in (1, 2))
-        return (8.0 * near - far) / (12.0 * spacing)
+        return np.asarray((8.0 * near - far) / (12.0 * spacing))
 
     along_y, along_x = (slope(coefficients, axis) for axis in (1, 2))
     yy, xy, xx = slope(along_y, 1), slope(along_y, 2), slope(along_x, 2)
@@ -401,7 +404,7 @@ def _splines_at(place: np.ndarray, knots: int, spacing: float) -> np.ndarray:
     """Cubic B-splines about `knots` equidistant places around 0 at `place` (…), (…, knots)."""
     middle = (np.arange(knots) - (knots - 1) / 2) * spacing
     t = np.abs(place[..., None] - middle) / spacing
-    return np.where(t < 1, 2 / 3 - t**2 + t**3 / 2, np.maximum(2 - t, 0.0) ** 3 / 6)
+    return np.asarray(np.where(t < 1, 2 / 3 - t**2 + t**3 / 2, np.maximum(2 - t, 0.0) ** 3 / 6))
 
 
 def _drawn(splines: np.ndarray, axis: np.ndarray, centre: np.ndarray, spacing: float) -> np.ndarray:

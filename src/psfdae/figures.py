@@ -100,7 +100,7 @@ def in_field_unit(field: np.ndarray) -> tuple[np.ndarray, str]:
     return 60.0 * degrees, "arcmin"
 
 
-def write_png(figure: Any, out: Path) -> None:
+def write_png(figure: Figure, out: Path) -> None:
     """Write a matplotlib figure atomically; the same figure gives the same bytes."""
     write_bytes(out, as_png(figure))
 
@@ -206,7 +206,11 @@ def restoration_strip(rows: Sequence[StripRow], columns: Sequence[str], title: s
 
 
 def draw_cell(
-    figure: Figure, box: tuple[float, ...], row: StripRow, column: int, peak: np.ndarray
+    figure: Figure,
+    box: tuple[float, float, float, float],
+    row: StripRow,
+    column: int,
+    peak: np.ndarray,
 ) -> Axes:
     """A stamp of a row on a square-root scale up to `peak`, (n,); the first one has the label."""
     image = row.images[column]

@@ -15,12 +15,17 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
 from psfdae.errors import Error
 from psfdae.version import __version__
+
+if TYPE_CHECKING:
+    from astropy.io.fits import HDUList
+    from h5py import Dataset, File
+    from pandas import DataFrame
 
 
 class ProductError(Error, RuntimeError):
@@ -206,15 +211,17 @@ def write_bytes(path: str | Path, content: bytes) -> None:
         temporary.write_bytes(content)
 
 
-def write_csv(path: str | Path, table: Any, digits: int = 8) -> None:
+def write_csv(path: str | Path, table: DataFrame, digits: int = 8) -> None:
     """Write a DataFrame as CSV, numbers with so many digits, atomically."""
     write_text(path, table.to_csv(index=False, float_format=f"%.{digits}g"))
 
 
-def write_columns(path: str | Path, columns: Mapping[str, Any], digits: int = 8) -> None:
+def write_columns(
+    path: str | Path, columns: Mapping[str, Iterable[object]], digits: int = 8
+) -> None:
     """Write columns of equal length as CSV, numbers with so many digits, NaN as nothing."""
 
-    def cell(value: Any) -> Any:
+    def cell(value: object) -> object:
         if not isinstance(value, float | np.floating):
             return value
         return "" if np.isnan(value) else f"{value:.{digits}g}"
@@ -226,13 +233,13 @@ def write_columns(path: str | Path, columns: Mapping[str, Any], digits: int = 8)
     write_text(path, text.getvalue())
 
 
-def write_parquet(path: str | Path, table: Any) -> None:
+def write_parquet(path: str | Path, table: DataFrame) -> None:
     """Write a DataFrame as Parquet with checksums, atomically."""
     with atomic_path(path) as temporary:
         table.to_parquet(temporary, index=False, write_page_checksum=True)
 
 
-def as_csv(rows: Sequence[Mapping[str, Any]]) -> str:
+def as_csv(rows: Sequence[Mapping[str, object]]) -> str:
     """CSV of rows with equal keys, the numbers in full."""
     text = io.StringIO()
     writer = csv.DictWriter(text, fieldnames=list(rows[0]), lineterminator="\n")
@@ -248,7 +255,7 @@ def as_yaml(tree: Mapping[str, Any]) -> str:
     return str(yaml.safe_dump(tree, sort_keys=True))
 
 
-def write_fits(path: str | Path, hdus: Any) -> None:
+def write_fits(path: str | Path, hdus: HDUList) -> None:
     """Write an astropy `HDUList` atomically."""
     content = io.BytesIO()
     hdus.writeto(content, output_verify="exception")
@@ -328,7 +335,7 @@ def stream_product(
     kind: str,
     columns: Mapping[str, Column | Empty],
     config: Mapping[str, Any],
-) -> Iterator[Mapping[str, Any]]:
+) -> Iterator[Mapping[str, Dataset]]:
     """Write a product piece by piece, so that it never has to fit into memory.
 
     Yields the HDF5 datasets by name; the block fills those of the `Empty`
@@ -370,7 +377,7 @@ def stream_product(
 
 
 @contextmanager
-def _reserved(path: Path, columns: Mapping[str, Column | Empty]) -> Iterator[Any]:
+def _reserved(path: Path, columns: Mapping[str, Column | Empty]) -> Iterator[File]:
     """A new HDF5 file that has its space: HDF5 crashes where a full disk keeps it from closing."""
     import h5py
 
@@ -399,7 +406,7 @@ def _most_bytes(column: Column | Empty) -> int:
     """Upper limit of what HDF5 stores of a column, with the table of its chunks."""
     if isinstance(column, Column):
         # Chunks at the border are whole; h5py gives them at least half of an axis' length.
-        return int(column.values.nbytes) * 2**column.values.ndim + 2**17
+        return (int(column.values.nbytes) << column.values.ndim) + 2**17
     rows = _storage(column)["chunks"][0]
     count = -(-column.shape[0] // rows)
     row_bytes = int(np.prod(column.shape[1:], dtype=int)) * np.dtype(column.dtype).itemsize
@@ -416,7 +423,7 @@ def _storage(column: Column | Empty) -> dict[str, Any]:
     return {"shape": column.shape, "dtype": dtype, "chunks": (rows, *column.shape[1:])}
 
 
-def _describe(file: Any, kind: str, config: Mapping[str, Any]) -> None:
+def _describe(file: File, kind: str, config: Mapping[str, Any]) -> None:
     file.attrs["kind"] = kind
     file.attrs["psfdae_version"] = __version__
     file.attrs["config"] = json.dumps(config, sort_keys=True)
@@ -474,7 +481,7 @@ class OutputError(Error, ValueError):
     """A result would take the place of what it is made of."""
 
 
-def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Any]) -> None:
+def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[object]) -> None:
     """Refuse outputs that are inputs, too; what is no path of a file is passed over.
 
     Raises

@@ -7,11 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from psfdae.belonging import TRAINED_ON, require_training, write_origin
 from psfdae.files import Product, as_csv, write_text
 from psfdae.method import Method, Storage
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
 
 
 def storage_of(kind: type[Method]) -> Storage:
@@ -86,7 +89,7 @@ def learnt(kind: type[Method], reference: str) -> str:
 
 
 def require(
-    kind: type[Method], place: Path, stars: Product, config: Any, split: str, reference: str
+    kind: type[Method], place: Path, stars: Product, config: BaseModel, split: str, reference: str
 ) -> None:
     """Refuse a fit that does not belong to test stars.
 

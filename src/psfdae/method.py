@@ -23,9 +23,11 @@ import numpy as np
 from psfdae.errors import Error
 from psfdae.files import Column, read_product, write_product
 from psfdae.noise import NoiseModel, mixed_levels
-from psfdae.settings import Group
+from psfdae.settings import Config, Group
 
 if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
     from psfdae.bright_stars import BrightStars
     from psfdae.bundle_info import BundleInfo
     from psfdae.settings import Evaluation
@@ -270,13 +272,26 @@ class Packing:
 class MeasuresStars(Protocol):
     """Measures flux, sky and centre of a star with its PSF: no other photometry is needed."""
 
-    def measure(self, *stars: Any, **known: Any) -> Estimate:
+    def measure(
+        self,
+        stamps: np.ndarray,
+        noise: np.ndarray,
+        position: np.ndarray | None = None,
+        centre: np.ndarray | None = None,
+        fixed: bool | np.ndarray = False,
+        flux: np.ndarray | None = None,
+        sky: np.ndarray | None = None,
+    ) -> Estimate:
         """From stamps in any unit; see `psfdae.methods.field.FieldMixture.measure`."""
 
 
 @runtime_checkable
 class KnowsField(Protocol):
     """Knows the PSF between the stars."""
+
+    @property
+    def order(self) -> int:
+        """Of the polynomial by which the PSF changes over the field."""
 
     def psf_at(self, position: np.ndarray, oversampling: int = 1) -> np.ndarray:
         """PSFs at positions (n, 2)."""
@@ -297,7 +312,7 @@ class FreesFlux(Protocol):
 class FindsFlux(FreesFlux, Protocol):
     """Finds, in that form, the flux of a star in that by which its image was divided."""
 
-    def flux(self, noisy: np.ndarray, level: np.ndarray) -> tuple[np.ndarray, Any]:
+    def flux(self, noisy: np.ndarray, level: np.ndarray) -> tuple[np.ndarray, object]:
         """That flux of images (n, d, d), shape (n,), and which parts of its law are near them.
 
         `estimate` and `outlier_score` take the latter as `near` and look at no other part.
@@ -319,7 +334,7 @@ class ScoresOutliers(Protocol):
 class HasConditions(Protocol):
     """Knows conditions that the arrays of any fit fulfil."""
 
-    def conditions(self) -> Iterator[tuple[str, str, Any]]:
+    def conditions(self) -> Iterator[tuple[str, str, ArrayLike]]:
         """Name of an array, what it must have in words, and whether it has it, bool."""
 
 
@@ -327,7 +342,7 @@ class HasConditions(Protocol):
 class FitsAgain(Protocol):
     """Has searched for some of its settings."""
 
-    def again(self, data: TrainingSet, **settings: Any) -> Self:
+    def again(self, data: TrainingSet, **settings: Group) -> Self:
         """A fit to `data` with its seed and the settings that were found."""
 
 
@@ -336,7 +351,7 @@ class GoesOn(Protocol):
     """A fit to templates may go on from one to the realisations."""
 
     @classmethod
-    def continues(cls, config: Any) -> bool:
+    def continues(cls, config: Config) -> bool:
         """Whether it does, by its settings."""
 
 
@@ -373,7 +388,7 @@ class Method:
     diagnosed: Mapping[str, list[dict[str, Any]]]
 
     if TYPE_CHECKING:
-        fit: Callable[..., Any]
+        fit: Callable[..., Self]
         """Class method: from a `TrainingSet` and the groups of settings to a fitted method."""
         predict: Callable[..., np.ndarray]
         """PSFs of flux-normalised noisy images, both of shape (n, d, d)."""
@@ -384,16 +399,16 @@ class Method:
             cls.look = replace(cls.look, label=f"{cls.look.label}{cls.needs}")
 
     @classmethod
-    def settings(cls, config: Any) -> dict[str, Any]:
+    def settings(cls, config: Config) -> dict[str, Group]:
         """Its groups of a configuration, as `fit` takes them."""
         return {name: getattr(config, name) for name in cls.groups}
 
     @classmethod
-    def check(cls, config: Any) -> None:
+    def check(cls, config: Config) -> None:
         """Raise ValueError if its settings contradict other groups of a configuration."""
 
     @classmethod
-    def threads(cls, config: Any) -> int:
+    def threads(cls, config: Config) -> int:
         """Threads of a fit: the setting of that name, if there is one."""
         groups = cls.settings(config).values()
         return next((g.threads for g in groups if hasattr(g, "threads")), 1)

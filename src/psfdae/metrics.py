@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,7 +20,7 @@ BLOCK = 256
 def mse(estimates: np.ndarray, references: np.ndarray) -> np.ndarray:
     """Mean squared error of every stamp, shape (n,)."""
     difference = estimates.astype(np.float64) - references
-    return (difference**2).mean(axis=(1, 2))
+    return np.asarray((difference**2).mean(axis=(1, 2)))
 
 
 def ssim(
@@ -58,7 +59,7 @@ def ssim(
     inner = slice(SSIM_WINDOW // 2, side - SSIM_WINDOW // 2)
 
     def mean(images: np.ndarray) -> np.ndarray:
-        return uniform_filter(images, (1, SSIM_WINDOW, SSIM_WINDOW))[:, inner, inner]
+        return np.asarray(uniform_filter(images, (1, SSIM_WINDOW, SSIM_WINDOW))[:, inner, inner])
 
     out = np.empty(ranges.shape)
     for first in range(0, count, BLOCK):
@@ -82,7 +83,7 @@ def ssim(
 
 def peak_range(references: np.ndarray) -> np.ndarray:
     """Maximum minus minimum of every reference, shape (n,)."""
-    return references.max(axis=(1, 2)) - references.min(axis=(1, 2))
+    return np.asarray(references.max(axis=(1, 2)) - references.min(axis=(1, 2)))
 
 
 def all_metrics(
@@ -119,7 +120,7 @@ def quality(estimate: Estimate, truth: np.ndarray, data_range: float) -> dict[st
 
 
 def summarised(
-    row: dict[str, Any], metrics: dict[str, np.ndarray], field: np.ndarray
+    row: Mapping[str, object], metrics: Mapping[str, np.ndarray], field: np.ndarray
 ) -> list[dict[str, Any]]:
     """Mean of each metric with its standard error by field, each added to a copy of `row`."""
     rows = []

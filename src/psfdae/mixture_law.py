@@ -33,7 +33,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
@@ -244,7 +244,7 @@ class MixtureLaw:
         evidence -= 0.5 * z.shape[1] * np.log(2 * np.pi)
         weight = weights.astype(np.float32)
         gain, own = np.zeros_like(z), np.zeros_like(z)
-        second = np.zeros(flat.shape) if sure else 0.0
+        second = np.zeros(flat.shape if sure else 0)
         flux = np.ones(len(z))
         for k in range(len(self.count)):
             (stars,) = weight[:, k].nonzero()
@@ -290,7 +290,9 @@ class MixtureLaw:
         self, flat: np.ndarray, gain: np.ndarray, own: np.ndarray | float, s: float
     ) -> np.ndarray:
         """Images or references from (C + s)⁻¹(z − μ) in the axes."""
-        return own + gain @ self.cross.T if len(self.cross) else flat - s * (gain @ self.axes.T)
+        return np.asarray(
+            own + gain @ self.cross.T if len(self.cross) else flat - s * (gain @ self.axes.T)
+        )
 
     def _against(
         self, k: int, z: np.ndarray, where: np.ndarray, s: float
@@ -408,7 +410,7 @@ class MixtureLaw:
         """Variance of all stars along the axes."""
         between = np.average(np.square(self.mean - self._middle), axis=0, weights=self.count)
         loose = np.square(self.loose * self._contrast).max(axis=0)
-        return self.variance + between + np.square(self.slope).sum(axis=0) + loose
+        return np.asarray(self.variance + between + np.square(self.slope).sum(axis=0) + loose)
 
     def _uncertain(self, k: int, s: float) -> np.ndarray:
         """Variance of each pixel inside a cluster once the image is known, shape (P,)."""
@@ -417,25 +419,25 @@ class MixtureLaw:
         if not len(self.cross):
             known = self._squares @ factor.inverse
             known -= np.square(factor.low @ self.axes[:, :m].T).sum(axis=0)
-            return np.maximum(s - s**2 * known, 0.0)
+            return np.asarray(np.maximum(s - s**2 * known, 0.0))
         own, cross = cluster.own_reference, self.cross[:, :m] * factor.shared[:m]
         cross += cluster.scale * own.T @ cluster.own[:, :m]
         prior = cluster.common * self.variance_reference + cluster.scale * cluster.square
         known = np.square(cross) @ factor.inverse[:m]
         known += self._squares[:, m:] @ (np.square(factor.shared[m:]) * factor.inverse[m:])
         known -= np.square(cross @ factor.low.T).sum(axis=1)
-        return np.maximum(prior - known, 0.0)
+        return np.asarray(np.maximum(prior - known, 0.0))
 
     @cached_property
     def _squares(self) -> np.ndarray:
         """Squares of the axes in pixels, or of the covariances with references, (P, P)."""
-        return np.square(self.cross if len(self.cross) else self.axes)
+        return np.asarray(np.square(self.cross if len(self.cross) else self.axes))
 
     @cached_property
     def _telling(self) -> Self:
         """The law of the leading coordinates."""
         none = np.empty((0, 0), np.float32)
-        cut = {
+        cut: dict[str, Any] = {
             n: np.ascontiguousarray(getattr(self, n)[..., :OUTLIER_COORDINATES])
             for n in LEADING_ARRAYS
         }

@@ -178,7 +178,8 @@ def _without_weight(seen: Matrix, weight: Matrix) -> Matrix:
         (xx * xy * c - (xx * yy + xy * xy) * b + xy * yy * a) / determinant,
         (xy * xy * c - 2.0 * xy * yy * b + yy * yy * a) / determinant,
     )
-    return tuple(t + np.where(gaussian, m, t) for t, m in zip(seen, more, strict=True))
+    xx, xy, yy = (t + np.where(gaussian, m, t) for t, m in zip(seen, more, strict=True))
+    return xx, xy, yy
 
 
 def _moved(

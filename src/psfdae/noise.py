@@ -38,11 +38,14 @@ class NoiseModel:
 
     def flux(self, level: np.ndarray | float) -> np.ndarray:
         """Flux F in photons inside the stamp of a star of noise level λ."""
-        return np.sqrt(self.background) / (self.kappa * np.asarray(level, dtype=np.float64))
+        photons: np.ndarray = np.sqrt(self.background) / (
+            self.kappa * np.asarray(level, np.float64)
+        )
+        return photons
 
     def variance(self, psf: np.ndarray, level: np.ndarray | float) -> np.ndarray:
         """Pixel variance of a normalised image; `level` broadcasts against `psf`."""
-        return (self.kappa * np.asarray(level)) ** 2 + psf / self.flux(level)
+        return np.asarray((self.kappa * np.asarray(level)) ** 2 + psf / self.flux(level))
 
     def draw(
         self, psf: np.ndarray, level: np.ndarray | float, rng: np.random.Generator
@@ -60,7 +63,7 @@ class NoiseModel:
         """
         flux = _per_image(self.flux(level), psf)
         photons = rng.poisson(flux * psf + self.background)
-        return ((photons - self.background) / flux).astype(np.float32)
+        return np.asarray((photons - self.background) / flux, np.float32)
 
     def draw_gaussian(
         self, psf: np.ndarray, level: np.ndarray | float, rng: np.random.Generator
@@ -70,7 +73,8 @@ class NoiseModel:
         With 1e4 photons of sky in a pixel the two laws differ by 1 % in skewness,
         and the draw takes a tenth of the time.
         """
-        noisy = np.sqrt(self.variance(psf, _per_image(level, psf))).astype(np.float32)
+        sigma: np.ndarray = np.sqrt(self.variance(psf, _per_image(level, psf)))
+        noisy = sigma.astype(np.float32)
         noisy *= rng.standard_normal(psf.shape, dtype=np.float32)
         noisy += psf
         return noisy

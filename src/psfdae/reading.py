@@ -6,9 +6,14 @@ import csv
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, SupportsFloat, TypeVar, overload
 
 from psfdae.files import ProductError
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+Made = TypeVar("Made")
 
 MOST_NODES = 1_000_000
 """Values that a YAML file may have once its aliases are written out."""
@@ -132,7 +137,13 @@ def _text(path: Path) -> str:
         raise ProductError(f"{path}: {where}: {found}") from None
 
 
-def from_tree(path: Path, tree: Any, *keys: str, make: Callable[[Any], Any] | None = None) -> Any:
+@overload
+def from_tree(path: Path, tree: object, *keys: str) -> Any: ...
+@overload
+def from_tree(path: Path, tree: object, *keys: str, make: Callable[[Any], Made]) -> Made: ...
+def from_tree(
+    path: Path, tree: Any, *keys: str, make: Callable[[Any], Made] | None = None
+) -> Any | Made:
     """A part of what a file holds, by its keys, made into something.
 
     Raises
@@ -182,20 +193,21 @@ def read_csv(path: Path, *columns: str) -> list[dict[str, str]]:
         raise ProductError(f"{path}: damaged ({error}); delete it and run again") from error
 
 
-def read_table(path: Path, **options: Any) -> Any:
+def read_table(path: Path, **options: Any) -> DataFrame:
     """A CSV as a pandas DataFrame, read with its options; raises ProductError."""
     import pandas as pd
 
     try:
-        return pd.read_csv(path, **options)
+        table: DataFrame = pd.read_csv(path, **options)
     except FileNotFoundError:
         raise ProductError(f"{path}: no such file") from None
     except (ValueError, pd.errors.ParserError, RecursionError) as error:
         line = " ".join(str(error).split())
         raise ProductError(f"{path}: damaged ({line}); delete it and run again") from error
+    return table
 
 
-def number(path: Path, text: Any) -> float:
+def number(path: Path, text: str | SupportsFloat) -> float:
     """A number of a table; raises ProductError that names the file."""
     try:
         return float(text)

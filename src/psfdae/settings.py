@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Protocol, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -36,15 +36,22 @@ class Group(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
+Config = Any
+"""A configuration: a model of which the groups are attributes. Which there are follows from the
+methods, and the class is made of them when it is needed."""
+
+
 class ConfigError(Error, ValueError):
     """The configuration is not usable; every line names a key, its value and the range."""
 
+
+Model = TypeVar("Model", bound=BaseModel)
 
 LONGEST = 200
 """Characters of a wrong value that a message repeats."""
 
 
-def validate(model: type[Any], tree: Mapping[str, Any]) -> Any:
+def validate(model: type[Model], tree: Mapping[str, Any]) -> Model:
     """Check a configuration tree against a pydantic model.
 
     Raises
@@ -151,12 +158,35 @@ class Parts(Group):
     )
 
 
+class WithNoise(Protocol):
+    """Settings of the noise that methods are told."""
+
+    @property
+    def noise(self) -> Noise: ...
+
+
+class OfFit(WithNoise, Protocol):
+    """Settings that every fit depends on."""
+
+    @property
+    def seed(self) -> int: ...
+    @property
+    def parts(self) -> Parts: ...
+
+
 class Evaluation(Group):
     """Image metrics."""
 
     data_range: Positive = Field(0.66, description="SSIM dynamic range fitted to the paper's rows")
     batch: Count = Field(256, description="Stars per forward pass")
     threads: Count = Field(1, description="Threads of the linear algebra")
+
+
+class OfTest(OfFit, Protocol):
+    """The same, and those of its test."""
+
+    @property
+    def evaluation(self) -> Evaluation: ...
 
 
 class CalibrationStars(Group):

@@ -176,7 +176,7 @@ def _of_stars(
     """
     source = fits.place_of(kind, **key)
     model = results / source
-    files = _model_files(kind, model) | {"evaluation.csv": evaluation} | figures
+    files = {**_model_files(kind, model), "evaluation.csv": evaluation, **figures}
     product = read_product(stars, "stars", ())
     require_origin(model, STARS, product)
     own, run_kind = kind.described(model), fits.storage_of(kind).run or kind.name
@@ -188,7 +188,9 @@ def _of_stars(
             metrics |= _measured(evaluation, row, "test")
     trained = HISTORY in fits.storage_of(kind).diagnostics
     return Run(
-        **key,
+        dataset=key["dataset"],
+        split=key["split"],
+        reference=key["reference"],
         kind=run_kind,
         source=source,
         name=" ".join([*key.values(), run_kind]),

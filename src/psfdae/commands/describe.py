@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated
 
 from psfdae.bundle_info import BundleInfo
@@ -80,7 +81,7 @@ def _facts(packed: Bundle) -> dict[str, str]:
     else:
         network = {"Method": f"{method(info.method).look.label}; {count} numbers"}
     fitted = None if info.dae else estimator(packed)
-    own = fitted.facts() if isinstance(fitted, KnowsField) else {}
+    own: Mapping[str, str] = fitted.facts() if isinstance(fitted, KnowsField) else {}
     return {
         "Name": info.name,
         "Format": f"{info.format_version}, written {info.created} by psfdae {info.psfdae_version}",

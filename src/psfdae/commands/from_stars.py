@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shlex
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,7 +30,7 @@ from psfdae.method import Method, facts_of
 from psfdae.methods import method
 from psfdae.model.bundle import SUFFIX
 from psfdae.model.fitting import best, described, fitted_to, makes_models, packed
-from psfdae.model.settings import CHOSEN, Words, of_config
+from psfdae.model.settings import CHOSEN, Settings, Words, of_config
 from psfdae.model.stars import Stars
 from psfdae.model.validation import validate
 from psfdae.options import File, Folder
@@ -59,7 +59,7 @@ class Made:
         return self.path / "stars.h5"
 
     @property
-    def list(self) -> Path:
+    def star_list(self) -> Path:
         return self.path / "stars.csv"
 
     def fit(self, kind: type[Method]) -> Path:
@@ -80,7 +80,7 @@ class Made:
 
 @command("from-stars", Words())
 def from_stars(
-    config: Any,
+    config: Settings,
     image: Annotated[File, {"argument": True}],
     stated: Stated,
     name: Annotated[str | None, "Name of the model.  [default: the image's]"] = None,
@@ -123,7 +123,7 @@ def from_stars(
 
 
 def trained(
-    config: Any,
+    config: Settings | Mapping[str, Any],
     image: Path,
     stated: Stated,
     name: str | None,
@@ -140,7 +140,7 @@ def trained(
     source = stated.source(image)
     settings, kinds, tried = _methods(of_config(config), taken)
     files = Made(out, _stem(image, name), kinds)
-    made = [*files.written(), *([files.list] if source.detect is not None else []), page]
+    made = [*files.written(), *([files.star_list] if source.detect is not None else []), page]
     check_outputs(made, source.files())
     if page is not None and page.exists() and not (overwrite or interrupted(files.bundle)):
         raise FolderError(f"{page}: exists already; --overwrite replaces it")
@@ -152,8 +152,8 @@ def trained(
 
 
 def _methods(
-    settings: Any, taken: str | None
-) -> tuple[Any, tuple[type[Method], ...], list[type[Method]]]:
+    settings: Settings, taken: str | None
+) -> tuple[Settings, tuple[type[Method], ...], list[type[Method]]]:
     """Settings whose methods are those that are measured; the fits, and who may be the model."""
     # Those that are given a place on the grid of a simulation know none of an image.
     names = [n for n in settings.methods if method(n).packing or not method(n).needs.position]
@@ -215,7 +215,7 @@ def _alone(folder: Path) -> Iterator[None]:
 
 
 def _make(
-    settings: Any,
+    settings: Settings,
     source: Source,
     files: Made,
     licence: str,
@@ -226,7 +226,7 @@ def _make(
     stars = Stars.of(source, settings)
     print(*stars.notes, stars.summary(), sep="\n")
     if source.detect is not None:
-        write_list(stars.observation, files.list)
+        write_list(stars.observation, files.star_list)
     write_columns(files.path / "selection.csv", stars.table.columns, digits=6)
     write_product(files.stars, "stars", stars.columns, stars.described())
     write_text(files.path / "overrides.txt", _overrides(stars.settings))
@@ -264,7 +264,7 @@ def _make(
     return str(report)
 
 
-def _overrides(settings: Any) -> str:
+def _overrides(settings: Settings) -> str:
     """The settings as words of a command line that chooses files of the configuration, too."""
     return (
         "\n".join([CHOSEN, *as_overrides(settings.model_dump(exclude={"calibration_stars"}))])

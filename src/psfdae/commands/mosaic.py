@@ -10,14 +10,17 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from psfdae.cli import REFUSABLE, refusal
 from psfdae.errors import Error
 from psfdae.image.catalogue import read_catalogue
 from psfdae.image.errors import ObservationError
 from psfdae.image.fits_file import science_images
-from psfdae.model.psf_model import available_cores
+from psfdae.threads import available_cores
+
+if TYPE_CHECKING:
+    from psfdae.commands.predict import Stated
 
 ALONE = ("extension", "origin", "mask", "weight", "variance")
 """What is stated of one image, and cannot be of several."""
@@ -27,11 +30,10 @@ class MosaicError(Error, RuntimeError):
     """Some images of a file could not be used."""
 
 
-def images_of(path: Path, stated: Any) -> dict[str, Any]:
+def images_of(path: Path, stated: Stated) -> dict[str, Stated]:
     """What is stated of each image of a file by its name (`science_images`).
 
-    `stated` is a `psfdae.commands.predict.Stated`; stars of its list belong to the image on which
-    they are.
+    Stars of the list that is stated belong to the image on which they are.
     """
     given = [f"--{name}" for name in ALONE if getattr(stated, name) is not None]
     if given:

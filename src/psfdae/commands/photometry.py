@@ -19,6 +19,7 @@ from psfdae.model.exchange import load_field
 from psfdae.options import File
 
 if TYPE_CHECKING:
+    from psfdae.image.observation import Observation
     from psfdae.model.crowded import CrowdedPhotometry
 
 FORMATS = {".fits": "fits", ".ecsv": "ascii.ecsv", ".csv": "ascii.csv"}
@@ -71,6 +72,7 @@ def photometry(
     if reference is not None:
         listed = replace(stated, catalogue=reference, detect=False, on_image=False)
         places = listed.source(image).open(loaded.stamp_px).positions
+        assert places is not None  # of an image
         magnitudes = places, as_catalogue(reference).numbers(magnitude_column)
 
     from psfdae.model.crowded import photometry as measured
@@ -91,7 +93,7 @@ def photometry(
 
 
 def _zero_point(
-    found: CrowdedPhotometry, places: Any, magnitude: np.ndarray, reference: Path | None
+    found: CrowdedPhotometry, places: np.ndarray, magnitude: np.ndarray, reference: Path | None
 ) -> tuple[float, str]:
     """Median of what stars of the reference say, in magnitudes, and how sure it is."""
     from scipy.spatial import cKDTree
@@ -116,7 +118,7 @@ def _zero_point(
     return value, f"zero point {value:.4f} ± {error:.4f} mag ({len(zero)} stars of {reference})"
 
 
-def _complete(found: CrowdedPhotometry, observation: Any, zero_point: float | None) -> None:
+def _complete(found: CrowdedPhotometry, observation: Observation, zero_point: float | None) -> None:
     """Columns that take a zero point, or a WCS."""
     stars = found.stars
     with np.errstate(all="ignore"):

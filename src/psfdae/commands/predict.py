@@ -21,8 +21,9 @@ from psfdae.image.observation import Observation, Source, list_offset
 from psfdae.image.stamps import Stamps, StarFlag
 from psfdae.method import MeasuresStars
 from psfdae.model.bundle import SUFFIX
+from psfdae.model.field_psfs import PredictionError
 from psfdae.model.prediction import Prediction, prediction_file
-from psfdae.model.psf_model import MARGIN_PX, PredictionError, PsfModel, load_model
+from psfdae.model.psf_model import MARGIN_PX, PsfModel, load_model
 from psfdae.options import File, NameOrNumber
 
 
@@ -73,17 +74,26 @@ class Stated:
                 words += [flag] if value is True else [flag, str(value)]
         return words
 
-    def source(self, path: Path, **more: str | None) -> Source:
+    def source(
+        self, path: Path, flux_column: str | None = None, background_column: str | None = None
+    ) -> Source:
         """The file with all that is stated about it."""
         stated = vars(self).copy()
         threshold, scale = stated.pop("threshold"), stated.pop("pixel_scale")
         del stated["all_extensions"]
         stated["detect"] = threshold if stated["detect"] else None
-        return Source(path, pixel_scale_arcsec=scale, **stated, **more)
+        return Source(
+            path,
+            pixel_scale_arcsec=scale,
+            flux_column=flux_column,
+            background_column=background_column,
+            **stated,
+        )
 
 
 def write_list(observation: Observation, path: Path) -> None:
     """The stars that were found, as a star list."""
+    assert observation.found is not None
     with atomic_path(path) as temporary:
         observation.found.table.write(temporary, format="ascii.csv", overwrite=True)
 
@@ -273,8 +283,8 @@ def _cards(source: Source, observation: Observation) -> list[Card]:
             f"[arcsec] width of a pixel{', assumed' if observation.scale_assumed else ''}",
         ),
     ]
-    if source.catalogue is not None:
-        cards.append(("CATALOG", source.catalogue.name, "star list"))
+    if observation.catalogue is not None:
+        cards.append(("CATALOG", observation.catalogue.name, "star list"))
     if observation.gain is not None:
         cards.append(("GAIN", observation.gain, "electrons per count"))
     if observation.saturate is not None:

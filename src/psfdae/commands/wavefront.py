@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import click
 import numpy as np
@@ -24,6 +24,12 @@ from psfdae.sensing.results import wavefront as sensed
 from psfdae.sensing.stars import SensingError
 from psfdae.telescope.settings import OwnTelescope, read_telescope
 from psfdae.version import __version__
+
+if TYPE_CHECKING:
+    from astropy.io.fits import HDUList
+    from astropy.table import Table
+
+    from psfdae.image.catalogue import StarList
 
 FIELD_COLUMNS = ("x_deg", "y_deg")
 """Field angles of the stars, if the star list has them."""
@@ -112,7 +118,7 @@ def check_scale(observation: Observation, telescope: OwnTelescope) -> None:
 
 def field_angles(
     observation: Observation,
-    catalogue: Any,
+    catalogue: StarList | None,
     telescope: OwnTelescope,
     axis: tuple[float, float] | None,
 ) -> np.ndarray:
@@ -135,19 +141,20 @@ def field_angles(
                 raise SensingError(f"{table.path}: no x_deg, y_deg in row {lost.argmax() + 1}")
             return angle
     positions, shape = observation.positions, observation.shape
-    if positions is None or (shape is None and axis is None):
+    if axis is None and shape is not None:
+        axis = (0.5 * (shape[1] - 1), 0.5 * (shape[0] - 1))
+    if positions is None or axis is None:
         raise SensingError(
             f"{observation.path}: the stars' field angles are not known: a star list with columns "
             "x_deg, y_deg, an image, or --axis with positions says them"
         )
-    middle = axis if axis is not None else (0.5 * (shape[1] - 1), 0.5 * (shape[0] - 1))
-    angle = (positions - np.asarray(middle)) * telescope.pixel_scale_arcsec / 3600.0
+    angle = (positions - np.asarray(axis)) * telescope.pixel_scale_arcsec / 3600.0
     if not np.isfinite(angle).all():
         raise SensingError(f"{observation.path}: stars without a position (--on-image leaves out)")
     return np.asarray(angle)
 
 
-def as_fits(found: Wavefronts, image: str) -> Any:
+def as_fits(found: Wavefronts, image: str) -> HDUList:
     """The FITS file: primary header, WAVEFRONT, PSF, UNCERT, MODEL, RESIDUAL, COVAR and JOINT."""
     from astropy.io import fits
 
@@ -206,7 +213,7 @@ def as_fits(found: Wavefronts, image: str) -> Any:
     return fits.HDUList(hdus)
 
 
-def _by_row(found: Wavefronts, rows: Any) -> np.ndarray:
+def _by_row(found: Wavefronts, rows: Table) -> np.ndarray:
     """Covariances of the rows of the table; NaN for stars without usable pixels."""
     covariance = found.summary["covariance"]
     whole = np.full((len(rows), *covariance.shape[1:]), np.nan)

@@ -11,10 +11,10 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -22,6 +22,13 @@ from psfdae.errors import Error
 from psfdae.image.errors import ObservationError, reading, shorten
 from psfdae.image.fits_file import UNPACK, PlainFile, open_hdus, plain_file
 from psfdae.image.stamps import StarFlag, raise_flag
+
+if TYPE_CHECKING:
+    from astropy.table import Column, Table
+    from numpy.typing import ArrayLike
+    from pandas import DataFrame
+
+    StarList: TypeAlias = str | Path | np.ndarray | Mapping[str, ArrayLike] | Table | DataFrame
 
 SEXTRACTOR_HEADER = re.compile(r"#\s*(\d+)\s+[A-Za-z_]\w*")
 SEXAGESIMAL = re.compile(r"[:hd\s]", re.IGNORECASE)
@@ -81,8 +88,8 @@ CONVENTIONS = [
 # SExtractor's bits that say something against a star; 1, a neighbour nearby, is no reason.
 FLAGGED = {2: StarFlag.BLENDED, 4: StarFlag.SATURATED, 8: StarFlag.TRUNCATED}
 # Columns that identify a star; the first of these that a catalogue has is used.
-ID_COLUMNS = ("id", "source_id", "number", "star_id", "objid", "obj_id", "object_id")
-ID_COLUMNS += ("label", "name")
+ID_COLUMNS: tuple[str, ...] = ("id", "source_id", "number", "star_id", "objid", "obj_id")
+ID_COLUMNS += ("object_id", "label", "name")
 
 
 class ColumnError(Error, ValueError):
@@ -138,7 +145,7 @@ class _FitsTable:
     def __len__(self) -> int:
         return self.rows
 
-    def __getitem__(self, name: str) -> Any:
+    def __getitem__(self, name: str) -> Column:
         from astropy.table import Column, MaskedColumn
         from astropy.units import Unit
 
@@ -160,7 +167,7 @@ class Catalogue:
     """A table of stars; rows keep their order, none is left out."""
 
     path: Path
-    table: Any
+    table: Table  # or what has columns like one
 
     def __len__(self) -> int:
         return len(self.table)
@@ -258,7 +265,7 @@ class Catalogue:
         names = self.table.colnames
         return wanted if wanted in names else _in_any_case(names, wanted)
 
-    def _column(self, name: str) -> Any:
+    def _column(self, name: str) -> Column:
         try:
             found = self._resolve(name)
         except ColumnError as error:
@@ -318,11 +325,11 @@ class Catalogue:
             ) from None
 
 
-def _text(value: Any) -> str:
+def _text(value: object) -> str:
     return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
 
 
-def _as_identifiers(column: Any) -> np.ndarray:
+def _as_identifiers(column: Column) -> np.ndarray:
     values, missing = np.ma.getdata(column), np.ma.getmaskarray(column)
     if values.dtype.kind in "iuf" and not missing.any():
         with np.errstate(all="ignore"):
@@ -357,7 +364,7 @@ def read_catalogue(path: Path) -> Catalogue:
     return Catalogue(path, table)
 
 
-def as_catalogue(given: Any) -> Catalogue:
+def as_catalogue(given: StarList) -> Catalogue:
     """A star list from a file, a table, or positions.
 
     Parameters
@@ -376,8 +383,8 @@ def as_catalogue(given: Any) -> Catalogue:
             if given.ndim != 2 or given.shape[1] != 2:
                 raise ObservationError(path, f"positions of shape {given.shape}, expected (n, 2)")
             given = {"x_fit": given[:, 0], "y_fit": given[:, 1]}
-        frame = hasattr(given, "to_records")
-        table = Table(given.to_records(index=False) if frame else given)
+        records = getattr(given, "to_records", None)  # of a DataFrame
+        table = Table(given if records is None else records(index=False))
     if len(table) == 0:
         raise ObservationError(path, "the catalogue has no stars")
     return Catalogue(path, table)
@@ -395,8 +402,8 @@ def _fits_table(path: Path) -> _FitsTable:
         ]
         objects = [hdu for hdu in tables if hdu.name == "LDAC_OBJECTS"] or tables
         if len(objects) != 1:
-            names = shorten([hdu.name or "(no name)" for hdu in objects])
-            raise ObservationError(path, f"expected one table of stars, found {names}")
+            found = shorten([hdu.name or "(no name)" for hdu in objects])
+            raise ObservationError(path, f"expected one table of stars, found {found}")
         rows = int(objects[0].header["NAXIS2"])
         size = objects[0].header["NAXIS1"] * rows
         if objects[0].fileinfo()["datLoc"] + size > file.path.stat().st_size:
@@ -430,7 +437,7 @@ def _lines(path: Path, content: bytes) -> list[str]:
     return [line for line in text.splitlines() if line.strip()]
 
 
-def _text_table(path: Path, lines: list[str]) -> Any:
+def _text_table(path: Path, lines: list[str]) -> Table:
     """Table of the lines, which are gone then: they take twice the memory of the file."""
     from astropy.io import ascii as text_tables
 

@@ -78,7 +78,7 @@ class Sky:
         source = np.bincount(parts.ravel()) >= LEAST_PX
         source[0] = False
         height, width = self.flat.shape
-        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        inside: np.ndarray = (column >= 0) & (column < width) & (row >= 0) & (row < height)
         inside[inside] = source[parts[row[inside], column[inside]]]
         return inside
 

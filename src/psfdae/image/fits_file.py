@@ -28,11 +28,16 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
 from psfdae.image.errors import ObservationError, reading, shorten
+
+if TYPE_CHECKING:
+    from astropy.io.fits import HDUList, Header
+    from astropy.wcs import WCS
+    from numpy.typing import DTypeLike
 
 BLOCK_BYTES = 2880  # FITS files consist of blocks of this size
 LONGEST_HEADERS = 8_000 * BLOCK_BYTES  # of a file, 288 000 cards; astropy takes ten times as much
@@ -61,17 +66,17 @@ NOT_SCIENCE = MASKS | ERRORS | EXTRAS  # extensions that go with an image
 
 # Electrons per count; cameras that write the first two put a setting without unit into GAIN.
 GAIN_KEYS = ("EGAIN", "GAIN", "ESO DET OUT1 CONAD", "ATODGAIN", "CCDGAIN", "GAIN1", "GAINA")
-READ_NOISE_KEYS = ("RDNOISE", "READNOIS", "READNOISE", "RON", "ENOISE", "ESO DET OUT1 RON")
-READ_NOISE_KEYS += ("CCDNOISE", "RDNOISE1", "RDNOISEA")  # electrons
+READ_NOISE_KEYS: tuple[str, ...] = ("RDNOISE", "READNOIS", "READNOISE", "RON", "ENOISE")
+READ_NOISE_KEYS += ("ESO DET OUT1 RON", "CCDNOISE", "RDNOISE1", "RDNOISEA")  # electrons
 SATURATION_KEYS = ("SATURATE", "SATLEVEL", "SATURATA", "MAXLIN")  # counts
 # Arcseconds; the second is POPPY's.
 SCALE_KEYS = ("PIXSCALE", "PIXELSCL", "SECPIX", "SECPIX1", "PIXSCAL1", "IM_SCALE", "SCALE")
 LENS_KEYS = ("XPIXSZ", "FOCALLEN")  # micrometres and millimetres, of amateurs' cameras
 # Where stamps come from, copied to whatever is made of them.
-PROVENANCE_KEYS = ("OBJECT", "TELESCOP", "INSTRUME", "OBSERVER", "FILTER")
+PROVENANCE_KEYS: tuple[str, ...] = ("OBJECT", "TELESCOP", "INSTRUME", "OBSERVER", "FILTER")
 PROVENANCE_KEYS += ("DATE-OBS", "MJD-OBS", "EXPTIME", "AIRMASS")
 
-Card = tuple[str, Any, str]  # key, value and comment
+Card = tuple[str, str | float | None, str]  # key, value and comment
 Said = tuple[float | None, str]  # a number, and the card that says it; or None, and words for that
 
 
@@ -168,7 +173,7 @@ def _unpacked(path: Path, content: IO[bytes]) -> PlainFile:
 
 
 @contextmanager
-def open_hdus(file: PlainFile, **options: Any) -> Iterator[Any]:
+def open_hdus(file: PlainFile, **options: Any) -> Iterator[HDUList]:
     """The file's `astropy.io.fits.HDUList` with all headers read; `options` are those of `open`.
 
     Belongs inside `reading`: only headers that are too long or too many are refused here.
@@ -232,8 +237,8 @@ class ImageFile:
     bscale: float
     bzero: float
     blank: int | None
-    headers: tuple[Any, ...]
-    wcs: Any
+    headers: tuple[Header, ...]
+    wcs: WCS | None
     values: np.ndarray | None = None
 
     @property
@@ -241,7 +246,7 @@ class ImageFile:
         """The file's own name, for messages."""
         return self.file.name
 
-    def physical(self, stored: np.ndarray, dtype: Any = np.float32) -> np.ndarray:
+    def physical(self, stored: np.ndarray, dtype: DTypeLike = np.float32) -> np.ndarray:
         """Physical values of stored ones, in native byte order, same shape."""
         if self.bscale == 1.0 and self.bzero == 0.0:
             values = stored.astype(dtype)
@@ -291,7 +296,7 @@ class ImageFile:
 
     def provenance(self) -> list[Card]:
         """Cards of `PROVENANCE_KEYS`, those that can be parsed."""
-        cards = []
+        cards: list[Card] = []
         for key in PROVENANCE_KEYS:
             for header in self.headers:
                 value = card_value(header, key)
@@ -301,7 +306,7 @@ class ImageFile:
         return cards
 
 
-def card_value(header: Any, key: str) -> Any:
+def card_value(header: Header, key: str) -> Any:
     """Value of a card; None if it is absent or cannot be parsed."""
     try:
         return header[key]
@@ -321,7 +326,9 @@ def array_image(values: np.ndarray, name: str = "array") -> ImageFile:
     return ImageFile(file, 0, values.shape, 0, 1.0, 0.0, None, (), None, values)
 
 
-def find_image(path: Any, extension: str | int | None = None) -> ImageFile:
+def find_image(
+    path: Path | PlainFile | np.ndarray, extension: str | int | None = None
+) -> ImageFile:
     """Find an image in a FITS file and check that its data are all there.
 
     Parameters
@@ -380,7 +387,7 @@ def science_images(path: Path) -> dict[str, int]:
 _AS_STORED = {"do_not_scale_image_data": True, "uint": False, "ignore_blank": True}
 
 
-def _choose(path: Path, hdus: Any, extension: str | int | None) -> Any:
+def _choose(path: Path, hdus: HDUList, extension: str | int | None) -> Any:
     listed = shorten([_label(k, hdu) for k, hdu in enumerate(hdus)])
     if extension is not None:
         hdu = _named(hdus, str(extension).strip())
@@ -400,7 +407,7 @@ def _choose(path: Path, hdus: Any, extension: str | int | None) -> Any:
     return science[0]
 
 
-def _named(hdus: Any, text: str) -> Any:
+def _named(hdus: HDUList, text: str) -> Any:
     """The extension of that number or name, or None."""
     if re.fullmatch("[0-9]{1,6}", text):
         return hdus[int(text)] if int(text) < len(hdus) else None
@@ -444,7 +451,7 @@ def _check_complete(file: PlainFile, hdu: Any) -> None:
         raise ObservationError(path, f"truncated: the last {missing} bytes are missing")
 
 
-def _celestial(header: Any, hdus: Any) -> Any:
+def _celestial(header: Header, hdus: HDUList) -> WCS | None:
     """Celestial WCS with a stated scale, or None; a WCS that is damaged counts as missing."""
     from astropy.wcs import WCS
 
@@ -490,7 +497,7 @@ def _check_tiles(path: Path, hdu: Any) -> None:
         raise ObservationError(path, f"damaged: {len(table.data)} tiles instead of {tiles}")
 
 
-def _tile_settings(header: Any) -> dict[str, Any]:
+def _tile_settings(header: Header) -> dict[str, Any]:
     """Parameters of the coding, stored as pairs ZNAMEi, ZVALi."""
     settings = {}
     for i in range(1, 1000):
@@ -524,7 +531,11 @@ def decompress(path: Path, hdu: Any, copy: IO[bytes]) -> np.ndarray:
         wide *= max(1, BLOCK_PX // (high * wide))
     for row in range(0, rows, high):
         for column in range(0, columns, wide):
-            block = (*first, slice(row, row + high), slice(column, column + wide))
+            block: tuple[int | slice, ...] = (
+                *first,
+                slice(row, row + high),
+                slice(column, column + wide),
+            )
             values[block] = hdu.section[block]
     return values
 
@@ -538,7 +549,7 @@ class Pixels:
 
     stored: Any
     image: ImageFile
-    dtype: Any = np.float32
+    dtype: DTypeLike = np.float32
 
     def __getitem__(self, key: Any) -> np.ndarray:
         key = key if isinstance(key, tuple) else (key,)
@@ -548,7 +559,9 @@ class Pixels:
 
 
 @contextmanager
-def open_pixels(image: ImageFile, *, whole: bool, dtype: Any = np.float32) -> Iterator[Pixels]:
+def open_pixels(
+    image: ImageFile, *, whole: bool, dtype: DTypeLike = np.float32
+) -> Iterator[Pixels]:
     """The values of an image as something to index, without the leading axes.
 
     As a `whole` it is an array, mapped into memory where the file allows, for access at

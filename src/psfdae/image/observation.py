@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -37,6 +37,11 @@ from psfdae.image.fits_file import (
 )
 from psfdae.image.stamps import Stamps, StarFlag, cut, raise_flag, sky_around
 
+if TYPE_CHECKING:
+    from astropy.wcs import WCS
+
+    from psfdae.image.catalogue import StarList
+
 FAR = 2**30  # positions are clipped to ± this many pixels, far off any image
 NEAR = 1.0  # stars farther off by this many image sizes are not corrected for distortion
 ASSUMED_SCALE = 1.0  # arcseconds per pixel where nothing says it
@@ -55,7 +60,9 @@ class Source:
     """A FITS file with stars, and what is stated about it."""
 
     image: Path | np.ndarray  # cube of stamps, or image
-    catalogue: Any = None  # of an image, as `as_catalogue` takes it; of a cube, row by row
+    catalogue: StarList | None = (
+        None  # of an image, as `as_catalogue` takes it; of a cube, row by row
+    )
     detect: float | None = None  # in its place: σ above the sky from which stars are searched
     extension: str | int | None = None  # with the stars
     on_image: bool = False  # stars of the catalogue that are off the image are left out
@@ -78,7 +85,7 @@ class Source:
         """The image's file, or what an array is called in messages."""
         return self.image if isinstance(self.image, Path) else Path("array")
 
-    def files(self) -> tuple[Any, ...]:
+    def files(self) -> tuple[object, ...]:
         """All that is read."""
         return (self.image, self.catalogue, self.mask, self.weight, self.variance)
 
@@ -105,7 +112,7 @@ class Source:
             sky = layers.sky()
             if layers.noise is not None:
                 layers = replace(layers, noise_scale=sky.noise_scale)
-            table = table if self.detect is None else self._detected(sky)
+            table = table if self.detect is None else self._detected(sky, self.detect)
         count = len(table) if table is not None else shape[0] if len(shape) == 3 else 1
         identifiers = np.arange(count, dtype=np.int64)
         positions, flags = None, np.zeros(count, dtype=np.uint16)
@@ -241,7 +248,7 @@ class Source:
         inverse = self.weight is not None
         with open_pixels(noise, whole=True) as pixels:
             values = pixels[:]
-        wrong, empty = np.count_nonzero(values < 0), np.count_nonzero(values == 0)
+        wrong, empty = (int(np.count_nonzero(some)) for some in (values < 0, values == 0))
         if wrong or (empty and not inverse):
             raise ObservationError(
                 noise.path,
@@ -250,14 +257,14 @@ class Source:
             )
         return Layers(image, mask, self.bad_bits, noise, inverse, empty, least_noise=least)
 
-    def _detected(self, sky: Sky) -> Catalogue:
+    def _detected(self, sky: Sky, threshold: float) -> Catalogue:
         """The stars of an image."""
         from astropy.table import Table
 
         with reading(self.path):
-            table = Table(sky.stars(self.detect))
+            table = Table(sky.stars(threshold))
         if len(table) == 0:
-            raise ObservationError(self.path, f"no star {self.detect:g} σ above the sky")
+            raise ObservationError(self.path, f"no star {threshold:g} σ above the sky")
         return Catalogue(self.path, table)
 
     def _column(self, table: Catalogue | None, name: str | None, count: int) -> np.ndarray:
@@ -336,7 +343,7 @@ def list_offset(path: Path | None, off: np.ndarray, accept: bool) -> str | None:
 def _inside(positions: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """Which positions (n, 2), x and y, are on an image (rows, columns)."""
     place = central_pixel(positions[:, ::-1])
-    return ((place >= 0) & (place < shape)).all(axis=1)
+    return np.asarray(((place >= 0) & (place < shape)).all(axis=1))
 
 
 def _find_beside(image: ImageFile, place: Any, what: str) -> ImageFile:
@@ -370,22 +377,25 @@ class Layers:
     least_noise: float = 0.0  # counts; the read noise
 
     @contextmanager
-    def open(self, whole: bool) -> Iterator[tuple[Any, Any, Any]]:
+    def open(self, whole: bool) -> Iterator[tuple[Pixels, Pixels | None, Pixels | None]]:
         """Pixels of the image, the mask and the map of noise, None for what there is not."""
         with ExitStack() as files:
+
+            def opened(image: ImageFile, dtype: type[np.floating] = np.float32) -> Pixels:
+                return files.enter_context(open_pixels(image, whole=whole, dtype=dtype))
+
+            pixels = opened(self.image)
             # Bits of whole numbers do not fit into the mantissa of a float32.
-            kinds = ((self.image, np.float32), (self.mask, np.float64), (self.noise, np.float32))
-            yield tuple(
-                image and files.enter_context(open_pixels(image, whole=whole, dtype=dtype))
-                for image, dtype in kinds
-            )  # type: ignore[misc]
+            mask = None if self.mask is None else opened(self.mask, np.float64)
+            noise = None if self.noise is None else opened(self.noise)
+            yield pixels, mask, noise
 
     def bad(self, values: np.ndarray) -> np.ndarray:
         """Which pixels the mask calls bad; those without a value are."""
         if self.bad_bits is None:
-            return values != 0
+            return np.asarray(values != 0)
         with np.errstate(invalid="ignore"):  # what is beyond any number has no bits
-            return (np.nan_to_num(values, nan=-1).astype(np.int64) & self.bad_bits) != 0
+            return np.asarray((np.nan_to_num(values, nan=-1).astype(np.int64) & self.bad_bits) != 0)
 
     def sigma(self, values: np.ndarray) -> np.ndarray:
         """σ of pixels by the map, NaN where it has none."""
@@ -483,8 +493,8 @@ class Observation:
         for (name, (value, origin)), unit in zip(self.camera.items(), units, strict=True):
             words.append(f"{name} {origin if value is None else f'{value:.6g} {unit} ({origin})'}")
         said = f"{self.path}: {', '.join(words)}"
-        if empty := self._layers.empty:
-            said += f"\n{self._layers.noise.path}: weight 0, bad pixels: {empty}"  # type: ignore
+        if (empty := self._layers.empty) and (noise := self._layers.noise) is not None:
+            said += f"\n{noise.path}: weight 0, bad pixels: {empty}"
         lost = self.without_position()
         if lost.any():
             rows = shorten([str(row + 1) for row in np.flatnonzero(lost)])
@@ -495,7 +505,7 @@ class Observation:
         """Which stars have no position though the list has others, bool, shape (n,)."""
         if self.positions is None or self.found is not None:
             return np.zeros(self.count, dtype=bool)
-        return ~np.isfinite(self.positions).all(axis=1)
+        return np.asarray(~np.isfinite(self.positions).all(axis=1))
 
     def check_list(self) -> None:
         """Refuse a star list of another image, and one with a star twice.
@@ -504,7 +514,7 @@ class Observation:
         """
         from scipy.spatial import cKDTree
 
-        if self.shape is None or self.catalogue is None:
+        if self.shape is None or self.catalogue is None or self.positions is None:
             return
         known = np.flatnonzero(np.isfinite(self.positions).all(axis=1))
         pairs = cKDTree(self.positions[known]).query_pairs(SAME_PX, output_type="ndarray")
@@ -516,7 +526,8 @@ class Observation:
             )
         sky = self._layers.sky()
         with reading(self.path):
-            seen = int(sky.covered(*central_pixel(self.positions.T), SEEN).sum())
+            column, row = central_pixel(self.positions.T)
+            seen = int(sky.covered(column, row, SEEN).sum())
         if seen < 0.5 * known.size:
             raise ObservationError(
                 self.catalogue,
@@ -551,8 +562,8 @@ class Observation:
                 yield self._stamps(part, *stamps_of(part, *opened))
 
     def _of_cube(
-        self, part: slice, pixels: Pixels, mask: Pixels | None, _: None
-    ) -> tuple[np.ndarray, ...]:
+        self, part: slice, pixels: Pixels, mask: Pixels | None, _: Pixels | None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Pixels, which of them are masked, which stars are truncated, and their noise."""
         side, count = self.stamp_px + 2 * self.margin, part.stop - part.start
         data = cut(_rows(pixels, part), side)
@@ -564,7 +575,8 @@ class Observation:
 
     def _of_image(
         self, part: slice, pixels: Pixels, mask: Pixels | None, noise: Pixels | None
-    ) -> tuple[np.ndarray, ...]:
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        assert self.shape is not None and self.positions is not None
         x, y = self.positions[part].T
         wide = max(self.margin, RING_PX)
         where = (self.shape, x, y, self.stamp_px, wide)
@@ -627,11 +639,16 @@ def central_pixel(position: np.ndarray) -> np.ndarray:
     Pixel k covers k − ½ ≤ position < k + ½.
     """
     rounded = np.floor(np.nan_to_num(position, nan=-FAR, posinf=FAR, neginf=-FAR) + 0.5)
-    return np.clip(rounded, -FAR, FAR).astype(np.int64)
+    return np.asarray(np.clip(rounded, -FAR, FAR), np.int64)
 
 
 def cut_image(
-    pixels: Any, shape: tuple[int, int], x: np.ndarray, y: np.ndarray, stamp_px: int, margin: int
+    pixels: Pixels | np.ndarray,
+    shape: tuple[int, ...],
+    x: np.ndarray,
+    y: np.ndarray,
+    stamp_px: int,
+    margin: int,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Cut a stamp around each star, with the star's pixel at index d//2 + margin.
 
@@ -652,20 +669,20 @@ def cut_image(
     side = np.arange(stamp_px + 2 * margin) - stamp_px // 2 - margin
     rows = central_pixel(y)[:, None] + side
     columns = central_pixel(x)[:, None] + side
-    row_inside = (rows >= 0) & (rows < shape[0])
-    column_inside = (columns >= 0) & (columns < shape[1])
-    stamps = pixels[
+    row_inside: np.ndarray = (rows >= 0) & (rows < shape[0])
+    column_inside: np.ndarray = (columns >= 0) & (columns < shape[1])
+    stamps: np.ndarray = pixels[
         np.clip(rows, 0, shape[0] - 1)[:, :, None], np.clip(columns, 0, shape[1] - 1)[:, None, :]
     ]
     inside = row_inside[:, :, None] & column_inside[:, None, :]
     stamp = slice(margin, margin + stamp_px)
-    truncated = ~(row_inside[:, stamp].all(axis=1) & column_inside[:, stamp].all(axis=1))
+    whole = row_inside[:, stamp].all(axis=1) & column_inside[:, stamp].all(axis=1)
     if not inside.all():
         stamps = np.where(inside, stamps, 0)
-    return stamps, inside, truncated
+    return stamps, inside, np.asarray(~whole)
 
 
-def pixel_scale(wcs: Any) -> float:
+def pixel_scale(wcs: WCS) -> float:
     """Side in arcseconds of a square as large as a pixel at the reference point."""
     from astropy.wcs.utils import proj_plane_pixel_area
 
@@ -673,7 +690,7 @@ def pixel_scale(wcs: Any) -> float:
 
 
 def sky_to_pixel(
-    wcs: Any, ra: np.ndarray, dec: np.ndarray, shape: tuple[int, ...]
+    wcs: WCS, ra: np.ndarray, dec: np.ndarray, shape: tuple[int, ...]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Positions of stars in an image (rows, columns) from their ICRS coordinates in degrees.
 

@@ -7,6 +7,7 @@ star of a stamp lies near index (s//2, s//2).
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
 from itertools import repeat
@@ -184,7 +185,7 @@ def _measure(
 def _at(wide: np.ndarray, peak: np.ndarray) -> np.ndarray:
     """Pixels of stamps (n, s, s) at (row, column) from index (s//2, s//2), shape (n,)."""
     row, column = (peak + wide.shape[-1] // 2).T
-    return wide[np.arange(len(wide)), row, column]
+    return np.asarray(wide[np.arange(len(wide)), row, column])
 
 
 def piled_up(brightest: np.ndarray, sky: np.ndarray, brightness: np.ndarray) -> float:
@@ -234,7 +235,7 @@ def signal_to_noise(stamps: np.ndarray, noise: np.ndarray) -> np.ndarray:
     """
     power = np.square(stamps, dtype=np.float64).sum(axis=(1, 2))
     safe = np.where(noise > 0, noise, np.inf)
-    return np.sqrt(np.maximum(power / safe**2 - stamps[0].size, 0.0))
+    return np.asarray(np.sqrt(np.maximum(power / safe**2 - stamps[0].size, 0.0)))
 
 
 def crowded(
@@ -287,7 +288,7 @@ def window_of(snr: np.ndarray, flux: np.ndarray, noise: np.ndarray) -> np.ndarra
     A = (F / (σ_noise · S/N))² = 4π σ²; at least 0.7 px.
     """
     area = (flux / (noise * snr)) ** 2
-    return np.maximum(np.sqrt(area / (4.0 * np.pi)), 0.7)
+    return np.asarray(np.maximum(np.sqrt(area / (4.0 * np.pi)), 0.7))
 
 
 def misfit(aligned: np.ndarray, position: np.ndarray, noise: np.ndarray) -> np.ndarray:
@@ -315,6 +316,7 @@ def misfit(aligned: np.ndarray, position: np.ndarray, noise: np.ndarray) -> np.n
     count = len(aligned)
     if count < 4:
         return np.ones(count)
+    usual: Iterable[tuple[np.ndarray, np.ndarray]]
     if np.isfinite(position).all() and count > COMPANIONS:
         near = cKDTree(position).query(position, k=COMPANIONS + 1)[1]
         usual = (_usual(aligned[found[found != star]]) for star, found in enumerate(near))
@@ -327,7 +329,7 @@ def misfit(aligned: np.ndarray, position: np.ndarray, noise: np.ndarray) -> np.n
         patches = ndimage.uniform_filter(square, 3)[None]
         score[star] = square.mean(), cut(patches, core).max()
     score = np.sqrt(score)
-    return (score / np.median(score, axis=0) / (1.0, LOCAL)).max(axis=1)
+    return np.asarray((score / np.median(score, axis=0) / (1.0, LOCAL)).max(axis=1))
 
 
 def _usual(stars: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

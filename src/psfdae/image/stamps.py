@@ -74,7 +74,7 @@ MEANING: dict[StarFlag, str] = {
 """One line for every flag."""
 
 
-def raise_flag(flags: np.ndarray, flag: StarFlag, where: np.ndarray) -> None:
+def raise_flag(flags: np.ndarray, flag: StarFlag, where: np.ndarray | np.bool) -> None:
     """Add a flag to some stars of `flags`, shape (n,), uint16."""
     flags[where] |= np.uint16(flag)
 
@@ -121,7 +121,7 @@ def border_scatter(stamps: np.ndarray, bad: np.ndarray | None = None) -> np.ndar
     border = border_pixels(stamps.shape[-1])
     ring = stamps.reshape(size)[:, border]
     if bad is None:
-        return mad_std(ring, axis=1).astype(np.float64)
+        return np.asarray(mad_std(ring, axis=1), np.float64)
     hidden = bad.reshape(size)[:, border]
     hidden &= ~hidden.all(axis=1, keepdims=True)
     ring = np.where(hidden, np.nan, ring)
@@ -180,7 +180,7 @@ def smoothed(stamps: np.ndarray) -> np.ndarray:
     """Stamps (n, s, s) convolved with [1, 2, 1]/4 along both axes; edge pixels repeated."""
     wide = np.pad(stamps, ((0, 0), (1, 1), (1, 1)), mode="edge")
     rows = wide[:, :-2] + 2 * wide[:, 1:-1] + wide[:, 2:]
-    return (rows[:, :, :-2] + 2 * rows[:, :, 1:-1] + rows[:, :, 2:]) / 16
+    return np.asarray((rows[:, :, :-2] + 2 * rows[:, :, 1:-1] + rows[:, :, 2:]) / 16)
 
 
 def displacement(stamps: np.ndarray, jitter_px: int) -> np.ndarray:
@@ -234,9 +234,9 @@ def cut(wide: np.ndarray, stamp_px: int, offset: np.ndarray | None = None) -> np
     side = wide.shape[-1]
     pixels = side // 2 - stamp_px // 2 + np.arange(stamp_px)
     middle = wide[:, pixels[0] : pixels[-1] + 1, pixels[0] : pixels[-1] + 1]
-    star = np.flatnonzero(offset.any(axis=1)) if offset is not None else ()
-    if not len(star):
+    if offset is None or not offset.any():
         return np.ascontiguousarray(middle)
+    star = np.flatnonzero(offset.any(axis=1))
     stamps = middle.copy()
     rows, columns = (np.clip(offset[star, i, None] + pixels, 0, side - 1) for i in (0, 1))
     stamps[star] = wide[star[:, None, None], rows[:, :, None], columns[:, None, :]]

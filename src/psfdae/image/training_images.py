@@ -76,7 +76,7 @@ def bins_of(position: np.ndarray, bins: int) -> np.ndarray:
     low, high = position.min(axis=0), position.max(axis=0)
     share = (position - low) / np.where(high > low, high - low, 1.0)
     place = np.minimum((share * bins).astype(np.int64), bins - 1)
-    return place[:, 0] + bins * place[:, 1]
+    return np.asarray(place[:, 0] + bins * place[:, 1])
 
 
 def stacks(aligned: np.ndarray, snr: np.ndarray, part: np.ndarray, parts: int) -> np.ndarray:
@@ -110,14 +110,14 @@ def templates_of(stars: BrightStars, held_out: np.ndarray, bins: int) -> np.ndar
     """
     part = bins_of(stars.position, bins)
     training = stars.of(~held_out)
-    return stacks(training.aligned(), training.snr, part[~held_out], bins**2)[part]
+    return np.asarray(stacks(training.aligned(), training.snr, part[~held_out], bins**2)[part])
 
 
 def single_psf(stars: BrightStars, held_out: np.ndarray) -> np.ndarray:
     """The stack of all training stars, (s, s), centre at index (s//2, s//2)."""
     training = stars.of(~held_out)
     everyone = np.zeros(len(training), dtype=int)
-    return stacks(training.aligned(), training.snr, everyone, 1)[0]
+    return np.asarray(stacks(training.aligned(), training.snr, everyone, 1)[0])
 
 
 def make_images(

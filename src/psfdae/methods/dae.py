@@ -22,7 +22,7 @@ from psfdae.method import (
 )
 from psfdae.networks.settings import DaeSettings, Train
 from psfdae.reading import from_tree, read_yaml
-from psfdae.settings import deciding
+from psfdae.settings import Config, deciding
 
 if TYPE_CHECKING:
     from psfdae.bundle_info import BundleInfo
@@ -75,7 +75,7 @@ class Dae(Method):
         self.diagnosed = {HISTORY: history or []}
 
     @classmethod
-    def continues(cls, config: Any) -> bool:
+    def continues(cls, config: Config) -> bool:
         """Whether a training on templates goes on from one on the realisations."""
         return bool(config.train.continued_epochs)
 
@@ -90,11 +90,10 @@ class Dae(Method):
         FitError
             If it is to go on from a network of another shape or scale of images.
         """
-        import torch
-
         from psfdae.networks.dae import Dae as Network
         from psfdae.networks.dae import train_dae
         from psfdae.networks.training import fingerprint, progress
+        from psfdae.networks.weights import channels_last
 
         described = {"dae": deciding(dae), "train": deciding(train), "seed": data.seed}
         described["noise"] = [data.levels.tolist(), data.noise.kappa, data.noise.background]
@@ -117,8 +116,9 @@ class Dae(Method):
             done = train_dae(data, dae, train, data.seed, data.checkpoint, seen, report)
         network = Network(dae.kernels, dae.widths)
         network.load_state_dict(done.result)
-        network = network.to(memory_format=torch.channels_last).eval()
-        return cls(network, dae.scale, attempt=done.attempt, history=done.history)
+        return cls(
+            channels_last(network).eval(), dae.scale, attempt=done.attempt, history=done.history
+        )
 
     def predict(self, noisy: np.ndarray) -> np.ndarray:
         """PSFs, neither clipped nor renormalised, float32."""
@@ -178,13 +178,13 @@ class Dae(Method):
         import torch
 
         from psfdae.networks.dae import Dae as Network
+        from psfdae.networks.weights import channels_last
 
         assert info.dae is not None and info.image_scale is not None
         network = Network(info.dae.kernels, info.dae.widths)
         network.load_state_dict({k: torch.from_numpy(v.copy()) for k, v in arrays.items()})
-        network = network.to(memory_format=torch.channels_last).eval()
         batch = max(1, BLOCK_VALUES // (max(info.dae.widths) * info.stamp_px**2))
-        return cls(network, float(info.image_scale), batch)
+        return cls(channels_last(network).eval(), float(info.image_scale), batch)
 
     def export(self, stamp_px: int, path: Path) -> None:
         """Write the network as ONNX and check it against torch; raises ExportError."""

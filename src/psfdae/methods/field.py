@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from psfdae.bright_stars import BrightStars
 from psfdae.field_law import MARGIN_PX, Asked, FieldLaw, FieldSettings, parts_of, phases_of
@@ -80,9 +81,8 @@ class FieldMixture(FieldLaw, Method):
         if data.bright is None:
             raise FitError("it learns from the bright stars of an image: psfdae from-stars")
         bright, side = data.bright.of(np.unique(data.star[data.train])), data.images.shape[-1]
-        sizes = (side + 2 * MARGIN_PX, side)
-        splines = (field.orders, field.spacing_px, field.smoothness)
-        fit = fit_field(bright, data.noise.background, *sizes, *splines)
+        sizes, splines = (side + 2 * MARGIN_PX, side), (field.spacing_px, field.smoothness)
+        fit = fit_field(bright, data.noise.background, *sizes, field.orders, *splines)
         used = bright.of(fit.good)
         terms = fit.model.terms(used.position)
         offset, modes, diagonal = _residuals(fit, used.noise / fit.flux[fit.good], field)
@@ -130,10 +130,10 @@ class FieldMixture(FieldLaw, Method):
         Settings that this release does not know change no number of a fit that is done.
         """
         noise = NoiseModel(config["noise"]["kappa"], config["noise"]["background_photons"])
-        same = {"modes": arrays["modes"].astype(np.float32)}
+        named: dict[str, Any] = {**arrays, "modes": arrays["modes"].astype(np.float32)}
         known = {k: v for k, v in config["field"].items() if k in FieldSettings.model_fields}
         settings = FieldSettings.model_validate(known)
-        return cls(**{**arrays, **same}, noise=noise, settings=settings)
+        return cls(**named, noise=noise, settings=settings)
 
     def pack(self, stamp_px: int, noise: float) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Arrays for a bundle: of large stamps fewer modes, the others join the diagonal."""
@@ -146,7 +146,7 @@ class FieldMixture(FieldLaw, Method):
         arrays["listed"] = self.listed if np.isfinite(self.listed).all() else np.empty((0, 2))
         return arrays, said
 
-    def conditions(self) -> Iterator[tuple[str, str, Any]]:
+    def conditions(self) -> Iterator[tuple[str, str, ArrayLike]]:
         """Conditions that any fit fulfils: a mean star of the sum 1, residuals smaller than it."""
         terms, spread = len(self.coefficients), self.spread
         usual = self.model.images(self.usual[None], np.zeros((1, 2)), self.side)
@@ -176,11 +176,11 @@ class FieldMixture(FieldLaw, Method):
         phase = (position - np.floor(position + 0.5))[:, ::-1]
         images = self.model.images(terms, phase + self._list_offset, self.side, oversampling)
         whole = self.model.images(terms, np.broadcast_to(self._list_offset, phase.shape), self.side)
-        return images / whole.sum(axis=(1, 2), keepdims=True)
+        return np.asarray(images / whole.sum(axis=(1, 2), keepdims=True))
 
     def facts(self) -> dict[str, str]:
         """The polynomial of the field."""
-        order = self.model.order
+        order = self.order
         changes = f"changes over the image by a polynomial of order {order}"
         same = "is the same everywhere (order 0: more is not supported by stars left out)"
         return {"Field": f"the PSF {changes if order else same}"}

@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self, TypeVar
 
 import numpy as np
 from pydantic import Field
@@ -32,6 +32,8 @@ from psfdae.rng import stream
 from psfdae.settings import Count, Group, Positive
 
 if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
     from psfdae.bundle_info import BundleInfo
 
 STARS_AT_ONCE = 4096
@@ -43,6 +45,8 @@ LEAST_GAIN = 0.02
 MOST_CAREFUL = 512
 """Clusters that k-means++ begins. Of more, it takes ten times as long as a random beginning,
 and errs as much."""
+
+Number = TypeVar("Number", bound=float)
 
 NEARLY_LEAST = 1.05
 """Times the least error, below which a search without positions may find a smaller one."""
@@ -98,7 +102,7 @@ class GaussianMixture(MixtureLaw, Method):
         },
         per_reference=True,
     )
-    packing = Packing(together=8192, padded=False, parallel=False)
+    packing: ClassVar[Packing | None] = Packing(together=8192, padded=False, parallel=False)
     groups: ClassVar = {"gmm": Gmm}
 
     @classmethod
@@ -144,7 +148,7 @@ class GaussianMixture(MixtureLaw, Method):
         truth, where = data.references[judge], cls._positions_of(data, judge)
 
         @cache
-        def clustered(k: int, positions: bool) -> Self:
+        def clustered(k: int, positions: bool) -> GaussianMixture:
             return cls._clustered(data, learn, k, gmm, positions)
 
         @cache
@@ -174,8 +178,10 @@ class GaussianMixture(MixtureLaw, Method):
             if error(k, nu, False) < NEARLY_LEAST * least:
                 best = min(best, search(k, nu, False))
         _, k, positions, nu = best
-        tried = [("K", k, [max(sizes)] if k > 1 else [], sizes)]
-        tried += [("ν", nu, [min(gmm.shrinkage), max(gmm.shrinkage)], gmm.shrinkage)]
+        tried: list[tuple[str, float, Sequence[float], Sequence[float]]] = [
+            ("K", k, [max(sizes)] if k > 1 else [], sizes),
+            ("ν", nu, [min(gmm.shrinkage), max(gmm.shrinkage)], gmm.shrinkage),
+        ]
         last = [f"{n} = {v:g}" for n, v, ends, all_ in tried if v in ends and len(all_) > 1]
         print(
             f"{cls.look.label}: K = {k} clusters, ν = {nu:g}"
@@ -257,8 +263,8 @@ class GaussianMixture(MixtureLaw, Method):
     ) -> Self:
         """A fit from its arrays; the noise is that of the configuration."""
         noise = NoiseModel(config["noise"]["kappa"], config["noise"]["background_photons"])
-        rows = arrays["deviation"].astype(np.float32)
-        return cls(**{**arrays, "deviation": rows}, noise=noise)
+        named: dict[str, Any] = {**arrays, "deviation": arrays["deviation"].astype(np.float32)}
+        return cls(**named, noise=noise)
 
     def pack(self, stamp_px: int, noise: float) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Arrays for a bundle; where the references are the images, clusters by their main axes.
@@ -283,7 +289,7 @@ class GaussianMixture(MixtureLaw, Method):
         pixels = info.stamp_px**2
         return dict.fromkeys(cls.stored()) | {"axes": (pixels, pixels), "variance": (pixels,)}
 
-    def conditions(self) -> Iterator[tuple[str, str, Any]]:
+    def conditions(self) -> Iterator[tuple[str, str, ArrayLike]]:
         """Conditions that any fit fulfils: images of the sum 1, without large negative pixels."""
         total, power = self.axes.sum(axis=0), np.square(self.deviation, dtype=np.float64).sum()
         some = stream(0, "gmm", "axes").standard_normal((len(self.axes), 4))
@@ -309,7 +315,7 @@ class GaussianMixture(MixtureLaw, Method):
         usual = np.log(2 * np.pi * (some._total + s[:, None])).sum(axis=1)
         evidence = some._estimate(noisy, level, None, sure=False, near=near)[0].evidence
         assert evidence is not None
-        return -2.0 * evidence - usual
+        return np.asarray(-2.0 * evidence - usual)
 
     def free_flux(self) -> Self:
         """The law of images whose flux and sky are estimates."""
@@ -361,7 +367,7 @@ def _less(x: np.ndarray, noise: np.ndarray) -> np.ndarray:
 def _standard(p: np.ndarray) -> np.ndarray:
     """Columns of zero mean and unit variance; one that does not vary is 0."""
     spread = p.std(axis=0)
-    return (p - p.mean(axis=0)) / np.where(spread > 0, spread, 1.0)
+    return np.asarray((p - p.mean(axis=0)) / np.where(spread > 0, spread, 1.0))
 
 
 def _whitening(p: np.ndarray) -> np.ndarray:
@@ -375,8 +381,8 @@ def _whitening(p: np.ndarray) -> np.ndarray:
 
 
 def climbed(
-    values: Sequence[float], start: float, error: Callable[[float], float], pays: float = 0.0
-) -> Any:
+    values: Sequence[Number], start: Number, error: Callable[[Number], float], pays: float = 0.0
+) -> Number:
     """Where steps from one of some values, up or else down, no longer lower the error.
 
     A step up must lower it by more than the part `pays`.

@@ -61,4 +61,4 @@ class LinearMmse(Method):
         system = self.cov_xx + np.diag(variance)
         gain = np.linalg.solve(system, self.cov_yx.T).T
         residual = noisy.reshape(len(noisy), -1) - self.mean_x
-        return (self.mean_y + residual @ gain.T).reshape(noisy.shape)
+        return np.asarray((self.mean_y + residual @ gain.T).reshape(noisy.shape))

@@ -168,7 +168,7 @@ def at_noise(noise: np.ndarray, nodes: np.ndarray, maps: np.ndarray) -> np.ndarr
     lower = np.where(np.isfinite(place), np.minimum(place, len(nodes) - 1), 0).astype(np.intp)
     upper = np.minimum(lower + 1, len(nodes) - 1)
     share = (place - lower).astype(maps.dtype)[:, None, None]
-    return maps[lower] * (1 - share) + maps[upper] * share
+    return np.asarray(maps[lower] * (1 - share) + maps[upper] * share)
 
 
 def brightest(psf: np.ndarray) -> np.ndarray:
@@ -205,7 +205,7 @@ def mahalanobis(
     centred = stamps.reshape(len(stamps), -1) - model.mean
     scores = centred @ model.basis[:, -components:]
     variance = model.variance[-components:] + np.asarray(noise, dtype=np.float64)[:, None] ** 2
-    return np.sqrt((scores**2 / variance).sum(axis=1))
+    return np.asarray(np.sqrt((scores**2 / variance).sum(axis=1)))
 
 
 # Writing.
@@ -299,6 +299,7 @@ def read_bundle(path: Path | None = None) -> Bundle:
     except RecursionError:
         raise BundleError(f"{path}: damaged (its description is nested too deeply)") from None
     _check(info, tensors, path)
+    optional: dict[str, Any] = {name: tensors.get(name) for name in OPTIONAL}
     return Bundle(
         info=info,
         weights={
@@ -309,7 +310,7 @@ def read_bundle(path: Path | None = None) -> Bundle:
         flux_model=_completed(tensors),
         **{name: tensors[name] for name in ("noise_nodes", "error68", "rms", "ratio95")},
         distance_limit=float(tensors["distance_limit"]),
-        **{name: tensors.get(name) for name in OPTIONAL},
+        **optional,
     )
 
 

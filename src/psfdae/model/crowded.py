@@ -18,6 +18,7 @@ least squares.
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -286,7 +287,8 @@ def outer_light(model: FieldPsfs, place: np.ndarray) -> np.ndarray:
     ring = np.hypot(axis[:, None], axis)
     ring = (ring >= OUTER * side / 2) & (ring < side / 2)
     parts = [place[a : a + PSFS_AT_ONCE] for a in range(0, len(place), PSFS_AT_ONCE)]
-    return np.concatenate([model.psf_at(*np.rint(p).T, 1)[:, ring].sum(axis=1) for p in parts])
+    psfs = (model.psf_at(x, y, 1) for x, y in (np.rint(part).T for part in parts))
+    return np.concatenate([some[:, ring].sum(axis=1) for some in psfs])
 
 
 def tents(r: np.ndarray, radius_px: np.ndarray) -> np.ndarray:
@@ -294,12 +296,12 @@ def tents(r: np.ndarray, radius_px: np.ndarray) -> np.ndarray:
     tops = np.log(radius_px)
     inside = np.maximum(r, radius_px[0])
     off = np.abs(np.log(inside) - tops[:-1].reshape(-1, *[1] * r.ndim)) / (tops[1] - tops[0])
-    return np.maximum(1.0 - off, 0.0) * (inside / radius_px[0]) ** -STEEPNESS
+    return np.asarray(np.maximum(1.0 - off, 0.0) * (inside / radius_px[0]) ** -STEEPNESS)
 
 
 def _tented(
     shape: tuple[int, ...], place: np.ndarray, flux: np.ndarray, outer: np.ndarray, wings: Wings
-):  # type: ignore[no-untyped-def]
+) -> Iterator[tuple[slice, np.ndarray]]:
     """Bands of rows, and Σ F s h_k of the stars in them, shape (K, rows, w)."""
     reach, radius = int(wings.radius_px[-1]), wings.radius_px
     light = flux * np.clip(outer / wings.outer, *OUTER_RANGE)
@@ -350,7 +352,7 @@ def wings_of(
         design = np.concatenate([tented, np.ones((1, *weight.shape))]) * weight
         flat, seen = design.reshape(TENTS + 1, -1), (left[band] * weight).ravel()
         normal, right = normal + flat @ flat.T, right + flat @ seen
-        square, count = square + float(seen @ seen), count + np.count_nonzero(weight)
+        square, count = square + float(seen @ seen), count + int(np.count_nonzero(weight))
     unit = np.sqrt(normal.diagonal())
     if not (unit > 0).all():
         return None

@@ -9,6 +9,7 @@ grid. In all of them, as in psfdae, a value is what a whole pixel there would ge
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NoReturn
@@ -17,7 +18,7 @@ import numpy as np
 
 from psfdae.files import atomic_path, write_fits
 from psfdae.image.errors import ascii_line, reading
-from psfdae.image.fits_file import BLOCK_BYTES, open_hdus, plain_file
+from psfdae.image.fits_file import BLOCK_BYTES, Card, open_hdus, plain_file
 from psfdae.model.field_psfs import FieldPsfs, PredictionError
 from psfdae.model.psf_model import load_model
 from psfdae.moments import measure_shapes
@@ -82,7 +83,7 @@ class PsfexField(FieldPsfs):
     def _refuse(self, why: str) -> NoReturn:
         raise PredictionError(f"{self.path}: {why}")
 
-    def _read(self, header: Any, mask: np.ndarray) -> None:
+    def _read(self, header: Mapping[str, Any], mask: np.ndarray) -> None:
         axes = int(header["POLNAXIS"])
         names = [str(header[f"POLNAME{i + 1}"]).strip() for i in range(axes)]
         at_place = len(names) == 2 and all(
@@ -91,7 +92,7 @@ class PsfexField(FieldPsfs):
         )
         if names and not (at_place and int(header["POLNGRP"]) == 1):
             self._refuse(f"changes with {', '.join(names)}; expected X_IMAGE and Y_IMAGE")
-        self.order = int(header["POLDEG1"]) if names else 0
+        self._order = order = int(header["POLDEG1"]) if names else 0
         self.step = float(header["PSF_SAMP"])
         zero, width = np.full(2, 0.0), np.full(2, NO_WIDTH)
         if names:
@@ -100,10 +101,11 @@ class PsfexField(FieldPsfs):
                 for key in ("POLZERO", "POLSCAL")
             )
         mask = mask.reshape(-1, *mask.shape[-2:])
-        self.terms = np.array(psfex_powers(self.order)) if self.order <= HIGHEST_ORDER else []
+        powers = psfex_powers(order) if order <= HIGHEST_ORDER else []
+        self.terms: np.ndarray = np.array(powers)
         side = min(mask.shape[-2:])
         usable = (
-            0 <= self.order <= HIGHEST_ORDER
+            0 <= order <= HIGHEST_ORDER
             and len(self.terms) == len(mask)
             and 1 < side <= max(mask.shape[-2:]) <= LARGEST_PSF
             and 0.01 < self.step <= 10
@@ -116,6 +118,10 @@ class PsfexField(FieldPsfs):
             self._refuse("its polynomial, sampling, scales or pixels are out of range")
         self.basis, self.stamp_px = mask, 2 * max(1, int(side * self.step / 2))
         self.zero, self.width = zero - 1.0, width
+
+    @property
+    def order(self) -> int:
+        return self._order
 
     @cached_property
     def sha256(self) -> str:
@@ -137,7 +143,7 @@ class PsfexField(FieldPsfs):
         axis = (np.arange(count) - oversampling * (self.stamp_px // 2)) / oversampling
         whole = np.arange(self.stamp_px) - self.stamp_px // 2  # of a star in the middle
         inside = self._interpolated(sampled, whole, np.zeros_like(phase)).sum(axis=(1, 2))
-        return self._interpolated(sampled, axis, phase) / inside[:, None, None]
+        return np.asarray(self._interpolated(sampled, axis, phase) / inside[:, None, None])
 
     def _interpolated(self, sampled: np.ndarray, axis: np.ndarray, phase: np.ndarray) -> np.ndarray:
         """Images (n, m, m) on an axis (m,) of samples (n, h, w), moved by phases (n, 2), x, y."""
@@ -197,7 +203,8 @@ def write_psfex(path: Path, model: FieldPsfs, oversampling: int) -> float:
     powers = psfex_powers(order)
     u, v = ((places - zero) / width).T
     terms = np.stack([u**i * v**j for i, j in powers], axis=1)
-    psfs = model.psf_at(*places.T, oversampling)
+    x, y = places.T
+    psfs = model.psf_at(x, y, oversampling)
     basis = np.tensordot(np.linalg.pinv(terms), psfs, 1)
     off = float(np.abs(np.tensordot(terms, basis, 1) - psfs).max() / psfs.max())
     size = basis.shape[-1]
@@ -213,7 +220,7 @@ def write_psfex(path: Path, model: FieldPsfs, oversampling: int) -> float:
         name="PSF_DATA",
     )
     stars = {"LOADED": 0, "ACCEPTED": 0, "CHI2": 1.0}
-    said: dict[str, Any] = {**stars, "POLNAXIS": 2}
+    said: dict[str, str | float] = {**stars, "POLNAXIS": 2}
     for i, axis in enumerate("XY"):
         said[f"POLGRP{i + 1}"] = 1
         said[f"POLNAME{i + 1}"] = f"{axis}_IMAGE"
@@ -246,7 +253,7 @@ def write_stdpsf(path: Path, model: FieldPsfs, columns: int, rows: int) -> None:
             "for a detector of STScI; expected another number of them"
         )
     places = np.rint(model.grid(columns, rows))
-    cards: list[tuple[str, Any, str]] = [("NXPSFS", columns, ""), ("NYPSFS", rows, "")]
+    cards: list[Card] = [("NXPSFS", columns, ""), ("NYPSFS", rows, "")]
     along = places.reshape(rows, columns, 2)
     cards += [(f"IPSFX{i + 1:02d}", int(x) + 1, "x, 1-based") for i, x in enumerate(along[0, :, 0])]
     cards += [(f"JPSFY{j + 1:02d}", int(y) + 1, "y, 1-based") for j, y in enumerate(along[:, 0, 1])]
@@ -255,7 +262,7 @@ def write_stdpsf(path: Path, model: FieldPsfs, columns: int, rows: int) -> None:
 
 def write_grid(path: Path, model: FieldPsfs, places: np.ndarray, oversampling: int) -> None:
     """A cube of PSFs (n, m, m) at places (n, 2), x and y, as STPSF's `psf_grid` lays it out."""
-    cards: list[tuple[str, Any, str]] = [
+    cards: list[Card] = [
         ("OVERSAMP", oversampling, "values per pixel and axis"),
         # photutils 3.0 takes every key with these letters, in any case, for a place, and would
         # exchange x and y without a word: now it stops at this one. Others look for capitals.
@@ -272,7 +279,7 @@ def _write_cube(
     model: FieldPsfs,
     places: np.ndarray,
     oversampling: int,
-    cards: list[tuple[str, Any, str]],
+    cards: list[Card],
 ) -> None:
     from astropy.io import fits
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,6 +18,14 @@ if TYPE_CHECKING:
 MOST_OVERSAMPLED = 32  # values per pixel and axis
 
 
+class _Array(Protocol):
+    def __array__(self) -> np.ndarray: ...
+
+
+Numbers: TypeAlias = float | Sequence[float] | _Array
+"""One number or several; `ArrayLike` would be texts, too."""
+
+
 class PredictionError(Error, ValueError):
     """Stars or places that a model cannot be applied to; one line with what it takes instead."""
 
@@ -26,21 +35,29 @@ class FieldPsfs(ABC):
 
     Attributes
     ----------
-    name, sha256 : str
-        What the model is called, and its checksum.
+    name : str
+        What the model is called.
     stamp_px : int
         Side d of the stamps in which PSFs have the sum 1, even.
-    order : int
-        Of the polynomial by which the PSF changes over the field; raises as `psf_at`.
-    image_px : (int, int) or None
-        Columns and rows of the image that the model is of, if known.
     """
 
     name: str
-    sha256: str
     stamp_px: int
-    order: int
-    image_px: tuple[int, int] | None
+
+    @property
+    @abstractmethod
+    def sha256(self) -> str:
+        """Checksum of the model."""
+
+    @property
+    @abstractmethod
+    def order(self) -> int:
+        """Of the polynomial by which the PSF changes over the field; raises as `psf_at`."""
+
+    @property
+    @abstractmethod
+    def image_px(self) -> tuple[int, int] | None:
+        """Columns and rows of the image that the model is of, if known."""
 
     @abstractmethod
     def field_range(self) -> tuple[np.ndarray, np.ndarray]:
@@ -54,7 +71,7 @@ class FieldPsfs(ABC):
     def _drawn(self, place: np.ndarray, oversampling: int) -> np.ndarray:
         """PSFs (n, m, m) as `psf_at`, at checked places (n, 2)."""
 
-    def psf_at(self, x: ArrayLike, y: ArrayLike, oversampling: int = 4) -> np.ndarray:
+    def psf_at(self, x: Numbers, y: Numbers, oversampling: int = 4) -> np.ndarray:
         """PSFs at places of the image of the training, where no star need be.
 
         Parameters
@@ -104,8 +121,8 @@ class FieldPsfs(ABC):
 
     def fwhm_px(self) -> float:
         """FWHM of the PSF in the middle of the field; raises as `psf_at`."""
-        middle = np.rint(np.mean(self.field_range(), axis=0))
-        return float(measure_shapes(self.psf_at(*middle[:, None], 1)).fwhm_px[0])
+        x, y = np.rint(np.mean(self.field_range(), axis=0))[:, None]
+        return float(measure_shapes(self.psf_at(x, y, 1)).fwhm_px[0])
 
     def to_photutils(self, nodes: int = 9, oversampling: int = 4) -> GriddedPSFModel:
         """The field as photutils' `GriddedPSFModel`, such as `PSFPhotometry` takes.

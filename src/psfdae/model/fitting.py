@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -28,6 +28,8 @@ from psfdae.rng import stream
 from psfdae.settings import ConfigError
 from psfdae.threads import fixed_threads
 
+Kind = TypeVar("Kind", bound=Method)
+
 
 def fit(
     stars: Stars,
@@ -35,7 +37,7 @@ def fit(
     *,
     name: str | None = None,
     licence: str = "not stated",
-    **settings: Any,
+    **settings: object,
 ) -> PsfModel:
     """Train a model on the bright stars of an image, without those that are held out.
 
@@ -90,7 +92,7 @@ def model_method(name: str) -> type[Method]:
     return method_of(name)
 
 
-def fitted_to(stars: Stars, kind: type[Method], checkpoint: Path | None = None) -> Method:
+def fitted_to(stars: Stars, kind: type[Kind], checkpoint: Path | None = None) -> Kind:
     """A fit of a method to the stars that are not held out.
 
     A long one keeps its state in the file `checkpoint`, if one is given.
@@ -99,8 +101,7 @@ def fitted_to(stars: Stars, kind: type[Method], checkpoint: Path | None = None) 
         stars.settings, kind, stars.product, SPLIT, REFERENCE, checkpoint=checkpoint
     )
     with fixed_threads(kind.threads(stars.settings)), needed_by(f"the method {kind.name}"):
-        fitted: Method = kind.fit(data, **kind.settings(stars.settings))
-    return fitted
+        return kind.fit(data, **kind.settings(stars.settings))
 
 
 def described(stars: Stars, kind: type[Method]) -> dict[str, Any]:

@@ -10,13 +10,13 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 
 from psfdae.errors import Error
 from psfdae.image.observation import cut_image
-from psfdae.method import Method
-from psfdae.methods import method
+from psfdae.methods.field import FieldMixture
 from psfdae.model import crowded
 from psfdae.model.field_psfs import FieldPsfs
 from psfdae.model.fitting import fitted_to
@@ -31,10 +31,16 @@ class _Field(FieldPsfs):
 
     name, image_px = "of stars without neighbours", None
 
-    def __init__(self, fitted: Method, stamp_px: int) -> None:
+    def __init__(self, fitted: FieldMixture, stamp_px: int) -> None:
         self.fitted, self.stamp_px = fitted, stamp_px
-        self.order = fitted.model.order
-        self.sha256 = hashlib.sha256(fitted.coefficients.tobytes()).hexdigest()
+
+    @property
+    def order(self) -> int:
+        return self.fitted.order
+
+    @cached_property
+    def sha256(self) -> str:
+        return hashlib.sha256(self.fitted.coefficients.tobytes()).hexdigest()
 
     def field_range(self) -> tuple[np.ndarray, np.ndarray]:
         return self.fitted.low, self.fitted.high
@@ -43,7 +49,7 @@ class _Field(FieldPsfs):
         """It is of the image that it is applied to."""
 
     def _drawn(self, place: np.ndarray, oversampling: int) -> np.ndarray:
-        return np.asarray(self.fitted.psf_at(place, oversampling))
+        return self.fitted.psf_at(place, oversampling)
 
 
 def without_neighbours(stars: Stars) -> Stars:
@@ -51,9 +57,9 @@ def without_neighbours(stars: Stars) -> Stars:
 
     What they were is what comes back if their image cannot be fitted, with a note that says why.
     """
-    kind = method("field")
-    field = _Field(fitted_to(stars, kind), stars.settings.framing.stamp_px)
+    field = _Field(fitted_to(stars, FieldMixture), stars.settings.framing.stamp_px)
     observation = stars.observation
+    assert observation.positions is not None
     try:
         found = crowded.photometry(field, observation, DETECTED_SIGMA)
         fwhm = field.fwhm_px()

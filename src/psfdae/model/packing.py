@@ -27,7 +27,6 @@ from psfdae.bundle_info import BundleInfo
 from psfdae.files import Product, ProductError
 from psfdae.method import Estimate, FindsFlux, MeasuresStars, Method, ScoresOutliers, with_free_flux
 from psfdae.model.bundle import (
-    SCALES,
     Bundle,
     BundleError,
     at_noise,
@@ -48,6 +47,7 @@ from psfdae.model.star_sets import (
 )
 from psfdae.noise import NoiseModel
 from psfdae.rng import stream
+from psfdae.settings import OfTest
 from psfdae.version import __version__
 
 NODES = 8  # noise levels at which errors are measured, equidistant in the logarithm
@@ -56,7 +56,7 @@ COVERAGE = 0.6827  # part of the errors within ± `error68`; of a normal variabl
 WIDE = 0.95  # part of them within ± `error68` times `ratio95`
 LEAST_SIGMA = 1e-12  # of the flux; equal stars leave a method no doubt
 # What is known of stars: their flux and sky, their sky, or neither.
-CASES = ({"flux": 1.0, "background": 0.0}, {"background": 0.0}, {})
+CASES: tuple[dict[str, float], ...] = ({"flux": 1.0, "background": 0.0}, {"background": 0.0}, {})
 NORMAL_WIDE = 1.96  # σ within which a normal variable has as much
 LIMIT = 0.999  # part of the test stars within the limit of the Mahalanobis distance
 STEPS = 64  # of the noise up to that of the flux in every pixel, of a model that is to be small
@@ -108,7 +108,7 @@ class Errors:
 
     def rms(self) -> np.ndarray:
         """Root mean square per pixel, shape (S, d, d)."""
-        return np.sqrt(np.stack([np.square(node).mean(axis=0) for node in self.error]))
+        return np.asarray(np.sqrt(np.stack([np.square(node).mean(axis=0) for node in self.error])))
 
     def strange_limit(self) -> np.ndarray | None:
         """What 0.1 % of the stars exceed at every node, shape (S,).
@@ -131,7 +131,7 @@ def bundle_of(
     fitted: Method,
     stars: Product,
     reference: str,
-    config: Any,
+    config: OfTest,
     trained: Mapping[str, Any],
     name: str,
     licence: str,
@@ -317,7 +317,9 @@ def measure_errors(
 def errors_of(estimate: Estimate, references: np.ndarray) -> np.ndarray:
     """PSFs minus references (n, d, d), in units of σ if the method says it, else of the flux."""
     error = estimate.psf - references
-    return error if estimate.sigma is None else error / np.maximum(estimate.sigma, LEAST_SIGMA)
+    return np.asarray(
+        error if estimate.sigma is None else error / np.maximum(estimate.sigma, LEAST_SIGMA)
+    )
 
 
 def calibrated(
@@ -332,7 +334,10 @@ def calibrated(
         distance_limit=errors.distance_limit(),
         ratio95=errors.ratio95(),
         strange_limit=errors.strange_limit(),
-        **dict.fromkeys((*SCALES, "widening")),
+        scale68=None,
+        scale95=None,
+        flux_error_scale=None,
+        widening=None,
     )
     return with_scales(found, stars, rng), errors
 
@@ -379,9 +384,11 @@ def with_scales(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -
     for index in np.ndindex(width.shape[:-1]):
         _, *case, _ = index
         width[index] = np.interp(nodes, noise[tuple(case)], width[index])
+    scale68, scale95 = np.moveaxis(width, -1, 1)
     return replace(
         bundle,
-        **dict(zip(("scale68", "scale95"), np.moveaxis(width, -1, 1), strict=True)),
+        scale68=scale68,
+        scale95=scale95,
         flux_error_scale=np.interp(nodes, noise[1, -1], of_flux),
     )
 

@@ -88,7 +88,7 @@ class FluxModel:
     @property
     def whole(self) -> bool:
         """The basis leaves no direction out."""
-        return self.basis.shape[1] >= self.mean.size
+        return bool(self.basis.shape[1] >= self.mean.size)
 
     @classmethod
     def fit(cls, images: np.ndarray) -> FluxModel:
@@ -196,9 +196,9 @@ def robust_flux(images: np.ndarray, model: FluxModel) -> FluxEstimate:
     raise_flag(flags, StarFlag.OUTLIER, possible & (kept < usable_pixel).any(axis=1))
     raise_flag(flags, StarFlag.FAINT, usable & (flux < FAINT_SNR * error))
     raise_flag(flags, StarFlag.NO_FLUX, ~usable)
-    found = (np.where(fitted, values * unit, np.nan) for values in (flux, error, sigma))
+    flux, error, sigma = (np.where(fitted, v * unit, np.nan) for v in (flux, error, sigma))
     repaired = np.where(fitted[:, None], repaired * unit[:, None], 0.0)
-    return FluxEstimate(*found, flags, repaired.reshape(images.shape))
+    return FluxEstimate(flux, error, sigma, flags, repaired.reshape(images.shape))
 
 
 def _robust_fit(
@@ -485,7 +485,7 @@ class Photometer:
         residual = ring / sigma2[:, None] + pull @ self._ring_basis
         lost = np.where(sky_known, 0.0, 1.0 / self.pixels)
         precision = beyond @ self._ring_basis**2 + ((1.0 - lost) / sigma2)[:, None]
-        return residual / np.sqrt(precision)
+        return np.asarray(residual / np.sqrt(precision))
 
     def _normalise(self, x: np.ndarray, fit: _Fit) -> tuple[np.ndarray, np.ndarray]:
         """Images of flux 1, and which of them stay in the range of the training set."""

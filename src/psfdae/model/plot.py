@@ -13,6 +13,7 @@ from psfdae.image.stamps import StarFlag
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure
 
 CELLS = 9  # stamps along the longer side of the field
@@ -114,7 +115,9 @@ def psf_map(psf: np.ndarray, stars: FieldStars, title: str) -> Figure:
     return figure
 
 
-def _whiskers(axes: Axes, stars: FieldStars, drawn: np.ndarray, cell: float) -> Any:
+def _whiskers(
+    axes: Axes, stars: FieldStars, drawn: np.ndarray, cell: float
+) -> LineCollection | None:
     """Lines along the major axes; a key tells the length of ellipticity 0.2."""
     from matplotlib.collections import LineCollection
 
@@ -128,7 +131,7 @@ def _whiskers(axes: Axes, stars: FieldStars, drawn: np.ndarray, cell: float) -> 
     middle = np.stack([stars.x[drawn], stars.y[drawn]], axis=1)
     size = stars.fwhm_px[drawn]
     lines = LineCollection(
-        np.stack([middle - step, middle + step], axis=1), cmap="viridis", linewidths=1.3
+        list(np.stack([middle - step, middle + step], axis=1)), cmap="viridis", linewidths=1.3
     )
     lines.set_array(size)
     lines.set_clim(*np.percentile(size, [2, 98]))

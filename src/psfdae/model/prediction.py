@@ -19,7 +19,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from itertools import combinations
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, Self
+from typing import IO, TYPE_CHECKING, Self
 
 import numpy as np
 
@@ -30,6 +30,8 @@ from psfdae.image.stamps import MEANING, Stamps
 from psfdae.version import __version__
 
 if TYPE_CHECKING:
+    from astropy.io.fits import Header
+
     from psfdae.model.bundle import Bundle
 
 
@@ -203,7 +205,7 @@ OF_STAMPS = ("id", "x", "y")  # columns that the stamps bring along
 class PredictionFile:
     """A file that is open and as long as it will be; `prediction_file` makes it."""
 
-    def __init__(self, file: IO[bytes], primary: Any, example: Stamps, count: int, side: int):
+    def __init__(self, file: IO[bytes], primary: Header, example: Stamps, count: int, side: int):
         self._file = file
         width = max(example.id.dtype.itemsize // 4, 1)
         id_is_text = example.id.dtype.kind == "U"
@@ -222,7 +224,7 @@ class PredictionFile:
         self._append("stars", header, count * self._row.itemsize)
         file.truncate(file.tell())
 
-    def _append(self, name: str, header: Any, size: int) -> None:
+    def _append(self, name: str, header: Header, size: int) -> None:
         """Write the header of a data unit, remember where it starts, and go to its end."""
         self._file.write(_text(header))
         self._offset[name] = self._file.tell()
@@ -263,7 +265,7 @@ def as_ascii(text: np.ndarray) -> np.ndarray:
     return np.array([name.encode("ascii", "replace") for name in text.tolist()], dtype=bytes)
 
 
-def _primary_header(bundle: Bundle, cards: Sequence[Card], history: str) -> Any:
+def _primary_header(bundle: Bundle, cards: Sequence[Card], history: str) -> Header:
     from astropy.io import fits
 
     info, header = bundle.info, fits.PrimaryHDU().header
@@ -292,7 +294,7 @@ def _primary_header(bundle: Bundle, cards: Sequence[Card], history: str) -> Any:
     return header
 
 
-def _cube_header(name: str, about: str, count: int, stamp_px: int) -> Any:
+def _cube_header(name: str, about: str, count: int, stamp_px: int) -> Header:
     from astropy.io import fits
 
     header = fits.ImageHDU(np.zeros((1, stamp_px, stamp_px), np.float32), name=name).header
@@ -303,7 +305,7 @@ def _cube_header(name: str, about: str, count: int, stamp_px: int) -> Any:
     return header
 
 
-def _table_header(id_format: str, count: int) -> Any:
+def _table_header(id_format: str, count: int) -> Header:
     from astropy.io import fits
 
     columns = [fits.Column("id", id_format)]
@@ -318,7 +320,7 @@ def _table_header(id_format: str, count: int) -> Any:
     return header
 
 
-def _text(header: Any) -> bytes:
+def _text(header: Header) -> bytes:
     """A header as it stands in the file."""
     encoded: bytes = header.tostring().encode("ascii")
     return encoded

@@ -9,7 +9,7 @@ from dataclasses import fields, replace
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,7 +25,14 @@ from psfdae.image.stamps import (
     displacement,
     raise_flag,
 )
-from psfdae.method import FindsFlux, KnowsField, MeasuresStars, Packing, with_free_flux
+from psfdae.method import (
+    FindsFlux,
+    KnowsField,
+    MeasuresStars,
+    Packing,
+    ScoresOutliers,
+    with_free_flux,
+)
 from psfdae.model.bundle import (
     Bundle,
     at_noise,
@@ -40,6 +47,9 @@ from psfdae.model.photometry import FAINT_SNR, KEPT, NOISE_FLOOR, Photometer, Ph
 from psfdae.model.prediction import Prediction, measured_of, unmeasured
 from psfdae.moments import measure_shapes
 from psfdae.threads import available_cores, in_order, side_by_side
+
+if TYPE_CHECKING:
+    from threadpoolctl import ThreadpoolController
 
 SCALE_TOLERANCE = 0.02  # relative difference of the pixel scale from that of the training
 SNR_TOLERANCE = 1.25  # beyond the trained S/N without a flag: a faint star's is no better known
@@ -91,6 +101,7 @@ class PsfModel(FieldPsfs):
     def __init__(self, bundle: Bundle) -> None:
         self.bundle = bundle
         self.engine = Engine(bundle)
+        self.name, self.stamp_px = bundle.info.name, bundle.info.stamp_px
 
     def __repr__(self) -> str:
         info = self.info
@@ -227,24 +238,14 @@ class PsfModel(FieldPsfs):
             yield from in_order(predicted, chunks, self.engine.threads(threads))
 
     @property
-    def name(self) -> str:
-        """What the bundle calls it."""
-        return self.info.name
-
-    @property
     def sha256(self) -> str:
         """Checksum of the bundle."""
         return self.bundle.sha256
 
     @property
-    def stamp_px(self) -> int:
-        """Side of the stamps in pixels."""
-        return self.info.stamp_px
-
-    @property
     def order(self) -> int:
         """Order of the field's polynomial; raises as `psf_at`."""
-        return self._field().model.order
+        return self._field().order
 
     @property
     def image_px(self) -> tuple[int, int] | None:
@@ -260,7 +261,7 @@ class PsfModel(FieldPsfs):
             raise PredictionError(f"the model {self.name!r} knows no places of its stars")
         return low, high
 
-    def _field(self) -> Any:
+    def _field(self) -> KnowsField:
         field = self.engine.estimator
         if not isinstance(field, KnowsField):
             raise PredictionError(
@@ -270,7 +271,7 @@ class PsfModel(FieldPsfs):
         return field
 
     def _drawn(self, place: np.ndarray, oversampling: int) -> np.ndarray:
-        return np.asarray(self._field().psf_at(place, oversampling))
+        return self._field().psf_at(place, oversampling)
 
     def check_scale(self, pixel_scale_arcsec: float | None, what: str) -> None:
         """Refuse stars whose pixels are not those of the training.
@@ -423,7 +424,7 @@ class Engine:
         parts = [stars.part(slice(a, a + SEEN)) for a in range(0, len(stars), SEEN)]
         seen = [self._seen(part, fixed) for part in parts]
         if isinstance(self.estimator, MeasuresStars):
-            restored = [self._measured(one) for one in seen]
+            restored = [self._measured(one, self.estimator) for one in seen]
         else:
             restored = self._estimated(seen)
         return Prediction.joined([*map(self._predicted, seen, restored)])
@@ -515,7 +516,7 @@ class Engine:
         width = width * np.where(brightest(psf), bright, faint)
         return width, ratios * widest / wider, np.where(flux_too & sky_too, scales[2], of_flux)
 
-    def _measured(self, seen: Seen) -> Restored:
+    def _measured(self, seen: Seen, method: MeasuresStars) -> Restored:
         """With what the method measures in place of the photometry.
 
         That repairs bad pixels and tells the noise.
@@ -535,7 +536,7 @@ class Engine:
         noise = np.where(found.noise > NOISE_FLOOR * size, found.noise, NOISE_FLOOR * size)
         photons = np.nan_to_num(np.maximum(found.flux, 0.0) / stars.gain / pixels)
         noise = np.where(nothing, 1.0, np.sqrt(noise**2 + photons))
-        estimate = self.estimator.measure(
+        estimate = method.measure(
             data,
             noise,
             np.stack([stars.x, stars.y], axis=1),
@@ -580,7 +581,8 @@ class Engine:
         It takes the noise for larger then: what it does not know of a bright star would pass for
         flux. Parts are restored together, in which some stars have about the same noise.
         """
-        info, near = self.bundle.info, {}
+        info = self.bundle.info
+        near: dict[str, Any] = {}
         found = Photometry.joined([one.found for one in seen])
         parts = np.cumsum([0, *(len(one.stars) for one in seen)])
         lost = (found.flags & StarFlag.NO_FLUX) > 0
@@ -595,8 +597,8 @@ class Engine:
             noise = found.noise / np.where(lost, np.nan, found.flux)
             return images, np.where(lost, info.noise_max, noise)
 
-        free = [np.isnan(one.stars.flux) & np.isnan(one.stars.background) for one in seen]
-        free = np.concatenate(free) & ~lost
+        unknown = [np.isnan(one.stars.flux) & np.isnan(one.stars.background) for one in seen]
+        free = np.concatenate(unknown) & ~lost
         if free.any() and isinstance(self.free_flux, FindsFlux):
             images, noise = current()
             wider = np.hypot(noise, info.misfit) / info.kappa
@@ -613,6 +615,7 @@ class Engine:
             if self.bundle.strange_limit is not None:
                 some = {name: values[~lost] for name, values in near.items()}
                 level = noise[~lost] / info.kappa
+                assert isinstance(self.free_flux, ScoresOutliers)
                 score[~lost] = self.free_flux.outlier_score(images[~lost], level, **some)
         rows = [slice(*ends) for ends in pairwise(parts)]
         return [
@@ -722,7 +725,7 @@ def _networks_on_one_thread() -> Iterator[None]:
 
 
 @cache
-def _libraries() -> Any:
+def _libraries() -> ThreadpoolController:
     """Looking for the loaded libraries takes milliseconds, hence once."""
     from threadpoolctl import ThreadpoolController
 

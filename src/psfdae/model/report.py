@@ -7,7 +7,7 @@ errors, the field, residuals, sizes and shapes, χ², and which stars were left 
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
 from io import BytesIO
@@ -60,7 +60,7 @@ def fitted_mean(noisy: np.ndarray, mean: np.ndarray, reach_px: float) -> np.ndar
 
     def at(places: np.ndarray) -> np.ndarray:
         psf = cut(moved(np.broadcast_to(mean, (len(places), *mean.shape)), places), side)
-        return psf / psf.sum(axis=(1, 2), keepdims=True)
+        return np.asarray(psf / psf.sum(axis=(1, 2), keepdims=True))
 
     count, side = noisy.shape[:2]
     axis = np.arange(-reach_px, reach_px + STEP_PX / 2, STEP_PX)
@@ -173,7 +173,7 @@ class Quality:
 
     def usable(self) -> np.ndarray:
         """Stars whose shape means something."""
-        return ~self.has(SPOILT) & np.isfinite(self.stars["fwhm_px"])
+        return np.asarray(~self.has(SPOILT) & np.isfinite(self.stars["fwhm_px"]))
 
     def chi2(self) -> dict[str, np.ndarray]:
         """χ² of stars without a flag that were not learnt from, by words for their S/N."""
@@ -450,7 +450,7 @@ def _magnitude(stars: dict[str, np.ndarray]) -> np.ndarray:
     return np.asarray(-2.5 * np.log10(np.where(stars["flux"] > 0, stars["flux"], np.nan)))
 
 
-ACROSS = {
+ACROSS: dict[str, Callable[[dict[str, np.ndarray]], np.ndarray]] = {
     "−2.5 log₁₀ flux": _magnitude,
     "x (px)": lambda stars: stars["x"],
     "y (px)": lambda stars: stars["y"],

@@ -33,7 +33,7 @@ CHOSEN = "dataset=from_stars"
 """The choice of the configuration's files with the same values."""
 
 
-class _Settings(Group):
+class Settings(Group):
     """What a training on the bright stars of an image depends on, but for the methods' own."""
 
     seed: Seed = 20200611
@@ -49,17 +49,17 @@ class _Settings(Group):
 
 
 @cache
-def settings_model() -> type[Any]:
+def settings_model() -> type[Settings]:
     """The model of all settings, those of the methods of `config.yaml` included."""
     groups: dict[str, Any] = {
         name: (group, Field(default_factory=group))
         for kind in known()
         for name, group in kind.groups.items()
     }
-    return create_model("Settings", __base__=_Settings, **groups)
+    return create_model("Settings", __base__=Settings, **groups)
 
 
-def from_words(words: Sequence[str] = ()) -> Any:
+def from_words(words: Sequence[str] = ()) -> Settings:
     """Settings from words `group.key=value`, the value as in YAML.
 
     Raises
@@ -80,10 +80,11 @@ def from_words(words: Sequence[str] = ()) -> Any:
     return validate(settings_model(), tree)
 
 
-def _composed(groups: tuple[str, ...], word: str, words: Sequence[str]) -> Any:
+def _composed(groups: tuple[str, ...], word: str, words: Sequence[str]) -> Group:
     """Groups of settings where a word chooses a file, or is wrong, of which Hydra says more."""
     for point in entry_points(group="psfdae.settings"):
-        return point.load()(groups, (CHOSEN, *words))
+        settings: Group = point.load()(groups, (CHOSEN, *words))
+        return settings
     raise ConfigError(f"{word}: expected group.key=value, the group one of {', '.join(groups)}")
 
 
@@ -93,16 +94,18 @@ class Words:
 
     choice: tuple[str, ...] = ()
 
-    def of(self, options: Mapping[str, Any]) -> tuple[str, ...]:
+    def of(self, options: Mapping[str, object]) -> tuple[str, ...]:
         """Names of the groups of settings."""
         return tuple(settings_model().model_fields)
 
-    def __call__(self, options: Mapping[str, Any], file: Path | None, words: Sequence[str]) -> Any:
+    def __call__(
+        self, options: Mapping[str, object], file: Path | None, words: Sequence[str]
+    ) -> Settings:
         """The settings of words, or of a YAML file."""
         return of_config(read_yaml(file)) if file is not None else from_words(words)
 
 
-def of_config(config: Any) -> Any:
+def of_config(config: Group | Mapping[str, Any]) -> Settings:
     """The settings among those of a configuration, a model or a tree, which may have more.
 
     Raises
@@ -129,7 +132,9 @@ def _value(text: str, word: str) -> Any:
         raise ConfigError(f"{word}: {text!r} is no value") from None
 
 
-def with_keywords(settings: Any, groups: Sequence[str], keywords: Mapping[str, Any]) -> Any:
+def with_keywords(
+    settings: Settings, groups: Sequence[str], keywords: Mapping[str, object]
+) -> Settings:
     """Settings with other values, given by the names of keys of some groups.
 
     A name that several of the groups have is that of the first one.

@@ -15,6 +15,7 @@ from psfdae.fits import learnt
 from psfdae.method import MeasuresStars, Method, TrainingSet
 from psfdae.noise import NoiseModel, OwnNoise, noise_equivalent_px
 from psfdae.rng import stream
+from psfdae.settings import Config, OfFit, WithNoise
 from psfdae.splits import Split, held_out_split, random_split
 
 INNER = 10
@@ -37,7 +38,7 @@ def field_positions(stars: Product) -> np.ndarray:
 
     NaN where an image's list does not say it.
     """
-    return stars["position" if of_image(stars) else "grid"][stars["field_index"]]
+    return np.asarray(stars["position" if of_image(stars) else "grid"][stars["field_index"]])
 
 
 def star_area(stars: Product, train: np.ndarray) -> float:
@@ -50,7 +51,7 @@ def star_area(stars: Product, train: np.ndarray) -> float:
     return noise_equivalent_px(stars["realisation"][train])
 
 
-def split_stars(stars: Product, kind: str, config: Any) -> Split:
+def split_stars(stars: Product, kind: str, config: OfFit) -> Split:
     """Training, validation and test stars of a split.
 
     Raises
@@ -73,12 +74,12 @@ def split_stars(stars: Product, kind: str, config: Any) -> Split:
     )
 
 
-def noise_model(config: Any) -> NoiseModel:
+def noise_model(config: WithNoise) -> NoiseModel:
     """The noise of a stage's config."""
     return NoiseModel(config.noise.kappa, config.noise.background_photons)
 
 
-def noisy_test_images(config: Any, stars: Product, test: np.ndarray, level: float) -> np.ndarray:
+def noisy_test_images(config: OfFit, stars: Product, test: np.ndarray, level: float) -> np.ndarray:
     """Noisy images of test stars, numbers `test` of a product "stars", at one λ.
 
     The noise of a star depends on seed, set of stars, λ and star only. Datasets differ in
@@ -87,7 +88,7 @@ def noisy_test_images(config: Any, stars: Product, test: np.ndarray, level: floa
     """
     of = stars.config.get("stars", {}).get("name", "own")
     rng = stream(config.seed, "noise", "test", of, f"{level:.6g}")
-    return noise_model(config).draw(stars["realisation"], level, rng)[test]
+    return np.asarray(noise_model(config).draw(stars["realisation"], level, rng)[test])
 
 
 def own_flux_error(stars: Product, train: np.ndarray) -> np.ndarray:
@@ -102,7 +103,7 @@ def own_flux_error(stars: Product, train: np.ndarray) -> np.ndarray:
 
 
 def training_set(
-    config: Any,
+    config: OfFit,
     kind: type[Method],
     stars: Product,
     split: str,
@@ -131,7 +132,7 @@ def training_set(
     )
 
 
-def fit_apart(kind: type[Method], data: TrainingSet, star: np.ndarray, config: Any) -> Method:
+def fit_apart(kind: type[Method], data: TrainingSet, star: np.ndarray, config: Config) -> Method:
     """A fit that has learnt nothing from the validation stars, for methods that else do.
 
     Some stars of `fit` choose its settings instead; `star` says which images are of the same.
@@ -141,7 +142,7 @@ def fit_apart(kind: type[Method], data: TrainingSet, star: np.ndarray, config: A
     return kind.fit(some, **kind.settings(config))
 
 
-def _own_noise(stars: Product, background: float) -> Callable[..., np.ndarray]:
+def _own_noise(stars: Product, background: float) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
     """Noise of the bright stars of an image; its arrays are read if a method asks for it."""
 
     def own_noise(images: np.ndarray, mean: np.ndarray) -> np.ndarray:

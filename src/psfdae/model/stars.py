@@ -16,13 +16,15 @@ from psfdae.files import Column, Product
 from psfdae.image.observation import Observation, Source, list_offset
 from psfdae.image.selection import Candidates, Verdict, advice, collect
 from psfdae.image.training_images import single_psf, star_grid, training_columns
-from psfdae.model.settings import IMAGE_GROUPS, settings_model, with_keywords
+from psfdae.model.settings import IMAGE_GROUPS, Settings, settings_model, with_keywords
 from psfdae.rng import stream
 from psfdae.settings import Noise
 from psfdae.splits import held_out_fields
 
 if TYPE_CHECKING:
     from astropy.table import Table
+
+    from psfdae.image.catalogue import StarList
 
 SPLIT, REFERENCE = "held_out", "realisation"
 """Whole stars are held out, and a star itself is what is to be restored."""
@@ -61,28 +63,28 @@ class Stars:
     candidates: Candidates
     held_out: np.ndarray
     columns: dict[str, Column]
-    settings: Any
+    settings: Settings
     notes: Sequence[str]
 
     @classmethod
     def from_image(
         cls,
         image: str | Path | np.ndarray,
-        catalogue: Any = None,
+        catalogue: StarList | None = None,
         *,
         detect: bool | float = False,
         extension: str | int | None = None,
         origin: int | None = None,
-        mask: Any = None,
+        mask: str | int | Path | np.ndarray | None = None,
         bad_bits: int | None = None,
-        weight: Any = None,
-        variance: Any = None,
+        weight: str | int | Path | np.ndarray | None = None,
+        variance: str | int | Path | np.ndarray | None = None,
         pixel_scale_arcsec: float | None = None,
         gain: float | None = None,
         read_noise: float | None = None,
         saturate: float | None = None,
         accept_offset: bool = False,
-        **settings: Any,
+        **settings: object,
     ) -> Stars:
         """Choose the bright stars of an image and make training data of them.
 
@@ -135,7 +137,7 @@ class Stars:
         return cls.of(source, with_keywords(settings_model()(), IMAGE_GROUPS, settings))
 
     @classmethod
-    def of(cls, source: Source, settings: Any) -> Stars:
+    def of(cls, source: Source, settings: Settings) -> Stars:
         """As `from_image`, of an image with what is stated about it, and settings."""
         margin = settings.calibration_stars.margin_px
         observation = source.open(settings.framing.stamp_px, margin).assuming()
@@ -151,7 +153,7 @@ class Stars:
         cls,
         source: Source,
         observation: Observation,
-        settings: Any,
+        settings: Settings,
         isolation_px: float | None = None,
     ) -> Stars:
         """The bright stars of an observation; no neighbour is nearer than `isolation_px`.
@@ -192,7 +194,7 @@ class Stars:
         """What a model of these stars is called by default."""
         return self.observation.path.name.split(".")[0] or "model"
 
-    def with_settings(self, settings: Any) -> Stars:
+    def with_settings(self, settings: Settings) -> Stars:
         """These stars with other settings of methods."""
         return replace(self, settings=settings)
 
@@ -242,7 +244,7 @@ class Stars:
         return plain
 
 
-def _noise(settings: Any, bright: BrightStars, background: float) -> Noise:
+def _noise(settings: Settings, bright: BrightStars, background: float) -> Noise:
     """Settings of the noise, with the levels of the S/N asked for, of noise-free stars."""
     area, kappa = float(np.median(bright.area())), settings.noise.kappa
     degraded = settings.calibration_stars.degraded()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,11 +16,12 @@ from psfdae.image.stamps import Stamps
 from psfdae.method import Method, facts_of
 from psfdae.methods import method as method_of
 from psfdae.metrics import all_metrics, clustered_mean, mse, quality, summarised
+from psfdae.model.field_psfs import PredictionError
 from psfdae.model.packing import COVERAGE, checksum
 from psfdae.model.photometry import signal_to_noise
 from psfdae.model.plot import FieldStars, psf_map
 from psfdae.model.prediction import Prediction
-from psfdae.model.psf_model import MARGIN_PX, PredictionError, PsfModel
+from psfdae.model.psf_model import MARGIN_PX, PsfModel
 from psfdae.model.report import MEAN_PSF, SHOWN_STARS, Quality, fitted_mean, quality_page, standing
 from psfdae.model.star_sets import (
     field_positions,
@@ -178,7 +179,7 @@ def _found_alone(model: PsfModel, stars: Stars, level: float, noisy: np.ndarray)
     return row
 
 
-def _stacked(rows: Sequence[Mapping[str, Any]]) -> Table:
+def _stacked(rows: Sequence[Mapping[str, object]]) -> Table:
     from astropy.table import Table
 
     return Table({name: [row[name] for row in rows] for name in rows[0]})
@@ -344,7 +345,7 @@ def _one_of_each(star: np.ndarray, position: np.ndarray) -> np.ndarray:
     stars, first = np.unique(star, return_index=True)
     if not np.isfinite(position[stars]).all():
         return first[:STRIP_STARS]
-    return first[spread_stars(position[stars], STRIP_STARS)]
+    return np.asarray(first[spread_stars(position[stars], STRIP_STARS)])
 
 
 def _all_stars(
@@ -367,7 +368,9 @@ def _all_stars(
     return joined, np.concatenate(psf), rows
 
 
-def _per_star(of: Stamps | Prediction, names: Any = None) -> Iterator[tuple[str, np.ndarray]]:
+def _per_star(
+    of: Stamps | Prediction, names: Iterable[str] = ()
+) -> Iterator[tuple[str, np.ndarray]]:
     for name in names or of.__dataclass_fields__:
         value = np.asarray(getattr(of, name))
         if value.ndim == 1:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import torch
@@ -20,9 +20,12 @@ from psfdae.errors import Error
 from psfdae.files import atomic_path
 from psfdae.method import TrainingSet
 from psfdae.networks.training import DeadNetworkError, Muon, Row, Training, TrainingError, train
+from psfdae.networks.weights import channels_last
 from psfdae.rng import stream
 
 if TYPE_CHECKING:
+    from onnxruntime import InferenceSession
+
     from psfdae.networks.settings import DaeSettings, Train
 
 
@@ -60,9 +63,10 @@ class SingleChannelConv(nn.Conv2d):
             return super().forward(x)
         x = x.to(self.weight.dtype)  # autocast hands on its own
         flipped = self.weight.flip(2, 3).transpose(0, 1)
-        return torch.ops.aten.slow_conv_transpose2d(
+        found: torch.Tensor = torch.ops.aten.slow_conv_transpose2d(
             x, flipped, self.kernel_size, self.bias, [1, 1], self.padding, [0, 0], [1, 1]
         )
+        return found
 
 
 class Dae(nn.Module):
@@ -87,6 +91,11 @@ class Dae(nn.Module):
             for (inner, outer), kernel in zip(pairwise(channels), kernels, strict=True)
         )
 
+    @property
+    def convolutions(self) -> list[nn.Conv2d]:
+        """The layers; torch's list holds modules of any kind."""
+        return [layer for layer in self.layers if isinstance(layer, nn.Conv2d)]
+
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Map scaled star images (B, 1, d, d) to scaled PSFs of the same shape."""
         for layer in self.layers:
@@ -105,16 +114,17 @@ def build_dae(
     `he` and `linear` draw N(0, 2/fan_in) with zero biases (He et al. 2015), `linear` for
     `begin_linear` to go on; `default` is PyTorch's uniform ±1/√fan_in for weights and biases.
     """
-    model = Dae(kernels, widths).to(memory_format=torch.channels_last)
+    model = channels_last(Dae(kernels, widths))
     with torch.no_grad():
         for layer in model.layers:
+            weight, bias = layer.parameters()
             if init == "default":
-                bound = float(layer.weight[0].numel()) ** -0.5
-                layer.weight.uniform_(-bound, bound, generator=generator)
-                layer.bias.uniform_(-bound, bound, generator=generator)
+                bound = float(weight[0].numel()) ** -0.5
+                weight.uniform_(-bound, bound, generator=generator)
+                bias.uniform_(-bound, bound, generator=generator)
             else:
-                nn.init.kaiming_normal_(layer.weight, nonlinearity="relu", generator=generator)
-                layer.bias.zero_()
+                nn.init.kaiming_normal_(weight, nonlinearity="relu", generator=generator)
+                bias.zero_()
     return model
 
 
@@ -146,9 +156,9 @@ def begin_linear(
     """
     if not (np.isfinite(noisy).all() and np.isfinite(references).all()):
         raise TrainingError("training stars that are not finite")
-    first, *inner, _ = model.layers
+    first, *inner, _ = model.convolutions
     images = torch.from_numpy(noisy[:, None])
-    axes = _eigenpatches(images, first)
+    axes = _eigenpatches(images, first.kernel_size[0])
     own = torch.zeros_like(axes[:, :1])
     own[len(own) // 2] = 1.0
     pairs = torch.cat([own, axes], dim=1).T[: len(first.weight) // 2]
@@ -170,8 +180,9 @@ def _fit_last_layer(
     pixels: np.ndarray,
 ) -> None:
     """Least squares from what the last layer sees of images (n, 1, d, d) to references (n, d²)."""
-    *others, last = model.layers
-    size = last.weight.numel() + 1
+    *others, last = model.convolutions
+    (final, bias), side = last.parameters(), last.kernel_size[0]
+    size = final.numel() + 1
     normal, right = torch.zeros(size, size, dtype=torch.float64), torch.zeros(size).double()
     root = torch.from_numpy(np.sqrt(weight / weight.mean()).astype(np.float32))[:, None]
     for start in range(0, len(images), LINEAR_BLOCK):
@@ -179,7 +190,7 @@ def _fit_last_layer(
         x = images[block].to(memory_format=torch.channels_last)
         for layer in others:
             x = torch.relu(layer(x))
-        x = nn.functional.unfold(x, last.kernel_size, padding=last.padding).transpose(1, 2)
+        x = nn.functional.unfold(x, side, padding=side // 2).transpose(1, 2)
         x = torch.stack([star[some] for star, some in zip(x, pixels[block], strict=True)])
         x = torch.cat([x, torch.ones_like(x[:, :, :1])], dim=2) * root[block, :, None]
         x = x.flatten(0, 1)
@@ -189,19 +200,16 @@ def _fit_last_layer(
         right += (x.T @ y.flatten()).double()
     normal += RIDGE * normal.diagonal().mean() * torch.eye(size, dtype=torch.float64)
     solved = torch.linalg.solve(normal, right).float()
-    last.weight.copy_(solved[:-1].view_as(last.weight))
-    last.bias.copy_(solved[-1:])
+    final.copy_(solved[:-1].view_as(final))
+    bias.copy_(solved[-1:])
 
 
-def _eigenpatches(images: torch.Tensor, layer: nn.Conv2d) -> torch.Tensor:
-    """Eigenvectors, columns, of the products of what a layer sees, the leading one first."""
+def _eigenpatches(images: torch.Tensor, side: int) -> torch.Tensor:
+    """Eigenvectors, columns, of the products of what a kernel sees, the leading one first."""
     # Without names, so that only one copy of the patches is there at the end.
-    flat = (
-        nn.functional.unfold(images, layer.kernel_size, padding=layer.padding)
-        .transpose(1, 2)
-        .flatten(0, 1)
-    )
-    return torch.linalg.eigh(flat.T @ flat).eigenvectors.flip(1)
+    flat = nn.functional.unfold(images, side, padding=side // 2).transpose(1, 2).flatten(0, 1)
+    axes: torch.Tensor = torch.linalg.eigh(flat.T @ flat).eigenvectors
+    return axes.flip(1)
 
 
 def image_scale(scale: Literal["mean", "none"], stamp_px: int) -> float:
@@ -252,6 +260,7 @@ class DaeTraining(Training):
     has MSEs of flux-normalised images. Another attempt draws other weights and other noise.
     """
 
+    model: Dae
     settings: Train
 
     def __init__(
@@ -263,7 +272,8 @@ class DaeTraining(Training):
         generator.manual_seed(int(stream(seed, "dae", "init", attempt).integers(2**62)))
         model = build_dae(dae.kernels, dae.widths, dae.init, generator)
         if data.start is not None:
-            model.load_state_dict(data.start.network.state_dict())
+            start: Any = data.start  # a `psfdae.methods.dae.Dae`, of a layer above this one
+            model.load_state_dict(start.network.state_dict())
         elif dae.init == "linear":
             rng = stream(seed, "dae", "linear", attempt)
             stars = rng.permutation(data.fit)[:LINEAR_STARS]
@@ -290,9 +300,10 @@ class DaeTraining(Training):
         """Muon for the weights of the inner layers, Adam for the others; or Adam for all."""
         if self.settings.optimiser == "adam":
             return super().begin(lr)
-        inner = [layer.weight for layer in self.model.layers[1:-1]]
+        inner = [layer.weight for layer in self.model.convolutions[1:-1]]
         others = [p for p in self.model.parameters() if all(p is not w for w in inner)]
-        return Muon([{"params": others}, {"params": inner, "orthogonal": True}], lr=lr)
+        groups: list[dict[str, Any]] = [{"params": others}, {"params": inner, "orthogonal": True}]
+        return Muon(groups, lr=lr)
 
     def batches(self, epoch: int) -> Iterator[tuple[torch.Tensor, ...]]:
         """Noisy images and what is to come of them, (B, 1, d, d) as the network sees them.
@@ -323,7 +334,7 @@ class DaeTraining(Training):
     def loss(self, batch: tuple[torch.Tensor, ...], step: int) -> torch.Tensor:
         """Mean squared error, weighted by star."""
         noisy, target, weight = batch
-        output = self.model(noisy)
+        output: torch.Tensor = self.model(noisy)
         if step % self.settings.dead_check_steps == 0 and not output.detach().any():
             raise DeadNetworkError(f"all outputs are zero at step {step}")
         return (weight * (output - target) ** 2).mean()
@@ -402,7 +413,7 @@ class _Exported(nn.Module):
     def __init__(self, model: Dae, factor: float) -> None:
         super().__init__()
         self.factor = factor
-        self.layers = nn.ModuleList(_plain(layer) for layer in model.layers)
+        self.layers = nn.ModuleList(_plain(layer) for layer in model.convolutions)
 
     def forward(self, images: torch.Tensor) -> torch.Tensor:
         x = images[:, None] * self.factor
@@ -413,9 +424,8 @@ class _Exported(nn.Module):
 
 def _plain(layer: nn.Conv2d) -> nn.Conv2d:
     """The convolution without its fast path, which has no ONNX operator."""
-    plain = nn.Conv2d(
-        layer.in_channels, layer.out_channels, layer.kernel_size, padding=layer.padding
-    )
+    side = layer.kernel_size[0]
+    plain = nn.Conv2d(layer.in_channels, layer.out_channels, side, padding=side // 2)
     plain.weight, plain.bias = layer.weight, layer.bias
     return plain
 
@@ -480,7 +490,7 @@ def _check(model: Dae, factor: float, stamp_px: int, path: Path) -> None:
             )
 
 
-def session(path: Path, threads: int):  # type: ignore[no-untyped-def]
+def session(path: Path, threads: int) -> InferenceSession:
     """An onnxruntime session on the CPU whose operators use this many threads."""
     import onnxruntime
 
@@ -499,4 +509,4 @@ def random_stars(count: int, stamp_px: int) -> np.ndarray:
     r2 = (grid[:, None] - centre[0]) ** 2 + (grid - centre[1]) ** 2
     images = np.exp(-0.5 * r2 / width**2)
     images /= images.sum(axis=(1, 2), keepdims=True)
-    return (images + rng.normal(0.0, 0.005, images.shape)).astype(np.float32)
+    return np.asarray(images + rng.normal(0.0, 0.005, images.shape), np.float32)

@@ -95,11 +95,16 @@ def orthogonal(matrices: Sequence[torch.Tensor]) -> list[torch.Tensor]:
 class Course(Protocol):
     """Settings of every training: learning rate and its schedule, passes, threads."""
 
-    lr: float
-    schedule: str
-    epochs: int
-    threads: int
-    checkpoint_seconds: float
+    @property
+    def lr(self) -> float: ...
+    @property
+    def schedule(self) -> str: ...
+    @property
+    def epochs(self) -> int: ...
+    @property
+    def threads(self) -> int: ...
+    @property
+    def checkpoint_seconds(self) -> float: ...
 
 
 class Training(ABC):
@@ -177,7 +182,8 @@ class Training(ABC):
     def run_epoch(self) -> Row:
         """One pass over the training data; raises TrainingError and DeadNetworkError."""
         started, started_cpu = time.monotonic(), time.process_time()
-        epoch, rate, losses = len(self.history), self.rate, []
+        epoch, rate = len(self.history), self.rate
+        losses: list[float] = []
         self.model.train()
         for batch in self.batches(epoch):
             losses.append(self._step(batch, epoch * self.steps + len(losses)))

@@ -14,6 +14,7 @@ import numpy as np
 from psfdae.files import ProductError, atomic_path
 
 if TYPE_CHECKING:
+    from torch import Tensor
     from torch.nn import Module
 
 Network = TypeVar("Network", bound="Module")
@@ -35,7 +36,7 @@ def digest_of(arrays: Mapping[str, np.ndarray]) -> str:
     return digest.hexdigest()
 
 
-def save_weights(path: Path, state: Mapping[str, Any], config: Mapping[str, Any]) -> None:
+def save_weights(path: Path, state: Mapping[str, Tensor], config: Mapping[str, Any]) -> None:
     """Write a network's tensors, its resolved config and the checksum of the tensors.
 
     Parameters
@@ -86,9 +87,18 @@ def with_weights(build: Callable[[], Network], path: Path) -> Network:
             raise ProductError(
                 f"{path}: shape of {name} is {has}, but {needs} in the network of its config.yaml"
             )
-    model = build().to(memory_format=torch.channels_last)
+    model = channels_last(build())
     model.load_state_dict(state)
     return model.eval()
+
+
+def channels_last(network: Network) -> Network:
+    """The network with its weights in the order in memory in which convolutions are fastest."""
+    import torch
+
+    # torch's own types know this argument of tensors only.
+    moved: Network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    return moved
 
 
 def load_weights(path: Path) -> dict[str, np.ndarray]:

@@ -70,15 +70,11 @@ class Separable:
     """Points of which one matrix P (d, m) makes pixels, P I Pᵀ."""
 
     pixels: np.ndarray
-
-    @property
-    def dtype(self) -> np.dtype:
-        """See `Sampling`."""
-        return self.pixels.dtype
+    dtype: np.dtype
 
     def to_pixels(self, values: np.ndarray) -> np.ndarray:
         """See `Sampling`."""
-        return self.pixels @ (values @ self.pixels.T)
+        return np.asarray(self.pixels @ (values @ self.pixels.T))
 
 
 class PointSampling(Separable):
@@ -100,7 +96,8 @@ class PointSampling(Separable):
         above = 0.5 * np.hstack([(even - odd)[::-1].T, (even + odd).T])
         # The middle pixel of an odd stamp is its own mirror image.
         below = above[::-1, ::-1][: stamp_px // 2]
-        self.pixels = np.vstack([below, above]).astype(np.empty(0, precision).real.dtype)
+        self.dtype = np.empty(0, precision).real.dtype
+        self.pixels = np.vstack([below, above]).astype(self.dtype)
         self._weighted: dict[int, np.ndarray] = {}
 
     def along_x(self, pupil_fields: np.ndarray, degrees: Sequence[int] = (0,)) -> np.ndarray:
@@ -166,8 +163,8 @@ class PeriodSampling(Separable, WholePeriod):
             pixel * np.sinc(frequency * pixel) * np.exp(-2j * np.pi * np.outer(centres, frequency))
         )
         from_points = np.exp(2j * np.pi * np.outer(lags, np.arange(self.points)) / self.points)
-        self.pixels = (to_pixels @ from_points).real / self.points
-        self.pixels = self.pixels.astype(np.empty(0, precision).real.dtype)
+        self.dtype = np.empty(0, precision).real.dtype
+        self.pixels = ((to_pixels @ from_points).real / self.points).astype(self.dtype)
 
 
 def _centres(stamp_px: int, pixel: float) -> np.ndarray:
@@ -297,7 +294,7 @@ class ModalStamps:
     def opd(self, coefficients: np.ndarray) -> np.ndarray:
         """OPD maps in waves, shape (B, M, M)."""
         opd = np.asarray(coefficients, self._modes.dtype) @ self._modes
-        return opd.reshape(-1, *self.shape)
+        return np.asarray(opd.reshape(-1, *self.shape))
 
     def _pupil_fields(self, coefficients: np.ndarray, offset_px: np.ndarray | None) -> np.ndarray:
         phase = self.opd(coefficients) * (2.0 * np.pi)

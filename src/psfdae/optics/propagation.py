@@ -24,12 +24,15 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from psfdae.optics.pupil import Pupil
 from psfdae.threads import side_by_side
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 Backend = Literal["numpy", "torch"]
 Precision = Literal["complex64", "complex128"]
@@ -140,7 +143,7 @@ class StampPropagator:
         self._axis = self._array(pupil.axis)
         self._work = threading.local()
 
-    def __call__(self, opd: Any, offset_px: np.ndarray | None = None) -> np.ndarray:
+    def __call__(self, opd: np.ndarray | Tensor, offset_px: np.ndarray | None = None) -> np.ndarray:
         """Propagate a batch.
 
         Parameters
@@ -232,10 +235,10 @@ class StampPropagator:
 
     def _buffer(self, name: str, *shape: int) -> Any:
         """Scratch space kept between calls: fresh pages would cost more than the arithmetic."""
-        kept = self._work.__dict__
-        if (name, shape) not in kept:
-            kept[name, shape] = self._array(np.empty(shape, self.real_dtype))
-        return kept[name, shape]
+        kept: dict[tuple[int, ...], Any] = vars(self._work).setdefault(name, {})
+        if shape not in kept:
+            kept[shape] = self._array(np.empty(shape, self.real_dtype))
+        return kept[shape]
 
 
 def in_batches(

@@ -83,7 +83,7 @@ def disc_coverage(
     x = np.abs(pupil_axis(samples, guard))
     half = 1.0 / samples
     near = np.hypot(np.maximum(x - half, 0)[:, None], np.maximum(x - half, 0)[None, :])
-    far = np.hypot((x + half)[:, None], (x + half)[None, :])
+    far: np.ndarray = np.hypot((x + half)[:, None], (x + half)[None, :])
     coverage = (far <= radius).astype(np.float64)
     rows, cols = np.nonzero((near < radius) & (far > radius))
     sub = pupil_axis(oversampling) * half
@@ -171,7 +171,7 @@ def required_samples(slopes: np.ndarray, reach: np.ndarray) -> np.ndarray:
         wavefront = int(np.flatnonzero(~np.isfinite(needed))[0])
         raise SamplingError(f"wavefront {wavefront} is not finite: no grid can sample it")
     # Larger numbers would wrap around as integers; no grid is that large.
-    return np.ceil(np.minimum(needed, 2.0**53)).astype(np.int64)
+    return np.asarray(np.ceil(np.minimum(needed, 2.0**53)), np.int64)
 
 
 def pixel_width(scale_arcsec: float, diameter_m: float, wavelength_m: float) -> float:
@@ -206,5 +206,4 @@ def choose_samples(needed: np.ndarray, sizes: tuple[int, ...]) -> np.ndarray:
             f"samples (half a wave per sample, replicas clear of the stamp); "
             f"{int((needed > sizes[-1]).sum())} of {needed.size} wavefronts exceed the last value"
         )
-    sizes = np.asarray(sizes)
-    return sizes[np.searchsorted(sizes, needed)]
+    return np.asarray(sizes)[np.searchsorted(sizes, needed)]

@@ -47,8 +47,8 @@ class Profile:
     def scale(self) -> float:
         """Core radius a, or the Gaussian's standard deviation, in λ/D."""
         if self.beta is None:
-            return self.fwhm / np.sqrt(8.0 * np.log(2.0))
-        return 0.5 * self.fwhm / np.sqrt(2.0 ** (1.0 / self.beta) - 1.0)
+            return float(self.fwhm / np.sqrt(8.0 * np.log(2.0)))
+        return float(0.5 * self.fwhm / np.sqrt(2.0 ** (1.0 / self.beta) - 1.0))
 
     def transfer(self, frequency: np.ndarray) -> np.ndarray:
         """Fourier transform at frequencies in cycles per λ/D, 1 at 0; any shape.
@@ -68,8 +68,8 @@ class Profile:
     def reach(self) -> float:
         """Radius in λ/D at which the profile has fallen to `FAINT` of its maximum."""
         if self.beta is None:
-            return self.scale * np.sqrt(-2.0 * np.log(FAINT))
-        return self.scale * np.sqrt(FAINT ** (-1.0 / self.beta) - 1.0)
+            return float(self.scale * np.sqrt(-2.0 * np.log(FAINT)))
+        return float(self.scale * np.sqrt(FAINT ** (-1.0 / self.beta) - 1.0))
 
 
 STEP = 1e-3
@@ -111,14 +111,14 @@ class WholePeriod:
         from scipy import fft
 
         weights = legendre(degrees, self._axis).astype(self.dtype)
-        return fft.fft(pupil_fields * weights[:, None, None], self.points)
+        return np.asarray(fft.fft(pupil_fields * weights[:, None, None], self.points))
 
     def along_y(self, rows: np.ndarray, degrees: Sequence[int] = (0,)) -> np.ndarray:
         """See `Sampling`."""
         from scipy import fft
 
         weights = legendre(degrees, self._axis).astype(self.dtype)
-        return fft.fft(rows * weights[:, None, :, None], self.points, axis=-2)
+        return np.asarray(fft.fft(rows * weights[:, None, :, None], self.points, axis=-2))
 
 
 class BlurredSampling(WholePeriod):
@@ -159,7 +159,9 @@ class BlurredSampling(WholePeriod):
         self._transfer = (weights * blur).astype(self.dtype)
         self._centres = np.arange(stamp_px) - 0.5 * (stamp_px - 1)
 
-    def to_pixels(self, values: np.ndarray, offset_px: tuple[float, float] = (0, 0)) -> np.ndarray:
+    def to_pixels(
+        self, values: np.ndarray, offset_px: Sequence[float] | np.ndarray = (0, 0)
+    ) -> np.ndarray:
         """Pixels (..., d, d) of intensities (..., n, n) around a place (row, column) in pixels."""
         from scipy import fft
 
@@ -168,7 +170,7 @@ class BlurredSampling(WholePeriod):
             np.exp(2j * np.pi * np.outer(self._centres + offset, frequency)).astype(self.complex)
             for offset, frequency in zip(offset_px, (self.rows, self.columns), strict=True)
         )
-        return ((to_rows @ spectrum) @ to_columns.T).real
+        return np.asarray(((to_rows @ spectrum) @ to_columns.T).real)
 
 
 class BlurredPropagator:

@@ -107,10 +107,11 @@ def noll_to_nm(j: int) -> tuple[int, int]:
 def radial_polynomial(n: int, m: int, r: np.ndarray) -> np.ndarray:
     """R_n^|m|(r), 1 at r = 1."""
     m = abs(m)
-    return sum(
+    found: np.ndarray = sum(
         (-1) ** k * comb(n - k, k) * comb(n - 2 * k, (n - m) // 2 - k) * r ** (n - 2 * k)
         for k in range((n - m) // 2 + 1)
     )
+    return found
 
 
 def zernike(j: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -131,9 +132,9 @@ def zernike(j: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     n, m = noll_to_nm(j)
     r, theta = np.hypot(x, y), np.arctan2(y, x)
     if m == 0:
-        return np.sqrt(n + 1.0) * radial_polynomial(n, 0, r)
+        return np.asarray(np.sqrt(n + 1.0) * radial_polynomial(n, 0, r))
     angular = np.cos(m * theta) if m > 0 else np.sin(-m * theta)
-    return np.sqrt(2.0 * (n + 1.0)) * radial_polynomial(n, m, r) * angular
+    return np.asarray(np.sqrt(2.0 * (n + 1.0)) * radial_polynomial(n, m, r) * angular)
 
 
 def zernike_images(noll: Iterable[int], x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -179,9 +180,7 @@ Modes = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Modes at pupil points (x, y) in pupil radii, shapes (...) to (J, ...)."""
 
 
-def movable_modes(
-    modes: Modes, pixel: float, x: np.ndarray | float, y: np.ndarray | float
-) -> np.ndarray:
+def movable_modes(modes: Modes, pixel: float, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Modes, (J, ...), and two tilts that move the image by a pixel along x and y, (J + 2, ...)."""
     tilts = 0.5 * pixel * np.stack(np.broadcast_arrays(x, y))
     return np.concatenate([modes(x, y), tilts])
@@ -254,10 +253,10 @@ def mode_slopes(modes: Modes) -> tuple[np.ndarray, np.ndarray]:
     x, y = np.meshgrid(axis, axis)
     inside = x**2 + y**2 <= 1.0
     angle = np.linspace(0.0, 2.0 * np.pi, 8 * SLOPE_POINTS, endpoint=False)
-    x, y = np.append(x[inside], np.cos(angle)), np.append(y[inside], np.sin(angle))
+    u, v = np.append(x[inside], np.cos(angle)), np.append(y[inside], np.sin(angle))
     return (
-        (modes(x + STEP, y) - modes(x - STEP, y)) / (2.0 * STEP),
-        (modes(x, y + STEP) - modes(x, y - STEP)) / (2.0 * STEP),
+        (modes(u + STEP, v) - modes(u - STEP, v)) / (2.0 * STEP),
+        (modes(u, v + STEP) - modes(u, v - STEP)) / (2.0 * STEP),
     )
 
 
@@ -324,7 +323,9 @@ class ModalWavefronts:
         if key not in self._images:
             images = self.modes(pupil.axis[None, :], pupil.axis[:, None])
             self._images[key] = images.reshape(len(images), -1).astype(dtype)
-        return (self.coefficients[index].astype(dtype) @ self._images[key]).reshape(-1, size, size)
+        return np.asarray(
+            (self.coefficients[index].astype(dtype) @ self._images[key]).reshape(-1, size, size)
+        )
 
 
 def seidel_wavefronts(seidel: np.ndarray, field: np.ndarray) -> ModalWavefronts:

@@ -191,11 +191,11 @@ def _step(
     information[held[:, :, None] | held[:, None, :]] = 0.0
     information[:, diagonal, diagonal] += held
     step = np.linalg.solve(information, np.where(held, 0.0, slope)[:, :, None])[:, :, 0]
-    return np.clip(parameters + step, -limit, limit) - parameters
+    return np.asarray(np.clip(parameters + step, -limit, limit) - parameters)
 
 
 def best_of_group(height: np.ndarray, group: np.ndarray) -> np.ndarray:
     """Greatest height in each one's group, shape (M,)."""
     best = np.full(group.max() + 1, -np.inf)
     np.maximum.at(best, group, height)
-    return best[group]
+    return np.asarray(best[group])

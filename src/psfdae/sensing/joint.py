@@ -112,14 +112,16 @@ class FieldPosterior:
 
     def coefficients(self, t: np.ndarray) -> np.ndarray:
         """Coefficients of the stars (m, K) in waves, of standardised numbers t (Q,)."""
-        return self.model.coefficients(self.model.mean + self.model.sd * t)[self.stars]
+        return np.asarray(self.model.coefficients(self.model.mean + self.model.sd * t)[self.stars])
 
     def slopes(self, t: np.ndarray) -> np.ndarray:
         """Their derivatives by t, (m, Q, K)."""
         whole = self.model.jacobian(self.model.mean + self.model.sd * t)
-        return np.moveaxis(whole * self.model.sd[:, None, None], 0, 1)[self.stars]
+        return np.asarray(np.moveaxis(whole * self.model.sd[:, None, None], 0, 1)[self.stars])
 
-    def evaluate(self, _: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, ...]:
+    def evaluate(
+        self, _: np.ndarray, numbers: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """See `psfdae.sensing.climbing.Evaluate`; states without an image are impossible."""
         parts = [self._one(each) for each in numbers]
         height, score, information = (np.stack(part) for part in zip(*parts, strict=True))

@@ -116,10 +116,13 @@ def _stamps(stars: ArrayLike, noise: ArrayLike | None, gain: ArrayLike | None) -
         np.zeros(data.shape, bool),
         np.zeros(count, np.uint16),
         np.arange(count),
-        *[unknown] * 4,
-        each("noise", noise),
-        each("gain", gain),
-        np.full((count, 2), np.nan),
+        x=unknown,
+        y=unknown,
+        flux=unknown,
+        background=unknown,
+        noise=each("noise", noise),
+        gain=each("gain", gain),
+        listed=np.full((count, 2), np.nan),
     )
 
 
@@ -161,7 +164,7 @@ class Wavefronts:
     @property
     def star(self) -> np.ndarray:
         """Stars with usable pixels, (m,)."""
-        return self.modes.star[self.modes.first]
+        return np.asarray(self.modes.star[self.modes.first])
 
     @cached_property
     def draws(self) -> np.ndarray:
@@ -172,7 +175,7 @@ class Wavefronts:
     def coefficients(self) -> np.ndarray:
         """Draws of the coefficients in waves, (m, s, K)."""
         k = len(self.terms.names)
-        return (
+        return np.asarray(
             self.terms.mean[self.star, None]
             + self.terms.sd[self.star, None] * (self.draws[..., :k])
         )
@@ -214,7 +217,7 @@ class Wavefronts:
 
     def _laplace(self, mode: int) -> np.ndarray:
         k, sd = len(self.terms.names), self.terms.sd[self.modes.star[mode]]
-        return self.modes.covariance[mode, :k, :k] * sd * sd[:, None]
+        return np.asarray(self.modes.covariance[mode, :k, :k] * sd * sd[:, None])
 
     def interval(self, probability: float = 0.6827) -> np.ndarray:
         """Central intervals of the coefficients over all modes, (n, K, 2) in waves."""

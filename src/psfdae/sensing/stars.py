@@ -151,7 +151,7 @@ class StarOptics:
 
     def coefficients(self, star: np.ndarray, z: np.ndarray) -> np.ndarray:
         """Coefficients in waves, (m, K), of standardised ones z (m, K) of stars (m,)."""
-        return self.terms.mean[star] + self.terms.sd[star] * z
+        return np.asarray(self.terms.mean[star] + self.terms.sd[star] * z)
 
     def modes(self, star: np.ndarray, z: np.ndarray, place: np.ndarray) -> np.ndarray:
         """Coefficients of the pupil's modes (m, J + 2); `place` (m, 2) is x, y in pixels."""
@@ -218,7 +218,9 @@ class Photons:
     @property
     def usable(self) -> np.ndarray:
         """Stars with enough pixels and a noise, (n,)."""
-        return (np.isfinite(self.counts).mean(axis=1) >= LEAST_PIXELS) & np.isfinite(self.noise)
+        return np.asarray(
+            (np.isfinite(self.counts).mean(axis=1) >= LEAST_PIXELS) & np.isfinite(self.noise)
+        )
 
 
 @dataclass(frozen=True)
@@ -252,7 +254,7 @@ class Modes:
     def probability(self) -> np.ndarray:
         """Part of its star's mass that every mode has, (M,)."""
         mass = np.exp(self.evidence - best_of_group(self.evidence, self.star))
-        return mass / np.bincount(self.star, mass)[self.star]
+        return np.asarray(mass / np.bincount(self.star, mass)[self.star])
 
     @property
     def first(self) -> np.ndarray:
@@ -377,7 +379,9 @@ class Search:
         k = optics.count
         limit = np.array([FARTHEST_Z] * k + [optics.reach_px] * 2 + [np.inf] * 2)
 
-        def evaluate(some: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, ...]:
+        def evaluate(
+            some: np.ndarray, numbers: np.ndarray
+        ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             members = star[some]
             stamps, slopes = optics.derivatives(members, numbers[:, :k], numbers[:, k : k + 2])
             mean, slopes = self.expected(members, stamps, slopes, numbers[:, k:])

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -25,8 +24,8 @@ from psfdae.optics.wavefronts import (
     zernike_images,
 )
 from psfdae.settings import ConfigError
-from psfdae.telescope.aberrations import Seidel, Zernike
-from psfdae.telescope.settings import OwnTelescope, Prior
+from psfdae.telescope.aberrations import Raytraced, Seidel, Zernike
+from psfdae.telescope.settings import OwnTelescope
 
 SEEN_SEIDEL = SEIDEL_TERMS[:-1]
 """Distortion is a tilt."""
@@ -83,6 +82,7 @@ def static_zernikes(
     if isinstance(aberrations, Zernike):
         field = relative(telescope, angle_deg)
         return aberrations.noll, field_coefficients(aberrations.polynomials, field)
+    assert isinstance(aberrations, Raytraced), "Seidel's terms are no Zernike terms"
     noll = tuple(range(FIRST_NOLL, aberrations.highest_zernike + 1))
     return noll, traced(telescope, angle_deg)
 
@@ -101,6 +101,7 @@ def traced(
     from psfdae.telescope.raytracing import ZernikeTracer, build_optic, misaligned
 
     own = telescope.aberrations
+    assert isinstance(own, Raytraced)
     defocus_m = own.defocus_m if defocus_m is None else defocus_m
     with needed_by(f"{telescope.name}: a ray trace"):
         optic = build_optic(own.prescription, telescope, defocus_m)
@@ -109,7 +110,7 @@ def traced(
         optic, telescope.wavelength_m, np.deg2rad(angle_deg), np.zeros(4), own.highest_zernike
     )
     # The trace counts the lead of the wavefront, an OPD its delay.
-    return -tracer(np.zeros((1, 4)))[0]
+    return np.asarray(-tracer(np.zeros((1, 4)))[0])
 
 
 def terms_of(telescope: OwnTelescope, angle_deg: np.ndarray) -> Terms:
@@ -122,7 +123,7 @@ def terms_of(telescope: OwnTelescope, angle_deg: np.ndarray) -> Terms:
     """
     prior, aberrations = telescope.prior, telescope.aberrations
     if isinstance(aberrations, Seidel):
-        names = SEEN_SEIDEL
+        names: tuple[str, ...] = SEEN_SEIDEL
         field = relative(telescope, angle_deg)
         each = np.eye(len(SEIDEL_TERMS))[: len(names)]
         to_modes = monomial_coefficients(each, field[:, None])
@@ -215,12 +216,14 @@ def _of_the_optics(telescope: OwnTelescope, angle_deg: np.ndarray) -> FieldModel
 
         return FieldModel(names, ("wave",) * len(names), mean[kept], sd[kept], seidel)
     if isinstance(aberrations, Zernike):
-        return _polynomials(telescope, np.asarray(angle_deg, float), prior)
-    return _ray_trace(telescope, np.asarray(angle_deg, float), prior)
+        return _polynomials(telescope, aberrations, np.asarray(angle_deg, float))
+    return _ray_trace(telescope, aberrations, np.asarray(angle_deg, float))
 
 
-def _polynomials(telescope: OwnTelescope, angle_deg: np.ndarray, prior: Prior) -> FieldModel:
-    aberrations: Any = telescope.aberrations
+def _polynomials(
+    telescope: OwnTelescope, aberrations: Zernike, angle_deg: np.ndarray
+) -> FieldModel:
+    prior = telescope.prior
     field, noll = relative(telescope, angle_deg), [j for j in aberrations.noll if j >= FIRST_NOLL]
     rows = [(j, name) for j in noll for name in aberrations.terms[f"z{j}"]]
     basis = np.zeros((len(rows), len(field), len(noll)))
@@ -242,8 +245,8 @@ def _polynomials(telescope: OwnTelescope, angle_deg: np.ndarray, prior: Prior) -
     )
 
 
-def _ray_trace(telescope: OwnTelescope, angle_deg: np.ndarray, prior: Prior) -> FieldModel:
-    own: Any = telescope.aberrations
+def _ray_trace(telescope: OwnTelescope, own: Raytraced, angle_deg: np.ndarray) -> FieldModel:
+    prior = telescope.prior
     if own.prescription.secondary is not None:
         to_radians = np.array([1.0, 1.0, np.deg2rad(1.0), np.deg2rad(1.0)])
         return FieldModel(

@@ -24,6 +24,8 @@ from psfdae.errors import Error
 from psfdae.optics.wavefronts import FIRST_NOLL, noll_to_nm, zernike_basis
 
 if TYPE_CHECKING:
+    from batoid import CompoundOptic
+
     from psfdae.telescope.aberrations import Lens, Mirror, Prescription
     from psfdae.telescope.settings import Telescope
 
@@ -43,7 +45,7 @@ class RayTracingError(Error, ValueError):
     """A state of misalignment or a field that the telescope cannot serve."""
 
 
-def misaligned(optic: Any, misalignment: np.ndarray) -> Any:
+def misaligned(optic: CompoundOptic, misalignment: np.ndarray) -> CompoundOptic:
     """The telescope with its item M2, the secondary, displaced; `optic` stays as it is.
 
     `misalignment` is a decentre x, y in metres and a tilt about x, y in radians; 0 is the
@@ -100,7 +102,12 @@ class ZernikeTracer:
     """
 
     def __init__(
-        self, optic: Any, wavelength: float, fields: np.ndarray, unit: np.ndarray, highest: int
+        self,
+        optic: CompoundOptic,
+        wavelength: float,
+        fields: np.ndarray,
+        unit: np.ndarray,
+        highest: int,
     ) -> None:
         import batoid
 
@@ -161,7 +168,7 @@ class ZernikeTracer:
         pupil = slice(0, self._weights.size)
         landing, velocity = (a.reshape(*lost.shape, 3)[:, pupil] for a in (rays.r, rays.v))
         lead = self._lead(landing, velocity, rays.t.reshape(lost.shape)[:, pupil])
-        return (lead @ self._fit.T)[:, FIRST_NOLL - 1 :]
+        return np.asarray((lead @ self._fit.T)[:, FIRST_NOLL - 1 :])
 
     def _lead(self, landing: np.ndarray, velocity: np.ndarray, path: np.ndarray) -> np.ndarray:
         """Lead of every ray on the mean of its field at the reference sphere, in waves."""
@@ -172,7 +179,7 @@ class ZernikeTracer:
         # Back along the ray to the sphere, |offset + s·direction| = radius with s < 0.
         beyond = (offset**2).sum(-1) - self.optic.sphereRadius**2
         path = path - along - np.sqrt(along**2 - beyond)
-        return (path @ self._weights[:, None] - path) / self.wavelength
+        return np.asarray((path @ self._weights[:, None] - path) / self.wavelength)
 
 
 def annulus_points(highest: int, obscuration: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -203,7 +210,9 @@ def annulus_points(highest: int, obscuration: float) -> tuple[np.ndarray, np.nda
     return x.ravel(), y.ravel(), np.repeat(0.5 * weights / spokes, spokes)
 
 
-def build_optic(prescription: Prescription, telescope: Telescope, defocus: float = 0.0) -> Any:
+def build_optic(
+    prescription: Prescription, telescope: Telescope, defocus: float = 0.0
+) -> CompoundOptic:
     """The aligned telescope, a batoid.CompoundOptic with items M1, D, and M2 and lenses if any.
 
     `defocus` is the distance of the detector beyond best focus, in metres. batoid is

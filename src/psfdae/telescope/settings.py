@@ -127,7 +127,7 @@ class OwnTelescope(Telescope):
         }
 
 
-def has_own_aberrations(tree: Any) -> bool:
+def has_own_aberrations(tree: object) -> bool:
     """Whether a telescope, checked or not yet, brings aberrations of its own."""
     own = {"aberrations", "field_edge_deg", "seeing", "prior"}
     return isinstance(tree, OwnTelescope) or (isinstance(tree, Mapping) and bool(own & set(tree)))
@@ -169,7 +169,8 @@ def _composed(path: Path, within: tuple[Path, ...] = ()) -> dict[str, Any]:
     if path in within:
         raise ConfigError(f"{path}: defaults: it names itself")
     tree = read_yaml(path)
-    entries, whole = tree.pop("defaults", []), {}
+    entries = tree.pop("defaults", [])
+    whole: dict[str, Any] = {}
     if not isinstance(entries, list):
         raise ConfigError(f"{path}: defaults = {entries!r}: must be a list")
     for entry in [*entries, *([] if "_self_" in entries else ["_self_"])]:

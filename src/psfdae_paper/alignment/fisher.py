@@ -127,7 +127,10 @@ def bound_covariances(
 
 def expected_abs_error(covariances: np.ndarray) -> np.ndarray:
     """Mean absolute error of normal errors, √(2/π) σ, (..., K, K) to (..., K)."""
-    return np.sqrt(2.0 / np.pi) * np.sqrt(np.diagonal(covariances, axis1=-2, axis2=-1))
+    expected: np.ndarray = np.sqrt(2.0 / np.pi) * np.sqrt(
+        np.diagonal(covariances, axis1=-2, axis2=-1)
+    )
+    return expected
 
 
 def coma_free_decentre(model: QuadraticModel, tilts: np.ndarray, noll: np.ndarray) -> np.ndarray:

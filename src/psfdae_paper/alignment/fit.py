@@ -61,7 +61,7 @@ def fit_states(
     settings : config group `fit`
     """
 
-    def evaluate(some: np.ndarray, states: np.ndarray) -> tuple[np.ndarray, ...]:
+    def evaluate(some: np.ndarray, states: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         deviance, score, fisher = likelihood.evaluate(images[some], states)
         return -0.5 * deviance, score, fisher
 

@@ -15,7 +15,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain, pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -23,7 +22,7 @@ from scipy.linalg import eigh
 from torch import nn
 
 from psfdae.networks.training import Row, Training
-from psfdae.networks.weights import with_weights
+from psfdae.networks.weights import channels_last, with_weights
 from psfdae.noise import NoiseModel, mixed_levels
 from psfdae.rng import stream
 from psfdae_paper.alignment.telescope import Mirror, mirror_symmetries
@@ -66,11 +65,15 @@ class AlignmentCnn(nn.Module):
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Map scaled stamps (B, fields, d, d) to states (B, 4)."""
-        return self.linear(self.features(x).flatten(1))
+        states: torch.Tensor = self.linear(self.features(x).flatten(1))
+        return states
 
 
 class AlignmentPerceptron(nn.Module):
     """The same behind principal components; parameters as for `AlignmentCnn`."""
+
+    mean: torch.Tensor
+    axes: torch.Tensor
 
     def __init__(self, config: Perceptron, fields: int, stamp_px: int) -> None:
         super().__init__()
@@ -92,7 +95,8 @@ class AlignmentPerceptron(nn.Module):
 
     def state_of(self, components: torch.Tensor) -> torch.Tensor:
         """States (B, 4) of principal components."""
-        return self.linear(self.features(components))
+        states: torch.Tensor = self.linear(self.features(components))
+        return states
 
     def look_at(self, clean: torch.Tensor, seen: torch.Tensor) -> None:
         """Take the components of noise-free stamps, scaled to variance 1 of those that are seen.
@@ -112,21 +116,25 @@ class AlignmentPerceptron(nn.Module):
         self.axes.copy_(axes / spread.clamp_min(torch.finfo(spread.dtype).tiny))
 
 
-def empty_network(config: Cnn | Perceptron, fields: int, stamp_px: int) -> nn.Module:
+Network = AlignmentCnn | AlignmentPerceptron
+
+
+def empty_network(config: Cnn | Perceptron, fields: int, stamp_px: int) -> Network:
     """The network of a configuration, its weights still to come."""
-    kind: Any = AlignmentCnn if isinstance(config, Cnn) else AlignmentPerceptron
-    return kind(config, fields, stamp_px)  # type: ignore[no-any-return]
+    if isinstance(config, Cnn):
+        return AlignmentCnn(config, fields, stamp_px)
+    return AlignmentPerceptron(config, fields, stamp_px)
 
 
 def build_network(
     config: Cnn | Perceptron, fields: int, stamp_px: int, generator: torch.Generator
-) -> nn.Module:
+) -> Network:
     """A fresh network whose weights come from `generator` alone.
 
     Inner layers draw N(0, 2/fan_in) (He et al. 2015), the last one PyTorch's uniform
     ±1/√fan_in; its bias is 0, the middle of the range.
     """
-    model = empty_network(config, fields, stamp_px).to(memory_format=torch.channels_last)
+    model = channels_last(empty_network(config, fields, stamp_px))
     leak = getattr(config, "leak", 0.0)
     with torch.no_grad():
         for layer in model.features:
@@ -142,7 +150,7 @@ def build_network(
     return model
 
 
-def load_network(config: Cnn | Perceptron, fields: int, stamp_px: int, weights: Path) -> nn.Module:
+def load_network(config: Cnn | Perceptron, fields: int, stamp_px: int, weights: Path) -> Network:
     """Network of a configuration with weights from a file; raises ProductError."""
     return with_weights(lambda: empty_network(config, fields, stamp_px), weights)
 
@@ -166,7 +174,8 @@ def predict_states(
     if mirrors:
         # The inverse of an orthogonal matrix is its transpose.
         each = [predict_states(model, m.stamps(stamps), batch) @ m.state for m in mirrors]
-        return np.mean(each, axis=0)
+        mean: np.ndarray = np.mean(each, axis=0)
+        return mean
     parts = [
         model(_scaled(stamps[start : start + batch])).numpy()
         for start in range(0, len(stamps), batch)
@@ -264,12 +273,13 @@ class NetworkTraining(Training):
     def _shown(self, chosen: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Stamps of chosen states, in one of the draws if there are several."""
         stamps = self.data.stamps
-        if stamps.ndim == 4:
-            return stamps[chosen]
-        fields = np.arange(stamps.shape[2])
-        return stamps[
-            rng.integers(len(stamps), size=(chosen.size, fields.size)), chosen[:, None], fields
-        ]
+        if stamps.ndim == 5:
+            fields = np.arange(stamps.shape[2])
+            draw = rng.integers(len(stamps), size=(chosen.size, fields.size))
+            shown: np.ndarray = stamps[draw, chosen[:, None], fields]
+        else:
+            shown = stamps[chosen]
+        return shown
 
     def _examples(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Stamps in all mirror images, as they are and as the network sees them."""
@@ -302,8 +312,15 @@ class PerceptronTraining(NetworkTraining):
 
     model: AlignmentPerceptron
 
-    def __init__(self, *arguments: Any) -> None:
-        super().__init__(*arguments)
+    def __init__(
+        self,
+        data: TrainingStates,
+        network: Cnn | Perceptron,
+        settings: NetworkTrain,
+        seed: int,
+        name: str,
+    ) -> None:
+        super().__init__(data, network, settings, seed, name)
         self.parts = self._parts()
         fields, side = self.data.stamps.shape[-3], self.data.stamps.shape[-1]
         axes = self.model.axes.numpy()
@@ -338,7 +355,9 @@ class PerceptronTraining(NetworkTraining):
         mean, axes = (a.double().numpy() for a in (self.model.mean, self.model.axes))
         psf = np.maximum(mean / to_mean, 0.0)
         sigma = [to_mean * np.sqrt(law.variance(psf, level)) for level in self.data.noise.levels]
-        return [np.linalg.qr(s[:, None] * axes, mode="r").astype(np.float32) for s in sigma]
+        # One array in this mode, which numpy's annotations do not know.
+        roots = (np.asarray(np.linalg.qr(s[:, None] * axes, mode="r")) for s in sigma)
+        return [root.astype(np.float32) for root in roots]
 
     def batches(self, epoch: int) -> Iterator[tuple[torch.Tensor, ...]]:
         """Components (B, K) and states (B, 4)."""
@@ -366,7 +385,9 @@ class PerceptronTraining(NetworkTraining):
         return nn.functional.mse_loss(self.model.state_of(components), states)
 
 
-def training_of(network: Cnn | Perceptron, data: TrainingStates, *rest: Any) -> NetworkTraining:
+def training_of(
+    network: Cnn | Perceptron, data: TrainingStates, settings: NetworkTrain, seed: int, name: str
+) -> NetworkTraining:
     """The training of a kind of network; arguments as those of `NetworkTraining`."""
     kind = NetworkTraining if isinstance(network, Cnn) else PerceptronTraining
-    return kind(data, network, *rest)
+    return kind(data, network, settings, seed, name)

@@ -41,7 +41,8 @@ def mean_slope(j: int, obscuration: float) -> tuple[float, float]:
     n, m = noll_to_nm(j)
     if abs(m) != 1:
         return 0.0, 0.0
-    inner = obscuration * float(radial_polynomial(n, m, np.float64(obscuration)))
+    rim = radial_polynomial(n, m, np.float64(obscuration))  # type: ignore[arg-type]  # at one radius
+    inner = obscuration * float(rim)
     slope = float(np.sqrt(2.0 * (n + 1.0)) * (1.0 - inner) / (1.0 - obscuration**2))
     return (slope, 0.0) if m > 0 else (0.0, slope)
 

@@ -97,7 +97,8 @@ class Mirror:
 
     def states(self, states: np.ndarray) -> np.ndarray:
         """Mirrored states, shape (n, 4)."""
-        return states @ self.state.T
+        mirrored: np.ndarray = states @ self.state.T
+        return mirrored
 
     def stamps(self, stamps: np.ndarray) -> np.ndarray:
         """Stamps of the mirrored states, shape (n, F, d, d)."""
@@ -152,11 +153,13 @@ class QuadraticModel:
 
     def __call__(self, states: np.ndarray) -> np.ndarray:
         """Zernike coefficients of states, (n, 4) to (n, F, J), in waves."""
-        return np.einsum("nt,ftj->nfj", quadratic_terms(states), self.coefficients)
+        zernikes: np.ndarray = np.einsum("nt,ftj->nfj", quadratic_terms(states), self.coefficients)
+        return zernikes
 
     def jacobian(self, states: np.ndarray) -> np.ndarray:
         """Derivatives by the four numbers of a state, shape (n, F, 4, J), in waves per range."""
-        return np.einsum("nkt,ftj->nfkj", term_slopes(states), self.coefficients)
+        slopes: np.ndarray = np.einsum("nkt,ftj->nfkj", term_slopes(states), self.coefficients)
+        return slopes
 
 
 def fit_quadratic(states: np.ndarray, zernikes: np.ndarray) -> QuadraticModel:
@@ -185,7 +188,7 @@ def verify(
     ModelError
         If it exceeds `tolerance` anywhere; names the state, the field and the RMS.
     """
-    residual = np.sqrt(((model(states) - zernikes) ** 2).sum(axis=-1))
+    residual: np.ndarray = np.sqrt(((model(states) - zernikes) ** 2).sum(axis=-1))
     if not residual.max() <= tolerance:
         state, field = np.unravel_index(residual.argmax(), residual.shape)
         raise ModelError(

@@ -11,6 +11,8 @@ from psfdae.files import Column, Product
 from psfdae.metrics import mse
 from psfdae.model.star_sets import noisy_test_images, split_stars
 from psfdae.rng import stream
+from psfdae.settings import ConfigError
+from psfdae.telescope.aberrations import Seidel
 from psfdae_paper.bounds.posterior import (
     MIRROR_MARGIN,
     Bank,
@@ -63,10 +65,8 @@ class BoundedStars:
 
     def take(self, stars: np.ndarray) -> BoundedStars:
         """Some of the stars, in the order given."""
-        truth, noisy = (
-            {key: images[stars] for key, images in kind.items()}
-            for kind in (self.truth, self.noisy)
-        )
+        truth = {name: images[stars] for name, images in self.truth.items()}
+        noisy = {level: images[stars] for level, images in self.noisy.items()}
         return BoundedStars(self.star[stars], self.field[stars], truth, noisy)
 
 
@@ -121,7 +121,8 @@ class Estimates:
     @property
     def ess(self) -> np.ndarray:
         """Effective sample size of every star."""
-        return self.full[-1]
+        size: np.ndarray = self.full[-1]
+        return size
 
     def improved(self, few: np.ndarray, other: Estimates | None) -> tuple[Estimates, int]:
         """With another one of the stars `few` where it has more samples, and for how many."""
@@ -206,8 +207,16 @@ def static_psfs(config: Config) -> np.ndarray:
 
 
 def stamp_model(config: Config) -> StampModel:
-    """Stamps of a dataset's stars as functions of their coefficients."""
-    mean = np.array(config.wavefront.coefficients)
+    """Stamps of a dataset's stars as functions of their coefficients.
+
+    Raises
+    ------
+    ConfigError
+        If their aberrations are no Seidel terms.
+    """
+    if not isinstance(config.wavefront, Seidel):
+        raise ConfigError(f"wavefront.kind = {config.wavefront.kind}: must be seidel")
+    mean = config.wavefront.coefficients
     spread = config.stars.aberration_fraction * np.abs(mean)
     field = relative_field(config.grid)
     return StampModel(mean, spread, field, config.telescope, config.optics, config.framing)

@@ -43,7 +43,8 @@ def local_error(derivatives: np.ndarray, prior_sd: np.ndarray, variance: np.ndar
     information = weighted @ jacobian.swapaxes(1, 2) + np.eye(terms)
     spread = jacobian @ jacobian.swapaxes(1, 2)
     trace = np.trace(np.linalg.solve(information, spread), axis1=1, axis2=2)
-    return trace / jacobian.shape[-1]
+    floor: np.ndarray = trace / jacobian.shape[-1]
+    return floor
 
 
 TOLERANCE = 0.05

@@ -64,7 +64,8 @@ class Bank:
     def log_weights(self) -> np.ndarray:
         """Logarithm of `weights`, −∞ for zero, shape (M, 8)."""
         with np.errstate(divide="ignore"):
-            return np.log(weights(self.field, self.peak, self.points))
+            logs: np.ndarray = np.log(weights(self.field, self.peak, self.points))
+            return logs
 
 
 def weights(field: np.ndarray, peak: np.ndarray, points: int) -> np.ndarray:
@@ -99,7 +100,8 @@ def weights(field: np.ndarray, peak: np.ndarray, points: int) -> np.ndarray:
 
 def jitters(jitter_px: int) -> list[tuple[int, int]]:
     """All centring errors (row, column) of up to `jitter_px` pixels per axis."""
-    return list(product(range(-jitter_px, jitter_px + 1), repeat=2))
+    shifts = range(-jitter_px, jitter_px + 1)
+    return list(product(shifts, shifts))
 
 
 def windows(jitter_px: int) -> dict[tuple[int, int], list[tuple[int, int]]]:
@@ -237,19 +239,24 @@ class PosteriorSums:
     def mean_image(self) -> np.ndarray:
         """Posterior mean of the noise-free image, shape (n, P); NaN where none was possible."""
         with np.errstate(invalid="ignore"):
-            return self.image / self.total[:, None]
+            mean: np.ndarray = self.image / self.total[:, None]
+            return mean
 
     @property
     def effective_size(self) -> np.ndarray:
         """Effective sample size 1/Σw² of the normalised weights, shape (n,)."""
-        return self.total**2 / np.maximum(self.square, np.finfo(float).tiny)
+        size: np.ndarray = self.total**2 / np.maximum(self.square, np.finfo(float).tiny)
+        return size
 
     @property
     def variance(self) -> np.ndarray:
         """Posterior variance of every pixel of the noise-free image, (n, P); NaN as above."""
         with np.errstate(invalid="ignore"):
             # Rounding makes none of it negative.
-            return np.maximum(self.power / self.total[:, None] - self.mean_image**2, 0.0)
+            variance: np.ndarray = np.maximum(
+                self.power / self.total[:, None] - self.mean_image**2, 0.0
+            )
+        return variance
 
     def template(self, templates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Posterior mean and variance of the static PSF, (n, P) both; NaN as `mean_image`.
@@ -499,11 +506,11 @@ def nested_means(
         size *= 2
 
 
-def last_change(errors: Sequence[float]) -> float:
+def last_change(errors: Sequence[float] | np.ndarray) -> float:
     """|error(M/4)/error(M) − 1| of banks that double in size; NaN for fewer than three."""
     if len(errors) < 3:
         return float("nan")
-    return abs(errors[-3] / errors[-1] - 1.0)
+    return float(abs(errors[-3] / errors[-1] - 1.0))
 
 
 def extrapolate(draws: np.ndarray, errors: np.ndarray) -> tuple[float, float, float]:
@@ -532,7 +539,8 @@ def extrapolate(draws: np.ndarray, errors: np.ndarray) -> tuple[float, float, fl
 
     def misfit(parameters: np.ndarray) -> np.ndarray:
         limit, excess, exponent = parameters
-        return (limit + excess * size**-exponent) / ratio - 1.0
+        relative: np.ndarray = (limit + excess * size**-exponent) / ratio - 1.0
+        return relative
 
     start = (0.9, max(ratio[-1] - 0.9, 1e-3), 0.7)
     fit = least_squares(misfit, start, bounds=((0.0, 0.0, 0.05), (1.0, np.inf, 3.0)), xtol=1e-12)

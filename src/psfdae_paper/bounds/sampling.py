@@ -288,7 +288,8 @@ class Modes:
     @property
     def group(self) -> np.ndarray:
         """The same number for modes of a star that were found with as much given, (M,)."""
-        return (TRUTH + 1) * self.star + self.given
+        number: np.ndarray = (TRUTH + 1) * self.star + self.given
+        return number
 
     @property
     def mixture(self) -> Mixture:
@@ -298,7 +299,10 @@ class Modes:
     def log_density(self, z: np.ndarray, field: np.ndarray, offset: np.ndarray) -> np.ndarray:
         """Log-density of Student's t around every mode, shape (M, n), of draws (n, 5)."""
         mixture = self.mixture
-        return mixture.log_density(mixture.distance(z)) + self._elsewhere(field, offset)
+        density: np.ndarray = mixture.log_density(mixture.distance(z)) + self._elsewhere(
+            field, offset
+        )
+        return density
 
     def _elsewhere(self, field: np.ndarray, offset: np.ndarray) -> np.ndarray:
         """−∞ for draws of another field or offset, otherwise 0, shape (M, n)."""
@@ -482,7 +486,8 @@ def best_matches(
         rows += [(star, field, scores[field].argmax(), NOTHING) for field in top]
         if own is None:
             continue
-        mine, seen = own[star], set()
+        mine = own[star]
+        seen: set[tuple[int, ...]] = set()
         for column in np.argsort(-scores[mine], kind="stable"):
             offset = tuple(middle[which[star, mine, column], column])
             if np.isfinite(scores[mine, column]) and offset not in seen and len(seen) < offsets:
@@ -500,7 +505,8 @@ def log_posterior(
     """Σ n ln(1 + F p/B) − F Σp − |z|²/2 of stamps and counts (n, P), without constants."""
     ratio = np.log1p(stamps * (likelihood.flux / likelihood.background), dtype=np.float64)
     light = likelihood.flux * stamps.sum(axis=-1, dtype=np.float64)
-    return (ratio * counts).sum(axis=-1) - light - 0.5 * (z**2).sum(axis=-1)
+    height: np.ndarray = (ratio * counts).sum(axis=-1) - light - 0.5 * (z**2).sum(axis=-1)
+    return height
 
 
 def climb(modes: Modes, counts: np.ndarray, likelihood: Likelihood, model: StampModel) -> Modes:
@@ -557,7 +563,7 @@ def _climbed(
 ) -> Peaks:
     """Maxima over z and coefficients of further directions `more` (K, 8), normal like z."""
 
-    def evaluate(some: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, ...]:
+    def evaluate(some: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         field = modes.field[some]
         coefficients = model.coefficients(z[:, :TERMS], field) + z[:, TERMS:] @ more
         directions = np.concatenate(
@@ -835,7 +841,8 @@ class _Sampler:
                 + modes.log_density(self.draws.z, self.draws.field, self.draws.offset)
                 for modes, number in self.mixtures
             ]
-        return self.height - np.logaddexp.reduce(np.concatenate(parts), axis=0)
+        weight: np.ndarray = self.height - np.logaddexp.reduce(np.concatenate(parts), axis=0)
+        return weight
 
     def parts(self, model: StampModel) -> list[PosteriorSums]:
         """Sums of every part without the field, then of every part with the field given."""

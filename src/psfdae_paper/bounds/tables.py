@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator, Mapping, Set
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -76,9 +76,9 @@ class Tables:
     def __init__(self, dataset: str, stars: BoundedStars) -> None:
         self.dataset = dataset
         self.stars = stars
-        self.summary: list[dict[str, Any]] = []
+        self.summary: list[dict[str, object]] = []
         self.per_star: list[pd.DataFrame] = []
-        self.growth: list[dict[str, Any]] = []
+        self.growth: list[dict[str, object]] = []
 
     def add(
         self,
@@ -98,11 +98,11 @@ class Tables:
         """
         import pandas as pd
 
-        key = {"dataset": self.dataset, "split": SPLIT, "reference": reference, "method": method}
-        key["noise_level"] = level
+        key: dict[str, object] = {"dataset": self.dataset, "split": SPLIT, "reference": reference}
+        key |= {"method": method, "noise_level": level}
         known = np.isfinite(values["mse"])
         field = self.stars.field[known]
-        common: dict[str, Any] = {"n": field.size, "missing": int((~known).sum()), **reached}
+        common: dict[str, object] = {"n": field.size, "missing": int((~known).sum()), **reached}
         common["missing_stars"] = " ".join(map(str, self.stars.star[~known]))
         common |= {"tight": "yes" if tight else "no", "found": found}
         for metric in [name for name in ("mse", "p_right") if name in values]:
@@ -168,8 +168,7 @@ def add_means(
         likelihood = Likelihood.of(noise_model(config), level, bank.stamps((bank.margin,) * 2))
         over_banks, sparse = {}, np.zeros(stars.star.size, bool)
         for method, given in POSTERIOR_MEANS.items():
-            draws = larger if given else bank
-            sizes = weighed(draws, given, static, stars, level, likelihood)
+            sizes = weighed(larger if given else bank, given, static, stars, level, likelihood)
             _grown(tables, method, level, sizes)
             over_banks[method] = max(sizes), Estimates.over_bank(sizes)
             sparse |= over_banks[method][1].ess < ENOUGH_ESS
@@ -238,13 +237,21 @@ def add_exact(config: Config, static: np.ndarray, tables: Tables) -> None:
 
 
 def compared(
-    key: dict[str, Any], methods: pd.DataFrame, bounded: pd.DataFrame, tight: set[tuple[Any, ...]]
-) -> Iterator[dict[str, Any]]:
-    """Rows of one dataset, reference and λ: every method beside every bound it has to respect."""
+    key: Mapping[str, object],
+    methods: pd.DataFrame,
+    bounded: pd.DataFrame,
+    tight: Set[tuple[str, str, str, str]],
+) -> Iterator[dict[str, object]]:
+    """Rows of one dataset, reference and λ: every method beside every bound it has to respect.
+
+    `tight` has dataset, reference, bound and λ, in six digits, of those that are tight.
+    """
     place = f"{key['dataset']}, {key['reference']}, λ = {key['noise_level']:g}"
-    for bound, limits in bounded.groupby("method", sort=False):
+    for bound in bounded["method"].unique():
+        limits = bounded[bounded["method"] == bound]
         sharp = (key["dataset"], key["reference"], bound, f"{key['noise_level']:.6g}") in tight
-        for method, errors in methods.groupby("method", sort=False):
+        for method in methods["method"].unique():
+            errors = methods[methods["method"] == method]
             if bound != "floor" and (
                 method in POSTERIOR_MEANS
                 or POSTERIOR_MEANS[bound] != method_named(method).needs.position
@@ -267,7 +274,9 @@ def compared(
             judged = (bound == "floor" or sharp) and (~estimated).mean() <= FEW
             paired = paired[estimated]
             found = compare(
-                *(paired[column].to_numpy() for column in ("mse", "mse_bound", "field")),
+                paired["mse"].to_numpy(),
+                paired["mse_bound"].to_numpy(),
+                paired["field"].to_numpy(),
                 FLOOR_TOLERANCE if bound == "floor" else TOLERANCE,
             )
             yield {

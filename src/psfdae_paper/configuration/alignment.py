@@ -103,7 +103,7 @@ class Perceptron(Group):
     )
 
 
-NETWORKS = {"cnn": Cnn, "perceptron": Perceptron}
+NETWORKS: dict[str, type[Cnn] | type[Perceptron]] = {"cnn": Cnn, "perceptron": Perceptron}
 """Groups of the configuration that are the settings of a network."""
 
 

@@ -5,10 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from psfdae import cli
 from psfdae.settings import ConfigError
+
+if TYPE_CHECKING:
+    from psfdae_paper.configuration.schema import Config
+
+Function = TypeVar("Function", bound=Callable[..., None])
 
 
 @dataclass(frozen=True)
@@ -25,7 +30,9 @@ class Groups:
         """Names of the groups that a command with these options reads."""
         return self.reads(**options) if callable(self.reads) else self.reads
 
-    def __call__(self, options: Mapping[str, Any], file: Path | None, words: Sequence[str]) -> Any:
+    def __call__(
+        self, options: Mapping[str, Any], file: Path | None, words: Sequence[str]
+    ) -> Config:
         """The checked groups, from a file that the workflow has written, or from overrides."""
         from psfdae_paper.configuration.compose import load_settings, load_stage
 
@@ -46,6 +53,6 @@ def command(
     name: str,
     reads: tuple[str, ...] | Callable[..., tuple[str, ...]] = (),
     choice: tuple[str, ...] = (),
-) -> Callable[..., Any]:
+) -> Callable[[Function], Function]:
     """`psfdae.cli.command`, whose `config` has groups of the configuration as attributes."""
     return cli.command(name, Groups(reads, choice))

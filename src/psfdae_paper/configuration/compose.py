@@ -10,7 +10,7 @@ from contextlib import suppress
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, cast
 
 from pydantic import create_model
 
@@ -22,7 +22,7 @@ from psfdae_paper.configuration.base import config_dir
 from psfdae_paper.configuration.consistency import stage_model, with_derived
 from psfdae_paper.configuration.methods import all_groups, methods_in
 from psfdae_paper.configuration.outline import filled, outline_of
-from psfdae_paper.configuration.schema import whole_config
+from psfdae_paper.configuration.schema import Config, whole_config
 
 ROOT = "config.yaml"
 
@@ -98,8 +98,8 @@ def _kept(overrides: tuple[str, ...], outline: str = "") -> dict[str, Any]:
 def _made_of(overrides: tuple[str, ...], outline: str) -> str:
     """Hash of all that a composition is made of, "" if a resolver may add more."""
     folder = config_dir()
-    words = (overrides, outline, all_groups(), _class_defaults())
-    words += (version("hydra-core"), version("omegaconf"))
+    versions = version("hydra-core"), version("omegaconf")
+    words = (overrides, outline, all_groups(), _class_defaults(), *versions)
     parts = [repr(words).encode(), Path(__file__).read_bytes()]
     for path in sorted(folder.rglob("*.yaml")):
         parts += [str(path.relative_to(folder)).encode(), path.read_bytes()]
@@ -120,7 +120,7 @@ def _by_hydra(overrides: tuple[str, ...], outline: str = "") -> dict[str, Any]:
     try:
         with hydra.initialize_config_dir(str(folder), version_base="1.3"):
             tree = hydra.compose(_primary(folder), overrides=list(overrides))
-        resolved = OmegaConf.to_container(tree, resolve=True, throw_on_missing=True)
+        resolved: Any = OmegaConf.to_container(tree, resolve=True, throw_on_missing=True)
     except Exception as error:  # what a broken file leads to inside Hydra is beyond listing
         raise ConfigError(_reason(error, folder)) from error
     if not isinstance(resolved, dict):
@@ -179,7 +179,7 @@ def _reason(error: Exception, folder: Path) -> str:
     return f"config: {_first_lines(error)}"
 
 
-def load(overrides: Sequence[str] = ()) -> Any:
+def load(overrides: Sequence[str] = ()) -> Config:
     """Compose and check the whole configuration of a dataset, or all that scene 3 reads of it.
 
     Raises
@@ -190,7 +190,7 @@ def load(overrides: Sequence[str] = ()) -> Any:
     return checked(compose(overrides))
 
 
-def checked(tree: Mapping[str, Any]) -> Any:
+def checked(tree: Mapping[str, Any]) -> Config:
     """As `load`, of a tree that is composed."""
     if not _aligns(tree):
         return validate(whole_config(), tree)
@@ -211,7 +211,7 @@ def _require_known(tree: Mapping[str, Any]) -> None:
         raise ConfigError(f"{unknown[0]}: unknown key")
 
 
-def load_groups(overrides: Sequence[str] = ()) -> Any:
+def load_groups(overrides: Sequence[str] = ()) -> Config:
     """As `load`, with every group checked by itself, not what groups owe each other.
 
     Raises
@@ -219,7 +219,7 @@ def load_groups(overrides: Sequence[str] = ()) -> Any:
     ConfigError
         As `load`.
     """
-    return validate(_groups_model(), _derived(compose(overrides)))
+    return _settings(_groups_model(), _derived(compose(overrides)))
 
 
 @cache
@@ -227,11 +227,19 @@ def _groups_model() -> type[Group]:
     fields: dict[str, Any] = {
         key: (field.rebuild_annotation(), ...) for key, field in whole_config().model_fields.items()
     }
-    model: type[Group] = create_model("Groups", __base__=Group, **fields)
-    return model
+    return create_model("Groups", __base__=Group, **fields)
 
 
-def load_file(model: type[Any], path: Path) -> Any:
+def _settings(model: type[Group], tree: Mapping[str, Any]) -> Config:
+    """Checked groups of the configuration, whose type for all that read them is the whole one."""
+    return cast(Config, validate(model, tree))
+
+
+Model = TypeVar("Model", bound=Group)
+T = TypeVar("T")
+
+
+def load_file(model: type[Model], path: Path) -> Model:
     """Read and check a file of the configuration that Hydra does not compose.
 
     Raises
@@ -244,7 +252,7 @@ def load_file(model: type[Any], path: Path) -> Any:
     try:
         parse_yaml(path)
         # OmegaConf reads 4e-3 as a number; plain YAML takes it for text.
-        tree = OmegaConf.to_container(OmegaConf.load(path), resolve=True)
+        tree: Any = OmegaConf.to_container(OmegaConf.load(path), resolve=True)
     except ProductError as error:
         raise ConfigError(str(error)) from None
     except Exception as error:
@@ -252,7 +260,7 @@ def load_file(model: type[Any], path: Path) -> Any:
     return _named(path, lambda: validate(model, tree if isinstance(tree, dict) else {}))
 
 
-def _named(path: Path, check: Callable[[], Any]) -> Any:
+def _named(path: Path, check: Callable[[], T]) -> T:
     """What a check gives; its refusals name the file."""
     try:
         return check()
@@ -261,12 +269,13 @@ def _named(path: Path, check: Callable[[], Any]) -> Any:
         raise ConfigError(lines) from None
 
 
-def load_stage(reads: tuple[str, ...], overrides: Sequence[str] = ()) -> Any:
+def load_stage(reads: tuple[str, ...], overrides: Sequence[str] = ()) -> Config:
     """Compose the configuration and check the groups that a stage reads.
 
     Returns
     -------
-    pydantic model with these groups as attributes
+    Config
+        With these groups alone.
 
     Raises
     ------
@@ -278,7 +287,7 @@ def load_stage(reads: tuple[str, ...], overrides: Sequence[str] = ()) -> Any:
     return part(reads, stage_tree(reads, tree))
 
 
-def load_settings(path: Path, reads: tuple[str, ...]) -> Any:
+def load_settings(path: Path, reads: tuple[str, ...]) -> Config:
     """The groups that a stage reads from a file that `write_settings` has written.
 
     Raises
@@ -288,7 +297,7 @@ def load_settings(path: Path, reads: tuple[str, ...]) -> Any:
     """
     tree = parse_yaml(path)
     model = stage_model(reads, whole_config())
-    return _named(path, lambda: validate(model, tree if isinstance(tree, dict) else {}))
+    return _named(path, lambda: _settings(model, tree if isinstance(tree, dict) else {}))
 
 
 def write_settings(
@@ -320,7 +329,7 @@ def write_settings(
     return path
 
 
-def part(reads: tuple[str, ...], tree: Any) -> Any:
+def part(reads: tuple[str, ...], tree: Mapping[str, Any] | Group) -> Config:
     """Some groups of a configuration, a tree or a model, checked.
 
     Raises
@@ -330,7 +339,7 @@ def part(reads: tuple[str, ...], tree: Any) -> Any:
     """
     tree = tree if isinstance(tree, Mapping) else tree.model_dump()
     found = {key: tree[key] for key in reads if key in tree}
-    return validate(stage_model(reads, whole_config()), found)
+    return _settings(stage_model(reads, whole_config()), found)
 
 
 def stage_tree(reads: tuple[str, ...], tree: Mapping[str, Any]) -> dict[str, Any]:

@@ -36,7 +36,7 @@ class Consistent(Group):
 
     @model_validator(mode="before")
     @classmethod
-    def _derive(cls, tree: Any) -> Any:
+    def _derive(cls, tree: object) -> object:
         if not isinstance(tree, Mapping):
             return tree
         _check_scene(tree)
@@ -45,12 +45,12 @@ class Consistent(Group):
     @model_validator(mode="after")
     def _jitter_is_drawn(self) -> Consistent:
         telescope, stars = getattr(self, "telescope", None), getattr(self, "stars", None)
-        aberrations = getattr(telescope, "aberrations", None)
-        if stars is None or not getattr(aberrations, "jitter_waves", 0.0):
+        jitter = getattr(getattr(telescope, "aberrations", None), "jitter_waves", 0.0)
+        if stars is None or not jitter:
             return self
         if stars.aberration_fraction == 0:
             raise ValueError(
-                f"telescope.aberrations.jitter_waves = {aberrations.jitter_waves}: "
+                f"telescope.aberrations.jitter_waves = {jitter}: "
                 "stars.aberration_fraction must be above 0, stars without random aberrations "
                 "are their templates"
             )
@@ -116,7 +116,7 @@ def _derived_values(name: str, tree: Mapping[str, Any]) -> dict[str, Any]:
     return {}
 
 
-def _search(group: Any, pixel: float | None) -> int:
+def _search(group: object, pixel: float | None) -> int:
     """Search distance in pixels; any number for a group that will be refused in a moment."""
     reach = group.get("search_lambda_d", SEARCH) if isinstance(group, Mapping) else SEARCH
     if isinstance(reach, bool) or not isinstance(reach, int | float) or not reach > 0:
@@ -142,7 +142,9 @@ def _space(grid: dict[str, Any]) -> None:
 
 
 @cache
-def stage_model(keys: tuple[str, ...], whole: type[Group]) -> type[Group]:
+def stage_model(keys: tuple[str, ...], whole: type[Group]) -> type[Consistent]:
     """Some groups of a whole configuration as a model of their own."""
-    fields = {key: (whole.model_fields[key].rebuild_annotation(), ...) for key in keys}
-    return create_model("Settings", __base__=Consistent, **fields)  # type: ignore[call-overload]
+    fields: dict[str, Any] = {
+        key: (whole.model_fields[key].rebuild_annotation(), ...) for key in keys
+    }
+    return create_model("Settings", __base__=Consistent, **fields)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 from psfdae.files import ProductError
 from psfdae.method import Method
@@ -45,7 +45,7 @@ def all_groups() -> tuple[str, ...]:
     return tuple(dict.fromkeys(group for kind in registered() for group in kind.groups))
 
 
-def oracles_last(names: Any) -> list[type[Method]]:
+def oracles_last(names: Iterable[str]) -> list[type[Method]]:
     """Methods among some names in the order of legends: those that are given λ at the end."""
     kinds = [kind for kind in registered() if kind.name in set(names)]
     return sorted(kinds, key=lambda kind: kind.needs.level)

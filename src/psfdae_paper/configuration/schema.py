@@ -114,13 +114,17 @@ class Optics(WholePeriodOptics):
     backend: Literal["numpy", "torch"] = Field(description="Library of the matrix products")
 
 
-def _optics(tree: Any) -> Any:
+def _optics(tree: object) -> object:
     if not isinstance(tree, Mapping):
         return tree
     return (Optics if "backend" in tree else WholePeriodOptics).model_validate(tree)
 
 
-AnyOptics = Annotated[WholePeriodOptics | Optics, BeforeValidator(_optics)]
+if TYPE_CHECKING:
+    # Of every dataset with a scene (`Consistent`); scene 3 reads no more than the base class.
+    AnyOptics = Optics
+else:
+    AnyOptics = Annotated[WholePeriodOptics | Optics, BeforeValidator(_optics)]
 
 
 class Dataset(Group):
@@ -191,9 +195,10 @@ class Workflow(Group):
 
 
 class Config(Consistent):
-    """The whole configuration of one dataset, but for the settings of methods.
+    """The whole configuration of one dataset.
 
-    Scene 3 reads `alignment.GROUPS` of them.
+    The type of what stages get, too: a model with those of these groups that they read, as
+    scene 3 reads `alignment.GROUPS`. Settings of methods are added by `whole_config`.
     """
 
     if TYPE_CHECKING:

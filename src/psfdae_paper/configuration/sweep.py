@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
@@ -11,7 +11,8 @@ from psfdae.methods import groups_of, method
 from psfdae.settings import ConfigError, Count, Finite, Group, Name, Reference, SplitKind
 from psfdae_paper.configuration.aligners import ALIGNERS, SWEPT
 from psfdae_paper.configuration.alignment import CHOICE, NAME, NETWORKS
-from psfdae_paper.configuration.compose import config_dir, load_file
+from psfdae_paper.configuration.base import config_dir
+from psfdae_paper.configuration.compose import load_file
 from psfdae_paper.configuration.methods import registered
 
 Scalar = bool | int | float | str
@@ -64,7 +65,7 @@ class Axis(Group):
 
     @model_validator(mode="before")
     @classmethod
-    def _short_forms(cls, given: Any) -> Any:
+    def _short_forms(cls, given: object) -> object:
         """A bare list are values; names of choices may look like numbers."""
         if isinstance(given, list):
             return {"values": given}
@@ -95,6 +96,13 @@ class Axis(Group):
     def options(self) -> list[Value]:
         """Listed values, or the names of the choices; empty for a range."""
         return list(self.values or self.choices or ())
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """Of a range."""
+        assert self.low is not None
+        assert self.high is not None
+        return self.low, self.high
 
     def changes(self, name: str, value: Value) -> dict[str, Value]:
         """Configuration keys and their values at a value of this axis."""
@@ -211,5 +219,4 @@ def load_sweep(name: str) -> Sweep:
     """
     if name not in sweep_names():
         raise ConfigError(f"sweep = {name!r}: must be one of {', '.join(sweep_names())}")
-    checked: Sweep = load_file(Sweep, config_dir() / "sweep" / f"{name}.yaml")
-    return checked
+    return load_file(Sweep, config_dir() / "sweep" / f"{name}.yaml")

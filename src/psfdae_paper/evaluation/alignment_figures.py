@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.image import AxesImage
 
 NAMES = dict(zip(PARAMETERS, ("decentre x", "decentre y", "tilt x", "tilt y"), strict=True))
 SHORT = ("dx", "dy", "tx", "ty")
@@ -39,7 +40,7 @@ def stamp_rows(rows: Sequence[tuple[str, np.ndarray]], titles: Sequence[str]) ->
     """
     fields = rows[0][1].shape[1]
     figure = new_figure(0.9 * len(rows) * len(titles) + 0.5 * len(titles), layout="constrained")
-    parts = np.atleast_1d(figure.subfigures(len(titles), 1))
+    parts = figure.subfigures(len(titles), 1, squeeze=False)[:, 0]
     for group, (part, title) in enumerate(zip(parts, titles, strict=True)):
         axes = part.subplots(len(rows), fields, squeeze=False)
         peak = rows[0][1][group].max()
@@ -105,7 +106,8 @@ def predicted_against_true(
 
 def size_of(states: np.ndarray) -> np.ndarray:
     """Size of a misalignment: RMS of its four numbers, in units of the range, shape (n,)."""
-    return np.sqrt((states**2).mean(axis=1))
+    size: np.ndarray = np.sqrt((states**2).mean(axis=1))
+    return size
 
 
 @styled
@@ -170,7 +172,7 @@ def twin_ambiguity(
     state : ndarray, shape (4,)
     """
     figure = new_figure(7.2, layout="constrained")
-    top, bottom = figure.subfigures(2, 1, height_ratios=[1.0, 1.15])
+    top, bottom = figure.subfigures(2, 1, squeeze=False, height_ratios=[1.0, 1.15])[:, 0]
     panels = top.subplots(1, curves.noise_level.nunique(), sharey=True, squeeze=False)[0]
     for axes, (level, rows) in zip(panels, curves.groupby("noise_level"), strict=True):
         for color, (defocus, line) in zip(SERIES_COLORS, rows.groupby("defocus_mm"), strict=False):
@@ -206,12 +208,12 @@ def correlation_matrices(panels: Sequence[Sequence[tuple[str, np.ndarray]]]) -> 
     """
     figure = new_figure(2.15 * len(panels), layout="constrained")
     axes = figure.subplots(len(panels), max(map(len, panels)), squeeze=False)
-    image: Any = None
+    images: list[AxesImage] = []
     for line, row in zip(axes, panels, strict=True):
         for cell in line[len(row) :]:
             cell.set_axis_off()
         for cell, (title, matrix) in zip(line, row, strict=False):
-            image = cell.imshow(matrix, cmap="RdBu_r", vmin=-1.0, vmax=1.0)
+            images.append(cell.imshow(matrix, cmap="RdBu_r", vmin=-1.0, vmax=1.0))
             cell.set_title(title, fontsize=8)
             cell.set_xticks(range(4), SHORT)
             cell.set_yticks(range(4), SHORT)
@@ -219,5 +221,5 @@ def correlation_matrices(panels: Sequence[Sequence[tuple[str, np.ndarray]]]) -> 
                 if np.isfinite(value):
                     color = "white" if abs(value) > 0.6 else "black"
                     cell.text(b, a, f"{value:.2f}", ha="center", va="center", size=6.5, color=color)
-    figure.colorbar(image, ax=axes, shrink=0.5, label="correlation of signed errors")
+    figure.colorbar(images[-1], ax=axes, shrink=0.5, label="correlation of signed errors")
     return figure

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from itertools import product
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -25,8 +25,11 @@ TEST_SETS = (
 )
 """What the paper's tables beside ours say of their column `test_set`."""
 
+Row = dict[str, object]
+"""Of a table, by column."""
 
-def error_rows(key: dict[str, Any], errors: np.ndarray, unit: np.ndarray) -> list[dict[str, Any]]:
+
+def error_rows(key: Mapping[str, object], errors: np.ndarray, unit: np.ndarray) -> list[Row]:
     """Rows of the error table of one method.
 
     Parameters
@@ -55,9 +58,7 @@ def error_rows(key: dict[str, Any], errors: np.ndarray, unit: np.ndarray) -> lis
     return _in_both_units(key, statistics, unit, len(errors))
 
 
-def bound_rows(
-    key: dict[str, Any], covariances: np.ndarray, unit: np.ndarray
-) -> list[dict[str, Any]]:
+def bound_rows(key: Mapping[str, object], covariances: np.ndarray, unit: np.ndarray) -> list[Row]:
     """Rows of the error table that unbiased normal errors at the bound would have.
 
     Parameters
@@ -78,9 +79,9 @@ def bound_rows(
 
 
 def _in_both_units(
-    key: dict[str, Any], statistics: dict[str, np.ndarray], unit: np.ndarray, count: int
-) -> list[dict[str, Any]]:
-    rows = []
+    key: Mapping[str, object], statistics: Mapping[str, np.ndarray], unit: np.ndarray, count: int
+) -> list[Row]:
+    rows: list[Row] = []
     for index, parameter in enumerate(PARAMETERS):
         for name, scale in (("range", 1.0), (SI_UNITS[index], unit[index])):
             power = {"variance": 2, "variance_abs": 2}
@@ -93,8 +94,8 @@ def _in_both_units(
 
 
 def correlation_rows(
-    key: dict[str, Any], matrix: np.ndarray, low: np.ndarray, high: np.ndarray
-) -> list[dict[str, Any]]:
+    key: Mapping[str, object], matrix: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> list[Row]:
     """Rows of the correlation table for all pairs of parameters, matrices (4, 4)."""
     return [
         {
@@ -109,12 +110,12 @@ def correlation_rows(
     ]
 
 
-def measured_correlations(key: dict[str, Any], errors: np.ndarray) -> list[dict[str, Any]]:
+def measured_correlations(key: Mapping[str, object], errors: np.ndarray) -> list[Row]:
     """Correlations of signed errors (n, 4) with 95 % intervals."""
     return correlation_rows(key, *error_correlation(errors))
 
 
-def predicted_correlations(key: dict[str, Any], covariances: np.ndarray) -> list[dict[str, Any]]:
+def predicted_correlations(key: Mapping[str, object], covariances: np.ndarray) -> list[Row]:
     """Correlations that the Fisher matrix predicts, of a state and of all errors together.
 
     Method `cramer_rao` is the mean over states of each state's correlation; its
@@ -209,8 +210,9 @@ def as_markdown(table: pd.DataFrame, title: str, digits: dict[str, str]) -> str:
             "" if pd.isna(value) else format(value, digits[kind])
             for value, kind in zip(table[column], kinds, strict=True)
         ]
+    printed = {name: each.look.paper[1] for name, each in ALIGNERS.items() if each.look.paper}
     shown["method"] = [
-        ALIGNERS[m].look.paper[1] if source == "paper" else ALIGNERS[m].look.label
+        printed[m] if source == "paper" else ALIGNERS[m].look.label
         for m, source in zip(table["method"], table["source"], strict=True)
     ]
     return f"{title}\n\n{shown.to_markdown(index=False, disable_numparse=True)}\n"

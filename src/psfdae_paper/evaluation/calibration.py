@@ -7,7 +7,9 @@ has, that is the pixel scale.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -18,27 +20,38 @@ OUTLIER = ("dataset8", 0.002)
 """The one column whose MSE does not follow λ²; it is left out of every fit."""
 
 
-def original_noise_rows() -> pd.DataFrame:
-    """The paper's original-noise columns: dataset, noise_level, mse, ssim, fitted."""
+class OriginalNoise(NamedTuple):
+    """An original-noise column of the paper's tables."""
+
+    dataset: str
+    noise_level: float
+    mse: float
+    ssim: float
+
+    @property
+    def fitted(self) -> bool:
+        """Whether it takes part in fits."""
+        return (self.dataset, self.noise_level) != OUTLIER
+
+
+def original_noise_rows() -> list[OriginalNoise]:
+    """The paper's original-noise columns, by dataset and noise level."""
     paper = published("psf")
     rows = paper[paper.method == "original_noise"]
     wide = rows.pivot(index=["dataset", "noise_level"], columns="metric", values="value")
-    wide = wide.reset_index().rename_axis(columns=None)
-    wide["fitted"] = [
-        (dataset, level) != OUTLIER
-        for dataset, level in zip(wide.dataset, wide.noise_level, strict=True)
-    ]
-    return wide
+    wide = wide.reset_index()
+    columns = (wide[name] for name in OriginalNoise._fields)
+    return [OriginalNoise(*row) for row in zip(*columns, strict=True)]
 
 
-def kappa_of_mse(mse: np.ndarray, level: np.ndarray, pixels: int, background: float) -> np.ndarray:
+def kappa_of_mse(mse: float, level: float, pixels: int, background: float) -> float:
     """κ of a noise level whose pixel variance is `mse`, the star's photons included.
 
     Solves (κλ)² + κλ/(P √B) = MSE, where 1/P is the mean of a normalised image
     of P pixels.
     """
     photon = 1.0 / (pixels * np.sqrt(background))
-    return (-photon + np.sqrt(photon**2 + 4.0 * np.asarray(mse))) / 2.0 / np.asarray(level)
+    return float((-photon + np.sqrt(photon**2 + 4.0 * mse)) / 2.0 / level)
 
 
 @dataclass(frozen=True)
@@ -70,15 +83,13 @@ def fit_scales(scan: pd.DataFrame) -> ScaleFit:
     """
     from scipy.optimize import least_squares
 
-    rows = original_noise_rows()
-    rows = rows[rows.fitted & rows.dataset.isin(scan.dataset)]
+    rows = _fitted(scan)
     experiments = sorted(scan.experiment.unique())
-    surfaces = [_surface(scan, row.dataset, row.noise_level) for row in rows.itertuples()]
+    surfaces = [_surface(scan, row) for row in rows]
     belongs = [
-        experiments.index(scan.experiment[scan.dataset == row.dataset].iloc[0])
-        for row in rows.itertuples()
+        experiments.index(scan.experiment[scan.dataset == row.dataset].iloc[0]) for row in rows
     ]
-    target = rows.ssim.to_numpy()
+    target = np.array([row.ssim for row in rows])
 
     def residuals(parameters: np.ndarray) -> np.ndarray:
         data_range, scales = np.exp(parameters[0]), np.exp(parameters[1:])
@@ -86,7 +97,8 @@ def fit_scales(scan: pd.DataFrame) -> ScaleFit:
             surface(scales[index], data_range)
             for surface, index in zip(surfaces, belongs, strict=True)
         ]
-        return np.array(values) - target
+        residual: np.ndarray = np.array(values) - target
+        return residual
 
     ranges = scan.data_range.agg(["min", "max"])
     bounds = [(ranges["min"], ranges["max"])]
@@ -108,14 +120,13 @@ def residuals_by_scale(scan: pd.DataFrame, data_range: float) -> pd.DataFrame:
     DataFrame
         Columns experiment, r0_m, pixel_scale_arcsec, rms, largest (SSIM).
     """
-    rows = original_noise_rows()
-    rows = rows[rows.fitted]
     table = []
     for (experiment, r0), part in scan.groupby(["experiment", "r0_m"], dropna=False):
-        columns = rows[rows.dataset.isin(part.dataset)]
-        surfaces = [_surface(part, row.dataset, row.noise_level) for row in columns.itertuples()]
+        rows = _fitted(part)
+        surfaces = [_surface(part, row) for row in rows]
+        target = np.array([row.ssim for row in rows])
         for scale in sorted(part.pixel_scale_arcsec.unique()):
-            residual = np.array([s(scale, data_range) for s in surfaces]) - columns.ssim
+            residual = np.array([s(scale, data_range) for s in surfaces]) - target
             table.append(
                 (experiment, r0, scale, np.sqrt((residual**2).mean()), np.abs(residual).max())
             )
@@ -124,11 +135,17 @@ def residuals_by_scale(scan: pd.DataFrame, data_range: float) -> pd.DataFrame:
     )
 
 
-def _surface(scan: pd.DataFrame, dataset: str, level: float):  # type: ignore[no-untyped-def]
+def _fitted(scan: pd.DataFrame) -> list[OriginalNoise]:
+    """The paper's columns that take part in fits and are in a scan."""
+    datasets = set(scan.dataset)
+    return [row for row in original_noise_rows() if row.fitted and row.dataset in datasets]
+
+
+def _surface(scan: pd.DataFrame, row: OriginalNoise) -> Callable[[float, float], float]:
     """SSIM of one column as a smooth function of pixel scale and dynamic range."""
     from scipy.interpolate import RectBivariateSpline
 
-    part = scan[(scan.dataset == dataset) & np.isclose(scan.noise_level, level)]
+    part = scan[(scan.dataset == row.dataset) & np.isclose(scan.noise_level, row.noise_level)]
     grid = part.pivot(index="pixel_scale_arcsec", columns="data_range", values="ssim")
     order = [min(3, size - 1) for size in grid.shape]
     spline = RectBivariateSpline(

@@ -77,7 +77,7 @@ def training_summary(history: pd.DataFrame) -> dict[str, float]:
         A row per epoch: epoch, train_mse, validation_mse (NaN where not measured), seconds.
     """
     valid = history.dropna(subset=["validation_mse"])
-    best = valid.loc[valid["validation_mse"].idxmin()]
+    best = valid.iloc[valid["validation_mse"].argmin()]
     epochs = float(history["epoch"].max())
     summary = {
         "epochs": epochs,
@@ -164,7 +164,8 @@ def _difference(
     first, second = (float(table[metric].mean()) for table in (one, other))
     fitted = (tuple(table[FITTED].iloc[0]) for table in (one, other))
     each = zip(fitted, (first, second), strict=True)
-    seeds = float(np.hypot(*(seed_stderr(scatter.get(f, np.nan), metric, m) for f, m in each)))
+    scatters = [seed_stderr(scatter.get(f, np.nan), metric, m) for f, m in each]
+    seeds = float(np.hypot(scatters[0], scatters[1]))
     error = np.hypot(stderr, np.nan_to_num(seeds))
     sigmas = 0.0 if difference == 0 else difference / error if error > 0 else np.inf
     return {
@@ -222,10 +223,13 @@ def compare_tables(
     gap = (rows.value_second - rows.value_first).abs()
     rounding = NEGLIGIBLE * rows[["stderr_first", "stderr_second"]].min(axis=1)
     allowed = SIGNIFICANT * np.hypot(rows.seed_stderr_first, rows.seed_stderr_second)
-    rows["verdict"] = np.select(
-        [gap == 0, gap <= rounding, allowed.isna(), gap <= allowed],
-        ["equal", "rounding", "not measured", "within"],
-        "beyond",
+    rows["verdict"] = pd.Series("beyond", rows.index).case_when(
+        [
+            (gap == 0, "equal"),
+            (gap <= rounding, "rounding"),
+            (np.isnan(allowed), "not measured"),
+            (gap <= allowed, "within"),
+        ]
     )
     rows = rows[[*keys, "value_first", "value_second", "verdict"]]
     signs = [_signs(table) for table in both]

@@ -14,6 +14,7 @@ from psfdae_paper.configuration.methods import oracles_last, registered
 
 if TYPE_CHECKING:
     import pandas as pd
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -32,11 +33,13 @@ METRIC_LABELS = {
     "ssim_peak": "SSIM, data range of each reference",
 }
 
+Style = dict[str, Any]
+"""Keyword arguments of a line."""
 
-BAYES = {"color": "black", "marker": "o", "label": "posterior mean (Bayes)"}
+BAYES: Style = {"color": "black", "marker": "o", "label": "posterior mean (Bayes)"}
 """Look of the posterior mean; its marker is open where the bank has too few similar stars."""
 
-MEANS = {
+MEANS: dict[str, Style] = {
     "bayes": BAYES,
     "bayes_position": {
         "color": "#8c510a",
@@ -71,7 +74,7 @@ def training_curves(histories: Mapping[str, pd.DataFrame], title: str) -> Figure
         axes.plot(
             checked["step"], checked["validation_mse"], color=color, lw=1.6, marker="o", ms=3.5
         )
-        kept = checked.loc[checked["validation_mse"].idxmin()]
+        kept = checked.iloc[checked["validation_mse"].argmin()]
         axes.plot(
             kept["step"], kept["validation_mse"], marker="*", ms=13, mfc=color, mec="black", ls=""
         )
@@ -110,12 +113,13 @@ def error_against_noise(
     figure, panels = _panels(ours)
     levels = np.unique(ours["noise_level"])
     for axes, (reference, measured) in zip(panels, _by_reference(ours), strict=True):
-        for (name, split), rows in measured.groupby(["method", "split"]):
-            line = rows.sort_values("noise_level")
-            style = {**_line(method(name)), "ls": SPLIT_LINES[split], "capsize": 3}
-            axes.errorbar(line["noise_level"], line["value"], yerr=line["stderr"], **style)
-        for name, rows in theirs.groupby("method"):
-            axes.plot(rows["noise_level"], rows["value"], **_paper_marker(method(name)))
+        for kind, rows in _by_method(measured):
+            for split, part in rows.groupby("split"):
+                line = part.sort_values("noise_level")
+                style = {**_line(kind), "ls": SPLIT_LINES[str(split)], "capsize": 3}
+                axes.errorbar(line["noise_level"], line["value"], yerr=line["stderr"], **style)
+        for kind, rows in _by_method(theirs):
+            axes.plot(rows["noise_level"], rows["value"], **_paper_marker(kind))
         axes.set_title(REFERENCES[reference].replace(" (", "\n("))
         noise_axis(axes, levels)
         axes.grid(True, which="major")
@@ -134,15 +138,15 @@ def error_against_noise(
     return figure
 
 
-def _paper_marker(kind: type[Method]) -> dict[str, Any]:
+def _paper_marker(kind: type[Method]) -> Style:
     return {**_line(kind), "mfc": "none", "mew": 1.4, "ms": 9, "ls": ""}
 
 
-def _method_handles(methods: set[str], published: Set[str] = frozenset()) -> list[Any]:
+def _method_handles(methods: set[str], published: Set[str] = frozenset()) -> list[Artist]:
     """Legend entries of our methods, each with the paper's open marker below it."""
     from matplotlib.lines import Line2D
 
-    handles = []
+    handles: list[Artist] = []
     for kind in oracles_last(methods | published):
         if kind.name in methods:
             handles.append(Line2D([], [], **_line(kind), label=kind.look.label))
@@ -190,8 +194,8 @@ def errors_above_bounds(efficiency: pd.DataFrame, bounds: pd.DataFrame, dataset:
     for axes, (reference, rows) in zip(panels, _by_reference(limits), strict=True):
         # Beside the floor, rows come again, and posterior means are among them.
         methods = ours[(ours.reference == reference) & (ours.bound != "floor")]
-        for name, errors in methods.sort_values("noise_level").groupby("method"):
-            axes.plot(errors["noise_level"], errors["mse"], **_line(method(name)))
+        for kind, errors in _by_method(methods.sort_values("noise_level")):
+            axes.plot(errors["noise_level"], errors["mse"], **_line(kind))
         for name, look in MEANS.items():
             _bayes_line(axes, rows[rows.method == name].sort_values("noise_level"), look)
         _finish_panel(axes, reference, np.unique(rows["noise_level"]))
@@ -231,10 +235,11 @@ def efficiency_against_noise(efficiency: pd.DataFrame, dataset: str) -> Figure:
     figure, panels = _panels(ours)
     for axes, (reference, rows) in zip(panels, _by_reference(ours), strict=True):
         shown = _of_methods(rows).sort_values("noise_level")
-        for (name, bound), values in shown.groupby(["method", "bound"]):
-            style = _line(method(name))
-            style |= {"ls": ":", "mfc": "none"} if bound == "floor" else {"ls": "-", "lw": 1.6}
-            axes.plot(values["noise_level"], values["efficiency"], **style)
+        for kind, compared in _by_method(shown):
+            for bound, values in compared.groupby("bound"):
+                style = _line(kind)
+                style |= {"ls": ":", "mfc": "none"} if bound == "floor" else {"ls": "-", "lw": 1.6}
+                axes.plot(values["noise_level"], values["efficiency"], **style)
         axes.axhline(1.0, color="black", lw=1.0)
         if shown["efficiency"].isna().all():
             axes.text(0.5, 0.5, "no tight bound above 0", transform=axes.transAxes, ha="center")
@@ -270,7 +275,7 @@ def bank_growth(growth: pd.DataFrame, dataset: str) -> Figure:
     colors = dict(zip(levels, np.resize(SERIES_COLORS, levels.size), strict=True))
     for axes, (reference, rows) in zip(panels, _by_reference(ours), strict=True):
         for (level, name), sizes in rows.sort_values("draws").groupby(["noise_level", "method"]):
-            color, marker = colors[level], MEANS[name]["marker"]
+            color, marker = colors[level], MEANS[str(name)]["marker"]
             axes.plot(sizes["draws"], sizes["mse"], color=color, marker=marker, ms=4.5, lw=1.4)
             axes.axhline(sizes["limit"].iloc[0], color=color, ls="--", lw=1.0)
         draws = np.unique(rows["draws"])
@@ -306,12 +311,17 @@ def _by_reference(table: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
     return [(name, table[table.reference == name]) for name in REFERENCES if name in present]
 
 
+def _by_method(table: pd.DataFrame) -> list[tuple[type[Method], pd.DataFrame]]:
+    """Methods of a table by name, and the rows of each."""
+    return [(method(str(name)), rows) for name, rows in table.groupby("method")]
+
+
 def _of_methods(table: pd.DataFrame) -> pd.DataFrame:
     """Rows but for those of the posterior mean."""
     return table[table.method.isin([kind.name for kind in registered()])]
 
 
-def _line(kind: type[Method]) -> dict[str, Any]:
+def _line(kind: type[Method]) -> Style:
     return {"color": kind.look.color, "marker": kind.look.marker, "lw": 1.4, "ms": 4.5}
 
 
@@ -324,10 +334,10 @@ def _finish_panel(axes: Axes, reference: str, levels: np.ndarray) -> None:
     axes.grid(True, which="major")
 
 
-def _bayes_line(axes: Axes, rows: pd.DataFrame, look: Mapping[str, str]) -> None:
+def _bayes_line(axes: Axes, rows: pd.DataFrame, look: Style) -> None:
     """Posterior mean with its confidence intervals; errors of 0 as a remark at the bottom."""
     color = look["color"]
-    side = {"ha": "right" if look is BAYES else "left", "weight": "bold", "color": color}
+    side: Style = {"ha": "right" if look is BAYES else "left", "weight": "bold", "color": color}
     for level in rows["noise_level"][rows.value == 0]:
         axes.text(level, 0.02, "0", transform=axes.get_xaxis_transform(), **side)
     rows = rows[rows.value > 0]
@@ -336,7 +346,7 @@ def _bayes_line(axes: Axes, rows: pd.DataFrame, look: Mapping[str, str]) -> None
     axes.errorbar(level, value, yerr=reach, color=color, ls="--", lw=1.2, capsize=3)
     tight = (rows["tight"] == "yes").to_numpy()
     for chosen, fill in ((tight, color), (~tight, "white")):
-        style = {"color": color, "marker": look["marker"], "mfc": fill, "ms": 6, "ls": ""}
+        style: Style = {"color": color, "marker": look["marker"], "mfc": fill, "ms": 6, "ls": ""}
         axes.plot(level[chosen], value[chosen], zorder=3, **style)
 
 
@@ -431,6 +441,5 @@ def _name(
 ) -> None:
     point = min(NAMED_POINT, len(level) - 1)
     place = (float(level.iloc[point]), float(value.iloc[point]))
-    style = {"ha": "left", "va": "top"} if below else {"ha": "right", "va": "bottom"}
-    offset = (6, -3) if below else (-2, 5)
-    axes.annotate(name, place, offset, textcoords="offset points", color=color, **style)
+    offset, ha, va = ((6, -3), "left", "top") if below else ((-2, 5), "right", "bottom")
+    axes.annotate(name, place, offset, textcoords="offset points", color=color, ha=ha, va=va)

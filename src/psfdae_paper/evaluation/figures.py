@@ -8,7 +8,7 @@ field are both drawn with y upwards.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from psfdae.figures import STAMP_MAP, in_field_unit, new_figure, styled
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.image import AxesImage
 
 MAX_NUMBERED, MAX_NUMBERED_SMALL = 15, 7
 """Grids with more points a side get no numbers in their cells: they would touch."""
@@ -113,7 +114,7 @@ def stamp_energy_map(
     """
     figure = new_figure(7.1, layout="constrained")
     axes = figure.add_subplot()
-    shown = _draw_values(axes, energy, grid, field, cmap="viridis")
+    shown = _draw_values(axes, energy, grid, field, "viridis")
     _field_axes(axes, field)
     if grid.max() < MAX_NUMBERED:
         _write_values(axes, shown, energy, field, fontsize=8)
@@ -164,18 +165,21 @@ def field_of_psfs(fields: FieldOfPsfs, name: str, pixel_scale_arcsec: float) -> 
     return figure
 
 
-def _small_map(axes: Axes, fields: FieldOfPsfs, values: np.ndarray, cmap: str, title: str) -> Any:
+def _small_map(
+    axes: Axes, fields: FieldOfPsfs, values: np.ndarray, cmap: str, title: str
+) -> AxesImage:
     middle = 0.5 * (values.min() + values.max())
     half = 0.5 * max(float(np.ptp(values)), LEAST_RANGE * middle)
-    ends = {"vmin": middle - half, "vmax": middle + half}
-    shown = _draw_values(axes, values, fields.grid, fields.field, cmap=cmap, **ends)
+    shown = _draw_values(
+        axes, values, fields.grid, fields.field, cmap, middle - half, middle + half
+    )
     axes.set_ylabel(f"y ({in_field_unit(fields.field)[1]})")
     axes.set_title(f"{title}: {values.min():.2f} … {values.max():.2f}")
     axes.figure.colorbar(shown, ax=axes, shrink=0.9)
     return shown
 
 
-def _draw_psfs(axes: Axes, psf: np.ndarray, grid: np.ndarray, field: np.ndarray) -> Any:
+def _draw_psfs(axes: Axes, psf: np.ndarray, grid: np.ndarray, field: np.ndarray) -> AxesImage:
     """Mosaic of stamps (F, d, d), each by its maximum, on a square-root scale."""
     from matplotlib import colormaps
 
@@ -194,16 +198,28 @@ def _draw_psfs(axes: Axes, psf: np.ndarray, grid: np.ndarray, field: np.ndarray)
 
 
 def _draw_values(
-    axes: Axes, values: np.ndarray, grid: np.ndarray, field: np.ndarray, **style: Any
-) -> Any:
+    axes: Axes,
+    values: np.ndarray,
+    grid: np.ndarray,
+    field: np.ndarray,
+    cmap: str,
+    vmin: float | None = None,
+    vmax: float | None = None,
+) -> AxesImage:
     """A value per field point (F,) as a coloured cell."""
-    image = mosaic(values[:, None, None], grid, gap=0)
-    place = {"origin": "lower", "extent": _extent(grid, field, 1, 0)}
-    return axes.imshow(image, interpolation="nearest", **place, **style)
+    return axes.imshow(
+        mosaic(values[:, None, None], grid, gap=0),
+        origin="lower",
+        extent=_extent(grid, field, 1, 0),
+        cmap=cmap,
+        vmin=vmin,
+        vmax=vmax,
+        interpolation="nearest",
+    )
 
 
 def _write_values(
-    axes: Axes, shown: Any, values: np.ndarray, field: np.ndarray, fontsize: float
+    axes: Axes, shown: AxesImage, values: np.ndarray, field: np.ndarray, fontsize: float
 ) -> None:
     """The numbers into their cells, dark on light or light on dark."""
     position, _ = in_field_unit(field)
@@ -213,19 +229,22 @@ def _write_values(
         axes.text(x, y, f"{value:.2f}", ha="center", va="center", color=color, fontsize=fontsize)
 
 
-def _extent(grid: np.ndarray, field: np.ndarray, side: int, gap: int) -> tuple[float, ...]:
+def _extent(
+    grid: np.ndarray, field: np.ndarray, side: int, gap: int
+) -> tuple[float, float, float, float]:
     """Edges of a mosaic (left, right, bottom, top) that put each stamp's centre on its field."""
     position, _ = in_field_unit(field)
     pitch = side + gap
-    edges: list[float] = []
-    for axis in (0, 1):
+
+    def edges(axis: int) -> tuple[float, float]:
         points = int(grid[:, axis].max()) + 1
         first, last = position[:, axis].min(), position[:, axis].max()
         # A single field point has no spacing; any width will do.
         pixel = ((last - first) / (points - 1) if points > 1 else 1.0) / pitch
         margin = (gap + 0.5 * side) * pixel
-        edges += [first - margin, last + margin]
-    return tuple(edges)
+        return first - margin, last + margin
+
+    return *edges(0), *edges(1)
 
 
 def _field_axes(axes: Axes, field: np.ndarray) -> None:

@@ -86,7 +86,7 @@ def scale_of(texts: Sequence[str], logarithmic: bool = False) -> Scale:
     different = np.unique(numbers)
     if different.size > 9:
         ends = np.log10(different[[0, -1]]) if logs else different[[0, -1]]
-        ticks = np.linspace(*ends, 5)
+        ticks = np.linspace(ends[0], ends[1], 5)
         labels = [f"{value:.2g}" for value in (10.0**ticks if logs else ticks)]
     else:
         ticks = np.log10(different) if logs else different
@@ -222,7 +222,10 @@ def _point_lines(
         scale.at[failed],
         np.full(failed.sum(), 0.97),
         transform=panel.get_xaxis_transform(),
-        **{"ls": "", "marker": "x", "ms": 6, "color": "0.4"},
+        ls="",
+        marker="x",
+        ms=6,
+        color="0.4",
     )
     return lines
 
@@ -246,7 +249,11 @@ def _level_lines(
             scale.at[order],
             _metric(table, column)[order],
             label=column.removeprefix(prefix),
-            **{"ls": "-" if joined else "", "marker": "o", "ms": 4, "lw": 1.3, "color": color},
+            ls="-" if joined else "",
+            marker="o",
+            ms=4,
+            lw=1.3,
+            color=color,
         )
         panel.plot(scale.at, tested, ls="", marker="o", ms=7, mfc="none", mec=color)
     return "noise level λ"
@@ -273,7 +280,7 @@ def _vertical_scales(panel: Axes, scales: Sequence[Scale]) -> None:
 def _metric_scale(outcome: Scale, metric: str) -> Scale:
     """Five ticks along the metric, whatever values the points have."""
     ends = np.array([np.nanmin(outcome.at), np.nanmax(outcome.at)])
-    ticks = np.linspace(*ends, 5) if ends[1] > ends[0] else ends[:1]
+    ticks = np.linspace(ends[0], ends[1], 5) if ends[1] > ends[0] else ends[:1]
     values = 10.0**ticks if _is_log(metric) else ticks
     style = ".2e" if metric.endswith("mse") else ".3g"
     return Scale(outcome.at, ticks, [format(value, style) for value in values])

@@ -21,4 +21,5 @@ class NonLocalMeans(Denoiser):
         """See `Denoiser`."""
         from skimage.restoration import denoise_nl_means
 
-        return denoise_nl_means(image, PATCH_PX, REACH_PX, strength, sigma=sigma)
+        denoised: np.ndarray = denoise_nl_means(image, PATCH_PX, REACH_PX, strength, sigma=sigma)
+        return denoised

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
 
 import numpy as np
 from pydantic import Field
@@ -22,6 +22,9 @@ from psfdae.files import Column, write_product
 from psfdae.method import FitError, Look, Method, Needs, Storage, TrainingSet
 from psfdae.rng import stream
 from psfdae.settings import Count, Group, Positive
+
+if TYPE_CHECKING:
+    from psfdae_paper.configuration.schema import Config
 
 
 class Baseline(Group):
@@ -71,7 +74,7 @@ class PcaFit:
         ValueError
             If an image has a pixel that is not finite: it is nearest to no node.
         """
-        features = (images.reshape(len(images), -1) - self.mean) @ self.components.T
+        features: np.ndarray = (images.reshape(len(images), -1) - self.mean) @ self.components.T
         if not (finite := np.isfinite(features).all(axis=1)).all():
             raise ValueError(
                 f"images: {np.count_nonzero(~finite)} of {len(images)} have pixels that are not "
@@ -83,11 +86,13 @@ class PcaFit:
         """Winning node (eq. 7) of every image, shape (n,); raises as `features`."""
         # |y − m|² without the term that is the same for all nodes.
         score = (self.nodes**2).sum(axis=1) - 2.0 * self.features(images) @ self.nodes.T
-        return score.argmin(axis=1)
+        winner: np.ndarray = score.argmin(axis=1)
+        return winner
 
     def predict(self, images: np.ndarray) -> np.ndarray:
         """PSF of every image, shape (n, d, d); raises as `features`."""
-        return self.psf[self.assign(images)].reshape(images.shape)
+        psf: np.ndarray = self.psf[self.assign(images)].reshape(images.shape)
+        return psf
 
 
 @dataclass(frozen=True)
@@ -123,7 +128,7 @@ class PcaSom(Method):
     fits: tuple[PcaFit, ...]
 
     @classmethod
-    def check(cls, config: Any) -> None:
+    def check(cls, config: Config) -> None:
         """Components must be fewer than pixels and stars."""
         components, side = config.baseline.components, config.framing.stamp_px
         if components > side**2:

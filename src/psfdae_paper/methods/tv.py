@@ -18,4 +18,5 @@ class TotalVariation(Denoiser):
         """See `Denoiser`."""
         from skimage.restoration import denoise_tv_chambolle
 
-        return denoise_tv_chambolle(image, strength)
+        denoised: np.ndarray = denoise_tv_chambolle(image, strength)  # type: ignore[no-untyped-call]
+        return denoised

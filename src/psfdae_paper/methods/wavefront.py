@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from psfdae.rng import stream
 if TYPE_CHECKING:
     from psfdae_paper.bounds.posterior import Bank, Likelihood, PosteriorSums
     from psfdae_paper.bounds.sampling import Modes, StampModel
+    from psfdae_paper.configuration.schema import Config
 
 BANK_STARS = 32000
 """Of a fit; the target `wavefront` has the bank of the error bounds."""
@@ -76,7 +77,7 @@ class Wavefront(Method):
         from psfdae_paper.configuration.compose import part
         from psfdae_paper.configuration.consistency import SIMULATION
 
-        simulated: Mapping[str, Any] = data.simulation
+        simulated = data.simulation
         if simulated.get("scene", {}).get("name") != "seidel":
             raise FitError(f"{cls.name}: needs stars with random Seidel aberrations (scene 1)")
         config = part(SIMULATION, simulated)
@@ -84,7 +85,7 @@ class Wavefront(Method):
         return cls.with_bank({name: c.values for name, c in drawn.items()}, config, data)
 
     @classmethod
-    def with_bank(cls, drawn: Mapping[str, np.ndarray], config: Any, data: TrainingSet) -> Self:
+    def with_bank(cls, drawn: Mapping[str, np.ndarray], config: Config, data: TrainingSet) -> Self:
         """The method with the columns of a bank of stars, as `fresh_stars` draws them."""
         from psfdae_paper.bounds.estimates import stamp_model, static_psfs
         from psfdae_paper.bounds.posterior import Bank
@@ -149,7 +150,8 @@ class Wavefront(Method):
     @cached_property
     def _middle(self) -> np.ndarray:
         """Mean of the bank's stamps, (1, d, d): the same for all noise levels."""
-        return self.bank.stamps((self.bank.margin,) * 2).mean(axis=0, keepdims=True)
+        mean: np.ndarray = self.bank.stamps((self.bank.margin,) * 2).mean(axis=0, keepdims=True)
+        return mean
 
     def posterior(
         self, noisy: np.ndarray, level: float, position: np.ndarray | None = None
@@ -182,7 +184,8 @@ class Wavefront(Method):
         """Numbers of the fields of stars, (n,), if the method is given them."""
         if not self.needs.position or position is None:
             return None
-        return np.rint(position @ [1, self.bank.points]).astype(int)
+        fields: np.ndarray = np.rint(position @ [1, self.bank.points]).astype(int)
+        return fields
 
     def _over_bank(self, noisy: np.ndarray, level: float, own: np.ndarray | None) -> PosteriorSums:
         """Sums over a part of the bank; over all of it where that promises to be enough."""

@@ -18,4 +18,7 @@ class Wavelet(Denoiser):
         """See `Denoiser`."""
         from skimage.restoration import denoise_wavelet
 
-        return denoise_wavelet(image, strength, "db2", method="BayesShrink", rescale_sigma=False)
+        denoised: np.ndarray = denoise_wavelet(
+            image, strength, "db2", method="BayesShrink", rescale_sigma=False
+        )
+        return denoised

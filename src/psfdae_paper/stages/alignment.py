@@ -7,6 +7,7 @@ too, beside the set of uniform states.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -17,6 +18,7 @@ from psfdae.files import Column, read_product, write_csv, write_product
 from psfdae.optics.wavefronts import FIRST_NOLL
 from psfdae.options import File
 from psfdae.rng import stream
+from psfdae.settings import Group
 from psfdae.telescope.raytracing import ZernikeTracer
 from psfdae.threads import limit_threads
 from psfdae_paper.alignment.stamps import AlignmentStamps
@@ -63,7 +65,9 @@ def model(
     write_product(out, "alignment_model", columns, config.model_dump())
 
 
-def read_model(path: Path, wanted: Any, whose: object = "the configuration") -> QuadraticModel:
+def read_model(
+    path: Path, wanted: Mapping[str, Any] | Group, whose: object = "the configuration"
+) -> QuadraticModel:
     """The quadratic model of a product; `wanted` and `whose` as in `psfdae.belonging.require`."""
     product = read_product(path, "alignment_model", ("coefficients",))
     require(path, product.config, STATES, wanted, whose)

@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Callable
-from dataclasses import asdict, make_dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import make_dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import click
 import numpy as np
@@ -81,10 +81,15 @@ CLEAN = 0.0
 
 OF_DAE = "Folder of `alignment train-dae`."
 DaeFolder = Annotated[Folder, OF_DAE]
-NetworkFolders = make_dataclass(
-    "NetworkFolders",
-    [(name, Annotated[Folder, "Folder of the network of that name."]) for name in TRAINED],
-)
+if TYPE_CHECKING:
+
+    class NetworkFolders:
+        """A folder of each network, by its name."""
+else:
+    NetworkFolders = make_dataclass(
+        "NetworkFolders",
+        [(name, Annotated[Folder, "Folder of the network of that name."]) for name in TRAINED],
+    )
 
 
 @command("alignment train-dae", reads=("seed", "noise", "dae", "dae_train"), choice=CHOICE)
@@ -116,7 +121,7 @@ def train_dae(
     checkpoint.unlink(missing_ok=True)
 
 
-def _groups(kind: str = "", **_: Any) -> tuple[str, ...]:
+def network_groups(kind: str = "", **_: object) -> tuple[str, ...]:
     """Config groups of the training of one network, or of all."""
     kinds = [kind] if kind else TRAINED
     noise = ["noise"] if any(ALIGNERS[name].noisy for name in kinds) else []
@@ -124,7 +129,7 @@ def _groups(kind: str = "", **_: Any) -> tuple[str, ...]:
     return ("seed", *noise, *NETWORKS, *(f"train_{name}" for name in kinds), *dae)
 
 
-@command("alignment train-network", reads=_groups, choice=CHOICE)
+@command("alignment train-network", reads=network_groups, choice=CHOICE)
 def train_network(
     config: Config,
     kind: Annotated[
@@ -179,7 +184,7 @@ def train_network(
     checkpoint.unlink(missing_ok=True)
 
 
-def denoised_draws(data: TrainingStates, dae: Dae, config: Any, kind: str) -> TrainingStates:
+def denoised_draws(data: TrainingStates, dae: Dae, config: Config, kind: str) -> TrainingStates:
     """States with the DAE's output for a few draws of their noise, each state at one level."""
     assert data.noise is not None
     rng = stream(config.seed, "cnn", "noise", kind)
@@ -194,7 +199,7 @@ def denoised_draws(data: TrainingStates, dae: Dae, config: Any, kind: str) -> Tr
     return replace(data, stamps=many, noise=None)
 
 
-def denoise(dae: Path, config: Any, stamps: np.ndarray) -> np.ndarray:
+def denoise(dae: Path, config: Config, stamps: np.ndarray) -> np.ndarray:
     """Output of a trained DAE for stamps (n, F, d, d), neither clipped nor renormalised."""
     network = Dae.load(dae, evaluation=config.evaluation)
     return network.predict(_flat(stamps)).reshape(stamps.shape)
@@ -204,7 +209,9 @@ def _flat(stamps: np.ndarray) -> np.ndarray:
     return stamps.reshape(-1, *stamps.shape[-2:])
 
 
-def noisy_test_states(config: Any, stamps: np.ndarray, test_set: str, level: float) -> np.ndarray:
+def noisy_test_states(
+    config: Config, stamps: np.ndarray, test_set: str, level: float
+) -> np.ndarray:
     """Stamps of a test set at one λ, shape (n, F, d, d), float32; unchanged for λ = 0."""
     if level == CLEAN:
         return stamps
@@ -212,7 +219,7 @@ def noisy_test_states(config: Any, stamps: np.ndarray, test_set: str, level: flo
     return noise_model(config).draw(stamps, level, rng)
 
 
-def network_predictor(folder: Path, config: Any) -> Callable[[np.ndarray], np.ndarray]:
+def network_predictor(folder: Path, config: Config) -> Callable[[np.ndarray], np.ndarray]:
     """The trained network of a folder, from stamps (n, F, d, d) to states (n, 4)."""
     import torch
 
@@ -231,13 +238,13 @@ def network_predictor(folder: Path, config: Any) -> Callable[[np.ndarray], np.nd
     return partial(predict_states, model, batch=config.evaluation.batch, mirrors=mirrors)
 
 
-def _kind(value: Any) -> str:
+def _kind(value: object) -> str:
     if value not in NETWORKS:
         raise ValueError(f"{value!r} must be one of {', '.join(NETWORKS)}")
     return str(value)
 
 
-def _size(value: Any) -> int:
+def _size(value: object) -> int:
     if not isinstance(value, int) or not 1 <= value <= 4096:
         raise ValueError(f"{value!r} must be a whole number from 1 to 4096")
     return value
@@ -267,7 +274,7 @@ def estimate(
     limit_threads(config.evaluation.threads)
     product = read_product(states, "alignment_states", ("states", "stamps"))
     require_origin(dae, STATE_STAMPS, product)
-    folders: dict[str, Path] = asdict(networks)
+    folders: dict[str, Path] = vars(networks)
     for name, folder in folders.items():
         require_network(folder, product, name)
     predict = {name: network_predictor(folder, config) for name, folder in folders.items()}
@@ -296,7 +303,7 @@ def _names(methods: list[Aligner]) -> str:
     return ", ".join(method.name for method in methods)
 
 
-def _write_times(path: Path, rows: list[tuple[str, float, str, float, int]]) -> None:
+def _write_times(path: Path, rows: Sequence[tuple[str, float, str, float, int]]) -> None:
     import pandas as pd
 
     columns = ["test_set", "noise_level", "method", "seconds", "states"]
@@ -360,7 +367,7 @@ def fit(
         start = found.parameters[:, :4]  # where the next one starts: it has more to find
         fits["estimates"].append(found.parameters[:, :4])
         fits["deviance"].append(-2.0 * found.height)
-        fits["evaluations"].append([best.evaluations, last])
+        fits["evaluations"].append(np.array([best.evaluations, last]))
         fits["converged"].append(found.converged)
         fits["twin_tried"].append(twins)
         fits["twin_won"].append(best.parameters[:, 0] != first.parameters[:, 0])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, TypedDict
 
 import numpy as np
 
@@ -34,6 +34,9 @@ from psfdae_paper.configuration.schema import Config
 from psfdae_paper.stages.alignment import StatesFile
 from psfdae_paper.stages.alignment_methods import DaeFolder, denoise, noisy_test_states
 
+if TYPE_CHECKING:
+    import pandas as pd
+
 Estimates = Annotated[tuple[File, ...], "Product of `alignment estimate`."]
 Fits = Annotated[tuple[File, ...], "Product of `alignment fit`.", {"flag": "--fit"}]
 Bounds = Annotated[tuple[File, ...], "Product of `alignment bound`.", {"flag": "--bound"}]
@@ -51,35 +54,44 @@ DRAWN = [method.name for method in ESTIMATORS if not method.free]
 Png = Annotated[File, "PNG."]
 
 
+class Key(TypedDict):
+    """Whose errors, and on what."""
+
+    test_set: str
+    noise_level: float
+    method: str
+
+
 def read_errors(
     estimates: Sequence[Path], fits: Sequence[Path]
-) -> Iterator[tuple[dict[str, Any], np.ndarray, np.ndarray]]:
-    """Key (test_set, noise_level, method), true states and estimates, (n, 4) each."""
+) -> Iterator[tuple[Key, np.ndarray, np.ndarray]]:
+    """Key, true states and estimates, (n, 4) each."""
     for path in estimates:
         product = read_product(path, "alignment_estimates")
         truth, test_set = product["states"], product.config["test_set"]
         for row, level in enumerate(product["levels"]):
-            key = {"test_set": test_set, "noise_level": float(level)}
-            yield {**key, "method": "constant"}, truth, np.zeros_like(truth)
+            key = Key(test_set=test_set, noise_level=float(level), method="constant")
+            yield key, truth, np.zeros_like(truth)
             for column, method in enumerate(LEARNED):
                 yield {**key, "method": method.name}, truth, product["estimates"][row, column]
     for path in fits:
         product = read_product(path, "alignment_fit", ("states", "estimates"))
         test_set = product.config["test_set"]
-        key = {"test_set": test_set, "noise_level": product.config["level"]}
+        level = product.config["level"]
         for method, found in zip(of_set(FITTED, test_set), product["estimates"], strict=True):
-            yield {**key, "method": method.name}, product["states"], found
+            key = Key(test_set=test_set, noise_level=level, method=method.name)
+            yield key, product["states"], found
 
 
-def read_bounds(bounds: Sequence[Path]) -> Iterator[tuple[dict[str, Any], np.ndarray, np.ndarray]]:
-    """Key (test_set, noise_level, method), true states (n, 4) and covariances (n, 4, 4)."""
+def read_bounds(bounds: Sequence[Path]) -> Iterator[tuple[Key, np.ndarray, np.ndarray]]:
+    """Key, true states (n, 4) and covariances (n, 4, 4)."""
     for path in bounds:
         product = read_product(path, "alignment_bound", ("states", "levels", "covariances"))
         test_set = product.config["test_set"]
         for method, levels in zip(of_set(BOUNDS, test_set), product["covariances"], strict=True):
             for level, covariances in zip(product["levels"], levels, strict=True):
-                key = {"test_set": test_set, "noise_level": float(level)}
-                yield {**key, "method": method.name}, product["states"], covariances
+                key = Key(test_set=test_set, noise_level=float(level), method=method.name)
+                yield key, product["states"], covariances
 
 
 SAME_TEST = ("noise.kappa", "noise.background_photons", *STATE_STAMPS)
@@ -132,7 +144,7 @@ def tables(
         made = read_product(path, "alignment_bound", ()).config
         require(path, made, STATE_STAMPS, product.config, states)
     unit = product["unit"]
-    found: dict[Path, list[dict[str, Any]]] = {errors: [], correlation: []}
+    found: dict[Path, list[rows.Row]] = {errors: [], correlation: []}
     for key, truth, estimate in read_errors(estimates, fits):
         found[errors] += rows.error_rows(key, estimate - truth, unit)
         if key["method"] != "constant":
@@ -161,7 +173,7 @@ def paper_tables(
     from psfdae_paper.evaluation import alignment_tables as rows
     from psfdae_paper.evaluation.paper import published
 
-    def write(name: str, table: Any, title: str, digits: dict[str, str]) -> None:
+    def write(name: str, table: pd.DataFrame, title: str, digits: dict[str, str]) -> None:
         path = out / f"alignment_paper_{name}.csv"
         write_csv(path, table, digits=6)
         text = rows.as_markdown(table, f"{title}. {rows.TEST_SETS}", digits)
@@ -195,7 +207,7 @@ def time_table(
     total = table.groupby("method")[["seconds", "states"]].sum()
     rows = []
     for method in ESTIMATORS:
-        seconds, states = total.loc[method.name]
+        seconds, states = total.loc[method.name].to_numpy()
         # With the trainings of all networks that the method needs.
         trained = sum(training[name] for name in (method.network, "dae" * method.denoised) if name)
         rows.append((method.name, seconds / states, int(states), trained))
@@ -247,7 +259,7 @@ def errors(estimates: Estimates, fits: Fits, bounds: Bounds, out: Png) -> None:
     from psfdae_paper.evaluation.alignment_figures import errors_against_size, size_of
 
     require_one_test(estimates, fits, bounds)
-    curves: defaultdict[float, dict[str, Any]] = defaultdict(dict)
+    curves: dict[float, dict[str, tuple[np.ndarray, np.ndarray]]] = defaultdict(dict)
     for key, truth, states in read_errors(estimates, fits):
         if key["method"] in DRAWN and key["noise_level"] > 0:
             error = np.abs(states - truth).mean(axis=1)
@@ -312,11 +324,12 @@ def correlation(correlation: ErrorTable, out: Png) -> None:
     from psfdae_paper.evaluation.alignment_tables import PARAMETERS
     from psfdae_paper.evaluation.paper import published
 
-    def titled(method: Aligner, rows: Any, whose: str = "") -> tuple[str, np.ndarray]:
+    def titled(method: Aligner, rows: pd.DataFrame, whose: str = "") -> tuple[str, np.ndarray]:
         matrix = np.full((4, 4), np.nan)
-        for row in rows[rows.method == method.name].itertuples():
-            a, b = (PARAMETERS.index(name) for name in row.pair.split("-"))
-            matrix[a, b] = matrix[b, a] = row.correlation
+        own = rows[rows.method == method.name]
+        for pair, value in zip(own.pair, own.correlation, strict=True):
+            a, b = (PARAMETERS.index(name) for name in pair.split("-"))
+            matrix[a, b] = matrix[b, a] = value
         return f"{whose}{method.short}, λ = {level:g}", matrix
 
     ours, paper = read_table(correlation), published("correlation")
@@ -325,7 +338,8 @@ def correlation(correlation: ErrorTable, out: Png) -> None:
     shown = [method for method in ALIGNERS.values() if method.short]
     published_too, more = [m for m in shown if m.look.paper], [m for m in shown if not m.look.paper]
     panels = []
-    for level, rows in ours.groupby("noise_level"):
+    for level in np.unique(ours.noise_level):
+        rows = ours[ours.noise_level == level]
         known = paper[np.isclose(paper.noise_level, level)]
         first = [titled(method, known, "paper, ") for method in published_too]
         first += [titled(method, rows) for method in published_too]

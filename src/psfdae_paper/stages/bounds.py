@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, cast
 
 import numpy as np
 
@@ -41,6 +41,9 @@ from psfdae_paper.bounds.tables import (
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.consistency import SIMULATION
 from psfdae_paper.configuration.schema import Config
+
+if TYPE_CHECKING:
+    from psfdae_paper.methods.wavefront import Wavefront
 
 KNOWING_THE_OPTICS = ("wavefront", "wavefront_position")
 
@@ -136,7 +139,7 @@ def optics(
     bounded = bounded_stars(config, product)
     position = field_positions(product)[bounded.star]
     summary, stars_table = [], []
-    for kind in (method(name) for name in KNOWING_THE_OPTICS):
+    for kind in (cast("type[Wavefront]", method(name)) for name in KNOWING_THE_OPTICS):
         data = {r: training_set(config, kind, product, SPLIT, r) for r in bounded.truth}
         first = kind.with_bank(drawn.arrays, config, next(iter(data.values())))
         fitted = {reference: replace(first, data=own) for reference, own in data.items()}
@@ -147,8 +150,8 @@ def optics(
                 found = estimator.estimated(*posterior, noisy, level, position)
                 truth = bounded.truth[reference]
                 metrics = quality(found, truth, config.evaluation.data_range)
-                row = {"dataset": dataset, "split": SPLIT, "reference": reference}
-                row |= {"method": kind.name, "noise_level": level}
+                row: dict[str, object] = {"dataset": dataset, "split": SPLIT}
+                row |= {"reference": reference, "method": kind.name, "noise_level": level}
                 summary += summarised(row, metrics, bounded.field)
                 each = {"star": bounded.star, "field": bounded.field}
                 stars_table.append(pd.DataFrame({**row, **each, **metrics}))
@@ -196,10 +199,9 @@ def efficiency(
 
     limits = pd.concat([read_table(path) for path in bounds], ignore_index=True)
     sure = limits.method.isin(POSTERIOR_MEANS) & (limits.metric == "mse") & (limits.tight == "yes")
-    tight = {
-        (row.dataset, row.reference, row.method, f"{row.noise_level:.6g}")
-        for row in limits[sure].itertuples()
-    }
+    of_tight = limits[sure]
+    levels = map("{:.6g}".format, of_tight.noise_level)
+    tight = {*zip(of_tight.dataset, of_tight.reference, of_tight.method, levels, strict=True)}
     best = pd.concat([pd.read_parquet(path) for path in bounds_per_star], ignore_index=True)
     wanted = [*COLUMN_OF_TABLE, "method", "star", "field", "mse"]
     methods = pd.concat([pd.read_parquet(path, columns=wanted) for path in parts])
@@ -207,7 +209,7 @@ def efficiency(
     means = best[best.method.isin(POSTERIOR_MEANS)][wanted]
     methods = pd.concat([methods, means], ignore_index=True)
     by_column = dict(list(methods.groupby(COLUMN_OF_TABLE, sort=False)))
-    rows: list[dict[str, Any]] = []
+    rows: list[dict[str, object]] = []
     for key, bounded in best.groupby(COLUMN_OF_TABLE, sort=False):
         found = by_column[key]
         if found.method.isin(POSTERIOR_MEANS).all():
@@ -243,9 +245,10 @@ def beside_the_paper(
         limits[[*column, "value", "stderr", "tight"]].rename(columns={"value": "mse_bound"}),
         on=column,
     )
+    difference = table.mse_paper - table.mse_bound
     found = [
-        Comparison(row.mse_paper, row.mse_bound, row.mse_paper - row.mse_bound, row.stderr)
-        for row in table.itertuples()
+        Comparison(*each)
+        for each in zip(table.mse_paper, table.mse_bound, difference, table.stderr, strict=True)
     ]
     table["paper_over_bound"] = [1 / each.efficiency for each in found]
     table["verdict"] = list(map(paper_verdict, found, table.tight == "yes"))

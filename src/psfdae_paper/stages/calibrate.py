@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from math import ceil
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 
@@ -21,7 +21,9 @@ from psfdae.threads import limit_threads
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.consistency import SIMULATION
 from psfdae_paper.configuration.schema import Config
+from psfdae_paper.configuration.wavefront import VonKarman
 from psfdae_paper.evaluation.calibration import (
+    OriginalNoise,
     fit_scales,
     kappa_of_mse,
     original_noise_rows,
@@ -46,19 +48,18 @@ def scan(
     import pandas as pd
 
     limit_threads(1)  # batches run side by side
-    rows = original_noise_rows()
-    rows = rows[rows.dataset == dataset]
-    turbulent = config.scene.name == "turbulence"
+    rows = [row for row in original_noise_rows() if row.dataset == dataset]
+    scanned = [float("nan")]
+    if isinstance(config.wavefront, VonKarman):
+        # The configured r0 is always scanned: its fit is set beside the configured scale.
+        scanned = sorted({*config.calibration.r0_m, config.wavefront.r0_m})
     table = []
-    # The configured r0 is always scanned: its fit is set beside the configured scale.
-    scanned = {*config.calibration.r0_m, config.wavefront.r0_m} if turbulent else {float("nan")}
-    for r0 in sorted(scanned):
-        source = _source(config, r0 if turbulent else None)
+    for r0 in scanned:
+        source = _source(config, r0)
         for scale in config.calibration.pixel_scales_arcsec:
             images = _images(config, source, scale)
-            for row in rows.itertuples():
-                level = row.noise_level
-                noisy = _at_published_mse(images, row.mse, level, config)
+            for row in rows:
+                noisy = _at_published_mse(images, row, config)
                 ranges = config.calibration.data_ranges
                 similar = np.atleast_2d(ssim(noisy, images, *ranges))
                 table += [
@@ -67,7 +68,7 @@ def scan(
                         "dataset": dataset,
                         "pixel_scale_arcsec": scale,
                         "r0_m": r0,
-                        "noise_level": level,
+                        "noise_level": row.noise_level,
                         "data_range": data_range,
                         "ssim": values.mean(),
                     }
@@ -93,12 +94,13 @@ class _Kept:
         if pupil.axis.size not in self._opd:
             every = np.arange(len(self))
             self._opd[pupil.axis.size] = self.source.opd(every, pupil, dtype)
-        return self._opd[pupil.axis.size][index]
+        opd: np.ndarray = self._opd[pupil.axis.size][index]
+        return opd
 
 
-def _source(config: Config, r0: float | None) -> WavefrontSource:
-    """Wavefronts of the scanned stars, or of all fields behind turbulence of an r0."""
-    if r0 is None:
+def _source(config: Config, r0: float) -> WavefrontSource:
+    """Wavefronts of the scanned stars, or of all fields behind turbulence, if it has this r0."""
+    if not isinstance(config.wavefront, VonKarman):
         count, fields = config.calibration.stars, config.grid.points**2
         return star_wavefronts(
             config, assign_fields(count, fields, stream(config.seed, "scan", "field"))
@@ -115,11 +117,9 @@ def _images(config: Config, source: WavefrontSource, scale: float) -> np.ndarray
     return normalise_flux(propagation.framed(config.framing.stamp_px)[0])[0]
 
 
-def _at_published_mse(
-    images: np.ndarray, published_mse: float, level: float, config: Config
-) -> np.ndarray:
-    background = config.noise.background_photons
-    kappa = float(kappa_of_mse(published_mse, level, images[0].size, background))
+def _at_published_mse(images: np.ndarray, row: OriginalNoise, config: Config) -> np.ndarray:
+    level, background = row.noise_level, config.noise.background_photons
+    kappa = kappa_of_mse(row.mse, level, images[0].size, background)
     rng = stream(config.seed, "noise", "scan", f"{level:.6g}")
     return NoiseModel(kappa, background).draw(images, level, rng)
 
@@ -139,7 +139,7 @@ def calibrate(
     limit_threads(config.evaluation.threads)
     scan_table = pd.concat([read_table(path) for path in scans], ignore_index=True)
     columns = pd.DataFrame(
-        [_column(row, products[row.dataset], config) for row in original_noise_rows().itertuples()]
+        [_column(row, products[row.dataset], config) for row in original_noise_rows()]
     )
     scanned = scan_table.r0_m
     by_r0 = {
@@ -190,20 +190,20 @@ def _configured(stars: dict[str, Path]) -> dict[str, float]:
     return values
 
 
-def _column(row: Any, path: Path, config: Config) -> dict[str, Any]:
+def _column(row: OriginalNoise, path: Path, config: Config) -> dict[str, object]:
     """One original-noise column: the paper's values and ours, at κλ and at its own MSE."""
     images = read_product(path, "stars", ("realisation",))["realisation"]
     background = config.noise.background_photons
     rng = stream(config.seed, "noise", "calibrate", row.dataset, f"{row.noise_level:.6g}")
     noise = NoiseModel(config.noise.kappa, background)
     ours = noise.draw(images, row.noise_level, rng)
-    matched = _at_published_mse(images, row.mse, row.noise_level, config)
+    matched = _at_published_mse(images, row, config)
     data_range, error = config.evaluation.data_range, mse(ours, images).mean()
     return {
         "dataset": row.dataset,
         "noise_level": row.noise_level,
         "fitted": row.fitted,
-        "kappa": float(kappa_of_mse(row.mse, row.noise_level, images[0].size, background)),
+        "kappa": kappa_of_mse(row.mse, row.noise_level, images[0].size, background),
         "mse_paper": row.mse,
         "mse": error,
         "mse_ratio": error / row.mse,

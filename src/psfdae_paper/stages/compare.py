@@ -193,9 +193,10 @@ def describe_tables(first: Path, second: Path) -> str:
         seed_scatter,
     )
 
-    both = [read_errors(folder) for folder in (first, second)]
+    both = read_errors(first), read_errors(second)
     rows, order = compare_tables(*both, seed_scatter())
-    names = " < ".join(method(name).look.paper[1] for name in PAPER_ORDER)  # type: ignore[index]
+    looks = [method(name).look for name in PAPER_ORDER]
+    names = " < ".join(look.paper[1] for look in looks if look.paper)
     said = {
         "equal": "are equal to the last digit",
         "rounding": f"differ by less than {NEGLIGIBLE:g} of the standard error of the test stars, "
@@ -227,7 +228,7 @@ def _named(rows: pd.DataFrame) -> list[str]:
         metrics: dict[str, list[str]] = {}
         for (name, metric), part in cell.groupby(["method", "metric"], sort=False):
             levels = ", ".join(f"{level:g}" for level in part.noise_level)
-            metrics.setdefault(f"{name} at λ = {levels}", []).append(metric)
+            metrics.setdefault(f"{name} at λ = {levels}", []).append(str(metric))
         found = (f"{name} ({', '.join(of)})" for name, of in metrics.items())
         lines.append(f"{_cell(key)}: {'; '.join(found)}")
     return lines
@@ -238,7 +239,7 @@ def _cell(key: Sequence[Any]) -> str:
     return ", ".join([*key[:3], *(f"λ = {level:g}" for level in key[3:])])
 
 
-def _table(rows: Sequence[Sequence[Any]], headers: Sequence[str]) -> str:
+def _table(rows: Sequence[Sequence[object]], headers: Sequence[str]) -> str:
     from tabulate import tabulate
 
     if not rows:

@@ -25,7 +25,9 @@ def config(overrides: Overrides = (), only: Only = None) -> None:
         checked = load(overrides)
     else:
         names = {_key(name): name for name in found()}
-        reader = stage(names[_key(only)]).stage.settings if _key(only) in names else None
+        reader = None
+        if _key(only) in names:
+            reader = stage(names[_key(only)]).stage.settings  # type: ignore[attr-defined]
         if reader is None:
             raise click.BadParameter(f"{only!r} is not one of {', '.join(sorted(found()))}")
         groups = Groups(reader.of({}), reader.choice)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import make_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from psfdae import fits
 from psfdae.files import Product, ProductError, write_csv, write_parquet, write_text
@@ -37,22 +37,26 @@ READS = (
 )
 """Groups of the configuration on which the measurements depend, models being given."""
 
-Models: Any = make_dataclass(
-    "Models",
-    [
-        (
-            kind.name,
-            Annotated[
-                (Folder if kind.storage.files else File) | None,
-                kind.storage.about or f"What `psfdae fit {kind.name}` leaves.",
-            ],
-            None,
-        )
-        for kind in registered()
-        if kind.storage
-    ],
-)
-"""Options with the model of each method that leaves one."""
+if TYPE_CHECKING:
+
+    class Models:
+        """Options with the model of each method that leaves one, by its name."""
+else:
+    Models = make_dataclass(
+        "Models",
+        [
+            (
+                kind.name,
+                Annotated[
+                    (Folder if kind.storage.files else File) | None,
+                    kind.storage.about or f"What `psfdae fit {kind.name}` leaves.",
+                ],
+                None,
+            )
+            for kind in registered()
+            if kind.storage
+        ],
+    )
 
 
 @command("evaluate", reads=READS)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
@@ -190,11 +190,12 @@ def field_of(stars: Product) -> np.ndarray:
     from psfdae_paper.stars.fields import square_grid
 
     grid = stars.config["grid"]
-    return np.deg2rad(square_grid(grid["points"], grid["spacing_deg"])[1])
+    angle: np.ndarray = np.deg2rad(square_grid(grid["points"], grid["spacing_deg"])[1])
+    return angle
 
 
 def strip_rows(
-    config: Any,
+    config: Config,
     product: Product,
     test: np.ndarray,
     picks: np.ndarray,

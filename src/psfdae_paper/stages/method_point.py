@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import Any
 
 from psfdae import fits
 from psfdae.files import read_product
@@ -14,6 +13,7 @@ from psfdae.model.star_sets import read_stars, training_set
 from psfdae.reading import read_table
 from psfdae.threads import limit_threads
 from psfdae_paper.configuration.compose import part
+from psfdae_paper.configuration.schema import Config
 from psfdae_paper.stages.fit import fit
 from psfdae_paper.sweeps.measured import Measured, Task, fit_in, measure_images
 
@@ -23,7 +23,7 @@ def files_of(name: str) -> tuple[str, ...]:
     return tuple(path.name for path in fits.outputs(method(name), fit_in(method(name), Path())))
 
 
-def run(config: Any, task: Task, name: str) -> Measured:
+def run(config: Config, task: Task, name: str) -> Measured:
     """Fit as the stage `fit` does, and measure.
 
     If that fit takes the validation stars, too, the model that is validated is fitted
@@ -58,18 +58,20 @@ def run(config: Any, task: Task, name: str) -> Measured:
     metrics = measure_images(config, task, name, validated or fitted, fitted)
     described = kind.described(place)
     attempt = described.pop("attempt", 0)
-    course: dict[str, Any] = {}
+    epochs, stopped = None, False
     if HISTORY in fits.storage_of(kind).diagnostics:
         last = read_table(fits.beside(kind, place, HISTORY)).iloc[-1]
         # Of the training alone, and of all its parts if it was interrupted.
         seconds, cpu_seconds = float(last["seconds"]), float(last["cpu_seconds"])
         most = max(getattr(group, "epochs", 0) for group in kind.settings(own).values())
-        course = {"epochs": int(last["epoch"]), "stopped": int(last["epoch"]) < most}
+        epochs = int(last["epoch"])
+        stopped = epochs < most
     return Measured(
         metrics=metrics,
         described={**read_product(stars, "stars", ()).config, **described},
         seconds=seconds,
         cpu_seconds=cpu_seconds,
+        epochs=epochs,
+        stopped=stopped,
         attempt=attempt,
-        **course,
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,8 +15,10 @@ from psfdae.threads import limit_threads
 from psfdae_paper.configuration.aligners import WEIGHTS
 from psfdae_paper.configuration.alignment import STATE_STAMPS
 from psfdae_paper.configuration.compose import part
-from psfdae_paper.evaluation.alignment_tables import error_rows
+from psfdae_paper.configuration.schema import Config
+from psfdae_paper.evaluation.alignment_tables import Row, error_rows
 from psfdae_paper.stages.alignment_methods import (
+    network_groups,
     network_predictor,
     noisy_test_states,
     train_network,
@@ -31,7 +34,7 @@ def files_of(name: str) -> tuple[str, ...]:
     return (WEIGHTS, CONFIG, HISTORY)
 
 
-def run(config: Any, task: Task, name: str) -> Measured:
+def run(config: Config, task: Task, name: str) -> Measured:
     """Train as the stage of the same network does, and measure.
 
     Parameters
@@ -49,7 +52,7 @@ def run(config: Any, task: Task, name: str) -> Measured:
     for role in ("validation", "test"):
         product = read_product(task.data[role], "alignment_states", ())
         require(product.path, product.config, STATE_STAMPS, trained_on.config, trained_on.path)
-    settings = part(train_network.stage.settings.reads(name), config)  # type: ignore[attr-defined]
+    settings = part(network_groups(name), config)
     train_network(settings, name, task.data["states"], task.checkpoint, task.folder)
     limit_threads(config.evaluation.threads)
     metrics: dict[str, float] = {}
@@ -68,12 +71,12 @@ def run(config: Any, task: Task, name: str) -> Measured:
     )
 
 
-def _rows(config: Any, task: Task, role: str) -> list[dict[str, Any]]:
+def _rows(config: Config, task: Task, role: str) -> list[Row]:
     """Rows of the table of errors as the main workflow makes them, of one network."""
     product = read_product(task.data[role], "alignment_states", ("states", "stamps", "unit"))
     predict = network_predictor(task.folder, config)
     test_set = TEST_SET if role == "test" else role
-    rows = []
+    rows: list[Row] = []
     for level in task.levels:
         stamps = noisy_test_states(config, product["stamps"], test_set, level)
         key = {"test_set": test_set, "noise_level": level, "method": task.dataset}
@@ -81,7 +84,7 @@ def _rows(config: Any, task: Task, role: str) -> list[dict[str, Any]]:
     return rows
 
 
-def _metrics(role: str, rows: list[dict[str, Any]]) -> dict[str, float]:
+def _metrics(role: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
     """Mean absolute error in units of the range: of all parameters, and at each noise level."""
     levels: dict[float, list[float]] = {}
     for row in rows:

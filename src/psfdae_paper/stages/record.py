@@ -27,6 +27,8 @@ from psfdae_paper.configuration.command import command
 from psfdae_paper.source import git
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from psfdae_paper.configuration.schema import Config
 
 VERSIONED = ("psfdae", "numpy", "scipy", "torch", "scikit-learn", "minisom")
@@ -70,7 +72,7 @@ def runtime(
     write_csv(out, _costs(results), 6)
 
 
-def _costs(results: Path):  # type: ignore[no-untyped-def]
+def _costs(results: Path) -> pd.DataFrame:
     import pandas as pd
 
     folder = results / "benchmarks"
@@ -211,7 +213,7 @@ def _require_history(name: str, found: Mapping[str, str]) -> None:
         ) from None
 
 
-def provenance(results: Path, config: Config) -> dict[str, Any]:
+def provenance(results: Path, config: Config) -> dict[str, object]:
     """Where a run comes from and what it took."""
     costs = _costs(results)
     canonical = json.dumps(config.model_dump(), sort_keys=True)

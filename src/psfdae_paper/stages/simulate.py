@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import click
 import numpy as np
@@ -196,7 +196,7 @@ def _sampling(config: Config, fields: FieldOfPsfs) -> list[str]:
     ]
 
 
-def write_psfs(config: Any, fields: FieldOfPsfs, path: Path) -> None:
+def write_psfs(config: Config, fields: FieldOfPsfs, path: Path) -> None:
     """Write the static PSFs as a cube, with a table of where they are.
 
     The primary HDU holds the fraction of the light on each pixel, (F, d, d), the
@@ -238,7 +238,7 @@ def write_psfs(config: Any, fields: FieldOfPsfs, path: Path) -> None:
 
 
 def write_image(
-    config: Any, fields: FieldOfPsfs, snr: float, seed: int, path: Path, catalogue: Path
+    config: Config, fields: FieldOfPsfs, snr: float, seed: int, path: Path, catalogue: Path
 ) -> None:
     """Write an image with one noisy star per field, and its catalogue.
 
@@ -302,13 +302,15 @@ def write_example(out: Path, catalogue: Path, seed: int, **recipe: int) -> Examp
     The image has a WCS and the cards GAIN and SATURATE; the list has pixel (1-based)
     and sky coordinates of all stars but the companions of blended ones.
     """
-    made = FieldRecipe(**recipe)
+    made = FieldRecipe(**recipe)  # type: ignore[arg-type]  # no pair of numbers among them
     field = simulated(made, seed)
+    x, y = field.centroid.T
     write_field(
         out,
         catalogue,
         field.image.astype(np.float32),
-        *field.centroid.T,
+        x,
+        y,
         pixel_scale_arcsec=made.pixel_scale_arcsec,
         GAIN=made.gain,
         SATURATE=float(made.saturation),

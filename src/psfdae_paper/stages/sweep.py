@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 from typing import Annotated, Any, Literal
 
 import click
@@ -15,12 +16,13 @@ import click
 from psfdae.files import ProductError, write_text
 from psfdae.method import FitError
 from psfdae.options import File, Folder
-from psfdae.settings import Reference, SplitKind
+from psfdae.settings import Reference, SplitKind, validate
 from psfdae_paper.configuration.aligners import SWEPT
 from psfdae_paper.configuration.alignment import CHOICE
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.compose import decisive, load_stage
-from psfdae_paper.configuration.sweep import models, point_groups
+from psfdae_paper.configuration.schema import Config
+from psfdae_paper.configuration.sweep import Axis, Value, models, point_groups
 from psfdae_paper.sweeps.measured import (
     CHECKSUM,
     COST,
@@ -28,6 +30,7 @@ from psfdae_paper.sweeps.measured import (
     FINISHED,
     RESULT,
     VALIDATION,
+    Measured,
     Task,
     checksum,
     read_result,
@@ -65,12 +68,14 @@ class Trial:
     known: Sequence[str]
 
 
-class JsonType(click.ParamType):
+class JsonType(click.ParamType):  # type: ignore[type-arg]  # click below 8.5 takes none
     """A JSON object as one argument."""
 
     name = "json"
 
-    def convert(self, value: Any, param: Any, ctx: Any) -> Any:
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> dict[str, Any]:
         """Parse; a wrong text is a usage error."""
         if isinstance(value, dict):
             return value
@@ -93,7 +98,7 @@ def sweep_list(name: Annotated[str, {"argument": True}], overrides: Overrides = 
     from psfdae_paper.sweeps.points import plan_sweep
 
     for each in plan_sweep(name, overrides).points.values():
-        values = each.values or {"trial": each.slot}
+        values: Mapping[str, object] = each.values or {"trial": each.slot}
         print("\t".join([each.name, *(f"{k}={json.dumps(v)}" for k, v in values.items())]))
 
 
@@ -137,10 +142,10 @@ def sweep_point(
 
 
 def point(
-    config: Any,
+    config: Config,
     model: str,
-    values: Mapping[str, Any],
-    keys: Mapping[str, Any],
+    values: Mapping[str, Value],
+    keys: Mapping[str, Value],
     task: Task,
     trial: Trial | None = None,
     source: str = "",
@@ -223,11 +228,11 @@ def as_json(result: Mapping[str, Any]) -> str:
     return json.dumps({**result, CHECKSUM: checksum(result)}, indent=1) + "\n"
 
 
-def _outcome(module: Any, config: Any, task: Task, model: str) -> dict[str, Any]:
+def _outcome(module: ModuleType, config: Config, task: Task, model: str) -> dict[str, object]:
     """Status, metrics and configuration of a point; its cost goes to a file of its own."""
     started, started_cpu = time.monotonic(), time.process_time()
     try:
-        done = module.run(config, task, model)
+        done: Measured = module.run(config, task, model)
     except FitError as error:
         reason = str(error).splitlines()[0]
         print(f"failed: {reason}", flush=True)
@@ -258,19 +263,15 @@ def _write_cost(folder: Path, seconds: float, cpu_seconds: float) -> None:
     write_text(folder / COST, json.dumps(cost) + "\n")
 
 
-def _asked(trial: Trial, folder: Path) -> tuple[dict[str, Any], Mapping[str, Any]]:
+def _asked(trial: Trial, folder: Path) -> tuple[dict[str, Axis], dict[str, Value]]:
     """Axes of the space, and the values that the search proposes for a trial."""
-    from psfdae.settings import validate
-    from psfdae_paper.configuration.sweep import Axis
-
     space = {name: validate(Axis, axis) for name, axis in trial.search["space"].items()}
     known = [read_result(folder.parent / other / RESULT) for other in trial.known]
     adaptive = import_module(ADAPTIVE_MODULE)
-    return space, adaptive.ask(space, trial.search, trial.slot, known)
+    values: dict[str, Value] = adaptive.ask(space, trial.search, trial.slot, known)
+    return space, values
 
 
-def _with(config: Any, keys: Mapping[str, Any]) -> Any:
+def _with(config: Config, keys: Mapping[str, Value]) -> Config:
     """The stage's configuration with other values, checked again."""
-    from psfdae.settings import validate
-
     return validate(type(config), with_values(config.model_dump(), keys))

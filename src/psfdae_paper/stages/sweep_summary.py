@@ -122,7 +122,7 @@ def best_overrides(results: Path, name: str) -> list[str]:
     return [str(override) for override in overrides]
 
 
-def _row(result: Mapping[str, Any], axes: Iterable[str], best: bool) -> dict[str, Any]:
+def _row(result: Mapping[str, Any], axes: Iterable[str], best: bool) -> dict[str, object]:
     values = {name: result["values"][name] for name in axes}
     values = {k: json.dumps(v) if isinstance(v, list) else v for k, v in values.items()}
     outcome = {key: result[key] for key in ("status", "reason", "epochs", "attempt")}

@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -139,7 +138,8 @@ def _shift_transfer(shift: np.ndarray, side: int) -> np.ndarray:
     """Factors that move images by (x, y) pixels, shape (n, side, side//2 + 1)."""
     rows = np.exp(-2j * np.pi * np.fft.fftfreq(side) * shift[:, 1, None])
     columns = np.exp(-2j * np.pi * np.fft.rfftfreq(side) * shift[:, 0, None])
-    return rows[:, :, None] * columns[:, None, :]
+    factors: np.ndarray = rows[:, :, None] * columns[:, None, :]
+    return factors
 
 
 def _fluxes(recipe: FieldRecipe, kind: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -152,7 +152,8 @@ def _fluxes(recipe: FieldRecipe, kind: np.ndarray, rng: np.random.Generator) -> 
     flux = noise * low * (high / low) ** draw
     # Twice to four times what fills the brightest pixel.
     full = recipe.saturation * recipe.gain / axis_psf.max()
-    return np.where(kind == "saturated", full * (2.0 + 2.0 * draw), flux)
+    fluxes: np.ndarray = np.where(kind == "saturated", full * (2.0 + 2.0 * draw), flux)
+    return fluxes
 
 
 def add_stamps(image: np.ndarray, stamps: np.ndarray, x: np.ndarray, y: np.ndarray) -> None:
@@ -171,7 +172,7 @@ def add_stamps(image: np.ndarray, stamps: np.ndarray, x: np.ndarray, y: np.ndarr
 # Files.
 
 
-def write_cube(path: Path, stamps: np.ndarray, **cards: Any) -> None:
+def write_cube(path: Path, stamps: np.ndarray, **cards: str | float) -> None:
     """Write an array, such as stamps, as a FITS image, float64 as float32, with header cards."""
     _write_image(path, stamps, cards)
 
@@ -184,7 +185,7 @@ def write_field(
     y: np.ndarray,
     pixel_scale_arcsec: float = 1.0,
     columns: Mapping[str, np.ndarray] | None = None,
-    **cards: Any,
+    **cards: str | float,
 ) -> None:
     """Write an image with header cards, float64 as float32, and a CSV catalogue of its stars.
 
@@ -209,7 +210,7 @@ def write_field(
         Table(rows).write(temporary, format="ascii.csv", formats=formats, overwrite=True)
 
 
-def _write_image(path: Path, pixels: np.ndarray, cards: Mapping[str, Any]) -> None:
+def _write_image(path: Path, pixels: np.ndarray, cards: Mapping[str, object]) -> None:
     from astropy.io import fits
 
     pixels = pixels.astype(np.float32) if pixels.dtype == np.float64 else pixels

@@ -21,7 +21,7 @@ from psfdae.optics.pupil import (
 )
 from psfdae.optics.seeing import BlurredPropagator
 from psfdae.optics.wavefronts import WavefrontSource
-from psfdae.telescope.settings import Telescope
+from psfdae.telescope.settings import OwnTelescope, Telescope
 from psfdae_paper.configuration.schema import Framing, Optics
 
 Propagator = StampPropagator | BlurredPropagator
@@ -65,7 +65,8 @@ def crop_jittered(framed: np.ndarray, jitter: np.ndarray, margin: int) -> np.nda
     pixels = np.arange(framed.shape[-1] - 2 * margin)
     start = np.broadcast_to(margin - np.asarray(jitter), (len(framed), 2))[:, :, None] + pixels
     stars = np.arange(len(framed))[:, None, None]
-    return framed[stars, start[:, 0, :, None], start[:, 1, None, :]]
+    cut: np.ndarray = framed[stars, start[:, 0, :, None], start[:, 1, None, :]]
+    return cut
 
 
 def normalise_flux(stamps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -131,12 +132,13 @@ class Propagation:
         pixel = telescope.pixel
         reach = 2 * search_px + 0.5 * framing.stamp_px + framing.jitter_px + 0.5 * framing.subpixel
         edge = reach * pixel
-        self._blur = getattr(telescope, "blur", None)
-        if self._blur is not None:
+        own = telescope if isinstance(telescope, OwnTelescope) else None
+        seeing, self._blur = (own.seeing, own.blur) if own else (None, None)
+        if seeing is not None and self._blur is not None:
             edge += self._blur.reach
             if edge > optics.pupil_samples[-1]:
                 raise SamplingError(
-                    f"telescope.seeing.fwhm_arcsec = {telescope.seeing.fwhm_arcsec:g}: its wings "
+                    f"telescope.seeing.fwhm_arcsec = {seeing.fwhm_arcsec:g}: its wings "
                     f"around the stamps need N ≥ {edge:.0f} pupil samples; "
                     f"optics.pupil_samples = {optics.pupil_samples}"
                 )
@@ -323,4 +325,5 @@ class Propagation:
 def _touches(peaks: np.ndarray, reach: np.ndarray) -> np.ndarray:
     """Which brightest pixels (n, 2) lie on the border of a window of ± `reach` pixels, (n,)."""
     reach = reach[:, None]
-    return ((peaks == -reach) | (peaks == reach - 1)).any(axis=1)
+    touches: np.ndarray = ((peaks == -reach) | (peaks == reach - 1)).any(axis=1)
+    return touches

@@ -6,8 +6,8 @@ static wavefronts of all fields, and those of stars with random aberrations.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -15,13 +15,17 @@ from psfdae.files import Column
 from psfdae.optics.pupil import Pupil, SamplingError, annular_pupil
 from psfdae.optics.wavefronts import (
     ModalWavefronts,
+    WavefrontSource,
     seidel_wavefronts,
     zernike_wavefronts,
 )
 from psfdae.rng import stream
+from psfdae.settings import ConfigError
+from psfdae.telescope.aberrations import Seidel
 from psfdae.telescope.field import static_zernikes
-from psfdae.telescope.settings import Telescope
-from psfdae_paper.configuration.schema import Grid, Stars
+from psfdae.telescope.settings import OwnTelescope, Telescope
+from psfdae_paper.configuration.schema import Config, Grid, Stars
+from psfdae_paper.configuration.wavefront import OfTelescope, VonKarman
 from psfdae_paper.stars.fields import perturb, relative_field, square_grid
 from psfdae_paper.stars.turbulence import SPECTRUM, Footprints, draw_waves, layer_r0
 
@@ -105,16 +109,35 @@ class TurbulentWavefronts:
 
 
 @dataclass(frozen=True)
-class Scene:
+class Scene(ABC):
     """Groups `grid`, `telescope` and `wavefront` of a configuration."""
 
     grid: Grid
     telescope: Telescope
-    wavefront: Any
+    wavefront: Seidel | VonKarman | OfTelescope
+
+    @abstractmethod
+    def templates(self) -> WavefrontSource:
+        """Static wavefronts of all fields."""
+
+    def stars(self, stars: Stars, star_field: np.ndarray, seed: int) -> ModalWavefronts:
+        """Wavefronts of stars with random aberrations, `star_field` the field of each, (n,).
+
+        Raises
+        ------
+        ConfigError
+            If the scene has none.
+        """
+        raise ConfigError(
+            f"stars.aberration_fraction = {stars.aberration_fraction}: must be 0, no star of this "
+            "scene has aberrations of its own"
+        )
 
 
 class SeidelScene(Scene):
     """Scene 1: a wide-field telescope with field-dependent Seidel aberrations."""
+
+    wavefront: Seidel
 
     def templates(self) -> ModalWavefronts:
         """Static wavefronts of all fields."""
@@ -131,6 +154,8 @@ class SeidelScene(Scene):
 
 class TurbulenceScene(Scene):
     """Scene 2: an ideal telescope behind static von Kármán turbulence; no star has its own."""
+
+    wavefront: VonKarman
 
     def templates(self) -> TurbulentWavefronts:
         """Static wavefronts of all fields.
@@ -182,6 +207,8 @@ class TelescopeScene(Scene):
     Everything is in the group `telescope`: aperture, field and static aberrations.
     """
 
+    telescope: OwnTelescope
+
     def templates(self) -> ModalWavefronts:
         """Static wavefronts of all fields.
 
@@ -190,15 +217,16 @@ class TelescopeScene(Scene):
         RayTracingError
             If the ray trace of a field is vignetted.
         """
-        if self.telescope.aberrations.kind == "seidel":
-            return self._seidel().templates()
+        aberrations = self.telescope.aberrations
+        if isinstance(aberrations, Seidel):
+            return self._seidel(aberrations).templates()
         return zernike_wavefronts(*self._zernikes())
 
     def stars(self, stars: Stars, star_field: np.ndarray, seed: int) -> ModalWavefronts:
         """Wavefronts of stars with random aberrations, `star_field` the field of each, (n,)."""
         aberrations = self.telescope.aberrations
-        if aberrations.kind == "seidel":
-            return self._seidel().stars(stars, star_field, seed)
+        if isinstance(aberrations, Seidel):
+            return self._seidel(aberrations).stars(stars, star_field, seed)
         noll, static = self._zernikes()
         perturbed = perturb(
             static[star_field],
@@ -214,29 +242,33 @@ class TelescopeScene(Scene):
         _, angle_deg = square_grid(self.grid.points, self.grid.spacing_deg)
         return static_zernikes(self.telescope, angle_deg)
 
-    def _seidel(self) -> SeidelScene:
-        return SeidelScene(self.grid, self.telescope, self.telescope.aberrations)
+    def _seidel(self, aberrations: Seidel) -> SeidelScene:
+        return SeidelScene(self.grid, self.telescope, aberrations)
 
 
-SCENES = {"seidel": SeidelScene, "turbulence": TurbulenceScene, "telescope": TelescopeScene}
+SCENES: dict[str, type[Scene]] = {
+    "seidel": SeidelScene,
+    "turbulence": TurbulenceScene,
+    "telescope": TelescopeScene,
+}
 """By name."""
 
 
-def scene_of(config: Any) -> Any:
+def scene_of(config: Config) -> Scene:
     """The scene of a stage's config."""
     return SCENES[config.scene.name](config.grid, config.telescope, config.wavefront)
 
 
-def template_wavefronts(config: Any) -> Any:
+def template_wavefronts(config: Config) -> WavefrontSource:
     """Static wavefronts of all fields of a stage's scene."""
     return scene_of(config).templates()
 
 
-def star_wavefronts(config: Any, star_field: np.ndarray) -> Any:
+def star_wavefronts(config: Config, star_field: np.ndarray) -> ModalWavefronts:
     """Wavefronts of stars with random aberrations, `star_field` the field of each."""
     return scene_of(config).stars(config.stars, star_field, config.seed)
 
 
-def drawn_columns(source: Any) -> dict[str, Column]:
+def drawn_columns(source: ModalWavefronts) -> dict[str, Column]:
     """What the stars' random aberrations were, as products keep it."""
     return {name: Column(values, "wave", about) for name, (values, about) in source.drawn.items()}

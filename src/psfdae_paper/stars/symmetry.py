@@ -59,7 +59,8 @@ class Symmetry:
             iy, ix = ix, iy
         iy = points - 1 - iy if self.flip_rows else iy
         ix = points - 1 - ix if self.flip_columns else ix
-        return ix + points * iy
+        moved: np.ndarray = ix + points * iy
+        return moved
 
     def window(self, jitter: tuple[int, int], margin: int) -> tuple[int, int]:
         """First row and column to cut from an image whose brightest pixel is at d/2 + `margin`.
@@ -86,4 +87,5 @@ SYMMETRIES = tuple(Symmetry(*flags) for flags in product((False, True), repeat=3
 
 def orbit(field: np.ndarray, points: int) -> np.ndarray:
     """First of the fields to which the symmetries take each field: the same for all of them."""
-    return np.min([symmetry.field(field, points) for symmetry in SYMMETRIES], axis=0)
+    first: np.ndarray = np.min([symmetry.field(field, points) for symmetry in SYMMETRIES], axis=0)
+    return first

@@ -8,21 +8,26 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from psfdae.rng import stream
+from psfdae_paper.configuration.sweep import Axis, Value
 from psfdae_paper.sweeps.points import tidy
+
+if TYPE_CHECKING:
+    from optuna.distributions import BaseDistribution
+    from optuna.trial import FrozenTrial
 
 FINISHED = ("finished", "stopped")
 """States of a point that has a result."""
 
 
 def ask(
-    space: Mapping[str, Any],
+    space: Mapping[str, Axis],
     search: Mapping[str, Any],
     slot: int,
     known: Sequence[Mapping[str, Any]],
-) -> dict[str, Any]:
+) -> dict[str, Value]:
     """Values of all axes for a trial: at random at first, then by a Parzen estimator (TPE).
 
     Bergstra et al. (2011), *Algorithms for hyper-parameter optimization*, as
@@ -30,7 +35,7 @@ def ask(
 
     Parameters
     ----------
-    space : mapping of name to config group `Axis`
+    space : axes by name
     search : mapping
         seed, startup, metric and direction of the sweep.
     slot : int
@@ -57,7 +62,9 @@ def ask(
     return {name: _read(axis, asked[name]) for name, axis in space.items()}
 
 
-def _trial(space: Mapping[str, Any], result: Mapping[str, Any], search: Mapping[str, Any]) -> Any:
+def _trial(
+    space: Mapping[str, Axis], result: Mapping[str, Any], search: Mapping[str, Any]
+) -> FrozenTrial:
     from optuna.trial import TrialState, create_trial
 
     done = result["status"] in FINISHED
@@ -69,30 +76,31 @@ def _trial(space: Mapping[str, Any], result: Mapping[str, Any], search: Mapping[
     )
 
 
-def _distributions(space: Mapping[str, Any]) -> dict[str, Any]:
+def _distributions(space: Mapping[str, Axis]) -> dict[str, BaseDistribution]:
     from optuna.distributions import (
         CategoricalDistribution,
         FloatDistribution,
         IntDistribution,
     )
 
-    found: dict[str, Any] = {}
+    found: dict[str, BaseDistribution] = {}
     for name, axis in space.items():
         if axis.options:
             found[name] = CategoricalDistribution([_written(axis, v) for v in axis.options])
         elif axis.integer:
-            found[name] = IntDistribution(int(axis.low), int(axis.high), log=axis.log)
+            low, high = map(int, axis.ends)
+            found[name] = IntDistribution(low, high, log=axis.log)
         else:
-            found[name] = FloatDistribution(axis.low, axis.high, log=axis.log)
+            found[name] = FloatDistribution(*axis.ends, log=axis.log)
     return found
 
 
-def _written(axis: Any, value: Any) -> Any:
+def _written(axis: Axis, value: Any) -> Any:
     """A value as Optuna stores it; lists are text there."""
     return json.dumps(value) if axis.options else value
 
 
-def _read(axis: Any, value: Any) -> Any:
+def _read(axis: Axis, value: Any) -> Any:
     return json.loads(value) if axis.options else tidy(axis, value)
 
 

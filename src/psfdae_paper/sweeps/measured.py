@@ -15,9 +15,11 @@ from psfdae.files import ProductError
 from psfdae.fits import storage_of
 from psfdae.method import Method
 from psfdae.reading import from_tree, read_json
+from psfdae.settings import Reference, SplitKind
 
 if TYPE_CHECKING:
     from psfdae.files import Product
+    from psfdae_paper.configuration.schema import Config
 
 EVALUATION, VALIDATION = "evaluation.csv", "validation.csv"
 """Tables of a point: on the test part, as in the main workflow, and on the validation part."""
@@ -42,14 +44,14 @@ class Task:
     """
 
     dataset: str
-    split: str
-    reference: str
+    split: SplitKind
+    reference: Reference
     data: Mapping[str, Path]
     levels: Sequence[float]
     folder: Path
     checkpoint: Path
 
-    def described(self) -> dict[str, Any]:
+    def described(self) -> dict[str, object]:
         """What of the task decides its result: names, levels and the bytes of the products."""
         return {
             "names": [self.dataset, self.split, self.reference],
@@ -98,7 +100,7 @@ def geometric_mean(values: Sequence[float]) -> float:
 
 
 def image_rows(
-    config: Any,
+    config: Config,
     task: Task,
     method: str,
     product: Product,
@@ -135,7 +137,7 @@ def image_rows(
     return rows
 
 
-def image_metrics(part: str, rows: list[dict[str, Any]]) -> dict[str, float]:
+def image_metrics(part: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
     """MSE and SSIM of a part, over all noise levels and at each."""
     metrics: dict[str, float] = {}
     for metric, mean in (("mse", geometric_mean), ("ssim", lambda v: float(np.mean(v)))):
@@ -146,7 +148,7 @@ def image_metrics(part: str, rows: list[dict[str, Any]]) -> dict[str, float]:
 
 
 def measure_images(
-    config: Any,
+    config: Config,
     task: Task,
     method: str,
     validate_with: Method,
@@ -232,6 +234,6 @@ def fit_in(kind: type[Method], folder: Path) -> Path:
     return folder if storage_of(kind).files else folder / f"{kind.name}.h5"
 
 
-def checksum(tree: Any) -> str:
+def checksum(tree: object) -> str:
     """SHA-256 of a tree as JSON."""
     return hashlib.sha256(json.dumps(tree, sort_keys=True).encode()).hexdigest()

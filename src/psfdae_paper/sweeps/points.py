@@ -16,16 +16,16 @@ from psfdae.errors import Error
 from psfdae.rng import stream
 from psfdae.settings import ConfigError
 from psfdae_paper.configuration.alignment import OF_STATES
+from psfdae_paper.configuration.base import config_dir
 from psfdae_paper.configuration.compose import (
     checked,
     compose,
-    config_dir,
     decisive,
     overrides_for,
     stage_tree,
 )
 from psfdae_paper.configuration.consistency import SIMULATION
-from psfdae_paper.configuration.sweep import Sweep, load_sweep
+from psfdae_paper.configuration.sweep import Axis, Sweep, Value, load_sweep
 
 DIGITS = 4
 """Significant digits of a drawn number: enough for a search, and short to paste."""
@@ -35,14 +35,8 @@ class SweepError(Error, ValueError):
     """A sweep cannot be used; the message names the file or key and says what to do."""
 
 
-def grid(space: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Every combination of the options of all axes, the last axis fastest.
-
-    Parameters
-    ----------
-    space : mapping of name to config group `Axis`
-        Without ranges.
-    """
+def grid(space: Mapping[str, Axis]) -> list[dict[str, Value]]:
+    """Every combination of the options of all axes, none of them a range, the last axis fastest."""
     names = list(space)
     return [
         dict(zip(names, options, strict=True))
@@ -50,16 +44,11 @@ def grid(space: Mapping[str, Any]) -> list[dict[str, Any]]:
     ]
 
 
-def draws(space: Mapping[str, Any], trials: int, seed: int) -> list[dict[str, Any]]:
+def draws(space: Mapping[str, Axis], trials: int, seed: int) -> list[dict[str, Value]]:
     """Random values of all axes, uniform in each option or along the range.
 
     Each axis has a stream of its own for each draw: more trials extend the list, and
     the order of axes does not matter.
-
-    Parameters
-    ----------
-    space : mapping of name to config group `Axis`
-    trials, seed : int
     """
     return [
         {name: _draw(axis, stream(seed, "sweep", name, i)) for name, axis in space.items()}
@@ -67,32 +56,33 @@ def draws(space: Mapping[str, Any], trials: int, seed: int) -> list[dict[str, An
     ]
 
 
-def _draw(axis: Any, rng: np.random.Generator) -> Any:
+def _draw(axis: Axis, rng: np.random.Generator) -> Value:
     if axis.options:
         return axis.options[int(rng.integers(len(axis.options)))]
     # Half a step beyond the ends makes all whole numbers equally likely.
     margin = 0.5 if axis.integer else 0.0
-    ends = np.array([axis.low - margin, axis.high + margin])
+    low, high = axis.ends
+    ends = np.array([low - margin, high + margin])
     value = np.exp(rng.uniform(*np.log(ends))) if axis.log else rng.uniform(*ends)
     return tidy(axis, float(value))
 
 
-def tidy(axis: Any, value: float) -> int | float:
+def tidy(axis: Axis, value: float) -> int | float:
     """A number of a range, whole or with few digits, and inside the range."""
     if axis.integer:
-        return int(np.clip(round(value), axis.low, axis.high))
-    return float(np.clip(float(f"{value:.{DIGITS}g}"), axis.low, axis.high))
+        return int(np.clip(round(value), *axis.ends))
+    return float(np.clip(float(f"{value:.{DIGITS}g}"), *axis.ends))
 
 
-def changes(space: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+def changes(space: Mapping[str, Axis], values: Mapping[str, Value]) -> dict[str, Value]:
     """Configuration keys and their values at a point of the space."""
-    keys: dict[str, Any] = {}
+    keys: dict[str, Value] = {}
     for name, axis in space.items():
         keys |= axis.changes(name, values[name])
     return keys
 
 
-def with_values(tree: Mapping[str, Any], keys: Mapping[str, Any]) -> dict[str, Any]:
+def with_values(tree: Mapping[str, Any], keys: Mapping[str, Value]) -> dict[str, Any]:
     """A configuration tree with other values at dotted keys; the tree itself stays.
 
     Raises
@@ -137,8 +127,8 @@ class Point:
     """
 
     name: str
-    values: dict[str, Any]
-    keys: dict[str, Any]
+    values: dict[str, Value]
+    keys: dict[str, Value]
     config: dict[str, Any]
     slot: int | None = None
 
@@ -196,7 +186,7 @@ class Plan:
             return []
         return list(self.points.values())[: max(0, point.slot + 1 - self.sweep.parallel)]
 
-    def _point(self, values: dict[str, Any], slot: int | None = None) -> Point:
+    def _point(self, values: dict[str, Value], slot: int | None = None) -> Point:
         keys = {**self.sweep.overrides, **(changes(self.sweep.space, values) if values else {})}
         config = self._checked(keys, values)
         content = {
@@ -210,7 +200,7 @@ class Plan:
         }
         return Point(hash_of(content)[:NAME_LENGTH], values, keys, config, slot)
 
-    def _checked(self, keys: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    def _checked(self, keys: Mapping[str, Value], values: Mapping[str, Value]) -> dict[str, Any]:
         """The stage's groups with some keys set, or an error that names file and point."""
         where = config_dir() / "sweep" / f"{self.name}.yaml"
         try:
@@ -228,24 +218,19 @@ class Plan:
 
     @cached_property
     def _base(self) -> dict[str, Any]:
-        base: dict[str, Any] = checked(self.tree).model_dump()
-        return base
+        return checked(self.tree).model_dump()
 
     def _check_range(self) -> None:
         """Refuse a space with a corner that the configuration does not allow."""
         ends = [
             {name: option}
             for name, axis in self.sweep.space.items()
-            for option in axis.options or (_end(axis, axis.low), _end(axis, axis.high))
+            for option in axis.options or [int(end) if axis.integer else end for end in axis.ends]
         ]
         for values in ends:
             (name,) = values
             keys = self.sweep.space[name].changes(name, values[name])
             self._checked({**self.sweep.overrides, **keys}, values)
-
-
-def _end(axis: Any, value: float) -> int | float:
-    return int(value) if axis.integer else value
 
 
 def plan_sweep(name: str, given: Sequence[str] = ()) -> Plan:
@@ -268,7 +253,7 @@ def plan_sweep(name: str, given: Sequence[str] = ()) -> Plan:
     return Plan(name, sweep, tuple(given), compose(chosen))
 
 
-def hash_of(tree: Any) -> str:
+def hash_of(tree: object) -> str:
     """Hash of a tree in its canonical JSON."""
     canonical = json.dumps(tree, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(canonical.encode()).hexdigest()

@@ -37,8 +37,7 @@ def paper_table(metrics: pd.DataFrame, dataset: str, metric: str) -> pd.DataFram
         The paper has no rows for datasets that it does not tabulate. Our methods say in brackets
         what they are given beside the image; of the paper's that is not known.
     """
-    kinds = {kind.name: kind for kind in registered() if kind.look.paper}
-    labels = {name: kind.look.paper[1] for name, kind in kinds.items()}
+    labels = {kind.name: kind.look.paper[1] for kind in registered() if kind.look.paper}
     ours = metrics[
         (metrics.dataset == dataset)
         & (metrics.metric == metric)
@@ -56,7 +55,7 @@ def paper_table(metrics: pd.DataFrame, dataset: str, metric: str) -> pd.DataFram
         index=["source", "reference", "order", "method"], columns="noise_level", values="value"
     )
     wide = wide.reset_index().drop(columns="order")
-    given = wide["method"].map({name: str(kind.needs) for name, kind in kinds.items()})
+    given = wide["method"].map({kind.name: str(kind.needs) for kind in registered()})
     wide["method"] = wide["method"].map(labels) + given.where(wide["source"] == "psfdae", "")
     wide.columns = [f"{c:g}" if isinstance(c, float) else c for c in wide.columns]
     return wide
