@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,12 +15,14 @@ from photutils.aperture import CircularAperture
 from scipy.ndimage import uniform_filter
 from scipy.spatial import cKDTree
 
-from psfdae import Stars, load_model
+from psfdae import PsfModel, Stars, load_model
 from psfdae.cli import main
 from psfdae.image.observation import Source, cut_image
 from psfdae.model import crowded
+from psfdae.model.bundle import BundleError
 from psfdae.model.field_psfs import PredictionError
 from psfdae.model.neighbours import light_of_others
+from psfdae.model.wings import TENTS, Wings, tented_light, wings_of
 from psfdae_paper.stars.example import add_stamps, write_field
 
 SIZE, SKY, STAMP, WIDE = 500, 200.0, 10, 81
@@ -141,30 +144,70 @@ def test_aperture_corrections(found):
         found.aperture_correction(250, 250, 26)
 
 
+def test_a_model_knows_the_light_beyond_its_stamps(sky, found):
+    folder, path, true = sky
+    model = load_model(path)
+    assert model.wings is not None and found.wings is not None
+    light, error = model.wings.light()
+    assert light == pytest.approx(found.wings.light()[0], abs=4 * error + 0.004)
+    observation = Source(folder / "i.fits", folder / "i.csv").open(STAMP, 2)
+    ((stamps, measured),) = model.stream(observation)
+    alone = ~true["pair"] & (true["flux"] > 1e4)
+    ratio = measured.flux_total[alone] / true["flux"][alone]
+    assert np.median(ratio) == pytest.approx(1.0, abs=0.006)
+    assert np.median(measured.flux[alone] / true["flux"][alone]) < 0.993
+    assert (measured.flux_total_error > measured.flux_error).all()
+    # Without a place, a star has the wings of a usual one.
+    unplaced = model.predict(stamps.data[:20], margin=2)
+    assert unplaced.flux_total / unplaced.flux == pytest.approx(1 + light)
+    assert model.aperture_correction(250, 250, 4.0) == pytest.approx(
+        found.aperture_correction(250, 250, 4.0), rel=0.006
+    )
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"outer": -1.0},
+        {"profile": [1.0]},
+        {"profile": [9e9] * TENTS},
+        {"radius_px": 3},
+        {"outer": []},
+    ],
+)
+def test_damaged_wings_are_refused(sky, changed):
+    bundle = load_model(sky[1]).bundle
+    stars = bundle.info.config["stars"]
+    config = bundle.info.config | {"stars": stars | {"wings": stars["wings"] | changed}}
+    damaged = replace(bundle, info=bundle.info.model_copy(update={"config": config}))
+    with pytest.raises(BundleError, match=r"damaged .*wings"):
+        PsfModel(damaged)
+
+
 @pytest.mark.parametrize("level", [0.0, 3.0])
 def test_wings_are_found_beside_a_wrong_sky(level):
     """Of a known profile, as tents are; an even light beside them does not count."""
     rng = np.random.default_rng(1)
     place, flux = rng.uniform(0, 300, (30, 2)), 10 ** rng.uniform(4, 5.5, 30)
     blank = np.ones(30)
-    radius = np.geomspace(5, 25, crowded.TENTS + 1)
-    true = crowded.Wings(radius, np.geomspace(3e-4, 1e-4, crowded.TENTS), np.eye(6), 1.0)
-    ((_, tented),) = crowded._tented((300, 300), place, flux, blank, true)
+    radius = np.geomspace(5, 25, TENTS + 1)
+    true = Wings(radius, np.geomspace(3e-4, 1e-4, TENTS), np.eye(6), 1.0)
+    ((_, tented),) = tented_light((300, 300), place, flux, blank, true)
     image = level + np.tensordot(true.profile, tented, 1) + rng.normal(0, 5, (300, 300))
     nothing = np.zeros(image.shape, bool)
     known = (np.full(image.shape, 5.0), nothing, place)
-    wings = crowded.wings_of(image, *known, flux, blank, 10)
+    wings = wings_of(image, *known, flux, blank, 10)
     assert wings.light()[0] == pytest.approx(true.light()[0], abs=4 * wings.light()[1])
     assert wings.light()[1] < 0.05 * true.light()[0]
     assert wings.seen
-    assert not crowded.wings_of(rng.normal(0, 5, image.shape), *known, flux, blank, 10).seen
-    assert crowded.wings_of(image, *known, np.full(30, np.nan), blank, 10) is None
+    assert not wings_of(rng.normal(0, 5, image.shape), *known, flux, blank, 10).seen
+    assert wings_of(image, *known, np.full(30, np.nan), blank, 10) is None
 
 
 def test_the_light_of_tents_is_the_sum_over_pixels():
-    radius = np.geomspace(5, 25, crowded.TENTS + 1)
-    wings = crowded.Wings(radius, np.linspace(2e-4, 1e-4, 6), np.eye(6), 1.0)
-    drawn = crowded._tented((81, 81), np.array([[40.0, 40.0]]), np.ones(1), np.ones(1), wings)
+    radius = np.geomspace(5, 25, TENTS + 1)
+    wings = Wings(radius, np.linspace(2e-4, 1e-4, 6), np.eye(6), 1.0)
+    drawn = tented_light((81, 81), np.array([[40.0, 40.0]]), np.ones(1), np.ones(1), wings)
     total = sum(np.tensordot(wings.profile, tented, 1).sum() for _, tented in drawn)
     assert wings.light()[0] == pytest.approx(total, rel=5e-3)
     assert wings.light(10.0)[0] < wings.light(20.0)[0] < wings.light()[0]

@@ -194,7 +194,7 @@ def found(stem: str, table: str, named: str) -> None:
 class TrueField:
     """What `psfdae photometry` asks of a model, of the true profile."""
 
-    stamp_px = 2 * HALF_PX[0]
+    stamp_px, wings = 2 * HALF_PX[0], None
 
     def to_photutils(self):
         return true_psf()
@@ -202,9 +202,9 @@ class TrueField:
     def fwhm_px(self):
         return FWHM_PX
 
-    def psf_at(self, x, y, oversampling):
+    def on_pixels(self, place):
         axis = np.arange(self.stamp_px) - self.stamp_px // 2
-        return np.stack([moffat(*np.meshgrid(axis, axis), *at) for at in np.stack([x, y], axis=1)])
+        return np.stack([moffat(*np.meshgrid(axis, axis), *at) for at in place])
 
 
 def with_truth(stem: str, catalogue: str) -> None:

@@ -248,6 +248,8 @@ def _make(
     model = packed(stars, fitted[taken.name], files.name, licence)
     for fact in facts_of(fitted[taken.name]):
         print(f"{taken.look.label}: {fact}")
+    if model.wings is not None:
+        print(f"light beyond the stamps: {model.wings}")
     # Its name is the last one to be there: it says that all is done.
     with atomic_path(files.bundle) as unfinished:
         model.save(unfinished)

@@ -34,6 +34,7 @@ from psfdae.image.errors import one_line
 from psfdae.method import HasConditions, Method
 from psfdae.methods import method
 from psfdae.model.photometry import FluxModel
+from psfdae.model.wings import Wings
 from psfdae.networks.weights import digest_of
 from psfdae.version import __version__
 
@@ -90,6 +91,16 @@ class Bundle:
     def sha256(self) -> str:
         """Checksum of everything but the date."""
         return _digest(self.info.described(), _tensors(self))
+
+    @property
+    def wings(self) -> Wings | None:
+        """Light of stars beyond the stamps, if the bundle says any; BundleError if damaged."""
+        stars = self.info.config.get("stars")
+        said = stars.get("wings") if isinstance(stars, dict) else None
+        try:
+            return None if said is None else Wings.of_plain(said)
+        except ValueError as error:
+            raise BundleError(f"{self.info.name}: damaged ({error})") from None
 
     def scales(self, noise: np.ndarray) -> list[np.ndarray] | None:
         """`scale68`, `scale95` and `flux_error_scale`, of any format, at the noise of stars (n,).

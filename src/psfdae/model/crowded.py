@@ -2,82 +2,33 @@
 
 photutils finds, groups and fits the stars (`PSFPhotometry`). What brighter stars hid is then found
 where their models are subtracted, and all are fitted again, on a sky without the light of stars.
-Stars that were hidden and have no flux of 3 σ are dropped, and the others fitted a last time.
-
-The model knows the light of a star in its stamp, above what is there in a ring around it. The rest
-is one profile for all stars: a star of flux F at distance r from its centre has
-
-    F s Σ_k p_k h_k(r)
-
-more in a pixel, with tents h_k in ln r times a power of r, the first one even inside the stamp,
-and s the light of the model's PSF in the outer part of its stamp over the mean of all stars:
-where the PSF is wider, it has more wings. All pixels of the image together give p_k by weighted
-least squares.
+Stars that were hidden and have no flux of 3 σ are dropped, and the others fitted a last time. The
+light that a star has beyond its stamp is measured with them (`psfdae.model.wings`).
 """
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from psfdae.image.detection import Sky, sky_of
+from psfdae.image.detection import Sky
 from psfdae.image.observation import Observation
+from psfdae.model.wings import Wings, aperture_correction, around_stars, outer_light
 
 if TYPE_CHECKING:
     from astropy.table import Table
 
     from psfdae.model.field_psfs import FieldPsfs
 
-ROUNDS, SKIES = 3, 3  # of fits, at most; of wings and sky in each
+ROUNDS = 3  # of fits, at most
 FIT_FWHM, GROUP_FWHM = 1.6, 2.4  # side of the pixels that are fitted; nearest of two groups
 MOST_MOVED_FWHM, SAME_FWHM = 1.0, 0.5  # by a fit; nearer to each other, two stars are one
 LARGEST_GROUP, CLOSER = 50, 0.8  # stars that are fitted together; a larger group is parted nearer
-FOLLOWED = 0.03  # part of a star's light in a pixel by which its PSF may be off
-OUTER, OUTER_RANGE = 0.7, (0.3, 3.0)  # radius of a stamp's outer part over half its side; s
-REACH, TENTS, STEEPNESS = 2.5, 6, 3.0  # radius of the wings in stamps; tents; power of 1/r in them
-WINGED, BAND_PX = 1000, 512  # brightest stars, whose wings are drawn; rows at a time
-CLIPPED_SIGMA = 4.0  # of a pixel from the wings known so far, from which it is left out
-LEAST_SEEN = 3.0  # σ, from which wings and hidden stars are real
+LEAST_SEEN = 3.0  # σ, from which hidden stars are real
 NEAREST_PX = 0.1  # of stars in a group that is to be parted
-PSFS_AT_ONCE = 2048
-
-
-@dataclass(frozen=True)
-class Wings:
-    """Light of stars beyond what their model knows.
-
-    Attributes
-    ----------
-    radius_px : ndarray, shape (K + 1,)
-        Tops of the tents h_k; at the last radius there is no light any more.
-    profile : ndarray, shape (K,)
-        p_k, per pixel.
-    covariance : ndarray, shape (K, K)
-        Of p_k.
-    outer : float
-        Mean light of the model's PSFs in the outer part of their stamps.
-    """
-
-    radius_px: np.ndarray
-    profile: np.ndarray
-    covariance: np.ndarray
-    outer: float
-
-    def light(self, radius_px: float = np.inf) -> tuple[float, float]:
-        """Part of the flux within a radius, where s = 1, and its standard error."""
-        r = np.linspace(0.0, min(radius_px, self.radius_px[-1]), 4001)
-        share = np.trapezoid(2 * np.pi * r * tents(r, self.radius_px), r, axis=1)
-        return float(self.profile @ share), float(np.sqrt(share @ self.covariance @ share))
-
-    @property
-    def seen(self) -> bool:
-        """The light is no chance."""
-        light, error = self.light()
-        return light > LEAST_SEEN * error
 
 
 @dataclass(frozen=True)
@@ -95,7 +46,7 @@ class CrowdedPhotometry:
     residual, light : ndarray, shape (h, w)
         Image without sky and stars, and that of all stars, counts.
     wings : Wings or None
-        None if no star is bright enough to show any.
+        Those of the model if no star is bright enough to show any.
     """
 
     model: FieldPsfs
@@ -110,40 +61,14 @@ class CrowdedPhotometry:
         half = self.model.stamp_px / 2
         return half if self.wings is None else float(self.wings.radius_px[-1])
 
-    def total(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Flux over that of the model at places (n,), wings included."""
-        if self.wings is None:
-            return np.ones(len(x))
-        scale = outer_light(self.model, np.stack([x, y], axis=1)) / self.wings.outer
-        return 1.0 + np.clip(scale, *OUTER_RANGE) * self.wings.light()[0]
-
     def part_of_model(self) -> tuple[float, float]:
         """Part of a usual star's flux that the model knows, and its standard error."""
         light, error = (0.0, 0.0) if self.wings is None else self.wings.light()
         return 1.0 / (1.0 + light), error / (1.0 + light) ** 2
 
     def aperture_correction(self, x: float, y: float, radius_px: float) -> float:
-        """Flux of a star at a place over what an aperture of a radius about it gets.
-
-        The aperture has parts of the pixels at its edge, as photutils' `CircularAperture`.
-
-        Raises
-        ------
-        ValueError
-            If the radius is not above 0, or beyond `radius_px`.
-        """
-        from photutils.aperture import CircularAperture
-
-        if not 0 < radius_px <= self.radius_px:
-            raise ValueError(f"radius {radius_px} px, expected above 0 up to {self.radius_px:g}")
-        psf = self.model.psf_at(x, y, 1)
-        middle = np.array([x, y]) - np.floor(np.array([x, y]) + 0.5) + psf.shape[0] // 2
-        inside = float(CircularAperture(middle, radius_px).do_photometry(psf)[0][0])
-        total = float(self.total(np.array([x]), np.array([y]))[0])
-        if self.wings is not None:
-            whole, part = (self.wings.light(r)[0] for r in (np.inf, radius_px))
-            inside += (total - 1.0) * part / whole
-        return total / inside
+        """Flux of a star over what an aperture gets; see `psfdae.model.wings`."""
+        return aperture_correction(self.model, self.wings, x, y, radius_px)
 
 
 def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> CrowdedPhotometry:
@@ -167,10 +92,10 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
     """
     psf, fwhm, side = model.to_photutils(), model.fwhm_px(), model.stamp_px
     sky = observation.sky()
-    mapped = np.isfinite(sky.noise_scale)
     image, bad = sky.flat + sky.level, sky.bad
     if observation.saturate is not None:
         bad = bad | (image >= observation.saturate)
+        sky = replace(sky, bad=bad)
     place, flux = np.array(observation.positions, dtype=np.float64), None
     light, far, wings = np.maximum(sky.flat, 0.0), np.zeros(image.shape), None
     for turn in range(ROUNDS):
@@ -180,15 +105,10 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
         fit = np.stack([table["x_fit"], table["y_fit"]], axis=1).astype(np.float64)
         place = np.where(np.isfinite(fit), fit, place)
         flux, flux_error = (np.array(table[c], dtype=np.float64) for c in ("flux_fit", "flux_err"))
-        outer = outer_light(model, np.nan_to_num(place))
-        for _ in range(SKIES):
-            left, doubt = image - sky.level - drawn, np.hypot(error, FOLLOWED * drawn)
-            wings = wings_of(left, doubt, bad, place, flux, outer, side, wings)
-            far = np.zeros(image.shape)
-            if wings is not None and wings.seen:
-                for band, tented in _tented(image.shape, place, flux, outer, wings):
-                    far[band] = np.tensordot(wings.profile, tented, 1)
-            sky = sky_of(image - drawn - far, bad, sky.noise if mapped else None)
+        outer = outer_light(model.on_pixels, place)
+        sky, far, wings, doubt = around_stars(
+            image, sky, error, drawn, place, flux, outer, side, wings
+        )
         # Noise in the weights would make fluxes too small: from now on they are of the models.
         light = np.maximum(drawn + far, 0.0)
         if turn == 0 and observation.found is not None:
@@ -199,9 +119,8 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
             if real.all():
                 break
             place, flux = place[real], flux[real]
-    return _described(
-        model, table, sky.flat, drawn + far, wings if wings is not None and wings.seen else None
-    )
+    seen = wings if wings is not None and wings.seen else model.wings
+    return _described(model, table, sky.flat, drawn + far, seen)
 
 
 def _fitted(
@@ -280,92 +199,6 @@ def _with_hidden(
     return np.concatenate([place, new[alone]]), np.append(flux, left["FLUX_ISO"][alone])
 
 
-def outer_light(model: FieldPsfs, place: np.ndarray) -> np.ndarray:
-    """Light of the PSFs at places (n, 2) in the outer part of their stamps, shape (n,)."""
-    side = model.stamp_px
-    axis = np.arange(side) - side // 2
-    ring = np.hypot(axis[:, None], axis)
-    ring = (ring >= OUTER * side / 2) & (ring < side / 2)
-    parts = [place[a : a + PSFS_AT_ONCE] for a in range(0, len(place), PSFS_AT_ONCE)]
-    psfs = (model.psf_at(x, y, 1) for x, y in (np.rint(part).T for part in parts))
-    return np.concatenate([some[:, ring].sum(axis=1) for some in psfs])
-
-
-def tents(r: np.ndarray, radius_px: np.ndarray) -> np.ndarray:
-    """h_k at distances r, shape (K, …)."""
-    tops = np.log(radius_px)
-    inside = np.maximum(r, radius_px[0])
-    off = np.abs(np.log(inside) - tops[:-1].reshape(-1, *[1] * r.ndim)) / (tops[1] - tops[0])
-    return np.asarray(np.maximum(1.0 - off, 0.0) * (inside / radius_px[0]) ** -STEEPNESS)
-
-
-def _tented(
-    shape: tuple[int, ...], place: np.ndarray, flux: np.ndarray, outer: np.ndarray, wings: Wings
-) -> Iterator[tuple[slice, np.ndarray]]:
-    """Bands of rows, and Σ F s h_k of the stars in them, shape (K, rows, w)."""
-    reach, radius = int(wings.radius_px[-1]), wings.radius_px
-    light = flux * np.clip(outer / wings.outer, *OUTER_RANGE)
-    known = np.flatnonzero(np.isfinite(light) & (light > 0) & np.isfinite(place).all(axis=1))
-    brightest = known[np.argsort(-light[known])[:WINGED]]
-    height, width = shape
-    for top in range(0, height, BAND_PX):
-        rows = min(BAND_PX, height - top)
-        tented = np.zeros((len(radius) - 1, rows, width))
-        for star in brightest:
-            x, y = place[star]
-            first, last = (np.clip(round(y) + d - top, 0, rows) for d in (-reach, reach + 1))
-            left, right = (np.clip(round(x) + d, 0, width) for d in (-reach, reach + 1))
-            if first < last and left < right:
-                r = np.hypot(np.arange(first, last)[:, None] + top - y, np.arange(left, right) - x)
-                tented[:, first:last, left:right] += light[star] * tents(r, radius)
-        yield slice(top, top + rows), tented
-
-
-def wings_of(
-    left: np.ndarray,
-    error: np.ndarray,
-    bad: np.ndarray,
-    place: np.ndarray,
-    flux: np.ndarray,
-    outer: np.ndarray,
-    stamp_px: int,
-    before: Wings | None = None,
-) -> Wings | None:
-    """Wings of stars in what is left of an image (h, w) without sky and models; None without light.
-
-    An even light that was left beside them, such as a wrong sky, does not count. Nor do pixels that
-    are far from the wings as they were known `before`.
-    """
-    from scipy.optimize import lsq_linear
-
-    radius = np.geomspace(stamp_px / 2, REACH * stamp_px, TENTS + 1)
-    lit = np.isfinite(flux) & (flux > 0)
-    if not lit.any() or not (mean := float(np.average(outer[lit], weights=flux[lit]))) > 0:
-        return None
-    blank = Wings(radius, np.zeros(TENTS), np.zeros((TENTS, TENTS)), mean)
-    normal, right, square, count = np.zeros((TENTS + 1,) * 2), np.zeros(TENTS + 1), 0.0, 0
-    for band, tented in _tented(left.shape, place, flux, outer, blank):
-        weight = np.where(bad[band], 0.0, 1.0 / error[band])
-        if before is not None:
-            off = (left[band] - np.tensordot(before.profile, tented, 1)) * weight
-            weight = np.where(np.abs(off) < CLIPPED_SIGMA, weight, 0.0)
-        design = np.concatenate([tented, np.ones((1, *weight.shape))]) * weight
-        flat, seen = design.reshape(TENTS + 1, -1), (left[band] * weight).ravel()
-        normal, right = normal + flat @ flat.T, right + flat @ seen
-        square, count = square + float(seen @ seen), count + int(np.count_nonzero(weight))
-    unit = np.sqrt(normal.diagonal())
-    if not (unit > 0).all():
-        return None
-    root = np.linalg.cholesky(normal / unit / unit[:, None] + 1e-12 * np.eye(TENTS + 1))
-    wanted, bounds = np.linalg.solve(root, right / unit), np.array([0.0] * TENTS + [-np.inf])
-    fit = lsq_linear(root.T, wanted, (bounds, np.inf))
-    found = fit.x / unit
-    # In Σ (seen − design found)², the part that no profile explains is what remains of Σ seen².
-    chi2 = (square - wanted @ wanted + 2.0 * fit.cost) / max(count, 1)
-    inverse = np.linalg.inv(root @ root.T) / unit / unit[:, None] * max(chi2, 1.0)
-    return Wings(radius, found[:-1], inverse[:-1, :-1], mean)
-
-
 def _described(
     model: FieldPsfs, table: Table, left: np.ndarray, light: np.ndarray, wings: Wings | None
 ) -> CrowdedPhotometry:
@@ -375,7 +208,10 @@ def _described(
     names = {"id": "id", "x_fit": "x", "y_fit": "y", "x_err": "x_error", "y_err": "y_error"}
     stars = Table({new: np.array(table[old]) for old, new in names.items()})
     found = CrowdedPhotometry(model, stars, left, light, wings)
-    total = found.total(*(np.nan_to_num(np.array(stars[axis])) for axis in "xy"))
+    total: np.ndarray | float = 1.0
+    if wings is not None:
+        place = np.stack([stars["x"], stars["y"]], axis=1)
+        total, _ = wings.total(outer_light(model.on_pixels, place))
     stars["flux"], stars["flux_error"] = (table[c] * total for c in ("flux_fit", "flux_err"))
     # Light that no model explains, of the PSF's own errors or of stars that nobody sees, is as much
     # in the fluxes as in the residuals.

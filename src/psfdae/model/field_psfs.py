@@ -15,6 +15,8 @@ from psfdae.moments import measure_shapes
 if TYPE_CHECKING:
     from photutils.psf import GriddedPSFModel
 
+    from psfdae.model.wings import Wings
+
 MOST_OVERSAMPLED = 32  # values per pixel and axis
 
 
@@ -58,6 +60,11 @@ class FieldPsfs(ABC):
     @abstractmethod
     def image_px(self) -> tuple[int, int] | None:
         """Columns and rows of the image that the model is of, if known."""
+
+    @property
+    def wings(self) -> Wings | None:
+        """Light of stars beyond their stamps, if the model knows any."""
+        return None
 
     @abstractmethod
     def field_range(self) -> tuple[np.ndarray, np.ndarray]:
@@ -112,6 +119,27 @@ class FieldPsfs(ABC):
                 f"finite flux above 0 at x {place[0]:.6g}, y {place[1]:.6g}"
             )
         return found if position.ndim == 2 else found[0]
+
+    def on_pixels(self, place: np.ndarray) -> np.ndarray:
+        """PSFs (n, d, d) in the pixels of the image, at places (n, 2); see `psf_at`."""
+        x, y = place.T
+        return self.psf_at(x, y, 1)
+
+    def aperture_correction(self, x: float, y: float, radius_px: float) -> float:
+        """Flux of a star at a place over what an aperture of a radius about it gets.
+
+        The flux is all light within `wings.radius_px[-1]`, or without wings that in the stamp.
+
+        Raises
+        ------
+        ValueError
+            If the radius is not above 0, or beyond that.
+        PredictionError
+            As `psf_at`.
+        """
+        from psfdae.model.wings import aperture_correction
+
+        return aperture_correction(self, self.wings, x, y, radius_px)
 
     def grid(self, columns: int, rows: int) -> np.ndarray:
         """Places (n, 2), x and y, that are spread over the field; raises as `field_range`."""

@@ -10,11 +10,11 @@ import numpy as np
 
 from psfdae.errors import needed_by
 from psfdae.fits import described_by
-from psfdae.method import Method, with_free_flux
+from psfdae.method import KnowsField, Method, with_free_flux
 from psfdae.methods import groups_of
 from psfdae.methods import method as method_of
-from psfdae.model.packing import bundle_of
-from psfdae.model.psf_model import PsfModel
+from psfdae.model.packing import bundle_of, with_wings
+from psfdae.model.psf_model import MARGIN_PX, PsfModel
 from psfdae.model.settings import with_keywords
 from psfdae.model.star_sets import (
     field_positions,
@@ -24,6 +24,7 @@ from psfdae.model.star_sets import (
     training_set,
 )
 from psfdae.model.stars import REFERENCE, SPLIT, Stars
+from psfdae.model.wings import wings_of_stars
 from psfdae.rng import stream
 from psfdae.settings import ConfigError
 from psfdae.threads import fixed_threads
@@ -140,7 +141,12 @@ def best(stars: Stars, fitted: Mapping[str, Method]) -> tuple[str, dict[str, flo
 
 
 def packed(stars: Stars, fitted: Method, name: str, licence: str) -> PsfModel:
-    """The model of a fit, with its errors on the stars that are held out."""
+    """The model of a fit, with its errors on the stars that are held out, and wings of stars."""
     of = stars.product, REFERENCE, stars.settings, described(stars, type(fitted)), name, licence
     with fixed_threads(stars.settings.evaluation.threads):
-        return PsfModel(bundle_of(fitted, *of))
+        model = PsfModel(bundle_of(fitted, *of))
+        observation = stars.observation
+        if not isinstance(fitted, KnowsField) or observation.shape is None:
+            return model
+        wings = wings_of_stars(model, observation.with_margin(MARGIN_PX))
+    return model if wings is None else PsfModel(with_wings(model.bundle, wings))

@@ -45,6 +45,7 @@ from psfdae.model.star_sets import (
     split_stars,
     star_area,
 )
+from psfdae.model.wings import Wings
 from psfdae.noise import NoiseModel
 from psfdae.rng import stream
 from psfdae.settings import OfTest
@@ -391,6 +392,13 @@ def with_scales(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -
         scale95=scale95,
         flux_error_scale=np.interp(nodes, noise[1, -1], of_flux),
     )
+
+
+def with_wings(bundle: Bundle, wings: Wings) -> Bundle:
+    """The bundle of a field model with the light of stars beyond their stamps."""
+    config = bundle.info.config
+    said = config | {"stars": config["stars"] | {"wings": wings.plain()}}
+    return replace(bundle, info=bundle.info.model_copy(update={"config": said}))
 
 
 def misfit(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -> float:

@@ -54,6 +54,8 @@ class Prediction:
     flux, flux_error : ndarray, shape (n,), float64
         Flux inside the stamp, in the unit of the stamps; the error is NaN where the
         flux was given.
+    flux_total, flux_total_error : ndarray, shape (n,), float64
+        With the light beyond the stamp (`PsfModel.wings`); NaN if the model knows none.
     background, noise : ndarray, shape (n,), float64
         Sky level and RMS of the sky noise in a pixel.
     snr : ndarray, shape (n,), float64
@@ -90,6 +92,8 @@ class Prediction:
     ratio95_bright: np.ndarray
     flux: np.ndarray
     flux_error: np.ndarray
+    flux_total: np.ndarray
+    flux_total_error: np.ndarray
     background: np.ndarray
     noise: np.ndarray
     snr: np.ndarray
@@ -170,6 +174,8 @@ COLUMNS: dict[str, tuple[str, str | None, str]] = {
     "y": ("D", "pix", "position in the image, 0-based, rows"),
     "flux": ("D", UNIT, "inside the stamp"),
     "flux_error": ("D", UNIT, "standard error; NaN if the flux was given"),
+    "flux_total": ("D", UNIT, "within FLUXRAD; NaN if the model has no wings"),
+    "flux_total_error": ("D", UNIT, "standard error"),
     "background": ("D", UNIT, "sky per pixel"),
     "noise": ("D", UNIT, "RMS of the sky noise in a pixel"),
     "snr": ("D", None, "of a matched filter, sqrt(sum of PSF^2) / noise"),
@@ -281,6 +287,7 @@ def _primary_header(bundle: Bundle, cards: Sequence[Card], history: str) -> Head
         ("SNRMAX", info.snr_max, "largest S/N of the training"),
         ("DISTMAX", bundle.distance_limit, "largest distance that raises no flag"),
     ]
+    own += bundle.wings.cards() if bundle.wings else []
     with warnings.catch_warnings():
         # A long value leaves no room for its comment, which astropy reports.
         warnings.simplefilter("ignore", fits.verify.VerifyWarning)

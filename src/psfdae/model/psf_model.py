@@ -45,6 +45,7 @@ from psfdae.model.bundle import (
 from psfdae.model.field_psfs import FieldPsfs, PredictionError, real_numbers
 from psfdae.model.photometry import FAINT_SNR, KEPT, NOISE_FLOOR, Photometer, Photometry
 from psfdae.model.prediction import Prediction, measured_of, unmeasured
+from psfdae.model.wings import Wings, outer_light
 from psfdae.moments import measure_shapes
 from psfdae.threads import available_cores, in_order, side_by_side
 
@@ -248,6 +249,11 @@ class PsfModel(FieldPsfs):
         return self._field().order
 
     @property
+    def wings(self) -> Wings | None:
+        """Light of stars beyond their stamps, if the bundle says any."""
+        return self.engine.wings
+
+    @property
     def image_px(self) -> tuple[int, int] | None:
         """Columns and rows of the image of the training stars, if the bundle says it."""
         size = self.info.config.get("stars", {}).get("image_px")
@@ -402,6 +408,7 @@ class Engine:
         )
         self.size = min(together, max(1, together * WHOLE_PX**2 // bundle.info.stamp_px**2))
         self._photometer = Photometer(bundle.flux_model, bundle.info.components)
+        self.wings = bundle.wings
 
     def threads(self, most: int | None) -> int:
         """Threads that gain time, of at most so many, or of all cores."""
@@ -466,6 +473,7 @@ class Engine:
         chi2 = _chi2(residual, psf, doubt, found.noise, stars.gain)
         raise_flag(flags, StarFlag.POOR_FIT, chi2 > MOST_CHI2)
         photons = np.nan_to_num(np.maximum(found.flux, 0.0) / stars.gain)
+        flux_error = np.sqrt((of_flux * found.flux_error) ** 2 + photons)
         return Prediction(
             psf=psf,
             residual=residual,
@@ -473,7 +481,8 @@ class Engine:
             ratio95=ratios[:, 0],
             ratio95_bright=ratios[:, 1],
             flux=found.flux,
-            flux_error=np.sqrt((of_flux * found.flux_error) ** 2 + photons),
+            flux_error=flux_error,
+            **self._total(stars, found.flux, flux_error),
             background=found.background,
             noise=found.noise,
             snr=snr,
@@ -488,6 +497,17 @@ class Engine:
             flags=flags,
             **(restored.of_star or unmeasured(len(stars))),
         )
+
+    def _total(self, stars: Stamps, flux: np.ndarray, error: np.ndarray) -> dict[str, np.ndarray]:
+        """Columns of fluxes with the light beyond the stamps."""
+        if self.wings is None or not isinstance(self.estimator, KnowsField):
+            unknown = np.full(len(flux), np.nan)
+            return {"flux_total": unknown, "flux_total_error": unknown}
+        place = np.stack([stars.x, stars.y], axis=1)
+        total, doubt = self.wings.total(outer_light(self.estimator.psf_at, place))
+        # An error of a flux that was given is not known.
+        own = np.hypot(error * total, flux * doubt)
+        return {"flux_total": flux * total, "flux_total_error": own}
 
     def _doubts(
         self, psf: np.ndarray, sigma: np.ndarray | None, noise: np.ndarray, stars: Stamps
