@@ -289,7 +289,7 @@ def _write_cube(
     header = fits.PrimaryHDU(first[None].astype(np.float32)).header
     header["NAXIS3"] = len(places)
     made = ("CREATOR", f"psfdae {__version__}", "program that made this file")
-    of = [("PSFMODEL", ascii_line(model.name), "model"), ("PSFSHA", model.sha256, "")]
+    of: list[Card] = [("PSFMODEL", ascii_line(model.name), "model"), ("PSFSHA", model.sha256, "")]
     of += model.wings.cards() if model.wings else []
     header = fits.Header([*header.cards, made, *of, *cards])  # `extend` takes the square of time
     # Not by astropy's StreamingHDU: its error on a full disk has no cause and no file.
