@@ -232,7 +232,7 @@ def _use(packed: Bundle) -> str:
         f"{100 * SCALE_TOLERANCE:g} %, and the S/N at least {info.snr_min:.3g}{most}. "
         f"It is meant for images {like}."
     )
-    command = f"psfdae predict image.fits --catalogue stars.csv {options}--out psfs.fits"
+    command = f"psfdae predict image.fits --catalogue stars.csv {options}--out restored.fits"
     return f"{_wrapped(text)}\n\n```sh\n{command}\n```"
 
 
