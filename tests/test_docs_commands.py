@@ -55,6 +55,7 @@ NOT_RUN = {
 LONG = "takes over 10 minutes, or needs a run that does"
 DRY = {
     **dict.fromkeys(("make reproduce", "make reproduce CORES=4"), LONG),
+    "make reproduce PRESET=smoke": "is what the fixture `smoke` runs",
     **dict.fromkeys(("make reproduce PRESET=paper", "make reference"), LONG),
     **dict.fromkeys((f"snakemake {t}" for t in ("scene1", "scene2", "scene3", "tables")), LONG),
     **dict.fromkeys((f"make {t}" for t in ("benchmark", "stability", "bounds")), LONG),

@@ -92,7 +92,7 @@ def test_a_model_of_an_image_names_the_image_and_what_is_assumed(bundle):
     config["train"] = config["train"] | {"split": "held_out"}
     text = card(bundle, **of_image, config=config)
     for said in (
-        *("bright stars of `m31.fits`", "of an image, that the training did not see"),
+        *("bright stars of `m31.fits`", "stars that were held out of the training"),
         *("The pixel scale was assumed", "optics of the telescope", "ask before you pass"),
         "psfdae predict image.fits --catalogue stars.csv --model FILE.psf.safetensors",
     ):

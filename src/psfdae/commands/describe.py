@@ -164,7 +164,7 @@ RESTORED = {
 
 SPLITS = {
     "random": "other stars than those of the training, at the same places of the field",
-    "held_out": "stars at places of the field, or of an image, that the training did not see",
+    "held_out": "stars at places of the field that the training did not see",
 }
 
 UNKNOWN = "not stated"
@@ -263,7 +263,10 @@ def _errors(info: BundleInfo) -> str:
         return "The file has none."
     counts = {int(row["stars"]) for row in info.metrics if "stars" in row}
     stars = f"{counts.pop()} images at each S/N" if len(counts) == 1 else "Images"
-    whose = SPLITS.get(str(_of_training(info).get("split")), "stars of which the file says no more")
+    split = str(_of_training(info).get("split"))
+    whose = SPLITS.get(split, "stars of which the file says no more")
+    if info.source == "stars":
+        whose = "stars that were held out of the training"
     before = ", before the model was adapted" if info.adapted else ""
     rows = zip(*columns.values(), strict=True)
     table = [tuple(columns), ("--:",) * len(columns), *rows]
