@@ -12,7 +12,7 @@ from click.testing import CliRunner
 
 from docs_pages import FENCE, read
 from psfdae.cli import main
-from psfdae.commands.describe import SAID, model_card
+from psfdae.commands.describe import NO_BREAK, SAID, model_card
 
 
 def card(bundle, **changes):
@@ -110,10 +110,10 @@ def outside(text):
 
 
 def test_no_text_of_a_file_becomes_markdown(bundle):
-    hostile = "x` <script> | ``` \n# y\n---"
+    hostile = f"x` <script> | ``` \n# y\n---{30 * ' # z'}"
     config = bundle.info.config | {hostile: {hostile: hostile}, "``` \n": 1}
     text = card(bundle, name=hostile, licence=hostile, config=config)
-    plain = "x' <script> | ''' # y ---"
+    plain = f"x' <script> | ''' # y ---{30 * ' # z'}".replace(" ", NO_BREAK)
     assert f"# Model card of `{plain}`\n" in text
     titles = [line for line in text.splitlines() if line.startswith("#")]
     assert len(titles) == 1 + 7 and text.splitlines().count("---") == 2

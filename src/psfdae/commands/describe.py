@@ -167,6 +167,8 @@ SPLITS = {
     "held_out": "stars at places of the field that the training did not see",
 }
 
+NO_BREAK = "\N{NO-BREAK SPACE}"
+
 UNKNOWN = "not stated"
 """The licence of a bundle whose maker gave none."""
 
@@ -279,7 +281,7 @@ def _errors(info: BundleInfo) -> str:
 def _limits(packed: Bundle) -> Iterator[str]:
     info = packed.info
     yield f"Its errors outside S/N {info.snr_min:.3g} to {info.snr_max:.3g} were not measured."
-    worse = [row["snr"] for row in info.metrics if _gain(row).get("gain", 1.0) < 1.0]
+    worse = [row.get("snr", 0.0) for row in info.metrics if _gain(row).get("gain", 1.0) < 1.0]
     if worse:
         listed = ", ".join(f"{snr:.0f}" for snr in sorted(worse))
         yield f"At S/N {listed} the noisy stamp itself has the smaller error."
@@ -326,8 +328,11 @@ def _json(value: Any) -> str:
 
 
 def _code(text: str) -> str:
-    """Text of a file as it is: in a code span, Markdown takes nothing of it for its own."""
-    return f"`{one_line(text).replace('`', chr(39))}`"
+    """Text of a file as it is: in a code span, Markdown takes nothing of it for its own.
+
+    Its spaces do not break, lest a part of it begins a line.
+    """
+    return f"`{one_line(text).replace('`', chr(39)).replace(' ', NO_BREAK)}`"
 
 
 def _plain(text: str) -> str:
