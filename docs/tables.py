@@ -32,6 +32,7 @@ from psfdae_paper.configuration import aligners
 from psfdae_paper.configuration.alignment import CHOICE
 from psfdae_paper.configuration.compose import compose
 from psfdae_paper.evaluation.comparison import FITTED, SIGNIFICANT, seed_scatter, with_seed_stderr
+from psfdae_paper.stars.example import FieldRecipe
 
 ROOT = Path(__file__).resolve().parents[1]
 REFERENCE = ROOT / "results/reference"
@@ -165,6 +166,11 @@ def _names(tree):
 def config(*overrides):
     """Groups of a configuration of scenes 1 and 2."""
     return _names(compose(overrides))
+
+
+def field_recipe():
+    """What the image of `psfdae example-field` shows."""
+    return vars(FieldRecipe())
 
 
 def scene3():

@@ -361,6 +361,8 @@ def test_commands_pack_describe_and_export(folder, tmp_path):
     said = runner.invoke(main, ["describe", str(path)]).output
     for fact in ("mine", "12 × 12 px of 0.1 arcsec (0.881 λ/D)", "not stated", "1000 simulated"):
         assert fact in said
+    card = runner.invoke(main, ["describe", str(path), "--card"]).output
+    assert "1000 simulated stars" in card and "the maker stated none" in card.lower()
     result = runner.invoke(main, ["export", str(path), "--out", str(onnx)])
     assert result.exit_code == 0, result.output
     images = gaussians(5, 11)

@@ -39,18 +39,23 @@ TINY = {
 """What makes a command quick; one that is not here has no handler."""
 
 TESTED_ELSEWHERE = {
+    "docs/first_session.md": "test_wheel.py",
     "docs/own_stars.md": "test_from_stars.py",
     "docs/own_telescope.md": "test_own_telescope.py",
     "docs/tutorial.md": "test_from_stars.py",
 }
 """Pages whose commands another test runs from first to last."""
 
-NOT_RUN = {"conda": "makes a second environment", ".": "activates the environment"}
+NOT_RUN = {
+    **dict.fromkeys(("conda", "python3", "pip"), "make a second environment"),
+    ".": "activates the environment",
+}
 """Commands that no test runs, and why."""
 
 LONG = "takes over 10 minutes, or needs a run that does"
 DRY = {
     **dict.fromkeys(("make reproduce", "make reproduce CORES=4"), LONG),
+    "make reproduce PRESET=smoke": "is what the fixture `smoke` runs",
     **dict.fromkeys(("make reproduce PRESET=paper", "make reference"), LONG),
     **dict.fromkeys((f"snakemake {t}" for t in ("scene1", "scene2", "scene3", "tables")), LONG),
     **dict.fromkeys((f"make {t}" for t in ("benchmark", "stability", "bounds")), LONG),

@@ -113,6 +113,8 @@ def test_the_command_writes_a_model_that_predict_takes(sky):
     assert run("exposure", *of, "--model", model, "--out", out).exit_code == 2
     assert "sparse.fits, by 10 of its stars" in run("describe", out).output
     assert "Adapted" not in run("describe", model).output
+    card = " ".join(run("describe", out, "--card").output.split())
+    assert "adapted to another one, `sparse.fits`" in card and "places without a star" in card
     assert run("predict", *of, "--model", out, "--out", folder / "p.fits").exit_code == 0
     assert error(load_model(out), 1.04) < 0.2 * error(load_model(model), 1.04)
     done = run("exposure", *of, "--model", out, "--out", folder / "second.psf.safetensors")

@@ -11,16 +11,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 from astropy.io import fits
+from matplotlib.image import imread
 
+from docs_pages import blocks, read
 from fits_inputs import write_cube
 from prediction_stars import observe
 from psfdae_paper.stages.simulate import write_example
-from workflow_runs import ROOT, captured
+from workflow_runs import PATH, ROOT, captured, clone
 
 pytestmark = pytest.mark.slow
 
 LARGEST_MB, LONGEST_IMPORT_S = 600, 0.3
 """Of the whole environment on the disk; CPU time of a process that imports psfdae."""
+
+FIRST_SESSION_S = 180
+"""Of CPU time, the installation included."""
 
 OF_EXTRAS = ("torch", "hydra", "mlflow", "pyarrow", "snakemake")
 """Modules that a plain installation has not."""
@@ -123,6 +128,21 @@ def test_a_command_of_the_reproduction_names_its_extra(installed, words, package
     done = installed.psfdae(*words)
     line = f'psfdae: this command needs {package}: pip install "psfdae[paper]"\n'
     assert (done.returncode, done.stderr) == (2, line)
+
+
+def test_the_first_session_as_written(installed, tmp_path):
+    """In a fresh copy of the source tree; its picture is that of docs/first_session.md."""
+    folder, page = clone(tmp_path / "psfdae"), read("docs/first_session.md")
+    lines = [*blocks(page, "sh"), "python - <<'END'\n", *blocks(page, "python"), "END"]
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    done = captured(["bash", "-ec", "".join(lines)], cwd=folder, env=HERE | {"PATH": PATH})
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    assert done.returncode == 0, done.stderr
+    assert after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime < FIRST_SESSION_S
+    drawn, shown = (
+        imread(place / "first_session.png") for place in (folder, ROOT / "docs/figures")
+    )
+    assert drawn.shape == shown.shape and np.abs(drawn - shown).mean() < 0.01
 
 
 FOUR_LINES = """

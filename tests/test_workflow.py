@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
 
+import h5py
 import numpy as np
 import pandas as pd
 import pytest
 from skimage.metrics import mean_squared_error, structural_similarity
 
+from docs_pages import read
 from psfdae.files import read_product
+from psfdae.methods import method
 from psfdae.model.star_sets import noisy_test_images, read_stars, split_stars
+from psfdae_paper.configuration.aligners import ESTIMATORS
 from psfdae_paper.configuration.compose import load
 from psfdae_paper.evaluation.comparison import seed_scatter
 from psfdae_paper.stages.bounds import COLUMNS as BOUND_COLUMNS
@@ -216,3 +221,43 @@ def test_targets_on_request(smoke, tmp_path):
     assert set(bounds.method) == {"bayes", "bayes_position", "floor"}
     assert set(pd.read_csv(tables / "benchmark_peers.csv").columns) >= {"scene", "method"}
     assert planned(folder, "benchmark", "stability", "bounds") == {}
+
+
+def test_the_data_card_describes_the_files(smoke):
+    """Arrays, their types, units and meanings; what is in brackets the card adds."""
+    tables = re.split(r"^`(\w+)` \(", read("docs/data_card.md"), flags=re.M)[1:]
+    rows = {
+        kind: {
+            name: (dtype, unit, about.partition(" (in scene")[0])
+            for name, _, dtype, unit, about in re.findall(
+                r"^\| `(\w+)` \| (.+?) \| (\w+) \| (.+?) \| (.+) \|$", text, re.M
+            )
+        }
+        for kind, text in zip(tables[::2], tables[1::2], strict=True)
+    }
+    seen = {kind: set() for kind in rows}
+    for path in sorted((smoke / "results/data").rglob("*.h5")):
+        with h5py.File(path) as file:
+            kind = file.attrs["kind"]
+            assert f"{path.parent.name}/{path.name}" in read("docs/data_card.md")
+            for name, array in file.items() if kind in rows else ():
+                dtype, unit, about = rows[kind][name]
+                assert (str(array.dtype), array.attrs["unit"]) == (dtype, unit), (path, name)
+                alike = {about} | ({"static PSF, sum 1"} if name == "realisation" else set())
+                assert array.attrs["about"] in alike, (path, name)
+                seen[kind].add(name)
+    assert seen == {kind: set(names) for kind, names in rows.items()}
+
+
+@pytest.mark.parametrize(("target", "pictures"), [("all", 3), ("dataset8", 2)])
+def test_the_report_opens_with_its_main_pictures_and_all_methods(smoke, tmp_path, target, pictures):
+    report = tmp_path / "report.html"
+    snakemake(smoke, "--report", str(report), target)
+    first = json.loads(re.search(r"var workflow_desc = (\".*\");\n", report.read_text())[1])
+    assert len(re.findall(r'<img [^>]*src="data:image/png', first)) == pictures
+    words = " ".join(re.sub("<[^>]+>", "", first).split())
+    assert ("the target scene3" in words) == (target == "dataset8")
+    assert ("Scene 3 (not built in this run)" in words) == (target == "dataset8")
+    config = load(["dataset=dataset8", "preset=smoke"])
+    for label in (*(method(name).look.label for name in config.methods), ESTIMATORS[0].look.label):
+        assert label in words

@@ -9,7 +9,16 @@ from importlib.metadata import PackageNotFoundError, requires
 
 
 class Error(Exception):
-    """Something that was given cannot be used; the message names it and says what is expected."""
+    """Something that was given cannot be used; the message names it and says what is expected.
+
+    Examples
+    --------
+    >>> try:
+    ...     psfdae.Stars.from_image("none.fits", detect=True)
+    ... except psfdae.Error as error:
+    ...     print(error)
+    none.fits: no such file
+    """
 
 
 REQUIRED_BY_EXTRA = re.compile(r"([A-Za-z0-9._-]+).*extra == [\"']([^\"']+)[\"']")

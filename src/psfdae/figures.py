@@ -174,7 +174,8 @@ def restoration_strip(rows: Sequence[StripRow], columns: Sequence[str], title: s
     All stamps of a column share the colour scale 0 … maximum of the first row,
     on a square-root scale, except rows with `own_scale`. `columns` are headings of the stars.
     """
-    left, right, top, bottom, cell, text = 1.0, 0.1, 0.85, 0.35, 0.86, 0.17
+    longest = max(len(line) for row in rows for line in _lines(row.label))
+    left, right, top, bottom, cell, text = max(1.0, 0.07 * longest), 0.1, 0.85, 0.35, 0.86, 0.17
     height = top + bottom + len(rows) * cell + text * sum(row.mse is not None for row in rows)
     figure = new_figure(height)
     width = figure.get_figwidth()
@@ -225,6 +226,11 @@ def draw_cell(
         interpolation="nearest",
     )
     if column == 0:
-        label = row.label.replace(" (", "\n(")
+        label = "\n".join(_lines(row.label))
         axes.set_ylabel(label, rotation=0, ha="right", va="center", ma="right", labelpad=5)
     return axes
+
+
+def _lines(label: str) -> list[str]:
+    """Lines of a label: what is in brackets has one of its own."""
+    return label.replace(" (", "\n(").splitlines()

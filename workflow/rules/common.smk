@@ -4,7 +4,9 @@ import sys
 from contextlib import contextmanager
 from functools import cache
 from importlib import import_module
+from inspect import getdoc
 
+from snakemake.report.common import data_uri_from_file
 from snakemake.utils import validate
 
 from psfdae import fits
@@ -12,6 +14,7 @@ from psfdae.cli import stage
 from psfdae.fits import suffix_of
 from psfdae.method import GoesOn
 from psfdae.settings import ConfigError, as_overrides
+from psfdae_paper.configuration.aligners import ESTIMATORS
 from psfdae_paper.configuration.alignment import NAME as SCENE3
 from psfdae_paper.configuration.compose import config_dir
 from psfdae_paper.configuration.compose import compose, dataset_names, decisive, load

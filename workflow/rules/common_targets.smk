@@ -120,3 +120,33 @@ def of_scene3(name, part, shown, caption=None):
         subcategory=part,
         labels={"figure": shown},
     )
+
+
+# What the first page of the report asks (workflow/report/workflow.rst).
+
+
+def shown_first(files, pattern):
+    """Of the report's files, that of a pattern: of `HEADLINE_DATASET`, else any; None."""
+    found = [file for file in files if file.path.match(pattern)]
+    return min(
+        found,
+        key=lambda file: (HEADLINE_DATASET not in file.path.parts, str(file.path)),
+        default=None,
+    )
+
+
+def methods_shown():
+    """Label of each method of the datasets, and the first sentence of its module."""
+    names = {name: None for dataset in default_datasets() for name in names_of(dataset)}
+    return {
+        method(name)
+        .look.label: getdoc(import_module(method(name).__module__))
+        .partition("\n\n")[0]
+        .replace("\n", " ")
+        for name in names
+    }
+
+
+def aligners_shown():
+    """Labels of the methods of scene 3."""
+    return [aligner.look.label for aligner in ESTIMATORS]

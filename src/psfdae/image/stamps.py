@@ -39,7 +39,15 @@ class Stamps:
 
 
 class StarFlag(IntFlag):
-    """What is said against a star; flags add up. Rows are flagged, never dropped."""
+    """What is said against a star; flags add up. Rows are flagged, never dropped.
+
+    Examples
+    --------
+    >>> psfdae.StarFlag(48)
+    <StarFlag.SATURATED|TRUNCATED: 48>
+    >>> 48 & psfdae.StarFlag.SATURATED > 0
+    True
+    """
 
     MASKED = 1
     OUTLIER = 2

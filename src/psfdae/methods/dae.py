@@ -1,4 +1,4 @@
-"""The denoising autoencoder as a method: its settings, its training, its files."""
+"""The denoising autoencoder: a network that learns from noisy stars to give noise-free ones."""
 
 from __future__ import annotations
 

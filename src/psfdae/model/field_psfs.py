@@ -29,7 +29,16 @@ Numbers: TypeAlias = float | Sequence[float] | _Array
 
 
 class PredictionError(Error, ValueError):
-    """Stars or places that a model cannot be applied to; one line with what it takes instead."""
+    """Stars or places that a model cannot be applied to; one line with what it takes instead.
+
+    Examples
+    --------
+    >>> try:
+    ...     model.predict(np.ones((1, 9, 9)))
+    ... except psfdae.PredictionError as error:
+    ...     print(error)
+    stamps of shape 1×9×9, but the model 'array' takes n×16×16
+    """
 
 
 class FieldPsfs(ABC):

@@ -64,6 +64,11 @@ def fit(
     ------
     Error
         If the method makes no model of an image, or a setting is wrong.
+
+    Examples
+    --------
+    >>> psfdae.fit(stars, method="gmm", components=[4], shrinkage=[10.0], name="mine")
+    PsfModel('mine', 16×16 px of 1", S/N 5 … 50)
     """
     names = [method] if method else [n for n in stars.settings.methods if makes_models(n)]
     kinds = [model_method(one) for one in names]

@@ -83,6 +83,16 @@ class Prediction:
         Pixels by which the stamp was moved along columns and rows to centre the star.
     flags : ndarray, shape (n,), uint16
         Sum of `psfdae.StarFlag`s.
+
+    Examples
+    --------
+    The first star was drawn with a flux of 2000 π 4.25 = 26704.
+
+    >>> found = model.predict(stamps, position=xy)
+    >>> bool(abs(found.flux[0] - 26704) < 3 * found.flux_error[0])
+    True
+    >>> int(found.flags[0])
+    0
     """
 
     psf: np.ndarray

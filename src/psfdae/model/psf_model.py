@@ -81,6 +81,11 @@ def load_model(path: str | Path | None = None) -> PsfModel:
         If it describes a telescope.
     MissingExtraError
         If the model is a network and torch is not installed.
+
+    Examples
+    --------
+    >>> psfdae.load_model()
+    PsfModel('wfsat', 16×16 px of 0.1", S/N 3.3 … 1.1e+03)
     """
     if path is not None and Path(path).suffix in (".yaml", ".yml"):
         raise PredictionError(
@@ -97,6 +102,17 @@ class PsfModel(FieldPsfs):
     ----------
     bundle : Bundle
         `load_model` reads one from a file.
+
+    Examples
+    --------
+    >>> found = model.predict(stamps, position=xy)
+    >>> found.psf.shape
+    (36, 16, 16)
+    >>> model.psf_at(150.0, 150.0, oversampling=1).shape
+    (16, 16)
+    >>> model.save("image.psf.safetensors")
+    >>> psfdae.load_model("image.psf.safetensors").info.training_stars
+    29
     """
 
     def __init__(self, bundle: Bundle) -> None:

@@ -56,6 +56,15 @@ class Stars:
         With the noise levels that follow from the stars.
     notes : tuple of str
         What is known of the camera and the list, and advice on settings.
+
+    Examples
+    --------
+    >>> stars = psfdae.Stars.from_image(image, catalogue=xy, **camera)
+    >>> print(stars.summary())
+    36 stars: 36 good
+    29 to learn from, 7 held out
+    >>> [str(part) for part in stars.table["part"][:2]]
+    ['training', 'held out']
     """
 
     source: Source

@@ -64,6 +64,13 @@ def validate(model: PsfModel, stars: Stars, others: Mapping[str, Method] | None 
     ------
     Error
         If the model may have seen the stars that are held out, or their pixels differ.
+
+    Examples
+    --------
+    >>> report = psfdae.validate(model, stars)
+    >>> mse = {row["method"]: row["mse"] for row in report.table if round(row["snr"]) == 10}
+    >>> bool(mse["field"] < mse["mean_psf"] < mse["noisy"])
+    True
     """
     _require_unseen(model, stars)
     settings, own = stars.settings, model.info.method
@@ -261,6 +268,13 @@ class Report:
         pixels that are within their stated errors, with standard errors clustered by star.
     restored : dict
         By noise level λ the held-out images (n, d, d): `truth`, `model`, and `mean_psf`.
+
+    Examples
+    --------
+    >>> report = psfdae.validate(model, stars)
+    >>> report.table.colnames
+    ['snr', 'noise', 'method', 'mse', 'mse_stderr', 'ssim', 'images', 'stars', 'truth_mse']
+    >>> report.strip().savefig("stars.png")
     """
 
     model: PsfModel

@@ -69,6 +69,11 @@ def wavefront(
         If shapes do not fit, no star is usable, or the aberrations are too large for any grid.
     ConfigError, RayTracingError, MissingExtraError
         If the telescope cannot be used.
+
+    Examples
+    --------
+    >>> psfdae.wavefront(stamps[:1], "telescope.yaml", field_deg=[[0.0, 0.0]], gain=1.0)
+    Wavefronts('refractor', 1 stars)
     """
     if not isinstance(telescope, OwnTelescope):
         telescope = read_telescope(Path(telescope))
@@ -140,6 +145,16 @@ class Wavefronts:
         Of the posteriors.
     joint : Joint or None
         State of the telescope.
+
+    Examples
+    --------
+    >>> found = psfdae.wavefront(stamps[:1], "telescope.yaml", field_deg=[[0.0, 0.0]], gain=1.0)
+    >>> found.explained
+    array([ True])
+    >>> found.psf().shape
+    (1, 16, 16)
+    >>> found.table.colnames[8:12]
+    ['z4', 'z4_error', 'z5', 'z5_error']
     """
 
     search: Search

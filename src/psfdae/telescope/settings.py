@@ -146,7 +146,7 @@ DEFAULT = re.compile(r"(?:/(?P<group>\w+)(?:@(?P<place>[\w.]+))?: )?(?P<name>\w+
 """An entry of the list `defaults`: a file of the same folder, or of another one."""
 
 
-def read_telescope(path: Path) -> OwnTelescope:
+def read_telescope(path: str | Path) -> OwnTelescope:
     """A telescope of one's own from its YAML file.
 
     Its list `defaults` may name other files, as those in `config/telescope` do: NAME is one of the
@@ -156,11 +156,18 @@ def read_telescope(path: Path) -> OwnTelescope:
     ------
     ConfigError
         Names the file and each wrong key with its value and the allowed range.
+
+    Examples
+    --------
+    >>> telescope = psfdae.read_telescope("telescope.yaml")
+    >>> f"{telescope.name}: a pixel is {telescope.pixel:.2f} λ/D wide"
+    'refractor: a pixel is 1.76 λ/D wide'
     """
     try:
-        return validate(OwnTelescope, _composed(path.absolute()))
+        return validate(OwnTelescope, _composed(Path(path).absolute()))
     except ConfigError as error:
-        lines = [line.removeprefix(f"{path.absolute()}: ") for line in str(error).splitlines()]
+        whole = f"{Path(path).absolute()}: "
+        lines = [line.removeprefix(whole) for line in str(error).splitlines()]
         raise ConfigError("\n".join(f"{path}: {line}" for line in lines)) from None
 
 
