@@ -23,7 +23,7 @@ class Command:
 def pages():
     """Names of all pages that a user reads."""
     docs = sorted(f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md"))
-    return ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", *docs]
+    return ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", "config/README.md", *docs]
 
 
 def read(page):

@@ -6,41 +6,21 @@ import shutil
 
 import pytest
 
+from docs_pages import blocks, read
 from psfdae.files import read_product
 from workflow_runs import NO_CLUSTER, ROOT, captured, environment, job_counts
 
 pytestmark = pytest.mark.workflow
 
-SNAKEFILE = """
-import os
-
-os.environ["PSFDAE_CONFIG"] = "config"  # this project's copy, with its telescope
-RESULTS, DATASET, settings = "elsewhere", 3, None  # names of the module are its own
-
-
-rule all:
-    input:
-        "errors.csv",
-
-
-rule stars:
-    input:
-        "out/tables/dataset3_mse.csv",
-    output:
-        "errors.csv",
-    shell:
-        "psfdae copy {input} {output}"
-
-
-module psfdae:
-    snakefile:
-        "SNAKEFILE"
-    config:
-        {"preset": "smoke", "results": "out", "set": "telescope=mine methods=[noisy,dae]"}
-
-
-use rule * from psfdae as psfdae_*
-"""
+WRITTEN = {
+    "/path/to/psfdae": str(ROOT),
+    "results/": "out/",
+    '"preset": "fast"': '"preset": "smoke", "results": "out"',
+    "telescope=mine": "telescope=mine methods=[noisy,dae]",
+    "rule errors": "rule stars",
+}
+"""What the test changes in the Snakefile of docs/reproduce.md; a rule there has a name of ours."""
+GLOBALS = "RESULTS, DATASET, settings = 'elsewhere', 3, None\n"
 TELESCOPE = """
 name: mine
 diameter_m: 0.6
@@ -55,8 +35,11 @@ def project(tmp_path):
     """Folder of a project, and a function that runs Snakemake in it."""
     shutil.copytree(ROOT / "config", tmp_path / "config")
     (tmp_path / "config/telescope/mine.yaml").write_text(TELESCOPE)
-    path = ROOT / "workflow/Snakefile"
-    (tmp_path / "Snakefile").write_text(SNAKEFILE.replace("SNAKEFILE", str(path)))
+    (text,) = blocks(read("docs/reproduce.md"), "snakemake")
+    for old, new in WRITTEN.items():
+        assert old in text
+        text = text.replace(old, new)
+    (tmp_path / "Snakefile").write_text(GLOBALS + text)
 
     def run(*arguments):
         line = ["snakemake", "--cores", "1", *arguments]
@@ -71,7 +54,7 @@ def project(tmp_path):
 @pytest.mark.slow
 def test_a_project_builds_dataset3_with_its_telescope(project):
     folder, run = project
-    run("psfdae_dataset3", "all")
+    run("psfdae_dataset3", "stars")
     stars = read_product(folder / "out/data/seidel/seidel_10pct.h5", "stars", ())
     assert stars.config["telescope"]["name"] == "mine"
     assert stars.config["telescope"]["pixel_scale_arcsec"] == 0.2
