@@ -63,7 +63,7 @@ def test_a_project_builds_dataset3_with_its_telescope(project):
     assert (folder / "out/mlflow/dataset3.csv").is_file()
     written = {path.name for path in folder.iterdir()}
     assert written == {".snakemake", "Snakefile", "config", "out", "errors.csv"}
-    assert "Nothing to be done" in run("--dry-run", "psfdae_dataset3", "all")
+    assert "Nothing to be done" in run("--dry-run", "psfdae_dataset3", "stars")
 
 
 def test_every_target_is_one_of_the_module(project):
