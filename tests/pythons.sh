@@ -13,7 +13,8 @@ for python in $PYTHONS; do
     venv=$PWD/.venvs/$python-$RESOLUTION
     uv venv --quiet --clear --system --no-python-downloads --python "$python" "$venv"
     uv pip install --quiet --python "$venv" --resolution "$RESOLUTION" --editable '.[paper,dev]'
-    uv pip freeze --python "$venv" >"$venv/versions.txt"
+    uv pip install --quiet --python "$venv" --requirement requirements/build.in
+    uv pip freeze --quiet --python "$venv" >"$venv/versions.txt"
     echo "Python $python, $RESOLUTION versions of its dependencies:"
     if PATH="$venv/bin:$PATH" "$@"; then passed="$passed $python"; else failed="$failed $python"; fi
 done
