@@ -7,6 +7,8 @@
 #   PORT=n           port of the MLflow page (default: 5000)
 #   TORCH_INDEX=url  package index with PyTorch's CPU builds (default: pip's own index)
 #   PYTHON=python3   interpreter that makes the environment (3.11 or newer)
+#   PYTHONS="…"      interpreters of `make test-pythons` (default: 3.11 to 3.14)
+#   RESOLUTION=…     its versions of dependencies: highest (default) or lowest-direct
 
 PYTHON ?= python3
 CORES ?= all
@@ -16,6 +18,8 @@ TARGETS ?=
 AGAINST ?=
 TORCH_INDEX ?=
 PORT ?= 5000
+PYTHONS ?= 3.11 3.12 3.13 3.14
+RESOLUTION ?= highest
 
 VENV := .venv
 PIP := $(VENV)/bin/python -m pip --disable-pip-version-check --no-input
@@ -42,8 +46,10 @@ override TARGETS := $(value TARGETS)
 override AGAINST := $(value AGAINST)
 override PORT := $(value PORT)
 override TORCH_INDEX := $(value TORCH_INDEX)
+override PYTHONS := $(value PYTHONS)
+override RESOLUTION := $(value RESOLUTION)
 PSFDAE_RESULTS := results$(if $(filter-out fast,$(PRESET)),/$(PRESET))
-export CORES PRESET SET TARGETS AGAINST PORT TORCH_INDEX PSFDAE_RESULTS
+export CORES PRESET SET TARGETS AGAINST PORT TORCH_INDEX PYTHONS RESOLUTION PSFDAE_RESULTS
 SNAKEMAKE := snakemake --cores "$$CORES" --config preset="$$PRESET" set="$$SET"
 # -f: a target is no pattern of file names.
 LOCKED := set -f; sh workflow/locked.sh $(SNAKEMAKE)
@@ -56,9 +62,11 @@ REPORTED = all \
   $(if $(wildcard $(PSFDAE_RESULTS)/figures/own_stars/strip.png),from_stars_example)
 # The 24 × 24 trainings take longest; started last, one would run alone in the end.
 LONGEST_FIRST := $(if $(strip $(TARGETS)),,--prioritize scene2)
+FAST_TESTS := env OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 pytest -m "not slow and not written" \
+  --numprocesses logical --maxprocesses 4 --dist worksteal
 
 .DEFAULT_GOAL := help
-.PHONY: help env reproduce report mlflow reference docs site test test-all test-docs lint format lock clean \
+.PHONY: help env reproduce report mlflow reference docs site test test-all test-docs test-pythons lint format lock clean \
   benchmark stability bounds training_knee bundles shipped
 
 help: ## List the targets
@@ -131,14 +139,16 @@ format: env ## Format Python and Snakemake files
 	snakefmt Snakefile workflow
 
 test: lint ## Lint, unit tests and the smoke workflow
-	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 pytest -m "not slow and not written" \
-	  --numprocesses logical --maxprocesses 4 --dist worksteal --junitxml results/tests.xml
+	$(FAST_TESTS) --junitxml results/tests.xml
 
 test-all: test ## The tests, then the slow ones
 	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 pytest -m slow --numprocesses 2 --dist loadfile
 
 test-docs: env ## Every command of README and docs as it is written
 	pytest -m written
+
+test-pythons: env ## The fast tests with other Pythons, and the newest or lowest versions of dependencies
+	sh tests/pythons.sh $(FAST_TESTS)
 
 lock: env ## Renew the lock files from pyproject.toml and requirements; torch's CPU builds from TORCH_INDEX
 	$(if $(TORCH_INDEX),$(COMPILE) --no-deps --default-index "$$TORCH_INDEX" \

@@ -1,10 +1,8 @@
-"""MkDocs hooks: the site's files lie as in the repository; keys of the configuration are listed."""
+"""MkDocs hooks: the site's files lie as in the repository."""
 
 from __future__ import annotations
 
-import json
 import re
-from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,21 +10,15 @@ from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).resolve().parents[1]
 PUBLISHED = (
-    *("*.md", "LICENSE", "CITATION.cff", "docs/*.md", "docs/*.css", "docs/figures/*.png"),
+    *("*.md", "LICENSE", "CITATION.cff", "config/*.md"),
+    *("docs/*.md", "docs/*.css", "docs/figures/*.png"),
     *("results/reference/**/*.png", "results/reference/**/*.csv", "studies/*/*.csv"),
     "src/psfdae_paper/configuration/schema.py",
 )
 """What pages are and link to; links are relative and the same on GitHub."""
 
-KEYS = "<!-- keys -->"
 CELL = re.compile(r"<td[^>]*>[^<]*")
 NUMBER = re.compile(r"[-+−]?\d[\d.]*e[-+]\d+")
-LIMITS = {"minimum": "≥", "exclusiveMinimum": ">", "maximum": "≤", "exclusiveMaximum": "<"}
-HEAD = ("| key | type | allowed | default | meaning |", "|---|---|---|---|---|")
-PRESETS = ("network_train", "preset")
-"""Groups of options that set keys of several groups."""
-
-Schema = Mapping[str, Any]
 
 
 def on_files(files: Files, config: Any) -> Files:
@@ -39,11 +31,6 @@ def on_files(files: Files, config: Any) -> Files:
     return files
 
 
-def on_page_markdown(markdown: str, **_: Any) -> str:
-    """List the keys of the configuration at `<!-- keys -->`."""
-    return markdown.replace(KEYS, "\n".join(key_reference())) if KEYS in markdown else markdown
-
-
 def on_page_content(html: str, **_: Any) -> str:
     """Keep numbers such as 2.5e-06 in cells of tables on one line."""
 
@@ -51,52 +38,3 @@ def on_page_content(html: str, **_: Any) -> str:
         return NUMBER.sub(r'<span class="number">\g<0></span>', cell[0])
 
     return CELL.sub(kept, html)
-
-
-def key_reference() -> Iterator[str]:
-    """Markdown of all groups: their keys and, below, their options."""
-    from psfdae_paper.configuration.base import config_dir
-    from psfdae_paper.configuration.compose import compose
-    from psfdae_paper.configuration.schema import whole_config
-
-    schema, tree = whole_config().model_json_schema(), compose()
-    for group in (*schema["properties"], *PRESETS):
-        yield f"\n### `{group}`\n"
-        if group not in PRESETS:
-            yield from (*HEAD, *_rows(group, schema["properties"][group], schema, tree.get(group)))
-        yield ""
-        for option in sorted((config_dir() / group).glob("[!_]*.yaml")):
-            comment = re.match(r"(?:#.*\n)*", option.read_text(encoding="utf-8"))[0]
-            lines = re.findall(r"^# ?(?! *@package)(.+)", comment, re.M)
-            yield f"- `{group}={option.stem}`{': ' if lines else ''}{' '.join(lines)}"
-
-
-def _rows(key: str, about: Schema, schema: Schema, value: Any) -> Iterator[str]:
-    """Rows of a key, or of the keys of the groups that it may hold."""
-    members = [about, *about.get("anyOf", []), *about.get("oneOf", [])]
-    members += [*about.get("patternProperties", {}).values()]
-    forms = [m["$ref"].rsplit("/", 1)[-1] for m in members if "$ref" in m]
-    for form in forms:
-        group = schema["$defs"][form]
-        yield f"| **{key}** | {form} | | | {_sentence(group)} |"
-        for name, inner in group["properties"].items():
-            known = value.get(name) if isinstance(value, Mapping) else None
-            yield from _rows(f"{key}.{name}", inner, schema, known)
-    if not forms:
-        kinds = dict.fromkeys(m["type"] for m in members if "type" in m)
-        value = about.get("default") if value is None else value
-        default = "" if value is None else f"`{json.dumps(value, ensure_ascii=False)}`"
-        limits = ", ".join(limit for m in members for limit in _limits(m))
-        cells = (f"`{key}`", " or ".join(kinds), limits, default, _sentence(about))
-        yield f"| {' | '.join(cells)} |"
-
-
-def _limits(about: Schema) -> list[str]:
-    found = [f"{sign} {about[key]:g}" for key, sign in LIMITS.items() if key in about]
-    found += [f"`{value}`" for value in about.get("enum", [about.get("const")]) if value]
-    return found + (_limits(about["items"]) if "items" in about else [])
-
-
-def _sentence(about: Schema) -> str:
-    """The meaning; a key without one stops the build."""
-    return " ".join(about["description"].split("\n\n")[0].split())

@@ -26,6 +26,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
+import yaml
 
 from psfdae.methods import known, method
 from psfdae_paper.configuration import aligners
@@ -75,7 +76,8 @@ READ: set[str] = set()
 
 def filled(page, drifted):
     """Text of a page with today's numbers; what has drifted is added to a list."""
-    sections = re.split(r"^(?=##+ )", page.read_text(encoding="utf-8"), flags=re.M)
+    # The reference of all keys is one mark; headings of its groups, `…`, do not part it.
+    sections = re.split(r"^(?=##+ (?!`))", page.read_text(encoding="utf-8"), flags=re.M)
     return "".join(_section(page.relative_to(ROOT), text, drifted) for text in sections)
 
 
@@ -176,6 +178,20 @@ def field_recipe():
 def scene3():
     """Groups of the configuration of scene 3."""
     return _names(compose(CHOICE))
+
+
+def keys():
+    """Reference of all keys of the configuration."""
+    from keys import reference
+
+    return "\n".join(reference())
+
+
+def command_line():
+    """What `snakemake --config` takes."""
+    path = ROOT / "workflow/schemas/command_line.schema.yaml"
+    schema = yaml.safe_load(path.read_text(encoding="utf-8"))
+    return pd.DataFrame([{"key": key, **about} for key, about in schema["properties"].items()])
 
 
 def datasets():
@@ -507,7 +523,8 @@ def over_lmmse():
 def main():
     """Fill in the pages, or name what has drifted."""
     drifted: list[str] = []
-    for page in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))):
+    pages = (ROOT / "README.md", ROOT / "config/README.md", *sorted((ROOT / "docs").glob("*.md")))
+    for page in filter(Path.is_file, pages):
         text = filled(page, drifted)
         if "--check" not in sys.argv:
             page.write_text(text, encoding="utf-8")

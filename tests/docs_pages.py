@@ -23,7 +23,8 @@ class Command:
 def pages():
     """Names of all pages that a user reads."""
     docs = sorted(f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md"))
-    return ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", *docs]
+    project = [f"{name}.md" for name in ("README", "CONTRIBUTING", "SECURITY", "CHANGELOG")]
+    return [*project, "config/README.md", *docs]
 
 
 def read(page):

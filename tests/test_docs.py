@@ -14,7 +14,9 @@ import pytest
 import yaml
 
 import psfdae
-from docs_pages import ROOT, pages
+from docs_pages import ROOT, pages, read
+from psfdae_paper.configuration.alignment import CHOICE
+from psfdae_paper.configuration.compose import compose, dataset_names
 from workflow_runs import captured
 
 TABLES = ROOT / "docs/tables.py"
@@ -31,9 +33,9 @@ def test_numbers_are_those_of_the_run_of_record():
 
 
 def test_a_typed_number_is_named(tmp_path):
-    for folder in ("src", "config", "results"):
-        (tmp_path / folder).symlink_to(ROOT / folder)
     (tmp_path / "docs").mkdir()
+    for name in ("src", "config", "results", "workflow", "docs/keys.py"):
+        (tmp_path / name).symlink_to(ROOT / name)
     (tmp_path / "docs/tables.py").write_text(TABLES.read_text(encoding="utf-8"))
     mark = "<!-- tables/stability.csv where verdict != 'pass': {len(case)} -->"
     (tmp_path / "README.md").write_text(f"Rows: {mark}0<!-- end -->.\n")
@@ -127,11 +129,29 @@ def test_site_has_every_page_and_needs_no_other_server(site):
 
 
 def test_site_has_the_references_and_no_mark(site):
-    for page, words in (("cli", "psfdae predict"), ("configuration", "train.lr</code></td>")):
+    for page, words in (("cli", "psfdae predict"), ("../config/index", "train.lr</code></td>")):
         text = (site / f"docs/{page}.html").read_text(encoding="utf-8")
         assert words in text
         assert "&lt;!--" not in text
         assert ":::" not in text
+
+
+def leaves(tree, name=""):
+    """Keys of a tree of settings."""
+    for key, value in tree.items():
+        inner = f"{name}.{key}" if name else key
+        yield from leaves(value, inner) if isinstance(value, dict) else [inner]
+
+
+def test_every_key_that_a_file_of_the_configuration_sets_is_documented():
+    page = read("config/README.md")
+    trees = [compose(CHOICE), *(compose([f"dataset={name}"]) for name in dataset_names())]
+    # A user names lenses.
+    keys = {re.sub(r"\.lenses\.\w+", ".lenses", key) for tree in trees for key in leaves(tree)}
+    assert len(keys) > 150
+    assert [key for key in sorted(keys) if f"| `{key}` |" not in page] == []
+    schema = yaml.safe_load(read("workflow/schemas/command_line.schema.yaml"))
+    assert [key for key in schema["properties"] if f"| `{key}` |" not in page] == []
 
 
 def test_versions_agree():

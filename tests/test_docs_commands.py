@@ -66,7 +66,9 @@ DRY = {
     "make reproduce TARGETS=dataset3 SET=$(psfdae best dae_width)": LONG,
     "make report": LONG,
     "snakemake tracking --forcerun track track_alignment": LONG,
-    **dict.fromkeys(("make test", "make test-all", "make test-docs"), "would run this test"),
+    **dict.fromkeys(
+        (f"make test{more}" for more in ("", "-all", "-docs", "-pythons")), "would run this"
+    ),
 }
 """Commands that are planned only, and why; all others run as they are written."""
 

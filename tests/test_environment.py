@@ -108,7 +108,8 @@ def test_the_plain_package_is_light():
 
 
 def test_snakefile_asks_for_the_snakemake_of_pyproject(declared):
-    asked = re.search(r'^min_version\("([0-9.]+)"\)', (ROOT / "Snakefile").read_text(), re.M)[1]
+    text = (ROOT / "workflow/Snakefile").read_text()
+    asked = re.search(r'^min_version\("([0-9.]+)"\)', text, re.M)[1]
     assert f">={asked}" in map(str, declared["snakemake"].specifier)
 
 

@@ -126,7 +126,7 @@ def test_a_stage_is_three(tree, tmp_path):
     places = {
         added(tree, "src/psfdae_paper/stages/count_fields.py", STAGE),
         added(tree, "workflow/rules/count.smk", RULE),
-        added(tree, "Snakefile", '\n\ninclude: "workflow/rules/count.smk"\n'),
+        added(tree, "workflow/Snakefile", '\n\ninclude: "rules/count.smk"\n'),
     }
     snakemake(tmp_path, "results/fields.txt", root=tree, overrides="grid.points=5")
     assert (tmp_path / "results/fields.txt").read_text() == "25"

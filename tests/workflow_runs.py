@@ -45,7 +45,7 @@ def clone(folder):
     if not (environment_of_make / ".complete").is_file():
         pytest.skip("the environment is not make's")
     made = shutil.ignore_patterns(
-        *(".*_cache", ".cache", ".git", ".hypothesis", ".snakemake", ".venv"),
+        *(".*_cache", ".cache", ".git", ".hypothesis", ".snakemake", ".venv*"),
         *("__pycache__", "dist", "site"),
     )
 

@@ -29,7 +29,7 @@ from psfdae.method import HISTORY
 from psfdae.methods import method
 from psfdae_paper.configuration.methods import registered
 from psfdae.files import DIGESTS, ProductError
-from psfdae_paper.source import source_hash
+from psfdae_paper.source import SOURCES, source_hash
 from psfdae_paper.sweeps.points import SweepError
 
 keep_in(Path(".snakemake/compositions"))
@@ -63,7 +63,7 @@ def options(group):
     return sorted(path.stem for path in config_dir().glob(f"{group}/[!_]*.yaml"))
 
 
-BENCHMARKS = os.path.relpath(Path(workflow.basedir, "workflow/benchmarks"))
+BENCHMARKS = os.path.relpath(SOURCES.parent / "workflow/benchmarks")
 sys.path.append(os.path.abspath(BENCHMARKS))
 
 

@@ -1,6 +1,6 @@
 STABILITY_DATASET, STABILITY_OTHER = "dataset3", "dataset8"
 STABILITY_READS = ("seed", "noise", "dae", "train", "baseline", "evaluation")
-STRESS = Path(workflow.basedir, "tests/stress")
+STRESS = SOURCES.parent / "tests/stress"
 STRESS_CODE = [p.name for p in sorted(STRESS.glob("*.py"))]
 
 
