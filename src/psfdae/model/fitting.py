@@ -153,5 +153,5 @@ def packed(stars: Stars, fitted: Method, name: str, licence: str) -> PsfModel:
         observation = stars.observation
         if not isinstance(fitted, KnowsField) or observation.shape is None:
             return model
-        wings = wings_of_stars(model, observation.with_margin(MARGIN_PX))
+        wings = stars.wings or wings_of_stars(model, observation.with_margin(MARGIN_PX))
     return model if wings is None else PsfModel(with_wings(model.bundle, wings))

@@ -74,7 +74,8 @@ def without_neighbours(stars: Stars) -> Stars:
         f"{stars.settings.calibration_stars.isolation_px:g} px, {len(again)} with none within "
         f"{NEAREST_FWHM * fwhm:.2g} px"
     )
-    return replace(again, observation=observation, notes=(*again.notes, said))
+    notes = (*again.notes, said)
+    return replace(again, observation=observation, wings=found.wings, notes=notes)
 
 
 def light_of_others(

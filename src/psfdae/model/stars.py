@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from astropy.table import Table
 
     from psfdae.image.catalogue import StarList
+    from psfdae.model.wings import Wings
 
 SPLIT, REFERENCE = "held_out", "realisation"
 """Whole stars are held out, and a star itself is what is to be restored."""
@@ -56,6 +57,8 @@ class Stars:
         With the noise levels that follow from the stars.
     notes : tuple of str
         What is known of the camera and the list, and advice on settings.
+    wings : Wings or None
+        Light of stars beyond their stamps, if all stars were fitted together to find it.
 
     Examples
     --------
@@ -74,6 +77,7 @@ class Stars:
     columns: dict[str, Column]
     settings: Settings
     notes: Sequence[str]
+    wings: Wings | None = None
 
     @classmethod
     def from_image(

@@ -292,6 +292,8 @@ def around_stars(
 def wings_of_stars(model: PsfModel, observation: Observation) -> Wings | None:
     """Wings of the stars of an image, restored one by one; None if they are too faint to be seen.
 
+    In a crowded image, where stars restored alone lack light, they come out too large.
+
     Raises
     ------
     ObservationError
@@ -299,19 +301,22 @@ def wings_of_stars(model: PsfModel, observation: Observation) -> Wings | None:
     """
     sky, side = observation.sky(), model.stamp_px
     image, places, fluxes = sky.flat + sky.level, [], []
+    # With the room of a stamp on all sides, for those that reach beyond the image.
     drawn = np.zeros(np.add(image.shape, 2 * side))
     for stamps, found in model.stream(observation, threads=1):
         place = np.stack([stamps.x, stamps.y], axis=1)
-        corner = np.floor(np.nan_to_num(place) + 0.5) + np.stack([found.shift_x, found.shift_y], 1)
+        shift = np.stack([found.shift_x, found.shift_y], axis=1)
+        corner = np.floor(np.nan_to_num(place) + 0.5).astype(int) + shift + side - side // 2
         known = np.isfinite(place).all(axis=1) & np.isfinite(found.psf).all(axis=(1, 2))
-        for x, y, psf in zip(*corner[known].astype(int).T, found.psf[known], strict=True):
-            rows, columns = (slice(c + side - side // 2, c + 2 * side - side // 2) for c in (y, x))
-            if drawn[rows, columns].shape == psf.shape:
-                drawn[rows, columns] += psf
+        for x, y, psf in zip(*corner[known].T, found.psf[known], strict=True):
+            stamp = np.s_[y : y + side, x : x + side]
+            if min(x, y) >= 0 and drawn[stamp].shape == psf.shape:
+                drawn[stamp] += psf
         places.append(place)
         fluxes.append(np.where(known, found.flux, np.nan))
-    place, flux = np.concatenate(places), np.concatenate(fluxes)
-    light, gain = drawn[side:-side, side:-side], observation.gain
+    inner = np.s_[side:-side, side:-side]
+    light = drawn[inner]
+    place, flux, gain = np.concatenate(places), np.concatenate(fluxes), observation.gain
     error = np.sqrt(sky.noise**2 + (np.maximum(light, 0.0) / gain if gain else 0.0))
     outer = outer_light(model.on_pixels, place)
     wings = around_stars(image, sky, error, light, place, flux, outer, side).wings
