@@ -26,6 +26,7 @@ import numpy as np
 from psfdae.bundle_info import BundleInfo
 from psfdae.files import Product, ProductError
 from psfdae.method import Estimate, FindsFlux, MeasuresStars, Method, ScoresOutliers, with_free_flux
+from psfdae.methods import method
 from psfdae.model.bundle import (
     SCALES,
     Bundle,
@@ -121,6 +122,77 @@ class Errors:
         return float(np.quantile(self.distance, LIMIT))
 
 
+@dataclass(frozen=True)
+class StarFacts:
+    """What a bundle says of the stars of a training, whatever was fitted to them.
+
+    Attributes
+    ----------
+    info : mapping
+        Fields of its `BundleInfo`, as plain values.
+    flux_model : FluxModel
+        Of the training stars.
+    held_out : HeldOutStars
+    levels : ndarray
+        Noise levels λ of the training.
+    seed : int
+        Of the training.
+    """
+
+    info: Mapping[str, Any]
+    flux_model: FluxModel
+    held_out: HeldOutStars
+    levels: np.ndarray
+    seed: int
+
+    @classmethod
+    def of(
+        cls, stars: Product, reference: str, config: Any, trained: Mapping[str, Any]
+    ) -> StarFacts:
+        """From a product "stars"; the rest is as in `bundle_of`."""
+        stamps, parts = _kind_of_stamps(stars), split_stars(stars, trained["split"], config)
+        images, references = stars["realisation"], stars[reference]
+        noise, levels = noise_model(config), np.asarray(config.noise.levels)
+        info = {
+            **stamps,
+            **reach(noise.kappa * levels, star_area(stars, parts.train)),
+            "components": COMPONENTS,
+            "training_sha256": checksum(images[parts.train], references[parts.train]),
+            "training_stars": _trained_on(stars, parts.train),
+            "config": {"stars": stars.config, "train": dict(trained)},
+        }
+        test = images[parts.test], references[parts.test]
+        held_out = HeldOutStars(*test, noise, field_positions(stars)[parts.test])
+        model = leading(FluxModel.fit(images[parts.train]), COMPONENTS)
+        return cls(info, model, held_out, levels, config.seed)
+
+
+def without_errors(
+    fitted: Method,
+    facts: StarFacts,
+    reference: str,
+    name: str,
+    licence: str,
+    largest_mb: float | None = None,
+) -> Bundle:
+    """A fit with all that it takes to apply it, but for its errors; raises as `bundle_of`."""
+    band, stamp_px = facts.held_out.noise.kappa * facts.levels, facts.info["stamp_px"]
+    arrays, said = packed(fitted, stamp_px, float(band.min()), 1e6 * (largest_mb or np.inf))
+    info = BundleInfo(
+        psfdae_version=__version__,
+        name=name,
+        licence=licence,
+        created=creation_date(),
+        metrics=[],
+        **facts.info,
+        **(said or {"method": fitted.name, "reference": reference}),
+    )
+    nodes = noise_nodes(band)
+    nothing = np.zeros((nodes.size, stamp_px, stamp_px), np.float32)
+    made = Bundle(info, arrays, facts.flux_model, nodes, nothing, nothing, np.ones(nodes.size), 0.0)
+    return with_misfit(made, facts.held_out, stream(facts.seed, "noise", "misfit"))
+
+
 def bundle_of(
     fitted: Method,
     stars: Product,
@@ -150,52 +222,24 @@ def bundle_of(
     BundleError
         If it cannot be that small.
     """
-    stamps, parts = _kind_of_stamps(stars), split_stars(stars, trained["split"], config)
-    images, references = stars["realisation"], stars[reference]
-    held_out = HeldOutStars(
-        images[parts.test],
-        references[parts.test],
-        noise_model(config),
-        field_positions(stars)[parts.test],
-    )
-    model = leading(FluxModel.fit(images[parts.train]), COMPONENTS)
-    band = config.noise.kappa * np.asarray(config.noise.levels)
-    largest = 1e6 * (largest_mb or np.inf)
-    arrays, said = packed(fitted, stamps["stamp_px"], float(band.min()), largest)
-    range_of = reach(band, star_area(stars, parts.train))
-    info = BundleInfo(
-        psfdae_version=__version__,
-        name=name,
-        licence=licence,
-        created=creation_date(),
-        **stamps,
-        **range_of,
-        components=COMPONENTS,
-        training_sha256=checksum(images[parts.train], references[parts.train]),
-        training_stars=_trained_on(stars, parts.train),
-        **(said or {"method": fitted.name, "reference": reference}),
-        config={
-            "stars": stars.config,
-            "train": dict(trained),
-            "evaluation": config.evaluation.model_dump(),
-        },
-        metrics=[],
-    )
-    unpacked = type(fitted).unpack(arrays, info)  # what it errs as packed
-    nodes, rng = noise_nodes(band), stream(config.seed, "noise", "bundle")
-    nothing = np.zeros((nodes.size, *images.shape[1:]), np.float32)
-    made = Bundle(info, arrays, model, nodes, nothing, nothing, np.ones(nodes.size), 0.0)
+    facts = StarFacts.of(stars, reference, config, trained)
+    made = without_errors(fitted, facts, reference, name, licence, largest_mb)
+    held_out = facts.held_out
+    unpacked = type(fitted).unpack(made.weights, made.info)  # what it errs as packed
+    rng = stream(config.seed, "noise", "bundle")
     made, errors = calibrated(made, unpacked, held_out, rng)
+    test = split_stars(stars, trained["split"], config).test
     metrics = measure_levels(
         config.noise.levels,
         held_out,
-        lambda level: noisy_test_images(config, stars, parts.test, level),
+        lambda level: noisy_test_images(config, stars, test, level),
         lambda noisy, level: unpacked.estimate(noisy, level, held_out.position),
         errors,
-        range_of["noise_equivalent_px"],
+        made.info.noise_equivalent_px,
         config.evaluation.data_range,
     )
-    return replace(made, info=made.info.model_copy(update={"metrics": metrics}))
+    said = {**made.info.config, "evaluation": config.evaluation.model_dump()}
+    return replace(made, info=made.info.model_copy(update={"metrics": metrics, "config": said}))
 
 
 def _trained_on(product: Product, train: np.ndarray) -> int:
@@ -331,13 +375,11 @@ def calibrated(
 
 
 def with_scales(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -> Bundle:
-    """The bundle with its `misfit`, and with what flux, sky and brightness do to its errors.
+    """The bundle with what flux, sky and brightness do to its errors.
 
     No training must have seen the stars: where noise is far below the errors that a method makes
-    on other stars, those on its own tell neither.
+    on other stars, those on its own do not tell.
     """
-    info = bundle.info.model_copy(update={"misfit": misfit(bundle, stars, rng)})
-    bundle = replace(bundle, info=info)
     model, nodes = PsfModel(bundle), bundle.noise_nodes
     shape = 2, len(CASES)  # the noise is known, or estimated
     noise = np.tile(nodes, (*shape, 1))
@@ -374,12 +416,14 @@ def with_scales(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -
     )
 
 
-def misfit(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -> float:
-    """Noise over the flux with which the method finds the flux of bright stars best.
+def with_misfit(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -> Bundle:
+    """The bundle with the noise over the flux with which its method finds that of bright stars.
 
     What the method does not know of a star's shape would pass for flux, if there is little noise
-    beside it. Tried are none and the nodes of the noise.
+    beside it. Tried are none and the nodes of the noise, on stars that no training has seen.
     """
+    if not issubclass(method(bundle.info.method), FindsFlux):
+        return bundle
     nodes, errors = bundle.noise_nodes, []
     some = {name: getattr(stars, name)[:FEW_STARS] for name in ("images", "references", "position")}
     few = replace(stars, **some)
@@ -387,8 +431,6 @@ def misfit(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -> flo
     tried = (0.0, *nodes)
     for value in tried:
         model = PsfModel(replace(bundle, info=bundle.info.model_copy(update={"misfit": value})))
-        if not isinstance(model.engine.estimator, FindsFlux):
-            break
         found = [(model.predict(images), stars.references[star]) for images, star in noisy]
         logs = [
             np.log(np.nanmean(np.square(t.psf / t.flux[:, None, None] - truth)))
@@ -397,7 +439,8 @@ def misfit(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -> flo
         errors.append(float(np.mean(logs)))
         if errors[-1] > min(errors):
             break
-    return float(tried[int(np.argmin(errors))]) if errors else 0.0
+    best = float(tried[int(np.argmin(errors))])
+    return replace(bundle, info=bundle.info.model_copy(update={"misfit": best}))
 
 
 def _noisy(
