@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 from urllib.parse import urlencode
 
@@ -26,10 +26,13 @@ ALL = "all"
 KIND = {"mlflow.experimentKind": "custom_model_development"}
 """Tag by which MLflow opens the runs of an experiment and not its pages for language models."""
 
+MODE = {"workflowType": "machine_learning"}
+"""Part of an address that hides what is for language models."""
+
 NOTE = "mlflow.note.content"
 
-TAGS = ("dataset", "kind", "split", "reference")
-"""Columns of every view, then the metrics."""
+NAME_PX, NUMBER_PX = 280, 105
+"""Widths of columns: a name says dataset, split, reference and method of a run."""
 
 COMPARED = (*(f"test_{name}" for name in AVERAGED), "best_validation_mse", "validation_mse")
 """Metrics of which each has the same meaning for every run of an experiment."""
@@ -89,7 +92,7 @@ def note(name: str, experiment: str, tags: set[str]) -> str:
 
 def address(experiment: str, view: str) -> str:
     """Of a view, within MLflow's page."""
-    return f"#/experiments/{experiment}/runs?{urlencode({'viewStateShareKey': view})}"
+    return f"#/experiments/{experiment}/runs?{urlencode({'viewStateShareKey': view, **MODE})}"
 
 
 def _view(records: Sequence[Run], only: str, more: Sequence[str] = ()) -> str:
@@ -99,16 +102,22 @@ def _view(records: Sequence[Run], only: str, more: Sequence[str] = ()) -> str:
         metrics = [name for name in records[0].metrics if "stderr" not in name][:MOST]
     axes = dict.fromkeys(f"axes.{key}" for r in records for key in r.config.get("axes", ()))
     columns = {
-        "tags": TAGS,
         "params": axes,
         "metrics": [*metrics, *more],
         "attributes": ("Models", "Dataset"),
     }
+    selected = [_column(kind, name) for kind, names in columns.items() for name in names]
+    name = _column("attributes", "Run Name")
     state = {
         "searchFilter": f"tags.superseded = 'false'{only}",
         "orderByKey": _column("metrics", metrics[0]),
         "orderByAsc": True,
-        "selectedColumns": [_column(kind, n) for kind, names in columns.items() for n in names],
+        "selectedColumns": selected,
+        "columnOrder": [name, *selected],
+        "columnWidths": {
+            name: NAME_PX,
+            **dict.fromkeys(selected[: -len(columns["attributes"])], NUMBER_PX),
+        },
     }
     return json.dumps(state)
 

@@ -344,13 +344,7 @@ def _of_states(folder: Path, data: Path, errors: Path, more: Mapping[str, Path])
     if not metrics:
         raise ProductError(f"{errors}: no rows of method {kind!r}")
     return Run(
-        kind=kind,
-        dataset="alignment",
-        split="uniform and grid",
-        reference="states",
-        source=f"alignment/{kind}",
-        name=f"alignment {kind}",
-        experiment="scene3",
+        **_of_scene3(kind),
         files=files,
         config=config,
         end_ms=_time_ms(folder / weights),
@@ -438,18 +432,54 @@ def _data_of(results: Path, result: Mapping[str, Any]) -> Path | None:
         return None
 
 
+def runs_under_way(results: Path, preset: str) -> list[Run]:
+    """Trainings that are not finished, as far as they are: those of datasets and of scene 3."""
+    folder, runs = results / "checkpoints", []
+    for kind in (k for k in registered() if k.storage and HISTORY in k.storage.diagnostics):
+        for path in sorted((folder / kind.name).glob("*/*-*.csv")):
+            split, reference = path.stem.split("-", 1)
+            key = {"dataset": path.parent.name, "split": split, "reference": reference}
+            config = load((f"dataset={key['dataset']}", f"preset={preset}"))
+            name = fits.storage_of(kind).run or kind.name
+            named = {"kind": name, "name": " ".join([*key.values(), name])}
+            where = {"source": fits.place_of(kind, **key), "experiment": config.scene.experiment}
+            runs.append(_under_way(path, **key, **named, **where))
+    for kind_of_network in WEIGHTS:
+        path = folder / f"alignment-{kind_of_network}.csv"
+        if path.is_file():
+            runs.append(_under_way(path, **_of_scene3(kind_of_network)))
+    return [run for run in runs if run.epochs]
+
+
+def _under_way(path: Path, **said: str) -> Run:
+    try:
+        end_ms, epochs = _time_ms(path), _epochs(path)
+    except ProductError:  # it has ended meanwhile
+        end_ms, epochs = 0, []
+    more = {"files": {}, "config": {}, "metrics": {}, "status": "RUNNING"}
+    return Run(**said, **more, end_ms=end_ms, epochs=epochs)
+
+
+def _of_scene3(kind: str) -> dict[str, str]:
+    """What the run of a network of scene 3 is called."""
+    key = {"dataset": "alignment", "split": "uniform and grid", "reference": "states"}
+    named = {"name": f"alignment {kind}", "source": f"alignment/{kind}", "experiment": "scene3"}
+    return {"kind": kind, **key, **named}
+
+
 def settings_of(run: Run, preset: str) -> dict[str, str]:
     """The settings that tell a run from others, by their dotted names.
 
-    They are what its dataset is, and those that are not the configuration's for this dataset and
-    preset. Which they are does not depend on other runs.
+    They are what its dataset and its method are, and those that are not the configuration's for
+    this dataset and preset. Which they are does not depend on other runs.
     """
     usual = _usual(run.dataset, preset)
-    return {
+    differing = {
         key: value
         for key, value in flatten(run.config).items()
         if key in OF_DATASET or usual.get(key) != value
     }
+    return {"method": run.kind, "split": run.split, "reference": run.reference, **differing}
 
 
 @cache

@@ -46,6 +46,7 @@ from psfdae_paper.tracking import (
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
+    from mlflow.entities import Metric
     from mlflow.entities import Run as MlflowRun
 
 SLOT = ("kind", "dataset", "split", "reference", "preset", "source")
@@ -103,11 +104,7 @@ def track(
 def import_runs(runs: Sequence[Run], preset: str, database: Path, receipt: Path) -> None:
     """Import runs; see `track`. Raises TrackingError if the database cannot be used."""
     artifacts = database.parent / "mlartifacts"
-    os.environ["MLFLOW_DISABLE_TELEMETRY"] = "true"
-    # MLflow's own waits add up to minutes for a server that is away.
-    os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", "20")
-    os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "1")
-    uri = os.environ.get("MLFLOW_TRACKING_URI", "")
+    uri = prepared()
     tags = {"preset": preset, "commit": git_commit(), "psfdae_version": __version__}
     done: list[tuple[str, str]] = []
     with alone(database):
@@ -115,15 +112,15 @@ def import_runs(runs: Sequence[Run], preset: str, database: Path, receipt: Path)
             for outcome in _import(runs, tags, uri, database, artifacts):
                 done.append(outcome)
         except Exception as error:
-            if not _ours_to_explain(error):
+            if not ours_to_explain(error):
                 raise
             if not uri:
                 raise TrackingError(
-                    f"{database}: {_first_line(error)} (if it is damaged, delete it: the next "
+                    f"{database}: {first_line(error)} (if it is damaged, delete it: the next "
                     "import rebuilds it)"
                 ) from error
             print(
-                f"MLflow at {uri} cannot be used: {_first_line(error)}\n"
+                f"MLflow at {uri} cannot be used: {first_line(error)}\n"
                 f"Not sent: {', '.join(r.name for r in runs[len(done) :])}\n"
                 "To send later, repeat the import (snakemake --forcerun track)."
             )
@@ -131,6 +128,15 @@ def import_runs(runs: Sequence[Run], preset: str, database: Path, receipt: Path)
     write_text(receipt, _as_csv(runs, preset, done))
     counts = Counter(action for _, action in done)
     print(f"{len(done)} runs:", ", ".join(f"{n} {action}" for action, n in sorted(counts.items())))
+
+
+def prepared() -> str:
+    """Address of the server that the environment names, "" if none; MLflow is made ready."""
+    os.environ["MLFLOW_DISABLE_TELEMETRY"] = "true"
+    # MLflow's own waits add up to minutes for a server that is away.
+    os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", "20")
+    os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "1")
+    return os.environ.get("MLFLOW_TRACKING_URI", "")
 
 
 @contextmanager
@@ -158,7 +164,7 @@ def _import(
             experiments[name] = experiment_of(client, name, uri, artifacts)
             for old in _runs(client, experiments[name]):
                 known.setdefault((name, *_slot(old.data.tags)), []).append(old)
-        own = {**tags, **_tags(record)}
+        own = {**tags, **tags_of(record)}
         if record.parent:
             own[PARENT] = imported[record.parent]
         outcome = _import_one(
@@ -261,8 +267,7 @@ def _create(client: MlflowClient, experiment: str, record: Run, tags: dict[str, 
     params = [Param(k, v[:PARAM_LENGTH]) for k, v in settings.items()]
     for i in range(0, len(params), BATCH):
         client.log_batch(run_id, params=params[i : i + BATCH], synchronous=True)
-    for i in range(0, len(metrics), 10 * BATCH):
-        client.log_batch(run_id, metrics=metrics[i : i + 10 * BATCH], synchronous=True)
+    log_metrics(client, run_id, metrics)
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         link({k: path for k, path in record.files.items() if not k.startswith(MODEL)}, folder)
@@ -273,6 +278,12 @@ def _create(client: MlflowClient, experiment: str, record: Run, tags: dict[str, 
     client.set_terminated(run_id, record.status, record.end_ms)
     client.set_tag(run_id, "content_hash", record.content_hash)
     return run_id
+
+
+def log_metrics(client: MlflowClient, run_id: str, metrics: Sequence[Metric]) -> None:
+    """Log any number of metrics."""
+    for i in range(0, len(metrics), 10 * BATCH):
+        client.log_batch(run_id, metrics=metrics[i : i + 10 * BATCH], synchronous=True)
 
 
 def _log_data(client: MlflowClient, run_id: str, record: Run) -> dict[str, str]:
@@ -298,7 +309,7 @@ def _log_data(client: MlflowClient, run_id: str, record: Run) -> dict[str, str]:
     return {"dataset_name": data.name, "dataset_digest": data.digest}
 
 
-def _tags(record: Run) -> dict[str, str]:
+def tags_of(record: Run) -> dict[str, str]:
     own = {key: getattr(record, key) for key in SLOT if key != "preset"}
     own |= record.tags
     return {**own, "config_hash": record.config_hash, "superseded": "false"}
@@ -308,7 +319,7 @@ def _slot(tags: dict[str, str]) -> tuple[str, ...]:
     return tuple(tags.get(key, "") for key in SLOT)
 
 
-def _ours_to_explain(error: Exception) -> bool:
+def ours_to_explain(error: Exception) -> bool:
     """Whether an error comes from the database, the server or the disk, not from a bug."""
     from mlflow.exceptions import MlflowException
     from sqlalchemy.exc import SQLAlchemyError
@@ -316,7 +327,7 @@ def _ours_to_explain(error: Exception) -> bool:
     return isinstance(error, MlflowException | SQLAlchemyError | OSError)
 
 
-def _first_line(error: Exception) -> str:
+def first_line(error: Exception) -> str:
     return str(error).strip().split("\n", 1)[0]
 
 
@@ -326,5 +337,5 @@ def _as_csv(runs: Sequence[Run], preset: str, done: Sequence[tuple[str, str]]) -
     writer.writeheader()
     for record, (run_id, action) in zip(runs, done, strict=True):
         row = {"run_id": run_id, "action": action, "experiment": record.experiment}
-        writer.writerow({**row, "preset": preset, **_tags(record)})
+        writer.writerow({**row, "preset": preset, **tags_of(record)})
     return text.getvalue()
