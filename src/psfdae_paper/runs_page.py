@@ -31,7 +31,7 @@ MODE = {"workflowType": "machine_learning"}
 
 NOTE = "mlflow.note.content"
 
-NAME_PX, NUMBER_PX = 280, 105
+NAME_PX, NUMBER_PX = 280, 120
 """Widths of columns: a name says dataset, split, reference and method of a run."""
 
 COMPARED = (*(f"test_{name}" for name in AVERAGED), "best_validation_mse", "validation_mse")
@@ -78,8 +78,7 @@ def views(records: Sequence[Run]) -> dict[str, str]:
 def note(name: str, experiment: str, tags: set[str]) -> str:
     """The description of an experiment in Markdown, from the names of its tags."""
     datasets = sorted(tag.removeprefix(VIEW) for tag in tags if tag.startswith(VIEW))
-    datasets.remove(ALL) if ALL in datasets else None
-    links = [f"[{d}]({address(experiment, d)})" for d in datasets]
+    links = [f"[{d}]({address(experiment, d)})" for d in datasets if d != ALL]
     return "\n\n".join(
         [
             ABOUT.get(name, f"Runs of {name}."),
@@ -101,12 +100,9 @@ def _view(records: Sequence[Run], only: str, more: Sequence[str] = ()) -> str:
     if not metrics:
         metrics = [name for name in records[0].metrics if "stderr" not in name][:MOST]
     axes = dict.fromkeys(f"axes.{key}" for r in records for key in r.config.get("axes", ()))
-    columns = {
-        "params": axes,
-        "metrics": [*metrics, *more],
-        "attributes": ("Models", "Dataset"),
-    }
-    selected = [_column(kind, name) for kind, names in columns.items() for name in names]
+    numbers = [_column("params", axis) for axis in axes]
+    numbers += [_column("metrics", metric) for metric in (*metrics, *more)]
+    selected = [*numbers, *(_column("attributes", key) for key in ("Models", "Dataset"))]
     name = _column("attributes", "Run Name")
     state = {
         "searchFilter": f"tags.superseded = 'false'{only}",
@@ -114,10 +110,7 @@ def _view(records: Sequence[Run], only: str, more: Sequence[str] = ()) -> str:
         "orderByAsc": True,
         "selectedColumns": selected,
         "columnOrder": [name, *selected],
-        "columnWidths": {
-            name: NAME_PX,
-            **dict.fromkeys(selected[: -len(columns["attributes"])], NUMBER_PX),
-        },
+        "columnWidths": {name: NAME_PX, **dict.fromkeys(numbers, NUMBER_PX)},
     }
     return json.dumps(state)
 

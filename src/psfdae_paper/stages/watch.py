@@ -11,7 +11,7 @@ import webbrowser
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import click
 
@@ -61,16 +61,25 @@ def watch(
         print(f"trainings are not shown in MLflow any more: {first_line(error)}")
 
 
+class Shown(NamedTuple):
+    """A run that follows a training: its id, its start in ms since 1970, the epochs that it has."""
+
+    run_id: str
+    start_ms: int
+    epochs: int
+
+
 class Watcher:
     """Runs of MLflow that follow trainings."""
 
     def __init__(self, preset: str, database: Path) -> None:
         self.preset, self.database, self.uri = preset, database, prepared()
-        self._shown: dict[str, tuple[str, int]] = {}  # id, and epochs that it has
+        self._shown: dict[str, Shown] = {}
 
     def look(self, records: Sequence[Run]) -> None:
         """Log the epochs that are new."""
-        fresh = [r for r in records if len(r.epochs) != self._shown.get(r.source, ("", 0))[1]]
+        known = {source: shown.epochs for source, shown in self._shown.items()}
+        fresh = [r for r in records if len(r.epochs) != known.get(r.source)]
         if not fresh:
             return
         with alone(self.database):
@@ -81,27 +90,34 @@ class Watcher:
     def _follow(self, client: MlflowClient, record: Run) -> None:
         from mlflow.entities import Metric
 
-        run_id, known = self._shown.get(record.source, ("", 0))
-        if not run_id or len(record.epochs) < known:  # or it has started anew
+        shown = self._shown.get(record.source)
+        if shown and len(record.epochs) < shown.epochs:  # it has started anew
+            client.delete_run(shown.run_id)
+            shown = None
+        if shown is None:
             artifacts = self.database.parent / "mlartifacts"
             experiment = experiment_of(client, record.experiment, self.uri, artifacts)
             tags = {**tags_of(record), "preset": self.preset, "config_hash": LIVE}
-            if run_id:
-                client.delete_run(run_id)
-            run_id = client.create_run(experiment, record.start_ms, tags, record.name).info.run_id
-            known = 0
-        new = [p for p in record.points if p.epoch > known]
-        log_metrics(client, run_id, [Metric(p.name, p.value, p.time_ms, p.epoch) for p in new])
-        self._shown[record.source] = run_id, len(record.epochs)
+            created = client.create_run(experiment, record.start_ms, tags, record.name)
+            shown = Shown(created.info.run_id, record.start_ms, 0)
+        # A file's time is later than its last epoch by this or that.
+        shift = shown.start_ms - record.start_ms
+        metrics = [
+            Metric(p.name, p.value, p.time_ms + shift, p.epoch)
+            for p in record.points
+            if p.epoch > shown.epochs
+        ]
+        log_metrics(client, shown.run_id, metrics)
+        self._shown[record.source] = shown._replace(epochs=len(record.epochs))
 
     def end(self) -> None:
         """Runs that no import has replaced were given up, or their import comes later."""
         if self._shown:
             with alone(self.database):
                 client = client_of(self.uri, self.database)
-                for run_id, _ in self._shown.values():
-                    if client.get_run(run_id).info.lifecycle_stage == "active":
-                        client.set_terminated(run_id, "KILLED")
+                for shown in self._shown.values():
+                    if client.get_run(shown.run_id).info.lifecycle_stage == "active":
+                        client.set_terminated(shown.run_id, "KILLED")
 
 
 @command("page")
