@@ -255,6 +255,18 @@ def test_page_opens_on_tables_that_compare(site):
     assert {run.data.tags["kind"] for run in found} == {"dae", "baseline"}
 
 
+def test_a_description_that_somebody_has_written_stays(site):
+    from mlflow import MlflowClient
+
+    site.track()
+    client = MlflowClient(f"sqlite:///{site.database}")
+    experiment = client.get_experiment_by_name("scene1")
+    assert experiment.tags["mlflow.note.content"].startswith("Scene 1: ")
+    client.set_experiment_tag(experiment.experiment_id, "mlflow.note.content", "mine")
+    site.track()
+    assert client.get_experiment_by_name("scene1").tags["mlflow.note.content"] == "mine"
+
+
 def test_what_knows_the_optics_is_a_run_without_a_model(site):
     rows = ["dataset,split,reference,method,noise_level,metric,value,stderr,n"]
     for method, value in (("wavefront", 3e-7), ("wavefront_position", 2.5e-7)):

@@ -14,14 +14,11 @@ from psfdae.model.packing import StarFacts
 from psfdae.model.star_sets import read_stars
 from psfdae.rng import stream
 from psfdae_paper import mlflow_model
-from psfdae_paper.tracking import Fit, Run
+from psfdae_paper.tracking import MODEL, Fit, Run
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
     from mlflow.entities.model_registry import ModelVersion
-
-MODEL = "model/"
-"""Files of a run that are its model have names that begin so."""
 
 BEST = "best"
 """Alias of a version; see `choose_best`."""

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 from urllib.parse import urlencode
 
-from psfdae_paper.tracking import AVERAGED, Run
+from psfdae_paper.tracking import AVERAGED, MODEL, Run
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -54,8 +54,11 @@ def show(client: MlflowClient, experiment: str, records: Sequence[Run]) -> None:
     """
     found = client.get_experiment(experiment)
     known = dict(found.tags)
-    wanted = KIND | {f"{VIEW}{name}": view for name, view in views(records).items()}
-    wanted[NOTE] = note(found.name, experiment, {*known, *wanted})
+    wanted = {f"{VIEW}{name}": view for name, view in views(records).items()}
+    # Somebody may have written another description, or chosen another kind.
+    if known.get(NOTE) in (None, note(found.name, experiment, {*known})):
+        wanted[NOTE] = note(found.name, experiment, {*known, *wanted})
+    wanted |= {key: kind for key, kind in KIND.items() if key not in known}
     for key, value in wanted.items():
         if known.get(key) != value:
             client.set_experiment_tag(experiment, key, value)
@@ -63,7 +66,7 @@ def show(client: MlflowClient, experiment: str, records: Sequence[Run]) -> None:
 
 def views(records: Sequence[Run]) -> dict[str, str]:
     """Views of records by name, as MLflow reads them."""
-    shaping = [r for r in records if any(name.startswith("model/") for name in r.files)]
+    shaping = [r for r in records if any(name.startswith(MODEL) for name in r.files)]
     if not shaping:
         return {}
     made = {ALL: _view(shaping, "")}

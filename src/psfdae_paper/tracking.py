@@ -41,6 +41,9 @@ STATISTICS = ("mean_abs_error", "bias", "variance")
 OF_DATASET = ("stars.name", "stars.aberration_fraction", "noise.name", "noise.levels")
 """Settings by which datasets differ."""
 
+MODEL = "model/"
+"""Files of a run that are its model have names that begin so."""
+
 SUMMARY_FILES = ("summary.csv", "cost.csv", "best.yaml", "sweep.yaml")
 POINT_FILES = ("result.json", "cost.json", "evaluation.csv", "validation.csv")
 """Files that a point of a sweep may have beside its model; a failed one has the first."""
@@ -286,7 +289,7 @@ def _measured(path: Path, row: Mapping[str, str], what: str) -> dict[str, float]
 
 def _model_files(kind: type[Method], place: Path) -> dict[str, Path]:
     """Files of a fit by their names within the run; `model/` is what the method loads."""
-    model = {f"model/{path.name}": path for path in fits.own_files(kind, place)}
+    model = {f"{MODEL}{path.name}": path for path in fits.own_files(kind, place)}
     more = fits.storage_of(kind).diagnostics
     return model | {name: fits.beside(kind, place, name) for name in more}
 
@@ -324,7 +327,7 @@ def runs_of_alignment(results: Path) -> list[Run]:
 
 
 def _network_files(folder: Path, weights: str) -> dict[str, Path]:
-    return {f"model/{name}": folder / name for name in (weights, CONFIG)} | {
+    return {f"{MODEL}{name}": folder / name for name in (weights, CONFIG)} | {
         HISTORY: folder / HISTORY
     }
 

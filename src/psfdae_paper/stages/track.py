@@ -24,7 +24,6 @@ from psfdae.options import File, Folder
 from psfdae.version import __version__
 from psfdae_paper.configuration.command import command
 from psfdae_paper.registry import (
-    MODEL,
     choose_best,
     forget,
     link,
@@ -35,6 +34,7 @@ from psfdae_paper.registry import (
 from psfdae_paper.runs_page import show
 from psfdae_paper.source import git_commit
 from psfdae_paper.tracking import (
+    MODEL,
     Run,
     described,
     runs_of_alignment,
