@@ -190,7 +190,7 @@ def without_errors(
     nodes = noise_nodes(band)
     nothing = np.zeros((nodes.size, stamp_px, stamp_px), np.float32)
     made = Bundle(info, arrays, facts.flux_model, nodes, nothing, nothing, np.ones(nodes.size), 0.0)
-    return with_misfit(made, facts.held_out, stream(facts.seed, "noise", "misfit"))
+    return with_misfit(made, facts.held_out, stream(facts.seed, "noise", "calibration", "misfit"))
 
 
 def bundle_of(
@@ -226,8 +226,7 @@ def bundle_of(
     made = without_errors(fitted, facts, reference, name, licence, largest_mb)
     held_out = facts.held_out
     unpacked = type(fitted).unpack(made.weights, made.info)  # what it errs as packed
-    rng = stream(config.seed, "noise", "bundle")
-    made, errors = calibrated(made, unpacked, held_out, rng)
+    made, errors = calibrated(made, unpacked, held_out, config.seed)
     test = split_stars(stars, trained["split"], config).test
     metrics = measure_levels(
         config.noise.levels,
@@ -358,9 +357,10 @@ def errors_of(estimate: Estimate, references: np.ndarray) -> np.ndarray:
 
 
 def calibrated(
-    bundle: Bundle, fitted: Method, stars: HeldOutStars, rng: np.random.Generator
+    bundle: Bundle, fitted: Method, stars: HeldOutStars, seed: int
 ) -> tuple[Bundle, Errors]:
     """The bundle of a method with all that these stars say of its errors, and these errors."""
+    rng = stream(seed, "noise", "calibration", "errors")
     errors = measure_errors(stars, fitted, bundle.flux_model, bundle.noise_nodes, rng)
     found = replace(
         bundle,
@@ -371,7 +371,7 @@ def calibrated(
         strange_limit=errors.strange_limit(),
         **dict.fromkeys((*SCALES, "widening")),
     )
-    return with_scales(found, stars, rng), errors
+    return with_scales(found, stars, stream(seed, "noise", "calibration", "scales")), errors
 
 
 def with_scales(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -> Bundle:
