@@ -5,6 +5,7 @@
 #   TARGETS="…"      Snakemake targets, for example dataset3 (default: all)
 #   AGAINST=commit   that `make benchmark TARGETS=run` compares this one with
 #   PORT=n           port of the MLflow page (default: 5000)
+#   TRACK=live       shows trainings in MLflow while they run (default: once they are finished)
 #   TORCH_INDEX=url  package index with PyTorch's CPU builds (default: pip's own index)
 #   PYTHON=python3   interpreter that makes the environment (3.11 or newer)
 #   PYTHONS="…"      interpreters of `make test-pythons` (default: 3.11 to 3.14)
@@ -18,6 +19,7 @@ TARGETS ?=
 AGAINST ?=
 TORCH_INDEX ?=
 PORT ?= 5000
+TRACK ?=
 PYTHONS ?= 3.11 3.12 3.13 3.14
 RESOLUTION ?= highest
 
@@ -45,11 +47,12 @@ override SET := $(value SET)
 override TARGETS := $(value TARGETS)
 override AGAINST := $(value AGAINST)
 override PORT := $(value PORT)
+override TRACK := $(value TRACK)
 override TORCH_INDEX := $(value TORCH_INDEX)
 override PYTHONS := $(value PYTHONS)
 override RESOLUTION := $(value RESOLUTION)
 PSFDAE_RESULTS := results$(if $(filter-out fast,$(PRESET)),/$(PRESET))
-export CORES PRESET SET TARGETS AGAINST PORT TORCH_INDEX PYTHONS RESOLUTION PSFDAE_RESULTS
+export CORES PRESET SET TARGETS AGAINST PORT TRACK TORCH_INDEX PYTHONS RESOLUTION PSFDAE_RESULTS
 SNAKEMAKE := snakemake --cores "$$CORES" --config preset="$$PRESET" set="$$SET"
 # -f: a target is no pattern of file names.
 LOCKED := set -f; sh workflow/locked.sh $(SNAKEMAKE)
@@ -85,7 +88,9 @@ $(VENV)/.complete: requirements.lock $(wildcard requirements/*.lock) pyproject.t
 	touch $@
 
 reproduce: env ## Build everything of the preset: datasets, models, tables, report
-	@$(LOCKED) $(LONGEST_FIRST) -- $$TARGETS
+	@case "$$TRACK" in '') ;; live) psfdae watch --results "$$PSFDAE_RESULTS" --preset "$$PRESET" \
+	    --database "$$PSFDAE_RESULTS/mlflow.db" & ;; *) echo "TRACK=$$TRACK: live, or nothing"; exit 2;; esac; \
+	  $(LOCKED) $(LONGEST_FIRST) -- $$TARGETS
 	@$(MAKE) --no-print-directory report
 	@[ "$$PSFDAE_RESULTS" != results ] || [ ! -d results/evaluation ] || \
 	  psfdae compare results results/reference || true
@@ -111,6 +116,7 @@ report: env ## Gather the figures of a finished run in results/report.html
 
 mlflow: env ## Compare the tracked runs in a browser (PORT=n)
 	@test -f "$$PSFDAE_RESULTS/mlflow.db" || { echo "no $$PSFDAE_RESULTS/mlflow.db yet: make reproduce"; exit 1; }
+	@psfdae page --database "$$PSFDAE_RESULTS/mlflow.db" --port "$$PORT" & \
 	mlflow ui --workers 1 --port "$$PORT" --backend-store-uri "sqlite:///$$PSFDAE_RESULTS/mlflow.db" \
 	  --artifacts-destination "$$PSFDAE_RESULTS/mlartifacts"
 

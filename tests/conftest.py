@@ -121,7 +121,7 @@ def empty_database(tmp_path_factory):
     path = tmp_path_factory.mktemp("mlflow") / "mlflow.db"
     patch = pytest.MonkeyPatch()
     patch.setenv("MLFLOW_DISABLE_TELEMETRY", "true")
-    track._client("", path)
+    track.client_of("", path)
     patch.undo()
     assert [p.name for p in path.parent.iterdir()] == ["mlflow.db"]
     return path

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import hashlib
+import json
 import re
 import shutil
 import socket
@@ -16,9 +18,12 @@ import pytest
 import yaml
 
 from psfdae.files import Column, ProductError, write_product
-from psfdae_paper.stages import track
+from psfdae_paper.stages import track, watch
 from psfdae_paper.tracking import flatten, runs_of_datasets
 
+TABLES = ("experiments", "experiment_tags", "runs", "metrics", "params", "tags")
+TABLES += ("datasets", "inputs", "logged_models", "logged_model_metrics", "logged_model_tags")
+TABLES += ("registered_models", "model_versions", "registered_model_aliases")
 PNG = b"\x89PNG\r\n\x1a\n"
 HISTORY = ((1, 3e-5, "nan", 1.5), (2, 2e-5, 1e-5, 3.0), (3, 1e-5, 2e-5, 4.5))
 
@@ -29,16 +34,33 @@ def write_history(path, rows=HISTORY):
 
 
 def write_config(path, **train):
-    tree = {"seed": 7, "dae": {"widths": [4, 4]}, "train": {"lr": 0.001, **train}, "attempt": 1}
+    noise = {"name": "noise3", "levels": [0.003], "kappa": 4.98, "background_photons": 1e4}
+    parts = {"train_stars": 30, "test_stars": 10, "validation_fraction": 0.1}
+    tree = {"seed": 7, "noise": noise, "parts": parts, "split": "random", "reference": "template"}
+    tree |= {"dae": {"widths": [4, 4]}, "train": {"lr": 0.001, **train}, "attempt": 1}
     path.write_text(yaml.safe_dump(tree))
+
+
+def write_stars(path, **scene):
+    """40 equal stars of 8 × 8 pixels, each in a field of its own."""
+    images = np.full((40, 8, 8), 1 / 64, np.float32)
+    columns = {
+        "realisation": Column(images, "1", "stars"),
+        "template": Column(images, "1", "templates"),
+        "field_index": Column(np.arange(40), "1", "fields"),
+        "grid": Column(np.stack([np.arange(40)] * 2, axis=1), "1", "places"),
+    }
+    telescope = {"diameter_m": 1.0, "wavelength_m": 5.5e-7, "pixel_scale_arcsec": 0.1}
+    tree = {"seed": 7, "scene": {"experiment": "scene1"}, "stars": {"name": "seidel_10pct"}}
+    tree |= {"telescope": telescope, "framing": {"jitter_px": 1}}
+    write_product(path, "stars", columns, tree | scene)
 
 
 def write_tree(results, dataset="dataset3", reference="template"):
     """A results folder as the workflow leaves it, without any training."""
     values = {"a": Column(np.arange(3.0), "1", "values")}
     stars = results / "data/seidel/stars.h5"
-    scene = {"seed": 7, "scene": {"experiment": "scene1"}, "telescope": {"diameter_m": 1.0}}
-    write_product(stars, "stars", values, scene)
+    write_stars(stars)
     baseline = {"seed": 7, "baseline": {"components": 2}}
     write_product(results / f"pca_som/{dataset}/random.h5", "pca_som", values, baseline)
     dae = results / f"dae/{dataset}/random-{reference}"
@@ -79,12 +101,17 @@ class Site:
         with receipt.open(newline="") as file:
             return {row["kind"]: row["action"] for row in csv.DictReader(file)}
 
-    def runs(self, kind="dae", view=1):
+    def runs(self, kind="dae", where=None):
         from mlflow import MlflowClient
 
         client = MlflowClient(f"sqlite:///{self.database}")
         experiment = client.get_experiment_by_name("scene1").experiment_id
-        return client.search_runs([experiment], f"tags.kind = '{kind}'", run_view_type=view)
+        return client.search_runs([experiment], where or f"tags.kind = '{kind}'")
+
+    def versions(self):
+        from mlflow import MlflowClient
+
+        return list(MlflowClient(f"sqlite:///{self.database}").search_model_versions())
 
     def history(self, run, metric):
         from mlflow import MlflowClient
@@ -97,7 +124,7 @@ class Site:
         with sqlite3.connect(self.database) as connection:
             return {
                 table: connection.execute(f"select count(*) from {table}").fetchone()[0]
-                for table in ("experiments", "runs", "metrics", "params", "tags")
+                for table in TABLES
             }
 
 
@@ -125,8 +152,6 @@ def test_run_holds_what_the_files_say(site):
         assert len(run.data.tags["config_hash"]) == 64
         assert run.data.tags["commit"]
     assert dae.data.params["dae.widths"] == "[4, 4]"
-    assert dae.data.params["telescope.diameter_m"] == "1.0"
-    assert "attempt" not in dae.data.params
     assert baseline.data.params["baseline.components"] == "2"
     assert dae.data.metrics["test_mse_0.003"] == 3e-5
     assert baseline.data.metrics["test_mse_0.003"] == 2e-5
@@ -136,6 +161,110 @@ def test_run_holds_what_the_files_say(site):
     assert [(p.step, p.value) for p in points] == [(1, 3e-5), (2, 2e-5), (3, 1e-5)]
     assert [p.timestamp - dae.info.start_time for p in points] == [1500, 3000, 4500]
     assert [p.step for p in site.history(dae, "validation_mse")] == [2, 3]
+
+
+def test_settings_that_tell_no_run_from_others_are_not_shown(site):
+    """Those of the preset for the dataset; files have all, and a hash tells them apart."""
+    site.track()
+    own = {"method": "dae", "split": "random", "reference": "template"}
+    changed = {"seed": "7", "dae.widths": "[4, 4]", "train.lr": "0.001"}
+    changed |= {"parts.train_stars": "30", "parts.test_stars": "10"}
+    of_dataset = {"stars.name": "seidel_10pct", "noise.name": "noise3", "noise.levels": "[0.003]"}
+    (dae,) = site.runs()
+    assert dae.data.params == {**own, **changed, **of_dataset}
+    write_config(site.dae / "config.yaml", lr=0.006)  # the preset's
+    site.track()
+    (now,) = (run for run in site.runs() if run.data.tags["superseded"] == "false")
+    assert "train.lr" not in now.data.params
+    assert now.data.tags["config_hash"] != dae.data.tags["config_hash"]
+
+
+def test_data_are_an_input_with_digest_and_schema(site):
+    site.track()
+    (dae,) = site.runs()
+    (given,) = dae.inputs.dataset_inputs
+    data = given.dataset
+    assert (data.name, data.source_type) == ("dataset3", "local")
+    digest = hashlib.sha256(site.stars["dataset3"].read_bytes()).hexdigest()
+    assert digest.startswith(data.digest)
+    features = json.loads(json.loads(data.schema)["mlflow_tensorspec"]["features"])
+    shapes = {feature["name"]: feature["tensor-spec"]["shape"] for feature in features}
+    assert shapes["realisation"] == [-1, 8, 8]
+    assert {tag.key: tag.value for tag in given.tags} == {"mlflow.data.context": "training"}
+
+
+def test_model_has_its_metrics_and_is_a_version_of_the_dataset_and_method(site):
+    from mlflow import MlflowClient
+
+    site.track()
+    client = MlflowClient(f"sqlite:///{site.database}")
+    (dae,), (baseline,) = site.runs("dae"), site.runs("baseline")
+    for run in (dae, baseline):
+        (output,) = run.outputs.model_outputs
+        model = client.get_logged_model(output.model_id)
+        assert (model.status, model.source_run_id) == ("READY", run.info.run_id)
+        metrics = {metric.key: metric for metric in model.metrics}
+        assert metrics["test_mse"].value == run.data.metrics["test_mse"]
+        assert metrics["test_mse"].dataset_name == "dataset3"
+        assert "train_mse" not in metrics
+    # No bundle holds a baseline.
+    (registered,) = client.search_registered_models()
+    assert registered.name == "dataset3-dae"
+    version = client.get_model_version_by_alias("dataset3-dae", "best")
+    assert version.run_id == dae.info.run_id
+    assert version.tags == {"split": "random", "reference": "template", "test_mse": "3e-05"}
+
+
+def test_best_is_the_version_that_errs_least_of_the_present_results(site):
+    from mlflow import MlflowClient
+
+    def best():
+        client = MlflowClient(f"sqlite:///{site.database}")
+        version = client.get_model_version_by_alias("dataset3-dae", "best")
+        return client.get_run(version.run_id).data
+
+    site.track()
+    write_config(site.dae / "config.yaml", lr=0.01)  # errs as much, and is the present one
+    site.track()
+    assert best().params["train.lr"] == "0.01"
+    other = site.dae.with_name("random-realisation")
+    shutil.copytree(site.dae, other)
+    table = site.results / "evaluation/dataset3/random-template.csv"
+    text = table.read_text().replace("template", "realisation").replace("3e-05", "4e-05")
+    table.with_name("random-realisation.csv").write_text(text)
+    site.track()  # errors to templates do not compete with errors to realisations
+    assert best().tags["reference"] == "realisation"
+
+
+def test_page_opens_on_tables_that_compare(site):
+    from mlflow import MlflowClient
+
+    site.track()
+    experiment = MlflowClient(f"sqlite:///{site.database}").get_experiment_by_name("scene1")
+    assert experiment.tags["mlflow.experimentKind"] == "custom_model_development"
+    views = dict(watch.views_in(site.database))
+    assert list(views) == ["scene1, all runs", "  dataset3"]
+    for place in views.values():
+        assert place in experiment.tags["mlflow.note.content"]
+        assert "workflowType=machine_learning" in place
+    view = json.loads(experiment.tags["mlflow.sharedViewState.dataset3"])
+    assert view["searchFilter"] == "tags.superseded = 'false' and tags.dataset = 'dataset3'"
+    assert view["orderByKey"] == "metrics.`test_mse`"
+    assert {"metrics.`test_mse`", "metrics.`test_mse_0.003`"} <= set(view["selectedColumns"])
+    found = site.runs(where=view["searchFilter"])
+    assert {run.data.tags["kind"] for run in found} == {"dae", "baseline"}
+
+
+def test_a_description_that_somebody_has_written_stays(site):
+    from mlflow import MlflowClient
+
+    site.track()
+    client = MlflowClient(f"sqlite:///{site.database}")
+    experiment = client.get_experiment_by_name("scene1")
+    assert experiment.tags["mlflow.note.content"].startswith("Scene 1: ")
+    client.set_experiment_tag(experiment.experiment_id, "mlflow.note.content", "mine")
+    site.track()
+    assert client.get_experiment_by_name("scene1").tags["mlflow.note.content"] == "mine"
 
 
 def test_what_knows_the_optics_is_a_run_without_a_model(site):
@@ -151,7 +280,7 @@ def test_what_knows_the_optics_is_a_run_without_a_model(site):
     (run,) = site.runs("wavefront_position")
     assert run.data.metrics["bounded_mse_0.001"] == 2.5e-7
     assert run.data.metrics["bounded_mse_stderr_0.001"] == 2e-8
-    assert run.data.params["telescope.diameter_m"] == "1.0"
+    assert run.data.params["stars.name"] == "seidel_10pct"
     assert set(site.track().values()) == {"unchanged"}
     (folder / "dataset3.csv").unlink()
     with pytest.raises(ProductError, match=r"dataset3\.csv: missing; run `snakemake wavefront`"):
@@ -160,14 +289,22 @@ def test_what_knows_the_optics_is_a_run_without_a_model(site):
 
 def test_artifacts_lie_beside_the_database(site):
     site.track()
-    folder = site.results / "mlartifacts/scene1" / site.runs()[0].info.run_id / "artifacts"
-    found = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
+    (run,), experiment = site.runs(), site.results / "mlartifacts/scene1"
+    folder = experiment / run.info.run_id / "artifacts"
+    model = experiment / "models" / run.outputs.model_outputs[0].model_id / "artifacts"
+    found, of_model = (
+        {p.relative_to(place).as_posix() for p in place.rglob("*") if p.is_file()}
+        for place in (folder, model)
+    )
     assert found == {
         *("config.yaml", "history.csv", "evaluation.csv"),
-        *("model/dae.safetensors", "model/config.yaml"),
         *("figures/curves.png", "figures/random-template_strip.png"),
     }
-    assert not any(p.is_symlink() for p in folder.rglob("*"))
+    assert of_model == {
+        *("MLmodel", "input_example.json"),
+        *("data/dae.safetensors", "data/config.yaml", "data/stars.h5"),
+    }
+    assert not any(p.is_symlink() for p in experiment.rglob("*"))
     assert yaml.safe_load((folder / "config.yaml").read_text())["dae"] == {"widths": [4, 4]}
 
 
@@ -184,6 +321,7 @@ def test_changed_files_replace_the_run(site):
     write_history(site.dae / "history.csv", [(1, 5e-5, 4e-5, 2.0), (2, 4e-5, 6e-5, 3.0)])
     assert site.track() == {"dae": "updated", "baseline": "unchanged"}
     (run,) = site.runs()
+    assert [version.run_id for version in site.versions()] == [run.info.run_id]
     assert run.data.metrics["train_mse"] == 4e-5
     assert [p.value for p in site.history(run, "train_mse")] == [5e-5, 4e-5]
     assert site.track() == {"dae": "unchanged", "baseline": "unchanged"}
@@ -204,20 +342,22 @@ def test_changed_config_is_a_second_run(site):
     assert flags == {old: "false", next(iter(superseded)): "true"}
 
 
-def test_killed_import_is_repaired(site, monkeypatch):
+@pytest.mark.parametrize("step", ["log_artifacts", "log_model_artifacts", "set_terminated"])
+def test_killed_import_is_repaired(site, monkeypatch, step):
     from mlflow import MlflowClient
 
     def killed(*arguments, **options):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(MlflowClient, "log_artifacts", killed)
+        patch.setattr(MlflowClient, step, killed)
         with pytest.raises(KeyboardInterrupt):
             site.track()
     assert len(site.runs("baseline")) + len(site.runs("dae")) == 1
     site.track()
     assert len(site.runs("baseline")) == len(site.runs("dae")) == 1
     assert all(run.info.status == "FINISHED" for run in site.runs("baseline") + site.runs("dae"))
+    assert len(site.versions()) == 1
 
 
 @pytest.mark.parametrize("refuses", [True, False], ids=["refuses", "silent"])
@@ -280,8 +420,7 @@ def test_config_hash_knows_the_stars_but_not_the_attempt(tmp_path):
     attempt = runs_of_datasets(tmp_path, stars)[1]
     assert attempt.config_hash == first.config_hash
     assert attempt.content_hash != first.content_hash
-    scene = {"seed": 7, "scene": {"experiment": "scene1"}, "telescope": {"diameter_m": 2.0}}
-    write_product(stars["dataset3"], "stars", {"a": Column(np.ones(2), "1", "")}, scene)
+    write_stars(stars["dataset3"], telescope={"diameter_m": 2.0})
     assert runs_of_datasets(tmp_path, stars)[1].config_hash != first.config_hash
 
 

@@ -7,8 +7,12 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from statistics import fmean
+from typing import Any, NamedTuple, TypedDict
+
+import numpy as np
 
 from psfdae import fits
 from psfdae.belonging import STARS, require_origin
@@ -17,8 +21,10 @@ from psfdae.method import CONFIG, HISTORY, Method
 from psfdae.methods import method
 from psfdae.methods.dae import WEIGHTS as DAE_WEIGHTS
 from psfdae.reading import number, read_csv, read_yaml
-from psfdae_paper.configuration.aligners import SWEPT, TRAINED
+from psfdae_paper.configuration.aligners import ALIGNERS, SWEPT, TRAINED
 from psfdae_paper.configuration.aligners import WEIGHTS as NETWORK_WEIGHTS
+from psfdae_paper.configuration.base import config_dir
+from psfdae_paper.configuration.compose import dataset_names, load
 from psfdae_paper.configuration.methods import registered
 from psfdae_paper.sweeps.points import hash_of
 
@@ -28,13 +34,22 @@ WEIGHTS = {"dae": DAE_WEIGHTS, **dict.fromkeys(TRAINED, NETWORK_WEIGHTS)}
 MEASURED = ("method", "noise_level", "metric", "value", "stderr")
 """Columns of tables of errors."""
 
+AVERAGED = ("mse", "ssim")
+"""Metrics of which a run has the mean over the noise levels, too."""
+
 STATISTICS = ("mean_abs_error", "bias", "variance")
+
+OF_DATASET = ("stars.name", "stars.aberration_fraction", "noise.name", "noise.levels")
+"""Settings by which datasets differ."""
+
+MODEL = "model/"
+"""Files of a run that are its model have names that begin so."""
 
 SUMMARY_FILES = ("summary.csv", "cost.csv", "best.yaml", "sweep.yaml")
 POINT_FILES = ("result.json", "cost.json", "evaluation.csv", "validation.csv")
 """Files that a point of a sweep may have beside its model; a failed one has the first."""
 
-CONTENT = 1
+CONTENT = 2
 """Goes into every content hash: raise it when what is taken from the files changes."""
 
 
@@ -45,6 +60,25 @@ class Point(NamedTuple):
     value: float
     epoch: int
     time_ms: int
+
+
+class Named(TypedDict):
+    """What a run is called; see `Run`."""
+
+    kind: str
+    dataset: str
+    split: str
+    reference: str
+    source: str
+    name: str
+    experiment: str
+
+
+class Fit(NamedTuple):
+    """A fit of a method that a model bundle can hold, and its place."""
+
+    kind: type[Method]
+    place: Path
 
 
 @dataclass(frozen=True)
@@ -75,6 +109,10 @@ class Run:
         Source of the run that this one is a part of, which comes first.
     tags : mapping
         Beside those that all runs have.
+    data : Path or None
+        Product that was learnt from.
+    fit : Fit or None
+        Of a run whose model restores lone stamps.
     content_hash : str
         Of files and settings.
 
@@ -100,6 +138,8 @@ class Run:
     status: str = "FINISHED"
     parent: str = ""
     tags: Mapping[str, str] = field(default_factory=dict)
+    data: Path | None = None
+    fit: Fit | None = None
     content_hash: str = field(init=False)
 
     def __post_init__(self) -> None:
@@ -183,9 +223,13 @@ def _of_stars(
     # Which start succeeded is an outcome, not a setting.
     own.pop("attempt", None)
     metrics: dict[str, float] = {}
-    for row in read_csv(evaluation, *MEASURED):
-        if row["method"] == kind.name:
-            metrics |= _measured(evaluation, row, "test")
+    rows = [row for row in read_csv(evaluation, *MEASURED) if row["method"] == kind.name]
+    for row in rows:
+        metrics |= _measured(evaluation, row, "test")
+    for metric in AVERAGED:
+        values = [number(evaluation, row["value"]) for row in rows if row["metric"] == metric]
+        if values:
+            metrics[f"test_{metric}"] = fmean(values)
     trained = HISTORY in fits.storage_of(kind).diagnostics
     return Run(
         dataset=key["dataset"],
@@ -199,6 +243,8 @@ def _of_stars(
         config={**product.config, **own},
         end_ms=_time_ms(fits.outputs(kind, model)[0]),
         metrics=metrics,
+        data=stars,
+        fit=Fit(kind, model) if kind.packing else None,
         epochs=_epochs(fits.beside(kind, model, HISTORY), "train_mse", "validation_mse")
         if trained
         else (),
@@ -234,6 +280,7 @@ def runs_of_optics(results: Path, datasets: Mapping[str, Path]) -> list[Run]:
                 config=product.config,
                 end_ms=_time_ms(path),
                 metrics=metrics,
+                data=stars,
             )
             for (kind, split, reference), metrics in of_run.items()
         ]
@@ -257,7 +304,7 @@ def _measured(path: Path, row: Mapping[str, str], what: str) -> dict[str, float]
 
 def _model_files(kind: type[Method], place: Path) -> dict[str, Path]:
     """Files of a fit by their names within the run; `model/` is what the method loads."""
-    model = {f"model/{path.name}": path for path in fits.own_files(kind, place)}
+    model = {f"{MODEL}{path.name}": path for path in fits.own_files(kind, place)}
     more = fits.storage_of(kind).diagnostics
     return model | {name: fits.beside(kind, place, name) for name in more}
 
@@ -289,16 +336,18 @@ def runs_of_alignment(results: Path) -> list[Run]:
         raise ProductError(f"{errors}: missing; run `snakemake scene3` first")
     figures = sorted((results / "figures/alignment").glob("*.png"))
     more = {"evaluation.csv": errors, **{f"figures/{path.name}": path for path in figures}}
-    return [_of_states(results / "alignment" / kind, errors, more) for kind in WEIGHTS]
+    states = {kind: ALIGNERS[kind].states for kind in TRAINED} | {"dae": "grid"}
+    data = {kind: results / f"data/alignment/{name}.h5" for kind, name in states.items()}
+    return [_of_states(results / "alignment" / kind, data[kind], errors, more) for kind in WEIGHTS]
 
 
 def _network_files(folder: Path, weights: str) -> dict[str, Path]:
-    return {f"model/{name}": folder / name for name in (weights, CONFIG)} | {
+    return {f"{MODEL}{name}": folder / name for name in (weights, CONFIG)} | {
         HISTORY: folder / HISTORY
     }
 
 
-def _of_states(folder: Path, errors: Path, more: Mapping[str, Path]) -> Run:
+def _of_states(folder: Path, data: Path, errors: Path, more: Mapping[str, Path]) -> Run:
     kind, weights = folder.name, WEIGHTS[folder.name]
     files = {**_network_files(folder, weights), **more}
     config = read_yaml(folder / CONFIG)
@@ -313,17 +362,12 @@ def _of_states(folder: Path, errors: Path, more: Mapping[str, Path]) -> Run:
     if not metrics:
         raise ProductError(f"{errors}: no rows of method {kind!r}")
     return Run(
-        kind=kind,
-        dataset="alignment",
-        split="uniform and grid",
-        reference="states",
-        source=f"alignment/{kind}",
-        name=f"alignment {kind}",
-        experiment="scene3",
+        **_of_scene3(kind),
         files=files,
         config=config,
         end_ms=_time_ms(folder / weights),
         metrics=metrics,
+        data=data,
         epochs=_epochs(folder / HISTORY),
     )
 
@@ -391,7 +435,91 @@ def _point_of_sweep(place: Path, name: str, point: str) -> Run:
         status="FAILED" if result["status"] == "failed" else "FINISHED",
         parent=f"sweeps/{name}",
         tags={key: result[key] for key in ("point", "status", "reason")},
+        data=_data_of(place.parents[3], result),
     )
+
+
+def _data_of(results: Path, result: Mapping[str, Any]) -> Path | None:
+    """Product of a point of a sweep, if the workflow made it under its usual name."""
+    config = result["config"]
+    try:
+        if result["model"] in SWEPT:
+            return results / f"data/alignment/{ALIGNERS[result['model']].states}.h5"
+        return results / f"data/{config['scene']['name']}/{config['stars']['name']}.h5"
+    except KeyError:
+        return None
+
+
+def runs_under_way(results: Path, preset: str) -> list[Run]:
+    """Trainings that are not finished, as far as they are: those of datasets and of scene 3."""
+    folder, runs = results / "checkpoints", []
+    for kind in (k for k in registered() if k.storage and HISTORY in k.storage.diagnostics):
+        for path in sorted((folder / kind.name).glob("*/*-*.csv")):
+            split, reference = path.stem.split("-", 1)
+            key = path.parent.name, split, reference
+            config = load((f"dataset={key[0]}", f"preset={preset}"))
+            name = fits.storage_of(kind).run or kind.name
+            said = Named(
+                kind=name,
+                dataset=key[0],
+                split=split,
+                reference=reference,
+                source=fits.place_of(kind, *key),
+                name=" ".join([*key, name]),
+                experiment=config.scene.experiment,
+            )
+            runs.append(_under_way(path, said))
+    for kind_of_network in WEIGHTS:
+        path = folder / f"alignment-{kind_of_network}.csv"
+        if path.is_file():
+            runs.append(_under_way(path, _of_scene3(kind_of_network)))
+    return [run for run in runs if run.epochs]
+
+
+def _under_way(path: Path, said: Named) -> Run:
+    try:
+        end_ms, epochs = _time_ms(path), _epochs(path)
+    except ProductError:  # it has ended meanwhile
+        end_ms, epochs = 0, []
+    return Run(
+        **said, files={}, config={}, metrics={}, end_ms=end_ms, epochs=epochs, status="RUNNING"
+    )
+
+
+def _of_scene3(kind: str) -> Named:
+    """What the run of a network of scene 3 is called."""
+    return Named(
+        kind=kind,
+        dataset="alignment",
+        split="uniform and grid",
+        reference="states",
+        source=f"alignment/{kind}",
+        name=f"alignment {kind}",
+        experiment="scene3",
+    )
+
+
+def settings_of(run: Run, preset: str) -> dict[str, str]:
+    """The settings that tell a run from others, by their dotted names.
+
+    They are what its dataset and its method are, and those that are not the configuration's for
+    this dataset and preset. Which they are does not depend on other runs.
+    """
+    usual = _usual(run.dataset, preset)
+    differing = {
+        key: value
+        for key, value in flatten(run.config).items()
+        if key in OF_DATASET or usual.get(key) != value
+    }
+    return {"method": run.kind, "split": run.split, "reference": run.reference, **differing}
+
+
+@cache
+def _usual(dataset: str, preset: str) -> dict[str, str]:
+    """Settings of a dataset where nobody gives others; none if the configuration has it not."""
+    if dataset not in dataset_names() or not (config_dir() / f"preset/{preset}.yaml").is_file():
+        return {}
+    return flatten(load((f"dataset={dataset}", f"preset={preset}")).model_dump())
 
 
 def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
@@ -403,6 +531,18 @@ def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
         else:
             leaves[f"{prefix}{key}"] = value if isinstance(value, str) else json.dumps(value)
     return leaves
+
+
+def described(product: Path) -> tuple[str, dict[str, tuple[np.dtype, tuple[int, ...]]]]:
+    """SHA-256 of a product, and type and shape of each of its arrays."""
+    import h5py
+
+    try:
+        with h5py.File(product, "r") as file:
+            arrays = {name: (file[name].dtype, file[name].shape) for name in file}
+    except (OSError, KeyError) as error:
+        raise ProductError(f"{product}: damaged ({error})") from None
+    return _digest(product), arrays
 
 
 def _digest(path: Path) -> str:

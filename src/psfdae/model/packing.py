@@ -26,6 +26,7 @@ import numpy as np
 from psfdae.bundle_info import BundleInfo
 from psfdae.files import Product, ProductError
 from psfdae.method import Estimate, FindsFlux, MeasuresStars, Method, ScoresOutliers, with_free_flux
+from psfdae.methods import method
 from psfdae.model.bundle import (
     Bundle,
     BundleError,
@@ -41,7 +42,7 @@ from psfdae.model.star_sets import (
     noise_model,
     noisy_test_images,
     of_image,
-    own_flux_error,
+    own_noise,
     split_stars,
     star_area,
 )
@@ -72,8 +73,8 @@ Restore = Callable[[np.ndarray, float], Estimate]
 class HeldOutStars:
     """Noise-free stars of flux 1 that no training has seen, (n, d, d), noise, and places (n, 2).
 
-    Those of an image are not free of noise: it makes their flux, which is taken to be 1, uncertain
-    by `flux_error` (n,).
+    Those of an image are not free of noise: `own_noise` (n, d, d) is in their pixels, and makes
+    their flux, which is taken to be 1, uncertain by `flux_error` (n,).
     """
 
     images: np.ndarray
@@ -81,6 +82,12 @@ class HeldOutStars:
     noise: NoiseModel
     position: np.ndarray
     flux_error: np.ndarray
+    own_noise: np.ndarray
+
+    def errors(self, psf: np.ndarray, star: np.ndarray | slice = slice(None)) -> np.ndarray:
+        """Moduli of the errors of PSFs of some stars, less what is the stars' own noise."""
+        square = np.square(psf - self.references[star]) - np.square(self.own_noise[star])
+        return np.asarray(np.sqrt(np.maximum(square, 0.0)))
 
 
 @dataclass(frozen=True)
@@ -88,7 +95,7 @@ class Errors:
     """Errors of the PSFs of test stars at S nodes of noise, as `errors_of` gives them."""
 
     nodes: np.ndarray  # (S,), pixel RMS over the flux
-    error: np.ndarray  # (S, N, d, d), float32
+    error: np.ndarray  # (S, N, d, d), float32, moduli
     star: np.ndarray  # (N,), of every error
     distance: np.ndarray  # (S, N), Mahalanobis', of the noisy images
     outlier_score: np.ndarray | None = None  # (S, N), if the method has one
@@ -128,6 +135,79 @@ class Errors:
         return float(np.quantile(self.distance, LIMIT))
 
 
+@dataclass(frozen=True)
+class StarFacts:
+    """What a bundle says of the stars of a training, whatever was fitted to them.
+
+    Attributes
+    ----------
+    info : mapping
+        Fields of its `BundleInfo`, as plain values.
+    flux_model : FluxModel
+        Of the training stars.
+    held_out : HeldOutStars
+    levels : ndarray
+        Noise levels λ of the training.
+    seed : int
+        Of the training.
+    """
+
+    info: Mapping[str, Any]
+    flux_model: FluxModel
+    held_out: HeldOutStars
+    levels: np.ndarray
+    seed: int
+
+    @classmethod
+    def of(
+        cls, stars: Product, reference: str, config: Any, trained: Mapping[str, Any]
+    ) -> StarFacts:
+        """From a product "stars"; the rest is as in `bundle_of`."""
+        stamps, parts = _kind_of_stamps(stars), split_stars(stars, trained["split"], config)
+        images, references = stars["realisation"], stars[reference]
+        noise, levels = noise_model(config), np.asarray(config.noise.levels)
+        info = {
+            **stamps,
+            **reach(noise.kappa * levels, star_area(stars, parts.train)),
+            "components": COMPONENTS,
+            "training_sha256": checksum(images[parts.train], references[parts.train]),
+            "training_stars": _trained_on(stars, parts.train),
+            "config": {"stars": stars.config, "train": dict(trained)},
+        }
+        own = own_noise(stars, references, parts.train, noise.background)
+        arrays = (images, references, field_positions(stars), *own)
+        test, truth, place, *doubts = (array[parts.test] for array in arrays)
+        held_out = HeldOutStars(test, truth, noise, place, *doubts)
+        model = leading(FluxModel.fit(images[parts.train]), COMPONENTS)
+        return cls(info, model, held_out, levels, config.seed)
+
+
+def without_errors(
+    fitted: Method,
+    facts: StarFacts,
+    reference: str,
+    name: str,
+    licence: str,
+    largest_mb: float | None = None,
+) -> Bundle:
+    """A fit with all that it takes to apply it, but for its errors; raises as `bundle_of`."""
+    band, stamp_px = facts.held_out.noise.kappa * facts.levels, facts.info["stamp_px"]
+    arrays, said = packed(fitted, stamp_px, float(band.min()), 1e6 * (largest_mb or np.inf))
+    info = BundleInfo(
+        psfdae_version=__version__,
+        name=name,
+        licence=licence,
+        created=creation_date(),
+        metrics=[],
+        **facts.info,
+        **(said or {"method": fitted.name, "reference": reference}),
+    )
+    nodes = noise_nodes(band)
+    nothing = np.zeros((nodes.size, stamp_px, stamp_px), np.float32)
+    made = Bundle(info, arrays, facts.flux_model, nodes, nothing, nothing, np.ones(nodes.size), 0.0)
+    return with_misfit(made, facts.held_out, stream(facts.seed, "noise", "calibration", "misfit"))
+
+
 def bundle_of(
     fitted: Method,
     stars: Product,
@@ -157,53 +237,23 @@ def bundle_of(
     BundleError
         If it cannot be that small.
     """
-    stamps, parts = _kind_of_stamps(stars), split_stars(stars, trained["split"], config)
-    images, references = stars["realisation"], stars[reference]
-    held_out = HeldOutStars(
-        images[parts.test],
-        references[parts.test],
-        noise_model(config),
-        field_positions(stars)[parts.test],
-        own_flux_error(stars, parts.train)[parts.test],
-    )
-    model = leading(FluxModel.fit(images[parts.train]), COMPONENTS)
-    band = config.noise.kappa * np.asarray(config.noise.levels)
-    largest = 1e6 * (largest_mb or np.inf)
-    arrays, said = packed(fitted, stamps["stamp_px"], float(band.min()), largest)
-    range_of = reach(band, star_area(stars, parts.train))
-    info = BundleInfo(
-        psfdae_version=__version__,
-        name=name,
-        licence=licence,
-        created=creation_date(),
-        **stamps,
-        **range_of,
-        components=COMPONENTS,
-        training_sha256=checksum(images[parts.train], references[parts.train]),
-        training_stars=_trained_on(stars, parts.train),
-        **(said or {"method": fitted.name, "reference": reference}),
-        config={
-            "stars": stars.config,
-            "train": dict(trained),
-            "evaluation": config.evaluation.model_dump(),
-        },
-        metrics=[],
-    )
-    unpacked = type(fitted).unpack(arrays, info)  # what it errs as packed
-    nodes, rng = noise_nodes(band), stream(config.seed, "noise", "bundle")
-    nothing = np.zeros((nodes.size, *images.shape[1:]), np.float32)
-    made = Bundle(info, arrays, model, nodes, nothing, nothing, np.ones(nodes.size), 0.0)
-    made, errors = calibrated(made, unpacked, held_out, rng)
+    facts = StarFacts.of(stars, reference, config, trained)
+    made = without_errors(fitted, facts, reference, name, licence, largest_mb)
+    held_out = facts.held_out
+    unpacked = type(fitted).unpack(made.weights, made.info)  # what it errs as packed
+    made, errors = calibrated(made, unpacked, held_out, config.seed)
+    test = split_stars(stars, trained["split"], config).test
     metrics = measure_levels(
         config.noise.levels,
         held_out,
-        lambda level: noisy_test_images(config, stars, parts.test, level),
+        lambda level: noisy_test_images(config, stars, test, level),
         lambda noisy, level: unpacked.estimate(noisy, level, held_out.position),
         errors,
-        range_of["noise_equivalent_px"],
+        made.info.noise_equivalent_px,
         config.evaluation.data_range,
     )
-    return replace(made, info=made.info.model_copy(update={"metrics": metrics}))
+    said = {**made.info.config, "evaluation": config.evaluation.model_dump()}
+    return replace(made, info=made.info.model_copy(update={"metrics": metrics, "config": said}))
 
 
 def _trained_on(product: Product, train: np.ndarray) -> int:
@@ -305,7 +355,7 @@ def measure_errors(
         level = noise / stars.noise.kappa
         noisy = stars.noise.draw(stars.images[star], level, rng)
         estimate = fitted.estimate(noisy, level, stars.position[star])
-        error[place] = errors_of(estimate, stars.references[star])
+        error[place] = errors_of(estimate, stars, star)
         found = estimate.outlier_score
         if found is None and isinstance(free, ScoresOutliers):
             found = free.outlier_score(noisy, np.full(star.size, level))
@@ -315,18 +365,19 @@ def measure_errors(
     return Errors(nodes, error, star, distance, np.stack(known) if known else None)
 
 
-def errors_of(estimate: Estimate, references: np.ndarray) -> np.ndarray:
-    """PSFs minus references (n, d, d), in units of σ if the method says it, else of the flux."""
-    error = estimate.psf - references
-    return np.asarray(
-        error if estimate.sigma is None else error / np.maximum(estimate.sigma, LEAST_SIGMA)
-    )
+def errors_of(
+    estimate: Estimate, stars: HeldOutStars, star: np.ndarray | slice = slice(None)
+) -> np.ndarray:
+    """Moduli of errors (n, d, d), in units of σ if the method says it, else of the flux."""
+    error = stars.errors(estimate.psf, star)
+    return error if estimate.sigma is None else error / np.maximum(estimate.sigma, LEAST_SIGMA)
 
 
 def calibrated(
-    bundle: Bundle, fitted: Method, stars: HeldOutStars, rng: np.random.Generator
+    bundle: Bundle, fitted: Method, stars: HeldOutStars, seed: int
 ) -> tuple[Bundle, Errors]:
     """The bundle of a method with all that these stars say of its errors, and these errors."""
+    rng = stream(seed, "noise", "calibration", "errors")
     errors = measure_errors(stars, fitted, bundle.flux_model, bundle.noise_nodes, rng)
     found = replace(
         bundle,
@@ -340,17 +391,15 @@ def calibrated(
         flux_error_scale=None,
         widening=None,
     )
-    return with_scales(found, stars, rng), errors
+    return with_scales(found, stars, stream(seed, "noise", "calibration", "scales")), errors
 
 
 def with_scales(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -> Bundle:
-    """The bundle with its `misfit`, and with what flux, sky and brightness do to its errors.
+    """The bundle with what flux, sky and brightness do to its errors.
 
     No training must have seen the stars: where noise is far below the errors that a method makes
-    on other stars, those on its own tell neither.
+    on other stars, those on its own do not tell.
     """
-    info = bundle.info.model_copy(update={"misfit": misfit(bundle, stars, rng)})
-    bundle = replace(bundle, info=info)
     model, nodes = PsfModel(bundle), bundle.noise_nodes
     shape = 2, len(CASES)  # the noise is known, or estimated
     noise = np.tile(nodes, (*shape, 1))
@@ -365,7 +414,7 @@ def with_scales(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -
             if not usable.any():
                 continue
             noise[estimated, case, place] = np.median((found.noise / found.flux)[usable])
-            error = np.abs(found.psf - stars.references[star])[usable]
+            error = stars.errors(found.psf, star)[usable]
             error /= np.maximum(found.uncertainty[usable], LEAST_SIGMA)
             wide = error / found.ratio95[usable, None, None]
             bright = brightest(found.psf[usable])
@@ -401,12 +450,14 @@ def with_wings(bundle: Bundle, wings: Wings) -> Bundle:
     return replace(bundle, info=bundle.info.model_copy(update={"config": said}))
 
 
-def misfit(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -> float:
-    """Noise over the flux with which the method finds the flux of bright stars best.
+def with_misfit(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -> Bundle:
+    """The bundle with the noise over the flux with which its method finds that of bright stars.
 
     What the method does not know of a star's shape would pass for flux, if there is little noise
-    beside it. Tried are none and the nodes of the noise.
+    beside it. Tried are none and the nodes of the noise, on stars that no training has seen.
     """
+    if not issubclass(method(bundle.info.method), FindsFlux):
+        return bundle
     nodes, errors = bundle.noise_nodes, []
     some = {name: getattr(stars, name)[:FEW_STARS] for name in ("images", "references", "position")}
     few = replace(stars, **some)
@@ -414,8 +465,6 @@ def misfit(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -> flo
     tried = (0.0, *nodes)
     for value in tried:
         model = PsfModel(replace(bundle, info=bundle.info.model_copy(update={"misfit": value})))
-        if not isinstance(model.engine.estimator, FindsFlux):
-            break
         found = [(model.predict(images), stars.references[star]) for images, star in noisy]
         logs = [
             np.log(np.nanmean(np.square(t.psf / t.flux[:, None, None] - truth)))
@@ -424,7 +473,8 @@ def misfit(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -> flo
         errors.append(float(np.mean(logs)))
         if errors[-1] > min(errors):
             break
-    return float(tried[int(np.argmin(errors))]) if errors else 0.0
+    best = float(tried[int(np.argmin(errors))])
+    return replace(bundle, info=bundle.info.model_copy(update={"misfit": best}))
 
 
 def _noisy(
@@ -468,7 +518,7 @@ def measure_levels(
                 "snr": signal_to_noise(noise, area),
                 "mse_noisy": float(np.square(noisy - stars.references).mean()),
                 **{name: float(values.mean()) for name, values in quality.items()},
-                **crossed_coverage(errors, errors_of(estimate, stars.references), noise),
+                **crossed_coverage(errors, errors_of(estimate, stars), noise),
                 "stars": len(noisy),
             }
         )

@@ -91,15 +91,35 @@ def noisy_test_images(config: OfFit, stars: Product, test: np.ndarray, level: fl
     return np.asarray(noise_model(config).draw(stars["realisation"], level, rng)[test])
 
 
-def own_flux_error(stars: Product, train: np.ndarray) -> np.ndarray:
-    """Error of the flux of stars of a product "stars", over it, by their own noise, (n,).
+def own_noise(
+    stars: Product, images: np.ndarray, train: np.ndarray, background: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """What the own noise of stars of a product "stars" does to images of them, of flux 1.
 
-    That of a filter matched to a typical training star; simulated stars have none.
+    Simulated stars have none.
+
+    Parameters
+    ----------
+    stars : product "stars"
+    images : ndarray, shape (n, d, d)
+    train : ndarray
+        Training images, of which the typical star is.
+    background : float
+        Photons of the sky in a pixel.
+
+    Returns
+    -------
+    flux_error : ndarray, shape (n,)
+        Of a filter matched to the typical star.
+    noise : ndarray, shape (n, d, d)
+        σ of every pixel: of the sky's noise σ and the star's F = √B / σ photons.
     """
-    star = stars["field_index"]
     if not of_image(stars):
-        return np.zeros(len(star))
-    return np.asarray(stars["noise"][star] * np.sqrt(star_area(stars, train)))
+        return np.zeros(len(images)), np.broadcast_to(np.float32(0.0), images.shape)
+    noise = stars["noise"][stars["field_index"]]
+    sigma = noise[:, None, None]
+    square = sigma**2 + np.maximum(images, 0.0) * sigma / np.sqrt(background)
+    return noise * np.sqrt(star_area(stars, train)), np.sqrt(square)
 
 
 def training_set(

@@ -26,12 +26,13 @@ from psfdae.model.report import MEAN_PSF, SHOWN_STARS, Quality, fitted_mean, qua
 from psfdae.model.star_sets import (
     field_positions,
     noisy_test_images,
-    own_flux_error,
+    own_noise,
     split_stars,
     star_area,
     training_set,
 )
 from psfdae.model.stars import REFERENCE, SPLIT, Stars
+from psfdae.splits import Split
 from psfdae.threads import fixed_threads
 
 if TYPE_CHECKING:
@@ -146,27 +147,27 @@ def _measured(model: PsfModel, stars: Stars, methods: Mapping[str, Method]) -> R
 def _found_alone(model: PsfModel, stars: Stars, level: float, noisy: np.ndarray) -> dict[str, Any]:
     """What `predict` makes of held-out stars of flux 1 at λ, of which it is told no more.
 
-    The bright star that is the truth has noise of its own: it counts in errors of flux and centre,
-    and is in UNCERT, which was measured on such stars.
+    The bright star that is the truth has noise of its own, which counts in every error.
     """
     settings, product = stars.settings, stars.product
     parts = split_stars(product, SPLIT, settings)
     train, test = parts.train, parts.test
     star, truth = product["field_index"][test], product[REFERENCE][test]
     position, own = field_positions(product)[test], product["noise"][star]
-    noise, sky = settings.noise.kappa * level, np.sqrt(settings.noise.background_photons)
-    found = model.predict(noisy, position=position, gain=sky / noise)
+    noise, background = settings.noise.kappa * level, settings.noise.background_photons
+    of_flux, of_pixels = own_noise(product, product[REFERENCE], train, background)
+    found = model.predict(noisy, position=position, gain=np.sqrt(background) / noise)
     bright = model.predict(truth, position=position, flux=1.0, background=0.0, noise=own)
     off = np.stack([getattr(found, c) - getattr(bright, c) for c in ("x_fit", "y_fit")])
     doubt = np.stack(
         [np.hypot(getattr(found, c), getattr(bright, c)) for c in ("x_error", "y_error")]
     )
     usable = np.isfinite(found.psf).all(axis=(1, 2)) & (found.flux_error > 0)
-    pull = (found.flux - 1.0) / np.hypot(found.flux_error, own_flux_error(product, train)[test])
+    pull = (found.flux - 1.0) / np.hypot(found.flux_error, of_flux[test])
     held = {
         "flux": np.abs(pull) < 1.0,
         "centre": (np.abs(off) < doubt).mean(axis=0),
-        "psf": (np.abs(found.psf - truth) < found.uncertainty).mean((1, 2)),
+        "psf": _within(found.psf - truth, np.hypot(found.uncertainty, of_pixels[test])),
     }
     bias, bias_error = clustered_mean(found.flux[usable] - 1.0, star[usable])
     row = {
@@ -213,7 +214,7 @@ def _table(rows: Sequence[Mapping[str, Any]], stars: Stars, methods: Mapping[str
     shared = {
         "images": parts.test.size,
         "stars": int(stars.held_out.sum()),
-        "truth_mse": _noise_of_truth(stars, parts.test),
+        "truth_mse": _own_mse(stars, parts),
     }
     found = []
     for level in sorted(settings.noise.levels, reverse=True):  # S/N ascending
@@ -234,15 +235,16 @@ def _table(rows: Sequence[Mapping[str, Any]], stars: Stars, methods: Mapping[str
     return _stacked(found)
 
 
-def _noise_of_truth(stars: Stars, test: np.ndarray) -> float:
-    """Mean variance of the pixels of the stars held out: their own noise, in every MSE.
-
-    Sky noise σ and the star's photons F, F = √B / σ: σ² + p/F with the mean p = 1/P.
-    """
+def _own_mse(stars: Stars, parts: Split) -> float:
+    """Mean variance of the pixels of the stars held out: their own noise, in every MSE."""
     product, sky = stars.product, stars.settings.noise.background_photons
-    noise = product["noise"][product["field_index"][test]]
-    pixels = product["realisation"][0].size
-    return float((noise**2 + noise / np.sqrt(sky) / pixels).mean())
+    _, noise = own_noise(product, product[REFERENCE], parts.train, sky)
+    return float(np.square(noise[parts.test]).mean())
+
+
+def _within(error: np.ndarray, doubt: np.ndarray) -> np.ndarray:
+    """Part of the pixels (n, d, d) of every star whose error is within the stated one, (n,)."""
+    return np.asarray((np.abs(error) < doubt).mean(axis=(1, 2)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,6 +22,7 @@ from torch import nn
 from torch.optim.lr_scheduler import LambdaLR, LRScheduler, OneCycleLR
 
 from psfdae.errors import Error
+from psfdae.files import as_csv, atomic_path
 from psfdae.method import FitError
 from psfdae.networks.weights import load_checkpoint, save_checkpoint
 
@@ -251,9 +252,11 @@ def train(
     report : called with the history's row after each epoch
     restarts : attempts after the first
 
+    While it trains, its history is in `course_of(checkpoint)`, for those who watch.
+
     Raises TrainingError if something is not finite, or if every attempt died.
     """
-    saved = load_checkpoint(checkpoint, fingerprint)
+    saved, course = load_checkpoint(checkpoint, fingerprint), course_of(checkpoint)
     for attempt in range(saved["attempt"] if saved else 0, restarts + 1):
         training = begin(attempt)
         torch.set_num_threads(training.settings.threads)
@@ -264,9 +267,13 @@ def train(
         try:
             while not training.finished():
                 report(training.run_epoch())
+                # No product: it changes all the time.
+                with atomic_path(course, digest=False) as temporary:
+                    temporary.write_text(as_csv(training.history), encoding="utf-8")
                 if time.monotonic() - last_saved >= training.settings.checkpoint_seconds:
                     save_checkpoint(checkpoint, fingerprint, training.state())
                     last_saved = time.monotonic()
+            course.unlink(missing_ok=True)
             return training
         except DeadNetworkError as death:
             print(f"attempt {attempt}: {death}; starting from another seed", flush=True)
@@ -274,6 +281,11 @@ def train(
         f"the network died in all {restarts + 1} attempts: "
         f"lower {training.key}.lr = {training.settings.lr}"
     )
+
+
+def course_of(checkpoint: Path) -> Path:
+    """Where the history of a training under way is, beside its checkpoint."""
+    return checkpoint.with_suffix(".csv")
 
 
 def fingerprint(deciding: Mapping[str, Any], *arrays: np.ndarray) -> str:
