@@ -37,6 +37,8 @@ NEAR_PX = 6  # of the brightest pixel from the list
 FARTHEST = 3  # px of a star's centre from the frame's middle, at the start
 ROUNDS = 30  # of Gauss-Newton steps
 STEP = 0.5  # px, at most
+TESTED, DRAWS = 500, 4  # stars whose stated errors are tested, and images of each
+FAINT_SNR = (5.0, 10.0, 20.0, 50.0)
 LANCZOS = 4  # of the interpolation of sampled PSFs
 
 
@@ -155,6 +157,49 @@ def places(
     pd.DataFrame(rows).to_csv(out, index=False, float_format="%.6g")
 
 
+@command("errors")
+def errors(
+    truth: Annotated[File, {"argument": True}, "NPZ of `field`."],
+    selection: Annotated[File, "selection.csv of from-stars on a part of its list."],
+    bundle: Annotated[File, "Its model, of the method field."],
+    out: Annotated[File, "CSV with the parts of the errors that are within the stated ones."],
+) -> None:
+    """Do the stated errors hold, for stars that from-stars was not given?
+
+    They are drawn anew with noise of S/N 5 to 50. A model is told of each star where it stands.
+    """
+    from psfdae.metrics import clustered_mean
+    from psfdae.model.psf_model import load_model
+
+    model, known, rows = load_model(bundle), np.load(truth), []
+    given, place = read_table(selection)[["x", "y"]].to_numpy(), known["pixel"]
+    fresh = np.abs(place[:, None] - given).max(axis=2).min(axis=1) > PITCH / 2
+    star, side = np.repeat(np.flatnonzero(fresh)[:TESTED], DRAWS), model.info.stamp_px
+    image = np.stack([_framed(psf, side) for psf in known["psf"][star].astype(float)])
+    area, rng = 1.0 / np.square(image).sum(axis=(1, 2)), stream(0, "simulated sky", "errors")
+    for snr in FAINT_SNR:
+        light = snr * np.sqrt(SKY * area)[:, None, None]
+        stamps = rng.poisson(SKY + light * image).astype(float) - SKY
+        found = model.predict(stamps, position=place[star], gain=np.ones(len(star)))
+        total = (light * image).sum(axis=(1, 2))
+        held = {
+            "flux": np.abs(found.flux - total) < found.flux_error,
+            "psf": (np.abs(found.psf - light * image) < found.uncertainty).mean(axis=(1, 2)),
+        }
+        row = {"snr": snr, "stars": len(np.unique(star)), "images": len(star)}
+        row["pull"] = np.quantile(np.abs(found.flux - total) / found.flux_error, 0.6827)
+        for name, of in held.items():
+            row[name], row[f"{name}_stderr"] = clustered_mean(of.astype(float), star)
+        rows.append(row | {"date": date.today().isoformat(), "commit": git_commit()})
+    pd.DataFrame(rows).to_csv(out, index=False, float_format="%.6g")
+
+
+def _framed(psf, side):
+    """The stamp (d, d) of a star, brightest pixel at (d/2, d/2)."""
+    row, column = np.divmod(psf.argmax(), SIDE)
+    return _cut(np.pad(psf, side), np.array([[column, row]]) + side, side)[0]
+
+
 def _cut(image, pixel, side):
     """Stamps (n, d, d) whose pixel (d/2, d/2) is a pixel (n, 2), x and y, of an image."""
     x, y = (pixel.T[..., None] - side // 2) + np.arange(side)
@@ -224,4 +269,4 @@ def _fitted(draw, stamps):
 
 
 if __name__ == "__main__":
-    program(field, places)
+    program(field, places, errors)
