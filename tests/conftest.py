@@ -91,6 +91,7 @@ def smoke(tmp_path_factory, worker_id):
 def built(folder):
     folder.mkdir(exist_ok=True)
     snakemake(folder)
+    assert (folder / "results/runtime.csv").is_file()
     (folder / FINISHED).touch()
     return folder
 
