@@ -145,7 +145,7 @@ def _measured(model: PsfModel, stars: Stars, methods: Mapping[str, Method]) -> R
 
 
 def _found_alone(model: PsfModel, stars: Stars, level: float, noisy: np.ndarray) -> dict[str, Any]:
-    """What `predict` makes of held-out stars of flux 1 at λ, of which it is told no more.
+    """What `predict` makes of held-out stars of flux 1 at λ, given nothing but their places.
 
     The bright star that is the truth has noise of its own, which counts in every error.
     """
