@@ -12,7 +12,8 @@ Of a telescope that is known::
     found = psfdae.wavefront(stamps, "telescope.yaml", field_deg=field, joint=True)
 
 `load_model` gives a trained model; its methods `predict` and `psf_at` give PSFs. No call writes a
-file unless it is named for that, prints, or changes threads or random generators of the process.
+file unless it is named for that, or changes threads or random generators of the process; fits of
+mixtures and networks print their progress.
 Refusals are of the class `Error`.
 """
 
