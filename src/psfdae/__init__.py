@@ -13,8 +13,7 @@ Of a telescope that is known::
 
 `load_model` gives a trained model; its methods `predict` and `psf_at` give PSFs. No call writes a
 file unless it is named for that, or changes threads or random generators of the process; fits of
-mixtures and networks print their progress.
-Refusals are of the class `Error`.
+mixtures and networks print their progress. Refusals are of the class `Error`.
 """
 
 from __future__ import annotations
