@@ -12,6 +12,7 @@ PROGRAM = """
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 import psfdae
 
@@ -20,8 +21,8 @@ psfdae.Stars.from_image(np.zeros((9, 9)), catalogue={"x_fit": [1.0], "y_fit": [2
 model = psfdae.fit(stars, method="field", orders=[0, 1])
 model.save(Path("image.psf.safetensors"))
 report = psfdae.validate(psfdae.load_model("image.psf.safetensors"), stars)
-images: np.ndarray = model.psf_at([1.0, 2.0], np.arange(2), oversampling=2)
-seen: np.ndarray = model.predict(np.zeros((3, 16, 16)), noise=1.0).psf
+images: NDArray[np.float64] = model.psf_at([1.0, 2.0], np.arange(2), oversampling=2)
+seen: NDArray[np.float64] = model.predict(np.zeros((3, 16, 16)), noise=1.0).psf
 flag: psfdae.StarFlag = psfdae.StarFlag.FAINT
 
 psfdae.Stars.from_image("image.fits", detect="5")  # wrong: arg-type
