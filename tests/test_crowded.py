@@ -160,6 +160,10 @@ def test_a_model_knows_the_light_beyond_its_stamps(sky, found):
     # Without a place, a star has the wings of a usual one.
     unplaced = model.predict(stamps.data[:20], margin=2)
     assert unplaced.flux_total / unplaced.flux == pytest.approx(1 + light)
+    assert run("psf", path, "--grid", "2x2", "--out", folder / "g.fits").exit_code == 0
+    header = fits.getheader(folder / "g.fits")
+    assert header["FLUXRAD"] == 2.5 * STAMP
+    assert header["INMODEL"] == pytest.approx(1 / (1 + light))
     assert model.aperture_correction(250, 250, 4.0) == pytest.approx(
         found.aperture_correction(250, 250, 4.0), rel=0.006
     )
@@ -172,6 +176,8 @@ def test_a_model_knows_the_light_beyond_its_stamps(sky, found):
         {"profile": [1.0]},
         {"profile": [9e9] * TENTS},
         {"radius_px": 3},
+        {"profile": [10**400] * TENTS},
+        {"covariance": (-np.eye(TENTS)).tolist()},
         {"outer": []},
     ],
 )

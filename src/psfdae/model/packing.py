@@ -85,7 +85,10 @@ class HeldOutStars:
     own_noise: np.ndarray
 
     def errors(self, psf: np.ndarray, star: np.ndarray | slice = slice(None)) -> np.ndarray:
-        """Moduli of the errors of PSFs of some stars, less what is the stars' own noise."""
+        """Moduli of the errors of PSFs of some stars, less the stars' own noise, at least 0.
+
+        Quantiles above the own noise are those of errors to noise-free stars; means are larger.
+        """
         square = np.square(psf - self.references[star]) - np.square(self.own_noise[star])
         return np.asarray(np.sqrt(np.maximum(square, 0.0)))
 

@@ -118,9 +118,9 @@ def _measured(model: PsfModel, stars: Stars, methods: Mapping[str, Method]) -> R
     position = field_positions(product)[parts.test]
     data_range = settings.evaluation.data_range
     key = {"dataset": stars.name, "split": SPLIT, "reference": REFERENCE}
-    rows, per_star, restored, measured_rows = [], [], {}, []
+    rows, per_star, restored, degraded = [], [], {}, {}
     for level in settings.noise.levels:
-        noisy = noisy_test_images(settings, product, parts.test, level)
+        noisy = degraded[level] = noisy_test_images(settings, product, parts.test, level)
         mean = fitted_mean(noisy, stars.mean_psf, settings.framing.jitter_px + 1.0)
         row = {**key, "method": MEAN_PSF, "noise_level": level}
         beside = summarised(row, all_metrics(mean, truth, data_range), field)
@@ -135,56 +135,58 @@ def _measured(model: PsfModel, stars: Stars, methods: Mapping[str, Method]) -> R
             if own:
                 restored[level] = {"truth": truth, "model": estimate.psf, MEAN_PSF: mean}
         rows += beside
-        measured_rows.append(_found_alone(model, stars, level, noisy))
     measured = [row for row in rows if row["method"] != MEAN_PSF]
     table = _table(rows, stars, methods)
-    found = _stacked(measured_rows[::-1])  # S/N ascending
+    found = _found(model, stars, degraded)
     return Report(
         model, stars, methods, table, _stacked(measured), _joined(per_star), found, restored
     )
 
 
-def _found_alone(model: PsfModel, stars: Stars, level: float, noisy: np.ndarray) -> dict[str, Any]:
-    """What `predict` makes of held-out stars of flux 1 at λ, given nothing but their places.
+def _found(model: PsfModel, stars: Stars, degraded: Mapping[float, np.ndarray]) -> Table:
+    """What `predict` makes of held-out stars of flux 1 at each λ, given only their places.
 
     The bright star that is the truth has noise of its own, which counts in every error.
     """
     settings, product = stars.settings, stars.product
-    parts = split_stars(product, SPLIT, settings)
-    train, test = parts.train, parts.test
+    parts, background = split_stars(product, SPLIT, settings), settings.noise.background_photons
+    test, area = parts.test, star_area(product, parts.train)
     star, truth = product["field_index"][test], product[REFERENCE][test]
-    position, own = field_positions(product)[test], product["noise"][star]
-    noise, background = settings.noise.kappa * level, settings.noise.background_photons
-    of_flux, of_pixels = own_noise(product, product[REFERENCE], train, background)
-    found = model.predict(noisy, position=position, gain=np.sqrt(background) / noise)
-    bright = model.predict(truth, position=position, flux=1.0, background=0.0, noise=own)
-    off = np.stack([getattr(found, c) - getattr(bright, c) for c in ("x_fit", "y_fit")])
-    doubt = np.stack(
-        [np.hypot(getattr(found, c), getattr(bright, c)) for c in ("x_error", "y_error")]
-    )
-    usable = np.isfinite(found.psf).all(axis=(1, 2)) & (found.flux_error > 0)
-    pull = (found.flux - 1.0) / np.hypot(found.flux_error, of_flux[test])
-    held = {
-        "flux": np.abs(pull) < 1.0,
-        "centre": (np.abs(off) < doubt).mean(axis=0),
-        "psf": _within(found.psf - truth, np.hypot(found.uncertainty, of_pixels[test])),
-    }
-    bias, bias_error = clustered_mean(found.flux[usable] - 1.0, star[usable])
-    row = {
-        "snr": signal_to_noise(noise, star_area(product, train)),
-        "lost": float(1.0 - usable.mean()),
-        "flux_bias": bias,
-        "flux_bias_stderr": bias_error,
-        "flux_pull": float(np.quantile(np.abs(pull[usable]), COVERAGE)),
-        "centre_rms_px": float(np.sqrt(np.square(off[:, usable]).sum(axis=0).mean())),
-    }
-    for name, of in held.items():
-        part, error = clustered_mean(of[usable].astype(float), star[usable])
-        known = name != "centre" or np.isfinite(off[:, usable]).all()
-        row[f"{name}_within"], row[f"{name}_within_stderr"] = (
-            (part, error) if known else (np.nan, np.nan)
-        )
-    return row
+    own = own_noise(product, product[REFERENCE], parts.train, background)
+    of_flux, of_pixels = (of_all[test] for of_all in own)
+    given = {"position": field_positions(product)[test]}
+    bright = model.predict(truth, flux=1.0, background=0.0, noise=product["noise"][star], **given)
+    rows = []
+    for level in sorted(degraded, reverse=True):  # S/N ascending
+        noise = settings.noise.kappa * level
+        found = model.predict(degraded[level], gain=np.sqrt(background) / noise, **given)
+        usable = np.isfinite(found.psf).all(axis=(1, 2)) & (found.flux_error > 0)
+        row = {"snr": signal_to_noise(noise, area), "lost": float(1.0 - usable.mean())}
+        off = np.stack([getattr(found, c) - getattr(bright, c) for c in ("x_fit", "y_fit")])
+        errors = ("x_error", "y_error")
+        doubt = np.stack([np.hypot(getattr(found, c), getattr(bright, c)) for c in errors])
+        pull = np.abs(found.flux - 1.0) / np.hypot(found.flux_error, of_flux)
+        row["flux_bias"], row["flux_bias_stderr"] = _mean(found.flux - 1.0, star, usable)
+        row["flux_pull"] = float(np.quantile(pull[usable], COVERAGE)) if usable.any() else np.nan
+        row["centre_rms_px"] = _mean(np.square(off).sum(axis=0), star, usable)[0] ** 0.5
+        inside = np.abs(found.psf - truth) < np.hypot(found.uncertainty, of_pixels)
+        measured = np.isfinite(off).all(axis=0)
+        held = {
+            "flux": np.where(usable, pull < 1.0, np.nan),
+            "centre": np.where(measured, (np.abs(off) < doubt).mean(axis=0), np.nan),
+            "psf": inside.mean(axis=(1, 2)),
+        }
+        for name, part in held.items():
+            row[f"{name}_within"], row[f"{name}_within_stderr"] = _mean(part, star, usable)
+        rows.append(row)
+    return _stacked(rows)
+
+
+def _mean(values: np.ndarray, star: np.ndarray, usable: np.ndarray) -> tuple[float, float]:
+    """Mean of some images (n,) and its standard error, clustered by star; NaN of none."""
+    if not usable.any():
+        return np.nan, np.nan
+    return clustered_mean(values[usable], star[usable])
 
 
 def _stacked(rows: Sequence[Mapping[str, object]]) -> Table:
@@ -240,11 +242,6 @@ def _own_mse(stars: Stars, parts: Split) -> float:
     product, sky = stars.product, stars.settings.noise.background_photons
     _, noise = own_noise(product, product[REFERENCE], parts.train, sky)
     return float(np.square(noise[parts.test]).mean())
-
-
-def _within(error: np.ndarray, doubt: np.ndarray) -> np.ndarray:
-    """Part of the pixels (n, d, d) of every star whose error is within the stated one, (n,)."""
-    return np.asarray((np.abs(error) < doubt).mean(axis=(1, 2)))
 
 
 @dataclass(frozen=True, eq=False)

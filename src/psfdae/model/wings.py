@@ -72,15 +72,17 @@ class Wings:
         try:
             arrays = {name: np.array(plain[name], dtype=np.float64) for name in names}
             found = cls(**arrays, outer=float(plain["outer"]))
-        except (TypeError, LookupError) as error:
+        except (TypeError, LookupError, ArithmeticError) as error:
             raise ValueError(f"wings without {error}") from None
         radius, count = found.radius_px, found.profile.size
         shapes = [a.shape for a in (found.profile, radius, found.covariance)]
         if shapes != [(count,), (count + 1,), (count, count)]:
             raise ValueError("wings whose numbers do not fit together")
         rising = radius[0] > 0 and (np.diff(radius) > 0).all() and radius[-1] < MOST_RADIUS_PX
-        light = found.light() if rising and found.outer > 0 else (np.nan, np.nan)
-        if not (0.0 <= light[0] < MOST_LIGHT and np.isfinite(light[1])):
+        with np.errstate(all="ignore"):
+            light, doubt = found.light() if rising else (np.nan, np.nan)
+        scale = 0.0 < found.outer < np.inf
+        if not (scale and 0.0 <= light < MOST_LIGHT and np.isfinite(doubt)):
             raise ValueError("wings whose light is no part of that of a star")
         return found
 

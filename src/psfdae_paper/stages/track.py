@@ -312,6 +312,7 @@ def _log_data(client: MlflowClient, run_id: str, record: Run) -> dict[str, str]:
 
 
 def tags_of(record: Run) -> dict[str, str]:
+    """Tags of a run in MLflow, but for those of the whole import."""
     own = {key: getattr(record, key) for key in SLOT if key != "preset"}
     own |= record.tags
     return {**own, "config_hash": record.config_hash, "superseded": "false"}
@@ -330,6 +331,7 @@ def ours_to_explain(error: Exception) -> bool:
 
 
 def first_line(error: Exception) -> str:
+    """What an error says, without what follows."""
     return str(error).strip().split("\n", 1)[0]
 
 
