@@ -242,7 +242,7 @@ def coverage(
         bundle = read_bundle(path)
         own = (p for p in products if p.config == bundle.info.config["stars"])
         product = next(own, None) or refuse(path, stars)
-        rows += covered(bundle, product, stream(config.seed, "coverage", bundle.info.name))
+        rows += covered(bundle, product, config.seed)
     write(out, rows)
 
 
@@ -251,30 +251,33 @@ def refuse(bundle, stars):
     raise ConfigError(f"{bundle}: was trained on other stars than {', '.join(map(str, stars))}")
 
 
-def covered(bundle, product, rng):
+def covered(bundle, product, seed):
     """Rows of a bundle: noise level, S/N, brightness, and part of the pixels that is covered."""
     from psfdae.model import packing
     from psfdae.model.bundle import brightest, estimator
     from psfdae.model.psf_model import PsfModel
 
     trained, fitted = bundle.info.config["train"], estimator(bundle)
-    said = part(("seed", "noise", "parts"), trained)
+    said, rng = (
+        part(("seed", "noise", "parts"), trained),
+        stream(seed, "coverage", bundle.info.name),
+    )
     noise, reference = (
         star_sets.noise_model(said),
         bundle.info.reference or trained.get("reference"),
     )
-    test = star_sets.split_stars(product, trained["split"], said).test
+    split = star_sets.split_stars(product, trained["split"], said)
+    test = split.test
     # Images of one star of an image are of one half.
     star = product["field_index"][test] if trained["split"] == "held_out" else test
     odd = np.unique(star, return_inverse=True)[1] % 2 == 1
-    columns = product["realisation"], product[reference], star_sets.field_positions(product)
     halves = [
-        packing.HeldOutStars(*(c[test[half]] for c in columns[:2]), noise, columns[2][test[half]])
+        packing.HeldOutStars.of(product, reference, noise, split.train, test[half])
         for half in (odd, ~odd)
     ]
     found = {}
     for judges, judged in (halves, halves[::-1]):
-        model = packing.calibrated(bundle, fitted, judges, rng)[0]
+        model = packing.calibrated(bundle, fitted, judges, seed)[0]
         for tested in bundle.info.metrics:
             level = tested["noise_level"]
             flux = float(noise.flux(level))

@@ -84,6 +84,17 @@ class HeldOutStars:
     flux_error: np.ndarray
     own_noise: np.ndarray
 
+    @classmethod
+    def of(
+        cls, stars: Product, reference: str, noise: NoiseModel, train: np.ndarray, test: np.ndarray
+    ) -> HeldOutStars:
+        """Some stars of a product "stars", by their indices and those of the training stars."""
+        truth = stars[reference]
+        doubts = own_noise(stars, truth, train, noise.background)
+        arrays = (stars["realisation"], truth, field_positions(stars), *doubts)
+        images, references, position, *of_test = (array[test] for array in arrays)
+        return cls(images, references, noise, position, *of_test)
+
     def errors(self, psf: np.ndarray, star: np.ndarray | slice = slice(None)) -> np.ndarray:
         """Moduli of the errors of PSFs of some stars, less the stars' own noise, at least 0.
 
@@ -177,10 +188,7 @@ class StarFacts:
             "training_stars": _trained_on(stars, parts.train),
             "config": {"stars": stars.config, "train": dict(trained)},
         }
-        own = own_noise(stars, references, parts.train, noise.background)
-        arrays = (images, references, field_positions(stars), *own)
-        test, truth, place, *doubts = (array[parts.test] for array in arrays)
-        held_out = HeldOutStars(test, truth, noise, place, *doubts)
+        held_out = HeldOutStars.of(stars, reference, noise, parts.train, parts.test)
         model = leading(FluxModel.fit(images[parts.train]), COMPONENTS)
         return cls(info, model, held_out, levels, config.seed)
 
