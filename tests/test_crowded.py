@@ -183,8 +183,8 @@ def test_a_model_knows_the_light_beyond_its_stamps(sky, found):
 )
 def test_damaged_wings_are_refused(sky, changed):
     bundle = load_model(sky[1]).bundle
-    stars = bundle.info.config["stars"]
-    config = bundle.info.config | {"stars": stars | {"wings": stars["wings"] | changed}}
+    said = bundle.info.config
+    config = said | {"wings": said["wings"] | changed}
     damaged = replace(bundle, info=bundle.info.model_copy(update={"config": config}))
     with pytest.raises(BundleError, match=r"damaged .*wings"):
         PsfModel(damaged)

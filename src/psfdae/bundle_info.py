@@ -100,7 +100,7 @@ class BundleInfo(_Described):
     misfit: Annotated[float, Field(ge=0, allow_inf_nan=False)] = Field(
         0.0, description="what the method takes for noise besides where it finds the flux"
     )
-    config: dict[str, Any] = Field(description="resolved configuration of all stages")
+    config: dict[str, Any] = Field(description="resolved configuration of all stages; wings")
     metrics: list[dict[str, float]] = Field(description="errors of the test stars by noise level")
 
     @model_validator(mode="after")

@@ -95,8 +95,7 @@ class Bundle:
     @property
     def wings(self) -> Wings | None:
         """Light of stars beyond the stamps, if the bundle says any; BundleError if damaged."""
-        stars = self.info.config.get("stars")
-        said = stars.get("wings") if isinstance(stars, dict) else None
+        said = self.info.config.get("wings")
         try:
             return None if said is None else Wings.of_plain(said)
         except ValueError as error:

@@ -456,9 +456,9 @@ def with_scales(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -
 
 def with_wings(bundle: Bundle, wings: Wings) -> Bundle:
     """The bundle of a field model with the light of stars beyond their stamps."""
-    config = bundle.info.config
-    said = config | {"stars": config["stars"] | {"wings": wings.plain()}}
-    return replace(bundle, info=bundle.info.model_copy(update={"config": said}))
+    info = bundle.info
+    said = info.config | {"wings": wings.plain()}
+    return replace(bundle, info=info.model_copy(update={"config": said}))
 
 
 def with_misfit(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -> Bundle:
