@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 
 from psfdae import PsfModel, Stars, load_model
 from psfdae.cli import main
+from psfdae.files import read_product
 from psfdae.image.observation import Source, cut_image
 from psfdae.model import crowded
 from psfdae.model.bundle import BundleError
@@ -167,6 +168,13 @@ def test_a_model_knows_the_light_beyond_its_stamps(sky, found):
     assert model.aperture_correction(250, 250, 4.0) == pytest.approx(
         found.aperture_correction(250, 250, 4.0), rel=0.006
     )
+
+
+def test_a_bundle_says_of_which_stars_it_is(sky):
+    """Wings are found in the image, and are no settings of the stars."""
+    folder, path, _ = sky
+    stars = read_product(folder / "model/stars.h5", "stars")
+    assert load_model(path).info.config["stars"] == stars.config
 
 
 @pytest.mark.parametrize(
