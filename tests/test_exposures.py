@@ -53,7 +53,7 @@ def run(*words):
 def sky(tmp_path_factory):
     """A model of an exposure with 300 stars, and another exposure with 10, of 4 % larger PSFs."""
     folder = tmp_path_factory.mktemp("exposures")
-    simulated(folder, "rich", 1, 300, 1.0)
+    simulated(folder, "rich", 1, 300, 1.0, INSTRUME="CAM ", FILTER="R")
     few = ("framing.stamp_px=10", "parts.train_stars=150", "parts.test_stars=30")
     words = ("--catalogue", folder / "rich.csv", "--out", folder / "m", "--method", "field")
     done = run("from-stars", folder / "rich.fits", *words, "methods=[noisy,field]", *few)
@@ -61,7 +61,7 @@ def sky(tmp_path_factory):
     return (
         folder,
         load_model(folder / "m/rich.psf.safetensors"),
-        simulated(folder, "sparse", 2, 10, 1.04),
+        simulated(folder, "sparse", 2, 10, 1.04, INSTRUME="Cam", FILTER="V"),
     )
 
 
@@ -102,6 +102,17 @@ def test_only_field_and_list_change_and_provenance_is_said(sky):
     assert adapted.sha256 != model.sha256 and adapted.name == "sparse"
     again, _ = exposure(model, sparse, "sparse")
     assert again.sha256 == adapted.sha256
+
+
+def test_another_filter_is_said_and_the_same_is_not(sky):
+    folder, model, sparse = sky
+    assert model.info.config["stars"]["instrument"] == {"INSTRUME": "CAM", "FILTER": "R"}
+    adapted, said = exposure(model, sparse, "sparse")
+    assert said.endswith("(FILTER is 'V', the model 'rich' was trained on 'R')")
+    assert not adapted.other_instrument({"FILTER": "v", "TELESCOP": "another"})
+    of = (folder / "sparse.fits", "--catalogue", folder / "sparse.csv")
+    words = (*of, "--model", folder / "m/rich.psf.safetensors", "--out", folder / "v.fits")
+    assert "sparse.fits: FILTER is 'V', the model 'rich'" in run("predict", *words).output
 
 
 def test_the_command_writes_a_model_that_predict_takes(sky):

@@ -213,7 +213,9 @@ def restored(
     flagged = zip(StarFlag, counts, strict=True)
     flags = "".join(f"\n  {flag.name}: {count}" for flag, count in flagged if count)
     clean_of = f"{out}: {observation.count} stars, {clean} without a flag{flags}"
-    return "\n".join([observation.said(), *([off] if off else []), clean_of])
+    other = loaded.other_instrument(observation.instrument)
+    unlike = f"{source.path}: {other}" if other else None
+    return "\n".join(line for line in (observation.said(), off, unlike, clean_of) if line)
 
 
 def check_targets(out: Path, plot: Path | None, found: Path | None, overwrite: bool) -> None:

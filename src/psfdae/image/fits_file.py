@@ -76,6 +76,7 @@ LENS_KEYS = ("XPIXSZ", "FOCALLEN")  # micrometres and millimetres, of amateurs' 
 PROVENANCE_KEYS: tuple[str, ...] = ("OBJECT", "TELESCOP", "INSTRUME", "OBSERVER", "FILTER")
 PROVENANCE_KEYS += ("DATE-OBS", "MJD-OBS", "EXPTIME", "AIRMASS")
 
+INSTRUMENT_KEYS: tuple[str, ...] = ("TELESCOP", "INSTRUME", "FILTER")  # with which PSFs change
 Card = tuple[str, str | float | None, str]  # key, value and comment
 Said = tuple[float | None, str]  # a number, and the card that says it; or None, and words for that
 

@@ -25,6 +25,7 @@ from psfdae.image.catalogue import Catalogue, Positions, as_catalogue
 from psfdae.image.detection import Sky, sky_of
 from psfdae.image.errors import ObservationError, reading, shorten
 from psfdae.image.fits_file import (
+    INSTRUMENT_KEYS,
     READ_NOISE_KEYS,
     SATURATION_KEYS,
     Card,
@@ -446,6 +447,11 @@ class Observation:
     @property
     def pixel_scale_arcsec(self) -> float | None:
         return self.camera["pixel scale"][0]
+
+    @property
+    def instrument(self) -> dict[str, str]:
+        """Telescope, camera and filter, by the key of the header that names them."""
+        return {key: str(value) for key, value, _ in self.header_cards if key in INSTRUMENT_KEYS}
 
     @property
     def gain(self) -> float | None:

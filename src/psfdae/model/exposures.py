@@ -39,7 +39,7 @@ def exposure(model: PsfModel, source: Source, name: str) -> tuple[PsfModel, str]
     -------
     model : PsfModel
     said : str
-        How many stars it rests on.
+        How many stars it rests on, and whether it is of another telescope, camera or filter.
 
     Raises
     ------
@@ -69,6 +69,7 @@ def exposure(model: PsfModel, source: Source, name: str) -> tuple[PsfModel, str]
     if observation.shape is None:
         raise PredictionError(f"{observation.path}: a cube of stamps; expected an image")
     model.check_scale(observation.pixel_scale_arcsec, str(observation.path))
+    other = model.other_instrument(observation.instrument)
     bright = collect(observation, wanted, settings.framing).bright
     if not np.isfinite(bright.position).all():
         raise PredictionError(f"{observation.path}: positions of bright stars are not known")
@@ -79,6 +80,7 @@ def exposure(model: PsfModel, source: Source, name: str) -> tuple[PsfModel, str]
         "image": observation.path.name,
         "image_sha256": observation.sha256(),
         "image_px": [*reversed(observation.shape)],
+        "instrument": observation.instrument,
         "adapted": {"from": model.sha256, "stars": len(bright)},
     }
     described = info.model_copy(
@@ -91,7 +93,7 @@ def exposure(model: PsfModel, source: Source, name: str) -> tuple[PsfModel, str]
     )
     bundle = replace(model.bundle, info=described, weights={**model.bundle.weights, **changed})
     said = f"{len(bright)} stars of {observation.path.name} change the field of {model.name}"
-    return PsfModel(bundle), said
+    return PsfModel(bundle), f"{said} ({other})" if other else said
 
 
 CHANGED = ("coefficients", "listed")

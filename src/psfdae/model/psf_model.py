@@ -275,6 +275,32 @@ class PsfModel(FieldPsfs):
         size = self.info.config.get("stars", {}).get("image_px")
         return None if size is None else (size[0], size[1])
 
+    def other_instrument(self, instrument: Mapping[str, str]) -> str:
+        """In words, what of another image's telescope, camera and filter is not the training's.
+
+        Parameters
+        ----------
+        instrument : mapping
+            By the key of the header, as `Observation.instrument`.
+
+        Returns
+        -------
+        said : str
+            Empty if all that both headers name is the same.
+        """
+        stars = self.info.config.get("stars")
+        known = stars.get("instrument") if isinstance(stars, Mapping) else None
+        pairs = [
+            (key, instrument[key].strip(), str(value).strip())
+            for key, value in (known.items() if isinstance(known, Mapping) else ())
+            if key in instrument
+        ]
+        return "; ".join(
+            f"{key} is {here!r}, the model {self.name!r} was trained on {there!r}"
+            for key, here, there in pairs
+            if here.casefold() != there.casefold()
+        )
+
     def field_range(self) -> tuple[np.ndarray, np.ndarray]:
         """Least and greatest position (x, y) of the training stars; raises as `psf_at`."""
         self._field()

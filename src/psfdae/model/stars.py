@@ -244,6 +244,7 @@ class Stars:
         kept = self.settings.model_dump(include={"seed", "calibration_stars", "framing", "parts"})
         scale = {"pixel_scale_arcsec": observation.pixel_scale_arcsec}
         size = {"image_px": [*reversed(observation.shape)]} if observation.shape else {}
+        taken_with = {"instrument": observation.instrument} if observation.instrument else {}
         assumed = {"assumed": True} if observation.scale_assumed else {}
         said = {
             **kept,
@@ -251,6 +252,7 @@ class Stars:
             "image": observation.path.name,
             "image_sha256": observation.sha256(),
             **size,
+            **taken_with,
             "telescope": {**scale, **assumed},
         }
         plain: dict[str, Any] = json.loads(json.dumps(said))
