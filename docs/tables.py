@@ -21,6 +21,7 @@ import json
 import re
 import sys
 from functools import cache
+from math import fsum
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -437,7 +438,8 @@ def mae():
     for level in table.index.levels[0]:
         paper = csv(f"tables/alignment_paper_{level}.csv")
         for row in paper.query("source == 'paper' and quantity == 'mean'").to_dict("records"):
-            table.loc[(level, row["method"]), "paper"] = sum(row[s] for s in STATES) / len(STATES)
+            mean = fsum(row[s] for s in STATES) / len(STATES)  # sum() rounds by Python's version
+            table.loc[(level, row["method"]), "paper"] = mean
         table.loc[level, "bound"] = table.loc[(level, "cramer_rao"), "mean"]
     order = pd.MultiIndex.from_product([table.index.levels[0], ALIGNERS], names=table.index.names)
     return table.reindex(order.intersection(table.index, sort=False)).reset_index()
