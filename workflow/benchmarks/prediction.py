@@ -258,14 +258,9 @@ def covered(bundle, product, seed):
     from psfdae.model.psf_model import PsfModel
 
     trained, fitted = bundle.info.config["train"], estimator(bundle)
-    said, rng = (
-        part(("seed", "noise", "parts"), trained),
-        stream(seed, "coverage", bundle.info.name),
-    )
-    noise, reference = (
-        star_sets.noise_model(said),
-        bundle.info.reference or trained.get("reference"),
-    )
+    said = part(("seed", "noise", "parts"), trained)
+    noise, rng = star_sets.noise_model(said), stream(seed, "coverage", bundle.info.name)
+    reference = bundle.info.reference or trained.get("reference")
     split = star_sets.split_stars(product, trained["split"], said)
     test = split.test
     # Images of one star of an image are of one half.
@@ -284,7 +279,8 @@ def covered(bundle, product, seed):
             stamps = rng.poisson(flux * judged.images + noise.background).astype(np.float32)
             told = PsfModel(model).predict(stamps, gain=1.0, position=judged.position)
             kept = np.isfinite(told.psf).all(axis=(1, 2))
-            error = np.abs(told.psf - flux * judged.references)[kept] / told.uncertainty[kept]
+            # As the calibration has it: the own noise of stars of an image is no error.
+            error = flux * judged.errors(told.psf / flux)[kept] / told.uncertainty[kept]
             bright = brightest(told.psf[kept])
             ratios = told.ratio95_bright, told.ratio95
             for name, pixels, ratio in zip(BRIGHTNESS, (bright, ~bright), ratios, strict=True):

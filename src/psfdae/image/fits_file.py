@@ -75,8 +75,8 @@ LENS_KEYS = ("XPIXSZ", "FOCALLEN")  # micrometres and millimetres, of amateurs' 
 # Where stamps come from, copied to whatever is made of them.
 PROVENANCE_KEYS: tuple[str, ...] = ("OBJECT", "TELESCOP", "INSTRUME", "OBSERVER", "FILTER")
 PROVENANCE_KEYS += ("DATE-OBS", "MJD-OBS", "EXPTIME", "AIRMASS")
+INSTRUMENT_KEYS = ("TELESCOP", "INSTRUME", "FILTER")  # of these, with which PSFs change
 
-INSTRUMENT_KEYS: tuple[str, ...] = ("TELESCOP", "INSTRUME", "FILTER")  # with which PSFs change
 Card = tuple[str, str | float | None, str]  # key, value and comment
 Said = tuple[float | None, str]  # a number, and the card that says it; or None, and words for that
 

@@ -290,15 +290,11 @@ class PsfModel(FieldPsfs):
         """
         stars = self.info.config.get("stars")
         known = stars.get("instrument") if isinstance(stars, Mapping) else None
-        pairs = [
-            (key, instrument[key].strip(), str(value).strip())
+        return "; ".join(
+            f"{key} is {instrument[key]!r}, the model {self.name!r} was trained on {value!r}"
             for key, value in (known.items() if isinstance(known, Mapping) else ())
             if key in instrument
-        ]
-        return "; ".join(
-            f"{key} is {here!r}, the model {self.name!r} was trained on {there!r}"
-            for key, here, there in pairs
-            if here.casefold() != there.casefold()
+            and instrument[key].strip().casefold() != str(value).strip().casefold()
         )
 
     def field_range(self) -> tuple[np.ndarray, np.ndarray]:
