@@ -256,7 +256,7 @@ def test_outlier_score_has_the_law_of_chi2_and_tells_blends(chosen, snr):
 
 
 def test_flux_and_sky_that_are_known_are_taken(field):
-    some = Faint(300, 5.0)
+    some = Faint(300, 20.0)
     known = some.measured(field, flux=np.full(300, 1000.0), sky=np.full(300, 3.0))
     assert some.mse(known) < some.mse(some.measured(field))
     assert known.measured.flux == pytest.approx(1000, rel=0.02)
@@ -279,7 +279,7 @@ def test_stars_are_restored_in_groups_that_do_not_matter(field, monkeypatch):
     each = [Faint(40, snr) for snr in (5.0, 50.0, 500.0, 5000.0)]
     told = [np.concatenate([getattr(some, n) for some in each]) for n in ("stamps", "sigma")]
     whole = field.measure(*told)
-    monkeypatch.setattr("psfdae.field_law.CACHE_BYTES", 1.0)
+    monkeypatch.setattr("psfdae.field_law.STARS_AT_ONCE", 13)
     few = fitted(bright()).measure(*told)
     assert few.psf == pytest.approx(whole.psf, abs=1e-7)
     assert few.measured.flux == pytest.approx(whole.measured.flux, rel=1e-9)

@@ -33,8 +33,8 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from psfdae.field_psf import FieldModel, slopes
-from psfdae.lowrank import FLUX_SIGMA, NOISE_STEP, Kept, factorised, mixing_weights
+from psfdae.field_psf import SLOPE_PX, FieldModel
+from psfdae.lowrank import FLUX_SIGMA, mixing_weights
 from psfdae.noise import NoiseModel
 from psfdae.settings import Count, Fraction, Group, Positive
 
@@ -60,15 +60,17 @@ the S/N up to which that is asked: of brighter stars, the filter does not know t
 WRONG_LIST = 0.05
 """Probability that the list, or its place, is not what it was for the training stars."""
 
-STARS_AT_ONCE = 4096
+STARS_AT_ONCE = 2048
 """Stars that are restored together."""
 
-OUTLIER_MODES, LEAST_SEEN = 12, 1e-9
-"""Leading modes that tell outliers, as the others tell the training stars from all others;
-and the least variance of one over that of the noise in it."""
+OUTLIER_MODES = 12
+"""Leading axes that tell outliers, as the others tell the training stars from all others."""
 
-CACHE_BYTES = 200e6
-"""Size of the factorisations that are kept for further stars."""
+NOISE_STEP = 0.1
+"""Step in ln of the noise variance between stars whose pixels are equally sure."""
+
+AXES = 96
+"""Of the covariance of the residuals in a node."""
 
 
 class FieldSettings(Group):
@@ -113,8 +115,8 @@ class Node(NamedTuple):
         Of C.
     spread : ndarray, shape (K, P)
         Rows that the variation over the field adds where the position is not known.
-    slope : ndarray, shape (2, P)
-        Change of the mean star with row and column of its centre.
+    latent : ndarray, shape (3, P)
+        Change of a star of flux 1 with the sky, and with row and column of its centre.
     diagonal : ndarray, shape (P,)
     """
 
@@ -122,112 +124,166 @@ class Node(NamedTuple):
     total: np.ndarray
     rows: np.ndarray
     spread: np.ndarray
-    slope: np.ndarray
+    latent: np.ndarray
     diagonal: np.ndarray
 
 
-class Factor(NamedTuple):
-    """S of a node at a noise variance s: S⁻¹ = diag(inverse) − lowᵀ low.
+class Axes(NamedTuple):
+    """Leading axes of C in a node; beyond them, C is taken for even.
 
     Attributes
     ----------
-    s : float
-    inverse : ndarray, shape (P,)
-    seen : ndarray, shape (R + K + 1, P)
-        `low` and `solved`.
-    means : ndarray, shape (K + 1, K + 1)
-        Products of the node's `mean` with `solved`.
-    half_det : float
-        ½ ln det S.
-    latent : ndarray, shape (3, P)
-        Rows of the sky and of the centre in units of their standard deviations, which are
-        `scale` (3,): 0 where they are known.
-    scale : ndarray, shape (3,)
-    latent_left : ndarray, shape (3, 3)
-        Covariance of these once the star is seen, and a known.
-    variance : ndarray, shape (P,)
-        The same of the pixels of the star.
-    whitening : ndarray, shape (T, T)
-        Its solution for the last T of `low` times a star is white if the star is as the others.
+    vectors : ndarray, shape (m, P)
+        Orthonormal, by descending variance.
+    variance : ndarray, shape (m,)
+        Along them.
+    rest : float
+        Mean variance beyond them.
+    latent : ndarray, shape (3, m)
+        The node's `latent` along them.
+    products : ndarray, shape (m + 1, 9)
+        Of the latter with each other along each axis, and beyond all.
+    squares : ndarray, shape (m, P)
+        Of the vectors.
     """
 
-    s: float
-    inverse: np.ndarray
-    seen: np.ndarray
-    means: np.ndarray
-    half_det: float
-    latent: np.ndarray
-    scale: np.ndarray
-    latent_left: np.ndarray
+    vectors: np.ndarray
     variance: np.ndarray
-    whitening: np.ndarray
-
-    @property
-    def low(self) -> np.ndarray:
-        return self.seen[: -len(self.means)]
-
-    @property
-    def solved(self) -> np.ndarray:
-        """S⁻¹ of the node's `mean`, shape (K + 1, P)."""
-        return self.seen[-len(self.means) :]
-
-    def solve(self, rows: np.ndarray, low: np.ndarray | None = None) -> np.ndarray:
-        """S⁻¹ of rows (n, P), of which `low` times them (n, R) may be known."""
-        low = rows @ self.low.T if low is None else low
-        return np.asarray(rows * self.inverse - low @ self.low)
+    rest: float
+    latent: np.ndarray
+    products: np.ndarray
+    squares: np.ndarray
 
 
-class Kind(NamedTuple):
-    """What a factorisation of a node is for."""
+def axes_of(node: Node, positioned: bool) -> Axes:
+    """Axes of a node, for stars whose position is known or is not.
 
-    number: int  # of the noise variance
-    positioned: bool  # the position is known
-    sky: bool  # likewise
-    centred: bool  # the centre is exactly known
-
-
-def factor_of(node: Node, kind: Kind, part_px: float) -> Factor:
-    """S of a node, a centre between two nodes being uncertain by `part_px`."""
-    from scipy.linalg.blas import dtrsm
-
-    s, pixels = float(np.exp(NOISE_STEP * kind.number)), len(node.diagonal)
-    # A sky of the whole flux in each pixel is as good as unknown.
-    width = np.array([0.0 if kind.sky else 1.0, *[0.0 if kind.centred else part_px] * 2])
-    latent = width[:, None] * np.vstack([np.ones(pixels), node.slope])
-    # Leading modes are the last ones: their law is the last block of the factor.
-    spread = [] if kind.positioned else [node.spread]
-    rows = np.vstack([latent, *spread, node.rows[::-1]])
-    d = node.diagonal + s
-    low, cholesky, half_det = factorised(d, rows)
-    last = cholesky[-OUTLIER_MODES:, -OUTLIER_MODES:]
-    solved = node.mean / d - (node.mean @ low.T) @ low
-    factor = Factor(
-        s=s,
-        inverse=1.0 / d,
-        seen=np.vstack([low, solved]),
-        means=solved @ node.mean.T,
-        half_det=half_det + float(0.5 * np.log(d).sum()),
-        latent=latent,
-        scale=width,
-        latent_left=np.eye(3),
-        variance=d,
-        whitening=np.linalg.cholesky(last.T @ last - (1.0 - LEAST_SEEN) * np.eye(len(last))),
+    They are those of C in the space of its rows and of the pixels with the largest diagonal
+    (Rayleigh and Ritz).
+    """
+    rows = node.rows if positioned else np.vstack([node.rows, node.spread])
+    pixels = len(node.diagonal)
+    kept = min(max(AXES, len(rows)), pixels)
+    large = np.argsort(-node.diagonal, kind="stable")[: kept - len(rows)]
+    basis = np.linalg.qr(np.vstack([rows, np.eye(pixels)[large]]).T)[0]
+    along = rows @ basis
+    variance, turn = np.linalg.eigh((basis.T * node.diagonal) @ basis + along.T @ along)
+    vectors = np.ascontiguousarray((basis @ turn[:, ::-1]).T)
+    beyond = node.diagonal.sum() + np.square(rows).sum() - variance.sum()
+    latent = node.latent @ vectors.T
+    even = node.latent @ node.latent.T - latent @ latent.T
+    each = (latent[:, None] * latent).reshape(9, -1).T
+    return Axes(
+        vectors,
+        variance[::-1].copy(),
+        float(beyond / (pixels - kept)) if kept < pixels else 1.0,
+        latent,
+        np.vstack([each, even.ravel()]),
+        vectors**2,
     )
-    # The same as I − latent S⁻¹ latentᵀ, which loses all digits for bright stars.
-    root = dtrsm(1.0, cholesky, np.eye(len(rows), 3), lower=1)
-    left = root.T @ root
-    inverse = factor.inverse - np.einsum("ij,ij->j", low, low)  # diagonal of S⁻¹
-    sky = width[0] ** 2 * left[0, 0] - 2 * s * width[0] * factor.solve(latent[:1])[0]
-    variance = s - s**2 * inverse + sky
-    return factor._replace(latent_left=left, variance=np.maximum(variance, 0.0))
+
+
+class Pairs(NamedTuple):
+    """Stars in nodes, in order of the nodes: N pairs of a star x and a node with its mean m."""
+
+    star: np.ndarray  # (N,)
+    node: np.ndarray  # (N,)
+    along: np.ndarray  # (N, 2, m), x and m along the axes
+    beyond: np.ndarray  # (N, 2, 5), products of both with x, m and the `latent` rows, beyond them
+
+    def of(self, chosen: np.ndarray) -> Pairs:
+        """A part of these pairs, by a mask."""
+        return Pairs._make(a[chosen] for a in self)
+
+    def by_node(self) -> Iterator[tuple[int, slice]]:
+        """Nodes, and which pairs are of them."""
+        nodes, first = np.unique(self.node, return_index=True)
+        for k, start, stop in zip(nodes.tolist(), first, [*first[1:], len(self.node)], strict=True):
+            yield k, slice(start, stop)
 
 
 class Fit(NamedTuple):
-    """Stars x over a guess of their flux, in nodes with their means m."""
+    """Stars x over a guess of their flux, in nodes with their means m; N pairs.
 
-    log: np.ndarray  # ln of the likelihood, without (2π)^(P/2)
-    factor: np.ndarray  # a
-    variance: np.ndarray  # of a
+    Products are those with (C + s)⁻¹, in which sky and centre are not.
+    """
+
+    log: np.ndarray  # (N,), ln of the likelihood, without (2π)^(P/2)
+    factor: np.ndarray  # (N,), a
+    variance: np.ndarray  # (N,), of a
+    left: np.ndarray  # (N, 3, 3), covariance of sky and centre in σ, once the star is seen
+    pull: np.ndarray  # (N, 2, 3), mean of these for x and for m
+
+    def of(self, chosen: np.ndarray) -> Fit:
+        """That of a part of the pairs, by a mask."""
+        return Fit._make(a[chosen] for a in self)
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What is known of the pixels of n stars in a node.
+
+    Attributes
+    ----------
+    axes : Axes
+    latent : ndarray, shape (3, P)
+        Of the node.
+    s : ndarray, shape (n, 1)
+        Variance of the noise.
+    width : ndarray, shape (n, 3)
+        Standard deviations of sky and centre.
+    left : ndarray, shape (n, 3, 3)
+        Their covariance over these, once the star is seen.
+    """
+
+    axes: Axes
+    latent: np.ndarray
+    s: np.ndarray
+    width: np.ndarray
+    left: np.ndarray
+
+    @cached_property
+    def _parts(self) -> tuple[np.ndarray, np.ndarray]:
+        """Part that is noise of what is seen, beyond the axes (n, 1); and how it differs along."""
+        beyond = self.s / (self.axes.rest + self.s)
+        return beyond, self.s / (self.axes.variance + self.s) - beyond
+
+    def noise_in(self, images: np.ndarray, projected: np.ndarray) -> np.ndarray:
+        """s (C + s)⁻¹ of images (n, P), which are known along the axes (n, m)."""
+        beyond, along = self._parts
+        return np.asarray(beyond * images + (along * projected) @ self.axes.vectors)
+
+    def variance(self) -> np.ndarray:
+        """Variance (n, P) of the pixels of a star without noise and sky, of known flux.
+
+        Stars of about the same noise share it.
+        """
+        known = np.column_stack([np.rint(np.log(self.s) / NOISE_STEP), self.width])
+        _, one, which = np.unique(known, axis=0, return_index=True, return_inverse=True)
+        s, width, left = self.s[one], self.width[one], self.left[one]
+        beyond, along = (part[one] for part in self._parts)
+        rows = (self.axes.latent * along[:, None]).reshape(-1, along.shape[1]) @ self.axes.vectors
+        rows = rows.reshape(*width.shape, -1) + beyond[:, None] * self.latent
+        rows *= width[:, :, None]
+        pull = left @ rows
+        noise = s * (1.0 - beyond - along @ self.axes.squares) + (rows * pull).sum(axis=1)
+        noise += width[:, :1] ** 2 * left[:, :1, 0] - 2 * width[:, :1] * pull[:, 0]
+        return np.asarray(np.maximum(noise, 0.0)[which.ravel()])
+
+    def covariance(self) -> np.ndarray:
+        """Of sky, row and column, (n, 3, 3)."""
+        return self.width[:, :, None] * self.left * self.width[:, None]
+
+    def score(self, projected: np.ndarray) -> np.ndarray:
+        """Square of Mahalanobis' distance along the leading axes, of what sky and centre leave."""
+        along, latent = projected[:, :OUTLIER_MODES], self.axes.latent[:, :OUTLIER_MODES]
+        scatter = self.axes.variance[:OUTLIER_MODES] + self.s
+        latent = self.width[:, :, None] * latent
+        scaled = latent / scatter[:, None]
+        pull = np.einsum("nij,nj->ni", scaled, along)
+        certain = np.linalg.inv(self.left) - scaled @ latent.transpose(0, 2, 1)
+        fitted = np.linalg.solve(certain, pull[..., None])[..., 0]
+        return np.asarray((along**2 / scatter).sum(axis=1) + (pull * fitted).sum(axis=1))
 
 
 class Asked(NamedTuple):
@@ -236,7 +292,7 @@ class Asked(NamedTuple):
     images: np.ndarray  # (n, P), sky roughly off
     noise: np.ndarray  # (n,)
     terms: np.ndarray  # (n, K)
-    positioned: np.ndarray  # (n,), the position is known
+    positioned: bool  # all positions are known, or none is
     prior: np.ndarray  # (n, nodes), ln; −inf where no centre is
     centre: np.ndarray | None  # (n, 2), if it is known
     flux: np.ndarray  # (n,), NaN where to be found
@@ -244,7 +300,7 @@ class Asked(NamedTuple):
 
     def of(self, chosen: np.ndarray | slice) -> Asked:
         """A part of these stars, by indices or a mask."""
-        return Asked._make(None if a is None else a[chosen] for a in self)
+        return Asked._make(a[chosen] if isinstance(a, np.ndarray) else a for a in self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -284,7 +340,7 @@ class FieldLaw:
     noise: NoiseModel
     settings: FieldSettings
     free: bool = False
-    _factors: Kept[Kind, Factor] = field(default_factory=Kept, init=False, repr=False)
+    _made: dict[tuple[int, bool], Axes] = field(default_factory=dict, init=False, repr=False)
 
     # The field.
 
@@ -327,68 +383,72 @@ class FieldLaw:
 
     @cached_property
     def _nodes(self) -> list[Node]:
-        count, side = len(self.usual), self.side
-        terms, phases = np.eye(count), phases_of(self.settings.step_px)
+        count, axis = len(self.usual), self.settings.step_px * self._axis
+        phases, steps = phases_of(self.settings.step_px), ((SLOPE_PX, 0.0), (0.0, SLOPE_PX))
+
+        def drawn(terms: np.ndarray, row: float = 0.0, column: float = 0.0) -> np.ndarray:
+            images = self.model.on_lattice(terms, axis + row, axis + column, self.side)
+            return images.reshape(len(terms), len(self.places), -1)
+
+        every, usual = drawn(np.eye(count)), self.usual[None]
+        slopes = [
+            (drawn(usual, *e) - drawn(usual, -e[0], -e[1]))[0] / (2 * SLOPE_PX) for e in steps
+        ]
         field_spread = _root(self.spread.reshape(count, count))
         nodes = []
-        for place in self.places:
-            centre = np.tile(place, (count, 1))
-            images = self.model.images(terms, centre, side).reshape(count, -1)
+        for k, place in enumerate(self.places):
+            images = every[:, k]
             total = images.sum(axis=1)
-            mean = self.usual @ images / (self.usual @ total)
+            flux = float(self.usual @ total)
+            mean = self.usual @ images / flux
 
-            def lit(rows: np.ndarray, mean: np.ndarray = mean) -> np.ndarray:  # no flux in them
-                return np.asarray(rows - rows.sum(axis=-1, keepdims=True) * mean)
-
-            def draw(at: np.ndarray) -> np.ndarray:
-                return self.model.images(self.usual[None], at, side)
+            def lit(rows: np.ndarray, mean: np.ndarray = mean, flux: float = flux) -> np.ndarray:
+                return np.asarray((rows - rows.sum(axis=-1, keepdims=True) * mean) / flux)
 
             whole, phase = _split(place, phases)
-            window = _window(side, whole)
-            residuals = np.concatenate([self.offset[phase][None], self.modes[phase]])
-            residuals = lit(residuals[:, window].astype(np.float64)) / (self.usual @ total)
-            slope = np.concatenate(slopes(draw, place[None])).reshape(2, -1)
+            window = _window(self.side, whole)
+            residuals = np.vstack([self.offset[phase, window], self.modes[phase][:, window]])
+            residuals = lit(residuals.astype(np.float64))
             nodes.append(
                 Node(
                     mean=np.vstack([images, residuals[:1]]),
                     total=total,
                     rows=residuals[1:],
-                    spread=lit(field_spread @ images) / (self.usual @ total),
-                    slope=lit(slope) / (self.usual @ total),
-                    diagonal=self.diagonal[phase][window].astype(np.float64),
+                    spread=lit(field_spread @ images),
+                    latent=np.vstack([np.ones_like(mean), lit(np.stack([s[k] for s in slopes]))]),
+                    diagonal=self.diagonal[phase, window].astype(np.float64),
                 )
             )
         return nodes
 
     @cached_property
-    def _everywhere(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Means of all nodes without their average, their products, and the sums of the terms."""
-        means = np.stack(
-            [node.mean - node.mean.mean(axis=1, keepdims=True) for node in self._nodes]
-        )
-        return means, means @ means.transpose(0, 2, 1), np.stack([n.total for n in self._nodes])
+    def _usual(self) -> tuple[np.ndarray, np.ndarray]:
+        """Usual stars of sum 1 in all nodes, less their average, and their squares' sums."""
+        parts = np.append(self.usual, 0.0)
+        means = np.stack([parts @ node.mean / (self.usual @ node.total) for node in self._nodes])
+        means += np.stack([node.mean[-1] for node in self._nodes])
+        means -= means.mean(axis=1, keepdims=True)
+        return means, np.square(means).sum(axis=1)
 
     def _parts(self, k: int, stars: Asked, rows: np.ndarray) -> np.ndarray:
         """Coefficients (n, K + 1) of PSFs of sum 1 that the field has in a node, in its `mean`."""
         terms = stars.terms[rows]
         return np.hstack([terms / (terms @ self._nodes[k].total)[:, None], np.ones((len(rows), 1))])
 
-    def _mean(
-        self, k: int, factor: Factor, stars: Asked, rows: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """PSFs m (n, P) of sum 1 that the field has for some stars in a node, and S⁻¹ m."""
+    def _mean(self, k: int, stars: Asked, rows: np.ndarray) -> np.ndarray:
+        """PSFs (n, P) of sum 1 that the field has for some stars in a node."""
         node = self._nodes[k]
         if stars.centre is None:
-            parts = self._parts(k, stars, rows)
-            return parts @ node.mean, parts @ factor.solved
+            return np.asarray(self._parts(k, stars, rows) @ node.mean)
         images = self.model.images(stars.terms[rows], stars.centre[rows], self.side)
         images = images.reshape(len(rows), -1)
-        mean = images / images.sum(axis=1, keepdims=True) + node.mean[-1]
-        return mean, factor.solve(mean)
+        return np.asarray(images / images.sum(axis=1, keepdims=True) + node.mean[-1])
 
-    def _factor(self, k: int, kind: Kind) -> Factor:
-        """S of a node."""
-        return self._factors(kind, k, lambda: factor_of(self._nodes[k], kind, self._part))
+    def _axes(self, k: int, positioned: bool) -> Axes:
+        """Axes of a node, made once."""
+        if (k, positioned) not in self._made:
+            self._made[k, positioned] = axes_of(self._nodes[k], positioned)
+        return self._made[k, positioned]
 
     @property
     def _part(self) -> float:
@@ -421,17 +481,8 @@ class FieldLaw:
 
     def _start(self, stars: Asked) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Fluxes by the node that fits best, the nodes (n, nodes) to look at, and √A there."""
-        means, products, totals = self._everywhere
-        part = np.concatenate(
-            [
-                stars.terms[:, None] / (stars.terms @ totals.T)[..., None],
-                np.ones((len(stars.terms), len(means), 1)),
-            ],
-            axis=-1,
-        )
-        along = (stars.images @ means.reshape(-1, means.shape[-1]).T).reshape(part.shape)
-        along = (along * part).sum(axis=-1)
-        square = np.einsum("nki,kij,nkj->nk", part, products, part, optimize=True)
+        means, square = self._usual
+        along = stars.images @ means.T
         known = np.isfinite(stars.flux)[:, None]
         flux = np.where(known, stars.flux[:, None], np.maximum(along / square, 0.0))
         gain = flux * along - 0.5 * flux**2 * square
@@ -444,13 +495,25 @@ class FieldLaw:
         least = np.clip(unclear.max(axis=1) - FAR, nearest[:, most], nearest[:, few])
         near = np.isfinite(score) & (unclear >= least[:, None])
         near[rows, best] = True
-        return flux[rows, best], near, 1.0 / np.sqrt(square[rows, best])
+        return flux[rows, best], near, 1.0 / np.sqrt(square[best])
 
-    def _alike(self, stars: Asked, guess: np.ndarray) -> list[np.ndarray]:
-        """Numbers of stars whose kinds of factorisations are kept through all rounds."""
-        number = np.log(stars.noise / np.maximum(guess, stars.noise)) * 2 / NOISE_STEP
-        _, which = np.unique(number // max(1, self._most - 2), return_inverse=True)
-        return [np.flatnonzero(which == index) for index in range(which.max(initial=-1) + 1)]
+    def _paired(self, stars: Asked, near: np.ndarray) -> Pairs:
+        """Stars in the nodes (n, nodes) that are to be looked at."""
+        node, star = near.T.nonzero()
+        images, kept = stars.images, len(self._axes(node[0], stars.positioned).variance)
+        pairs = Pairs(star, node, *(np.empty((len(star), 2, count)) for count in (kept, 5)))
+        square = np.square(images).sum(axis=1)
+        for k, rows in pairs.by_node():
+            latent, axes = self._nodes[k].latent, self._axes(k, stars.positioned)
+            image, mean = images[star[rows]], self._mean(k, stars, star[rows])
+            along, beyond = pairs.along[rows], pairs.beyond[rows]
+            along[:, 0], along[:, 1] = image @ axes.vectors.T, mean @ axes.vectors.T
+            beyond[:, 0, 0] = square[star[rows]]
+            beyond[:, 0, 1] = beyond[:, 1, 0] = np.einsum("ij,ij->i", image, mean)
+            beyond[:, 1, 1] = np.einsum("ij,ij->i", mean, mean)
+            beyond[:, 0, 2:], beyond[:, 1, 2:] = image @ latent.T, mean @ latent.T
+            beyond -= products_of(along, along, axes.latent)
+        return pairs
 
     def _restored(
         self, stars: Asked, guess: np.ndarray, near: np.ndarray, width: np.ndarray
@@ -462,112 +525,123 @@ class FieldLaw:
         """
         known = np.isfinite(stars.flux) & (stars.flux > 0)
         precision = np.where(known, KNOWN_FLUX_SIGMA, FLUX_SIGMA) ** -2.0
+        pairs = self._paired(stars, near)
         for _ in range(FLUX_ROUNDS):
             least = LEAST_SNR * stars.noise * width
             flux = np.where(known, stars.flux, np.maximum(guess, least))
-            scaled = stars._replace(images=stars.images / flux[:, None])
-            number = np.rint(np.log((stars.noise / flux) ** 2) / NOISE_STEP).astype(int)
-            fit = Fit(np.full(near.shape, -np.inf), np.ones(near.shape), np.ones(near.shape))
-            for k, kind, rows in self._asked(stars, number, near):
-                for all_nodes, found in zip(
-                    fit, self._against(k, kind, scaled, rows, precision), strict=True
-                ):
-                    all_nodes[rows, k] = found
-            weight, evidence = mixing_weights(fit.log + stars.prior)
-            near = weight > 0
-            guess = flux * (weight * fit.factor).sum(axis=1)
-        values, covariance, outlying, psf, sigma = self._summed(scaled, number, weight, fit)
-        evidence -= scaled.images.shape[1] * np.log(np.sqrt(2 * np.pi) * flux)
+            fit = self._fitted(stars, pairs, flux, precision)
+            log = np.full(near.shape, -np.inf)
+            log[pairs.star, pairs.node] = fit.log
+            weight, evidence = mixing_weights(log + stars.prior)
+            part = weight[pairs.star, pairs.node]
+            guess = flux * np.bincount(pairs.star, part * fit.factor, len(flux))
+            used = part > 0
+            pairs, part, fit = pairs.of(used), part[used], fit.of(used)
+        values, covariance, outlying, psf, sigma = self._summed(stars, pairs, part, fit, flux)
+        evidence -= stars.images.shape[1] * np.log(np.sqrt(2 * np.pi) * flux)
         unit = np.stack([flux, flux, *np.ones((2, len(flux)))], axis=1)
         found = np.hstack([evidence[:, None], values * unit, outlying[:, None], psf, sigma])
         return found, covariance * unit[:, :, None] * unit[:, None, :]
 
-    def _asked(
-        self, stars: Asked, number: np.ndarray, near: np.ndarray
-    ) -> Iterator[tuple[int, Kind, np.ndarray]]:
-        """Nodes, kinds of factorisations and the stars that need them."""
-        known = np.stack([number, stars.positioned, stars.sky], axis=1)
-        kinds, which = np.unique(known, axis=0, return_inverse=True)
-        for index, (s, positioned, sky) in enumerate(kinds.tolist()):
-            kind = Kind(s, bool(positioned), bool(sky), stars.centre is not None)
-            (rows,) = (which.ravel() == index).nonzero()
-            for k in near[rows].any(axis=0).nonzero()[0].tolist():
-                yield k, kind, rows[near[rows, k]]
-            self._factors.trim(self._most)
+    def _width(self, stars: Asked) -> np.ndarray:
+        """Standard deviations (n, 3) of sky, row and column before a star is seen; 0 if known."""
+        centre = 0.0 if stars.centre is not None else self._part
+        # A sky of the whole flux in each pixel is as good as unknown.
+        return np.stack([~stars.sky * 1.0, *np.full((2, len(stars.sky)), centre)], axis=1)
 
-    @cached_property
-    def _most(self) -> int:
-        """Kinds whose factorisations are kept."""
-        return max(1, int(CACHE_BYTES // sum(8 * node.rows.size for node in self._nodes)))
-
-    def _against(
-        self, k: int, kind: Kind, stars: Asked, rows: np.ndarray, precision: np.ndarray
-    ) -> Fit:
-        """Some stars over their guessed flux in a node: likelihood, and a with its prior."""
-        factor, certain, images = self._factor(k, kind), precision[rows], stars.images[rows]
-        low, along = np.split(images @ factor.seen.T, [-len(factor.means)], axis=1)
-        if stars.centre is None:
-            parts = self._parts(k, stars, rows)
-            along, means = (np.einsum("ij,ij->i", a, parts) for a in (along, parts @ factor.means))
-        else:
-            mean, solved = self._mean(k, factor, stars, rows)
-            along, means = (np.einsum("ij,ij->i", a, solved) for a in (images, mean))
-        chi2 = np.square(images) @ factor.inverse - np.einsum("ij,ij->i", low, low)
-        information, left = means + certain, along - means
-        chi2 -= along + left + left**2 / information
-        log = -0.5 * (chi2 + np.log(information / certain)) - factor.half_det
+    def _fitted(self, stars: Asked, pairs: Pairs, flux: np.ndarray, precision: np.ndarray) -> Fit:
+        """Stars over their guessed flux in nodes: likelihood, and a with its prior."""
+        s, count = np.square(stars.noise / flux)[pairs.star], len(pairs.star)
+        products, certain, det = np.empty((count, 2, 5)), np.empty((count, 9)), np.empty(count)
+        for k, rows in pairs.by_node():
+            axes, along = self._axes(k, stars.positioned), pairs.along[rows]
+            inverse, even = 1.0 / (axes.variance + s[rows, None]), 1.0 / (axes.rest + s[rows])
+            products[rows] = products_of(along * inverse[:, None], along, axes.latent)
+            products[rows] += even[:, None, None] * pairs.beyond[rows]
+            certain[rows] = np.hstack([inverse, even[:, None]]) @ axes.products
+            rest = stars.images.shape[1] - len(axes.variance)
+            det[rows] = -np.log(inverse).sum(axis=1) - rest * np.log(even)
+        unit, width = 1.0 / flux[pairs.star, None], self._width(stars)[pairs.star]
+        products[:, 0] *= unit
+        products[:, :, 0] *= unit
+        products[:, :, 2:] *= width[:, None]
+        certain = np.eye(3) + certain.reshape(-1, 3, 3) * (width[:, :, None] * width[:, None])
+        left = np.linalg.inv(certain)
+        pull = products[:, :, 2:] @ left
+        products[:, :, :2] -= pull @ products[:, :, 2:].transpose(0, 2, 1)
+        (square, along), (_, means) = products[:, :, :2].transpose(1, 2, 0)
+        prior = precision[pairs.star]
+        information, off = means + prior, along - means
+        chi2 = square - along - off - off**2 / information
+        det += np.linalg.slogdet(certain)[1]
+        log = -0.5 * (chi2 + np.log(information / prior) + det)
         # What was found before says nothing new: it is no part of the error.
-        variance = 1.0 / np.where(certain > FLUX_SIGMA**-2.0, information, means)
-        return Fit(log, 1.0 + left / information, variance)
+        variance = 1.0 / np.where(prior > FLUX_SIGMA**-2.0, information, means)
+        return Fit(log, 1.0 + off / information, variance, left, pull)
 
     def _summed(
-        self, stars: Asked, number: np.ndarray, weight: np.ndarray, fit: Fit
+        self, stars: Asked, pairs: Pairs, weight: np.ndarray, fit: Fit, unit: np.ndarray
     ) -> tuple[np.ndarray, ...]:
         """Mean (n, 4) and covariance of flux, sky, row, column; outlier score; PSF (n, P) and σ.
 
         Of stars over a guess of their flux, which is the unit of flux and sky. The score is the
-        square of Mahalanobis' distance in the leading modes of C, with the noise in them.
+        square of Mahalanobis' distance along the leading axes of C, with the noise in them.
         """
         count, pixels = stars.images.shape
         first, second = np.zeros((count, 4)), np.zeros((count, 4, 4))
         star, square, inside = np.zeros((3, count, pixels))
         total = np.zeros((count, 1))
         outlying = np.zeros(count)
-        for k, kind, rows in self._asked(stars, number, weight > 0):
-            factor, w = self._factor(k, kind), weight[rows, k, None]
-            a, variance = fit.factor[rows, k, None], fit.variance[rows, k, None]
-            mean, solved = self._mean(k, factor, stars, rows)
-            left = stars.images[rows] - a * mean
-            low = left @ factor.low.T
-            gain = factor.solve(left, low)
-            latent, pull = gain @ factor.latent.T, solved @ factor.latent.T
-            sky = factor.scale[0] * latent[:, :1]
-            one = stars.images[rows] - factor.s * gain - sky
-            change = factor.s * solved + factor.scale[0] * pull[:, :1]  # with a
+        widths = self._width(stars)
+        for k, of_node in pairs.by_node():
+            rows = pairs.star[of_node]
+            axes, w = self._axes(k, stars.positioned), weight[of_node, None]
+            s = np.square(stars.noise / unit)[rows, None]
+            seen = Seen(axes, self._nodes[k].latent, s, widths[rows], fit.left[of_node])
+            a, variance = fit.factor[of_node, None], fit.variance[of_node, None]
+            image, mean = stars.images[rows] / unit[rows, None], self._mean(k, stars, rows)
+            along_image, along_mean = pairs.along[of_node].transpose(1, 0, 2)
+            pull_image, pull_mean = fit.pull[of_node].transpose(1, 0, 2)
+            latent = seen.width * (pull_image - a * pull_mean)
+            with_mean = -seen.width * pull_mean
+            left = image - a * mean - latent @ seen.latent
+            along = along_image / unit[rows, None] - a * along_mean - latent @ axes.latent
+            sky = latent[:, :1]
+            one = image - seen.noise_in(left, along) - sky
+            change = seen.noise_in(
+                mean + with_mean @ seen.latent, along_mean + with_mean @ axes.latent
+            )
+            change -= with_mean[:, :1]
             flux = one.sum(axis=1, keepdims=True)
-            if not kind.sky:  # what is even in the star is sky
-                more = (a - flux) / pixels
-                one, sky, flux = one + more, sky - more, a
-                change += (1.0 - change.sum(axis=1, keepdims=True)) / pixels
-            white = np.linalg.solve(factor.whitening, low[:, -OUTLIER_MODES:].T)
-            outlying[rows] += w[:, 0] * np.square(white).sum(axis=0)
+            even = ~stars.sky[rows, None] / pixels  # what is even in the star is sky
+            more = even * (a - flux)
+            one, sky, flux = one + more, sky - more, flux + pixels * more
+            change += even * (1.0 - change.sum(axis=1, keepdims=True))
+            outlying[rows] += w[:, 0] * seen.score(along)
             doubt = w * variance
             star[rows] += w * one
             square[rows] += w * one**2
-            inside[rows] += w * factor.variance + doubt * change**2
+            inside[rows] += w * seen.variance() + doubt * change**2
             total[rows] += w * flux
             place = self.places[k] if stars.centre is None else stars.centre[rows]
-            measured = np.hstack([flux, sky, place + factor.scale[1:] * latent[:, 1:]])
-            with_a = np.hstack([np.ones_like(flux), -factor.scale * pull])
-            alone = np.zeros((4, 4))
-            alone[1:, 1:] = factor.scale[:, None] * factor.scale * factor.latent_left
+            measured = np.hstack([flux, sky, place + latent[:, 1:]])
+            with_a = np.hstack([np.ones_like(flux), with_mean])
             first[rows] += w * measured
-            second[rows] += w[..., None] * (alone + measured[:, :, None] * measured[:, None, :])
+            second[rows] += w[..., None] * measured[:, :, None] * measured[:, None, :]
+            second[rows, 1:, 1:] += w[..., None] * seen.covariance()
             second[rows] += doubt[..., None] * with_a[:, :, None] * with_a[:, None, :]
         psf = star / total
         # Of the star as it is: the doubt about its flux is in its pixels.
         sigma = np.sqrt(np.maximum(square + inside - star**2, 0.0)) / np.abs(total)
         return first, second - first[:, :, None] * first[:, None, :], outlying, psf, sigma
+
+
+def products_of(weighted: np.ndarray, along: np.ndarray, latent: np.ndarray) -> np.ndarray:
+    """Products (n, 2, 5) of two weighted vectors (n, 2, m) with both, and with rows (3, m)."""
+    found = np.empty((len(along), 2, 5))
+    found[..., :2] = np.einsum("nim,njm->nij", weighted, along)
+    found[..., 2:] = (weighted.reshape(-1, weighted.shape[-1]) @ latent.T).reshape(-1, 2, 3)
+    return found
 
 
 def parts_of(rows: np.ndarray) -> list[np.ndarray]:

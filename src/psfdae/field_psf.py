@@ -89,6 +89,21 @@ class FieldModel:
         splines = np.tensordot(terms, self.coefficients, 1)
         return _drawn(splines, axis, centre, self.spacing)
 
+    def on_lattice(
+        self, terms: np.ndarray, rows: np.ndarray, columns: np.ndarray, side: int
+    ) -> np.ndarray:
+        """As `images`, with the star at all pairs of rows (r,) and columns (c,), (n, r c, m, m)."""
+        splines = np.tensordot(terms, self.coefficients, 1)
+        axis = np.arange(side) - side // 2
+        down, across = (
+            _splines_at(axis - at[:, None], splines.shape[-1], self.spacing)
+            for at in (rows, columns)
+        )
+        half = np.tensordot(splines, across, ((2,), (2,)))  # (n, knots, c, m)
+        images = np.tensordot(down, half, ((2,), (1,)))  # (r, m, n, c, m)
+        images = images.transpose(2, 0, 3, 1, 4)
+        return np.asarray(images.reshape(len(terms), -1, side, side))
+
 
 class FieldFit(NamedTuple):
     """A model, and what it makes of the stars that it was fitted to."""
@@ -404,7 +419,8 @@ def _splines_at(place: np.ndarray, knots: int, spacing: float) -> np.ndarray:
     """Cubic B-splines about `knots` equidistant places around 0 at `place` (…), (…, knots)."""
     middle = (np.arange(knots) - (knots - 1) / 2) * spacing
     t = np.abs(place[..., None] - middle) / spacing
-    return np.asarray(np.where(t < 1, 2 / 3 - t**2 + t**3 / 2, np.maximum(2 - t, 0.0) ** 3 / 6))
+    near, far = np.maximum(1 - t, 0.0), np.maximum(2 - t, 0.0)
+    return np.asarray((far * far * far - 4 * near * near * near) / 6)
 
 
 def _drawn(splines: np.ndarray, axis: np.ndarray, centre: np.ndarray, spacing: float) -> np.ndarray:

@@ -257,25 +257,21 @@ class FieldMixture(FieldLaw, Method):
         terms, positioned = self._terms(position, count)
         level = np.nan_to_num(sky)
         stars = Asked(
-            *(images - level[:, None], np.broadcast_to(noise, count), terms, positioned),
+            *(images - level[:, None], np.broadcast_to(noise, count), terms, True),
             *(self._prior(listed), None, flux, np.isfinite(sky)),
         )
         known = np.isfinite(listed).all(axis=1) & fixed
         found = np.empty((count, 6 + 2 * images.shape[1]))
         covariance = np.empty((count, 4, 4))
-        for at, rows in ((None, ~known), (listed, known)):
-            for part in parts_of(np.flatnonzero(rows)):
-                some = stars.of(part)
-                if at is not None:
-                    near = np.square(self.places - at[part, None]).sum(axis=-1).argmin(axis=1)
+        for centred, placed in np.ndindex(2, 2):
+            for part in parts_of(np.flatnonzero((known == centred) & (positioned == placed))):
+                some = stars.of(part)._replace(positioned=bool(placed))
+                if centred:
+                    at = listed[part]
+                    near = np.square(self.places - at[:, None]).sum(axis=-1).argmin(axis=1)
                     alone = np.where(np.arange(len(self.places)) == near[:, None], 0.0, -np.inf)
-                    some = some._replace(centre=at[part], prior=alone)
-                start = self._start(some)
-                for alike in self._alike(some, start[0]):
-                    rest = (a[alike] for a in start)
-                    found[part[alike]], covariance[part[alike]] = self._restored(
-                        some.of(alike), *rest
-                    )
+                    some = some._replace(centre=at, prior=alone)
+                found[part], covariance[part] = self._restored(some, *self._start(some))
         values, psf, sigma = np.split(found, [6, 6 + images.shape[1]], axis=1)
         measured = Measured(
             flux=values[:, 1],
