@@ -272,6 +272,21 @@ def test_models_of_photutils_do_not_mix(sky):
     assert fluxes[0] != pytest.approx([1e3, 1e3], rel=0.02)
 
 
+def test_a_grid_is_interpolated_as_photutils_does_it(sky):
+    """Between the nodes and beyond them, in the pixels of a fit."""
+    from photutils.psf import GriddedPSFModel
+
+    grid = load_model(sky[1]).to_photutils(4, 4)
+    low, high = grid.grid_xypos.min(axis=0), grid.grid_xypos.max(axis=0)
+    rng = np.random.default_rng(4)
+    for x, y in np.vstack([rng.uniform(low, high, (20, 2)), [low - 9.3, high + 7.6]]):
+        rows, columns = np.mgrid[-4:5, -4:5] + np.rint([y, x]).astype(int)[:, None, None]
+        expected = GriddedPSFModel.evaluate(grid, columns, rows, 1e3, x, y)
+        assert grid.evaluate(columns, rows, 1e3, x, y) == pytest.approx(expected, abs=1e-6)
+        assert grid.copy()(columns, rows).shape == (9, 9)
+    assert grid.evaluate(np.array([x + 99.0]), np.array([y]), 1.0, x, y) == 0
+
+
 def test_the_command_and_its_table(sky, tmp_path):
     folder, model, true = sky
     true["mag"] = 24.5 - 2.5 * np.log10(true["flux"])

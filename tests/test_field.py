@@ -296,6 +296,30 @@ def test_nodes_that_the_matched_filter_leaves_out_do_not_matter(field, snr, monk
     assert found.evidence == pytest.approx(every.evidence, abs=1e-3)
 
 
+@pytest.mark.parametrize("snr", [5.0, 100.0])
+def test_a_star_of_known_centre_is_the_posterior_mean_of_its_normal_law(snr, monkeypatch):
+    """x − s (C + s)⁻¹ (x − m), with C as a whole, for flux, sky and centre that are known."""
+    monkeypatch.setattr("psfdae.field_law.AXES", SIDE**2)
+    field, some = fitted(bright()), Faint(30, snr)
+    flux, sky = np.full(30, 1000.0), np.full(30, 3.0)
+    found = some.measured(field, centre=some.centre, fixed=True, flux=flux, sky=sky)
+    at = some.centre + field.listed[0]
+    near = np.square(field.places - at[:, None]).sum(axis=-1).argmin(axis=1)
+    means = field.model.images(field.model.terms(some.position), at, SIDE).reshape(30, -1)
+    s = (some.sigma[0] / 1000) ** 2
+    for k, mean, stamp, psf, sigma in zip(
+        near, means, some.stamps, found.psf, found.sigma, strict=True
+    ):
+        node, star = field._nodes[k], (stamp.ravel() - 3) / 1000
+        inverse = np.linalg.inv(node.rows.T @ node.rows + np.diag(node.diagonal + s))
+        restored = star - s * inverse @ (star - mean / mean.sum() - node.mean[-1])
+        assert psf.ravel() == pytest.approx(restored / restored.sum(), abs=1e-6)
+        variance = s - s**2 * inverse.diagonal()
+        assert np.square(sigma).sum() == pytest.approx(
+            variance.sum() / restored.sum() ** 2, rel=0.05
+        )
+
+
 def test_bad_stamps_are_refused(field):
     stamps = np.zeros((2, SIDE, SIDE))
     stamps[1, 3, 3] = np.nan

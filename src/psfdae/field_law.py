@@ -9,16 +9,18 @@ square lattice, finer than a pixel. In each node a stamp x of a star of flux F o
 with the field's PSF m at this place and centre, moved by the part u of a step, and the
 covariance C of the training stars' residuals, moved to c. It is of low rank beside a
 diagonal, and without flux. F is a guess, the factor a is about 1, and nothing is known of b,
-so that sky, centre and residuals are rows of one covariance
+so that sky and centre are rows L beside the residuals:
 
-    S = D + LᵀL,   D = diagonal + s,   s = (noise/F)²,
+    S = C + s + LᵀL,   s = (noise/F)².
 
-a is one unknown of generalised least squares (Aitken 1935, Proc. R. Soc. Edinb. 55, 42), and
-the star is what S leaves after noise and sky. Nodes count by their marginal likelihood and
-by what is known of the centre. The weighted sum over the nodes is divided by its sum in the
-end: a faint star's flux differs between nodes, and so does what it is divided by.
+The eigenvectors of C do not depend on the noise. Along the leading ones of a node, C + s is
+diagonal for every star, and beyond them C is taken for even; sky and centre are three unknowns
+more (Woodbury's identity). a is one unknown of generalised least squares (Aitken 1935, Proc. R.
+Soc. Edinb. 55, 42), and the star is what S leaves after noise and sky. Nodes count by their
+marginal likelihood and by what is known of the centre. The weighted sum over the nodes is divided
+by its sum in the end: a faint star's flux differs between nodes, and so does what it is divided by.
 
-Where no position is known, m is the mean over the field and its variation is in L. A centre
+Where no position is known, m is the mean over the field and its variation is in C. A centre
 that is known is one node at exactly that place.
 """
 
@@ -154,6 +156,20 @@ class Axes(NamedTuple):
     products: np.ndarray
     squares: np.ndarray
 
+    def inverse(self, s: np.ndarray) -> np.ndarray:
+        """1/(C + s) along the axes and beyond them, (n, m + 1), for noise of variances s (n, 1)."""
+        return np.asarray(1.0 / (np.append(self.variance, self.rest) + s))
+
+    def noise_parts(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Part s/(C + s) beyond the axes (n, 1), and by how much it differs along them (n, m)."""
+        part = s * self.inverse(s)
+        return part[:, -1:], part[:, :-1] - part[:, -1:]
+
+    def certainty(self, s: np.ndarray, width: np.ndarray) -> np.ndarray:
+        """Inverse covariance (n, 3, 3) of sky and centre, in their standard deviations (n, 3)."""
+        products = (self.inverse(s) @ self.products).reshape(-1, 3, 3)
+        return np.asarray(np.eye(3) + products * (width[:, :, None] * width[:, None]))
+
 
 def axes_of(node: Node, positioned: bool) -> Axes:
     """Axes of a node, for stars whose position is known or is not.
@@ -242,15 +258,9 @@ class Seen:
     width: np.ndarray
     left: np.ndarray
 
-    @cached_property
-    def _parts(self) -> tuple[np.ndarray, np.ndarray]:
-        """Part that is noise of what is seen, beyond the axes (n, 1); and how it differs along."""
-        beyond = self.s / (self.axes.rest + self.s)
-        return beyond, self.s / (self.axes.variance + self.s) - beyond
-
     def noise_in(self, images: np.ndarray, projected: np.ndarray) -> np.ndarray:
         """s (C + s)⁻¹ of images (n, P), which are known along the axes (n, m)."""
-        beyond, along = self._parts
+        beyond, along = self.axes.noise_parts(self.s)
         return np.asarray(beyond * images + (along * projected) @ self.axes.vectors)
 
     def variance(self) -> np.ndarray:
@@ -258,10 +268,11 @@ class Seen:
 
         Stars of about the same noise share it.
         """
-        known = np.column_stack([np.rint(np.log(self.s) / NOISE_STEP), self.width])
-        _, one, which = np.unique(known, axis=0, return_index=True, return_inverse=True)
-        s, width, left = self.s[one], self.width[one], self.left[one]
-        beyond, along = (part[one] for part in self._parts)
+        number = np.rint(np.log(self.s) / NOISE_STEP)
+        known, which = np.unique(np.hstack([number, self.width]), axis=0, return_inverse=True)
+        s, width = np.exp(NOISE_STEP * known[:, :1]), known[:, 1:]
+        beyond, along = self.axes.noise_parts(s)
+        left = np.linalg.inv(self.axes.certainty(s, width))
         rows = (self.axes.latent * along[:, None]).reshape(-1, along.shape[1]) @ self.axes.vectors
         rows = rows.reshape(*width.shape, -1) + beyond[:, None] * self.latent
         rows *= width[:, :, None]
@@ -551,21 +562,20 @@ class FieldLaw:
 
     def _fitted(self, stars: Asked, pairs: Pairs, flux: np.ndarray, precision: np.ndarray) -> Fit:
         """Stars over their guessed flux in nodes: likelihood, and a with its prior."""
-        s, count = np.square(stars.noise / flux)[pairs.star], len(pairs.star)
-        products, certain, det = np.empty((count, 2, 5)), np.empty((count, 9)), np.empty(count)
+        count, s = len(pairs.star), np.square(stars.noise / flux)[pairs.star, None]
+        unit, width = 1.0 / flux[pairs.star, None], self._width(stars)[pairs.star]
+        products, certain, det = (np.empty((count, *shape)) for shape in ((2, 5), (3, 3), ()))
         for k, rows in pairs.by_node():
             axes, along = self._axes(k, stars.positioned), pairs.along[rows]
-            inverse, even = 1.0 / (axes.variance + s[rows, None]), 1.0 / (axes.rest + s[rows])
-            products[rows] = products_of(along * inverse[:, None], along, axes.latent)
-            products[rows] += even[:, None, None] * pairs.beyond[rows]
-            certain[rows] = np.hstack([inverse, even[:, None]]) @ axes.products
-            rest = stars.images.shape[1] - len(axes.variance)
-            det[rows] = -np.log(inverse).sum(axis=1) - rest * np.log(even)
-        unit, width = 1.0 / flux[pairs.star, None], self._width(stars)[pairs.star]
+            inverse = axes.inverse(s[rows])
+            products[rows] = products_of(along * inverse[:, None, :-1], along, axes.latent)
+            products[rows] += inverse[:, -1, None, None] * pairs.beyond[rows]
+            certain[rows] = axes.certainty(s[rows], width[rows])
+            more = stars.images.shape[1] - inverse.shape[1]  # axes as the last one
+            det[rows] = -np.log(inverse).sum(axis=1) - more * np.log(inverse[:, -1])
         products[:, 0] *= unit
         products[:, :, 0] *= unit
         products[:, :, 2:] *= width[:, None]
-        certain = np.eye(3) + certain.reshape(-1, 3, 3) * (width[:, :, None] * width[:, None])
         left = np.linalg.inv(certain)
         pull = products[:, :, 2:] @ left
         products[:, :, :2] -= pull @ products[:, :, 2:].transpose(0, 2, 1)

@@ -176,16 +176,12 @@ class FieldPsfs(ABC):
         PredictionError
             As `psf_at`.
         """
-        from astropy.nddata import NDData
-        from photutils.psf import GriddedPSFModel
+        from psfdae.model.field_grid import FieldGrid
 
         x, y = np.rint(self.grid(nodes, nodes)).T
-        meta = {"grid_xypos": list(zip(x, y, strict=True)), "oversampling": oversampling}
-        # Of a class of its own: photutils 3.0 fits groups with the first model of a class.
         name = f"FieldPSF_{self.sha256[:12]}_{nodes}_{oversampling}"
-        return type(name, (GriddedPSFModel,), {})(
-            NDData(self.psf_at(x, y, oversampling), meta=meta)
-        )
+        psfs = self.psf_at(x, y, oversampling)
+        return FieldGrid.of(name, psfs, x[:nodes], y[::nodes], oversampling)
 
 
 def real_numbers(name: str, values: ArrayLike) -> np.ndarray:
