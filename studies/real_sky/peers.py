@@ -24,6 +24,7 @@ from scipy.interpolate import make_interp_spline
 
 STEP, REACH = 0.25, 3  # px: of drawn centres, which go that far from the middle
 FIELD = 40  # px beyond the image
+GAIN, SATURATE = 2.0, 4000  # electrons a count, and counts, where the header has none
 
 
 def training(image, selection, half=10):
@@ -39,11 +40,11 @@ def piff(image, selection, side, sampling, order):
     import galsim
     import piff
 
-    stars, half = [], side // 2 + 2
+    stars, half, gain = [], side // 2 + 2, fits.getheader(image).get("GAIN", GAIN)
     for (x, y), (px, py), stamp, sigma in training(image, selection, half):
         frame = galsim.Image(stamp, xmin=int(px) - half + 1, ymin=int(py) - half + 1, scale=1.0)
-        # Photons as of two electrons a count, and one per cent of the star that no model fits.
-        variance = sigma**2 + 0.5 * stamp.clip(0) + (0.01 * stamp) ** 2
+        # Its photons, and one per cent of the star that no model fits.
+        variance = sigma**2 + stamp.clip(0) / gain + (0.01 * stamp) ** 2
         weight = galsim.Image(1 / variance, xmin=frame.xmin, ymin=frame.ymin, scale=1.0)
         place = galsim.PositionD(float(x) + 1, float(y) + 1)
         stars.append(piff.Star(piff.StarData(frame, place, weight=weight), None))
@@ -76,7 +77,8 @@ def psfex(image, selection, side, sampling, order):
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / "sex.param").write_text(columns)
         words = "-c /dev/null -CATALOG_NAME all.cat -CATALOG_TYPE FITS_LDAC -FILTER N"
-        words += " -PARAMETERS_NAME sex.param -DETECT_THRESH 5 -ANALYSIS_THRESH 5 -SATUR_LEVEL 4000"
+        words += " -PARAMETERS_NAME sex.param -DETECT_THRESH 5 -ANALYSIS_THRESH 5"
+        words += f" -SATUR_LEVEL {fits.getheader(image).get('SATURATE', SATURATE)}"
         run = ["source-extractor", str(Path(image).resolve()), *words.split()]
         subprocess.run(run, cwd=folder, check=True, capture_output=True)
         with fits.open(f"{folder}/all.cat") as file:
