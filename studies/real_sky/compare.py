@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 from faint import FLUX, SNR
+from peers import CENTRES
 from scipy.stats import sem
 
 from psfdae import __version__, load_model
@@ -36,12 +37,12 @@ def ours(known, bundle):
 
 
 def theirs(file):
-    """The same of a file of peers.py, with the centre fitted and averaged."""
+    """The same of a file of peers.py, with each kind of centre."""
     package, sampling, order, _ = file.stem.split("-")
     found = np.load(file)
     about = {"version": str(found["version"]), "fit_cpu_s": float(found["fit_cpu_s"])}
     for snr in SNR:
-        for centre in ("fitted", "averaged"):
+        for centre in CENTRES:
             setting = (package, sampling, order if package != "epsf" else "", centre)
             yield setting, snr, found[f"{centre}{snr}"], found[f"flux{snr}"], about
 
@@ -97,10 +98,15 @@ def main(out, *folders):
     table = pd.DataFrame(row for folder in folders for row in of_image(Path(folder).resolve()))
     table = table.assign(date=date.today().isoformat(), commit=git_commit())
     table.to_csv(out, index=False, float_format="%.6g")
-    others = table.query("package != 'psfdae'")
-    best = others.loc[others.groupby(["image", "centre", "snr"], sort=False).mse.idxmin()]
-    shown = ["image", "snr", *SETTING, "ratio", "ratio_stderr", "median_ratio", "median_stderr"]
-    print(best[shown].round(3).to_string(index=False))
+    print("| image | S/N | centre | best of the others | psfdae over it | of the median star |")
+    print("|---|---|---|---|---|---|")
+    others = table[table.package != "psfdae"].set_index(SETTING[:3])
+    for (image, snr, centre), group in others.groupby(["image", "snr", "centre"], sort=False):
+        name, best = " ".join(map(str, group.mse.idxmin())).strip(), group.loc[group.mse.idxmin()]
+        print(
+            f"| {image} | {snr} | {centre} | {name} | {best.ratio:.2f} ± {best.ratio_stderr:.2f} "
+            f"| {best.median_ratio:.2f} ± {best.median_stderr:.2f} |"
+        )
 
 
 if __name__ == "__main__":
