@@ -42,7 +42,7 @@ def theirs(file):
     found = np.load(file)
     about = {"version": str(found["version"]), "fit_cpu_s": float(found["fit_cpu_s"])}
     for snr in SNR:
-        for centre in CENTRES:
+        for centre in (one for one in CENTRES if f"{one}{snr}" in found):
             setting = (package, sampling, order if package != "epsf" else "", centre)
             yield setting, snr, found[f"{centre}{snr}"], found[f"flux{snr}"], about
 
