@@ -98,15 +98,17 @@ def main(out, *folders):
     table = pd.DataFrame(row for folder in folders for row in of_image(Path(folder).resolve()))
     table = table.assign(date=date.today().isoformat(), commit=git_commit())
     table.to_csv(out, index=False, float_format="%.6g")
-    print("| image | S/N | centre | best of the others | psfdae over it | of the median star |")
-    print("|---|---|---|---|---|---|")
-    others = table[table.package != "psfdae"].set_index(SETTING[:3])
-    for (image, snr, centre), group in others.groupby(["image", "snr", "centre"], sort=False):
-        name, best = " ".join(map(str, group.mse.idxmin())).strip(), group.loc[group.mse.idxmin()]
-        print(
-            f"| {image} | {snr} | {centre} | {name} | {best.ratio:.2f} ± {best.ratio_stderr:.2f} "
-            f"| {best.median_ratio:.2f} ± {best.median_stderr:.2f} |"
-        )
+    print(f"| image | S/N | {' | '.join(CENTRES)} | median star: {' | '.join(CENTRES)} |")
+    print("|---|---" + 2 * len(CENTRES) * "|---" + "|")
+    others = table[table.package != "psfdae"]
+    for (image, snr), cell in others.groupby(["image", "snr"], sort=False):
+        best = cell.loc[cell.groupby("centre").mse.idxmin()].set_index("centre").loc[[*CENTRES]]
+        cells = [
+            f"{one[name]:.2f} ± {one[error]:.2f}"
+            for name, error in (("ratio", "ratio_stderr"), ("median_ratio", "median_stderr"))
+            for _, one in best.iterrows()
+        ]
+        print(f"| {image} | {snr} | {' | '.join(cells)} |")
 
 
 if __name__ == "__main__":
