@@ -1,11 +1,13 @@
 """Table of the errors of all packages, over the stars of all splits.
 
-usage: compare.py FOLDER OUT.csv
+usage: compare.py OUT.csv FOLDER...
 
-FOLDER is that of run.sh. OUT has a row for every S/N, package, setting and kind of centre. `mse` is
-that of PSFs of sum 1, the mean over stars, each the mean of its copies; the truth's own noise
-(`own_mse`) is in it. `ratio` is psfdae's over it, of the same copies. Every `stderr` is that of the
-stars. Fluxes, relative to the true one, are those of the fitted centre, of copies that have one.
+A FOLDER is that of run.sh for one image, which has its name. OUT has a row for every image, S/N,
+package, setting and kind of centre. `mse` is that of PSFs of sum 1, the mean over stars, each the
+mean of its copies; the truth's own noise (`own_mse`) is in it. `ratio` is psfdae's over it, of the
+same copies, and `median_ratio` that of the median star. Every `stderr` is that of the stars; of the
+median, by drawing the stars anew. Fluxes, relative to the true one, are those of the fitted centre,
+of copies that have one. What is printed is psfdae over the best setting of all packages.
 """
 
 import sys
@@ -15,13 +17,14 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 from faint import FLUX, SNR
+from peers import CENTRES
 from scipy.stats import sem
 
 from psfdae import __version__, load_model
 from psfdae_paper.source import git_commit
 
 SETTING = ["package", "sampling_px", "order", "centre"]
-SPLITS = 5
+DRAWS = 1000  # of the stars, for the error of a median
 
 
 def ours(known, bundle):
@@ -34,12 +37,12 @@ def ours(known, bundle):
 
 
 def theirs(file):
-    """The same of a file of peers.py, with the centre fitted and averaged."""
+    """The same of a file of peers.py, with each kind of centre."""
     package, sampling, order, _ = file.stem.split("-")
     found = np.load(file)
     about = {"version": str(found["version"]), "fit_cpu_s": float(found["fit_cpu_s"])}
     for snr in SNR:
-        for centre in ("fitted", "averaged"):
+        for centre in (one for one in CENTRES if f"{one}{snr}" in found):
             setting = (package, sampling, order if package != "epsf" else "", centre)
             yield setting, snr, found[f"{centre}{snr}"], found[f"flux{snr}"], about
 
@@ -71,21 +74,41 @@ def row(cell, reference):
     bias = cell.off.mean()
     found |= {"flux_bias": bias, "bias_stderr": sem(cell.off)}
     found |= {"flux_scatter": np.sqrt(cell.off2.mean() - bias**2)}
+    of_each = (reference.mse / cell.mse).to_numpy()
+    drawn = np.random.default_rng(0).choice(of_each, (DRAWS, len(of_each)))
+    found |= {"median_ratio": np.median(of_each)}
+    found["median_stderr"] = np.median(drawn, axis=1).std()
     return found | {"own_mse": cell.own_mse.mean()}
 
 
-def main(folder, out):
-    splits = [pd.concat(of_stars(Path(folder), split)) for split in range(SPLITS)]
-    stars = pd.concat(splits).sort_index()
-    rows = []
+def of_image(folder):
+    """Rows of one image."""
+    splits = [file.stem.removeprefix("faint") for file in folder.glob("faint?.npz")]
+    stars = pd.concat(rows for split in splits for rows in of_stars(folder, split)).sort_index()
     for (snr, *setting), cell in stars.groupby(["snr", *SETTING]):
         reference = stars.query("snr == @snr and package == 'psfdae'")
         # Every star is held out once.
         if not cell.index.equals(reference.index) or not cell.index.is_unique:
             sys.exit(f"{setting}: {len(cell)} stars, not the {len(reference)} of psfdae")
-        rows.append({"snr": snr} | dict(zip(SETTING, setting, strict=True)) | row(cell, reference))
-    table = pd.DataFrame(rows).assign(date=date.today().isoformat(), commit=git_commit())
+        about = {"image": folder.name, "snr": snr} | dict(zip(SETTING, setting, strict=True))
+        yield about | row(cell, reference)
+
+
+def main(out, *folders):
+    table = pd.DataFrame(row for folder in folders for row in of_image(Path(folder).resolve()))
+    table = table.assign(date=date.today().isoformat(), commit=git_commit())
     table.to_csv(out, index=False, float_format="%.6g")
+    print(f"| image | S/N | {' | '.join(CENTRES)} | median star: {' | '.join(CENTRES)} |")
+    print("|---|---" + 2 * len(CENTRES) * "|---" + "|")
+    others = table[table.package != "psfdae"]
+    for (image, snr), cell in others.groupby(["image", "snr"], sort=False):
+        best = cell.loc[cell.groupby("centre").mse.idxmin()].set_index("centre").loc[[*CENTRES]]
+        cells = [
+            f"{one[name]:.2f} ± {one[error]:.2f}"
+            for name, error in (("ratio", "ratio_stderr"), ("median_ratio", "median_stderr"))
+            for _, one in best.iterrows()
+        ]
+        print(f"| {image} | {snr} | {' | '.join(cells)} |")
 
 
 if __name__ == "__main__":

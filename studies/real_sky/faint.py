@@ -1,4 +1,4 @@
-"""Cut the held-out stars of an image and add noise until they are faint, for all packages.
+"""Cut the held-out stars and add noise until they are faint, for all packages.
 
 usage: faint.py IMAGE SELECTION OUT.npz [SIDE] [COPIES]
 
@@ -7,9 +7,13 @@ SELECTION is the selection.csv that `psfdae from-stars` leaves: id, x, y (0-base
 their PSFs of sum 1, `star` (copies,), the star of each among the held-out ones, `id` and `at`
 (stars, 2), their brightest pixels (x, y), `own` (copies,), the noise of the truth. Every frame is
 moved by a random whole pixel per axis, so that no package profits from where the middle is.
+
+The stars are cut from the image, with their own noise and that of their sky. Beside an image of
+images.py there is IMAGE.npz: then they are cut from its noise-free stars, and `own` is 0.
 """
 
 import sys
+from pathlib import Path
 
 import numpy as np
 from astropy.io import fits
@@ -45,13 +49,25 @@ def brightest(data, x, y, reach):
     return x + column - 2, y + row - 2
 
 
+def noise_free(known, star, at, half):
+    """Stamp of a star of images.py about pixel (x, y) of its image."""
+    psf = np.pad(np.asarray(known["psf"][star], np.float64), half)
+    column, row = at - known["pixel"][star] + psf.shape[-1] // 2
+    return psf[row - half : row + half, column - half : column + half]
+
+
 def main(image, selection, out, side=10, copies=10):
     side, copies = int(side), int(copies)
     half, reach = side // 2 + MOVE, side // 2 + MOVE + RING + 3
     data, stars = padded(image, reach), Table.read(selection, format="ascii.csv")
     stars = stars[stars["part"] == "held out"]
     at = np.array([brightest(data, s["x"], s["y"], reach) for s in stars])
-    wide, own = zip(*(around(data, x, y, half, reach) for x, y in at), strict=True)
+    file = Path(image).with_suffix(".npz")
+    if file.exists():
+        known, own = np.load(file), np.zeros(len(stars))
+        wide = [noise_free(known, s, xy, half) for s, xy in zip(stars["id"], at, strict=True)]
+    else:
+        wide, own = zip(*(around(data, x, y, half, reach) for x, y in at), strict=True)
     rng = np.random.default_rng(int(stars["id"].sum()))
     star = np.repeat(np.arange(len(stars)), copies)
     move = rng.integers(0, 2 * MOVE + 1, (star.size, 2))[:, :, None] + np.arange(side)

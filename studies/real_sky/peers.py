@@ -4,9 +4,10 @@ usage: peers.py PACKAGE SAMPLING ORDER IMAGE SELECTION FAINT.npz OUT.npz
 
 PACKAGE is piff, psfex or epsf; SAMPLING the samples' distance in pixels (1 or 0.5); ORDER that of
 the polynomial over the field (epsf has none). OUT has, of every copy and S/N, the PSF at the fitted
-centre (`fitted<S/N>`), its average over the posterior of the centre (`averaged<S/N>`) and the
-fitted flux (`flux<S/N>`); and of the package its `version` and `fit_cpu_s`, what its fit took.
-Flux, sky and centre are unknown to it; the noise, which weighs the centres, is given.
+centre (`fitted<S/N>`), its average over the posterior of the centre (`averaged<S/N>`), the same
+where it is known how far faint.py moves a frame (`framed<S/N>`), as psfdae knows it from its own
+framing, and the fitted flux (`flux<S/N>`); and of the package its `version` and `fit_cpu_s`, what
+its fit took. Flux, sky and centre are unknown to it; the noise, which weighs the centres, is given.
 """
 
 import os
@@ -19,11 +20,15 @@ from pathlib import Path
 import numpy as np
 from astropy.io import fits
 from astropy.table import Table
-from faint import SNR, around, brightest, padded
+from faint import MOVE, SNR, around, brightest, padded
 from scipy.interpolate import make_interp_spline
+from scipy.linalg import solve
 
 STEP, REACH = 0.25, 3  # px: of drawn centres, which go that far from the middle
+CENTRES = ("fitted", "averaged", "framed")
+FRAMED = MOVE + 0.5  # px per axis from the middle, in which all centres are
 FIELD = 40  # px beyond the image
+GAIN, SATURATE = 2.0, 4000  # electrons a count, and counts, where the header has none
 
 
 def training(image, selection, half=10):
@@ -39,11 +44,11 @@ def piff(image, selection, side, sampling, order):
     import galsim
     import piff
 
-    stars, half = [], side // 2 + 2
+    stars, half, gain = [], side // 2 + 2, fits.getheader(image).get("GAIN", GAIN)
     for (x, y), (px, py), stamp, sigma in training(image, selection, half):
         frame = galsim.Image(stamp, xmin=int(px) - half + 1, ymin=int(py) - half + 1, scale=1.0)
-        # Photons as of two electrons a count, and one per cent of the star that no model fits.
-        variance = sigma**2 + 0.5 * stamp.clip(0) + (0.01 * stamp) ** 2
+        # Its photons, and one per cent of the star that no model fits.
+        variance = sigma**2 + stamp.clip(0) / gain + (0.01 * stamp) ** 2
         weight = galsim.Image(1 / variance, xmin=frame.xmin, ymin=frame.ymin, scale=1.0)
         place = galsim.PositionD(float(x) + 1, float(y) + 1)
         stars.append(piff.Star(piff.StarData(frame, place, weight=weight), None))
@@ -51,6 +56,7 @@ def piff(image, selection, side, sampling, order):
     # and chi-squared 8 a degree of freedom), and those of a pixel err 3 to 9 % more (one split).
     model = piff.PixelGrid(sampling, round(side / sampling) + 1, centered=False)
     outliers = [piff.ChisqOutliers(nsigma=6, max_remove=0.02)]
+    piff.BasisPolynomial._solve_direct_python = normal_equations
     psf = piff.SimplePSF(model, piff.BasisPolynomial(order), outliers=outliers)
     psf.fit(stars, {0: galsim.PixelScale(1.0)}, None)
 
@@ -61,6 +67,18 @@ def piff(image, selection, side, sampling, order):
         return psf.draw(x=x + 1, y=y + 1, image=frame, center=centre, chipnum=0, flux=1.0).array
 
     return draw
+
+
+def normal_equations(polynomial, stars, logger):
+    """Piff's own equations as one product of matrices: its sum over stars takes minutes."""
+    basis = np.array([polynomial.basis(star) for star in stars])
+    left, right = (np.array([getattr(star.fit, a) for star in stars]) for a in ("alpha", "beta"))
+    size, terms = right.shape[1], basis.shape[1]
+    pairs = (basis[:, :, None] * basis[:, None]).reshape(len(stars), -1)
+    left = (left.reshape(len(stars), -1).T @ pairs).reshape(size, size, terms, terms)
+    left = left.transpose(0, 2, 1, 3).reshape(size * terms, -1)
+    found = solve(left, (right.T @ basis).ravel(), assume_a="pos", check_finite=False)
+    polynomial.q += found.reshape(polynomial.q.shape)
 
 
 def psfex(image, selection, side, sampling, order):
@@ -76,7 +94,8 @@ def psfex(image, selection, side, sampling, order):
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / "sex.param").write_text(columns)
         words = "-c /dev/null -CATALOG_NAME all.cat -CATALOG_TYPE FITS_LDAC -FILTER N"
-        words += " -PARAMETERS_NAME sex.param -DETECT_THRESH 5 -ANALYSIS_THRESH 5 -SATUR_LEVEL 4000"
+        words += " -PARAMETERS_NAME sex.param -DETECT_THRESH 5 -ANALYSIS_THRESH 5"
+        words += f" -SATUR_LEVEL {fits.getheader(image).get('SATURATE', SATURATE)}"
         run = ["source-extractor", str(Path(image).resolve()), *words.split()]
         subprocess.run(run, cwd=folder, check=True, capture_output=True)
         with fits.open(f"{folder}/all.cat") as file:
@@ -164,7 +183,7 @@ def lattice(centre, shape, count):
 
 
 def restored(centres, stamp, sigma):
-    """PSF at the fitted centre, its average over the posterior of the centre, and the flux."""
+    """PSFs of CENTRES, and the flux."""
     product = np.tensordot(centres.free, stamp.astype(np.float64), 2)
 
     def gain(points):
@@ -172,23 +191,32 @@ def restored(centres, stamp, sigma):
         match, norm = centres.between(points, product, centres.norm)
         return np.maximum(match, 0.0) ** 2 / (norm * sigma**2), norm, match / norm
 
-    points = lattice(np.zeros(2), np.eye(2) * 2.0, 17)
-    centre = points[gain(points)[0].argmax()]
-    for step in (0.25, 0.0625, 0.0156, 0.0039):
-        near = lattice(centre, np.eye(2) * step, 9)
-        centre = near[gain(near)[0].argmax()]
-    fitted = centres.mean(centre[None], np.ones(1))
-    # Four standard errors about it, of a parabola: then the posterior itself weighs.
-    at = centre + 0.05 * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, -1]])
-    peak, up, down, right, left, both, neither = gain(at)[0]
-    mixed = (both + neither - up - down - right - left + 2 * peak) / 2
-    bend = -np.array([[up + down - 2 * peak, mixed], [mixed, right + left - 2 * peak]]) / 0.05**2
-    value, axes = np.linalg.eigh(bend)  # of χ², twice the inverse variance
-    near = lattice(centre, axes * np.clip(4.0 / np.sqrt(value.clip(1e-9) / 2), 0.02, 2.0), 17)
-    near = near[np.abs(near).max(axis=1) <= centres.offsets[-1]]
-    found, norm, _ = gain(near)
-    weight = np.exp((found - found.max()) / 2) / np.sqrt(norm)
-    return fitted, centres.mean(near, weight), gain(centre[None])[2][0]
+    def best(start, most):
+        """Best centre within `most`, searched for from a lattice within `start`."""
+        points = lattice(np.zeros(2), np.eye(2) * start, 17)
+        centre = points[gain(points)[0].argmax()]
+        for step in (0.25, 0.0625, 0.0156, 0.0039):
+            near = np.clip(lattice(centre, np.eye(2) * step, 9), -most, most)
+            centre = near[gain(near)[0].argmax()]
+        return centre
+
+    def averaged(centre, most):
+        """Over four standard errors about it, of a parabola: then the posterior itself weighs."""
+        around = np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, -1]])
+        peak, up, down, right, left, both, neither = gain(centre + 0.05 * around)[0]
+        mixed = (both + neither - up - down - right - left + 2 * peak) / 2
+        bend = np.array([[2 * peak - up - down, -mixed], [-mixed, 2 * peak - right - left]])
+        value, axes = np.linalg.eigh(bend / 0.05**2)  # of χ², twice the inverse variance
+        near = lattice(centre, axes * np.clip(4.0 / np.sqrt(value.clip(1e-9) / 2), 0.02, 2.0), 17)
+        near = near[np.abs(near).max(axis=1) <= most]
+        found, norm, _ = gain(near)
+        return centres.mean(near, np.exp((found - found.max()) / 2) / np.sqrt(norm))
+
+    farthest = centres.offsets[-1]
+    centre = best(2.0, farthest)
+    framed = centre if np.abs(centre).max() <= FRAMED else best(FRAMED, FRAMED)
+    psfs = centres.mean(centre[None], np.ones(1)), averaged(centre, farthest)
+    return *psfs, averaged(framed, FRAMED), gain(centre[None])[2][0]
 
 
 def version(package):
@@ -207,22 +235,23 @@ def main(package, sampling, order, image, selection, faint, out):
     found = {"version": version(package), "fit_cpu_s": sum(os.times()[:4])} | {
         f"{name}{snr}": np.empty(known["truth"].shape[: 1 if name == "flux" else 3])
         for snr in SNR
-        for name in ("fitted", "averaged", "flux")
+        for name in (*CENTRES, "flux")
     }
     for star, (x, y) in enumerate(known["at"]):
         centres = Centres(draw, x, y, side)
         for snr in SNR:
             for copy in np.flatnonzero(known["star"] == star):
                 stamp = known[f"noisy{snr}"][copy]
-                fitted, mean, flux = restored(centres, stamp, float(known[f"sigma{snr}"]))
-                found[f"fitted{snr}"][copy], found[f"averaged{snr}"][copy] = fitted, mean
-                found[f"flux{snr}"][copy] = flux
+                for name, one in zip(
+                    (*CENTRES, "flux"),
+                    restored(centres, stamp, float(known[f"sigma{snr}"])),
+                    strict=True,
+                ):
+                    found[f"{name}{snr}"][copy] = one
     np.savez_compressed(f"{out}.part.npz", **found)
     Path(f"{out}.part.npz").replace(out)
     for snr in SNR:
-        errors = [
-            np.square(found[f"{n}{snr}"] - known["truth"]).mean() for n in ("fitted", "averaged")
-        ]
+        errors = [np.square(found[f"{n}{snr}"] - known["truth"]).mean() for n in CENTRES]
         print(package, sampling, order, snr, *(f"{error:.3e}" for error in errors))
 
 
