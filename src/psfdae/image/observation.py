@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -86,9 +86,20 @@ class Source:
         """The image's file, or what an array is called in messages."""
         return self.image if isinstance(self.image, Path) else Path("array")
 
+    @property
+    def name(self) -> str:
+        """What a model of its stars is called by default."""
+        return self.path.name.split(".")[0] or "model"
+
     def files(self) -> tuple[object, ...]:
         """All that is read."""
         return (self.image, self.catalogue, self.mask, self.weight, self.variance)
+
+    def of_each(self, images: Sequence[Path]) -> list[Source]:
+        """Several images of which the same is stated; a star belongs to those on which it is."""
+        if self.catalogue is not None:
+            require_sky(self.catalogue, "a training on several images")
+        return [replace(self, image=one, on_image=self.catalogue is not None) for one in images]
 
     def open(self, stamp_px: int, margin: int = 0) -> Observation:
         """Check all that can be checked without reading pixels.
@@ -275,6 +286,17 @@ class Source:
         if table is None:
             raise ObservationError(self.path, f"no catalogue is given to take {name!r} from")
         return table.numbers(name)
+
+
+def require_sky(stars: StarList, what: str) -> None:
+    """Refuse a star list of several images that has no sky coordinates."""
+    table = as_catalogue(stars)
+    if not table.positions().sky:
+        raise ObservationError(
+            table.path,
+            f"{what} takes a list with sky coordinates, or --detect: pixels do not say which "
+            "image they are of",
+        )
 
 
 def _refuse_colours(image: ImageFile) -> None:
@@ -632,6 +654,34 @@ class Observation:
         raise_flag(flags, StarFlag.TRUNCATED, truncated)
         known = (flux, background, noise, gain, listed)
         return Stamps(data, masked, saturated, flags, ids, x, y, *known)
+
+
+@dataclass(frozen=True)
+class Exposures(Observation):
+    """The stars of several images of one camera, one image after the other."""
+
+    parts: Sequence[Observation] = ()
+
+    @classmethod
+    def of(cls, parts: Sequence[Observation]) -> Exposures:
+        """Several observations as one; what is known of the camera is that of the first."""
+        first, shapes = parts[0], [part.shape for part in parts if part.shape]
+        joined = {
+            "path": Path(f"{first.path} and {len(parts) - 1} more"),
+            "count": sum(part.count for part in parts),
+            "shape": tuple(map(max, zip(*shapes, strict=True))),
+            "header_cards": [card for part in parts for card in part.header_cards],
+        }
+        return cls(**vars(first) | joined, parts=parts)
+
+    def with_margin(self, margin: int) -> Exposures:
+        """As that of one."""
+        return replace(self, parts=[part.with_margin(margin) for part in self.parts])
+
+    def chunks(self, rows: int) -> Iterator[Stamps]:
+        """As that of one; none has stars of two images."""
+        for part in self.parts:
+            yield from part.chunks(rows)
 
 
 def _rows(pixels: Pixels, part: slice) -> np.ndarray:
