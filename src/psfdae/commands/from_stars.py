@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shlex
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -55,7 +55,7 @@ class Made:
     path: Path
     name: str
     kinds: tuple[type[Method], ...]
-    exposures: tuple[str, ...] = ()
+    exposures: Sequence[str] = ()
 
     @property
     def stars(self) -> Path:
@@ -147,16 +147,13 @@ def trained(
 
     `config` is what `from_stars` receives, or its tree.
     """
-    sources, settings = [stated.source(image[0])], of_config(config)
-    several: tuple[str, ...] = ()
-    if len(image) > 1:
-        sources = sources[0].of_each(image)
-        several = tuple(_stem((one,), None) for one in image)
-        # On validation stars, the field of all has not become that of an exposure yet.
-        taken = taken or ("field" if "field" in settings.methods else None)
+    sources, settings = stated.source(image[0]).of_each(image), of_config(config)
+    exposures = [_stem((one,), None) for one in image] if len(image) > 1 else []
+    if exposures and taken is None and "field" in settings.methods:
+        taken = "field"  # validation stars would judge the field of all, not those of exposures
     settings, kinds, tried = _methods(settings, taken)
-    files = Made(out, _stem(image, name), kinds, several)
-    if files.name in several:
+    files = Made(out, _stem(image, name), kinds, exposures)
+    if files.name in exposures:
         raise FolderError(f"{files.bundle}: of an image and of all; --name changes the latter")
     lists = [files.star_list(source.name) for source in sources] if stated.detect else []
     check_outputs([*files.written(), *lists, page], [f for s in sources for f in s.files()])

@@ -95,11 +95,13 @@ class Source:
         """All that is read."""
         return (self.image, self.catalogue, self.mask, self.weight, self.variance)
 
-    def of_each(self, images: Sequence[Path]) -> list[Source]:
-        """Several images of which the same is stated; a star belongs to those on which it is."""
-        if self.catalogue is not None:
+    def of_each(self, images: Sequence[Path | np.ndarray]) -> list[Source]:
+        """The same of each image; stars of the list of several are of those on which they are."""
+        on_image = self.on_image
+        if self.catalogue is not None and len(images) > 1:
             require_sky(self.catalogue, "a training on several images")
-        return [replace(self, image=one, on_image=self.catalogue is not None) for one in images]
+            on_image = True
+        return [replace(self, image=image, on_image=on_image) for image in images]
 
     def open(self, stamp_px: int, margin: int = 0) -> Observation:
         """Check all that can be checked without reading pixels.
@@ -654,34 +656,6 @@ class Observation:
         raise_flag(flags, StarFlag.TRUNCATED, truncated)
         known = (flux, background, noise, gain, listed)
         return Stamps(data, masked, saturated, flags, ids, x, y, *known)
-
-
-@dataclass(frozen=True)
-class Exposures(Observation):
-    """The stars of several images of one camera, one image after the other."""
-
-    parts: Sequence[Observation] = ()
-
-    @classmethod
-    def of(cls, parts: Sequence[Observation]) -> Exposures:
-        """Several observations as one; what is known of the camera is that of the first."""
-        first, shapes = parts[0], [part.shape for part in parts if part.shape]
-        joined = {
-            "path": Path(f"{first.path} and {len(parts) - 1} more"),
-            "count": sum(part.count for part in parts),
-            "shape": tuple(map(max, zip(*shapes, strict=True))),
-            "header_cards": [card for part in parts for card in part.header_cards],
-        }
-        return cls(**vars(first) | joined, parts=parts)
-
-    def with_margin(self, margin: int) -> Exposures:
-        """As that of one."""
-        return replace(self, parts=[part.with_margin(margin) for part in self.parts])
-
-    def chunks(self, rows: int) -> Iterator[Stamps]:
-        """As that of one; none has stars of two images."""
-        for part in self.parts:
-            yield from part.chunks(rows)
 
 
 def _rows(pixels: Pixels, part: slice) -> np.ndarray:

@@ -14,7 +14,7 @@ import numpy as np
 from psfdae.bright_stars import BrightStars
 from psfdae.files import Column, Product
 from psfdae.image.errors import ObservationError, no_formula
-from psfdae.image.observation import ASSUMED_SCALE, Exposures, Observation, Source, list_offset
+from psfdae.image.observation import ASSUMED_SCALE, Observation, Source, list_offset
 from psfdae.image.selection import Candidates, Verdict, advice, collect
 from psfdae.image.training_images import single_psf, star_grid, training_columns
 from psfdae.model.psf_model import SCALE_TOLERANCE
@@ -53,7 +53,7 @@ class Stars:
     source : Source
         The image, and what was stated about it; of several, the first one.
     observation : Observation
-        All of its stars.
+        All of its stars; of several images that of the first, with the names of all.
     candidates : Candidates
         What was measured of each, and the bright ones.
     held_out : ndarray of bool
@@ -140,9 +140,13 @@ class Stars:
             If the image or the list cannot be used, or too few stars are bright enough.
         """
         threshold = DETECTED_SIGMA if detect is True else detect or None
-        images = [image] if isinstance(image, str | Path | np.ndarray) else [*image]
+        images: list[Path | np.ndarray]
+        if isinstance(image, str | Path | np.ndarray):
+            images = [image if isinstance(image, np.ndarray) else Path(image)]
+        else:
+            images = [Path(one) for one in image]
         source = Source(
-            images[0] if isinstance(images[0], np.ndarray) else Path(images[0]),
+            images[0],
             catalogue,
             threshold,
             extension,
@@ -157,8 +161,8 @@ class Stars:
             saturate=saturate,
             accept_offset=accept_offset,
         )
-        sources = [source] if len(images) == 1 else source.of_each([Path(one) for one in images])
-        return cls.of(sources, with_keywords(settings_model()(), IMAGE_GROUPS, settings))
+        settings_of_all = with_keywords(settings_model()(), IMAGE_GROUPS, settings)
+        return cls.of(source.of_each(images), settings_of_all)
 
     @classmethod
     def of(cls, sources: Sequence[Source], settings: Settings) -> Stars:
@@ -185,7 +189,13 @@ class Stars:
         Each is held out or not as in its own image. CalibrationStarsError: all are too few.
         """
         first = exposures[0]
-        observation = Exposures.of([part.observation for part in exposures])
+        seen = [part.observation for part in exposures]
+        observation = replace(
+            seen[0],
+            path=Path(f"{seen[0].path} and {len(seen) - 1} more"),
+            shape=tuple(map(max, zip(*(one.shape or () for one in seen), strict=True))),
+            header_cards=[card for one in seen for card in one.header_cards],
+        )
         found = Candidates.joined([part.candidates for part in exposures])
         found.require(observation.path, first.settings.calibration_stars.stars_min)
         sky = np.repeat(
@@ -329,9 +339,10 @@ def _require_own_names(sources: Sequence[Source]) -> None:
     """Refuse images whose models would have the same name."""
     known: dict[str, Path] = {}
     for source in sources:
-        if (other := known.setdefault(source.name, source.path)) is not source.path:
-            problem = f"its model would have the name of that of {other}, {source.name!r}"
-            raise ObservationError(source.path, problem)
+        if source.name in known:
+            problem = f"its model would have the name of that of {known[source.name]}"
+            raise ObservationError(source.path, f"{problem}, {source.name!r}")
+        known[source.name] = source.path
 
 
 def _require_one_camera(opened: Sequence[Observation]) -> None:
