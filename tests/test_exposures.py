@@ -221,7 +221,8 @@ def night(tmp_path_factory):
     for seed, (name, what) in enumerate(NIGHT.items()):
         simulated(folder, name, 11 + seed, *what, INSTRUME="Cam", FILTER="R")
     images = [folder / f"{name}.fits" for name in NIGHT]
-    said = trained(*images, *FEW, "--detect", "--out", folder / "m")
+    page = ("--report", folder / "m/page.html")
+    said = trained(*images, *FEW, "--detect", *page, "--out", folder / "m")
     return folder, folder / "m", said
 
 
@@ -259,6 +260,8 @@ def test_stars_are_chosen_and_held_out_in_each_image_by_itself(night):
     assert [*table["image"]] == [
         f"{name}.fits" for name, (count, _) in NIGHT.items() for _ in range(count)
     ]
+    page = (out / "page.html").read_text(encoding="utf-8")
+    assert "<td>good</td><td>163</td>" in page and "rich.fits and 2 more" in page
     assert [*table["part"][:150]] == [*alone.table["part"]]
     bright = stars.candidates.bright
     assert len(set(bright.row)) == len(bright) == len(table) == 163
@@ -270,6 +273,17 @@ def test_stars_are_chosen_and_held_out_in_each_image_by_itself(night):
     with pytest.raises(PredictionError, match="was trained on other stars of this image"):
         validate(model, alone)
     assert {*for_exposures(load_model(out / "all.psf.safetensors"), stars)} == {*NIGHT}
+
+
+def test_a_list_on_the_sky_is_one_of_all_images(night, tmp_path):
+    rich = night[0] / "rich.fits"
+    again = simulated(tmp_path, "again", 11, 150, 1.02).image  # the seed of the other one
+    Table.read(rich.with_name("rich.csv"))["id", "ra", "dec"].write(tmp_path / "sky.csv")
+    stars = Stars.from_image([rich, again], tmp_path / "sky.csv", stamp_px=STAMP)
+    first, second = (part.candidates for part in stars.exposures)
+    assert len(first.bright) == len(second.bright) == 150
+    assert first.position == pytest.approx(second.position, abs=1e-3)
+    assert stars.candidates.bright.row[150] == 150
 
 
 def test_a_model_without_a_field_is_that_of_each_exposure(night):
