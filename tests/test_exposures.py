@@ -13,14 +13,14 @@ from astropy.table import Table
 from click.testing import CliRunner
 
 from command_line import refused
-from psfdae import PredictionError, PsfModel, Stars, for_exposures, load_model
+from psfdae import PredictionError, PsfModel, Stars, load_model
 from psfdae.cli import main
 from psfdae.commands import from_stars as stage
 from psfdae.field_psf import _deformations, fit_field
 from psfdae.files import atomic_path
 from psfdae.image.observation import Source
 from psfdae.model import packing
-from psfdae.model.exposures import exposure
+from psfdae.model.exposures import exposure, for_exposures
 from psfdae.model.settings import from_words
 from psfdae.model.validation import validate
 from psfdae.model.wings import Wings

@@ -26,7 +26,6 @@ from psfdae.version import __version__
 if TYPE_CHECKING:
     from psfdae.errors import Error
     from psfdae.image.stamps import StarFlag
-    from psfdae.model.exposures import for_exposures
     from psfdae.model.field_psfs import PredictionError
     from psfdae.model.fitting import fit
     from psfdae.model.prediction import Prediction
@@ -46,7 +45,6 @@ _MODULES = {
     "Stars": "model.stars",
     "Wavefronts": "sensing.results",
     "fit": "model.fitting",
-    "for_exposures": "model.exposures",
     "load_model": "model.psf_model",
     "read_telescope": "telescope.settings",
     "validate": "model.validation",
@@ -64,7 +62,6 @@ __all__ = [
     "Wavefronts",
     "__version__",
     "fit",
-    "for_exposures",
     "load_model",
     "read_telescope",
     "validate",

@@ -86,7 +86,7 @@ def for_exposures(model: PsfModel, stars: Stars) -> dict[str, PsfModel]:
     Parameters
     ----------
     model : PsfModel
-        Fitted to these stars.
+        Fitted to them, as `psfdae.fit` does it.
     stars : Stars
         Of several images.
 
@@ -95,16 +95,6 @@ def for_exposures(model: PsfModel, stars: Stars) -> dict[str, PsfModel]:
     dict of str to PsfModel
         By the images' names without suffix, as `psfdae exposure` adapts a model to an exposure;
         `model` itself where its method knows no field, or an image has fewer than 5 bright stars.
-
-    Examples
-    --------
-    >>> from astropy.io import fits
-    >>> for name in ("first.fits", "second.fits"):
-    ...     fits.writeto(name, image)
-    >>> night = psfdae.Stars.from_image(["first.fits", "second.fits"], detect=True, **camera)
-    >>> both = psfdae.fit(night, method="field", orders=[1], modes=4)
-    >>> psfdae.for_exposures(both, night)["second"]
-    PsfModel('second', 16×16 px of 1", S/N 5 … 50)
     """
     field, made = model.engine.estimator, {}
     for part in stars.exposures:
