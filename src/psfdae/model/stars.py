@@ -53,7 +53,7 @@ class Stars:
     source : Source
         The image, and what was stated about it; of several, the first one.
     observation : Observation
-        All of its stars; of several images that of the first, with the names of all.
+        All of its stars; of several images that of the first, under a name for all.
     candidates : Candidates
         What was measured of each, and the bright ones.
     held_out : ndarray of bool
