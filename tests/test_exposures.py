@@ -1,22 +1,38 @@
-"""A field model for another exposure: what few stars of it show, and what stays."""
+"""Field models of several exposures: what few stars of one show, and what stays."""
 
 from __future__ import annotations
 
+import os
+import signal
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from astropy.io import fits
+from astropy.table import Table
 from click.testing import CliRunner
 
-from psfdae import PredictionError, PsfModel, load_model
+from command_line import refused
+from psfdae import PredictionError, PsfModel, Stars, load_model
 from psfdae.cli import main
+from psfdae.commands import from_stars as stage
 from psfdae.field_psf import _deformations, fit_field
+from psfdae.files import atomic_path
 from psfdae.image.observation import Source
-from psfdae.model.exposures import exposure
-from psfdae.model.stars import Stars
+from psfdae.model import packing
+from psfdae.model.exposures import exposure, for_exposures
+from psfdae.model.settings import from_words
+from psfdae.model.validation import validate
+from psfdae.model.wings import Wings
 from psfdae_paper.stars.example import add_stamps, write_field
 
 SIZE, SKY, STAMP = 700, 100.0, 10
+FEW = (
+    "methods=[noisy,field]",
+    "framing.stamp_px=10",
+    "parts.train_stars=150",
+    "parts.test_stars=30",
+)
 PLACES = np.stack(np.meshgrid(*[np.linspace(60, 640, 5)] * 2), axis=-1).reshape(-1, 2)
 
 
@@ -49,15 +65,23 @@ def run(*words):
     return CliRunner().invoke(main, [str(word) for word in words])
 
 
+def trained(*words):
+    """from-stars, with errors of models that are measured on few noisy images."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in (("NODES", 3), ("LEAST_STARS", 60), ("FEW_STARS", 40)):
+            patch.setattr(packing, name, value)
+        done = run("from-stars", *words)
+    assert done.exit_code == 0, done.output
+    return done.output
+
+
 @pytest.fixture(scope="module")
 def sky(tmp_path_factory):
     """A model of an exposure with 300 stars, and another exposure with 10, of 4 % larger PSFs."""
     folder = tmp_path_factory.mktemp("exposures")
     simulated(folder, "rich", 1, 300, 1.0, INSTRUME="CAM ", FILTER="R")
-    few = ("framing.stamp_px=10", "parts.train_stars=150", "parts.test_stars=30")
     words = ("--catalogue", folder / "rich.csv", "--out", folder / "m", "--method", "field")
-    done = run("from-stars", folder / "rich.fits", *words, "methods=[noisy,field]", *few)
-    assert done.exit_code == 0, done.output
+    trained(folder / "rich.fits", *words, *FEW)
     return (
         folder,
         load_model(folder / "m/rich.psf.safetensors"),
@@ -72,10 +96,10 @@ def error(model, width):
     return np.square(found - true / inside).mean()
 
 
-def test_ten_stars_are_as_good_as_a_hundred_with_another_exposure(sky):
-    folder, model, sparse = sky
-    adapted, said = exposure(model, sparse, "sparse")
-    assert "10 stars of sparse.fits" in said
+@pytest.fixture(scope="module")
+def hundred(sky):
+    """Error of the field of 100 stars of the sparse exposure's PSFs, alone."""
+    folder, model, _ = sky
     stars = Stars.from_image(
         simulated(folder, "hundred", 3, 100, 1.04).image, folder / "hundred.csv",
         stamp_px=STAMP, train_stars=60, test_stars=10,
@@ -85,7 +109,13 @@ def test_ten_stars_are_as_good_as_a_hundred_with_another_exposure(sky):
     alone = fit_field(bright, SKY, STAMP + 4, STAMP, *splines).model
     images = alone.images(alone.terms(PLACES), (PLACES - np.rint(PLACES))[:, ::-1], STAMP)
     inside = psfs(np.rint(PLACES), 1.04, STAMP).sum(axis=(1, 2), keepdims=True)
-    hundred = np.square(images - psfs(PLACES, 1.04, STAMP) / inside).mean()
+    return np.square(images - psfs(PLACES, 1.04, STAMP) / inside).mean()
+
+
+def test_ten_stars_are_as_good_as_a_hundred_with_another_exposure(sky, hundred):
+    _, model, sparse = sky
+    adapted, said = exposure(model, sparse, "sparse")
+    assert "10 stars of sparse.fits" in said
     assert error(adapted, 1.04) < 1.15 * hundred
     assert error(adapted, 1.04) < 0.2 * error(model, 1.04)
 
@@ -176,3 +206,160 @@ def test_deformations_are_the_slopes_of_the_splines():
     largest = np.abs(wanted).max(axis=(1, 2), keepdims=True)
     off = (np.abs(found - wanted) / largest).max(axis=(1, 2))
     assert (off < [0.005] * 3 + [0.02] * 3).all()
+
+
+# Several exposures in one training.
+
+NIGHT = {"rich": (150, 1.0), "poor": (10, 1.04), "empty": (3, 0.98)}
+"""Stars of three exposures, and how wide their PSFs are."""
+
+
+@pytest.fixture(scope="module")
+def night(tmp_path_factory):
+    """A folder with exposures, their model in another one, and what the command said."""
+    folder = tmp_path_factory.mktemp("night")
+    for seed, (name, what) in enumerate(NIGHT.items()):
+        simulated(folder, name, 11 + seed, *what, INSTRUME="Cam", FILTER="R")
+    images = [folder / f"{name}.fits" for name in NIGHT]
+    page = ("--report", folder / "m/page.html")
+    said = trained(*images, *FEW, "--detect", *page, "--out", folder / "m")
+    return folder, folder / "m", said
+
+
+def test_a_poor_exposure_of_a_night_has_a_field_as_of_a_hundred_stars(night, hundred):
+    _, out, said = night
+    models = {name: load_model(out / f"{name}.psf.safetensors") for name in ("all", *NIGHT)}
+    assert 0.2 * hundred < error(models["poor"], 1.04) < 1.15 * hundred
+    assert error(models["poor"], 1.04) < 0.1 * error(models["all"], 1.04)
+    assert 0.2 * hundred < error(models["rich"], 1.0) < 1.15 * hundred
+    assert models["empty"].sha256 == models["all"].sha256
+    assert "poor: 10 stars change" in said and "empty: 3 stars get the model of all" in said
+
+
+def test_predict_takes_the_exposure_s_own_model_from_the_folder(night, tmp_path):
+    folder, out, said = night
+    for name in ("rich", "poor"):
+        words = (folder / f"{name}.fits", "--detect", "--model", out)
+        done = run("predict", *words, "--out", tmp_path / f"{name}.fits")
+        assert done.exit_code == 0, done.output
+        header = fits.getheader(tmp_path / f"{name}.fits")
+        assert header["PSFSHA"] == load_model(out / f"{name}.psf.safetensors").sha256
+    assert said.splitlines()[-1].split("--out")[0].endswith(f"rich.fits --detect --model {out} ")
+    other = simulated(tmp_path, "other", 1, 5, 1.0).image
+    words = (other, "--detect", "--model", out, "--out", tmp_path / "x.fits")
+    assert "other: 0 models, expected one" in refused("predict", *words)
+
+
+def test_stars_are_chosen_and_held_out_in_each_image_by_itself(night):
+    folder, out, _ = night
+    images = [folder / f"{name}.fits" for name in NIGHT]
+    settings = {"stamp_px": STAMP, "train_stars": 150, "test_stars": 30}
+    stars = Stars.from_image(images, detect=True, **settings)
+    alone = Stars.from_image(images[0], detect=True, **settings)
+    table = Table.read(out / "selection.csv")
+    assert [*table["image"]] == [
+        f"{name}.fits" for name, (count, _) in NIGHT.items() for _ in range(count)
+    ]
+    page = (out / "page.html").read_text(encoding="utf-8")
+    assert "<td>good</td><td>163</td>" in page and "rich.fits and 2 more" in page
+    assert [*table["part"][:150]] == [*alone.table["part"]]
+    bright = stars.candidates.bright
+    assert len(set(bright.row)) == len(bright) == len(table) == 163
+    assert np.allclose(bright.position, np.stack([table["x"], table["y"]], axis=1), rtol=1e-5)
+    held_out, of = stars.held_out, stars.columns["field_index"].values
+    assert not {*of[:150]} & set(np.flatnonzero(held_out)) and held_out[150:160].any()
+    assert stars.name == "all" and [part.name for part in stars.exposures] == [*NIGHT]
+    model = load_model(out / "poor.psf.safetensors")
+    with pytest.raises(PredictionError, match="was trained on other stars of this image"):
+        validate(model, alone)
+    assert {*for_exposures(load_model(out / "all.psf.safetensors"), stars)} == {*NIGHT}
+
+
+def test_a_list_on_the_sky_is_one_of_all_images(night, tmp_path):
+    rich = night[0] / "rich.fits"
+    again = simulated(tmp_path, "again", 11, 150, 1.02).image  # the seed of the other one
+    Table.read(rich.with_name("rich.csv"))["id", "ra", "dec"].write(tmp_path / "sky.csv")
+    stars = Stars.from_image([rich, again], tmp_path / "sky.csv", stamp_px=STAMP)
+    first, second = (part.candidates for part in stars.exposures)
+    assert len(first.bright) == len(second.bright) == 150
+    assert first.position == pytest.approx(second.position, abs=1e-3)
+    assert stars.candidates.bright.row[150] == 150
+
+
+def test_a_model_without_a_field_is_that_of_each_exposure(night):
+    folder, _, _ = night
+    images = [folder / f"{name}.fits" for name in NIGHT]
+    stars = Stars.from_image(images, detect=True, stamp_px=STAMP, train_stars=150, test_stars=30)
+    shipped = load_model()
+    assert set(for_exposures(shipped, stars).values()) == {shipped}
+
+
+def test_the_sky_of_a_training_is_that_of_the_typical_star(night):
+    """In photons: an exposure with another gain counts by its stars."""
+    folder, _, _ = night
+    sources = [Source(folder / f"{name}.fits", detect=5.0) for name in ("rich", "poor")]
+    sources[1] = replace(sources[1], gain=3.0)
+    stars = Stars.of(sources, from_words(["framing.stamp_px=10"]))
+    sky = [part.settings.noise.background_photons for part in stars.exposures]
+    assert sky[1] == pytest.approx(9 * sky[0], rel=0.05)
+    assert stars.settings.noise.background_photons == sky[0] == pytest.approx(SKY + 9, rel=0.05)
+
+
+def test_several_images_that_belong_to_no_training_are_refused(sky, night, tmp_path):
+    folder, out, _ = night
+    rich, poor, empty = (folder / f"{name}.fits" for name in NIGHT)
+    twin = tmp_path / "rich.fit"
+    twin.symlink_to(poor)
+    coarse = simulated(tmp_path, "coarse", 1, 3, 1.0).image
+    fits.setval(coarse, "CDELT1", value=-2 / 3600), fits.setval(coarse, "CDELT2", value=2 / 3600)
+    for words, message in (
+        ([rich, twin, "--detect"], f"rich.fit: its model would have the name of that of {rich}"),
+        ([rich, coarse, "--detect"], "coarse.fits: the pixel scale is 2 arcsec, but that of"),
+        ([sky[0] / "sparse.fits", rich, "--detect"], "rich.fits: FILTER is 'R', but that of"),
+        ([rich, poor, "--catalogue", folder / "rich.csv"], "takes a list with sky coordinates"),
+        ([poor, empty, "--detect"], "poor.fits and 1 more: 13 stars are good enough"),
+        ([rich, poor, "--detect", "--name", "poor"], "of an image and of all; --name changes"),
+        ([rich, poor, "--detect", "--all-extensions"], "--all-extensions takes one file"),
+        ([rich, poor, "--detect", "--out", out], "a model is there already; --overwrite"),
+    ):
+        assert message in refused("from-stars", "--out", tmp_path / "m", *words, *FEW)
+    assert not (tmp_path / "m").exists()
+    done = run("from-stars", "seed=1", "--detect", "--out", tmp_path / "m")
+    assert done.exit_code == 2 and "Missing argument" in done.output
+
+
+def test_models_of_exposures_that_a_killed_run_left_are_no_finished_ones(
+    night, tmp_path, monkeypatch
+):
+    folder, _, _ = night
+    words = (
+        "from-stars",
+        folder / "rich.fits",
+        folder / "poor.fits",
+        "--detect",
+        "--out",
+        tmp_path,
+    )
+    monkeypatch.setattr(stage, "_make", lambda *_: "made")
+    (tmp_path / "poor.psf.safetensors").write_bytes(b"")
+    assert "a model is there already" in refused(*words, *FEW)
+    if (child := os.fork()) == 0:
+        with atomic_path(tmp_path / "all.psf.safetensors"):
+            os.kill(os.getpid(), signal.SIGKILL)
+    os.waitpid(child, 0)
+    assert run(*words, *FEW).exit_code == 0
+
+
+def test_wings_of_several_images_are_one_profile():
+    """Each counts by its error; a profile is by the light in the outer part of the PSF."""
+    radius, eye = np.array([5.0, 8.0, 12.0]), np.eye(2)
+    one = Wings(radius, np.array([1e-4, 3e-5]), 1e-12 * eye, 0.02)
+    assert Wings.joined([one]).plain() == one.plain()
+    both = Wings.joined([one, one])
+    assert both.profile == pytest.approx(one.profile)
+    assert both.light()[1] == pytest.approx(one.light()[1] / np.sqrt(2))
+    vague = Wings(radius, 3 * one.profile, 1e-8 * eye, 0.02)
+    assert Wings.joined([one, vague]).profile == pytest.approx(one.profile, rel=1e-3)
+    wider = Wings(radius, 2 * one.profile, 4e-12 * eye, 0.04)
+    light = np.array([0.03])
+    assert Wings.joined([one, wider]).total(light)[0] == pytest.approx(one.total(light)[0])

@@ -445,7 +445,7 @@ def test_commands_of_pages_run(page, tmp_path, monkeypatch):
     for _, name, *rest in steps:
         if rest[-2:] == ["$(cat", "model/overrides.txt)"]:
             rest[-2:] = (tmp_path / "model/overrides.txt").read_text().split()
-        if name == "exposure":
+        if "sparse.fits" in rest:
             shutil.copy("image.fits", "sparse.fits")
         words = [name, *rest, *small.get(name, [])]
         result = CliRunner().invoke(main, words)

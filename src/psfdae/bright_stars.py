@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -55,6 +56,11 @@ class BrightStars:
         arrays = {name: stars[name] for name in names}
         centre = np.full(arrays["position"].shape, np.nan)
         return cls(**arrays, centre=centre, flux=np.ones(len(centre)))
+
+    @classmethod
+    def joined(cls, several: Sequence[BrightStars]) -> BrightStars:
+        """Several sets, one after the other, with margins alike."""
+        return cls(*(np.concatenate([getattr(s, f.name) for s in several]) for f in fields(cls)))
 
     def __len__(self) -> int:
         return len(self.wide)

@@ -64,7 +64,7 @@ def command(name: str, settings: Reader | None = None) -> Callable[[Function], F
     parameters are options: required without a default, repeatable as `tuple[X, ...]`, a flag as
     bool, all fields of a dataclass. `Annotated` adds help (a text), a click type, or a dict of
     what click's option takes, where "flag" names it and "argument" makes it positional. Help is
-    the docstring.
+    the docstring. Of the words of a repeatable argument beside `config`, those with = are settings.
     """
 
     def mark(function: Function) -> Function:
@@ -223,12 +223,13 @@ def as_click(function: Callable[..., Any]) -> click.Command:
         path = click.Path(path_type=Path, dir_okay=False)
         about = "Settings as the workflow writes them, instead of overrides."
         parameters.append(click.Option(["--config", "settings"], type=path, help=about))
-        parameters.append(click.Argument(["overrides"], nargs=-1))
+        if not any(p.nargs == -1 for p in parameters):
+            parameters.append(click.Argument(["overrides"], nargs=-1))
 
     def run(**given: Any) -> None:
         config = {}
         if read is not None:
-            file, overrides = given.pop("settings"), given.pop("overrides")
+            file, overrides = given.pop("settings"), _settings(parameters, given)
             if file is not None and overrides:
                 raise click.UsageError("--config and overrides exclude each other")
             config["config"] = read(given, file, overrides)
@@ -238,6 +239,20 @@ def as_click(function: Callable[..., Any]) -> click.Command:
 
     help_text = cleandoc(function.__doc__ or "")
     return click.Command(spec.name.split()[-1], callback=run, params=parameters, help=help_text)
+
+
+def _settings(parameters: Sequence[click.Parameter], given: dict[str, Any]) -> Sequence[str]:
+    """Take the settings from what is given; a file among them is one as ./a=b.fits."""
+    if "overrides" in given:
+        found: Sequence[str] = given.pop("overrides")
+        return found
+    files = next(p for p in parameters if p.nargs == -1)
+    words = given[files.name or ""]
+    settings = [str(word) for word in words if re.match("[^/]*=", str(word))]
+    if not (kept := tuple(word for word in words if str(word) not in settings)):
+        raise click.MissingParameter(param=files)
+    given[files.name or ""] = kept
+    return settings
 
 
 def program(*functions: Callable[..., Any]) -> None:

@@ -1,12 +1,12 @@
-"""Stage `from-stars`: from an image and its star list to a model of its own, in one go."""
+"""Stage `from-stars`: from images and their star list to models of their own, in one go."""
 
 from __future__ import annotations
 
 import os
 import shlex
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -25,13 +25,15 @@ from psfdae.files import (
     write_product,
     write_text,
 )
+from psfdae.image.errors import ObservationError
 from psfdae.image.observation import Source
 from psfdae.method import Method, facts_of
 from psfdae.methods import method
 from psfdae.model.bundle import SUFFIX
+from psfdae.model.exposures import for_exposures
 from psfdae.model.fitting import best, described, fitted_to, makes_models, packed
 from psfdae.model.settings import CHOSEN, Settings, Words, of_config
-from psfdae.model.stars import Stars
+from psfdae.model.stars import ALL, Stars
 from psfdae.model.validation import validate
 from psfdae.options import File, Folder
 from psfdae.settings import ConfigError, as_overrides
@@ -53,21 +55,24 @@ class Made:
     path: Path
     name: str
     kinds: tuple[type[Method], ...]
+    exposures: Sequence[str] = ()
 
     @property
     def stars(self) -> Path:
         return self.path / "stars.h5"
 
-    @property
-    def star_list(self) -> Path:
-        return self.path / "stars.csv"
+    def star_list(self, exposure: str) -> Path:
+        return self.path / (f"{exposure}_stars.csv" if self.exposures else "stars.csv")
 
     def fit(self, kind: type[Method]) -> Path:
         return self.path / fits.named(kind, kind.name)
 
     @property
     def bundle(self) -> Path:
-        return self.path / f"{self.name}{SUFFIX}"
+        return self.bundle_of(self.name)
+
+    def bundle_of(self, exposure: str) -> Path:
+        return self.path / f"{exposure}{SUFFIX}"
 
     def written(self) -> list[Path]:
         """Files of the folder itself."""
@@ -75,20 +80,22 @@ class Made:
         own = [self.path / name for name in (*names, "report.csv", "found.csv", "report.png")]
         for kind in self.kinds:
             own += fits.outputs(kind, self.fit(kind))
+        own += map(self.bundle_of, self.exposures)
         return [self.stars, self.bundle, *own]
 
 
 @command("from-stars", Words())
 def from_stars(
     config: Settings,
-    image: Annotated[File, {"argument": True}],
+    image: Annotated[tuple[File, ...], {"argument": True, "metavar": "IMAGE... [OVERRIDES]..."}],
     stated: Stated,
-    name: Annotated[str | None, "Name of the model.  [default: the image's]"] = None,
+    name: Annotated[str | None, "Name of the model.  [default: the image's; all]"] = None,
     licence: Annotated[str, "Of the model."] = "not stated",
     taken: Annotated[
         str | None,
         {"flag": "--method"},
-        "Method of the model.  [default: that which errs least on validation stars]",
+        "Method of the model.  [default: that which errs least on validation stars; of several "
+        "images field]",
     ] = None,
     *,
     out: Annotated[Folder, "Folder for the model, its report and what they are made of."],
@@ -100,12 +107,15 @@ def from_stars(
     """Train a model on the bright stars of IMAGE.
 
     IMAGE is a FITS image with --catalogue or --detect, or a FITS cube of stamps. Some stars choose
-    the method of the model; others are held out and degraded to low S/N to test it.
+    the method of the model; others are held out and degraded to low S/N to test it. Several images
+    are exposures of one camera; all share a model, and each gets its own by the stars that it has.
     """
     job = dict(locals())
     stem = _stem(image, name)
     if not stated.all_extensions:
         print(trained(**job))
+    elif len(image) > 1:
+        raise ObservationError(image[1], "--all-extensions takes one file with images")
     else:
         jobs = {
             extension: {
@@ -116,15 +126,15 @@ def from_stars(
                 "out": out / extension,
                 "page": with_name(page, extension),
             }
-            for extension, of_image in images_of(image, stated).items()
+            for extension, of_image in images_of(image[0], stated).items()
         }
-        each(trained, jobs, image)
+        each(trained, jobs, image[0])
     print(f"next: {shlex.join(_next(image, stated, out, name))}")
 
 
 def trained(
     config: Settings | Mapping[str, Any],
-    image: Path,
+    image: tuple[Path, ...],
     stated: Stated,
     name: str | None,
     licence: str,
@@ -133,22 +143,32 @@ def trained(
     page: Path | None,
     overwrite: bool,
 ) -> str:
-    """Train a model on the stars of one image; how good it is, in a sentence.
+    """Train a model on the stars of one image, or of exposures; how good it is, in a sentence.
 
     `config` is what `from_stars` receives, or its tree.
     """
-    source = stated.source(image)
-    settings, kinds, tried = _methods(of_config(config), taken)
-    files = Made(out, _stem(image, name), kinds)
-    made = [*files.written(), *([files.star_list] if source.detect is not None else []), page]
-    check_outputs(made, source.files())
+    sources, settings = stated.source(image[0]).of_each(image), of_config(config)
+    exposures = [_stem((one,), None) for one in image] if len(image) > 1 else []
+    if exposures and taken is None and "field" in settings.methods:
+        taken = "field"  # validation stars would judge the field of all, not those of exposures
+    settings, kinds, tried = _methods(settings, taken)
+    files = Made(out, _stem(image, name), kinds, exposures)
+    if files.name in exposures:
+        raise FolderError(f"{files.bundle}: of an image and of all; --name changes the latter")
+    lists = [files.star_list(source.name) for source in sources] if stated.detect else []
+    check_outputs([*files.written(), *lists, page], [f for s in sources for f in s.files()])
     if page is not None and page.exists() and not (overwrite or interrupted(files.bundle)):
         raise FolderError(f"{page}: exists already; --overwrite replaces it")
     with _alone(out):
         finished = sorted(out.glob(f"*{SUFFIX}"))
-        if finished and not overwrite:
+        if finished and not (overwrite or _unfinished(files.bundle)):
             raise FolderError(f"{finished[0]}: a model is there already; --overwrite replaces it")
-        return _make(settings, source, files, licence, tried, page)
+        return _make(settings, sources, files, licence, tried, page)
+
+
+def _unfinished(bundle: Path) -> bool:
+    """Whether a killed run has left models of exposures, but not that of all."""
+    return not bundle.exists() and interrupted(bundle)
 
 
 def _methods(
@@ -168,21 +188,23 @@ def _methods(
     return settings.model_copy(update={"methods": names}), kinds, tried
 
 
-def _stem(image: Path, name: str | None) -> str:
+def _stem(image: tuple[Path, ...], name: str | None) -> str:
     """The name of a model, with which names of its files start; FolderError if they cannot."""
-    name = name or image.name.split(".")[0] or "model"
+    name = name or (ALL if len(image) > 1 else Source(image[0]).name)
     if "/" in name or len(f"{name}{SUFFIX}".encode()) > LONGEST_NAME:
         said = f"at most {LONGEST_NAME - len(SUFFIX)} bytes, and no folder"
         raise FolderError(f"--name {name}: expected the start of a file's name, {said}")
     return name
 
 
-def _next(image: Path, stated: Stated, out: Path, name: str | None) -> list[str]:
-    """The command that applies the models to all stars of their image."""
-    name = _stem(image, name)
-    model = out if stated.all_extensions else Made(out, name, ()).bundle
+def _next(image: tuple[Path, ...], stated: Stated, out: Path, name: str | None) -> list[str]:
+    """The command that applies the models to all stars of their image, or of the first one."""
+    several = len(image) > 1
+    name = _stem(image[:1], None if several else name)
+    stated = replace(stated, on_image=True) if several and stated.catalogue else stated
+    model = out if stated.all_extensions or several else Made(out, name, ()).bundle
     where = ["--model", str(model), "--out", str(out / f"{name}_psf.fits")]
-    return ["psfdae", "predict", str(image), *stated.words(), *where]
+    return ["psfdae", "predict", str(image[0]), *stated.words(), *where]
 
 
 @contextmanager
@@ -216,17 +238,18 @@ def _alone(folder: Path) -> Iterator[None]:
 
 def _make(
     settings: Settings,
-    source: Source,
+    sources: list[Source],
     files: Made,
     licence: str,
     tried: list[type[Method]],
     page: Path | None,
 ) -> str:
     """Make all files; how good the model is, in a sentence."""
-    stars = Stars.of(source, settings)
+    stars = Stars.of(sources, settings)
     print(*stars.notes, stars.summary(), sep="\n")
-    if source.detect is not None:
-        write_list(stars.observation, files.star_list)
+    for part in stars.each:
+        if part.observation.found is not None:
+            write_list(part.observation, files.star_list(part.name))
     write_columns(files.path / "selection.csv", stars.table.columns, digits=6)
     write_product(files.stars, "stars", stars.columns, stars.described())
     write_text(files.path / "overrides.txt", _overrides(stars.settings))
@@ -251,8 +274,14 @@ def _make(
     if model.wings is not None:
         print(f"light beyond the stamps: {model.wings}")
     # Its name is the last one to be there: it says that all is done.
-    with atomic_path(files.bundle) as unfinished:
-        model.save(unfinished)
+    with ExitStack() as stack:
+        model.save(stack.enter_context(atomic_path(files.bundle)))
+        own = for_exposures(model, stars)
+        for part in stars.exposures:
+            count, made = len(part), own[part.name]
+            made.save(stack.enter_context(atomic_path(files.bundle_of(part.name))))
+            said = "get the model of all" if made is model else "change the field of all"
+            print(f"{part.name}: {count} stars {said}")
         print("testing on the stars held out")
         report = validate(model, stars, fitted)
         write_columns(files.path / "evaluation.csv", report.evaluation.columns)

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 from psfdae.cli import REFUSABLE, refusal
 from psfdae.errors import Error
-from psfdae.image.catalogue import read_catalogue
 from psfdae.image.errors import ObservationError
 from psfdae.image.fits_file import science_images
+from psfdae.image.observation import require_sky
 from psfdae.threads import available_cores
 
 if TYPE_CHECKING:
@@ -38,12 +38,8 @@ def images_of(path: Path, stated: Stated) -> dict[str, Stated]:
     given = [f"--{name}" for name in ALONE if getattr(stated, name) is not None]
     if given:
         raise ObservationError(path, f"--all-extensions excludes {' and '.join(given)}")
-    if stated.catalogue is not None and not read_catalogue(stated.catalogue).positions().sky:
-        raise ObservationError(
-            stated.catalogue,
-            "--all-extensions takes a list with sky coordinates, or --detect: pixels do not say "
-            "which image they are of",
-        )
+    if stated.catalogue is not None:
+        require_sky(stated.catalogue, "--all-extensions")
     of_each = replace(stated, all_extensions=False, on_image=stated.catalogue is not None)
     return {name: replace(of_each, extension=n) for name, n in science_images(path).items()}
 

@@ -114,7 +114,7 @@ def predict(
     model: Annotated[
         Path | None,
         click.Path(path_type=Path),
-        "Model bundle, or folder of from-stars --all-extensions.  [default: the shipped one]",
+        "Model bundle, or folder of from-stars.  [default: the shipped one]",
     ] = None,
     plot: Annotated[File | None, "PNG with a map of the PSF over the field."] = None,
     overwrite: Annotated[bool, "Replace files that exist."] = False,
@@ -154,7 +154,8 @@ def bundle_of(model: Path | None, name: str) -> Path | None:
     """The bundle of an image, if the model is a folder with one for each."""
     if model is None or not model.is_dir():
         return model
-    found = sorted((model / name).glob(f"*{SUFFIX}"))
+    own = model / f"{name}{SUFFIX}"
+    found = [own] if own.is_file() else sorted((model / name).glob(f"*{SUFFIX}"))
     if len(found) != 1:
         raise PredictionError(f"{model / name}: {len(found)} models, expected one")
     return found[0]
@@ -176,6 +177,7 @@ def restored(
     """Predict the stars of one image; what there is to say of it."""
     source = stated.source(stars, flux_column=flux_column, background_column=background_column)
     found = out.with_name(f"{out.stem}_stars.csv") if stated.detect else None
+    model = bundle_of(model, source.name)
     check_outputs((out, plot, found), (*source.files(), model))
     check_targets(out, plot, found, overwrite)
     loaded = load_model(model)

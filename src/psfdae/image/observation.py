@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -86,9 +86,22 @@ class Source:
         """The image's file, or what an array is called in messages."""
         return self.image if isinstance(self.image, Path) else Path("array")
 
+    @property
+    def name(self) -> str:
+        """What a model of its stars is called by default."""
+        return self.path.name.split(".")[0] or "model"
+
     def files(self) -> tuple[object, ...]:
         """All that is read."""
         return (self.image, self.catalogue, self.mask, self.weight, self.variance)
+
+    def of_each(self, images: Sequence[Path | np.ndarray]) -> list[Source]:
+        """The same of each image; stars of the list of several are of those on which they are."""
+        on_image = self.on_image
+        if self.catalogue is not None and len(images) > 1:
+            require_sky(self.catalogue, "a training on several images")
+            on_image = True
+        return [replace(self, image=image, on_image=on_image) for image in images]
 
     def open(self, stamp_px: int, margin: int = 0) -> Observation:
         """Check all that can be checked without reading pixels.
@@ -275,6 +288,17 @@ class Source:
         if table is None:
             raise ObservationError(self.path, f"no catalogue is given to take {name!r} from")
         return table.numbers(name)
+
+
+def require_sky(stars: StarList, what: str) -> None:
+    """Refuse a star list of several images that has no sky coordinates."""
+    table = as_catalogue(stars)
+    if not table.positions().sky:
+        raise ObservationError(
+            table.path,
+            f"{what} takes a list with sky coordinates, or --detect: pixels do not say which "
+            "image they are of",
+        )
 
 
 def _refuse_colours(image: ImageFile) -> None:

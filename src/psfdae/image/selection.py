@@ -7,10 +7,11 @@ star of a stamp lies near index (s//2, s//2).
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields, replace
 from enum import StrEnum
-from itertools import repeat
+from itertools import accumulate, repeat
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -68,6 +69,27 @@ class Candidates:
     highest: np.ndarray  # pixel of the stamp, likewise; -inf if none can be used
     verdict: np.ndarray  # a `Verdict` for every star
     bright: BrightStars  # the good ones
+
+    @classmethod
+    def joined(cls, several: Sequence[Candidates]) -> Candidates:
+        """Those of several observations, one after the other."""
+        starts = accumulate((len(found.verdict) for found in several), initial=0)
+        bright = [
+            replace(found.bright, row=found.bright.row + start)
+            for found, start in zip(several, starts, strict=False)
+        ]
+        names = [field.name for field in fields(cls) if field.name != "bright"]
+        columns = {name: np.concatenate([getattr(f, name) for f in several]) for name in names}
+        return cls(**columns, bright=BrightStars.joined(bright))
+
+    def require(self, path: Path, least: int) -> None:
+        """Refuse an image with fewer good stars, by CalibrationStarsError."""
+        if len(self.bright) < least:
+            raise CalibrationStarsError(
+                f"{path}: {len(self.bright)} stars are good enough to learn from, "
+                f"calibration_stars.stars_min = {least} are needed "
+                f"(of {len(self.verdict)}: {self.count()})"
+            )
 
     def count(self) -> str:
         """How many stars there are of every verdict, in words."""
@@ -134,12 +156,7 @@ def collect(
     score = misfit(cut(bright.aligned(), side), bright.position, bright.noise / bright.flux)
     verdict[row[score > settings.misfit]] = Verdict.MISFIT
     result = Candidates(**found, bright=bright.of(score <= settings.misfit))
-    if len(result.bright) < settings.stars_min:
-        raise CalibrationStarsError(
-            f"{observation.path}: {len(result.bright)} stars are good enough to learn from, "
-            f"calibration_stars.stars_min = {settings.stars_min} are needed "
-            f"(of {len(verdict)}: {result.count()})"
-        )
+    result.require(observation.path, settings.stars_min)
     return result
 
 

@@ -1,4 +1,4 @@
-"""A field model of one exposure for another one, which may have few bright stars of its own."""
+"""A field model of some exposures for one, which may have few bright stars of its own."""
 
 from __future__ import annotations
 
@@ -6,13 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from psfdae.image.observation import Source
+from psfdae.bright_stars import BrightStars
+from psfdae.image.observation import Observation, Source
 from psfdae.image.selection import collect
 from psfdae.methods.field import FieldMixture
 from psfdae.model.bundle import creation_date
 from psfdae.model.field_psfs import PredictionError
 from psfdae.model.psf_model import PsfModel
 from psfdae.model.settings import of_config
+from psfdae.model.stars import Stars
 from psfdae.version import __version__
 
 FEWEST_STARS = 5
@@ -73,13 +75,48 @@ def exposure(model: PsfModel, source: Source, name: str) -> tuple[PsfModel, str]
     bright = collect(observation, wanted, settings.framing).bright
     if not np.isfinite(bright.position).all():
         raise PredictionError(f"{observation.path}: positions of bright stars are not known")
+    said = f"{len(bright)} stars of {observation.path.name} change the field of {model.name}"
+    made = _adapted(model, field, observation, bright, name)
+    return made, f"{said} ({other})" if other else said
+
+
+def for_exposures(model: PsfModel, stars: Stars) -> dict[str, PsfModel]:
+    """A model for each exposure of several, by its own bright stars.
+
+    Parameters
+    ----------
+    model : PsfModel
+        Fitted to them, as `psfdae.fit` does it.
+    stars : Stars
+        Of several images.
+
+    Returns
+    -------
+    dict of str to PsfModel
+        By the images' names without suffix, as `psfdae exposure` adapts a model to an exposure;
+        `model` itself where its method knows no field, or an image has fewer than 5 bright stars.
+    """
+    field, made = model.engine.estimator, {}
+    for part in stars.exposures:
+        bright, own = part.candidates.bright, model
+        if isinstance(field, FieldMixture) and len(bright) >= FEWEST_STARS:
+            own = _adapted(model, field, part.observation, bright, part.name)
+        made[part.name] = own
+    return made
+
+
+def _adapted(
+    model: PsfModel, field: FieldMixture, observation: Observation, bright: BrightStars, name: str
+) -> PsfModel:
+    info, trained = model.info, model.info.config["stars"]
     sky = bright.sky_photons(observation.gain, field.noise.background)
     arrays, _ = field.of_exposure(bright, sky).pack(info.stamp_px, info.noise_min)
     changed = {key: arrays[key].astype(model.bundle.weights[key].dtype) for key in CHANGED}
     image = {
         "image": observation.path.name,
         "image_sha256": observation.sha256(),
-        "image_px": [*reversed(observation.shape)],
+        "trained_on": trained.get("image_sha256", ""),
+        "image_px": [*reversed(observation.shape or ())],
         "instrument": observation.instrument,
         "adapted": {"from": model.sha256, "stars": len(bright)},
     }
@@ -92,8 +129,7 @@ def exposure(model: PsfModel, source: Source, name: str) -> tuple[PsfModel, str]
         }
     )
     bundle = replace(model.bundle, info=described, weights={**model.bundle.weights, **changed})
-    said = f"{len(bright)} stars of {observation.path.name} change the field of {model.name}"
-    return PsfModel(bundle), f"{said} ({other})" if other else said
+    return PsfModel(bundle)
 
 
 CHANGED = ("coefficients", "listed")

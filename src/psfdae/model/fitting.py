@@ -24,7 +24,7 @@ from psfdae.model.star_sets import (
     training_set,
 )
 from psfdae.model.stars import REFERENCE, SPLIT, Stars
-from psfdae.model.wings import wings_of_stars
+from psfdae.model.wings import Wings, wings_of_stars
 from psfdae.rng import stream
 from psfdae.settings import ConfigError
 from psfdae.threads import fixed_threads
@@ -150,8 +150,13 @@ def packed(stars: Stars, fitted: Method, name: str, licence: str) -> PsfModel:
     of = stars.product, REFERENCE, stars.settings, described(stars, type(fitted)), name, licence
     with fixed_threads(stars.settings.evaluation.threads):
         model = PsfModel(bundle_of(fitted, *of))
-        observation = stars.observation
-        if not isinstance(fitted, KnowsField) or observation.shape is None:
+        if not isinstance(fitted, KnowsField) or stars.observation.shape is None:
             return model
-        wings = stars.wings or wings_of_stars(model, observation.with_margin(MARGIN_PX))
-    return model if wings is None else PsfModel(with_wings(model.bundle, wings))
+        each = [
+            part.wings or wings_of_stars(model, part.observation.with_margin(MARGIN_PX))
+            for part in stars.each
+        ]
+    known = [wings for wings in each if wings is not None]
+    if not known or not (wings := Wings.joined(known)).seen:
+        return model
+    return PsfModel(with_wings(model.bundle, wings))

@@ -1,4 +1,4 @@
-"""`Stars`: the bright stars of an image, some to learn from, the others to test a model."""
+"""`Stars`: the bright stars of images, some to learn from, the others to test a model."""
 
 from __future__ import annotations
 
@@ -13,9 +13,11 @@ import numpy as np
 
 from psfdae.bright_stars import BrightStars
 from psfdae.files import Column, Product
-from psfdae.image.observation import Observation, Source, list_offset
+from psfdae.image.errors import ObservationError, no_formula
+from psfdae.image.observation import ASSUMED_SCALE, Observation, Source, list_offset
 from psfdae.image.selection import Candidates, Verdict, advice, collect
 from psfdae.image.training_images import single_psf, star_grid, training_columns
+from psfdae.model.psf_model import SCALE_TOLERANCE
 from psfdae.model.settings import IMAGE_GROUPS, Settings, settings_model, with_keywords
 from psfdae.rng import stream
 from psfdae.settings import Noise
@@ -33,6 +35,9 @@ SPLIT, REFERENCE = "held_out", "realisation"
 MANY_CROWDED = 1.0
 """Bright stars with neighbours over those without, from which the neighbours are subtracted."""
 
+ALL = "all"
+"""Name of a model of several exposures by default."""
+
 DETECTED_SIGMA = 5.0
 """σ above the sky from which stars are searched by default."""
 
@@ -41,24 +46,26 @@ DETECTED_SIGMA = 5.0
 class Stars:
     """The bright stars of an image, and the images that methods learn from and are tested on.
 
+    Those of several exposures are one set; each exposure keeps its own in `exposures`.
+
     Attributes
     ----------
     source : Source
-        The image, and what was stated about it.
+        The image, and what was stated about it; of several, the first one.
     observation : Observation
-        All of its stars.
+        All of its stars; of several images that of the first, under a name for all.
     candidates : Candidates
         What was measured of each, and the bright ones.
     held_out : ndarray of bool
         Which of the bright ones no fit learns from.
-    columns : dict of str to Column
-        Arrays of the product "stars".
     settings : Settings
         With the noise levels that follow from the stars.
     notes : tuple of str
         What is known of the camera and the list, and advice on settings.
     wings : Wings or None
         Light of stars beyond their stamps, if all stars were fitted together to find it.
+    exposures : sequence of Stars
+        The stars of each image, if there are several.
 
     Examples
     --------
@@ -74,15 +81,15 @@ class Stars:
     observation: Observation
     candidates: Candidates
     held_out: np.ndarray
-    columns: dict[str, Column]
     settings: Settings
     notes: Sequence[str]
     wings: Wings | None = None
+    exposures: Sequence[Stars] = ()
 
     @classmethod
     def from_image(
         cls,
-        image: str | Path | np.ndarray,
+        image: str | Path | np.ndarray | Sequence[str | Path],
         catalogue: StarList | None = None,
         *,
         detect: bool | float = False,
@@ -103,10 +110,12 @@ class Stars:
 
         Parameters
         ----------
-        image : path-like, or array of shape (h, w) or (n, s, s)
-            FITS image, or cube of stamps.
+        image : path-like, array of shape (h, w) or (n, s, s), or several paths
+            FITS image, or cube of stamps; or images that are exposures of one camera, of which all
+            that follows is stated alike.
         catalogue : path-like, table, or array of shape (n, 2), optional
-            Star list: a file, a table with its columns, or positions (x, y), 0-based.
+            Star list: a file, a table with its columns, or positions (x, y), 0-based; of several
+            images, one with sky coordinates.
         detect : bool or float
             Search for stars instead, this many σ above the sky (True: 5).
         extension : str or int, optional
@@ -131,8 +140,13 @@ class Stars:
             If the image or the list cannot be used, or too few stars are bright enough.
         """
         threshold = DETECTED_SIGMA if detect is True else detect or None
+        images: list[Path | np.ndarray]
+        if isinstance(image, str | Path | np.ndarray):
+            images = [image if isinstance(image, np.ndarray) else Path(image)]
+        else:
+            images = [Path(one) for one in image]
         source = Source(
-            image if isinstance(image, np.ndarray) else Path(image),
+            images[0],
             catalogue,
             threshold,
             extension,
@@ -147,19 +161,56 @@ class Stars:
             saturate=saturate,
             accept_offset=accept_offset,
         )
-        return cls.of(source, with_keywords(settings_model()(), IMAGE_GROUPS, settings))
+        settings_of_all = with_keywords(settings_model()(), IMAGE_GROUPS, settings)
+        return cls.of(source.of_each(images), settings_of_all)
 
     @classmethod
-    def of(cls, source: Source, settings: Settings) -> Stars:
-        """As `from_image`, of an image with what is stated about it, and settings."""
+    def of(cls, sources: Sequence[Source], settings: Settings) -> Stars:
+        """As `from_image`, of images with what is stated about them, and settings."""
+        _require_own_names(sources)
         margin = settings.calibration_stars.margin_px
-        observation = source.open(settings.framing.stamp_px, margin).assuming()
-        stars = cls.chosen(source, observation, settings)
-        if not stars.many_crowded:
-            return stars
-        from psfdae.model.neighbours import without_neighbours
+        opened = [source.open(settings.framing.stamp_px, margin).assuming() for source in sources]
+        _require_one_camera(opened)
+        least = None if len(sources) == 1 else 0
+        found = []
+        for source, observation in zip(sources, opened, strict=True):
+            stars = cls.chosen(source, observation, settings, least=least)
+            if stars.many_crowded:
+                from psfdae.model.neighbours import without_neighbours
 
-        return without_neighbours(stars)
+                stars = without_neighbours(stars)
+            found.append(stars)
+        return found[0] if len(found) == 1 else cls.joined(found)
+
+    @classmethod
+    def joined(cls, exposures: Sequence[Stars]) -> Stars:
+        """The stars of several images of one camera, chosen with the same settings, as one set.
+
+        Each is held out or not as in its own image. CalibrationStarsError: all are too few.
+        """
+        first = exposures[0]
+        seen = [part.observation for part in exposures]
+        observation = replace(
+            seen[0],
+            path=Path(f"{seen[0].path} and {len(seen) - 1} more"),
+            shape=tuple(map(max, zip(*(one.shape or () for one in seen), strict=True))),
+            header_cards=[card for one in seen for card in one.header_cards],
+        )
+        found = Candidates.joined([part.candidates for part in exposures])
+        found.require(observation.path, first.settings.calibration_stars.stars_min)
+        sky = np.repeat(
+            [part.settings.noise.background_photons for part in exposures],
+            [len(part) for part in exposures],
+        )
+        return cls(
+            first.source,
+            observation,
+            found,
+            np.concatenate([part.held_out for part in exposures]),
+            _with_noise(first.settings, found.bright, float(np.median(sky))),
+            [note for part in exposures for note in part.notes],
+            exposures=exposures,
+        )
 
     @classmethod
     def chosen(
@@ -168,33 +219,49 @@ class Stars:
         observation: Observation,
         settings: Settings,
         isolation_px: float | None = None,
+        least: int | None = None,
     ) -> Stars:
         """The bright stars of an observation; no neighbour is nearer than `isolation_px`.
 
-        By default, the settings say how near one may be.
+        By default, the settings say how near one may be, and how many there are at least.
         """
         framing, wanted = settings.framing, settings.calibration_stars
+        if least is not None:
+            wanted = wanted.model_copy(update={"stars_min": least})
         found = collect(observation, wanted, framing, isolation_px)
         bright = found.bright
         off = list_offset(
             observation.catalogue, (bright.centre - bright.listed)[:, ::-1], source.accept_offset
         )
         notes = [observation.said(), *filter(None, [off])]
-        notes += advice(found, observation, framing.stamp_px)
-        grid = star_grid(bright.position)
-        held_out = held_out_fields(grid)
+        if len(bright) >= settings.calibration_stars.stars_min:
+            notes += advice(found, observation, framing.stamp_px)
+        if len(bright):
+            sky = bright.sky_photons(observation.gain, settings.noise.background_photons)
+            settings = _with_noise(settings, bright, sky)
+        held_out = held_out_fields(star_grid(bright.position))
+        return cls(source, observation, found, held_out, settings, tuple(notes))
+
+    @property
+    def each(self) -> Sequence[Stars]:
+        """The stars of every image."""
+        return self.exposures or (self,)
+
+    @cached_property
+    def columns(self) -> dict[str, Column]:
+        """Arrays of the product "stars"."""
+        settings, bright = self.settings, self.candidates.bright
+        grid = np.concatenate([star_grid(s.candidates.bright.position) for s in self.each])
+        rest = settings.calibration_stars.bins, settings.framing, settings.parts
         rng = stream(settings.seed, "own stars")
-        columns = training_columns(
-            bright, grid, held_out, wanted.bins, framing, settings.parts, rng
-        )
-        sky = bright.sky_photons(observation.gain, settings.noise.background_photons)
-        settings = settings.model_copy(update={"noise": _noise(settings, bright, sky)})
-        return cls(source, observation, found, held_out, columns, settings, tuple(notes))
+        return training_columns(bright, grid, self.held_out, *rest, rng)
 
     @property
     def many_crowded(self) -> bool:
         """So many bright stars of an image have neighbours that it pays to subtract these."""
         if self.observation.shape is None or not np.isfinite(self.candidates.bright.position).all():
+            return False
+        if len(self) < self.settings.calibration_stars.stars_min:
             return False
         crowded = np.count_nonzero(self.candidates.verdict == Verdict.CROWDED)
         return bool(crowded >= MANY_CROWDED * len(self))
@@ -205,11 +272,13 @@ class Stars:
     @property
     def name(self) -> str:
         """What a model of these stars is called by default."""
-        return self.observation.path.name.split(".")[0] or "model"
+        return ALL if self.exposures else self.source.name
 
     def with_settings(self, settings: Settings) -> Stars:
         """These stars with other settings of methods."""
-        return replace(self, settings=settings)
+        stars = replace(self, settings=settings)
+        vars(stars)["columns"] = self.columns  # no setting of a method changes them
+        return stars
 
     def __len__(self) -> int:
         return len(self.held_out)
@@ -225,7 +294,14 @@ class Stars:
     @property
     def table(self) -> Table:
         """Every star of the image: place, S/N, why it is not used, and its part."""
-        return self.candidates.table(self.held_out)
+        table = self.candidates.table(self.held_out)
+        if self.exposures:
+            names, counts = zip(
+                *((no_formula(s.observation.path.name), s.observation.count) for s in self.each),
+                strict=True,
+            )
+            table.add_column(np.repeat(names, counts), name="image", index=0)
+        return table
 
     @cached_property
     def product(self) -> Product:
@@ -249,8 +325,8 @@ class Stars:
         said = {
             **kept,
             "source": "stars",
-            "image": observation.path.name,
-            "image_sha256": observation.sha256(),
+            "image": ", ".join(part.observation.path.name for part in self.each),
+            "image_sha256": ", ".join(part.observation.sha256() for part in self.each),
             **size,
             **taken_with,
             "telescope": {**scale, **assumed},
@@ -259,14 +335,47 @@ class Stars:
         return plain
 
 
-def _noise(settings: Settings, bright: BrightStars, background: float) -> Noise:
-    """Settings of the noise, with the levels of the S/N asked for, of noise-free stars."""
+def _require_own_names(sources: Sequence[Source]) -> None:
+    """Refuse images whose models would have the same name."""
+    known: dict[str, Path] = {}
+    for source in sources:
+        if source.name in known:
+            problem = f"its model would have the name of that of {known[source.name]}"
+            raise ObservationError(source.path, f"{problem}, {source.name!r}")
+        known[source.name] = source.path
+
+
+def _require_one_camera(opened: Sequence[Observation]) -> None:
+    """Refuse several images with pixels of several sizes, or several cameras or filters."""
+    first = opened[0]
+    for other in opened if len(opened) > 1 else ():
+        if other.shape is None:
+            raise ObservationError(other.path, "a cube of stamps; expected an image")
+        scales = [o.pixel_scale_arcsec or ASSUMED_SCALE for o in (first, other)]
+        unlike = []
+        if abs(scales[1] / scales[0] - 1.0) > SCALE_TOLERANCE:
+            unlike = [("the pixel scale", *(f"{scale:.6g} arcsec" for scale in scales))]
+        unlike += [
+            (key, repr(said), repr(other.instrument[key]))
+            for key, said in first.instrument.items()
+            if key in other.instrument
+            and said.strip().casefold() != other.instrument[key].strip().casefold()
+        ]
+        if unlike:
+            what, one, two = unlike[0]
+            problem = f"{what} is {two}, but that of {first.path} is {one}; a model is of one"
+            raise ObservationError(other.path, problem)
+
+
+def _with_noise(settings: Settings, bright: BrightStars, background: float) -> Settings:
+    """Settings with the noise levels of the S/N asked for, of noise-free stars."""
     area, kappa = float(np.median(bright.area())), settings.noise.kappa
     degraded = settings.calibration_stars.degraded()
     levels = [1.0 / (snr * np.sqrt(area) * kappa) for snr in degraded]
-    return Noise(
+    noise = Noise(
         name=settings.noise.name,
         levels=[float(f"{level:.9g}") for level in reversed(levels)],
         kappa=kappa,
         background_photons=background,
     )
+    return settings.model_copy(update={"noise": noise})

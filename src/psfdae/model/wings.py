@@ -13,7 +13,7 @@ least squares.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
@@ -118,6 +118,17 @@ class Wings:
             f"{100 * light:.2f} ± {100 * error:.2f} % of the flux in the stamp of a usual star, "
             f"out to {self.radius_px[-1]:.3g} px"
         )
+
+    @classmethod
+    def joined(cls, several: Sequence[Wings]) -> Wings:
+        """Those of several images with one model, each by the inverse of its light's variance."""
+        weight = np.array([wings.light()[1] ** -2.0 for wings in several])
+        weight /= weight.sum()
+        outer = float(weight @ [wings.outer for wings in several])
+        share = weight * [outer / wings.outer for wings in several]
+        profile = np.tensordot(share, [wings.profile for wings in several], 1)
+        covariance = np.tensordot(share**2, [wings.covariance for wings in several], 1)
+        return cls(several[0].radius_px, profile, covariance, outer)
 
     @property
     def seen(self) -> bool:
@@ -292,7 +303,7 @@ def around_stars(
 
 
 def wings_of_stars(model: PsfModel, observation: Observation) -> Wings | None:
-    """Wings of the stars of an image, restored one by one; None if they are too faint to be seen.
+    """Wings of the stars of an image, restored one by one; None if there is no light at all.
 
     In a crowded image, where stars restored alone lack light, they come out too large.
 
@@ -321,5 +332,4 @@ def wings_of_stars(model: PsfModel, observation: Observation) -> Wings | None:
     place, flux, gain = np.concatenate(places), np.concatenate(fluxes), observation.gain
     error = np.sqrt(sky.noise**2 + (np.maximum(light, 0.0) / gain if gain else 0.0))
     outer = outer_light(model.on_pixels, place)
-    wings = around_stars(image, sky, error, light, place, flux, outer, side).wings
-    return wings if wings is not None and wings.seen else None
+    return around_stars(image, sky, error, light, place, flux, outer, side).wings
