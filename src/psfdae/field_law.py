@@ -283,7 +283,7 @@ class Seen:
 
     def covariance(self) -> np.ndarray:
         """Of sky, row and column, (n, 3, 3)."""
-        return self.width[:, :, None] * self.left * self.width[:, None]
+        return np.asarray(self.width[:, :, None] * self.left * self.width[:, None])
 
     def score(self, projected: np.ndarray) -> np.ndarray:
         """Square of Mahalanobis' distance along the leading axes, of what sky and centre leave."""

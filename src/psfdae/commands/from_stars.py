@@ -15,7 +15,6 @@ from psfdae.cli import command
 from psfdae.commands.mosaic import each, images_of, with_name
 from psfdae.commands.predict import Stated, write_list
 from psfdae.errors import Error
-from psfdae.figures import as_png
 from psfdae.files import (
     atomic_path,
     check_outputs,
@@ -288,7 +287,7 @@ def _make(
         write_columns(files.path / "per_star.csv", report.per_star.columns)
         write_columns(files.path / "report.csv", report.table.columns, digits=6)
         write_columns(files.path / "found.csv", report.found.columns, digits=6)
-        write_bytes(files.path / "report.png", as_png(report.strip()))
+        write_bytes(files.path / "report.png", report.strip_png)
         if page is not None:
             print(f"writing {page}")
             report.save(page)

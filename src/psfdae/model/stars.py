@@ -145,6 +145,8 @@ class Stars:
             images = [image if isinstance(image, np.ndarray) else Path(image)]
         else:
             images = [Path(one) for one in image]
+        if not images:
+            raise ObservationError("image", "no image, expected at least one")
         source = Source(
             images[0],
             catalogue,

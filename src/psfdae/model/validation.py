@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -317,6 +318,11 @@ class Report:
         title = f"Bright stars that no training saw, degraded to S/N {found:.3g}"
         return restoration_strip(rows, columns, title)
 
+    @cached_property
+    def strip_png(self) -> bytes:
+        """The picture of `strip` as a file holds it."""
+        return as_png(self.strip())
+
     def page(self) -> str:
         """The HTML of the page; the PSFs of all stars of the image are predicted for it."""
         model, stars = self.model, self.stars
@@ -346,7 +352,7 @@ class Report:
                 stars=found | columns,
                 residual=residual / found["noise"][shown, None, None],
                 bright=psf[shown] + residual,
-                strip=as_png(self.strip()),
+                strip=self.strip_png,
                 field=None if stars.observation.positions is None else _map(found, psf, stars),
                 facts=facts_of(model.engine.estimator),
             )
