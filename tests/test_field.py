@@ -23,7 +23,7 @@ from photutils_grid import drawn, gridded
 from psfdae import load_model
 from psfdae.bright_stars import BrightStars
 from psfdae.cli import main
-from psfdae.field_law import MOST_NODES, OUTLIER_MODES
+from psfdae.field_law import MOST_PX2, OUTLIER_MODES
 from psfdae.field_psf import fit_field
 from psfdae.method import FitError, TrainingSet
 from psfdae.methods.field import FieldMixture
@@ -289,7 +289,7 @@ def test_stars_are_restored_in_groups_that_do_not_matter(field, monkeypatch):
 def test_nodes_that_the_matched_filter_leaves_out_do_not_matter(field, snr, monkeypatch):
     some = Faint(40, snr)
     found = some.measured(field)
-    monkeypatch.setattr("psfdae.field_law.LEAST_NODES", MOST_NODES)
+    monkeypatch.setattr("psfdae.field_law.LEAST_NODES", round(MOST_PX2 * 16))
     every = some.measured(field)
     assert np.abs(found.psf - every.psf).max() < 0.01 * every.sigma.max()
     assert found.measured.flux == pytest.approx(every.measured.flux, rel=1e-5)

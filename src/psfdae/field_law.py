@@ -29,7 +29,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
-from math import isqrt
+from math import ceil, isqrt
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -52,8 +52,12 @@ FLUX_ROUNDS = 2
 LEAST_SNR = 1.5
 """Least S/N that a star is taken to have."""
 
-LEAST_NODES, MOST_NODES = 9, 48
-"""Nodes of which the likelihood is computed; a matched filter finds them."""
+LEAST_NODES, MOST_PX2 = 9, 3.0
+"""Nodes of which the likelihood is computed, at least, and the area that they have at most; a
+matched filter finds them."""
+
+STEP_FWHM = 0.125
+"""Largest step between two nodes over the FWHM: in between, stars change linearly."""
 
 FAR, MATCHED_SNR = 12.0, 30.0
 """ln of the filter's likelihood below the best, from which a node is one of the fewest only; and
@@ -92,7 +96,9 @@ class FieldSettings(Group):
     smoothness: Positive = Field(
         100.0, description="Of the splines: weight of their second differences"
     )
-    step_px: Annotated[float, Field(gt=0, le=1)] = Field(0.25, description="Between two nodes")
+    step_px: Annotated[float, Field(gt=0, le=1)] = Field(
+        0.25, description="Between two nodes, at most; less where stars are undersampled"
+    )
     reach_px: Annotated[float, Field(gt=0, lt=MARGIN_PX)] = Field(
         1.75, description="Distance, per axis, of the outermost nodes from the stamp's middle"
     )
@@ -258,9 +264,13 @@ class Seen:
     width: np.ndarray
     left: np.ndarray
 
+    @cached_property
+    def _parts(self) -> tuple[np.ndarray, np.ndarray]:
+        return self.axes.noise_parts(self.s)
+
     def noise_in(self, images: np.ndarray, projected: np.ndarray) -> np.ndarray:
         """s (C + s)⁻¹ of images (n, P), which are known along the axes (n, m)."""
-        beyond, along = self.axes.noise_parts(self.s)
+        beyond, along = self._parts
         return np.asarray(beyond * images + (along * projected) @ self.axes.vectors)
 
     def variance(self) -> np.ndarray:
@@ -381,21 +391,27 @@ class FieldLaw:
     # The nodes.
 
     @cached_property
+    def step_px(self) -> float:
+        """Between two nodes, for which there are residuals."""
+        step, phases = self.settings.step_px, isqrt(len(self.offset))
+        return step if len(phases_of(step)) == phases else 1.0 / phases
+
+    @cached_property
     def _axis(self) -> np.ndarray:
         """Nodes along an axis in units of a step."""
-        most = round(self.settings.reach_px / self.settings.step_px)
+        most = round(self.settings.reach_px / self.step_px)
         return np.arange(-most, most + 1)
 
     @cached_property
     def places(self) -> np.ndarray:
         """Centres (row, column) of the nodes from the stamp's middle pixel, shape (nodes, 2)."""
         row, column = np.meshgrid(self._axis, self._axis, indexing="ij")
-        return self.settings.step_px * np.stack([row.ravel(), column.ravel()], axis=1)
+        return self.step_px * np.stack([row.ravel(), column.ravel()], axis=1)
 
     @cached_property
     def _nodes(self) -> list[Node]:
-        count, axis = len(self.usual), self.settings.step_px * self._axis
-        phases, steps = phases_of(self.settings.step_px), ((SLOPE_PX, 0.0), (0.0, SLOPE_PX))
+        count, axis = len(self.usual), self.step_px * self._axis
+        phases, steps = phases_of(self.step_px), ((SLOPE_PX, 0.0), (0.0, SLOPE_PX))
 
         def drawn(terms: np.ndarray, row: float = 0.0, column: float = 0.0) -> np.ndarray:
             images = self.model.on_lattice(terms, axis + row, axis + column, self.side)
@@ -464,7 +480,7 @@ class FieldLaw:
     @property
     def _part(self) -> float:
         """σ of a place between two nodes."""
-        return float(self.settings.step_px / np.sqrt(12.0))
+        return float(self.step_px / np.sqrt(12.0))
 
     # Stars.
 
@@ -476,7 +492,7 @@ class FieldLaw:
 
     def _prior(self, listed: np.ndarray) -> np.ndarray:
         """ln of each node's probability for stars with centres of a list, or NaN, (n, nodes)."""
-        step, half = self.settings.step_px, self.settings.centring_px
+        step, half = self.step_px, self.settings.centring_px
         box = np.clip((half + step / 2 - np.abs(self.places)) / step, 0.0, 1.0).prod(axis=1)
         prior = np.tile(box / box.sum(), (len(listed), 1))
         near = np.isfinite(listed).all(axis=1)
@@ -501,7 +517,8 @@ class FieldLaw:
         score = gain / variance + stars.prior
         rows, best = np.arange(len(flux)), score.argmax(axis=1)
         unclear = gain / (variance + flux**2 * square / MATCHED_SNR**2) + stars.prior
-        few, most = (min(count, score.shape[1]) - 1 for count in (LEAST_NODES, MOST_NODES))
+        limits = LEAST_NODES, round(MOST_PX2 / self.step_px**2)
+        few, most = (min(count, score.shape[1]) - 1 for count in limits)
         nearest = -np.partition(-unclear, [few, most], axis=1)
         least = np.clip(unclear.max(axis=1) - FAR, nearest[:, most], nearest[:, few])
         near = np.isfinite(score) & (unclear >= least[:, None])
@@ -652,6 +669,12 @@ def products_of(weighted: np.ndarray, along: np.ndarray, latent: np.ndarray) -> 
     found[..., :2] = np.einsum("nim,njm->nij", weighted, along)
     found[..., 2:] = (weighted.reshape(-1, weighted.shape[-1]) @ latent.T).reshape(-1, 2, 3)
     return found
+
+
+def step_of(fwhm_px: float, most_px: float) -> float:
+    """Step between two nodes in pixels, a whole part of one if it is not the largest."""
+    wanted = STEP_FWHM * fwhm_px
+    return most_px if wanted >= most_px else 1.0 / ceil(1.0 / wanted)
 
 
 def parts_of(rows: np.ndarray) -> list[np.ndarray]:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from psfdae.bright_stars import BrightStars
-from psfdae.field_law import MARGIN_PX, Asked, FieldLaw, FieldSettings, parts_of, phases_of
+from psfdae.field_law import MARGIN_PX, Asked, FieldLaw, FieldSettings, parts_of, phases_of, step_of
 from psfdae.field_psf import FieldFit, fit_field, refit_field
 from psfdae.method import (
     Estimate,
@@ -27,7 +27,7 @@ from psfdae.method import (
     Storage,
     TrainingSet,
 )
-from psfdae.moments import moving_matrices, robust_scatter
+from psfdae.moments import measure_shapes, moving_matrices, robust_scatter
 from psfdae.noise import NoiseModel
 
 OWN_NOISE = 0.5
@@ -85,7 +85,9 @@ class FieldMixture(FieldLaw, Method):
         fit = fit_field(bright, data.noise.background, *sizes, field.orders, *splines)
         used = bright.of(fit.good)
         terms = fit.model.terms(used.position)
-        offset, modes, diagonal = _residuals(fit, used.noise / fit.flux[fit.good], field)
+        usual = fit.model.images(terms.mean(axis=0)[None], np.zeros((1, 2)), side)
+        step = step_of(float(measure_shapes(usual).fwhm_px[0]), field.step_px)
+        offset, modes, diagonal = _residuals(fit, used.noise / fit.flux[fit.good], field, step)
         return cls(
             coefficients=fit.model.coefficients.astype(np.float32),
             low=fit.model.low,
@@ -289,7 +291,7 @@ class FieldMixture(FieldLaw, Method):
 
 
 def _residuals(
-    fit: FieldFit, noise: np.ndarray, settings: FieldSettings
+    fit: FieldFit, noise: np.ndarray, settings: FieldSettings, step_px: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Mean, modes and remaining variance of the residuals in every phase of a pixel.
 
@@ -304,7 +306,7 @@ def _residuals(
     weight = (signal + 1e-12) / (signal + 1e-12 + own)
     weight /= weight.sum()
     left = OWN_NOISE * float(weight @ noise**2)
-    steps = phases_of(settings.step_px)[:, None, None] - centre
+    steps = phases_of(step_px)[:, None, None] - centre
     rows, columns = (
         np.array([moving_matrices(side, row) for row in steps[..., axis]]) for axis in (0, 1)
     )
