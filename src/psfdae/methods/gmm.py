@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self, TypeVar
 import numpy as np
 from pydantic import Field
 
+from psfdae.clusters import k_means, principal_axes
 from psfdae.lowrank import FLUX_SIGMA
 from psfdae.method import (
     Estimate,
@@ -199,7 +200,7 @@ class GaussianMixture(MixtureLaw, Method):
         same = np.array_equal(data.images[stars], data.references[stars])
         p = cls._positions_of(data, stars).astype(np.float64) * positions
         x = data.images[stars].reshape(stars.size, -1).astype(np.float64)
-        cluster = _k_means(x, gmm.place * _standard(p), clusters, gmm.principal, data.seed)
+        cluster = _clusters_of(x, gmm.place * _standard(p), clusters, gmm.principal, data.seed)
         del x  # before it is there in another order
         order = np.argsort(cluster, kind="stable")
         count = np.unique(cluster, return_counts=True)[1]
@@ -400,22 +401,18 @@ def climbed(
     return best
 
 
-def _k_means(
+def _clusters_of(
     x: np.ndarray, place: np.ndarray, clusters: int, principal: int, seed: int
 ) -> np.ndarray:
     """Cluster of each star (n, P), by k-means in the leading principal components.
 
     `place`, shape (n, q), joins them, in units of their RMS.
     """
-    from sklearn.cluster import KMeans
-    from sklearn.decomposition import PCA
-
     if clusters == 1:
         return np.zeros(len(x), int)
-    found = PCA(min(principal, *x.shape), svd_solver="covariance_eigh").fit_transform(x)
+    mean, axes = principal_axes(x, min(principal, *x.shape))
+    found = x @ axes.T - mean @ axes.T
     scale = np.sqrt(np.square(found).sum() / len(x) / max(place.shape[1], 1))
     draw = int(stream(seed, "gmm", "clusters").integers(2**31))
     features = np.hstack([found, scale * place]).astype(np.float32)
-    init = "k-means++" if clusters <= MOST_CAREFUL else "random"
-    means = KMeans(clusters, init=init, n_init=1, random_state=draw)
-    return np.asarray(means.fit(features).labels_)
+    return k_means(features, clusters, draw, careful=clusters <= MOST_CAREFUL)
