@@ -66,7 +66,7 @@ def _spread(x: np.ndarray, count: int, even: np.ndarray, rng: np.random.RandomSt
         """Squared distances of all points from some, (len(some), n)."""
         distance = norm[some, None] - (2.0 * wide[some]) @ wide.T
         distance += norm
-        return np.maximum(distance, 0.0).astype(np.float32)
+        return np.asarray(np.maximum(distance, 0.0), np.float32)
 
     trials = 2 + int(np.log(count))
     chosen = np.empty(count, int)
@@ -95,13 +95,12 @@ def _nearest(x: np.ndarray, centre: np.ndarray) -> np.ndarray:
 
 def _means(x: np.ndarray, own: np.ndarray, centre: np.ndarray) -> np.ndarray:
     """Means (K, q) of the clusters; an empty one takes the point that is farthest from its own."""
-    count = np.bincount(own, minlength=len(centre))
-    (empty,) = np.nonzero(count == 0)
+    (empty,) = np.nonzero(np.bincount(own, minlength=len(centre)) == 0)
     if empty.size:
-        far = np.square(x - centre[own]).sum(axis=1).argsort()[: -empty.size - 1 : -1]
-        own[far] = empty
-        count = np.bincount(own, minlength=len(centre))
-    total = np.zeros_like(centre)
-    np.add.at(total, own, x)
-    mean = total * (np.float32(1.0) / np.maximum(count, 1).astype(np.float32))[:, None]
-    return np.where(count[:, None], mean, centre)
+        own[np.square(x - centre[own]).sum(axis=1).argsort()[: -empty.size - 1 : -1]] = empty
+    filled, count = np.unique(own, return_counts=True)
+    start = np.concatenate([[0], count.cumsum()[:-1]])
+    total = np.add.reduceat(x[own.argsort(kind="stable")], start)
+    mean = centre.copy()
+    mean[filled] = total * (1.0 / count).astype(np.float32)[:, None]
+    return mean

@@ -31,6 +31,8 @@ Y_k, σ_a μ_y,k with σ_a = `FLUX_SIGMA`.
 from __future__ import annotations
 
 import math
+from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any, NamedTuple, Self
@@ -226,6 +228,7 @@ class MixtureLaw:
         near = self._near(z, where, s) if near is None else near
         log = np.full((len(z), len(self.count)), -np.inf)
         leading = self._leading(s)
+        self._factorise(np.flatnonzero(near.any(axis=0)), s)
         for k in range(len(self.count)):
             (stars,) = near[:, k].nonzero()
             if stars.size:
@@ -370,28 +373,48 @@ class MixtureLaw:
 
     def _factor(self, k: int, s: float) -> Factor:
         """C_k + s factorised."""
-        return self._factors(s, k, partial(self._factored, k, s))
+        return self._factors(s, k, lambda: self._factored([k], s)[0])
 
-    def _factored(self, k: int, s: float) -> Factor:
-        cluster = self._clusters[k]
-        leading = min(self._leading(s), cluster.own.shape[1])
+    def _factorise(self, some: np.ndarray, s: float) -> None:
+        """C_k + s of some clusters factorised, those with as many rows and stars together."""
+        alike = defaultdict(list)
+        for k in self._factors.missing(s, some):
+            alike[self.rows[k], self.count[k]].append(k)
+        for own in alike.values():
+            for k, factor in zip(own, self._factored(own, s), strict=True):
+                self._factors(s, k, partial(lambda made: made, factor))
+
+    def _factored(self, alike: Sequence[int], s: float) -> list[Factor]:
+        """Factors of clusters with as many rows and stars."""
+        clusters = [self._clusters[k] for k in alike]
+        first = clusters[0]
+        leading = min(self._leading(s), first.own.shape[1])
         shared = np.ones(len(self.variance))
-        shared[:leading] = cluster.common
+        shared[:leading] = first.common
         d = shared * self.variance + s
-        rows, y = cluster.own[:, :leading].astype(np.float64), cluster.own_reference
-        found = factorised(d[:leading], rows, cluster.scale, y if len(y) else None)
-        return Factor(
-            inverse=(1.0 / d).astype(np.float32),
-            low=np.ascontiguousarray(found.low[:, :leading], np.float32),
-            low_reference=np.ascontiguousarray(found.low[:, leading:], np.float32),
-            shared=shared.astype(np.float32),
-            constant=float(
-                np.log(self.count[k] / self.count.sum())
-                - found.half_det
-                - 0.5 * np.log(d).sum()
-                + np.log(cluster.spread.diagonal()).sum()
-            ),
-        )
+        rows = np.stack([c.own[:, :leading] for c in clusters]).astype(np.float64)
+        y = np.stack([c.own_reference for c in clusters]) if len(self.cross) else None
+        if len(alike) == 1:
+            rows, y = rows[0], None if y is None else y[0]
+        found = factorised(d[:leading], rows, first.scale, y)
+        same = (1.0 / d).astype(np.float32), shared.astype(np.float32)
+        half, log_d = np.atleast_1d(found.half_det), np.log(d).sum()
+        low = found.low.reshape(len(alike), len(first.own), -1).astype(np.float32)
+        return [
+            Factor(
+                inverse=same[0],
+                low=np.ascontiguousarray(low[i, :, :leading]),
+                low_reference=np.ascontiguousarray(low[i, :, leading:]),
+                shared=same[1],
+                constant=float(
+                    np.log(self.count[k] / self.count.sum())
+                    - half[i]
+                    - 0.5 * log_d
+                    + np.log(clusters[i].spread.diagonal()).sum()
+                ),
+            )
+            for i, k in enumerate(alike)
+        ]
 
     def _leading(self, s: float) -> int:
         """Coordinates in which clusters differ at a noise variance s.
