@@ -58,6 +58,9 @@ OUTLIER_COORDINATES, LEADING_ARRAYS = 40, ("axes", "variance", "mean", "deviatio
 """Coordinates that tell outliers, and arrays whose last axis they are. More of them find
 more outliers that are bright, and fewer that are faint."""
 
+FEW_ROWS = 64
+"""Rows of a cluster up to which its factorisation takes no time by itself."""
+
 FLAT_VARIANCE = 0.005
 """Variance of a coordinate over s below which all clusters share one normal law."""
 
@@ -394,7 +397,7 @@ class MixtureLaw:
         d = shared * self.variance + s
         rows = np.stack([c.own[:, :leading] for c in clusters]).astype(np.float64)
         y = np.stack([c.own_reference for c in clusters]) if len(self.cross) else None
-        if len(alike) == 1:
+        if rows.shape[1] > FEW_ROWS and len(alike) == 1:
             rows, y = rows[0], None if y is None else y[0]
         found = factorised(d[:leading], rows, first.scale, y)
         same = (1.0 / d).astype(np.float32), shared.astype(np.float32)
