@@ -236,7 +236,7 @@ class MixtureLaw:
             (stars,) = near[:, k].nonzero()
             if stars.size:
                 factor = self._factor(k, s)
-                _, residual, half = self._against(k, z[stars, :leading], where[stars], s)
+                _, residual, half = self._against(k, factor, z[stars, :leading], where[stars])
                 off = (where[stars] - self.center[k]) @ self._clusters[k].spread.T
                 log[stars, k] = factor.constant - 0.5 * (
                     np.square(residual) @ factor.inverse[:leading]
@@ -258,7 +258,7 @@ class MixtureLaw:
                 continue
             w = weight[stars, k, None]
             factor = self._factor(k, s)
-            at, residual, half = self._against(k, z[stars], where[stars], s)
+            at, residual, half = self._against(k, factor, z[stars], where[stars])
             g = residual * factor.inverse
             g[:, : factor.low.shape[1]] -= half @ factor.low
             if self.loose:
@@ -301,13 +301,13 @@ class MixtureLaw:
         )
 
     def _against(
-        self, k: int, z: np.ndarray, where: np.ndarray, s: float
+        self, k: int, factor: Factor, z: np.ndarray, where: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Position from the cluster's, image less its mean there, and A times that.
 
         The image z has all coordinates or the leading ones.
         """
-        low = self._factor(k, s).low
+        low = factor.low
         at = (where - self.center[k]).astype(np.float32)
         width = z.shape[1]
         residual = z - self.mean[k, :width]
@@ -333,16 +333,18 @@ class MixtureLaw:
     @cached_property
     def _clusters(self) -> list[Cluster]:
         """Each cluster with its own slope, by the same shrinkage as its covariances."""
+        p, nu, total = self.deviation_center, float(self.shrinkage[0]), self.count + self.shrinkage
         ends = self.rows.cumsum()
-        return [
-            self._cluster(k, slice(b - n, b))
-            for k, (b, n) in enumerate(zip(ends, self.rows, strict=True))
-        ]
+        parts = [slice(b - n, b) for b, n in zip(ends, self.rows, strict=True)]
+        scatter = np.array([p[rows].T @ p[rows] for rows in parts]) + nu * np.eye(p.shape[1])
+        inverse = np.linalg.inv(scatter)
+        spread = np.linalg.inv(np.linalg.cholesky(scatter / total[:, None, None]))
+        return [self._cluster(k, rows, inverse[k], spread[k]) for k, rows in enumerate(parts)]
 
-    def _cluster(self, k: int, rows: slice) -> Cluster:
+    def _cluster(self, k: int, rows: slice, inverse: np.ndarray, spread: np.ndarray) -> Cluster:
+        """`inverse` is that of the positions' scatter, (q, q), and ν."""
         p = self.deviation_center[rows]
         nu, total = float(self.shrinkage[0]), self.count[k] + float(self.shrinkage[0])
-        scatter = p.T @ p + nu * np.eye(p.shape[1])
 
         def sloped(a: np.ndarray, common: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             """Deviations without the slope of the cluster, and that slope.
@@ -351,7 +353,7 @@ class MixtureLaw:
             """
             if not (p.size and len(a)):
                 return a, common
-            own = np.linalg.solve(scatter, p.T @ a).astype(np.float32)
+            own = (inverse @ (p.T @ a)).astype(np.float32)
             rows = np.vstack([a - p.astype(np.float32) @ own, np.float32(np.sqrt(nu)) * own])
             return rows, common + own
 
@@ -369,7 +371,6 @@ class MixtureLaw:
         if len(own) > own.shape[1]:
             rotation, own = np.linalg.qr(own)
             own_reference = rotation.T @ own_reference if len(own_reference) else own_reference
-        spread = np.linalg.inv(np.linalg.cholesky(scatter / total))
         return Cluster(
             own, own_reference, square, slope, slope_reference, spread, nu / total, 1 / total
         )
