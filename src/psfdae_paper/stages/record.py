@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from psfdae_paper.configuration.schema import Config
 
-VERSIONED = ("psfdae", "numpy", "scipy", "torch", "scikit-learn", "minisom")
+VERSIONED = ("psfdae", "numpy", "scipy", "torch", "minisom")
 """Packages whose versions can change a number; recorded with the run."""
 
 ON_REQUEST = "benchmarks_on_request"
