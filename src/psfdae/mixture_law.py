@@ -228,24 +228,7 @@ class MixtureLaw:
     ) -> tuple[np.ndarray, np.ndarray | float, np.ndarray, np.ndarray, np.ndarray]:
         """Posterior mean, its σ, evidence, flux and weights of images (n, P) of variance s."""
         z = (flat @ self.axes).astype(np.float32)
-        near = self._near(z, where, s) if near is None else near
-        log = np.full((len(z), len(self.count)), -np.inf)
-        leading = self._leading(s)
-        self._factorise(np.flatnonzero(near.any(axis=0)), s)
-        for k in range(len(self.count)):
-            (stars,) = near[:, k].nonzero()
-            if stars.size:
-                factor = self._factor(k, s)
-                _, residual, half = self._against(k, factor, z[stars, :leading], where[stars])
-                off = (where[stars] - self.center[k]) @ self._clusters[k].spread.T
-                log[stars, k] = factor.constant - 0.5 * (
-                    np.square(residual) @ factor.inverse[:leading]
-                    - np.square(half).sum(axis=1)
-                    + np.square(off).sum(axis=1)
-                )
-        # In the other coordinates all clusters have nearly one law.
-        rest = np.square(z[:, leading:] - self._middle[leading:])
-        log -= 0.5 * (rest @ (1.0 / (self.variance[leading:] + s)))[:, None]
+        log = self._log_densities(z, where, s, near)
         weights, evidence = mixing_weights(log)
         evidence -= 0.5 * z.shape[1] * np.log(2 * np.pi)
         weight = weights.astype(np.float32)
@@ -267,7 +250,8 @@ class MixtureLaw:
             if len(self.cross):
                 g *= factor.shared
                 mean = self.mean_reference[k] + half @ factor.low_reference
-                mean += at @ self._clusters[k].slope_reference
+                if at.size:
+                    mean += at @ self._clusters[k].slope_reference
                 own[stars] += w * mean
             gain[stars] += w * g
             if sure:
@@ -279,6 +263,32 @@ class MixtureLaw:
         if not len(self.cross):  # the sky of the image is no part of the star
             psf += ((flux - 1.0) / z.shape[1]).astype(np.float32)[:, None]
         return psf, sigma, evidence, flux, weight
+
+    def _log_densities(
+        self, z: np.ndarray, where: np.ndarray, s: float, near: np.ndarray | None
+    ) -> np.ndarray:
+        """ln of the probability of images in the axes under each cluster that is near, (n, K).
+
+        Without the term of 2π.
+        """
+        near = self._near(z, where, s) if near is None else near
+        log = np.full((len(z), len(self.count)), -np.inf)
+        leading = self._leading(s)
+        self._factorise(np.flatnonzero(near.any(axis=0)), s)
+        for k in range(len(self.count)):
+            (stars,) = near[:, k].nonzero()
+            if stars.size:
+                factor = self._factor(k, s)
+                _, residual, half = self._against(k, factor, z[stars, :leading], where[stars])
+                far = np.square(residual) @ factor.inverse[:leading] - np.square(half).sum(axis=1)
+                if where.shape[1]:
+                    off = (where[stars] - self.center[k]) @ self._clusters[k].spread.T
+                    far = far + np.square(off).sum(axis=1)
+                log[stars, k] = factor.constant - 0.5 * far
+        # In the other coordinates all clusters have nearly one law.
+        rest = np.square(z[:, leading:] - self._middle[leading:])
+        log -= 0.5 * (rest @ (1.0 / (self.variance[leading:] + s)))[:, None]
+        return log
 
     @cached_property
     def _contrast(self) -> np.ndarray:
