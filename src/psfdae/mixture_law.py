@@ -281,9 +281,10 @@ class MixtureLaw:
                 factor = self._factor(k, s)
                 _, residual, half = self._against(k, factor, z[stars, :leading], where[stars])
                 far = np.square(residual) @ factor.inverse[:leading] - np.square(half).sum(axis=1)
+                far = far.astype(np.float64)
                 if where.shape[1]:
                     off = (where[stars] - self.center[k]) @ self._clusters[k].spread.T
-                    far = far + np.square(off).sum(axis=1)
+                    far += np.square(off).sum(axis=1)
                 log[stars, k] = factor.constant - 0.5 * far
         # In the other coordinates all clusters have nearly one law.
         rest = np.square(z[:, leading:] - self._middle[leading:])
