@@ -7,6 +7,7 @@ import pytest
 from minisom import MiniSom
 from sklearn.cluster import KMeans
 from sklearn.decomposition import PCA
+from sklearn.metrics import adjusted_rand_score
 
 from psfdae.clusters import k_means, principal_axes
 from psfdae_paper.methods.pca_som import self_organised
@@ -36,6 +37,15 @@ def test_clusters_are_scikit_learn_s(points, clusters, careful):
     assert np.mean(own == theirs.labels_) > 0.99
     means = np.array([points[own == k].mean(axis=0) for k in range(clusters)])
     assert np.square(points - means[own]).sum() == pytest.approx(theirs.inertia_, rel=1e-3)
+
+
+def test_empty_clusters_are_filled_as_scikit_learn_does(points):
+    """Of points that are there three times, many centres that are drawn are the same."""
+    three = np.repeat(points[:200], 3, axis=0)
+    theirs = KMeans(150, init="random", n_init=1, random_state=5).fit(three.astype(np.float32))
+    own = k_means(three, 150, 5, careful=False)
+    assert len(np.unique(own)) == 150  # in another order, where distances are equal
+    assert adjusted_rand_score(own, theirs.labels_) > 0.9
 
 
 @pytest.mark.parametrize("careful", [True, False])

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-POINTS_AT_ONCE = 1024
+POINTS_AT_ONCE = 256
 """Points whose distances to all centres fit into a processor's cache together."""
 
 MOST_ROUNDS, TOLERANCE = 300, 1e-4
@@ -87,7 +87,7 @@ def _spread(x: np.ndarray, count: int, even: np.ndarray, rng: np.random.RandomSt
 def _nearest(x: np.ndarray, centre: np.ndarray) -> np.ndarray:
     """Number of the centre (K, q) that is nearest to each point (n, q)."""
     # |x − c|² without the term that is the same for all centres.
-    square, twice = np.square(centre).sum(axis=1), (-2.0 * centre).T
+    square, twice = np.einsum("kq,kq->k", centre, centre), (-2.0 * centre).T  # rounds as theirs
     parts = range(0, len(x), POINTS_AT_ONCE)
     found = [(x[a : a + POINTS_AT_ONCE] @ twice + square).argmin(axis=1) for a in parts]
     return np.concatenate(found)
@@ -95,12 +95,21 @@ def _nearest(x: np.ndarray, centre: np.ndarray) -> np.ndarray:
 
 def _means(x: np.ndarray, own: np.ndarray, centre: np.ndarray) -> np.ndarray:
     """Means (K, q) of the clusters; an empty one takes the point that is farthest from its own."""
-    (empty,) = np.nonzero(np.bincount(own, minlength=len(centre)) == 0)
-    if empty.size:
-        own[np.square(x - centre[own]).sum(axis=1).argsort()[: -empty.size - 1 : -1]] = empty
-    filled, count = np.unique(own, return_counts=True)
-    start = np.concatenate([[0], count.cumsum()[:-1]])
-    total = np.add.reduceat(x[own.argsort(kind="stable")], start)
-    mean = centre.copy()
-    mean[filled] = total * (1.0 / count).astype(np.float32)[:, None]
-    return mean
+    total, count = np.zeros_like(centre), np.bincount(own, minlength=len(centre))
+    filled = np.flatnonzero(count)
+    start = np.concatenate([[0], count[filled].cumsum()[:-1]])
+    total[filled] = np.add.reduceat(x[own.argsort(kind="stable")], start)
+    (empty,) = np.nonzero(count == 0)
+    away = np.square(x - centre[own]).sum(axis=1) if empty.size else np.zeros(0)
+    if away.any():
+        far = away.argpartition(-empty.size)[: -empty.size - 1 : -1]
+        for point, new in zip(far, empty, strict=True):
+            total[own[point]] -= x[point]
+            total[new] = x[point]
+            count[own[point]] -= 1
+            count[new] = 1
+    mean = total * (np.float32(1.0) / np.maximum(count, 1).astype(np.float32))[:, None]
+    most = count.argmax()
+    for lost in np.flatnonzero(count == 0):  # its only point was taken: as scikit-learn does
+        mean[lost] = total[most] if lost < most else mean[most]
+    return np.asarray(mean)
