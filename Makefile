@@ -33,6 +33,8 @@ COMPILE := uv pip compile --quiet --upgrade --universal --python-version 3.11 --
   --no-header --no-annotate
 export PATH := $(CURDIR)/$(VENV)/bin:$(PATH)
 export PYTHONUNBUFFERED := 1
+# Where an environment forbids to keep compiled modules, every job would compile them again.
+export PYTHONDONTWRITEBYTECODE :=
 export MLFLOW_DISABLE_TELEMETRY := true
 # Everything stays in this folder, caches of libraries, too.
 export XDG_CACHE_HOME := $(CURDIR)/.cache

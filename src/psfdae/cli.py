@@ -14,7 +14,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, is_dataclass
 from functools import cache
 from importlib import import_module
-from importlib.metadata import entry_points
 from importlib.util import find_spec
 from inspect import Parameter, cleandoc, signature
 from pathlib import Path
@@ -33,6 +32,7 @@ from typing import (
 import click
 
 from psfdae.errors import Error, missing
+from psfdae.joined import joined
 from psfdae.version import __version__
 
 OWN = "psfdae.commands"
@@ -166,7 +166,7 @@ def found() -> dict[str, tuple[str, Path]]:
 
 
 def _packages() -> list[str]:
-    return [OWN, *(point.value for point in entry_points(group="psfdae.commands"))]
+    return [OWN, *(point.value for point in joined("commands"))]
 
 
 @cache

@@ -31,6 +31,8 @@ Y_k, σ_a μ_y,k with σ_a = `FLUX_SIGMA`.
 from __future__ import annotations
 
 import math
+from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any, NamedTuple, Self
@@ -55,6 +57,9 @@ hold less than 1 % of the weight."""
 OUTLIER_COORDINATES, LEADING_ARRAYS = 40, ("axes", "variance", "mean", "deviation", "slope")
 """Coordinates that tell outliers, and arrays whose last axis they are. More of them find
 more outliers that are bright, and fewer that are faint."""
+
+FEW_ROWS = 64
+"""Rows of a cluster up to which its factorisation takes no time by itself."""
 
 FLAT_VARIANCE = 0.005
 """Variance of a coordinate over s below which all clusters share one normal law."""
@@ -223,23 +228,7 @@ class MixtureLaw:
     ) -> tuple[np.ndarray, np.ndarray | float, np.ndarray, np.ndarray, np.ndarray]:
         """Posterior mean, its σ, evidence, flux and weights of images (n, P) of variance s."""
         z = (flat @ self.axes).astype(np.float32)
-        near = self._near(z, where, s) if near is None else near
-        log = np.full((len(z), len(self.count)), -np.inf)
-        leading = self._leading(s)
-        for k in range(len(self.count)):
-            (stars,) = near[:, k].nonzero()
-            if stars.size:
-                factor = self._factor(k, s)
-                _, residual, half = self._against(k, z[stars, :leading], where[stars], s)
-                off = (where[stars] - self.center[k]) @ self._clusters[k].spread.T
-                log[stars, k] = factor.constant - 0.5 * (
-                    np.square(residual) @ factor.inverse[:leading]
-                    - np.square(half).sum(axis=1)
-                    + np.square(off).sum(axis=1)
-                )
-        # In the other coordinates all clusters have nearly one law.
-        rest = np.square(z[:, leading:] - self._middle[leading:])
-        log -= 0.5 * (rest @ (1.0 / (self.variance[leading:] + s)))[:, None]
+        log = self._log_densities(z, where, s, near)
         weights, evidence = mixing_weights(log)
         evidence -= 0.5 * z.shape[1] * np.log(2 * np.pi)
         weight = weights.astype(np.float32)
@@ -252,7 +241,7 @@ class MixtureLaw:
                 continue
             w = weight[stars, k, None]
             factor = self._factor(k, s)
-            at, residual, half = self._against(k, z[stars], where[stars], s)
+            at, residual, half = self._against(k, factor, z[stars], where[stars])
             g = residual * factor.inverse
             g[:, : factor.low.shape[1]] -= half @ factor.low
             if self.loose:
@@ -261,7 +250,8 @@ class MixtureLaw:
             if len(self.cross):
                 g *= factor.shared
                 mean = self.mean_reference[k] + half @ factor.low_reference
-                mean += at @ self._clusters[k].slope_reference
+                if at.size:
+                    mean += at @ self._clusters[k].slope_reference
                 own[stars] += w * mean
             gain[stars] += w * g
             if sure:
@@ -273,6 +263,33 @@ class MixtureLaw:
         if not len(self.cross):  # the sky of the image is no part of the star
             psf += ((flux - 1.0) / z.shape[1]).astype(np.float32)[:, None]
         return psf, sigma, evidence, flux, weight
+
+    def _log_densities(
+        self, z: np.ndarray, where: np.ndarray, s: float, near: np.ndarray | None
+    ) -> np.ndarray:
+        """ln of the probability of images in the axes under each cluster that is near, (n, K).
+
+        Without the term of 2π.
+        """
+        near = self._near(z, where, s) if near is None else near
+        log = np.full((len(z), len(self.count)), -np.inf)
+        leading = self._leading(s)
+        self._factorise(np.flatnonzero(near.any(axis=0)), s)
+        for k in range(len(self.count)):
+            (stars,) = near[:, k].nonzero()
+            if stars.size:
+                factor = self._factor(k, s)
+                _, residual, half = self._against(k, factor, z[stars, :leading], where[stars])
+                far = np.square(residual) @ factor.inverse[:leading] - np.square(half).sum(axis=1)
+                far = far.astype(np.float64)
+                if where.shape[1]:
+                    off = (where[stars] - self.center[k]) @ self._clusters[k].spread.T
+                    far += np.square(off).sum(axis=1)
+                log[stars, k] = factor.constant - 0.5 * far
+        # In the other coordinates all clusters have nearly one law.
+        rest = np.square(z[:, leading:] - self._middle[leading:])
+        log -= 0.5 * (rest @ (1.0 / (self.variance[leading:] + s)))[:, None]
+        return log
 
     @cached_property
     def _contrast(self) -> np.ndarray:
@@ -295,13 +312,13 @@ class MixtureLaw:
         )
 
     def _against(
-        self, k: int, z: np.ndarray, where: np.ndarray, s: float
+        self, k: int, factor: Factor, z: np.ndarray, where: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Position from the cluster's, image less its mean there, and A times that.
 
         The image z has all coordinates or the leading ones.
         """
-        low = self._factor(k, s).low
+        low = factor.low
         at = (where - self.center[k]).astype(np.float32)
         width = z.shape[1]
         residual = z - self.mean[k, :width]
@@ -327,16 +344,18 @@ class MixtureLaw:
     @cached_property
     def _clusters(self) -> list[Cluster]:
         """Each cluster with its own slope, by the same shrinkage as its covariances."""
+        p, nu, total = self.deviation_center, float(self.shrinkage[0]), self.count + self.shrinkage
         ends = self.rows.cumsum()
-        return [
-            self._cluster(k, slice(b - n, b))
-            for k, (b, n) in enumerate(zip(ends, self.rows, strict=True))
-        ]
+        parts = [slice(b - n, b) for b, n in zip(ends, self.rows, strict=True)]
+        scatter = np.array([p[rows].T @ p[rows] for rows in parts]) + nu * np.eye(p.shape[1])
+        inverse = np.linalg.inv(scatter)
+        spread = np.linalg.inv(np.linalg.cholesky(scatter / total[:, None, None]))
+        return [self._cluster(k, rows, inverse[k], spread[k]) for k, rows in enumerate(parts)]
 
-    def _cluster(self, k: int, rows: slice) -> Cluster:
+    def _cluster(self, k: int, rows: slice, inverse: np.ndarray, spread: np.ndarray) -> Cluster:
+        """`inverse` is that of the positions' scatter, (q, q), and ν."""
         p = self.deviation_center[rows]
         nu, total = float(self.shrinkage[0]), self.count[k] + float(self.shrinkage[0])
-        scatter = p.T @ p + nu * np.eye(p.shape[1])
 
         def sloped(a: np.ndarray, common: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             """Deviations without the slope of the cluster, and that slope.
@@ -345,7 +364,7 @@ class MixtureLaw:
             """
             if not (p.size and len(a)):
                 return a, common
-            own = np.linalg.solve(scatter, p.T @ a).astype(np.float32)
+            own = (inverse @ (p.T @ a)).astype(np.float32)
             rows = np.vstack([a - p.astype(np.float32) @ own, np.float32(np.sqrt(nu)) * own])
             return rows, common + own
 
@@ -363,35 +382,54 @@ class MixtureLaw:
         if len(own) > own.shape[1]:
             rotation, own = np.linalg.qr(own)
             own_reference = rotation.T @ own_reference if len(own_reference) else own_reference
-        spread = np.linalg.inv(np.linalg.cholesky(scatter / total))
         return Cluster(
             own, own_reference, square, slope, slope_reference, spread, nu / total, 1 / total
         )
 
     def _factor(self, k: int, s: float) -> Factor:
         """C_k + s factorised."""
-        return self._factors(s, k, partial(self._factored, k, s))
+        return self._factors(s, k, lambda: self._factored([k], s)[0])
 
-    def _factored(self, k: int, s: float) -> Factor:
-        cluster = self._clusters[k]
-        leading = min(self._leading(s), cluster.own.shape[1])
+    def _factorise(self, some: np.ndarray, s: float) -> None:
+        """C_k + s of some clusters factorised, those with as many rows and stars together."""
+        alike = defaultdict(list)
+        for k in self._factors.missing(s, some):
+            alike[self.rows[k], self.count[k]].append(k)
+        for own in alike.values():
+            for k, factor in zip(own, self._factored(own, s), strict=True):
+                self._factors(s, k, partial(lambda made: made, factor))
+
+    def _factored(self, alike: Sequence[int], s: float) -> list[Factor]:
+        """Factors of clusters with as many rows and stars."""
+        clusters = [self._clusters[k] for k in alike]
+        first = clusters[0]
+        leading = min(self._leading(s), first.own.shape[1])
         shared = np.ones(len(self.variance))
-        shared[:leading] = cluster.common
+        shared[:leading] = first.common
         d = shared * self.variance + s
-        rows, y = cluster.own[:, :leading].astype(np.float64), cluster.own_reference
-        found = factorised(d[:leading], rows, cluster.scale, y if len(y) else None)
-        return Factor(
-            inverse=(1.0 / d).astype(np.float32),
-            low=np.ascontiguousarray(found.low[:, :leading], np.float32),
-            low_reference=np.ascontiguousarray(found.low[:, leading:], np.float32),
-            shared=shared.astype(np.float32),
-            constant=float(
-                np.log(self.count[k] / self.count.sum())
-                - found.half_det
-                - 0.5 * np.log(d).sum()
-                + np.log(cluster.spread.diagonal()).sum()
-            ),
-        )
+        rows = np.stack([c.own[:, :leading] for c in clusters]).astype(np.float64)
+        y = np.stack([c.own_reference for c in clusters]) if len(self.cross) else None
+        if rows.shape[1] > FEW_ROWS and len(alike) == 1:
+            rows, y = rows[0], None if y is None else y[0]
+        found = factorised(d[:leading], rows, first.scale, y)
+        same = (1.0 / d).astype(np.float32), shared.astype(np.float32)
+        half, log_d = np.atleast_1d(found.half_det), np.log(d).sum()
+        low = found.low.reshape(len(alike), len(first.own), -1).astype(np.float32)
+        return [
+            Factor(
+                inverse=same[0],
+                low=np.ascontiguousarray(low[i, :, :leading]),
+                low_reference=np.ascontiguousarray(low[i, :, leading:]),
+                shared=same[1],
+                constant=float(
+                    np.log(self.count[k] / self.count.sum())
+                    - half[i]
+                    - 0.5 * log_d
+                    + np.log(clusters[i].spread.diagonal()).sum()
+                ),
+            )
+            for i, k in enumerate(alike)
+        ]
 
     def _leading(self, s: float) -> int:
         """Coordinates in which clusters differ at a noise variance s.

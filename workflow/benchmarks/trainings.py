@@ -181,9 +181,7 @@ def grid_around(used, most_components):
 
 def time_points(tree, stars):
     """Fit and test settings on the training and test stars of the split random."""
-    # Imported before the clock starts.
-    import minisom  # noqa: F401
-    import sklearn.decomposition  # noqa: F401
+    import minisom  # noqa: F401  # before the clock starts
 
     from psfdae_paper.methods.pca_som import PcaSom
 

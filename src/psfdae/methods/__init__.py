@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from functools import cache
 from importlib import import_module
-from importlib.metadata import entry_points
 from importlib.util import find_spec
 from pkgutil import iter_modules
 from typing import Annotated
@@ -16,6 +15,7 @@ from typing import Annotated
 from pydantic import AfterValidator, Field
 
 from psfdae.files import ProductError
+from psfdae.joined import joined
 from psfdae.method import Method
 
 OWN = "psfdae.methods"
@@ -44,7 +44,7 @@ def known() -> tuple[type[Method], ...]:
 
 @cache
 def _joined() -> dict[str, type[Method]]:
-    packages = [point.value for point in entry_points(group="psfdae.methods")]
+    packages = [point.value for point in joined("methods")]
     found = [_of_module(f"{package}.{name}") for package in packages for name in _modules(package)]
     return {kind.name: kind for kind in found if kind}
 

@@ -9,12 +9,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
 from pydantic import Field, create_model
 
+from psfdae.joined import joined
 from psfdae.methods import MethodNames, known
 from psfdae.reading import read_yaml
 from psfdae.settings import (
@@ -82,7 +82,7 @@ def from_words(words: Sequence[str] = ()) -> Settings:
 
 def _composed(groups: tuple[str, ...], word: str, words: Sequence[str]) -> Group:
     """Groups of settings where a word chooses a file, or is wrong, of which Hydra says more."""
-    for point in entry_points(group="psfdae.settings"):
+    for point in joined("settings"):
         settings: Group = point.load()(groups, (CHOSEN, *words))
         return settings
     raise ConfigError(f"{word}: expected group.key=value, the group one of {', '.join(groups)}")

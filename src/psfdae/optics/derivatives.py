@@ -164,7 +164,20 @@ class PeriodSampling(Separable, WholePeriod):
         )
         from_points = np.exp(2j * np.pi * np.outer(lags, np.arange(self.points)) / self.points)
         self.dtype = np.empty(0, precision).real.dtype
-        self.pixels = ((to_pixels @ from_points).real / self.points).astype(self.dtype)
+        # A pixel's width along the axis, a wave of the image gains this phase.
+        moved = to_pixels * (2j * np.pi * pixel * frequency)
+        self.pixels, self._moved = (
+            ((waves @ from_points).real / self.points).astype(self.dtype)
+            for waves in (to_pixels, moved)
+        )
+
+    def slopes_by_place(self, values: np.ndarray) -> np.ndarray:
+        """Derivatives of the pixels of intensities (B, m, m) by the image's place.
+
+        Along x and y, per pixel; shape (B, 2, d, d).
+        """
+        pairs = (self.pixels, self._moved), (self._moved, self.pixels)
+        return np.stack([of_y @ (values @ of_x.T) for of_y, of_x in pairs], axis=1)
 
 
 def _centres(stamp_px: int, pixel: float) -> np.ndarray:
@@ -227,6 +240,7 @@ class ModalStamps:
         coefficients: np.ndarray,
         directions: np.ndarray | None = None,
         offset_px: np.ndarray | None = None,
+        places: bool = False,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Stamps of a batch and their derivatives along directions of the coefficients.
 
@@ -238,11 +252,14 @@ class ModalStamps:
             transpose; by default the coefficients themselves, K = J.
         offset_px : ndarray, shape (B, 2), optional
             As in `stamps`; kept fixed.
+        places : bool
+            Two more derivatives, by the place of the image along x and y, in pixels. They follow
+            from the image, which is why they cost little; its sampling must be `PeriodSampling`.
 
         Returns
         -------
         stamps : ndarray, shape (B, d, d)
-        derivatives : ndarray, shape (B, K, d, d)
+        derivatives : ndarray, shape (B, K, d, d), or (B, K + 2, d, d) with `places`
             Per unit parameter.
         """
         if directions is None:
@@ -253,12 +270,16 @@ class ModalStamps:
         pupil_fields = self._pupil_fields(coefficients, offset_px)
         few = directions.shape[1] < self._sampling.product_cost * len(self._products)
         derivatives = self._by_direction if few else self._by_product
-        return derivatives(pupil_fields, directions)
+        intensity, slopes = derivatives(pupil_fields, directions)
+        if places:
+            assert isinstance(self._sampling, PeriodSampling)
+            slopes = np.concatenate([slopes, self._sampling.slopes_by_place(intensity)], axis=1)
+        return self._sampling.to_pixels(intensity), slopes
 
     def _by_direction(
         self, pupil_fields: np.ndarray, directions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Stamps and derivatives, each direction a field of its own."""
+        """Intensities at the points and slopes of the pixels, each direction a field of its own."""
         sampling, (count, *shape) = self._sampling, pupil_fields.shape
         changed = np.empty((count, 1 + directions.shape[1], *shape), pupil_fields.dtype)
         changed[:, 0] = pupil_fields
@@ -267,14 +288,15 @@ class ModalStamps:
         (rows,) = sampling.along_x(changed.reshape(-1, *shape))
         (fields,) = sampling.along_y(rows)
         image, *changes = np.moveaxis(fields.reshape(*changed.shape[:2], *fields.shape[1:]), 1, 0)
-        slopes = [image.imag * c.real - image.real * c.imag for c in changes]
-        stamps = sampling.to_pixels(image.real**2 + image.imag**2)
-        return stamps, (4.0 * np.pi) * sampling.to_pixels(np.stack(slopes, axis=1))
+        slopes = np.empty((count, len(changes), *image.shape[1:]), self.dtype)
+        for k, change in enumerate(changes):
+            slopes[:, k] = image.imag * change.real - image.real * change.imag
+        return image.real**2 + image.imag**2, (4.0 * np.pi) * sampling.to_pixels(slopes)
 
     def _by_product(
         self, pupil_fields: np.ndarray, directions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Stamps and derivatives from those of all products of Legendre polynomials."""
+        """Intensities and slopes as above, from those of all products of Legendre polynomials."""
         sampling, weights = self._sampling, directions @ self._coefficients
         slopes: dict[tuple[int, int], np.ndarray] = {}
         for a, rows in enumerate(sampling.along_x(pupil_fields, range(len(self._degrees)))):
@@ -287,9 +309,9 @@ class ModalStamps:
                 slope = image.imag * change.real - image.real * change.imag
                 slopes[a, b] = sampling.to_pixels(slope)
         each = (4.0 * np.pi) * np.stack([slopes[place] for place in self._products], axis=1)
-        stamps = sampling.to_pixels(image.real**2 + image.imag**2)
-        shape = (len(stamps), weights.shape[1], *stamps.shape[1:])
-        return stamps, (weights @ each.reshape(*each.shape[:2], -1)).reshape(shape)
+        shape = (len(each), weights.shape[1], *each.shape[2:])
+        found = (weights @ each.reshape(*each.shape[:2], -1)).reshape(shape)
+        return image.real**2 + image.imag**2, found
 
     def opd(self, coefficients: np.ndarray) -> np.ndarray:
         """OPD maps in waves, shape (B, M, M)."""
@@ -399,12 +421,13 @@ class SampledStamps:
         directions: np.ndarray,
         offset_px: np.ndarray | None = None,
         samples: np.ndarray | None = None,
+        places: bool = False,
     ) -> tuple[np.ndarray, np.ndarray]:
         """As `ModalStamps.derivatives`, directions (B, K, J); raises as `samples`.
 
         `samples` (B,) are pupil samples, by default as many as the stamps need.
         """
-        count, side = directions.shape[1], self.stamp_px
+        count, side = directions.shape[1] + 2 * places, self.stamp_px
         stamps = np.empty((len(coefficients), side, side), self._dtype)
         slopes = np.empty((len(coefficients), count, side, side), self._dtype)
 
@@ -414,7 +437,7 @@ class SampledStamps:
             def differentiate(part: np.ndarray) -> None:
                 offset = None if offset_px is None else offset_px[part]
                 stamps[part], slopes[part] = operator.derivatives(
-                    coefficients[part], directions[part], offset
+                    coefficients[part], directions[part], offset, places
                 )
 
             return differentiate

@@ -108,17 +108,28 @@ class WholePeriod:
 
     def along_x(self, pupil_fields: np.ndarray, degrees: Sequence[int] = (0,)) -> np.ndarray:
         """See `Sampling`, m = points."""
-        from scipy import fft
-
-        weights = legendre(degrees, self._axis).astype(self.dtype)
-        return np.asarray(fft.fft(pupil_fields * weights[:, None, None], self.points))
+        return self._transformed(pupil_fields, degrees, -1)
 
     def along_y(self, rows: np.ndarray, degrees: Sequence[int] = (0,)) -> np.ndarray:
         """See `Sampling`."""
+        return self._transformed(rows, degrees, -2)
+
+    def _transformed(self, fields: np.ndarray, degrees: Sequence[int], axis: int) -> np.ndarray:
+        """Fields (B, ., .) times Legendre polynomials along an axis, transformed along it."""
         from scipy import fft
 
-        weights = legendre(degrees, self._axis).astype(self.dtype)
-        return np.asarray(fft.fft(rows * weights[:, None, :, None], self.points, axis=-2))
+        shape = [len(degrees), *fields.shape]
+        shape[axis] = self.points
+        padded = np.zeros(shape, fields.dtype)
+        own = padded[..., : len(self._axis)] if axis == -1 else padded[..., : len(self._axis), :]
+        if max(degrees):
+            weights = legendre(degrees, self._axis).astype(self.dtype)
+            np.multiply(
+                fields, weights[:, None, :, None] if axis == -2 else weights[:, None, None], out=own
+            )
+        else:
+            own[:] = fields
+        return np.asarray(fft.fft(padded, axis=axis, overwrite_x=True))
 
 
 class BlurredSampling(WholePeriod):

@@ -12,7 +12,7 @@ the state the three of each stamp in turn, what is missing to its flux relative 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -57,8 +57,7 @@ def stamps_and_slopes(
     if operator.movable:
         own = own.reshape(*zernikes.shape[:2], 3)
         zernikes = np.concatenate([zernikes, own[:, :, 1:]], axis=2)
-        directions = np.pad(directions, ((0, 0), (0, 0), (0, 2), (0, 2)))
-        directions[:, :, [-2, -1], [-2, -1]] = 1.0
+        directions = np.pad(directions, ((0, 0), (0, 0), (0, 0), (0, 2)))
     shapes, slopes = operator.derivatives(zernikes, directions)
     if emulator is not None:
         slopes = np.concatenate([emulator(states)[1], slopes], axis=2)
@@ -104,24 +103,27 @@ def bound_covariances(
     noise: NoiseModel,
     levels: list[float],
     states: np.ndarray,
+    free: Sequence[bool],
 ) -> np.ndarray:
     """Cramér–Rao bounds on the covariance of any unbiased estimate of states (n, 4).
 
-    If the operator's stamps are movable, nobody knows the flux and the place of any star.
+    Each of `free` is a bound: whether nobody knows the flux and the place of any star, for which
+    the operator's stamps must be movable.
 
     Returns
     -------
-    ndarray, shape (L, n, 4, 4)
+    ndarray, shape (len(free), L, n, 4, 4)
         For the L noise levels λ, in squared units of the range.
     """
-    out = np.empty((len(levels), len(states), 4, 4))
+    out = np.empty((len(free), len(levels), len(states), 4, 4))
     for start in range(0, len(states), CHUNK):
         part = slice(start, start + CHUNK)
-        free = parameters_of(model, operator, states[part])
-        images, slopes = stamps_and_slopes(model, operator, free)
-        for index, level in enumerate(levels):
-            fisher = deviance_and_information(noise, level, images, images, slopes)[2]
-            out[index, part] = np.linalg.inv(fisher)[:, :4, :4]
+        parameters = parameters_of(model, operator, states[part])
+        images, slopes = stamps_and_slopes(model, operator, parameters)
+        for bound, level in np.ndindex(out.shape[:2]):
+            own = slopes if free[bound] else slopes[:, :, :4]
+            fisher = deviance_and_information(noise, levels[level], images, images, own)[2]
+            out[bound, level, part] = np.linalg.inv(fisher)[:, :4, :4]
     return out
 
 

@@ -9,6 +9,7 @@ derivative of a stamp is that of the centred stamp.
 from __future__ import annotations
 
 from functools import partial
+from math import prod
 
 import numpy as np
 
@@ -152,27 +153,28 @@ class AlignmentStamps:
             In waves.
         directions : ndarray, shape (..., K, J)
             Changes of the coefficients per unit parameter, such as those of
-            `QuadraticModel.jacobian`; of none, stamps alone are made.
+            `QuadraticModel.jacobian`.
 
         Returns
         -------
         stamps : ndarray, shape (..., d, d)
             Each sums to 1.
         derivatives : ndarray, shape (..., K, d, d)
-            Per unit parameter; each sums to 0.
+            Per unit parameter; each sums to 0. If stamps are movable, two more follow, by the
+            place of the star along x and y in pixels.
 
         Raises
         ------
         SamplingError, EnergyError
             As for stamps.
         """
-        shape, count = zernikes.shape[:-1], directions.shape[-2]
-        if not count:
+        shape = zernikes.shape[:-1]
+        if not (directions.shape[-2] or self.movable):
             return self(zernikes)[0], np.empty((*shape, 0, *[self.alignment.stamp_px] * 2))
         zernikes, directions = (
-            a.reshape(-1, *a.shape[len(shape) :]) for a in (zernikes, directions)
+            a.reshape(prod(shape), *a.shape[len(shape) :]) for a in (zernikes, directions)
         )
-        raw = self.propagation.derivatives(zernikes, directions)
+        raw = self.propagation.derivatives(zernikes, directions, places=self.movable)
         stamps, slopes, energy = normalise_with_derivatives(*raw)
         self._check_energy(energy)
         return stamps.reshape(*shape, *stamps.shape[1:]), slopes.reshape(*shape, *slopes.shape[1:])

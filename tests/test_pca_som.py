@@ -1,0 +1,34 @@
+"""Principal axes and the self-organising map of the baseline beside the packages that have them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from minisom import MiniSom
+from sklearn.decomposition import PCA
+
+from psfdae_paper.methods.pca_som import principal_axes, self_organised
+
+
+@pytest.fixture(scope="module")
+def points():
+    """Points about 30 places, more along some axes than along others."""
+    rng = np.random.default_rng(0)
+    places = rng.normal(size=(30, 6)) * [5, 4, 3, 2, 1, 0.5]
+    return places[rng.integers(30, size=900)] + rng.normal(size=(900, 6))
+
+
+def test_principal_axes_are_scikit_learn_s(points):
+    mean, axes = principal_axes(points + 7.0, 4)
+    theirs = PCA(4, svd_solver="full").fit(points + 7.0)
+    assert mean == pytest.approx(theirs.mean_)
+    assert axes == pytest.approx(theirs.components_, abs=1e-9)
+
+
+def test_the_map_is_minisom_s_to_the_last_bit(points):
+    given = dict(sigma=1.2, learning_rate=0.5)
+    theirs = MiniSom(5, 4, 6, random_seed=3, **given)
+    theirs.random_weights_init(points)
+    theirs.train(points, 3, random_order=True, use_epochs=True)
+    own = self_organised(points, (5, 4), 3, seed=3, **given)
+    assert (own == theirs.get_weights().reshape(20, 6)).all()
