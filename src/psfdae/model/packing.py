@@ -63,8 +63,7 @@ NORMAL_WIDE = 1.96  # σ within which a normal variable has as much
 LIMIT = 0.999  # part of the test stars within the limit of the Mahalanobis distance
 STEPS = 64  # of the noise up to that of the flux in every pixel, of a model that is to be small
 LEAST_STARS = 1000  # noisy images per node; few test stars are seen several times with new noise
-FEW_STARS = 500  # of them, for a choice, and where all pixels of a brightness are one number
-SCALED = 4  # of the nodes, at which such numbers are measured
+FEW_STARS = 250  # of them, for a choice, and where all pixels of a brightness are one number
 
 Restore = Callable[[np.ndarray, float], Estimate]
 """The method: normalised noisy images (n, d, d) of a noise level λ to PSFs."""
@@ -412,8 +411,7 @@ def with_scales(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -
     No training must have seen the stars: where noise is far below the errors that a method makes
     on other stars, those on its own do not tell.
     """
-    model, every = PsfModel(bundle), bundle.noise_nodes
-    nodes = every[np.rint(np.linspace(0, len(every) - 1, SCALED)).astype(int)]
+    model, nodes = PsfModel(bundle), bundle.noise_nodes
     shape = 2, len(CASES)  # the noise is known, or estimated
     noise = np.tile(nodes, (*shape, 1))
     width, of_flux = np.ones((2, *shape, 2, len(nodes))), np.ones(len(nodes))
@@ -444,16 +442,15 @@ def with_scales(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -
                 )
     # Where a star has light that the photometry does not know, its noise is found too large.
     noise = np.maximum.accumulate(noise, axis=-1)
-    scales = np.ones((*width.shape[:-1], len(every)))
     for index in np.ndindex(width.shape[:-1]):
         _, *case, _ = index
-        scales[index] = np.interp(every, noise[tuple(case)], width[index])
-    scale68, scale95 = np.moveaxis(scales, -1, 1)
+        width[index] = np.interp(nodes, noise[tuple(case)], width[index])
+    scale68, scale95 = np.moveaxis(width, -1, 1)
     return replace(
         bundle,
         scale68=scale68,
         scale95=scale95,
-        flux_error_scale=np.interp(every, noise[1, -1], of_flux),
+        flux_error_scale=np.interp(nodes, noise[1, -1], of_flux),
     )
 
 
