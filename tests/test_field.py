@@ -23,7 +23,7 @@ from photutils_grid import drawn, gridded
 from psfdae import load_model
 from psfdae.bright_stars import BrightStars
 from psfdae.cli import main
-from psfdae.field_law import MOST_PX2, OUTLIER_MODES
+from psfdae.field_law import MOST_PX2, OUTLIER_MODES, step_of
 from psfdae.field_psf import fit_field
 from psfdae.method import FitError, TrainingSet
 from psfdae.methods.field import FieldMixture
@@ -395,6 +395,19 @@ def test_same_stars_give_the_same_fit(stars, field):
 def test_list_of_the_training_is_known(field):
     assert field.listed[0] == pytest.approx([-0.1, -0.1], abs=0.03)
     assert field.listed[1] == pytest.approx([0.05, 0.05], rel=0.5)
+
+
+def test_nodes_are_nearer_to_each_other_where_stars_are_undersampled(field, stars, monkeypatch):
+    assert [step_of(fwhm, 0.25) for fwhm in (1.1, 1.7, 2.5)] == [1 / 8, 1 / 5, 0.25]
+    assert field.step_px == 0.25
+    monkeypatch.setattr("psfdae.field_law.STEP_FWHM", 0.2 / size(stars.wide).mean())
+    finer = fitted(stars)
+    arrays, _ = finer.pack(SIDE, 1e-3)
+    config = {"noise": {"kappa": 1.0, "background_photons": 1e6}}
+    config["field"] = finer.settings.model_dump()
+    restored = FieldMixture.restored(arrays, config, "realisation")
+    assert restored.step_px == finer.step_px == pytest.approx(0.18, abs=0.021)
+    assert np.diff(np.unique(restored.places)) == pytest.approx(finer.step_px)
 
 
 def test_packed_is_the_same_to_half_precision(field):

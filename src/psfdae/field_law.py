@@ -72,7 +72,7 @@ STARS_AT_ONCE = 2048
 OUTLIER_MODES = 12
 """Leading axes that tell outliers, as the others tell the training stars from all others."""
 
-NOISE_STEP = 0.1
+VARIANCE_STEP = 0.1
 """Step in ln of the noise variance between stars whose pixels are equally sure."""
 
 AXES = 96
@@ -278,9 +278,9 @@ class Seen:
 
         Stars of about the same noise share it.
         """
-        number = np.rint(np.log(self.s) / NOISE_STEP)
+        number = np.rint(np.log(self.s) / VARIANCE_STEP)
         known, which = np.unique(np.hstack([number, self.width]), axis=0, return_inverse=True)
-        s, width = np.exp(NOISE_STEP * known[:, :1]), known[:, 1:]
+        s, width = np.exp(VARIANCE_STEP * known[:, :1]), known[:, 1:]
         beyond, along = self.axes.noise_parts(s)
         left = np.linalg.inv(self.axes.certainty(s, width))
         rows = (self.axes.latent * along[:, None]).reshape(-1, along.shape[1]) @ self.axes.vectors

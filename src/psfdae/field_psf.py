@@ -45,7 +45,7 @@ DEFORMATION_STEPS = 3  # of Gauss-Newton
 HIGHER_CHANGE = 0.3  # times this, of terms beyond the constant
 FOLDS, ENOUGH_STARS = 5, 300  # left out, of which one fold after the other is predicted
 TOLERANCE, ITERATIONS = 1e-4, 150  # of the conjugate gradients
-TRIED_TOLERANCE = 3e-3  # of fits that are tried; errors of stars left out change by 0.3 %
+TRIED_TOLERANCE = 3e-3  # of fits that are tried: errors of stars left out hardly change
 
 
 @dataclass(frozen=True)

@@ -29,14 +29,11 @@ class Factorised(NamedTuple):
     ----------
     low : ndarray, shape (r, m + q), or (n, r, m + q) of several
         A in the leading m coordinates, where X is not 0; then L⁻¹ of q further columns.
-    cholesky : ndarray, shape (r, r) or (n, r, r)
-        L.
     half_det : float, or ndarray, shape (n,)
         ½ ln of the determinant over that of D.
     """
 
     low: np.ndarray
-    cholesky: np.ndarray
     half_det: Any
 
 
@@ -67,7 +64,7 @@ def factorised(
     else:  # many small ones: their inverses take less than a call for each
         low = np.linalg.inv(cholesky) @ columns
     half_det = np.log(np.diagonal(cholesky, axis1=-2, axis2=-1)).sum(axis=-1)
-    return Factorised(low, cholesky, half_det + 0.5 * size * np.log(weight))
+    return Factorised(low, half_det + 0.5 * size * np.log(weight))
 
 
 def mixing_weights(log: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

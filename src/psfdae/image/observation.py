@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -288,6 +288,17 @@ class Source:
         if table is None:
             raise ObservationError(self.path, f"no catalogue is given to take {name!r} from")
         return table.numbers(name)
+
+
+def other_instruments(
+    known: Mapping[str, object], seen: Mapping[str, str]
+) -> list[tuple[str, str, str]]:
+    """Keys of headers by which two images' telescope, camera or filter differ, and both values."""
+    return [
+        (key, str(value), seen[key])
+        for key, value in known.items()
+        if key in seen and seen[key].strip().casefold() != str(value).strip().casefold()
+    ]
 
 
 def require_sky(stars: StarList, what: str) -> None:

@@ -265,9 +265,9 @@ class FieldMixture(FieldLaw, Method):
         known = np.isfinite(listed).all(axis=1) & fixed
         found = np.empty((count, 6 + 2 * images.shape[1]))
         covariance = np.empty((count, 4, 4))
-        for centred, placed in np.ndindex(2, 2):
-            for part in parts_of(np.flatnonzero((known == centred) & (positioned == placed))):
-                some = stars.of(part)._replace(positioned=bool(placed))
+        for centred, located in np.ndindex(2, 2):
+            for part in parts_of(np.flatnonzero((known == centred) & (positioned == located))):
+                some = stars.of(part)._replace(positioned=bool(located))
                 if centred:
                     at = listed[part]
                     near = np.square(self.places - at[:, None]).sum(axis=-1).argmin(axis=1)

@@ -17,7 +17,7 @@ class FieldGrid(GriddedPSFModel):  # type: ignore[misc]
 
     What photutils' own class interpolates from the splines of four PSFs, one after the other, is
     read here from one spline: interpolation is linear, so that the coefficients can be averaged
-    first. Fits of stars take a fourth of the time.
+    first.
     """
 
     columns: ClassVar[Sequence[float]]

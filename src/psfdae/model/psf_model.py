@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from psfdae.bundle_info import BundleInfo
-from psfdae.image.observation import Observation
+from psfdae.image.observation import Observation, other_instruments
 from psfdae.image.stamps import (
     Stamps,
     StarFlag,
@@ -291,10 +291,10 @@ class PsfModel(FieldPsfs):
         stars = self.info.config.get("stars")
         known = stars.get("instrument") if isinstance(stars, Mapping) else None
         return "; ".join(
-            f"{key} is {instrument[key]!r}, the model {self.name!r} was trained on {value!r}"
-            for key, value in (known.items() if isinstance(known, Mapping) else ())
-            if key in instrument
-            and instrument[key].strip().casefold() != str(value).strip().casefold()
+            f"{key} is {seen!r}, the model {self.name!r} was trained on {value!r}"
+            for key, value, seen in other_instruments(
+                known if isinstance(known, Mapping) else {}, instrument
+            )
         )
 
     def field_range(self) -> tuple[np.ndarray, np.ndarray]:

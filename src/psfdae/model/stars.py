@@ -14,7 +14,13 @@ import numpy as np
 from psfdae.bright_stars import BrightStars
 from psfdae.files import Column, Product
 from psfdae.image.errors import ObservationError, no_formula
-from psfdae.image.observation import ASSUMED_SCALE, Observation, Source, list_offset
+from psfdae.image.observation import (
+    ASSUMED_SCALE,
+    Observation,
+    Source,
+    list_offset,
+    other_instruments,
+)
 from psfdae.image.selection import Candidates, Verdict, advice, collect
 from psfdae.image.training_images import single_psf, star_grid, training_columns
 from psfdae.model.psf_model import SCALE_TOLERANCE
@@ -358,10 +364,8 @@ def _require_one_camera(opened: Sequence[Observation]) -> None:
         if abs(scales[1] / scales[0] - 1.0) > SCALE_TOLERANCE:
             unlike = [("the pixel scale", *(f"{scale:.6g} arcsec" for scale in scales))]
         unlike += [
-            (key, repr(said), repr(other.instrument[key]))
-            for key, said in first.instrument.items()
-            if key in other.instrument
-            and said.strip().casefold() != other.instrument[key].strip().casefold()
+            (key, repr(known), repr(seen))
+            for key, known, seen in other_instruments(first.instrument, other.instrument)
         ]
         if unlike:
             what, one, two = unlike[0]

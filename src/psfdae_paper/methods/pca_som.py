@@ -294,7 +294,7 @@ def self_organised(
 ) -> np.ndarray:
     """Nodes (M, K) of the map of features (n, K); parameters as of `fit_pca_som`.
 
-    They are MiniSom's to the last bit, in a fifth of its time: what a node's victory does to all
+    They are MiniSom's to the last bit, in less time: what a node's victory does to all
     others changes from epoch to epoch only, and the way from the nodes to a star finds the winner
     and is what they go.
     """
