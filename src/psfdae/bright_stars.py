@@ -17,6 +17,14 @@ LEAST_SKY, MOST_SKY = 2.0 * DEFECT**2, 1e12
 """Photons per pixel of the new noise, at least: no rate of photons is negative, and the deepest
 pixel of a star that is made fainter has B − DEFECT √B at most."""
 
+LEAST_FLUX = 1e-30
+"""Counts. A star that is seen to have less is fainter than any other."""
+
+
+def magnitude(flux: np.ndarray) -> np.ndarray:
+    """Instrumental magnitudes of fluxes in counts; that of `LEAST_FLUX` for what is below."""
+    return np.asarray(-2.5 * np.log10(np.maximum(flux, LEAST_FLUX)))
+
 
 @dataclass(frozen=True)
 class BrightStars:
@@ -33,7 +41,7 @@ class BrightStars:
     position : ndarray, shape (n, 2)
         (x, y) in the image, NaN where unknown.
     flux, noise : ndarray, shape (n,)
-        Flux inside the stamp, and RMS of the sky in a pixel, both in counts or over the flux.
+        Flux inside the stamp, and RMS of the sky in a pixel, in counts.
     snr : ndarray, shape (n,)
     row : ndarray of int, shape (n,)
         Of the star list.
@@ -51,11 +59,12 @@ class BrightStars:
 
     @classmethod
     def of_product(cls, stars: Product) -> BrightStars:
-        """Read the bright stars of a product "stars" of an image; flux 1, no centroids."""
-        names = ("wide", "peak", "position", "noise", "snr", "row", "listed")
+        """Read the bright stars of a product "stars" of an image, which has no centroids."""
+        names = ("peak", "position", "snr", "row", "listed", "flux")
         arrays = {name: stars[name] for name in names}
-        centre = np.full(arrays["position"].shape, np.nan)
-        return cls(**arrays, centre=centre, flux=np.ones(len(centre)))
+        flux, centre = arrays["flux"], np.full(arrays["position"].shape, np.nan)
+        wide, noise = stars["wide"] * flux[:, None, None], stars["noise"] * flux
+        return cls(**arrays, centre=centre, wide=wide, noise=noise)
 
     @classmethod
     def joined(cls, several: Sequence[BrightStars]) -> BrightStars:
@@ -68,6 +77,11 @@ class BrightStars:
     def of(self, chosen: np.ndarray) -> BrightStars:
         """A part of the stars, by a mask or by indices."""
         return BrightStars(*(getattr(self, field.name)[chosen] for field in fields(self)))
+
+    @property
+    def place(self) -> np.ndarray:
+        """x, y and magnitude, on which the PSF may depend, shape (n, 3)."""
+        return np.column_stack([self.position, magnitude(self.flux)])
 
     def area(self) -> np.ndarray:
         """Noise-equivalent area A = (F / (σ S/N))² of each star in pixels, shape (n,)."""

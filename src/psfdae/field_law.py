@@ -382,11 +382,18 @@ class FieldLaw:
         return isqrt(self.offset.shape[-1]) - 2 * MARGIN_PX
 
     def _terms(self, position: np.ndarray | None, count: int = 0) -> tuple[np.ndarray, np.ndarray]:
-        """Terms of the field of each star, the usual ones where no position is known, and where."""
+        """Terms of the field of each star, and where its position is known, (n,) of bool.
+
+        They are the usual ones where it is not, and so are those of an unknown magnitude.
+        """
         position = np.full((count, 2), np.nan) if position is None else position
-        positioned = np.isfinite(position).all(axis=1) | (len(self.usual) == 1)
-        terms = self.model.terms(np.nan_to_num(position))
-        return np.where(positioned[:, None], terms, self.usual), positioned
+        x, y, mag = (*position.T, np.full(len(position), np.nan))[:3]
+        positioned = (np.isfinite(x) & np.isfinite(y)) | (self.order == 0)
+        known = np.repeat(positioned[:, None], len(self.usual), axis=1)
+        if last := self.model.of_magnitude:
+            known[:, -last:] = np.isfinite(mag)[:, None]
+        terms = self.model.terms(np.nan_to_num(np.stack([x, y, mag], axis=1)))
+        return np.where(known, terms, self.usual), positioned
 
     # The nodes.
 

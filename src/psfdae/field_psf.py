@@ -10,7 +10,9 @@ change with the phase against each other. Changes over the field are as small a 
 as of the core, unless the stars say otherwise. Stars that are unlike the others do not count, and
 pixels that are brighter or fainter than the model count less: they may show a neighbour. How far
 the polynomial goes, and how smooth the splines are, is what stars that were left out are
-predicted best with.
+predicted best with. Where a detector or a plate is not linear, f changes with the brightness of a
+star as well: its magnitude and the square of that are two more terms, if they predict stars that
+were left out clearly better.
 """
 
 from __future__ import annotations
@@ -38,6 +40,7 @@ CHANGE, LEAST_CHANGE = 0.5, 1e-5  # of a coefficient over the field, by its mean
 UNLIKE_SIGMA = 3.0  # of a pixel, from which it counts less: it may show a neighbour
 UNLIKE_CHI2 = 8.0  # times the median, from which a star does not count
 CURVED = 2  # order up to which all are tried: a symmetric field has no slope
+MAGNITUDE_TERMS, MAGNITUDE_GAIN = 2, 0.02  # and the part of the error by which they lower it
 SMOOTHER, SMOOTHER_BY = 3, 10.0  # steps of the smoothness, each by this factor, that are tried
 EXPOSURE_CHANGES = (0.005, 0.02, 0.1)  # of a coefficient by that of another exposure, tried
 LARGEST_DEFORMATION = 0.3  # usual stretch of a PSF in another exposure; px² of its blur
@@ -56,8 +59,9 @@ class FieldModel:
     ----------
     coefficients : ndarray, shape (K, N, N)
         Of the splines, for each of the K terms of the polynomial.
-    low, high : ndarray, shape (2,)
-        Range of the positions; beyond it the PSF is that of its edge.
+    low, high : ndarray, shape (2,) or (3,)
+        Range of the positions, and of the magnitudes if the PSF changes with these; beyond it the
+        PSF is that of its edge.
     spacing : float
         Of the knots, in pixels.
     """
@@ -69,11 +73,20 @@ class FieldModel:
 
     @property
     def order(self) -> int:
-        """Order of the polynomial, which has (order + 1)(order + 2)/2 terms."""
-        return (isqrt(8 * len(self.coefficients) + 1) - 3) // 2
+        """Order of the polynomial in the place, which has (order + 1)(order + 2)/2 terms."""
+        return (isqrt(8 * (len(self.coefficients) - self.of_magnitude) + 1) - 3) // 2
+
+    @property
+    def of_magnitude(self) -> int:
+        """Last terms, of the magnitude alone: 0 if the PSF does not change with it."""
+        return MAGNITUDE_TERMS * (len(self.low) - 2)
 
     def terms(self, position: np.ndarray) -> np.ndarray:
-        """Terms of the polynomial at positions (n, 2), shape (n, K); NaN where unknown."""
+        """Terms of the polynomial, shape (n, K); NaN where unknown.
+
+        At positions (n, 3) of x, y and magnitude, of which the last one may be left out of a model
+        that does not change with it.
+        """
         return _terms(position, self.low, self.high, self.order)
 
     def images(
@@ -127,7 +140,8 @@ def fit_field(
 ) -> FieldFit:
     """Fit orders of the polynomial, ascending, and then stronger smoothing, as long as it pays.
 
-    It pays if stars that are left out are predicted better.
+    It pays if stars that are left out are predicted better. With the best order, terms of the
+    magnitude are tried.
 
     Parameters
     ----------
@@ -155,6 +169,12 @@ def fit_field(
             best, least = order, error
         elif order >= CURVED:
             break
+    alternating.coordinates = 3
+    error = alternating.crossed_error(alternating.fit(best))
+    if error < (1.0 - MAGNITUDE_GAIN) * least:
+        least = error
+    else:
+        alternating.coordinates = 2
     for _ in range(SMOOTHER):
         alternating.smoothness *= SMOOTHER_BY
         error = alternating.crossed_error(alternating.fit(best))
@@ -191,6 +211,7 @@ class _Alternating:
     """Rounds of a fit to stars, and to what is known of the field from other exposures."""
 
     change, tolerance = 0.0, TOLERANCE
+    coordinates = 2  # of a place that count: x and y, and the magnitude as well if 3
 
     def __init__(
         self,
@@ -204,23 +225,24 @@ class _Alternating:
     ) -> None:
         self.prior = prior
         self.images, self.seen = stars.framed(side)
-        self.noise, self.position = stars.noise, stars.position
+        self.noise, self.place = stars.noise, stars.place
         self.photons = np.sqrt(background) * stars.flux / stars.noise
         self.stamp_px, self.spacing, self.smoothness = stamp_px, spacing, smoothness
         self.axis = np.arange(side) - side // 2.0
         self.inner = np.abs(self.axis + 0.5) < stamp_px / 2
         self.knots = int((side + 1) / spacing) - 1
-        known = self.position[np.isfinite(self.position).all(axis=1)]
-        known = known if len(known) else np.zeros((1, 2))
-        self.low, self.high = known.min(axis=0), known.max(axis=0)
+        known = [column[np.isfinite(column)] for column in self.place.T]
+        ends = [(column.min(), column.max()) if column.size else (0.0, 0.0) for column in known]
+        self.low, self.high = np.transpose(ends)
         if prior is not None:
-            self.low, self.high = prior.low, prior.high
+            self.low, self.high, self.coordinates = prior.low, prior.high, len(prior.low)
         bend = np.diff(np.eye(self.knots), 2, axis=0)
         self.bend = bend.T @ bend
 
     def fit(self, order: int) -> FieldFit:
         """All stars."""
-        terms = _terms(self.position, self.low, self.high, order)
+        low, high = self.low[: self.coordinates], self.high[: self.coordinates]
+        terms = _terms(self.place, low, high, order)
         good, flux = np.ones(len(terms), bool), self.images.sum(axis=(1, 2))
         start, window = np.zeros((len(flux), 2)), np.full(len(flux), WINDOW_PX)
         centre = windowed_centres(self.images, start, window, WINDOW_ROUNDS, WINDOW_REACH_PX)
@@ -234,7 +256,7 @@ class _Alternating:
             factor, centre, _ = _adjusted(
                 splines, data, weight, centre, self.axis, self.spacing, CENTRE_STEPS
             )
-            middle = found[:1] if order == 0 else np.tensordot(terms.mean(axis=0)[None], found, 1)
+            middle = np.tensordot(terms.mean(axis=0)[None], found, 1)
             sides = np.arange(self.stamp_px) - self.stamp_px // 2.0
             total = float(_drawn(middle, sides, np.zeros((1, 2)), self.spacing).sum())
             found, flux = found / total, flux * factor * total
@@ -251,7 +273,7 @@ class _Alternating:
             if turn:
                 good = chi2 < UNLIKE_CHI2 * np.median(chi2)
         assert found is not None
-        model = FieldModel(found, self.low, self.high, self.spacing)
+        model = FieldModel(found, low, high, self.spacing)
         return FieldFit(model, flux, centre, good, residual)
 
     def crossed_error(self, fit: FieldFit) -> float:
@@ -259,7 +281,7 @@ class _Alternating:
 
         Flux, sky and centre of these are fitted to them. Of many stars, some folds are enough.
         """
-        terms = fit.model.terms(self.position)
+        terms = fit.model.terms(self.place)
         data = self.images / fit.flux[:, None, None]
         weight = self._weight(fit.flux)
         fold, errors = np.arange(len(terms)) % FOLDS, []
@@ -406,13 +428,17 @@ def _deformations(coefficients: np.ndarray, spacing: float) -> np.ndarray:
 
 
 def _terms(position: np.ndarray, low: np.ndarray, high: np.ndarray, order: int) -> np.ndarray:
-    """Monomials x^a y^b, a + b ≤ order, of positions scaled to ±1, shape (n, K)."""
-    if order == 0:
-        return np.ones((len(position), 1))
+    """Monomials x^a y^b, a + b ≤ order, of positions scaled to ±1, shape (n, K).
+
+    Where the range has a third coordinate, its powers are the last terms.
+    """
     width = np.where(high > low, high - low, 1.0)
-    x, y = np.clip(2.0 * (position - low) / width - 1.0, -1.0, 1.0).T
+    scaled = np.clip(2.0 * (position[:, : len(low)] - low) / width - 1.0, -1.0, 1.0)
+    x, y, *more = scaled.T
     powers = [(a, total - a) for total in range(order + 1) for a in range(total, -1, -1)]
-    return np.stack([x**a * y**b for a, b in powers], axis=1)
+    terms = [x**a * y**b for a, b in powers]
+    terms += [column**power for column in more for power in range(1, MAGNITUDE_TERMS + 1)]
+    return np.stack(terms, axis=1)
 
 
 def _splines_at(place: np.ndarray, knots: int, spacing: float) -> np.ndarray:

@@ -294,7 +294,7 @@ class KnowsField(Protocol):
         """Of the polynomial by which the PSF changes over the field."""
 
     def psf_at(self, position: np.ndarray, oversampling: int = 1) -> np.ndarray:
-        """PSFs at positions (n, 2)."""
+        """PSFs at positions (n, 2), or with magnitudes (n, 3)."""
 
     def facts(self) -> Mapping[str, str]:
         """What a fit knows of the field that its user should: a title and words for each."""

@@ -665,7 +665,7 @@ class Observation:
             listed = np.stack([y - central_pixel(y), x - central_pixel(x)], axis=1)
         ids, flux, background, flags = (column[part].copy() for column in self._columns)
         raise_flag(flags, StarFlag.TRUNCATED, truncated)
-        known = (flux, background, noise, gain, listed)
+        known = (flux, background, noise, gain, unknown, listed)
         return Stamps(data, masked, saturated, flags, ids, x, y, *known)
 
 

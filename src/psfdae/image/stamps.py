@@ -27,6 +27,7 @@ class Stamps:
     background: np.ndarray  # (n,), sky level, likewise
     noise: np.ndarray  # (n,), RMS of the sky in a pixel, likewise
     gain: np.ndarray  # (n,), electrons per unit of the stamps; NaN where unknown
+    magnitude: np.ndarray  # (n,), for which the PSF is asked; NaN: that of the flux that is found
     # (n, 2), centre (row, column) from index s//2 that a list says; NaN where unknown
     listed: np.ndarray
 

@@ -198,6 +198,7 @@ def training_columns(
         "jitter": Column(jitter, "pixel", "centring error (row, column)"),
         "phase": Column(phase, "pixel", "(row, column) that splines moved the star"),
         "position": Column(bright.position, "pixel", "(x, y) of every star, 0-based"),
+        "flux": Column(bright.flux, "count", "of every star inside its stamp"),
         "snr": Column(bright.snr, "1", "signal to noise of every star"),
         "noise": Column(bright.noise / bright.flux, "1", "pixel RMS over flux of every star"),
         "row": Column(bright.row, "1", "row of every star in the catalogue"),

@@ -55,8 +55,8 @@ class FieldMixture(FieldLaw, Method):
     storage = Storage(
         arrays={
             "coefficients": ("1", "splines of the field for each term of its polynomial"),
-            "low": ("pixel", "least position (x, y)"),
-            "high": ("pixel", "greatest position (x, y)"),
+            "low": ("pixel", "least position (x, y), and magnitude if the PSF changes with it"),
+            "high": ("pixel", "greatest position, likewise"),
             "usual": ("1", "mean of the terms"),
             "spread": ("1", "their covariance"),
             "offset": ("1", "mean residual by phase"),
@@ -84,7 +84,7 @@ class FieldMixture(FieldLaw, Method):
         sizes, splines = (side + 2 * MARGIN_PX, side), (field.spacing_px, field.smoothness)
         fit = fit_field(bright, data.noise.background, *sizes, field.orders, *splines)
         used = bright.of(fit.good)
-        terms = fit.model.terms(used.position)
+        terms = fit.model.terms(used.place)
         usual = fit.model.images(terms.mean(axis=0)[None], np.zeros((1, 2)), side)
         step = step_of(float(measure_shapes(usual).fwhm_px[0]), field.step_px)
         offset, modes, diagonal = _residuals(fit, used.noise / fit.flux[fit.good], field, step)
@@ -167,15 +167,16 @@ class FieldMixture(FieldLaw, Method):
         return replace(self, free=True)
 
     def psf_at(self, position: np.ndarray, oversampling: int = 1) -> np.ndarray:
-        """The field's PSFs (n, m, m) at positions (n, 2), as `FieldModel.images` draws them.
+        """The field's PSFs (n, m, m) at positions, as `FieldModel.images` draws them.
 
-        Positions are meant as those of the training's list. Stars lie in their sub-pixel phase
+        Positions (n, 2), or with magnitudes (n, 3), are meant as those of the training's list,
+        and what is not known of them as usual. Stars lie in their sub-pixel phase
         beside the middle, which is the pixel of their position. Their flux is that for which a
         star in the middle of its pixel has the sum 1 in its stamp: a PSF keeps it where it moves
         with its star, as it does in photometry, though some light then crosses the stamp's edge.
         """
         terms = self._terms(position)[0]
-        phase = (position - np.floor(position + 0.5))[:, ::-1]
+        phase = (position - np.floor(position + 0.5))[:, 1::-1]
         images = self.model.images(terms, phase + self._list_offset, self.side, oversampling)
         whole = self.model.images(terms, np.broadcast_to(self._list_offset, phase.shape), self.side)
         return np.asarray(images / whole.sum(axis=(1, 2), keepdims=True))
@@ -185,7 +186,14 @@ class FieldMixture(FieldLaw, Method):
         order = self.order
         changes = f"changes over the image by a polynomial of order {order}"
         same = "is the same everywhere (order 0: more is not supported by stars left out)"
-        return {"Field": f"the PSF {changes if order else same}"}
+        facts = {"Field": f"the PSF {changes if order else same}"}
+        if self.model.of_magnitude:
+            bright, faint = self.low[2], self.high[2]
+            facts["Brightness"] = (
+                f"the PSF changes with the magnitude −2.5 log₁₀ (flux / counts), {bright:.2f} to "
+                f"{faint:.2f}; brighter and fainter stars have the PSF of the end of this range"
+            )
+        return facts
 
     def predict(
         self, noisy: np.ndarray, level: float | np.ndarray, position: np.ndarray | None = None
@@ -231,8 +239,8 @@ class FieldMixture(FieldLaw, Method):
             In any unit; the sky may be roughly subtracted.
         noise : ndarray, shape (n,)
             RMS of a pixel.
-        position : ndarray, shape (n, 2), optional
-            (x, y) in the field; NaN where unknown.
+        position : ndarray, shape (n, 2) or (n, 3), optional
+            (x, y) in the field, and the magnitude; NaN where unknown.
         centre : ndarray, shape (n, 2), optional
             (row, column) that a list says, from pixel (d//2, d//2); NaN where none does.
         fixed : bool or ndarray of bool, shape (n,)

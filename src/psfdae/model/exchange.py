@@ -136,6 +136,7 @@ class PsfexField(FieldPsfs):
         """Files of PSFEx do not say how large pixels are."""
 
     def _drawn(self, place: np.ndarray, oversampling: int) -> np.ndarray:
+        place = place[:, :2]  # no magnitude
         u, v = np.clip((place - self.zero) / self.width, -0.5, 0.5).T
         sampled = np.tensordot(np.stack([u**i * v**j for i, j in self.terms], 1), self.basis, 1)
         phase = place - np.floor(place + 0.5)

@@ -43,7 +43,7 @@ class _Field(FieldPsfs):
         return hashlib.sha256(self.fitted.coefficients.tobytes()).hexdigest()
 
     def field_range(self) -> tuple[np.ndarray, np.ndarray]:
-        return self.fitted.low, self.fitted.high
+        return self.fitted.low[:2], self.fitted.high[:2]
 
     def check_scale(self, pixel_scale_arcsec: float | None, what: str) -> None:
         """It is of the image that it is applied to."""

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from psfdae.bright_stars import magnitude
 from psfdae.bundle_info import BundleInfo
 from psfdae.image.observation import Observation, other_instruments
 from psfdae.image.stamps import (
@@ -171,8 +172,10 @@ class PsfModel(FieldPsfs):
         gain : float or array, shape (n,), optional
             Electrons per unit of the stamps: adds the star's photon noise to `chi2`
             and `flux_error`.
-        position : array, shape (n, 2), optional
-            (x, y) of the stars in the image of the training, 0-based; NaN where unknown.
+        position : array, shape (n, 2) or (n, 3), optional
+            (x, y) of the stars in the image of the training, 0-based; NaN where unknown. The third
+            number is the magnitude −2.5 log₁₀ (flux / counts), by default that of the flux in the
+            stamp; it counts where the PSF of the training stars changes with their brightness.
         centre : array, shape (n, 2), optional
             (x, y) of the stars' centres that a list says, from index s//2; NaN where unknown.
             Like the position, for models that measure centres (`psfdae.methods.field`).
@@ -223,7 +226,7 @@ class PsfModel(FieldPsfs):
                 f"stamps of shape {size}, but the model {self.info.name!r} takes n×{side}×{side}"
             )
         finite = np.isfinite(data)
-        x, y = _pairs("position", position, len(data)).T
+        x, y, mag = _numbers("position", position, len(data), 3).T
         return Stamps(
             data=data if finite.all() else np.where(finite, data, 0),
             bad=_mask("bad", masks["bad"], data, single) | ~finite,
@@ -232,7 +235,8 @@ class PsfModel(FieldPsfs):
             id=np.arange(len(data)),
             x=x,
             y=y,
-            listed=_pairs("centre", centre, len(data))[:, ::-1],
+            magnitude=mag,
+            listed=_numbers("centre", centre, len(data), 2)[:, ::-1],
             **{name: _per_star(name, value, len(data)) for name, value in given.items()},
         )
 
@@ -300,7 +304,7 @@ class PsfModel(FieldPsfs):
     def field_range(self) -> tuple[np.ndarray, np.ndarray]:
         """Least and greatest position (x, y) of the training stars; raises as `psf_at`."""
         self._field()
-        low, high = (np.asarray(self.bundle.weights[name]) for name in ("low", "high"))
+        low, high = (np.asarray(self.bundle.weights[name][:2]) for name in ("low", "high"))
         if not (high > low).all():
             raise PredictionError(f"the model {self.name!r} knows no places of its stars")
         return low, high
@@ -358,12 +362,13 @@ def _mask(name: str, mask: ArrayLike | None, data: np.ndarray, single: bool) -> 
     return array
 
 
-def _pairs(name: str, values: ArrayLike | None, count: int) -> np.ndarray:
-    """Two numbers per star, NaN where they are not known."""
+def _numbers(name: str, values: ArrayLike | None, count: int, most: int) -> np.ndarray:
+    """Two numbers per star, or as many as `most`, (n, most); NaN where they are not known."""
     numbers = real_numbers(name, np.full((count, 2), np.nan) if values is None else values)
-    if numbers.shape != (count, 2):
+    if numbers.shape not in [(count, columns) for columns in range(2, most + 1)]:
         raise PredictionError(f"{name} of shape {numbers.shape}, expected ({count}, 2)")
-    return numbers.astype(np.float64)
+    missing = np.full((count, most - numbers.shape[1]), np.nan)
+    return np.hstack([numbers, missing], dtype=np.float64)
 
 
 def _per_star(name: str, value: ArrayLike | None, count: int) -> np.ndarray:
@@ -594,10 +599,12 @@ class Engine:
         noise = np.where(found.noise > NOISE_FLOOR * size, found.noise, NOISE_FLOOR * size)
         photons = np.nan_to_num(np.maximum(found.flux, 0.0) / stars.gain / pixels)
         noise = np.where(nothing, 1.0, np.sqrt(noise**2 + photons))
+        flux = np.where(given, stars.flux, found.flux)
+        mag = np.where(np.isnan(stars.magnitude), magnitude(flux), stars.magnitude)
         estimate = method.measure(
             data,
             noise,
-            np.stack([stars.x, stars.y], axis=1),
+            np.stack([stars.x, stars.y, mag], axis=1),
             stars.listed - shift,
             exact,
             flux=stars.flux,

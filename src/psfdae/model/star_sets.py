@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from psfdae.bright_stars import BrightStars
+from psfdae.bright_stars import BrightStars, magnitude
 from psfdae.files import Product, ProductError, read_product
 from psfdae.fits import learnt
 from psfdae.method import MeasuresStars, Method, TrainingSet
@@ -34,11 +34,15 @@ def of_image(stars: Product) -> bool:
 
 
 def field_positions(stars: Product) -> np.ndarray:
-    """Where each star stands, shape (n, 2): in steps of the field's grid, or pixels of an image.
+    """Where each star stands: in steps of the field's grid, shape (n, 2).
 
-    NaN where an image's list does not say it.
+    Of an image in pixels, NaN where its list does not say it, with a third column: the magnitude
+    of the bright star, which stays that of its noisy images.
     """
-    return np.asarray(stars["position" if of_image(stars) else "grid"][stars["field_index"]])
+    if not of_image(stars):
+        return np.asarray(stars["grid"][stars["field_index"]])
+    place = np.column_stack([stars["position"], magnitude(stars["flux"])])
+    return np.asarray(place[stars["field_index"]])
 
 
 def star_area(stars: Product, train: np.ndarray) -> float:

@@ -127,6 +127,7 @@ def _stamps(stars: ArrayLike, noise: ArrayLike | None, gain: ArrayLike | None) -
         background=unknown,
         noise=each("noise", noise),
         gain=each("gain", gain),
+        magnitude=unknown,
         listed=np.full((count, 2), np.nan),
     )
 

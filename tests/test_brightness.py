@@ -1,0 +1,117 @@
+"""Fields whose PSF changes with the brightness of a star, as on plates, simulated."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import psfdae
+from psfdae.model.fitting import fit
+from psfdae.model.stars import Stars
+from psfdae_paper.stars.example import add_stamps
+
+SIZE, STAMP, WIDE = 800, 16, 32
+BRIGHTEST, FAINTEST = -13.0, -8.0  # magnitudes of stars that are learnt from
+PLACES = np.array([[200.0, 200.0], [400.0, 600.0]])
+
+
+def sigma_of(mag):
+    """Width of stars in pixels: bright ones are larger."""
+    return 1.3 + 0.7 * ((FAINTEST - np.asarray(mag)) / (FAINTEST - BRIGHTEST)) ** 1.5
+
+
+def stars_of(centre, sigma, side):
+    """Gaussian stars (n, side, side) of flux 1, pixels integrated."""
+    from scipy.special import erf
+
+    edges = np.arange(side + 1) - side // 2 - 0.5
+    rows, columns = (
+        np.diff(erf((edges - centre[:, axis, None]) / (np.sqrt(2) * sigma[:, None]))) / 2
+        for axis in (0, 1)
+    )
+    return rows[:, :, None] * columns[:, None, :]
+
+
+def image_of(width, seed=3):
+    """Pixels with stars whose σ is `width` of their magnitude, with places and magnitudes."""
+    rng = np.random.default_rng(seed)
+    axis = np.arange(32.0, SIZE - 32, 40)
+    position = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    position = position + rng.uniform(-0.5, 0.5, position.shape)
+    mag = rng.uniform(BRIGHTEST, FAINTEST, len(position))
+    centre = (position - np.floor(position + 0.5))[:, ::-1]
+    pixels = 100.0 + rng.standard_normal((SIZE, SIZE))
+    add_stamps(pixels, 10 ** (-0.4 * mag)[:, None, None] * stars_of(centre, width(mag), WIDE),
+               *position.T)  # fmt: skip
+    return pixels, position, mag
+
+
+def model_of(pixels, position, **settings):
+    small = {"train_stars": 300, "test_stars": 60, "stamp_px": STAMP, "seed": 1}
+    stars = Stars.from_image(pixels, position, pixel_scale_arcsec=1.0, gain=1e9, **small)
+    return fit(stars, "field", name="plate", **settings)
+
+
+@pytest.fixture(scope="module")
+def sky():
+    return image_of(sigma_of)
+
+
+@pytest.fixture(scope="module")
+def model(sky):
+    return model_of(*sky[:2])
+
+
+def test_the_psf_follows_the_magnitude_and_is_that_of_the_end_beyond(model):
+    for mag in (-12.5, -10.5, -8.5):
+        found = model.psf_at(*PLACES.T, 1, mag=mag)
+        wanted = stars_of(np.zeros((2, 2)), np.full(2, sigma_of(mag)), STAMP)
+        assert found == pytest.approx(wanted / wanted.sum(axis=(1, 2), keepdims=True), abs=2e-3)
+    for end, beyond in ((BRIGHTEST, -16.0), (FAINTEST, -2.0)):
+        far = model.psf_at(200.0, 200.0, mag=beyond)
+        assert far == pytest.approx(model.psf_at(200.0, 200.0, mag=end), abs=1e-3)
+    usual = model.psf_at(200.0, 200.0).max()
+    assert usual == pytest.approx(model.psf_at(200.0, 200.0, mag=-10.5).max(), rel=0.2)
+    several = model.psf_at(200.0, 200.0, mag=[-12.5, -8.5])
+    assert several[0].max() < several[1].max()
+    assert "changes with the magnitude" in model.engine.estimator.facts()["Brightness"]
+    low, high = model.field_range()
+    assert low.shape == high.shape == (2,) and model.grid(2, 2).shape == (4, 2)
+
+
+def test_a_star_has_the_psf_of_its_own_flux_or_of_the_magnitude_that_is_stated(model, sky):
+    """Where noise hides the star itself; a stated magnitude counts whatever the flux."""
+    rng, mag = np.random.default_rng(5), -12.0
+    truth = stars_of(np.zeros((200, 2)), np.full(200, sigma_of(mag)), STAMP)
+    noise = 0.01 * rng.standard_normal(truth.shape)
+    place = np.tile(PLACES[0], (200, 1))
+    flux = 10 ** (-0.4 * mag)
+    in_counts = model.predict(flux * (truth + noise), position=place)
+    stated = model.predict(truth + noise, position=np.column_stack([place, np.full(200, mag)]))
+    unlike = model.predict(truth + noise, position=place)  # as the faintest
+    assert in_counts.flux / flux == pytest.approx(stated.flux, rel=0.05)
+
+    def error(found):
+        return float(np.square(found.psf / found.flux[:, None, None] - truth).mean())
+
+    assert error(in_counts) == pytest.approx(error(stated), rel=0.02)
+    assert error(stated) < 0.5 * error(unlike)
+
+
+def test_stars_that_are_alike_need_no_magnitude(sky):
+    pixels, position, _ = image_of(lambda mag: np.full(len(mag), 1.5))
+    model = model_of(pixels, position)
+    assert len(model.bundle.weights["low"]) == 2
+    known = model.psf_at(200.0, 200.0)
+    assert (model.psf_at(200.0, 200.0, mag=-9.0) == known).all()
+    # Of one order nothing is tried.
+    assert len(model_of(*sky[:2], orders=[0]).bundle.weights["low"]) == 2
+
+
+def test_a_model_of_brightness_is_kept_and_written_for_other_programs(model, tmp_path):
+    model.save(tmp_path / "plate.psf.safetensors")
+    again = psfdae.load_model(tmp_path / "plate.psf.safetensors")
+    for mag in (None, -9.0):
+        assert (again.psf_at(1.0, 2.0, mag=mag) == model.psf_at(1.0, 2.0, mag=mag)).all()
+    nodes = again.to_photutils(3, 2)
+    assert nodes.data[4] == pytest.approx(again.psf_at(*np.rint(again.grid(3, 3)[4]), 2), abs=1e-9)
