@@ -94,7 +94,7 @@ def test_a_star_has_the_psf_of_its_own_flux_or_of_the_magnitude_that_is_stated(m
     def error(found):
         return float(np.square(found.psf / found.flux[:, None, None] - truth).mean())
 
-    assert error(in_counts) == pytest.approx(error(stated), rel=0.02)
+    assert error(in_counts) == pytest.approx(error(stated), rel=0.1)
     assert error(stated) < 0.5 * error(unlike)
 
 

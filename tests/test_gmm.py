@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from psfdae import lowrank
+from psfdae import mixing
 from psfdae import mixture_law as module
 from psfdae.method import Needs, TrainingSet
 from psfdae.methods import gmm
@@ -125,7 +125,8 @@ def dense(mixture, noisy, level, position):
 @pytest.mark.parametrize("clusters", [1, 12])
 def test_sums_are_those_of_dense_matrices(same, kind, level, clusters, monkeypatch):
     monkeypatch.setattr(module, "FLAT_VARIANCE", 0.0)
-    monkeypatch.setattr(lowrank, "LEAST_WEIGHT", 0.0)
+    monkeypatch.setattr(module, "LEAST_VARIANCE", 0.0)
+    monkeypatch.setattr(mixing, "LEAST_WEIGHT", 0.0)
     mixture = fitted(same=same, kind=kind, components=[clusters])
     noisy = NOISE.draw(stars(50, seed=2)[0], level, np.random.default_rng(3))
     mean, sigma, evidence = dense(mixture, noisy, level, where(50, seed=2))
@@ -138,7 +139,8 @@ def test_sums_are_those_of_dense_matrices(same, kind, level, clusters, monkeypat
 @pytest.mark.parametrize("same", [True, False])
 def test_a_flux_that_is_an_estimate_is_found(same, monkeypatch):
     monkeypatch.setattr(module, "FLAT_VARIANCE", 0.0)
-    monkeypatch.setattr(lowrank, "LEAST_WEIGHT", 0.0)
+    monkeypatch.setattr(module, "LEAST_VARIANCE", 0.0)
+    monkeypatch.setattr(mixing, "LEAST_WEIGHT", 0.0)
     mixture, rng, pixels = fitted(same=same, components=[12]), np.random.default_rng(3), D * D
     images, wider = stars(300, seed=2)
     flux = rng.normal(1.0, 0.1, (300, 1, 1))
@@ -159,7 +161,7 @@ def test_a_flux_that_is_an_estimate_is_found(same, monkeypatch):
 def test_total_variance_is_that_of_the_stars_and_with_a_free_flux_of_no_less():
     """By it coordinates are left out in which noise hides all differences of the clusters."""
     mixture, (images, _) = fitted(components=[4]), stars(400)
-    flux = np.random.default_rng(5).normal(1.0, lowrank.FLUX_SIGMA, (400, 1))
+    flux = np.random.default_rng(5).normal(1.0, mixing.FLUX_SIGMA, (400, 1))
     flat = images.reshape(400, -1)
     loose = flux * flat + (1 - flux) / flat.shape[1]
     plain, moved = ((a @ mixture.axes).astype(float).var(axis=0) for a in (flat, loose))
@@ -266,12 +268,12 @@ def test_a_search_that_ends_at_the_last_value_says_so(capsys):
 @pytest.mark.parametrize("free", [False, True])
 def test_outlier_score_of_one_cluster_is_the_square_of_mahalanobis_distance(free, monkeypatch):
     monkeypatch.setattr(module, "FLAT_VARIANCE", 0.0)
+    monkeypatch.setattr(module, "LEAST_VARIANCE", 0.0)
     monkeypatch.setattr(module, "OUTLIER_COORDINATES", 10)
     mixture = fitted(same=False)
     mixture = mixture.free_flux() if free else mixture
     noisy = NOISE.draw(stars(20, seed=2)[0], LEVEL, np.random.default_rng(3))
-    s = np.rint(np.log(NOISE.variance(1.0 / D**2, LEVEL)) / module.FINE_NOISE_STEP)
-    s = np.exp(s * module.FINE_NOISE_STEP)
+    s = NOISE.variance(1.0 / D**2, LEVEL)
     residual = (noisy.reshape(20, -1) @ mixture.axes - mixture.mean[0])[:, :10].astype(float)
     row = mixture.loose * mixture._contrast[0, :10].astype(float)
     usual = np.diag(mixture._total[:10] + s)

@@ -36,7 +36,7 @@ import numpy as np
 from pydantic import Field
 
 from psfdae.field_psf import SLOPE_PX, FieldModel
-from psfdae.lowrank import FLUX_SIGMA, mixing_weights
+from psfdae.mixing import FLUX_SIGMA, mixing_weights
 from psfdae.noise import NoiseModel
 from psfdae.settings import Count, Fraction, Group, Positive
 

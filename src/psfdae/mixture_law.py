@@ -14,9 +14,10 @@ Where the images have noise of their own, as bright stars do, its covariance is 
 S and every XᵀX, and what would be negative is 0.
 
 All covariances of a cluster of n_k stars are shrunk towards those within all clusters:
-C_k = (X_kᵀX_k + ν S) / (n_k + ν), X_k the deviations of its stars from their mean. In the
-eigenvectors of S this is a diagonal and a matrix of rank n_k; by Woodbury's identity its
-inverse takes matrices of n_k × n_k alone, and no C_k is ever made.
+C_k = (X_kᵀX_k + ν S) / (n_k + ν), X_k the deviations of its stars from their mean. The
+eigenvectors of C_k do not depend on the noise: along the leading ones C_k + s is diagonal for
+every star, and beyond them C_k is taken for even. Coordinates are the eigenvectors of S; only in
+the leading ones do clusters differ by more than the noise hides.
 
 A method that is given where the star stands has two more numbers p in the observed vector,
 without noise. Given p, everything above holds again: π_k becomes π_k N(p; p_k, P_k), μ_k
@@ -31,24 +32,24 @@ Y_k, σ_a μ_y,k with σ_a = `FLUX_SIGMA`.
 from __future__ import annotations
 
 import math
-from collections import defaultdict
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from psfdae.lowrank import NOISE_STEP, Kept, factorised, mixing_weights
 from psfdae.method import Estimate
+from psfdae.mixing import mixing_weights
 from psfdae.noise import NoiseModel
 
-FINE_NOISE_STEP = 0.2
-"""`NOISE_STEP` where the density of images counts: an error of s weighs more in it than in their
-mean."""
+NOISE_BIN = 2.0
+"""Range of ln s of stars for which the same coordinates and axes of a cluster count."""
 
-CACHE_BYTES = 400e6
-"""Size of the factorisations that are kept for further stars."""
+DET_NODES = 41
+"""Of ln s in such a range, between which determinants are interpolated."""
+
+NOISE_STEP = 0.4
+"""Step in ln s between stars that share the variance of their pixels over s."""
 
 NEAREST, LEADING = 32, 64
 """Clusters that are looked at, and coordinates in which they are found; the others of 512
@@ -58,11 +59,11 @@ OUTLIER_COORDINATES, LEADING_ARRAYS = 40, ("axes", "variance", "mean", "deviatio
 """Coordinates that tell outliers, and arrays whose last axis they are. More of them find
 more outliers that are bright, and fewer that are faint."""
 
-FEW_ROWS = 64
-"""Rows of a cluster up to which its factorisation takes no time by itself."""
-
 FLAT_VARIANCE = 0.005
 """Variance of a coordinate over s below which all clusters share one normal law."""
+
+LEAST_VARIANCE = 5e-4
+"""Variance over s of a cluster's axes; of smaller ones only the mean is known."""
 
 IMAGES_AT_ONCE = 4096
 """Images that are restored together."""
@@ -96,27 +97,76 @@ class Cluster(NamedTuple):
     scale: float
 
 
-class Factor(NamedTuple):
-    """(C_k + s)⁻¹ = diag(inverse) − AᵀA, A in the leading m coordinates.
+class Axes(NamedTuple):
+    """Eigenvectors of C_k in the leading w coordinates.
 
     Attributes
     ----------
-    inverse : ndarray, shape (P,)
-    low : ndarray, shape (r, m)
-        A.
-    low_reference : ndarray, shape (r, P)
-        What Aᵀ becomes in C_yx (C_k + s)⁻¹, of references that are not the images.
-    shared : ndarray, shape (P,)
-        Factor of S in C_k, by coordinate.
-    constant : float
-        ln π_k − ½ ln det(C_k + s) of the determinant in units of 2π.
+    vectors : ndarray, shape (w, w), float32
+        Columns, by descending variance.
+    variance : ndarray, shape (w,)
+        Along them.
+    total : float
+        Sum of the variances.
     """
 
-    inverse: np.ndarray
-    low: np.ndarray
-    low_reference: np.ndarray
-    shared: np.ndarray
-    constant: float
+    vectors: np.ndarray
+    variance: np.ndarray
+    total: float
+
+
+class Cut(NamedTuple):
+    """What counts of a cluster's axes above some noise.
+
+    Attributes
+    ----------
+    vectors : ndarray, shape (m, a), float32
+        Columns V.
+    variance : ndarray, shape (a,)
+        λ along them.
+    rest : float
+        Mean variance beyond them in the m coordinates; infinite if there is nothing beyond.
+    """
+
+    vectors: np.ndarray
+    variance: np.ndarray
+    rest: float
+
+    def inverse(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(C_k + s)⁻¹ along the axes (n, a) and beyond them (n, 1), for noise s (n, 1)."""
+        variance = self.variance.astype(s.dtype)
+        return 1 / (variance + s), 1 / (s.dtype.type(self.rest) + s)
+
+    def half_log_det(self, s: np.ndarray) -> np.ndarray:
+        """½ ln det(C_k + s) of some s (n,), in the m coordinates."""
+        more = len(self.vectors) - len(self.variance)
+        along = np.log(self.variance + s[:, None]).sum(axis=1)
+        return np.asarray(0.5 * (along + (more * np.log(self.rest + s) if more else 0.0)))
+
+
+class Seen(NamedTuple):
+    """Images of about the same noise.
+
+    Attributes
+    ----------
+    flat : ndarray, shape (n, P)
+    z : ndarray, shape (n, P), float32
+        In the axes of S.
+    where : ndarray, shape (n, q)
+        Positions, whitened.
+    s : ndarray, shape (n, 1), float32
+    node : ndarray, shape (n,)
+        s or what is near it, of which there are few.
+    least : float
+        Below every s.
+    """
+
+    flat: np.ndarray
+    z: np.ndarray
+    where: np.ndarray
+    s: np.ndarray
+    node: np.ndarray
+    least: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,8 +207,6 @@ class MixtureLaw:
     noise : NoiseModel
     loose : float
         Standard deviation of a, or 0 where fluxes are known.
-    step : float
-        Between noise variances that share a factorisation, in ln s.
     """
 
     axes: np.ndarray
@@ -179,9 +227,10 @@ class MixtureLaw:
     shrinkage: np.ndarray
     noise: NoiseModel
     loose: float = 0.0
-    step: float = NOISE_STEP
-    _factors: Kept[float, Factor] = field(default_factory=Kept, init=False, repr=False)
-    _insides: Kept[float, np.ndarray] = field(default_factory=Kept, init=False, repr=False)
+    _spectra: dict[tuple[int, int], Axes] = field(default_factory=dict, init=False, repr=False)
+    _doubts: dict[tuple[int, float, float], np.ndarray] = field(
+        default_factory=dict, init=False, repr=False
+    )
 
     def _estimate(
         self,
@@ -201,94 +250,111 @@ class MixtureLaw:
         where = position @ self.whitening if self.whitening.size else np.empty((len(flat), 0))
         even = np.full(len(flat), 1.0 / flat.shape[1])
         s = self.noise.variance(even, np.asarray(level))
-        if np.ndim(level):  # not by how many there are: stars do not influence each other
-            s = np.exp(np.rint(np.log(s) / self.step) * self.step)
-        s, node = np.unique(s, return_inverse=True)
+        # Not by how many there are: stars do not influence each other.
+        node = np.exp(np.rint(np.log(s) / NOISE_STEP) * NOISE_STEP) if np.ndim(level) else s
+        s, node = (np.broadcast_to(a, len(flat)) for a in (s, node))
         psf, sigma = (np.empty(flat.shape, np.float32) for _ in range(2))
         evidence, flux = np.empty((2, len(flat)))
         weight = np.empty((len(flat), len(self.count)), np.float32)
-        for place, variance in enumerate(s):
-            (stars,) = (node == place).nonzero()
+        range_of = np.floor(np.log(s) / NOISE_BIN)
+        for number in np.unique(range_of):
+            (stars,) = (range_of == number).nonzero()
+            least = float(np.exp(NOISE_BIN * number))
             for part in np.array_split(stars, -(-stars.size // IMAGES_AT_ONCE)):
-                own = None if near is None else near[part]
-                found = self._posterior(flat[part], where[part], float(variance), sure, own)
+                seen = Seen(
+                    flat[part],
+                    (flat[part] @ self.axes).astype(np.float32),
+                    *(where[part], s[part, None].astype(np.float32), node[part], least),
+                )
+                found = self._posterior(seen, sure, None if near is None else near[part])
                 psf[part], sigma[part], evidence[part], flux[part], weight[part] = found
-            for kept in (self._factors, self._insides):
-                kept.trim(self._most)
         shaped = psf.reshape(noisy.shape), sigma.reshape(noisy.shape) if sure else None
         return Estimate(*shaped, evidence, flux if self.loose else None), weight
 
     def _posterior(
-        self,
-        flat: np.ndarray,
-        where: np.ndarray,
-        s: float,
-        sure: bool,
-        near: np.ndarray | None = None,
+        self, seen: Seen, sure: bool, near: np.ndarray | None
     ) -> tuple[np.ndarray, np.ndarray | float, np.ndarray, np.ndarray, np.ndarray]:
-        """Posterior mean, its σ, evidence, flux and weights of images (n, P) of variance s."""
-        z = (flat @ self.axes).astype(np.float32)
-        log = self._log_densities(z, where, s, near)
-        weights, evidence = mixing_weights(log)
-        evidence -= 0.5 * z.shape[1] * np.log(2 * np.pi)
+        """Posterior mean, its σ, evidence, flux and weights of images."""
+        weights, evidence = mixing_weights(self._log_densities(seen, near))
+        evidence -= 0.5 * seen.z.shape[1] * np.log(2 * np.pi)
         weight = weights.astype(np.float32)
-        gain, own = np.zeros_like(z), np.zeros_like(z)
-        second = np.zeros(flat.shape if sure else 0)
-        flux = np.ones(len(z))
-        for k in range(len(self.count)):
-            (stars,) = weight[:, k].nonzero()
-            if not stars.size:
+        same, m = not len(self.cross), self._known(seen.least)
+        own = np.zeros((0 if same else len(weight), seen.flat.shape[1]), np.float32)
+        gain, first, second = np.zeros_like(seen.z), *np.zeros((2, *seen.flat.shape * sure))
+        others = weight @ self.mean[:, m:]  # in the other coordinates
+        lead, of_flux = (self.axes if same else self.cross)[:, :m].T, np.zeros(len(weight))
+        for k, cluster in enumerate(self._clusters):
+            (rows,) = weight[:, k].nonzero()
+            if not rows.size:
                 continue
-            w = weight[stars, k, None]
-            factor = self._factor(k, s)
-            at, residual, half = self._against(k, factor, z[stars], where[stars])
-            g = residual * factor.inverse
-            g[:, : factor.low.shape[1]] -= half @ factor.low
+            w, s, cut = weight[rows, k, None], seen.s[rows], self._cut(k, seen.least)
+            at, residual = self._against(k, seen.z[rows, :m], seen.where[rows])
+            along, beyond = cut.inverse(s)
+            axes = residual @ cut.vectors
+            both = np.vstack([along * axes, axes]) @ cut.vectors.T
+            g = both[: len(rows)] + beyond * (residual - both[len(rows) :])
+            if at.size:
+                others[rows] += w * (at @ cluster.slope[:, m:])
             if self.loose:
-                flux[stars] += w[:, 0] * self.loose**2 * (g @ self._contrast[k])
-            mean = 0.0
-            if len(self.cross):
-                g *= factor.shared
-                mean = self.mean_reference[k] + half @ factor.low_reference
-                if at.size:
-                    mean += at @ self._clusters[k].slope_reference
-                own[stars] += w * mean
-            gain[stars] += w * g
+                of_flux[rows] += w[:, 0] * (g @ self._contrast[k, :m])
+            if not same:
+                mean = (g @ cluster.own[:, :m].T) @ cluster.own_reference
+                mean = self.mean_reference[k] + cluster.scale * mean
+                mean += at @ cluster.slope_reference if at.size else 0.0
+                g *= cluster.common
+                own[rows] += w * mean
+            gain[rows, :m] += w * g
             if sure:
-                one = self._restored(flat[stars], g, mean, s).astype(np.float64)
-                inside = self._insides(s, k, partial(self._uncertain, k, s))
-                second[stars] += w * (inside + one**2)
-        psf = self._restored(flat, gain, own, s)
-        sigma = np.sqrt(np.maximum(second - psf.astype(np.float64) ** 2, 0.0)) if sure else np.nan
-        if not len(self.cross):  # the sky of the image is no part of the star
-            psf += ((flux - 1.0) / z.shape[1]).astype(np.float32)[:, None]
+                one = (-s * (g @ lead) if same else mean + g @ lead).astype(np.float64)
+                first[rows] += w * one
+                second[rows] += w * (s * self._doubt(k, seen.least, seen.node[rows]) + one**2)
+        gain[:, m:] = (seen.z[:, m:] - others) / (self.variance[m:].astype(np.float32) + seen.s)
+        psf = seen.flat - seen.s * (gain @ self.axes.T) if same else own + gain @ self.cross.T
+        sigma = np.sqrt(np.maximum(second - first**2, 0.0)) if sure else np.nan
+        if self.loose:
+            of_flux += (gain[:, m:] * (others - self.axes.mean(axis=0)[m:])).sum(axis=1)
+        flux = 1.0 + self.loose**2 * of_flux
+        if same:  # the sky of the image is no part of the star
+            psf += ((flux - 1.0) / psf.shape[1]).astype(np.float32)[:, None]
         return psf, sigma, evidence, flux, weight
 
-    def _log_densities(
-        self, z: np.ndarray, where: np.ndarray, s: float, near: np.ndarray | None
-    ) -> np.ndarray:
-        """ln of the probability of images in the axes under each cluster that is near, (n, K).
+    def _log_densities(self, seen: Seen, near: np.ndarray | None) -> np.ndarray:
+        """ln of the probability of images under each cluster that is near, (n, K).
 
         Without the term of 2π.
         """
-        near = self._near(z, where, s) if near is None else near
-        log = np.full((len(z), len(self.count)), -np.inf)
-        leading = self._leading(s)
-        self._factorise(np.flatnonzero(near.any(axis=0)), s)
-        for k in range(len(self.count)):
-            (stars,) = near[:, k].nonzero()
-            if stars.size:
-                factor = self._factor(k, s)
-                _, residual, half = self._against(k, factor, z[stars, :leading], where[stars])
-                far = np.square(residual) @ factor.inverse[:leading] - np.square(half).sum(axis=1)
-                far = far.astype(np.float64)
-                if where.shape[1]:
-                    off = (where[stars] - self.center[k]) @ self._clusters[k].spread.T
-                    far += np.square(off).sum(axis=1)
-                log[stars, k] = factor.constant - 0.5 * far
+        near = self._near(seen) if near is None else near
+        log = np.full((len(seen.z), len(self.count)), -np.inf)
+        width = self._leading(seen.least)
+        leading = np.ascontiguousarray(seen.z[:, :width])
+        ln_s = np.log(seen.s[:, 0].astype(np.float64))
+        nodes = np.log(seen.least) + np.linspace(0.0, NOISE_BIN, DET_NODES)
+        for k, cluster in enumerate(self._clusters):
+            (rows,) = near[:, k].nonzero()
+            if not rows.size:
+                continue
+            cut, s, where = self._cut(k, seen.least), seen.s[rows], seen.where[rows]
+            m = len(cut.vectors)
+            _, residual = self._against(k, leading[rows], where)
+            along, beyond = cut.inverse(s)
+            squares = np.square(residual[:, :m] @ cut.vectors)
+            left = np.square(residual[:, :m]).sum(axis=1) - squares.sum(axis=1)
+            far = (squares * along).sum(axis=1) + left * beyond[:, 0]
+            det = cut.half_log_det(np.exp(nodes))
+            if width > m:
+                more = self.variance[m:width]
+                far += (np.square(residual[:, m:]) / (more + s)).sum(axis=1)
+                det += 0.5 * np.log(more + np.exp(nodes)[:, None]).sum(axis=1)
+            far = far.astype(np.float64)
+            if where.size:
+                far += np.square((where - self.center[k]) @ cluster.spread.T).sum(axis=1)
+            constant = np.log(self.count[k] / self.count.sum())
+            constant += np.log(cluster.spread.diagonal()).sum()
+            log[rows, k] = constant - np.interp(ln_s[rows], nodes, det) - 0.5 * far
         # In the other coordinates all clusters have nearly one law.
-        rest = np.square(z[:, leading:] - self._middle[leading:])
-        log -= 0.5 * (rest @ (1.0 / (self.variance[leading:] + s)))[:, None]
+        variance = self.variance[width:] + seen.s
+        rest = np.square(seen.z[:, width:] - self._middle[width:])
+        log -= 0.5 * (rest / variance + np.log(variance)).sum(axis=1, keepdims=True)
         return log
 
     @cached_property
@@ -296,46 +362,25 @@ class MixtureLaw:
         """Mean of each cluster less an even sky of the same sum, in the axes, (K, P)."""
         return np.asarray(self.mean - self.axes.mean(axis=0))
 
-    @cached_property
-    def _most(self) -> int:
-        """Noise variances whose factorisations are kept."""
-        return max(
-            1, int(CACHE_BYTES // (self.deviation.nbytes + self.deviation_reference.nbytes + 1))
-        )
-
-    def _restored(
-        self, flat: np.ndarray, gain: np.ndarray, own: np.ndarray | float, s: float
-    ) -> np.ndarray:
-        """Images or references from (C + s)⁻¹(z − μ) in the axes."""
-        return np.asarray(
-            own + gain @ self.cross.T if len(self.cross) else flat - s * (gain @ self.axes.T)
-        )
-
-    def _against(
-        self, k: int, factor: Factor, z: np.ndarray, where: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Position from the cluster's, image less its mean there, and A times that.
-
-        The image z has all coordinates or the leading ones.
-        """
-        low = factor.low
-        at = (where - self.center[k]).astype(np.float32)
-        width = z.shape[1]
+    def _against(self, k: int, z: np.ndarray, where: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Position from the cluster's, and its leading coordinates less their mean there."""
+        at, width = (where - self.center[k]).astype(np.float32), z.shape[1]
         residual = z - self.mean[k, :width]
         if at.size:
             residual -= at @ self._clusters[k].slope[:, :width]
-        return at, residual, residual[:, : low.shape[1]] @ low.T
+        return at, residual
 
-    def _near(self, z: np.ndarray, where: np.ndarray, s: float) -> np.ndarray:
+    def _near(self, seen: Seen) -> np.ndarray:
         """Clusters that are nearest by the common covariance, (n, K) of bool."""
         if len(self.count) <= NEAREST:
-            return np.ones((len(z), len(self.count)), bool)
-        weight = 1.0 / np.sqrt(self.variance[:LEADING] + s)
+            return np.ones((len(seen.z), len(self.count)), bool)
         star, mean = (
-            np.hstack([(a - p @ self.slope)[:, :LEADING] * weight, p])
-            for a, p in ((z, where), (self.mean, self.center))
+            (a - p @ self.slope)[:, :LEADING]
+            for a, p in ((seen.z, seen.where), (self.mean, self.center))
         )
-        distance = np.square(mean).sum(axis=1) - 2.0 * star @ mean.T
+        certain = 1.0 / (self.variance[:LEADING] + seen.s)
+        distance = certain @ np.square(mean).T - 2.0 * (certain * star) @ mean.T
+        distance += np.square(self.center).sum(axis=1) - 2.0 * seen.where @ self.center.T
         nearest = np.argpartition(distance, NEAREST, axis=1)[:, :NEAREST]
         near = np.zeros(distance.shape, bool)
         np.put_along_axis(near, nearest, True, axis=1)
@@ -386,50 +431,28 @@ class MixtureLaw:
             own, own_reference, square, slope, slope_reference, spread, nu / total, 1 / total
         )
 
-    def _factor(self, k: int, s: float) -> Factor:
-        """C_k + s factorised."""
-        return self._factors(s, k, lambda: self._factored([k], s)[0])
+    def _cut(self, k: int, s: float) -> Cut:
+        """Axes of a cluster that count at a noise variance s and above."""
+        axes = self._axes(k, self._known(s))
+        width, variance = len(axes.variance), axes.variance[axes.variance > LEAST_VARIANCE * s]
+        more = width - len(variance)
+        rest = (axes.total - variance.sum()) / more if more else np.inf
+        return Cut(axes.vectors[:, : len(variance)], variance, float(rest))
 
-    def _factorise(self, some: np.ndarray, s: float) -> None:
-        """C_k + s of some clusters factorised, those with as many rows and stars together."""
-        alike = defaultdict(list)
-        for k in self._factors.missing(s, some):
-            alike[self.rows[k], self.count[k]].append(k)
-        for own in alike.values():
-            for k, factor in zip(own, self._factored(own, s), strict=True):
-                self._factors(s, k, partial(lambda made: made, factor))
-
-    def _factored(self, alike: Sequence[int], s: float) -> list[Factor]:
-        """Factors of clusters with as many rows and stars."""
-        clusters = [self._clusters[k] for k in alike]
-        first = clusters[0]
-        leading = min(self._leading(s), first.own.shape[1])
-        shared = np.ones(len(self.variance))
-        shared[:leading] = first.common
-        d = shared * self.variance + s
-        rows = np.stack([c.own[:, :leading] for c in clusters]).astype(np.float64)
-        y = np.stack([c.own_reference for c in clusters]) if len(self.cross) else None
-        if rows.shape[1] > FEW_ROWS and len(alike) == 1:
-            rows, y = rows[0], None if y is None else y[0]
-        found = factorised(d[:leading], rows, first.scale, y)
-        same = (1.0 / d).astype(np.float32), shared.astype(np.float32)
-        half, log_d = np.atleast_1d(found.half_det), np.log(d).sum()
-        low = found.low.reshape(len(alike), len(first.own), -1).astype(np.float32)
-        return [
-            Factor(
-                inverse=same[0],
-                low=np.ascontiguousarray(low[i, :, :leading]),
-                low_reference=np.ascontiguousarray(low[i, :, leading:]),
-                shared=same[1],
-                constant=float(
-                    np.log(self.count[k] / self.count.sum())
-                    - half[i]
-                    - 0.5 * log_d
-                    + np.log(clusters[i].spread.diagonal()).sum()
-                ),
+    def _axes(self, k: int, width: int) -> Axes:
+        """Axes of C_k, made once."""
+        if (k, width) not in self._spectra:
+            cluster = self._clusters[k]
+            rows = cluster.own[:, :width].astype(np.float64)
+            covariance = cluster.scale * (rows.T @ rows)
+            covariance[np.diag_indices(width)] += cluster.common * self.variance[:width]
+            variance, vectors = np.linalg.eigh(covariance)
+            self._spectra[k, width] = Axes(
+                np.ascontiguousarray(vectors[:, ::-1], dtype=np.float32),
+                np.maximum(variance[::-1], 0.0),
+                float(np.trace(covariance)),
             )
-            for i, k in enumerate(alike)
-        ]
+        return self._spectra[k, width]
 
     def _leading(self, s: float) -> int:
         """Coordinates in which clusters differ at a noise variance s.
@@ -437,6 +460,10 @@ class MixtureLaw:
         That is by the largest variance of all stars along an axis or one after it.
         """
         return int(np.count_nonzero(np.maximum.accumulate(self._total[::-1]) > FLAT_VARIANCE * s))
+
+    def _known(self, s: float) -> int:
+        """Leading coordinates in which clusters have covariances of their own."""
+        return min(self._leading(s), int(self.deviation.shape[1]))
 
     @cached_property
     def _middle(self) -> np.ndarray:
@@ -450,21 +477,34 @@ class MixtureLaw:
         loose = np.square(self.loose * self._contrast).max(axis=0)
         return np.asarray(self.variance + between + np.square(self.slope).sum(axis=0) + loose)
 
-    def _uncertain(self, k: int, s: float) -> np.ndarray:
-        """Variance of each pixel inside a cluster once the image is known, shape (P,)."""
-        factor, cluster = self._factor(k, s), self._clusters[k]
-        m = factor.low.shape[1]
+    def _doubt(self, k: int, least: float, node: np.ndarray) -> np.ndarray:
+        """Variance over s of the pixels of images (n, P) once they are known, inside a cluster.
+
+        Of those noise variances s (n,), of which few differ.
+        """
+        nodes, which = np.unique(node, return_inverse=True)
+        keys = [(k, least, s) for s in nodes.tolist()]
+        if new := [key for key in keys if key not in self._doubts]:
+            found = self._doubts_of(k, least, np.array([s for _, _, s in new]))
+            self._doubts.update(zip(new, found, strict=True))
+        return np.stack([self._doubts[key] for key in keys])[which]
+
+    def _doubts_of(self, k: int, least: float, s: np.ndarray) -> np.ndarray:
+        cut, cluster, s = self._cut(k, least), self._clusters[k], s[:, None]
+        m = len(cut.vectors)
+        # Covariance of references with the leading coordinates; images are their own references.
+        lead = self.axes[:, :m]
+        if len(self.cross):
+            lead = cluster.common * self.cross[:, :m]
+            lead = lead + cluster.scale * cluster.own_reference.T @ cluster.own[:, :m]
+        along, beyond = cut.inverse(s)
+        seen = np.square(lead @ cut.vectors).T
+        known = along @ seen + beyond * (np.square(lead).sum(axis=1) - seen.sum(axis=0))
+        known += (1.0 / (self.variance[m:] + s)) @ self._squares[:, m:].T
         if not len(self.cross):
-            known = self._squares @ factor.inverse
-            known -= np.square(factor.low @ self.axes[:, :m].T).sum(axis=0)
-            return np.asarray(np.maximum(s - s**2 * known, 0.0))
-        own, cross = cluster.own_reference, self.cross[:, :m] * factor.shared[:m]
-        cross += cluster.scale * own.T @ cluster.own[:, :m]
+            return np.asarray(np.maximum(1.0 - s * known, 0.0))
         prior = cluster.common * self.variance_reference + cluster.scale * cluster.square
-        known = np.square(cross) @ factor.inverse[:m]
-        known += self._squares[:, m:] @ (np.square(factor.shared[m:]) * factor.inverse[m:])
-        known -= np.square(cross @ factor.low.T).sum(axis=1)
-        return np.asarray(np.maximum(prior - known, 0.0))
+        return np.asarray(np.maximum(prior - known, 0.0) / s)
 
     @cached_property
     def _squares(self) -> np.ndarray:
@@ -485,5 +525,4 @@ class MixtureLaw:
             cross=none,
             deviation_reference=none,
             slope_reference=none,
-            step=FINE_NOISE_STEP,
         )

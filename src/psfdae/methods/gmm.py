@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self, TypeVar
 import numpy as np
 from pydantic import Field
 
-from psfdae.lowrank import FLUX_SIGMA
 from psfdae.method import (
     Estimate,
     FitError,
@@ -26,6 +25,7 @@ from psfdae.method import (
     Storage,
     TrainingSet,
 )
+from psfdae.mixing import FLUX_SIGMA
 from psfdae.mixture_law import FLAT_VARIANCE, MixtureLaw
 from psfdae.noise import NoiseModel
 from psfdae.rng import stream

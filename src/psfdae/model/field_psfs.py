@@ -100,8 +100,9 @@ class FieldPsfs(ABC):
             Values per pixel and axis; each is what a whole pixel there would get.
         mag : float or array, shape (n,), optional
             Instrumental magnitude −2.5 log₁₀ (flux / counts); by default the PSF is the average
-            over those of the training stars. Beyond these stars the PSF is that of the brightest or faintest one; it changes
-            with the magnitude only where stars that were left out of the training say so.
+            over those of the training stars. Brighter and fainter stars have the PSF of the
+            brightest and faintest of these; it changes with the magnitude only where stars that
+            were left out of the training say so.
 
         Returns
         -------
