@@ -32,6 +32,7 @@ Y_k, σ_a μ_y,k with σ_a = `FLUX_SIGMA`.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple, Self
@@ -232,18 +233,10 @@ class MixtureLaw:
         default_factory=dict, init=False, repr=False
     )
 
-    def _estimate(
-        self,
-        noisy: np.ndarray,
-        level: float | np.ndarray,
-        position: np.ndarray | None,
-        sure: bool,
-        near: np.ndarray | None = None,
-    ) -> tuple[Estimate, np.ndarray]:
-        """Estimates, and the weight of each cluster for each image, (n, K).
-
-        Those that are not `near`, (n, K) of bool, have none.
-        """
+    def _parts(
+        self, noisy: np.ndarray, level: float | np.ndarray, position: np.ndarray | None = None
+    ) -> Iterator[tuple[np.ndarray, Seen]]:
+        """Images (n, d, d) of about the same noise, and their numbers."""
         flat = noisy.reshape(len(noisy), math.prod(noisy.shape[1:]))
         if not np.isfinite(flat).all():
             raise ValueError("noisy images must be finite")
@@ -253,70 +246,106 @@ class MixtureLaw:
         # Not by how many there are: stars do not influence each other.
         node = np.exp(np.rint(np.log(s) / NOISE_STEP) * NOISE_STEP) if np.ndim(level) else s
         s, node = (np.broadcast_to(a, len(flat)) for a in (s, node))
-        psf, sigma = (np.empty(flat.shape, np.float32) for _ in range(2))
-        evidence, flux = np.empty((2, len(flat)))
-        weight = np.empty((len(flat), len(self.count)), np.float32)
         range_of = np.floor(np.log(s) / NOISE_BIN)
         for number in np.unique(range_of):
             (stars,) = (range_of == number).nonzero()
             least = float(np.exp(NOISE_BIN * number))
             for part in np.array_split(stars, -(-stars.size // IMAGES_AT_ONCE)):
-                seen = Seen(
-                    flat[part],
-                    (flat[part] @ self.axes).astype(np.float32),
-                    *(where[part], s[part, None].astype(np.float32), node[part], least),
-                )
-                found = self._posterior(seen, sure, None if near is None else near[part])
-                psf[part], sigma[part], evidence[part], flux[part], weight[part] = found
-        shaped = psf.reshape(noisy.shape), sigma.reshape(noisy.shape) if sure else None
-        return Estimate(*shaped, evidence, flux if self.loose else None), weight
+                images = flat.take(part, axis=0)
+                z = (images @ self.axes).astype(np.float32)
+                of_noise = s[part, None].astype(np.float32), node[part], least
+                yield part, Seen(images, z, where[part], *of_noise)
+
+    def _estimate(
+        self,
+        noisy: np.ndarray,
+        level: float | np.ndarray,
+        position: np.ndarray | None,
+        sure: bool,
+        near: np.ndarray | None = None,
+    ) -> Estimate:
+        """Estimates, from the clusters that are `near`, (n, K) of bool."""
+        psf, sigma = (np.empty(noisy.shape, np.float32) for _ in range(2))
+        evidence, flux = np.empty((2, len(noisy)))
+        for part, seen in self._parts(noisy, level, position):
+            weight, evidence[part] = self._weights(seen, None if near is None else near[part])
+            own, doubt = self._posterior(seen, weight, sure)
+            if self.loose:
+                flux[part] = self._flux(seen, weight)
+                if not len(self.cross):  # the sky of the image is no part of the star
+                    own += ((flux[part] - 1.0) / own.shape[1])[:, None]
+            psf[part], sigma[part] = (a.reshape(-1, *noisy.shape[1:]) for a in (own, doubt))
+        return Estimate(psf, sigma if sure else None, evidence, flux if self.loose else None)
+
+    def _weights(self, seen: Seen, near: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+        """Weight of each cluster for each image, (n, K), and the images' evidence."""
+        weight, evidence = mixing_weights(self._log_densities(seen, near))
+        evidence -= 0.5 * seen.z.shape[1] * np.log(2 * np.pi)
+        return weight.astype(np.float32), evidence
 
     def _posterior(
-        self, seen: Seen, sure: bool, near: np.ndarray | None
-    ) -> tuple[np.ndarray, np.ndarray | float, np.ndarray, np.ndarray, np.ndarray]:
-        """Posterior mean, its σ, evidence, flux and weights of images."""
-        weights, evidence = mixing_weights(self._log_densities(seen, near))
-        evidence -= 0.5 * seen.z.shape[1] * np.log(2 * np.pi)
-        weight = weights.astype(np.float32)
+        self, seen: Seen, weight: np.ndarray, sure: bool
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Posterior mean and its σ, (n, P), NaN unless `sure`."""
         same, m = not len(self.cross), self._known(seen.least)
-        own = np.zeros((0 if same else len(weight), seen.flat.shape[1]), np.float32)
-        gain, first, second = np.zeros_like(seen.z), *np.zeros((2, *seen.flat.shape * sure))
+        first, second = np.zeros((2, *seen.flat.shape), np.float32)
         others = weight @ self.mean[:, m:]  # in the other coordinates
-        lead, of_flux = (self.axes if same else self.cross)[:, :m].T, np.zeros(len(weight))
-        for k, cluster in enumerate(self._clusters):
-            (rows,) = weight[:, k].nonzero()
-            if not rows.size:
-                continue
-            w, s, cut = weight[rows, k, None], seen.s[rows], self._cut(k, seen.least)
-            at, residual = self._against(k, seen.z[rows, :m], seen.where[rows])
+        images = self.axes if same else self.cross
+        for k, rows, at, residual, cut in self._pairs(seen, weight > 0, m):
+            cluster, w, s = self._clusters[k], weight[rows, k, None], seen.s[rows]
             along, beyond = cut.inverse(s)
             axes = residual @ cut.vectors
             both = np.vstack([along * axes, axes]) @ cut.vectors.T
             g = both[: len(rows)] + beyond * (residual - both[len(rows) :])
             if at.size:
                 others[rows] += w * (at @ cluster.slope[:, m:])
-            if self.loose:
-                of_flux[rows] += w[:, 0] * (g @ self._contrast[k, :m])
+            one = (-s if same else cluster.common) * g @ images[:, :m].T
             if not same:
                 mean = (g @ cluster.own[:, :m].T) @ cluster.own_reference
-                mean = self.mean_reference[k] + cluster.scale * mean
-                mean += at @ cluster.slope_reference if at.size else 0.0
-                g *= cluster.common
-                own[rows] += w * mean
-            gain[rows, :m] += w * g
+                one += self.mean_reference[k] + cluster.scale * mean
+                one += at @ cluster.slope_reference if at.size else 0.0
+            first[rows] += w * one
             if sure:
-                one = (-s * (g @ lead) if same else mean + g @ lead).astype(np.float64)
-                first[rows] += w * one
-                second[rows] += w * (s * self._doubt(k, seen.least, seen.node[rows]) + one**2)
-        gain[:, m:] = (seen.z[:, m:] - others) / (self.variance[m:].astype(np.float32) + seen.s)
-        psf = seen.flat - seen.s * (gain @ self.axes.T) if same else own + gain @ self.cross.T
-        sigma = np.sqrt(np.maximum(second - first**2, 0.0)) if sure else np.nan
-        if self.loose:
-            of_flux += (gain[:, m:] * (others - self.axes.mean(axis=0)[m:])).sum(axis=1)
-        flux = 1.0 + self.loose**2 * of_flux
-        if same:  # the sky of the image is no part of the star
-            psf += ((flux - 1.0) / psf.shape[1]).astype(np.float32)[:, None]
-        return psf, sigma, evidence, flux, weight
+                doubt = s * self._doubt(k, seen.least, seen.node[rows])
+                second[rows] += w * (doubt + np.square(one))
+        gain = (seen.z[:, m:] - others) / (self.variance[m:].astype(np.float32) + seen.s)
+        sigma = np.sqrt(np.maximum(second - np.square(first), 0.0)) if sure else second + np.nan
+        if same:
+            first += seen.flat - seen.s * gain @ images[:, m:].T
+        else:
+            first += gain @ images[:, m:].T
+        return first, sigma
+
+    def _flux(self, seen: Seen, weight: np.ndarray) -> np.ndarray:
+        """Posterior mean of a, (n,)."""
+        flux, m = np.ones(len(weight)), self._known(seen.least)
+        others = self.variance[m:].astype(np.float32)
+        for k, rows, _, residual, cut in self._pairs(seen, weight > 0, seen.z.shape[1]):
+            s, lead, contrast = seen.s[rows], residual[:, :m], self._contrast[k]
+            along, beyond = cut.inverse(s)
+            axes, of_axes = lead @ cut.vectors, contrast[:m] @ cut.vectors
+            found = (along * axes) @ of_axes + beyond[:, 0] * (lead @ contrast[:m] - axes @ of_axes)
+            found += (residual[:, m:] / (others + s)) @ contrast[m:]
+            flux[rows] += self.loose**2 * weight[rows, k] * found
+        return flux
+
+    def _pairs(
+        self, seen: Seen, near: np.ndarray, width: int
+    ) -> Iterator[tuple[int, np.ndarray, np.ndarray, np.ndarray, Cut]]:
+        """Clusters with the images (n, K) of bool that are near.
+
+        Their numbers, positions and leading coordinates less the cluster's, and its axes.
+        """
+        leading = np.ascontiguousarray(seen.z[:, :width])
+        for k, of in enumerate(np.ascontiguousarray(near.T)):
+            (rows,) = of.nonzero()
+            if rows.size:
+                at = (seen.where[rows] - self.center[k]).astype(np.float32)
+                residual = leading.take(rows, axis=0)
+                residual -= self.mean[k, :width]
+                if at.size:
+                    residual -= at @ self._clusters[k].slope[:, :width]
+                yield k, rows, at, residual, self._cut(k, seen.least)
 
     def _log_densities(self, seen: Seen, near: np.ndarray | None) -> np.ndarray:
         """ln of the probability of images under each cluster that is near, (n, K).
@@ -325,17 +354,11 @@ class MixtureLaw:
         """
         near = self._near(seen) if near is None else near
         log = np.full((len(seen.z), len(self.count)), -np.inf)
-        width = self._leading(seen.least)
-        leading = np.ascontiguousarray(seen.z[:, :width])
+        width, m = self._leading(seen.least), self._known(seen.least)
         ln_s = np.log(seen.s[:, 0].astype(np.float64))
         nodes = np.log(seen.least) + np.linspace(0.0, NOISE_BIN, DET_NODES)
-        for k, cluster in enumerate(self._clusters):
-            (rows,) = near[:, k].nonzero()
-            if not rows.size:
-                continue
-            cut, s, where = self._cut(k, seen.least), seen.s[rows], seen.where[rows]
-            m = len(cut.vectors)
-            _, residual = self._against(k, leading[rows], where)
+        for k, rows, at, residual, cut in self._pairs(seen, near, width):
+            cluster, s = self._clusters[k], seen.s[rows]
             along, beyond = cut.inverse(s)
             squares = np.square(residual[:, :m] @ cut.vectors)
             left = np.square(residual[:, :m]).sum(axis=1) - squares.sum(axis=1)
@@ -346,8 +369,8 @@ class MixtureLaw:
                 far += (np.square(residual[:, m:]) / (more + s)).sum(axis=1)
                 det += 0.5 * np.log(more + np.exp(nodes)[:, None]).sum(axis=1)
             far = far.astype(np.float64)
-            if where.size:
-                far += np.square((where - self.center[k]) @ cluster.spread.T).sum(axis=1)
+            if at.size:
+                far += np.square(at @ cluster.spread.T).sum(axis=1)
             constant = np.log(self.count[k] / self.count.sum())
             constant += np.log(cluster.spread.diagonal()).sum()
             log[rows, k] = constant - np.interp(ln_s[rows], nodes, det) - 0.5 * far
@@ -361,14 +384,6 @@ class MixtureLaw:
     def _contrast(self) -> np.ndarray:
         """Mean of each cluster less an even sky of the same sum, in the axes, (K, P)."""
         return np.asarray(self.mean - self.axes.mean(axis=0))
-
-    def _against(self, k: int, z: np.ndarray, where: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Position from the cluster's, and its leading coordinates less their mean there."""
-        at, width = (where - self.center[k]).astype(np.float32), z.shape[1]
-        residual = z - self.mean[k, :width]
-        if at.size:
-            residual -= at @ self._clusters[k].slope[:, :width]
-        return at, residual
 
     def _near(self, seen: Seen) -> np.ndarray:
         """Clusters that are nearest by the common covariance, (n, K) of bool."""

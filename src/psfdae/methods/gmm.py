@@ -102,7 +102,7 @@ class GaussianMixture(MixtureLaw, Method):
         },
         per_reference=True,
     )
-    packing: ClassVar[Packing | None] = Packing(together=8192, padded=False, parallel=False)
+    packing: ClassVar[Packing | None] = Packing(together=8192, padded=False)
     groups: ClassVar = {"gmm": Gmm}
 
     @classmethod
@@ -313,8 +313,9 @@ class GaussianMixture(MixtureLaw, Method):
         some = self._telling
         s = self.noise.variance(np.full(len(noisy), 1.0 / self.axes.shape[0]), np.asarray(level))
         usual = np.log(2 * np.pi * (some._total + s[:, None])).sum(axis=1)
-        evidence = some._estimate(noisy, level, None, sure=False, near=near)[0].evidence
-        assert evidence is not None
+        evidence = np.empty(len(noisy))
+        for part, seen in some._parts(noisy, level):
+            _, evidence[part] = some._weights(seen, None if near is None else near[part])
         return np.asarray(-2.0 * evidence - usual)
 
     def free_flux(self) -> Self:
@@ -326,14 +327,19 @@ class GaussianMixture(MixtureLaw, Method):
 
         The flux is 1 where fluxes are known.
         """
-        found, weight = self._estimate(noisy, level, None, sure=False)
-        return np.ones(len(noisy)) if found.flux is None else found.flux, weight > 0
+        flux, near = np.ones(len(noisy)), np.zeros((len(noisy), len(self.count)), bool)
+        for part, seen in self._parts(noisy, level):
+            weight, _ = self._weights(seen, None)
+            near[part] = weight > 0
+            if self.loose:
+                flux[part] = self._flux(seen, weight)
+        return flux, near
 
     def predict(
         self, noisy: np.ndarray, level: float | np.ndarray, position: np.ndarray | None = None
     ) -> np.ndarray:
         """PSFs, float32; raises as `estimate`."""
-        return self._estimate(noisy, level, position, sure=False)[0].psf
+        return self._estimate(noisy, level, position, sure=False).psf
 
     def estimate(
         self,
@@ -352,7 +358,7 @@ class GaussianMixture(MixtureLaw, Method):
         ValueError
             If a pixel is not finite.
         """
-        return self._estimate(noisy, level, position, sure=True, near=near)[0]
+        return self._estimate(noisy, level, position, sure=True, near=near)
 
 
 def _less(x: np.ndarray, noise: np.ndarray) -> np.ndarray:
