@@ -354,7 +354,7 @@ def test_the_unit_of_a_star_does_not_matter_to_the_field():
         stars = replace(some, wide=wide, flux=unit, noise=unit * noise)
         return fit_field(stars, 1e6, 14, SIDE, [1], 0.5, 100.0)
 
-    one, other = fit(np.ones(60)), fit(unit := rng.uniform(0.2, 5.0, 60))
+    one, other = fit(np.ones(60)), fit(unit := 10 ** rng.uniform(-5.0, 5.0, 60))
     assert other.model.coefficients == pytest.approx(one.model.coefficients, abs=1e-4)
     assert other.flux / unit == pytest.approx(one.flux, rel=1e-3)
     assert other.centre == pytest.approx(one.centre, abs=1e-3)

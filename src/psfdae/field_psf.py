@@ -226,7 +226,7 @@ class _Alternating:
         self.prior = prior
         self.images, self.seen = stars.framed(side)
         self.noise, self.place = stars.noise, stars.place
-        self.photons = np.sqrt(background) * stars.flux / stars.noise
+        self.photons = np.sqrt(background) / stars.noise  # per unit of flux
         self.stamp_px, self.spacing, self.smoothness = stamp_px, spacing, smoothness
         self.axis = np.arange(side) - side // 2.0
         self.inner = np.abs(self.axis + 0.5) < stamp_px / 2
