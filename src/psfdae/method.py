@@ -60,13 +60,14 @@ class TrainingSet:
         Of the method's random streams.
     reference : str
         "realisation" or "template".
-    positions : ndarray, shape (n, 2)
-        Where the stars stand in the field, any unit; empty where nobody knows.
+    positions : ndarray, shape (n, 2) or (n, 3)
+        Where the stars stand in the field, any unit, and of an image their magnitudes; empty where
+        nobody knows.
     own_noise : callable or None
         Of images that are not noise-free: from star indices (m,) and their mean image (P,)
         to what noise adds to their scatter (P, P) about it.
     bright : BrightStars or None
-        The stars of which the images were made, if these are an image's; of flux 1.
+        The stars of which the images were made, if these are an image's, in counts.
     star : ndarray of int, shape (n,)
         Bright star of every image; empty if there are none.
     simulation : mapping

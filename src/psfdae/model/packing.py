@@ -73,8 +73,9 @@ Restore = Callable[[np.ndarray, float], Estimate]
 class HeldOutStars:
     """Noise-free stars of flux 1 that no training has seen, (n, d, d), noise, and places (n, 2).
 
-    Those of an image are not free of noise: `own_noise` (n, d, d) is in their pixels, and makes
-    their flux, which is taken to be 1, uncertain by `flux_error` (n,).
+    Those of an image have their magnitudes as a third number of their places. They
+    are not free of noise: `own_noise` (n, d, d) is in their pixels, and makes their flux, which is
+    taken to be 1, uncertain by `flux_error` (n,).
     """
 
     images: np.ndarray
