@@ -66,7 +66,7 @@ the S/N up to which that is asked: of brighter stars, the filter does not know t
 WRONG_LIST = 0.05
 """Probability that the list, or its place, is not what it was for the training stars."""
 
-STARS_AT_ONCE = 2048
+STARS_AT_ONCE = 1024
 """Stars that are restored together."""
 
 OUTLIER_MODES = 12
@@ -141,26 +141,24 @@ class Axes(NamedTuple):
 
     Attributes
     ----------
-    vectors : ndarray, shape (m, P)
-        Orthonormal, by descending variance.
+    basis : ndarray, shape (3 + m, P)
+        The node's `latent`; then the axes, orthonormal, by descending variance.
     variance : ndarray, shape (m,)
-        Along them.
+        Along the axes.
     rest : float
         Mean variance beyond them.
-    latent : ndarray, shape (3, m)
-        The node's `latent` along them.
+    mean, latent : ndarray, shape (K + 1, m) and (3, m)
+        Those of the node along the axes.
     products : ndarray, shape (m + 1, 9)
-        Of the latter with each other along each axis, and beyond all.
-    squares : ndarray, shape (m, P)
-        Of the vectors.
+        Of `latent` with each other along each axis, and beyond all.
     """
 
-    vectors: np.ndarray
+    basis: np.ndarray
     variance: np.ndarray
     rest: float
+    mean: np.ndarray
     latent: np.ndarray
     products: np.ndarray
-    squares: np.ndarray
 
     def inverse(self, s: np.ndarray) -> np.ndarray:
         """1/(C + s) along the axes and beyond them, (n, m + 1), for noise of variances s (n, 1)."""
@@ -176,6 +174,34 @@ class Axes(NamedTuple):
         products = (self.inverse(s) @ self.products).reshape(-1, 3, 3)
         return np.asarray(np.eye(3) + products * (width[:, :, None] * width[:, None]))
 
+    def leading(
+        self, along: np.ndarray, s: np.ndarray, width: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """χ² of stars (n, m) along the `OUTLIER_MODES` leading axes, and these on sky and centre.
+
+        Of the latter, in their standard deviations (n, 3): the products with the stars, (n, 3), and
+        what these axes add to their inverse covariance, (n, 3, 3).
+        """
+        along, scatter = along[:, :OUTLIER_MODES], self.variance[:OUTLIER_MODES] + s
+        latent = width[:, :, None] * self.latent[:, :OUTLIER_MODES]
+        scaled = latent / scatter[:, None]
+        pull = np.einsum("nij,nj->ni", scaled, along)
+        return (along**2 / scatter).sum(axis=1), pull, scaled @ latent.transpose(0, 2, 1)
+
+    def pixel_variance(self, s: np.ndarray, width: np.ndarray) -> np.ndarray:
+        """Variance (n, P) of a star without noise and sky, of known flux, once it is seen."""
+        beyond, along = self.noise_parts(s)
+        left = np.linalg.inv(self.certainty(s, width))
+        latent, vectors = self.basis[:3], self.basis[3:]
+        rows = ((self.latent * along[:, None]).reshape(-1, len(vectors)) @ vectors).reshape(
+            len(s), 3, -1
+        )
+        rows = (rows + beyond[:, None] * latent) * width[:, :, None]
+        pull = left @ rows
+        noise = s * (1.0 - beyond - along @ vectors**2) + (rows * pull).sum(axis=1)
+        noise += width[:, :1] ** 2 * left[:, :1, 0] - 2 * width[:, :1] * pull[:, 0]
+        return np.asarray(np.maximum(noise, 0.0))
+
 
 def axes_of(node: Node, positioned: bool) -> Axes:
     """Axes of a node, for stars whose position is known or is not.
@@ -187,21 +213,21 @@ def axes_of(node: Node, positioned: bool) -> Axes:
     pixels = len(node.diagonal)
     kept = min(max(AXES, len(rows)), pixels)
     large = np.argsort(-node.diagonal, kind="stable")[: kept - len(rows)]
-    basis = np.linalg.qr(np.vstack([rows, np.eye(pixels)[large]]).T)[0]
-    along = rows @ basis
-    variance, turn = np.linalg.eigh((basis.T * node.diagonal) @ basis + along.T @ along)
-    vectors = np.ascontiguousarray((basis @ turn[:, ::-1]).T)
+    space = np.linalg.qr(np.vstack([rows, np.eye(pixels)[large]]).T)[0]
+    along = rows @ space
+    variance, turn = np.linalg.eigh((space.T * node.diagonal) @ space + along.T @ along)
     beyond = node.diagonal.sum() + np.square(rows).sum() - variance.sum()
-    latent = node.latent @ vectors.T
+    basis = np.vstack([node.latent, (space @ turn[:, ::-1]).T])
+    mean, latent = node.mean @ basis[3:].T, node.latent @ basis[3:].T
     even = node.latent @ node.latent.T - latent @ latent.T
     each = (latent[:, None] * latent).reshape(9, -1).T
     return Axes(
-        vectors,
+        basis,
         variance[::-1].copy(),
         float(beyond / (pixels - kept)) if kept < pixels else 1.0,
+        mean,
         latent,
         np.vstack([each, even.ravel()]),
-        vectors**2,
     )
 
 
@@ -233,78 +259,13 @@ class Fit(NamedTuple):
     log: np.ndarray  # (N,), ln of the likelihood, without (2π)^(P/2)
     factor: np.ndarray  # (N,), a
     variance: np.ndarray  # (N,), of a
-    left: np.ndarray  # (N, 3, 3), covariance of sky and centre in σ, once the star is seen
+    certain: np.ndarray  # (N, 3, 3), inverse covariance of sky and centre in σ
+    left: np.ndarray  # (N, 3, 3), the covariance, once the star is seen
     pull: np.ndarray  # (N, 2, 3), mean of these for x and for m
 
     def of(self, chosen: np.ndarray) -> Fit:
         """That of a part of the pairs, by a mask."""
         return Fit._make(a[chosen] for a in self)
-
-
-@dataclass(frozen=True, eq=False)
-class Seen:
-    """What is known of the pixels of n stars in a node.
-
-    Attributes
-    ----------
-    axes : Axes
-    latent : ndarray, shape (3, P)
-        Of the node.
-    s : ndarray, shape (n, 1)
-        Variance of the noise.
-    width : ndarray, shape (n, 3)
-        Standard deviations of sky and centre.
-    left : ndarray, shape (n, 3, 3)
-        Their covariance over these, once the star is seen.
-    """
-
-    axes: Axes
-    latent: np.ndarray
-    s: np.ndarray
-    width: np.ndarray
-    left: np.ndarray
-
-    @cached_property
-    def _parts(self) -> tuple[np.ndarray, np.ndarray]:
-        return self.axes.noise_parts(self.s)
-
-    def noise_in(self, images: np.ndarray, projected: np.ndarray) -> np.ndarray:
-        """s (C + s)⁻¹ of images (n, P), which are known along the axes (n, m)."""
-        beyond, along = self._parts
-        return np.asarray(beyond * images + (along * projected) @ self.axes.vectors)
-
-    def variance(self) -> np.ndarray:
-        """Variance (n, P) of the pixels of a star without noise and sky, of known flux.
-
-        Stars of about the same noise share it.
-        """
-        number = np.rint(np.log(self.s) / VARIANCE_STEP)
-        known, which = np.unique(np.hstack([number, self.width]), axis=0, return_inverse=True)
-        s, width = np.exp(VARIANCE_STEP * known[:, :1]), known[:, 1:]
-        beyond, along = self.axes.noise_parts(s)
-        left = np.linalg.inv(self.axes.certainty(s, width))
-        rows = (self.axes.latent * along[:, None]).reshape(-1, along.shape[1]) @ self.axes.vectors
-        rows = rows.reshape(*width.shape, -1) + beyond[:, None] * self.latent
-        rows *= width[:, :, None]
-        pull = left @ rows
-        noise = s * (1.0 - beyond - along @ self.axes.squares) + (rows * pull).sum(axis=1)
-        noise += width[:, :1] ** 2 * left[:, :1, 0] - 2 * width[:, :1] * pull[:, 0]
-        return np.asarray(np.maximum(noise, 0.0)[which.ravel()])
-
-    def covariance(self) -> np.ndarray:
-        """Of sky, row and column, (n, 3, 3)."""
-        return np.asarray(self.width[:, :, None] * self.left * self.width[:, None])
-
-    def score(self, projected: np.ndarray) -> np.ndarray:
-        """Square of Mahalanobis' distance along the leading axes, of what sky and centre leave."""
-        along, latent = projected[:, :OUTLIER_MODES], self.axes.latent[:, :OUTLIER_MODES]
-        scatter = self.axes.variance[:OUTLIER_MODES] + self.s
-        latent = self.width[:, :, None] * latent
-        scaled = latent / scatter[:, None]
-        pull = np.einsum("nij,nj->ni", scaled, along)
-        certain = np.linalg.inv(self.left) - scaled @ latent.transpose(0, 2, 1)
-        fitted = np.linalg.solve(certain, pull[..., None])[..., 0]
-        return np.asarray((along**2 / scatter).sum(axis=1) + (pull * fitted).sum(axis=1))
 
 
 class Asked(NamedTuple):
@@ -542,7 +503,11 @@ class FieldLaw:
             latent, axes = self._nodes[k].latent, self._axes(k, stars.positioned)
             image, mean = images[star[rows]], self._mean(k, stars, star[rows])
             along, beyond = pairs.along[rows], pairs.beyond[rows]
-            along[:, 0], along[:, 1] = image @ axes.vectors.T, mean @ axes.vectors.T
+            along[:, 0] = image @ axes.basis[3:].T
+            if stars.centre is None:
+                along[:, 1] = self._parts(k, stars, star[rows]) @ axes.mean
+            else:
+                along[:, 1] = mean @ axes.basis[3:].T
             beyond[:, 0, 0] = square[star[rows]]
             beyond[:, 0, 1] = beyond[:, 1, 0] = np.einsum("ij,ij->i", image, mean)
             beyond[:, 1, 1] = np.einsum("ij,ij->i", mean, mean)
@@ -611,7 +576,7 @@ class FieldLaw:
         log = -0.5 * (chi2 + np.log(information / prior) + det)
         # What was found before says nothing new: it is no part of the error.
         variance = 1.0 / np.where(prior > FLUX_SIGMA**-2.0, information, means)
-        return Fit(log, 1.0 + off / information, variance, left, pull)
+        return Fit(log, 1.0 + off / information, variance, certain, left, pull)
 
     def _summed(
         self, stars: Asked, pairs: Pairs, weight: np.ndarray, fit: Fit, unit: np.ndarray
@@ -622,52 +587,69 @@ class FieldLaw:
         square of Mahalanobis' distance along the leading axes of C, with the noise in them.
         """
         count, pixels = stars.images.shape
-        first, second = np.zeros((count, 4)), np.zeros((count, 4, 4))
-        star, square, inside = np.zeros((3, count, pixels))
-        total = np.zeros((count, 1))
-        outlying = np.zeros(count)
-        widths = self._width(stars)
-        for k, of_node in pairs.by_node():
-            rows = pairs.star[of_node]
-            axes, w = self._axes(k, stars.positioned), weight[of_node, None]
-            s = np.square(stars.noise / unit)[rows, None]
-            seen = Seen(axes, self._nodes[k].latent, s, widths[rows], fit.left[of_node])
-            a, variance = fit.factor[of_node, None], fit.variance[of_node, None]
-            image, mean = stars.images[rows] / unit[rows, None], self._mean(k, stars, rows)
-            along_image, along_mean = pairs.along[of_node].transpose(1, 0, 2)
-            pull_image, pull_mean = fit.pull[of_node].transpose(1, 0, 2)
-            latent = seen.width * (pull_image - a * pull_mean)
-            with_mean = -seen.width * pull_mean
-            left = image - a * mean - latent @ seen.latent
-            along = along_image / unit[rows, None] - a * along_mean - latent @ axes.latent
-            sky = latent[:, :1]
-            one = image - seen.noise_in(left, along) - sky
-            change = seen.noise_in(
-                mean + with_mean @ seen.latent, along_mean + with_mean @ axes.latent
-            )
-            change -= with_mean[:, :1]
-            flux = one.sum(axis=1, keepdims=True)
-            even = ~stars.sky[rows, None] / pixels  # what is even in the star is sky
-            more = even * (a - flux)
-            one, sky, flux = one + more, sky - more, flux + pixels * more
+        psf, square = np.zeros((2, count, pixels))
+        images, s = stars.images / unit[:, None], np.square(stars.noise / unit)[:, None]
+        width, star, a = self._width(stars), pairs.star, fit.factor[:, None]
+        # Pixels of stars of about the same noise are equally sure.
+        step = np.rint(np.log(s) / VARIANCE_STEP)
+        kinds = 2 * step[:, 0] + stars.sky
+        _, one_of, kind = np.unique(kinds, return_index=True, return_inverse=True)
+        usual = np.exp(VARIANCE_STEP * step[one_of]), width[one_of]
+        width, free = width[star], ~stars.sky[star]
+        latent = width * (fit.pull[:, 0] - a * fit.pull[:, 1])
+        with_a = -width * fit.pull[:, 1]
+        flux, score = np.empty((2, len(star)))
+        pull, certain = np.empty((len(star), 3)), fit.certain.copy()
+        for k, part in pairs.by_node():
+            axes, rows = self._axes(k, stars.positioned), star[part]
+            beyond, along = axes.noise_parts(s[rows])
+            w, even = weight[part, None], free[part, None] / pixels
+            image, mean = pairs.along[part].transpose(1, 0, 2)
+            left = image / unit[rows, None] - a[part] * mean - latent[part] @ axes.latent
+            score[part], pull[part], known = axes.leading(left, s[rows], width[part])
+            certain[part] -= known
+            # The star without noise and sky, and its change with a.
+            rest = np.stack([latent[part], with_a[part]])
+            change = along * (mean + with_a[part] @ axes.latent)
+            combined = np.concatenate([beyond * rest, np.stack([-along * left, change])], axis=2)
+            combined[..., 0] -= rest[..., 0]
+            one, change = combined @ axes.basis
+            mean = beyond * self._mean(k, stars, rows)
+            one += (1.0 - beyond) * images[rows] + a[part] * mean
+            change += mean
+            flux[part] = one.sum(axis=1)
+            one += even * (a[part] - flux[part, None])  # what is even in the star is sky
             change += even * (1.0 - change.sum(axis=1, keepdims=True))
-            outlying[rows] += w[:, 0] * seen.score(along)
-            doubt = w * variance
-            star[rows] += w * one
-            square[rows] += w * one**2
-            inside[rows] += w * seen.variance() + doubt * change**2
-            total[rows] += w * flux
-            place = self.places[k] if stars.centre is None else stars.centre[rows]
-            measured = np.hstack([flux, sky, place + latent[:, 1:]])
-            with_a = np.hstack([np.ones_like(flux), with_mean])
-            first[rows] += w * measured
-            second[rows] += w[..., None] * measured[:, :, None] * measured[:, None, :]
-            second[rows, 1:, 1:] += w[..., None] * seen.covariance()
-            second[rows] += doubt[..., None] * with_a[:, :, None] * with_a[:, None, :]
-        psf = star / total
+            some, which = np.unique(kind[rows], return_inverse=True)
+            sure = axes.pixel_variance(*(known[some] for known in usual))
+            psf[rows] += w * one
+            square[rows] += w * (one**2 + sure[which] + fit.variance[part, None] * change**2)
+        score += (pull * np.linalg.solve(certain, pull[..., None])[..., 0]).sum(axis=1)
+        sky = latent[:, 0] - np.where(free, fit.factor - flux, 0.0) / pixels
+        flux = np.where(free, fit.factor, flux)
+        place = self.places[pairs.node] if stars.centre is None else stars.centre[star]
+        measured = np.column_stack([flux, sky, place + latent[:, 1:]])
+        with_a = np.hstack([np.ones_like(a), with_a])
+        inside = fit.variance[:, None, None] * with_a[:, :, None] * with_a[:, None]
+        inside[:, 1:, 1:] += width[:, :, None] * fit.left * width[:, None]
+        inside += measured[:, :, None] * measured[:, None]
+        first, second, total, score = (
+            _weighted_sums(star, weight, values, count)
+            for values in (measured, inside, flux, score)
+        )
         # Of the star as it is: the doubt about its flux is in its pixels.
-        sigma = np.sqrt(np.maximum(square + inside - star**2, 0.0)) / np.abs(total)
-        return first, second - first[:, :, None] * first[:, None, :], outlying, psf, sigma
+        sigma = np.sqrt(np.maximum(square - psf**2, 0.0)) / np.abs(total[:, None])
+        covariance = second - first[:, :, None] * first[:, None]
+        return first, covariance, score, psf / total[:, None], sigma
+
+
+def _weighted_sums(
+    star: np.ndarray, weight: np.ndarray, values: np.ndarray, count: int
+) -> np.ndarray:
+    """Weighted sums (count, …) over the pairs of each star of their values (N, …)."""
+    columns = values.reshape(len(star), -1).T
+    sums = [np.bincount(star, weight * column, count) for column in columns]
+    return np.stack(sums, axis=1).reshape(count, *values.shape[1:])
 
 
 def products_of(weighted: np.ndarray, along: np.ndarray, latent: np.ndarray) -> np.ndarray:

@@ -136,9 +136,9 @@ class Prediction:
         """Former name of `outlier_score`."""
         return self.outlier_score
 
-    def first(self, count: int) -> Self:
-        """The rows of the first stars."""
-        return type(self)(*(getattr(self, f.name)[:count] for f in fields(self)))
+    def of(self, rows: slice) -> Self:
+        """Those of some stars."""
+        return type(self)(*(getattr(self, f.name)[rows] for f in fields(self)))
 
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:

@@ -468,7 +468,7 @@ class Engine:
         if count < size:
             stars = _filled(stars, self.bundle, size)
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            return self._compute(stars, fixed).first(count)
+            return self._compute(stars, fixed).of(slice(count))
 
     def _compute(self, stars: Stamps, fixed: bool) -> Prediction:
         parts = [stars.part(slice(a, a + SEEN)) for a in range(0, len(stars), SEEN)]
