@@ -1,9 +1,10 @@
-"""Fields whose PSF changes with the brightness of a star, as on plates, simulated."""
+"""Fields whose PSF changes with brightness or colour of a star, as on plates, simulated."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from astropy.table import Table
 
 import psfdae
 from psfdae.model.fitting import fit
@@ -33,7 +34,7 @@ def stars_of(centre, sigma, side):
 
 
 def image_of(width, seed=3):
-    """Pixels with stars whose σ is `width` of their magnitude, with places and magnitudes."""
+    """Pixels with stars whose σ is `width` of their magnitudes, with places and magnitudes."""
     rng = np.random.default_rng(seed)
     axis = np.arange(32.0, SIZE - 32, 40)
     position = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
@@ -90,6 +91,8 @@ def test_a_star_has_the_psf_of_its_own_flux_or_of_the_magnitude_that_is_stated(m
     stated = model.predict(truth + noise, position=np.column_stack([place, np.full(200, mag)]))
     unlike = model.predict(truth + noise, position=place)  # as the faintest
     assert in_counts.flux / flux == pytest.approx(stated.flux, rel=0.05)
+    beyond = [(found.flags & psfdae.StarFlag.BEYOND) > 0 for found in (in_counts, stated, unlike)]
+    assert [some.mean() for some in beyond] == [0.0, 0.0, 1.0]
 
     def error(found):
         return float(np.square(found.psf / found.flux[:, None, None] - truth).mean())
@@ -115,3 +118,62 @@ def test_a_model_of_brightness_is_kept_and_written_for_other_programs(model, tmp
         assert (again.psf_at(1.0, 2.0, mag=mag) == model.psf_at(1.0, 2.0, mag=mag)).all()
     nodes = again.to_photutils(3, 2)
     assert nodes.data[4] == pytest.approx(again.psf_at(*np.rint(again.grid(3, 3)[4]), 2), abs=1e-9)
+
+
+COLOURS = np.array([-0.2, 1.6])
+
+
+def sigma_of_colour(colour):
+    """Width of stars in pixels: red ones are larger."""
+    return 1.3 + 0.3 * (np.asarray(colour) - COLOURS[0]) / np.ptp(COLOURS)
+
+
+@pytest.fixture(scope="module")
+def colourful():
+    """A model whose stars say their colours, but for some."""
+    drawn = []
+
+    def width(mag):
+        drawn.append(np.random.default_rng(9).uniform(*COLOURS, len(mag)))
+        return sigma_of_colour(drawn[0])
+
+    pixels, position, _ = image_of(width)
+    colour = np.where(np.arange(len(position)) % 20 == 7, np.nan, drawn[0])
+    listed = Table({"x": position[:, 0], "y": position[:, 1], "g_r": colour})
+    given = {"origin": 0, "colour_column": "g_r", "pixel_scale_arcsec": 1.0, "gain": 1e9}
+    small = {"train_stars": 300, "test_stars": 60, "stamp_px": STAMP, "seed": 1}
+    stars = Stars.from_image(pixels, listed, **given, **small)
+    return fit(stars, "field", name="colourful")
+
+
+def test_the_psf_follows_the_colour_and_is_that_of_the_end_beyond(colourful):
+    place = PLACES[0]
+    for colour in (0.1, 0.7, 1.3):
+        found = colourful.psf_at(*place, 1, colour=colour)
+        wanted = stars_of(np.zeros((1, 2)), sigma_of_colour([colour]), STAMP)[0]
+        assert found == pytest.approx(wanted / wanted.sum(), abs=2e-3)
+    for end, beyond in zip(COLOURS, (-5.0, 5.0), strict=True):
+        far = colourful.psf_at(*place, colour=beyond)
+        assert far == pytest.approx(colourful.psf_at(*place, colour=end), abs=1e-3)
+    usual = colourful.psf_at(*place).max()
+    assert usual == pytest.approx(colourful.psf_at(*place, colour=0.7).max(), rel=0.05)
+    assert "changes with the colour" in colourful.engine.estimator.facts()["Colour"]
+
+
+def test_a_star_has_the_psf_of_its_colour(colourful):
+    """Where noise hides the star itself."""
+    rng, count = np.random.default_rng(5), 300
+    colour = np.resize(COLOURS, count)
+    truth = stars_of(np.zeros((count, 2)), sigma_of_colour(colour), STAMP)
+    noisy = 1e4 * (truth + 0.02 * rng.standard_normal(truth.shape))
+    place, mag = np.tile(PLACES[0], (count, 1)), np.full(count, np.nan)
+
+    known = np.column_stack([place, mag, [*COLOURS, np.nan, 3.0] + [0.5] * (count - 4)])
+    flagged = (colourful.predict(noisy, position=known).flags & psfdae.StarFlag.BEYOND) > 0
+    assert flagged.tolist() == [False, False, False, True] + [False] * (count - 4)
+
+    def error(known):
+        found = colourful.predict(noisy, position=np.column_stack([place, mag, known]))
+        return float(np.square(found.psf / found.flux[:, None, None] - truth).mean())
+
+    assert error(colour) < 0.8 * error(np.full(count, np.nan)) < error(colour[::-1])

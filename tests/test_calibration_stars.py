@@ -43,8 +43,8 @@ def bright_stars(centre, snr=500.0):
     peak, _ = brightest_pixels(wide, 3)
     level = np.full(count, snr)
     noise = np.ones(count)
-    centre, row = np.asarray(centre), np.arange(count)
-    return BrightStars(wide, peak, centre, position, 1e4 * noise, noise, level, row, centre)
+    centre, row, colour = np.asarray(centre), np.arange(count), np.full(count, np.nan)
+    return BrightStars(wide, peak, centre, position, 1e4 * noise, noise, level, row, centre, colour)
 
 
 def test_window_of_a_gaussian_is_as_wide_as_it_is():

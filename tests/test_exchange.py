@@ -91,6 +91,27 @@ def test_photutils_reads_stdpsf(tmp_path):
         assert np.abs(seen - wanted).max() < 1e-3 * wanted.max()
 
 
+def test_photutils_reads_asdf(tmp_path):
+    pytest.importorskip("photutils.extension")
+    asdf = pytest.importorskip("asdf")
+    pytest.importorskip("asdf_astropy")
+    model, path = Moving(), tmp_path / "m.asdf"
+    places = np.rint(model.grid(7, 5))
+    exchange.write_asdf(path, model, places, 4)
+    with asdf.open(path) as file:
+        grid = file["psf"]
+    assert type(grid) is GriddedPSFModel and grid.grid_xypos == pytest.approx(places)
+    assert grid.data == pytest.approx(model.psf_at(*places.T, 4))
+    assert grid.meta["model"] == model.name
+
+
+def test_without_what_writes_asdf_there_is_no_file(psfex, tmp_path, monkeypatch):
+    monkeypatch.setattr(exchange, "find_spec", lambda name: None)
+    done = run("psf", psfex, "--grid", "3x3", "--out", tmp_path / "a.asdf")
+    assert done.exit_code == 2 and "pip install asdf-astropy" in done.output, done.output
+    assert sorted(tmp_path.iterdir()) == [psfex]
+
+
 def test_the_same_everywhere_is_a_polynomial_of_order_0(tmp_path, monkeypatch):
     monkeypatch.setattr(Moving, "order", 0)
     monkeypatch.setattr(Moving, "field_range", lambda self: (LOW, LOW))
@@ -161,6 +182,7 @@ def test_psf_converts_a_model_of_psfex(psfex, tmp_path):
     [
         ("a.psf", ("--grid", "3x3"), "has the whole field"),
         ("a.stdpsf.fits", ("--at", "5,5"), "STDPSF has a --grid"),
+        ("a.asdf", ("--at", "5,5"), "has a --grid"),
         ("a.stdpsf.fits", ("--grid", "3x3", "--oversampling", 2), "4 values per pixel"),
         ("a.stdpsf.fits", ("--grid", "100x2"), "at most 99 places"),
         ("x_y_z.stdpsf.fits", ("--grid", "3x3"), "underscores"),

@@ -79,6 +79,7 @@ def bright(count=150, seed=1, spread=0.02, varied=True):
     listed = centre + 0.1 + 0.05 * rng.standard_normal((count, 2))
     known = {"peak": peak, "listed": listed, "position": position, "noise": noise}
     nothing = {"centre": listed, "snr": 1 / noise, "row": np.arange(count)}
+    nothing["colour"] = np.full(count, np.nan)
     return BrightStars(wide=images, flux=np.ones(count), **known, **nothing)
 
 

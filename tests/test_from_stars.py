@@ -357,7 +357,7 @@ def test_a_killed_command_ends_well_if_typed_again(field, model, tmp_path, monke
 @pytest.mark.parametrize("gain", [1e-9, 1.6, 1e12, 1e300])
 def test_the_sky_of_any_gain_can_be_drawn(gain):
     """A header may say GAIN = 1e12: nothing draws 1e26 photons."""
-    stars = BrightStars(*[np.ones(30)] * 9)
+    stars = BrightStars(*[np.ones(30)] * 10)
     noise = NoiseModel(1.0, stars.sky_photons(gain, 1e4))
     psf = np.full((20, 16, 16), 1 / 256)
     left = noise.draw(psf, 0.05, stream(1, "gain")) - psf

@@ -62,12 +62,14 @@ FORMATS = {
 def test_every_format_gives_the_same_stars(tmp_path, image, name):
     path = tmp_path / "stars.cat"
     table = Table({"NUMBER": [5, 7, 9], "X_IMAGE": X, "Y_IMAGE": Y, "FLUX": [1e3, 2e3, 3e3]})
+    table["G_R"] = [0.5, 0.25, -0.25]
     FORMATS[name](table, path)
-    found = open_observation(image, D, catalogue=path, flux_column="flux")
+    found = open_observation(image, D, catalogue=path, flux_column="flux", colour_column="g_r")
     np.testing.assert_allclose(found.positions, np.stack([X, Y], axis=1) - 1)
     (chunk,) = found.chunks(10)
     np.testing.assert_array_equal(chunk.id, [5, 7, 9])
     np.testing.assert_array_equal(chunk.flux, [1e3, 2e3, 3e3])
+    np.testing.assert_array_equal(chunk.colour, [0.5, 0.25, -0.25])
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS, ids=lambda c: c.pairs[0][0])

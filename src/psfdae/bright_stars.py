@@ -26,6 +26,11 @@ def magnitude(flux: np.ndarray) -> np.ndarray:
     return np.asarray(-2.5 * np.log10(np.maximum(flux, LEAST_FLUX)))
 
 
+def places(position: np.ndarray, flux: np.ndarray, colour: np.ndarray) -> np.ndarray:
+    """x, y, magnitude and colour of stars, on which the PSF may depend, shape (n, 4)."""
+    return np.column_stack([position, magnitude(flux), colour])
+
+
 @dataclass(frozen=True)
 class BrightStars:
     """Bright stars with the pixels around them.
@@ -45,6 +50,8 @@ class BrightStars:
     snr : ndarray, shape (n,)
     row : ndarray of int, shape (n,)
         Of the star list.
+    colour : ndarray, shape (n,)
+        By the star list, NaN where it says none.
     """
 
     wide: np.ndarray
@@ -56,11 +63,12 @@ class BrightStars:
     snr: np.ndarray
     row: np.ndarray
     listed: np.ndarray
+    colour: np.ndarray
 
     @classmethod
     def of_product(cls, stars: Product) -> BrightStars:
         """Read the bright stars of a product "stars" of an image, which has no centroids."""
-        names = ("peak", "position", "snr", "row", "listed", "flux")
+        names = ("peak", "position", "snr", "row", "listed", "flux", "colour")
         arrays = {name: stars[name] for name in names}
         flux, centre = arrays["flux"], np.full(arrays["position"].shape, np.nan)
         wide, noise = stars["wide"] * flux[:, None, None], stars["noise"] * flux
@@ -80,8 +88,8 @@ class BrightStars:
 
     @property
     def place(self) -> np.ndarray:
-        """x, y and magnitude, on which the PSF may depend, shape (n, 3)."""
-        return np.column_stack([self.position, magnitude(self.flux)])
+        """x, y, magnitude and colour, shape (n, 4)."""
+        return places(self.position, self.flux, self.colour)
 
     def area(self) -> np.ndarray:
         """Noise-equivalent area A = (F / (σ S/N))² of each star in pixels, shape (n,)."""

@@ -35,7 +35,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from psfdae.field_psf import SLOPE_PX, FieldModel
+from psfdae.field_psf import SLOPE_PX, STAR_TERMS, FieldModel
 from psfdae.mixing import FLUX_SIGMA, mixing_weights
 from psfdae.noise import NoiseModel
 from psfdae.settings import Count, Fraction, Group, Positive
@@ -345,16 +345,21 @@ class FieldLaw:
     def _terms(self, position: np.ndarray | None, count: int = 0) -> tuple[np.ndarray, np.ndarray]:
         """Terms of the field of each star, and where its position is known, (n,) of bool.
 
-        They are the usual ones where it is not, and so are those of an unknown magnitude.
+        They are the usual ones where it is not, and so are those of an unknown magnitude or colour.
         """
-        position = np.full((count, 2), np.nan) if position is None else position
-        x, y, mag = (*position.T, np.full(len(position), np.nan))[:3]
-        positioned = (np.isfinite(x) & np.isfinite(y)) | (self.order == 0)
-        known = np.repeat(positioned[:, None], len(self.usual), axis=1)
-        if last := self.model.of_magnitude:
-            known[:, -last:] = np.isfinite(mag)[:, None]
-        terms = self.model.terms(np.nan_to_num(np.stack([x, y, mag], axis=1)))
-        return np.where(known, terms, self.usual), positioned
+        place = np.full((count if position is None else len(position), 4), np.nan)
+        if position is not None:
+            place[:, : position.shape[1]] = position
+        given = np.isfinite(place)
+        positioned = given[:, :2].all(axis=1) | (self.order == 0)
+        of_place = len(self.usual) - self.model.of_star
+        known = np.hstack(
+            [
+                np.repeat(positioned[:, None], of_place, axis=1),
+                np.repeat(given[:, 2 : len(self.low)], STAR_TERMS, axis=1),
+            ]
+        )
+        return np.where(known, self.model.terms(np.nan_to_num(place)), self.usual), positioned
 
     # The nodes.
 

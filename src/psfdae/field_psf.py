@@ -11,8 +11,8 @@ as of the core, unless the stars say otherwise. Stars that are unlike the others
 pixels that are brighter or fainter than the model count less: they may show a neighbour. How far
 the polynomial goes, and how smooth the splines are, is what stars that were left out are
 predicted best with. Where a detector or a plate is not linear, f changes with the brightness of a
-star as well: its magnitude and the square of that are two more terms, if they predict stars that
-were left out clearly better.
+star as well, and through lenses and air with its colour: magnitude and its square are two more
+terms, and so are those of the colour, if they predict stars that were left out clearly better.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ CHANGE, LEAST_CHANGE = 0.5, 1e-5  # of a coefficient over the field, by its mean
 UNLIKE_SIGMA = 3.0  # of a pixel, from which it counts less: it may show a neighbour
 UNLIKE_CHI2 = 8.0  # times the median, from which a star does not count
 CURVED = 2  # order up to which all are tried: a symmetric field has no slope
-MAGNITUDE_TERMS, MAGNITUDE_GAIN = 2, 0.02  # and the part of the error by which they lower it
+STAR_TERMS, STAR_GAIN = 2, 0.02  # of magnitude or colour; part of the error that they save
 SMOOTHER, SMOOTHER_BY = 3, 10.0  # steps of the smoothness, each by this factor, that are tried
 EXPOSURE_CHANGES = (0.005, 0.02, 0.1)  # of a coefficient by that of another exposure, tried
 LARGEST_DEFORMATION = 0.3  # usual stretch of a PSF in another exposure; px² of its blur
@@ -59,9 +59,9 @@ class FieldModel:
     ----------
     coefficients : ndarray, shape (K, N, N)
         Of the splines, for each of the K terms of the polynomial.
-    low, high : ndarray, shape (2,) or (3,)
-        Range of the positions, and of the magnitudes if the PSF changes with these; beyond it the
-        PSF is that of its edge.
+    low, high : ndarray, shape (2,) to (4,)
+        Range of the positions, and if the PSF changes with them of magnitudes, and colours;
+        beyond it the PSF is that of its edge.
     spacing : float
         Of the knots, in pixels.
     """
@@ -74,18 +74,18 @@ class FieldModel:
     @property
     def order(self) -> int:
         """Order of the polynomial in the place, which has (order + 1)(order + 2)/2 terms."""
-        return (isqrt(8 * (len(self.coefficients) - self.of_magnitude) + 1) - 3) // 2
+        return (isqrt(8 * (len(self.coefficients) - self.of_star) + 1) - 3) // 2
 
     @property
-    def of_magnitude(self) -> int:
-        """Last terms, of the magnitude alone: 0 if the PSF does not change with it."""
-        return MAGNITUDE_TERMS * (len(self.low) - 2)
+    def of_star(self) -> int:
+        """Last terms, of magnitude and colour: 0 if the PSF changes with the place alone."""
+        return STAR_TERMS * (len(self.low) - 2)
 
     def terms(self, position: np.ndarray) -> np.ndarray:
-        """Terms of the polynomial, shape (n, K); NaN where unknown.
+        """Terms of the polynomial, shape (n, K).
 
-        At positions (n, 3) of x, y and magnitude, of which the last one may be left out of a model
-        that does not change with it.
+        At positions (n, 4) of x, y, magnitude and colour, of which the last ones may be left out of
+        a model that does not change with them.
         """
         return _terms(position, self.low, self.high, self.order)
 
@@ -141,7 +141,7 @@ def fit_field(
     """Fit orders of the polynomial, ascending, and then stronger smoothing, as long as it pays.
 
     It pays if stars that are left out are predicted better. With the best order, terms of the
-    magnitude are tried.
+    magnitude and then of the colour are tried.
 
     Parameters
     ----------
@@ -169,12 +169,13 @@ def fit_field(
             best, least = order, error
         elif order >= CURVED:
             break
-    alternating.coordinates = 3
-    error = alternating.crossed_error(alternating.fit(best))
-    if error < (1.0 - MAGNITUDE_GAIN) * least:
-        least = error
-    else:
-        alternating.coordinates = 2
+    taken, varies = 2, alternating.high > alternating.low
+    for coordinates in (c for c in (3, 4) if varies[c - 1]):
+        alternating.coordinates = coordinates
+        error = alternating.crossed_error(alternating.fit(best))
+        if error < (1.0 - STAR_GAIN) * least:
+            taken, least = coordinates, error
+    alternating.coordinates = taken
     for _ in range(SMOOTHER):
         alternating.smoothness *= SMOOTHER_BY
         error = alternating.crossed_error(alternating.fit(best))
@@ -211,7 +212,7 @@ class _Alternating:
     """Rounds of a fit to stars, and to what is known of the field from other exposures."""
 
     change, tolerance = 0.0, TOLERANCE
-    coordinates = 2  # of a place that count: x and y, and the magnitude as well if 3
+    coordinates = 2  # of a place that count: x and y, then magnitude, then colour
 
     def __init__(
         self,
@@ -430,14 +431,16 @@ def _deformations(coefficients: np.ndarray, spacing: float) -> np.ndarray:
 def _terms(position: np.ndarray, low: np.ndarray, high: np.ndarray, order: int) -> np.ndarray:
     """Monomials x^a y^b, a + b ≤ order, of positions scaled to ±1, shape (n, K).
 
-    Where the range has a third coordinate, its powers are the last terms.
+    Where the range has more coordinates, their powers are the last terms. What is not known is
+    taken for the middle of its range.
     """
     width = np.where(high > low, high - low, 1.0)
     scaled = np.clip(2.0 * (position[:, : len(low)] - low) / width - 1.0, -1.0, 1.0)
+    scaled = np.nan_to_num(scaled)
     x, y, *more = scaled.T
     powers = [(a, total - a) for total in range(order + 1) for a in range(total, -1, -1)]
     terms = [x**a * y**b for a, b in powers]
-    terms += [column**power for column in more for power in range(1, MAGNITUDE_TERMS + 1)]
+    terms += [column**power for column in more for power in range(1, STAR_TERMS + 1)]
     return np.stack(terms, axis=1)
 
 

@@ -60,9 +60,9 @@ class TrainingSet:
         Of the method's random streams.
     reference : str
         "realisation" or "template".
-    positions : ndarray, shape (n, 2) or (n, 3)
-        Where the stars stand in the field, any unit, and of an image their magnitudes; empty where
-        nobody knows.
+    positions : ndarray, shape (n, 2) or (n, 4)
+        Where the stars stand in the field, any unit, and of an image their magnitudes and colours;
+        empty where nobody knows.
     own_noise : callable or None
         Of images that are not noise-free: from star indices (m,) and their mean image (P,)
         to what noise adds to their scatter (P, P) about it.
@@ -273,6 +273,9 @@ class Packing:
 class MeasuresStars(Protocol):
     """Measures flux, sky and centre of a star with its PSF: no other photometry is needed."""
 
+    def beyond(self, position: np.ndarray) -> np.ndarray:
+        """Whether magnitude or colour of stars (n, 4) are beyond the training's, if they count."""
+
     def measure(
         self,
         stamps: np.ndarray,
@@ -295,7 +298,7 @@ class KnowsField(Protocol):
         """Of the polynomial by which the PSF changes over the field."""
 
     def psf_at(self, position: np.ndarray, oversampling: int = 1) -> np.ndarray:
-        """PSFs at positions (n, 2), or with magnitudes (n, 3)."""
+        """PSFs at positions (n, 2), or with magnitudes and colours (n, 4)."""
 
     def facts(self) -> Mapping[str, str]:
         """What a fit knows of the field that its user should: a title and words for each."""

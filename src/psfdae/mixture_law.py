@@ -35,6 +35,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import islice
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -116,8 +117,8 @@ class Axes(NamedTuple):
     total: float
 
 
-class Cut(NamedTuple):
-    """What counts of a cluster's axes above some noise.
+class Spectrum(NamedTuple):
+    """(C_k + s)⁻¹ of a cluster for any noise variance s (n, 1) above some, along its axes.
 
     Attributes
     ----------
@@ -133,16 +134,85 @@ class Cut(NamedTuple):
     variance: np.ndarray
     rest: float
 
-    def inverse(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(C_k + s)⁻¹ along the axes (n, a) and beyond them (n, 1), for noise s (n, 1)."""
+    def _inverse(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Along the axes (n, a) and beyond them (n, 1)."""
         variance = self.variance.astype(s.dtype)
         return 1 / (variance + s), 1 / (s.dtype.type(self.rest) + s)
+
+    def solved(self, rows: np.ndarray, s: np.ndarray) -> np.ndarray:
+        """Its product with rows (n, m)."""
+        along, beyond = self._inverse(s)
+        axes = rows @ self.vectors
+        both = np.vstack([along * axes, axes]) @ self.vectors.T
+        return np.asarray(both[: len(rows)] + beyond * (rows - both[len(rows) :]))
+
+    def distance(self, rows: np.ndarray, s: np.ndarray) -> np.ndarray:
+        """Its products with rows (n, m) on both sides, (n,)."""
+        along, beyond = self._inverse(s)
+        squares = np.square(rows @ self.vectors)
+        left = np.square(rows).sum(axis=1) - squares.sum(axis=1)
+        return np.asarray((squares * along).sum(axis=1) + left * beyond[:, 0])
+
+    def product(self, rows: np.ndarray, one: np.ndarray, s: np.ndarray) -> np.ndarray:
+        """Its products with rows (n, m) and another one (m,), (n,)."""
+        along, beyond = self._inverse(s)
+        axes, of_axes = rows @ self.vectors, one @ self.vectors
+        return np.asarray((along * axes) @ of_axes + beyond[:, 0] * (rows @ one - axes @ of_axes))
+
+    def distances(self, rows: np.ndarray, s: np.ndarray) -> np.ndarray:
+        """As `distance`, of rows (r, m) for every s, (n, r)."""
+        along, beyond = self._inverse(s)
+        squares = np.square(rows @ self.vectors).T
+        return np.asarray(
+            along @ squares + beyond * (np.square(rows).sum(axis=1) - squares.sum(axis=0))
+        )
 
     def half_log_det(self, s: np.ndarray) -> np.ndarray:
         """½ ln det(C_k + s) of some s (n,), in the m coordinates."""
         more = len(self.vectors) - len(self.variance)
         along = np.log(self.variance + s[:, None]).sum(axis=1)
         return np.asarray(0.5 * (along + (more * np.log(self.rest + s) if more else 0.0)))
+
+
+class LowRank(NamedTuple):
+    """The same for one noise variance, which takes far less to make (Woodbury's identity).
+
+    Attributes
+    ----------
+    certain : ndarray, shape (m,)
+        D⁻¹, with C_k + s = D + UᵀU and a diagonal D.
+    rows : ndarray, shape (r, m), float32
+        L⁻¹ U D⁻¹, with L Lᵀ = 1 + U D⁻¹ Uᵀ; (C_k + s)⁻¹ is D⁻¹ less the products of these.
+    half_log : float
+        ½ ln det(C_k + s).
+    """
+
+    certain: np.ndarray
+    rows: np.ndarray
+    half_log: float
+
+    def solved(self, rows: np.ndarray, s: np.ndarray) -> np.ndarray:
+        """As `Spectrum`."""
+        certain = self.certain.astype(rows.dtype)
+        return np.asarray(rows * certain - (rows @ self.rows.T) @ self.rows)
+
+    def distance(self, rows: np.ndarray, s: np.ndarray) -> np.ndarray:
+        """As `Spectrum`."""
+        known = np.square(rows @ self.rows.T).sum(axis=1)
+        return np.asarray(np.square(rows) @ self.certain.astype(rows.dtype) - known)
+
+    def product(self, rows: np.ndarray, one: np.ndarray, s: np.ndarray) -> np.ndarray:
+        """As `Spectrum`."""
+        return np.asarray(rows @ (self.certain * one) - (rows @ self.rows.T) @ (self.rows @ one))
+
+    def distances(self, rows: np.ndarray, s: np.ndarray) -> np.ndarray:
+        """As `Spectrum`."""
+        known = np.square(rows) @ self.certain - np.square(rows @ self.rows.T).sum(axis=1)
+        return np.asarray(np.repeat(known[None], len(s), axis=0))
+
+    def half_log_det(self, s: np.ndarray) -> np.ndarray:
+        """As `Spectrum`."""
+        return np.full(len(s), self.half_log)
 
 
 class Seen(NamedTuple):
@@ -160,6 +230,8 @@ class Seen(NamedTuple):
         s or what is near it, of which there are few.
     least : float
         Below every s.
+    alone : float or None
+        That of all images, if they were given one.
     """
 
     flat: np.ndarray
@@ -168,6 +240,7 @@ class Seen(NamedTuple):
     s: np.ndarray
     node: np.ndarray
     least: float
+    alone: float | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,6 +302,7 @@ class MixtureLaw:
     noise: NoiseModel
     loose: float = 0.0
     _spectra: dict[tuple[int, int], Axes] = field(default_factory=dict, init=False, repr=False)
+    _of_one: dict[tuple[int, float], LowRank] = field(default_factory=dict, init=False, repr=False)
     _doubts: dict[tuple[int, float, float], np.ndarray] = field(
         default_factory=dict, init=False, repr=False
     )
@@ -246,6 +320,7 @@ class MixtureLaw:
         # Not by how many there are: stars do not influence each other.
         node = np.exp(np.rint(np.log(s) / NOISE_STEP) * NOISE_STEP) if np.ndim(level) else s
         s, node = (np.broadcast_to(a, len(flat)) for a in (s, node))
+        alone = None if np.ndim(level) else float(s[0]) if len(s) else None
         range_of = np.floor(np.log(s) / NOISE_BIN)
         for number in np.unique(range_of):
             (stars,) = (range_of == number).nonzero()
@@ -253,7 +328,7 @@ class MixtureLaw:
             for part in np.array_split(stars, -(-stars.size // IMAGES_AT_ONCE)):
                 images = flat.take(part, axis=0)
                 z = (images @ self.axes).astype(np.float32)
-                of_noise = s[part, None].astype(np.float32), node[part], least
+                of_noise = s[part, None].astype(np.float32), node[part], least, alone
                 yield part, Seen(images, z, where[part], *of_noise)
 
     def _estimate(
@@ -288,15 +363,14 @@ class MixtureLaw:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Posterior mean and its σ, (n, P), NaN unless `sure`."""
         same, m = not len(self.cross), self._known(seen.least)
-        first, second = np.zeros((2, *seen.flat.shape), np.float32)
+        # Those of one noise are few, and it may be far above the star: squares cancel then.
+        sums = np.float32 if seen.alone is None else np.float64
+        first, second = np.zeros((2, *seen.flat.shape), sums)
         others = weight @ self.mean[:, m:]  # in the other coordinates
         images = self.axes if same else self.cross
         for k, rows, at, residual, cut in self._pairs(seen, weight > 0, m):
             cluster, w, s = self._clusters[k], weight[rows, k, None], seen.s[rows]
-            along, beyond = cut.inverse(s)
-            axes = residual @ cut.vectors
-            both = np.vstack([along * axes, axes]) @ cut.vectors.T
-            g = both[: len(rows)] + beyond * (residual - both[len(rows) :])
+            g = cut.solved(residual, s)
             if at.size:
                 others[rows] += w * (at @ cluster.slope[:, m:])
             one = (-s if same else cluster.common) * g @ images[:, :m].T
@@ -306,8 +380,8 @@ class MixtureLaw:
                 one += at @ cluster.slope_reference if at.size else 0.0
             first[rows] += w * one
             if sure:
-                doubt = s * self._doubt(k, seen.least, seen.node[rows])
-                second[rows] += w * (doubt + np.square(one))
+                doubt = s * self._doubt(k, seen, seen.node[rows])
+                second[rows] += w * (doubt + np.square(one, dtype=sums))
         gain = (seen.z[:, m:] - others) / (self.variance[m:].astype(np.float32) + seen.s)
         sigma = np.sqrt(np.maximum(second - np.square(first), 0.0)) if sure else second + np.nan
         if same:
@@ -322,16 +396,14 @@ class MixtureLaw:
         others = self.variance[m:].astype(np.float32)
         for k, rows, _, residual, cut in self._pairs(seen, weight > 0, seen.z.shape[1]):
             s, lead, contrast = seen.s[rows], residual[:, :m], self._contrast[k]
-            along, beyond = cut.inverse(s)
-            axes, of_axes = lead @ cut.vectors, contrast[:m] @ cut.vectors
-            found = (along * axes) @ of_axes + beyond[:, 0] * (lead @ contrast[:m] - axes @ of_axes)
+            found = cut.product(lead, contrast[:m], s)
             found += (residual[:, m:] / (others + s)) @ contrast[m:]
             flux[rows] += self.loose**2 * weight[rows, k] * found
         return flux
 
     def _pairs(
         self, seen: Seen, near: np.ndarray, width: int
-    ) -> Iterator[tuple[int, np.ndarray, np.ndarray, np.ndarray, Cut]]:
+    ) -> Iterator[tuple[int, np.ndarray, np.ndarray, np.ndarray, Spectrum | LowRank]]:
         """Clusters with the images (n, K) of bool that are near.
 
         Their numbers, positions and leading coordinates less the cluster's, and its axes.
@@ -345,7 +417,7 @@ class MixtureLaw:
                 residual -= self.mean[k, :width]
                 if at.size:
                     residual -= at @ self._clusters[k].slope[:, :width]
-                yield k, rows, at, residual, self._cut(k, seen.least)
+                yield k, rows, at, residual, self._cut(k, seen)
 
     def _log_densities(self, seen: Seen, near: np.ndarray | None) -> np.ndarray:
         """ln of the probability of images under each cluster that is near, (n, K).
@@ -359,10 +431,7 @@ class MixtureLaw:
         nodes = np.log(seen.least) + np.linspace(0.0, NOISE_BIN, DET_NODES)
         for k, rows, at, residual, cut in self._pairs(seen, near, width):
             cluster, s = self._clusters[k], seen.s[rows]
-            along, beyond = cut.inverse(s)
-            squares = np.square(residual[:, :m] @ cut.vectors)
-            left = np.square(residual[:, :m]).sum(axis=1) - squares.sum(axis=1)
-            far = (squares * along).sum(axis=1) + left * beyond[:, 0]
+            far = cut.distance(residual[:, :m], s)
             det = cut.half_log_det(np.exp(nodes))
             if width > m:
                 more = self.variance[m:width]
@@ -446,13 +515,34 @@ class MixtureLaw:
             own, own_reference, square, slope, slope_reference, spread, nu / total, 1 / total
         )
 
-    def _cut(self, k: int, s: float) -> Cut:
-        """Axes of a cluster that count at a noise variance s and above."""
-        axes = self._axes(k, self._known(s))
+    def _cut(self, k: int, seen: Seen) -> Spectrum | LowRank:
+        """(C_k + s)⁻¹ of a cluster for the noise of some images."""
+        s, width = seen.least, self._known(seen.least)
+        if seen.alone is not None:
+            return self._at(k, width, seen.alone)
+        axes = self._axes(k, width)
         width, variance = len(axes.variance), axes.variance[axes.variance > LEAST_VARIANCE * s]
         more = width - len(variance)
         rest = (axes.total - variance.sum()) / more if more else np.inf
-        return Cut(axes.vectors[:, : len(variance)], variance, float(rest))
+        return Spectrum(axes.vectors[:, : len(variance)], variance, float(rest))
+
+    def _at(self, k: int, width: int, s: float) -> LowRank:
+        """(C_k + s)⁻¹, kept as long as s is the same."""
+        if found := self._of_one.get((k, s)):
+            return found
+        if any(of != s for _, of in islice(self._of_one, 1)):
+            self._of_one.clear()
+        cluster = self._clusters[k]
+        diagonal = cluster.common * self.variance[:width] + s
+        rows = np.sqrt(cluster.scale) * cluster.own[:, :width].astype(np.float64)
+        certain = rows / diagonal
+        lower = np.linalg.cholesky(np.eye(len(rows)) + certain @ rows.T)
+        found = self._of_one[k, s] = LowRank(
+            1.0 / diagonal,
+            (np.linalg.inv(lower) @ certain).astype(np.float32),
+            float(0.5 * np.log(diagonal).sum() + np.log(lower.diagonal()).sum()),
+        )
+        return found
 
     def _axes(self, k: int, width: int) -> Axes:
         """Axes of C_k, made once."""
@@ -492,29 +582,26 @@ class MixtureLaw:
         loose = np.square(self.loose * self._contrast).max(axis=0)
         return np.asarray(self.variance + between + np.square(self.slope).sum(axis=0) + loose)
 
-    def _doubt(self, k: int, least: float, node: np.ndarray) -> np.ndarray:
+    def _doubt(self, k: int, seen: Seen, node: np.ndarray) -> np.ndarray:
         """Variance over s of the pixels of images (n, P) once they are known, inside a cluster.
 
         Of those noise variances s (n,), of which few differ.
         """
         nodes, which = np.unique(node, return_inverse=True)
-        keys = [(k, least, s) for s in nodes.tolist()]
+        keys = [(k, seen.least, s) for s in nodes.tolist()]
         if new := [key for key in keys if key not in self._doubts]:
-            found = self._doubts_of(k, least, np.array([s for _, _, s in new]))
+            found = self._doubts_of(k, seen, np.array([s for _, _, s in new]))
             self._doubts.update(zip(new, found, strict=True))
         return np.stack([self._doubts[key] for key in keys])[which]
 
-    def _doubts_of(self, k: int, least: float, s: np.ndarray) -> np.ndarray:
-        cut, cluster, s = self._cut(k, least), self._clusters[k], s[:, None]
-        m = len(cut.vectors)
+    def _doubts_of(self, k: int, seen: Seen, s: np.ndarray) -> np.ndarray:
+        cluster, m, s = self._clusters[k], self._known(seen.least), s[:, None]
         # Covariance of references with the leading coordinates; images are their own references.
         lead = self.axes[:, :m]
         if len(self.cross):
             lead = cluster.common * self.cross[:, :m]
             lead = lead + cluster.scale * cluster.own_reference.T @ cluster.own[:, :m]
-        along, beyond = cut.inverse(s)
-        seen = np.square(lead @ cut.vectors).T
-        known = along @ seen + beyond * (np.square(lead).sum(axis=1) - seen.sum(axis=0))
+        known = self._cut(k, seen).distances(lead, s)
         known += (1.0 / (self.variance[m:] + s)) @ self._squares[:, m:].T
         if not len(self.cross):
             return np.asarray(np.maximum(1.0 - s * known, 0.0))

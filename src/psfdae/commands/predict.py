@@ -62,6 +62,9 @@ class Stated:
     saturate: Annotated[float | None, "Counts of a saturated pixel.  [default: the header's]"] = (
         None
     )
+    colour_column: Annotated[
+        str | None, "Colours of the list's stars, with which the PSF may change."
+    ] = None
     accept_offset: Annotated[bool, "Take a star list that is off by more than a pixel."] = False
 
     def words(self) -> list[str]:

@@ -79,6 +79,7 @@ class Source:
     saturate: float | None = None  # counts
     flux_column: str | None = None  # of the catalogue: fluxes that are not to be estimated
     background_column: str | None = None  # the same for sky levels per pixel
+    colour_column: str | None = None  # of the catalogue: colours, on which the PSF may depend
     accept_offset: bool = False  # of the catalogue's positions from the stars
 
     @property
@@ -134,8 +135,8 @@ class Source:
             where = table.positions()
             positions = self._positions(image, table, where, is_cube)
             identifiers, flags = table.identifiers(), table.flags(where)
-        known = (self._column(table, c, count) for c in (self.flux_column, self.background_column))
-        columns = [identifiers, *known, flags]
+        names = (self.flux_column, self.background_column, self.colour_column)
+        columns = [identifiers, *(self._column(table, name, count) for name in names), flags]
         if self.on_image and positions is not None and not is_cube:
             kept = _inside(positions, shape)
             columns, positions = [column[kept] for column in columns], positions[kept]
@@ -474,7 +475,7 @@ class Observation:
     header_cards: list[Card]  # provenance to copy into what is made of the stars
     catalogue: Path | None  # the star list
     found: Catalogue | None  # that made in its place
-    _columns: list[np.ndarray] = field(repr=False)  # identifiers, flux, sky and flags of the list
+    _columns: list[np.ndarray] = field(repr=False)  # identifiers, flux, sky, colour and flags
     _layers: Layers = field(repr=False)
     # Light of other stars in the stamps of a part of the list, of a side and with a margin in px.
     others: Callable[[slice, int, int], np.ndarray] | None = field(default=None, repr=False)
@@ -663,9 +664,9 @@ class Observation:
         listed = np.full((len(data), 2), np.nan)
         if self.shape is not None:
             listed = np.stack([y - central_pixel(y), x - central_pixel(x)], axis=1)
-        ids, flux, background, flags = (column[part].copy() for column in self._columns)
+        ids, flux, background, colour, flags = (column[part].copy() for column in self._columns)
         raise_flag(flags, StarFlag.TRUNCATED, truncated)
-        known = (flux, background, noise, gain, unknown, listed)
+        known = (flux, background, noise, gain, unknown, colour, listed)
         return Stamps(data, masked, saturated, flags, ids, x, y, *known)
 
 

@@ -142,16 +142,18 @@ def collect(
     close = crowded(found["position"], snr * noise, near, settings.neighbour_ratio)
     verdict[close & (verdict == Verdict.GOOD)] = Verdict.CROWDED
     verdict[observation.without_position()] = Verdict.NO_POSITION
-    wide, peak, listed = (np.concatenate([k[i] for k in kept]) for i in range(3))
+    wide, peak, listed, colour = (np.concatenate([k[i] for k in kept]) for i in range(4))
     wide = np.maximum(wide, -DEFECT * noise[row, None, None])
     flux = cut(wide, side, peak).sum(axis=(1, 2))
     verdict[row[flux <= 0]] = Verdict.MISFIT
     good = verdict[row] == Verdict.GOOD
-    wide, peak, listed, flux, row = (a[good] for a in (wide, peak, listed, flux, row))
+    wide, peak, listed, colour, flux, row = (
+        a[good] for a in (wide, peak, listed, colour, flux, row)
+    )
     window = window_of(snr[row], flux, noise[row])
     centre = windowed_centres(wide, peak, window, REGISTRATION_ROUNDS, FARTHEST_PX)
     bright = BrightStars(
-        wide, peak, centre, found["position"][row], flux, noise[row], snr[row], row, listed
+        wide, peak, centre, found["position"][row], flux, noise[row], snr[row], row, listed, colour
     )
     score = misfit(cut(bright.aligned(), side), bright.position, bright.noise / bright.flux)
     verdict[row[score > settings.misfit]] = Verdict.MISFIT
@@ -163,7 +165,7 @@ def collect(
 def _measure(
     chunk: Stamps, settings: CalibrationStars, framing: Stamp, least_noise: float
 ) -> tuple[dict[str, np.ndarray], tuple[np.ndarray, ...]]:
-    """Columns for all stars of a chunk; stamps, peaks and listed centres of the bright ones."""
+    """Columns for all stars of a chunk; stamps, peak, listed centre, colour of the bright ones."""
     side = framing.stamp_px
     level, noise = sky_around(chunk.data, chunk.bad, side)
     noise = np.where(np.isfinite(chunk.noise), chunk.noise, np.maximum(noise, least_noise))
@@ -196,7 +198,7 @@ def _measure(
         "verdict": verdict,
     }
     good = verdict == Verdict.GOOD
-    return columns, (wide[good], peak[good], chunk.listed[good])
+    return columns, (wide[good], peak[good], chunk.listed[good], chunk.colour[good])
 
 
 def _at(wide: np.ndarray, peak: np.ndarray) -> np.ndarray:

@@ -28,6 +28,7 @@ class Stamps:
     noise: np.ndarray  # (n,), RMS of the sky in a pixel, likewise
     gain: np.ndarray  # (n,), electrons per unit of the stamps; NaN where unknown
     magnitude: np.ndarray  # (n,), for which the PSF is asked; NaN: that of the flux that is found
+    colour: np.ndarray  # (n,), by the list, such as g − r; NaN where unknown
     # (n, 2), centre (row, column) from index s//2 that a list says; NaN where unknown
     listed: np.ndarray
 
@@ -63,6 +64,7 @@ class StarFlag(IntFlag):
     BLENDED = 1024
     SKY_OFF = 2048
     POOR_FIT = 4096
+    BEYOND = 8192
 
 
 MEANING: dict[StarFlag, str] = {
@@ -79,6 +81,8 @@ MEANING: dict[StarFlag, str] = {
     StarFlag.BLENDED: "the star list says that it was parted from a neighbour",
     StarFlag.SKY_OFF: "the sky that was given is over 5 sigma off the border of the stamp",
     StarFlag.POOR_FIT: "chi2 above 10: the residual is far above the noise",
+    StarFlag.BEYOND: "brighter, fainter or of another colour than all stars of the training, where "
+    "the PSF changes with that",
 }
 """One line for every flag."""
 

@@ -199,6 +199,7 @@ def training_columns(
         "phase": Column(phase, "pixel", "(row, column) that splines moved the star"),
         "position": Column(bright.position, "pixel", "(x, y) of every star, 0-based"),
         "flux": Column(bright.flux, "count", "of every star inside its stamp"),
+        "colour": Column(bright.colour, "mag", "of every star by the catalogue, NaN if unknown"),
         "snr": Column(bright.snr, "1", "signal to noise of every star"),
         "noise": Column(bright.noise / bright.flux, "1", "pixel RMS over flux of every star"),
         "row": Column(bright.row, "1", "row of every star in the catalogue"),

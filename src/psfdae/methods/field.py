@@ -42,6 +42,9 @@ LEAST_DIAGONAL, LEAST_ERROR = 0.01, 1e-6
 LEAST_LISTED = 5
 """Stars with listed centres that are needed to measure the error of a list."""
 
+RANGE_SLACK = 0.02
+"""Part of the range of magnitudes or colours by which a star of the training may seem beyond it."""
+
 PACKED_BYTES = 3e6
 """Largest size of the residuals in a bundle."""
 
@@ -55,8 +58,8 @@ class FieldMixture(FieldLaw, Method):
     storage = Storage(
         arrays={
             "coefficients": ("1", "splines of the field for each term of its polynomial"),
-            "low": ("pixel", "least position (x, y), and magnitude if the PSF changes with it"),
-            "high": ("pixel", "greatest position, likewise"),
+            "low": ("pixel", "least x, y; magnitude and colour if the PSF changes with them"),
+            "high": ("pixel", "greatest, likewise"),
             "usual": ("1", "mean of the terms"),
             "spread": ("1", "their covariance"),
             "offset": ("1", "mean residual by phase"),
@@ -169,8 +172,8 @@ class FieldMixture(FieldLaw, Method):
     def psf_at(self, position: np.ndarray, oversampling: int = 1) -> np.ndarray:
         """The field's PSFs (n, m, m) at positions, as `FieldModel.images` draws them.
 
-        Positions (n, 2), or with magnitudes (n, 3), are meant as those of the training's list,
-        and what is not known of them as usual. Stars lie in their sub-pixel phase
+        Positions, which may have magnitudes and colours (n, 4), are meant as those of the list of
+        the training, and what is not known of them as usual. Stars lie in their sub-pixel phase
         beside the middle, which is the pixel of their position. Their flux is that for which a
         star in the middle of its pixel has the sum 1 in its stamp: a PSF keeps it where it moves
         with its star, as it does in photometry, though some light then crosses the stamp's edge.
@@ -181,17 +184,28 @@ class FieldMixture(FieldLaw, Method):
         whole = self.model.images(terms, np.broadcast_to(self._list_offset, phase.shape), self.side)
         return np.asarray(images / whole.sum(axis=(1, 2), keepdims=True))
 
+    def beyond(self, position: np.ndarray) -> np.ndarray:
+        """Whether magnitude or colour of stars (n, 4) are beyond the training's, if they count."""
+        value, low, high = position[:, 2 : len(self.low)], self.low[2:], self.high[2:]
+        slack = RANGE_SLACK * (high - low)
+        return np.asarray(((value < low - slack) | (value > high + slack)).any(axis=1))
+
     def facts(self) -> dict[str, str]:
         """The polynomial of the field."""
         order = self.order
         changes = f"changes over the image by a polynomial of order {order}"
         same = "is the same everywhere (order 0: more is not supported by stars left out)"
         facts = {"Field": f"the PSF {changes if order else same}"}
-        if self.model.of_magnitude:
-            bright, faint = self.low[2], self.high[2]
-            facts["Brightness"] = (
-                f"the PSF changes with the magnitude −2.5 log₁₀ (flux / counts), {bright:.2f} to "
-                f"{faint:.2f}; brighter and fainter stars have the PSF of the end of this range"
+        ranges = zip(
+            ("Brightness", "Colour"),
+            ("magnitude −2.5 log₁₀ (flux / counts)", "colour of the star list"),
+            *(self.low[2:], self.high[2:]),
+            strict=False,
+        )
+        for name, what, low, high in ranges:
+            facts[name] = (
+                f"the PSF changes with the {what}, {low:.2f} to {high:.2f}; stars beyond this "
+                "range have the PSF of its end"
             )
         return facts
 
@@ -239,8 +253,8 @@ class FieldMixture(FieldLaw, Method):
             In any unit; the sky may be roughly subtracted.
         noise : ndarray, shape (n,)
             RMS of a pixel.
-        position : ndarray, shape (n, 2) or (n, 3), optional
-            (x, y) in the field, and the magnitude; NaN where unknown.
+        position : ndarray, shape (n, 2) to (n, 4), optional
+            (x, y) in the field, magnitude and colour; NaN where unknown.
         centre : ndarray, shape (n, 2), optional
             (row, column) that a list says, from pixel (d//2, d//2); NaN where none does.
         fixed : bool or ndarray of bool, shape (n,)

@@ -1,4 +1,4 @@
-"""PSFs at places of an image in files of other programs: PSFEx, STPSF, STDPSF.
+"""PSFs at places of an image in files of other programs: PSFEx, STPSF, STDPSF, photutils.
 
 A model of PSFEx (Bertin 2011, ASP Conf. Ser. 442, 435) is a polynomial in the position, of which
 each term has an image with samples of `PSF_SAMP` pixels, to be interpolated by Lanczos' kernel.
@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from functools import cached_property
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -24,7 +25,7 @@ from psfdae.model.psf_model import load_model
 from psfdae.moments import measure_shapes
 from psfdae.version import __version__
 
-PSFEX, STDPSF = ".psf", ".stdpsf.fits"
+PSFEX, STDPSF, ASDF = ".psf", ".stdpsf.fits", ".asdf"
 """Ends of names: what a file is written as, or read as."""
 
 LANCZOS = 4  # order of the kernel, as of PSFEx
@@ -136,7 +137,7 @@ class PsfexField(FieldPsfs):
         """Files of PSFEx do not say how large pixels are."""
 
     def _drawn(self, place: np.ndarray, oversampling: int) -> np.ndarray:
-        place = place[:, :2]  # no magnitude
+        place = place[:, :2]  # neither magnitude nor colour
         u, v = np.clip((place - self.zero) / self.width, -0.5, 0.5).T
         sampled = np.tensordot(np.stack([u**i * v**j for i, j in self.terms], 1), self.basis, 1)
         phase = place - np.floor(place + 0.5)
@@ -273,6 +274,33 @@ def write_grid(path: Path, model: FieldPsfs, places: np.ndarray, oversampling: i
         key = f"DET_YX{number}" if number < 100 else f"HIERARCH DET_YX{number}"
         cards.append((key, f"({row:.8g}, {column:.8g})", "y, x, 0-based"))
     _write_cube(path, model, places, oversampling, cards)
+
+
+def write_asdf(path: Path, model: FieldPsfs, places: np.ndarray, oversampling: int) -> None:
+    """Write PSFs on a grid of places (n, 2), x and y, as photutils' `GriddedPSFModel`.
+
+    It is the value of `psf` in an ASDF file.
+
+    Raises
+    ------
+    PredictionError
+        If what writes such files is not installed.
+    """
+    if not (find_spec("asdf_astropy") and find_spec("photutils.extension")):
+        raise PredictionError(
+            f"{path}: ASDF files take asdf-astropy and photutils 3.1 or newer, which needs "
+            "Python 3.12: pip install asdf-astropy 'photutils>=3.1'"
+        )
+    import asdf
+    from astropy.nddata import NDData
+    from photutils.psf import GriddedPSFModel
+
+    about: dict[str, Any] = {"grid_xypos": places.tolist(), "oversampling": oversampling}
+    about |= {"creator": f"psfdae {__version__}", "model": model.name, "sha256": model.sha256}
+    psfs = model.psf_at(places[:, 0], places[:, 1], oversampling)
+    grid = GriddedPSFModel(NDData(psfs, meta=about))
+    with atomic_path(path) as temporary:
+        asdf.AsdfFile({"psf": grid}).write_to(temporary)
 
 
 def _write_cube(

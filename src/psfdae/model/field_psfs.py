@@ -85,10 +85,16 @@ class FieldPsfs(ABC):
 
     @abstractmethod
     def _drawn(self, place: np.ndarray, oversampling: int) -> np.ndarray:
-        """PSFs (n, m, m) as `psf_at`, at checked places, (n, 2) or with the magnitude (n, 3)."""
+        """PSFs (n, m, m) as `psf_at`, at checked places (n, 2) to (n, 4)."""
 
     def psf_at(
-        self, x: Numbers, y: Numbers, oversampling: int = 4, *, mag: Numbers | None = None
+        self,
+        x: Numbers,
+        y: Numbers,
+        oversampling: int = 4,
+        *,
+        mag: Numbers | None = None,
+        colour: Numbers | None = None,
     ) -> np.ndarray:
         """PSFs at places of the image of the training, where no star need be.
 
@@ -98,11 +104,11 @@ class FieldPsfs(ABC):
             0-based pixel coordinates. The PSF lies at their sub-pixel phase.
         oversampling : int
             Values per pixel and axis; each is what a whole pixel there would get.
-        mag : float or array, shape (n,), optional
-            Instrumental magnitude −2.5 log₁₀ (flux / counts); by default the PSF is the average
-            over those of the training stars. Brighter and fainter stars have the PSF of the
-            brightest and faintest of these; it changes with the magnitude only where stars that
-            were left out of the training say so.
+        mag, colour : float or array, shape (n,), optional
+            Instrumental magnitude −2.5 log₁₀ (flux / counts), and colour as in the star list; by
+            default the PSF is the average over those of the training stars. Beyond these stars it
+            is that of the last of them; it changes with either only where stars that were left out
+            of the training say so.
 
         Returns
         -------
@@ -117,20 +123,23 @@ class FieldPsfs(ABC):
             If the model's method knows no PSF between the stars, a number is not usable, or the
             model has no PSF of a finite flux above 0 at a place.
         """
-        given = {"x": x, "y": y} | ({} if mag is None else {"mag": mag})
-        position = np.stack(
-            np.broadcast_arrays(*(real_numbers(name, of) for name, of in given.items())), axis=-1
-        )
-        if position.ndim > 2 or not np.isfinite(position).all():
+        stated = {"x": x, "y": y, "mag": mag, "colour": colour}
+        known = [value is not None for value in stated.values()]
+        count = 4 if known[3] else 3 if known[2] else 2
+        numbers = [
+            real_numbers(name, np.nan if value is None else value) for name, value in stated.items()
+        ]
+        position = np.stack(np.broadcast_arrays(*numbers[:count]), axis=-1)
+        if position.ndim > 2 or not np.isfinite(position[..., known[:count]]).all():
             raise PredictionError("positions must be finite, one x and y or arrays of as many")
         if not 1 <= oversampling <= MOST_OVERSAMPLED:
             raise PredictionError(f"oversampling {oversampling}: 1 to {MOST_OVERSAMPLED}")
         with np.errstate(all="ignore"):
-            found = self._drawn(position.reshape(-1, len(given)), oversampling)
+            found = self._drawn(position.reshape(-1, count), oversampling)
         flux = found.sum(axis=(1, 2))
         usable = np.isfinite(flux) & (flux > 0)
         if not usable.all():
-            place = position.reshape(-1, len(given))[np.argmin(usable)]
+            place = position.reshape(-1, count)[np.argmin(usable)]
             raise PredictionError(
                 f"the model {self.name!r}: damaged, or far outside its image: no PSF of a "
                 f"finite flux above 0 at x {place[0]:.6g}, y {place[1]:.6g}"

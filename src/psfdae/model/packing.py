@@ -73,7 +73,7 @@ Restore = Callable[[np.ndarray, float], Estimate]
 class HeldOutStars:
     """Noise-free stars of flux 1 that no training has seen, (n, d, d), noise, and places (n, 2).
 
-    Those of an image have their magnitudes as a third number of their places. They
+    Those of an image have magnitudes and colours in their places. They
     are not free of noise: `own_noise` (n, d, d) is in their pixels, and makes their flux, which is
     taken to be 1, uncertain by `flux_error` (n,).
     """

@@ -172,10 +172,11 @@ class PsfModel(FieldPsfs):
         gain : float or array, shape (n,), optional
             Electrons per unit of the stamps: adds the star's photon noise to `chi2`
             and `flux_error`.
-        position : array, shape (n, 2) or (n, 3), optional
+        position : array, shape (n, 2) to (n, 4), optional
             (x, y) of the stars in the image of the training, 0-based; NaN where unknown. The third
             number is the magnitude −2.5 log₁₀ (flux / counts), by default that of the flux in the
-            stamp; it counts where the PSF of the training stars changes with their brightness.
+            stamp, the fourth the colour; they count where the PSF of the training stars changes
+            with their brightness and colour.
         centre : array, shape (n, 2), optional
             (x, y) of the stars' centres that a list says, from index s//2; NaN where unknown.
             Like the position, for models that measure centres (`psfdae.methods.field`).
@@ -226,7 +227,7 @@ class PsfModel(FieldPsfs):
                 f"stamps of shape {size}, but the model {self.info.name!r} takes n×{side}×{side}"
             )
         finite = np.isfinite(data)
-        x, y, mag = _numbers("position", position, len(data), 3).T
+        x, y, mag, colour = _numbers("position", position, len(data), 4).T
         return Stamps(
             data=data if finite.all() else np.where(finite, data, 0),
             bad=_mask("bad", masks["bad"], data, single) | ~finite,
@@ -236,6 +237,7 @@ class PsfModel(FieldPsfs):
             x=x,
             y=y,
             magnitude=mag,
+            colour=colour,
             listed=_numbers("centre", centre, len(data), 2)[:, ::-1],
             **{name: _per_star(name, value, len(data)) for name, value in given.items()},
         )
@@ -601,10 +603,11 @@ class Engine:
         noise = np.where(nothing, 1.0, np.sqrt(noise**2 + photons))
         flux = np.where(given, stars.flux, found.flux)
         mag = np.where(np.isnan(stars.magnitude), magnitude(flux), stars.magnitude)
+        place = np.stack([stars.x, stars.y, mag, stars.colour], axis=1)
         estimate = method.measure(
             data,
             noise,
-            np.stack([stars.x, stars.y, mag], axis=1),
+            place,
             stars.listed - shift,
             exact,
             flux=stars.flux,
@@ -618,6 +621,7 @@ class Engine:
         flags = found.flags & np.uint16(StarFlag.MASKED | StarFlag.OUTLIER)
         raise_flag(flags, StarFlag.NO_FLUX, lost)
         raise_flag(flags, StarFlag.FAINT, ~given & ~lost & (flux < FAINT_SNR * error))
+        raise_flag(flags, StarFlag.BEYOND, method.beyond(place))
         sky = start + own.background
         unit = np.where(lost, 1.0, flux)[:, None, None]
         images = (data - own.background[:, None, None]) / unit

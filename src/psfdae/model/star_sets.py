@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from psfdae.bright_stars import BrightStars, magnitude
+from psfdae.bright_stars import BrightStars, places
 from psfdae.files import Product, ProductError, read_product
 from psfdae.fits import learnt
 from psfdae.method import MeasuresStars, Method, TrainingSet
@@ -36,12 +36,12 @@ def of_image(stars: Product) -> bool:
 def field_positions(stars: Product) -> np.ndarray:
     """Where each star stands: in steps of the field's grid, shape (n, 2).
 
-    Of an image in pixels, NaN where its list does not say it, with a third column: the magnitude
-    of the bright star, which stays that of its noisy images.
+    Of an image in pixels, NaN where its list does not say it, with two more columns: magnitude and
+    colour of the bright star, which stay those of its noisy images.
     """
     if not of_image(stars):
         return np.asarray(stars["grid"][stars["field_index"]])
-    place = np.column_stack([stars["position"], magnitude(stars["flux"])])
+    place = places(stars["position"], stars["flux"], stars["colour"])
     return np.asarray(place[stars["field_index"]])
 
 

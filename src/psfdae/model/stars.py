@@ -109,6 +109,7 @@ class Stars:
         gain: float | None = None,
         read_noise: float | None = None,
         saturate: float | None = None,
+        colour_column: str | None = None,
         accept_offset: bool = False,
         **settings: object,
     ) -> Stars:
@@ -134,6 +135,8 @@ class Stars:
         bad_bits : int, optional
         pixel_scale_arcsec, gain, read_noise, saturate : float, optional
             Arcseconds per pixel, electrons per count, electrons, counts; instead of the header's.
+        colour_column : str, optional
+            Of the star list, such as g − r; the PSF may change with it.
         accept_offset : bool
             Take a star list that is off by more than a pixel.
         **settings
@@ -167,6 +170,7 @@ class Stars:
             gain=gain,
             read_noise=read_noise,
             saturate=saturate,
+            colour_column=colour_column,
             accept_offset=accept_offset,
         )
         settings_of_all = with_keywords(settings_model()(), IMAGE_GROUPS, settings)

@@ -128,6 +128,7 @@ def _stamps(stars: ArrayLike, noise: ArrayLike | None, gain: ArrayLike | None) -
         noise=each("noise", noise),
         gain=each("gain", gain),
         magnitude=unknown,
+        colour=unknown,
         listed=np.full((count, 2), np.nan),
     )
 
