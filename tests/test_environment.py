@@ -25,7 +25,11 @@ CONDA_NAMES = {
     "matplotlib-base": "matplotlib",
 }
 CONDA_ONLY = {"pip", "python"}
-TRANSITIVE = {"sqlalchemy": "of mlflow", "numexpr": "of poppy"}
+TRANSITIVE = {
+    "sqlalchemy": "of mlflow",
+    "numexpr": "of poppy",
+    "asdf": "of asdf-astropy, which photutils takes from Python 3.12 on; tests/pythons.sh has it",
+}
 NOT_IMPORTED = {
     "pywavelets": "scikit-image's wavelets need it",
     "pyarrow": "writes the Parquet files of pandas",

@@ -359,7 +359,8 @@ class FieldLaw:
                 np.repeat(given[:, 2 : len(self.low)], STAR_TERMS, axis=1),
             ]
         )
-        return np.where(known, self.model.terms(np.nan_to_num(place)), self.usual), positioned
+        terms = self.model.terms(np.nan_to_num(place))
+        return np.where(known, terms, self.usual), positioned
 
     # The nodes.
 
