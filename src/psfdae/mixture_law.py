@@ -35,7 +35,6 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import islice
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -302,7 +301,9 @@ class MixtureLaw:
     noise: NoiseModel
     loose: float = 0.0
     _spectra: dict[tuple[int, int], Axes] = field(default_factory=dict, init=False, repr=False)
-    _of_one: dict[tuple[int, float], LowRank] = field(default_factory=dict, init=False, repr=False)
+    _of_one: dict[tuple[int, float], list[LowRank]] = field(
+        default_factory=dict, init=False, repr=False
+    )
     _doubts: dict[tuple[int, float, float], np.ndarray] = field(
         default_factory=dict, init=False, repr=False
     )
@@ -368,20 +369,25 @@ class MixtureLaw:
         first, second = np.zeros((2, *seen.flat.shape), sums)
         others = weight @ self.mean[:, m:]  # in the other coordinates
         images = self.axes if same else self.cross
+        lead = np.zeros((len(weight), m), np.float32)  # of all clusters, if one by one is not asked
         for k, rows, at, residual, cut in self._pairs(seen, weight > 0, m):
             cluster, w, s = self._clusters[k], weight[rows, k, None], seen.s[rows]
             g = cut.solved(residual, s)
             if at.size:
                 others[rows] += w * (at @ cluster.slope[:, m:])
-            one = (-s if same else cluster.common) * g @ images[:, :m].T
+            linear = (-s if same else cluster.common) * g
+            one = linear @ images[:, :m].T if sure else np.float32(0.0)
             if not same:
                 mean = (g @ cluster.own[:, :m].T) @ cluster.own_reference
-                one += self.mean_reference[k] + cluster.scale * mean
+                one = one + self.mean_reference[k] + cluster.scale * mean
                 one += at @ cluster.slope_reference if at.size else 0.0
             first[rows] += w * one
             if sure:
                 doubt = s * self._doubt(k, seen, seen.node[rows])
                 second[rows] += w * (doubt + np.square(one, dtype=sums))
+            else:
+                lead[rows] += w * linear
+        first += lead @ images[:, :m].T
         gain = (seen.z[:, m:] - others) / (self.variance[m:].astype(np.float32) + seen.s)
         sigma = np.sqrt(np.maximum(second - np.square(first), 0.0)) if sure else second + np.nan
         if same:
@@ -519,29 +525,32 @@ class MixtureLaw:
         """(C_k + s)⁻¹ of a cluster for the noise of some images."""
         s, width = seen.least, self._known(seen.least)
         if seen.alone is not None:
-            return self._at(k, width, seen.alone)
+            return self._factors(width, seen.alone)[k]
         axes = self._axes(k, width)
         width, variance = len(axes.variance), axes.variance[axes.variance > LEAST_VARIANCE * s]
         more = width - len(variance)
         rest = (axes.total - variance.sum()) / more if more else np.inf
         return Spectrum(axes.vectors[:, : len(variance)], variance, float(rest))
 
-    def _at(self, k: int, width: int, s: float) -> LowRank:
-        """(C_k + s)⁻¹, kept as long as s is the same."""
-        if found := self._of_one.get((k, s)):
+    def _factors(self, width: int, s: float) -> list[LowRank]:
+        """(C_k + s)⁻¹ of all clusters, those with as many rows together; kept for the last s."""
+        if found := self._of_one.get((width, s)):
             return found
-        if any(of != s for _, of in islice(self._of_one, 1)):
-            self._of_one.clear()
-        cluster = self._clusters[k]
-        diagonal = cluster.common * self.variance[:width] + s
-        rows = np.sqrt(cluster.scale) * cluster.own[:, :width].astype(np.float64)
-        certain = rows / diagonal
-        lower = np.linalg.cholesky(np.eye(len(rows)) + certain @ rows.T)
-        found = self._of_one[k, s] = LowRank(
-            1.0 / diagonal,
-            (np.linalg.inv(lower) @ certain).astype(np.float32),
-            float(0.5 * np.log(diagonal).sum() + np.log(lower.diagonal()).sum()),
-        )
+        made: dict[int, LowRank] = {}
+        for size in np.unique([len(cluster.own) for cluster in self._clusters]):
+            numbers = [k for k, cluster in enumerate(self._clusters) if len(cluster.own) == size]
+            some = [self._clusters[k] for k in numbers]
+            common, scale = (np.array([[getattr(c, n)] for c in some]) for n in ("common", "scale"))
+            diagonal = common * self.variance[:width] + s
+            rows = np.stack([c.own[:, :width] for c in some]) * np.sqrt(scale)[..., None]
+            certain = rows / diagonal[:, None]
+            lower = np.linalg.cholesky(np.eye(size) + certain @ rows.transpose(0, 2, 1))
+            half_log = 0.5 * np.log(diagonal).sum(axis=1)
+            half_log += np.log(np.diagonal(lower, axis1=1, axis2=2)).sum(axis=1)
+            factors = (np.linalg.inv(lower) @ certain).astype(np.float32)
+            made |= dict(zip(numbers, map(LowRank, 1.0 / diagonal, factors, half_log), strict=True))
+        self._of_one.clear()
+        found = self._of_one[width, s] = [made[k] for k in range(len(self.count))]
         return found
 
     def _axes(self, k: int, width: int) -> Axes:
