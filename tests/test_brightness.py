@@ -47,10 +47,10 @@ def image_of(width, seed=3):
     return pixels, position, mag
 
 
-def model_of(pixels, position, **settings):
+def model_of(pixels, position, orders=(0, 1)):
     small = {"train_stars": 300, "test_stars": 60, "stamp_px": STAMP, "seed": 1}
     stars = Stars.from_image(pixels, position, pixel_scale_arcsec=1.0, gain=1e9, **small)
-    return fit(stars, "field", name="plate", **settings)
+    return fit(stars, "field", name="plate", orders=list(orders))
 
 
 @pytest.fixture(scope="module")
@@ -143,7 +143,7 @@ def colourful():
     given = {"origin": 0, "colour_column": "g_r", "pixel_scale_arcsec": 1.0, "gain": 1e9}
     small = {"train_stars": 300, "test_stars": 60, "stamp_px": STAMP, "seed": 1}
     stars = Stars.from_image(pixels, listed, **given, **small)
-    return fit(stars, "field", name="colourful")
+    return fit(stars, "field", name="colourful", orders=[0, 1])
 
 
 def test_the_psf_follows_the_colour_and_is_that_of_the_end_beyond(colourful):

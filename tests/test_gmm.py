@@ -124,16 +124,19 @@ def dense(mixture, noisy, level, position):
 @pytest.mark.parametrize("level", [1e-4, LEVEL, 0.05])
 @pytest.mark.parametrize("clusters", [1, 12])
 def test_sums_are_those_of_dense_matrices(same, kind, level, clusters, monkeypatch):
+    """Those of images of one noise, and those of images that say theirs one by one."""
+    monkeypatch.setattr(module, "NOISE_STEP", 1e-3)
     monkeypatch.setattr(module, "FLAT_VARIANCE", 0.0)
     monkeypatch.setattr(module, "LEAST_VARIANCE", 0.0)
     monkeypatch.setattr(mixing, "LEAST_WEIGHT", 0.0)
     mixture = fitted(same=same, kind=kind, components=[clusters])
     noisy = NOISE.draw(stars(50, seed=2)[0], level, np.random.default_rng(3))
     mean, sigma, evidence = dense(mixture, noisy, level, where(50, seed=2))
-    found = mixture.estimate(noisy, level, where(50, seed=2))
-    np.testing.assert_allclose(found.psf, mean, atol=2e-4 * mean.max())
-    np.testing.assert_allclose(found.sigma**2, sigma**2, rtol=0.01, atol=1e-7)
-    np.testing.assert_allclose(found.evidence, evidence, atol=0.05)
+    for of_each in (level, np.full(len(noisy), level)):
+        found = mixture.estimate(noisy, of_each, where(50, seed=2))
+        np.testing.assert_allclose(found.psf, mean, atol=2e-4 * mean.max())
+        np.testing.assert_allclose(found.sigma**2, sigma**2, rtol=0.01, atol=1e-7)
+        np.testing.assert_allclose(found.evidence, evidence, atol=0.05)
 
 
 @pytest.mark.parametrize("same", [True, False])

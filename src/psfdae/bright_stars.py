@@ -88,8 +88,10 @@ class BrightStars:
 
     @property
     def place(self) -> np.ndarray:
-        """x, y, magnitude and colour, shape (n, 4)."""
-        return places(self.position, self.flux, self.colour)
+        """x, y, magnitude and colour, (n, 4); an unknown colour is the median of the others."""
+        known = np.isfinite(self.colour)
+        usual = np.median(self.colour[known]) if known.any() else np.nan
+        return places(self.position, self.flux, np.where(known, self.colour, usual))
 
     def area(self) -> np.ndarray:
         """Noise-equivalent area A = (F / (σ S/N))² of each star in pixels, shape (n,)."""

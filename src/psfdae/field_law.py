@@ -177,10 +177,10 @@ class Axes(NamedTuple):
     def leading(
         self, along: np.ndarray, s: np.ndarray, width: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """χ² of stars (n, m) along the `OUTLIER_MODES` leading axes, and these on sky and centre.
+        """Stars (n, m) along the `OUTLIER_MODES` leading axes alone, with noise of variances s.
 
-        Of the latter, in their standard deviations (n, 3): the products with the stars, (n, 3), and
-        what these axes add to their inverse covariance, (n, 3, 3).
+        Their χ², (n,); their products with sky, row and column in units of these numbers' standard
+        deviations (n, 3), (n, 3); what the axes add to the inverse covariance of these, (n, 3, 3).
         """
         along, scatter = along[:, :OUTLIER_MODES], self.variance[:OUTLIER_MODES] + s
         latent = width[:, :, None] * self.latent[:, :OUTLIER_MODES]
@@ -346,19 +346,21 @@ class FieldLaw:
         """Terms of the field of each star, and where its position is known, (n,) of bool.
 
         They are the usual ones where it is not, and so are those of an unknown magnitude or colour.
+        A star whose PSF is not known for want of these counts as one of unknown position.
         """
         place = np.full((count if position is None else len(position), 4), np.nan)
         if position is not None:
             place[:, : position.shape[1]] = position
-        given = np.isfinite(place)
+        given, more = np.isfinite(place), self.model.of_star
         positioned = given[:, :2].all(axis=1) | (self.order == 0)
-        of_place = len(self.usual) - self.model.of_star
+        of_place = len(self.usual) - STAR_TERMS * len(more)
         known = np.hstack(
             [
                 np.repeat(positioned[:, None], of_place, axis=1),
-                np.repeat(given[:, 2 : len(self.low)], STAR_TERMS, axis=1),
+                np.repeat(given[:, more], STAR_TERMS, axis=1),
             ]
         )
+        positioned = positioned & given[:, more].all(axis=1)
         terms = self.model.terms(np.nan_to_num(place))
         return np.where(known, terms, self.usual), positioned
 
@@ -605,7 +607,7 @@ class FieldLaw:
         latent = width * (fit.pull[:, 0] - a * fit.pull[:, 1])
         with_a = -width * fit.pull[:, 1]
         flux, score = np.empty((2, len(star)))
-        pull, certain = np.empty((len(star), 3)), fit.certain.copy()
+        pull, certain = np.empty((len(star), 3)), fit.certain
         for k, part in pairs.by_node():
             axes, rows = self._axes(k, stars.positioned), star[part]
             beyond, along = axes.noise_parts(s[rows])

@@ -60,8 +60,8 @@ class FieldModel:
     coefficients : ndarray, shape (K, N, N)
         Of the splines, for each of the K terms of the polynomial.
     low, high : ndarray, shape (2,) to (4,)
-        Range of the positions, and if the PSF changes with them of magnitudes, and colours;
-        beyond it the PSF is that of its edge.
+        Range of x and y, and then of magnitude and colour: the PSF does not change with one that
+        has the same ends, or is not there. Beyond a range the PSF is that of its end.
     spacing : float
         Of the knots, in pixels.
     """
@@ -74,12 +74,13 @@ class FieldModel:
     @property
     def order(self) -> int:
         """Order of the polynomial in the place, which has (order + 1)(order + 2)/2 terms."""
-        return (isqrt(8 * (len(self.coefficients) - self.of_star) + 1) - 3) // 2
+        of_place = len(self.coefficients) - STAR_TERMS * len(self.of_star)
+        return (isqrt(8 * of_place + 1) - 3) // 2
 
     @property
-    def of_star(self) -> int:
-        """Last terms, of magnitude and colour: 0 if the PSF changes with the place alone."""
-        return STAR_TERMS * (len(self.low) - 2)
+    def of_star(self) -> np.ndarray:
+        """Numbers of the coordinates beyond x and y with which the PSF changes."""
+        return np.asarray(2 + np.flatnonzero(self.high[2:] > self.low[2:]))
 
     def terms(self, position: np.ndarray) -> np.ndarray:
         """Terms of the polynomial, shape (n, K).
@@ -169,13 +170,15 @@ def fit_field(
             best, least = order, error
         elif order >= CURVED:
             break
-    taken, varies = 2, alternating.high > alternating.low
-    for coordinates in (c for c in (3, 4) if varies[c - 1]):
-        alternating.coordinates = coordinates
-        error = alternating.crossed_error(alternating.fit(best))
-        if error < (1.0 - STAR_GAIN) * least:
-            taken, least = coordinates, error
-    alternating.coordinates = taken
+    low, high = alternating.low, alternating.high
+    for coordinate, most in enumerate(alternating.most):
+        if most > high[coordinate]:
+            high[coordinate] = most
+            error = alternating.crossed_error(alternating.fit(best))
+            if error < (1.0 - STAR_GAIN) * least:
+                least = error
+            else:
+                high[coordinate] = low[coordinate]
     for _ in range(SMOOTHER):
         alternating.smoothness *= SMOOTHER_BY
         error = alternating.crossed_error(alternating.fit(best))
@@ -212,7 +215,6 @@ class _Alternating:
     """Rounds of a fit to stars, and to what is known of the field from other exposures."""
 
     change, tolerance = 0.0, TOLERANCE
-    coordinates = 2  # of a place that count: x and y, then magnitude, then colour
 
     def __init__(
         self,
@@ -234,15 +236,18 @@ class _Alternating:
         self.knots = int((side + 1) / spacing) - 1
         known = [column[np.isfinite(column)] for column in self.place.T]
         ends = [(column.min(), column.max()) if column.size else (0.0, 0.0) for column in known]
-        self.low, self.high = np.transpose(ends)
+        self.low, self.most = np.transpose(ends)
+        # Magnitude and colour do not count until they are tried.
+        self.high = np.concatenate([self.most[:2], self.low[2:]])
         if prior is not None:
-            self.low, self.high, self.coordinates = prior.low, prior.high, len(prior.low)
+            self.low, self.high = prior.low, prior.high
         bend = np.diff(np.eye(self.knots), 2, axis=0)
         self.bend = bend.T @ bend
 
     def fit(self, order: int) -> FieldFit:
         """All stars."""
-        low, high = self.low[: self.coordinates], self.high[: self.coordinates]
+        count = 2 + max(np.flatnonzero(self.high[2:] > self.low[2:]) + 1, default=0)
+        low, high = self.low[:count].copy(), self.high[:count].copy()
         terms = _terms(self.place, low, high, order)
         good, flux = np.ones(len(terms), bool), self.images.sum(axis=(1, 2))
         start, window = np.zeros((len(flux), 2)), np.full(len(flux), WINDOW_PX)
@@ -431,7 +436,7 @@ def _deformations(coefficients: np.ndarray, spacing: float) -> np.ndarray:
 def _terms(position: np.ndarray, low: np.ndarray, high: np.ndarray, order: int) -> np.ndarray:
     """Monomials x^a y^b, a + b ≤ order, of positions scaled to ±1, shape (n, K).
 
-    Where the range has more coordinates, their powers are the last terms. What is not known is
+    Powers of other coordinates whose range has two ends are the last terms. What is not known is
     taken for the middle of its range.
     """
     width = np.where(high > low, high - low, 1.0)
@@ -440,7 +445,8 @@ def _terms(position: np.ndarray, low: np.ndarray, high: np.ndarray, order: int) 
     x, y, *more = scaled.T
     powers = [(a, total - a) for total in range(order + 1) for a in range(total, -1, -1)]
     terms = [x**a * y**b for a, b in powers]
-    terms += [column**power for column in more for power in range(1, STAR_TERMS + 1)]
+    counted = (column for column, ends in zip(more, (high > low)[2:], strict=True) if ends)
+    terms += [column**power for column in counted for power in range(1, STAR_TERMS + 1)]
     return np.stack(terms, axis=1)
 
 

@@ -197,7 +197,8 @@ class Needs:
     level : bool
         `predict` gets the noise level λ, too: of all images, or of each, shape (n,).
     position : bool
-        `predict` gets the positions in the field as well, shape (n, 2).
+        `predict` gets the positions in the field as well, shape (n, 2); of an image with
+        magnitudes and colours (n, 4), NaN where unknown.
     validation : bool
         The fit leaves out the validation stars, or only chooses by them.
     memory_mb, minutes : int

@@ -16,8 +16,9 @@ S and every XᵀX, and what would be negative is 0.
 All covariances of a cluster of n_k stars are shrunk towards those within all clusters:
 C_k = (X_kᵀX_k + ν S) / (n_k + ν), X_k the deviations of its stars from their mean. The
 eigenvectors of C_k do not depend on the noise: along the leading ones C_k + s is diagonal for
-every star, and beyond them C_k is taken for even. Coordinates are the eigenvectors of S; only in
-the leading ones do clusters differ by more than the noise hides.
+every star, and beyond them C_k is taken for even. Where all images have one noise, Woodbury's
+identity takes less than eigenvectors. Coordinates are the eigenvectors of S; only in the leading
+ones do clusters differ by more than the noise hides.
 
 A method that is given where the star stands has two more numbers p in the observed vector,
 without noise. Given p, everything above holds again: π_k becomes π_k N(p; p_k, P_k), μ_k
@@ -117,7 +118,7 @@ class Axes(NamedTuple):
 
 
 class Spectrum(NamedTuple):
-    """(C_k + s)⁻¹ of a cluster for any noise variance s (n, 1) above some, along its axes.
+    """(C_k + s)⁻¹ of a cluster for any noise variance s (n, 1) above `Seen.least`, along its axes.
 
     Attributes
     ----------
@@ -230,7 +231,7 @@ class Seen(NamedTuple):
     least : float
         Below every s.
     alone : float or None
-        That of all images, if they were given one.
+        The noise variance of all images, if one level was given for all.
     """
 
     flat: np.ndarray
@@ -364,12 +365,12 @@ class MixtureLaw:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Posterior mean and its σ, (n, P), NaN unless `sure`."""
         same, m = not len(self.cross), self._known(seen.least)
-        # Those of one noise are few, and it may be far above the star: squares cancel then.
+        # Noise of simulated stars may be far above the star, which cancels in second − first².
         sums = np.float32 if seen.alone is None else np.float64
         first, second = np.zeros((2, *seen.flat.shape), sums)
         others = weight @ self.mean[:, m:]  # in the other coordinates
         images = self.axes if same else self.cross
-        lead = np.zeros((len(weight), m), np.float32)  # of all clusters, if one by one is not asked
+        lead = np.zeros((len(weight), m), np.float32)  # sums over clusters, where no σ is asked
         for k, rows, at, residual, cut in self._pairs(seen, weight > 0, m):
             cluster, w, s = self._clusters[k], weight[rows, k, None], seen.s[rows]
             g = cut.solved(residual, s)
@@ -381,13 +382,15 @@ class MixtureLaw:
                 mean = (g @ cluster.own[:, :m].T) @ cluster.own_reference
                 one = one + self.mean_reference[k] + cluster.scale * mean
                 one += at @ cluster.slope_reference if at.size else 0.0
-            first[rows] += w * one
+            if sure or not same:
+                first[rows] += w * one
             if sure:
                 doubt = s * self._doubt(k, seen, seen.node[rows])
                 second[rows] += w * (doubt + np.square(one, dtype=sums))
             else:
                 lead[rows] += w * linear
-        first += lead @ images[:, :m].T
+        if not sure:
+            first += lead @ images[:, :m].T
         gain = (seen.z[:, m:] - others) / (self.variance[m:].astype(np.float32) + seen.s)
         sigma = np.sqrt(np.maximum(second - np.square(first), 0.0)) if sure else second + np.nan
         if same:
@@ -412,7 +415,7 @@ class MixtureLaw:
     ) -> Iterator[tuple[int, np.ndarray, np.ndarray, np.ndarray, Spectrum | LowRank]]:
         """Clusters with the images (n, K) of bool that are near.
 
-        Their numbers, positions and leading coordinates less the cluster's, and its axes.
+        Their numbers, positions and leading coordinates less the cluster's, and its (C_k + s)⁻¹.
         """
         leading = np.ascontiguousarray(seen.z[:, :width])
         for k, of in enumerate(np.ascontiguousarray(near.T)):
@@ -518,7 +521,8 @@ class MixtureLaw:
             rotation, own = np.linalg.qr(own)
             own_reference = rotation.T @ own_reference if len(own_reference) else own_reference
         return Cluster(
-            own, own_reference, square, slope, slope_reference, spread, nu / total, 1 / total
+            *(own, own_reference, square, slope, slope_reference, spread),
+            *(float(nu / total), float(1 / total)),
         )
 
     def _cut(self, k: int, seen: Seen) -> Spectrum | LowRank:
@@ -597,7 +601,7 @@ class MixtureLaw:
         Of those noise variances s (n,), of which few differ.
         """
         nodes, which = np.unique(node, return_inverse=True)
-        keys = [(k, seen.least, s) for s in nodes.tolist()]
+        keys = [(k, seen.alone or seen.least, s) for s in nodes.tolist()]
         if new := [key for key in keys if key not in self._doubts]:
             found = self._doubts_of(k, seen, np.array([s for _, _, s in new]))
             self._doubts.update(zip(new, found, strict=True))

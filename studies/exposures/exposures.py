@@ -58,12 +58,13 @@ def exposure(rng, count, conditions):
     snr = np.sqrt(np.square(stamps).sum(axis=(1, 2))) / noise
     phase = (place - np.floor(place + 0.5))[:, ::-1]
     at = np.zeros((count, 2), int), phase, place, stamps.sum(axis=(1, 2)), noise, snr
-    return BrightStars(wide, *at, np.arange(count), phase)
+    return BrightStars(wide, *at, np.arange(count), phase, np.full(count, np.nan))
 
 
 def error(model, conditions):
     """Mean squared error of PSFs of the sum 1 in their stamps."""
-    found = model.images(model.terms(PLACES), np.zeros((len(PLACES), 2)), STAMP_PX)
+    place = np.hstack([PLACES, np.full(PLACES.shape, np.nan)])
+    found = model.images(model.terms(place), np.zeros((len(PLACES), 2)), STAMP_PX)
     true = np.array([psf(p, STAMP_PX, *conditions) for p in PLACES])
     unit = (a / a.sum(axis=(1, 2), keepdims=True) for a in (found, true))
     return np.square(np.subtract(*unit)).mean()

@@ -71,6 +71,7 @@ def photometry(
     magnitudes = None
     if reference is not None:
         listed = replace(stated, catalogue=reference, detect=False, on_image=False)
+        listed = replace(listed, colour_column=None)
         places = listed.source(image).open(loaded.stamp_px).positions
         assert places is not None  # of an image
         magnitudes = places, as_catalogue(reference).numbers(magnitude_column)

@@ -63,7 +63,8 @@ class Stated:
         None
     )
     colour_column: Annotated[
-        str | None, "Colours of the list's stars, with which the PSF may change."
+        str | None,
+        "Colours of the list's stars, with which the PSF may change; empty where unknown.",
     ] = None
     accept_offset: Annotated[bool, "Take a star list that is off by more than a pixel."] = False
 

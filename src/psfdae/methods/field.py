@@ -156,7 +156,8 @@ class FieldMixture(FieldLaw, Method):
         terms, spread = len(self.coefficients), self.spread
         usual = self.model.images(self.usual[None], np.zeros((1, 2)), self.side)
         yield "coefficients", "a mean star of the sum 1", abs(usual.sum() - 1) < 0.1
-        yield "high", "at least low", self.low <= self.high
+        alike = self.low.shape == self.high.shape and 2 <= len(self.low) <= 4
+        yield "high", "at least low", alike and self.low <= self.high
         yield "usual", "terms from -1 to 1", self.usual.shape == (terms,) and abs(self.usual) <= 1
         least = np.linalg.eigvalsh(spread)[0] if spread.shape == (terms, terms) else -1.0
         yield "spread", "a covariance", (spread == spread.T) & (least > -1e-6)
@@ -186,7 +187,7 @@ class FieldMixture(FieldLaw, Method):
 
     def beyond(self, position: np.ndarray) -> np.ndarray:
         """Whether magnitude or colour of stars (n, 4) are beyond the training's, if they count."""
-        value, low, high = position[:, 2 : len(self.low)], self.low[2:], self.high[2:]
+        value, low, high = (a[..., self.model.of_star] for a in (position, self.low, self.high))
         slack = RANGE_SLACK * (high - low)
         return np.asarray(((value < low - slack) | (value > high + slack)).any(axis=1))
 
@@ -196,13 +197,13 @@ class FieldMixture(FieldLaw, Method):
         changes = f"changes over the image by a polynomial of order {order}"
         same = "is the same everywhere (order 0: more is not supported by stars left out)"
         facts = {"Field": f"the PSF {changes if order else same}"}
-        ranges = zip(
-            ("Brightness", "Colour"),
-            ("magnitude −2.5 log₁₀ (flux / counts)", "colour of the star list"),
-            *(self.low[2:], self.high[2:]),
-            strict=False,
-        )
-        for name, what, low, high in ranges:
+        names = {
+            2: ("Brightness", "magnitude −2.5 log₁₀ (flux / counts)"),
+            3: ("Colour", "colour of the star list"),
+        }
+        for coordinate in self.model.of_star.tolist():
+            name, what = names[coordinate]
+            low, high = self.low[coordinate], self.high[coordinate]
             facts[name] = (
                 f"the PSF changes with the {what}, {low:.2f} to {high:.2f}; stars beyond this "
                 "range have the PSF of its end"

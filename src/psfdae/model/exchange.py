@@ -286,6 +286,12 @@ def write_asdf(path: Path, model: FieldPsfs, places: np.ndarray, oversampling: i
     PredictionError
         If what writes such files is not installed.
     """
+    if oversampling == 1 and model.stamp_px % 2 == 0:
+        raise PredictionError(
+            f"{path}: stamps of {model.stamp_px} px have no middle pixel; --oversampling 2 or more"
+        )
+    if len(np.unique(places, axis=0)) < len(places):
+        raise PredictionError(f"{path}: places less than a pixel apart; fewer in the --grid")
     if not (find_spec("asdf_astropy") and find_spec("photutils.extension")):
         raise PredictionError(
             f"{path}: ASDF files take asdf-astropy and photutils 3.1 or newer, which needs "

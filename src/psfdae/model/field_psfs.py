@@ -107,8 +107,8 @@ class FieldPsfs(ABC):
         mag, colour : float or array, shape (n,), optional
             Instrumental magnitude −2.5 log₁₀ (flux / counts), and colour as in the star list; by
             default the PSF is the average over those of the training stars. Beyond these stars it
-            is that of the last of them; it changes with either only where stars that were left out
-            of the training say so.
+            is that of the nearest end of their range; it changes with either only where stars that
+            were left out of the training say so.
 
         Returns
         -------
@@ -131,7 +131,9 @@ class FieldPsfs(ABC):
         ]
         position = np.stack(np.broadcast_arrays(*numbers[:count]), axis=-1)
         if position.ndim > 2 or not np.isfinite(position[..., known[:count]]).all():
-            raise PredictionError("positions must be finite, one x and y or arrays of as many")
+            raise PredictionError(
+                "positions, mag and colour must be finite, one of each or arrays of as many"
+            )
         if not 1 <= oversampling <= MOST_OVERSAMPLED:
             raise PredictionError(f"oversampling {oversampling}: 1 to {MOST_OVERSAMPLED}")
         with np.errstate(all="ignore"):

@@ -73,9 +73,9 @@ Restore = Callable[[np.ndarray, float], Estimate]
 class HeldOutStars:
     """Noise-free stars of flux 1 that no training has seen, (n, d, d), noise, and places (n, 2).
 
-    Those of an image have magnitudes and colours in their places. They
-    are not free of noise: `own_noise` (n, d, d) is in their pixels, and makes their flux, which is
-    taken to be 1, uncertain by `flux_error` (n,).
+    The places of an image's stars have magnitudes and colours, too, (n, 4). These stars are not
+    free of noise: `own_noise` (n, d, d) is in their pixels, and makes their flux, which is taken to
+    be 1, uncertain by `flux_error` (n,).
     """
 
     images: np.ndarray
@@ -418,19 +418,13 @@ def with_scales(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -
     width, of_flux = np.ones((2, *shape, 2, len(nodes))), np.ones(len(nodes))
     for place, node in enumerate(nodes):
         noisy, star = _noisy(stars, node, rng)
-        cases = {
-            (estimated, case): {**CASES[case], **({} if estimated else {"noise": node})}
-            for estimated, case in np.ndindex(shape)
-        }
-        # All at once: what a method computes for many stars takes little more than for few.
-        known: dict[str, Any] = {
-            name: np.repeat([of.get(name, np.nan) for of in cases.values()], len(star))
-            for name in ("noise", "flux", "background")
-        }
-        images, position = (np.concatenate([a] * len(cases)) for a in (noisy, stars.position[star]))
-        every = model.predict(images, position=position, **known)
-        for number, (estimated, case) in enumerate(cases):
-            found = every.of(slice(number * len(star), (number + 1) * len(star)))
+        images, position = (np.concatenate([a, a]) for a in (noisy, stars.position[star]))
+        levels = np.repeat([node, np.nan], len(star))
+        for case, estimated in np.ndindex(shape[::-1]):
+            if not estimated:  # the first half of the stars, which are predicted with the second
+                known: dict[str, Any] = {"noise": levels, **CASES[case]}
+                both = model.predict(images, position=position, **known)
+            found = both.of(slice(estimated * len(star), (1 + estimated) * len(star)))
             usable = np.isfinite(found.psf).all(axis=(1, 2))
             if not usable.any():
                 continue
@@ -442,7 +436,7 @@ def with_scales(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -
             for pixels, kind in ((~bright, 0), (bright, 1)):
                 width[0, estimated, case, kind, place] = np.quantile(error[pixels], COVERAGE)
                 width[1, estimated, case, kind, place] = np.quantile(wide[pixels], WIDE)
-            if not cases[estimated, case]:
+            if estimated and not CASES[case]:
                 doubt = np.hypot(found.flux_error, stars.flux_error[star])[usable]
                 off = np.abs(found.flux - 1.0)[usable] / doubt
                 of_flux[place] = (

@@ -368,7 +368,10 @@ def _numbers(name: str, values: ArrayLike | None, count: int, most: int) -> np.n
     """Two numbers per star, or as many as `most`, (n, most); NaN where they are not known."""
     numbers = real_numbers(name, np.full((count, 2), np.nan) if values is None else values)
     if numbers.shape not in [(count, columns) for columns in range(2, most + 1)]:
-        raise PredictionError(f"{name} of shape {numbers.shape}, expected ({count}, 2)")
+        raise PredictionError(
+            f"{name} of shape {numbers.shape}, expected ({count}, 2)"
+            + f" to ({count}, {most})" * (most > 2)
+        )
     missing = np.full((count, most - numbers.shape[1]), np.nan)
     return np.hstack([numbers, missing], dtype=np.float64)
 
@@ -621,7 +624,7 @@ class Engine:
         flags = found.flags & np.uint16(StarFlag.MASKED | StarFlag.OUTLIER)
         raise_flag(flags, StarFlag.NO_FLUX, lost)
         raise_flag(flags, StarFlag.FAINT, ~given & ~lost & (flux < FAINT_SNR * error))
-        raise_flag(flags, StarFlag.BEYOND, method.beyond(place))
+        raise_flag(flags, StarFlag.BEYOND, method.beyond(place) & ~lost)
         sky = start + own.background
         unit = np.where(lost, 1.0, flux)[:, None, None]
         images = (data - own.background[:, None, None]) / unit
