@@ -70,8 +70,9 @@ def photometry(
     loaded.check_scale(observation.pixel_scale_arcsec, str(image))
     magnitudes = None
     if reference is not None:
-        listed = replace(stated, catalogue=reference, detect=False, on_image=False)
-        listed = replace(listed, colour_column=None)
+        listed = replace(
+            stated, catalogue=reference, detect=False, on_image=False, colour_column=None
+        )
         places = listed.source(image).open(loaded.stamp_px).positions
         assert places is not None  # of an image
         magnitudes = places, as_catalogue(reference).numbers(magnitude_column)

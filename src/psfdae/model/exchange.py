@@ -172,6 +172,14 @@ def psfex_powers(order: int) -> list[tuple[int, int]]:
     return [(i, j) for j in range(order + 1) for i in range(order + 1 - j)]
 
 
+def _require_middle(path: Path, model: FieldPsfs, oversampling: int) -> None:
+    """Refuse PSFs without a middle sample, which other programs take for their centre."""
+    if oversampling == 1 and model.stamp_px % 2 == 0:
+        raise PredictionError(
+            f"{path}: stamps of {model.stamp_px} px have no middle pixel; --oversampling 2 or more"
+        )
+
+
 def write_psfex(path: Path, model: FieldPsfs, oversampling: int) -> float:
     """Write a model for PSFEx's readers; how far it is off, over the brightest value.
 
@@ -190,10 +198,7 @@ def write_psfex(path: Path, model: FieldPsfs, oversampling: int) -> float:
     from astropy.io import fits
 
     order = model.order
-    if oversampling == 1 and model.stamp_px % 2 == 0:
-        raise PredictionError(
-            f"{path}: stamps of {model.stamp_px} px have no middle pixel; --oversampling 2 or more"
-        )
+    _require_middle(path, model, oversampling)
     try:
         low, high = model.field_range()
         places = np.rint(model.grid(2 * order + 3, 2 * order + 3))
@@ -284,12 +289,10 @@ def write_asdf(path: Path, model: FieldPsfs, places: np.ndarray, oversampling: i
     Raises
     ------
     PredictionError
-        If what writes such files is not installed.
+        If the PSFs would have no middle sample, two places are the same pixel, or what writes such
+        files is not installed.
     """
-    if oversampling == 1 and model.stamp_px % 2 == 0:
-        raise PredictionError(
-            f"{path}: stamps of {model.stamp_px} px have no middle pixel; --oversampling 2 or more"
-        )
+    _require_middle(path, model, oversampling)
     if len(np.unique(places, axis=0)) < len(places):
         raise PredictionError(f"{path}: places less than a pixel apart; fewer in the --grid")
     if not (find_spec("asdf_astropy") and find_spec("photutils.extension")):
