@@ -20,6 +20,7 @@ from psfdae.networks.dae import (
     SingleChannelConv,
     build_dae,
     image_scale,
+    middle_px,
     predict,
     train_dae,
 )
@@ -211,16 +212,17 @@ def test_dae_keeps_the_size_and_is_never_negative(gaussian_stars):
     assert sizes == kernels
 
 
-def test_single_channel_convolution_is_the_plain_one():
-    layer = SingleChannelConv(3, 1, 5, padding=2)
-    x = torch.randn(2, 3, 9, 9, requires_grad=True)
-    plain = torch.nn.functional.conv2d(x, layer.weight, layer.bias, padding=2)
-    assert torch.allclose(layer(x), plain, atol=1e-6)
-    parameters = [x, layer.weight, layer.bias]
-    ours = torch.autograd.grad(layer(x).square().sum(), parameters)
-    theirs = torch.autograd.grad(plain.square().sum(), parameters)
-    for mine, other in zip(ours, theirs, strict=True):
-        assert torch.allclose(mine, other, rtol=1e-4, atol=1e-5)
+@pytest.mark.parametrize("shape", [(8, 8), (10, 10), (13, 17), (3, 5)])
+def test_single_channel_convolution_is_the_plain_one(shape):
+    torch.manual_seed(3)
+    layer = SingleChannelConv(5, 1, 9, padding=4).double()
+    x = torch.randn(2, 5, *shape, dtype=torch.float64, requires_grad=True)
+    plain = torch.nn.functional.conv2d(x, layer.weight, layer.bias, padding=4)
+    torch.testing.assert_close(layer(x), plain)
+    upstream = torch.randn_like(plain)
+    of = (x, *layer.parameters())
+    found, wanted = (torch.autograd.grad(y, of, upstream) for y in (layer(x), plain))
+    torch.testing.assert_close(found, wanted)
 
 
 def test_he_initialisation_keeps_the_variance(gaussian_stars):
@@ -231,8 +233,9 @@ def test_he_initialisation_keeps_the_variance(gaussian_stars):
 
 
 @pytest.mark.parametrize("widths", [[16] * 4, [7, 3, 5, 9], [1] * 4])
-def test_linear_start_has_the_least_squares_of_what_its_last_layer_sees(data, widths):
+def test_linear_start_has_the_least_squares_of_what_its_last_layer_sees(data, widths, monkeypatch):
     """A linear function of the layer before has no smaller error: the two are uncorrelated."""
+    monkeypatch.setattr(dae_network, "LINEAR_PX", data.images[data.fit].size)
     dae = DAE.model_copy(update={"init": "linear", "widths": widths})
     training = DaeTraining(data, dae, TRAIN, 3)
     noisy, _ = data.draw(data.fit, np.random.default_rng(5))
@@ -411,17 +414,29 @@ def test_steps_of_muon_are_along_orthogonal_matrices():
         assert (along - along.diagonal().diag()).abs().max() < 1e-3
 
 
-def test_training_begins_with_the_middle_of_the_stamps(data):
-    settings = TRAIN.model_copy(update={"crop_epochs": 0.5, "epochs": 4})
+@pytest.mark.parametrize(
+    ("reference", "sides"),
+    [("realisation", (8, 8, 8, 10, 12, 14, 16, 16)), ("template", (12,) * 4 + (16,) * 4)],
+)
+def test_training_begins_with_the_middle_of_the_stamps(data, reference, sides):
+    settings = TRAIN.model_copy(update={"crop_epochs": 0.75, "epochs": len(sides)})
+    data = replace(data, reference=reference)
     training, whole = DaeTraining(data, DAE, settings, 3, 0), DaeTraining(data, DAE, TRAIN, 3, 0)
-    for epoch, side in enumerate((10, 10, 16, 16)):
+    for epoch, side in enumerate(sides):
         for part, full in zip(
             next(training.batches(epoch))[:2], next(whole.batches(epoch))[:2], strict=True
         ):
             edge = (16 - side) // 2
             assert torch.equal(part, full[:, :, edge : 16 - edge, edge : 16 - edge])
-    of_templates = DaeTraining(replace(data, reference="template"), DAE, settings, 3, 0)
-    assert next(of_templates.batches(0))[0].shape[-1] == 16
+
+
+@pytest.mark.parametrize("stamp_px", [7, 16, 24, 25])
+@pytest.mark.parametrize("reference", ["realisation", "template"])
+def test_middle_of_stamps_grows_about_their_middle(stamp_px, reference):
+    sides = [middle_px(stamp_px, part, reference) for part in np.linspace(0.0, 1.2, 25)]
+    assert sides == sorted(sides) and sides[-1] == stamp_px
+    assert all(side % 2 == stamp_px % 2 for side in sides)
+    assert abs(sides[0] / stamp_px - (0.5 if reference == "realisation" else 0.75)) <= 1 / stamp_px
 
 
 def test_training_goes_on_from_another_network(data):

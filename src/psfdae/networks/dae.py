@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 import torch
 from torch import nn
+from torch.nn.grad import conv2d_weight
 
 from psfdae.errors import Error
 from psfdae.files import atomic_path
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
 LINEAR_STARS = 1500
 """Training stars from which a network that begins as a linear estimator takes its weights."""
 
-LINEAR_PX = 48_000
+LINEAR_PX = 24_000
 """Pixels of them all, at random, that its last layer is fitted to."""
 
 LINEAR_BLOCK = 100
@@ -44,17 +45,19 @@ DRAWN = 0.1
 RIDGE = 1e-6
 """Of the mean of the fit's normal matrix's diagonal, added to it: a channel may be empty."""
 
+BLOCK_PX = 4
+"""Side of the blocks of pixels that the last layer computes at once."""
+
 MOST_ZERO = 0.5
 """Part of the validation stars without any output above which a network is dead."""
 
 
 class SingleChannelConv(nn.Conv2d):
-    """Convolution to one channel, computed as a transposed convolution.
+    """Convolution to one channel.
 
-    The two are the same sum: correlating with a kernel is scattering with the
-    flipped one. oneDNN vectorises over output channels and is slow for one; the
-    matrix-product path of the transposed convolution takes half the time (a
-    tenth of a training step at width 16).
+    oneDNN vectorises over output channels and is slow for one. On the CPU, blocks of pixels are
+    the channels of a strided convolution with a kernel for each pixel of a block; the gradients
+    are those of the convolution from one channel that is its transpose.
     """
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
@@ -62,11 +65,40 @@ class SingleChannelConv(nn.Conv2d):
         if x.device.type != "cpu":
             return super().forward(x)
         x = x.to(self.weight.dtype)  # autocast hands on its own
-        flipped = self.weight.flip(2, 3).transpose(0, 1)
-        found: torch.Tensor = torch.ops.aten.slow_conv_transpose2d(
-            x, flipped, self.kernel_size, self.bias, [1, 1], self.padding, [0, 0], [1, 1]
-        )
+        found: torch.Tensor = _ToOneChannel.apply(x, self.weight, self.bias)  # type: ignore[no-untyped-call]
         return found
+
+
+class _ToOneChannel(torch.autograd.Function):
+    """Correlation of images (B, C, h, w) with a weight (1, C, s, s), s odd, plus a bias (1,)."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, x: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor
+    ) -> torch.Tensor:
+        ctx.save_for_backward(x, weight)
+        (height, width), side = x.shape[-2:], weight.shape[-1]
+        wide = side + BLOCK_PX - 1
+        padded = nn.functional.pad(weight[0], (BLOCK_PX - 1,) * 4)
+        # Window i of the padded weight is that of pixel BLOCK_PX - 1 - i of a block.
+        kernels = padded.unfold(1, wide, 1).unfold(2, wide, 1).flip(1, 2).permute(1, 2, 0, 3, 4)
+        found = nn.functional.conv2d(
+            nn.functional.pad(x, (0, -width % BLOCK_PX, 0, -height % BLOCK_PX)),
+            kernels.flatten(0, 1),
+            bias.expand(BLOCK_PX**2),
+            stride=BLOCK_PX,
+            padding=side // 2,
+        )
+        return nn.functional.pixel_shuffle(found, BLOCK_PX)[..., :height, :width]
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, grad: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        x, weight = ctx.saved_tensors
+        flipped, padding = weight.flip(2, 3).transpose(0, 1), weight.shape[-1] // 2
+        by_image = nn.functional.conv2d(grad, flipped, padding=padding)
+        by_weight = conv2d_weight(grad, flipped.shape, x, padding=padding)
+        return by_image, by_weight.flip(2, 3).transpose(0, 1), grad.sum().view(1)
 
 
 class Dae(nn.Module):
@@ -190,8 +222,9 @@ def _fit_last_layer(
         x = images[block].to(memory_format=torch.channels_last)
         for layer in others:
             x = torch.relu(layer(x))
-        x = nn.functional.unfold(x, side, padding=side // 2).transpose(1, 2)
-        x = torch.stack([star[some] for star, some in zip(x, pixels[block], strict=True)])
+        x = nn.functional.pad(x, (side // 2,) * 4).unfold(2, side, 1).unfold(3, side, 1)
+        row, column = np.divmod(pixels[block], x.shape[3])
+        x = x[np.arange(len(x))[:, None], :, row, column].flatten(2)
         x = torch.cat([x, torch.ones_like(x[:, :, :1])], dim=2) * root[block, :, None]
         x = x.flatten(0, 1)
         y = torch.from_numpy(np.take_along_axis(references[block], pixels[block], axis=1))
@@ -217,12 +250,26 @@ def image_scale(scale: Literal["mean", "none"], stamp_px: int) -> float:
     return float(stamp_px**2) if scale == "mean" else 1.0
 
 
-def crop_px(stamp_px: int) -> int:
-    """Side of the middle of stamps in which a training begins, as even or odd as theirs.
+def middle_px(stamp_px: int, part: float, reference: str) -> int:
+    """Side of the middle of stamps that a training sees, as even or odd as theirs.
 
     Most of a star's light is there, and all that a convolution has to learn but the border.
+
+    Parameters
+    ----------
+    stamp_px : int
+        Side of the stamps.
+    part : float
+        Of the epochs that see less than whole stamps, what is over; whole stamps from 1 on.
+    reference : str
+        "realisation": half of the side at first, then more and more. A "template" follows from
+        more of a star: three quarters of the side, and whole stamps from 2/3 on.
     """
-    return stamp_px - 2 * round(0.2 * stamp_px)
+    if reference == "realisation":
+        middle = 0.5 + 0.5 * min(part, 1.0) ** 2
+    else:
+        middle = 0.75 if part < 2 / 3 else 1.0
+    return stamp_px - 2 * round(0.5 * (1.0 - middle) * stamp_px)
 
 
 @torch.inference_mode()
@@ -256,7 +303,7 @@ def predict(model: Dae, noisy: np.ndarray, factor: float, batch: int = 256) -> n
 class DaeTraining(Training):
     """Training on noisy images, with noise that is drawn anew in every epoch, or once.
 
-    It may begin with the middle of the stamps, where an epoch takes half of the time. The history
+    It may begin with the middle of the stamps, where an epoch takes less time. The history
     has MSEs of flux-normalised images. Another attempt draws other weights and other noise.
     """
 
@@ -288,9 +335,6 @@ class DaeTraining(Training):
             )
         super().__init__(model, settings, -(-data.fit.size // settings.batch), attempt)
         self.grad_clip = settings.grad_clip or self.grad_clip
-        # A template follows from all of a stamp.
-        own = data.reference == "realisation"
-        self.cropped = round(settings.crop_epochs * settings.epochs) if own else 0
         self.fixed: tuple[np.ndarray, ...] | None = None
         if settings.noise == "fixed":
             stars = np.arange(len(data.images))
@@ -303,7 +347,7 @@ class DaeTraining(Training):
         inner = [layer.weight for layer in self.model.convolutions[1:-1]]
         others = [p for p in self.model.parameters() if all(p is not w for w in inner)]
         groups: list[dict[str, Any]] = [{"params": others}, {"params": inner, "orthogonal": True}]
-        return Muon(groups, lr=lr)
+        return Muon(groups, lr=lr, fused=True)
 
     def batches(self, epoch: int) -> Iterator[tuple[torch.Tensor, ...]]:
         """Noisy images and what is to come of them, (B, 1, d, d) as the network sees them.
@@ -311,8 +355,9 @@ class DaeTraining(Training):
         The third is the weight of each star's error, (B, 1, 1, 1), of mean 1 over the levels.
         """
         rng = stream(self.seed, "dae", "epoch", self.attempt, epoch)
-        side = self.data.images.shape[-1]
-        edge = (side - crop_px(side)) // 2 if epoch < self.cropped else 0
+        side, cropped = self.data.images.shape[-1], self.settings.crop_epochs * self.settings.epochs
+        part = epoch / cropped if cropped else 1.0
+        edge = (side - middle_px(side, part, self.data.reference)) // 2
         order = rng.permutation(self.data.fit)
         for start in range(0, order.size, self.settings.batch):
             stars = order[start : start + self.settings.batch]
