@@ -343,7 +343,7 @@ class DaeTraining(Training):
     def begin(self, lr: float) -> torch.optim.Optimizer:
         """Muon for the weights of the inner layers, Adam for the others; or Adam for all."""
         if self.settings.optimiser == "adam":
-            return super().begin(lr)
+            return torch.optim.Adam(self.model.parameters(), lr=lr, fused=True)
         inner = [layer.weight for layer in self.model.convolutions[1:-1]]
         others = [p for p in self.model.parameters() if all(p is not w for w in inner)]
         groups: list[dict[str, Any]] = [{"params": others}, {"params": inner, "orthogonal": True}]
