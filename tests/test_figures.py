@@ -124,15 +124,24 @@ def test_strip_has_a_stamp_per_star_and_row(gaussian_stars):
         StripRow("DAE\nλ = 0.001", 0.5 * truth, np.array([1e-6, 2e-6, 3e-6])),
     ]
     figure = restoration_strip(rows, ["a", "b", "c"], "stars")
-    assert len(figure.axes) == 9
-    shown = [axes.images[0].get_array() for axes in figure.axes]
+    (axes,) = figure.axes
+    shown = [image.get_array() for image in axes.images]
+    assert len(shown) == 9
     assert shown[0].max() == pytest.approx(1.0)
     assert shown[3].max() == pytest.approx(1.0)  # noisy: by its own maximum
     assert shown[6].max() == pytest.approx(np.sqrt(0.5))
-    assert [axes.get_ylabel() for axes in figure.axes[::3]] == [row.label for row in rows]
-    assert [axes.get_xlabel() for axes in figure.axes[3:6]] == ["1.00", "25.0", "617"]
-    assert [axes.get_title() for axes in figure.axes[:3]] == ["a", "b", "c"]
-    assert not figure.axes[0].yaxis.get_inverted()
+    texts = {text.get_text(): text.get_position() for text in axes.texts}
+    for row, image in zip(rows, axes.images[::3], strict=True):
+        left, _, lower, upper = image.get_extent()
+        x, y = texts[row.label]
+        assert x < left and lower < y < upper
+    for column, names in enumerate((("a", "1.00"), ("b", "25.0"), ("c", "617"))):
+        first, second = (image.get_extent() for image in axes.images[column:6:3])
+        assert first[0] < texts[names[0]][0] < first[1] and texts[names[0]][1] > first[3]
+        assert second[0] < texts[names[1]][0] < second[1]
+        assert first[2] > second[3] and second[2] > texts[names[1]][1]
+        assert axes.images[column].origin == "lower"
+        assert first[1] - first[0] == pytest.approx(first[3] - first[2])
 
 
 def test_training_curves_draw_both_errors_and_the_kept_network():

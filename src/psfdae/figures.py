@@ -178,57 +178,68 @@ def restoration_strip(rows: Sequence[StripRow], columns: Sequence[str], title: s
     left, right, top, bottom, cell, text = max(1.0, 0.07 * longest), 0.1, 0.85, 0.35, 0.86, 0.17
     height = top + bottom + len(rows) * cell + text * sum(row.mse is not None for row in rows)
     figure = new_figure(height)
-    width = figure.get_figwidth()
-    step = (width - left - right) / len(columns)
+    axes = in_inches(figure)
+    step = (WIDTH_IN - left - right) / len(columns)
+    middle = left + step * (np.arange(len(columns)) + 0.485)
     y = height - top
     peak = rows[0].images.max(axis=(1, 2))
-    for number, row in enumerate(rows):
+    for x, name in zip(middle, columns, strict=True):
+        axes.text(x, y + 0.02, name, ha="center", va="bottom", fontsize=8)
+    for row in rows:
         y -= cell
-        for i in range(len(row.images)):
-            box = ((left + i * step) / width, y / height, 0.97 * step / width, 0.97 * cell / height)
-            axes = draw_cell(figure, box, row, i, peak)
-            if number == 0:
-                axes.set_title(columns[i], fontsize=8, pad=3)
-            if row.mse is not None:
-                number_text = f"{1e6 * row.mse[i]:#.3g}".rstrip(".")
-                axes.set_xlabel(number_text, fontsize=8, labelpad=1.5)
-        y -= text if row.mse is not None else 0.0
+        draw_row(axes, row, (left, y), (step, cell), peak)
+        if row.mse is not None:
+            for x, error in zip(middle, row.mse, strict=True):
+                number = f"{1e6 * error:#.3g}".rstrip(".")
+                axes.text(x, y - 0.02, number, ha="center", va="top", fontsize=8)
+            y -= text
     figure.suptitle(title, y=1.0 - 0.12 / height, va="top")
-    figure.text(
-        0.5,
-        0.09 / height,
+    about = (
         "Colour: √flux from 0 to the reference's maximum in each column; noisy stamps to their own"
-        " maximum. Numbers: MSE × 10⁶.",
-        ha="center",
-        va="bottom",
-        fontsize=8,
+        " maximum. Numbers: MSE × 10⁶."
     )
+    axes.text(0.5 * WIDTH_IN, 0.09, about, ha="center", va="bottom", fontsize=8)
     return figure
 
 
-def draw_cell(
-    figure: Figure,
-    box: tuple[float, float, float, float],
-    row: StripRow,
-    column: int,
-    peak: np.ndarray,
-) -> Axes:
-    """A stamp of a row on a square-root scale up to `peak`, (n,); the first one has the label."""
-    image = row.images[column]
-    scale = image.max() if row.own_scale else peak[column]
-    axes = figure.add_axes(box, xticks=[], yticks=[])
-    axes.imshow(
-        np.sqrt(np.clip(image / scale, 0.0, 1.0)),
-        origin="lower",
-        cmap=STAMP_MAP,
-        vmin=0.0,
-        vmax=1.0,
-        interpolation="nearest",
-    )
-    if column == 0:
-        label = "\n".join(_lines(row.label))
-        axes.set_ylabel(label, rotation=0, ha="right", va="center", ma="right", labelpad=5)
+def in_inches(figure: Figure) -> Axes:
+    """Empty axes over a whole figure, in inches from its lower left corner."""
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    axes.set_axis_off()
+    axes.set(xlim=(0.0, figure.get_figwidth()), ylim=(0.0, figure.get_figheight()))
+    axes.set_autoscale_on(False)
     return axes
+
+
+def draw_row(
+    axes: Axes,
+    row: StripRow,
+    corner: tuple[float, float],
+    cell: tuple[float, float],
+    peak: np.ndarray,
+) -> None:
+    """The stamps of a row on a square-root scale up to `peak`, (n,), and its label at the left.
+
+    In axes of inches, from the lower left `corner` (x, y) on; `cell` is (width, height).
+    """
+    side = 0.97 * min(cell)
+    lower = corner[1] + 0.5 * (0.97 * cell[1] - side)
+    for column, image in enumerate(row.images):
+        scale = image.max() if row.own_scale else peak[column]
+        x = corner[0] + column * cell[0] + 0.5 * (0.97 * cell[0] - side)
+        axes.imshow(
+            np.sqrt(np.clip(image / scale, 0.0, 1.0)),
+            extent=(x, x + side, lower, lower + side),
+            origin="lower",
+            cmap=STAMP_MAP,
+            vmin=0.0,
+            vmax=1.0,
+            interpolation="nearest",
+        )
+    label = "\n".join(_lines(row.label))
+    axes.text(
+        corner[0] - 0.06, lower + 0.5 * side, label, ha="right", va="center", ma="right", fontsize=9
+    )
 
 
 def _lines(label: str) -> list[str]:

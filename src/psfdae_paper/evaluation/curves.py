@@ -7,7 +7,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from psfdae.figures import REFERENCES, SERIES_COLORS, StripRow, draw_cell, new_figure, styled
+from psfdae.figures import (
+    REFERENCES,
+    SERIES_COLORS,
+    WIDTH_IN,
+    StripRow,
+    draw_row,
+    in_inches,
+    new_figure,
+    styled,
+)
 from psfdae.method import Method
 from psfdae.methods import method
 from psfdae_paper.configuration.methods import oracles_last, registered
@@ -383,11 +392,11 @@ def headline(
     left, bottom, top = 0.115, 0.13, 0.86
     columns = len(rows[0].images)
     step, tall = 0.395 / columns, (top - bottom) / len(rows)
-    peak = rows[-1].images.max(axis=(1, 2))
-    for number, row in enumerate(rows):
-        lower = top - (number + 1) * tall
-        for i in range(columns):
-            draw_cell(figure, (left + i * step, lower, 0.96 * step, 0.96 * tall), row, i, peak)
+    cell = (step * WIDTH_IN, tall * figure.get_figheight())
+    peak, stamps = rows[-1].images.max(axis=(1, 2)), in_inches(figure)
+    for number, row in enumerate(rows, 1):
+        lower = top * figure.get_figheight() - number * cell[1]
+        draw_row(stamps, row, (left * WIDTH_IN, lower), cell, peak)
     figure.text(left + 0.5 * columns * step, 0.92, titles[0], ha="center", fontsize=10)
     panel = figure.add_axes((0.66, bottom, 0.325, top - bottom))
     _errors(panel, methods, efficiency, bounds)
