@@ -271,3 +271,18 @@ def test_the_advised_saturation_flags_as_many_stars_as_it_says(sky, tmp_path):
 
 def test_what_the_package_gives_is_listed():
     assert set(psfdae.__all__) <= set(dir(psfdae))
+
+
+def test_a_hole_in_the_image_makes_no_faint_star_bright(sky, tmp_path):
+    """What is left where too much of a neighbour's light was subtracted is no light of a star."""
+    faint = int(np.flatnonzero(sky.snr < 10)[0])
+    x, y = np.rint(sky.position[faint]).astype(int)
+    pixels, noise = sky.pixels.copy(), np.std(sky.pixels[:5, :5])
+    pixels[y + 4 : y + 7, x + 4 : x + 7] -= 100.0 * noise
+    path = tmp_path / "hole.fits"
+    fits.PrimaryHDU(pixels.astype(np.float32)).writeto(path)
+    config = from_words(["dataset=from_stars", "framing.stamp_px=22"])
+    stars = config.calibration_stars.model_copy(update={"stars_min": 10})
+    found = collect(Source(path, sky.list).open(22, 8), stars, config.framing)
+    assert found.snr[faint] < stars.snr_min
+    assert found.verdict[faint] == "faint"

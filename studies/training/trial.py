@@ -4,7 +4,9 @@
 
 appends a row per seed, reference and noise level to the CSV OUT. KEY=VALUE are overrides of the
 configuration, as for the workflow, or of the schedule of the learning rate: course=cos (how it
-rises and falls; linear in use) and peak=0.15 (part of the steps before the peak; 0.3 in use).
+rises and falls; linear in use) and peak=0.15 (part of the steps before the peak; 0.3 in use). Or
+sides=8,8,16,16:12,16 says the side in pixels of the stamps' middle that each epoch sees, of the
+realisations and, after the colon, of the templates; there are as many epochs as sides.
 """
 
 from __future__ import annotations
@@ -23,7 +25,7 @@ from psfdae.files import read_product
 from psfdae.method import HISTORY
 from psfdae.methods.dae import Dae
 from psfdae.model.star_sets import noisy_test_images, split_stars, training_set
-from psfdae.networks import training
+from psfdae.networks import dae, training
 from psfdae_paper.configuration.compose import load
 from psfdae_paper.source import git_commit
 
@@ -33,12 +35,27 @@ def with_schedule(**own):
     training.OneCycleLR = lambda *given, **usual: OneCycleLR(*given, **{**usual, **own})
 
 
+def with_sides(text):
+    """Let each epoch see the middle of stamps of a side of its own; overrides that go with it."""
+    own, *templates = [[int(side) for side in part.split(",")] for part in text.split(":")]
+    sides = {"realisation": own, "template": templates[0] if templates else own}
+    # All epochs being cropped, their part that is over says which one it is.
+    dae.middle_px = lambda _, part, reference: sides[reference][round(part * len(sides[reference]))]
+    continued = len(sides["template"]) / len(own)
+    return [
+        "train.crop_epochs=0.999",
+        f"train.epochs={len(own)}",
+        f"train.continued_epochs={continued}",
+    ]
+
+
 def main(dataset: str, name: str, seeds: str, stars: str, out: str, *given: str) -> None:
     """Train with every seed, measure, append."""
     words = dict(word.split("=", 1) for word in given)
     own = {"course": ("anneal_strategy", str), "peak": ("pct_start", float)}
     with_schedule(**{own[k][0]: own[k][1](v) for k, v in words.items() if k in own})
-    overrides = [f"{k}={v}" for k, v in words.items() if k not in own]
+    overrides = [f"{k}={v}" for k, v in words.items() if k not in {*own, "sides"}]
+    overrides += with_sides(words["sides"]) if "sides" in words else []
     config = load([f"dataset={dataset}", *overrides])
     references = config.dataset.references
     product = read_product(Path(stars), "stars", ("field_index", "grid", *references))
