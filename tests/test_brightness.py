@@ -7,6 +7,7 @@ import pytest
 from astropy.table import Table
 
 import psfdae
+from psfdae.image.observation import Source
 from psfdae.model.fitting import fit
 from psfdae.model.stars import Stars
 from psfdae_paper.stars.example import add_stamps
@@ -158,6 +159,15 @@ def test_the_psf_follows_the_colour_and_is_that_of_the_end_beyond(colourful):
     usual = colourful.psf_at(*place).max()
     assert usual == pytest.approx(colourful.psf_at(*place, colour=0.7).max(), rel=0.05)
     assert "changes with the colour" in colourful.engine.estimator.facts()["Colour"]
+
+
+@pytest.mark.parametrize(("column", "said"), [("g_r", ""), ("r_i", "is 'r_i', the model")])
+def test_colours_of_another_column_are_named(colourful, column, said):
+    image = np.random.default_rng(5).normal(size=(99, 99))
+    listed = Table({"x": [50.0], "y": [50.0], column: [0.4]})
+    observation = Source(image, listed, origin=0, colour_column=column).open(STAMP)
+    other = colourful.other_instrument(observation.instrument, observation.colour_column)
+    assert said in other and bool(said) == bool(other)
 
 
 def test_a_star_has_the_psf_of_its_colour(colourful):

@@ -288,6 +288,21 @@ def test_a_grid_is_interpolated_as_photutils_does_it(sky):
     assert grid.evaluate(np.array([x + 99.0]), np.array([y]), 1.0, x, y) == 0
 
 
+@pytest.mark.parametrize("oversampling", [1, 2])
+def test_a_grid_has_the_star_where_it_is_put(sky, oversampling):
+    model = load_model(sky[1])
+    x, y = np.rint(np.mean(model.field_range(), axis=0)) + np.array([0.3, -0.4])
+    grid = model.to_photutils(3, oversampling)
+    rows, columns = np.mgrid[-8:9, -8:9] + np.rint([y, x]).astype(int)[:, None, None]
+    moved, still = (grid.evaluate(columns, rows, 1.0, *at) for at in ((x, y), np.rint([x, y])))
+    own = model.psf_at(*np.rint([x, y]), 1)[1:, 1:]
+    middle = np.average(np.arange(-(own.shape[1] // 2), own.shape[1] // 2 + 1), weights=own.sum(0))
+    assert np.average(columns, weights=still) - np.rint(x) == pytest.approx(middle, abs=0.03)
+    for axis, by in ((columns, 0.3), (rows, -0.4)):
+        step = np.average(axis, weights=moved) - np.average(axis, weights=still)
+        assert step == pytest.approx(by, abs=0.03)
+
+
 def test_the_command_and_its_table(sky, tmp_path):
     folder, model, true = sky
     true["mag"] = 24.5 - 2.5 * np.log10(true["flux"])

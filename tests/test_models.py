@@ -212,12 +212,16 @@ def test_dae_keeps_the_size_and_is_never_negative(gaussian_stars):
     assert sizes == kernels
 
 
-@pytest.mark.parametrize("shape", [(8, 8), (10, 10), (13, 17), (3, 5)])
-def test_single_channel_convolution_is_the_plain_one(shape):
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(
+    ("kernel", "shape"), [(9, (8, 8)), (9, (10, 10)), (9, (13, 17)), (9, (3, 5)), (1, (6, 7))]
+)
+def test_single_channel_convolution_is_the_plain_one(kernel, shape, dtype):
     torch.manual_seed(3)
-    layer = SingleChannelConv(5, 1, 9, padding=4).double()
-    x = torch.randn(2, 5, *shape, dtype=torch.float64, requires_grad=True)
-    plain = torch.nn.functional.conv2d(x, layer.weight, layer.bias, padding=4)
+    layer = SingleChannelConv(5, 1, kernel, padding=kernel // 2).to(dtype)
+    x = torch.randn(2, 5, *shape, dtype=dtype).to(memory_format=torch.channels_last)
+    x.requires_grad_()
+    plain = torch.nn.functional.conv2d(x, layer.weight, layer.bias, padding=kernel // 2)
     torch.testing.assert_close(layer(x), plain)
     upstream = torch.randn_like(plain)
     of = (x, *layer.parameters())
@@ -416,7 +420,13 @@ def test_steps_of_muon_are_along_orthogonal_matrices():
 
 @pytest.mark.parametrize(
     ("reference", "sides"),
-    [("realisation", (8, 8, 8, 10, 12, 14, 16, 16)), ("template", (12,) * 4 + (16,) * 4)],
+    [
+        ("realisation", (8, 8, 8, 10, 12, 14, 16, 16)),
+        ("template", (12,) * 4 + (16,) * 4),
+        ("realisation", (8, 10, 16)),
+        ("realisation", (16,)),
+        ("template", (16,)),
+    ],
 )
 def test_training_begins_with_the_middle_of_the_stamps(data, reference, sides):
     settings = TRAIN.model_copy(update={"crop_epochs": 0.75, "epochs": len(sides)})
@@ -535,6 +545,6 @@ def test_progress_says_what_was_measured_and_how_long_it_takes(capsys):
         report(row)
         report({**row, "epoch": 2, "validation_mse": 1e-5})
     assert capsys.readouterr().out.splitlines() == [
-        "epoch 1/4  train MSE 2.000e-05  3 s, 9 s left at most",
-        "epoch 2/4  train MSE 2.000e-05  validation MSE 1.000e-05  3 s, 3 s left at most",
+        "epoch 1/4  train MSE 2.000e-05  3 s, about 9 s left",
+        "epoch 2/4  train MSE 2.000e-05  validation MSE 1.000e-05  3 s, about 3 s left",
     ]

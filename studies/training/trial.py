@@ -6,7 +6,8 @@ appends a row per seed, reference and noise level to the CSV OUT. KEY=VALUE are 
 configuration, as for the workflow, or of the schedule of the learning rate: course=cos (how it
 rises and falls; linear in use) and peak=0.15 (part of the steps before the peak; 0.3 in use). Or
 sides=8,8,16,16:12,16 says the side in pixels of the stamps' middle that each epoch sees, of the
-realisations and, after the colon, of the templates; there are as many epochs as sides.
+realisations and, after the colon, of the templates (else the same); there are as many epochs as
+sides. A side is as even or odd as the stamps'.
 """
 
 from __future__ import annotations
@@ -39,8 +40,10 @@ def with_sides(text):
     """Let each epoch see the middle of stamps of a side of its own; overrides that go with it."""
     own, *templates = [[int(side) for side in part.split(",")] for part in text.split(":")]
     sides = {"realisation": own, "template": templates[0] if templates else own}
-    # All epochs being cropped, their part that is over says which one it is.
-    dae.middle_px = lambda _, part, reference: sides[reference][round(part * len(sides[reference]))]
+    # All epochs but the last being cropped, their part that is over says which one it is.
+    dae.middle_px = lambda _, part, reference: sides[reference][
+        round(part * (len(sides[reference]) - 1))
+    ]
     continued = len(sides["template"]) / len(own)
     return [
         "train.crop_epochs=0.999",

@@ -219,7 +219,7 @@ def restored(
     flagged = zip(StarFlag, counts, strict=True)
     flags = "".join(f"\n  {flag.name}: {count}" for flag, count in flagged if count)
     clean_of = f"{out}: {observation.count} stars, {clean} without a flag{flags}"
-    other = loaded.other_instrument(observation.instrument)
+    other = loaded.other_instrument(observation.instrument, observation.colour_column)
     unlike = f"{source.path}: {other}" if other else None
     return "\n".join(line for line in (observation.said(), off, unlike, clean_of) if line)
 

@@ -151,6 +151,7 @@ class Source:
             header_cards=image.provenance(),
             catalogue=listed,
             found=table if self.detect is not None else None,
+            colour_column=self.colour_column,
             _columns=columns,
             _layers=layers,
         )
@@ -475,6 +476,7 @@ class Observation:
     header_cards: list[Card]  # provenance to copy into what is made of the stars
     catalogue: Path | None  # the star list
     found: Catalogue | None  # that made in its place
+    colour_column: str | None  # of the star list
     _columns: list[np.ndarray] = field(repr=False)  # identifiers, flux, sky, colour and flags
     _layers: Layers = field(repr=False)
     # Light of other stars in the stamps of a part of the list, of a side and with a margin in px.

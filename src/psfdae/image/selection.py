@@ -169,7 +169,7 @@ def _measure(
     level, noise = sky_around(chunk.data, chunk.bad, side)
     noise = np.where(np.isfinite(chunk.noise), chunk.noise, np.maximum(noise, least_noise))
     wide = np.where(chunk.bad, 0.0, chunk.data - level[:, None, None])
-    wide = np.fmax(wide, -DEFECT * noise[:, None, None])
+    wide = np.maximum(wide, -DEFECT * noise[:, None, None])
     reach = min(settings.search_px, (wide.shape[-1] - 5) // 2)
     peak, centred = brightest_pixels(wide, reach)
     needed = side + 2 * min(reach + framing.jitter_px + 1, (wide.shape[-1] - side) // 2)

@@ -71,7 +71,7 @@ def exposure(model: PsfModel, source: Source, name: str) -> tuple[PsfModel, str]
     if observation.shape is None:
         raise PredictionError(f"{observation.path}: a cube of stamps; expected an image")
     model.check_scale(observation.pixel_scale_arcsec, str(observation.path))
-    other = model.other_instrument(observation.instrument)
+    other = model.other_instrument(observation.instrument, observation.colour_column)
     bright = collect(observation, wanted, settings.framing).bright
     if not np.isfinite(bright.position).all():
         raise PredictionError(f"{observation.path}: positions of bright stars are not known")

@@ -183,6 +183,8 @@ class FieldPsfs(ABC):
     def to_photutils(self, nodes: int = 9, oversampling: int = 4) -> GriddedPSFModel:
         """The field as photutils' `GriddedPSFModel`, such as `PSFPhotometry` takes.
 
+        Its PSFs have an odd number of values along an axis.
+
         Parameters
         ----------
         nodes : int
@@ -200,6 +202,8 @@ class FieldPsfs(ABC):
         x, y = np.rint(self.grid(nodes, nodes)).T
         name = f"FieldPSF_{self.sha256[:12]}_{nodes}_{oversampling}"
         psfs = self.psf_at(x, y, oversampling)
+        # photutils takes the middle of the array for that of the star; even stamps have none.
+        psfs = np.pad(psfs, ((0, 0), *[(0, 1 - psfs.shape[-1] % 2)] * 2))
         return FieldGrid.of(name, psfs, x[:nodes], y[::nodes], oversampling)
 
 

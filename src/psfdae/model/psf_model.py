@@ -53,6 +53,7 @@ from psfdae.threads import available_cores, in_order, side_by_side
 if TYPE_CHECKING:
     from threadpoolctl import ThreadpoolController
 
+COLOURS = "the column of colours"
 SCALE_TOLERANCE = 0.02  # relative difference of the pixel scale from that of the training
 SNR_TOLERANCE = 1.25  # beyond the trained S/N without a flag: a faint star's is no better known
 LEAST_LEFT = 0.01  # of the noise in a pixel, by a PSF that follows the star there
@@ -281,26 +282,33 @@ class PsfModel(FieldPsfs):
         size = self.info.config.get("stars", {}).get("image_px")
         return None if size is None else (size[0], size[1])
 
-    def other_instrument(self, instrument: Mapping[str, str]) -> str:
+    def other_instrument(
+        self, instrument: Mapping[str, str], colour_column: str | None = None
+    ) -> str:
         """In words, what of another image's telescope, camera and filter is not the training's.
 
         Parameters
         ----------
         instrument : mapping
             By the key of the header, as `Observation.instrument`.
+        colour_column : str, optional
+            Of the star list, if its colours are used.
 
         Returns
         -------
         said : str
-            Empty if all that both headers name is the same.
+            Empty if all that both headers and lists name is the same.
         """
         stars = self.info.config.get("stars")
-        known = stars.get("instrument") if isinstance(stars, Mapping) else None
+        stars = stars if isinstance(stars, Mapping) else {}
+        known = stars.get("instrument")
+        known = dict(known) if isinstance(known, Mapping) else {}
+        if colour_column and "colour_column" in stars:
+            known[COLOURS] = stars["colour_column"]
+            instrument = {**instrument, COLOURS: colour_column}
         return "; ".join(
             f"{key} is {seen!r}, the model {self.name!r} was trained on {value!r}"
-            for key, value, seen in other_instruments(
-                known if isinstance(known, Mapping) else {}, instrument
-            )
+            for key, value, seen in other_instruments(known, instrument)
         )
 
     def field_range(self) -> tuple[np.ndarray, np.ndarray]:

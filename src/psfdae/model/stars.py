@@ -333,6 +333,7 @@ class Stars:
         scale = {"pixel_scale_arcsec": observation.pixel_scale_arcsec}
         size = {"image_px": [*reversed(observation.shape)]} if observation.shape else {}
         taken_with = {"instrument": observation.instrument} if observation.instrument else {}
+        colours = {"colour_column": observation.colour_column} if observation.colour_column else {}
         assumed = {"assumed": True} if observation.scale_assumed else {}
         said = {
             **kept,
@@ -341,6 +342,7 @@ class Stars:
             "image_sha256": ", ".join(part.observation.sha256() for part in self.each),
             **size,
             **taken_with,
+            **colours,
             "telescope": {**scale, **assumed},
         }
         plain: dict[str, Any] = json.loads(json.dumps(said))

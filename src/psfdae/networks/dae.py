@@ -53,18 +53,17 @@ MOST_ZERO = 0.5
 
 
 class SingleChannelConv(nn.Conv2d):
-    """Convolution to one channel.
+    """Convolution to one channel, its kernel of an odd side k and its padding k // 2.
 
-    oneDNN vectorises over output channels and is slow for one. On the CPU, blocks of pixels are
-    the channels of a strided convolution with a kernel for each pixel of a block; the gradients
-    are those of the convolution from one channel that is its transpose.
+    oneDNN vectorises over output channels and is slow for one. On the CPU, one strided convolution
+    computes blocks of output pixels, with a channel for each pixel of a block. The gradients come
+    from the transposed convolution, from one channel to many, which is fast.
     """
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Map (B, C, h, w) to (B, 1, h, w)."""
         if x.device.type != "cpu":
             return super().forward(x)
-        x = x.to(self.weight.dtype)  # autocast hands on its own
         found: torch.Tensor = _ToOneChannel.apply(x, self.weight, self.bias)  # type: ignore[no-untyped-call]
         return found
 
@@ -82,8 +81,10 @@ class _ToOneChannel(torch.autograd.Function):
         padded = nn.functional.pad(weight[0], (BLOCK_PX - 1,) * 4)
         # Window i of the padded weight is that of pixel BLOCK_PX - 1 - i of a block.
         kernels = padded.unfold(1, wide, 1).unfold(2, wide, 1).flip(1, 2).permute(1, 2, 0, 3, 4)
+        if width % BLOCK_PX or height % BLOCK_PX:
+            x = nn.functional.pad(x, (0, -width % BLOCK_PX, 0, -height % BLOCK_PX))
         found = nn.functional.conv2d(
-            nn.functional.pad(x, (0, -width % BLOCK_PX, 0, -height % BLOCK_PX)),
+            x,
             kernels.flatten(0, 1),
             bias.expand(BLOCK_PX**2),
             stride=BLOCK_PX,
@@ -260,10 +261,11 @@ def middle_px(stamp_px: int, part: float, reference: str) -> int:
     stamp_px : int
         Side of the stamps.
     part : float
-        Of the epochs that see less than whole stamps, what is over; whole stamps from 1 on.
+        Number of the epoch, from 0, over that of the epochs that see the middle alone.
     reference : str
-        "realisation": half of the side at first, then more and more. A "template" follows from
-        more of a star: three quarters of the side, and whole stamps from 2/3 on.
+        "realisation": half of the side at first, then more and more, and whole stamps from 1 on. A
+        "template" depends on more of the stamp: three quarters of the side, and whole stamps from
+        2/3 on.
     """
     if reference == "realisation":
         middle = 0.5 + 0.5 * min(part, 1.0) ** 2
@@ -355,7 +357,8 @@ class DaeTraining(Training):
         The third is the weight of each star's error, (B, 1, 1, 1), of mean 1 over the levels.
         """
         rng = stream(self.seed, "dae", "epoch", self.attempt, epoch)
-        side, cropped = self.data.images.shape[-1], self.settings.crop_epochs * self.settings.epochs
+        side = self.data.images.shape[-1]
+        cropped = int(self.settings.crop_epochs * self.settings.epochs)
         part = epoch / cropped if cropped else 1.0
         edge = (side - middle_px(side, part, self.data.reference)) // 2
         order = rng.permutation(self.data.fit)

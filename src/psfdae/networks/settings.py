@@ -75,7 +75,8 @@ class Train(Group):
     )
     crop_epochs: Annotated[float, Field(ge=0, lt=1)] = Field(
         0.0,
-        description="First part of the epochs, which sees the middle of stamps alone; 0: none",
+        description="First part of the epochs, which sees the middle of stamps alone (two thirds "
+        "of it where templates are learnt); 0: none",
     )
     continued_epochs: Annotated[float, Field(ge=0, le=2)] = Field(
         1.0,

@@ -311,7 +311,7 @@ def progress(epochs: int) -> Iterator[Callable[[Row], None]]:
         bar.update()
         if not terminal:
             left = row["seconds"] * (epochs / row["epoch"] - 1)
-            time = f"{row['seconds']:.0f} s, {left:.0f} s left at most"
+            time = f"{row['seconds']:.0f} s, about {left:.0f} s left"
             print(f"epoch {row['epoch']:.0f}/{epochs}", *errors, time, sep="  ", flush=True)
 
     with tqdm(total=epochs, unit="epoch", disable=not terminal, desc="train") as bar:
