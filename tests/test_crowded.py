@@ -363,6 +363,7 @@ def test_what_cannot_be_measured_is_refused_in_one_line(sky, tmp_path):
         (out, "--zero-point", 1, "--reference", tmp_path / "far.csv"): "or --reference gives it",
         (out, "--reference", tmp_path / "far.csv", "--origin", 0): "0 of its stars",
         (out, "--all-extensions"): "one image, not --all-extensions",
+        (out, "--colour-column", "mag"): "no --colour-column",
         (model,): "expected a name",
         (out, "--residual", out): "is the name of the FITS file, too",
     }

@@ -62,6 +62,10 @@ def photometry(
     check_targets(out, residual, None, overwrite)
     if stated.all_extensions:
         raise PhotometryError(f"{image}: photometry takes one image, not --all-extensions")
+    if stated.colour_column:
+        raise PhotometryError(
+            f"{image}: all stars get the PSF of the usual one: no --colour-column"
+        )
     loaded = load_field(model)
     loaded.field_range()  # or it knows no place
     observation = source.open(loaded.stamp_px).assuming()
@@ -70,9 +74,7 @@ def photometry(
     loaded.check_scale(observation.pixel_scale_arcsec, str(image))
     magnitudes = None
     if reference is not None:
-        listed = replace(
-            stated, catalogue=reference, detect=False, on_image=False, colour_column=None
-        )
+        listed = replace(stated, catalogue=reference, detect=False, on_image=False)
         places = listed.source(image).open(loaded.stamp_px).positions
         assert places is not None  # of an image
         magnitudes = places, as_catalogue(reference).numbers(magnitude_column)

@@ -64,6 +64,8 @@ def wavefront(
     """
     if stated.all_extensions:
         raise SensingError("psfdae wavefront takes one image: name it with --extension")
+    if stated.colour_column:
+        raise SensingError("psfdae wavefront takes light of one colour: no --colour-column")
     source = stated.source(stars)
     found_list = out.with_name(f"{out.stem}_stars.csv") if stated.detect else None
     check_outputs((out, plot, found_list), (*source.files(), telescope))
