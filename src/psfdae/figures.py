@@ -109,6 +109,9 @@ def write_png(figure: Figure, out: Path) -> None:
 
 STAMP_MAP = "magma"
 
+STAMP_PART = 0.97
+"""Side of a stamp over that of its cell in a row; the rest is a gap."""
+
 
 @dataclass(frozen=True)
 class StripRow:
@@ -180,7 +183,7 @@ def restoration_strip(rows: Sequence[StripRow], columns: Sequence[str], title: s
     figure = new_figure(height)
     axes = in_inches(figure)
     step = (WIDTH_IN - left - right) / len(columns)
-    middle = left + step * (np.arange(len(columns)) + 0.485)
+    middle = left + step * (np.arange(len(columns)) + 0.5 * STAMP_PART)
     y = height - top
     peak = rows[0].images.max(axis=(1, 2))
     for x, name in zip(middle, columns, strict=True):
@@ -222,11 +225,11 @@ def draw_row(
 
     In axes of inches, from the lower left `corner` (x, y) on; `cell` is (width, height).
     """
-    side = 0.97 * min(cell)
-    lower = corner[1] + 0.5 * (0.97 * cell[1] - side)
+    side = STAMP_PART * min(cell)
+    lower = corner[1] + 0.5 * (STAMP_PART * cell[1] - side)
     for column, image in enumerate(row.images):
         scale = image.max() if row.own_scale else peak[column]
-        x = corner[0] + column * cell[0] + 0.5 * (0.97 * cell[0] - side)
+        x = corner[0] + column * cell[0] + 0.5 * (STAMP_PART * cell[0] - side)
         axes.imshow(
             np.sqrt(np.clip(image / scale, 0.0, 1.0)),
             extent=(x, x + side, lower, lower + side),
