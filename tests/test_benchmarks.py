@@ -55,6 +55,7 @@ def test_two_commits_are_compared_target_by_target():
     assert "CPU time 12 -> 6 s: 0.500 ± 0.000" in said
     assert "wall time 6 -> 5 s: 0.833 ± 0.4" in said
     assert "largest job 4 -> 3 MB" in said
+    assert "wall time 4 -> 2 s: 0.500\n" in commits.said(table[table.target == "x"], "a", "b")
 
 
 def test_a_process_of_its_own_has_its_own_threads(monkeypatch):

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from psfdae.bright_stars import BrightStars
+from psfdae.bright_stars import LEAST_SKY, BrightStars
 from psfdae.image.selection import (
     brightest_pixels,
     crowded,
@@ -20,7 +20,7 @@ from psfdae.image.selection import (
 from psfdae.image.stamps import cut
 from psfdae.image.training_images import bins_of, make_images, stacks, star_grid, star_of_images
 from psfdae.moments import moved, windowed_centres
-from psfdae.noise import noise_equivalent_px
+from psfdae.noise import NoiseModel, noise_equivalent_px
 from psfdae.rng import stream
 from psfdae.splits import held_out_fields
 
@@ -210,3 +210,16 @@ def test_images_are_framed_normalised_and_moved_only_where_asked():
     assert phase.std(axis=0) == pytest.approx(np.sqrt(1 / 12), rel=0.1)
     again = windowed_centres(made.astype(float), jitter, np.full(400, 1.5), 10, 1.5)
     assert np.abs(again - place).max() < 0.03
+
+
+def test_a_neighbour_s_saturated_rest_makes_no_negative_rates():
+    """Splines that move a star ring beside it; the least sky of a new noise is enough for all."""
+    stars = bright_stars(np.zeros((1, 2)))
+    stars.wide[0, 16 - 9, 16 + 4] = 5 * stars.flux[0]  # beyond the stamp
+    stars.noise[:] = 1e-3 * stars.flux
+    star = np.zeros(40, dtype=int)
+    images, *_ = make_images(
+        stars, gaussians(np.zeros((1, 2))), star, FRAMING, star == 0, stream(1, "test")
+    )
+    assert images.min() < -3e-3
+    assert NoiseModel(1.0, LEAST_SKY).draw(images, 1e-3, stream(2, "test")).shape == images.shape

@@ -288,6 +288,17 @@ def test_a_grid_is_interpolated_as_photutils_does_it(sky):
     assert grid.evaluate(np.array([x + 99.0]), np.array([y]), 1.0, x, y) == 0
 
 
+def test_derivatives_of_a_grid_are_those_of_its_light(sky):
+    grid = load_model(sky[1]).to_photutils(4, 4)
+    x, y = grid.grid_xypos.mean(axis=0) + [0.3, -0.4]
+    rows, columns = (axis.ravel() for axis in np.mgrid[-4:5, -4:5])
+    pixels, step = (columns + round(x), rows + round(y)), 1e-3
+    found = grid.fit_deriv(*pixels, 1e3, x, y)
+    for slope, (f, a, b) in zip(found, step * np.eye(3), strict=True):
+        less, more = (grid.evaluate(*pixels, 1e3 + s * f, x + s * a, y + s * b) for s in (-1, 1))
+        assert slope == pytest.approx((more - less) / (2 * step), abs=2e-3 * np.abs(slope).max())
+
+
 @pytest.mark.parametrize("oversampling", [1, 2])
 def test_a_grid_has_the_star_where_it_is_put(sky, oversampling):
     model = load_model(sky[1])

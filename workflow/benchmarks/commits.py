@@ -59,14 +59,18 @@ def compare(
 
 
 def said(table, old, new):
-    """Ratios of the costs of two commits, in lines; `table` has a row per target and commit."""
+    """Ratios of the costs of two commits, in lines; `table` has a row per target and commit.
+
+    Their scatter is that between targets, if there are several.
+    """
     first, second = (table[table.commit == c].set_index("target") for c in (old, new))
     lines = [f"{new} over {old}, {len(first)} targets:"]
     for name, about in COSTS.items():
         both = [second[name].to_numpy(float), first[name].reindex(second.index).to_numpy(float)]
         ratio, stderr = clustered_ratio(*both, np.arange(len(second)))
+        scatter = f" ± {stderr:.3f}" if len(second) > 1 else ""
         lines.append(
-            f"  {about} {both[1].sum():.0f} -> {both[0].sum():.0f} s: {ratio:.3f} ± {stderr:.3f}"
+            f"  {about} {both[1].sum():.0f} -> {both[0].sum():.0f} s: {ratio:.3f}{scatter}"
         )
     peaks = [f"{side.peak_mb.max():.0f}" for side in (first, second)]
     return "\n".join([*lines, f"  largest job {peaks[0]} -> {peaks[1]} MB"])

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from psfdae.bright_stars import BrightStars
+from psfdae.bright_stars import DEFECT, BrightStars
 from psfdae.files import Column
 from psfdae.image.selection import brightest_pixels
 from psfdae.image.stamps import cut
@@ -162,7 +162,10 @@ def make_images(
     for start in range(0, star.size, IMAGES_AT_A_TIME):
         rows = slice(start, start + IMAGES_AT_A_TIME)
         who, wide = star[rows], stars.wide[star[rows]]
-        wide[subpixel[rows]] = moved(wide[subpixel[rows]], phase[rows][subpixel[rows]])
+        some = subpixel[rows]
+        # Splines ring beside the rest of a saturated neighbour: defects, as in the stars themselves.
+        least = -DEFECT * stars.noise[who[some], None, None]
+        wide[some] = np.maximum(moved(wide[some], phase[rows][some]), least)
         offset = brightest_pixels(wide, reach)[0] - jitter[rows]
         shifted = moved(template[who], stars.centre[who] + phase[rows])
         for source, target in ((wide, realisations), (shifted, templates)):

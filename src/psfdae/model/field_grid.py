@@ -11,18 +11,26 @@ from astropy.nddata import NDData
 from photutils.psf import GriddedPSFModel
 from scipy.ndimage import map_coordinates, spline_filter
 
+from psfdae.field_psf import SLOPE_PX
+
+
+KEPT = 256
+"""Stars in pixels whose light is kept: several times those of the largest group of a fit."""
+
 
 class FieldGrid(GriddedPSFModel):  # type: ignore[misc]
     """PSFs at the nodes of a grid, and between them by bilinear interpolation.
 
     What photutils' own class interpolates from the splines of four PSFs, one after the other, is
     read here from one spline: interpolation is linear, so that the coefficients can be averaged
-    first.
+    first. Fits of a group ask for the light of all of its stars again where one of them moves:
+    that of a place is kept.
     """
 
     columns: ClassVar[Sequence[float]]
     rows: ClassVar[Sequence[float]]
     splines: ClassVar[np.ndarray]
+    seen: ClassVar[dict[tuple[float | bytes, ...], np.ndarray]]
 
     @classmethod
     def of(
@@ -35,7 +43,7 @@ class FieldGrid(GriddedPSFModel):  # type: ignore[misc]
         """
         places = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
         splines = np.stack([spline_filter(psf) for psf in psfs])
-        known = {"columns": x.tolist(), "rows": y.tolist()}
+        known = {"columns": x.tolist(), "rows": y.tolist(), "seen": {}}
         own = type(name, (cls,), known | {"splines": splines.reshape(len(y), len(x), -1)})
         meta = {"grid_xypos": [tuple(place) for place in places], "oversampling": oversampling}
         grid: Self = own(NDData(psfs, meta=meta))
@@ -44,18 +52,47 @@ class FieldGrid(GriddedPSFModel):  # type: ignore[misc]
     # Without annotations, which astropy would take for units.
     def evaluate(self, x, y, flux, x_0, y_0):  # type: ignore[no-untyped-def]
         """Light of a star in pixels x, y of any shape; 0 beyond the PSF's edge."""
-        # photutils gives arrays of one number, too.
-        x_0, y_0 = (float(np.ravel(value)[0]) for value in (x_0, y_0))
+        x, y = (np.asarray(pixels, dtype=float) for pixels in (x, y))
+        x_0, y_0 = _number(x_0), _number(y_0)
+        key = x_0, y_0, x.tobytes(), y.tobytes()
+        light = self.seen.get(key)
+        if light is None:
+            if len(self.seen) == KEPT:
+                self.seen.clear()
+            light = self.seen[key] = self._read(self._spline(x_0, y_0), x - x_0, y - y_0)
+        return flux * light.reshape(x.shape)
+
+    def fit_deriv(self, x, y, flux, x_0, y_0):  # type: ignore[no-untyped-def]
+        """Derivatives of the light in pixels x, y by flux, x_0 and y_0."""
+        x_0, y_0 = _number(x_0), _number(y_0)
+        off = np.stack([np.asarray(x) - x_0, np.asarray(y) - y_0])
+        steps = SLOPE_PX * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]], dtype=float)
+        moved = off[:, None] + steps.T.reshape(2, -1, *(1,) * np.ndim(x))
+        right, left, up, down = self._read(self._spline(x_0, y_0), *moved)
+        slope = flux / (2 * SLOPE_PX)
+        return [self.evaluate(x, y, 1.0, x_0, y_0), slope * (left - right), slope * (down - up)]
+
+    def _spline(self, x_0: float, y_0: float) -> np.ndarray:
+        """Coefficients of the PSF at a place."""
         (row, down), (column, across) = _between(self.rows, y_0), _between(self.columns, x_0)
+        near = self.splines[row : row + 2, column : column + 2].reshape(-1, self.splines.shape[-1])
         weights = np.outer([1.0 - down, down], [1.0 - across, across]).ravel()
-        near = self.splines[row : row + 2, column : column + 2].reshape(weights.size, -1)
-        spline = (weights @ near).reshape(self.data.shape[1:])
-        across_px, down_px = (
-            self.oversampling[0] * (np.asarray(pixels, dtype=float) - middle) + origin
-            for pixels, middle, origin in zip((x, y), (x_0, y_0), self.origin, strict=False)
+        return np.asarray((weights @ near).reshape(self.data.shape[1:]))
+
+    def _read(self, spline: np.ndarray, across: np.ndarray, down: np.ndarray) -> np.ndarray:
+        """Values at distances from the star, in pixels."""
+        where = np.stack(
+            [
+                self.oversampling[0] * down + self.origin[1],
+                self.oversampling[1] * across + self.origin[0],
+            ]
         )
-        where = np.stack([down_px, across_px])
-        return np.asarray(flux * map_coordinates(spline, where, prefilter=False, mode="constant"))
+        return np.asarray(map_coordinates(spline, where, prefilter=False, mode="constant"))
+
+
+def _number(value: float | np.ndarray) -> float:
+    """photutils gives arrays of one number, too."""
+    return float(np.ravel(value)[0]) if isinstance(value, np.ndarray) else float(value)
 
 
 def _between(nodes: Sequence[float], place: float) -> tuple[int, float]:
