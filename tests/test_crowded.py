@@ -290,7 +290,7 @@ def test_a_grid_is_interpolated_as_photutils_does_it(sky):
 
 def test_derivatives_of_a_grid_are_those_of_its_light(sky):
     grid = load_model(sky[1]).to_photutils(4, 4)
-    x, y = grid.grid_xypos.mean(axis=0) + [0.3, -0.4]
+    x, y = grid.grid_xypos.mean(axis=0) + np.array([0.3, -0.4])
     rows, columns = (axis.ravel() for axis in np.mgrid[-4:5, -4:5])
     pixels, step = (columns + round(x), rows + round(y)), 1e-3
     found = grid.fit_deriv(*pixels, 1e3, x, y)

@@ -163,7 +163,7 @@ def make_images(
         rows = slice(start, start + IMAGES_AT_A_TIME)
         who, wide = star[rows], stars.wide[star[rows]]
         some = subpixel[rows]
-        # Splines ring beside the rest of a saturated neighbour: defects, as in the stars themselves.
+        # Splines ring beside what is left of a saturated neighbour.
         least = -DEFECT * stars.noise[who[some], None, None]
         wide[some] = np.maximum(moved(wide[some], phase[rows][some]), least)
         offset = brightest_pixels(wide, reach)[0] - jitter[rows]

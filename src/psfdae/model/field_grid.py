@@ -13,7 +13,6 @@ from scipy.ndimage import map_coordinates, spline_filter
 
 from psfdae.field_psf import SLOPE_PX
 
-
 KEPT = 256
 """Stars in pixels whose light is kept: several times those of the largest group of a fit."""
 
