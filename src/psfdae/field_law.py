@@ -59,7 +59,7 @@ matched filter finds them."""
 STEP_FWHM = 0.125
 """Largest step between two nodes over the FWHM: in between, stars change linearly."""
 
-FAR, MATCHED_SNR = 12.0, 30.0
+FAR, MATCHED_SNR = 8.0, 30.0
 """ln of the filter's likelihood below the best, from which a node is one of the fewest only; and
 the S/N up to which that is asked: of brighter stars, the filter does not know the shape."""
 
