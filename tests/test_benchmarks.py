@@ -51,7 +51,7 @@ def test_two_commits_are_compared_target_by_target():
     table = pd.DataFrame({**names, **costs, "peak_mb": [1.0, 2.0, 3.0, 4.0]})
     table.loc[2:, "cpu_s"] = [4.0, 8.0]
     said = commits.said(table, "a", "b")
-    assert "b over a, 2 targets" in said
+    assert "b over a, targets: x, y" in said
     assert "CPU time 12 -> 6 s: 0.500 ± 0.000" in said
     assert "wall time 6 -> 5 s: 0.833 ± 0.4" in said
     assert "largest job 4 -> 3 MB" in said

@@ -289,6 +289,18 @@ def test_training_learns_and_repeats(data, tmp_path):
     assert errors[-1] < 0.5 * errors[0]
 
 
+def test_a_network_begins_on_the_threads_of_its_training(data, monkeypatch):
+    """Near eigenpatches turn into each other by the rounding of another number of threads."""
+    before, seen = torch.get_num_threads(), []
+    monkeypatch.setattr(
+        "psfdae.networks.dae.begin_linear", lambda *given: seen.append(torch.get_num_threads())
+    )
+    torch.set_num_threads(2)
+    DaeTraining(data, DAE.model_copy(update={"init": "linear"}), TRAIN, 3)
+    assert seen == [1]
+    torch.set_num_threads(before)
+
+
 def test_interrupted_training_continues_as_if_nothing_had_happened(data, tmp_path):
     whole = train(data, tmp_path)
 

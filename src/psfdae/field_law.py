@@ -60,8 +60,9 @@ STEP_FWHM = 0.125
 """Largest step between two nodes over the FWHM: in between, stars change linearly."""
 
 FAR, MATCHED_SNR = 8.0, 30.0
-"""ln of the filter's likelihood below the best, from which a node is one of the fewest only; and
-the S/N up to which that is asked: of brighter stars, the filter does not know the shape."""
+"""Nodes whose likelihood by the filter is further below the best than this, in ln, are looked at
+only if they are among the `LEAST_NODES` best: most would have less than `LEAST_WEIGHT`. The filter
+does not know the shape of bright stars, so that they count as stars of this S/N."""
 
 WRONG_LIST = 0.05
 """Probability that the list, or its place, is not what it was for the training stars."""

@@ -64,7 +64,7 @@ def said(table, old, new):
     Their scatter is that between targets, if there are several.
     """
     first, second = (table[table.commit == c].set_index("target") for c in (old, new))
-    lines = [f"{new} over {old}, {len(first)} targets:"]
+    lines = [f"{new} over {old}, targets: {', '.join(first.index)}"]
     for name, about in COSTS.items():
         both = [second[name].to_numpy(float), first[name].reindex(second.index).to_numpy(float)]
         ratio, stderr = clustered_ratio(*both, np.arange(len(second)))

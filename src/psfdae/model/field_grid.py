@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import lru_cache
 from typing import ClassVar, Self
 
 import numpy as np
@@ -13,8 +14,8 @@ from scipy.ndimage import map_coordinates, spline_filter
 
 from psfdae.field_psf import SLOPE_PX
 
-KEPT = 256
-"""Stars in pixels whose light is kept: several times those of the largest group of a fit."""
+KEPT, KEPT_PX = 256, 4096
+"""Places of stars whose light is kept, those last asked for, and the most pixels that it has."""
 
 
 class FieldGrid(GriddedPSFModel):  # type: ignore[misc]
@@ -22,14 +23,14 @@ class FieldGrid(GriddedPSFModel):  # type: ignore[misc]
 
     What photutils' own class interpolates from the splines of four PSFs, one after the other, is
     read here from one spline: interpolation is linear, so that the coefficients can be averaged
-    first. Fits of a group ask for the light of all of its stars again where one of them moves:
-    that of a place is kept.
+    first. A fit of a group asks for the light of all of its stars each time that one of them moves
+    or changes its flux; that of the others is kept.
     """
 
     columns: ClassVar[Sequence[float]]
     rows: ClassVar[Sequence[float]]
     splines: ClassVar[np.ndarray]
-    seen: ClassVar[dict[tuple[float | bytes, ...], np.ndarray]]
+    kept: Callable[[float, float, bytes, bytes], np.ndarray]
 
     @classmethod
     def of(
@@ -42,34 +43,36 @@ class FieldGrid(GriddedPSFModel):  # type: ignore[misc]
         """
         places = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
         splines = np.stack([spline_filter(psf) for psf in psfs])
-        known = {"columns": x.tolist(), "rows": y.tolist(), "seen": {}}
+        known = {"columns": x.tolist(), "rows": y.tolist()}
         own = type(name, (cls,), known | {"splines": splines.reshape(len(y), len(x), -1)})
         meta = {"grid_xypos": [tuple(place) for place in places], "oversampling": oversampling}
         grid: Self = own(NDData(psfs, meta=meta))
+        grid.kept = lru_cache(KEPT)(grid._light)  # by its copies, too
         return grid
 
     # Without annotations, which astropy would take for units.
     def evaluate(self, x, y, flux, x_0, y_0):  # type: ignore[no-untyped-def]
         """Light of a star in pixels x, y of any shape; 0 beyond the PSF's edge."""
         x, y = (np.asarray(pixels, dtype=float) for pixels in (x, y))
-        x_0, y_0 = _number(x_0), _number(y_0)
-        key = x_0, y_0, x.tobytes(), y.tobytes()
-        light = self.seen.get(key)
-        if light is None:
-            if len(self.seen) == KEPT:
-                self.seen.clear()
-            light = self.seen[key] = self._read(self._spline(x_0, y_0), x - x_0, y - y_0)
-        return flux * light.reshape(x.shape)
+        find = self._light if x.size > KEPT_PX else self.kept
+        return flux * find(_number(x_0), _number(y_0), x.tobytes(), y.tobytes()).reshape(x.shape)
 
     def fit_deriv(self, x, y, flux, x_0, y_0):  # type: ignore[no-untyped-def]
-        """Derivatives of the light in pixels x, y by flux, x_0 and y_0."""
+        """Derivatives of the light in pixels x, y by flux, x_0 and y_0.
+
+        That the PSF changes slowly over the grid is not in them.
+        """
         x_0, y_0 = _number(x_0), _number(y_0)
-        off = np.stack([np.asarray(x) - x_0, np.asarray(y) - y_0])
-        steps = SLOPE_PX * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]], dtype=float)
+        off = np.stack([np.asarray(x, dtype=float) - x_0, np.asarray(y, dtype=float) - y_0])
+        steps = SLOPE_PX * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]], dtype=float)
         moved = off[:, None] + steps.T.reshape(2, -1, *(1,) * np.ndim(x))
-        right, left, up, down = self._read(self._spline(x_0, y_0), *moved)
+        light, right, left, up, down = self._read(self._spline(x_0, y_0), *moved)
         slope = flux / (2 * SLOPE_PX)
-        return [self.evaluate(x, y, 1.0, x_0, y_0), slope * (left - right), slope * (down - up)]
+        return [light, slope * (left - right), slope * (down - up)]
+
+    def _light(self, x_0: float, y_0: float, x: bytes, y: bytes) -> np.ndarray:
+        """Light of a star of flux 1 in pixels, which are the bytes of float64."""
+        return self._read(self._spline(x_0, y_0), np.frombuffer(x) - x_0, np.frombuffer(y) - y_0)
 
     def _spline(self, x_0: float, y_0: float) -> np.ndarray:
         """Coefficients of the PSF at a place."""
@@ -90,8 +93,8 @@ class FieldGrid(GriddedPSFModel):  # type: ignore[misc]
 
 
 def _number(value: float | np.ndarray) -> float:
-    """photutils gives arrays of one number, too."""
-    return float(np.ravel(value)[0]) if isinstance(value, np.ndarray) else float(value)
+    """A number, or the only one of an array, which photutils gives, too."""
+    return float(np.ravel(value)[0])
 
 
 def _between(nodes: Sequence[float], place: float) -> tuple[int, float]:

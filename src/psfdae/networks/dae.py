@@ -316,6 +316,7 @@ class DaeTraining(Training):
         self, data: TrainingSet, dae: DaeSettings, settings: Train, seed: int, attempt: int = 0
     ) -> None:
         self.data, self.seed = data, seed
+        torch.set_num_threads(settings.threads)  # of the linear start, too, and its last digits
         self.factor = image_scale(dae.scale, data.images.shape[-1])
         generator = torch.Generator()
         generator.manual_seed(int(stream(seed, "dae", "init", attempt).integers(2**62)))
