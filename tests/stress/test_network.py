@@ -145,7 +145,6 @@ def test_seeds(bench, record):
 
 def score(data, dae, settings, folder, seed):
     """Validation error, new starts and first weights of a training in a process of its own."""
-    torch.set_num_threads(settings.threads)  # before the network is drawn, as the stage does it
     checkpoint = folder / f"{seed}.pt"
     training = train_dae(data, dae, settings, seed, checkpoint, "seeds")
     weights = next(iter(training.result.values())).flatten()[:16].tolist()
