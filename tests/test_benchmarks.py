@@ -271,6 +271,9 @@ def test_targets_on_request(smoke, tmp_path):
     cover = tables["predict_coverage"]
     assert set(cover.bundle) == {*poppy.bundle, "example"}
     assert (cover.groupby(["bundle", "noise_level"]).pixels.nunique() == 2).all()
+    field = cover.query("bundle == 'example'")
+    assert field.coverage68.between(0.6, 0.76).all()
+    assert field.coverage95.between(0.9, 0.98).all()
     usual = tables["predict_strange"].query("kind == 'usual'")
     assert (usual.found - usual.false_alarms).abs().max() < 0.02
     (row,) = tables["predict_throughput"].to_dict("records")

@@ -32,7 +32,7 @@ from psfdae.model.photometry import FluxModel, signal_to_noise
 from psfdae.model.psf_model import PsfModel
 from psfdae.model.star_sets import noise_model, noisy_test_images, read_stars
 from psfdae.networks import dae as dae_network
-from psfdae.noise import noise_equivalent_px
+from psfdae.noise import NoiseModel, noise_equivalent_px
 from psfdae.rng import stream
 from psfdae_paper.configuration.compose import load_stage
 from psfdae_paper.configuration.consistency import SIMULATION, STATIC
@@ -445,3 +445,23 @@ def test_ship_names_checks_and_writes(folder, tiny, tmp_path, capsys):
     write_bundle(poor, tmp_path / "poor.psf.safetensors")
     with pytest.raises(BundleError, match=r"error68 holds 50\.0% of the errors"):
         stage.ship(config, (tmp_path / "poor.psf.safetensors",), **given)
+
+
+def test_half_widths_beside_the_stars_own_noise_are_above_0_and_hold_68_per_cent():
+    """Own noise three times the method's errors: most of these are hidden in it, star by star."""
+    rng = np.random.default_rng(6)
+    own, error = 3e-3, 1e-3
+    zero = np.zeros((2000, 8, 8), np.float32)
+    own_noise = np.full(zero.shape, own)
+    of = NoiseModel(1.0, 1e4), np.zeros((2000, 4)), np.zeros(2000), own_noise
+    stars = packing.HeldOutStars(zero, rng.normal(0, own, zero.shape), *of)
+    psf = rng.normal(0, error, zero.shape)
+    few = np.arange(40)
+    measured = packing.Errors(
+        np.ones(1), stars.errors(psf[few], few)[None], few, np.ones((1, few.size))
+    )
+    width = measured.half_width()
+    assert width.min() > 0 and 0.1 * own < width.mean() < 0.7 * own
+    assert packing.coverage(stars.errors(psf), np.ones(2000), np.ones(1), width) == pytest.approx(
+        0.72, abs=0.05
+    )

@@ -59,6 +59,7 @@ WIDE = 0.95  # part of them within ± `error68` times `ratio95`
 LEAST_SIGMA = 1e-12  # of the flux; equal stars leave a method no doubt
 # What is known of stars: their flux and sky, their sky, or neither.
 CASES: tuple[dict[str, float], ...] = ({"flux": 1.0, "background": 0.0}, {"background": 0.0}, {})
+HIDDEN = 0.25  # of a pixel's RMS error, which its `error68` has at least
 NORMAL_WIDE = 1.96  # σ within which a normal variable has as much
 LIMIT = 0.999  # part of the test stars within the limit of the Mahalanobis distance
 STEPS = 64  # of the noise up to that of the flux in every pixel, of a model that is to be small
@@ -121,8 +122,13 @@ class Errors:
         return Errors(self.nodes, self.error[:, kept], self.star[kept], self.distance[:, kept])
 
     def half_width(self) -> np.ndarray:
-        """Half-width of the interval around 0 that holds 68.27 %, shape (S, d, d)."""
-        return np.stack([np.quantile(np.abs(node), COVERAGE, axis=0) for node in self.error])
+        """Half-width of the interval around 0 that holds 68.27 %, shape (S, d, d).
+
+        At least `HIDDEN` of the root mean square: beside much noise of the stars' own, most
+        errors in a pixel may be 0.
+        """
+        holds = np.stack([np.quantile(np.abs(node), COVERAGE, axis=0) for node in self.error])
+        return np.asarray(np.maximum(holds, HIDDEN * self.rms()))
 
     def ratio95(self) -> np.ndarray:
         """By how much the interval that holds 95 % of all pixels is wider, shape (S,)."""
