@@ -447,7 +447,7 @@ def test_ship_names_checks_and_writes(folder, tiny, tmp_path, capsys):
         stage.ship(config, (tmp_path / "poor.psf.safetensors",), **given)
 
 
-def test_half_widths_beside_the_stars_own_noise_are_above_0_and_hold_68_per_cent():
+def test_half_widths_beside_the_stars_own_noise_are_above_0_and_hold_two_thirds_or_more():
     """Own noise three times the method's errors: most of these are hidden in it, star by star."""
     rng = np.random.default_rng(6)
     own, error = 3e-3, 1e-3

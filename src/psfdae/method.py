@@ -257,14 +257,11 @@ class Packing:
         Small images that `psfdae predict` has restored at once.
     padded : bool
         Fewer are made up to as many: other numbers of them round otherwise.
-    parallel : bool
-        Threads restore some at a time. Without large products, they would wait for each other.
     """
 
     suffix: str | None = None
     together: int = 256
     padded: bool = True
-    parallel: bool = True
 
 
 # What some methods can do.

@@ -131,7 +131,8 @@ def make_images(
     """Frame stars as the network will see them, at new sub-pixel phases where asked for.
 
     Every star has its brightest pixel at (d/2, d/2), moved by a random jitter, and
-    the sum 1. A template lies at its star's phase, in the same pixels.
+    the sum 1. A template lies at its star's phase, in the same pixels. No pixel of a moved star is
+    below −`DEFECT` σ of its sky, before the sum is made 1.
 
     Parameters
     ----------

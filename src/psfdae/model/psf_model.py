@@ -203,7 +203,7 @@ class PsfModel(FieldPsfs):
         stars = self._stamps(stamps, margin, given, masks, position, centre)
         blocks = self.engine.blocks(stars)
         with one_thread_each():
-            threads = min(self.engine.threads(threads), max(len(blocks), 1))
+            threads = min(threads or available_cores(), max(len(blocks), 1))
             work = (lambda block: self.engine.block(block, fixed), blocks or [stars], threads)
             parts = side_by_side(*work)
         return Prediction.joined(parts)
@@ -259,7 +259,7 @@ class PsfModel(FieldPsfs):
 
         chunks = observation.chunks(max(size, min(ROWS, 4 * size)))
         with one_thread_each():
-            yield from in_order(predicted, chunks, self.engine.threads(threads))
+            yield from in_order(predicted, chunks, threads or available_cores())
 
     @property
     def sha256(self) -> str:
@@ -457,18 +457,10 @@ class Engine:
         self.estimator = estimator(bundle)
         self.free_flux = with_free_flux(self.estimator)
         packing = self.estimator.packing or Packing()
-        together, self._padded, self._parallel = (
-            packing.together,
-            packing.padded,
-            packing.parallel,
-        )
+        together, self._padded = packing.together, packing.padded
         self.size = min(together, max(1, together * WHOLE_PX**2 // bundle.info.stamp_px**2))
         self._photometer = Photometer(bundle.flux_model, bundle.info.components)
         self.wings = bundle.wings
-
-    def threads(self, most: int | None) -> int:
-        """Threads that gain time, of at most so many, or of all cores."""
-        return (most or available_cores()) if self._parallel else 1
 
     def blocks(self, stars: Stamps) -> list[Stamps]:
         """Stars in parts of `size`."""
