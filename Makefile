@@ -8,6 +8,7 @@
 #   TRACK=live       shows trainings in MLflow while they run (default: once they are finished)
 #   TORCH_INDEX=url  package index with PyTorch's CPU builds (default: pip's own index)
 #   PYTHON=python3   interpreter that makes the environment (3.11 or newer)
+#   PART=k/n         the k-th of n parts of `make nightly` (default: all of it)
 #   PYTHONS="…"      interpreters of `make test-pythons` (default: 3.11 to 3.14)
 #   RESOLUTION=…     its versions of dependencies: highest (default) or lowest-direct
 
@@ -20,6 +21,7 @@ AGAINST ?=
 TORCH_INDEX ?=
 PORT ?= 5000
 TRACK ?=
+PART ?=
 PYTHONS ?= 3.11 3.12 3.13 3.14
 RESOLUTION ?= highest
 
@@ -51,10 +53,11 @@ override AGAINST := $(value AGAINST)
 override PORT := $(value PORT)
 override TRACK := $(value TRACK)
 override TORCH_INDEX := $(value TORCH_INDEX)
+override PART := $(value PART)
 override PYTHONS := $(value PYTHONS)
 override RESOLUTION := $(value RESOLUTION)
 PSFDAE_RESULTS := results$(if $(filter-out fast,$(PRESET)),/$(PRESET))
-export CORES PRESET SET TARGETS AGAINST PORT TRACK TORCH_INDEX PYTHONS RESOLUTION PSFDAE_RESULTS
+export CORES PRESET SET TARGETS AGAINST PORT TRACK TORCH_INDEX PART PYTHONS RESOLUTION PSFDAE_RESULTS
 SNAKEMAKE := snakemake --cores "$$CORES" --config preset="$$PRESET" set="$$SET"
 # -f: a target is no pattern of file names.
 LOCKED := set -f; sh workflow/locked.sh $(SNAKEMAKE)
@@ -67,11 +70,13 @@ REPORTED = all \
   $(if $(wildcard $(PSFDAE_RESULTS)/figures/own_stars/strip.png),from_stars_example)
 # The 24 × 24 trainings take longest; started last, one would run alone in the end.
 LONGEST_FIRST := $(if $(strip $(TARGETS)),,--prioritize scene2)
-FAST_TESTS := env OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 pytest -m "not slow and not written" \
-  --numprocesses logical --maxprocesses 4 --dist worksteal
+# The tests of a file on one worker, the smoke run first (tests/conftest.py).
+PYTEST := env OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 pytest --numprocesses logical \
+  --maxprocesses 4 --dist loadgroup --no-loadscope-reorder
+FAST_TESTS := $(PYTEST) -m "not slow and not written"
 
 .DEFAULT_GOAL := help
-.PHONY: help env reproduce report mlflow reference docs site test test-all test-docs test-pythons lint format lock clean \
+.PHONY: help env reproduce report mlflow reference docs site test nightly test-all test-light test-docs test-pythons lint format lock clean \
   benchmark stability bounds training_knee bundles shipped
 
 help: ## List the targets
@@ -149,8 +154,13 @@ format: env ## Format Python and Snakemake files
 test: lint ## Lint, unit tests and the smoke workflow
 	$(FAST_TESTS) --junitxml results/tests.xml
 
-test-all: test ## The tests, then the slow ones
-	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 pytest -m slow --numprocesses 2 --dist loadfile
+nightly: env ## The slow tests; PART=3/7: the third seventh of their files
+	$(PYTEST) -m slow $${PART:+--part "$$PART"}
+
+test-all: test nightly ## The tests, then the slow ones
+
+test-light: env ## The commands and Python lines of the pages in a plain installation
+	$(PYTEST) -m slow tests/test_light_install.py
 
 test-docs: env ## Every command of README and docs as it is written
 	pytest -m written

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
-
 import numpy as np
 import pytest
 
@@ -22,8 +20,33 @@ from psfdae_paper.configuration.alignment import CHOICE
 from psfdae_paper.configuration.compose import load
 from workflow_runs import snakemake
 
-FINISHED = ".built"
-"""File in the folder of the smoke run once it is whole."""
+
+def pytest_addoption(parser):
+    help_text = "K/N: only the tests of every N-th file, from the K-th on; K = 1 … N"
+    parser.addoption("--part", metavar="K/N", help=help_text)
+
+
+def pytest_itemcollected(item):
+    """One worker runs all tests of a file, and one all that need the smoke run.
+
+    What a module or the session builds for its tests is built once, and no worker waits for the
+    smoke run of another.
+    """
+    group = "smoke" if "smoke" in item.fixturenames else item.path.stem
+    item.add_marker(pytest.mark.xdist_group(group))
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(config, items):
+    """Keep the files of a part, and begin with the tests that need the smoke run, the longest."""
+    if part := config.getoption("--part"):
+        first, parts = map(int, part.split("/"))
+        if not 1 <= first <= parts:
+            raise pytest.UsageError(f"--part {part}: expected K/N with K = 1 … N")
+        files = sorted({item.path for item in items})[first - 1 :: parts]
+        config.hook.pytest_deselected(items=[item for item in items if item.path not in files])
+        items[:] = [item for item in items if item.path in files]
+    items.sort(key=lambda item: "smoke" not in item.fixturenames)
 
 
 @pytest.fixture(scope="session")
@@ -78,21 +101,11 @@ def grid(tracer):
 
 
 @pytest.fixture(scope="session")
-def smoke(tmp_path_factory, worker_id):
-    """Folder of the whole DAG on tiny sizes, made by one process of the tests for all."""
-    if worker_id == "master":
-        return built(tmp_path_factory.mktemp("smoke"))
-    shared = tmp_path_factory.getbasetemp().parent / "smoke"
-    with shared.with_suffix(".lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        return shared if (shared / FINISHED).exists() else built(shared)
-
-
-def built(folder):
-    folder.mkdir(exist_ok=True)
+def smoke(tmp_path_factory):
+    """Folder of the whole DAG on tiny sizes, read only."""
+    folder = tmp_path_factory.mktemp("smoke")
     snakemake(folder)
     assert (folder / "results/runtime.csv").is_file()
-    (folder / FINISHED).touch()
     return folder
 
 

@@ -39,7 +39,7 @@ TINY = {
 """What makes a command quick; one that is not here has no handler."""
 
 TESTED_ELSEWHERE = {
-    "docs/first_session.md": "test_wheel.py",
+    "docs/first_session.md": "test_light_install.py",
     "docs/own_stars.md": "test_from_stars.py",
     "docs/own_telescope.md": "test_own_telescope.py",
     "docs/tutorial.md": "test_from_stars.py",

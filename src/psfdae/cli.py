@@ -31,7 +31,7 @@ from typing import (
 
 import click
 
-from psfdae.errors import Error, missing
+from psfdae.errors import Error, install_line, missing
 from psfdae.joined import joined
 from psfdae.version import __version__
 
@@ -136,16 +136,22 @@ class Commands(Careful):
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """List the commands with the first sentence of their help, from the modules' text."""
-        names = [f"{self.prefix} {word}".strip() for word in self.list_commands(ctx)]
-        width = formatter.width - 6 - max(map(len, names))
-        with formatter.section("Commands"):
-            formatter.write_dl([(n.split()[-1], _shortened(_about(n), width)) for n in names])
+        words = self.list_commands(ctx)
+        listed = {"Commands": words} if self.prefix else sections(words)
+        width = formatter.width - 6 - max(map(len, words))
+        for heading, commands in listed.items():
+            with formatter.section(heading):
+                names = [f"{self.prefix} {word}".strip() for word in commands]
+                formatter.write_dl([(n.split()[-1], _shortened(_about(n), width)) for n in names])
+        if absent := len(words) - sum(map(len, listed.values())):
+            formatter.write_paragraph()
+            formatter.write_text(f'{absent} more with the extra "paper": {install_line("paper")}')
 
 
 @click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__)
 def main() -> None:
-    """PSF modelling with a denoising autoencoder, one command per stage.
+    """Model the PSF of astronomical images, and reproduce the paper on denoising autoencoders.
 
     OVERRIDES are words group.key=value, such as train.lr=1e-3; with the extra "paper" also
     choices of files of the config folder, such as dataset=dataset5.
@@ -167,6 +173,29 @@ def found() -> dict[str, tuple[str, Path]]:
 
 def _packages() -> list[str]:
     return [OWN, *(point.value for point in joined("commands"))]
+
+
+def sections(words: Sequence[str]) -> dict[str, list[str]]:
+    """Return those first words of commands that this installation can run, below their headings.
+
+    The packages' `SECTIONS` say what stands where, and their `REQUIRED` which module a command
+    needs; what is in no section is a stage of the paper's.
+    """
+    headings: dict[str, list[str]] = {}
+    required: dict[str, str] = {}
+    for package in map(import_module, _packages()):
+        for heading, commands in getattr(package, "SECTIONS", {}).items():
+            headings.setdefault(heading, []).extend(commands)
+        required |= getattr(package, "REQUIRED", {})
+    placed = {word for commands in headings.values() for word in commands}
+    headings["The paper's stages"] = [word for word in words if word not in placed]
+
+    def runs(word: str) -> bool:
+        module = required.get(word, "" if word in placed else required.get("*", ""))
+        return word in words and (not module or find_spec(module) is not None)
+
+    available = {heading: list(filter(runs, names)) for heading, names in headings.items()}
+    return {heading: commands for heading, commands in available.items() if commands}
 
 
 @cache

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib.metadata import PackageNotFoundError, requires
+from importlib.metadata import PackageNotFoundError, distribution, requires
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
 
 
 class Error(Exception):
@@ -48,12 +51,28 @@ def needed_by(what: str) -> Iterator[None]:
 
 
 def missing(error: ModuleNotFoundError, what: str) -> str | None:
-    """One line that says what to install for `what`; None if no extra brings the module."""
-    found = _source(error.name or "")
-    if found is None:
+    """Return the line that says what to install for `what`; None if no extra brings the module."""
+    requirement = _source(error.name or "")
+    if requirement is None:
         return None
-    package, extra = found
-    return f'{what} needs {package}: pip install "psfdae[{extra}]"'
+    package, extra = requirement
+    return f"{what} needs {package}: {install_line(extra)}"
+
+
+def install_line(extra: str) -> str:
+    """Return the command that installs psfdae with an extra, from where it was installed.
+
+    psfdae is on no package index: pip needs the folder or wheel that it was installed from, which
+    it has noted in direct_url.json (PEP 610).
+    """
+    try:
+        note = json.loads(distribution("psfdae").read_text("direct_url.json") or "{}")
+    except (PackageNotFoundError, ValueError):
+        note = {}
+    place = urlsplit(note.get("url", ""))
+    if place.scheme == "file" and (path := Path(unquote(place.path))).exists():
+        return f'pip install "{path}[{extra}]"'
+    return f'pip install ".[{extra}]" in the folder of psfdae\'s source'
 
 
 def _source(module: str) -> tuple[str, str] | None:

@@ -1,1 +1,11 @@
 """Commands of the library: each reads files, calls the functions of Python, and writes files."""
+
+SECTIONS = {
+    "Your images": ("from-stars", "predict", "photometry", "exposure", "psf"),
+    "Models": ("describe", "export"),
+    "Telescopes": ("wavefront",),
+}
+"""Headings of `psfdae --help` with the commands below each."""
+
+REQUIRED = {"export": "torch"}
+"""Modules of an extra without which a command cannot run, and is not listed."""

@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from traceback import walk_tb
 
 import numpy as np
 
@@ -59,18 +60,33 @@ _ONE_AT_A_TIME = threading.RLock()
 
 
 @contextmanager
-def reading(path: str | Path) -> Iterator[None]:
-    """Around calls of astropy on a file of unknown content: silent, and one kind of error.
-
-    Only such calls belong inside. On damaged files astropy raises a dozen kinds of
-    errors (struct, index, key, assertion, zlib, …) that no list would complete.
-    """
+def silent() -> Iterator[None]:
+    """Silence warnings, log messages and floating-point errors of libraries."""
     from astropy import log
 
     with _ONE_AT_A_TIME, warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")
         level = log.level
         log.setLevel("CRITICAL")
+        try:
+            yield
+        finally:
+            log.setLevel(level)
+
+
+@contextmanager
+def reading(path: str | Path) -> Iterator[None]:
+    """Silence libraries while they read a file, and turn what they raise about it into one error.
+
+    Libraries raise a dozen kinds of errors on damaged files (struct, index, key, assertion, zlib,
+    …) that no list would complete; errors of the program itself pass as they are (`_is_bug`).
+
+    Raises
+    ------
+    ObservationError
+        If the file is missing, cannot be read or is damaged; it names the file.
+    """
+    with silent():
         try:
             yield
         except ObservationError:
@@ -84,7 +100,22 @@ def reading(path: str | Path) -> Iterator[None]:
         except MemoryError:
             raise ObservationError(path, "does not fit into memory") from None
         except Exception as error:
-            what = one_line(error)[:LONGEST] or type(error).__name__
-            raise ObservationError(path, f"damaged or of a wrong format ({what})") from error
-        finally:
-            log.setLevel(level)
+            if _is_bug(error):
+                raise
+            problem = one_line(error)[:LONGEST] or type(error).__name__
+            raise ObservationError(path, f"damaged or of a wrong format ({problem})") from error
+
+
+def _is_bug(error: Exception) -> bool:
+    """Return True if an error is one of the program or its installation, not of a file.
+
+    A package that is missing and a name that is not defined are no property of a file. Neither is
+    a wrong type, attribute, index or assertion in a line of psfdae's own; libraries raise these
+    on damaged files, in their own lines.
+    """
+    if isinstance(error, ImportError | NameError):
+        return True
+    if not isinstance(error, TypeError | AttributeError | LookupError | AssertionError):
+        return False
+    *_, (frame, _) = walk_tb(error.__traceback__)
+    return str(frame.f_globals.get("__name__", "")).partition(".")[0] == "psfdae"

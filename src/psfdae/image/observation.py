@@ -23,7 +23,7 @@ import numpy as np
 
 from psfdae.image.catalogue import Catalogue, Positions, as_catalogue
 from psfdae.image.detection import Sky, sky_of
-from psfdae.image.errors import ObservationError, reading, shorten
+from psfdae.image.errors import ObservationError, reading, shorten, silent
 from psfdae.image.fits_file import (
     INSTRUMENT_KEYS,
     READ_NOISE_KEYS,
@@ -277,7 +277,7 @@ class Source:
         """The stars of an image."""
         from astropy.table import Table
 
-        with reading(self.path):
+        with silent():
             table = Table(sky.stars(threshold))
         if len(table) == 0:
             raise ObservationError(self.path, f"no star {threshold:g} σ above the sky")
@@ -454,7 +454,7 @@ class Layers:
             if noise is not None:
                 sigma = self.sigma(noise[everything])
                 bad |= np.isnan(sigma)
-        with reading(self.image.path):
+        with silent():
             try:
                 return sky_of(image, bad, sigma, self.least_noise)
             except ValueError:  # nothing to measure the sky on
@@ -569,7 +569,7 @@ class Observation:
                 f"rows {one} and {other} are the same star; {len(pairs)} such pairs in all",
             )
         sky = self._layers.sky()
-        with reading(self.path):
+        with silent():
             column, row = central_pixel(self.positions.T)
             seen = int(sky.covered(column, row, SEEN).sum())
         if seen < 0.5 * known.size:

@@ -7,3 +7,12 @@ GROUPS = {
     "sweep": "Train many variants of a model and compare them (config/sweep).",
 }
 """Help of the first words of commands of two and three words."""
+
+SECTIONS = {
+    "Your images": ("example-field",),
+    "Telescopes": ("simulate",),
+}
+"""Headings of `psfdae --help` with the commands below each; all others are "The paper's stages"."""
+
+REQUIRED = {"simulate": "hydra", "*": "hydra"}
+"""Modules of an extra without which a command, or any other command (*), is not listed."""

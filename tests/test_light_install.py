@@ -1,0 +1,157 @@
+"""A plain `pip install` of the wheel, without extras, does what the pages on own images say."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from matplotlib.image import imread
+
+from docs_pages import FENCE, ROOT, read
+from fits_inputs import write_cube
+from prediction_stars import observe
+from workflow_runs import captured
+
+pytestmark = pytest.mark.slow
+
+PAGES = ("README", "docs/first_session", "docs/tutorial", "docs/own_stars", "docs/predict")
+PAGES += ("docs/python",)
+
+WITH_EXTRA = ("simulate", "train")
+"""Commands of these pages that need the extra `paper`; another environment runs them."""
+
+OTHER_PROGRAMS = ("make", "snakemake", "pip", "python3", ".")
+"""First words of lines that install psfdae or build the reproduction."""
+
+SMALL = {"example-field": "--side=700 --bright=60 --faint=80"}
+"""Options that make a command quick; the picture of the first session is of the full image."""
+
+EXAMPLE = "psfdae example-field --out image.fits --catalogue stars.csv"
+BEFORE = {
+    "README": EXAMPLE,
+    "docs/python": f"""{EXAMPLE}
+python - <<'END'
+import numpy as np
+from astropy.io import fits
+from astropy.table import Table
+image, table = fits.getdata("image.fits"), Table.read("stars.csv")
+place = np.stack([table["X_IMAGE"], table["Y_IMAGE"]], axis=1) - 1
+place = place[(abs(place - 350) < 300).all(axis=1)][:8]
+corners = np.rint(place).astype(int) - 8
+np.savez("cut.npz", xy=place, stamps=[image[y : y + 16, x : x + 16] for x, y in corners])
+END""",
+}
+"""Shell lines that make what the reader of a page has: an image with its list, and stamps."""
+
+LINES_BEFORE = {"docs/python": 'import numpy as np\nglobals().update(np.load("cut.npz"))\n'}
+"""Lines of Python before those of a page."""
+
+
+@pytest.fixture(scope="module")
+def light(tmp_path_factory):
+    """Folder `bin` of a fresh virtual environment with the wheel and what it requires."""
+    folder = tmp_path_factory.mktemp("light")
+    pip = [sys.executable, "-m", "pip"]
+    build = ["wheel", "--no-deps", "--no-build-isolation", "--wheel-dir", folder, ROOT]
+    subprocess.run([*pip, *build], check=True, cwd=folder)
+    subprocess.run([sys.executable, "-m", "venv", folder / "venv"], check=True)
+    if captured([*pip, "index", "versions", "click"]).returncode:
+        pytest.skip("pip reaches no index from which to install what the wheel requires")
+    (wheel,) = folder.glob("*.whl")
+    programs = folder / "venv/bin"
+    subprocess.run([programs / "python", "-m", "pip", "install", "--quiet", wheel], check=True)
+    return programs
+
+
+def run(light, folder, script):
+    """What a bash script prints in a folder, `psfdae` and `python` being the environment's."""
+    environment = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "VIRTUAL_ENV")}
+    environment["PATH"] = f"{light}{os.pathsep}{os.environ['PATH']}"
+    done = captured(["bash", "-euc", script], cwd=folder, env=environment)
+    assert done.returncode == 0, f"{script}\n{done.stdout}{done.stderr}"
+    return done.stdout
+
+
+def script_of(page):
+    """The shell and Python blocks of a page as one bash script, in their order."""
+    lines = BEFORE.get(page, "").splitlines()
+    session = LINES_BEFORE.get(page, "")
+    for _, language, body in FENCE.findall(read(f"{page}.md")):
+        if language == "python":
+            # Python blocks of a page are one session, but shell commands come between them.
+            lines += ["python - <<'END'", session, body, "END"]
+        if language == "sh":
+            lines += body.splitlines()
+    return "\n".join(filter(None, (shell_line(line, page) for line in lines)))
+
+
+def shell_line(line, page):
+    """A line of a script, made quick; one that needs an extra is run in this environment."""
+    words = shlex.split(line, comments=True) if re.match(r"[\w.]+ ", line) else []
+    if not words or words[0] not in ("psfdae", *OTHER_PROGRAMS):
+        return line
+    if words[0] in OTHER_PROGRAMS:
+        return ""
+    if words[1] in WITH_EXTRA:
+        return f"{shlex.quote(sys.executable)} -m {line}"
+    small = SMALL.get(words[1], "") if page != "docs/first_session" else ""
+    sparse = "cp image.fits sparse.fits\n" if "sparse.fits" in words[:4] else ""
+    return f"{sparse}{line} {small}"
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_commands_and_python_lines_of_a_page_run_without_extras(light, page, tmp_path):
+    script = script_of(page)
+    assert "psfdae" in script
+    run(light, tmp_path, script)
+    if page == "README":
+        # The four lines of Python and the command make the same model.
+        models = [tmp_path / f"{place}image.psf.safetensors" for place in ("", "model/")]
+        assert models[0].read_bytes() == models[1].read_bytes()
+        assert (tmp_path / "page.html").stat().st_size > 10_000
+    if page == "docs/first_session":
+        drawn, shown = (
+            imread(folder / "first_session.png") for folder in (tmp_path, ROOT / "docs/figures")
+        )
+        assert drawn.shape == shown.shape and np.abs(drawn - shown).mean() < 0.01
+
+
+def test_environment_is_small_and_holds_no_extra(light, tmp_path):
+    blocks = sum(path.lstat().st_blocks for path in light.parent.rglob("*"))
+    assert blocks * 512 < 700e6  # bytes on the disk; torch alone takes as much
+    names = ("torch", "hydra", "mlflow", "pyarrow", "snakemake")
+    code = f"import importlib.util as u; print([n for n in {names} if u.find_spec(n)])"
+    assert run(light, tmp_path, f'python -c "{code}"') == "[]\n"
+
+
+def test_help_lists_what_works_here_and_names_the_extra_for_the_others(light, tmp_path):
+    lines = run(light, tmp_path, "psfdae --help")
+    for heading in (
+        "Your images:",
+        "Models:",
+        "Telescopes:",
+        'with the extra "paper": pip install',
+    ):
+        assert heading in lines
+    assert "from-stars" in lines and "snakemake" not in lines and "  train " not in lines
+    refusal = run(light, tmp_path, "psfdae train --stars a.h5 --out b 2>&1 || test $? = 2")
+    assert re.fullmatch(
+        r'psfdae: this command needs hydra-core: pip install ".*\.whl\[paper\]"\n', refusal
+    )
+
+
+def test_shipped_model_predicts_what_it_does_here(light, tmp_path, field_psfs, shipped):
+    observed = observe(field_psfs[:64], 0.002)
+    scale = shipped.info.pixel_scale_arcsec
+    write_cube(tmp_path / "stars.fits", observed.stamps, PIXSCALE=scale)
+    run(light, tmp_path, "psfdae predict stars.fits --out psf.fits")
+    psf = fits.getdata(tmp_path / "psf.fits", "PSF")
+    np.testing.assert_allclose(psf, shipped.predict(observed.stamps).psf, rtol=1e-3, atol=1e-2)
+    # Better than the noisy star by five in the mean squared error.
+    assert np.square(psf / observed.flux - observed.truth).mean() < observed.noise**2 / 5
