@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import shutil
 
 import pytest
 import yaml
@@ -50,8 +51,9 @@ def test_every_network_has_its_curve_and_its_errors(results):
     assert len({record.content_hash for record in records.values()}) == len(WEIGHTS)
 
 
-def test_importing_twice_changes_nothing(results, tmp_path):
+def test_importing_twice_changes_nothing(results, empty_database, tmp_path):
     receipt = tmp_path / "receipt.csv"
+    shutil.copy(empty_database, results / "mlflow.db")
     for action in ("created", "unchanged"):
         track.track(results, "fast", results / "mlflow.db", receipt, alignment=True)
         rows = list(csv.DictReader(receipt.open()))

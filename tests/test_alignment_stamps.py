@@ -101,15 +101,11 @@ def test_period_sampling_integrates_pixels_exactly(tracer, exact, config):
 
 
 @pytest.mark.parametrize("product_cost", [0.0, np.inf])
-@pytest.mark.parametrize("kind", ["points", "period"])
+@pytest.mark.parametrize("kind", [PointSampling, PeriodSampling])
 def test_derivatives_by_coefficients_are_differences(kind, product_cost):
     """By products of polynomials, and each direction by itself."""
     pupil = annular_pupil(48, 0.3)
-    sampling = (
-        PointSampling(pupil, 8, 2.0, "complex128")
-        if kind == "points"
-        else PeriodSampling(pupil, 8, 2.0, "complex128")
-    )
+    sampling = kind(pupil, 8, 2.0, "complex128")
     sampling.product_cost = product_cost
     modal = ModalStamps(pupil, partial(centred_modes, 11, 0.3), sampling, 2.0)
     rng = np.random.default_rng(0)
@@ -147,7 +143,7 @@ def test_configured_precision_and_threads(model, operator, config, exact):
     assert slopes == pytest.approx(truth, abs=5e-3 * np.abs(truth).max())
 
 
-def test_every_stamp_of_the_range_holds_its_light(operator, tracer, grid):
+def test_every_stamp_of_the_range_holds_its_light(operator, grid):
     """At least 0.99 in the corners of the range, where the images are widest."""
     states, zernikes = grid
     corners = (np.abs(states) == 1).all(axis=1)
@@ -156,20 +152,16 @@ def test_every_stamp_of_the_range_holds_its_light(operator, tracer, grid):
     assert stamps.sum(axis=(2, 3)) == pytest.approx(1, abs=1e-5)
 
 
-def test_stamp_that_loses_light_is_refused(config, model):
+def test_stamps_that_lose_light_or_alias_are_refused(config, model):
+    corner = model(np.ones((1, 4)))
     small = config.alignment.model_copy(update={"stamp_px": 8, "least_energy": 0.9})
     telescope = config.telescope.model_copy(update={"pixel_scale_arcsec": 0.25})
-    stamps = AlignmentStamps(telescope, config.optics, small)
     message = r"stamp \d+ holds 0\.\d+ of the light \(alignment\.least_energy = 0\.9\)"
     with pytest.raises(EnergyError, match=message):
-        stamps(model(np.ones((1, 4))))
-
-
-def test_coarse_pupil_is_refused(config, model):
-    optics = config.optics.model_copy(update={"pupil_samples": [64, 90]})
-    stamps = AlignmentStamps(config.telescope, optics, config.alignment)
+        AlignmentStamps(telescope, config.optics, small)(corner)
+    coarse = config.optics.model_copy(update={"pupil_samples": [64, 90]})
     with pytest.raises(SamplingError, match=r"pupil_samples = \[64, 90\]: wavefront \d+ needs N"):
-        stamps(model(np.ones((1, 4))))
+        AlignmentStamps(config.telescope, coarse, config.alignment)(corner)
 
 
 def test_chosen_grids_have_two_samples_per_wave_of_the_maps(operator, grid):
@@ -191,19 +183,6 @@ def test_settings_stay_within_the_error_budget(operator, exact, tracer, config):
     stamps, truth = (o(zernikes)[0] for o in (operator, exact))
     assert ((stamps - truth) ** 2).mean(axis=(2, 3)).max() < budget
     assert (np.abs(stamps - truth) / truth.max(axis=(2, 3), keepdims=True)).max() < 2e-3
-
-
-def test_mirrored_states_have_mirrored_stamps(operator, tracer):
-    """Columns run along the x, rows along the y of fields and decentres."""
-    state = np.array([0.5, -0.8, 0.3, 0.7])
-    mirrored_x = state * [-1, 1, 1, -1]
-    mirrored_y = state * [1, -1, -1, 1]
-    zernikes = tracer(np.stack([state, mirrored_x, mirrored_y]))
-    here, in_x, in_y = operator(zernikes)[0]
-    across_x, across_y = [0, 5, 4, 3, 2, 1, 8, 7, 6], [0, 1, 8, 7, 6, 5, 4, 3, 2]
-    assert in_x[across_x] == pytest.approx(here[:, :, ::-1], abs=1e-5)
-    assert in_y[across_y] == pytest.approx(here[:, ::-1], abs=1e-5)
-    assert np.abs(here - here[:, :, ::-1]).max() > 0.02
 
 
 def huygens_stamp(tracer, state, field, telescope, nodes=14, rays_across=160):
@@ -283,10 +262,3 @@ def test_against_poppy_fraunhofer(tracer, operator, config):
     for stamp, wave in zip(operator(zernikes)[0], zernikes, strict=True):
         theirs = poppy_stamp(wave, config.telescope)
         assert np.abs(stamp - theirs).max() < 1e-3 * stamp.max()
-
-
-@pytest.mark.slow
-def test_stamps_of_the_whole_grid_hold_the_light(operator, grid):
-    stamps, energy = operator(grid[1])
-    assert stamps.shape == (625, 9, 16, 16)
-    assert energy.min() >= 0.99

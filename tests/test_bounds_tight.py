@@ -25,15 +25,14 @@ def gaussian(assumed=1.0):
     """
     rng = np.random.default_rng(3)
     truth = rng.standard_normal((STARS, PIXELS))
-    seen = truth + 0.5 * rng.standard_normal((STARS, PIXELS))
+    noisy = truth + 0.5 * rng.standard_normal((STARS, PIXELS))
     noise = 0.25 * assumed
-    error = ((seen / (1.0 + noise) - truth) ** 2).mean(axis=1)
+    error = ((noisy / (1.0 + noise) - truth) ** 2).mean(axis=1)
     return error, np.full(STARS, noise / (1.0 + noise))
 
 
 def test_the_error_of_an_exact_posterior_mean_is_its_variance():
     error, variance = gaussian()
-    assert variance == pytest.approx(np.full(STARS, 0.2))
     assert error.mean() == pytest.approx(0.2, rel=0.05)
     assert abs(calibration(error, variance, FIELD)) < 2
 
@@ -66,9 +65,9 @@ def test_one_in_a_hundred_may_have_few_samples_or_none(few, missing, low):
     ess = np.full(STARS, 300.0)
     ess[:few] = 3.0
     mse[10 : 10 + missing] = np.nan
-    found = Evidence.of(mse, variance, ess, FIELD, last_change=0.0, undetected=0.0)
-    assert found.ess_low == low
-    assert found.tight == (low >= 10)
+    evidence = Evidence.of(mse, variance, ess, FIELD, last_change=0.0, undetected=0.0)
+    assert evidence.ess_low == low
+    assert evidence.tight == (low >= 10)
 
 
 def measured(mse, ess=300.0):
