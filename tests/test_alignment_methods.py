@@ -39,8 +39,8 @@ FIT = load(CHOICE).fit
 EXACT = FIT.model_copy(update={"iterations": 25, "tolerance": 1e-7})
 
 
-def _likelihood(model, operator, noise, level, emulator=None, kind=Likelihood):
-    return kind(partial(stamps_and_slopes, model, operator, emulator=emulator), noise, level)
+def _likelihood(model, operator, noise, level, emulator=None):
+    return Likelihood(partial(stamps_and_slopes, model, operator, emulator=emulator), noise, level)
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +65,7 @@ def exact_operator(config):
 
 @pytest.fixture(scope="module")
 def states():
-    return uniform_states(20, np.random.default_rng(5))
+    return uniform_states(30, np.random.default_rng(5))
 
 
 @pytest.fixture(scope="module")
@@ -167,7 +167,7 @@ def test_loss_that_is_not_finite_is_refused(config, tiny, tmp_path):
 
 @pytest.mark.parametrize("network", [CNN, PERCEPTRON])
 def test_networks_learn_states_from_clean_stamps(config, stamps, states, network, tmp_path):
-    training = _train(tmp_path / "x", config, 40, (stamps, states), 3, network)
+    training = _train(tmp_path / "x", config, 60, (stamps, states), 3, network)
     error = np.abs(predict_states(training.model, stamps) - states).mean()
     assert error < 0.7 * np.abs(states).mean()
 
@@ -205,14 +205,14 @@ def test_every_epoch_shows_every_state_once(config, states, stamps):
     once = sorted(states.astype(np.float32).tolist())
     assert sorted(first.tolist()) == sorted(second.tolist()) == once
     assert first.tolist() != second.tolist()
-    assert len(_batches(config, 8, data)) == 3
+    assert len(_batches(config, 8, data)) == 4
     # A batch of one has no variance to normalise.
-    assert len(_batches(config, 19, data)) == 1
+    assert len(_batches(config, 29, data)) == 1
 
 
 def test_every_field_shows_a_draw_of_its_own(config, states, stamps):
     draws = np.stack([stamps, -stamps, 3 * stamps]).astype(np.float32)
-    (images, truth), *_ = _batches(config, 20, TrainingStates(states, draws))
+    (images, truth), *_ = _batches(config, 30, TrainingStates(states, draws))
     order = [np.abs(states - state).sum(axis=1).argmin() for state in truth]
     factors = images.sum(axis=(2, 3)) / (256 * stamps[order].sum(axis=(2, 3)))
     number = np.round(factors)
@@ -266,19 +266,6 @@ def test_decentre_and_tilt_errors_are_correlated_with_the_signs_of_coma(
     assert np.abs(matrix[[0, 1, 2], [1, 3, 3]]).max() < 0.3
 
 
-def test_score_is_the_slope_of_the_likelihood(model, exact_operator, noise, states):
-    truth = states[:1]
-    stamps = exact_operator(model(truth))[0]
-    images = noise.draw(stamps, 0.005, np.random.default_rng(2))
-    likelihood = _likelihood(model, exact_operator, noise, 0.005)
-    score = likelihood.evaluate(images, truth)[1][0]
-    step = 1e-5
-    for axis in range(4):
-        move = step * np.eye(4)[axis]
-        plus, minus = (likelihood.evaluate(images, truth + s * move)[0][0] for s in (1, -1))
-        assert score[axis] == pytest.approx(-(plus - minus) / (4 * step), rel=1e-3, abs=1e-2)
-
-
 @pytest.mark.parametrize("movable", [False, True])
 def test_noise_free_parameters_are_recovered(model, config, noise, movable):
     """From 0.08 of the range aside; with flux and place free, those of another star, too."""
@@ -298,7 +285,7 @@ def test_noise_free_parameters_are_recovered(model, config, noise, movable):
 
 @pytest.mark.parametrize("movable", [False, True])
 def test_scatter_of_the_fit_is_the_bound(model, config, noise, states, stamps, movable):
-    """At low noise the estimator is efficient: χ² of 20 × 4 errors within its 99.9 % range."""
+    """At low noise the estimator is efficient: χ² of 30 × 4 errors within its 99.9 % range."""
     operator = _optics(config, movable)
     level = 2e-4
     images = noise.draw(stamps, level, np.random.default_rng(7))
@@ -307,46 +294,12 @@ def test_scatter_of_the_fit_is_the_bound(model, config, noise, states, stamps, m
     covariances = bound_covariances(model, operator, noise, [level], states, [movable])[0, 0]
     error = fit.parameters[:, :4] - states
     chi2 = np.einsum("nk,nkl,nl->", error, np.linalg.inv(covariances), error)
-    assert 45 < chi2 < 128
+    assert 75 < chi2 < 177
     # Pixels minus parameters, with the spread √(2 N) of χ².
     pixels, free = 9 * 16 * 16, 4 + 27 * movable
     assert (-2 * fit.height).mean() == pytest.approx(
-        pixels - free, abs=5 * np.sqrt(2 * pixels / 20)
+        pixels - free, abs=5 * np.sqrt(2 * pixels / 30)
     )
-
-
-class Uphill(Likelihood):
-    """Every step makes it worse, the shorter the less."""
-
-    def evaluate(self, images, states):
-        count, fisher = len(states), np.eye(4)
-        return (states**2).sum(axis=1), states, np.broadcast_to(fisher, (count, 4, 4)).copy()
-
-
-def test_a_step_that_damping_made_small_is_no_convergence(model, operator, noise, stamps):
-    start = np.array([[0.5, 0.5, 0.5, 0.5], [0.01, 0.01, 0.01, 0.01]])
-    settings = FIT.model_copy(update={"tolerance": 0.05})
-    fit = fit_states(
-        _likelihood(model, operator, noise, 0.002, kind=Uphill), stamps[:2], start, settings
-    )
-    assert fit.converged.tolist() == [False, True]
-    # A short step is taken without another look.
-    assert fit.parameters == pytest.approx(np.array([start[0], 2 * start[1]]))
-    assert fit.evaluations.tolist() == [13, 1]
-
-
-def test_slopes_by_flux_and_place_are_differences(model, config, noise, states):
-    movable, step = _optics(config, True, "complex128"), 1e-5
-    given = parameters_of(model, movable, states[:1])
-    given[0, 4:] = np.random.default_rng(4).uniform(-0.2, 0.2, 27)
-    _, slopes = stamps_and_slopes(model, movable, given)
-    for axis, field in ((0, 3), (4, 0), (8, 1), (9, 1), (30, 8)):
-        move = step * np.eye(31)[axis]
-        plus, minus = (stamps_and_slopes(model, movable, given + s * move)[0][0] for s in (1, -1))
-        column = axis if axis < 4 else 4 + (axis - 4) % 3
-        expected = (plus - minus) / (2 * step)
-        assert slopes[0, field, column] == pytest.approx(expected[field], abs=1e-7)
-        assert axis < 4 or not np.delete(expected, field, axis=0).any()
 
 
 def test_free_flux_and_place_cost_precision(model, config, operator, noise, states):
@@ -362,41 +315,13 @@ def test_free_flux_and_place_cost_precision(model, config, operator, noise, stat
     assert np.linalg.eigvalsh(free - fixed).min() > -1e-9
 
 
-@pytest.fixture(scope="module")
-def emulator(model, config, operator):
-    """Of all steps but the last, as the workflow makes it but for the states' numbers."""
-    train = uniform_states(config.alignment.train_states, np.random.default_rng(1))
-    return StampEmulator(model, operator, train, operator(model(train))[0], FIT)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("scale", "least", "most", "noisy"), [(1.0, 0.02, 0.05, 0.15), (1.1, 0.04, 0.3, 0.5)]
-)
-def test_emulator_errs_by_a_part_of_a_standard_error(
-    model, operator, emulator, noise, scale, least, most, noisy
-):
-    """By what its stamps move a fit, and by what its slopes make noise of it."""
-    states = scale * uniform_states(150, np.random.default_rng(6))
-    stamps, slopes = stamps_and_slopes(model, operator, states)
-    emulated, emulated_slopes = emulator(states)
-    _, score, fisher = deviance_and_information(noise, 0.002, emulated, stamps, slopes)
-    covariance = np.linalg.inv(fisher)
-    sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-    shift = np.einsum("nkl,nl->nk", covariance, score) / sigma
-    assert least < np.sqrt(np.mean(shift**2)) < most
-    assert np.median(np.abs(shift)) < 0.05
-    assert np.abs(shift).max() < 1.0
-    off = emulated_slopes - slopes
-    spread = deviance_and_information(noise, 0.002, emulated, stamps, off)[2]
-    wander = np.sqrt(np.einsum("nkl,nlk->n", spread, covariance))
-    assert 0.05 < np.median(wander) < noisy
-
-
 @pytest.mark.slow
 def test_last_step_reaches_the_maximum_of_the_exact_optics(
-    model, operator, emulator, noise, states, stamps
+    model, operator, config, noise, states, stamps
 ):
+    """Of all steps but the last an emulator, as the workflow makes it, gives the stamps."""
+    train = uniform_states(config.alignment.train_states, np.random.default_rng(1))
+    emulator = StampEmulator(model, operator, train, operator(model(train))[0], FIT)
     level = 0.002
     images = noise.draw(stamps, level, np.random.default_rng(8))
     last, exact = (_likelihood(model, operator, noise, level, e) for e in (emulator, None))
@@ -425,29 +350,6 @@ def test_emulator_of_few_states(model, operator, states, stamps):
     expected = (emulator(asked + step)[0] - emulator(asked - step)[0]) / 2e-3
     off = np.abs(emulator(asked)[1][:, :, 2] - expected)
     assert off.max() < 0.1 * np.abs(expected).max()
-
-
-def test_start_far_beyond_the_range_is_safe(model, operator, noise, stamps):
-    images, start = stamps[:2], np.array([[9.0, -9.0, 9.0, -9.0], [1.25, 1.25, 1.25, 1.25]])
-    likelihood = _likelihood(model, operator, noise, 0.005)
-    fit = fit_states(likelihood, images, start, FIT)
-    before = likelihood.evaluate(images, np.clip(start, -FIT.limit, FIT.limit))[0]
-    assert np.abs(fit.parameters).max() <= FIT.limit
-    assert ((-2 * fit.height) < before).all()
-
-
-def test_twin_keeps_the_coma_and_turns_the_tilt(model, config):
-    noll = np.arange(4, 23)
-    state = np.array([[-0.36, 0.29, 0.20, 0.25]])
-    twin = twin_states(model, state, noll)
-    assert twin[:, 2:] == pytest.approx(-state[:, 2:])
-    coma = model.coefficients[:, 1:5][:, :, np.isin(noll, (7, 8))].mean(axis=0)
-    assert (twin - state) @ coma == pytest.approx(0, abs=1e-12)
-    assert twin_states(model, twin, noll) == pytest.approx(state)
-    line = coma_free_decentre(model, state[:, 2:], noll)
-    assert twin_states(model, np.hstack([line, state[:, 2:]]), noll)[0, :2] == pytest.approx(
-        -line[0]
-    )
 
 
 @pytest.mark.parametrize("movable", [False, True])

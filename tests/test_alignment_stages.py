@@ -1,4 +1,4 @@
-"""Stages of scene 3 by the command line, on tiny sizes: states, networks, tables, figures."""
+"""Scene 3 by its workflow, on tiny sizes: states, networks, tables, runs, and refusals."""
 
 from __future__ import annotations
 
@@ -6,23 +6,17 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from command_line import psfdae, refused
-from psfdae.files import read_product
-from psfdae_paper.configuration.aligners import (
-    ALIGNERS,
-    ESTIMATORS,
-    FITTED,
-    LEARNED,
-    TRAINED,
-    of_set,
-)
+from command_line import psfdae
+from psfdae.files import ProductError, read_product
+from psfdae_paper.configuration.aligners import ALIGNERS, ESTIMATORS, LEARNED
 from psfdae_paper.configuration.alignment import CHOICE
 from psfdae_paper.configuration.compose import load, load_stage, overrides_for
 from psfdae_paper.evaluation import alignment_tables
 from psfdae_paper.stages.alignment import states
-from psfdae_paper.stages.alignment_results import read_bounds
+from psfdae_paper.tracking import WEIGHTS, runs_of_alignment
 
-PRESET = ("preset=smoke", "alignment.grid_levels=2")
+pytestmark = pytest.mark.workflow
+
 TRAINING = ("--states=x.h5", "--checkpoint=c", "--out=o")
 
 
@@ -68,90 +62,34 @@ def test_measured_correlations_are_those_predicted():
     assert pooled.ci_low[3] < -0.75 < pooled.ci_high[3]
 
 
-def _run(*arguments):
-    result = psfdae("alignment", *arguments)
-    assert result.exit_code == 0, result.output
-
-
 @pytest.fixture(scope="module")
-def products(tmp_path_factory):
-    """Model, states and key figures."""
-    at = tmp_path_factory.mktemp("scene3")
-    model = ("--model", at / "model.h5")
-    _run("model", "--out", at / "model.h5", *PRESET)
-    for kind in ("grid", "uniform", "train"):
-        given = model if kind == "train" else ()
-        _run("states", "--set", kind, "--out", at / f"{kind}.h5", *given, *PRESET)
-    sets = ("--grid", at / "grid.h5", "--uniform", at / "uniform.h5")
-    _run("telescope", *model, *sets, "--out", at / "telescope.csv", *PRESET)
-    return at
+def results(smoke):
+    return smoke / "results"
 
 
-@pytest.fixture(scope="module")
-def tables(products):
-    """Networks, estimates, fits and bounds of the uniform states, and their tables."""
-    at = products
-    data = ("--grid", at / "grid.h5", "--train", at / "train.h5", "--checkpoint", at / "c")
-    _run("train-dae", *data, "--out", at / "dae", *PRESET)
-    for name in TRAINED:
-        given = ("--kind", name, "--states", at / f"{ALIGNERS[name].states}.h5")
-        given += ("--dae", at / "dae") if ALIGNERS[name].denoised else ()
-        _run("train-network", *given, "--checkpoint", at / "c", "--out", at / name, *PRESET)
-    networks = [w for n in ("dae", *TRAINED) for w in (f"--{n.replace('_', '-')}", at / n)]
-    test = ("--set", "uniform", "--states", at / "uniform.h5")
-    model = ("--model", at / "model.h5")
-    times = ("--times", at / "estimates.csv")
-    _run("estimate", *test, *networks, "--out", at / "estimates.h5", *times, *PRESET)
-    _run("bound", *test, *model, "--out", at / "bound.h5", *PRESET)
-    given = ["--estimates", at / "estimates.h5", "--bound", at / "bound.h5"]
-    fit = ("fit", *test, *model, "--train", at / "train.h5", "--network", at / "noise_trained")
-    for level in ("0.002", "0.005"):
-        out = at / f"fit_{level}.h5"
-        outputs = ("--out", out, "--times", out.with_suffix(".csv"))
-        _run(*fit, "--level", level, *outputs, *PRESET, "fit.iterations=1")
-        given += ["--fit", out]
-    out = ("--errors", at / "errors.csv", "--correlation", at / "correlation.csv")
-    _run("tables", "--states", at / "uniform.h5", *given, *out)
-    return at
+def alignment_table(results, name):
+    return pd.read_csv(results / f"tables/alignment_{name}.csv")
 
 
-def test_sets_of_states(products):
+def test_sets_of_states(results):
     grid, uniform, train = (
-        read_product(products / f"{name}.h5", "alignment_states")
+        read_product(results / f"data/alignment/{name}.h5", "alignment_states")
         for name in ("grid", "uniform", "train")
     )
-    assert sorted(set(grid["states"].ravel())) == [-1, 1]
+    assert sorted(set(grid["states"].ravel())) == [-1, 0, 1]
     assert train["zernikes"].shape == (40, 9, 19)
     assert np.abs(train["states"]).max() <= 1
     assert not np.isin(uniform["states"], train["states"]).any()
-    for product, count in ((grid, 16), (uniform, 12), (train, 40)):
+    for product, count in ((grid, 81), (uniform, 12), (train, 40)):
         assert product["stamps"].shape == (count, 9, 16, 16)
         assert product["stamps"].dtype == np.float32
         assert product["stamps"].sum(axis=(2, 3)) == pytest.approx(1, abs=1e-5)
         assert product["unit"] == pytest.approx([1e-3, 1e-3, *np.deg2rad([0.1, 0.1])])
         assert product["noll"].tolist() == list(range(4, 23))
-        assert product.config["seed"] == 20200611
 
 
-def _states_config(*overrides):
-    return load_stage(states.stage.settings.reads, (*CHOICE, *PRESET, *overrides))
-
-
-def test_model_and_rays_give_the_same_training_stamps(products, tmp_path):
-    states(_states_config(), "train", tmp_path / "traced.h5")
-    traced, modelled = (
-        read_product(path, "alignment_states")
-        for path in (tmp_path / "traced.h5", products / "train.h5")
-    )
-    assert (traced["states"] == modelled["states"]).all()
-    assert np.abs(traced["zernikes"] - modelled["zernikes"]).max() < 5e-4
-    assert modelled["stamps"] == pytest.approx(traced["stamps"], abs=1e-3)
-
-
-def test_key_figures(products):
-    table = pd.read_csv(products / "telescope.csv").set_index("quantity")
-    assert list(table.columns) == ["value", "unit"]
-    value = table["value"]
+def test_key_figures(results):
+    value = alignment_table(results, "telescope").set_index("quantity").value
     assert value["pixel"] == pytest.approx(7.27, abs=0.01)
     assert value["lambda_over_d"] == pytest.approx(0.0825, abs=1e-4)
     assert value["sensitivity_condition"] == pytest.approx(3.05, abs=0.02)
@@ -161,21 +99,25 @@ def test_key_figures(products):
     assert value["energy_least_uniform"] > 0.99
 
 
-def test_same_configuration_gives_the_same_bytes(products, tmp_path):
-    states(_states_config("optics.threads=1"), "uniform", tmp_path / "again.h5")
-    one, two = (
+def test_same_configuration_gives_the_same_bytes(results, tmp_path):
+    for name, override in (("again", "optics.threads=1"), ("other", "seed=1")):
+        words = (*CHOICE, "preset=smoke", override)
+        config = load_stage(states.stage.settings.reads, words)
+        states(config, "uniform", tmp_path / f"{name}.h5")
+    first, again, other = (
         read_product(path, "alignment_states")
-        for path in (tmp_path / "again.h5", products / "uniform.h5")
+        for path in (
+            results / "data/alignment/uniform.h5",
+            tmp_path / "again.h5",
+            tmp_path / "other.h5",
+        )
     )
-    assert all((one[name] == two[name]).all() for name in one.arrays)
-    states(_states_config("seed=1"), "uniform", tmp_path / "other.h5")
-    other = read_product(tmp_path / "other.h5", "alignment_states")
-    assert not np.isin(other["states"], one["states"]).any()
+    assert all((first[name] == again[name]).all() for name in first.arrays)
+    assert not np.isin(other["states"], first["states"]).any()
 
 
 @pytest.mark.parametrize(
-    ("preset", "states", "schedule"),
-    [("fast", 625, "onecycle"), ("paper", 625, "constant"), ("smoke", 12, "onecycle")],
+    ("preset", "states", "schedule"), [("paper", 625, "constant"), ("smoke", 12, "onecycle")]
 )
 def test_presets_reach_scene_3(preset, states, schedule):
     config = load((*CHOICE, f"preset={preset}"))
@@ -185,11 +127,11 @@ def test_presets_reach_scene_3(preset, states, schedule):
 
 def test_scene_3_keeps_its_telescope_where_a_whole_run_gets_another():
     given = ["preset=smoke", "noise.kappa=5", "train.lr=1e-3", "stars.count=9"]
-    given += ["telescope=wfsat_literal", "network_train@train_original=denoised", "trian.lr=1"]
-    kept = [word for word in given if word.split("=")[0] != "telescope"]
-    assert overrides_for([*given, "wavefront.coma=3"], CHOICE) == tuple(kept)
+    given += ["telescope=wfsat_literal", "network_train@train_original=denoised"]
     assert overrides_for(given) == tuple(given)
-    assert overrides_for(["optics.backend=torch"], list(CHOICE)) == ()
+    kept = [word for word in given if word != "telescope=wfsat_literal"]
+    assert overrides_for([*given, "optics.backend=torch"], CHOICE) == tuple(kept)
+    assert overrides_for(["trian.lr=1"], CHOICE) == ("trian.lr=1",)
 
 
 @pytest.mark.parametrize(
@@ -208,86 +150,78 @@ def test_scene_3_keeps_its_telescope_where_a_whole_run_gets_another():
 )
 def test_words_that_do_not_fit_scene_3_are_refused(words, message, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert message in refused(*words)
+    result = psfdae(*words)
+    assert result.exit_code == 2
+    assert message in result.output.splitlines()[-1]
     assert not list(tmp_path.glob("*.h5"))
 
 
-@pytest.mark.parametrize("stage", ["from-stars", "train", "alignment_estimate"])
-def test_groups_of_any_command_are_shown(stage):
-    result = psfdae("config", "--stage", stage)
-    assert result.exit_code == 0
-    assert "noise:" in result.output
-
-
-def test_tables_hold_every_method(tables):
-    errors = pd.read_csv(tables / "errors.csv")
-    noisy = errors[errors.noise_level > 0]
-    cells = noisy.groupby(["noise_level", "method"]).size()
-    assert (cells == 8).all()
-    assert set(noisy.method) == set(ALIGNERS) - {"cramer_rao_pooled"}
-    assert set(noisy.noise_level) == {0.002, 0.005}
-    clean = set(errors[errors.noise_level == 0].method)
-    assert clean == {"constant", *(method.name for method in LEARNED)}
-    correlation = pd.read_csv(tables / "correlation.csv")
-    assert len(correlation) == 16 * (2 * 8 + 4)
+def test_tables_hold_every_method(results):
+    """Flux and place are free for uniform states only."""
+    errors = alignment_table(results, "errors")
+    everyone = set(ALIGNERS) - {"cramer_rao_pooled"}
+    free = {name for name in everyone if name.endswith("_free")}
+    for (kind, level), rows in errors.groupby(["test_set", "noise_level"]):
+        assert (rows.groupby("method").size() == 8).all()
+        noisy = everyone if kind == "uniform" else everyone - free
+        clean = {"constant", *(method.name for method in LEARNED)}
+        assert set(rows.method) == (noisy if level else clean)
+    assert set(errors.noise_level) == {0, 0.002, 0.005}
+    correlation = alignment_table(results, "correlation")
     diagonal = correlation[correlation.parameter_a == correlation.parameter_b]
+    assert 4 * len(diagonal) == len(correlation)
     assert diagonal.correlation.to_numpy() == pytest.approx(1)
 
 
-def test_flux_and_place_are_free_for_uniform_states_only(products, tmp_path):
-    given = ("--set", "grid", "--states", products / "grid.h5", "--model", products / "model.h5")
-    _run("bound", *given, "--out", tmp_path / "bound.h5", *PRESET)
-    assert read_product(tmp_path / "bound.h5", "alignment_bound")["covariances"].shape[0] == 1
-    assert [key["method"] for key, _, _ in read_bounds([tmp_path / "bound.h5"])] == 2 * [
-        "cramer_rao"
-    ]
-    assert of_set(FITTED, "uniform") == FITTED
-    assert of_set(FITTED, "grid") == [ALIGNERS["max_likelihood"]]
-
-
-def test_paper_s_rows_stand_beside_ours(tables):
-    given = ("--errors", tables / "errors.csv", "--correlation", tables / "correlation.csv")
-    _run("paper-tables", *given, "--out", tables / "paper")
-    table = pd.read_csv(tables / "paper" / "alignment_paper_0.005.csv")
+def test_paper_s_rows_stand_beside_ours(results):
+    table = alignment_table(results, "paper_0.005")
     paper = table[(table.source == "paper") & (table.quantity == "mean")].set_index("method")
     assert paper.decenter_y.to_dict() == {"original": 0.802, "dae": 0.0262}
-    ours = table[(table.source == "psfdae") & (table.quantity == "variance")].set_index("method")
-    errors = pd.read_csv(tables / "errors.csv").query("noise_level == 0.005 and unit == 'range'")
+    ours = table.query("source == 'psfdae' and test_set == 'uniform' and quantity == 'variance'")
+    errors = alignment_table(results, "errors").query(
+        "test_set == 'uniform' and noise_level == 0.005 and unit == 'range'"
+    )
     variance = errors.query("method == 'dae' and parameter == 'tilt_x'").variance_abs.item()
-    assert ours.tilt_x["dae"] == pytest.approx(variance, rel=1e-4)
-    text = (tables / "paper" / "alignment_paper_correlation.md").read_text()
+    assert ours.set_index("method").tilt_x["dae"] == pytest.approx(variance, rel=1e-4)
+    text = (results / "tables/alignment_paper_correlation.md").read_text()
     assert "| 0.379 " in text
 
 
-def test_time_table(tables):
-    given = [f"--history={n}={tables / n}/history.csv" for n in ("dae", *TRAINED)]
-    given += [f"--times={tables / name}" for name in ("estimates.csv", "fit_0.002.csv")]
-    _run("time-table", *given, "--out", tables / "time.csv")
-    table = pd.read_csv(tables / "time.csv").set_index("method")
+def test_time_table(results):
+    table = alignment_table(results, "time").set_index("method")
     assert list(table.index) == [method.name for method in ESTIMATORS]
     assert table.training_seconds["dae"] >= table.training_seconds["original"]
-    assert table.states["max_likelihood"] == table.states["max_likelihood_free"] == 12
+    # Two noise levels of 81 and 12 states; with free flux and place of the latter alone.
+    assert table.states["max_likelihood"] == 2 * (81 + 12)
+    assert table.states["max_likelihood_free"] == 2 * 12
 
 
-@pytest.mark.parametrize("kind", ["predicted", "errors", "correlation", "stamps"])
-def test_figures_are_drawn(tables, kind):
-    fits = [f"--fit={tables / f'fit_{level}.h5'}" for level in ("0.002", "0.005")]
-    estimates = f"--estimates={tables / 'estimates.h5'}"
-    given = {
-        "predicted": [estimates, *fits],
-        "errors": [estimates, *fits, f"--bound={tables / 'bound.h5'}"],
-        "correlation": [f"--correlation={tables / 'correlation.csv'}"],
-        "stamps": [f"--states={tables / 'uniform.h5'}", f"--dae={tables / 'dae'}", *PRESET],
-    }[kind]
-    _run("figure", kind, *given, "--out", tables / f"{kind}.png")
-    assert (tables / f"{kind}.png").stat().st_size > 10_000
-
-
-def test_twin_is_closer_in_focus(tmp_path):
-    _run("figure", "twin", "--table", tmp_path / "twin.csv", "--out", tmp_path / "twin.png")
-    table = pd.read_csv(tmp_path / "twin.csv")
+def test_twin_is_closer_in_focus(results):
+    table = alignment_table(results, "twin")
     near = table[np.isclose(table.position, -1) & np.isclose(table.noise_level, 0.002)]
     chi2 = near.set_index("defocus_mm").chi2
     assert chi2[0.2] > 10 * chi2[0.0]
     at_the_state = table[np.isclose(table.position, 1)]
     assert at_the_state.chi2.to_numpy() == pytest.approx(0, abs=1e-6)
+
+
+def test_networks_as_runs_have_their_curves_and_errors(results, tmp_path):
+    errors = alignment_table(results, "errors").query(
+        "test_set == 'uniform' and noise_level == 0.002 and unit == 'range'"
+    )
+    tilt = errors[errors.parameter == "tilt_x"].set_index("method")
+    runs = {run.kind: run for run in runs_of_alignment(results)}
+    assert set(runs) == set(WEIGHTS)
+    assert len({run.content_hash for run in runs.values()}) == len(WEIGHTS)
+    for kind, run in runs.items():
+        values = {(point.name, point.epoch): point.value for point in run.points}
+        history = pd.read_csv(results / "alignment" / kind / "history.csv")
+        curve = "train_mse" if kind == "dae" else "loss"
+        assert values[curve, 2] == history[curve][1]
+        for name in ("mean_abs_error", "bias"):
+            assert values[f"uniform_tilt_x_{name}_0.002", 0] == tilt[name][kind]
+        assert run.end_ms - run.start_ms == pytest.approx(1000 * history.seconds.iloc[-1], abs=1)
+        assert "attempt" not in run.config
+        assert run.name == f"alignment {kind}"
+    with pytest.raises(ProductError, match="snakemake scene3"):
+        runs_of_alignment(tmp_path)

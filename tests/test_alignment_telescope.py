@@ -166,15 +166,6 @@ def test_weights_of_the_annulus_integrate_zernike_products():
     assert (basis**2) @ weights == pytest.approx((fine**2).mean(axis=(1, 2)), rel=1e-3)
 
 
-@pytest.mark.parametrize("highest", [22, 37])
-def test_points_of_the_annulus_are_their_own_mirror_images(highest):
-    x, y, _ = annulus_points(highest, 0.42)
-    points = np.stack([x, y], axis=1)
-    for mirrored in (points * [-1, 1], points[:, ::-1]):
-        off = np.linalg.norm(mirrored[:, None] - points, axis=2).min(axis=1)
-        assert off.max() < 1e-12
-
-
 @pytest.mark.parametrize(
     ("state", "message"),
     [
@@ -202,8 +193,6 @@ def test_vignetted_field_is_refused():
     [
         ("prescription.lenses.l1.back_vertex_m=-0.48", r"prescription\.lenses\.l1: thickness"),
         ("prescription.lenses.l2.front_vertex_m=-0.51", "from back of l1 to front of l2"),
-        ("prescription.best_focus_m=-0.6", "from back of l2 to best focus"),
-        ("prescription.secondary.vertex_m=-0.2", "primary to secondary"),
         ("~prescription.secondary.conic", r"prescription\.secondary\.conic: missing"),
         ("prescription.primary.radius_m=0", r"prescription\.primary\.radius_m"),
         ("alignment.stamp_px=15", r"alignment\.stamp_px = 15: .*multiple of 2"),

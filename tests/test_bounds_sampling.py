@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.stats import f as f_law
 from scipy.stats import multivariate_t
 
 from psfdae.optics.wavefronts import seidel_wavefronts
@@ -16,12 +15,10 @@ from psfdae_paper.bounds import sampling
 from psfdae_paper.bounds.posterior import Likelihood, jitters, merge
 from psfdae_paper.bounds.sampling import (
     FIELD,
-    SEARCH,
     TRUTH,
     Modes,
     StampModel,
     climb,
-    corners,
     recentred,
     sampled_sums,
     twins,
@@ -94,8 +91,8 @@ def modes(model, stars, noise):
     )
     likelihood = Likelihood.of(noise, LEVEL, stars[1])
     counts = likelihood.counts(stars[2])
-    found = climb(start, counts, likelihood, model)
-    return climb(found + twins(found, likelihood, model), counts, likelihood, model)
+    first = climb(start, counts, likelihood, model)
+    return climb(first + twins(first, likelihood, model), counts, likelihood, model)
 
 
 def sampled(model, modes, stars, noise, draws=2000):
@@ -106,26 +103,18 @@ def sampled(model, modes, stars, noise, draws=2000):
 
 
 def test_draws_have_the_posterior_mean_of_the_grid(model, modes, stars, noise, exact):
-    found = sampled(model, modes, stars, noise)
-    mean, share, told = exact
-    free = merge(found.free)
+    sums = sampled(model, modes, stars, noise)
+    mean, share, mean_in_field = exact
+    free, in_field = merge(sums.free), merge(sums.in_field)
     error = ((mean - stars[1].reshape(4, -1)) ** 2).mean()
     assert ((free.mean_image - mean) ** 2).mean() < 0.01 * error
-    assert ((merge(found.in_field).mean_image - told) ** 2).mean() < 0.01 * error
+    assert ((in_field.mean_image - mean_in_field) ** 2).mean() < 0.01 * error
     assert free.share / free.total[:, None, None] == pytest.approx(share, abs=0.03)
     # Fields in one direction can give nearly the same image.
     assert (share[:, 1].sum(axis=1) > 0.01).any()
-    assert (merge(found.in_field).share[:, 1:] == 0).all()
-    assert found.free_helped.mean_image == pytest.approx(free.mean_image, abs=1e-12)
-
-
-def test_effective_size_is_that_of_the_weights(model, modes, stars, noise):
-    found = sampled(model, modes, stars, noise, 400)
-    whole = merge(found.free).effective_size
-    assert (whole > 100).all()
-    assert (whole < 400 + len(modes.star) * 3).all()
-    parts = np.mean([part.effective_size for part in found.free], axis=0)
-    assert whole / parts == pytest.approx(np.full(4, len(found.free)), rel=0.4)
+    assert (in_field.share[:, 1:] == 0).all()
+    assert sums.free_helped.mean_image == pytest.approx(free.mean_image, abs=1e-12)
+    assert ((free.effective_size > 500) & (free.effective_size < 2100)).all()
 
 
 def test_same_streams_give_the_same_bytes_in_any_blocks(model, modes, stars, noise, monkeypatch):
@@ -138,8 +127,9 @@ def test_same_streams_give_the_same_bytes_in_any_blocks(model, modes, stars, noi
 
 def test_stamps_are_those_of_the_simulator(model, stars):
     z, truth, _, offset = stars
-    assert model.stamps(z, np.zeros(4, int), offset) == pytest.approx(truth, abs=1e-4)
-    assert ((model.stamps(z, np.zeros(4, int), offset) - truth) ** 2).mean() < 1e-9
+    stamps = model.stamps(z, np.zeros(4, int), offset)
+    assert stamps == pytest.approx(truth, abs=1e-4)
+    assert ((stamps - truth) ** 2).mean() < 1e-9
 
 
 def test_twins_give_the_same_image(model, noise):
@@ -186,7 +176,7 @@ def test_the_twin_of_a_mode_at_its_own_place_weighs_as_the_mode(model, noise):
         assert other.z[at] == pytest.approx(found.z, abs=0.1)
 
 
-def test_draws_have_the_density_of_students_t():
+def test_density_of_draws_is_students_t():
     rng = np.random.default_rng(5)
     factor = np.tril(rng.normal(0, 0.3, (2, 5, 5))) + np.eye(5)
     number, none = np.arange(2), np.zeros(2, int)
@@ -194,23 +184,13 @@ def test_draws_have_the_density_of_students_t():
     modes = replace(start, factor=factor)
     z, field = rng.normal(0, 3, (30, 5)), np.arange(30) % 2
     offset = np.where(np.arange(30) < 20, modes.offset[field].T, 7).T
-    found = modes.log_density(z, field, offset)
+    density = modes.log_density(z, field, offset)
     for mode in number:
         scale = factor[mode] @ factor[mode].T
         law = multivariate_t(modes.z[mode], scale, FREEDOM)
         there = (field == mode) & (np.arange(30) < 20)
-        assert found[mode, there] == pytest.approx(law.logpdf(z[there]), abs=1e-9)
-        assert (found[mode, ~there] == -np.inf).all()
-    draws, count = modes.draws(20_000, 0, rng)
-    for mode in number:
-        mine = draws.z[draws.field == mode]
-        assert len(mine) == count[mode] > 5000
-        whitened = np.linalg.solve(factor[mode], (mine - modes.z[mode]).T)
-        # The median of the squared distance of t is that of F, times the dimension.
-        expected = 5 * f_law(5, FREEDOM).median()
-        assert np.median((whitened**2).sum(axis=0)) == pytest.approx(expected, rel=0.05)
-        inside = np.cov(whitened[:, (whitened**2).sum(axis=0) < 2 * expected])
-        assert inside == pytest.approx(inside[0, 0] * np.eye(5), abs=0.06 * inside[0, 0])
+        assert density[mode, there] == pytest.approx(law.logpdf(z[there]), abs=1e-9)
+        assert (density[mode, ~there] == -np.inf).all()
 
 
 def aside(stars, model, noise, level, shift):
@@ -234,15 +214,6 @@ def test_stamps_beside_their_place_are_recentred(stars, model, noise):
         back += (found.offset == offset).all(axis=1).tolist()
     # A tilt and coma move an image nearly alike.
     assert np.mean(back) > 0.6
-
-
-def test_corners_lie_all_around_the_best_mode(stars, model, noise):
-    mode, *_ = aside(stars, model, noise, 1e-4, (0, 0))
-    starts = corners(mode, np.zeros(1, int))
-    assert len(starts.star) == 2**5 == len(np.unique(starts.z, axis=0))
-    assert np.abs(starts.z - mode.z) == pytest.approx(SEARCH.corner, rel=1e-12)
-    assert starts.z.mean(axis=0) == pytest.approx(mode.z[0], abs=1e-12)
-    assert not len(corners(mode, np.zeros(0, int)).star)
 
 
 def test_a_mode_undetected_with_the_field_given_shows(stars, model, noise):
