@@ -343,8 +343,8 @@ def test_emulator_of_few_states(model, operator, states, stamps):
     settings = FIT.model_copy(update={"outer_states": 5})
     emulator = StampEmulator(model, operator, states, stamps, settings)
     mirror = mirror_symmetries(8)[3]
-    known, slopes = emulator(mirror.states(states))
-    assert known == pytest.approx(mirror.stamps(stamps), abs=2e-3)
+    emulated, slopes = emulator(mirror.states(states))
+    assert emulated == pytest.approx(mirror.stamps(stamps), abs=2e-3)
     assert slopes.sum(axis=(-2, -1)) == pytest.approx(0, abs=1e-3)
     step, asked = 1e-3 * np.eye(4)[2], states[:4] * 0.9
     expected = (emulator(asked + step)[0] - emulator(asked - step)[0]) / 2e-3

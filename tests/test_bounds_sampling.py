@@ -77,18 +77,15 @@ def exact(model, stars, noise):
     weight = np.exp(scores - scores.max(axis=1, keepdims=True))
     weight /= weight.sum(axis=1, keepdims=True)
     share = weight.reshape(4, len(FIELDS), -1, 9).sum(axis=2)
-    own = np.where(np.repeat(field, 9) == 0, weight, 0.0)
-    return weight @ images, share, own @ images / own.sum(axis=1, keepdims=True)
+    inside = np.where(np.repeat(field, 9) == 0, weight, 0.0)
+    return weight @ images, share, inside @ images / inside.sum(axis=1, keepdims=True)
 
 
 @pytest.fixture(scope="module")
 def modes(model, stars, noise):
     """Modes found from one start in the right field, at no aberration."""
-    count, eye = 4, np.tile(np.eye(5), (4, 1, 1))
-    start = Modes(
-        *(np.arange(count), np.zeros(count, int), stars[3], np.zeros(count, int)),
-        *(np.zeros((count, 5)), eye, np.zeros(count)),
-    )
+    none = np.zeros(4, int)
+    start = Modes.at(np.arange(4), none, stars[3], none, np.zeros((4, 5)))
     likelihood = Likelihood.of(noise, LEVEL, stars[1])
     counts = likelihood.counts(stars[2])
     first = climb(start, counts, likelihood, model)
@@ -143,15 +140,13 @@ def test_twins_give_the_same_image(model, noise):
     assert images[1] == pytest.approx(images[0], abs=1e-5)
     odd = near * [-1, 1, -1, -1, 1]  # the even part negated
     assert wide.stamps(odd, np.array([0]), middle) == pytest.approx(images[0], abs=1e-5)
-    start = Modes(
-        *(np.zeros(1, int), np.zeros(1, int), middle, np.zeros(1, int)),
-        *(near, np.eye(5)[None], np.zeros(1)),
-    )
-    found = twins(start, Likelihood.of(noise, 1e-4, images[0]), wide)
-    there = (found.field == 1) & (found.offset == middle).all(axis=1)
-    assert found.z[there][0] == pytest.approx(far[0], abs=0.02)
+    none = np.zeros(1, int)
+    start = Modes.at(none, none, middle, none, near)
+    others = twins(start, Likelihood.of(noise, 1e-4, images[0]), wide)
+    there = (others.field == 1) & (others.offset == middle).all(axis=1)
+    assert others.z[there][0] == pytest.approx(far[0], abs=0.02)
     # A pixel aside is a tilt, which distortion can make up for where it is large.
-    assert len(found.star) > 1
+    assert len(others.star) > 1
 
 
 def test_the_twin_of_a_mode_at_its_own_place_weighs_as_the_mode(model, noise):
@@ -163,17 +158,17 @@ def test_the_twin_of_a_mode_at_its_own_place_weighs_as_the_mode(model, noise):
     images = wide.stamps(z, 2 * number, middle)
     likelihood = Likelihood.of(noise, 1e-4, images)
     start = Modes.at(number, 2 * number, middle, 0 * number, z)
-    found = climb(start, likelihood.counts(images), likelihood, wide)
+    modes = climb(start, likelihood.counts(images), likelihood, wide)
     for first in range(2):
         evidence = np.where(number == first, 100.0, 99.0)
-        both = replace(found, star=0 * number, evidence=evidence)
+        both = replace(modes, star=0 * number, evidence=evidence)
         other = twins(both, likelihood, wide)
         at = [
             np.flatnonzero((other.field == f) & (other.offset == o).all(axis=1))[0]
             for f, o in zip(2 * number, middle, strict=True)
         ]
         assert at[first] < at[1 - first]
-        assert other.z[at] == pytest.approx(found.z, abs=0.1)
+        assert other.z[at] == pytest.approx(modes.z, abs=0.1)
 
 
 def test_density_of_draws_is_students_t():
@@ -199,9 +194,10 @@ def aside(stars, model, noise, level, shift):
     noisy = noise.draw(truth, level, np.random.default_rng(7))
     likelihood = Likelihood.of(noise, level, truth)
     problem = (likelihood.counts(noisy), likelihood, model)
-    own = np.zeros(1, int)
-    start = Modes.at(own, own, offset + shift, np.full(1, FIELD), z)
-    return climb(start, *problem), Modes.at(own, own, offset, np.full(1, TRUTH), z), noisy, problem
+    none = np.zeros(1, int)
+    start = Modes.at(none, none, offset + shift, np.full(1, FIELD), z)
+    truth = Modes.at(none, none, offset, np.full(1, TRUTH), z)
+    return climb(start, *problem), truth, noisy, problem
 
 
 def test_stamps_beside_their_place_are_recentred(stars, model, noise):
@@ -210,8 +206,8 @@ def test_stamps_beside_their_place_are_recentred(stars, model, noise):
     counts, number, back = likelihood.counts(noisy), np.arange(len(z)), []
     for shift in set(jitters(1)) - {(0, 0)}:
         start = Modes.at(number, 0 * number, offset + shift, np.full(len(z), FIELD), z)
-        found = recentred(start, counts, likelihood, model)
-        back += (found.offset == offset).all(axis=1).tolist()
+        modes = recentred(start, counts, likelihood, model)
+        back += (modes.offset == offset).all(axis=1).tolist()
     # A tilt and coma move an image nearly alike.
     assert np.mean(back) > 0.6
 
@@ -227,9 +223,9 @@ def test_a_mode_undetected_with_the_field_given_shows(stars, model, noise):
     error = ((lost.in_field_helped.mean_image - stars[1][:1].reshape(1, -1)) ** 2).mean()
     assert error < 1e-7
     assert 0 < lost.in_field_helped.variance[0].mean() < 1e-7
-    found = sampled_sums(replace(right, given=np.full(1, FIELD)), *arguments)
-    assert found.in_field_helped.mean_image == pytest.approx(
-        merge(found.in_field).mean_image, abs=1e-9
+    sums = sampled_sums(replace(right, given=np.full(1, FIELD)), *arguments)
+    assert sums.in_field_helped.mean_image == pytest.approx(
+        merge(sums.in_field).mean_image, abs=1e-9
     )
 
 

@@ -114,19 +114,19 @@ def test_a_star_without_possible_samples_is_named_and_the_others_bounded(tmp_pat
     errors = 2 * mse
     mse[[5, 50]], errors[[5, 50]] = np.nan, 1e6
     tables = table_of(estimates(mse, mse))
-    known = mse[np.isfinite(mse)]
+    finite = mse[np.isfinite(mse)]
     for row in tables.summary:
         assert (row["n"], row["missing"], row["missing_stars"]) == (STARS - 2, 2, "1005 1050")
-        assert row["value"] == row["variance"] == pytest.approx(known.mean())
-        assert row["median"] == pytest.approx(np.median(known))
+        assert row["value"] == row["variance"] == pytest.approx(finite.mean())
+        assert row["median"] == pytest.approx(np.median(finite))
         assert row["tight"] == "yes"
     for row in compared(tables, tmp_path, errors).itertuples():
         assert row.n == STARS - 2
-        assert row.mse == pytest.approx(2 * known.mean(), rel=1e-5)
+        assert row.mse == pytest.approx(2 * finite.mean(), rel=1e-5)
         assert (row.median, row.median_bound) == pytest.approx(
-            (2 * np.median(known), np.median(known)), rel=1e-5
+            (2 * np.median(finite), np.median(finite)), rel=1e-5
         )
-        assert row.variance_bound == pytest.approx(known.mean(), rel=1e-5)
+        assert row.variance_bound == pytest.approx(finite.mean(), rel=1e-5)
         assert row.efficiency == pytest.approx(0.5, rel=1e-5)
 
 

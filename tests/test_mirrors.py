@@ -87,18 +87,6 @@ def test_detector_beyond_focus_sees_the_wavefront_ahead(name):
     assert change[FOCUS] == pytest.approx(expected, rel=0.01)
 
 
-def test_ritchey_chretien_has_the_conics_of_theory(ritchey):
-    """Both that remove spherical aberration and coma, and the paraxial focus."""
-    p = ritchey.aberrations.prescription
-    first = -1 - 2 * (1 + B) / (M**2 * (M - B))
-    second = -(((M + 1) / (M - 1)) ** 2) - 2 * M * (M + 1) / ((M - B) * (M - 1) ** 3)
-    assert (p.primary.conic, p.secondary.conic) == pytest.approx((first, second), abs=1e-5)
-    k = (1 + B) / (M + 1)
-    assert p.secondary.vertex_m == pytest.approx((1 - k) * 1.2, abs=1e-6)
-    assert p.secondary.radius_m == pytest.approx(2.4 * M * k / (M - 1), abs=1e-6)
-    assert p.best_focus_m == pytest.approx(-B * 1.2)
-
-
 def test_ritchey_chretien_has_no_third_order_coma(ritchey):
     """Its rest is that of fifth order; astigmatism is what theory leaves."""
     radius, opd = 0.5 * ritchey.diameter_m, zernikes(ritchey)

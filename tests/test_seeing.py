@@ -89,14 +89,6 @@ def test_blur_is_a_convolution(obscured, opd, profile):
     assert np.abs(sharp - expected).max() > 0.5 * expected.max()
 
 
-@pytest.mark.parametrize("profile", PROFILES)
-def test_light_of_the_image_is_conserved(obscured, opd, profile):
-    """Over the whole period of the image, 126 λ/D."""
-    light = BlurredPropagator(obscured, 63, 2.0, profile)(opd).sum()
-    assert light == pytest.approx(StampPropagator(obscured, 63, 2.0)(opd).sum(), rel=1e-4)
-    assert light == pytest.approx(1, abs=6e-3)
-
-
 def words_of(**seeing):
     """Overrides of a seeing of the example telescope."""
     return [OWN, "grid.points=3", *(f"++telescope.seeing.{k}={v}" for k, v in seeing.items())]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from scipy.special import jv
@@ -14,7 +12,7 @@ from psfdae.rng import stream
 from psfdae.settings import ConfigError
 from psfdae_paper.configuration.compose import load
 from psfdae_paper.stars.fields import square_grid
-from psfdae_paper.stars.scenes import TurbulenceScene
+from psfdae_paper.stars.scenes import template_wavefronts
 from psfdae_paper.stars.turbulence import (
     SPECTRUM,
     STRENGTH,
@@ -31,21 +29,8 @@ FLOAT64 = np.dtype(np.float64)
 
 def scene(points=20, **changes):
     """Wavefronts of scene 2; `changes` go to the group `wavefront`."""
-    wavefront = {
-        "kind": "von_karman",
-        "seed": 7,
-        "r0_m": R0,
-        "outer_scale_m": L0,
-        "layer_heights_m": list(HEIGHTS),
-        "layer_strengths": list(STRENGTHS),
-        "waves": 512,
-        "remove_tilt": True,
-    }
-    return TurbulenceScene(
-        SimpleNamespace(points=points, spacing_deg=14 / 60 / 19),
-        SimpleNamespace(diameter_m=1.0, obscuration=0.0),
-        SimpleNamespace(**(wavefront | changes)),
-    ).templates()
+    words = [f"wavefront.{key}={value}" for key, value in {"seed": 7, **changes}.items()]
+    return template_wavefronts(load(["dataset=dataset7", f"grid.points={points}", *words]))
 
 
 def waves(seed, r0=R0, highest=60.0):
