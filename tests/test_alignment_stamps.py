@@ -153,7 +153,7 @@ def test_chosen_grids_have_two_samples_per_wave_of_the_maps(operator, grid):
 def test_settings_stay_within_the_error_budget(operator, exact, model, config):
     """1 % of the smallest noise variance; within about 1e-3 of the peak as well."""
     budget = 0.01 * (config.noise.kappa * min(config.noise.levels)) ** 2
-    states = uniform_states(8, np.random.default_rng(7))
+    states = uniform_states(4, np.random.default_rng(7))
     (stamps, slopes), (truth, true_slopes) = (
         o.derivatives(model(states), model.jacobian(states)) for o in (operator, exact)
     )
