@@ -10,7 +10,6 @@ import torch
 from torch import nn
 
 from psfdae.networks.training import TrainingError, train
-from psfdae.settings import ConfigError
 from psfdae_paper.alignment.emulator import StampEmulator
 from psfdae_paper.alignment.fisher import (
     bound_covariances,
@@ -28,7 +27,6 @@ from psfdae_paper.alignment.networks import (
     NetworkTraining,
     TrainingStates,
     _scaled,
-    build_network,
     predict_states,
     training_of,
 )
@@ -41,8 +39,8 @@ FIT = load(CHOICE).fit
 EXACT = FIT.model_copy(update={"iterations": 25, "tolerance": 1e-7})
 
 
-def _likelihood(model, operator, noise, level, emulator=None, kind=Likelihood):
-    return kind(partial(stamps_and_slopes, model, operator, emulator=emulator), noise, level)
+def _likelihood(model, operator, noise, level, emulator=None):
+    return Likelihood(partial(stamps_and_slopes, model, operator, emulator=emulator), noise, level)
 
 
 @pytest.fixture(scope="module")
@@ -50,15 +48,19 @@ def config():
     return load(CHOICE)
 
 
+def _optics(config, movable, precision="complex64"):
+    optics = config.optics.model_copy(update={"precision": precision})
+    return AlignmentStamps(config.telescope, optics, config.alignment, movable)
+
+
 @pytest.fixture(scope="module")
 def operator(config):
-    return AlignmentStamps(config.telescope, config.optics, config.alignment)
+    return _optics(config, False)
 
 
 @pytest.fixture(scope="module")
 def exact_operator(config):
-    optics = config.optics.model_copy(update={"precision": "complex128"})
-    return AlignmentStamps(config.telescope, optics, config.alignment)
+    return _optics(config, False, "complex128")
 
 
 @pytest.fixture(scope="module")
@@ -76,19 +78,15 @@ def stamps(model, operator, states):
 
 def test_mirrored_states_have_the_mirrored_stamps(model, operator, states, stamps):
     symmetries = mirror_symmetries(8)
-    assert len(symmetries) == 8
+    images = [symmetry.states(states[:1]).tolist() for symmetry in symmetries]
+    assert len({str(image) for image in images}) == 8
+    # Six points on the ring do not map on themselves when x and y are exchanged.
+    assert len(mirror_symmetries(6)) == 4
     for symmetry in symmetries:
         expected = operator(model(symmetry.states(states[:3])))[0]
         # The fit of the quadratic model to rays is symmetric to 1e-6 waves.
         assert symmetry.stamps(stamps[:3]) == pytest.approx(expected, abs=1e-5)
         assert symmetry.state @ symmetry.state.T == pytest.approx(np.eye(4))
-
-
-def test_eight_symmetries_are_different(states, stamps):
-    images = [symmetry.states(states[:1]).tolist() for symmetry in mirror_symmetries(8)]
-    assert len({str(image) for image in images}) == 8
-    # Six points on the ring do not map on themselves when x and y are exchanged.
-    assert len(mirror_symmetries(6)) == 4
 
 
 # --- networks
@@ -111,13 +109,15 @@ def test_cnn_is_the_paper_s(config):
     assert not train.mirrors
 
 
-def test_learning_rate_falls_every_30_epochs(config):
-    training = _training(config, 31, _tiny())
+def test_learning_rate_falls_every_30_epochs(config, tiny):
+    training = _training(config, 31, tiny)
     rates = [training.run_epoch()["lr"] for _ in range(31)]
     assert rates == pytest.approx([1e-3 * 0.1 ** (epoch // 30) for epoch in range(31)])
 
 
-def _tiny():
+@pytest.fixture(scope="module")
+def tiny():
+    """Six made-up stamps and states."""
     rng = np.random.default_rng(0)
     return rng.random((6, 9, 16, 16), dtype=np.float32), rng.uniform(-1, 1, (6, 4))
 
@@ -136,9 +136,9 @@ def _train(path, *given, report=lambda row: None):
 
 
 @pytest.mark.parametrize("network", [CNN, PERCEPTRON])
-def test_training_is_deterministic_and_resumes_where_it_was(config, network, tmp_path):
-    whole, other, *_ = (
-        _train(tmp_path / str(seed), config, 4, _tiny(), seed, network) for seed in (3, 4)
+def test_training_is_deterministic_and_resumes_where_it_was(config, tiny, network, tmp_path):
+    whole, other_seed = (
+        _train(tmp_path / str(seed), config, 4, tiny, seed, network) for seed in (3, 4)
     )
 
     def interrupt(row):
@@ -146,37 +146,36 @@ def test_training_is_deterministic_and_resumes_where_it_was(config, network, tmp
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        _train(tmp_path / "c", config, 4, _tiny(), 3, network, report=interrupt)
-    seen = []
+        _train(tmp_path / "c", config, 4, tiny, 3, network, report=interrupt)
+    epochs = []
     resumed = _train(
-        *(tmp_path / "c", config, 4, _tiny(), 3, network),
-        report=lambda row: seen.append(row["epoch"]),
+        *(tmp_path / "c", config, 4, tiny, 3, network),
+        report=lambda row: epochs.append(row["epoch"]),
     )
-    assert seen == [3, 4]
+    assert epochs == [3, 4]
     assert [row["loss"] for row in resumed.history] == [row["loss"] for row in whole.history]
     for key, value in whole.result.items():
         assert torch.equal(value, resumed.result[key]), key
-    assert not torch.equal(whole.model.linear.weight, other.model.linear.weight)
+    assert not torch.equal(whole.model.linear.weight, other_seed.model.linear.weight)
 
 
-def test_training_refuses_what_is_not_finite(config, tmp_path):
-    stamps, states = _tiny()
-    message = r"the loss is nan at step 0 \(epoch 1\): lower train_test\.lr = 0\.001"
-    with pytest.raises(TrainingError, match=message):
+def test_loss_that_is_not_finite_is_refused(config, tiny, tmp_path):
+    stamps, states = tiny
+    with pytest.raises(TrainingError, match=r"nan at step 0 .*train_test\.lr"):
         _train(tmp_path / "x", config, 2, (stamps * np.nan, states))
 
 
 @pytest.mark.parametrize("network", [CNN, PERCEPTRON])
 def test_networks_learn_states_from_clean_stamps(config, stamps, states, network, tmp_path):
-    training = _train(tmp_path / "x", config, 60, (stamps, states), 3, network)
+    training = _train(tmp_path / "x", config, 45, (stamps, states), 3, network)
     error = np.abs(predict_states(training.model, stamps) - states).mean()
     assert error < 0.7 * np.abs(states).mean()
 
 
 def test_perceptron_sees_uncorrelated_numbers_of_variance_1(config, stamps, states):
     model = _training(config, 1, (stamps, states), network=PERCEPTRON).model
-    seen = np.concatenate([m.stamps(stamps) for m in mirror_symmetries(8)])
-    scaled = torch.from_numpy(seen).flatten(1) * stamps.shape[-1] ** 2
+    images = np.concatenate([m.stamps(stamps) for m in mirror_symmetries(8)])
+    scaled = torch.from_numpy(images).flatten(1) * stamps.shape[-1] ** 2
     features = ((scaled - model.mean) @ model.axes).numpy()
     assert np.cov(features.T) == pytest.approx(np.eye(10), abs=1e-3)
     assert features.mean(axis=0) == pytest.approx(np.zeros(10), abs=1e-3)
@@ -184,26 +183,6 @@ def test_perceptron_sees_uncorrelated_numbers_of_variance_1(config, stamps, stat
     kept = np.square(features / np.linalg.norm(model.axes.numpy(), axis=0)).sum()
     largest = np.linalg.svd(scaled.numpy() - model.mean.numpy(), compute_uv=False)[:10]
     assert kept == pytest.approx(np.square(largest).sum(), rel=1e-3)
-
-
-def test_configuration_names_what_is_wrong():
-    with pytest.raises(ConfigError, match=r"cnn: strides = \[1, 2\]: 5 widths need as many"):
-        load([*CHOICE, "cnn.strides=[1,2]"])
-    with pytest.raises(ConfigError, match=r"cnn: kernels = .* must be odd"):
-        load([*CHOICE, "cnn.kernels=[3,3,4,3,3]"])
-
-
-def test_weights_come_from_the_generator_alone(config):
-    def weights(seed):
-        generator = torch.Generator()
-        generator.manual_seed(seed)
-        return build_network(config.cnn, 9, 16, generator).linear.weight
-
-    torch.manual_seed(0)
-    first = weights(1)
-    torch.manual_seed(9)
-    assert torch.equal(first, weights(1))
-    assert not torch.equal(first, weights(2))
 
 
 # --- batches
@@ -218,7 +197,7 @@ def _batches(config, size, data, epoch=0):
     return batches
 
 
-def test_every_epoch_sees_every_state_once(config, states, stamps):
+def test_every_epoch_shows_every_state_once(config, states, stamps):
     data = TrainingStates(states, stamps)
     first, second = (
         np.concatenate([truth for _, truth in _batches(config, 8, data, epoch)]) for epoch in (0, 1)
@@ -233,17 +212,13 @@ def test_every_epoch_sees_every_state_once(config, states, stamps):
 
 def test_every_field_shows_a_draw_of_its_own(config, states, stamps):
     draws = np.stack([stamps, -stamps, 3 * stamps]).astype(np.float32)
-    signs = []
-    for images, truth in _batches(config, 8, TrainingStates(states, draws)):
-        chosen = [
-            np.flatnonzero((states.astype(np.float32) == one).all(axis=1))[0] for one in truth
-        ]
-        factor = images.sum(axis=(2, 3)) / (256 * stamps[chosen].sum(axis=(2, 3)))
-        signs.append(np.round(factor).astype(int))
-        assert factor == pytest.approx(signs[-1], rel=1e-4)
-    signs = np.concatenate(signs)
-    assert set(signs.ravel()) == {1, -1, 3}
-    assert any(len(set(fields)) > 1 for fields in signs)
+    (images, truth), *_ = _batches(config, 30, TrainingStates(states, draws))
+    order = [np.abs(states - state).sum(axis=1).argmin() for state in truth]
+    factors = images.sum(axis=(2, 3)) / (256 * stamps[order].sum(axis=(2, 3)))
+    number = np.round(factors)
+    assert factors == pytest.approx(number, rel=1e-4)
+    assert set(number.ravel()) == {1, -1, 3}
+    assert any(len(set(fields)) > 1 for fields in number)
 
 
 def test_components_are_those_of_mirrored_noisy_stamps(config, noise, stamps, states):
@@ -252,32 +227,17 @@ def test_components_are_those_of_mirrored_noisy_stamps(config, noise, stamps, st
     settings = config.train_noise_trained.model_copy(update={"epochs": 1, "batch": 5})
     law, level = MixedNoise(noise, np.array([0.005])), 0.005
     draws = np.stack([stamps, 2 * stamps]).astype(np.float32)
-    for data in (TrainingStates(states, stamps, law), TrainingStates(states, draws)):
+    for data in (TrainingStates(states, draws), TrainingStates(states, stamps, law)):
         training = training_of(network, data, settings, 1, "x")
         scaled = _scaled(np.asarray(stamps, np.float32))
-        every = np.arange(training.parts.shape[2])
-        parts = training.parts[0][:, every].sum(axis=1)
+        parts = training.parts[0].sum(axis=1)
         assert parts == pytest.approx(training.model.components(scaled).numpy(), abs=1e-3)
-    data = TrainingStates(states, stamps, law)
-    training = training_of(network, data, settings, 1, "x")
-    many = np.repeat(np.mean(stamps, axis=0, keepdims=True), 3000, axis=0)
-    seen = noise.draw(many, level, np.random.default_rng(2)) - many
-    spread = training.model.components(_scaled(seen)).numpy().std(axis=0)
+    many = np.repeat(np.mean(stamps, axis=0, keepdims=True), 1500, axis=0)
+    errors = noise.draw(many, level, np.random.default_rng(2)) - many
+    spread = training.model.components(_scaled(errors)).numpy().std(axis=0)
     expected = np.sqrt(np.square(training.roots[0]).sum(axis=0))
+    # A standard deviation of 1500 draws scatters by 1.8 %.
     assert spread == pytest.approx(expected, rel=0.1)
-
-
-def test_gaussian_noise_has_poisson_s_variance(noise, stamps):
-    levels = np.full(len(stamps), 0.005)
-    draws = [
-        draw(stamps, levels, np.random.default_rng(1)) for draw in (noise.draw, noise.draw_gaussian)
-    ]
-    expected = noise.variance(stamps, 0.005)
-    for images in draws:
-        ratio = (images - stamps) ** 2 / expected
-        assert ratio.mean() == pytest.approx(1.0, abs=0.02)
-        bright = stamps > 0.05
-        assert ratio[bright].mean() == pytest.approx(1.0, abs=0.15)
 
 
 # --- Fisher information and maximum likelihood
@@ -290,19 +250,8 @@ def test_fisher_matrix_against_finite_differences(model, exact_operator, noise):
     step = 1e-4
     plus, minus = (exact_operator(model(state + sign * step * np.eye(4)))[0] for sign in (1, -1))
     slopes = ((plus - minus) / (2 * step)).reshape(4, -1)
-    own = exact_operator(model(state))[0].ravel()
-    expected = (slopes / noise.variance(own, 0.002)) @ slopes.T
+    expected = (slopes / noise.variance(stamps.ravel(), 0.002)) @ slopes.T
     assert fisher[0] == pytest.approx(expected, rel=1e-4, abs=1e-4 * expected.max())
-
-
-def test_bound_scales_with_noise(model, operator, noise, states):
-    low, high = bound_covariances(model, operator, noise, [1e-5, 2e-5], states[:2], [False])[0]
-    # Background-limited at high noise, star-limited at low noise: between 2 and 4.
-    ratio = np.diagonal(high, axis1=1, axis2=2) / np.diagonal(low, axis1=1, axis2=2)
-    assert (ratio > 2).all()
-    assert (ratio < 4).all()
-    sigma = np.sqrt(np.diagonal(low, axis1=-2, axis2=-1))
-    assert expected_abs_error(low) == pytest.approx(0.79788456 * sigma)
 
 
 def test_decentre_and_tilt_errors_are_correlated_with_the_signs_of_coma(
@@ -317,174 +266,76 @@ def test_decentre_and_tilt_errors_are_correlated_with_the_signs_of_coma(
     assert np.abs(matrix[[0, 1, 2], [1, 3, 3]]).max() < 0.3
 
 
-def test_gauss_newton_recovers_a_noise_free_state(model, exact_operator, noise):
+@pytest.mark.parametrize("movable", [False, True])
+def test_noise_free_parameters_are_recovered(model, config, noise, movable):
+    """From 0.08 of the range aside; with flux and place free, those of another star, too."""
+    operator = _optics(config, movable, "complex128")
     truth = np.array([[0.3, -0.5, 0.4, 0.2], [0.9, 0.8, -0.7, -0.95]])
-    images = exact_operator(model(truth))[0]
-    likelihood = _likelihood(model, exact_operator, noise, 0.002)
-    found = fit_states(likelihood, images, truth + 0.08, EXACT)
-    assert found.converged.all()
-    assert found.parameters == pytest.approx(truth, abs=1e-6)
-    assert (-2 * found.height) == pytest.approx(0, abs=1e-6)
-
-
-def test_score_is_the_slope_of_the_likelihood(model, exact_operator, noise, states):
-    truth = states[:1]
-    rng = np.random.default_rng(2)
-    stamps = exact_operator(model(truth))[0]
-    images = noise.draw(stamps, 0.005, rng)
-    likelihood = _likelihood(model, exact_operator, noise, 0.005)
-    score = likelihood.evaluate(images, truth)[1][0]
-    step = 1e-5
-    for axis in range(4):
-        move = step * np.eye(4)[axis]
-        plus, minus = (likelihood.evaluate(images, truth + s * move)[0][0] for s in (1, -1))
-        assert score[axis] == pytest.approx(-(plus - minus) / (4 * step), rel=1e-3, abs=1e-2)
+    given = parameters_of(model, operator, truth)
+    given[:, 4:] = np.random.default_rng(4).uniform(-0.2, 0.2, given[:, 4:].shape)
+    images, _ = stamps_and_slopes(model, operator, given)
+    flux = 1 + given[:, 4::3] if movable else np.ones((2, 9))
+    assert images.sum(axis=(2, 3)) == pytest.approx(flux)
+    start = parameters_of(model, operator, truth + 0.08)
+    fit = fit_states(_likelihood(model, operator, noise, 0.002), images, start, EXACT)
+    assert fit.converged.all()
+    assert fit.parameters == pytest.approx(given, abs=1e-6)
+    assert (-2 * fit.height) == pytest.approx(0, abs=1e-6)
 
 
 @pytest.mark.parametrize("movable", [False, True])
 def test_scatter_of_the_fit_is_the_bound(model, config, noise, states, stamps, movable):
-    """At low noise the estimator is efficient: χ² of 30 × 4 errors within its 99.9 % range."""
-    operator = AlignmentStamps(config.telescope, config.optics, config.alignment, movable)
-    level = 2e-4
-    images = noise.draw(stamps, level, np.random.default_rng(7))
+    """At low noise the estimator is efficient: χ² of 20 × 4 errors within its 99.9 % range."""
+    operator = _optics(config, movable)
+    level, truth = 2e-4, states[:20]
+    images = noise.draw(stamps[:20], level, np.random.default_rng(7))
     likelihood = _likelihood(model, operator, noise, level)
-    found = fit_states(likelihood, images, parameters_of(model, operator, states + 0.01), FIT)
-    covariances = bound_covariances(model, operator, noise, [level], states, [movable])[0, 0]
-    error = found.parameters[:, :4] - states
+    fit = fit_states(likelihood, images, parameters_of(model, operator, truth + 0.01), FIT)
+    covariances = bound_covariances(model, operator, noise, [level], truth, [movable])[0, 0]
+    error = fit.parameters[:, :4] - truth
     chi2 = np.einsum("nk,nkl,nl->", error, np.linalg.inv(covariances), error)
-    assert 75 < chi2 < 177
+    assert 45 < chi2 < 128
     # Pixels minus parameters, with the spread √(2 N) of χ².
     pixels, free = 9 * 16 * 16, 4 + 27 * movable
-    assert (-2 * found.height).mean() == pytest.approx(
-        pixels - free, abs=5 * np.sqrt(2 * pixels / 30)
+    assert (-2 * fit.height).mean() == pytest.approx(
+        pixels - free, abs=5 * np.sqrt(2 * pixels / 20)
     )
 
 
-class Uphill(Likelihood):
-    """Every step makes it worse, the shorter the less."""
-
-    def evaluate(self, images, states):
-        count, fisher = len(states), np.eye(4)
-        return (states**2).sum(axis=1), states, np.broadcast_to(fisher, (count, 4, 4)).copy()
-
-
-def test_a_step_that_damping_made_small_is_no_convergence(model, operator, noise, stamps):
-    start = np.array([[0.5, 0.5, 0.5, 0.5], [0.01, 0.01, 0.01, 0.01]])
-    settings = FIT.model_copy(update={"tolerance": 0.05})
-    found = fit_states(
-        _likelihood(model, operator, noise, 0.002, kind=Uphill), stamps[:2], start, settings
+def test_free_flux_and_place_cost_precision(model, config, operator, noise, states):
+    """By a quarter to a third, and never gain in any direction."""
+    covariances = bound_covariances(
+        model, _optics(config, True), noise, [0.002], states[:12], [False, True]
     )
-    assert found.converged.tolist() == [False, True]
-    # A short step is taken without another look.
-    assert found.parameters == pytest.approx(np.array([start[0], 2 * start[1]]))
-    assert found.evaluations.tolist() == [13, 1]
-
-
-def test_free_flux_and_place_are_recovered(model, exact_operator, config, noise):
-    """Noise-free stamps of another flux and place, from the true state: exactly those."""
-    truth = np.array([[0.3, -0.5, 0.4, 0.2]])
-    movable = _movable(config, "complex128")
-    given = parameters_of(model, movable, truth)
-    given[0, 4:] = np.random.default_rng(4).uniform(-0.2, 0.2, 27)
-    images, _ = stamps_and_slopes(model, movable, given)
-    still = exact_operator(model(truth))[0]
-    assert images.sum(axis=(2, 3))[0] == pytest.approx(1 + given[0, 4::3])
-    assert np.abs(images - still).max() > 0.01
-    start = parameters_of(model, movable, truth + 0.08)
-    found = fit_states(_likelihood(model, movable, noise, 0.002), images, start, EXACT)
-    assert found.converged.all()
-    assert found.parameters == pytest.approx(given, abs=1e-6)
-
-
-def _movable(config, precision="complex64"):
-    optics = config.optics.model_copy(update={"precision": precision})
-    return AlignmentStamps(config.telescope, optics, config.alignment, movable=True)
-
-
-def test_free_parameters_slopes_against_finite_differences(model, config, noise, states):
-    movable, step = _movable(config, "complex128"), 1e-5
-    given = parameters_of(model, movable, states[:1])
-    given[0, 4:] = np.random.default_rng(4).uniform(-0.2, 0.2, 27)
-    _, slopes = stamps_and_slopes(model, movable, given)
-    for axis, field in ((0, 3), (4, 0), (8, 1), (9, 1), (30, 8)):
-        move = step * np.eye(31)[axis]
-        plus, minus = (stamps_and_slopes(model, movable, given + s * move)[0][0] for s in (1, -1))
-        own = axis if axis < 4 else 4 + (axis - 4) % 3
-        expected = (plus - minus) / (2 * step)
-        assert slopes[0, field, own] == pytest.approx(expected[field], abs=1e-7)
-        assert axis < 4 or not np.delete(expected, field, axis=0).any()
-
-
-def test_what_is_free_costs_precision(model, config, operator, noise, states):
-    """By a quarter to a third, and never gains in any direction."""
-    movable = _movable(config)
-    told, free = bound_covariances(model, movable, noise, [0.002], states, [False, True])[:, 0]
-    alone = bound_covariances(model, operator, noise, [0.002], states, [False])[0, 0]
-    assert told == pytest.approx(alone, rel=1e-3)
-    ratio = expected_abs_error(free).mean() / expected_abs_error(told).mean()
+    fixed, free = covariances[:, 0]
+    alone = bound_covariances(model, operator, noise, [0.002], states[:12], [False])[0, 0]
+    assert fixed == pytest.approx(alone, rel=1e-3)
+    ratio = expected_abs_error(free).mean() / expected_abs_error(fixed).mean()
     assert 1.2 < ratio < 1.35
-    assert np.linalg.eigvalsh(free - told).min() > -1e-9
-
-
-def test_fit_stays_near_the_range(model, operator, noise):
-    truth = np.array([[1.0, -1.0, 1.0, 1.0]])
-    stamps = operator(model(truth))[0]
-    images = noise.draw(stamps, 0.02, np.random.default_rng(3))
-    settings = FIT.model_copy(update={"limit": 1.0})
-    found = fit_states(_likelihood(model, operator, noise, 0.02), images, truth, settings)
-    assert np.abs(found.parameters).max() <= 1.0
-
-
-@pytest.fixture(scope="module")
-def emulator(model, config, operator):
-    """Of all steps but the last, as the workflow makes it but for the states' numbers."""
-    train = uniform_states(config.alignment.train_states, np.random.default_rng(1))
-    return StampEmulator(model, operator, train, operator(model(train))[0], FIT)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("scale", "least", "most", "noisy"), [(1.0, 0.02, 0.05, 0.15), (1.1, 0.04, 0.3, 0.5)]
-)
-def test_emulator_errs_by_a_part_of_a_standard_error(
-    model, operator, emulator, noise, scale, least, most, noisy
-):
-    """By what its stamps move a fit, and by what its slopes make noise of it."""
-    states = scale * uniform_states(150, np.random.default_rng(6))
-    stamps, slopes = stamps_and_slopes(model, operator, states)
-    about, theirs = emulator(states)
-    _, score, fisher = deviance_and_information(noise, 0.002, about, stamps, slopes)
-    covariance = np.linalg.inv(fisher)
-    sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-    shift = np.einsum("nkl,nl->nk", covariance, score) / sigma
-    assert least < np.sqrt(np.mean(shift**2)) < most
-    assert np.median(np.abs(shift)) < 0.05
-    assert np.abs(shift).max() < 1.0
-    spread = deviance_and_information(noise, 0.002, about, stamps, theirs - slopes)[2]
-    wander = np.sqrt(np.einsum("nkl,nlk->n", spread, covariance))
-    assert 0.05 < np.median(wander) < noisy
+    assert np.linalg.eigvalsh(free - fixed).min() > -1e-9
 
 
 @pytest.mark.slow
 def test_last_step_reaches_the_maximum_of_the_exact_optics(
-    model, operator, emulator, noise, states, stamps
+    model, operator, config, noise, states, stamps
 ):
+    """Of all steps but the last an emulator, as the workflow makes it, gives the stamps."""
+    train = uniform_states(config.alignment.train_states, np.random.default_rng(1))
+    emulator = StampEmulator(model, operator, train, operator(model(train))[0], FIT)
     level = 0.002
     images = noise.draw(stamps, level, np.random.default_rng(8))
     last, exact = (_likelihood(model, operator, noise, level, e) for e in (emulator, None))
     first = fit_states(Likelihood(emulator, noise, level), images, states + 0.02, FIT)
-    found = fit_states(last, images, first.parameters, FIT)
-    best = fit_states(exact, images, found.parameters, FIT.model_copy(update={"tolerance": 0.01}))
-    assert found.converged.all()
-    assert found.evaluations.mean() < 1.2
+    fit = fit_states(last, images, first.parameters, FIT)
+    best = fit_states(exact, images, fit.parameters, FIT.model_copy(update={"tolerance": 0.01}))
+    assert fit.converged.all()
+    assert fit.evaluations.mean() < 1.2
     sigma = np.sqrt(np.diagonal(np.linalg.inv(best.information), axis1=1, axis2=2))
-    off = [
-        np.sqrt(np.mean(((f.parameters - best.parameters) / sigma) ** 2)) for f in (first, found)
-    ]
+    off = [np.sqrt(np.mean(((f.parameters - best.parameters) / sigma) ** 2)) for f in (first, fit)]
     assert 0.01 < off[1] < 0.08
     assert off[1] < off[0] < 0.12
     # The gain of a step that is not looked at.
-    assert (-2 * found.height) == pytest.approx((-2 * best.height), abs=0.3)
+    assert (-2 * fit.height) == pytest.approx((-2 * best.height), abs=0.3)
 
 
 def test_emulator_of_few_states(model, operator, states, stamps):
@@ -492,8 +343,8 @@ def test_emulator_of_few_states(model, operator, states, stamps):
     settings = FIT.model_copy(update={"outer_states": 5})
     emulator = StampEmulator(model, operator, states, stamps, settings)
     mirror = mirror_symmetries(8)[3]
-    known, slopes = emulator(mirror.states(states))
-    assert known == pytest.approx(mirror.stamps(stamps), abs=2e-3)
+    emulated, slopes = emulator(mirror.states(states))
+    assert emulated == pytest.approx(mirror.stamps(stamps), abs=2e-3)
     assert slopes.sum(axis=(-2, -1)) == pytest.approx(0, abs=1e-3)
     step, asked = 1e-3 * np.eye(4)[2], states[:4] * 0.9
     expected = (emulator(asked + step)[0] - emulator(asked - step)[0]) / 2e-3
@@ -501,33 +352,9 @@ def test_emulator_of_few_states(model, operator, states, stamps):
     assert off.max() < 0.1 * np.abs(expected).max()
 
 
-def test_start_far_beyond_the_range_is_safe(model, operator, noise, stamps):
-    images, start = stamps[:2], np.array([[9.0, -9.0, 9.0, -9.0], [1.25, 1.25, 1.25, 1.25]])
-    likelihood = _likelihood(model, operator, noise, 0.005)
-    found = fit_states(likelihood, images, start, FIT)
-    before = likelihood.evaluate(images, np.clip(start, -FIT.limit, FIT.limit))[0]
-    assert np.abs(found.parameters).max() <= FIT.limit
-    assert ((-2 * found.height) < before).all()
-
-
-def test_twin_keeps_the_coma_and_turns_the_tilt(model, config):
-    noll = np.arange(4, 23)
-    state = np.array([[-0.36, 0.29, 0.20, 0.25]])
-    twin = twin_states(model, state, noll)
-    assert twin[:, 2:] == pytest.approx(-state[:, 2:])
-    coma = model.coefficients[:, 1:5][:, :, np.isin(noll, (7, 8))].mean(axis=0)
-    assert (twin - state) @ coma == pytest.approx(0, abs=1e-12)
-    assert twin_states(model, twin, noll) == pytest.approx(state)
-    line = coma_free_decentre(model, state[:, 2:], noll)
-    assert twin_states(model, np.hstack([line, state[:, 2:]]), noll)[0, :2] == pytest.approx(
-        -line[0]
-    )
-
-
 @pytest.mark.parametrize("movable", [False, True])
 def test_wrong_twin_is_left_for_the_more_likely_state(model, config, noise, movable):
-    operator = AlignmentStamps(config.telescope, config.optics, config.alignment, movable)
-    noll = np.arange(4, 23)
+    operator, noll = _optics(config, movable), np.arange(4, 23)
     tilt = np.array([[0.1, 0.12]])
     truth = np.hstack([coma_free_decentre(model, tilt, noll), tilt])
     images, _ = stamps_and_slopes(model, operator, parameters_of(model, operator, truth))
@@ -538,7 +365,7 @@ def test_wrong_twin_is_left_for_the_more_likely_state(model, config, noise, mova
     once = settings.model_copy(update={"iterations": 1})
     stuck = fit_states(likelihood, images, twin, once)
     others = twin_states(model, stuck.parameters, noll)
-    found, tried = refit_twins(likelihood, images, stuck, others, settings)
+    fit, tried = refit_twins(likelihood, images, stuck, others, settings)
     assert tried.all()
-    assert found.parameters[:, :4] == pytest.approx(truth, abs=2e-3)
-    assert (-2 * found.height)[0] < (-2 * stuck.height)[0]
+    assert fit.parameters[:, :4] == pytest.approx(truth, abs=2e-3)
+    assert (-2 * fit.height)[0] < (-2 * stuck.height)[0]

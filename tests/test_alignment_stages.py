@@ -1,39 +1,33 @@
-"""Stages of scene 3 by the command line, on tiny sizes: states, networks, tables, figures."""
+"""Scene 3 by its workflow, on tiny sizes: states, networks, tables, runs, and refusals."""
 
 from __future__ import annotations
 
 import numpy as np
 import pandas as pd
 import pytest
-from click.testing import CliRunner
 
-from psfdae.cli import main
-from psfdae.files import read_product
-from psfdae.settings import ConfigError
-from psfdae_paper.configuration.aligners import (
-    ALIGNERS,
-    ESTIMATORS,
-    FITTED,
-    LEARNED,
-    TRAINED,
-    of_set,
-)
+from command_line import psfdae
+from psfdae.files import ProductError, read_product
+from psfdae_paper.configuration.aligners import ALIGNERS, ESTIMATORS, LEARNED
 from psfdae_paper.configuration.alignment import CHOICE
 from psfdae_paper.configuration.compose import load, load_stage, overrides_for
 from psfdae_paper.evaluation import alignment_tables
 from psfdae_paper.stages.alignment import states
-from psfdae_paper.stages.alignment_results import read_bounds
+from psfdae_paper.tracking import WEIGHTS, runs_of_alignment
 
-PRESET = ("preset=smoke", "alignment.grid_levels=2")
+pytestmark = pytest.mark.workflow
+
+TRAINING = ("--states=x.h5", "--checkpoint=c", "--out=o")
 
 
-def test_rows_of_the_tables():
-    rng = np.random.default_rng(0)
-    covariance = np.array([[4, 0, 0, -3], [0, 4, 3, 0], [0, 3, 4, 0], [-3, 0, 0, 4]]) * 1e-4
-    errors = rng.multivariate_normal(np.zeros(4), covariance, 4000)
-    key = {"test_set": "uniform", "noise_level": 0.002, "method": "dae"}
-    unit = np.array([1e-3, 1e-3, 2e-3, 2e-3])
-    table = pd.DataFrame(alignment_tables.error_rows(key, errors, unit))
+COVARIANCE = np.array([[4, 0, 0, -3], [0, 4, 3, 0], [0, 3, 4, 0], [-3, 0, 0, 4]]) * 1e-4
+ERRORS = np.random.default_rng(0).multivariate_normal(np.zeros(4), COVARIANCE, 4000)
+CELL = {"test_set": "uniform", "noise_level": 0.002}
+
+
+def test_rows_of_errors_and_bounds_agree_on_normal_errors():
+    key, unit = {**CELL, "method": "dae"}, np.array([1e-3, 1e-3, 2e-3, 2e-3])
+    table = pd.DataFrame(alignment_tables.error_rows(key, ERRORS, unit))
     assert list(table.columns) == [
         *("test_set", "noise_level", "method", "parameter", "mean_abs_error", "bias"),
         *("variance", "variance_abs", "unit", "n"),
@@ -45,132 +39,57 @@ def test_rows_of_the_tables():
         1e-3 * ranges.mean_abs_error["decenter_x"]
     )
     assert metres.variance["decenter_y"] == pytest.approx(1e-6 * ranges.variance["decenter_y"])
-    # Normal errors: the absolute error has 1 − 2/π of the variance.
-    ratio = ranges.variance_abs / ranges.variance
-    assert ratio.to_numpy() == pytest.approx(1 - 2 / np.pi, abs=0.03)
-    bound = pd.DataFrame(
-        alignment_tables.bound_rows(key, np.broadcast_to(covariance, (5, 4, 4)), unit)
-    )
-    same = bound[bound.unit == "range"].set_index("parameter")
-    assert ranges.mean_abs_error.to_numpy() == pytest.approx(same.mean_abs_error, rel=0.05)
-    assert ranges.variance_abs.to_numpy() == pytest.approx(same.variance_abs, rel=0.1)
+    covariances = np.broadcast_to(COVARIANCE, (5, 4, 4))
+    bound = pd.DataFrame(alignment_tables.bound_rows(key, covariances, unit))
+    expected = bound[bound.unit == "range"].set_index("parameter")
+    # Of normal errors, whose absolute values have the mean σ √(2/π) and 1 − 2/π of the variance.
+    assert expected.mean_abs_error.to_numpy() == pytest.approx(0.02 * np.sqrt(2 / np.pi))
+    assert expected.variance_abs.to_numpy() == pytest.approx(4e-4 * (1 - 2 / np.pi))
+    assert ranges.mean_abs_error.to_numpy() == pytest.approx(expected.mean_abs_error, rel=0.05)
+    assert ranges.variance_abs.to_numpy() == pytest.approx(expected.variance_abs, rel=0.1)
 
 
 def test_measured_correlations_are_those_predicted():
-    rng = np.random.default_rng(0)
-    covariance = np.array([[4, 0, 0, -3], [0, 4, 3, 0], [0, 3, 4, 0], [-3, 0, 0, 4]]) * 1e-4
-    errors = rng.multivariate_normal(np.zeros(4), covariance, 600)
-    key = {"test_set": "uniform", "noise_level": 0.002}
-    measured = pd.DataFrame(alignment_tables.measured_correlations(key, errors))
-    predicted = pd.DataFrame(
-        alignment_tables.predicted_correlations(key, np.broadcast_to(covariance, (600, 4, 4)))
-    )
+    errors, covariances = ERRORS[:600], np.broadcast_to(COVARIANCE, (600, 4, 4))
+    measured = pd.DataFrame(alignment_tables.measured_correlations(CELL, errors))
+    predicted = pd.DataFrame(alignment_tables.predicted_correlations(CELL, covariances))
     assert len(measured) == 16
     pooled = predicted[predicted.method == "cramer_rao_pooled"].reset_index(drop=True)
-    assert pooled.correlation[3] == pytest.approx(-0.75)
-    assert pooled.correlation[6] == pytest.approx(0.75)
+    assert pooled.correlation[[3, 6]].tolist() == pytest.approx([-0.75, 0.75])
     off = measured.parameter_a != measured.parameter_b
     assert (measured.ci_low[off] < pooled.correlation[off]).mean() > 0.8
     assert (measured.ci_high[off] > pooled.correlation[off]).mean() > 0.8
-    assert (pooled.ci_low[3] < -0.75) and (pooled.ci_high[3] > -0.75)
-
-
-def _run(*arguments):
-    result = CliRunner().invoke(main, ["alignment", *map(str, arguments)], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
+    assert pooled.ci_low[3] < -0.75 < pooled.ci_high[3]
 
 
 @pytest.fixture(scope="module")
-def products(tmp_path_factory):
-    """Model, states and key figures."""
-    at = tmp_path_factory.mktemp("scene3")
-    model = ("--model", at / "model.h5")
-    _run("model", "--out", at / "model.h5", *PRESET)
-    for kind in ("grid", "uniform", "train"):
-        given = model if kind == "train" else ()
-        _run("states", "--set", kind, "--out", at / f"{kind}.h5", *given, *PRESET)
-    sets = ("--grid", at / "grid.h5", "--uniform", at / "uniform.h5")
-    _run("telescope", *model, *sets, "--out", at / "telescope.csv", *PRESET)
-    return at
+def results(smoke):
+    return smoke / "results"
 
 
-@pytest.fixture(scope="module")
-def tables(products):
-    """Networks, estimates, fits and bounds of the uniform states, and their tables."""
-    at = products
-    data = ("--grid", at / "grid.h5", "--train", at / "train.h5", "--checkpoint", at / "c")
-    _run("train-dae", *data, "--out", at / "dae", *PRESET)
-    for name in TRAINED:
-        given = ("--kind", name, "--states", at / f"{ALIGNERS[name].states}.h5")
-        given += ("--dae", at / "dae") if ALIGNERS[name].denoised else ()
-        _run("train-network", *given, "--checkpoint", at / "c", "--out", at / name, *PRESET)
-    networks = [w for n in ("dae", *TRAINED) for w in (f"--{n.replace('_', '-')}", at / n)]
-    test = ("--set", "uniform", "--states", at / "uniform.h5")
-    model = ("--model", at / "model.h5")
-    times = ("--times", at / "estimates.csv")
-    _run("estimate", *test, *networks, "--out", at / "estimates.h5", *times, *PRESET)
-    _run("bound", *test, *model, "--out", at / "bound.h5", *PRESET)
-    given = ["--estimates", at / "estimates.h5", "--bound", at / "bound.h5"]
-    for level in ("0.002", "0.005"):
-        out = at / f"fit_{level}.h5"
-        chosen = ("--level", level, "--network", at / "noise_trained", "--out", out)
-        times = ("--times", out.with_suffix(".csv"))
-        _run(
-            "fit",
-            *test,
-            *model,
-            "--train",
-            at / "train.h5",
-            *chosen,
-            *times,
-            *PRESET,
-            "fit.iterations=1",
-        )
-        given += ["--fit", out]
-    out = ("--errors", at / "errors.csv", "--correlation", at / "correlation.csv")
-    _run("tables", "--states", at / "uniform.h5", *given, *out)
-    return at
+def alignment_table(results, name):
+    return pd.read_csv(results / f"tables/alignment_{name}.csv")
 
 
-def test_sets_of_states(products):
+def test_sets_of_states(results):
     grid, uniform, train = (
-        read_product(products / f"{name}.h5", "alignment_states")
+        read_product(results / f"data/alignment/{name}.h5", "alignment_states")
         for name in ("grid", "uniform", "train")
     )
-    assert grid["stamps"].shape == (16, 9, 16, 16)
-    assert sorted(set(grid["states"].ravel())) == [-1, 1]
-    assert uniform["stamps"].shape == (12, 9, 16, 16)
-    assert train["stamps"].shape == (40, 9, 16, 16)
+    assert sorted(set(grid["states"].ravel())) == [-1, 0, 1]
     assert train["zernikes"].shape == (40, 9, 19)
     assert np.abs(train["states"]).max() <= 1
     assert not np.isin(uniform["states"], train["states"]).any()
-    for product in (grid, uniform, train):
+    for product, count in ((grid, 81), (uniform, 12), (train, 40)):
+        assert product["stamps"].shape == (count, 9, 16, 16)
         assert product["stamps"].dtype == np.float32
         assert product["stamps"].sum(axis=(2, 3)) == pytest.approx(1, abs=1e-5)
         assert product["unit"] == pytest.approx([1e-3, 1e-3, *np.deg2rad([0.1, 0.1])])
         assert product["noll"].tolist() == list(range(4, 23))
-        assert product.config["seed"] == 20200611
 
 
-def _states_config(*overrides):
-    return load_stage(states.stage.settings.reads, (*CHOICE, *PRESET, *overrides))
-
-
-def test_model_and_rays_give_the_same_training_stamps(products, tmp_path):
-    states(_states_config(), "train", tmp_path / "traced.h5")
-    traced, modelled = (
-        read_product(path, "alignment_states")
-        for path in (tmp_path / "traced.h5", products / "train.h5")
-    )
-    assert (traced["states"] == modelled["states"]).all()
-    assert np.abs(traced["zernikes"] - modelled["zernikes"]).max() < 5e-4
-    assert modelled["stamps"] == pytest.approx(traced["stamps"], abs=1e-3)
-
-
-def test_key_figures(products):
-    table = pd.read_csv(products / "telescope.csv").set_index("quantity")
-    assert list(table.columns) == ["value", "unit"]
-    value = table["value"]
+def test_key_figures(results):
+    value = alignment_table(results, "telescope").set_index("quantity").value
     assert value["pixel"] == pytest.approx(7.27, abs=0.01)
     assert value["lambda_over_d"] == pytest.approx(0.0825, abs=1e-4)
     assert value["sensitivity_condition"] == pytest.approx(3.05, abs=0.02)
@@ -180,21 +99,25 @@ def test_key_figures(products):
     assert value["energy_least_uniform"] > 0.99
 
 
-def test_same_configuration_gives_the_same_bytes(products, tmp_path):
-    states(_states_config("optics.threads=1"), "uniform", tmp_path / "again.h5")
-    one, two = (
+def test_same_configuration_gives_the_same_bytes(results, tmp_path):
+    for name, override in (("again", "optics.threads=1"), ("other", "seed=1")):
+        words = (*CHOICE, "preset=smoke", override)
+        config = load_stage(states.stage.settings.reads, words)
+        states(config, "uniform", tmp_path / f"{name}.h5")
+    first, again, other = (
         read_product(path, "alignment_states")
-        for path in (tmp_path / "again.h5", products / "uniform.h5")
+        for path in (
+            results / "data/alignment/uniform.h5",
+            tmp_path / "again.h5",
+            tmp_path / "other.h5",
+        )
     )
-    assert all((one[name] == two[name]).all() for name in one.arrays)
-    states(_states_config("seed=1"), "uniform", tmp_path / "other.h5")
-    other = read_product(tmp_path / "other.h5", "alignment_states")
-    assert not np.isin(other["states"], one["states"]).any()
+    assert all((first[name] == again[name]).all() for name in first.arrays)
+    assert not np.isin(other["states"], first["states"]).any()
 
 
 @pytest.mark.parametrize(
-    ("preset", "states", "schedule"),
-    [("fast", 625, "onecycle"), ("paper", 625, "constant"), ("smoke", 12, "onecycle")],
+    ("preset", "states", "schedule"), [("paper", 625, "constant"), ("smoke", 12, "onecycle")]
 )
 def test_presets_reach_scene_3(preset, states, schedule):
     config = load((*CHOICE, f"preset={preset}"))
@@ -204,138 +127,101 @@ def test_presets_reach_scene_3(preset, states, schedule):
 
 def test_scene_3_keeps_its_telescope_where_a_whole_run_gets_another():
     given = ["preset=smoke", "noise.kappa=5", "train.lr=1e-3", "stars.count=9"]
-    given += ["telescope=wfsat_literal", "network_train@train_original=denoised", "trian.lr=1"]
-    kept = [word for word in given if word.split("=")[0] not in ("telescope", "wavefront.coma")]
-    assert overrides_for([*given, "wavefront.coma=3"], CHOICE) == tuple(kept)
+    given += ["telescope=wfsat_literal", "network_train@train_original=denoised"]
     assert overrides_for(given) == tuple(given)
-    assert overrides_for(["optics.backend=torch"], list(CHOICE)) == ()
-    with pytest.raises(ConfigError, match=r"trian\.lr"):
-        load([*CHOICE, "trian.lr=1"])
-    with pytest.raises(ConfigError, match="colour: unknown key"):
-        load([*CHOICE, "+colour=blue"])
-    with pytest.raises(ConfigError, match=r"example_zernike: brings its own aberrations"):
-        load([*CHOICE, "telescope=example_zernike"])
+    kept = [word for word in given if word != "telescope=wfsat_literal"]
+    assert overrides_for([*given, "optics.backend=torch"], CHOICE) == tuple(kept)
+    assert overrides_for(["trian.lr=1"], CHOICE) == ("trian.lr=1",)
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["alignment", "config", "dataset=dataset3"], "this command is about dataset=alignment"),
-        (["alignment", "bound", "dataset=dataset3"], "this command is about dataset=alignment"),
-        (
-            ["config", "--stage", "alignment_bound", "dataset=dataset3"],
-            "is about dataset=alignment",
-        ),
-        (["config", "--stage", "templates", "dataset=alignment"], "has no simulated stars"),
-        (["config", "--stage", "no-such"], "'no-such' is not one of"),
+        (["alignment", "config", "dataset=dataset3"], "dataset=alignment"),
+        (["config", "--stage", "alignment_bound", "dataset=dataset3"], "dataset=alignment"),
+        (["config", "--stage", "templates", "dataset=alignment"], "no simulated stars"),
+        (["config", "--stage", "no-such"], "'no-such'"),
+        (["alignment", "config", "trian.lr=1"], "trian.lr"),
+        (["alignment", "config", "telescope=example_zernike"], "example_zernike: brings its own"),
+        (["alignment", "config", "prescription=newtonian"], "secondary: missing"),
+        (["alignment", "model", "--out=x.h5", "alignment.field_radius_deg=0.8"], "field (0.8, 0)°"),
+        (["alignment", "train-network", "--kind=dae_retrained", *TRAINING], "--dae"),
     ],
 )
-def test_datasets_and_scene_3_are_not_taken_for_each_other(words, message):
-    if words[1] == "bound":
-        words += ["--set=grid", "--states=x", "--model=x", "--out=x"]
-    result = CliRunner().invoke(main, words)
-    assert result.exit_code == 2 and message in result.output
-
-
-@pytest.mark.parametrize("stage", ["from-stars", "train", "alignment_estimate"])
-def test_groups_of_any_command_are_shown(stage):
-    result = CliRunner().invoke(main, ["config", "--stage", stage], catch_exceptions=False)
-    assert result.exit_code == 0 and "noise:" in result.output
-
-
-def test_prescriptions_without_a_secondary_stop_scene_3_alone():
-    load(["prescription=newtonian"])
-    with pytest.raises(ConfigError, match="secondary: missing"):
-        load([*CHOICE, "prescription=newtonian"])
-
-
-def test_command_line_names_what_is_wrong(tmp_path):
-    arguments = ["alignment", "model", "--out", str(tmp_path / "x.h5")]
-    result = CliRunner().invoke(main, [*arguments, "alignment.field_radius_deg=0.8"])
+def test_words_that_do_not_fit_scene_3_are_refused(words, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    result = psfdae(*words)
     assert result.exit_code == 2
-    assert "field (0.8, 0)°" in result.output
-    assert not (tmp_path / "x.h5").exists()
+    assert message in result.output.splitlines()[-1]
+    assert not list(tmp_path.glob("*.h5"))
 
 
-def test_tables_hold_every_method(tables):
-    errors = pd.read_csv(tables / "errors.csv")
-    noisy = errors[errors.noise_level > 0]
-    cells = noisy.groupby(["noise_level", "method"]).size()
-    assert (cells == 8).all()
-    assert set(noisy.method) == set(ALIGNERS) - {"cramer_rao_pooled"}
-    assert set(noisy.noise_level) == {0.002, 0.005}
-    clean = set(errors[errors.noise_level == 0].method)
-    assert clean == {"constant", *(method.name for method in LEARNED)}
-    correlation = pd.read_csv(tables / "correlation.csv")
-    assert len(correlation) == 16 * (2 * 8 + 4)
+def test_tables_hold_every_method(results):
+    """Flux and place are free for uniform states only."""
+    errors = alignment_table(results, "errors")
+    everyone = set(ALIGNERS) - {"cramer_rao_pooled"}
+    free = {name for name in everyone if name.endswith("_free")}
+    for (kind, level), rows in errors.groupby(["test_set", "noise_level"]):
+        assert (rows.groupby("method").size() == 8).all()
+        noisy = everyone if kind == "uniform" else everyone - free
+        clean = {"constant", *(method.name for method in LEARNED)}
+        assert set(rows.method) == (noisy if level else clean)
+    assert set(errors.noise_level) == {0, 0.002, 0.005}
+    correlation = alignment_table(results, "correlation")
     diagonal = correlation[correlation.parameter_a == correlation.parameter_b]
+    assert 4 * len(diagonal) == len(correlation)
     assert diagonal.correlation.to_numpy() == pytest.approx(1)
 
 
-def test_flux_and_place_are_free_for_uniform_states_only(products, tmp_path):
-    given = ("--set", "grid", "--states", products / "grid.h5", "--model", products / "model.h5")
-    _run("bound", *given, "--out", tmp_path / "bound.h5", *PRESET)
-    assert read_product(tmp_path / "bound.h5", "alignment_bound")["covariances"].shape[0] == 1
-    assert [key["method"] for key, _, _ in read_bounds([tmp_path / "bound.h5"])] == 2 * [
-        "cramer_rao"
-    ]
-    assert of_set(FITTED, "uniform") == FITTED
-    assert of_set(FITTED, "grid") == [ALIGNERS["max_likelihood"]]
-
-
-def test_paper_s_rows_stand_beside_ours(tables):
-    given = ("--errors", tables / "errors.csv", "--correlation", tables / "correlation.csv")
-    _run("paper-tables", *given, "--out", tables / "paper")
-    table = pd.read_csv(tables / "paper" / "alignment_paper_0.005.csv")
+def test_paper_s_rows_stand_beside_ours(results):
+    table = alignment_table(results, "paper_0.005")
     paper = table[(table.source == "paper") & (table.quantity == "mean")].set_index("method")
     assert paper.decenter_y.to_dict() == {"original": 0.802, "dae": 0.0262}
-    ours = table[(table.source == "psfdae") & (table.quantity == "variance")].set_index("method")
-    errors = pd.read_csv(tables / "errors.csv").query("noise_level == 0.005 and unit == 'range'")
-    own = errors.query("method == 'dae' and parameter == 'tilt_x'").variance_abs.item()
-    assert ours.tilt_x["dae"] == pytest.approx(own, rel=1e-4)
-    text = (tables / "paper" / "alignment_paper_correlation.md").read_text()
+    ours = table.query("source == 'psfdae' and test_set == 'uniform' and quantity == 'variance'")
+    errors = alignment_table(results, "errors").query(
+        "test_set == 'uniform' and noise_level == 0.005 and unit == 'range'"
+    )
+    variance = errors.query("method == 'dae' and parameter == 'tilt_x'").variance_abs.item()
+    assert ours.set_index("method").tilt_x["dae"] == pytest.approx(variance, rel=1e-4)
+    text = (results / "tables/alignment_paper_correlation.md").read_text()
     assert "| 0.379 " in text
 
 
-def test_time_table(tables):
-    given = [f"--history={n}={tables / n}/history.csv" for n in ("dae", *TRAINED)]
-    given += [f"--times={tables / name}" for name in ("estimates.csv", "fit_0.002.csv")]
-    _run("time-table", *given, "--out", tables / "time.csv")
-    table = pd.read_csv(tables / "time.csv").set_index("method")
+def test_time_table(results):
+    table = alignment_table(results, "time").set_index("method")
     assert list(table.index) == [method.name for method in ESTIMATORS]
     assert table.training_seconds["dae"] >= table.training_seconds["original"]
-    assert table.states["max_likelihood"] == table.states["max_likelihood_free"] == 12
+    # Two noise levels of 81 and 12 states; with free flux and place of the latter alone.
+    assert table.states["max_likelihood"] == 2 * (81 + 12)
+    assert table.states["max_likelihood_free"] == 2 * 12
 
 
-@pytest.mark.parametrize("kind", ["predicted", "errors", "correlation", "stamps"])
-def test_figures(tables, kind):
-    fits = [f"--fit={tables / f'fit_{level}.h5'}" for level in ("0.002", "0.005")]
-    estimates = f"--estimates={tables / 'estimates.h5'}"
-    given = {
-        "predicted": [estimates, *fits],
-        "errors": [estimates, *fits, f"--bound={tables / 'bound.h5'}"],
-        "correlation": [f"--correlation={tables / 'correlation.csv'}"],
-        "stamps": [f"--states={tables / 'uniform.h5'}", f"--dae={tables / 'dae'}", *PRESET],
-    }[kind]
-    _run("figure", kind, *given, "--out", tables / f"{kind}.png")
-    assert (tables / f"{kind}.png").stat().st_size > 10_000
-
-
-def test_twin_is_closer_in_focus(tmp_path):
-    arguments = ["figure", "twin", "--table", tmp_path / "twin.csv", "--out", tmp_path / "twin.png"]
-    _run(*arguments)
-    table = pd.read_csv(tmp_path / "twin.csv")
+def test_twin_is_closer_in_focus(results):
+    table = alignment_table(results, "twin")
     near = table[np.isclose(table.position, -1) & np.isclose(table.noise_level, 0.002)]
     chi2 = near.set_index("defocus_mm").chi2
     assert chi2[0.2] > 10 * chi2[0.0]
-    own = table[np.isclose(table.position, 1)]
-    assert own.chi2.to_numpy() == pytest.approx(0, abs=1e-6)
+    at_the_state = table[np.isclose(table.position, 1)]
+    assert at_the_state.chi2.to_numpy() == pytest.approx(0, abs=1e-6)
 
 
-def test_dae_option_goes_with_its_kind(tmp_path):
-    arguments = ["alignment", "train-network", "--kind", "dae_retrained", "--states", "x.h5"]
-    result = CliRunner().invoke(
-        main, [*arguments, "--checkpoint", str(tmp_path / "c"), "--out", str(tmp_path / "o")]
+def test_networks_as_runs_have_their_curves_and_errors(results, tmp_path):
+    errors = alignment_table(results, "errors").query(
+        "test_set == 'uniform' and noise_level == 0.002 and unit == 'range'"
     )
-    assert result.exit_code == 2
-    assert "--dae goes with --kind dae_retrained" in result.output
+    tilt = errors[errors.parameter == "tilt_x"].set_index("method")
+    runs = {run.kind: run for run in runs_of_alignment(results)}
+    assert set(runs) == set(WEIGHTS)
+    assert len({run.content_hash for run in runs.values()}) == len(WEIGHTS)
+    for kind, run in runs.items():
+        values = {(point.name, point.epoch): point.value for point in run.points}
+        history = pd.read_csv(results / "alignment" / kind / "history.csv")
+        curve = "train_mse" if kind == "dae" else "loss"
+        assert values[curve, 2] == history[curve][1]
+        for name in ("mean_abs_error", "bias"):
+            assert values[f"uniform_tilt_x_{name}_0.002", 0] == tilt[name][kind]
+        assert run.end_ms - run.start_ms == pytest.approx(1000 * history.seconds.iloc[-1], abs=1)
+        assert "attempt" not in run.config
+        assert run.name == f"alignment {kind}"
+    with pytest.raises(ProductError, match="snakemake scene3"):
+        runs_of_alignment(tmp_path)

@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-import psfdae
 from psfdae.optics.wavefronts import zernike_basis
 from psfdae.settings import ConfigError
 from psfdae.telescope.raytracing import (
@@ -24,7 +19,6 @@ from psfdae_paper.alignment.telescope import (
     design_states,
     field_points,
     fit_quadratic,
-    grid_states,
     uniform_states,
     verify,
     zernike_tracer,
@@ -57,22 +51,21 @@ def test_focal_ratio_and_spots_of_the_prescription(config, tracer):
         assert np.sqrt(x.var() + y.var()) / focal < 0.05 * ARCSEC
 
 
-def test_no_misalignment_is_the_aligned_telescope(tracer):
-    aligned = misaligned(tracer.optic, np.zeros(4))
-    assert aligned == tracer.optic
+def test_misalignment_moves_the_secondary_of_a_copy(config, tracer):
+    assert misaligned(tracer.optic, np.zeros(4)) == tracer.optic
+    moved = misaligned(tracer.optic, np.array([1e-3, 0.0, 0.0, 1e-3]))
+    assert moved["M2"].coordSys.origin[0] == pytest.approx(1e-3)
+    assert moved["M1"] == tracer.optic["M1"]
+    assert tracer.optic == build_optic(
+        config.prescription, config.telescope, config.alignment.defocus_m
+    )
+
+
+def test_aligned_telescope_is_round_and_out_of_focus(tracer):
     centre = tracer(np.zeros((1, 4)))[0, 0]
     round_terms = np.isin(np.arange(4, 23), [4, 11, 22])
     assert np.abs(centre[~round_terms]).max() < 1e-8
     assert centre[0] == pytest.approx(0.32, abs=0.01)  # the CCD is beyond focus
-
-
-def test_perturbing_leaves_the_telescope_as_it_was(config, tracer):
-    before = build_optic(config.prescription, config.telescope, config.alignment.defocus_m)
-    moved = misaligned(tracer.optic, np.array([1e-3, 0.0, 0.0, 1e-3]))
-    assert moved != tracer.optic
-    assert tracer.optic == before
-    assert moved["M2"].coordSys.origin[0] == pytest.approx(1e-3)
-    assert moved["M1"] == tracer.optic["M1"]
 
 
 def linear_response(tracer, name):
@@ -173,30 +166,19 @@ def test_weights_of_the_annulus_integrate_zernike_products():
     assert (basis**2) @ weights == pytest.approx((fine**2).mean(axis=(1, 2)), rel=1e-3)
 
 
-@pytest.mark.parametrize("highest", [4, 22, 28, 37])
-def test_points_of_the_annulus_are_their_own_mirror_images(highest):
-    x, y, _ = annulus_points(highest, 0.42)
-    points = np.stack([x, y], axis=1)
-    for mirrored in (points * [-1, 1], points * [1, -1], points[:, ::-1]):
-        off = np.linalg.norm(mirrored[:, None] - points, axis=2).min(axis=1)
-        assert off.max() < 1e-12
-
-
 @pytest.mark.parametrize(
     ("state", "message"),
     [
-        ([0, 0, 1.2, 0], r"state 1: tilt_x = 1\.2 of the range \(0\.12°\): must be between"),
+        ([0, 0, 1.2, 0], r"state 1: tilt_x = 1\.2 of the range \(0\.12°\)"),
         ([0, -1.5, 0, 0], r"state 1: decenter_y = -1\.5 of the range \(-1\.5 mm\)"),
         ([0, 0, 0, np.nan], r"state 1: tilt_y = nan"),
     ],
 )
 def test_state_outside_the_range_is_refused(tracer, state, message):
+    ends = np.ones(4) * (1 + 1e-12)
+    assert tracer(ends[None]).shape == (1, 9, 19)
     with pytest.raises(RayTracingError, match=message):
-        tracer(np.array([[0.0] * 4, state]))
-
-
-def test_ends_of_the_range_are_inside(tracer):
-    assert tracer(np.array([np.ones(4) * (1 + 1e-12)])).shape == (1, 9, 19)
+        tracer(np.array([ends, state]))
 
 
 def test_vignetted_field_is_refused():
@@ -206,32 +188,17 @@ def test_vignetted_field_is_refused():
         zernike_tracer(config.telescope, config.prescription, config.alignment)(np.zeros((1, 4)))
 
 
-def test_no_state_of_the_grid_is_vignetted(tracer):
-    assert np.isfinite(tracer(grid_states(2))).all()
-
-
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        (
-            "prescription.lenses.l1.back_vertex_m=-0.48",
-            r"prescription\.lenses\.l1: thickness = -0\.0091 m .*greater than 0",
-        ),
-        (
-            "prescription.lenses.l2.front_vertex_m=-0.51",
-            r"distance from back of l1 to front of l2 = -0\.0041 m",
-        ),
-        ("prescription.best_focus_m=-0.6", r"from back of l2 to best focus = -0\.041 m"),
-        ("prescription.secondary.vertex_m=-0.2", r"primary to secondary = -0\.2 m"),
+        ("prescription.lenses.l1.back_vertex_m=-0.48", r"prescription\.lenses\.l1: thickness"),
+        ("prescription.lenses.l2.front_vertex_m=-0.51", "from back of l1 to front of l2"),
         ("~prescription.secondary.conic", r"prescription\.secondary\.conic: missing"),
-        ("~prescription.lenses.l2.clear_radius_m", r"lenses\.l2\.clear_radius_m: missing"),
-        ("prescription.primary.radius_m=0", r"prescription\.primary\.radius_m: must not be 0"),
-        ("prescription.glass.sellmeier_b=[1.0]", r"sellmeier_b = \[1\.0\]: .*at least 3"),
-        ("alignment.tilt_range_deg=2", r"alignment\.tilt_range_deg = 2: .*less than or equal to 1"),
-        ("alignment.decenter_range_m=0", r"alignment\.decenter_range_m = 0: .*greater than 0"),
-        ("alignment.grid_levels=1", r"alignment\.grid_levels = 1: .*greater than or equal to 2"),
+        ("prescription.primary.radius_m=0", r"prescription\.primary\.radius_m"),
         ("alignment.stamp_px=15", r"alignment\.stamp_px = 15: .*multiple of 2"),
         ("optics.pupil_samples=[158,126]", r"pupil_samples: \[158, 126\] must be ascending"),
+        ("cnn.strides=[1,2]", r"cnn: strides = \[1, 2\]: 5 widths"),
+        ("cnn.kernels=[3,3,4,3,3]", r"cnn: kernels = .* must be odd"),
     ],
 )
 def test_wrong_configuration_is_named(override, message):
@@ -247,18 +214,6 @@ def test_nine_fields_are_the_centre_and_a_circle():
     assert np.hypot(*degrees[1:].T) == pytest.approx(0.5)
 
 
-def test_batoid_is_imported_by_ray_tracing_only():
-    package = Path(psfdae.__file__).parents[1]
-    importing = {
-        path.relative_to(package).as_posix()
-        for path in package.rglob("*.py")
-        if "import batoid" in path.read_text() or "from batoid" in path.read_text()
-    }
-    assert importing == {"psfdae/telescope/raytracing.py"}
-    code = "import sys, psfdae_paper.stages.alignment as s; sys.exit('batoid' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
-
-
 def test_quadratic_model_reproduces_ray_tracing(model, grid, tracer):
     """25 states of the fit, 600 others of the grid, uniform ones: 5e-4 waves RMS at most."""
     states, zernikes = grid
@@ -269,19 +224,15 @@ def test_quadratic_model_reproduces_ray_tracing(model, grid, tracer):
     assert np.sqrt((residual**2).mean()) < 2e-4
 
 
-def test_linear_terms_alone_do_not(model, grid):
-    states, zernikes = grid
+def test_a_model_of_too_few_terms_or_states_is_refused(model, tracer):
+    states = design_states()[:9]
+    zernikes = tracer(states)
     coefficients = model.coefficients.copy()
     coefficients[:, 5:] = 0
-    message = r"quadratic model: 0\.\d+ waves RMS .*\(at most 0\.0005\)"
-    with pytest.raises(ModelError, match=message):
+    with pytest.raises(ModelError, match=r"0\.\d+ waves RMS .*\(at most 0\.0005\)"):
         verify(type(model)(coefficients), states, zernikes, 5e-4)
-
-
-def test_too_few_states_do_not_determine_the_model(tracer):
-    states = design_states()[:9]
-    with pytest.raises(ModelError, match=r"9 states determine 9 of the 15 quadratic terms"):
-        fit_quadratic(states, tracer(states))
+    with pytest.raises(ModelError, match=r"9 states determine 9 of the 15"):
+        fit_quadratic(states, zernikes)
 
 
 def test_jacobian_of_the_model_is_that_of_the_rays(model, tracer):

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.stats import f as f_law
 from scipy.stats import multivariate_t
 
 from psfdae.optics.wavefronts import seidel_wavefronts
@@ -16,12 +15,10 @@ from psfdae_paper.bounds import sampling
 from psfdae_paper.bounds.posterior import Likelihood, jitters, merge
 from psfdae_paper.bounds.sampling import (
     FIELD,
-    SEARCH,
     TRUTH,
     Modes,
     StampModel,
     climb,
-    corners,
     recentred,
     sampled_sums,
     twins,
@@ -80,22 +77,19 @@ def exact(model, stars, noise):
     weight = np.exp(scores - scores.max(axis=1, keepdims=True))
     weight /= weight.sum(axis=1, keepdims=True)
     share = weight.reshape(4, len(FIELDS), -1, 9).sum(axis=2)
-    own = np.where(np.repeat(field, 9) == 0, weight, 0.0)
-    return weight @ images, share, own @ images / own.sum(axis=1, keepdims=True)
+    inside = np.where(np.repeat(field, 9) == 0, weight, 0.0)
+    return weight @ images, share, inside @ images / inside.sum(axis=1, keepdims=True)
 
 
 @pytest.fixture(scope="module")
 def modes(model, stars, noise):
     """Modes found from one start in the right field, at no aberration."""
-    count, eye = 4, np.tile(np.eye(5), (4, 1, 1))
-    start = Modes(
-        *(np.arange(count), np.zeros(count, int), stars[3], np.zeros(count, int)),
-        *(np.zeros((count, 5)), eye, np.zeros(count)),
-    )
+    none = np.zeros(4, int)
+    start = Modes.at(np.arange(4), none, stars[3], none, np.zeros((4, 5)))
     likelihood = Likelihood.of(noise, LEVEL, stars[1])
     counts = likelihood.counts(stars[2])
-    found = climb(start, counts, likelihood, model)
-    return climb(found + twins(found, likelihood, model), counts, likelihood, model)
+    first = climb(start, counts, likelihood, model)
+    return climb(first + twins(first, likelihood, model), counts, likelihood, model)
 
 
 def sampled(model, modes, stars, noise, draws=2000):
@@ -106,26 +100,18 @@ def sampled(model, modes, stars, noise, draws=2000):
 
 
 def test_draws_have_the_posterior_mean_of_the_grid(model, modes, stars, noise, exact):
-    found = sampled(model, modes, stars, noise)
-    mean, share, told = exact
-    free = merge(found.free)
+    sums = sampled(model, modes, stars, noise)
+    mean, share, mean_in_field = exact
+    free, in_field = merge(sums.free), merge(sums.in_field)
     error = ((mean - stars[1].reshape(4, -1)) ** 2).mean()
     assert ((free.mean_image - mean) ** 2).mean() < 0.01 * error
-    assert ((merge(found.in_field).mean_image - told) ** 2).mean() < 0.01 * error
+    assert ((in_field.mean_image - mean_in_field) ** 2).mean() < 0.01 * error
     assert free.share / free.total[:, None, None] == pytest.approx(share, abs=0.03)
     # Fields in one direction can give nearly the same image.
     assert (share[:, 1].sum(axis=1) > 0.01).any()
-    assert (merge(found.in_field).share[:, 1:] == 0).all()
-    assert found.free_helped.mean_image == pytest.approx(free.mean_image, abs=1e-12)
-
-
-def test_effective_size_is_that_of_the_weights(model, modes, stars, noise):
-    found = sampled(model, modes, stars, noise, 400)
-    whole = merge(found.free).effective_size
-    assert (whole > 100).all()
-    assert (whole < 400 + len(modes.star) * 3).all()
-    parts = np.mean([part.effective_size for part in found.free], axis=0)
-    assert whole / parts == pytest.approx(np.full(4, len(found.free)), rel=0.4)
+    assert (in_field.share[:, 1:] == 0).all()
+    assert sums.free_helped.mean_image == pytest.approx(free.mean_image, abs=1e-12)
+    assert ((free.effective_size > 500) & (free.effective_size < 2100)).all()
 
 
 def test_same_streams_give_the_same_bytes_in_any_blocks(model, modes, stars, noise, monkeypatch):
@@ -138,8 +124,9 @@ def test_same_streams_give_the_same_bytes_in_any_blocks(model, modes, stars, noi
 
 def test_stamps_are_those_of_the_simulator(model, stars):
     z, truth, _, offset = stars
-    assert model.stamps(z, np.zeros(4, int), offset) == pytest.approx(truth, abs=1e-4)
-    assert ((model.stamps(z, np.zeros(4, int), offset) - truth) ** 2).mean() < 1e-9
+    stamps = model.stamps(z, np.zeros(4, int), offset)
+    assert stamps == pytest.approx(truth, abs=1e-4)
+    assert ((stamps - truth) ** 2).mean() < 1e-9
 
 
 def test_twins_give_the_same_image(model, noise):
@@ -153,15 +140,13 @@ def test_twins_give_the_same_image(model, noise):
     assert images[1] == pytest.approx(images[0], abs=1e-5)
     odd = near * [-1, 1, -1, -1, 1]  # the even part negated
     assert wide.stamps(odd, np.array([0]), middle) == pytest.approx(images[0], abs=1e-5)
-    start = Modes(
-        *(np.zeros(1, int), np.zeros(1, int), middle, np.zeros(1, int)),
-        *(near, np.eye(5)[None], np.zeros(1)),
-    )
-    found = twins(start, Likelihood.of(noise, 1e-4, images[0]), wide)
-    there = (found.field == 1) & (found.offset == middle).all(axis=1)
-    assert found.z[there][0] == pytest.approx(far[0], abs=0.02)
+    none = np.zeros(1, int)
+    start = Modes.at(none, none, middle, none, near)
+    others = twins(start, Likelihood.of(noise, 1e-4, images[0]), wide)
+    there = (others.field == 1) & (others.offset == middle).all(axis=1)
+    assert others.z[there][0] == pytest.approx(far[0], abs=0.02)
     # A pixel aside is a tilt, which distortion can make up for where it is large.
-    assert len(found.star) > 1
+    assert len(others.star) > 1
 
 
 def test_the_twin_of_a_mode_at_its_own_place_weighs_as_the_mode(model, noise):
@@ -173,20 +158,20 @@ def test_the_twin_of_a_mode_at_its_own_place_weighs_as_the_mode(model, noise):
     images = wide.stamps(z, 2 * number, middle)
     likelihood = Likelihood.of(noise, 1e-4, images)
     start = Modes.at(number, 2 * number, middle, 0 * number, z)
-    found = climb(start, likelihood.counts(images), likelihood, wide)
+    modes = climb(start, likelihood.counts(images), likelihood, wide)
     for first in range(2):
         evidence = np.where(number == first, 100.0, 99.0)
-        both = replace(found, star=0 * number, evidence=evidence)
+        both = replace(modes, star=0 * number, evidence=evidence)
         other = twins(both, likelihood, wide)
         at = [
             np.flatnonzero((other.field == f) & (other.offset == o).all(axis=1))[0]
             for f, o in zip(2 * number, middle, strict=True)
         ]
         assert at[first] < at[1 - first]
-        assert other.z[at] == pytest.approx(found.z, abs=0.1)
+        assert other.z[at] == pytest.approx(modes.z, abs=0.1)
 
 
-def test_draws_have_the_density_of_students_t():
+def test_density_of_draws_is_students_t():
     rng = np.random.default_rng(5)
     factor = np.tril(rng.normal(0, 0.3, (2, 5, 5))) + np.eye(5)
     number, none = np.arange(2), np.zeros(2, int)
@@ -194,23 +179,13 @@ def test_draws_have_the_density_of_students_t():
     modes = replace(start, factor=factor)
     z, field = rng.normal(0, 3, (30, 5)), np.arange(30) % 2
     offset = np.where(np.arange(30) < 20, modes.offset[field].T, 7).T
-    found = modes.log_density(z, field, offset)
+    density = modes.log_density(z, field, offset)
     for mode in number:
         scale = factor[mode] @ factor[mode].T
         law = multivariate_t(modes.z[mode], scale, FREEDOM)
         there = (field == mode) & (np.arange(30) < 20)
-        assert found[mode, there] == pytest.approx(law.logpdf(z[there]), abs=1e-9)
-        assert (found[mode, ~there] == -np.inf).all()
-    draws, count = modes.draws(20_000, 0, rng)
-    for mode in number:
-        mine = draws.z[draws.field == mode]
-        assert len(mine) == count[mode] > 5000
-        whitened = np.linalg.solve(factor[mode], (mine - modes.z[mode]).T)
-        # The median of the squared distance of t is that of F, times the dimension.
-        expected = 5 * f_law(5, FREEDOM).median()
-        assert np.median((whitened**2).sum(axis=0)) == pytest.approx(expected, rel=0.05)
-        inside = np.cov(whitened[:, (whitened**2).sum(axis=0) < 2 * expected])
-        assert inside == pytest.approx(inside[0, 0] * np.eye(5), abs=0.06 * inside[0, 0])
+        assert density[mode, there] == pytest.approx(law.logpdf(z[there]), abs=1e-9)
+        assert (density[mode, ~there] == -np.inf).all()
 
 
 def aside(stars, model, noise, level, shift):
@@ -219,9 +194,10 @@ def aside(stars, model, noise, level, shift):
     noisy = noise.draw(truth, level, np.random.default_rng(7))
     likelihood = Likelihood.of(noise, level, truth)
     problem = (likelihood.counts(noisy), likelihood, model)
-    own = np.zeros(1, int)
-    start = Modes.at(own, own, offset + shift, np.full(1, FIELD), z)
-    return climb(start, *problem), Modes.at(own, own, offset, np.full(1, TRUTH), z), noisy, problem
+    none = np.zeros(1, int)
+    start = Modes.at(none, none, offset + shift, np.full(1, FIELD), z)
+    truth = Modes.at(none, none, offset, np.full(1, TRUTH), z)
+    return climb(start, *problem), truth, noisy, problem
 
 
 def test_stamps_beside_their_place_are_recentred(stars, model, noise):
@@ -230,19 +206,10 @@ def test_stamps_beside_their_place_are_recentred(stars, model, noise):
     counts, number, back = likelihood.counts(noisy), np.arange(len(z)), []
     for shift in set(jitters(1)) - {(0, 0)}:
         start = Modes.at(number, 0 * number, offset + shift, np.full(len(z), FIELD), z)
-        found = recentred(start, counts, likelihood, model)
-        back += (found.offset == offset).all(axis=1).tolist()
+        modes = recentred(start, counts, likelihood, model)
+        back += (modes.offset == offset).all(axis=1).tolist()
     # A tilt and coma move an image nearly alike.
     assert np.mean(back) > 0.6
-
-
-def test_corners_lie_all_around_the_best_mode(stars, model, noise):
-    mode, *_ = aside(stars, model, noise, 1e-4, (0, 0))
-    starts = corners(mode, np.zeros(1, int))
-    assert len(starts.star) == 2**5 == len(np.unique(starts.z, axis=0))
-    assert np.abs(starts.z - mode.z) == pytest.approx(SEARCH.corner, rel=1e-12)
-    assert starts.z.mean(axis=0) == pytest.approx(mode.z[0], abs=1e-12)
-    assert not len(corners(mode, np.zeros(0, int)).star)
 
 
 def test_a_mode_undetected_with_the_field_given_shows(stars, model, noise):
@@ -256,9 +223,9 @@ def test_a_mode_undetected_with_the_field_given_shows(stars, model, noise):
     error = ((lost.in_field_helped.mean_image - stars[1][:1].reshape(1, -1)) ** 2).mean()
     assert error < 1e-7
     assert 0 < lost.in_field_helped.variance[0].mean() < 1e-7
-    found = sampled_sums(replace(right, given=np.full(1, FIELD)), *arguments)
-    assert found.in_field_helped.mean_image == pytest.approx(
-        merge(found.in_field).mean_image, abs=1e-9
+    sums = sampled_sums(replace(right, given=np.full(1, FIELD)), *arguments)
+    assert sums.in_field_helped.mean_image == pytest.approx(
+        merge(sums.in_field).mean_image, abs=1e-9
     )
 
 

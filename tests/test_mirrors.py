@@ -13,7 +13,6 @@ import pytest
 from psfdae.settings import ConfigError
 from psfdae.telescope.aberrations import Prescription
 from psfdae.telescope.raytracing import ZernikeTracer, build_optic
-from psfdae_paper.configuration.alignment import CHOICE
 from psfdae_paper.configuration.compose import load
 
 OWN = "dataset=_telescope"
@@ -63,21 +62,19 @@ def classical(prescription):
     return Prescription.model_validate(tree)
 
 
-def test_axial_image_of_a_paraboloid_is_perfect(newtonian):
-    assert np.abs(zernikes(newtonian)[0]).max() < 1e-6 * newtonian.wavelength_m
-
-
 def test_third_order_aberrations_of_a_paraboloid(newtonian):
     """Coma 3θ/(16F²), with its tail away from the axis, and astigmatism θ²/(2F)."""
-    radius, found = 0.5 * newtonian.diameter_m, zernikes(newtonian)
+    radius, opd = 0.5 * newtonian.diameter_m, zernikes(newtonian)
     ratio = newtonian.aberrations.prescription.best_focus_m / newtonian.diameter_m
     assert ratio == pytest.approx(5)
-    coma = tangential_coma(found[:, COMA_X], radius)
+    coma = tangential_coma(opd[:, COMA_X], radius)
     assert coma == pytest.approx(3 * FIELD / (16 * ratio**2), rel=3e-3, abs=1e-12)
     # Light focuses earlier in the tangential plane: the wavefront runs ahead at its rim.
-    astigmatic = astigmatism(-found[:, ASTIGMATISM], radius)
+    astigmatic = astigmatism(-opd[:, ASTIGMATISM], radius)
     assert astigmatic == pytest.approx(FIELD**2 / (2 * ratio), rel=5e-3, abs=1e-12)
-    assert np.abs(found[:, COMA_Y]).max() < 1e-6 * newtonian.wavelength_m
+    # Perfect on the axis, and symmetric about the plane of the field.
+    assert np.abs(opd[0]).max() < 1e-6 * newtonian.wavelength_m
+    assert np.abs(opd[:, COMA_Y]).max() < 1e-6 * newtonian.wavelength_m
 
 
 @pytest.mark.parametrize("name", ["newtonian", "ritchey_chretien"])
@@ -90,40 +87,26 @@ def test_detector_beyond_focus_sees_the_wavefront_ahead(name):
     assert change[FOCUS] == pytest.approx(expected, rel=0.01)
 
 
-def test_ritchey_chretien_has_the_conics_of_theory(ritchey):
-    """Both that remove spherical aberration and coma, and the paraxial focus."""
-    p = ritchey.aberrations.prescription
-    first = -1 - 2 * (1 + B) / (M**2 * (M - B))
-    second = -(((M + 1) / (M - 1)) ** 2) - 2 * M * (M + 1) / ((M - B) * (M - 1) ** 3)
-    assert (p.primary.conic, p.secondary.conic) == pytest.approx((first, second), abs=1e-5)
-    k = (1 + B) / (M + 1)
-    assert p.secondary.vertex_m == pytest.approx((1 - k) * 1.2, abs=1e-6)
-    assert p.secondary.radius_m == pytest.approx(2.4 * M * k / (M - 1), abs=1e-6)
-    assert p.best_focus_m == pytest.approx(-B * 1.2)
-
-
 def test_ritchey_chretien_has_no_third_order_coma(ritchey):
     """Its rest is that of fifth order; astigmatism is what theory leaves."""
-    radius, found = 0.5 * ritchey.diameter_m, zernikes(ritchey)
-    assert np.abs(found[0]).max() < 0.005 * ritchey.wavelength_m
+    radius, opd = 0.5 * ritchey.diameter_m, zernikes(ritchey)
+    assert np.abs(opd[0]).max() < 0.005 * ritchey.wavelength_m
     of_a_paraboloid = 3 * FIELD / (16 * F**2)
-    coma = tangential_coma(found[:, COMA_X], radius)
+    coma = tangential_coma(opd[:, COMA_X], radius)
     assert (np.abs(coma) < 0.01 * of_a_paraboloid + 1e-12).all()
     factor = (M * (2 * M + 1) + B) / (2 * M * (1 + B))
     expected = factor * FIELD**2 / (2 * F)
-    assert astigmatism(-found[:, ASTIGMATISM], radius) == pytest.approx(
-        expected, rel=0.01, abs=1e-11
-    )
+    assert astigmatism(-opd[:, ASTIGMATISM], radius) == pytest.approx(expected, rel=0.01, abs=1e-11)
 
 
 def test_classical_cassegrain_has_the_coma_of_a_paraboloid_of_its_focal_ratio(ritchey):
-    found = zernikes(ritchey, classical(ritchey.aberrations.prescription))
+    opd = zernikes(ritchey, classical(ritchey.aberrations.prescription))
     radius = 0.5 * ritchey.diameter_m
-    assert np.abs(found[0]).max() < 1e-3 * ritchey.wavelength_m
-    coma = tangential_coma(found[:, COMA_X], radius)
+    assert np.abs(opd[0]).max() < 1e-3 * ritchey.wavelength_m
+    coma = tangential_coma(opd[:, COMA_X], radius)
     assert coma == pytest.approx(3 * FIELD / (16 * F**2), rel=5e-3, abs=1e-11)
     factor = (M**2 + B) / (M * (1 + B))
-    assert astigmatism(-found[:, ASTIGMATISM], radius) == pytest.approx(
+    assert astigmatism(-opd[:, ASTIGMATISM], radius) == pytest.approx(
         factor * FIELD**2 / (2 * F), rel=0.01, abs=1e-11
     )
 
@@ -133,24 +116,17 @@ LENS = (
     "{front_radius_m: -1, back_radius_m: -1, front_vertex_m: 0.5, back_vertex_m: 0.4, "
     "clear_radius_m: 0.1}"
 )
-GLASS = f"++{PRESCRIPTION}.glass={{sellmeier_b: [1,1,1], sellmeier_c_um2: [0,0,90]}}"
 
 
 @pytest.mark.parametrize(
     ("name", "override", "message"),
     [
-        ("newtonian", f"{PRESCRIPTION}.best_focus_m=-1", "from primary to best focus = -1 m: must"),
+        ("newtonian", f"{PRESCRIPTION}.best_focus_m=-1", "from primary to best focus = -1 m"),
         ("ritchey_chretien", f"{PRESCRIPTION}.best_focus_m=1", "from secondary to best focus = -0"),
         ("newtonian", f"++{PRESCRIPTION}.lenses.l1={LENS}", r"lenses = \['l1'\]: must lie behind"),
         ("ritchey_chretien", f"++{PRESCRIPTION}.lenses.l1={LENS}", "glass: must be given for lens"),
-        ("newtonian", GLASS, "glass: must be given for lenses, and for nothing else"),
     ],
 )
 def test_mirrors_that_cannot_be_are_named(name, override, message):
     with pytest.raises(ConfigError, match=rf"prescription: .*{message}"):
         load([OWN, f"telescope=example_{name}", override])
-
-
-def test_nothing_of_a_newtonian_can_be_misaligned():
-    with pytest.raises(ConfigError, match=r"^prescription: secondary: missing"):
-        load([*CHOICE, "prescription=newtonian"])

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-
 import numpy as np
 import pytest
 
@@ -14,12 +12,10 @@ from psfdae.optics.pupil import annular_pupil
 from psfdae.optics.wavefronts import (
     field_coefficients,
     seidel_wavefronts,
-    zernike_images,
     zernike_wavefronts,
 )
 from psfdae.settings import ConfigError, as_overrides
 from psfdae.telescope.field import static_zernikes
-from psfdae.telescope.raytracing import RayTracingError
 from psfdae_paper.alignment.stamps import AlignmentStamps, mean_slope
 from psfdae_paper.alignment.telescope import zernike_tracer
 from psfdae_paper.configuration.alignment import CHOICE as SCENE3
@@ -84,22 +80,6 @@ def test_seidel_s_wavefront_in_zernikes(both):
     assert np.ptp(difference, axis=1) == pytest.approx(0, abs=1e-9)
 
 
-def test_seidel_s_stamps_from_zernikes(scene1, both):
-    """Tilts included: the brightest pixels are the same."""
-    framing = scene1.framing
-    offsets = np.zeros((3, 2))
-    some = np.array([0, 38, 60])
-    stamps, peaks = [], []
-    for source in both:
-        propagation = Propagation(
-            source, scene1.telescope, scene1.optics, framing, framing.search_px
-        )
-        stamps.append(propagation.stamps(32, offsets, some))
-        peaks.append(propagation.brightest(some))
-    assert stamps[0] == pytest.approx(stamps[1], abs=2e-5 * stamps[0].max())
-    assert (peaks[0] == peaks[1]).all()
-
-
 def test_slopes_are_those_of_the_same_polynomials(both):
     seidel, zernikes = both
     assert zernikes.slopes() == pytest.approx(seidel.slopes(), abs=1e-5)
@@ -107,27 +87,6 @@ def test_slopes_are_those_of_the_same_polynomials(both):
     assert focus.slopes()[0] == pytest.approx(
         np.full((2, 2), [-4 * np.sqrt(3), 4 * np.sqrt(3)]), abs=1e-6
     )
-
-
-@pytest.mark.parametrize(("noll", "axis"), [(2, 1), (3, 0)])
-def test_tilt_moves_the_image_along_its_axis(scene1, noll, axis):
-    """Z2 = 2x waves is a slope of 2 waves per radius: + 4 λ/D along x, the columns."""
-    source = zernike_wavefronts((noll,), np.array([[3.0]]))
-    propagation = Propagation(source, scene1.telescope, scene1.optics, scene1.framing, 24)
-    moved = np.zeros(2)
-    moved[axis] = 3.0 * 4.0 / scene1.telescope.pixel
-    assert propagation.brightest()[0] == pytest.approx(moved - 0.5, abs=0.51)
-
-
-def test_field_polynomials():
-    field = np.array([[0.5, -2.0]])
-    terms = [{(0, 0): 1.0, (1, 0): 2.0}, {(2, 1): 3.0}, {}]
-    assert field_coefficients(terms, field) == pytest.approx(np.array([[2.0, -1.5, 0.0]]))
-
-
-def test_zernike_images_follow_the_list():
-    x = np.array([0.3, -0.2])
-    assert zernike_images((3, 2), x, 0 * x) == pytest.approx(np.stack([0 * x, 2 * x]), abs=1e-12)
 
 
 @pytest.fixture(scope="module")
@@ -146,8 +105,7 @@ def test_ray_trace_is_that_of_scene_3(traced):
     assert noll == tuple(range(4, 23))
     assert traced.telescope.aberrations.defocus_m == alignment.alignment.defocus_m
     # Scene 3's circle starts on the x axis; its odd points are the corners of the grid.
-    for own, other in ((4, 0), (8, 2), (6, 4), (0, 6), (2, 8)):
-        assert ours[own] == pytest.approx(theirs[other], abs=1e-9)
+    assert ours[[4, 8, 6, 0, 2]] == pytest.approx(theirs[[0, 2, 4, 6, 8]], abs=1e-9)
     assert np.abs(theirs).max() > 0.3
 
 
@@ -162,27 +120,20 @@ def test_ray_traced_stamps_are_those_of_scene_3(traced):
     # Scene 3 centres a stamp on the centroid, 2 λ/D per wave of mean slope away.
     slopes = np.array([mean_slope(j, traced.telescope.obscuration) for j in range(4, 23)])
     centroid = 2.0 * (leaning @ slopes)[:, ::-1] / traced.telescope.pixel
-    own = zernike_wavefronts(range(4, 23), leaning)
-    propagation = Propagation(own, traced.telescope, traced.optics, traced.framing, 24)
+    source = zernike_wavefronts(range(4, 23), leaning)
+    propagation = Propagation(source, traced.telescope, traced.optics, traced.framing, 24)
     stamps, _ = normalise_flux(propagation.stamps(16, centroid))
     assert np.abs(stamps - expected).max() < 2e-3 * expected.max()
     for other in (expected[:, ::-1], expected[:, :, ::-1], expected.swapaxes(1, 2)):
         assert np.abs(stamps - other).max(axis=(1, 2)).min() > 0.1 * expected.max()
 
 
-def test_field_beyond_the_corrector_is_refused(traced):
-    with pytest.raises(RayTracingError, match="vignetted"):
-        template_wavefronts(
-            load([OWN, "telescope=example_raytraced", "telescope.field_edge_deg=3"])
-        )
-
-
 def test_seidel_telescope_is_scene_1_byte_by_byte(tmp_path):
     small = ["grid.points=3", "stars.count=24", "stars.name=seidel_10pct"]
-    own = [OWN, "telescope=example_seidel", "grid.spacing_deg=1.1", "optics=scene1"]
-    own += ["framing=stamp16", "stars.search_px=24"]
+    words = [OWN, "telescope=example_seidel", "grid.spacing_deg=1.1", "optics=scene1"]
+    words += ["framing=stamp16", "stars.search_px=24"]
     products = []
-    for name, choice in (("paper", ["stars=seidel_10pct"]), ("own", own)):
+    for name, choice in (("paper", ["stars=seidel_10pct"]), ("telescope", words)):
         fields, out = tmp_path / f"{name}_t.h5", tmp_path / f"{name}.h5"
         stars.templates(load_stage(STATIC, [*choice, *small]), fields)
         stars.stars(load_stage(SIMULATION, [*choice, *small]), fields, out)
@@ -208,16 +159,6 @@ def test_random_aberrations_have_both_spreads():
     assert (again.coefficients == drawn.coefficients).all()
 
 
-def test_stars_of_zernike_telescope_differ_from_their_template(tmp_path):
-    choice = [OWN, "grid.points=3", "stars.count=20"]
-    stars.templates(load_stage(STATIC, choice), tmp_path / "t.h5")
-    stars.stars(load_stage(SIMULATION, choice), tmp_path / "t.h5", tmp_path / "s.h5")
-    product = read_product(tmp_path / "s.h5", "stars")
-    assert product["realisation"].sum(axis=(1, 2)) == pytest.approx(np.ones(20), abs=1e-5)
-    assert np.abs(product["realisation"] - product["template"]).max() > 0.01
-    assert np.abs(product["phase"]).max() > 0.3
-
-
 def test_what_follows_from_the_telescope():
     config = load([OWN, "telescope.pixel_scale_arcsec=1.6", "grid.points=5"])
     assert config.grid.spacing_deg == pytest.approx(0.5)
@@ -235,7 +176,7 @@ def test_other_scenes_keep_their_groups():
     assert dumped["wavefront"]["kind"] == "seidel"
 
 
-@pytest.mark.parametrize("telescope", ["zernike", "seidel", "raytraced", "newtonian"])
+@pytest.mark.parametrize("telescope", ["zernike", "raytraced"])
 def test_workflow_s_overrides_reproduce_the_configuration(telescope):
     """Options that differ in their keys are chosen by name, then every key is pinned."""
     option = f"telescope=example_{telescope}"
@@ -253,18 +194,12 @@ TERMS = "telescope.aberrations.terms"
     ("overrides", "message"),
     [
         (["telescope=example_zernike"], "brings its own aberrations, but scene = seidel"),
-        ([OWN, "telescope=wfsat"], "wfsat: has no aberrations; scene = telescope needs"),
-        ([OWN, "telescope.diameter_m=-1"], r"^telescope\.diameter_m = -1: .*greater than 0$"),
         ([OWN, f"++{TERMS}.z1=1"], r"'z1': must be between z2 and z45"),
-        ([OWN, f"++{TERMS}.coma=1"], r"'coma': must be between z2 and z45"),
-        ([OWN, f"++{TERMS}.z4.xz=1"], r"z4: 'xz': must be constant or a product such as"),
-        ([OWN, f"++{TERMS}.z4.xxxxyyy=1"], "of degree 6 or less"),
-        ([OWN, f"++{TERMS}.z4=high"], r"terms\.z4 = 'high'"),
-        ([OWN, "telescope.aberrations.kind=spot"], "kind = 'spot': must be seidel, zernike"),
+        ([OWN, f"++{TERMS}.z4.xz=1"], r"z4: 'xz': must be constant or a product"),
+        ([OWN, "telescope.aberrations.kind=spot"], "kind = 'spot'"),
         ([OWN, "++telescope.aberrations.seing=1"], r"^telescope\.aberrations\.seing: unknown key$"),
-        ([OWN, "++telescope.colour=1"], r"^telescope\.colour: unknown key$"),
-        ([OWN, "stars.aberration_fraction=0"], "jitter_waves = 0.03: .*must be above 0"),
-        ([OWN, "telescope.field_edge_deg=90"], r"field_edge_deg = 90: .*less than or equal to 45"),
+        ([OWN, "stars.aberration_fraction=0"], "jitter_waves = 0.03"),
+        ([OWN, "telescope.field_edge_deg=90"], r"field_edge_deg = 90"),
     ],
 )
 def test_every_mistake_is_named(overrides, message):
@@ -279,31 +214,37 @@ def simulate(folder, *arguments):
     return psfdae("simulate", "--out", folder, *arguments)
 
 
-def test_simulate_writes_what_the_stage_writes(tmp_path):
-    result = simulate(tmp_path / "mine", "--fits", "--image-snr", "40", *CHOICE)
-    assert result.exit_code == 0, result.output
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory):
+    """Two simulations with the same words."""
+    folders = [tmp_path_factory.mktemp("simulated") for _ in range(2)]
+    for folder in folders:
+        result = simulate(folder, "--fits", "--image-snr", "40", *CHOICE)
+        assert result.exit_code == 0, result.output
+    return folders
+
+
+def test_simulate_writes_what_the_stage_writes(simulated, tmp_path):
+    first, second = simulated
     names = {"templates.h5", "psfs.png", "fields.csv", "psfs.fits", "image.fits", "stars.csv"}
-    assert {path.name for path in (tmp_path / "mine").iterdir()} == names
+    assert {path.name for path in first.iterdir()} == names
+    for name in names:
+        assert (first / name).read_bytes() == (second / name).read_bytes(), name
     stars.templates(load_stage(STATIC, [OWN, *CHOICE]), tmp_path / "t.h5")
-    assert (tmp_path / "mine/templates.h5").read_bytes() == (tmp_path / "t.h5").read_bytes()
-    table = np.genfromtxt(tmp_path / "mine/fields.csv", delimiter=",", names=True)
+    assert (first / "templates.h5").read_bytes() == (tmp_path / "t.h5").read_bytes()
+    table = np.genfromtxt(first / "fields.csv", delimiter=",", names=True)
     assert sorted(set(table["x_deg"])) == [-1, 0, 1]
     product = read_product(tmp_path / "t.h5", "templates")
     assert table["energy"] == pytest.approx(product["energy"], rel=1e-5)
     assert (table["fwhm_arcsec"] > 0.8).all()
 
 
-def test_simulated_observations_can_be_read(tmp_path):
-    for folder in ("one", "two"):
-        simulate(tmp_path / folder, "--fits", "--image-snr", "40", *CHOICE)
-    for name in ("psfs.fits", "image.fits", "stars.csv", "psfs.png"):
-        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
-    cube = open_observation(tmp_path / "one/psfs.fits", stamp_px=16)
+def test_simulated_observations_can_be_read(simulated):
+    folder, _ = simulated
+    cube = open_observation(folder / "psfs.fits", stamp_px=16)
     assert (cube.count, cube.pixel_scale_arcsec) == (9, 0.8)
     psf = next(cube.chunks(9)).data
-    image = open_observation(
-        tmp_path / "one/image.fits", catalogue=tmp_path / "one/stars.csv", stamp_px=16
-    )
+    image = open_observation(folder / "image.fits", catalogue=folder / "stars.csv", stamp_px=16)
     assert image.pixel_scale_arcsec == pytest.approx(0.8, rel=1e-6)
     data = next(image.chunks(9)).data - 1000.0
     mean = (psf / psf.sum(axis=(1, 2), keepdims=True)).mean(axis=0)
@@ -311,22 +252,26 @@ def test_simulated_observations_can_be_read(tmp_path):
     assert np.mean(flux) / np.sqrt(1000.0 / (mean**2).sum()) == pytest.approx(40, rel=0.1)
 
 
-def test_psf_that_does_not_fit_is_reported_then_refused(tmp_path):
-    blurred = [*CHOICE, f"{TERMS}.z4.constant=1.2"]
-    warned = simulate(tmp_path / "a", *blurred)
-    assert warned.exit_code == 0
-    assert "9 of 9 fields have less than 80% of their light inside 16 × 16 px" in warned.output
-    assert "framing.stamp_px=" in warned.output
-    refused("simulate", "--out", tmp_path / "b", "--least-energy", "0.9", *blurred)
-    assert not list((tmp_path / "b").iterdir())
-
-
-def test_wavefront_that_the_grid_would_alias_is_refused(tmp_path):
-    line = refused("simulate", "--out", tmp_path, *CHOICE, f"{TERMS}.z4.constant=40")
-    assert re.search(r"optics\.pupil_samples.*needs N ≥", line)
-
-
-def test_undersampled_psf_is_reported(tmp_path):
-    result = simulate(tmp_path, *CHOICE, "telescope.pixel_scale_arcsec=4")
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        (f"{TERMS}.z4.constant=1.2", "9 of 9 fields have less than 80% of their light inside"),
+        ("telescope.pixel_scale_arcsec=4", "undersampled"),
+    ],
+)
+def test_psf_that_does_not_fit_is_reported(tmp_path, override, message):
+    result = simulate(tmp_path, *CHOICE, override)
     assert result.exit_code == 0
-    assert "undersampled" in result.output
+    assert message in result.output
+
+
+@pytest.mark.parametrize(
+    ("words", "key"),
+    [
+        (["--least-energy=0.9", f"{TERMS}.z4.constant=1.2"], "framing.stamp_px"),
+        ([f"{TERMS}.z4.constant=40"], "optics.pupil_samples"),
+    ],
+)
+def test_psf_beyond_stamp_or_grid_is_refused(tmp_path, words, key):
+    assert key in refused("simulate", "--out", tmp_path, *CHOICE, *words)
+    assert not list(tmp_path.iterdir())
