@@ -143,21 +143,19 @@ def test_a_missing_aberration_is_none_and_what_is_not_stated_is_unknown(tmp_path
     telescope = load(["dataset=_telescope"]).model_dump()
     aberrations = telescope["telescope"]["aberrations"]
     terms = {name: term for name, term in aberrations["terms"].items() if name != "z9"}
-    less = {**aberrations, "terms": terms}
-    drawn = {**aberrations, "jitter_waves": 0.5}
 
-    def with_(value):
-        return {**telescope, "telescope": {**telescope["telescope"], "aberrations": value}}
+    def with_(**changes):
+        return {"telescope": {**telescope["telescope"], "aberrations": {**aberrations, **changes}}}
 
+    drawn = with_(jitter_waves=0.5)
     require(tmp_path, telescope, STARS, telescope)
     with pytest.raises(ProductError, match=r"terms\.z9 = nothing, but the configuration has "):
-        require(tmp_path, with_(less), STATIC, telescope)
+        require(tmp_path, with_(terms=terms), STATIC, telescope)
     # Static PSFs do not know what is drawn for every star.
-    require(tmp_path, with_(drawn), STATIC, telescope)
+    require(tmp_path, drawn, STATIC, telescope)
     with pytest.raises(ProductError, match=r"jitter_waves = 0\.5, .* has 0\.03"):
-        require(tmp_path, with_(drawn), STARS, telescope)
-    own = {"telescope": {"pixel_scale_arcsec": 0.8}, "framing": telescope["framing"]}
-    require(tmp_path, own, STARS, telescope)
+        require(tmp_path, drawn, STARS, telescope)
+    require(tmp_path, {"telescope": {"pixel_scale_arcsec": 0.8}}, STARS, telescope)
 
 
 # Scene 3, of which the headers are enough to be refused

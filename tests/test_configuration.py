@@ -60,14 +60,12 @@ def test_settings_of_the_paper():
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("framing.stamp_px=6", r"framing\.stamp_px = 6: "),
         ("framing.stamp_px=15", r"framing\.stamp_px = 15: "),
         ("noise.levels=[0.001,0]", r"noise\.levels\.1 = 0: .*greater than 0"),
         ("parts.train_stars=9000", r"= 10681: must be at most stars\.count = 8405"),
         ("train.lr=fast", r"train\.lr = 'fast': .*valid number"),
         ("telescope.obscuration=1.0", r"telescope\.obscuration = 1\.0: .*less than 1"),
         ("dae.widths=[8,8]", r"dae: widths = \[8, 8\]: 10 kernels need 9 widths"),
-        ("dae.kernels=[4,4]", r"dae: kernels = \[4, 4\]: "),
         ("optics.pupil_samples=[300,200]", r"pupil_samples: \[300, 200\] "),
         ("parts.train_stars=19", r"baseline\.components = 20: must be at most .* 19"),
         ("baseline.components=300", r"baseline\.components = 300: must be at most .* 256"),
@@ -75,7 +73,6 @@ def test_settings_of_the_paper():
         ("+train.momentum=0.9", r"train\.momentum: unknown key"),
         ("+colour=blue", r"colour: unknown key"),
         ("trian.lr=0.1", r"trian\.lr"),
-        ("dataset=dataset99", r"dataset/dataset99"),
         ("noise.levels=[0.1", r"no viable alternative at input"),
     ],
 )
@@ -153,12 +150,12 @@ def test_overrides_reach_the_datasets_that_know_them():
     assert compose.overrides_for(given, ["dataset=dataset8"]) == tuple(given)
 
 
-@pytest.mark.parametrize("reads", [SIMULATION, groups_of("dae"), READS])
-def test_stage_overrides_reproduce_the_stage_s_configuration(reads):
-    """What the workflow puts on a command line means what the dataset meant."""
-    chosen = ["dataset=dataset5", "preset=smoke"]
-    tree = compose.stage_tree(reads, compose.compose(tuple(chosen)))
-    assert load_stage(reads, as_overrides(tree)) == load_stage(reads, chosen)
+def test_stage_overrides_reproduce_the_stage_s_configuration():
+    """Words that the workflow puts on a command line mean what the dataset meant."""
+    chosen = ("dataset=dataset5", "preset=smoke")
+    for reads in (SIMULATION, READS):
+        tree = compose.stage_tree(reads, compose.compose(chosen))
+        assert load_stage(reads, as_overrides(tree)) == load_stage(reads, chosen)
 
 
 @pytest.fixture
@@ -197,9 +194,7 @@ def test_a_dataset_is_one_small_file_and_those_that_differ_in_values_are_compose
 @pytest.mark.parametrize(
     "text",
     [
-        "seed: 1\ndataset:\n  name: own\n",
         "seed: 1\ndataset:\n  name: own_${noise.name}\n",
-        "seed: 1\ndataset:\n  name: own\nstars:\n  name: ${dataset.name}\n",
         "seed: 1\ndataset:\n  name: own\nstars:\n  name: of_${dataset.name}\n",
         "seed: 1\ndataset:\n  name: ${oc.env:HOME}\n",
         "seed: ~\nparts: {}\ntrain: 3\n",

@@ -6,7 +6,6 @@ import os
 import re
 import shutil
 import signal
-import subprocess
 import urllib.request
 from subprocess import PIPE, STDOUT
 
@@ -18,21 +17,12 @@ from command_line import psfdae
 from docs_pages import ROOT, blocks, commands, pages, read
 from fits_inputs import write_field
 from psfdae.cli import main
-from psfdae.files import write_text
 from psfdae.model import packing
 from psfdae.model.bundle import read_bundle
-from psfdae_paper.configuration.compose import forget
-from test_compare import errors
-from workflow_runs import QUIET, clone, environment, shell, wait_until
+from workflow_runs import QUIET, clone, shell, wait_until
 
-TINY = {
-    "templates": ["grid.points=5"],
-    "stars": ["grid.points=5", "stars.count=200"],
-    "train": ["preset=smoke", "parts.train_stars=150", "parts.test_stars=50"],
-    "simulate": ["grid.points=3"],
-    "from-stars": ["parts.train_stars=60", "parts.test_stars=20"],
-}
-"""What makes a command quick."""
+SMALL = ("parts.train_stars=60", "parts.test_stars=20")
+"""Makes `psfdae from-stars` quick."""
 
 TESTED_ELSEWHERE = {
     "docs/first_session.md": "test_wheel.py",
@@ -60,8 +50,10 @@ DRY = {
 """Commands that take over 10 minutes, need a run that does, or would run this test: planned."""
 
 
-def test_every_command_is_one_that_there_is():
+def test_every_command_is_one_that_there_is_and_a_test_reads_its_page():
     """Its words are those of `psfdae`, of the Makefile, or of a program that a test runs."""
+    for page, test in TESTED_ELSEWHERE.items():
+        assert page.removeprefix("docs/") in read(f"tests/{test}")
     targets = set(re.findall(r"^([\w-]+):", read("Makefile"), re.M))
     for page in pages():
         for line in commands(read(page)):
@@ -76,37 +68,6 @@ def test_every_command_is_one_that_there_is():
                 assert {w.partition("=")[0] for w in words if w[0] == "-"} <= options, line.typed
             else:
                 assert program in ("cat", "cp", "snakemake", *NOT_RUN), line.typed
-
-
-@pytest.fixture
-def sandbox(tmp_path, monkeypatch):
-    """A working folder with a config tree of its own and finished trainings to compare."""
-    # Errors of models are measured on few noisy images.
-    for name, value in (("NODES", 3), ("LEAST_STARS", 60), ("FEW_STARS", 40)):
-        monkeypatch.setattr(packing, name, value)
-    shutil.copytree(ROOT / "config", tmp_path / "config")
-    shutil.copytree(ROOT / "profiles", tmp_path / "profiles")
-    for run in ("results", "results/paper", "results/smoke"):
-        for network in ("random-realisation", "held_out-realisation"):
-            write_network(tmp_path / run, f"dataset3/{network}")
-    for run in ("results", "results/reference"):
-        table = tmp_path / run / "tables" / "psf_metrics.csv"
-        table.parent.mkdir(parents=True)
-        shutil.copy(ROOT / "results/reference/tables/psf_metrics.csv", table)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("PSFDAE_CONFIG", str(tmp_path / "config"))
-    forget()
-    yield tmp_path
-    forget()
-
-
-def write_network(results, place):
-    folder = results / "dae" / place
-    write_text(folder / "config.yaml", f"train:\n  lr: 0.004\nrun: {results.name}\n")
-    write_text(folder / "history.csv", "epoch,train_mse,validation_mse,seconds\n1,2e-5,1e-5,3\n")
-    table = results / "evaluation" / f"{place}.parquet"
-    table.parent.mkdir(parents=True, exist_ok=True)
-    errors(1, 1e-5).to_parquet(table)
 
 
 @pytest.fixture(scope="module")
@@ -130,36 +91,19 @@ def star_stamps(count, side):
     return np.tile(image / image.sum(), (count, 1, 1))
 
 
-def run(command, folder):
-    """Run a command that is no workflow; snakemake has a test of its own."""
-    first, *words = command.words
-    if first == "psfdae":
-        result = psfdae(*words, *TINY.get(words[0], []))
-        assert result.exit_code == 0, result.output
-    elif first == "cat":
-        (folder / words[-1]).write_text(command.heredoc)
-        forget()
-    elif first == "cp":
-        subprocess.run(command.words, cwd=folder, check=True)
-    elif first == "make":
-        # What a shell would fill in is not there.
-        words = [re.sub(r"\$\([^)]*\)", "", word) for word in words]
-        listed = ["make", "--dry-run", "--directory", str(ROOT), *words]
-        subprocess.run(listed, env=environment(), check=True, capture_output=True)
-
-
-WITH_COMMANDS = [page for page in pages() if commands(read(page))]
-NIGHTLY = [page for page in WITH_COMMANDS if page not in ("README.md", *TESTED_ELSEWHERE)]
-
-
-@pytest.mark.parametrize(
-    "page", ["README.md", *(pytest.param(page, marks=pytest.mark.slow) for page in NIGHTLY)]
-)
-def test_commands_run(page, sandbox, observation):
+def test_commands_of_the_readme_run(observation, tmp_path, monkeypatch):
+    # Errors of models are measured on few noisy images.
+    for name, value in (("NODES", 3), ("LEAST_STARS", 60), ("FEW_STARS", 40)):
+        monkeypatch.setattr(packing, name, value)
     for path in observation:
-        shutil.copy(path, sandbox)
-    for line in commands(read(page)):
-        run(line, sandbox)
+        shutil.copy(path, tmp_path)
+    monkeypatch.chdir(tmp_path)
+    lines = [line.words[1:] for line in commands(read("README.md")) if line.words[0] == "psfdae"]
+    assert {words[0] for words in lines} == {"from-stars", "predict"}
+    for words in lines:
+        result = psfdae(*words, *(SMALL if words[0] == "from-stars" else ()))
+        assert result.exit_code == 0, result.output
+    assert {"page.html", "psfs.fits", "psfs.png"} <= {path.name for path in tmp_path.iterdir()}
 
 
 @pytest.fixture(scope="module")
@@ -205,7 +149,7 @@ def answers(url):
 
 @pytest.mark.written
 @pytest.mark.workflow
-@pytest.mark.parametrize("page", WITH_COMMANDS)
+@pytest.mark.parametrize("page", [page for page in pages() if commands(read(page))])
 def test_commands_as_written(page, house, tmp_path):
     """In a shell with the environment active and nothing else set."""
     for line in commands(read(page)):
@@ -223,12 +167,6 @@ def test_commands_as_written(page, house, tmp_path):
         process = shell(folder, typed(line), stdout=PIPE, stderr=STDOUT, text=True)
         output, _ = process.communicate()
         assert process.returncode == 0, f"{line.typed}\n{output}"
-
-
-@pytest.mark.parametrize(("page", "test"), TESTED_ELSEWHERE.items())
-def test_the_other_test_reads_the_page(page, test):
-    assert commands(read(page))
-    assert page.removeprefix("docs/") in (ROOT / "tests" / test).read_text(encoding="utf-8")
 
 
 def test_python_blocks_run(tmp_path, monkeypatch):
