@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import doctest
 import re
-import time
 from types import ModuleType
 
 import pytest
@@ -14,15 +13,12 @@ from docs_pages import blocks, read
 from psfdae.model import packing
 
 NAMES = [name for name in psfdae.__all__ if name != "__version__"]
-LONGEST_S = 3.0
-"""Of CPU time; an example is for trying it out."""
-
 REFERENCE = "docs/api.md"
 
 
 @pytest.fixture(scope="module")
 def lines(tmp_path_factory):
-    """What the lines at the head of the page leave, in a folder of their own."""
+    """Variables that the lines at the head of the page leave, in a folder of their own."""
     folder = tmp_path_factory.mktemp("examples")
     (body,) = blocks(read(REFERENCE), "python")
     names = {}
@@ -37,10 +33,9 @@ def lines(tmp_path_factory):
 
 def examples(name):
     """The examples of a name, those of its members included."""
-    found = doctest.DocTestFinder(recurse=True).find(
-        getattr(psfdae, name), name, module=ModuleType(name), globs={}
-    )
-    return [test for test in found if test.examples]
+    finder = doctest.DocTestFinder(recurse=True)
+    tests = finder.find(getattr(psfdae, name), name, module=ModuleType(name), globs={})
+    return [test for test in tests if test.examples]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -48,19 +43,15 @@ def test_the_example_gives_what_it_says(name, lines):
     tests = examples(name)
     assert any(test.name == name for test in tests), f"psfdae.{name} has no example"
     runner = doctest.DocTestRunner(optionflags=doctest.NORMALIZE_WHITESPACE)
-    said, start = [], time.process_time()
+    output = []
     for test in tests:
         test.globs = dict(lines)
-        runner.run(test, out=said.append)
-    assert runner.failures == 0, "".join(said)
-    assert time.process_time() - start < LONGEST_S
+        runner.run(test, out=output.append)
+    assert runner.failures == 0, "".join(output)
 
 
 def test_the_reference_is_the_public_names():
     page = read(REFERENCE)
-    listed = [place.rpartition(".") for place in re.findall(r"^::: (\S+)", page, re.M)]
-    kinds = {name: getattr(psfdae, name) for name in NAMES}
-    assert {(module, name) for module, _, name in listed} == {
-        (kind.__module__, name) for name, kind in kinds.items()
-    }
+    listed = set(re.findall(r"^::: (\S+)", page, re.M))
+    assert listed == {f"{getattr(psfdae, name).__module__}.{name}" for name in NAMES}
     assert "`psfdae.__version__`" in page and psfdae.__version__

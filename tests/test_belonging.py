@@ -7,10 +7,10 @@ import shutil
 import numpy as np
 import pytest
 import yaml
-from click.testing import CliRunner
 
+from command_line import psfdae, refused
 from psfdae.belonging import STARS, STATIC, require
-from psfdae.cli import main, stage
+from psfdae.cli import stage
 from psfdae.files import Column, ProductError, write_product
 from psfdae_paper.configuration.alignment import CHOICE
 from psfdae_paper.configuration.compose import load, load_stage
@@ -21,23 +21,17 @@ SIZES += ("parts.test_stars=20", "optics.threads=1", "train.epochs=1")
 METHODS = "methods=[noisy,pca_som,lmmse,dae]"
 
 
-def psfdae(*words):
-    return CliRunner().invoke(main, list(map(str, words)))
-
-
 def done(*words):
     result = psfdae(*words)
     assert result.exit_code == 0, result.output
 
 
-def refused(folder, *words, file, key, values):
+def differs(folder, *words, file, key, values):
     """The command ends in one line that names file, key and both values, and writes nothing."""
     before = sorted(folder.rglob("*"))
-    result = psfdae(*words)
-    assert result.exit_code == 2, result.output
-    assert len(result.stderr.strip().splitlines()) == 1, result.stderr
-    assert f"{file}: {key} = {values[0]}, but " in result.stderr, result.stderr
-    assert result.stderr.rstrip().endswith(f" has {values[1]}"), result.stderr
+    line = refused(*words)
+    assert f"{file}: {key} = {values[0]}, but " in line, line
+    assert line.rstrip().endswith(f" has {values[1]}"), line
     assert sorted(folder.rglob("*")) == before
 
 
@@ -66,42 +60,41 @@ def evaluate(at, stars="s.h5", dae="dae"):
     [
         ("telescope.pixel_scale_arcsec=0.2", "telescope.pixel_scale_arcsec", (0.1, 0.2)),
         ("grid.points=5", "grid.points", (3, 5)),
-        ("framing.jitter_px=2", "framing.jitter_px", (1, 2)),
         ("wavefront.coma=5.0", "wavefront.coma", (4.0, 5.0)),
         ("stars=turbulence", "scene.name", ("seidel", "turbulence")),
     ],
 )
 def test_stars_need_templates_of_their_own_scene(at, override, key, values):
     words = ("stars", "--templates", at / "t.h5", "--out", at / "out.h5", *SIZES, override)
-    refused(at, *words, file=at / "t.h5", key=key, values=values)
-
-
-def test_models_need_stars_of_their_own_kind(at):
-    file, scale = at / "pca_som.trained_on.yaml", "telescope.pixel_scale_arcsec"
-    refused(at, *evaluate(at, "s2.h5"), file=file, key=scale, values=(0.1, 0.15))
+    differs(at, *words, file=at / "t.h5", key=key, values=values)
 
 
 @pytest.mark.parametrize(
-    ("words", "file", "key", "values"),
+    ("stars", "words", "file", "key", "values"),
     [
-        (["--split", "held_out"], "pca_som.h5", "split", ("random", "held_out")),
-        (["--reference", "template"], "dae/config.yaml", "reference", ("realisation", "template")),
-        (["seed=1"], "pca_som.h5", "seed", (20200611, 1)),
-        (["parts.train_stars=30"], "pca_som.h5", "parts.train_stars", (40, 30)),
+        ("s2.h5", [], "pca_som.trained_on.yaml", "telescope.pixel_scale_arcsec", (0.1, 0.15)),
+        ("s.h5", ["--split=held_out"], "pca_som.h5", "split", ("random", "held_out")),
+        (
+            *("s.h5", ["--reference=template"], "dae/config.yaml"),
+            *("reference", ("realisation", "template")),
+        ),
+        ("s.h5", ["seed=1"], "pca_som.h5", "seed", (20200611, 1)),
+        ("s.h5", ["parts.train_stars=30"], "pca_som.h5", "parts.train_stars", (40, 30)),
     ],
 )
-def test_stars_of_the_training_are_no_test(at, words, file, key, values):
-    refused(at, *evaluate(at), *words, file=at / file, key=key, values=values)
+def test_models_are_tested_on_stars_of_their_kind_that_they_have_not_seen(
+    at, stars, words, file, key, values
+):
+    differs(at, *evaluate(at, stars), *words, file=at / file, key=key, values=values)
 
 
 def test_templates_go_on_from_the_realisations_of_the_same_training_part(at, tmp_path):
     words = ("fit", "dae", "--stars", at / "s.h5", "--start", at / "dae", "--out", tmp_path / "on")
     sizes = (*SIZES, "train.epochs=4", "train.continued_epochs=0.5")
     parts = {"file": at / "dae/config.yaml", "key": "parts.train_stars", "values": (40, 30)}
-    refused(at, *words, "--reference=template", *sizes, "parts.train_stars=30", **parts)
+    differs(at, *words, "--reference=template", *sizes, "parts.train_stars=30", **parts)
     assert "--start" in psfdae(*words, *sizes).stderr
-    other = psfdae(*words, "--reference=template", *sizes, "dae.scale=none")
-    assert other.exit_code == 2 and "dae.scale" in other.stderr
+    assert "dae.scale" in refused(*words, "--reference=template", *sizes, "dae.scale=none")
     done(*words, "--reference=template", *sizes)
     assert len((tmp_path / "on/history.csv").read_text().splitlines()) == 1 + 2
 
@@ -109,34 +102,25 @@ def test_templates_go_on_from_the_realisations_of_the_same_training_part(at, tmp
 def test_a_bundle_holds_the_very_stars_of_the_training(at):
     words = ("bundle", "--stars", at / "fresh.h5", "--dae", at / "dae", "--out", at / "out")
     values = ("seidel_10pct", "fresh")
-    refused(at, *words, *SIZES, file=at / "dae/trained_on.yaml", key="stars.name", values=values)
+    differs(at, *words, *SIZES, file=at / "dae/trained_on.yaml", key="stars.name", values=values)
 
 
 def test_bounds_need_stars_of_the_scene_of_their_templates(at):
     inputs = ("--dataset", "d", "--stars", at / "s.h5", "--templates", at / "t.h5")
     out = ("--growth", at / "g.csv", "--per-star", at / "p.parquet", "--out", at / "out.csv")
     key, more = "stars.aberration_fraction", "stars=seidel_50pct"
-    refused(at, "bounds", *inputs, *out, *SIZES, more, file=at / "s.h5", key=key, values=(0.1, 0.5))
+    differs(at, "bounds", *inputs, *out, *SIZES, more, file=at / "s.h5", key=key, values=(0.1, 0.5))
 
 
 def test_runs_are_tracked_with_their_own_stars(at, tmp_path):
     shutil.copytree(at / "dae", tmp_path / "dae/dataset3/random-realisation")
     (tmp_path / "evaluation/dataset3").mkdir(parents=True)
     (tmp_path / "evaluation/dataset3/random-realisation.csv").write_text("method\ndae\n")
-    words = (
-        "track",
-        "--results",
-        tmp_path,
-        "--preset",
-        "smoke",
-        "--stars",
-        "dataset3",
-        at / "s2.h5",
-    )
+    words = ("track", "--results", tmp_path, "--preset=smoke", "--stars", "dataset3", at / "s2.h5")
     out = ("--database", tmp_path / "mlflow.db", "--out", tmp_path / "out.csv")
     file = tmp_path / "dae/dataset3/random-realisation/trained_on.yaml"
     key = "telescope.pixel_scale_arcsec"
-    refused(tmp_path, *words, *out, file=file, key=key, values=(0.1, 0.15))
+    differs(tmp_path, *words, *out, file=file, key=key, values=(0.1, 0.15))
 
 
 def test_what_changes_no_result_may_differ(at, tmp_path):
@@ -152,30 +136,26 @@ def test_a_model_that_does_not_say_its_stars_is_used_and_a_damaged_note_is_one_l
     (tmp_path / "dae/trained_on.yaml").unlink()
     done(*evaluate(tmp_path, "s2.h5"))
     (tmp_path / "dae/trained_on.yaml").write_text("telescope: [", encoding="utf-8")
-    result = psfdae(*evaluate(tmp_path))
-    assert result.exit_code == 2
-    assert f"psfdae: {tmp_path / 'dae/trained_on.yaml'}: line 1, column 13" in result.stderr
+    assert f"{tmp_path / 'dae/trained_on.yaml'}: line 1" in refused(*evaluate(tmp_path))
 
 
 def test_a_missing_aberration_is_none_and_what_is_not_stated_is_unknown(tmp_path):
     telescope = load(["dataset=_telescope"]).model_dump()
     aberrations = telescope["telescope"]["aberrations"]
     terms = {name: term for name, term in aberrations["terms"].items() if name != "z9"}
-    less = {**aberrations, "terms": terms}
-    drawn = {**aberrations, "jitter_waves": 0.5}
 
-    def with_(value):
-        return {**telescope, "telescope": {**telescope["telescope"], "aberrations": value}}
+    def with_(**changes):
+        return {"telescope": {**telescope["telescope"], "aberrations": {**aberrations, **changes}}}
 
+    drawn = with_(jitter_waves=0.5)
     require(tmp_path, telescope, STARS, telescope)
     with pytest.raises(ProductError, match=r"terms\.z9 = nothing, but the configuration has "):
-        require(tmp_path, with_(less), STATIC, telescope)
+        require(tmp_path, with_(terms=terms), STATIC, telescope)
     # Static PSFs do not know what is drawn for every star.
-    require(tmp_path, with_(drawn), STATIC, telescope)
+    require(tmp_path, drawn, STATIC, telescope)
     with pytest.raises(ProductError, match=r"jitter_waves = 0\.5, .* has 0\.03"):
-        require(tmp_path, with_(drawn), STARS, telescope)
-    own = {"telescope": {"pixel_scale_arcsec": 0.8}, "framing": telescope["framing"]}
-    require(tmp_path, own, STARS, telescope)
+        require(tmp_path, drawn, STARS, telescope)
+    require(tmp_path, {"telescope": {"pixel_scale_arcsec": 0.8}}, STARS, telescope)
 
 
 # Scene 3, of which the headers are enough to be refused
@@ -203,7 +183,7 @@ def test_products_of_scene_3_are_of_one_telescope(tmp_path):
     words += ("--dae", tmp_path / "dae", "--checkpoint", tmp_path / "c.pt")
     found = {"key": "telescope.pixel_scale_arcsec", "values": (0.4, 0.6)}
     out = ("--out", tmp_path / "out", "preset=smoke")
-    refused(tmp_path, *words, *out, file=tmp_path / "dae/trained_on.yaml", **found)
+    differs(tmp_path, *words, *out, file=tmp_path / "dae/trained_on.yaml", **found)
 
 
 def test_tables_of_scene_3_are_of_one_test(tmp_path):
@@ -223,9 +203,10 @@ def test_tables_of_scene_3_are_of_one_test(tmp_path):
     ):
         with pytest.raises(ProductError, match=message):
             require_one_test(estimates, fit, written("o", "bound", states, override))
-    with pytest.raises(ProductError, match=r"o\.h5: seed = 2, but .*e\.h5 has 20200611"):
-        require_one_test(estimates, written("o", "fit", states, "seed=2"), [])
-    with pytest.raises(ProductError, match=r"o\.h5: state 0 = \[1\.0, .*e\.h5 has \[-1\.0, "):
-        require_one_test(estimates, written("o", "fit", -states), [])
-    with pytest.raises(ProductError, match=r"number of states = 2, but .*e\.h5 has 3"):
-        require_one_test(estimates, written("o", "fit", states[:2]), [])
+    for message, other, override in (
+        (r"o\.h5: seed = 2, but .*e\.h5 has 20200611", states, ("seed=2",)),
+        (r"o\.h5: state 0 = \[1\.0, .*e\.h5 has \[-1\.0, ", -states, ()),
+        (r"number of states = 2, but .*e\.h5 has 3", states[:2], ()),
+    ):
+        with pytest.raises(ProductError, match=message):
+            require_one_test(estimates, written("o", "fit", other, *override), [])

@@ -2,47 +2,55 @@
 
 from __future__ import annotations
 
+import os
+import shutil
+import sys
+
+import numpy as np
 import pytest
 
 from psfdae.methods import groups_of
-from psfdae.settings import ConfigError, as_overrides
+from psfdae.networks.training import fingerprint
+from psfdae.settings import ConfigError, as_overrides, deciding
 from psfdae_paper.configuration import compose
 from psfdae_paper.configuration.alignment import NAME as SCENE3
 from psfdae_paper.configuration.compose import config_dir, load, load_stage
 from psfdae_paper.configuration.consistency import SIMULATION
-from psfdae_paper.stages.alignment_methods import train_dae, train_network
+from psfdae_paper.stages.alignment_methods import train_network
 from psfdae_paper.stages.evaluate import READS
+from workflow_runs import captured
 
 DATASETS = sorted({p.stem for p in config_dir().glob("dataset/[!_]*.yaml")} - {SCENE3})
 PRESETS = sorted(p.stem for p in config_dir().glob("preset/*.yaml"))
 
 
-@pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("dataset", DATASETS)
-def test_every_dataset_composes_in_every_preset(dataset, preset):
-    config = load([f"dataset={dataset}", f"preset={preset}"])
-    assert config.dataset.name == dataset
+def test_every_dataset_composes_in_every_preset_as_its_file(dataset):
+    for preset in PRESETS:
+        words = (f"dataset={dataset}", f"preset={preset}")
+        config = load(words)
+        assert config.dataset.name == dataset
+    if dataset != "from_stars":  # its stars are of an image
+        assert (config_dir() / f"noise/{config.noise.name}.yaml").is_file()
+        assert (config_dir() / f"stars/{config.stars.name}.yaml").is_file()
+    # A composition by the outline of the dataset's file is Hydra's own.
+    assert compose.compose(words) == compose._by_hydra(words)
 
 
-@pytest.mark.parametrize("group", ["telescope", "noise", "stars"])
-def test_names_of_options_are_their_file_names(group):
-    for option in config_dir().glob(f"{group}/[!_]*.yaml"):
-        own = group == "telescope" and "aberrations:" in option.read_text(encoding="utf-8")
-        dataset = ["dataset=_telescope"] if own else ["dataset.references=[realisation]"]
-        config = load([f"{group}={option.stem}", *dataset])
-        assert getattr(config, group).name == option.stem
+@pytest.mark.parametrize("name", [p.stem for p in config_dir().glob("telescope/*.yaml")])
+def test_every_telescope_composes_by_its_name(name):
+    text = (config_dir() / f"telescope/{name}.yaml").read_text(encoding="utf-8")
+    dataset = "dataset=_telescope" if "aberrations:" in text else "dataset=dataset7"
+    assert load([f"telescope={name}", dataset]).telescope.name == name
 
 
-def test_noise_bands_and_aberrations_of_the_paper_s_table():
+def test_settings_of_the_paper():
     bands = {1: [3e-5, 5e-5, 7e-5, 9e-5], 2: [3e-4, 5e-4, 7e-4, 9e-4], 3: [1e-3, 2e-3, 3e-3, 5e-3]}
     for number in range(1, 7):
         config = load([f"dataset=dataset{number}"])
         assert config.noise.levels == bands[(number - 1) % 3 + 1]
         assert config.stars.aberration_fraction == (0.1 if number <= 3 else 0.5)
         assert config.stars.count == 8405
-
-
-def test_paper_preset_has_the_paper_s_hyper_parameters():
     config = load(["preset=paper"])
     assert (config.train.epochs, config.train.batch, config.train.lr) == (100, 125, 5e-5)
     assert config.dae.kernels == [9, 7, 5, 3, 1, 1, 3, 5, 7, 9]
@@ -52,30 +60,33 @@ def test_paper_preset_has_the_paper_s_hyper_parameters():
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("framing.stamp_px=6", r"framing\.stamp_px = 6: .*greater than or equal to 8"),
-        ("framing.stamp_px=15", r"framing\.stamp_px = 15: .*multiple of 2"),
-        ("telescope.wavelength_m=-5e-7", r"telescope\.wavelength_m = -5e-07: .*greater than"),
+        ("framing.stamp_px=15", r"framing\.stamp_px = 15: "),
         ("noise.levels=[0.001,0]", r"noise\.levels\.1 = 0: .*greater than 0"),
-        ("noise.levels=[-0.001]", r"noise\.levels\.0 = -0\.001: .*greater than 0"),
         ("parts.train_stars=9000", r"= 10681: must be at most stars\.count = 8405"),
         ("train.lr=fast", r"train\.lr = 'fast': .*valid number"),
-        ("seed=-1", r"seed = -1: .*greater than or equal to 0"),
         ("telescope.obscuration=1.0", r"telescope\.obscuration = 1\.0: .*less than 1"),
         ("dae.widths=[8,8]", r"dae: widths = \[8, 8\]: 10 kernels need 9 widths"),
-        ("dae.kernels=[4,4]", r"dae: kernels = \[4, 4\]: must be odd"),
-        ("optics.pupil_samples=[300,200]", r"pupil_samples: \[300, 200\] must be ascending"),
+        ("optics.pupil_samples=[300,200]", r"pupil_samples: \[300, 200\] "),
         ("parts.train_stars=19", r"baseline\.components = 20: must be at most .* 19"),
         ("baseline.components=300", r"baseline\.components = 300: must be at most .* 256"),
+        ("stars.search_lambda_d=-1", r"stars\.search_lambda_d = -1: .*greater than 0"),
         ("+train.momentum=0.9", r"train\.momentum: unknown key"),
         ("+colour=blue", r"colour: unknown key"),
         ("trian.lr=0.1", r"trian\.lr"),
-        ("dataset=dataset99", r"dataset/dataset99"),
         ("noise.levels=[0.1", r"no viable alternative at input"),
     ],
 )
 def test_every_mistake_is_named(override, message):
     with pytest.raises(ConfigError, match=message):
         load([override])
+
+
+def test_a_stage_refuses_an_unknown_group_and_a_folder_without_a_root(tmp_path, monkeypatch):
+    with pytest.raises(ConfigError, match="colour: unknown key"):
+        load_stage(groups_of("dae"), ["+colour=blue"])
+    monkeypatch.setenv("PSFDAE_CONFIG", str(tmp_path))
+    with pytest.raises(ConfigError, match=r"no config\.yaml"):
+        config_dir()
 
 
 def test_search_distances_follow_from_the_telescope():
@@ -90,23 +101,20 @@ def test_search_distances_follow_from_the_telescope():
     assert literal.framing.search_px == literal.stars.search_px == 239
     given = load(["telescope=wfsat_literal", "framing.search_px=100", "stars.search_lambda_d=5"])
     assert (given.framing.search_px, given.stars.search_px) == (100, 57)
-    with pytest.raises(ConfigError, match=r"stars\.search_lambda_d = -1: .*greater than 0"):
-        load(["stars.search_lambda_d=-1"])
 
 
-@pytest.mark.parametrize(
-    "groups",
-    [
-        ("seed", "noise", "parts", "dae", "train"),
-        train_dae.stage.settings.reads,
-        train_network.stage.settings.reads("original"),
-    ],
-)
-def test_settings_that_cannot_change_a_result_are_set_apart(groups):
+@pytest.mark.parametrize("network", [False, True])
+def test_settings_that_cannot_change_a_result_are_set_apart(network):
+    groups = train_network.stage.settings.reads("original") if network else groups_of("dae")
     tree = compose.stage_tree(groups, compose.compose())
     free = as_overrides(compose.neutral(tree))
     assert [text.split(".", 1)[1] for text in free] == ["checkpoint_seconds=20.0"]
     assert sorted([*free, *as_overrides(compose.decisive(tree))]) == as_overrides(tree)
+
+    def checkpoint(*overrides):
+        return fingerprint(deciding(load(overrides).train), np.zeros(3))
+
+    assert checkpoint("train.checkpoint_seconds=3") == checkpoint() != checkpoint("train.lr=0.003")
 
 
 def test_a_file_of_settings_is_named_by_what_decides_a_result(tmp_path):
@@ -121,30 +129,12 @@ def test_a_file_of_settings_is_named_by_what_decides_a_result(tmp_path):
     path.write_bytes(b"\xff" + whole[1:])
     assert written() == path and path.read_bytes() == whole
     assert written("train.checkpoint_seconds=1.5") == path
-    assert compose.load_settings(path, reads).train.checkpoint_seconds == 1.5
+    given = ("preset=smoke", "train.checkpoint_seconds=1.5")
+    assert compose.load_settings(path, reads) == load_stage(reads, given)
     assert written("train.lr=1e-3") != path
-    assert compose.load_settings(path, reads) == load_stage(
-        reads, ("preset=smoke", "train.checkpoint_seconds=1.5")
-    )
-
-
-def test_a_file_of_settings_that_is_damaged_is_named(tmp_path):
-    path = tmp_path / "train.yaml"
     path.write_text("seed: -1\n")
-    with pytest.raises(ConfigError, match=r"train\.yaml: seed = -1: .*greater than or equal to 0"):
+    with pytest.raises(ConfigError, match=rf"{path.name}: seed = -1: "):
         compose.load_settings(path, ("seed",))
-
-
-def test_a_checkpoint_does_not_depend_on_how_often_it_is_written():
-    import numpy as np
-
-    from psfdae.networks.training import fingerprint
-    from psfdae.settings import deciding
-
-    def of(*overrides):
-        return fingerprint(deciding(load(overrides).train), np.zeros(3))
-
-    assert of("train.checkpoint_seconds=3") == of() != of("train.lr=0.003")
 
 
 def test_overrides_reach_the_datasets_that_know_them():
@@ -160,55 +150,17 @@ def test_overrides_reach_the_datasets_that_know_them():
     assert compose.overrides_for(given, ["dataset=dataset8"]) == tuple(given)
 
 
-@pytest.mark.parametrize("reads", [SIMULATION, groups_of("dae"), READS])
-def test_stage_overrides_reproduce_the_stage_s_configuration(reads):
-    """What the workflow puts on a command line means what the dataset meant."""
-    chosen = ["dataset=dataset5", "preset=smoke"]
-    tree = compose.stage_tree(reads, compose.compose(tuple(chosen)))
-    assert load_stage(reads, as_overrides(tree)) == load_stage(reads, chosen)
-
-
-def test_stage_refuses_an_unknown_group():
-    with pytest.raises(ConfigError, match="colour: unknown key"):
-        load_stage(groups_of("dae"), ["+colour=blue"])
-
-
-def test_other_config_folder_must_have_a_root(tmp_path, monkeypatch):
-    monkeypatch.setenv("PSFDAE_CONFIG", str(tmp_path))
-    with pytest.raises(ConfigError, match=r"no config\.yaml"):
-        config_dir()
-
-
-def test_ninth_dataset_is_one_small_file(tmp_path, monkeypatch):
-    import shutil
-
-    folder = tmp_path / "config"
-    shutil.copytree(config_dir(), folder)
-    (folder / "dataset" / "dataset9.yaml").write_text(
-        "# @package _global_\n"
-        "defaults:\n  - dataset3\n  - _self_\n"
-        "seed: 7\n"
-        "dataset:\n  name: dataset9\n"
-        "noise:\n  name: bright\n  levels: [1.0e-3, 3.0e-3]\n"
-    )
-    monkeypatch.setenv("PSFDAE_CONFIG", str(folder))
-    compose.forget()
-    try:
-        config = load(["dataset=dataset9"])
-        assert (config.seed, config.noise.levels, config.stars.name) == (
-            7,
-            [1e-3, 3e-3],
-            "seidel_10pct",
-        )
-    finally:
-        compose.forget()
+def test_stage_overrides_reproduce_the_stage_s_configuration():
+    """Words that the workflow puts on a command line mean what the dataset meant."""
+    chosen = ("dataset=dataset5", "preset=smoke")
+    for reads in (SIMULATION, READS):
+        tree = compose.stage_tree(reads, compose.compose(chosen))
+        assert load_stage(reads, as_overrides(tree)) == load_stage(reads, chosen)
 
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     """A copy of the configuration that a test may change."""
-    import shutil
-
     folder = tmp_path / "config"
     shutil.copytree(config_dir(), folder)
     monkeypatch.setenv("PSFDAE_CONFIG", str(folder))
@@ -217,32 +169,32 @@ def folder(tmp_path, monkeypatch):
     compose.forget()
 
 
-OWN = (
+DATASET = (
     "# @package _global_\ndefaults:\n  - {base}\n  - _self_\nseed: {seed}\n"
-    "dataset:\n  name: {name}\nnoise:\n  levels: [{seed}.0e-4, 2e-3]\n"
+    "dataset:\n  name: mine{seed}\nnoise:\n  levels: [{seed}.0e-4, 2e-3]\n"
 )
 
 
-def test_datasets_that_differ_in_their_values_are_composed_once(folder, monkeypatch):
+def test_a_dataset_is_one_small_file_and_those_that_differ_in_values_are_composed_once(
+    folder, monkeypatch
+):
     calls = []
     by_hydra = compose._by_hydra
     monkeypatch.setattr(compose, "_by_hydra", lambda *a: calls.append(a) or by_hydra(*a))
-    for seed in range(1, 21):
-        text = OWN.format(base=f"dataset{3 + seed % 2}", seed=seed, name=f"own{seed}")
-        (folder / f"dataset/own{seed}.yaml").write_text(text)
-    for seed in range(1, 21):
-        config = load([f"dataset=own{seed}", "preset=fast"])
-        assert (config.seed, config.dataset.name) == (seed, f"own{seed}")
+    for seed in range(1, 7):
+        text = DATASET.format(base=f"dataset{3 + seed % 2}", seed=seed)
+        (folder / f"dataset/mine{seed}.yaml").write_text(text)
+        config = load([f"dataset=mine{seed}", "preset=fast"])
+        assert (config.seed, config.dataset.name) == (seed, f"mine{seed}")
         assert config.noise.levels == [float(f"{seed}e-4"), 2e-3]
+        assert config.stars.name == ("seidel_50pct" if seed % 2 else "seidel_10pct")
     assert len(calls) == 2  # as many as there are datasets to start from
 
 
 @pytest.mark.parametrize(
     "text",
     [
-        "seed: 1\ndataset:\n  name: own\n",
         "seed: 1\ndataset:\n  name: own_${noise.name}\n",
-        "seed: 1\ndataset:\n  name: own\nstars:\n  name: ${dataset.name}\n",
         "seed: 1\ndataset:\n  name: own\nstars:\n  name: of_${dataset.name}\n",
         "seed: 1\ndataset:\n  name: ${oc.env:HOME}\n",
         "seed: ~\nparts: {}\ntrain: 3\n",
@@ -253,56 +205,25 @@ def test_a_composition_by_outline_is_hydra_s_own(folder, text):
     defaults = "defaults:\n  - dataset3\n  - override /train: onecycle\n  - _self_\n"
     (folder / "dataset/own.yaml").write_text(f"# @package _global_\n{defaults}{text}")
     words = ("dataset=own", "preset=smoke", "seed=5", "~parts.test_stars")
-    found = compose.compose(words)
-    own = compose._by_hydra(words)
-    assert (found, list(found)) == (own, list(own))
+    tree, expected = compose.compose(words), compose._by_hydra(words)
+    assert (tree, list(tree)) == (expected, list(expected))
 
 
-def test_every_dataset_s_outline_composes_as_its_file():
-    for name in ("dataset1", "dataset8", "field", "from_stars"):
-        words = (f"dataset={name}", "preset=fast")
-        assert compose.compose(words) == compose._by_hydra(words)
-
-
-@pytest.fixture(scope="module")
-def installed(tmp_path_factory):
-    """A folder into which the wheel of this source tree has been installed."""
-    import subprocess
-    import sys
-
-    folder = tmp_path_factory.mktemp("wheel")
-    python, root = [sys.executable, "-m"], config_dir().parent
-    pip = ["pip", "--quiet", "--disable-pip-version-check", "--no-input"]
-    build = [*python, "hatchling", "build", "-t", "wheel", "-d", str(folder)]
-    subprocess.run(build, cwd=root, check=True, capture_output=True)
-    (wheel,) = folder.glob("*.whl")
-    target = folder / "site"
-    install = [*python, *pip, "install", "--no-deps", "--no-index", "--target", str(target)]
-    subprocess.run([*install, str(wheel)], check=True, capture_output=True)
-    return target
-
-
-@pytest.mark.parametrize("arguments", [["config", "--stage", "train"], ["alignment", "config"]])
-def test_an_installed_wheel_finds_its_configuration(installed, tmp_path, arguments):
-    import os
-    import subprocess
-    import sys
-
+@pytest.mark.slow
+def test_an_installed_wheel_finds_its_configuration(tmp_path):
+    """Somebody else's Hydra project beside it is not ours."""
+    root, site = config_dir().parent, tmp_path / "site"
+    build = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)]
+    assert captured(build, cwd=root).returncode == 0
+    shutil.unpack_archive(*tmp_path.glob("*.whl"), site, format="zip")
+    (site / "config").mkdir()
+    (site / "config/config.yaml").write_text("colour: blue\n")
     kept = {key: value for key, value in os.environ.items() if key != "PSFDAE_CONFIG"}
-    # Somebody else's Hydra project is not ours.
-    (installed / "config").mkdir(exist_ok=True)
-    (installed / "config/config.yaml").write_text("colour: blue\n")
-    shown = [
-        subprocess.run(
-            [sys.executable, "-m", "psfdae", *arguments],
-            cwd=tmp_path,
-            env={**kept, "PYTHONPATH": str(path)},
-            capture_output=True,
-            text=True,
-            check=True,
-        ).stdout
-        for path in (installed, config_dir().parent / "src")
-    ]
-    assert shown[0] == shown[1]
-    assert "checkpoint_seconds: 20.0" in shown[0]
-    assert (installed / "psfdae_paper/config/config.yaml").is_file()
+    for words in (("config", "--stage", "train"), ("alignment", "config")):
+        line = [sys.executable, "-m", "psfdae", *words]
+        installed, source = (
+            captured(line, cwd=tmp_path, env={**kept, "PYTHONPATH": str(path)})
+            for path in (site, root / "src")
+        )
+        assert installed.stdout == source.stdout
+        assert "checkpoint_seconds: 20.0" in source.stdout

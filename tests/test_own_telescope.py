@@ -6,41 +6,34 @@ import shutil
 
 import pytest
 from astropy.io import fits
-from click.testing import CliRunner
 
+from command_line import psfdae
 from docs_pages import commands, read
-from psfdae.cli import main
 from psfdae_paper.configuration.compose import config_dir, forget
 from workflow_runs import planned
 
 STARS = ["grid.points=3", "stars.count=200"]
+TRAINED = ["parts.train_stars=160", "parts.test_stars=40", *STARS]
 TINY = {
     "simulate": ["grid.points=3"],
     "stars": STARS,
-    "train": [
-        *("train.epochs=1", "dae.widths=[4,4,4,4,4,4,4,4,4]"),
-        *("parts.train_stars=160", "parts.test_stars=40", *STARS),
-    ],
-    "bundle": ["parts.train_stars=160", "parts.test_stars=40", *STARS],
+    "train": ["train.epochs=1", "dae.widths=[4,4,4,4,4,4,4,4,4]", *TRAINED],
+    "bundle": TRAINED,
     "predict": ["--threads", "1", "--quiet"],
 }
-"""What makes each command small."""
+"""Words that make each command small."""
 
-pytestmark = pytest.mark.workflow
+LINES = commands(read("docs/own_telescope.md"))
 
-
-@pytest.fixture(scope="module")
-def lines():
-    """The page's commands."""
-    return commands(read("docs/own_telescope.md"))
+pytestmark = [pytest.mark.workflow, pytest.mark.slow]
 
 
 @pytest.fixture(scope="module")
-def workshop(lines, tmp_path_factory):
+def workshop(tmp_path_factory):
     """A copy of the configuration with the files that the page writes."""
     folder = tmp_path_factory.mktemp("own")
     shutil.copytree(config_dir(), folder / "config")
-    for line in lines:
+    for line in LINES:
         if line.words[0] == "cat":
             (folder / line.words[-1]).write_text(line.heredoc, encoding="utf-8")
     with pytest.MonkeyPatch.context() as patch:
@@ -51,21 +44,16 @@ def workshop(lines, tmp_path_factory):
     forget()
 
 
-def words(lines, program):
-    return [list(line.words[1:]) for line in lines if line.words[0] == program]
+def words(program):
+    return [list(line.words[1:]) for line in LINES if line.words[0] == program]
 
 
-def test_every_line_is_run_by_a_test(lines):
-    assert {line.words[0] for line in lines} == {"cat", "psfdae", "snakemake"}
-
-
-@pytest.mark.slow
-def test_page_from_the_telescope_s_file_to_restored_stars(lines, workshop):
-    steps = words(lines, "psfdae")
-    assert {"simulate", "stars", "train", "bundle", "predict"} == {step[0] for step in steps}
+def test_page_from_the_telescope_s_file_to_restored_stars(workshop):
+    steps = words("psfdae")
+    assert set(TINY) == {step[0] for step in steps}
     for step in steps:
-        result = CliRunner().invoke(main, [*step, *TINY[step[0]]])
-        assert result.exit_code == 0, (step, result.output, result.exception)
+        result = psfdae(*step, *TINY[step[0]])
+        assert result.exit_code == 0, (step, result.output)
     examples = [f"example_{kind}" for kind in ("seidel", "newtonian", "ritchey_chretien")]
     drawn = [f"{folder}/psfs.png" for folder in (*examples, "mine", "hazy")]
     for name in (*drawn, "mine/psfs.fits", "night/map.png"):
@@ -75,11 +63,9 @@ def test_page_from_the_telescope_s_file_to_restored_stars(lines, workshop):
         assert len(restored["STARS"].data) == 9
 
 
-@pytest.mark.slow
-def test_page_s_dataset_is_a_target(lines, workshop):
-    targets = words(lines, "snakemake")
-    assert targets == [["mytarget"]]
-    jobs = planned(workshop, *targets[0])
-    assert {"telescope_templates", "telescope_stars", "figure_telescope"} <= set(jobs)
-    assert {"train", "bundle", "evaluate"} <= set(jobs)
-    assert not {"templates", "stars"} & set(jobs)
+def test_page_s_dataset_is_a_target(workshop):
+    assert words("snakemake") == [["mytarget"]]
+    jobs = set(planned(workshop, "mytarget"))
+    made = {"telescope_templates", "telescope_stars", "figure_telescope", "train", "bundle"}
+    assert made | {"evaluate"} <= jobs
+    assert not {"templates", "stars"} & jobs

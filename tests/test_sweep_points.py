@@ -13,23 +13,23 @@ import yaml
 
 from psfdae.files import Column, ProductError, write_product
 from psfdae.methods import groups_of
-from psfdae.model.star_sets import noise_model
 from psfdae.splits import random_split
 from psfdae_paper.configuration.alignment import CHOICE
 from psfdae_paper.configuration.compose import compose, load, load_stage, stage_tree
 from psfdae_paper.configuration.sweep import point_groups
-from psfdae_paper.methods.pca_som import PcaSom
 from psfdae_paper.stages import sweep as stage
 from psfdae_paper.stages import sweep_summary, track
 from psfdae_paper.stages.alignment_methods import train_network
-from psfdae_paper.stages.fit import baseline, train
+from psfdae_paper.stages.fit import fit
 from psfdae_paper.sweeps.measured import Task
 from psfdae_paper.sweeps.points import SweepError
 from psfdae_paper.tracking import runs_of_sweep
+from test_track import site  # noqa: F401
 
 SIZES = ("parts.train_stars=160", "parts.test_stars=60", "noise.levels=[0.001,0.005]")
 TINY = ("dataset=dataset3", "preset=smoke", *SIZES, "train.epochs=3")
 LEVELS = [0.001, 0.005]
+FILES = {"dae": ("dae.safetensors", "config.yaml"), "pca_som": ("pca_som.h5",)}
 
 
 @pytest.fixture(scope="module")
@@ -71,88 +71,82 @@ class Point:
     def result(self):
         return stage.read_result(self.folder / stage.RESULT)
 
+    def trained_ns(self):
+        """When the last training ended."""
+        return (self.folder / stage.COST).stat().st_mtime_ns
+
 
 @pytest.fixture
 def point(tmp_path, stars):
     return Point(tmp_path, stars)
 
 
-def test_point_is_the_main_workflow_s_training(point, stars, tmp_path):
-    result = point.run()
-    assert result["status"] == "finished"
-    assert (result["epochs"], result["attempt"]) == (3, 0)
-    config = load_stage(groups_of("dae"), TINY)
-    train(config, stars, out=tmp_path / "main")
-    for name in ("dae.safetensors", "config.yaml"):
+@pytest.mark.parametrize("model", FILES)
+def test_point_is_the_main_workflow_s_fit(point, stars, tmp_path, model):
+    assert point.run(model=model)["status"] == "finished"
+    main = tmp_path / ("main" if model == "dae" else "main/pca_som.h5")
+    fit(load_stage(groups_of(model), TINY), model, stars, out=main)
+    for name in FILES[model]:
         assert (tmp_path / "main" / name).read_bytes() == (point.folder / name).read_bytes()
 
 
-def test_metrics_are_those_of_the_tables_and_means_over_levels(point):
-    metrics = point.run()["metrics"]
-    for part, name in (("test", "evaluation.csv"), ("validation", "validation.csv")):
+def test_point_is_measured_and_kept_unless_something_changed(point, capsys):
+    first = point.run()
+    metrics = first["metrics"]
+    assert (first["epochs"], first["attempt"]) == (3, 0)
+    # Metrics are those of the tables, and geometric means over levels.
+    for part, name, count in (("test", "evaluation.csv", 60), ("validation", "validation.csv", 16)):
         table = pd.read_csv(point.folder / name)
-        assert set(table.n) == {60 if part == "test" else 16}
-        for metric in ("mse", "ssim"):
-            values = table[table.metric == metric].set_index("noise_level").value
-            for level in LEVELS:
-                found = metrics[f"{part}_{metric}_{level:g}"]
-                assert found == pytest.approx(values[level], rel=1e-7)
+        assert set(table.n) == {count}
+        for row in table[table.metric.isin(["mse", "ssim"])].itertuples():
+            value = metrics[f"{part}_{row.metric}_{row.noise_level:g}"]
+            assert value == pytest.approx(row.value, rel=1e-7)
         both = [metrics[f"{part}_mse_{level:g}"] for level in LEVELS]
         assert metrics[f"{part}_mse"] == pytest.approx(np.sqrt(both[0] * both[1]))
-
-
-def test_finished_point_is_not_trained_again_unless_something_changed(point, capsys):
-    first = point.run()
-    trained = (point.folder / stage.COST).stat().st_mtime_ns
+    trained = point.trained_ns()
     # Snakemake deletes the result of a job that it believes to be incomplete.
     (point.folder / stage.RESULT).unlink()
     assert point.run() == first
     assert "kept" in capsys.readouterr().out
-    assert (point.folder / stage.COST).stat().st_mtime_ns == trained
+    assert point.trained_ns() == trained
     for change in ({"source": "2"}, {"values": {"train.lr": 0.1}}):
-        assert point.run(**change)["metrics"] == first["metrics"]
-        now = (point.folder / stage.COST).stat().st_mtime_ns
-        assert now > trained, change
-        trained = now
+        assert point.run(**change)["metrics"] == metrics
+        assert point.trained_ns() > trained, change
+        trained = point.trained_ns()
     (point.folder / "dae.safetensors").unlink()
     point.run(values={"train.lr": 0.1})
     assert (point.folder / "dae.safetensors").is_file()
 
 
-def test_changed_digit_of_a_result_is_damage(point):
-    point.run()
-    path = point.folder / stage.RESULT
-    text = path.read_text()
-    changed = re.sub(r'("validation_mse": \d\.)(\d)', lambda m: m[1] + str(9 - int(m[2])), text)
-    assert changed != text
-    path.write_text(changed)
-    with pytest.raises(ProductError, match=r"result\.json: damaged \(wrong checksum\)"):
-        point.result()
-
-
 def test_early_stopping_is_recorded(point):
     late = ("train.epochs=40", "train.lr=0.3", "train.schedule=constant", "train.grad_clip=0.01")
     result = point.run(*late, "train.patience=1", "train.validate_every=1")
-    assert result["status"] == "stopped"
-    assert result["epochs"] < 40
+    assert result["status"] == "stopped" and result["epochs"] < 40
     assert np.isfinite(result["metrics"]["validation_mse"])
 
 
-def test_failed_point_is_a_result_with_its_reason(point):
-    point.run()
-    fatal = ("train.lr=1", "train.restarts=0", "train.grad_clip=0", "train.dead_check_steps=1")
-    result = point.run(*fatal)
-    assert result["status"] == "failed"
-    assert re.search(r"lower train\.lr = 1", result["reason"])
-    assert result["metrics"] == {}
-    assert not (point.folder / "dae.safetensors").exists()
+def test_changed_digit_of_a_result_is_damage(tmp_path):
+    path, *_ = write_points(tmp_path, OUTCOMES)
+    path.write_text(path.read_text().replace("3e-05", "2e-05"))
+    with pytest.raises(ProductError, match=r"result\.json: damaged"):
+        stage.read_result(path)
+
+
+@pytest.mark.parametrize(
+    ("model", "fatal", "reason"),
+    [
+        ("dae", ("train.lr=1", "train.restarts=0", "train.grad_clip=0"), r"lower train\.lr = 1"),
+        ("pca_som", ("baseline.components=150",), r"baseline\.components = 150: .* at most 144"),
+    ],
+)
+def test_failed_point_is_a_result_with_its_reason(point, model, fatal, reason):
+    (point.folder).mkdir(parents=True)
+    (point.folder / FILES[model][0]).write_bytes(b"of an earlier run")
+    result = point.run(*fatal, "train.dead_check_steps=1", model=model)
+    assert (result["status"], result["metrics"]) == ("failed", {})
+    assert re.search(reason, result["reason"])
+    assert not (point.folder / FILES[model][0]).exists()
     assert not point.task.checkpoint.exists()
-
-
-def test_baseline_is_the_main_workflow_s(point, stars, tmp_path):
-    assert point.run(model="pca_som")["status"] == "finished"
-    baseline(load_stage(groups_of("pca_som"), TINY), stars, out=tmp_path / "main.h5")
-    assert (tmp_path / "main.h5").read_bytes() == (point.folder / "pca_som.h5").read_bytes()
 
 
 def test_baseline_is_validated_on_stars_that_it_has_not_seen(tmp_path, gaussian_stars):
@@ -164,19 +158,8 @@ def test_baseline_is_validated_on_stars_that_it_has_not_seen(tmp_path, gaussian_
     point = Point(tmp_path, write_stars(tmp_path / "stars.h5", images))
     point.run(model="pca_som")
     table = pd.read_csv(point.folder / "validation.csv")
-    errors = table[table.metric == "mse"].value
     # The spike alone, missed, is 1/256 per pixel.
-    assert (errors > 0.9 / 256).all()
-    config = load_stage(groups_of("pca_som"), TINY)
-    noisy = noise_model(config).draw(images[validation], 0.001, np.random.default_rng(0))
-    seen = PcaSom.load(point.folder / "pca_som.h5").predict(noisy, 0.001)
-    assert ((seen - images[validation]) ** 2).mean() < 0.1 / 256
-
-
-def test_more_components_than_stars_is_a_failed_point(point):
-    result = point.run("baseline.components=150", model="pca_som")
-    assert result["status"] == "failed"
-    assert result["reason"].startswith("baseline.components = 150: must be at most 144")
+    assert (table[table.metric == "mse"].value > 0.9 / 256).all()
 
 
 def write_states(path, rng, count):
@@ -197,14 +180,10 @@ def write_states(path, rng, count):
 
 def test_cnn_is_the_main_workflow_s_and_measured_on_other_states(tmp_path):
     rng = np.random.default_rng(1)
-    roles = {"states": 200, "validation": 60, "test": 50}
-    data = {role: write_states(tmp_path / f"{role}.h5", rng, n) for role, n in roles.items()}
+    counts = {"states": 200, "validation": 60, "test": 50}
+    data = {role: write_states(tmp_path / f"{role}.h5", rng, n) for role, n in counts.items()}
     folder = tmp_path / "points/0123456789ab"
-    given = (
-        "preset=smoke",
-        "train_noise_trained.mirrors=false",
-        "perceptron.widths=[8,8]",
-    )
+    given = ("preset=smoke", "train_noise_trained.mirrors=false", "perceptron.widths=[8,8]")
     task = Task(
         *("noise_trained", "random", "realisation"),
         data=data,
@@ -222,21 +201,21 @@ def test_cnn_is_the_main_workflow_s_and_measured_on_other_states(tmp_path):
     metrics = stage.read_result(folder / stage.RESULT)["metrics"]
     for role, name in (("validation", "validation.csv"), ("test", "evaluation.csv")):
         table = pd.read_csv(folder / name)
-        assert set(table.n) == {roles[role]}
+        assert set(table.n) == {counts[role]}
         mean = table[table.unit == "range"].mean_abs_error.mean()
         assert metrics[f"{role}_mae"] == pytest.approx(mean, rel=1e-7)
 
 
-def test_trial_asks_and_trains_what_it_asked_for(point):
+def test_trial_trains_the_number_that_it_asked_for(point):
     space = {"train.lr": {"low": 1e-3, "high": 1e-2, "log": True}}
     search = {"space": space, "seed": 1, "startup": 2, "metric": "validation_mse"}
     search |= {"direction": "minimize"}
     result = point.run(trial=stage.Trial(0, search, ()))
-    asked = result["values"]["train.lr"]
-    assert 1e-3 <= asked <= 1e-2
-    assert result["keys"] == {"train.lr": asked}
-    described = yaml.safe_load((point.folder / "config.yaml").read_text())
-    assert described["train"]["lr"] == asked
+    lr = result["values"]["train.lr"]
+    assert 1e-3 <= lr <= 1e-2
+    assert result["keys"] == {"train.lr": lr}
+    config = yaml.safe_load((point.folder / "config.yaml").read_text())
+    assert config["train"]["lr"] == lr
 
 
 def write_points(root, outcomes):
@@ -283,7 +262,7 @@ def summarise(root, outcomes=OUTCOMES, **changes):
     return out
 
 
-def test_summary_has_every_point_and_the_best_of_them(tmp_path):
+def test_summary_has_every_point_and_the_best_by_validation(tmp_path):
     out = summarise(tmp_path)
     table = pd.read_csv(out / "summary.csv").set_index("point")
     assert table.status.tolist() == ["finished", "finished", "failed", "finished"]
@@ -291,39 +270,26 @@ def test_summary_has_every_point_and_the_best_of_them(tmp_path):
     assert table.best.tolist() == ["no", "no", "no", "yes"]
     assert table.width.tolist() == [4, 4, 8, 8]
     assert pd.read_csv(out / "cost.csv").seconds.tolist() == [2.0] * 4
-
-
-def test_best_is_chosen_by_validation_in_the_direction_asked_for(tmp_path):
-    def chosen(name, **changes):
-        tree = yaml.safe_load((summarise(tmp_path / name, **changes) / "best.yaml").read_text())
-        return tree["point"]
-
-    assert chosen("a") == f"{3:012x}"
-    assert chosen("b", direction="maximize") == f"{0:012x}"
-    results = [stage.read_result(p) for p in write_points(tmp_path / "c", OUTCOMES)]
-    for result in results:
-        result["metrics"]["test_mse"] = 0.0 if result["point"].endswith("0") else 1.0
-    best = sweep_summary.choose(results, "validation_mse", "minimize")
-    assert best["point"] == f"{3:012x}"
-
-
-def test_sweep_without_any_result_says_why(tmp_path):
-    with pytest.raises(SweepError, match=r"all 1 points of sweep tried failed.*the network died"):
-        summarise(tmp_path, [(4, 0.1, None)])
-
-
-def test_best_overrides_are_what_the_point_was(tmp_path):
-    summarise(tmp_path)
-    text = " ".join(sweep_summary.best_overrides(tmp_path, "tried"))
-    assert text == "train.epochs=3 dae.widths=[8,8,8,8,8,8,8,8,8] train.lr=0.004"
-    tree = stage_tree(groups_of("dae"), compose(("preset=smoke", *shlex.split(text))))
+    overrides = " ".join(sweep_summary.best_overrides(tmp_path, "tried"))
+    assert overrides == "train.epochs=3 dae.widths=[8,8,8,8,8,8,8,8,8] train.lr=0.004"
+    tree = stage_tree(groups_of("dae"), compose(("preset=smoke", *shlex.split(overrides))))
     assert (tree["train"]["lr"], tree["train"]["epochs"]) == (0.004, 3)
     assert tree["dae"]["widths"] == [8] * 9
+    # Errors on the test stars choose nothing.
+    results = [stage.read_result(path) for path in write_points(tmp_path, OUTCOMES)]
+    for number, result in enumerate(results):
+        result["metrics"]["test_mse"] = number
+    for direction, number in (("minimize", 3), ("maximize", 0)):
+        best = sweep_summary.choose(results, "validation_mse", direction)
+        assert best["point"] == f"{number:012x}"
 
 
-def test_best_of_a_sweep_that_was_not_run_says_what_to_do(tmp_path):
-    with pytest.raises(ProductError, match="run `snakemake sweep --config sweep=tried`"):
-        sweep_summary.best_overrides(tmp_path, "tried")
+def test_sweep_without_a_result_or_a_summary_is_refused(tmp_path):
+    with pytest.raises(SweepError, match=r"sweep tried failed.*the network died"):
+        summarise(tmp_path, [(4, 0.1, None)])
+    for reader in (sweep_summary.best_overrides, runs_of_sweep):
+        with pytest.raises(ProductError, match="run `snakemake sweep --config sweep=tried`"):
+            reader(tmp_path, "tried")
 
 
 @pytest.mark.parametrize("kind", ["parallel", "response"])
@@ -336,57 +302,33 @@ def test_figures_are_drawn_with_failed_points_and_the_same_again(tmp_path, kind)
     assert image == (tmp_path / "b.png").read_bytes()
 
 
-class Site:
-    """Imports of a sweep into MLflow."""
-
-    def __init__(self, root):
-        self.root, self.database = root, root / "mlflow.db"
-
-    def track(self):
-        receipt = self.root / "receipt.csv"
-        track.track(self.root, "smoke", self.database, receipt, sweeps=("tried",))
+def test_sweep_is_a_parent_run_with_a_child_per_point(site):  # noqa: F811
+    def actions():
+        receipt = site.results / "receipt.csv"
+        track.track(site.results, "smoke", site.database, receipt, sweeps=("tried",))
         with receipt.open(newline="") as file:
             return [row["action"] for row in csv.DictReader(file)]
 
-    def runs(self):
-        from mlflow import MlflowClient
+    def runs():
+        experiment = site.client.get_experiment_by_name("sweep_tried").experiment_id
+        return {run.info.run_name: run for run in site.client.search_runs([experiment])}
 
-        client = MlflowClient(f"sqlite:///{self.database}")
-        experiment = client.get_experiment_by_name("sweep_tried").experiment_id
-        return {run.data.tags["source"]: run for run in client.search_runs([experiment])}
-
-
-def test_sweep_is_a_parent_run_with_a_child_per_point(tmp_path, monkeypatch):
-    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
-    for key, value in (("TIMEOUT", "3"), ("MAX_RETRIES", "0")):
-        monkeypatch.setenv(f"MLFLOW_HTTP_REQUEST_{key}", value)
-    monkeypatch.setenv("MLFLOW_DISABLE_TELEMETRY", "true")
-    summarise(tmp_path)
-    site = Site(tmp_path)
-    assert site.track() == ["created"] * 5
-    assert site.track() == ["unchanged"] * 5
-    runs = site.runs()
-    parent = runs.pop("sweeps/tried")
+    summarise(site.results)
+    assert actions() == ["created"] * 5
+    assert actions() == ["unchanged"] * 5
+    children = runs()
+    parent = children.pop("sweep tried")
     assert parent.data.metrics["best_validation_mse"] == 1e-5
     assert parent.data.metrics["points_failed"] == 1
     assert parent.data.tags["best_point"] == f"{3:012x}"
-    for run in runs.values():
-        assert run.data.tags["mlflow.parentRunId"] == parent.info.run_id
-    failed = runs[f"sweeps/tried/points/{2:012x}"]
-    assert (failed.info.status, failed.data.tags["reason"]) == ("FAILED", "the network died")
-    best = runs[f"sweeps/tried/points/{3:012x}"]
-    assert best.info.run_name == "width=8, train.lr=0.004"
-    assert best.data.metrics["test_mse"] == pytest.approx(1.1e-5)
-    assert best.data.params["axes.width"] == "8"
+    assert children["width=8, train.lr=0.001"].info.status == "FAILED"
+    best = children["width=8, train.lr=0.004"].data
+    assert best.metrics["test_mse"] == pytest.approx(1.1e-5)
+    assert best.params["axes.width"] == "8"
     # A grid that has grown is another parent: old points move to it and are not doubled.
     space = {**DEFINITION["space"], "width": {"values": [4, 8, 16]}}
-    summarise(tmp_path, [*OUTCOMES, (16, 0.004, 2e-5)], space=space)
-    assert site.track() == ["created", *["unchanged"] * 4, "created"]
-    parents = {run.data.tags.get("mlflow.parentRunId") for run in site.runs().values()}
+    summarise(site.results, [*OUTCOMES, (16, 0.004, 2e-5)], space=space)
+    assert actions() == ["created", *["unchanged"] * 4, "created"]
+    parents = {run.data.tags.get("mlflow.parentRunId") for run in runs().values()}
     assert len(parents - {None}) == 1
     assert parent.info.run_id not in parents
-
-
-def test_sweep_without_summary_is_refused(tmp_path):
-    with pytest.raises(ProductError, match="run `snakemake sweep --config sweep=tried`"):
-        runs_of_sweep(tmp_path, "tried")

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
-import random
 import shutil
 
 import numpy as np
+import pandas as pd
 import pytest
 import yaml
 
@@ -17,7 +16,6 @@ from psfdae_paper.configuration.sweep import Axis, load_sweep, sweep_names
 from psfdae_paper.sweeps import adaptive
 from psfdae_paper.sweeps.points import SweepError, draws, grid, plan_sweep, tidy, with_values
 
-PRESETS = sorted(p.stem for p in config_dir().glob("preset/*.yaml"))
 GRID = {
     "kind": "grid",
     "model": "dae",
@@ -49,15 +47,10 @@ def sweep(tmp_path, monkeypatch):
     compose.forget()
 
 
-@pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("name", sweep_names())
-def test_every_shipped_sweep_can_be_planned(name, preset):
-    plan = plan_sweep(name, (f"preset={preset}",))
-    assert 5 <= len(plan.points) <= 24
-    if plan.sweep.kind != "adaptive":
-        assert len({json.dumps(p.values) for p in plan.points.values()}) == len(plan.points)
-    for point in plan.points.values():
-        assert "seed" in point.config
+def test_every_shipped_sweep_can_be_planned(name):
+    plans = [plan_sweep(name, (f"preset={preset}",)) for preset in ("fast", "paper")]
+    assert all(5 <= len(plan.points) <= 24 for plan in plans)
 
 
 def test_grid_has_every_combination_once(sweep):
@@ -67,33 +60,21 @@ def test_grid_has_every_combination_once(sweep):
     )
     assert points[2].config["dae"]["widths"] == [8] * 9
     assert points[3].config["train"]["lr"] == 0.004
+    choices = axes(a=[1, 2], b={"choices": {3: {"x": 1}, 4: {"x": 2}}})
+    assert grid(choices) == [{"a": i, "b": j} for i in (1, 2) for j in ("3", "4")]
 
 
-def test_names_depend_on_content_not_on_order(sweep):
+def test_names_depend_on_content_not_on_order_or_format(sweep):
     names = set(sweep(GRID).points)
-    axes = list(GRID["space"].items())
-    for seed in range(3):
-        random.Random(seed).shuffle(axes)
-        space = {
-            name: {**a, "values": a["values"][::-1]} if isinstance(a, dict) else a[::-1]
-            for name, a in axes
-        }
-        shuffled = dict(random.Random(seed).sample(list(GRID.items()), len(GRID)))
-        assert set(sweep({**shuffled, "space": space}, name=f"other{seed}").points) == names
-
-
-def test_names_of_a_grown_grid_contain_the_old_ones(sweep):
-    old = set(sweep(GRID).points)
-    wider = {**GRID["space"], "train.lr": [0.0005, 0.001, 0.004]}
-    new = set(sweep({**GRID, "space": wider}).points)
-    assert old < new
-    assert len(new) == 6
-
-
-def test_equal_numbers_are_equal_points(sweep):
+    space = dict(reversed(GRID["space"].items())) | {"train.lr": [0.004, 0.001]}
+    reordered = dict(reversed(GRID.items())) | {"space": space}
+    assert set(sweep(reordered).points) == names
     text = yaml.safe_dump(GRID).replace("0.001", "1e-3").replace("0.004", "4.0E-3")
     assert "1e-3" in text
-    assert set(sweep(text).points) == set(sweep(GRID).points)
+    assert set(sweep(text).points) == names
+    grown = {**GRID["space"], "train.lr": [0.0005, 0.001, 0.004]}
+    larger = set(sweep({**GRID, "space": grown}).points)
+    assert names < larger and len(larger) == 6
 
 
 def test_names_follow_what_decides_the_result_and_nothing_else(sweep):
@@ -116,26 +97,21 @@ def test_points_are_measured_at_the_dataset_s_levels_whatever_they_train_on():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"kind": "all"}, r"tried\.yaml: kind = 'all'"),
-        ({"colour": "blue"}, "colour: unknown key"),
-        ({"trials": 5}, "trials: random and adaptive sweeps need it"),
-        ({"kind": "random"}, "trials: random and adaptive sweeps need it"),
-        ({"dataset": None}, "dataset: methods need one"),
-        ({"model": "original"}, "dataset: .* scene 3's networks have none"),
-        ({"metric": "validation_mae"}, "model dae has validation_mse or validation_ssim"),
-        ({"space": {}}, "space = {}"),
-        ({"space": {"train.lr": []}}, r"space\.train\.lr\.values"),
-        ({"space": {"train.lr": {"low": 1e-3}}}, "either values, or choices, or low and high"),
-        ({"space": {"train.lr": {"low": 1e-3, "high": 1e-2}}}, "not a range"),
-        ({"space": {"seed": [1, 2]}}, "seed: a sweep of dae may change dae, train, noise.levels"),
-        ({"space": {"telescope.obscuration": [0.1]}}, "telescope.obscuration: a sweep of dae may"),
-        ({"space": {"baseline.rows": [4]}}, "baseline.rows: a sweep of dae may"),
-        ({"space": {"status": {"keys": ["train.lr"], "values": [1]}}}, "column of the summary"),
-        ({"overrides": {"train.lr": 0.1}}, "train.lr: set more than once"),
-        ({"space": {"train.learning": [0.1]}}, r"tried\.yaml: train\.learning: unknown key"),
+        ({"colour": "blue"}, "colour: "),
+        ({"trials": 5}, "trials: "),
+        ({"dataset": None}, "dataset: "),
+        ({"model": "original"}, "dataset: "),
+        ({"metric": "validation_mae"}, "metric = validation_mae: "),
+        ({"space": {"train.lr": {"low": 1e-3}}}, "low and high"),
+        ({"space": {"train.lr": {"low": 1e-3, "high": 1e-2}}}, r"space\.train\.lr: "),
+        ({"space": {"seed": [1, 2]}}, "seed: "),
+        ({"space": {"status": {"keys": ["train.lr"], "values": [1]}}}, r"space\.status: "),
+        ({"overrides": {"train.lr": 0.1}}, r"train\.lr: "),
         ({"space": {"train.lr": [0.1, 7]}}, r"train\.lr = 7: .* \(point train\.lr=7\)"),
-        ({"space": {"dae.widths": [[4, 4]]}}, "10 kernels need 9 widths"),
-        ({"dataset": "dataset99"}, "dataset99"),
+        (
+            {"kind": "adaptive", "trials": 3, "space": {"train.lr": {"low": 0.1, "high": 2}}},
+            r"tried\.yaml: train\.lr = 2\.0: ",
+        ),
     ],
 )
 def test_every_mistake_is_named_before_any_work(sweep, change, message):
@@ -143,16 +119,10 @@ def test_every_mistake_is_named_before_any_work(sweep, change, message):
         assert sweep({**GRID, **change}).points
 
 
-def test_range_with_an_impossible_end_is_refused(sweep):
-    tree = {**GRID, "kind": "adaptive", "trials": 3, "space": {"train.lr": {"low": 0.1, "high": 2}}}
-    with pytest.raises(SweepError, match=r"train\.lr = 2\.0: .*less than or equal to 1"):
-        assert sweep(tree).points
-
-
 def test_damaged_file_and_unknown_name_are_named(sweep):
     with pytest.raises(ConfigError, match=r"tried\.yaml: .*line"):
         sweep("kind: [grid\n")
-    with pytest.raises(ConfigError, match=r"sweep = 'nothing': must be one of .*dae_width"):
+    with pytest.raises(ConfigError, match=r"sweep = 'nothing': .*dae_width"):
         load_sweep("nothing")
 
 
@@ -162,17 +132,12 @@ def test_other_keys_of_the_tree_stay():
     assert new == {"train": {"lr": 5, "batch": 2}, "dae": {"widths": [4]}}
     assert tree["train"]["lr"] == 1
     for key in ("train.rate", "train", "train.lr.x", "optics.batch"):
-        with pytest.raises(SweepError, match="unknown key"):
+        with pytest.raises(SweepError, match=key):
             with_values(tree, {key: 1})
 
 
 def axes(**space):
     return {name: Axis.model_validate(axis) for name, axis in space.items()}
-
-
-def test_grid_of_lists_and_choices():
-    found = grid(axes(a=[1, 2], b={"choices": {3: {"x": 1}, 4: {"x": 2}}}))
-    assert found == [{"a": i, "b": j} for i in (1, 2) for j in ("3", "4")]
 
 
 def test_draws_extend_and_each_axis_is_on_its_own():
@@ -190,28 +155,22 @@ def test_draws_fill_their_range_evenly():
         log={"low": 1e-4, "high": 1, "log": True},
         listed=["x", "y"],
     )
-    found = draws(space, 2000, seed=1)
-    counts = np.bincount([point["whole"] for point in found])[1:]
+    drawn = pd.DataFrame(draws(space, 500, seed=1))
+    # Five standard deviations of a binomial with 500 trials of probability 1/4 and 1/2.
+    counts = np.bincount(drawn.whole)[1:]
     assert counts.size == 4
-    # Five standard deviations of a binomial with 2000 trials of probability 1/4.
-    assert np.abs(counts - 500).max() < 5 * np.sqrt(2000 * 0.25 * 0.75)
-    listed = sum(point["listed"] == "x" for point in found)
-    assert abs(listed - 1000) < 5 * np.sqrt(2000 * 0.25)
-    for unit in (
-        (np.array([point["even"] for point in found]) - 2) / 2,
-        np.log10([point["log"] for point in found]) / 4 + 1,
-    ):
-        assert unit.min() >= 0
-        assert unit.max() <= 1
-        assert abs(unit.mean() - 0.5) < 5 / np.sqrt(12 * 2000)
-        assert abs(unit.var() - 1 / 12) < 0.01
+    assert np.abs(counts - 125).max() < 5 * np.sqrt(500 * 0.25 * 0.75)
+    assert abs((drawn.listed == "x").sum() - 250) < 5 * np.sqrt(500 * 0.25)
+    for unit in ((drawn.even - 2) / 2, np.log10(drawn.log) / 4 + 1):
+        assert unit.min() >= 0 and unit.max() <= 1
+        # Mean 1/2 and variance 1/12, whose own variances are 1/12n and 1/180n.
+        assert abs(unit.mean() - 0.5) < 5 / np.sqrt(12 * 500)
+        assert abs(unit.var() - 1 / 12) < 5 / np.sqrt(180 * 500)
 
 
 def test_numbers_are_short_and_stay_inside():
     axis = Axis(low=0.00123456, high=0.987654)
-    assert tidy(axis, 0.1234567) == 0.1235
-    assert tidy(axis, 0.9876539) == 0.987654
-    assert tidy(axis, 0.00123457) == 0.001235
+    assert [tidy(axis, x) for x in (0.1234567, 0.9876539)] == [0.1235, 0.987654]
     assert tidy(Axis(low=2, high=8, integer=True), 7.6) == 8
 
 
@@ -268,7 +227,6 @@ def test_more_trials_keep_the_old_ones_and_another_search_has_others(sweep):
     tree = {**GRID, "kind": "adaptive", "trials": 3}
     old = list(sweep(tree).points)
     assert list(sweep({**tree, "trials": 5}).points)[:3] == old
-    for change in ({"seed": 1}, {"direction": "maximize"}, {"startup": 2}):
+    narrower = {"space": {**GRID["space"], "train.lr": [0.001]}}
+    for change in ({"seed": 1}, {"direction": "maximize"}, {"startup": 2}, narrower):
         assert not set(sweep({**tree, **change}).points) & set(old)
-    narrower = {**GRID["space"], "train.lr": [0.001]}
-    assert not set(sweep({**tree, "space": narrower}).points) & set(old)
