@@ -39,6 +39,8 @@ def origin_of(sky: Sky, listed: np.ndarray) -> tuple[int, np.ndarray, int] | Non
     reach = 6
     inside = (pixel >= reach).all(axis=1) & (pixel < np.array([width, height]) - reach).all(axis=1)
     pixel, listed = pixel[inside], listed[inside]
+    if len(listed) < FEWEST:
+        return None
     axis = np.arange(-reach, reach + 1)
     rows, columns = pixel[:, 1, None, None] + axis[:, None], pixel[:, 0, None, None] + axis
     stamps, noise = sky.flat[rows, columns], sky.noise[rows, columns]

@@ -752,6 +752,16 @@ class Observation:
             return np.zeros(self.count, dtype=bool)
         return listed_again(self.positions)
 
+    def of(self, selected: np.ndarray) -> Observation:
+        """The same with some of the stars of the list, by a bool for each, shape (n,)."""
+        assert self.positions is not None
+        return replace(
+            self,
+            count=int(selected.sum()),
+            positions=self.positions[selected],
+            _columns=[column[selected] for column in self._columns],
+        )
+
     def check_list(self) -> None:
         """Refuse a star list of another image.
 

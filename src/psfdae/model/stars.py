@@ -22,7 +22,13 @@ from psfdae.image.observation import (
     list_offset,
     other_instruments,
 )
-from psfdae.image.selection import Candidates, Verdict, advice, collect
+from psfdae.image.selection import (
+    CalibrationStarsError,
+    Candidates,
+    Verdict,
+    advice,
+    collect,
+)
 from psfdae.image.training_images import single_psf, star_grid, training_columns
 from psfdae.model.psf_model import SCALE_TOLERANCE
 from psfdae.model.settings import IMAGE_GROUPS, Settings, settings_model, with_keywords
@@ -243,7 +249,11 @@ class Stars:
         framing, wanted = settings.framing, settings.calibration_stars
         if least is not None:
             wanted = wanted.model_copy(update={"stars_min": least})
-        found = collect(observation, wanted, framing, isolation_px)
+        try:
+            found = collect(observation, wanted, framing, isolation_px)
+        except CalibrationStarsError as error:
+            # A mask or a header value that was used or not may be why.
+            raise CalibrationStarsError("; ".join([str(error), *observation.remarks])) from None
         bright = found.bright
         off = list_offset(
             observation.catalogue, (bright.centre - bright.listed)[:, ::-1], source.accept_offset
