@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -84,19 +85,9 @@ def photometry(
 
     from psfdae.model.crowded import photometry as measured
 
-    # Rows without a position cannot be fitted, and those of a star that is listed twice have no
-    # light of their own.
-    unusable = observation.without_position() | observation.listed_again()
-    usable = observation.of(~unusable) if unusable.any() else observation
-    found = measured(loaded, usable, stated.threshold)
-    if unusable.any():
-        stars = _with_rows(found.stars, observation.positions, unusable)
-        found = replace(found, stars=stars)
-    offset = None
-    if stated.catalogue is not None and len(found.stars) == observation.count:
-        fitted = np.stack([found.stars["x"], found.stars["y"]], axis=1)
-        # The stars are fitted where they are, whatever the list says.
-        offset = list_offset(observation.catalogue, fitted - observation.positions, accept=True)
+    found, offset = _of_all_rows(
+        observation, lambda usable: measured(loaded, usable, stated.threshold)
+    )
     if magnitudes is not None:
         zero_point, said = _zero_point(found, *magnitudes, reference)
         print(said)
@@ -109,6 +100,23 @@ def photometry(
 
         write_fits(residual, fits.PrimaryHDU(found.residual.astype(np.float32)))
     print(*filter(None, [observation.said(), offset, _summary(found, out)]), sep="\n")
+
+
+def _of_all_rows(
+    observation: Observation, measured: Callable[[Observation], CrowdedPhotometry]
+) -> tuple[CrowdedPhotometry, str | None]:
+    """Measure the stars that can be, and return a row for every one; and how far a list is off."""
+    # Rows without a position cannot be fitted, and those of a star that is listed twice have no
+    # light of their own.
+    unusable = observation.without_position() | observation.listed_again()
+    found = measured(observation.of(~unusable) if unusable.any() else observation)
+    if unusable.any():
+        found = replace(found, stars=_with_rows(found.stars, observation.positions, unusable))
+    if observation.catalogue is None or len(found.stars) != observation.count:
+        return found, None
+    # The stars are fitted where they are, whatever the list says.
+    fitted = np.stack([found.stars["x"], found.stars["y"]], axis=1)
+    return found, list_offset(observation.catalogue, fitted - observation.positions, accept=True)
 
 
 def _with_rows(stars: Table, positions: np.ndarray | None, unusable: np.ndarray) -> Table:

@@ -135,7 +135,8 @@ def choose_positions(names: Sequence[str]) -> Positions:
     """Find the position columns among the names of a catalogue, or raise ColumnError."""
     for result in RESULTS:
         if set(names).issuperset((*result.pairs[0], *result.beside)):
-            return Positions(*result.pairs[0], result.sky, result.origin, None)
+            first_name, second_name = result.pairs[0]
+            return Positions(first_name, second_name, result.sky, result.origin, None)
     found: list[Positions] = []
     for convention in CONVENTIONS:
         for pair in convention.pairs:
@@ -472,12 +473,14 @@ def _pairs(path: Path, given: Any) -> dict[str, np.ndarray]:
 def _with_sky_columns(table: Table) -> Table:
     """Return a table whose only column of SkyCoord is replaced by RA and Dec in degrees, ICRS."""
     from astropy.coordinates import SkyCoord
+    from astropy.table import Table
 
     sky = [name for name in table.colnames if isinstance(table[name], SkyCoord)]
     if len(sky) != 1:
         return table
     icrs = table[sky[0]].icrs
-    plain = table[[name for name in table.colnames if name not in (sky[0], "ra", "dec")]]
+    others = [name for name in table.colnames if name not in (sky[0], "ra", "dec")]
+    plain = Table({name: table[name] for name in others})
     for name, angle in (("ra", icrs.ra), ("dec", icrs.dec)):
         values, mask, _ = parts_of_array(angle.deg)
         plain[name] = values.astype(np.float64)

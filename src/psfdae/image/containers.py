@@ -7,6 +7,7 @@ ERR (σ), so that it is read as a file is. Plain arrays stay arrays.
 from __future__ import annotations
 
 import io
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -55,24 +56,22 @@ def as_image(image: Any) -> Path | PlainFile | np.ndarray:
     if isinstance(image, PlainFile) or type(image) is np.ndarray:
         return image
     name = Path(type(image).__name__)
-    with reading(name):
-        if isinstance(image, fits.HDUList):
-            return _written(Path(image.filename() or name), image)
-        if isinstance(image, fits.ImageHDU | fits.CompImageHDU):
-            return _written(name, fits.HDUList([fits.PrimaryHDU(), image.copy()]))
-        if isinstance(image, fits.PrimaryHDU):
-            return _written(name, fits.HDUList([image.copy()]))
-        if isinstance(image, NDData):
-            return _written(name, _of_nddata(image))
-        if isinstance(image, np.ndarray):
-            data, mask, unit = parts_of_array(image)
-            if mask is None and not unit:
-                return data
-            header = fits.Header({"BUNIT": unit} if unit else {})
-            return _written(name, _hdus(data, header, mask, None))
-    raise ObservationError(
-        name, "no image; expected a path, array, NDData, CCDData, HDU or HDUList"
-    )
+    if isinstance(image, np.ndarray):
+        data, mask, unit = parts_of_array(image)
+        if mask is None and not unit:
+            return data
+        header = fits.Header({"BUNIT": unit} if unit else {})
+        return _written(name, lambda: _hdus(data, header, mask, None))
+    if isinstance(image, fits.HDUList):
+        return _written(Path(image.filename() or name), lambda: image)
+    if isinstance(image, fits.PrimaryHDU | fits.ImageHDU | fits.CompImageHDU):
+        first = [] if isinstance(image, fits.PrimaryHDU) else [fits.PrimaryHDU()]
+        return _written(name, lambda: fits.HDUList([*first, image.copy()]))
+    if not isinstance(image, NDData):
+        raise ObservationError(
+            name, "no image; expected a path, array, NDData, CCDData, HDU or HDUList"
+        )
+    return _written(name, lambda: _of_nddata(image))
 
 
 def parts_of_array(values: Any) -> tuple[np.ndarray, np.ndarray | None, str]:
@@ -193,7 +192,8 @@ def _hdus(
     return hdus
 
 
-def _written(name: Path, hdus: fits.HDUList) -> PlainFile:
+def _written(name: Path, hdus: Callable[[], fits.HDUList]) -> PlainFile:
     content = io.BytesIO()
-    hdus.writeto(content, output_verify="silentfix+ignore")
+    with reading(name):
+        hdus().writeto(content, output_verify="silentfix+ignore")
     return temporary_file(name, content.getvalue())

@@ -482,8 +482,10 @@ def layers_beside(image: ImageFile) -> dict[str, ImageFile]:
             and hdu.ver == this.ver
         ]
     found: dict[str, ImageFile] = {}
-    for layer in [find_image(image.file, place) for place in places]:
-        layer = layer.one_plane() if len(layer.shape) > len(image.shape) else layer
+    for place in places:
+        layer = find_image(image.file, place)
+        if len(layer.shape) > len(image.shape):
+            layer = layer.one_plane()
         if layer.shape != image.shape:
             continue
         kind = map_kind(layer)
@@ -637,7 +639,7 @@ def _tile_settings(header: Header) -> dict[str, Any]:
     return settings
 
 
-def decompress(path: Path, hdu: Any, copy: IO[bytes]) -> np.ndarray:
+def decompress(file: PlainFile, hdu: Any, copy: IO[bytes]) -> np.ndarray:
     """The stored values of an image, written to a file block by block and mapped from there.
 
     Only the tiles of a block of `BLOCK_PX` pixels are in memory; the file `copy` holds the
@@ -645,10 +647,10 @@ def decompress(path: Path, hdu: Any, copy: IO[bytes]) -> np.ndarray:
     """
     first = (0,) * (len(hdu.shape) - 2)
     dtype = hdu.section[(*first, slice(0, 1), slice(0, 1))].dtype
-    allowed, words = DECOMPRESSED.of(path.stat().st_size)
+    allowed, words = DECOMPRESSED.of(file.path.stat().st_size)
     needed = math.prod(hdu.shape) * dtype.itemsize
     if needed > allowed:
-        raise ObservationError(path, f"decompresses to {needed} bytes, more than {words}")
+        raise ObservationError(file.name, f"decompresses to {needed} bytes, more than {words}")
     # Room for all of it now: a disk that fills up later would kill the process.
     os.posix_fallocate(copy.fileno(), 0, needed)
     values = np.memmap(copy, dtype, "r+", shape=hdu.shape)
@@ -713,7 +715,7 @@ def open_pixels(
                 stored = hdu.section
             elif isinstance(hdu, fits.CompImageHDU):
                 copy = files.enter_context(tempfile.TemporaryFile(prefix="psfdae-"))
-                stored = decompress(image.path, hdu, copy)
+                stored = decompress(image.file, hdu, copy)
             else:
                 stored = hdu.data
         yield Pixels(stored, image, dtype)

@@ -1,4 +1,4 @@
-"""Header values against the pixels: gain, read noise and saturation that cannot be of this image."""
+"""Header values against the pixels: gain, read noise and saturation that cannot be right."""
 
 from __future__ import annotations
 
@@ -83,7 +83,8 @@ def checked_camera(
     ObservationError
         If a saturation that is given is below the sky.
     """
-    values, remarks = dict(camera), []
+    values = dict(camera)
+    remarks: list[str] = []
     if sky is None:
         return CheckedCamera(values, remarks)
     unit = image.unit or "counts"
@@ -123,8 +124,8 @@ def checked_camera(
         return CheckedCamera(values, remarks)
     values["gain"] = None, f"not known, {gain_origin} does not fit the pixels"
     remarks.append(
-        f"{image.path}: {problem} (a mean of frames, another unit, or a bias that was not subtracted?): not "
-        "used, errors come from the pixels; --gain states another one"
+        f"{image.path}: {problem} (a mean of frames, another unit, or a bias that was not "
+        "subtracted?): not used, errors come from the pixels; --gain states another one"
     )
     # A scale on which the gain is none cannot have the saturation of the camera, either.
     saturation, origin = values["saturation"]

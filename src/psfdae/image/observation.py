@@ -158,7 +158,8 @@ class Source:
             raise ObservationError(
                 self.path, "--detect takes an image, no cube; no list, and no origin of one"
             )
-        camera, remarks = self._camera(image), []
+        camera = self._camera(image)
+        remarks: list[str] = []
         if not is_cube:
             # The header's values are used as far as the pixels do not contradict them.
             refuse_mosaic_of_colours(image)
@@ -170,6 +171,8 @@ class Source:
             sky = layers.sky()
             if layers.noise is not None:
                 layers = replace(layers, noise_scale=sky.noise_scale)
+                layers, camera, remark = _with_photons(layers, camera, sky)
+                remarks += remark
             table = table if self.detect is None else self._detected(sky, self.detect)
         count = len(table) if table is not None else shape[0] if len(shape) == 3 else 1
         identifiers = np.arange(count, dtype=np.int64)
@@ -231,8 +234,8 @@ class Source:
             return where, []
         origin, offset, count = found
         words = (
-            f"{table.path}: {where.first},{where.second} count from {origin}, as {count} stars show "
-            f"(their centroids are off by x {offset[0]:+.2f}, y {offset[1]:+.2f} px); --origin "
+            f"{table.path}: {where.first},{where.second} count from {origin}, as {count} stars "
+            f"show (their centroids are off by x {offset[0]:+.2f}, y {offset[1]:+.2f} px); --origin "
             "states it"
         )
         return replace(where, origin=origin), [words]
@@ -331,19 +334,8 @@ class Source:
     ) -> tuple[Layers, list[str]]:
         """The image with its mask and map of noise, and what is said of those of its own file."""
         own = {} if is_cube else layers_beside(image)
-        remarks: list[str] = []
-        # The mask that is stated, else that of the file; "none" is for neither.
-        mask, bad_bits, said = None, self.bad_bits, []
-        if self.mask is not None and not _is_none(self.mask):
-            mask = _find_beside(image, self.mask, "a mask")
-        elif self.mask is None and "mask" in own:
-            mask = own["mask"]
-            said = [f"{_label(mask)} as mask"]
-        if bad_bits is not None and mask is None:
-            raise ObservationError(self.path, "bits are given, but no mask that has them")
-        if mask is not None and bad_bits is None and (by_header := bits_of_bad_pixels(mask)):
-            bad_bits, planes = by_header
-            remarks.append(f"{self.path}: bad pixels by {_label(mask)}: {planes} (bits {bad_bits})")
+        mask, bad_bits, remarks = self._mask_and_bits(image, own.get("mask"))
+        said = [f"{_label(mask)} as mask"] if mask is not None and self.mask is None else []
         gain, read_noise = (camera[name][0] for name in ("gain", "read noise"))
         layers = Layers(
             image, mask, bad_bits, least_noise=read_noise / gain if read_noise and gain else 0.0
@@ -375,6 +367,22 @@ class Source:
                 )
             remarks.insert(0, line)
         return layers, remarks
+
+    def _mask_and_bits(
+        self, image: ImageFile, own: ImageFile | None
+    ) -> tuple[ImageFile | None, int | None, list[str]]:
+        """The mask that is stated, else that of the image's file; its bad bits, and who says so."""
+        mask = own
+        if self.mask is not None:
+            mask = None if _is_none(self.mask) else _find_beside(image, self.mask, "a mask")
+        if self.bad_bits is not None and mask is None:
+            raise ObservationError(self.path, "bits are given, but no mask that has them")
+        by_header = None if mask is None else bits_of_bad_pixels(mask)
+        if mask is None or self.bad_bits is not None or by_header is None:
+            return mask, self.bad_bits, []
+        bits, planes = by_header
+        said = f"{self.path}: bad pixels by {_label(mask)}: {planes} (bits {bits})"
+        return mask, bits, [said]
 
     def _detected(self, sky: Sky, threshold: float) -> Catalogue:
         """The stars of an image."""
@@ -561,6 +569,40 @@ def _with_own_noise(layers: Layers, noise: ImageFile, kind: str) -> tuple[Layers
     return replace(layers, noise=noise, kind=kind), ""
 
 
+def _with_photons(
+    layers: Layers, camera: dict[str, Said], sky: Sky
+) -> tuple[Layers, dict[str, Said], list[str]]:
+    """Layers that know how the map of noise grows with the light of stars, and the gain by that.
+
+    Where photons make the noise, variance = variance of the sky + light/gain. A map of the sky
+    alone does not grow, and nothing changes. A gain that is known otherwise stays.
+    """
+    with layers.open(whole=True) as (_, _, noise):
+        assert noise is not None
+        sigma = layers.sigma(noise[slice(None), slice(None)])
+    good = ~sky.bad & np.isfinite(sigma)
+    variance, snr = sigma**2, sky.flat / np.where(sky.noise > 0, sky.noise, np.inf)
+    stars = good & (sky.flat > 0)
+    # Pixels of stars in which photons of the star are a large part of the variance, if any are.
+    stars &= snr >= np.quantile(snr[stars], 0.9) if stars.any() else False
+    faint = good & (np.abs(snr) < 1.0)
+    if np.count_nonzero(stars) < 50 or not faint.any():
+        return layers, camera, []
+    growth = (variance[stars] - np.median(variance[faint])) / sky.flat[stars]
+    slope = float(np.median(growth))
+    spread = 1.48 * float(np.median(np.abs(growth - slope)))
+    if not (slope > 0 and spread < 0.3 * slope):
+        return layers, camera, []
+    # σ is scaled by the measured noise of the sky, and so is the slope of its square.
+    layers = replace(layers, photons=slope / layers.noise_scale**2)
+    if camera["gain"][0] is not None:
+        return layers, camera, []
+    assert layers.noise is not None
+    name = _label(layers.noise)
+    words = f"{layers.image.path}: {name} grows with the light of the stars: gain {1 / slope:.4g}"
+    return layers, camera | {"gain": (1.0 / slope, name)}, [words]
+
+
 def listed_again(positions: np.ndarray) -> np.ndarray:
     """Return which positions (n, 2) are nearer than `SAME_PX` to an earlier one, bool, (n,)."""
     from scipy.spatial import cKDTree
@@ -579,8 +621,8 @@ def _on_pairs(table: Catalogue, again: np.ndarray) -> list[str]:
         return []
     said = "row is" if len(rows) == 1 else "rows are"
     return [
-        f"{table.path}: {len(rows)} {said} within {SAME_PX:g} px of an earlier one ({shorten(rows)})"
-        ": flagged BLENDED, and not learnt from"
+        f"{table.path}: {len(rows)} {said} within {SAME_PX:g} px of an earlier one "
+        f"({shorten(rows)}): flagged BLENDED, and not learnt from"
     ]
 
 
@@ -595,6 +637,7 @@ class Layers:
     kind: str = "variance"  # of the map of noise: "weight", "variance" or "error"
     empty: int = 0  # pixels of the weight 0, which are bad
     noise_scale: float = 1.0  # of σ by this map
+    photons: float = 0.0  # variance by this map for a unit of light above the sky
     least_noise: float = 0.0  # counts; the read noise
 
     @contextmanager
@@ -618,14 +661,19 @@ class Layers:
         with np.errstate(invalid="ignore"):  # what is beyond any number has no bits
             return np.asarray((np.nan_to_num(values, nan=-1).astype(np.int64) & self.bad_bits) != 0)
 
-    def sigma(self, values: np.ndarray) -> np.ndarray:
-        """σ of pixels by the map, NaN where it has none."""
+    def sigma(self, values: np.ndarray, light: np.ndarray | float = 0.0) -> np.ndarray:
+        """σ of the sky in pixels by the map, NaN where it has none.
+
+        The photons of stars, `light` above the sky, are taken out of a map that has them.
+        """
         with np.errstate(all="ignore"):
             if self.kind == "weight":
                 variance = 1.0 / values
             else:
                 variance = values**2 if self.kind == "error" else values
             known = np.isfinite(variance) & (variance > 0)
+            # Light is noisy, too; at least a hundredth of the variance is of the sky.
+            variance = np.clip(variance - self.photons * light, 0.01 * variance, 2.0 * variance)
         return self.noise_scale * np.sqrt(np.where(known, variance, np.nan))
 
     def masked_part(self) -> float:
@@ -644,16 +692,22 @@ class Layers:
             if mask is not None:
                 bad |= self.bad(mask[everything])
             if noise is not None:
-                sigma = self.sigma(noise[everything])
+                sigma = replace(self, photons=0.0).sigma(noise[everything])
                 bad |= np.isnan(sigma)
         with reading(self.image.path):
             try:
-                return sky_of(image, bad, sigma, self.least_noise)
+                sky = sky_of(image, bad, sigma, self.least_noise)
             except ValueError:  # nothing to measure the sky on
                 problem = "too few pixels of the image have a value that is not masked"
                 if self.mask is not None and self.bad_bits is None:
                     problem += "; --bad-bits says which bits are bad, --mask none takes no mask"
                 raise ObservationError(self.image.path, problem) from None
+        if sigma is None or not self.photons:
+            return sky
+        with self.open(whole=True) as (_, _, noise):
+            assert noise is not None
+            own = self.sigma(noise[everything], sky.flat)
+        return replace(sky, noise=sky.noise_scale * own)
 
 
 @dataclass(frozen=True)
@@ -827,6 +881,7 @@ class Observation:
         wide = max(self.margin, RING_PX)
         where = (self.shape, x, y, self.stamp_px, wide)
         data, inside, truncated = cut_image(pixels, *where)
+        pixels_of_stars = data
         if self.others is not None:
             full = np.inf if self.saturate is None else self.saturate
             left = data - self.others(part, self.stamp_px, wide)
@@ -836,7 +891,11 @@ class Observation:
             masked |= self._layers.bad(cut_image(mask, *where)[0])
         own = slice(wide - self.margin, wide + self.stamp_px + self.margin)
         if noise is not None:
-            sigma = self._layers.sigma(cut_image(noise, *where)[0])
+            light: np.ndarray | float = 0.0
+            if self._layers.photons:
+                level, _ = sky_around(pixels_of_stars, masked, self.stamp_px)
+                light = pixels_of_stars - level[:, None, None]
+            sigma = self._layers.sigma(cut_image(noise, *where)[0], light)
             masked |= np.isnan(sigma)
             each = np.ma.array(sigma, mask=masked)[:, own, own]
             level = np.ma.median(each, axis=(1, 2)).filled(np.nan).astype(float)
