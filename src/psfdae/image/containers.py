@@ -51,10 +51,8 @@ def as_image(image: Any) -> Path | PlainFile | np.ndarray:
     from astropy.io import fits
     from astropy.nddata import NDData
 
-    if isinstance(image, str | Path):
-        return Path(image)
-    if isinstance(image, PlainFile) or type(image) is np.ndarray:
-        return image
+    if isinstance(image, str | Path | PlainFile):
+        return Path(image) if isinstance(image, str) else image
     name = Path(type(image).__name__)
     if isinstance(image, np.ndarray):
         data, mask, unit = parts_of_array(image)

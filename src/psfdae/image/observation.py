@@ -235,8 +235,8 @@ class Source:
         origin, offset, count = found
         words = (
             f"{table.path}: {where.first},{where.second} count from {origin}, as {count} stars "
-            f"show (their centroids are off by x {offset[0]:+.2f}, y {offset[1]:+.2f} px); --origin "
-            "states it"
+            f"show (their centroids are off by x {offset[0]:+.2f}, y {offset[1]:+.2f} px); "
+            "--origin states it"
         )
         return replace(where, origin=origin), [words]
 
