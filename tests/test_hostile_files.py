@@ -213,7 +213,9 @@ def test_tiles_are_decompressed_in_blocks(tmp_path, monkeypatch, tile):
     path = write_tiles(tmp_path / "a.fz", image, tile_shape=tile)
     monkeypatch.setattr(images, "BLOCK_PX", 150)
     with fits.open(path) as hdus, (tmp_path / "copy").open("w+b") as copy:
-        np.testing.assert_array_equal(images.decompress(path, hdus[1], copy), image)
+        np.testing.assert_array_equal(
+            images.decompress(images.PlainFile(path, path), hdus[1], copy), image
+        )
 
 
 def test_only_some_tiles_of_an_image_are_in_memory(tmp_path):

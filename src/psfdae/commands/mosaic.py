@@ -22,7 +22,7 @@ from psfdae.threads import available_cores
 if TYPE_CHECKING:
     from psfdae.commands.predict import Stated
 
-ALONE = ("extension", "origin", "mask", "weight", "variance")
+ALONE = ("extension", "origin", "mask", "weight", "variance", "error")
 """What is stated of one image, and cannot be of several."""
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -15,10 +16,13 @@ from psfdae.errors import Error
 from psfdae.files import atomic_path, check_outputs, write_fits
 from psfdae.image.catalogue import as_catalogue
 from psfdae.image.errors import ascii_line
+from psfdae.image.observation import list_offset
 from psfdae.model.exchange import load_field
 from psfdae.options import File
 
 if TYPE_CHECKING:
+    from astropy.table import Table
+
     from psfdae.image.observation import Observation
     from psfdae.model.crowded import CrowdedPhotometry
 
@@ -81,7 +85,9 @@ def photometry(
 
     from psfdae.model.crowded import photometry as measured
 
-    found = measured(loaded, observation, stated.threshold)
+    found, offset = _of_all_rows(
+        observation, lambda usable: measured(loaded, usable, stated.threshold)
+    )
     if magnitudes is not None:
         zero_point, said = _zero_point(found, *magnitudes, reference)
         print(said)
@@ -93,7 +99,56 @@ def photometry(
         from astropy.io import fits
 
         write_fits(residual, fits.PrimaryHDU(found.residual.astype(np.float32)))
-    print(observation.said(), _summary(found, out), sep="\n")
+    print(*filter(None, [observation.said(), offset, _summary(found, out)]), sep="\n")
+
+
+def _of_all_rows(
+    observation: Observation, measured: Callable[[Observation], CrowdedPhotometry]
+) -> tuple[CrowdedPhotometry, str | None]:
+    """Measure the stars that can be, and return a row for every one; and how far a list is off."""
+    # Rows without a position cannot be fitted, and those of a star that is listed twice have no
+    # light of their own.
+    unusable = observation.without_position() | observation.listed_again()
+    found = measured(observation.of(~unusable) if unusable.any() else observation)
+    if unusable.any():
+        found = replace(found, stars=_with_rows(found.stars, observation.positions, unusable))
+    if observation.catalogue is None or len(found.stars) != observation.count:
+        return found, None
+    # The stars are fitted where they are, whatever the list says.
+    fitted = np.stack([found.stars["x"], found.stars["y"]], axis=1)
+    return found, list_offset(observation.catalogue, fitted - observation.positions, accept=True)
+
+
+def _with_rows(stars: Table, positions: np.ndarray | None, unusable: np.ndarray) -> Table:
+    """Return a row for every star of the list; those that were not measured have NaN and flags.
+
+    Parameters
+    ----------
+    stars : Table
+        A row for each star that was measured, in the order of the list.
+    positions : ndarray, shape (n, 2)
+        All positions of the list, x and y.
+    unusable : ndarray of bool, shape (n,)
+        Rows that were not measured.
+    """
+    from astropy.table import Table
+
+    assert positions is not None
+    rows = Table()
+    for name in stars.colnames:
+        measured = np.array(stars[name])
+        column = np.zeros(len(unusable), measured.dtype)
+        if measured.dtype.kind == "f":
+            column[:] = np.nan
+        column[~unusable] = measured
+        rows[name] = column
+    rows["id"] = np.arange(1, len(rows) + 1)
+    rows["x"][unusable], rows["y"][unusable] = positions[unusable].T
+    # As photutils flags them: no position; no flux.
+    no_position = unusable & ~np.isfinite(positions).all(axis=1)
+    rows["flags"][unusable] = 1024
+    rows["flags"][no_position] += 512
+    return rows
 
 
 def _zero_point(

@@ -44,7 +44,9 @@ class Stated:
         bool, "All images of the file, each by itself and in parallel; OUT gets their names."
     ] = False
     mask: Annotated[
-        str | int | None, NameOrNumber(), "Extension or FITS file; pixels other than 0 are bad."
+        str | int | None,
+        NameOrNumber(),
+        "Extension or FITS file; pixels other than 0 are bad.  [default: DQ of the file; none]",
     ] = None
     bad_bits: Annotated[
         int | None,
@@ -56,6 +58,11 @@ class Stated:
     ] = None
     variance: Annotated[
         str | int | None, NameOrNumber(), "Extension or FITS file with their variance."
+    ] = None
+    error: Annotated[
+        str | int | None,
+        NameOrNumber(),
+        "Extension or FITS file with their σ.  [default: ERR of the file; none]",
     ] = None
     gain: Annotated[float | None, "Electrons per count.  [default: the header's]"] = None
     read_noise: Annotated[float | None, "Electrons.  [default: the header's]"] = None

@@ -1,10 +1,11 @@
-"""Star catalogues: FITS tables (also FITS_LDAC), CSV and other text tables, ECSV, SExtractor.
+"""Star catalogues: FITS tables (also FITS_LDAC), text tables, VOTable, DAOPHOT, DS9, VizieR.
 
-Names of columns (`CONVENTIONS`) are found whatever their case. The origin, the index of
-the centre of the first pixel, is 1 for SExtractor and 0 for photutils; plain x, y are
-written with either (IRAF and DS9 count from 1, numpy and sep from 0): a wrong guess would
-shift every star by a pixel, so there is none. Pixel columns go before sky columns.
-Columns of different programs in one catalogue are not guessed between, either.
+Names of columns (`CONVENTIONS`) are found whatever their case, but that IRAF's XCENTER counts from
+1 and photutils' xcenter from 0. The origin, the index of the centre of the first pixel, is 1 for
+SExtractor, IRAF, DAOPHOT and DS9, and 0 for photutils and for psfdae's own results; plain x, y are
+written with either: a wrong guess would shift every star by a pixel, so there is none. Pixel
+columns go before sky columns. Columns of different programs in one catalogue are not guessed
+between, either.
 """
 
 from __future__ import annotations
@@ -19,16 +20,28 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from psfdae.errors import Error
+from psfdae.image import list_formats
+from psfdae.image.containers import parts_of_array
 from psfdae.image.errors import ObservationError, reading, shorten
 from psfdae.image.fits_file import UNPACK, PlainFile, open_hdus, plain_file
 from psfdae.image.stamps import StarFlag, raise_flag
 
 if TYPE_CHECKING:
+    from astropy.coordinates import SkyCoord
     from astropy.table import Column, Table
     from numpy.typing import ArrayLike
     from pandas import DataFrame
 
-    StarList: TypeAlias = str | Path | np.ndarray | Mapping[str, ArrayLike] | Table | DataFrame
+    StarList: TypeAlias = (
+        str
+        | Path
+        | np.ndarray
+        | Sequence[Sequence[float]]
+        | SkyCoord
+        | Mapping[str, ArrayLike]
+        | Table
+        | DataFrame
+    )
 
 SEXTRACTOR_HEADER = re.compile(r"#\s*(\d+)\s+[A-Za-z_]\w*")
 SEXAGESIMAL = re.compile(r"[:hd\s]", re.IGNORECASE)
@@ -52,6 +65,8 @@ class Convention:
     sky: bool = False
     origin: int | None = None
     flags: str | None = None  # its column with the bits `FLAGGED`
+    exact: bool = False  # in capitals or not as it is written here
+    beside: tuple[str, ...] = ()  # columns that the program writes, too
 
     @property
     def pairs(self) -> list[list[str]]:
@@ -64,6 +79,12 @@ def _each(names: str, sky: bool = False) -> list[Convention]:
     return [Convention(pair, sky) for pair in names.split()]
 
 
+# Tables that psfdae itself writes; they may hold columns of other programs, too.
+RESULTS = [
+    Convention("x,y", origin=0, beside=("shift_x", "shift_y")),  # predict
+    Convention("x,y", origin=0, beside=("x_error", "y_error", "flux_model")),  # photometry
+    Convention("x,y", origin=0, beside=("snr", "verdict", "part")),  # from-stars
+]
 CONVENTIONS = [
     Convention(
         "XWIN_IMAGE,YWIN_IMAGE XPSF_IMAGE,YPSF_IMAGE XMODEL_IMAGE,YMODEL_IMAGE "
@@ -71,7 +92,10 @@ CONVENTIONS = [
         origin=1,
         flags="FLAGS",
     ),
-    Convention("x_fit,y_fit x_centroid,y_centroid xcentroid,ycentroid xcenter,ycenter", origin=0),
+    Convention("x_fit,y_fit x_centroid,y_centroid xcentroid,ycentroid", origin=0),
+    Convention("xcenter,ycenter", origin=0, exact=True),
+    Convention("XCENTER,YCENTER", origin=1, exact=True),
+    Convention("XCenter,YCenter"),
     *_each("x,y xpos,ypos x_pos,y_pos xpix,ypix x_pix,y_pix x_pixel,y_pixel"),
     Convention(
         "ALPHAWIN_J2000,DELTAWIN_J2000 ALPHAPSF_J2000,DELTAPSF_J2000 ALPHA_J2000,DELTA_J2000 "
@@ -109,14 +133,24 @@ class Positions:
 
 def choose_positions(names: Sequence[str]) -> Positions:
     """Find the position columns among the names of a catalogue, or raise ColumnError."""
-    found = []
+    for result in RESULTS:
+        if set(names).issuperset((*result.pairs[0], *result.beside)):
+            first_name, second_name = result.pairs[0]
+            return Positions(first_name, second_name, result.sky, result.origin, None)
+    found: list[Positions] = []
     for convention in CONVENTIONS:
         for pair in convention.pairs:
             first, second = (_in_any_case(names, name) for name in pair)
-            if first is not None and second is not None:
+            if first is None or second is None or (convention.exact and [first, second] != pair):
+                continue
+            if all(first != where.first for where in found):
                 how = (convention.sky, convention.origin, convention.flags)
                 found.append(Positions(first, second, *how))
-                break
+            break
+    # Tables of astropy keep sky coordinates as NAME.ra and NAME.dec in FITS files.
+    stems = [name[:-3] for name in names if name.endswith(".ra") and f"{name[:-3]}.dec" in names]
+    if len(stems) == 1 and not found:
+        found = [Positions(f"{stems[0]}.ra", f"{stems[0]}.dec", True, None, None)]
     found = [where for where in found if not where.sky] or found
     if not found:
         raise ColumnError("no position columns")
@@ -199,6 +233,23 @@ class Catalogue:
         if not finite.any():
             raise ObservationError(self.path, f"column {name!r} has no finite number in any row")
         return np.where(finite, numbers, np.nan)
+
+    def pixels(self, name: str) -> np.ndarray:
+        """A column of pixel positions, as `coordinates`; another unit than pixels is refused."""
+        from astropy import units
+
+        unit = getattr(self._column(name), "unit", None)
+        if unit is not None:
+            known = units.Unit(unit, parse_strict="silent")
+            plain = isinstance(known, units.UnrecognizedUnit) or known in (
+                units.pix,
+                units.dimensionless_unscaled,
+            )
+            if not plain:
+                raise ObservationError(
+                    self.path, f"column {name!r} has the unit {str(unit)!r}, expected pixels"
+                )
+        return self.coordinates(name)
 
     def flags(self, where: Positions) -> np.ndarray:
         """What the list's own program says against its stars, as `StarFlag`s, (n,), uint16."""
@@ -350,9 +401,10 @@ def read_catalogue(path: Path) -> Catalogue:
     """Read a star catalogue.
 
     The format follows from the content: a FITS file, of which the LDAC_OBJECTS or
-    the only table is taken; ECSV; the ASCII_HEAD format of SExtractor; or a text
-    table with a line of column names, separated by commas, semicolons, tabs or
-    blanks. Lines that begin with # are comments.
+    the only table is taken; VOTable; ECSV; the ASCII_HEAD format of SExtractor; lists of
+    IRAF's DAOPHOT and of DAOPHOT itself; regions of DS9; or a text table with a line of
+    column names, separated by commas, semicolons, tabs or blanks, also with VizieR's lines
+    of units and dashes. Lines that begin with # are comments.
     """
     with reading(path), path.open("rb") as file:
         start = file.read(16)
@@ -369,25 +421,72 @@ def as_catalogue(given: StarList) -> Catalogue:
 
     Parameters
     ----------
-    given : path-like, table, or array of shape (n, 2)
+    given : path-like, table, SkyCoord, array of shape (n, 2), or sequence of n pairs
         A table is one of astropy or pandas, or a mapping of columns, with names as in files
-        (`CONVENTIONS`); positions are (x, y), 0-based.
+        (`CONVENTIONS`) or with a column of SkyCoord; positions are (x, y), 0-based.
     """
+    from astropy.coordinates import SkyCoord
     from astropy.table import Table
 
+    if isinstance(given, Catalogue):
+        return given
     if isinstance(given, str | Path):
         return read_catalogue(Path(given))
     path = Path("catalogue")
     with reading(path):
-        if isinstance(given, np.ndarray) and given.dtype.names is None:
-            if given.ndim != 2 or given.shape[1] != 2:
-                raise ObservationError(path, f"positions of shape {given.shape}, expected (n, 2)")
-            given = {"x_fit": given[:, 0], "y_fit": given[:, 1]}
+        if isinstance(given, SkyCoord):
+            given = {"sky": given.reshape(-1)}
+        elif _is_positions(given):
+            given = _pairs(path, given)
         records = getattr(given, "to_records", None)  # of a DataFrame
+        # Quantities become columns with units.
         table = Table(given if records is None else records(index=False))
+        table = _with_sky_columns(table)
     if len(table) == 0:
         raise ObservationError(path, "the catalogue has no stars")
     return Catalogue(path, table)
+
+
+def _is_positions(given: Any) -> bool:
+    """Return True for an array without names of columns, and for a sequence that is no table."""
+    if isinstance(given, np.ndarray):
+        return given.dtype.names is None
+    return isinstance(given, Sequence) and not any(isinstance(row, Mapping) for row in given)
+
+
+def _pairs(path: Path, given: Any) -> dict[str, np.ndarray]:
+    """Return the columns of positions (x, y), NaN where they are masked."""
+    values, mask, unit = parts_of_array(given)
+    if unit not in ("", "pix", "pixel"):
+        raise ObservationError(
+            path, f"positions in {unit}, expected pixels; sky coordinates go as a SkyCoord"
+        )
+    shape = values.shape
+    if values.ndim != 2 or shape[1] != 2 or values.dtype.kind not in "fiu":
+        raise ObservationError(path, f"positions of shape {shape}, expected numbers of (n, 2)")
+    values = values.astype(np.float64)
+    if mask is not None:
+        values[mask] = np.nan
+    return {"x_fit": values[:, 0], "y_fit": values[:, 1]}
+
+
+def _with_sky_columns(table: Table) -> Table:
+    """Return a table whose only column of SkyCoord is replaced by RA and Dec in degrees, ICRS."""
+    from astropy.coordinates import SkyCoord
+    from astropy.table import Table
+
+    sky = [name for name in table.colnames if isinstance(table[name], SkyCoord)]
+    if len(sky) != 1:
+        return table
+    icrs = table[sky[0]].icrs
+    others = [name for name in table.colnames if name not in (sky[0], "ra", "dec")]
+    plain = Table({name: table[name] for name in others})
+    for name, angle in (("ra", icrs.ra), ("dec", icrs.dec)):
+        values, mask, _ = parts_of_array(angle.deg)
+        plain[name] = values.astype(np.float64)
+        if mask is not None:
+            plain[name][mask] = np.nan
+    return plain
 
 
 def _fits_table(path: Path) -> _FitsTable:
@@ -441,9 +540,17 @@ def _text_table(path: Path, lines: list[str]) -> Table:
     """Table of the lines, which are gone then: they take twice the memory of the file."""
     from astropy.io import ascii as text_tables
 
+    if lines[0].startswith("# Region file") or path.suffix.lower() == ".reg":
+        return list_formats.regions(path, lines)
+    if lines[0].lstrip().startswith("<"):
+        return list_formats.votable(path, lines, WIDEST)
+    if list_formats.STETSON.match(lines[0]):
+        return list_formats.stetson(path, lines)
     rows = _without_comments(lines)
-    if lines[0].startswith("# %ECSV"):
-        kind: dict[str, Any] = {"format": "ecsv"}
+    if lines[0].startswith(("#K ", "#N ")):
+        kind: dict[str, Any] = {"format": "daophot"}
+    elif lines[0].startswith("# %ECSV"):
+        kind = {"format": "ecsv"}
         if sum(map(len, lines)) - sum(map(len, rows)) > LARGEST_ECSV_HEADER:
             raise ObservationError(
                 path, f"an ECSV header of more than {LARGEST_ECSV_HEADER} characters"
@@ -453,7 +560,7 @@ def _text_table(path: Path, lines: list[str]) -> Table:
         numbered = filter(None, map(SEXTRACTOR_HEADER.match, lines))
         _check_size(path, 0, max(int(found[1][:9]) for found in numbered))
     else:
-        lines[:] = rows
+        lines[:] = rows = list_formats.without_vizier_head(rows)
         kind = {"format": "basic", "delimiter": _delimiter(rows)}
     if not rows:
         raise ObservationError(path, "the catalogue has no stars")
@@ -466,7 +573,7 @@ def _text_table(path: Path, lines: list[str]) -> Table:
     lines.clear()
     rows.clear()
     with reading(path):
-        return text_tables.read(text, guess=False, **kind)
+        return _with_sky_columns(text_tables.read(text, guess=False, **kind))
 
 
 def _delimiter(rows: list[str]) -> str:

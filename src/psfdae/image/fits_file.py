@@ -26,7 +26,7 @@ import tempfile
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -59,10 +59,23 @@ END_CARD = re.compile(rb"(?:.{80})*?END(?![A-Z0-9_-])", re.DOTALL)
 SAFE_TILES = ("RICE_1", "RICE_ONE", "GZIP_1", "GZIP_2", "NOCOMPRESS")
 RICE = {"BLOCKSIZE": (32, (16, 32)), "BYTEPIX": (4, (1, 2, 4))}  # default, and what is accepted
 
-MASKS = {"DQ", "MASK", "BPM", "FLAG", "FLAGS"}
-ERRORS = {"ERR", "ERROR", "SIGMA", "STDDEV", "RMS", "VAR", "VARIANCE", "IVAR", "UNCERT"}
-EXTRAS = {"WEIGHT", "WHT", "WGT", "BKG", "BACKGROUND", "SKY", "CTX", "SAMP", "TIME"}
-NOT_SCIENCE = MASKS | ERRORS | EXTRAS  # extensions that go with an image
+# Extensions that go with an image, by the pipelines of JWST, HST, LCO, LSST, Gemini, ccdproc.
+MAPS = {
+    "mask": re.compile("DQ|MASK|BPM|FLAGS?"),
+    "error": re.compile("(ERR|ERROR|SIGMA|STDDEV|RMS|UNCERT)(_.*)?"),
+    "variance": re.compile("(VAR|VARIANCE)(_.*)?"),  # VAR_POISSON, a part of it
+    "weight": re.compile("IVAR|WEIGHT|WHT|WGT"),
+}
+NOT_SCIENCE = re.compile(
+    "|".join(kind.pattern for kind in MAPS.values())
+    + "|BKG|BACKGROUND|SKY|CTX|CON|SAMP|NSAMP|TIME|EXP|AREA|WMAP|PSFIMAGE"
+    + "|WCSDVARR|D2IMARR"
+)
+SCIENCE = ("SCI", "IMAGE")  # of which there is one in a file, it is meant
+# Types of astropy's uncertainties, which CCDData writes as UTYPE.
+UNCERTAINTIES = {"STD": "error", "VAR": "variance", "IVAR": "weight"}
+# Planes of an LSST mask of which the pixels show no light of stars; others mark good pixels.
+LSST_BAD_PLANES = ("BAD", "SAT", "INTRP", "CR", "NO_DATA", "UNMASKEDNAN")
 
 # Electrons per count; cameras that write the first two put a setting without unit into GAIN.
 GAIN_KEYS = ("EGAIN", "GAIN", "ESO DET OUT1 CONAD", "ATODGAIN", "CCDGAIN", "GAIN1", "GAINA")
@@ -74,7 +87,7 @@ SCALE_KEYS = ("PIXSCALE", "PIXELSCL", "SECPIX", "SECPIX1", "PIXSCAL1", "IM_SCALE
 LENS_KEYS = ("XPIXSZ", "FOCALLEN")  # micrometres and millimetres, of amateurs' cameras
 # Where stamps come from, copied to whatever is made of them.
 PROVENANCE_KEYS: tuple[str, ...] = ("OBJECT", "TELESCOP", "INSTRUME", "OBSERVER", "FILTER")
-PROVENANCE_KEYS += ("DATE-OBS", "MJD-OBS", "EXPTIME", "AIRMASS")
+PROVENANCE_KEYS += ("DATE-OBS", "MJD-OBS", "EXPTIME", "AIRMASS", "BUNIT")
 INSTRUMENT_KEYS = ("TELESCOP", "INSTRUME", "FILTER")  # of these, with which PSFs change
 
 Card = tuple[str, str | float | None, str]  # key, value and comment
@@ -134,6 +147,12 @@ class PlainFile:
     path: Path
     _copy: Any = None
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle a temporary copy by its content."""
+        if self._copy is None:
+            return type(self), (self.name, self.path)
+        return temporary_file, (self.name, self.path.read_bytes())
+
 
 def plain_file(path: Path) -> PlainFile:
     """A FITS file, unpacked if need be."""
@@ -148,6 +167,14 @@ def plain_file(path: Path) -> PlainFile:
         file.seek(0)
         with unpack(file) as content:
             return _unpacked(path, content)
+
+
+def temporary_file(name: Path, content: bytes) -> PlainFile:
+    """A FITS file of this content, which exists as long as the object that is returned."""
+    copy = tempfile.NamedTemporaryFile(prefix="psfdae-", suffix=".fits")  # noqa: SIM115
+    copy.write(content)
+    copy.flush()
+    return PlainFile(name, Path(copy.name), copy)
 
 
 def _check_start(path: Path, start: bytes) -> None:
@@ -274,18 +301,42 @@ class ImageFile:
         """Electrons per count.
 
         Images in electrons (BUNIT) have 1 whatever the camera's gain was; for images
-        of a rate, counts per second, the gain of the camera is not that of the pixels.
+        of a rate, counts per second, or of a calibrated brightness, the gain of the camera is
+        not that of the pixels.
         """
+        name = self.unit.lower().replace(" ", "")
+        if name in {"electron", "electrons", "e-", "e"}:
+            return 1.0, "BUNIT"
+        if name.endswith(("/s", "/sec", "/second", "s-1", "s**-1", "s^-1")):
+            return None, "not known, the image is a rate"
+        if "jy" in name or "erg" in name:
+            return None, f"not known, the image is in {self.unit}"
+        gain = self.positive(GAIN_KEYS)
+        if gain[1] == "GAIN" and self._is_camera_setting():
+            return None, f"not known, GAIN = {gain[0]:g} is a setting of the camera"
+        return gain
+
+    def _is_camera_setting(self) -> bool:
+        """Return True if GAIN is a whole number from 20 without unit, as of amateurs' cameras."""
+        for header in self.headers:
+            value = card_value(header, "GAIN")
+            if value is not None:
+                unit = re.search("e-|electron|adu", str(card_value(header.comments, "GAIN")), re.I)
+                return isinstance(value, int) and value >= 20 and unit is None
+        return False
+
+    @property
+    def unit(self) -> str:
+        """Unit of the pixels by BUNIT; "" if no header says it."""
         for header in self.headers:
             unit = card_value(header, "BUNIT")
             if isinstance(unit, str) and unit.strip():
-                name = unit.strip().lower().replace(" ", "")
-                if name in {"electron", "electrons", "e-", "e"}:
-                    return 1.0, "BUNIT"
-                if name.endswith(("/s", "/sec", "/second", "s-1", "s**-1", "s^-1")):
-                    return None, "not known, the image is a rate"
-                break
-        return self.positive(GAIN_KEYS)
+                return unit.strip()
+        return ""
+
+    def one_plane(self) -> ImageFile:
+        """The only plane of an image with NAXIS3 = 1."""
+        return replace(self, shape=self.shape[1:], leading=self.leading + 1)
 
     def scale(self) -> Said:
         """Arcseconds per pixel by the header's cards, the WCS aside."""
@@ -341,7 +392,7 @@ def find_image(
     The file may be tile-compressed (.fz) or compressed as a whole (.gz, .bz2, .xz, .zip with
     one file). The extension is a name (case does not matter), "NAME,version" or a number (0
     is the primary one); without it the only image is taken that is not a mask, an error or
-    the like (`NOT_SCIENCE`).
+    the like (`NOT_SCIENCE`), or the only one called as in `SCIENCE`.
     """
     if isinstance(path, np.ndarray):
         return array_image(path)
@@ -376,13 +427,87 @@ def science_images(path: Path) -> dict[str, int]:
     """
     with reading(path), open_hdus(plain_file(path)) as hdus:
         found = {k: hdu.name for k, hdu in enumerate(hdus) if _has_pixels(hdu)}
-    found = {k: name for k, name in found.items() if name.upper() not in NOT_SCIENCE}
+    found = {k: name for k, name in found.items() if _is_science(name)}
     if not found:
         raise ObservationError(path, "no image")
     names = list(found.values())
     plain = re.compile("(?![0-9]+$)[A-Za-z0-9_+-]+")
     own = {k for k, name in found.items() if names.count(name) == 1 and plain.fullmatch(name)}
     return {name if k in own else str(k): k for k, name in found.items()}
+
+
+def _is_science(name: str) -> bool:
+    """Return False for an extension that goes with an image, such as DQ, by its name."""
+    return NOT_SCIENCE.fullmatch(name.strip().upper()) is None
+
+
+def map_kind(image: ImageFile) -> str | None:
+    """Return which of `MAPS` an extension is by its name or UTYPE, None if neither says it."""
+    header = image.headers[0] if image.headers else {}
+    name = str(card_value(header, "EXTNAME") or "").strip().upper()
+    kind = next((kind for kind, names in MAPS.items() if names.fullmatch(name)), None)
+    if kind != "error":
+        return kind
+    return UNCERTAINTIES.get(str(card_value(header, "UTYPE") or "STD").strip().upper(), kind)
+
+
+def layers_beside(image: ImageFile) -> dict[str, ImageFile]:
+    """Find the mask and the map of noise that a file has for an image, by the names in `MAPS`.
+
+    They have its size. If names repeat, their versions (EXTVER) belong together; of a file with
+    several science images that do not, none is taken.
+
+    Returns
+    -------
+    dict of str to ImageFile
+        Under "mask"; under one of "error", "variance".
+    """
+    if image.values is not None:
+        return {}
+    with reading(image.path), open_hdus(image.file, memmap=True, **_AS_STORED) as hdus:
+        images = [(k, hdu) for k, hdu in enumerate(hdus) if _has_pixels(hdu)]
+        this = hdus[image.index]
+        science = [hdu for _, hdu in images if _is_science(hdu.name)]
+        of_pipeline = this.name.upper() in SCIENCE
+        if not _is_science(this.name) or (len(science) > 1 and not of_pipeline):
+            return {}
+        places = [
+            k
+            for k, hdu in images
+            if not _is_science(hdu.name)
+            and "_" not in hdu.name
+            and tuple(hdu.shape)[-2:] == image.shape[-2:]
+            and hdu.ver == this.ver
+        ]
+    found: dict[str, ImageFile] = {}
+    for place in places:
+        layer = find_image(image.file, place)
+        if len(layer.shape) > len(image.shape):
+            layer = layer.one_plane()
+        if layer.shape != image.shape:
+            continue
+        kind = map_kind(layer)
+        if kind in MAPS:
+            found.setdefault(kind, layer)
+    # A standard deviation goes before a variance; weights have no unit that could be trusted.
+    names = ("mask", "error" if "error" in found else "variance")
+    return {name: found[name] for name in names if name in found}
+
+
+def bits_of_bad_pixels(mask: ImageFile) -> tuple[int, str] | None:
+    """Return the sum of the mask's bits that are bad by its header, and who says so.
+
+    None if the header does not say it. LSST names its planes (MP_BAD = 0 for bit 0); JWST's and
+    Roman's bit 1 is DO_NOT_USE.
+    """
+    for header in mask.headers:
+        planes = {name: card_value(header, f"MP_{name}") for name in LSST_BAD_PLANES}
+        bits = {name: bit for name, bit in planes.items() if isinstance(bit, int) and 0 <= bit < 63}
+        if bits:
+            return sum(1 << bit for bit in set(bits.values())), ", ".join(bits)
+        if str(card_value(header, "TELESCOP")).strip().upper() in ("JWST", "ROMAN"):
+            return 1, "DO_NOT_USE"
+    return None
 
 
 _AS_STORED = {"do_not_scale_image_data": True, "uint": False, "ignore_blank": True}
@@ -400,9 +525,13 @@ def _choose(path: Path, hdus: HDUList, extension: str | int | None) -> Any:
             )
         return hdu
     images = [hdu for hdu in hdus if _has_pixels(hdu)]
-    science = [hdu for hdu in images if hdu.name.upper() not in NOT_SCIENCE] or images
+    science = [hdu for hdu in images if _is_science(hdu.name)] or images
     if not science:
         raise ObservationError(path, f"no image; the file has {listed}")
+    # The science image of a pipeline, if there is just one, whatever other layers are called.
+    for name in SCIENCE:
+        named = [hdu for hdu in science if hdu.name.upper() == name]
+        science = named if len(named) == 1 else science
     if len(science) > 1:
         raise ObservationError(path, f"several images, choose an extension of {listed}")
     return science[0]
@@ -508,7 +637,7 @@ def _tile_settings(header: Header) -> dict[str, Any]:
     return settings
 
 
-def decompress(path: Path, hdu: Any, copy: IO[bytes]) -> np.ndarray:
+def decompress(file: PlainFile, hdu: Any, copy: IO[bytes]) -> np.ndarray:
     """The stored values of an image, written to a file block by block and mapped from there.
 
     Only the tiles of a block of `BLOCK_PX` pixels are in memory; the file `copy` holds the
@@ -516,10 +645,10 @@ def decompress(path: Path, hdu: Any, copy: IO[bytes]) -> np.ndarray:
     """
     first = (0,) * (len(hdu.shape) - 2)
     dtype = hdu.section[(*first, slice(0, 1), slice(0, 1))].dtype
-    allowed, words = DECOMPRESSED.of(path.stat().st_size)
+    allowed, words = DECOMPRESSED.of(file.path.stat().st_size)
     needed = math.prod(hdu.shape) * dtype.itemsize
     if needed > allowed:
-        raise ObservationError(path, f"decompresses to {needed} bytes, more than {words}")
+        raise ObservationError(file.name, f"decompresses to {needed} bytes, more than {words}")
     # Room for all of it now: a disk that fills up later would kill the process.
     os.posix_fallocate(copy.fileno(), 0, needed)
     values = np.memmap(copy, dtype, "r+", shape=hdu.shape)
@@ -584,7 +713,7 @@ def open_pixels(
                 stored = hdu.section
             elif isinstance(hdu, fits.CompImageHDU):
                 copy = files.enter_context(tempfile.TemporaryFile(prefix="psfdae-"))
-                stored = decompress(image.path, hdu, copy)
+                stored = decompress(image.file, hdu, copy)
             else:
                 stored = hdu.data
         yield Pixels(stored, image, dtype)

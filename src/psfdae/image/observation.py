@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
@@ -22,6 +23,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from psfdae.image.catalogue import Catalogue, Positions, as_catalogue
+from psfdae.image.containers import in_unit
 from psfdae.image.detection import Sky, sky_of
 from psfdae.image.errors import ObservationError, reading, shorten, silent
 from psfdae.image.fits_file import (
@@ -31,14 +33,22 @@ from psfdae.image.fits_file import (
     Card,
     ImageFile,
     Pixels,
+    PlainFile,
     Said,
     array_image,
+    bits_of_bad_pixels,
+    card_value,
     find_image,
+    layers_beside,
+    map_kind,
     open_pixels,
 )
+from psfdae.image.header_checks import checked_camera, refuse_mosaic_of_colours, sky_sample
+from psfdae.image.list_origin import TOLERANCE_PX, origin_of
 from psfdae.image.stamps import Stamps, StarFlag, cut, raise_flag, sky_around
 
 if TYPE_CHECKING:
+    from astropy.units import Quantity
     from astropy.wcs import WCS
 
     from psfdae.image.catalogue import StarList
@@ -54,13 +64,16 @@ LARGEST_STAMP_PX = 256  # of a model; a margin of stamps is small beside it
 RING_PX = 8  # around a stamp, at least: there the noise of the sky is that of no star
 HASHED_ROWS = 256  # of an image, or stamps of a cube, that are read at a time for its checksum
 SAME_PX = 0.1  # nearer to each other than this, two rows of a list are one star
+NO_LAYER = "none"  # in place of an extension: none of the image's own file, either
+NOISE_MAPS = {"weight": "a weight map", "variance": "a variance map", "error": "a map of σ"}
+FITS_SUFFIXES = re.compile(r"(\.(fits|fit|fts|fz|gz|bz2|xz|zip))+$", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
 class Source:
     """A FITS file with stars, and what is stated about it."""
 
-    image: Path | np.ndarray  # cube of stamps, or image
+    image: Path | PlainFile | np.ndarray  # cube of stamps, or image
     catalogue: StarList | None = (
         None  # of an image, as `as_catalogue` takes it; of a cube, row by row
     )
@@ -69,14 +82,17 @@ class Source:
     on_image: bool = False  # stars of the catalogue that are off the image are left out
     origin: int | None = None  # of the catalogue's pixels; by default that of its program
     # Extension, file or array as large as the image; or a mask (d, d) for all of a cube.
+    # "none": without that of the image's own file.
     mask: str | int | Path | np.ndarray | None = None
     bad_bits: int | None = None  # of the mask; any by default
     weight: str | int | Path | np.ndarray | None = None  # 1/σ² of every pixel, but for a factor
     variance: str | int | Path | np.ndarray | None = None  # σ² in its place
-    pixel_scale_arcsec: float | None = None  # what is given goes before the header
-    gain: float | None = None  # electrons per count
-    read_noise: float | None = None  # electrons
-    saturate: float | None = None  # counts
+    error: str | int | Path | np.ndarray | None = None  # σ in its place; "none" as of the mask
+    # What is given goes before the header; quantities are converted.
+    pixel_scale_arcsec: float | Quantity | None = None
+    gain: float | Quantity | None = None  # electrons per count
+    read_noise: float | Quantity | None = None  # electrons
+    saturate: float | Quantity | None = None  # counts
     flux_column: str | None = None  # of the catalogue: fluxes that are not to be estimated
     background_column: str | None = None  # the same for sky levels per pixel
     colour_column: str | None = None  # of the catalogue: colours, on which the PSF may depend
@@ -85,18 +101,20 @@ class Source:
     @property
     def path(self) -> Path:
         """The image's file, or what an array is called in messages."""
+        if isinstance(self.image, PlainFile):
+            return self.image.name
         return self.image if isinstance(self.image, Path) else Path("array")
 
     @property
     def name(self) -> str:
-        """What a model of its stars is called by default."""
-        return self.path.name.split(".")[0] or "model"
+        """What a model of its stars is called by default: the file's name without its suffixes."""
+        return FITS_SUFFIXES.sub("", self.path.name) or "model"
 
     def files(self) -> tuple[object, ...]:
         """All that is read."""
-        return (self.image, self.catalogue, self.mask, self.weight, self.variance)
+        return (self.image, self.catalogue, self.mask, self.weight, self.variance, self.error)
 
-    def of_each(self, images: Sequence[Path | np.ndarray]) -> list[Source]:
+    def of_each(self, images: Sequence[Path | PlainFile | np.ndarray]) -> list[Source]:
         """The same of each image; stars of the list of several are of those on which they are."""
         on_image = self.on_image
         if self.catalogue is not None and len(images) > 1:
@@ -110,8 +128,29 @@ class Source:
         Pixels are read to find stars, and where there is a map of noise. Stamps get a margin
         of so many pixels, those of a cube as many of these as they have.
         """
-        self._check(stamp_px, margin)
         image = find_image(self.image, self.extension)
+        return self._in_units(image)._opened(image, stamp_px, margin)
+
+    def _in_units(self, image: ImageFile) -> Source:
+        """The same with plain numbers in place of quantities."""
+        units = {
+            "pixel_scale_arcsec": "arcsec/pix arcsec",
+            "gain": "electron/adu electron/ct electron/DN",
+            "read_noise": "electron",
+            "saturate": "adu ct DN",
+        }
+        if image.unit:
+            units["saturate"] = f"{units['saturate']} {image.unit.replace(' ', '')}"
+        numbers: dict[str, Any] = {
+            name: in_unit(getattr(self, name), accepted, name, self.path)
+            for name, accepted in units.items()
+        }
+        return replace(self, **numbers)
+
+    def _opened(self, image: ImageFile, stamp_px: int, margin: int) -> Observation:
+        self._check(stamp_px, margin)
+        table = None if self.catalogue is None else as_catalogue(self.catalogue)
+        image = self._as_image(image, table)
         shape = image.shape
         is_cube = self._is_cube(image, stamp_px)
         given = self.catalogue is not None or self.origin is not None
@@ -120,21 +159,35 @@ class Source:
                 self.path, "--detect takes an image, no cube; no list, and no origin of one"
             )
         camera = self._camera(image)
-        layers = self._layers(image, is_cube, camera)
-        table = None if self.catalogue is None else as_catalogue(self.catalogue)
+        remarks: list[str] = []
+        if not is_cube:
+            # The header's values are used as far as the pixels do not contradict them.
+            refuse_mosaic_of_colours(image)
+            camera, remarks = checked_camera(image, camera, sky_sample(image))
+        layers, beside = self._layers(image, is_cube, camera)
+        remarks += beside
         listed = None if table is None else table.path
         if self.detect is not None or layers.noise is not None:
             sky = layers.sky()
             if layers.noise is not None:
                 layers = replace(layers, noise_scale=sky.noise_scale)
+                layers, camera, remark = _with_photons(layers, camera, sky)
+                remarks += remark
             table = table if self.detect is None else self._detected(sky, self.detect)
         count = len(table) if table is not None else shape[0] if len(shape) == 3 else 1
         identifiers = np.arange(count, dtype=np.int64)
         positions, flags = None, np.zeros(count, dtype=np.uint16)
         if table is not None:
             where = table.positions()
+            if self.origin is None and where.origin is None and not (where.sky or is_cube):
+                where, remark = self._with_origin(table, where, layers)
+                remarks += remark
             positions = self._positions(image, table, where, is_cube)
             identifiers, flags = table.identifiers(), table.flags(where)
+            if positions is not None and not is_cube and self.detect is None:
+                again = listed_again(positions)
+                raise_flag(flags, StarFlag.BLENDED, again)
+                remarks += _on_pairs(table, again)
         names = (self.flux_column, self.background_column, self.colour_column)
         columns = [identifiers, *(self._column(table, name, count) for name in names), flags]
         if self.on_image and positions is not None and not is_cube:
@@ -152,9 +205,40 @@ class Source:
             catalogue=listed,
             found=table if self.detect is not None else None,
             colour_column=self.colour_column,
+            remarks=tuple(remarks),
             _columns=columns,
             _layers=layers,
         )
+
+    def _as_image(self, image: ImageFile, table: Catalogue | None) -> ImageFile:
+        """The only plane of a cube with one, if it is no stamp of the only star of a list."""
+        stars_wanted = self.detect is not None or (table is not None and len(table) != 1)
+        if len(image.shape) != 3 or image.shape[0] != 1:
+            return image
+        large = max(image.shape) > LARGEST_STAMP_PX
+        return image.one_plane() if stars_wanted or large else image
+
+    def _with_origin(
+        self, table: Catalogue, where: Positions, layers: Layers
+    ) -> tuple[Positions, list[str]]:
+        """The columns of a list with the origin that the stars of the image say, in words, too.
+
+        Unchanged if they do not say it clearly.
+        """
+        places = np.stack([table.pixels(where.first), table.pixels(where.second)], axis=1)
+        try:
+            found = origin_of(layers.sky(), places)
+        except ObservationError:  # no sky can be measured
+            found = None
+        if found is None:
+            return where, []
+        origin, offset, count = found
+        words = (
+            f"{table.path}: {where.first},{where.second} count from {origin}, as {count} stars "
+            f"show (their centroids are off by x {offset[0]:+.2f}, y {offset[1]:+.2f} px); "
+            "--origin states it"
+        )
+        return replace(where, origin=origin), [words]
 
     def _check(self, stamp_px: int, margin: int) -> None:
         if stamp_px < 1:
@@ -215,9 +299,9 @@ class Source:
                 raise ObservationError(
                     table.path,
                     f"the origin of columns {where.first},{where.second} must be stated: "
-                    "is the centre of the first pixel 0 or 1?",
+                    "is the centre of the first pixel 0 or 1? --origin says it",
                 )
-            columns = [table.coordinates(name) for name in (where.first, where.second)]
+            columns = [table.pixels(name) for name in (where.first, where.second)]
             positions = np.stack(columns, axis=1) - origin
         # What is beyond any image is no position: its squares would not even be numbers.
         positions = np.where(np.abs(positions) < FAR, positions, np.nan)
@@ -245,33 +329,60 @@ class Source:
         given = {name: (v, "given") for name, v in self._given().items() if v is not None}
         return headers | given
 
-    def _layers(self, image: ImageFile, is_cube: bool, camera: dict[str, Said]) -> Layers:
-        mask = None if self.mask is None else _find_beside(image, self.mask, "a mask")
+    def _layers(
+        self, image: ImageFile, is_cube: bool, camera: dict[str, Said]
+    ) -> tuple[Layers, list[str]]:
+        """The image with its mask and map of noise, and what is said of those of its own file."""
+        own = {} if is_cube else layers_beside(image)
+        mask, bad_bits, remarks = self._mask_and_bits(image, own.get("mask"))
+        said = [f"{_label(mask)} as mask"] if mask is not None and self.mask is None else []
+        gain, read_noise = (camera[name][0] for name in ("gain", "read noise"))
+        layers = Layers(
+            image, mask, bad_bits, least_noise=read_noise / gain if read_noise and gain else 0.0
+        )
+
+        maps = {"weight": self.weight, "variance": self.variance, "error": self.error}
+        stated = {k: v for k, v in maps.items() if v is not None and not _is_none(v)}
+        if len(stated) > 1 or (stated and is_cube):
+            raise ObservationError(
+                self.path,
+                "an image takes one map of weight, variance or error, a cube of stamps none",
+            )
+        for kind, place in stated.items():
+            noise = _find_beside(image, place, NOISE_MAPS[kind])
+            layers = _with_stated_noise(layers, noise, kind)
+        if all(value is None for value in maps.values()):
+            for kind in own.keys() & NOISE_MAPS.keys():
+                layers, problem = _with_own_noise(layers, own[kind], kind)
+                symbol = "σ" if kind == "error" else "σ²"
+                said = [problem or f"{_label(own[kind])} as {symbol}", *said]
+        if said:
+            # A bit may mark pixels that are fine; then good stars would be lost.
+            line = f"{self.path}: uses {' and '.join(said)}"
+            part = layers.masked_part() if mask is not None and self.mask is None else 0.0
+            if part > 0.2:
+                line += (
+                    f"; {100 * part:.0f} % of the pixels have a bit of {_label(own['mask'])}: "
+                    "state --bad-bits, or --mask none"
+                )
+            remarks.insert(0, line)
+        return layers, remarks
+
+    def _mask_and_bits(
+        self, image: ImageFile, own: ImageFile | None
+    ) -> tuple[ImageFile | None, int | None, list[str]]:
+        """The mask that is stated, else that of the image's file; its bad bits, and who says so."""
+        mask = own
+        if self.mask is not None:
+            mask = None if _is_none(self.mask) else _find_beside(image, self.mask, "a mask")
         if self.bad_bits is not None and mask is None:
             raise ObservationError(self.path, "bits are given, but no mask that has them")
-        gain, read_noise = (camera[name][0] for name in ("gain", "read noise"))
-        least = read_noise / gain if read_noise and gain else 0.0
-        maps = {"a weight map": self.weight, "a variance map": self.variance}
-        given = [(what, place) for what, place in maps.items() if place is not None]
-        if not given:
-            return Layers(image, mask, self.bad_bits, least_noise=least)
-        if len(given) > 1 or is_cube:
-            raise ObservationError(
-                self.path, "an image takes one map of weight or variance, a cube of stamps none"
-            )
-        what, place = given[0]
-        noise = _find_beside(image, place, what)
-        inverse = self.weight is not None
-        with open_pixels(noise, whole=True) as pixels:
-            values = pixels[:]
-        wrong, empty = (int(np.count_nonzero(some)) for some in (values < 0, values == 0))
-        if wrong or (empty and not inverse):
-            raise ObservationError(
-                noise.path,
-                f"{what} of which {wrong + (not inverse) * empty} of {values.size} pixels are not "
-                f"{'at least' if inverse else 'above'} 0; NaN is for bad pixels, or a mask",
-            )
-        return Layers(image, mask, self.bad_bits, noise, inverse, empty, least_noise=least)
+        by_header = None if mask is None else bits_of_bad_pixels(mask)
+        if mask is None or self.bad_bits is not None or by_header is None:
+            return mask, self.bad_bits, []
+        bits, planes = by_header
+        said = f"{self.path}: bad pixels by {_label(mask)}: {planes} (bits {bits})"
+        return mask, bits, [said]
 
     def _detected(self, sky: Sky, threshold: float) -> Catalogue:
         """The stars of an image."""
@@ -369,6 +480,16 @@ def list_offset(path: Path | None, off: np.ndarray, accept: bool) -> str | None:
         f"stars are off its positions by x {x:+.2f}, y {y:+.2f} px in the median, half of them "
         f"by more than {distance[0]:.2f}, {distance[1]:.2f} px either way ({len(known)} stars)"
     )
+    # A list whose pixels count from the other origin is off by one pixel along both axes.
+    x1, y1 = round(x), round(y)
+    one_px = x1 == y1 and abs(x1) == 1 and max(abs(x - x1), abs(y - y1)) < TOLERANCE_PX
+    if one_px and not accept:
+        origin = int(x1 < 0)
+        raise ObservationError(
+            path,
+            f"{said}: its positions count from {origin}? --origin {origin} says so "
+            "(--accept-offset takes it as it is)",
+        )
     if (distance > FARTHEST_OFF).any() and not accept:
         raise ObservationError(
             path,
@@ -395,10 +516,114 @@ def _find_beside(image: ImageFile, place: Any, what: str) -> ImageFile:
     else:
         found = find_image(Path(place)) if outside else find_image(image.file, place)
     wanted = image.shape
+    if len(found.shape) == 3 and found.shape[0] == 1 and len(wanted) == 2:
+        found = found.one_plane()
     if found.shape != wanted and not (len(wanted) == 3 and found.shape == wanted[1:]):
         sizes = ["×".join(str(n) for n in shape) for shape in (found.shape, wanted)]
         raise ObservationError(found.path, f"{what} of {sizes[0]} pixels, expected {sizes[1]}")
     return found
+
+
+def _is_none(place: object) -> bool:
+    """Return True for the word that takes no layer, not even that of the image's file."""
+    return isinstance(place, str) and place.strip().lower() == NO_LAYER
+
+
+def _label(layer: ImageFile) -> str:
+    """Name of an extension, else of its file."""
+    header = layer.headers[0] if layer.headers else {}
+    return str(card_value(header, "EXTNAME") or layer.path)
+
+
+def _with_stated_noise(layers: Layers, noise: ImageFile, kind: str) -> Layers:
+    """Layers with a map of noise that is stated; one whose name says another kind is refused."""
+    is_kind = map_kind(noise)
+    if is_kind in NOISE_MAPS and is_kind != kind:
+        raise ObservationError(
+            noise.path,
+            f"extension {_label(noise)} is {NOISE_MAPS[is_kind]}, not {NOISE_MAPS[kind]}: "
+            f"--{is_kind} {_label(noise)}",
+        )
+    with open_pixels(noise, whole=True) as pixels:
+        values = pixels[:]
+    wrong, empty = (int(np.count_nonzero(some)) for some in (values < 0, values == 0))
+    may_be_0 = kind != "variance"
+    if wrong or (empty and not may_be_0):
+        raise ObservationError(
+            noise.path,
+            f"{NOISE_MAPS[kind]} of which {wrong + (not may_be_0) * empty} of {values.size} pixels "
+            f"are not {'at least' if may_be_0 else 'above'} 0; NaN is for bad pixels, or a mask",
+        )
+    return replace(layers, noise=noise, kind=kind, empty=empty)
+
+
+def _with_own_noise(layers: Layers, noise: ImageFile, kind: str) -> tuple[Layers, str]:
+    """Layers with the map of noise of the image's own file, in which 0 is for bad pixels.
+
+    Without it, and with the reason, if it has values for fewer than half of the pixels.
+    """
+    with open_pixels(noise, whole=True) as pixels:
+        good = np.mean(np.nan_to_num(pixels[:], posinf=0.0) > 0)
+    if good < 0.5:
+        return layers, f"not {_label(noise)} ({100 * good:.0f} % of its pixels are above 0)"
+    return replace(layers, noise=noise, kind=kind), ""
+
+
+def _with_photons(
+    layers: Layers, camera: dict[str, Said], sky: Sky
+) -> tuple[Layers, dict[str, Said], list[str]]:
+    """Layers that know how the map of noise grows with the light of stars, and the gain by that.
+
+    Where photons make the noise, variance = variance of the sky + light/gain. A map of the sky
+    alone does not grow, and nothing changes. A gain that is known otherwise stays.
+    """
+    with layers.open(whole=True) as (_, _, noise):
+        assert noise is not None
+        sigma = layers.sigma(noise[slice(None), slice(None)])
+    good = ~sky.bad & np.isfinite(sigma)
+    variance, snr = sigma**2, sky.flat / np.where(sky.noise > 0, sky.noise, np.inf)
+    stars = good & (sky.flat > 0)
+    # Pixels of stars in which photons of the star are a large part of the variance, if any are.
+    stars &= snr >= np.quantile(snr[stars], 0.9) if stars.any() else False
+    faint = good & (np.abs(snr) < 1.0)
+    if np.count_nonzero(stars) < 50 or not faint.any():
+        return layers, camera, []
+    growth = (variance[stars] - np.median(variance[faint])) / sky.flat[stars]
+    slope = float(np.median(growth))
+    spread = 1.48 * float(np.median(np.abs(growth - slope)))
+    if not (slope > 0 and spread < 0.3 * slope):
+        return layers, camera, []
+    # σ is scaled by the measured noise of the sky, and so is the slope of its square.
+    layers = replace(layers, photons=slope / layers.noise_scale**2)
+    if camera["gain"][0] is not None:
+        return layers, camera, []
+    assert layers.noise is not None
+    name = _label(layers.noise)
+    words = f"{layers.image.path}: {name} grows with the light of the stars: gain {1 / slope:.4g}"
+    return layers, camera | {"gain": (1.0 / slope, name)}, [words]
+
+
+def listed_again(positions: np.ndarray) -> np.ndarray:
+    """Return which positions (n, 2) are nearer than `SAME_PX` to an earlier one, bool, (n,)."""
+    from scipy.spatial import cKDTree
+
+    known = np.flatnonzero(np.isfinite(positions).all(axis=1))
+    again = np.zeros(len(positions), dtype=bool)
+    pairs = cKDTree(positions[known]).query_pairs(SAME_PX, output_type="ndarray")
+    again[known[pairs.max(axis=1)]] = True
+    return again
+
+
+def _on_pairs(table: Catalogue, again: np.ndarray) -> list[str]:
+    """Return a sentence on rows of a list that are the same star as an earlier one."""
+    rows = [str(row + 1) for row in np.flatnonzero(again)]
+    if not rows:
+        return []
+    said = "row is" if len(rows) == 1 else "rows are"
+    return [
+        f"{table.path}: {len(rows)} {said} within {SAME_PX:g} px of an earlier one "
+        f"({shorten(rows)}): flagged BLENDED, and not learnt from"
+    ]
 
 
 @dataclass(frozen=True)
@@ -408,10 +633,11 @@ class Layers:
     image: ImageFile
     mask: ImageFile | None = None
     bad_bits: int | None = None
-    noise: ImageFile | None = None  # weight or variance
-    inverse: bool = False  # weight
+    noise: ImageFile | None = None
+    kind: str = "variance"  # of the map of noise: "weight", "variance" or "error"
     empty: int = 0  # pixels of the weight 0, which are bad
     noise_scale: float = 1.0  # of σ by this map
+    photons: float = 0.0  # variance by this map for a unit of light above the sky
     least_noise: float = 0.0  # counts; the read noise
 
     @contextmanager
@@ -435,12 +661,26 @@ class Layers:
         with np.errstate(invalid="ignore"):  # what is beyond any number has no bits
             return np.asarray((np.nan_to_num(values, nan=-1).astype(np.int64) & self.bad_bits) != 0)
 
-    def sigma(self, values: np.ndarray) -> np.ndarray:
-        """σ of pixels by the map, NaN where it has none."""
+    def sigma(self, values: np.ndarray, light: np.ndarray | float = 0.0) -> np.ndarray:
+        """σ of the sky in pixels by the map, NaN where it has none.
+
+        The photons of stars, `light` above the sky, are taken out of a map that has them.
+        """
         with np.errstate(all="ignore"):
-            variance = 1.0 / values if self.inverse else values
+            if self.kind == "weight":
+                variance = 1.0 / values
+            else:
+                variance = values**2 if self.kind == "error" else values
             known = np.isfinite(variance) & (variance > 0)
+            # Light is noisy, too; at least a hundredth of the variance is of the sky.
+            variance = np.clip(variance - self.photons * light, 0.01 * variance, 2.0 * variance)
         return self.noise_scale * np.sqrt(np.where(known, variance, np.nan))
+
+    def masked_part(self) -> float:
+        """Part of the pixels that the mask calls bad."""
+        everything = (slice(None), slice(None))
+        with self.open(whole=True) as (_, mask, _):
+            return 0.0 if mask is None else float(np.mean(self.bad(mask[everything])))
 
     def sky(self) -> Sky:
         """The image as a whole with its sky."""
@@ -452,14 +692,22 @@ class Layers:
             if mask is not None:
                 bad |= self.bad(mask[everything])
             if noise is not None:
-                sigma = self.sigma(noise[everything])
+                sigma = replace(self, photons=0.0).sigma(noise[everything])
                 bad |= np.isnan(sigma)
         with silent():
             try:
-                return sky_of(image, bad, sigma, self.least_noise)
+                sky = sky_of(image, bad, sigma, self.least_noise)
             except ValueError:  # nothing to measure the sky on
                 problem = "too few pixels of the image have a value that is not masked"
+                if self.mask is not None and self.bad_bits is None:
+                    problem += "; --bad-bits says which bits are bad, --mask none takes no mask"
                 raise ObservationError(self.image.path, problem) from None
+        if sigma is None or not self.photons:
+            return sky
+        with self.open(whole=True) as (_, _, noise):
+            assert noise is not None
+            own = self.sigma(noise[everything], sky.flat)
+        return replace(sky, noise=sky.noise_scale * own)
 
 
 @dataclass(frozen=True)
@@ -477,6 +725,7 @@ class Observation:
     catalogue: Path | None  # the star list
     found: Catalogue | None  # that made in its place
     colour_column: str | None  # of the star list
+    remarks: tuple[str, ...]  # sentences on what was found in the file or the list, and used or not
     _columns: list[np.ndarray] = field(repr=False)  # identifiers, flux, sky, colour and flags
     _layers: Layers = field(repr=False)
     # Light of other stars in the stamps of a part of the list, of a side and with a margin in px.
@@ -536,9 +785,9 @@ class Observation:
         words = []
         for (name, (value, origin)), unit in zip(self.camera.items(), units, strict=True):
             words.append(f"{name} {origin if value is None else f'{value:.6g} {unit} ({origin})'}")
-        said = f"{self.path}: {', '.join(words)}"
+        said = "\n".join([f"{self.path}: {', '.join(words)}", *self.remarks])
         if (empty := self._layers.empty) and (noise := self._layers.noise) is not None:
-            said += f"\n{noise.path}: weight 0, bad pixels: {empty}"
+            said += f"\n{noise.path}: {self._layers.kind} 0, bad pixels: {empty}"
         lost = self.without_position()
         if lost.any():
             rows = shorten([str(row + 1) for row in np.flatnonzero(lost)])
@@ -551,23 +800,30 @@ class Observation:
             return np.zeros(self.count, dtype=bool)
         return np.asarray(~np.isfinite(self.positions).all(axis=1))
 
+    def listed_again(self) -> np.ndarray:
+        """Which stars of a list are the same as an earlier one, bool, shape (n,)."""
+        if self.positions is None or self.found is not None or self.shape is None:
+            return np.zeros(self.count, dtype=bool)
+        return listed_again(self.positions)
+
+    def of(self, selected: np.ndarray) -> Observation:
+        """The same with some of the stars of the list, by a bool for each, shape (n,)."""
+        assert self.positions is not None
+        return replace(
+            self,
+            count=int(selected.sum()),
+            positions=self.positions[selected],
+            _columns=[column[selected] for column in self._columns],
+        )
+
     def check_list(self) -> None:
-        """Refuse a star list of another image, and one with a star twice.
+        """Refuse a star list of another image.
 
         At least half of its positions must be on a source.
         """
-        from scipy.spatial import cKDTree
-
         if self.shape is None or self.catalogue is None or self.positions is None:
             return
         known = np.flatnonzero(np.isfinite(self.positions).all(axis=1))
-        pairs = cKDTree(self.positions[known]).query_pairs(SAME_PX, output_type="ndarray")
-        if len(pairs):
-            one, other = known[pairs[np.lexsort(pairs.T[::-1])[0]]] + 1
-            raise ObservationError(
-                self.catalogue,
-                f"rows {one} and {other} are the same star; {len(pairs)} such pairs in all",
-            )
         sky = self._layers.sky()
         with silent():
             column, row = central_pixel(self.positions.T)
@@ -625,6 +881,7 @@ class Observation:
         wide = max(self.margin, RING_PX)
         where = (self.shape, x, y, self.stamp_px, wide)
         data, inside, truncated = cut_image(pixels, *where)
+        pixels_of_stars = data
         if self.others is not None:
             full = np.inf if self.saturate is None else self.saturate
             left = data - self.others(part, self.stamp_px, wide)
@@ -634,7 +891,11 @@ class Observation:
             masked |= self._layers.bad(cut_image(mask, *where)[0])
         own = slice(wide - self.margin, wide + self.stamp_px + self.margin)
         if noise is not None:
-            sigma = self._layers.sigma(cut_image(noise, *where)[0])
+            light: np.ndarray | float = 0.0
+            if self._layers.photons:
+                level, _ = sky_around(pixels_of_stars, masked, self.stamp_px)
+                light = pixels_of_stars - level[:, None, None]
+            sigma = self._layers.sigma(cut_image(noise, *where)[0], light)
             masked |= np.isnan(sigma)
             each = np.ma.array(sigma, mask=masked)[:, own, own]
             level = np.ma.median(each, axis=(1, 2)).filled(np.nan).astype(float)

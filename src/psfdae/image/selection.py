@@ -139,7 +139,9 @@ def collect(
         flat = found["highest"] >= piled_up(found["brightest"], found["sky"], snr * noise)
         verdict[flat & (verdict == Verdict.GOOD)] = Verdict.SATURATED
     near = settings.isolation_px if isolation_px is None else isolation_px
-    close = crowded(found["position"], snr * noise, near, settings.neighbour_ratio)
+    # A star that is listed twice is no neighbour of itself.
+    apart = np.where(observation.listed_again()[:, None], np.nan, found["position"])
+    close = crowded(apart, snr * noise, near, settings.neighbour_ratio)
     verdict[close & (verdict == Verdict.GOOD)] = Verdict.CROWDED
     verdict[observation.without_position()] = Verdict.NO_POSITION
     wide, peak, listed, colour = (np.concatenate([k[i] for k in kept]) for i in range(4))

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from psfdae.bright_stars import BrightStars
-from psfdae.image.observation import Observation, Source
+from psfdae.image.observation import Observation, Source, list_offset
 from psfdae.image.selection import collect
 from psfdae.methods.field import FieldMixture
 from psfdae.model.bundle import creation_date
@@ -76,8 +76,12 @@ def exposure(model: PsfModel, source: Source, name: str) -> tuple[PsfModel, str]
     if not np.isfinite(bright.position).all():
         raise PredictionError(f"{observation.path}: positions of bright stars are not known")
     said = f"{len(bright)} stars of {observation.path.name} change the field of {model.name}"
+    off = list_offset(
+        observation.catalogue, (bright.centre - bright.listed)[:, ::-1], source.accept_offset
+    )
     made = _adapted(model, field, observation, bright, name)
-    return made, f"{said} ({other})" if other else said
+    said = f"{said} ({other})" if other else said
+    return made, "\n".join([*observation.remarks, *filter(None, [off]), said])
 
 
 def for_exposures(model: PsfModel, stars: Stars) -> dict[str, PsfModel]:

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 
 from psfdae.bright_stars import magnitude
 from psfdae.bundle_info import BundleInfo
+from psfdae.image.containers import parts_of_array, sigma_of
 from psfdae.image.observation import Observation, other_instruments
 from psfdae.image.stamps import (
     Stamps,
@@ -161,8 +162,9 @@ class PsfModel(FieldPsfs):
 
         Parameters
         ----------
-        stamps : array, shape (n, s, s) or (s, s)
-            s = `info.stamp_px` + 2 `margin`; in any unit, sky included, the star's
+        stamps : array, masked array, Quantity or NDData, shape (n, s, s) or (s, s)
+            Masked pixels are bad; an NDData's σ, its median in a stamp, is the noise that is not
+            given. s = `info.stamp_px` + 2 `margin`; in any unit, sky included, the star's
             brightest pixel about [s/2, s/2] (0-based), pixels of the scale
             `info.pixel_scale_arcsec`.
         flux, background, noise : float or array, shape (n,), optional
@@ -198,9 +200,15 @@ class PsfModel(FieldPsfs):
         PredictionError
             If shapes or types do not fit.
         """
+        values, masked, sigma, unit = _unpacked(stamps)
+        if noise is None and sigma is not None:
+            noise = np.nanmedian(sigma, axis=(-2, -1))
         given = {"flux": flux, "background": background, "noise": noise, "gain": gain}
+        given = {name: _without_unit(name, value, unit) for name, value in given.items()}
+        if masked is not None:
+            bad = masked if bad is None else masked | np.asarray(bad, dtype=bool)
         masks = {"bad": bad, "saturated": saturated}
-        stars = self._stamps(stamps, margin, given, masks, position, centre)
+        stars = self._stamps(values, margin, given, masks, position, centre)
         blocks = self.engine.blocks(stars)
         with one_thread_each():
             threads = min(threads or available_cores(), max(len(blocks), 1))
@@ -360,6 +368,38 @@ class PsfModel(FieldPsfs):
                 f"{self.info.name!r} was trained on {trained:.6g} arcsec{assumed} "
                 f"(tolerance {100 * SCALE_TOLERANCE:g} %){other}"
             )
+
+
+def _unpacked(
+    stamps: Any,
+) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None, str]:
+    """Numbers, mask, σ and unit of stamps in any container; None, None and "" without them."""
+    if hasattr(stamps, "uncertainty") and hasattr(stamps, "mask"):  # an NDData
+        mask = stamps.mask if stamps.mask is None else np.asarray(stamps.mask, dtype=bool)
+        unit = "" if stamps.unit is None else str(stamps.unit)
+        return np.asarray(stamps.data), mask, sigma_of(stamps), unit
+    if hasattr(stamps, "fileinfo"):  # an HDU, or a list of them
+        raise PredictionError(
+            f"{type(stamps).__name__} in place of stamps: its array is its attribute data; "
+            "psfdae.Stars.from_image takes images in FITS files"
+        )
+    values, mask, unit = parts_of_array(stamps)
+    return values, mask, None, unit
+
+
+def _without_unit(name: str, value: Any, unit: str) -> Any:
+    """A quantity as numbers of the unit of the stamps, of electrons per that of a gain."""
+    if not hasattr(value, "to_value"):
+        return value
+    wanted = unit or "ct"
+    if name == "gain":
+        wanted = f"electron / ({wanted})"
+    try:
+        return value.to_value(wanted)
+    except (ValueError, TypeError):
+        raise PredictionError(
+            f"{name} in {value.unit}, but that of the stamps is {wanted or 'none'}"
+        ) from None
 
 
 def _mask(name: str, mask: ArrayLike | None, data: np.ndarray, single: bool) -> np.ndarray:

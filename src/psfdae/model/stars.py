@@ -13,6 +13,7 @@ import numpy as np
 
 from psfdae.bright_stars import BrightStars
 from psfdae.files import Column, Product
+from psfdae.image.containers import as_images
 from psfdae.image.errors import ObservationError, no_formula
 from psfdae.image.observation import (
     ASSUMED_SCALE,
@@ -21,7 +22,13 @@ from psfdae.image.observation import (
     list_offset,
     other_instruments,
 )
-from psfdae.image.selection import Candidates, Verdict, advice, collect
+from psfdae.image.selection import (
+    CalibrationStarsError,
+    Candidates,
+    Verdict,
+    advice,
+    collect,
+)
 from psfdae.image.training_images import single_psf, star_grid, training_columns
 from psfdae.model.psf_model import SCALE_TOLERANCE
 from psfdae.model.settings import IMAGE_GROUPS, Settings, settings_model, with_keywords
@@ -31,8 +38,10 @@ from psfdae.splits import held_out_fields
 
 if TYPE_CHECKING:
     from astropy.table import Table
+    from astropy.units import Quantity
 
     from psfdae.image.catalogue import StarList
+    from psfdae.image.containers import Image
     from psfdae.model.wings import Wings
 
 SPLIT, REFERENCE = "held_out", "realisation"
@@ -95,7 +104,7 @@ class Stars:
     @classmethod
     def from_image(
         cls,
-        image: str | Path | np.ndarray | Sequence[str | Path],
+        image: Image | Sequence[Image],
         catalogue: StarList | None = None,
         *,
         detect: bool | float = False,
@@ -105,10 +114,11 @@ class Stars:
         bad_bits: int | None = None,
         weight: str | int | Path | np.ndarray | None = None,
         variance: str | int | Path | np.ndarray | None = None,
-        pixel_scale_arcsec: float | None = None,
-        gain: float | None = None,
-        read_noise: float | None = None,
-        saturate: float | None = None,
+        error: str | int | Path | np.ndarray | None = None,
+        pixel_scale_arcsec: float | Quantity | None = None,
+        gain: float | Quantity | None = None,
+        read_noise: float | Quantity | None = None,
+        saturate: float | Quantity | None = None,
         colour_column: str | None = None,
         accept_offset: bool = False,
         **settings: object,
@@ -117,10 +127,11 @@ class Stars:
 
         Parameters
         ----------
-        image : path-like, array of shape (h, w) or (n, s, s), or several paths
+        image : path-like, array of shape (h, w) or (n, s, s), NDData, HDU, or several of these
             FITS image, or cube of stamps; or images that are exposures of one camera, of which all
-            that follows is stated alike.
-        catalogue : path-like, table, or array of shape (n, 2), optional
+            that follows is stated alike. Mask, uncertainty, unit, WCS and meta of CCDData and
+            NDData are used, and the mask of a masked array; an HDUList is read as a file is.
+        catalogue : path-like, table, SkyCoord, array of shape (n, 2), or n pairs, optional
             Star list: a file, a table with its columns, or positions (x, y), 0-based; of several
             images, one with sky coordinates.
         detect : bool or float
@@ -129,11 +140,12 @@ class Stars:
             With the stars, if the file has several.
         origin : 0 or 1, optional
             Index of the first pixel's centre in the list, where its columns do not say it.
-        mask, weight, variance : extension, path or array as large as the image, optional
+        mask, weight, variance, error : extension, path or array as large as the image, optional
             Bad pixels are other than 0, or those with one of `bad_bits`; 1/σ² but for a factor;
-            σ² of the pixels.
+            σ² of the pixels; σ. Of a file with extensions DQ and ERR, these by default; "none"
+            takes neither.
         bad_bits : int, optional
-        pixel_scale_arcsec, gain, read_noise, saturate : float, optional
+        pixel_scale_arcsec, gain, read_noise, saturate : float or Quantity, optional
             Arcseconds per pixel, electrons per count, electrons, counts; instead of the header's.
         colour_column : str, optional
             Of the star list, such as g − r; the PSF may change with it.
@@ -149,11 +161,7 @@ class Stars:
             If the image or the list cannot be used, or too few stars are bright enough.
         """
         threshold = DETECTED_SIGMA if detect is True else detect or None
-        images: list[Path | np.ndarray]
-        if isinstance(image, str | Path | np.ndarray):
-            images = [image if isinstance(image, np.ndarray) else Path(image)]
-        else:
-            images = [Path(one) for one in image]
+        images = as_images(image)
         if not images:
             raise ObservationError("image", "no image, expected at least one")
         source = Source(
@@ -166,6 +174,7 @@ class Stars:
             bad_bits=bad_bits,
             weight=weight,
             variance=variance,
+            error=error,
             pixel_scale_arcsec=pixel_scale_arcsec,
             gain=gain,
             read_noise=read_noise,
@@ -240,7 +249,11 @@ class Stars:
         framing, wanted = settings.framing, settings.calibration_stars
         if least is not None:
             wanted = wanted.model_copy(update={"stars_min": least})
-        found = collect(observation, wanted, framing, isolation_px)
+        try:
+            found = collect(observation, wanted, framing, isolation_px)
+        except CalibrationStarsError as error:
+            # A mask or a header value that was used or not may be why.
+            raise CalibrationStarsError("; ".join([str(error), *observation.remarks])) from None
         bright = found.bright
         off = list_offset(
             observation.catalogue, (bright.centre - bright.listed)[:, ::-1], source.accept_offset

@@ -1,0 +1,197 @@
+"""Images as Python hands them over: HDU, HDUList, CCDData, NDData, masked arrays, quantities.
+
+Each becomes a FITS file in a temporary place, with its mask as extension DQ and its uncertainty as
+ERR (σ), so that it is read as a file is. Plain arrays stay arrays.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+
+from psfdae.image.errors import ObservationError, reading
+from psfdae.image.fits_file import PlainFile, temporary_file
+
+if TYPE_CHECKING:
+    from astropy.io import fits
+    from astropy.nddata import NDData
+    from astropy.units import Quantity
+    from astropy.wcs import WCS
+
+    Image: TypeAlias = (
+        str | Path | np.ndarray | NDData | fits.HDUList | fits.PrimaryHDU | fits.ImageHDU
+    )
+
+
+def as_images(images: Any) -> list[Path | PlainFile | np.ndarray]:
+    """Return what is read for an image, or for each of several; see `as_image`."""
+    from astropy.io.fits import HDUList
+
+    # An HDUList is a list of the parts of one image, and an array could be iterated over.
+    iterable = hasattr(images, "__iter__") and not isinstance(images, str | HDUList | np.ndarray)
+    return [as_image(one) for one in images] if iterable else [as_image(images)]
+
+
+def as_image(image: Any) -> Path | PlainFile | np.ndarray:
+    """Return what is read for an image: a path, an array of plain numbers, or a FITS file.
+
+    Parameters
+    ----------
+    image : path-like, array, masked array, Quantity, NDData, HDU, or HDUList
+
+    Raises
+    ------
+    ObservationError
+        If it is none of these, or cannot be written as FITS.
+    """
+    from astropy.io import fits
+    from astropy.nddata import NDData
+
+    if isinstance(image, str | Path | PlainFile):
+        return Path(image) if isinstance(image, str) else image
+    name = Path(type(image).__name__)
+    if isinstance(image, np.ndarray):
+        data, mask, unit = parts_of_array(image)
+        if mask is None and not unit:
+            return data
+        header = fits.Header({"BUNIT": unit} if unit else {})
+        return _written(name, lambda: _hdus(data, header, mask, None))
+    if isinstance(image, fits.HDUList):
+        return _written(Path(image.filename() or name), lambda: image)
+    if isinstance(image, fits.PrimaryHDU | fits.ImageHDU | fits.CompImageHDU):
+        first = [] if isinstance(image, fits.PrimaryHDU) else [fits.PrimaryHDU()]
+        return _written(name, lambda: fits.HDUList([*first, image.copy()]))
+    if not isinstance(image, NDData):
+        raise ObservationError(
+            name, "no image; expected a path, array, NDData, CCDData, HDU or HDUList"
+        )
+    return _written(name, lambda: _of_nddata(image))
+
+
+def parts_of_array(values: Any) -> tuple[np.ndarray, np.ndarray | None, str]:
+    """Return numbers, mask (None without one) and unit ("" without one) of an array of any kind.
+
+    Masked arrays of numpy, and quantities of astropy, also masked ones.
+    """
+    if isinstance(values, np.ma.MaskedArray):
+        return np.asarray(values.data), np.ma.getmaskarray(values), ""
+    unit = getattr(values, "unit", None)
+    mask = getattr(values, "mask", None)
+    plain = getattr(values, "unmasked", values)  # of astropy's Masked
+    array = np.asarray(plain if unit is None else plain.value)
+    return array, None if mask is None else np.asarray(mask, bool), _fits_unit(unit)
+
+
+def sigma_of(data: NDData) -> np.ndarray | None:
+    """Return σ of the pixels, in the unit of the data; None without an uncertainty."""
+    from astropy.nddata import StdDevUncertainty
+
+    if data.uncertainty is None:
+        return None
+    sigma = data.uncertainty.represent_as(StdDevUncertainty)
+    values = sigma.array
+    if sigma.unit is not None and data.unit is not None and sigma.unit != data.unit:
+        values = (values * sigma.unit).to_value(data.unit)
+    return np.asarray(values)
+
+
+def in_unit(value: float | Quantity | None, units: str, name: str, path: Path) -> float | None:
+    """Return a quantity as a number of the first of some units; plain numbers stay.
+
+    Parameters
+    ----------
+    value : float, Quantity or None
+    units : str
+        Names of astropy, separated by blanks; the others mean the same as the first, such as
+        counts, adu and DN.
+    name : str
+        What the value is, for the message.
+    path : Path
+        The image, for the message.
+
+    Raises
+    ------
+    ObservationError
+        If it has another unit, or more than one value.
+    """
+    from astropy import units as u
+
+    if not isinstance(value, u.Quantity):
+        return value
+    for unit in units.split():
+        try:
+            return float(value.to_value(u.Unit(unit)))
+        except (u.UnitConversionError, TypeError):
+            continue
+    wanted = " or ".join(units.split())
+    raise ObservationError(path, f"{name} {value}, expected a number of {wanted}")
+
+
+def _of_nddata(data: NDData) -> fits.HDUList:
+    """Return image, mask and σ of an NDData as FITS, with its meta as header, unit and WCS."""
+    from astropy.io import fits
+
+    header = fits.Header()
+    for key, value in data.meta.items():
+        # Meta may hold anything; what is no card of FITS is left out.
+        if isinstance(value, str | int | float | bool) and not str(key).startswith("NAXIS"):
+            try:
+                header[str(key)] = value
+            except ValueError:
+                continue
+    if unit := _fits_unit(data.unit):
+        header["BUNIT"] = unit
+    hdus = _hdus(np.asarray(data.data), header, data.mask, sigma_of(data))
+    wcs = None if data.wcs is None else _fits_wcs(data.wcs)
+    if wcs is not None:
+        first, *tables = wcs.to_fits(relax=True)
+        hdus[0].header.update(first.header)
+        hdus += tables
+    return hdus
+
+
+def _fits_wcs(wcs: Any) -> WCS | None:
+    """Return the WCS of FITS that an NDData holds, None if it is of another kind."""
+    from astropy.wcs import WCS
+
+    low_level = getattr(wcs, "low_level_wcs", wcs)
+    return low_level if isinstance(low_level, WCS) else None
+
+
+def _fits_unit(unit: Any) -> str:
+    """Return a unit as FITS writes it; its own name if FITS knows none."""
+    if unit is None:
+        return ""
+    try:
+        return str(unit.to_string("fits"))
+    except ValueError:
+        return str(unit)
+
+
+def _hdus(
+    data: np.ndarray, header: fits.Header, mask: np.ndarray | None, sigma: np.ndarray | None
+) -> fits.HDUList:
+    """Return an image with its mask as DQ and σ as ERR."""
+    from astropy.io import fits
+
+    # FITS has no half precision and no truth values.
+    narrow = data.dtype.kind == "b" or data.dtype == np.float16
+    hdus = fits.HDUList([fits.PrimaryHDU(data.astype(np.float32) if narrow else data, header)])
+    if mask is not None:
+        bits = np.broadcast_to(np.asarray(mask), data.shape)
+        bits = bits.astype(np.uint8) if bits.dtype.kind == "b" else np.array(bits)
+        hdus.append(fits.ImageHDU(bits, name="DQ"))
+    if sigma is not None:
+        hdus.append(fits.ImageHDU(np.broadcast_to(sigma, data.shape).copy(), name="ERR"))
+    return hdus
+
+
+def _written(name: Path, hdus: Callable[[], fits.HDUList]) -> PlainFile:
+    content = io.BytesIO()
+    with reading(name):
+        hdus().writeto(content, output_verify="silentfix+ignore")
+    return temporary_file(name, content.getvalue())

@@ -1,0 +1,42 @@
+"""A field of 70 Gaussian stars on 300 × 300 pixels, with photon noise, for tests of its input."""
+
+from __future__ import annotations
+
+import numpy as np
+from astropy.io import fits
+from astropy.table import Table
+
+SIZE, COUNT, GAIN, READ, SKY = 300, 70, 1.5, 5.0, 300.0
+CAMERA = {"gain": GAIN, "read_noise": READ, "pixel_scale_arcsec": 0.6, "saturate": 6e4}
+
+
+def field(seed=3):
+    """Counts (300, 300), float32, and positions (70, 2), x and y from 0."""
+    rng = np.random.default_rng(seed)
+    # A star in the middle third of each cell of a grid, so that none has a close neighbour.
+    cell = np.stack(np.meshgrid(np.arange(10), np.arange(7)), axis=-1).reshape(-1, 2)
+    place = (cell + rng.uniform(0.33, 0.67, (COUNT, 2))) * [30.0, 42.0]
+    flux = 10 ** rng.uniform(4.0, 5.0, COUNT)
+    y, x = np.indices((SIZE, SIZE))
+    image = np.full((SIZE, SIZE), SKY)
+    for (x0, y0), f in zip(place, flux, strict=True):
+        image += f * np.exp(-((x - x0) ** 2 + (y - y0) ** 2) / (2 * 1.3**2)) / (2 * np.pi * 1.3**2)
+    noisy = rng.poisson(image * GAIN) / GAIN + rng.normal(0, READ / GAIN, image.shape)
+    return noisy.astype(np.float32), place
+
+
+def header(**cards):
+    """Cards of the camera, and others."""
+    camera = {"GAIN": GAIN, "RDNOISE": READ, "SATURATE": 6e4, "PIXSCALE": 0.6}
+    return fits.Header({**camera, **cards}.items())
+
+
+def write(path, image, **cards):
+    """An image with the camera's header."""
+    fits.writeto(path, image, header(**cards), overwrite=True)
+    return path
+
+
+def table(place, origin=0, names=("x", "y")):
+    """A list of positions that count from an origin."""
+    return Table(list((place + origin).T), names=names)

@@ -1,0 +1,314 @@
+"""Images in any container, layers of pipelines' files, and headers that contradict the pixels."""
+
+from __future__ import annotations
+
+import pickle
+
+import numpy as np
+import pytest
+from astropy import units as u
+from astropy.io import fits
+from astropy.nddata import (
+    CCDData,
+    InverseVariance,
+    NDData,
+    StdDevUncertainty,
+    VarianceUncertainty,
+)
+from astropy.utils.masked import Masked
+from astropy.wcs import WCS
+
+from command_line import refused
+from psfdae import Error, PsfModel, Stars
+from psfdae.image.fits_file import science_images
+from psfdae.image.observation import Source
+from small_field import CAMERA, GAIN, READ, SIZE, SKY, field, header, write
+
+
+@pytest.fixture(scope="module")
+def image():
+    return field()[0]
+
+
+@pytest.fixture(scope="module")
+def place():
+    return field()[1]
+
+
+@pytest.fixture(scope="module")
+def bad():
+    mask = np.zeros((SIZE, SIZE), dtype=bool)
+    mask[:, :60] = True
+    return mask
+
+
+def verdicts(image, place, **stated):
+    return Stars.from_image(image, catalogue=place, **stated).candidates.verdict.tolist()
+
+
+CONTAINERS = {
+    "masked array": np.ma.MaskedArray,
+    "masked quantity": lambda image, bad: Masked(image * u.adu, bad),
+    "NDData": lambda image, bad: NDData(image, mask=bad),
+    "CCDData": lambda image, bad: CCDData(image, unit="adu", mask=bad),
+    "HDUList": lambda image, bad: fits.HDUList(
+        [fits.PrimaryHDU(image), fits.ImageHDU(bad.astype(np.uint8), name="MASK")]
+    ),
+    "LSST": lambda image, bad: fits.HDUList(
+        [
+            fits.PrimaryHDU(),
+            fits.ImageHDU(image, name="IMAGE"),
+            # Bit 5 marks the pixels of sources, and is no fault.
+            fits.ImageHDU(
+                2 * bad.astype(np.int32) + 32 * (image > 500),
+                fits.Header({"MP_SAT": 1, "MP_DETECTED": 5}.items()),
+                name="MASK",
+            ),
+        ]
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CONTAINERS)
+def test_the_mask_of_a_container_is_that_of_the_keyword(image, place, bad, name):
+    expected = verdicts(image, place, mask=bad, **CAMERA)
+    assert 0 < expected.count("incomplete") < len(expected) / 2
+    assert verdicts(CONTAINERS[name](image, bad), place, **CAMERA) == expected
+
+
+@pytest.mark.parametrize("kind", [fits.PrimaryHDU, fits.ImageHDU, fits.CompImageHDU])
+def test_an_hdu_is_read_with_its_header(image, place, kind):
+    stars = Stars.from_image(kind(image, header()), catalogue=place)
+    assert stars.observation.gain == GAIN
+    assert verdicts(image, place, **CAMERA) == stars.candidates.verdict.tolist()
+
+
+def test_an_hdulist_of_a_file_has_its_name_and_the_same_stars(tmp_path, image, place):
+    path = write(tmp_path / "night.fits", image)
+    from_file = Stars.from_image(path, catalogue=place)
+    with fits.open(path) as hdus:
+        from_list = Stars.from_image(hdus, catalogue=place)
+    assert from_list.name == "night" and from_list.described() == from_file.described()
+    again = pickle.loads(pickle.dumps(from_list.source))
+    assert again.open(16).sha256() == from_file.observation.sha256()
+
+
+@pytest.mark.parametrize("kind", [StdDevUncertainty, VarianceUncertainty, InverseVariance])
+def test_uncertainty_unit_meta_and_wcs_of_nddata_are_used(image, place, kind):
+    sigma = np.full(image.shape, np.sqrt(SKY / GAIN + (READ / GAIN) ** 2))
+    wcs = WCS(naxis=2)
+    wcs.wcs.ctype, wcs.wcs.cdelt = ["RA---TAN", "DEC--TAN"], [-0.5 / 3600, 0.5 / 3600]
+    wcs.wcs.crpix, wcs.wcs.crval = [150, 150], [10.0, 20.0]
+    data = NDData(
+        image,
+        uncertainty=StdDevUncertainty(sigma).represent_as(kind),
+        unit=u.adu,
+        wcs=wcs,
+        meta={"EGAIN": GAIN, "history": ["of", "no", "use"], "TELESCOP": "T1"},
+    )
+    ra, dec = wcs.all_pix2world(*place.T, 0)
+    observation = Stars.from_image(data, catalogue={"ra": ra, "dec": dec}).observation
+    assert observation.gain == GAIN and observation.instrument == {"TELESCOP": "T1"}
+    assert observation.pixel_scale_arcsec == pytest.approx(0.5)
+    np.testing.assert_allclose(observation.positions, place, atol=1e-6)
+    (chunk,) = observation.chunks(100)
+    # One σ for all, as the map has it, not those of stamps, which differ.
+    assert np.ptp(chunk.noise) < 1e-6 * chunk.noise[0]
+    assert chunk.noise[0] == pytest.approx(sigma[0, 0], rel=0.02)
+    assert "uses ERR as σ" in observation.said()
+
+
+def test_what_is_no_image_is_refused(place):
+    for image in (3.0, {"data": 1}, fits.BinTableHDU(), np.ma.MaskedArray(["a"], [True])):
+        with pytest.raises(Error):
+            Stars.from_image(image, catalogue=place)
+
+
+def test_quantities_are_converted_and_other_units_refused(tmp_path, image, place):
+    path = write(tmp_path / "a.fits", image)
+    stated = {
+        "gain": 1.6 * u.electron / u.ct,
+        "read_noise": 4 * u.electron,
+        "saturate": 5e4 * u.adu,
+        "pixel_scale_arcsec": 0.01 * u.arcmin / u.pix,
+    }
+    camera = Stars.from_image(path, catalogue=place, **stated).observation.camera
+    values = [camera[name][0] for name in ("gain", "read noise", "saturation", "pixel scale")]
+    np.testing.assert_allclose(values, [1.6, 4.0, 5e4, 0.6])
+    for name, wrong in (("gain", u.m), ("read_noise", u.adu), ("saturate", u.s)):
+        with pytest.raises(Error, match=name):
+            Stars.from_image(path, catalogue=place, **{name: 2.0 * wrong})
+
+
+def test_predict_uses_mask_sigma_and_unit_of_its_stamps(small_model, image):
+    stamps = image[None, 60:76, 60:76].repeat(3, axis=0)
+    bad = np.zeros(stamps.shape, bool)
+    bad[1, 4, 4] = True
+    expected = small_model.predict(stamps, bad=bad, noise=15.0, gain=GAIN)
+    masked = small_model.predict(np.ma.MaskedArray(stamps, bad), noise=15.0, gain=GAIN)
+    sigma = StdDevUncertainty(np.full(stamps.shape, 15.0))
+    data = NDData(stamps, mask=bad, uncertainty=sigma, unit=u.adu)
+    of_data = small_model.predict(data, gain=GAIN * u.electron / u.adu)
+    for found in (masked, of_data):
+        np.testing.assert_array_equal(found.flags, expected.flags)
+        np.testing.assert_array_equal(found.flux, expected.flux)
+    quantity = small_model.predict(stamps * u.ct)
+    np.testing.assert_array_equal(quantity.flux, small_model.predict(stamps).flux)
+    for wrong in ({"stamps": fits.PrimaryHDU(stamps)}, {"stamps": stamps, "noise": 3 * u.m}):
+        with pytest.raises(Error):
+            small_model.predict(**wrong)
+
+
+@pytest.fixture(scope="module")
+def small_model(image, place) -> PsfModel:
+    from psfdae import fit
+
+    return fit(Stars.from_image(image, catalogue=place, **CAMERA), "field")
+
+
+# Layers of pipelines' files.
+
+
+def pipeline_file(path, image, quality, **more):
+    """SCI in MJy/sr without its sky, ERR with the stars' photons, DQ, and other layers."""
+    scale = 1e-3
+    error = np.sqrt(np.clip(image, 1, None) / GAIN + (READ / GAIN) ** 2) * scale
+    science = ((image - SKY) * scale).astype(np.float32)
+    layers = {
+        "SCI": science,
+        "ERR": error.astype(np.float32),
+        "DQ": quality.astype(np.uint32),
+        "AREA": np.ones_like(science),
+        "VAR_POISSON": science**2,
+        "WHT": np.ones_like(science),
+        **more,
+    }
+    hdus = [fits.ImageHDU(values, name=name) for name, values in layers.items()]
+    hdus[0].header["BUNIT"] = "MJy/sr"
+    fits.HDUList([fits.PrimaryHDU(), *hdus]).writeto(path, overwrite=True)
+    return path
+
+
+def test_err_and_dq_of_the_file_are_used_and_said(tmp_path, image, place, bad):
+    path = pipeline_file(tmp_path / "cal.fits", image, bad)
+    stars = Stars.from_image(path, catalogue=place)
+    assert verdicts(image, place, mask=bad, **CAMERA) == stars.candidates.verdict.tolist()
+    notes = "\n".join(stars.notes)
+    assert "uses ERR as σ and DQ as mask" in notes and "--bad-bits" not in notes.split("gain")[0]
+    # Electrons per MJy/sr from the growth of ERR with the light of the stars.
+    assert stars.observation.gain == pytest.approx(GAIN / 1e-3, rel=0.1)
+    sigma = 1e-3 * np.sqrt(SKY / GAIN + (READ / GAIN) ** 2)
+    good = stars.candidates.verdict == "good"
+    np.testing.assert_allclose(stars.candidates.noise[good], sigma, rtol=0.05)
+    assert ("BUNIT", "MJy/sr") in [card[:2] for card in stars.observation.header_cards]
+    plain = Stars.from_image(path, catalogue=place, mask="none", error="none")
+    assert plain.candidates.verdict.tolist() == verdicts(image, place, **CAMERA)
+
+
+def test_many_masked_pixels_are_said_with_the_option_that_helps(tmp_path, image, place, bad):
+    harmless = 4 * (np.arange(bad.size).reshape(bad.shape) % 3 == 0)
+    path = pipeline_file(tmp_path / "cal.fits", image, bad + harmless)
+    with pytest.raises(Error, match=r"47 % of the pixels have a bit of DQ: state --bad-bits"):
+        Stars.from_image(path, catalogue=place)
+    found = verdicts(path, place, bad_bits=1)
+    assert found == verdicts(image, place, mask=bad, **CAMERA)
+    jwst = fits.open(path)
+    jwst[0].header["TELESCOP"] = "JWST"  # whose bit 1 is DO_NOT_USE
+    assert verdicts(jwst, place) == found
+
+
+def test_sigma_is_no_variance_and_other_layers_are_no_science(tmp_path, image, place, bad):
+    path = pipeline_file(tmp_path / "cal.fits", image, bad)
+    assert science_images(path) == {"SCI": 1}
+    for option, name, hint in (
+        ("variance", "ERR", "--error ERR"),
+        ("weight", "ERR", "--error ERR"),
+        ("error", "VAR_POISSON", "--variance VAR_POISSON"),
+    ):
+        with pytest.raises(Error, match=hint):
+            Stars.from_image(path, catalogue=place, **{option: name})
+    stated = Stars.from_image(path, catalogue=place, mask="none", error="ERR")
+    squared = Stars.from_image(
+        path, catalogue=place, mask="none", variance=fits.getdata(path, "ERR").astype("f8") ** 2
+    )
+    np.testing.assert_allclose(stated.candidates.noise, squared.candidates.noise, rtol=1e-5)
+
+
+def test_versions_of_several_science_images_belong_together(tmp_path, image, bad):
+    hdus = [fits.PrimaryHDU()]
+    for version, mask in ((1, bad), (2, ~bad)):
+        hdus.append(fits.ImageHDU(image, name="SCI", ver=version))
+        hdus.append(fits.ImageHDU(mask.astype(np.uint8), name="DQ", ver=version))
+    fits.HDUList(hdus).writeto(tmp_path / "two.fits")
+    for version, mask in ((1, bad), (2, ~bad)):
+        source = Source(tmp_path / "two.fits", detect=5.0, extension=f"SCI,{version}")
+        assert (source.open(16).sky().bad == mask).all()
+
+
+# Headers against pixels.
+
+
+@pytest.mark.parametrize(
+    ("factor", "offset", "cards", "key"),
+    [
+        (1 / 65535, 0.0, {"EGAIN": GAIN}, "EGAIN"),
+        (1 / 65535, -SKY / 65535, {"EGAIN": GAIN, "RDNOISE": 0}, "EGAIN"),
+        (1 / 100, 0.0, {}, "GAIN"),
+        (1.0, 0.0, {"EGAIN": 0.0, "GAIN": 139}, "GAIN = 139 is a setting"),
+    ],
+)
+def test_a_gain_that_the_pixels_contradict_is_left_out(
+    tmp_path, image, place, factor, offset, cards, key
+):
+    path = write(tmp_path / "a.fits", (image * factor + offset).astype(np.float32), **cards)
+    stars = Stars.from_image(path, catalogue=place)
+    assert stars.observation.gain is None and stars.observation.least_noise == 0.0
+    assert key in stars.observation.said()
+    without = Stars.from_image((image * factor + offset).astype(np.float32), catalogue=place)
+    np.testing.assert_allclose(stars.candidates.snr, without.candidates.snr, rtol=1e-6)
+    stated = Stars.from_image(path, catalogue=place, gain=GAIN / factor)
+    assert stated.observation.gain == GAIN / factor
+
+
+def test_a_gain_that_fits_stays_and_a_given_one_is_used_with_a_word(tmp_path, image, place):
+    path = write(tmp_path / "a.fits", image)
+    observation = Stars.from_image(path, catalogue=place).observation
+    assert observation.gain == GAIN and observation.remarks == ()
+    stated = Stars.from_image(path, catalogue=place, gain=0.1).observation
+    assert stated.gain == 0.1 and "given = 0.1" in stated.said() and "used" in stated.said()
+
+
+def test_a_saturation_below_the_sky_is_said_or_refused(tmp_path, image, place):
+    path = write(tmp_path / "a.fits", image, SATURATE=10.0)
+    stars = Stars.from_image(path, catalogue=place)
+    assert stars.observation.saturate is None
+    assert "10 counts (SATURATE) is below the sky of 300" in stars.observation.said()
+    with pytest.raises(Error, match="--saturate"):
+        Stars.from_image(path, catalogue=place, saturate=10.0)
+
+
+def test_one_plane_is_an_image(tmp_path, image, place):
+    expected = verdicts(image, place, **CAMERA)
+    path = write(tmp_path / "plane.fits", image[None])
+    assert verdicts(path, place) == expected
+    assert verdicts(image[None], place, **CAMERA) == expected
+
+
+def test_an_undebayered_frame_is_refused_in_one_line(tmp_path, image):
+    path = write(tmp_path / "osc.fits", image, BAYERPAT="RGGB")
+    line = refused("from-stars", path, "--detect", "--out", tmp_path / "m")
+    assert line.startswith(f"psfdae: {path}: ") and "debayer" in line
+    assert not (tmp_path / "m").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("LAST.01.02.04_20230301.sci_Image_1.fits", "LAST.01.02.04_20230301.sci_Image_1"),
+        ("a.b.fits.gz", "a.b"),
+        ("a.FIT.fz", "a"),
+        (".fits", "model"),
+    ],
+)
+def test_a_model_has_the_name_of_its_file_without_suffixes(tmp_path, name, expected):
+    assert Source(tmp_path / name).name == expected

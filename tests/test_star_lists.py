@@ -1,0 +1,288 @@
+"""Star lists as programs and people write them: each gives the same stars, or one line says why."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+from astropy import units as u
+from astropy.io import fits
+from astropy.table import QTable, Table
+from astropy.wcs import WCS
+
+from psfdae import Error, StarFlag, Stars
+from psfdae.image.catalogue import as_catalogue, read_catalogue
+from psfdae.image.observation import Source
+from small_field import CAMERA, field, header, table, write
+
+
+@pytest.fixture(scope="module")
+def image():
+    return field()[0]
+
+
+@pytest.fixture(scope="module")
+def place():
+    return field()[1]
+
+
+@pytest.fixture(scope="module")
+def wcs():
+    tangent = WCS(naxis=2)
+    tangent.wcs.ctype, tangent.wcs.cdelt = ["RA---TAN", "DEC--TAN"], [-0.6 / 3600, 0.6 / 3600]
+    tangent.wcs.crpix, tangent.wcs.crval = [150, 150], [10.0, 20.0]
+    return tangent
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory, image, wcs):
+    name = tmp_path_factory.mktemp("field") / "image.fits"
+    fits.writeto(name, image, header() + wcs.to_header())
+    return name
+
+
+def positions(image, catalogue, **stated):
+    return Source(image, catalogue, **stated).open(16).positions
+
+
+# Lists in Python.
+
+
+def test_pairs_and_masked_positions_are_positions_from_0(image, place):
+    for listed in (place.tolist(), [tuple(row) for row in place], place * u.pix):
+        np.testing.assert_array_equal(positions(image, listed), place)
+    masked = np.ma.MaskedArray(place, np.arange(len(place))[:, None] == [3, 3])
+    found = positions(image, masked)
+    assert np.isnan(found[3]).all() and np.isfinite(np.delete(found, 3, axis=0)).all()
+
+
+def test_sky_coordinates_of_astropy(path, place, wcs):
+    sky = wcs.pixel_to_world(*place.T)
+    tables = (
+        sky,
+        sky.galactic,
+        QTable({"name": np.arange(len(place)), "where": sky}),
+        QTable({"ra": sky.ra, "dec": sky.dec.to(u.rad)}),
+        Table({"RAJ2000": sky.ra.hourangle * u.hourangle, "DEJ2000": sky.dec.deg}),
+    )
+    for listed in tables:
+        np.testing.assert_allclose(positions(path, listed), place, atol=1e-5)
+    for listed in (sky.ra, place * u.deg, [1, 2, 3], [], "no"):
+        with pytest.raises(Error):
+            positions(path, listed)
+
+
+def test_columns_with_units(image, place):
+    listed = QTable({"x_fit": place[:, 0] * u.pix, "y_fit": place[:, 1] * u.pix})
+    np.testing.assert_array_equal(positions(image, listed), place)
+    frame = pd.DataFrame({"x": place[:, 0], "y": place[:, 1]})
+    np.testing.assert_array_equal(positions(image, frame, origin=0), place)
+    with pytest.raises(Error, match="'arcsec', expected pixels"):
+        positions(image, QTable({"x_fit": place[:, 0] * u.arcsec, "y_fit": place[:, 1]}))
+
+
+# Files.
+
+
+def votable(listed, name):
+    listed.write(name, format="votable")
+
+
+def vizier(listed, name):
+    """As asu-tsv writes it: comments, names, units, dashes."""
+    rows = "\n".join(f"{k}\t{ra:.7f}\t{dec:.7f}" for k, (ra, dec) in enumerate(listed))
+    head = "#\n#   VizieR Astronomical Server\n#Column\tRAJ2000\t(F10.6)\tRight ascension\n\n"
+    name.write_text(f"{head}\nrecno\tRAJ2000\tDEJ2000\n\tdeg\tdeg\n--------\t---\t----\n{rows}\n")
+
+
+def daophot(listed, name):
+    """A list of IRAF's allstar."""
+    lines = ["#K IRAF       = NOAO/IRAFV2.12EXPORT    version    %-23s"]
+    lines += ["#", "#N ID    XCENTER   YCENTER   MAG         MERR    \\"]
+    lines += ["#U ##    pixels    pixels    magnitudes  magnitudes \\"]
+    lines += ["#F %-9d  %-10.3f   %-10.3f   %-12.3f     %-14.3f", "#"]
+    lines += [f"{k:<9d}{x:<10.3f}{y:<10.3f}{15.0:<12.3f}{0.01:<14.3f}" for k, x, y in listed]
+    name.write_text("\n".join(lines) + "\n")
+
+
+def stetson(listed, name):
+    lines = [" NL    NX    NY  LOWBAD HIGHBAD  THRESH     AP1", "  1   300   300     1.0     6e4"]
+    lines += ["", *(f"{k:7d} {x:8.3f} {y:8.3f}   15.000    0.010" for k, x, y in listed)]
+    name.write_text("\n".join(lines) + "\n")
+
+
+def regions(listed, name):
+    shapes = [f"circle({x:.3f},{y:.3f},5) # text={{{k}}} color=red" for k, x, y in listed]
+    shapes[1] = shapes[1].replace("circle", "point").replace(",5)", ")")
+    shapes.insert(3, "-circle(100,100,20)")
+    head = ["# Region file format: DS9 version 4.1", 'global color=green font="helvetica 10"']
+    name.write_text("\n".join([*head, "image", *shapes]) + "\n")
+
+
+WRITE = {"s.vot": votable, "s.xml": votable, "s.ecsv": lambda t, name: t.write(name)}
+
+
+@pytest.mark.parametrize("name", WRITE)
+def test_tables_of_astropy(tmp_path, image, place, name):
+    listed = table(place, 1, ("XWIN_IMAGE", "YWIN_IMAGE"))
+    listed["NUMBER"] = np.arange(len(place)) + 100
+    WRITE[name](listed, tmp_path / name)
+    observation = Source(image, tmp_path / name).open(16)
+    np.testing.assert_allclose(observation.positions, place)
+    assert next(observation.chunks(100)).id[0] == 100
+
+
+@pytest.mark.parametrize("form", [daophot, stetson, regions])
+def test_lists_that_count_from_1(tmp_path, image, place, form):
+    listed = [(k + 5, x + 1, y + 1) for k, (x, y) in enumerate(place)]
+    form(listed, tmp_path / "s.als")
+    observation = Source(image, tmp_path / "s.als").open(16)
+    np.testing.assert_allclose(observation.positions, place, atol=1e-3)
+    assert [int(k) for k in next(observation.chunks(100)).id] == [k for k, _, _ in listed]
+
+
+def test_regions_on_the_sky(tmp_path, path, place, wcs):
+    sky = wcs.pixel_to_world(*place.T)
+    name = tmp_path / "s.reg"
+    for words in (
+        sky.to_string("decimal", precision=8),
+        sky.to_string("hmsdms", sep=":", precision=6),
+    ):
+        name.write_text("".join(f'fk5;circle({w.replace(" ", ",")},3")\n' for w in words))
+        np.testing.assert_allclose(positions(path, name), place, atol=1e-3)
+    for text, problem in (
+        ("physical\ncircle(1,2,3)\n", "physical"),
+        ("circle(1,2,3)\n", "not stated"),
+        ("image\npolygon(1,2,3,4,5,6)\n", "polygon"),
+    ):
+        name.write_text(text)
+        with pytest.raises(Error, match=problem):
+            read_catalogue(name)
+
+
+def test_vizier(tmp_path, path, place, wcs):
+    sky = wcs.pixel_to_world(*place.T)
+    vizier(zip(sky.ra.deg, sky.dec.deg, strict=True), tmp_path / "s.tsv")
+    np.testing.assert_allclose(positions(path, tmp_path / "s.tsv"), place, atol=2e-3)
+
+
+def test_sky_coordinates_in_files_of_astropy(tmp_path, path, place, wcs):
+    listed = QTable({"where": wcs.pixel_to_world(*place.T)})
+    for name in ("s.ecsv", "s.fits"):
+        listed.write(tmp_path / name)
+        np.testing.assert_allclose(positions(path, tmp_path / name), place, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        (("<TABLEDATA>", "<TABLEDATA><STREAM href='file:///etc/passwd'/>"), "not in it"),
+        (("<VOTABLE", "<!DOCTYPE a [<!ENTITY b 'c'>]><VOTABLE"), "entities"),
+        (('datatype="double"', 'datatype="double" arraysize="100000000"'), "arrays"),
+        (("</TABLE>", ""), "damaged"),
+    ],
+)
+def test_a_votable_that_could_do_harm_is_refused(tmp_path, place, change, problem):
+    table(place).write(tmp_path / "s.vot", format="votable")
+    text = (tmp_path / "s.vot").read_text()
+    assert change[0] in text
+    (tmp_path / "s.vot").write_text(text.replace(*change))
+    with pytest.raises(Error, match=problem):
+        read_catalogue(tmp_path / "s.vot")
+
+
+def test_announced_rows_take_no_memory(tmp_path, place):
+    table(place).write(tmp_path / "s.vot", format="votable")
+    text = (tmp_path / "s.vot").read_text()
+    (tmp_path / "s.vot").write_text(text.replace('nrows="70"', 'nrows="70000000000"'))
+    assert len(read_catalogue(tmp_path / "s.vot")) == 70
+
+
+# Origin.
+
+
+def test_the_stars_say_the_origin_of_plain_columns(tmp_path, image, place):
+    for origin in (0, 1):
+        observation = Source(image, table(place, origin)).open(16)
+        np.testing.assert_allclose(observation.positions, place)
+        assert f"count from {origin}" in observation.said()
+
+
+@pytest.mark.parametrize("off", [0.3, 0.5, 3.0])
+def test_where_they_do_not_the_origin_is_asked_for(image, place, off):
+    for listed in (table(place + off), table(place + np.array([0.0, 1.0])), table(place[:5])):
+        with pytest.raises(Error, match="--origin says it"):
+            positions(image, listed)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_list_off_by_one_pixel_is_refused_whatever_the_noise(seed):
+    image, place = field(seed)
+    cases = (
+        ({"catalogue": place + 1}, 1),
+        ({"catalogue": table(place + 1), "origin": 0}, 1),
+        ({"catalogue": table(place, 0, ("X_IMAGE", "Y_IMAGE"))}, 0),
+        ({"catalogue": table(place), "origin": 1}, 0),
+    )
+    for stated, right in cases[:: 1 if seed == 0 else 4]:
+        with pytest.raises(Error, match=f"--origin {right} says so"):
+            Stars.from_image(image, **stated, **CAMERA)
+    accepted = Stars.from_image(image, catalogue=place + 1, accept_offset=True, **CAMERA)
+    assert "x -1.00, y -1.00 px" in "".join(accepted.notes)
+
+
+def test_iraf_counts_from_1_and_photutils_from_0(image, place):
+    listed = table(place, 1, ("XCENTER", "YCENTER"))
+    np.testing.assert_allclose(positions(image, listed), place)
+    listed = table(place, 0, ("xcenter", "ycenter"))
+    np.testing.assert_allclose(positions(image, listed), place)
+
+
+# Rows.
+
+
+def test_of_two_rows_of_one_star_one_is_flagged_and_one_learnt_from(image, place):
+    twice = np.concatenate([place, place[5:8] + np.array([0.05, -0.05])])
+    alone = Stars.from_image(image, catalogue=place, **CAMERA)
+    stars = Stars.from_image(image, catalogue=twice, **CAMERA)
+    flags = next(stars.observation.chunks(100)).flags
+    assert np.flatnonzero(flags & StarFlag.BLENDED).tolist() == [70, 71, 72]
+    assert stars.candidates.verdict.tolist() == alone.candidates.verdict.tolist() + ["blended"] * 3
+    assert "3 rows are within 0.1 px of an earlier one (71, 72, 73)" in stars.notes[0]
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory, image, place):
+    from psfdae import fit
+
+    name = tmp_path_factory.mktemp("model") / "m.psf.safetensors"
+    fit(Stars.from_image(image, catalogue=place, **CAMERA), "field").save(name)
+    return name
+
+
+def test_rows_without_position_and_twice_stay_in_every_result(tmp_path, image, place, model):
+    from command_line import psfdae
+
+    write(tmp_path / "image.fits", image)
+    odd = np.concatenate([place, place[:1]])
+    odd[3, 0] = np.nan
+    table(odd).write(tmp_path / "s.csv")
+    said = ["--catalogue", tmp_path / "s.csv", "--model", model]
+    done = psfdae("photometry", tmp_path / "image.fits", *said, "--out", tmp_path / "p.ecsv")
+    assert done.exit_code == 0, done.output
+    assert "row 4" in done.output and "1 row is within 0.1 px" in done.output
+    found = Table.read(tmp_path / "p.ecsv")
+    assert len(found) == len(odd)
+    np.testing.assert_array_equal(np.flatnonzero(np.isnan(found["flux"])), [3, 70])
+    assert (found["flags"][[3, 70]] > 0).all()
+    done = psfdae("predict", tmp_path / "image.fits", *said, "--out", tmp_path / "p.fits")
+    assert done.exit_code == 0, done.output
+    rows = fits.getdata(tmp_path / "p.fits", "STARS")
+    assert np.isnan(rows["flux"][3]) and rows["flags"][3] & StarFlag.NO_FLUX
+
+    # Both results are star lists themselves, from 0.
+    for name in ("p.ecsv", "p.fits"):
+        where = as_catalogue(tmp_path / name).positions()
+        assert (where.first, where.second, where.origin) == ("x", "y", 0)
+        again = positions(tmp_path / "image.fits", tmp_path / name)
+        np.testing.assert_allclose(np.delete(again, 3, 0), np.delete(odd, 3, 0), atol=0.1)
