@@ -161,19 +161,6 @@ def test_header_values_and_those_that_are_given_before_them(cube):
     assert columns["saturated"].any() and not columns["bad"].any()
 
 
-def test_the_primary_header_serves_its_extensions(tmp_path, stamps):
-    primary, image = fits.PrimaryHDU(), fits.ImageHDU(stamps)
-    primary.header.update(GAIN=2.0, SATURATE=1000.0)
-    image.header["GAIN"] = 3.0
-    fits.HDUList([primary, image]).writeto(tmp_path / "e.fits")
-    camera = open_observation(tmp_path / "e.fits", D)
-    assert (camera.gain, camera.saturate, camera.pixel_scale_arcsec) == (
-        3.0,
-        1000.0,
-        None,
-    )
-
-
 def test_the_scale_of_the_wcs_goes_before_a_nominal_one(tmp_path):
     path = write_ramp(tmp_path / "w.fits", pixel_scale_arcsec=0.7, PIXSCALE=1.0)
     stars = catalogue(tmp_path / "c.csv", [20], [15])
