@@ -11,11 +11,12 @@ import random
 import resource
 import shutil
 import subprocess
+import time
 
 import psutil
 import pytest
 
-from workflow_runs import KERNELS, NO_CLUSTER, PATH, QUIET, captured, clone, job_counts, wait_until
+from workflow_runs import KERNELS, NO_CLUSTER, PATH, QUIET, captured, clone, job_counts
 
 pytestmark = [pytest.mark.workflow, pytest.mark.slow]
 
@@ -80,7 +81,11 @@ def recovered(folder, undisturbed):
 def test_a_killed_process(half_done, undisturbed, victim):
     """A worker resumes after its last epoch; jobs of a killed Snakemake run on and are awaited."""
     run = subprocess.Popen(**reproduce(half_done), **QUIET)
-    wait_until((half_done / CHECKPOINT).exists, 90, "the training left no checkpoint")
+    for _ in range(3000):
+        if (half_done / CHECKPOINT).exists() or run.poll() is not None:
+            break
+        time.sleep(0.1)
+    assert run.poll() is None, "the training left no checkpoint"
     for child in psutil.Process(run.pid).children(recursive=True):
         words = child.cmdline()
         worker = "fit" in words and "--checkpoint" in words
