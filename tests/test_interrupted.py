@@ -1,0 +1,138 @@
+"""Runs that are killed, starved or damaged end, once repeated, in the same files.
+
+Every case breaks a `make reproduce` of one dataset's network, baseline and evaluation, then
+types the same again. What comes out is compared byte by byte with an undisturbed run.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import resource
+import shutil
+import subprocess
+import time
+
+import psutil
+import pytest
+
+from workflow_runs import KERNELS, NO_CLUSTER, PATH, QUIET, captured, clone, job_counts
+
+pytestmark = [pytest.mark.workflow, pytest.mark.slow]
+
+RESULTS = "results/smoke"
+TARGET = f"{RESULTS}/evaluation/dataset3/random-realisation.csv"
+STARS = f"{RESULTS}/data/seidel/seidel_10pct.h5"
+CHECKPOINT = f"{RESULTS}/checkpoints/dae/dataset3/random-realisation.pt"
+# Long enough for a signal to arrive in mid-training, which then resumes.
+SLOW = "train.epochs=40 train.checkpoint_seconds=0 train.batch=8"
+TOO_LARGE = 150_000
+"""Bytes that a file may have where there is no space: less than the stars need."""
+
+
+def reproduce(folder):
+    """What a user types, with the environment active and nothing else set, for `subprocess`."""
+    environment = {"HOME": str(folder), "PATH": PATH, "PYTHONPATH": str(folder / "src")}
+    environment |= NO_CLUSTER | KERNELS
+    line = ["make", "reproduce", "PRESET=smoke", f"TARGETS={TARGET}", f"SET={SLOW}"]
+    return {"args": line, "cwd": folder, "env": environment}
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory):
+    """The run that nothing happens to."""
+    folder = clone(tmp_path_factory.mktemp("undisturbed") / "house")
+    run = captured(**reproduce(folder))
+    assert run.returncode == 0, run.stdout + run.stderr
+    return folder
+
+
+@pytest.fixture
+def half_done(undisturbed, tmp_path):
+    """A house with the stars and their digests, but without network and evaluation."""
+    folder = clone(tmp_path / "house")
+    for name in ("data", ".digests/data"):
+        shutil.copytree(undisturbed / RESULTS / name, folder / RESULTS / name)
+    return folder
+
+
+def products(folder):
+    """Content of all results that do not tell times, by name."""
+    return {
+        path.relative_to(folder): path.read_bytes()
+        for path in sorted((folder / RESULTS).rglob("*"))
+        if path.suffix in (".h5", ".safetensors", ".csv", ".parquet") and path.name != "history.csv"
+    }
+
+
+def recovered(folder, undisturbed):
+    """Output of the repeated run, whose files are those of the undisturbed one."""
+    run = captured(**reproduce(folder))
+    assert run.returncode == 0, run.stdout + run.stderr
+    expected = products(undisturbed)
+    assert len(expected) >= 6
+    assert products(folder) == expected
+    assert not list((folder / RESULTS).rglob("*.tmp"))
+    assert not (folder / CHECKPOINT).exists()
+    return run.stdout + run.stderr
+
+
+@pytest.mark.parametrize("victim", ["fit", "snakemake"])
+def test_a_killed_process(half_done, undisturbed, victim):
+    """A worker resumes after its last epoch; jobs of a killed Snakemake run on and are awaited."""
+    run = subprocess.Popen(**reproduce(half_done), **QUIET)
+    for _ in range(3000):
+        if (half_done / CHECKPOINT).exists() or run.poll() is not None:
+            break
+        time.sleep(0.1)
+    assert run.poll() is None, "the training left no checkpoint"
+    for child in psutil.Process(run.pid).children(recursive=True):
+        words = child.cmdline()
+        worker = "fit" in words and "--checkpoint" in words
+        if worker if victim == "fit" else any("bin/snakemake" in word for word in words[:2]):
+            child.kill()
+    assert run.wait(60) != 0
+    assert not (half_done / TARGET).exists()
+    output = recovered(half_done, undisturbed)
+    if victim == "fit":
+        log = half_done / RESULTS / "logs/train/dataset3/random-realisation.log"
+        assert "resuming after epoch" in log.read_text()
+    else:
+        assert "waiting for it to end" in output
+
+
+def test_no_space(half_done, undisturbed):
+    """A limit on the size of files: the stars do not fit, nothing half-written stays."""
+    (half_done / STARS).unlink()
+
+    def limit():
+        resource.setrlimit(resource.RLIMIT_FSIZE, (TOO_LARGE, resource.RLIM_INFINITY))
+
+    run = captured(**reproduce(half_done), preexec_fn=limit)
+    assert run.returncode != 0
+    assert not (half_done / STARS).exists()
+    log = (half_done / RESULTS / "logs/stars/seidel/seidel_10pct.log").read_text()
+    assert log.startswith("psfdae: ") and "File too large" in log
+    recovered(half_done, undisturbed)
+
+
+def test_damaged_files(undisturbed, tmp_path):
+    """One of each kind is flipped or cut: named, set aside, and built again with all after it."""
+    folder = tmp_path / "house"
+    shutil.copytree(undisturbed, folder, symlinks=True)
+    draw = random.Random(4)
+    kinds = {
+        (path.relative_to(folder).parts[2], path.suffix): path
+        for path in (folder / name for name in products(folder))
+    }
+    for number, path in enumerate(kinds.values()):
+        whole, times = bytearray(path.read_bytes()), path.stat()
+        place = draw.randrange(8 * len(whole))
+        whole[place // 8] ^= 1 << place % 8
+        path.write_bytes(whole if number % 2 else whole[: len(whole) // 2])
+        # As a failing disk does it: nothing tells by its date.
+        os.utime(path, ns=(times.st_atime_ns, times.st_mtime_ns))
+    output = recovered(folder, undisturbed)
+    for path in kinds.values():
+        assert f"{path.relative_to(folder)}: " in output
+    assert "set aside" in output and job_counts(output)["train"] == 1
