@@ -13,7 +13,6 @@ import prediction
 import propagators
 import scenes
 import speed
-import trainings
 from psfdae.optics.propagation import StampPropagator
 from psfdae.optics.pupil import annular_pupil
 from psfdae.optics.wavefronts import seidel_wavefronts
@@ -93,19 +92,6 @@ def test_pages_extrapolate_alike():
     (billion,) = speed.planned(rows)
     assert million.time_s == pytest.approx(0.15 + 8.7e-5 * 1e6, rel=1e-3)
     assert billion["time_s"] / billion["stars"] == pytest.approx(million.time_s / 1e6, rel=1e-2)
-
-
-@pytest.mark.parametrize(
-    ("gains", "chosen"),
-    [
-        ([0.5, 0.5, 0.5], 3),  # every doubling pays
-        ([0.95, 0.6, 0.95], 2),  # a flat stretch may be crossed for a later gain
-        ([0.99, 0.99, 0.99], 0),
-    ],
-)
-def test_knee_is_where_doublings_stop_paying(gains, chosen):
-    time, error = 2.0 ** np.arange(4), np.r_[1.0, np.cumprod(gains)]
-    assert trainings.knee(time, error) == chosen
 
 
 def test_training_figure_is_drawn_from_the_table_of_the_record(tmp_path):

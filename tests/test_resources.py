@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
-import subprocess
-import sys
 
 import pandas as pd
-import psutil
 import pytest
 
+from command_line import psfdae
 from workflow_runs import ROOT, captured, environment
 
 SNAKEMAKE_MB = 250
@@ -59,30 +58,22 @@ def test_jobs_on_a_cluster_fit_a_node_of_one_cpu_with_what_the_record_measured(t
     assert len(compared) > 100
 
 
-PINNED = """
-import os, sys
-os.sched_setaffinity(0, map(int, sys.argv[1].split(",")))
-os.execv(sys.argv[2], sys.argv[2:])
-"""
-
-
 @pytest.mark.slow
 @pytest.mark.skipif(
-    not hasattr(psutil.Process, "cpu_affinity") or psutil.cpu_count() < 2,
+    shutil.which("taskset") is None or os.cpu_count() < 2,
     reason="needs two CPUs and a way to leave out one",
 )
 def test_number_of_cpus_does_not_change_a_product(tmp_path):
     """Two threads of linear algebra, as configured, on two CPUs and on one."""
     sizes = ["grid.points=3", "stars.count=48", "optics.threads=2"]
     templates = tmp_path / "templates.h5"
-    psfdae = [sys.executable, "-m", "psfdae"]
-    make = [*psfdae, "templates", "--out", templates, "scene=seidel", *sizes]
-    subprocess.run(make, check=True, capture_output=True)
+    assert psfdae("templates", "--out", templates, "scene=seidel", *sizes).exit_code == 0
     products = []
-    for cpus in ("0,1", "0"):
-        out = tmp_path / f"{cpus}.h5"
-        stars = [*psfdae, "stars", "--templates", templates, "--out", out, *sizes]
-        threads = environment(OMP_NUM_THREADS=str(len(cpus.split(","))))
-        subprocess.run([sys.executable, "-c", PINNED, cpus, *stars], env=threads, check=True)
+    for cpus, threads in (("0,1", "2"), ("0", "1")):
+        out = tmp_path / f"{threads}.h5"
+        line = ["taskset", "--cpu-list", cpus, "psfdae", "stars", "--templates", templates]
+        variables = environment(OMP_NUM_THREADS=threads)
+        run = captured([*line, "--out", out, *sizes], env=variables)
+        assert run.returncode == 0, run.stderr
         products.append(out.read_bytes())
     assert products[0] == products[1]

@@ -112,20 +112,6 @@ def test_new_value_runs_its_points_only(killed, configure):
 
 
 @pytest.mark.slow
-def test_adaptive_sweep_goes_on_where_it_was(smoke, configure, tmp_path):
-    folder = shutil.copytree(smoke, tmp_path / "run", symlinks=True)
-    configure(kind="adaptive", trials=2, startup=1, seed=1)
-    snakemake(folder, SUMMARY)
-    before = finished(folder)
-    assert len(before) == 2
-    configure(kind="adaptive", trials=3, startup=1, seed=1)
-    snakemake(folder, SUMMARY)
-    after = finished(folder)
-    assert len(after) == 3
-    assert after == {**after, **before}
-
-
-@pytest.mark.slow
 def test_sweep_lists_its_points_figures_and_import(tmp_path):
     line = [*command(tmp_path, "--dry-run", "sweep"), "sweep=dae_width"]
     jobs = job_counts(captured(line, env=environment()).stdout)
