@@ -10,7 +10,8 @@ import pytest
 
 from workflow_runs import QUIET, ROOT, VARYING, clone, shell, wait_until
 
-REPRODUCE = "make reproduce PRESET=smoke"
+TARGETS = "dataset7 results/smoke/alignment/dae_retrained/network.safetensors"
+REPRODUCE = f"make reproduce PRESET=smoke TARGETS='{TARGETS}'"
 
 
 @pytest.fixture
@@ -79,19 +80,19 @@ def snapshot(results):
 @pytest.mark.slow
 @pytest.mark.workflow
 def test_a_killed_run_ends_in_the_bytes_of_another_run_and_leaves_its_home_alone(smoke, tmp_path):
-    """Killed with all its children after 30 jobs, in a folder with a blank in its name."""
+    """Killed with all its children after 8 jobs, in a folder with a blank in its name."""
     folder, home, log = clone(tmp_path / "my house"), tmp_path / "home", tmp_path / "log"
     home.mkdir()
     with log.open("w") as out:
         run = shell(folder, REPRODUCE, home, stdout=out, stderr=out, start_new_session=True)
-        wait_until(lambda: log.read_text().count("\nFinished jobid") >= 30, 600, "no progress")
+        wait_until(lambda: log.read_text().count("\nFinished jobid") >= 8, 600, "no progress")
         os.killpg(run.pid, signal.SIGKILL)
         assert run.wait() != 0
     with log.open("w") as out:
         assert shell(folder, REPRODUCE, home, stdout=out, stderr=out).wait() == 0, log.read_text()
     products = snapshot(folder / "results/smoke")
-    assert len(products) > 100
-    assert products == snapshot(smoke / "results")
+    assert len(products) > 50
+    assert products.items() <= snapshot(smoke / "results").items()
     assert (folder / "results/smoke/report.html").stat().st_size > 1e6
     assert not list((folder / "results").rglob("*.tmp"))
     assert list(home.rglob("*")) == []

@@ -86,7 +86,7 @@ def test_runtime_lists_every_job(results, tmp_path):
 def test_every_job_of_a_run_has_its_cpu_time(smoke):
     """Snakemake itself samples it after 15 s for the first time."""
     jobs = pd.read_csv(smoke / "results/runtime.csv")
-    assert len(jobs) >= 80
+    assert len(jobs) >= 70
     assert jobs.cpu_s.notna().all()
 
 

@@ -24,7 +24,7 @@ from workflow_runs import (
     wait_until,
 )
 
-pytestmark = pytest.mark.workflow
+pytestmark = [pytest.mark.workflow, pytest.mark.slow]
 
 GRID = {
     **{"kind": "grid", "model": "dae", "dataset": "dataset3"},
@@ -74,7 +74,6 @@ def killed(smoke, configure, tmp_path_factory):
     return folder, before
 
 
-@pytest.mark.slow
 def test_killed_sweep_is_finished_and_repeats_no_finished_point(killed):
     folder, before = killed
     after = finished(folder)
@@ -87,7 +86,6 @@ def test_killed_sweep_is_finished_and_repeats_no_finished_point(killed):
     assert best.validation_mse == table.validation_mse.min()
 
 
-@pytest.mark.slow
 def test_main_workflow_repeats_the_best_point_to_the_last_digit(killed):
     folder, _ = killed
     overrides = " ".join(best_overrides(folder / "results", "tried"))
@@ -101,7 +99,6 @@ def test_main_workflow_repeats_the_best_point_to_the_last_digit(killed):
     assert weights.read_bytes() == (point / "dae.safetensors").read_bytes()
 
 
-@pytest.mark.slow
 def test_new_value_runs_its_points_only(killed, configure):
     folder, _ = killed
     rates = [0.001, *GRID["space"]["train.lr"]]
@@ -111,7 +108,6 @@ def test_new_value_runs_its_points_only(killed, configure):
     assert planned(folder, SUMMARY) == {"sweep_summary": 1}
 
 
-@pytest.mark.slow
 def test_sweep_lists_its_points_figures_and_import(tmp_path):
     line = [*command(tmp_path, "--dry-run", "sweep"), "sweep=dae_width"]
     jobs = job_counts(captured(line, env=environment()).stdout)
@@ -121,7 +117,7 @@ def test_sweep_lists_its_points_figures_and_import(tmp_path):
 
 @pytest.mark.parametrize(
     ("choice", "message"),
-    [(["sweep=none"], "sweep = 'none'"), pytest.param([], "which sweep?", marks=pytest.mark.slow)],
+    [([], "which sweep?"), (["sweep=none"], "sweep = 'none'")],
 )
 def test_wrong_choice_of_a_sweep_is_named(tmp_path, choice, message):
     run = captured([*command(tmp_path, "sweep"), *choice], env=environment())

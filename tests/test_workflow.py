@@ -225,7 +225,7 @@ def test_a_target_lists_no_job_of_another(tmp_path, target, included, others):
 )
 def test_wrong_config_stops_before_any_job(tmp_path, options, key):
     out = snakemake(tmp_path, check=False, **options)
-    (line) = [line for line in out.splitlines() if key in line]
+    (line,) = [line for line in out.splitlines() if key in line]
     assert line.startswith("psfdae: ")
     assert "Traceback" not in out
     assert not (tmp_path / "results").exists()
