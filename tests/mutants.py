@@ -72,17 +72,14 @@ def find(sources: Path, mutant: Mutant) -> tuple[Path, ast.AST]:
     """File and node of a mutant below a folder; LookupError unless there is exactly one."""
     wanted = ast.parse(mutant.original).body[0]
     text = ast.dump(wanted.value if isinstance(wanted, ast.Expr) else wanted)
-    found: dict[Path, list[ast.AST]] = {}
+    alike: dict[Path, list[ast.AST]] = {}
     for path, part in parts_below(sources).get(mutant.function, ()):
-        alike = [node for node in ast.walk(part) if ast.dump(node) == text]
-        found[path] = [*found.get(path, ()), *alike]
-    enough = [path for path, nodes in found.items() if len(nodes) > mutant.occurrence]
-    if len(enough) != 1:
-        raise LookupError(
-            f"{mutant.function}: {mutant.original!r} is in {len(enough)} files, not 1"
-        )
-    nodes = sorted(found[enough[0]], key=lambda node: (node.lineno, node.col_offset))
-    return enough[0], nodes[mutant.occurrence]
+        alike.setdefault(path, []).extend(n for n in ast.walk(part) if ast.dump(n) == text)
+    paths = [path for path, nodes in alike.items() if len(nodes) > mutant.occurrence]
+    if len(paths) != 1:
+        raise LookupError(f"{mutant.function}: {mutant.original!r} is in {len(paths)} files, not 1")
+    nodes = sorted(alike[paths[0]], key=lambda node: (node.lineno, node.col_offset))
+    return paths[0], nodes[mutant.occurrence]
 
 
 def mutated(path: Path, node: ast.AST, text: str) -> str:
@@ -98,9 +95,7 @@ def mutated(path: Path, node: ast.AST, text: str) -> str:
 def main(words: list[str]) -> None:
     chosen = [m for m in read_list() if not m.equivalent]
     chosen = [m for m in chosen if not words or any(word in str(m) for word in words)]
-    line = ["git", "ls-files"]
-    tracked = subprocess.run(line, cwd=ROOT, capture_output=True, text=True, check=True)
-    tracked = tracked.stdout.splitlines()
+    tracked = subprocess.check_output(["git", "ls-files"], cwd=ROOT, text=True).splitlines()
     for mutant in chosen:
         with tempfile.TemporaryDirectory() as folder:
             for name in tracked:
@@ -108,15 +103,14 @@ def main(words: list[str]) -> None:
                 shutil.copy(ROOT / name, Path(folder, name))
             path, node = find(Path(folder, "src"), mutant)
             path.write_text(mutated(path, node, mutant.mutated), encoding="utf-8")
-            named = re.compile(rf"\b{path.stem}\b")
+            module = re.compile(rf"\b{path.stem}\b")
             tests = sorted(Path(folder).glob("tests/test_*.py"))
-            tests.sort(key=lambda test: not named.search(test.read_text(encoding="utf-8")))
+            tests.sort(key=lambda test: not module.search(test.read_text(encoding="utf-8")))
             line = [sys.executable, "-m", "pytest", "-qx", *FAST, *map(str, tests)]
-            done = subprocess.run(
-                line, cwd=folder, env={**os.environ, "PYTHONPATH": "src"}, check=False
-            )
+            variables = {**os.environ, "PYTHONPATH": "src"}
+            run = subprocess.run(line, cwd=folder, env=variables, check=False)
         # Other codes of pytest say that no test was tried.
-        fate = {0: "alive", 1: "killed"}[done.returncode]
+        fate = {0: "alive", 1: "killed"}[run.returncode]
         print(f"{fate}  {mutant.function}: {mutant.original} -> {mutant.mutated}", flush=True)
 
 

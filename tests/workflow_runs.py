@@ -28,14 +28,14 @@ KERNELS = {
 
 
 def environment(**more):
-    """The environment of a run, without what this run of the tests has found in its own."""
+    """The environment of a run, without what `make test` has in its own."""
     dropped = ("PSFDAE_RESULTS", "MAKEFLAGS", "MAKELEVEL")
-    kept = {key: value for key, value in os.environ.items() if key not in dropped}
-    return {**kept, "PATH": PATH, **more}
+    inherited = {key: value for key, value in os.environ.items() if key not in dropped}
+    return {**inherited, "PATH": PATH, **more}
 
 
 def captured(args, **options):
-    """A finished program with what it said, whether it succeeded or not."""
+    """A finished program with its output, whether it succeeded or not."""
     return subprocess.run(args, capture_output=True, text=True, check=False, **options)
 
 
@@ -63,10 +63,10 @@ def shell(folder, line, home=None, **options):
 
     `home` is the user's, by default the folder itself; options are those of `Popen`.
     """
-    own = {"HOME": str(home or folder), "PATH": PATH, "LANG": "C.UTF-8", **NO_CLUSTER, **KERNELS}
+    variables = {"HOME": str(home or folder), "PATH": PATH, "LANG": "C.UTF-8"}
     # An environment of the copy's own would be linked to the copy's source.
-    own["PYTHONPATH"] = str(folder / "src")
-    return subprocess.Popen(["bash", "-c", line], cwd=folder, env=own, **options)
+    variables |= {"PYTHONPATH": str(folder / "src"), **NO_CLUSTER, **KERNELS}
+    return subprocess.Popen(["bash", "-c", line], cwd=folder, env=variables, **options)
 
 
 def command(folder, *arguments, overrides="", preset="smoke", root=ROOT):
@@ -82,8 +82,8 @@ def command(folder, *arguments, overrides="", preset="smoke", root=ROOT):
 def snakemake(folder, *arguments, check=True, **options):
     """Output of a run; fails the test if the run fails, unless told otherwise."""
     source = str(options.get("root", ROOT) / "src")
-    own = environment(PYTHONPATH=source, **NO_CLUSTER)
-    result = captured(command(folder, *arguments, **options), env=own)
+    variables = environment(PYTHONPATH=source, **NO_CLUSTER)
+    result = captured(command(folder, *arguments, **options), env=variables)
     if check:
         assert result.returncode == 0, result.stdout + result.stderr
     return result.stdout + result.stderr
@@ -111,9 +111,10 @@ def locked(folder, *arguments, **options):
     return {"args": line, "cwd": folder, "env": environment(PSFDAE_RESULTS="results")}
 
 
-def wait_until(condition, seconds, what):
-    """Wait for something; a test fails if it takes too long."""
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, what
+def wait_until(condition, seconds, failure):
+    """Wait for something, with 20 looks a second; a test fails if it takes too long."""
+    for _ in range(20 * seconds):
+        if condition():
+            return
         time.sleep(0.05)
+    pytest.fail(failure)
