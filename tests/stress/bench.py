@@ -19,9 +19,7 @@ from psfdae_paper.stars.framing import Propagation, normalise_flux
 from psfdae_paper.stars.scenes import star_wavefronts
 
 THREADS = 2  # of the linear algebra, and trainings side by side
-# Noise levels λ of the paper's three bands.
-LEVELS = 1e-5 * np.array([3, 5, 7, 9, 30, 50, 70, 90, 100, 200, 300, 500])
-# The smallest that the stamps of a scene carry, over all of its datasets.
+# Smallest noise level λ that the stamps of a scene carry, over all of its datasets.
 LEAST_LEVEL = {"seidel": 3e-5, "turbulence": 3e-4}
 BUDGET = 0.01  # numerical MSE of a stamp in units of the smallest noise variance that it carries
 MODEL_STARS, TRAINING_STARS = 1000, 250  # of scene 1's flux model, of the network in the bench
@@ -142,8 +140,8 @@ def rounding_of(dae):
     return float(np.finfo(np.float32).eps) * float(np.sqrt(terms))
 
 
-def subspace_angle(first, second):
-    """Sine of the largest principal angle between the row spaces of (K, P) arrays."""
-    a, b = (np.linalg.qr(rows.T.astype(np.float64))[0] for rows in (first, second))
-    # From the part of one that lies outside the other: cosines near 1 would lose all digits.
-    return float(np.linalg.norm(b - a @ (a.T @ b), 2))
+def noisy_stars(bench, count=None):
+    """Noisy stars at the band's smallest level in double precision."""
+    images = bench.seidel.images[:count].astype(np.float64)
+    sigma = np.sqrt(bench.noise.variance(images, bench.level))
+    return images + sigma * bench.stream("noisy").standard_normal(images.shape)
