@@ -20,12 +20,11 @@ from psfdae.networks.dae import (
     SingleChannelConv,
     build_dae,
     image_scale,
-    middle_px,
     predict,
     train_dae,
 )
 from psfdae.networks.settings import DaeSettings, Train
-from psfdae.networks.training import DeadNetworkError, TrainingError, orthogonal, progress
+from psfdae.networks.training import DeadNetworkError, TrainingError, orthogonal
 from psfdae.networks.weights import load_weights, save_checkpoint, save_weights
 from psfdae_paper.methods.pca_som import Baseline, PcaFit, PcaSom, fit_pca_som
 
@@ -392,15 +391,6 @@ def test_training_begins_with_the_middle_of_the_stamps(data, reference, sides):
             assert torch.equal(part, full[:, :, edge : 16 - edge, edge : 16 - edge])
 
 
-@pytest.mark.parametrize("stamp_px", [16, 25])
-@pytest.mark.parametrize("reference", ["realisation", "template"])
-def test_middle_of_stamps_grows_about_their_middle(stamp_px, reference):
-    sides = [middle_px(stamp_px, part, reference) for part in np.linspace(0.0, 1.2, 25)]
-    assert sides == sorted(sides) and sides[-1] == stamp_px
-    assert all(side % 2 == stamp_px % 2 for side in sides)
-    assert abs(sides[0] / stamp_px - (0.5 if reference == "realisation" else 0.75)) <= 1 / stamp_px
-
-
 def test_training_goes_on_from_another_network(data):
     anew = DaeTraining(data, DAE, TRAIN, 3, 0)
     known = DaeTraining(data, DAE, TRAIN, 4, 0).model
@@ -466,13 +456,3 @@ def test_weights_come_back_and_damage_is_noticed(tmp_path):
     path.unlink()
     with pytest.raises(ProductError, match="no such file"):
         load_weights(path)
-
-
-def test_progress_says_what_was_measured_and_how_long_it_takes(capsys):
-    row = {"epoch": 1, "train_mse": 2e-5, "validation_mse": np.nan, "seconds": 3.0}
-    with progress(4) as report:
-        report(row)
-        report({**row, "epoch": 2, "validation_mse": 1e-5})
-    first, second = capsys.readouterr().out.splitlines()
-    assert "about 9 s left" in first and "validation" not in first
-    assert "about 3 s left" in second and "1.000e-05" in second

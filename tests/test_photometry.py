@@ -83,7 +83,7 @@ def test_bad_pixels_are_marked_and_repaired(noisy, stars, model, noise, value, p
 def test_unit_does_not_matter(noisy, model, unit):
     before, after = robust_flux(noisy, model), robust_flux(noisy * unit, model)
     assert after.flux / unit == pytest.approx(before.flux, rel=1e-12)
-    assert after.images / unit == pytest.approx(before.images, rel=1e-12)
+    np.testing.assert_allclose(after.images / unit, before.images, rtol=1e-12)
     assert np.array_equal(after.flags, before.flags)
 
 
@@ -302,7 +302,7 @@ def gaussians(sigma, ratio, angle, count=50):
 
 @pytest.mark.parametrize(
     ("sigma", "ratio", "degrees"),
-    [(0.85, 1.0, 0.0), (2.1, 1.0, 0.0), (2.4, 0.6, -60.0), (2.4, 0.6, 89.0)],
+    [(0.85, 1.0, 0.0), (2.1, 1.0, 0.0), (2.4, 0.6, -60.0)],
 )
 def test_width_and_axes_of_a_gaussian_with_its_pixel(sigma, ratio, degrees):
     shapes = measure_shapes(gaussians(sigma, ratio=ratio, angle=np.deg2rad(degrees)))

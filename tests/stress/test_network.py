@@ -10,35 +10,15 @@ import pytest
 import torch
 from scipy.stats import binom
 
-from psfdae.networks.dae import Dae, DaeTraining, predict, train_dae
-from psfdae.networks.training import DeadNetworkError, TrainingError
-from stress.bench import THREADS, rounding_of
+from psfdae.networks.dae import Dae, predict, train_dae
+from psfdae.networks.training import TrainingError
+from stress.bench import THREADS
 
 pytestmark = pytest.mark.slow
 NARROW = 4  # channels of the networks whose accuracy does not matter
 SEEDS, EPOCHS, SEEN = 10, 3, 2000  # trainings, their epochs, or more: so many stars in all
 DEATHS = 0.1  # part of the trainings that die and start again, seen at rates of 3e-3 to 5e-3
 LIVE = "a live network"
-
-
-def test_batches(bench, record):
-    """A forward pass in batches of another size."""
-    run = partial(predict, bench.network, factor=bench.factor)
-    noisy = bench.noise.draw(bench.test_stars()[:40], 1e-3, bench.stream("forward"))
-    usual, rounding = run(noisy), rounding_of(bench.config.dae)
-    what, peak = "change of the output over its peak", float(np.abs(usual).max())
-    record.close("batches of 7", what, run(noisy, batch=7), usual, rounding, over=peak)
-
-
-def test_dead_network(bench, record):
-    """A network whose last ReLU passes nothing any more, which no step looks at."""
-    settings = short(bench, dead_check_steps=1000)
-    training = DaeTraining(bench.training_set(100), narrow(bench), settings, bench.config.seed)
-    training.run_epoch()
-    with torch.no_grad():
-        training.model.layers[-1].bias.fill_(-1e6)
-    with record.refused("dead between two looks, met by the validation", DeadNetworkError):
-        training.run_epoch()
 
 
 @pytest.mark.parametrize(("lr", "clip"), [(0.1, 0.0), (1.0, 0.0), (1.0, 1.0)])
@@ -63,19 +43,6 @@ def test_broken_training(bench, record):
     single = replace(data, fit=data.fit[:1], validation=data.validation[:1])
     outcome = fate(bench, single, short(bench, batch=1, epochs=3))
     record.one_of("a training set of one star", "outcome", outcome, LIVE)
-
-
-def test_thread_counts(bench, record):
-    """A short training on one and on two threads."""
-    data = bench.training_set(100)
-    one, two = (train(bench, data, short(bench, threads=threads)).history[-1] for threads in (1, 2))
-    torch.set_num_threads(1)
-    steps, ratio = 2 * -(-len(data.fit) // 25), two["validation_mse"] / one["validation_mse"]
-    # Every step adds the rounding of a pass; Adam, which divides by the gradient's own size,
-    # may amplify it ten times where the gradient is small.
-    bound = 10 * steps * rounding_of(narrow(bench))
-    case, what = "training on 2 threads against 1", "relative difference of the validation MSE"
-    record.close(case, what, ratio, 1, bound)
 
 
 def test_seeds(bench, record):

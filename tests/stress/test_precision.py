@@ -1,15 +1,12 @@
-"""Single precision, from the kernel to the metrics."""
-
-import copy
+"""The kernel in single precision."""
 
 import numpy as np
 import pytest
-import torch
 
 from psfdae.optics.wavefronts import seidel_wavefronts
 from psfdae_paper.stars.fields import relative_field
 from psfdae_paper.stars.scenes import template_wavefronts
-from stress.bench import changed, noisy_stars, propagation, rounding_of
+from stress.bench import changed, propagation
 
 pytestmark = pytest.mark.slow
 EPS = float(np.finfo(np.float32).eps)  # relative spacing of single precision
@@ -34,15 +31,3 @@ def test_kernel(bench, record, scene, number):
     change = (np.abs(single - double) / double.max(axis=(1, 2), keepdims=True)).max()
     case = f"kernel in single precision, scene {number}"
     record.at_most(case, "largest pixel difference over peak", change, bound)
-
-
-def test_network(bench, record):
-    """The same weights in single and in double precision."""
-    double = copy.deepcopy(bench.network).double()
-    noisy = noisy_stars(bench, 64)
-    images = torch.from_numpy(noisy.astype(np.float32))[:, None] * bench.factor
-    with torch.inference_mode():
-        exact = double(images.double())
-        change = (bench.network(images).double() - exact).abs().max() / exact.abs().max()
-    case, what = "DAE in single precision", "largest difference over largest output"
-    record.at_most(case, what, change, rounding_of(bench.config.dae))
