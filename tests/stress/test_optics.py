@@ -94,31 +94,6 @@ def test_pixel_scale(bench, record, scale):
     record.point("pixel scale", scale, error, budget)
 
 
-@pytest.mark.slow
-def test_similar_telescopes(bench, record):
-    """Aperture and wavelength over decades at the same λ/D per pixel: the same stamps."""
-    config, telescope = bench.seidel.config, bench.seidel.config.telescope
-    source, stamps = seidel(config.wavefront.coefficients), []
-    for factor in (1.0, 1e-1, 1e1, 1e3):
-        lengths = {n: factor * getattr(telescope, n) for n in ("diameter_m", "wavelength_m")}
-        exact = stamper(changed(config, telescope=lengths), source, precision="complex128")
-        stamps.append(exact.stamps(16, CENTRED))
-    case, what = "D and λ times 0.1 … 1000", "largest relative difference of a pixel"
-    # Rounding of p = pixel · D/λ turns the phase of the outermost pixel by πN·ε at most.
-    bound = 1e3 * np.pi * 256 * np.finfo(float).eps
-    record.close(case, what, np.stack(stamps[1:]) / stamps[0], 1, bound)
-
-
-def test_energy(bench, record):
-    """Parseval: one period of the image holds Σ A² of the pupil's Σ A."""
-    pupil, rng = annular_pupil(32, 0.3), np.random.default_rng(bench.config.seed)
-    pixel, opd = 2.0 / pupil.spacing / 16, rng.uniform(-0.5, 0.5, (2, *pupil.amplitude.shape))
-    total = StampPropagator(pupil, 16, pixel, 24, "complex128")(opd).sum(axis=(1, 2))
-    total *= pupil.amplitude.sum() / (pupil.amplitude**2).sum()
-    case = f"Parseval, pixel of {pixel:.3g} λ/D"
-    record.close(case, "|energy − 1| over one period", total, 1, 1e-10)
-
-
 def agreement(record, case, config, source, offset, reach, truth, budget, **optics):
     """Row: within the budget of the truth, or refused; MSE, None if refused, ∞ without a truth."""
     expected, error = f"≤ {budget:.3g} or SamplingError", None

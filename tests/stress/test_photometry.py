@@ -69,31 +69,6 @@ def put(images, place, value):
     return out
 
 
-def test_single_photons(bench, record):
-    """Stars of one photon on the usual sky: marked, and without consequence for the network."""
-    stars, sky = bench.test_stars(), bench.noise.background
-    found = measured(bench, bench.stream("photon").poisson(stars + sky) - sky)
-    case = "stars of one photon on the sky"
-    # Noise passes three times its error in 0.13 % of the stars; the error itself is measured.
-    unmarked = np.mean((found.flags & (StarFlag.NO_FLUX | StarFlag.FAINT)) == 0)
-    scatter = SIGMAS * (0.0013 / len(stars)) ** 0.5
-    record.at_most(case, "part without a flag", unmarked, 0.0013 + scatter)
-    # Half of a Gaussian's deviations are within 0.67 of its standard deviation.
-    ratio = np.median(np.abs(found.flux - 1) / found.flux_error)
-    record.within(case, "median error over stated error", ratio, 0.55, 0.8)
-
-
-def test_units(bench, record):
-    """The same stars in another unit: the same images."""
-    # Each with a bad pixel, so that it is fitted in double precision.
-    stars = put(bright_stars(bench, 32), (slice(None), 3, 4), np.nan)
-    before, found = measured(bench, stars), measured(bench, stars * 1e-300)
-    # A sum of P terms and five fits, each rounding once per term at worst.
-    bound, ratio = 5 * stars[0].size * np.finfo(float).eps, found.flux / 1e-300 / before.flux
-    case = "images in units of 1e-300"
-    record.close(case, "relative change of the flux", ratio, 1, bound)
-
-
 def test_hot_pixels(bench, record):
     """One pixel off the core too bright by 1e-3 … 1e6 times the star's flux."""
     model, stars = bench.flux_models["seidel"], bench.test_stars()
