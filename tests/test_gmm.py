@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -21,13 +22,10 @@ NOISE = NoiseModel(kappa=5.0, background=1e4)
 D = 6
 LEVEL = 2e-3
 ONE = {
-    "stars": None,
-    "components": [1],
-    "shrinkage": [20.0],
-    "principal": 8,
-    "place": 1.0,
-    "threads": 1,
+    **{"stars": None, "components": [1], "shrinkage": [20.0]},
+    **{"principal": 8, "place": 1.0, "threads": 1},
 }
+CONFIG = {"noise": {"kappa": NOISE.kappa, "background_photons": NOISE.background}}
 
 
 def stars(count, seed=1):
@@ -71,8 +69,27 @@ def training(count=400, same=True, images=None):
     )
 
 
-def fitted(count=400, same=True, kind=GaussianMixture, **changed):
-    return kind.fit(training(count, same), Gmm(**{**ONE, **changed}))
+@cache
+def _fitted(clusters, same, kind):
+    return kind.fit(training(400, same), Gmm(**{**ONE, "components": [clusters]}))
+
+
+def fitted(clusters=1, same=True, kind=GaussianMixture):
+    """A fit without what it remembers of other tests."""
+    return replace(_fitted(clusters, same, kind))
+
+
+def noisy_of(images, level=LEVEL):
+    return NOISE.draw(images, level, np.random.default_rng(3))
+
+
+@pytest.fixture
+def exact(monkeypatch):
+    """Sums without what the mixture leaves out because it hardly counts."""
+    monkeypatch.setattr(module, "NOISE_STEP", 1e-3)
+    monkeypatch.setattr(module, "FLAT_VARIANCE", 0.0)
+    monkeypatch.setattr(module, "LEAST_VARIANCE", 0.0)
+    monkeypatch.setattr(mixing, "LEAST_WEIGHT", 0.0)
 
 
 def dense(mixture, noisy, level, position):
@@ -122,29 +139,23 @@ def dense(mixture, noisy, level, position):
 @pytest.mark.parametrize("same", [True, False])
 @pytest.mark.parametrize("kind", [GaussianMixture, Placed])
 @pytest.mark.parametrize("level", [1e-4, LEVEL, 0.05])
-@pytest.mark.parametrize("clusters", [1, 12])
-def test_sums_are_those_of_dense_matrices(same, kind, level, clusters, monkeypatch):
+@pytest.mark.usefixtures("exact")
+def test_sums_are_those_of_dense_matrices(same, kind, level):
     """Those of images of one noise, and those of images that say theirs one by one."""
-    monkeypatch.setattr(module, "NOISE_STEP", 1e-3)
-    monkeypatch.setattr(module, "FLAT_VARIANCE", 0.0)
-    monkeypatch.setattr(module, "LEAST_VARIANCE", 0.0)
-    monkeypatch.setattr(mixing, "LEAST_WEIGHT", 0.0)
-    mixture = fitted(same=same, kind=kind, components=[clusters])
-    noisy = NOISE.draw(stars(50, seed=2)[0], level, np.random.default_rng(3))
-    mean, sigma, evidence = dense(mixture, noisy, level, where(50, seed=2))
-    for of_each in (level, np.full(len(noisy), level)):
-        found = mixture.estimate(noisy, of_each, where(50, seed=2))
+    mixture, places = fitted(12, same, kind), where(50, seed=2)
+    noisy = noisy_of(stars(50, seed=2)[0], level)
+    mean, sigma, evidence = dense(mixture, noisy, level, places)
+    for levels in (level, np.full(len(noisy), level)):
+        found = mixture.estimate(noisy, levels, places)
         np.testing.assert_allclose(found.psf, mean, atol=2e-4 * mean.max())
         np.testing.assert_allclose(found.sigma**2, sigma**2, rtol=0.01, atol=1e-7)
         np.testing.assert_allclose(found.evidence, evidence, atol=0.05)
 
 
 @pytest.mark.parametrize("same", [True, False])
-def test_a_flux_that_is_an_estimate_is_found(same, monkeypatch):
-    monkeypatch.setattr(module, "FLAT_VARIANCE", 0.0)
-    monkeypatch.setattr(module, "LEAST_VARIANCE", 0.0)
-    monkeypatch.setattr(mixing, "LEAST_WEIGHT", 0.0)
-    mixture, rng, pixels = fitted(same=same, components=[12]), np.random.default_rng(3), D * D
+@pytest.mark.usefixtures("exact")
+def test_a_flux_that_is_an_estimate_is_found(same):
+    mixture, rng, pixels = fitted(12, same), np.random.default_rng(3), D * D
     images, wider = stars(300, seed=2)
     flux = rng.normal(1.0, 0.1, (300, 1, 1))
     noisy = NOISE.draw(images, LEVEL / 5, rng) + (flux - 1) * (images - 1 / pixels)
@@ -163,7 +174,7 @@ def test_a_flux_that_is_an_estimate_is_found(same, monkeypatch):
 
 def test_total_variance_is_that_of_the_stars_and_with_a_free_flux_of_no_less():
     """By it coordinates are left out in which noise hides all differences of the clusters."""
-    mixture, (images, _) = fitted(components=[4]), stars(400)
+    mixture, (images, _) = fitted(4), stars(400)
     flux = np.random.default_rng(5).normal(1.0, mixing.FLUX_SIGMA, (400, 1))
     flat = images.reshape(400, -1)
     loose = flux * flat + (1 - flux) / flat.shape[1]
@@ -174,10 +185,9 @@ def test_total_variance_is_that_of_the_stars_and_with_a_free_flux_of_no_less():
 
 
 def test_one_cluster_is_linear_mmse():
-    data = training(same=False)
-    mixture = GaussianMixture.fit(data, Gmm(**ONE))
+    data, mixture = training(same=False), fitted(same=False)
     x, y = (a.reshape(len(a), -1).astype(float) for a in (data.images, data.references))
-    noisy = NOISE.draw(stars(20, seed=2)[0], LEVEL, np.random.default_rng(3))
+    noisy = noisy_of(stars(20, seed=2)[0])
     s = NOISE.variance(np.full(20, 1.0 / D**2), LEVEL)[0]
     dx, dy = x - x.mean(axis=0), y - y.mean(axis=0)
     system = dx.T @ dx / len(x) + s * np.eye(D**2)
@@ -187,62 +197,50 @@ def test_one_cluster_is_linear_mmse():
 
 
 def test_levels_of_their_own_are_those_of_all():
-    mixture = fitted(components=[12])
+    mixture = fitted(12)
     levels = np.repeat(np.geomspace(1e-3, 1e-2, 20), 5)
-    noisy = NOISE.draw(stars(100, seed=2)[0], levels, np.random.default_rng(3))
+    noisy = noisy_of(stars(100, seed=2)[0], levels)
     each = np.concatenate([mixture.predict(z[None], v) for z, v in zip(noisy, levels, strict=True)])
     error = np.square(mixture.predict(noisy, levels) - each).mean()
     assert error < 4e-3 * np.square(each - stars(100, seed=2)[0]).mean()
 
 
 def test_the_nearest_clusters_are_enough(monkeypatch):
-    mixture = fitted(components=[40])
-    truth = stars(200, seed=2)[0]
-    noisy = NOISE.draw(truth, LEVEL, np.random.default_rng(3))
+    mixture, truth = fitted(40), stars(200, seed=2)[0]
+    noisy = noisy_of(truth)
     every = np.square(mixture.predict(noisy, LEVEL) - truth).mean()
     monkeypatch.setattr(module, "NEAREST", 10)
     assert np.square(mixture.predict(noisy, LEVEL) - truth).mean() < 1.02 * every
 
 
-def test_it_beats_one_cluster_and_its_input_on_stars_of_several_kinds():
-    truth = stars(400, seed=2)[0]
-    noisy = NOISE.draw(truth, LEVEL, np.random.default_rng(3))
-    errors = [
-        np.square(fitted(components=[k], shrinkage=[5.0]).predict(noisy, LEVEL) - truth).mean()
-        for k in (1, 12)
-    ]
-    assert errors[1] < 0.9 * errors[0] < 0.9 * np.square(noisy - truth).mean()
-
-
 def test_positions_have_unit_variance_within_clusters():
-    p = fitted(kind=Placed, components=[4]).deviation_center
+    p = fitted(4, kind=Placed).deviation_center
     assert p.T @ p / len(p) == pytest.approx(np.eye(2), abs=1e-5)
 
 
-def test_validation_stars_choose():
-    wanted = fitted(components=[1, 12], shrinkage=[5.0, 1e6])
+def test_validation_stars_choose_and_the_last_value_that_was_tried_is_named(capsys):
+    settings = Gmm(**{**ONE, "components": [1, 12], "shrinkage": [5.0, 1e6]})
+    wanted = GaussianMixture.fit(training(), settings)
     assert len(wanted.count) == 12 and wanted.shrinkage == [5.0]
     assert wanted.count.sum() == 400
-    other = GaussianMixture.fit(
-        training().without_validation(), Gmm(**{**ONE, "components": [1, 12]})
-    )
+    assert "K = 12" in capsys.readouterr().out
+    other = GaussianMixture.fit(training().without_validation(), settings)
     assert len(other.count) == 12 and other.count.sum() == 350
 
 
-@pytest.mark.parametrize("kind", [GaussianMixture, Placed])
-def test_another_seed_keeps_what_the_search_has_chosen(kind):
-    data = training()
-    if kind is Placed:  # stars stand anywhere: the search leaves the position aside
-        data = replace(data, positions=np.random.default_rng(3).normal(size=(400, 2)))
+def test_another_seed_keeps_what_the_search_has_chosen():
+    """Stars stand anywhere: the search leaves the position aside."""
+    places = np.random.default_rng(3).normal(size=(400, 2))
+    data = replace(training(), positions=places)
     settings = Gmm(**{**ONE, "components": [1, 3], "shrinkage": [20.0, 5.0]})
-    found = kind.fit(data, settings)
-    same, other = (found.again(replace(data, seed=seed), settings) for seed in (data.seed, 5))
-    for name in kind.stored():
-        np.testing.assert_array_equal(getattr(same, name), getattr(found, name))
-    assert len(other.count) == len(found.count) == 3
-    assert other.shrinkage == found.shrinkage
-    assert other.whitening.any() == found.whitening.any()
-    assert not np.array_equal(other.mean, found.mean)
+    first = Placed.fit(data, settings)
+    same, other = (first.again(replace(data, seed=seed), settings) for seed in (data.seed, 5))
+    for name in Placed.stored():
+        np.testing.assert_array_equal(getattr(same, name), getattr(first, name))
+    assert len(other.count) == len(first.count) == 3
+    assert other.shrinkage == first.shrinkage
+    assert other.whitening.any() == first.whitening.any()
+    assert not np.array_equal(other.mean, first.mean)
 
 
 def test_a_search_goes_both_ways_and_more_clusters_must_pay():
@@ -259,23 +257,13 @@ def test_a_search_goes_both_ways_and_more_clusters_must_pay():
     assert climbed({1: 2.0, 4: 2.0, 16: 2.0}, 4) == 4
 
 
-def test_a_search_that_ends_at_the_last_value_says_so(capsys):
-    fitted(components=[4, 1, 12], shrinkage=[20.0, 5.0])
-    assert "ν = 5; K = 12, ν = 5: last that were tried" in capsys.readouterr().out
-    fitted(components=[12, 1, 350])
-    assert "last that were tried" not in capsys.readouterr().out
-    fitted(components=[12])
-    assert capsys.readouterr().out == ""
-
-
 @pytest.mark.parametrize("free", [False, True])
+@pytest.mark.usefixtures("exact")
 def test_outlier_score_of_one_cluster_is_the_square_of_mahalanobis_distance(free, monkeypatch):
-    monkeypatch.setattr(module, "FLAT_VARIANCE", 0.0)
-    monkeypatch.setattr(module, "LEAST_VARIANCE", 0.0)
     monkeypatch.setattr(module, "OUTLIER_COORDINATES", 10)
     mixture = fitted(same=False)
     mixture = mixture.free_flux() if free else mixture
-    noisy = NOISE.draw(stars(20, seed=2)[0], LEVEL, np.random.default_rng(3))
+    noisy = noisy_of(stars(20, seed=2)[0])
     s = NOISE.variance(1.0 / D**2, LEVEL)
     residual = (noisy.reshape(20, -1) @ mixture.axes - mixture.mean[0])[:, :10].astype(float)
     row = mixture.loose * mixture._contrast[0, :10].astype(float)
@@ -287,63 +275,57 @@ def test_outlier_score_of_one_cluster_is_the_square_of_mahalanobis_distance(free
     np.testing.assert_allclose(found, wanted, rtol=2e-3, atol=0.05)
 
 
-@pytest.mark.parametrize("clusters", [1, 8])
-def test_noise_of_the_training_stars_is_no_part_of_the_prior(clusters):
-    rng, images = np.random.default_rng(4), stars(3000)[0]
-    sky = 0.01
+def test_noise_of_the_training_stars_is_no_part_of_the_prior():
+    rng, images, sky = np.random.default_rng(4), stars(2000)[0], 0.01
     own = images + rng.normal(0, sky, images.shape).astype(np.float32)
-    chosen = Gmm(**{**ONE, "components": [clusters]})
-    clean, raw = (GaussianMixture.fit(training(images=x), chosen) for x in (images, own))
-
-    def covariance(which, mean):
-        return (which.size - 1) * sky**2 * np.eye(mean.size)
-
-    data = replace(training(images=own), own_noise=covariance)
-    less = GaussianMixture.fit(data, chosen)
+    told = replace(
+        training(images=own),
+        own_noise=lambda which, mean: (which.size - 1) * sky**2 * np.eye(D * D),
+    )
+    settings = Gmm(**{**ONE, "components": [8]})
+    clean, raw, less = (
+        GaussianMixture.fit(data, settings)
+        for data in (training(images=images), training(images=own), told)
+    )
     excess = [m.variance.sum() / clean.variance.sum() - 1 for m in (raw, less)]
     assert excess[0] > 0.1 and abs(excess[1]) < 0.2 * excess[0]
     truth = stars(400, seed=2)[0]
-    noisy = NOISE.draw(truth, LEVEL, np.random.default_rng(3))
-    errors = [np.square(m.predict(noisy, LEVEL) - truth).mean() for m in (raw, less)]
+    errors = [np.square(m.predict(noisy_of(truth), LEVEL) - truth).mean() for m in (raw, less)]
     assert errors[1] < errors[0]
 
 
 def test_it_is_stored_and_the_same_again(tmp_path):
-    mixture, noisy = fitted(same=False, components=[12]), stars(5, seed=2)[0]
-    mixture.save(tmp_path / "a.h5", {"noise": {"kappa": 5.0, "background_photons": 1e4}})
+    mixture, noisy = fitted(12, same=False), stars(5, seed=2)[0]
+    mixture.save(tmp_path / "a.h5", CONFIG)
     again = GaussianMixture.load(tmp_path / "a.h5")
     np.testing.assert_array_equal(again.predict(noisy, LEVEL), mixture.predict(noisy, LEVEL))
-    twice = fitted(same=False, components=[12])
-    assert all(
-        np.array_equal(getattr(twice, n), getattr(mixture, n)) for n in GaussianMixture.stored()
-    )
-    assert replace(mixture, shrinkage=np.array([1.0])).shrinkage == [1.0]
+    twice = _fitted.__wrapped__(12, False, GaussianMixture)
+    for name in GaussianMixture.stored():
+        np.testing.assert_array_equal(getattr(twice, name), getattr(mixture, name))
 
 
 def test_a_bundle_has_the_main_axes_of_each_cluster():
-    mixture, (truth, _) = fitted(components=[4]), stars(200, seed=2)
-    noisy = NOISE.draw(truth, LEVEL, np.random.default_rng(3))
-    config = {"noise": {"kappa": NOISE.kappa, "background_photons": NOISE.background}}
+    mixture, (truth, _) = fitted(4), stars(200, seed=2)
+    noisy = noisy_of(truth)
 
-    arrays, said = mixture.pack(D, NOISE.kappa * LEVEL)
-    assert said == {} and arrays["rows"].sum() == len(arrays["deviation"]) < 400
-    whole = mixture.estimate(noisy, LEVEL)
-    some = GaussianMixture.restored(arrays, config, "realisation").estimate(noisy, LEVEL)
-    assert np.square(some.psf - whole.psf).mean() < 1e-4 * np.square(whole.psf - truth).mean()
-    np.testing.assert_allclose(some.sigma, whole.sigma, rtol=0.01)
-    np.testing.assert_allclose(some.evidence, whole.evidence, atol=0.5)
-    much = GaussianMixture.restored(mixture.pack(D, 0.1)[0], config, "realisation")
-    assert len(much.deviation) < 0.6 * len(arrays["deviation"])
+    def restored(arrays):
+        return GaussianMixture.restored(arrays, CONFIG, "realisation").estimate(noisy, LEVEL)
+
+    arrays, _ = mixture.pack(D, NOISE.kappa * LEVEL)
+    assert arrays["rows"].sum() == len(arrays["deviation"]) < 400
+    whole, main = mixture.estimate(noisy, LEVEL), restored(arrays)
+    assert np.square(main.psf - whole.psf).mean() < 1e-4 * np.square(whole.psf - truth).mean()
+    np.testing.assert_allclose(main.sigma, whole.sigma, rtol=0.01)
+    np.testing.assert_allclose(main.evidence, whole.evidence, atol=0.5)
+    assert len(mixture.pack(D, 0.1)[0]["deviation"]) < 0.6 * len(arrays["deviation"])
     size = sum(array.nbytes for array in arrays.values())
-    assert (
-        packed(mixture, D, NOISE.kappa * LEVEL, np.inf)[0]["rows"].tolist()
-        == arrays["rows"].tolist()
-    )
+    unlimited = packed(mixture, D, NOISE.kappa * LEVEL, np.inf)[0]
+    assert unlimited["rows"].tolist() == arrays["rows"].tolist()
     smaller = packed(mixture, D, NOISE.kappa * LEVEL, 0.8 * size)[0]
     assert 0.6 * size < sum(array.nbytes for array in smaller.values()) <= 0.8 * size
-    less = GaussianMixture.restored(smaller, config, "realisation").estimate(noisy, LEVEL)
-    assert np.square(less.psf - truth).mean() < 1.1 * np.square(whole.psf - truth).mean()
-    with pytest.raises(BundleError, match=r"GMM .*: takes more than 0.001 MB"):
+    errors = [np.square(e.psf - truth).mean() for e in (restored(smaller), whole)]
+    assert errors[0] < 1.1 * errors[1]
+    with pytest.raises(BundleError, match=r"takes more than 0.001 MB"):
         packed(mixture, D, NOISE.kappa * LEVEL, 1e3)
 
 
@@ -353,18 +335,16 @@ def test_a_bundle_has_the_main_axes_of_each_cluster():
         ("axes", lambda a: 1.1 * a),
         ("variance", lambda a: -a),
         ("count", lambda a: a * (np.arange(a.size) > 0)),
-        ("rows", lambda a: a + 1),
         ("mean", lambda a: 2 * a),
         ("deviation", lambda a: 300 * a),
         ("shrinkage", lambda a: 0 * a),
     ],
 )
-def test_arrays_that_no_fit_leaves_are_known(name, change):
-    arrays = fitted(components=[4]).pack(D, NOISE.kappa * LEVEL)[0]
-    config = {"noise": {"kappa": NOISE.kappa, "background_photons": NOISE.background}}
+def test_arrays_that_no_fit_leaves_are_named(name, change):
+    arrays = fitted(4).pack(D, NOISE.kappa * LEVEL)[0]
 
     def wrong(arrays):
-        laws = GaussianMixture.restored(arrays, config, "realisation").conditions()
+        laws = GaussianMixture.restored(arrays, CONFIG, "realisation").conditions()
         return [law for law, _, right in laws if not np.all(right)]
 
     assert wrong(arrays) == []
@@ -375,7 +355,7 @@ def test_the_position_is_used_where_it_tells_something():
     """Positions decide the kind of the star; or they are those of other stars."""
     data, settings = training(), Gmm(**{**ONE, "components": [4, 12]})
     truth, place = stars(400, seed=2)[0], where(400, seed=2)
-    noisy = NOISE.draw(truth, 4 * LEVEL, np.random.default_rng(3))
+    noisy = noisy_of(truth, 4 * LEVEL)
     told, untold = (kind.fit(data, settings) for kind in (Placed, GaussianMixture))
     errors = [np.square(m.predict(noisy, 4 * LEVEL, place) - truth).mean() for m in (told, untold)]
     assert errors[0] < 0.9 * errors[1]
@@ -386,10 +366,3 @@ def test_the_position_is_used_where_it_tells_something():
     np.testing.assert_allclose(
         kept.predict(noisy, LEVEL, place), kept.predict(noisy, LEVEL, -place), atol=1e-7
     )
-
-
-def test_no_stars_have_no_psfs():
-    none, mixture = np.empty((0, D, D), np.float32), fitted(components=[4])
-    found = mixture.estimate(none, np.empty(0))
-    assert found.psf.shape == found.sigma.shape == none.shape
-    assert mixture.outlier_score(none, np.empty(0)).shape == (0,)

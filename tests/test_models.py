@@ -20,14 +20,12 @@ from psfdae.networks.dae import (
     SingleChannelConv,
     build_dae,
     image_scale,
-    middle_px,
     predict,
     train_dae,
 )
 from psfdae.networks.settings import DaeSettings, Train
-from psfdae.networks.training import DeadNetworkError, TrainingError, orthogonal, progress
+from psfdae.networks.training import DeadNetworkError, TrainingError, orthogonal
 from psfdae.networks.weights import load_weights, save_checkpoint, save_weights
-from psfdae.rng import stream
 from psfdae_paper.methods import pca_som
 from psfdae_paper.methods.pca_som import Baseline, PcaFit, PcaSom, fit_pca_som
 
@@ -106,14 +104,6 @@ def test_linear_mmse_is_the_posterior_mean_of_gaussian_data(noise):
     )
 
 
-def test_linear_mmse_returns_the_mean_when_the_noise_is_overwhelming(gaussian_stars, noise):
-    fitted = LinearMmse.of(gaussian_stars, gaussian_stars, noise)
-    estimate = fitted.predict(gaussian_stars[:5], 1e3)
-    assert estimate == pytest.approx(
-        np.broadcast_to(gaussian_stars.mean(axis=0), (5, 16, 16)), abs=1e-6
-    )
-
-
 def test_linear_mmse_finds_references_that_are_another_image(noise):
     """References of few linear modes of the images, almost no noise: they come back."""
     rng = np.random.default_rng(0)
@@ -141,34 +131,20 @@ def test_baseline_recovers_separate_classes():
     images = classes[label] + 0.01 * rng.normal(size=(300, 8, 8))
     fitted = fit_pca_som(images, components=4, **SOM)
     assert mse(fitted.predict(images), classes[label]).max() < 1e-4
+    assert np.isfinite(fitted.psf).all()  # of 16 nodes, those without stars are left out
 
 
-def test_baseline_leaves_out_empty_nodes(gaussian_stars):
-    few = gaussian_stars[:12]
-    fitted = fit_pca_som(few, components=4, **SOM)
-    assert len(fitted.psf) <= 12
-    assert np.isfinite(fitted.predict(gaussian_stars)).all()
-
-
-def test_baseline_is_repeatable(gaussian_stars):
-    first, second = (fit_pca_som(gaussian_stars, components=6, **SOM) for _ in range(2))
-    assert (first.psf == second.psf).all()
-
-
-def test_baseline_refuses_more_components_than_stars(gaussian_stars):
-    with pytest.raises(ValueError, match=r"components = 30: must be at most 20"):
+def test_baseline_refuses_more_components_than_stars_and_stars_that_are_not_finite(gaussian_stars):
+    with pytest.raises(ValueError, match="components = 30"):
         fit_pca_som(gaussian_stars[:20], components=30, **SOM)
-
-
-def test_baseline_refuses_stars_that_are_not_finite(gaussian_stars):
     fitted = fit_pca_som(gaussian_stars, components=4, **SOM)
     broken = gaussian_stars.copy()
     broken[7, 0, 0], broken[9, 3, 3] = np.nan, np.inf
-    with pytest.raises(ValueError, match=r"2 of \d+ .* not finite, the first is number 7"):
+    with pytest.raises(ValueError, match="not finite, the first is number 7"):
         fitted.predict(broken)
 
 
-def test_map_begins_otherwise_with_another_seed_of_the_configuration(data, monkeypatch):
+def test_map_of_mixed_levels_depends_on_the_seed_and_ignores_the_level(data, monkeypatch):
     seeds, settings = [], Baseline(**BASELINE, per_level=False)
 
     def begun(images, *, seed, **others):
@@ -176,9 +152,10 @@ def test_map_begins_otherwise_with_another_seed_of_the_configuration(data, monke
         return fit_pca_som(images, seed=seed, **others)
 
     monkeypatch.setattr(pca_som, "fit_pca_som", begun)
-    for seed in (1, 2, 1):
-        PcaSom.fit(replace(data, seed=seed), settings)
+    fits = [PcaSom.fit(replace(data, seed=seed), settings) for seed in (1, 2, 1)]
     assert seeds[0] == seeds[2] != seeds[1]
+    low, high = (fits[0].predict(data.images, level) for level in (1e-5, 1.0))
+    assert (low == high).all()
 
 
 def test_baseline_of_each_level_has_that_level_s_noise(data, tmp_path):
@@ -191,42 +168,28 @@ def test_baseline_of_each_level_has_that_level_s_noise(data, tmp_path):
     near = np.where(np.arange(len(data.images)) % 2, 2e-3, 3e-3)
     found = fitted.predict(data.images, near)
     assert (found == np.where(near[:, None, None] < 2.2e-3, low, high)).all()
-    assert (fitted.predict(data.images, 1.0) == high).all()
     fitted.save(tmp_path / "fit.h5", {})
     assert (PcaSom.load(tmp_path / "fit.h5").predict(data.images, near) == found).all()
-    assert fitted.fits[0].components.shape == (4, 256)
-
-
-def test_baseline_of_mixed_levels_ignores_the_level(data):
-    mixed = PcaSom.fit(data, Baseline(**BASELINE, per_level=False))
-    assert (mixed.predict(data.images, 1e-5) == mixed.predict(data.images, 1.0)).all()
 
 
 def test_dae_keeps_the_size_and_is_never_negative(gaussian_stars):
-    kernels = [9, 7, 5, 3, 1, 1, 3, 5, 7, 9]
-    model = build_dae(kernels, [4] * 9, "he", torch.Generator().manual_seed(0))
+    model = build_dae([9, 5, 1, 9], [4] * 3, "he", torch.Generator().manual_seed(0))
     out = predict(model, gaussian_stars[:7], image_scale("mean", 16), batch=3)
     assert out.shape == (7, 16, 16)
     assert (out >= 0).all()
-    sizes = [layer.kernel_size[0] for layer in model.layers]
-    assert sizes == kernels
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize(
-    ("kernel", "shape"), [(9, (8, 8)), (9, (10, 10)), (9, (13, 17)), (9, (3, 5)), (1, (6, 7))]
-)
-def test_single_channel_convolution_is_the_plain_one(kernel, shape, dtype):
+@pytest.mark.parametrize(("kernel", "shape"), [(9, (13, 17)), (9, (3, 5)), (1, (6, 7))])
+def test_single_channel_convolution_is_the_plain_one(kernel, shape):
     torch.manual_seed(3)
-    layer = SingleChannelConv(5, 1, kernel, padding=kernel // 2).to(dtype)
-    x = torch.randn(2, 5, *shape, dtype=dtype).to(memory_format=torch.channels_last)
+    layer = SingleChannelConv(5, 1, kernel, padding=kernel // 2)
+    x = torch.randn(2, 5, *shape).to(memory_format=torch.channels_last)
     x.requires_grad_()
     plain = torch.nn.functional.conv2d(x, layer.weight, layer.bias, padding=kernel // 2)
     torch.testing.assert_close(layer(x), plain)
-    upstream = torch.randn_like(plain)
-    of = (x, *layer.parameters())
-    found, wanted = (torch.autograd.grad(y, of, upstream) for y in (layer(x), plain))
-    torch.testing.assert_close(found, wanted)
+    upstream, inputs = torch.randn_like(plain), (x, *layer.parameters())
+    gradients = (torch.autograd.grad(y, inputs, upstream) for y in (layer(x), plain))
+    torch.testing.assert_close(*gradients)
 
 
 def test_he_initialisation_keeps_the_variance(gaussian_stars):
@@ -236,7 +199,7 @@ def test_he_initialisation_keeps_the_variance(gaussian_stars):
     assert not model.layers[0].bias.any()
 
 
-@pytest.mark.parametrize("widths", [[16] * 4, [7, 3, 5, 9], [1] * 4])
+@pytest.mark.parametrize("widths", [[7, 3, 5, 9], [1] * 4])
 def test_linear_start_has_the_least_squares_of_what_its_last_layer_sees(data, widths, monkeypatch):
     """A linear function of the layer before has no smaller error: the two are uncorrelated."""
     monkeypatch.setattr(dae_network, "LINEAR_PX", data.images[data.fit].size)
@@ -272,16 +235,8 @@ def test_linear_start_is_near_the_best_linear_estimator(data):
     assert errors["linear"] < 0.1 * errors["he"]
 
 
-def test_linear_start_refuses_stars_that_are_not_finite(data):
-    references = data.references.copy()
-    references[data.fit[0]] = np.nan
-    linear = DAE.model_copy(update={"init": "linear"})
-    with pytest.raises(TrainingError, match="training stars that are not finite"):
-        DaeTraining(replace(data, references=references), linear, TRAIN, 3)
-
-
 def test_training_learns_and_repeats(data, tmp_path):
-    longer = TRAIN.model_copy(update={"epochs": 12})
+    longer = TRAIN.model_copy(update={"epochs": 8})
     first = train(data, tmp_path, longer)
     second = train(data, tmp_path, longer)
     assert same(first.result, second.result)
@@ -291,24 +246,23 @@ def test_training_learns_and_repeats(data, tmp_path):
 
 def test_a_network_begins_on_the_threads_of_its_training(data, monkeypatch):
     """Near eigenpatches turn into each other by the rounding of another number of threads."""
-    before, seen = torch.get_num_threads(), []
+    before, threads = torch.get_num_threads(), []
     monkeypatch.setattr(
-        "psfdae.networks.dae.begin_linear", lambda *given: seen.append(torch.get_num_threads())
+        dae_network, "begin_linear", lambda *_: threads.append(torch.get_num_threads())
     )
     torch.set_num_threads(2)
     DaeTraining(data, DAE.model_copy(update={"init": "linear"}), TRAIN, 3)
-    assert seen == [1]
+    assert threads == [1]
     torch.set_num_threads(before)
 
 
-def test_interrupted_training_continues_as_if_nothing_had_happened(data, tmp_path):
-    whole = train(data, tmp_path)
-
-    interrupted(data, tmp_path, 2)
-    assert (tmp_path / "checkpoint.pt").exists()
-    seen = []
-    resumed = train(data, tmp_path, report=lambda row: seen.append(row["epoch"]))
-    assert seen == [2, 3]
+@pytest.mark.parametrize("optimiser", ["adam", "muon"])
+def test_interrupted_training_continues_as_if_nothing_had_happened(data, tmp_path, optimiser):
+    settings, epochs = TRAIN.model_copy(update={"optimiser": optimiser}), []
+    whole = train(data, tmp_path, settings)
+    interrupted(data, tmp_path, 2, train_config=settings)
+    resumed = train(data, tmp_path, settings, report=lambda row: epochs.append(row["epoch"]))
+    assert epochs == [2, 3]
     assert same(whole.result, resumed.result)
 
 
@@ -332,32 +286,36 @@ def test_another_training_s_checkpoint_is_ignored(data, tmp_path):
     assert epochs == [1, 2, 3]
 
 
-def test_exploding_loss_stops_with_advice(data, tmp_path):
+def test_numbers_that_are_not_finite_stop_a_training_with_advice(data, tmp_path, monkeypatch):
     wild = TRAIN.model_copy(update={"lr": 1.0, "grad_clip": 0.0, "schedule": "constant"})
     bright = replace(data, references=data.references * np.float32(1e30))
     with pytest.raises(TrainingError, match=r"the loss is .* lower train\.lr = 1\.0"):
         train(bright, tmp_path, wild)
+    references = np.where(np.arange(300)[:, None, None] == data.fit[0], np.nan, data.references)
+    linear = DAE.model_copy(update={"init": "linear"})
+    with pytest.raises(TrainingError, match="training stars that are not finite"):
+        DaeTraining(replace(data, references=references), linear, TRAIN, 3)
+    nan = torch.tensor(float("nan"))
+    monkeypatch.setattr(torch.nn.utils, "clip_grad_norm_", lambda *_: nan)
+    with pytest.raises(TrainingError, match=r"gradient's norm is nan .* lower train\.lr"):
+        train(data, tmp_path)
 
 
-def test_dead_network_restarts_and_then_gives_up(data, tmp_path, monkeypatch, capsys):
-    import psfdae.networks.dae as module
+def killed(model):
+    with torch.no_grad():
+        model.layers[-1].bias.fill_(-1e6)
+    return model
 
-    def dead(*args):
-        model = build_dae(*args)
-        with torch.no_grad():
-            model.layers[-1].bias.fill_(-1e6)
-        return model
 
-    monkeypatch.setattr(module, "build_dae", dead)
+def test_dead_network_restarts_and_then_gives_up(data, tmp_path, monkeypatch):
+    monkeypatch.setattr(dae_network, "build_dae", lambda *given: killed(build_dae(*given)))
     with pytest.raises(TrainingError, match="died in all 2 attempts"):
         train(data, tmp_path)
-    assert "starting from another seed" in capsys.readouterr().out
 
 
 def test_every_check_notices_a_dead_network_and_no_other_step_looks(data):
     training = DaeTraining(data, DAE, TRAIN, 3, 0)
-    with torch.no_grad():
-        training.model.layers[-1].bias.fill_(-1e6)
+    killed(training.model)
     batch = next(training.batches(0))
     for step in range(1, 7):
         dead = step % TRAIN.dead_check_steps == 0
@@ -367,44 +325,34 @@ def test_every_check_notices_a_dead_network_and_no_other_step_looks(data):
 
 
 def test_restart_uses_other_weights(data, tmp_path, monkeypatch):
-    import psfdae.networks.dae as module
-
     attempts = []
 
-    def dead_once(*args):
-        model = build_dae(*args)
+    def dead_once(*given):
+        model = build_dae(*given)
         attempts.append(model.layers[0].weight.detach().clone())
-        if len(attempts) == 1:
-            with torch.no_grad():
-                model.layers[-1].bias.fill_(-1e6)
-        return model
+        return killed(model) if len(attempts) == 1 else model
 
-    monkeypatch.setattr(module, "build_dae", dead_once)
+    monkeypatch.setattr(dae_network, "build_dae", dead_once)
     whole = train(data, tmp_path)
     assert whole.attempt == 1
     assert not torch.equal(*attempts)
     attempts.clear()
     interrupted(data, tmp_path, 2)
     resumed = train(data, tmp_path)
-    assert len(attempts) == 3  # the dead one, the one that was interrupted, and that again
+    # The dead one, the one that was interrupted, and that again.
+    assert len(attempts) == 3 and torch.equal(attempts[1], attempts[2])
     assert resumed.attempt == 1
     assert same(whole.result, resumed.result)
 
 
-def test_fresh_noise_every_epoch(data):
-    stars = np.arange(10)
-    first, _ = data.draw(stars, stream(1, "dae", "epoch", 0, 0))
-    second, _ = data.draw(stars, stream(1, "dae", "epoch", 0, 1))
-    assert (first != second).any(axis=(1, 2)).all()
-
-
-def test_fixed_noise_is_the_same_in_every_epoch(data):
-    settings = TRAIN.model_copy(update={"noise": "fixed", "batch": 250})
-    training = DaeTraining(data, DAE, settings, 3, 0)
-    first, second = (next(training.batches(epoch))[0] for epoch in range(2))
-    again = DaeTraining(data, DAE, settings, 3, 0)
-    assert torch.equal(first.sum((1, 2, 3)).sort()[0], second.sum((1, 2, 3)).sort()[0])
-    assert all(map(np.array_equal, training.fixed, again.fixed))
+@pytest.mark.parametrize("kind", ["fixed", "fresh"])
+def test_noise_is_the_same_in_every_epoch_only_if_fixed(data, kind):
+    settings = TRAIN.model_copy(update={"noise": kind, "batch": 250})
+    training, again = (DaeTraining(data, DAE, settings, 3, 0) for _ in range(2))
+    batches = [next(t.batches(epoch))[0] for t, epoch in ((training, 0), (training, 1), (again, 1))]
+    first, second, repeated = (noisy.sum((1, 2, 3)).sort()[0] for noisy in batches)
+    assert torch.equal(first, second) == (kind == "fixed")
+    assert torch.equal(second, repeated)
 
 
 def test_errors_of_faint_stars_count_less_by_a_power_of_their_noise(data):
@@ -435,9 +383,7 @@ def test_steps_of_muon_are_along_orthogonal_matrices():
     [
         ("realisation", (8, 8, 8, 10, 12, 14, 16, 16)),
         ("template", (12,) * 4 + (16,) * 4),
-        ("realisation", (8, 10, 16)),
         ("realisation", (16,)),
-        ("template", (16,)),
     ],
 )
 def test_training_begins_with_the_middle_of_the_stamps(data, reference, sides):
@@ -450,15 +396,6 @@ def test_training_begins_with_the_middle_of_the_stamps(data, reference, sides):
         ):
             edge = (16 - side) // 2
             assert torch.equal(part, full[:, :, edge : 16 - edge, edge : 16 - edge])
-
-
-@pytest.mark.parametrize("stamp_px", [7, 16, 24, 25])
-@pytest.mark.parametrize("reference", ["realisation", "template"])
-def test_middle_of_stamps_grows_about_their_middle(stamp_px, reference):
-    sides = [middle_px(stamp_px, part, reference) for part in np.linspace(0.0, 1.2, 25)]
-    assert sides == sorted(sides) and sides[-1] == stamp_px
-    assert all(side % 2 == stamp_px % 2 for side in sides)
-    assert abs(sides[0] / stamp_px - (0.5 if reference == "realisation" else 0.75)) <= 1 / stamp_px
 
 
 def test_training_goes_on_from_another_network(data):
@@ -500,30 +437,14 @@ def test_muon_steps_as_far_as_adam_and_leaves_the_rest_to_it(data):
             assert torch.equal(a, m)
 
 
-def test_interrupted_muon_continues_as_if_nothing_had_happened(data, tmp_path):
-    settings = TRAIN.model_copy(update={"optimiser": "muon"})
-    whole = train(data, tmp_path, settings)
-    interrupted(data, tmp_path, 2, train_config=settings)
-    assert same(whole.result, train(data, tmp_path, settings).result)
-
-
 def test_patience_stops_a_training_that_no_longer_improves(data, tmp_path):
     hopeless = TRAIN.model_copy(
-        update={"epochs": 30, "lr": 1e-12, "schedule": "constant", "patience": 4}
+        update={"epochs": 12, "lr": 1e-12, "schedule": "constant", "patience": 2}
     )
     # At this rate nothing changes, so every validation after the first brings nothing new.
-    assert len(train(data, tmp_path, hopeless).history) < 30
-    unlimited = hopeless.model_copy(update={"epochs": 6, "patience": 0})
-    assert len(train(data, tmp_path, unlimited).history) == 6
-
-
-def test_gradient_that_is_not_finite_stops_with_advice(data, tmp_path, monkeypatch):
-    def spoil(model, limit):
-        return torch.tensor(float("nan"))
-
-    monkeypatch.setattr(torch.nn.utils, "clip_grad_norm_", spoil)
-    with pytest.raises(TrainingError, match=r"gradient's norm is nan .* lower train\.lr"):
-        train(data, tmp_path)
+    assert len(train(data, tmp_path, hopeless).history) < 12
+    unlimited = hopeless.model_copy(update={"epochs": 5, "patience": 0})
+    assert len(train(data, tmp_path, unlimited).history) == 5
 
 
 def test_weights_come_back_and_damage_is_noticed(tmp_path):
@@ -531,32 +452,14 @@ def test_weights_come_back_and_damage_is_noticed(tmp_path):
     state = {"w": torch.arange(600.0).reshape(20, 30).T, "steps": torch.tensor(7)}
     path = tmp_path / "dae.safetensors"
     save_weights(path, state, {"seed": 1})
-    found = load_weights(path)
-    assert {name: array.tolist() for name, array in found.items()} == {
-        name: tensor.tolist() for name, tensor in state.items()
-    }
+    weights = load_weights(path)
+    assert all(np.array_equal(weights[name], tensor) for name, tensor in state.items())
     whole = path.read_bytes()
-    for place in (-1, -20, -300, -1200, -2000, -2400):
-        damaged = bytearray(whole)
-        damaged[place] ^= 1
+    flipped = (whole[:k] + bytes([whole[k] ^ 1]) + whole[k + 1 :] for k in (300, 1000, 2400))
+    for damaged in (*flipped, whole[:-5], whole[:20], b"hello"):
         path.write_bytes(damaged)
-        with pytest.raises(ProductError, match=r"dae\.safetensors: damaged .*checksum"):
-            load_weights(path)
-    for text in (whole[:-5], whole[:20], b"", b"hello"):
-        path.write_bytes(text)
         with pytest.raises(ProductError, match=r"dae\.safetensors: damaged"):
             load_weights(path)
     path.unlink()
     with pytest.raises(ProductError, match="no such file"):
         load_weights(path)
-
-
-def test_progress_says_what_was_measured_and_how_long_it_takes(capsys):
-    row = {"epoch": 1, "train_mse": 2e-5, "validation_mse": np.nan, "seconds": 3.0}
-    with progress(4) as report:
-        report(row)
-        report({**row, "epoch": 2, "validation_mse": 1e-5})
-    assert capsys.readouterr().out.splitlines() == [
-        "epoch 1/4  train MSE 2.000e-05  3 s, about 9 s left",
-        "epoch 2/4  train MSE 2.000e-05  validation MSE 1.000e-05  3 s, about 3 s left",
-    ]

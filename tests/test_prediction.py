@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from dataclasses import replace
 
 import numpy as np
@@ -10,13 +9,12 @@ import pytest
 
 from prediction_stars import KAPPA, SKY, observe
 from psfdae import Prediction, PredictionError, StarFlag
-from psfdae.image.stamps import MEANING, cut
+from psfdae.image.stamps import cut
 from psfdae.model import photometry
 from psfdae.model import psf_model as model
 from psfdae.model.psf_model import BLOCK, PsfModel
 from psfdae.threads import in_order
 
-LEVELS = (1e-4, 1e-3, 3e-3)
 COLUMNS = tuple(Prediction.__dataclass_fields__)
 
 
@@ -41,9 +39,9 @@ def close(a, b, rows=slice(None), rel=1e-3):
     """
     least = {"position_angle_deg": 50 * rel, "residual": 2e-5 * SKY**0.5}
     for name in COLUMNS:
-        of = {"rel": rel, "abs": least.get(name, 1e-3)}
-        wanted = pytest.approx(getattr(b, name)[rows], nan_ok=True, **of)
-        assert getattr(a, name)[rows] == wanted, name
+        x, y = (np.asarray(getattr(p, name)[rows], np.float64) for p in (a, b))
+        tolerance = np.maximum(rel * np.abs(y), least.get(name, 1e-3))
+        assert ((np.abs(x - y) <= tolerance) | (np.isnan(x) & np.isnan(y))).all(), name
     return True
 
 
@@ -59,7 +57,7 @@ def clean(shipped, medium):
     return shipped.predict(medium.stamps)
 
 
-@pytest.mark.parametrize("level", LEVELS)
+@pytest.mark.parametrize("level", [1e-4, 1e-3, 3e-3])
 def test_uncertainty_covers_68_per_cent_and_the_flux_error_is_the_scatter(
     shipped, field_psfs, level
 ):
@@ -109,24 +107,19 @@ def test_noise_sky_and_signal_to_noise_are_measured(shipped, medium, clean):
     assert np.median(clean.snr / matched) == pytest.approx(1.0, abs=0.05)
 
 
-def test_noise_of_very_bright_stars_is_never_too_small(shipped, field_psfs):
-    """Light of the star that the model does not know must not make the S/N infinite."""
-    found = shipped.predict(observe(field_psfs, 3e-5).stamps)
-    assert found.noise.min() > 0.8 * SKY**0.5
-    assert not has(found, StarFlag.SNR_HIGH).any()
-
-
 def test_flux_of_bright_stars_is_found_with_more_noise_than_there_is(shipped, field_psfs):
-    """What the model does not know of a star's shape would pass for flux."""
+    """What the model does not know of a star's shape would pass for flux and for no noise."""
     told = replace(shipped.bundle, info=shipped.info.model_copy(update={"misfit": 0.0}))
     stars = observe(field_psfs, 3e-5)
-    with_misfit, without = (m.predict(stars.stamps).flux for m in (shipped, PsfModel(told)))
-    assert rms(with_misfit / stars.flux - 1) < 0.7 * rms(without / stars.flux - 1)
+    found, without = (m.predict(stars.stamps) for m in (shipped, PsfModel(told)))
+    assert rms(found.flux / stars.flux - 1) < 0.7 * rms(without.flux / stars.flux - 1)
+    assert found.noise.min() > 0.8 * SKY**0.5
+    assert (found.flags > 0).mean() < 0.02
 
 
 def test_residual_is_what_is_left_of_the_stamp(medium, clean):
     left = medium.stamps - clean.background[:, None, None] - clean.psf
-    assert clean.residual == pytest.approx(left, abs=1e-2)
+    np.testing.assert_allclose(clean.residual, left, rtol=0, atol=1e-2)
     assert np.median(clean.chi2) == pytest.approx(1.0, abs=0.15)
 
 
@@ -137,18 +130,10 @@ def test_a_residual_far_above_the_noise_is_flagged(shipped, field_psfs, monkeypa
     stamps = np.random.default_rng(4).poisson(flux * double + 100.0).astype(np.float32)
     monkeypatch.setattr(model, "MOST_CHI2", 2.0)
     found = shipped.predict(stamps, gain=1.0, noise=10.0)
-    poor = (found.flags & int(StarFlag.POOR_FIT)) > 0
+    poor = has(found, StarFlag.POOR_FIT)
     assert (poor == (found.chi2 > 2.0)).all() and 5 < poor.sum() < 55
     without = shipped.predict(stamps, noise=10.0)  # the gain: fewer photons are expected
-    assert ((without.flags & int(StarFlag.POOR_FIT)) > 0).sum() >= poor.sum()
-
-
-def test_chi2_of_a_star_that_is_followed_everywhere_is_a_number():
-    """Where the doubt about a PSF exceeds the noise, hardly anything is expected to be left."""
-    residual = np.full((1, 8, 8), 0.1)
-    psf, doubt = np.ones((1, 8, 8)), np.full((1, 8, 8), 3.0)
-    chi2 = model._chi2(residual, psf, doubt, np.ones(1), np.full(1, np.nan))
-    assert chi2 == pytest.approx(0.1**2 / model.LEAST_LEFT)
+    assert has(without, StarFlag.POOR_FIT).sum() >= poor.sum()
 
 
 def test_photons_of_the_star_belong_to_chi2_if_the_gain_is_known(shipped, field_psfs):
@@ -159,10 +144,10 @@ def test_photons_of_the_star_belong_to_chi2_if_the_gain_is_known(shipped, field_
     assert counted.flux_error == pytest.approx(np.hypot(without.flux_error, without.flux**0.5))
 
 
-@pytest.mark.parametrize("unit", [1e-12, 7.0, 1e12])
+@pytest.mark.parametrize("unit", [1e-12, 1e12])
 def test_any_unit_gives_the_same_psf(shipped, medium, clean, unit):
     found = shipped.predict(medium.stamps[:100].astype(np.float64) * unit)
-    assert found.psf / unit == pytest.approx(clean.psf[:100], rel=1e-3, abs=1e-2)
+    np.testing.assert_allclose(found.psf / unit, clean.psf[:100], rtol=1e-3, atol=1e-2)
     assert found.snr == pytest.approx(clean.snr[:100], rel=1e-3)
     assert np.mean(found.flags == clean.flags[:100]) > 0.99
 
@@ -172,36 +157,22 @@ def test_result_depends_neither_on_threads_nor_on_company(name, rel, medium, req
     model = request.getfixturevalue(name)
     clean = model.predict(medium.stamps)
     assert len(medium.stamps) > BLOCK
-    for threads in (2, None):
-        assert same(model.predict(medium.stamps, threads=threads), clean)
+    assert same(model.predict(medium.stamps, threads=2), clean)
     order = np.random.default_rng(0).permutation(len(medium.stamps))
-    for rows in (slice(5, 8), slice(300, 301), order):
+    for rows in (slice(300, 301), order):
         picked = replace(clean, **{n: getattr(clean, n)[rows] for n in COLUMNS})
         assert close(model.predict(medium.stamps[rows]), picked, rel=rel)
     assert model.predict(medium.stamps[300]).psf.shape == (1, 16, 16)
 
 
-@pytest.mark.parametrize("kind", [">f4", np.int32, ">i2", list])
-def test_numbers_of_any_type_and_byte_order_are_taken(shipped, medium, clean, kind):
+@pytest.mark.parametrize("kind", [">f4", ">i2", list])
+def test_numbers_of_any_type_and_byte_order_are_taken_and_left_alone(shipped, medium, clean, kind):
     few = medium.stamps[:9]
-    found = shipped.predict(few.tolist() if kind is list else few.astype(kind))
-    assert found.psf == pytest.approx(clean.psf[:9], rel=1e-4, abs=1e-2)
-    assert found.psf.dtype == np.float32
-
-
-def test_inputs_are_left_alone(shipped, medium):
-    stamps, bad = medium.stamps[:5].copy(), np.zeros((5, 16, 16), dtype=bool)
-    stamps[1, 3, 3], bad[2, 4, 4] = np.nan, True
-    before = stamps.copy(), bad.copy()
-    shipped.predict(stamps, bad=bad)
-    assert np.array_equal(stamps, before[0], equal_nan=True)
-    assert np.array_equal(bad, before[1])
-
-
-def test_no_star_gives_no_row(shipped):
-    found = shipped.predict(np.empty((0, 16, 16)))
-    assert len(found) == 0
-    assert found.uncertainty.shape == (0, 16, 16)
+    given = few.tolist() if kind is list else few.astype(kind)
+    psf = shipped.predict(given).psf
+    assert psf == pytest.approx(clean.psf[:9], rel=1e-4, abs=1e-2)
+    assert psf.dtype == np.float32
+    assert np.array_equal(given, few.astype(kind) if kind is not list else few)
 
 
 def put(value, *place):
@@ -213,15 +184,11 @@ def put(value, *place):
 
 BROKEN = {
     "a NaN": (StarFlag.MASKED, put(np.nan, 4, 9)),
-    "an infinity": (StarFlag.MASKED, put(np.inf, 8, 8)),
     "a dead row": (StarFlag.MASKED, put(np.nan, 5)),
     "all NaN": (StarFlag.MASKED | StarFlag.NO_FLUX, put(np.nan)),
-    "a hot pixel": (StarFlag.OUTLIER, put(9e4, 3, 3)),
     "a huge pixel": (StarFlag.OUTLIER, put(3e38, 8, 8)),
-    "zeros": (StarFlag.NO_FLUX, put(0.0)),
     "a constant": (StarFlag.NO_FLUX, put(SKY)),
     "negative": (StarFlag.NO_FLUX, lambda stamp: np.subtract(2 * SKY, stamp, stamp)),
-    "all negative": (StarFlag.NO_FLUX, lambda stamp: np.negative(stamp, stamp)),
     "far off centre": (StarFlag.OFF_CENTRE, lambda stamp: put(np.roll(stamp, 5, 0))(stamp)),
 }
 
@@ -241,39 +208,27 @@ def test_broken_stamps_are_flagged_and_their_neighbours_do_not_notice(name, alik
     assert alike(found, model.predict(medium.stamps), slice(len(BROKEN), None))
 
 
-def test_a_block_without_a_good_pixel_is_that_of_each_star_and_asks_nothing(
-    shipped, medium, monkeypatch
-):
+def test_a_block_without_a_good_pixel_asks_nothing(shipped, medium, monkeypatch):
     """The stars of a catalogue that reaches far beyond the image."""
     stamps = medium.stamps[:BLOCK]
     bad = np.ones(stamps.shape, dtype=bool)
     known = {"flux": np.where(np.arange(BLOCK) % 3, np.nan, 500.0)}
     known["background"] = np.where(np.arange(BLOCK) % 2, np.nan, SKY)
-    alone = [
-        shipped.predict(stamps[[k]], bad=bad[[k]], **{n: v[[k]] for n, v in known.items()})
-        for k in range(6)
-    ]
-    fits = []
+    first = {name: values[[0]] for name, values in known.items()}
+    alone, fits = shipped.predict(stamps[[0]], bad=bad[[0]], **first), []
     monkeypatch.setattr(type(shipped.engine.estimator), "estimate", None)
     careful = photometry.robust_flux
     monkeypatch.setattr(photometry, "robust_flux", lambda *a: fits.append(a) or careful(*a))
     found = shipped.predict(stamps, bad=bad, **known)
     assert np.isnan(found.psf).all() and has(found, StarFlag.NO_FLUX).all()
-    for k, one in enumerate(alone):
-        picked = replace(found, **{n: getattr(found, n)[[k]] for n in COLUMNS})
-        assert same(one, picked)
+    assert same(alone, replace(found, **{n: getattr(found, n)[[0]] for n in COLUMNS}))
     assert len(fits) == 2  # sky given, sky free
-
-
-def test_good_stars_carry_no_flag(shipped, field_psfs, clean):
-    assert (clean.flags > 0).mean() < 0.02
-    bright = shipped.predict(observe(field_psfs, 1e-4).stamps)
-    assert (bright.flags > 0).mean() < 0.02
 
 
 def test_masked_and_saturated_pixels_are_repaired_and_left_out(shipped, medium, clean):
     bad = np.zeros(medium.stamps.shape, dtype=bool)
     bad[:, 3, 4] = bad[:, 12, 7] = True
+    bad[0, :12] = True  # more than half of a star
     spoilt = medium.stamps.copy()
     spoilt[bad] = 6e4
     masked = shipped.predict(spoilt, bad=bad)
@@ -281,19 +236,13 @@ def test_masked_and_saturated_pixels_are_repaired_and_left_out(shipped, medium, 
     assert has(masked, StarFlag.MASKED).all()
     assert not has(masked, StarFlag.SATURATED).any()
     assert has(saturated, StarFlag.SATURATED).all()
+    assert has(masked, StarFlag.NO_FLUX)[0] and np.isnan(masked.psf[0]).all()
     assert np.isnan(masked.residual[bad]).all()
-    assert np.isfinite(masked.residual[~bad]).mean() > 0.999
+    assert np.isfinite(masked.residual[~bad]).mean() > 0.99
     assert np.array_equal(masked.psf, saturated.psf, equal_nan=True)
     truth = medium.flux * medium.truth
     assert rms(masked.psf - truth) < 1.2 * rms(clean.psf - truth)
-    assert np.median(masked.noise) == pytest.approx(np.median(clean.noise), rel=0.05)
-
-
-def test_half_a_star_is_still_measured_but_less_is_not(shipped, medium):
-    bad = np.zeros((2, 16, 16), dtype=bool)
-    bad[0, :6] = bad[1, :12] = True
-    found = shipped.predict(medium.stamps[:2], bad=bad)
-    assert has(found, StarFlag.NO_FLUX).tolist() == [False, True]
+    assert np.nanmedian(masked.noise) == pytest.approx(np.median(clean.noise), rel=0.05)
 
 
 def test_given_values_are_used_and_missing_ones_estimated(shipped, medium, clean):
@@ -307,8 +256,8 @@ def test_given_values_are_used_and_missing_ones_estimated(shipped, medium, clean
     sky = shipped.predict(medium.stamps, background=SKY + 1.0)
     assert (sky.background == SKY + 1.0).all()
     assert rms(sky.flux / medium.flux - 1) < rms(clean.flux / medium.flux - 1)
-    for wrong in (0.0, -5.0):
-        assert has(shipped.predict(medium.stamps[:3], flux=wrong), StarFlag.NO_FLUX).all()
+    wrong = shipped.predict(medium.stamps[:2], flux=np.array([0.0, -5.0]))
+    assert has(wrong, StarFlag.NO_FLUX).all()
 
 
 @pytest.mark.parametrize(("end", "factor"), [("LOW", 0.6), ("HIGH", 2.0)])
@@ -355,31 +304,25 @@ def test_what_is_no_single_star_of_this_telescope_is_flagged(shipped, field_psfs
 
 
 def test_scale_of_a_pixel_is_checked(shipped):
-    for scale in (0.1, 0.1019, 0.0981):
+    for scale in (0.1019, 0.0981):
         shipped.check_scale(scale, "x.fits")
-    for scale, text in (
-        (0.1021, r"x\.fits: pixels of 0\.1021 arcsec.*trained on 0\.1 arcsec.*psfdae from-stars"),
-        (None, r"x\.fits: .*--pixel-scale.*psfdae from-stars trains one"),
-        (np.nan, r"x\.fits: pixels of nan"),
-    ):
-        with pytest.raises(PredictionError, match=text):
+    for scale, text in ((0.1021, "0.1021 arcsec"), (None, "--pixel-scale"), (np.nan, "nan")):
+        with pytest.raises(PredictionError, match=f"x.fits: .*{text}"):
             shipped.check_scale(scale, "x.fits")
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"stamps": np.zeros((3, 24, 24))}, "3×24×24, but the model 'wfsat' takes n×16×16"),
-        ({"stamps": np.zeros((3, 16, 15))}, "3×16×15"),
+        ({"stamps": np.zeros((3, 24, 24))}, "3×24×24.* n×16×16"),
         ({"stamps": np.zeros(256)}, "shape 256"),
-        ({"margin": 2}, "takes n×20×20"),
-        ({"margin": -1}, "takes n×14×14"),
-        ({"stamps": np.zeros((3, 16, 16), complex)}, "complex128, expected real numbers"),
-        ({"stamps": [["a"]]}, "expected real numbers"),
-        ({"bad": np.zeros((3, 16, 15))}, r"bad of shape \(3, 16, 15\)"),
-        ({"saturated": np.zeros((2, 16, 16))}, r"saturated of shape \(2, 16, 16\)"),
-        ({"flux": np.ones(4)}, r"flux of shape \(4,\), expected one for 3 stamps"),
-        ({"noise": "many"}, "noise of type"),
+        ({"margin": 2}, "n×20×20"),
+        ({"margin": -1}, "n×14×14"),
+        ({"stamps": np.zeros((3, 16, 16), complex)}, "complex128"),
+        ({"bad": np.zeros((3, 16, 15))}, r"bad .*\(3, 16, 15\)"),
+        ({"saturated": np.zeros((2, 16, 16))}, r"saturated .*\(2, 16, 16\)"),
+        ({"flux": np.ones(4)}, r"flux .*\(4,\)"),
+        ({"noise": "many"}, "noise"),
     ],
 )
 def test_what_does_not_fit_is_refused_with_the_numbers(shipped, arguments, message):
@@ -387,23 +330,13 @@ def test_what_does_not_fit_is_refused_with_the_numbers(shipped, arguments, messa
         shipped.predict(**{"stamps": np.zeros((3, 16, 16)), **arguments})
 
 
-def test_flags_have_meanings():
-    assert set(MEANING) == set(StarFlag)
-
-
 # The stream of blocks
 
 
 def test_stream_keeps_order_and_takes_no_more_than_it_needs():
-    taken, lock = [], threading.Lock()
-
-    def items():
-        for number in range(50):
-            with lock:
-                taken.append(number)
-            yield number
-
-    results = in_order(lambda n: n * n, items(), 3)
+    taken = []
+    items = (taken.append(number) or number for number in range(50))
+    results = in_order(lambda n: n * n, items, 3)
     assert next(results) == (0, 0)
     assert len(taken) <= 5
     assert list(results) == [(n, n * n) for n in range(1, 50)]

@@ -35,29 +35,22 @@ def cheap(tmp_path_factory):
 def test_streamed_product_is_that_of_one_write(tmp_path):
     values = np.random.default_rng(1).random((70, 5, 5))
     fixed = Column(np.arange(70), "1", "number")
-    write_product(
-        tmp_path / "one.h5", "k", {"a": Column(values, "m", "x"), "n": fixed}, {"seed": 1}
-    )
+    columns = {"a": Column(values, "m", "x"), "n": fixed}
+    write_product(tmp_path / "one.h5", "k", columns, {"seed": 1})
+    empty = Empty((70, 5, 5), float, "m", "x")
+    columns = {"a": empty, "n": fixed, "b": empty}
     for name in ("two.h5", "three.h5"):
-        columns = {"a": Empty((70, 5, 5), float, "m", "x"), "n": fixed}
         with stream_product(tmp_path / name, "k", columns, {"seed": 1}) as data:
             for start in range(0, 70, 32):
                 data["a"][start : start + 32] = values[start : start + 32]
     one, two = (read_product(tmp_path / name, "k") for name in ("one.h5", "two.h5"))
-    assert (one["a"] == two["a"]).all()
-    assert (one["n"] == two["n"]).all()
+    assert (one["a"] == two["a"]).all() and (one["n"] == two["n"]).all()
+    assert (two["b"] == two["a"]).all()  # the same empty column is a link
     assert one.config == two.config
     assert (tmp_path / "two.h5").read_bytes() == (tmp_path / "three.h5").read_bytes()
     with h5py.File(tmp_path / "one.h5") as whole, h5py.File(tmp_path / "two.h5") as streamed:
         assert dict(whole["a"].attrs) == dict(streamed["a"].attrs)
         assert streamed["a"].fletcher32
-
-
-def test_same_empty_column_is_a_link(tmp_path):
-    empty = Empty((3, 2), np.float32, "1", "x")
-    with stream_product(tmp_path / "p.h5", "k", {"a": empty, "b": empty}, {}) as data:
-        data["a"][:] = 7
-    assert (read_product(tmp_path / "p.h5", "k")["b"] == 7).all()
 
 
 def test_unfilled_or_failed_stream_leaves_no_file(tmp_path):
@@ -98,7 +91,7 @@ def test_search_is_exact_for_large_pixels():
     # Measuring 400 slopes takes longer than the test; the largest grid serves all.
     source.slopes = lambda: np.zeros((len(source), 2, 2))  # type: ignore[method-assign]
     optics = config.optics.model_copy(update={"pupil_samples": [222]})
-    some = np.arange(4, 400, 19)
+    some = np.arange(4, 400, 39)
     settings = (source, config.telescope)
     found = Propagation(*settings, optics, config.framing, 12).brightest(some)
     fine = optics.model_copy(update={"precision": "complex128"})
@@ -110,12 +103,12 @@ def test_search_is_exact_for_large_pixels():
 
 @pytest.fixture(scope="module")
 def memory(cheap, tmp_path_factory):
-    """Memory that simulation and prediction of 4000 and of 40 000 stars take, MB."""
+    """Memory that simulation and prediction of 4000 and of 20 000 stars take, MB."""
     folder = tmp_path_factory.mktemp("memory")
     tree = dict(compose([*CHEAP, "dae.kernels=[3,3]", "dae.widths=[2]"]))
     stars, cube, bundle = (folder / name for name in ("stars.h5", "stars.fits", "m.safetensors"))
     found = {"simulate": [], "predict": []}
-    for count in (4000, 40_000):
+    for count in (4000, 20_000):
         tree["stars"] = {**tree["stars"], "count": count}
         costs = {
             "simulate": alone(1, cost_of_command, ["stars", "--templates", cheap[1]], stars, tree)
@@ -133,5 +126,5 @@ def memory(cheap, tmp_path_factory):
 @pytest.mark.parametrize("job", ["simulate", "predict"])
 def test_memory_does_not_grow_with_the_stars(memory, job):
     few, many = memory[job]
-    # Images alone would need 37 000 × 3 kB = 110 MB more; the drawn numbers 100 bytes a star.
-    assert many - few < 25
+    # Images alone would need 16 000 × 3 kB = 48 MB more; the drawn numbers 100 bytes a star.
+    assert many - few < 20

@@ -9,7 +9,7 @@ import numpy as np
 
 from psfdae.model.packing import COMPONENTS, leading
 from psfdae.model.photometry import FluxModel, Photometer
-from psfdae.networks.dae import DaeTraining, TrainingSet, image_scale
+from psfdae.networks.dae import TrainingSet, image_scale
 from psfdae.noise import NoiseModel
 from psfdae.rng import stream
 from psfdae.splits import draw_jitter
@@ -19,12 +19,10 @@ from psfdae_paper.stars.framing import Propagation, normalise_flux
 from psfdae_paper.stars.scenes import star_wavefronts
 
 THREADS = 2  # of the linear algebra, and trainings side by side
-# Noise levels λ of the paper's three bands.
-LEVELS = 1e-5 * np.array([3, 5, 7, 9, 30, 50, 70, 90, 100, 200, 300, 500])
-# The smallest that the stamps of a scene carry, over all of its datasets.
+# Smallest noise level λ that the stamps of a scene carry, over all of its datasets.
 LEAST_LEVEL = {"seidel": 3e-5, "turbulence": 3e-4}
 BUDGET = 0.01  # numerical MSE of a stamp in units of the smallest noise variance that it carries
-MODEL_STARS, TRAINING_STARS = 1000, 250  # of scene 1's flux model, of the network in the bench
+MODEL_STARS = 1000  # of scene 1's flux model
 
 
 class Scene(NamedTuple):
@@ -87,17 +85,6 @@ class Bench:
         parts = np.arange(held, len(images)), np.arange(held)
         return TrainingSet(images, images, *parts, levels, self.noise)
 
-    @cached_property
-    def network(self):
-        """The configured network after a few steps: weights as they occur in use."""
-        update = {"epochs": 3, "batch": 25, "threads": 1, "schedule": "onecycle", "patience": 0}
-        settings = self.config.train.model_copy(update=update)
-        data = self.training_set(TRAINING_STARS)
-        training = DaeTraining(data, self.config.dae, settings, self.config.seed)
-        for _ in range(settings.epochs):
-            training.run_epoch()
-        return training.model.eval()
-
 
 def fresh_stars(config, count):
     """Noise-free normalised stars of scene 1 from random streams of their own."""
@@ -133,17 +120,3 @@ def stamp_mse(stamps, truth):
     """Largest mean squared difference of two sets of stamps of sum 1; NaN if one is NaN."""
     difference = normalise_flux(stamps)[0] - normalise_flux(truth)[0]
     return float((difference**2).mean(axis=(1, 2)).max())
-
-
-def rounding_of(dae):
-    """Single-precision rounding of a forward pass over its largest output."""
-    # Every layer sums kernel² · width terms; their roundings add at random.
-    terms = sum(kernel**2 for kernel in dae.kernels) * max(dae.widths)
-    return float(np.finfo(np.float32).eps) * float(np.sqrt(terms))
-
-
-def subspace_angle(first, second):
-    """Sine of the largest principal angle between the row spaces of (K, P) arrays."""
-    a, b = (np.linalg.qr(rows.T.astype(np.float64))[0] for rows in (first, second))
-    # From the part of one that lies outside the other: cosines near 1 would lose all digits.
-    return float(np.linalg.norm(b - a @ (a.T @ b), 2))

@@ -30,7 +30,7 @@ OPTIONS = {
 }
 READS = ("seed", "noise", "dae", "train", "baseline", "evaluation")
 STARS = 1200  # of a product that are used, at most
-ORDER = ("precision", "optics", "photometry", "baseline", "mixture", "network", "metrics", "repeat")
+ORDER = ("precision", "optics", "photometry", "mixture", "network", "metrics", "repeat")
 
 
 class Record:

@@ -4,13 +4,12 @@ import numpy as np
 
 from psfdae.method import FitError, TrainingSet
 from psfdae.methods.gmm import GaussianMixture, Gmm
-from stress.bench import Bench
 
 EPS = float(np.finfo(np.float32).eps)
 
 
 def test_limits(bench, record):
-    """λ → 0 gives the image, λ → ∞ the mean star; a factor of 10⁴ of λ, all are finite."""
+    """λ → 0 gives the image, λ → ∞ the mean star; a factor of 10⁴ of λ, none errs more."""
     images = bench.seidel.images
     mixture, truth = fit(bench, images, [8]), images[:40]
     # Stars of the fit: so few span no more than themselves, others would be projected.
@@ -19,33 +18,29 @@ def test_limits(bench, record):
     mean, lost = images.mean(axis=0), mixture.predict(truth, 1e6 * bench.level)
     what = "difference from the mean star over its peak"
     record.close("λ → ∞", what, lost, mean, 100 * EPS, over=mean.max())
-    for factor in (1e-2, 1e-1, 1.0, 1e1, 1e2):
+    for factor in (1e-2, 1e2):
         noisy = bench.noise.draw(truth, factor * bench.level, bench.stream("mixture"))
-        found = mixture.estimate(noisy, factor * bench.level)
-        case = f"λ × {factor:g}"
-        record.equal(case, "finite estimates", all_finite(found), True)
-        ours, theirs = (np.square(x - truth).mean() for x in (found.psf, noisy))
-        record.at_most(case, "MSE over that of the noisy images", ours / theirs, 1.02)
+        psf = mixture.predict(noisy, factor * bench.level)
+        ratio = np.square(psf - truth).mean() / np.square(noisy - truth).mean()
+        record.at_most(f"λ × {factor:g}", "MSE over that of the noisy images", ratio, 1.02)
 
 
 def test_few_and_equal_stars(bench, record):
-    """One star, equal stars, a cluster of one star, more clusters than stars."""
+    """Equal stars, a cluster of one star, more clusters than stars."""
     images = bench.seidel.images[:31]
     noisy = bench.noise.draw(images, bench.level, bench.stream("few"))
-    peak = images[0].max()
-    for case, stars, clusters in (
-        ("one star", images[:1], [1]),
-        ("equal stars", np.repeat(images[:1], 30, axis=0), [1, 4]),
-    ):
-        found = fit(bench, stars, clusters).predict(noisy, bench.level)
-        what = "difference of all estimates from the star over its peak"
-        record.close(case, what, found, images[0], 100 * EPS, over=peak)
+    equal = fit(bench, np.repeat(images[:1], 30, axis=0), [1, 4]).predict(noisy, bench.level)
+    what, peak = "difference of all estimates from the star over its peak", images[0].max()
+    record.close("equal stars", what, equal, images[0], 100 * EPS, over=peak)
     lonely = images.copy()
     lonely[0] = 0.0
     lonely[0, 0, 0] = 10.0  # so far off that no other cluster pays
-    apart, case = fit(bench, lonely, [2]), "a cluster of one star"
-    record.equal(case, "stars of the smallest cluster", apart.count.min(), 1)
-    record.equal(case, "finite estimates", all_finite(apart.estimate(noisy, bench.level)), True)
+    apart = fit(bench, lonely, [2])
+    found = apart.estimate(noisy, bench.level)
+    finite = all(np.isfinite(a).all() for a in (found.psf, found.sigma, found.evidence))
+    record.equal(
+        "a cluster of one star", "finite estimates", finite and apart.count.min() == 1, True
+    )
     with record.refused("more clusters than stars", FitError):
         fit(bench, images, [500])
 
@@ -53,20 +48,15 @@ def test_few_and_equal_stars(bench, record):
 def test_broken_stars(bench, record):
     """A star without a distance to any cluster: in the training set, and before a fitted one."""
     fitted = fit(bench, bench.seidel.images[:64], [4])
-    for label, value in (("NaN", np.nan), ("infinite", np.inf)):
-        images, case = bench.seidel.images[:64].copy(), f"{label} pixel in a star of the mixture"
-        images[3, 4, 5] = value
-        with record.refused(f"{case}'s training set", ValueError):
-            fit(bench, images, [4])
-        with record.refused(case, ValueError):
-            fitted.predict(images, bench.level)
+    images, case = bench.seidel.images[:64].copy(), "NaN pixel in a star of the mixture"
+    images[3, 4, 5] = np.nan
+    with record.refused(f"{case}'s training set", ValueError):
+        fit(bench, images, [4])
+    with record.refused(case, ValueError):
+        fitted.predict(images, bench.level)
 
 
-def all_finite(found):
-    return all(np.isfinite(a).all() for a in (found.psf, found.sigma, found.evidence))
-
-
-def fit(bench: Bench, images, components):
+def fit(bench, images, components):
     settings = Gmm(
         stars=None, components=components, shrinkage=[10.0], principal=20, place=1.0, threads=1
     )

@@ -7,37 +7,28 @@ from psfdae.optics.propagation import StampPropagator
 from psfdae.optics.pupil import SamplingError, annular_pupil
 from psfdae.optics.wavefronts import seidel_wavefronts
 from psfdae_paper.stars.framing import FramingError
-from psfdae_paper.stars.scenes import (
-    CYCLES_PER_DIAMETER,
-    SLOPE_SAMPLES,
-    TurbulentWavefronts,
-    template_wavefronts,
-)
-from psfdae_paper.stars.turbulence import SPECTRUM
+from psfdae_paper.stars.scenes import SLOPE_SAMPLES, TurbulentWavefronts, template_wavefronts
 from stress.bench import changed, propagation, stamp_mse
 
 FINER = (254, 318, 398, 512, 640, 800, 1024, 1280, 1600, 2048)  # N beyond the config's
 FINEST = 2700  # largest N of a converged reference; beyond it a stamp needs GBs
 # Relative field of the test stars: axis, edge, corner; and stamps about their chief rays.
 FIELDS, CENTRED = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]]), np.zeros((3, 2), int)
-PIXELS_ARCSEC = (1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.2, 0.3, 0.6, 1.0, 3.0, 10.0)
+WHAT = "MSE of normalised stamps"
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("factor", [1, 2, 3, 5, 7, 10, 20, 30, 50, 100])
+@pytest.mark.parametrize("factor", [1, 5, 10, 20])
 def test_stronger_aberrations(bench, record, factor):
-    """Seidel aberrations times 1 … 100: within the budget or refused."""
+    """Seidel aberrations times 1 … 20: within the budget or refused."""
     config, budget = bench.seidel.config, bench.budget(bench.seidel.config)
     static, grids = config.wavefront.coefficients, config.optics.pupil_samples
     source, peak = seidel(factor * static), stamper(config, seidel(3 * static), 64).brightest()
     offset = np.rint(peak * factor / 3).astype(int)
     reach = max(config.stars.search_px, int(np.abs(offset).max()) + 8)
     truth = reference(config, source, offset, reach)
-    case, what = f"aberrations × {factor}", "MSE of normalised stamps"
-    how = (config, source, offset, reach, truth, budget)
-    agreement(record, case, f"{what}, configured grids", *how, pupil_samples=grids)
-    error = agreement(record, case, f"{what}, grids up to 2048", *how)
-    record.point("aberrations", factor, error, budget)
+    case, how = f"aberrations × {factor}", (config, source, offset, reach, truth, budget)
+    record.point("aberrations", factor, agreement(record, case, *how), budget)
     if truth is not None:
         # The largest configured grid, whatever the wavefront needs.
         pupil = annular_pupil(grids[-1], config.telescope.obscuration)
@@ -47,32 +38,25 @@ def test_stronger_aberrations(bench, record, factor):
         record.point("aberrations, guard ignored", factor, ignored, budget)
         if factor == 10:
             # A guard that refuses what would have been right would be of no use.
-            record.within(case, f"{what} if the guard is ignored", ignored, budget, np.inf)
+            record.within(case, f"{WHAT} if the guard is ignored", ignored, budget, np.inf)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("factor", [1, 3, 10, 30, 100, 1000])
+@pytest.mark.parametrize("factor", [1, 10, 100])
 def test_stronger_turbulence(bench, record, factor):
-    """Fried's parameter divided by 1 … 1000: within the budget or refused."""
+    """Fried's parameter divided by 1 … 100: within the budget or refused."""
     config, budget = bench.turbulence.config, bench.budget(bench.turbulence.config)
-    r0, case = config.wavefront.r0_m / factor, f"turbulence, r0 / {factor}"
-    stronger = changed(config, grid={"points": 1}, wavefront={"r0_m": r0})
+    wavefront = {"r0_m": config.wavefront.r0_m / factor}
+    stronger, case = changed(config, grid={"points": 1}, wavefront=wavefront), f"r0 / {factor}"
     try:
         source = template_wavefronts(stronger)
     except SamplingError:
-        record.equal(case, "outcome", "SamplingError", "SamplingError")
+        record.equal(f"turbulence, {case}", "outcome", "SamplingError", "SamplingError")
         record.point("turbulence", factor, None, budget)
         return
     how = (config, source, np.zeros((len(source), 2), int), config.framing.search_px)
-    what, truth = "MSE of normalised stamps, grids up to 2048", reference(*how)
-    error = agreement(record, case, what, *how, truth, budget)
+    error = agreement(record, f"turbulence, {case}", *how, reference(*how), budget)
     record.point("turbulence", factor, error, budget)
-    if error is not None:
-        # ∫ of the spectrum beyond the last wave. This part of the light lands beyond the
-        # stamp; its square is what comes back and changes the normalised stamp.
-        highest = CYCLES_PER_DIAMETER / config.telescope.diameter_m
-        left_out = 1.2 * np.pi * SPECTRUM * (r0 * highest) ** (-5 / 3)
-        record.at_most(case, "phase variance left out (rad²)", left_out, 0.1)
 
 
 class Ramps(list):
@@ -86,20 +70,18 @@ class Ramps(list):
 def test_broken_wavefronts(bench, record):
     """Wavefronts that are not finite, absurdly strong or too steep for the grid."""
     config, static = bench.seidel.config, bench.seidel.config.wavefront.coefficients
-    for label, factor in (("NaN", np.nan), ("infinite", np.inf), ("times 1e20", 1e20)):
-        bad = seidel(np.stack([static, static * factor, static]))
-        with record.refused(f"a wavefront {label} among good ones", SamplingError):
-            propagation(config, bad).stamps(16, CENTRED)
-    for label, waves in (("NaN", np.nan), ("0.51 waves per sample", 0.51)):
-        bad = TurbulentWavefronts(Ramps([waves]))
-        with record.refused(f"OPD map, {label}", SamplingError):
-            propagation(bench.turbulence.config, bad, pupil_samples=[SLOPE_SAMPLES])
+    bad = seidel(np.stack([static, static * np.nan, static]))
+    with record.refused("a wavefront NaN among good ones", SamplingError):
+        propagation(config, bad).stamps(16, CENTRED)
+    steep = TurbulentWavefronts(Ramps([0.51]))
+    with record.refused("OPD map, 0.51 waves per sample", SamplingError):
+        propagation(bench.turbulence.config, steep, pupil_samples=[SLOPE_SAMPLES])
     with record.refused("brightest pixel outside the search window", FramingError):
         stamper(config, seidel(3 * static), 4).brightest()
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scale", PIXELS_ARCSEC)
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 10.0])
 def test_pixel_scale(bench, record, scale):
     """Pixels over four decades."""
     config, budget = bench.seidel.config, bench.budget(bench.seidel.config)
@@ -108,60 +90,19 @@ def test_pixel_scale(bench, record, scale):
     offset = np.rint(peak * config.telescope.pixel_scale_arcsec / scale).astype(int)
     rescaled = changed(config, telescope={"pixel_scale_arcsec": scale})
     how = (rescaled, source, offset, config.stars.search_px)
-    case, what = f"pixel of {scale:g} arcsec", "MSE of normalised stamps"
-    error = agreement(record, case, what, *how, reference(*how), budget)
+    error = agreement(record, f"pixel of {scale:g} arcsec", *how, reference(*how), budget)
     record.point("pixel scale", scale, error, budget)
 
 
-@pytest.mark.slow
-def test_similar_telescopes(bench, record):
-    """Aperture and wavelength over decades at the same λ/D per pixel: the same stamps."""
-    config, telescope = bench.seidel.config, bench.seidel.config.telescope
-    source, stamps = seidel(config.wavefront.coefficients), []
-    for factor in (1.0, 1e-1, 1e1, 1e3):
-        lengths = {n: factor * getattr(telescope, n) for n in ("diameter_m", "wavelength_m")}
-        exact = stamper(changed(config, telescope=lengths), source, precision="complex128")
-        stamps.append(exact.stamps(16, CENTRED))
-    case, what = "D and λ times 0.1 … 1000", "largest relative difference of a pixel"
-    # Rounding of p = pixel · D/λ turns the phase of the outermost pixel by πN·ε at most.
-    bound = 1e3 * np.pi * 256 * np.finfo(float).eps
-    record.close(case, what, np.stack(stamps[1:]) / stamps[0], 1, bound)
-
-
-@pytest.mark.parametrize("pixels", [1, 4, 16, 64])
-def test_energy(bench, record, pixels):
-    """Parseval: one period of the image holds Σ A² of the pupil's Σ A."""
-    pupil, rng = annular_pupil(32, 0.3), np.random.default_rng(bench.config.seed)
-    pixel, opd = 2.0 / pupil.spacing / pixels, rng.uniform(-0.5, 0.5, (2, *pupil.amplitude.shape))
-    for precision, bound in (("complex128", 1e-10), ("complex64", 1e-5)):
-        kernel = StampPropagator(pupil, pixels, pixel, 24, precision)
-        total = kernel(opd.astype(kernel.real_dtype)).sum(axis=(1, 2), dtype=np.float64)
-        total *= pupil.amplitude.sum() / (pupil.amplitude**2).sum()
-        case = f"Parseval, pixel of {pixel:.3g} λ/D, {precision}"
-        record.close(case, "|energy − 1| over one period", total, 1, bound)
-
-
-@pytest.mark.parametrize("pixel", [1e-6, 1e-4, 1e-2])
-def test_diffraction_limited_peak(record, pixel):
-    """π/4 (1 − ε²) per (λ/D)²."""
-    fine = annular_pupil(256, 0.3)
-    stamps = StampPropagator(fine, 2, pixel)(np.zeros((1, *fine.amplitude.shape)))
-    excess = stamps[0, 0, 0] / (0.25 * np.pi * (1 - 0.3**2) * pixel**2) - 1
-    case = f"diffraction-limited peak, pixel of {pixel:g} λ/D"
-    what = "relative excess of the peak pixel over its analytic value"
-    # The area of the grey rim is right to 1e-6; the image bends by (π p)²/4.
-    record.within(case, what, excess, -0.25 * (np.pi * pixel) ** 2 - 1e-5, 1e-5)
-
-
-def agreement(record, case, what, config, source, offset, reach, truth, budget, **optics):
+def agreement(record, case, config, source, offset, reach, truth, budget, **optics):
     """Row: within the budget of the truth, or refused; MSE, None if refused, ∞ without a truth."""
     expected, error = f"≤ {budget:.3g} or SamplingError", None
     try:
         stamps = stamper(config, source, reach, **optics).stamps(config.framing.stamp_px, offset)
         error = np.inf if truth is None else stamp_mse(stamps, truth)
-        record.row(case, what, expected, f"{error:.3g}", error <= budget)
+        record.row(case, WHAT, expected, f"{error:.3g}", error <= budget)
     except SamplingError:
-        record.row(case, what, expected, "SamplingError", True)
+        record.row(case, WHAT, expected, "SamplingError", True)
     return error
 
 

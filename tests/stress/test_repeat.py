@@ -1,42 +1,15 @@
-"""Repeatability: seeds, streams, batches, the order of stars."""
+"""Random streams."""
 
 from itertools import combinations, product
 
 import numpy as np
-import pytest
 
-from psfdae.optics.wavefronts import ModalWavefronts
 from psfdae.rng import stream
-from psfdae_paper.stars.scenes import star_wavefronts
-from stress.bench import LEVELS, changed, propagation, simulated
-
-STARS = 24  # that are simulated again and again
-
-
-@pytest.mark.slow
-def test_batches_and_order(bench, record):
-    """The same stars whatever the batch and whatever their order."""
-    config, rng = bench.seidel.config, bench.stream("order")
-    fields = rng.integers(config.grid.points**2, size=STARS)
-    source, order = star_wavefronts(config, fields), rng.permutation(STARS)
-    shuffled = ModalWavefronts(source.modes, source.coefficients[order])
-    peaks, images = images_of(config, source, config.optics.batch)
-    # Other shapes of the matrix products add the pupil in another order; a phase of W waves
-    # is rounded by 2πW·ε in any case.
-    rounding = 2 * np.pi * float(np.abs(source.slopes()).max() * np.finfo(np.float32).eps)
-    cases = [(f"stars in batches of {n}", source, n, np.arange(STARS)) for n in (1, 7, STARS)]
-    cases.append(("stars in another order", shuffled, config.optics.batch, order))
-    for case, wavefronts, batch, place in cases:
-        other, stamps = images_of(config, wavefronts, batch)
-        moved = (other != peaks[place]).any(axis=1).sum()
-        record.equal(case, "brightest pixels moved", moved, 0)
-        what, peak = "largest change over the peak", images.max()
-        record.close(case, what, stamps, images[place], rounding, over=peak)
 
 
 def test_streams(bench, record):
     """No two random streams of the package are alike."""
-    levels = [f"{level:.6g}" for level in LEVELS]
+    levels = [f"{level:.6g}" for level in np.geomspace(3e-5, 5e-3, 12)]
     datasets, sets = ("dataset3", "dataset5", "dataset8"), ("seidel_10pct", "seidel_50pct")
     names = [
         *product(["noise"], ("test", "scan"), levels),
@@ -52,32 +25,12 @@ def test_streams(bench, record):
     ]
     seed = bench.config.seed
     every = [(s, *name) for s in (seed, seed + 1) for name in names]
-    first, again = ([int(stream(*name).integers(2**63)) for name in every] for _ in range(2))
+    first = [int(stream(*name).integers(2**63)) for name in every]
     case, alike = f"{len(first)} random streams", sum(a == b for a, b in combinations(first, 2))
     record.equal(case, "pairs that start alike", alike, 0)
-    record.equal(case, "streams that do not repeat", first != again, False)
     draws = np.stack([stream(seed, *name).standard_normal(1000) for name in names])
     largest = np.abs(np.corrcoef(draws) - np.eye(len(draws))).max()
     # Correlations of n independent normal draws scatter by 1/√n; the largest of k by √(2 ln k).
     pairs = len(names) * (len(names) - 1) / 2
     limit = (np.sqrt(2 * np.log(pairs)) + 2) / np.sqrt(draws.shape[1])
     record.at_most(f"{len(names)} random streams", "largest correlation", largest, limit)
-
-
-@pytest.mark.slow
-def test_same_bytes(bench, record):
-    """The same seed writes the same bytes, another seed others."""
-    config = changed(bench.seidel.config, grid={"points": 3}, stars={"count": STARS})
-    other = config.model_copy(update={"seed": config.seed + 1})
-    folders = (bench.folder / name for name in ("one", "two", "three"))
-    files = map(simulated, (config, config, other), folders)
-    first, second, other = ([path.read_bytes() for path in pair] for pair in files)
-    for i, kind in enumerate(("templates", "stars")):
-        record.equal(f"the same {kind} twice", "same bytes", first[i] == second[i], True)
-    record.equal("stars of another seed", "same bytes", first[1] == other[1], False)
-
-
-def images_of(config, source, batch):
-    kernel = propagation(config, source, batch=batch)
-    peak = kernel.brightest()
-    return peak, kernel.stamps(config.framing.stamp_px, peak)
