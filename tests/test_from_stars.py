@@ -71,7 +71,8 @@ def network(training, tmp_path_factory):
     """Folder of a model whose method was named."""
     out = tmp_path_factory.mktemp("network") / "model"
     words = [*training.words, "--out", out, *TINY, "methods=[noisy,dae]", "--method", "dae"]
-    result = run(*words)
+    with few_draws():
+        result = run(*words)
     assert result.exit_code == 0 and "validation stars" not in result.output, result.output
     return out
 
@@ -281,18 +282,6 @@ def test_own_noise_is_what_moving_and_dividing_leave_of_it():
     assert few == pytest.approx(0.75 * model, rel=0.1, abs=0.01 * model.max())
 
 
-def test_settings_can_be_used_by_hand(model, tmp_path):
-    out, _ = model
-    config = load_stage(groups_of("dae"), (out / "overrides.txt").read_text().split())
-    assert config.noise.kappa == 1.0
-    assert len(config.noise.levels) == 4
-    by_hand = [*("train", "--stars", str(out / "stars.h5"), "--split", "held_out")]
-    words = [*by_hand, "--out", str(tmp_path / "dae"), *(out / "overrides.txt").read_text().split()]
-    assert CliRunner().invoke(main, words).exit_code == 0
-    weights = "dae.safetensors"
-    assert (tmp_path / "dae" / weights).read_bytes() == (out / "dae" / weights).read_bytes()
-
-
 def test_a_model_is_replaced_on_request_only(training, tmp_path):
     out = tmp_path / "model"
     shutil.copytree(training.out, out)
@@ -318,7 +307,9 @@ def test_a_killed_command_ends_well_if_typed_again(training, tmp_path, monkeypat
     made.unlink()
     monkeypatch.setattr(stage, "fitted_to", lambda stars, kind, _: kind.load(out / "field.h5"))
     monkeypatch.setattr(stage, "packed", lambda *args: training.model)
-    words = [*training.words, "--out", out, "--report", page, *WORDS, "--method", "field"]
+    monkeypatch.setattr(Report, "page", lambda self: "page")
+    words = [*training.words, "--out", out, "--report", page, *WORDS]
+    words += ["methods=[noisy,field]", "--method", "field"]
     save = Report.save
 
     def killed(*args):
