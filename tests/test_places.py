@@ -122,27 +122,22 @@ def python(root, program):
     return done.stdout.strip()
 
 
-def test_a_stage_is_three(tree, tmp_path):
-    places = {
+def test_a_stage_and_a_figure_are_three_each(tree, tmp_path):
+    stage = {
         added(tree, "src/psfdae_paper/stages/count_fields.py", STAGE),
         added(tree, "workflow/rules/count.smk", RULE),
         added(tree, "workflow/Snakefile", '\n\ninclude: "rules/count.smk"\n'),
     }
-    snakemake(tmp_path, "results/fields.txt", root=tree, overrides="grid.points=5")
-    assert (tmp_path / "results/fields.txt").read_text() == "25"
-    assert len(places) == 3
-
-
-def test_a_figure_is_three(tree, tmp_path):
-    places = {
+    figure = {
         added(tree, "src/psfdae_paper/evaluation/figures.py", DRAWING),
         added(tree, "src/psfdae_paper/stages/figures.py", FIGURE),
         added(tree, "workflow/rules/figures.smk", FIGURE_RULE),
     }
-    out = "results/figures/seidel/dots.png"
-    snakemake(tmp_path, out, root=tree, overrides="grid.points=3")
-    assert (tmp_path / out).stat().st_size > 5_000
-    assert len(places) == 3
+    assert len(stage) == len(figure) == 3
+    targets = ("results/fields.txt", "results/figures/seidel/dots.png")
+    snakemake(tmp_path, *targets, root=tree, overrides="grid.points=3")
+    assert (tmp_path / targets[0]).read_text() == "9"
+    assert (tmp_path / targets[1]).stat().st_size > 5_000
 
 
 def test_a_setting_is_two_and_an_option_of_the_field_model_is_one_file(tree):

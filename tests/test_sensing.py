@@ -8,20 +8,20 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import Table
-from click.testing import CliRunner
 
 import psfdae
+from command_line import psfdae as command
+from command_line import refused
 from docs_pages import blocks, read
-from psfdae.cli import main
 from psfdae.commands.wavefront import as_fits
 from psfdae.optics.derivatives import ModalStamps
 from psfdae.optics.pupil import annular_pupil
 from psfdae.optics.seeing import BlurredPropagator, BlurredSampling, Broadening, Profile
 from psfdae.optics.wavefronts import zernike_images
+from psfdae.sensing import sampling
 from psfdae.sensing import stars as engine
-from psfdae.sensing.climbing import Steps, climb, poisson, together
-from psfdae.sensing.plot import wavefront_map
-from psfdae.sensing.sampling import Mixture, sample_around
+from psfdae.sensing.climbing import Steps, climb, poisson
+from psfdae.sensing.sampling import Chains, Mixture, sample_around
 from psfdae.sensing.stars import SensingError, StarOptics
 from psfdae.settings import ConfigError
 from psfdae.telescope.field import field_model, terms_of
@@ -30,15 +30,27 @@ from psfdae_paper.configuration.base import config_dir
 from psfdae_paper.configuration.compose import load
 
 SKY = 1000.0
-EXAMPLES = ("zernike", "seidel", "newtonian", "raytraced", "ritchey_chretien")
 
 
 def example(kind):
     return read_telescope(config_dir() / "telescope" / f"example_{kind}.yaml")
 
 
+def three_terms():
+    """The example with focus, astigmatism and coma alone."""
+    telescope = example("zernike")
+    terms = {name: telescope.aberrations.terms[name] for name in ("z4", "z6", "z8")}
+    few = telescope.aberrations.model_copy(update={"terms": terms})
+    return telescope.model_copy(update={"aberrations": few})
+
+
 def field_of(telescope, count, rng):
     return rng.uniform(-1.0, 1.0, (count, 2)) * telescope.field_edge_deg
+
+
+def sensed(counts, telescope, angle, **options):
+    options = {"noise": SKY**0.5, "gain": 1.0, **options}
+    return psfdae.wavefront(counts, telescope, field_deg=angle, **options)
 
 
 def imaged(telescope, angle, coefficients, place, snr, rng=None):
@@ -52,7 +64,15 @@ def imaged(telescope, angle, coefficients, place, snr, rng=None):
     return (mean if rng is None else rng.poisson(mean).astype(float)), flux
 
 
-@pytest.mark.parametrize("kind", EXAMPLES)
+@pytest.fixture
+def short_chains(monkeypatch):
+    """Half of the steps, with as many draws kept: quantiles scatter as they do otherwise."""
+    monkeypatch.setattr(sampling, "CHAINS", Chains(steps=600))
+
+
+@pytest.mark.parametrize(
+    "kind", ("zernike", "seidel", "newtonian", "raytraced", "ritchey_chretien")
+)
 def test_library_reads_telescopes_as_hydra_composes_them(kind):
     composed = load(["dataset=_telescope", f"telescope=example_{kind}"]).telescope
     assert example(kind) == composed
@@ -61,12 +81,10 @@ def test_library_reads_telescopes_as_hydra_composes_them(kind):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("name: a\ndefaults: 3\n", "defaults = 3: must be a list"),
-        ("defaults: ['../../secret']\n", "must be NAME or /GROUP@KEY: NAME"),
+        ("defaults: ['../../secret']\n", "NAME"),
         ("defaults: [nobody]\n", "nobody.yaml"),
-        ("defaults: [telescope]\n", "it names itself"),
-        ("aberrations: {kind: [zernike]}\n", "kind = "),
-        ("name: a\ndiameter_m: -1\n", "diameter_m = -1"),
+        ("defaults: [telescope]\n", "itself"),
+        ("name: a\ndiameter_m: -1\n", "diameter_m"),
     ],
 )
 def test_telescope_file_that_cannot_be_used_is_named(tmp_path, text, message):
@@ -74,17 +92,6 @@ def test_telescope_file_that_cannot_be_used_is_named(tmp_path, text, message):
     path.write_text(text)
     with pytest.raises(psfdae.Error, match=message):
         read_telescope(path)
-
-
-def test_misalignment_needs_a_secondary(tmp_path):
-    path = tmp_path / "telescope"
-    path.mkdir()
-    text = (config_dir() / "telescope" / "example_newtonian.yaml").read_text()
-    (tmp_path / "prescription").symlink_to(config_dir() / "prescription")
-    moved = text.replace("kind: raytraced", "kind: raytraced\n  tilt_deg: [0.1, 0.0]")
-    (path / "mine.yaml").write_text(moved)
-    with pytest.raises(ConfigError, match="of a secondary, which the prescription has not"):
-        read_telescope(path / "mine.yaml")
 
 
 # --- The climb
@@ -115,16 +122,6 @@ def test_deviance_is_the_log_likelihood_that_is_missing():
     assert found == pytest.approx(expected)
 
 
-def test_shared_parameters_add_up_and_own_ones_stand_alone():
-    rng = np.random.default_rng(2)
-    score, root = rng.normal(size=(1, 3, 4)), rng.normal(size=(1, 3, 4, 4))
-    whole, matrix = together(score, root @ root.swapaxes(2, 3), 2)
-    assert whole[0, :2] == pytest.approx(score[0, :, :2].sum(axis=0))
-    assert whole[0, 2:] == pytest.approx(score[0, :, 2:].ravel())
-    assert matrix.shape == (1, 8, 8)
-    assert not matrix[0, 2:4, 4:].any()
-
-
 def quadratic(centre, curvature):
     def evaluate(some, at):
         gap = centre[some] - at
@@ -146,16 +143,6 @@ def test_climb_reaches_maxima_and_stays_within_its_limit():
     assert held.parameters[0] == pytest.approx(centre[0], abs=1e-4)
     # At the limit the other parameter is at its own maximum: 1 + 0.3 (5 − 3).
     assert held.parameters[1] == pytest.approx([3.0, 1.6], abs=1e-4)
-
-
-def test_a_climb_far_below_the_best_of_its_group_is_given_up():
-    def evaluate(some, at):
-        height = np.where(some == 0, 0.0, -100.0) - 0.5 * (at**2).sum(axis=1)
-        return height, -at, np.tile(np.eye(1), (len(some), 1, 1))
-
-    start, steps = np.array([[0.0], [3.0], [3.0]]), Steps(depth=20.0, first_damping=10.0)
-    peaks = climb(evaluate, start, np.inf, steps, np.array([0, 0, 1]))
-    assert peaks.converged.tolist() == [True, False, True]
 
 
 # --- Draws
@@ -272,38 +259,40 @@ def test_coarse_pupils_err_far_below_the_noise(kind, monkeypatch):
 # --- Single stars
 
 
+@pytest.mark.usefixtures("short_chains")
 def test_noise_free_stars_come_back():
-    telescope, rng = example("zernike"), np.random.default_rng(4)
-    angle = field_of(telescope, 6, rng)
+    telescope, rng = three_terms(), np.random.default_rng(4)
+    angle = field_of(telescope, 4, rng)
     terms = terms_of(telescope, angle)
     truth = terms.mean + 0.7 * terms.sd * rng.standard_normal(terms.mean.shape)
-    place = rng.uniform(-0.5, 0.5, (6, 2))
+    place = rng.uniform(-0.5, 0.5, (4, 2))
     counts, flux = imaged(telescope, angle, truth, place, 2000.0)
-    found = psfdae.wavefront(counts, telescope, field_deg=angle, noise=SKY**0.5, gain=1.0)
+    found = sensed(counts, telescope, angle)
     best = found.summary["mean"][found.summary["probability"] > 0.5]
     error = np.sqrt(np.einsum("mkk->mk", found.summary["covariance"]))
     assert np.abs(best - truth).max() < 6 * error.max()
     assert error.max() < 0.2 * terms.sd.min()
-    own = found.measured()
-    assert own["x"] == pytest.approx(7.5 + place[:, 0], abs=0.02)
-    assert own["y"] == pytest.approx(7.5 + place[:, 1], abs=0.02)
-    assert own["flux"] == pytest.approx(flux, rel=5e-3)
-    assert own["sky"] == pytest.approx(SKY, abs=5 * own["sky_error"].max())
+    measured = found.measured()
+    assert measured["x"] == pytest.approx(7.5 + place[:, 0], abs=0.02)
+    assert measured["y"] == pytest.approx(7.5 + place[:, 1], abs=0.02)
+    assert measured["flux"] == pytest.approx(flux, rel=5e-3)
+    assert measured["sky"] == pytest.approx(SKY, abs=5 * measured["sky_error"].max())
     assert found.explained.all()
     assert found.psf().sum(axis=(1, 2)) == pytest.approx(1.0, abs=0.3)
     fine = found.psf(3)
-    binned = fine.reshape(6, 16, 3, 16, 3).mean(axis=(2, 4))
+    binned = fine.reshape(4, 16, 3, 16, 3).mean(axis=(2, 4))
     assert binned[:, 2:-2, 2:-2] == pytest.approx(found.psf()[:, 2:-2, 2:-2], abs=1e-3)
 
 
+@pytest.mark.usefixtures("short_chains")
 def test_intervals_hold_as_many_stars_as_they_say(monkeypatch):
-    telescope, rng = example("zernike"), np.random.default_rng(5)
+    telescope, rng = three_terms(), np.random.default_rng(5)
     angle = field_of(telescope, 30, rng)
     terms = terms_of(telescope, angle)
     truth = terms.mean + terms.sd * rng.standard_normal(terms.mean.shape)
     place = rng.uniform(-0.5, 0.5, (30, 2))
     counts, _ = imaged(telescope, angle, truth, place, 60.0, rng)
-    found = psfdae.wavefront(counts, telescope, field_deg=angle, noise=SKY**0.5, gain=1.0)
+    found = sensed(counts, telescope, angle)
     for probability, least, most in ((0.6827, 0.56, 0.80), (0.9545, 0.87, 0.995)):
         low, high = np.moveaxis(found.interval(probability), -1, 0)
         assert least < np.mean((truth >= low) & (truth <= high)) < most
@@ -313,23 +302,22 @@ def test_intervals_hold_as_many_stars_as_they_say(monkeypatch):
     assert 0.56 < np.mean(off <= error) < 0.80
     assert np.mean(off <= 3 * error) > 0.95
     monkeypatch.setattr(engine, "STARS_AT_ONCE", 1)
-    again = psfdae.wavefront(counts[:2], telescope, field_deg=angle[:2], noise=SKY**0.5, gain=1.0)
+    again = sensed(counts[:2], telescope, angle[:2])
     assert again.draws == pytest.approx(found.draws[:2], abs=1e-3)
     assert found.chi2.mean() == pytest.approx(0.97, abs=0.05)
     assert len(found.table) >= 30
-    picture = wavefront_map(found, "stars")
-    assert len(picture.axes) == 6
 
 
+@pytest.mark.usefixtures("short_chains")
 def test_both_signs_of_focus_have_a_probability():
     """A round image out of focus, with a prior that does not know the side."""
-    telescope = example("zernike").model_copy(update={"prior": Prior(fraction=0.0, waves=0.3)})
-    rng, angle = np.random.default_rng(6), np.zeros((3, 2))
+    telescope = three_terms().model_copy(update={"prior": Prior(fraction=0.0, waves=0.3)})
+    rng, angle = np.random.default_rng(6), np.zeros((2, 2))
     terms = terms_of(telescope, angle)
     terms.mean[:] = 0.0
     truth = np.where(np.array(terms.names) == "z4", 0.3, 0.0) + terms.mean
-    counts, _ = imaged(telescope, angle, truth, np.zeros((3, 2)), 100.0, rng)
-    found = psfdae.wavefront(counts, telescope, field_deg=angle, noise=SKY**0.5, gain=1.0)
+    counts, _ = imaged(telescope, angle, truth, np.zeros((2, 2)), 100.0, rng)
+    found = sensed(counts, telescope, angle)
     focus = found.coefficients[..., terms.names.index("z4")]
     for star in focus:
         assert 0.1 < np.mean(star > 0) < 0.9
@@ -337,45 +325,40 @@ def test_both_signs_of_focus_have_a_probability():
     assert (found.summary["probability"] < 0.9).all()
 
 
-def test_a_wrong_telescope_explains_few_stars():
-    telescope, rng = example("zernike"), np.random.default_rng(7)
-    angle = field_of(telescope, 2, rng)
-    narrow = rng.poisson(SKY, (2, 16, 16)).astype(float)
-    narrow[:, 7:9, 7:9] += 50_000.0
-    narrow[:, 3, 12] += 40_000.0
-    found = psfdae.wavefront(narrow, telescope, field_deg=angle, noise=SKY**0.5, gain=1.0)
-    assert not found.explained.any()
-    assert found.chi2.min() > 3.0
-
-
-def test_stars_without_pixels_are_kept_as_rows():
-    telescope, rng = example("zernike"), np.random.default_rng(8)
-    angle = field_of(telescope, 3, rng)
-    counts, _ = imaged(
-        telescope, angle, terms_of(telescope, angle).mean, np.zeros((3, 2)), 50.0, rng
-    )
+@pytest.mark.usefixtures("short_chains")
+def test_bad_stars_stop_nobody_and_are_kept_as_rows():
+    telescope, rng = three_terms(), np.random.default_rng(8)
+    angle = field_of(telescope, 6, rng)
+    mean = terms_of(telescope, angle).mean
+    counts, _ = imaged(telescope, angle, mean, np.zeros((6, 2)), 60.0, rng)
     counts[1] = np.nan
     counts[2, :3] = np.nan
-    found = psfdae.wavefront(counts, telescope, field_deg=angle, gain=1.0)
-    assert found.star.tolist() == [0, 2]
-    assert np.isnan(found.psf()[1]).all()
-    assert found.explained.tolist() == [True, False, True]
+    counts[3] = SKY  # no star at all
+    counts[4] = rng.poisson(SKY, (16, 16))
+    counts[4, :, 15] += 3000.0  # light of a star beside the stamp
+    counts[5, 7:9, 7:9] += 50_000.0  # no image of this telescope
+    counts[5, 3, 12] += 40_000.0
+    found = sensed(counts, telescope, angle)
+    assert found.star.tolist() == [0, 2, 3, 4, 5]
+    assert found.explained[[0, 2]].all() and not found.explained[[1, 5]].any()
+    assert found.chi2[-1] > 3.0
+    assert np.isnan(found.psf()[1]).all() and np.isfinite(found.draws).all()
+    assert np.nanmax(np.abs(found.measured()["x"] - 7.5)) < 13
     table = found.table
     assert np.isnan(table["z4"][table["id"] == 1]).all()
-    file = as_fits(found, "stars")
-    sd = np.sqrt(np.einsum("mkk->mk", file["COVAR"].data))[:, 0]
+    sd = np.sqrt(np.einsum("mkk->mk", as_fits(found, "stars")["COVAR"].data))[:, 0]
     assert sd == pytest.approx(np.asarray(table["z4_error"]), rel=1e-5, nan_ok=True)
     with pytest.raises(SensingError, match="no star has enough"):
-        psfdae.wavefront(counts[1:2], telescope, field_deg=angle[1:2])
+        sensed(counts[1:2], telescope, angle[1:2])
 
 
 @pytest.mark.parametrize(
     ("stars", "options", "message"),
     [
-        (np.ones((2, 16, 15)), {}, "expected \\(n, d, d\\)"),
-        (np.ones((2, 16, 16)), {"field_deg": np.zeros((3, 2))}, "field_deg of shape"),
-        (np.ones((2, 16, 16)), {"noise": -1.0}, "noise: expected numbers above 0"),
-        (np.ones((2, 16, 16)), {"gain": np.ones(5)}, "gain of shape"),
+        (np.ones((2, 16, 15)), {}, r"\(n, d, d\)"),
+        (np.ones((2, 16, 16)), {"field_deg": np.zeros((3, 2))}, "field_deg"),
+        (np.ones((2, 16, 16)), {"noise": -1.0}, "noise"),
+        (np.ones((2, 16, 16)), {"gain": np.ones(5)}, "gain"),
     ],
 )
 def test_wrong_input_is_named(stars, options, message):
@@ -386,22 +369,7 @@ def test_wrong_input_is_named(stars, options, message):
 def test_aberrations_beyond_every_grid_are_refused():
     telescope = example("zernike").model_copy(update={"prior": Prior(waves=90.0)})
     with pytest.raises(SensingError, match=f"more than {engine.SIZES[-1]} samples"):
-        psfdae.wavefront(np.random.default_rng(1).normal(size=(1, 16, 16)), telescope,
-                         field_deg=np.zeros((1, 2)))  # fmt: skip
-
-
-def test_one_bad_star_stops_nobody():
-    telescope, rng = example("zernike"), np.random.default_rng(11)
-    angle = field_of(telescope, 4, rng)
-    mean = terms_of(telescope, angle).mean
-    counts, _ = imaged(telescope, angle, mean, np.zeros((4, 2)), 60.0, rng)
-    counts[1] = SKY  # nothing at all
-    counts[2] = rng.poisson(SKY, (16, 16))
-    counts[2, :, 15] += 3000.0  # light of a star beside the stamp
-    found = psfdae.wavefront(counts, telescope, field_deg=angle, noise=SKY**0.5, gain=1.0)
-    assert found.explained[[0, 3]].all()
-    assert np.isfinite(found.draws).all()
-    assert np.abs(found.measured()["x"] - 7.5).max() < 13
+        sensed(np.random.default_rng(1).normal(size=(1, 16, 16)), telescope, np.zeros((1, 2)))
 
 
 # --- The state of a telescope
@@ -419,9 +387,7 @@ def test_state_of_the_telescope_is_found_with_its_errors(kind, count):
     place = rng.uniform(-0.5, 0.5, (count, 2))
     counts, _ = imaged(telescope, angle, model.coefficients(truth), place, 60.0, rng)
     counts[0] = np.roll(counts[0], 5, axis=1) + counts[1] - SKY  # two stars in one stamp
-    found = psfdae.wavefront(
-        counts, telescope, field_deg=angle, noise=SKY**0.5, gain=1.0, joint=True
-    )
+    found = sensed(counts, telescope, angle, joint=True)
     state = found.joint
     pull = (state.value - truth) / state.error
     assert np.sqrt(np.mean(pull**2)) < 2.0
@@ -432,9 +398,10 @@ def test_state_of_the_telescope_is_found_with_its_errors(kind, count):
     assert state.correlation == pytest.approx(state.correlation.T)
 
 
+@pytest.mark.usefixtures("short_chains")
 def test_seeing_is_found_with_the_telescope():
     """Worse by 20 % than the file says; its error goes with that of the aberrations."""
-    telescope, rng = example("zernike"), np.random.default_rng(4)
+    telescope, rng = three_terms(), np.random.default_rng(4)
     angle = field_of(telescope, 12, rng)
 
     def seen(fwhm, prior):
@@ -446,9 +413,7 @@ def test_seeing_is_found_with_the_telescope():
     truth = model.mean + model.sd * rng.standard_normal(model.sd.size)
     place = rng.uniform(-0.5, 0.5, (12, 2))
     counts, _ = imaged(there, angle, model.coefficients(truth), place, 100.0, rng)
-    state = psfdae.wavefront(
-        counts, stated, field_deg=angle, noise=SKY**0.5, gain=1.0, joint=True
-    ).joint
+    state = sensed(counts, stated, angle, joint=True).joint
     assert state.model.names[-1] == "seeing"
     assert state.model.units[-1] == "arcsec"
     assert abs(state.value[-1] - 1.8) < 3 * state.error[-1]
@@ -456,9 +421,7 @@ def test_seeing_is_found_with_the_telescope():
     pull = (state.value[:-1] - truth) / state.error[:-1]
     assert np.sqrt(np.mean(pull**2)) < 2.0
     assert np.abs(state.correlation[-1, :-1]).max() > 0.2
-    fixed = psfdae.wavefront(
-        counts, seen(1.5, 0.0), field_deg=angle, noise=SKY**0.5, gain=1.0, joint=True
-    ).joint
+    fixed = sensed(counts, seen(1.5, 0.0), angle, joint=True).joint
     assert "seeing" not in fixed.model.names
     assert fixed.deviance.sum() > state.deviance.sum() + 20
 
@@ -491,60 +454,51 @@ def night(tmp_path_factory):
     """An image of the example whose coma is not that of its file, with its star list."""
     folder = tmp_path_factory.mktemp("night")
     words = ["telescope=example_zernike", "++telescope.aberrations.terms.z8.constant=0.1"]
-    options = ["--image-snr", "80", "--out", str(folder), "grid.points=4"]
-    result = CliRunner().invoke(main, ["simulate", *words, *options])
-    assert result.exit_code == 0, result.output
+    done = command("simulate", *words, "--image-snr", 80, "--out", folder, "grid.points=3")
+    assert done.exit_code == 0, done.output
     return folder
 
 
 def sense(night, *options):
     telescope = config_dir() / "telescope" / "example_zernike.yaml"
-    words = [str(night / "image.fits"), "--catalogue", str(night / "stars.csv")]
-    words += ["--telescope", str(telescope), "--out", str(night / "wavefront.fits")]
-    return CliRunner().invoke(main, ["wavefront", *words, *options])
+    words = ["wavefront", night / "image.fits", "--catalogue", night / "stars.csv"]
+    return [*words, "--telescope", telescope, "--out", night / "wavefront.fits", *options]
 
 
+@pytest.mark.usefixtures("short_chains")
 def test_command_finds_the_changed_coma(night):
-    result = sense(night, "--joint", "--plot", str(night / "map.png"), "--overwrite")
-    assert result.exit_code == 0, (result.output, result.exception)
+    result = command(*sense(night, "--joint", "--plot", night / "map.png"))
+    assert result.exit_code == 0, result.output
     with fits.open(night / "wavefront.fits") as file:
         assert {hdu.name for hdu in file} >= {"WAVEFRONT", "PSF", "MODEL", "RESIDUAL", "JOINT"}
         assert (file["UNCERT"].data > 0).all()
         state = file["JOINT"].data
         coma = state[state["name"] == "z8.constant"]
         assert coma["value"][0] == pytest.approx(0.1, abs=5 * coma["error"][0])
-        assert coma["error"][0] < 0.005
-        assert len(file["COVAR"].data) == len(file["WAVEFRONT"].data)
+        assert coma["error"][0] < 0.007
         rows = file["WAVEFRONT"].data
+        assert len(file["COVAR"].data) == len(rows)
         listed = Table.read(night / "stars.csv")[rows["id"]]
         off = np.hypot(rows["x"] + 1 - listed["X_IMAGE"], rows["y"] + 1 - listed["Y_IMAGE"])
         # Near the axis the brightest pixel touches the chief ray with a corner; coma moves it off.
         assert off.min() == pytest.approx(0.5**0.5, abs=0.1)
         assert off.max() < 4.5
-        assert file["PSF"].data.shape == (16, 16, 16)
+        assert file["PSF"].data.shape == (9, 16, 16)
     assert "z8.constant" in result.output
-    assert "16 stars, 0 not explained" in result.output
+    assert "9 stars, 0 not explained" in result.output
     assert (night / "map.png").stat().st_size > 5000
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--pixel-scale", "0.9"], "pixels of 0.9 arcsec, but those of the telescope"),
-        (["--stamp-px", "7"], "stamp"),
-    ],
-)
-def test_command_refuses_in_one_line(night, options, message):
-    result = sense(night, *options, "--overwrite")
-    assert result.exit_code == 2
-    assert message in result.output
+def test_command_refuses_pixels_of_another_telescope(night):
+    assert "0.9 arcsec" in refused(*sense(night, "--pixel-scale", 0.9, "--overwrite"))
 
 
+@pytest.mark.usefixtures("short_chains")
 def test_python_lines_of_the_page_run(monkeypatch, capsys):
     telescope, rng = example("zernike"), np.random.default_rng(10)
-    angle = field_of(telescope, 6, rng)
+    angle = field_of(telescope, 7, rng)
     mean = terms_of(telescope, angle).mean
-    counts, _ = imaged(telescope, angle, mean, np.zeros((6, 2)), 80.0, rng)
+    counts, _ = imaged(telescope, angle, mean, np.zeros((7, 2)), 80.0, rng)
     (lines,) = blocks(read("docs/wavefront.md"), "python")
     monkeypatch.chdir(config_dir().parent)
     exec(compile(lines, "page", "exec"), {"stamps": counts, "field_deg": angle})

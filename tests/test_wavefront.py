@@ -78,14 +78,6 @@ def test_errors_are_at_the_local_floor(stars, data, fitted, noisy, name):
     assert np.median(error) < 0.3 * np.median(mse(mixture, images[-TEST:]))
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_same_images_have_the_same_bytes(data, fitted, noisy, name):
-    once, twice = (
-        fitted[name].estimate(noisy[:4], LEVEL, data.positions[-TEST:][:4]).psf for _ in range(2)
-    )
-    assert (once == twice).all()
-
-
 def test_a_star_that_no_wavefront_explains_has_the_mixture_s_psf(data, fitted, noisy):
     moved = noisy[:3].copy()
     moved[1] = np.roll(moved[1], 5, axis=0)
