@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import fcntl
+
 import numpy as np
 import pytest
 
@@ -150,10 +152,11 @@ def training(tmp_path_factory, worker_id):
         made.make()
         return made
     made = Training(tmp_path_factory.getbasetemp().parent / "training")
+    finished = made.folder.with_suffix(".finished")
     with made.folder.with_suffix(".lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        if not (made.folder / FINISHED).exists():
+        if not finished.exists():
             made.folder.mkdir(exist_ok=True)
             made.make()
-            (made.folder / FINISHED).touch()
+            finished.touch()
     return made

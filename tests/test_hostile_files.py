@@ -220,7 +220,9 @@ def test_tiles_are_decompressed_in_blocks_whatever_their_shape(tmp_path, monkeyp
     with fits.open(path) as hdus, (tmp_path / "copy").open("w+b") as copy:
         section = Section(hdus[1])
         hdu = SimpleNamespace(shape=image.shape, tile_shape=tile, section=section)
-        np.testing.assert_array_equal(images.decompress(images.PlainFile(path, path), hdu, copy), image)
+        np.testing.assert_array_equal(
+            images.decompress(images.PlainFile(path, path), hdu, copy), image
+        )
     assert section.largest <= max(150, tile[0] * tile[1])
 
 
