@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from psfdae.image.bad_pixels import BadPixels, ClippedSkyError, find_bad_pixels
 from psfdae.image.catalogue import Catalogue, Positions, as_catalogue
 from psfdae.image.detection import Sky, sky_of
 from psfdae.image.errors import ObservationError, reading, shorten
@@ -251,10 +252,11 @@ class Source:
             raise ObservationError(self.path, "bits are given, but no mask that has them")
         gain, read_noise = (camera[name][0] for name in ("gain", "read noise"))
         least = read_noise / gain if read_noise and gain else 0.0
+        limits: dict[str, Any] = {"least_noise": least, "saturate": camera["saturation"][0]}
         maps = {"a weight map": self.weight, "a variance map": self.variance}
         given = [(what, place) for what, place in maps.items() if place is not None]
         if not given:
-            return Layers(image, mask, self.bad_bits, least_noise=least)
+            return Layers(image, mask, self.bad_bits, **limits)
         if len(given) > 1 or is_cube:
             raise ObservationError(
                 self.path, "an image takes one map of weight or variance, a cube of stamps none"
@@ -271,7 +273,7 @@ class Source:
                 f"{what} of which {wrong + (not inverse) * empty} of {values.size} pixels are not "
                 f"{'at least' if inverse else 'above'} 0; NaN is for bad pixels, or a mask",
             )
-        return Layers(image, mask, self.bad_bits, noise, inverse, empty, least_noise=least)
+        return Layers(image, mask, self.bad_bits, noise, inverse, empty, **limits)
 
     def _detected(self, sky: Sky, threshold: float) -> Catalogue:
         """The stars of an image."""
@@ -413,6 +415,8 @@ class Layers:
     empty: int = 0  # pixels of the weight 0, which are bad
     noise_scale: float = 1.0  # of σ by this map
     least_noise: float = 0.0  # counts; the read noise
+    saturate: float | None = None  # counts
+    _bad_pixels: list[BadPixels] = field(default_factory=list, repr=False)  # once they are found
 
     @contextmanager
     def open(self, whole: bool) -> Iterator[tuple[Pixels, Pixels | None, Pixels | None]]:
@@ -444,22 +448,44 @@ class Layers:
 
     def sky(self) -> Sky:
         """The image as a whole with its sky."""
-        everything = (slice(None), slice(None))
-        with self.open(whole=True) as (pixels, mask, noise):
-            image = pixels[everything]
-            bad = ~np.isfinite(image)
-            sigma = None
-            if mask is not None:
-                bad |= self.bad(mask[everything])
-            if noise is not None:
-                sigma = self.sigma(noise[everything])
-                bad |= np.isnan(sigma)
+        image, masked, sigma = self._whole()
+        bad = self._found(image, masked).mask
         with reading(self.image.path):
             try:
                 return sky_of(image, bad, sigma, self.least_noise)
             except ValueError:  # nothing to measure the sky on
                 problem = "too few pixels of the image have a value that is not masked"
                 raise ObservationError(self.image.path, problem) from None
+
+    @property
+    def bad_pixels(self) -> BadPixels:
+        """Pixels of the image that are left out; ObservationError if its sky was clipped."""
+        return self._bad_pixels[0] if self._bad_pixels else self._found(*self._whole()[:2])
+
+    def _whole(self) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+        """The image (h, w), its masked pixels, and σ of all pixels if there is a map of it."""
+        everything = (slice(None), slice(None))
+        sigma = None
+        with self.open(whole=True) as (pixels, mask, noise):
+            image = pixels[everything]
+            masked = ~np.isfinite(image)
+            if mask is not None:
+                masked |= self.bad(mask[everything])
+            if noise is not None:
+                sigma = self.sigma(noise[everything])
+                masked |= np.isnan(sigma)
+        return image, masked, sigma
+
+    def _found(self, image: np.ndarray, masked: np.ndarray) -> BadPixels:
+        """Bad pixels of the image, searched for once."""
+        if not self._bad_pixels:
+            with reading(self.image.path):
+                try:
+                    found = find_bad_pixels(image, masked, self.image.headers, self.saturate)
+                except ClippedSkyError as error:
+                    raise ObservationError(self.image.path, str(error)) from None
+            self._bad_pixels.append(found)
+        return self._bad_pixels[0]
 
 
 @dataclass(frozen=True)
@@ -539,6 +565,8 @@ class Observation:
         said = f"{self.path}: {', '.join(words)}"
         if (empty := self._layers.empty) and (noise := self._layers.noise) is not None:
             said += f"\n{noise.path}: weight 0, bad pixels: {empty}"
+        if self.shape is not None and (notes := self._layers.bad_pixels.notes):
+            said += f"\n{self.path}: left out: {', '.join(notes)}"
         lost = self.without_position()
         if lost.any():
             rows = shorten([str(row + 1) for row in np.flatnonzero(lost)])
@@ -618,7 +646,7 @@ class Observation:
         return data, masked, np.zeros(count, dtype=bool), np.full(count, np.nan)
 
     def _of_image(
-        self, part: slice, pixels: Pixels, mask: Pixels | None, noise: Pixels | None
+        self, part: slice, pixels: Pixels, _: Pixels | None, noise: Pixels | None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         assert self.shape is not None and self.positions is not None
         x, y = self.positions[part].T
@@ -629,13 +657,11 @@ class Observation:
             full = np.inf if self.saturate is None else self.saturate
             left = data - self.others(part, self.stamp_px, wide)
             data = np.where(data >= full, data, left)  # or saturated pixels would not be seen
-        masked = ~inside
-        if mask is not None:
-            masked |= self._layers.bad(cut_image(mask, *where)[0])
+        bad = self._layers.bad_pixels
+        masked = ~inside | (cut_image(bad.mask, *where)[0] != 0)
         own = slice(wide - self.margin, wide + self.stamp_px + self.margin)
         if noise is not None:
             sigma = self._layers.sigma(cut_image(noise, *where)[0])
-            masked |= np.isnan(sigma)
             each = np.ma.array(sigma, mask=masked)[:, own, own]
             level = np.ma.median(each, axis=(1, 2)).filled(np.nan).astype(float)
         else:
@@ -668,6 +694,10 @@ class Observation:
             listed = np.stack([y - central_pixel(y), x - central_pixel(x)], axis=1)
         ids, flux, background, colour, flags = (column[part].copy() for column in self._columns)
         raise_flag(flags, StarFlag.TRUNCATED, truncated)
+        if self.shape is not None:
+            # A cosmic ray within a pixel of the position: it may be no star.
+            cosmic = cut_image(self._layers.bad_pixels.cosmic, self.shape, x, y, 3, 0)[0]
+            raise_flag(flags, StarFlag.SHARP, cosmic.any(axis=(1, 2)))
         known = (flux, background, noise, gain, unknown, colour, listed)
         return Stamps(data, masked, saturated, flags, ids, x, y, *known)
 
