@@ -81,8 +81,8 @@ def find_bad_pixels(
     if share >= CLIPPED_SHARE:
         raise ClippedSkyError(
             f"{100 * share:.0f} % of the pixels have the least value, {least:g}: the sky was "
-            "clipped there, and neither it nor its noise can be measured; take the image from "
-            "before this step, or subtract less sky and write negative values, too"
+            "clipped there, or has hardly any photons, and neither it nor its noise can be "
+            "measured; take the image from before it was clipped, or write negative values, too"
         )
     cosmic = cosmic_rays(image, mask, saturate)
     if cosmic.any():
@@ -135,7 +135,7 @@ def blank_areas(
             continue
         middle = float(np.median(others))
         if value > middle:
-            label, count = ndimage.label(area)
+            label, _ = ndimage.label(area)
             at_edge = np.unique(np.concatenate([label[0], label[-1], label[:, 0], label[:, -1]]))
             area &= np.isin(label, at_edge[at_edge > 0])
         # Beside a blank area, the image is as far from its value as anywhere, and few pixels of
@@ -167,7 +167,7 @@ def _constant_squares(values: np.ndarray) -> np.ndarray:
         # A filter of even size covers the pixels from −s/2 to s/2 − 1 about its own.
         grown = ndimage.maximum_filter(corner, BLANK_PX, origin=-1)
         found[rows] = grown[inner]
-    return found & np.isfinite(values)
+    return np.asarray(found & np.isfinite(values))
 
 
 def least_value_share(image: np.ndarray, bad: np.ndarray) -> tuple[float, float]:
@@ -242,15 +242,14 @@ def overscan(
 # Cosmic rays.
 
 
-def cosmic_rays(
-    image: np.ndarray, bad: np.ndarray, saturate: float | None = None
-) -> np.ndarray:
+def cosmic_rays(image: np.ndarray, bad: np.ndarray, saturate: float | None = None) -> np.ndarray:
     """Find cosmic rays and hot pixels by their sharp edges (van Dokkum 2001, PASP 113, 1420).
 
     A pixel counts if its Laplacian L⁺ is `COSMIC_SIGMA` times the noise, and larger than the fine
     structure F of the image around it by a factor: `COSMIC_RATIO`, or four times what the bright
     sources of this image have where they are so narrow that it is more. Stars are thus never
-    taken for cosmic rays, and where they are as narrow as these, only very high ones are found.
+    taken for cosmic rays, and where they are nearly as narrow as these, only very high ones are
+    found; none are where the median is over 10.
 
     Parameters
     ----------
@@ -267,10 +266,13 @@ def cosmic_rays(
     found = np.zeros(image.shape, dtype=bool)
     if min(image.shape) < 2 * BAND_EDGE:
         return found
-    ratio = max(COSMIC_RATIO, 4.0 * sharpness_of_sources(image, bad, saturate))
+    sharpness = sharpness_of_sources(image, bad, saturate)
+    if sharpness > 10.0:  # one pixel has nearly all light of a star
+        return found
+    ratio = max(COSMIC_RATIO, 4.0 * sharpness)
     for rows, wide, inner in _bands(len(image)):
         found[rows] = _cosmic_rays_of_band(image[wide], bad[wide], saturate, ratio)[inner]
-    return found & ~bad
+    return np.asarray(found & ~bad)
 
 
 def _cosmic_rays_of_band(
@@ -392,9 +394,10 @@ def _saturated_stars(image: np.ndarray, saturate: float) -> np.ndarray:
 def sharpness_of_sources(
     image: np.ndarray, bad: np.ndarray, saturate: float | None = None
 ) -> float:
-    """Return the median of L⁺/F at the brightest pixels of the bright sources; 0 if there are none.
+    """Return the median of L⁺/F at the brightest pixels of the bright stars; 0 if there are none.
 
-    It is 0.5 where stars have a FWHM of 2.8 px, 1.3 for 1.8 px, and 3 to 5 for 1.2 px.
+    It is 0.5 where stars have a FWHM of 2.8 px, 1.3 for 1.8 px, 3 to 5 for 1.2 px, and 7 to 15 for
+    0.9 px. Sources above 20 are no stars.
     """
     from scipy import ndimage
 
@@ -404,15 +407,15 @@ def sharpness_of_sources(
         hidden = bad[rows]
         clean = interpolated(image[rows].astype(np.float64), hidden)[0]
         noise, edge = pixel_noise(clean, hidden), edges(clean)
-        # Local maxima of the smoothed image, so bright that noise does not matter.
-        smooth = ndimage.uniform_filter(clean, 3)
-        above = smooth - np.median(clean)
-        top = (smooth == ndimage.maximum_filter(smooth, 7)) & (above > 50.0 * noise)
+        # Local maxima, so bright that noise does not matter.
+        above = clean - np.median(clean)
+        top = (clean == ndimage.maximum_filter(clean, 7)) & (above > 50.0 * noise)
         top &= (ndimage.maximum_filter(clean, 5) < full) & ~hidden
         row, column = np.nonzero(top)
         brightest = np.argsort(-above[row, column], kind="stable")[:1000]
         height, structure = _contrast(clean, edge, row[brightest], column[brightest])
-        ratios.append(height / np.maximum(structure, noise[row, column][brightest]))
+        ratio = height / np.maximum(structure, noise[row, column][brightest])
+        ratios.append(ratio[ratio < 20.0])
     return float(np.median(np.concatenate(ratios))) if sum(map(len, ratios)) >= 5 else 0.0
 
 

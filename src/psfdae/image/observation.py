@@ -646,7 +646,7 @@ class Observation:
         return data, masked, np.zeros(count, dtype=bool), np.full(count, np.nan)
 
     def _of_image(
-        self, part: slice, pixels: Pixels, _: Pixels | None, noise: Pixels | None
+        self, part: slice, pixels: Pixels, _mask: Pixels | None, noise: Pixels | None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         assert self.shape is not None and self.positions is not None
         x, y = self.positions[part].T

@@ -255,9 +255,7 @@ def sharper_than_stars(area: np.ndarray) -> np.ndarray:
     return np.asarray(size < np.median(size) - limit)
 
 
-def completed(
-    stars: BrightStars, stamp_px: int, search_px: int
-) -> tuple[BrightStars, np.ndarray]:
+def completed(stars: BrightStars, stamp_px: int, search_px: int) -> tuple[BrightStars, np.ndarray]:
     """Fill the bad pixels of stars with the PSF of the nearest stars, scaled to the good pixels.
 
     Parameters
@@ -311,9 +309,7 @@ def completed(
         window = window_of(
             *(np.where(usable, v, 1.0) for v in (snr[incomplete], flux, stars.noise[incomplete]))
         )
-        centres = windowed_centres(
-            wide[incomplete], peak, window, REGISTRATION_ROUNDS, FARTHEST_PX
-        )
+        centres = windowed_centres(wide[incomplete], peak, window, REGISTRATION_ROUNDS, FARTHEST_PX)
         new = {"peak": peak, "centre": centres, "flux": flux, "snr": snr[incomplete]}
         columns = {name: getattr(stars, name).copy() for name in new}
         for name, values in new.items():
