@@ -612,7 +612,8 @@ class Observation:
         digest = hashlib.sha256()
         with open_pixels(self._layers.image, whole=False) as pixels:
             for start in range(0, pixels.image.shape[0], HASHED_ROWS):
-                digest.update(pixels[slice(start, start + HASHED_ROWS)].tobytes())
+                values = pixels[slice(start, start + HASHED_ROWS)]
+                digest.update(values.astype(np.float32, copy=False).tobytes())
         return digest.hexdigest()
 
     def with_margin(self, margin: int) -> Observation:
