@@ -84,6 +84,10 @@ def find_bad_pixels(
             "clipped there, or has hardly any photons, and neither it nor its noise can be "
             "measured; take the image from before it was clipped, or write negative values, too"
         )
+    dead = dead_pixels(image, mask)
+    if dead.any():
+        mask |= dead
+        notes.append(f"{np.count_nonzero(dead)} dead pixels")
     cosmic = cosmic_rays(image, mask, saturate)
     if cosmic.any():
         notes.append(f"{np.count_nonzero(cosmic)} pixels of cosmic rays and hot pixels")
@@ -239,7 +243,32 @@ def overscan(
     return areas
 
 
-# Cosmic rays.
+# Single pixels.
+
+
+def dead_pixels(image: np.ndarray, bad: np.ndarray) -> np.ndarray:
+    """Find the pixels (h, w) that are 6 σ below the least of their eight neighbours.
+
+    Beside these, others would look like cosmic rays. `bad` pixels (h, w) do not count.
+    """
+    from scipy import ndimage
+
+    found = np.zeros(image.shape, dtype=bool)
+    around = np.ones((3, 3), dtype=bool)
+    around[1, 1] = False
+    if min(image.shape) < 2 * BAND_EDGE:
+        return found
+    for rows, wide, inner in _bands(len(image)):
+        clean = interpolated(image[wide].astype(np.float64), bad[wide])[0]
+        noise = pixel_noise(clean, bad[wide])
+        depth = ndimage.minimum_filter(clean, footprint=around) - clean
+        row, column = np.nonzero((depth > COSMIC_SIGMA * noise) & ~bad[wide])
+        local = _noise_around(clean, noise, row, column)
+        deep = depth[row, column] > COSMIC_SIGMA * local
+        band = np.zeros(clean.shape, dtype=bool)
+        band[row[deep], column[deep]] = True
+        found[rows] = band[inner]
+    return found
 
 
 def cosmic_rays(image: np.ndarray, bad: np.ndarray, saturate: float | None = None) -> np.ndarray:
