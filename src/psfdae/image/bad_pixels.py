@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 BLANK_PX = 8  # side of the smallest blank square; noise fills none with one value
 CLIPPED_SHARE = 0.3  # of the pixels at the least value, from which the sky was clipped there
 COSMIC_SIGMA, COSMIC_RATIO = 6.0, 5.0  # least height and sharpness of a cosmic ray
-BAND_ROWS, BAND_EDGE = 1024, 16  # rows that are searched at a time, and beyond them on each side
+BAND_ROWS, BAND_EDGE = 256, 16  # rows that are searched at a time, and beyond them on each side
 SECTION = re.compile(r"\[\s*(\d+)\s*:\s*(\d+)\s*,\s*(\d+)\s*:\s*(\d+)\s*\]")
 
 
@@ -134,7 +134,9 @@ def blank_areas(
     for value, _ in candidates:
         # The whole of each connected area of this value that holds a square or a line of it.
         area = ndimage.binary_propagation(solid & (values == value), mask=values == value)
-        others = values[~area & ~bad]
+        # Of a large image, one pixel of 16 says how far the rest is from the value.
+        rest = ~area & ~bad
+        others = values[rest] if rest.size < 2**22 else values[::4, ::4][rest[::4, ::4]]
         if not others.size or (saturate is not None and value >= saturate):
             continue
         middle = float(np.median(others))
@@ -148,8 +150,8 @@ def blank_areas(
         if not beside.any():
             continue
         height_beside = float(np.median(np.abs(values[beside] - value)))
-        height = float(np.median(np.abs(values[~area & ~bad] - value)))
-        if height_beside > 0.25 * height and beside.sum() < 0.3 * others.size:
+        height = float(np.median(np.abs(others - value)))
+        if height_beside > 0.25 * height and beside.sum() < 0.3 * np.count_nonzero(rest):
             areas.append((float(value), area))
     return areas
 
@@ -180,22 +182,24 @@ def least_value_share(image: np.ndarray, bad: np.ndarray) -> tuple[float, float]
     The part is 0 where these pixels lie together, as the even sky of an image without noise
     does, and where the values are counts of few photons: the next value is as frequent then.
     """
-    good = image[~bad]
-    if not good.size:
+    good = ~bad
+    count = np.count_nonzero(good)
+    if not count:
         return 0.0, np.nan
-    least = float(good.min())
+    least = float(image.min(where=good, initial=np.inf))
     at_least = image == least
-    share = float(np.count_nonzero(at_least & ~bad) / good.size)
+    share = float(np.count_nonzero(at_least & good) / count)
     if share < CLIPPED_SHARE:
         return share, least
     # Neighbours change between least and other values 2p(1 − p) times where noise decides it.
     pairs = ~(bad[:, 1:] | bad[:, :-1])
     changes = np.count_nonzero((at_least[:, 1:] != at_least[:, :-1]) & pairs)
     by_noise = 2.0 * share * (1.0 - share) * np.count_nonzero(pairs)
-    higher = good[good > least]
-    if changes < 0.5 * by_noise or not higher.size:
+    higher = good & ~at_least
+    if changes < 0.5 * by_noise or not higher.any():
         return 0.0, least
-    following = np.count_nonzero(higher == higher.min()) / good.size
+    second = image.min(where=higher, initial=np.inf)
+    following = np.count_nonzero((image == second) & higher) / count
     return (0.0 if following > 0.3 * share else share), least
 
 
