@@ -70,9 +70,9 @@ REPORTED = all \
   $(if $(wildcard $(PSFDAE_RESULTS)/figures/own_stars/strip.png),from_stars_example)
 # The 24 × 24 trainings take longest; started last, one would run alone in the end.
 LONGEST_FIRST := $(if $(strip $(TARGETS)),,--prioritize scene2)
-# The tests of a file on one worker, the smoke run first (tests/conftest.py).
+# The tests of a file run in one worker, the smoke run first (tests/conftest.py).
 PYTEST := env OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 pytest --numprocesses logical \
-  --maxprocesses 4 --dist loadgroup --no-loadscope-reorder
+  --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 FAST_TESTS := $(PYTEST) -m "not slow and not written"
 
 .DEFAULT_GOAL := help

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -29,19 +30,13 @@ def pytest_addoption(parser):
     parser.addoption("--part", metavar="K/N", help=help_text)
 
 
-def pytest_itemcollected(item):
-    """One worker runs all tests of a file, and one all that need the smoke run.
-
-    What a module or the session builds for its tests is built once, and no worker waits for the
-    smoke run of another.
-    """
-    group = "smoke" if "smoke" in item.fixturenames else item.path.stem
-    item.add_marker(pytest.mark.xdist_group(group))
-
-
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(config, items):
-    """Keep the files of a part, and begin with the tests that need the smoke run, the longest."""
+    """Keep the files of a part; begin with one that makes the smoke run, end with others of it.
+
+    All tests of a file run in one worker. While the first makes the smoke run, which takes longest,
+    no other waits for it.
+    """
     if part := config.getoption("--part"):
         first, parts = map(int, part.split("/"))
         if not 1 <= first <= parts:
@@ -49,7 +44,27 @@ def pytest_collection_modifyitems(config, items):
         files = sorted({item.path for item in items})[first - 1 :: parts]
         config.hook.pytest_deselected(items=[item for item in items if item.path not in files])
         items[:] = [item for item in items if item.path in files]
-    items.sort(key=lambda item: "smoke" not in item.fixturenames)
+    reading_smoke = sorted({item.path for item in items if "smoke" in item.fixturenames})
+    order = dict.fromkeys(reading_smoke, 2) | dict.fromkeys(reading_smoke[:1], 0)
+    items.sort(key=lambda item: order.get(item.path, 1))
+
+
+@contextmanager
+def made_once(folder):
+    """Say whether a folder that all workers share is still to be made; others wait meanwhile."""
+    finished = folder.with_suffix(".finished")
+    with folder.with_suffix(".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        folder.mkdir(exist_ok=True)
+        yield not finished.exists()
+        finished.touch()
+
+
+@pytest.fixture(scope="session")
+def shared_folder(tmp_path_factory, worker_id):
+    """Folder of this run of the tests, the same for all workers."""
+    folder = tmp_path_factory.getbasetemp()
+    return folder if worker_id == "master" else folder.parent
 
 
 @pytest.fixture(scope="session")
@@ -104,11 +119,13 @@ def grid(tracer):
 
 
 @pytest.fixture(scope="session")
-def smoke(tmp_path_factory):
-    """Folder of the whole DAG on tiny sizes, read only."""
-    folder = tmp_path_factory.mktemp("smoke")
-    snakemake(folder)
-    assert (folder / "results/runtime.csv").is_file()
+def smoke(shared_folder):
+    """Folder of the whole DAG on tiny sizes, made once for all workers, which only read it."""
+    folder = shared_folder / "smoke"
+    with made_once(folder) as missing:
+        if missing:
+            snakemake(folder)
+            assert (folder / "results/runtime.csv").is_file()
     return folder
 
 
@@ -145,18 +162,10 @@ def empty_database(tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
-def training(tmp_path_factory, worker_id):
+def training(shared_folder):
     """A model of a simulated image, trained once for all workers, which only read it."""
-    if worker_id == "master":
-        made = Training(tmp_path_factory.mktemp("training"))
-        made.make()
-        return made
-    made = Training(tmp_path_factory.getbasetemp().parent / "training")
-    finished = made.folder.with_suffix(".finished")
-    with made.folder.with_suffix(".lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        if not finished.exists():
-            made.folder.mkdir(exist_ok=True)
+    made = Training(shared_folder / "training")
+    with made_once(made.folder) as missing:
+        if missing:
             made.make()
-            finished.touch()
     return made

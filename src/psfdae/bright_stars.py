@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 
@@ -17,8 +17,8 @@ LEAST_SKY, MOST_SKY = 2.0 * DEFECT**2, 1e12
 """Photons per pixel of the new noise, at least: no rate of photons is negative, and the deepest
 pixel of a star that is made fainter has B − DEFECT √B at most."""
 
-LEAST_FLUX = 1e-30
-"""Counts. A star that is seen to have less is fainter than any other."""
+LEAST_FLUX = 1e-300
+"""In any unit. A star that is seen to have less is fainter than any other."""
 
 
 def magnitude(flux: np.ndarray) -> np.ndarray:
@@ -52,6 +52,9 @@ class BrightStars:
         Of the star list.
     colour : ndarray, shape (n,)
         By the star list, NaN where it says none.
+    bad : ndarray of bool, shape (n, s, s)
+        Pixels of `wide` that were not measured: they show what nearby stars have there. By default
+        none are.
     """
 
     wide: np.ndarray
@@ -64,11 +67,16 @@ class BrightStars:
     row: np.ndarray
     listed: np.ndarray
     colour: np.ndarray
+    bad: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))
+
+    def __post_init__(self) -> None:
+        if self.bad.shape != self.wide.shape:
+            object.__setattr__(self, "bad", np.zeros(self.wide.shape, dtype=bool))
 
     @classmethod
     def of_product(cls, stars: Product) -> BrightStars:
         """Read the bright stars of a product "stars" of an image, which has no centroids."""
-        names = ("peak", "position", "snr", "row", "listed", "flux", "colour")
+        names = ("peak", "position", "snr", "row", "listed", "flux", "colour", "bad")
         arrays = {name: stars[name] for name in names}
         flux, centre = arrays["flux"], np.full(arrays["position"].shape, np.nan)
         wide, noise = stars["wide"] * flux[:, None, None], stars["noise"] * flux
@@ -84,7 +92,7 @@ class BrightStars:
 
     def of(self, chosen: np.ndarray) -> BrightStars:
         """A part of the stars, by a mask or by indices."""
-        return BrightStars(*(getattr(self, field.name)[chosen] for field in fields(self)))
+        return BrightStars(*(getattr(self, f.name)[chosen] for f in fields(self)))
 
     @property
     def place(self) -> np.ndarray:
@@ -114,11 +122,13 @@ class BrightStars:
     def framed(self, side: int) -> tuple[np.ndarray, np.ndarray]:
         """Frames (n, side, side) with the brightest pixel at index (side//2, side//2).
 
-        The second array says which pixels `wide` shows; the others are 0.
+        The second array says which pixels were measured. Those that `wide` does not show are 0.
         """
         wide = np.pad(self.wide, ((0, 0), (side, side), (side, side)), constant_values=np.nan)
         start = side + self.wide.shape[-1] // 2 - side // 2
         rows, columns = (self.peak[:, i, None] + start + np.arange(side) for i in (0, 1))
         images = wide[np.arange(len(wide))[:, None, None], rows[:, :, None], columns[:, None, :]]
         seen = np.isfinite(images)
-        return np.where(seen, images, 0.0).astype(np.float64), seen
+        bad = np.pad(self.bad, ((0, 0), (side, side), (side, side)))
+        bad = bad[np.arange(len(wide))[:, None, None], rows[:, :, None], columns[:, None, :]]
+        return np.where(seen, images, 0.0).astype(np.float64), seen & ~bad

@@ -275,7 +275,8 @@ class _Alternating:
             residual = np.where(self.seen, self.images / flux[:, None, None] - drawn, 0.0)
             noise = self._weight(flux)
             square = residual**2 * noise
-            chi2, alike = square.mean(axis=(1, 2)), 1.0 / (1.0 + square / UNLIKE_SIGMA**2)
+            chi2 = square.sum(axis=(1, 2)) / np.maximum(self.seen.sum(axis=(1, 2)), 1)
+            alike = 1.0 / (1.0 + square / UNLIKE_SIGMA**2)
             if turn:
                 good = chi2 < UNLIKE_CHI2 * np.median(chi2)
         assert found is not None

@@ -62,7 +62,8 @@ class NoiseModel:
         ndarray, shape (B, ...), float32
         """
         flux = _per_image(self.flux(level), psf)
-        photons = rng.poisson(flux * psf + self.background)
+        # A pixel of a measured star may lie so far below the sky that no rate of photons is left.
+        photons = rng.poisson(np.maximum(flux * psf + self.background, 0.0))
         return np.asarray((photons - self.background) / flux, np.float32)
 
     def draw_gaussian(

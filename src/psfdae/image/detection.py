@@ -7,9 +7,12 @@ photutils does it: the sky in meshes, sources as connected pixels above it (Bert
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
+
+from psfdae.image.bad_pixels import interpolated
 
 MESH_PX = 64  # side of the squares in which the sky is measured
 MOST_BAD = 80.0  # per cent of a mesh's pixels; others are interpolated over it
@@ -18,18 +21,30 @@ LEVELS, CONTRAST = 8, 0.005  # of the parting; 32 levels take three times as lon
 SMOOTHING = np.outer([1, 2, 1], [1, 2, 1]) / 16.0
 SMOOTHED_NOISE = float(np.sqrt(np.square(SMOOTHING).sum()))  # that of a pixel, in σ of before
 DECIMALS = 3  # of positions
-LEAST_NOISE = 1e-9  # counts; whole counts may show none
 
 
 @dataclass(frozen=True)
 class Sky:
     """An image (h, w) with its sky subtracted, and what was subtracted."""
 
-    flat: np.ndarray  # 0 where bad
+    flat: np.ndarray  # interpolated where bad; 0 where no good pixel is near
     level: np.ndarray
     noise: np.ndarray  # σ of every pixel
     bad: np.ndarray
     noise_scale: float  # of the map of σ, if there was one
+
+    @cached_property
+    def holes(self) -> np.ndarray:
+        """Bad pixels (h, w) of which more than half of the 5 × 5 pixels around are bad, too.
+
+        Other bad pixels are interpolated, so that a star with one of these is one source.
+        """
+        from scipy import ndimage
+
+        if not self.bad.any():
+            return self.bad
+        around = ndimage.uniform_filter(self.bad.astype(np.float32), 5, mode="nearest")
+        return np.asarray(self.bad & (around > 0.5))
 
     def _above(self, threshold: float) -> tuple[np.ndarray, np.ndarray]:
         """The smoothed image, and where its threshold is."""
@@ -47,10 +62,10 @@ class Sky:
         smooth, limit = self._above(threshold)
         finder = SourceFinder(LEAST_PX, n_levels=LEVELS, contrast=CONTRAST)
         finder.progress_bar = False  # photutils 3.0 shows one; the argument goes in 4.0
-        parts = finder(smooth, limit, mask=self.bad)
+        parts = finder(smooth, limit, mask=self.holes)
         if parts is None:
             return {"id": np.empty(0, np.int64)}
-        found = SourceCatalog(self.flat, parts, convolved_data=smooth, mask=self.bad)
+        found = SourceCatalog(self.flat, parts, convolved_data=smooth, mask=self.holes)
         x, y, flux = (
             np.atleast_1d(v) for v in (found.x_centroid, found.y_centroid, found.segment_flux)
         )
@@ -64,8 +79,9 @@ class Sky:
             "id": np.arange(1, len(x) + 1),
             "X_IMAGE": np.round(x + 1, DECIMALS),
             "Y_IMAGE": np.round(y + 1, DECIMALS),
-            "FLUX_ISO": np.round(flux.astype(float), DECIMALS),
-            "BACKGROUND": np.round(self.level[row, column].astype(float), DECIMALS),
+            # Digits, not decimals: the unit of an image may be of any size.
+            "FLUX_ISO": _with_digits(flux.astype(float)),
+            "BACKGROUND": _with_digits(self.level[row, column].astype(float)),
         }
 
     def covered(self, column: np.ndarray, row: np.ndarray, threshold: float) -> np.ndarray:
@@ -74,13 +90,18 @@ class Sky:
 
         # As photutils parts an image, which takes a second to be loaded.
         smooth, limit = self._above(threshold)
-        parts, _ = ndimage.label((smooth > limit) & ~self.bad, np.ones((3, 3)))
+        parts, _ = ndimage.label((smooth > limit) & ~self.holes, np.ones((3, 3)))
         source = np.bincount(parts.ravel()) >= LEAST_PX
         source[0] = False
         height, width = self.flat.shape
         inside: np.ndarray = (column >= 0) & (column < width) & (row >= 0) & (row < height)
         inside[inside] = source[parts[row[inside], column[inside]]]
         return inside
+
+
+def _with_digits(values: np.ndarray) -> np.ndarray:
+    """Return numbers (n,) with eight significant digits."""
+    return np.array([float(f"{value:.8g}") for value in values.tolist()])
 
 
 def sky_of(
@@ -107,9 +128,12 @@ def sky_of(
 
     values: Any = np.where(bad, 0.0, image)
     found = Background2D(values, MESH_PX, mask=bad, exclude_percentile=MOST_BAD)
-    level, noise = found.background, np.maximum(found.background_rms, max(least, LEAST_NOISE))
+    level = found.background
+    # Whole counts, or images without noise, may show none; the threshold must not be 0 there.
+    least = max(least, 1e-13 * float(np.ptp(values)), float(np.finfo(np.float64).tiny))
+    noise = np.maximum(found.background_rms, least)
     scale = np.nan
     if sigma is not None:
         scale = float(np.median(noise[~bad] / sigma[~bad]))
         noise = scale * sigma
-    return Sky(np.where(bad, 0.0, image - level), level, noise, bad, scale)
+    return Sky(interpolated(image - level, bad)[0], level, noise, bad, scale)

@@ -275,13 +275,20 @@ class ImageFile:
         return self.file.name
 
     def physical(self, stored: np.ndarray, dtype: DTypeLike = np.float32) -> np.ndarray:
-        """Physical values of stored ones, in native byte order, same shape."""
+        """Physical values of stored ones, in native byte order, same shape.
+
+        They are of double precision where all are below 1e-15.
+        """
         if self.bscale == 1.0 and self.bzero == 0.0:
             values = stored.astype(dtype)
         else:
             values = (stored.astype(np.float64) * self.bscale + self.bzero).astype(dtype)
         if self.blank is not None and stored.dtype.kind in "iu":
             values[stored == self.blank] = np.nan
+        # In a unit in which stars have 1e-20, squares of single precision would be 0.
+        largest = np.abs(values).max(initial=0.0, where=np.isfinite(values))
+        if values.dtype == np.float32 and 0.0 < largest < 1e-15:
+            values = values.astype(np.float64)
         return values
 
     def positive(self, keys: Sequence[str]) -> Said:

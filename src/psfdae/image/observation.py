@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from psfdae.image.bad_pixels import BadPixels, ClippedSkyError, find_bad_pixels
 from psfdae.image.catalogue import Catalogue, Positions, as_catalogue
 from psfdae.image.containers import in_unit
 from psfdae.image.detection import Sky, sky_of
@@ -338,7 +339,11 @@ class Source:
         said = [f"{_label(mask)} as mask"] if mask is not None and self.mask is None else []
         gain, read_noise = (camera[name][0] for name in ("gain", "read noise"))
         layers = Layers(
-            image, mask, bad_bits, least_noise=read_noise / gain if read_noise and gain else 0.0
+            image,
+            mask,
+            bad_bits,
+            least_noise=read_noise / gain if read_noise and gain else 0.0,
+            saturate=camera["saturation"][0],
         )
 
         maps = {"weight": self.weight, "variance": self.variance, "error": self.error}
@@ -639,6 +644,8 @@ class Layers:
     noise_scale: float = 1.0  # of σ by this map
     photons: float = 0.0  # variance by this map for a unit of light above the sky
     least_noise: float = 0.0  # counts; the read noise
+    saturate: float | None = None  # counts
+    _bad_pixels: list[BadPixels] = field(default_factory=list, repr=False)  # once they are found
 
     @contextmanager
     def open(self, whole: bool) -> Iterator[tuple[Pixels, Pixels | None, Pixels | None]]:
@@ -684,16 +691,8 @@ class Layers:
 
     def sky(self) -> Sky:
         """The image as a whole with its sky."""
-        everything = (slice(None), slice(None))
-        with self.open(whole=True) as (pixels, mask, noise):
-            image = pixels[everything]
-            bad = ~np.isfinite(image)
-            sigma = None
-            if mask is not None:
-                bad |= self.bad(mask[everything])
-            if noise is not None:
-                sigma = replace(self, photons=0.0).sigma(noise[everything])
-                bad |= np.isnan(sigma)
+        image, masked, sigma = self._whole()
+        bad = self._found(image, masked).mask
         with silent():
             try:
                 sky = sky_of(image, bad, sigma, self.least_noise)
@@ -706,8 +705,38 @@ class Layers:
             return sky
         with self.open(whole=True) as (_, _, noise):
             assert noise is not None
-            own = self.sigma(noise[everything], sky.flat)
+            own = self.sigma(noise[:], sky.flat)
         return replace(sky, noise=sky.noise_scale * own)
+
+    @property
+    def bad_pixels(self) -> BadPixels:
+        """Pixels of the image that are left out; ObservationError if its sky was clipped."""
+        return self._bad_pixels[0] if self._bad_pixels else self._found(*self._whole()[:2])
+
+    def _whole(self) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+        """The image (h, w), its masked pixels, and σ of all pixels if there is a map of it."""
+        everything = (slice(None), slice(None))
+        sigma = None
+        with self.open(whole=True) as (pixels, mask, noise):
+            image = pixels[everything]
+            masked = ~np.isfinite(image)
+            if mask is not None:
+                masked |= self.bad(mask[everything])
+            if noise is not None:
+                sigma = replace(self, photons=0.0).sigma(noise[everything])
+                masked |= np.isnan(sigma)
+        return image, masked, sigma
+
+    def _found(self, image: np.ndarray, masked: np.ndarray) -> BadPixels:
+        """Bad pixels of the image, searched for once."""
+        if not self._bad_pixels:
+            with silent():
+                try:
+                    found = find_bad_pixels(image, masked, self.image.headers, self.saturate)
+                except ClippedSkyError as error:
+                    raise ObservationError(self.image.path, str(error)) from None
+            self._bad_pixels.append(found)
+        return self._bad_pixels[0]
 
 
 @dataclass(frozen=True)
@@ -788,6 +817,8 @@ class Observation:
         said = "\n".join([f"{self.path}: {', '.join(words)}", *self.remarks])
         if (empty := self._layers.empty) and (noise := self._layers.noise) is not None:
             said += f"\n{noise.path}: {self._layers.kind} 0, bad pixels: {empty}"
+        if self.shape is not None and (notes := self._layers.bad_pixels.notes):
+            said += f"\n{self.path}: left out: {', '.join(notes)}"
         lost = self.without_position()
         if lost.any():
             rows = shorten([str(row + 1) for row in np.flatnonzero(lost)])
@@ -840,7 +871,8 @@ class Observation:
         digest = hashlib.sha256()
         with open_pixels(self._layers.image, whole=False) as pixels:
             for start in range(0, pixels.image.shape[0], HASHED_ROWS):
-                digest.update(pixels[slice(start, start + HASHED_ROWS)].tobytes())
+                values = pixels[slice(start, start + HASHED_ROWS)]
+                digest.update(values.astype(np.float32, copy=False).tobytes())
         return digest.hexdigest()
 
     def with_margin(self, margin: int) -> Observation:
@@ -874,7 +906,7 @@ class Observation:
         return data, masked, np.zeros(count, dtype=bool), np.full(count, np.nan)
 
     def _of_image(
-        self, part: slice, pixels: Pixels, mask: Pixels | None, noise: Pixels | None
+        self, part: slice, pixels: Pixels, _mask: Pixels | None, noise: Pixels | None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         assert self.shape is not None and self.positions is not None
         x, y = self.positions[part].T
@@ -886,9 +918,8 @@ class Observation:
             full = np.inf if self.saturate is None else self.saturate
             left = data - self.others(part, self.stamp_px, wide)
             data = np.where(data >= full, data, left)  # or saturated pixels would not be seen
-        masked = ~inside
-        if mask is not None:
-            masked |= self._layers.bad(cut_image(mask, *where)[0])
+        bad = self._layers.bad_pixels
+        masked = ~inside | (cut_image(bad.mask, *where)[0] != 0)
         own = slice(wide - self.margin, wide + self.stamp_px + self.margin)
         if noise is not None:
             light: np.ndarray | float = 0.0
@@ -896,7 +927,6 @@ class Observation:
                 level, _ = sky_around(pixels_of_stars, masked, self.stamp_px)
                 light = pixels_of_stars - level[:, None, None]
             sigma = self._layers.sigma(cut_image(noise, *where)[0], light)
-            masked |= np.isnan(sigma)
             each = np.ma.array(sigma, mask=masked)[:, own, own]
             level = np.ma.median(each, axis=(1, 2)).filled(np.nan).astype(float)
         else:
@@ -929,6 +959,10 @@ class Observation:
             listed = np.stack([y - central_pixel(y), x - central_pixel(x)], axis=1)
         ids, flux, background, colour, flags = (column[part].copy() for column in self._columns)
         raise_flag(flags, StarFlag.TRUNCATED, truncated)
+        if self.shape is not None:
+            # A cosmic ray within a pixel of the position: it may be no star.
+            cosmic = cut_image(self._layers.bad_pixels.cosmic, self.shape, x, y, 3, 0)[0]
+            raise_flag(flags, StarFlag.SHARP, cosmic.any(axis=(1, 2)))
         known = (flux, background, noise, gain, unknown, colour, listed)
         return Stamps(data, masked, saturated, flags, ids, x, y, *known)
 

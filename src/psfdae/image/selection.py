@@ -18,10 +18,11 @@ import numpy as np
 
 from psfdae.bright_stars import DEFECT, BrightStars
 from psfdae.errors import Error
+from psfdae.image.bad_pixels import interpolated_stamps
 from psfdae.image.errors import no_formula
-from psfdae.image.observation import Observation
+from psfdae.image.observation import Observation, central_pixel
 from psfdae.image.stamps import Stamps, StarFlag, cut, peaks, sky_around
-from psfdae.moments import robust_scatter, windowed_centres
+from psfdae.moments import moved, robust_scatter, windowed_centres
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -33,6 +34,7 @@ REGISTRATION_ROUNDS, FARTHEST_PX = 10, 1.5  # of the centroid; from the brightes
 COMPANIONS = 12  # nearest stars with which a star is compared
 CORE_PX = 8  # or half of the stamp, if that is more: no place for a faint neighbour
 LOCAL = 1.2  # the worst pixels of good stars scatter more than their stamps as a whole
+MOST_MISSING = 0.2  # of a star's light, in bad pixels, with which it is still learnt from
 # Stars are saturated if at least so many have brightest pixels that agree to this part, which is
 # less of their light, by this factor, than in stars at least so bright.
 PILE, PILE_WIDTH, PILE_SHARPNESS, PILE_FROM = 3, 0.03, 0.9, 0.1
@@ -47,12 +49,13 @@ class Verdict(StrEnum):
 
     GOOD = "good"
     NO_POSITION = "no position"
-    INCOMPLETE = "incomplete"  # pixels off the image, masked or not finite
+    INCOMPLETE = "incomplete"  # pixels off the image, or over a fifth of the light in bad pixels
     SATURATED = "saturated"
     BLENDED = "blended"  # by the star list
     FAINT = "faint"
     OFF_CENTRE = "off centre"
     CROWDED = "crowded"
+    SHARP = "sharp"  # far narrower than the other stars: a cosmic ray, a hot pixel
     MISFIT = "misfit"  # unlike its neighbours: a blend, a galaxy, a cosmic ray
 
 
@@ -130,7 +133,10 @@ def collect(
     """
     observation.check_list()
     least = observation.least_noise
-    measured = [_measure(chunk, settings, framing, least) for chunk in observation.chunks(ROWS)]
+    measured = [
+        _measure(chunk, settings, framing, least, observation.shape)
+        for chunk in observation.chunks(ROWS)
+    ]
     columns, kept = zip(*measured, strict=True)
     found = {key: np.concatenate([c[key] for c in columns]) for key in columns[0]}
     side, verdict, noise, snr = framing.stamp_px, found["verdict"], found["noise"], found["snr"]
@@ -144,18 +150,27 @@ def collect(
     close = crowded(apart, snr * noise, near, settings.neighbour_ratio)
     verdict[close & (verdict == Verdict.GOOD)] = Verdict.CROWDED
     verdict[observation.without_position()] = Verdict.NO_POSITION
-    wide, peak, listed, colour = (np.concatenate([k[i] for k in kept]) for i in range(4))
+    wide, peak, listed, colour, bad = (np.concatenate([k[i] for k in kept]) for i in range(5))
     flux = cut(wide, side, peak).sum(axis=(1, 2))
     verdict[row[flux <= 0]] = Verdict.MISFIT
     good = verdict[row] == Verdict.GOOD
-    wide, peak, listed, colour, flux, row = (
-        a[good] for a in (wide, peak, listed, colour, flux, row)
+    wide, peak, listed, colour, flux, row, bad = (
+        a[good] for a in (wide, peak, listed, colour, flux, row, bad)
     )
     window = window_of(snr[row], flux, noise[row])
     centre = windowed_centres(wide, peak, window, REGISTRATION_ROUNDS, FARTHEST_PX)
     bright = BrightStars(
-        wide, peak, centre, found["position"][row], flux, noise[row], snr[row], row, listed, colour
+        *(wide, peak, centre, found["position"][row], flux, noise[row], snr[row], row),
+        *(listed, colour, bad),
     )
+    # Sources off the locus of the stars, whose noise-equivalent areas are about the same.
+    narrow = sharper_than_stars(bright.area())
+    verdict[bright.row[narrow]] = Verdict.SHARP
+    bright = bright.of(~narrow)
+    bright, missing = completed(bright, side, settings.search_px)
+    verdict[bright.row[missing > MOST_MISSING]] = Verdict.INCOMPLETE
+    bright = bright.of(missing <= MOST_MISSING)
+    row = bright.row
     score = misfit(cut(bright.aligned(), side), bright.position, bright.noise / bright.flux)
     verdict[row[score > settings.misfit]] = Verdict.MISFIT
     result = Candidates(**found, bright=bright.of(score <= settings.misfit))
@@ -164,18 +179,34 @@ def collect(
 
 
 def _measure(
-    chunk: Stamps, settings: CalibrationStars, framing: Stamp, least_noise: float
+    chunk: Stamps,
+    settings: CalibrationStars,
+    framing: Stamp,
+    least_noise: float,
+    shape: tuple[int, ...] | None,
 ) -> tuple[dict[str, np.ndarray], tuple[np.ndarray, ...]]:
-    """Columns for all stars of a chunk; stamps, peak, listed centre, colour of the bright ones."""
+    """Measure all stars of a chunk of an image of a shape; None is that of a cube of stamps.
+
+    Returns columns of all, and of the good ones stamps, peak, listed centre, colour and bad pixels.
+    """
     side = framing.stamp_px
     level, noise = sky_around(chunk.data, chunk.bad, side)
     noise = np.where(np.isfinite(chunk.noise), chunk.noise, np.maximum(noise, least_noise))
     wide = np.where(chunk.bad, 0.0, chunk.data - level[:, None, None])
-    wide = np.maximum(wide, -DEFECT * noise[:, None, None])
+    # Far below the sky there is no light: dead pixels, and neighbours that were subtracted badly.
+    # These also make the noise around a star seem large.
+    depth = -DEFECT * np.minimum(noise, 3.0 * np.median(noise))[:, None, None]
+    off = _off_image(chunk, wide.shape[-1], shape)
+    bad = (chunk.bad | (wide < depth)) & ~off
+    wide = interpolated_stamps(np.maximum(wide, depth), bad)
     reach = min(settings.search_px, (wide.shape[-1] - 5) // 2)
     peak, centred = brightest_pixels(wide, reach)
     needed = side + 2 * min(reach + framing.jitter_px + 1, (wide.shape[-1] - side) // 2)
     snr = signal_to_noise(cut(wide, side), noise)
+    # A bad pixel that is saturated tells of a saturated star only in the star's core.
+    saturated = chunk.saturated & ~bad
+    core = cut(chunk.saturated, 5).any(axis=(1, 2)) | cut(saturated, side).any(axis=(1, 2))
+    incomplete = cut(off, needed).any(axis=(1, 2)) | (cut(bad, needed).mean(axis=(1, 2)) > 0.5)
     verdict = np.full(len(chunk), Verdict.GOOD, dtype="<U16")
 
     def said(flag: StarFlag) -> np.ndarray:
@@ -185,8 +216,8 @@ def _measure(
         (Verdict.OFF_CENTRE, ~centred),
         (Verdict.FAINT, snr < settings.snr_min),
         (Verdict.BLENDED, said(StarFlag.BLENDED)),
-        (Verdict.SATURATED, cut(chunk.saturated, side).any(axis=(1, 2)) | said(StarFlag.SATURATED)),
-        (Verdict.INCOMPLETE, cut(chunk.bad, needed).any(axis=(1, 2)) | said(StarFlag.TRUNCATED)),
+        (Verdict.SATURATED, core | said(StarFlag.SATURATED)),
+        (Verdict.INCOMPLETE, incomplete | said(StarFlag.TRUNCATED)),
     ):
         verdict[stars] = reason
     columns = {
@@ -200,7 +231,93 @@ def _measure(
         "verdict": verdict,
     }
     good = verdict == Verdict.GOOD
-    return columns, (wide[good], peak[good], chunk.listed[good], chunk.colour[good])
+    return columns, (wide[good], peak[good], chunk.listed[good], chunk.colour[good], bad[good])
+
+
+def _off_image(stamps: Stamps, side: int, shape: tuple[int, ...] | None) -> np.ndarray:
+    """Return the pixels of stamps (n, side, side) that are beyond the edges of their image."""
+    if shape is None:
+        return np.zeros(stamps.data.shape, dtype=bool)
+    axis = np.arange(side) - side // 2
+    rows, columns = (central_pixel(v)[:, None] + axis for v in (stamps.y, stamps.x))
+    inside = ((rows >= 0) & (rows < shape[0]))[:, :, None]
+    return np.asarray(~(inside & ((columns >= 0) & (columns < shape[1]))[:, None, :]))
+
+
+def sharper_than_stars(area: np.ndarray) -> np.ndarray:
+    """Return which sources (n,) have a far smaller noise-equivalent area than the median source.
+
+    Less than half of it, and less by more than five times the scatter: that of stars changes with
+    the place in the field, and with the phase on the pixel grid where stars are narrow.
+    """
+    if len(area) < 4:
+        return np.zeros(len(area), dtype=bool)
+    size = np.log(area)
+    limit = max(np.log(2.0), 5.0 * float(robust_scatter(size)))
+    return np.asarray(size < np.median(size) - limit)
+
+
+def completed(stars: BrightStars, stamp_px: int, search_px: int) -> tuple[BrightStars, np.ndarray]:
+    """Fill the bad pixels of stars with the PSF of the nearest stars, scaled to the good pixels.
+
+    Parameters
+    ----------
+    stars : BrightStars
+        With interpolated bad pixels.
+    stamp_px, search_px : int
+        Side of the stamps, in which the scale is measured; distance of the brightest pixel from
+        the middle, at most.
+
+    Returns
+    -------
+    stars : BrightStars
+        With new pixels, peaks, centres, fluxes and S/N of the stars that have bad pixels.
+    missing : ndarray, shape (n,)
+        Part of the light in the stamp that is in bad pixels.
+    """
+    from scipy.spatial import cKDTree
+
+    missing = np.zeros(len(stars))
+    incomplete = np.flatnonzero(stars.bad.any(axis=(1, 2)))
+    if not incomplete.size or len(stars) < 4:
+        return stars, missing
+    count = min(COMPANIONS + 1, len(stars))
+    place = stars.position
+    if not np.isfinite(place).all():  # all stars are as near then
+        place = np.arange(len(stars))[:, None] * np.ones(2)
+    nearest = cKDTree(place).query(place[incomplete], k=count)[1]
+    inner = cut(np.ones((1, *stars.wide.shape[1:])), stamp_px).shape[-1]
+    middle = stars.wide.shape[-1] // 2 - inner // 2
+    stamp = np.s_[middle : middle + inner, middle : middle + inner]
+    for _ in range(2):
+        aligned, wide = stars.aligned(), stars.wide.copy()
+        for star, near in zip(incomplete, nearest, strict=True):
+            # Median of the neighbours, moved to the star's centre; its flux by least squares over
+            # the good pixels of the stamp, F = Σ x p / Σ p².
+            psf = np.median(aligned[near[near != star]], axis=0)
+            psf = moved(psf[None], stars.centre[star][None])[0]
+            bad = stars.bad[star]
+            good = ~bad[stamp]
+            square = float(np.square(psf[stamp][good]).sum())
+            flux = float((wide[star][stamp] * psf[stamp])[good].sum()) / square if square else 0.0
+            wide[star][bad] = flux * psf[bad]
+            missing[star] = (psf * bad)[stamp].sum() / psf[stamp].sum()
+        peak = brightest_pixels(wide[incomplete], search_px)[0]
+        light = cut(wide[incomplete], stamp_px, peak)
+        flux, snr = light.sum(axis=(1, 2)), stars.snr.copy()
+        snr[incomplete] = signal_to_noise(cut(wide[incomplete], stamp_px), stars.noise[incomplete])
+        usable = (flux > 0) & (snr[incomplete] > 0)
+        missing[incomplete[~usable]] = 1.0
+        window = window_of(
+            *(np.where(usable, v, 1.0) for v in (snr[incomplete], flux, stars.noise[incomplete]))
+        )
+        centres = windowed_centres(wide[incomplete], peak, window, REGISTRATION_ROUNDS, FARTHEST_PX)
+        new = {"peak": peak, "centre": centres, "flux": flux, "snr": snr[incomplete]}
+        columns = {name: getattr(stars, name).copy() for name in new}
+        for name, values in new.items():
+            columns[name][incomplete[usable]] = values[usable]
+        stars = replace(stars, wide=wide, **columns)
+    return stars, missing
 
 
 def _at(wide: np.ndarray, peak: np.ndarray) -> np.ndarray:

@@ -65,6 +65,7 @@ class StarFlag(IntFlag):
     SKY_OFF = 2048
     POOR_FIT = 4096
     BEYOND = 8192
+    SHARP = 16384
 
 
 MEANING: dict[StarFlag, str] = {
@@ -83,6 +84,7 @@ MEANING: dict[StarFlag, str] = {
     StarFlag.POOR_FIT: "chi2 above 10: the residual is far above the noise",
     StarFlag.BEYOND: "brighter, fainter or of another colour than all stars of the training, where "
     "the PSF changes with that",
+    StarFlag.SHARP: "a cosmic ray or hot pixel within 1 px of its position: perhaps no star",
 }
 """One line for every flag."""
 

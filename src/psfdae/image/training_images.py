@@ -210,4 +210,5 @@ def training_columns(
         "wide": Column(wide, "1", "the bright stars with a margin, of flux 1"),
         "peak": Column(bright.peak, "pixel", "brightest pixel (row, column) from the middle's"),
         "listed": Column(bright.listed, "pixel", "centre by the catalogue, likewise"),
+        "bad": Column(bright.bad, "1", "pixels of `wide` that were not measured"),
     }

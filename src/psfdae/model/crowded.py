@@ -142,13 +142,21 @@ def _fitted(
     if flux is not None:
         start["flux"] = np.where(np.isfinite(flux), flux, 0.0)
     bounds = MOST_MOVED_FWHM * fwhm
+    # Where the noise is no number of about 1 to 1000, the fitters of astropy end too early: fluxes
+    # and centres have to be of sizes that one tolerance suits.
+    noise = float(np.median(error[~bad])) if not bad.all() else 1.0
+    unit = 1.0 if 2.0**-4 <= noise <= 2.0**13 else 2.0 ** (round(np.log2(noise)) - 4)
+    if flux is not None:
+        start["flux"] /= unit
     fit = PSFPhotometry(
         psf, side, aperture_radius=fwhm, xy_bounds=bounds, group_warning_threshold=10**9
     )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        found = fit(flat, mask=bad, error=error, init_params=start)
-        drawn = fit.make_model_image(flat.shape)
+        found = fit(flat / unit, mask=bad, error=error / unit, init_params=start)
+        drawn = unit * fit.make_model_image(flat.shape)
+    for name in ("flux_init", "flux_fit", "flux_err"):
+        found[name] *= unit
     found.sort("id")
     found["parted"] = parted
     return found, drawn

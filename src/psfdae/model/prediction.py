@@ -332,7 +332,8 @@ def _table_header(id_format: str, count: int) -> Header:
     for number, (_, _, about) in enumerate(COLUMNS.values(), start=2):
         header[f"TCOMM{number}"] = about
     for flag, about in MEANING.items():
-        header[f"FLAG{int(flag)}"] = flag.name
+        # A FITS keyword has eight characters.
+        header[f"FLAG{int(flag)}" if flag < 10000 else f"FLG{int(flag)}"] = flag.name
         header["COMMENT"] = f"{int(flag)} {flag.name}: {about}"
     return header
 

@@ -1,0 +1,359 @@
+"""Pixels that are not light: bad, blank, overscan, hot, cosmic rays; clipped skies; units."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from scipy.spatial import cKDTree
+
+import psfdae
+from command_line import refused
+from psfdae.bright_stars import BrightStars
+from psfdae.image import bad_pixels
+from psfdae.image.detection import sky_of
+from psfdae.image.errors import ObservationError
+from psfdae.image.observation import Source
+from psfdae.image.selection import Verdict, completed, sharper_than_stars
+from psfdae.methods.field import FieldMixture
+from psfdae.model import crowded
+from psfdae.model.fitting import fitted_to
+from psfdae.model.neighbours import _Field
+from psfdae.model.stars import Stars
+from psfdae.noise import NoiseModel
+
+SIDE, GAIN, SKY = 320, 1.5, 300.0
+CAMERA = {"gain": GAIN, "read_noise": 5.0, "saturate": 6e4, "pixel_scale_arcsec": 1.0}
+
+
+def star(side, x, y, fwhm, beta=3.0, fine=5):
+    """A Moffat profile of flux 1, integrated over pixels, in a stamp."""
+    axis = (np.arange(side * fine) + 0.5) / fine - 0.5
+    alpha = fwhm / 2 / np.sqrt(2 ** (1 / beta) - 1)
+    image = (1 + ((axis - x) ** 2 + (axis[:, None] - y) ** 2) / alpha**2) ** -beta
+    return image.reshape(side, fine, side, fine).mean((1, 3)) * (beta - 1) / (np.pi * alpha**2)
+
+
+def field(fwhm=2.8, side=SIDE, spacing=32, seed=1):
+    """A noisy image of stars on a jittered lattice, their places (n, 2) and fluxes."""
+    rng = np.random.default_rng(seed)
+    lattice = np.arange(spacing // 2, side, spacing)
+    place = np.stack(np.meshgrid(lattice, lattice), axis=-1).reshape(-1, 2)
+    place = place + rng.uniform(-4, 4, place.shape)
+    flux = 10 ** rng.uniform(4.2, 5.3, len(place))
+    image, half = np.zeros((side + 60, side + 60)), 30
+    for (x, y), f in zip(place, flux, strict=True):
+        column, row = round(x), round(y)
+        stamp = np.s_[row : row + 2 * half + 1, column : column + 2 * half + 1]
+        image[stamp] += f * star(2 * half + 1, half + x - column, half + y - row, fwhm)
+    image = image[half:-half, half:-half]
+    noisy = rng.poisson((image + SKY) * GAIN) / GAIN + rng.normal(0, 5 / GAIN, image.shape)
+    return noisy, place, flux
+
+
+@pytest.fixture(scope="module")
+def clean():
+    return field()
+
+
+def with_cosmics(image, seed=3, count=40):
+    """Hot pixels, and tracks of cosmic rays; which pixels these are."""
+    rng, out = np.random.default_rng(seed), image.copy()
+    row, column = rng.integers(0, len(image), (2, count))
+    out[row, column] += rng.uniform(300, 2e4, count)
+    for _ in range(10):
+        (y, x), angle = rng.uniform(20, len(image) - 20, 2), rng.uniform(0, np.pi)
+        for s in np.arange(0, 10, 0.5):
+            out[int(y + s * np.sin(angle)), int(x + s * np.cos(angle))] += rng.uniform(500, 5000)
+    return out, out != image
+
+
+def good(stars):
+    return stars.candidates.bright.position
+
+
+# Cosmic rays and hot pixels.
+
+
+@pytest.mark.parametrize("fwhm", [1.2, 1.6, 2.8, 8.0])
+def test_cosmic_rays_are_found_and_stars_are_none(fwhm):
+    image = field(fwhm)[0]
+    none = np.zeros(image.shape, bool)
+    assert not bad_pixels.cosmic_rays(image, none, 6e4).any()
+    dirty, true = with_cosmics(image)
+    found = bad_pixels.cosmic_rays(dirty, none, 6e4)
+    assert (found & ~true).sum() <= 2
+    assert (found & true).sum() >= 0.9 * true.sum()
+
+
+def test_no_star_as_narrow_as_a_pixel_is_a_cosmic_ray():
+    image = field(0.5)[0]
+    none = np.zeros(image.shape, bool)
+    assert not bad_pixels.cosmic_rays(with_cosmics(image)[0], none, 6e4).any()
+
+
+def test_a_saturated_star_has_no_cosmic_rays(clean):
+    flat = np.minimum(clean[0], 3000.0)
+    none = np.zeros(flat.shape, bool)
+    assert not bad_pixels.cosmic_rays(flat, none, 3000.0).any()
+    assert not bad_pixels.blank_areas(flat, none, 3000.0)
+
+
+def test_no_cosmic_ray_is_learnt_from_and_their_number_is_said(clean):
+    image, place, _ = clean
+    dirty, true = with_cosmics(image)
+    before = Stars.from_image(image, detect=True, **CAMERA)
+    stars = Stars.from_image(dirty, detect=True, **CAMERA)
+    distance, _ = cKDTree(place).query(good(stars))
+    assert (distance < 1).all() and len(stars) >= 0.9 * len(before)
+    found = np.count_nonzero(bad_pixels.cosmic_rays(dirty, np.zeros(dirty.shape, bool), 6e4))
+    assert abs(found - true.sum()) < 0.1 * true.sum()
+    assert f"left out: {found} pixels of cosmic rays and hot pixels" in "\n".join(stars.notes)
+    assert "left out" not in "\n".join(before.notes)
+
+
+def test_a_listed_cosmic_ray_is_flagged_sharp(clean):
+    image, place, _ = clean
+    dirty = image.copy()
+    dirty[150, 165] += 5000.0
+    assert np.hypot(*(place - [165, 150]).T).min() > 8
+    listed = np.concatenate([place, [[165, 150]]])
+    (stamps,) = Source(dirty, listed, origin=0, **CAMERA).open(16, 2).chunks(500)
+    sharp = (stamps.flags & psfdae.StarFlag.SHARP) > 0
+    assert sharp.tolist() == [False] * len(place) + [True]
+
+
+def test_sources_off_the_locus_of_the_stars_are_sharp():
+    area = np.exp(np.random.default_rng(1).normal(3.0, 0.05, 60))
+    area[[4, 9]] = 1.0, 5.0
+    assert np.flatnonzero(sharper_than_stars(area)).tolist() == [4, 9]
+    # Where the PSF changes much over the field, half the area is nothing unusual.
+    varied = np.exp(np.linspace(2.0, 4.0, 60))
+    assert not sharper_than_stars(varied).any()
+
+
+# Bad pixels.
+
+
+@pytest.mark.parametrize("part", [0.002, 0.01])
+def test_bad_pixels_cost_no_stars_and_nan_is_as_a_mask(clean, part):
+    image = clean[0]
+    mask = np.random.default_rng(1).uniform(size=image.shape) < part
+    before = Stars.from_image(image, detect=True, **CAMERA)
+    few = {"train_stars": 100, "test_stars": 20}  # images of them
+    masked, nan = (
+        Stars.from_image(pixels, detect=True, **CAMERA, **more, **few)
+        for pixels, more in (
+            (np.where(mask, 3e4, image), {"mask": mask.astype(np.uint8)}),
+            (np.where(mask, np.nan, image), {}),
+        )
+    )
+    assert len(masked) >= 0.9 * len(before)
+    assert f"{mask.sum()} pixels that are masked or have no value" in "\n".join(nan.notes)
+    for name, column in masked.columns.items():
+        assert np.array_equal(column.values, nan.columns[name].values, equal_nan=True), name
+    # What fills a pixel is near what was there: far nearer than the sky is.
+    bright, whole = masked.candidates.bright, before.candidates.bright
+    _, same = cKDTree(whole.position).query(bright.position)
+    true = whole.wide[same]
+    core = np.zeros_like(bright.bad)
+    core[:, 13:20, 13:20] = True
+    chosen = bright.bad & core & (true > 50 * bright.noise[:, None, None])
+    ratio = bright.wide[chosen] / true[chosen] - 1
+    assert chosen.sum() >= 5 * part / 0.01 and np.abs(ratio).max() < 0.3
+    assert np.abs(bright.centre - whole.centre[same]).max() < 0.03
+
+
+@pytest.mark.slow
+def test_bad_pixels_have_no_weight_in_the_field(clean):
+    """Nothing that is written into them changes the fit."""
+    image, place, _ = clean
+    mask = np.random.default_rng(2).uniform(size=image.shape) < 0.005
+    before, after = (
+        fitted_to(Stars.from_image(i, place, mask=m.astype(np.uint8), **CAMERA), FieldMixture)
+        for i, m in ((image, np.zeros_like(mask)), (image, mask))
+    )
+    at = np.array([[160.2, 160.4]])
+    difference = after.psf_at(at) - before.psf_at(at)
+    # σ of a pixel of the mean of all stars, times that part of it which is left out, and some.
+    assert np.abs(difference).max() < 0.002 * before.psf_at(at).max()
+
+
+def test_a_star_without_a_fifth_of_its_light_is_incomplete(clean):
+    image, place, _ = clean
+    mask = np.zeros(image.shape, np.uint8)
+    column, row = np.rint(place[44]).astype(int)
+    mask[row - 1 : row + 2, column - 1 : column + 2] = 1  # over half of the light
+    column, row = np.rint(place[45]).astype(int)
+    mask[row, column + 2] = 1
+    stars = Stars.from_image(image, place, mask=mask, **CAMERA)
+    verdict = stars.candidates.verdict
+    assert verdict[44] == Verdict.INCOMPLETE and verdict[45] == Verdict.GOOD
+
+
+def test_completed_stars_are_their_neighbours_scaled():
+    """Equal stars of other fluxes: a bad pixel gets what the star has there."""
+    rng = np.random.default_rng(3)
+    shift = rng.uniform(-0.5, 0.5, (20, 2))
+    shape = np.stack([star(32, 16 + x, 16 + y, 3.0) for y, x in shift])
+    flux = rng.uniform(1e4, 1e5, 20)
+    wide, bad = shape * flux[:, None, None], np.zeros(shape.shape, bool)
+    bad[7, 16, 17] = True
+    hurt = np.where(bad, 0.0, wide)
+    zero = np.zeros((20, 2), int)
+    position, nan = rng.uniform(0, 300, (20, 2)), np.full((20, 2), np.nan)
+    known = (position, flux, np.full(20, 5.0), flux / 30, np.arange(20), nan, nan[:, 0])
+    found, missing = completed(BrightStars(hurt, zero, shift, *known, bad), 16, 3)
+    assert found.wide[7, 16, 17] == pytest.approx(wide[7, 16, 17], rel=0.02)
+    part = shape[7, 16, 17] / shape[7, 8:24, 8:24].sum()
+    assert missing[7] == pytest.approx(part, rel=0.03) and missing.sum() == missing[7]
+    assert found.framed(20)[1].sum() == 20 * 400 - 1
+
+
+def test_a_star_with_a_bad_pixel_in_its_core_is_one_source(clean):
+    image, place, _ = clean
+    bad = np.zeros(image.shape, bool)
+    column, row = np.rint(place).astype(int).T
+    bad[row, column] = True
+    found = sky_of(np.where(bad, np.nan, image), bad).stars(5.0)
+    seen = np.stack([found["X_IMAGE"], found["Y_IMAGE"]], axis=1) - 1
+    distance, index = cKDTree(seen).query(place)
+    assert len(seen) == len(place) == len(set(index)) and distance.max() < 0.5
+
+
+# Areas without data.
+
+
+@pytest.mark.parametrize("value", [0.0, -32768.0, 300.0])
+def test_blank_areas_are_bad_and_said(clean, value):
+    image, place, _ = clean
+    empty = image.copy()
+    empty[:, :60] = value
+    empty[100:112, 200:220] = value  # inside
+    stars = Stars.from_image(empty, detect=True, **CAMERA)
+    count = 60 * SIDE + 12 * 20
+    assert f"{count} blank pixels (value {value:g})" in "\n".join(stars.notes)
+    assert stars.observation.positions[:, 0].min() > 59
+    sky = stars.observation.sky()
+    assert np.median(sky.level) == pytest.approx(SKY, rel=0.01)
+    known = place[place[:, 0] > 68]
+    assert cKDTree(stars.observation.positions).query(known)[0].max() < 8
+
+
+@pytest.mark.slow
+def test_light_and_fluxes_beside_an_empty_area(clean):
+    image, place, flux = clean
+    empty = image.copy()
+    empty[:, :80] = 0.0
+    total = []
+    for pixels in (image, empty):
+        stars = Stars.from_image(pixels, place, **CAMERA)
+        model = _Field(fitted_to(stars, FieldMixture), 16)
+        found = crowded.photometry(model, stars.observation, 5.0)
+        wings = found.wings
+        total.append(0.0 if wings is None else wings.light()[0])
+        at = (place[:, 0] > 100) & (place[:, 0] < 300)
+        assert np.median(found.stars["flux"][at] / flux[at]) == pytest.approx(1.0, abs=0.02)
+    assert total[1] == pytest.approx(total[0], abs=0.015)
+
+
+def test_noise_of_few_counts_has_no_blank_areas():
+    rng = np.random.default_rng(5)
+    for scatter in (0.2, 0.4, 1.0):
+        image = np.rint(rng.normal(100.0, scatter, (256, 256)))
+        assert not bad_pixels.blank_areas(image, np.zeros(image.shape, bool))
+    # Nor has the even sky of an image without noise, where the light of stars ends.
+    image = np.full((256, 256), 7.0)
+    image[100:132, 100:132] += 1e4 * star(32, 16, 16, 3.0)
+    none = np.zeros(image.shape, bool)
+    assert not bad_pixels.blank_areas(image, none)
+    assert bad_pixels.least_value_share(image, none)[0] == 0
+
+
+def test_overscan_of_the_header_is_bad_where_the_pixels_confirm_it(clean):
+    image = clean[0]
+    header = fits.Header({"TRIMSEC": "[1:300,1:320]", "BIASSEC": "[305:320,1:320]"}.items())
+    none = np.zeros(image.shape, bool)
+    assert not bad_pixels.overscan([header], image, none)  # it was trimmed, and this is sky
+    rng, frame = np.random.default_rng(6), image.copy()
+    frame[:, 300:] = rng.normal(50.0, 4.0, (SIDE, 20))
+    ((key, area),) = bad_pixels.overscan([header], frame, none)
+    assert key == "TRIMSEC" and area[:, 300:].all() and not area[:, :300].any()
+    other = fits.Header({"TRIMSEC": "[51:2098,1:2048]"}.items())
+    assert not bad_pixels.overscan([other], frame, none)
+
+
+# Clipped skies.
+
+
+def test_a_clipped_sky_is_refused_in_one_line(clean, tmp_path):
+    image, place, _ = clean
+    clipped = np.clip(np.rint(image - SKY), 0, None)
+    path = tmp_path / "clipped.fits"
+    fits.writeto(path, clipped.astype(np.uint16))
+    said = refused("from-stars", path, "--detect", "--out", tmp_path / "m")
+    assert "of the pixels have the least value, 0: the sky was clipped" in said
+    assert not (tmp_path / "m").exists()
+    with pytest.raises(ObservationError, match="clipped"):
+        Stars.from_image(clipped, place)
+    for scatter, sky in ((12.0, 0.0), (12.0, -12.0)):
+        noise = np.random.default_rng(7).normal(sky, scatter, (256, 256))
+        share, least = bad_pixels.least_value_share(
+            np.maximum(noise, 0), np.zeros(noise.shape, bool)
+        )
+        assert share >= 0.49 and least == 0
+    few = np.random.default_rng(8).poisson(1.0, (256, 256)).astype(float)
+    assert bad_pixels.least_value_share(few, np.zeros(few.shape, bool))[0] == 0
+
+
+# Units.
+
+
+@pytest.mark.parametrize("unit", [1e-12, 1e-25])
+def test_the_same_stars_are_chosen_in_any_unit(clean, unit):
+    image = clean[0] - SKY
+    one, two = (Stars.from_image(pixels, detect=True) for pixels in (image, image * unit))
+    assert (one.candidates.verdict == two.candidates.verdict).all()
+    assert good(two) == pytest.approx(good(one))
+    fluxes = [stars.candidates.bright.flux for stars in (one, two)]
+    assert fluxes[1] / unit == pytest.approx(fluxes[0], rel=1e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("unit", [1e-4, 1e-18, 1e-25, 1e10])
+def test_nothing_depends_on_the_unit(clean, unit):
+    image = clean[0] - SKY
+    found = []
+    for pixels in (image, image * unit):
+        stars = Stars.from_image(pixels, detect=True)
+        model = _Field(fitted_to(stars, FieldMixture), 16)
+        found.append((stars, model, crowded.photometry(model, stars.observation, 5.0).stars))
+    (one, first, table), (two, second, scaled) = found
+    assert (one.candidates.verdict == two.candidates.verdict).all()
+    assert good(two) == pytest.approx(good(one))
+    assert second.psf_at(160.0, 160.0) == pytest.approx(first.psf_at(160.0, 160.0), abs=1e-7)
+    off = np.array(scaled["flux"]) / unit - np.array(table["flux"])
+    assert np.nanmax(np.abs(off) / np.array(table["flux_error"])) < 0.01
+
+
+# Pixels far below the sky.
+
+
+def test_no_rate_of_photons_is_below_zero():
+    psf = star(16, 8, 8, 2.5)[None].repeat(3, axis=0)
+    psf[1, 3, 4] = -0.05  # where a neighbour was subtracted badly
+    noisy = NoiseModel(1.0, 72.0).draw(psf, 1e-3, np.random.default_rng(1))
+    assert np.isfinite(noisy).all()
+
+
+def test_pixels_far_below_the_sky_are_left_out(clean):
+    image, place, _ = clean
+    deep = image.copy()
+    column, row = np.rint(place[44]).astype(int)
+    deep[row + 3, column + 2] -= 3000.0
+    stars = Stars.from_image(deep, place, **CAMERA)
+    bright = stars.candidates.bright
+    (index,) = np.flatnonzero(bright.row == 44)
+    assert "left out: 1 dead pixels" in "\n".join(stars.notes)
+    assert bright.bad[index].sum() == 1
+    assert bright.wide[index][bright.bad[index]] > -5 * bright.noise[index]
