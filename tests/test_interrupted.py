@@ -25,7 +25,7 @@ TARGET = f"{RESULTS}/evaluation/dataset3/random-realisation.csv"
 STARS = f"{RESULTS}/data/seidel/seidel_10pct.h5"
 CHECKPOINT = f"{RESULTS}/checkpoints/dae/dataset3/random-realisation.pt"
 # Long enough for a signal to arrive in mid-training, which then resumes.
-SLOW = "train.epochs=40 train.checkpoint_seconds=0 train.batch=8"
+SLOW = "train.epochs=20 train.checkpoint_seconds=0 train.batch=8"
 TOO_LARGE = 150_000
 """Bytes that a file may have where there is no space: less than the stars need."""
 
