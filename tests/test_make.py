@@ -85,7 +85,8 @@ def test_a_killed_run_ends_in_the_bytes_of_another_run_and_leaves_its_home_alone
     home.mkdir()
     with log.open("w") as out:
         run = shell(folder, REPRODUCE, home, stdout=out, stderr=out, start_new_session=True)
-        wait_until(lambda: log.read_text().count("\nFinished jobid") >= 8, 600, "no progress")
+        wait_until(lambda: run.poll() or log.read_text().count("\nFinished") >= 8, 600, "too slow")
+        assert run.poll() is None, log.read_text()
         os.killpg(run.pid, signal.SIGKILL)
         assert run.wait() != 0
     with log.open("w") as out:
