@@ -428,7 +428,7 @@ def test_one_command_beats_the_noisy_star_and_the_baseline(tmp_path):
     image, catalogue, out = (tmp_path / name for name in ("i.fits", "s.csv", "model"))
     made = simulate.write_example(image, catalogue, seed=1)
     words = [image, "--catalogue", catalogue, "--out", out]
-    words += ["methods=[noisy,pca_som,dae]"]
+    words += ["methods=[noisy,pca_som,dae]", "train.epochs=12", "parts.train_stars=2000"]
     assert run(*words).exit_code == 0
     report = pd.read_csv(out / "report.csv").set_index(["method", "snr"])
     dae, baseline, noisy = (report.loc[m] for m in ("dae", "pca_som", "noisy"))
