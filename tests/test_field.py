@@ -123,7 +123,7 @@ def field(stars):
 
 @pytest.fixture(scope="module")
 def chosen(stars):
-    """With order and smoothness by stars left out, as those of a user's image."""
+    """Order and smoothness are those of stars left out, as for a user's image."""
     return fitted(stars, (0, 1, 2))
 
 
@@ -153,7 +153,7 @@ def size(images):
 
 
 def test_terms_of_high_orders_are_solved_for(stars, monkeypatch):
-    """Though monomials are nearly the same over the field, conjugate gradients end in time."""
+    """Conjugate gradients end in time though monomials are nearly the same over the field."""
     from scipy.sparse import linalg
 
     solve, ended = linalg.cg, []

@@ -262,7 +262,7 @@ def test_the_method_may_be_named_and_settings_used_by_hand(network, tmp_path):
 
 
 def test_own_noise_is_what_moving_and_dividing_leave_of_it():
-    """Of many noisy images of one star, and of few stars in many images."""
+    """The covariance is that of many noisy images of one star, and of few stars in many."""
     rng, grid, count = np.random.default_rng(3), np.arange(24) - 12, 6000
     wide = np.exp(-(grid[:, None] ** 2 + grid**2) / 8)
     wide /= cut(wide[None], 8).sum()
@@ -395,7 +395,7 @@ def test_what_cannot_be_used_ends_in_one_line(training, tmp_path, monkeypatch, w
 @pytest.mark.workflow
 @pytest.mark.parametrize("page", ["docs/own_stars.md", "docs/tutorial.md"])
 def test_commands_of_pages_run(page, tmp_path, monkeypatch):
-    """From first to last, on a small image and a tiny network."""
+    """The commands run from first to last, on a small image and a tiny network."""
     text = read(page)
     steps = [line.words for line in commands(text) if line.words[0] == "psfdae"]
     assert {"example-field", "from-stars", "predict", "psf"} <= {step[1] for step in steps}
