@@ -47,7 +47,7 @@ class Moving(FieldPsfs):
 
 @pytest.mark.parametrize(("samples", "limit"), [(8, 1.5e-3), (16, 1e-3)])
 def test_galsim_reads_what_is_written_for_psfex(tmp_path, samples, limit):
-    """Positions, axes, phases, sampling and flux agree at ten places; its Lanczos kernel has order 3."""
+    """Positions, axes, phases, sampling and flux agree at ten places (Lanczos order 3)."""
     model, path = Moving(), tmp_path / "m.psf"
     assert exchange.write_psfex(path, model, samples) < 1e-6
     read = des.DES_PSFEx(str(path))
