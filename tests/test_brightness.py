@@ -95,7 +95,7 @@ def test_the_psf_follows_magnitude_or_colour_and_is_that_of_the_end_beyond(name)
 
 @pytest.mark.parametrize(("change", "orders"), [(0.0, [0, 1]), (1.0, [0])])
 def test_stars_that_are_alike_or_one_order_alone_need_no_magnitude(change, orders):
-    """Of one order nothing is tried."""
+    """No term of a star is tried beside a single order."""
     assert len(fitted(bright_stars(2, change), orders).low) == 2
 
 
@@ -168,7 +168,7 @@ def squared_error(prediction, truth):
 
 
 def test_a_star_has_the_psf_of_its_own_flux_or_of_the_magnitude_that_is_stated(plate):
-    """Where noise hides the star itself; a stated magnitude counts whatever the flux."""
+    """Noise hides the star itself; a stated magnitude counts whatever the flux."""
     rng, mag, count = np.random.default_rng(5), -12.5, 200
     truth = plate.psf_at(*PLACE, 1, mag=mag)
     noisy = truth + 0.01 * rng.standard_normal((count, *truth.shape))
@@ -184,7 +184,7 @@ def test_a_star_has_the_psf_of_its_own_flux_or_of_the_magnitude_that_is_stated(p
 
 
 def test_a_star_has_the_psf_of_its_colour(colourful):
-    """Where noise hides the star itself."""
+    """Noise hides the star itself."""
     rng, count = np.random.default_rng(5), 200
     low, high = RANGES["colour"]
     colour = np.resize([low, high], count)

@@ -79,7 +79,7 @@ def sky(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def found(sky):
-    """Its photometry, with stars that are looked for."""
+    """The photometry of all stars, which are looked for."""
     folder, path, _ = sky
     observation = Source(folder / "i.fits", detect=5.0).open(STAMP)
     return crowded.photometry(load_model(path), observation, 5.0)
@@ -195,7 +195,7 @@ def test_damaged_wings_are_refused(sky, changed):
 
 @pytest.mark.parametrize("level", [0.0, 3.0])
 def test_wings_are_found_beside_a_wrong_sky(level):
-    """Of a known profile, as tents are; an even light beside them does not count."""
+    """The profile is known, tents; an even light beside them does not count."""
     rng = np.random.default_rng(1)
     place, flux = rng.uniform(0, 300, (30, 2)), 10 ** rng.uniform(4, 5.5, 30)
     blank = np.ones(30)
@@ -402,7 +402,7 @@ def chosen(sky, **settings):
 
 
 def test_stars_are_kept_whose_neighbours_can_be_subtracted(sky, monkeypatch):
-    """Where many are crowded: the stars of pairs are good then, and as alike as single ones."""
+    """Stars of pairs are good where many are crowded, and as alike as single ones."""
     before = chosen(sky)
     assert "neighbours" not in words_of(before)
     level = float(np.quantile(fits.getdata(sky[0] / "i.fits"), 0.9998))

@@ -47,7 +47,7 @@ class Moving(FieldPsfs):
 
 @pytest.mark.parametrize(("samples", "limit"), [(8, 1.5e-3), (16, 1e-3)])
 def test_galsim_reads_what_is_written_for_psfex(tmp_path, samples, limit):
-    """At ten places: positions, axes, phases, sampling, flux. Its Lanczos kernel is of order 3."""
+    """Positions, axes, phases, sampling and flux agree at ten places (Lanczos order 3)."""
     model, path = Moving(), tmp_path / "m.psf"
     assert exchange.write_psfex(path, model, samples) < 1e-6
     read = des.DES_PSFEx(str(path))
@@ -61,7 +61,7 @@ def test_galsim_reads_what_is_written_for_psfex(tmp_path, samples, limit):
 
 
 def test_psfex_comes_back(tmp_path):
-    """What was written is read as the same PSFs, at any sampling, and described alike."""
+    """The PSFs that were written are read again, at any sampling, and described alike."""
     model, path = Moving(), tmp_path / "m.psf"
     exchange.write_psfex(path, model, 8)
     back = load_field(path)

@@ -183,7 +183,7 @@ def test_without_other_stars_the_field_stays(sky):
 
 
 def test_deformations_are_the_slopes_of_the_splines():
-    """Of a Gaussian, to 0.5 % of the largest where it is stretched, to 2 % where it is blurred."""
+    """A Gaussian is stretched to 0.5 % of the largest slope, and blurred to 2 %."""
     spacing, sigma = 0.5, 1.4
     axis = (np.arange(41) - 20) * spacing
     x, y = axis, axis[:, None]
@@ -277,7 +277,7 @@ def test_a_list_on_the_sky_is_one_of_all_images(night, tmp_path):
 
 
 def test_the_sky_of_a_training_is_that_of_the_typical_star(night):
-    """In photons: an exposure with another gain counts by its stars."""
+    """The sky counts in photons: an exposure with another gain counts by its stars."""
     folder, _, _ = night
     sources = [Source(folder / f"{name}.fits", detect=5.0) for name in ("rich", "poor")]
     sources[1] = replace(sources[1], gain=3.0)

@@ -262,7 +262,7 @@ def test_the_method_may_be_named_and_settings_used_by_hand(network, tmp_path):
 
 
 def test_own_noise_is_what_moving_and_dividing_leave_of_it():
-    """Of many noisy images of one star, and of few stars in many images."""
+    """The covariance is that of many noisy images of one star, and of few stars in many."""
     rng, grid, count = np.random.default_rng(3), np.arange(24) - 12, 6000
     wide = np.exp(-(grid[:, None] ** 2 + grid**2) / 8)
     wide /= cut(wide[None], 8).sum()
@@ -395,7 +395,7 @@ def test_what_cannot_be_used_ends_in_one_line(training, tmp_path, monkeypatch, w
 @pytest.mark.workflow
 @pytest.mark.parametrize("page", ["docs/own_stars.md", "docs/tutorial.md"])
 def test_commands_of_pages_run(page, tmp_path, monkeypatch):
-    """From first to last, on a small image and a tiny network."""
+    """The commands run from first to last, on a small image and a tiny network."""
     text = read(page)
     steps = [line.words for line in commands(text) if line.words[0] == "psfdae"]
     assert {"example-field", "from-stars", "predict", "psf"} <= {step[1] for step in steps}
@@ -428,7 +428,7 @@ def test_one_command_beats_the_noisy_star_and_the_baseline(tmp_path):
     image, catalogue, out = (tmp_path / name for name in ("i.fits", "s.csv", "model"))
     made = simulate.write_example(image, catalogue, seed=1)
     words = [image, "--catalogue", catalogue, "--out", out]
-    words += ["methods=[noisy,pca_som,dae]"]
+    words += ["methods=[noisy,pca_som,dae]", "train.epochs=12", "parts.train_stars=2000"]
     assert run(*words).exit_code == 0
     report = pd.read_csv(out / "report.csv").set_index(["method", "snr"])
     dae, baseline, noisy = (report.loc[m] for m in ("dae", "pca_som", "noisy"))

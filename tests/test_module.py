@@ -66,6 +66,7 @@ def test_a_project_builds_dataset3_with_its_telescope(project):
     assert "Nothing to be done" in run("--dry-run", "psfdae_dataset3", "stars")
 
 
+@pytest.mark.slow
 def test_every_target_is_one_of_the_module(project):
     """Programs and stress tests lie beside the workflow, wherever the project is."""
     _, run = project

@@ -122,6 +122,7 @@ def python(root, program):
     return done.stdout.strip()
 
 
+@pytest.mark.slow
 def test_a_stage_and_a_figure_are_three_each(tree, tmp_path):
     stage = {
         added(tree, "src/psfdae_paper/stages/count_fields.py", STAGE),
