@@ -59,7 +59,6 @@ def evaluate(at, stars="s.h5", dae="dae"):
     ("override", "key", "values"),
     [
         ("telescope.pixel_scale_arcsec=0.2", "telescope.pixel_scale_arcsec", (0.1, 0.2)),
-        ("grid.points=5", "grid.points", (3, 5)),
         ("wavefront.coma=5.0", "wavefront.coma", (4.0, 5.0)),
         ("stars=turbulence", "scene.name", ("seidel", "turbulence")),
     ],
@@ -78,7 +77,6 @@ def test_stars_need_templates_of_their_own_scene(at, override, key, values):
             *("s.h5", ["--reference=template"], "dae/config.yaml"),
             *("reference", ("realisation", "template")),
         ),
-        ("s.h5", ["seed=1"], "pca_som.h5", "seed", (20200611, 1)),
         ("s.h5", ["parts.train_stars=30"], "pca_som.h5", "parts.train_stars", (40, 30)),
     ],
 )
