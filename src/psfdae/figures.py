@@ -78,13 +78,13 @@ def new_figure(height_in: float, **kwargs: Any) -> Figure:
     return figure
 
 
-def as_png(figure: Figure) -> bytes:
+def as_png(figure: Figure, dpi: int = DPI) -> bytes:
     """The figure as PNG; the same figure gives the same bytes."""
     content = BytesIO()
     # Ticks are made, and the way of saving is looked up, only now. The default metadata name
     # matplotlib's version.
     with in_style():
-        figure.savefig(content, format="png", dpi=DPI, metadata={"Software": None})
+        figure.savefig(content, format="png", dpi=dpi, metadata={"Software": None})
     return content.getvalue()
 
 
