@@ -210,17 +210,6 @@ def test_every_epoch_shows_every_state_once(config, states, stamps):
     assert len(_batches(config, 29, data)) == 1
 
 
-def test_every_field_shows_a_draw_of_its_own(config, states, stamps):
-    draws = np.stack([stamps, -stamps, 3 * stamps]).astype(np.float32)
-    (images, truth), *_ = _batches(config, 30, TrainingStates(states, draws))
-    order = [np.abs(states - state).sum(axis=1).argmin() for state in truth]
-    factors = images.sum(axis=(2, 3)) / (256 * stamps[order].sum(axis=(2, 3)))
-    number = np.round(factors)
-    assert factors == pytest.approx(number, rel=1e-4)
-    assert set(number.ravel()) == {1, -1, 3}
-    assert any(len(set(fields)) > 1 for fields in number)
-
-
 def test_components_are_those_of_mirrored_noisy_stamps(config, noise, stamps, states):
     """A perceptron learns from components that its network would find in the stamps."""
     network = config.perceptron.model_copy(update={"components": 20})

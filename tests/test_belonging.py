@@ -195,16 +195,11 @@ def test_tables_of_scene_3_are_of_one_test(tmp_path):
 
     estimates, fit = written("e", "estimate", states), written("f", "fit", states)
     require_one_test(estimates, fit, written("b", "bound", states))
-    for message, override in (
-        (r"o\.h5: noise\.kappa = 3\.0, but .*e\.h5 has 4\.98", "noise.kappa=3"),
-        (r"o\.h5: telescope\.diameter_m = 2\.0, but .*f\.h5 has 1\.5", "telescope.diameter_m=2"),
-    ):
-        with pytest.raises(ProductError, match=message):
-            require_one_test(estimates, fit, written("o", "bound", states, override))
-    for message, other, override in (
-        (r"o\.h5: seed = 2, but .*e\.h5 has 20200611", states, ("seed=2",)),
-        (r"o\.h5: state 0 = \[1\.0, .*e\.h5 has \[-1\.0, ", -states, ()),
-        (r"number of states = 2, but .*e\.h5 has 3", states[:2], ()),
+    for message, other, *override in (
+        (r"o\.h5: telescope\.diameter_m = 2\.0, but .* 1\.5", states, "telescope.diameter_m=2"),
+        (r"o\.h5: seed = 2, but .*e\.h5 has 20200611", states, "seed=2"),
+        (r"o\.h5: state 0 = \[1\.0, .*e\.h5 has \[-1\.0, ", -states),
+        (r"number of states = 2, but .*e\.h5 has 3", states[:2]),
     ):
         with pytest.raises(ProductError, match=message):
             require_one_test(estimates, written("o", "fit", other, *override), [])

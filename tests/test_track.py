@@ -18,7 +18,6 @@ from psfdae_paper.stages import track
 from psfdae_paper.tracking import runs_of_datasets
 
 TABLES = ("runs", "metrics", "params", "tags", "inputs", "logged_models", "model_versions")
-METHODS = ("wavefront", "wavefront_position")
 PNG = b"\x89PNG\r\n\x1a\n"
 HISTORY = ((1, 3e-5, "nan", 1.5), (2, 2e-5, 1e-5, 3.0), (3, 1e-5, 2e-5, 4.5))
 
@@ -51,8 +50,9 @@ def write_stars(path, **scene):
     write_product(path, "stars", columns, tree | scene)
 
 
-def write_tree(results, dataset="dataset3", reference="template"):
+def write_tree(results):
     """A results folder as the workflow leaves it, without any training."""
+    dataset, reference = "dataset3", "template"
     values = {"a": Column(np.arange(3.0), "1", "values")}
     stars = results / "data/seidel/stars.h5"
     write_stars(stars)
@@ -85,14 +85,13 @@ class Site:
         self.stars = write_tree(self.results)
         self.database = self.results / "mlflow.db"
         self.dae = self.results / "dae/dataset3/random-template"
-        self.optics = False
         shutil.copy(empty_database, self.database)
 
     def track(self):
         """Import everything; actions by kind of run, as the receipt tells."""
         receipt = self.results / "runs.csv"
         stars = tuple(self.stars.items())
-        track.track(self.results, "smoke", self.database, receipt, stars, self.optics)
+        track.track(self.results, "smoke", self.database, receipt, stars)
         with receipt.open(newline="") as file:
             return {row["kind"]: row["action"] for row in csv.DictReader(file)}
 
@@ -102,14 +101,9 @@ class Site:
 
         return MlflowClient(f"sqlite:///{self.database}")
 
-    @property
-    def experiment(self):
-        return self.client.get_experiment_by_name("scene1")
-
-    def runs(self, kind="dae", where=None):
-        """Runs of a kind, or those that a filter finds."""
-        place = [self.experiment.experiment_id]
-        return self.client.search_runs(place, where or f"tags.kind = '{kind}'")
+    def runs(self, kind="dae"):
+        experiment = self.client.get_experiment_by_name("scene1").experiment_id
+        return self.client.search_runs([experiment], f"tags.kind = '{kind}'")
 
     def history(self, run, metric):
         return self.client.get_metric_history(run.info.run_id, metric)
@@ -179,19 +173,6 @@ def test_best_is_the_version_that_errs_least_of_the_present_results(site):
     table.with_name("random-realisation.csv").write_text(text)
     site.track()  # errors to templates do not compete with errors to realisations
     assert best().tags["reference"] == "realisation"
-
-
-def test_a_method_that_knows_the_optics_is_a_run_without_a_model(site):
-    rows = ["dataset,split,reference,method,noise_level,metric,value,stderr,n"]
-    rows += [f"dataset3,random,template,{m},0.001,mse,3e-7,2e-8,420" for m in METHODS]
-    folder = site.results / "wavefront"
-    folder.mkdir()
-    (folder / "dataset3.csv").write_text("\n".join([*rows, ""]))
-    (folder / "dataset3.parquet").write_bytes(b"stars")
-    site.optics = True
-    assert site.track() == dict.fromkeys(METHODS, "created")
-    (run,) = site.runs("wavefront_position")
-    assert run.data.metrics["bounded_mse_0.001"] == 3e-7
 
 
 def test_changed_files_replace_a_run_and_another_config_supersedes_it(site):
