@@ -195,8 +195,10 @@ def test_tables_of_scene_3_are_of_one_test(tmp_path):
 
     estimates, fit = written("e", "estimate", states), written("f", "fit", states)
     require_one_test(estimates, fit, written("b", "bound", states))
+    bound = written("o", "bound", states, "telescope.diameter_m=2")
+    with pytest.raises(ProductError, match=r"o\.h5: telescope\.diameter_m = 2\.0, but .* 1\.5"):
+        require_one_test(estimates, fit, bound)
     for message, other, *override in (
-        (r"o\.h5: telescope\.diameter_m = 2\.0, but .* 1\.5", states, "telescope.diameter_m=2"),
         (r"o\.h5: seed = 2, but .*e\.h5 has 20200611", states, "seed=2"),
         (r"o\.h5: state 0 = \[1\.0, .*e\.h5 has \[-1\.0, ", -states),
         (r"number of states = 2, but .*e\.h5 has 3", states[:2]),
