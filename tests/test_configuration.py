@@ -21,14 +21,14 @@ from workflow_runs import captured
 DATASETS = sorted({p.stem for p in config_dir().glob("dataset/[!_]*.yaml")} - {SCENE3})
 
 
-def of_the_paper(dataset):
-    """A dataset in the preset of the paper, composed once for all tests of this file."""
-    return load((f"dataset={dataset}", "preset=paper"))
+def settings_of(dataset):
+    """A dataset in the default preset, composed once for all tests of this file."""
+    return load((f"dataset={dataset}",))
 
 
 @pytest.mark.parametrize("dataset", DATASETS)
 def test_every_dataset_composes_as_its_file(dataset):
-    config = of_the_paper(dataset)
+    config = settings_of(dataset)
     assert config.dataset.name == dataset
     if dataset != "from_stars":  # its stars are of an image
         assert (config_dir() / f"noise/{config.noise.name}.yaml").is_file()
@@ -38,10 +38,11 @@ def test_every_dataset_composes_as_its_file(dataset):
 def test_settings_of_the_paper():
     bands = {1: [3e-5, 5e-5, 7e-5, 9e-5], 2: [3e-4, 5e-4, 7e-4, 9e-4], 3: [1e-3, 2e-3, 3e-3, 5e-3]}
     for number in range(1, 7):
-        config = of_the_paper(f"dataset{number}")
+        config = settings_of(f"dataset{number}")
         assert config.noise.levels == bands[(number - 1) % 3 + 1]
         assert config.stars.aberration_fraction == (0.1 if number <= 3 else 0.5)
         assert config.stars.count == 8405
+    config = load(["preset=paper"])
     assert (config.train.epochs, config.train.batch, config.train.lr) == (100, 125, 5e-5)
     assert config.dae.kernels == [9, 7, 5, 3, 1, 1, 3, 5, 7, 9]
     assert config.baseline.epochs == 200
@@ -77,7 +78,7 @@ def test_search_distances_follow_from_the_telescope():
     asked = {f"dataset{n}": 24 for n in (1, 2, 3, 7, 8)}
     asked |= {"dataset4": 64, "dataset5": 64, "dataset6": 64, "field": 48}
     for dataset, px in asked.items():
-        config = of_the_paper(dataset)
+        config = settings_of(dataset)
         assert (config.framing.search_px, config.stars.search_px) == (24, px)
         assert "search_lambda_d" not in config.model_dump()["stars"]
     given = load(["telescope=wfsat_literal", "framing.search_px=100", "stars.search_lambda_d=5"])
