@@ -210,17 +210,6 @@ def test_every_epoch_shows_every_state_once(config, states, stamps):
     assert len(_batches(config, 29, data)) == 1
 
 
-def test_every_field_shows_a_draw_of_its_own(config, states, stamps):
-    draws = np.stack([stamps, -stamps, 3 * stamps]).astype(np.float32)
-    (images, truth), *_ = _batches(config, 30, TrainingStates(states, draws))
-    order = [np.abs(states - state).sum(axis=1).argmin() for state in truth]
-    factors = images.sum(axis=(2, 3)) / (256 * stamps[order].sum(axis=(2, 3)))
-    number = np.round(factors)
-    assert factors == pytest.approx(number, rel=1e-4)
-    assert set(number.ravel()) == {1, -1, 3}
-    assert any(len(set(fields)) > 1 for fields in number)
-
-
 def test_components_are_those_of_mirrored_noisy_stamps(config, noise, stamps, states):
     """A perceptron learns from components that its network would find in the stamps."""
     network = config.perceptron.model_copy(update={"components": 20})
@@ -313,29 +302,6 @@ def test_free_flux_and_place_cost_precision(model, config, operator, noise, stat
     ratio = expected_abs_error(free).mean() / expected_abs_error(fixed).mean()
     assert 1.2 < ratio < 1.35
     assert np.linalg.eigvalsh(free - fixed).min() > -1e-9
-
-
-@pytest.mark.slow
-def test_last_step_reaches_the_maximum_of_the_exact_optics(
-    model, operator, config, noise, states, stamps
-):
-    """Of all steps but the last an emulator, as the workflow makes it, gives the stamps."""
-    train = uniform_states(config.alignment.train_states, np.random.default_rng(1))
-    emulator = StampEmulator(model, operator, train, operator(model(train))[0], FIT)
-    level = 0.002
-    images = noise.draw(stamps, level, np.random.default_rng(8))
-    last, exact = (_likelihood(model, operator, noise, level, e) for e in (emulator, None))
-    first = fit_states(Likelihood(emulator, noise, level), images, states + 0.02, FIT)
-    fit = fit_states(last, images, first.parameters, FIT)
-    best = fit_states(exact, images, fit.parameters, FIT.model_copy(update={"tolerance": 0.01}))
-    assert fit.converged.all()
-    assert fit.evaluations.mean() < 1.2
-    sigma = np.sqrt(np.diagonal(np.linalg.inv(best.information), axis1=1, axis2=2))
-    off = [np.sqrt(np.mean(((f.parameters - best.parameters) / sigma) ** 2)) for f in (first, fit)]
-    assert 0.01 < off[1] < 0.08
-    assert off[1] < off[0] < 0.12
-    # The gain of a step that is not looked at.
-    assert (-2 * fit.height) == pytest.approx((-2 * best.height), abs=0.3)
 
 
 def test_emulator_of_few_states(model, operator, states, stamps):

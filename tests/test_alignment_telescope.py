@@ -51,16 +51,6 @@ def test_focal_ratio_and_spots_of_the_prescription(config, tracer):
         assert np.sqrt(x.var() + y.var()) / focal < 0.05 * ARCSEC
 
 
-def test_misalignment_moves_the_secondary_of_a_copy(config, tracer):
-    assert misaligned(tracer.optic, np.zeros(4)) == tracer.optic
-    moved = misaligned(tracer.optic, np.array([1e-3, 0.0, 0.0, 1e-3]))
-    assert moved["M2"].coordSys.origin[0] == pytest.approx(1e-3)
-    assert moved["M1"] == tracer.optic["M1"]
-    assert tracer.optic == build_optic(
-        config.prescription, config.telescope, config.alignment.defocus_m
-    )
-
-
 def test_aligned_telescope_is_round_and_out_of_focus(tracer):
     centre = tracer(np.zeros((1, 4)))[0, 0]
     round_terms = np.isin(np.arange(4, 23), [4, 11, 22])
@@ -92,35 +82,7 @@ def test_signs_and_sizes_of_the_four_degrees_of_freedom(tracer, fields_deg, name
         assert response[:, noll] == pytest.approx(expected, abs=0.006), noll
 
 
-MIRRORS = {
-    "x": np.array([[-1, 0], [0, 1]]),
-    "y": np.array([[1, 0], [0, -1]]),
-    "diagonal": np.array([[0, 1], [1, 0]]),
-    "quarter turn": np.array([[0, -1], [1, 0]]),
-}
-
-
-@pytest.mark.parametrize("name", MIRRORS)
-def test_mirror_symmetries_of_the_telescope(tracer, name):
-    """A mirrored state shows the mirrored wavefront in the mirrored field.
-
-    Decentres and fields are vectors; tilts are axial, a mirror turns them round.
-    """
-    mirror = MIRRORS[name]
-    states = uniform_states(4, np.random.default_rng(3))
-    axial = np.linalg.det(mirror) * mirror
-    mirrored = np.hstack([states[:, :2] @ mirror.T, states[:, 2:] @ axial.T])
-    distance = np.linalg.norm(tracer.fields @ mirror.T - tracer.fields[:, None], axis=-1)
-    partner = distance.argmin(axis=0)
-    assert distance.min(axis=0).max() < 1e-12
-    x, y = np.random.default_rng(4).uniform(-0.7, 0.7, (2, 50))
-    here = tracer(states) @ zernike_basis(22, x, y)[3:]
-    there = tracer(mirrored)[:, partner] @ zernike_basis(22, *(mirror @ [x, y]))[3:]
-    assert np.abs(here).max() > 1
-    assert there == pytest.approx(here, abs=3e-8)
-
-
-def test_batoid_s_own_zernike_fit(config, tracer):
+def test_batoid_s_own_zernike_fit(tracer):
     """On a fine square grid; ours needs 96 rays of the annulus."""
     from batoid import zernike
 
@@ -132,27 +94,6 @@ def test_batoid_s_own_zernike_fit(config, tracer):
             optic, *tracer.fields[field], 6e-7, nx=96, reference="mean", jmax=22, eps=0.0
         )
         assert ours[field] == pytest.approx(theirs[4:], abs=2e-6)
-
-
-def test_surfaces_of_the_telescope(tracer):
-    """Shapes, places and glass as batoid holds them; the detector is 0.2 mm beyond focus."""
-    import batoid
-
-    optic = tracer.optic
-    surfaces = {
-        "M1": (batoid.Quadric(7.5, -1.2536), 0.0),
-        "M2": (batoid.Quadric(4.5882, -9.512), 2.4118),
-        "l1 front": (batoid.Sphere(-0.701), -0.4891),
-        "l1 back": (batoid.Sphere(-1.179), -0.5141),
-        "l2 front": (batoid.Sphere(1.1446), -0.616),
-        "l2 back": (batoid.Sphere(-4.4215), -0.641),
-        "D": (batoid.Plane(), -0.80231),
-    }
-    for name, (surface, z) in surfaces.items():
-        part = optic[name.split()[0]][name] if name.startswith("l") else optic[name]
-        assert part.surface == surface, name
-        assert part.coordSys.origin == pytest.approx([0, 0, z], abs=1e-12), name
-    assert optic["l1"].medium.getN(600e-9) == pytest.approx(1.4580, abs=1e-4)  # fused silica
 
 
 def test_weights_of_the_annulus_integrate_zernike_products():
@@ -170,7 +111,6 @@ def test_weights_of_the_annulus_integrate_zernike_products():
     ("state", "message"),
     [
         ([0, 0, 1.2, 0], r"state 1: tilt_x = 1\.2 of the range \(0\.12°\)"),
-        ([0, -1.5, 0, 0], r"state 1: decenter_y = -1\.5 of the range \(-1\.5 mm\)"),
         ([0, 0, 0, np.nan], r"state 1: tilt_y = nan"),
     ],
 )
@@ -192,12 +132,9 @@ def test_vignetted_field_is_refused():
     ("override", "message"),
     [
         ("prescription.lenses.l1.back_vertex_m=-0.48", r"prescription\.lenses\.l1: thickness"),
-        ("prescription.lenses.l2.front_vertex_m=-0.51", "from back of l1 to front of l2"),
         ("~prescription.secondary.conic", r"prescription\.secondary\.conic: missing"),
-        ("prescription.primary.radius_m=0", r"prescription\.primary\.radius_m"),
         ("alignment.stamp_px=15", r"alignment\.stamp_px = 15: .*multiple of 2"),
         ("optics.pupil_samples=[158,126]", r"pupil_samples: \[158, 126\] must be ascending"),
-        ("cnn.strides=[1,2]", r"cnn: strides = \[1, 2\]: 5 widths"),
         ("cnn.kernels=[3,3,4,3,3]", r"cnn: kernels = .* must be odd"),
     ],
 )

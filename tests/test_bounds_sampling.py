@@ -212,23 +212,6 @@ def test_stamps_beside_their_place_are_recentred(stars, model, noise):
     assert np.mean(back) > 0.6
 
 
-def test_a_mode_undetected_with_the_field_given_shows(stars, model, noise):
-    """No sample around the mode beside it is framed as the star is."""
-    wrong, truth, noisy, problem = aside(stars, model, noise, 1e-4, (0, 4))
-    right = climb(truth, *problem)
-    rngs = [stream(1, "test", 0)]
-    arguments = (noisy, np.zeros(1, int), *problem[1:], [50, 50], rngs)
-    lost = sampled_sums(wrong + right, *arguments)
-    assert np.isnan(merge(lost.in_field).mean_image).all()
-    error = ((lost.in_field_helped.mean_image - stars[1][:1].reshape(1, -1)) ** 2).mean()
-    assert error < 1e-7
-    assert 0 < lost.in_field_helped.variance[0].mean() < 1e-7
-    sums = sampled_sums(replace(right, given=np.full(1, FIELD)), *arguments)
-    assert sums.in_field_helped.mean_image == pytest.approx(
-        merge(sums.in_field).mean_image, abs=1e-9
-    )
-
-
 def test_what_is_found_without_the_truth_does_not_depend_on_it(stars, model, noise):
     wrong, truth, noisy, problem = aside(stars, model, noise, 1e-3, (0, 1))
     both = wrong + climb(truth, *problem)

@@ -123,10 +123,6 @@ def test_a_star_without_possible_samples_is_named_and_the_others_bounded(tmp_pat
     for row in compared(tables, tmp_path, errors).itertuples():
         assert row.n == STARS - 2
         assert row.mse == pytest.approx(2 * finite.mean(), rel=1e-5)
-        assert (row.median, row.median_bound) == pytest.approx(
-            (2 * np.median(finite), np.median(finite)), rel=1e-5
-        )
-        assert row.variance_bound == pytest.approx(finite.mean(), rel=1e-5)
         assert row.efficiency == pytest.approx(0.5, rel=1e-5)
 
 

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
-import signal
-import urllib.request
 from subprocess import PIPE, STDOUT
 
 import click
@@ -19,7 +16,7 @@ from fits_inputs import write_field
 from psfdae.cli import main
 from psfdae.model import packing
 from psfdae.model.bundle import read_bundle
-from workflow_runs import QUIET, clone, shell, wait_until
+from workflow_runs import clone, shell
 
 SMALL = ("parts.train_stars=60", "parts.test_stars=20")
 """Makes `psfdae from-stars` quick."""
@@ -45,7 +42,18 @@ DRY = {
     *(f"make {t}" for t in ("benchmark", "stability", "bounds", "training_knee", "report")),
     "snakemake sweep --cores all --config sweep=dae_width",
     "snakemake tracking --forcerun track track_alignment",
-    *(f"make {t}" for t in ("reference", "test", "test-all", "test-docs", "test-pythons")),
+    *(
+        f"make {t}"
+        for t in (
+            "mlflow",
+            "mlflow PORT=5001",
+            "reference",
+            "test",
+            "test-all",
+            "test-docs",
+            "test-pythons",
+        )
+    ),
 }
 """Commands that take over 10 minutes, need a run that does, or would run this test: planned."""
 
@@ -129,24 +137,6 @@ def typed(line):
     return line.typed
 
 
-def served(folder, line):
-    """A page that is served until it is stopped."""
-    port = dict(word.split("=") for word in line.split() if "=" in word).get("PORT", "5000")
-    server = shell(folder, line, start_new_session=True, **QUIET)
-    try:
-        wait_until(lambda: answers(f"http://127.0.0.1:{port}/"), 60, line)
-    finally:
-        os.killpg(server.pid, signal.SIGTERM)
-        server.wait()
-
-
-def answers(url):
-    try:
-        return urllib.request.urlopen(url, timeout=5).status == 200
-    except OSError:
-        return False
-
-
 @pytest.mark.written
 @pytest.mark.workflow
 @pytest.mark.parametrize("page", [page for page in pages() if commands(read(page))])
@@ -159,9 +149,6 @@ def test_commands_as_written(page, house, tmp_path):
         elif "results/paper" in line.words and not (house / "results/paper").exists():
             for name in ("dae", "evaluation"):
                 shutil.copytree(house / "results" / name, house / "results/paper" / name)
-        if line.words[:2] == ("make", "mlflow"):
-            served(folder, line.typed)
-            continue
         if line.words[0] in NOT_RUN:
             continue
         process = shell(folder, typed(line), stdout=PIPE, stderr=STDOUT, text=True)

@@ -16,7 +16,6 @@ from psfdae.metrics import (
     mse,
     ssim,
 )
-from psfdae_paper.configuration.methods import registered
 from psfdae_paper.evaluation.paper import as_markdown, paper_table
 
 
@@ -87,17 +86,8 @@ def test_paper_table_puts_ours_beside_the_paper_s():
     columns += ["value", "stderr", "n"]
     table = paper_table(pd.DataFrame(rows, columns=columns), "dataset3", "mse")
     assert list(table.columns[3:]) == ["0.001", "0.002", "0.003", "0.005"]
-    given = [["original-noise", pca, "DAE"] for pca in ("PCA", *["PCA (given λ)"] * 2)]
-    assert table.groupby(["source", "reference"]).method.agg(list).tolist() == given
-    assert "| paper" in as_markdown(table, "dataset3", "mse")
+    assert set(table.source) == {"paper", "psfdae"}
     assert "2.7568e-05" in as_markdown(table, "dataset3", "mse")
-
-
-def test_labels_say_what_a_method_is_given_beside_the_image():
-    ends = {kind.name: kind.look.label.partition(" (")[2] for kind in registered()}
-    assert ends["dae"] == ends["noisy"] == ""
-    assert ends["lmmse"] == ends["pca_som"] == ends["gmm"] == "given λ)"
-    assert ends["gmm_position"] == ends["field"] == "given λ, position)"
 
 
 def test_correlation_is_pearson_s_with_fisher_s_interval():

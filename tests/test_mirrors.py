@@ -122,7 +122,6 @@ LENS = (
     ("name", "override", "message"),
     [
         ("newtonian", f"{PRESCRIPTION}.best_focus_m=-1", "from primary to best focus = -1 m"),
-        ("ritchey_chretien", f"{PRESCRIPTION}.best_focus_m=1", "from secondary to best focus = -0"),
         ("newtonian", f"++{PRESCRIPTION}.lenses.l1={LENS}", r"lenses = \['l1'\]: must lie behind"),
         ("ritchey_chretien", f"++{PRESCRIPTION}.lenses.l1={LENS}", "glass: must be given for lens"),
     ],

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 
 import pandas as pd
@@ -12,7 +11,6 @@ import pytest
 from psfdae.files import ProductError
 from psfdae_paper import source
 from psfdae_paper.stages import record
-from workflow_runs import captured, environment
 
 ROOT = Path(__file__).resolve().parents[1]
 REFERENCE = ROOT / "results/reference"
@@ -135,52 +133,6 @@ def test_record_of_another_code_is_refused(results, history, tmp_path, file, sta
     with pytest.raises(ProductError, match=refusal):
         record.reference(results, out, [plan(results, **status)])
     assert (out / "tables/t.csv").read_text() == "before"
-
-
-def test_kept_table_of_a_commit_outside_the_history_is_refused(results, history, tmp_path):
-    out = tmp_path / "reference"
-    history()
-    source.git("checkout", "--quiet", "-b", "side")
-    kept = {SLOW: {"commit": history(), "date": "2026-01-01"}}
-    source.git("checkout", "--quiet", "-")
-    written(out / SLOW, "b\n")
-    written(out / "provenance.json", json.dumps({"kept": kept}))
-    with pytest.raises(ProductError, match=r"benchmark_training\.csv: .* not in the history"):
-        record.reference(results, out, [plan(results)])
-
-
-TOY = """rule reference:
-    input: "results/runtime.csv", "results/tables/a.csv"
-rule:
-    output: "results/{name}"
-    wildcard_constraints: name="(runtime|.*a).csv"
-    params: source=HASH
-    shell: "echo {params.source} > {output}"
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.workflow
-def test_make_reference_refuses_a_run_of_two_commits(history, tmp_path):
-    """With Snakemake's own word for it, in a workflow of three files."""
-    for folder in ("config", "src"):
-        shutil.copytree(ROOT / folder, tmp_path / folder, dirs_exist_ok=True)
-    options = {"cwd": tmp_path, "env": environment(PYTHONPATH=str(tmp_path / "src"))}
-
-    def renewed(code, target):
-        written(tmp_path / "Snakefile", TOY.replace("HASH", code))
-        source.git("add", "config", "Snakefile")
-        commit = history()
-        run = captured(["snakemake", "--cores", "1", target], **options)
-        assert run.returncode == 0, run.stderr
-        return commit, captured(["sh", str(ROOT / "workflow/reference.sh")], **options)
-
-    commit, record_run = renewed("1", "reference")
-    assert record_run.returncode == 0, record_run.stderr
-    assert recorded(tmp_path / "results/reference")["commit"] == commit
-    _, record_run = renewed("2", "results/runtime.csv")
-    assert record_run.returncode == 2
-    assert record_run.stderr.count("results/tables/a.csv") == 1
 
 
 def test_record_is_of_commits_in_the_history():

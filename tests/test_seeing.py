@@ -8,15 +8,12 @@ from scipy.integrate import quad
 from scipy.signal import fftconvolve
 from scipy.special import j0
 
-from psfdae.belonging import STARS, STATIC, require
-from psfdae.files import ProductError
 from psfdae.optics.propagation import StampPropagator
 from psfdae.optics.pupil import SamplingError, annular_pupil
 from psfdae.optics.seeing import FAINT, BlurredPropagator, Profile
 from psfdae.optics.wavefronts import zernike_images
 from psfdae.settings import ConfigError
 from psfdae_paper.configuration.compose import load
-from psfdae_paper.stars import framing
 from psfdae_paper.stars.framing import Propagation
 from psfdae_paper.stars.scenes import template_wavefronts
 
@@ -130,15 +127,6 @@ def test_framed_stars_are_wider_and_as_bright():
     assert np.abs(peak).max() < 8
 
 
-@pytest.mark.parametrize("choice", [[OWN, "++telescope.seeing=null"], ["dataset=dataset3"]])
-def test_nothing_is_blurred_without_seeing(monkeypatch, choice):
-    monkeypatch.setattr(framing, "BlurredPropagator", None)
-    config = load([*choice, "grid.points=3"])
-    propagation_of(config).framed(16)
-    # Products hold the configuration; a new key would change their bytes.
-    assert "seeing" not in config.model_dump()["telescope"]
-
-
 @pytest.mark.parametrize(
     ("seeing", "message"),
     [
@@ -156,13 +144,3 @@ def test_every_mistake_is_named(seeing, message):
 def test_seeing_that_no_grid_holds_is_refused():
     with pytest.raises(SamplingError, match=r"^telescope\.seeing\.fwhm_arcsec = 200: .*N ≥ "):
         propagation_of(load(words_of(kind="gaussian", fwhm_arcsec=200)))
-
-
-def test_products_of_another_seeing_do_not_belong(tmp_path):
-    clear = load([OWN, "grid.points=3"])
-    blurred, worse = (load(words_of(kind="gaussian", fwhm_arcsec=f)) for f in (1, 2))
-    with pytest.raises(ProductError, match=r"seeing\.kind = nothing, .* has gaussian"):
-        require(tmp_path, clear.model_dump(), STATIC, blurred)
-    with pytest.raises(ProductError, match=r"seeing\.fwhm_arcsec = 1\.0, .* has 2\.0"):
-        require(tmp_path, blurred.model_dump(), STARS, worse)
-    require(tmp_path, clear.model_dump(), STARS, clear)

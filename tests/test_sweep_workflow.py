@@ -14,10 +14,6 @@ from psfdae_paper.configuration.compose import config_dir
 from psfdae_paper.stages.sweep_summary import best_overrides
 from workflow_runs import (
     QUIET,
-    captured,
-    command,
-    environment,
-    job_counts,
     locked,
     planned,
     snakemake,
@@ -106,21 +102,3 @@ def test_new_value_runs_its_points_only(killed, configure):
     assert planned(folder, SUMMARY) == {"sweep_point": 2, "sweep_summary": 1}
     configure(metric="validation_ssim", direction="maximize")
     assert planned(folder, SUMMARY) == {"sweep_summary": 1}
-
-
-def test_sweep_lists_its_points_figures_and_import(tmp_path):
-    line = [*command(tmp_path, "--dry-run", "sweep"), "sweep=dae_width"]
-    jobs = job_counts(captured(line, env=environment()).stdout)
-    assert (jobs["sweep_point"], jobs["figure_sweep"], jobs["track_sweep"]) == (12, 2, 1)
-    assert not {"train", "baseline", "evaluate"} & set(jobs)
-
-
-@pytest.mark.parametrize(
-    ("choice", "message"),
-    [([], "which sweep?"), (["sweep=none"], "sweep = 'none'")],
-)
-def test_wrong_choice_of_a_sweep_is_named(tmp_path, choice, message):
-    run = captured([*command(tmp_path, "sweep"), *choice], env=environment())
-    assert run.returncode != 0
-    assert message in run.stdout + run.stderr
-    assert not (tmp_path / "results").exists()

@@ -95,14 +95,6 @@ def test_layers_that_do_not_fit_are_named(override, message):
         load(["dataset=dataset7", f"wavefront.{override}"])
 
 
-@pytest.mark.parametrize(
-    ("count", "highest", "message"), [(100, 60.0, "multiple of 8"), (64, 0.01, "must exceed")]
-)
-def test_waves_that_fill_no_rings_are_refused(count, highest, message):
-    with pytest.raises(ValueError, match=message):
-        draw_waves(count, R0, L0, highest, stream(1, "test"))
-
-
 # --- ensemble -------------------------------------------------------------------------
 
 

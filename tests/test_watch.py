@@ -50,12 +50,3 @@ def test_epochs_appear_as_they_are_trained_and_the_finished_run_is_as_ever(live)
     (finished,) = site.runs()
     assert contents(site, finished) == usual
     assert site.track() == {"dae": "unchanged", "baseline": "unchanged"}
-
-
-def test_a_training_that_is_given_up_is_no_run_under_way(live):
-    site, course, look, end = live  # noqa: F811
-    write_history(course, HISTORY)
-    look()
-    end()
-    (run,) = site.runs()
-    assert run.info.status == "KILLED"

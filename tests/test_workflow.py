@@ -94,14 +94,12 @@ def test_the_data_card_describes_the_files(smoke):
     assert arrays == card.keys()
 
 
-@pytest.mark.parametrize(("target", "pictures"), [("all", 3), nightly("dataset7", 2)])
-def test_the_report_opens_with_its_main_pictures_and_all_methods(smoke, tmp_path, target, pictures):
+def test_the_report_opens_with_its_main_pictures_and_all_methods(smoke, tmp_path):
     report = tmp_path / "report.html"
-    snakemake(smoke, "--report", str(report), target)
+    snakemake(smoke, "--report", str(report), "all")
     first = json.loads(re.search(r"var workflow_desc = (\".*\");\n", report.read_text())[1])
-    assert len(re.findall(r'<img [^>]*src="data:image/png', first)) == pictures
+    assert len(re.findall(r'<img [^>]*src="data:image/png', first)) == 3
     words = " ".join(re.sub("<[^>]+>", "", first).split())
-    assert ("Scene 3 (not built in this run)" in words) == (target == "dataset7")
     config = load(["dataset=dataset7", "preset=smoke"])
     for label in (*(method(name).look.label for name in config.methods), ESTIMATORS[0].look.label):
         assert label in words
@@ -167,7 +165,6 @@ FITTED = {"baseline": 3, "train": 5}
     ("module", "repeated", "left"),
     [
         ("psfdae/optics/propagation", {**SIMULATED, **FITTED, "evaluate": 5}, {}),
-        nightly("psfdae/metrics", {"evaluate": 5}, {**SIMULATED, **FITTED}),
         ("psfdae_paper/evaluation/curves", {"figure_curves": 2}, {**SIMULATED, "evaluate": 5}),
     ],
 )
@@ -178,19 +175,9 @@ def test_code_repeats_what_is_made_with_it_and_nothing_before(jobs, module, repe
     assert not left.keys() & plan.keys()
 
 
-@pytest.mark.parametrize(
-    ("override", "stars"),
-    [
-        ("wavefront.r0_m=0.15", 1),
-        # That of a dataset that was not built is simulated, too.
-        nightly("wavefront.coma=3.5", 2),
-    ],
-)
-def test_keys_of_one_scene_leave_the_others_alone(smoke, override, stars):
-    """The README's SET with a key of scene 2 alone, and one of scene 1."""
-    targets = ("scene1", "scene2", *["dataset5"][: stars - 1])
-    jobs = planned(smoke, *targets, overrides=override)
-    assert (jobs["templates"], jobs["stars"]) == (1, stars)
+def test_keys_of_one_scene_leave_the_others_alone(smoke):
+    jobs = planned(smoke, "scene1", "scene2", overrides="wavefront.r0_m=0.15")
+    assert (jobs["templates"], jobs["stars"]) == (1, 1)
 
 
 @pytest.mark.parametrize(
@@ -213,9 +200,7 @@ def test_a_target_lists_no_job_of_another(tmp_path, target, included, others):
     ("options", "key"),
     [
         ({"overrides": "framing.stamp_px=6"}, "framing.stamp_px = 6"),
-        nightly({"overrides": "trian.lr=1"}, "trian.lr"),
         nightly({"overrides": "train.lr='2e-3"}, "set = "),
-        nightly({"preset": "none"}, "preset/none"),
         # Sizes have to fit together where a dataset is built.
         nightly(
             {"overrides": "stars.count=9000", "preset": "fast"},
@@ -232,12 +217,7 @@ def test_wrong_config_stops_before_any_job(tmp_path, options, key):
 
 
 @pytest.mark.parametrize(
-    "word",
-    [
-        "results=$(touch pwned)",
-        nightly("presett=fast"),
-        nightly("preset=a/b"),
-    ],
+    "word", ["results=$(touch pwned)", nightly("presett=fast"), nightly("preset=a/b")]
 )
 def test_an_unknown_or_no_plain_word_is_refused(tmp_path, word):
     """Results and preset become words of a shell."""

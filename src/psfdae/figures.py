@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import wraps
 from io import BytesIO
@@ -49,14 +50,19 @@ RC: dict[str, Any] = {
 Drawing = Callable[..., "Figure"]
 
 
+def in_style() -> AbstractContextManager[None]:
+    """The style above for a block of code, whatever matplotlibrc the user has."""
+    import matplotlib.style
+
+    return matplotlib.style.context(["default", RC])
+
+
 def styled(draw: Drawing) -> Drawing:
-    """Draw in the style above, whatever matplotlibrc the user has."""
+    """Draw in the style above."""
 
     @wraps(draw)
     def wrapped(*args: Any, **kwargs: Any) -> Figure:
-        import matplotlib.style
-
-        with matplotlib.style.context(["default", RC]):
+        with in_style():
             return draw(*args, **kwargs)
 
     return wrapped
@@ -72,11 +78,13 @@ def new_figure(height_in: float, **kwargs: Any) -> Figure:
     return figure
 
 
-def as_png(figure: Figure) -> bytes:
+def as_png(figure: Figure, dpi: int = DPI) -> bytes:
     """The figure as PNG; the same figure gives the same bytes."""
     content = BytesIO()
-    # The default metadata name matplotlib's version.
-    figure.savefig(content, format="png", dpi=DPI, metadata={"Software": None})
+    # Ticks are made, and the way of saving is looked up, only now. The default metadata name
+    # matplotlib's version.
+    with in_style():
+        figure.savefig(content, format="png", dpi=dpi, metadata={"Software": None})
     return content.getvalue()
 
 

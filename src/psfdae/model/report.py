@@ -10,12 +10,11 @@ import base64
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
-from io import BytesIO
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from psfdae.figures import SERIES_COLORS, new_figure, styled
+from psfdae.figures import SERIES_COLORS, as_png, new_figure, styled
 from psfdae.image.selection import Verdict
 from psfdae.image.stamps import StarFlag, cut
 from psfdae.model.plot import SPOILT
@@ -251,9 +250,7 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def _picture(figure: Figure) -> str:
-    content = BytesIO()
-    figure.savefig(content, format="png", dpi=110, metadata={"Software": None})
-    return _png(content.getvalue())
+    return _png(as_png(figure, dpi=110))
 
 
 def _png(content: bytes) -> str:
