@@ -61,7 +61,7 @@ DRY = {
 def test_every_command_is_one_that_there_is_and_a_test_reads_its_page():
     """Its words are those of `psfdae`, of the Makefile, or of a program that a test runs."""
     for page, test in TESTED_ELSEWHERE.items():
-        assert page.removeprefix("docs/") in read(f"tests/{test}")
+        assert page.removesuffix(".md") in read(f"tests/{test}")
     targets = set(re.findall(r"^([\w-]+):", read("Makefile"), re.M))
     for page in pages():
         for line in commands(read(page)):
@@ -111,7 +111,7 @@ def test_commands_of_the_readme_run(observation, tmp_path, monkeypatch):
     for words in lines:
         result = psfdae(*words, *(SMALL if words[0] == "from-stars" else ()))
         assert result.exit_code == 0, result.output
-    assert {"page.html", "psfs.fits", "psfs.png"} <= {path.name for path in tmp_path.iterdir()}
+    assert {"model.html", "psfs.fits", "psfs.png"} <= {path.name for path in tmp_path.iterdir()}
 
 
 @pytest.fixture(scope="module")
