@@ -388,39 +388,25 @@ def test_slopes_of_the_field_s_numbers_are_differences():
 # --- The command
 
 
-@pytest.fixture(scope="module")
-def night(tmp_path_factory):
-    """An image of the example whose coma is not that of its file, with its star list."""
-    folder = tmp_path_factory.mktemp("night")
-    words = ["telescope=example_zernike", "++telescope.aberrations.terms.z8.constant=0.1"]
-    done = command("simulate", *words, "--image-snr", 80, "--out", folder, "grid.points=3")
-    assert done.exit_code == 0, done.output
-    return folder
-
-
-def sense(night, *options):
-    telescope = config_dir() / "telescope" / "example_zernike.yaml"
-    words = ["wavefront", night / "image.fits", "--catalogue", night / "stars.csv"]
-    return [*words, "--telescope", telescope, "--out", night / "wavefront.fits", *options]
-
-
 @pytest.mark.usefixtures("short_chains")
-def test_command_finds_the_changed_coma(night):
-    result = command(
-        *sense(
-            night,
-            "--joint",
-        )
-    )
+def test_command_finds_the_changed_coma(tmp_path):
+    """The coma of an image is not that of the telescope's file."""
+    words = ["telescope=example_zernike", "++telescope.aberrations.terms.z8.constant=0.1"]
+    done = command("simulate", *words, "--image-snr", 80, "--out", tmp_path, "grid.points=3")
+    assert done.exit_code == 0, done.output
+    telescope = config_dir() / "telescope" / "example_zernike.yaml"
+    words = ["--catalogue", tmp_path / "stars.csv", "--telescope", telescope, "--joint"]
+    out = tmp_path / "wavefront.fits"
+    result = command("wavefront", tmp_path / "image.fits", *words, "--out", out)
     assert result.exit_code == 0, result.output
-    with fits.open(night / "wavefront.fits") as file:
+    with fits.open(out) as file:
         state = file["JOINT"].data
         coma = state[state["name"] == "z8.constant"]
         assert coma["value"][0] == pytest.approx(0.1, abs=5 * coma["error"][0])
         assert coma["error"][0] < 0.007
         rows = file["WAVEFRONT"].data
         assert len(file["COVAR"].data) == len(rows)
-        listed = Table.read(night / "stars.csv")[rows["id"]]
+        listed = Table.read(tmp_path / "stars.csv")[rows["id"]]
         off = np.hypot(rows["x"] + 1 - listed["X_IMAGE"], rows["y"] + 1 - listed["Y_IMAGE"])
         # Near the axis the brightest pixel touches the chief ray with a corner; coma moves it off.
         assert off.min() == pytest.approx(0.5**0.5, abs=0.1)
