@@ -8,7 +8,7 @@ import pytest
 
 from docs_pages import blocks, read
 from psfdae.files import read_product
-from workflow_runs import NO_CLUSTER, ROOT, captured, environment, job_counts
+from workflow_runs import NO_CLUSTER, ROOT, captured, environment
 
 pytestmark = pytest.mark.workflow
 
@@ -64,14 +64,3 @@ def test_a_project_builds_dataset3_with_its_telescope(project):
     written = {path.name for path in folder.iterdir()}
     assert written == {".snakemake", "Snakefile", "config", "out", "errors.csv"}
     assert "Nothing to be done" in run("--dry-run", "psfdae_dataset3", "stars")
-
-
-@pytest.mark.slow
-def test_every_target_is_one_of_the_module(project):
-    """Programs and stress tests lie beside the workflow, wherever the project is."""
-    _, run = project
-    targets = ("all", "benchmark", "stability", "bounds", "bundles", "scene3")
-    out = run("--dry-run", *(f"psfdae_{name}" for name in targets))
-    jobs = job_counts(out)
-    assert {name.partition("_")[0] for name in jobs} == {"psfdae", "total"}
-    assert jobs["total"] > 100
