@@ -71,7 +71,7 @@ class Image:
 
 @pytest.fixture(scope="module")
 def sky(tmp_path_factory):
-    """The image, and a field model of it with what the command said."""
+    """The image, a field model of it, and its stars as `predict` measures them."""
     made = Image(tmp_path_factory.mktemp("sky"))
     out = made.folder / "model"
     words = ("--catalogue", made.list, "--method", "field", "--out", out)
@@ -81,11 +81,10 @@ def sky(tmp_path_factory):
             patched.setattr(packing, name, fewer)
         done = run("from-stars", made.image, *words, "methods=[noisy,field]", *TINY)
     assert done.exit_code == 0, done.output
-    made.trained, made.model = done.output, out / "sky.psf.safetensors"
-    made.selection = pd.read_csv(out / "selection.csv")
+    made.model = out / "sky.psf.safetensors"
     done, table = made.predicted(made.list)
     assert done.exit_code == 0, done.output
-    made.prediction, made.stars = done.output, Table.read(table, hdu="STARS")
+    made.stars = Table.read(table, hdu="STARS")
     return made
 
 
