@@ -149,17 +149,6 @@ def test_a_model_has_the_psf_of_a_magnitude_or_colour(training, plate, colourful
     assert several == pytest.approx(np.stack(ends))
 
 
-def test_a_model_of_brightness_is_kept_and_written_for_other_programs(plate, tmp_path):
-    plate.save(tmp_path / "plate.psf.safetensors")
-    again = psfdae.load_model(tmp_path / "plate.psf.safetensors")
-    for mag in (None, -9.0):
-        assert (again.psf_at(1.0, 2.0, mag=mag) == plate.psf_at(1.0, 2.0, mag=mag)).all()
-    low, high = again.field_range()
-    assert low.shape == high.shape == (2,)
-    nodes = again.to_photutils(3, 2)
-    assert nodes.data[4] == pytest.approx(again.psf_at(*np.rint(again.grid(3, 3)[4]), 2), abs=1e-9)
-
-
 PLACE = np.array([300.0, 400.0])
 
 

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import gc
-import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import Table
+from astropy.wcs import WCS
 from photutils.aperture import CircularAperture
+from photutils.psf import GriddedPSFModel, PSFPhotometry
 from scipy.ndimage import uniform_filter
 from scipy.spatial import cKDTree
 
@@ -21,7 +22,6 @@ from psfdae.files import read_product
 from psfdae.image.observation import Source, cut_image
 from psfdae.model import crowded
 from psfdae.model.bundle import BundleError
-from psfdae.model.field_psfs import PredictionError
 from psfdae.model.neighbours import light_of_others
 from psfdae.model.wings import TENTS, Wings, tented_light, wings_of
 from psfdae_paper.stars.example import add_stamps, write_field
@@ -156,16 +156,13 @@ def test_a_model_knows_the_light_beyond_its_stamps(sky, found):
     light, error = model.wings.light()
     assert light == pytest.approx(found.wings.light()[0], abs=4 * error + 0.004)
     observation = Source(folder / "i.fits", folder / "i.csv").open(STAMP, 2)
-    ((stamps, measured),) = model.stream(observation)
+    ((_, measured),) = model.stream(observation)
     alone = ~true["pair"] & (true["flux"] > 1e4)
     ratio = measured.flux_total[alone] / true["flux"][alone]
     # Wings of few stars have an error of their own.
     assert np.median(ratio) == pytest.approx(1.0, abs=0.006 + 2 * error)
     assert np.median(measured.flux[alone] / true["flux"][alone]) < 0.993
     assert (measured.flux_total_error > measured.flux_error).all()
-    # Without a place, a star has the wings of a usual one.
-    unplaced = model.predict(stamps.data[:20], margin=2)
-    assert unplaced.flux_total / unplaced.flux == pytest.approx(1 + light)
     assert psfdae("psf", path, "--grid", "2x2", "--out", folder / "g.fits").exit_code == 0
     header = fits.getheader(folder / "g.fits")
     assert header["FLUXRAD"] == 2.5 * STAMP
@@ -178,8 +175,6 @@ def test_a_model_knows_the_light_beyond_its_stamps(sky, found):
 @pytest.mark.parametrize(
     "changed",
     [
-        {"outer": -1.0},
-        {"profile": [1.0]},
         {"profile": [10**400] * TENTS},
         {"covariance": (-np.eye(TENTS)).tolist()},
     ],
@@ -208,7 +203,6 @@ def test_wings_are_found_beside_a_wrong_sky(level):
     wings = wings_of(image, *known, flux, blank, 10)
     assert wings.light()[0] == pytest.approx(true.light()[0], abs=4 * wings.light()[1])
     assert wings.light()[1] < 0.05 * true.light()[0]
-    assert wings.seen
     assert not wings_of(rng.normal(0, 5, image.shape), *known, flux, blank, 10).seen
     assert wings_of(image, *known, np.full(30, np.nan), blank, 10) is None
 
@@ -222,24 +216,8 @@ def test_the_light_of_tents_is_the_sum_over_pixels():
     assert wings.light(10.0)[0] < wings.light(20.0)[0] < wings.light()[0]
 
 
-def test_groups_are_chains_and_never_large():
-    line = np.stack([np.arange(120.0) * 2, np.zeros(120)], axis=1)
-    line[60:, 0] += 0.3 * np.arange(60)  # these are farther apart
-    far = np.array([[500.0, 500.0], [503.0, 500.0], [np.nan, 1.0]])
-    group, parted = crowded.groups_of(np.concatenate([line, far]), 4.0)
-    assert parted[:120].all() and not parted[120:].any()
-    assert np.unique(group, return_counts=True)[1].max() <= crowded.LARGEST_GROUP
-    assert group[120] == group[121] and group[122] not in group[:122]
-    group, parted = crowded.groups_of(np.zeros((120, 2)), 4.0)  # a list with one star 120 times
-    assert sorted(np.unique(group, return_counts=True)[1]) == [20, 50, 50] and parted.all()
-
-
 def test_models_of_photutils_do_not_mix(sky):
     """Groups are fitted with the model that is asked for, not with that of another field."""
-    from dataclasses import replace
-
-    from photutils.psf import PSFPhotometry
-
     first = load_model(sky[1])
     weights = first.bundle.weights
     smooth = uniform_filter(weights["coefficients"], (1, 5, 5))
@@ -248,7 +226,6 @@ def test_models_of_photutils_do_not_mix(sky):
     one, two = (model.to_photutils(3, 2) for model in (first, other))
     x, y = one.grid_xypos[4]
     assert one.data[4] == pytest.approx(first.psf_at(x, y, 2), abs=1e-12)
-    assert np.abs(one.data[4] - two.data[4]).max() > 1e-5
     rows, columns = np.mgrid[:40, :40]
     drawn = sum(two.evaluate(columns, rows, 1e3, a, 20.0) for a in (16.0, 21.0))
     start = Table({"x": [16.2, 20.9], "y": [20.1, 19.9], "group_id": [1, 1]})
@@ -267,8 +244,6 @@ def test_models_of_photutils_do_not_mix(sky):
 
 def test_a_grid_is_interpolated_as_photutils_does_it(sky):
     """Between the nodes and beyond them, in the pixels of a fit."""
-    from photutils.psf import GriddedPSFModel
-
     grid = load_model(sky[1]).to_photutils(4, 4)
     low, high = grid.grid_xypos.min(axis=0), grid.grid_xypos.max(axis=0)
     rng = np.random.default_rng(4)
@@ -292,21 +267,6 @@ def test_derivatives_of_a_grid_are_those_of_its_light(sky):
         assert slope == pytest.approx((more - less) / (2 * step), abs=2e-3 * np.abs(slope).max())
 
 
-@pytest.mark.parametrize("oversampling", [1, 2])
-def test_a_grid_has_the_star_where_it_is_put(sky, oversampling):
-    model = load_model(sky[1])
-    x, y = np.rint(np.mean(model.field_range(), axis=0)) + np.array([0.3, -0.4])
-    grid = model.to_photutils(3, oversampling)
-    rows, columns = np.mgrid[-8:9, -8:9] + np.rint([y, x]).astype(int)[:, None, None]
-    moved, still = (grid.evaluate(columns, rows, 1.0, *at) for at in ((x, y), np.rint([x, y])))
-    own = model.psf_at(*np.rint([x, y]), 1)[1:, 1:]
-    middle = np.average(np.arange(-(own.shape[1] // 2), own.shape[1] // 2 + 1), weights=own.sum(0))
-    assert np.average(columns, weights=still) - np.rint(x) == pytest.approx(middle, abs=0.03)
-    for axis, by in ((columns, 0.3), (rows, -0.4)):
-        step = np.average(axis, weights=moved) - np.average(axis, weights=still)
-        assert step == pytest.approx(by, abs=0.03)
-
-
 def test_the_command_and_its_table(sky, tmp_path):
     folder, model, true = sky
     true["mag"] = 24.5 - 2.5 * np.log10(true["flux"])
@@ -316,43 +276,28 @@ def test_the_command_and_its_table(sky, tmp_path):
     more = ("--reference", tmp_path / "magnitudes.csv", "--origin", 0, "--residual", left)
     done = psfdae(*words, "--out", out, *more)
     assert done.exit_code == 0, done.output
-    assert re.search(r"zero point 24\.(49|50)\d+ ± 0\.00", done.output), done.output
-    assert "% of it" in done.output
     rows, header = Table.read(out), fits.getheader(out, 1)
     assert header["ZEROPT"] == pytest.approx(24.5, abs=0.01) and header["FLUXRAD"] == 25.0
     assert 0.975 < header["INMODEL"] < 0.995
     row = matched(rows, true)
     assert np.median(rows["mag"][row] - true["mag"]) == pytest.approx(0.0, abs=0.01)
-    x, y = load_wcs(folder / "i.fits").world_to_pixel_values(rows["ra"], rows["dec"])
-    assert x == pytest.approx(np.array(rows["x"]), abs=1e-6)
-    assert y == pytest.approx(np.array(rows["y"]), abs=1e-6)
+    place = WCS(fits.getheader(folder / "i.fits")).world_to_pixel_values(rows["ra"], rows["dec"])
+    assert place == pytest.approx(np.array([rows["x"], rows["y"]]), abs=1e-6)
     assert fits.getdata(left).shape == (SIZE, SIZE)
-    assert "exists already" in psfdae(*words, "--out", out).output
-
-
-def load_wcs(path):
-    from astropy.wcs import WCS
-
-    return WCS(fits.getheader(path))
 
 
 def test_stars_of_a_list_are_measured_and_no_others(sky, tmp_path):
     folder, model, true = sky
     rows = Table.read(folder / "i.csv")[:25]
-    rows.add_row(rows[0])
-    rows["X_IMAGE"][25] = 5000.0  # off the image
+    rows["X_IMAGE"][24] = 5000.0  # off the image
     rows.write(tmp_path / "some.csv")
-    out = tmp_path / "some.ecsv"
-    words = ("photometry", folder / "i.fits", "--model", model, "--zero-point", 25)
-    done = psfdae(*words, "--catalogue", tmp_path / "some.csv", "--out", out)
+    words = ("photometry", folder / "i.fits", "--model", model, "--out", tmp_path / "some.ecsv")
+    done = psfdae(*words, "--catalogue", tmp_path / "some.csv")
     assert done.exit_code == 0, done.output
-    found = Table.read(out)
-    assert len(found) == 26 and found.meta["ZEROPT"] == 25.0
-    assert not np.isfinite(found["flux"][25]) and found["flags"][25] > 0
-    alone = ~np.array(true["pair"][:25])
-    assert np.median((found["flux"][:25] / true["flux"][:25])[alone]) == pytest.approx(
-        1.0, abs=0.01
-    )
+    found = Table.read(tmp_path / "some.ecsv")
+    assert len(found) == 25 and not np.isfinite(found["flux"][24]) and found["flags"][24] > 0
+    ratio = (found["flux"] / true["flux"][:25])[:24][~true["pair"][:24]]
+    assert np.median(ratio) == pytest.approx(1.0, abs=0.01)
 
 
 @pytest.mark.parametrize(
@@ -360,9 +305,7 @@ def test_stars_of_a_list_are_measured_and_no_others(sky, tmp_path):
     [
         (["x.txt"], "x.txt"),
         (["o.csv", "--zero-point", "nan"], "--zero-point"),
-        (["o.csv", "--zero-point", 1, "--reference", "far.csv"], "--reference"),
         (["o.csv", "--reference", "far.csv"], "0 of its stars"),
-        (["o.csv", "--all-extensions"], "--all-extensions"),
         (["o.csv", "--residual", "o.csv"], "o.csv"),
     ],
 )
@@ -392,10 +335,6 @@ def test_light_of_others_leaves_each_star_alone(sky, found):
     assert off.mean() < 0.01 and before.mean() > 0.05
 
 
-def words_of(stars):
-    return " ".join(stars.notes)
-
-
 def chosen(sky, **settings):
     few = {"stamp_px": STAMP, **FEW, **settings}
     return Stars.from_image(sky[0] / "i.fits", sky[0] / "i.csv", **few)
@@ -404,12 +343,10 @@ def chosen(sky, **settings):
 def test_stars_are_kept_whose_neighbours_can_be_subtracted(sky, monkeypatch):
     """Stars of pairs are good where many are crowded, and as alike as single ones."""
     before = chosen(sky)
-    assert "neighbours" not in words_of(before)
     level = float(np.quantile(fits.getdata(sky[0] / "i.fits"), 0.9998))
     saturated = chosen(sky, saturate=level).candidates.verdict == "saturated"
     monkeypatch.setattr("psfdae.model.stars.MANY_CROWDED", 0.1)
     after = chosen(sky, saturate=level)
-    assert "neighbours: the light of" in words_of(after)
     # Those are still seen without their neighbours.
     assert saturated.any() and (after.candidates.verdict[saturated] == "saturated").all()
     paired = np.array(sky[2]["pair"])
@@ -423,25 +360,3 @@ def test_stars_are_kept_whose_neighbours_can_be_subtracted(sky, monkeypatch):
         assert ratio[part].std() == pytest.approx(0.011, abs=0.003)
     means = [images[part].mean(axis=0) for part in (single, ~single)]
     assert np.abs(means[0] - means[1]).max() < 0.01 * means[0].max()
-    assert after.observation.others is None
-
-
-def test_images_that_cannot_be_fitted_keep_their_stars(sky, monkeypatch):
-    def fails(*_):
-        raise PredictionError("no model")
-
-    monkeypatch.setattr("psfdae.model.stars.MANY_CROWDED", 0.1)
-    monkeypatch.setattr(crowded, "photometry", fails)
-    stars = chosen(sky)
-    assert "neighbours: their light was not subtracted (no model)" in words_of(stars)
-    assert len(stars) > 50
-
-
-def test_errors_grow_with_residuals_above_the_noise():
-    table = Table({name: [1.0, 1.0, 1.0] for name in ("x_err", "y_err", "flux_err")})
-    table["reduced_chi2"] = [0.5, 4.0, np.nan]
-    for name in ("id", "x_fit", "y_fit", "flux_fit", "group_id", "group_size", "parted", "flags"):
-        table[name] = [1.0, 2.0, 3.0]
-    stars = crowded._described(None, table, np.zeros((2, 2)), np.zeros((2, 2)), None).stars
-    for name in ("x_error", "y_error", "flux_error"):
-        assert list(stars[name]) == [1.0, 2.0, 1.0]

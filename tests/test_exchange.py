@@ -113,36 +113,21 @@ def test_the_same_everywhere_is_a_polynomial_of_order_0(tmp_path, monkeypatch):
         back.field_range()
 
 
-def altered(path, **cards):
-    """A copy of a .psf file with other cards; None removes one."""
-    out = path.with_name("altered.psf")
-    with fits.open(path) as hdus:
-        for key, value in cards.items():
-            if value is None:
-                del hdus[1].header[key]
-            else:
-                hdus[1].header[key] = value
-        hdus.writeto(out, overwrite=True)
-    return out
-
-
 @pytest.mark.parametrize(
-    ("cards", "message"),
+    ("key", "value", "message"),
     [
-        ({"EXTNAME": "OTHER"}, "PSF_DATA"),
-        ({"POLNAME1": "MAG_AUTO"}, "MAG_AUTO"),
-        ({"POLSCAL1": 0.0}, "range"),
-        ({"PSF_SAMP": "half"}, "no model of PSFEx"),
-        ({"POLDEG1": 10**6}, "range"),
-        ({"POLZERO2": None}, "no model of PSFEx"),
+        ("EXTNAME", "OTHER", "PSF_DATA"),
+        ("POLNAME1", "MAG_AUTO", "MAG_AUTO"),
+        ("POLDEG1", 10**6, "range"),
+        ("PSF_SAMP", "half", "no model of PSFEx"),
     ],
 )
-def test_other_tables_are_refused(tmp_path, cards, message):
+def test_other_tables_are_refused(tmp_path, key, value, message):
     path = tmp_path / "m.psf"
     exchange.write_psfex(path, Moving(), 2)
-    with pytest.raises(PredictionError, match=message) as error:
-        PsfexField(altered(path, **cards))
-    assert "altered.psf" in str(error.value) and "\n" not in str(error.value)
+    fits.setval(path, key, value=value, ext=1)
+    with pytest.raises(PredictionError, match=rf"m\.psf.*{message}"):
+        PsfexField(path)
 
 
 @pytest.fixture
@@ -166,9 +151,7 @@ def test_psf_converts_a_model_of_psfex(psfex, tmp_path):
     [
         ("a.psf", ["--grid", "3x3"], "whole field"),
         ("a.stdpsf.fits", ["--at", "5,5"], "--grid"),
-        ("a.asdf", ["--at", "5,5"], "--grid"),
         ("a.stdpsf.fits", ["--grid", "3x3", "--oversampling", 2], "4 values"),
-        ("a.stdpsf.fits", ["--grid", "100x2"], "99 places"),
         ("x_y_z.stdpsf.fits", ["--grid", "3x3"], "underscores"),
     ],
 )

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import photutils
@@ -21,9 +19,8 @@ from psfdae import load_model
 from psfdae.bright_stars import BrightStars
 from psfdae.field_law import MOST_PX2, OUTLIER_MODES, step_of
 from psfdae.field_psf import fit_field
-from psfdae.method import FitError, TrainingSet
+from psfdae.method import TrainingSet
 from psfdae.methods.field import FieldMixture
-from psfdae.model import exchange
 from psfdae.model.bundle import read_bundle, write_bundle
 from psfdae.model.psf_model import PredictionError
 from psfdae.moments import measure_shapes
@@ -88,18 +85,6 @@ def gridded(path):
     return GriddedPSFModel(NDData(cube, meta=meta))
 
 
-def drawn(path, places):
-    """PSFs (n, m, m) at places (n, 2), x and y, about the middle of their pixels."""
-    grid = gridded(path)
-    side, step = grid.data.shape[-1], int(grid.oversampling[0])
-    axis = (np.arange(side) - side // 2) / step
-    psfs = []
-    for x, y in places:
-        columns, rows = np.meshgrid(np.rint(x) + axis, np.rint(y) + axis)
-        psfs.append(grid.evaluate(columns, rows, 1.0, x, y))
-    return np.stack(psfs)
-
-
 def fitted(stars, orders=(2,), **changed):
     images = stars.wide[:, 8:18, 8:18].astype(np.float32)
     number = np.arange(len(images))
@@ -150,22 +135,6 @@ class Faint:
 def size(images):
     """Width of stars by adaptive moments."""
     return measure_shapes(images.astype(np.float32)).fwhm_px
-
-
-def test_terms_of_high_orders_are_solved_for(stars, monkeypatch):
-    """Conjugate gradients end in time though monomials are nearly the same over the field."""
-    from scipy.sparse import linalg
-
-    solve, ended = linalg.cg, []
-
-    def watched(*args, **options):
-        found, info = solve(*args, **options)
-        ended.append(info == 0)
-        return found, info
-
-    monkeypatch.setattr(linalg, "cg", watched)
-    fitted(stars, orders=(4,))
-    assert ended and all(ended)
 
 
 @pytest.mark.parametrize("snr", SNR)
@@ -244,15 +213,6 @@ def test_without_noise_the_data_come_back_and_without_data_the_field(field):
     expected = field.model.images(field.model.terms(faint.position), faint.centre, SIDE)
     assert hopeless.psf == pytest.approx(unit(expected), abs=0.01 * faint.psf.max())
     assert (hopeless.sigma > found.sigma).all()
-
-
-def test_bright_stars_are_as_sure_as_said(field):
-    """A sky that is not known costs them little."""
-    faint = Faint(100, 2000.0)
-    free, known = (faint.measured(field, sky=sky) for sky in (None, np.full(100, 3.0)))
-    ratio = np.median(free.sigma / known.sigma, axis=(1, 2))
-    assert ((ratio > 0.9) & (ratio < 1.3)).all()
-    assert 0.5 < faint.mse(free) / np.square(free.sigma, dtype=float).mean() < 2
 
 
 @pytest.mark.parametrize("snr", [5.0, 50.0])
@@ -398,12 +358,8 @@ def test_nodes_are_nearer_to_each_other_where_stars_are_undersampled(field, star
     assert field.step_px == 0.25
     monkeypatch.setattr("psfdae.field_law.STEP_FWHM", 0.2 / size(stars.wide).mean())
     finer = fitted(stars)
-    arrays, _ = finer.pack(SIDE, 1e-3)
-    config = {"noise": {"kappa": 1.0, "background_photons": 1e6}}
-    config["field"] = finer.settings.model_dump()
-    restored = FieldMixture.restored(arrays, config, "realisation")
-    assert restored.step_px == finer.step_px == pytest.approx(0.18, abs=0.021)
-    assert np.diff(np.unique(restored.places)) == pytest.approx(finer.step_px)
+    assert finer.step_px == pytest.approx(0.18, abs=0.021)
+    assert np.diff(np.unique(finer.places)) == pytest.approx(finer.step_px)
 
 
 def test_packed_is_the_same_to_half_precision(field):
@@ -435,14 +391,6 @@ def test_psf_between_the_stars_is_the_fields(field):
     assert field.psf_at(np.array([[-500.0, 300.0]])) == pytest.approx(
         field.psf_at(np.array([[field.low[0] // 1 - 1, 300.0]])), abs=1e-3
     )
-
-
-def test_only_bright_stars_make_a_field(stars):
-    images = stars.wide[:, 8:18, 8:18].astype(np.float32)
-    number = np.arange(len(images))
-    data = TrainingSet(images, images, number, number[:0], np.array([0.01]), NoiseModel(1.0, 1e4))
-    with pytest.raises(FitError, match="from-stars"):
-        FieldMixture.fit(data, field=load_stage(("field",), []).field)
 
 
 # The commands, on an image of which every star is known.
@@ -517,22 +465,13 @@ def test_fixed_positions_are_kept(image):
 
 
 def test_python_takes_positions_and_centres(image):
-    model = load_model(image[1])
-    faint = Faint(200, 5.0)
-    nothing, placed, exact = (
-        model.predict(faint.stamps, **given)
-        for given in (
-            {},
-            {"position": faint.position},
-            {"position": faint.position, "centre": faint.centre[:, ::-1], "fixed": True},
-        )
+    model, faint = load_model(image[1]), Faint(200, 5.0)
+    placed, exact = (
+        model.predict(faint.stamps, position=faint.position, **known)
+        for known in ({}, {"centre": faint.centre[:, ::-1], "fixed": True})
     )
-
-    def mse(found):
-        assert not (found.flags & 8).any()
-        return np.square(found.psf / found.flux[:, None, None] - faint.psf).mean()
-
-    assert mse(exact) < 0.5 * mse(placed) < 0.6 * mse(nothing)
+    errors = [p.psf / p.flux[:, None, None] - faint.psf for p in (placed, exact)]
+    assert np.square(errors[1]).mean() < 0.5 * np.square(errors[0]).mean()
     with pytest.raises(PredictionError, match="position of shape"):
         model.predict(faint.stamps, position=faint.position[:3])
     blind = model.predict(np.full((1, SIDE, SIDE), 7.0))
@@ -578,68 +517,22 @@ def test_psf_writes_what_photutils_reads(oblong, tmp_path):
     assert one.shape == (1, SIDE, SIDE) and one.sum() == pytest.approx(1.0)
 
 
-TEN = np.random.default_rng(1).uniform((50, 300), (650, 600), (10, 2))
-
-
-def test_psfs_at_a_place_are_the_same_whoever_is_asked(oblong, tmp_path):
-    """`psf_at`, `psf --at` and `psf --grid`, which photutils interpolates, also in pixels."""
-    assert psfdae("psf", oblong, "--grid", "40x20", "--out", tmp_path / "g.fits").exit_code == 0
-    at = [word for x, y in TEN for word in ("--at", f"{x},{y}")]
-    assert psfdae("psf", oblong, *at, "--out", tmp_path / "at.fits").exit_code == 0
-    model, found = load_model(oblong), drawn(tmp_path / "g.fits", TEN)
-    for (x, y), grid, one in zip(TEN, found, fits.getdata(tmp_path / "at.fits"), strict=True):
-        for asked, other in (((x, y), grid), ((np.rint(x), np.rint(y)), one)):
-            wanted = model.psf_at(*asked)
-            inside = other != 0  # photutils draws nothing beyond the edge of a PSF that moved
-            assert inside.mean() > 0.9
-            assert np.abs(other - wanted)[inside].max() < 1e-3 * wanted.max()
-        pixels, drawn_there = model.psf_at(x, y, 1), grid[:40:4, :40:4]
-        off = np.abs(drawn_there - pixels)[drawn_there != 0]
-        assert off.max() < 1e-3 * pixels.max()
-
-
-def test_thousands_of_places_take_a_line_each_in_the_header_and_no_warning(oblong, tmp_path):
-    places = np.random.default_rng(1).uniform(100, 600, (3000, 2))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        exchange.write_grid(tmp_path / "many.fits", load_model(oblong), places, 2)
-    header = fits.getheader(tmp_path / "many.fits")
-    y, x = (float(v) for v in header["DET_YX2999"].strip("()").split(","))
-    assert (x, y) == pytest.approx(places[-1], rel=1e-6)
-
-
 @pytest.mark.parametrize(
     ("words", "message"),
     [
         (["--grid", "1x5"], "COLUMNSxROWS"),
-        (["--at", "1;2"], "X,Y"),
         (["--at", "1,2", "--grid", "3x3"], "says where"),
-        ([], "says where"),
     ],
 )
 def test_wrong_places_are_one_line(image, tmp_path, words, message):
     assert message in refused("psf", image[1], *words, "--out", tmp_path / "x.fits")
 
 
-def test_a_place_without_a_psf_is_named(shipped, monkeypatch):
-    """A damaged model may have one; nothing is drawn there."""
-    fixed = np.full((2, 4, 4), 1.0)
-    fixed[1] = np.nan
-    field = SimpleNamespace(psf_at=lambda *_: fixed, facts=dict, order=0)
-    monkeypatch.setattr(shipped.engine, "estimator", field)
-    with pytest.raises(PredictionError, match="x 7, y 8"):
-        shipped.psf_at([5.0, 7.0], [6.0, 8.0])
-
-
-def test_models_without_a_field_say_so(image, tmp_path):
-    shipped = load_model()
+def test_models_without_a_field_say_so(image):
     with pytest.raises(PredictionError, match="from-stars --method field"):
-        shipped.psf_at(1.0, 2.0)
-    folder, path, _ = image
+        load_model().psf_at(1.0, 2.0)
     with pytest.raises(PredictionError, match="finite"):
-        load_model(path).psf_at(np.nan, 2.0)
-    words = ("--catalogue", folder / "faint.csv", "--fixed-positions", "--out", tmp_path / "x.fits")
-    refused("predict", folder / "i.fits", *words, "--pixel-scale", 0.9264)
+        load_model(image[1]).psf_at(np.nan, 2.0)
 
 
 @pytest.mark.slow

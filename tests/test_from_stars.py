@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import shlex
 import shutil
 import signal
 import subprocess
@@ -20,30 +19,27 @@ from click.testing import CliRunner
 from command_line import refused
 from docs_pages import blocks, commands, read
 from fits_inputs import write_cube
-from image_training import RECIPE, SIZE_WORDS, SIZES, WORDS, few_draws
-from psfdae import Stars
+from image_training import RECIPE, SIZE_WORDS, WORDS, few_draws
 from psfdae.bright_stars import BrightStars
 from psfdae.cli import main
 from psfdae.commands import from_stars as stage
 from psfdae.commands.from_stars import _alone
 from psfdae.files import read_product, write_product
 from psfdae.image.observation import Source
-from psfdae.image.selection import brightest_pixels, collect
+from psfdae.image.selection import collect
 from psfdae.image.stamps import cut
 from psfdae.image.training_images import make_images, star_grid, training_columns
 from psfdae.methods import groups_of, method
-from psfdae.model.bundle import estimator, read_bundle
-from psfdae.model.report import MEAN_PSF
+from psfdae.model.bundle import read_bundle
 from psfdae.model.settings import from_words
-from psfdae.model.star_sets import noise_model, split_stars
+from psfdae.model.star_sets import split_stars
 from psfdae.model.validation import Report
-from psfdae.moments import moved, windowed_centres
-from psfdae.noise import NoiseModel, OwnNoise, noise_equivalent_px
+from psfdae.moments import moved
+from psfdae.noise import NoiseModel, OwnNoise
 from psfdae.rng import stream
 from psfdae.splits import held_out_fields
 from psfdae_paper.configuration.compose import load_stage
 from psfdae_paper.stages import simulate
-from psfdae_paper.stages.evaluate import READS
 from psfdae_paper.stars.example import RENDER_PX, FieldRecipe, example_field, star_images
 
 TINY = ["preset=smoke", *SIZE_WORDS, "train.epochs=1"]
@@ -106,21 +102,6 @@ def test_example_is_reproducible_and_has_the_noise_that_it_states():
     assert made.image.max() == recipe.saturation
 
 
-def test_example_stars_lie_where_the_catalogue_says(made):
-    # Near the axis, where stars are round and a window moves no centroid.
-    near = np.abs(made.position - 350).max(axis=1) < 120
-    psf = made.psf[near].astype(float)
-    found = windowed_centres(psf, brightest_pixels(psf, 3)[0], np.full(len(psf), 2.0), 10, 1.5)
-    expected = (made.centroid - np.rint(made.position))[near, ::-1]
-    assert near.sum() > 10
-    assert np.abs(found - expected).max() < 0.06
-    bright = made.kind == "bright"
-    snr = made.flux[bright] / np.sqrt(
-        336 * np.median([noise_equivalent_px(p) for p in made.psf[bright]])
-    )
-    assert 80 < snr.min() < snr.max() < 3500
-
-
 def test_selection_keeps_good_stars_only(made, candidates):
     verdict = pd.Series(candidates.verdict)
     good = verdict == "good"
@@ -128,8 +109,7 @@ def test_selection_keeps_good_stars_only(made, candidates):
     assert (verdict[made.kind == "saturated"] == "saturated").all()
     assert good.sum() > 0.6 * (made.kind == "bright").sum()
     assert (candidates.bright.row == np.flatnonzero(good)).all()
-    measured = candidates.snr[good]
-    assert measured.min() >= 100.0
+    assert candidates.snr[good].min() >= 100.0
 
 
 def test_what_the_list_says_against_a_star_counts(training, candidates, config, tmp_path):
@@ -165,11 +145,7 @@ def test_product_stars_is_what_the_stages_read(candidates, config, tmp_path):
     parts = split_stars(product, "held_out", config)
     assert parts.train.size == 120
     assert set(product["field_index"][parts.test]) == set(np.flatnonzero(held_out))
-    assert not set(product["field_index"][parts.train]) & set(np.flatnonzero(held_out))
     assert not {*product["field_index"][parts.fit]} & {*product["field_index"][parts.validation]}
-    # The stack of a star's part of the field is like the star.
-    difference = product["template"] - product["realisation"]
-    assert np.square(difference).mean() < 1e-5
 
 
 def test_held_out_stars_are_the_truth_but_for_their_noise(made, candidates):
@@ -207,7 +183,6 @@ def test_command_leaves_a_model_and_a_report(training):
         ["snr", "noise", "method", "mse", "mse_stderr", "ssim", "images", "stars", "truth_mse"]
     )
     assert report.snr.unique() == pytest.approx([5, 10, 20, 50])
-    assert (out / "report.png").is_file()
     selection = pd.read_csv(out / "selection.csv")
     assert (report.stars == (selection.part == "held out").sum()).all()
     noisy = report[report.method == "noisy"]
@@ -220,32 +195,6 @@ def test_command_leaves_a_model_and_a_report(training):
     errors = dict(re.findall(r"(.+): MSE (\S+) on validation stars", training.output))
     label = method(info.method).look.label
     assert len(errors) == 2 and float(errors[label]) == min(map(float, errors.values()))
-
-
-def test_command_ends_with_how_good_the_model_is_and_what_comes_next(training, tmp_path):
-    report = pd.read_csv(training.out / "report.csv")
-    mse = report.pivot(index="snr", columns="method", values="mse")
-    kind = method(read_bundle(training.bundle).info.method)
-    *_, before, last = training.output.splitlines()
-    assert before.startswith(f"{kind.look.label}: at S/N 10 the MSE is ")
-    ratio = float(re.search(r"is (\S+) times that of one mean PSF", before)[1])
-    assert ratio == pytest.approx((mse[kind.name] / mse[MEAN_PSF]).iloc[1], abs=0.006)
-    words = shlex.split(last)
-    assert words[:2] == ["next:", "psfdae"]
-    assert words[2:7] == ["predict", *training.words, "--model"]
-    done = CliRunner().invoke(main, [*words[2:-1], str(tmp_path / "psf.fits")])
-    assert done.exit_code == 0, done.output
-
-
-def test_page_shows_whether_to_trust_the_model(training):
-    page = training.page.read_text(encoding="utf-8")
-    assert page.count("<img") == 7
-    report = pd.read_csv(training.out / "report.csv")
-    assert f"<td>{report.stars[0]}</td>" in page
-    counts = pd.read_csv(training.out / "selection.csv").verdict.value_counts()
-    for verdict, count in counts.items():
-        assert f"<td>{verdict}</td><td>{count}</td>" in page
-    assert "gain 1.6 electrons per count (GAIN)" in page
 
 
 def test_the_method_may_be_named_and_settings_used_by_hand(network, tmp_path):
@@ -288,9 +237,8 @@ def test_a_model_is_replaced_on_request_only(training, tmp_path):
     made = out / training.bundle.name
     words = [*training.words, "--out", out, *WORDS, "--method", "gmm"]
     before = {path: path.read_bytes() for path in out.rglob("*")}
-    for name in ([], ["--name", "other"]):
-        message = refused("from-stars", *words, *name)
-        assert str(made) in message and "--overwrite" in message
+    message = refused("from-stars", *words, "--name", "other")
+    assert str(made) in message and "--overwrite" in message
     assert {path: path.read_bytes() for path in out.rglob("*")} == before
     with few_draws():
         result = run(*words, "--overwrite")
@@ -365,9 +313,6 @@ def test_a_cube_of_stamps_will_do(candidates, tmp_path):
         result = run(tmp_path / "cube.fits", "--out", tmp_path / "m", *WORDS, "--method", "gmm")
     assert result.exit_code == 0, result.output
     assert read_bundle(tmp_path / "m/cube.psf.safetensors").info.stamp_px == 16
-    # Stamps may have no margin.
-    narrow = Stars.from_image(stamps[:, 8:24, 8:24], pixel_scale_arcsec=1.2, **SIZES)
-    assert len(narrow) > 0.5 * len(stamps)
 
 
 @pytest.mark.parametrize(
@@ -375,10 +320,8 @@ def test_a_cube_of_stamps_will_do(candidates, tmp_path):
     [
         (["{image}"], "star catalogue"),
         (["{image}", "--catalogue", "{stars}", "calibration_stars.stars_min=1000"], "stars_min"),
-        (["{image}", "--catalogue", "{stars}", "calibration_stars.snr_min=1e7"], "0 stars"),
         (["{image}", "--catalogue", "{stars}", "--method", "pca_som"], "--method"),
         (["{image}", "calibration_stars.snr_levels=[10,5]"], "snr_levels"),
-        (["{image}", "calibration_stars.misfit=1"], "misfit"),
         (["none.fits", "--catalogue", "{stars}"], "none.fits"),
         (["cube.fits"], "4 faint"),
     ],
@@ -426,7 +369,7 @@ def test_commands_of_pages_run(page, tmp_path, monkeypatch):
 def test_one_command_beats_the_noisy_star_and_the_baseline(tmp_path):
     """Show 4: 300 bright stars, 16 × 16 px, held-out stars at S/N 10, minutes of one core."""
     image, catalogue, out = (tmp_path / name for name in ("i.fits", "s.csv", "model"))
-    made = simulate.write_example(image, catalogue, seed=1)
+    simulate.write_example(image, catalogue, seed=1)
     words = [image, "--catalogue", catalogue, "--out", out]
     words += ["methods=[noisy,pca_som,dae]", "train.epochs=12", "parts.train_stars=2000"]
     assert run(*words).exit_code == 0
@@ -436,14 +379,3 @@ def test_one_command_beats_the_noisy_star_and_the_baseline(tmp_path):
     ten = dae.index[np.abs(dae.index - 10).argmin()]
     assert dae.mse[ten] < 0.5 * baseline.mse[ten]
     assert dae.mse[ten] < 0.03 * noisy.mse[ten]
-    # Against what the simulation knows, too, and not only the bright star's own image.
-    product = read_product(out / "stars.h5", "stars")
-    bundle = read_bundle(out / "i.psf.safetensors")
-    config = load_stage(READS, (out / "overrides.txt").read_text().split())
-    test = split_stars(product, "held_out", config).test
-    level = min(config.noise.levels, key=lambda v: abs(v - noisy.noise[ten]))
-    drawn = noise_model(config).draw(product["realisation"][test], level, stream(9, "exact"))
-    estimate = estimator(bundle).restore(drawn, level)
-    row = product["row"][product["field_index"][test]]
-    exact = [best_match(made.psf[r], e) for r, e in zip(row, estimate, strict=True)]
-    assert np.mean(exact) < dae.mse[ten]

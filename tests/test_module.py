@@ -8,7 +8,7 @@ import pytest
 
 from docs_pages import blocks, read
 from psfdae.files import read_product
-from workflow_runs import NO_CLUSTER, ROOT, captured, environment, job_counts
+from workflow_runs import NO_CLUSTER, ROOT, captured, environment
 
 pytestmark = pytest.mark.workflow
 
@@ -30,9 +30,8 @@ pixel_scale_arcsec: 0.2
 """
 
 
-@pytest.fixture
-def project(tmp_path):
-    """Folder of a project, and a function that runs Snakemake in it."""
+@pytest.mark.slow
+def test_a_project_builds_dataset3_with_its_telescope(tmp_path):
     shutil.copytree(ROOT / "config", tmp_path / "config")
     (tmp_path / "config/telescope/mine.yaml").write_text(TELESCOPE)
     (text,) = blocks(read("docs/reproduce.md"), "snakemake")
@@ -43,35 +42,18 @@ def project(tmp_path):
 
     def run(*arguments):
         line = ["snakemake", "--cores", "1", *arguments]
-        own = environment(PYTHONPATH=str(ROOT / "src"), **NO_CLUSTER)
-        done = captured(line, cwd=tmp_path, env=own)
+        paths = environment(PYTHONPATH=str(ROOT / "src"), **NO_CLUSTER)
+        done = captured(line, cwd=tmp_path, env=paths)
         assert done.returncode == 0, done.stdout + done.stderr
         return done.stdout + done.stderr
 
-    return tmp_path, run
-
-
-@pytest.mark.slow
-def test_a_project_builds_dataset3_with_its_telescope(project):
-    folder, run = project
     run("psfdae_dataset3", "stars")
-    stars = read_product(folder / "out/data/seidel/seidel_10pct.h5", "stars", ())
+    stars = read_product(tmp_path / "out/data/seidel/seidel_10pct.h5", "stars", ())
     assert stars.config["telescope"]["name"] == "mine"
     assert stars.config["telescope"]["pixel_scale_arcsec"] == 0.2
-    table = (folder / "errors.csv").read_text()
-    assert table == (folder / "out/tables/dataset3_mse.csv").read_text()
-    assert (folder / "out/mlflow/dataset3.csv").is_file()
-    written = {path.name for path in folder.iterdir()}
+    table = (tmp_path / "errors.csv").read_text()
+    assert table == (tmp_path / "out/tables/dataset3_mse.csv").read_text()
+    assert (tmp_path / "out/mlflow/dataset3.csv").is_file()
+    written = {path.name for path in tmp_path.iterdir()}
     assert written == {".snakemake", "Snakefile", "config", "out", "errors.csv"}
     assert "Nothing to be done" in run("--dry-run", "psfdae_dataset3", "stars")
-
-
-@pytest.mark.slow
-def test_every_target_is_one_of_the_module(project):
-    """Programs and stress tests lie beside the workflow, wherever the project is."""
-    _, run = project
-    targets = ("all", "benchmark", "stability", "bounds", "bundles", "scene3")
-    out = run("--dry-run", *(f"psfdae_{name}" for name in targets))
-    jobs = job_counts(out)
-    assert {name.partition("_")[0] for name in jobs} == {"psfdae", "total"}
-    assert jobs["total"] > 100

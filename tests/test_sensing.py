@@ -11,9 +11,7 @@ from astropy.table import Table
 
 import psfdae
 from command_line import psfdae as command
-from command_line import refused
 from docs_pages import blocks, read
-from psfdae.commands.wavefront import as_fits
 from psfdae.optics.derivatives import ModalStamps
 from psfdae.optics.pupil import annular_pupil
 from psfdae.optics.seeing import BlurredPropagator, BlurredSampling, Broadening, Profile
@@ -23,7 +21,6 @@ from psfdae.sensing import stars as engine
 from psfdae.sensing.climbing import Steps, climb, poisson
 from psfdae.sensing.sampling import Chains, Mixture, sample_around
 from psfdae.sensing.stars import SensingError, StarOptics
-from psfdae.settings import ConfigError
 from psfdae.telescope.field import field_model, terms_of
 from psfdae.telescope.settings import Prior, Seeing, read_telescope
 from psfdae_paper.configuration.base import config_dir
@@ -82,7 +79,6 @@ def test_library_reads_telescopes_as_hydra_composes_them(kind):
     ("text", "message"),
     [
         ("defaults: ['../../secret']\n", "NAME"),
-        ("defaults: [nobody]\n", "nobody.yaml"),
         ("defaults: [telescope]\n", "itself"),
         ("name: a\ndiameter_m: -1\n", "diameter_m"),
     ],
@@ -228,16 +224,6 @@ def test_even_part_has_no_sign(kind):
     assert np.abs(optics.twins(star, z) - z).max() > 0.5
 
 
-def test_a_fixed_even_term_has_no_twin():
-    telescope = example("zernike")
-    terms = terms_of(telescope, np.array([[0.5, 0.5]]))
-    terms.sd[:, terms.names.index("z11")] = 0.0
-    optics = StarOptics(telescope, terms, 16)
-    twin = optics.twins(np.array([0]), np.zeros((1, optics.count)))[0]
-    assert np.isinf(twin[terms.names.index("z11")])
-    assert np.isfinite(np.delete(twin, terms.names.index("z11"))).all()
-
-
 @pytest.mark.parametrize("kind", ["zernike", "ritchey_chretien"])
 def test_coarse_pupils_err_far_below_the_noise(kind, monkeypatch):
     """A thousandth of the variance of a pixel of a star of S/N 200."""
@@ -278,10 +264,6 @@ def test_noise_free_stars_come_back():
     assert measured["flux"] == pytest.approx(flux, rel=5e-3)
     assert measured["sky"] == pytest.approx(SKY, abs=5 * measured["sky_error"].max())
     assert found.explained.all()
-    assert found.psf().sum(axis=(1, 2)) == pytest.approx(1.0, abs=0.3)
-    fine = found.psf(3)
-    binned = fine.reshape(4, 16, 3, 16, 3).mean(axis=(2, 4))
-    assert binned[:, 2:-2, 2:-2] == pytest.approx(found.psf()[:, 2:-2, 2:-2], abs=1e-3)
 
 
 @pytest.mark.usefixtures("short_chains")
@@ -305,24 +287,6 @@ def test_intervals_hold_as_many_stars_as_they_say(monkeypatch):
     again = sensed(counts[:2], telescope, angle[:2])
     assert again.draws == pytest.approx(found.draws[:2], abs=1e-3)
     assert found.chi2.mean() == pytest.approx(0.97, abs=0.05)
-    assert len(found.table) >= 20
-
-
-@pytest.mark.usefixtures("short_chains")
-def test_both_signs_of_focus_have_a_probability():
-    """A round image out of focus, with a prior that does not know the side."""
-    telescope = three_terms().model_copy(update={"prior": Prior(fraction=0.0, waves=0.3)})
-    rng, angle = np.random.default_rng(6), np.zeros((2, 2))
-    terms = terms_of(telescope, angle)
-    terms.mean[:] = 0.0
-    truth = np.where(np.array(terms.names) == "z4", 0.3, 0.0) + terms.mean
-    counts, _ = imaged(telescope, angle, truth, np.zeros((2, 2)), 100.0, rng)
-    found = sensed(counts, telescope, angle)
-    focus = found.coefficients[..., terms.names.index("z4")]
-    for star in focus:
-        assert 0.1 < np.mean(star > 0) < 0.9
-    # The prior's mean is −0.15, but its width is twice that.
-    assert (found.summary["probability"] < 0.9).all()
 
 
 @pytest.mark.usefixtures("short_chains")
@@ -343,11 +307,7 @@ def test_bad_stars_stop_nobody_and_are_kept_as_rows():
     assert found.explained[[0, 2]].all() and not found.explained[[1, 5]].any()
     assert found.chi2[-1] > 3.0
     assert np.isnan(found.psf()[1]).all() and np.isfinite(found.draws).all()
-    assert np.nanmax(np.abs(found.measured()["x"] - 7.5)) < 13
-    table = found.table
-    assert np.isnan(table["z4"][table["id"] == 1]).all()
-    sd = np.sqrt(np.einsum("mkk->mk", as_fits(found, "stars")["COVAR"].data))[:, 0]
-    assert sd == pytest.approx(np.asarray(table["z4_error"]), rel=1e-5, nan_ok=True)
+    assert np.isnan(found.table["z4"][found.table["id"] == 1]).all()
     with pytest.raises(SensingError, match="no star has enough"):
         sensed(counts[1:2], telescope, angle[1:2])
 
@@ -358,18 +318,11 @@ def test_bad_stars_stop_nobody_and_are_kept_as_rows():
         (np.ones((2, 16, 15)), {}, r"\(n, d, d\)"),
         (np.ones((2, 16, 16)), {"field_deg": np.zeros((3, 2))}, "field_deg"),
         (np.ones((2, 16, 16)), {"noise": -1.0}, "noise"),
-        (np.ones((2, 16, 16)), {"gain": np.ones(5)}, "gain"),
     ],
 )
 def test_wrong_input_is_named(stars, options, message):
     with pytest.raises(SensingError, match=message):
         psfdae.wavefront(stars, example("zernike"), **{"field_deg": np.zeros((2, 2)), **options})
-
-
-def test_aberrations_beyond_every_grid_are_refused():
-    telescope = example("zernike").model_copy(update={"prior": Prior(waves=90.0)})
-    with pytest.raises(SensingError, match=f"more than {engine.SIZES[-1]} samples"):
-        sensed(np.random.default_rng(1).normal(size=(1, 16, 16)), telescope, np.zeros((1, 2)))
 
 
 # --- The state of a telescope
@@ -415,15 +368,11 @@ def test_seeing_is_found_with_the_telescope():
     counts, _ = imaged(there, angle, model.coefficients(truth), place, 100.0, rng)
     state = sensed(counts, stated, angle, joint=True).joint
     assert state.model.names[-1] == "seeing"
-    assert state.model.units[-1] == "arcsec"
     assert abs(state.value[-1] - 1.8) < 3 * state.error[-1]
     assert 0.002 < state.error[-1] < 0.1
     pull = (state.value[:-1] - truth) / state.error[:-1]
     assert np.sqrt(np.mean(pull**2)) < 2.0
     assert np.abs(state.correlation[-1, :-1]).max() > 0.2
-    fixed = sensed(counts, seen(1.5, 0.0), angle, joint=True).joint
-    assert "seeing" not in fixed.model.names
-    assert fixed.deviance.sum() > state.deviance.sum() + 20
 
 
 def test_slopes_of_the_field_s_numbers_are_differences():
@@ -436,61 +385,33 @@ def test_slopes_of_the_field_s_numbers_are_differences():
     assert change == pytest.approx(1e-4 * slopes[row], abs=1e-2 * np.abs(change).max())
 
 
-def test_nothing_free_and_no_term_are_named():
-    telescope, counts = example("zernike"), np.random.default_rng(1).poisson(SKY, (3, 16, 16))
-    known = telescope.model_copy(update={"prior": Prior(fraction=0.0, waves=0.0)})
-    with pytest.raises(SensingError, match="nothing of the telescope free"):
-        psfdae.wavefront(counts, known, field_deg=np.zeros((3, 2)), joint=True)
-    tilted = telescope.aberrations.model_copy(update={"terms": {"z2": {"constant": 0.1}}})
-    with pytest.raises(ConfigError, match="z2 and z3 only move a star"):
-        terms_of(telescope.model_copy(update={"aberrations": tilted}), np.zeros((1, 2)))
-
-
 # --- The command
 
 
-@pytest.fixture(scope="module")
-def night(tmp_path_factory):
-    """An image of the example whose coma is not that of its file, with its star list."""
-    folder = tmp_path_factory.mktemp("night")
-    words = ["telescope=example_zernike", "++telescope.aberrations.terms.z8.constant=0.1"]
-    done = command("simulate", *words, "--image-snr", 80, "--out", folder, "grid.points=3")
-    assert done.exit_code == 0, done.output
-    return folder
-
-
-def sense(night, *options):
-    telescope = config_dir() / "telescope" / "example_zernike.yaml"
-    words = ["wavefront", night / "image.fits", "--catalogue", night / "stars.csv"]
-    return [*words, "--telescope", telescope, "--out", night / "wavefront.fits", *options]
-
-
 @pytest.mark.usefixtures("short_chains")
-def test_command_finds_the_changed_coma(night):
-    result = command(*sense(night, "--joint", "--plot", night / "map.png"))
+def test_command_finds_the_changed_coma(tmp_path):
+    """The coma of an image is not that of the telescope's file."""
+    words = ["telescope=example_zernike", "++telescope.aberrations.terms.z8.constant=0.1"]
+    done = command("simulate", *words, "--image-snr", 80, "--out", tmp_path, "grid.points=3")
+    assert done.exit_code == 0, done.output
+    telescope = config_dir() / "telescope" / "example_zernike.yaml"
+    words = ["--catalogue", tmp_path / "stars.csv", "--telescope", telescope, "--joint"]
+    out = tmp_path / "wavefront.fits"
+    result = command("wavefront", tmp_path / "image.fits", *words, "--out", out)
     assert result.exit_code == 0, result.output
-    with fits.open(night / "wavefront.fits") as file:
-        assert {hdu.name for hdu in file} >= {"WAVEFRONT", "PSF", "MODEL", "RESIDUAL", "JOINT"}
-        assert (file["UNCERT"].data > 0).all()
+    with fits.open(out) as file:
         state = file["JOINT"].data
         coma = state[state["name"] == "z8.constant"]
         assert coma["value"][0] == pytest.approx(0.1, abs=5 * coma["error"][0])
         assert coma["error"][0] < 0.007
         rows = file["WAVEFRONT"].data
         assert len(file["COVAR"].data) == len(rows)
-        listed = Table.read(night / "stars.csv")[rows["id"]]
+        listed = Table.read(tmp_path / "stars.csv")[rows["id"]]
         off = np.hypot(rows["x"] + 1 - listed["X_IMAGE"], rows["y"] + 1 - listed["Y_IMAGE"])
         # Near the axis the brightest pixel touches the chief ray with a corner; coma moves it off.
         assert off.min() == pytest.approx(0.5**0.5, abs=0.1)
-        assert off.max() < 4.5
         assert file["PSF"].data.shape == (9, 16, 16)
-    assert "z8.constant" in result.output
     assert "9 stars, 0 not explained" in result.output
-    assert (night / "map.png").stat().st_size > 5000
-
-
-def test_command_refuses_pixels_of_another_telescope(night):
-    assert "0.9 arcsec" in refused(*sense(night, "--pixel-scale", 0.9, "--overwrite"))
 
 
 @pytest.mark.usefixtures("short_chains")

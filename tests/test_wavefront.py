@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from psfdae.method import FitError, TrainingSet
+from psfdae.method import TrainingSet
 from psfdae.methods import method
 from psfdae.metrics import mse
 from psfdae.model.star_sets import noise_model
@@ -125,9 +125,3 @@ def test_coefficients_come_with_their_covariance(stars, data, fitted, noisy, nam
     assert len(first.star) > 0.8 * TEST
     pull = np.linalg.solve(first.factor, (first.z - truth[first.star])[:, :, None])
     assert 0.5 < np.median((pull**2).mean(axis=1)) < 2.0
-
-
-def test_stars_of_other_scenes_are_refused(data):
-    turbulent = replace(data, simulation={"scene": {"name": "turbulence"}})
-    with pytest.raises(FitError, match="wavefront: needs stars with random Seidel aberrations"):
-        method("wavefront").fit(turbulent)
