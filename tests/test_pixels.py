@@ -85,6 +85,12 @@ def test_cosmic_rays_are_found_and_stars_are_none(fwhm):
     assert (found & true).sum() >= 0.9 * true.sum()
 
 
+def test_no_star_as_narrow_as_a_pixel_is_a_cosmic_ray():
+    image = field(0.5)[0]
+    none = np.zeros(image.shape, bool)
+    assert not bad_pixels.cosmic_rays(with_cosmics(image)[0], none, 6e4).any()
+
+
 def test_a_saturated_star_has_no_cosmic_rays(clean):
     flat = np.minimum(clean[0], 3000.0)
     none = np.zeros(flat.shape, bool)
