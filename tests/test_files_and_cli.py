@@ -46,23 +46,17 @@ def test_same_config_gives_the_same_bytes(tmp_path):
     assert (tmp_path / "one.h5").read_bytes() == (tmp_path / "two.h5").read_bytes()
 
 
-@pytest.mark.parametrize("damage", ["missing", "truncated", "flipped", "kind", "array"])
-def test_damaged_product_is_named(tmp_path, damage):
+@pytest.mark.parametrize(
+    ("kind", "names"), [("stars", None), ("lengths", ("c",)), ("lengths", None)]
+)
+def test_damaged_product_is_named(tmp_path, kind, names):
+    """A product of another kind, one without an array, one with a flipped bit."""
     path = tmp_path / "p.h5"
     write(path, np.random.default_rng(0).random((200, 30)))
-    whole = path.read_bytes()
-    kind, names = "lengths", None
-    if damage == "missing":
-        path.unlink()
-    elif damage == "truncated":
-        path.write_bytes(whole[: len(whole) // 2])
-    elif damage == "flipped":
-        middle = len(whole) - 3000
-        path.write_bytes(whole[:middle] + bytes([whole[middle] ^ 1]) + whole[middle + 1 :])
-    elif damage == "kind":
-        kind = "stars"
-    else:
-        names = ("c",)
+    if kind == "lengths" and names is None:
+        content = bytearray(path.read_bytes())
+        content[-3000] ^= 1
+        path.write_bytes(content)
     with pytest.raises(ProductError, match=r"p\.h5: "):
         read_product(path, kind, names)
 
