@@ -148,13 +148,6 @@ def test_every_fifth_star_is_held_out_evenly_over_the_field(count):
     assert (star_grid(position[order]) == grid[order]).all()
 
 
-def test_stars_without_positions_keep_their_order():
-    grid = star_grid(np.full((30, 2), np.nan))
-    assert grid[:6].tolist() == [[0, i] for i in range(5)] + [[1, 0]]
-    assert held_out_fields(grid).any()
-    assert (bins_of(np.full((30, 2), np.nan), 4) == 0).all()
-
-
 def test_images_are_shared_out_evenly():
     held = np.array([False, True, False, False, True])
     star = star_of_images(held, 10, 5)
