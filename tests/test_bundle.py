@@ -164,7 +164,7 @@ def test_completed_covariance_measures_fluxes_as_the_whole_one(gaussian_stars):
 def test_a_bundle_of_format_2_predicts_as_it_did():
     """It and its predictions were written by the code that made it, which rounded the noise.
 
-    Without rounding, PSFs change by far less than they are uncertain.
+    Without rounding, PSFs change by far less than they are uncertain, σ by an eighth at most.
     """
     folder = Path(__file__).parent / "data"
     model = PsfModel(read_bundle(folder / "format2.psf.safetensors"))
@@ -175,6 +175,5 @@ def test_a_bundle_of_format_2_predicts_as_it_did():
         found = model.predict(before["stamps"], **told)
         off = found.psf - before[f"{case}_psf"]
         assert np.nanmean(np.square(off / before[f"{case}_uncertainty"])) < 0.02
-        for name in ("uncertainty", "ratio95", "flux", "flux_error"):
-            expected = before[f"{case}_{name}"]
-            print(case, name, np.nanmax(np.abs(getattr(found, name) / expected - 1)), np.nanmedian(np.abs(getattr(found, name) / expected - 1)))
+        for name, rtol in {"uncertainty": 0.13, "ratio95": 1e-3, "flux": 0.01}.items():
+            np.testing.assert_allclose(getattr(found, name), before[f"{case}_{name}"], rtol=rtol)
