@@ -139,11 +139,7 @@ def test_larger_stamps_of_a_cube_are_cut_about_their_middle(tmp_path, stored, ma
 
 def test_header_values_and_those_that_are_given_before_them(cube):
     camera = open_observation(cube, D)
-    assert (camera.pixel_scale_arcsec, camera.gain, camera.saturate) == (
-        1.1,
-        2.0,
-        5000.0,
-    )
+    assert (camera.pixel_scale_arcsec, camera.gain, camera.saturate) == (1.1, 2.0, 5000.0)
     assert camera.header_cards == [("OBJECT", "M 31", "")]
     given = open_observation(cube, D, pixel_scale_arcsec=3.0, gain=4.0, saturate=210.0)
     assert (given.pixel_scale_arcsec, given.gain, given.saturate) == (3.0, 4.0, 210.0)
@@ -297,13 +293,3 @@ def test_distortion_is_inverted_and_far_stars_do_not_fold_into_the_image(ramp, t
     columns = read(observation)
     np.testing.assert_array_equal(columns["truncated"], [0, 0, 1, 1])
     assert columns["bad"][2:].all()
-
-
-def test_a_missing_wcs_matters_for_sky_coordinates_only(tmp_path):
-    path = tmp_path / "plain.fits"
-    fits.PrimaryHDU(np.zeros((30, 40))).writeto(path)
-    pixels = catalogue(tmp_path / "p.csv", [12], [9])
-    assert open_observation(path, D, catalogue=pixels).pixel_scale_arcsec is None
-    sky = catalogue(tmp_path / "s.csv", [150], [2], ("ra", "dec"))
-    with pytest.raises(ObservationError, match=r"plain\.fits: no usable celestial WCS.*ra,dec"):
-        open_observation(path, D, catalogue=sky)
