@@ -272,6 +272,13 @@ def test_a_saturation_below_the_sky_is_said_or_refused(tmp_path, image, place):
         Stars.from_image(path, catalogue=place, saturate=10.0)
 
 
+def test_one_plane_is_an_image(tmp_path, image, place):
+    expected = verdicts(image, place, **CAMERA)
+    path = write(tmp_path / "plane.fits", image[None])
+    assert verdicts(path, place) == expected
+    assert verdicts(image[None], place, **CAMERA) == expected
+
+
 def test_an_undebayered_frame_is_refused_in_one_line(tmp_path, image):
     path = write(tmp_path / "osc.fits", image, BAYERPAT="RGGB")
     line = refused("from-stars", path, "--detect", "--out", tmp_path / "m")
