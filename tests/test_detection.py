@@ -238,6 +238,7 @@ def bad(field):
     listed = Table.read(folder / "stars.csv")
     listed[made.kind == "bright"][:5].write(folder / "five.csv")
     listed[[*range(len(listed)), 7]].write(folder / "twice.csv")
+    Table({"ra": [150.0], "dec": [2.0]}).write(folder / "sky.csv")
     Table(rng.uniform(1, SIDE, (150, 2)), names=("X_IMAGE", "Y_IMAGE")).write(folder / "other.csv")
     return folder
 
@@ -257,6 +258,7 @@ LIST = ["--catalogue", "stars.csv"]
         (["image.fits", *LIST, "--gain", 0], "image.fits: gain 0.0"),
         (["image.fits", *LIST, "--method", "psfex"], "no method 'psfex'; there are "),
         (["image.fits", "--catalogue", "other.csv"], "of 150 positions"),
+        (["image.fits", "--catalogue", "sky.csv"], "no usable celestial WCS"),
         (["image.fits", "--catalogue", "twice.csv"], "rows 8 and "),
         (["image.fits", *LIST, "--detect"], "--detect takes an image"),
         (["colour.fits", "--detect"], "3 planes of 520×520"),
