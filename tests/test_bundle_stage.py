@@ -16,7 +16,6 @@ from psfdae.methods import groups_of
 from psfdae.model import packing
 from psfdae.model.bundle import (
     BundleError,
-    at_noise,
     brightest,
     estimator,
     mahalanobis,
@@ -24,11 +23,11 @@ from psfdae.model.bundle import (
     shipped_path,
     write_bundle,
 )
-from psfdae.model.photometry import FluxModel, signal_to_noise
+from psfdae.model.photometry import FluxModel
 from psfdae.model.psf_model import PsfModel
 from psfdae.model.star_sets import noise_model, noisy_test_images, read_stars
 from psfdae.networks import dae as dae_network
-from psfdae.noise import NoiseModel, noise_equivalent_px
+from psfdae.noise import NoiseModel
 from psfdae.splits import random_split
 from psfdae_paper.configuration.compose import load_stage
 from psfdae_paper.stages import bundle as stage
@@ -231,18 +230,6 @@ def test_bright_pixels_are_covered_as_the_others_are(tiny, told):
             assert (error <= wide)[pixels].mean() == pytest.approx(0.95, abs=0.02)
 
 
-def test_signal_to_noise_is_that_of_a_matched_filter():
-    """The flux of the mean PSF in white noise scatters by 1 / (S/N) of itself."""
-    mean = gaussians(1, 3)[0].astype(np.float64)
-    noise = 0.01
-    images = mean + np.random.default_rng(0).normal(0, noise, size=(5000, 12, 12))
-    flux = (images * mean).sum(axis=(1, 2)) / (mean**2).sum()
-    area = noise_equivalent_px(mean)
-    assert 1 / flux.std() == pytest.approx(signal_to_noise(noise, area), rel=0.03)
-    flat = np.full((12, 12), 1 / 144)
-    assert noise_equivalent_px(flat) == pytest.approx(144)
-
-
 def test_errors_of_some_stars_are_those_stars_errors():
     """Images repeat the stars; a mask over stars keeps every image of those, and no other."""
     star = np.array([0, 1, 2, 3, 4, 0, 1, 2, 3, 4])
@@ -267,16 +254,6 @@ def test_either_half_of_the_stars_is_judged_by_the_errors_of_the_other():
     expected = (0.9973 + 0.2611) / 2
     wanted = {"coverage68": expected, "coverage_rms": expected, "coverage95": (1 + 0.4865) / 2}
     assert found == pytest.approx(wanted, abs=0.01)
-
-
-def test_errors_between_nodes_are_interpolated_and_held_outside():
-    nodes, maps = np.array([1.0, 2.0, 4.0]), np.arange(12.0).reshape(3, 2, 2)
-    found = at_noise(np.array([1.0, 1.5, 3.0, 4.0, 9.0, 0.1, np.nan]), nodes, maps)
-    expected = [maps[0], (maps[0] + maps[1]) / 2, (maps[1] + maps[2]) / 2, maps[2], maps[2]]
-    assert found[:5] == pytest.approx(np.stack(expected))
-    assert (found[5] == maps[0]).all()
-    assert np.isnan(found[6]).all()
-    assert (at_noise(np.array([0.5, 7.0]), np.array([1.0]), maps[:1]) == maps[0]).all()
 
 
 def test_distance_is_the_number_of_components_whatever_the_noise():

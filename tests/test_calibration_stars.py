@@ -18,7 +18,7 @@ from psfdae.image.selection import (
     window_of,
 )
 from psfdae.image.stamps import cut
-from psfdae.image.training_images import bins_of, make_images, stacks, star_grid, star_of_images
+from psfdae.image.training_images import bins_of, make_images, stacks, star_grid
 from psfdae.moments import moved, windowed_centres
 from psfdae.noise import NoiseModel, noise_equivalent_px
 from psfdae.rng import stream
@@ -146,21 +146,6 @@ def test_every_fifth_star_is_held_out_evenly_over_the_field(count):
     assert (np.bincount(quarter[held], minlength=4) > 0).all()
     order = np.random.default_rng(0).permutation(count)
     assert (star_grid(position[order]) == grid[order]).all()
-
-
-def test_stars_without_positions_keep_their_order():
-    grid = star_grid(np.full((30, 2), np.nan))
-    assert grid[:6].tolist() == [[0, i] for i in range(5)] + [[1, 0]]
-    assert held_out_fields(grid).any()
-    assert (bins_of(np.full((30, 2), np.nan), 4) == 0).all()
-
-
-def test_images_are_shared_out_evenly():
-    held = np.array([False, True, False, False, True])
-    star = star_of_images(held, 10, 5)
-    assert np.bincount(star[:10], minlength=5).tolist() == [4, 0, 3, 3, 0]
-    assert np.bincount(star[10:], minlength=5).tolist() == [0, 3, 0, 0, 2]
-    assert star_of_images(held, 1, 1).size == 5  # none is left out
 
 
 def test_a_moved_star_is_the_star_rendered_there():

@@ -66,9 +66,6 @@ def test_images_are_called_by_their_own_names_where_they_have_one(ccds, tmp_path
     assert science_images(ccds[0]) == NUMBERS
     path = mosaic_file(tmp_path / "odd.fits", ("a/../b", np.ones((3, 3)), None))
     assert science_images(path) == {"1": 1}
-    ones = np.ones((3, 3))
-    path = mosaic_file(tmp_path / "2.fits", ("2", ones, None), ("", ones, None), ("2A", ones, None))
-    assert science_images(path) == {"1": 1, "2": 2, "2A": 3}
     with pytest.raises(ObservationError, match="no image"):
         science_images(mosaic_file(tmp_path / "none.fits", ("CAT", None, None)))
 
@@ -114,8 +111,6 @@ def test_images_that_fail_or_are_killed_are_named_at_the_end_and_stop_no_other(c
     [
         ("predict", ["--detect", "--mask", "DQ"], "m.fits: --all-extensions excludes --mask"),
         ("from-stars", ["--detect", "--extension", 1], "--all-extensions excludes --extension"),
-        ("predict", ["--catalogue", "1.csv"], "1.csv: --all-extensions"),
-        ("from-stars", ["--catalogue", "nowhere.csv"], "nowhere.csv: no such file"),
         ("predict", ["--detect", "--model", "."], "CCD1: "),
     ],
 )

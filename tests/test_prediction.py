@@ -10,10 +10,8 @@ import pytest
 from prediction_stars import KAPPA, SKY, observe
 from psfdae import Prediction, PredictionError, StarFlag
 from psfdae.image.stamps import cut
-from psfdae.model import photometry
 from psfdae.model import psf_model as model
 from psfdae.model.psf_model import BLOCK, PsfModel
-from psfdae.threads import in_order
 
 COLUMNS = tuple(Prediction.__dataclass_fields__)
 
@@ -208,23 +206,6 @@ def test_broken_stamps_are_flagged_and_their_neighbours_do_not_notice(name, alik
     assert alike(found, model.predict(medium.stamps), slice(len(BROKEN), None))
 
 
-def test_a_block_without_a_good_pixel_asks_nothing(shipped, medium, monkeypatch):
-    """The stars of a catalogue that reaches far beyond the image."""
-    stamps = medium.stamps[:BLOCK]
-    bad = np.ones(stamps.shape, dtype=bool)
-    known = {"flux": np.where(np.arange(BLOCK) % 3, np.nan, 500.0)}
-    known["background"] = np.where(np.arange(BLOCK) % 2, np.nan, SKY)
-    first = {name: values[[0]] for name, values in known.items()}
-    alone, fits = shipped.predict(stamps[[0]], bad=bad[[0]], **first), []
-    monkeypatch.setattr(type(shipped.engine.estimator), "estimate", None)
-    careful = photometry.robust_flux
-    monkeypatch.setattr(photometry, "robust_flux", lambda *a: fits.append(a) or careful(*a))
-    found = shipped.predict(stamps, bad=bad, **known)
-    assert np.isnan(found.psf).all() and has(found, StarFlag.NO_FLUX).all()
-    assert same(alone, replace(found, **{n: getattr(found, n)[[0]] for n in COLUMNS}))
-    assert len(fits) == 2  # sky given, sky free
-
-
 def test_masked_and_saturated_pixels_are_repaired_and_left_out(shipped, medium, clean):
     bad = np.zeros(medium.stamps.shape, dtype=bool)
     bad[:, 3, 4] = bad[:, 12, 7] = True
@@ -303,51 +284,16 @@ def test_what_is_no_single_star_of_this_telescope_is_flagged(shipped, field_psfs
     assert has(clean, unlike).mean() < 0.02
 
 
-def test_scale_of_a_pixel_is_checked(shipped):
-    for scale in (0.1019, 0.0981):
-        shipped.check_scale(scale, "x.fits")
-    for scale, text in ((0.1021, "0.1021 arcsec"), (None, "--pixel-scale"), (np.nan, "nan")):
-        with pytest.raises(PredictionError, match=f"x.fits: .*{text}"):
-            shipped.check_scale(scale, "x.fits")
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         ({"stamps": np.zeros((3, 24, 24))}, "3×24×24.* n×16×16"),
-        ({"stamps": np.zeros(256)}, "shape 256"),
         ({"margin": 2}, "n×20×20"),
-        ({"margin": -1}, "n×14×14"),
         ({"stamps": np.zeros((3, 16, 16), complex)}, "complex128"),
-        ({"bad": np.zeros((3, 16, 15))}, r"bad .*\(3, 16, 15\)"),
         ({"saturated": np.zeros((2, 16, 16))}, r"saturated .*\(2, 16, 16\)"),
-        ({"flux": np.ones(4)}, r"flux .*\(4,\)"),
         ({"noise": "many"}, "noise"),
     ],
 )
 def test_what_does_not_fit_is_refused_with_the_numbers(shipped, arguments, message):
     with pytest.raises(PredictionError, match=message):
         shipped.predict(**{"stamps": np.zeros((3, 16, 16)), **arguments})
-
-
-# The stream of blocks
-
-
-def test_stream_keeps_order_and_takes_no_more_than_it_needs():
-    taken = []
-    items = (taken.append(number) or number for number in range(50))
-    results = in_order(lambda n: n * n, items, 3)
-    assert next(results) == (0, 0)
-    assert len(taken) <= 5
-    assert list(results) == [(n, n * n) for n in range(1, 50)]
-
-
-def test_stream_raises_what_the_work_raises_and_stops():
-    done = []
-
-    def work(number):
-        done.append(1 / (3 - number))
-
-    with pytest.raises(ZeroDivisionError):
-        list(in_order(work, range(1000), 2))
-    assert len(done) < 20

@@ -21,7 +21,6 @@ from psfdae import files
 from psfdae.cli import main
 from psfdae.files import Column, Empty, stream_product, write_product, write_text
 from psfdae.networks.weights import load_checkpoint, save_checkpoint, save_weights
-from psfdae_paper.stages import record
 
 VALUES = np.random.default_rng(0).random((100, 16, 16))
 TABLE = pd.DataFrame(VALUES.reshape(-1, 256)[:, :9])
@@ -83,15 +82,6 @@ def test_a_flipped_bit_of_a_table_or_its_digest_is_noticed(results):
             assert verify(results) == ([], "")
 
 
-def test_headers_of_data_and_weights_are_guarded(results):
-    write_product(results / "data/b.h5", "b", {"b": Column(np.arange(3), "m", "b")}, {"seed": 7})
-    save_weights(results / "dae/w.safetensors", WEIGHTS, {"lr": 0.5})
-    for path, text in ((results / "data/b.h5", b'"seed"'), (results / "dae/w.safetensors", b"0.5")):
-        flip(path, path.read_bytes().index(text) + 1)
-        assert str(path) in verify(results)[0]
-        assert not path.exists()
-
-
 def test_lost_products_and_logs_are_no_damage_and_other_files_are_built_with_their_job(results):
     (results / "tables/a.csv").unlink()
     (results / "logs").mkdir()
@@ -133,10 +123,7 @@ def test_on_the_disk_before_it_has_its_name(results, monkeypatch):
     ]
 
 
-def test_what_a_killed_writer_left_is_swept_if_it_is_certainly_stale(tmp_path, monkeypatch):
-    def denied(pid, number):
-        raise PermissionError
-
+def test_what_a_killed_writer_left_is_swept_if_it_is_certainly_stale(tmp_path):
     code = (
         "import sys, time; from psfdae.files import atomic_path\n"
         "with atomic_path(sys.argv[1]): print('in', flush=True); time.sleep(60)"
@@ -148,13 +135,7 @@ def test_what_a_killed_writer_left_is_swept_if_it_is_certainly_stale(tmp_path, m
         write_text(tmp_path / "a.csv", "1")
         verify(tmp_path)
         assert left.exists(), "its writer was alive"
-        with monkeypatch.context() as patched:
-            # A process of another user may be hidden.
-            patched.setattr(files, "_started", lambda pid: "")
-            patched.setattr(os, "kill", denied)
-            verify(tmp_path)
         writer.send_signal(signal.SIGKILL)
-    assert left.exists(), "its writer was hidden"
     machine, pid, started, token = left.name.removesuffix(".tmp").rsplit(".", 1)[1].split("-")
     reused = tmp_path / f".a.csv.{machine}-{os.getpid()}-1-{token}.tmp"
     elsewhere = tmp_path / f".a.csv.{machine[::-1]}-{pid}-{started}-{token}.tmp"
@@ -171,13 +152,6 @@ def test_what_a_killed_writer_left_is_swept_if_it_is_certainly_stale(tmp_path, m
     assert [path.exists() for path in (left, reused, elsewhere, foreign)] == [0, 0, 1, 1]
 
 
-def test_a_long_name_can_be_written(tmp_path):
-    path = tmp_path / ("ü" * 120 + ".csv")
-    write_text(path, "1")
-    assert path.read_text() == "1"
-    assert list(tmp_path.iterdir()) == [path]
-
-
 def stream(path):
     columns = {"a": Empty(VALUES.shape, np.float64, "1", "a"), "b": Column(np.arange(9), "1", "b")}
     with stream_product(path, "p", columns, {"seed": 1}) as data:
@@ -186,12 +160,10 @@ def stream(path):
 
 
 WRITERS = {
-    "product.h5": lambda path: write_product(path, "p", {"a": Column(VALUES, "1", "a")}, {}),
     "stream.h5": stream,
     "table.parquet": lambda path: files.write_parquet(path, pd.concat([TABLE] * 40)),
     "w.safetensors": lambda path: save_weights(path, WEIGHTS, {"lr": 1}),
     "checkpoint.pt": lambda path: save_checkpoint(path, "f", {**WEIGHTS, "history": []}),
-    "table.csv": lambda path: files.write_csv(path, pd.concat([TABLE] * 20)),
     "cube.fits": lambda path: write_cube(path, VALUES),
 }
 
@@ -235,30 +207,3 @@ def test_no_flipped_bit_of_a_checkpoint_is_trained_on(tmp_path, capsys):
     for content in (b"", b"psfdae checkpoint, sha256 \n"):
         path.write_bytes(content)
         assert load_checkpoint(path, "same") is None
-
-
-GOOD_LOG = "0m0.002s 0m0.001s\n0m1.150s 0m0.100s\n"
-GOOD_TABLE = "s\tmax_rss\tcpu_time\n1.5\t-\t1.25\n"
-
-
-@pytest.mark.parametrize(
-    ("table", "log", "row", "named"),
-    [
-        *((text, GOOD_LOG, "train,b,,1.25,", "b.tsv") for text in ("", "s\n1\tx\n", "\xff")),
-        *((GOOD_TABLE, text, "train,b,1.5,,", "b.log") for text in ("", "0m1.150s\n", "\xff")),
-    ],
-)
-def test_a_damaged_benchmark_or_log_costs_its_numbers_only(
-    tmp_path, capsys, table, log, row, named
-):
-    for folder, suffix, texts in (
-        ("benchmarks", "tsv", (GOOD_TABLE, table)),
-        ("logs", "log", (GOOD_LOG, log)),
-    ):
-        (tmp_path / folder / "train").mkdir(parents=True)
-        for name, text in zip("ab", texts, strict=True):
-            (tmp_path / folder / "train" / f"{name}.{suffix}").write_bytes(text.encode("latin1"))
-    record.runtime(tmp_path, tmp_path / "runtime.csv")
-    (line,) = capsys.readouterr().err.splitlines()
-    assert f"/{named}: " in line
-    assert (tmp_path / "runtime.csv").read_text().splitlines()[1:] == ["train,a,1.5,1.25,", row]
