@@ -47,6 +47,7 @@ LARGEST_DEFORMATION = 0.3  # usual stretch of a PSF in another exposure; px² of
 DEFORMATION_STEPS = 3  # of Gauss-Newton
 HIGHER_CHANGE = 0.3  # times this, of terms beyond the constant
 FOLDS, ENOUGH_STARS = 5, 300  # left out, of which one fold after the other is predicted
+FEW_STARS = 16  # with fewer, their number limits the order of the polynomial
 TOLERANCE, ITERATIONS = 1e-4, 150  # of the conjugate gradients
 TRIED_TOLERANCE = 3e-3  # of fits that are tried: errors of stars left out hardly change
 
@@ -162,6 +163,12 @@ def fit_field(
     alternating = _Alternating(stars, background, frame_px, stamp_px, spacing, smoothness)
     tried = sorted(orders) if np.isfinite(stars.position).all() else [0]
     if len(orders) == 1:
+        return alternating.fit(tried[0])
+    if len(stars) < FEW_STARS:
+        # Stars that are left out say too little then: at least three stars a term of the polynomial
+        # of order o, which has (o + 1)(o + 2)/2.
+        tried = [o for o in tried if 3 * (o + 1) * (o + 2) // 2 <= len(stars)] or tried[:1]
+    if len(stars) < 3:  # none can be left out
         return alternating.fit(tried[0])
     alternating.tolerance, best, least = TRIED_TOLERANCE, 0, np.inf
     for order in tried:

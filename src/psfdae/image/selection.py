@@ -91,7 +91,8 @@ class Candidates:
             raise CalibrationStarsError(
                 f"{path}: {len(self.bright)} stars are good enough to learn from, "
                 f"calibration_stars.stars_min = {least} are needed "
-                f"(of {len(self.verdict)}: {self.count()})"
+                f"(of {len(self.verdict)}: {self.count()}); --stars-min takes fewer, --snr-min "
+                "fainter ones"
             )
 
     def count(self) -> str:
@@ -212,7 +213,7 @@ def _measure(
 
     for reason, stars in (
         (Verdict.OFF_CENTRE, ~centred),
-        (Verdict.FAINT, snr < settings.snr_min),
+        (Verdict.FAINT, snr < settings.least_snr),
         (Verdict.BLENDED, said(StarFlag.BLENDED)),
         (Verdict.SATURATED, core | said(StarFlag.SATURATED)),
         (Verdict.INCOMPLETE, incomplete | said(StarFlag.TRUNCATED)),

@@ -22,6 +22,7 @@ from psfdae.image.observation import (
     other_instruments,
 )
 from psfdae.image.selection import Candidates, Verdict, advice, collect
+from psfdae.image.source_size import measure_size
 from psfdae.image.training_images import single_psf, star_grid, training_columns
 from psfdae.model.psf_model import SCALE_TOLERANCE
 from psfdae.model.settings import IMAGE_GROUPS, Settings, settings_model, with_keywords
@@ -43,6 +44,10 @@ MANY_CROWDED = 1.0
 
 ALL = "all"
 """Name of a model of several exposures by default."""
+
+ENOUGH_STARS, FEW_STARS, FAINT_SNR = 20, 5, 20.0
+"""Stars for which S/N 100 is asked; fewest of which an error is stated; least S/N if there are
+some."""
 
 DETECTED_SIGMA = 5.0
 """σ above the sky from which stars are searched by default."""
@@ -183,16 +188,35 @@ class Stars:
         margin = settings.calibration_stars.margin_px
         opened = [source.open(settings.framing.stamp_px, margin).assuming() for source in sources]
         _require_one_camera(opened)
-        least = None if len(sources) == 1 else 0
-        found = []
-        for source, observation in zip(sources, opened, strict=True):
-            stars = cls.chosen(source, observation, settings, least=least)
+        # The stars, first in stamps of the size of the settings, then in wider ones if these hold
+        # too little of their light.
+        chosen, candidates = enough_stars(opened, settings)
+        notes = []
+        if (sized := fitting_stamps(opened, candidates, settings)) is not None:
+            settings, note = sized
+            notes.append(note)
+            size, margin = settings.framing.stamp_px, settings.calibration_stars.margin_px
+            opened = [replace(one, stamp_px=size, margin=margin) for one in opened]
+            chosen, candidates = enough_stars(opened, settings)
+        if chosen.calibration_stars.least_snr < settings.calibration_stars.least_snr:
+            notes.append(
+                f"few stars: those of S/N {chosen.calibration_stars.least_snr:g} and above are "
+                "learnt from, as fewer than 20 have S/N "
+                f"{settings.calibration_stars.least_snr:g}; --snr-min takes others"
+            )
+        exposures = []
+        for source, observation, found in zip(sources, opened, candidates, strict=True):
+            if len(sources) == 1:
+                found.require(observation.path, chosen.calibration_stars.stars_min)
+            stars = cls.of_candidates(source, observation, found, chosen)
             if stars.many_crowded:
                 from psfdae.model.neighbours import without_neighbours
 
                 stars = without_neighbours(stars)
-            found.append(stars)
-        return found[0] if len(found) == 1 else cls.joined(found)
+            exposures.append(stars)
+        found_stars = exposures[0] if len(exposures) == 1 else cls.joined(exposures)
+        notes += few_stars(found_stars)
+        return replace(found_stars, notes=(*found_stars.notes, *notes))
 
     @classmethod
     def joined(cls, exposures: Sequence[Stars]) -> Stars:
@@ -231,23 +255,27 @@ class Stars:
         observation: Observation,
         settings: Settings,
         isolation_px: float | None = None,
-        least: int | None = None,
     ) -> Stars:
         """The bright stars of an observation; no neighbour is nearer than `isolation_px`.
 
-        By default, the settings say how near one may be, and how many there are at least.
+        By default, the settings say how near one may be.
         """
-        framing, wanted = settings.framing, settings.calibration_stars
-        if least is not None:
-            wanted = wanted.model_copy(update={"stars_min": least})
-        found = collect(observation, wanted, framing, isolation_px)
+        wanted = settings.calibration_stars
+        found = collect(observation, wanted, settings.framing, isolation_px)
+        return cls.of_candidates(source, observation, found, settings)
+
+    @classmethod
+    def of_candidates(
+        cls, source: Source, observation: Observation, found: Candidates, settings: Settings
+    ) -> Stars:
+        """The bright stars among those of an observation that were measured."""
         bright = found.bright
         off = list_offset(
             observation.catalogue, (bright.centre - bright.listed)[:, ::-1], source.accept_offset
         )
         notes = [observation.said(), *filter(None, [off])]
         if len(bright) >= settings.calibration_stars.stars_min:
-            notes += advice(found, observation, framing.stamp_px)
+            notes += advice(found, observation, settings.framing.stamp_px)
         if len(bright):
             sky = bright.sky_photons(observation.gain, settings.noise.background_photons)
             settings = _with_noise(settings, bright, sky)
@@ -273,7 +301,7 @@ class Stars:
         """So many bright stars of an image have neighbours that it pays to subtract these."""
         if self.observation.shape is None or not np.isfinite(self.candidates.bright.position).all():
             return False
-        if len(self) < self.settings.calibration_stars.stars_min:
+        if len(self) < ENOUGH_STARS:
             return False
         crowded = np.count_nonzero(self.candidates.verdict == Verdict.CROWDED)
         return bool(crowded >= MANY_CROWDED * len(self))
@@ -347,6 +375,119 @@ class Stars:
         }
         plain: dict[str, Any] = json.loads(json.dumps(said))
         return plain
+
+
+def enough_stars(
+    opened: Sequence[Observation], settings: Settings
+) -> tuple[Settings, list[Candidates]]:
+    """Choose stars from the brightest down, until there are enough.
+
+    Where S/N 100 gives fewer than `ENOUGH_STARS`, the least S/N is lowered until there are three
+    times as many, or to 20; and to 10 if even that gives too few.
+
+    Returns
+    -------
+    settings : Settings
+        With the least S/N.
+    candidates : list of Candidates
+        Of each observation.
+    """
+    asked = settings.calibration_stars
+
+    def with_least(snr: float) -> tuple[Settings, list[Candidates]]:
+        stars = asked.model_copy(update={"snr_min": snr})
+        # Only the stars of all images together must be enough, which is required later.
+        of_each = stars.model_copy(update={"stars_min": 0})
+        found = [collect(one, of_each, settings.framing) for one in opened]
+        return settings.model_copy(update={"calibration_stars": stars}), found
+
+    chosen, found = with_least(asked.least_snr)
+    if sum(len(one.bright) for one in found) >= ENOUGH_STARS:
+        return chosen, found
+    for snr in asked.lower_snr():
+        chosen, found = with_least(snr)
+        wanted = ENOUGH_STARS if snr <= FAINT_SNR else 3 * ENOUGH_STARS
+        if sum(len(one.bright) for one in found) >= wanted:
+            break
+    return chosen, found
+
+
+def fitting_stamps(
+    opened: Sequence[Observation], candidates: Sequence[Candidates], settings: Settings
+) -> tuple[Settings, str] | None:
+    """Settings for stars that are too large, or too hollow, for those that there are.
+
+    Margin, search distance, isolation and the sub-pixel steps follow the side of the stamps; a note
+    says so. None if the stamps hold the light of the stars, and these have their brightest pixels
+    in their middle.
+    """
+    asked, framing = settings.calibration_stars, settings.framing
+    if not asked.light_min and asked.centring_px is not None:
+        return None
+    sizes = []
+    for observation, found in zip(opened, candidates, strict=True):
+        if observation.shape is None or observation.positions is None:
+            continue
+        sky, good = observation.sky(), found.bright.position
+        # Stars that are good in small stamps are not saturated; without some, all count.
+        place = good if len(good) >= FEW_STARS else observation.positions
+        if (size := measure_size(sky.flat, sky.bad, place)) is not None:
+            sizes.append(size)
+    if not sizes:
+        return None
+    largest = max(sizes, key=lambda size: size.fwhm_px)
+    side = max(largest.side(asked.light_min), framing.stamp_px)
+    wide, hollow = side > framing.stamp_px, largest.peak_offset_px > 1.0
+    if not asked.light_min:
+        side, wide = framing.stamp_px, False
+    if not (wide or hollow):
+        return None
+    scale = side / framing.stamp_px
+    centring = asked.centring_px
+    if centring is None:
+        centring = largest.fwhm_px if hollow or largest.fwhm_px > 5.0 else 0.0
+    stars = {
+        "centring_px": float(f"{centring:.3g}"),
+        "margin_px": min(round(asked.margin_px * scale), 64),
+        "search_px": min(round(asked.search_px * scale), 16),
+        "isolation_px": asked.isolation_px * scale,
+    }
+    changed: dict[str, Any] = {
+        "calibration_stars": asked.model_copy(update=stars),
+        "framing": framing.model_copy(update={"stamp_px": side}),
+    }
+    if wide and (field := getattr(settings, "field", None)) is not None:
+        # Steps of smooth stars are as much wider as their finest structure, in powers of 2; that
+        # of stars of a FWHM of 2.8 px, for which the settings are made, is 1.5 px.
+        wider = 2.0 ** max(np.floor(np.log2(largest.sharpness_px / 1.5)), 0.0)
+        steps = {name: getattr(field, name) * wider for name in ("spacing_px", "step_px")}
+        steps = {"spacing_px": min(steps["spacing_px"], 2.0), "step_px": min(steps["step_px"], 1.0)}
+        changed["field"] = field.model_copy(update=steps)
+    held = 100 * largest.light_within(framing.stamp_px)
+    note = f"stars: half of the light is within a diameter of {largest.fwhm_px:.3g} px"
+    if wide:
+        note += (
+            f"; stamps of {side} px, which hold {100 * largest.light_within(side):.1f} % of it, "
+            f"are used instead of {framing.stamp_px} px ({held:.0f} %); --stamp-px takes others"
+        )
+    if hollow:
+        note += "; the brightest pixel is off the middle: stars are centred on their smoothed light"
+    return settings.model_copy(update=changed), note
+
+
+def few_stars(stars: Stars) -> list[str]:
+    """What is to be said of a model of few stars."""
+    count, held = len(stars), int(stars.held_out.sum())
+    if count >= ENOUGH_STARS:
+        return []
+    if count < FEW_STARS:
+        return [
+            f"few stars: the PSF is the mean of {count - held} stars, tested on {held}: its error "
+            "is not known"
+        ]
+    return [
+        f"few stars: {count - held} are learnt from, {held} test the model; its errors are rough"
+    ]
 
 
 def _require_own_names(sources: Sequence[Source]) -> None:
