@@ -165,9 +165,9 @@ def fit_field(
     if len(orders) == 1:
         return alternating.fit(tried[0])
     if len(stars) < FEW_STARS:
-        # Stars that are left out say too little then: at least three stars a term of the polynomial
+        # Stars that are left out say too little then: at least two stars a term of the polynomial
         # of order o, which has (o + 1)(o + 2)/2.
-        tried = [o for o in tried if 3 * (o + 1) * (o + 2) // 2 <= len(stars)] or tried[:1]
+        tried = [o for o in tried if (o + 1) * (o + 2) <= len(stars)] or tried[:1]
     if len(stars) < 3:  # none can be left out
         return alternating.fit(tried[0])
     alternating.tolerance, best, least = TRIED_TOLERANCE, 0, np.inf
@@ -238,6 +238,10 @@ class _Alternating:
         self.noise, self.place = stars.noise, stars.place
         self.photons = np.sqrt(background) / stars.noise  # per unit of flux
         self.stamp_px, self.spacing, self.smoothness = stamp_px, spacing, smoothness
+        # A = 4πσ² of a Gaussian. A ring has no light in its middle: a window as wide as the radius
+        # of all light does, 1.4 σ.
+        sigma = float(np.sqrt(np.median(stars.area()) / (4.0 * np.pi)))
+        self.window_px = 1.4 * sigma if sigma > 3.0 else WINDOW_PX
         self.axis = np.arange(side) - side // 2.0
         self.inner = np.abs(self.axis + 0.5) < stamp_px / 2
         self.knots = int((side + 1) / spacing) - 1
@@ -257,8 +261,9 @@ class _Alternating:
         low, high = self.low[:count].copy(), self.high[:count].copy()
         terms = _terms(self.place, low, high, order)
         good, flux = np.ones(len(terms), bool), self.images.sum(axis=(1, 2))
-        start, window = np.zeros((len(flux), 2)), np.full(len(flux), WINDOW_PX)
-        centre = windowed_centres(self.images, start, window, WINDOW_ROUNDS, WINDOW_REACH_PX)
+        start, window = np.zeros((len(flux), 2)), np.full(len(flux), self.window_px)
+        reach = WINDOW_REACH_PX if self.window_px == WINDOW_PX else FARTHEST_PX
+        centre = windowed_centres(self.images, start, window, WINDOW_ROUNDS, reach)
         alike, noise = np.ones(self.images.shape), self._weight(flux)
         found: np.ndarray | None = None
         for turn in range(FIT_ROUNDS):

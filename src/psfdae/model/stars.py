@@ -294,7 +294,8 @@ class Stars:
         grid = np.concatenate([star_grid(s.candidates.bright.position) for s in self.each])
         rest = settings.calibration_stars.bins, settings.framing, settings.parts
         rng = stream(settings.seed, "own stars")
-        return training_columns(bright, grid, self.held_out, *rest, rng)
+        centring = settings.calibration_stars.centring_px or 0.0
+        return training_columns(bright, grid, self.held_out, *rest, rng, centring)
 
     @property
     def many_crowded(self) -> bool:
@@ -401,15 +402,17 @@ def enough_stars(
         found = [collect(one, of_each, settings.framing) for one in opened]
         return settings.model_copy(update={"calibration_stars": stars}), found
 
-    chosen, found = with_least(asked.least_snr)
-    if sum(len(one.bright) for one in found) >= ENOUGH_STARS:
-        return chosen, found
+    best = with_least(asked.least_snr)
+    count = sum(len(one.bright) for one in best[1])
+    if count >= ENOUGH_STARS:
+        return best
     for snr in asked.lower_snr():
         chosen, found = with_least(snr)
-        wanted = ENOUGH_STARS if snr <= FAINT_SNR else 3 * ENOUGH_STARS
-        if sum(len(one.bright) for one in found) >= wanted:
+        if (more := sum(len(one.bright) for one in found)) > count:
+            best, count = (chosen, found), more
+        if count >= (ENOUGH_STARS if snr <= FAINT_SNR else 3 * ENOUGH_STARS):
             break
-    return chosen, found
+    return best
 
 
 def fitting_stamps(
