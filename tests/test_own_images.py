@@ -284,5 +284,5 @@ def test_a_hole_in_the_image_makes_no_faint_star_bright(sky, tmp_path):
     config = from_words(["dataset=from_stars", "framing.stamp_px=22"])
     stars = config.calibration_stars.model_copy(update={"stars_min": 10})
     found = collect(Source(path, sky.list).open(22, 8), stars, config.framing)
-    assert found.snr[faint] < stars.snr_min
+    assert found.snr[faint] < stars.least_snr
     assert found.verdict[faint] == "faint"

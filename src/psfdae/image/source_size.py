@@ -57,8 +57,20 @@ class SourceSize:
         radius = side_px / np.sqrt(np.pi)
         return float(np.interp(radius, np.append(0.0, self.radius_px), np.append(0.0, self.light)))
 
+    @property
+    def hollow(self) -> bool:
+        """Most stars have their brightest pixel off their centre, as rings have."""
+        return self.peak_offset_px > 1.0
+
     def side(self, light_min: float) -> int:
-        """Side of stamps: the least one if it holds so much light, else one that holds 98 %."""
+        """Side of stamps: the least one if it holds so much light, else one that holds 98 %.
+
+        The edge of a hollow star is bright: it must be within the stamp wherever in its pixel the
+        star lies.
+        """
+        if self.hollow:
+            enough = (side for side in SIDES_PX if self.light_within(side - 2) >= 0.99)
+            return next(enough, SIDES_PX[-1])
         if self.light_within(SIDES_PX[0]) >= light_min:
             return SIDES_PX[0]
         enough = (side for side in SIDES_PX if self.light_within(side) >= LIGHT_WANTED)

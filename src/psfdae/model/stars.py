@@ -440,7 +440,7 @@ def fitting_stamps(
         return None
     largest = max(sizes, key=lambda size: size.fwhm_px)
     side = max(largest.side(asked.light_min), framing.stamp_px)
-    wide, hollow = side > framing.stamp_px, largest.peak_offset_px > 1.0
+    wide, hollow = side > framing.stamp_px, largest.hollow
     if not asked.light_min:
         side, wide = framing.stamp_px, False
     if not (wide or hollow):
