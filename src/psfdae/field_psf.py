@@ -161,14 +161,8 @@ def fit_field(
         Least weight of the squared second differences of the coefficients, 1/flux².
     """
     alternating = _Alternating(stars, background, frame_px, stamp_px, spacing, smoothness)
-    tried = sorted(orders) if np.isfinite(stars.position).all() else [0]
-    if len(orders) == 1:
-        return alternating.fit(tried[0])
-    if len(stars) < FEW_STARS:
-        # Stars that are left out say too little then: at least two stars a term of the polynomial
-        # of order o, which has (o + 1)(o + 2)/2.
-        tried = [o for o in tried if (o + 1) * (o + 2) <= len(stars)] or tried[:1]
-    if len(stars) < 3:  # none can be left out
+    tried = _supported(orders, stars)
+    if len(orders) == 1 or len(stars) < 3:  # of two stars, none can be left out
         return alternating.fit(tried[0])
     alternating.tolerance, best, least = TRIED_TOLERANCE, 0, np.inf
     for order in tried:
@@ -195,6 +189,18 @@ def fit_field(
         least = error
     alternating.tolerance = TOLERANCE
     return alternating.fit(best)
+
+
+def _supported(orders: Sequence[int], stars: BrightStars) -> list[int]:
+    """Return the orders, ascending, that so many stars may support."""
+    if not np.isfinite(stars.position).all():
+        return [0]
+    tried = sorted(orders)
+    if len(stars) >= FEW_STARS or len(orders) == 1:
+        return tried
+    # Stars that are left out say too little then: at least two stars a term of the polynomial of
+    # order o, which has (o + 1)(o + 2)/2.
+    return [o for o in tried if (o + 1) * (o + 2) <= len(stars)] or tried[:1]
 
 
 def refit_field(

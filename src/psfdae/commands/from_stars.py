@@ -31,7 +31,7 @@ from psfdae.method import Method, facts_of
 from psfdae.methods import method
 from psfdae.model.bundle import SUFFIX
 from psfdae.model.exposures import for_exposures
-from psfdae.model.fitting import best, described, fitted_to, makes_models, packed
+from psfdae.model.fitting import best, described, fitted_to, makes_models, packed, worth_trying
 from psfdae.model.settings import (
     CHOSEN,
     IMAGE_GROUPS,
@@ -272,17 +272,11 @@ def _make(
     write_columns(files.path / "selection.csv", stars.table.columns, digits=6)
     write_product(files.stars, "stars", stars.columns, stars.described())
     write_text(files.path / "overrides.txt", _overrides(stars.settings))
-    fitted = {}
-    for kind in files.kinds:
-        print(f"fitting {kind.look.label}")
-        place = files.fit(kind)
-        checkpoint = fits.beside(kind, place, "checkpoint.pt")
-        fitted[kind.name] = fitted_to(stars, kind, checkpoint)
-        fits.store(fitted[kind.name], place, described(stars, kind), stars.product)
-        checkpoint.unlink(missing_ok=True)
-    taken = tried[0]
-    if len(tried) > 1:
-        name, errors = best(stars, {kind.name: fitted[kind.name] for kind in tried})
+    taking = worth_trying(stars, tried)
+    fitted = _fits(stars, files, [k for k in files.kinds if k in taking or k not in tried])
+    taken = taking[0]
+    if len(taking) > 1:
+        name, errors = best(stars, {kind.name: fitted[kind.name] for kind in taking})
         taken = method(name)
         for other, error in errors.items():
             print(f"{method(other).look.label}: MSE {error:.3g} on validation stars")
@@ -312,6 +306,19 @@ def _make(
             print(f"writing {page}")
             report.save(page)
     return str(report)
+
+
+def _fits(stars: Stars, files: Made, kinds: Sequence[type[Method]]) -> dict[str, Method]:
+    """Fit methods to the stars, each to a file, by their names."""
+    fitted: dict[str, Method] = {}
+    for kind in kinds:
+        print(f"fitting {kind.look.label}")
+        place = files.fit(kind)
+        checkpoint = fits.beside(kind, place, "checkpoint.pt")
+        fitted[kind.name] = fitted_to(stars, kind, checkpoint)
+        fits.store(fitted[kind.name], place, described(stars, kind), stars.product)
+        checkpoint.unlink(missing_ok=True)
+    return fitted
 
 
 def _overrides(settings: Settings) -> str:

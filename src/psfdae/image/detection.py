@@ -122,10 +122,10 @@ class Sky:
         smooth, limit = self._above(threshold)
         above = (smooth > limit) & ~self.holes
         # The middle of a ring, such as a star out of focus, is on the star: of up to 100 px.
-        inside, _ = ndimage.label(ndimage.binary_fill_holes(above) & ~above)
-        small = np.bincount(inside.ravel()) <= 100
+        enclosed, _ = ndimage.label(ndimage.binary_fill_holes(above) & ~above)
+        small = np.bincount(enclosed.ravel()) <= 100
         small[0] = False
-        parts, _ = ndimage.label(above | small[inside], np.ones((3, 3)))
+        parts, _ = ndimage.label(above | small[enclosed], np.ones((3, 3)))
         source = np.bincount(parts.ravel()) >= LEAST_PX
         source[0] = False
         height, width = self.flat.shape

@@ -50,7 +50,8 @@ class SourceSize:
     @property
     def fwhm_px(self) -> float:
         """Twice the radius of half of the light, which is the FWHM of a Gaussian."""
-        return 2.0 * float(np.interp(0.5, np.append(0.0, self.light), np.append(0.0, self.radius_px)))
+        light, radius = (np.append(0.0, values) for values in (self.light, self.radius_px))
+        return 2.0 * float(np.interp(0.5, light, radius))
 
     def light_within(self, side_px: int) -> float:
         """Part of the light in a square, by that in a circle of the same area."""

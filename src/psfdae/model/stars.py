@@ -22,7 +22,7 @@ from psfdae.image.observation import (
     other_instruments,
 )
 from psfdae.image.selection import Candidates, Verdict, advice, collect
-from psfdae.image.source_size import measure_size
+from psfdae.image.source_size import SourceSize, measure_size
 from psfdae.image.training_images import single_psf, star_grid, training_columns
 from psfdae.model.psf_model import SCALE_TOLERANCE
 from psfdae.model.settings import IMAGE_GROUPS, Settings, settings_model, with_keywords
@@ -427,28 +427,21 @@ def fitting_stamps(
     asked, framing = settings.calibration_stars, settings.framing
     if not asked.light_min and asked.centring_px is not None:
         return None
-    sizes = []
-    for observation, found in zip(opened, candidates, strict=True):
-        if observation.shape is None or observation.positions is None:
-            continue
-        sky, good = observation.sky(), found.bright.position
-        # Stars that are good in small stamps are not saturated; without some, all count.
-        place = good if len(good) >= FEW_STARS else observation.positions
-        if (size := measure_size(sky.flat, sky.bad, place)) is not None:
-            sizes.append(size)
-    if not sizes:
+    sizes = [_size(*both) for both in zip(opened, candidates, strict=True)]
+    known = [size for size in sizes if size is not None]
+    if not known:
         return None
-    largest = max(sizes, key=lambda size: size.fwhm_px)
-    side = max(largest.side(asked.light_min), framing.stamp_px)
-    wide, hollow = side > framing.stamp_px, largest.hollow
-    if not asked.light_min:
-        side, wide = framing.stamp_px, False
-    if not (wide or hollow):
+    largest = max(known, key=lambda size: size.fwhm_px)
+    side = framing.stamp_px
+    if asked.light_min:
+        side = max(side, largest.side(asked.light_min))
+    wide = side > framing.stamp_px
+    if not (wide or largest.hollow):
         return None
-    scale = side / framing.stamp_px
-    centring = asked.centring_px
+    # Lengths of the choice of stars grow with their stamps.
+    scale, centring = side / framing.stamp_px, asked.centring_px
     if centring is None:
-        centring = largest.fwhm_px if hollow or largest.fwhm_px > 5.0 else 0.0
+        centring = largest.fwhm_px if largest.hollow or largest.fwhm_px > 5.0 else 0.0
     stars = {
         "centring_px": float(f"{centring:.3g}"),
         "margin_px": min(round(asked.margin_px * scale), 64),
@@ -463,19 +456,31 @@ def fitting_stamps(
         # Steps of smooth stars are as much wider as their finest structure, in powers of 2; that
         # of stars of a FWHM of 2.8 px, for which the settings are made, is 1.5 px.
         wider = 2.0 ** max(np.floor(np.log2(largest.sharpness_px / 1.5)), 0.0)
-        steps = {name: getattr(field, name) * wider for name in ("spacing_px", "step_px")}
-        steps = {"spacing_px": min(steps["spacing_px"], 2.0), "step_px": min(steps["step_px"], 1.0)}
-        changed["field"] = field.model_copy(update=steps)
-    held = 100 * largest.light_within(framing.stamp_px)
+        steps = (
+            ("spacing_px", min(2.0, field.spacing_px * wider)),
+            ("step_px", min(1.0, field.step_px * wider)),
+        )
+        changed["field"] = field.model_copy(update=dict(steps))
     note = f"stars: half of the light is within a diameter of {largest.fwhm_px:.3g} px"
     if wide:
+        now, then = (100 * largest.light_within(s) for s in (framing.stamp_px, side))
         note += (
-            f"; stamps of {side} px, which hold {100 * largest.light_within(side):.1f} % of it, "
-            f"are used instead of {framing.stamp_px} px ({held:.0f} %); --stamp-px takes others"
+            f"; stamps of {side} px, which hold {then:.1f} % of it, are used instead of "
+            f"{framing.stamp_px} px ({now:.0f} %); --stamp-px takes others"
         )
-    if hollow:
+    if largest.hollow:
         note += "; the brightest pixel is off the middle: stars are centred on their smoothed light"
     return settings.model_copy(update=changed), note
+
+
+def _size(observation: Observation, found: Candidates) -> SourceSize | None:
+    """Size of the stars of an image; None of a cube of stamps, or if no star is seen."""
+    if observation.shape is None or observation.positions is None:
+        return None
+    sky, good = observation.sky(), found.bright.position
+    # Stars that are good in small stamps are not saturated; without some, all count.
+    place = good if len(good) >= FEW_STARS else observation.positions
+    return measure_size(sky.flat, sky.bad, place)
 
 
 def few_stars(stars: Stars) -> list[str]:
