@@ -63,12 +63,15 @@ class Sky:
         smooth = ndimage.gaussian_filter(self.flat, sigma)
         return smooth, threshold * self.noise / (2.0 * np.sqrt(np.pi) * sigma)
 
-    def stars(self, threshold: float) -> dict[str, np.ndarray]:
+    def stars(self, threshold: float, fwhm_px: float | None = None) -> dict[str, np.ndarray]:
         """Columns of a star list as SExtractor names them, positions from 1, ids too.
 
         `threshold` is in σ of the smoothed image: slightly, or, where stars are wide, by a Gaussian
-        as wide as the brightest sources. Otherwise noise would part a star into many.
+        as wide as the brightest sources. Otherwise noise would part a star into many. The FWHM of
+        stars is measured if it is not known.
         """
+        if fwhm_px is not None:
+            return self._sources(threshold, fwhm_px if fwhm_px >= WIDE_PX else 0.0)
         columns, smoothing = self._sources(threshold), 0.0
         for _ in range(3):
             if "X_IMAGE" not in columns:
