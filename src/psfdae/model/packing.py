@@ -149,20 +149,29 @@ class Errors:
         """
         if self.outlier_score is None:
             return None
-        from scipy.stats import t
-
-        count = len(np.unique(self.star))
-        distance = np.sqrt(np.maximum(self.outlier_score, 0.0))
-        factor = float(t.ppf(LIMIT, max(count - 1, 2))) * np.sqrt(1.0 + 1.0 / count)
-        least = np.square(distance.mean(axis=1) + factor * distance.std(axis=1))
+        least = np.square(self._of_few(np.sqrt(np.maximum(self.outlier_score, 0.0))))
         usual = np.median(self.outlier_score, axis=1)
         spread = np.median(np.abs(self.outlier_score - usual[:, None]), axis=1)
         excess = (self.outlier_score - usual[:, None]) / np.maximum(spread, 1e-12)[:, None]
         return np.asarray(np.maximum(usual + spread * np.quantile(excess, LIMIT), least))
 
     def distance_limit(self) -> float:
-        """Distance that 0.1 % of the stars of all nodes exceed."""
-        return float(np.quantile(self.distance, LIMIT))
+        """Distance that 0.1 % of the stars of all nodes exceed; as high as few stars ask for."""
+        found = float(np.quantile(self.distance, LIMIT))
+        return max(found, float(self._of_few(self.distance).max()))
+
+    def _of_few(self, distance: np.ndarray) -> np.ndarray:
+        """Limit (S,) of normal distances (S, N) that knows how few stars it rests on.
+
+        0 for a hundred or more, whose own quantile says it.
+        """
+        from scipy.stats import t
+
+        count = len(np.unique(self.star))
+        if count >= 100:
+            return np.zeros(len(distance))
+        factor = float(t.ppf(LIMIT, max(count - 1, 2))) * np.sqrt(1.0 + 1.0 / count)
+        return np.asarray(distance.mean(axis=1) + factor * distance.std(axis=1))
 
 
 @dataclass(frozen=True)
@@ -494,7 +503,9 @@ def with_training_stars(bundle: Bundle, stars: BrightStars) -> Bundle:
     if score.size:
         # All but 1 % of them, which may be unlike the others, and a margin for other pixels.
         limit[0] = max(limit[0], 1.1 * float(np.quantile(score, 0.99)))
-    return replace(bundle, strange_limit=limit)
+    distance = found.distance[np.isfinite(found.distance)]
+    far = 1.1 * float(np.quantile(distance, 0.99)) if distance.size else 0.0
+    return replace(bundle, strange_limit=limit, distance_limit=max(bundle.distance_limit, far))
 
 
 def with_wings(bundle: Bundle, wings: Wings) -> Bundle:
