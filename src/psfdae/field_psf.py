@@ -47,6 +47,7 @@ LARGEST_DEFORMATION = 0.3  # usual stretch of a PSF in another exposure; px² of
 DEFORMATION_STEPS = 3  # of Gauss-Newton
 HIGHER_CHANGE = 0.3  # times this, of terms beyond the constant
 FOLDS, ENOUGH_STARS = 5, 300  # left out, of which one fold after the other is predicted
+FEW_STARS = 16  # with fewer, their number limits the order of the polynomial
 TOLERANCE, ITERATIONS = 1e-4, 150  # of the conjugate gradients
 TRIED_TOLERANCE = 3e-3  # of fits that are tried: errors of stars left out hardly change
 
@@ -160,8 +161,8 @@ def fit_field(
         Least weight of the squared second differences of the coefficients, 1/flux².
     """
     alternating = _Alternating(stars, background, frame_px, stamp_px, spacing, smoothness)
-    tried = sorted(orders) if np.isfinite(stars.position).all() else [0]
-    if len(orders) == 1:
+    tried = _supported(orders, stars)
+    if len(orders) == 1 or len(stars) < 3:  # of two stars, none can be left out
         return alternating.fit(tried[0])
     alternating.tolerance, best, least = TRIED_TOLERANCE, 0, np.inf
     for order in tried:
@@ -188,6 +189,18 @@ def fit_field(
         least = error
     alternating.tolerance = TOLERANCE
     return alternating.fit(best)
+
+
+def _supported(orders: Sequence[int], stars: BrightStars) -> list[int]:
+    """Return the orders, ascending, that so many stars may support."""
+    if not np.isfinite(stars.position).all():
+        return [0]
+    tried = sorted(orders)
+    if len(stars) >= FEW_STARS or len(orders) == 1:
+        return tried
+    # Stars that are left out say too little then: at least two stars a term of the polynomial of
+    # order o, which has (o + 1)(o + 2)/2.
+    return [o for o in tried if (o + 1) * (o + 2) <= len(stars)] or tried[:1]
 
 
 def refit_field(
@@ -231,6 +244,10 @@ class _Alternating:
         self.noise, self.place = stars.noise, stars.place
         self.photons = np.sqrt(background) / stars.noise  # per unit of flux
         self.stamp_px, self.spacing, self.smoothness = stamp_px, spacing, smoothness
+        # A = 4πσ² of a Gaussian. A ring has no light in its middle: a window as wide as the radius
+        # of all light does, 1.4 σ.
+        sigma = float(np.sqrt(np.median(stars.area()) / (4.0 * np.pi)))
+        self.window_px = 1.4 * sigma if sigma > 3.0 else WINDOW_PX
         self.axis = np.arange(side) - side // 2.0
         self.inner = np.abs(self.axis + 0.5) < stamp_px / 2
         self.knots = int((side + 1) / spacing) - 1
@@ -250,8 +267,9 @@ class _Alternating:
         low, high = self.low[:count].copy(), self.high[:count].copy()
         terms = _terms(self.place, low, high, order)
         good, flux = np.ones(len(terms), bool), self.images.sum(axis=(1, 2))
-        start, window = np.zeros((len(flux), 2)), np.full(len(flux), WINDOW_PX)
-        centre = windowed_centres(self.images, start, window, WINDOW_ROUNDS, WINDOW_REACH_PX)
+        start, window = np.zeros((len(flux), 2)), np.full(len(flux), self.window_px)
+        reach = WINDOW_REACH_PX if self.window_px == WINDOW_PX else FARTHEST_PX
+        centre = windowed_centres(self.images, start, window, WINDOW_ROUNDS, reach)
         alike, noise = np.ones(self.images.shape), self._weight(flux)
         found: np.ndarray | None = None
         for turn in range(FIT_ROUNDS):

@@ -192,7 +192,11 @@ class OfTest(OfFit, Protocol):
 class CalibrationStars(Group):
     """Which stars of an image become training data, and the noise that they get."""
 
-    snr_min: Positive = Field(100.0, description="Least S/N of a star that is learnt from")
+    snr_min: Positive | None = Field(
+        None,
+        description="Least S/N of a star that is learnt from; null: 100, and lower, down to 10, "
+        "where fewer than 20 stars have that",
+    )
     isolation_px: Positive = Field(
         12.0, description="Distance within which a neighbour is too close"
     )
@@ -209,7 +213,18 @@ class CalibrationStars(Group):
     margin_px: Annotated[int, Field(ge=0, le=64)] = Field(
         8, description="Pixels around a stamp, in which the sky is measured"
     )
-    stars_min: Annotated[int, Field(ge=10)] = Field(20, description="Fewest stars to learn from")
+    stars_min: Annotated[int, Field(ge=2)] = Field(5, description="Fewest stars to learn from")
+    light_min: Annotated[float, Field(ge=0, lt=1)] = Field(
+        0.95,
+        description="Part of a star's light that stamps hold at least: where those of "
+        "framing.stamp_px hold less, they are as wide as 98 % take. A stamp_px that is stated "
+        "is taken as it is; so it is with 0",
+    )
+    centring_px: Annotated[float, Field(ge=0, le=64)] | None = Field(
+        None,
+        description="FWHM of the Gaussian that smooths a star before its brightest pixel is "
+        "searched; null: that of the stars, where their brightest pixels are off their middle",
+    )
     bins: Annotated[int, Field(ge=1, le=64)] = Field(
         4, description="Parts of the field along a side; stars of a part are stacked"
     )
@@ -225,6 +240,15 @@ class CalibrationStars(Group):
             raise ValueError(f"snr_levels = {self.snr_levels}: must be ascending")
         return self
 
+    @property
+    def least_snr(self) -> float:
+        """Least S/N of a star that is learnt from, where there are enough stars."""
+        return 100.0 if self.snr_min is None else self.snr_min
+
+    def lower_snr(self) -> list[float]:
+        """Least S/N to try one after the other where too few stars have more; none if stated."""
+        return [70.0, 50.0, 35.0, 25.0, 20.0, 14.0, 10.0] if self.snr_min is None else []
+
     def degraded(self) -> list[float]:
         """S/N to which bright stars are degraded, ascending, none above snr_min / 2."""
-        return sorted({min(level, 0.5 * self.snr_min) for level in self.snr_levels})
+        return sorted({min(level, 0.5 * self.least_snr) for level in self.snr_levels})

@@ -7,6 +7,7 @@ import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
+from inspect import signature
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -30,8 +31,15 @@ from psfdae.method import Method, facts_of
 from psfdae.methods import method
 from psfdae.model.bundle import SUFFIX
 from psfdae.model.exposures import for_exposures
-from psfdae.model.fitting import best, described, fitted_to, makes_models, packed
-from psfdae.model.settings import CHOSEN, Settings, Words, of_config
+from psfdae.model.fitting import best, described, fitted_to, makes_models, packed, worth_trying
+from psfdae.model.settings import (
+    CHOSEN,
+    IMAGE_GROUPS,
+    Settings,
+    Words,
+    of_config,
+    with_keywords,
+)
 from psfdae.model.stars import ALL, Stars
 from psfdae.model.validation import validate
 from psfdae.options import File, Folder
@@ -102,6 +110,13 @@ def from_stars(
         File | None, {"flag": "--report"}, "HTML page that shows whether to trust the model."
     ] = None,
     overwrite: Annotated[bool, "Replace a model that the folder holds."] = False,
+    snr_min: Annotated[
+        float | None, "Least S/N of a star that is learnt from.  [default: 100, less if few]"
+    ] = None,
+    stars_min: Annotated[int | None, "Fewest stars to learn from.  [default: 5]"] = None,
+    stamp_px: Annotated[
+        int | None, "Side of the stamps, even.  [default: 16, more if stars are larger]"
+    ] = None,
 ) -> None:
     """Train a model on the bright stars of IMAGE.
 
@@ -109,7 +124,12 @@ def from_stars(
     the method of the model; others are held out and degraded to low S/N to test it. Several images
     are exposures of one camera; all share a model, and each gets its own by the stars that it has.
     """
-    job = dict(locals())
+    sizes = {"snr_min": snr_min, "stars_min": stars_min, "stamp_px": stamp_px}
+    stated_sizes: dict[str, object] = {k: v for k, v in sizes.items() if v is not None}
+    if stamp_px is not None:
+        stated_sizes["light_min"] = 0.0  # no light asks for other stamps
+    config = with_keywords(of_config(config), IMAGE_GROUPS, stated_sizes)
+    job = {key: value for key, value in locals().items() if key in signature(trained).parameters}
     stem = _stem(image, name)
     if not stated.all_extensions:
         print(trained(**job))
@@ -252,17 +272,11 @@ def _make(
     write_columns(files.path / "selection.csv", stars.table.columns, digits=6)
     write_product(files.stars, "stars", stars.columns, stars.described())
     write_text(files.path / "overrides.txt", _overrides(stars.settings))
-    fitted = {}
-    for kind in files.kinds:
-        print(f"fitting {kind.look.label}")
-        place = files.fit(kind)
-        checkpoint = fits.beside(kind, place, "checkpoint.pt")
-        fitted[kind.name] = fitted_to(stars, kind, checkpoint)
-        fits.store(fitted[kind.name], place, described(stars, kind), stars.product)
-        checkpoint.unlink(missing_ok=True)
-    taken = tried[0]
-    if len(tried) > 1:
-        name, errors = best(stars, {kind.name: fitted[kind.name] for kind in tried})
+    taking = worth_trying(stars, tried)
+    fitted = _fits(stars, files, [k for k in files.kinds if k in taking or k not in tried])
+    taken = taking[0]
+    if len(taking) > 1:
+        name, errors = best(stars, {kind.name: fitted[kind.name] for kind in taking})
         taken = method(name)
         for other, error in errors.items():
             print(f"{method(other).look.label}: MSE {error:.3g} on validation stars")
@@ -292,6 +306,19 @@ def _make(
             print(f"writing {page}")
             report.save(page)
     return str(report)
+
+
+def _fits(stars: Stars, files: Made, kinds: Sequence[type[Method]]) -> dict[str, Method]:
+    """Fit methods to the stars, each to a file, by their names."""
+    fitted: dict[str, Method] = {}
+    for kind in kinds:
+        print(f"fitting {kind.look.label}")
+        place = files.fit(kind)
+        checkpoint = fits.beside(kind, place, "checkpoint.pt")
+        fitted[kind.name] = fitted_to(stars, kind, checkpoint)
+        fits.store(fitted[kind.name], place, described(stars, kind), stars.product)
+        checkpoint.unlink(missing_ok=True)
+    return fitted
 
 
 def _overrides(settings: Settings) -> str:

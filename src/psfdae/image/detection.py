@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 
 from psfdae.image.bad_pixels import interpolated
+from psfdae.image.source_size import measure_size
+from psfdae.moments import FWHM_OF_SIGMA
 
 MESH_PX = 64  # side of the squares in which the sky is measured
 MOST_BAD = 80.0  # per cent of a mesh's pixels; others are interpolated over it
@@ -21,6 +23,7 @@ LEVELS, CONTRAST = 8, 0.005  # of the parting; 32 levels take three times as lon
 SMOOTHING = np.outer([1, 2, 1], [1, 2, 1]) / 16.0
 SMOOTHED_NOISE = float(np.sqrt(np.square(SMOOTHING).sum()))  # that of a pixel, in σ of before
 DECIMALS = 3  # of positions
+WIDE_PX = 7.0  # FWHM of sources from which an image is smoothed by it before it is searched
 
 
 @dataclass(frozen=True)
@@ -46,21 +49,51 @@ class Sky:
         around = ndimage.uniform_filter(self.bad.astype(np.float32), 5, mode="nearest")
         return np.asarray(self.bad & (around > 0.5))
 
-    def _above(self, threshold: float) -> tuple[np.ndarray, np.ndarray]:
-        """The smoothed image, and where its threshold is."""
+    def _above(self, threshold: float, fwhm_px: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+        """The smoothed image, and where its threshold is.
+
+        It is smoothed slightly, or by a Gaussian of that FWHM.
+        """
         from scipy import ndimage
 
-        return ndimage.convolve(self.flat, SMOOTHING), threshold * SMOOTHED_NOISE * self.noise
+        if not fwhm_px:
+            return ndimage.convolve(self.flat, SMOOTHING), threshold * SMOOTHED_NOISE * self.noise
+        # Noise of a pixel after a Gaussian of σ_g: σ/(2 √π σ_g).
+        sigma = fwhm_px / FWHM_OF_SIGMA
+        smooth = ndimage.gaussian_filter(self.flat, sigma)
+        return smooth, threshold * self.noise / (2.0 * np.sqrt(np.pi) * sigma)
 
-    def stars(self, threshold: float) -> dict[str, np.ndarray]:
+    def stars(self, threshold: float, fwhm_px: float | None = None) -> dict[str, np.ndarray]:
         """Columns of a star list as SExtractor names them, positions from 1, ids too.
 
-        `threshold` is in σ of the slightly smoothed image.
+        `threshold` is in σ of the smoothed image: slightly, or, where stars are wide, by a Gaussian
+        as wide as the brightest sources. Otherwise noise would part a star into many. The FWHM of
+        stars is measured if it is not known.
         """
+        if fwhm_px is not None:
+            return self._sources(threshold, fwhm_px if fwhm_px >= WIDE_PX else 0.0)
+        columns, smoothing = self._sources(threshold), 0.0
+        for _ in range(3):
+            if "X_IMAGE" not in columns:
+                break
+            place = np.stack([columns["X_IMAGE"], columns["Y_IMAGE"]], axis=1) - 1
+            size = measure_size(self.flat, self.bad, place)
+            if size is None or size.fwhm_px < WIDE_PX:
+                break
+            if abs(size.fwhm_px - smoothing) < 0.2 * smoothing:
+                break
+            smoothing = size.fwhm_px
+            columns = self._sources(threshold, smoothing)
+        return columns
+
+    def _sources(self, threshold: float, fwhm_px: float = 0.0) -> dict[str, np.ndarray]:
+        """Columns of a star list of the image, smoothed by a Gaussian of that FWHM or slightly."""
         from photutils.segmentation import SourceCatalog, SourceFinder
 
-        smooth, limit = self._above(threshold)
-        finder = SourceFinder(LEAST_PX, n_levels=LEVELS, contrast=CONTRAST)
+        smooth, limit = self._above(threshold, fwhm_px)
+        # A source has at least a circle of half the FWHM in diameter.
+        least = max(LEAST_PX, round(np.pi * (fwhm_px / 4.0) ** 2))
+        finder = SourceFinder(least, n_levels=LEVELS, contrast=CONTRAST)
         finder.progress_bar = False  # photutils 3.0 shows one; the argument goes in 4.0
         parts = finder(smooth, limit, mask=self.holes)
         if parts is None:
@@ -90,7 +123,12 @@ class Sky:
 
         # As photutils parts an image, which takes a second to be loaded.
         smooth, limit = self._above(threshold)
-        parts, _ = ndimage.label((smooth > limit) & ~self.holes, np.ones((3, 3)))
+        above = (smooth > limit) & ~self.holes
+        # The middle of a ring, such as a star out of focus, is on the star: of up to 100 px.
+        enclosed, _ = ndimage.label(ndimage.binary_fill_holes(above) & ~above)
+        small = np.bincount(enclosed.ravel()) <= 100
+        small[0] = False
+        parts, _ = ndimage.label(above | small[enclosed], np.ones((3, 3)))
         source = np.bincount(parts.ravel()) >= LEAST_PX
         source[0] = False
         height, width = self.flat.shape

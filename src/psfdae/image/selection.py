@@ -21,8 +21,8 @@ from psfdae.errors import Error
 from psfdae.image.bad_pixels import interpolated_stamps
 from psfdae.image.errors import no_formula
 from psfdae.image.observation import Observation, central_pixel
-from psfdae.image.stamps import Stamps, StarFlag, cut, peaks, sky_around
-from psfdae.moments import moved, robust_scatter, windowed_centres
+from psfdae.image.stamps import Stamps, StarFlag, cut, peaks, sky_around, softened
+from psfdae.moments import FWHM_OF_SIGMA, moved, robust_scatter, windowed_centres
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -85,14 +85,19 @@ class Candidates:
         columns = {name: np.concatenate([getattr(f, name) for f in several]) for name in names}
         return cls(**columns, bright=BrightStars.joined(bright))
 
-    def require(self, path: Path, least: int) -> None:
-        """Refuse an image with fewer good stars, by CalibrationStarsError."""
+    def require(self, path: Path, least: int, remarks: Sequence[str] = ()) -> None:
+        """Refuse an image with fewer good stars, by CalibrationStarsError.
+
+        `remarks` are sentences on a mask or header values that were used or not, which may be why.
+        """
         if len(self.bright) < least:
-            raise CalibrationStarsError(
+            problem = (
                 f"{path}: {len(self.bright)} stars are good enough to learn from, "
                 f"calibration_stars.stars_min = {least} are needed "
-                f"(of {len(self.verdict)}: {self.count()})"
+                f"(of {len(self.verdict)}: {self.count()}); --stars-min takes fewer, --snr-min "
+                "fainter ones"
             )
+            raise CalibrationStarsError("; ".join([problem, *remarks]))
 
     def count(self) -> str:
         """How many stars there are of every verdict, in words."""
@@ -157,7 +162,8 @@ def collect(
     wide, peak, listed, colour, flux, row, bad = (
         a[good] for a in (wide, peak, listed, colour, flux, row, bad)
     )
-    window = window_of(snr[row], flux, noise[row])
+    centring = settings.centring_px or 0.0
+    window = np.maximum(window_of(snr[row], flux, noise[row]), centring / FWHM_OF_SIGMA)
     centre = windowed_centres(wide, peak, window, REGISTRATION_ROUNDS, FARTHEST_PX)
     bright = BrightStars(
         *(wide, peak, centre, found["position"][row], flux, noise[row], snr[row], row),
@@ -167,14 +173,14 @@ def collect(
     narrow = sharper_than_stars(bright.area())
     verdict[bright.row[narrow]] = Verdict.SHARP
     bright = bright.of(~narrow)
-    bright, missing = completed(bright, side, settings.search_px)
+    bright, missing = completed(bright, side, settings.search_px, centring)
     verdict[bright.row[missing > MOST_MISSING]] = Verdict.INCOMPLETE
     bright = bright.of(missing <= MOST_MISSING)
     row = bright.row
     score = misfit(cut(bright.aligned(), side), bright.position, bright.noise / bright.flux)
     verdict[row[score > settings.misfit]] = Verdict.MISFIT
     result = Candidates(**found, bright=bright.of(score <= settings.misfit))
-    result.require(observation.path, settings.stars_min)
+    result.require(observation.path, settings.stars_min, observation.remarks)
     return result
 
 
@@ -200,7 +206,8 @@ def _measure(
     bad = (chunk.bad | (wide < depth)) & ~off
     wide = interpolated_stamps(np.maximum(wide, depth), bad)
     reach = min(settings.search_px, (wide.shape[-1] - 5) // 2)
-    peak, centred = brightest_pixels(wide, reach)
+    centring = settings.centring_px or 0.0
+    peak, centred = brightest_pixels(wide, reach, centring)
     needed = side + 2 * min(reach + framing.jitter_px + 1, (wide.shape[-1] - side) // 2)
     snr = signal_to_noise(cut(wide, side), noise)
     # A bad pixel that is saturated tells of a saturated star only in the star's core.
@@ -214,7 +221,7 @@ def _measure(
 
     for reason, stars in (
         (Verdict.OFF_CENTRE, ~centred),
-        (Verdict.FAINT, snr < settings.snr_min),
+        (Verdict.FAINT, snr < settings.least_snr),
         (Verdict.BLENDED, said(StarFlag.BLENDED)),
         (Verdict.SATURATED, core | said(StarFlag.SATURATED)),
         (Verdict.INCOMPLETE, incomplete | said(StarFlag.TRUNCATED)),
@@ -226,7 +233,8 @@ def _measure(
         "snr": snr,
         "noise": noise,
         "sky": level,
-        "brightest": level + np.where(centred, _at(wide, peak), -np.inf),
+        "brightest": level
+        + np.where(centred, cut(wide, side).max((1, 2)) if centring else _at(wide, peak), -np.inf),
         "highest": cut(np.where(chunk.bad, -np.inf, chunk.data), side).max(axis=(1, 2)),
         "verdict": verdict,
     }
@@ -257,7 +265,9 @@ def sharper_than_stars(area: np.ndarray) -> np.ndarray:
     return np.asarray(size < np.median(size) - limit)
 
 
-def completed(stars: BrightStars, stamp_px: int, search_px: int) -> tuple[BrightStars, np.ndarray]:
+def completed(
+    stars: BrightStars, stamp_px: int, search_px: int, centring_px: float = 0.0
+) -> tuple[BrightStars, np.ndarray]:
     """Fill the bad pixels of stars with the PSF of the nearest stars, scaled to the good pixels.
 
     Parameters
@@ -267,6 +277,8 @@ def completed(stars: BrightStars, stamp_px: int, search_px: int) -> tuple[Bright
     stamp_px, search_px : int
         Side of the stamps, in which the scale is measured; distance of the brightest pixel from
         the middle, at most.
+    centring_px : float
+        FWHM of the Gaussian that smooths stars before their brightest pixel is searched.
 
     Returns
     -------
@@ -302,7 +314,7 @@ def completed(stars: BrightStars, stamp_px: int, search_px: int) -> tuple[Bright
             flux = float((wide[star][stamp] * psf[stamp])[good].sum()) / square if square else 0.0
             wide[star][bad] = flux * psf[bad]
             missing[star] = (psf * bad)[stamp].sum() / psf[stamp].sum()
-        peak = brightest_pixels(wide[incomplete], search_px)[0]
+        peak = brightest_pixels(wide[incomplete], search_px, centring_px)[0]
         light = cut(wide[incomplete], stamp_px, peak)
         flux, snr = light.sum(axis=(1, 2)), stars.snr.copy()
         snr[incomplete] = signal_to_noise(cut(wide[incomplete], stamp_px), stars.noise[incomplete])
@@ -311,6 +323,7 @@ def completed(stars: BrightStars, stamp_px: int, search_px: int) -> tuple[Bright
         window = window_of(
             *(np.where(usable, v, 1.0) for v in (snr[incomplete], flux, stars.noise[incomplete]))
         )
+        window = np.maximum(window, centring_px / FWHM_OF_SIGMA)
         centres = windowed_centres(wide[incomplete], peak, window, REGISTRATION_ROUNDS, FARTHEST_PX)
         new = {"peak": peak, "centre": centres, "flux": flux, "snr": snr[incomplete]}
         columns = {name: getattr(stars, name).copy() for name in new}
@@ -398,7 +411,9 @@ def crowded(
     return out
 
 
-def brightest_pixels(wide: np.ndarray, search_px: int) -> tuple[np.ndarray, np.ndarray]:
+def brightest_pixels(
+    wide: np.ndarray, search_px: int, centring_px: float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
     """Brightest pixel near the middle of every stamp.
 
     Parameters
@@ -406,6 +421,8 @@ def brightest_pixels(wide: np.ndarray, search_px: int) -> tuple[np.ndarray, np.n
     wide : ndarray, shape (n, s, s)
     search_px : int
         Searched within ± this of the middle.
+    centring_px : float
+        FWHM of the Gaussian that smooths the stamps before; 0: none.
 
     Returns
     -------
@@ -416,7 +433,7 @@ def brightest_pixels(wide: np.ndarray, search_px: int) -> tuple[np.ndarray, np.n
     """
     middle, reach = wide.shape[-1] // 2, search_px + 1
     near = slice(middle - reach, middle + reach + 1)
-    peak = peaks(wide[:, near, near]) - reach
+    peak = peaks(softened(wide, centring_px)[:, near, near]) - reach
     return peak, np.abs(peak).max(axis=1, initial=0) <= search_px
 
 

@@ -9,6 +9,8 @@ from functools import cache
 
 import numpy as np
 
+from psfdae.moments import FWHM_OF_SIGMA
+
 
 @dataclass(frozen=True)
 class Stamps:
@@ -198,7 +200,20 @@ def smoothed(stamps: np.ndarray) -> np.ndarray:
     return np.asarray((rows[:, :, :-2] + 2 * rows[:, :, 1:-1] + rows[:, :, 2:]) / 16)
 
 
-def displacement(stamps: np.ndarray, jitter_px: int) -> np.ndarray:
+def softened(stamps: np.ndarray, fwhm_px: float) -> np.ndarray:
+    """Stamps (n, s, s) convolved with a Gaussian of that FWHM, edges repeated; 0 is none.
+
+    A ring, or a star that is wide beside its pixels, has its brightest pixel in its middle then.
+    """
+    from scipy import ndimage
+
+    if not fwhm_px:
+        return stamps
+    sigma = fwhm_px / FWHM_OF_SIGMA
+    return np.asarray(ndimage.gaussian_filter(stamps, (0.0, sigma, sigma), mode="nearest"))
+
+
+def displacement(stamps: np.ndarray, jitter_px: int, centring_px: float = 0.0) -> np.ndarray:
     """How far each star lies off the place where the training would have put it.
 
     The training moves stars by up to `jitter_px` whole pixels, so only a star beyond
@@ -212,6 +227,8 @@ def displacement(stamps: np.ndarray, jitter_px: int) -> np.ndarray:
         s even; bad pixels at the sky level. The sky need not be subtracted.
     jitter_px : int
         Distance (per axis) that the training covers.
+    centring_px : float
+        FWHM of the Gaussian by which the training smoothed stars to find their brightest pixels.
 
     Returns
     -------
@@ -221,8 +238,9 @@ def displacement(stamps: np.ndarray, jitter_px: int) -> np.ndarray:
     """
     middle = stamps.shape[-1] // 2
     near = slice(middle - jitter_px, middle + jitter_px + 1)
-    smooth = smoothed(stamps)
-    brightest, second = (peaks(images) - middle for images in (stamps, smooth))
+    soft = softened(stamps, centring_px)
+    smooth = smoothed(soft)
+    brightest, second = (peaks(images) - middle for images in (soft, smooth))
     outside = np.abs(brightest).max(axis=1) > jitter_px
     star = np.flatnonzero(outside & (np.abs(brightest - second).max(axis=1) <= 1))
     out = np.zeros((len(stamps), 2), dtype=np.int16)

@@ -127,6 +127,7 @@ def make_images(
     framing: Stamp,
     subpixel: np.ndarray,
     rng: np.random.Generator,
+    centring_px: float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Frame stars as the network will see them, at new sub-pixel phases where asked for.
 
@@ -146,6 +147,8 @@ def make_images(
     subpixel : ndarray of bool, shape (n,)
         Images of stars that are moved by up to ± ½ pixel; the others are not interpolated.
     rng : Generator
+    centring_px : float
+        FWHM of the Gaussian that smooths stars before their brightest pixel is searched.
 
     Returns
     -------
@@ -167,7 +170,7 @@ def make_images(
         # Splines ring beside what is left of a saturated neighbour.
         least = -DEFECT * stars.noise[who[some], None, None]
         wide[some] = np.maximum(moved(wide[some], phase[rows][some]), least)
-        offset = brightest_pixels(wide, reach)[0] - jitter[rows]
+        offset = brightest_pixels(wide, reach, centring_px)[0] - jitter[rows]
         shifted = moved(template[who], stars.centre[who] + phase[rows])
         for source, target in ((wide, realisations), (shifted, templates)):
             stamp = cut(source, side, offset)
@@ -183,16 +186,19 @@ def training_columns(
     framing: Stamp,
     parts: Parts,
     rng: np.random.Generator,
+    centring_px: float = 0.0,
 ) -> dict[str, Column]:
     """Columns of the product "stars": images of bright stars, and what is known of these.
 
     `grid` (n, 2) is their place (`star_grid`); stars of each of `bins`² parts of the field
-    are stacked.
+    are stacked, and stars are framed as `make_images` does it.
     """
     star = star_of_images(held_out, parts.train_stars, parts.test_stars)
     template = templates_of(bright, held_out, bins)
     subpixel = ~held_out[star] & framing.subpixel
-    images, templates, jitter, phase = make_images(bright, template, star, framing, subpixel, rng)
+    images, templates, jitter, phase = make_images(
+        bright, template, star, framing, subpixel, rng, centring_px
+    )
     wide = (bright.wide / bright.flux[:, None, None]).astype(np.float32)
     return {
         "template": Column(templates, "1", "stack of the star's part of the field, sum 1"),

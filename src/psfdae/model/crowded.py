@@ -198,7 +198,7 @@ def _with_hidden(
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of photutils, if there is none
-        left = Sky(sky.flat, sky.level, error, sky.bad, np.nan).stars(threshold)
+        left = Sky(sky.flat, sky.level, error, sky.bad, np.nan).stars(threshold, fwhm)
     if not len(left["id"]):
         return place, flux
     new = np.stack([left["X_IMAGE"], left["Y_IMAGE"]], axis=1) - 1.0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -23,7 +23,7 @@ from psfdae.model.star_sets import (
     split_stars,
     training_set,
 )
-from psfdae.model.stars import REFERENCE, SPLIT, Stars
+from psfdae.model.stars import ENOUGH_STARS, REFERENCE, SPLIT, Stars
 from psfdae.model.wings import Wings, wings_of_stars
 from psfdae.rng import stream
 from psfdae.settings import ConfigError
@@ -71,12 +71,22 @@ def fit(
     PsfModel('mine', 16×16 px of 1", S/N 5 … 50)
     """
     names = [method] if method else [n for n in stars.settings.methods if makes_models(n)]
-    kinds = [model_method(one) for one in names]
+    kinds = worth_trying(stars, [model_method(one) for one in names])
     groups = [group for kind in kinds for group in kind.groups]
     stars = stars.with_settings(with_keywords(stars.settings, groups, settings))
     fitted = {kind.name: fitted_to(stars, kind) for kind in kinds}
     chosen = next(iter(fitted)) if len(fitted) == 1 else best(stars, fitted)[0]
     return packed(stars, fitted[chosen], name or stars.name, licence)
+
+
+def worth_trying(stars: Stars, kinds: Sequence[type[Method]]) -> list[type[Method]]:
+    """Return the methods of which one becomes the model: of few stars the field alone.
+
+    Too few are left to choose a method by validation stars, and only the field falls back to one
+    PSF for all.
+    """
+    field = [kind for kind in kinds if kind.name == "field"]
+    return field if field and len(stars) < ENOUGH_STARS else [*kinds]
 
 
 def makes_models(name: str) -> bool:

@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+from psfdae.bright_stars import BrightStars
 from psfdae.bundle_info import BundleInfo
 from psfdae.files import Product, ProductError
 from psfdae.method import Estimate, FindsFlux, MeasuresStars, Method, ScoresOutliers, with_free_flux
@@ -142,18 +143,35 @@ class Errors:
     def strange_limit(self) -> np.ndarray | None:
         """What 0.1 % of the stars exceed at every node, shape (S,).
 
-        The excess over a node's median is taken to be as usual at all of them.
+        The excess over a node's median is taken to be as usual at all of them. Few stars do not
+        show what 0.1 % exceed: the limit is at least that of a further star beside n normal √score,
+        mean + t (1 + 1/n)^½ σ with t of n − 1 degrees of freedom.
         """
         if self.outlier_score is None:
             return None
+        least = np.square(self._of_few(np.sqrt(np.maximum(self.outlier_score, 0.0))))
         usual = np.median(self.outlier_score, axis=1)
         spread = np.median(np.abs(self.outlier_score - usual[:, None]), axis=1)
         excess = (self.outlier_score - usual[:, None]) / np.maximum(spread, 1e-12)[:, None]
-        return np.asarray(usual + spread * np.quantile(excess, LIMIT))
+        return np.asarray(np.maximum(usual + spread * np.quantile(excess, LIMIT), least))
 
     def distance_limit(self) -> float:
-        """Distance that 0.1 % of the stars of all nodes exceed."""
-        return float(np.quantile(self.distance, LIMIT))
+        """Distance that 0.1 % of the stars of all nodes exceed; as high as few stars ask for."""
+        found = float(np.quantile(self.distance, LIMIT))
+        return max(found, float(self._of_few(self.distance).max()))
+
+    def _of_few(self, distance: np.ndarray) -> np.ndarray:
+        """Limit (S,) of normal distances (S, N) that knows how few stars it rests on.
+
+        0 for a hundred or more, whose own quantile says it.
+        """
+        from scipy.stats import t
+
+        count = len(np.unique(self.star))
+        if count >= 100:
+            return np.zeros(len(distance))
+        factor = float(t.ppf(LIMIT, max(count - 1, 2))) * np.sqrt(1.0 + 1.0 / count)
+        return np.asarray(distance.mean(axis=1) + factor * distance.std(axis=1))
 
 
 @dataclass(frozen=True)
@@ -260,6 +278,9 @@ def bundle_of(
     held_out = facts.held_out
     unpacked = type(fitted).unpack(made.weights, made.info)  # what it errs as packed
     made, errors = calibrated(made, unpacked, held_out, config.seed)
+    if of_image(stars):
+        train = np.unique(stars["field_index"][split_stars(stars, trained["split"], config).train])
+        made = with_training_stars(made, BrightStars.of_product(stars).of(train))
     test = split_stars(stars, trained["split"], config).test
     metrics = measure_levels(
         config.noise.levels,
@@ -462,6 +483,29 @@ def with_scales(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -
         scale95=scale95,
         flux_error_scale=np.interp(nodes, noise[1, -1], of_flux),
     )
+
+
+def with_training_stars(bundle: Bundle, stars: BrightStars) -> Bundle:
+    """The bundle with a limit of outliers that its own training stars are not beyond.
+
+    The noise of a training star is in the axes of the training, along which a star of the same
+    noise is an outlier by as much as there are few of them. Training stars have less noise than the
+    least node, of which the limit is that of all brighter stars.
+    """
+    if bundle.strange_limit is None or not len(stars):
+        return bundle
+    images, seen = stars.framed(bundle.info.stamp_px)
+    images = np.where(seen, images, 0.0) / stars.flux[:, None, None]
+    noise = stars.noise / stars.flux
+    found = PsfModel(bundle).predict(images, noise=noise, background=0.0, position=stars.place)
+    score = found.outlier_score[np.isfinite(found.outlier_score)]
+    limit = bundle.strange_limit.copy()
+    if score.size:
+        # All but 1 % of them, which may be unlike the others, and a margin for other pixels.
+        limit[0] = max(limit[0], 1.1 * float(np.quantile(score, 0.99)))
+    distance = found.distance[np.isfinite(found.distance)]
+    far = 1.1 * float(np.quantile(distance, 0.99)) if distance.size else 0.0
+    return replace(bundle, strange_limit=limit, distance_limit=max(bundle.distance_limit, far))
 
 
 def with_wings(bundle: Bundle, wings: Wings) -> Bundle:

@@ -501,6 +501,8 @@ class Engine:
         self.size = min(together, max(1, together * WHOLE_PX**2 // bundle.info.stamp_px**2))
         self._photometer = Photometer(bundle.flux_model, bundle.info.components)
         self.wings = bundle.wings
+        stars = bundle.info.config.get("stars", {}).get("calibration_stars", {})
+        self._centring_px = float(stars.get("centring_px") or 0.0)
 
     def blocks(self, stars: Stamps) -> list[Stamps]:
         """Stars in parts of `size`."""
@@ -753,7 +755,7 @@ class Engine:
         data, hidden = stars.data, stars.bad & ~stars.saturated
         if hidden.any():
             data = np.where(hidden, border_median(data, hidden)[:, None, None], data)
-        shift = displacement(data, self.bundle.info.jitter_px)
+        shift = displacement(data, self.bundle.info.jitter_px, self._centring_px)
         shift[exact] = 0
         too_far = np.abs(shift).max(axis=1) > margin
         shift[too_far] = 0

@@ -12,7 +12,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from pydantic import Field, create_model
+from pydantic import Field, create_model, model_validator
 
 from psfdae.joined import joined
 from psfdae.methods import MethodNames, known
@@ -46,6 +46,17 @@ class Settings(Group):
     noise: Noise = Noise(name="from_stars", levels=[1e-2], kappa=1.0, background_photons=1e4)
     parts: Parts = Parts()
     evaluation: Evaluation = Evaluation()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _stated_size(cls, tree: Any) -> Any:
+        """A size of stamps that is stated is taken as it is: no light asks for another one."""
+        if not isinstance(tree, Mapping) or not isinstance(tree.get("framing"), Mapping):
+            return tree
+        stars = tree.get("calibration_stars", {})
+        if "stamp_px" not in tree["framing"] or not isinstance(stars, Mapping):
+            return tree
+        return {**tree, "calibration_stars": {"light_min": 0.0, **stars}}
 
 
 @cache
@@ -82,6 +93,8 @@ def from_words(words: Sequence[str] = ()) -> Settings:
 
 def _composed(groups: tuple[str, ...], word: str, words: Sequence[str]) -> Group:
     """Groups of settings where a word chooses a file, or is wrong, of which Hydra says more."""
+    if any(word.lstrip("+").startswith("framing.stamp_px=") for word in words):
+        words = ("++calibration_stars.light_min=0", *words)
     for point in joined("settings"):
         settings: Group = point.load()(groups, (CHOSEN, *words))
         return settings
@@ -144,13 +157,13 @@ def with_keywords(
     ConfigError
         If no group has a name, or a value is out of its range.
     """
-    tree = settings.model_dump()
+    tree = settings.model_dump(exclude_unset=True)
     for name, value in keywords.items():
         owner = next((group for group in groups if _has(group, name)), None)
         if owner is None:
             known = [key for group in groups for key in sorted(_keys(group) or (group,))]
             raise ConfigError(f"{name}: unknown setting; there are {', '.join(known)}")
-        tree[owner] = value if owner == name else {**tree[owner], name: value}
+        tree[owner] = value if owner == name else {**tree.get(owner, {}), name: value}
     return validate(settings_model(), tree)
 
 

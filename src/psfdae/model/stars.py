@@ -22,13 +22,8 @@ from psfdae.image.observation import (
     list_offset,
     other_instruments,
 )
-from psfdae.image.selection import (
-    CalibrationStarsError,
-    Candidates,
-    Verdict,
-    advice,
-    collect,
-)
+from psfdae.image.selection import Candidates, Verdict, advice, collect
+from psfdae.image.source_size import SourceSize, measure_size
 from psfdae.image.training_images import single_psf, star_grid, training_columns
 from psfdae.model.psf_model import SCALE_TOLERANCE
 from psfdae.model.settings import IMAGE_GROUPS, Settings, settings_model, with_keywords
@@ -52,6 +47,10 @@ MANY_CROWDED = 1.0
 
 ALL = "all"
 """Name of a model of several exposures by default."""
+
+ENOUGH_STARS, FEW_STARS, FAINT_SNR = 20, 5, 20.0
+"""Stars for which S/N 100 is asked; fewest of which an error is stated; least S/N if there are
+some."""
 
 DETECTED_SIGMA = 5.0
 """σ above the sky from which stars are searched by default."""
@@ -192,16 +191,36 @@ class Stars:
         margin = settings.calibration_stars.margin_px
         opened = [source.open(settings.framing.stamp_px, margin).assuming() for source in sources]
         _require_one_camera(opened)
-        least = None if len(sources) == 1 else 0
-        found = []
-        for source, observation in zip(sources, opened, strict=True):
-            stars = cls.chosen(source, observation, settings, least=least)
+        # The stars, first in stamps of the size of the settings, then in wider ones if these hold
+        # too little of their light.
+        chosen, candidates = enough_stars(opened, settings)
+        notes = []
+        if (sized := fitting_stamps(opened, candidates, settings)) is not None:
+            settings, note = sized
+            notes.append(note)
+            size, margin = settings.framing.stamp_px, settings.calibration_stars.margin_px
+            opened = [replace(one, stamp_px=size, margin=margin) for one in opened]
+            chosen, candidates = enough_stars(opened, settings)
+        if chosen.calibration_stars.least_snr < settings.calibration_stars.least_snr:
+            notes.append(
+                f"few stars: those of S/N {chosen.calibration_stars.least_snr:g} and above are "
+                "learnt from, as fewer than 20 have S/N "
+                f"{settings.calibration_stars.least_snr:g}; --snr-min takes others"
+            )
+        exposures = []
+        for source, observation, found in zip(sources, opened, candidates, strict=True):
+            if len(sources) == 1:
+                least = chosen.calibration_stars.stars_min
+                found.require(observation.path, least, observation.remarks)
+            stars = cls.of_candidates(source, observation, found, chosen)
             if stars.many_crowded:
                 from psfdae.model.neighbours import without_neighbours
 
                 stars = without_neighbours(stars)
-            found.append(stars)
-        return found[0] if len(found) == 1 else cls.joined(found)
+            exposures.append(stars)
+        found_stars = exposures[0] if len(exposures) == 1 else cls.joined(exposures)
+        notes += few_stars(found_stars)
+        return replace(found_stars, notes=(*found_stars.notes, *notes))
 
     @classmethod
     def joined(cls, exposures: Sequence[Stars]) -> Stars:
@@ -240,27 +259,27 @@ class Stars:
         observation: Observation,
         settings: Settings,
         isolation_px: float | None = None,
-        least: int | None = None,
     ) -> Stars:
         """The bright stars of an observation; no neighbour is nearer than `isolation_px`.
 
-        By default, the settings say how near one may be, and how many there are at least.
+        By default, the settings say how near one may be.
         """
-        framing, wanted = settings.framing, settings.calibration_stars
-        if least is not None:
-            wanted = wanted.model_copy(update={"stars_min": least})
-        try:
-            found = collect(observation, wanted, framing, isolation_px)
-        except CalibrationStarsError as error:
-            # A mask or a header value that was used or not may be why.
-            raise CalibrationStarsError("; ".join([str(error), *observation.remarks])) from None
+        wanted = settings.calibration_stars
+        found = collect(observation, wanted, settings.framing, isolation_px)
+        return cls.of_candidates(source, observation, found, settings)
+
+    @classmethod
+    def of_candidates(
+        cls, source: Source, observation: Observation, found: Candidates, settings: Settings
+    ) -> Stars:
+        """The bright stars among those of an observation that were measured."""
         bright = found.bright
         off = list_offset(
             observation.catalogue, (bright.centre - bright.listed)[:, ::-1], source.accept_offset
         )
         notes = [observation.said(), *filter(None, [off])]
         if len(bright) >= settings.calibration_stars.stars_min:
-            notes += advice(found, observation, framing.stamp_px)
+            notes += advice(found, observation, settings.framing.stamp_px)
         if len(bright):
             sky = bright.sky_photons(observation.gain, settings.noise.background_photons)
             settings = _with_noise(settings, bright, sky)
@@ -279,14 +298,15 @@ class Stars:
         grid = np.concatenate([star_grid(s.candidates.bright.position) for s in self.each])
         rest = settings.calibration_stars.bins, settings.framing, settings.parts
         rng = stream(settings.seed, "own stars")
-        return training_columns(bright, grid, self.held_out, *rest, rng)
+        centring = settings.calibration_stars.centring_px or 0.0
+        return training_columns(bright, grid, self.held_out, *rest, rng, centring)
 
     @property
     def many_crowded(self) -> bool:
         """So many bright stars of an image have neighbours that it pays to subtract these."""
         if self.observation.shape is None or not np.isfinite(self.candidates.bright.position).all():
             return False
-        if len(self) < self.settings.calibration_stars.stars_min:
+        if len(self) < ENOUGH_STARS:
             return False
         crowded = np.count_nonzero(self.candidates.verdict == Verdict.CROWDED)
         return bool(crowded >= MANY_CROWDED * len(self))
@@ -360,6 +380,126 @@ class Stars:
         }
         plain: dict[str, Any] = json.loads(json.dumps(said))
         return plain
+
+
+def enough_stars(
+    opened: Sequence[Observation], settings: Settings
+) -> tuple[Settings, list[Candidates]]:
+    """Choose stars from the brightest down, until there are enough.
+
+    Where S/N 100 gives fewer than `ENOUGH_STARS`, the least S/N is lowered until there are three
+    times as many, or to 20; and to 10 if even that gives too few.
+
+    Returns
+    -------
+    settings : Settings
+        With the least S/N.
+    candidates : list of Candidates
+        Of each observation.
+    """
+    asked = settings.calibration_stars
+
+    def with_least(snr: float) -> tuple[Settings, list[Candidates]]:
+        stars = asked.model_copy(update={"snr_min": snr})
+        # Only the stars of all images together must be enough, which is required later.
+        of_each = stars.model_copy(update={"stars_min": 0})
+        found = [collect(one, of_each, settings.framing) for one in opened]
+        return settings.model_copy(update={"calibration_stars": stars}), found
+
+    best = with_least(asked.least_snr)
+    count = sum(len(one.bright) for one in best[1])
+    if count >= ENOUGH_STARS:
+        return best
+    for snr in asked.lower_snr():
+        chosen, found = with_least(snr)
+        if (more := sum(len(one.bright) for one in found)) > count:
+            best, count = (chosen, found), more
+        if count >= (ENOUGH_STARS if snr <= FAINT_SNR else 3 * ENOUGH_STARS):
+            break
+    return best
+
+
+def fitting_stamps(
+    opened: Sequence[Observation], candidates: Sequence[Candidates], settings: Settings
+) -> tuple[Settings, str] | None:
+    """Settings for stars that are too large, or too hollow, for those that there are.
+
+    Margin, search distance, isolation and the sub-pixel steps follow the side of the stamps; a note
+    says so. None if the stamps hold the light of the stars, and these have their brightest pixels
+    in their middle.
+    """
+    asked, framing = settings.calibration_stars, settings.framing
+    if not asked.light_min and asked.centring_px is not None:
+        return None
+    sizes = [_size(*both) for both in zip(opened, candidates, strict=True)]
+    known = [size for size in sizes if size is not None]
+    if not known:
+        return None
+    largest = max(known, key=lambda size: size.fwhm_px)
+    side = framing.stamp_px
+    if asked.light_min:
+        side = max(side, largest.side(asked.light_min))
+    wide = side > framing.stamp_px
+    if not (wide or largest.hollow):
+        return None
+    # Lengths of the choice of stars grow with their stamps.
+    scale, centring = side / framing.stamp_px, asked.centring_px
+    if centring is None:
+        centring = largest.fwhm_px if largest.hollow or largest.fwhm_px > 5.0 else 0.0
+    stars = {
+        "centring_px": float(f"{centring:.3g}"),
+        "margin_px": min(round(asked.margin_px * scale), 64),
+        "search_px": min(round(asked.search_px * scale), 16),
+        "isolation_px": asked.isolation_px * scale,
+    }
+    changed: dict[str, Any] = {
+        "calibration_stars": asked.model_copy(update=stars),
+        "framing": framing.model_copy(update={"stamp_px": side}),
+    }
+    if wide and (field := getattr(settings, "field", None)) is not None:
+        # Steps of smooth stars are as much wider as their finest structure, in powers of 2; that
+        # of stars of a FWHM of 2.8 px, for which the settings are made, is 1.5 px.
+        wider = 2.0 ** max(np.floor(np.log2(largest.sharpness_px / 1.5)), 0.0)
+        steps = (
+            ("spacing_px", min(2.0, field.spacing_px * wider)),
+            ("step_px", min(1.0, field.step_px * wider)),
+        )
+        changed["field"] = field.model_copy(update=dict(steps))
+    note = f"stars: half of the light is within a diameter of {largest.fwhm_px:.3g} px"
+    if wide:
+        now, then = (100 * largest.light_within(s) for s in (framing.stamp_px, side))
+        note += (
+            f"; stamps of {side} px, which hold {then:.1f} % of it, are used instead of "
+            f"{framing.stamp_px} px ({now:.0f} %); --stamp-px takes others"
+        )
+    if largest.hollow:
+        note += "; the brightest pixel is off the middle: stars are centred on their smoothed light"
+    return settings.model_copy(update=changed), note
+
+
+def _size(observation: Observation, found: Candidates) -> SourceSize | None:
+    """Size of the stars of an image; None of a cube of stamps, or if no star is seen."""
+    if observation.shape is None or observation.positions is None:
+        return None
+    sky, good = observation.sky(), found.bright.position
+    # Stars that are good in small stamps are not saturated; without some, all count.
+    place = good if len(good) >= FEW_STARS else observation.positions
+    return measure_size(sky.flat, sky.bad, place)
+
+
+def few_stars(stars: Stars) -> list[str]:
+    """What is to be said of a model of few stars."""
+    count, held = len(stars), int(stars.held_out.sum())
+    if count >= ENOUGH_STARS:
+        return []
+    if count < FEW_STARS:
+        return [
+            f"few stars: the PSF is the mean of {count - held} stars, tested on {held}: its error "
+            "is not known"
+        ]
+    return [
+        f"few stars: {count - held} are learnt from, {held} test the model; its errors are rough"
+    ]
 
 
 def _require_own_names(sources: Sequence[Source]) -> None:

@@ -114,10 +114,14 @@ class Wings:
 
     def __str__(self) -> str:
         light, error = self.light()
-        return (
+        said = (
             f"{100 * light:.2f} ± {100 * error:.2f} % of the flux in the stamp of a usual star, "
             f"out to {self.radius_px[-1]:.3g} px"
         )
+        if light / (1.0 + light) > 0.2:
+            said += "; over a fifth of the flux: try wider stamps (--stamp-px), or a list without "
+            said += "sources that are no stars"
+        return said
 
     @classmethod
     def joined(cls, several: Sequence[Wings]) -> Wings:
