@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import tomllib
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -45,12 +46,12 @@ def bundle(network, tmp_path):
 def test_a_command_names_the_package_and_its_extra(without):
     without("hydra")
     output = refused("train", "--stars", "stars.h5", "--out", "model", "seed=20811")
-    assert output == 'psfdae: this command needs hydra-core: pip install "psfdae[paper]"\n'
+    assert output == f"psfdae: this command needs hydra-core: {errors.install_line('paper')}\n"
 
 
 def test_a_network_without_torch_names_the_extra(bundle, without):
     without("torch")
-    line = "the model 'wfsat' needs torch: pip install \"psfdae[dae]\""
+    line = f"the model 'wfsat' needs torch: {errors.install_line('dae')}"
     with pytest.raises(MissingExtraError) as caught:
         load_model(bundle)
     assert (str(caught.value), caught.value.name) == (line, "torch")
@@ -76,3 +77,19 @@ def test_what_no_extra_brings_stays_a_traceback(module):
     with pytest.raises(ModuleNotFoundError) as caught, errors.needed_by("it"):
         raise error
     assert caught.value is error
+
+
+@pytest.mark.parametrize(
+    ("note", "line"),
+    [
+        ('{{"url": "file://{folder}"}}', 'pip install "{folder}[dae]"'),
+        ('{{"url": "https://host/psfdae.whl"}}', 'pip install ".[dae]" in the folder of'),
+        ("", 'pip install ".[dae]" in the folder of'),
+    ],
+)
+def test_an_extra_is_installed_from_where_psfdae_was(monkeypatch, tmp_path, note, line):
+    """As pip notes it (PEP 610): psfdae is on no index."""
+    text = note.format(folder=tmp_path) or None
+    installed = SimpleNamespace(read_text=lambda name: text)
+    monkeypatch.setattr(errors, "distribution", lambda name: installed)
+    assert errors.install_line("dae").startswith(line.format(folder=tmp_path))

@@ -129,6 +129,14 @@ class Source:
         Pixels are read to find stars, and where there is a map of noise. Stamps get a margin
         of so many pixels, those of a cube as many of these as they have.
         """
+        if stamp_px < 1:
+            raise ObservationError(self.path, f"stamp size {stamp_px}, expected at least 1 pixel")
+        if margin < 0:
+            raise ObservationError(self.path, f"margin {margin}, expected at least 0 pixels")
+        if self.origin not in (None, 0, 1):
+            raise ObservationError(
+                self.path, f"origin {self.origin!r} of pixel coordinates, expected 0 or 1"
+            )
         image = find_image(self.image, self.extension)
         return self._in_units(image)._opened(image, stamp_px, margin)
 
@@ -149,7 +157,7 @@ class Source:
         return replace(self, **numbers)
 
     def _opened(self, image: ImageFile, stamp_px: int, margin: int) -> Observation:
-        self._check(stamp_px, margin)
+        self._check_numbers()
         table = None if self.catalogue is None else as_catalogue(self.catalogue)
         image = self._as_image(image, table)
         shape = image.shape
@@ -241,15 +249,8 @@ class Source:
         )
         return replace(where, origin=origin), [words]
 
-    def _check(self, stamp_px: int, margin: int) -> None:
-        if stamp_px < 1:
-            raise ObservationError(self.path, f"stamp size {stamp_px}, expected at least 1 pixel")
-        if margin < 0:
-            raise ObservationError(self.path, f"margin {margin}, expected at least 0 pixels")
-        if self.origin not in (None, 0, 1):
-            raise ObservationError(
-                self.path, f"origin {self.origin!r} of pixel coordinates, expected 0 or 1"
-            )
+    def _check_numbers(self) -> None:
+        """Refuse a camera value or a threshold that is no number above 0."""
         for name, value in (*self._given().items(), ("threshold", self.detect)):
             if value is not None and not (math.isfinite(value) and value > 0):
                 raise ObservationError(self.path, f"{name} {value!r}, expected a number above 0")
