@@ -259,7 +259,6 @@ LIST = ["--catalogue", "stars.csv"]
         (["image.fits", *LIST, "--method", "psfex"], "no method 'psfex'; there are "),
         (["image.fits", "--catalogue", "other.csv"], "of 150 positions"),
         (["image.fits", "--catalogue", "sky.csv"], "no usable celestial WCS"),
-        (["image.fits", "--catalogue", "twice.csv"], "rows 8 and "),
         (["image.fits", *LIST, "--detect"], "--detect takes an image"),
         (["colour.fits", "--detect"], "3 planes of 520×520"),
         (["image.fits", *LIST, "--report", "five.csv"], "five.csv: exists already; --overwrite"),
