@@ -172,7 +172,9 @@ def test_the_advised_saturation_flags_as_many_stars_as_it_says(sky, tmp_path):
     over = np.maximum(sky.pixels - level, 0.0)
     plate = np.minimum(sky.pixels, level) + 0.01 * level * (1 - np.exp(-over / level))
     x, y = np.rint(sky.position[sky.snr < 10][:3]).astype(int).T
-    plate[y, x + 7] = plate.max()  # a neighbour that is saturated
+    # A neighbour that is saturated; one pixel alone would be a hot one.
+    for row, column in np.ndindex(3, 3):
+        plate[y + row - 1, x + column + 6] = plate.max()
     path, candidates = collected(plate, sky, tmp_path)
     advice = re.search(r"(\d+) stamps have .*--saturate (\S+) ", saturation_advice(candidates))
     count, saturation = int(advice[1]), float(advice[2])
