@@ -172,12 +172,9 @@ def test_the_advised_saturation_flags_as_many_stars_as_it_says(sky, tmp_path):
     over = np.maximum(sky.pixels - level, 0.0)
     plate = np.minimum(sky.pixels, level) + 0.01 * level * (1 - np.exp(-over / level))
     x, y = np.rint(sky.position[sky.snr < 10][:3]).astype(int).T
-    # A neighbour that is saturated, 7 px away: a Gaussian that is cut off at the plate's maximum.
-    axis = np.arange(-4, 5)
-    flat = np.minimum(1.0, 3.0 * np.exp(-(axis[:, None] ** 2 + axis**2) / 4.0)) * plate.max()
-    for row, column in zip(y, x + 7, strict=True):
-        patch = np.s_[row - 4 : row + 5, column - 4 : column + 5]
-        plate[patch] = np.maximum(plate[patch], flat)
+    # A neighbour that is saturated; one pixel alone would be a hot one.
+    for row, column in np.ndindex(3, 3):
+        plate[y + row - 1, x + column + 6] = plate.max()
     path, candidates = collected(plate, sky, tmp_path)
     advice = re.search(r"(\d+) stamps have .*--saturate (\S+) ", saturation_advice(candidates))
     count, saturation = int(advice[1]), float(advice[2])

@@ -278,7 +278,7 @@ def bundle_of(
     held_out = facts.held_out
     unpacked = type(fitted).unpack(made.weights, made.info)  # what it errs as packed
     made, errors = calibrated(made, unpacked, held_out, config.seed)
-    if of_image(stars):
+    if of_image(stars) and made.strange_limit is not None:
         train = np.unique(stars["field_index"][split_stars(stars, trained["split"], config).train])
         made = with_training_stars(made, BrightStars.of_product(stars).of(train))
     test = split_stars(stars, trained["split"], config).test
