@@ -561,6 +561,8 @@ class Engine:
         chi2 = _chi2(residual, psf, doubt, found.noise, stars.gain)
         raise_flag(flags, StarFlag.POOR_FIT, chi2 > MOST_CHI2)
         photons = np.nan_to_num(np.maximum(found.flux, 0.0) / stars.gain)
+        if restored.of_star:  # whose errors have the photons
+            photons[:] = 0.0
         flux_error = np.sqrt((of_flux * found.flux_error) ** 2 + photons)
         return Prediction(
             psf=psf,
@@ -655,9 +657,11 @@ class Engine:
             exact,
             flux=stars.flux,
             sky=stars.background - start,
+            gain=stars.gain,
         )
         own = estimate.measured
         assert own is not None and estimate.sigma is not None
+        own = replace(own, covariance=self._with_model_errors(own.covariance, own.flux))
         error = np.sqrt(own.covariance[:, 0, 0])
         flux = np.where(given, stars.flux, own.flux)
         lost = nothing | np.where(given, unseen, ~(flux > error))
@@ -686,6 +690,21 @@ class Engine:
             score[~lost] = estimate.outlier_score[~lost]
         of_star = {k: np.where(lost, np.nan, v) for k, v in measured.items()}
         return Restored(estimate.psf, estimate.sigma, better, lost, score, of_star)
+
+    def _with_model_errors(self, covariance: np.ndarray, flux: np.ndarray) -> np.ndarray:
+        """Covariances (n, 4, 4) of flux, sky, row and column with the errors of the model itself.
+
+        A number that is known, whose variance is almost 0, stays so.
+        """
+        errors = self.bundle.model_errors
+        unit = np.maximum(flux, 0.0)[:, None]
+        more = np.concatenate(
+            [unit * [errors.flux, errors.sky], np.full((len(flux), 2), errors.centre)], axis=1
+        )
+        variance = np.maximum(np.einsum("nii->ni", covariance), 0.0)
+        least = np.concatenate([unit * 1e-5, unit * 1e-12, np.full((len(flux), 2), 1e-9)], axis=1)
+        more[np.sqrt(variance) < least] = 0.0
+        return np.asarray(covariance + more[:, :, None] ** 2 * np.eye(4))
 
     def _estimated(self, seen: Sequence[Seen]) -> list[Restored]:
         """With fluxes and sky that the method found first, if it can where both are unknown.
