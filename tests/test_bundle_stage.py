@@ -77,6 +77,7 @@ def write_stars(path, config):
         "snr": Column(np.full(25, 250.0), "1", "of stars of an image"),
         "flux": Column(np.full(25, 1e4), "count", "of stars of an image"),
         "colour": Column(np.full(25, np.nan), "mag", "of stars of an image"),
+        "wide": Column(np.zeros((25, 32, 32)), "1", "of stars of an image"),
     }
     write_product(path, "stars", columns, config)
     return path

@@ -222,12 +222,12 @@ class FieldMixture(FieldLaw, Method):
         images /= images.sum(axis=(1, 2), keepdims=True)
         # The residual e ~ N(offset, C) at the phase of the centre: modes and diagonal.
         phases = phases_of(self.step_px)
-        for image, place in zip(images, centre, strict=True):
-            phase, window = phase_of(place, phases, self.side)
+        for number in range(count):
+            phase, window = phase_of(centre[number], phases, self.side)
             modes, variance = self.modes[phase][:, window], self.diagonal[phase, window]
             residual = self.offset[phase, window] + rng.normal(size=len(modes)) @ modes
             residual = residual + rng.normal(size=len(window)) * np.sqrt(variance)
-            image += residual.reshape(image.shape)
+            images[number] += residual.reshape(self.side, self.side)
         # Light that looks like sky.
         images += self.unknown_light * rng.normal(size=(count, 1, 1)) / images[0].size
         images /= images.sum(axis=(1, 2), keepdims=True)

@@ -98,11 +98,11 @@ class HeldOutStars:
 
     @classmethod
     def of(
-        cls, stars: Product, reference: str, noise: NoiseModel, train: np.ndarray, test: np.ndarray
+        cls, stars: Product, reference: str, noise: NoiseModel, test: np.ndarray
     ) -> HeldOutStars:
-        """Some stars of a product "stars", by their indices and those of the training stars."""
+        """Some stars of a product "stars", by their indices."""
         truth = stars[reference]
-        doubts = own_noise(stars, truth, train, noise.background)
+        doubts = own_noise(stars, truth, noise.background)
         arrays = (stars["realisation"], truth, field_positions(stars), *doubts)
         images, references, position, *of_test = (array[test] for array in arrays)
         return cls(images, references, noise, position, *of_test)
@@ -205,7 +205,7 @@ class StarFacts:
             "training_stars": _trained_on(stars, parts.train),
             "config": {"stars": stars.config, "train": dict(trained)},
         }
-        held_out = HeldOutStars.of(stars, reference, noise, parts.train, parts.test)
+        held_out = HeldOutStars.of(stars, reference, noise, parts.test)
         model = leading(FluxModel.fit(images[parts.train]), COMPONENTS)
         return cls(info, model, held_out, levels, config.seed)
 
@@ -473,9 +473,9 @@ def with_scales(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -
 
 
 def with_model_errors(bundle: Bundle, fitted: Method, seed: int) -> Bundle:
-    """The bundle with the errors of measured stars that are its model's, if its method draws stars.
+    """The bundle with the errors of measured stars that its model makes, if its method draws stars.
 
-    Stars that are drawn by what the fit leaves open, with hardly any noise, are measured; what their
+    Stars that are drawn by what the fit leaves open are measured with hardly any noise; what their
     stated errors lack is the model's.
     """
     if not isinstance(fitted, DrawsStars):
@@ -496,7 +496,9 @@ def with_model_errors(bundle: Bundle, fitted: Method, seed: int) -> Bundle:
         return float(np.median(stated) * np.sqrt(max(scale**2 - 1.0, 0.0)))
 
     flux = lacking((found.flux - 1.0)[usable], found.flux_error[usable])
+    # Light that a stamp of a bright star has more than its model is sky to one, flux to the other.
     sky = lacking(found.background[usable], found.background_error[usable])
+    sky = max(sky, flux / images[0].size)
     off = np.concatenate([found.y_fit - centre[:, 0], found.x_fit - centre[:, 1]])
     stated = np.concatenate([found.y_error, found.x_error])
     both = np.concatenate([usable, usable])

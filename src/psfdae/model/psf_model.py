@@ -572,8 +572,7 @@ class Engine:
             ratio95_bright=ratios[:, 1],
             flux=found.flux,
             flux_error=flux_error,
-            **self._total(stars, found.flux, flux_error),
-            background=found.background,
+            **self._with_wings(stars, found, flux_error),
             noise=found.noise,
             snr=snr,
             chi2=chi2,
@@ -588,16 +587,26 @@ class Engine:
             **(restored.of_star or unmeasured(len(stars))),
         )
 
-    def _total(self, stars: Stamps, flux: np.ndarray, error: np.ndarray) -> dict[str, np.ndarray]:
-        """Columns of fluxes with the light beyond the stamps."""
+    def _with_wings(
+        self, stars: Stamps, found: Photometry, error: np.ndarray
+    ) -> dict[str, np.ndarray]:
+        """Columns of fluxes with the light beyond the stamps, and of the sky without that in them.
+
+        `error` (n,) is that of the fluxes.
+        """
+        flux, sky = found.flux, found.background
         if self.wings is None or not isinstance(self.estimator, KnowsField):
             unknown = np.full(len(flux), np.nan)
-            return {"flux_total": unknown, "flux_total_error": unknown}
+            return {"flux_total": unknown, "flux_total_error": unknown, "background": sky}
         place = np.stack([stars.x, stars.y], axis=1)
         total, doubt = self.wings.total(outer_light(self.estimator.psf_at, place))
         # An error of a flux that was given is not known.
         own = np.hypot(error * total, flux * doubt)
-        return {"flux_total": flux * total, "flux_total_error": own}
+        # Wings go on evenly inside the stamp, where a star on an unknown sky has them in its sky.
+        scale = (total - 1.0) / self.wings.light()[0]
+        even = np.nan_to_num(np.maximum(flux, 0.0) * scale * self.wings.profile[0])
+        sky = np.where(np.isnan(stars.background), sky - even, sky)
+        return {"flux_total": flux * total, "flux_total_error": own, "background": sky}
 
     def _doubts(
         self, psf: np.ndarray, sigma: np.ndarray | None, noise: np.ndarray, stars: Stamps
