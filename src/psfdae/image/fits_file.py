@@ -428,8 +428,6 @@ def science_images(path: Path) -> dict[str, int]:
     with reading(path), open_hdus(plain_file(path)) as hdus:
         found = {k: hdu.name for k, hdu in enumerate(hdus) if _has_pixels(hdu)}
     found = {k: name for k, name in found.items() if _is_science(name)}
-    # Beside the science images of a pipeline, other layers are none.
-    found = {k: name for k, name in found.items() if name.upper() == SCIENCE[0]} or found
     if not found:
         raise ObservationError(path, "no image")
     names = list(found.values())

@@ -81,7 +81,7 @@ def exposure(model: PsfModel, source: Source, name: str) -> tuple[PsfModel, str]
     )
     made = _adapted(model, field, observation, bright, name)
     said = f"{said} ({other})" if other else said
-    return made, "\n".join([said, *observation.remarks, *filter(None, [off])])
+    return made, "\n".join([*observation.remarks, *filter(None, [off]), said])
 
 
 def for_exposures(model: PsfModel, stars: Stars) -> dict[str, PsfModel]:
