@@ -62,6 +62,7 @@ def write_stars(path, config):
     measured = {"noise": 1e-3, "snr": 250.0, "flux": 1e4, "colour": np.nan}
     arrays |= {"position": 100.0 * grid}
     arrays |= {name: np.full(25, value) for name, value in measured.items()}
+    arrays["wide"] = np.zeros((25, 32, 32))
     columns = {name: Column(array, "1", "of stars") for name, array in arrays.items()}
     write_product(path, "stars", columns, config)
     return path

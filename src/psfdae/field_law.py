@@ -280,6 +280,7 @@ class Asked(NamedTuple):
     centre: np.ndarray | None  # (n, 2), if it is known
     flux: np.ndarray  # (n,), NaN where to be found
     sky: np.ndarray  # (n,) of bool: the sky is off
+    per_photon: np.ndarray  # (n,), unit of the images for an electron; 0 where unknown
 
     def of(self, chosen: np.ndarray | slice) -> Asked:
         """A part of these stars, by indices or a mask."""
@@ -409,8 +410,7 @@ class FieldLaw:
             def lit(rows: np.ndarray, mean: np.ndarray = mean, flux: float = flux) -> np.ndarray:
                 return np.asarray((rows - rows.sum(axis=-1, keepdims=True) * mean) / flux)
 
-            whole, phase = _split(place, phases)
-            window = _window(self.side, whole)
+            phase, window = phase_of(place, phases, self.side)
             residuals = np.vstack([self.offset[phase, window], self.modes[phase][:, window]])
             residuals = lit(residuals.astype(np.float64))
             nodes.append(
@@ -547,6 +547,7 @@ class FieldLaw:
             used = part > 0
             pairs, part, fit = pairs.of(used), part[used], fit.of(used)
         values, covariance, outlying, psf, sigma = self._summed(stars, pairs, part, fit, flux)
+        covariance += self._photon_covariance(stars, pairs, part, flux, precision)
         evidence -= stars.images.shape[1] * np.log(np.sqrt(2 * np.pi) * flux)
         unit = np.stack([flux, flux, *np.ones((2, len(flux)))], axis=1)
         found = np.hstack([evidence[:, None], values * unit, outlying[:, None], psf, sigma])
@@ -586,6 +587,49 @@ class FieldLaw:
         # What was found before says nothing new: it is no part of the error.
         variance = 1.0 / np.where(prior > FLUX_SIGMA**-2.0, information, means)
         return Fit(log, 1.0 + off / information, variance, certain, left, pull)
+
+    def _photon_covariance(
+        self,
+        stars: Asked,
+        pairs: Pairs,
+        weight: np.ndarray,
+        unit: np.ndarray,
+        precision: np.ndarray,
+    ) -> np.ndarray:
+        """What photons add to the covariance (n, 4, 4) of flux, sky, row and column.
+
+        In the likelihood, a star's photons are spread evenly over its stamp; they are where its
+        light is. The errors of an estimate W x, W = (J N⁻¹ Jᵀ)⁻¹ J N⁻¹ with N = C + s, have
+        W (V − s) Wᵀ more if the variance of the noise is V.
+        """
+        count, pixels = stars.images.shape
+        found = np.zeros((count, 4, 4))
+        # One node of each star is enough: that of the largest weight.
+        order = np.lexsort((-weight, pairs.star))
+        best = np.zeros(len(weight), dtype=bool)
+        best[order[np.unique(pairs.star[order], return_index=True)[1]]] = True
+        best &= (stars.per_photon > 0)[pairs.star]
+        if not best.any():
+            return found
+        # A number that is known has a prior that no data move.
+        precision = np.where(precision > FLUX_SIGMA**-2.0, precision, 0.0)
+        known = np.column_stack([precision, np.where(self._width(stars) > 0, 0.0, 1e30)])
+        for k, rows in pairs.of(best).by_node():
+            star = pairs.star[best][rows]
+            axes, s = self._axes(k, stars.positioned), np.square(stars.noise / unit)[star, None]
+            mean, inverse = self._mean(k, stars, star), axes.inverse(s)[:, None]
+            # J: the change of the image with flux, sky, row and column; J N⁻¹.
+            change = np.empty((len(star), 4, pixels))
+            change[:, 0], change[:, 1:] = mean, axes.basis[:3]
+            along = (change @ axes.basis[3:].T) * (inverse[..., :-1] - inverse[..., -1:])
+            weighted = inverse[..., -1:] * change + along @ axes.basis[3:]
+            information = weighted @ change.transpose(0, 2, 1) + known[star, :, None] * np.eye(4)
+            influence = np.linalg.solve(information, weighted)
+            # V − s of a star of flux F in units of F²: g (m − mean of m) / F.
+            more = (mean - mean.mean(axis=1, keepdims=True)) / unit[star, None]
+            more *= stars.per_photon[star, None]
+            found[star] = (influence * more[:, None]) @ influence.transpose(0, 2, 1)
+        return found
 
     def _summed(
         self, stars: Asked, pairs: Pairs, weight: np.ndarray, fit: Fit, unit: np.ndarray
@@ -684,6 +728,12 @@ def phases_of(step: float) -> np.ndarray:
     """Parts of a pixel at which nodes lie."""
     place = step * np.arange(-round(MARGIN_PX / step), round(MARGIN_PX / step) + 1)
     return np.unique(np.round(place - np.floor(place + 0.5), 9))
+
+
+def phase_of(place: np.ndarray, phases: np.ndarray, side: int) -> tuple[int, np.ndarray]:
+    """Number of the phase nearest to a centre (row, column), and its stamp's pixels in a frame."""
+    whole, phase = _split(place, phases)
+    return phase, _window(side, whole)
 
 
 def _split(place: np.ndarray, phases: np.ndarray) -> tuple[np.ndarray, int]:

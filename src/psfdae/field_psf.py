@@ -17,7 +17,7 @@ terms, and so are those of the colour, if they predict stars that were left out 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from math import isqrt
 from typing import NamedTuple
@@ -129,6 +129,16 @@ class FieldFit(NamedTuple):
     centre: np.ndarray  # (n, 2), (row, column) from index s//2
     good: np.ndarray  # (n,) of bool
     residual: np.ndarray  # (n, s, s), of flux 1; 0 where not seen
+    redrawn: Sequence[FieldModel] = ()  # what the same stars give with other noise
+    unknown_light: float = 0.0  # in stamps, over the flux: scatter of what is taken for sky
+
+
+class LeftOut(NamedTuple):
+    """Stars that were left out of a fit, with flux, sky and centre fitted to them."""
+
+    light: np.ndarray  # (2, n), what looks like sky in their stamps, over the flux, and its σ
+    residual: np.ndarray  # (n, d, d), of flux 1
+    seen: np.ndarray  # (n, d, d), 1 in pixels that count, else 0
 
 
 def fit_field(
@@ -139,6 +149,7 @@ def fit_field(
     orders: Sequence[int],
     spacing: float,
     smoothness: float,
+    rng: np.random.Generator | None = None,
 ) -> FieldFit:
     """Fit orders of the polynomial, ascending, and then stronger smoothing, as long as it pays.
 
@@ -159,11 +170,16 @@ def fit_field(
         Of the knots, in pixels.
     smoothness : float
         Least weight of the squared second differences of the coefficients, 1/flux².
+    rng : Generator, optional
+        Source of the noise with which the fit is repeated for `FieldFit.redrawn`; without it the
+        errors of the field are not measured.
     """
     alternating = _Alternating(stars, background, frame_px, stamp_px, spacing, smoothness)
     tried = _supported(orders, stars)
-    if len(orders) == 1 or len(stars) < 3:  # of two stars, none can be left out
+    if len(stars) < 3:  # none can be left out
         return alternating.fit(tried[0])
+    if len(orders) == 1:
+        return alternating.with_errors(alternating.fit(tried[0]), rng)
     alternating.tolerance, best, least = TRIED_TOLERANCE, 0, np.inf
     for order in tried:
         error = alternating.crossed_error(alternating.fit(order))
@@ -188,7 +204,7 @@ def fit_field(
             break
         least = error
     alternating.tolerance = TOLERANCE
-    return alternating.fit(best)
+    return alternating.with_errors(alternating.fit(best), rng)
 
 
 def _supported(orders: Sequence[int], stars: BrightStars) -> list[int]:
@@ -241,6 +257,7 @@ class _Alternating:
     ) -> None:
         self.prior = prior
         self.images, self.seen = stars.framed(side)
+        self.around_px = max(stars.wide[0].size - stamp_px**2, 1)  # of which the sky is the median
         self.noise, self.place = stars.noise, stars.place
         self.photons = np.sqrt(background) / stars.noise  # per unit of flux
         self.stamp_px, self.spacing, self.smoothness = stamp_px, spacing, smoothness
@@ -301,15 +318,51 @@ class _Alternating:
         model = FieldModel(found, low, high, self.spacing)
         return FieldFit(model, flux, centre, good, residual)
 
+    def with_errors(self, fit: FieldFit, rng: np.random.Generator | None) -> FieldFit:
+        """The fit with what its stars say of the errors of its model.
+
+        Four other fits, to noise-free stars of the model with new noise, scatter as much as the
+        field is uncertain (parametric bootstrap: Efron & Tibshirani 1993, An Introduction to the
+        Bootstrap, ch. 6.5). Light that the model does not know is the sky that stars which were
+        left out seem to have.
+        """
+        if rng is None:
+            return fit
+        light = np.concatenate([part.light for part in self._left_out(fit)], axis=1)
+        # Noise-free images F m of the stars, and the variance of their pixels: sky and photons.
+        stars = fit.model.images(fit.model.terms(self.place), fit.centre, len(self.axis))
+        stars = stars * fit.flux[:, None, None]
+        variance = np.maximum(stars, 0.0) / self.photons[:, None, None]
+        sigma = np.sqrt(variance + self.noise[:, None, None] ** 2)
+        images, tolerance, models = self.images, self.tolerance, []
+        self.tolerance = TRIED_TOLERANCE
+        for _ in range(4):
+            self.images = np.where(self.seen, stars + sigma * rng.normal(size=stars.shape), 0.0)
+            models.append(self.fit(fit.model.order).model)
+        self.images, self.tolerance = images, tolerance
+        unknown = excess_scatter(*light)
+        return fit._replace(redrawn=tuple(models), unknown_light=unknown)
+
     def crossed_error(self, fit: FieldFit) -> float:
         """Geometric mean of the squared errors of stars that were left out, fold by fold.
 
-        Flux, sky and centre of these are fitted to them. Of many stars, some folds are enough.
+        Flux, sky and centre of these are fitted to them.
+        """
+        errors = [
+            np.log((part.residual**2 * part.seen).sum(axis=(1, 2)) / part.seen.sum(axis=(1, 2)))
+            for part in self._left_out(fit)
+        ]
+        return float(np.exp(np.concatenate(errors).mean()))
+
+    def _left_out(self, fit: FieldFit) -> Iterator[LeftOut]:
+        """Stars of one fold after the other, as the others predict them; some folds of many stars.
+
+        Splines are fitted without them, to the fluxes and centres of the fit.
         """
         terms = fit.model.terms(self.place)
         data = self.images / fit.flux[:, None, None]
-        weight = self._weight(fit.flux)
-        fold, errors = np.arange(len(terms)) % FOLDS, []
+        weight, noise = self._weight(fit.flux), self._variance(fit.flux)
+        fold, judged_stars = np.arange(len(terms)) % FOLDS, 0
         inner = self.inner
         box = np.ix_(range(len(terms)), inner, inner)
         for left_out in range(FOLDS):
@@ -320,25 +373,35 @@ class _Alternating:
                 continue
             images, even = data[box][judged], self.seen[box][judged].astype(float)
             splines = np.tensordot(terms[judged], found, 1)
-            _, _, left = _adjusted(
-                *(splines, images, even, fit.centre[judged]),
-                *(self.axis[inner], self.spacing, LEFT_OUT_STEPS),
-                sky=True,
-            )
-            errors.append(np.log((left**2 * even).sum(axis=(1, 2)) / even.sum(axis=(1, 2))))
-            if sum(map(len, errors)) >= ENOUGH_STARS:
+            parts = splines, images, even, fit.centre[judged], self.axis[inner], self.spacing
+            flux, centre, left = _adjusted(*parts, LEFT_OUT_STEPS, sky=True)
+            # The sky b of weighted least squares with the design D of flux, row, column and sky is
+            # W x with W = (Dᵀ w D)⁻¹ Dᵀ w. Its error has the noise of the pixels, and that of the
+            # median around the star which was subtracted from them.
+            design = _design(splines, centre, self.axis[inner], self.spacing, sky=True)
+            turned = (design * weight[box][judged].reshape(len(judged), -1, 1)).transpose(0, 2, 1)
+            influence = np.linalg.solve(turned @ design, turned)[:, 3]
+            level = (influence * images.reshape(len(judged), -1)).sum(axis=1)
+            variance = (influence**2 * noise[box][judged].reshape(len(judged), -1)).sum(axis=1)
+            variance += np.pi / 2 * (self.noise / fit.flux)[judged] ** 2 / self.around_px
+            light = inner.sum() ** 2 / flux * [level, np.sqrt(variance)]
+            yield LeftOut(light, left, even)
+            judged_stars += len(judged)
+            if judged_stars >= ENOUGH_STARS:
                 break
-        return float(np.exp(np.concatenate(errors).mean()))
 
     def _weight(self, flux: np.ndarray) -> np.ndarray:
-        """1/variance of the pixels of flux 1; 0 where not seen."""
+        """1/variance of the pixels of flux 1, with errors of the model; 0 where not seen."""
+        light = np.maximum(self.images / flux[:, None, None], 0.0)
+        variance = self._variance(flux) + (MODEL_ERROR * light) ** 2 + LEAST_ERROR**2
+        return np.where(self.seen, 1.0 / variance, 0.0)
+
+    def _variance(self, flux: np.ndarray) -> np.ndarray:
+        """Variance of the pixels of flux 1 by the sky and the star's photons."""
         factor = 1.0 / flux[:, None, None]
         light = np.maximum(self.images * factor, 0.0)
         noise, photons = (a[:, None, None] for a in (self.noise, self.photons))
-        variance = (noise * factor) ** 2 + light * factor / photons
-        return np.where(
-            self.seen, 1.0 / (variance + (MODEL_ERROR * light) ** 2 + LEAST_ERROR**2), 0.0
-        )
+        return np.asarray((noise * factor) ** 2 + light * factor / photons)
 
     def _deformed(
         self,
@@ -503,18 +566,44 @@ def _adjusted(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Flux, centre (n, 2) and, if asked for, sky of stars, and residuals over the flux."""
 
-    def draw(place: np.ndarray) -> np.ndarray:
-        return _drawn(splines, axis, place, spacing)
-
     count, flat = len(data), data.reshape(len(data), -1, 1)
     for _ in range(steps):
-        parts = [draw(centre), *slopes(draw, centre)]
-        parts += [np.ones_like(data)] * sky
-        design = np.stack(parts, axis=-1).reshape(count, -1, len(parts))
+        design = _design(splines, centre, axis, spacing, sky)
         left = (design * weight.reshape(count, -1, 1)).transpose(0, 2, 1)
         found = np.linalg.solve(left @ design, left @ flat)[..., 0]
         flux = found[:, 0]
         move = np.clip(found[:, 1:3] / flux[:, None], -LARGEST_STEP_PX, LARGEST_STEP_PX)
         centre = np.clip(centre + move, -FARTHEST_PX, FARTHEST_PX)
     level = found[:, 3, None, None] if sky else 0.0
-    return flux, centre, (data - level) / flux[:, None, None] - draw(centre)
+    drawn = _drawn(splines, axis, centre, spacing)
+    return flux, centre, (data - level) / flux[:, None, None] - drawn
+
+
+def _design(
+    splines: np.ndarray, centre: np.ndarray, axis: np.ndarray, spacing: float, sky: bool
+) -> np.ndarray:
+    """Change of images (n, P, 3 or 4) with flux, row, column of the centre and, if asked, sky."""
+
+    def draw(place: np.ndarray) -> np.ndarray:
+        return _drawn(splines, axis, place, spacing)
+
+    parts = [draw(centre), *slopes(draw, centre)]
+    parts += [np.ones_like(parts[0])] * sky
+    return np.stack(parts, axis=-1).reshape(len(centre), -1, len(parts))
+
+
+def excess_scatter(values: np.ndarray, sigma: np.ndarray) -> float:
+    """Scatter τ of values (n,) about 0 beyond their errors σ (n,), the likeliest one.
+
+    Σ (e²/(σ² + τ²) − 1) / (σ² + τ²) = 0 with e² ≤ 9 (σ² + τ²), for outliers; 0 of fewer than five.
+    """
+    from scipy.optimize import brentq
+
+    def slope(scatter: float) -> float:
+        total = sigma**2 + scatter**2
+        return float(((np.minimum(values**2 / total, 9.0) - 1.0) / total).sum())
+
+    if len(values) < 5 or slope(0.0) <= 0:
+        return 0.0
+    most = 3.0 * float(np.abs(values).max())
+    return float(brentq(slope, 0.0, most))

@@ -283,8 +283,19 @@ class MeasuresStars(Protocol):
         fixed: bool | np.ndarray = False,
         flux: np.ndarray | None = None,
         sky: np.ndarray | None = None,
+        gain: np.ndarray | None = None,
     ) -> Estimate:
         """From stamps in any unit; see `psfdae.methods.field.FieldMixture.measure`."""
+
+
+@runtime_checkable
+class DrawsStars(Protocol):
+    """Draws stars as they may be, by all that a fit leaves open."""
+
+    def draw_stars(
+        self, count: int, rng: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Noise-free stars; see `psfdae.methods.field.FieldMixture.draw_stars`."""
 
 
 @runtime_checkable

@@ -17,6 +17,7 @@ from psfdae.files import atomic_path, check_outputs, write_fits
 from psfdae.image.catalogue import as_catalogue
 from psfdae.image.errors import ascii_line
 from psfdae.image.observation import list_offset
+from psfdae.image.stamps import StarFlag, raise_flag
 from psfdae.model.exchange import load_field
 from psfdae.options import File
 
@@ -99,7 +100,9 @@ def photometry(
         from astropy.io import fits
 
         write_fits(residual, fits.PrimaryHDU(found.residual.astype(np.float32)))
-    print(*filter(None, [observation.said(), offset, _summary(found, out)]), sep="\n")
+    print(
+        *filter(None, [observation.said(), offset, _summary(found, out, stated.detect)]), sep="\n"
+    )
 
 
 def _of_all_rows(
@@ -111,7 +114,7 @@ def _of_all_rows(
     unusable = observation.without_position() | observation.listed_again()
     found = measured(observation.of(~unusable) if unusable.any() else observation)
     if unusable.any():
-        found = replace(found, stars=_with_rows(found.stars, observation.positions, unusable))
+        found = replace(found, stars=_with_rows(found.stars, observation, unusable))
     if observation.catalogue is None or len(found.stars) != observation.count:
         return found, None
     # The stars are fitted where they are, whatever the list says.
@@ -119,21 +122,21 @@ def _of_all_rows(
     return found, list_offset(observation.catalogue, fitted - observation.positions, accept=True)
 
 
-def _with_rows(stars: Table, positions: np.ndarray | None, unusable: np.ndarray) -> Table:
+def _with_rows(stars: Table, observation: Observation, unusable: np.ndarray) -> Table:
     """Return a row for every star of the list; those that were not measured have NaN and flags.
 
     Parameters
     ----------
     stars : Table
         A row for each star that was measured, in the order of the list.
-    positions : ndarray, shape (n, 2)
-        All positions of the list, x and y.
+    observation : Observation
+        All stars of the list.
     unusable : ndarray of bool, shape (n,)
         Rows that were not measured.
     """
     from astropy.table import Table
 
-    assert positions is not None
+    assert observation.positions is not None
     rows = Table()
     for name in stars.colnames:
         measured = np.array(stars[name])
@@ -142,12 +145,10 @@ def _with_rows(stars: Table, positions: np.ndarray | None, unusable: np.ndarray)
             column[:] = np.nan
         column[~unusable] = measured
         rows[name] = column
-    rows["id"] = np.arange(1, len(rows) + 1)
-    rows["x"][unusable], rows["y"][unusable] = positions[unusable].T
-    # As photutils flags them: no position; no flux.
-    no_position = unusable & ~np.isfinite(positions).all(axis=1)
-    rows["flags"][unusable] = 1024
-    rows["flags"][no_position] += 512
+    rows["id"] = observation.identifiers
+    rows["x"][unusable], rows["y"][unusable] = observation.positions[unusable].T
+    rows["flags"] |= observation.list_flags
+    raise_flag(rows["flags"], StarFlag.NO_FLUX, unusable)
     return rows
 
 
@@ -178,7 +179,7 @@ def _zero_point(
 
 
 def _complete(found: CrowdedPhotometry, observation: Observation, zero_point: float | None) -> None:
-    """Columns that take a zero point, or a WCS."""
+    """Columns that take a zero point, or a WCS; and units."""
     stars = found.stars
     with np.errstate(all="ignore"):
         if zero_point is not None:
@@ -188,6 +189,21 @@ def _complete(found: CrowdedPhotometry, observation: Observation, zero_point: fl
         sky = observation.on_sky(np.array(stars["x"]), np.array(stars["y"]))
     if sky is not None:
         stars["ra"], stars["dec"] = sky
+    units = dict.fromkeys(("x", "y", "x_error", "y_error"), "pix")
+    units |= dict.fromkeys(("flux", "flux_error", "flux_model"), _unit(observation.unit))
+    units |= {"mag": "mag", "mag_error": "mag", "ra": "deg", "dec": "deg"}
+    for name in stars.colnames:
+        stars[name].unit = units.get(name)
+
+
+def _unit(said: str) -> str:
+    """The unit of an image, if it is one of the FITS standard, else counts."""
+    from astropy.units import Unit
+
+    try:
+        return Unit(said, format="fits").to_string("fits") if said else "adu"
+    except (ValueError, TypeError):
+        return "adu"
 
 
 def _said(found: CrowdedPhotometry, image: Path, zero_point: float | None) -> dict[str, Any]:
@@ -202,7 +218,7 @@ def _said(found: CrowdedPhotometry, image: Path, zero_point: float | None) -> di
     }
 
 
-def _summary(found: CrowdedPhotometry, out: Path) -> str:
+def _summary(found: CrowdedPhotometry, out: Path, detected: bool) -> str:
     from psfdae.model.crowded import LARGEST_GROUP
 
     count, measured = len(found.stars), int(np.isfinite(found.stars["flux"]).sum())
@@ -216,4 +232,10 @@ def _summary(found: CrowdedPhotometry, out: Path) -> str:
     said = f"{out}: {count} stars, {measured} measured"
     if parted := int(np.sum(found.stars["parted"])):
         said += f", {parted} of them in groups of over {LARGEST_GROUP}, which were parted"
+    if detected:
+        # Selection by brightness: Eddington (1913, MNRAS 73, 359).
+        beyond += (
+            "\nof stars near the detection threshold, those are found that noise makes brighter: "
+            "fluxes below 7 sigma are too large by a third, up to 14 sigma by 4 % in the mean"
+        )
     return f"{said}\n{beyond}"

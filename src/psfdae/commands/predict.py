@@ -19,7 +19,7 @@ from psfdae.files import atomic_path, check_outputs, interrupted
 from psfdae.image.fits_file import Card
 from psfdae.image.observation import Observation, Source, list_offset
 from psfdae.image.stamps import Stamps, StarFlag
-from psfdae.method import MeasuresStars
+from psfdae.method import KnowsField, MeasuresStars
 from psfdae.model.bundle import SUFFIX
 from psfdae.model.field_psfs import PredictionError
 from psfdae.model.prediction import Prediction, prediction_file
@@ -228,7 +228,13 @@ def restored(
     clean_of = f"{out}: {observation.count} stars, {clean} without a flag{flags}"
     other = loaded.other_instrument(observation.instrument, observation.colour_column)
     unlike = f"{source.path}: {other}" if other else None
-    return "\n".join(line for line in (observation.said(), off, unlike, clean_of) if line)
+    alone = None
+    if observation.shape and isinstance(loaded.engine.estimator, KnowsField) and not loaded.wings:
+        alone = (
+            "flux_total is NaN: no bright star of the training showed light beyond its stamp of "
+            f"{loaded.stamp_px} px; flux is the light in the stamp"
+        )
+    return "\n".join(line for line in (observation.said(), off, unlike, alone, clean_of) if line)
 
 
 def check_targets(out: Path, plot: Path | None, found: Path | None, overwrite: bool) -> None:

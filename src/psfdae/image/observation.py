@@ -838,6 +838,21 @@ class Observation:
             return np.zeros(self.count, dtype=bool)
         return listed_again(self.positions)
 
+    @property
+    def identifiers(self) -> np.ndarray:
+        """Names of the stars, by the list if it says any, shape (n,)."""
+        return self._columns[0]
+
+    @property
+    def list_flags(self) -> np.ndarray:
+        """`StarFlag`s of the stars by the list, shape (n,), uint16."""
+        return self._columns[-1]
+
+    @property
+    def unit(self) -> str:
+        """Unit of the image's pixels by its header; "" where that says none."""
+        return self._layers.image.unit
+
     def of(self, selected: np.ndarray) -> Observation:
         """The same with some of the stars of the list, by a bool for each, shape (n,)."""
         assert self.positions is not None

@@ -6,7 +6,7 @@ applied to stamps.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self
 
@@ -14,8 +14,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from psfdae.bright_stars import BrightStars
-from psfdae.field_law import MARGIN_PX, Asked, FieldLaw, FieldSettings, parts_of, phases_of, step_of
-from psfdae.field_psf import FieldFit, fit_field, refit_field
+from psfdae.field_law import (
+    MARGIN_PX,
+    Asked,
+    FieldLaw,
+    FieldSettings,
+    parts_of,
+    phase_of,
+    phases_of,
+    step_of,
+)
+from psfdae.field_psf import FieldFit, FieldModel, fit_field, refit_field
 from psfdae.method import (
     Estimate,
     FitError,
@@ -29,6 +38,7 @@ from psfdae.method import (
 )
 from psfdae.moments import measure_shapes, moving_matrices, robust_scatter
 from psfdae.noise import NoiseModel
+from psfdae.rng import stream
 
 OWN_NOISE = 0.5
 """Part of the variance of bright stars' own noise that is left when splines have moved them."""
@@ -51,7 +61,19 @@ PACKED_BYTES = 3e6
 
 @dataclass(frozen=True, eq=False)
 class FieldMixture(FieldLaw, Method):
-    """A fitted field with the residuals of its stars."""
+    """A fitted field with the residuals of its stars.
+
+    Attributes
+    ----------
+    redrawn : sequence of FieldModel
+        Fields that the training stars give with other noise; none of a fit that was stored.
+    unknown_light : float
+        Scatter of the light in the stamps of stars that the field takes for sky, over the flux; 0
+        of a fit that was stored.
+    """
+
+    redrawn: Sequence[FieldModel] = ()
+    unknown_light: float = 0.0
 
     look = Look("field", "#117733", "D")
     needs = Needs(level=True, position=True)
@@ -85,7 +107,8 @@ class FieldMixture(FieldLaw, Method):
             raise FitError("it learns from the bright stars of an image: psfdae from-stars")
         bright, side = data.bright.of(np.unique(data.star[data.train])), data.images.shape[-1]
         sizes, splines = (side + 2 * MARGIN_PX, side), (field.spacing_px, field.smoothness)
-        fit = fit_field(bright, data.noise.background, *sizes, field.orders, *splines)
+        rng = stream(data.seed, "noise", "field")
+        fit = fit_field(bright, data.noise.background, *sizes, field.orders, *splines, rng)
         used = bright.of(fit.good)
         terms = fit.model.terms(used.place)
         usual = fit.model.images(terms.mean(axis=0)[None], np.zeros((1, 2)), side)
@@ -103,6 +126,8 @@ class FieldMixture(FieldLaw, Method):
             listed=_list_error((fit.centre + bright.peak - bright.listed)[fit.good]),
             noise=data.noise,
             settings=field,
+            redrawn=fit.redrawn,
+            unknown_light=fit.unknown_light,
         )
 
     def of_exposure(self, bright: BrightStars, background: float) -> Self:
@@ -165,6 +190,48 @@ class FieldMixture(FieldLaw, Method):
         yield "offset", "numbers from -1 to 1", abs(self.offset) <= 1
         yield "diagonal", "numbers from 0 to 1", (self.diagonal > 0) & (self.diagonal < 1)
         yield "listed", "an error above 0, if any", self.listed[1:] > 0
+
+    def draw_stars(
+        self, count: int, rng: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Draw noise-free stars of flux 1 at random places of the field and of a pixel.
+
+        Each is of one of the fields that the training stars give with other noise, with a residual
+        of the law and light that the field takes for sky: what the fit leaves open is in it.
+
+        Parameters
+        ----------
+        count : int
+        rng : Generator
+
+        Returns
+        -------
+        images : ndarray, shape (count, d, d)
+        position : ndarray, shape (count, 2) to (count, 4)
+        centre : ndarray, shape (count, 2)
+            (row, column) from pixel (d//2, d//2), of a list.
+        """
+        fields = self.redrawn or (self.model,)
+        position = rng.uniform(self.low, self.high, (count, len(self.low)))
+        centre = rng.uniform(-0.5, 0.5, (count, 2))
+        # The field's image at this place, of one field after the other.
+        images = np.empty((count, self.side, self.side))
+        for number, field in enumerate(fields):
+            rows = slice(number, None, len(fields))
+            images[rows] = field.images(field.terms(position[rows]), centre[rows], self.side)
+        images /= images.sum(axis=(1, 2), keepdims=True)
+        # The residual e ~ N(offset, C) at the phase of the centre: modes and diagonal.
+        phases = phases_of(self.step_px)
+        for number in range(count):
+            phase, window = phase_of(centre[number], phases, self.side)
+            modes, variance = self.modes[phase][:, window], self.diagonal[phase, window]
+            residual = self.offset[phase, window] + rng.normal(size=len(modes)) @ modes
+            residual = residual + rng.normal(size=len(window)) * np.sqrt(variance)
+            images[number] += residual.reshape(self.side, self.side)
+        # Light that looks like sky.
+        images += self.unknown_light * rng.normal(size=(count, 1, 1)) / images[0].size
+        images /= images.sum(axis=(1, 2), keepdims=True)
+        return images, position, centre - self._list_offset
 
     def free_flux(self) -> Self:
         """The form that finds flux and sky."""
@@ -245,6 +312,7 @@ class FieldMixture(FieldLaw, Method):
         fixed: bool | np.ndarray = False,
         flux: np.ndarray | None = None,
         sky: np.ndarray | None = None,
+        gain: np.ndarray | None = None,
     ) -> Estimate:
         """PSF, flux, sky and centre of every star.
 
@@ -253,7 +321,7 @@ class FieldMixture(FieldLaw, Method):
         stamps : ndarray, shape (n, d, d)
             In any unit; the sky may be roughly subtracted.
         noise : ndarray, shape (n,)
-            RMS of a pixel.
+            RMS of a pixel, all photons spread evenly.
         position : ndarray, shape (n, 2) to (n, 4), optional
             (x, y) in the field, magnitude and colour; NaN where unknown.
         centre : ndarray, shape (n, 2), optional
@@ -262,6 +330,9 @@ class FieldMixture(FieldLaw, Method):
             These are taken as they are, where there are any.
         flux, sky : ndarray, shape (n,), optional
             Those that are known; NaN where they are to be found.
+        gain : ndarray, shape (n,), optional
+            Electrons per unit of the stamps, by which the errors have the star's photons where they
+            are; NaN where unknown.
 
         Raises
         ------
@@ -284,6 +355,7 @@ class FieldMixture(FieldLaw, Method):
         stars = Asked(
             *(images - level[:, None], np.broadcast_to(noise, count), terms, True),
             *(self._prior(listed), None, flux, np.isfinite(sky)),
+            np.zeros(count) if gain is None else np.nan_to_num(1.0 / gain),
         )
         known = np.isfinite(listed).all(axis=1) & fixed
         found = np.empty((count, 6 + 2 * images.shape[1]))

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from pydantic import ValidationError
@@ -60,6 +60,24 @@ class BundleError(Error, ValueError):
 
     def __init__(self, problem: str) -> None:
         super().__init__(one_line(problem))
+
+
+class ModelErrors(NamedTuple):
+    """Standard errors of measured stars that the model of the PSF makes, whatever their S/N.
+
+    Attributes
+    ----------
+    flux : float
+        Over the flux.
+    sky : float
+        In a pixel, over the flux.
+    centre : float
+        In pixels, along each axis.
+    """
+
+    flux: float = 0.0
+    sky: float = 0.0
+    centre: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,6 +118,18 @@ class Bundle:
             return None if said is None else Wings.of_plain(said)
         except ValueError as error:
             raise BundleError(f"{self.info.name}: damaged ({error})") from None
+
+    @property
+    def model_errors(self) -> ModelErrors:
+        """Errors of measured stars by the model's own; BundleError if damaged."""
+        said = self.info.config.get("model_errors", {})
+        try:
+            errors = ModelErrors(**{name: float(value) for name, value in said.items()})
+            if not all(0.0 <= error < 1e3 for error in errors):
+                raise ValueError("numbers that are no errors")
+        except (TypeError, ValueError, AttributeError) as error:
+            raise BundleError(f"{self.info.name}: damaged (model_errors: {error})") from None
+        return errors
 
     def scales(self, noise: np.ndarray) -> list[np.ndarray] | None:
         """`scale68`, `scale95` and `flux_error_scale`, of any format, at the noise of stars (n,).

@@ -16,6 +16,8 @@ import numpy as np
 
 from psfdae.image.detection import Sky
 from psfdae.image.observation import Observation
+from psfdae.image.stamps import StarFlag, raise_flag
+from psfdae.model.photometry import FAINT_SNR
 from psfdae.model.wings import Wings, aperture_correction, around_stars, outer_light
 
 if TYPE_CHECKING:
@@ -42,7 +44,8 @@ class CrowdedPhotometry:
         A row for each: `id`, `x`, `y` (0-based pixels), `x_error`, `y_error`, `flux` (counts,
         wings included), `flux_error`, `flux_model` (without the wings), `group`, `group_size`,
         `parted` (the group was too large, and is a part of it), `chi2` (reduced, of the pixels of
-        the fit), `flags` of photutils. Errors are √χ² times those of the noise where χ² > 1.
+        the fit), `flags` (`StarFlag`s), `photutils_flags`. Stars of a list have its `id` and come
+        in its order. Errors are √χ² times those of the noise where χ² > 1.
     residual, light : ndarray, shape (h, w)
         Image without sky and stars, and that of all stars, counts.
     wings : Wings or None
@@ -120,7 +123,70 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
                 break
             place, flux = place[real], flux[real]
     seen = wings if wings is not None and wings.seen else model.wings
-    return _described(model, table, sky.flat, drawn + far, seen)
+    found = _described(model, table, sky.flat, drawn + far, seen)
+    stars = found.stars
+    saturated = np.zeros(image.shape, dtype=bool)
+    if observation.saturate is not None:
+        saturated = image >= observation.saturate
+    stars["flags"] = star_flags(table, stars, bad & ~saturated, saturated, _box(fwhm), fwhm)
+    if observation.found is None:
+        stars["id"] = observation.identifiers
+        stars["flags"] |= observation.list_flags
+    return found
+
+
+def star_flags(
+    table: Table,
+    stars: Table,
+    bad: np.ndarray,
+    saturated: np.ndarray,
+    side: int,
+    fwhm: float,
+) -> np.ndarray:
+    """Flags (n,), uint16, of stars that were fitted in boxes of `side` pixels.
+
+    Parameters
+    ----------
+    table, stars : Table
+        What photutils says of the fits, and the stars as they are described.
+    bad, saturated : ndarray of bool, shape (h, w)
+        Pixels that were not fitted.
+    side : int
+    fwhm : float
+        In pixels.
+    """
+    from scipy.ndimage import maximum_filter
+    from scipy.spatial import cKDTree
+
+    place = np.stack([stars["x"], stars["y"]], axis=1)
+    seen = np.isfinite(place).all(axis=1)
+    flags, photutils = np.zeros(len(stars), np.uint16), np.array(table["flags"])
+    # Pixels of the box about each star.
+    height, width = bad.shape
+    column, row = np.rint(np.where(seen[:, None], place, -side)).astype(int).T
+    half = side // 2
+    edge = (column < half) | (row < half) | (column >= width - half) | (row >= height - half)
+    at = np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)
+    for pixels, flag in ((bad, StarFlag.MASKED), (saturated, StarFlag.SATURATED)):
+        raise_flag(flags, flag, seen & maximum_filter(pixels, side, mode="constant")[at])
+    raise_flag(flags, StarFlag.TRUNCATED, edge & seen)
+    # Flux, fit and neighbours.
+    flux, error = np.array(stars["flux"]), np.array(stars["flux_error"])
+    raise_flag(flags, StarFlag.NO_FLUX, ~np.isfinite(flux))
+    raise_flag(flags, StarFlag.FAINT, flux < FAINT_SNR * error)
+    # No convergence or no covariance; a place at its bound.
+    raise_flag(flags, StarFlag.POOR_FIT, (np.array(stars["chi2"]) > 10.0) | (photutils & 24 > 0))
+    raise_flag(flags, StarFlag.OFF_CENTRE, photutils & 32 > 0)
+    known = np.flatnonzero(seen)
+    near = cKDTree(place[known]).query_pairs(fwhm, output_type="ndarray")
+    raise_flag(flags, StarFlag.BLENDED, known[near.ravel()])
+    raise_flag(flags, StarFlag.BLENDED, np.array(stars["parted"], dtype=bool))
+    return flags
+
+
+def _box(fwhm: float) -> int:
+    """Side of the pixels that are fitted to a star, odd."""
+    return 2 * int(np.ceil(FIT_FWHM * fwhm / 2)) + 1
 
 
 def _fitted(
@@ -136,7 +202,7 @@ def _fitted(
     from astropy.table import Table
     from photutils.psf import PSFPhotometry
 
-    side = 2 * int(np.ceil(FIT_FWHM * fwhm / 2)) + 1
+    side = _box(fwhm)
     start = Table({"id": np.arange(1, len(place) + 1), "x": place[:, 0], "y": place[:, 1]})
     start["group_id"], parted = groups_of(place, GROUP_FWHM * fwhm)
     if flux is not None:
@@ -229,5 +295,5 @@ def _described(
     stars["flux_model"] = table["flux_fit"]
     stars["group"], stars["group_size"] = table["group_id"], table["group_size"]
     stars["parted"] = table["parted"]
-    stars["chi2"], stars["flags"] = table["reduced_chi2"], table["flags"]
+    stars["chi2"], stars["photutils_flags"] = table["reduced_chi2"], table["flags"]
     return found

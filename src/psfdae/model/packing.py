@@ -26,11 +26,21 @@ import numpy as np
 from psfdae.bright_stars import BrightStars
 from psfdae.bundle_info import BundleInfo
 from psfdae.files import Product, ProductError
-from psfdae.method import Estimate, FindsFlux, MeasuresStars, Method, ScoresOutliers, with_free_flux
+from psfdae.image.stamps import StarFlag
+from psfdae.method import (
+    DrawsStars,
+    Estimate,
+    FindsFlux,
+    MeasuresStars,
+    Method,
+    ScoresOutliers,
+    with_free_flux,
+)
 from psfdae.methods import method
 from psfdae.model.bundle import (
     Bundle,
     BundleError,
+    ModelErrors,
     at_noise,
     brightest,
     creation_date,
@@ -89,11 +99,11 @@ class HeldOutStars:
 
     @classmethod
     def of(
-        cls, stars: Product, reference: str, noise: NoiseModel, train: np.ndarray, test: np.ndarray
+        cls, stars: Product, reference: str, noise: NoiseModel, test: np.ndarray
     ) -> HeldOutStars:
-        """Some stars of a product "stars", by their indices and those of the training stars."""
+        """Some stars of a product "stars", by their indices."""
         truth = stars[reference]
-        doubts = own_noise(stars, truth, train, noise.background)
+        doubts = own_noise(stars, truth, noise.background)
         arrays = (stars["realisation"], truth, field_positions(stars), *doubts)
         images, references, position, *of_test = (array[test] for array in arrays)
         return cls(images, references, noise, position, *of_test)
@@ -213,7 +223,7 @@ class StarFacts:
             "training_stars": _trained_on(stars, parts.train),
             "config": {"stars": stars.config, "train": dict(trained)},
         }
-        held_out = HeldOutStars.of(stars, reference, noise, parts.train, parts.test)
+        held_out = HeldOutStars.of(stars, reference, noise, parts.test)
         model = leading(FluxModel.fit(images[parts.train]), COMPONENTS)
         return cls(info, model, held_out, levels, config.seed)
 
@@ -277,6 +287,7 @@ def bundle_of(
     made = without_errors(fitted, facts, reference, name, licence, largest_mb)
     held_out = facts.held_out
     unpacked = type(fitted).unpack(made.weights, made.info)  # what it errs as packed
+    made = with_model_errors(made, fitted, config.seed)
     made, errors = calibrated(made, unpacked, held_out, config.seed)
     if of_image(stars) and made.strange_limit is not None:
         train = np.unique(stars["field_index"][split_stars(stars, trained["split"], config).train])
@@ -440,6 +451,7 @@ def with_scales(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -
     on other stars, those on its own do not tell.
     """
     model, nodes = PsfModel(bundle), bundle.noise_nodes
+    fitted = model.engine.estimator
     shape = 2, len(CASES)  # the noise is known, or estimated
     noise = np.tile(nodes, (*shape, 1))
     width, of_flux = np.ones((2, *shape, 2, len(nodes))), np.ones(len(nodes))
@@ -463,14 +475,10 @@ def with_scales(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -
             for pixels, kind in ((~bright, 0), (bright, 1)):
                 width[0, estimated, case, kind, place] = np.quantile(error[pixels], COVERAGE)
                 width[1, estimated, case, kind, place] = np.quantile(wide[pixels], WIDE)
-            if estimated and not CASES[case]:
+            if estimated and not CASES[case] and not isinstance(fitted, MeasuresStars):
                 doubt = np.hypot(found.flux_error, stars.flux_error[star])[usable]
                 off = np.abs(found.flux - 1.0)[usable] / doubt
-                of_flux[place] = (
-                    np.quantile(off, COVERAGE)
-                    if isinstance(model.engine.estimator, MeasuresStars)
-                    else np.quantile(off, WIDE) / NORMAL_WIDE
-                )
+                of_flux[place] = np.quantile(off, WIDE) / NORMAL_WIDE
     # Where a star has light that the photometry does not know, its noise is found too large.
     noise = np.maximum.accumulate(noise, axis=-1)
     for index in np.ndindex(width.shape[:-1]):
@@ -506,6 +514,42 @@ def with_training_stars(bundle: Bundle, stars: BrightStars) -> Bundle:
     distance = found.distance[np.isfinite(found.distance)]
     far = 1.1 * float(np.quantile(distance, 0.99)) if distance.size else 0.0
     return replace(bundle, strange_limit=limit, distance_limit=max(bundle.distance_limit, far))
+
+
+def with_model_errors(bundle: Bundle, fitted: Method, seed: int) -> Bundle:
+    """The bundle with the errors of measured stars that its model makes, if its method draws stars.
+
+    Stars that are drawn by what the fit leaves open are measured with hardly any noise; what their
+    stated errors lack is the model's.
+    """
+    if not isinstance(fitted, DrawsStars):
+        return bundle
+    model, rng = PsfModel(bundle), stream(seed, "noise", "calibration", "model")
+    # S/N 2000 of a matched filter, where noise is far below the errors of most models.
+    noise = 1.0 / (2000.0 * np.sqrt(bundle.info.noise_equivalent_px))
+    images, position, centre = fitted.draw_stars(FEW_STARS, rng)
+    noisy = images + noise * rng.normal(size=images.shape)
+    found = model.predict(noisy, position=position)
+    usable = (found.flags & (StarFlag.NO_FLUX | StarFlag.OUTLIER)) == 0
+    centre = centre + images.shape[-1] // 2
+
+    def lacking(off: np.ndarray, stated: np.ndarray) -> float:
+        """√(e² − stated²) for the e within which 68 % of normal errors are, or 95 % within 1.96."""
+        ratio = np.abs(off) / stated
+        scale = 0.5 * (np.quantile(ratio, COVERAGE) + np.quantile(ratio, WIDE) / NORMAL_WIDE)
+        return float(np.median(stated) * np.sqrt(max(scale**2 - 1.0, 0.0)))
+
+    flux = lacking((found.flux - 1.0)[usable], found.flux_error[usable])
+    # Light that a stamp of a bright star has more than its model is sky to one, flux to the other.
+    sky = lacking(found.background[usable], found.background_error[usable])
+    sky = max(sky, flux / images[0].size)
+    off = np.concatenate([found.y_fit - centre[:, 0], found.x_fit - centre[:, 1]])
+    stated = np.concatenate([found.y_error, found.x_error])
+    both = np.concatenate([usable, usable])
+    errors = ModelErrors(flux, sky, lacking(off[both], stated[both]))
+    info = bundle.info
+    said = info.config | {"model_errors": errors._asdict()}
+    return replace(bundle, info=info.model_copy(update={"config": said}))
 
 
 def with_wings(bundle: Bundle, wings: Wings) -> Bundle:

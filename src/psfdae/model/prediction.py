@@ -45,7 +45,8 @@ class Prediction:
         Noise-free image of the star without sky, in the unit of the stamps: the PSF
         times the flux. NaN where there is no usable flux (flag NO_FLUX).
     residual : ndarray, shape (n, d, d), float32
-        Stamp − sky − `psf`; NaN in pixels that were not used.
+        Stamp − sky − `psf`, and − the even light of the star's wings in it; NaN in pixels that
+        were not used.
     uncertainty : ndarray, shape (n, d, d), float32
         Half-width that holds 68.27 % of the errors of `psf` at this S/N, of the brightest
         pixels (`psfdae.model.bundle.brightest`) and of the others, as found on test stars.
@@ -57,7 +58,8 @@ class Prediction:
     flux_total, flux_total_error : ndarray, shape (n,), float64
         With the light beyond the stamp (`PsfModel.wings`); NaN if the model knows none.
     background, noise : ndarray, shape (n,), float64
-        Sky level and RMS of the sky noise in a pixel.
+        Sky level, without the light of the star's wings if the model knows it, and RMS of the sky
+        noise in a pixel.
     snr : ndarray, shape (n,), float64
         Of a filter matched to the star as restored, √Σ psf² / noise: flux / (noise √A), with
         its own noise-equivalent area A.

@@ -563,6 +563,8 @@ class Engine:
         chi2 = _chi2(residual, psf, doubt, found.noise, stars.gain)
         raise_flag(flags, StarFlag.POOR_FIT, chi2 > MOST_CHI2)
         photons = np.nan_to_num(np.maximum(found.flux, 0.0) / stars.gain)
+        if restored.of_star:  # whose errors have the photons
+            photons[:] = 0.0
         flux_error = np.sqrt((of_flux * found.flux_error) ** 2 + photons)
         return Prediction(
             psf=psf,
@@ -572,8 +574,7 @@ class Engine:
             ratio95_bright=ratios[:, 1],
             flux=found.flux,
             flux_error=flux_error,
-            **self._total(stars, found.flux, flux_error),
-            background=found.background,
+            **self._with_wings(stars, found, flux_error),
             noise=found.noise,
             snr=snr,
             chi2=chi2,
@@ -588,16 +589,26 @@ class Engine:
             **(restored.of_star or unmeasured(len(stars))),
         )
 
-    def _total(self, stars: Stamps, flux: np.ndarray, error: np.ndarray) -> dict[str, np.ndarray]:
-        """Columns of fluxes with the light beyond the stamps."""
+    def _with_wings(
+        self, stars: Stamps, found: Photometry, error: np.ndarray
+    ) -> dict[str, np.ndarray]:
+        """Columns of fluxes with the light beyond the stamps, and of the sky without that in them.
+
+        `error` (n,) is that of the fluxes.
+        """
+        flux, sky = found.flux, found.background
         if self.wings is None or not isinstance(self.estimator, KnowsField):
             unknown = np.full(len(flux), np.nan)
-            return {"flux_total": unknown, "flux_total_error": unknown}
+            return {"flux_total": unknown, "flux_total_error": unknown, "background": sky}
         place = np.stack([stars.x, stars.y], axis=1)
         total, doubt = self.wings.total(outer_light(self.estimator.psf_at, place))
         # An error of a flux that was given is not known.
         own = np.hypot(error * total, flux * doubt)
-        return {"flux_total": flux * total, "flux_total_error": own}
+        # Wings go on evenly inside the stamp, where a star on an unknown sky has them in its sky.
+        scale = (total - 1.0) / self.wings.light()[0]
+        even = np.nan_to_num(np.maximum(flux, 0.0) * scale * self.wings.profile[0])
+        sky = np.where(np.isnan(stars.background), sky - even, sky)
+        return {"flux_total": flux * total, "flux_total_error": own, "background": sky}
 
     def _doubts(
         self, psf: np.ndarray, sigma: np.ndarray | None, noise: np.ndarray, stars: Stamps
@@ -657,9 +668,11 @@ class Engine:
             exact,
             flux=stars.flux,
             sky=stars.background - start,
+            gain=stars.gain,
         )
         own = estimate.measured
         assert own is not None and estimate.sigma is not None
+        own = replace(own, covariance=self._with_model_errors(own.covariance, own.flux))
         error = np.sqrt(own.covariance[:, 0, 0])
         flux = np.where(given, stars.flux, own.flux)
         lost = nothing | np.where(given, unseen, ~(flux > error))
@@ -688,6 +701,21 @@ class Engine:
             score[~lost] = estimate.outlier_score[~lost]
         of_star = {k: np.where(lost, np.nan, v) for k, v in measured.items()}
         return Restored(estimate.psf, estimate.sigma, better, lost, score, of_star)
+
+    def _with_model_errors(self, covariance: np.ndarray, flux: np.ndarray) -> np.ndarray:
+        """Covariances (n, 4, 4) of flux, sky, row and column with the errors of the model itself.
+
+        A number that is known, whose variance is almost 0, stays so.
+        """
+        errors = self.bundle.model_errors
+        unit = np.maximum(flux, 0.0)[:, None]
+        more = np.concatenate(
+            [unit * [errors.flux, errors.sky], np.full((len(flux), 2), errors.centre)], axis=1
+        )
+        variance = np.maximum(np.einsum("nii->ni", covariance), 0.0)
+        least = np.concatenate([unit * 1e-5, unit * 1e-12, np.full((len(flux), 2), 1e-9)], axis=1)
+        more[np.sqrt(variance) < least] = 0.0
+        return np.asarray(covariance + more[:, :, None] ** 2 * np.eye(4))
 
     def _estimated(self, seen: Sequence[Seen]) -> list[Restored]:
         """With fluxes and sky that the method found first, if it can where both are unknown.

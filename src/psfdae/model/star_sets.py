@@ -96,7 +96,7 @@ def noisy_test_images(config: OfFit, stars: Product, test: np.ndarray, level: fl
 
 
 def own_noise(
-    stars: Product, images: np.ndarray, train: np.ndarray, background: float
+    stars: Product, images: np.ndarray, background: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """What the own noise of stars of a product "stars" does to images of them, of flux 1.
 
@@ -106,15 +106,14 @@ def own_noise(
     ----------
     stars : product "stars"
     images : ndarray, shape (n, d, d)
-    train : ndarray
-        Training images, of which the typical star is.
     background : float
         Photons of the sky in a pixel.
 
     Returns
     -------
     flux_error : ndarray, shape (n,)
-        Of a filter matched to the typical star.
+        Of the sum of the pixels, by which stars have the flux 1, above a sky that is the median of
+        the pixels around them.
     noise : ndarray, shape (n, d, d)
         σ of every pixel: of the sky's noise σ and the star's F = √B / σ photons.
     """
@@ -123,7 +122,10 @@ def own_noise(
     noise = stars["noise"][stars["field_index"]]
     sigma = noise[:, None, None]
     square = sigma**2 + np.maximum(images, 0.0) * sigma / np.sqrt(background)
-    return noise * np.sqrt(star_area(stars, train)), np.sqrt(square)
+    # P pixels have the noise √P σ; the median of n pixels around them errs by √(π/2n) σ in each.
+    pixels = images[0].size
+    around = max(stars["wide"][0].size - pixels, 1)
+    return noise * np.sqrt(pixels + np.pi / 2 * pixels**2 / around), np.sqrt(square)
 
 
 def training_set(

@@ -153,7 +153,7 @@ def _found(model: PsfModel, stars: Stars, degraded: Mapping[float, np.ndarray]) 
     parts, background = split_stars(product, SPLIT, settings), settings.noise.background_photons
     test, area = parts.test, star_area(product, parts.train)
     star, truth = product["field_index"][test], product[REFERENCE][test]
-    own = own_noise(product, product[REFERENCE], parts.train, background)
+    own = own_noise(product, product[REFERENCE], background)
     of_flux, of_pixels = (of_all[test] for of_all in own)
     given = {"position": field_positions(product)[test]}
     bright = model.predict(truth, flux=1.0, background=0.0, noise=product["noise"][star], **given)
@@ -241,7 +241,7 @@ def _table(rows: Sequence[Mapping[str, Any]], stars: Stars, methods: Mapping[str
 def _own_mse(stars: Stars, parts: Split) -> float:
     """Mean variance of the pixels of the stars held out: their own noise, in every MSE."""
     product, sky = stars.product, stars.settings.noise.background_photons
-    _, noise = own_noise(product, product[REFERENCE], parts.train, sky)
+    _, noise = own_noise(product, product[REFERENCE], sky)
     return float(np.square(noise[parts.test]).mean())
 
 
