@@ -176,9 +176,7 @@ def fit_field(
     """
     alternating = _Alternating(stars, background, frame_px, stamp_px, spacing, smoothness)
     tried = _supported(orders, stars)
-    if len(stars) < 3:  # none can be left out
-        return alternating.fit(tried[0])
-    if len(orders) == 1:
+    if len(orders) == 1 or len(stars) < 3:
         return alternating.with_errors(alternating.fit(tried[0]), rng)
     alternating.tolerance, best, least = TRIED_TOLERANCE, 0, np.inf
     for order in tried:
@@ -326,7 +324,7 @@ class _Alternating:
         Bootstrap, ch. 6.5). Light that the model does not know is the sky that stars which were
         left out seem to have.
         """
-        if rng is None:
+        if rng is None or len(self.noise) < 3:  # of two stars, none can be left out
             return fit
         light = np.concatenate([part.light for part in self._left_out(fit)], axis=1)
         # Noise-free images F m of the stars, and the variance of their pixels: sky and photons.
