@@ -4,10 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from astropy.io import fits
+from astropy.table import Table
+from click.testing import CliRunner
 
 import psfdae
+from psfdae.cli import main
 from psfdae.field_psf import excess_scatter
+from psfdae.image.observation import Source
 from psfdae.methods.field import FieldMixture
+from psfdae.model.crowded import star_flags
 from psfdae.model.fitting import described, fitted_to
 from psfdae.model.packing import StarFacts, with_model_errors, with_wings, without_errors
 from psfdae.model.wings import wings_of_stars
@@ -113,6 +119,60 @@ def test_no_errors_of_the_model_where_numbers_are_known(models):
     assert (found.background_error == 0).all()
     assert (found.x_error == 0).all()
     assert (found.flux_error > 1e5 * models[0].bundle.model_errors.flux).all()
+
+
+@pytest.mark.slow
+def test_photometry_keeps_the_list_and_states_errors_of_bright_stars(models, tmp_path):
+    image, place = bright_field(1)
+    models[0].save(tmp_path / "m.psf.safetensors")
+    header = {"GAIN": GAIN, "RDNOISE": READ, "PIXSCALE": 0.6, "BUNIT": "electron"}
+    fits.writeto(tmp_path / "i.fits", image.astype(np.float32), fits.Header(header.items()))
+    names = [f"star {n}" for n in range(60, 0, -1)]
+    Table({"id": names, "x": place[:, 0], "y": place[:, 1]}).write(tmp_path / "s.csv")
+    words = ["photometry", tmp_path / "i.fits", "--catalogue", tmp_path / "s.csv", "--origin", 0]
+    words += ["--model", tmp_path / "m.psf.safetensors", "--out", tmp_path / "p.ecsv"]
+    done = CliRunner().invoke(main, [str(word) for word in words])
+    assert done.exit_code == 0, done.output
+    rows = Table.read(tmp_path / "p.ecsv")
+    assert rows["id"].tolist() == names
+    assert (rows["flags"] == 0).mean() > 0.9
+    assert [str(rows[c].unit) for c in ("x", "flux", "flux_error")] == [
+        "pix",
+        "electron",
+        "electron",
+    ]
+    # As one star after the other is measured by `predict`, within the errors of both.
+    found = next(models[0].stream(Source(tmp_path / "i.fits", place).open(16, 2), threads=1))[1]
+    off = np.array(rows["flux"]) - found.flux_total
+    one, two = within(off, np.hypot(rows["flux_error"], found.flux_total_error))
+    assert one > 0.6 and two > 0.9
+    # No error of a bright star is below that of the model.
+    assert (rows["flux_error"] > models[0].flux_error * rows["flux"]).all()
+
+
+def test_flags_of_photometry():
+    """Stars that are fine, at the edge, saturated, masked, faint, badly fitted, near, and lost."""
+    x = np.array([50.0, 1.0, 80.0, 20.0, 20.0, 50.0, 80.0, 82.0, np.nan])
+    y = np.array([50.0, 50.0, 80.0, 20.0, 80.0, 20.0, 20.0, 20.0, np.nan])
+    flux = np.full(9, 100.0)
+    flux[8] = np.nan
+    stars = Table({"x": x, "y": y, "flux": flux, "flux_error": np.full(9, 10.0)})
+    stars["flux_error"][4] = 50.0
+    stars["chi2"], stars["parted"] = np.where(np.arange(9) == 5, 30.0, 1.0), np.zeros(9, bool)
+    table = Table({"flags": np.zeros(9, int)})
+    bad, saturated = np.zeros((2, 100, 100), bool)
+    bad[21, 20] = saturated[80, 82] = True
+    flags = star_flags(table, stars, bad, saturated, 5, 3.0)
+    of = psfdae.StarFlag
+    wanted = [0, of.TRUNCATED, of.SATURATED, of.MASKED, of.FAINT, of.POOR_FIT]
+    assert flags.tolist() == [*wanted, of.BLENDED, of.BLENDED, of.NO_FLUX]
+    table["flags"][:3] = [32, 8, 16]
+    flags = star_flags(table, stars, bad, saturated, 5, 3.0)
+    assert flags[:3].tolist() == [
+        of.OFF_CENTRE,
+        of.TRUNCATED | of.POOR_FIT,
+        of.SATURATED | of.POOR_FIT,
+    ]
 
 
 def test_the_scatter_beyond_errors_is_found_and_0_where_there_is_none():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -94,7 +95,8 @@ def photometry(
         print(said)
     _complete(found, observation, zero_point)
     found.stars.meta |= _said(found, image, zero_point)
-    with atomic_path(out) as temporary:
+    with atomic_path(out) as temporary, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of units that are not of the FITS standard
         found.stars.write(temporary, format=form, overwrite=True)
     if residual is not None:
         from astropy.io import fits
@@ -180,6 +182,8 @@ def _zero_point(
 
 def _complete(found: CrowdedPhotometry, observation: Observation, zero_point: float | None) -> None:
     """Columns that take a zero point, or a WCS; and units."""
+    from astropy.units import Unit
+
     stars = found.stars
     with np.errstate(all="ignore"):
         if zero_point is not None:
@@ -190,20 +194,11 @@ def _complete(found: CrowdedPhotometry, observation: Observation, zero_point: fl
     if sky is not None:
         stars["ra"], stars["dec"] = sky
     units = dict.fromkeys(("x", "y", "x_error", "y_error"), "pix")
-    units |= dict.fromkeys(("flux", "flux_error", "flux_model"), _unit(observation.unit))
+    units |= dict.fromkeys(("flux", "flux_error", "flux_model"), observation.unit or "adu")
     units |= {"mag": "mag", "mag_error": "mag", "ra": "deg", "dec": "deg"}
     for name in stars.colnames:
-        stars[name].unit = units.get(name)
-
-
-def _unit(said: str) -> str:
-    """The unit of an image, if it is one of the FITS standard, else counts."""
-    from astropy.units import Unit
-
-    try:
-        return Unit(said, format="fits").to_string("fits") if said else "adu"
-    except (ValueError, TypeError):
-        return "adu"
+        # Units that no standard has are kept as they are.
+        stars[name].unit = Unit(units[name], parse_strict="silent") if name in units else None
 
 
 def _said(found: CrowdedPhotometry, image: Path, zero_point: float | None) -> dict[str, Any]:

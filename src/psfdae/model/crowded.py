@@ -45,7 +45,8 @@ class CrowdedPhotometry:
         wings included), `flux_error`, `flux_model` (without the wings), `group`, `group_size`,
         `parted` (the group was too large, and is a part of it), `chi2` (reduced, of the pixels of
         the fit), `flags` (`StarFlag`s), `photutils_flags`. Stars of a list have its `id` and come
-        in its order. Errors are √χ² times those of the noise where χ² > 1.
+        in its order. Errors are √χ² times those of the noise where χ² > 1;
+        that of the flux has the model's, too (`FieldPsfs.flux_error`).
     residual, light : ndarray, shape (h, w)
         Image without sky and stars, and that of all stars, counts.
     wings : Wings or None
@@ -125,6 +126,8 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
     seen = wings if wings is not None and wings.seen else model.wings
     found = _described(model, table, sky.flat, drawn + far, seen)
     stars = found.stars
+    # The error of the PSF is no noise, and is as large a part of each flux.
+    stars["flux_error"] = np.hypot(stars["flux_error"], model.flux_error * stars["flux"])
     saturated = np.zeros(image.shape, dtype=bool)
     if observation.saturate is not None:
         saturated = image >= observation.saturate

@@ -71,6 +71,11 @@ class FieldPsfs(ABC):
         """Columns and rows of the image that the model is of, if known."""
 
     @property
+    def flux_error(self) -> float:
+        """Standard error over the flux that the model makes of every star; 0 if not known."""
+        return 0.0
+
+    @property
     def wings(self) -> Wings | None:
         """Light of stars beyond their stamps, if the model knows any."""
         return None

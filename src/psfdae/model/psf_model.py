@@ -285,6 +285,11 @@ class PsfModel(FieldPsfs):
         return self.engine.wings
 
     @property
+    def flux_error(self) -> float:
+        """Standard error over the flux that the model makes of every star; 0 if not known."""
+        return self.bundle.model_errors.flux
+
+    @property
     def image_px(self) -> tuple[int, int] | None:
         """Columns and rows of the image of the training stars, if the bundle says it."""
         size = self.info.config.get("stars", {}).get("image_px")
