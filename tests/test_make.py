@@ -47,19 +47,6 @@ def test_a_variable_of_make_stays_a_text(pretended, variable):
     assert not list(pretended.rglob("pwned"))
 
 
-@pytest.mark.parametrize("finished", [True, False])
-def test_reproduce_ends_with_a_comparison_with_the_record(pretended, finished):
-    """It compares only where there is something to compare, and never fails by that."""
-    (pretended / "results/.report.html").touch()
-    if finished:
-        (pretended / "results/evaluation").mkdir()
-    with (pretended / ".venv/bin/psfdae").open("a") as program:
-        program.write('[ "$1" != compare ] || exit 2\n')
-    assert shell(pretended, "make reproduce PRESET=fast", **QUIET).wait() == 0
-    words = (pretended / "words").read_text().splitlines()
-    assert (words[-3:] == ["compare", "results", "results/reference"]) == finished
-
-
 def snapshot(results):
     """Bytes of the products of a run: no times, no logs, no views of other products."""
     # MLflow draws the names of its runs, which its receipts and their notes hold.

@@ -50,30 +50,3 @@ def test_pythons_of_the_jobs_are_those_of_the_package():
     pythons = jobs["pythons"]["strategy"]["matrix"]["python"]
     assert re.search(r"^PYTHONS \?= (.+)", read("Makefile"), re.M)[1].split() == pythons
     assert f'requires-python = ">={pythons[0]}"' in read("pyproject.toml")
-
-
-UV = """#!/bin/sh
-case "$*" in
-*"python find"*) case "$*" in *3.1[12]*) ;; *) exit 2 ;; esac ;;
-*venv*) for v; do :; done; mkdir -p "$v" ;;
-esac
-"""
-"""A program that finds the Pythons 3.11 and 3.12 only."""
-
-
-@pytest.mark.parametrize(
-    ("pythons", "code", "words"),
-    [
-        ("3.11 3.14", 0, "Not on this machine, skipped: Python 3.14\nPassed: Python 3.11\n"),
-        ("3.11 3.12", 1, "Failed: Python 3.12\nPassed: Python 3.11\n"),
-        ("3.14", 1, "Passed: Python of no version\n"),
-    ],
-)
-def test_a_python_that_is_missing_is_named_and_no_pass(tmp_path, pythons, code, words):
-    (tmp_path / "uv").write_text(UV)
-    (tmp_path / "uv").chmod(0o755)
-    tests = ["sh", "-c", 'case "$PATH" in *3.12-*) exit 1;; esac']
-    environment = {"PATH": f"{tmp_path}:/usr/bin:/bin", "RESOLUTION": "highest"}
-    line = ["sh", str(ROOT / "tests/pythons.sh"), *tests]
-    done = captured(line, cwd=tmp_path, env=environment | {"PYTHONS": pythons})
-    assert (done.returncode, done.stdout.endswith(words)) == (code, True), done.stdout
