@@ -30,11 +30,6 @@ def test_files_are_valid(schema, files):
     assert done.returncode == 0, done.stdout
 
 
-def test_the_catalog_finds_what_it_asks_for():
-    assert all((ROOT / name).is_file() for name in ("workflow/Snakefile", "config/README.md"))
-    assert {"snakemake", "workflow"} <= set(re.findall(r"\w+", read("README.md").lower()))
-
-
 def test_jobs_call_make_and_nothing_else():
     targets = re.findall(r"^([a-z-]+):.*## ", read("Makefile"), re.M)
     for path in JOBS:
@@ -43,10 +38,3 @@ def test_jobs_call_make_and_nothing_else():
             assert len(lines) == 1
             called = re.fullmatch(r"make ([a-z-]+)( [A-Z]+=(\w+|\$\{\{ matrix\.\w+ \}\}))*", *lines)
             assert called and called[1] in targets, lines
-
-
-def test_pythons_of_the_jobs_are_those_of_the_package():
-    jobs = yaml.safe_load(read(".github/workflows/ci.yml"))["jobs"]
-    pythons = jobs["pythons"]["strategy"]["matrix"]["python"]
-    assert re.search(r"^PYTHONS \?= (.+)", read("Makefile"), re.M)[1].split() == pythons
-    assert f'requires-python = ">={pythons[0]}"' in read("pyproject.toml")
