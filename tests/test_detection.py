@@ -255,7 +255,6 @@ LIST = ["--catalogue", "stars.csv"]
         (["image.fits", *LIST, "--weight", "small.fits"], "small.fits: a weight map of 10×10"),
         (["image.fits", *LIST, "--weight", "below.fits"], "below.fits: a weight map of which 1 "),
         (["image.fits", *LIST, "--name", "../../x"], "--name ../../x"),
-        (["image.fits", *LIST, "--gain", 0], "image.fits: gain 0.0"),
         (["image.fits", *LIST, "--method", "psfex"], "no method 'psfex'; there are "),
         (["image.fits", "--catalogue", "other.csv"], "of 150 positions"),
         (["image.fits", "--catalogue", "sky.csv"], "no usable celestial WCS"),
