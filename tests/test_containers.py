@@ -134,6 +134,7 @@ def test_quantities_are_converted_and_other_units_refused(tmp_path, image, place
             Stars.from_image(path, catalogue=place, **{name: 2.0 * wrong})
 
 
+@pytest.mark.slow
 def test_predict_uses_mask_sigma_and_unit_of_its_stamps(small_model, image):
     stamps = image[None, 60:76, 60:76].repeat(3, axis=0)
     bad = np.zeros(stamps.shape, bool)

@@ -229,6 +229,7 @@ def model(tmp_path_factory, image, place):
     return name
 
 
+@pytest.mark.slow
 def test_rows_without_position_and_twice_stay_in_every_result(tmp_path, image, place, model):
     from command_line import psfdae
 

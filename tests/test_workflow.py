@@ -94,6 +94,7 @@ def test_the_data_card_describes_the_files(smoke):
     assert arrays == card.keys()
 
 
+@pytest.mark.slow
 def test_the_report_opens_with_its_main_pictures_and_all_methods(smoke, tmp_path):
     report = tmp_path / "report.html"
     snakemake(smoke, "--report", str(report), "all")
