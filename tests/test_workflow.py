@@ -205,7 +205,7 @@ def test_a_target_lists_no_job_of_another(tmp_path, target, included, others):
         # Sizes have to fit together where a dataset is built.
         nightly(
             {"overrides": "stars.count=9000", "preset": "fast"},
-            "dataset=dataset1: parts.train_stars + parts.test_stars = 10000",
+            "parts.train_stars + parts.test_stars = 10000",
         ),
     ],
 )
