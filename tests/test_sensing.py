@@ -403,7 +403,8 @@ def test_command_finds_the_changed_coma(tmp_path):
         state = file["JOINT"].data
         coma = state[state["name"] == "z8.constant"]
         assert coma["value"][0] == pytest.approx(0.1, abs=5 * coma["error"][0])
-        assert coma["error"][0] < 0.007
+        # 0.005 waves of 16 stars; the error falls as the root of their number, here 9.
+        assert coma["error"][0] < 0.005 * (16 / 9) ** 0.5
         rows = file["WAVEFRONT"].data
         assert len(file["COVAR"].data) == len(rows)
         listed = Table.read(tmp_path / "stars.csv")[rows["id"]]

@@ -231,6 +231,6 @@ def _summary(found: CrowdedPhotometry, out: Path, detected: bool) -> str:
         # Selection by brightness: Eddington (1913, MNRAS 73, 359).
         beyond += (
             "\nof stars near the detection threshold, those are found that noise makes brighter: "
-            "fluxes below 7 sigma are too large by a third, up to 14 sigma by 4 % in the mean"
+            "their fluxes are too large in the mean, the more the fainter they are"
         )
     return f"{said}\n{beyond}"
