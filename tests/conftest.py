@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import fcntl
+import os
 from contextlib import contextmanager
 
 import numpy as np
 import pytest
 
 from image_training import Training
+from job_server import job_server
 from prediction_stars import fresh_psfs, with_network
 from psfdae import load_model
 from psfdae.model.psf_model import PsfModel
@@ -22,7 +24,7 @@ from psfdae_paper.alignment.telescope import (
 )
 from psfdae_paper.configuration.alignment import CHOICE
 from psfdae_paper.configuration.compose import load
-from workflow_runs import snakemake
+from workflow_runs import PATH, snakemake
 
 
 def pytest_addoption(parser):
@@ -124,7 +126,8 @@ def smoke(shared_folder):
     folder = shared_folder / "smoke"
     with made_once(folder) as missing:
         if missing:
-            snakemake(folder)
+            with job_server(folder) as programs:
+                snakemake(folder, path=f"{programs}{os.pathsep}{PATH}")
             assert (folder / "results/runtime.csv").is_file()
     return folder
 

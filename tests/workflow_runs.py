@@ -79,10 +79,13 @@ def command(folder, *arguments, overrides="", preset="smoke", root=ROOT):
     ]
 
 
-def snakemake(folder, *arguments, check=True, **options):
-    """Output of a run; fails the test if the run fails, unless told otherwise."""
+def snakemake(folder, *arguments, check=True, path=PATH, **options):
+    """Output of a run; fails the test if the run fails, unless told otherwise.
+
+    `path` is where its jobs look for programs.
+    """
     source = str(options.get("root", ROOT) / "src")
-    variables = environment(PYTHONPATH=source, **NO_CLUSTER)
+    variables = environment(PYTHONPATH=source, PATH=path, **NO_CLUSTER)
     result = captured(command(folder, *arguments, **options), env=variables)
     if check:
         assert result.returncode == 0, result.stdout + result.stderr
