@@ -214,8 +214,6 @@ def _said(found: CrowdedPhotometry, image: Path, zero_point: float | None) -> di
 
 
 def _summary(found: CrowdedPhotometry, out: Path, detected: bool) -> str:
-    from psfdae.model.crowded import LARGEST_GROUP
-
     count, measured = len(found.stars), int(np.isfinite(found.stars["flux"]).sum())
     beyond = "no star is bright enough to show light beyond the model's stamp"
     if found.wings is not None:
@@ -225,8 +223,6 @@ def _summary(found: CrowdedPhotometry, out: Path, detected: bool) -> str:
             f"{100 * part:.2f} ± {100 * error:.2f} % of it"
         )
     said = f"{out}: {count} stars, {measured} measured"
-    if parted := int(np.sum(found.stars["parted"])):
-        said += f", {parted} of them in groups of over {LARGEST_GROUP}, which were parted"
     if detected:
         # Selection by brightness: Eddington (1913, MNRAS 73, 359).
         beyond += (

@@ -20,6 +20,7 @@ from psfdae.methods.field import FieldMixture
 from psfdae.model import crowded
 from psfdae.model.field_psfs import FieldPsfs
 from psfdae.model.fitting import fitted_to
+from psfdae.model.psf_grid import PsfGrid
 from psfdae.model.stars import DETECTED_SIGMA, Stars
 
 NEAREST_FWHM = 1.25  # of a neighbour whose light can be told from that of its star
@@ -101,16 +102,16 @@ def light_of_others(
     fitted = np.stack([stars["x"], stars["y"]], axis=1)
     known = np.flatnonzero(np.isfinite(fitted).all(axis=1) & np.isfinite(stars["flux_model"]))
     off, nearest = cKDTree(fitted[known]).query(np.nan_to_num(place, nan=-np.inf))
-    psf = found.model.to_photutils()
+    psfs, flux = PsfGrid.of(found.model), np.array(stars["flux_model"])
 
     def light(part: slice, stamp_px: int, margin: int) -> np.ndarray:
         x, y = place[part].T
         stamps = cut_image(found.light, found.light.shape, x, y, stamp_px, margin)[0]
-        axis = np.arange(stamps.shape[-1]) - stamp_px // 2 - margin
-        for row in np.flatnonzero(off[part] <= SAME_PX):
-            star = known[nearest[part][row]]
-            columns, rows = np.meshgrid(np.rint(x[row]) + axis, np.rint(y[row]) + axis)
-            stamps[row] -= psf.evaluate(columns, rows, stars["flux_model"][star], *fitted[star])
+        rows = np.flatnonzero(off[part] <= SAME_PX)
+        star = known[nearest[part][rows]]
+        corner = np.rint(place[part][rows]).astype(int) - stamp_px // 2 - margin
+        drawn = psfs.stamps(fitted[star], corner, stamps.shape[-1])[:, 0]
+        stamps[rows] -= flux[star, None, None] * drawn
         return stamps
 
     return light
