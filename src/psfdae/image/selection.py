@@ -152,7 +152,7 @@ def collect(
     near = settings.isolation_px if isolation_px is None else isolation_px
     # A star that is listed twice is no neighbour of itself.
     apart = np.where(observation.listed_again()[:, None], np.nan, found["position"])
-    close = crowded(apart, snr * noise, near, settings.neighbour_ratio)
+    close = crowded(apart, found.pop("core"), near, settings.neighbour_ratio)
     verdict[close & (verdict == Verdict.GOOD)] = Verdict.CROWDED
     verdict[observation.without_position()] = Verdict.NO_POSITION
     wide, peak, listed, colour, bad = (np.concatenate([k[i] for k in kept]) for i in range(5))
@@ -235,6 +235,8 @@ def _measure(
         "sky": level,
         "brightest": level
         + np.where(centred, cut(wide, side).max((1, 2)) if centring else _at(wide, peak), -np.inf),
+        # Of a faint star beside a bright one, a whole stamp would have the other's light.
+        "core": cut(wide, 3).sum(axis=(1, 2)),
         "highest": cut(np.where(chunk.bad, -np.inf, chunk.data), side).max(axis=(1, 2)),
         "verdict": verdict,
     }

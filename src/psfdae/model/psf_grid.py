@@ -9,6 +9,7 @@ guide to splines), and its derivatives by the position of the star take another.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,15 +30,12 @@ class PsfGrid:
         Values of each PSF; index m//2 is its centre.
     oversampling : int
         Values per pixel and axis.
-    splines : ndarray, shape (r · c, m + 4, m + 4)
-        Coefficients of the splines, mirrored by two at each edge.
     """
 
     columns: np.ndarray
     rows: np.ndarray
     psfs: np.ndarray
     oversampling: int
-    splines: np.ndarray
 
     @classmethod
     def of(cls, model: FieldPsfs, nodes: int = 9, oversampling: int = 4) -> PsfGrid:
@@ -48,15 +46,19 @@ class PsfGrid:
         PredictionError
             If the model knows no PSF of a place.
         """
-        from scipy.ndimage import spline_filter
-
         x, y = np.rint(model.grid(nodes, nodes)).T
         psfs = model.psf_at(x, y, oversampling)
         # An even stamp has no middle value; with a row and a column of zeros it has.
         psfs = np.pad(psfs, ((0, 0), *[(0, 1 - psfs.shape[-1] % 2)] * 2))
-        splines = np.stack([np.pad(spline_filter(psf), 2, mode="reflect") for psf in psfs])
-        shape = (nodes, nodes, *psfs.shape[1:])
-        return cls(x[:nodes], y[::nodes], psfs.reshape(shape), oversampling, splines)
+        return cls(x[:nodes], y[::nodes], psfs.reshape(nodes, nodes, *psfs.shape[1:]), oversampling)
+
+    @cached_property
+    def splines(self) -> np.ndarray:
+        """Coefficients (r · c, m + 4, m + 4) of the splines, mirrored by two at each edge."""
+        from scipy.ndimage import spline_filter
+
+        psfs = self.psfs.reshape(-1, *self.psfs.shape[2:])
+        return np.stack([np.pad(spline_filter(psf), 2, mode="reflect") for psf in psfs])
 
     @property
     def side_px(self) -> int:

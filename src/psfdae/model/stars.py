@@ -216,7 +216,8 @@ class Stars:
             if stars.many_crowded:
                 from psfdae.model.neighbours import without_neighbours
 
-                stars = without_neighbours(stars)
+                asked = settings.calibration_stars.neighbour_ratio
+                stars = without_neighbours(stars, asked)
             exposures.append(stars)
         found_stars = exposures[0] if len(exposures) == 1 else cls.joined(exposures)
         notes += few_stars(found_stars)
@@ -306,10 +307,10 @@ class Stars:
         """So many bright stars of an image have neighbours that it pays to subtract these."""
         if self.observation.shape is None or not np.isfinite(self.candidates.bright.position).all():
             return False
-        if len(self) < ENOUGH_STARS:
+        if len(self) < FEW_STARS:
             return False
         crowded = np.count_nonzero(self.candidates.verdict == Verdict.CROWDED)
-        return bool(crowded >= MANY_CROWDED * len(self))
+        return bool(crowded >= MANY_CROWDED * max(len(self), ENOUGH_STARS))
 
     def __repr__(self) -> str:
         return f"Stars({str(self.observation.path)!r}, {self.summary()})"
@@ -388,33 +389,45 @@ def enough_stars(
     """Choose stars from the brightest down, until there are enough.
 
     Where S/N 100 gives fewer than `ENOUGH_STARS`, the least S/N is lowered until there are three
-    times as many, or to 20; and to 10 if even that gives too few.
+    times as many, or to 20; and to 10 if even that gives too few. Where these are still too few
+    because bright stars have neighbours, brighter and brighter neighbours are accepted, whose light
+    is subtracted later.
 
     Returns
     -------
     settings : Settings
-        With the least S/N.
+        With the least S/N, and the brightness of neighbours.
     candidates : list of Candidates
         Of each observation.
     """
     asked = settings.calibration_stars
 
-    def with_least(snr: float) -> tuple[Settings, list[Candidates]]:
-        stars = asked.model_copy(update={"snr_min": snr})
+    def with_limits(**limits: float) -> tuple[Settings, list[Candidates]]:
+        stars = asked.model_copy(update=limits)
         # Only the stars of all images together must be enough, which is required later.
         of_each = stars.model_copy(update={"stars_min": 0})
         found = [collect(one, of_each, settings.framing) for one in opened]
         return settings.model_copy(update={"calibration_stars": stars}), found
 
-    best = with_least(asked.least_snr)
+    best = with_limits(snr_min=asked.least_snr)
     count = sum(len(one.bright) for one in best[1])
     if count >= ENOUGH_STARS:
         return best
     for snr in asked.lower_snr():
-        chosen, found = with_least(snr)
+        chosen, found = with_limits(snr_min=snr)
         if (more := sum(len(one.bright) for one in found)) > count:
             best, count = (chosen, found), more
         if count >= (ENOUGH_STARS if snr <= FAINT_SNR else 3 * ENOUGH_STARS):
+            break
+    crowded = sum(np.count_nonzero(one.verdict == Verdict.CROWDED) for one in best[1])
+    if count >= ENOUGH_STARS or crowded < ENOUGH_STARS:
+        return best
+    for ratio in (0.05, 0.1, 0.2, 0.4):
+        # The median of stars with neighbours here and there has little of their light.
+        chosen, found = with_limits(snr_min=asked.least_snr, neighbour_ratio=ratio)
+        if (more := sum(len(one.bright) for one in found)) > count:
+            best, count = (chosen, found), more
+        if count >= ENOUGH_STARS:
             break
     return best
 
