@@ -89,7 +89,7 @@ def fit_stars(
     prior = np.array([0.0, 3.0, 3.0]) / range_px**2
     damping, group, cost = np.zeros(len(fit.stars)), chains(fit.start, range_px), fit.squares()
     moving = np.ones(len(fit.stars), dtype=bool)
-    for _ in range(30):  # stars without neighbours take three or four, close pairs ten
+    for _ in range(15):  # stars without neighbours take three or four, close pairs ten
         design = fit.design()
         step, gradient = fit.solve(design, prior, damping)
         # No farther at once than the light is nearly linear in the place, and not out of its range.

@@ -82,45 +82,59 @@ class PsfGrid:
             The light, and its derivatives by x and y per pixel; that the PSF changes over the
             field is not in these. 0 beyond the PSF's edge.
         """
-        light = np.empty((len(place), 3, side_px, side_px))
-        # Few stars at a time: 16 values of four splines for every pixel.
-        step = max(1, 2**17 // side_px**2)
-        for part in (slice(a, a + step) for a in range(0, len(place), step)):
-            light[part] = self._stamps(place[part], corner[part], side_px)
-        return light
-
-    def _stamps(self, place: np.ndarray, corner: np.ndarray, side_px: int) -> np.ndarray:
-        """As `stamps`, of a few stars."""
-        count, size = len(place), self.splines.shape[-1]
+        light = np.zeros((len(place), 3, side_px, side_px))
+        # Splines with room for stamps that reach beyond them, in which there is no light.
+        room = side_px * self.oversampling + 4
+        splines = np.pad(self.splines, ((0, 0), *[(room, room)] * 2))
         # Knots u = o (pixel − centre) + m//2 of the first pixel, along x and y.
-        first = self.oversampling * (corner - place) + self.psfs.shape[-1] // 2
+        size = self.psfs.shape[-1]
+        first = self.oversampling * (corner - place) + size // 2
         knot = np.floor(first).astype(int)
-        weights, slopes = _cubic(first - knot)
-        # The four coefficients around each pixel along either axis: (n, side · 4).
-        pixel = self.oversampling * np.arange(side_px)
-        index = (knot[..., None, None] + 2) + pixel[:, None] + np.arange(-1, 3)
-        inside = (index[..., 1] >= 2) & (index[..., 1] + (first > knot)[..., None] <= size - 3)
-        index = np.clip(index, 0, size - 1).reshape(count, 2, -1)
-        flat = index[:, 1, :, None] * size + index[:, 0, None, :]
-        # The spline at the place of each star: the bilinear mean of four.
+        pixel = knot[..., None] + self.oversampling * np.arange(side_px)
+        inside = (pixel >= 0) & (pixel + (first > knot)[..., None] <= size - 1)
+        lit = np.flatnonzero(inside.any(axis=2).all(axis=1))
         node, share = self._nodes(place)
-        values = np.zeros(flat.shape)
-        for which in range(4):
-            offset = flat + (node[:, which] * size**2)[:, None, None]
-            values += share[:, which, None, None] * self.splines.ravel().take(offset)
-        values = values.reshape(count, -1, side_px, 4)
-        # Σ over the four coefficients along x, then along y.
-        along_x = np.stack(
-            [np.einsum("nvsk,nk->nvs", values, kernel[:, 0]) for kernel in (weights, slopes)],
-            axis=1,
-        ).reshape(count, 2, side_px, 4, side_px)
-        light = np.empty((count, 3, side_px, side_px))
-        light[:, :2] = np.einsum("npskt,nk->npst", along_x, weights[:, 1])
-        light[:, 2] = np.einsum("nskt,nk->nst", along_x[:, 0], slopes[:, 1])
+        weights, slopes = _cubic(first - knot)
+        span = self.oversampling * (side_px - 1) + 1
+        # Few stars at a time: some 20 values of a spline for every pixel.
+        for rows in np.array_split(lit, len(lit) * side_px**2 // 2**17 + 1):
+            begin = knot[rows] + room + 1
+            squares = self._squares(splines, node[rows], share[rows], begin, span + 3)
+            # Σ over the four coefficients around each pixel, along x, then along y.
+            taps = [slice(t, t + span, self.oversampling) for t in range(4)]
+            smooth, steep = (
+                sum(
+                    kernel[rows, 0, t, None, None] * squares[:, :, tap]
+                    for t, tap in enumerate(taps)
+                )
+                for kernel in (weights, slopes)
+            )
+            for which, (values, kernel) in enumerate(
+                ((smooth, weights), (steep, weights), (smooth, slopes))
+            ):
+                light[rows, which] = sum(
+                    kernel[rows, 1, t, None, None] * values[:, tap] for t, tap in enumerate(taps)
+                )
         # A star that moves by a pixel moves by −o knots under its pixels.
         light[:, 1:] *= -self.oversampling
         light *= (inside[:, 1, :, None] & inside[:, 0, None, :])[:, None]
         return light
+
+    @staticmethod
+    def _squares(
+        splines: np.ndarray, node: np.ndarray, share: np.ndarray, begin: np.ndarray, side: int
+    ) -> np.ndarray:
+        """Coefficients (n, s, s) of the splines at the places of stars, from their first pixel on.
+
+        They are the means, by shares (n, 4), of the splines of four nodes (n, 4).
+        """
+        squares = np.empty((len(node), side, side))
+        for star, (column, row) in enumerate(begin.tolist()):
+            square = np.s_[row : row + side, column : column + side]
+            squares[star] = share[star, 0] * splines[node[star, 0]][square]
+            for corner in range(1, 4):
+                squares[star] += share[star, corner] * splines[node[star, corner]][square]
+        return squares
 
     def _nodes(self, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Numbers (n, 4) of the nodes around each place, and their shares in the PSF there."""
