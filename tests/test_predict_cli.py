@@ -16,6 +16,7 @@ from fits_inputs import write_cube, write_field
 from prediction_stars import SKY, observe
 from psfdae import StarFlag
 from psfdae.commands import predict as stage
+from psfdae.image.tables import COLUMNS
 from psfdae.model import prediction as writer
 from psfdae.model import psf_model as engine
 from psfdae.model.psf_model import SCALE_TOLERANCE
@@ -173,8 +174,9 @@ def test_page_lists_all_flags_and_columns():
     text = (ROOT / "docs/predict.md").read_text(encoding="utf-8")
     for flag in StarFlag:
         assert f"| `{flag.name}` | {int(flag)} |" in text
-    for name in ("id", *writer.COLUMNS):
-        assert f"`{name}`" in text, name
+    photometry = (ROOT / "docs/own_stars.md").read_text(encoding="utf-8")
+    for name in COLUMNS:
+        assert f"`{name}`" in text + photometry, name
     for extension, _ in writer.CUBES.values():
         assert f"| `{extension}` |" in text
     assert f"by up to {stage.MARGIN_PX} px" in text

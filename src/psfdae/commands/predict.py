@@ -269,10 +269,10 @@ def write_prediction(
     counts = np.zeros(len(StarFlag), dtype=int)
     done, clean, off = 0, 0, []
     history = " ".join(["psfdae", *sys.argv[1:]])  # without the folder of the program
-    header = (first[0], observation.count, _cards(source, observation), history)
+    header = (first[1], observation.count, _cards(source, observation), history)
     with prediction_file(out, model.bundle, *header) as file:
         for stamps, result in itertools.chain([first], pairs):
-            file.write(done, stamps, result)
+            file.write(done, result)
             counts += [(result.flags & int(flag) > 0).sum() for flag in StarFlag]
             clean += int((result.flags == 0).sum())
             off.append(_off(stamps, result))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -13,7 +13,7 @@ import numpy as np
 
 from psfdae.figures import StripRow, as_png, restoration_strip, spread_stars
 from psfdae.files import write_text
-from psfdae.image.stamps import Stamps
+from psfdae.image.tables import shown_with_digits
 from psfdae.method import Method, facts_of
 from psfdae.methods import method as method_of
 from psfdae.metrics import all_metrics, clustered_mean, mse, quality, summarised
@@ -21,7 +21,6 @@ from psfdae.model.field_psfs import PredictionError
 from psfdae.model.packing import COVERAGE, checksum
 from psfdae.model.photometry import signal_to_noise
 from psfdae.model.plot import FieldStars, psf_map
-from psfdae.model.prediction import Prediction
 from psfdae.model.psf_model import MARGIN_PX, PsfModel
 from psfdae.model.report import MEAN_PSF, SHOWN_STARS, Quality, fitted_mean, quality_page, standing
 from psfdae.model.star_sets import (
@@ -193,7 +192,7 @@ def _mean(values: np.ndarray, star: np.ndarray, usable: np.ndarray) -> tuple[flo
 def _stacked(rows: Sequence[Mapping[str, object]]) -> Table:
     from astropy.table import Table
 
-    return Table({name: [row[name] for row in rows] for name in rows[0]})
+    return shown_with_digits(Table({name: [row[name] for row in rows] for name in rows[0]}))
 
 
 def _joined(parts: Sequence[Mapping[str, Any]]) -> Table:
@@ -326,12 +325,12 @@ class Report:
     def page(self) -> str:
         """The HTML of the page; the PSFs of all stars of the image are predicted for it."""
         model, stars = self.model, self.stars
-        info, selection = model.info, stars.table
+        info, selection = model.info, stars.candidates.columns(stars.held_out)
         held = np.flatnonzero(selection["part"] == "held out")
-        where = np.stack([selection["x"][held], selection["y"][held]], axis=1)
+        where = stars.candidates.position[held]
         shown = held[spread_stars(where, SHOWN_STARS)] if np.isfinite(where).all() else held
         found, psf, residual = _all_stars(model, stars, shown[:SHOWN_STARS])
-        columns = {name: np.asarray(selection[name]) for name in ("verdict", "part")}
+        columns = {name: selection[name] for name in ("verdict", "part")}
         area, shown = info.noise_equivalent_px, shown[:SHOWN_STARS]
         kind = type(model.engine.estimator)
         levels, product = self.restored.items(), stars.product
@@ -376,9 +375,9 @@ def _all_stars(
     of_images = (
         model.stream(part.observation.with_margin(MARGIN_PX), threads=1) for part in stars.each
     )
-    for stamps, found in itertools.chain.from_iterable(of_images):
-        for name, value in itertools.chain(_per_star(stamps, ("x", "y")), _per_star(found)):
-            columns.setdefault(name, []).append(value)
+    for _, found in itertools.chain.from_iterable(of_images):
+        for name, values in found.columns().items():
+            columns.setdefault(name, []).append(values)
         psf.append(found.psf)
         inside = kept[(kept >= done) & (kept < done + len(found))] - done
         residual.append((inside + done, found.residual[inside]))
@@ -388,15 +387,6 @@ def _all_stars(
     joined = {name: np.concatenate(values) for name, values in columns.items()}
     joined["flags"] = joined["flags"].astype(int)
     return joined, np.concatenate(psf), rows
-
-
-def _per_star(
-    of: Stamps | Prediction, names: Iterable[str] = ()
-) -> Iterator[tuple[str, np.ndarray]]:
-    for name in names or of.__dataclass_fields__:
-        value = np.asarray(getattr(of, name))
-        if value.ndim == 1:
-            yield name, value
 
 
 def _map(found: Mapping[str, np.ndarray], psf: np.ndarray, stars: Stars) -> Figure:
