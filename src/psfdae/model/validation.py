@@ -6,6 +6,7 @@ import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +23,17 @@ from psfdae.model.packing import COVERAGE, checksum
 from psfdae.model.photometry import signal_to_noise
 from psfdae.model.plot import FieldStars, psf_map
 from psfdae.model.psf_model import MARGIN_PX, PsfModel
-from psfdae.model.report import MEAN_PSF, SHOWN_STARS, Quality, fitted_mean, quality_page, standing
+from psfdae.model.report import (
+    MEAN_PSF,
+    SHOWN_STARS,
+    Check,
+    Quality,
+    checks_html,
+    checks_of_held_out,
+    fitted_mean,
+    quality_page,
+    standing,
+)
 from psfdae.model.star_sets import (
     field_positions,
     noisy_test_images,
@@ -289,6 +300,33 @@ class Report:
         kind = type(self.model.engine.estimator)
         return standing(self.table, kind.name, kind.look.label)
 
+    def __repr__(self) -> str:
+        return f"Report({self.model.name!r}, {self})"
+
+    def _repr_html_(self) -> str:
+        """What the model comes down to, and its checks on held-out stars, for a notebook."""
+        return f"<p>{escape(str(self))}</p>{checks_html(self.checks())}"
+
+    def checks(self) -> list[Check]:
+        """Checks of the model on the stars held out: question, answer, and whether it is passed."""
+        errors = self.table, self.found, self._coverage, self._faint
+        return checks_of_held_out(self.model.info.method, *errors)
+
+    @property
+    def _faint(self) -> dict[float, dict[str, np.ndarray]]:
+        """The restored images by S/N."""
+        info = self.model.info
+        return {
+            signal_to_noise(info.kappa * level, info.noise_equivalent_px): images
+            for level, images in self.restored.items()
+        }
+
+    @property
+    def _coverage(self) -> dict[float, float]:
+        """Part of the errors within ± the stated 68 %, by S/N."""
+        rows = self.model.info.metrics
+        return {row["snr"]: row["coverage68"] for row in rows if "coverage68" in row}
+
     def save(self, path: str | Path) -> None:
         """Write the page, one HTML file that needs no other."""
         write_text(path, self.page())
@@ -331,9 +369,9 @@ class Report:
         shown = held[spread_stars(where, SHOWN_STARS)] if np.isfinite(where).all() else held
         found, psf, residual = _all_stars(model, stars, shown[:SHOWN_STARS])
         columns = {name: selection[name] for name in ("verdict", "part")}
-        area, shown = info.noise_equivalent_px, shown[:SHOWN_STARS]
+        shown = shown[:SHOWN_STARS]
         kind = type(model.engine.estimator)
-        levels, product = self.restored.items(), stars.product
+        product = stars.product
         test = split_stars(product, SPLIT, stars.settings).test
         row = product["row"][product["field_index"][test]]
         return quality_page(
@@ -345,8 +383,8 @@ class Report:
                 notes=stars.notes,
                 errors=self.table,
                 found=self.found,
-                coverage={r["snr"]: r["coverage68"] for r in info.metrics if "coverage68" in r},
-                faint={signal_to_noise(info.kappa * level, area): of for level, of in levels},
+                coverage=self._coverage,
+                faint=self._faint,
                 degraded={name: found[name][row] for name in ("x", "y", "flux")},
                 stars=found | columns,
                 residual=residual / found["noise"][shown, None, None],
