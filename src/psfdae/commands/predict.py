@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import sys
-from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated
@@ -25,6 +25,7 @@ from psfdae.model.field_psfs import PredictionError
 from psfdae.model.prediction import Prediction, prediction_file
 from psfdae.model.psf_model import MARGIN_PX, PsfModel, load_model
 from psfdae.options import File, NameOrNumber
+from psfdae.progress import silence
 
 
 @dataclass(frozen=True)
@@ -205,24 +206,20 @@ def restored(
         )
     if plot is not None and observation.positions is None:
         raise PredictionError(f"{source.path}: a map needs a catalogue with pixel positions")
-    hidden = quiet or not sys.stderr.isatty()
-    with click.progressbar(
-        length=observation.count, label="predict", show_pos=True, hidden=hidden, file=sys.stderr
-    ) as bar:
-        try:
-            # Its name is the last one to be there: it says that all is done.
-            with atomic_path(out) as unfinished:
-                done = (loaded, source, observation, unfinished, threads, bar.update)
-                counts, clean, off = write_prediction(*done, fixed_positions)
-                if found is not None:
-                    write_list(observation, found)
-                if plot is not None:
-                    from psfdae.model.plot import map_of_file
+    try:
+        # Its name is the last one to be there: it says that all is done.
+        with atomic_path(out) as unfinished, silence() if quiet else nullcontext():
+            work = (loaded, source, observation, unfinished, threads)
+            counts, clean, off = write_prediction(*work, fixed_positions)
+            if found is not None:
+                write_list(observation, found)
+            if plot is not None:
+                from psfdae.model.plot import map_of_file
 
-                    write_png(map_of_file(unfinished), plot)
-        except OSError as error:
-            said = error.strerror or error
-            raise PredictionError(f"{out}: cannot be written ({said})") from error
+                write_png(map_of_file(unfinished), plot)
+    except OSError as error:
+        said = error.strerror or error
+        raise PredictionError(f"{out}: cannot be written ({said})") from error
     flagged = zip(StarFlag, counts, strict=True)
     flags = "".join(f"\n  {flag.name}: {count}" for flag, count in flagged if count)
     clean_of = f"{out}: {observation.count} stars, {clean} without a flag{flags}"
@@ -257,7 +254,6 @@ def write_prediction(
     observation: Observation,
     out: Path,
     threads: int | None,
-    tick: Callable[[int], object] = lambda done: None,
     fixed: bool = False,
 ) -> tuple[np.ndarray, int, str | None]:
     """Write the file; number of stars with each flag, of those without any, and how good a list is.
@@ -277,7 +273,6 @@ def write_prediction(
             clean += int((result.flags == 0).sum())
             off.append(_off(stamps, result))
             done += len(result)
-            tick(len(result))
         said = list_offset(observation.catalogue, np.concatenate(off), source.accept_offset)
     return counts, clean, said if observation.shape else None
 

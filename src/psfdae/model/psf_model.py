@@ -49,6 +49,7 @@ from psfdae.model.photometry import FAINT_SNR, KEPT, NOISE_FLOOR, Photometer, Ph
 from psfdae.model.prediction import Prediction, measured_of, unmeasured
 from psfdae.model.wings import Wings, outer_light
 from psfdae.moments import measure_shapes
+from psfdae.progress import task
 from psfdae.threads import available_cores, in_order, side_by_side
 
 if TYPE_CHECKING:
@@ -267,7 +268,7 @@ class PsfModel(FieldPsfs):
 
         chunks = observation.chunks(max(size, min(ROWS, 4 * size)))
         list_columns, start = observation.list_columns, 0
-        with one_thread_each():
+        with one_thread_each(), task("stars", observation.count) as advance:
             for stamps, prediction in in_order(predicted, chunks, threads or available_cores()):
                 rows = slice(start, start + len(prediction))
                 start = rows.stop
@@ -282,6 +283,7 @@ class PsfModel(FieldPsfs):
                     stamps,
                     replace(prediction, ra=ra, dec=dec, list_columns=list_rows, unit=unit),
                 )
+                advance(len(prediction))
 
     @property
     def sha256(self) -> str:

@@ -43,6 +43,7 @@ from psfdae.model.star_sets import (
     training_set,
 )
 from psfdae.model.stars import REFERENCE, SPLIT, Stars
+from psfdae.progress import steps
 from psfdae.splits import Split
 from psfdae.threads import fixed_threads
 
@@ -130,7 +131,7 @@ def _measured(model: PsfModel, stars: Stars, methods: Mapping[str, Method]) -> R
     data_range = settings.evaluation.data_range
     key = {"dataset": stars.name, "split": SPLIT, "reference": REFERENCE}
     rows, per_star, restored, degraded = [], [], {}, {}
-    for level in settings.noise.levels:
+    for level in steps("stars held out", settings.noise.levels):
         noisy = degraded[level] = noisy_test_images(settings, product, parts.test, level)
         mean = fitted_mean(noisy, stars.mean_psf, settings.framing.jitter_px + 1.0)
         row = {**key, "method": MEAN_PSF, "noise_level": level}
