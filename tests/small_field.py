@@ -25,6 +25,37 @@ def field(seed=3):
     return noisy.astype(np.float32), place
 
 
+def moffat(fwhm):
+    """Profile of a star by its distance in px, of the light 1, β = 3."""
+    alpha = fwhm / 2 / np.sqrt(2 ** (1 / 3) - 1)
+    return lambda r: 2 / (np.pi * alpha**2) * (1 + (r / alpha) ** 2) ** -3
+
+
+def ring(r):
+    """Star out of focus: a disc of 7 px with a hole of 2.5 px, of the light 1 within 1 %."""
+    disc = 1 / (1 + np.exp((r - 7.0) / 0.5)) - 1 / (1 + np.exp((r - 2.5) / 0.5))
+    return np.clip(disc, 0, None) / 135.0
+
+
+def image_of(profile, flux, size, apart, seed=1, edge=20, half=40, over=4):
+    """Noisy image (size, size) of stars at least `apart` px from each other, and their places."""
+    rng, place = np.random.default_rng(seed), []
+    while len(place) < len(flux):
+        new = rng.uniform(edge, size - 1 - edge, 2)
+        if all(np.hypot(*(new - old)) >= apart for old in place):
+            place.append(new)
+    light = np.zeros((size + 2 * half, size + 2 * half))
+    axis = (np.arange((2 * half + 1) * over) + 0.5) / over - 0.5 - half
+    for (x, y), total in zip(place, flux, strict=True):
+        column, row = round(x), round(y)
+        r = np.hypot(axis - (x - column), axis[:, None] - (y - row))
+        star = profile(r).reshape(2 * half + 1, over, 2 * half + 1, over).mean((1, 3))
+        light[row : row + 2 * half + 1, column : column + 2 * half + 1] += total * star
+    light = light[half:-half, half:-half]
+    noise = rng.normal(0, READ / GAIN, light.shape)
+    return rng.poisson((light + SKY) * GAIN) / GAIN + noise, np.array(place)
+
+
 def header(**cards):
     """Cards of the camera, and others."""
     camera = {"GAIN": GAIN, "RDNOISE": READ, "SATURATE": 6e4, "PIXSCALE": 0.6}

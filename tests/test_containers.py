@@ -1,12 +1,16 @@
-"""Images in any container, layers of pipelines' files, and headers that contradict the pixels."""
+"""Images of any kind, in any container; layers of files, and headers that contradict pixels."""
 
 from __future__ import annotations
 
 import pickle
+import re
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 
 import numpy as np
 import pytest
 from astropy import units as u
+from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from astropy.nddata import (
     CCDData,
@@ -15,13 +19,30 @@ from astropy.nddata import (
     StdDevUncertainty,
     VarianceUncertainty,
 )
+from astropy.table import QTable
 from astropy.wcs import WCS
 
-from command_line import refused
-from psfdae import Error, PsfModel, Stars
+from command_line import psfdae, refused
+from docs_pages import read
+from image_training import WORDS, few_draws
+from psfdae import Error, PsfModel, Stars, fit
+from psfdae.commands import from_stars
 from psfdae.image.fits_file import science_images
 from psfdae.image.observation import Source
-from small_field import CAMERA, GAIN, READ, SIZE, SKY, field, header, write
+from small_field import (
+    CAMERA,
+    GAIN,
+    READ,
+    SIZE,
+    SKY,
+    field,
+    header,
+    image_of,
+    moffat,
+    ring,
+    table,
+    write,
+)
 
 
 @pytest.fixture(scope="module")
@@ -68,6 +89,132 @@ def test_the_mask_of_a_container_is_that_of_the_keyword(image, place, bad, name)
     expected = verdicts(image, place, mask=bad, **CAMERA)
     assert 0 < expected.count("incomplete") < len(expected) / 2
     assert verdicts(CONTAINERS[name](image, bad), place, **CAMERA) == expected
+
+
+# The four lines of Python: each container, with each kind of list.
+
+QUICK = {"orders": [0], "modes": 4, "step_px": 1.0, "spacing_px": 1.0}
+SKY_PLACE = WCS(header(CTYPE1="RA---TAN", CTYPE2="DEC--TAN", CDELT1=-1e-4, CDELT2=1e-4))
+
+
+def model_of(image, catalogue):
+    """What a process gives back: stars, their model, and a prediction."""
+    stars = Stars.from_image(image, catalogue=catalogue, train_stars=30, test_stars=10, **CAMERA)
+    with few_draws():
+        model = fit(stars, method="field", **QUICK)
+    return stars, model, model.predict(np.ones((1, 16, 16)))
+
+
+@pytest.fixture(scope="module")
+def expected(image, place):
+    """By another process, which pickles what it gives back."""
+    with ProcessPoolExecutor(1, get_context("fork")) as pool:
+        return pool.submit(model_of, image, place).result()
+
+
+def listed(place, kind):
+    """Positions as a list of a kind."""
+    lists = {
+        "Table": lambda: table(place),
+        "QTable": lambda: QTable({"x_fit": place[:, 0] * u.pix, "y_fit": place[:, 1] * u.pix}),
+        "SkyCoord": lambda: SkyCoord(*SKY_PLACE.all_pix2world(*place.T, 0), unit="deg"),
+        "array": lambda: place,
+        "pairs": lambda: [tuple(xy) for xy in place],
+    }
+    return lists[kind]()
+
+
+@pytest.mark.parametrize(
+    ("container", "kind"),
+    [
+        (lambda image: image, "pairs"),
+        (lambda image: np.ma.MaskedArray(image, np.zeros(image.shape, bool)), "Table"),
+        (lambda image: CCDData(image, unit="adu", wcs=SKY_PLACE), "SkyCoord"),
+        (NDData, "QTable"),
+        (lambda image: fits.PrimaryHDU(image, header()), "array"),
+        (lambda image: fits.HDUList([fits.PrimaryHDU(image, header())]), "path"),
+        ("image.fits", "array"),
+    ],
+)
+def test_any_container_and_any_list_give_the_same_model(
+    tmp_path, monkeypatch, image, place, expected, container, kind
+):
+    monkeypatch.chdir(tmp_path)
+    write("image.fits", image)
+    listed(place, "Table").write("stars.csv")
+    given = container if isinstance(container, str) else container(image)
+    stars, model, _ = model_of(given, "stars.csv" if kind == "path" else listed(place, kind))
+    weights = (m.bundle.weights["coefficients"] for m in (model, expected[1]))
+    np.testing.assert_allclose(*weights, rtol=1e-4, atol=1e-8)
+    assert len(stars) == len(expected[0]) and repr(stars).count("\n") == 0
+
+
+def test_what_a_process_gives_back_is_as_good_as_its_own(expected):
+    stars, model, found = pickle.loads(pickle.dumps(expected))
+    assert stars.settings == expected[0].settings and repr(stars) == repr(expected[0])
+    assert f"{len(stars)} stars" in repr(stars) and f"{len(found)} stars" in repr(found)
+    again = model.predict(np.ones((1, 16, 16)))
+    np.testing.assert_array_equal(again.flux, found.flux)
+    for result in (stars, found):
+        assert "<table>" in result._repr_html_() and len(result._repr_html_()) < 2000
+
+
+# The tutorial's table: images of these kinds, by a word of their row.
+
+KINDS = {
+    "cosmic": lambda image: image + 3e3 * (np.random.default_rng(1).random(image.shape) < 1e-3),
+    "faint": lambda _: image_of(moffat(2.8), np.geomspace(8e2, 6e3, 70), 300, 16)[0],
+    "NaN": lambda image: np.where(np.arange(SIZE)[:, None] // 10 == 10, np.nan, image),
+    "zeros": lambda image: np.pad(image, 20),
+    "few": lambda _: image_of(moffat(2.6), np.geomspace(3e4, 2e5, 8), 160, 25)[0],
+    "ring": lambda _: image_of(ring, np.geomspace(5e4, 1e6, 40), 300, 28)[0],
+    "crowded": lambda _: image_of(moffat(2.6), np.geomspace(1e4, 1e5, 80), 220, 6)[0],
+    "MJy/sr": lambda image: 1e-18 * (image - SKY),
+    "SCI": lambda image: image,
+    "colour": lambda image: np.stack(3 * [image]),
+    "header": lambda image: image,
+    "list": lambda image: image,
+}
+ROWS = re.findall(r"^\| (is .*|has .*|comes .*) \| (.*) \| (.*)\|$", read("docs/tutorial.md"), re.M)
+
+
+@pytest.mark.parametrize(
+    "is_trained",
+    [False, pytest.param(True, marks=[pytest.mark.slow, pytest.mark.written])],
+)
+@pytest.mark.parametrize("row", ROWS, ids=lambda row: row[0][:30])
+def test_an_image_of_the_tutorials_table_gives_what_it_says(
+    tmp_path, monkeypatch, image, place, row, is_trained
+):
+    monkeypatch.chdir(tmp_path)
+    what, happens, typed = row
+    (kind,) = [kind for kind in KINDS if kind in what]
+    pixels = KINDS[kind](image).astype(np.float32)
+    write("image.fits", pixels, **({"BUNIT": "MJy/sr"} if kind == "MJy/sr" else {}))
+    if kind == "header":
+        fits.writeto("image.fits", pixels, overwrite=True)
+    if kind == "SCI":
+        pipeline_file("image.fits", image, image > 5e4)
+    write("mask.fits", np.zeros(pixels.shape, np.uint8))
+    daophot = [f"{k} {x + 1:.3f} {y + 1:.3f} 15.0 0.01" for k, (x, y) in enumerate(place, 1)]
+    (tmp_path / "list.als").write_text(
+        "\n".join([" NL NX NY LOWBAD", " 1 300 300 1.0", "", *daophot])
+    )
+    if not is_trained:
+        monkeypatch.setattr(from_stars, "_make", notes_alone)
+    output = ""
+    for option in ["", *re.findall("`(--[a-z]+[- ][^`]*)`", typed)]:
+        words = [*option.split(), *([] if "--catalogue" in option else ["--detect"])]
+        with few_draws():
+            done = psfdae("from-stars", "image.fits", *words, *WORDS, "--out", "m", "--overwrite")
+        assert done.exit_code == (2 if "refused" in happens else 0), done.output
+        output += done.output
+    assert all(said in output for said in re.findall("`([^`]+)`[.,]", happens)), output
+
+
+def notes_alone(settings, sources, *_):
+    """What `from-stars` says of an image before it trains."""
+    return "\n".join(Stars.of(sources, settings).notes)
 
 
 @pytest.mark.parametrize("kind", [fits.PrimaryHDU, fits.CompImageHDU])

@@ -110,7 +110,9 @@ class Prediction:
     0
     >>> found
     Prediction(36 stars of 16×16 px, 36 without a flag)
-    >>> found.to_table()["x", "y", "flux", "flux_error"][:1].pprint()
+    >>> table = found.to_table()
+    >>> table.colnames[:5], table["flux"].unit
+    (['id', 'x', 'y', 'flux', 'flux_error'], Unit("adu"))
     """
 
     id: np.ndarray

@@ -86,9 +86,8 @@ class Stars:
     Examples
     --------
     >>> stars = psfdae.Stars.from_image(image, catalogue=xy, **camera)
-    >>> print(stars.summary())
-    36 stars: 36 good
-    29 to learn from, 7 held out
+    >>> stars
+    Stars('array', 36 stars (29 to learn from, 7 held out) of 36)
     >>> [str(part) for part in stars.table["part"][:2]]
     ['training', 'held out']
     """
