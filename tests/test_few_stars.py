@@ -11,7 +11,7 @@ from psfdae.image.stamps import StarFlag
 from psfdae.model.crowded import photometry
 from psfdae.model.packing import Errors
 from psfdae.model.psf_model import MARGIN_PX
-from psfdae.model.settings import from_words, settings_model, with_keywords
+from psfdae.model.settings import from_words
 from small_field import GAIN, READ, SKY, image_of, moffat, ring
 
 CAMERA = {"gain": GAIN, "read_noise": READ, "pixel_scale_arcsec": 0.6}
@@ -37,14 +37,6 @@ def rings():
 # As many stars as there are
 
 
-def test_few_bright_stars_are_enough():
-    image, place = image_of(moffat(2.6), np.geomspace(3e4, 2e5, 8), 160, 25)
-    stars = psfdae.Stars.from_image(image, catalogue=place, **CAMERA)
-    assert len(stars) == 8 and 1 <= stars.held_out.sum() <= 3
-    assert stars.settings.calibration_stars.snr_min == 100
-    assert any("few stars" in note for note in stars.notes)
-
-
 def test_faint_stars_lower_the_least_signal_to_noise():
     image, place = image_of(moffat(2.8), np.geomspace(8e2, 6e3, 70), 300, 16)
     stars = psfdae.Stars.from_image(image, catalogue=place, **CAMERA)
@@ -52,8 +44,6 @@ def test_faint_stars_lower_the_least_signal_to_noise():
     assert len(stars) >= 20 and 20 <= least < 100
     assert stars.candidates.bright.snr.min() >= least
     assert max(stars.settings.calibration_stars.degraded()) <= least / 2
-    stated = psfdae.Stars.from_image(image, catalogue=place, snr_min=30, **CAMERA)
-    assert stated.settings.calibration_stars.snr_min == 30
 
 
 def test_refusal_names_the_options():
@@ -132,8 +122,6 @@ def test_stated_size_is_taken_as_it_is():
     assert from_words(["framing.jitter_px=1"]).calibration_stars.light_min > 0.9
     both = ["framing.stamp_px=24", "calibration_stars.light_min=0.9"]
     assert from_words(both).calibration_stars.light_min == 0.9
-    stated = with_keywords(settings_model()(), ("framing", "calibration_stars"), {"stamp_px": 24})
-    assert stated.calibration_stars.light_min == 0.0
 
 
 @pytest.mark.parametrize("kind", ["wide", "rings"])

@@ -111,7 +111,6 @@ def test_tables_have_units_digits_and_the_columns_of_the_list(tmp_path):
     of_list = Table({"Flux": [1, 2], "flux_list": ["=1+1", "é"], "mag": [3.0, 4.0] * u.mag})
     table = star_table(columns, "electron / s", of_list)
     names = ["id", "x", "flux", "Flux_list", "flux_list_list", "mag"]
-    assert any("5.0000" in line for line in table.pformat())
     for suffix in SUFFIXES:
         write_table(tmp_path / f"t{suffix}", table)
         again = QTable.read(tmp_path / f"t{suffix}")

@@ -128,7 +128,7 @@ def fits_values(column: Column) -> np.ndarray:
     """Return a column of a table as a FITS table holds it, shape (n,).
 
     Text is ASCII, as wide as the column, with question marks for other characters. Real numbers
-    that are missing are NaN, whole ones the least or the greatest of their type (`_missing`).
+    that are missing are NaN, whole ones the least of their type.
     """
     unmasked = getattr(column, "unmasked", column)
     values = np.ma.getdata(np.asarray(getattr(unmasked, "value", unmasked)))
@@ -137,8 +137,11 @@ def fits_values(column: Column) -> np.ndarray:
         width = max(values.dtype.itemsize // (4 if values.dtype.kind == "U" else 1), 1)
         texts = ["" if m else v for v, m in zip(values.tolist(), is_missing, strict=True)]
         return np.array([ascii_bytes(text) for text in texts], dtype=f"S{width}")
-    if values.dtype.kind == "u" or values.dtype == np.int8:  # FITS has no such types
+    # FITS has 16, 32 and 64 bits of whole numbers with a sign, 32 and 64 of real ones.
+    if values.dtype.kind == "u" or values.dtype == np.int8:
         values = values.astype(np.float64 if values.dtype.itemsize == 8 else np.int64)
+    elif values.dtype.kind == "f" and values.dtype.itemsize not in (4, 8):
+        values = values.astype(np.float64)
     if is_missing.any():
         values = np.where(is_missing, _missing(values.dtype), values).astype(values.dtype)
     return values
