@@ -20,34 +20,18 @@ from psfdae.model import crowded
 from psfdae.model.fitting import fitted_to
 from psfdae.model.neighbours import _Field
 from psfdae.model.stars import Stars
+from small_field import CAMERA, SKY, drawn, moffat, noisy
 
-SIDE, GAIN, SKY = 320, 1.5, 300.0
-CAMERA = {"gain": GAIN, "read_noise": 5.0, "saturate": 6e4, "pixel_scale_arcsec": 1.0}
-
-
-def star(side, x, y, fwhm, beta=3.0, fine=5):
-    """A Moffat profile of flux 1, integrated over pixels, in a stamp."""
-    axis = (np.arange(side * fine) + 0.5) / fine - 0.5
-    alpha = fwhm / 2 / np.sqrt(2 ** (1 / beta) - 1)
-    image = (1 + ((axis - x) ** 2 + (axis[:, None] - y) ** 2) / alpha**2) ** -beta
-    return image.reshape(side, fine, side, fine).mean((1, 3)) * (beta - 1) / (np.pi * alpha**2)
+SIDE = 320
 
 
-def field(fwhm=2.8, side=SIDE, spacing=32, seed=1):
+def field(fwhm=2.8, spacing=32):
     """A noisy image of stars on a jittered lattice, their places (n, 2) and fluxes."""
-    rng = np.random.default_rng(seed)
-    lattice = np.arange(spacing // 2, side, spacing)
+    rng, lattice = np.random.default_rng(1), np.arange(spacing // 2, SIDE, spacing)
     place = np.stack(np.meshgrid(lattice, lattice), axis=-1).reshape(-1, 2)
     place = place + rng.uniform(-4, 4, place.shape)
     flux = 10 ** rng.uniform(4.2, 5.3, len(place))
-    image, half = np.zeros((side + 60, side + 60)), 30
-    for (x, y), f in zip(place, flux, strict=True):
-        column, row = round(x), round(y)
-        stamp = np.s_[row : row + 2 * half + 1, column : column + 2 * half + 1]
-        image[stamp] += f * star(2 * half + 1, half + x - column, half + y - row, fwhm)
-    image = image[half:-half, half:-half]
-    noisy = rng.poisson((image + SKY) * GAIN) / GAIN + rng.normal(0, 5 / GAIN, image.shape)
-    return noisy, place, flux
+    return noisy(drawn(moffat(fwhm), place, flux, SIDE), rng), place, flux
 
 
 @pytest.fixture(scope="module")
@@ -194,7 +178,7 @@ def test_completed_stars_are_their_neighbours_scaled():
     """Equal stars of other fluxes: a bad pixel gets what the star has there."""
     rng = np.random.default_rng(3)
     shift = rng.uniform(-0.5, 0.5, (20, 2))
-    shape = np.stack([star(32, 16 + x, 16 + y, 3.0) for y, x in shift])
+    shape = np.stack([drawn(moffat(3.0), [(16 + x, 16 + y)], [1.0], 32) for y, x in shift])
     flux = rng.uniform(1e4, 1e5, 20)
     wide, bad = shape * flux[:, None, None], np.zeros(shape.shape, bool)
     bad[7, 16, 17] = True
@@ -246,7 +230,7 @@ def test_noise_of_few_counts_has_no_blank_areas():
         assert not bad_pixels.blank_areas(image, np.zeros(image.shape, bool))
     # Nor has the even sky of an image without noise, where the light of stars ends.
     image = np.full((256, 256), 7.0)
-    image[100:132, 100:132] += 1e4 * star(32, 16, 16, 3.0)
+    image[100:132, 100:132] += drawn(moffat(3.0), [(16, 16)], [1e4], 32)
     none = np.zeros(image.shape, bool)
     assert not bad_pixels.blank_areas(image, none)
     assert bad_pixels.least_value_share(image, none)[0] == 0

@@ -26,6 +26,7 @@ import numpy as np
 
 from psfdae.bright_stars import BrightStars
 from psfdae.moments import windowed_centres
+from psfdae.progress import Advance, task
 
 FIT_ROUNDS = 3  # of splines, centres and fluxes; with more, centres follow what splines cannot
 CENTRE_STEPS, LEFT_OUT_STEPS = 2, 5  # of Gauss-Newton in a round, and for a star that was left out
@@ -176,7 +177,29 @@ def fit_field(
     """
     alternating = _Alternating(stars, background, frame_px, stamp_px, spacing, smoothness)
     tried = _supported(orders, stars)
-    if len(orders) == 1 or len(stars) < 3:
+    # Fits: all orders, with magnitude and colour, all smoothnesses, the last one and four more.
+    with task("field", len(tried) + 2 + SMOOTHER + 5) as alternating.advance:
+        return _best_fit(alternating, tried, len(orders) == 1 or len(stars) < 3, rng)
+
+
+def _best_fit(
+    alternating: _Alternating,
+    tried: Sequence[int],
+    is_settled: bool,
+    rng: np.random.Generator | None,
+) -> FieldFit:
+    """The fit whose order, terms and smoothness predict stars best that are left out.
+
+    Parameters
+    ----------
+    alternating : _Alternating
+    tried : sequence of int
+        Orders, ascending.
+    is_settled : bool
+        Nothing is tried: the fit is that of the first order.
+    rng : Generator, optional
+    """
+    if is_settled:
         return alternating.with_errors(alternating.fit(tried[0]), rng)
     alternating.tolerance, best, least = TRIED_TOLERANCE, 0, np.inf
     for order in tried:
@@ -275,6 +298,7 @@ class _Alternating:
             self.low, self.high = prior.low, prior.high
         bend = np.diff(np.eye(self.knots), 2, axis=0)
         self.bend = bend.T @ bend
+        self.advance: Advance = lambda fits: None
 
     def fit(self, order: int) -> FieldFit:
         """All stars."""
@@ -313,6 +337,7 @@ class _Alternating:
             if turn:
                 good = chi2 < UNLIKE_CHI2 * np.median(chi2)
         assert found is not None
+        self.advance(1)
         model = FieldModel(found, low, high, self.spacing)
         return FieldFit(model, flux, centre, good, residual)
 

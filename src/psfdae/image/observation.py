@@ -17,6 +17,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -49,6 +50,7 @@ from psfdae.image.list_origin import TOLERANCE_PX, origin_of
 from psfdae.image.stamps import Stamps, StarFlag, cut, raise_flag, sky_around
 
 if TYPE_CHECKING:
+    from astropy.table import Table
     from astropy.units import Quantity
     from astropy.wcs import WCS
 
@@ -198,7 +200,8 @@ class Source:
                 raise_flag(flags, StarFlag.BLENDED, again)
                 remarks += _on_pairs(table, again)
         names = (self.flux_column, self.background_column, self.colour_column)
-        columns = [identifiers, *(self._column(table, name, count) for name in names), flags]
+        of_list = (self._column(table, name, count) for name in names)
+        columns = [identifiers, np.arange(count), *of_list, flags]
         if self.on_image and positions is not None and not is_cube:
             kept = _inside(positions, shape)
             columns, positions = [column[kept] for column in columns], positions[kept]
@@ -215,6 +218,7 @@ class Source:
             found=table if self.detect is not None else None,
             colour_column=self.colour_column,
             remarks=tuple(remarks),
+            _list=table if self.detect is None else None,
             _columns=columns,
             _layers=layers,
         )
@@ -756,7 +760,9 @@ class Observation:
     found: Catalogue | None  # that made in its place
     colour_column: str | None  # of the star list
     remarks: tuple[str, ...]  # sentences on what was found in the file or the list, and used or not
-    _columns: list[np.ndarray] = field(repr=False)  # identifiers, flux, sky, colour and flags
+    _list: Catalogue | None = field(repr=False)  # all of it, also stars that are off the image
+    # Identifiers, rows of the list, flux, sky, colour and flags.
+    _columns: list[np.ndarray] = field(repr=False)
     _layers: Layers = field(repr=False)
     # Light of other stars in the stamps of a part of the list, of a side and with a margin in px.
     others: Callable[[slice, int, int], np.ndarray] | None = field(default=None, repr=False)
@@ -800,10 +806,13 @@ class Observation:
         return self._layers.sky()
 
     def on_sky(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-        """ICRS coordinates in degrees of 0-based pixels (n,); None without a celestial WCS."""
+        """ICRS coordinates in degrees of 0-based pixels (n,).
+
+        None without a celestial WCS, and of a cube of stamps.
+        """
         from astropy.wcs.utils import pixel_to_skycoord
 
-        if (wcs := self._layers.image.wcs) is None:
+        if self.shape is None or (wcs := self._layers.image.wcs) is None:
             return None
         with reading(self.path):
             place = pixel_to_skycoord(x, y, wcs).icrs
@@ -842,6 +851,11 @@ class Observation:
     def identifiers(self) -> np.ndarray:
         """Names of the stars, by the list if it says any, shape (n,)."""
         return self._columns[0]
+
+    @cached_property
+    def list_columns(self) -> Table | None:
+        """Further columns of the star list, with a row for each star; None without a list."""
+        return None if self._list is None else self._list.columns(self._columns[1])
 
     @property
     def list_flags(self) -> np.ndarray:
@@ -973,7 +987,7 @@ class Observation:
         listed = np.full((len(data), 2), np.nan)
         if self.shape is not None:
             listed = np.stack([y - central_pixel(y), x - central_pixel(x)], axis=1)
-        ids, flux, background, colour, flags = (column[part].copy() for column in self._columns)
+        ids, _, flux, background, colour, flags = (column[part].copy() for column in self._columns)
         raise_flag(flags, StarFlag.TRUNCATED, truncated)
         if self.shape is not None:
             # A cosmic ray within a pixel of the position: it may be no star.

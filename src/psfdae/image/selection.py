@@ -19,14 +19,11 @@ import numpy as np
 from psfdae.bright_stars import DEFECT, BrightStars
 from psfdae.errors import Error
 from psfdae.image.bad_pixels import interpolated_stamps
-from psfdae.image.errors import no_formula
 from psfdae.image.observation import Observation, central_pixel
 from psfdae.image.stamps import Stamps, StarFlag, cut, peaks, sky_around, softened
 from psfdae.moments import FWHM_OF_SIGMA, moved, robust_scatter, windowed_centres
 
 if TYPE_CHECKING:
-    from astropy.table import Table
-
     from psfdae.settings import CalibrationStars, Stamp
 
 ROWS = 2048  # stars that are measured at a time
@@ -104,22 +101,19 @@ class Candidates:
         found = Counter(self.verdict.tolist())
         return ", ".join(f"{found[v]} {v}" for v in map(str, Verdict) if found[v])
 
-    def table(self, held_out: np.ndarray) -> Table:
-        """Every star of the catalogue, and which of the good ones are held out."""
-        from astropy.table import Table
-
+    def columns(self, held_out: np.ndarray) -> dict[str, np.ndarray]:
+        """Columns of every star of the list, and which of the good ones are held out, (n,) each."""
         part = np.full(len(self.verdict), "", dtype="<U8")
         part[self.bright.row] = np.where(held_out, "held out", "training")
-        return Table(
-            {
-                "id": self.id if self.id.dtype.kind == "i" else [no_formula(n) for n in self.id],
-                "x": self.position[:, 0],
-                "y": self.position[:, 1],
-                "snr": self.snr,
-                "verdict": self.verdict,
-                "part": part,
-            }
-        )
+        x, y = self.position.T
+        return {
+            "id": self.id,
+            "x": x,
+            "y": y,
+            "snr": self.snr,
+            "verdict": self.verdict,
+            "part": part,
+        }
 
 
 def collect(

@@ -38,6 +38,7 @@ from psfdae.method import (
 )
 from psfdae.moments import measure_shapes, moving_matrices, robust_scatter
 from psfdae.noise import NoiseModel
+from psfdae.progress import steps
 from psfdae.rng import stream
 
 OWN_NOISE = 0.5
@@ -401,13 +402,13 @@ def _residuals(
     weight = (signal + 1e-12) / (signal + 1e-12 + own)
     weight /= weight.sum()
     left = OWN_NOISE * float(weight @ noise**2)
-    steps = phases_of(step_px)[:, None, None] - centre
+    shifts = phases_of(step_px)[:, None, None] - centre
     rows, columns = (
-        np.array([moving_matrices(side, row) for row in steps[..., axis]]) for axis in (0, 1)
+        np.array([moving_matrices(side, row) for row in shifts[..., axis]]) for axis in (0, 1)
     )
     columns = columns.transpose(0, 1, 3, 2)
     found = []
-    for row in rows:
+    for row in steps("residuals", rows):
         half = row @ residual
         for column in columns:
             moved = (half @ column).reshape(len(residual), -1)

@@ -59,6 +59,7 @@ from psfdae.model.star_sets import (
 )
 from psfdae.model.wings import Wings
 from psfdae.noise import NoiseModel
+from psfdae.progress import steps
 from psfdae.rng import stream
 from psfdae.settings import OfTest
 from psfdae.version import __version__
@@ -401,7 +402,7 @@ def measure_errors(
     distance = np.empty((len(nodes), star.size))
     scores = []
     free = with_free_flux(fitted)
-    for place, noise in enumerate(nodes):
+    for place, noise in enumerate(steps("errors of PSFs", nodes)):
         level = noise / stars.noise.kappa
         noisy = stars.noise.draw(stars.images[star], level, rng)
         estimate = fitted.estimate(noisy, level, stars.position[star])
@@ -455,7 +456,7 @@ def with_scales(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -
     shape = 2, len(CASES)  # the noise is known, or estimated
     noise = np.tile(nodes, (*shape, 1))
     width, of_flux = np.ones((2, *shape, 2, len(nodes))), np.ones(len(nodes))
-    for place, node in enumerate(nodes):
+    for place, node in enumerate(steps("errors of fluxes", nodes)):
         noisy, star = _noisy(stars, node, rng)
         images, position = (np.concatenate([a, a]) for a in (noisy, stars.position[star]))
         levels = np.repeat([node, np.nan], len(star))

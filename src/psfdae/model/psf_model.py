@@ -49,6 +49,7 @@ from psfdae.model.photometry import FAINT_SNR, KEPT, NOISE_FLOOR, Photometer, Ph
 from psfdae.model.prediction import Prediction, measured_of, unmeasured
 from psfdae.model.wings import Wings, outer_light
 from psfdae.moments import measure_shapes
+from psfdae.progress import task
 from psfdae.threads import available_cores, in_order, side_by_side
 
 if TYPE_CHECKING:
@@ -214,7 +215,7 @@ class PsfModel(FieldPsfs):
             threads = min(threads or available_cores(), max(len(blocks), 1))
             work = (lambda block: self.engine.block(block, fixed), blocks or [stars], threads)
             parts = side_by_side(*work)
-        return Prediction.joined(parts)
+        return replace(Prediction.joined(parts), unit=unit)
 
     def _stamps(
         self,
@@ -266,8 +267,23 @@ class PsfModel(FieldPsfs):
             return Prediction.joined([self.engine.block(block, fixed) for block in blocks])
 
         chunks = observation.chunks(max(size, min(ROWS, 4 * size)))
-        with one_thread_each():
-            yield from in_order(predicted, chunks, threads or available_cores())
+        list_columns, start = observation.list_columns, 0
+        with one_thread_each(), task("stars", observation.count) as advance:
+            for stamps, prediction in in_order(predicted, chunks, threads or available_cores()):
+                rows = slice(start, start + len(prediction))
+                start = rows.stop
+                # The star on the sky, by its own centre where the model measures one.
+                x = np.where(np.isfinite(prediction.x_fit), prediction.x_fit, prediction.x)
+                y = np.where(np.isfinite(prediction.y_fit), prediction.y_fit, prediction.y)
+                sky = observation.on_sky(x, y)
+                ra, dec = (None, None) if sky is None else sky
+                list_rows = None if list_columns is None else list_columns[rows]
+                unit = observation.unit
+                yield (
+                    stamps,
+                    replace(prediction, ra=ra, dec=dec, list_columns=list_rows, unit=unit),
+                )
+                advance(len(prediction))
 
     @property
     def sha256(self) -> str:
@@ -571,7 +587,12 @@ class Engine:
         if restored.of_star:  # whose errors have the photons
             photons[:] = 0.0
         flux_error = np.sqrt((of_flux * found.flux_error) ** 2 + photons)
+        fluxes: dict[str, Any] = self._with_wings(stars, found, flux_error)
+        centres: dict[str, Any] = restored.of_star or unmeasured(len(stars))
         return Prediction(
+            id=stars.id,
+            x=stars.x,
+            y=stars.y,
             psf=psf,
             residual=residual,
             uncertainty=uncertainty,
@@ -579,7 +600,7 @@ class Engine:
             ratio95_bright=ratios[:, 1],
             flux=found.flux,
             flux_error=flux_error,
-            **self._with_wings(stars, found, flux_error),
+            **fluxes,
             noise=found.noise,
             snr=snr,
             chi2=chi2,
@@ -591,7 +612,7 @@ class Engine:
             shift_x=seen.shift[:, 1],
             shift_y=seen.shift[:, 0],
             flags=flags,
-            **(restored.of_star or unmeasured(len(stars))),
+            **centres,
         )
 
     def _with_wings(

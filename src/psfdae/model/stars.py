@@ -6,6 +6,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +15,7 @@ import numpy as np
 from psfdae.bright_stars import BrightStars
 from psfdae.files import Column, Product
 from psfdae.image.containers import as_images
-from psfdae.image.errors import ObservationError, no_formula
+from psfdae.image.errors import ObservationError
 from psfdae.image.observation import (
     ASSUMED_SCALE,
     Observation,
@@ -24,6 +25,7 @@ from psfdae.image.observation import (
 )
 from psfdae.image.selection import Candidates, Verdict, advice, collect
 from psfdae.image.source_size import SourceSize, measure_size
+from psfdae.image.tables import html_table, star_table
 from psfdae.image.training_images import single_psf, star_grid, training_columns
 from psfdae.model.psf_model import SCALE_TOLERANCE
 from psfdae.model.settings import IMAGE_GROUPS, Settings, settings_model, with_keywords
@@ -32,7 +34,7 @@ from psfdae.settings import Noise
 from psfdae.splits import held_out_fields
 
 if TYPE_CHECKING:
-    from astropy.table import Table
+    from astropy.table import QTable
     from astropy.units import Quantity
 
     from psfdae.image.catalogue import StarList
@@ -84,9 +86,8 @@ class Stars:
     Examples
     --------
     >>> stars = psfdae.Stars.from_image(image, catalogue=xy, **camera)
-    >>> print(stars.summary())
-    36 stars: 36 good
-    29 to learn from, 7 held out
+    >>> stars
+    Stars('array', 36 stars (29 to learn from, 7 held out) of 36)
     >>> [str(part) for part in stars.table["part"][:2]]
     ['training', 'held out']
     """
@@ -313,7 +314,23 @@ class Stars:
         return bool(crowded >= MANY_CROWDED * max(len(self), ENOUGH_STARS))
 
     def __repr__(self) -> str:
-        return f"Stars({str(self.observation.path)!r}, {self.summary()})"
+        held = int(self.held_out.sum())
+        return (
+            f"Stars({str(self.observation.path)!r}, {len(self)} stars ({len(self) - held} to learn "
+            f"from, {held} held out) of {len(self.candidates.verdict)})"
+        )
+
+    def _repr_html_(self) -> str:
+        """Counts of the stars, for a notebook."""
+        held, images = int(self.held_out.sum()), len(self.each)
+        rows = [
+            ["image", escape(self.observation.path.name)],
+            ["stars", f"{len(self)}: {len(self) - held} to learn from, {held} held out"],
+            [f"of {len(self.candidates.verdict)}", self.candidates.count()],
+            ["stamps", f"{self.settings.framing.stamp_px} px"],
+        ]
+        rows += [["images", str(images)]] if images > 1 else []
+        return html_table(["Stars", ""], rows)
 
     @property
     def name(self) -> str:
@@ -338,16 +355,22 @@ class Stars:
         )
 
     @property
-    def table(self) -> Table:
-        """Every star of the image: place, S/N, why it is not used, and its part."""
-        table = self.candidates.table(self.held_out)
+    def table(self) -> QTable:
+        """Every star: place, S/N, why it is not used, its part, and further columns of its list.
+
+        `psfdae.image.tables.star_table` says which names and units the columns have.
+        """
+        from astropy.table import vstack
+
+        columns = self.candidates.columns(self.held_out)
         if self.exposures:
-            names, counts = zip(
-                *((no_formula(s.observation.path.name), s.observation.count) for s in self.each),
-                strict=True,
-            )
-            table.add_column(np.repeat(names, counts), name="image", index=0)
-        return table
+            counts = [one.observation.count for one in self.each]
+            names = [one.observation.path.name for one in self.each]
+            columns = {"image": np.repeat(names, counts), **columns}
+        of_lists = [one.observation.list_columns for one in self.each]
+        known = [of_list for of_list in of_lists if of_list is not None]
+        of_list = vstack(known) if len(known) == len(of_lists) else None
+        return star_table(columns, self.observation.unit, of_list)
 
     @cached_property
     def product(self) -> Product:
