@@ -25,7 +25,7 @@ def lines(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         # Errors of models are measured on few noisy images.
-        for name, value in (("NODES", 3), ("LEAST_STARS", 60), ("FEW_STARS", 40)):
+        for name, value in (("NODES", 3), ("FEW_STARS", 40)):
             patch.setattr(packing, name, value)
         exec(compile(body, REFERENCE, "exec"), names)
         yield names

@@ -94,7 +94,7 @@ def test_a_star_without_noise_is_found_exactly_and_nothing_is_named_twice():
 
 def test_commands_need_no_list_and_no_card(field, tmp_path, monkeypatch):
     # What a bundle says of its errors is not looked at here, and takes long.
-    for name, fewer in {"NODES": 3, "LEAST_STARS": 120, "FEW_STARS": 60}.items():
+    for name, fewer in {"NODES": 3, "FEW_STARS": 60}.items():
         monkeypatch.setattr(packing, name, fewer)
     image, model, out = field[0] / "image.fits", tmp_path / "model", tmp_path / "psf.fits"
     words = [image, "--detect"]

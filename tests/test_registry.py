@@ -32,7 +32,7 @@ def test_a_registered_model_restores_as_its_bundle_does(
     monkeypatch.setenv("MLFLOW_DISABLE_TELEMETRY", "true")
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
     # Errors, of which no PSF depends, are measured on few noisy images.
-    for constant, value in (("NODES", 2), ("LEAST_STARS", 60), ("FEW_STARS", 40)):
+    for constant, value in (("NODES", 2), ("FEW_STARS", 40)):
         monkeypatch.setattr(packing, constant, value)
     telescope = {"pixel_scale_arcsec": 0.1, "diameter_m": 1.0, "wavelength_m": 5.5e-7}
     columns = {

@@ -210,7 +210,7 @@ class StarFacts:
     def of(
         cls, stars: Product, reference: str, config: Any, trained: Mapping[str, Any]
     ) -> StarFacts:
-        """From a product "stars"; the rest is as in `bundle_of`."""
+        """From a product "stars"; the rest is as in `model_of`."""
         stamps, parts = _kind_of_stamps(stars), split_stars(stars, trained["split"], config)
         images, references = stars["realisation"], stars[reference]
         noise, levels = noise_model(config), np.asarray(config.noise.levels)
@@ -235,7 +235,7 @@ def without_errors(
     licence: str,
     largest_mb: float | None = None,
 ) -> Bundle:
-    """A fit with all that it takes to apply it, but for its errors; raises as `bundle_of`."""
+    """A fit with all that it takes to apply it, but for its errors; raises as `model_of`."""
     band, stamp_px = facts.held_out.noise.kappa * facts.levels, facts.info["stamp_px"]
     arrays, said = packed(fitted, stamp_px, float(band.min()), 1e6 * (largest_mb or np.inf))
     info = BundleInfo(
@@ -253,7 +253,7 @@ def without_errors(
     return with_misfit(made, facts.held_out, stream(facts.seed, "noise", "calibration", "misfit"))
 
 
-def bundle_of(
+def model_of(
     fitted: Method,
     stars: Product,
     reference: str,
@@ -262,8 +262,8 @@ def bundle_of(
     name: str,
     licence: str,
     largest_mb: float | None = None,
-) -> Bundle:
-    """A fit with its errors on test stars and all that it takes to apply it.
+) -> PsfModel:
+    """The model of a fit, with its errors on test stars and all that it takes to apply it.
 
     Parameters
     ----------
@@ -304,7 +304,8 @@ def bundle_of(
         config.evaluation.data_range,
     )
     said = {**made.info.config, "evaluation": config.evaluation.model_dump()}
-    return replace(made, info=made.info.model_copy(update={"metrics": metrics, "config": said}))
+    info = made.info.model_copy(update={"metrics": metrics, "config": said})
+    return PsfModel(replace(made, info=info), unpacked)
 
 
 def _trained_on(product: Product, train: np.ndarray) -> int:
@@ -458,13 +459,14 @@ def with_scales(model: PsfModel, stars: HeldOutStars, rng: np.random.Generator) 
     nodes, shape = bundle.noise_nodes, (2, CASES)  # the noise is known, or estimated
     noise = np.tile(nodes, (*shape, 1))
     width, of_flux = np.ones((2, *shape, 2, len(nodes))), np.ones(len(nodes))
+    # A method that measures stars needs no factor of their fluxes: for their pixels, which are
+    # many, a third of the stars is enough in each case. Its errors are the same if noise is known.
+    every, kinds = (3, (True,)) if measures else (1, (False, True))
     for place, node in enumerate(nodes):
         noisy, star = _noisy(stars, node, rng)
-        # Stars in every case of flux and sky: a third of them, as the pixels of a star are many;
-        # all, where their fluxes count as well.
-        case, image = np.divmod(np.arange(0, CASES * len(star), 3 if measures else 1), len(star))
-        case, image = np.tile(case, 2), np.tile(image, 2)
-        estimated = np.arange(len(case)) >= len(case) // 2
+        case, image = np.divmod(np.arange(0, CASES * len(star), every), len(star))
+        estimated = np.repeat(kinds, len(case))
+        case, image = np.tile(case, len(kinds)), np.tile(image, len(kinds))
         found = model.predict(
             noisy[image],
             flux=np.where(case == 0, 1.0, np.nan),
@@ -472,12 +474,12 @@ def with_scales(model: PsfModel, stars: HeldOutStars, rng: np.random.Generator) 
             noise=np.where(estimated, np.nan, node),
             position=stars.position[star[image]],
         )
+        finite = np.isfinite(found.psf).all(axis=(1, 2))
         error = stars.errors(found.psf, star[image])
         error /= np.maximum(found.uncertainty, LEAST_SIGMA)
         bright = brightest(found.psf)
         for index in np.ndindex(shape):
-            usable = np.isfinite(found.psf).all(axis=(1, 2))
-            usable &= (estimated == index[0]) & (case == index[1])
+            usable = finite & (estimated == index[0]) & (case == index[1])
             if not usable.any():
                 continue
             noise[*index, place] = np.median((found.noise / found.flux)[usable])
@@ -494,6 +496,8 @@ def with_scales(model: PsfModel, stars: HeldOutStars, rng: np.random.Generator) 
     for index in np.ndindex(width.shape[:-1]):
         _, *known, _ = index
         width[index] = np.interp(nodes, noise[tuple(known)], width[index])
+    if measures:
+        width[:, 0] = width[:, 1]
     scale68, scale95 = np.moveaxis(width, -1, 1)
     return replace(
         bundle,
