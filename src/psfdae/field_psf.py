@@ -536,9 +536,7 @@ def _terms(position: np.ndarray, low: np.ndarray, high: np.ndarray, order: int) 
     return np.stack(terms, axis=1)
 
 
-def _splines_at(
-    place: np.ndarray, knots: int, spacing: float, slope: bool = False
-) -> np.ndarray:
+def _splines_at(place: np.ndarray, knots: int, spacing: float, slope: bool = False) -> np.ndarray:
     """Cubic B-splines about `knots` equidistant places around 0 at `place` (…), (…, knots).
 
     If asked for, their slopes per pixel.
