@@ -58,7 +58,8 @@ def fitted(seed):
     field = fitted_to(stars, FieldMixture)
     settings, of_fit = stars.settings, described(stars, FieldMixture)
     facts = StarFacts.of(stars.product, "realisation", settings, of_fit)
-    bundle = with_model_errors(without_errors(field, facts, "realisation", "field", ""), field, 1)
+    made = without_errors(field, facts, "realisation", "field", "")
+    bundle = with_model_errors(psfdae.PsfModel(made), field, 1)
     wings = wings_of_stars(psfdae.PsfModel(bundle), stars.observation.with_margin(2))
     return psfdae.PsfModel(with_wings(bundle, wings))
 

@@ -17,7 +17,7 @@ terms, and so are those of the colour, if they predict stars that were left out 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from math import isqrt
 from typing import NamedTuple
@@ -402,8 +402,8 @@ class _Alternating:
             # W x with W = (Dᵀ w D)⁻¹ Dᵀ w. Its error has the noise of the pixels, and that of the
             # median around the star which was subtracted from them.
             design = _design(splines, centre, self.axis[inner], self.spacing, sky=True)
-            turned = (design * weight[box][judged].reshape(len(judged), -1, 1)).transpose(0, 2, 1)
-            influence = np.linalg.solve(turned @ design, turned)[:, 3]
+            turned = design * weight[box][judged].reshape(len(judged), 1, -1)
+            influence = np.linalg.solve(turned @ design.transpose(0, 2, 1), turned)[:, 3]
             level = (influence * images.reshape(len(judged), -1)).sum(axis=1)
             variance = (influence**2 * noise[box][judged].reshape(len(judged), -1)).sum(axis=1)
             variance += np.pi / 2 * (self.noise / fit.flux)[judged] ** 2 / self.around_px
@@ -475,7 +475,7 @@ class _Alternating:
             _splines_at(self.axis[None] - centre[:, i, None], self.knots, self.spacing)
             for i in (0, 1)
         )
-        rows_t, columns_t = rows.transpose(0, 2, 1), columns.transpose(0, 2, 1)
+        columns_t = columns.transpose(0, 2, 1)
         penalty = np.full(shape[0], HIGHER_SMOOTHNESS * self.smoothness)
         penalty[0] = self.smoothness
         penalty = penalty[:, None, None]
@@ -488,9 +488,15 @@ class _Alternating:
         elif start is not None:
             ridge[1:] = 1.0 / (CHANGE * np.abs(start[0]) + LEAST_CHANGE) ** 2
 
+        # The gradients stop at a part of 1e-4: single precision is enough for their products.
+        single = (terms, data, weight, rows, columns)
+        terms, data, weight, rows, columns = (a.astype(np.float32) for a in single)
+        rows_t, columns_t = (np.ascontiguousarray(a.transpose(0, 2, 1)) for a in (rows, columns))
+
         def normal(flat: np.ndarray) -> np.ndarray:
             c = flat.reshape(shape)
-            image = rows @ (terms @ c.reshape(shape[0], -1)).reshape(-1, *shape[1:]) @ columns_t
+            splines = (terms @ c.reshape(shape[0], -1).astype(np.float32)).reshape(-1, *shape[1:])
+            image = rows @ splines @ columns_t
             back = (rows_t @ (weight * image) @ columns).reshape(len(terms), -1)
             smooth = penalty * (self.bend @ c + c @ self.bend) + ridge * c
             return np.asarray(((terms.T @ back).reshape(shape) + smooth).ravel())
@@ -555,12 +561,27 @@ def _terms(position: np.ndarray, low: np.ndarray, high: np.ndarray, order: int) 
     return np.stack(terms, axis=1)
 
 
-def _splines_at(place: np.ndarray, knots: int, spacing: float) -> np.ndarray:
-    """Cubic B-splines about `knots` equidistant places around 0 at `place` (…), (…, knots)."""
-    middle = (np.arange(knots) - (knots - 1) / 2) * spacing
-    t = np.abs(place[..., None] - middle) / spacing
-    near, far = np.maximum(1 - t, 0.0), np.maximum(2 - t, 0.0)
-    return np.asarray((far * far * far - 4 * near * near * near) / 6)
+def _splines_at(place: np.ndarray, knots: int, spacing: float, slope: bool = False) -> np.ndarray:
+    """Cubic B-splines about `knots` equidistant places around 0 at `place` (…), (…, knots).
+
+    If asked for, their slopes per pixel.
+    """
+    # At a part t of the way from one knot to the next, only the two knots on each side count.
+    u = place / spacing + (knots - 1) / 2
+    first = np.floor(u)
+    t = u - first
+    if slope:
+        near = (-0.5 * (1 - t) ** 2, t * (1.5 * t - 2), (1 - t) * (1.5 * t + 0.5), 0.5 * t**2)
+        values = np.stack(near, axis=-1) / spacing
+    else:
+        last = 1 - t
+        near = (last**3, 4 - 3 * t**2 * (1 + last), 4 - 3 * last**2 * (1 + t), t**3)
+        values = np.stack(near, axis=-1) / 6
+    # Four knots more on each side take what is beyond the others.
+    out = np.zeros((*place.shape, knots + 8))
+    before = np.clip(np.nan_to_num(first), -3, knots + 1).astype(np.intp)
+    np.put_along_axis(out, before[..., None] + np.arange(3, 7), values, axis=-1)
+    return out[..., 4:-4]
 
 
 def _drawn(splines: np.ndarray, axis: np.ndarray, centre: np.ndarray, spacing: float) -> np.ndarray:
@@ -569,12 +590,6 @@ def _drawn(splines: np.ndarray, axis: np.ndarray, centre: np.ndarray, spacing: f
         _splines_at(axis[None] - centre[:, i, None], splines.shape[-1], spacing) for i in (0, 1)
     )
     return np.asarray(rows @ splines @ columns.transpose(0, 2, 1))
-
-
-def slopes(draw: Callable[[np.ndarray], np.ndarray], centre: np.ndarray) -> list[np.ndarray]:
-    """Change of drawn images with the row and the column of their centre (n, 2), per pixel."""
-    steps = SLOPE_PX * np.eye(2)
-    return [(draw(centre + e) - draw(centre - e)) / (2 * SLOPE_PX) for e in steps]
 
 
 def _adjusted(
@@ -592,8 +607,8 @@ def _adjusted(
     count, flat = len(data), data.reshape(len(data), -1, 1)
     for _ in range(steps):
         design = _design(splines, centre, axis, spacing, sky)
-        left = (design * weight.reshape(count, -1, 1)).transpose(0, 2, 1)
-        found = np.linalg.solve(left @ design, left @ flat)[..., 0]
+        left = design * weight.reshape(count, 1, -1)
+        found = np.linalg.solve(left @ design.transpose(0, 2, 1), left @ flat)[..., 0]
         flux = found[:, 0]
         move = np.clip(found[:, 1:3] / flux[:, None], -LARGEST_STEP_PX, LARGEST_STEP_PX)
         centre = np.clip(centre + move, -FARTHEST_PX, FARTHEST_PX)
@@ -605,14 +620,17 @@ def _adjusted(
 def _design(
     splines: np.ndarray, centre: np.ndarray, axis: np.ndarray, spacing: float, sky: bool
 ) -> np.ndarray:
-    """Change of images (n, P, 3 or 4) with flux, row, column of the centre and, if asked, sky."""
-
-    def draw(place: np.ndarray) -> np.ndarray:
-        return _drawn(splines, axis, place, spacing)
-
-    parts = [draw(centre), *slopes(draw, centre)]
-    parts += [np.ones_like(parts[0])] * sky
-    return np.stack(parts, axis=-1).reshape(len(centre), -1, len(parts))
+    """Change of images (n, 3 or 4, P) with flux, row, column of the centre and, if asked, sky."""
+    # An image is R c Cᵀ, with the B-splines R of its rows and C of its columns; their slopes R' and
+    # C' give its changes −R' c Cᵀ and −R c C'ᵀ as the centre moves.
+    place, knots = axis - centre[..., None], splines.shape[-1]
+    rows, columns = _splines_at(place, knots, spacing).swapaxes(0, 1)
+    down, across = _splines_at(place, knots, spacing, slope=True).swapaxes(0, 1)
+    along = splines @ columns.transpose(0, 2, 1)
+    moved = rows @ splines @ across.transpose(0, 2, 1)
+    parts = [rows @ along, -down @ along, -moved]
+    parts += [np.ones_like(moved)] * sky
+    return np.stack(parts, axis=1).reshape(len(centre), len(parts), -1)
 
 
 def excess_scatter(values: np.ndarray, sigma: np.ndarray) -> float:

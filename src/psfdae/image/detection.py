@@ -8,13 +8,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from psfdae.image.bad_pixels import interpolated
 from psfdae.image.source_size import measure_size
 from psfdae.moments import FWHM_OF_SIGMA
+
+if TYPE_CHECKING:
+    from photutils.background import Background2D
 
 MESH_PX = 64  # side of the squares in which the sky is measured
 MOST_BAD = 80.0  # per cent of a mesh's pixels; others are interpolated over it
@@ -142,6 +145,18 @@ def _with_digits(values: np.ndarray) -> np.ndarray:
     return np.array([float(f"{value:.8g}") for value in values.tolist()])
 
 
+def _background(image: np.ndarray, bad: np.ndarray) -> Background2D:
+    """The sky of an image in meshes; ValueError if none has enough pixels that count."""
+    from photutils.background import Background2D
+
+    return Background2D(image, MESH_PX, mask=bad, exclude_percentile=MOST_BAD)
+
+
+def sky_level(image: np.ndarray, bad: np.ndarray) -> np.ndarray:
+    """Level of the sky (h, w) of an image whose `bad` pixels do not count; raises as `sky_of`."""
+    return np.asarray(_background(np.where(bad, 0.0, image), bad).background)
+
+
 def sky_of(
     image: np.ndarray, bad: np.ndarray, sigma: np.ndarray | None = None, least: float = 0.0
 ) -> Sky:
@@ -162,10 +177,8 @@ def sky_of(
     ValueError
         If no mesh has enough pixels that count.
     """
-    from photutils.background import Background2D
-
-    values: Any = np.where(bad, 0.0, image)
-    found = Background2D(values, MESH_PX, mask=bad, exclude_percentile=MOST_BAD)
+    values = np.where(bad, 0.0, image)
+    found = _background(values, bad)
     level = found.background
     # Whole counts, or images without noise, may show none; the threshold must not be 0 there.
     least = max(least, 1e-13 * float(np.ptp(values)), float(np.finfo(np.float64).tiny))

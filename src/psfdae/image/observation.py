@@ -17,7 +17,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -636,7 +636,7 @@ def _on_pairs(table: Catalogue, again: np.ndarray) -> list[str]:
     ]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Layers:
     """An image, what lies beside it, and how that is read."""
 
@@ -696,22 +696,7 @@ class Layers:
 
     def sky(self) -> Sky:
         """The image as a whole with its sky."""
-        image, masked, sigma = self._whole()
-        bad = self._found(image, masked).mask
-        with silent():
-            try:
-                sky = sky_of(image, bad, sigma, self.least_noise)
-            except ValueError:  # nothing to measure the sky on
-                problem = "too few pixels of the image have a value that is not masked"
-                if self.mask is not None and self.bad_bits is None:
-                    problem += "; --bad-bits says which bits are bad, --mask none takes no mask"
-                raise ObservationError(self.image.path, problem) from None
-        if sigma is None or not self.photons:
-            return sky
-        with self.open(whole=True) as (_, _, noise):
-            assert noise is not None
-            own = self.sigma(noise[:], sky.flat)
-        return replace(sky, noise=sky.noise_scale * own)
+        return _sky(self)
 
     @property
     def bad_pixels(self) -> BadPixels:
@@ -742,6 +727,27 @@ class Layers:
                     raise ObservationError(self.image.path, str(error)) from None
             self._bad_pixels.append(found)
         return self._bad_pixels[0]
+
+
+@lru_cache(maxsize=1)
+def _sky(layers: Layers) -> Sky:
+    """The image of layers as a whole with its sky; that of the last ones is kept for more calls."""
+    image, masked, sigma = layers._whole()
+    bad = layers._found(image, masked).mask
+    with silent():
+        try:
+            sky = sky_of(image, bad, sigma, layers.least_noise)
+        except ValueError:  # nothing to measure the sky on
+            problem = "too few pixels of the image have a value that is not masked"
+            if layers.mask is not None and layers.bad_bits is None:
+                problem += "; --bad-bits says which bits are bad, --mask none takes no mask"
+            raise ObservationError(layers.image.path, problem) from None
+    if sigma is None or not layers.photons:
+        return sky
+    with layers.open(whole=True) as (_, _, noise):
+        assert noise is not None
+        own = layers.sigma(noise[:], sky.flat)
+    return replace(sky, noise=sky.noise_scale * own)
 
 
 @dataclass(frozen=True)

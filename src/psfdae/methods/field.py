@@ -357,6 +357,7 @@ class FieldMixture(FieldLaw, Method):
             *(images - level[:, None], np.broadcast_to(noise, count), terms, True),
             *(self._prior(listed), None, flux, np.isfinite(sky)),
             np.zeros(count) if gain is None else np.nan_to_num(1.0 / gain),
+            np.full(count, self.off_node_px),
         )
         known = np.isfinite(listed).all(axis=1) & fixed
         found = np.empty((count, 6 + 2 * images.shape[1]))
@@ -368,7 +369,7 @@ class FieldMixture(FieldLaw, Method):
                     at = listed[part]
                     near = np.square(self.places - at[:, None]).sum(axis=-1).argmin(axis=1)
                     alone = np.where(np.arange(len(self.places)) == near[:, None], 0.0, -np.inf)
-                    some = some._replace(centre=at, prior=alone)
+                    some = some._replace(centre=at, prior=alone, off_node=np.zeros(len(part)))
                 found[part], covariance[part] = self._restored(some, *self._start(some))
         values, psf, sigma = np.split(found, [6, 6 + images.shape[1]], axis=1)
         measured = Measured(

@@ -31,6 +31,7 @@ from psfdae.method import (
     FindsFlux,
     KnowsField,
     MeasuresStars,
+    Method,
     Packing,
     ScoresOutliers,
     with_free_flux,
@@ -106,6 +107,8 @@ class PsfModel(FieldPsfs):
     ----------
     bundle : Bundle
         `load_model` reads one from a file.
+    fitted : Method, optional
+        The method of its arrays; by default it is unpacked from them.
 
     Examples
     --------
@@ -119,9 +122,9 @@ class PsfModel(FieldPsfs):
     29
     """
 
-    def __init__(self, bundle: Bundle) -> None:
+    def __init__(self, bundle: Bundle, fitted: Method | None = None) -> None:
         self.bundle = bundle
-        self.engine = Engine(bundle)
+        self.engine = Engine(bundle, estimator(bundle) if fitted is None else fitted)
         self.name, self.stamp_px = bundle.info.name, bundle.info.stamp_px
 
     def __repr__(self) -> str:
@@ -513,9 +516,8 @@ class Engine:
     Safe to use from several threads.
     """
 
-    def __init__(self, bundle: Bundle) -> None:
-        self.bundle = bundle
-        self.estimator = estimator(bundle)
+    def __init__(self, bundle: Bundle, fitted: Method) -> None:
+        self.bundle, self.estimator = bundle, fitted
         self.free_flux = with_free_flux(self.estimator)
         packing = self.estimator.packing or Packing()
         together, self._padded = packing.together, packing.padded

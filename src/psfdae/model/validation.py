@@ -145,7 +145,8 @@ def _measured(model: PsfModel, stars: Stars, methods: Mapping[str, Method]) -> R
             rows += summarised(row, metrics, field)
             per_star.append({**row, "star": parts.test, "field": field, **metrics})
             if own:
-                restored[level] = {"truth": truth, "model": estimate.psf, MEAN_PSF: mean}
+                images = {"noisy": noisy, "truth": truth, "model": estimate.psf, MEAN_PSF: mean}
+                restored[level] = images
         rows += beside
     measured = [row for row in rows if row["method"] != MEAN_PSF]
     table = _table(rows, stars, methods)
@@ -278,7 +279,7 @@ class Report:
         are below: 1 if errors hold), RMS of the centre, and the parts of fluxes, centres and
         pixels that are within their stated errors, with standard errors clustered by star.
     restored : dict
-        By noise level λ the held-out images (n, d, d): `truth`, `model`, and `mean_psf`.
+        By noise level λ the held-out images (n, d, d): `noisy`, `truth`, `model`, and `mean_psf`.
 
     Examples
     --------
@@ -341,14 +342,13 @@ class Report:
         snr = 1.0 / (settings.noise.kappa * levels * np.sqrt(area))
         level = float(levels[np.abs(np.log(snr / STRIP_SNR)).argmin()])
         star, place = product["field_index"][parts.test], field_positions(product)[parts.test]
-        noisy = noisy_test_images(settings, product, parts.test, level)
         shown = _one_of_each(star, product["position"])
-        truth = product[REFERENCE][parts.test][shown]
+        noisy, truth = (self.restored[level][kind][shown] for kind in ("noisy", "truth"))
         rows = [StripRow("bright\nstar", truth)]
         for method in self.methods.values():
             look = method.look
             if look.drawn:
-                stamps = method.restore(noisy, level, place)[shown]
+                stamps = method.restore(noisy, level, place[shown])
                 error = mse(stamps, truth)
                 rows.append(StripRow(look.label, stamps, error, own_scale=not look.restores))
         columns = [f"S/N {value:.0f}" for value in product["snr"][star[shown]]]

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 
-from psfdae.image.detection import Sky, sky_of
+from psfdae.image.detection import Sky, sky_level, sky_of
 
 if TYPE_CHECKING:
     from psfdae.image.fits_file import Card
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 FOLLOWED = 0.03  # part of a star's light in a pixel by which its PSF may be off
 OUTER, OUTER_RANGE = 0.7, (0.3, 3.0)  # radius of a stamp's outer part over half its side; s
 REACH, TENTS, STEEPNESS = 2.5, 6, 3.0  # radius of the wings in stamps; tents; power of 1/r in them
-WINGED, BAND_PX = 1000, 512  # brightest stars, whose wings are drawn; rows at a time
+WINGED, BAND_PX = 1000, 128  # brightest stars, whose wings are drawn; rows at a time
 CLIPPED_SIGMA = 4.0  # of a pixel from the wings known so far, from which it is left out
 LEAST_SEEN = 3.0  # σ, from which wings are real
 MOST_LIGHT, MOST_RADIUS_PX = 10.0, 1e5  # of wings over the flux in the stamp; no nonsense
@@ -186,32 +186,62 @@ def outer_light(draw: Callable[[np.ndarray], np.ndarray], place: np.ndarray) -> 
 
 def tents(r: np.ndarray, radius_px: np.ndarray) -> np.ndarray:
     """h_k at distances r, shape (K, …)."""
-    tops = np.log(radius_px)
-    inside = np.maximum(r, radius_px[0])
-    off = np.abs(np.log(inside) - tops[:-1].reshape(-1, *[1] * r.ndim)) / (tops[1] - tops[0])
-    return np.asarray(np.maximum(1.0 - off, 0.0) * (inside / radius_px[0]) ** -STEEPNESS)
+    # ln of r over the first top, where even light ends; tops are equidistant in it.
+    radius = radius_px.astype(r.dtype)
+    beyond = np.log(np.maximum(r / radius[0], 1.0))
+    top = np.arange(len(radius) - 1, dtype=r.dtype).reshape(-1, *[1] * r.ndim)
+    off = np.abs(beyond / np.log(radius[1] / radius[0]) - top)
+    return np.asarray(np.maximum(1.0 - off, 0.0) * np.exp(-STEEPNESS * beyond))
+
+
+def star_tents(
+    rows: slice, width: int, place: np.ndarray, flux: np.ndarray, outer: np.ndarray, wings: Wings
+) -> Iterator[tuple[tuple[slice, slice], np.ndarray]]:
+    """Windows about the brightest stars within some rows, and F s h_k there, shape (K, …)."""
+    reach, radius = int(wings.radius_px[-1]), wings.radius_px
+    light = flux * np.clip(outer / wings.outer, *OUTER_RANGE)
+    known = np.flatnonzero(np.isfinite(light) & (light > 0) & np.isfinite(place).all(axis=1))
+    brightest = known[np.argsort(-light[known])[:WINGED]]
+    # The pixels within reach, as far as they are in these rows.
+    middle = np.rint(place[brightest]).astype(int)
+    low = np.maximum(middle - reach, [0, rows.start])
+    high = np.minimum(middle + reach + 1, [width, rows.stop])
+    for inside in np.flatnonzero((low < high).all(axis=1)):
+        star, (left, top), (right, end) = brightest[inside], low[inside], high[inside]
+        across, down = (
+            np.square(np.arange(*ends) - at).astype(np.float32)
+            for ends, at in zip(((left, right), (top, end)), place[star], strict=True)
+        )
+        window = slice(top - rows.start, end - rows.start), slice(left, right)
+        yield window, float(light[star]) * tents(np.sqrt(down[:, None] + across), radius)
 
 
 def tented_light(
     shape: tuple[int, ...], place: np.ndarray, flux: np.ndarray, outer: np.ndarray, wings: Wings
 ) -> Iterator[tuple[slice, np.ndarray]]:
     """Bands of rows, and Σ F s h_k of the stars in them, shape (K, rows, w)."""
-    reach, radius = int(wings.radius_px[-1]), wings.radius_px
-    light = flux * np.clip(outer / wings.outer, *OUTER_RANGE)
-    known = np.flatnonzero(np.isfinite(light) & (light > 0) & np.isfinite(place).all(axis=1))
-    brightest = known[np.argsort(-light[known])[:WINGED]]
     height, width = shape
     for top in range(0, height, BAND_PX):
-        rows = min(BAND_PX, height - top)
-        tented = np.zeros((len(radius) - 1, rows, width))
-        for star in brightest:
-            x, y = place[star]
-            first, last = (np.clip(round(y) + d - top, 0, rows) for d in (-reach, reach + 1))
-            left, right = (np.clip(round(x) + d, 0, width) for d in (-reach, reach + 1))
-            if first < last and left < right:
-                r = np.hypot(np.arange(first, last)[:, None] + top - y, np.arange(left, right) - x)
-                tented[:, first:last, left:right] += light[star] * tents(r, radius)
-        yield slice(top, top + rows), tented
+        rows = slice(top, min(top + BAND_PX, height))
+        tented = np.zeros((len(wings.profile), rows.stop - top, width), np.float32)
+        for window, light in star_tents(rows, width, place, flux, outer, wings):
+            tented[:, *window] += light
+        yield rows, tented
+
+
+def wing_light(
+    shape: tuple[int, ...],
+    place: np.ndarray,
+    flux: np.ndarray,
+    outer: np.ndarray,
+    wings: Wings | None,
+) -> np.ndarray:
+    """Light of the wings of stars in an image (h, w); none if they are not seen."""
+    far = np.zeros(shape, np.float32)
+    if wings is not None and wings.seen:
+        for window, light in star_tents(slice(0, shape[0]), shape[1], place, flux, outer, wings):
+            far[window] += np.tensordot(wings.profile, light, 1)
+    return far
 
 
 def wings_of(
@@ -293,17 +323,31 @@ def around_stars(
     stamp_px : int
     before : Wings, optional
     """
-    bad, wings, doubt = sky.bad, before, np.hypot(error, FOLLOWED * drawn)
-    for _ in range(ROUNDS):
-        left = image - sky.level - drawn
-        wings = wings_of(left, doubt, bad, place, flux, outer, stamp_px, wings)
-        far = np.zeros(image.shape)
-        if wings is not None and wings.seen:
-            for band, light in tented_light(image.shape, place, flux, outer, wings):
-                far[band] = np.tensordot(wings.profile, light, 1)
-        mapped = np.isfinite(sky.noise_scale)
-        sky = sky_of(image - drawn - far, bad, sky.noise if mapped else None)
-    return Around(sky, far, wings, doubt)
+    doubt, beside, light = np.hypot(error, FOLLOWED * drawn), image - drawn, (place, flux, outer)
+    wings = _wings_beside(beside, sky.level, doubt, sky.bad, *light, stamp_px, before)
+    far = wing_light(image.shape, *light, wings)
+    mapped = np.isfinite(sky.noise_scale)
+    return Around(sky_of(beside - far, sky.bad, sky.noise if mapped else None), far, wings, doubt)
+
+
+def _wings_beside(
+    beside: np.ndarray,
+    level: np.ndarray,
+    doubt: np.ndarray,
+    bad: np.ndarray,
+    place: np.ndarray,
+    flux: np.ndarray,
+    outer: np.ndarray,
+    stamp_px: int,
+    before: Wings | None = None,
+) -> Wings | None:
+    """Wings of stars in an image (h, w) without its models, in turns with the level of its sky."""
+    wings = before
+    for turn in range(ROUNDS):
+        if turn:
+            level = sky_level(beside - wing_light(beside.shape, place, flux, outer, wings), bad)
+        wings = wings_of(beside - level, doubt, bad, place, flux, outer, stamp_px, wings)
+    return wings
 
 
 def wings_of_stars(model: PsfModel, observation: Observation) -> Wings | None:
@@ -317,9 +361,9 @@ def wings_of_stars(model: PsfModel, observation: Observation) -> Wings | None:
         If there is no sky to measure.
     """
     sky, side = observation.sky(), model.stamp_px
-    image, places, fluxes = sky.flat + sky.level, [], []
+    places, fluxes = [], []
     # With the room of a stamp on all sides, for those that reach beyond the image.
-    drawn = np.zeros(np.add(image.shape, 2 * side))
+    drawn = np.zeros(np.add(sky.flat.shape, 2 * side), np.float32)
     for stamps, found in model.stream(observation, threads=1):
         place = np.stack([stamps.x, stamps.y], axis=1)
         shift = np.stack([found.shift_x, found.shift_y], axis=1)
@@ -334,6 +378,8 @@ def wings_of_stars(model: PsfModel, observation: Observation) -> Wings | None:
     inner = np.s_[side:-side, side:-side]
     light = drawn[inner]
     place, flux, gain = np.concatenate(places), np.concatenate(fluxes), observation.gain
-    error = np.sqrt(sky.noise**2 + (np.maximum(light, 0.0) / gain if gain else 0.0))
+    photons = np.maximum(light, 0.0) / gain if gain else 0.0
+    doubt = np.sqrt(sky.noise**2 + photons + (FOLLOWED * light) ** 2)
     outer = outer_light(model.on_pixels, place)
-    return around_stars(image, sky, error, light, place, flux, outer, side).wings
+    beside = sky.flat + sky.level - light
+    return _wings_beside(beside, sky.level, doubt, sky.bad, place, flux, outer, side)
