@@ -285,7 +285,11 @@ class _Alternating:
         start, window = np.zeros((len(flux), 2)), np.full(len(flux), self.window_px)
         reach = WINDOW_REACH_PX if self.window_px == WINDOW_PX else FARTHEST_PX
         centre = windowed_centres(self.images, start, window, WINDOW_ROUNDS, reach)
-        alike, noise = np.ones(self.images.shape), self._weight(flux)
+        # Weights are those of a star's expected light, first that of the median star. Weights of its
+        # own noisy pixels would favour pixels that noise makes fainter, and splines with too little
+        # light in the wings (Humphrey, Liu & Buote 2009, ApJ 693, 822).
+        light = np.median(self.images / flux[:, None, None], axis=0)
+        alike, noise = np.ones(self.images.shape), self._weight(flux, light)
         found: np.ndarray | None = None
         for turn in range(FIT_ROUNDS):
             data = self.images / flux[:, None, None]
@@ -303,10 +307,10 @@ class _Alternating:
             drawn = _drawn(splines, self.axis, centre, self.spacing)
             # Where a star lies on the pixel grid changes no light: without this, fluxes and splines
             # could change with that place against each other.
-            light = drawn[:, self.inner][:, :, self.inner].sum(axis=(1, 2))
-            flux, drawn = flux * light, drawn / light[:, None, None]
+            inside = drawn[:, self.inner][:, :, self.inner].sum(axis=(1, 2))
+            flux, drawn = flux * inside, drawn / inside[:, None, None]
             residual = np.where(self.seen, self.images / flux[:, None, None] - drawn, 0.0)
-            noise = self._weight(flux)
+            noise = self._weight(flux, drawn)
             square = residual**2 * noise
             chi2 = square.sum(axis=(1, 2)) / np.maximum(self.seen.sum(axis=(1, 2)), 1)
             alike = 1.0 / (1.0 + square / UNLIKE_SIGMA**2)
@@ -359,7 +363,8 @@ class _Alternating:
         """
         terms = fit.model.terms(self.place)
         data = self.images / fit.flux[:, None, None]
-        weight, noise = self._weight(fit.flux), self._variance(fit.flux)
+        drawn = fit.model.images(terms, fit.centre, len(self.axis))
+        weight, noise = self._weight(fit.flux, drawn), self._variance(fit.flux, drawn)
         fold, judged_stars = np.arange(len(terms)) % FOLDS, 0
         inner = self.inner
         box = np.ix_(range(len(terms)), inner, inner)
@@ -388,18 +393,20 @@ class _Alternating:
             if judged_stars >= ENOUGH_STARS:
                 break
 
-    def _weight(self, flux: np.ndarray) -> np.ndarray:
-        """1/variance of the pixels of flux 1, with errors of the model; 0 where not seen."""
-        light = np.maximum(self.images / flux[:, None, None], 0.0)
-        variance = self._variance(flux) + (MODEL_ERROR * light) ** 2 + LEAST_ERROR**2
+    def _weight(self, flux: np.ndarray, light: np.ndarray) -> np.ndarray:
+        """1/variance of the pixels of flux 1, with errors of the model; 0 where not seen.
+
+        `light` is that expected of stars of flux 1, of each (n, s, s) or of all (s, s).
+        """
+        of_model = MODEL_ERROR * np.maximum(light, 0.0)
+        variance = self._variance(flux, light) + of_model**2 + LEAST_ERROR**2
         return np.where(self.seen, 1.0 / variance, 0.0)
 
-    def _variance(self, flux: np.ndarray) -> np.ndarray:
+    def _variance(self, flux: np.ndarray, light: np.ndarray) -> np.ndarray:
         """Variance of the pixels of flux 1 by the sky and the star's photons."""
         factor = 1.0 / flux[:, None, None]
-        light = np.maximum(self.images * factor, 0.0)
         noise, photons = (a[:, None, None] for a in (self.noise, self.photons))
-        return np.asarray((noise * factor) ** 2 + light * factor / photons)
+        return np.asarray((noise * factor) ** 2 + np.maximum(light, 0.0) * factor / photons)
 
     def _deformed(
         self,

@@ -1,14 +1,16 @@
 """Light of stars beyond the stamps of a model, and the sky that is left without it.
 
 The model knows the light of a star in its stamp, above what is there in a ring around it. The rest
-is one profile for all stars: a star of flux F at distance r from its centre has
+is one profile for all stars: a star of flux F has
 
-    F s Σ_k p_k h_k(r)
+    F s (p_0 h_0 + Σ_k p_k h_k(r))
 
-more in a pixel, with tents h_k in ln r times a power of r, the first one even inside the stamp,
-and s the light of the model's PSF in the outer part of its stamp over the mean of all stars:
-where the PSF is wider, it has more wings. All pixels of the image together give p_k by weighted
-least squares.
+more in a pixel, with h_0 = 1 in its stamp and 0 elsewhere, tents h_k in ln r times a power of r
+outside of the stamp, r the distance from its centre, and s the light of the model's PSF in the
+outer part of its stamp over the mean of all stars: where the PSF is wider, it has more wings.
+All pixels of the image together give p by weighted least squares, beside what is expected of p
+before: that the light falls on outside of the stamp about as that of other telescopes does. Bright
+stars say more than that, and few faint ones hardly anything.
 """
 
 from __future__ import annotations
@@ -44,8 +46,9 @@ class Wings:
 
     Attributes
     ----------
-    radius_px : ndarray, shape (K + 1,)
-        Tops of the tents h_k; at the last radius there is no light any more.
+    radius_px : ndarray, shape (K,)
+        Tops of the tents h_1 …, the first one at half the side of the stamp; at the last radius
+        there is no light any more.
     profile : ndarray, shape (K,)
         p_k, per pixel.
     covariance : ndarray, shape (K, K)
@@ -76,13 +79,13 @@ class Wings:
             raise ValueError(f"wings without {error}") from None
         radius, count = found.radius_px, found.profile.size
         shapes = [a.shape for a in (found.profile, radius, found.covariance)]
-        if shapes != [(count,), (count + 1,), (count, count)]:
+        if count < 2 or shapes != [(count,), (count,), (count, count)]:
             raise ValueError("wings whose numbers do not fit together")
         rising = radius[0] > 0 and (np.diff(radius) > 0).all() and radius[-1] < MOST_RADIUS_PX
         with np.errstate(all="ignore"):
             light, doubt = found.light() if rising else (np.nan, np.nan)
         scale = 0.0 < found.outer < np.inf
-        if not (scale and 0.0 <= light < MOST_LIGHT and np.isfinite(doubt)):
+        if not (scale and abs(light) < MOST_LIGHT and np.isfinite(doubt)):
             raise ValueError("wings whose light is no part of that of a star")
         return found
 
@@ -90,19 +93,25 @@ class Wings:
         """Lists and numbers, for a bundle."""
         return {name: np.asarray(value).tolist() for name, value in vars(self).items()}
 
-    def total(self, outer: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Flux over that of the model of stars by their `outer_light`, and its error, (n,) both.
+    def scale(self, outer: np.ndarray) -> np.ndarray:
+        """s of stars by their `outer_light` (n,), 1 where that is NaN, of an unknown place."""
+        known = np.where(np.isfinite(outer), outer / self.outer, 1.0)
+        return np.asarray(np.clip(known, *OUTER_RANGE))
 
-        NaN, of stars whose place is not known, counts as a usual star.
-        """
-        scale = np.clip(np.where(np.isfinite(outer), outer / self.outer, 1.0), *OUTER_RANGE)
+    def total(self, outer: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Flux over that of the model of stars by their `outer_light`, and its error, (n,) both."""
+        scale = self.scale(outer)
         light, error = self.light()
         return 1.0 + scale * light, scale * error
 
     def light(self, radius_px: float = np.inf) -> tuple[float, float]:
         """Part of the flux within a radius, where s = 1, and its standard error."""
+        half = self.radius_px[0]
         r = np.linspace(0.0, min(radius_px, self.radius_px[-1]), 4001)
-        share = np.trapezoid(2 * np.pi * r * tents(r, self.radius_px), r, axis=1)
+        # Part of a circle that is outside of the square of side 2 half: 4/π arccos(half/r), up to 1.
+        outside = np.clip(np.arccos(np.minimum(half / np.maximum(r, half), 1.0)) * 4 / np.pi, 0, 1)
+        height = np.concatenate([1.0 - outside[None], outside * tents(r, self.radius_px)])
+        share = np.trapezoid(2 * np.pi * r * height, r, axis=1)
         return float(self.profile @ share), float(np.sqrt(share @ self.covariance @ share))
 
     def cards(self) -> list[Card]:
@@ -163,9 +172,9 @@ def aperture_correction(
     inside = float(CircularAperture(middle, radius_px).do_photometry(psf)[0][0])
     if wings is None:
         return 1.0 / inside
-    total = float(wings.total(outer_light(model.on_pixels, np.array([[x, y]])))[0][0])
-    whole, part = (wings.light(r)[0] for r in (np.inf, radius_px))
-    return total / (inside + (total - 1.0) * part / whole)
+    scale = float(wings.scale(outer_light(model.on_pixels, np.array([[x, y]])))[0])
+    whole, part = (scale * wings.light(r)[0] for r in (np.inf, radius_px))
+    return (1.0 + whole) / (inside + part)
 
 
 def outer_light(draw: Callable[[np.ndarray], np.ndarray], place: np.ndarray) -> np.ndarray:
@@ -185,7 +194,7 @@ def outer_light(draw: Callable[[np.ndarray], np.ndarray], place: np.ndarray) -> 
 
 
 def tents(r: np.ndarray, radius_px: np.ndarray) -> np.ndarray:
-    """h_k at distances r, shape (K, …)."""
+    """h_1 … at distances r, shape (K − 1, …), as they are outside of the stamp."""
     tops = np.log(radius_px)
     inside = np.maximum(r, radius_px[0])
     off = np.abs(np.log(inside) - tops[:-1].reshape(-1, *[1] * r.ndim)) / (tops[1] - tops[0])
@@ -197,21 +206,42 @@ def tented_light(
 ) -> Iterator[tuple[slice, np.ndarray]]:
     """Bands of rows, and Σ F s h_k of the stars in them, shape (K, rows, w)."""
     reach, radius = int(wings.radius_px[-1]), wings.radius_px
-    light = flux * np.clip(outer / wings.outer, *OUTER_RANGE)
+    light = np.where(np.isfinite(outer), flux * wings.scale(outer), np.nan)
     known = np.flatnonzero(np.isfinite(light) & (light > 0) & np.isfinite(place).all(axis=1))
     brightest = known[np.argsort(-light[known])[:WINGED]]
     height, width = shape
     for top in range(0, height, BAND_PX):
         rows = min(BAND_PX, height - top)
-        tented = np.zeros((len(radius) - 1, rows, width))
+        tented = np.zeros((len(radius), rows, width))
         for star in brightest:
             x, y = place[star]
             first, last = (np.clip(round(y) + d - top, 0, rows) for d in (-reach, reach + 1))
             left, right = (np.clip(round(x) + d, 0, width) for d in (-reach, reach + 1))
             if first < last and left < right:
-                r = np.hypot(np.arange(first, last)[:, None] + top - y, np.arange(left, right) - x)
-                tented[:, first:last, left:right] += light[star] * tents(r, radius)
+                down, across = np.arange(first, last)[:, None] + top - y, np.arange(left, right) - x
+                inside = np.maximum(np.abs(down), np.abs(across)) < radius[0]
+                outside = np.where(inside, 0.0, tents(np.hypot(down, across), radius))
+                tented[0, first:last, left:right] += light[star] * inside
+                tented[1:, first:last, left:right] += light[star] * outside
         yield slice(top, top + rows), tented
+
+
+def expected_profile(radius_px: np.ndarray, outer: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return what is expected of p before any pixel outside of stamps is seen, and its σ, (K,).
+
+    Outside of a stamp of the half side h, the light falls on as a (r/h)^-5, the mean slope of
+    Moffat profiles there (Moffat 1969, A&A 3, 455), where a follows from the light `outer` between
+    0.7 h and h. It may be more by half of what falls as r^-3, as light that mirrors and air scatter
+    does (King 1971, PASP 83, 199), or less, and has an error of 0.1 % of the star at least.
+    """
+    half = radius_px[0]
+    # ∫ 2π r (r/h)^-5 dr from 0.7 h to h is 2π h² (0.7^-3 − 1)/3.
+    edge = max(outer, 0.0) * 3.0 / (2.0 * np.pi * half**2 * (OUTER**-3.0 - 1.0))
+    # In the stamp, what the ring around it has was taken for sky: the light at 1.5 h.
+    expected = edge * np.append(1.5**-5.0, (radius_px[:-1] / half) ** (STEEPNESS - 5.0))
+    sigma = np.full(len(radius_px), 0.5 * edge)
+    sigma[0] *= 1.5**-STEEPNESS
+    return expected, np.hypot(sigma, 1e-3 / (2.0 * np.pi * half**2))
 
 
 def wings_of(
@@ -224,39 +254,42 @@ def wings_of(
     stamp_px: int,
     before: Wings | None = None,
 ) -> Wings | None:
-    """Wings of stars in what is left of an image (h, w) without sky and models; None without light.
+    """Wings of stars in what is left of an image (h, w) without sky and models; None without stars.
 
     An even light that was left beside them, such as a wrong sky, does not count. Nor do pixels that
     are far from the wings as they were known `before`.
     """
-    from scipy.optimize import lsq_linear
-
     radius = np.geomspace(stamp_px / 2, REACH * stamp_px, TENTS + 1)
     lit = np.isfinite(flux) & (flux > 0)
     lit &= np.isfinite(outer)
     if not lit.any() or not (mean := float(np.average(outer[lit], weights=flux[lit]))) > 0:
         return None
-    blank = Wings(radius, np.zeros(TENTS), np.zeros((TENTS, TENTS)), mean)
-    normal, right, square, count = np.zeros((TENTS + 1,) * 2), np.zeros(TENTS + 1), 0.0, 0
+    count = len(radius)
+    blank = Wings(radius, np.zeros(count), np.zeros((count, count)), mean)
+    normal, right, square, pixels = np.zeros((count + 1,) * 2), np.zeros(count + 1), 0.0, 0
     for band, tented in tented_light(left.shape, place, flux, outer, blank):
         weight = np.where(bad[band], 0.0, 1.0 / error[band])
         if before is not None:
             off = (left[band] - np.tensordot(before.profile, tented, 1)) * weight
             weight = np.where(np.abs(off) < CLIPPED_SIGMA, weight, 0.0)
         design = np.concatenate([tented, np.ones((1, *weight.shape))]) * weight
-        flat, seen = design.reshape(TENTS + 1, -1), (left[band] * weight).ravel()
+        flat, seen = design.reshape(count + 1, -1), (left[band] * weight).ravel()
         normal, right = normal + flat @ flat.T, right + flat @ seen
-        square, count = square + float(seen @ seen), count + int(np.count_nonzero(weight))
-    unit = np.sqrt(normal.diagonal())
-    if not (unit > 0).all():
+        square, pixels = square + float(seen @ seen), pixels + int(np.count_nonzero(weight))
+    if not normal[-1, -1] > 0:
         return None
-    root = np.linalg.cholesky(normal / unit / unit[:, None] + 1e-12 * np.eye(TENTS + 1))
-    wanted, bounds = np.linalg.solve(root, right / unit), np.array([0.0] * TENTS + [-np.inf])
-    fit = lsq_linear(root.T, wanted, (bounds, np.inf))
-    found = fit.x / unit
-    # In Σ (seen − design found)², the part that no profile explains is what remains of Σ seen².
-    chi2 = (square - wanted @ wanted + 2.0 * fit.cost) / max(count, 1)
-    inverse = np.linalg.inv(root @ root.T) / unit / unit[:, None] * max(chi2, 1.0)
+    # Generalised least squares of p and of the even light, of which nothing is expected, in units
+    # of the σ that are expected: (N/χ² + 1) x = b/χ² + μ, χ² that of the pixels, at least 1.
+    expected, sigma = expected_profile(radius, mean)
+    unit = np.append(sigma, normal[-1, -1] ** -0.5)
+    normal, right = normal * unit * unit[:, None], right * unit
+    known, start = np.diag(np.append(np.ones(count), 0.0)), np.append(expected / sigma, 0.0)
+    chi2 = 1.0
+    for _ in range(2):
+        inverse = np.linalg.inv(normal / chi2 + known)
+        found = inverse @ (right / chi2 + start)
+        chi2 = max((square - 2.0 * found @ right + found @ normal @ found) / max(pixels, 1), 1.0)
+    found, inverse = found * unit, inverse * unit * unit[:, None]
     return Wings(radius, found[:-1], inverse[:-1, :-1], mean)
 
 
@@ -298,7 +331,7 @@ def around_stars(
         left = image - sky.level - drawn
         wings = wings_of(left, doubt, bad, place, flux, outer, stamp_px, wings)
         far = np.zeros(image.shape)
-        if wings is not None and wings.seen:
+        if wings is not None:
             for band, light in tented_light(image.shape, place, flux, outer, wings):
                 far[band] = np.tensordot(wings.profile, light, 1)
         mapped = np.isfinite(sky.noise_scale)
