@@ -167,6 +167,4 @@ def packed(stars: Stars, fitted: Method, name: str, licence: str) -> PsfModel:
             for part in stars.each
         ]
     known = [wings for wings in each if wings is not None]
-    if not known or not (wings := Wings.joined(known)).seen:
-        return model
-    return PsfModel(with_wings(model.bundle, wings))
+    return PsfModel(with_wings(model.bundle, Wings.joined(known))) if known else model

@@ -16,7 +16,7 @@ stars say more than that, and few faint ones hardly anything.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
@@ -34,9 +34,8 @@ OUTER, OUTER_RANGE = 0.7, (0.3, 3.0)  # radius of a stamp's outer part over half
 REACH, TENTS, STEEPNESS = 2.5, 6, 3.0  # radius of the wings in stamps; tents; power of 1/r in them
 WINGED, BAND_PX = 1000, 512  # brightest stars, whose wings are drawn; rows at a time
 CLIPPED_SIGMA = 4.0  # of a pixel from the wings known so far, from which it is left out
-LEAST_SEEN = 3.0  # σ, from which wings are real
 MOST_LIGHT, MOST_RADIUS_PX = 10.0, 1e5  # of wings over the flux in the stamp; no nonsense
-ROUNDS = 3  # of wings and sky
+ROUNDS, SAME = 8, 0.1  # of wings and sky, at most; change of the light in σ with which they end
 PSFS_AT_ONCE = 2048
 
 
@@ -108,7 +107,7 @@ class Wings:
         """Part of the flux within a radius, where s = 1, and its standard error."""
         half = self.radius_px[0]
         r = np.linspace(0.0, min(radius_px, self.radius_px[-1]), 4001)
-        # Part of a circle that is outside of the square of side 2 half: 4/π arccos(half/r), up to 1.
+        # Part of a circle outside of the square of side 2 half, the stamp: 4/π arccos(half/r) ≤ 1.
         outside = np.clip(np.arccos(np.minimum(half / np.maximum(r, half), 1.0)) * 4 / np.pi, 0, 1)
         height = np.concatenate([1.0 - outside[None], outside * tents(r, self.radius_px)])
         share = np.trapezoid(2 * np.pi * r * height, r, axis=1)
@@ -145,9 +144,9 @@ class Wings:
 
     @property
     def seen(self) -> bool:
-        """The light is no chance."""
-        light, error = self.light()
-        return light > LEAST_SEEN * error
+        """The pixels of the image say something of the light: its error is less than expected."""
+        sigma = expected_profile(self.radius_px, self.outer)[1]
+        return self.light()[1] < replace(self, covariance=np.diag(sigma**2)).light()[1]
 
 
 def aperture_correction(
@@ -239,9 +238,10 @@ def expected_profile(radius_px: np.ndarray, outer: float) -> tuple[np.ndarray, n
     edge = max(outer, 0.0) * 3.0 / (2.0 * np.pi * half**2 * (OUTER**-3.0 - 1.0))
     # In the stamp, what the ring around it has was taken for sky: the light at 1.5 h.
     expected = edge * np.append(1.5**-5.0, (radius_px[:-1] / half) ** (STEEPNESS - 5.0))
-    sigma = np.full(len(radius_px), 0.5 * edge)
-    sigma[0] *= 1.5**-STEEPNESS
-    return expected, np.hypot(sigma, 1e-3 / (2.0 * np.pi * half**2))
+    sigma = np.hypot(np.full(len(radius_px), 0.5 * edge), 1e-3 / (2.0 * np.pi * half**2))
+    # The model may have 1.5 % too much or too little light in its stamp.
+    sigma[0] = 0.015 / (2.0 * half) ** 2
+    return expected, sigma
 
 
 def wings_of(
@@ -259,6 +259,8 @@ def wings_of(
     An even light that was left beside them, such as a wrong sky, does not count. Nor do pixels that
     are far from the wings as they were known `before`.
     """
+    from scipy.ndimage import uniform_filter
+
     radius = np.geomspace(stamp_px / 2, REACH * stamp_px, TENTS + 1)
     lit = np.isfinite(flux) & (flux > 0)
     lit &= np.isfinite(outer)
@@ -267,11 +269,15 @@ def wings_of(
     count = len(radius)
     blank = Wings(radius, np.zeros(count), np.zeros((count, count)), mean)
     normal, right, square, pixels = np.zeros((count + 1,) * 2), np.zeros(count + 1), 0.0, 0
+    # Within a stamp all pixels count alike: then p_0 is the mean of what the model leaves there,
+    # and p_0 times the area of the stamp the light that it lacks, as an aperture would find it.
+    even = np.sqrt(uniform_filter(np.square(error), stamp_px, mode="nearest"))
     for band, tented in tented_light(left.shape, place, flux, outer, blank):
-        weight = np.where(bad[band], 0.0, 1.0 / error[band])
+        used = ~bad[band]
         if before is not None:
-            off = (left[band] - np.tensordot(before.profile, tented, 1)) * weight
-            weight = np.where(np.abs(off) < CLIPPED_SIGMA, weight, 0.0)
+            off = left[band] - np.tensordot(before.profile, tented, 1)
+            used &= np.abs(off) < CLIPPED_SIGMA * error[band]
+        weight = np.where(used, 1.0 / even[band], 0.0)
         design = np.concatenate([tented, np.ones((1, *weight.shape))]) * weight
         flat, seen = design.reshape(count + 1, -1), (left[band] * weight).ravel()
         normal, right = normal + flat @ flat.T, right + flat @ seen
@@ -315,6 +321,8 @@ def around_stars(
 ) -> Around:
     """Wings and sky of an image (h, w), by turns, where models of its stars are `drawn`.
 
+    A map of the sky takes wings that are wider than its meshes for sky, until these are known.
+
     Parameters
     ----------
     image, error, drawn : ndarray, shape (h, w)
@@ -328,15 +336,26 @@ def around_stars(
     """
     bad, wings, doubt = sky.bad, before, np.hypot(error, FOLLOWED * drawn)
     for _ in range(ROUNDS):
+        known = wings
         left = image - sky.level - drawn
-        wings = wings_of(left, doubt, bad, place, flux, outer, stamp_px, wings)
+        wings = wings_of(left, doubt, bad, place, flux, outer, stamp_px, known)
         far = np.zeros(image.shape)
         if wings is not None:
             for band, light in tented_light(image.shape, place, flux, outer, wings):
                 far[band] = np.tensordot(wings.profile, light, 1)
         mapped = np.isfinite(sky.noise_scale)
         sky = sky_of(image - drawn - far, bad, sky.noise if mapped else None)
-    return Around(sky, far, wings, doubt)
+        if wings is None:
+            break
+        now, sigma = wings.light()
+        if known is not None and abs(now - known.light()[0]) < SAME * sigma:
+            break
+    # The map has the most frequent value of the pixels, which is below the mean where noise is that
+    # of photons, and where stars are too faint to be seen: both are in the pixels of stars, too.
+    left = image - sky.level - drawn - far
+    weight = np.where(bad | (np.abs(left) > CLIPPED_SIGMA * doubt), 0.0, doubt**-2.0)
+    even = float((weight * left).sum() / max(weight.sum(), np.finfo(float).tiny))
+    return Around(replace(sky, level=sky.level + even, flat=sky.flat - even), far, wings, doubt)
 
 
 def wings_of_stars(model: PsfModel, observation: Observation) -> Wings | None:
@@ -350,7 +369,8 @@ def wings_of_stars(model: PsfModel, observation: Observation) -> Wings | None:
         If there is no sky to measure.
     """
     sky, side = observation.sky(), model.stamp_px
-    image, places, fluxes = sky.flat + sky.level, [], []
+    image = sky.flat + sky.level
+    middles, fluxes, outers = [], [], []
     # With the room of a stamp on all sides, for those that reach beyond the image.
     drawn = np.zeros(np.add(image.shape, 2 * side))
     for stamps, found in model.stream(observation, threads=1):
@@ -362,11 +382,12 @@ def wings_of_stars(model: PsfModel, observation: Observation) -> Wings | None:
             stamp = np.s_[y : y + side, x : x + side]
             if min(x, y) >= 0 and drawn[stamp].shape == psf.shape:
                 drawn[stamp] += psf
-        places.append(place)
+        outers.append(outer_light(model.on_pixels, place))
+        # Wings begin where the stamps end: they are those about the middles of the stamps.
+        middles.append(np.where(known[:, None], corner - side + 0.5 * (side - 1), np.nan))
         fluxes.append(np.where(known, found.flux, np.nan))
     inner = np.s_[side:-side, side:-side]
-    light = drawn[inner]
-    place, flux, gain = np.concatenate(places), np.concatenate(fluxes), observation.gain
+    light, gain = drawn[inner], observation.gain
+    middle, flux, outer = (np.concatenate(values) for values in (middles, fluxes, outers))
     error = np.sqrt(sky.noise**2 + (np.maximum(light, 0.0) / gain if gain else 0.0))
-    outer = outer_light(model.on_pixels, place)
-    return around_stars(image, sky, error, light, place, flux, outer, side).wings
+    return around_stars(image, sky, error, light, middle, flux, outer, side).wings
