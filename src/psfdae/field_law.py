@@ -35,7 +35,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from psfdae.field_psf import SLOPE_PX, STAR_TERMS, FieldModel
+from psfdae.field_psf import SLOPE_PX, STAR_TERMS, FieldModel, spacing_of
 from psfdae.mixing import FLUX_SIGMA, mixing_weights
 from psfdae.noise import NoiseModel
 from psfdae.settings import Count, Fraction, Group, Positive
@@ -95,7 +95,7 @@ class FieldSettings(Group):
         "predicts stars that were left out no better",
     )
     spacing_px: Annotated[float, Field(gt=0.1, le=2)] = Field(
-        0.5, description="Distance of the knots of the field's splines"
+        0.5, description="Distance of the knots of the field's splines, at least"
     )
     smoothness: Positive = Field(
         100.0, description="Of the splines: weight of their second differences"
@@ -336,7 +336,8 @@ class FieldLaw:
     def model(self) -> FieldModel:
         """The PSF at every place."""
         coefficients = self.coefficients.astype(np.float64)
-        return FieldModel(coefficients, self.low, self.high, self.settings.spacing_px)
+        spacing = spacing_of(self.side + 2 * MARGIN_PX, coefficients.shape[-1])
+        return FieldModel(coefficients, self.low, self.high, spacing)
 
     @property
     def order(self) -> int:

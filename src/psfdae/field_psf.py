@@ -1,18 +1,19 @@
 """The PSF as a function of the place in the field, from the bright stars of an image.
 
-What a detector shows of a star whose centre lies at u from a pixel is f(u; x, y), pixel
-included (Anderson & King 2000, PASP 112, 1360). Here f is a sum of cubic B-splines in u,
-of knots finer than a pixel, whose coefficients are polynomials in the position (x, y).
-Stars lie at all phases of the pixel grid, hence f is known between the pixels. Weighted
-least squares by conjugate gradients alternate with the flux and the centre of every star
-(Gauss-Newton). Light is the same at all phases: without that condition, splines and fluxes could
-change with the phase against each other. Changes over the field are as small a part of the wings
-as of the core, unless the stars say otherwise. Stars that are unlike the others do not count, and
-pixels that are brighter or fainter than the model count less: they may show a neighbour. How far
-the polynomial goes, and how smooth the splines are, is what stars that were left out are
-predicted best with. Where a detector or a plate is not linear, f changes with the brightness of a
-star as well, and through lenses and air with its colour: magnitude and its square are two more
-terms, and so are those of the colour, if they predict stars that were left out clearly better.
+What a detector shows of a star whose centre lies at u from a pixel is f(u; x, y), pixel included
+(Anderson & King 2000, PASP 112, 1360). Here f is a sum of cubic B-splines in u, whose coefficients
+are polynomials in the position (x, y). Stars lie at all phases of the pixel grid, hence f is known
+between the pixels. Weighted least squares by conjugate gradients alternate with the flux and the
+centre of every star (Gauss-Newton). Light is the same at all phases: without that condition,
+splines and fluxes could change with the phase against each other. Changes over the field are as
+small a part of the wings as of the core, unless the stars say otherwise. Stars that are unlike the
+others do not count, and pixels that are brighter or fainter than the model count less: they may
+show a neighbour. How far the knots are apart, how far the polynomial goes, and how smooth the
+splines are, is what stars that were left out are predicted best with: knots finer than the
+structure of stars would follow noise. Where a detector or a plate is not linear, f changes with the
+brightness of a star as well, and through lenses and air with its colour: magnitude and its square
+are two more terms, and so are those of the colour, if they predict stars that were left out clearly
+better.
 """
 
 from __future__ import annotations
@@ -43,6 +44,7 @@ UNLIKE_CHI2 = 8.0  # times the median, from which a star does not count
 CURVED = 2  # order up to which all are tried: a symmetric field has no slope
 STAR_TERMS, STAR_GAIN = 2, 0.02  # of magnitude or colour; part of the error that they save
 SMOOTHER, SMOOTHER_BY = 3, 10.0  # steps of the smoothness, each by this factor, that are tried
+COARSER, COARSER_BY = 6, 2.0**0.5  # steps of the distance of the knots, likewise
 EXPOSURE_CHANGES = (0.005, 0.02, 0.1)  # of a coefficient by that of another exposure, tried
 LARGEST_DEFORMATION = 0.3  # usual stretch of a PSF in another exposure; px² of its blur
 DEFORMATION_STEPS = 3  # of Gauss-Newton
@@ -139,7 +141,7 @@ class LeftOut(NamedTuple):
 
     light: np.ndarray  # (2, n), what looks like sky in their stamps, over the flux, and its σ
     residual: np.ndarray  # (n, d, d), of flux 1
-    seen: np.ndarray  # (n, d, d), 1 in pixels that count, else 0
+    weight: np.ndarray  # (n, d, d), expected light of pixels that count, else 0
 
 
 def fit_field(
@@ -152,7 +154,7 @@ def fit_field(
     smoothness: float,
     rng: np.random.Generator | None = None,
 ) -> FieldFit:
-    """Fit orders of the polynomial, ascending, and then stronger smoothing, as long as it pays.
+    """Fit coarser knots, orders of the polynomial, and stronger smoothing, as long as it pays.
 
     It pays if stars that are left out are predicted better. With the best order, terms of the
     magnitude and then of the colour are tried.
@@ -168,7 +170,7 @@ def fit_field(
     orders : sequence of int
         Of one alone nothing is tried.
     spacing : float
-        Of the knots, in pixels.
+        Of the knots, in pixels, at least.
     smoothness : float
         Least weight of the squared second differences of the coefficients, 1/flux².
     rng : Generator, optional
@@ -201,7 +203,11 @@ def _best_fit(
     """
     if is_settled:
         return alternating.with_errors(alternating.fit(tried[0]), rng)
-    alternating.tolerance, best, least = TRIED_TOLERANCE, 0, np.inf
+    alternating.tolerance = TRIED_TOLERANCE
+    # Splines first, with a polynomial that follows most of the field: with those that follow noise,
+    # no higher order would seem to pay.
+    alternating.choose_splines(max((o for o in tried if o <= CURVED), default=tried[0]))
+    best, least = 0, np.inf
     for order in tried:
         error = alternating.crossed_error(alternating.fit(order))
         if error < least:
@@ -217,13 +223,6 @@ def _best_fit(
                 least = error
             else:
                 high[coordinate] = low[coordinate]
-    for _ in range(SMOOTHER):
-        alternating.smoothness *= SMOOTHER_BY
-        error = alternating.crossed_error(alternating.fit(best))
-        if error >= least:
-            alternating.smoothness /= SMOOTHER_BY
-            break
-        least = error
     alternating.tolerance = TOLERANCE
     return alternating.with_errors(alternating.fit(best), rng)
 
@@ -235,9 +234,9 @@ def _supported(orders: Sequence[int], stars: BrightStars) -> list[int]:
     tried = sorted(orders)
     if len(stars) >= FEW_STARS or len(orders) == 1:
         return tried
-    # Stars that are left out say too little then: at least two stars a term of the polynomial of
-    # order o, which has (o + 1)(o + 2)/2.
-    return [o for o in tried if (o + 1) * (o + 2) <= len(stars)] or tried[:1]
+    # Stars that are left out say too little then: at least three stars for two terms of the
+    # polynomial of order o, which has (o + 1)(o + 2)/2.
+    return [o for o in tried if 3 * (o + 1) * (o + 2) <= 4 * len(stars)] or tried[:1]
 
 
 def refit_field(
@@ -281,14 +280,14 @@ class _Alternating:
         self.around_px = max(stars.wide[0].size - stamp_px**2, 1)  # of which the sky is the median
         self.noise, self.place = stars.noise, stars.place
         self.photons = np.sqrt(background) / stars.noise  # per unit of flux
-        self.stamp_px, self.spacing, self.smoothness = stamp_px, spacing, smoothness
+        self.stamp_px, self.smoothness = stamp_px, smoothness
         # A = 4πσ² of a Gaussian. A ring has no light in its middle: a window as wide as the radius
         # of all light does, 1.4 σ.
         sigma = float(np.sqrt(np.median(stars.area()) / (4.0 * np.pi)))
         self.window_px = 1.4 * sigma if sigma > 3.0 else WINDOW_PX
         self.axis = np.arange(side) - side // 2.0
         self.inner = np.abs(self.axis + 0.5) < stamp_px / 2
-        self.knots = int((side + 1) / spacing) - 1
+        self.set_knots(knots_of(side, spacing))
         known = [column[np.isfinite(column)] for column in self.place.T]
         ends = [(column.min(), column.max()) if column.size else (0.0, 0.0) for column in known]
         self.low, self.most = np.transpose(ends)
@@ -296,9 +295,30 @@ class _Alternating:
         self.high = np.concatenate([self.most[:2], self.low[2:]])
         if prior is not None:
             self.low, self.high = prior.low, prior.high
-        bend = np.diff(np.eye(self.knots), 2, axis=0)
+
+    def set_knots(self, knots: int) -> None:
+        """Set the number of knots along each side of the frame."""
+        self.knots, self.spacing = knots, spacing_of(len(self.axis), knots)
+        bend = np.diff(np.eye(knots), 2, axis=0)
         self.bend = bend.T @ bend
         self.advance: Advance = lambda fits: None
+
+    def choose_splines(self, order: int) -> None:
+        """Take knots farther apart, and then smoother splines, as long as each step pays."""
+        least = self.crossed_error(self.fit(order))
+        for _ in range(COARSER):
+            finer = self.knots
+            self.set_knots(knots_of(len(self.axis), COARSER_BY * self.spacing))
+            if (error := self.crossed_error(self.fit(order))) >= least:
+                self.set_knots(finer)
+                break
+            least = error
+        for _ in range(SMOOTHER):
+            self.smoothness *= SMOOTHER_BY
+            if (error := self.crossed_error(self.fit(order))) >= least:
+                self.smoothness /= SMOOTHER_BY
+                break
+            least = error
 
     def fit(self, order: int) -> FieldFit:
         """All stars."""
@@ -309,7 +329,11 @@ class _Alternating:
         start, window = np.zeros((len(flux), 2)), np.full(len(flux), self.window_px)
         reach = WINDOW_REACH_PX if self.window_px == WINDOW_PX else FARTHEST_PX
         centre = windowed_centres(self.images, start, window, WINDOW_ROUNDS, reach)
-        alike, noise = np.ones(self.images.shape), self._weight(flux)
+        # Weights are those of a star's expected light, first that of the median star. Those of its
+        # own pixels would be larger where noise makes them fainter, and light in the wings too
+        # little (Humphrey, Liu & Buote 2009, ApJ 693, 822).
+        light = np.median(self.images / flux[:, None, None], axis=0)
+        alike, noise = np.ones(self.images.shape), self._weight(flux, light)
         found: np.ndarray | None = None
         for turn in range(FIT_ROUNDS):
             data = self.images / flux[:, None, None]
@@ -327,10 +351,10 @@ class _Alternating:
             drawn = _drawn(splines, self.axis, centre, self.spacing)
             # Where a star lies on the pixel grid changes no light: without this, fluxes and splines
             # could change with that place against each other.
-            light = drawn[:, self.inner][:, :, self.inner].sum(axis=(1, 2))
-            flux, drawn = flux * light, drawn / light[:, None, None]
+            inside = drawn[:, self.inner][:, :, self.inner].sum(axis=(1, 2))
+            flux, drawn = flux * inside, drawn / inside[:, None, None]
             residual = np.where(self.seen, self.images / flux[:, None, None] - drawn, 0.0)
-            noise = self._weight(flux)
+            noise = self._weight(flux, drawn)
             square = residual**2 * noise
             chi2 = square.sum(axis=(1, 2)) / np.maximum(self.seen.sum(axis=(1, 2)), 1)
             alike = 1.0 / (1.0 + square / UNLIKE_SIGMA**2)
@@ -369,10 +393,12 @@ class _Alternating:
     def crossed_error(self, fit: FieldFit) -> float:
         """Geometric mean of the squared errors of stars that were left out, fold by fold.
 
-        Flux, sky and centre of these are fitted to them.
+        Flux, sky and centre of these are fitted to them. Pixels count as the light m in them: by
+        Cauchy and Schwarz, the error Σ m δ / Σ m² of a flux by residuals δ is at most that of
+        Σ m δ².
         """
         errors = [
-            np.log((part.residual**2 * part.seen).sum(axis=(1, 2)) / part.seen.sum(axis=(1, 2)))
+            np.log((part.residual**2 * part.weight).sum(axis=(1, 2)) / part.weight.sum(axis=(1, 2)))
             for part in self._left_out(fit)
         ]
         return float(np.exp(np.concatenate(errors).mean()))
@@ -384,7 +410,8 @@ class _Alternating:
         """
         terms = fit.model.terms(self.place)
         data = self.images / fit.flux[:, None, None]
-        weight, noise = self._weight(fit.flux), self._variance(fit.flux)
+        drawn = fit.model.images(terms, fit.centre, len(self.axis))
+        weight, noise = self._weight(fit.flux, drawn), self._variance(fit.flux, drawn)
         fold, judged_stars = np.arange(len(terms)) % FOLDS, 0
         inner = self.inner
         box = np.ix_(range(len(terms)), inner, inner)
@@ -408,23 +435,25 @@ class _Alternating:
             variance = (influence**2 * noise[box][judged].reshape(len(judged), -1)).sum(axis=1)
             variance += np.pi / 2 * (self.noise / fit.flux)[judged] ** 2 / self.around_px
             light = inner.sum() ** 2 / flux * [level, np.sqrt(variance)]
-            yield LeftOut(light, left, even)
+            yield LeftOut(light, left, even * np.maximum(drawn[box][judged], 0.0))
             judged_stars += len(judged)
             if judged_stars >= ENOUGH_STARS:
                 break
 
-    def _weight(self, flux: np.ndarray) -> np.ndarray:
-        """1/variance of the pixels of flux 1, with errors of the model; 0 where not seen."""
-        light = np.maximum(self.images / flux[:, None, None], 0.0)
-        variance = self._variance(flux) + (MODEL_ERROR * light) ** 2 + LEAST_ERROR**2
+    def _weight(self, flux: np.ndarray, light: np.ndarray) -> np.ndarray:
+        """1/variance of the pixels of flux 1, with errors of the model; 0 where not seen.
+
+        `light` is that expected of stars of flux 1, of each (n, s, s) or of all (s, s).
+        """
+        of_model = MODEL_ERROR * np.maximum(light, 0.0)
+        variance = self._variance(flux, light) + of_model**2 + LEAST_ERROR**2
         return np.where(self.seen, 1.0 / variance, 0.0)
 
-    def _variance(self, flux: np.ndarray) -> np.ndarray:
+    def _variance(self, flux: np.ndarray, light: np.ndarray) -> np.ndarray:
         """Variance of the pixels of flux 1 by the sky and the star's photons."""
         factor = 1.0 / flux[:, None, None]
-        light = np.maximum(self.images * factor, 0.0)
         noise, photons = (a[:, None, None] for a in (self.noise, self.photons))
-        return np.asarray((noise * factor) ** 2 + light * factor / photons)
+        return np.asarray((noise * factor) ** 2 + np.maximum(light, 0.0) * factor / photons)
 
     def _deformed(
         self,
@@ -523,6 +552,16 @@ class _Alternating:
             M=LinearOperator(size, matvec=nearly, dtype=float),
         )
         return np.asarray(found).reshape(shape) + known
+
+
+def knots_of(frame_px: int, spacing: float) -> int:
+    """Return the number of knots along a side of a frame, the outermost ½ pixel beyond its edge."""
+    return max(round((frame_px + 1) / spacing), 3) + 1
+
+
+def spacing_of(frame_px: int, knots: int) -> float:
+    """Return the distance of so many knots in pixels."""
+    return (frame_px + 1) / (knots - 1)
 
 
 def _deformations(coefficients: np.ndarray, spacing: float) -> np.ndarray:

@@ -297,6 +297,9 @@ class DrawsStars(Protocol):
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Noise-free stars; see `psfdae.methods.field.FieldMixture.draw_stars`."""
 
+    def fitted_flux_error(self) -> float:
+        """Error of a flux on a known sky; see `psfdae.methods.field.FieldMixture`."""
+
 
 @runtime_checkable
 class KnowsField(Protocol):

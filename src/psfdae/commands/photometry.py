@@ -52,7 +52,7 @@ def photometry(
 
     --detect finds the stars, and in a second round those that brighter ones hide; those of
     --catalogue are measured where it says, and no others. Fluxes have the light beyond the
-    stamps of MODEL, which the bright stars show.
+    stamps of MODEL, which the bright stars show; these show the gain, too, if it is not known.
     """
     if out.suffix.lower() not in SUFFIXES:
         raise PhotometryError(f"{out}: expected a name that ends in {', '.join(SUFFIXES)}")
@@ -83,7 +83,9 @@ def photometry(
         magnitudes = places, as_catalogue(reference).numbers(magnitude_column)
 
     from psfdae.model.crowded import photometry as measured
+    from psfdae.model.photon_noise import with_measured_gain
 
+    observation = with_measured_gain(loaded, observation)
     found, offset = _of_all_rows(
         observation, lambda usable: measured(loaded, usable, stated.threshold)
     )

@@ -73,11 +73,14 @@ class ModelErrors(NamedTuple):
         In a pixel, over the flux.
     centre : float
         In pixels, along each axis.
+    fitted_flux : float
+        Over the flux, where the PSF is fitted on a sky that is known from the whole image.
     """
 
     flux: float = 0.0
     sky: float = 0.0
     centre: float = 0.0
+    fitted_flux: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)

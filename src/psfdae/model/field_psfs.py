@@ -72,7 +72,10 @@ class FieldPsfs(ABC):
 
     @property
     def flux_error(self) -> float:
-        """Standard error over the flux that the model makes of every star; 0 if not known."""
+        """Standard error over the flux that the model makes of every star on a known sky.
+
+        0 if it is not known.
+        """
         return 0.0
 
     @property

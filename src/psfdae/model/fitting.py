@@ -167,6 +167,6 @@ def packed(stars: Stars, fitted: Method, name: str, licence: str) -> PsfModel:
             for part in stars.each
         ]
     known = [wings for wings in each if wings is not None]
-    if not known or not (wings := Wings.joined(known)).seen:
+    if not known:
         return model
-    return PsfModel(with_wings(model.bundle, wings), model.engine.estimator)
+    return PsfModel(with_wings(model.bundle, Wings.joined(known)), model.engine.estimator)

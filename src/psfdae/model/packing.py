@@ -560,7 +560,7 @@ def with_model_errors(model: PsfModel, fitted: DrawsStars, seed: int) -> Bundle:
     off = np.concatenate([found.y_fit - centre[:, 0], found.x_fit - centre[:, 1]])
     stated = np.concatenate([found.y_error, found.x_error])
     both = np.concatenate([usable, usable])
-    errors = ModelErrors(flux, sky, lacking(off[both], stated[both]))
+    errors = ModelErrors(flux, sky, lacking(off[both], stated[both]), fitted.fitted_flux_error())
     info = bundle.info
     said = info.config | {"model_errors": errors._asdict()}
     return replace(bundle, info=info.model_copy(update={"config": said}))

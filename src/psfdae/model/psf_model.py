@@ -305,8 +305,9 @@ class PsfModel(FieldPsfs):
 
     @property
     def flux_error(self) -> float:
-        """Standard error over the flux that the model makes of every star; 0 if not known."""
-        return self.bundle.model_errors.flux
+        """Standard error over the flux that model and wings make of every star on a known sky."""
+        light, error = (0.0, 0.0) if self.wings is None else self.wings.light()
+        return float(np.hypot(self.bundle.model_errors.fitted_flux, error / (1.0 + light)))
 
     @property
     def image_px(self) -> tuple[int, int] | None:

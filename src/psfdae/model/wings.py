@@ -1,20 +1,22 @@
 """Light of stars beyond the stamps of a model, and the sky that is left without it.
 
 The model knows the light of a star in its stamp, above what is there in a ring around it. The rest
-is one profile for all stars: a star of flux F at distance r from its centre has
+is one profile for all stars: a star of flux F has
 
-    F s Σ_k p_k h_k(r)
+    F s (p_0 h_0 + Σ_k p_k h_k(r))
 
-more in a pixel, with tents h_k in ln r times a power of r, the first one even inside the stamp,
-and s the light of the model's PSF in the outer part of its stamp over the mean of all stars:
-where the PSF is wider, it has more wings. All pixels of the image together give p_k by weighted
-least squares.
+more in a pixel, with h_0 = 1 in its stamp and 0 elsewhere, tents h_k in ln r times a power of r
+outside of the stamp, r the distance from its centre, and s the light of the model's PSF in the
+outer part of its stamp over the mean of all stars: where the PSF is wider, it has more wings.
+All pixels of the image together give p by weighted least squares, beside what is expected of p
+before: that the light falls on outside of the stamp about as that of other telescopes does. Bright
+stars say more than that, and few faint ones hardly anything.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
@@ -32,9 +34,8 @@ OUTER, OUTER_RANGE = 0.7, (0.3, 3.0)  # radius of a stamp's outer part over half
 REACH, TENTS, STEEPNESS = 2.5, 6, 3.0  # radius of the wings in stamps; tents; power of 1/r in them
 WINGED, BAND_PX = 1000, 128  # brightest stars, whose wings are drawn; rows at a time
 CLIPPED_SIGMA = 4.0  # of a pixel from the wings known so far, from which it is left out
-LEAST_SEEN = 3.0  # σ, from which wings are real
 MOST_LIGHT, MOST_RADIUS_PX = 10.0, 1e5  # of wings over the flux in the stamp; no nonsense
-ROUNDS = 3  # of wings and sky
+ROUNDS, SAME = 8, 0.1  # of wings and sky, at most; change of the light in σ with which they end
 PSFS_AT_ONCE = 2048
 
 
@@ -44,8 +45,9 @@ class Wings:
 
     Attributes
     ----------
-    radius_px : ndarray, shape (K + 1,)
-        Tops of the tents h_k; at the last radius there is no light any more.
+    radius_px : ndarray, shape (K,)
+        Tops of the tents h_1 …, the first one at half the side of the stamp; at the last radius
+        there is no light any more.
     profile : ndarray, shape (K,)
         p_k, per pixel.
     covariance : ndarray, shape (K, K)
@@ -76,13 +78,13 @@ class Wings:
             raise ValueError(f"wings without {error}") from None
         radius, count = found.radius_px, found.profile.size
         shapes = [a.shape for a in (found.profile, radius, found.covariance)]
-        if shapes != [(count,), (count + 1,), (count, count)]:
+        if count < 2 or shapes != [(count,), (count,), (count, count)]:
             raise ValueError("wings whose numbers do not fit together")
         rising = radius[0] > 0 and (np.diff(radius) > 0).all() and radius[-1] < MOST_RADIUS_PX
         with np.errstate(all="ignore"):
             light, doubt = found.light() if rising else (np.nan, np.nan)
         scale = 0.0 < found.outer < np.inf
-        if not (scale and 0.0 <= light < MOST_LIGHT and np.isfinite(doubt)):
+        if not (scale and abs(light) < MOST_LIGHT and np.isfinite(doubt)):
             raise ValueError("wings whose light is no part of that of a star")
         return found
 
@@ -90,19 +92,25 @@ class Wings:
         """Lists and numbers, for a bundle."""
         return {name: np.asarray(value).tolist() for name, value in vars(self).items()}
 
-    def total(self, outer: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Flux over that of the model of stars by their `outer_light`, and its error, (n,) both.
+    def scale(self, outer: np.ndarray) -> np.ndarray:
+        """s of stars by their `outer_light` (n,), 1 where that is NaN, of an unknown place."""
+        known = np.where(np.isfinite(outer), outer / self.outer, 1.0)
+        return np.asarray(np.clip(known, *OUTER_RANGE))
 
-        NaN, of stars whose place is not known, counts as a usual star.
-        """
-        scale = np.clip(np.where(np.isfinite(outer), outer / self.outer, 1.0), *OUTER_RANGE)
+    def total(self, outer: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Flux over that of the model of stars by their `outer_light`, and its error, (n,) both."""
+        scale = self.scale(outer)
         light, error = self.light()
         return 1.0 + scale * light, scale * error
 
     def light(self, radius_px: float = np.inf) -> tuple[float, float]:
         """Part of the flux within a radius, where s = 1, and its standard error."""
+        half = self.radius_px[0]
         r = np.linspace(0.0, min(radius_px, self.radius_px[-1]), 4001)
-        share = np.trapezoid(2 * np.pi * r * tents(r, self.radius_px), r, axis=1)
+        # Part of a circle outside of the square of side 2 half, the stamp: 4/π arccos(half/r) ≤ 1.
+        outside = np.clip(np.arccos(np.minimum(half / np.maximum(r, half), 1.0)) * 4 / np.pi, 0, 1)
+        height = np.concatenate([1.0 - outside[None], outside * tents(r, self.radius_px)])
+        share = np.trapezoid(2 * np.pi * r * height, r, axis=1)
         return float(self.profile @ share), float(np.sqrt(share @ self.covariance @ share))
 
     def cards(self) -> list[Card]:
@@ -136,9 +144,9 @@ class Wings:
 
     @property
     def seen(self) -> bool:
-        """The light is no chance."""
-        light, error = self.light()
-        return light > LEAST_SEEN * error
+        """The pixels of the image say something of the light: its error is less than expected."""
+        sigma = expected_profile(self.radius_px, self.outer)[1]
+        return self.light()[1] < replace(self, covariance=np.diag(sigma**2)).light()[1]
 
 
 def aperture_correction(
@@ -163,9 +171,9 @@ def aperture_correction(
     inside = float(CircularAperture(middle, radius_px).do_photometry(psf)[0][0])
     if wings is None:
         return 1.0 / inside
-    total = float(wings.total(outer_light(model.on_pixels, np.array([[x, y]])))[0][0])
-    whole, part = (wings.light(r)[0] for r in (np.inf, radius_px))
-    return total / (inside + (total - 1.0) * part / whole)
+    scale = float(wings.scale(outer_light(model.on_pixels, np.array([[x, y]])))[0])
+    whole, part = (scale * wings.light(r)[0] for r in (np.inf, radius_px))
+    return (1.0 + whole) / (inside + part)
 
 
 def outer_light(draw: Callable[[np.ndarray], np.ndarray], place: np.ndarray) -> np.ndarray:
@@ -185,8 +193,8 @@ def outer_light(draw: Callable[[np.ndarray], np.ndarray], place: np.ndarray) -> 
 
 
 def tents(r: np.ndarray, radius_px: np.ndarray) -> np.ndarray:
-    """h_k at distances r, shape (K, …)."""
-    # ln of r over the first top, where even light ends; tops are equidistant in it.
+    """h_1 … at distances r, shape (K − 1, …), as they are outside of the stamp."""
+    # ln of r over the first top; tops are equidistant in it.
     radius = radius_px.astype(r.dtype)
     beyond = np.log(np.maximum(r / radius[0], 1.0))
     top = np.arange(len(radius) - 1, dtype=r.dtype).reshape(-1, *[1] * r.ndim)
@@ -199,7 +207,7 @@ def star_tents(
 ) -> Iterator[tuple[tuple[slice, slice], np.ndarray]]:
     """Windows about the brightest stars within some rows, and F s h_k there, shape (K, …)."""
     reach, radius = int(wings.radius_px[-1]), wings.radius_px
-    light = flux * np.clip(outer / wings.outer, *OUTER_RANGE)
+    light = np.where(np.isfinite(outer), flux * wings.scale(outer), np.nan)
     known = np.flatnonzero(np.isfinite(light) & (light > 0) & np.isfinite(place).all(axis=1))
     brightest = known[np.argsort(-light[known])[:WINGED]]
     # The pixels within reach, as far as they are in these rows.
@@ -209,11 +217,14 @@ def star_tents(
     for inside in np.flatnonzero((low < high).all(axis=1)):
         star, (left, top), (right, end) = brightest[inside], low[inside], high[inside]
         across, down = (
-            np.square(np.arange(*ends) - at).astype(np.float32)
+            (np.arange(*ends) - at).astype(np.float32)
             for ends, at in zip(((left, right), (top, end)), place[star], strict=True)
         )
+        distance = np.sqrt(np.square(down)[:, None] + np.square(across))
+        stamp = np.maximum(np.abs(down)[:, None], np.abs(across)) < radius[0]
+        shape = np.concatenate([stamp[None], np.where(stamp, 0.0, tents(distance, radius))])
         window = slice(top - rows.start, end - rows.start), slice(left, right)
-        yield window, float(light[star]) * tents(np.sqrt(down[:, None] + across), radius)
+        yield window, float(light[star]) * shape
 
 
 def tented_light(
@@ -236,12 +247,31 @@ def wing_light(
     outer: np.ndarray,
     wings: Wings | None,
 ) -> np.ndarray:
-    """Light of the wings of stars in an image (h, w); none if they are not seen."""
+    """Light of the wings of stars in an image (h, w)."""
     far = np.zeros(shape, np.float32)
-    if wings is not None and wings.seen:
+    if wings is not None:
         for window, light in star_tents(slice(0, shape[0]), shape[1], place, flux, outer, wings):
             far[window] += np.tensordot(wings.profile, light, 1)
     return far
+
+
+def expected_profile(radius_px: np.ndarray, outer: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return what is expected of p before any pixel outside of stamps is seen, and its σ, (K,).
+
+    Outside of a stamp of the half side h, the light falls on as a (r/h)^-5, the mean slope of
+    Moffat profiles there (Moffat 1969, A&A 3, 455), where a follows from the light `outer` between
+    0.7 h and h. It may be more by half of what falls as r^-3, as light that mirrors and air scatter
+    does (King 1971, PASP 83, 199), or less, and has an error of 0.1 % of the star at least.
+    """
+    half = radius_px[0]
+    # ∫ 2π r (r/h)^-5 dr from 0.7 h to h is 2π h² (0.7^-3 − 1)/3.
+    edge = max(outer, 0.0) * 3.0 / (2.0 * np.pi * half**2 * (OUTER**-3.0 - 1.0))
+    # In the stamp, what the ring around it has was taken for sky: the light at 1.5 h.
+    expected = edge * np.append(1.5**-5.0, (radius_px[:-1] / half) ** (STEEPNESS - 5.0))
+    sigma = np.hypot(np.full(len(radius_px), 0.5 * edge), 1e-3 / (2.0 * np.pi * half**2))
+    # The model may have 1.5 % too much or too little light in its stamp.
+    sigma[0] = 0.015 / (2.0 * half) ** 2
+    return expected, sigma
 
 
 def wings_of(
@@ -254,39 +284,48 @@ def wings_of(
     stamp_px: int,
     before: Wings | None = None,
 ) -> Wings | None:
-    """Wings of stars in what is left of an image (h, w) without sky and models; None without light.
+    """Wings of stars in what is left of an image (h, w) without sky and models; None without stars.
 
     An even light that was left beside them, such as a wrong sky, does not count. Nor do pixels that
     are far from the wings as they were known `before`.
     """
-    from scipy.optimize import lsq_linear
+    from scipy.ndimage import uniform_filter
 
     radius = np.geomspace(stamp_px / 2, REACH * stamp_px, TENTS + 1)
     lit = np.isfinite(flux) & (flux > 0)
     lit &= np.isfinite(outer)
     if not lit.any() or not (mean := float(np.average(outer[lit], weights=flux[lit]))) > 0:
         return None
-    blank = Wings(radius, np.zeros(TENTS), np.zeros((TENTS, TENTS)), mean)
-    normal, right, square, count = np.zeros((TENTS + 1,) * 2), np.zeros(TENTS + 1), 0.0, 0
+    count = len(radius)
+    blank = Wings(radius, np.zeros(count), np.zeros((count, count)), mean)
+    normal, right, square, pixels = np.zeros((count + 1,) * 2), np.zeros(count + 1), 0.0, 0
+    # Within a stamp all pixels count alike: then p_0 is the mean of what the model leaves there,
+    # and p_0 times the area of the stamp the light that it lacks, as an aperture would find it.
+    even = np.sqrt(uniform_filter(np.square(error), stamp_px, mode="nearest"))
     for band, tented in tented_light(left.shape, place, flux, outer, blank):
-        weight = np.where(bad[band], 0.0, 1.0 / error[band])
+        used = ~bad[band]
         if before is not None:
-            off = (left[band] - np.tensordot(before.profile, tented, 1)) * weight
-            weight = np.where(np.abs(off) < CLIPPED_SIGMA, weight, 0.0)
+            off = left[band] - np.tensordot(before.profile, tented, 1)
+            used &= np.abs(off) < CLIPPED_SIGMA * error[band]
+        weight = np.where(used, 1.0 / even[band], 0.0)
         design = np.concatenate([tented, np.ones((1, *weight.shape))]) * weight
-        flat, seen = design.reshape(TENTS + 1, -1), (left[band] * weight).ravel()
+        flat, seen = design.reshape(count + 1, -1), (left[band] * weight).ravel()
         normal, right = normal + flat @ flat.T, right + flat @ seen
-        square, count = square + float(seen @ seen), count + int(np.count_nonzero(weight))
-    unit = np.sqrt(normal.diagonal())
-    if not (unit > 0).all():
+        square, pixels = square + float(seen @ seen), pixels + int(np.count_nonzero(weight))
+    if not normal[-1, -1] > 0:
         return None
-    root = np.linalg.cholesky(normal / unit / unit[:, None] + 1e-12 * np.eye(TENTS + 1))
-    wanted, bounds = np.linalg.solve(root, right / unit), np.array([0.0] * TENTS + [-np.inf])
-    fit = lsq_linear(root.T, wanted, (bounds, np.inf))
-    found = fit.x / unit
-    # In Σ (seen − design found)², the part that no profile explains is what remains of Σ seen².
-    chi2 = (square - wanted @ wanted + 2.0 * fit.cost) / max(count, 1)
-    inverse = np.linalg.inv(root @ root.T) / unit / unit[:, None] * max(chi2, 1.0)
+    # Generalised least squares of p and of the even light, of which nothing is expected, in units
+    # of the σ that are expected: (N/χ² + 1) x = b/χ² + μ, χ² that of the pixels, at least 1.
+    expected, sigma = expected_profile(radius, mean)
+    unit = np.append(sigma, normal[-1, -1] ** -0.5)
+    normal, right = normal * unit * unit[:, None], right * unit
+    known, start = np.diag(np.append(np.ones(count), 0.0)), np.append(expected / sigma, 0.0)
+    chi2 = 1.0
+    for _ in range(2):
+        inverse = np.linalg.inv(normal / chi2 + known)
+        found = inverse @ (right / chi2 + start)
+        chi2 = max((square - 2.0 * found @ right + found @ normal @ found) / max(pixels, 1), 1.0)
+    found, inverse = found * unit, inverse * unit * unit[:, None]
     return Wings(radius, found[:-1], inverse[:-1, :-1], mean)
 
 
@@ -312,6 +351,8 @@ def around_stars(
 ) -> Around:
     """Wings and sky of an image (h, w), by turns, where models of its stars are `drawn`.
 
+    A map of the sky takes wings that are wider than its meshes for sky, until these are known.
+
     Parameters
     ----------
     image, error, drawn : ndarray, shape (h, w)
@@ -327,7 +368,13 @@ def around_stars(
     wings = _wings_beside(beside, sky.level, doubt, sky.bad, *light, stamp_px, before)
     far = wing_light(image.shape, *light, wings)
     mapped = np.isfinite(sky.noise_scale)
-    return Around(sky_of(beside - far, sky.bad, sky.noise if mapped else None), far, wings, doubt)
+    sky = sky_of(beside - far, sky.bad, sky.noise if mapped else None)
+    # The map has the most frequent value of the pixels, which is below the mean where noise is that
+    # of photons, and where stars are too faint to be seen: both are in the pixels of stars, too.
+    left = beside - sky.level - far
+    weight = np.where(sky.bad | (np.abs(left) > CLIPPED_SIGMA * doubt), 0.0, doubt**-2.0)
+    even = float((weight * left).sum() / max(weight.sum(), np.finfo(float).tiny))
+    return Around(replace(sky, level=sky.level + even, flat=sky.flat - even), far, wings, doubt)
 
 
 def _wings_beside(
@@ -344,9 +391,15 @@ def _wings_beside(
     """Wings of stars in an image (h, w) without its models, in turns with the level of its sky."""
     wings = before
     for turn in range(ROUNDS):
+        known = wings
         if turn:
-            level = sky_level(beside - wing_light(beside.shape, place, flux, outer, wings), bad)
-        wings = wings_of(beside - level, doubt, bad, place, flux, outer, stamp_px, wings)
+            level = sky_level(beside - wing_light(beside.shape, place, flux, outer, known), bad)
+        wings = wings_of(beside - level, doubt, bad, place, flux, outer, stamp_px, known)
+        if wings is None:
+            break
+        light, sigma = wings.light()
+        if known is not None and abs(light - known.light()[0]) < SAME * sigma:
+            break
     return wings
 
 
@@ -361,7 +414,7 @@ def wings_of_stars(model: PsfModel, observation: Observation) -> Wings | None:
         If there is no sky to measure.
     """
     sky, side = observation.sky(), model.stamp_px
-    places, fluxes = [], []
+    middles, fluxes, outers = [], [], []
     # With the room of a stamp on all sides, for those that reach beyond the image.
     drawn = np.zeros(np.add(sky.flat.shape, 2 * side), np.float32)
     for stamps, found in model.stream(observation, threads=1):
@@ -373,13 +426,14 @@ def wings_of_stars(model: PsfModel, observation: Observation) -> Wings | None:
             stamp = np.s_[y : y + side, x : x + side]
             if min(x, y) >= 0 and drawn[stamp].shape == psf.shape:
                 drawn[stamp] += psf
-        places.append(place)
+        outers.append(outer_light(model.on_pixels, place))
+        # Wings begin where the stamps end: they are those about the middles of the stamps.
+        middles.append(np.where(known[:, None], corner - side + 0.5 * (side - 1), np.nan))
         fluxes.append(np.where(known, found.flux, np.nan))
     inner = np.s_[side:-side, side:-side]
-    light = drawn[inner]
-    place, flux, gain = np.concatenate(places), np.concatenate(fluxes), observation.gain
+    light, gain = drawn[inner], observation.gain
+    middle, flux, outer = (np.concatenate(values) for values in (middles, fluxes, outers))
     photons = np.maximum(light, 0.0) / gain if gain else 0.0
     doubt = np.sqrt(sky.noise**2 + photons + (FOLLOWED * light) ** 2)
-    outer = outer_light(model.on_pixels, place)
     beside = sky.flat + sky.level - light
-    return _wings_beside(beside, sky.level, doubt, sky.bad, place, flux, outer, side)
+    return _wings_beside(beside, sky.level, doubt, sky.bad, middle, flux, outer, side)

@@ -1,0 +1,193 @@
+"""Photon noise of an image of which nobody states the gain, from the pixels of its stars.
+
+The variance of a pixel with the light L of a star in it is
+
+    v = σ² + L/g + (ε L)²,
+
+with the noise σ of the sky, the gain g in electrons per count, and what the PSF of the star is off
+by, ε (photon transfer: Janesick 2007, Photon Transfer, SPIE). The residuals of fainter and brighter
+stars tell the last two apart.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from psfdae.field_psf import SLOPE_PX
+from psfdae.moments import SIGMA_OF_MAD
+
+if TYPE_CHECKING:
+    from psfdae.image.observation import Observation
+    from psfdae.model.field_psfs import FieldPsfs
+
+
+def with_measured_gain(model: FieldPsfs, observation: Observation) -> Observation:
+    """Return the observation with the gain that its stars show, if it is not known.
+
+    It stays unknown where they do not show it at 3 σ, as in an image without photon noise.
+
+    Raises
+    ------
+    PredictionError
+        If the model knows no PSF of a place.
+    ObservationError
+        If there is no sky to measure.
+    """
+    if observation.gain is not None or observation.positions is None:
+        return observation
+    sky = observation.sky()
+    bad = sky.bad
+    if observation.saturate is not None:
+        bad = bad | (sky.flat + sky.level >= observation.saturate)
+    measured = measure_gain(model, sky.flat, sky.noise, bad, observation.positions)
+    if measured is None:
+        return observation
+    said = (measured[0], "about, by the scatter of the pixels of stars")
+    return replace(observation, camera=observation.camera | {"gain": said})
+
+
+def measure_gain(
+    model: FieldPsfs, flat: np.ndarray, noise: np.ndarray, bad: np.ndarray, place: np.ndarray
+) -> tuple[float, float] | None:
+    """Measure the gain of an image, and its standard error.
+
+    Parameters
+    ----------
+    model : FieldPsfs
+    flat, noise : ndarray, shape (h, w)
+        Sky-subtracted counts, and σ of the sky.
+    bad : ndarray of bool, shape (h, w)
+    place : ndarray, shape (n, 2)
+        x and y of stars, NaN where unknown.
+
+    Returns
+    -------
+    (float, float) or None
+        Electrons per count. None if fewer than ten stars stand alone, or no photon noise is seen
+        at 3 σ.
+
+    Raises
+    ------
+    PredictionError
+        If the model knows no PSF of a place.
+    """
+    fwhm = model.fwhm_px()
+    half = min(int(np.ceil(0.8 * fwhm)), model.stamp_px // 2 - 1)
+    axis = np.arange(-half, half + 1)
+    place = place[stars_alone(place, bad, half, 3.0 * fwhm)]
+    # The brightest 300 of these: fainter ones show no photon noise.
+    column, row = np.floor(place + 0.5).astype(int).T
+    brightest = np.argsort(-flat[row, column], kind="stable")[:300]
+    place, column, row = place[brightest], column[brightest], row[brightest]
+    if len(place) < 10:
+        return None
+    pixels = row[:, None, None] + axis[:, None], column[:, None, None] + axis
+    data, sigma = (image[pixels].reshape(len(place), -1) for image in (flat, noise))
+    unit = float(np.median(sigma))
+    data, sigma = data / unit, sigma / unit
+    photons, off = 0.0, 0.0
+    light = np.zeros(data.shape)
+    for _ in range(4):
+        # Weighted least squares of flux, centre and sky, its design (n, P, 4) and weights 1/v.
+        design = _changes_of_star(model, place, axis)
+        weighted = design / (sigma**2 + photons * light + (off * light) ** 2)[..., None]
+        inverse = np.linalg.inv(weighted.transpose(0, 2, 1) @ design)
+        found = (inverse @ (weighted.transpose(0, 2, 1) @ data[..., None]))[..., 0]
+        light = np.maximum(found[:, :1] * design[..., 0], 0.0)
+        # A residual has the part 1 − h of its pixel's variance, with the leverage h of the fit.
+        leverage = np.einsum("npi,nij,npj->np", design, inverse, weighted)
+        residual = data - (design @ found[..., None])[..., 0]
+        residual /= np.sqrt(np.clip(1.0 - leverage, 0.05, 1.0))
+        photons, error, off = _slopes_of_variance(light.ravel(), residual.ravel(), sigma.ravel())
+        # Centres stay in their pixel, whose stamp the PSF is drawn in.
+        move = np.clip(found[:, 1:3] / np.maximum(found[:, :1], 1e-12), -0.2, 0.2)
+        middle = np.floor(place + 0.5)
+        place = np.clip(place + move, middle - 0.49, middle + 0.49)
+    if not photons > 3.0 * error:
+        return None
+    return 1.0 / (photons * unit), error / (photons**2 * unit)
+
+
+def stars_alone(place: np.ndarray, bad: np.ndarray, half_px: int, distance_px: float) -> np.ndarray:
+    """Return which stars at places (n, 2) have no bad pixel in their box, and no star beside them.
+
+    The box has 2 `half_px` + 1 pixels along each side and is whole in the image, of which `bad`
+    (h, w) pixels do not count.
+    """
+    from scipy.ndimage import maximum_filter
+    from scipy.spatial import cKDTree
+
+    known = np.flatnonzero(np.isfinite(place).all(axis=1))
+    alone = np.zeros(len(place), dtype=bool)
+    if len(known) < 2:
+        return alone
+    distance = cKDTree(place[known]).query(place[known], k=2)[0][:, 1]
+    # Beyond its edges, an image has only bad pixels.
+    masked = maximum_filter(bad, 2 * half_px + 1, mode="constant", cval=True)
+    column, row = np.floor(place[known] + 0.5).astype(int).T
+    inside = (column >= 0) & (row >= 0) & (column < bad.shape[1]) & (row < bad.shape[0])
+    masked = masked[np.where(inside, row, 0), np.where(inside, column, 0)]
+    alone[known] = inside & ~masked & (distance > distance_px)
+    return alone
+
+
+def _changes_of_star(model: FieldPsfs, place: np.ndarray, axis: np.ndarray) -> np.ndarray:
+    """Return the change of the pixels (n, P) about stars with flux, x, y and sky, (n, P, 4)."""
+    at = model.stamp_px // 2 + axis
+
+    def psfs(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return model.psf_at(x, y, 1)[:, at[:, None], at].reshape(len(x), -1)
+
+    x, y = place.T
+    # Steps towards the middle of the pixel, about which the stamp lies.
+    step_x, step_y = (np.where(v > np.floor(v + 0.5), -SLOPE_PX, SLOPE_PX) for v in (x, y))
+    psf = psfs(x, y)
+    slope_x = (psfs(x + step_x, y) - psf) / step_x[:, None]
+    slope_y = (psfs(x, y + step_y) - psf) / step_y[:, None]
+    return np.stack([psf, slope_x, slope_y, np.ones_like(psf)], axis=-1)
+
+
+def _slopes_of_variance(
+    light: np.ndarray, residual: np.ndarray, sigma: np.ndarray
+) -> tuple[float, float, float]:
+    """Return 1/g, its standard error, and ε from pixels (m,), by robust variances at equal light.
+
+    Bins of about 60 pixels have the variance (1.48 median |r/σ|)² ± 2.33/√n of itself, and
+    v/σ² − 1 = (L/σ²)/g + ε² L²/σ² is fitted to them; both terms are at least 0.
+    """
+    from scipy.optimize import nnls
+
+    scaled = light / sigma**2
+    order = np.argsort(scaled, kind="stable")
+    order = order[scaled[order] > 0.02]
+    bins = np.array_split(order, max(len(order) // 60, 1))
+    if len(bins) < 6:
+        return 0.0, np.inf, 0.0
+    linear, square, variance, count = (
+        np.array(values)
+        for values in zip(
+            *(
+                (
+                    scaled[some].mean(),
+                    (light[some] * scaled[some]).mean(),
+                    (SIGMA_OF_MAD * np.median(np.abs(residual[some] / sigma[some]))) ** 2,
+                    len(some),
+                )
+                for some in bins
+            ),
+            strict=True,
+        )
+    )
+    expected = np.maximum(variance, 1.0)
+    for _ in range(5):
+        weight = np.sqrt(count) / (2.33 * expected)
+        design = np.stack([linear, square], axis=1) * weight[:, None]
+        found, left = nnls(design, (variance - 1.0) * weight)
+        expected = 1.0 + found[0] * linear + found[1] * square
+    # Where the law does not hold, it is known as badly as that.
+    excess = max(left**2 / (len(bins) - 2), 1.0)
+    error = np.sqrt(excess * np.linalg.inv(design.T @ design)[0, 0])
+    return float(found[0]), float(error), float(np.sqrt(found[1]))
