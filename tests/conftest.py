@@ -119,7 +119,7 @@ def smoke(shared_folder):
     folder = shared_folder / "smoke"
     with made_once(folder) as missing:
         if missing:
-            with job_server(folder) as programs:
+            with job_server() as programs:
                 snakemake(folder, path=f"{programs}{os.pathsep}{PATH}")
             assert (folder / "results/runtime.csv").is_file()
     return folder
