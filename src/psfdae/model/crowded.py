@@ -95,6 +95,9 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
         If there is no sky to measure.
     """
     psfs, fwhm, side = PsfGrid.of(model), model.fwhm_px(), model.stamp_px
+    x, y = np.rint(np.mean(model.field_range(), axis=0))
+    usual = model.psf_at(float(x), float(y), 1)
+    area_px = float(1.0 / np.square(usual).sum())  # noise-equivalent
     sky = observation.sky()
     image, bad = sky.flat + sky.level, sky.bad
     if observation.saturate is not None:
@@ -117,8 +120,10 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
         if turn == 0 and observation.found is not None:
             place, flux = _with_hidden(sky, doubt, place, flux, threshold, fwhm)
         elif turn > 0:
-            # A hidden star that is faint, or that has moved to another one, is none.
-            real = flux > LEAST_SEEN * fit.flux_error
+            # A hidden star is none if it is faint, if it may be what the PSF of another star lacks,
+            # or if it has moved to another star.
+            doubt = _psf_doubt(place, flux, side, area_px)
+            real = flux > LEAST_SEEN * np.hypot(fit.flux_error, doubt)
             real &= ~_beside_others(place, SAME_FWHM * fwhm)
             real[: observation.count] = True
             if real.all():
@@ -202,6 +207,22 @@ def _with_hidden(
     known = place[np.isfinite(place).all(axis=1)]
     alone = cKDTree(known).query(new)[0] > SAME_FWHM * fwhm
     return np.concatenate([place, new[alone]]), np.append(flux, left["FLUX_ISO"][alone])
+
+
+def _psf_doubt(place: np.ndarray, flux: np.ndarray, side: int, area_px: float) -> np.ndarray:
+    """Flux (n,) that errors of the PSFs of other stars may make at places (n, 2).
+
+    A PSF may lack 1.5 % of its light in and about its stamp of `side` pixels, of which a star gets
+    what falls on its noise-equivalent area.
+    """
+    from scipy.spatial import cKDTree
+
+    known = np.flatnonzero(np.isfinite(place).all(axis=1) & (flux > 0))
+    pairs = known[cKDTree(place[known]).query_pairs(0.75 * side, output_type="ndarray")]
+    square = np.zeros(len(place))
+    for one, other in ((0, 1), (1, 0)):
+        np.add.at(square, pairs[:, one], np.square(flux[pairs[:, other]]))
+    return np.asarray(0.015 * area_px / side**2 * np.sqrt(square))
 
 
 def _beside_others(place: np.ndarray, distance_px: float) -> np.ndarray:
