@@ -308,7 +308,7 @@ class Source:
         # What is beyond any image is no position: its squares would not even be numbers.
         positions = np.where(np.abs(positions) < FAR, positions, np.nan)
         if not is_cube:
-            _check_overlap(image, table, positions)
+            _check_overlap(image, table, where, positions)
         return positions
 
     def _given(self) -> dict[str, float | None]:
@@ -448,7 +448,9 @@ def _refuse_colours(image: ImageFile) -> None:
         )
 
 
-def _check_overlap(image: ImageFile, table: Catalogue, positions: np.ndarray) -> None:
+def _check_overlap(
+    image: ImageFile, table: Catalogue, where: Positions, positions: np.ndarray
+) -> None:
     rows, columns = image.shape
     found = np.count_nonzero(_inside(positions, image.shape))
     if found > rows * columns:
@@ -468,7 +470,8 @@ def _check_overlap(image: ImageFile, table: Catalogue, positions: np.ndarray) ->
     raise ObservationError(
         table.path,
         f"none of the {len(table)} stars is on the image {image.path} of {columns} columns "
-        f"and {rows} rows; they are {ranges}",
+        f"and {rows} rows; they are {ranges}"
+        + (f" ({where.first},{where.second} without a unit are degrees)" if where.sky else ""),
     )
 
 
