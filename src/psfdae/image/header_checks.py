@@ -65,10 +65,35 @@ def sky_sample(image: ImageFile) -> SkySample | None:
     return SkySample(float(np.median(levels)), float(np.median(noises)), highest)
 
 
+def clipped_level(image: ImageFile, sky: SkySample) -> tuple[float, int] | None:
+    """Return the largest value of an image, and its pixels, if the image was cut off there.
+
+    Noise gives no five pixels far above the sky exactly the same value; those of saturated stars
+    lie together, and those of a value for bad pixels do not. A value that over a hundredth of the
+    image has is that of an area without data.
+    """
+    largest, count, pairs = -np.inf, 0, 0
+    with open_pixels(image, whole=False, dtype=np.float64) as pixels:
+        for start in range(0, image.shape[0], 8 * BLOCK):
+            band = pixels[start : start + 8 * BLOCK]
+            top = float(band.max(initial=-np.inf, where=np.isfinite(band)))
+            if top > largest:
+                largest, count, pairs = top, 0, 0
+            full = band == largest
+            count += int(np.count_nonzero(full))
+            pairs += int(np.count_nonzero(full[:, 1:] & full[:, :-1]))
+            pairs += int(np.count_nonzero(full[1:] & full[:-1]))
+    few = 5 <= count <= 0.01 * image.shape[0] * image.shape[1]
+    clipped = few and 2 * pairs >= count and largest > sky.level + 50.0 * sky.noise
+    return (largest, count) if clipped else None
+
+
 def checked_camera(
     image: ImageFile, camera: Mapping[str, Said], sky: SkySample | None
 ) -> CheckedCamera:
     """Leave out header values that the pixels contradict; those that are given stay, with a word.
+
+    Where the image was cut off at a level below that of its header, that is the saturation.
 
     Parameters
     ----------
@@ -97,6 +122,14 @@ def checked_camera(
             raise ObservationError(image.path, f"{problem}; --saturate takes that of a pixel")
         values["saturation"] = None, f"not known, {origin} is below the sky"
         remarks.append(f"{image.path}: {problem}: not used, --saturate states another one")
+    level, origin = values["saturation"]
+    clipped = None if origin == "given" else clipped_level(image, sky)
+    if clipped is not None and (level is None or clipped[0] < level):
+        values["saturation"] = clipped[0], "the largest value"
+        remarks.append(
+            f"{image.path}: {clipped[1]} pixels have exactly the largest value, {clipped[0]:g} "
+            f"{unit}: taken as saturated, --saturate states another level"
+        )
 
     # Sky photons alone scatter by √(sky/gain), and the electronics by read noise/gain.
     gain, gain_origin = values["gain"]
