@@ -178,6 +178,7 @@ class Source:
         listed = None if table is None else table.path
         if self.detect is not None or layers.noise is not None:
             sky = layers.sky()
+            remarks += [f"{self.path}: {note}" for note in sky.notes]
             if layers.noise is not None:
                 layers = replace(layers, noise_scale=sky.noise_scale)
                 layers, camera, remark = _with_photons(layers, camera, sky)
