@@ -10,6 +10,7 @@ import numpy as np
 
 from psfdae.image.errors import ObservationError
 from psfdae.image.fits_file import ImageFile, Said, card_value, open_pixels
+from psfdae.image.sky_level import noise_correlation
 
 BLOCK = 32  # px, side of the squares in which sky and noise are measured
 
@@ -21,7 +22,8 @@ class SkySample:
     Attributes
     ----------
     level, noise : float
-        Median over the squares of their median and of their scatter, σ by the median deviation.
+        Median over the squares of their median and of their scatter, σ by the median deviation
+        and, where pixels share their noise, that of sums of pixels.
     highest : float
         Largest pixel of all squares.
     """
@@ -46,23 +48,28 @@ def sky_sample(image: ImageFile) -> SkySample | None:
     rows, columns = image.shape
     starts = np.unique(np.linspace(0, max(rows - BLOCK, 0), min(32, -(-rows // BLOCK))).astype(int))
     levels, noises, highest = [], [], -np.inf
+    deviations: list[np.ndarray] = []  # of bands of rows, four rows without values between them
     with open_pixels(image, whole=False, dtype=np.float64) as pixels:
         for start in starts:
             band = np.where(np.isfinite(band := pixels[start : start + BLOCK]), band, np.nan)
+            deviation = np.full((BLOCK + 4, columns), np.nan)
+            deviations.append(deviation)
             for left in range(0, columns, BLOCK):
                 square = band[:, left : left + BLOCK]
-                square = square[np.isfinite(square)]
-                if square.size < BLOCK:
+                known = square[np.isfinite(square)]
+                if known.size < BLOCK:
                     continue
-                highest = max(highest, float(square.max()))
-                level = float(np.median(square))
-                noise = 1.4826 * float(np.median(np.abs(square - level)))
+                highest = max(highest, float(known.max()))
+                level = float(np.median(known))
+                noise = 1.4826 * float(np.median(np.abs(known - level)))
                 if noise > 0:
+                    deviation[: len(band), left : left + BLOCK] = (square - level) / noise
                     levels.append(level)
                     noises.append(noise)
     if not levels:
         return None
-    return SkySample(float(np.median(levels)), float(np.median(noises)), highest)
+    correlation = noise_correlation(np.concatenate(deviations))
+    return SkySample(float(np.median(levels)), correlation * float(np.median(noises)), highest)
 
 
 def clipped_level(image: ImageFile, sky: SkySample) -> tuple[float, int] | None:

@@ -47,6 +47,7 @@ from psfdae.image.fits_file import (
 from psfdae.image.header_checks import checked_camera, refuse_mosaic_of_colours, sky_sample
 from psfdae.image.list_origin import TOLERANCE_PX, origin_of
 from psfdae.image.stamps import Stamps, StarFlag, cut, raise_flag, sky_around
+from psfdae.image.trails import with_trails
 
 if TYPE_CHECKING:
     from astropy.units import Quantity
@@ -738,6 +739,7 @@ class Layers:
             with silent():
                 try:
                     found = find_bad_pixels(image, masked, self.image.headers, self.saturate)
+                    found = with_trails(image, found)
                 except ClippedSkyError as error:
                     raise ObservationError(self.image.path, str(error)) from None
             self._bad_pixels.append(found)
