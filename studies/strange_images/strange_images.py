@@ -550,12 +550,11 @@ COLUMNS += ["date", "commit"]
 
 def main(table: Path, folder: Path, *names: str) -> None:
     """Make, run and judge the kinds that are named."""
-    wanted = {kind.__name__: seeds for kind, seeds in SEEDS.items()}
-    if names:
-        pairs = [name.split(":") for name in names]
-        wanted = {p[0]: tuple(map(int, p[1:])) or wanted[p[0]] for p in pairs}
     kinds = {kind.__name__: kind for kind in SEEDS}
-    for name, seed in ((name, seed) for name, seeds in wanted.items() for seed in seeds):
+    pairs = [(name, seed) for name, kind in kinds.items() for seed in SEEDS[kind]]
+    if names:
+        pairs = [p for p in pairs if {p[0], f"{p[0]}:{p[1]}"} & set(names)]
+    for name, seed in pairs:
         row = judged(name, seed, kinds[name](seed), folder)
         row |= {"date": date.today().isoformat(), "commit": git_commit()}
         rows = pd.DataFrame([row], columns=COLUMNS)

@@ -57,12 +57,15 @@ def sky_level(image: np.ndarray, bad: np.ndarray) -> SkyLevel:
             part = np.s_[top:bottom, left:right]
             if not bad[part].all() or not (rows or columns):
                 level[part], noise[part] = _meshed(image[part], bad[part])
-    share, weight = structure(image, bad, noise)
+    pixel_sigma = pixel_noise(interpolated(image, bad)[0], bad)
+    share, weight = structure(noise / pixel_sigma, bad)
     around = _median_level(image - level, bad) if share > 0.05 else None
-    if around is not None and _sources_stay(image - level, around, bad):
+    if around is not None and _sources_stay(image - level, around, bad, pixel_sigma):
         level += weight * around
+        # What is left; its noise changes with the light of the structure, from mesh to mesh of 16.
         rest, noise = _meshed(image - level, bad)
         level += rest
+        noise += weight * (_meshed(image - level, bad, 16)[1] - noise)
         notes.append(
             f"the sky has structure within {MESH_PX} px in {100 * share:.0f} % of the image: "
             "it is measured in 14 px there, and light of wide sources is lost in it"
@@ -127,11 +130,13 @@ def noise_correlation(deviation: np.ndarray) -> float:
     return float(np.sqrt(max(1.0 + 2.0 * excess, 1.0)))
 
 
-def _meshed(image: np.ndarray, bad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _meshed(
+    image: np.ndarray, bad: np.ndarray, mesh_px: int = MESH_PX
+) -> tuple[np.ndarray, np.ndarray]:
     """Return level and σ (h, w) in meshes, interpolated; 80 % of one may be bad."""
     from photutils.background import Background2D
 
-    found = Background2D(image, MESH_PX, mask=bad, exclude_percentile=80.0)
+    found = Background2D(image, mesh_px, mask=bad, exclude_percentile=80.0)
     return found.background, found.background_rms
 
 
@@ -149,32 +154,39 @@ def _median_level(image: np.ndarray, bad: np.ndarray) -> np.ndarray:
     return np.asarray(ndimage.map_coordinates(smooth, at, order=1, mode="nearest"))
 
 
-def _sources_stay(light: np.ndarray, level: np.ndarray, bad: np.ndarray) -> bool:
+def _sources_stay(light: np.ndarray, level: np.ndarray, bad: np.ndarray, noise: np.ndarray) -> bool:
     """Return True if the brightest sources of an image (h, w) keep most of their peaks.
 
-    A level (h, w) that takes more than a quarter of them is that of the sources themselves.
+    A level (h, w) that takes more than a quarter of them is that of the sources themselves. Without
+    five sources of 50 σ, such as where their models are subtracted, there are none to lose.
     """
     from scipy import ndimage
 
     height = light - level
-    peak = np.flatnonzero((height == ndimage.maximum_filter(height, 25)) & ~bad & (light > 0))
+    high = (height == ndimage.maximum_filter(height, 25)) & ~bad
+    peak = np.flatnonzero(high & (light > 50.0 * noise))
     brightest = peak[np.argsort(-height.ravel()[peak], kind="stable")[:30]]
     kept = height.ravel()[brightest] / light.ravel()[brightest]
-    return bool(brightest.size and np.median(kept) > 0.75)
+    return bool(brightest.size < 5 or np.median(kept) > 0.75)
 
 
-def structure(image: np.ndarray, bad: np.ndarray, noise: np.ndarray) -> tuple[float, np.ndarray]:
+def structure(ratio: np.ndarray, bad: np.ndarray) -> tuple[float, np.ndarray]:
     """Return the part of an image whose sky changes within a mesh, and where, from 0 to 1, (h, w).
 
-    There the σ of a mesh is larger, beside that from differences of neighbouring pixels, than
-    elsewhere by a factor of 1.5. That of resampled images is larger everywhere.
+    `ratio` (h, w) is the σ of a mesh over that from differences of neighbouring pixels. Where the
+    sky has structure it is larger than elsewhere by a factor of 1.5; that of resampled images is
+    larger everywhere.
     """
-    ratio = noise / pixel_noise(interpolated(image, bad)[0], bad)
+    from scipy import ndimage
+
     good = ratio[~bad & (ratio > 0)]
     if not good.size:
-        return 0.0, np.zeros(image.shape)
+        return 0.0, np.zeros(ratio.shape)
     usual = max(float(np.percentile(good, 25)), 1e-6)
-    weight = np.clip((ratio / usual - 1.25) / 0.5, 0.0, 1.0)
+    # Meshes beside those with structure are interpolated from these, and wrong, too.
+    weight = np.where(bad, 0.0, np.clip((ratio / usual - 1.25) / 0.5, 0.0, 1.0))
+    wide = ndimage.maximum_filter(weight, 2 * MESH_PX + 1, mode="nearest")
+    weight = ndimage.uniform_filter(wide, MESH_PX, mode="nearest")
     return float(np.mean(good > 1.5 * usual)), weight
 
 
@@ -206,8 +218,8 @@ def sky_steps(image: np.ndarray, bad: np.ndarray, axis: int) -> list[int]:
 def _steps_along(values: np.ndarray, good: np.ndarray) -> list[int]:
     """Return the columns of some rows (n, w) at which the level has a step.
 
-    It is the same in all eighths of the rows, and within 3 px and 24 px of the column; it is above
-    a tenth of the noise and eight times its error, slopes beside it subtracted.
+    It is the same in all eighths of the rows, up to 3 px from the column and from 3 to 12 and 12 to
+    24 px, slopes subtracted; and above a tenth of the noise and eight times its error.
     """
     count, width = values.shape
     if width < 4 * REACH_PX or count < 64:
@@ -247,13 +259,14 @@ def _steps_along(values: np.ndarray, good: np.ndarray) -> list[int]:
         steps: list[int] = []
         for k in chosen[np.argsort(-np.abs(jump[chosen]))]:
             line, height = int(lines[k]), jump[k]
-            far = jumps(3, REACH_PX, np.array([line]))[:, 0]
             eighths = [
-                median(part) - d * slope[k]
-                for v, d in ((near[:, k], 3.0), (far, 3.0 + REACH_PX))
-                for part in np.array_split(v, 8)
+                median(part) - (start + end) * slope[k]
+                for start, end in ((0, 3), (3, side), (side, REACH_PX))
+                for part in np.array_split(jumps(start, end, np.array([line]))[:, 0], 8)
             ]
             same = np.abs(np.array(eighths) - height) < 0.5 * abs(height)
-            if same.mean() > 0.8 and all(abs(line - other) > REACH_PX for other in steps):
+            if same.reshape(3, 8).mean(axis=1).min() >= 0.75 and all(
+                abs(line - other) > REACH_PX for other in steps
+            ):
                 steps.append(line)
     return steps
