@@ -535,7 +535,7 @@ def judged(kind: str, seed: int, case: Case, folder: Path) -> dict[str, object]:
         "n": int(bright.sum()),
         "bias_percent": 100 * np.median(ratio[bright]),
         "scatter_percent": 148.26 * np.median(deviation),
-        "stated_percent": 100 * np.median(error[bright]),
+        "stated_percent": 100 * np.nanmedian(error[bright]),
         "within": np.mean(np.abs(ratio[bright]) < error[bright]),
         "fakes": int((clean & (truth.query(where)[0] > max(2.0, case.reach_px))).sum()),
         "far_off": int(wrong.sum()),
