@@ -174,6 +174,27 @@ def checked_camera(
     return CheckedCamera(values, remarks)
 
 
+def sky_coordinate_remarks(image: ImageFile) -> list[str]:
+    """Return sentences on a WCS that is damaged, or that says two things of its distortion."""
+    if not image.headers:
+        return []
+    header = image.headers[0]
+    projection = str(card_value(header, "CTYPE1") or "")
+    if image.wcs is None and projection[:4].strip("-") in ("RA", "DEC", "GLON", "GLAT"):
+        return [
+            f"{image.path}: its WCS (CTYPE1 = {projection}) is damaged and not used: no sky "
+            "coordinates, and the pixel scale is that of other keys"
+        ]
+    distorted = image.wcs is not None and image.wcs.sip is not None
+    if distorted and not projection.endswith("-SIP"):
+        return [
+            f"{image.path}: CTYPE1 = {projection} has no -SIP, but there is a polynomial of "
+            "distortion (A_ORDER): it is used; remove its keys if the image was resampled without "
+            "distortion"
+        ]
+    return []
+
+
 def refuse_mosaic_of_colours(image: ImageFile) -> None:
     """Refuse a frame of a colour camera whose pixels still have the colours of their filters.
 

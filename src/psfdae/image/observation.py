@@ -44,7 +44,12 @@ from psfdae.image.fits_file import (
     map_kind,
     open_pixels,
 )
-from psfdae.image.header_checks import checked_camera, refuse_mosaic_of_colours, sky_sample
+from psfdae.image.header_checks import (
+    checked_camera,
+    refuse_mosaic_of_colours,
+    sky_coordinate_remarks,
+    sky_sample,
+)
 from psfdae.image.list_origin import TOLERANCE_PX, origin_of
 from psfdae.image.stamps import Stamps, StarFlag, cut, raise_flag, sky_around
 from psfdae.image.trails import with_trails
@@ -174,6 +179,7 @@ class Source:
             # The header's values are used as far as the pixels do not contradict them.
             refuse_mosaic_of_colours(image)
             camera, remarks = checked_camera(image, camera, sky_sample(image))
+            remarks += sky_coordinate_remarks(image)
         layers, beside = self._layers(image, is_cube, camera)
         remarks += beside
         listed = None if table is None else table.path
