@@ -14,7 +14,9 @@ from psfdae.image import bad_pixels
 from psfdae.image.detection import sky_of
 from psfdae.image.errors import ObservationError
 from psfdae.image.observation import Source
-from psfdae.image.selection import Verdict, completed, sharper_than_stars
+from psfdae.image.selection import Verdict, completed, sharper_than_stars, wider_than_stars
+from psfdae.image.sky_level import noise_correlation, sky_level, sky_steps
+from psfdae.image.trails import find_trails
 from psfdae.methods.field import FieldMixture
 from psfdae.model import crowded
 from psfdae.model.fitting import fitted_to
@@ -113,6 +115,69 @@ def test_sources_off_the_locus_of_the_stars_are_sharp():
     # Where the PSF changes much over the field, half the area is nothing unusual.
     varied = np.exp(np.linspace(2.0, 4.0, 60))
     assert not sharper_than_stars(varied).any()
+
+
+def test_galaxies_are_wider_than_the_stars_around_them():
+    rng = np.random.default_rng(2)
+    place, area = rng.uniform(0, 500, (80, 2)), np.exp(rng.normal(3.4, 0.08, 80))
+    area *= 1.0 + np.square(place / 500).sum(axis=1) / 4  # the PSF changes over the field
+    assert not wider_than_stars(area, place).any()
+    galaxy = np.arange(80) % 2 == 0
+    area[galaxy] *= rng.uniform(2.0, 6.0, 40)
+    assert (wider_than_stars(area, place) == galaxy).mean() > 0.95
+
+
+def test_an_image_that_was_cut_off_says_its_saturation(clean):
+    unsaid = {key: value for key, value in CAMERA.items() if key != "saturate"}
+    image = clean[0].copy()
+    image[::40, ::40] = 1e5  # a value for bad pixels is no saturation
+    assert Source(image, clean[1], origin=0, **unsaid).open(16).saturate is None
+    observation = Source(np.minimum(clean[0], 3000.0), clean[1], origin=0, **unsaid).open(16)
+    assert observation.saturate == 3000.0
+    assert "exactly the largest value, 3000 counts: taken as saturated" in observation.said()
+
+
+# Skies with steps, structure, trails, and shared noise.
+
+
+def test_a_step_of_the_sky_is_sharp_in_its_level(clean):
+    image, none = clean[0], np.zeros(clean[0].shape, bool)
+    slope = np.linspace(0, 200, SIDE)[None]
+    assert not sky_steps(image + slope, none, 0) and not sky_steps(image + slope, none, 1)
+    step = np.where(np.arange(SIDE) < 150, 0.0, 40.0)[None]
+    found = sky_level(image + step, none)
+    assert np.abs(found.level - SKY - step).max() < 5.0
+    assert found.notes == ("the sky has a step at column 150: the parts have their own sky",)
+
+
+def test_stars_in_the_halo_of_a_bright_star_are_found(clean):
+    image, place, _ = clean
+    row, column = np.indices(image.shape) - SIDE / 2
+    halo = 3000.0 / (1 + np.hypot(row, column) ** 2 / 400)
+    sky = sky_of(image + halo, np.zeros(image.shape, bool))
+    assert "structure within 64 px" in sky.notes[0]
+    stars = sky.stars(5.0)
+    found = np.stack([stars["X_IMAGE"], stars["Y_IMAGE"]], axis=1) - 1
+    assert (cKDTree(found).query(place)[0] < 1).mean() > 0.9
+    assert (cKDTree(place).query(found)[0] > 2).sum() < 5
+
+
+def test_noise_of_neighbours_that_is_shared_is_that_of_their_sum(clean):
+    white = np.random.default_rng(5).normal(size=(SIDE, SIDE))
+    means = (white[1:, 1:] + white[:-1, 1:] + white[1:, :-1] + white[:-1, :-1]) / 4
+    assert noise_correlation(white) == 1.0
+    assert abs(noise_correlation(2.0 * means) - 2.0) < 0.15  # σ/2 in a pixel, σ in sums
+    assert sky_level(clean[0], np.zeros(clean[0].shape, bool)).notes == ()
+
+
+def test_trails_are_found_and_stars_are_none(clean):
+    image, none = clean[0], np.zeros(clean[0].shape, bool)
+    row, column = np.indices(image.shape)
+    assert find_trails(image, none)[1] == 0
+    across = (row - 100 - 0.4 * column) / np.hypot(1, 0.4)
+    mask, count = find_trails(image + 150 * np.exp(-0.5 * (across / 1.2) ** 2), none)
+    assert count == 1 and mask[np.abs(across) < 2].mean() > 0.95
+    assert not mask[np.abs(across) > 12].any()
 
 
 # Bad pixels.

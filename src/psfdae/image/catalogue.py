@@ -45,6 +45,7 @@ if TYPE_CHECKING:
 
 SEXTRACTOR_HEADER = re.compile(r"#\s*(\d+)\s+[A-Za-z_]\w*")
 SEXAGESIMAL = re.compile(r"[:hd\s]", re.IGNORECASE)
+WHOLE = re.compile(r"\d{1,9}")  # hours or degrees of a sexagesimal text
 
 MOST_STARS = 5_000_000  # rows of a catalogue
 MOST_COLUMNS = 2000
@@ -105,7 +106,8 @@ CONVENTIONS = [
     ),
     *_each(
         "ra,dec RAJ2000,DEJ2000 RAJ2000,DECJ2000 _RAJ2000,_DEJ2000 RA_ICRS,DE_ICRS "
-        "RA_ICRS,DEC_ICRS ra_deg,dec_deg raMean,decMean radeg,decdeg radeg,dedeg",
+        "RA_ICRS,DEC_ICRS RA_J2000,DEC_J2000 ra_deg,dec_deg raMean,decMean radeg,decdeg "
+        "radeg,dedeg",
         sky=True,
     ),
 ]
@@ -282,8 +284,8 @@ class Catalogue:
         """Right ascension and declination in degrees, each shape (n,).
 
         Columns without unit are in degrees; text with colons, blanks or letters is
-        sexagesimal, then right ascensions are in hours. Declinations off the sphere are NaN,
-        and an error if all are.
+        sexagesimal, then right ascensions are in hours unless one is beyond 24. Declinations
+        off the sphere are NaN, and an error if all are.
         """
         ra = self._angles(where.first, "hourangle")
         dec = self._angles(where.second, "deg")
@@ -398,6 +400,10 @@ class Catalogue:
             there = ~np.ma.getmaskarray(column)
             texts = [_text(value).strip() for value in values[there]]
             if any(SEXAGESIMAL.search(text) for text in texts):
+                # A right ascension of 150:00:12 cannot be in hours, nor can those beside it.
+                whole = [int(number[0]) for number in map(WHOLE.match, texts) if number]
+                if max(whole, default=0) > 24:
+                    sexagesimal_unit = "deg"
                 angles = np.full(len(values), np.nan)
                 with reading(self.path):
                     angles[there] = Angle(texts, unit=sexagesimal_unit).deg

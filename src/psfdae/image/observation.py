@@ -45,9 +45,15 @@ from psfdae.image.fits_file import (
     map_kind,
     open_pixels,
 )
-from psfdae.image.header_checks import checked_camera, refuse_mosaic_of_colours, sky_sample
+from psfdae.image.header_checks import (
+    checked_camera,
+    refuse_mosaic_of_colours,
+    sky_coordinate_remarks,
+    sky_sample,
+)
 from psfdae.image.list_origin import TOLERANCE_PX, origin_of
 from psfdae.image.stamps import Stamps, StarFlag, cut, raise_flag, sky_around
+from psfdae.image.trails import with_trails
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -175,11 +181,13 @@ class Source:
             # The header's values are used as far as the pixels do not contradict them.
             refuse_mosaic_of_colours(image)
             camera, remarks = checked_camera(image, camera, sky_sample(image))
+            remarks += sky_coordinate_remarks(image)
         layers, beside = self._layers(image, is_cube, camera)
         remarks += beside
         listed = None if table is None else table.path
         if self.detect is not None or layers.noise is not None:
             sky = layers.sky()
+            remarks += [f"{self.path}: {note}" for note in sky.notes]
             if layers.noise is not None:
                 layers = replace(layers, noise_scale=sky.noise_scale)
                 layers, camera, remark = _with_photons(layers, camera, sky)
@@ -312,7 +320,7 @@ class Source:
         # What is beyond any image is no position: its squares would not even be numbers.
         positions = np.where(np.abs(positions) < FAR, positions, np.nan)
         if not is_cube:
-            _check_overlap(image, table, positions)
+            _check_overlap(image, table, where, positions)
         return positions
 
     def _given(self) -> dict[str, float | None]:
@@ -452,7 +460,9 @@ def _refuse_colours(image: ImageFile) -> None:
         )
 
 
-def _check_overlap(image: ImageFile, table: Catalogue, positions: np.ndarray) -> None:
+def _check_overlap(
+    image: ImageFile, table: Catalogue, where: Positions, positions: np.ndarray
+) -> None:
     rows, columns = image.shape
     found = np.count_nonzero(_inside(positions, image.shape))
     if found > rows * columns:
@@ -472,7 +482,8 @@ def _check_overlap(image: ImageFile, table: Catalogue, positions: np.ndarray) ->
     raise ObservationError(
         table.path,
         f"none of the {len(table)} stars is on the image {image.path} of {columns} columns "
-        f"and {rows} rows; they are {ranges}",
+        f"and {rows} rows; they are {ranges}"
+        + (f" ({where.first},{where.second} without a unit are degrees)" if where.sky else ""),
     )
 
 
@@ -723,6 +734,7 @@ class Layers:
             with silent():
                 try:
                     found = find_bad_pixels(image, masked, self.image.headers, self.saturate)
+                    found = with_trails(image, found)
                 except ClippedSkyError as error:
                     raise ObservationError(self.image.path, str(error)) from None
             self._bad_pixels.append(found)

@@ -53,6 +53,7 @@ class Verdict(StrEnum):
     OFF_CENTRE = "off centre"
     CROWDED = "crowded"
     SHARP = "sharp"  # far narrower than the other stars: a cosmic ray, a hot pixel
+    EXTENDED = "extended"  # far wider than the stars around it: a galaxy, a blend
     MISFIT = "misfit"  # unlike its neighbours: a blend, a galaxy, a cosmic ray
 
 
@@ -170,6 +171,9 @@ def collect(
     bright, missing = completed(bright, side, settings.search_px, centring)
     verdict[bright.row[missing > MOST_MISSING]] = Verdict.INCOMPLETE
     bright = bright.of(missing <= MOST_MISSING)
+    large = wider_than_stars(bright.area(), bright.position)
+    verdict[bright.row[large]] = Verdict.EXTENDED
+    bright = bright.of(~large)
     row = bright.row
     score = misfit(cut(bright.aligned(), side), bright.position, bright.noise / bright.flux)
     verdict[row[score > settings.misfit]] = Verdict.MISFIT
@@ -259,6 +263,48 @@ def sharper_than_stars(area: np.ndarray) -> np.ndarray:
     size = np.log(area)
     limit = max(np.log(2.0), 5.0 * float(robust_scatter(size)))
     return np.asarray(size < np.median(size) - limit)
+
+
+def wider_than_stars(area: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """Return which sources have a far larger noise-equivalent area than the stars around them.
+
+    Stars have nearly one size, other sources any: of the logarithms of all areas, each less the
+    lower quartile of those of its nearest sources, the stars are the shortest interval that has a
+    quarter of them. Sources above it by a factor of 1.5, and by more than five times the scatter
+    that the interval implies, are no stars; the interval is then searched again. Where the PSF
+    changes over the field, so do the sources around.
+
+    Parameters
+    ----------
+    area : ndarray, shape (n,)
+    position : ndarray, shape (n, 2)
+        In the image; all sources are near where one is not finite.
+    """
+    from scipy.spatial import cKDTree
+
+    wide = np.zeros(len(area), dtype=bool)
+    if len(area) < 8:
+        return wide
+    size = np.log(area)
+    for _ in range(10):
+        star = np.flatnonzero(~wide)
+        if len(star) < 8:
+            break
+        # Size beside that of the nearest eight: usually one of these is a star.
+        around = size[star] * np.ones((len(size), 1))
+        if np.isfinite(position).all():
+            around = size[star][cKDTree(position[star]).query(position, k=8)[1]]
+        excess = size - np.percentile(around, 25, axis=1)
+        # A quarter of a normal distribution about its middle has the width 0.637 σ.
+        ordered, count = np.sort(excess[star]), -(-len(star) // 4)
+        width = ordered[count:] - ordered[:-count]
+        first = int(width.argmin())
+        usual, scatter = np.median(ordered[first : first + count + 1]), width[first] / 0.637
+        wider = excess > usual + max(np.log(1.5), 5.0 * float(scatter))
+        if not (wider & ~wide).any():
+            break
+        wide |= wider
+    return wide
 
 
 def completed(

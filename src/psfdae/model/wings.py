@@ -21,7 +21,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 
-from psfdae.image.detection import Sky, sky_level, sky_of
+from psfdae.image.detection import Sky, sky_of
+from psfdae.image.sky_level import sky_level
 
 if TYPE_CHECKING:
     from psfdae.image.fits_file import Card
@@ -393,7 +394,8 @@ def _wings_beside(
     for turn in range(ROUNDS):
         known = wings
         if turn:
-            level = sky_level(beside - wing_light(beside.shape, place, flux, outer, known), bad)
+            far = wing_light(beside.shape, place, flux, outer, known)
+            level = sky_level(np.where(bad, 0.0, beside - far), bad).level
         wings = wings_of(beside - level, doubt, bad, place, flux, outer, stamp_px, known)
         if wings is None:
             break
