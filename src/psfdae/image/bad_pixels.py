@@ -309,8 +309,8 @@ def cosmic_rays(
         return found
     ratio = max(COSMIC_RATIO, 4.0 * sharpness)
     for rows, wide, inner in _bands(len(image)):
-        band = (array[wide] for array in (image, bad, noise))
-        found[rows] = _cosmic_rays_of_band(*band, saturate, ratio)[inner]
+        band = _cosmic_rays_of_band(image[wide], bad[wide], noise[wide], saturate, ratio)
+        found[rows] = band[inner]
     return np.asarray(found & ~bad)
 
 
