@@ -60,28 +60,29 @@ def good(stars):
 # Cosmic rays and hot pixels.
 
 
+def cosmic_rays(image, saturate=6e4):
+    none = np.zeros(image.shape, bool)
+    return bad_pixels.cosmic_rays(image, none, bad_pixels.pixel_noise(image, none), saturate)
+
+
 @pytest.mark.parametrize("fwhm", [1.2, 1.6, 2.8, 8.0])
 def test_cosmic_rays_are_found_and_stars_are_none(fwhm):
     image = field(fwhm)[0]
-    none = np.zeros(image.shape, bool)
-    assert not bad_pixels.cosmic_rays(image, none, 6e4).any()
+    assert not cosmic_rays(image).any()
     dirty, true = with_cosmics(image)
-    found = bad_pixels.cosmic_rays(dirty, none, 6e4)
+    found = cosmic_rays(dirty)
     assert (found & ~true).sum() <= 2
     assert (found & true).sum() >= 0.9 * true.sum()
 
 
 def test_no_star_as_narrow_as_a_pixel_is_a_cosmic_ray():
-    image = field(0.5)[0]
-    none = np.zeros(image.shape, bool)
-    assert not bad_pixels.cosmic_rays(with_cosmics(image)[0], none, 6e4).any()
+    assert not cosmic_rays(with_cosmics(field(0.5)[0])[0]).any()
 
 
 def test_a_saturated_star_has_no_cosmic_rays(clean):
     flat = np.minimum(clean[0], 3000.0)
-    none = np.zeros(flat.shape, bool)
-    assert not bad_pixels.cosmic_rays(flat, none, 3000.0).any()
-    assert not bad_pixels.blank_areas(flat, none, 3000.0)
+    assert not cosmic_rays(flat, 3000.0).any()
+    assert not bad_pixels.blank_areas(flat, np.zeros(flat.shape, bool), 3000.0)
 
 
 def test_no_cosmic_ray_is_learnt_from_and_their_number_is_said(clean):
@@ -91,7 +92,7 @@ def test_no_cosmic_ray_is_learnt_from_and_their_number_is_said(clean):
     stars = Stars.from_image(dirty, detect=True, **CAMERA)
     distance, _ = cKDTree(place).query(good(stars))
     assert (distance < 1).all() and len(stars) >= 0.9 * len(before)
-    found = np.count_nonzero(bad_pixels.cosmic_rays(dirty, np.zeros(dirty.shape, bool), 6e4))
+    found = np.count_nonzero(cosmic_rays(dirty))
     assert abs(found - true.sum()) < 0.1 * true.sum()
     assert f"left out: {found} pixels of cosmic rays and hot pixels" in "\n".join(stars.notes)
     assert "left out" not in "\n".join(before.notes)

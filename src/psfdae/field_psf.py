@@ -26,7 +26,7 @@ from typing import NamedTuple
 import numpy as np
 
 from psfdae.bright_stars import BrightStars
-from psfdae.moments import windowed_centres
+from psfdae.moments import cubic_splines, windowed_centres
 from psfdae.progress import Advance, task
 
 FIT_ROUNDS = 3  # of splines, centres and fluxes; with more, centres follow what splines cannot
@@ -115,7 +115,7 @@ class FieldModel:
         splines = np.tensordot(terms, self.coefficients, 1)
         axis = np.arange(side) - side // 2
         down, across = (
-            _splines_at(axis - at[:, None], splines.shape[-1], self.spacing)
+            cubic_splines(axis - at[:, None], splines.shape[-1], self.spacing)
             for at in (rows, columns)
         )
         half = np.tensordot(splines, across, ((2,), (2,)))  # (n, knots, c, m)
@@ -501,7 +501,7 @@ class _Alternating:
         terms, data, weight, centre = terms[used], data[used], weight[used], centre[used]
         shape = (terms.shape[1], self.knots, self.knots)
         rows, columns = (
-            _splines_at(self.axis[None] - centre[:, i, None], self.knots, self.spacing)
+            cubic_splines(self.axis[None] - centre[:, i, None], self.knots, self.spacing)
             for i in (0, 1)
         )
         columns_t = columns.transpose(0, 2, 1)
@@ -600,33 +600,10 @@ def _terms(position: np.ndarray, low: np.ndarray, high: np.ndarray, order: int) 
     return np.stack(terms, axis=1)
 
 
-def _splines_at(place: np.ndarray, knots: int, spacing: float, slope: bool = False) -> np.ndarray:
-    """Cubic B-splines about `knots` equidistant places around 0 at `place` (…), (…, knots).
-
-    If asked for, their slopes per pixel.
-    """
-    # At a part t of the way from one knot to the next, only the two knots on each side count.
-    u = place / spacing + (knots - 1) / 2
-    first = np.floor(u)
-    t = u - first
-    if slope:
-        near = (-0.5 * (1 - t) ** 2, t * (1.5 * t - 2), (1 - t) * (1.5 * t + 0.5), 0.5 * t**2)
-        values = np.stack(near, axis=-1) / spacing
-    else:
-        last = 1 - t
-        near = (last**3, 4 - 3 * t**2 * (1 + last), 4 - 3 * last**2 * (1 + t), t**3)
-        values = np.stack(near, axis=-1) / 6
-    # Four knots more on each side take what is beyond the others.
-    out = np.zeros((*place.shape, knots + 8))
-    before = np.clip(np.nan_to_num(first), -3, knots + 1).astype(np.intp)
-    np.put_along_axis(out, before[..., None] + np.arange(3, 7), values, axis=-1)
-    return out[..., 4:-4]
-
-
 def _drawn(splines: np.ndarray, axis: np.ndarray, centre: np.ndarray, spacing: float) -> np.ndarray:
     """Images (n, m, m) on an axis (m,) of coefficients (n, N, N), moved to centres (n, 2)."""
     rows, columns = (
-        _splines_at(axis[None] - centre[:, i, None], splines.shape[-1], spacing) for i in (0, 1)
+        cubic_splines(axis[None] - centre[:, i, None], splines.shape[-1], spacing) for i in (0, 1)
     )
     return np.asarray(rows @ splines @ columns.transpose(0, 2, 1))
 
@@ -663,8 +640,8 @@ def _design(
     # An image is R c Cᵀ, with the B-splines R of its rows and C of its columns; their slopes R' and
     # C' give its changes −R' c Cᵀ and −R c C'ᵀ as the centre moves.
     place, knots = axis - centre[..., None], splines.shape[-1]
-    rows, columns = _splines_at(place, knots, spacing).swapaxes(0, 1)
-    down, across = _splines_at(place, knots, spacing, slope=True).swapaxes(0, 1)
+    rows, columns = cubic_splines(place, knots, spacing).swapaxes(0, 1)
+    down, across = cubic_splines(place, knots, spacing, slope=True).swapaxes(0, 1)
     along = splines @ columns.transpose(0, 2, 1)
     moved = rows @ splines @ across.transpose(0, 2, 1)
     parts = [rows @ along, -down @ along, -moved]

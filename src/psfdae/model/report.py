@@ -59,7 +59,7 @@ def fitted_mean(noisy: np.ndarray, mean: np.ndarray, reach_px: float) -> np.ndar
     """
 
     def at(places: np.ndarray) -> np.ndarray:
-        psf = cut(moved(np.broadcast_to(mean, (len(places), *mean.shape)), places), side)
+        psf = cut(moved(mean[None], places, np.zeros(len(places), int)), side)
         return np.asarray(psf / psf.sum(axis=(1, 2), keepdims=True))
 
     count, side = noisy.shape[:2]
