@@ -21,7 +21,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 
-from psfdae.image.detection import Sky, sky_of
+from psfdae.image.detection import SMOOTHED_NOISE, WIDE_PX, Sky, sky_of
+from psfdae.moments import FWHM_OF_SIGMA
 
 if TYPE_CHECKING:
     from psfdae.image.fits_file import Card
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from psfdae.model.psf_model import PsfModel
 
 FOLLOWED = 0.03  # part of a star's light in a pixel by which its PSF may be off
+ROUND = 0.3  # the same of wings, which are round here, and are not there
 OUTER, OUTER_RANGE = 0.7, (0.3, 3.0)  # radius of a stamp's outer part over half its side; s
 REACH, TENTS, STEEPNESS = 2.5, 6, 3.0  # radius of the wings in stamps; tents; power of 1/r in them
 WINGED, BAND_PX = 1000, 512  # brightest stars, whose wings are drawn; rows at a time
@@ -305,7 +307,7 @@ class Around(NamedTuple):
     sky: Sky
     far: np.ndarray
     wings: Wings | None
-    doubt: np.ndarray  # of every pixel without models and wings
+    doubt: np.ndarray  # of every pixel without models and wings, as `search_error`
 
 
 def around_stars(
@@ -355,7 +357,34 @@ def around_stars(
     left = image - sky.level - drawn - far
     weight = np.where(bad | (np.abs(left) > CLIPPED_SIGMA * doubt), 0.0, doubt**-2.0)
     even = float((weight * left).sum() / max(weight.sum(), np.finfo(float).tiny))
-    return Around(replace(sky, level=sky.level + even, flat=sky.flat - even), far, wings, doubt)
+    sky = replace(sky, level=sky.level + even, flat=sky.flat - even)
+    return Around(sky, far, wings, search_error(error, drawn, far, flux))
+
+
+def search_error(
+    error: np.ndarray, drawn: np.ndarray, far: np.ndarray, flux: np.ndarray
+) -> np.ndarray:
+    """σ of the pixels (h, w) in which stars are searched that others hide.
+
+    It has what models and wings may be off by. These errors are alike over the width of the PSF:
+    where stars are so wide that they are searched in a smoothed image (`psfdae.image.detection`),
+    that averages the noise, but not them.
+
+    Parameters
+    ----------
+    error, drawn, far : ndarray, shape (h, w)
+        σ by noise; light of the models, and of the wings.
+    flux : ndarray, shape (n,)
+        Of the stars.
+    """
+    off = np.hypot(FOLLOWED * drawn, ROUND * far)
+    # Noise-equivalent area A = Σ F² / Σ L² = 4π σ² of a Gaussian, and what it leaves of noise.
+    square = float(np.square(drawn).sum())
+    area = float(np.nansum(np.square(flux))) / square if square > 0 else 0.0
+    sigma = np.sqrt(area / (4.0 * np.pi))
+    if FWHM_OF_SIGMA * sigma >= WIDE_PX:
+        off *= SMOOTHED_NOISE * 2.0 * np.sqrt(np.pi) * sigma
+    return np.asarray(np.hypot(error, off))
 
 
 def wings_of_stars(model: PsfModel, observation: Observation) -> Wings | None:
