@@ -23,6 +23,7 @@ from psfdae.image.observation import Source, cut_image
 from psfdae.model import crowded
 from psfdae.model.bundle import BundleError
 from psfdae.model.neighbours import light_of_others
+from psfdae.model.photon_noise import measure_gain, with_measured_gain
 from psfdae.model.psf_grid import PsfGrid
 from psfdae.model.wings import TENTS, Wings, tented_light, wings_of
 from psfdae_paper.stars.example import add_stamps, write_field
@@ -176,8 +177,8 @@ def test_a_model_knows_the_light_beyond_its_stamps(sky, found):
 @pytest.mark.parametrize(
     "changed",
     [
-        {"profile": [10**400] * TENTS},
-        {"covariance": (-np.eye(TENTS)).tolist()},
+        {"profile": [10**400] * (TENTS + 1)},
+        {"covariance": (-np.eye(TENTS + 1)).tolist()},
     ],
 )
 def test_damaged_wings_are_refused(sky, changed):
@@ -189,33 +190,56 @@ def test_damaged_wings_are_refused(sky, changed):
         PsfModel(damaged)
 
 
+RADIUS = np.geomspace(5, 25, TENTS + 1)
+
+
 @pytest.mark.parametrize("level", [0.0, 3.0])
-def test_wings_are_found_beside_a_wrong_sky(level):
-    """The profile is known, tents; an even light beside them does not count."""
+@pytest.mark.parametrize("brightness", [1.0, 1e-3])
+def test_wings_are_those_of_bright_stars_or_as_expected(level, brightness):
+    """An even light beside them does not count; faint stars leave what is expected of any star."""
     rng = np.random.default_rng(1)
-    place, flux = rng.uniform(0, 300, (30, 2)), 10 ** rng.uniform(4, 5.5, 30)
-    blank = np.ones(30)
-    radius = np.geomspace(5, 25, TENTS + 1)
-    true = Wings(radius, np.geomspace(3e-4, 1e-4, TENTS), np.eye(6), 1.0)
-    bands = tented_light((300, 300), place, flux, blank, true)
+    place, flux = rng.uniform(0, 300, (30, 2)), brightness * 10 ** rng.uniform(4, 5.5, 30)
+    outer = np.full(30, 0.03)
+    true = Wings(RADIUS, np.geomspace(3e-4, 1e-4, TENTS + 1), np.eye(TENTS + 1), 0.03)
+    bands = tented_light((300, 300), place, flux, outer, true)
     tented = np.concatenate([light for _, light in bands], axis=1)
     image = level + np.tensordot(true.profile, tented, 1) + rng.normal(0, 5, (300, 300))
     nothing = np.zeros(image.shape, bool)
     known = (np.full(image.shape, 5.0), nothing, place)
-    wings = wings_of(image, *known, flux, blank, 10)
-    assert wings.light()[0] == pytest.approx(true.light()[0], abs=4 * wings.light()[1])
-    assert wings.light()[1] < 0.05 * true.light()[0]
-    assert not wings_of(rng.normal(0, 5, image.shape), *known, flux, blank, 10).seen
-    assert wings_of(image, *known, np.full(30, np.nan), blank, 10) is None
+    wings = wings_of(image, *known, flux, outer, 10)
+    light, error = wings.light()
+    if brightness == 1.0:
+        assert light == pytest.approx(true.light()[0], abs=4 * error)
+        assert error < 0.05 * light
+    else:
+        # (r/h)^-5 has 0.65 of the light between 0.7 h and h, with that of the ring in the stamp.
+        assert light == pytest.approx(0.65 * 0.03, abs=0.002)
+        assert 0.3 * light < error < 1.5 * light
+    assert wings_of(image, *known, np.full(30, np.nan), outer, 10) is None
 
 
-def test_the_light_of_tents_is_the_sum_over_pixels():
-    radius = np.geomspace(5, 25, TENTS + 1)
-    wings = Wings(radius, np.linspace(2e-4, 1e-4, 6), np.eye(6), 1.0)
-    drawn = tented_light((81, 81), np.array([[40.0, 40.0]]), np.ones(1), np.ones(1), wings)
+def test_the_light_of_wings_is_the_sum_over_pixels():
+    wings = Wings(RADIUS, np.linspace(2e-4, 1e-4, TENTS + 1), np.eye(TENTS + 1), 1.0)
+    drawn = tented_light((81, 81), np.array([[40.3, 40.1]]), np.ones(1), np.ones(1), wings)
     total = sum(np.tensordot(wings.profile, tented, 1).sum() for _, tented in drawn)
     assert wings.light()[0] == pytest.approx(total, rel=5e-3)
     assert wings.light(10.0)[0] < wings.light(20.0)[0] < wings.light()[0]
+
+
+def test_the_gain_is_seen_in_the_pixels_of_stars(sky):
+    """Variance grows with the light of a star by 1/gain; not in an image without photon noise."""
+    folder, path, true = sky
+    model, observation = load_model(path), Source(folder / "i.fits", detect=5.0).open(STAMP)
+    unknown = replace(observation, camera=observation.camera | {"gain": (None, "not known")})
+    assert with_measured_gain(model, unknown).gain == pytest.approx(1.0, rel=0.25)
+    assert with_measured_gain(model, observation) is observation
+    place = np.stack([true["x"], true["y"]], axis=1)
+    light = np.zeros((SIZE, SIZE))
+    add_stamps(light, np.array(true["flux"])[:, None, None] * stamps(*place.T), *place.T)
+    noise, good = np.full(light.shape, 15.0), np.zeros(light.shape, bool)
+    noisy = light + noise * np.random.default_rng(2).standard_normal(light.shape)
+    assert measure_gain(model, noisy, noise, good, place) is None
+    assert measure_gain(model, noisy, noise, good, place[:9]) is None
 
 
 def test_models_of_photutils_do_not_mix(sky):

@@ -326,6 +326,21 @@ def test_order_is_what_the_field_has(chosen):
     assert np.isfinite(Faint(50, 20.0).measured(alone).psf).all()
 
 
+def test_photon_noise_takes_no_light_from_the_wings():
+    """Weights by a star's own pixels would take half a photon from each, here 3 % of its light."""
+    stars, rng, photons, noise = bright(80, varied=False), np.random.default_rng(5), 1e3, 4e-3
+    sigma = np.sqrt(noise**2 + np.maximum(stars.wide, 0.0) / photons)
+    wide = stars.wide + sigma * rng.standard_normal(sigma.shape)
+    stars = replace(stars, wide=wide, noise=np.full(80, noise))
+    model = fit_field(stars, (photons * noise) ** 2, SIDE + 4, SIDE, [0], 0.5, 1e4).model
+    middle, place = np.zeros((1, 2)), np.full((1, 2), FIELD / 2)
+    core = [
+        image[0, 2:-2, 2:-2].sum() / image[0].sum()
+        for image in (model.images(model.terms(place), middle, SIDE), truth(place, middle, SIDE))
+    ]
+    assert core[0] == pytest.approx(core[1], abs=0.01)
+
+
 def test_light_is_the_same_at_all_phases_of_the_pixel_grid():
     """Neighbours at the edges of the frames spoil fluxes, which phases must not make up for."""
     stars, rng = bright(60), np.random.default_rng(3)

@@ -19,7 +19,7 @@ better.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import isqrt
 from typing import NamedTuple
 
@@ -36,7 +36,7 @@ FARTHEST_PX = 1.5  # of a centre from the brightest pixel
 LARGEST_STEP_PX = 0.3  # of Gauss-Newton
 SLOPE_PX = 0.02  # for differences
 MODEL_ERROR = 0.02  # of a pixel's light, which no polynomial follows
-LEAST_ERROR = 1e-4  # of the flux, in any pixel
+LEAST_ERROR = 1e-5  # of the flux, in any pixel
 HIGHER_SMOOTHNESS, RIDGE = 10.0, 10.0  # of terms beyond the constant, times its; 1/flux²
 CHANGE, LEAST_CHANGE = 0.5, 1e-5  # of a coefficient over the field, by its mean, and at least
 UNLIKE_SIGMA = 3.0  # of a pixel, from which it counts less: it may show a neighbour
@@ -133,12 +133,14 @@ class FieldFit(NamedTuple):
     good: np.ndarray  # (n,) of bool
     residual: np.ndarray  # (n, s, s), of flux 1; 0 where not seen
     redrawn: Sequence[FieldModel] = ()  # what the same stars give with other noise
+    parted: Sequence[FieldModel] = ()  # as uncertain as without some stars after the others
     unknown_light: float = 0.0  # in stamps, over the flux: scatter of what is taken for sky
 
 
 class LeftOut(NamedTuple):
     """Stars that were left out of a fit, with flux, sky and centre fitted to them."""
 
+    coefficients: np.ndarray  # (K, N, N), of the splines of the others
     light: np.ndarray  # (2, n), what looks like sky in their stamps, over the flux, and its σ
     residual: np.ndarray  # (n, d, d), of flux 1
     weight: np.ndarray  # (n, d, d), expected light of pixels that count, else 0
@@ -375,7 +377,15 @@ class _Alternating:
         """
         if rng is None or len(self.noise) < 3:  # of two stars, none can be left out
             return fit
-        light = np.concatenate([part.light for part in self._left_out(fit)], axis=1)
+        parts = list(self._left_out(fit))
+        light = np.concatenate([part.light for part in parts], axis=1)
+        # Delete-group jackknife (Kott 2001, J. Off. Stat. 17, 521): without one of K folds after
+        # the other, fields scatter by 1/√(K − 1) of their error, and by more the more a fit of p
+        # terms follows its own n stars.
+        fields = np.array([part.coefficients for part in parts])
+        followed = min(fields.shape[1] / len(self.noise), 1.0)
+        fields = (fields - fields.mean(axis=0)) * np.sqrt((len(fields) - 1) * (1.0 - followed))
+        parted = [replace(fit.model, coefficients=fit.model.coefficients + f) for f in fields]
         # Noise-free images F m of the stars, and the variance of their pixels: sky and photons.
         stars = fit.model.images(fit.model.terms(self.place), fit.centre, len(self.axis))
         stars = stars * fit.flux[:, None, None]
@@ -388,7 +398,7 @@ class _Alternating:
             models.append(self.fit(fit.model.order).model)
         self.images, self.tolerance = images, tolerance
         unknown = excess_scatter(*light)
-        return fit._replace(redrawn=tuple(models), unknown_light=unknown)
+        return fit._replace(redrawn=tuple(models), parted=tuple(parted), unknown_light=unknown)
 
     def crossed_error(self, fit: FieldFit) -> float:
         """Geometric mean of the squared errors of stars that were left out, fold by fold.
@@ -412,6 +422,7 @@ class _Alternating:
         data = self.images / fit.flux[:, None, None]
         drawn = fit.model.images(terms, fit.centre, len(self.axis))
         weight, noise = self._weight(fit.flux, drawn), self._variance(fit.flux, drawn)
+        weight /= 1.0 + fit.residual**2 * weight / UNLIKE_SIGMA**2
         fold, judged_stars = np.arange(len(terms)) % FOLDS, 0
         inner = self.inner
         box = np.ix_(range(len(terms)), inner, inner)
@@ -435,7 +446,7 @@ class _Alternating:
             variance = (influence**2 * noise[box][judged].reshape(len(judged), -1)).sum(axis=1)
             variance += np.pi / 2 * (self.noise / fit.flux)[judged] ** 2 / self.around_px
             light = inner.sum() ** 2 / flux * [level, np.sqrt(variance)]
-            yield LeftOut(light, left, even * np.maximum(drawn[box][judged], 0.0))
+            yield LeftOut(found, light, left, even * np.maximum(drawn[box][judged], 0.0))
             judged_stars += len(judged)
             if judged_stars >= ENOUGH_STARS:
                 break

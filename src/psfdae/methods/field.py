@@ -68,12 +68,15 @@ class FieldMixture(FieldLaw, Method):
     ----------
     redrawn : sequence of FieldModel
         Fields that the training stars give with other noise; none of a fit that was stored.
+    parted : sequence of FieldModel
+        Fields as uncertain as they are without some of the stars after the others, likewise.
     unknown_light : float
         Scatter of the light in the stamps of stars that the field takes for sky, over the flux; 0
         of a fit that was stored.
     """
 
     redrawn: Sequence[FieldModel] = ()
+    parted: Sequence[FieldModel] = ()
     unknown_light: float = 0.0
 
     look = Look("field", "#117733", "D")
@@ -128,6 +131,7 @@ class FieldMixture(FieldLaw, Method):
             noise=data.noise,
             settings=field,
             redrawn=fit.redrawn,
+            parted=fit.parted,
             unknown_light=fit.unknown_light,
         )
 
@@ -237,11 +241,10 @@ class FieldMixture(FieldLaw, Method):
     def fitted_flux_error(self) -> float:
         """Standard error, over the flux, of a fit of the PSF to a star on a known sky.
 
-        By the fields that the training stars give with other noise: of a star m' of one of them,
-        the model m finds the flux Σ m m' / Σ m². 0 of a fit that was stored.
+        Of a star m' of another field, the model m finds the flux Σ m m' / Σ m². The error is the
+        larger one of two: by fields of other noise, and by fields of other stars, which has what
+        neighbours do to their stars, too. 0 of a fit that was stored.
         """
-        if not self.redrawn:
-            return 0.0
         # 5 × 5 places over the field; magnitude and colour are in the middle of their range.
         axes = np.linspace(self.low[:2], self.high[:2], 5).T
         place = np.full((25, 4), np.nan)
@@ -252,9 +255,12 @@ class FieldMixture(FieldLaw, Method):
             return np.asarray(images / images.sum(axis=(1, 2), keepdims=True))
 
         psf = psfs(self.model)
-        flux = [(psf * psfs(other)).sum(axis=(1, 2)) for other in self.redrawn]
-        error = np.array(flux) / np.square(psf).sum(axis=(1, 2)) - 1.0
-        return float(np.sqrt(np.square(error).mean()))
+
+        def error(models: Sequence[FieldModel]) -> float:
+            flux = [(psf * psfs(other)).sum(axis=(1, 2)) for other in models]
+            return float(np.sqrt(np.square(flux / np.square(psf).sum(axis=(1, 2)) - 1.0).mean()))
+
+        return max((error(models) for models in (self.redrawn, self.parted) if models), default=0.0)
 
     def free_flux(self) -> Self:
         """The form that finds flux and sky."""

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 def with_measured_gain(model: FieldPsfs, observation: Observation) -> Observation:
     """Return the observation with the gain that its stars show, if it is not known.
 
-    It stays unknown where they do not show it at 3 σ, as in an image without photon noise.
+    It stays unknown where they do not show it at 5 σ, as in an image without photon noise.
 
     Raises
     ------
@@ -67,7 +67,7 @@ def measure_gain(
     -------
     (float, float) or None
         Electrons per count. None if fewer than ten stars stand alone, or no photon noise is seen
-        at 3 σ.
+        at 5 σ: errors of the PSF follow the law above only about.
 
     Raises
     ------
@@ -93,7 +93,8 @@ def measure_gain(
     for _ in range(4):
         # Weighted least squares of flux, centre and sky, its design (n, P, 4) and weights 1/v.
         design = _changes_of_star(model, place, axis)
-        weighted = design / (sigma**2 + photons * light + (off * light) ** 2)[..., None]
+        variance = sigma**2 + photons * light + (off * light) ** 2
+        weighted = design / variance[..., None]
         inverse = np.linalg.inv(weighted.transpose(0, 2, 1) @ design)
         found = (inverse @ (weighted.transpose(0, 2, 1) @ data[..., None]))[..., 0]
         light = np.maximum(found[:, :1] * design[..., 0], 0.0)
@@ -101,12 +102,15 @@ def measure_gain(
         leverage = np.einsum("npi,nij,npj->np", design, inverse, weighted)
         residual = data - (design @ found[..., None])[..., 0]
         residual /= np.sqrt(np.clip(1.0 - leverage, 0.05, 1.0))
-        photons, error, off = _slopes_of_variance(light.ravel(), residual.ravel(), sigma.ravel())
+        # Stars that are off by far more than others have neighbours that are on no list.
+        chi2 = (residual**2 / variance).mean(axis=1)
+        usual = chi2 < 4.0 * np.median(chi2)
+        photons, error, off = _slopes_of_variance(light[usual], residual[usual], sigma[usual])
         # Centres stay in their pixel, whose stamp the PSF is drawn in.
         move = np.clip(found[:, 1:3] / np.maximum(found[:, :1], 1e-12), -0.2, 0.2)
         middle = np.floor(place + 0.5)
         place = np.clip(place + move, middle - 0.49, middle + 0.49)
-    if not photons > 3.0 * error:
+    if not photons > 5.0 * error:
         return None
     return 1.0 / (photons * unit), error / (photons**2 * unit)
 
@@ -153,13 +157,14 @@ def _changes_of_star(model: FieldPsfs, place: np.ndarray, axis: np.ndarray) -> n
 def _slopes_of_variance(
     light: np.ndarray, residual: np.ndarray, sigma: np.ndarray
 ) -> tuple[float, float, float]:
-    """Return 1/g, its standard error, and ε from pixels (m,), by robust variances at equal light.
+    """Return 1/g, its standard error, and ε from pixels of any shape, by robust variances.
 
-    Bins of about 60 pixels have the variance (1.48 median |r/σ|)² ± 2.33/√n of itself, and
-    v/σ² − 1 = (L/σ²)/g + ε² L²/σ² is fitted to them; both terms are at least 0.
+    Bins of about 60 pixels of equal light have the variance (1.48 median |r/σ|)² ± 2.33/√n of
+    itself, and v/σ² − 1 = (L/σ²)/g + ε² L²/σ² is fitted to them; both terms are at least 0.
     """
     from scipy.optimize import nnls
 
+    light, residual, sigma = light.ravel(), residual.ravel(), sigma.ravel()
     scaled = light / sigma**2
     order = np.argsort(scaled, kind="stable")
     order = order[scaled[order] > 0.02]

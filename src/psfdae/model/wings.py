@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from psfdae.model.psf_model import PsfModel
 
 FOLLOWED = 0.03  # part of a star's light in a pixel by which its PSF may be off
+ROUND = 0.3  # the same of wings, which are round here, and are not there
 OUTER, OUTER_RANGE = 0.7, (0.3, 3.0)  # radius of a stamp's outer part over half its side; s
 REACH, TENTS, STEEPNESS = 2.5, 6, 3.0  # radius of the wings in stamps; tents; power of 1/r in them
 WINGED, BAND_PX = 1000, 128  # brightest stars, whose wings are drawn; rows at a time
@@ -336,7 +337,7 @@ class Around(NamedTuple):
     sky: Sky
     far: np.ndarray
     wings: Wings | None
-    doubt: np.ndarray  # of every pixel without models and wings
+    doubt: np.ndarray  # σ of every pixel without models and wings, with what these may be off by
 
 
 def around_stars(
@@ -375,7 +376,8 @@ def around_stars(
     left = beside - sky.level - far
     weight = np.where(sky.bad | (np.abs(left) > CLIPPED_SIGMA * doubt), 0.0, doubt**-2.0)
     even = float((weight * left).sum() / max(weight.sum(), np.finfo(float).tiny))
-    return Around(replace(sky, level=sky.level + even, flat=sky.flat - even), far, wings, doubt)
+    sky = replace(sky, level=sky.level + even, flat=sky.flat - even)
+    return Around(sky, far, wings, np.hypot(doubt, ROUND * far))
 
 
 def _wings_beside(
