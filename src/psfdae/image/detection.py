@@ -153,8 +153,11 @@ def _background(image: np.ndarray, bad: np.ndarray) -> Background2D:
 
 
 def sky_level(image: np.ndarray, bad: np.ndarray) -> np.ndarray:
-    """Level of the sky (h, w) of an image whose `bad` pixels do not count; raises as `sky_of`."""
-    return np.asarray(_background(np.where(bad, 0.0, image), bad).background)
+    """Level of the sky (h, w) of an image whose `bad` pixels, finite, do not count.
+
+    Raises as `sky_of`.
+    """
+    return np.asarray(_background(image, bad).background)
 
 
 def sky_of(

@@ -342,11 +342,13 @@ def _wings_beside(
     before: Wings | None = None,
 ) -> Wings | None:
     """Wings of stars in an image (h, w) without its models, in turns with the level of its sky."""
-    wings = before
-    for turn in range(ROUNDS):
-        if turn:
-            level = sky_level(beside - wing_light(beside.shape, place, flux, outer, wings), bad)
-        wings = wings_of(beside - level, doubt, bad, place, flux, outer, stamp_px, wings)
+    left, stars = beside - level, (place, flux, outer)
+    wings = wings_of(left, doubt, bad, *stars, stamp_px, before)
+    for _ in range(ROUNDS - 1):
+        # The sky without the wings as they are known, and the wings above it; large images in place.
+        np.subtract(beside, wing_light(beside.shape, *stars, wings), out=left)
+        np.subtract(beside, sky_level(left, bad), out=left)
+        wings = wings_of(left, doubt, bad, *stars, stamp_px, wings)
     return wings
 
 
@@ -375,11 +377,11 @@ def wings_of_stars(model: PsfModel, observation: Observation) -> Wings | None:
                 drawn[stamp] += psf
         places.append(place)
         fluxes.append(np.where(known, found.flux, np.nan))
-    inner = np.s_[side:-side, side:-side]
-    light = drawn[inner]
+    light = drawn[side:-side, side:-side]
     place, flux, gain = np.concatenate(places), np.concatenate(fluxes), observation.gain
     photons = np.maximum(light, 0.0) / gain if gain else 0.0
     doubt = np.sqrt(sky.noise**2 + photons + (FOLLOWED * light) ** 2)
     outer = outer_light(model.on_pixels, place)
-    beside = sky.flat + sky.level - light
+    # The image without its models, in their place in memory.
+    beside = np.subtract(sky.flat + sky.level, light, out=light)
     return _wings_beside(beside, sky.level, doubt, sky.bad, place, flux, outer, side)
