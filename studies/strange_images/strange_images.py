@@ -357,6 +357,18 @@ def undersampled(seed: int) -> Case:
     return Case(file_of(exposed(rng, light + SKY)), stars)
 
 
+def crowded_undersampled(seed: int) -> Case:
+    """2500 stars of a FWHM of 1.3 px on 400 × 400 px, on a sky that changes from 200 to 600 counts.
+
+    The brightest ones have a neighbour of a fiftieth of their light within 12 px, nearly all of
+    them.
+    """
+    rng, light, stars = scene(seed, 2500, 400, low=150.0, fwhm=1.3)
+    across, down = np.meshgrid(np.linspace(-1, 1, 400), np.linspace(-1, 1, 400))
+    sky = 400.0 + 150.0 * across + 50.0 * np.sin(4.0 * down + 2.0 * across)
+    return Case(file_of(exposed(rng, light + sky)), stars)
+
+
 def galaxies(seed: int) -> Case:
     """500 galaxies among 310 stars: exponential discs of scales of 1 to 4 px, seen by the PSF."""
     rng, light, stars = scene(seed)
@@ -449,6 +461,7 @@ SEEDS = {
     **dict.fromkeys((usual, cosmics, few_12, wide, rings, half_empty), (101, 102)),
     **dict.fromkeys((nebula, bleeding, bleeding_unsaid, trailed, amplifiers, resampled), (201,)),
     **dict.fromkeys((unsigned, quantised, satellites, undersampled, galaxies, halo), (201,)),
+    crowded_undersampled: tuple(range(301, 311)),
     **dict.fromkeys((difference, rotated, sip_list, broken_wcs), (201,)),
 }
 """Kinds in the order of the table, and the seeds of their rows."""
