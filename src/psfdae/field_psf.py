@@ -184,7 +184,7 @@ def fit_field(
 
 def _best_fit(
     alternating: _Alternating,
-    tried: Sequence[int],
+    orders: Sequence[int],
     is_settled: bool,
     rng: np.random.Generator | None,
 ) -> FieldFit:
@@ -193,16 +193,16 @@ def _best_fit(
     Parameters
     ----------
     alternating : _Alternating
-    tried : sequence of int
-        Orders, ascending.
+    orders : sequence of int
+        Ascending.
     is_settled : bool
         Nothing is tried: the fit is that of the first order.
     rng : Generator, optional
     """
     if is_settled:
-        return alternating.with_errors(alternating.fit(tried[0]), rng)
+        return alternating.with_errors(alternating.fit(orders[0]), rng)
     alternating.tolerance, best, least = TRIED_TOLERANCE, 0, np.inf
-    for order in tried:
+    for order in orders:
         error = alternating.crossed_error(alternating.fit(order))
         if error < least:
             best, least = order, error
