@@ -43,7 +43,7 @@ def test_the_command_is_the_calls_which_are_silent_and_write_nothing(
     printed = capfd.readouterr()
     assert printed.err == "" and all("K = " in line for line in printed.out.splitlines())
     assert not list(tmp_path.iterdir())
-    assert str(report) == training.output.splitlines()[-2]
+    assert str(report) == training.output.splitlines()[-2] and "<table>" in report._repr_html_()
     table = pd.read_csv(training.out / "report.csv")
     assert set(table.method) == {"noisy", "lmmse", "gmm", "field", "mean_psf"}
     assert table.mse.to_numpy() == pytest.approx(np.asarray(report.table["mse"]), rel=1e-5)

@@ -188,7 +188,7 @@ def fit_field(
 
 def _best_fit(
     alternating: _Alternating,
-    tried: Sequence[int],
+    orders: Sequence[int],
     is_settled: bool,
     rng: np.random.Generator | None,
 ) -> FieldFit:
@@ -197,22 +197,23 @@ def _best_fit(
     Parameters
     ----------
     alternating : _Alternating
-    tried : sequence of int
-        Orders, ascending.
+    orders : sequence of int
+        Ascending.
     is_settled : bool
         Nothing is tried: the fit is that of the first order.
     rng : Generator, optional
     """
     if is_settled:
-        return alternating.with_errors(alternating.fit(tried[0]), rng)
+        return alternating.with_errors(alternating.fit(orders[0]), rng)
     alternating.tolerance = TRIED_TOLERANCE
     # Splines first, with a polynomial that follows most of the field: with those that follow noise,
     # no higher order would seem to pay.
-    alternating.choose_splines(max((o for o in tried if o <= CURVED), default=tried[0]))
+    alternating.choose_splines(max((o for o in orders if o <= CURVED), default=orders[0]))
     best, least = 0, np.inf
-    for order in tried:
+    for order in orders:
         error = alternating.crossed_error(alternating.fit(order))
-        if error < least:
+        # A curved field is the rule. Higher orders must pay clearly: noise makes some seem better.
+        if error < (1.0 if order <= CURVED else 0.99) * least:
             best, least = order, error
         elif order >= CURVED:
             break

@@ -25,20 +25,21 @@ def bar(name: str, count: int) -> Iterator[Advance]:
 
     import click
 
-    start, done, shown = time.time(), 0, False
-    drawn = click.progressbar(length=count, label=name, file=sys.stderr)
+    start, completed_steps, is_shown = time.time(), 0, False
+    progress_bar = click.progressbar(length=count, label=name, file=sys.stderr)
     with ExitStack() as stack:
 
         def advance(steps: int) -> None:
-            nonlocal done, shown
-            done = min(done + steps, count)
-            if not shown and time.time() > start + 1.0:
-                stack.enter_context(drawn)
-                drawn.start = drawn.last_eta = start  # the time that is left follows from both
-                shown = True
-            if shown:
-                drawn.update(done - drawn.pos)
+            nonlocal completed_steps, is_shown
+            completed_steps = min(completed_steps + steps, count)
+            if not is_shown and time.time() > start + 1.0:
+                stack.enter_context(progress_bar)
+                # The time that is left follows from both.
+                progress_bar.start = progress_bar.last_eta = start
+                is_shown = True
+            if is_shown:
+                progress_bar.update(completed_steps - progress_bar.pos)
 
         yield advance
-        if shown:
+        if is_shown:
             advance(count)  # a task may need fewer steps

@@ -337,7 +337,7 @@ class Catalogue:
         """
         from astropy.table import Table
 
-        further, where = Table(), self.positions()
+        further_columns, where = Table(), self.positions()
         read = {self._identifier(), *(() if where.sky else (where.first, where.second))}
         names = getattr(self.table, "names_of_values", self.table.colnames)
         for name in [name for name in names[:900] if name not in read]:
@@ -348,8 +348,8 @@ class Catalogue:
             if column.dtype.kind == "O":
                 column = column.astype(str)
             if column.dtype.kind in "biufUS":
-                further[name] = column[rows]
-        return further
+                further_columns[name] = column[rows]
+        return further_columns
 
     def _resolve(self, wanted: str) -> str | None:
         """The one column of that name, case aside if it is not written exactly so."""

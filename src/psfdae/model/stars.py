@@ -314,18 +314,20 @@ class Stars:
         return bool(crowded >= MANY_CROWDED * max(len(self), ENOUGH_STARS))
 
     def __repr__(self) -> str:
-        held = int(self.held_out.sum())
+        held_count = int(self.held_out.sum())
         return (
-            f"Stars({str(self.observation.path)!r}, {len(self)} stars ({len(self) - held} to learn "
-            f"from, {held} held out) of {len(self.candidates.verdict)})"
+            f"Stars({str(self.observation.path)!r}, {len(self)} stars "
+            f"({len(self) - held_count} to learn from, {held_count} held out) "
+            f"of {len(self.candidates.verdict)})"
         )
 
     def _repr_html_(self) -> str:
         """Counts of the stars, for a notebook."""
-        held, images = int(self.held_out.sum()), len(self.each)
+        held_count, images = int(self.held_out.sum()), len(self.each)
+        learnt_count = len(self) - held_count
         rows = [
             ["image", escape(self.observation.path.name)],
-            ["stars", f"{len(self)}: {len(self) - held} to learn from, {held} held out"],
+            ["stars", f"{len(self)}: {learnt_count} to learn from, {held_count} held out"],
             [f"of {len(self.candidates.verdict)}", self.candidates.count()],
             ["stamps", f"{self.settings.framing.stamp_px} px"],
         ]

@@ -306,7 +306,7 @@ class Report:
         return f"Report({self.model.name!r}, {self})"
 
     def _repr_html_(self) -> str:
-        """What the model comes down to, and its checks on held-out stars, for a notebook."""
+        """A sentence on the model, and its checks on held-out stars, for a notebook."""
         return f"<p>{escape(str(self))}</p>{checks_html(self.checks())}"
 
     def checks(self) -> list[Check]:
