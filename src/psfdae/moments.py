@@ -41,7 +41,7 @@ def moved(wide: np.ndarray, shift: np.ndarray, stamp: np.ndarray | None = None) 
     from scipy import ndimage
 
     side, around = wide.shape[-1], 12  # pixels around a stamp, beyond which no edge counts
-    some, stamp = np.unique(range(len(wide)) if stamp is None else stamp, return_inverse=True)
+    some, stamp = np.unique(np.arange(len(wide)) if stamp is None else stamp, return_inverse=True)
     # Coefficients of the splines through the pixels of each stamp.
     splines = np.pad(wide[some], ((0, 0), (around, around), (around, around)), mode="edge")
     for axis in (1, 2):

@@ -345,7 +345,7 @@ def _wings_beside(
     left, stars = beside - level, (place, flux, outer)
     wings = wings_of(left, doubt, bad, *stars, stamp_px, before)
     for _ in range(ROUNDS - 1):
-        # The sky without the wings as they are known, and the wings above it; large images in place.
+        # The sky without the wings as known so far, and the wings above it; all in place.
         np.subtract(beside, wing_light(beside.shape, *stars, wings), out=left)
         np.subtract(beside, sky_level(left, bad), out=left)
         wings = wings_of(left, doubt, bad, *stars, stamp_px, wings)
