@@ -217,15 +217,20 @@ def _best_fit(
             best, least = order, error
         elif order >= CURVED:
             break
-    low, high = alternating.low, alternating.high
-    for coordinate, most in enumerate(alternating.most):
-        if most > high[coordinate]:
-            high[coordinate] = most
-            error = alternating.crossed_error(alternating.fit(best))
-            if error < (1.0 - STAR_GAIN) * least:
-                least = error
-            else:
-                high[coordinate] = low[coordinate]
+    low, high, most = alternating.low, alternating.high, alternating.most
+    # Magnitude and colour, the one that saves more error first: the other may only go along with it.
+    untried = [coordinate for coordinate in range(len(most)) if most[coordinate] > high[coordinate]]
+    while untried:
+        errors = {}
+        for coordinate in untried:
+            high[coordinate] = most[coordinate]
+            errors[coordinate] = alternating.crossed_error(alternating.fit(best))
+            high[coordinate] = low[coordinate]
+        chosen = min(untried, key=errors.__getitem__)
+        if errors[chosen] >= (1.0 - STAR_GAIN) * least:
+            break
+        high[chosen], least = most[chosen], errors[chosen]
+        untried.remove(chosen)
     alternating.tolerance = TOLERANCE
     return alternating.with_errors(alternating.fit(best), rng)
 

@@ -122,10 +122,13 @@ def collect(
     settings: CalibrationStars,
     framing: Stamp,
     isolation_px: float | None = None,
+    by_core: bool = False,
 ) -> Candidates:
     """Measure all stars and choose those that are good enough to learn from.
 
-    No neighbour is nearer than `isolation_px`, by default that of the settings.
+    No neighbour is nearer than `isolation_px`, by default that of the settings. Its brightness is
+    that of its stamp, or `by_core` that of 3 × 3 px: of a faint star beside a bright one, a whole
+    stamp has the other's light.
 
     The observation has stamps with a margin (a cube: its own, larger ones), of which only
     those of bright stars are kept in memory. CalibrationStarsError says that there are
@@ -147,7 +150,8 @@ def collect(
     near = settings.isolation_px if isolation_px is None else isolation_px
     # A star that is listed twice is no neighbour of itself.
     apart = np.where(observation.listed_again()[:, None], np.nan, found["position"])
-    close = crowded(apart, found.pop("core"), near, settings.neighbour_ratio)
+    core = found.pop("core")
+    close = crowded(apart, core if by_core else snr * noise, near, settings.neighbour_ratio)
     verdict[close & (verdict == Verdict.GOOD)] = Verdict.CROWDED
     verdict[observation.without_position()] = Verdict.NO_POSITION
     wide, peak, listed, colour, bad = (np.concatenate([k[i] for k in kept]) for i in range(5))
@@ -233,7 +237,6 @@ def _measure(
         "sky": level,
         "brightest": level
         + np.where(centred, cut(wide, side).max((1, 2)) if centring else _at(wide, peak), -np.inf),
-        # Of a faint star beside a bright one, a whole stamp would have the other's light.
         "core": cut(wide, 3).sum(axis=(1, 2)),
         "highest": cut(np.where(chunk.bad, -np.inf, chunk.data), side).max(axis=(1, 2)),
         "verdict": verdict,

@@ -66,7 +66,6 @@ COLUMNS: dict[str, tuple[str, str, str]] = {
     "shift_y": ("pix", "", "stamp moved along rows"),
     "group": ("", "", "number of the stars that were fitted together"),
     "group_size": ("", "", "how many they are"),
-    "parted": ("", "", "the group was too large, and is a part of it"),
     "photutils_flags": ("", "", "flags of photutils.psf.PSFPhotometry"),
     "flags": ("", "", "sum of the FLAG values of psfdae.StarFlag"),
 }

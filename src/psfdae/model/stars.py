@@ -427,11 +427,11 @@ def enough_stars(
     """
     asked = settings.calibration_stars
 
-    def with_limits(**limits: float) -> tuple[Settings, list[Candidates]]:
+    def with_limits(by_core: bool = False, **limits: float) -> tuple[Settings, list[Candidates]]:
         stars = asked.model_copy(update=limits)
         # Only the stars of all images together must be enough, which is required later.
         of_each = stars.model_copy(update={"stars_min": 0})
-        found = [collect(one, of_each, settings.framing) for one in opened]
+        found = [collect(one, of_each, settings.framing, by_core=by_core) for one in opened]
         return settings.model_copy(update={"calibration_stars": stars}), found
 
     best = with_limits(snr_min=asked.least_snr)
@@ -449,7 +449,7 @@ def enough_stars(
         return best
     for ratio in (0.05, 0.1, 0.2, 0.4):
         # The median of stars with neighbours here and there has little of their light.
-        chosen, found = with_limits(snr_min=asked.least_snr, neighbour_ratio=ratio)
+        chosen, found = with_limits(True, snr_min=asked.least_snr, neighbour_ratio=ratio)
         if (more := sum(len(one.bright) for one in found)) > count:
             best, count = (chosen, found), more
         if count >= ENOUGH_STARS:
