@@ -218,7 +218,7 @@ def _best_fit(
         elif order >= CURVED:
             break
     low, high, most = alternating.low, alternating.high, alternating.most
-    # Magnitude and colour, the one that saves more error first: the other may only go along with it.
+    # Magnitude and colour, the one that saves more first: the other may only go along with it.
     untried = [coordinate for coordinate in range(len(most)) if most[coordinate] > high[coordinate]]
     while untried:
         errors = {}
