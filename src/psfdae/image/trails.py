@@ -160,7 +160,8 @@ def _trail(
     for half in range(2, WIDEST_PX):
         edge = inside & (ring >= half) & (ring < half + 1)
         if edge.any() and np.median(flat[edge]) < 1.5 * np.median(noise[edge]):
-            return np.asarray(inside & (ring < half + 1))
+            narrow = (run[1] - run[0]) * STEP_PX > 20 * half  # or it is a filament of a nebula
+            return np.asarray(inside & (ring < half + 1)) if narrow else None
     return None
 
 
