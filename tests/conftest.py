@@ -6,12 +6,11 @@ import fcntl
 import os
 from contextlib import contextmanager
 
-import numpy as np
 import pytest
 
 from image_training import Training
 from job_server import job_server
-from prediction_stars import fresh_psfs, with_network
+from prediction_stars import fresh_psfs, gaussians, with_network
 from psfdae import load_model
 from psfdae.model.psf_model import PsfModel
 from psfdae.noise import NoiseModel
@@ -83,14 +82,8 @@ def pupil():
 
 @pytest.fixture(scope="session")
 def gaussian_stars():
-    """300 flux-normalised 16 × 16 Gaussians of random width and position, float32."""
-    rng = np.random.default_rng(3)
-    grid = np.arange(16) - 8
-    centre = rng.uniform(-1, 1, size=(2, 300, 1, 1))
-    width = rng.uniform(1.0, 2.5, size=(300, 1, 1))
-    r2 = (grid[:, None] - centre[0]) ** 2 + (grid - centre[1]) ** 2
-    images = np.exp(-0.5 * r2 / width**2)
-    return (images / images.sum(axis=(1, 2), keepdims=True)).astype(np.float32)
+    """300 of 16 × 16 pixels."""
+    return gaussians(300, 3, 16, 1.0)
 
 
 @pytest.fixture(scope="session")
@@ -126,7 +119,7 @@ def smoke(shared_folder):
     folder = shared_folder / "smoke"
     with made_once(folder) as missing:
         if missing:
-            with job_server(folder) as programs:
+            with job_server() as programs:
                 snakemake(folder, path=f"{programs}{os.pathsep}{PATH}")
             assert (folder / "results/runtime.csv").is_file()
     return folder

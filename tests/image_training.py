@@ -32,7 +32,7 @@ WORDS = [
 def few_draws():
     """Errors of models are measured at three levels of noise, on few noisy images."""
     with pytest.MonkeyPatch.context() as patch:
-        for name, value in (("NODES", 3), ("LEAST_STARS", 60), ("FEW_STARS", 40)):
+        for name, value in (("NODES", 3), ("FEW_STARS", 40)):
             patch.setattr(packing, name, value)
         yield
 

@@ -14,6 +14,7 @@ import sys
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 CLIENT = """\
 #!{python} -SE
@@ -29,23 +30,19 @@ sys.exit(int(server.recv(8) or 1))
 
 
 @contextmanager
-def job_server(folder: Path):
+def job_server():
     """Serve the jobs of a run; gives the folder with the program `psfdae`, for their PATH."""
-    address = f"{folder}/jobs.socket"
-    program = folder / "bin" / "psfdae"
-    program.parent.mkdir()
-    program.write_text(CLIENT.format(python=sys.executable, address=address))
-    program.chmod(0o755)
-    server = subprocess.Popen(
-        [sys.executable, __file__, address], stdout=subprocess.PIPE, text=True
-    )
-    try:
-        assert server.stdout.readline() == "ready\n"
-        yield program.parent
-    finally:
-        server.kill()
-        server.wait()
-        server.stdout.close()
+    with TemporaryDirectory() as folder:
+        address, program = f"{folder}/jobs", Path(folder) / "psfdae"
+        program.write_text(CLIENT.format(python=sys.executable, address=address))
+        program.chmod(0o755)
+        words = [sys.executable, __file__, address]
+        with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as server:
+            try:
+                assert server.stdout.readline() == "ready\n"
+                yield folder
+            finally:
+                server.kill()
 
 
 def import_stages() -> None:

@@ -60,3 +60,14 @@ def with_network(bundle):
         weights={name: value.contiguous().numpy() for name, value in network.state_dict().items()},
         **dict.fromkeys(OPTIONAL),
     )
+
+
+def gaussians(count, seed, side=12, narrowest=0.8):
+    """Gaussian stars of random width and position, (count, side, side), float32, of sum 1."""
+    rng = np.random.default_rng(seed)
+    grid = np.arange(side) - side // 2
+    centre = rng.uniform(-1, 1, size=(2, count, 1, 1))
+    width = rng.uniform(narrowest, 2.5, size=(count, 1, 1))
+    r2 = (grid[:, None] - centre[0]) ** 2 + (grid - centre[1]) ** 2
+    images = np.exp(-0.5 * r2 / width**2)
+    return (images / images.sum(axis=(1, 2), keepdims=True)).astype(np.float32)

@@ -10,7 +10,7 @@ import pytest
 
 import psfdae
 from docs_pages import blocks, read
-from psfdae.model import packing
+from image_training import few_draws
 
 NAMES = [name for name in psfdae.__all__ if name != "__version__"]
 REFERENCE = "docs/api.md"
@@ -22,11 +22,8 @@ def lines(tmp_path_factory):
     folder = tmp_path_factory.mktemp("examples")
     (body,) = blocks(read(REFERENCE), "python")
     names = {}
-    with pytest.MonkeyPatch.context() as patch:
+    with pytest.MonkeyPatch.context() as patch, few_draws():
         patch.chdir(folder)
-        # Errors of models are measured on few noisy images.
-        for name, value in (("NODES", 3), ("LEAST_STARS", 60), ("FEW_STARS", 40)):
-            patch.setattr(packing, name, value)
         exec(compile(body, REFERENCE, "exec"), names)
         yield names
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from command_line import psfdae, refused
+from prediction_stars import gaussians
 from psfdae import StarFlag
 from psfdae.belonging import write_origin
 from psfdae.files import Column, ProductError, read_product, write_product
@@ -42,17 +43,6 @@ STARS = {
     "telescope": {"pixel_scale_arcsec": 0.1, "diameter_m": 1.0, "wavelength_m": 5.5e-7},
     "framing": {"jitter_px": 1, "subpixel": True},
 }
-
-
-def gaussians(count, seed):
-    """Gaussian stars of random width and position, 12 × 12, float32, of sum 1."""
-    rng = np.random.default_rng(seed)
-    grid = np.arange(12) - 6
-    centre = rng.uniform(-1, 1, size=(2, count, 1, 1))
-    width = rng.uniform(0.8, 2.5, size=(count, 1, 1))
-    r2 = (grid[:, None] - centre[0]) ** 2 + (grid - centre[1]) ** 2
-    images = np.exp(-0.5 * r2 / width**2)
-    return (images / images.sum(axis=(1, 2), keepdims=True)).astype(np.float32)
 
 
 def write_stars(path, config):

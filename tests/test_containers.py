@@ -1,12 +1,16 @@
-"""Images in any container, layers of pipelines' files, and headers that contradict the pixels."""
+"""Images of any kind, in any container; layers of files, and headers that contradict pixels."""
 
 from __future__ import annotations
 
 import pickle
+import re
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 
 import numpy as np
 import pytest
 from astropy import units as u
+from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from astropy.nddata import (
     CCDData,
@@ -15,13 +19,17 @@ from astropy.nddata import (
     StdDevUncertainty,
     VarianceUncertainty,
 )
-from astropy.wcs import WCS
+from astropy.table import QTable
 
-from command_line import refused
-from psfdae import Error, PsfModel, Stars
+import small_field as small
+from command_line import psfdae, refused
+from docs_pages import read
+from image_training import WORDS, few_draws
+from psfdae import Error, Stars, fit
+from psfdae.commands import from_stars
 from psfdae.image.fits_file import science_images
 from psfdae.image.observation import Source
-from small_field import CAMERA, GAIN, READ, SIZE, SKY, field, header, write
+from small_field import CAMERA, GAIN, READ, SIZE, SKY, TANGENT, field, header, table, write
 
 
 @pytest.fixture(scope="module")
@@ -70,9 +78,105 @@ def test_the_mask_of_a_container_is_that_of_the_keyword(image, place, bad, name)
     assert verdicts(CONTAINERS[name](image, bad), place, **CAMERA) == expected
 
 
-@pytest.mark.parametrize("kind", [fits.PrimaryHDU, fits.CompImageHDU])
-def test_an_hdu_is_read_with_its_header(image, place, kind):
-    stars = Stars.from_image(kind(image, header()), catalogue=place)
+# The four lines of Python: each container, with each kind of list.
+
+
+def model_of(image, catalogue):
+    """Stars, their model and a prediction."""
+    stars = Stars.from_image(image, catalogue=catalogue, train_stars=30, test_stars=10, **CAMERA)
+    with few_draws():
+        model = fit(stars, "field", orders=[0], modes=4, step_px=1.0, spacing_px=1.0)
+    return stars, model, model.predict(np.ones((1, 16, 16)))
+
+
+@pytest.fixture(scope="module")
+def expected(image, place):
+    """From another process, which pickles what it gives back."""
+    with ProcessPoolExecutor(1, get_context("fork")) as pool:
+        return pool.submit(model_of, image, place).result()
+
+
+@pytest.mark.parametrize(
+    ("container", "listed"),
+    [
+        (lambda image: image, lambda place: [tuple(xy) for xy in place]),
+        (lambda image: np.ma.MaskedArray(image, np.zeros(image.shape, bool)), table),
+        (
+            lambda image: CCDData(image, unit="adu", wcs=TANGENT),
+            lambda place: SkyCoord(*TANGENT.all_pix2world(*place.T, 0), unit="deg"),
+        ),
+        (NDData, lambda place: QTable(place * u.pix, names=("x_fit", "y_fit"))),
+        (lambda image: fits.PrimaryHDU(image, header()), lambda place: place),
+        (lambda image: fits.HDUList([fits.PrimaryHDU(image, header())]), lambda _: "stars.csv"),
+        (lambda _: "image.fits", lambda place: place),
+    ],
+)
+def test_any_container_and_any_list_give_the_same_model(
+    tmp_path, monkeypatch, image, place, expected, container, listed
+):
+    monkeypatch.chdir(tmp_path)
+    write("image.fits", image)
+    table(place).write("stars.csv")
+    stars, model, _ = model_of(container(image), listed(place))
+    weights = (m.bundle.weights["coefficients"] for m in (model, expected[1]))
+    np.testing.assert_allclose(*weights, rtol=1e-4, atol=1e-8)
+    assert len(stars) == len(expected[0]) and "\n" not in repr(stars)
+
+
+def test_what_a_process_gives_back_is_as_good_as_its_own(expected):
+    stars, model, found = pickle.loads(pickle.dumps(expected))
+    assert stars.settings == expected[0].settings
+    np.testing.assert_array_equal(model.predict(np.ones((1, 16, 16))).flux, found.flux)
+    for result in (stars, found):
+        assert f"{len(result)} stars" in repr(result) and "<table>" in result._repr_html_()
+
+
+# The tutorial's table: images of these kinds, by a word of their row.
+
+KINDS = {
+    "cosmic": lambda image: image + 3e3 * (np.random.default_rng(1).random(image.shape) < 1e-3),
+    "faint": lambda _: small.image_of(small.moffat(2.8), np.geomspace(8e2, 6e3, 70), 300, 16)[0],
+    "NaN": lambda image: np.where(np.arange(SIZE)[:, None] // 10 == 10, np.nan, image),
+    "zeros": lambda image: np.pad(image, 20),
+    "few": lambda _: small.image_of(small.moffat(2.6), np.geomspace(3e4, 2e5, 8), 160, 25)[0],
+    "ring": lambda _: small.image_of(small.ring, np.geomspace(5e4, 1e6, 40), 300, 28)[0],
+    "crowded": lambda _: small.image_of(small.moffat(2.6), np.geomspace(1e4, 1e5, 80), 220, 6)[0],
+    "colour": lambda image: np.stack(3 * [image]),
+    **dict.fromkeys(("MJy/sr", "SCI", "header", "list"), lambda image: image),
+}
+ROWS = re.findall(r"^\| ((?:is|has|comes) .*) \| (.*) \| (.*)\|$", read("docs/tutorial.md"), re.M)
+LONG = pytest.param(True, marks=[pytest.mark.slow, pytest.mark.written])
+
+
+@pytest.mark.parametrize("is_trained", [False, LONG])
+@pytest.mark.parametrize("row", ROWS, ids=lambda row: row[0][:30])
+def test_an_image_of_the_tutorials_table_gives_what_it_says(
+    tmp_path, monkeypatch, image, place, row, is_trained
+):
+    monkeypatch.chdir(tmp_path)
+    (kind,) = [kind for kind in KINDS if kind in row[0]]
+    pixels = KINDS[kind](image).astype(np.float32)
+    cards = {"MJy/sr": header(BUNIT=kind), "header": None}.get(kind, header())
+    fits.writeto("image.fits", pixels, cards)
+    fits.writeto("mask.fits", np.zeros(pixels.shape, np.uint8))
+    if kind == "SCI":
+        pipeline_file("image.fits", image, image > 5e4)
+    small.stetson([(k, x + 1, y + 1) for k, (x, y) in enumerate(place)], tmp_path / "list.als")
+    if not is_trained:
+        monkeypatch.setattr(from_stars, "_make", lambda a, b, *_: "\n".join(Stars.of(b, a).notes))
+    output = ""
+    for option in ["", *re.findall("`(--[a-z]+[- ][^`]*)`", row[2])]:
+        words = [*option.split(), *([] if "--catalogue" in option else ["--detect"])]
+        words += [*WORDS, "--method", "field", "--out", "m", "--overwrite"]
+        with few_draws():
+            done = psfdae("from-stars", "image.fits", *words)
+        assert done.exit_code == (2 if "refused" in row[1] else 0), done.output
+        output += done.output
+    assert all(said in output for said in re.findall("`([^`]+)`[.,]", row[1])), output
+
+
+def test_an_hdu_is_read_with_its_header(image, place):
+    stars = Stars.from_image(fits.CompImageHDU(image, header()), catalogue=place)
     assert stars.observation.gain == GAIN
     assert verdicts(image, place, **CAMERA) == stars.candidates.verdict.tolist()
 
@@ -90,20 +194,17 @@ def test_an_hdulist_of_a_file_has_its_name_and_the_same_stars(tmp_path, image, p
 @pytest.mark.parametrize("kind", [StdDevUncertainty, VarianceUncertainty, InverseVariance])
 def test_uncertainty_unit_meta_and_wcs_of_nddata_are_used(image, place, kind):
     sigma = np.full(image.shape, np.sqrt(SKY / GAIN + (READ / GAIN) ** 2))
-    wcs = WCS(naxis=2)
-    wcs.wcs.ctype, wcs.wcs.cdelt = ["RA---TAN", "DEC--TAN"], [-0.5 / 3600, 0.5 / 3600]
-    wcs.wcs.crpix, wcs.wcs.crval = [150, 150], [10.0, 20.0]
     data = NDData(
         image,
         uncertainty=StdDevUncertainty(sigma).represent_as(kind),
         unit=u.adu,
-        wcs=wcs,
+        wcs=TANGENT,
         meta={"EGAIN": GAIN, "history": ["of", "no", "use"], "TELESCOP": "T1"},
     )
-    ra, dec = wcs.all_pix2world(*place.T, 0)
+    ra, dec = TANGENT.all_pix2world(*place.T, 0)
     observation = Stars.from_image(data, catalogue={"ra": ra, "dec": dec}).observation
     assert observation.gain == GAIN and observation.instrument == {"TELESCOP": "T1"}
-    assert observation.pixel_scale_arcsec == pytest.approx(0.5)
+    assert observation.pixel_scale_arcsec == pytest.approx(0.6)
     np.testing.assert_allclose(observation.positions, place, atol=1e-6)
     (chunk,) = observation.chunks(100)
     # One σ for all, as the map has it, not those of stamps, which differ.
@@ -134,28 +235,21 @@ def test_quantities_are_converted_and_other_units_refused(tmp_path, image, place
             Stars.from_image(path, catalogue=place, **{name: 2.0 * wrong})
 
 
-@pytest.mark.slow
-def test_predict_uses_mask_sigma_and_unit_of_its_stamps(small_model, image):
+def test_predict_uses_mask_sigma_and_unit_of_its_stamps(expected, image):
+    small_model = expected[1]
     stamps = image[None, 60:76, 60:76].repeat(3, axis=0)
     bad = np.zeros(stamps.shape, bool)
     bad[1, 4, 4] = True
-    expected = small_model.predict(stamps, bad=bad, noise=15.0, gain=GAIN)
+    of_arrays = small_model.predict(stamps, bad=bad, noise=15.0, gain=GAIN)
     masked = small_model.predict(np.ma.MaskedArray(stamps, bad), noise=15.0, gain=GAIN)
     sigma = StdDevUncertainty(np.full(stamps.shape, 15.0))
     data = NDData(stamps, mask=bad, uncertainty=sigma, unit=u.adu)
     of_data = small_model.predict(data, gain=GAIN * u.electron / u.adu)
     for found in (masked, of_data):
-        np.testing.assert_array_equal(found.flags, expected.flags)
-        np.testing.assert_array_equal(found.flux, expected.flux)
+        np.testing.assert_array_equal(found.flags, of_arrays.flags)
+        np.testing.assert_array_equal(found.flux, of_arrays.flux)
     quantity = small_model.predict(stamps * u.ct)
     np.testing.assert_array_equal(quantity.flux, small_model.predict(stamps).flux)
-
-
-@pytest.fixture(scope="module")
-def small_model(image, place) -> PsfModel:
-    from psfdae import fit
-
-    return fit(Stars.from_image(image, catalogue=place, **CAMERA), "field")
 
 
 # Layers of pipelines' files.

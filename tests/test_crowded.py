@@ -11,7 +11,7 @@ from astropy.io import fits
 from astropy.table import Table
 from astropy.wcs import WCS
 from photutils.aperture import CircularAperture
-from photutils.psf import GriddedPSFModel, PSFPhotometry
+from photutils.psf import PSFPhotometry
 from scipy.ndimage import uniform_filter
 from scipy.spatial import cKDTree
 
@@ -24,6 +24,7 @@ from psfdae.model import crowded
 from psfdae.model.bundle import BundleError
 from psfdae.model.neighbours import light_of_others
 from psfdae.model.photon_noise import measure_gain, with_measured_gain
+from psfdae.model.psf_grid import PsfGrid
 from psfdae.model.wings import TENTS, Wings, tented_light, wings_of
 from psfdae_paper.stars.example import add_stamps, write_field
 
@@ -200,7 +201,8 @@ def test_wings_are_those_of_bright_stars_or_as_expected(level, brightness):
     place, flux = rng.uniform(0, 300, (30, 2)), brightness * 10 ** rng.uniform(4, 5.5, 30)
     outer = np.full(30, 0.03)
     true = Wings(RADIUS, np.geomspace(3e-4, 1e-4, TENTS + 1), np.eye(TENTS + 1), 0.03)
-    ((_, tented),) = tented_light((300, 300), place, flux, outer, true)
+    bands = tented_light((300, 300), place, flux, outer, true)
+    tented = np.concatenate([light for _, light in bands], axis=1)
     image = level + np.tensordot(true.profile, tented, 1) + rng.normal(0, 5, (300, 300))
     nothing = np.zeros(image.shape, bool)
     known = (np.full(image.shape, 5.0), nothing, place)
@@ -210,7 +212,7 @@ def test_wings_are_those_of_bright_stars_or_as_expected(level, brightness):
         assert light == pytest.approx(true.light()[0], abs=4 * error)
         assert error < 0.05 * light
     else:
-        # (r/h)^-5 has 0.65 of the light between 0.7 h and h, that of the ring in the stamp included.
+        # (r/h)^-5 has 0.65 of the light between 0.7 h and h, with that of the ring in the stamp.
         assert light == pytest.approx(0.65 * 0.03, abs=0.002)
         assert 0.3 * light < error < 1.5 * light
     assert wings_of(image, *known, np.full(30, np.nan), outer, 10) is None
@@ -268,28 +270,30 @@ def test_models_of_photutils_do_not_mix(sky):
     assert fluxes[0] != pytest.approx([1e3, 1e3], rel=0.02)
 
 
-def test_a_grid_is_interpolated_as_photutils_does_it(sky):
-    """Between the nodes and beyond them, in the pixels of a fit."""
-    grid = load_model(sky[1]).to_photutils(4, 4)
-    low, high = grid.grid_xypos.min(axis=0), grid.grid_xypos.max(axis=0)
+@pytest.mark.parametrize(("oversampling", "limit"), [(2, 2e-3), (4, 1e-4)])
+def test_the_light_of_a_grid_is_that_of_photutils(sky, oversampling, limit):
+    """At the nodes, between them and beyond them; a star that no stamp holds has no light there."""
+    model = load_model(sky[1])
+    grid, photutils = PsfGrid.of(model, 4, oversampling), model.to_photutils(4, oversampling)
+    low, high = photutils.grid_xypos.min(axis=0), photutils.grid_xypos.max(axis=0)
     rng = np.random.default_rng(4)
-    for x, y in np.vstack([rng.uniform(low, high, (20, 2)), [low - 9.3, high + 7.6]]):
-        rows, columns = np.mgrid[-4:5, -4:5] + np.rint([y, x]).astype(int)[:, None, None]
-        expected = GriddedPSFModel.evaluate(grid, columns, rows, 1e3, x, y)
-        found = grid.evaluate(columns, rows, 1e3, x, y)
-        assert found == pytest.approx(expected, abs=1e-4 * expected.max())
-        assert grid.copy()(columns, rows).shape == (9, 9)
-    assert grid.evaluate(np.array([x + 99.0]), np.array([y]), 1.0, x, y) == 0
+    place = np.vstack([rng.uniform(low, high, (20, 2)), low, low - 9.3, high + 7.6])
+    corner = np.rint(place).astype(int) - 4
+    drawn = grid.stamps(place, corner, 9)
+    for (x, y), (left, top), light in zip(place, corner, drawn, strict=True):
+        rows, columns = np.mgrid[top : top + 9, left : left + 9]
+        expected = photutils.evaluate(columns, rows, 1.0, x, y)
+        assert light[0] == pytest.approx(expected, abs=limit * expected.max())
+    assert not grid.stamps(place, corner + 99, 9).any()
 
 
 def test_derivatives_of_a_grid_are_those_of_its_light(sky):
-    grid = load_model(sky[1]).to_photutils(4, 4)
-    x, y = grid.grid_xypos.mean(axis=0) + np.array([0.3, -0.4])
-    rows, columns = (axis.ravel() for axis in np.mgrid[-4:5, -4:5])
-    pixels, step = (columns + round(x), rows + round(y)), 1e-3
-    found = grid.fit_deriv(*pixels, 1e3, x, y)
-    for slope, (f, a, b) in zip(found, step * np.eye(3), strict=True):
-        less, more = (grid.evaluate(*pixels, 1e3 + s * f, x + s * a, y + s * b) for s in (-1, 1))
+    grid, step = PsfGrid.of(load_model(sky[1]), 4, 4), 1e-3
+    place = np.array([[grid.columns.mean() + 0.3, grid.rows.mean() - 0.4]])
+    corner = np.rint(place).astype(int) - 4
+    slopes = grid.stamps(place, corner, 9)[0, 1:]
+    for slope, move in zip(slopes, step * np.eye(2), strict=True):
+        less, more = (grid.stamps(place + s * move, corner, 9)[0, 0] for s in (-1, 1))
         assert slope == pytest.approx((more - less) / (2 * step), abs=2e-3 * np.abs(slope).max())
 
 

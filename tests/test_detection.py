@@ -12,11 +12,11 @@ from astropy.table import Table
 from scipy.spatial import cKDTree
 
 from command_line import psfdae, refused
+from image_training import few_draws
 from psfdae.image.detection import Sky
 from psfdae.image.fits_file import READ_NOISE_KEYS, SATURATION_KEYS, find_image
 from psfdae.image.observation import SEEN, Source
 from psfdae.image.selection import collect
-from psfdae.model import packing
 from psfdae.model.bundle import read_bundle
 from psfdae.model.settings import from_words
 from psfdae_paper.stages import simulate
@@ -92,13 +92,11 @@ def test_a_star_without_noise_is_found_exactly_and_nothing_is_named_twice():
     assert smooth.std() == pytest.approx(limit[0, 0] / 2.0, rel=0.05)
 
 
-def test_commands_need_no_list_and_no_card(field, tmp_path, monkeypatch):
-    # What a bundle says of its errors is not looked at here, and takes long.
-    for name, fewer in {"NODES": 3, "LEAST_STARS": 120, "FEW_STARS": 60}.items():
-        monkeypatch.setattr(packing, name, fewer)
+def test_commands_need_no_list_and_no_card(field, tmp_path):
     image, model, out = field[0] / "image.fits", tmp_path / "model", tmp_path / "psf.fits"
     words = [image, "--detect"]
-    first = psfdae("from-stars", *words, "--out", model, *TINY)
+    with few_draws():
+        first = psfdae("from-stars", *words, "--out", model, *TINY)
     assert first.exit_code == 0, first.output
     camera = "image.fits: pixel scale 1 arcsec (assumed), gain not known, read noise not known"
     assert camera in first.output

@@ -13,8 +13,8 @@ import pytest
 from command_line import psfdae
 from docs_pages import ROOT, blocks, commands, pages, read
 from fits_inputs import write_field
+from image_training import few_draws
 from psfdae.cli import main
-from psfdae.model import packing
 from psfdae.model.bundle import read_bundle
 from workflow_runs import clone, shell
 
@@ -100,16 +100,14 @@ def star_stamps(count, side):
 
 
 def test_commands_of_the_readme_run(observation, tmp_path, monkeypatch):
-    # Errors of models are measured on few noisy images.
-    for name, value in (("NODES", 3), ("LEAST_STARS", 60), ("FEW_STARS", 40)):
-        monkeypatch.setattr(packing, name, value)
     for path in observation:
         shutil.copy(path, tmp_path)
     monkeypatch.chdir(tmp_path)
     lines = [line.words[1:] for line in commands(read("README.md")) if line.words[0] == "psfdae"]
     assert {words[0] for words in lines} == {"from-stars", "predict"}
     for words in lines:
-        result = psfdae(*words, *(SMALL if words[0] == "from-stars" else ()))
+        with few_draws():
+            result = psfdae(*words, *(SMALL if words[0] == "from-stars" else ()))
         assert result.exit_code == 0, result.output
     assert {"model.html", "psfs.fits", "psfs.png"} <= {path.name for path in tmp_path.iterdir()}
 

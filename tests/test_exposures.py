@@ -253,8 +253,8 @@ def test_several_images_that_belong_to_no_training_are_refused(sky, night, tmp_p
 
 def test_wings_of_several_images_are_one_profile():
     """Each counts by its error; a profile is by the light in the outer part of the PSF."""
-    radius, eye = np.array([5.0, 8.0, 12.0]), np.eye(2)
-    one = Wings(radius, np.array([1e-4, 3e-5]), 1e-12 * eye, 0.02)
+    radius, eye = np.array([5.0, 8.0, 12.0]), np.eye(3)
+    one = Wings(radius, np.array([1e-5, 1e-4, 3e-5]), 1e-12 * eye, 0.02)
     assert Wings.joined([one]).plain() == one.plain()
     both = Wings.joined([one, one])
     assert both.profile == pytest.approx(one.profile)

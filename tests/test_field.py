@@ -258,8 +258,8 @@ def test_nodes_that_the_matched_filter_leaves_out_do_not_matter(field, snr, monk
     monkeypatch.setattr("psfdae.field_law.LEAST_NODES", round(MOST_PX2 * 16))
     every = faint.measured(field)
     assert np.abs(found.psf - every.psf).max() < 0.01 * every.sigma.max()
-    assert found.measured.flux == pytest.approx(every.measured.flux, rel=1e-5)
-    assert found.evidence == pytest.approx(every.evidence, abs=1e-3)
+    assert found.measured.flux == pytest.approx(every.measured.flux, rel=1e-3)
+    assert found.evidence == pytest.approx(every.evidence, abs=2e-3)
 
 
 @pytest.mark.parametrize("snr", [5.0, 100.0])

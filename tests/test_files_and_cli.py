@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import itertools
 import json
 import subprocess
 import sys
@@ -12,6 +14,7 @@ import numpy as np
 import pytest
 
 from command_line import refused
+from psfdae import progress
 from psfdae.files import (
     Column,
     ProductError,
@@ -105,6 +108,23 @@ def test_nothing_loads_packages_that_it_does_without():
     found = json.loads(done.stdout.splitlines()[-1])
     assert len(found) == 3
     assert not any(found.values()), found
+
+
+@pytest.mark.parametrize("is_terminal", [False, True])
+def test_progress_is_a_bar_in_a_terminal_and_nothing_elsewhere(monkeypatch, is_terminal):
+    """Of tasks within a task nothing is shown; one that needs fewer steps ends at 100 %."""
+    monkeypatch.setattr("time.time", itertools.count(0.0, 0.6).__next__)
+    error = io.StringIO()
+    error.isatty = lambda: is_terminal
+    monkeypatch.setattr(sys, "stderr", error)
+    for _ in progress.steps("stars", range(5)):
+        assert list(progress.steps("inner", "abc")) == ["a", "b", "c"]
+    with progress.task("field", 9) as advance:
+        advance(4)
+        advance(1)
+    shown = error.getvalue()
+    assert [shown.count(word) > 0 for word in ("stars", "inner")] == [is_terminal, False]
+    assert shown.count("100%") == 2 * is_terminal
 
 
 def test_wrong_config_and_missing_input_are_one_message_and_exit_code_2(tmp_path):

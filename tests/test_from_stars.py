@@ -14,14 +14,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from click.testing import CliRunner
 
-from command_line import refused
+from command_line import psfdae, refused
 from docs_pages import blocks, commands, read
 from fits_inputs import write_cube
 from image_training import RECIPE, SIZE_WORDS, WORDS, few_draws
 from psfdae.bright_stars import BrightStars
-from psfdae.cli import main
 from psfdae.commands import from_stars as stage
 from psfdae.commands.from_stars import _alone
 from psfdae.files import read_product, write_product
@@ -173,7 +171,7 @@ def best_match(psf, image):
 
 
 def run(*words):
-    return CliRunner().invoke(main, ["from-stars", *map(str, words)])
+    return psfdae("from-stars", *words)
 
 
 def test_command_leaves_a_model_and_a_report(training):
@@ -205,7 +203,7 @@ def test_the_method_may_be_named_and_settings_used_by_hand(network, tmp_path):
     assert noise.kappa == 1.0 and len(noise.levels) == 4
     by_hand = ["train", "--stars", network / "stars.h5", "--split", "held_out"]
     words = [*by_hand, "--out", tmp_path / "dae", *overrides]
-    assert CliRunner().invoke(main, list(map(str, words))).exit_code == 0
+    assert psfdae(*words).exit_code == 0
     weights = "dae/dae.safetensors"
     assert (tmp_path / weights).read_bytes() == (network / weights).read_bytes()
 
@@ -354,7 +352,7 @@ def test_commands_of_pages_run(page, tmp_path, monkeypatch):
         if "sparse.fits" in rest:
             shutil.copy("image.fits", "sparse.fits")
         words = [name, *rest, *small.get(name, [])]
-        result = CliRunner().invoke(main, words)
+        result = psfdae(*words)
         assert result.exit_code == 0, (words, result.output)
     names: dict[str, Any] = {}
     for body in blocks(text, "python"):

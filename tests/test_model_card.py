@@ -6,10 +6,9 @@ import re
 from dataclasses import replace
 
 import pytest
-from click.testing import CliRunner
 
+from command_line import psfdae
 from docs_pages import FENCE, read
-from psfdae.cli import main
 from psfdae.commands.describe import NO_BREAK, SAID, model_card
 
 
@@ -24,7 +23,7 @@ def bundle(shipped):
 
 
 def test_the_page_is_what_the_command_prints():
-    done = CliRunner().invoke(main, ["describe", "--card"])
+    done = psfdae("describe", "--card")
     assert done.exit_code == 0, done.output
     assert read("docs/model_card.md") == done.output, "make docs renews it"
 

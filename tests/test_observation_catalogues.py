@@ -88,11 +88,15 @@ def test_the_best_columns_of_a_program_and_pixels_before_sky(tmp_path, image):
 
 def test_units_and_sexagesimal_coordinates(tmp_path):
     (tmp_path / "a.csv").write_text("ra,dec\n10:00:00.0,+02:00:00\n10:00:04.0,-00:30:00\n")
+    (tmp_path / "d.csv").write_text("ra,dec\n7:30:00,+02:00:00\n150:06:00,-00:30:00\n")
     radians = {"ra": np.deg2rad([150.0]), "dec": np.deg2rad([2.0])}
     Table(radians, units=["rad", "rad"]).write(tmp_path / "b.fits")
     Table({"ra": [1.0], "dec": [2.0]}, units=["m", "deg"]).write(tmp_path / "c.fits")
-    tables = {name: read_catalogue(tmp_path / name) for name in ("a.csv", "b.fits", "c.fits")}
+    tables = {
+        name: read_catalogue(tmp_path / name) for name in ("a.csv", "b.fits", "c.fits", "d.csv")
+    }
     expected = {"a.csv": ([150.0, 150 + 1 / 60], [2.0, -0.5]), "b.fits": ([150.0], [2.0])}
+    expected["d.csv"] = ([7.5, 150.1], [2.0, -0.5])  # 150 are no hours
     for name, angles in expected.items():
         np.testing.assert_allclose(tables[name].sky(tables[name].positions()), angles)
     with pytest.raises(ObservationError, match="column 'ra' has the unit 'm', expected an angle"):

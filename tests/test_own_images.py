@@ -14,11 +14,11 @@ from astropy.table import Table
 
 from command_line import psfdae as run
 from command_line import refused
+from image_training import few_draws
 from psfdae import StarFlag, load_model
 from psfdae.image.observation import Source
 from psfdae.image.selection import collect, saturation_advice
 from psfdae.image.stamps import cut
-from psfdae.model import packing
 from psfdae.model.bundle import read_bundle, write_bundle
 from psfdae.model.settings import from_words
 
@@ -75,10 +75,7 @@ def sky(tmp_path_factory):
     made = Image(tmp_path_factory.mktemp("sky"))
     out = made.folder / "model"
     words = ("--catalogue", made.list, "--method", "field", "--out", out)
-    with pytest.MonkeyPatch.context() as patched:
-        # What a bundle says of its errors is hardly used here, and takes longest.
-        for name, fewer in {"NODES": 3, "LEAST_STARS": 120, "FEW_STARS": 60}.items():
-            patched.setattr(packing, name, fewer)
+    with few_draws():
         done = run("from-stars", made.image, *words, "methods=[noisy,field]", *TINY)
     assert done.exit_code == 0, done.output
     made.model = out / "sky.psf.safetensors"

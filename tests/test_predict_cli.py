@@ -8,14 +8,17 @@ from signal import SIGKILL
 
 import numpy as np
 import pytest
+from astropy import units as u
 from astropy.io import fits
-from astropy.table import Table
+from astropy.table import QTable, Table
 
 from command_line import psfdae, refused
 from fits_inputs import write_cube, write_field
 from prediction_stars import SKY, observe
 from psfdae import StarFlag
 from psfdae.commands import predict as stage
+from psfdae.image.observation import Source
+from psfdae.image.tables import COLUMNS, SUFFIXES, star_table, write_table
 from psfdae.model import prediction as writer
 from psfdae.model import psf_model as engine
 from psfdae.model.psf_model import SCALE_TOLERANCE
@@ -79,7 +82,7 @@ def test_cube_gives_what_the_model_gives(folder, shipped):
     assert (header["INFILE"], header["OBJECT"]) == ("cube.fits", "M 67")
 
 
-def test_image_and_catalogue(folder, field_psfs):
+def test_image_and_catalogue(folder, field_psfs, shipped):
     out, png = folder / "image_psf.fits", folder / "map.png"
     result = run(
         *(folder / "image.fits", "--catalogue", folder / "stars.csv"), "--out", out, "--plot", png
@@ -88,12 +91,38 @@ def test_image_and_catalogue(folder, field_psfs):
     cubes, table, header = read(out)
     truth = Table.read(folder / "stars.csv")
     assert np.allclose(table["x"], truth["X_IMAGE"] - 1)
+    source = Source(folder / "image.fits", folder / "stars.csv")
+    ((_, found),) = shipped.stream(source.open(shipped.stamp_px, engine.MARGIN_PX))
+    rows = found.to_table()
+    assert rows.colnames == table.colnames and {"ra", "dec"} < {*rows.colnames}
+    for name in rows.colnames:
+        assert rows[name].unit == table[name].unit
+        np.testing.assert_array_equal(np.ma.filled(table[name], np.nan), rows[name].value)
     assert header["GAIN"] == 1.0
     still = (table["shift_x"] == 0) & (table["shift_y"] == 0)
     assert still.sum() > 55
     error = np.abs(cubes["PSF"] - 2e4 * field_psfs[:60])[still]
     assert (error <= cubes["UNCERT"][still]).mean() == pytest.approx(0.68, abs=0.06)
     assert png.read_bytes()[:4] == b"\x89PNG"
+
+
+def test_tables_have_units_digits_and_the_columns_of_the_list(tmp_path):
+    columns = {"id": np.arange(2), "x": np.array([4.999999999883585, np.nan]), "flux": np.ones(2)}
+    of_list = Table({"Flux": [1, 2], "flux_list": ["=1+1", "é"], "mag": [3.0, 4.0] * u.mag})
+    table = star_table(columns, "electron / s", of_list)
+    names = ["id", "x", "flux", "Flux_list", "flux_list_list", "mag"]
+    for suffix in SUFFIXES:
+        write_table(tmp_path / f"t{suffix}", table)
+        again = QTable.read(tmp_path / f"t{suffix}")
+        assert again.colnames == names
+        if suffix != ".csv":
+            assert again["x"][0] == table["x"][0]
+            units = [str(again[name].unit) for name in ("x", "flux", "mag")]
+            assert units == ["pix", "electron / s", "mag"]
+    assert (tmp_path / "t.csv").read_text().splitlines()[1:] == [
+        "0,5.0000,1,1,'=1+1,3.0",
+        "1,,1,2,é,4.0",
+    ]
 
 
 def test_names_given_fluxes_and_columns_of_a_table(folder):
@@ -109,6 +138,8 @@ def test_names_given_fluxes_and_columns_of_a_table(folder):
     assert (table["flux"][1::2] == 2e4).all()
     assert table["flux_error"].mask[1::2].all()
     assert (table["flux"][::2] != 2e4).all()
+    # A column of the list whose name is taken.
+    assert (table["flux_list"][1::2] == 2e4).all() and table["flux_list"].mask[::2].all()
 
 
 def test_chunks_and_threads_do_not_show(folder, monkeypatch):
@@ -173,8 +204,9 @@ def test_page_lists_all_flags_and_columns():
     text = (ROOT / "docs/predict.md").read_text(encoding="utf-8")
     for flag in StarFlag:
         assert f"| `{flag.name}` | {int(flag)} |" in text
-    for name in ("id", *writer.COLUMNS):
-        assert f"`{name}`" in text, name
+    photometry = (ROOT / "docs/own_stars.md").read_text(encoding="utf-8")
+    for name in COLUMNS:
+        assert f"`{name}`" in text + photometry, name
     for extension, _ in writer.CUBES.values():
         assert f"| `{extension}` |" in text
     assert f"by up to {stage.MARGIN_PX} px" in text

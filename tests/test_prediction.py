@@ -13,7 +13,8 @@ from psfdae.image.stamps import cut
 from psfdae.model import psf_model as model
 from psfdae.model.psf_model import BLOCK, PsfModel
 
-COLUMNS = tuple(Prediction.__dataclass_fields__)
+NAMES = {"id", "x", "y", "ra", "dec", "list_columns", "unit"}
+COLUMNS = tuple(name for name in Prediction.__dataclass_fields__ if name not in NAMES)
 
 
 def rms(values):

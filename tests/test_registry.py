@@ -8,10 +8,10 @@ import numpy as np
 from astropy.io import fits as fits_files
 
 from command_line import psfdae
+from image_training import few_draws
 from psfdae import fits
 from psfdae.files import Column, write_product
 from psfdae.methods import groups_of, method
-from psfdae.model import packing
 from psfdae_paper.configuration.compose import load_stage
 from psfdae_paper.stages import bundle, track
 from psfdae_paper.stages.evaluate import Models
@@ -31,9 +31,6 @@ def test_a_registered_model_restores_as_its_bundle_does(
 
     monkeypatch.setenv("MLFLOW_DISABLE_TELEMETRY", "true")
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
-    # Errors, of which no PSF depends, are measured on few noisy images.
-    for constant, value in (("NODES", 2), ("LEAST_STARS", 60), ("FEW_STARS", 40)):
-        monkeypatch.setattr(packing, constant, value)
     telescope = {"pixel_scale_arcsec": 0.1, "diameter_m": 1.0, "wavelength_m": 5.5e-7}
     columns = {
         "realisation": Column(gaussian_stars, "1", "noise-free image"),
@@ -46,7 +43,8 @@ def test_a_registered_model_restores_as_its_bundle_does(
     place = tmp_path / fits.named(kind, "fit")
     fit(load_stage(groups_of("dae"), SIZES), "dae", stars, out=place)
     config = load_stage(bundle.bundle.stage.settings.reads, SIZES)
-    bundle.bundle(config, stars, Models(dae=place), out=packed)
+    with few_draws():
+        bundle.bundle(config, stars, Models(dae=place), out=packed)
 
     files = {f"model/{path.name}": path for path in fits.own_files(kind, place)}
     run = Run("dae", "mine", "random", "realisation", "fit", "a fit", "trials", files, {}, 1, {})

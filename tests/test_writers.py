@@ -14,11 +14,10 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from click.testing import CliRunner
 
+from command_line import psfdae
 from fits_inputs import write_cube
 from psfdae import files
-from psfdae.cli import main
 from psfdae.files import Column, Empty, stream_product, write_product, write_text
 from psfdae.networks.weights import load_checkpoint, save_checkpoint, save_weights
 
@@ -38,7 +37,7 @@ def results(tmp_path):
 
 def verify(results):
     """Files to build, and what was printed of them."""
-    done = CliRunner().invoke(main, ["verify", str(results)])
+    done = psfdae("verify", results)
     assert done.exit_code == 0, done.output
     return done.stdout.splitlines(), done.stderr
 

@@ -12,8 +12,8 @@ Of a telescope that is known::
     found = psfdae.wavefront(stamps, "telescope.yaml", field_deg=field, joint=True)
 
 `load_model` gives a trained model; its methods `predict` and `psf_at` give PSFs. No call writes a
-file unless it is named for that, or changes threads or random generators of the process; fits of
-mixtures and networks print their progress. Refusals are of the class `Error`.
+file unless it is named for that, or changes threads or random generators of the process. In a
+terminal, long calls show a bar of their progress. Refusals are of the class `Error`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,10 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING
 
+from psfdae import progress, terminal
 from psfdae.version import __version__
+
+progress.show_with(terminal.bar)
 
 if TYPE_CHECKING:
     from psfdae.errors import Error

@@ -64,6 +64,9 @@ FAR, MATCHED_SNR = 8.0, 30.0
 only if they are among the `LEAST_NODES` best: most would have less than `LEAST_WEIGHT`. The filter
 does not know the shape of bright stars, so that they count as stars of this S/N."""
 
+COARSE_SNR = 10.0
+"""S/N below which every second node is enough."""
+
 WRONG_LIST = 0.05
 """Probability that the list, or its place, is not what it was for the training stars."""
 
@@ -281,6 +284,7 @@ class Asked(NamedTuple):
     flux: np.ndarray  # (n,), NaN where to be found
     sky: np.ndarray  # (n,) of bool: the sky is off
     per_photon: np.ndarray  # (n,), unit of the images for an electron; 0 where unknown
+    off_node: np.ndarray  # (n,), σ of a centre about its node, per axis, in pixels; 0 where exact
 
     def of(self, chosen: np.ndarray | slice) -> Asked:
         """A part of these stars, by indices or a mask."""
@@ -456,7 +460,7 @@ class FieldLaw:
         return self._made[k, positioned]
 
     @property
-    def _part(self) -> float:
+    def off_node_px(self) -> float:
         """σ of a place between two nodes."""
         return float(self.step_px / np.sqrt(12.0))
 
@@ -475,7 +479,7 @@ class FieldLaw:
         prior = np.tile(box / box.sum(), (len(listed), 1))
         near = np.isfinite(listed).all(axis=1)
         if near.any() and len(self.listed) and np.isfinite(self.listed).all():
-            sigma = np.hypot(self.listed[1], self._part)
+            sigma = np.hypot(self.listed[1], self.off_node_px)
             off = (self.places - listed[near, None]) / sigma
             there = np.exp(-0.5 * np.square(off).sum(axis=-1))
             total = there.sum(axis=1, keepdims=True)
@@ -533,6 +537,15 @@ class FieldLaw:
         These are evidence, flux, sky, row, column, outlier score, PSF and its σ. The rest is what
         `_start` has for these stars.
         """
+        # A faint star is looked at in every second node along both axes, if many are near: what is
+        # not linear over twice the step is far below its noise. Such a node counts for four.
+        even = near & (np.rint(self.places / self.step_px) % 2 == 0).all(axis=1)
+        faint = (guess < COARSE_SNR * stars.noise * width) & (even.sum(axis=1) > 4)
+        near = np.where(faint[:, None], even, near)
+        stars = stars._replace(
+            off_node=np.where(faint, 2.0, 1.0) * stars.off_node,
+            prior=stars.prior + np.where(faint, np.log(4.0), 0.0)[:, None],
+        )
         known = np.isfinite(stars.flux) & (stars.flux > 0)
         precision = np.where(known, KNOWN_FLUX_SIGMA, FLUX_SIGMA) ** -2.0
         pairs = self._paired(stars, near)
@@ -556,9 +569,8 @@ class FieldLaw:
 
     def _width(self, stars: Asked) -> np.ndarray:
         """Standard deviations (n, 3) of sky, row and column before a star is seen; 0 if known."""
-        centre = 0.0 if stars.centre is not None else self._part
         # A sky of the whole flux in each pixel is as good as unknown.
-        return np.stack([~stars.sky * 1.0, *np.full((2, len(stars.sky)), centre)], axis=1)
+        return np.stack([~stars.sky * 1.0, stars.off_node, stars.off_node], axis=1)
 
     def _fitted(self, stars: Asked, pairs: Pairs, flux: np.ndarray, precision: np.ndarray) -> Fit:
         """Stars over their guessed flux in nodes: likelihood, and a with its prior."""
@@ -646,8 +658,8 @@ class FieldLaw:
         width, star, a = self._width(stars), pairs.star, fit.factor[:, None]
         # Pixels of stars of about the same noise are equally sure.
         step = np.rint(np.log(s) / VARIANCE_STEP)
-        kinds = 2 * step[:, 0] + stars.sky
-        _, one_of, kind = np.unique(kinds, return_index=True, return_inverse=True)
+        kinds = np.column_stack([step, width])
+        _, one_of, kind = np.unique(kinds, axis=0, return_index=True, return_inverse=True)
         usual = np.exp(VARIANCE_STEP * step[one_of]), width[one_of]
         width, free = width[star], ~stars.sky[star]
         latent = width * (fit.pull[:, 0] - a * fit.pull[:, 1])

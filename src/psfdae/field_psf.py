@@ -18,7 +18,7 @@ better.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from math import isqrt
 from typing import NamedTuple
@@ -26,7 +26,8 @@ from typing import NamedTuple
 import numpy as np
 
 from psfdae.bright_stars import BrightStars
-from psfdae.moments import windowed_centres
+from psfdae.moments import cubic_splines, windowed_centres
+from psfdae.progress import Advance, task
 
 FIT_ROUNDS = 3  # of splines, centres and fluxes; with more, centres follow what splines cannot
 CENTRE_STEPS, LEFT_OUT_STEPS = 2, 5  # of Gauss-Newton in a round, and for a star that was left out
@@ -114,7 +115,7 @@ class FieldModel:
         splines = np.tensordot(terms, self.coefficients, 1)
         axis = np.arange(side) - side // 2
         down, across = (
-            _splines_at(axis - at[:, None], splines.shape[-1], self.spacing)
+            cubic_splines(axis - at[:, None], splines.shape[-1], self.spacing)
             for at in (rows, columns)
         )
         half = np.tensordot(splines, across, ((2,), (2,)))  # (n, knots, c, m)
@@ -180,29 +181,56 @@ def fit_field(
     """
     alternating = _Alternating(stars, background, frame_px, stamp_px, spacing, smoothness)
     tried = _supported(orders, stars)
-    if len(orders) == 1 or len(stars) < 3:
-        return alternating.with_errors(alternating.fit(tried[0]), rng)
+    # Fits: all orders, with magnitude and colour, all smoothnesses, the last one and four more.
+    with task("field", len(tried) + 2 + SMOOTHER + 5) as alternating.advance:
+        return _best_fit(alternating, tried, len(orders) == 1 or len(stars) < 3, rng)
+
+
+def _best_fit(
+    alternating: _Alternating,
+    orders: Sequence[int],
+    is_settled: bool,
+    rng: np.random.Generator | None,
+) -> FieldFit:
+    """The fit whose order, terms and smoothness predict stars best that are left out.
+
+    Parameters
+    ----------
+    alternating : _Alternating
+    orders : sequence of int
+        Ascending.
+    is_settled : bool
+        Nothing is tried: the fit is that of the first order.
+    rng : Generator, optional
+    """
+    if is_settled:
+        return alternating.with_errors(alternating.fit(orders[0]), rng)
     alternating.tolerance = TRIED_TOLERANCE
     # Splines first, with a polynomial that follows most of the field: with those that follow noise,
     # no higher order would seem to pay.
-    alternating.choose_splines(max((o for o in tried if o <= CURVED), default=tried[0]))
+    alternating.choose_splines(max((o for o in orders if o <= CURVED), default=orders[0]))
     best, least = 0, np.inf
-    for order in tried:
+    for order in orders:
         error = alternating.crossed_error(alternating.fit(order))
         # A curved field is the rule. Higher orders must pay clearly: noise makes some seem better.
         if error < (1.0 if order <= CURVED else 0.99) * least:
             best, least = order, error
         elif order >= CURVED:
             break
-    low, high = alternating.low, alternating.high
-    for coordinate, most in enumerate(alternating.most):
-        if most > high[coordinate]:
-            high[coordinate] = most
-            error = alternating.crossed_error(alternating.fit(best))
-            if error < (1.0 - STAR_GAIN) * least:
-                least = error
-            else:
-                high[coordinate] = low[coordinate]
+    low, high, most = alternating.low, alternating.high, alternating.most
+    # Magnitude and colour, the one that saves more first: the other may only go along with it.
+    untried = [coordinate for coordinate in range(len(most)) if most[coordinate] > high[coordinate]]
+    while untried:
+        errors = {}
+        for coordinate in untried:
+            high[coordinate] = most[coordinate]
+            errors[coordinate] = alternating.crossed_error(alternating.fit(best))
+            high[coordinate] = low[coordinate]
+        chosen = min(untried, key=errors.__getitem__)
+        if errors[chosen] >= (1.0 - STAR_GAIN) * least:
+            break
+        high[chosen], least = most[chosen], errors[chosen]
+        untried.remove(chosen)
     alternating.tolerance = TOLERANCE
     return alternating.with_errors(alternating.fit(best), rng)
 
@@ -281,6 +309,7 @@ class _Alternating:
         self.knots, self.spacing = knots, spacing_of(len(self.axis), knots)
         bend = np.diff(np.eye(knots), 2, axis=0)
         self.bend = bend.T @ bend
+        self.advance: Advance = lambda fits: None
 
     def choose_splines(self, order: int) -> None:
         """Take knots farther apart, and then smoother splines, as long as each step pays."""
@@ -340,6 +369,7 @@ class _Alternating:
             if turn:
                 good = chi2 < UNLIKE_CHI2 * np.median(chi2)
         assert found is not None
+        self.advance(1)
         model = FieldModel(found, low, high, self.spacing)
         return FieldFit(model, flux, centre, good, residual)
 
@@ -416,8 +446,8 @@ class _Alternating:
             # W x with W = (Dᵀ w D)⁻¹ Dᵀ w. Its error has the noise of the pixels, and that of the
             # median around the star which was subtracted from them.
             design = _design(splines, centre, self.axis[inner], self.spacing, sky=True)
-            turned = (design * weight[box][judged].reshape(len(judged), -1, 1)).transpose(0, 2, 1)
-            influence = np.linalg.solve(turned @ design, turned)[:, 3]
+            turned = design * weight[box][judged].reshape(len(judged), 1, -1)
+            influence = np.linalg.solve(turned @ design.transpose(0, 2, 1), turned)[:, 3]
             level = (influence * images.reshape(len(judged), -1)).sum(axis=1)
             variance = (influence**2 * noise[box][judged].reshape(len(judged), -1)).sum(axis=1)
             variance += np.pi / 2 * (self.noise / fit.flux)[judged] ** 2 / self.around_px
@@ -488,10 +518,10 @@ class _Alternating:
         terms, data, weight, centre = terms[used], data[used], weight[used], centre[used]
         shape = (terms.shape[1], self.knots, self.knots)
         rows, columns = (
-            _splines_at(self.axis[None] - centre[:, i, None], self.knots, self.spacing)
+            cubic_splines(self.axis[None] - centre[:, i, None], self.knots, self.spacing)
             for i in (0, 1)
         )
-        rows_t, columns_t = rows.transpose(0, 2, 1), columns.transpose(0, 2, 1)
+        columns_t = columns.transpose(0, 2, 1)
         penalty = np.full(shape[0], HIGHER_SMOOTHNESS * self.smoothness)
         penalty[0] = self.smoothness
         penalty = penalty[:, None, None]
@@ -504,9 +534,15 @@ class _Alternating:
         elif start is not None:
             ridge[1:] = 1.0 / (CHANGE * np.abs(start[0]) + LEAST_CHANGE) ** 2
 
+        # The gradients stop at a part of 1e-4: single precision is enough for their products.
+        single = (terms, data, weight, rows, columns)
+        terms, data, weight, rows, columns = (a.astype(np.float32) for a in single)
+        rows_t, columns_t = (np.ascontiguousarray(a.transpose(0, 2, 1)) for a in (rows, columns))
+
         def normal(flat: np.ndarray) -> np.ndarray:
             c = flat.reshape(shape)
-            image = rows @ (terms @ c.reshape(shape[0], -1)).reshape(-1, *shape[1:]) @ columns_t
+            splines = (terms @ c.reshape(shape[0], -1).astype(np.float32)).reshape(-1, *shape[1:])
+            image = rows @ splines @ columns_t
             back = (rows_t @ (weight * image) @ columns).reshape(len(terms), -1)
             smooth = penalty * (self.bend @ c + c @ self.bend) + ridge * c
             return np.asarray(((terms.T @ back).reshape(shape) + smooth).ravel())
@@ -581,26 +617,12 @@ def _terms(position: np.ndarray, low: np.ndarray, high: np.ndarray, order: int) 
     return np.stack(terms, axis=1)
 
 
-def _splines_at(place: np.ndarray, knots: int, spacing: float) -> np.ndarray:
-    """Cubic B-splines about `knots` equidistant places around 0 at `place` (…), (…, knots)."""
-    middle = (np.arange(knots) - (knots - 1) / 2) * spacing
-    t = np.abs(place[..., None] - middle) / spacing
-    near, far = np.maximum(1 - t, 0.0), np.maximum(2 - t, 0.0)
-    return np.asarray((far * far * far - 4 * near * near * near) / 6)
-
-
 def _drawn(splines: np.ndarray, axis: np.ndarray, centre: np.ndarray, spacing: float) -> np.ndarray:
     """Images (n, m, m) on an axis (m,) of coefficients (n, N, N), moved to centres (n, 2)."""
     rows, columns = (
-        _splines_at(axis[None] - centre[:, i, None], splines.shape[-1], spacing) for i in (0, 1)
+        cubic_splines(axis[None] - centre[:, i, None], splines.shape[-1], spacing) for i in (0, 1)
     )
     return np.asarray(rows @ splines @ columns.transpose(0, 2, 1))
-
-
-def slopes(draw: Callable[[np.ndarray], np.ndarray], centre: np.ndarray) -> list[np.ndarray]:
-    """Change of drawn images with the row and the column of their centre (n, 2), per pixel."""
-    steps = SLOPE_PX * np.eye(2)
-    return [(draw(centre + e) - draw(centre - e)) / (2 * SLOPE_PX) for e in steps]
 
 
 def _adjusted(
@@ -618,8 +640,8 @@ def _adjusted(
     count, flat = len(data), data.reshape(len(data), -1, 1)
     for _ in range(steps):
         design = _design(splines, centre, axis, spacing, sky)
-        left = (design * weight.reshape(count, -1, 1)).transpose(0, 2, 1)
-        found = np.linalg.solve(left @ design, left @ flat)[..., 0]
+        left = design * weight.reshape(count, 1, -1)
+        found = np.linalg.solve(left @ design.transpose(0, 2, 1), left @ flat)[..., 0]
         flux = found[:, 0]
         move = np.clip(found[:, 1:3] / flux[:, None], -LARGEST_STEP_PX, LARGEST_STEP_PX)
         centre = np.clip(centre + move, -FARTHEST_PX, FARTHEST_PX)
@@ -631,14 +653,17 @@ def _adjusted(
 def _design(
     splines: np.ndarray, centre: np.ndarray, axis: np.ndarray, spacing: float, sky: bool
 ) -> np.ndarray:
-    """Change of images (n, P, 3 or 4) with flux, row, column of the centre and, if asked, sky."""
-
-    def draw(place: np.ndarray) -> np.ndarray:
-        return _drawn(splines, axis, place, spacing)
-
-    parts = [draw(centre), *slopes(draw, centre)]
-    parts += [np.ones_like(parts[0])] * sky
-    return np.stack(parts, axis=-1).reshape(len(centre), -1, len(parts))
+    """Change of images (n, 3 or 4, P) with flux, row, column of the centre and, if asked, sky."""
+    # An image is R c Cᵀ, with the B-splines R of its rows and C of its columns; their slopes R' and
+    # C' give its changes −R' c Cᵀ and −R c C'ᵀ as the centre moves.
+    place, knots = axis - centre[..., None], splines.shape[-1]
+    rows, columns = cubic_splines(place, knots, spacing).swapaxes(0, 1)
+    down, across = cubic_splines(place, knots, spacing, slope=True).swapaxes(0, 1)
+    along = splines @ columns.transpose(0, 2, 1)
+    moved = rows @ splines @ across.transpose(0, 2, 1)
+    parts = [rows @ along, -down @ along, -moved]
+    parts += [np.ones_like(moved)] * sky
+    return np.stack(parts, axis=1).reshape(len(centre), len(parts), -1)
 
 
 def excess_scatter(values: np.ndarray, sigma: np.ndarray) -> float:

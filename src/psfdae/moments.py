@@ -33,14 +33,50 @@ def robust_scatter(values: np.ndarray) -> np.ndarray:
     return np.asarray(SIGMA_OF_MAD * np.median(np.abs(values - middle), axis=0))
 
 
-def moved(wide: np.ndarray, shift: np.ndarray) -> np.ndarray:
-    """Stamps (n, s, s) moved by (row, column) pixels, the edges repeated."""
+def moved(wide: np.ndarray, shift: np.ndarray, stamp: np.ndarray | None = None) -> np.ndarray:
+    """Stamps (n, s, s) moved by (row, column) pixels (n, 2), the edges repeated.
+
+    If `stamp` (m,) chooses some, once or several times, these by shifts (m, 2).
+    """
     from scipy import ndimage
 
-    out = np.empty(wide.shape)
-    for image, step, target in zip(wide, shift, out, strict=True):
-        ndimage.shift(image, step, target, order=SPLINE_ORDER, mode="nearest")
+    side, around = wide.shape[-1], 12  # pixels around a stamp, beyond which no edge counts
+    some, stamp = np.unique(np.arange(len(wide)) if stamp is None else stamp, return_inverse=True)
+    # Coefficients of the splines through the pixels of each stamp.
+    splines = np.pad(wide[some], ((0, 0), (around, around), (around, around)), mode="edge")
+    for axis in (1, 2):
+        splines = ndimage.spline_filter1d(splines, SPLINE_ORDER, axis, mode="nearest")
+    # The pixels of a moved stamp lie at −shift among the knots; R c Cᵀ are their values.
+    out, knots = np.empty((len(stamp), side, side)), side + 2 * around
+    pixels, farthest = np.arange(side) - (side - 1) / 2, (knots - 3) / 2
+    for part in (slice(start, start + 256) for start in range(0, len(stamp), 256)):
+        place = np.clip(pixels - shift[part, :, None], -farthest, farthest)
+        rows, columns = cubic_splines(place, knots, 1.0).swapaxes(0, 1)
+        out[part] = rows @ splines[stamp[part]] @ columns.transpose(0, 2, 1)
     return out
+
+
+def cubic_splines(place: np.ndarray, knots: int, spacing: float, slope: bool = False) -> np.ndarray:
+    """Cubic B-splines about `knots` equidistant places around 0 at `place` (…), (…, knots).
+
+    If asked for, their slopes per pixel.
+    """
+    # At a part t of the way from one knot to the next, only the two knots on each side count.
+    u = place / spacing + (knots - 1) / 2
+    first = np.floor(u)
+    t = u - first
+    if slope:
+        near = (-0.5 * (1 - t) ** 2, t * (1.5 * t - 2), (1 - t) * (1.5 * t + 0.5), 0.5 * t**2)
+        values = np.stack(near, axis=-1) / spacing
+    else:
+        last = 1 - t
+        near = (last**3, 4 - 3 * t**2 * (1 + last), 4 - 3 * last**2 * (1 + t), t**3)
+        values = np.stack(near, axis=-1) / 6
+    # Four knots more on each side take what is beyond the others.
+    out = np.zeros((*place.shape, knots + 8))
+    before = np.clip(np.nan_to_num(first), -3, knots + 1).astype(np.intp)
+    np.put_along_axis(out, before[..., None] + np.arange(3, 7), values, axis=-1)
+    return out[..., 4:-4]
 
 
 def moving_matrices(side: int, steps: np.ndarray) -> np.ndarray:

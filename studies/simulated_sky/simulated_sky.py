@@ -15,7 +15,6 @@ import pandas as pd
 from scipy.stats import sem
 
 from psfdae.cli import program
-from psfdae.field_psf import slopes
 from psfdae.files import atomic_path
 from psfdae.image.observation import central_pixel
 from psfdae.options import File
@@ -264,7 +263,9 @@ def _fitted(draw, stamps):
     first = [solved(np.tile(start, (len(stamps), 1)))[1] for start in starts]
     centre, least, part = starts[np.argmin(first, axis=0)], np.min(first, axis=0), 1.0
     for _ in range(ROUNDS):
-        found, _ = solved(centre, *slopes(draw, centre))
+        # Changes with the row and the column of the centre, from differences.
+        slopes = [(draw(centre + e) - draw(centre - e)) / 0.04 for e in 0.02 * np.eye(2)]
+        found, _ = solved(centre, *slopes)
         move = np.clip(found[:, 2:] / found[:, :1], -STEP, STEP) * part
         chi2 = solved(centre + move)[1]
         better = chi2 < least

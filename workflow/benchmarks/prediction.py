@@ -327,9 +327,10 @@ def strange(
             flux = noise.flux(level)
             stamps = rng.poisson(flux * changed + noise.background).astype(np.float32)
             found = model.predict(stamps, gain=1.0)
-            for measure in ("distance", "strangeness"):
-                values = getattr(found, measure)
-                values = values[np.isfinite(values)]
+            # Tables of the record name the outlier score so.
+            scores = {"distance": found.distance, "strangeness": found.outlier_score}
+            for measure, score in scores.items():
+                values = score[np.isfinite(score)]
                 limits.setdefault(measure, np.quantile(values, 1.0 - FALSE_ALARMS))
                 row = {"noise_level": level, "kind": kind, "measure": measure}
                 row |= {"stars": values.size, "false_alarms": FALSE_ALARMS}

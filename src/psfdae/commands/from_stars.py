@@ -27,6 +27,7 @@ from psfdae.files import (
 )
 from psfdae.image.errors import ObservationError
 from psfdae.image.observation import Source
+from psfdae.image.tables import write_table
 from psfdae.method import Method, facts_of
 from psfdae.methods import method
 from psfdae.model.bundle import SUFFIX
@@ -269,7 +270,7 @@ def _make(
     for part in stars.each:
         if part.observation.found is not None:
             write_list(part.observation, files.star_list(part.name))
-    write_columns(files.path / "selection.csv", stars.table.columns, digits=6)
+    write_table(files.path / "selection.csv", stars.table)
     write_product(files.stars, "stars", stars.columns, stars.described())
     write_text(files.path / "overrides.txt", _overrides(stars.settings))
     taking = worth_trying(stars, tried)

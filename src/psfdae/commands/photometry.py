@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,23 +13,22 @@ import numpy as np
 from psfdae.cli import command
 from psfdae.commands.predict import Stated, check_targets
 from psfdae.errors import Error
-from psfdae.files import atomic_path, check_outputs, write_fits
+from psfdae.files import check_outputs, write_fits
 from psfdae.image.catalogue import as_catalogue
 from psfdae.image.errors import ascii_line
 from psfdae.image.observation import list_offset
 from psfdae.image.stamps import StarFlag, raise_flag
+from psfdae.image.tables import SUFFIXES, star_table, write_table
 from psfdae.model.exchange import load_field
 from psfdae.options import File
 
 if TYPE_CHECKING:
-    from astropy.table import Table
+    from astropy.table import QTable, Table
 
     from psfdae.image.observation import Observation
     from psfdae.model.crowded import CrowdedPhotometry
 
-FORMATS = {".fits": "fits", ".ecsv": "ascii.ecsv", ".csv": "ascii.csv"}
 MATCHED_FWHM, FEWEST = 0.5, 3  # distance of a reference star; those that a zero point takes
-MAGNITUDE = 2.5 / math.log(10.0)  # of a relative error
 
 
 class PhotometryError(Error, ValueError):
@@ -56,9 +54,8 @@ def photometry(
     --catalogue are measured where it says, and no others. Fluxes have the light beyond the
     stamps of MODEL, which the bright stars show; these show the gain, too, if it is not known.
     """
-    form = FORMATS.get(out.suffix.lower())
-    if form is None:
-        raise PhotometryError(f"{out}: expected a name that ends in {', '.join(FORMATS)}")
+    if out.suffix.lower() not in SUFFIXES:
+        raise PhotometryError(f"{out}: expected a name that ends in {', '.join(SUFFIXES)}")
     if zero_point is not None and (reference is not None or not math.isfinite(zero_point)):
         raise PhotometryError("--zero-point takes a number, or --reference gives it")
     # Of stars that are found, the origin is known; then it is that of the reference.
@@ -95,11 +92,9 @@ def photometry(
     if magnitudes is not None:
         zero_point, said = _zero_point(found, *magnitudes, reference)
         print(said)
-    _complete(found, observation, zero_point)
-    found.stars.meta |= _said(found, image, zero_point)
-    with atomic_path(out) as temporary, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of units that are not of the FITS standard
-        found.stars.write(temporary, format=form, overwrite=True)
+    table = photometry_table(found, observation, zero_point)
+    table.meta |= _said(found, image, zero_point)
+    write_table(out, table)
     if residual is not None:
         from astropy.io import fits
 
@@ -182,25 +177,32 @@ def _zero_point(
     return value, f"zero point {value:.4f} ± {error:.4f} mag ({len(zero)} stars of {reference})"
 
 
-def _complete(found: CrowdedPhotometry, observation: Observation, zero_point: float | None) -> None:
-    """Columns that take a zero point, or a WCS; and units."""
-    from astropy.units import Unit
+def photometry_table(
+    found: CrowdedPhotometry, observation: Observation, zero_point: float | None = None
+) -> QTable:
+    """Return the stars with units, magnitudes, sky coordinates and the columns of their list.
 
-    stars = found.stars
+    Parameters
+    ----------
+    found : CrowdedPhotometry
+        With a row for every star of the observation if these are of a list.
+    observation : Observation
+        The image, which has the unit of the fluxes and, perhaps, a WCS.
+    zero_point : float, optional
+        Magnitude of a flux of 1; without it there are no magnitudes.
+    """
+    columns = {name: np.array(found.stars[name]) for name in found.stars.colnames}
+    columns["flags"] = columns["flags"].astype(np.int32)  # FITS has no unsigned integers
     with np.errstate(all="ignore"):
         if zero_point is not None:
-            flux = np.where(np.array(stars["flux"]) > 0, stars["flux"], np.nan)
-            stars["mag"] = zero_point - 2.5 * np.log10(flux)
-            stars["mag_error"] = MAGNITUDE * np.array(stars["flux_error"]) / flux
-        sky = observation.on_sky(np.array(stars["x"]), np.array(stars["y"]))
+            # m = ZP − 2.5 log₁₀ F, and σ_m = 2.5 / ln 10 · σ_F / F.
+            flux = np.where(columns["flux"] > 0, columns["flux"], np.nan)
+            columns["mag"] = zero_point - 2.5 * np.log10(flux)
+            columns["mag_error"] = 2.5 / math.log(10.0) * columns["flux_error"] / flux
+        sky = observation.on_sky(columns["x"], columns["y"])
     if sky is not None:
-        stars["ra"], stars["dec"] = sky
-    units = dict.fromkeys(("x", "y", "x_error", "y_error"), "pix")
-    units |= dict.fromkeys(("flux", "flux_error", "flux_model"), observation.unit or "adu")
-    units |= {"mag": "mag", "mag_error": "mag", "ra": "deg", "dec": "deg"}
-    for name in stars.colnames:
-        # Units that no standard has are kept as they are.
-        stars[name].unit = Unit(units[name], parse_strict="silent") if name in units else None
+        columns["ra"], columns["dec"] = sky
+    return star_table(columns, observation.unit, observation.list_columns)
 
 
 def _said(found: CrowdedPhotometry, image: Path, zero_point: float | None) -> dict[str, Any]:
@@ -216,8 +218,6 @@ def _said(found: CrowdedPhotometry, image: Path, zero_point: float | None) -> di
 
 
 def _summary(found: CrowdedPhotometry, out: Path, detected: bool) -> str:
-    from psfdae.model.crowded import LARGEST_GROUP
-
     count, measured = len(found.stars), int(np.isfinite(found.stars["flux"]).sum())
     beyond = "no star is bright enough to show light beyond the model's stamp"
     if found.wings is not None:
@@ -227,8 +227,6 @@ def _summary(found: CrowdedPhotometry, out: Path, detected: bool) -> str:
             f"{100 * part:.2f} ± {100 * error:.2f} % of it"
         )
     said = f"{out}: {count} stars, {measured} measured"
-    if parted := int(np.sum(found.stars["parted"])):
-        said += f", {parted} of them in groups of over {LARGEST_GROUP}, which were parted"
     if detected:
         # Selection by brightness: Eddington (1913, MNRAS 73, 359).
         beyond += (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import sys
-from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated
@@ -25,6 +25,7 @@ from psfdae.model.field_psfs import PredictionError
 from psfdae.model.prediction import Prediction, prediction_file
 from psfdae.model.psf_model import MARGIN_PX, PsfModel, load_model
 from psfdae.options import File, NameOrNumber
+from psfdae.progress import silence
 
 
 @dataclass(frozen=True)
@@ -205,24 +206,20 @@ def restored(
         )
     if plot is not None and observation.positions is None:
         raise PredictionError(f"{source.path}: a map needs a catalogue with pixel positions")
-    hidden = quiet or not sys.stderr.isatty()
-    with click.progressbar(
-        length=observation.count, label="predict", show_pos=True, hidden=hidden, file=sys.stderr
-    ) as bar:
-        try:
-            # Its name is the last one to be there: it says that all is done.
-            with atomic_path(out) as unfinished:
-                done = (loaded, source, observation, unfinished, threads, bar.update)
-                counts, clean, off = write_prediction(*done, fixed_positions)
-                if found is not None:
-                    write_list(observation, found)
-                if plot is not None:
-                    from psfdae.model.plot import map_of_file
+    try:
+        # Its name is the last one to be there: it says that all is done.
+        with atomic_path(out) as unfinished, silence() if quiet else nullcontext():
+            work = (loaded, source, observation, unfinished, threads)
+            counts, clean, off = write_prediction(*work, fixed_positions)
+            if found is not None:
+                write_list(observation, found)
+            if plot is not None:
+                from psfdae.model.plot import map_of_file
 
-                    write_png(map_of_file(unfinished), plot)
-        except OSError as error:
-            said = error.strerror or error
-            raise PredictionError(f"{out}: cannot be written ({said})") from error
+                write_png(map_of_file(unfinished), plot)
+    except OSError as error:
+        said = error.strerror or error
+        raise PredictionError(f"{out}: cannot be written ({said})") from error
     flagged = zip(StarFlag, counts, strict=True)
     flags = "".join(f"\n  {flag.name}: {count}" for flag, count in flagged if count)
     clean_of = f"{out}: {observation.count} stars, {clean} without a flag{flags}"
@@ -257,7 +254,6 @@ def write_prediction(
     observation: Observation,
     out: Path,
     threads: int | None,
-    tick: Callable[[int], object] = lambda done: None,
     fixed: bool = False,
 ) -> tuple[np.ndarray, int, str | None]:
     """Write the file; number of stars with each flag, of those without any, and how good a list is.
@@ -269,15 +265,14 @@ def write_prediction(
     counts = np.zeros(len(StarFlag), dtype=int)
     done, clean, off = 0, 0, []
     history = " ".join(["psfdae", *sys.argv[1:]])  # without the folder of the program
-    header = (first[0], observation.count, _cards(source, observation), history)
+    header = (first[1], observation.count, _cards(source, observation), history)
     with prediction_file(out, model.bundle, *header) as file:
         for stamps, result in itertools.chain([first], pairs):
-            file.write(done, stamps, result)
+            file.write(done, result)
             counts += [(result.flags & int(flag) > 0).sum() for flag in StarFlag]
             clean += int((result.flags == 0).sum())
             off.append(_off(stamps, result))
             done += len(result)
-            tick(len(result))
         said = list_offset(observation.catalogue, np.concatenate(off), source.accept_offset)
     return counts, clean, said if observation.shape else None
 

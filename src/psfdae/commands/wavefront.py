@@ -15,7 +15,7 @@ from psfdae.files import check_outputs, write_fits
 from psfdae.image.catalogue import as_catalogue
 from psfdae.image.errors import ascii_line
 from psfdae.image.observation import Observation, central_pixel, list_offset
-from psfdae.model.prediction import as_ascii
+from psfdae.image.tables import fits_values
 from psfdae.model.psf_model import SCALE_TOLERANCE
 from psfdae.options import File
 from psfdae.sensing.joint import Joint
@@ -174,7 +174,7 @@ def as_fits(found: Wavefronts, image: str) -> HDUList:
         primary.header.append(card)
     rows = found.table
     if rows["id"].dtype.kind == "U":
-        rows["id"] = as_ascii(np.asarray(rows["id"]))
+        rows["id"] = fits_values(rows["id"])
     table = fits.table_to_hdu(rows)
     table.name = "WAVEFRONT"
     table.header["COMMENT"] = "Coefficients and their errors are in waves; a row per star and mode."

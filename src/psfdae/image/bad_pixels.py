@@ -84,11 +84,12 @@ def find_bad_pixels(
             "clipped there, or has hardly any photons, and neither it nor its noise can be "
             "measured; take the image from before it was clipped, or write negative values, too"
         )
-    dead = dead_pixels(image, mask)
+    noise = pixel_noise(image, mask)
+    dead = dead_pixels(image, mask, noise)
     if dead.any():
         mask |= dead
         notes.append(f"{np.count_nonzero(dead)} dead pixels")
-    cosmic = cosmic_rays(image, mask, saturate)
+    cosmic = cosmic_rays(image, mask, noise, saturate)
     if cosmic.any():
         notes.append(f"{np.count_nonzero(cosmic)} pixels of cosmic rays and hot pixels")
     return BadPixels(mask | cosmic, cosmic, tuple(notes))
@@ -250,10 +251,11 @@ def overscan(
 # Single pixels.
 
 
-def dead_pixels(image: np.ndarray, bad: np.ndarray) -> np.ndarray:
+def dead_pixels(image: np.ndarray, bad: np.ndarray, noise: np.ndarray) -> np.ndarray:
     """Find the pixels (h, w) that are 6 σ below the least of their eight neighbours.
 
-    Beside these, others would look like cosmic rays. `bad` pixels (h, w) do not count.
+    Beside these, others would look like cosmic rays. `bad` pixels (h, w) do not count; `noise`
+    (h, w) is that of pixels.
     """
     from scipy import ndimage
 
@@ -263,11 +265,10 @@ def dead_pixels(image: np.ndarray, bad: np.ndarray) -> np.ndarray:
     if min(image.shape) < 2 * BAND_EDGE:
         return found
     for rows, wide, inner in _bands(len(image)):
-        clean = interpolated(image[wide].astype(np.float64), bad[wide])[0]
-        noise = pixel_noise(clean, bad[wide])
+        clean = interpolated(image[wide], bad[wide])[0]
         depth = ndimage.minimum_filter(clean, footprint=around) - clean
-        row, column = np.nonzero((depth > COSMIC_SIGMA * noise) & ~bad[wide])
-        local = _noise_around(clean, noise, row, column)
+        row, column = np.nonzero((depth > COSMIC_SIGMA * noise[wide]) & ~bad[wide])
+        local = _noise_around(clean, noise[wide], row, column)
         deep = depth[row, column] > COSMIC_SIGMA * local
         band = np.zeros(clean.shape, dtype=bool)
         band[row[deep], column[deep]] = True
@@ -275,7 +276,9 @@ def dead_pixels(image: np.ndarray, bad: np.ndarray) -> np.ndarray:
     return found
 
 
-def cosmic_rays(image: np.ndarray, bad: np.ndarray, saturate: float | None = None) -> np.ndarray:
+def cosmic_rays(
+    image: np.ndarray, bad: np.ndarray, noise: np.ndarray, saturate: float | None = None
+) -> np.ndarray:
     """Find cosmic rays and hot pixels by their sharp edges (van Dokkum 2001, PASP 113, 1420).
 
     A pixel counts if its Laplacian L⁺ is `COSMIC_SIGMA` times the noise, and larger than the fine
@@ -289,6 +292,8 @@ def cosmic_rays(image: np.ndarray, bad: np.ndarray, saturate: float | None = Non
     image : ndarray, shape (h, w)
     bad : ndarray of bool, shape (h, w)
         Pixels that do not count.
+    noise : ndarray, shape (h, w)
+        Of the pixels (`pixel_noise`).
     saturate : float, optional
         Around areas of four or more pixels above it, edges are those of saturated stars.
 
@@ -299,23 +304,23 @@ def cosmic_rays(image: np.ndarray, bad: np.ndarray, saturate: float | None = Non
     found = np.zeros(image.shape, dtype=bool)
     if min(image.shape) < 2 * BAND_EDGE:
         return found
-    sharpness = sharpness_of_sources(image, bad, saturate)
+    sharpness = sharpness_of_sources(image, bad, noise, saturate)
     if sharpness > 10.0:  # one pixel has nearly all light of a star
         return found
     ratio = max(COSMIC_RATIO, 4.0 * sharpness)
     for rows, wide, inner in _bands(len(image)):
-        found[rows] = _cosmic_rays_of_band(image[wide], bad[wide], saturate, ratio)[inner]
+        band = _cosmic_rays_of_band(image[wide], bad[wide], noise[wide], saturate, ratio)
+        found[rows] = band[inner]
     return np.asarray(found & ~bad)
 
 
 def _cosmic_rays_of_band(
-    band: np.ndarray, bad: np.ndarray, saturate: float | None, ratio: float
+    band: np.ndarray, bad: np.ndarray, noise: np.ndarray, saturate: float | None, ratio: float
 ) -> np.ndarray:
     """Find the cosmic rays of some rows (r, w) that are sharper than stars by a ratio."""
     from scipy import ndimage
 
-    clean = interpolated(band.astype(np.float64), bad)[0]
-    noise = pixel_noise(clean, bad)
+    clean = interpolated(band, bad)[0]
     forbidden = ndimage.binary_dilation(bad)
     if saturate is not None:
         forbidden |= _saturated_stars(band, saturate)
@@ -384,16 +389,19 @@ def pixel_noise(image: np.ndarray, bad: np.ndarray) -> np.ndarray:
     It is infinite where neighbours do not differ: there is no noise with which to compare.
     """
     difference = np.abs(np.diff(image, axis=1, append=image[:, -2:-1]))
-    hidden = bad | np.roll(bad, -1, axis=1)
+    hidden = bad | np.concatenate([bad[:, 1:], bad[:, -2:-1]], axis=1)
     difference[hidden] = np.nan
     height, width = image.shape
-    noise = np.full(image.shape, np.inf)
+    noise = np.full(image.shape, np.inf, difference.dtype)
     for top in range(0, height, 64):
         for left in range(0, width, 64):
             square = np.s_[top : top + 64, left : left + 64]
-            known = difference[square][~np.isnan(difference[square])]
-            # σ of one pixel from the median of |x₁ − x₂|, which has √2 σ.
-            sigma = 1.4826 / np.sqrt(2.0) * float(np.median(known)) if known.size else 0.0
+            values, known = difference[square].ravel(), np.count_nonzero(~hidden[square])
+            if not known:
+                continue
+            # σ of one pixel from the median of |x₁ − x₂|, which has √2 σ; NaN comes last.
+            middle = [(known - 1) // 2, known // 2]
+            sigma = 1.4826 / np.sqrt(2.0) * float(np.partition(values, middle)[middle].mean())
             noise[square] = sigma if sigma > 0 else np.inf
     return noise
 
@@ -425,7 +433,7 @@ def _saturated_stars(image: np.ndarray, saturate: float) -> np.ndarray:
 
 
 def sharpness_of_sources(
-    image: np.ndarray, bad: np.ndarray, saturate: float | None = None
+    image: np.ndarray, bad: np.ndarray, noise: np.ndarray, saturate: float | None = None
 ) -> float:
     """Return the median of L⁺/F at the brightest pixels of the bright stars; 0 if there are none.
 
@@ -437,17 +445,17 @@ def sharpness_of_sources(
     full = np.inf if saturate is None else saturate
     ratios = []
     for rows, _, _ in _bands(len(image)):
-        hidden = bad[rows]
-        clean = interpolated(image[rows].astype(np.float64), hidden)[0]
-        noise, edge = pixel_noise(clean, hidden), edges(clean)
+        hidden, sigma = bad[rows], noise[rows]
+        clean = interpolated(image[rows], hidden)[0]
+        edge = edges(clean)
         # Local maxima, so bright that noise does not matter.
         above = clean - np.median(clean)
-        top = (clean == ndimage.maximum_filter(clean, 7)) & (above > 50.0 * noise)
+        top = (clean == ndimage.maximum_filter(clean, 7)) & (above > 50.0 * sigma)
         top &= (ndimage.maximum_filter(clean, 5) < full) & ~hidden
         row, column = np.nonzero(top)
         brightest = np.argsort(-above[row, column], kind="stable")[:1000]
         height, structure = _contrast(clean, edge, row[brightest], column[brightest])
-        ratio = height / np.maximum(structure, noise[row, column][brightest])
+        ratio = height / np.maximum(structure, sigma[row, column][brightest])
         ratios.append(ratio[ratio < 20.0])
     return float(np.median(np.concatenate(ratios))) if sum(map(len, ratios)) >= 5 else 0.0
 

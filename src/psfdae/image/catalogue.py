@@ -45,6 +45,7 @@ if TYPE_CHECKING:
 
 SEXTRACTOR_HEADER = re.compile(r"#\s*(\d+)\s+[A-Za-z_]\w*")
 SEXAGESIMAL = re.compile(r"[:hd\s]", re.IGNORECASE)
+WHOLE = re.compile(r"\d{1,9}")  # hours or degrees of a sexagesimal text
 
 MOST_STARS = 5_000_000  # rows of a catalogue
 MOST_COLUMNS = 2000
@@ -105,7 +106,8 @@ CONVENTIONS = [
     ),
     *_each(
         "ra,dec RAJ2000,DEJ2000 RAJ2000,DECJ2000 _RAJ2000,_DEJ2000 RA_ICRS,DE_ICRS "
-        "RA_ICRS,DEC_ICRS ra_deg,dec_deg raMean,decMean radeg,decdeg radeg,dedeg",
+        "RA_ICRS,DEC_ICRS RA_J2000,DEC_J2000 ra_deg,dec_deg raMean,decMean radeg,decdeg "
+        "radeg,dedeg",
         sky=True,
     ),
 ]
@@ -174,10 +176,18 @@ class _FitsTable:
     file: PlainFile
     index: int
     colnames: list[str]
+    formats: list[str]
     rows: int
 
     def __len__(self) -> int:
         return self.rows
+
+    @property
+    def names_of_values(self) -> list[str]:
+        """Names of the columns that hold one number, or one text such as 20A, for each star."""
+        array = re.compile(r"\d*[PQ]|0*([2-9]|1\d)\d*[^\dA]")
+        pairs = zip(self.colnames, self.formats, strict=True)
+        return [name for name, form in pairs if not array.match(form)]
 
     def __getitem__(self, name: str) -> Column:
         from astropy.table import Column, MaskedColumn
@@ -187,7 +197,7 @@ class _FitsTable:
             hdu, place = hdus[self.index], self.colnames.index(name)
             column = hdu.columns[place]
             # Arrays of variable length may all be the same bytes of the file: 3 MB unfold to 1 TB.
-            if re.match(r"\d*[PQ]", str(column.format)):
+            if re.match(r"\d*[PQ]", self.formats[place]):
                 raise ObservationError(self.file.name, f"column {name!r} holds arrays, not numbers")
             values = hdu.data.field(place)
             unit = column.unit and Unit(column.unit, format="fits", parse_strict="silent")
@@ -274,8 +284,8 @@ class Catalogue:
         """Right ascension and declination in degrees, each shape (n,).
 
         Columns without unit are in degrees; text with colons, blanks or letters is
-        sexagesimal, then right ascensions are in hours. Declinations off the sphere are NaN,
-        and an error if all are.
+        sexagesimal, then right ascensions are in hours unless one is beyond 24. Declinations
+        off the sphere are NaN, and an error if all are.
         """
         ra = self._angles(where.first, "hourangle")
         dec = self._angles(where.second, "deg")
@@ -290,17 +300,10 @@ class Catalogue:
 
     def identifiers(self) -> np.ndarray:
         """One identifier per star, int64 or str, shape (n,); row numbers from 0 without any."""
-        for alias in ID_COLUMNS:
-            try:
-                name = self._resolve(alias)
-            except ColumnError:
-                continue
-            column = None if name is None else self._column(name)
-            if column is not None and column.ndim == 1:
-                found = _as_identifiers(column)
-                break
-        else:
+        name = self._identifier()
+        if name is None:
             return np.arange(len(self), dtype=np.int64)
+        found = _as_identifiers(self._column(name))
         if found.dtype.kind == "U" and found.dtype.itemsize > 4 * LONGEST_IDENTIFIER:
             lengths = np.char.str_len(found)
             row = lengths.argmax()
@@ -310,6 +313,43 @@ class Catalogue:
                 f"an identifier may have {LONGEST_IDENTIFIER}",
             )
         return found
+
+    def _identifier(self) -> str | None:
+        """Name of the column that identifies the stars; None without one."""
+        for alias in ID_COLUMNS:
+            try:
+                name = self._resolve(alias)
+            except ColumnError:
+                continue
+            if name is not None and self._column(name).ndim == 1:
+                return name
+        return None
+
+    def columns(self, rows: np.ndarray) -> Table:
+        """Some rows of all columns of numbers and text but identifiers and pixel positions.
+
+        Columns of arrays, such as images of the stars, are left out, and so is what comes after
+        900 columns, as a FITS table has 999 at most.
+
+        Parameters
+        ----------
+        rows : ndarray of int, shape (m,)
+        """
+        from astropy.table import Table
+
+        further_columns, where = Table(), self.positions()
+        read = {self._identifier(), *(() if where.sky else (where.first, where.second))}
+        names = getattr(self.table, "names_of_values", self.table.colnames)
+        for name in [name for name in names[:900] if name not in read]:
+            column = self.table[name]
+            # Times, coordinates and arrays have no place in a table of numbers.
+            if not isinstance(column, np.ndarray) or column.ndim != 1:
+                continue
+            if column.dtype.kind == "O":
+                column = column.astype(str)
+            if column.dtype.kind in "biufUS":
+                further_columns[name] = column[rows]
+        return further_columns
 
     def _resolve(self, wanted: str) -> str | None:
         """The one column of that name, case aside if it is not written exactly so."""
@@ -360,6 +400,10 @@ class Catalogue:
             there = ~np.ma.getmaskarray(column)
             texts = [_text(value).strip() for value in values[there]]
             if any(SEXAGESIMAL.search(text) for text in texts):
+                # A right ascension of 150:00:12 cannot be in hours, nor can those beside it.
+                whole = [int(number[0]) for number in map(WHOLE.match, texts) if number]
+                if max(whole, default=0) > 24:
+                    sexagesimal_unit = "deg"
                 angles = np.full(len(values), np.nan)
                 with reading(self.path):
                     angles[there] = Angle(texts, unit=sexagesimal_unit).deg
@@ -510,7 +554,8 @@ def _fits_table(path: Path) -> _FitsTable:
         # A damaged table has columns without a name, or of the same one.
         names = [str(name or f"col{k}") for k, name in enumerate(objects[0].columns.names, 1)]
         _check_size(path, rows, len(names))
-        return _FitsTable(file, hdus.index(objects[0]), names, rows)
+        formats = [str(form) for form in objects[0].columns.formats]
+        return _FitsTable(file, hdus.index(objects[0]), names, formats, rows)
 
 
 def _check_size(path: Path, rows: int, columns: int) -> None:

@@ -83,7 +83,7 @@ def parts_of_array(values: Any) -> tuple[np.ndarray, np.ndarray | None, str]:
     mask = getattr(values, "mask", None)
     plain = getattr(values, "unmasked", values)  # of astropy's Masked
     array = np.asarray(plain if unit is None else plain.value)
-    return array, None if mask is None else np.asarray(mask, bool), _fits_unit(unit)
+    return array, None if mask is None else np.asarray(mask, bool), fits_unit(unit)
 
 
 def sigma_of(data: NDData) -> np.ndarray | None:
@@ -143,7 +143,7 @@ def _of_nddata(data: NDData) -> fits.HDUList:
                 header[str(key)] = value
             except ValueError:
                 continue
-    if unit := _fits_unit(data.unit):
+    if unit := fits_unit(data.unit):
         header["BUNIT"] = unit
     hdus = _hdus(np.asarray(data.data), header, data.mask, sigma_of(data))
     wcs = None if data.wcs is None else _fits_wcs(data.wcs)
@@ -162,7 +162,7 @@ def _fits_wcs(wcs: Any) -> WCS | None:
     return low_level if isinstance(low_level, WCS) else None
 
 
-def _fits_unit(unit: Any) -> str:
+def fits_unit(unit: Any) -> str:
     """Return a unit as FITS writes it; its own name if FITS knows none."""
     if unit is None:
         return ""

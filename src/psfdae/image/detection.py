@@ -1,6 +1,6 @@
 """Stars of an image without a list: its sky, what stands above it, and whether a list fits.
 
-photutils does it: the sky in meshes, sources as connected pixels above it (Bertin & Arnouts
+photutils does it: sources as connected pixels above it (Bertin & Arnouts
 1996, A&AS 117, 393), those that touch parted where a saddle is deep enough.
 """
 
@@ -8,16 +8,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
 from psfdae.image.bad_pixels import interpolated
+from psfdae.image.sky_level import sky_level
 from psfdae.image.source_size import measure_size
 from psfdae.moments import FWHM_OF_SIGMA
 
-MESH_PX = 64  # side of the squares in which the sky is measured
-MOST_BAD = 80.0  # per cent of a mesh's pixels; others are interpolated over it
 LEAST_PX = 5  # pixels of a source
 LEVELS, CONTRAST = 8, 0.005  # of the parting; 32 levels take three times as long for 1 % more stars
 SMOOTHING = np.outer([1, 2, 1], [1, 2, 1]) / 16.0
@@ -35,6 +33,7 @@ class Sky:
     noise: np.ndarray  # σ of every pixel
     bad: np.ndarray
     noise_scale: float  # of the map of σ, if there was one
+    notes: tuple[str, ...] = ()  # what is unusual in the sky
 
     @cached_property
     def holes(self) -> np.ndarray:
@@ -162,16 +161,14 @@ def sky_of(
     ValueError
         If no mesh has enough pixels that count.
     """
-    from photutils.background import Background2D
-
-    values: Any = np.where(bad, 0.0, image)
-    found = Background2D(values, MESH_PX, mask=bad, exclude_percentile=MOST_BAD)
-    level = found.background
+    values = np.where(bad, 0.0, image)
+    found = sky_level(values, bad)
+    level = found.level
     # Whole counts, or images without noise, may show none; the threshold must not be 0 there.
     least = max(least, 1e-13 * float(np.ptp(values)), float(np.finfo(np.float64).tiny))
-    noise = np.maximum(found.background_rms, least)
+    noise = np.maximum(found.noise, least)
     scale = np.nan
     if sigma is not None:
         scale = float(np.median(noise[~bad] / sigma[~bad]))
         noise = scale * sigma
-    return Sky(interpolated(image - level, bad)[0], level, noise, bad, scale)
+    return Sky(interpolated(image - level, bad)[0], level, noise, bad, scale, found.notes)

@@ -10,6 +10,7 @@ import numpy as np
 
 from psfdae.image.errors import ObservationError
 from psfdae.image.fits_file import ImageFile, Said, card_value, open_pixels
+from psfdae.image.sky_level import noise_correlation
 
 BLOCK = 32  # px, side of the squares in which sky and noise are measured
 
@@ -21,7 +22,8 @@ class SkySample:
     Attributes
     ----------
     level, noise : float
-        Median over the squares of their median and of their scatter, σ by the median deviation.
+        Median over the squares of their median and of their scatter, σ by the median deviation
+        and, where pixels share their noise, that of sums of pixels.
     highest : float
         Largest pixel of all squares.
     """
@@ -46,29 +48,59 @@ def sky_sample(image: ImageFile) -> SkySample | None:
     rows, columns = image.shape
     starts = np.unique(np.linspace(0, max(rows - BLOCK, 0), min(32, -(-rows // BLOCK))).astype(int))
     levels, noises, highest = [], [], -np.inf
+    deviations: list[np.ndarray] = []  # of bands of rows, four rows without values between them
     with open_pixels(image, whole=False, dtype=np.float64) as pixels:
         for start in starts:
             band = np.where(np.isfinite(band := pixels[start : start + BLOCK]), band, np.nan)
+            deviation = np.full((BLOCK + 4, columns), np.nan)
+            deviations.append(deviation)
             for left in range(0, columns, BLOCK):
                 square = band[:, left : left + BLOCK]
-                square = square[np.isfinite(square)]
-                if square.size < BLOCK:
+                known = square[np.isfinite(square)]
+                if known.size < BLOCK:
                     continue
-                highest = max(highest, float(square.max()))
-                level = float(np.median(square))
-                noise = 1.4826 * float(np.median(np.abs(square - level)))
+                highest = max(highest, float(known.max()))
+                level = float(np.median(known))
+                noise = 1.4826 * float(np.median(np.abs(known - level)))
                 if noise > 0:
+                    deviation[: len(band), left : left + BLOCK] = (square - level) / noise
                     levels.append(level)
                     noises.append(noise)
     if not levels:
         return None
-    return SkySample(float(np.median(levels)), float(np.median(noises)), highest)
+    correlation = noise_correlation(np.concatenate(deviations))
+    return SkySample(float(np.median(levels)), correlation * float(np.median(noises)), highest)
+
+
+def clipped_level(image: ImageFile, sky: SkySample) -> tuple[float, int] | None:
+    """Return the largest value of an image, and its pixels, if the image was cut off there.
+
+    Noise gives no five pixels far above the sky exactly the same value; those of saturated stars
+    lie together, and those of a value for bad pixels do not. A value that over a hundredth of the
+    image has is that of an area without data.
+    """
+    largest, count, pairs = -np.inf, 0, 0
+    with open_pixels(image, whole=False, dtype=np.float64) as pixels:
+        for start in range(0, image.shape[0], 8 * BLOCK):
+            band = pixels[start : start + 8 * BLOCK]
+            top = float(band.max(initial=-np.inf, where=np.isfinite(band)))
+            if top > largest:
+                largest, count, pairs = top, 0, 0
+            full = band == largest
+            count += int(np.count_nonzero(full))
+            pairs += int(np.count_nonzero(full[:, 1:] & full[:, :-1]))
+            pairs += int(np.count_nonzero(full[1:] & full[:-1]))
+    few = 5 <= count <= 0.01 * image.shape[0] * image.shape[1]
+    clipped = few and 2 * pairs >= count and largest > sky.level + 50.0 * sky.noise
+    return (largest, count) if clipped else None
 
 
 def checked_camera(
     image: ImageFile, camera: Mapping[str, Said], sky: SkySample | None
 ) -> CheckedCamera:
     """Leave out header values that the pixels contradict; those that are given stay, with a word.
+
+    Where the image was cut off at a level below that of its header, that is the saturation.
 
     Parameters
     ----------
@@ -97,6 +129,14 @@ def checked_camera(
             raise ObservationError(image.path, f"{problem}; --saturate takes that of a pixel")
         values["saturation"] = None, f"not known, {origin} is below the sky"
         remarks.append(f"{image.path}: {problem}: not used, --saturate states another one")
+    level, origin = values["saturation"]
+    clipped = None if origin == "given" else clipped_level(image, sky)
+    if clipped is not None and (level is None or clipped[0] < level):
+        values["saturation"] = clipped[0], "the largest value"
+        remarks.append(
+            f"{image.path}: {clipped[1]} pixels have exactly the largest value, {clipped[0]:g} "
+            f"{unit}: taken as saturated, --saturate states another level"
+        )
 
     # Sky photons alone scatter by √(sky/gain), and the electronics by read noise/gain.
     gain, gain_origin = values["gain"]
@@ -132,6 +172,27 @@ def checked_camera(
     if saturation is not None and origin != "given" and sky.highest <= 1.0 < saturation:
         values["saturation"] = None, f"not known, {origin} is of counts"
     return CheckedCamera(values, remarks)
+
+
+def sky_coordinate_remarks(image: ImageFile) -> list[str]:
+    """Return sentences on a WCS that is damaged, or that says two things of its distortion."""
+    if not image.headers:
+        return []
+    header = image.headers[0]
+    projection = str(card_value(header, "CTYPE1") or "")
+    if image.wcs is None and projection[:4].strip("-") in ("RA", "DEC", "GLON", "GLAT"):
+        return [
+            f"{image.path}: its WCS (CTYPE1 = {projection}) is damaged and not used: no sky "
+            "coordinates, and the pixel scale is that of other keys"
+        ]
+    distorted = image.wcs is not None and image.wcs.sip is not None
+    if distorted and not projection.endswith("-SIP"):
+        return [
+            f"{image.path}: CTYPE1 = {projection} has no -SIP, but there is a polynomial of "
+            "distortion (A_ORDER): it is used; remove its keys if the image was resampled without "
+            "distortion"
+        ]
+    return []
 
 
 def refuse_mosaic_of_colours(image: ImageFile) -> None:

@@ -17,6 +17,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -44,11 +45,18 @@ from psfdae.image.fits_file import (
     map_kind,
     open_pixels,
 )
-from psfdae.image.header_checks import checked_camera, refuse_mosaic_of_colours, sky_sample
+from psfdae.image.header_checks import (
+    checked_camera,
+    refuse_mosaic_of_colours,
+    sky_coordinate_remarks,
+    sky_sample,
+)
 from psfdae.image.list_origin import TOLERANCE_PX, origin_of
 from psfdae.image.stamps import Stamps, StarFlag, cut, raise_flag, sky_around
+from psfdae.image.trails import with_trails
 
 if TYPE_CHECKING:
+    from astropy.table import Table
     from astropy.units import Quantity
     from astropy.wcs import WCS
 
@@ -173,11 +181,13 @@ class Source:
             # The header's values are used as far as the pixels do not contradict them.
             refuse_mosaic_of_colours(image)
             camera, remarks = checked_camera(image, camera, sky_sample(image))
+            remarks += sky_coordinate_remarks(image)
         layers, beside = self._layers(image, is_cube, camera)
         remarks += beside
         listed = None if table is None else table.path
         if self.detect is not None or layers.noise is not None:
             sky = layers.sky()
+            remarks += [f"{self.path}: {note}" for note in sky.notes]
             if layers.noise is not None:
                 layers = replace(layers, noise_scale=sky.noise_scale)
                 layers, camera, remark = _with_photons(layers, camera, sky)
@@ -198,7 +208,8 @@ class Source:
                 raise_flag(flags, StarFlag.BLENDED, again)
                 remarks += _on_pairs(table, again)
         names = (self.flux_column, self.background_column, self.colour_column)
-        columns = [identifiers, *(self._column(table, name, count) for name in names), flags]
+        of_list = (self._column(table, name, count) for name in names)
+        columns = [identifiers, np.arange(count), *of_list, flags]
         if self.on_image and positions is not None and not is_cube:
             kept = _inside(positions, shape)
             columns, positions = [column[kept] for column in columns], positions[kept]
@@ -215,6 +226,7 @@ class Source:
             found=table if self.detect is not None else None,
             colour_column=self.colour_column,
             remarks=tuple(remarks),
+            _list=table if self.detect is None else None,
             _columns=columns,
             _layers=layers,
         )
@@ -308,7 +320,7 @@ class Source:
         # What is beyond any image is no position: its squares would not even be numbers.
         positions = np.where(np.abs(positions) < FAR, positions, np.nan)
         if not is_cube:
-            _check_overlap(image, table, positions)
+            _check_overlap(image, table, where, positions)
         return positions
 
     def _given(self) -> dict[str, float | None]:
@@ -448,7 +460,9 @@ def _refuse_colours(image: ImageFile) -> None:
         )
 
 
-def _check_overlap(image: ImageFile, table: Catalogue, positions: np.ndarray) -> None:
+def _check_overlap(
+    image: ImageFile, table: Catalogue, where: Positions, positions: np.ndarray
+) -> None:
     rows, columns = image.shape
     found = np.count_nonzero(_inside(positions, image.shape))
     if found > rows * columns:
@@ -468,7 +482,8 @@ def _check_overlap(image: ImageFile, table: Catalogue, positions: np.ndarray) ->
     raise ObservationError(
         table.path,
         f"none of the {len(table)} stars is on the image {image.path} of {columns} columns "
-        f"and {rows} rows; they are {ranges}",
+        f"and {rows} rows; they are {ranges}"
+        + (f" ({where.first},{where.second} without a unit are degrees)" if where.sky else ""),
     )
 
 
@@ -632,7 +647,7 @@ def _on_pairs(table: Catalogue, again: np.ndarray) -> list[str]:
     ]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Layers:
     """An image, what lies beside it, and how that is read."""
 
@@ -692,22 +707,7 @@ class Layers:
 
     def sky(self) -> Sky:
         """The image as a whole with its sky."""
-        image, masked, sigma = self._whole()
-        bad = self._found(image, masked).mask
-        with silent():
-            try:
-                sky = sky_of(image, bad, sigma, self.least_noise)
-            except ValueError:  # nothing to measure the sky on
-                problem = "too few pixels of the image have a value that is not masked"
-                if self.mask is not None and self.bad_bits is None:
-                    problem += "; --bad-bits says which bits are bad, --mask none takes no mask"
-                raise ObservationError(self.image.path, problem) from None
-        if sigma is None or not self.photons:
-            return sky
-        with self.open(whole=True) as (_, _, noise):
-            assert noise is not None
-            own = self.sigma(noise[:], sky.flat)
-        return replace(sky, noise=sky.noise_scale * own)
+        return _sky(self)
 
     @property
     def bad_pixels(self) -> BadPixels:
@@ -734,10 +734,32 @@ class Layers:
             with silent():
                 try:
                     found = find_bad_pixels(image, masked, self.image.headers, self.saturate)
+                    found = with_trails(image, found)
                 except ClippedSkyError as error:
                     raise ObservationError(self.image.path, str(error)) from None
             self._bad_pixels.append(found)
         return self._bad_pixels[0]
+
+
+@lru_cache(maxsize=1)
+def _sky(layers: Layers) -> Sky:
+    """The image of layers as a whole with its sky; that of the last ones is kept for more calls."""
+    image, masked, sigma = layers._whole()
+    bad = layers._found(image, masked).mask
+    with silent():
+        try:
+            sky = sky_of(image, bad, sigma, layers.least_noise)
+        except ValueError:  # nothing to measure the sky on
+            problem = "too few pixels of the image have a value that is not masked"
+            if layers.mask is not None and layers.bad_bits is None:
+                problem += "; --bad-bits says which bits are bad, --mask none takes no mask"
+            raise ObservationError(layers.image.path, problem) from None
+    if sigma is None or not layers.photons:
+        return sky
+    with layers.open(whole=True) as (_, _, noise):
+        assert noise is not None
+        own = layers.sigma(noise[:], sky.flat)
+    return replace(sky, noise=sky.noise_scale * own)
 
 
 @dataclass(frozen=True)
@@ -756,7 +778,9 @@ class Observation:
     found: Catalogue | None  # that made in its place
     colour_column: str | None  # of the star list
     remarks: tuple[str, ...]  # sentences on what was found in the file or the list, and used or not
-    _columns: list[np.ndarray] = field(repr=False)  # identifiers, flux, sky, colour and flags
+    _list: Catalogue | None = field(repr=False)  # all of it, also stars that are off the image
+    # Identifiers, rows of the list, flux, sky, colour and flags.
+    _columns: list[np.ndarray] = field(repr=False)
     _layers: Layers = field(repr=False)
     # Light of other stars in the stamps of a part of the list, of a side and with a margin in px.
     others: Callable[[slice, int, int], np.ndarray] | None = field(default=None, repr=False)
@@ -800,10 +824,13 @@ class Observation:
         return self._layers.sky()
 
     def on_sky(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-        """ICRS coordinates in degrees of 0-based pixels (n,); None without a celestial WCS."""
+        """ICRS coordinates in degrees of 0-based pixels (n,).
+
+        None without a celestial WCS, and of a cube of stamps.
+        """
         from astropy.wcs.utils import pixel_to_skycoord
 
-        if (wcs := self._layers.image.wcs) is None:
+        if self.shape is None or (wcs := self._layers.image.wcs) is None:
             return None
         with reading(self.path):
             place = pixel_to_skycoord(x, y, wcs).icrs
@@ -842,6 +869,11 @@ class Observation:
     def identifiers(self) -> np.ndarray:
         """Names of the stars, by the list if it says any, shape (n,)."""
         return self._columns[0]
+
+    @cached_property
+    def list_columns(self) -> Table | None:
+        """Further columns of the star list, with a row for each star; None without a list."""
+        return None if self._list is None else self._list.columns(self._columns[1])
 
     @property
     def list_flags(self) -> np.ndarray:
@@ -973,7 +1005,7 @@ class Observation:
         listed = np.full((len(data), 2), np.nan)
         if self.shape is not None:
             listed = np.stack([y - central_pixel(y), x - central_pixel(x)], axis=1)
-        ids, flux, background, colour, flags = (column[part].copy() for column in self._columns)
+        ids, _, flux, background, colour, flags = (column[part].copy() for column in self._columns)
         raise_flag(flags, StarFlag.TRUNCATED, truncated)
         if self.shape is not None:
             # A cosmic ray within a pixel of the position: it may be no star.

@@ -19,14 +19,11 @@ import numpy as np
 from psfdae.bright_stars import DEFECT, BrightStars
 from psfdae.errors import Error
 from psfdae.image.bad_pixels import interpolated_stamps
-from psfdae.image.errors import no_formula
 from psfdae.image.observation import Observation, central_pixel
 from psfdae.image.stamps import Stamps, StarFlag, cut, peaks, sky_around, softened
 from psfdae.moments import FWHM_OF_SIGMA, moved, robust_scatter, windowed_centres
 
 if TYPE_CHECKING:
-    from astropy.table import Table
-
     from psfdae.settings import CalibrationStars, Stamp
 
 ROWS = 2048  # stars that are measured at a time
@@ -56,6 +53,7 @@ class Verdict(StrEnum):
     OFF_CENTRE = "off centre"
     CROWDED = "crowded"
     SHARP = "sharp"  # far narrower than the other stars: a cosmic ray, a hot pixel
+    EXTENDED = "extended"  # far wider than the stars around it: a galaxy, a blend
     MISFIT = "misfit"  # unlike its neighbours: a blend, a galaxy, a cosmic ray
 
 
@@ -104,22 +102,19 @@ class Candidates:
         found = Counter(self.verdict.tolist())
         return ", ".join(f"{found[v]} {v}" for v in map(str, Verdict) if found[v])
 
-    def table(self, held_out: np.ndarray) -> Table:
-        """Every star of the catalogue, and which of the good ones are held out."""
-        from astropy.table import Table
-
+    def columns(self, held_out: np.ndarray) -> dict[str, np.ndarray]:
+        """Columns of every star of the list, and which of the good ones are held out, (n,) each."""
         part = np.full(len(self.verdict), "", dtype="<U8")
         part[self.bright.row] = np.where(held_out, "held out", "training")
-        return Table(
-            {
-                "id": self.id if self.id.dtype.kind == "i" else [no_formula(n) for n in self.id],
-                "x": self.position[:, 0],
-                "y": self.position[:, 1],
-                "snr": self.snr,
-                "verdict": self.verdict,
-                "part": part,
-            }
-        )
+        x, y = self.position.T
+        return {
+            "id": self.id,
+            "x": x,
+            "y": y,
+            "snr": self.snr,
+            "verdict": self.verdict,
+            "part": part,
+        }
 
 
 def collect(
@@ -127,10 +122,13 @@ def collect(
     settings: CalibrationStars,
     framing: Stamp,
     isolation_px: float | None = None,
+    by_core: bool = False,
 ) -> Candidates:
     """Measure all stars and choose those that are good enough to learn from.
 
-    No neighbour is nearer than `isolation_px`, by default that of the settings.
+    No neighbour is nearer than `isolation_px`, by default that of the settings. Its brightness is
+    that of its stamp, or `by_core` that of 3 × 3 px: of a faint star beside a bright one, a whole
+    stamp has the other's light.
 
     The observation has stamps with a margin (a cube: its own, larger ones), of which only
     those of bright stars are kept in memory. CalibrationStarsError says that there are
@@ -152,7 +150,8 @@ def collect(
     near = settings.isolation_px if isolation_px is None else isolation_px
     # A star that is listed twice is no neighbour of itself.
     apart = np.where(observation.listed_again()[:, None], np.nan, found["position"])
-    close = crowded(apart, snr * noise, near, settings.neighbour_ratio)
+    core = found.pop("core")
+    close = crowded(apart, core if by_core else snr * noise, near, settings.neighbour_ratio)
     verdict[close & (verdict == Verdict.GOOD)] = Verdict.CROWDED
     verdict[observation.without_position()] = Verdict.NO_POSITION
     wide, peak, listed, colour, bad = (np.concatenate([k[i] for k in kept]) for i in range(5))
@@ -176,6 +175,9 @@ def collect(
     bright, missing = completed(bright, side, settings.search_px, centring)
     verdict[bright.row[missing > MOST_MISSING]] = Verdict.INCOMPLETE
     bright = bright.of(missing <= MOST_MISSING)
+    large = wider_than_stars(bright.area(), bright.position)
+    verdict[bright.row[large]] = Verdict.EXTENDED
+    bright = bright.of(~large)
     row = bright.row
     score = misfit(cut(bright.aligned(), side), bright.position, bright.noise / bright.flux)
     verdict[row[score > settings.misfit]] = Verdict.MISFIT
@@ -235,6 +237,7 @@ def _measure(
         "sky": level,
         "brightest": level
         + np.where(centred, cut(wide, side).max((1, 2)) if centring else _at(wide, peak), -np.inf),
+        "core": cut(wide, 3).sum(axis=(1, 2)),
         "highest": cut(np.where(chunk.bad, -np.inf, chunk.data), side).max(axis=(1, 2)),
         "verdict": verdict,
     }
@@ -263,6 +266,48 @@ def sharper_than_stars(area: np.ndarray) -> np.ndarray:
     size = np.log(area)
     limit = max(np.log(2.0), 5.0 * float(robust_scatter(size)))
     return np.asarray(size < np.median(size) - limit)
+
+
+def wider_than_stars(area: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """Return which sources have a far larger noise-equivalent area than the stars around them.
+
+    Stars have nearly one size, other sources any: of the logarithms of all areas, each less the
+    lower quartile of those of its nearest sources, the stars are the shortest interval that has a
+    quarter of them. Sources above it by a factor of 1.5, and by more than five times the scatter
+    that the interval implies, are no stars; the interval is then searched again. Where the PSF
+    changes over the field, so do the sources around.
+
+    Parameters
+    ----------
+    area : ndarray, shape (n,)
+    position : ndarray, shape (n, 2)
+        In the image; all sources are near where one is not finite.
+    """
+    from scipy.spatial import cKDTree
+
+    wide = np.zeros(len(area), dtype=bool)
+    if len(area) < 8:
+        return wide
+    size = np.log(area)
+    for _ in range(10):
+        star = np.flatnonzero(~wide)
+        if len(star) < 8:
+            break
+        # Size beside that of the nearest eight: usually one of these is a star.
+        around = size[star] * np.ones((len(size), 1))
+        if np.isfinite(position).all():
+            around = size[star][cKDTree(position[star]).query(position, k=8)[1]]
+        excess = size - np.percentile(around, 25, axis=1)
+        # A quarter of a normal distribution about its middle has the width 0.637 σ.
+        ordered, count = np.sort(excess[star]), -(-len(star) // 4)
+        width = ordered[count:] - ordered[:-count]
+        first = int(width.argmin())
+        usual, scatter = np.median(ordered[first : first + count + 1]), width[first] / 0.637
+        wider = excess > usual + max(np.log(1.5), 5.0 * float(scatter))
+        if not (wider & ~wide).any():
+            break
+        wide |= wider
+    return wide
 
 
 def completed(

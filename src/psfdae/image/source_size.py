@@ -142,15 +142,19 @@ def _profile(windows: np.ndarray, seen: np.ndarray, centre: np.ndarray) -> Sourc
     offset = np.empty(len(windows))
     for star, (image, good, (row, column)) in enumerate(zip(windows, seen, centre, strict=True)):
         radius = np.hypot(axis[:, None] - row, axis - column)
-        place = np.digitize(radius[good], edges) - 1
+        place = (np.digitize(radius[good], edges) - 1).astype(np.int16)  # sorted by their digits
         values = image[good]
         order = np.argsort(place, kind="stable")
         starts = np.searchsorted(place[order], np.arange(len(edges)))
         for ring in range(len(edges) - 1):
             pixels = values[order[starts[ring] : starts[ring + 1]]]
             if len(pixels):
-                # Within a few pixels a star is not round on the pixel grid: the mean is the light.
-                rings[star, ring] = np.mean(pixels) if edges[ring + 1] <= 4 else np.median(pixels)
+                # Within a few pixels a star is not round on the pixel grid: the mean is the light;
+                # beyond, the median is, the mean of the two middle pixels.
+                if edges[ring + 1] > 4:
+                    middle = [(len(pixels) - 1) // 2, len(pixels) // 2]
+                    pixels = np.partition(pixels, middle)[middle]
+                rings[star, ring] = pixels.mean()
         inner = np.where(radius < max(4.0, REACH_PX / 6), image, -np.inf)
         peak = np.unravel_index(inner.argmax(), inner.shape)
         offset[star] = max(abs(axis[peak[0]] - row), abs(axis[peak[1]] - column))

@@ -82,7 +82,7 @@ MEANING: dict[StarFlag, str] = {
     StarFlag.OFF_CENTRE: "brightest pixel farther from the centre than the stamp could be moved",
     StarFlag.UNLIKE_TRAINING: "farther from the training set than 99.9 % of its test stars",
     StarFlag.BLENDED: "the star list says that it was parted from a neighbour; in photometry, a "
-    "star is nearer than one FWHM, or its group was too large to be fitted together",
+    "star is nearer than one FWHM",
     StarFlag.SKY_OFF: "the sky that was given is over 5 sigma off the border of the stamp",
     StarFlag.POOR_FIT: "chi2 above 10: the residual is far above the noise; or a fit did not end",
     StarFlag.BEYOND: "brighter, fainter or of another colour than all stars of the training, where "

@@ -169,9 +169,9 @@ def make_images(
         some = subpixel[rows]
         # Splines ring beside what is left of a saturated neighbour.
         least = -DEFECT * stars.noise[who[some], None, None]
-        wide[some] = np.maximum(moved(wide[some], phase[rows][some]), least)
+        wide[some] = np.maximum(moved(stars.wide, phase[rows][some], who[some]), least)
         offset = brightest_pixels(wide, reach, centring_px)[0] - jitter[rows]
-        shifted = moved(template[who], stars.centre[who] + phase[rows])
+        shifted = moved(template, stars.centre[who] + phase[rows], who)
         for source, target in ((wide, realisations), (shifted, templates)):
             stamp = cut(source, side, offset)
             target[rows] = stamp / stamp.sum(axis=(1, 2), keepdims=True)

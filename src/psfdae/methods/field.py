@@ -38,6 +38,7 @@ from psfdae.method import (
 )
 from psfdae.moments import measure_shapes, moving_matrices, robust_scatter
 from psfdae.noise import NoiseModel
+from psfdae.progress import steps
 from psfdae.rng import stream
 
 OWN_NOISE = 0.5
@@ -384,6 +385,7 @@ class FieldMixture(FieldLaw, Method):
             *(images - level[:, None], np.broadcast_to(noise, count), terms, True),
             *(self._prior(listed), None, flux, np.isfinite(sky)),
             np.zeros(count) if gain is None else np.nan_to_num(1.0 / gain),
+            np.full(count, self.off_node_px),
         )
         known = np.isfinite(listed).all(axis=1) & fixed
         found = np.empty((count, 6 + 2 * images.shape[1]))
@@ -395,7 +397,7 @@ class FieldMixture(FieldLaw, Method):
                     at = listed[part]
                     near = np.square(self.places - at[:, None]).sum(axis=-1).argmin(axis=1)
                     alone = np.where(np.arange(len(self.places)) == near[:, None], 0.0, -np.inf)
-                    some = some._replace(centre=at, prior=alone)
+                    some = some._replace(centre=at, prior=alone, off_node=np.zeros(len(part)))
                 found[part], covariance[part] = self._restored(some, *self._start(some))
         values, psf, sigma = np.split(found, [6, 6 + images.shape[1]], axis=1)
         measured = Measured(
@@ -429,13 +431,13 @@ def _residuals(
     weight = (signal + 1e-12) / (signal + 1e-12 + own)
     weight /= weight.sum()
     left = OWN_NOISE * float(weight @ noise**2)
-    steps = phases_of(step_px)[:, None, None] - centre
+    shifts = phases_of(step_px)[:, None, None] - centre
     rows, columns = (
-        np.array([moving_matrices(side, row) for row in steps[..., axis]]) for axis in (0, 1)
+        np.array([moving_matrices(side, row) for row in shifts[..., axis]]) for axis in (0, 1)
     )
     columns = columns.transpose(0, 1, 3, 2)
     found = []
-    for row in rows:
+    for row in steps("residuals", rows):
         half = row @ residual
         for column in columns:
             moved = (half @ column).reshape(len(residual), -1)

@@ -28,6 +28,7 @@ from psfdae.method import (
 from psfdae.mixing import FLUX_SIGMA
 from psfdae.mixture_law import FLAT_VARIANCE, MixtureLaw
 from psfdae.noise import NoiseModel
+from psfdae.progress import task
 from psfdae.rng import stream
 from psfdae.settings import Count, Group, Positive
 
@@ -155,6 +156,7 @@ class GaussianMixture(MixtureLaw, Method):
         def error(k: int, nu: float, positions: bool) -> float:
             """Geometric mean over the noise levels."""
             tried = replace(clustered(k, positions), shrinkage=np.array([nu]))
+            advance(1)
             pairs = zip(noisy, data.levels, strict=True)
             errors = [np.square(tried.predict(z, s, where) - truth).mean() for z, s in pairs]
             return float(np.exp(np.mean(np.log(errors))))
@@ -171,12 +173,13 @@ class GaussianMixture(MixtureLaw, Method):
                 nu = climbed(gmm.shrinkage, nu, lambda tried: error(k, tried, positions))
             return error(k, nu, positions), k, positions, nu
 
-        best = search(sizes[0], gmm.shrinkage[0], cls.needs.position)
-        if cls.needs.position:
-            # Positions may be left aside, where stars in other places are worse for it.
-            least, k, _, nu = best
-            if error(k, nu, False) < NEARLY_LEAST * least:
-                best = min(best, search(k, nu, False))
+        with task("mixture", len(sizes) + len(gmm.shrinkage)) as advance:
+            best = search(sizes[0], gmm.shrinkage[0], cls.needs.position)
+            if cls.needs.position:
+                # Positions may be left aside, where stars in other places are worse for it.
+                least, k, _, nu = best
+                if error(k, nu, False) < NEARLY_LEAST * least:
+                    best = min(best, search(k, nu, False))
         _, k, positions, nu = best
         tried: list[tuple[str, float, Sequence[float], Sequence[float]]] = [
             ("K", k, [max(sizes)] if k > 1 else [], sizes),

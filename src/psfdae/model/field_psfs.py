@@ -205,14 +205,18 @@ class FieldPsfs(ABC):
         PredictionError
             As `psf_at`.
         """
-        from psfdae.model.field_grid import FieldGrid
+        from astropy.nddata import NDData
+        from photutils.psf import GriddedPSFModel
 
-        x, y = np.rint(self.grid(nodes, nodes)).T
-        name = f"FieldPSF_{self.sha256[:12]}_{nodes}_{oversampling}"
-        psfs = self.psf_at(x, y, oversampling)
-        # photutils takes the middle of the array for that of the star; even stamps have none.
-        psfs = np.pad(psfs, ((0, 0), *[(0, 1 - psfs.shape[-1] % 2)] * 2))
-        return FieldGrid.of(name, psfs, x[:nodes], y[::nodes], oversampling)
+        from psfdae.model.psf_grid import PsfGrid
+
+        grid = PsfGrid.of(self, nodes, oversampling)
+        places = np.stack(np.meshgrid(grid.columns, grid.rows), axis=-1).reshape(-1, 2)
+        meta = {"grid_xypos": [tuple(place) for place in places], "oversampling": oversampling}
+        # A class of its own: photutils 3.0 fits groups with the first model of a class.
+        kind = type(f"FieldPSF_{self.sha256[:12]}_{nodes}_{oversampling}", (GriddedPSFModel,), {})
+        psfs = grid.psfs.reshape(-1, *grid.psfs.shape[2:])
+        return kind(NDData(psfs, meta=meta))
 
 
 def real_numbers(name: str, values: ArrayLike) -> np.ndarray:

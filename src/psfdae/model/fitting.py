@@ -13,7 +13,7 @@ from psfdae.fits import described_by
 from psfdae.method import KnowsField, Method, with_free_flux
 from psfdae.methods import groups_of
 from psfdae.methods import method as method_of
-from psfdae.model.packing import bundle_of, with_wings
+from psfdae.model.packing import model_of, with_wings
 from psfdae.model.psf_model import MARGIN_PX, PsfModel
 from psfdae.model.settings import with_keywords
 from psfdae.model.star_sets import (
@@ -159,7 +159,7 @@ def packed(stars: Stars, fitted: Method, name: str, licence: str) -> PsfModel:
     """The model of a fit, with its errors on the stars that are held out, and wings of stars."""
     of = stars.product, REFERENCE, stars.settings, described(stars, type(fitted)), name, licence
     with fixed_threads(stars.settings.evaluation.threads):
-        model = PsfModel(bundle_of(fitted, *of))
+        model = model_of(fitted, *of)
         if not isinstance(fitted, KnowsField) or stars.observation.shape is None:
             return model
         each = [
@@ -167,4 +167,6 @@ def packed(stars: Stars, fitted: Method, name: str, licence: str) -> PsfModel:
             for part in stars.each
         ]
     known = [wings for wings in each if wings is not None]
-    return PsfModel(with_wings(model.bundle, Wings.joined(known))) if known else model
+    if not known:
+        return model
+    return PsfModel(with_wings(model.bundle, Wings.joined(known)), model.engine.estimator)

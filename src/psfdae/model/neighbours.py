@@ -20,6 +20,7 @@ from psfdae.methods.field import FieldMixture
 from psfdae.model import crowded
 from psfdae.model.field_psfs import FieldPsfs
 from psfdae.model.fitting import fitted_to
+from psfdae.model.psf_grid import PsfGrid
 from psfdae.model.stars import DETECTED_SIGMA, Stars
 
 NEAREST_FWHM = 1.25  # of a neighbour whose light can be told from that of its star
@@ -52,30 +53,39 @@ class _Field(FieldPsfs):
         return self.fitted.psf_at(place, oversampling)
 
 
-def without_neighbours(stars: Stars) -> Stars:
+def without_neighbours(stars: Stars, neighbour_ratio: float) -> Stars:
     """The stars of the same image, each without the light of all others.
 
-    What they were is what comes back if their image cannot be fitted, with a note that says why.
+    Where the stars were chosen in spite of neighbours brighter than `neighbour_ratio`, in units of
+    the star, the stars that come out are the start of a second round. What they were is what comes
+    back if their image cannot be fitted, with a note that says why.
     """
-    field = _Field(fitted_to(stars, FieldMixture), stars.settings.framing.stamp_px)
-    observation = stars.observation
-    assert observation.positions is not None
-    try:
-        found = crowded.photometry(field, observation, DETECTED_SIGMA)
-        fwhm = field.fwhm_px()
-        alone = replace(observation, others=light_of_others(found, observation.positions))
-        again = Stars.chosen(stars.source, alone, stars.settings, NEAREST_FWHM * fwhm)
-    except Error as error:
-        note = f"neighbours: their light was not subtracted ({error})"
-        return replace(stars, notes=(*stars.notes, note))
-    said = (
-        f"neighbours: the light of {len(found.stars)} stars was subtracted in the others' stamps; "
-        f"{len(stars)} stars are good with no neighbour within "
-        f"{stars.settings.calibration_stars.isolation_px:g} px, {len(again)} with none within "
-        f"{NEAREST_FWHM * fwhm:.2g} px"
+    observation, notes = stars.observation, stars.notes
+    accepted = stars.settings.calibration_stars.neighbour_ratio
+    wanted = stars.settings.calibration_stars.model_copy(
+        update={"neighbour_ratio": neighbour_ratio}
     )
-    notes = (*again.notes, said)
-    return replace(again, observation=observation, wings=found.wings, notes=notes)
+    settings = stars.settings.model_copy(update={"calibration_stars": wanted})
+    assert observation.positions is not None
+    for _ in range(2 if accepted > neighbour_ratio else 1):
+        field = _Field(fitted_to(stars, FieldMixture), settings.framing.stamp_px)
+        try:
+            found = crowded.photometry(field, observation, DETECTED_SIGMA)
+            near = NEAREST_FWHM * field.fwhm_px()
+            alone = replace(observation, others=light_of_others(found, observation.positions))
+            again = Stars.chosen(stars.source, alone, settings, near)
+        except Error as error:
+            note = f"neighbours: their light was not subtracted ({error})"
+            return replace(stars, notes=(*stars.notes, note))
+        said = (
+            f"neighbours: the light of {len(found.stars)} stars was subtracted in the others' "
+            f"stamps; {len(stars)} stars are good with no neighbour above {100 * accepted:g} % of "
+            f"their brightness within {wanted.isolation_px:g} px, {len(again)} with none above "
+            f"{100 * neighbour_ratio:g} % within {near:.2g} px"
+        )
+        stars = replace(again, observation=observation, wings=found.wings)
+        notes = (*again.notes, said)
+    return replace(stars, notes=notes)
 
 
 def light_of_others(
@@ -101,16 +111,16 @@ def light_of_others(
     fitted = np.stack([stars["x"], stars["y"]], axis=1)
     known = np.flatnonzero(np.isfinite(fitted).all(axis=1) & np.isfinite(stars["flux_model"]))
     off, nearest = cKDTree(fitted[known]).query(np.nan_to_num(place, nan=-np.inf))
-    psf = found.model.to_photutils()
+    psfs, flux = PsfGrid.of(found.model), np.array(stars["flux_model"])
 
     def light(part: slice, stamp_px: int, margin: int) -> np.ndarray:
         x, y = place[part].T
         stamps = cut_image(found.light, found.light.shape, x, y, stamp_px, margin)[0]
-        axis = np.arange(stamps.shape[-1]) - stamp_px // 2 - margin
-        for row in np.flatnonzero(off[part] <= SAME_PX):
-            star = known[nearest[part][row]]
-            columns, rows = np.meshgrid(np.rint(x[row]) + axis, np.rint(y[row]) + axis)
-            stamps[row] -= psf.evaluate(columns, rows, stars["flux_model"][star], *fitted[star])
+        rows = np.flatnonzero(off[part] <= SAME_PX)
+        star = known[nearest[part][rows]]
+        corner = np.rint(place[part][rows]).astype(int) - stamp_px // 2 - margin
+        drawn = psfs.stamps(fitted[star], corner, stamps.shape[-1])[:, 0]
+        stamps[rows] -= flux[star, None, None] * drawn
         return stamps
 
     return light

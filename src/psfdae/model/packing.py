@@ -44,6 +44,7 @@ from psfdae.model.bundle import (
     at_noise,
     brightest,
     creation_date,
+    estimator,
     mahalanobis,
 )
 from psfdae.model.photometry import FluxModel, signal_to_noise
@@ -59,6 +60,7 @@ from psfdae.model.star_sets import (
 )
 from psfdae.model.wings import Wings
 from psfdae.noise import NoiseModel
+from psfdae.progress import steps
 from psfdae.rng import stream
 from psfdae.settings import OfTest
 from psfdae.version import __version__
@@ -68,14 +70,12 @@ COMPONENTS = 48  # leading eigenvectors that a bundle stores
 COVERAGE = 0.6827  # part of the errors within ± `error68`; of a normal variable within ± 1 σ
 WIDE = 0.95  # part of them within ± `error68` times `ratio95`
 LEAST_SIGMA = 1e-12  # of the flux; equal stars leave a method no doubt
-# What is known of stars: their flux and sky, their sky, or neither.
-CASES: tuple[dict[str, float], ...] = ({"flux": 1.0, "background": 0.0}, {"background": 0.0}, {})
+CASES = 3  # of what is known of stars: their flux and sky, their sky, or neither
 HIDDEN = 0.25  # of a pixel's RMS error, which its `error68` has at least
 NORMAL_WIDE = 1.96  # σ within which a normal variable has as much
 LIMIT = 0.999  # part of the test stars within the limit of the Mahalanobis distance
 STEPS = 64  # of the noise up to that of the flux in every pixel, of a model that is to be small
-LEAST_STARS = 1000  # noisy images per node; few test stars are seen several times with new noise
-FEW_STARS = 250  # of them, for a choice, and where all pixels of a brightness are one number
+FEW_STARS = 250  # noisy images per node, at least; fewer test stars are seen several times
 
 Restore = Callable[[np.ndarray, float], Estimate]
 """The method: normalised noisy images (n, d, d) of a noise level λ to PSFs."""
@@ -211,7 +211,7 @@ class StarFacts:
     def of(
         cls, stars: Product, reference: str, config: Any, trained: Mapping[str, Any]
     ) -> StarFacts:
-        """From a product "stars"; the rest is as in `bundle_of`."""
+        """From a product "stars"; the rest is as in `model_of`."""
         stamps, parts = _kind_of_stamps(stars), split_stars(stars, trained["split"], config)
         images, references = stars["realisation"], stars[reference]
         noise, levels = noise_model(config), np.asarray(config.noise.levels)
@@ -236,7 +236,7 @@ def without_errors(
     licence: str,
     largest_mb: float | None = None,
 ) -> Bundle:
-    """A fit with all that it takes to apply it, but for its errors; raises as `bundle_of`."""
+    """A fit with all that it takes to apply it, but for its errors; raises as `model_of`."""
     band, stamp_px = facts.held_out.noise.kappa * facts.levels, facts.info["stamp_px"]
     arrays, said = packed(fitted, stamp_px, float(band.min()), 1e6 * (largest_mb or np.inf))
     info = BundleInfo(
@@ -254,7 +254,7 @@ def without_errors(
     return with_misfit(made, facts.held_out, stream(facts.seed, "noise", "calibration", "misfit"))
 
 
-def bundle_of(
+def model_of(
     fitted: Method,
     stars: Product,
     reference: str,
@@ -263,8 +263,8 @@ def bundle_of(
     name: str,
     licence: str,
     largest_mb: float | None = None,
-) -> Bundle:
-    """A fit with its errors on test stars and all that it takes to apply it.
+) -> PsfModel:
+    """The model of a fit, with its errors on test stars and all that it takes to apply it.
 
     Parameters
     ----------
@@ -286,12 +286,14 @@ def bundle_of(
     facts = StarFacts.of(stars, reference, config, trained)
     made = without_errors(fitted, facts, reference, name, licence, largest_mb)
     held_out = facts.held_out
-    unpacked = type(fitted).unpack(made.weights, made.info)  # what it errs as packed
-    made = with_model_errors(made, fitted, config.seed)
+    unpacked = estimator(made)  # what it errs as packed
+    if isinstance(fitted, DrawsStars):
+        made = with_model_errors(PsfModel(made, unpacked), fitted, config.seed)
     made, errors = calibrated(made, unpacked, held_out, config.seed)
     if of_image(stars) and made.strange_limit is not None:
         train = np.unique(stars["field_index"][split_stars(stars, trained["split"], config).train])
-        made = with_training_stars(made, BrightStars.of_product(stars).of(train))
+        bright = BrightStars.of_product(stars).of(train)
+        made = with_training_stars(PsfModel(made, unpacked), bright)
     test = split_stars(stars, trained["split"], config).test
     metrics = measure_levels(
         config.noise.levels,
@@ -303,7 +305,8 @@ def bundle_of(
         config.evaluation.data_range,
     )
     said = {**made.info.config, "evaluation": config.evaluation.model_dump()}
-    return replace(made, info=made.info.model_copy(update={"metrics": metrics, "config": said}))
+    info = made.info.model_copy(update={"metrics": metrics, "config": said})
+    return PsfModel(replace(made, info=info), unpacked)
 
 
 def _trained_on(product: Product, train: np.ndarray) -> int:
@@ -396,23 +399,25 @@ def measure_errors(
     rng: np.random.Generator,
 ) -> Errors:
     """Errors and distances of noisy test stars at every node (S,), pixel RMS over the flux."""
-    star = _repeated(len(stars.images), LEAST_STARS)
-    error = np.empty((len(nodes), star.size, *stars.images.shape[1:]), np.float32)
-    distance = np.empty((len(nodes), star.size))
-    scores = []
-    free = with_free_flux(fitted)
-    for place, noise in enumerate(nodes):
-        level = noise / stars.noise.kappa
-        noisy = stars.noise.draw(stars.images[star], level, rng)
-        estimate = fitted.estimate(noisy, level, stars.position[star])
-        error[place] = errors_of(estimate, stars, star)
-        found = estimate.outlier_score
-        if found is None and isinstance(free, ScoresOutliers):
-            found = free.outlier_score(noisy, np.full(star.size, level))
-        scores.append(found)
-        distance[place] = mahalanobis(noisy, np.full(star.size, noise), model, COMPONENTS)
-    known = [node for node in scores if node is not None]
-    return Errors(nodes, error, star, distance, np.stack(known) if known else None)
+    # Each star at each node of the noise; all are restored together.
+    drawn = [_noisy(stars, node, rng) for node in nodes]
+    noisy, star = (np.concatenate(arrays) for arrays in zip(*drawn, strict=True))
+    noise = np.repeat(nodes, len(drawn[0][1]))
+    level = noise / stars.noise.kappa
+    estimate = fitted.estimate(noisy, level, stars.position[star])
+    score, free = estimate.outlier_score, with_free_flux(fitted)
+    if score is None and isinstance(free, ScoresOutliers):
+        score = free.outlier_score(noisy, level)
+    error = errors_of(estimate, stars, star).astype(np.float32)
+    distance = mahalanobis(noisy, noise, model, COMPONENTS)
+    shape = len(nodes), -1
+    return Errors(
+        nodes,
+        error.reshape(*shape, *stars.images.shape[1:]),
+        drawn[0][1],
+        distance.reshape(shape),
+        None if score is None else score.reshape(shape),
+    )
 
 
 def errors_of(
@@ -441,49 +446,59 @@ def calibrated(
         flux_error_scale=None,
         widening=None,
     )
-    return with_scales(found, stars, stream(seed, "noise", "calibration", "scales")), errors
+    rng = stream(seed, "noise", "calibration", "scales")
+    return with_scales(PsfModel(found, fitted), stars, rng), errors
 
 
-def with_scales(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -> Bundle:
-    """The bundle with what flux, sky and brightness do to its errors.
+def with_scales(model: PsfModel, stars: HeldOutStars, rng: np.random.Generator) -> Bundle:
+    """The bundle of a model with what flux, sky and brightness do to its errors.
 
     No training must have seen the stars: where noise is far below the errors that a method makes
     on other stars, those on its own do not tell.
     """
-    model, nodes = PsfModel(bundle), bundle.noise_nodes
-    fitted = model.engine.estimator
-    shape = 2, len(CASES)  # the noise is known, or estimated
+    bundle, measures = model.bundle, isinstance(model.engine.estimator, MeasuresStars)
+    nodes, shape = bundle.noise_nodes, (2, CASES)  # the noise is known, or estimated
     noise = np.tile(nodes, (*shape, 1))
     width, of_flux = np.ones((2, *shape, 2, len(nodes))), np.ones(len(nodes))
-    for place, node in enumerate(nodes):
+    # A method that measures stars needs no factor of their fluxes: for their pixels, which are
+    # many, a third of the stars is enough in each case. Its errors are the same if noise is known.
+    every, kinds = (3, (True,)) if measures else (1, (False, True))
+    for place, node in enumerate(steps("errors of fluxes", nodes)):
         noisy, star = _noisy(stars, node, rng)
-        images, position = (np.concatenate([a, a]) for a in (noisy, stars.position[star]))
-        levels = np.repeat([node, np.nan], len(star))
-        for case, estimated in np.ndindex(shape[::-1]):
-            if not estimated:  # the first half of the stars, which are predicted with the second
-                known: dict[str, Any] = {"noise": levels, **CASES[case]}
-                both = model.predict(images, position=position, **known)
-            found = both.of(slice(estimated * len(star), (1 + estimated) * len(star)))
-            usable = np.isfinite(found.psf).all(axis=(1, 2))
+        case, image = np.divmod(np.arange(0, CASES * len(star), every), len(star))
+        estimated = np.repeat(kinds, len(case))
+        case, image = np.tile(case, len(kinds)), np.tile(image, len(kinds))
+        found = model.predict(
+            noisy[image],
+            flux=np.where(case == 0, 1.0, np.nan),
+            background=np.where(case <= 1, 0.0, np.nan),
+            noise=np.where(estimated, np.nan, node),
+            position=stars.position[star[image]],
+        )
+        finite = np.isfinite(found.psf).all(axis=(1, 2))
+        error = stars.errors(found.psf, star[image])
+        error /= np.maximum(found.uncertainty, LEAST_SIGMA)
+        bright = brightest(found.psf)
+        for index in np.ndindex(shape):
+            usable = finite & (estimated == index[0]) & (case == index[1])
             if not usable.any():
                 continue
-            noise[estimated, case, place] = np.median((found.noise / found.flux)[usable])
-            error = stars.errors(found.psf, star)[usable]
-            error /= np.maximum(found.uncertainty[usable], LEAST_SIGMA)
-            wide = error / found.ratio95[usable, None, None]
-            bright = brightest(found.psf[usable])
-            for pixels, kind in ((~bright, 0), (bright, 1)):
-                width[0, estimated, case, kind, place] = np.quantile(error[pixels], COVERAGE)
-                width[1, estimated, case, kind, place] = np.quantile(wide[pixels], WIDE)
-            if estimated and not CASES[case] and not isinstance(fitted, MeasuresStars):
-                doubt = np.hypot(found.flux_error, stars.flux_error[star])[usable]
+            noise[*index, place] = np.median((found.noise / found.flux)[usable])
+            wide = error[usable] / found.ratio95[usable, None, None]
+            for pixels, kind in ((~bright[usable], 0), (bright[usable], 1)):
+                width[0, *index, kind, place] = np.quantile(error[usable][pixels], COVERAGE)
+                width[1, *index, kind, place] = np.quantile(wide[pixels], WIDE)
+            if index == (1, CASES - 1) and not measures:
+                doubt = np.hypot(found.flux_error, stars.flux_error[star[image]])[usable]
                 off = np.abs(found.flux - 1.0)[usable] / doubt
                 of_flux[place] = np.quantile(off, WIDE) / NORMAL_WIDE
     # Where a star has light that the photometry does not know, its noise is found too large.
     noise = np.maximum.accumulate(noise, axis=-1)
     for index in np.ndindex(width.shape[:-1]):
-        _, *case, _ = index
-        width[index] = np.interp(nodes, noise[tuple(case)], width[index])
+        _, *known, _ = index
+        width[index] = np.interp(nodes, noise[tuple(known)], width[index])
+    if measures:
+        width[:, 0] = width[:, 1]
     scale68, scale95 = np.moveaxis(width, -1, 1)
     return replace(
         bundle,
@@ -493,19 +508,20 @@ def with_scales(bundle: Bundle, stars: HeldOutStars, rng: np.random.Generator) -
     )
 
 
-def with_training_stars(bundle: Bundle, stars: BrightStars) -> Bundle:
-    """The bundle with a limit of outliers that its own training stars are not beyond.
+def with_training_stars(model: PsfModel, stars: BrightStars) -> Bundle:
+    """The bundle of a model with a limit of outliers that its own training stars are not beyond.
 
     The noise of a training star is in the axes of the training, along which a star of the same
     noise is an outlier by as much as there are few of them. Training stars have less noise than the
     least node, of which the limit is that of all brighter stars.
     """
+    bundle = model.bundle
     if bundle.strange_limit is None or not len(stars):
         return bundle
     images, seen = stars.framed(bundle.info.stamp_px)
     images = np.where(seen, images, 0.0) / stars.flux[:, None, None]
     noise = stars.noise / stars.flux
-    found = PsfModel(bundle).predict(images, noise=noise, background=0.0, position=stars.place)
+    found = model.predict(images, noise=noise, background=0.0, position=stars.place)
     score = found.outlier_score[np.isfinite(found.outlier_score)]
     limit = bundle.strange_limit.copy()
     if score.size:
@@ -516,15 +532,13 @@ def with_training_stars(bundle: Bundle, stars: BrightStars) -> Bundle:
     return replace(bundle, strange_limit=limit, distance_limit=max(bundle.distance_limit, far))
 
 
-def with_model_errors(bundle: Bundle, fitted: Method, seed: int) -> Bundle:
-    """The bundle with the errors of measured stars that its model makes, if its method draws stars.
+def with_model_errors(model: PsfModel, fitted: DrawsStars, seed: int) -> Bundle:
+    """The bundle of a model with the errors of measured stars that the model makes.
 
     Stars that are drawn by what the fit leaves open are measured with hardly any noise; what their
     stated errors lack is the model's.
     """
-    if not isinstance(fitted, DrawsStars):
-        return bundle
-    model, rng = PsfModel(bundle), stream(seed, "noise", "calibration", "model")
+    bundle, rng = model.bundle, stream(seed, "noise", "calibration", "model")
     # S/N 2000 of a matched filter, where noise is far below the errors of most models.
     noise = 1.0 / (2000.0 * np.sqrt(bundle.info.noise_equivalent_px))
     images, position, centre = fitted.draw_stars(FEW_STARS, rng)
@@ -590,13 +604,8 @@ def _noisy(
     stars: HeldOutStars, noise: float, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
     """At least `FEW_STARS` noisy images (n, d, d) of flux 1, and which stars they show, (n,)."""
-    star = _repeated(len(stars.images), FEW_STARS)
+    star = np.resize(np.arange(len(stars.images)), max(len(stars.images), FEW_STARS))
     return stars.noise.draw(stars.images[star], noise / stars.noise.kappa, rng), star
-
-
-def _repeated(count: int, least: int) -> np.ndarray:
-    """Numbers of so many stars, over and over if they are few."""
-    return np.resize(np.arange(count), max(count, least))
 
 
 def measure_levels(

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 def with_measured_gain(model: FieldPsfs, observation: Observation) -> Observation:
     """Return the observation with the gain that its stars show, if it is not known.
 
-    It stays unknown where they do not show it at 3 σ, as in an image without photon noise.
+    It stays unknown where they do not show it at 5 σ, as in an image without photon noise.
 
     Raises
     ------
@@ -67,7 +67,7 @@ def measure_gain(
     -------
     (float, float) or None
         Electrons per count. None if fewer than ten stars stand alone, or no photon noise is seen
-        at 3 σ.
+        at 5 σ: errors of the PSF follow the law above only about.
 
     Raises
     ------
@@ -110,7 +110,7 @@ def measure_gain(
         move = np.clip(found[:, 1:3] / np.maximum(found[:, :1], 1e-12), -0.2, 0.2)
         middle = np.floor(place + 0.5)
         place = np.clip(place + move, middle - 0.49, middle + 0.49)
-    if not photons > 3.0 * error:
+    if not photons > 5.0 * error:
         return None
     return 1.0 / (photons * unit), error / (photons**2 * unit)
 

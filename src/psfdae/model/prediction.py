@@ -16,31 +16,37 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from itertools import combinations
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Self
+from typing import IO, TYPE_CHECKING, Any, Self
 
 import numpy as np
 
 from psfdae.files import atomic_path
 from psfdae.image.errors import ascii_line
 from psfdae.image.fits_file import BLOCK_BYTES, Card
-from psfdae.image.stamps import MEANING, Stamps
+from psfdae.image.stamps import MEANING, StarFlag
+from psfdae.image.tables import as_fits, fits_values, html_table, star_table
 from psfdae.version import __version__
 
 if TYPE_CHECKING:
     from astropy.io.fits import Header
+    from astropy.table import QTable, Table
 
     from psfdae.model.bundle import Bundle
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Prediction:
     """PSFs of n stars and what was measured on the way; every star has its row.
 
     Attributes
     ----------
+    id : ndarray, shape (n,)
+        By the star list, else the number of the star.
+    x, y : ndarray, shape (n,), float64
+        Place in the image by the list, 0-based; NaN where unknown.
     psf : ndarray, shape (n, d, d), float32
         Noise-free image of the star without sky, in the unit of the stamps: the PSF
         times the flux. NaN where there is no usable flux (flag NO_FLUX).
@@ -85,6 +91,13 @@ class Prediction:
         Pixels by which the stamp was moved along columns and rows to centre the star.
     flags : ndarray, shape (n,), uint16
         Sum of `psfdae.StarFlag`s.
+    ra, dec : ndarray, shape (n,), float64, or None
+        ICRS coordinates in degrees of (x_fit, y_fit), or of (x, y) where these are NaN; None if
+        the image has no WCS.
+    list_columns : Table or None
+        n rows of further columns of the star list.
+    unit : str
+        Of the stamps; "" where nothing says it.
 
     Examples
     --------
@@ -95,13 +108,18 @@ class Prediction:
     True
     >>> int(found.flags[0])
     0
+    >>> found
+    Prediction(36 stars of 16×16 px, 36 without a flag)
+    >>> table = found.to_table()
+    >>> table.colnames[:5], table["flux"].unit
+    (['id', 'x', 'y', 'flux', 'flux_error'], Unit("adu"))
     """
 
-    psf: np.ndarray
-    residual: np.ndarray
-    uncertainty: np.ndarray
-    ratio95: np.ndarray
-    ratio95_bright: np.ndarray
+    id: np.ndarray
+    x: np.ndarray
+    y: np.ndarray
+    ra: np.ndarray | None = None
+    dec: np.ndarray | None = None
     flux: np.ndarray
     flux_error: np.ndarray
     flux_total: np.ndarray
@@ -109,15 +127,14 @@ class Prediction:
     background: np.ndarray
     noise: np.ndarray
     snr: np.ndarray
+    ratio95: np.ndarray
+    ratio95_bright: np.ndarray
     chi2: np.ndarray
     distance: np.ndarray
     outlier_score: np.ndarray
     fwhm_px: np.ndarray
     ellipticity: np.ndarray
     position_angle_deg: np.ndarray
-    shift_x: np.ndarray
-    shift_y: np.ndarray
-    flags: np.ndarray
     x_fit: np.ndarray
     y_fit: np.ndarray
     x_error: np.ndarray
@@ -129,26 +146,72 @@ class Prediction:
     corr_background_y: np.ndarray
     corr_background_x: np.ndarray
     corr_y_x: np.ndarray
+    shift_x: np.ndarray
+    shift_y: np.ndarray
+    flags: np.ndarray
+    psf: np.ndarray
+    residual: np.ndarray
+    uncertainty: np.ndarray
+    list_columns: Table | None = None
+    unit: str = ""
 
     def __len__(self) -> int:
         return len(self.psf)
 
-    @property
-    def strangeness(self) -> np.ndarray:
-        """Former name of `outlier_score`."""
-        return self.outlier_score
+    def __repr__(self) -> str:
+        side, clean = self.psf.shape[-1], int((self.flags == 0).sum())
+        return f"Prediction({len(self)} stars of {side}×{side} px, {clean} without a flag)"
+
+    def _repr_html_(self) -> str:
+        """Counts of the stars and of their flags, for a notebook."""
+        side, clean = self.psf.shape[-1], int((self.flags == 0).sum())
+        rows = [["stars", str(len(self))], ["stamps", f"{side}×{side} px"]]
+        rows += [["without a flag", str(clean)]]
+        for flag in StarFlag:
+            if count := int((self.flags & int(flag) > 0).sum()):
+                rows.append([str(flag.name), str(count)])
+        return html_table(["Prediction", ""], rows)
+
+    def to_table(self) -> QTable:
+        """Return a row for each star: all but the images, with units.
+
+        It is the table STARS of the file that `psfdae predict` writes; further columns of a star
+        list come last (`psfdae.image.tables.star_table`).
+        """
+        # FITS has no unsigned integers.
+        columns = self.columns() | {"flags": self.flags.astype(np.int32)}
+        return star_table(columns, self.unit, self.list_columns)
+
+    def columns(self) -> dict[str, np.ndarray]:
+        """Return the arrays with one value for each star, shape (n,), by their names."""
+        return {name: values for name, values in self._arrays().items() if values.ndim == 1}
+
+    def _arrays(self) -> dict[str, np.ndarray]:
+        """Return all arrays, shape (n, ...), by their names."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
 
     def of(self, rows: slice) -> Self:
         """Those of some stars."""
-        return type(self)(*(getattr(self, f.name)[rows] for f in fields(self)))
+        parts: dict[str, Any] = {name: values[rows] for name, values in self._arrays().items()}
+        if self.list_columns is not None:
+            parts["list_columns"] = self.list_columns[rows]
+        return replace(self, **parts)
 
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
         """One prediction of the stars of several."""
         if len(parts) == 1:
             return parts[0]
-        columns = (np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(cls))
-        return cls(*columns)
+        columns: dict[str, Any] = {
+            name: np.concatenate([getattr(part, name) for part in parts])
+            for name in parts[0]._arrays()
+        }
+        if parts[0].list_columns is not None:
+            from astropy.table import vstack
+
+            columns["list_columns"] = vstack([part.list_columns for part in parts])
+        return replace(parts[0], **columns)
 
 
 def measured_of(centre: np.ndarray, covariance: np.ndarray) -> dict[str, np.ndarray]:
@@ -179,67 +242,21 @@ CUBES: dict[str, tuple[str, str]] = {
 }
 """Arrays of a prediction with the name and the meaning of their extensions."""
 
-UNIT = "adu"  # of the pixels: counts, as in the input
-
-COLUMNS: dict[str, tuple[str, str | None, str]] = {
-    "x": ("D", "pix", "position in the image, 0-based, columns"),
-    "y": ("D", "pix", "position in the image, 0-based, rows"),
-    "flux": ("D", UNIT, "inside the stamp"),
-    "flux_error": ("D", UNIT, "standard error; NaN if the flux was given"),
-    "flux_total": ("D", UNIT, "within FLUXRAD; NaN if the model has no wings"),
-    "flux_total_error": ("D", UNIT, "standard error"),
-    "background": ("D", UNIT, "sky per pixel"),
-    "noise": ("D", UNIT, "RMS of the sky noise in a pixel"),
-    "snr": ("D", None, "of a matched filter, sqrt(sum of PSF^2) / noise"),
-    "ratio95": ("D", None, "UNCERT times this holds 95 % of the errors"),
-    "ratio95_bright": ("D", None, "the same in the brightest 8 % of the pixels"),
-    "chi2": ("D", None, "squared residuals over their expectation"),
-    "distance": ("D", None, "Mahalanobis distance from the training set"),
-    "outlier_score": ("D", None, "its square by the model's own law of stars"),
-    "strangeness": ("D", None, "former name of outlier_score"),
-    "fwhm_px": ("D", "pix", "of the PSF, adaptive moments"),
-    "ellipticity": ("D", None, "1 - b/a of the PSF"),
-    "position_angle_deg": ("D", "deg", "of the major axis, from +x to +y"),
-    "x_fit": ("D", "pix", "centre of the star, columns, 0-based"),
-    "y_fit": ("D", "pix", "centre of the star, rows, 0-based"),
-    "x_error": ("D", "pix", "standard error of x_fit"),
-    "y_error": ("D", "pix", "standard error of y_fit"),
-    "background_error": ("D", UNIT, "standard error of background"),
-    "corr_flux_background": ("D", None, "correlation of errors"),
-    "corr_flux_y": ("D", None, "correlation of errors"),
-    "corr_flux_x": ("D", None, "correlation of errors"),
-    "corr_background_y": ("D", None, "correlation of errors"),
-    "corr_background_x": ("D", None, "correlation of errors"),
-    "corr_y_x": ("D", None, "correlation of errors"),
-    "shift_x": ("I", "pix", "stamp moved along columns"),
-    "shift_y": ("I", "pix", "stamp moved along rows"),
-    "flags": ("J", None, "sum of the FLAG values in this header"),
-}
-"""FITS format, unit and meaning of the columns of STARS, besides `id`."""
-
-OF_STAMPS = ("id", "x", "y")  # columns that the stamps bring along
-
 
 class PredictionFile:
     """A file that is open and as long as it will be; `prediction_file` makes it."""
 
-    def __init__(self, file: IO[bytes], primary: Header, example: Stamps, count: int, side: int):
+    def __init__(self, file: IO[bytes], primary: Header, example: Prediction, count: int):
         self._file = file
-        width = max(example.id.dtype.itemsize // 4, 1)
-        id_is_text = example.id.dtype.kind == "U"
-        big_endian = {"D": ">f8", "I": ">i2", "J": ">i4"}
-        self._row = np.dtype(
-            [
-                ("id", f"S{width}" if id_is_text else ">i8"),
-                *((name, big_endian[f]) for name, (f, _, _) in COLUMNS.items()),
-            ]
-        )
+        side, unit = example.psf.shape[-1], example.unit or "adu"
+        table = as_fits(example.to_table(), "STARS")
+        self._row = table.data.dtype.newbyteorder(">")
         self._offset: dict[str, int] = {}
         file.write(_text(primary))
         for name, (extension, about) in CUBES.items():
-            self._append(name, _cube_header(extension, about, count, side), 4 * count * side**2)
-        header = _table_header(f"{width}A" if id_is_text else "K", count)
-        self._append("stars", header, count * self._row.itemsize)
+            header = _cube_header(extension, about, count, side, unit)
+            self._append(name, header, 4 * count * side**2)
+        self._append("stars", _with_flags(table.header, count), count * self._row.itemsize)
         file.truncate(file.tell())
 
     def _append(self, name: str, header: Header, size: int) -> None:
@@ -248,15 +265,18 @@ class PredictionFile:
         self._offset[name] = self._file.tell()
         self._file.seek(self._offset[name] + -(-size // BLOCK_BYTES) * BLOCK_BYTES)
 
-    def write(self, start: int, stamps: Stamps, prediction: Prediction) -> None:
+    def write(self, start: int, prediction: Prediction) -> None:
         """Write the stars from number `start` on."""
         for name in CUBES:
             cube = getattr(prediction, name)
             self._put(name, start * cube[0].nbytes if len(cube) else 0, cube.astype(">f4"))
-        rows = np.zeros(len(prediction), dtype=self._row)
-        for name in self._row.names or ():
-            value = getattr(stamps if name in OF_STAMPS else prediction, name)
-            rows[name] = as_ascii(value) if value.dtype.kind == "U" else value
+        table = prediction.to_table()
+        rows = np.zeros(len(table), dtype=self._row)
+        for name in table.colnames:
+            values = fits_values(table[name])
+            # FITS keeps truth values as the letters T and F.
+            is_truth = values.dtype.kind == "b"
+            rows[name] = np.where(values, ord("T"), ord("F")) if is_truth else values
         self._put("stars", start * self._row.itemsize, rows)
 
     def _put(self, name: str, place: int, values: np.ndarray) -> None:
@@ -266,21 +286,16 @@ class PredictionFile:
 
 @contextmanager
 def prediction_file(
-    path: Path, bundle: Bundle, example: Stamps, count: int, cards: Sequence[Card], history: str
+    path: Path, bundle: Bundle, example: Prediction, count: int, cards: Sequence[Card], history: str
 ) -> Iterator[PredictionFile]:
     """A `PredictionFile` for so many stars that gets its name if the block succeeds.
 
-    `example` are some of the stars, for the type of their identifiers; `cards` are further
-    provenance.
+    `example` is that of some of the stars, which says the types of the columns; `cards` are
+    further provenance.
     """
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         primary = _primary_header(bundle, cards, history)
-        yield PredictionFile(file, primary, example, count, bundle.info.stamp_px)
-
-
-def as_ascii(text: np.ndarray) -> np.ndarray:
-    """FITS tables hold ASCII; other characters become question marks."""
-    return np.array([name.encode("ascii", "replace") for name in text.tolist()], dtype=bytes)
+        yield PredictionFile(file, primary, example, count)
 
 
 def _primary_header(bundle: Bundle, cards: Sequence[Card], history: str) -> Header:
@@ -313,26 +328,20 @@ def _primary_header(bundle: Bundle, cards: Sequence[Card], history: str) -> Head
     return header
 
 
-def _cube_header(name: str, about: str, count: int, stamp_px: int) -> Header:
+def _cube_header(name: str, about: str, count: int, stamp_px: int, unit: str) -> Header:
     from astropy.io import fits
 
     header = fits.ImageHDU(np.zeros((1, stamp_px, stamp_px), np.float32), name=name).header
     header["NAXIS3"] = count
-    header["BUNIT"] = (UNIT, "counts, as in the input")
+    header["BUNIT"] = (ascii_line(unit), "as in the input")
     header["COMMENT"] = about
     header["COMMENT"] = "The star is about pixel (d/2, d/2), 0-based."
     return header
 
 
-def _table_header(id_format: str, count: int) -> Header:
-    from astropy.io import fits
-
-    columns = [fits.Column("id", id_format)]
-    columns += [fits.Column(name, f, unit) for name, (f, unit, _) in COLUMNS.items()]
-    header = fits.BinTableHDU.from_columns(columns, nrows=0, name="STARS").header
+def _with_flags(header: Header, count: int) -> Header:
+    """Return the header of a table of so many stars, with the meaning of their flags."""
     header["NAXIS2"] = count
-    for number, (_, _, about) in enumerate(COLUMNS.values(), start=2):
-        header[f"TCOMM{number}"] = about
     for flag, about in MEANING.items():
         # A FITS keyword has eight characters.
         header[f"FLAG{int(flag)}" if flag < 10000 else f"FLG{int(flag)}"] = flag.name

@@ -31,6 +31,7 @@ from psfdae.method import (
     FindsFlux,
     KnowsField,
     MeasuresStars,
+    Method,
     Packing,
     ScoresOutliers,
     with_free_flux,
@@ -49,6 +50,7 @@ from psfdae.model.photometry import FAINT_SNR, KEPT, NOISE_FLOOR, Photometer, Ph
 from psfdae.model.prediction import Prediction, measured_of, unmeasured
 from psfdae.model.wings import Wings, outer_light
 from psfdae.moments import measure_shapes
+from psfdae.progress import task
 from psfdae.threads import available_cores, in_order, side_by_side
 
 if TYPE_CHECKING:
@@ -105,6 +107,8 @@ class PsfModel(FieldPsfs):
     ----------
     bundle : Bundle
         `load_model` reads one from a file.
+    fitted : Method, optional
+        The method of its arrays; by default it is unpacked from them.
 
     Examples
     --------
@@ -118,9 +122,9 @@ class PsfModel(FieldPsfs):
     29
     """
 
-    def __init__(self, bundle: Bundle) -> None:
+    def __init__(self, bundle: Bundle, fitted: Method | None = None) -> None:
         self.bundle = bundle
-        self.engine = Engine(bundle)
+        self.engine = Engine(bundle, estimator(bundle) if fitted is None else fitted)
         self.name, self.stamp_px = bundle.info.name, bundle.info.stamp_px
 
     def __repr__(self) -> str:
@@ -214,7 +218,7 @@ class PsfModel(FieldPsfs):
             threads = min(threads or available_cores(), max(len(blocks), 1))
             work = (lambda block: self.engine.block(block, fixed), blocks or [stars], threads)
             parts = side_by_side(*work)
-        return Prediction.joined(parts)
+        return replace(Prediction.joined(parts), unit=unit)
 
     def _stamps(
         self,
@@ -266,8 +270,23 @@ class PsfModel(FieldPsfs):
             return Prediction.joined([self.engine.block(block, fixed) for block in blocks])
 
         chunks = observation.chunks(max(size, min(ROWS, 4 * size)))
-        with one_thread_each():
-            yield from in_order(predicted, chunks, threads or available_cores())
+        list_columns, start = observation.list_columns, 0
+        with one_thread_each(), task("stars", observation.count) as advance:
+            for stamps, prediction in in_order(predicted, chunks, threads or available_cores()):
+                rows = slice(start, start + len(prediction))
+                start = rows.stop
+                # The star on the sky, by its own centre where the model measures one.
+                x = np.where(np.isfinite(prediction.x_fit), prediction.x_fit, prediction.x)
+                y = np.where(np.isfinite(prediction.y_fit), prediction.y_fit, prediction.y)
+                sky = observation.on_sky(x, y)
+                ra, dec = (None, None) if sky is None else sky
+                list_rows = None if list_columns is None else list_columns[rows]
+                unit = observation.unit
+                yield (
+                    stamps,
+                    replace(prediction, ra=ra, dec=dec, list_columns=list_rows, unit=unit),
+                )
+                advance(len(prediction))
 
     @property
     def sha256(self) -> str:
@@ -498,9 +517,8 @@ class Engine:
     Safe to use from several threads.
     """
 
-    def __init__(self, bundle: Bundle) -> None:
-        self.bundle = bundle
-        self.estimator = estimator(bundle)
+    def __init__(self, bundle: Bundle, fitted: Method) -> None:
+        self.bundle, self.estimator = bundle, fitted
         self.free_flux = with_free_flux(self.estimator)
         packing = self.estimator.packing or Packing()
         together, self._padded = packing.together, packing.padded
@@ -572,7 +590,12 @@ class Engine:
         if restored.of_star:  # whose errors have the photons
             photons[:] = 0.0
         flux_error = np.sqrt((of_flux * found.flux_error) ** 2 + photons)
+        fluxes: dict[str, Any] = self._with_wings(stars, found, flux_error)
+        centres: dict[str, Any] = restored.of_star or unmeasured(len(stars))
         return Prediction(
+            id=stars.id,
+            x=stars.x,
+            y=stars.y,
             psf=psf,
             residual=residual,
             uncertainty=uncertainty,
@@ -580,7 +603,7 @@ class Engine:
             ratio95_bright=ratios[:, 1],
             flux=found.flux,
             flux_error=flux_error,
-            **self._with_wings(stars, found, flux_error),
+            **fluxes,
             noise=found.noise,
             snr=snr,
             chi2=chi2,
@@ -592,7 +615,7 @@ class Engine:
             shift_x=seen.shift[:, 1],
             shift_y=seen.shift[:, 0],
             flags=flags,
-            **(restored.of_star or unmeasured(len(stars))),
+            **centres,
         )
 
     def _with_wings(

@@ -7,7 +7,7 @@ errors, the field, residuals, sizes and shapes, χ², and which stars were left 
 from __future__ import annotations
 
 import base64
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import TYPE_CHECKING, Any
@@ -17,6 +17,7 @@ import numpy as np
 from psfdae.figures import SERIES_COLORS, as_png, new_figure, styled
 from psfdae.image.selection import Verdict
 from psfdae.image.stamps import StarFlag, cut
+from psfdae.image.tables import html_table
 from psfdae.model.plot import SPOILT
 from psfdae.moments import measure_shapes, moved
 
@@ -58,7 +59,7 @@ def fitted_mean(noisy: np.ndarray, mean: np.ndarray, reach_px: float) -> np.ndar
     """
 
     def at(places: np.ndarray) -> np.ndarray:
-        psf = cut(moved(np.broadcast_to(mean, (len(places), *mean.shape)), places), side)
+        psf = cut(moved(mean[None], places, np.zeros(len(places), int)), side)
         return np.asarray(psf / psf.sum(axis=(1, 2), keepdims=True))
 
     count, side = noisy.shape[:2]
@@ -187,12 +188,18 @@ class Quality:
         return found
 
     def sizes(self, snr: float) -> tuple[np.ndarray, np.ndarray]:
-        """FWHM of the faint held-out stars over that of their bright images, minus 1, (n,).
+        """Errors of sizes and shapes at a S/N (`size_errors`), (n,) each."""
+        return size_errors(self.faint[snr])
 
-        The second one is by how much their ellipticity is larger.
-        """
-        found, truth = (measure_shapes(self.faint[snr][kind]) for kind in ("model", "truth"))
-        return found.fwhm_px / truth.fwhm_px - 1.0, found.ellipticity - truth.ellipticity
+
+def size_errors(faint: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """FWHM of faint held-out stars over that of their bright images, minus 1, shape (n,).
+
+    The second one is by how much their ellipticity is larger. `faint` has the images (n, d, d) of
+    `model` and `truth`.
+    """
+    found, truth = (measure_shapes(faint[kind]) for kind in ("model", "truth"))
+    return found.fwhm_px / truth.fwhm_px - 1.0, found.ellipticity - truth.ellipticity
 
 
 def quality_page(q: Quality) -> str:
@@ -200,7 +207,7 @@ def quality_page(q: Quality) -> str:
     lead = standing(q.errors, q.method, q.label)
     parts = [
         f"<h1>{escape(q.name)}</h1><p class=lead>{escape(lead)}.</p>",
-        _checks(q),
+        checks_html(checks(q)),
         "<h2>Errors on stars that no training saw, degraded to low S/N</h2>",
         _errors_table(q),
         _picture(errors_figure(q)),
@@ -243,12 +250,6 @@ img {{ max-width: 100%; display: block; margin: 1em 0 }}
 """
 
 
-def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    cells = "".join(f"<th>{escape(name)}</th>" for name in head)
-    lines = ("".join(f"<td>{cell}</td>" for cell in row) for row in rows)
-    return f"<table><tr>{cells}</tr>{''.join(f'<tr>{line}</tr>' for line in lines)}</table>"
-
-
 def _picture(figure: Figure) -> str:
     return _png(as_png(figure, dpi=110))
 
@@ -257,17 +258,26 @@ def _png(content: bytes) -> str:
     return f'<img src="data:image/png;base64,{base64.b64encode(content).decode()}">'
 
 
-def checks(q: Quality) -> list[tuple[str, str, bool]]:
-    """Checks before the model is trusted: question, answer, and whether it is passed."""
-    mean, linear = (ratios(q.errors, q.method, other) for other in (MEAN_PSF, LINEAR))
-    snr = nearest(q.faint)
-    size = q.sizes(snr)[0]
-    images = q.errors["images"][0]
-    held = int(q.errors["stars"][0])
-    bias, error = float(np.median(size)), 1.25 * float(size.std()) / np.sqrt(min(held, images))
-    chi2 = {name: (float(np.median(some)), some.size) for name, some in q.chi2().items()}
-    unlike = float(q.has(StarFlag.UNLIKE_TRAINING).mean())
-    found = [
+Check = tuple[str, str, bool]
+"""Question, answer, and whether the check is passed."""
+
+
+def checks_of_held_out(
+    method: str,
+    errors: Table,
+    found: Table,
+    coverage: Mapping[float, float],
+    faint: Mapping[float, Mapping[str, np.ndarray]],
+) -> list[Check]:
+    """Checks that rest on the stars held out alone; parameters are attributes of `Quality`."""
+    mean, linear = (ratios(errors, method, other) for other in (MEAN_PSF, LINEAR))
+    snr = nearest(faint)
+    size = size_errors(faint[snr])[0]
+    held = int(errors["stars"][0])
+    # Standard error of a median, 1.25 σ/√n, of as many images as there are different stars.
+    bias = float(np.median(size))
+    error = 1.25 * float(size.std()) / np.sqrt(min(held, errors["images"][0]))
+    rows = [
         ("Better than one mean PSF?", _by_snr(mean), max(mean.values()) < 1),
         ("Better than linear MMSE?", _by_snr(linear), max(linear.values(), default=0.0) < 1),
         (
@@ -277,20 +287,30 @@ def checks(q: Quality) -> list[tuple[str, str, bool]]:
         ),
         (
             "Does ± UNCERT hold 68 % of the errors?",
-            ", ".join(f"{100 * v:.0f} % at S/N {s:.3g}" for s, v in sorted(q.coverage.items())),
-            all(COVERED[0] < v < COVERED[1] for v in q.coverage.values()),
+            ", ".join(f"{100 * v:.0f} % at S/N {s:.3g}" for s, v in sorted(coverage.items())),
+            all(COVERED[0] < v < COVERED[1] for v in coverage.values()),
         ),
-        ("Do errors of the flux hold 68 %?", *_held(q.found, "flux")),
-        ("Do errors of the centre hold 68 %?", *_held(q.found, "centre")),
+        ("Do errors of the flux hold 68 %?", *_held(found, "flux")),
+        ("Do errors of the centre hold 68 %?", *_held(found, "centre")),
+        ("Stars held out", f"{held}", held >= FEW_STARS),
+    ]
+    return [row for row in rows if row[1]]
+
+
+def checks(q: Quality) -> list[Check]:
+    """Checks before the model is trusted, also those of all stars of the image."""
+    chi2 = {name: (float(np.median(some)), some.size) for name, some in q.chi2().items()}
+    unlike = float(q.has(StarFlag.UNLIKE_TRAINING).mean())
+    rows = [
         (
             "χ² of stars without a flag that were not learnt from",
             ", ".join(f"median {v:.2f} at S/N {s} ({n} stars)" for s, (v, n) in chi2.items()),
             all(USUAL_CHI2[0] < v < USUAL_CHI2[1] for v, _ in chi2.values()),
         ),
         ("Stars unlike the training", f"{100 * unlike:.0f} % of the list", unlike < 0.1),
-        ("Stars held out", f"{held}", held >= FEW_STARS),
     ]
-    return [row for row in found if row[1]]
+    *first, held = checks_of_held_out(q.method, q.errors, q.found, q.coverage, q.faint)
+    return [*first, *(row for row in rows if row[1]), held]
 
 
 def _held(found: Table, name: str) -> tuple[str, bool]:
@@ -306,10 +326,11 @@ def _by_snr(values: dict[float, float]) -> str:
     return f"MSE × {said}" if said else ""
 
 
-def _checks(q: Quality) -> str:
+def checks_html(rows: Sequence[Check]) -> str:
+    """Return a table of checks, each passed or to be inspected."""
     words = {True: "<b class=pass>pass</b>", False: "<b class=inspect>inspect</b>"}
-    rows = ((escape(a), escape(b), words[bool(good)]) for a, b, good in checks(q))
-    return _table(("check", "found", ""), rows)
+    cells = [(escape(a), escape(b), words[bool(passed)]) for a, b, passed in rows]
+    return html_table(("check", "found", ""), cells)
 
 
 def _errors_table(q: Quality) -> str:
@@ -322,7 +343,7 @@ def _errors_table(q: Quality) -> str:
         for name, label in labels.items()
     ]
     truth = q.errors["truth_mse"][0]
-    return _table(["MSE", *(f"S/N {snr:.3g}" for snr in levels)], rows) + (
+    return html_table(["MSE", *(f"S/N {snr:.3g}" for snr in levels)], rows) + (
         f"<p>Stars have flux 1. Noise of the bright images is {truth:.1e} of every MSE.</p>"
     )
 
@@ -342,7 +363,7 @@ def _found_table(q: Quality) -> str:
     return (
         "<p>Held-out stars degraded to low S/N, of which neither flux, sky, noise nor centre is "
         "given. The pull is what 68 % of the errors are below, over the stated error; it is 1 "
-        "where errors hold.</p>" + _table(head, rows)
+        "where errors hold.</p>" + html_table(head, rows)
     )
 
 
@@ -481,7 +502,7 @@ def _left_out(q: Quality) -> str:
     rows = [(escape(v), str(n)) for v in Verdict if (n := int((verdicts == v).sum()))]
     marked = [(f.name or "", str(n)) for f in StarFlag if (n := int(((flags & int(f)) > 0).sum()))]
     return (
-        _table(("used for training, or why not", "stars"), rows)
+        html_table(("used for training, or why not", "stars"), rows)
         + "<p>Flags of the model on all stars of the list:</p>"
-        + _table(("flag", "stars"), [*marked, ("none", str(int((flags == 0).sum())))])
+        + html_table(("flag", "stars"), [*marked, ("none", str(int((flags == 0).sum())))])
     )

@@ -58,6 +58,16 @@ class Settings(Group):
             return tree
         return {**tree, "calibration_stars": {"light_min": 0.0, **stars}}
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle the values alone: the class of all settings is made at run time."""
+        return _unpickled, (), self.__getstate__()
+
+
+def _unpickled() -> Settings:
+    """Return settings without values, which pickle fills in."""
+    kind = settings_model()
+    return kind.__new__(kind)
+
 
 @cache
 def settings_model() -> type[Settings]:

@@ -6,6 +6,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +15,7 @@ import numpy as np
 from psfdae.bright_stars import BrightStars
 from psfdae.files import Column, Product
 from psfdae.image.containers import as_images
-from psfdae.image.errors import ObservationError, no_formula
+from psfdae.image.errors import ObservationError
 from psfdae.image.observation import (
     ASSUMED_SCALE,
     Observation,
@@ -24,6 +25,7 @@ from psfdae.image.observation import (
 )
 from psfdae.image.selection import Candidates, Verdict, advice, collect
 from psfdae.image.source_size import SourceSize, measure_size
+from psfdae.image.tables import html_table, star_table
 from psfdae.image.training_images import single_psf, star_grid, training_columns
 from psfdae.model.psf_model import SCALE_TOLERANCE
 from psfdae.model.settings import IMAGE_GROUPS, Settings, settings_model, with_keywords
@@ -32,7 +34,7 @@ from psfdae.settings import Noise
 from psfdae.splits import held_out_fields
 
 if TYPE_CHECKING:
-    from astropy.table import Table
+    from astropy.table import QTable
     from astropy.units import Quantity
 
     from psfdae.image.catalogue import StarList
@@ -84,9 +86,8 @@ class Stars:
     Examples
     --------
     >>> stars = psfdae.Stars.from_image(image, catalogue=xy, **camera)
-    >>> print(stars.summary())
-    36 stars: 36 good
-    29 to learn from, 7 held out
+    >>> stars
+    Stars('array', 36 stars (29 to learn from, 7 held out) of 36)
     >>> [str(part) for part in stars.table["part"][:2]]
     ['training', 'held out']
     """
@@ -216,7 +217,8 @@ class Stars:
             if stars.many_crowded:
                 from psfdae.model.neighbours import without_neighbours
 
-                stars = without_neighbours(stars)
+                asked = settings.calibration_stars.neighbour_ratio
+                stars = without_neighbours(stars, asked)
             exposures.append(stars)
         found_stars = exposures[0] if len(exposures) == 1 else cls.joined(exposures)
         notes += few_stars(found_stars)
@@ -306,13 +308,31 @@ class Stars:
         """So many bright stars of an image have neighbours that it pays to subtract these."""
         if self.observation.shape is None or not np.isfinite(self.candidates.bright.position).all():
             return False
-        if len(self) < ENOUGH_STARS:
+        if len(self) < FEW_STARS:
             return False
         crowded = np.count_nonzero(self.candidates.verdict == Verdict.CROWDED)
-        return bool(crowded >= MANY_CROWDED * len(self))
+        return bool(crowded >= MANY_CROWDED * max(len(self), ENOUGH_STARS))
 
     def __repr__(self) -> str:
-        return f"Stars({str(self.observation.path)!r}, {self.summary()})"
+        held_count = int(self.held_out.sum())
+        return (
+            f"Stars({str(self.observation.path)!r}, {len(self)} stars "
+            f"({len(self) - held_count} to learn from, {held_count} held out) "
+            f"of {len(self.candidates.verdict)})"
+        )
+
+    def _repr_html_(self) -> str:
+        """Counts of the stars, for a notebook."""
+        held_count, images = int(self.held_out.sum()), len(self.each)
+        learnt_count = len(self) - held_count
+        rows = [
+            ["image", escape(self.observation.path.name)],
+            ["stars", f"{len(self)}: {learnt_count} to learn from, {held_count} held out"],
+            [f"of {len(self.candidates.verdict)}", self.candidates.count()],
+            ["stamps", f"{self.settings.framing.stamp_px} px"],
+        ]
+        rows += [["images", str(images)]] if images > 1 else []
+        return html_table(["Stars", ""], rows)
 
     @property
     def name(self) -> str:
@@ -337,16 +357,22 @@ class Stars:
         )
 
     @property
-    def table(self) -> Table:
-        """Every star of the image: place, S/N, why it is not used, and its part."""
-        table = self.candidates.table(self.held_out)
+    def table(self) -> QTable:
+        """Every star: place, S/N, why it is not used, its part, and further columns of its list.
+
+        `psfdae.image.tables.star_table` says which names and units the columns have.
+        """
+        from astropy.table import vstack
+
+        columns = self.candidates.columns(self.held_out)
         if self.exposures:
-            names, counts = zip(
-                *((no_formula(s.observation.path.name), s.observation.count) for s in self.each),
-                strict=True,
-            )
-            table.add_column(np.repeat(names, counts), name="image", index=0)
-        return table
+            counts = [one.observation.count for one in self.each]
+            names = [one.observation.path.name for one in self.each]
+            columns = {"image": np.repeat(names, counts), **columns}
+        of_lists = [one.observation.list_columns for one in self.each]
+        known = [of_list for of_list in of_lists if of_list is not None]
+        of_list = vstack(known) if len(known) == len(of_lists) else None
+        return star_table(columns, self.observation.unit, of_list)
 
     @cached_property
     def product(self) -> Product:
@@ -388,33 +414,45 @@ def enough_stars(
     """Choose stars from the brightest down, until there are enough.
 
     Where S/N 100 gives fewer than `ENOUGH_STARS`, the least S/N is lowered until there are three
-    times as many, or to 20; and to 10 if even that gives too few.
+    times as many, or to 20; and to 10 if even that gives too few. Where these are still too few
+    because bright stars have neighbours, brighter and brighter neighbours are accepted, whose light
+    is subtracted later.
 
     Returns
     -------
     settings : Settings
-        With the least S/N.
+        With the least S/N, and the brightness of neighbours.
     candidates : list of Candidates
         Of each observation.
     """
     asked = settings.calibration_stars
 
-    def with_least(snr: float) -> tuple[Settings, list[Candidates]]:
-        stars = asked.model_copy(update={"snr_min": snr})
+    def with_limits(by_core: bool = False, **limits: float) -> tuple[Settings, list[Candidates]]:
+        stars = asked.model_copy(update=limits)
         # Only the stars of all images together must be enough, which is required later.
         of_each = stars.model_copy(update={"stars_min": 0})
-        found = [collect(one, of_each, settings.framing) for one in opened]
+        found = [collect(one, of_each, settings.framing, by_core=by_core) for one in opened]
         return settings.model_copy(update={"calibration_stars": stars}), found
 
-    best = with_least(asked.least_snr)
+    best = with_limits(snr_min=asked.least_snr)
     count = sum(len(one.bright) for one in best[1])
     if count >= ENOUGH_STARS:
         return best
     for snr in asked.lower_snr():
-        chosen, found = with_least(snr)
+        chosen, found = with_limits(snr_min=snr)
         if (more := sum(len(one.bright) for one in found)) > count:
             best, count = (chosen, found), more
         if count >= (ENOUGH_STARS if snr <= FAINT_SNR else 3 * ENOUGH_STARS):
+            break
+    crowded = sum(np.count_nonzero(one.verdict == Verdict.CROWDED) for one in best[1])
+    if count >= ENOUGH_STARS or crowded < ENOUGH_STARS:
+        return best
+    for ratio in (0.05, 0.1, 0.2, 0.4):
+        # The median of stars with neighbours here and there has little of their light.
+        chosen, found = with_limits(True, snr_min=asked.least_snr, neighbour_ratio=ratio)
+        if (more := sum(len(one.bright) for one in found)) > count:
+            best, count = (chosen, found), more
+        if count >= ENOUGH_STARS:
             break
     return best
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +14,7 @@ import numpy as np
 
 from psfdae.figures import StripRow, as_png, restoration_strip, spread_stars
 from psfdae.files import write_text
-from psfdae.image.stamps import Stamps
+from psfdae.image.tables import shown_with_digits
 from psfdae.method import Method, facts_of
 from psfdae.methods import method as method_of
 from psfdae.metrics import all_metrics, clustered_mean, mse, quality, summarised
@@ -21,9 +22,18 @@ from psfdae.model.field_psfs import PredictionError
 from psfdae.model.packing import COVERAGE, checksum
 from psfdae.model.photometry import signal_to_noise
 from psfdae.model.plot import FieldStars, psf_map
-from psfdae.model.prediction import Prediction
 from psfdae.model.psf_model import MARGIN_PX, PsfModel
-from psfdae.model.report import MEAN_PSF, SHOWN_STARS, Quality, fitted_mean, quality_page, standing
+from psfdae.model.report import (
+    MEAN_PSF,
+    SHOWN_STARS,
+    Check,
+    Quality,
+    checks_html,
+    checks_of_held_out,
+    fitted_mean,
+    quality_page,
+    standing,
+)
 from psfdae.model.star_sets import (
     field_positions,
     noisy_test_images,
@@ -33,6 +43,7 @@ from psfdae.model.star_sets import (
     training_set,
 )
 from psfdae.model.stars import REFERENCE, SPLIT, Stars
+from psfdae.progress import steps
 from psfdae.splits import Split
 from psfdae.threads import fixed_threads
 
@@ -120,7 +131,7 @@ def _measured(model: PsfModel, stars: Stars, methods: Mapping[str, Method]) -> R
     data_range = settings.evaluation.data_range
     key = {"dataset": stars.name, "split": SPLIT, "reference": REFERENCE}
     rows, per_star, restored, degraded = [], [], {}, {}
-    for level in settings.noise.levels:
+    for level in steps("stars held out", settings.noise.levels):
         noisy = degraded[level] = noisy_test_images(settings, product, parts.test, level)
         mean = fitted_mean(noisy, stars.mean_psf, settings.framing.jitter_px + 1.0)
         row = {**key, "method": MEAN_PSF, "noise_level": level}
@@ -134,7 +145,8 @@ def _measured(model: PsfModel, stars: Stars, methods: Mapping[str, Method]) -> R
             rows += summarised(row, metrics, field)
             per_star.append({**row, "star": parts.test, "field": field, **metrics})
             if own:
-                restored[level] = {"truth": truth, "model": estimate.psf, MEAN_PSF: mean}
+                images = {"noisy": noisy, "truth": truth, "model": estimate.psf, MEAN_PSF: mean}
+                restored[level] = images
         rows += beside
     measured = [row for row in rows if row["method"] != MEAN_PSF]
     table = _table(rows, stars, methods)
@@ -193,7 +205,7 @@ def _mean(values: np.ndarray, star: np.ndarray, usable: np.ndarray) -> tuple[flo
 def _stacked(rows: Sequence[Mapping[str, object]]) -> Table:
     from astropy.table import Table
 
-    return Table({name: [row[name] for row in rows] for name in rows[0]})
+    return shown_with_digits(Table({name: [row[name] for row in rows] for name in rows[0]}))
 
 
 def _joined(parts: Sequence[Mapping[str, Any]]) -> Table:
@@ -267,7 +279,7 @@ class Report:
         are below: 1 if errors hold), RMS of the centre, and the parts of fluxes, centres and
         pixels that are within their stated errors, with standard errors clustered by star.
     restored : dict
-        By noise level λ the held-out images (n, d, d): `truth`, `model`, and `mean_psf`.
+        By noise level λ the held-out images (n, d, d): `noisy`, `truth`, `model`, and `mean_psf`.
 
     Examples
     --------
@@ -290,6 +302,33 @@ class Report:
         kind = type(self.model.engine.estimator)
         return standing(self.table, kind.name, kind.look.label)
 
+    def __repr__(self) -> str:
+        return f"Report({self.model.name!r}, {self})"
+
+    def _repr_html_(self) -> str:
+        """A sentence on the model, and its checks on held-out stars, for a notebook."""
+        return f"<p>{escape(str(self))}</p>{checks_html(self.checks())}"
+
+    def checks(self) -> list[Check]:
+        """Checks of the model on the stars held out: question, answer, and whether it is passed."""
+        errors = self.table, self.found, self._coverage, self._faint
+        return checks_of_held_out(self.model.info.method, *errors)
+
+    @property
+    def _faint(self) -> dict[float, dict[str, np.ndarray]]:
+        """The restored images by S/N."""
+        info = self.model.info
+        return {
+            signal_to_noise(info.kappa * level, info.noise_equivalent_px): images
+            for level, images in self.restored.items()
+        }
+
+    @property
+    def _coverage(self) -> dict[float, float]:
+        """Part of the errors within ± the stated 68 %, by S/N."""
+        rows = self.model.info.metrics
+        return {row["snr"]: row["coverage68"] for row in rows if "coverage68" in row}
+
     def save(self, path: str | Path) -> None:
         """Write the page, one HTML file that needs no other."""
         write_text(path, self.page())
@@ -303,14 +342,13 @@ class Report:
         snr = 1.0 / (settings.noise.kappa * levels * np.sqrt(area))
         level = float(levels[np.abs(np.log(snr / STRIP_SNR)).argmin()])
         star, place = product["field_index"][parts.test], field_positions(product)[parts.test]
-        noisy = noisy_test_images(settings, product, parts.test, level)
         shown = _one_of_each(star, product["position"])
-        truth = product[REFERENCE][parts.test][shown]
+        noisy, truth = (self.restored[level][kind][shown] for kind in ("noisy", "truth"))
         rows = [StripRow("bright\nstar", truth)]
         for method in self.methods.values():
             look = method.look
             if look.drawn:
-                stamps = method.restore(noisy, level, place)[shown]
+                stamps = method.restore(noisy, level, place[shown])
                 error = mse(stamps, truth)
                 rows.append(StripRow(look.label, stamps, error, own_scale=not look.restores))
         columns = [f"S/N {value:.0f}" for value in product["snr"][star[shown]]]
@@ -326,15 +364,15 @@ class Report:
     def page(self) -> str:
         """The HTML of the page; the PSFs of all stars of the image are predicted for it."""
         model, stars = self.model, self.stars
-        info, selection = model.info, stars.table
+        info, selection = model.info, stars.candidates.columns(stars.held_out)
         held = np.flatnonzero(selection["part"] == "held out")
-        where = np.stack([selection["x"][held], selection["y"][held]], axis=1)
+        where = stars.candidates.position[held]
         shown = held[spread_stars(where, SHOWN_STARS)] if np.isfinite(where).all() else held
         found, psf, residual = _all_stars(model, stars, shown[:SHOWN_STARS])
-        columns = {name: np.asarray(selection[name]) for name in ("verdict", "part")}
-        area, shown = info.noise_equivalent_px, shown[:SHOWN_STARS]
+        columns = {name: selection[name] for name in ("verdict", "part")}
+        shown = shown[:SHOWN_STARS]
         kind = type(model.engine.estimator)
-        levels, product = self.restored.items(), stars.product
+        product = stars.product
         test = split_stars(product, SPLIT, stars.settings).test
         row = product["row"][product["field_index"][test]]
         return quality_page(
@@ -346,8 +384,8 @@ class Report:
                 notes=stars.notes,
                 errors=self.table,
                 found=self.found,
-                coverage={r["snr"]: r["coverage68"] for r in info.metrics if "coverage68" in r},
-                faint={signal_to_noise(info.kappa * level, area): of for level, of in levels},
+                coverage=self._coverage,
+                faint=self._faint,
                 degraded={name: found[name][row] for name in ("x", "y", "flux")},
                 stars=found | columns,
                 residual=residual / found["noise"][shown, None, None],
@@ -376,9 +414,9 @@ def _all_stars(
     of_images = (
         model.stream(part.observation.with_margin(MARGIN_PX), threads=1) for part in stars.each
     )
-    for stamps, found in itertools.chain.from_iterable(of_images):
-        for name, value in itertools.chain(_per_star(stamps, ("x", "y")), _per_star(found)):
-            columns.setdefault(name, []).append(value)
+    for _, found in itertools.chain.from_iterable(of_images):
+        for name, values in found.columns().items():
+            columns.setdefault(name, []).append(values)
         psf.append(found.psf)
         inside = kept[(kept >= done) & (kept < done + len(found))] - done
         residual.append((inside + done, found.residual[inside]))
@@ -388,15 +426,6 @@ def _all_stars(
     joined = {name: np.concatenate(values) for name, values in columns.items()}
     joined["flags"] = joined["flags"].astype(int)
     return joined, np.concatenate(psf), rows
-
-
-def _per_star(
-    of: Stamps | Prediction, names: Iterable[str] = ()
-) -> Iterator[tuple[str, np.ndarray]]:
-    for name in names or of.__dataclass_fields__:
-        value = np.asarray(getattr(of, name))
-        if value.ndim == 1:
-            yield name, value
 
 
 def _map(found: Mapping[str, np.ndarray], psf: np.ndarray, stars: Stars) -> Figure:

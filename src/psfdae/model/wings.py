@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 
-from psfdae.image.detection import SMOOTHED_NOISE, WIDE_PX, Sky, sky_of
-from psfdae.moments import FWHM_OF_SIGMA
+from psfdae.image.detection import Sky, sky_of
+from psfdae.image.sky_level import sky_level
 
 if TYPE_CHECKING:
     from psfdae.image.fits_file import Card
@@ -34,7 +34,7 @@ FOLLOWED = 0.03  # part of a star's light in a pixel by which its PSF may be off
 ROUND = 0.3  # the same of wings, which are round here, and are not there
 OUTER, OUTER_RANGE = 0.7, (0.3, 3.0)  # radius of a stamp's outer part over half its side; s
 REACH, TENTS, STEEPNESS = 2.5, 6, 3.0  # radius of the wings in stamps; tents; power of 1/r in them
-WINGED, BAND_PX = 1000, 512  # brightest stars, whose wings are drawn; rows at a time
+WINGED, BAND_PX = 1000, 128  # brightest stars, whose wings are drawn; rows at a time
 CLIPPED_SIGMA = 4.0  # of a pixel from the wings known so far, from which it is left out
 MOST_LIGHT, MOST_RADIUS_PX = 10.0, 1e5  # of wings over the flux in the stamp; no nonsense
 ROUNDS, SAME = 8, 0.1  # of wings and sky, at most; change of the light in σ with which they end
@@ -199,35 +199,65 @@ def outer_light(draw: Callable[[np.ndarray], np.ndarray], place: np.ndarray) -> 
 
 def tents(r: np.ndarray, radius_px: np.ndarray) -> np.ndarray:
     """h_1 … at distances r, shape (K − 1, …), as they are outside of the stamp."""
-    tops = np.log(radius_px)
-    inside = np.maximum(r, radius_px[0])
-    off = np.abs(np.log(inside) - tops[:-1].reshape(-1, *[1] * r.ndim)) / (tops[1] - tops[0])
-    return np.asarray(np.maximum(1.0 - off, 0.0) * (inside / radius_px[0]) ** -STEEPNESS)
+    # ln of r over the first top; tops are equidistant in it.
+    radius = radius_px.astype(r.dtype)
+    beyond = np.log(np.maximum(r / radius[0], 1.0))
+    top = np.arange(len(radius) - 1, dtype=r.dtype).reshape(-1, *[1] * r.ndim)
+    off = np.abs(beyond / np.log(radius[1] / radius[0]) - top)
+    return np.asarray(np.maximum(1.0 - off, 0.0) * np.exp(-STEEPNESS * beyond))
+
+
+def star_tents(
+    rows: slice, width: int, place: np.ndarray, flux: np.ndarray, outer: np.ndarray, wings: Wings
+) -> Iterator[tuple[tuple[slice, slice], np.ndarray]]:
+    """Windows about the brightest stars within some rows, and F s h_k there, shape (K, …)."""
+    reach, radius = int(wings.radius_px[-1]), wings.radius_px
+    light = np.where(np.isfinite(outer), flux * wings.scale(outer), np.nan)
+    known = np.flatnonzero(np.isfinite(light) & (light > 0) & np.isfinite(place).all(axis=1))
+    brightest = known[np.argsort(-light[known])[:WINGED]]
+    # The pixels within reach, as far as they are in these rows.
+    middle = np.rint(place[brightest]).astype(int)
+    low = np.maximum(middle - reach, [0, rows.start])
+    high = np.minimum(middle + reach + 1, [width, rows.stop])
+    for inside in np.flatnonzero((low < high).all(axis=1)):
+        star, (left, top), (right, end) = brightest[inside], low[inside], high[inside]
+        across, down = (
+            (np.arange(*ends) - at).astype(np.float32)
+            for ends, at in zip(((left, right), (top, end)), place[star], strict=True)
+        )
+        distance = np.sqrt(np.square(down)[:, None] + np.square(across))
+        stamp = np.maximum(np.abs(down)[:, None], np.abs(across)) < radius[0]
+        shape = np.concatenate([stamp[None], np.where(stamp, 0.0, tents(distance, radius))])
+        window = slice(top - rows.start, end - rows.start), slice(left, right)
+        yield window, float(light[star]) * shape
 
 
 def tented_light(
     shape: tuple[int, ...], place: np.ndarray, flux: np.ndarray, outer: np.ndarray, wings: Wings
 ) -> Iterator[tuple[slice, np.ndarray]]:
     """Bands of rows, and Σ F s h_k of the stars in them, shape (K, rows, w)."""
-    reach, radius = int(wings.radius_px[-1]), wings.radius_px
-    light = np.where(np.isfinite(outer), flux * wings.scale(outer), np.nan)
-    known = np.flatnonzero(np.isfinite(light) & (light > 0) & np.isfinite(place).all(axis=1))
-    brightest = known[np.argsort(-light[known])[:WINGED]]
     height, width = shape
     for top in range(0, height, BAND_PX):
-        rows = min(BAND_PX, height - top)
-        tented = np.zeros((len(radius), rows, width))
-        for star in brightest:
-            x, y = place[star]
-            first, last = (np.clip(round(y) + d - top, 0, rows) for d in (-reach, reach + 1))
-            left, right = (np.clip(round(x) + d, 0, width) for d in (-reach, reach + 1))
-            if first < last and left < right:
-                down, across = np.arange(first, last)[:, None] + top - y, np.arange(left, right) - x
-                inside = np.maximum(np.abs(down), np.abs(across)) < radius[0]
-                outside = np.where(inside, 0.0, tents(np.hypot(down, across), radius))
-                tented[0, first:last, left:right] += light[star] * inside
-                tented[1:, first:last, left:right] += light[star] * outside
-        yield slice(top, top + rows), tented
+        rows = slice(top, min(top + BAND_PX, height))
+        tented = np.zeros((len(wings.profile), rows.stop - top, width), np.float32)
+        for window, light in star_tents(rows, width, place, flux, outer, wings):
+            tented[:, *window] += light
+        yield rows, tented
+
+
+def wing_light(
+    shape: tuple[int, ...],
+    place: np.ndarray,
+    flux: np.ndarray,
+    outer: np.ndarray,
+    wings: Wings | None,
+) -> np.ndarray:
+    """Light of the wings of stars in an image (h, w)."""
+    far = np.zeros(shape, np.float32)
+    if wings is not None:
+        for window, light in star_tents(slice(0, shape[0]), shape[1], place, flux, outer, wings):
+            far[window] += np.tensordot(wings.profile, light, 1)
+    return far
 
 
 def expected_profile(radius_px: np.ndarray, outer: float) -> tuple[np.ndarray, np.ndarray]:
@@ -310,7 +340,7 @@ class Around(NamedTuple):
     sky: Sky
     far: np.ndarray
     wings: Wings | None
-    doubt: np.ndarray  # of every pixel without models and wings, as `search_error`
+    doubt: np.ndarray  # σ of every pixel without models and wings, with what these may be off by
 
 
 def around_stars(
@@ -339,55 +369,45 @@ def around_stars(
     stamp_px : int
     before : Wings, optional
     """
-    bad, wings, doubt = sky.bad, before, np.hypot(error, FOLLOWED * drawn)
-    for _ in range(ROUNDS):
-        known = wings
-        left = image - sky.level - drawn
-        wings = wings_of(left, doubt, bad, place, flux, outer, stamp_px, known)
-        far = np.zeros(image.shape)
-        if wings is not None:
-            for band, light in tented_light(image.shape, place, flux, outer, wings):
-                far[band] = np.tensordot(wings.profile, light, 1)
-        mapped = np.isfinite(sky.noise_scale)
-        sky = sky_of(image - drawn - far, bad, sky.noise if mapped else None)
-        if wings is None:
-            break
-        now, sigma = wings.light()
-        if known is not None and abs(now - known.light()[0]) < SAME * sigma:
-            break
+    doubt, beside, light = np.hypot(error, FOLLOWED * drawn), image - drawn, (place, flux, outer)
+    wings = _wings_beside(beside, sky.level, doubt, sky.bad, *light, stamp_px, before)
+    far = wing_light(image.shape, *light, wings)
+    mapped = np.isfinite(sky.noise_scale)
+    sky = sky_of(beside - far, sky.bad, sky.noise if mapped else None)
     # The map has the most frequent value of the pixels, which is below the mean where noise is that
     # of photons, and where stars are too faint to be seen: both are in the pixels of stars, too.
-    left = image - sky.level - drawn - far
-    weight = np.where(bad | (np.abs(left) > CLIPPED_SIGMA * doubt), 0.0, doubt**-2.0)
+    left = beside - sky.level - far
+    weight = np.where(sky.bad | (np.abs(left) > CLIPPED_SIGMA * doubt), 0.0, doubt**-2.0)
     even = float((weight * left).sum() / max(weight.sum(), np.finfo(float).tiny))
     sky = replace(sky, level=sky.level + even, flat=sky.flat - even)
-    return Around(sky, far, wings, search_error(error, drawn, far, flux))
+    return Around(sky, far, wings, np.hypot(doubt, ROUND * far))
 
 
-def search_error(
-    error: np.ndarray, drawn: np.ndarray, far: np.ndarray, flux: np.ndarray
-) -> np.ndarray:
-    """σ of the pixels (h, w) in which stars are searched that others hide.
-
-    It has what models and wings may be off by. These errors are alike over the width of the PSF:
-    where stars are so wide that they are searched in a smoothed image (`psfdae.image.detection`),
-    that averages the noise, but not them.
-
-    Parameters
-    ----------
-    error, drawn, far : ndarray, shape (h, w)
-        σ by noise; light of the models, and of the wings.
-    flux : ndarray, shape (n,)
-        Of the stars.
-    """
-    off = np.hypot(FOLLOWED * drawn, ROUND * far)
-    # Noise-equivalent area A = Σ F² / Σ L² = 4π σ² of a Gaussian, and what it leaves of noise.
-    square = float(np.square(drawn).sum())
-    area = float(np.nansum(np.square(flux))) / square if square > 0 else 0.0
-    sigma = np.sqrt(area / (4.0 * np.pi))
-    if FWHM_OF_SIGMA * sigma >= WIDE_PX:
-        off *= SMOOTHED_NOISE * 2.0 * np.sqrt(np.pi) * sigma
-    return np.asarray(np.hypot(error, off))
+def _wings_beside(
+    beside: np.ndarray,
+    level: np.ndarray,
+    doubt: np.ndarray,
+    bad: np.ndarray,
+    place: np.ndarray,
+    flux: np.ndarray,
+    outer: np.ndarray,
+    stamp_px: int,
+    before: Wings | None = None,
+) -> Wings | None:
+    """Wings of stars in an image (h, w) without its models, in turns with the level of its sky."""
+    wings = before
+    for turn in range(ROUNDS):
+        known = wings
+        if turn:
+            far = wing_light(beside.shape, place, flux, outer, known)
+            level = sky_level(np.where(bad, 0.0, beside - far), bad).level
+        wings = wings_of(beside - level, doubt, bad, place, flux, outer, stamp_px, known)
+        if wings is None:
+            break
+        light, sigma = wings.light()
+        if known is not None and abs(light - known.light()[0]) < SAME * sigma:
+            break
+    return wings
 
 
 def wings_of_stars(model: PsfModel, observation: Observation) -> Wings | None:
@@ -401,10 +421,9 @@ def wings_of_stars(model: PsfModel, observation: Observation) -> Wings | None:
         If there is no sky to measure.
     """
     sky, side = observation.sky(), model.stamp_px
-    image = sky.flat + sky.level
     middles, fluxes, outers = [], [], []
     # With the room of a stamp on all sides, for those that reach beyond the image.
-    drawn = np.zeros(np.add(image.shape, 2 * side))
+    drawn = np.zeros(np.add(sky.flat.shape, 2 * side), np.float32)
     for stamps, found in model.stream(observation, threads=1):
         place = np.stack([stamps.x, stamps.y], axis=1)
         shift = np.stack([found.shift_x, found.shift_y], axis=1)
@@ -421,5 +440,7 @@ def wings_of_stars(model: PsfModel, observation: Observation) -> Wings | None:
     inner = np.s_[side:-side, side:-side]
     light, gain = drawn[inner], observation.gain
     middle, flux, outer = (np.concatenate(values) for values in (middles, fluxes, outers))
-    error = np.sqrt(sky.noise**2 + (np.maximum(light, 0.0) / gain if gain else 0.0))
-    return around_stars(image, sky, error, light, middle, flux, outer, side).wings
+    photons = np.maximum(light, 0.0) / gain if gain else 0.0
+    doubt = np.sqrt(sky.noise**2 + photons + (FOLLOWED * light) ** 2)
+    beside = sky.flat + sky.level - light
+    return _wings_beside(beside, sky.level, doubt, sky.bad, middle, flux, outer, side)

@@ -25,6 +25,7 @@ from psfdae.errors import Error
 from psfdae.files import as_csv, atomic_path
 from psfdae.method import FitError
 from psfdae.networks.weights import load_checkpoint, save_checkpoint
+from psfdae.progress import task
 
 Row = dict[str, float]
 """An epoch in the history of a training."""
@@ -299,20 +300,17 @@ def fingerprint(deciding: Mapping[str, Any], *arrays: np.ndarray) -> str:
 @contextmanager
 def progress(epochs: int) -> Iterator[Callable[[Row], None]]:
     """What a training calls after each epoch: a bar, in a log a line."""
-    from tqdm import tqdm
-
     terminal = sys.stderr.isatty()
 
     def report(row: Row) -> None:
         # Not every epoch is validated.
         known = {key: name for key, name in ERRORS.items() if np.isfinite(row.get(key, np.nan))}
         errors = [f"{name} {row[key]:.3e}" for key, name in known.items()]
-        bar.set_postfix_str(errors[0])
-        bar.update()
+        advance(1)
         if not terminal:
             left = row["seconds"] * (epochs / row["epoch"] - 1)
             time = f"{row['seconds']:.0f} s, about {left:.0f} s left"
             print(f"epoch {row['epoch']:.0f}/{epochs}", *errors, time, sep="  ", flush=True)
 
-    with tqdm(total=epochs, unit="epoch", disable=not terminal, desc="train") as bar:
+    with task("training", epochs) as advance:
         yield report

@@ -13,6 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from psfdae.progress import steps
+
 FREEDOM = 5.0
 """Degrees of freedom of Student's t; its tails are heavier than any normal posterior's."""
 
@@ -165,7 +167,7 @@ def sample_around(
     tall = height(whose, mean + moved(place))
     stride = np.ones(posteriors)
     kept = []
-    for step in range(CHAINS.steps):
+    for step in steps("draws", range(CHAINS.steps)):
         part = stride[whose][:, None]
         trial = np.sqrt(1.0 - part**2) * place + part * drawn(mean.shape[1:])
         new = height(whose, mean + moved(trial))

@@ -23,6 +23,7 @@ from psfdae.image.stamps import Stamps, border_median, border_scatter
 from psfdae.optics.derivatives import PointSampling, SampledStamps, Sampling
 from psfdae.optics.seeing import BlurredSampling, Broadening
 from psfdae.optics.wavefronts import movable_modes
+from psfdae.progress import task
 from psfdae.rng import stream
 from psfdae.sensing.climbing import Steps, best_of_group, climb, poisson
 from psfdae.sensing.sampling import Mixture, sample_around
@@ -382,6 +383,7 @@ class Search:
         def evaluate(
             some: np.ndarray, numbers: np.ndarray
         ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+            advance(1)
             members = star[some]
             stamps, slopes = optics.derivatives(members, numbers[:, :k], numbers[:, k : k + 2])
             mean, slopes = self.expected(members, stamps, slopes, numbers[:, k:])
@@ -394,7 +396,8 @@ class Search:
             information[:, range(k + 2, k + BESIDE), range(k + 2, k + BESIDE)] += WEAK
             return -0.5 * (deviance + self.penalty(numbers)), score, information
 
-        peaks = climb(evaluate, start, limit, CLIMB, star)
+        with task("modes", CLIMB.most + 1) as advance:
+            peaks = climb(evaluate, start, limit, CLIMB, star)
         covariance = np.linalg.inv(peaks.information)
         sign, width = np.linalg.slogdet(covariance)
         evidence = np.where(sign > 0, peaks.height + 0.5 * width, -np.inf)

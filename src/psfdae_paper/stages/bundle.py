@@ -73,9 +73,8 @@ def bundle(
     require_origin(place, (*STARS, *SAME_STARS, *SAME_IMAGE), product)
     fitted = kind.load(place, restored, config.evaluation)
     said = name or out.name.removesuffix(SUFFIX), licence
-    write_bundle(
-        packing.bundle_of(fitted, product, restored, config, trained, *said, largest_mb), out
-    )
+    model = packing.model_of(fitted, product, restored, config, trained, *said, largest_mb)
+    model.save(out)
 
 
 def _trained(kind: type[Method], place: Path, config: Config, split: str | None) -> dict[str, Any]:

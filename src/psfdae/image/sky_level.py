@@ -1,0 +1,272 @@
+"""Level and noise of the sky of an image, also where it has steps or structure.
+
+photutils measures both in meshes and interpolates between them. Amplifiers of different bias make
+steps, which are found first: each part of the image has meshes of its own. A nebula, or the halo of
+a bright star, changes within a mesh; there the level is a median of the pixels around.
+"""
+
+from __future__ import annotations
+
+import warnings
+from typing import NamedTuple
+
+import numpy as np
+
+from psfdae.image.bad_pixels import interpolated, pixel_noise
+
+MESH_PX = 64
+"""Side of the squares in which the sky is measured."""
+
+REACH_PX = 24
+"""Width of the strips on both sides of a line that say whether the sky has a step there."""
+
+
+class SkyLevel(NamedTuple):
+    """Level and σ (h, w) of the sky, and sentences on what is unusual in it."""
+
+    level: np.ndarray
+    noise: np.ndarray
+    notes: tuple[str, ...]
+
+
+def sky_level(image: np.ndarray, bad: np.ndarray) -> SkyLevel:
+    """Measure level and noise of the sky of an image.
+
+    Parameters
+    ----------
+    image : ndarray, shape (h, w)
+        Finite.
+    bad : ndarray of bool, shape (h, w)
+        Pixels that do not count.
+
+    Raises
+    ------
+    ValueError
+        If no mesh has enough pixels that count.
+    """
+    # Parts between steps of the sky, each with meshes of its own.
+    rows, columns = (sky_steps(image, bad, axis) for axis in (0, 1))
+    notes = []
+    for name, lines in (("row", rows), ("column", columns)):
+        if lines:
+            where = ", ".join(map(str, lines))
+            notes.append(f"the sky has a step at {name} {where}: the parts have their own sky")
+    level, noise = np.zeros((2, *image.shape))
+    for top, bottom in zip((0, *rows), (*rows, len(image)), strict=True):
+        for left, right in zip((0, *columns), (*columns, image.shape[1]), strict=True):
+            part = np.s_[top:bottom, left:right]
+            if not bad[part].all() or not (rows or columns):
+                level[part], noise[part] = _meshed(image[part], bad[part])
+    pixel_sigma = pixel_noise(interpolated(image, bad)[0], bad)
+    share, weight = structure(noise / pixel_sigma, bad)
+    around = _median_level(image - level, bad) if share > 0.05 else None
+    if around is not None and _sources_stay(image - level, around, bad, pixel_sigma):
+        level += weight * around
+        # What is left; its noise changes with the light of the structure, from mesh to mesh of 16.
+        rest, noise = _meshed(image - level, bad)
+        level += rest
+        noise += weight * (_meshed(image - level, bad, 16)[1] - noise)
+        notes.append(
+            f"the sky has structure within {MESH_PX} px in {100 * share:.0f} % of the image: "
+            "it is measured in 14 px there, and light of wide sources is lost in it"
+        )
+    with np.errstate(all="ignore"):
+        correlation = noise_correlation(np.where(bad, np.nan, (image - level) / noise))
+    if correlation > 1.0:
+        noise *= correlation
+        notes.append(
+            f"neighbouring pixels share their noise, as in resampled images: that of sums of "
+            f"pixels is {correlation:.2f} times as large, and errors are of sums"
+        )
+    return SkyLevel(level, noise, tuple(notes))
+
+
+def noise_correlation(deviation: np.ndarray) -> float:
+    """Return the noise of sums of pixels over that of independent ones, at least 1.
+
+    √(Σ ρ) over the correlations ρ of pixels up to 2 px apart. Faint sources and structure of the
+    sky correlate pixels 3 and 4 px apart nearly as much as neighbours; the ρ at these distances is
+    of them, and is subtracted. Unless 0.15 are left of that of neighbours, the result is 1.
+
+    Parameters
+    ----------
+    deviation : ndarray, shape (h, w)
+        Pixels without their sky, in σ; NaN where they do not count. Sources are left out here.
+    """
+    from scipy import ndimage
+
+    middle = tuple(slice(max(0, n // 2 - 512), n // 2 + 512) for n in deviation.shape)
+    values = deviation[middle]
+    # Means of 3 × 3 pixels scatter by σ/3, or more if these are correlated: three times this.
+    light = np.abs(ndimage.uniform_filter(np.nan_to_num(values), 3)) > 1.5
+    values = np.where(ndimage.binary_dilation(light, iterations=3), np.nan, values)
+    values[np.abs(values) > 3.0] = np.nan
+
+    def correlation(down: int, right: int) -> float:
+        """ρ = (s²(a + b) − s²(a − b))/(s²(a + b) + s²(a − b)), s by median deviations."""
+        height, width = values.shape
+        a = values[: height - down, max(0, -right) : width - max(0, right)]
+        b = values[down:, max(0, right) : width - max(0, -right)]
+        both = np.isfinite(a) & np.isfinite(b)
+        if np.count_nonzero(both) < 1000:
+            return 0.0
+        plus, minus = (
+            float(np.median(np.abs(v - np.median(v)))) ** 2
+            for v in (a[both] + b[both], a[both] - b[both])
+        )
+        return (plus - minus) / (plus + minus) if plus + minus > 0 else 0.0
+
+    if min(values.shape) < 16:
+        return 1.0
+    nearest = 0.5 * (correlation(0, 1) + correlation(1, 0))
+    if nearest < 0.15:
+        return 1.0
+    far = [correlation(*lag) for lag in ((0, 3), (3, 0), (0, 4), (4, 0))]
+    shared = max(float(np.mean(far)), 0.0)
+    if nearest - shared < 0.15:
+        return 1.0
+    lags = [(0, 1), (0, 2), *((down, right) for down in (1, 2) for right in range(-2, 3))]
+    excess = sum(correlation(*lag) - shared for lag in lags) / max(1.0 - shared, 0.1)
+    return float(np.sqrt(max(1.0 + 2.0 * excess, 1.0)))
+
+
+def _meshed(
+    image: np.ndarray, bad: np.ndarray, mesh_px: int = MESH_PX
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return level and σ (h, w) in meshes, interpolated; 80 % of one may be bad."""
+    from photutils.background import Background2D
+
+    found = Background2D(image, mesh_px, mask=bad, exclude_percentile=80.0)
+    return found.background, found.background_rms
+
+
+def _median_level(image: np.ndarray, bad: np.ndarray) -> np.ndarray:
+    """Return the median (h, w) of the 14 × 14 px around each pixel, from means of 2 × 2 px."""
+    from scipy import ndimage
+
+    height, width = image.shape
+    even = np.pad(interpolated(image, bad)[0], ((0, height % 2), (0, width % 2)), mode="edge")
+    binned = even.reshape(even.shape[0] // 2, 2, even.shape[1] // 2, 2).mean(axis=(1, 3))
+    smooth = ndimage.gaussian_filter(ndimage.median_filter(binned, 7, mode="nearest"), 1.0)
+    # Back to the pixels: linear between the middles of the squares.
+    row, column = (np.arange(0.0, n) / 2.0 - 0.25 for n in (height, width))
+    at = np.meshgrid(row, column, indexing="ij")
+    return np.asarray(ndimage.map_coordinates(smooth, at, order=1, mode="nearest"))
+
+
+def _sources_stay(light: np.ndarray, level: np.ndarray, bad: np.ndarray, noise: np.ndarray) -> bool:
+    """Return True if the brightest sources of an image (h, w) keep most of their peaks.
+
+    A level (h, w) that takes more than a quarter of them is that of the sources themselves. Without
+    five sources of 50 σ, such as where their models are subtracted, there are none to lose.
+    """
+    from scipy import ndimage
+
+    height = light - level
+    high = (height == ndimage.maximum_filter(height, 25)) & ~bad
+    peak = np.flatnonzero(high & (light > 50.0 * noise))
+    brightest = peak[np.argsort(-height.ravel()[peak], kind="stable")[:30]]
+    kept = height.ravel()[brightest] / light.ravel()[brightest]
+    return bool(brightest.size < 5 or np.median(kept) > 0.75)
+
+
+def structure(ratio: np.ndarray, bad: np.ndarray) -> tuple[float, np.ndarray]:
+    """Return the part of an image whose sky changes within a mesh, and where, from 0 to 1, (h, w).
+
+    `ratio` (h, w) is the σ of a mesh over that from differences of neighbouring pixels. Where the
+    sky has structure it is larger than elsewhere by a factor of 1.5; that of resampled images is
+    larger everywhere.
+    """
+    from scipy import ndimage
+
+    good = ratio[~bad & (ratio > 0)]
+    if not good.size:
+        return 0.0, np.zeros(ratio.shape)
+    usual = max(float(np.percentile(good, 25)), 1e-6)
+    # Meshes beside those with structure are interpolated from these, and wrong, too.
+    weight = np.where(bad, 0.0, np.clip((ratio / usual - 1.25) / 0.5, 0.0, 1.0))
+    wide = ndimage.maximum_filter(weight, 2 * MESH_PX + 1, mode="nearest")
+    weight = ndimage.uniform_filter(wide, MESH_PX, mode="nearest")
+    return float(np.mean(good > 1.5 * usual)), weight
+
+
+def sky_steps(image: np.ndarray, bad: np.ndarray, axis: int) -> list[int]:
+    """Return the rows (axis 0) or columns (axis 1) at which the sky of an image has a step.
+
+    The step goes along the whole line or half of it.
+
+    Parameters
+    ----------
+    image : ndarray, shape (h, w)
+    bad : ndarray of bool, shape (h, w)
+        Pixels that do not count.
+    """
+    values, good = (image.T, ~bad.T) if axis == 0 else (image, ~bad)
+    count = len(values)
+    found: list[int] = []
+    for part in (slice(0, count), slice(0, count // 2), slice(count // 2, count)):
+        every = max(1, (part.stop - part.start) // 256)
+        found += _steps_along(values[part][::every], good[part][::every])
+    # Lines that several parts found are one.
+    steps: list[int] = []
+    for line in sorted(found):
+        if not steps or line > steps[-1] + REACH_PX:
+            steps.append(line)
+    return steps
+
+
+def _steps_along(values: np.ndarray, good: np.ndarray) -> list[int]:
+    """Return the columns of some rows (n, w) at which the level has a step.
+
+    It is the same in all eighths of the rows, up to 3 px from the column and from 3 to 12 and 12 to
+    24 px, slopes subtracted; and above a tenth of the noise and eight times its error.
+    """
+    count, width = values.shape
+    if width < 4 * REACH_PX or count < 64:
+        return []
+    light, number = (
+        np.pad(np.cumsum(v, axis=1, dtype=np.float64), ((0, 0), (1, 0)))
+        for v in (np.where(good, values, 0.0), good)
+    )
+    lines = np.arange(2 * REACH_PX, width - 2 * REACH_PX + 1)
+    side = REACH_PX // 2
+
+    def jumps(start: int, end: int, at: np.ndarray) -> np.ndarray:
+        """Mean of each row from `start` to `end` px after columns, less that before them."""
+        with np.errstate(all="ignore"):
+            after, before = (
+                (light[:, b] - light[:, a]) / (number[:, b] - number[:, a])
+                for a, b in ((at + start, at + end), (at - end, at - start))
+            )
+        return np.asarray(after - before)
+
+    median = np.median if good.all() else np.nanmedian
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # of columns without good pixels
+        near = jumps(0, 3, lines)
+        middle = median(near, axis=0)
+        spread = 1.4826 * median(np.abs(near - middle), axis=0)
+        # Slope of the level per px: changes within 12 px on both sides, a pixel off the line.
+        before, after = (
+            median(jumps(0, side, lines + sign * (side + 1)), axis=0) for sign in (-1, 1)
+        )
+        smaller = np.sign(before) * np.minimum(np.abs(before), np.abs(after)) / side
+        slope = np.where(before * after > 0, smaller, 0.0)  # of two kinds: none, but bad columns
+        jump = middle - 3.0 * slope
+        noise = spread * np.sqrt(1.5)
+        error = 1.25 * spread / np.sqrt(count)
+        chosen = np.flatnonzero(np.abs(jump) > np.maximum(0.1 * noise, 8.0 * error))
+        steps: list[int] = []
+        for k in chosen[np.argsort(-np.abs(jump[chosen]))]:
+            line, height = int(lines[k]), jump[k]
+            eighths = [
+                median(part) - (start + end) * slope[k]
+                for start, end in ((0, 3), (3, side), (side, REACH_PX))
+                for part in np.array_split(jumps(start, end, np.array([line]))[:, 0], 8)
+            ]
+            same = np.abs(np.array(eighths) - height) < 0.5 * abs(height)
+            if same.reshape(3, 8).mean(axis=1).min() >= 0.75 and all(
+                abs(line - other) > REACH_PX for other in steps
+            ):
+                steps.append(line)
+    return steps

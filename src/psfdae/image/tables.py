@@ -1,0 +1,220 @@
+"""Tables of stars: names, units and digits of their columns, and how they are written.
+
+`psfdae predict`, `psfdae photometry`, `Stars.table` and `Prediction.to_table` all give the table of
+`star_table`; `COLUMNS` says what each of their columns is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from psfdae.files import atomic_path
+from psfdae.image.containers import fits_unit
+from psfdae.image.errors import ascii_line, no_formula, silent
+
+if TYPE_CHECKING:
+    from astropy.io.fits import BinTableHDU
+    from astropy.table import Column, QTable, Table
+
+OF_IMAGE = "unit of the image"
+"""Stands in `COLUMNS` for the unit of the image's pixels."""
+
+COLUMNS: dict[str, tuple[str, str, str]] = {
+    "image": ("", "", "file of the exposure"),
+    "id": ("", "", "by the star list, else the number of the star"),
+    "x": ("pix", ".4f", "place in the image, 0-based, columns"),
+    "y": ("pix", ".4f", "place in the image, 0-based, rows"),
+    "ra": ("deg", ".8f", "ICRS, of the fitted centre if there is one"),
+    "dec": ("deg", ".8f", "ICRS, of the fitted centre if there is one"),
+    "verdict": ("", "", "good, or why the star is not used for training"),
+    "part": ("", "", "training, or held out"),
+    "flux": (OF_IMAGE, ".7g", "light of the star; of predict, that in its stamp"),
+    "flux_error": (OF_IMAGE, ".3g", "standard error; NaN if the flux was given"),
+    "flux_total": (OF_IMAGE, ".7g", "within FLUXRAD; NaN if the model has no wings"),
+    "flux_total_error": (OF_IMAGE, ".3g", "standard error"),
+    "flux_model": (OF_IMAGE, ".7g", "without the light that the model does not have"),
+    "background": (OF_IMAGE, ".6g", "sky per pixel"),
+    "noise": (OF_IMAGE, ".4g", "RMS of the sky noise in a pixel"),
+    "snr": ("", ".1f", "of a matched filter, sqrt(sum of PSF^2) / noise"),
+    "mag": ("mag", ".4f", "zero point - 2.5 log10(flux)"),
+    "mag_error": ("mag", ".4f", "standard error"),
+    "ratio95": ("", ".3f", "UNCERT times this holds 95 % of the errors"),
+    "ratio95_bright": ("", ".3f", "the same in the brightest 8 % of the pixels"),
+    "chi2": ("", ".3f", "squared residuals over their expectation"),
+    "distance": ("", ".2f", "Mahalanobis distance from the training set"),
+    "outlier_score": ("", ".2f", "its square by the model's own law of stars"),
+    "fwhm_px": ("pix", ".3f", "of the PSF, adaptive moments"),
+    "ellipticity": ("", ".4f", "1 - b/a of the PSF"),
+    "position_angle_deg": ("deg", ".1f", "of the major axis, from +x to +y"),
+    "x_fit": ("pix", ".4f", "centre of the star, columns, 0-based"),
+    "y_fit": ("pix", ".4f", "centre of the star, rows, 0-based"),
+    "x_error": ("pix", ".3g", "standard error of x_fit, or of x"),
+    "y_error": ("pix", ".3g", "standard error of y_fit, or of y"),
+    "background_error": (OF_IMAGE, ".3g", "standard error of background"),
+    "corr_flux_background": ("", ".3f", "correlation of errors"),
+    "corr_flux_y": ("", ".3f", "correlation of errors"),
+    "corr_flux_x": ("", ".3f", "correlation of errors"),
+    "corr_background_y": ("", ".3f", "correlation of errors"),
+    "corr_background_x": ("", ".3f", "correlation of errors"),
+    "corr_y_x": ("", ".3f", "correlation of errors"),
+    "shift_x": ("pix", "", "stamp moved along columns"),
+    "shift_y": ("pix", "", "stamp moved along rows"),
+    "group": ("", "", "number of the stars that were fitted together"),
+    "group_size": ("", "", "how many they are"),
+    "photutils_flags": ("", "", "flags of photutils.psf.PSFPhotometry"),
+    "flags": ("", "", "sum of the FLAG values of psfdae.StarFlag"),
+}
+"""Unit, format in which values are shown, and meaning of each column, by its name."""
+
+SUFFIXES = (".fits", ".ecsv", ".csv")
+"""Ends of the names of files that `write_table` writes."""
+
+
+def star_table(
+    columns: Mapping[str, np.ndarray], image_unit: str = "", of_list: Table | None = None
+) -> QTable:
+    """Return a table of n stars with units, and further columns of their star list.
+
+    Parameters
+    ----------
+    columns : mapping of str to ndarray, shape (n,)
+        By names of `COLUMNS`, in this order; names that are not there have neither unit nor
+        meaning.
+    image_unit : str
+        Unit of the image's pixels; "" where nothing says it, which is taken for adu.
+    of_list : Table, optional
+        n rows of the star list. Its columns come after the others. One whose name is taken, upper
+        and lower case being the same, gets `_list` at its end.
+    """
+    from astropy.table import QTable
+    from astropy.units import Quantity, Unit
+
+    table = QTable()
+    for name, values in columns.items():
+        unit, form, meaning = COLUMNS.get(name, ("", "", ""))
+        # Units that no standard has are kept as they are.
+        text = (image_unit or "adu") if unit == OF_IMAGE else unit
+        column_unit = Unit(text, parse_strict="silent")
+        table[name] = Quantity(values, column_unit, dtype=values.dtype) if unit else values
+        table[name].info.description = meaning
+        if form:
+            table[name].info.format = form
+    if of_list is None:
+        return table
+    for name in of_list.colnames:
+        column_name, names = name, {column.lower() for column in table.colnames}
+        while column_name.lower() in names:
+            column_name += "_list"
+        with silent():  # a unit that suits no quantity leaves a plain column
+            table[column_name] = of_list[name]
+    return table
+
+
+def shown_with_digits(table: Table, form: str = ".4g") -> Table:
+    """Return the table, whose columns of real numbers are shown in a format from now on."""
+    for column in table.itercols():
+        if column.dtype.kind == "f":
+            column.info.format = form
+    return table
+
+
+def fits_values(column: Column) -> np.ndarray:
+    """Return a column of a table as a FITS table holds it, shape (n,).
+
+    Text is ASCII, as wide as the column, with question marks for other characters. Real numbers
+    that are missing are NaN, whole ones the least of their type.
+    """
+    unmasked = getattr(column, "unmasked", column)
+    values = np.ma.getdata(np.asarray(getattr(unmasked, "value", unmasked)))
+    is_missing = np.broadcast_to(np.asarray(getattr(column, "mask", False)), values.shape)
+    if values.dtype.kind in "US":
+        width = max(values.dtype.itemsize // (4 if values.dtype.kind == "U" else 1), 1)
+        texts = ["" if m else v for v, m in zip(values.tolist(), is_missing, strict=True)]
+        return np.array([ascii_bytes(text) for text in texts], dtype=f"S{width}")
+    # FITS has 16, 32 and 64 bits of whole numbers with a sign, 32 and 64 of real ones.
+    if values.dtype.kind == "u" or values.dtype == np.int8:
+        values = values.astype(np.float64 if values.dtype.itemsize == 8 else np.int64)
+    elif values.dtype.kind == "f" and values.dtype.itemsize not in (4, 8):
+        values = values.astype(np.float64)
+    if is_missing.any():
+        values = np.where(is_missing, _missing(values.dtype), values).astype(values.dtype)
+    return values
+
+
+def _missing(dtype: np.dtype) -> Any:
+    """Return what stands for a missing value in FITS."""
+    if dtype.kind == "f":
+        return np.nan
+    return np.iinfo(dtype).min if dtype.kind == "i" else False
+
+
+def ascii_bytes(text: str | bytes) -> bytes:
+    """Return a text as FITS holds it, question marks in place of characters that it has not."""
+    return text if isinstance(text, bytes) else text.encode("ascii", "replace")
+
+
+def as_fits(table: QTable, name: str) -> BinTableHDU:
+    """Return a table as an extension of a FITS file, with units, meanings and missing values."""
+    from astropy.io import fits
+    from astropy.table import Table
+
+    plain = Table({column: fits_values(table[column]) for column in table.colnames})
+    for column in table.colnames:
+        if isinstance(form := table[column].info.format, str):
+            plain[column].info.format = form
+    with silent():
+        hdu = fits.table_to_hdu(plain)
+    hdu.name = name
+    for number, column in enumerate(table.colnames, start=1):
+        info = table[column].info
+        if info.unit is not None and str(info.unit):
+            hdu.columns[column].unit = ascii_line(fits_unit(info.unit))
+        if plain[column].dtype.kind == "i" and hasattr(table[column], "mask"):
+            hdu.columns[column].null = int(_missing(plain[column].dtype))
+        if info.description:
+            hdu.header[f"TCOMM{number}"] = ascii_line(info.description)
+    for key, value in table.meta.items():
+        hdu.header[key] = value
+    return hdu
+
+
+def write_table(path: Path, table: QTable) -> None:
+    """Write a table of stars to a file, in the format that the end of its name says.
+
+    FITS and ECSV have all digits, CSV those that are shown. In CSV, no text is a formula to a
+    spreadsheet, and a missing number is an empty cell.
+
+    Parameters
+    ----------
+    path : Path
+        Its name ends in one of `SUFFIXES`.
+    table : QTable
+    """
+    from astropy.io import ascii as text_tables
+    from astropy.io import fits
+    from astropy.table import Table
+
+    plain = Table(table)  # columns with units in place of quantities
+    with atomic_path(path) as temporary, silent():
+        if path.suffix.lower() == ".fits":
+            hdus = fits.HDUList([fits.PrimaryHDU(), as_fits(table, "STARS")])
+            hdus.writeto(temporary, overwrite=True)
+        elif path.suffix.lower() == ".ecsv":
+            plain.write(temporary, format="ascii.ecsv", overwrite=True)
+        else:
+            for name in [n for n in plain.colnames if plain[n].dtype.kind == "U"]:
+                plain[name] = [no_formula(text or "") for text in plain[name].tolist()]
+            empty = [("nan", ""), (text_tables.masked, "")]
+            plain.write(temporary, format="ascii.csv", fill_values=empty, overwrite=True)
+
+
+def html_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return a table of HTML; cells of the rows are HTML, those of the head are text."""
+    cells = "".join(f"<th>{escape(name)}</th>" for name in head)
+    lines = ("".join(f"<td>{cell}</td>" for cell in row) for row in rows)
+    return f"<table><tr>{cells}</tr>{''.join(f'<tr>{line}</tr>' for line in lines)}</table>"

@@ -1,0 +1,80 @@
+"""All stars of an image in one fit: exact without noise, honest with it, in any unit."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from psfdae.model.joint_fit import chains, fit_stars
+from psfdae.model.psf_grid import PsfGrid
+
+SIGMA_PX, FWHM_PX, BOX_PX = 1.2, 2.83, 7
+
+
+@pytest.fixture(scope="module")
+def psfs():
+    """A round Gaussian at the four corners of an image of 120 × 120 px."""
+    axis = (np.arange(65) - 32) / 4
+    psf = np.exp(-(axis[:, None] ** 2 + axis**2) / (2 * SIGMA_PX**2)) / (2 * np.pi * SIGMA_PX**2)
+    return PsfGrid(np.array([0.0, 119.0]), np.array([0.0, 119.0]), np.tile(psf, (2, 2, 1, 1)), 4)
+
+
+def image_of(psfs, place, flux, size=120):
+    """Light of stars on an image without noise."""
+    side = psfs.side_px
+    image = np.zeros((size + 2 * side,) * 2)
+    corner = np.rint(place).astype(int) - side // 2
+    drawn = psfs.stamps(place, corner, side)[:, 0]
+    for (x, y), light in zip(corner + side, flux[:, None, None] * drawn, strict=True):
+        image[y : y + side, x : x + side] += light
+    return image[side:-side, side:-side]
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-18])
+def test_stars_that_overlap_are_parted_exactly(psfs, unit):
+    """A pair at 0.8 FWHM, a chain of three, and a star at the edge; half a pixel off at first."""
+    place = np.array([[30.2, 30], [32.4, 30.4], [60, 60.3], [63, 61], [66.1, 60], [118.6, 40]])
+    flux = unit * np.array([1e4, 3e3, 2e4, 500.0, 9e3, 4e3])
+    image = image_of(psfs, place, flux)
+    start = place + np.random.default_rng(1).uniform(-0.5, 0.5, place.shape)
+    error, bad = np.full(image.shape, unit), np.zeros(image.shape, bool)
+    fit = fit_stars(psfs, image, error, bad, start, None, BOX_PX, FWHM_PX)
+    sigma = np.column_stack([fit.flux_error, fit.place_error])
+    off = np.column_stack([fit.flux - flux, fit.place - place])
+    assert (np.abs(off) < 0.2 * sigma).all()
+    assert fit.flags.tolist() == [0, 0, 0, 0, 0, 1]
+    assert fit.light == pytest.approx(image, abs=unit)
+
+
+def test_errors_are_those_of_the_noise(psfs):
+    """150 stars, a third of which overlap: (fitted − true)/σ has the scatter 1, and no bias."""
+    rng, sky = np.random.default_rng(4), 100.0
+    place, flux = rng.uniform(0, 119, (150, 2)), 10 ** rng.uniform(3, 5, 150)
+    light = image_of(psfs, place, flux)
+    image, error = rng.poisson(light + sky) - sky, np.sqrt(light + sky)
+    start = place + rng.normal(0, 0.2, place.shape)
+    fit = fit_stars(psfs, image, error, light < -1, start, None, BOX_PX, FWHM_PX)
+    pulls = np.column_stack([fit.flux - flux, fit.place - place])
+    pulls /= np.column_stack([fit.flux_error, fit.place_error])
+    assert (np.abs(pulls) < 1).mean(axis=0) == pytest.approx([0.68] * 3, abs=0.1)
+    assert np.median(pulls, axis=0) == pytest.approx([0.0] * 3, abs=0.25)
+    assert np.median(fit.chi2) == pytest.approx(1.0, abs=0.1)
+    assert (fit.flags & 8 == 0).mean() > 0.95  # at rest
+
+
+def test_stars_that_have_no_pixels_are_nan_and_the_others_as_without_them(psfs):
+    place = np.array([[30.2, 30.0], [np.nan, 5.0], [80.0, 80.0], [500.0, 3.0]])
+    image = image_of(psfs, place[[0, 2]], np.array([1e4, 1e4]))
+    bad = np.zeros(image.shape, bool)
+    bad[70:90, 70:90] = bad[30, 31] = True
+    image[bad] = np.nan
+    fit = fit_stars(psfs, image, np.ones(image.shape), bad, place, np.full(4, 9e3), BOX_PX, FWHM_PX)
+    assert fit.flux[0] == pytest.approx(1e4, abs=1)
+    assert np.isnan(fit.flux[1:]).all() and np.isnan(fit.place_error[1:]).all()
+    assert fit.flags.tolist() == [1, 64, 64, 64]
+
+
+def test_chains_of_neighbours():
+    place = np.array([[0.0, 0], [1, 0], [2, 0], [9, 9], [np.nan, 0], [9.5, 9]])
+    chain = chains(place, 1.5)
+    assert [len(set(chain[rows])) for rows in ([0, 1, 2], [3, 5], [0, 3, 4])] == [1, 1, 3]
