@@ -238,7 +238,9 @@ def test_the_gain_is_seen_in_the_pixels_of_stars(sky):
     add_stamps(light, np.array(true["flux"])[:, None, None] * stamps(*place.T), *place.T)
     noise, good = np.full(light.shape, 15.0), np.zeros(light.shape, bool)
     noisy = light + noise * np.random.default_rng(2).standard_normal(light.shape)
-    assert measure_gain(model, noisy, noise, good, place) is None
+    # There, errors of the model pass for little photon noise at most.
+    (weak, _) = measure_gain(model, noisy, noise, good, place) or (np.inf, 0.0)
+    assert weak > 4.0
     assert measure_gain(model, noisy, noise, good, place[:9]) is None
 
 

@@ -181,8 +181,9 @@ def fit_field(
     """
     alternating = _Alternating(stars, background, frame_px, stamp_px, spacing, smoothness)
     tried = _supported(orders, stars)
-    # Fits: all orders, with magnitude and colour, all smoothnesses, the last one and four more.
-    with task("field", len(tried) + 2 + SMOOTHER + 5) as alternating.advance:
+    # Fits: all knots and smoothnesses, all orders, with magnitude and colour in either order, the
+    # last one and four more.
+    with task("field", 1 + COARSER + SMOOTHER + len(tried) + 3 + 5) as alternating.advance:
         return _best_fit(alternating, tried, len(orders) == 1 or len(stars) < 3, rng)
 
 
@@ -296,6 +297,7 @@ class _Alternating:
         self.axis = np.arange(side) - side // 2.0
         self.inner = np.abs(self.axis + 0.5) < stamp_px / 2
         self.set_knots(knots_of(side, spacing))
+        self.advance: Advance = lambda fits: None
         known = [column[np.isfinite(column)] for column in self.place.T]
         ends = [(column.min(), column.max()) if column.size else (0.0, 0.0) for column in known]
         self.low, self.most = np.transpose(ends)
@@ -309,7 +311,6 @@ class _Alternating:
         self.knots, self.spacing = knots, spacing_of(len(self.axis), knots)
         bend = np.diff(np.eye(knots), 2, axis=0)
         self.bend = bend.T @ bend
-        self.advance: Advance = lambda fits: None
 
     def choose_splines(self, order: int) -> None:
         """Take knots farther apart, and then smoother splines, as long as each step pays."""

@@ -630,11 +630,12 @@ class Engine:
             unknown = np.full(len(flux), np.nan)
             return {"flux_total": unknown, "flux_total_error": unknown, "background": sky}
         place = np.stack([stars.x, stars.y], axis=1)
-        total, doubt = self.wings.total(outer_light(self.estimator.psf_at, place))
+        outer = outer_light(self.estimator.psf_at, place)
+        total, doubt = self.wings.total(outer)
         # An error of a flux that was given is not known.
         own = np.hypot(error * total, flux * doubt)
-        # Wings go on evenly inside the stamp, where a star on an unknown sky has them in its sky.
-        scale = (total - 1.0) / self.wings.light()[0]
+        # Light that is even in the stamp is in the sky of a star whose sky is not known.
+        scale = self.wings.scale(outer)
         even = np.nan_to_num(np.maximum(flux, 0.0) * scale * self.wings.profile[0])
         sky = np.where(np.isnan(stars.background), sky - even, sky)
         return {"flux_total": flux * total, "flux_total_error": own, "background": sky}

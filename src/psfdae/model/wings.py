@@ -100,10 +100,13 @@ class Wings:
         return np.asarray(np.clip(known, *OUTER_RANGE))
 
     def total(self, outer: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Flux over that of the model of stars by their `outer_light`, and its error, (n,) both."""
+        """Flux over that of the model of stars by their `outer_light`, and its error, (n,) both.
+
+        How the wings change with the PSF is known to half of the change.
+        """
         scale = self.scale(outer)
         light, error = self.light()
-        return 1.0 + scale * light, scale * error
+        return 1.0 + scale * light, np.hypot(scale * error, 0.5 * (scale - 1.0) * light)
 
     def light(self, radius_px: float = np.inf) -> tuple[float, float]:
         """Part of the flux within a radius, where s = 1, and its standard error."""
