@@ -664,7 +664,7 @@ class FieldLaw:
         latent = width * (fit.pull[:, 0] - a * fit.pull[:, 1])
         with_a = -width * fit.pull[:, 1]
         flux, score = np.empty((2, len(star)))
-        pull, certain = np.empty((len(star), 3)), fit.certain
+        pull, certain, unsure = np.empty((len(star), 3)), fit.certain, 2 - (stars.flux > 0).all()
         for k, part in pairs.by_node():
             axes, rows = self._axes(k, stars.positioned), star[part]
             beyond, along = axes.noise_parts(s[rows])
@@ -673,22 +673,25 @@ class FieldLaw:
             left = image / unit[rows, None] - a[part] * mean - latent[part] @ axes.latent
             score[part], pull[part], known = axes.leading(left, s[rows], width[part])
             certain[part] -= known
-            # The star without noise and sky, and its change with a.
-            rest = np.stack([latent[part], with_a[part]])
+            # The star without noise and sky, and its change with a where that has a doubt.
+            rest = np.stack([latent[part], with_a[part]])[:unsure]
             change = along * (mean + with_a[part] @ axes.latent)
-            combined = np.concatenate([beyond * rest, np.stack([-along * left, change])], axis=2)
+            combined = np.concatenate([beyond * rest, [-along * left, change][:unsure]], axis=2)
             combined[..., 0] -= rest[..., 0]
-            one, change = combined @ axes.basis
+            one, *changes = combined @ axes.basis
             mean = beyond * self._mean(k, stars, rows)
             one += (1.0 - beyond) * images[rows] + a[part] * mean
-            change += mean
             flux[part] = one.sum(axis=1)
             one += even * (a[part] - flux[part, None])  # what is even in the star is sky
-            change += even * (1.0 - change.sum(axis=1, keepdims=True))
             some, which = np.unique(kind[rows], return_inverse=True)
-            sure = axes.pixel_variance(*(known[some] for known in usual))
+            spread = axes.pixel_variance(*(known[some] for known in usual))[which]
+            spread += one**2
+            for slope in changes:
+                change = slope + mean
+                change += even * (1.0 - change.sum(axis=1, keepdims=True))
+                spread += fit.variance[part, None] * change**2
             psf[rows] += w * one
-            square[rows] += w * (one**2 + sure[which] + fit.variance[part, None] * change**2)
+            square[rows] += w * spread
         score += (pull * np.linalg.solve(certain, pull[..., None])[..., 0]).sum(axis=1)
         sky = latent[:, 0] - np.where(free, fit.factor - flux, 0.0) / pixels
         flux = np.where(free, fit.factor, flux)
