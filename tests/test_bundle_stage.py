@@ -241,7 +241,8 @@ def test_either_half_of_the_stars_is_judged_by_the_errors_of_the_other():
     error = rng.normal(size=(1, 4000, 8, 8)) * scale
     errors = packing.Errors(np.array([0.01]), error, star, np.zeros((1, 4000)))
     fresh = rng.normal(size=(400, 8, 8)) * scale[:400]
-    found = packing.crossed_coverage(errors, fresh, 0.01)
+    halves = packing.crossed_maps(errors, len(fresh))
+    found = packing.crossed_coverage(halves, errors.nodes, fresh, 0.01)
     expected = (0.9973 + 0.2611) / 2
     wanted = {"coverage68": expected, "coverage_rms": expected, "coverage95": (1 + 0.4865) / 2}
     assert found == pytest.approx(wanted, abs=0.01)
@@ -330,7 +331,7 @@ def test_half_widths_beside_the_stars_own_noise_are_above_0_and_hold_two_thirds_
     psf = rng.normal(0, error, zero.shape)
     few = np.arange(40)
     errors, distance = stars.errors(psf[few], few)[None], np.ones((1, few.size))
-    width = packing.Errors(np.ones(1), errors, few, distance).half_width()
+    width = packing.Errors(np.ones(1), errors, few, distance).half_width
     assert width.min() > 0 and 0.1 * own < width.mean() < 0.7 * own
     covered = packing.coverage(stars.errors(psf), np.ones(2000), np.ones(1), width)
     assert covered == pytest.approx(0.72, abs=0.05)

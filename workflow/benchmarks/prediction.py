@@ -261,14 +261,12 @@ def covered(bundle, product, seed):
     said = part(("seed", "noise", "parts"), trained)
     noise, rng = star_sets.noise_model(said), stream(seed, "coverage", bundle.info.name)
     reference = bundle.info.reference or trained.get("reference")
-    split = star_sets.split_stars(product, trained["split"], said)
-    test = split.test
+    test = star_sets.split_stars(product, trained["split"], said).test
     # Images of one star of an image are of one half.
     star = product["field_index"][test] if trained["split"] == "held_out" else test
     odd = np.unique(star, return_inverse=True)[1] % 2 == 1
     halves = [
-        packing.HeldOutStars.of(product, reference, noise, split.train, test[half])
-        for half in (odd, ~odd)
+        packing.HeldOutStars.of(product, reference, noise, test[half]) for half in (odd, ~odd)
     ]
     found = {}
     for judges, judged in (halves, halves[::-1]):

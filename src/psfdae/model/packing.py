@@ -18,7 +18,7 @@ import hashlib
 from bisect import bisect_left
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -132,6 +132,7 @@ class Errors:
         kept = chosen[self.star]
         return Errors(self.nodes, self.error[:, kept], self.star[kept], self.distance[:, kept])
 
+    @cached_property
     def half_width(self) -> np.ndarray:
         """Half-width of the interval around 0 that holds 68.27 %, shape (S, d, d).
 
@@ -143,7 +144,7 @@ class Errors:
 
     def ratio95(self) -> np.ndarray:
         """By how much the interval that holds 95 % of all pixels is wider, shape (S,)."""
-        scaled = np.abs(self.error) / np.maximum(self.half_width(), LEAST_SIGMA)[:, None]
+        scaled = np.abs(self.error) / np.maximum(self.half_width, LEAST_SIGMA)[:, None]
         return np.array([np.quantile(node, WIDE) for node in scaled], np.float64)
 
     def rms(self) -> np.ndarray:
@@ -436,7 +437,7 @@ def calibrated(
     errors = measure_errors(stars, fitted, bundle.flux_model, bundle.noise_nodes, rng)
     found = replace(
         bundle,
-        error68=errors.half_width(),
+        error68=errors.half_width,
         rms=errors.rms(),
         distance_limit=errors.distance_limit(),
         ratio95=errors.ratio95(),
@@ -624,7 +625,7 @@ def measure_levels(
     """
     from psfdae.metrics import all_metrics
 
-    rows = []
+    rows, halves = [], crossed_maps(errors, len(stars.images))
     for level in levels:
         noisy, noise = draw(level), stars.noise.kappa * level
         estimate = restore(noisy, level)
@@ -636,7 +637,7 @@ def measure_levels(
                 "snr": signal_to_noise(noise, area),
                 "mse_noisy": float(np.square(noisy - stars.references).mean()),
                 **{name: float(values.mean()) for name, values in quality.items()},
-                **crossed_coverage(errors, errors_of(estimate, stars), noise),
+                **crossed_coverage(halves, errors.nodes, errors_of(estimate, stars), noise),
                 "stars": len(noisy),
             }
         )
@@ -648,25 +649,38 @@ def coverage(error: np.ndarray, noise: np.ndarray, nodes: np.ndarray, maps: np.n
     return float((np.abs(error) <= at_noise(noise, nodes, maps)).mean())
 
 
-def crossed_coverage(errors: Errors, error: np.ndarray, noise: float) -> dict[str, float]:
-    """Coverage at another noise, of either half of the stars by the errors of the other.
+def crossed_maps(errors: Errors, count: int) -> list[tuple[np.ndarray, dict[str, np.ndarray]]]:
+    """Either half of so many stars, bool (count,), with maps of errors (S, d, d) of the other half.
 
-    `error` (n, d, d) holds every star once, at `noise`. Told are `coverage68` of the
-    half-width, `coverage95` of the wider one and `coverage_rms` of the root mean square.
+    They are named by what they are to cover: `coverage68` the half-width, `coverage95` the wider
+    one and `coverage_rms` the root mean square.
     """
-    even = np.arange(len(error)) % 2 == 0
-    found: dict[str, list[float]] = {}
-    for half in (even, ~even):
-        if not half.any() or half.all():
-            continue
+    even = np.arange(count) % 2 == 0
+    found = []
+    for half in (even, ~even) if count > 1 else ():
         other = errors.of(~half)
-        level = np.full(int(half.sum()), noise)
-        half_width = other.half_width()
+        half_width = other.half_width
         wide = (half_width * other.ratio95()[:, None, None]).astype(half_width.dtype)
-        of = {"coverage68": half_width, "coverage95": wide, "coverage_rms": other.rms()}
+        maps = {"coverage68": half_width, "coverage95": wide, "coverage_rms": other.rms()}
+        found.append((half, maps))
+    return found
+
+
+def crossed_coverage(
+    halves: Sequence[tuple[np.ndarray, Mapping[str, np.ndarray]]],
+    nodes: np.ndarray,
+    error: np.ndarray,
+    noise: float,
+) -> dict[str, float]:
+    """Coverage at another noise of either half of the stars by the `crossed_maps` of the other.
+
+    `error` (n, d, d) holds every star once, at `noise`; the maps are those at the `nodes` (S,).
+    """
+    found: dict[str, list[float]] = {}
+    for half, of in halves:
+        level = np.full(int(half.sum()), noise)
         for name, maps in of.items():
-            covered = coverage(error[half], level, errors.nodes, maps)
-            found.setdefault(name, []).append(covered)
+            found.setdefault(name, []).append(coverage(error[half], level, nodes, maps))
     return {name: float(np.mean(values)) for name, values in found.items()}
 
 
