@@ -49,15 +49,15 @@ def test_faint_stars_lower_the_least_signal_to_noise():
 def test_refusal_names_the_options():
     image, place = image_of(moffat(2.6), np.full(3, 5e4), 160, 25)
     with pytest.raises(Error, match=r"stars_min = 5 are needed.*--stars-min.*--snr-min"):
-        psfdae.Stars.from_image(image, catalogue=place, **CAMERA)
-    stars = psfdae.Stars.from_image(image, catalogue=place, stars_min=3, **CAMERA)
+        psfdae.Stars.from_image(image, catalogue=place, stars_min=5, **CAMERA)
+    stars = psfdae.Stars.from_image(image, catalogue=place, **CAMERA)
     assert any("error is not known" in note for note in stars.notes)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("count", [5, 12])
+@pytest.mark.parametrize("count", [1, 5, 12])
 def test_model_of_few_stars_measures_fluxes(count):
-    flux = np.geomspace(3e4, 2e5, count)
+    flux = np.geomspace(2e5, 3e4, count)
     image, place = image_of(moffat(2.6), flux, 200, 25)
     stars = psfdae.Stars.from_image(image, catalogue=place, **CAMERA)
     model = psfdae.fit(stars, method="field")

@@ -213,7 +213,7 @@ class CalibrationStars(Group):
     margin_px: Annotated[int, Field(ge=0, le=64)] = Field(
         8, description="Pixels around a stamp, in which the sky is measured"
     )
-    stars_min: Annotated[int, Field(ge=2)] = Field(5, description="Fewest stars to learn from")
+    stars_min: Annotated[int, Field(ge=1)] = Field(1, description="Fewest stars to learn from")
     light_min: Annotated[float, Field(ge=0, lt=1)] = Field(
         0.95,
         description="Part of a star's light that stamps hold at least: where those of "

@@ -114,7 +114,7 @@ def from_stars(
     snr_min: Annotated[
         float | None, "Least S/N of a star that is learnt from.  [default: 100, less if few]"
     ] = None,
-    stars_min: Annotated[int | None, "Fewest stars to learn from.  [default: 5]"] = None,
+    stars_min: Annotated[int | None, "Fewest stars to learn from.  [default: 1]"] = None,
     stamp_px: Annotated[
         int | None, "Side of the stamps, even.  [default: 16, more if stars are larger]"
     ] = None,

@@ -105,7 +105,8 @@ class Candidates:
     def columns(self, held_out: np.ndarray) -> dict[str, np.ndarray]:
         """Columns of every star of the list, and which of the good ones are held out, (n,) each."""
         part = np.full(len(self.verdict), "", dtype="<U8")
-        part[self.bright.row] = np.where(held_out, "held out", "training")
+        part[self.bright.row[held_out]] = "held out"
+        part[self.bright.row[~held_out]] = "training"
         x, y = self.position.T
         return {
             "id": self.id,

@@ -187,7 +187,8 @@ def write_table(path: Path, table: QTable) -> None:
     """Write a table of stars to a file, in the format that the end of its name says.
 
     FITS and ECSV have all digits, CSV those that are shown. In CSV, no text is a formula to a
-    spreadsheet, and a missing number is an empty cell.
+    spreadsheet. A real number that is missing is `nan` there, so that readers need no mask, and any
+    other value that is missing an empty cell.
 
     Parameters
     ----------
@@ -209,7 +210,10 @@ def write_table(path: Path, table: QTable) -> None:
         else:
             for name in [n for n in plain.colnames if plain[n].dtype.kind == "U"]:
                 plain[name] = [no_formula(text or "") for text in plain[name].tolist()]
-            empty = [("nan", ""), (text_tables.masked, "")]
+            for column in [*plain.columns.values()]:
+                if column.dtype.kind == "f" and hasattr(column, "filled"):
+                    plain[column.name] = column.filled(np.nan)
+            empty = [(text_tables.masked, "")]
             plain.write(temporary, format="ascii.csv", fill_values=empty, overwrite=True)
 
 

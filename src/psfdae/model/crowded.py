@@ -103,12 +103,14 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
     if observation.saturate is not None:
         bad = bad | (image >= observation.saturate)
         sky = replace(sky, bad=bad)
-    place, flux = np.array(observation.positions, dtype=np.float64), None
+    origin, flux = np.array(observation.positions, dtype=np.float64), None
+    place = origin
     light, far, wings = np.maximum(sky.flat, 0.0), np.zeros(image.shape), None
     for turn in range(ROUNDS):
         flat = image - sky.level - far
         error = np.sqrt(sky.noise**2 + (light / observation.gain if observation.gain else 0.0))
-        fit = fit_stars(psfs, flat, error, bad, place, flux, _box(fwhm), MOST_MOVED_FWHM * fwhm)
+        limits = _box(fwhm), MOST_MOVED_FWHM * fwhm
+        fit = fit_stars(psfs, flat, error, bad, place, flux, *limits, origin)
         place = np.where(np.isfinite(fit.place), fit.place, place)
         flux = fit.flux
         outer = outer_light(model.on_pixels, place)
@@ -119,6 +121,7 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
         light = np.maximum(fit.light + far, 0.0)
         if turn == 0 and observation.found is not None:
             place, flux = _with_hidden(sky, doubt, place, flux, threshold, fwhm)
+            origin = np.concatenate([origin, place[len(origin) :]])
         elif turn > 0:
             # A hidden star is none if it is faint, if it may be what the PSF of another star lacks,
             # or if it has moved to another star.
@@ -126,9 +129,9 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
             real = flux > LEAST_SEEN * np.hypot(fit.flux_error, doubt)
             real &= ~_beside_others(place, SAME_FWHM * fwhm)
             real[: observation.count] = True
-            if real.all():
+            if real.all() or turn == ROUNDS - 1:
                 break
-            place, flux = place[real], flux[real]
+            place, flux, origin = place[real], flux[real], origin[real]
     seen = wings if wings is not None and wings.seen else model.wings
     found = _described(model, fit, GROUP_FWHM * fwhm, sky.flat, fit.light + far, seen)
     stars = found.stars
@@ -138,6 +141,10 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
     if observation.saturate is not None:
         saturated = image >= observation.saturate
     stars["flags"] = star_flags(stars, bad & ~saturated, saturated, _box(fwhm), fwhm)
+    # Farther from where it was expected than noise explains, a star may be another one.
+    moved = np.hypot(*(fit.place - origin).T)
+    is_far = moved > np.maximum(SAME_FWHM * fwhm, 3.0 * np.hypot(stars["x_error"], stars["y_error"]))
+    raise_flag(stars["flags"], StarFlag.OFF_CENTRE, is_far)
     if observation.found is None:
         stars["id"] = observation.identifiers
         stars["flags"] |= observation.list_flags

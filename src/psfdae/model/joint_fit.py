@@ -63,6 +63,7 @@ def fit_stars(
     flux: np.ndarray | None,
     box_px: int,
     range_px: float,
+    origin: np.ndarray | None = None,
 ) -> JointFit:
     """Fit all stars of an image together.
 
@@ -80,9 +81,12 @@ def fit_stars(
     box_px : int
         Side of the pixels about each star that decide on it, odd.
     range_px : float
-        How far a star may move from its start along either axis.
+        How far a star may move from its origin along either axis.
+    origin : ndarray, shape (n, 2), optional
+        Where the stars are by a list or by detection, by default where the fit starts.
     """
     fit = _Fit(psfs, image, error, bad, place, min(box_px, psfs.side_px))
+    middle = fit.start if origin is None else origin[fit.stars]
     # Fluxes are linear in the pixels: those at the places of the start are one step away.
     fit.set_flux(fit.best_flux() if flux is None else np.nan_to_num(flux[fit.stars]))
     # A place is known to its range: an even chance of ± a has the variance a²/3.
@@ -94,7 +98,7 @@ def fit_stars(
         step, gradient = fit.solve(design, prior, damping)
         # No farther at once than the light is nearly linear in the place, and not out of its range.
         move = np.clip(step[:, 1:], -range_px / 4, range_px / 4)
-        move = np.clip(fit.place + move, fit.start - range_px, fit.start + range_px) - fit.place
+        move = np.clip(fit.place + move, middle - range_px, middle + range_px) - fit.place
         step = np.column_stack([step[:, 0], move])
         # A group is at rest if its χ² would fall by less than 0.01: it is within 0.1 σ.
         expected = np.bincount(group, (step * gradient).sum(axis=1))
@@ -112,7 +116,7 @@ def fit_stars(
         fit.move(back, -step[back])
         damping = np.where(poor, np.maximum(4.0 * damping, 0.03), 0.1 * damping)
         cost = fit.squares() if len(back) else squares
-    return fit.result(len(place), fit.design(), prior, moving, range_px)
+    return fit.result(len(place), fit.design(), prior, moving, middle, range_px)
 
 
 def chains(place: np.ndarray, distance_px: float) -> np.ndarray:
@@ -242,6 +246,7 @@ class _Fit:
         design: np.ndarray,
         prior: np.ndarray,
         moving: np.ndarray,
+        middle: np.ndarray,
         range_px: float,
     ) -> JointFit:
         """What `count` stars are, of which these were fitted; `moving` ones were not at rest."""
@@ -252,7 +257,7 @@ class _Fit:
         # Flags as photutils has them.
         height, width = self.image.shape
         outside = (self.place < -0.5) | (self.place > (width - 0.5, height - 0.5))
-        bound = np.abs(self.place - self.start) > 0.999 * range_px
+        bound = np.abs(self.place - middle) > 0.999 * range_px
         flags = 1 * (self.pixels < self.box_px**2) + 2 * outside.any(axis=1) + 4 * (self.flux <= 0)
         flags += 8 * moving + 32 * bound.any(axis=1)
 

@@ -485,7 +485,8 @@ def with_scales(model: PsfModel, stars: HeldOutStars, rng: np.random.Generator) 
             if not usable.any():
                 continue
             noise[*index, place] = np.median((found.noise / found.flux)[usable])
-            wide = error[usable] / found.ratio95[usable, None, None]
+            # 95 % of errors are within no less than 68 % are, though a star alone has no errors.
+            wide = error[usable] / np.maximum(found.ratio95, 1.0)[usable, None, None]
             for pixels, kind in ((~bright[usable], 0), (bright[usable], 1)):
                 width[0, *index, kind, place] = np.quantile(error[usable][pixels], COVERAGE)
                 width[1, *index, kind, place] = np.quantile(wide[pixels], WIDE)

@@ -348,7 +348,8 @@ class PsfModel(FieldPsfs):
         """Least and greatest position (x, y) of the training stars; raises as `psf_at`."""
         self._field()
         low, high = (np.asarray(self.bundle.weights[name][:2]) for name in ("low", "high"))
-        if not (high > low).all():
+        # Stars without places leave zeros; a star alone is at one place.
+        if not ((high > low) | ((high == low) & (low > 0))).all():
             raise PredictionError(f"the model {self.name!r} knows no places of its stars")
         return low, high
 

@@ -276,6 +276,10 @@ class Stars:
     ) -> Stars:
         """The bright stars among those of an observation that were measured."""
         bright = found.bright
+        # A star that is alone stands twice: the model is learnt from it and tested on it.
+        if len(bright) == 1:
+            bright = bright.of(np.array([0, 0]))
+            found = replace(found, bright=bright)
         off = list_offset(
             observation.catalogue, (bright.centre - bright.listed)[:, ::-1], source.accept_offset
         )
@@ -530,9 +534,11 @@ def few_stars(stars: Stars) -> list[str]:
     count, held = len(stars), int(stars.held_out.sum())
     if count >= ENOUGH_STARS:
         return []
+    if len(np.unique(stars.candidates.bright.row)) == 1:
+        return ["one star: the PSF is this star, tested on itself; its error is not known"]
     if count < FEW_STARS:
         return [
-            f"few stars: the PSF is the mean of {count - held} stars, tested on {held}: its error "
+            f"few stars: the PSF is the mean of {count - held} stars, tested on {held}; its error "
             "is not known"
         ]
     return [
