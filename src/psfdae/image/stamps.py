@@ -79,8 +79,8 @@ MEANING: dict[StarFlag, str] = {
     StarFlag.TRUNCATED: "part of the stamp is off the image; or the star list says so",
     StarFlag.SNR_LOW: "S/N less than 1/1.25 of the least that the training had",
     StarFlag.SNR_HIGH: "S/N over 1.25 times the largest of the training; not of field models",
-    StarFlag.OFF_CENTRE: "brightest pixel farther from the centre than the stamp could be moved; in "
-    "photometry, the fit moved the star by half a FWHM and three errors of its place",
+    StarFlag.OFF_CENTRE: "brightest pixel farther from the centre than the stamp could be moved; "
+    "in photometry, the fit moved the star by half a FWHM and three errors of its place",
     StarFlag.UNLIKE_TRAINING: "farther from the training set than 99.9 % of its test stars",
     StarFlag.BLENDED: "the star list says that it was parted from a neighbour; in photometry, a "
     "star is nearer than one FWHM",

@@ -142,8 +142,9 @@ def photometry(model: FieldPsfs, observation: Observation, threshold: float) -> 
         saturated = image >= observation.saturate
     stars["flags"] = star_flags(stars, bad & ~saturated, saturated, _box(fwhm), fwhm)
     # Farther from where it was expected than noise explains, a star may be another one.
-    moved = np.hypot(*(fit.place - origin).T)
-    is_far = moved > np.maximum(SAME_FWHM * fwhm, 3.0 * np.hypot(stars["x_error"], stars["y_error"]))
+    distance_px = np.hypot(*(fit.place - origin).T)
+    sigma_px = np.hypot(stars["x_error"], stars["y_error"])
+    is_far = distance_px > np.maximum(SAME_FWHM * fwhm, 3.0 * sigma_px)
     raise_flag(stars["flags"], StarFlag.OFF_CENTRE, is_far)
     if observation.found is None:
         stars["id"] = observation.identifiers
