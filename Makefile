@@ -76,7 +76,7 @@ PYTEST := env OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 pytest --numprocesses log
 FAST_TESTS := $(PYTEST) -m "not slow and not written"
 
 .DEFAULT_GOAL := help
-.PHONY: help env reproduce report mlflow reference docs site test nightly test-all test-light test-docs test-pythons lint format lock clean \
+.PHONY: help env reproduce report mlflow reference docs site test fast-tests nightly test-all test-light test-docs test-pythons lint format lock clean \
   benchmark stability bounds training_knee bundles shipped
 
 help: ## List the targets
@@ -151,7 +151,11 @@ format: env ## Format Python and Snakemake files
 	ruff format .
 	snakefmt Snakefile workflow
 
-test: lint ## Lint, unit tests and the smoke workflow
+test: env ## Lint, unit tests and the smoke workflow
+	@$(MAKE) --no-print-directory --jobs 2 lint fast-tests
+
+# Beside lint, which keeps one core busy for a minute while the first tests are collected.
+fast-tests: env
 	$(FAST_TESTS) --junitxml results/tests.xml
 
 nightly: env ## The slow tests; PART=3/7: the third seventh of their files

@@ -121,7 +121,7 @@ def test_tables_have_units_digits_and_the_columns_of_the_list(tmp_path):
             assert units == ["pix", "electron / s", "mag"]
     assert (tmp_path / "t.csv").read_text().splitlines()[1:] == [
         "0,5.0000,1,1,'=1+1,3.0",
-        "1,,1,2,é,4.0",
+        "1,nan,1,2,é,4.0",
     ]
 
 
