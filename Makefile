@@ -133,7 +133,6 @@ reference: env ## Make the finished run in results the run of record, and renew 
 
 docs: env ## Renew the numbers in README and docs
 	python docs/tables.py
-	psfdae describe --card > docs/.model_card.md && mv docs/.model_card.md docs/model_card.md
 
 site: docs ## Build the site of README and docs in site/
 	NO_MKDOCS_2_WARNING=1 mkdocs build --strict

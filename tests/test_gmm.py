@@ -220,21 +220,6 @@ def test_validation_stars_choose_and_the_last_value_that_was_tried_is_named(caps
     assert len(other.count) == 12 and other.count.sum() == 350
 
 
-def test_another_seed_keeps_what_the_search_has_chosen():
-    """Stars stand anywhere: the search leaves the position aside."""
-    places = np.random.default_rng(3).normal(size=(400, 2))
-    data = replace(training(), positions=places)
-    settings = Gmm(**{**ONE, "components": [1, 3], "shrinkage": [20.0, 5.0]})
-    first = Placed.fit(data, settings)
-    same, other = (first.again(replace(data, seed=seed), settings) for seed in (data.seed, 5))
-    for name in Placed.stored():
-        np.testing.assert_array_equal(getattr(same, name), getattr(first, name))
-    assert len(other.count) == len(first.count) == 3
-    assert other.shrinkage == first.shrinkage
-    assert other.whitening.any() == first.whitening.any()
-    assert not np.array_equal(other.mean, first.mean)
-
-
 def test_a_search_goes_both_ways_and_more_clusters_must_pay():
     asked = []
 

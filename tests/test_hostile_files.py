@@ -243,7 +243,6 @@ def test_results_never_take_the_place_of_what_they_are_made_of(good, tmp_path):
     for words in (
         ["predict", cube, "--model", model, "--out", model, "--overwrite"],
         ["predict", cube, "--mask", cube, "--out", cube, "--overwrite"],
-        ["export", model, "--out", tmp_path / "x" / ".." / model.name],
         ["from-stars", cube, "--catalogue", field, "--pixel-scale", 1, "--report", field],
     ):
         out = [] if "--out" in words else ["--out", tmp_path / "model"]

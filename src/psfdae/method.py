@@ -355,28 +355,12 @@ class HasConditions(Protocol):
 
 
 @runtime_checkable
-class FitsAgain(Protocol):
-    """Has searched for some of its settings."""
-
-    def again(self, data: TrainingSet, **settings: Group) -> Self:
-        """A fit to `data` with its seed and the settings that were found."""
-
-
-@runtime_checkable
 class GoesOn(Protocol):
     """A fit to templates may go on from one to the realisations."""
 
     @classmethod
     def continues(cls, config: Config) -> bool:
         """Whether it does, by its settings."""
-
-
-@runtime_checkable
-class Exports(Protocol):
-    """Is a network."""
-
-    def export(self, stamp_px: int, path: Path) -> None:
-        """Write it as ONNX."""
 
 
 class Method:

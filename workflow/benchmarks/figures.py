@@ -24,7 +24,6 @@ WAYS = {
 """Label, colour and marker of every method and backend."""
 
 SCENES = {"seidel": "scene 1", "turbulence": "scene 2"}
-ENGINES = {"torch": ("o", "-"), "onnxruntime": ("s", "--")}
 COLORS = {"simulation": SERIES_COLORS[0], "inference": SERIES_COLORS[1]}
 COSTS = {"time_s": "time (s)", "peak_mb": "peak memory (MB)", "disk_mb": "disk (MB)"}
 SIZES = {"components": "components K", "rows": "side of the map", "epochs": "epochs"}
@@ -201,11 +200,10 @@ def inference(table):
     panels = figure.subplots(*shape, sharex=True, sharey=True, squeeze=False)
     groups = table.groupby(["threads", "stamp_px"])
     for axes, ((count, side), part) in zip(panels.flat, groups, strict=True):
-        for (engine, width), rows in part.sort_values("batch").groupby(["engine", "width"]):
-            marker, style = ENGINES[engine]
+        for width, rows in part.sort_values("batch").groupby("width"):
             low, high = rows["stars_per_s_low"], rows["stars_per_s_high"]
             axes.fill_between(rows["batch"], low, high, color=colors[width], alpha=0.15, lw=0)
-            line = {"marker": marker, "ms": 4, "ls": style, "lw": 1.3, "color": colors[width]}
+            line = {"marker": "o", "ms": 4, "lw": 1.3, "color": colors[width]}
             axes.plot(rows["batch"], rows["stars_per_s"], **line)
         axes.set(**LOGS, title=f"{side} × {side} px, {count} thread{'s' if count > 1 else ''}")
         axes.set_xticks(batches, batches)
@@ -216,8 +214,6 @@ def inference(table):
     for axes in panels[:, 0]:
         axes.set_ylabel("stars per second")
     handles = [entry(f"width {width}", color=colors[width], lw=2) for width in widths]
-    for engine, (marker, style) in ENGINES.items():
-        handles.append(entry(engine, color="black", marker=marker, ls=style, ms=4))
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
     figure.suptitle("Speed of the network (median, band: all repeats)")
     return figure

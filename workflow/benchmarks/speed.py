@@ -37,7 +37,7 @@ SIMULATED = 2  # of the numbers of stars, the smallest, simulation and predictio
 
 @command("inference", reads=("dae", "benchmark"))
 def inference(config: Config, out: Annotated[File, "CSV with stars per second."]) -> None:
-    """Time the network in torch and in onnxruntime, on a quiet machine.
+    """Time the network in torch, on a quiet machine.
 
     Speed does not depend on the values of the weights, so random networks do. Widths are
     half, once and twice the configured one; stamps are the two smallest of the config.
@@ -47,12 +47,8 @@ def inference(config: Config, out: Annotated[File, "CSV with stars per second."]
     most = LARGEST_BATCH_PER_STAMP * settings.stamps
     batches = [batch for batch in BATCHES if batch <= most]
     dae, rows = config.dae.model_dump(), []
-    with TemporaryDirectory() as folder:
-        alone(1, export_networks, dae, sizes, Path(folder))
-        for threads in sorted({1, settings.threads}):
-            for engine in ("torch", "onnxruntime"):
-                work = (engine, dae, Path(folder), sizes, batches, threads, settings.repeats)
-                rows += alone(threads, time_networks, *work)
+    for threads in sorted({1, settings.threads}):
+        rows += alone(threads, time_networks, dae, sizes, batches, threads, settings.repeats)
     write(out, rows)
 
 
@@ -66,26 +62,8 @@ def random_network(dae, width, side):
     return build_dae(dae["kernels"], widths, "he", seed), image_scale(dae["scale"], side)
 
 
-def onnx_path(folder, width, side):
-    """Name of an exported network."""
-    return folder / f"width{width}_stamp{side}.onnx"
-
-
-def export_networks(dae, sizes, folder):
-    """Export random networks of each width and side of the stamps."""
-    from psfdae.networks.dae import export_onnx
-
-    for size in sizes:
-        export_onnx(*random_network(dae, *size), size[1], onnx_path(folder, *size))
-
-
-def network(engine, dae, folder, size, threads):
-    """An exported network, or in torch `predict` as every stage calls it."""
-    if engine == "onnxruntime":
-        from psfdae.networks.dae import session
-
-        run = session(onnx_path(folder, *size), threads).run
-        return lambda images: run(None, {"images": images})[0]
+def network(dae, size, threads):
+    """`predict` with a random network, as every stage calls it."""
     import torch
 
     from psfdae.networks.dae import predict
@@ -95,17 +73,17 @@ def network(engine, dae, folder, size, threads):
     return lambda images: predict(model, images, factor, len(images))
 
 
-def time_networks(engine, dae, folder, sizes, batches, threads, repeats):
-    """Rows of an engine in this process, with median and extremes of the repeats."""
+def time_networks(dae, sizes, batches, threads, repeats):
+    """Stars per second in this process, with median and extremes of the repeats."""
     rows = []
     for (width, side), batch in product(sizes, batches):
-        apply = network(engine, dae, folder, (width, side), threads)
+        apply = network(dae, (width, side), threads)
         noise = stream(0, "throughput").normal(0.0, 0.005, (batch, side, side))
         timer = Timer(partial(apply, (noise + side**-2.0).astype(np.float32)))
         timer.timeit(1)
         calls = max(1, round(LEAST_S / timer.timeit(1)))
         rates = calls * batch / np.array(timer.repeat(repeats, calls))
-        row = {"engine": engine, "width": width, "stamp_px": side, "threads": threads}
+        row = {"width": width, "stamp_px": side, "threads": threads}
         row |= {"batch": batch, "repeats": repeats, "stars_per_s": np.median(rates)}
         rows.append(row | {"stars_per_s_low": rates.min(), "stars_per_s_high": rates.max()})
     return rows

@@ -14,7 +14,7 @@ from psfdae import fits
 from psfdae.belonging import STARS, require
 from psfdae.cli import program
 from psfdae.files import read_product, write_csv
-from psfdae.method import FitsAgain, GoesOn
+from psfdae.method import GoesOn
 from psfdae.methods import groups_of, method
 from psfdae.model import star_sets
 from psfdae.options import File, Folder
@@ -319,11 +319,11 @@ def own_fits(config, kind, dataset, references, product, results):
     return found
 
 
-def other_fits(config, kind, own, product, seed):
+def other_fits(config, kind, references, product, seed):
     """Fits that differ from the given ones by nothing but their seed."""
     found = {}
     goes_on = issubclass(kind, GoesOn) and kind.continues(config)
-    for reference, fitted in own.items():
+    for reference in references:
         if found and kind.storage and not kind.storage.per_reference:
             found[reference] = next(iter(found.values()))  # one serves all
             continue
@@ -334,8 +334,7 @@ def other_fits(config, kind, own, product, seed):
                 start=found.get("realisation") if goes_on else None,
             )
             data = replace(data, seed=seed)
-            again = fitted.again if isinstance(fitted, FitsAgain) else kind.fit
-            found[reference] = again(data, **kind.settings(config))
+            found[reference] = kind.fit(data, **kind.settings(config))
     return found
 
 

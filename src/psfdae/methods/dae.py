@@ -186,12 +186,6 @@ class Dae(Method):
         batch = max(1, BLOCK_VALUES // (max(info.dae.widths) * info.stamp_px**2))
         return cls(channels_last(network).eval(), float(info.image_scale), batch)
 
-    def export(self, stamp_px: int, path: Path) -> None:
-        """Write the network as ONNX and check it against torch; raises ExportError."""
-        from psfdae.networks.dae import export_onnx
-
-        export_onnx(self.network, self.factor(stamp_px), stamp_px, path)
-
     @classmethod
     def described(cls, place: Path) -> dict[str, Any]:
         """The resolved configuration of the training."""

@@ -133,12 +133,6 @@ class GaussianMixture(MixtureLaw, Method):
         final = cls._clustered(data, data.train[: gmm.stars], clusters, gmm, positions)
         return replace(final, shrinkage=np.array([shrinkage]))
 
-    def again(self, data: TrainingSet, gmm: Gmm) -> Self:
-        """Fit to other stars, with the K, the ν and the use of the position of this one."""
-        positions = bool(self.whitening.any())
-        one = self._clustered(data, data.train[: gmm.stars], len(self.count), gmm, positions)
-        return replace(one, shrinkage=self.shrinkage)
-
     @classmethod
     def _chosen(
         cls, data: TrainingSet, learn: np.ndarray, judge: np.ndarray, sizes: list[int], gmm: Gmm
