@@ -9,7 +9,6 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 FORMAT_VERSION = 3  # raised when an older psfdae could no longer read what a newer one writes
-OLDEST_FORMAT = 2
 
 # A network says its shape, other methods what they are.
 NETWORK, OTHERS = ("dae", "image_scale"), ("method", "reference")

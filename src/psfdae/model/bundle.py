@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from pydantic import ValidationError
 
-from psfdae.bundle_info import FORMAT_VERSION, OLDEST_FORMAT, BundleInfo
+from psfdae.bundle_info import FORMAT_VERSION, BundleInfo
 from psfdae.errors import Error, needed_by
 from psfdae.files import ProductError, atomic_path
 from psfdae.image.errors import one_line
@@ -49,8 +49,8 @@ TOLERANCE = 1e-3  # by which the mean PSF may miss the sum 1, and eigenvectors o
 VARIANCE = 1e6  # largest variance of images of sum 1 that is no nonsense
 # Arrays of S nodes that a bundle may lack, and the shape of their rows.
 SCALES = {"scale68": (2, 3, 2), "scale95": (2, 3, 2), "flux_error_scale": ()}
-OPTIONAL = {"strange_limit": (), "widening": (7,), **SCALES}
-NEVER_NEGATIVE = {"error68", "rms", "ratio95", "widening", *SCALES}
+OPTIONAL = {"strange_limit": (), **SCALES}
+NEVER_NEGATIVE = {"error68", "rms", "ratio95", *SCALES}
 # Arrays of float64; the others are float32.
 DOUBLE = {"flux/variance", "flux/rest", "noise_nodes", "distance_limit", "ratio95", *OPTIONAL}
 
@@ -104,9 +104,6 @@ class Bundle:
     scale68: np.ndarray | None = None
     scale95: np.ndarray | None = None
     flux_error_scale: np.ndarray | None = None  # (S,), scatter of the flux over its error
-    # (S, 7), what format 2 had in their place: 68 % and 95 % for each of the three cases of flux
-    # and sky, with estimated noise and of all pixels; then the flux
-    widening: np.ndarray | None = None
 
     @property
     def sha256(self) -> str:
@@ -135,7 +132,7 @@ class Bundle:
         return errors
 
     def scales(self, noise: np.ndarray) -> list[np.ndarray] | None:
-        """`scale68`, `scale95` and `flux_error_scale`, of any format, at the noise of stars (n,).
+        """`scale68`, `scale95` and `flux_error_scale` at the noise of stars (n,).
 
         They are interpolated linearly: (n, 2, 3, 2) twice, and (n,); None if there are none.
         """
@@ -145,15 +142,7 @@ class Bundle:
             found = [np.interp(noise, self.noise_nodes, column) for column in columns]
             return np.stack(found, axis=1).reshape(-1, *table.shape[1:])
 
-        if self.widening is None:
-            return None if self.scale68 is None else [at(getattr(self, name)) for name in SCALES]
-        old = at(self.widening)
-        found = []
-        for wider in (old[:, 0:6:2], old[:, 1:6:2]):
-            # That format took the estimate of the noise for a factor by itself.
-            both = np.stack([wider / wider[:, :1], wider], axis=1)
-            found.append(np.stack([both, both], axis=-1))
-        return [*found, old[:, 6]]
+        return None if self.scale68 is None else [at(getattr(self, name)) for name in SCALES]
 
 
 def estimator(bundle: Bundle) -> Method:
@@ -394,10 +383,10 @@ def _check_format(text: Any, path: Path) -> None:
             f"{path}: format {version}, but psfdae {__version__} reads up to "
             f"format {FORMAT_VERSION}; a newer psfdae would do"
         )
-    if version < OLDEST_FORMAT:
+    if version < FORMAT_VERSION:
         raise BundleError(
-            f"{path}: format {version}, but psfdae {__version__} reads formats from "
-            f"{OLDEST_FORMAT} on; train the model again"
+            f"{path}: format {version}, but psfdae {__version__} reads format {FORMAT_VERSION}; "
+            "train the model again"
         )
 
 
@@ -431,8 +420,7 @@ def _check(info: BundleInfo, tensors: Mapping[str, np.ndarray], path: Path) -> N
         "ratio95": (nodes,),
         "distance_limit": (),
     }
-    old = info.format_version == OLDEST_FORMAT
-    known = {"strange_limit", *(("widening",) if old else SCALES)} & set(tensors)
+    known = {"strange_limit", *SCALES} & set(tensors)
     known |= set(SCALES if set(SCALES) & known else ())  # all of them or none
     expected |= {name: (nodes, *OPTIONAL[name]) for name in known}
     expected |= _of_method(info, tensors, path)

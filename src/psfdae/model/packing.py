@@ -445,7 +445,6 @@ def calibrated(
         scale68=None,
         scale95=None,
         flux_error_scale=None,
-        widening=None,
     )
     rng = stream(seed, "noise", "calibration", "scales")
     return with_scales(PsfModel(found, fitted), stars, rng), errors
