@@ -12,8 +12,7 @@ for python in $PYTHONS; do
     fi
     venv=$PWD/.venvs/$python-$RESOLUTION
     uv venv --quiet --clear --system --no-python-downloads --python "$python" "$venv"
-    uv pip install --quiet --python "$venv" --resolution "$RESOLUTION" --editable '.[paper,dev]' \
-        "asdf-astropy>=0.10; python_version >= '3.12'"
+    uv pip install --quiet --python "$venv" --resolution "$RESOLUTION" --editable '.[paper,dev]'
     uv pip install --quiet --python "$venv" --requirement requirements/build.in
     uv pip freeze --quiet --python "$venv" >"$venv/versions.txt"
     echo "Python $python, $RESOLUTION versions of its dependencies:"

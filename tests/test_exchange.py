@@ -88,20 +88,6 @@ def test_photutils_reads_stdpsf(tmp_path):
         assert np.abs(seen - wanted).max() < 1e-3 * wanted.max()
 
 
-def test_photutils_reads_asdf(tmp_path):
-    pytest.importorskip("photutils.extension")
-    asdf = pytest.importorskip("asdf")
-    pytest.importorskip("asdf_astropy")
-    model, path = Moving(), tmp_path / "m.asdf"
-    places = np.rint(model.grid(7, 5))
-    exchange.write_asdf(path, model, places, 4)
-    with asdf.open(path) as file:
-        grid = file["psf"]
-    assert type(grid) is GriddedPSFModel and grid.grid_xypos == pytest.approx(places)
-    assert grid.data == pytest.approx(model.psf_at(*places.T, 4))
-    assert grid.meta["model"] == model.name
-
-
 def test_the_same_everywhere_is_a_polynomial_of_order_0(tmp_path, monkeypatch):
     monkeypatch.setattr(Moving, "order", 0)
     monkeypatch.setattr(Moving, "field_range", lambda self: (LOW, LOW))

@@ -11,7 +11,7 @@ import numpy as np
 from psfdae.cli import command
 from psfdae.files import check_outputs
 from psfdae.model import exchange
-from psfdae.model.exchange import ASDF, PSFEX, STDPSF, load_field
+from psfdae.model.exchange import PSFEX, STDPSF, load_field
 from psfdae.model.field_psfs import FieldPsfs, PredictionError
 from psfdae.options import File
 
@@ -29,17 +29,14 @@ def psf(
     ] = None,
     overwrite: Annotated[bool, "Replace a file that exists."] = False,
     *,
-    out: Annotated[
-        File, "FITS cube for photutils, NAME.stdpsf.fits, NAME.asdf, or NAME.psf as of PSFEx."
-    ],
+    out: Annotated[File, "FITS cube for photutils, NAME.stdpsf.fits, or NAME.psf as of PSFEx."],
 ) -> None:
     """Write the PSFs of MODEL, of from-stars --method field or of PSFEx, at places of the image.
 
     Each image of the cube is a PSF of flux 1 with its centre in the middle, sampled at parts of
     a pixel. The header names the places, y before x, as the files of STScI's STPSF do; photutils
     3.1 reads one, or a grid. A grid in NAME.stdpsf.fits is as STScI's STDPSF, which older releases
-    read, too; in NAME.asdf it is photutils' own GriddedPSFModel. NAME.psf has the whole field, for
-    SExtractor and other readers of PSFEx's models.
+    read, too. NAME.psf has the whole field, for SExtractor and other readers of PSFEx's models.
     """
     check_outputs((out,), (model,))
     if out.exists() and not overwrite:
@@ -60,16 +57,12 @@ def psf(
         off = exchange.write_psfex(out, loaded, oversampling)
         print(f"{out}: within {off:.1g} of the brightest value of {model} at the places looked at")
         return
-    if at and out.name.endswith(ASDF):
-        raise PredictionError(f"{out}: has a --grid, no --at")
     size = None if grid is None else _size(grid)
     places = np.array([_place(text) for text in at]) if size is None else loaded.grid(*size)
     for note in _notes(loaded, places):
         print(f"{model}: {note}")
     if standard and size is not None:
         exchange.write_stdpsf(out, loaded, *size)
-    elif out.name.endswith(ASDF):
-        exchange.write_asdf(out, loaded, np.rint(places), oversampling)
     else:
         exchange.write_grid(out, loaded, places, oversampling)
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from functools import cached_property
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -25,7 +24,7 @@ from psfdae.model.psf_model import load_model
 from psfdae.moments import measure_shapes
 from psfdae.version import __version__
 
-PSFEX, STDPSF, ASDF = ".psf", ".stdpsf.fits", ".asdf"
+PSFEX, STDPSF = ".psf", ".stdpsf.fits"
 """Ends of names: what a file is written as, or read as."""
 
 LANCZOS = 4  # order of the kernel, as of PSFEx
@@ -279,37 +278,6 @@ def write_grid(path: Path, model: FieldPsfs, places: np.ndarray, oversampling: i
         key = f"DET_YX{number}" if number < 100 else f"HIERARCH DET_YX{number}"
         cards.append((key, f"({row:.8g}, {column:.8g})", "y, x, 0-based"))
     _write_cube(path, model, places, oversampling, cards)
-
-
-def write_asdf(path: Path, model: FieldPsfs, places: np.ndarray, oversampling: int) -> None:
-    """Write PSFs on a grid of places (n, 2), x and y, as photutils' `GriddedPSFModel`.
-
-    It is the value of `psf` in an ASDF file.
-
-    Raises
-    ------
-    PredictionError
-        If the PSFs would have no middle sample, two places are the same pixel, or what writes such
-        files is not installed.
-    """
-    _require_middle(path, model, oversampling)
-    if len(np.unique(places, axis=0)) < len(places):
-        raise PredictionError(f"{path}: places less than a pixel apart; fewer in the --grid")
-    if not (find_spec("asdf_astropy") and find_spec("photutils.extension")):
-        raise PredictionError(
-            f"{path}: ASDF files take asdf-astropy and photutils 3.1 or newer, which needs "
-            "Python 3.12: pip install asdf-astropy 'photutils>=3.1'"
-        )
-    import asdf
-    from astropy.nddata import NDData
-    from photutils.psf import GriddedPSFModel
-
-    about: dict[str, Any] = {"grid_xypos": places.tolist(), "oversampling": oversampling}
-    about |= {"creator": f"psfdae {__version__}", "model": model.name, "sha256": model.sha256}
-    psfs = model.psf_at(places[:, 0], places[:, 1], oversampling)
-    grid = GriddedPSFModel(NDData(psfs, meta=about))
-    with atomic_path(path) as temporary:
-        asdf.AsdfFile({"psf": grid}).write_to(temporary)
 
 
 def _write_cube(
