@@ -490,8 +490,6 @@ def inference():
     """Stars per second of the network at its best batch."""
     keys = ["width", "stamp_px", "threads"]
     rows = csv("tables/benchmark_inference.csv").sort_values("stars_per_s")
-    if "engine" in rows:  # a table of before 28 November has another engine, too
-        rows = rows[rows["engine"] == "torch"]
     return rows.drop_duplicates(keys, keep="last").sort_values(keys)
 
 
