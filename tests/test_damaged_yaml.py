@@ -2,47 +2,18 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import shutil
 
-import numpy as np
 import pytest
 
 from command_line import refused as refusal
 from psfdae.files import ProductError
 from psfdae.reading import read_csv, read_json, read_table, read_yaml
-from psfdae.settings import ConfigError
 from psfdae_paper.configuration import compose
 from psfdae_paper.configuration.compose import config_dir, forget, load
-from psfdae_paper.sweeps.points import SweepError, plan_sweep
-from trainings import load_knee
 
 SCENE3 = ["dataset=alignment", "preset=smoke"]
-READERS = {
-    "config.yaml": load,
-    "dataset/dataset3.yaml": load,
-    "preset/smoke.yaml": lambda: load(["preset=smoke"]),
-    "prescription/rc15.yaml": lambda: load(SCENE3),
-    "sweep/dae_width.yaml": lambda: plan_sweep("dae_width").points,
-    "knee/points.yaml": load_knee,
-}
-"""Files of the configuration, and what reads each."""
-
-INSERTED = (
-    *(b"\t", b"\n", b": ", b"- ", b"'", b"[", b"{", b"<<: *a\n", b"!!python/object:os.system "),
-    *(b"\x00", b"\xff", b"\xef\xbb\xbf", b"---\n", b"1e999", b"2024-02-30", b"${", b"9" * 400),
-)
-"""Signs of YAML and OmegaConf, and bytes that are no UTF-8."""
-
-
-def damaged_copies(text, count, seed):
-    """Yield copies of a file with a piece inserted, and those with a few bytes lost."""
-    rng = np.random.default_rng(seed)
-    for _ in range(count):
-        place = int(rng.integers(len(text)))
-        yield text[:place] + INSERTED[rng.integers(len(INSERTED))] + text[place:]
-        yield text[:place] + text[place + int(rng.integers(1, 20)) :]
 
 
 @pytest.fixture
@@ -79,20 +50,6 @@ def test_a_mistake_is_one_short_line_with_its_place(folder, name, content, words
         assert refusal("train", "--stars=x", "--out=y") == line
 
 
-@pytest.mark.parametrize("count", [1, pytest.param(12, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("name", READERS)
-def test_no_damage_to_the_configuration_is_another_error(folder, name, count):
-    path = folder / name
-    for damaged in damaged_copies(path.read_bytes(), count, seed=sum(name.encode())):
-        path.write_bytes(damaged)
-        forget()
-        with contextlib.suppress(ConfigError, SweepError):
-            READERS[name]()
-
-
-ALIASES = [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 12)]
-
-
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -100,7 +57,6 @@ ALIASES = [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 12
         ("- x", "no mapping"),
         ("a: 2024-01-02", "neither text"),
         ("!!python/object/apply:os.getpid []", "python"),
-        ("\n".join(["a0: &a0 x", *ALIASES]), "more than"),
     ],
 )
 def test_a_network_s_configuration_is_texts_and_numbers(tmp_path, text, words):

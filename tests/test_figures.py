@@ -7,7 +7,6 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from psfdae.figures import StripRow, restoration_strip, spread_stars
 from psfdae.files import Column, ProductError, write_product
 from psfdae_paper.evaluation.figures import template_map
 from psfdae_paper.stages import figures as stage
@@ -62,32 +61,6 @@ def test_template_map_shows_the_bright_pixel_where_it_belongs():
     opposite = (x - (column - 1.5) * pixel, y - (row - 1.5) * pixel)
     assert rgb_at(figure, axes, *at).min() > 0.7
     assert rgb_at(figure, axes, *opposite).max() < 0.1
-
-
-def test_spread_stars_are_distinct_and_even():
-    index, _ = square_grid(11, 1.0)
-    position = np.repeat(index, 3, axis=0).astype(float)
-    picks = spread_stars(position, 8)
-    assert len(set(picks)) == 8
-    for quadrant in ((0, 0), (0, 1), (1, 0), (1, 1)):
-        assert ((position[picks] > 5) == quadrant).all(axis=1).any()
-    assert sorted(spread_stars(position[:2], 8)) == [0, 1]
-
-
-def test_strip_has_a_stamp_per_star_and_row(gaussian_stars):
-    truth = gaussian_stars[:3]
-    rows = [
-        StripRow("reference", truth),
-        StripRow("noisy\nλ = 0.001", 0.5 * truth, np.array([1e-6, 2.5e-5, 6.174e-4]), True),
-        StripRow("DAE\nλ = 0.001", 0.5 * truth, np.array([1e-6, 2e-6, 3e-6])),
-    ]
-    figure = restoration_strip(rows, ["a", "b", "c"], "stars")
-    (axes,) = figure.axes
-    shown = [image.get_array() for image in axes.images]
-    assert len(shown) == 9
-    assert shown[0].max() == pytest.approx(1.0)
-    assert shown[3].max() == pytest.approx(1.0)  # noisy: by its own maximum
-    assert shown[6].max() == pytest.approx(np.sqrt(0.5))
 
 
 def test_stages_write_the_same_bytes_twice(tmp_path):

@@ -13,8 +13,6 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import Table
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from command_line import psfdae, refused
 from fits_inputs import PACK, open_observation, write_cube, write_field
@@ -134,30 +132,6 @@ def test_a_bad_file_is_one_line_and_no_code(good, tmp_path, monkeypatch, name, c
     line = refused(*command(good, path))
     assert words in " ".join(line.split()) and line.rstrip("\n").isprintable()
     assert list(tmp_path.iterdir()) == [path]
-
-
-EDITS = st.lists(st.tuples(st.floats(0, 1), st.binary(max_size=90), st.integers(0, 90)), max_size=5)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", [CUBE, TILES, LIST, TABLE, MODEL])
-@settings(
-    max_examples=25,
-    deadline=None,
-    derandomize=True,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
-)
-@given(edits=EDITS)
-def test_any_damage_ends_with_a_product_or_one_line(good, tmp_path, name, edits):
-    raw = bytearray((good / name).read_bytes())
-    for place, piece, removed in edits:
-        start = int(place * min(len(raw), 9000))  # headers, mostly
-        raw[start : start + removed] = piece
-    path = tmp_path / name
-    path.write_bytes(raw)
-    done = psfdae(*command(good, path))
-    assert done.exit_code in (0, 2), done.output
-    assert len(done.output.splitlines()) == done.exit_code // 2, done.output
 
 
 # What is read of files that are packed or change.

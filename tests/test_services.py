@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import re
 import sys
 
 import pytest
-import yaml
 
-from docs_pages import ROOT, read
+from docs_pages import ROOT
 from workflow_runs import captured
 
 JOBS = sorted((ROOT / ".github/workflows").glob("*.yml"))
@@ -28,13 +26,3 @@ def test_files_are_valid(schema, files):
     option = ("--schemafile", str(path)) if path.is_file() else ("--builtin-schema", schema)
     done = captured([sys.executable, "-m", "check_jsonschema", *option, *map(str, files)])
     assert done.returncode == 0, done.stdout
-
-
-def test_jobs_call_make_and_nothing_else():
-    targets = re.findall(r"^([a-z-]+):.*## ", read("Makefile"), re.M)
-    for path in JOBS:
-        jobs = yaml.safe_load(path.read_text(encoding="utf-8"))["jobs"].values()
-        for lines in ([step["run"] for step in job["steps"] if "run" in step] for job in jobs):
-            assert len(lines) == 1
-            called = re.fullmatch(r"make ([a-z-]+)( [A-Z]+=(\w+|\$\{\{ matrix\.\w+ \}\}))*", *lines)
-            assert called and called[1] in targets, lines

@@ -14,8 +14,6 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PATH = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-VARYING = ("history.csv", "_times.csv", "alignment_time.csv", "runtime.csv", "mlflow.db")
-"""Ends of the names of files with run times, which no two runs share."""
 QUIET = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
 NO_CLUSTER = {"SLURM_CONF": os.devnull}
 """Snakemake asks SLURM's programs, where there are any, and waits 10 s for a cluster in vain."""
@@ -45,7 +43,7 @@ def clone(folder):
     if not (environment_of_make / ".complete").is_file():
         pytest.skip("the environment is not make's")
     made = shutil.ignore_patterns(
-        *(".*_cache", ".cache", ".git", ".hypothesis", ".snakemake", ".venv*"),
+        *(".*_cache", ".cache", ".git", ".snakemake", ".venv*"),
         *("__pycache__", "dist", "site"),
     )
 
