@@ -92,7 +92,9 @@ class Sky:
         smooth, limit = self._above(threshold, fwhm_px)
         # A source has at least a circle of half the FWHM in diameter.
         least = max(LEAST_PX, round(np.pi * (fwhm_px / 4.0) ** 2))
-        finder = SourceFinder(least, n_levels=LEVELS, contrast=CONTRAST)
+        # Smoothed stars have shallow saddles between them, which few levels miss.
+        levels = 4 * LEVELS if fwhm_px else LEVELS
+        finder = SourceFinder(least, n_levels=levels, contrast=CONTRAST)
         finder.progress_bar = False  # photutils 3.0 shows one; the argument goes in 4.0
         parts = finder(smooth, limit, mask=self.holes)
         if parts is None:

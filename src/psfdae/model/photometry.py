@@ -27,6 +27,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -382,7 +383,11 @@ class Photometer:
         limit = SLACK * model.high.max()
         self._high = (MARGIN * model.high + limit).astype(np.float32)
         self._low = (model.low / MARGIN - limit).astype(np.float32)
-        self._free_sky = model.with_free_sky()
+
+    @cached_property
+    def _free_sky(self) -> FluxModel:
+        """The model of stars on an unknown sky, which few stars with bad pixels ask for."""
+        return self.model.with_free_sky()
 
     def measure(
         self, stamps: np.ndarray, bad: np.ndarray, start: np.ndarray, known: Stamps
@@ -510,8 +515,10 @@ class Photometer:
     ) -> None:
         """Fit some stars with `robust_flux` and overwrite their rows of `out`."""
         free = ~np.isfinite(known.background[stars])
-        for model, members in ((self._free_sky, stars[free]), (self.model, stars[~free])):
-            nothing = None
+        for is_free, members in ((True, stars[free]), (False, stars[~free])):
+            if not members.size:
+                continue
+            model, nothing = self._free_sky if is_free else self.model, None
             for begin in range(0, members.size, GROUP):
                 group = members[begin : begin + GROUP]
                 x = np.tile(self.model.mean, (GROUP, 1))

@@ -304,6 +304,7 @@ def wings_of(
     count = len(radius)
     blank = Wings(radius, np.zeros(count), np.zeros((count, count)), mean)
     normal, right, square, pixels = np.zeros((count + 1,) * 2), np.zeros(count + 1), 0.0, 0
+    blocks = []
     # Within a stamp all pixels count alike: then p_0 is the mean of what the model leaves there,
     # and p_0 times the area of the stamp the light that it lacks, as an aperture would find it.
     even = np.sqrt(uniform_filter(np.square(error), stamp_px, mode="nearest"))
@@ -317,21 +318,38 @@ def wings_of(
         flat, seen = design.reshape(count + 1, -1), (left[band] * weight).ravel()
         normal, right = normal + flat @ flat.T, right + flat @ seen
         square, pixels = square + float(seen @ seen), pixels + int(np.count_nonzero(weight))
+        each = np.concatenate([design, [left[band] * weight, weight > 0]])
+        blocks.append(block_sums(each, stamp_px).reshape(len(each), -1))
     if not normal[-1, -1] > 0:
         return None
+    *block_design, block_light, block_pixels = np.concatenate(blocks, axis=1)
     # Generalised least squares of p and of the even light, of which nothing is expected, in units
-    # of the σ that are expected: (N/χ² + 1) x = b/χ² + μ, χ² that of the pixels, at least 1.
+    # of the σ that are expected: (N/χ² + 1) x = b/χ² + μ, χ² at least 1 and that of the pixels, or
+    # of sums over blocks of a stamp: a sky that is not even, and stars and galaxies that nobody
+    # sees, are residuals that neighbouring pixels share, and wings are as wide as these.
     expected, sigma = expected_profile(radius, mean)
     unit = np.append(sigma, normal[-1, -1] ** -0.5)
     normal, right = normal * unit * unit[:, None], right * unit
     known, start = np.diag(np.append(np.ones(count), 0.0)), np.append(expected / sigma, 0.0)
     chi2 = 1.0
-    for _ in range(2):
+    for _ in range(3):
         inverse = np.linalg.inv(normal / chi2 + known)
         found = inverse @ (right / chi2 + start)
-        chi2 = max((square - 2.0 * found @ right + found @ normal @ found) / max(pixels, 1), 1.0)
+        of_pixels = (square - 2.0 * found @ right + found @ normal @ found) / max(pixels, 1)
+        shared = block_light - (found * unit) @ np.array(block_design)
+        chi2 = max(of_pixels, float(shared @ shared) / max(block_pixels.sum(), 1.0), 1.0)
     found, inverse = found * unit, inverse * unit * unit[:, None]
     return Wings(radius, found[:-1], inverse[:-1, :-1], mean)
+
+
+def block_sums(values: np.ndarray, side: int) -> np.ndarray:
+    """Return sums over blocks of side × side pixels of the last two axes of an array.
+
+    Blocks at the lower and right edges may be smaller.
+    """
+    for axis in (-2, -1):
+        values = np.add.reduceat(values, range(0, values.shape[axis], side), axis=axis)
+    return values
 
 
 class Around(NamedTuple):
