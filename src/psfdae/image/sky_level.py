@@ -136,8 +136,61 @@ def _meshed(
     """Return level and σ (h, w) in meshes, interpolated; 80 % of one may be bad."""
     from photutils.background import Background2D
 
-    found = Background2D(image, mesh_px, mask=bad, exclude_percentile=80.0)
-    return found.background, found.background_rms
+    meshes = Background2D(image, mesh_px, filter_size=1, mask=bad, exclude_percentile=80.0)
+    level, sigma = meshes.background_mesh, meshes.background_rms_mesh
+    usual = _of_neighbours(level)
+    # A mesh differs from what its neighbours say by its error, about 2.5 σ/√N of the mode of N
+    # pixels, and by the curvature of the sky: the more of that there is, the more it counts itself
+    # (James & Stein 1961). A mesh that differs by far more than the others has stars in it.
+    off = level - usual
+    scatter = 1.4826 * float(np.median(np.abs(off)))
+    error = 2.5 * float(np.median(sigma)) / mesh_px
+    own_weight = 1.0 - (error / scatter) ** 2 if scatter > error else 0.0
+    smooth = usual + np.where(np.abs(off) > 4.0 * max(scatter, error), 0.0, own_weight * off)
+    return (
+        _on_pixels(smooth, image.shape, mesh_px),
+        np.maximum(_on_pixels(_of_neighbours(sigma), image.shape, mesh_px), 0.5 * sigma.min()),
+    )
+
+
+def _continued(mesh: np.ndarray, width: int) -> np.ndarray:
+    """Return values of meshes (m, n), continued beyond the edges along straight lines."""
+    for axis, count in enumerate(mesh.shape):
+        pads = [(width, width) if axis == other else (0, 0) for other in (0, 1)]
+        if count > width:
+            mesh = np.pad(mesh, pads, mode="reflect", reflect_type="odd")
+        else:
+            mesh = np.pad(mesh, pads, mode="edge")
+    return mesh
+
+
+def _of_neighbours(mesh: np.ndarray) -> np.ndarray:
+    """Return values of meshes (m, n) by their neighbours, without a few that are far off.
+
+    It is the median of the value itself and of the means of the four pairs of neighbours that face
+    each other: all five are the same where the sky is a plane, up to the edges of the image.
+    """
+    rows, columns = mesh.shape
+    wide = _continued(mesh, 1)
+
+    def shifted(down: int, right: int) -> np.ndarray:
+        return wide[1 + down : rows + 1 + down, 1 + right : columns + 1 + right]
+
+    pairs = [
+        0.5 * (shifted(down, right) + shifted(-down, -right))
+        for down, right in ((0, 1), (1, 0), (1, 1), (1, -1))
+    ]
+    return np.asarray(np.median([mesh, *pairs], axis=0))
+
+
+def _on_pixels(mesh: np.ndarray, shape: tuple[int, ...], mesh_px: int) -> np.ndarray:
+    """Return values of meshes (m, n) at the pixels of an image (h, w), by cubic splines."""
+    from scipy import ndimage
+
+    wide = _continued(mesh, 2)
+    at = [(np.arange(count) + 0.5) / mesh_px - 0.5 + 2.0 for count in shape]
+    grid = np.meshgrid(*at, indexing="ij")
+    return np.asarray(ndimage.map_coordinates(wide, grid, order=3, mode="nearest"))
 
 
 def _median_level(image: np.ndarray, bad: np.ndarray) -> np.ndarray:
