@@ -148,19 +148,20 @@ def _meshed(
     own_weight = 1.0 - (error / scatter) ** 2 if scatter > error else 0.0
     smooth = usual + np.where(np.abs(off) > 4.0 * max(scatter, error), 0.0, own_weight * off)
     return (
-        _on_pixels(smooth, image.shape, mesh_px),
-        np.maximum(_on_pixels(_of_neighbours(sigma), image.shape, mesh_px), 0.5 * sigma.min()),
+        _on_pixels(smooth, image.shape, mesh_px, own_weight),
+        _on_pixels(_of_neighbours(sigma), image.shape, mesh_px, 0.0),
     )
 
 
-def _continued(mesh: np.ndarray, width: int) -> np.ndarray:
-    """Return values of meshes (m, n), continued beyond the edges along straight lines."""
+def _continued(mesh: np.ndarray, width: int, slope: float = 1.0) -> np.ndarray:
+    """Return values of meshes (m, n), continued beyond the edges with a part of their slope."""
     for axis, count in enumerate(mesh.shape):
         pads = [(width, width) if axis == other else (0, 0) for other in (0, 1)]
+        level = np.pad(mesh, pads, mode="edge")
         if count > width:
-            mesh = np.pad(mesh, pads, mode="reflect", reflect_type="odd")
-        else:
-            mesh = np.pad(mesh, pads, mode="edge")
+            line = np.pad(mesh, pads, mode="reflect", reflect_type="odd")
+            level += slope * (line - level)
+        mesh = level
     return mesh
 
 
@@ -183,11 +184,14 @@ def _of_neighbours(mesh: np.ndarray) -> np.ndarray:
     return np.asarray(np.median([mesh, *pairs], axis=0))
 
 
-def _on_pixels(mesh: np.ndarray, shape: tuple[int, ...], mesh_px: int) -> np.ndarray:
-    """Return values of meshes (m, n) at the pixels of an image (h, w), by cubic splines."""
+def _on_pixels(mesh: np.ndarray, shape: tuple[int, ...], mesh_px: int, slope: float) -> np.ndarray:
+    """Return values of meshes (m, n) at the pixels of an image (h, w), by cubic splines.
+
+    Beyond the middles of the outer meshes they go on with a part of their slope.
+    """
     from scipy import ndimage
 
-    wide = _continued(mesh, 2)
+    wide = _continued(mesh, 2, slope)
     at = [(np.arange(count) + 0.5) / mesh_px - 0.5 + 2.0 for count in shape]
     grid = np.meshgrid(*at, indexing="ij")
     return np.asarray(ndimage.map_coordinates(wide, grid, order=3, mode="nearest"))
