@@ -414,18 +414,38 @@ def _wings_beside(
 ) -> Wings | None:
     """Wings of stars in an image (h, w) without its models, in turns with the level of its sky."""
     wings = before
+    shown = np.where(_like_stars(beside - level, doubt, bad, place), flux, np.nan)
     for turn in range(ROUNDS):
         known = wings
         if turn:
             far = wing_light(beside.shape, place, flux, outer, known)
             level = sky_level(np.where(bad, 0.0, beside - far), bad).level
-        wings = wings_of(beside - level, doubt, bad, place, flux, outer, stamp_px, known)
+        wings = wings_of(beside - level, doubt, bad, place, shown, outer, stamp_px, known)
         if wings is None:
             break
         light, sigma = wings.light()
         if known is not None and abs(light - known.light()[0]) < SAME * sigma:
             break
     return wings
+
+
+def _like_stars(
+    residual: np.ndarray, sigma: np.ndarray, bad: np.ndarray, place: np.ndarray
+) -> np.ndarray:
+    """Return True for the sources (n,) whose light about them may say what wings of stars are.
+
+    The residuals (h, w) in 5 × 5 px about them are within twice their σ, which has what the PSF may
+    be off by, and most of these pixels are good. Galaxies, blends and saturated stars are not.
+    """
+    from scipy.ndimage import uniform_filter
+
+    squares = uniform_filter(np.where(bad, 0.0, np.square(residual / sigma)), 5, mode="constant")
+    part_good = uniform_filter(np.where(bad, 0.0, 1.0), 5, mode="constant")
+    height, width = bad.shape
+    column, row = np.rint(np.nan_to_num(place, nan=-9.0)).astype(int).T
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    at = np.where(inside, row, 0), np.where(inside, column, 0)
+    return np.asarray(inside & (part_good[at] > 0.5) & (squares[at] < 4.0 * part_good[at]))
 
 
 def wings_of_stars(model: PsfModel, observation: Observation) -> Wings | None:
