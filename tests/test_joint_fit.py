@@ -74,6 +74,14 @@ def test_stars_that_have_no_pixels_are_nan_and_the_others_as_without_them(psfs):
     assert fit.flags.tolist() == [1, 64, 64, 64]
 
 
+def test_a_star_stays_within_its_range_of_where_it_was_expected(psfs):
+    place = np.array([[60.0, 60.0]])
+    image = image_of(psfs, place, np.array([1e4]))
+    known = np.ones(image.shape), np.zeros(image.shape, bool), place, None, BOX_PX, 2.0
+    fit = fit_stars(psfs, image, *known, origin=place - [3.0, 0.0])
+    assert fit.place[0] == pytest.approx([59.0, 60.0], abs=1e-3) and fit.flags[0] & 32
+
+
 def test_chains_of_neighbours():
     place = np.array([[0.0, 0], [1, 0], [2, 0], [9, 9], [np.nan, 0], [9.5, 9]])
     chain = chains(place, 1.5)

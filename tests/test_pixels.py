@@ -147,6 +147,16 @@ def test_a_step_of_the_sky_is_sharp_in_its_level(clean):
     assert found.notes == ("the sky has a step at column 150: the parts have their own sky",)
 
 
+@pytest.mark.parametrize("amplitude", [0.0, 50.0])
+def test_the_level_follows_a_sky_that_curves_within_a_few_meshes(amplitude):
+    """A wave of 300 px and a slope, up to the edges; a flat sky is smoothed over meshes."""
+    down, right = np.indices((400, 400)) / 400
+    sky = amplitude * (np.sin(8.0 * down + 4.0 * right) + 3.0 * right)
+    noise = np.random.default_rng(6).normal(0, 15, sky.shape)
+    off = sky_level(sky + noise, np.zeros(sky.shape, bool)).level - sky
+    assert off.std() < (6.0 if amplitude else 0.4) and abs(off.mean()) < 1.5
+
+
 def test_stars_in_the_halo_of_a_bright_star_are_found(clean):
     image, place, _ = clean
     row, column = np.indices(image.shape) - SIDE / 2
