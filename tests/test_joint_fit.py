@@ -77,8 +77,9 @@ def test_stars_that_have_no_pixels_are_nan_and_the_others_as_without_them(psfs):
 def test_a_star_stays_within_its_range_of_where_it_was_expected(psfs):
     place = np.array([[60.0, 60.0]])
     image = image_of(psfs, place, np.array([1e4]))
-    known = np.ones(image.shape), np.zeros(image.shape, bool), place, None, BOX_PX, 2.0
-    fit = fit_stars(psfs, image, *known, origin=place - [3.0, 0.0])
+    known = np.ones(image.shape), np.zeros(image.shape, bool)
+    start, origin = place - [1.5, 0.0], place - [3.0, 0.0]
+    fit = fit_stars(psfs, image, *known, start, None, BOX_PX, 2.0, origin)
     assert fit.place[0] == pytest.approx([59.0, 60.0], abs=1e-3) and fit.flags[0] & 32
 
 
