@@ -77,10 +77,10 @@ def find_bad_pixels(
     for key, area in overscan(headers, image, mask):
         mask |= area
         notes.append(f"{np.count_nonzero(area)} pixels outside the exposed area by {key}")
-    share, least = least_value_share(image, mask)
+    share, least_value = least_value_share(image, mask)
     if share >= CLIPPED_SHARE:
         raise ClippedSkyError(
-            f"{100 * share:.0f} % of the pixels have the least value, {least:g}: the sky was "
+            f"{100 * share:.0f} % of the pixels have the least value, {least_value:g}: the sky was "
             "clipped there, or has hardly any photons, and neither it nor its noise can be "
             "measured; take the image from before it was clipped, or write negative values, too"
         )
@@ -136,23 +136,25 @@ def blank_areas(
         # The whole of each connected area of this value that holds a square or a line of it.
         area = ndimage.binary_propagation(solid & (values == value), mask=values == value)
         # Of a large image, one pixel of 16 says how far the rest is from the value.
-        rest = ~area & ~bad
-        others = values[rest] if rest.size < 2**22 else values[::4, ::4][rest[::4, ::4]]
-        if not others.size or (saturate is not None and value >= saturate):
+        outside = ~area & ~bad
+        outside_values = (
+            values[outside] if outside.size < 2**22 else values[::4, ::4][outside[::4, ::4]]
+        )
+        if not outside_values.size or (saturate is not None and value >= saturate):
             continue
-        middle = float(np.median(others))
+        middle = float(np.median(outside_values))
         if value > middle:
             label, _ = ndimage.label(area)
             at_edge = np.unique(np.concatenate([label[0], label[-1], label[:, 0], label[:, -1]]))
             area &= np.isin(label, at_edge[at_edge > 0])
         # Beside a blank area, the image is as far from its value as anywhere, and few pixels of
         # the image touch it. Beside the even sky of an image without noise, there is faint light.
-        beside = ndimage.binary_dilation(area) & ~area & ~bad
-        if not beside.any():
+        border = ndimage.binary_dilation(area) & ~area & ~bad
+        if not border.any():
             continue
-        height_beside = float(np.median(np.abs(values[beside] - value)))
-        height = float(np.median(np.abs(others - value)))
-        if height_beside > 0.25 * height and beside.sum() < 0.3 * np.count_nonzero(rest):
+        height_beside = float(np.median(np.abs(values[border] - value)))
+        height = float(np.median(np.abs(outside_values - value)))
+        if height_beside > 0.25 * height and border.sum() < 0.3 * np.count_nonzero(outside):
             areas.append((float(value), area))
     return areas
 
@@ -161,20 +163,20 @@ def _constant_squares(values: np.ndarray) -> np.ndarray:
     """Return the pixels (h, w) of squares of `BLANK_PX` pixels that have one value."""
     from scipy import ndimage
 
-    found = np.zeros(values.shape, dtype=bool)
+    constant = np.zeros(values.shape, dtype=bool)
     if min(values.shape) < BLANK_PX:
-        return found
-    for rows, wide, inner in _bands(len(values)):
-        band = values[wide]
+        return constant
+    for rows, band_rows, core_rows in _bands(len(values)):
+        band = values[band_rows]
         # NaN differs from itself; filters would spread it in an order of their own.
-        known = np.isfinite(band)
-        low = ndimage.minimum_filter(np.where(known, band, -np.inf), BLANK_PX, mode="nearest")
-        high = ndimage.maximum_filter(np.where(known, band, np.inf), BLANK_PX, mode="nearest")
+        is_finite = np.isfinite(band)
+        low = ndimage.minimum_filter(np.where(is_finite, band, -np.inf), BLANK_PX, mode="nearest")
+        high = ndimage.maximum_filter(np.where(is_finite, band, np.inf), BLANK_PX, mode="nearest")
         corner = (low == high) & np.isfinite(low)
         # A filter of even size covers the pixels from −s/2 to s/2 − 1 about its own.
         grown = ndimage.maximum_filter(corner, BLANK_PX, origin=-1)
-        found[rows] = grown[inner]
-    return np.asarray(found & np.isfinite(values))
+        constant[rows] = grown[core_rows]
+    return np.asarray(constant & np.isfinite(values))
 
 
 def least_value_share(image: np.ndarray, bad: np.ndarray) -> tuple[float, float]:
@@ -187,21 +189,21 @@ def least_value_share(image: np.ndarray, bad: np.ndarray) -> tuple[float, float]
     count = np.count_nonzero(good)
     if not count:
         return 0.0, np.nan
-    least = float(image.min(where=good, initial=np.inf))
-    at_least = image == least
+    least_value = float(image.min(where=good, initial=np.inf))
+    at_least = image == least_value
     share = float(np.count_nonzero(at_least & good) / count)
     if share < CLIPPED_SHARE:
-        return share, least
+        return share, least_value
     # Neighbours change between least and other values 2p(1 − p) times where noise decides it.
     pairs = ~(bad[:, 1:] | bad[:, :-1])
     changes = np.count_nonzero((at_least[:, 1:] != at_least[:, :-1]) & pairs)
     by_noise = 2.0 * share * (1.0 - share) * np.count_nonzero(pairs)
     higher = good & ~at_least
     if changes < 0.5 * by_noise or not higher.any():
-        return 0.0, least
+        return 0.0, least_value
     second = image.min(where=higher, initial=np.inf)
     following = np.count_nonzero((image == second) & higher) / count
-    return (0.0 if following > 0.3 * share else share), least
+    return (0.0 if following > 0.3 * share else share), least_value
 
 
 # Overscan.
@@ -224,27 +226,27 @@ def overscan(
     from psfdae.moments import robust_scatter
 
     areas = []
-    known = bad.copy()
+    excluded = bad.copy()
     for key in ("TRIMSEC", "DATASEC", "BIASSEC"):
-        found = next((SECTION.search(str(h[key])) for h in headers if key in h), None)
-        if found is None:
+        section = next((SECTION.search(str(h[key])) for h in headers if key in h), None)
+        if section is None:
             continue
-        x0, x1, y0, y1 = map(int, found.groups())
+        x0, x1, y0, y1 = map(int, section.groups())
         if not (1 <= x0 <= x1 <= image.shape[1] and 1 <= y0 <= y1 <= image.shape[0]):
             continue
         area = np.full(image.shape, key != "BIASSEC")
         area[y0 - 1 : y1, x0 - 1 : x1] = key == "BIASSEC"
-        area &= ~known
+        area &= ~excluded
         if not 0 < np.count_nonzero(area) <= 0.25 * image.size:
             continue
-        inside, outside = image[~(known | area)], image[area]
+        inside, outside = image[~(excluded | area)], image[area]
         if not inside.size:
             continue
         noise, other_noise = (float(robust_scatter(part)) for part in (inside, outside))
         step = abs(float(np.median(outside)) - float(np.median(inside)))
         if step > 3.0 * other_noise or other_noise < 0.8 * noise:
             areas.append((key, area))
-            known |= area
+            excluded |= area
     return areas
 
 
@@ -259,21 +261,21 @@ def dead_pixels(image: np.ndarray, bad: np.ndarray, noise: np.ndarray) -> np.nda
     """
     from scipy import ndimage
 
-    found = np.zeros(image.shape, dtype=bool)
+    dead = np.zeros(image.shape, dtype=bool)
     around = np.ones((3, 3), dtype=bool)
     around[1, 1] = False
     if min(image.shape) < 2 * BAND_EDGE:
-        return found
-    for rows, wide, inner in _bands(len(image)):
-        clean = interpolated(image[wide], bad[wide])[0]
+        return dead
+    for rows, band_rows, core_rows in _bands(len(image)):
+        clean = interpolated(image[band_rows], bad[band_rows])[0]
         depth = ndimage.minimum_filter(clean, footprint=around) - clean
-        row, column = np.nonzero((depth > COSMIC_SIGMA * noise[wide]) & ~bad[wide])
-        local = _noise_around(clean, noise[wide], row, column)
+        row, column = np.nonzero((depth > COSMIC_SIGMA * noise[band_rows]) & ~bad[band_rows])
+        local = _noise_around(clean, noise[band_rows], row, column)
         deep = depth[row, column] > COSMIC_SIGMA * local
         band = np.zeros(clean.shape, dtype=bool)
         band[row[deep], column[deep]] = True
-        found[rows] = band[inner]
-    return found
+        dead[rows] = band[core_rows]
+    return dead
 
 
 def cosmic_rays(
@@ -301,17 +303,19 @@ def cosmic_rays(
     -------
     ndarray of bool, shape (h, w)
     """
-    found = np.zeros(image.shape, dtype=bool)
+    cosmic = np.zeros(image.shape, dtype=bool)
     if min(image.shape) < 2 * BAND_EDGE:
-        return found
+        return cosmic
     sharpness = sharpness_of_sources(image, bad, noise, saturate)
     if sharpness > 10.0:  # one pixel has nearly all light of a star
-        return found
+        return cosmic
     ratio = max(COSMIC_RATIO, 4.0 * sharpness)
-    for rows, wide, inner in _bands(len(image)):
-        band = _cosmic_rays_of_band(image[wide], bad[wide], noise[wide], saturate, ratio)
-        found[rows] = band[inner]
-    return np.asarray(found & ~bad)
+    for rows, band_rows, core_rows in _bands(len(image)):
+        band = _cosmic_rays_of_band(
+            image[band_rows], bad[band_rows], noise[band_rows], saturate, ratio
+        )
+        cosmic[rows] = band[core_rows]
+    return np.asarray(cosmic & ~bad)
 
 
 def _cosmic_rays_of_band(
@@ -324,29 +328,29 @@ def _cosmic_rays_of_band(
     forbidden = ndimage.binary_dilation(bad)
     if saturate is not None:
         forbidden |= _saturated_stars(band, saturate)
-    found = np.zeros(band.shape, dtype=bool)
+    cosmic = np.zeros(band.shape, dtype=bool)
     # Tracks are found from their ends inwards: what was found is replaced, and the search repeated.
     for _ in range(8):
         edge = edges(clean)
-        row, column = np.nonzero((edge > 0.5 * COSMIC_SIGMA * noise) & ~forbidden & ~found)
+        row, column = np.nonzero((edge > 0.5 * COSMIC_SIGMA * noise) & ~forbidden & ~cosmic)
         if not row.size:
             break
         local = _noise_around(clean, noise, row, column)
         height, structure = _contrast(clean, edge, row, column)
         high = height > COSMIC_SIGMA * local
         sharp = high & (height > ratio * (np.maximum(structure, 0.0) + local))
-        new = np.zeros_like(found)
+        new = np.zeros_like(cosmic)
         new[row[sharp], column[sharp]] = True
         # Beside a cosmic ray, half the height is enough, and no sharpness is asked for.
         lower = height > 0.5 * COSMIC_SIGMA * local
-        beside = ndimage.binary_dilation(new, np.ones((3, 3)))[row, column] & lower
-        beside &= height > 0.5 * ratio * (np.maximum(structure, 0.0) + local)
-        new[row[beside], column[beside]] = True
+        is_beside = ndimage.binary_dilation(new, np.ones((3, 3)))[row, column] & lower
+        is_beside &= height > 0.5 * ratio * (np.maximum(structure, 0.0) + local)
+        new[row[is_beside], column[is_beside]] = True
         if not new.any():
             break
-        found |= new
-        clean = interpolated(clean, found | bad)[0]
-    return found
+        cosmic |= new
+        clean = interpolated(clean, cosmic | bad)[0]
+    return cosmic
 
 
 def edges(image: np.ndarray) -> np.ndarray:
@@ -356,9 +360,18 @@ def edges(image: np.ndarray) -> np.ndarray:
     both axes differs from two neighbours only, one along each axis; L⁺ is the mean of the four
     quarters, each cut off at 0.
     """
-    wide = np.pad(image, 1, mode="edge")
-    up, down, left, right = wide[:-2, 1:-1], wide[2:, 1:-1], wide[1:-1, :-2], wide[1:-1, 2:]
-    quarters = [np.maximum(2.0 * image - a - b, 0.0) for a in (up, down) for b in (left, right)]
+    padded = np.pad(image, 1, mode="edge")
+    upper_pixels, lower_pixels, left_pixels, right_pixels = (
+        padded[:-2, 1:-1],
+        padded[2:, 1:-1],
+        padded[1:-1, :-2],
+        padded[1:-1, 2:],
+    )
+    quarters = [
+        np.maximum(2.0 * image - a - b, 0.0)
+        for a in (upper_pixels, lower_pixels)
+        for b in (left_pixels, right_pixels)
+    ]
     return np.asarray(sum(quarters) / 8.0)
 
 
@@ -371,9 +384,9 @@ def _contrast(
     pixels less that over 7 × 7 of these medians.
     """
     height, structure = np.empty((2, len(row)))
-    wide_edge, wide = np.pad(edge, 2, mode="edge"), np.pad(image, 4, mode="edge")
+    wide_edge, padded = np.pad(edge, 2, mode="edge"), np.pad(image, 4, mode="edge")
     fives = np.lib.stride_tricks.sliding_window_view(wide_edge, (5, 5))
-    nines = np.lib.stride_tricks.sliding_window_view(wide, (9, 9))
+    nines = np.lib.stride_tricks.sliding_window_view(padded, (9, 9))
     for part in (slice(start, start + 4096) for start in range(0, len(row), 4096)):
         at = row[part], column[part]
         height[part] = edge[at] - np.median(fives[at].reshape(-1, 25), axis=1)
@@ -394,13 +407,13 @@ def pixel_noise(image: np.ndarray, bad: np.ndarray) -> np.ndarray:
     height, width = image.shape
     noise = np.full(image.shape, np.inf, difference.dtype)
     for top in range(0, height, 64):
-        for left in range(0, width, 64):
-            square = np.s_[top : top + 64, left : left + 64]
-            values, known = difference[square].ravel(), np.count_nonzero(~hidden[square])
-            if not known:
+        for residual in range(0, width, 64):
+            square = np.s_[top : top + 64, residual : residual + 64]
+            values, is_good = difference[square].ravel(), np.count_nonzero(~hidden[square])
+            if not is_good:
                 continue
             # σ of one pixel from the median of |x₁ − x₂|, which has √2 σ; NaN comes last.
-            middle = [(known - 1) // 2, known // 2]
+            middle = [(is_good - 1) // 2, is_good // 2]
             sigma = 1.4826 / np.sqrt(2.0) * float(np.partition(values, middle)[middle].mean())
             noise[square] = sigma if sigma > 0 else np.inf
     return noise
@@ -413,13 +426,13 @@ def _noise_around(
 
     In the light of a bright star the noise is larger than in the sky.
     """
-    found = np.empty(len(row))
-    wide = np.pad(image, 4, mode="edge")
-    nines = np.lib.stride_tricks.sliding_window_view(wide, (9, 9))
+    scatter = np.empty(len(row))
+    padded = np.pad(image, 4, mode="edge")
+    nines = np.lib.stride_tricks.sliding_window_view(padded, (9, 9))
     for part in (slice(start, start + 4096) for start in range(0, len(row), 4096)):
         difference = np.abs(np.diff(nines[row[part], column[part]], axis=2)).reshape(-1, 72)
-        found[part] = 1.4826 / np.sqrt(2.0) * np.median(difference, axis=1)
-    return np.asarray(np.maximum(found, noise[row, column]))
+        scatter[part] = 1.4826 / np.sqrt(2.0) * np.median(difference, axis=1)
+    return np.asarray(np.maximum(scatter, noise[row, column]))
 
 
 def _saturated_stars(image: np.ndarray, saturate: float) -> np.ndarray:
@@ -478,12 +491,12 @@ def interpolated(image: np.ndarray, bad: np.ndarray) -> tuple[np.ndarray, np.nda
         A copy; 0 where nothing is near.
     left : ndarray of bool, shape (h, w)
     """
-    filled, left = np.where(bad, 0.0, image), np.zeros(bad.shape, dtype=bool)
+    filled, remaining = np.where(bad, 0.0, image), np.zeros(bad.shape, dtype=bool)
     row, column = np.nonzero(bad)
     if not row.size:
-        return filled, left
+        return filled, remaining
     reach = 2
-    wide = np.pad(filled, reach)
+    padded = np.pad(filled, reach)
     good = np.pad(~bad, reach)
     steps = np.arange(-reach, reach + 1)
     weights = np.exp(-0.5 * (steps[:, None] ** 2 + steps**2))
@@ -492,41 +505,41 @@ def interpolated(image: np.ndarray, bad: np.ndarray) -> tuple[np.ndarray, np.nda
         for across in steps:
             at = row + reach + down, column + reach + across
             weight = weights[down + reach, across + reach] * good[at]
-            mean += weight * wide[at]
+            mean += weight * padded[at]
             light += weight
     for axis in (np.array([1, 0]), np.array([0, 1])):
-        values, there = [], []
+        values, has_neighbours = [], []
         for step in (-2, -1, 1, 2):
             at = row + reach + step * axis[0], column + reach + step * axis[1]
-            values.append(wide[at])
-            there.append(good[at])
-        near = there[1] & there[2]
-        far = near & there[0] & there[3]
+            values.append(padded[at])
+            has_neighbours.append(good[at])
+        nearby = has_neighbours[1] & has_neighbours[2]
+        distant = nearby & has_neighbours[0] & has_neighbours[3]
         line = 0.5 * (values[1] + values[2])
         cubic = (4.0 * (values[1] + values[2]) - values[0] - values[3]) / 6.0
         # A cubic counts twice as much as a line, which cuts off peaks.
-        part = np.where(far, 2.0, near * 1.0)
-        total += part * np.where(far, cubic, line)
+        part = np.where(distant, 2.0, nearby * 1.0)
+        total += part * np.where(distant, cubic, line)
         count += part
-    known = light > 0
-    mean = mean / np.where(known, light, 1.0)
+    is_good = light > 0
+    mean = mean / np.where(is_good, light, 1.0)
     filled[row, column] = np.where(count > 0, total / np.maximum(count, 1.0), mean)
-    left[row, column] = ~known
-    return filled, left
+    remaining[row, column] = ~is_good
+    return filled, remaining
 
 
 def interpolated_stamps(stamps: np.ndarray, bad: np.ndarray) -> np.ndarray:
     """Return stamps (n, s, s) with their bad pixels `interpolated`, each from its own pixels."""
-    chosen = np.flatnonzero(bad.any(axis=(1, 2)))
-    if not chosen.size:
+    rows = np.flatnonzero(bad.any(axis=(1, 2)))
+    if not rows.size:
         return stamps
     # Two rows of bad pixels part each stamp from the next one.
     between = ((0, 0), (0, 2), (0, 0))
     side = stamps.shape[-1]
-    tall = np.pad(stamps[chosen], between).reshape(-1, side)
-    hidden = np.pad(bad[chosen], between, constant_values=True).reshape(-1, side)
+    tall = np.pad(stamps[rows], between).reshape(-1, side)
+    hidden = np.pad(bad[rows], between, constant_values=True).reshape(-1, side)
     out = np.array(stamps)
-    out[chosen] = interpolated(tall, hidden)[0].reshape(len(chosen), side + 2, side)[:, :side]
+    out[rows] = interpolated(tall, hidden)[0].reshape(len(rows), side + 2, side)[:, :side]
     return out
 
 
@@ -538,6 +551,6 @@ def _bands(height: int) -> list[tuple[slice, slice, slice]]:
     bands = []
     for top in range(0, height, BAND_ROWS):
         end, start = min(top + BAND_ROWS, height), max(top - BAND_EDGE, 0)
-        wide = slice(start, min(end + BAND_EDGE, height))
-        bands.append((slice(top, end), wide, slice(top - start, end - start)))
+        band_rows = slice(start, min(end + BAND_EDGE, height))
+        bands.append((slice(top, end), band_rows, slice(top - start, end - start)))
     return bands

@@ -124,7 +124,7 @@ class ColumnError(Error, ValueError):
 
 @dataclass(frozen=True)
 class Positions:
-    """Which two columns hold the positions and how to read them."""
+    """Columns that hold the positions of a list, and how to read them."""
 
     first: str
     second: str
@@ -139,34 +139,34 @@ def choose_positions(names: Sequence[str]) -> Positions:
         if set(names).issuperset((*result.pairs[0], *result.beside)):
             first_name, second_name = result.pairs[0]
             return Positions(first_name, second_name, result.sky, result.origin, None)
-    found: list[Positions] = []
+    choices: list[Positions] = []
     for convention in CONVENTIONS:
         for pair in convention.pairs:
             first, second = (_in_any_case(names, name) for name in pair)
             if first is None or second is None or (convention.exact and [first, second] != pair):
                 continue
-            if all(first != where.first for where in found):
-                how = (convention.sky, convention.origin, convention.flags)
-                found.append(Positions(first, second, *how))
+            if all(first != choice.first for choice in choices):
+                meaning = (convention.sky, convention.origin, convention.flags)
+                choices.append(Positions(first, second, *meaning))
             break
     # Tables of astropy keep sky coordinates as NAME.ra and NAME.dec in FITS files.
     stems = [name[:-3] for name in names if name.endswith(".ra") and f"{name[:-3]}.dec" in names]
-    if len(stems) == 1 and not found:
-        found = [Positions(f"{stems[0]}.ra", f"{stems[0]}.dec", True, None, None)]
-    found = [where for where in found if not where.sky] or found
-    if not found:
+    if len(stems) == 1 and not choices:
+        choices = [Positions(f"{stems[0]}.ra", f"{stems[0]}.dec", True, None, None)]
+    choices = [choice for choice in choices if not choice.sky] or choices
+    if not choices:
         raise ColumnError("no position columns")
-    if len(found) > 1:
-        pairs = " or ".join(f"{where.first},{where.second}" for where in found)
+    if len(choices) > 1:
+        pairs = " or ".join(f"{choice.first},{choice.second}" for choice in choices)
         raise ColumnError(f"ambiguous position columns {pairs}; keep one pair")
-    return found[0]
+    return choices[0]
 
 
-def _in_any_case(names: Sequence[str], wanted: str) -> str | None:
-    same = [name for name in names if name.strip().lower() == wanted.lower()]
-    if len(same) > 1:
-        raise ColumnError(f"columns {' and '.join(same)} differ in their case only; keep one")
-    return same[0] if same else None
+def _in_any_case(names: Sequence[str], name_wanted: str) -> str | None:
+    matches = [name for name in names if name.strip().lower() == name_wanted.lower()]
+    if len(matches) > 1:
+        raise ColumnError(f"columns {' and '.join(matches)} differ in their case only; keep one")
+    return matches[0] if matches else None
 
 
 @dataclass(frozen=True)
@@ -250,8 +250,8 @@ class Catalogue:
 
         unit = getattr(self._column(name), "unit", None)
         if unit is not None:
-            known = units.Unit(unit, parse_strict="silent")
-            plain = isinstance(known, units.UnrecognizedUnit) or known in (
+            pixel_unit = units.Unit(unit, parse_strict="silent")
+            plain = isinstance(pixel_unit, units.UnrecognizedUnit) or pixel_unit in (
                 units.pix,
                 units.dimensionless_unscaled,
             )
@@ -261,13 +261,15 @@ class Catalogue:
                 )
         return self.coordinates(name)
 
-    def flags(self, where: Positions) -> np.ndarray:
-        """What the list's own program says against its stars, as `StarFlag`s, (n,), uint16."""
+    def flags(self, positions: Positions) -> np.ndarray:
+        """Return flags of the list's own program as `StarFlag`s, (n,), uint16."""
         flags = np.zeros(len(self), dtype=np.uint16)
-        if where.flags is not None and where.flags in self.table.colnames:
-            said = np.nan_to_num(self.numbers(where.flags), posinf=0, neginf=0).astype(np.int64)
+        if positions.flags is not None and positions.flags in self.table.colnames:
+            list_flags = np.nan_to_num(self.numbers(positions.flags), posinf=0, neginf=0).astype(
+                np.int64
+            )
             for bit, flag in FLAGGED.items():
-                raise_flag(flags, flag, (said & bit) > 0)
+                raise_flag(flags, flag, (list_flags & bit) > 0)
         return flags
 
     def positions(self) -> Positions:
@@ -280,21 +282,21 @@ class Catalogue:
                 self.path, f"{error}; found {shorten(self.table.colnames)}; accepted {accepted}"
             ) from None
 
-    def sky(self, where: Positions) -> tuple[np.ndarray, np.ndarray]:
+    def sky(self, positions: Positions) -> tuple[np.ndarray, np.ndarray]:
         """Right ascension and declination in degrees, each shape (n,).
 
         Columns without unit are in degrees; text with colons, blanks or letters is
         sexagesimal, then right ascensions are in hours unless one is beyond 24. Declinations
         off the sphere are NaN, and an error if all are.
         """
-        ra = self._angles(where.first, "hourangle")
-        dec = self._angles(where.second, "deg")
+        ra = self._angles(positions.first, "hourangle")
+        dec = self._angles(positions.second, "deg")
         on = np.abs(dec) <= 90
         if not on.any():
             row = np.flatnonzero(np.isfinite(dec))[0]
             raise ObservationError(
                 self.path,
-                f"column {where.second!r} is {dec[row]:g}° in row {row + 1}, expected -90 … 90",
+                f"column {positions.second!r} is {dec[row]:g}° in row {row + 1}, expected -90 … 90",
             )
         return ra, np.where(on, dec, np.nan)
 
@@ -303,16 +305,16 @@ class Catalogue:
         name = self._identifier()
         if name is None:
             return np.arange(len(self), dtype=np.int64)
-        found = _as_identifiers(self._column(name))
-        if found.dtype.kind == "U" and found.dtype.itemsize > 4 * LONGEST_IDENTIFIER:
-            lengths = np.char.str_len(found)
+        identifiers = _as_identifiers(self._column(name))
+        if identifiers.dtype.kind == "U" and identifiers.dtype.itemsize > 4 * LONGEST_IDENTIFIER:
+            lengths = np.char.str_len(identifiers)
             row = lengths.argmax()
             raise ObservationError(
                 self.path,
                 f"column {name!r} has {lengths[row]} characters in row {row + 1}, "
                 f"an identifier may have {LONGEST_IDENTIFIER}",
             )
-        return found
+        return identifiers
 
     def _identifier(self) -> str | None:
         """Name of the column that identifies the stars; None without one."""
@@ -337,8 +339,8 @@ class Catalogue:
         """
         from astropy.table import Table
 
-        further_columns, where = Table(), self.positions()
-        read = {self._identifier(), *(() if where.sky else (where.first, where.second))}
+        further_columns, positions = Table(), self.positions()
+        read = {self._identifier(), *(() if positions.sky else (positions.first, positions.second))}
         names = getattr(self.table, "names_of_values", self.table.colnames)
         for name in [name for name in names[:900] if name not in read]:
             column = self.table[name]
@@ -351,21 +353,21 @@ class Catalogue:
                 further_columns[name] = column[rows]
         return further_columns
 
-    def _resolve(self, wanted: str) -> str | None:
+    def _resolve(self, name_wanted: str) -> str | None:
         """The one column of that name, case aside if it is not written exactly so."""
         names = self.table.colnames
-        return wanted if wanted in names else _in_any_case(names, wanted)
+        return name_wanted if name_wanted in names else _in_any_case(names, name_wanted)
 
     def _column(self, name: str) -> Column:
         try:
-            found = self._resolve(name)
+            resolved = self._resolve(name)
         except ColumnError as error:
             raise ObservationError(self.path, str(error)) from None
-        if found is None:
+        if resolved is None:
             raise ObservationError(
                 self.path, f"no column {name!r}; found {shorten(self.table.colnames)}"
             )
-        column = self.table[found]
+        column = self.table[resolved]
         if not isinstance(column, np.ndarray):
             raise ObservationError(self.path, f"column {name!r} does not hold plain numbers")
         return column
@@ -397,16 +399,16 @@ class Catalogue:
         values = np.asarray(np.ma.getdata(column))
         is_text = values.dtype.kind in "SUO"
         if is_text and column.ndim == 1:
-            there = ~np.ma.getmaskarray(column)
-            texts = [_text(value).strip() for value in values[there]]
+            has_value = ~np.ma.getmaskarray(column)
+            texts = [_text(value).strip() for value in values[has_value]]
             if any(SEXAGESIMAL.search(text) for text in texts):
                 # A right ascension of 150:00:12 cannot be in hours, nor can those beside it.
-                whole = [int(number[0]) for number in map(WHOLE.match, texts) if number]
-                if max(whole, default=0) > 24:
+                whole_parts = [int(number[0]) for number in map(WHOLE.match, texts) if number]
+                if max(whole_parts, default=0) > 24:
                     sexagesimal_unit = "deg"
                 angles = np.full(len(values), np.nan)
                 with reading(self.path):
-                    angles[there] = Angle(texts, unit=sexagesimal_unit).deg
+                    angles[has_value] = Angle(texts, unit=sexagesimal_unit).deg
                 return angles
         numbers = self.coordinates(name)
         unit = getattr(column, "unit", None)
@@ -428,12 +430,15 @@ def _as_identifiers(column: Column) -> np.ndarray:
     values, missing = np.ma.getdata(column), np.ma.getmaskarray(column)
     if values.dtype.kind in "iuf" and not missing.any():
         with np.errstate(all="ignore"):
-            whole = values.astype(np.int64)
+            integers = values.astype(np.int64)
         # Unsigned ones beyond the largest signed one come back negative.
-        if (whole.astype(values.dtype) == values).all() and ((whole < 0) == (values < 0)).all():
-            return whole
+        if (integers.astype(values.dtype) == values).all() and (
+            (integers < 0) == (values < 0)
+        ).all():
+            return integers
     texts = [
-        "" if gone else _text(v).strip() for v, gone in zip(values.tolist(), missing, strict=True)
+        "" if is_missing else _text(v).strip()
+        for v, is_missing in zip(values.tolist(), missing, strict=True)
     ]
     return np.array(texts, dtype=str)
 
@@ -460,47 +465,49 @@ def read_catalogue(path: Path) -> Catalogue:
     return Catalogue(path, table)
 
 
-def as_catalogue(given: StarList) -> Catalogue:
+def as_catalogue(star_list: StarList) -> Catalogue:
     """A star list from a file, a table, or positions.
 
     Parameters
     ----------
-    given : path-like, table, SkyCoord, array of shape (n, 2), or sequence of n pairs
+    star_list : path-like, table, SkyCoord, array of shape (n, 2), or sequence of n pairs
         A table is one of astropy or pandas, or a mapping of columns, with names as in files
         (`CONVENTIONS`) or with a column of SkyCoord; positions are (x, y), 0-based.
     """
     from astropy.coordinates import SkyCoord
     from astropy.table import Table
 
-    if isinstance(given, Catalogue):
-        return given
-    if isinstance(given, str | Path):
-        return read_catalogue(Path(given))
+    if isinstance(star_list, Catalogue):
+        return star_list
+    if isinstance(star_list, str | Path):
+        return read_catalogue(Path(star_list))
     path = Path("catalogue")
     with reading(path):
-        if isinstance(given, SkyCoord):
-            given = {"sky": given.reshape(-1)}
-        elif _is_positions(given):
-            given = _pairs(path, given)
-        records = getattr(given, "to_records", None)  # of a DataFrame
+        if isinstance(star_list, SkyCoord):
+            star_list = {"sky": star_list.reshape(-1)}
+        elif _is_positions(star_list):
+            star_list = _pairs(path, star_list)
+        records = getattr(star_list, "to_records", None)  # of a DataFrame
         # Quantities become columns with units.
-        table = Table(given if records is None else records(index=False))
+        table = Table(star_list if records is None else records(index=False))
         table = _with_sky_columns(table)
     if len(table) == 0:
         raise ObservationError(path, "the catalogue has no stars")
     return Catalogue(path, table)
 
 
-def _is_positions(given: Any) -> bool:
+def _is_positions(star_list: Any) -> bool:
     """Return True for an array without names of columns, and for a sequence that is no table."""
-    if isinstance(given, np.ndarray):
-        return given.dtype.names is None
-    return isinstance(given, Sequence) and not any(isinstance(row, Mapping) for row in given)
+    if isinstance(star_list, np.ndarray):
+        return star_list.dtype.names is None
+    return isinstance(star_list, Sequence) and not any(
+        isinstance(row, Mapping) for row in star_list
+    )
 
 
-def _pairs(path: Path, given: Any) -> dict[str, np.ndarray]:
+def _pairs(path: Path, star_list: Any) -> dict[str, np.ndarray]:
     """Return the columns of positions (x, y), NaN where they are masked."""
-    values, mask, unit = parts_of_array(given)
+    values, mask, unit = parts_of_array(star_list)
     if unit not in ("", "pix", "pixel"):
         raise ObservationError(
             path, f"positions in {unit}, expected pixels; sky coordinates go as a SkyCoord"
@@ -523,8 +530,8 @@ def _with_sky_columns(table: Table) -> Table:
     if len(sky) != 1:
         return table
     icrs = table[sky[0]].icrs
-    others = [name for name in table.colnames if name not in (sky[0], "ra", "dec")]
-    plain = Table({name: table[name] for name in others})
+    further = [name for name in table.colnames if name not in (sky[0], "ra", "dec")]
+    plain = Table({name: table[name] for name in further})
     for name, angle in (("ra", icrs.ra), ("dec", icrs.dec)):
         values, mask, _ = parts_of_array(angle.deg)
         plain[name] = values.astype(np.float64)
@@ -545,8 +552,8 @@ def _fits_table(path: Path) -> _FitsTable:
         ]
         objects = [hdu for hdu in tables if hdu.name == "LDAC_OBJECTS"] or tables
         if len(objects) != 1:
-            found = shorten([hdu.name or "(no name)" for hdu in objects])
-            raise ObservationError(path, f"expected one table of stars, found {found}")
+            table_names = shorten([hdu.name or "(no name)" for hdu in objects])
+            raise ObservationError(path, f"expected one table of stars, found {table_names}")
         rows = int(objects[0].header["NAXIS2"])
         size = objects[0].header["NAXIS1"] * rows
         if objects[0].fileinfo()["datLoc"] + size > file.path.stat().st_size:
@@ -559,9 +566,9 @@ def _fits_table(path: Path) -> _FitsTable:
 
 
 def _check_size(path: Path, rows: int, columns: int) -> None:
-    for what, found, most in (("stars", rows, MOST_STARS), ("columns", columns, MOST_COLUMNS)):
-        if found > most:
-            raise ObservationError(path, f"{found} {what} in a catalogue, at most {most}")
+    for noun, count, limit in (("stars", rows, MOST_STARS), ("columns", columns, MOST_COLUMNS)):
+        if count > limit:
+            raise ObservationError(path, f"{count} {noun} in a catalogue, at most {limit}")
 
 
 def _lines(path: Path, content: bytes) -> list[str]:
@@ -603,7 +610,7 @@ def _text_table(path: Path, lines: list[str]) -> Table:
     elif SEXTRACTOR_HEADER.match(lines[0]):
         kind = {"format": "sextractor"}
         numbered = filter(None, map(SEXTRACTOR_HEADER.match, lines))
-        _check_size(path, 0, max(int(found[1][:9]) for found in numbered))
+        _check_size(path, 0, max(int(match[1][:9]) for match in numbered))
     else:
         lines[:] = rows = list_formats.without_vizier_head(rows)
         kind = {"format": "basic", "delimiter": _delimiter(rows)}
@@ -630,7 +637,7 @@ def _check_widths(path: Path, rows: list[str]) -> None:
     delimiter = _delimiter(rows)
     columns = len(rows[0].split(None if delimiter == " " else delimiter))
     _check_size(path, len(rows), columns)
-    widest = [0] * columns
+    widths = [0] * columns
     for start in range(0, len(rows), ROWS):
         part = rows[start : start + ROWS]
         split = map(str.split, part) if delimiter == " " else csv.reader(part, delimiter=delimiter)
@@ -639,16 +646,16 @@ def _check_widths(path: Path, rows: list[str]) -> None:
         except csv.Error as error:
             raise ObservationError(path, f"not a text table ({error})") from None
         if all(len(row) == columns for row in cells):
-            found = [max(map(len, column)) for column in zip(*cells, strict=True)]
+            lengths = [max(map(len, column)) for column in zip(*cells, strict=True)]
         else:
             # Quoted otherwise than we think, or no table at all.
-            found = [max(map(len, part))] * columns
-        widest = list(map(max, widest, found))
-    if len(rows) * sum(widest) > WIDEST:
-        column = max(range(columns), key=widest.__getitem__)
+            lengths = [max(map(len, part))] * columns
+        widths = list(map(max, widths, lengths))
+    if len(rows) * sum(widths) > WIDEST:
+        column = max(range(columns), key=widths.__getitem__)
         raise ObservationError(
             path,
-            f"column {column + 1} is {widest[column]} characters wide; {len(rows)} rows may have "
+            f"column {column + 1} is {widths[column]} characters wide; {len(rows)} rows may have "
             f"{WIDEST // len(rows)} characters in all columns",
         )
 
@@ -658,7 +665,7 @@ def _without_comments(lines: list[str]) -> list[str]:
     table = [line for line in lines if not line.lstrip().startswith("#")]
     if not table:
         return []
-    before = lines[: lines.index(table[0])]
-    if before and not any(c.isalpha() for c in table[0].replace("e", "").replace("E", "")):
-        return [before[-1].lstrip("# \t"), *table]
+    preamble = lines[: lines.index(table[0])]
+    if preamble and not any(c.isalpha() for c in table[0].replace("e", "").replace("E", "")):
+        return [preamble[-1].lstrip("# \t"), *table]
     return table

@@ -33,7 +33,7 @@ def as_images(images: Any) -> list[Path | PlainFile | np.ndarray]:
 
     # An HDUList is a list of the parts of one image, and an array could be iterated over.
     iterable = hasattr(images, "__iter__") and not isinstance(images, str | HDUList | np.ndarray)
-    return [as_image(one) for one in images] if iterable else [as_image(images)]
+    return [as_image(container) for container in images] if iterable else [as_image(images)]
 
 
 def as_image(image: Any) -> Path | PlainFile | np.ndarray:
@@ -127,8 +127,8 @@ def in_unit(value: float | Quantity | None, units: str, name: str, path: Path) -
             return float(value.to_value(u.Unit(unit)))
         except (u.UnitConversionError, TypeError):
             continue
-    wanted = " or ".join(units.split())
-    raise ObservationError(path, f"{name} {value}, expected a number of {wanted}")
+    target_unit = " or ".join(units.split())
+    raise ObservationError(path, f"{name} {value}, expected a number of {target_unit}")
 
 
 def _of_nddata(data: NDData) -> fits.HDUList:

@@ -91,17 +91,18 @@ class Sky:
 
         smooth, limit = self._above(threshold, fwhm_px)
         # A source has at least a circle of half the FWHM in diameter.
-        least = max(LEAST_PX, round(np.pi * (fwhm_px / 4.0) ** 2))
+        least_px = max(LEAST_PX, round(np.pi * (fwhm_px / 4.0) ** 2))
         # Smoothed stars have shallow saddles between them, which few levels miss.
         levels = 4 * LEVELS if fwhm_px else LEVELS
-        finder = SourceFinder(least, n_levels=levels, contrast=CONTRAST)
+        finder = SourceFinder(least_px, n_levels=levels, contrast=CONTRAST)
         finder.progress_bar = False  # photutils 3.0 shows one; the argument goes in 4.0
         parts = finder(smooth, limit, mask=self.holes)
         if parts is None:
             return {"id": np.empty(0, np.int64)}
-        found = SourceCatalog(self.flat, parts, convolved_data=smooth, mask=self.holes)
+        catalogue = SourceCatalog(self.flat, parts, convolved_data=smooth, mask=self.holes)
         x, y, flux = (
-            np.atleast_1d(v) for v in (found.x_centroid, found.y_centroid, found.segment_flux)
+            np.atleast_1d(v)
+            for v in (catalogue.x_centroid, catalogue.y_centroid, catalogue.segment_flux)
         )
         finite = np.isfinite(x) & np.isfinite(y)
         x, y, flux = x[finite], y[finite], flux[finite]
@@ -144,7 +145,7 @@ def _with_digits(values: np.ndarray) -> np.ndarray:
 
 
 def sky_of(
-    image: np.ndarray, bad: np.ndarray, sigma: np.ndarray | None = None, least: float = 0.0
+    image: np.ndarray, bad: np.ndarray, sigma: np.ndarray | None = None, least_noise: float = 0.0
 ) -> Sky:
     """Sky and noise of an image.
 
@@ -155,7 +156,7 @@ def sky_of(
         Pixels that do not count.
     sigma : ndarray, shape (h, w), optional
         σ of every pixel but for a factor, which is found here.
-    least : float
+    least_noise : float
         The noise is nowhere below this.
 
     Raises
@@ -164,13 +165,13 @@ def sky_of(
         If no mesh has enough pixels that count.
     """
     values = np.where(bad, 0.0, image)
-    found = sky_level(values, bad)
-    level = found.level
+    measured = sky_level(values, bad)
+    level = measured.level
     # Whole counts, or images without noise, may show none; the threshold must not be 0 there.
-    least = max(least, 1e-13 * float(np.ptp(values)), float(np.finfo(np.float64).tiny))
-    noise = np.maximum(found.noise, least)
+    least_noise = max(least_noise, 1e-13 * float(np.ptp(values)), float(np.finfo(np.float64).tiny))
+    noise = np.maximum(measured.noise, least_noise)
     scale = np.nan
     if sigma is not None:
         scale = float(np.median(noise[~bad] / sigma[~bad]))
         noise = scale * sigma
-    return Sky(interpolated(image - level, bad)[0], level, noise, bad, scale, found.notes)
+    return Sky(interpolated(image - level, bad)[0], level, noise, bad, scale, measured.notes)

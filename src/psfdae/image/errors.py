@@ -42,10 +42,10 @@ def no_formula(text: str) -> str:
     return text
 
 
-def shorten(names: list[str], most: int = 20) -> str:
+def shorten(names: list[str], length_max: int = 20) -> str:
     """A list of names for a message, cut after `most`."""
-    more = f", … ({len(names)} in all)" if len(names) > most else ""
-    return ", ".join(name[:40] for name in names[:most]) + more if names else "none"
+    ellipsis = f", … ({len(names)} in all)" if len(names) > length_max else ""
+    return ", ".join(name[:40] for name in names[:length_max]) + ellipsis if names else "none"
 
 
 class ObservationError(Error, ValueError):

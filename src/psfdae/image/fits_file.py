@@ -104,11 +104,14 @@ class Limit:
     def of(self, packed: int) -> tuple[int, str]:
         """Bytes allowed for so many packed ones, and the words for them."""
         folder = tempfile.gettempdir()
-        free = shutil.disk_usage(folder).free // 2
-        allowed = max(self.least, self.ratio * packed)
-        if free < allowed:
-            return free, f"{free} bytes, half of what is free in {folder} (TMPDIR names another)"
-        return allowed, f"{allowed} bytes, the most for {packed} packed ones"
+        free_bytes = shutil.disk_usage(folder).free // 2
+        allowed_bytes = max(self.least, self.ratio * packed)
+        if free_bytes < allowed_bytes:
+            return (
+                free_bytes,
+                f"{free_bytes} bytes, half of what is free in {folder} (TMPDIR names another)",
+            )
+        return allowed_bytes, f"{allowed_bytes} bytes, the most for {packed} packed ones"
 
 
 WHOLE = Limit(2**29)  # of files compressed as a whole
@@ -160,7 +163,9 @@ def plain_file(path: Path) -> PlainFile:
         start = file.read(80)
         if not start:
             raise ObservationError(path, "the file is empty")
-        unpack = next((found for magic, found in UNPACK.items() if start.startswith(magic)), None)
+        unpack = next(
+            (unpacker for magic, unpacker in UNPACK.items() if start.startswith(magic)), None
+        )
         if unpack is None:
             _check_start(path, start)
             return PlainFile(path, path)
@@ -187,12 +192,12 @@ def _check_start(path: Path, start: bytes) -> None:
 def _unpacked(path: Path, content: IO[bytes]) -> PlainFile:
     start = content.read(BLOCK_BYTES)
     _check_start(path, start)
-    allowed, words = WHOLE.of(path.stat().st_size)
+    allowed_bytes, words = WHOLE.of(path.stat().st_size)
     copy = tempfile.NamedTemporaryFile(prefix="psfdae-", suffix=".fits")  # noqa: SIM115
-    done = copy.write(start)
+    written_bytes = copy.write(start)
     while piece := content.read(PIECE):
-        done += len(piece)
-        if done > allowed:
+        written_bytes += len(piece)
+        if written_bytes > allowed_bytes:
             copy.close()
             raise ObservationError(path, f"unpacks to more than {words}; unpack it beforehand")
         copy.write(piece)
@@ -227,10 +232,10 @@ def open_hdus(file: PlainFile, **options: Any) -> Iterator[HDUList]:
         yield hdus
 
 
-def _header_bytes(name: Path, raw: IO[bytes], place: int, before: int) -> int:
+def _header_bytes(name: Path, raw: IO[bytes], place: int, bytes_before: int) -> int:
     """`before` and the bytes of the header at a place of the file, up to its end or the file's."""
     raw.seek(place)
-    for size in range(before + BLOCK_BYTES, LONGEST_HEADERS, BLOCK_BYTES):
+    for size in range(bytes_before + BLOCK_BYTES, LONGEST_HEADERS, BLOCK_BYTES):
         block = raw.read(BLOCK_BYTES)
         for card in COUNT_CARD.finditer(block):
             if card.start() % 80 == 0 and int(card[1]) > LARGEST_COUNT:
@@ -348,10 +353,10 @@ class ImageFile:
     def scale(self) -> Said:
         """Arcseconds per pixel by the header's cards, the WCS aside."""
         width, focus = (self.positive((key,))[0] for key in LENS_KEYS)
-        found = self.positive(SCALE_KEYS)
-        if found[0] is None and width and focus:
+        header_scale = self.positive(SCALE_KEYS)
+        if header_scale[0] is None and width and focus:
             return float(np.rad2deg(width * 1e-3 / focus)) * 3600.0, " and ".join(LENS_KEYS)
-        return found
+        return header_scale
 
     def provenance(self) -> list[Card]:
         """Cards of `PROVENANCE_KEYS`, those that can be parsed."""
@@ -433,14 +438,16 @@ def science_images(path: Path) -> dict[str, int]:
     like the number of another.
     """
     with reading(path), open_hdus(plain_file(path)) as hdus:
-        found = {k: hdu.name for k, hdu in enumerate(hdus) if _has_pixels(hdu)}
-    found = {k: name for k, name in found.items() if _is_science(name)}
-    if not found:
+        names_by_number = {k: hdu.name for k, hdu in enumerate(hdus) if _has_pixels(hdu)}
+    names_by_number = {k: name for k, name in names_by_number.items() if _is_science(name)}
+    if not names_by_number:
         raise ObservationError(path, "no image")
-    names = list(found.values())
+    names = list(names_by_number.values())
     plain = re.compile("(?![0-9]+$)[A-Za-z0-9_+-]+")
-    own = {k for k, name in found.items() if names.count(name) == 1 and plain.fullmatch(name)}
-    return {name if k in own else str(k): k for k, name in found.items()}
+    unique = {
+        k for k, name in names_by_number.items() if names.count(name) == 1 and plain.fullmatch(name)
+    }
+    return {name if k in unique else str(k): k for k, name in names_by_number.items()}
 
 
 def _is_science(name: str) -> bool:
@@ -473,10 +480,10 @@ def layers_beside(image: ImageFile) -> dict[str, ImageFile]:
         return {}
     with reading(image.path), open_hdus(image.file, memmap=True, **_AS_STORED) as hdus:
         images = [(k, hdu) for k, hdu in enumerate(hdus) if _has_pixels(hdu)]
-        this = hdus[image.index]
+        science_hdu = hdus[image.index]
         science = [hdu for _, hdu in images if _is_science(hdu.name)]
-        of_pipeline = this.name.upper() in SCIENCE
-        if not _is_science(this.name) or (len(science) > 1 and not of_pipeline):
+        of_pipeline = science_hdu.name.upper() in SCIENCE
+        if not _is_science(science_hdu.name) or (len(science) > 1 and not of_pipeline):
             return {}
         places = [
             k
@@ -484,9 +491,9 @@ def layers_beside(image: ImageFile) -> dict[str, ImageFile]:
             if not _is_science(hdu.name)
             and "_" not in hdu.name
             and tuple(hdu.shape)[-2:] == image.shape[-2:]
-            and hdu.ver == this.ver
+            and hdu.ver == science_hdu.ver
         ]
-    found: dict[str, ImageFile] = {}
+    layers: dict[str, ImageFile] = {}
     for place in places:
         layer = find_image(image.file, place)
         if len(layer.shape) > len(image.shape):
@@ -495,10 +502,10 @@ def layers_beside(image: ImageFile) -> dict[str, ImageFile]:
             continue
         kind = map_kind(layer)
         if kind in MAPS:
-            found.setdefault(kind, layer)
+            layers.setdefault(kind, layer)
     # A standard deviation goes before a variance; weights have no unit that could be trusted.
-    names = ("mask", "error" if "error" in found else "variance")
-    return {name: found[name] for name in names if name in found}
+    names = ("mask", "error" if "error" in layers else "variance")
+    return {name: layers[name] for name in names if name in layers}
 
 
 def bits_of_bad_pixels(mask: ImageFile) -> tuple[int, str] | None:
@@ -652,26 +659,26 @@ def decompress(file: PlainFile, hdu: Any, copy: IO[bytes]) -> np.ndarray:
     """
     first = (0,) * (len(hdu.shape) - 2)
     dtype = hdu.section[(*first, slice(0, 1), slice(0, 1))].dtype
-    allowed, words = DECOMPRESSED.of(file.path.stat().st_size)
+    allowed_bytes, words = DECOMPRESSED.of(file.path.stat().st_size)
     needed = math.prod(hdu.shape) * dtype.itemsize
-    if needed > allowed:
+    if needed > allowed_bytes:
         raise ObservationError(file.name, f"decompresses to {needed} bytes, more than {words}")
     # Room for all of it now: a disk that fills up later would kill the process.
     os.posix_fallocate(copy.fileno(), 0, needed)
     values = np.memmap(copy, dtype, "r+", shape=hdu.shape)
     rows, columns = hdu.shape[-2:]
     # Blocks of whole tiles, as wide as the image if that is few pixels.
-    high, wide = hdu.tile_shape[-2:]
-    if columns * high <= BLOCK_PX:
-        high, wide = BLOCK_PX // (columns * high) * high, columns
+    tile_rows, tile_columns = hdu.tile_shape[-2:]
+    if columns * tile_rows <= BLOCK_PX:
+        tile_rows, tile_columns = BLOCK_PX // (columns * tile_rows) * tile_rows, columns
     else:
-        wide *= max(1, BLOCK_PX // (high * wide))
-    for row in range(0, rows, high):
-        for column in range(0, columns, wide):
+        tile_columns *= max(1, BLOCK_PX // (tile_rows * tile_columns))
+    for row in range(0, rows, tile_rows):
+        for column in range(0, columns, tile_columns):
             block: tuple[int | slice, ...] = (
                 *first,
-                slice(row, row + high),
-                slice(column, column + wide),
+                slice(row, row + tile_rows),
+                slice(column, column + tile_columns),
             )
             values[block] = hdu.section[block]
     return values

@@ -54,16 +54,16 @@ def sky_sample(image: ImageFile) -> SkySample | None:
             band = np.where(np.isfinite(band := pixels[start : start + BLOCK]), band, np.nan)
             deviation = np.full((BLOCK + 4, columns), np.nan)
             deviations.append(deviation)
-            for left in range(0, columns, BLOCK):
-                square = band[:, left : left + BLOCK]
-                known = square[np.isfinite(square)]
-                if known.size < BLOCK:
+            for residual in range(0, columns, BLOCK):
+                square = band[:, residual : residual + BLOCK]
+                is_good = square[np.isfinite(square)]
+                if is_good.size < BLOCK:
                     continue
-                highest = max(highest, float(known.max()))
-                level = float(np.median(known))
-                noise = 1.4826 * float(np.median(np.abs(known - level)))
+                highest = max(highest, float(is_good.max()))
+                level = float(np.median(is_good))
+                noise = 1.4826 * float(np.median(np.abs(is_good - level)))
                 if noise > 0:
-                    deviation[: len(band), left : left + BLOCK] = (square - level) / noise
+                    deviation[: len(band), residual : residual + BLOCK] = (square - level) / noise
                     levels.append(level)
                     noises.append(noise)
     if not levels:
@@ -90,8 +90,8 @@ def clipped_level(image: ImageFile, sky: SkySample) -> tuple[float, int] | None:
             count += int(np.count_nonzero(full))
             pairs += int(np.count_nonzero(full[:, 1:] & full[:, :-1]))
             pairs += int(np.count_nonzero(full[1:] & full[:-1]))
-    few = 5 <= count <= 0.01 * image.shape[0] * image.shape[1]
-    clipped = few and 2 * pairs >= count and largest > sky.level + 50.0 * sky.noise
+    sample = 5 <= count <= 0.01 * image.shape[0] * image.shape[1]
+    clipped = sample and 2 * pairs >= count and largest > sky.level + 50.0 * sky.noise
     return (largest, count) if clipped else None
 
 
@@ -143,9 +143,9 @@ def checked_camera(
     read_noise, read_origin = values["read noise"]
     photons = np.sqrt(max(sky.level, 0.0) / gain) if gain else 0.0
     electronics = read_noise / gain if gain and read_noise else 0.0
-    least = max(photons, electronics)
+    least_sigma = max(photons, electronics)
     # A mean of two frames has 0.71 of the noise of one; resampling leaves about 0.8.
-    contradicted = sky.noise < 0.75 * least
+    contradicted = sky.noise < 0.75 * least_sigma
     by_unit = bool(gain) and sky.highest <= 1.0 and gain_origin not in ("given", "BUNIT")
     if not (contradicted or by_unit):
         return CheckedCamera(values, remarks)
@@ -154,7 +154,7 @@ def checked_camera(
         if electronics >= photons:
             cause = f"{read_origin} = {read_noise:g} and {cause}"
         problem = (
-            f"{cause} mean a noise of the sky of at least {least:.3g} {unit}, but the pixels "
+            f"{cause} mean a noise of the sky of at least {least_sigma:.3g} {unit}, but the pixels "
             f"scatter by {sky.noise:.3g}"
         )
     else:

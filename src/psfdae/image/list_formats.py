@@ -80,18 +80,18 @@ def regions(path: Path, lines: list[str]) -> Table:
             if part.lower() in SYSTEMS or part.lower() in OTHER_SYSTEMS:
                 system = part.lower()
                 continue
-            found = REGION.match(part)
-            shape = found[2].lower() if found else part[:20]
-            if found is None or shape not in CENTRED:
+            circles = REGION.match(part)
+            shape = circles[2].lower() if circles else part[:20]
+            if circles is None or shape not in CENTRED:
                 raise ObservationError(
                     path, f"region {shape!r}, expected one of {', '.join(CENTRED)}"
                 )
-            if found[1] == "-":
+            if circles[1] == "-":
                 continue
             used.add(system)
             text = re.search(r"text\s*=\s*(?:\{([^}]*)\}|\"([^\"]*)\"|'([^']*)')", properties)
-            first.append(found[3])
-            second.append(found[4])
+            first.append(circles[3])
+            second.append(circles[4])
             texts.append("" if text is None else next(filter(None, text.groups()), ""))
     if len(used) > 1 or not used <= SYSTEMS.keys():
         raise ObservationError(

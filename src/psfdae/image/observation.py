@@ -116,7 +116,7 @@ class Source:
 
     @property
     def name(self) -> str:
-        """What a model of its stars is called by default: the file's name without its suffixes."""
+        """Default name of a model of its stars: the file's name without its suffixes."""
         return FITS_SUFFIXES.sub("", self.path.name) or "model"
 
     def files(self) -> tuple[object, ...]:
@@ -170,8 +170,8 @@ class Source:
         image = self._as_image(image, table)
         shape = image.shape
         is_cube = self._is_cube(image, stamp_px)
-        given = self.catalogue is not None or self.origin is not None
-        if self.detect is not None and (is_cube or given):
+        is_stated = self.catalogue is not None or self.origin is not None
+        if self.detect is not None and (is_cube or is_stated):
             raise ObservationError(
                 self.path, "--detect takes an image, no cube; no list, and no origin of one"
             )
@@ -182,8 +182,8 @@ class Source:
             refuse_mosaic_of_colours(image)
             camera, remarks = checked_camera(image, camera, sky_sample(image))
             remarks += sky_coordinate_remarks(image)
-        layers, beside = self._layers(image, is_cube, camera)
-        remarks += beside
+        layers, layer_notes = self._layers(image, is_cube, camera)
+        remarks += layer_notes
         listed = None if table is None else table.path
         if self.detect is not None or layers.noise is not None:
             sky = layers.sky()
@@ -197,22 +197,26 @@ class Source:
         identifiers = np.arange(count, dtype=np.int64)
         positions, flags = None, np.zeros(count, dtype=np.uint16)
         if table is not None:
-            where = table.positions()
-            if self.origin is None and where.origin is None and not (where.sky or is_cube):
-                where, remark = self._with_origin(table, where, layers)
+            positions_choice = table.positions()
+            if (
+                self.origin is None
+                and positions_choice.origin is None
+                and not (positions_choice.sky or is_cube)
+            ):
+                positions_choice, remark = self._with_origin(table, positions_choice, layers)
                 remarks += remark
-            positions = self._positions(image, table, where, is_cube)
-            identifiers, flags = table.identifiers(), table.flags(where)
+            positions = self._positions(image, table, positions_choice, is_cube)
+            identifiers, flags = table.identifiers(), table.flags(positions_choice)
             if positions is not None and not is_cube and self.detect is None:
-                again = listed_again(positions)
-                raise_flag(flags, StarFlag.BLENDED, again)
-                remarks += _on_pairs(table, again)
+                is_repeated = listed_again(positions)
+                raise_flag(flags, StarFlag.BLENDED, is_repeated)
+                remarks += _on_pairs(table, is_repeated)
         names = (self.flux_column, self.background_column, self.colour_column)
         of_list = (self._column(table, name, count) for name in names)
         columns = [identifiers, np.arange(count), *of_list, flags]
         if self.on_image and positions is not None and not is_cube:
-            kept = _inside(positions, shape)
-            columns, positions = [column[kept] for column in columns], positions[kept]
+            on_image = _inside(positions, shape)
+            columns, positions = [column[on_image] for column in columns], positions[on_image]
         return Observation(
             self.path,
             len(columns[0]),
@@ -240,26 +244,26 @@ class Source:
         return image.one_plane() if stars_wanted or large else image
 
     def _with_origin(
-        self, table: Catalogue, where: Positions, layers: Layers
+        self, table: Catalogue, columns: Positions, layers: Layers
     ) -> tuple[Positions, list[str]]:
         """The columns of a list with the origin that the stars of the image say, in words, too.
 
         Unchanged if they do not say it clearly.
         """
-        places = np.stack([table.pixels(where.first), table.pixels(where.second)], axis=1)
+        places = np.stack([table.pixels(columns.first), table.pixels(columns.second)], axis=1)
         try:
-            found = origin_of(layers.sky(), places)
+            data_origin = origin_of(layers.sky(), places)
         except ObservationError:  # no sky can be measured
-            found = None
-        if found is None:
-            return where, []
-        origin, offset, count = found
+            data_origin = None
+        if data_origin is None:
+            return columns, []
+        origin, offset, count = data_origin
         words = (
-            f"{table.path}: {where.first},{where.second} count from {origin}, as {count} stars "
+            f"{table.path}: {columns.first},{columns.second} count from {origin}, as {count} stars "
             f"show (their centroids are off by x {offset[0]:+.2f}, y {offset[1]:+.2f} px); "
             "--origin states it"
         )
-        return replace(where, origin=origin), [words]
+        return replace(columns, origin=origin), [words]
 
     def _check_numbers(self) -> None:
         """Refuse a camera value or a threshold that is no number above 0."""
@@ -285,7 +289,7 @@ class Source:
         )
 
     def _positions(
-        self, image: ImageFile, table: Catalogue, where: Positions, is_cube: bool
+        self, image: ImageFile, table: Catalogue, positions_choice: Positions, is_cube: bool
     ) -> np.ndarray | None:
         """Positions (n, 2) of the catalogue's stars; None for a cube if they are on the sky.
 
@@ -295,32 +299,35 @@ class Source:
             raise ObservationError(
                 table.path, f"{len(table)} stars for the {image.shape[0]} stamps of {image.path}"
             )
-        if where.sky and is_cube:
+        if positions_choice.sky and is_cube:
             return None
-        if where.sky:
-            ra, dec = table.sky(where)
+        if positions_choice.sky:
+            ra, dec = table.sky(positions_choice)
             if image.wcs is None:
                 raise ObservationError(
                     image.path,
-                    f"no usable celestial WCS, which the sky coordinates {where.first},"
-                    f"{where.second} of {table.path} need",
+                    f"no usable celestial WCS, which the sky coordinates {positions_choice.first},"
+                    f"{positions_choice.second} of {table.path} need",
                 )
             with reading(image.path):
                 positions = np.stack(sky_to_pixel(image.wcs, ra, dec, image.shape), axis=1)
         else:
-            origin = where.origin if self.origin is None else self.origin
+            origin = positions_choice.origin if self.origin is None else self.origin
             if origin is None:
                 raise ObservationError(
                     table.path,
-                    f"the origin of columns {where.first},{where.second} must be stated: "
+                    "the origin of columns "
+                    f"{positions_choice.first},{positions_choice.second} must be stated: "
                     "is the centre of the first pixel 0 or 1? --origin says it",
                 )
-            columns = [table.pixels(name) for name in (where.first, where.second)]
+            columns = [
+                table.pixels(name) for name in (positions_choice.first, positions_choice.second)
+            ]
             positions = np.stack(columns, axis=1) - origin
         # What is beyond any image is no position: its squares would not even be numbers.
         positions = np.where(np.abs(positions) < FAR, positions, np.nan)
         if not is_cube:
-            _check_overlap(image, table, where, positions)
+            _check_overlap(image, table, positions_choice, positions)
         return positions
 
     def _given(self) -> dict[str, float | None]:
@@ -332,24 +339,24 @@ class Source:
         }
 
     def _camera(self, image: ImageFile) -> dict[str, Said]:
-        """What is given, else what the WCS and the headers say, and who says it."""
+        """Return values that are stated, else those of WCS and headers, each with its source."""
         scale = image.scale()
         if image.wcs is not None:
             with reading(image.path):
-                found = pixel_scale(image.wcs)
-            scale = (found, "WCS") if math.isfinite(found) and found > 0 else scale
+                wcs_scale = pixel_scale(image.wcs)
+            scale = (wcs_scale, "WCS") if math.isfinite(wcs_scale) and wcs_scale > 0 else scale
         saturation, noise = map(image.positive, (SATURATION_KEYS, READ_NOISE_KEYS))
         headers = dict(zip(self._given(), (scale, image.gain(), noise, saturation), strict=True))
-        given = {name: (v, "given") for name, v in self._given().items() if v is not None}
-        return headers | given
+        stated = {name: (v, "given") for name, v in self._given().items() if v is not None}
+        return headers | stated
 
     def _layers(
         self, image: ImageFile, is_cube: bool, camera: dict[str, Said]
     ) -> tuple[Layers, list[str]]:
         """The image with its mask and map of noise, and what is said of those of its own file."""
-        own = {} if is_cube else layers_beside(image)
-        mask, bad_bits, remarks = self._mask_and_bits(image, own.get("mask"))
-        said = [f"{_label(mask)} as mask"] if mask is not None and self.mask is None else []
+        files = {} if is_cube else layers_beside(image)
+        mask, bad_bits, remarks = self._mask_and_bits(image, files.get("mask"))
+        notes = [f"{_label(mask)} as mask"] if mask is not None and self.mask is None else []
         gain, read_noise = (camera[name][0] for name in ("gain", "read noise"))
         layers = Layers(
             image,
@@ -370,27 +377,27 @@ class Source:
             noise = _find_beside(image, place, NOISE_MAPS[kind])
             layers = _with_stated_noise(layers, noise, kind)
         if all(value is None for value in maps.values()):
-            for kind in own.keys() & NOISE_MAPS.keys():
-                layers, problem = _with_own_noise(layers, own[kind], kind)
+            for kind in files.keys() & NOISE_MAPS.keys():
+                layers, problem = _with_own_noise(layers, files[kind], kind)
                 symbol = "σ" if kind == "error" else "σ²"
-                said = [problem or f"{_label(own[kind])} as {symbol}", *said]
-        if said:
+                notes = [problem or f"{_label(files[kind])} as {symbol}", *notes]
+        if notes:
             # A bit may mark pixels that are fine; then good stars would be lost.
-            line = f"{self.path}: uses {' and '.join(said)}"
-            part = layers.masked_part() if mask is not None and self.mask is None else 0.0
-            if part > 0.2:
+            line = f"{self.path}: uses {' and '.join(notes)}"
+            share = layers.masked_part() if mask is not None and self.mask is None else 0.0
+            if share > 0.2:
                 line += (
-                    f"; {100 * part:.0f} % of the pixels have a bit of {_label(own['mask'])}: "
+                    f"; {100 * share:.0f} % of the pixels have a bit of {_label(files['mask'])}: "
                     "state --bad-bits, or --mask none"
                 )
             remarks.insert(0, line)
         return layers, remarks
 
     def _mask_and_bits(
-        self, image: ImageFile, own: ImageFile | None
+        self, image: ImageFile, layer_file: ImageFile | None
     ) -> tuple[ImageFile | None, int | None, list[str]]:
         """The mask that is stated, else that of the image's file; its bad bits, and who says so."""
-        mask = own
+        mask = layer_file
         if self.mask is not None:
             mask = None if _is_none(self.mask) else _find_beside(image, self.mask, "a mask")
         if self.bad_bits is not None and mask is None:
@@ -399,8 +406,8 @@ class Source:
         if mask is None or self.bad_bits is not None or by_header is None:
             return mask, self.bad_bits, []
         bits, planes = by_header
-        said = f"{self.path}: bad pixels by {_label(mask)}: {planes} (bits {bits})"
-        return mask, bits, [said]
+        note = f"{self.path}: bad pixels by {_label(mask)}: {planes} (bits {bits})"
+        return mask, bits, [note]
 
     def _detected(self, sky: Sky, threshold: float) -> Catalogue:
         """The stars of an image."""
@@ -422,23 +429,24 @@ class Source:
 
 
 def other_instruments(
-    known: Mapping[str, object], seen: Mapping[str, str]
+    training_instrument: Mapping[str, object], image_instrument: Mapping[str, str]
 ) -> list[tuple[str, str, str]]:
     """Keys of headers by which two images' telescope, camera or filter differ, and both values."""
     return [
-        (key, str(value), seen[key])
-        for key, value in known.items()
-        if key in seen and seen[key].strip().casefold() != str(value).strip().casefold()
+        (key, str(value), image_instrument[key])
+        for key, value in training_instrument.items()
+        if key in image_instrument
+        and image_instrument[key].strip().casefold() != str(value).strip().casefold()
     ]
 
 
-def require_sky(stars: StarList, what: str) -> None:
+def require_sky(stars: StarList, purpose: str) -> None:
     """Refuse a star list of several images that has no sky coordinates."""
     table = as_catalogue(stars)
     if not table.positions().sky:
         raise ObservationError(
             table.path,
-            f"{what} takes a list with sky coordinates, or --detect: pixels do not say which "
+            f"{purpose} takes a list with sky coordinates, or --detect: pixels do not say which "
             "image they are of",
         )
 
@@ -461,45 +469,52 @@ def _refuse_colours(image: ImageFile) -> None:
 
 
 def _check_overlap(
-    image: ImageFile, table: Catalogue, where: Positions, positions: np.ndarray
+    image: ImageFile, table: Catalogue, positions_of: Positions, positions: np.ndarray
 ) -> None:
     rows, columns = image.shape
-    found = np.count_nonzero(_inside(positions, image.shape))
-    if found > rows * columns:
+    inside_count = np.count_nonzero(_inside(positions, image.shape))
+    if inside_count > rows * columns:
         raise ObservationError(
             table.path,
-            f"{found} stars are on the image {image.path} of {columns} columns and {rows} rows, "
-            "more than it has pixels",
+            f"{inside_count} stars are on the image {image.path} of {columns} columns and {rows} "
+            "rows, more than it has pixels",
         )
-    if found:
+    if inside_count:
         return
     with np.errstate(all="ignore"):
-        known = positions[np.isfinite(positions).all(axis=1)]
+        located = positions[np.isfinite(positions).all(axis=1)]
         ranges = "nowhere in its projection"
-        if len(known):
-            (x0, y0), (x1, y1) = known.min(axis=0), known.max(axis=0)
+        if len(located):
+            (x0, y0), (x1, y1) = located.min(axis=0), located.max(axis=0)
             ranges = f"at x {x0:.6g} … {x1:.6g}, y {y0:.6g} … {y1:.6g}"
     raise ObservationError(
         table.path,
         f"none of the {len(table)} stars is on the image {image.path} of {columns} columns "
         f"and {rows} rows; they are {ranges}"
-        + (f" ({where.first},{where.second} without a unit are degrees)" if where.sky else ""),
+        + (
+            f" ({positions_of.first},{positions_of.second} without a unit are degrees)"
+            if positions_of.sky
+            else ""
+        ),
     )
 
 
 def list_offset(path: Path | None, off: np.ndarray, accept: bool) -> str | None:
-    """What is said of a list of which the stars are `off` (n, 2), x and y, its positions.
+    """Return a sentence on a list of which the stars are `off` (n, 2), x and y, its positions.
 
     Rows that are not known are left out; None if there are few, or no list. ObservationError says
     that they are farther off than `FARTHEST_OFF`, unless that is to be accepted.
     """
-    known = off[~np.isnan(off).any(axis=1)]
-    if path is None or len(known) < FEWEST_OFF:
+    offsets = off[~np.isnan(off).any(axis=1)]
+    if path is None or len(offsets) < FEWEST_OFF:
         return None
-    (x, y), distance = np.median(known, axis=0), np.median(np.abs(known), axis=0)
-    said = (
+    (x, y), distance = (
+        np.median(offsets, axis=0),
+        np.median(np.abs(offsets), axis=0),
+    )
+    sentence = (
         f"stars are off its positions by x {x:+.2f}, y {y:+.2f} px in the median, half of them "
-        f"by more than {distance[0]:.2f}, {distance[1]:.2f} px either way ({len(known)} stars)"
+        f"by more than {distance[0]:.2f}, {distance[1]:.2f} px either way ({len(offsets)} stars)"
     )
     # A list whose pixels count from the other origin is off by one pixel along both axes.
     x1, y1 = round(x), round(y)
@@ -508,41 +523,43 @@ def list_offset(path: Path | None, off: np.ndarray, accept: bool) -> str | None:
         origin = int(x1 < 0)
         raise ObservationError(
             path,
-            f"{said}: its positions count from {origin}? --origin {origin} says so "
+            f"{sentence}: its positions count from {origin}? --origin {origin} says so "
             "(--accept-offset takes it as it is)",
         )
     if (distance > FARTHEST_OFF).any() and not accept:
         raise ObservationError(
             path,
-            f"{said}: a list of another image or origin, or x and y exchanged? --accept-offset "
+            f"{sentence}: a list of another image or origin, or x and y exchanged? --accept-offset "
             "takes it as it is",
         )
-    return f"{path}: {said}"
+    return f"{path}: {sentence}"
 
 
 def _inside(positions: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Which positions (n, 2), x and y, are on an image (rows, columns)."""
+    """Return True for positions (n, 2), x and y, on an image (rows, columns)."""
     place = central_pixel(positions[:, ::-1])
     return np.asarray(((place >= 0) & (place < shape)).all(axis=1))
 
 
-def _find_beside(image: ImageFile, place: Any, what: str) -> ImageFile:
+def _find_beside(image: ImageFile, place: Any, role: str) -> ImageFile:
     """An extension, or another file, with a pixel for every one of the image."""
     array = isinstance(place, np.ndarray)
     outside = isinstance(place, Path) or (isinstance(place, str) and Path(place).is_file())
     if image.values is not None and not (array or outside):
-        raise ObservationError(image.path, f"{what} of an array is an array, too, or a file")
+        raise ObservationError(image.path, f"{role} of an array is an array, too, or a file")
     if array:
-        found = array_image(np.asarray(place, dtype=np.float64), what)
+        layer = array_image(np.asarray(place, dtype=np.float64), role)
     else:
-        found = find_image(Path(place)) if outside else find_image(image.file, place)
-    wanted = image.shape
-    if len(found.shape) == 3 and found.shape[0] == 1 and len(wanted) == 2:
-        found = found.one_plane()
-    if found.shape != wanted and not (len(wanted) == 3 and found.shape == wanted[1:]):
-        sizes = ["×".join(str(n) for n in shape) for shape in (found.shape, wanted)]
-        raise ObservationError(found.path, f"{what} of {sizes[0]} pixels, expected {sizes[1]}")
-    return found
+        layer = find_image(Path(place)) if outside else find_image(image.file, place)
+    expected_shape = image.shape
+    if len(layer.shape) == 3 and layer.shape[0] == 1 and len(expected_shape) == 2:
+        layer = layer.one_plane()
+    if layer.shape != expected_shape and not (
+        len(expected_shape) == 3 and layer.shape == expected_shape[1:]
+    ):
+        sizes = ["×".join(str(n) for n in shape) for shape in (layer.shape, expected_shape)]
+        raise ObservationError(layer.path, f"{role} of {sizes[0]} pixels, expected {sizes[1]}")
+    return layer
 
 
 def _is_none(place: object) -> bool:
@@ -567,15 +584,16 @@ def _with_stated_noise(layers: Layers, noise: ImageFile, kind: str) -> Layers:
         )
     with open_pixels(noise, whole=True) as pixels:
         values = pixels[:]
-    wrong, empty = (int(np.count_nonzero(some)) for some in (values < 0, values == 0))
+    negative, zero = (int(np.count_nonzero(is_invalid)) for is_invalid in (values < 0, values == 0))
     may_be_0 = kind != "variance"
-    if wrong or (empty and not may_be_0):
+    if negative or (zero and not may_be_0):
         raise ObservationError(
             noise.path,
-            f"{NOISE_MAPS[kind]} of which {wrong + (not may_be_0) * empty} of {values.size} pixels "
-            f"are not {'at least' if may_be_0 else 'above'} 0; NaN is for bad pixels, or a mask",
+            f"{NOISE_MAPS[kind]} of which {negative + (not may_be_0) * zero} of {values.size} "
+            f"pixels are not {'at least' if may_be_0 else 'above'} 0; NaN is for bad pixels, "
+            "or a mask",
         )
-    return replace(layers, noise=noise, kind=kind, empty=empty)
+    return replace(layers, noise=noise, kind=kind, empty=zero)
 
 
 def _with_own_noise(layers: Layers, noise: ImageFile, kind: str) -> tuple[Layers, str]:
@@ -598,7 +616,7 @@ def _with_photons(
     Where photons make the noise, variance = variance of the sky + light/gain. A map of the sky
     alone does not grow, and nothing changes. A gain that is known otherwise stays.
     """
-    with layers.open(whole=True) as (_, _, noise):
+    with layers.open(is_whole=True) as (_, _, noise):
         assert noise is not None
         sigma = layers.sigma(noise[slice(None), slice(None)])
     good = ~sky.bad & np.isfinite(sigma)
@@ -628,21 +646,21 @@ def listed_again(positions: np.ndarray) -> np.ndarray:
     """Return which positions (n, 2) are nearer than `SAME_PX` to an earlier one, bool, (n,)."""
     from scipy.spatial import cKDTree
 
-    known = np.flatnonzero(np.isfinite(positions).all(axis=1))
-    again = np.zeros(len(positions), dtype=bool)
-    pairs = cKDTree(positions[known]).query_pairs(SAME_PX, output_type="ndarray")
-    again[known[pairs.max(axis=1)]] = True
-    return again
+    located = np.flatnonzero(np.isfinite(positions).all(axis=1))
+    is_repeated = np.zeros(len(positions), dtype=bool)
+    pairs = cKDTree(positions[located]).query_pairs(SAME_PX, output_type="ndarray")
+    is_repeated[located[pairs.max(axis=1)]] = True
+    return is_repeated
 
 
-def _on_pairs(table: Catalogue, again: np.ndarray) -> list[str]:
+def _on_pairs(table: Catalogue, is_repeated: np.ndarray) -> list[str]:
     """Return a sentence on rows of a list that are the same star as an earlier one."""
-    rows = [str(row + 1) for row in np.flatnonzero(again)]
+    rows = [str(row + 1) for row in np.flatnonzero(is_repeated)]
     if not rows:
         return []
-    said = "row is" if len(rows) == 1 else "rows are"
+    subject = "row is" if len(rows) == 1 else "rows are"
     return [
-        f"{table.path}: {len(rows)} {said} within {SAME_PX:g} px of an earlier one "
+        f"{table.path}: {len(rows)} {subject} within {SAME_PX:g} px of an earlier one "
         f"({shorten(rows)}): flagged BLENDED, and not learnt from"
     ]
 
@@ -664,12 +682,12 @@ class Layers:
     _bad_pixels: list[BadPixels] = field(default_factory=list, repr=False)  # once they are found
 
     @contextmanager
-    def open(self, whole: bool) -> Iterator[tuple[Pixels, Pixels | None, Pixels | None]]:
+    def open(self, is_whole: bool) -> Iterator[tuple[Pixels, Pixels | None, Pixels | None]]:
         """Pixels of the image, the mask and the map of noise, None for what there is not."""
         with ExitStack() as files:
 
             def opened(image: ImageFile, dtype: type[np.floating] = np.float32) -> Pixels:
-                return files.enter_context(open_pixels(image, whole=whole, dtype=dtype))
+                return files.enter_context(open_pixels(image, whole=is_whole, dtype=dtype))
 
             pixels = opened(self.image)
             # Bits of whole numbers do not fit into the mantissa of a float32.
@@ -678,7 +696,7 @@ class Layers:
             yield pixels, mask, noise
 
     def bad(self, values: np.ndarray) -> np.ndarray:
-        """Which pixels the mask calls bad; those without a value are."""
+        """Return the pixels that the mask calls bad; those without a value are."""
         if self.bad_bits is None:
             return np.asarray(values != 0)
         with np.errstate(invalid="ignore"):  # what is beyond any number has no bits
@@ -694,15 +712,15 @@ class Layers:
                 variance = 1.0 / values
             else:
                 variance = values**2 if self.kind == "error" else values
-            known = np.isfinite(variance) & (variance > 0)
+            is_known = np.isfinite(variance) & (variance > 0)
             # Light is noisy, too; at least a hundredth of the variance is of the sky.
             variance = np.clip(variance - self.photons * light, 0.01 * variance, 2.0 * variance)
-        return self.noise_scale * np.sqrt(np.where(known, variance, np.nan))
+        return self.noise_scale * np.sqrt(np.where(is_known, variance, np.nan))
 
     def masked_part(self) -> float:
         """Part of the pixels that the mask calls bad."""
         everything = (slice(None), slice(None))
-        with self.open(whole=True) as (_, mask, _):
+        with self.open(is_whole=True) as (_, mask, _):
             return 0.0 if mask is None else float(np.mean(self.bad(mask[everything])))
 
     def sky(self) -> Sky:
@@ -718,7 +736,7 @@ class Layers:
         """The image (h, w), its masked pixels, and σ of all pixels if there is a map of it."""
         everything = (slice(None), slice(None))
         sigma = None
-        with self.open(whole=True) as (pixels, mask, noise):
+        with self.open(is_whole=True) as (pixels, mask, noise):
             image = pixels[everything]
             masked = ~np.isfinite(image)
             if mask is not None:
@@ -733,11 +751,11 @@ class Layers:
         if not self._bad_pixels:
             with silent():
                 try:
-                    found = find_bad_pixels(image, masked, self.image.headers, self.saturate)
-                    found = with_trails(image, found)
+                    bad_pixels = find_bad_pixels(image, masked, self.image.headers, self.saturate)
+                    bad_pixels = with_trails(image, bad_pixels)
                 except ClippedSkyError as error:
                     raise ObservationError(self.image.path, str(error)) from None
-            self._bad_pixels.append(found)
+            self._bad_pixels.append(bad_pixels)
         return self._bad_pixels[0]
 
 
@@ -756,10 +774,10 @@ def _sky(layers: Layers) -> Sky:
             raise ObservationError(layers.image.path, problem) from None
     if sigma is None or not layers.photons:
         return sky
-    with layers.open(whole=True) as (_, _, noise):
+    with layers.open(is_whole=True) as (_, _, noise):
         assert noise is not None
-        own = layers.sigma(noise[:], sky.flat)
-    return replace(sky, noise=sky.noise_scale * own)
+        stated_sigma = layers.sigma(noise[:], sky.flat)
+    return replace(sky, noise=sky.noise_scale * stated_sigma)
 
 
 @dataclass(frozen=True)
@@ -837,30 +855,30 @@ class Observation:
         return place.ra.deg, place.dec.deg
 
     def said(self) -> str:
-        """What is known of the camera and who says it, in words."""
+        """Return camera values and their sources in words."""
         units = ("arcsec", "electrons per count", "electrons", "counts")
         words = []
         for (name, (value, origin)), unit in zip(self.camera.items(), units, strict=True):
             words.append(f"{name} {origin if value is None else f'{value:.6g} {unit} ({origin})'}")
-        said = "\n".join([f"{self.path}: {', '.join(words)}", *self.remarks])
+        text = "\n".join([f"{self.path}: {', '.join(words)}", *self.remarks])
         if (empty := self._layers.empty) and (noise := self._layers.noise) is not None:
-            said += f"\n{noise.path}: {self._layers.kind} 0, bad pixels: {empty}"
+            text += f"\n{noise.path}: {self._layers.kind} 0, bad pixels: {empty}"
         if self.shape is not None and (notes := self._layers.bad_pixels.notes):
-            said += f"\n{self.path}: left out: {', '.join(notes)}"
-        lost = self.without_position()
-        if lost.any():
-            rows = shorten([str(row + 1) for row in np.flatnonzero(lost)])
-            said += f"\n{self.catalogue}: no position in row {rows}: flagged, and not learnt from"
-        return said
+            text += f"\n{self.path}: left out: {', '.join(notes)}"
+        is_lost = self.without_position()
+        if is_lost.any():
+            rows = shorten([str(row + 1) for row in np.flatnonzero(is_lost)])
+            text += f"\n{self.catalogue}: no position in row {rows}: flagged, and not learnt from"
+        return text
 
     def without_position(self) -> np.ndarray:
-        """Which stars have no position though the list has others, bool, shape (n,)."""
+        """Return True for stars without a position in a list that has others, shape (n,)."""
         if self.positions is None or self.found is not None:
             return np.zeros(self.count, dtype=bool)
         return np.asarray(~np.isfinite(self.positions).all(axis=1))
 
     def listed_again(self) -> np.ndarray:
-        """Which stars of a list are the same as an earlier one, bool, shape (n,)."""
+        """Return True for stars of a list that are the same as an earlier one, shape (n,)."""
         if self.positions is None or self.found is not None or self.shape is None:
             return np.zeros(self.count, dtype=bool)
         return listed_again(self.positions)
@@ -902,15 +920,15 @@ class Observation:
         """
         if self.shape is None or self.catalogue is None or self.positions is None:
             return
-        known = np.flatnonzero(np.isfinite(self.positions).all(axis=1))
+        located = np.flatnonzero(np.isfinite(self.positions).all(axis=1))
         sky = self._layers.sky()
         with silent():
             column, row = central_pixel(self.positions.T)
-            seen = int(sky.covered(column, row, SEEN).sum())
-        if seen < 0.5 * known.size:
+            hits = int(sky.covered(column, row, SEEN).sum())
+        if hits < 0.5 * located.size:
             raise ObservationError(
                 self.catalogue,
-                f"{seen} of {known.size} positions are on a source of {self.path}, at least half "
+                f"{hits} of {located.size} positions are on a source of {self.path}, at least half "
                 "are expected: a list of another image, or with stars too faint for this one?",
             )
 
@@ -936,7 +954,7 @@ class Observation:
         if rows < 1:
             raise ValueError(f"rows is {rows}, expected at least 1")
         stamps_of = self._of_cube if self.shape is None else self._of_image
-        with self._layers.open(whole=self.shape is not None) as opened:
+        with self._layers.open(is_whole=self.shape is not None) as opened:
             for start in range(0, self.count, rows):
                 part = slice(start, min(start + rows, self.count))
                 yield self._stamps(part, *stamps_of(part, *opened))
@@ -949,8 +967,8 @@ class Observation:
         data = cut(_rows(pixels, part), side)
         masked = np.zeros(data.shape, dtype=bool)
         if mask is not None:
-            each = part if len(mask.image.shape) == 3 else slice(0, 1)
-            masked |= self._layers.bad(cut(_rows(mask, each), side))
+            mask_rows = part if len(mask.image.shape) == 3 else slice(0, 1)
+            masked |= self._layers.bad(cut(_rows(mask, mask_rows), side))
         return data, masked, np.zeros(count, dtype=bool), np.full(count, np.nan)
 
     def _of_image(
@@ -958,30 +976,30 @@ class Observation:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         assert self.shape is not None and self.positions is not None
         x, y = self.positions[part].T
-        wide = max(self.margin, RING_PX)
-        where = (self.shape, x, y, self.stamp_px, wide)
-        data, inside, truncated = cut_image(pixels, *where)
+        margin = max(self.margin, RING_PX)
+        cut_of = (self.shape, x, y, self.stamp_px, margin)
+        data, inside, truncated = cut_image(pixels, *cut_of)
         pixels_of_stars = data
         if self.others is not None:
             full = np.inf if self.saturate is None else self.saturate
-            left = data - self.others(part, self.stamp_px, wide)
-            data = np.where(data >= full, data, left)  # or saturated pixels would not be seen
+            cleaned = data - self.others(part, self.stamp_px, margin)
+            data = np.where(data >= full, data, cleaned)  # or saturated pixels would not be seen
         bad = self._layers.bad_pixels
-        masked = ~inside | (cut_image(bad.mask, *where)[0] != 0)
-        own = slice(wide - self.margin, wide + self.stamp_px + self.margin)
+        masked = ~inside | (cut_image(bad.mask, *cut_of)[0] != 0)
+        stamp_part = slice(margin - self.margin, margin + self.stamp_px + self.margin)
         if noise is not None:
             light: np.ndarray | float = 0.0
             if self._layers.photons:
                 level, _ = sky_around(pixels_of_stars, masked, self.stamp_px)
                 light = pixels_of_stars - level[:, None, None]
-            sigma = self._layers.sigma(cut_image(noise, *where)[0], light)
-            each = np.ma.array(sigma, mask=masked)[:, own, own]
-            level = np.ma.median(each, axis=(1, 2)).filled(np.nan).astype(float)
+            sigma = self._layers.sigma(cut_image(noise, *cut_of)[0], light)
+            stamp_sigma = np.ma.array(sigma, mask=masked)[:, stamp_part, stamp_part]
+            level = np.ma.median(stamp_sigma, axis=(1, 2)).filled(np.nan).astype(float)
         else:
             # In the stamp of a bright star, light that no PSF explains would pass for noise.
             _, level = sky_around(data, masked | ~np.isfinite(data), self.stamp_px)
             level = np.where(level > 0, np.maximum(level, self.least_noise), np.nan)
-        return data[:, own, own], masked[:, own, own], truncated, level
+        return data[:, stamp_part, stamp_part], masked[:, stamp_part, stamp_part], truncated, level
 
     def _stamps(
         self,
@@ -1011,8 +1029,8 @@ class Observation:
             # A cosmic ray within a pixel of the position: it may be no star.
             cosmic = cut_image(self._layers.bad_pixels.cosmic, self.shape, x, y, 3, 0)[0]
             raise_flag(flags, StarFlag.SHARP, cosmic.any(axis=(1, 2)))
-        known = (flux, background, noise, gain, unknown, colour, listed)
-        return Stamps(data, masked, saturated, flags, ids, x, y, *known)
+        facts = (flux, background, noise, gain, unknown, colour, listed)
+        return Stamps(data, masked, saturated, flags, ids, x, y, *facts)
 
 
 def _rows(pixels: Pixels, part: slice) -> np.ndarray:
@@ -1063,10 +1081,10 @@ def cut_image(
     ]
     inside = row_inside[:, :, None] & column_inside[:, None, :]
     stamp = slice(margin, margin + stamp_px)
-    whole = row_inside[:, stamp].all(axis=1) & column_inside[:, stamp].all(axis=1)
+    is_whole = row_inside[:, stamp].all(axis=1) & column_inside[:, stamp].all(axis=1)
     if not inside.all():
         stamps = np.where(inside, stamps, 0)
-    return stamps, inside, np.asarray(~whole)
+    return stamps, inside, np.asarray(~is_whole)
 
 
 def pixel_scale(wcs: WCS) -> float:
@@ -1093,15 +1111,15 @@ def sky_to_pixel(
     stars = SkyCoord(ra, dec, unit="deg")
     x, y = (np.array(v, dtype=np.float64) for v in skycoord_to_pixel(stars, wcs, mode="wcs"))
     rows, columns = shape
-    near = (np.abs(x - columns / 2) < (0.5 + NEAR) * columns) & (
+    is_near = (np.abs(x - columns / 2) < (0.5 + NEAR) * columns) & (
         np.abs(y - rows / 2) < (0.5 + NEAR) * rows
     )
-    if wcs.has_distortion and near.any():
+    if wcs.has_distortion and is_near.any():
         try:
-            x[near], y[near] = skycoord_to_pixel(stars[near], wcs, mode="all")
+            x[is_near], y[is_near] = skycoord_to_pixel(stars[is_near], wcs, mode="all")
         except NoConvergence as error:
             solution = np.array(error.best_solution, dtype=np.float64)
             if error.divergent is not None:
                 solution[error.divergent] = np.nan
-            x[near], y[near] = solution.T
+            x[is_near], y[is_near] = solution.T
     return x, y

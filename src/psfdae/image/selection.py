@@ -1,4 +1,4 @@
-"""Which stars of an image are good enough to learn the PSF from.
+"""Choice of the stars of an image that are good enough to learn the PSF from.
 
 Everything works on stamps (n, s, s) somewhat wider than those of the network. The
 star of a stamp lies near index (s//2, s//2).
@@ -59,7 +59,7 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True)
 class Candidates:
-    """What is known of all n stars of an observation, and the bright ones among them."""
+    """Measurements of all n stars of an observation, and the bright ones among them."""
 
     id: np.ndarray
     position: np.ndarray  # (n, 2), x, y, NaN where unknown
@@ -74,10 +74,10 @@ class Candidates:
     @classmethod
     def joined(cls, several: Sequence[Candidates]) -> Candidates:
         """Those of several observations, one after the other."""
-        starts = accumulate((len(found.verdict) for found in several), initial=0)
+        starts = accumulate((len(candidates.verdict) for candidates in several), initial=0)
         bright = [
-            replace(found.bright, row=found.bright.row + start)
-            for found, start in zip(several, starts, strict=False)
+            replace(candidates.bright, row=candidates.bright.row + start)
+            for candidates, start in zip(several, starts, strict=False)
         ]
         names = [field.name for field in fields(cls) if field.name != "bright"]
         columns = {name: np.concatenate([getattr(f, name) for f in several]) for name in names}
@@ -99,8 +99,8 @@ class Candidates:
 
     def count(self) -> str:
         """How many stars there are of every verdict, in words."""
-        found = Counter(self.verdict.tolist())
-        return ", ".join(f"{found[v]} {v}" for v in map(str, Verdict) if found[v])
+        counts = Counter(self.verdict.tolist())
+        return ", ".join(f"{counts[v]} {v}" for v in map(str, Verdict) if counts[v])
 
     def columns(self, held_out: np.ndarray) -> dict[str, np.ndarray]:
         """Columns of every star of the list, and which of the good ones are held out, (n,) each."""
@@ -141,32 +141,41 @@ def collect(
         _measure(chunk, settings, framing, least, observation.shape)
         for chunk in observation.chunks(ROWS)
     ]
-    columns, kept = zip(*measured, strict=True)
-    found = {key: np.concatenate([c[key] for c in columns]) for key in columns[0]}
-    side, verdict, noise, snr = framing.stamp_px, found["verdict"], found["noise"], found["snr"]
+    columns, kept_stamps = zip(*measured, strict=True)
+    measured_columns = {key: np.concatenate([c[key] for c in columns]) for key in columns[0]}
+    side, verdict, noise, snr = (
+        framing.stamp_px,
+        measured_columns["verdict"],
+        measured_columns["noise"],
+        measured_columns["snr"],
+    )
     row = np.flatnonzero(verdict == Verdict.GOOD)
     if observation.saturate is None:
-        flat = found["highest"] >= piled_up(found["brightest"], found["sky"], snr * noise)
+        flat = measured_columns["highest"] >= piled_up(
+            measured_columns["brightest"], measured_columns["sky"], snr * noise
+        )
         verdict[flat & (verdict == Verdict.GOOD)] = Verdict.SATURATED
-    near = settings.isolation_px if isolation_px is None else isolation_px
+    isolation = settings.isolation_px if isolation_px is None else isolation_px
     # A star that is listed twice is no neighbour of itself.
-    apart = np.where(observation.listed_again()[:, None], np.nan, found["position"])
-    core = found.pop("core")
-    close = crowded(apart, core if by_core else snr * noise, near, settings.neighbour_ratio)
+    position = np.where(observation.listed_again()[:, None], np.nan, measured_columns["position"])
+    core = measured_columns.pop("core")
+    close = crowded(position, core if by_core else snr * noise, isolation, settings.neighbour_ratio)
     verdict[close & (verdict == Verdict.GOOD)] = Verdict.CROWDED
     verdict[observation.without_position()] = Verdict.NO_POSITION
-    wide, peak, listed, colour, bad = (np.concatenate([k[i] for k in kept]) for i in range(5))
-    flux = cut(wide, side, peak).sum(axis=(1, 2))
+    stamps, peak, listed, colour, bad = (
+        np.concatenate([k[i] for k in kept_stamps]) for i in range(5)
+    )
+    flux = cut(stamps, side, peak).sum(axis=(1, 2))
     verdict[row[flux <= 0]] = Verdict.MISFIT
     good = verdict[row] == Verdict.GOOD
-    wide, peak, listed, colour, flux, row, bad = (
-        a[good] for a in (wide, peak, listed, colour, flux, row, bad)
+    stamps, peak, listed, colour, flux, row, bad = (
+        a[good] for a in (stamps, peak, listed, colour, flux, row, bad)
     )
     centring = settings.centring_px or 0.0
     window = np.maximum(window_of(snr[row], flux, noise[row]), centring / FWHM_OF_SIGMA)
-    centre = windowed_centres(wide, peak, window, REGISTRATION_ROUNDS, FARTHEST_PX)
+    centre = windowed_centres(stamps, peak, window, REGISTRATION_ROUNDS, FARTHEST_PX)
     bright = BrightStars(
-        *(wide, peak, centre, found["position"][row], flux, noise[row], snr[row], row),
+        *(stamps, peak, centre, measured_columns["position"][row], flux, noise[row], snr[row], row),
         *(listed, colour, bad),
     )
     # Sources off the locus of the stars, whose noise-equivalent areas are about the same.
@@ -182,7 +191,7 @@ def collect(
     row = bright.row
     score = misfit(cut(bright.aligned(), side), bright.position, bright.noise / bright.flux)
     verdict[row[score > settings.misfit]] = Verdict.MISFIT
-    result = Candidates(**found, bright=bright.of(score <= settings.misfit))
+    result = Candidates(**measured_columns, bright=bright.of(score <= settings.misfit))
     result.require(observation.path, settings.stars_min, observation.remarks)
     return result
 
@@ -201,18 +210,18 @@ def _measure(
     side = framing.stamp_px
     level, noise = sky_around(chunk.data, chunk.bad, side)
     noise = np.where(np.isfinite(chunk.noise), chunk.noise, np.maximum(noise, least_noise))
-    wide = np.where(chunk.bad, 0.0, chunk.data - level[:, None, None])
+    stamps = np.where(chunk.bad, 0.0, chunk.data - level[:, None, None])
     # Far below the sky there is no light: dead pixels, and neighbours that were subtracted badly.
     # These also make the noise around a star seem large.
     depth = -DEFECT * np.minimum(noise, 3.0 * np.median(noise))[:, None, None]
-    off = _off_image(chunk, wide.shape[-1], shape)
-    bad = (chunk.bad | (wide < depth)) & ~off
-    wide = interpolated_stamps(np.maximum(wide, depth), bad)
-    reach = min(settings.search_px, (wide.shape[-1] - 5) // 2)
+    off = _off_image(chunk, stamps.shape[-1], shape)
+    bad = (chunk.bad | (stamps < depth)) & ~off
+    stamps = interpolated_stamps(np.maximum(stamps, depth), bad)
+    reach = min(settings.search_px, (stamps.shape[-1] - 5) // 2)
     centring = settings.centring_px or 0.0
-    peak, centred = brightest_pixels(wide, reach, centring)
-    needed = side + 2 * min(reach + framing.jitter_px + 1, (wide.shape[-1] - side) // 2)
-    snr = signal_to_noise(cut(wide, side), noise)
+    peak, centred = brightest_pixels(stamps, reach, centring)
+    needed = side + 2 * min(reach + framing.jitter_px + 1, (stamps.shape[-1] - side) // 2)
+    snr = signal_to_noise(cut(stamps, side), noise)
     # A bad pixel that is saturated tells of a saturated star only in the star's core.
     saturated = chunk.saturated & ~bad
     core = cut(chunk.saturated, 5).any(axis=(1, 2)) | cut(saturated, side).any(axis=(1, 2))
@@ -237,13 +246,15 @@ def _measure(
         "noise": noise,
         "sky": level,
         "brightest": level
-        + np.where(centred, cut(wide, side).max((1, 2)) if centring else _at(wide, peak), -np.inf),
-        "core": cut(wide, 3).sum(axis=(1, 2)),
+        + np.where(
+            centred, cut(stamps, side).max((1, 2)) if centring else _at(stamps, peak), -np.inf
+        ),
+        "core": cut(stamps, 3).sum(axis=(1, 2)),
         "highest": cut(np.where(chunk.bad, -np.inf, chunk.data), side).max(axis=(1, 2)),
         "verdict": verdict,
     }
     good = verdict == Verdict.GOOD
-    return columns, (wide[good], peak[good], chunk.listed[good], chunk.colour[good], bad[good])
+    return columns, (stamps[good], peak[good], chunk.listed[good], chunk.colour[good], bad[good])
 
 
 def _off_image(stamps: Stamps, side: int, shape: tuple[int, ...] | None) -> np.ndarray:
@@ -286,12 +297,12 @@ def wider_than_stars(area: np.ndarray, position: np.ndarray) -> np.ndarray:
     """
     from scipy.spatial import cKDTree
 
-    wide = np.zeros(len(area), dtype=bool)
+    is_wide = np.zeros(len(area), dtype=bool)
     if len(area) < 8:
-        return wide
+        return is_wide
     size = np.log(area)
     for _ in range(10):
-        star = np.flatnonzero(~wide)
+        star = np.flatnonzero(~is_wide)
         if len(star) < 8:
             break
         # Size beside that of the nearest eight: usually one of these is a star.
@@ -303,12 +314,12 @@ def wider_than_stars(area: np.ndarray, position: np.ndarray) -> np.ndarray:
         ordered, count = np.sort(excess[star]), -(-len(star) // 4)
         width = ordered[count:] - ordered[:-count]
         first = int(width.argmin())
-        usual, scatter = np.median(ordered[first : first + count + 1]), width[first] / 0.637
-        wider = excess > usual + max(np.log(1.5), 5.0 * float(scatter))
-        if not (wider & ~wide).any():
+        local_area, scatter = np.median(ordered[first : first + count + 1]), width[first] / 0.637
+        is_wider = excess > local_area + max(np.log(1.5), 5.0 * float(scatter))
+        if not (is_wider & ~is_wide).any():
             break
-        wide |= wider
-    return wide
+        is_wide |= is_wider
+    return is_wide
 
 
 def completed(
@@ -344,45 +355,49 @@ def completed(
     if not np.isfinite(place).all():  # all stars are as near then
         place = np.arange(len(stars))[:, None] * np.ones(2)
     nearest = cKDTree(place).query(place[incomplete], k=count)[1]
-    inner = cut(np.ones((1, *stars.wide.shape[1:])), stamp_px).shape[-1]
-    middle = stars.wide.shape[-1] // 2 - inner // 2
-    stamp = np.s_[middle : middle + inner, middle : middle + inner]
+    core = cut(np.ones((1, *stars.wide.shape[1:])), stamp_px).shape[-1]
+    middle = stars.wide.shape[-1] // 2 - core // 2
+    stamp = np.s_[middle : middle + core, middle : middle + core]
     for _ in range(2):
-        aligned, wide = stars.aligned(), stars.wide.copy()
-        for star, near in zip(incomplete, nearest, strict=True):
+        aligned, stamps = stars.aligned(), stars.wide.copy()
+        for star, neighbours in zip(incomplete, nearest, strict=True):
             # Median of the neighbours, moved to the star's centre; its flux by least squares over
             # the good pixels of the stamp, F = Σ x p / Σ p².
-            psf = np.median(aligned[near[near != star]], axis=0)
+            psf = np.median(aligned[neighbours[neighbours != star]], axis=0)
             psf = moved(psf[None], stars.centre[star][None])[0]
             bad = stars.bad[star]
             good = ~bad[stamp]
             square = float(np.square(psf[stamp][good]).sum())
-            flux = float((wide[star][stamp] * psf[stamp])[good].sum()) / square if square else 0.0
-            wide[star][bad] = flux * psf[bad]
+            flux = float((stamps[star][stamp] * psf[stamp])[good].sum()) / square if square else 0.0
+            stamps[star][bad] = flux * psf[bad]
             missing[star] = (psf * bad)[stamp].sum() / psf[stamp].sum()
-        peak = brightest_pixels(wide[incomplete], search_px, centring_px)[0]
-        light = cut(wide[incomplete], stamp_px, peak)
+        peak = brightest_pixels(stamps[incomplete], search_px, centring_px)[0]
+        light = cut(stamps[incomplete], stamp_px, peak)
         flux, snr = light.sum(axis=(1, 2)), stars.snr.copy()
-        snr[incomplete] = signal_to_noise(cut(wide[incomplete], stamp_px), stars.noise[incomplete])
+        snr[incomplete] = signal_to_noise(
+            cut(stamps[incomplete], stamp_px), stars.noise[incomplete]
+        )
         usable = (flux > 0) & (snr[incomplete] > 0)
         missing[incomplete[~usable]] = 1.0
         window = window_of(
             *(np.where(usable, v, 1.0) for v in (snr[incomplete], flux, stars.noise[incomplete]))
         )
         window = np.maximum(window, centring_px / FWHM_OF_SIGMA)
-        centres = windowed_centres(wide[incomplete], peak, window, REGISTRATION_ROUNDS, FARTHEST_PX)
+        centres = windowed_centres(
+            stamps[incomplete], peak, window, REGISTRATION_ROUNDS, FARTHEST_PX
+        )
         new = {"peak": peak, "centre": centres, "flux": flux, "snr": snr[incomplete]}
         columns = {name: getattr(stars, name).copy() for name in new}
         for name, values in new.items():
             columns[name][incomplete[usable]] = values[usable]
-        stars = replace(stars, wide=wide, **columns)
+        stars = replace(stars, wide=stamps, **columns)
     return stars, missing
 
 
-def _at(wide: np.ndarray, peak: np.ndarray) -> np.ndarray:
+def _at(stamps: np.ndarray, peak: np.ndarray) -> np.ndarray:
     """Pixels of stamps (n, s, s) at (row, column) from index (s//2, s//2), shape (n,)."""
-    row, column = (peak + wide.shape[-1] // 2).T
-    return np.asarray(wide[np.arange(len(wide)), row, column])
+    row, column = (peak + stamps.shape[-1] // 2).T
+    return np.asarray(stamps[np.arange(len(stamps)), row, column])
 
 
 def piled_up(brightest: np.ndarray, sky: np.ndarray, brightness: np.ndarray) -> float:
@@ -401,11 +416,11 @@ def piled_up(brightest: np.ndarray, sky: np.ndarray, brightness: np.ndarray) -> 
     height = brightest - sky
     top = height.max(initial=0.0)
     piled = height >= (1.0 - PILE_WIDTH) * top
-    others = (height >= PILE_FROM * top) & ~piled
-    if top <= 0 or piled.sum() < PILE or not others.any():
+    fainter = (height >= PILE_FROM * top) & ~piled
+    if top <= 0 or piled.sum() < PILE or not fainter.any():
         return np.inf
     sharpness = height / np.where(brightness > 0, brightness, 1.0)
-    if np.median(sharpness[piled]) > PILE_SHARPNESS * np.median(sharpness[others]):
+    if np.median(sharpness[piled]) > PILE_SHARPNESS * np.median(sharpness[fainter]):
         return np.inf
     return _rounded_down(float(brightest[piled].min()))
 
@@ -449,22 +464,22 @@ def crowded(
     """
     from scipy.spatial import cKDTree
 
-    known = np.flatnonzero(np.isfinite(position).all(axis=1))
+    located = np.flatnonzero(np.isfinite(position).all(axis=1))
     out = np.zeros(len(position), dtype=bool)
-    pairs = known[cKDTree(position[known]).query_pairs(distance_px, output_type="ndarray")]
-    for one, other in ((pairs[:, 0], pairs[:, 1]), (pairs[:, 1], pairs[:, 0])):
-        out[one[brightness[other] >= ratio * brightness[one]]] = True
+    pairs = located[cKDTree(position[located]).query_pairs(distance_px, output_type="ndarray")]
+    for first, second in ((pairs[:, 0], pairs[:, 1]), (pairs[:, 1], pairs[:, 0])):
+        out[first[brightness[second] >= ratio * brightness[first]]] = True
     return out
 
 
 def brightest_pixels(
-    wide: np.ndarray, search_px: int, centring_px: float = 0.0
+    stamps: np.ndarray, search_px: int, centring_px: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
     """Brightest pixel near the middle of every stamp.
 
     Parameters
     ----------
-    wide : ndarray, shape (n, s, s)
+    stamps : ndarray, shape (n, s, s)
     search_px : int
         Searched within ± this of the middle.
     centring_px : float
@@ -477,9 +492,9 @@ def brightest_pixels(
     inside : ndarray of bool, shape (n,)
         Whether no pixel just outside the search window is brighter.
     """
-    middle, reach = wide.shape[-1] // 2, search_px + 1
-    near = slice(middle - reach, middle + reach + 1)
-    peak = peaks(softened(wide, centring_px)[:, near, near]) - reach
+    middle, reach = stamps.shape[-1] // 2, search_px + 1
+    window = slice(middle - reach, middle + reach + 1)
+    peak = peaks(softened(stamps, centring_px)[:, window, window]) - reach
     return peak, np.abs(peak).max(axis=1, initial=0) <= search_px
 
 
@@ -517,15 +532,17 @@ def misfit(aligned: np.ndarray, position: np.ndarray, noise: np.ndarray) -> np.n
     count = len(aligned)
     if count < 4:
         return np.ones(count)
-    usual: Iterable[tuple[np.ndarray, np.ndarray]]
+    local_medians: Iterable[tuple[np.ndarray, np.ndarray]]
     if np.isfinite(position).all() and count > COMPANIONS:
-        near = cKDTree(position).query(position, k=COMPANIONS + 1)[1]
-        usual = (_usual(aligned[found[found != star]]) for star, found in enumerate(near))
+        neighbours = cKDTree(position).query(position, k=COMPANIONS + 1)[1]
+        local_medians = (
+            _usual(aligned[nearest[nearest != star]]) for star, nearest in enumerate(neighbours)
+        )
     else:
-        usual = repeat(_usual(aligned), count)
+        local_medians = repeat(_usual(aligned), count)
     score, side = np.empty((count, 2)), aligned.shape[-1]
     core = min(side, max(side // 2, CORE_PX))
-    for star, (median, variance) in enumerate(usual):
+    for star, (median, variance) in enumerate(local_medians):
         square = (aligned[star] - median) ** 2 / (variance + noise[star] ** 2)
         patches = ndimage.uniform_filter(square, 3)[None]
         score[star] = square.mean(), cut(patches, core).max()
@@ -559,12 +576,14 @@ def advice(found: Candidates, observation: Observation, stamp_px: int) -> list[s
     return [sentence for sentence in said if sentence]
 
 
-def saturation_advice(found: Candidates) -> str:
-    """From where brightest pixels pile up."""
-    level = piled_up(found.brightest, found.sky, found.snr * found.noise)
+def saturation_advice(candidates: Candidates) -> str:
+    """Return advice on saturation, from where brightest pixels pile up."""
+    level = piled_up(candidates.brightest, candidates.sky, candidates.snr * candidates.noise)
     if not np.isfinite(level):
-        return f"saturation: none is seen up to {found.brightest.max():.6g} counts"
-    piled, flagged = (int((pixel >= level).sum()) for pixel in (found.brightest, found.highest))
+        return f"saturation: none is seen up to {candidates.brightest.max():.6g} counts"
+    piled, flagged = (
+        int((pixel >= level).sum()) for pixel in (candidates.brightest, candidates.highest)
+    )
     return (
         f"saturation: the brightest pixels of {piled} stars agree from {level:.6g} counts on, as "
         f"if cut off; {flagged} stamps have such pixels and are not learnt from, --saturate "
@@ -572,28 +591,28 @@ def saturation_advice(found: Candidates) -> str:
     )
 
 
-def gain_advice(found: Candidates) -> str:
-    """From sky and its noise, if photons make it: variance = level / gain."""
-    sky, noise = float(np.median(found.sky)), float(np.median(found.noise))
-    seen = f"gain: the sky is {sky:.4g} counts, its noise {noise:.3g}"
+def gain_advice(candidates: Candidates) -> str:
+    """Return advice on the gain by sky and noise, if photons make it: variance = level / gain."""
+    sky, noise = float(np.median(candidates.sky)), float(np.median(candidates.noise))
+    sky_text = f"gain: the sky is {sky:.4g} counts, its noise {noise:.3g}"
     if not sky > SKY_SIGMA * noise > 0:
-        return f"{seen}; it was probably subtracted, and says nothing of the gain"
+        return f"{sky_text}; it was probably subtracted, and says nothing of the gain"
     return (
-        f"{seen}; if photons make it and no bias or sky was subtracted or added, "
+        f"{sky_text}; if photons make it and no bias or sky was subtracted or added, "
         f"--gain {sky / noise**2:.3g} is right"
     )
 
 
-def stamp_advice(found: Candidates, stamp_px: int) -> str | None:
-    """From the light of the median star in squares about its centre, and how many overlap."""
-    typical = np.median(found.bright.aligned(), axis=0)[None]
+def stamp_advice(candidates: Candidates, stamp_px: int) -> str | None:
+    """Return advice on the stamps: light of the median star in squares, and how many overlap."""
+    typical = np.median(candidates.bright.aligned(), axis=0)[None]
     sides = np.arange(SMALLEST_PX, typical.shape[-1] + 1, 2)
     light = np.array([cut(typical, side).sum() for side in sides]) / typical.sum()
     needed = int(sides[np.argmax(light >= LIGHT)])
     if abs(needed - stamp_px) < STEP_PX:
         return None
     shared = ", ".join(
-        f"{100 * overlapping(found.position, side):.0f} % of {side} px"
+        f"{100 * overlapping(candidates.position, side):.0f} % of {side} px"
         for side in (stamp_px, needed)
     )
     return (
@@ -606,8 +625,8 @@ def overlapping(position: np.ndarray, side: int) -> float:
     """Part of the stars (n, 2) in whose stamps another one stands."""
     from scipy.spatial import cKDTree
 
-    known = position[np.isfinite(position).all(axis=1)]
-    if len(known) < 2:
+    located = position[np.isfinite(position).all(axis=1)]
+    if len(located) < 2:
         return 0.0
-    distance, _ = cKDTree(known).query(known, k=2, p=np.inf)
+    distance, _ = cKDTree(located).query(located, k=2, p=np.inf)
     return float((distance[:, 1] < 0.5 * side).mean())

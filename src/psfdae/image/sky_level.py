@@ -49,12 +49,12 @@ def sky_level(image: np.ndarray, bad: np.ndarray) -> SkyLevel:
     notes = []
     for name, lines in (("row", rows), ("column", columns)):
         if lines:
-            where = ", ".join(map(str, lines))
-            notes.append(f"the sky has a step at {name} {where}: the parts have their own sky")
+            lines_text = ", ".join(map(str, lines))
+            notes.append(f"the sky has a step at {name} {lines_text}: the parts have their own sky")
     level, noise = np.zeros((2, *image.shape))
     for top, bottom in zip((0, *rows), (*rows, len(image)), strict=True):
-        for left, right in zip((0, *columns), (*columns, image.shape[1]), strict=True):
-            part = np.s_[top:bottom, left:right]
+        for first, last in zip((0, *columns), (*columns, image.shape[1]), strict=True):
+            part = np.s_[top:bottom, first:last]
             if not bad[part].all() or not (rows or columns):
                 level[part], noise[part] = _meshed(image[part], bad[part])
     pixel_sigma = pixel_noise(interpolated(image, bad)[0], bad)
@@ -63,8 +63,8 @@ def sky_level(image: np.ndarray, bad: np.ndarray) -> SkyLevel:
     if around is not None and _sources_stay(image - level, around, bad, pixel_sigma):
         level += weight * around
         # What is left; its noise changes with the light of the structure, from mesh to mesh of 16.
-        rest, noise = _meshed(image - level, bad)
-        level += rest
+        remainder, noise = _meshed(image - level, bad)
+        level += remainder
         noise += weight * (_meshed(image - level, bad, 16)[1] - noise)
         notes.append(
             f"the sky has structure within {MESH_PX} px in {100 * share:.0f} % of the image: "
@@ -102,17 +102,17 @@ def noise_correlation(deviation: np.ndarray) -> float:
     values = np.where(ndimage.binary_dilation(light, iterations=3), np.nan, values)
     values[np.abs(values) > 3.0] = np.nan
 
-    def correlation(down: int, right: int) -> float:
+    def correlation(rows_apart: int, columns_apart: int) -> float:
         """ρ = (s²(a + b) − s²(a − b))/(s²(a + b) + s²(a − b)), s by median deviations."""
         height, width = values.shape
-        a = values[: height - down, max(0, -right) : width - max(0, right)]
-        b = values[down:, max(0, right) : width - max(0, -right)]
-        both = np.isfinite(a) & np.isfinite(b)
-        if np.count_nonzero(both) < 1000:
+        a = values[: height - rows_apart, max(0, -columns_apart) : width - max(0, columns_apart)]
+        b = values[rows_apart:, max(0, columns_apart) : width - max(0, -columns_apart)]
+        is_finite = np.isfinite(a) & np.isfinite(b)
+        if np.count_nonzero(is_finite) < 1000:
             return 0.0
         plus, minus = (
             float(np.median(np.abs(v - np.median(v)))) ** 2
-            for v in (a[both] + b[both], a[both] - b[both])
+            for v in (a[is_finite] + b[is_finite], a[is_finite] - b[is_finite])
         )
         return (plus - minus) / (plus + minus) if plus + minus > 0 else 0.0
 
@@ -121,8 +121,8 @@ def noise_correlation(deviation: np.ndarray) -> float:
     nearest = 0.5 * (correlation(0, 1) + correlation(1, 0))
     if nearest < 0.15:
         return 1.0
-    far = [correlation(*lag) for lag in ((0, 3), (3, 0), (0, 4), (4, 0))]
-    shared = max(float(np.mean(far)), 0.0)
+    distant = [correlation(*lag) for lag in ((0, 3), (3, 0), (0, 4), (4, 0))]
+    shared = max(float(np.mean(distant)), 0.0)
     if nearest - shared < 0.15:
         return 1.0
     lags = [(0, 1), (0, 2), *((down, right) for down in (1, 2) for right in range(-2, 3))]
@@ -138,15 +138,15 @@ def _meshed(
 
     meshes = Background2D(image, mesh_px, filter_size=1, mask=bad, exclude_percentile=80.0)
     level, sigma = meshes.background_mesh, meshes.background_rms_mesh
-    usual = _of_neighbours(level)
+    neighbours = _of_neighbours(level)
     # A mesh differs from what its neighbours say by its error, about 2.5 σ/√N of the mode of N
     # pixels, and by the curvature of the sky: the more of that there is, the more it counts itself
     # (James & Stein 1961). A mesh that differs by far more than the others has stars in it.
-    off = level - usual
+    off = level - neighbours
     scatter = 1.4826 * float(np.median(np.abs(off)))
     error = 2.5 * float(np.median(sigma)) / mesh_px
     own_weight = 1.0 - (error / scatter) ** 2 if scatter > error else 0.0
-    smooth = usual + np.where(np.abs(off) > 4.0 * max(scatter, error), 0.0, own_weight * off)
+    smooth = neighbours + np.where(np.abs(off) > 4.0 * max(scatter, error), 0.0, own_weight * off)
     return (
         _on_pixels(smooth, image.shape, mesh_px, own_weight),
         _on_pixels(_of_neighbours(sigma), image.shape, mesh_px, 0.0),
@@ -156,7 +156,7 @@ def _meshed(
 def _continued(mesh: np.ndarray, width: int, slope: float = 1.0) -> np.ndarray:
     """Return values of meshes (m, n), continued beyond the edges with a part of their slope."""
     for axis, count in enumerate(mesh.shape):
-        pads = [(width, width) if axis == other else (0, 0) for other in (0, 1)]
+        pads = [(width, width) if axis == padded_axis else (0, 0) for padded_axis in (0, 1)]
         level = np.pad(mesh, pads, mode="edge")
         if count > width:
             line = np.pad(mesh, pads, mode="reflect", reflect_type="odd")
@@ -172,14 +172,14 @@ def _of_neighbours(mesh: np.ndarray) -> np.ndarray:
     each other: all five are the same where the sky is a plane, up to the edges of the image.
     """
     rows, columns = mesh.shape
-    wide = _continued(mesh, 1)
+    continued = _continued(mesh, 1)
 
-    def shifted(down: int, right: int) -> np.ndarray:
-        return wide[1 + down : rows + 1 + down, 1 + right : columns + 1 + right]
+    def shifted(rows_down: int, right: int) -> np.ndarray:
+        return continued[1 + rows_down : rows + 1 + rows_down, 1 + right : columns + 1 + right]
 
     pairs = [
-        0.5 * (shifted(down, right) + shifted(-down, -right))
-        for down, right in ((0, 1), (1, 0), (1, 1), (1, -1))
+        0.5 * (shifted(rows_down, right) + shifted(-rows_down, -right))
+        for rows_down, right in ((0, 1), (1, 0), (1, 1), (1, -1))
     ]
     return np.asarray(np.median([mesh, *pairs], axis=0))
 
@@ -191,10 +191,10 @@ def _on_pixels(mesh: np.ndarray, shape: tuple[int, ...], mesh_px: int, slope: fl
     """
     from scipy import ndimage
 
-    wide = _continued(mesh, 2, slope)
+    continued = _continued(mesh, 2, slope)
     at = [(np.arange(count) + 0.5) / mesh_px - 0.5 + 2.0 for count in shape]
     grid = np.meshgrid(*at, indexing="ij")
-    return np.asarray(ndimage.map_coordinates(wide, grid, order=3, mode="nearest"))
+    return np.asarray(ndimage.map_coordinates(continued, grid, order=3, mode="nearest"))
 
 
 def _median_level(image: np.ndarray, bad: np.ndarray) -> np.ndarray:
@@ -202,8 +202,10 @@ def _median_level(image: np.ndarray, bad: np.ndarray) -> np.ndarray:
     from scipy import ndimage
 
     height, width = image.shape
-    even = np.pad(interpolated(image, bad)[0], ((0, height % 2), (0, width % 2)), mode="edge")
-    binned = even.reshape(even.shape[0] // 2, 2, even.shape[1] // 2, 2).mean(axis=(1, 3))
+    even_sized = np.pad(interpolated(image, bad)[0], ((0, height % 2), (0, width % 2)), mode="edge")
+    binned = even_sized.reshape(even_sized.shape[0] // 2, 2, even_sized.shape[1] // 2, 2).mean(
+        axis=(1, 3)
+    )
     smooth = ndimage.gaussian_filter(ndimage.median_filter(binned, 7, mode="nearest"), 1.0)
     # Back to the pixels: linear between the middles of the squares.
     row, column = (np.arange(0.0, n) / 2.0 - 0.25 for n in (height, width))
@@ -223,8 +225,8 @@ def _sources_stay(light: np.ndarray, level: np.ndarray, bad: np.ndarray, noise: 
     high = (height == ndimage.maximum_filter(height, 25)) & ~bad
     peak = np.flatnonzero(high & (light > 50.0 * noise))
     brightest = peak[np.argsort(-height.ravel()[peak], kind="stable")[:30]]
-    kept = height.ravel()[brightest] / light.ravel()[brightest]
-    return bool(brightest.size < 5 or np.median(kept) > 0.75)
+    height_left = height.ravel()[brightest] / light.ravel()[brightest]
+    return bool(brightest.size < 5 or np.median(height_left) > 0.75)
 
 
 def structure(ratio: np.ndarray, bad: np.ndarray) -> tuple[float, np.ndarray]:
@@ -239,12 +241,12 @@ def structure(ratio: np.ndarray, bad: np.ndarray) -> tuple[float, np.ndarray]:
     good = ratio[~bad & (ratio > 0)]
     if not good.size:
         return 0.0, np.zeros(ratio.shape)
-    usual = max(float(np.percentile(good, 25)), 1e-6)
+    typical_ratio = max(float(np.percentile(good, 25)), 1e-6)
     # Meshes beside those with structure are interpolated from these, and wrong, too.
-    weight = np.where(bad, 0.0, np.clip((ratio / usual - 1.25) / 0.5, 0.0, 1.0))
-    wide = ndimage.maximum_filter(weight, 2 * MESH_PX + 1, mode="nearest")
-    weight = ndimage.uniform_filter(wide, MESH_PX, mode="nearest")
-    return float(np.mean(good > 1.5 * usual)), weight
+    weight = np.where(bad, 0.0, np.clip((ratio / typical_ratio - 1.25) / 0.5, 0.0, 1.0))
+    widened = ndimage.maximum_filter(weight, 2 * MESH_PX + 1, mode="nearest")
+    weight = ndimage.uniform_filter(widened, MESH_PX, mode="nearest")
+    return float(np.mean(good > 1.5 * typical_ratio)), weight
 
 
 def sky_steps(image: np.ndarray, bad: np.ndarray, axis: int) -> list[int]:
@@ -260,13 +262,13 @@ def sky_steps(image: np.ndarray, bad: np.ndarray, axis: int) -> list[int]:
     """
     values, good = (image.T, ~bad.T) if axis == 0 else (image, ~bad)
     count = len(values)
-    found: list[int] = []
+    lines: list[int] = []
     for part in (slice(0, count), slice(0, count // 2), slice(count // 2, count)):
         every = max(1, (part.stop - part.start) // 256)
-        found += _steps_along(values[part][::every], good[part][::every])
+        lines += _steps_along(values[part][::every], good[part][::every])
     # Lines that several parts found are one.
     steps: list[int] = []
-    for line in sorted(found):
+    for line in sorted(lines):
         if not steps or line > steps[-1] + REACH_PX:
             steps.append(line)
     return steps
@@ -291,39 +293,43 @@ def _steps_along(values: np.ndarray, good: np.ndarray) -> list[int]:
     def jumps(start: int, end: int, at: np.ndarray) -> np.ndarray:
         """Mean of each row from `start` to `end` px after columns, less that before them."""
         with np.errstate(all="ignore"):
-            after, before = (
+            mean_after, mean_before = (
                 (light[:, b] - light[:, a]) / (number[:, b] - number[:, a])
                 for a, b in ((at + start, at + end), (at - end, at - start))
             )
-        return np.asarray(after - before)
+        return np.asarray(mean_after - mean_before)
 
     median = np.median if good.all() else np.nanmedian
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # of columns without good pixels
-        near = jumps(0, 3, lines)
-        middle = median(near, axis=0)
-        spread = 1.4826 * median(np.abs(near - middle), axis=0)
+        step_sizes = jumps(0, 3, lines)
+        middle = median(step_sizes, axis=0)
+        spread = 1.4826 * median(np.abs(step_sizes - middle), axis=0)
         # Slope of the level per px: changes within 12 px on both sides, a pixel off the line.
-        before, after = (
+        slope_before, slope_after = (
             median(jumps(0, side, lines + sign * (side + 1)), axis=0) for sign in (-1, 1)
         )
-        smaller = np.sign(before) * np.minimum(np.abs(before), np.abs(after)) / side
-        slope = np.where(before * after > 0, smaller, 0.0)  # of two kinds: none, but bad columns
+        smaller = (
+            np.sign(slope_before) * np.minimum(np.abs(slope_before), np.abs(slope_after)) / side
+        )
+        slope = np.where(
+            slope_before * slope_after > 0, smaller, 0.0
+        )  # of two kinds: none, but bad columns
         jump = middle - 3.0 * slope
         noise = spread * np.sqrt(1.5)
         error = 1.25 * spread / np.sqrt(count)
-        chosen = np.flatnonzero(np.abs(jump) > np.maximum(0.1 * noise, 8.0 * error))
+        candidates = np.flatnonzero(np.abs(jump) > np.maximum(0.1 * noise, 8.0 * error))
         steps: list[int] = []
-        for k in chosen[np.argsort(-np.abs(jump[chosen]))]:
+        for k in candidates[np.argsort(-np.abs(jump[candidates]))]:
             line, height = int(lines[k]), jump[k]
             eighths = [
                 median(part) - (start + end) * slope[k]
                 for start, end in ((0, 3), (3, side), (side, REACH_PX))
                 for part in np.array_split(jumps(start, end, np.array([line]))[:, 0], 8)
             ]
-            same = np.abs(np.array(eighths) - height) < 0.5 * abs(height)
-            if same.reshape(3, 8).mean(axis=1).min() >= 0.75 and all(
-                abs(line - other) > REACH_PX for other in steps
+            is_same = np.abs(np.array(eighths) - height) < 0.5 * abs(height)
+            if is_same.reshape(3, 8).mean(axis=1).min() >= 0.75 and all(
+                abs(line - step) > REACH_PX for step in steps
             ):
                 steps.append(line)
     return steps

@@ -94,20 +94,20 @@ def measure_size(flat: np.ndarray, bad: np.ndarray, position: np.ndarray) -> Sou
     SourceSize or None
         None if no star is seen.
     """
-    windows, seen = _windows(flat, bad, position)
+    windows, measured = _windows(flat, bad, position)
     if not len(windows):
         return None
     # The centre under a window as wide as the star, of which the first profile knows the width.
     centre, size = np.zeros((len(windows), 2)), None
     for _ in range(2):
-        size = _profile(windows, seen, centre)
+        size = _profile(windows, measured, centre)
         if size is None:
             return None
         # A ring has no light in its middle: a window narrower than its radius would leave it.
         sigma = np.full(len(windows), max(size.fwhm_px / FWHM_OF_SIGMA, 0.7))
-        light = np.where(seen, windows, 0.0)
+        light = np.where(measured, windows, 0.0)
         centre = windowed_centres(light, np.zeros_like(centre), sigma, 10, max(size.fwhm_px, 1.5))
-    return _profile(windows, seen, centre)
+    return _profile(windows, measured, centre)
 
 
 def _windows(
@@ -126,21 +126,23 @@ def _windows(
     light += total[low[:, 0], low[:, 1]] - total[high[:, 0], low[:, 1]]
     brightest = place[np.argsort(-light, kind="stable")[:MOST_STARS]]
     pad = np.pad(clean, REACH_PX)
-    unseen = np.pad(bad, REACH_PX, constant_values=True)
+    not_measured = np.pad(bad, REACH_PX, constant_values=True)
     axis = np.arange(2 * REACH_PX + 1)
     rows, columns = (brightest[:, i, None] + axis for i in (0, 1))
     pixels = rows[:, :, None], columns[:, None, :]
-    return pad[pixels], ~unseen[pixels]
+    return pad[pixels], ~not_measured[pixels]
 
 
-def _profile(windows: np.ndarray, seen: np.ndarray, centre: np.ndarray) -> SourceSize | None:
+def _profile(windows: np.ndarray, measured: np.ndarray, centre: np.ndarray) -> SourceSize | None:
     """Size by the median profile of stars whose centres (n, 2) are off the middle of windows."""
     axis = np.arange(windows.shape[-1]) - windows.shape[-1] // 2
     edges = np.concatenate([np.arange(0.0, 10.0), np.arange(10.0, REACH_PX - 3.0, 2.0)])
     area = np.pi * np.diff(edges**2)
     rings = np.full((len(windows), len(edges) - 1), np.nan)
     offset = np.empty(len(windows))
-    for star, (image, good, (row, column)) in enumerate(zip(windows, seen, centre, strict=True)):
+    for star, (image, good, (row, column)) in enumerate(
+        zip(windows, measured, centre, strict=True)
+    ):
         radius = np.hypot(axis[:, None] - row, axis - column)
         place = (np.digitize(radius[good], edges) - 1).astype(np.int16)  # sorted by their digits
         values = image[good]
@@ -155,8 +157,8 @@ def _profile(windows: np.ndarray, seen: np.ndarray, centre: np.ndarray) -> Sourc
                     middle = [(len(pixels) - 1) // 2, len(pixels) // 2]
                     pixels = np.partition(pixels, middle)[middle]
                 rings[star, ring] = pixels.mean()
-        inner = np.where(radius < max(4.0, REACH_PX / 6), image, -np.inf)
-        peak = np.unravel_index(inner.argmax(), inner.shape)
+        core = np.where(radius < max(4.0, REACH_PX / 6), image, -np.inf)
+        peak = np.unravel_index(core.argmax(), core.shape)
         offset[star] = max(abs(axis[peak[0]] - row), abs(axis[peak[1]] - column))
     with np.errstate(all="ignore"):
         rings = rings - np.nanmedian(rings[:, -4:], axis=1)[:, None]
@@ -166,8 +168,8 @@ def _profile(windows: np.ndarray, seen: np.ndarray, centre: np.ndarray) -> Sourc
     if not usable.any():
         return None
     scaled = rings[usable] / flux[usable, None]
-    known = np.isfinite(scaled).sum(axis=0) > 0.5 * usable.sum()
-    last = len(known) if known.all() else int(np.argmin(known))
+    is_covered = np.isfinite(scaled).sum(axis=0) > 0.5 * usable.sum()
+    last = len(is_covered) if is_covered.all() else int(np.argmin(is_covered))
     scaled = np.where(np.isfinite(scaled), scaled, np.nanmedian(scaled, axis=0))[:, :last]
     profile = np.median(scaled, axis=0)
     # 1.25 σ/√n is the error of a median; three of these above 0 are light.
@@ -177,9 +179,9 @@ def _profile(windows: np.ndarray, seen: np.ndarray, centre: np.ndarray) -> Sourc
     light = np.cumsum(profile[:end] * area[:end])
     if not len(light) or light[-1] <= 0:
         return None
-    beyond = _beyond(0.5 * (edges[:end] + edges[1 : end + 1]), profile[:end], edges[end])
+    outer_light = _beyond(0.5 * (edges[:end] + edges[1 : end + 1]), profile[:end], edges[end])
     radius = np.append(edges[1 : end + 1], 2.0 * edges[end])
-    light = np.append(light, light[-1] + min(beyond, 0.1 * light[-1]))
+    light = np.append(light, light[-1] + min(outer_light, 0.1 * light[-1]))
     stamp = np.median(_scaled(windows[usable], flux[usable]), axis=0)
     rows, columns = np.gradient(stamp)
     gradient = float(np.square(rows).sum() + np.square(columns).sum())
@@ -192,15 +194,15 @@ def _beyond(radius: np.ndarray, profile: np.ndarray, end: float) -> float:
 
     ∫ p(end) (r/end)^-k 2πr dr = 2π p(end) end² / (k − 2), with k at least 4.
     """
-    outer = (radius > 0.5 * end) & (profile > 0)
-    if np.count_nonzero(outer) < 3:
+    outer_half = (radius > 0.5 * end) & (profile > 0)
+    if np.count_nonzero(outer_half) < 3:
         return 0.0
-    slope, height = np.polyfit(np.log(radius[outer] / end), np.log(profile[outer]), 1)
+    slope, height = np.polyfit(np.log(radius[outer_half] / end), np.log(profile[outer_half]), 1)
     return float(2.0 * np.pi * np.exp(height) * end**2 / (max(-slope, 4.0) - 2.0))
 
 
 def _scaled(windows: np.ndarray, flux: np.ndarray) -> np.ndarray:
     """The inner parts of windows over the fluxes of their stars."""
     middle = windows.shape[-1] // 2
-    inner = slice(middle - 24, middle + 25)
-    return np.asarray(windows[:, inner, inner] / flux[:, None, None])
+    core = slice(middle - 24, middle + 25)
+    return np.asarray(windows[:, core, core] / flux[:, None, None])

@@ -43,7 +43,7 @@ class Stamps:
 
 
 class StarFlag(IntFlag):
-    """What is said against a star; flags add up. Rows are flagged, never dropped.
+    """Reasons to distrust a star; flags add up. Rows are flagged, never dropped.
 
     Examples
     --------
@@ -147,7 +147,7 @@ def border_scatter(stamps: np.ndarray, bad: np.ndarray | None = None) -> np.ndar
     return np.asarray(mad_std(ring, axis=1, ignore_nan=True), np.float64)
 
 
-def sky_around(wide: np.ndarray, bad: np.ndarray, stamp_px: int) -> tuple[np.ndarray, np.ndarray]:
+def sky_around(window: np.ndarray, bad: np.ndarray, stamp_px: int) -> tuple[np.ndarray, np.ndarray]:
     """Median and scatter of the pixels outside the stamps, other stars clipped.
 
     Without a margin (s < d + 4) the pixels are the outer two rows and columns of
@@ -155,7 +155,7 @@ def sky_around(wide: np.ndarray, bad: np.ndarray, stamp_px: int) -> tuple[np.nda
 
     Parameters
     ----------
-    wide : ndarray, shape (n, s, s)
+    window : ndarray, shape (n, s, s)
     bad : ndarray of bool, shape (n, s, s)
         Pixels that do not count.
     stamp_px : int
@@ -168,15 +168,15 @@ def sky_around(wide: np.ndarray, bad: np.ndarray, stamp_px: int) -> tuple[np.nda
     """
     from astropy.stats import sigma_clipped_stats
 
-    side = wide.shape[-1]
-    inner = stamp_px if side >= stamp_px + 4 else side - 4
-    start = side // 2 - inner // 2
+    side = window.shape[-1]
+    hole_px = stamp_px if side >= stamp_px + 4 else side - 4
+    start = side // 2 - hole_px // 2
     ring = np.ones((side, side), dtype=bool)
-    ring[start : start + inner, start : start + inner] = False
+    ring[start : start + hole_px, start : start + hole_px] = False
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # stars off the image have no pixels
         _, level, noise = sigma_clipped_stats(
-            wide[:, ring],
+            window[:, ring],
             mask=bad[:, ring],
             sigma=SKY_CLIP,
             cenfunc="median",
@@ -184,8 +184,10 @@ def sky_around(wide: np.ndarray, bad: np.ndarray, stamp_px: int) -> tuple[np.nda
             axis=1,
         )
     # Where no pixel counts in any stamp, both are one masked value.
-    found = np.nan_to_num(np.stack([np.ma.filled(a, np.nan) for a in (level, noise)])).astype(float)
-    level, noise = np.broadcast_to(found.T, (len(wide), 2)).T.copy()
+    statistics = np.nan_to_num(np.stack([np.ma.filled(a, np.nan) for a in (level, noise)])).astype(
+        float
+    )
+    level, noise = np.broadcast_to(statistics.T, (len(window), 2)).T.copy()
     return level, noise
 
 
@@ -197,8 +199,8 @@ SMOOTHED_NOISE = 0.53  # √2 · (6/16): that σ of two pixels of a smoothed sta
 
 def smoothed(stamps: np.ndarray) -> np.ndarray:
     """Stamps (n, s, s) convolved with [1, 2, 1]/4 along both axes; edge pixels repeated."""
-    wide = np.pad(stamps, ((0, 0), (1, 1), (1, 1)), mode="edge")
-    rows = wide[:, :-2] + 2 * wide[:, 1:-1] + wide[:, 2:]
+    padded = np.pad(stamps, ((0, 0), (1, 1), (1, 1)), mode="edge")
+    rows = padded[:, :-2] + 2 * padded[:, 1:-1] + padded[:, 2:]
     return np.asarray((rows[:, :, :-2] + 2 * rows[:, :, 1:-1] + rows[:, :, 2:]) / 16)
 
 
@@ -239,7 +241,7 @@ def displacement(stamps: np.ndarray, jitter_px: int, centring_px: float = 0.0) -
         within `jitter_px`, or of which that cannot be said.
     """
     middle = stamps.shape[-1] // 2
-    near = slice(middle - jitter_px, middle + jitter_px + 1)
+    nearby = slice(middle - jitter_px, middle + jitter_px + 1)
     soft = softened(stamps, centring_px)
     smooth = smoothed(soft)
     brightest, second = (peaks(images) - middle for images in (soft, smooth))
@@ -248,7 +250,7 @@ def displacement(stamps: np.ndarray, jitter_px: int, centring_px: float = 0.0) -
     out = np.zeros((len(stamps), 2), dtype=np.int16)
     if not star.size:
         return out
-    excess = smooth[star].max(axis=(1, 2)) - smooth[star, near, near].max(axis=(1, 2))
+    excess = smooth[star].max(axis=(1, 2)) - smooth[star, nearby, nearby].max(axis=(1, 2))
     sure = excess > SIGNIFICANCE * SMOOTHED_NOISE * border_scatter(stamps[star])
     out[star[sure]] = brightest[star[sure]]
     return out

@@ -89,14 +89,14 @@ def find_trails(image: np.ndarray, bad: np.ndarray) -> tuple[np.ndarray, int]:
                 break
             mask |= trail
             count += 1
-            left = ~trail[row, column]
-            row, column = row[left], column[left]
+            is_left = ~trail[row, column]
+            row, column = row[is_left], column[is_left]
             if len(row) < shortest:
                 break
-    whole = np.zeros(image.shape, dtype=bool)
+    full_mask = np.zeros(image.shape, dtype=bool)
     large = np.kron(mask, np.ones((size, size), dtype=bool))
-    whole[: large.shape[0], : large.shape[1]] = large
-    return whole & ~bad, count
+    full_mask[: large.shape[0], : large.shape[1]] = large
+    return full_mask & ~bad, count
 
 
 def _binned(image: np.ndarray, bad: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
@@ -113,23 +113,26 @@ def _binned(image: np.ndarray, bad: np.ndarray, size: int) -> tuple[np.ndarray, 
 
 def _line(x: np.ndarray, y: np.ndarray) -> Line:
     """Return the line on which most of some pixels lie (Hough 1962, US patent 3069654)."""
-    best, most = Line(0.0, 0.0), 0
+    line, most_pixels = Line(0.0, 0.0), 0
     thinned = np.s_[:: max(1, len(x) // 5000)]
     for angle in np.deg2rad(np.arange(0.0, 180.0, 0.5)):
         across = Line(float(angle), 0.0).across(x[thinned], y[thinned])
         count, edge = np.histogram(across, max(1, int(np.ptp(across) / 2.0)))
-        if count.max() > most:
-            most, best = int(count.max()), Line(float(angle), float(edge[count.argmax()]) + 1.0)
+        if count.max() > most_pixels:
+            most_pixels, line = (
+                int(count.max()),
+                Line(float(angle), float(edge[count.argmax()]) + 1.0),
+            )
     # Least squares on the pixels nearby: offset and slope along the line.
     for reach in (5.0, 3.0, 3.0):
-        across, along = best.across(x, y), best.along(x, y)
-        near = np.abs(across) < reach
-        if np.count_nonzero(near) < 10:
+        across, along = line.across(x, y), line.along(x, y)
+        is_near = np.abs(across) < reach
+        if np.count_nonzero(is_near) < 10:
             break
-        slope, _ = np.polyfit(along[near], across[near], 1)
-        turned = Line(best.angle_rad - float(np.arctan(slope)), 0.0)
-        best = turned._replace(distance_px=float(np.mean(turned.across(x[near], y[near]))))
-    return best
+        slope, _ = np.polyfit(along[is_near], across[is_near], 1)
+        turned = Line(line.angle_rad - float(np.arctan(slope)), 0.0)
+        line = turned._replace(distance_px=float(np.mean(turned.across(x[is_near], y[is_near]))))
+    return line
 
 
 def _trail(
@@ -143,17 +146,21 @@ def _trail(
     middle = np.abs(across) < 1.0
     # Parts of the line of which three of four pixels are bright, gaps of two parts closed.
     pixels = np.bincount(part[middle], minlength=part.max() + 1)
-    seen = np.bincount(part[middle], bright[middle], minlength=len(pixels)) > 0.75 * pixels
-    seen &= pixels > 0
-    gaps = np.convolve(np.pad(seen, 2), np.ones(3), "same")
+    is_bright = np.bincount(part[middle], bright[middle], minlength=len(pixels)) > 0.75 * pixels
+    is_bright &= pixels > 0
+    gaps = np.convolve(np.pad(is_bright, 2), np.ones(3), "same")
     run = _longest((gaps > 0)[2:-2])
-    if run is None or (run[1] - run[0]) * STEP_PX < shortest or seen[slice(*run)].mean() < 0.85:
+    if (
+        run is None
+        or (run[1] - run[0]) * STEP_PX < shortest
+        or is_bright[slice(*run)].mean() < 0.85
+    ):
         return None
     inside = (part >= run[0]) & (part < run[1])
     # Stars in a row have bright and dark parts; a trail is as bright all along.
     heights = np.array([np.median(flat[middle & (part == k)]) for k in range(*run) if pixels[k]])
-    low, usual = np.percentile(heights, [15, 50])
-    if low < 0.7 * usual:
+    low, median_height = np.percentile(heights, [15, 50])
+    if low < 0.7 * median_height:
         return None
     # Half width: to where the median height is no more than half the noise of a pixel.
     ring = np.abs(across)
@@ -165,9 +172,9 @@ def _trail(
     return None
 
 
-def _longest(seen: np.ndarray) -> tuple[int, int] | None:
+def _longest(is_true: np.ndarray) -> tuple[int, int] | None:
     """Return start and end of the longest run of True, None without one."""
-    edges = np.flatnonzero(np.diff(np.pad(seen.astype(np.int8), 1)))
+    edges = np.flatnonzero(np.diff(np.pad(is_true.astype(np.int8), 1)))
     if not edges.size:
         return None
     starts, ends = edges[::2], edges[1::2]

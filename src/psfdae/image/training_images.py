@@ -45,12 +45,12 @@ def star_grid(position: np.ndarray) -> np.ndarray:
     """
     count = len(position)
     rows = max(1, round(np.sqrt(count)))
-    known = np.isfinite(position).all()
-    by_x = np.argsort(position[:, 0], kind="stable") if known else np.arange(count)
+    is_located = np.isfinite(position).all()
+    by_x = np.argsort(position[:, 0], kind="stable") if is_located else np.arange(count)
     grid = np.empty((count, 2), dtype=np.int64)
     for column, start in enumerate(range(0, count, rows)):
         members = by_x[start : start + rows]
-        if known:
+        if is_located:
             members = members[np.argsort(position[members, 1], kind="stable")]
         grid[members] = np.stack([np.full(members.size, column), np.arange(members.size)], axis=1)
     return grid
@@ -63,11 +63,13 @@ def star_of_images(held_out: np.ndarray, train: int, test: int) -> np.ndarray:
     star of a part comes as often as the others, or once more.
     """
     parts = ((np.flatnonzero(~held_out), train), (np.flatnonzero(held_out), test))
-    return np.concatenate([np.resize(stars, max(wanted, stars.size)) for stars, wanted in parts])
+    return np.concatenate(
+        [np.resize(stars, max(image_count, stars.size)) for stars, image_count in parts]
+    )
 
 
 def bins_of(position: np.ndarray, bins: int) -> np.ndarray:
-    """Which of bins × bins parts of the field every star is in, ix + bins·iy, shape (n,).
+    """Return the part of bins × bins of the field that each star is in, ix + bins·iy, (n,).
 
     Where a position (n, 2) is not finite, all stars are in the first part.
     """
@@ -95,8 +97,8 @@ def stacks(aligned: np.ndarray, snr: np.ndarray, part: np.ndarray, parts: int) -
     everyone = np.average(aligned, axis=0, weights=snr)
     out = np.broadcast_to(everyone, (parts, *everyone.shape)).copy()
     for index in np.unique(part):
-        mine = part == index
-        out[index] = np.average(aligned[mine], axis=0, weights=snr[mine])
+        members = part == index
+        out[index] = np.average(aligned[members], axis=0, weights=snr[members])
     return out
 
 
@@ -165,14 +167,16 @@ def make_images(
     reach = int(np.abs(stars.peak).max()) + 1
     for start in range(0, star.size, IMAGES_AT_A_TIME):
         rows = slice(start, start + IMAGES_AT_A_TIME)
-        who, wide = star[rows], stars.wide[star[rows]]
-        some = subpixel[rows]
+        star_rows, stamps = star[rows], stars.wide[star[rows]]
+        is_moved = subpixel[rows]
         # Splines ring beside what is left of a saturated neighbour.
-        least = -DEFECT * stars.noise[who[some], None, None]
-        wide[some] = np.maximum(moved(stars.wide, phase[rows][some], who[some]), least)
-        offset = brightest_pixels(wide, reach, centring_px)[0] - jitter[rows]
-        shifted = moved(template, stars.centre[who] + phase[rows], who)
-        for source, target in ((wide, realisations), (shifted, templates)):
+        floor = -DEFECT * stars.noise[star_rows[is_moved], None, None]
+        stamps[is_moved] = np.maximum(
+            moved(stars.wide, phase[rows][is_moved], star_rows[is_moved]), floor
+        )
+        offset = brightest_pixels(stamps, reach, centring_px)[0] - jitter[rows]
+        shifted = moved(template, stars.centre[star_rows] + phase[rows], star_rows)
+        for source, target in ((stamps, realisations), (shifted, templates)):
             stamp = cut(source, side, offset)
             target[rows] = stamp / stamp.sum(axis=(1, 2), keepdims=True)
     return realisations, templates, jitter, phase
