@@ -47,7 +47,7 @@ def test_a_mistake_is_one_short_line_with_its_place(folder, name, content, words
     assert all(word in line for word in words), line
     assert len(line) < 500
     if name == TRAIN:
-        assert refusal("train", "--stars=x", "--out=y") == line
+        assert refusal("fit", "dae", "--stars=x", "--out=y") == line
 
 
 @pytest.mark.parametrize(

@@ -45,7 +45,7 @@ def bundle(network, tmp_path):
 
 def test_a_command_names_the_package_and_its_extra(without):
     without("hydra")
-    output = refused("train", "--stars", "stars.h5", "--out", "model", "seed=20811")
+    output = refused("fit", "dae", "--stars", "stars.h5", "--out", "model", "seed=20811")
     assert output == f"psfdae: this command needs hydra-core: {errors.install_line('paper')}\n"
 
 
