@@ -160,7 +160,7 @@ class Run:
     @property
     def points(self) -> list[Point]:
         """All metrics that are finite."""
-        points = _epoch_points(self.epochs, self.start_ms)
+        points = epoch_points(self.epochs, self.start_ms)
         points += [Point(name, value, 0, self.end_ms) for name, value in self.metrics.items()]
         return [point for point in points if math.isfinite(point.value)]
 
@@ -450,40 +450,33 @@ def _data_of(results: Path, result: Mapping[str, Any]) -> Path | None:
         return None
 
 
-def runs_under_way(results: Path, preset: str) -> list[Run]:
-    """Trainings that are not finished, as far as they are: those of datasets and of scene 3."""
-    folder, runs = results / "checkpoints", []
-    for kind in (k for k in registered() if k.storage and HISTORY in k.storage.diagnostics):
-        for path in sorted((folder / kind.name).glob("*/*-*.csv")):
-            split, reference = path.stem.split("-", 1)
-            key = path.parent.name, split, reference
-            config = load((f"dataset={key[0]}", f"preset={preset}"))
-            name = fits.storage_of(kind).run or kind.name
-            said = Named(
-                kind=name,
-                dataset=key[0],
-                split=split,
-                reference=reference,
-                source=fits.place_of(kind, *key),
-                name=" ".join([*key, name]),
-                experiment=config.scene.experiment,
-            )
-            runs.append(_under_way(path, said))
-    for kind_of_network in WEIGHTS:
-        path = folder / f"alignment-{kind_of_network}.csv"
-        if path.is_file():
-            runs.append(_under_way(path, _of_scene3(kind_of_network)))
-    return [run for run in runs if run.epochs]
+def training_at(checkpoint: Path, results: Path, preset: str) -> Run | None:
+    """Return the run of a training under way, by its checkpoint's place; None if it has no run.
 
-
-def _under_way(path: Path, said: Named) -> Run:
-    try:
-        end_ms, epochs = _time_ms(path), _epochs(path)
-    except ProductError:  # it has ended meanwhile
-        end_ms, epochs = 0, []
-    return Run(
-        **said, files={}, config={}, metrics={}, end_ms=end_ms, epochs=epochs, status="RUNNING"
-    )
+    Those of datasets and of scene 3 have runs.
+    """
+    folder = results / "checkpoints"
+    if not checkpoint.is_relative_to(folder):
+        return None
+    *places, stem = checkpoint.relative_to(folder).with_suffix("").parts
+    network = stem.removeprefix("alignment-")
+    if len(places) == len(("method", "dataset")):
+        (kind, dataset), (split, reference) = places, stem.split("-", 1)
+        name = fits.storage_of(method(kind)).run or kind
+        said = Named(
+            kind=name,
+            dataset=dataset,
+            split=split,
+            reference=reference,
+            source=fits.place_of(method(kind), dataset, split, reference),
+            name=" ".join([dataset, split, reference, name]),
+            experiment=load((f"dataset={dataset}", f"preset={preset}")).scene.experiment,
+        )
+    elif network in WEIGHTS and network != stem:
+        said = _of_scene3(network)
+    else:
+        return None
+    return Run(**said, files={}, config={}, metrics={}, end_ms=0, status="RUNNING")
 
 
 def _of_scene3(kind: str) -> Named:
@@ -566,7 +559,7 @@ def _epochs(history: Path, *columns: str) -> list[dict[str, float]]:
     return [{name: number(history, text) for name, text in row.items()} for row in rows]
 
 
-def _epoch_points(epochs: Sequence[Mapping[str, float]], start_ms: int) -> list[Point]:
+def epoch_points(epochs: Sequence[Mapping[str, float]], start_ms: int) -> list[Point]:
     """Metrics of every epoch of a history, and the best validation error."""
     points = [
         Point(name, value, int(row["epoch"]), start_ms + int(1000 * row["seconds"]))

@@ -12,7 +12,7 @@ import json
 import os
 import tempfile
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -31,7 +31,6 @@ from psfdae_paper.registry import (
     register,
     registered_name,
 )
-from psfdae_paper.runs_page import show
 from psfdae_paper.source import git_commit
 from psfdae_paper.tracking import (
     MODEL,
@@ -43,6 +42,7 @@ from psfdae_paper.tracking import (
     runs_of_sweep,
     settings_of,
 )
+from psfdae_paper.views import show
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -210,6 +210,11 @@ def experiment_of(client: MlflowClient, name: str, uri: str, artifacts: Path) ->
     return str(found.experiment_id)
 
 
+def runs_of_slot(client: MlflowClient, experiment: str, tags: Mapping[str, str]) -> list[MlflowRun]:
+    """Return the active runs of a place in the results folder that this stage has made."""
+    return [run for run in _runs(client, experiment) if _slot(run.data.tags) == _slot(tags)]
+
+
 def _runs(client: MlflowClient, experiment: str) -> Iterator[MlflowRun]:
     """Active runs of an experiment that this stage has made."""
     token = None
@@ -318,7 +323,7 @@ def tags_of(record: Run) -> dict[str, str]:
     return {**own, "config_hash": record.config_hash, "superseded": "false"}
 
 
-def _slot(tags: dict[str, str]) -> tuple[str, ...]:
+def _slot(tags: Mapping[str, str]) -> tuple[str, ...]:
     return tuple(tags.get(key, "") for key in SLOT)
 
 
