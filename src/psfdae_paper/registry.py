@@ -26,9 +26,6 @@ TEST_MSE = "test_mse"
 EXAMPLE = {"artifact_path": "input_example.json", "type": "ndarray", "format": "tf-serving"}
 """How MLflow finds what shows the input of a model."""
 
-VERSIONS = "mlflow.modelVersions"
-"""Tag by which MLflow's page of a model shows its versions."""
-
 
 def log_model(client: MlflowClient, experiment: str, run_id: str, record: Run) -> str | None:
     """Log the model of a run with all its files; its id, or None if the run has no model.
@@ -80,9 +77,7 @@ def register(client: MlflowClient, run_id: str, model_id: str, record: Run) -> N
     if TEST_MSE in record.metrics:
         tags[TEST_MSE] = f"{record.metrics[TEST_MSE]:.6g}"
     place = client.get_logged_model(model_id).artifact_location
-    version = client.create_model_version(name, place, run_id, tags, model_id=model_id)
-    said = [{"name": name, "version": version.version}]
-    client.set_logged_model_tags(model_id, {VERSIONS: json.dumps(said)})
+    client.create_model_version(name, place, run_id, tags, model_id=model_id)
 
 
 def choose_best(client: MlflowClient, name: str) -> None:

@@ -12,8 +12,6 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any, NamedTuple, TypedDict
 
-import numpy as np
-
 from psfdae import fits
 from psfdae.belonging import STARS, require_origin
 from psfdae.files import Product, ProductError, read_product
@@ -143,7 +141,7 @@ class Run:
     content_hash: str = field(init=False)
 
     def __post_init__(self) -> None:
-        contents = {name: _digest(path) for name, path in self.files.items()}
+        contents = {name: digest_of(path) for name, path in self.files.items()}
         object.__setattr__(self, "content_hash", hash_of([CONTENT, self.config_hash, contents]))
 
     @property
@@ -225,7 +223,7 @@ def _of_stars(
     metrics: dict[str, float] = {}
     rows = [row for row in read_csv(evaluation, *MEASURED) if row["method"] == kind.name]
     for row in rows:
-        metrics |= _measured(evaluation, row, "test")
+        metrics |= _measured(evaluation, row)
     for metric in AVERAGED:
         values = [number(evaluation, row["value"]) for row in rows if row["metric"] == metric]
         if values:
@@ -251,42 +249,6 @@ def _of_stars(
     )
 
 
-def runs_of_optics(results: Path, datasets: Mapping[str, Path]) -> list[Run]:
-    """What the methods that know the telescope made of the stars that are bounded.
-
-    Parameters and errors are those of `runs_of_datasets`. They keep no model: a run has its
-    errors, named `bounded_…` because they are those of some of the test stars.
-    """
-    runs = []
-    for dataset, stars in datasets.items():
-        path = results / "wavefront" / f"{dataset}.csv"
-        if not path.is_file():
-            raise ProductError(f"{path}: missing; run `snakemake wavefront` first")
-        product = read_product(stars, "stars", ())
-        of_run: dict[tuple[str, str, str], dict[str, float]] = {}
-        for row in read_csv(path, "split", "reference", *MEASURED):
-            metrics = of_run.setdefault((row["method"], row["split"], row["reference"]), {})
-            metrics |= _measured(path, row, "bounded")
-        runs += [
-            Run(
-                kind=kind,
-                dataset=dataset,
-                split=split,
-                reference=reference,
-                source=f"wavefront/{dataset}/{kind}",
-                name=f"{dataset} {split} {reference} {kind}",
-                experiment=_experiment(product),
-                files={"evaluation.csv": path, "stars.parquet": path.with_suffix(".parquet")},
-                config=product.config,
-                end_ms=_time_ms(path),
-                metrics=metrics,
-                data=stars,
-            )
-            for (kind, split, reference), metrics in of_run.items()
-        ]
-    return runs
-
-
 def _experiment(stars: Product) -> str:
     """Name of the experiment of stars, their scene; raises ProductError without one."""
     try:
@@ -295,11 +257,11 @@ def _experiment(stars: Product) -> str:
         raise ProductError(f"{stars.path}: its config has no scene.experiment") from None
 
 
-def _measured(path: Path, row: Mapping[str, str], what: str) -> dict[str, float]:
+def _measured(path: Path, row: Mapping[str, str]) -> dict[str, float]:
     """Value and standard error of a row of a table of errors, by their names in MLflow."""
     metric, level = row["metric"], f"{number(path, row['noise_level']):g}"
     named = ((metric, "value"), (f"{metric}_stderr", "stderr"))
-    return {f"{what}_{name}_{level}": number(path, row[column]) for name, column in named}
+    return {f"test_{name}_{level}": number(path, row[column]) for name, column in named}
 
 
 def _model_files(kind: type[Method], place: Path) -> dict[str, Path]:
@@ -526,19 +488,8 @@ def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
     return leaves
 
 
-def described(product: Path) -> tuple[str, dict[str, tuple[np.dtype, tuple[int, ...]]]]:
-    """SHA-256 of a product, and type and shape of each of its arrays."""
-    import h5py
-
-    try:
-        with h5py.File(product, "r") as file:
-            arrays = {name: (file[name].dtype, file[name].shape) for name in file}
-    except (OSError, KeyError) as error:
-        raise ProductError(f"{product}: damaged ({error})") from None
-    return _digest(product), arrays
-
-
-def _digest(path: Path) -> str:
+def digest_of(path: Path) -> str:
+    """Return the SHA-256 of a file; raises ProductError if it is missing."""
     try:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()

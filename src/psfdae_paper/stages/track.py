@@ -35,10 +35,9 @@ from psfdae_paper.source import git_commit
 from psfdae_paper.tracking import (
     MODEL,
     Run,
-    described,
+    digest_of,
     runs_of_alignment,
     runs_of_datasets,
-    runs_of_optics,
     runs_of_sweep,
     settings_of,
 )
@@ -61,6 +60,9 @@ PARENT = "mlflow.parentRunId"
 BATCH, PARAM_LENGTH = 100, 6000
 """MLflow takes 100 params, or 1000 metrics, at once, and 6000 characters of a param."""
 
+MOST_RUNS = 50_000
+"""Runs of an experiment that MLflow gives at once, at most."""
+
 DIGEST = 16
 """Characters of the SHA-256 of its product that tell a dataset from others."""
 
@@ -81,7 +83,6 @@ def track(
     stars: Annotated[
         tuple[tuple[str, File], ...], "Dataset and its product of the stage stars."
     ] = (),
-    optics: Annotated[bool, "Of these datasets, the methods that know the telescope."] = False,
     alignment: Annotated[bool, "The networks of scene 3."] = False,
     sweeps: Annotated[tuple[str, ...], "The points of a sweep.", {"flag": "--sweep"}] = (),
 ) -> None:
@@ -94,8 +95,7 @@ def track(
 
     If a server fails there is a message and no error: it must not stop a workflow.
     """
-    of_datasets = runs_of_optics if optics else runs_of_datasets
-    runs = of_datasets(results, dict(stars))
+    runs = runs_of_datasets(results, dict(stars))
     runs += runs_of_alignment(results) if alignment else []
     runs += [run for sweep in sweeps for run in runs_of_sweep(results, sweep)]
     import_runs(runs, preset, database, out)
@@ -217,13 +217,8 @@ def runs_of_slot(client: MlflowClient, experiment: str, tags: Mapping[str, str])
 
 def _runs(client: MlflowClient, experiment: str) -> Iterator[MlflowRun]:
     """Active runs of an experiment that this stage has made."""
-    token = None
-    while True:
-        page = client.search_runs([experiment], max_results=1000, page_token=token)
-        yield from (run for run in page if "config_hash" in run.data.tags)
-        token = page.token
-        if not token:
-            return
+    known = client.search_runs([experiment], max_results=MOST_RUNS)
+    yield from (run for run in known if "config_hash" in run.data.tags)
 
 
 def _import_one(
@@ -296,21 +291,9 @@ def _log_data(client: MlflowClient, run_id: str, record: Run) -> dict[str, str]:
     if record.data is None or not record.data.is_file():
         return {}
     from mlflow.entities import Dataset, DatasetInput, InputTag
-    from mlflow.types import Schema, TensorSpec
 
-    content, arrays = described(record.data)
-    specs = Schema(
-        [TensorSpec(dtype, (-1, *shape[1:]), name) for name, (dtype, shape) in arrays.items()]
-    )
-    schema = {"mlflow_tensorspec": {"features": specs.to_json(), "targets": None}}
-    data = Dataset(
-        record.dataset,
-        content[:DIGEST],
-        "local",
-        json.dumps({"uri": record.data.resolve().as_uri()}),
-        json.dumps(schema),
-        json.dumps({"shapes": {name: list(shape) for name, (_, shape) in arrays.items()}}),
-    )
+    source = json.dumps({"uri": record.data.resolve().as_uri()})
+    data = Dataset(record.dataset, digest_of(record.data)[:DIGEST], "local", source)
     of_training = [InputTag("mlflow.data.context", "training")]
     client.log_inputs(run_id, [DatasetInput(data, of_training)])
     return {"dataset_name": data.name, "dataset_digest": data.digest}
