@@ -136,10 +136,11 @@ docs: env ## Renew the numbers in README and docs
 site: docs ## Build the site of README and docs in site/
 	NO_MKDOCS_2_WARNING=1 mkdocs build --strict
 
-lint: env ## Check style and types of Python, and Snakemake files
+lint: env ## Check style, words and types of Python, and Snakemake files
 	ruff check .
 	ruff format --check .
 	lint-imports --no-cache
+	python workflow/house.py
 	mypy
 	snakefmt --check Snakefile workflow
 	snakemake --lint
