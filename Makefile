@@ -95,8 +95,8 @@ $(VENV)/.complete: requirements.lock $(wildcard requirements/*.lock) pyproject.t
 	touch $@
 
 reproduce: env ## Build everything of the preset: datasets, models, tables, report
-	@case "$$TRACK" in '') ;; live) psfdae watch --results "$$PSFDAE_RESULTS" --preset "$$PRESET" \
-	    --database "$$PSFDAE_RESULTS/mlflow.db" & ;; *) echo "TRACK=$$TRACK: live, or nothing"; exit 2;; esac; \
+	@case "$$TRACK" in '') ;; live) export PSFDAE_EPOCHS=psfdae_paper.stages.live:logger ;; \
+	    *) echo "TRACK=$$TRACK: live, or nothing"; exit 2;; esac; \
 	  $(LOCKED) $(LONGEST_FIRST) -- $$TARGETS
 	@$(MAKE) --no-print-directory report
 	@[ "$$PSFDAE_RESULTS" != results ] || [ ! -d results/evaluation ] || \
@@ -123,7 +123,6 @@ report: env ## Gather the figures of a finished run in results/report.html
 
 mlflow: env ## Compare the tracked runs in a browser (PORT=n)
 	@test -f "$$PSFDAE_RESULTS/mlflow.db" || { echo "no $$PSFDAE_RESULTS/mlflow.db yet: make reproduce"; exit 1; }
-	@psfdae page --database "$$PSFDAE_RESULTS/mlflow.db" --port "$$PORT" & \
 	mlflow ui --workers 1 --port "$$PORT" --backend-store-uri "sqlite:///$$PSFDAE_RESULTS/mlflow.db" \
 	  --artifacts-destination "$$PSFDAE_RESULTS/mlartifacts"
 

@@ -44,8 +44,8 @@ def at(tmp_path_factory):
         stars = ("stars", "--templates", at / f"t{name}.h5", "--out", at / f"s{name}.h5")
         done(*stars, "stars=seidel_10pct", *SIZES, *more)
     done("stars", "--templates", at / "t.h5", "--out", at / "fresh.h5", *SIZES, "stars.name=fresh")
-    done("baseline", "--stars", at / "s.h5", "--out", at / "pca_som.h5", *SIZES)
-    done("train", "--stars", at / "s.h5", "--out", at / "dae", *SIZES)
+    done("fit", "pca_som", "--stars", at / "s.h5", "--out", at / "pca_som.h5", *SIZES)
+    done("fit", "dae", "--stars", at / "s.h5", "--out", at / "dae", *SIZES)
     return at
 
 

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import shutil
-
 import numpy as np
-import pandas as pd
 import pytest
 
 import propagators
@@ -15,9 +12,7 @@ from psfdae.optics.pupil import annular_pupil
 from psfdae.optics.wavefronts import seidel_wavefronts
 from psfdae_paper.configuration.compose import load_stage
 from psfdae_paper.stars.framing import normalise_flux
-from workflow_runs import ROOT, planned, snakemake
 
-RECORD = ROOT / "results/reference/tables"
 COMATIC, FIELD = np.array([0.3, 0.8, 0.6, 0.4, -0.1]), np.array([0.6, -0.4])
 
 
@@ -63,31 +58,3 @@ def test_configured_optics_stay_within_the_error_budget(dataset, worst_stars):
 
 
 # Tables
-
-
-@pytest.fixture(scope="module")
-def on_request(smoke, tmp_path_factory):
-    """A copy of the smoke run, which other tests want as the default target leaves it."""
-    folder = shutil.copytree(smoke, tmp_path_factory.mktemp("request") / "run", symlinks=True)
-    # It knows where the results lay; the next import makes another.
-    (folder / "results/mlflow.db").unlink()
-    return folder
-
-
-@pytest.mark.slow
-@pytest.mark.workflow
-@pytest.mark.parametrize(
-    "names",
-    [
-        ("psf_bounds", "psf_bounds_growth", "psf_efficiency", "psf_optics"),
-        ("benchmark_baseline", "benchmark_inference", "benchmark_methods", "benchmark_scaling"),
-        ("predict_poppy", "predict_strange", "predict_throughput"),
-    ],
-)
-def test_tables_on_request_have_the_columns_of_the_record(on_request, names):
-    tables = [f"results/tables/{name}.csv" for name in names]
-    snakemake(on_request, *tables)
-    for table in tables:
-        columns = list(pd.read_csv(RECORD / table.rpartition("/")[2]))
-        assert list(pd.read_csv(on_request / table)) == columns, table
-    assert planned(on_request, *tables) == {}

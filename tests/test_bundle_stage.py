@@ -32,7 +32,7 @@ from psfdae.splits import random_split
 from psfdae_paper.configuration.compose import load_stage
 from psfdae_paper.stages import bundle as stage
 from psfdae_paper.stages.evaluate import Models
-from psfdae_paper.stages.fit import fit, train
+from psfdae_paper.stages.fit import fit
 
 TINY = [
     *("noise.levels=[1e-3,3e-3,1e-2]", "parts.train_stars=1000", "parts.test_stars=400"),
@@ -63,7 +63,7 @@ def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("bundle")
     stars = write_stars(folder / "stars.h5", STARS)
     config = load_stage(groups_of("dae"), TINY)
-    train(config, stars, out=folder / "dae")
+    fit(config, "dae", stars, out=folder / "dae")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SOURCE_DATE_EPOCH", "0")
         pack(folder, folder / "tiny.psf.safetensors")

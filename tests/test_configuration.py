@@ -102,7 +102,7 @@ def test_a_file_of_settings_is_named_by_what_decides_a_result(tmp_path):
 
     def written(*overrides):
         tree = compose.compose(("preset=smoke", *overrides))
-        return compose.write_settings(tmp_path, "train", reads, tree)
+        return compose.write_settings(tmp_path, "fit", reads, tree)
 
     path = written()
     assert written("train.checkpoint_seconds=1.5") == path
@@ -190,7 +190,7 @@ def test_an_installed_wheel_finds_its_configuration(tmp_path):
     (site / "config").mkdir()
     (site / "config/config.yaml").write_text("colour: blue\n")
     kept = {key: value for key, value in os.environ.items() if key != "PSFDAE_CONFIG"}
-    for words in (("config", "--stage", "train"), ("alignment", "config")):
+    for words in (("config", "--stage", "fit"), ("alignment", "config")):
         line = [sys.executable, "-m", "psfdae", *words]
         installed, source = (
             captured(line, cwd=tmp_path, env={**kept, "PYTHONPATH": str(path)})

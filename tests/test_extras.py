@@ -43,12 +43,6 @@ def bundle(network, tmp_path):
     return path
 
 
-def test_a_command_names_the_package_and_its_extra(without):
-    without("hydra")
-    output = refused("train", "--stars", "stars.h5", "--out", "model", "seed=20811")
-    assert output == f"psfdae: this command needs hydra-core: {errors.install_line('paper')}\n"
-
-
 def test_a_network_without_torch_names_the_extra(bundle, without):
     without("torch")
     line = f"the model 'wfsat' needs torch: {errors.install_line('dae')}"

@@ -201,7 +201,7 @@ def test_the_method_may_be_named_and_settings_used_by_hand(network, tmp_path):
     overrides = (network / "overrides.txt").read_text().split()
     noise = load_stage(groups_of("dae"), overrides).noise
     assert noise.kappa == 1.0 and len(noise.levels) == 4
-    by_hand = ["train", "--stars", network / "stars.h5", "--split", "held_out"]
+    by_hand = ["fit", "dae", "--stars", network / "stars.h5", "--split", "held_out"]
     words = [*by_hand, "--out", tmp_path / "dae", *overrides]
     assert psfdae(*words).exit_code == 0
     weights = "dae/dae.safetensors"

@@ -6,7 +6,6 @@ import gc
 import pickle
 import shutil
 import struct
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,7 @@ import pytest
 from astropy.io import fits
 from astropy.table import Table
 
-from command_line import psfdae, refused
+from command_line import refused
 from fits_inputs import PACK, open_observation, write_cube, write_field
 from prediction_stars import with_network
 from psfdae import load_model
@@ -22,7 +21,7 @@ from psfdae.image import fits_file as images
 from psfdae.image.catalogue import read_catalogue
 from psfdae.image.errors import ObservationError
 from psfdae.model import bundle as bundles
-from psfdae.model.bundle import read_bundle, shipped_path, write_bundle
+from psfdae.model.bundle import read_bundle, shipped_path
 
 SIDE = 16
 CUBE, TILES, LIST, TABLE, MODEL = (
@@ -200,7 +199,7 @@ def test_predictions_do_not_depend_on_who_completes_the_basis(monkeypatch, shipp
             np.testing.assert_allclose(a, b, rtol=2e-5, atol=1e-6 * np.nanmax(np.abs(a)))
 
 
-# Results, texts that others execute, memory.
+# Results.
 
 
 def test_results_never_take_the_place_of_what_they_are_made_of(good, tmp_path):
@@ -216,18 +215,3 @@ def test_results_never_take_the_place_of_what_they_are_made_of(good, tmp_path):
         out = [] if "--out" in words else ["--out", tmp_path / "model"]
         assert "is an input, too" in refused(*words, *out)
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
-
-
-def test_lack_of_memory_is_one_line(good, tmp_path, monkeypatch):
-    monkeypatch.setattr("psfdae.model.psf_model.Engine.block", lambda *_: np.empty(2**50))
-    assert "not enough memory" in refused("predict", good / CUBE, "--out", tmp_path / "o.fits")
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_texts_of_a_model_are_shown_and_not_obeyed(tmp_path):
-    path = tmp_path / MODEL
-    bundle = read_bundle()
-    texts = {"name": "a\x1b[31mb", "licence": "c\nLicence  MIT\x07"}
-    write_bundle(replace(bundle, info=bundle.info.model_copy(update=texts)), path)
-    output = psfdae("describe", path).output
-    assert "a?[31mb" in output and "c Licence MIT?" in output

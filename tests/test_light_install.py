@@ -139,8 +139,8 @@ def test_help_lists_what_works_here_and_names_the_extra_for_the_others(light, tm
         'with the extra "paper": pip install',
     ):
         assert heading in lines
-    assert "from-stars" in lines and "snakemake" not in lines and "  train " not in lines
-    refusal = run(light, tmp_path, "psfdae train --stars a.h5 --out b 2>&1 || test $? = 2")
+    assert "from-stars" in lines and "snakemake" not in lines and "  fit " not in lines
+    refusal = run(light, tmp_path, "psfdae fit dae --stars a.h5 --out b 2>&1 || test $? = 2")
     assert re.fullmatch(
         r'psfdae: this command needs hydra-core: pip install ".*\.whl\[paper\]"\n', refusal
     )

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import warnings
-from signal import SIGKILL
 
 import numpy as np
 import pytest
@@ -181,23 +179,6 @@ def test_what_cannot_be_used_ends_in_one_line_and_code_2(bad, monkeypatch, words
     assert all(text in line for text in texts), line
     assert not (bad / "out.fits").exists()
     assert (bad / "exists.fits").read_text() == "precious"
-
-
-@pytest.mark.slow
-def test_a_killed_command_ends_well_if_typed_again(folder, tmp_path, monkeypatch):
-    """Whatever files it has left: that of the PSFs comes last, and says that all are there."""
-    out, listed, plotted = (tmp_path / name for name in ("psf.fits", "psf_stars.csv", "map.png"))
-    words = [folder / "image.fits", "--detect", "--out", out, "--plot", plotted, "--quiet"]
-    child = os.fork()
-    if child == 0:
-        monkeypatch.setattr(stage, "write_png", lambda *_: os.kill(os.getpid(), SIGKILL))
-        run(*words)
-        os._exit(1)
-    assert os.waitpid(child, 0)[1] == SIGKILL
-    assert listed.exists() and not out.exists()
-    assert run(*words).exit_code == 0
-    assert sorted(tmp_path.iterdir()) == sorted([out, listed, plotted])
-    assert "exists already" in run(*words).output  # these may be anybody's
 
 
 def test_page_lists_all_flags_and_columns():

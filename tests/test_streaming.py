@@ -10,7 +10,6 @@ import speed
 from measure import alone, cost_of_command
 from prediction import make_cube
 from psfdae.files import Column, Empty, ProductError, read_product, stream_product, write_product
-from psfdae.optics.wavefronts import ModalWavefronts, monomial_images
 from psfdae_paper.configuration.compose import compose, load_stage
 from psfdae_paper.configuration.consistency import SIMULATION, STATIC
 from psfdae_paper.stages import stars
@@ -75,13 +74,6 @@ def test_stars_do_not_depend_on_how_many_are_made_at_a_time(cheap, tmp_path, mon
         assert (whole[name] == pieces[name]).all(), name
     for name in ("template", "realisation", "energy"):
         assert pieces[name] == pytest.approx(whole[name], rel=1e-5, abs=1e-8), name
-
-
-def test_slopes_do_not_depend_on_the_batch():
-    coefficients = np.random.default_rng(2).normal(size=(600, 8))
-    whole = ModalWavefronts(monomial_images, coefficients).slopes()
-    parts = [ModalWavefronts(monomial_images, c).slopes() for c in np.split(coefficients, 30)]
-    assert whole == pytest.approx(np.concatenate(parts), rel=1e-12)
 
 
 def test_search_is_exact_for_large_pixels():

@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 import yaml
 
-from psfdae.files import Column, ProductError, write_product
+from psfdae.files import Column, write_product
 from psfdae.methods import groups_of
 from psfdae.splits import random_split
 from psfdae_paper.configuration.alignment import CHOICE
@@ -20,8 +20,6 @@ from psfdae_paper.stages import sweep as stage
 from psfdae_paper.stages import sweep_summary, track
 from psfdae_paper.stages.fit import fit
 from psfdae_paper.sweeps.measured import Task
-from psfdae_paper.sweeps.points import SweepError
-from psfdae_paper.tracking import runs_of_sweep
 from test_track import site  # noqa: F401
 
 SIZES = ("parts.train_stars=160", "parts.test_stars=60", "noise.levels=[0.001,0.005]")
@@ -254,14 +252,6 @@ def test_summary_has_every_point_and_the_best_by_validation(tmp_path):
     for direction, number in (("minimize", 3), ("maximize", 0)):
         best = sweep_summary.choose(results, "validation_mse", direction)
         assert best["point"] == f"{number:012x}"
-
-
-def test_sweep_without_a_result_or_a_summary_is_refused(tmp_path):
-    with pytest.raises(SweepError, match=r"sweep tried failed.*the network died"):
-        summarise(tmp_path, [(4, 0.1, None)])
-    for reader in (sweep_summary.best_overrides, runs_of_sweep):
-        with pytest.raises(ProductError, match="run `snakemake sweep --config sweep=tried`"):
-            reader(tmp_path, "tried")
 
 
 def test_sweep_is_a_parent_run_with_a_child_per_point(site):  # noqa: F811

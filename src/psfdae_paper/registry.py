@@ -10,11 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from psfdae.model.packing import StarFacts
-from psfdae.model.star_sets import read_stars
-from psfdae.rng import stream
 from psfdae_paper import mlflow_model
-from psfdae_paper.tracking import MODEL, Fit, Run
+from psfdae_paper.tracking import MODEL, Run
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -28,9 +25,6 @@ TEST_MSE = "test_mse"
 
 EXAMPLE = {"artifact_path": "input_example.json", "type": "ndarray", "format": "tf-serving"}
 """How MLflow finds what shows the input of a model."""
-
-VERSIONS = "mlflow.modelVersions"
-"""Tag by which MLflow's page of a model shows its versions."""
 
 
 def log_model(client: MlflowClient, experiment: str, run_id: str, record: Run) -> str | None:
@@ -51,9 +45,10 @@ def log_model(client: MlflowClient, experiment: str, run_id: str, record: Run) -
         folder = Path(temporary, "files")
         link(files, folder, MODEL)
         if record.fit is not None and record.data is not None:
-            facts = _facts(record.fit, record.data, record.reference)
-            mlflow_model.write_facts(facts, record.fit, record.reference, name, folder)
-            folder = _loadable(folder, facts, run_id, model_id)
+            example = mlflow_model.write_model(
+                record.fit, record.data, record.reference, name, folder
+            )
+            folder = _loadable(folder, example, run_id, model_id)
         client.log_model_artifacts(model_id, str(folder))
     client.finalize_logged_model(model_id, "READY")
     return model_id
@@ -82,9 +77,7 @@ def register(client: MlflowClient, run_id: str, model_id: str, record: Run) -> N
     if TEST_MSE in record.metrics:
         tags[TEST_MSE] = f"{record.metrics[TEST_MSE]:.6g}"
     place = client.get_logged_model(model_id).artifact_location
-    version = client.create_model_version(name, place, run_id, tags, model_id=model_id)
-    said = [{"name": name, "version": version.version}]
-    client.set_logged_model_tags(model_id, {VERSIONS: json.dumps(said)})
+    client.create_model_version(name, place, run_id, tags, model_id=model_id)
 
 
 def choose_best(client: MlflowClient, name: str) -> None:
@@ -119,14 +112,8 @@ def _rank(version: ModelVersion) -> tuple[bool, float]:
     return version.tags["reference"] == "template", float(version.tags[TEST_MSE])
 
 
-def _facts(fit: Fit, data: Path, reference: str) -> StarFacts:
-    return mlflow_model.facts_of(
-        read_stars(data, reference), fit.kind.described(fit.place), reference
-    )
-
-
-def _loadable(files: Path, facts: StarFacts, run_id: str, model_id: str) -> Path:
-    """A folder that `mlflow.pyfunc` loads, with the files of one that `mlflow_model` knows.
+def _loadable(files: Path, stamp: np.ndarray, run_id: str, model_id: str) -> Path:
+    """Return a folder that `mlflow.pyfunc` loads, with all files of one that has a bundle.
 
     Not by `mlflow.pyfunc.save_model`, which looks at all files of all installed packages.
     """
@@ -134,10 +121,10 @@ def _loadable(files: Path, facts: StarFacts, run_id: str, model_id: str) -> Path
     from mlflow.pyfunc import add_to_model
     from mlflow.types import Schema, TensorSpec
 
-    folder, side = files.with_name("loadable"), facts.info["stamp_px"]
+    folder, side = files.with_name("loadable"), stamp.shape[-1]
     folder.mkdir()
     files.rename(folder / "data")
-    example = json.dumps(_example(facts).tolist())
+    example = json.dumps(stamp.tolist())
     (folder / EXAMPLE["artifact_path"]).write_text(example, encoding="utf-8")
     stamps = Schema([TensorSpec(np.dtype(np.float32), (-1, side, side))])
     signature = ModelSignature(stamps, stamps)
@@ -147,11 +134,3 @@ def _loadable(files: Path, facts: StarFacts, run_id: str, model_id: str) -> Path
     add_to_model(model, loader_module=mlflow_model.__name__, data="data")  # type: ignore[no-untyped-call]
     model.save(str(folder / "MLmodel"))
     return folder
-
-
-def _example(facts: StarFacts) -> np.ndarray:
-    """A noisy stamp of a test star on its sky, in photons, shape (1, d, d)."""
-    noise, rng = facts.held_out.noise, stream(facts.seed, "noise", "example")
-    flux = noise.flux(float(np.median(facts.levels)))
-    counts = rng.poisson(flux * facts.held_out.images[:1] + noise.background)
-    return np.asarray(counts, np.float32)

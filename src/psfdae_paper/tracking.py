@@ -12,8 +12,6 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any, NamedTuple, TypedDict
 
-import numpy as np
-
 from psfdae import fits
 from psfdae.belonging import STARS, require_origin
 from psfdae.files import Product, ProductError, read_product
@@ -143,7 +141,7 @@ class Run:
     content_hash: str = field(init=False)
 
     def __post_init__(self) -> None:
-        contents = {name: _digest(path) for name, path in self.files.items()}
+        contents = {name: digest_of(path) for name, path in self.files.items()}
         object.__setattr__(self, "content_hash", hash_of([CONTENT, self.config_hash, contents]))
 
     @property
@@ -160,7 +158,7 @@ class Run:
     @property
     def points(self) -> list[Point]:
         """All metrics that are finite."""
-        points = _epoch_points(self.epochs, self.start_ms)
+        points = epoch_points(self.epochs, self.start_ms)
         points += [Point(name, value, 0, self.end_ms) for name, value in self.metrics.items()]
         return [point for point in points if math.isfinite(point.value)]
 
@@ -225,7 +223,7 @@ def _of_stars(
     metrics: dict[str, float] = {}
     rows = [row for row in read_csv(evaluation, *MEASURED) if row["method"] == kind.name]
     for row in rows:
-        metrics |= _measured(evaluation, row, "test")
+        metrics |= _measured(evaluation, row)
     for metric in AVERAGED:
         values = [number(evaluation, row["value"]) for row in rows if row["metric"] == metric]
         if values:
@@ -251,42 +249,6 @@ def _of_stars(
     )
 
 
-def runs_of_optics(results: Path, datasets: Mapping[str, Path]) -> list[Run]:
-    """What the methods that know the telescope made of the stars that are bounded.
-
-    Parameters and errors are those of `runs_of_datasets`. They keep no model: a run has its
-    errors, named `bounded_…` because they are those of some of the test stars.
-    """
-    runs = []
-    for dataset, stars in datasets.items():
-        path = results / "wavefront" / f"{dataset}.csv"
-        if not path.is_file():
-            raise ProductError(f"{path}: missing; run `snakemake wavefront` first")
-        product = read_product(stars, "stars", ())
-        of_run: dict[tuple[str, str, str], dict[str, float]] = {}
-        for row in read_csv(path, "split", "reference", *MEASURED):
-            metrics = of_run.setdefault((row["method"], row["split"], row["reference"]), {})
-            metrics |= _measured(path, row, "bounded")
-        runs += [
-            Run(
-                kind=kind,
-                dataset=dataset,
-                split=split,
-                reference=reference,
-                source=f"wavefront/{dataset}/{kind}",
-                name=f"{dataset} {split} {reference} {kind}",
-                experiment=_experiment(product),
-                files={"evaluation.csv": path, "stars.parquet": path.with_suffix(".parquet")},
-                config=product.config,
-                end_ms=_time_ms(path),
-                metrics=metrics,
-                data=stars,
-            )
-            for (kind, split, reference), metrics in of_run.items()
-        ]
-    return runs
-
-
 def _experiment(stars: Product) -> str:
     """Name of the experiment of stars, their scene; raises ProductError without one."""
     try:
@@ -295,11 +257,11 @@ def _experiment(stars: Product) -> str:
         raise ProductError(f"{stars.path}: its config has no scene.experiment") from None
 
 
-def _measured(path: Path, row: Mapping[str, str], what: str) -> dict[str, float]:
+def _measured(path: Path, row: Mapping[str, str]) -> dict[str, float]:
     """Value and standard error of a row of a table of errors, by their names in MLflow."""
     metric, level = row["metric"], f"{number(path, row['noise_level']):g}"
     named = ((metric, "value"), (f"{metric}_stderr", "stderr"))
-    return {f"{what}_{name}_{level}": number(path, row[column]) for name, column in named}
+    return {f"test_{name}_{level}": number(path, row[column]) for name, column in named}
 
 
 def _model_files(kind: type[Method], place: Path) -> dict[str, Path]:
@@ -450,40 +412,33 @@ def _data_of(results: Path, result: Mapping[str, Any]) -> Path | None:
         return None
 
 
-def runs_under_way(results: Path, preset: str) -> list[Run]:
-    """Trainings that are not finished, as far as they are: those of datasets and of scene 3."""
-    folder, runs = results / "checkpoints", []
-    for kind in (k for k in registered() if k.storage and HISTORY in k.storage.diagnostics):
-        for path in sorted((folder / kind.name).glob("*/*-*.csv")):
-            split, reference = path.stem.split("-", 1)
-            key = path.parent.name, split, reference
-            config = load((f"dataset={key[0]}", f"preset={preset}"))
-            name = fits.storage_of(kind).run or kind.name
-            said = Named(
-                kind=name,
-                dataset=key[0],
-                split=split,
-                reference=reference,
-                source=fits.place_of(kind, *key),
-                name=" ".join([*key, name]),
-                experiment=config.scene.experiment,
-            )
-            runs.append(_under_way(path, said))
-    for kind_of_network in WEIGHTS:
-        path = folder / f"alignment-{kind_of_network}.csv"
-        if path.is_file():
-            runs.append(_under_way(path, _of_scene3(kind_of_network)))
-    return [run for run in runs if run.epochs]
+def training_at(checkpoint: Path, results: Path, preset: str) -> Run | None:
+    """Return the run of a training under way, by its checkpoint's place; None if it has no run.
 
-
-def _under_way(path: Path, said: Named) -> Run:
-    try:
-        end_ms, epochs = _time_ms(path), _epochs(path)
-    except ProductError:  # it has ended meanwhile
-        end_ms, epochs = 0, []
-    return Run(
-        **said, files={}, config={}, metrics={}, end_ms=end_ms, epochs=epochs, status="RUNNING"
-    )
+    Those of datasets and of scene 3 have runs.
+    """
+    folder = results / "checkpoints"
+    if not checkpoint.is_relative_to(folder):
+        return None
+    *places, stem = checkpoint.relative_to(folder).with_suffix("").parts
+    network = stem.removeprefix("alignment-")
+    if len(places) == len(("method", "dataset")):
+        (kind, dataset), (split, reference) = places, stem.split("-", 1)
+        name = fits.storage_of(method(kind)).run or kind
+        said = Named(
+            kind=name,
+            dataset=dataset,
+            split=split,
+            reference=reference,
+            source=fits.place_of(method(kind), dataset, split, reference),
+            name=" ".join([dataset, split, reference, name]),
+            experiment=load((f"dataset={dataset}", f"preset={preset}")).scene.experiment,
+        )
+    elif network in WEIGHTS and network != stem:
+        said = _of_scene3(network)
+    else:
+        return None
+    return Run(**said, files={}, config={}, metrics={}, end_ms=0, status="RUNNING")
 
 
 def _of_scene3(kind: str) -> Named:
@@ -533,19 +488,8 @@ def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
     return leaves
 
 
-def described(product: Path) -> tuple[str, dict[str, tuple[np.dtype, tuple[int, ...]]]]:
-    """SHA-256 of a product, and type and shape of each of its arrays."""
-    import h5py
-
-    try:
-        with h5py.File(product, "r") as file:
-            arrays = {name: (file[name].dtype, file[name].shape) for name in file}
-    except (OSError, KeyError) as error:
-        raise ProductError(f"{product}: damaged ({error})") from None
-    return _digest(product), arrays
-
-
-def _digest(path: Path) -> str:
+def digest_of(path: Path) -> str:
+    """Return the SHA-256 of a file; raises ProductError if it is missing."""
     try:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
@@ -566,7 +510,7 @@ def _epochs(history: Path, *columns: str) -> list[dict[str, float]]:
     return [{name: number(history, text) for name, text in row.items()} for row in rows]
 
 
-def _epoch_points(epochs: Sequence[Mapping[str, float]], start_ms: int) -> list[Point]:
+def epoch_points(epochs: Sequence[Mapping[str, float]], start_ms: int) -> list[Point]:
     """Metrics of every epoch of a history, and the best validation error."""
     points = [
         Point(name, value, int(row["epoch"]), start_ms + int(1000 * row["seconds"]))

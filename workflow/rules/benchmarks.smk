@@ -255,15 +255,15 @@ rule knee_train:
         runtime=60,
     params:
         config=lambda w: settings(
-            "train", f"dataset={KNEE_DATASET}", more=knee_overrides(w.point)
+            "fit", f"dataset={KNEE_DATASET}", more=knee_overrides(w.point), name="dae"
         ),
-        source=source_hash("train", chosen=["psfdae.methods.dae"]),
+        source=source_hash("fit", chosen=["psfdae.methods.dae"]),
         folder=subpath(output.weights, parent=True),
         checkpoint=lambda w: f"{RESULTS}/checkpoints/knee-{w.point}.pt",
     message:
         "Training point {wildcards.point} of the knee"
     shell:
-        "psfdae train --config {params.config} --stars {input.stars}"
+        "psfdae fit dae --config {params.config} --stars {input.stars}"
         " --checkpoint {params.checkpoint} --out {params.folder} > {log} 2>&1"
 
 

@@ -129,7 +129,6 @@ use rule psf_bounds as psf_optics with:
 rule wavefront:
     input:
         rules.psf_optics.output,
-        rules.track_wavefront.output,
     localrule: True
 
 

@@ -49,27 +49,3 @@ use rule track as track_alignment with:
         source=source_hash("track"),
     message:
         "Importing the runs of scene 3 into MLflow"
-
-
-use rule track as track_wavefront with:
-    input:
-        lambda w: [path for d in default_datasets() for path in optics_of(d, "csv")],
-        lambda w: [stars_of(d) for d in default_datasets() if has_bank(d)],
-    output:
-        f"{RESULTS}/mlflow/wavefront.csv",
-    log:
-        f"{RESULTS}/logs/track/wavefront.log",
-    benchmark:
-        f"{RESULTS}/benchmarks_on_request/bounds/track.tsv"
-    localrule: True
-    params:
-        what=lambda w: " ".join(
-            ["--optics"]
-            + [f"--stars {d} {stars_of(d)}" for d in default_datasets() if has_bank(d)]
-        ),
-        results=lambda w: RESULTS,
-        preset=PRESET,
-        database=f"{RESULTS}/mlflow.db",
-        source=source_hash("track"),
-    message:
-        "Importing the runs of the telescope's optics into MLflow"

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import sys
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -22,7 +24,6 @@ from torch import nn
 from torch.optim.lr_scheduler import LambdaLR, LRScheduler, OneCycleLR
 
 from psfdae.errors import Error
-from psfdae.files import as_csv, atomic_path
 from psfdae.method import FitError
 from psfdae.networks.weights import load_checkpoint, save_checkpoint
 from psfdae.progress import task
@@ -253,11 +254,9 @@ def train(
     report : called with the history's row after each epoch
     restarts : attempts after the first
 
-    While it trains, its history is in `course_of(checkpoint)`, for those who watch.
-
     Raises TrainingError if something is not finite, or if every attempt died.
     """
-    saved, course = load_checkpoint(checkpoint, fingerprint), course_of(checkpoint)
+    saved, listening = load_checkpoint(checkpoint, fingerprint), listener(checkpoint)
     for attempt in range(saved["attempt"] if saved else 0, restarts + 1):
         training = begin(attempt)
         torch.set_num_threads(training.settings.threads)
@@ -267,14 +266,12 @@ def train(
         last_saved = time.monotonic()
         try:
             while not training.finished():
-                report(training.run_epoch())
-                # No product: it changes all the time.
-                with atomic_path(course, digest=False) as temporary:
-                    temporary.write_text(as_csv(training.history), encoding="utf-8")
+                row = training.run_epoch()
+                report(row)
+                listening(row)
                 if time.monotonic() - last_saved >= training.settings.checkpoint_seconds:
                     save_checkpoint(checkpoint, fingerprint, training.state())
                     last_saved = time.monotonic()
-            course.unlink(missing_ok=True)
             return training
         except DeadNetworkError as death:
             print(f"attempt {attempt}: {death}; starting from another seed", flush=True)
@@ -284,9 +281,18 @@ def train(
     )
 
 
-def course_of(checkpoint: Path) -> Path:
-    """Where the history of a training under way is, beside its checkpoint."""
-    return checkpoint.with_suffix(".csv")
+def listener(checkpoint: Path) -> Callable[[Row], None]:
+    """Return what is called after each epoch beside the log, or a function that does nothing.
+
+    The environment variable PSFDAE_EPOCHS names it as "module:function": the function takes the
+    checkpoint of the training and returns what takes the row of the history.
+    """
+    module, _, function = os.environ.get("PSFDAE_EPOCHS", "").partition(":")
+    if not function:
+        return lambda row: None
+    # By name: what listens decides no result, so it is no part of the code of a stage.
+    heard: Callable[[Row], None] = getattr(import_module(module), function)(checkpoint)
+    return heard
 
 
 def fingerprint(deciding: Mapping[str, Any], *arrays: np.ndarray) -> str:

@@ -81,8 +81,7 @@ def _trained(kind: type[Method], place: Path, config: Config, split: str | None)
     """Configuration of a fit, if it is that of the stage."""
     for path in fits.own_files(kind, place):
         if not path.is_file():
-            command = fits.rule_of(kind).replace("_", " ", 1)
-            raise BundleError(f"{path}: no such file; psfdae {command} writes it")
+            raise BundleError(f"{path}: no such file; psfdae fit {kind.name} writes it")
     path, trained = place / CONFIG if place.is_dir() else place, kind.described(place)
     lacking = {*SEEN_BY_TRAINING, *kind.groups, "split"} - set(trained)
     lacking |= {"reference"} - set(trained) if fits.storage_of(kind).per_reference else set()

@@ -16,12 +16,18 @@ from psfdae.options import File, Folder
 from psfdae.settings import Reference, SplitKind
 from psfdae.threads import limit_threads
 from psfdae_paper.configuration.command import command
+from psfdae_paper.configuration.methods import all_groups
 from psfdae_paper.configuration.schema import Config
 
 Stars = Annotated[File, "Product of the stage stars."]
 
 
-@command("fit", reads=groups_of)
+def groups_read(name: str = "", **options: object) -> tuple[str, ...]:
+    """Return the groups of settings that decide a fit of a method, or of any method."""
+    return groups_of(name) if name else ("seed", "noise", "parts", *all_groups())
+
+
+@command("fit", reads=groups_read)
 def fit(
     config: Config,
     name: Annotated[str, {"argument": True, "metavar": "METHOD"}],
@@ -49,31 +55,3 @@ def fit(
     described = fits.described_by(kind, config.model_dump(), split, reference)
     fits.store(kind.fit(data, **kind.settings(config)), out, described, product)
     kept.unlink(missing_ok=True)
-
-
-@command("baseline", reads=groups_of("pca_som"))
-def baseline(
-    config: Config,
-    stars: Stars,
-    split: SplitKind = "random",
-    *,
-    out: Annotated[File, "HDF5 product with the fitted PCA+SOM."],
-) -> None:
-    """Fit the PCA+SOM baseline."""
-    fit(config, "pca_som", stars, split, out=out)
-
-
-@command("train", reads=groups_of("dae"))
-def train(
-    config: Config,
-    stars: Stars,
-    split: SplitKind = "random",
-    reference: Reference = "realisation",
-    checkpoint: Annotated[
-        File | None, "State of an interrupted training.  [default: OUT/checkpoint.pt]"
-    ] = None,
-    *,
-    out: Annotated[Folder, "Folder for weights, resolved config and history."],
-) -> None:
-    """Train a denoising autoencoder; resumes from its checkpoint."""
-    fit(config, "dae", stars, split, reference, checkpoint=checkpoint, out=out)

@@ -12,7 +12,7 @@ import json
 import os
 import tempfile
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -31,18 +31,17 @@ from psfdae_paper.registry import (
     register,
     registered_name,
 )
-from psfdae_paper.runs_page import show
 from psfdae_paper.source import git_commit
 from psfdae_paper.tracking import (
     MODEL,
     Run,
-    described,
+    digest_of,
     runs_of_alignment,
     runs_of_datasets,
-    runs_of_optics,
     runs_of_sweep,
     settings_of,
 )
+from psfdae_paper.views import show
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -60,6 +59,9 @@ PARENT = "mlflow.parentRunId"
 
 BATCH, PARAM_LENGTH = 100, 6000
 """MLflow takes 100 params, or 1000 metrics, at once, and 6000 characters of a param."""
+
+MOST_RUNS = 50_000
+"""Runs of an experiment that MLflow gives at once, at most."""
 
 DIGEST = 16
 """Characters of the SHA-256 of its product that tell a dataset from others."""
@@ -81,7 +83,6 @@ def track(
     stars: Annotated[
         tuple[tuple[str, File], ...], "Dataset and its product of the stage stars."
     ] = (),
-    optics: Annotated[bool, "Of these datasets, the methods that know the telescope."] = False,
     alignment: Annotated[bool, "The networks of scene 3."] = False,
     sweeps: Annotated[tuple[str, ...], "The points of a sweep.", {"flag": "--sweep"}] = (),
 ) -> None:
@@ -94,8 +95,7 @@ def track(
 
     If a server fails there is a message and no error: it must not stop a workflow.
     """
-    of_datasets = runs_of_optics if optics else runs_of_datasets
-    runs = of_datasets(results, dict(stars))
+    runs = runs_of_datasets(results, dict(stars))
     runs += runs_of_alignment(results) if alignment else []
     runs += [run for sweep in sweeps for run in runs_of_sweep(results, sweep)]
     import_runs(runs, preset, database, out)
@@ -210,15 +210,15 @@ def experiment_of(client: MlflowClient, name: str, uri: str, artifacts: Path) ->
     return str(found.experiment_id)
 
 
+def runs_of_slot(client: MlflowClient, experiment: str, tags: Mapping[str, str]) -> list[MlflowRun]:
+    """Return the active runs of a place in the results folder that this stage has made."""
+    return [run for run in _runs(client, experiment) if _slot(run.data.tags) == _slot(tags)]
+
+
 def _runs(client: MlflowClient, experiment: str) -> Iterator[MlflowRun]:
     """Active runs of an experiment that this stage has made."""
-    token = None
-    while True:
-        page = client.search_runs([experiment], max_results=1000, page_token=token)
-        yield from (run for run in page if "config_hash" in run.data.tags)
-        token = page.token
-        if not token:
-            return
+    known = client.search_runs([experiment], max_results=MOST_RUNS)
+    yield from (run for run in known if "config_hash" in run.data.tags)
 
 
 def _import_one(
@@ -291,21 +291,9 @@ def _log_data(client: MlflowClient, run_id: str, record: Run) -> dict[str, str]:
     if record.data is None or not record.data.is_file():
         return {}
     from mlflow.entities import Dataset, DatasetInput, InputTag
-    from mlflow.types import Schema, TensorSpec
 
-    content, arrays = described(record.data)
-    specs = Schema(
-        [TensorSpec(dtype, (-1, *shape[1:]), name) for name, (dtype, shape) in arrays.items()]
-    )
-    schema = {"mlflow_tensorspec": {"features": specs.to_json(), "targets": None}}
-    data = Dataset(
-        record.dataset,
-        content[:DIGEST],
-        "local",
-        json.dumps({"uri": record.data.resolve().as_uri()}),
-        json.dumps(schema),
-        json.dumps({"shapes": {name: list(shape) for name, (_, shape) in arrays.items()}}),
-    )
+    source = json.dumps({"uri": record.data.resolve().as_uri()})
+    data = Dataset(record.dataset, digest_of(record.data)[:DIGEST], "local", source)
     of_training = [InputTag("mlflow.data.context", "training")]
     client.log_inputs(run_id, [DatasetInput(data, of_training)])
     return {"dataset_name": data.name, "dataset_digest": data.digest}
@@ -318,7 +306,7 @@ def tags_of(record: Run) -> dict[str, str]:
     return {**own, "config_hash": record.config_hash, "superseded": "false"}
 
 
-def _slot(tags: dict[str, str]) -> tuple[str, ...]:
+def _slot(tags: Mapping[str, str]) -> tuple[str, ...]:
     return tuple(tags.get(key, "") for key in SLOT)
 
 

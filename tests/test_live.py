@@ -1,0 +1,38 @@
+"""Trainings that log the ends of their epochs to MLflow."""
+
+from __future__ import annotations
+
+import pytest
+
+from psfdae.networks.training import listener
+from test_track import HISTORY, site  # noqa: F401
+
+
+@pytest.mark.parametrize("place", ["dae/dataset3/random-template.pt", "knee-1.pt"])
+def test_epochs_appear_as_they_are_trained_and_the_finished_run_replaces_them(
+    site,  # noqa: F811
+    monkeypatch,
+    place,
+):
+    monkeypatch.setenv("PSFDAE_EPOCHS", "psfdae_paper.stages.live:logger")
+    monkeypatch.setenv("PSFDAE_RESULTS", str(site.results))
+    monkeypatch.setenv("PRESET", "smoke")
+    checkpoint = site.results / "checkpoints" / place
+    names = ("epoch", "train_mse", "validation_mse", "seconds")
+    rows = [
+        dict(zip(names, (epoch, mse, float(validation), seconds), strict=True))
+        for epoch, mse, validation, seconds in HISTORY
+    ]
+    # A training that starts anew has its first epoch once.
+    for count in (3, 1, 3):
+        heard = listener(checkpoint)
+        for row in rows[:count]:
+            heard(row)
+        if place.startswith("dae"):
+            (run,) = site.runs()
+            assert run.info.status == "RUNNING"
+            points = [(p.step, p.value) for p in site.history(run, "train_mse")]
+            assert points == [(row[0], row[1]) for row in HISTORY[:count]]
+    assert site.track() == {"dae": "created", "baseline": "created"}
+    (finished,) = site.runs()
+    assert finished.info.status == "FINISHED"
