@@ -147,7 +147,7 @@ def optics(
             start = time.monotonic()
             posterior = first.posterior(noisy, level, position)
             for reference, estimator in fitted.items():
-                found = estimator.estimated(*posterior, noisy, level, position)
+                found = estimator.estimate_from_posterior(*posterior, noisy, level, position)
                 truth = bounded.truth[reference]
                 metrics = quality(found, truth, config.evaluation.data_range)
                 row: dict[str, object] = {"dataset": dataset, "split": SPLIT}

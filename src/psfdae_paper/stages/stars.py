@@ -17,7 +17,7 @@ from psfdae_paper.configuration.consistency import SIMULATION, STATIC
 from psfdae_paper.configuration.schema import Config
 from psfdae_paper.stars.fields import assign_fields, square_grid
 from psfdae_paper.stars.framing import Propagation, crop_jittered, normalise_flux
-from psfdae_paper.stars.scenes import drawn_columns, star_wavefronts, template_wavefronts
+from psfdae_paper.stars.scenes import aberration_columns, star_wavefronts, template_wavefronts
 
 ABOUT_PEAK = "brightest pixel (row, column) from the chief ray"
 
@@ -91,7 +91,7 @@ def stars(
             "realisation": Empty(shape, np.float32, "1", "noise-free image, sum 1"),
             "energy": energy,
             "peak": Empty((count, 2), np.int64, "pixel", ABOUT_PEAK),
-            **drawn_columns(source),
+            **aberration_columns(source),
             "pupil_samples": Column(propagation.samples, "1", "pupil samples N"),
         }
         if framing.subpixel:
