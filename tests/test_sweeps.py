@@ -36,7 +36,7 @@ def sweep(tmp_path, monkeypatch):
     folder = tmp_path / "config"
     shutil.copytree(config_dir(), folder)
     monkeypatch.setenv("PSFDAE_CONFIG", str(folder))
-    compose.forget()
+    compose.clear_caches()
 
     def plan(tree, *given, name="tried"):
         text = tree if isinstance(tree, str) else yaml.safe_dump(tree, sort_keys=False)
@@ -44,7 +44,7 @@ def sweep(tmp_path, monkeypatch):
         return plan_sweep(name, ("preset=smoke", *given))
 
     yield plan
-    compose.forget()
+    compose.clear_caches()
 
 
 @pytest.mark.parametrize("name", sweep_names())

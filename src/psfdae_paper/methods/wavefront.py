@@ -92,9 +92,8 @@ class Wavefront(Method):
         from psfdae_paper.bounds.estimates import stamp_model, static_psfs
         from psfdae_paper.bounds.posterior import Bank
 
-        sizes = config.grid.points, config.framing.jitter_px
-        stars = (bank_columns[name] for name in ("framed", "field_index", "peak"))
-        bank = Bank(*stars, *sizes)
+        framed, field, peak = (bank_columns[name] for name in ("framed", "field_index", "peak"))
+        bank = Bank(framed, field, peak, config.grid.points, config.framing.jitter_px)
         return cls(bank, bank_columns["seidel"], stamp_model(config), static_psfs(config), data)
 
     @cached_property

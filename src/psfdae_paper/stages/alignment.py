@@ -32,7 +32,7 @@ from psfdae_paper.alignment.telescope import (
     verify,
     zernike_tracer,
 )
-from psfdae_paper.configuration.alignment import CHOICE, OF_STATES, STATE_STAMPS, STATES
+from psfdae_paper.configuration.alignment import CHOICE, STAMP_KEYS, STATE_GROUPS, WAVEFRONT_KEYS
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.schema import Config
 
@@ -70,13 +70,13 @@ def read_model(
 ) -> QuadraticModel:
     """The quadratic model of a product; `wanted` and `whose` as in `psfdae.belonging.require`."""
     product = read_product(path, "alignment_model", ("coefficients",))
-    require(path, product.config, STATES, wanted, whose)
+    require(path, product.config, WAVEFRONT_KEYS, wanted, whose)
     return QuadraticModel(product["coefficients"])
 
 
 @command(
     "alignment states",
-    reads=OF_STATES,
+    reads=STATE_GROUPS,
     choice=CHOICE,
 )
 def states(
@@ -144,9 +144,9 @@ def telescope(
         name: read_product(path, "alignment_states", ("energy", "stamps"))
         for name, path in (("grid", grid), ("uniform", uniform))
     }
-    require(model, fitted.config, STATES, config)
+    require(model, fitted.config, WAVEFRONT_KEYS, config)
     for product in sets.values():
-        require(product.path, product.config, STATE_STAMPS, config)
+        require(product.path, product.config, STAMP_KEYS, config)
     coefficients, residual, noll = (fitted[k] for k in ("coefficients", "residual", "noll"))
     # How well the states are separated, and the aligned telescope's defocus.
     sensitivity = np.moveaxis(coefficients[:, 1:5], 1, -1).reshape(-1, 4)

@@ -49,12 +49,12 @@ from psfdae_paper.configuration.aligners import (
     TRAINED,
     WEIGHTS,
     Aligner,
-    of_set,
+    methods_of_set,
 )
 from psfdae_paper.configuration.alignment import (
     CHOICE,
     NETWORKS,
-    STATE_STAMPS,
+    STAMP_KEYS,
     NetworkTrain,
 )
 from psfdae_paper.configuration.command import command
@@ -104,7 +104,7 @@ def train_dae(
     on, validating = (
         read_product(path, "alignment_states", ("states", "stamps")) for path in (grid, train)
     )
-    require(train, validating.config, STATE_STAMPS, on.config, grid)
+    require(train, validating.config, STAMP_KEYS, on.config, grid)
     fit, validation = _flat(on["stamps"]), _flat(validating["stamps"][:VALIDATION_STATES])
     images = np.concatenate([fit, validation])
     data = TrainingSet(
@@ -157,7 +157,7 @@ def train_network(
     settings: NetworkTrain = getattr(config, f"train_{kind}")
     product = read_product(states, "alignment_states", ("states", "stamps"))
     if dae:
-        require_origin(dae, STATE_STAMPS, product)
+        require_origin(dae, STAMP_KEYS, product)
     data = TrainingStates(product["states"], product["stamps"])
     if ALIGNERS[kind].noisy:
         data = replace(data, noise=MixedNoise(noise_model(config), np.asarray(config.noise.levels)))
@@ -255,7 +255,7 @@ def require_network(folder: Path, states: Product, name: str | None = None) -> N
     _, fields, _, side = states["stamps"].shape
     said, keys = read_yaml(folder / CONFIG), ("fields", "stamp_px")
     require(folder / CONFIG, said, keys, {"fields": fields, "stamp_px": side}, states.path)
-    require_origin(folder, STATE_STAMPS, states)
+    require_origin(folder, STAMP_KEYS, states)
     if name:
         require(folder / CONFIG, said, ("name",), {"name": name}, "the command")
 
@@ -273,7 +273,7 @@ def estimate(
     """Estimate the states of a test set with every learned method."""
     limit_threads(config.evaluation.threads)
     product = read_product(states, "alignment_states", ("states", "stamps"))
-    require_origin(dae, STATE_STAMPS, product)
+    require_origin(dae, STAMP_KEYS, product)
     folders: dict[str, Path] = vars(networks)
     for name, folder in folders.items():
         require_network(folder, product, name)
@@ -338,13 +338,13 @@ def fit(
         for path in (states, train)
     )
     for given in (product, many):
-        require(given.path, given.config, STATE_STAMPS, config)
+        require(given.path, given.config, STAMP_KEYS, config)
     wavefronts = read_model(model, product.config, states)
     require_network(network, product)
     predict = network_predictor(network, config)
     stamps = noisy_test_states(config, product["stamps"], test_set, level)
     fits: dict[str, list[np.ndarray]] = defaultdict(list)
-    rows, methods = [], of_set(FITTED, test_set)
+    rows, methods = [], methods_of_set(FITTED, test_set)
     operator = partial(AlignmentStamps, config.telescope, config.optics, config.alignment)
     columns = {"states": Column(product["states"], "range", "true states")}
     started = time.perf_counter()
@@ -352,11 +352,11 @@ def fit(
     start = predict(stamps)
     columns["start"] = Column(start, "range", "estimate of the network")
     for method in methods:
-        own = operator(movable=method.free)
+        own = operator(movable=method.unknown_flux)
         optics = partial(stamps_and_slopes, wavefronts, own, emulator=emulator)
         exact = Likelihood(optics, noise_model(config), level)
         # The emulator knows stars in their place only.
-        near = exact if method.free else replace(exact, stamps=emulator)
+        near = exact if method.unknown_flux else replace(exact, stamps=emulator)
         first = fit_states(near, stamps, parameters_of(wavefronts, own, start), config.fit)
         # In focus, a state and its twin have nearly the same stamps.
         others = twin_states(wavefronts, first.parameters, product["noll"])
@@ -400,11 +400,11 @@ def bound(
 
     limit_threads(1)
     product = read_product(states, "alignment_states", ("states",))
-    require(states, product.config, STATE_STAMPS, config)
+    require(states, product.config, STAMP_KEYS, config)
     wavefronts = read_model(model, product.config, states)
     noise, levels, truth = noise_model(config), config.noise.levels, product["states"]
-    methods = of_set(BOUNDS, test_set)
-    free = [method.free for method in methods]
+    methods = methods_of_set(BOUNDS, test_set)
+    free = [method.unknown_flux for method in methods]
     operator = AlignmentStamps(config.telescope, config.optics, config.alignment, any(free))
     covariances = bound_covariances(wavefronts, operator, noise, levels, truth, free)
     about = f"[method, λ, state, number, number] of the bound; {_names(methods)}"

@@ -26,9 +26,9 @@ from psfdae_paper.configuration.aligners import (
     FITTED,
     LEARNED,
     Aligner,
-    of_set,
+    methods_of_set,
 )
-from psfdae_paper.configuration.alignment import CHOICE, STATE_STAMPS
+from psfdae_paper.configuration.alignment import CHOICE, STAMP_KEYS
 from psfdae_paper.configuration.command import command
 from psfdae_paper.configuration.schema import Config
 from psfdae_paper.stages.alignment import StatesFile
@@ -49,7 +49,7 @@ SHOWN_STATES = 2
 TWIN_TILT = (0.20, 0.25)
 """Tilts x, y of the state of the twin figure; its decentre cancels the constant coma."""
 
-DRAWN = [method.name for method in ESTIMATORS if not method.free]
+DRAWN = [method.name for method in ESTIMATORS if not method.unknown_flux]
 
 Png = Annotated[File, "PNG."]
 
@@ -78,7 +78,9 @@ def read_errors(
         product = read_product(path, "alignment_fit", ("states", "estimates"))
         test_set = product.config["test_set"]
         level = product.config["level"]
-        for method, found in zip(of_set(FITTED, test_set), product["estimates"], strict=True):
+        for method, found in zip(
+            methods_of_set(FITTED, test_set), product["estimates"], strict=True
+        ):
             key = Key(test_set=test_set, noise_level=level, method=method.name)
             yield key, product["states"], found
 
@@ -88,13 +90,15 @@ def read_bounds(bounds: Sequence[Path]) -> Iterator[tuple[Key, np.ndarray, np.nd
     for path in bounds:
         product = read_product(path, "alignment_bound", ("states", "levels", "covariances"))
         test_set = product.config["test_set"]
-        for method, levels in zip(of_set(BOUNDS, test_set), product["covariances"], strict=True):
+        for method, levels in zip(
+            methods_of_set(BOUNDS, test_set), product["covariances"], strict=True
+        ):
             for level, covariances in zip(product["levels"], levels, strict=True):
                 key = Key(test_set=test_set, noise_level=float(level), method=method.name)
                 yield key, product["states"], covariances
 
 
-SAME_TEST = ("noise.kappa", "noise.background_photons", *STATE_STAMPS)
+SAME_TEST = ("noise.kappa", "noise.background_photons", *STAMP_KEYS)
 """What products of one test agree in; estimates and fits in the seed of the noise, too."""
 
 
@@ -142,7 +146,7 @@ def tables(
     product = read_product(states, "alignment_states", ("unit",))
     for path in bounds:
         made = read_product(path, "alignment_bound", ()).config
-        require(path, made, STATE_STAMPS, product.config, states)
+        require(path, made, STAMP_KEYS, product.config, states)
     unit = product["unit"]
     found: dict[Path, list[rows.Row]] = {errors: [], correlation: []}
     for key, truth, estimate in read_errors(estimates, fits):
@@ -221,7 +225,7 @@ def stamps(config: Config, states: StatesFile, dae: DaeFolder, out: Png) -> None
     from psfdae_paper.evaluation.alignment_figures import stamp_rows
 
     product = read_product(states, "alignment_states", ("states", "stamps"))
-    require_origin(dae, STATE_STAMPS, product)
+    require_origin(dae, STAMP_KEYS, product)
     rows = [("noise-free", product["stamps"][:SHOWN_STATES])]
     for level in config.noise.levels:
         noisy = noisy_test_states(config, product["stamps"], "uniform", level)[:SHOWN_STATES]

@@ -30,15 +30,15 @@ def config(overrides: Overrides = (), only: Only = None) -> None:
             reader = stage(names[_key(only)]).stage.settings  # type: ignore[attr-defined]
         if reader is None:
             raise click.BadParameter(f"{only!r} is not one of {', '.join(sorted(found()))}")
-        groups = Groups(reader.of({}), reader.choice)
-        checked = load_stage(groups.of({}), groups.chosen(overrides))
+        groups = Groups(reader.names({}), reader.choice)
+        checked = load_stage(groups.names({}), groups.with_choice(overrides))
     click.echo(yaml.safe_dump(checked.model_dump(), sort_keys=False), nl=False)
 
 
 @command("alignment config")
 def alignment_config(only: Only = None, overrides: Overrides = ()) -> None:
     """Check the configuration of scene 3 and print it, resolved: `config dataset=alignment`."""
-    config(overrides if only else Groups((), CHOICE).chosen(overrides), only)
+    config(overrides if only else Groups((), CHOICE).with_choice(overrides), only)
 
 
 def _key(name: str) -> str:

@@ -13,7 +13,7 @@ from psfdae.method import CONFIG, HISTORY
 from psfdae.reading import read_table, read_yaml
 from psfdae.threads import limit_threads
 from psfdae_paper.configuration.aligners import WEIGHTS
-from psfdae_paper.configuration.alignment import STATE_STAMPS
+from psfdae_paper.configuration.alignment import STAMP_KEYS
 from psfdae_paper.configuration.compose import part
 from psfdae_paper.configuration.schema import Config
 from psfdae_paper.evaluation.alignment_tables import Row, error_rows
@@ -51,7 +51,7 @@ def run(config: Config, task: Task, name: str) -> Measured:
     trained_on = read_product(task.data["states"], "alignment_states", ())
     for role in ("validation", "test"):
         product = read_product(task.data[role], "alignment_states", ())
-        require(product.path, product.config, STATE_STAMPS, trained_on.config, trained_on.path)
+        require(product.path, product.config, STAMP_KEYS, trained_on.config, trained_on.path)
     settings = part(network_groups(name), config)
     train_network(settings, name, task.data["states"], task.checkpoint, task.folder)
     limit_threads(config.evaluation.threads)

@@ -20,7 +20,7 @@ from psfdae.settings import Reference, SplitKind, validate
 from psfdae_paper.configuration.aligners import SWEPT
 from psfdae_paper.configuration.alignment import CHOICE
 from psfdae_paper.configuration.command import command
-from psfdae_paper.configuration.compose import decisive, load_stage
+from psfdae_paper.configuration.compose import decisive_settings, load_stage
 from psfdae_paper.configuration.schema import Config
 from psfdae_paper.configuration.sweep import Axis, Value, models, point_groups
 from psfdae_paper.sweeps.measured import (
@@ -182,7 +182,7 @@ def point(
     content = [
         source,
         model,
-        decisive(config.model_dump()),
+        decisive_settings(config.model_dump()),
         dict(values),
         dict(keys),
         task.described(),

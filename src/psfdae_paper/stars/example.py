@@ -86,8 +86,8 @@ def example_field(recipe: FieldRecipe, seed: int) -> ExampleField:
     # clipping at the saturation level or the largest number of 16 bits.
     ramp = 1.0 + recipe.sky_slope * np.linspace(-0.5, 0.5, recipe.side_px)
     expected_e = recipe.sky_e * np.broadcast_to(ramp, starlight.shape) + starlight
-    electrons = rng.poisson(expected_e)
-    electrons = electrons + recipe.read_noise_e * rng.standard_normal(expected_e.shape)
+    photo_electrons = rng.poisson(expected_e)
+    electrons = photo_electrons + recipe.read_noise_e * rng.standard_normal(expected_e.shape)
     image = np.clip(np.rint(electrons / recipe.gain), 0, min(recipe.saturation, 65535))
     # Centres of light from the first moments of the noise-free stamps, whose sum is 1.
     psf = psf[: kind.size]

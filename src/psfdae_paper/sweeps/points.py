@@ -15,14 +15,14 @@ import numpy as np
 from psfdae.errors import Error
 from psfdae.rng import stream
 from psfdae.settings import ConfigError
-from psfdae_paper.configuration.alignment import OF_STATES
+from psfdae_paper.configuration.alignment import STATE_GROUPS
 from psfdae_paper.configuration.base import config_dir
 from psfdae_paper.configuration.compose import (
-    checked,
     compose,
-    decisive,
+    decisive_settings,
     overrides_for,
     stage_tree,
+    validate_tree,
 )
 from psfdae_paper.configuration.consistency import SIMULATION
 from psfdae_paper.configuration.sweep import Axis, Sweep, Value, load_sweep
@@ -195,7 +195,7 @@ class Plan:
             "reference": self.sweep.reference,
             "levels": self.levels,
             "data": self._data,
-            "config": decisive(config),
+            "config": decisive_settings(config),
             "search": None if slot is None else {**self.search, "slot": slot},
         }
         return Point(hash_of(content)[:NAME_LENGTH], values, keys, config, slot)
@@ -205,7 +205,7 @@ class Plan:
         where = config_dir() / "sweep" / f"{self.name}.yaml"
         try:
             tree = with_values(self.tree, keys)
-            whole = checked(tree).model_dump()
+            whole = validate_tree(tree).model_dump()
         except (SweepError, ConfigError) as error:
             at = f" (point {', '.join(f'{k}={v}' for k, v in values.items())})" if values else ""
             raise SweepError(f"{where}: {str(error).splitlines()[0]}{at}") from None
@@ -214,11 +214,11 @@ class Plan:
     @cached_property
     def _data(self) -> dict[str, Any]:
         """Configuration of the images that all points share."""
-        return stage_tree(SIMULATION if self.sweep.dataset else OF_STATES, self._base)
+        return stage_tree(SIMULATION if self.sweep.dataset else STATE_GROUPS, self._base)
 
     @cached_property
     def _base(self) -> dict[str, Any]:
-        return checked(self.tree).model_dump()
+        return validate_tree(self.tree).model_dump()
 
     def _check_range(self) -> None:
         """Refuse a space with a corner that the configuration does not allow."""
