@@ -54,9 +54,8 @@ class Scale:
     def to_unit(self, coordinate: np.ndarray) -> np.ndarray:
         """Scale coordinates so that the smallest and largest of this axis become 0 and 1."""
         low, high = np.nanmin(self.coordinate), np.nanmax(self.coordinate)
-        if high > low:
-            return (coordinate - low) / (high - low)
-        return np.full(np.shape(coordinate), 0.5)
+        constant = np.full(np.shape(coordinate), 0.5)
+        return (coordinate - low) / (high - low) if high > low else constant
 
 
 def scale_of(texts: Sequence[str], logarithmic: bool = False) -> Scale:
