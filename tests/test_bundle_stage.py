@@ -307,7 +307,7 @@ def test_ship_names_checks_and_writes(folder, tiny, tmp_path, capsys):
     rows = [row | {"coverage68": 0.5} for row in tiny.info.metrics]
     poor = replace(tiny, info=tiny.info.model_copy(update={"metrics": rows}))
     write_bundle(poor, tmp_path / "poor.psf.safetensors")
-    with pytest.raises(BundleError, match=r"error68 holds 50\.0%"):
+    with pytest.raises(BundleError, match=r"error68 contains 50\.0%"):
         stage.ship(config, (tmp_path / "poor.psf.safetensors",), **given)
 
 

@@ -1,4 +1,4 @@
-"""A point of a sweep over the networks of scene 3."""
+"""Training and measurement of one point of a sweep over a network of scene 3."""
 
 from __future__ import annotations
 
@@ -25,12 +25,9 @@ from psfdae_paper.stages.alignment_methods import (
 )
 from psfdae_paper.sweeps.measured import EVALUATION, VALIDATION, Measured, Task, geometric_mean
 
-TEST_SET = "uniform"
-"""Test set of scene 3, whose noise is drawn as in the main workflow."""
-
 
 def files_of(name: str) -> tuple[str, ...]:
-    """Names of the files of a point's training."""
+    """Return the names of the files of a point's training."""
     return (WEIGHTS, CONFIG, HISTORY)
 
 
@@ -39,12 +36,18 @@ def run(config: Config, task: Task, name: str) -> Measured:
 
     Parameters
     ----------
-    config : stage config (seed, noise, cnn, perceptron, train_<name>, evaluation)
+    config : Config
+        Stage configuration (seed, noise, cnn, perceptron, train_<name>, evaluation).
     task : Task
-    name : of the network, original or noise_trained
+    name : str
+        Name of the network, original or noise_trained.
 
-    Raises TrainingError if the training cannot go on, and ProductError if the products
-    are of different telescopes or stamps.
+    Raises
+    ------
+    TrainingError
+        If the training cannot continue.
+    ProductError
+        If the products are of different telescopes or stamps.
     """
     import pandas as pd
 
@@ -72,10 +75,11 @@ def run(config: Config, task: Task, name: str) -> Measured:
 
 
 def _rows(config: Config, task: Task, role: str) -> list[Row]:
-    """Rows of the table of errors as the main workflow makes them, of one network."""
+    """Measure one network at all noise levels; return rows like those of the main workflow."""
     product = read_product(task.data[role], "alignment_states", ("states", "stamps", "unit"))
     predict = network_predictor(task.folder, config)
-    test_set = TEST_SET if role == "test" else role
+    # The test part is the uniform set, with the noise that it has in the main workflow.
+    test_set = "uniform" if role == "test" else role
     rows: list[Row] = []
     for level in task.levels:
         stamps = noisy_test_states(config, product["stamps"], test_set, level)
@@ -85,11 +89,14 @@ def _rows(config: Config, task: Task, role: str) -> list[Row]:
 
 
 def _metrics(role: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    """Mean absolute error in units of the range: of all parameters, and at each noise level."""
-    levels: dict[float, list[float]] = {}
+    """Return the mean absolute error of all parameters, over all noise levels and at each.
+
+    It is in units of the range.
+    """
+    errors_by_level: dict[float, list[float]] = {}
     for row in rows:
         if row["unit"] == "range":
-            levels.setdefault(row["noise_level"], []).append(row["mean_abs_error"])
-    each = {level: float(np.mean(errors)) for level, errors in levels.items()}
-    metrics = {f"{role}_mae": geometric_mean(list(each.values()))}
-    return metrics | {f"{role}_mae_{level:g}": value for level, value in each.items()}
+            errors_by_level.setdefault(row["noise_level"], []).append(row["mean_abs_error"])
+    mae = {level: float(np.mean(errors)) for level, errors in errors_by_level.items()}
+    metrics = {f"{role}_mae": geometric_mean(list(mae.values()))}
+    return metrics | {f"{role}_mae_{level:g}": value for level, value in mae.items()}
