@@ -120,6 +120,7 @@ def errors_against_size(
     figure = new_figure(3.9, layout="constrained")
     panels = figure.subplots(1, len(curves), sharey=True, squeeze=False)[0]
     for axes, (level, methods) in zip(panels, curves.items(), strict=True):
+        # Bounds are dashed lines, estimates have standard errors.
         for method, (size, error) in methods.items():
             mean_size, mean_error, stderr = binned(size, error)
             style = {
@@ -172,6 +173,7 @@ def twin_ambiguity(
     state : ndarray, shape (4,)
         In units of the range.
     """
+    # χ² along the line through the state and its twin, one panel per noise level.
     figure = new_figure(7.2, layout="constrained")
     top, bottom = figure.subfigures(2, 1, squeeze=False, height_ratios=[1.0, 1.15])[:, 0]
     panels = top.subplots(1, curves.noise_level.nunique(), sharey=True, squeeze=False)[0]

@@ -74,6 +74,7 @@ def training_curves(histories: Mapping[str, pd.DataFrame], title: str) -> Figure
     figure = new_figure(4.6, layout="constrained")
     axes = figure.add_subplot()
     entries = []
+    # Dotted training error, solid validation error with markers, in one colour per network.
     for i, (label, history) in enumerate(histories.items()):
         color = SERIES_COLORS[i % len(SERIES_COLORS)]
         axes.plot(history["step"], history["train_mse"], color=color, lw=1.0, ls=":")
@@ -221,6 +222,7 @@ def errors_above_bounds(efficiency: pd.DataFrame, bounds: pd.DataFrame, dataset:
         for name, look in MEANS.items():
             _draw_posterior_mean(axes, rows[rows.method == name].sort_values("noise_level"), look)
         _finish_panel(axes, reference, np.unique(rows["noise_level"]))
+    # One logarithmic axis for all panels, down to the floor.
     panels[0].set_yscale("log")
     bottom = _draw_floor(panels, limits)
     if bottom is not None:
@@ -257,6 +259,7 @@ def efficiency_against_noise(efficiency: pd.DataFrame, dataset: str) -> Figure:
     measured = efficiency[efficiency.dataset == dataset]
     figure, panels = _panels(measured)
     for axes, (reference, rows) in zip(panels, _by_reference(measured), strict=True):
+        # Solid lines relative to the posterior mean, dotted lines relative to the floor.
         method_rows = _without_posterior_means(rows).sort_values("noise_level")
         for method_class, errors in _by_method(method_rows):
             for bound, values in errors.groupby("bound"):
@@ -314,6 +317,7 @@ def bank_growth(growth: pd.DataFrame, dataset: str) -> Figure:
     readable_log_axis(panels[0])
     panels[0].set_ylabel(METRIC_LABELS["mse"])
     figure.suptitle(f"{dataset}: the posterior mean over banks of growing size")
+    # Colours are noise levels; markers are the posterior mean with and without the field.
     handles = [
         Line2D([], [], color=color, marker="o", ms=4.5, lw=1.4, label=f"λ = {level:g}")
         for level, color in colors.items()
@@ -387,6 +391,7 @@ def _draw_floor(panels: np.ndarray, limits: pd.DataFrame) -> float | None:
     floor = limits[limits.method == "floor"].sort_values("noise_level")
     if floor.empty:
         return None
+    # The axis ends a factor of two below the lowest value.
     bottom = 0.5 * float(floor["value"].min())
     for axes, (reference, _) in zip(panels, _by_reference(limits), strict=True):
         rows = floor[floor.reference == reference]

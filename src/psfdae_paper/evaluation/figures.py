@@ -66,7 +66,7 @@ def mosaic(stamps: np.ndarray, grid: np.ndarray, gap: int = 1) -> np.ndarray:
         NaN where there is no stamp.
     """
     side = stamps.shape[-1]
-    pitch = side + gap
+    pitch = side + gap  # pixels from one stamp to the next
     columns, rows = grid.max(axis=0) + 1
     canvas = np.full((rows * pitch + gap, columns * pitch + gap), np.nan)
     for stamp, (ix, iy) in zip(stamps, grid, strict=True):
@@ -87,6 +87,7 @@ def template_map(psf: np.ndarray, grid: np.ndarray, field: np.ndarray, title: st
     axes.set_title(title)
     bar = figure.colorbar(image, ax=axes, shrink=0.8, pad=0.02)
     bar.set_label("pixel flux / maximum of the stamp (square-root scale)")
+    # Ticks at fractions of the maximum, whose square roots are drawn.
     share_ticks = np.array([0.0, 0.01, 0.05, 0.1, 0.25, 0.5, 0.75, 1.0])
     bar.set_ticks(np.sqrt(share_ticks), labels=[f"{value:g}" for value in share_ticks])
     return figure
@@ -127,6 +128,7 @@ def field_of_psfs(fields: FieldOfPsfs, name: str, pixel_scale_arcsec: float) -> 
     grid = figure.add_gridspec(2, 2, width_ratios=(2.1, 1.0))
     side = fields.psf.shape[-1]
     axes = figure.add_subplot(grid[:, 0])
+    # Mosaic of the stamps at the left, with the colour bar below it.
     image = _draw_psfs(axes, fields.psf, fields.grid, fields.field)
     ticks = np.array([0.0, 0.01, 0.1, 0.25, 0.5, 1.0])
     bar = figure.colorbar(image, ax=axes, orientation="horizontal", shrink=0.8, aspect=40)
@@ -231,8 +233,9 @@ def _extent(
     With these edges the centre of each stamp is at its field point.
     """
     position, _ = in_field_unit(field)
-    pitch = side + gap
+    pitch = side + gap  # pixels from one stamp to the next
 
+    # The centre of a stamp is gap + side/2 pixels from the edge of the mosaic.
     def edges(axis: int) -> tuple[float, float]:
         points = int(grid[:, axis].max()) + 1
         first, last = position[:, axis].min(), position[:, axis].max()

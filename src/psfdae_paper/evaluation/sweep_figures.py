@@ -113,13 +113,16 @@ def parallel_coordinates(
     from matplotlib import colormaps
     from matplotlib.lines import Line2D
 
+    # Height of every line on every axis, from 0 to 1; the last axis is the metric.
     metric = described["metric"]
     metric_values = _column(table, metric)
     succeeded = np.isfinite(metric_values)
     values = metric_values[succeeded]
     scales = {name: scale_of(table[name].tolist(), name in logs) for name in axes}
     metric_scale = scale_of([f"{value:.3g}" for value in values], metric != "validation_ssim")
-    rank = _ranks(values if described["direction"] == "minimize" else -values)
+    # Rank of every point, from 0, the best, to 1: it decides the colour of its line.
+    order = np.argsort(values if described["direction"] == "minimize" else -values, kind="stable")
+    rank = np.argsort(order, kind="stable") / max(values.size - 1, 1)
     heights = np.full((len(table), len(axes) + 1), FAILED_HEIGHT)
     # Lines of a grid would lie on each other: they leave an axis at slightly different heights.
     offset = np.zeros(len(table))
@@ -164,6 +167,7 @@ def response_curves(
     second panel with the metric at every noise level. Parameters are those of
     `parallel_coordinates`.
     """
+    # Name of the axis of each panel, and True for the panel of noise levels.
     contents = [(name, False) for name in axes] + ([(axes[0], True)] if len(axes) == 1 else [])
     columns = min(len(contents), 2)
     rows = -(-len(contents) // columns)
@@ -171,6 +175,7 @@ def response_curves(
     panels = figure.subplots(rows, columns, squeeze=False, sharey="row").ravel()
     for panel, (name, by_level) in zip(panels, contents, strict=False):
         scale = scale_of(table[name].tolist(), name in logs)
+        # Only listed numbers are joined; draws from a range are scattered.
         joined = scale.numeric and described["space"][name].get("low") is None
         draw = _draw_noise_levels if by_level else _draw_points
         title = draw(panel, table, scale, described, name, joined)
@@ -242,6 +247,7 @@ def _draw_noise_levels(
     joined: bool,
 ) -> str:
     """Draw the metric at every noise level; return the quantity that the lines stand for."""
+    # The table has a column METRIC_LEVEL for each noise level.
     prefix = f"{described['metric']}_"
     columns = [column for column in table.columns if column.startswith(prefix)]
     order = np.argsort(scale.coordinate)
@@ -289,12 +295,6 @@ def _with_metric_ticks(scale: Scale, metric: str) -> Scale:
 def _column(table: pd.DataFrame, name: str) -> np.ndarray:
     """Return a column of numbers; NaN where a point failed."""
     return table[name].to_numpy(dtype=float)
-
-
-def _ranks(values: np.ndarray) -> np.ndarray:
-    """Return ranks from 0, the smallest, to 1."""
-    ranks = np.argsort(np.argsort(values, kind="stable"), kind="stable")
-    return ranks / max(values.size - 1, 1)
 
 
 def _is_log(metric: str) -> bool:

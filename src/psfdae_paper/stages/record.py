@@ -16,7 +16,7 @@ from collections.abc import Iterable, Mapping
 from datetime import date
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 from xml.etree import ElementTree
 
 import numpy as np
@@ -137,8 +137,9 @@ def reference(
     provenance_path = out / "provenance.json"
     earlier = json.loads(provenance_path.read_text()) if provenance_path.is_file() else {}
     names = (path.relative_to(out).as_posix() for path in sorted(out.rglob("*")) if path.is_file())
-    retained = {
-        name: _recorded_at(name, earlier)
+    earlier_record = {key: earlier.get(key, "unknown") for key in ("commit", "date")}
+    retained: dict[str, dict[str, str]] = {
+        name: earlier.get("kept", {}).get(name) or earlier_record
         for name in names
         if name not in renewed and MAY_STAY.fullmatch(name)
     }
@@ -202,12 +203,6 @@ def _up_to_date(results: Path, plans: Iterable[Path]) -> list[str]:
             f" {len(refused)} files of {len(recorded)}); run the targets of the record first"
         )
     return [name for name in recorded if name not in outdated]
-
-
-def _recorded_at(name: str, earlier: Mapping[str, Any]) -> dict[str, str]:
-    """Return commit and date at which a file of the earlier record was recorded."""
-    retained = earlier.get("kept", {}).get(name)
-    return retained or {key: earlier.get(key, "unknown") for key in ("commit", "date")}
 
 
 def _require_history(name: str, record: Mapping[str, str]) -> None:

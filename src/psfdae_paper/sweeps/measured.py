@@ -150,6 +150,7 @@ def image_rows(
     images, truth = (product[kind][stars] for kind in ("realisation", task.reference))
     field, position = product["field_index"][stars], field_positions(product)[stars]
     key = {"dataset": task.dataset, "split": task.split, "reference": task.reference}
+    # Errors of all stars at each level, summarised with standard errors clustered by field.
     rows = []
     for level in task.levels:
         estimate = model.estimate(noisy(images, level), level, position)
@@ -217,6 +218,7 @@ def measure_images(
     def noisy_test(images: np.ndarray, level: float) -> np.ndarray:
         return noisy_test_images(config, product, parts.test, level)
 
+    # Each part has its own stars, noise, fit and table.
     metrics: dict[str, float] = {}
     for part, stars, noisy, model, table in (
         ("validation", parts.validation, noisy_validation, validate_with, VALIDATION),

@@ -64,6 +64,7 @@ def _draw(axis: Axis, rng: np.random.Generator) -> Value:
     margin = 0.5 if axis.integer else 0.0
     low, high = axis.ends
     ends = np.array([low - margin, high + margin])
+    # A logarithmic range is uniform in ln(value).
     value = np.exp(rng.uniform(*np.log(ends))) if axis.log else rng.uniform(*ends)
     return tidy(axis, float(value))
 
@@ -96,6 +97,7 @@ def with_values(tree: Mapping[str, Any], keys: Mapping[str, Value]) -> dict[str,
     """
     changed_tree = dict(tree)
     for dotted_key, value in keys.items():
+        # Copy each group on the way to the key, so that the given tree does not change.
         node, (*groups, key) = changed_tree, dotted_key.split(".")
         for group in groups:
             if not isinstance(node.get(group), Mapping):
@@ -188,6 +190,7 @@ class Plan:
         """Make the point at some values of the axes, or the trial of a number."""
         keys = {**self.sweep.overrides, **(changes(self.sweep.space, values) if values else {})}
         config = self._point_config(keys, values)
+        # All that can change the result: points with the same content have the same name.
         content = {
             "model": self.sweep.model,
             "split": self.sweep.split,
