@@ -108,16 +108,14 @@ def _used_names(tree: ast.Module) -> set[str]:
 
 def _without_docstrings(tree: ast.Module) -> ast.Module:
     """Remove all statements that are only a constant, such as docstrings, from a syntax tree."""
+
+    def is_text(statement: ast.stmt) -> bool:
+        return isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant)
+
     for node in ast.walk(tree):
         body = getattr(node, "body", None)
         if isinstance(body, list):
-            node.body = [  # type: ignore[attr-defined]
-                statement
-                for statement in body
-                if not (
-                    isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant)
-                )
-            ]
+            node.body = [s for s in body if not is_text(s)]  # type: ignore[attr-defined]
     return tree
 
 

@@ -84,9 +84,8 @@ def _in_both_units(
 ) -> list[Row]:
     """Return a row in units of the range and one in SI units for each parameter."""
     rows: list[Row] = []
-    for index, (parameter, si_unit) in enumerate(
-        zip(PARAMETERS, ("m", "m", "rad", "rad"), strict=True)
-    ):
+    si_units = ("m", "m", "rad", "rad")
+    for index, (parameter, si_unit) in enumerate(zip(PARAMETERS, si_units, strict=True)):
         for unit_name, scale in (("range", 1.0), (si_unit, unit[index])):
             # Variances scale with the square of the unit.
             values = {
@@ -207,9 +206,8 @@ def _pivoted(
     methods = list(ALIGNERS)
     table = rows.pivot(index=index, columns=column, values="value")[column_order].reset_index()
     table.columns.name = None
-    keys = [
-        table["method"].map(methods.index) if name == "method" else table[name] for name in index
-    ]
+    rank = table["method"].map(methods.index)
+    keys = [rank if name == "method" else table[name] for name in index]
     # `lexsort` sorts by its last key first.
     order = np.lexsort([key.to_numpy() for key in reversed(keys)])
     return table.iloc[order].reset_index(drop=True)
@@ -233,9 +231,7 @@ def as_markdown(table: pd.DataFrame, title: str, digits: dict[str, str]) -> str:
             for value, quantity in zip(table[column], quantities, strict=True)
         ]
     # The paper's rows have its own names of the methods.
-    paper_labels = {
-        name: aligner.look.paper[1] for name, aligner in ALIGNERS.items() if aligner.look.paper
-    }
+    paper_labels = {a.name: a.look.paper[1] for a in ALIGNERS.values() if a.look.paper}
     formatted["method"] = [
         paper_labels[method] if source == "paper" else ALIGNERS[method].look.label
         for method, source in zip(table["method"], table["source"], strict=True)

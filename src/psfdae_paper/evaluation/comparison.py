@@ -275,10 +275,8 @@ def _mse_signs(table: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(signs, index=mse.index)
 
 
-HELD_OUT_COLUMNS = [
-    *("dataset", "reference", "method", "noise_level", "mse_random", "mse_held_out"),
-    *("ratio", "stderr", "n", "fields"),
-]
+HELD_OUT_COLUMNS = ["dataset", "reference", "method", "noise_level", "mse_random", "mse_held_out"]
+HELD_OUT_COLUMNS += ["ratio", "stderr", "n", "fields"]
 """Columns of the table of held-out ratios."""
 
 

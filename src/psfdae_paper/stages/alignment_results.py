@@ -160,9 +160,7 @@ def tables(
     for path, table_rows in rows_by_table.items():
         frame = pd.DataFrame(table_rows).sort_values(
             ["test_set", "noise_level", "method"],
-            key=lambda column: (
-                column.map(method_order.index) if column.name == "method" else column
-            ),
+            key=lambda c: c.map(method_order.index) if c.name == "method" else c,
             kind="stable",
         )
         write_csv(path, frame)

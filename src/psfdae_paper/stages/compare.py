@@ -79,11 +79,7 @@ def compare(
 
 def _networks(folder: Path) -> set[Path]:
     """Return the folders of trained networks, relative to a folder of results."""
-    names = (
-        method_class.name
-        for method_class in registered()
-        if method_class.storage and CONFIG in method_class.storage.files
-    )
+    names = (m.name for m in registered() if m.storage and CONFIG in m.storage.files)
     paths = (path for name in names for path in folder.glob(f"{name}/*/*/{CONFIG}"))
     return {path.parent.relative_to(folder) for path in paths}
 

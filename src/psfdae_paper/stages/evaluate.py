@@ -33,12 +33,7 @@ if TYPE_CHECKING:
 
 READS = (
     *("seed", "noise", "parts", "evaluation", "methods"),
-    *dict.fromkeys(
-        group
-        for method_class in registered()
-        if method_class.storage is None
-        for group in method_class.groups
-    ),
+    *dict.fromkeys(group for m in registered() if m.storage is None for group in m.groups),
 )
 """Groups of the configuration on which the measurements depend, if stored models are given.
 
@@ -138,11 +133,7 @@ def estimators(
     ProductError
         If a model is damaged, or does not belong to the stars.
     """
-    classes = [
-        method_class
-        for method_class in map(method, config.methods)
-        if method_class.look.drawn or not only_drawn
-    ]
+    classes = [m for m in map(method, config.methods) if m.look.drawn or not only_drawn]
     # Check all models before any method is loaded or fitted.
     places: dict[str, Path] = {}
     for method_class in classes:
@@ -164,10 +155,8 @@ def estimators(
     return fitted
 
 
-COLUMNS = [
-    *("dataset", "split", "reference", "method", "noise_level", "metric"),
-    *("value", "stderr", "n"),
-]
+COLUMNS = ["dataset", "split", "reference", "method", "noise_level", "metric"]
+COLUMNS += ["value", "stderr", "n"]
 """Columns of the table of an evaluation."""
 
 Evaluations = Annotated[tuple[File, ...], {"argument": True}]

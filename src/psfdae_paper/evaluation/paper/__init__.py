@@ -11,11 +11,7 @@ from psfdae_paper.configuration.methods import registered
 
 def paper_rows() -> dict[str, str]:
     """Return the names of methods here by their names in the paper's tables."""
-    return {
-        method_class.look.paper[0]: method_class.name
-        for method_class in registered()
-        if method_class.look.paper
-    }
+    return {m.look.paper[0]: m.name for m in registered() if m.look.paper}
 
 
 def published(table: str) -> pd.DataFrame:
@@ -41,11 +37,7 @@ def paper_table(metrics: pd.DataFrame, dataset: str, metric: str) -> pd.DataFram
         The paper has no rows for datasets that it does not tabulate. Methods of psfdae have in
         brackets what they are given beside the image; for the paper's that is unknown.
     """
-    labels = {
-        method_class.name: method_class.look.paper[1]
-        for method_class in registered()
-        if method_class.look.paper
-    }
+    labels = {m.name: m.look.paper[1] for m in registered() if m.look.paper}
     measured = metrics[
         (metrics.dataset == dataset)
         & (metrics.metric == metric)
@@ -64,9 +56,7 @@ def paper_table(metrics: pd.DataFrame, dataset: str, metric: str) -> pd.DataFram
         index=["source", "reference", "order", "method"], columns="noise_level", values="value"
     )
     table = table.reset_index().drop(columns="order")
-    inputs = table["method"].map(
-        {method_class.name: str(method_class.needs) for method_class in registered()}
-    )
+    inputs = table["method"].map({m.name: str(m.needs) for m in registered()})
     table["method"] = table["method"].map(labels) + inputs.where(table["source"] == "psfdae", "")
     table.columns = [f"{c:g}" if isinstance(c, float) else c for c in table.columns]
     return table
